@@ -100,9 +100,9 @@ def test_extending_layouts(
     assert "own: 1 images, 2 instances" in capsys.readouterr().out
 
 
-def add_median(estimated: Rigid, instance: Instance, ruler: ErrorContext) -> float:
+def add_median(estimated: Rigid, instance: Instance, context: ErrorContext) -> float:
     """A metric of our own: the median distance of a model point [m]."""
-    points_m = ruler.model.vertices_m.double()
+    points_m = context.model.vertices_m.double()
     true = instance.camera_from_model
     gaps_m = (estimated.apply(points_m) - true.apply(points_m)).norm(dim=-1)
     return float(gaps_m.median())

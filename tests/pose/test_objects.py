@@ -274,5 +274,5 @@ def test_frames_refuse_what_they_cannot_show() -> None:
         next(make_frames([_numbered(1)], dataclasses.replace(_FRAME, distance_m=(0.2, 1.0)), 1))
     with pytest.raises(InputError, match="there is no object to show"):
         next(make_frames([], _FRAME, 1))
-    with pytest.raises(InputError, match=r"frame_objects is \(0, 2\), but it goes from 1 or more"):
+    with pytest.raises(InputError, match=r"frame_objects must be in \[1, inf\), got \(0, 2\)"):
         dataclasses.replace(_FRAME, frame_objects=(0, 2))

@@ -11,7 +11,7 @@ import pytest
 import torch
 import torch.nn.functional as F
 from tests.pose.stopping import StoppedError, stop_after
-from tests.pose.synthetic_objects import bottle, bracket, tiny_weights
+from tests.pose.synthetic_objects import bottle, bracket, tiny_weights, write_part
 
 from depthpose.core.config import read_config
 from depthpose.core.errors import InputError
@@ -27,7 +27,7 @@ from depthpose.pose.datasets import write_bop_models, write_bop_scene
 from depthpose.pose.losses import unit_directions
 from depthpose.pose.network import ResUNet, ResUNetConfig, fold_norms
 from depthpose.pose.sparse import Voxels
-from depthpose.pose.synthetic import Objects, make_frames, write_part
+from depthpose.pose.synthetic import Objects, make_frames
 from depthpose.pose.train import (
     STAGES,
     FramesConfig,
@@ -470,13 +470,23 @@ def test_a_config_is_read_and_opens_with_its_own_command(path: Path) -> None:
 @pytest.mark.parametrize(
     ("make", "said"),
     [
-        (lambda: _training(first_alone=-1), "first_alone is -1; take 0 or more"),
+        (lambda: _training(first_alone=-1), "first_alone must be in [0, inf), got -1"),
         (FramesConfig, "frames has no folder"),
-        (lambda: FramesConfig(folder="x", share=0.0), "share is 0.0, but it is above 0"),
-        (lambda: HeldOutConfig(number=0), "nothing would be measured; take 25"),
-        (lambda: HeldOutConfig(occlusions=(0.0, 1.0)), "held_out.occlusions is (1.0, 1.0)"),
-        (lambda: ModelsConfig(symmetry_tolerance=-1.0), "symmetry_tolerance is -1.0"),
-        (lambda: PoseTraining(confidence_weight=-1.0), "confidence_weight is -1.0; take 0"),
+        (lambda: FramesConfig(folder="x", share=0.0), "share must be in (0, 1], got 0.0"),
+        (lambda: HeldOutConfig(number=0), "number must be in [1, inf), got 0"),
+        (lambda: HeldOutConfig(occlusions=()), "nothing would be measured; take (0, 0.3)"),
+        (
+            lambda: HeldOutConfig(occlusions=(0.0, 1.0)),
+            "occlusions must be in [0, 0.95], got (0.0, 1.0)",
+        ),
+        (
+            lambda: ModelsConfig(symmetry_tolerance=-1.0),
+            "symmetry_tolerance must be in (0, 1), got -1.0",
+        ),
+        (
+            lambda: PoseTraining(confidence_weight=-1.0),
+            "confidence_weight must be in [0, inf), got -1.0",
+        ),
     ],
 )
 def test_settings_that_cannot_be_are_refused(make, said: str) -> None:  # noqa: ANN001

@@ -4,7 +4,7 @@ from dataclasses import dataclass, field
 from typing import ClassVar, Literal, get_args
 
 from depthpose.core.config_values import check_settings
-from depthpose.core.errors import InputError, refuse_seed, refuse_unknown
+from depthpose.core.errors import InputError, refuse_seed
 
 VotingMethod = Literal["least squares", "ransac"]
 InlierTest = Literal["angle", "distance"]
@@ -49,23 +49,17 @@ class CloudConfig:
 
     def __post_init__(self) -> None:
         """Refuse sizes that leave nothing or mean another unit."""
-        if not 0 < self.voxel_m < 1:
-            raise InputError(
-                f"voxel_m is {self.voxel_m}, but a voxel is a positive part of a metre; 0.008 "
-                "means 8 mm"
-            )
-        if self.min_points < 3:
-            raise InputError(f"min_points is {self.min_points}, but 3 points are the least of a "
-                             "pose; take 16")  # fmt: skip
+        check_settings(
+            self,
+            voxel_m="(0, 1)",
+            min_points="[3, inf)",
+            max_points="[3, inf)",
+            max_offset_diameters="(0, inf)",
+        )
         if self.max_points is not None and self.max_points < self.min_points:
             raise InputError(
                 f"max_points is {self.max_points}, below min_points {self.min_points}: every cloud "
                 "would be refused; raise it"
-            )
-        if not self.max_offset_diameters > 0:
-            raise InputError(
-                f"max_offset_diameters is {self.max_offset_diameters}, but no point is nearer than "
-                "0; take 1"
             )
 
     @property
@@ -262,7 +256,12 @@ class EstimateConfig:
 
     def __post_init__(self) -> None:
         """Refuse counts of nothing, and a certainty that is none."""
-        check_settings(self, min_certainty="[0, 1]")
+        check_settings(
+            self,
+            min_certainty="[0, 1]",
+            max_cloud_points="[100, inf)",
+            batch_voxels="[1, inf)",
+        )
         if self.rough_rigidity_diameters < self.voting.rigidity_diameters:
             raise InputError(
                 f"rough_rigidity_diameters is {self.rough_rigidity_diameters}, but the strict one, "
@@ -272,11 +271,6 @@ class EstimateConfig:
             raise InputError(
                 "registration refines by ICP; omit --no-icp (with_icp=False) or "
                 "--register-refused (register_refused=True)"
-            )
-        if self.max_cloud_points < 100 or self.batch_voxels < 1:
-            raise InputError(
-                f"max_cloud_points is {self.max_cloud_points} and batch_voxels "
-                f"{self.batch_voxels}; take 100 and 1 at least"
             )
 
 
@@ -304,23 +298,15 @@ class EvaluationConfig:
 
     def __post_init__(self) -> None:
         """Refuse unknown names, and a tolerance out of range."""
-        refuse_unknown("diameters", self.diameters, get_args(DiameterTable))
-        refuse_unknown("adds", self.adds, get_args(SymmetryRule))
-        if not 0 < self.vsd_delta_m < 1:
-            raise InputError(
-                f"vsd_delta_m is {self.vsd_delta_m}, but it is a positive part of a metre; BOP "
-                "takes 0.015"
-            )
+        check_settings(self, vsd_delta_m="(0, 1)")
 
 
 SensorKind = Literal["structured light", "active stereo", "time of flight", "laser", "none"]
 """What measures depth, and so what its errors look like."""
 _LINEMOD_PX = (640, 480)
 _LINEMOD_CENTRE_PX = (325.2611, 242.04899)
-MOST_NOISE = 20.0
-"""Times the noise of its kind that a sensor may have."""
-OCCLUSIONS = (0.0, 0.95)
-"""Least and largest share of a silhouette that something may occlude."""
+OCCLUSIONS = "[0, 0.95]"
+"""Share of a silhouette that something may occlude."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -351,14 +337,16 @@ class SensorConfig:
 
     def __post_init__(self) -> None:
         """Refuse unknown kinds and empty ranges."""
-        known = get_args(SensorKind)
-        if not self.kinds or any(kind not in known for kind in self.kinds):
-            raise InputError(f"kinds is {self.kinds}; name one or more of {', '.join(known)}")
-        refuse_range("noise", self.noise, (0.0, MOST_NOISE), "(0.5, 1.5)")
-        if self.noise_correlation_px is not None:
-            refuse_range("noise_correlation_px", self.noise_correlation_px, (0.0, 30.0), "(3, 6)")
-        refuse_range("missing", self.missing, (0.0, 0.9), "(0.0, 0.1)")
-        refuse_range("offset_m", self.offset_m, (-0.1, 0.1), "(-0.005, 0.005), in metres")
+        if not self.kinds:
+            raise InputError(f"kinds is (); name one or more of {', '.join(get_args(SensorKind))}")
+        check_settings(
+            self,
+            noise="[0, 20]",
+            noise_correlation_px="[0, 30]",
+            missing="[0, 0.9]",
+            offset_m="[-0.1, 0.1]",
+        )
+        refuse_reversed(self, "noise", "noise_correlation_px", "missing", "offset_m")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -421,40 +409,25 @@ class ObjectsConfig:
 
     def __post_init__(self) -> None:
         """Refuse counts of nothing, shares beyond one and empty ranges."""
-        if self.number < 1 or (self.views is not None and self.views < 1):
-            raise InputError(f"number is {self.number} and views {self.views}; both are 1 or more")
+        check_settings(
+            self,
+            number="[1, inf)",
+            views="[1, inf)",
+            image_px="(0, inf)",
+            focal_px="(0, inf)",
+            distance_m="[0.05, 20]",
+            resolution="[0.05, 4]",
+            occluded_share="[0, 1]",
+            occlusion=OCCLUSIONS,
+            mask_error_px="[0, 20]",
+            mask_shift_px="[0, 20]",
+            frame_objects="[1, inf)",
+            frame_clutter="[0, inf)",
+        )
         refuse_seed(self.seed)
-        if min(*self.image_px, *self.focal_px) <= 0:
-            raise InputError(
-                f"image_px is {self.image_px} and focal_px {self.focal_px}; both are positive "
-                "pixels, as (640, 480) and (572.4114, 573.57043)"
-            )
-        self._place_centre()
-        if not 0 <= self.occluded_share <= 1:
-            raise InputError(f"occluded_share is {self.occluded_share}, but a share is 0 to 1")
-        for name, usual in (("mask_error_px", 3), ("mask_shift_px", 2)):
-            if not 0 <= getattr(self, name) <= 20:
-                given = getattr(self, name)
-                raise InputError(f"{name} is {given}; take 0 to 20, usually {usual}")
-        for name in ("frame_objects", "frame_clutter"):
-            low, high = getattr(self, name)
-            least = 1 if name == "frame_objects" else 0
-            if not least <= low <= high:
-                raise InputError(
-                    f"{name} is ({low}, {high}), but it goes from {least} or more upward; usual is "
-                    f"({2 * least}, {4 + 2 * least})"
-                )
-        refuse_range("distance_m", self.distance_m, (0.05, 20.0), "(0.6, 1.1), in metres")
-        refuse_range("resolution", self.resolution, (0.05, 4.0), "(0.4, 0.8)")
-        refuse_range("occlusion", self.occlusion, OCCLUSIONS, "(0.0, 0.4)")
-
-    @property
-    def principal_point_px(self) -> tuple[float, float]:
-        """``centre_px``, or what it is where it was not given."""
-        assert self.centre_px is not None
-        return self.centre_px
-
-    def _place_centre(self) -> None:
+        refuse_reversed(
+            self, "distance_m", "resolution", "occlusion", "frame_objects", "frame_clutter"
+        )
         width, height = self.image_px
         middle = ((width - 1) / 2, (height - 1) / 2)
         if self.centre_px is None:
@@ -467,18 +440,20 @@ class ObjectsConfig:
                 f"image_px is {self.image_px}; leave it out for the middle, {middle}"
             )
 
+    @property
+    def principal_point_px(self) -> tuple[float, float]:
+        """``centre_px``, or what it is where it was not given."""
+        assert self.centre_px is not None
+        return self.centre_px
 
-def refuse_range(
-    name: str, given: tuple[float, float], limits: tuple[float, float], usual: str
-) -> None:
-    """Refuse a range that is empty or reaches beyond its limits.
+
+def refuse_reversed(config: object, *names: str) -> None:
+    """Refuse ranges whose upper end comes first.
 
     Raises:
-        InputError: that is so; ``usual`` is what one takes otherwise.
+        InputError: that is so.
     """
-    low, high = given
-    if not limits[0] <= low <= high <= limits[1]:
-        raise InputError(
-            f"{name} is {given}, but it is a range within {limits[0]} to {limits[1]}, the lower "
-            f"end first; usual is {usual}"
-        )
+    for name in names:
+        ends = getattr(config, name)
+        if ends is not None and ends[0] > ends[1]:
+            raise InputError(f"{name} must be a range, the lower end first, got {ends}; turn it")

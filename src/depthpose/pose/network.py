@@ -307,22 +307,14 @@ def write_network(path: Path, network: ResUNet, facts: Mapping[str, str]) -> Non
 
 
 def read_network(path: Path) -> ResUNet:
-    """Read what :func:`write_network` wrote, in eval mode.
+    """Read what :func:`write_network` wrote, in eval mode; 16-bit weights come back as 32-bit.
 
     Raises:
         InputError: no such weights, or weights that do not fit their own config.
     """
-    return network_of(read_checkpoint(path, KIND), str(path))
-
-
-def network_of(checkpoint: Checkpoint, source: str) -> ResUNet:
-    """Build the network of a checkpoint, in eval mode; 16-bit weights come back as 32-bit.
-
-    Raises:
-        InputError: weights that do not fit their own config.
-    """
-    config = config_from_dict(checkpoint.config, ResUNetConfig, source=source)
-    return build_network(lambda: ResUNet(config), checkpoint, source).eval()
+    checkpoint = read_checkpoint(path, KIND)
+    config = config_from_dict(checkpoint.config, ResUNetConfig, source=str(path))
+    return build_network(lambda: ResUNet(config), checkpoint, str(path)).eval()
 
 
 _PARTS = {"kernel": "weight", "bias": "bias"}

@@ -1,11 +1,13 @@
 """Predictions as files: records of what is done, and BOP results."""
 
+import csv
 import math
 import warnings
 from collections import Counter, defaultdict
 from collections.abc import Callable, Generator, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from functools import partial
+from io import StringIO
 from pathlib import Path
 from typing import Any, Generic, NamedTuple, TypeVar, cast, get_args
 
@@ -15,18 +17,18 @@ from torch import Tensor
 from depthpose.core.config import config_from_dict
 from depthpose.core.errors import InputError, Notice, nearest_name
 from depthpose.core.files import write_json
+from depthpose.core.files.disk import refused_as, write_bytes
+from depthpose.core.files.shards import read_bytes
+from depthpose.core.files.text import refuse_heavy
 from depthpose.core.rigid import Rigid
 from depthpose.core.run import claim_folder
 from depthpose.pose.datasets import (
     BopDataset,
-    BopResult,
     Detection,
     Instance,
     read_mask,
-    read_results,
-    write_results,
 )
-from depthpose.pose.datasets.layouts import integer, number, read_rows
+from depthpose.pose.datasets.layouts import MOST, integer, make_pose, number, read_rows
 from depthpose.pose.types import (
     POSED,
     Alternative,
@@ -186,7 +188,13 @@ def parse_prediction(row: dict[str, Any], source: str) -> Prediction:
     name, what = row.get("name"), row.get("object")
     if not isinstance(name, str) or not isinstance(what, str):
         raise InputError(f"{source}: name and object are {name!r} and {what!r}; write two words")
-    status, reason = _status(row.get("status"), source), row.get("reason", "")
+    status, reason = row.get("status"), row.get("reason", "")
+    if status not in get_args(Status):
+        known = get_args(Status)
+        raise InputError(f"{source}: status {status!r}: {nearest_name(str(status), known)}")
+    tracking = row.get("tracking")
+    if tracking is not None and tracking not in get_args(Tracking):
+        raise InputError(f"{source}: tracking is {tracking!r}; write one of {get_args(Tracking)}")
     pose = _pose(row.get("camera_from_model"), source)
     if (pose is not None) != (status in POSED) or (status != "ok" and not reason):
         raise InputError(
@@ -196,7 +204,7 @@ def parse_prediction(row: dict[str, Any], source: str) -> Prediction:
     estimate = PoseEstimate(
         name=name,
         object=what,
-        status=status,
+        status=cast("Status", status),
         reason=str(reason),
         camera_from_model=pose,
         keypoints_m=_table(row, "keypoints_m", 3, source),
@@ -210,24 +218,11 @@ def parse_prediction(row: dict[str, Any], source: str) -> Prediction:
         alternatives=_alternatives(row.get("alternatives", []), source),
         signals=_named(row, "signals", source),
         seconds=_named(row, "seconds", source),
-        tracking=_tracking(row.get("tracking"), source),
+        tracking=cast("Tracking | None", tracking),
     )
     has_place = any(row.get(key) is not None for key in _PLACE)
     place = Place(*(integer(row, key, source) for key in _PLACE)) if has_place else None
     return Prediction(estimate=estimate, place=place)
-
-
-def _status(entry: object, source: str) -> Status:
-    known = get_args(Status)
-    if entry not in known:
-        raise InputError(f"{source}: status {entry!r}: {nearest_name(str(entry), known)}")
-    return cast("Status", entry)
-
-
-def _tracking(entry: object, source: str) -> Tracking | None:
-    if entry is not None and entry not in get_args(Tracking):
-        raise InputError(f"{source}: tracking is {entry!r}; write one of {get_args(Tracking)}")
-    return cast("Tracking | None", entry)
 
 
 def _pose(entry: object, source: str) -> Rigid | None:
@@ -443,35 +438,14 @@ def detection_jobs(
     return jobs
 
 
+_HEADER = ["scene_id", "im_id", "obj_id", "score", "R", "t", "time"]
+_SAME_TIME_S = 0.001
+"""BOP's toolkit refuses rows of an image whose times differ by more."""
+
+
 def results_name(dataset: BopDataset) -> str:
     """Name the BOP csv of a data set: ``depthpose_DATASET-SPLIT.csv``."""
     return f"depthpose_{dataset.folder.resolve().name}-{dataset.split}.csv"
-
-
-def read_bop_results(path: Path) -> list[Prediction]:
-    """Read anybody's BOP csv as predictions.
-
-    A row has a share of its image's time; its score is kept as the share of votes that agree.
-
-    Raises:
-        InputError: the file is missing or damaged.
-    """
-    results = read_results(path)
-    rows_of = Counter((result.scene_id, result.image_id) for result in results)
-    found: list[Prediction] = []
-    for row, result in enumerate(results, 1):
-        place = Place(result.scene_id, result.image_id, result.object_id)
-        whole_s = result.seconds
-        estimate = PoseEstimate(
-            name=f"row {row}",
-            object=f"obj_{result.object_id:06d}",
-            status="ok",
-            camera_from_model=result.camera_from_model,
-            inlier_share=result.score,
-            seconds={} if whole_s is None else {"image": whole_s / rows_of[place[:2]]},
-        )
-        found.append(Prediction(estimate=estimate, place=place))
-    return found
 
 
 def alternatives_name(dataset: BopDataset) -> str:
@@ -479,13 +453,73 @@ def alternatives_name(dataset: BopDataset) -> str:
     return results_name(dataset).replace("depthpose_", "depthpose-alternatives_", 1)
 
 
+def read_bop_results(path: str | Path) -> list[Prediction]:
+    """Read anybody's BOP csv (mm, seconds) as predictions.
+
+    A row has a share of its image's time; its score is kept as the share of votes that agree.
+
+    Raises:
+        InputError: it is missing or damaged, or rows of an image have different times.
+    """
+    data = read_bytes(path)
+    refuse_heavy(path, data, {b"\n": 300, b",": 60})
+    with refused_as(path, "results file", "write it anew"):
+        rows = list(csv.reader(data.decode("utf-8-sig").splitlines()))
+    if not rows or [name.strip() for name in rows[0]] != _HEADER:
+        raise InputError(f"{path}: the first line is not {','.join(_HEADER)}; put it there")
+    found: list[tuple[Place, PoseEstimate]] = []
+    image_s: dict[tuple[int, int], float] = {}
+    for line, row in enumerate(rows[1:], 2):
+        if not row:
+            continue
+        place, score, pose, time_s = _parse_result(row, f"{path}: line {line}")
+        said = image_s.setdefault(place[:2], time_s)
+        if (said < 0) != (time_s < 0) or (time_s >= 0 and abs(said - time_s) > _SAME_TIME_S):
+            raise InputError(
+                f"{path}: scene {place.scene_id} image {place.image_id} took {said} s in one row "
+                f"and {time_s} s in another; time is that of the whole image, the same in all"
+            )
+        estimate = PoseEstimate(
+            name=f"row {len(found) + 1}",
+            object=f"obj_{place.object_id:06d}",
+            status="ok",
+            camera_from_model=pose,
+            inlier_share=score,
+        )
+        found.append((place, estimate))
+    rows_of = Counter(place[:2] for place, _ in found)
+    shares = {image: {"image": s / rows_of[image]} for image, s in image_s.items() if s >= 0}
+    return [
+        Prediction(estimate=replace(estimate, seconds=shares.get(place[:2], {})), place=place)
+        for place, estimate in found
+    ]
+
+
+def _parse_result(row: list[str], source: str) -> tuple[Place, float, Rigid, float]:
+    """Read place, score, pose and time [s] of one row."""
+    if len(row) != len(_HEADER):
+        raise InputError(f"{source}: {len(row)} values, where {len(_HEADER)} belong")
+    try:
+        place = Place(*(int(value) for value in row[:3]))
+        score, time_s = float(row[3]), float(row[6])
+        R, t_mm = ([float(value) for value in text.split()] for text in row[4:6])
+    except ValueError as error:
+        raise InputError(f"{source}: {error}; write numbers, R and t parted by blanks") from error
+    if not all(0 <= value <= MOST for value in place):
+        raise InputError(f"{source}: scene, image and object are numbers from 0 to {MOST}")
+    if len(R) != 9 or len(t_mm) != 3 or not all(map(math.isfinite, [score, time_s, *R, *t_mm])):
+        raise InputError(f"{source}: {len(R)} numbers of R and {len(t_mm)} of t, where 9 and 3 "
+                         "finite ones belong")  # fmt: skip
+    return place, score, make_pose(R, t_mm, source), time_s
+
+
 def write_bop_results(
-    path: Path, predictions: Iterable[Prediction], *, with_alternatives: bool = False
+    path: str | Path, predictions: Iterable[Prediction], *, with_alternatives: bool = False
 ) -> None:
     """Write BOP's csv; refused ones have no row. An image's time is the sum over its estimates.
 
     Args:
-        path: the csv.
+        path: the csv. Numbers keep all their digits.
         predictions: of a data set.
         with_alternatives: give each alternative a row too, its probability the score. BOP's
             measures take the surest rows of an image, so they are no row of the csv that is
@@ -495,48 +529,28 @@ def write_bop_results(
         InputError: a pose belongs to no scene, or the disk refuses.
     """
     known = list(predictions)
-    seconds: dict[tuple[int, int], float] = {}
+    image_s: dict[tuple[int, int], float] = defaultdict(float)
     for prediction in known:
         if prediction.place is not None:
-            image = prediction.place[:2]
-            spent = sum(prediction.estimate.seconds.values())
-            seconds[image] = seconds.get(image, 0.0) + spent
-    answered = [p for p in known if p.estimate.is_posed]
-    if with_alternatives:
-        answered = [other for p in answered for other in [p, *_others(p)]]
-    write_results(path, [_result(p, seconds) for p in answered])
-
-
-def _others(prediction: Prediction) -> list[Prediction]:
-    """Give each alternative as a prediction of its own."""
-    return [
-        replace(
-            prediction,
-            estimate=replace(
-                prediction.estimate,
-                camera_from_model=other.camera_from_model,
-                certainty=other.probability,
-                alternatives=(),
-            ),
-        )
-        for other in prediction.estimate.alternatives
-    ]
-
-
-def _result(prediction: Prediction, seconds: dict[tuple[int, int], float]) -> BopResult:
-    pose, place = prediction.estimate.camera_from_model, prediction.place
-    if place is None:
-        raise InputError(
-            f"{prediction.estimate.name}: belongs to no scene of a BOP data set, and its csv is of "
-            "such; leave it out"
-        )
-    assert pose is not None
-    spent_s = seconds[place[:2]]
-    return BopResult(
-        scene_id=place.scene_id,
-        image_id=place.image_id,
-        object_id=place.object_id,
-        score=score_of(prediction.estimate),
-        camera_from_model=pose,
-        seconds=spent_s if spent_s > 0 else None,
-    )
+            image_s[prediction.place[:2]] += sum(prediction.estimate.seconds.values())
+    text = StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(_HEADER)
+    for prediction in known:
+        estimate, place = prediction.estimate, prediction.place
+        if estimate.camera_from_model is None:
+            continue
+        if place is None:
+            raise InputError(
+                f"{estimate.name}: belongs to no scene of a BOP data set, and its csv is of such; "
+                "leave it out"
+            )
+        answers = [(estimate.camera_from_model, score_of(estimate))]
+        if with_alternatives:
+            others = estimate.alternatives
+            answers += [(other.camera_from_model, other.probability) for other in others]
+        for pose, score in answers:
+            R = " ".join(repr(value) for value in pose.R.double().flatten().tolist())
+            t_mm = " ".join(repr(value) for value in (1000 * pose.t_m.double()).tolist())
+            writer.writerow([*place, score, R, t_mm, image_s[place[:2]] or -1])
+    write_bytes(path, text.getvalue().encode())

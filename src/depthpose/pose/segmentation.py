@@ -243,6 +243,13 @@ class SegmentationWeights:
         assert len(self.objects) == len(self.numbers) == self.network.classes - 1
 
 
+@dataclass(frozen=True)
+class _FileConfig:
+    network: SegmentationConfig = field(default_factory=SegmentationConfig)
+    objects: tuple[str, ...] = ()
+    numbers: tuple[int, ...] = ()
+
+
 def write_segmentation(
     path: Path, weights: SegmentationWeights, *, with_half: bool = False
 ) -> None:
@@ -276,13 +283,6 @@ def read_segmentation(path: Path) -> SegmentationWeights:
     network = build_network(lambda: FCN(len(config.objects), config.network), checkpoint, str(path))
     return SegmentationWeights(network=network.eval(), objects=config.objects,
                                numbers=config.numbers, facts=checkpoint.facts)  # fmt: skip
-
-
-@dataclass(frozen=True)
-class _FileConfig:
-    network: SegmentationConfig = field(default_factory=SegmentationConfig)
-    objects: tuple[str, ...] = ()
-    numbers: tuple[int, ...] = ()
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

@@ -387,15 +387,15 @@ def compare_rays(
 
 
 @compiled
-def _cell(x, y, z, scale, column, row, reach):
+def _cell(x, y, z, scale, column, row, half):
     """Number the cell of a ray, those far off at the border."""
-    u = min(max(np.floor(x / z * scale - column), -reach), reach) + reach
-    v = min(max(np.floor(y / z * scale - row), -reach), reach) + reach
-    return int(u) * (2 * reach + 1) + int(v)
+    u = min(max(np.floor(x / z * scale - column), -half), half) + half
+    v = min(max(np.floor(y / z * scale - row), -half), half) + half
+    return int(u) * (2 * half + 1) + int(v)
 
 
 @compiled
-def _look(cloud, Rs, ts, points, scale, column, row, reach, limit, front, unseen):
+def _look(cloud, Rs, ts, points, scale, column, row, half, limit, front, unseen):
     """Compare a cloud with each of several poses of a surface.
 
     Args:
@@ -406,16 +406,16 @@ def _look(cloud, Rs, ts, points, scale, column, row, reach, limit, front, unseen
         scale: cells for a unit of a ray's slope.
         column: of the middle cell.
         row: of the middle cell.
-        reach: cells to each side of it.
+        half: cells to each side of it.
         limit: how far before a point the surface occludes it.
         front: (b,), written: share of points that the surface would have occluded.
         unseen: (b,), written: share of the surface's cells in which nothing was seen.
     """
-    cells = (2 * reach + 1) ** 2
+    cells = (2 * half + 1) ** 2
     is_seen = np.zeros(cells, np.bool_)
     theirs = np.empty(len(cloud), np.int64)
     for i in range(len(cloud)):
-        theirs[i] = _cell(cloud[i, 0], cloud[i, 1], cloud[i, 2], scale, column, row, reach)
+        theirs[i] = _cell(cloud[i, 0], cloud[i, 1], cloud[i, 2], scale, column, row, half)
         is_seen[theirs[i]] = True
     nearest = np.empty(cells)
     for b in range(len(ts)):
@@ -428,7 +428,7 @@ def _look(cloud, Rs, ts, points, scale, column, row, reach, limit, front, unseen
                 continue
             x = R[0, 0] * sx + R[0, 1] * sy + R[0, 2] * sz + t[0]
             y = R[1, 0] * sx + R[1, 1] * sy + R[1, 2] * sz + t[1]
-            mine = _cell(x, y, max(z, 1e-6), scale, column, row, reach)
+            mine = _cell(x, y, max(z, 1e-6), scale, column, row, half)
             nearest[mine] = min(nearest[mine], z)
         total, missed = 0, 0
         for k in range(cells):

@@ -12,13 +12,16 @@ _FARTHEST = 1e9
 """A step beyond this is none."""
 
 
-def fitted(pose: Rigid, terms: tuple[Tensor, Tensor, Tensor], steps: int) -> tuple[Rigid, Tensor]:
+def fitted(
+    pose: Rigid, model: Tensor, found: Tensor, information: Tensor, steps: int
+) -> tuple[Rigid, Tensor]:
     """Move poses to the least ``sum e^T W e`` with ``e = R m + t - p``.
 
     Args:
         pose: one or a batch, to begin with, float64.
-        terms: keypoints of the model and those that were found, (..., k, 3), and inverse
-            covariances W, (..., k, 3, 3), 0 where a keypoint does not count.
+        model: keypoints of the model, (..., k, 3).
+        found: those that were found, (..., k, 3).
+        information: inverse covariances W, (..., k, 3, 3), 0 where a keypoint does not count.
         steps: so many.
 
     Returns:
@@ -26,12 +29,10 @@ def fitted(pose: Rigid, terms: tuple[Tensor, Tensor, Tensor], steps: int) -> tup
     """
     R, t_m = pose.R.contiguous().clone(), pose.t_m.contiguous().clone()
     H = R.new_empty(*R.shape[:-2], 6, 6)
-    model, found, information = (a.contiguous().numpy() for a in terms)
-    keypoints = (model.reshape(-1, *model.shape[-2:]), found.reshape(-1, *found.shape[-2:]))
-    _fit(
-        R.view(-1, 3, 3).numpy(), t_m.view(-1, 3).numpy(), *keypoints,
-        information.reshape(-1, *information.shape[-3:]), steps, H.view(-1, 6, 6).numpy(),
-    )  # fmt: skip
+    keypoints = (a.contiguous().numpy().reshape(-1, *a.shape[-2:]) for a in (model, found))
+    W = information.contiguous().numpy().reshape(-1, *information.shape[-3:])
+    poses = (R.view(-1, 3, 3).numpy(), t_m.view(-1, 3).numpy())
+    _fit(*poses, *keypoints, W, steps, H.view(-1, 6, 6).numpy())
     return Rigid(R, t_m), H
 
 
@@ -80,13 +81,14 @@ _SMALLEST = 1e-12
 
 
 def met(
-    lines: tuple[Tensor, Tensor, Tensor], refinements: int, nearest: float
+    points: Tensor, directions: Tensor, weights: Tensor, refinements: int, nearest: float
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Find the point where the lines of each keypoint meet best.
 
     Args:
-        lines: points (1, 3, n) about their mean, unit directions (k, 3, n), weights (k, n), all
-            float64.
+        points: about their mean, (1, 3, n), float64 as the others.
+        directions: of unit length, (k, 3, n).
+        weights: (k, n).
         refinements: steps after the nearest point.
         nearest: points nearer to a keypoint than this share of the mean distance weigh no more.
 
@@ -96,10 +98,10 @@ def met(
     Raises:
         ValueError: a value is not finite.
     """
-    count = len(lines[1])
+    count = len(directions)
     out = [torch.empty(count, *shape, dtype=torch.float64) for shape in ((3,), (3, 3), ())]
-    given = (finite_array(a) for a in lines)
-    _meet(*given, refinements, nearest, *(a.numpy() for a in out))
+    arrays = (finite_array(a) for a in (points, directions, weights))
+    _meet(*arrays, refinements, nearest, *(a.numpy() for a in out))
     return out[0], out[1], out[2]
 
 
@@ -160,15 +162,15 @@ def _gradients(local, n, w, p, nearest, A, gradient):
     A[:] = 0.0
     for i in range(len(w)):
         x, y, z = p[0] - local[0, i], p[1] - local[1, i], p[2] - local[2, i]
-        reach = max(np.sqrt(x * x + y * y + z * z), _SMALLEST)
-        x, y, z = x / reach, y / reach, z / reach
-        reach = max(reach, least)
+        distance = max(np.sqrt(x * x + y * y + z * z), _SMALLEST)
+        x, y, z = x / distance, y / distance, z / distance
+        distance = max(distance, least)
         cosine = n[0, i] * x + n[1, i] * y + n[2, i] * z
-        pull = w[i] / reach / total
+        pull = w[i] / distance / total
         gradient[0, i] = (n[0, i] - x * cosine) * pull
         gradient[1, i] = (n[1, i] - y * cosine) * pull
         gradient[2, i] = (n[2, i] - z * cosine) * pull
-        _add_outer(A, pull / reach * max(cosine, 0.5), x, y, z)
+        _add_outer(A, pull / distance * max(cosine, 0.5), x, y, z)
     _mirror(A)
 
 

@@ -228,26 +228,35 @@ def bop_instances(scene: Path) -> Iterator[Instance]:
     truths = read_mapping(scene / "scene_gt.json")
     info_path = scene / "scene_gt_info.json"
     infos = read_mapping(info_path) if info_path.is_file() else {}
-    for key in sorted(truths, key=_image_number):
+    wrong = [key for key in truths if entry_number(key) is None]
+    if wrong:
+        raise InputError(
+            f"scene_gt.json: {wrong[0][:80]!r} is no number of an image; name images 0, 1, ..."
+        )
+    for key in sorted(truths, key=int):
         source = f"{scene / 'scene_gt.json'}: image {key}"
         if key not in cameras:
             raise InputError(f"{source} has no entry in scene_camera.json; add its camera")
         entries, more = truths[key], infos.get(key, [])
         if not isinstance(entries, list) or not isinstance(more, list):
             raise InputError(f"{source}: is no list of annotations")
+        at_camera = f"{scene / 'scene_camera.json'}: image {int(key)}"
         for index, entry in enumerate(entries):
+            K, unit_m = camera_from_bop(cameras[key], at_camera)
             extra = more[index] if index < len(more) and isinstance(more[index], dict) else {}
-            at = f"{source}, annotation {index}"
-            yield _bop_instance(scene, (int(key), index), (entry, cameras[key], extra), at)
+            yield _bop_instance(
+                scene, int(key), index, entry, extra, K, unit_m, f"{source}, annotation {index}"
+            )
 
 
 def _bop_instance(
-    scene: Path, place: tuple[int, int], parts: tuple[Any, Any, dict[str, Any]], source: str
-) -> Instance:
-    image, index = place
-    entry, camera, extra = parts
-    K, unit_m = camera_from_bop(camera, f"{scene / 'scene_camera.json'}: image {image}")
+    scene: Path, image: int, index: int, entry: object, extra: dict[str, Any],
+    K: Float64[Tensor, "3 3"], unit_m: float, source: str,
+) -> Instance:  # fmt: skip
     mask = scene / "mask_visib" / f"{image:06d}_{index:06d}.png"
+    tiff = scene / "depth" / f"{image:06d}.tif"  # of ITODD
+    pictures = (scene / folder / f"{image:06d}{suffix}"
+                for folder in _IMAGE_FOLDERS for suffix in LISTED_SUFFIXES)  # fmt: skip
     visible = number(extra, "visib_fract", -1.0, source)
     return Instance(
         scene_id=int(scene.name),
@@ -255,38 +264,18 @@ def _bop_instance(
         index=index,
         object_id=integer(entry, "obj_id", source),
         K=K,
-        depth=_depth(scene, image),
+        depth=tiff if tiff.is_file() else tiff.with_suffix(".png"),
         depth_unit_m=unit_m,
         mask=mask if mask.is_file() else None,
-        rgb=_picture(scene, image),
+        rgb=next((path for path in pictures if path.is_file()), None),
         camera_from_model=pose_from_bop(entry, source),
         visible_fraction=visible if visible >= 0 else None,
         is_measured=not str(extra.get("pose_source", "")).startswith("pseudo"),
     )
 
 
-def _depth(scene: Path, image: int) -> Path:
-    tiff = scene / "depth" / f"{image:06d}.tif"  # of ITODD
-    return tiff if tiff.is_file() else tiff.with_suffix(".png")
-
-
-def _picture(scene: Path, image: int) -> Path | None:
-    named = (scene / folder / f"{image:06d}{suffix}"
-             for folder in _IMAGE_FOLDERS for suffix in LISTED_SUFFIXES)  # fmt: skip
-    return next((path for path in named if path.is_file()), None)
-
-
-def _image_number(key: str) -> int:
-    number = entry_number(key)
-    if number is None:
-        raise InputError(
-            f"scene_gt.json: {key[:80]!r} is no number of an image; name images 0, 1, ..."
-        )
-    return number
-
-
 @dataclass(frozen=True, kw_only=True, order=True)
-class Target:
+class BopTarget:
     """So many instances of an object in an image."""
 
     scene_id: int
@@ -295,7 +284,7 @@ class Target:
     count: int
 
 
-def read_targets(path: str | Path) -> list[Target]:
+def read_targets(path: str | Path) -> list[BopTarget]:
     """Read a list of targets.
 
     Raises:
@@ -308,7 +297,7 @@ def read_targets(path: str | Path) -> list[Target]:
         scene, image, wanted, count = (
             integer(row, key, source) for key in ("scene_id", "im_id", "obj_id", "inst_count")
         )
-        targets.append(Target(scene_id=scene, image_id=image, object_id=wanted, count=count))
+        targets.append(BopTarget(scene_id=scene, image_id=image, object_id=wanted, count=count))
     return targets
 
 
@@ -369,21 +358,21 @@ def linemod_instances(folder: Path, split: str) -> Iterator[Instance]:
         for line in read_text(listed, _MAX_BYTES).split():
             if entry_number(line) is None:
                 raise InputError(f"{listed}: {line[:40]!r} is no number of an image")
-            yield _linemod_instance(scene, int(line), (truths, infos))
+            yield _linemod_instance(scene, int(line), truths, infos)
 
 
 def _linemod_instance(
-    scene: Path, image: int, parts: tuple[dict[Any, Any], dict[Any, Any]]
+    scene: Path, image: int, truths: dict[Any, Any], infos: dict[Any, Any]
 ) -> Instance:
     number = int(scene.name)
     source = f"{scene / 'gt.yml'}: image {image}"
-    entries = parts[0].get(image)
+    entries = truths.get(image)
     if not isinstance(entries, list):
         raise InputError(f"{source} has no annotation; is the list of another download?")
     own = [e for e in entries if integer(e, "obj_id", source) == number]
     if len(own) != 1:
         raise InputError(f"{source} annotates object {number} {len(own)} times, where once belongs")
-    K, unit_m = camera_from_bop(parts[1].get(image), f"{scene / 'info.yml'}: image {image}")
+    K, unit_m = camera_from_bop(infos.get(image), f"{scene / 'info.yml'}: image {image}")
     mask, rgb = scene / "mask" / f"{image:04d}.png", scene / "rgb" / f"{image:04d}.png"
     return Instance(
         scene_id=number,
@@ -423,10 +412,6 @@ class Layout:
     predicted_mask: Callable[[Path, Instance], Path] | None = None
 
 
-def _bop_instances(folder: Path, split: str) -> Iterable[Instance]:
-    return (one for scene in bop_scenes(folder, split) for one in bop_instances(scene))
-
-
 LAYOUTS: dict[str, Layout] = {
     "Linemod_preprocessed": Layout(
         splits=linemod_splits,
@@ -434,7 +419,12 @@ LAYOUTS: dict[str, Layout] = {
         symmetries=linemod_symmetries,
         predicted_mask=segnet_mask,
     ),
-    "BOP": Layout(splits=bop_splits, instances=_bop_instances),
+    "BOP": Layout(
+        splits=bop_splits,
+        instances=lambda folder, split: (
+            one for scene in bop_scenes(folder, split) for one in bop_instances(scene)
+        ),
+    ),
 }
 """Name to layout: one more entry, and every command takes it. A folder is of the first that finds a
 split in it."""

@@ -13,13 +13,12 @@ import torch
 
 from depthpose.core.errors import InputError
 from depthpose.pose.config import EvaluationConfig
-from depthpose.pose.datasets import BopDataset, Instance, Target
+from depthpose.pose.datasets import BopDataset, BopTarget, Instance
 from depthpose.pose.evaluate.errors import (
     METRICS,
     ErrorContext,
     Errors,
     convention_advice,
-    make_ruler,
     match,
     measure,
 )
@@ -113,17 +112,10 @@ class InstanceRow:
 
     def columns(self) -> dict[str, Any]:
         """Give the columns of a table, in its order."""
+        names = ("instance", "object", "status", "is_success", "score", "visible_fraction")
         return {
             **_method_of(self.origin),
-            "instance": self.instance,
-            "object": self.object,
-            "status": self.status,
-            "is_success": self.is_success,
-            "score": self.score,
-            "visible_fraction": self.visible_fraction,
-            "truth": self.truth,
-            "diameter_m": self.diameter_m,
-            "metric": self.metric,
+            **_fields_of(self, *names, "truth", "diameter_m", "metric"),
             **{name: self.error(name) for name in METRICS},
             **_times(self.ms),
             "reason": self.reason,
@@ -166,21 +158,15 @@ class ObjectRow:
 
     def columns(self) -> dict[str, Any]:
         """Give the columns of a table, in its order."""
-        found: dict[str, Any] = {} if self.origin is None else asdict(self.origin)
-        found |= {
-            "object": self.object,
-            "instances": self.instances,
-            "annotated": self.annotated,
-            "success": self.success,
-            "refused": self.refused,
-            "wrong": self.wrong,
-            "coverage": self.coverage,
+        names = ("object", "instances", "annotated", "success", "refused", "wrong", "coverage")
+        return {
+            **({} if self.origin is None else asdict(self.origin)),
+            **_fields_of(self, *names),
             **self.scores,
             **_times(self.ms),
+            **({} if self.metric is None else _fields_of(self, "metric", "diameter_m")),
+            **({} if self.conditions is None else asdict(self.conditions)),
         }
-        if self.metric is not None:
-            found |= {"metric": self.metric, "diameter_m": self.diameter_m}
-        return found | ({} if self.conditions is None else asdict(self.conditions))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -207,16 +193,17 @@ class RiskRow:
         """Give the columns of a table, in its order."""
         return {
             **_method_of(self.origin),
-            "coverage": self.coverage,
-            "answers": self.answers,
-            "least_score": self.least_score,
-            "risk": self.risk,
+            **_fields_of(self, "coverage", "answers", "least_score", "risk"),
             **({} if self.conditions is None else asdict(self.conditions)),
         }
 
 
 def _method_of(origin: Origin | None) -> dict[str, Any]:
     return {} if origin is None else {"method": origin.method, "masks": origin.masks}
+
+
+def _fields_of(row: object, *names: str) -> dict[str, Any]:
+    return {name: getattr(row, name) for name in names}
 
 
 def _times(ms: Mapping[str, Number]) -> dict[str, Any]:
@@ -329,7 +316,7 @@ def frames_hash(instances: Sequence[Instance]) -> str:
     return hashlib.sha256("".join(sorted(lines)).encode()).hexdigest()
 
 
-def of_targets(dataset: BopDataset, targets: Sequence[Target]) -> BopDataset:
+def of_targets(dataset: BopDataset, targets: Sequence[BopTarget]) -> BopDataset:
     """Keep the instances that a list of targets asks for, the most visible where it takes fewer.
 
     Raises:
@@ -452,81 +439,70 @@ def evaluate(
     config = EvaluationConfig() if config is None else config
     found = match(dataset.instances, predictions, dataset.objects)
     _refuse_unknown(dataset, predictions, found)
-    rulers, stages = _rulers(dataset, config), _stages_of(predictions)
-    rows = [
-        _instance_row(one, found.get(one.name), rulers[one.object_id], stages)
-        for one in progress(dataset.instances)
-    ]
-    conditions = _conditions(dataset, config)
-    return Evaluation(
-        rows=[replace(row, conditions=conditions) for row in _sum_up(dataset, rows, rulers)],
-        per_instance=rows,
-        risk=[replace(row, conditions=conditions) for row in risk_rows(rows)],
-        advice=convention_advice(dataset, predictions, rulers, SUCCESS_SHARE),
-    )
-
-
-def _rulers(dataset: BopDataset, config: EvaluationConfig) -> dict[int, ErrorContext]:
-    return {
-        number: make_ruler(
-            model,
-            diameter_of(model, config),
+    contexts = {
+        number: ErrorContext(
+            model=model,
+            diameter_m=diameter_of(model, config),
             is_adds=is_adds(model, config),
             vsd_delta_m=config.vsd_delta_m if config.with_vsd else None,
         )
         for number, model in dataset.objects.items()
     }
+    # In the order of work; what a method of its own calls otherwise comes last.
+    seen = dict.fromkeys(stage for p in predictions for stage in p.estimate.seconds)
+    stages = [s for s in STAGES if s in seen] + [s for s in seen if s not in STAGES]
+    rows = [
+        _instance_row(one, found.get(one.name), contexts[one.object_id], stages)
+        for one in progress(dataset.instances)
+    ]
+    conditions = Conditions(
+        diameters=config.diameters,
+        frames=f"{dataset.folder.resolve().name} {dataset.split}",
+        frames_sha256=frames_hash(dataset.instances)[:12],
+    )
+    return Evaluation(
+        rows=[replace(row, conditions=conditions) for row in _sum_up(dataset, rows, contexts)],
+        per_instance=rows,
+        risk=[replace(row, conditions=conditions) for row in risk_rows(rows)],
+        advice=convention_advice(dataset, predictions, contexts, SUCCESS_SHARE),
+    )
 
 
 def _instance_row(
-    instance: Instance, estimate: PoseEstimate | None, ruler: ErrorContext, stages: list[str]
+    instance: Instance, estimate: PoseEstimate | None, context: ErrorContext, stages: list[str]
 ) -> InstanceRow:
     pose = None if estimate is None else estimate.camera_from_model
-    errors = measure(pose, instance, ruler)
+    errors = measure(pose, instance, context)
     seconds = {} if estimate is None else estimate.seconds
     ms = {stage: 1000 * seconds[stage] if stage in seconds else None for stage in stages}
     return InstanceRow(
         instance=instance.name,
-        object=ruler.model.name,
+        object=context.model.name,
         status="missing" if estimate is None else estimate.status,
-        is_success=float(errors["error_m"]) < SUCCESS_SHARE * ruler.diameter_m,
+        is_success=float(errors["error_m"]) < SUCCESS_SHARE * context.diameter_m,
         score=None if estimate is None or pose is None else score_of(estimate),
         visible_fraction=instance.visible_fraction,
         truth="annotated" if instance.is_measured else "fitted",
-        diameter_m=ruler.diameter_m,
-        metric="ADD-S" if ruler.is_adds else "ADD",
+        diameter_m=context.diameter_m,
+        metric="ADD-S" if context.is_adds else "ADD",
         errors=errors,
         ms={**ms, "total": 1000 * sum(seconds.values()) if seconds else None},
         reason="" if estimate is None else estimate.reason,
     )
 
 
-def _stages_of(predictions: Sequence[Prediction]) -> list[str]:
-    """Stages in the order of work; what a method of its own calls otherwise comes last."""
-    seen = dict.fromkeys(stage for p in predictions for stage in p.estimate.seconds)
-    return [s for s in STAGES if s in seen] + [s for s in seen if s not in STAGES]
-
-
 def _sum_up(
-    dataset: BopDataset, rows: list[InstanceRow], rulers: dict[int, ErrorContext]
+    dataset: BopDataset, rows: list[InstanceRow], contexts: dict[int, ErrorContext]
 ) -> list[ObjectRow]:
     summed: list[ObjectRow] = []
     numbers = [instance.object_id for instance in dataset.instances]
-    for number, ruler in sorted(rulers.items()):
+    for number, context in sorted(contexts.items()):
         own = [row for row, of in zip(rows, numbers, strict=True) if of == number]
-        row = object_row(ruler.model.name, own)
-        summed.append(replace(row, metric=own[0].metric, diameter_m=ruler.diameter_m))
+        row = object_row(context.model.name, own)
+        summed.append(replace(row, metric=own[0].metric, diameter_m=context.diameter_m))
     if len(summed) > 1:
         summed += [mean_row(summed), object_row("all", rows)]
     return summed
-
-
-def _conditions(dataset: BopDataset, config: EvaluationConfig) -> Conditions:
-    return Conditions(
-        diameters=config.diameters,
-        frames=f"{dataset.folder.resolve().name} {dataset.split}",
-        frames_sha256=frames_hash(dataset.instances)[:12],
-    )
 
 
 def _refuse_unknown(

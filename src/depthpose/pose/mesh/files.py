@@ -4,10 +4,11 @@ What a file declares, or may grow to, is checked before it is read in full.
 """
 
 import json
+import math
 import struct
 from array import array
 from codecs import BOM_UTF8
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from contextlib import suppress
 from io import BytesIO
 from pathlib import Path
@@ -119,16 +120,13 @@ def _read_ply(path: AnyPath) -> tuple[np.ndarray, Ragged]:
     faces = [name for name in lists if name.split()[0] in ("face", "tristrips")]
     indices = [name for name in faces if name.startswith("face ") and "ind" in name]
     named = [name for name in indices if "vert" in name] or indices
-    if faces and (len(named) != 1 or not _are_whole(lists[named[0]].values)):
+    values = lists[named[0]].values if len(named) == 1 else np.array([math.nan])
+    if faces and not ((np.abs(values) < _FARTHEST).all() and (values % 1 == 0).all()):
         raise InputError(
             f"{path}: the lists of its faces are {faces}, where one 'face vertex_indices' of whole "
             "numbers is needed. Export it again."
         )
     return vertices, lists[named[0]] if named else _NO_FACES
-
-
-def _are_whole(values: np.ndarray) -> bool:
-    return bool((np.abs(values) < _FARTHEST).all()) and bool((values % 1 == 0).all())
 
 
 def _rows_of(path: AnyPath, data: bytes) -> Iterator[tuple[int, list[bytes]]]:
@@ -251,7 +249,7 @@ def _refuse_scene(path: AnyPath, data: bytes) -> None:
             raise InputError(f"{path}: {size} bytes of JSON in a GLB; export the part alone")
         scene: Any = json.loads(data[20 : 20 + size])
         accessors = scene.get("accessors", [])
-        values = [_values(accessor) for accessor in accessors]
+        values = [abs(int(one["count"])) * _WIDTHS[one["type"]] for one in accessors]
         placed = sum(
             values[part["attributes"]["POSITION"]]
             for node in scene.get("nodes", [])
@@ -282,10 +280,6 @@ def _refuse_scene(path: AnyPath, data: bytes) -> None:
             f"{path}: declares {max(sum(values), placed)} numbers in {nodes} nodes, more than "
             f"{_MOST_VALUES} and {_MOST_NODES}; export the part alone"
         )
-
-
-def _values(accessor: Mapping[str, Any]) -> int:
-    return abs(int(accessor["count"])) * _WIDTHS[accessor["type"]]
 
 
 MESH_READERS: dict[str, Callable[[AnyPath], tuple[np.ndarray, np.ndarray | Ragged]]] = {
@@ -380,15 +374,11 @@ def _cut(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     fan = np.stack([0 * steps, steps + 1, steps + 2], -1)
     local = (first[:, None, None] + fan) % count
     for k in np.flatnonzero(is_back.any(1)) if count > 4 else ():
-        local[k] = _clip_ears(_seen_along(points[k], normals[k]))
+        # Projected along its normal, which then points at the viewer.
+        across = np.cross(normals[k], np.eye(3)[np.abs(normals[k]).argmin()])
+        basis = np.stack([across, np.cross(normals[k], across)], -1)
+        local[k] = _clip_ears(points[k] @ (basis / np.linalg.norm(basis, axis=0).clip(1e-300)))
     return normals, local
-
-
-def _seen_along(points: np.ndarray, normal: np.ndarray) -> np.ndarray:
-    """Project points (n, 3) along a normal, which then points at the viewer: (n, 2)."""
-    across = np.cross(normal, np.eye(3)[np.abs(normal).argmin()])
-    basis = np.stack([across, np.cross(normal, across)], -1)
-    return points @ (basis / np.linalg.norm(basis, axis=0).clip(1e-300))
 
 
 def _clip_ears(points: np.ndarray) -> list[tuple[int, int, int]]:

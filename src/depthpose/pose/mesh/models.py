@@ -3,12 +3,13 @@
 import math
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Float, Float64, Int64
+from jaxtyping import Float, Int64
 from scipy.spatial import ConvexHull, KDTree, QhullError
 from torch import Tensor
 
@@ -403,7 +404,17 @@ def read_model(
     scale = metres_of(unit)
     vertices, faces = read_geometry(path)
     vertices_m = torch.from_numpy(vertices) * scale
-    _refuse_unit(path, vertices_m, unit)
+    extent_m = float((vertices_m.amax(0) - vertices_m.amin(0)).max())
+    if extent_m > _LARGEST_M and unit == "m":
+        raise InputError(
+            f"{path}: the model is {extent_m:g} m long, and no sensor sees it whole; is it in mm? "
+            "Then say unit mm (or cm)."
+        )
+    if 0 < extent_m < _SMALLEST_M and unit == "mm":
+        raise InputError(
+            f"{path}: the model is {extent_m * 1000:g} mm long, below what a sensor resolves; is "
+            "it in metres? Then say unit m; of BOP, whose models are in mm, multiply it by 1000."
+        )
     return make_model(
         vertices_m,
         torch.from_numpy(faces),
@@ -445,7 +456,10 @@ def make_model(
         keypoints_m=vertices_m[:0],
         symmetries=Symmetries() if symmetries is None else symmetries,
     )
-    return _with_keypoints(model, config.keypoints)
+    candidates = vertices_m
+    if len(faces) and len(candidates) < _COARSE_MESH:
+        candidates = torch.cat([candidates, sample_surface(model, 4096)[0]])
+    return replace(model, keypoints_m=candidates[farthest_points(candidates, config.keypoints)])
 
 
 def refuse_one_name(models: Sequence[ObjectModel]) -> None:
@@ -482,29 +496,14 @@ def exact_diameter(points_m: Float[Tensor, "n 3"]) -> float:
         points = points[ConvexHull(points).vertices]
     everything = torch.from_numpy(points)
     if len(everything) > _HULL:
-        everything = everything[_farthest_each_way(everything)]
+        farthest = []
+        for some in fibonacci_directions(_HULL_DIRECTIONS).T.split(256, dim=1):
+            along = everything @ some
+            farthest += [along.argmax(0), along.argmin(0)]
+        everything = everything[torch.cat(farthest).unique()]
     exactly = "donot_use_mm_for_euclid_dist"
     rows = (torch.cdist(row, everything, compute_mode=exactly) for row in everything.split(1024))
     return max(float(row.max()) for row in rows)
-
-
-def _farthest_each_way(points: Float64[Tensor, "n 3"]) -> Int64[Tensor, " m"]:
-    """Number the points that lie farthest forwards or backwards in evenly spread directions."""
-    directions = fibonacci_directions(_HULL_DIRECTIONS).T
-    found = []
-    for some in directions.split(256, dim=1):
-        along = points @ some
-        found += [along.argmax(0), along.argmin(0)]
-    return torch.cat(found).unique()
-
-
-def _with_keypoints(model: ObjectModel, count: int) -> ObjectModel:
-    candidates = model.vertices_m
-    if len(model.faces) and len(candidates) < _COARSE_MESH:
-        candidates = torch.cat([candidates, sample_surface(model, 4096)[0]])
-    keypoints_m = candidates[farthest_points(candidates, count)]
-    fields = {**vars(model), "keypoints_m": keypoints_m}
-    return ObjectModel(**fields)
 
 
 def _vertex_normals(vertices_m: Tensor, faces: Tensor) -> Tensor:
@@ -515,17 +514,3 @@ def _vertex_normals(vertices_m: Tensor, faces: Tensor) -> Tensor:
     for corner in range(3):
         total.index_add_(0, faces[:, corner], doubled)
     return (total / total.norm(dim=-1, keepdim=True).clamp(min=1e-300)).to(vertices_m)
-
-
-def _refuse_unit(path: AnyPath, vertices_m: Tensor, unit: Unit) -> None:
-    extent_m = float((vertices_m.amax(0) - vertices_m.amin(0)).max())
-    if extent_m > _LARGEST_M and unit == "m":
-        raise InputError(
-            f"{path}: the model is {extent_m:g} m long, and no sensor sees it whole; is it in mm? "
-            "Then say unit mm (or cm)."
-        )
-    if 0 < extent_m < _SMALLEST_M and unit == "mm":
-        raise InputError(
-            f"{path}: the model is {extent_m * 1000:g} mm long, below what a sensor resolves; is "
-            "it in metres? Then say unit m; of BOP, whose models are in mm, multiply it by 1000."
-        )

@@ -51,39 +51,31 @@ def kept(
         compute: gives the value in a form that JSON has.
         decode: makes the value of that form; what it cannot read is computed again.
     """
-    key = _key_of(model)
-    place = f"{name}/{key}"
+    place = f"{name}/{_key_of(model)}.json"
     if place not in _memory:
-        _memory[place] = _on_disk(cache_folder() / name / f"{key}.json", model, compute, decode)
+        path = cache_folder() / place
+        try:
+            _memory[place] = decode(read_json(path))
+        except (InputError, OSError, KeyError, TypeError, ValueError, RuntimeError):
+            value = compute(model)
+            with suppress(InputError, OSError):
+                write_json(path, value)
+            _memory[place] = decode(value)
         while len(_memory) > _MOST_IN_MEMORY:
             _memory.popitem(last=False)
     return _memory[place]
-
-
-def _on_disk(
-    path: Path,
-    model: ObjectModel,
-    compute: Callable[[ObjectModel], Any],
-    decode: Callable[[Any], ValueT],
-) -> ValueT:
-    with suppress(InputError, OSError, KeyError, TypeError, ValueError, RuntimeError):
-        return decode(read_json(path))
-    found = compute(model)
-    with suppress(InputError, OSError):
-        write_json(path, found)
-    return decode(found)
 
 
 @lru_cache(maxsize=64)
 def _key_of(model: ObjectModel) -> str:
     """Name a shape and its symmetries by their bytes, and by the code that computes."""
     symmetries = model.symmetries
-    every = [model.vertices_m, model.faces]
+    tensors = [model.vertices_m, model.faces]
     if symmetries.discrete is not None:
-        every.append(symmetries.discrete.R)
-    every += [axis.direction for axis in symmetries.continuous]
+        tensors.append(symmetries.discrete.R)
+    tensors += [axis.direction for axis in symmetries.continuous]
     digest = sha256(f"{symmetries.is_found} {_code()}".encode())
-    for tensor in every:
+    for tensor in tensors:
         digest.update(tensor.contiguous().numpy().tobytes())
     return digest.hexdigest()
 
@@ -233,9 +225,16 @@ def symmetries_from_proposals(
             continue
         turn = turn_about(proposal.axis.direction, proposal.axis.point_m,
                           torch.tensor(proposal.angle_rad, dtype=torch.float64))  # fmt: skip
-        if not any(float(geodesic_rad(turn.R, other.R)) < _SAME_RAD for other in kept) and not any(
-            _is_same_about(axis.direction, turn.R, [other.R for other in kept]) for axis in axes
-        ):
+        # A turn about an axis makes it one of those kept where both move the axis alike.
+        is_known = any(
+            float(geodesic_rad(turn.R, other.R)) < _SAME_RAD
+            or any(
+                float((turn.R @ axis.direction - other.R @ axis.direction).norm()) < _SAME_RAD
+                for axis in axes
+            )
+            for other in kept
+        )
+        if not is_known:
             kept.append(turn)
     if not kept:
         return Symmetries(continuous=axes)
@@ -296,11 +295,6 @@ def _completed(turns: list[Rigid]) -> list[Rigid]:
     return every
 
 
-def _is_same_about(axis: Tensor, R: Tensor, kept: list[Tensor]) -> bool:
-    """Whether a turn about the axis makes ``R`` one of those kept: they move the axis alike."""
-    return any(float((R @ axis - other @ axis).norm()) < _SAME_RAD for other in kept)
-
-
 def _proposal(
     kind: str, axis: Axis, angle_rad: float | None, deviation: float, tolerance: float
 ) -> SymmetryProposal:
@@ -308,12 +302,6 @@ def _proposal(
     return SymmetryProposal(
         kind=kind, axis=axis, angle_rad=angle_rad, deviation=deviation, certainty=certainty
     )
-
-
-def _fractions() -> Float[Tensor, " a"]:
-    """Every turn of order 2 to 12, each once."""
-    turns = {k / order for order in _TRIED_ORDERS for k in range(1, order)}
-    return torch.tensor(sorted(turns), dtype=torch.float64) * (2 * math.pi)
 
 
 def _turns(direction: Float[Tensor, "3"], angles: Float[Tensor, " a"]) -> Float[Tensor, "a 3 3"]:
@@ -354,7 +342,9 @@ def _measure(
             found = [_proposal("continuous", axis, None, worst, tolerance)]
         if worst <= tolerance:
             return found
-    angles = _fractions()
+    # Every turn of order 2 to 12, each once.
+    shares = sorted({k / order for order in _TRIED_ORDERS for k in range(1, order)})
+    angles = torch.tensor(shares, dtype=torch.float64) * (2 * math.pi)
     angles = angles[surface.is_promising(_turns(direction, angles))]
     if len(angles) == 0:
         return found
@@ -409,14 +399,14 @@ def mirror_deviation(model: ObjectModel) -> float:
     Args:
         model: the object, a mesh or points with normals.
     """
-    return kept(model, "mirror_deviation", _deviation, float)
 
+    def compute(model: ObjectModel) -> float:
+        surface = SurfaceDeviation(model)
+        turns = [refine_turn(surface, R @ _FLIP, _FLIP) for R in _mirror_starts(surface)]
+        R, shift = torch.stack([t.R for t in turns]) @ _FLIP, torch.stack([t.t_m for t in turns])
+        return float(surface.deviation(R, shift).min())
 
-def _deviation(model: ObjectModel) -> float:
-    surface = SurfaceDeviation(model)
-    found = [slid(surface, R @ _FLIP, _FLIP) for R in _mirror_starts(surface)]
-    R, shift = torch.stack([t.R for t in found]) @ _FLIP, torch.stack([t.t_m for t in found])
-    return float(surface.deviation(R, shift).min())
+    return kept(model, "mirror_deviation", compute, float)
 
 
 def is_mirror_alike(model: ObjectModel) -> bool:
@@ -424,7 +414,7 @@ def is_mirror_alike(model: ObjectModel) -> bool:
     return mirror_deviation(model) <= MIRROR_ALIKE
 
 
-def slid(
+def refine_turn(
     surface: SurfaceDeviation, R: Float64[Tensor, "3 3"], flip: Float64[Tensor, "3 3"] | None = None
 ) -> Rigid:
     """Refine the turn of a surface about the middle of its box onto itself (ICP).
@@ -457,13 +447,12 @@ def _mirror_starts(surface: SurfaceDeviation) -> list[Float64[Tensor, "3 3"]]:
     every = torch.cat(turns)
     chosen: list[Float64[Tensor, "3 3"]] = []
     for k in surface.rough_distance(every).argsort().tolist():
-        if len(chosen) < _MIRROR_STARTS and all(_is_apart(every[k], other) for other in chosen):
+        if len(chosen) == _MIRROR_STARTS:
+            break
+        apart_rad = [float(geodesic_rad(every[k] @ _FLIP, other @ _FLIP)) for other in chosen]
+        if all(angle > _APART_RAD for angle in apart_rad):
             chosen.append(every[k])
     return chosen
-
-
-def _is_apart(first: Float64[Tensor, "3 3"], second: Float64[Tensor, "3 3"]) -> bool:
-    return float(geodesic_rad(first @ _FLIP, second @ _FLIP)) > _APART_RAD
 
 
 ALIKE = 0.01
@@ -552,8 +541,12 @@ def _search(model: ObjectModel) -> dict[str, Any]:
     same = symmetry_transforms(_true(model.symmetries, alike), _FINE_STEP).R.double()
     near: list[tuple[Rigid, float]] = []
     for off, turn in sorted(_measured(model, surface), key=lambda pair: pair[0]):
-        others = [torch.eye(3).double(), *(one.R for one, _ in near)]
-        if len(near) < _MOST_NEAR and off <= 2 * _TOLERANCE and _is_new(turn.R, others, same):
+        if len(near) == _MOST_NEAR or off > 2 * _TOLERANCE:
+            break
+        # New is what is far from the others and from all copies of them that look alike.
+        others = torch.cat([R @ same for R in (torch.eye(3).double(), *(one.R for one, _ in near))])
+        apart_rad = float(geodesic_rad(turn.R.expand_as(others), others).min())
+        if apart_rad > _NEAR_SUPPRESSION_RAD:
             near.append((turn, off))
     return {"near": [(turn.matrix().tolist(), off) for turn, off in near], "alike": alike}
 
@@ -566,12 +559,17 @@ def _measured(model: ObjectModel, surface: SurfaceDeviation) -> list[tuple[float
     found = symmetry_transforms(model.symmetries, _STEP).R.double()[1:]
     exact = found if model.symmetries.is_found else found[:0]
     tried = [Rigid(R, torch.zeros(3).double()) for R in exact]
-    tried += [slid(surface, R) for R in _near_starts(surface)]
+    tried += [refine_turn(surface, R) for R in _near_starts(surface)]
     measured = _deviations(tried, surface)
     good = [turn for off, turn in sorted(measured, key=lambda pair: pair[0]) if off <= _TOLERANCE]
     # Two turns one after the other are one: of a can, upside down and then about its axis.
     measured += _deviations([a @ b for a in good[:_NEAR_STARTS] for b in good[:3]], surface)
-    return [(off, _in_model(turn, surface, model)) for off, turn in measured]
+    # About the centre of the surface, in diameters, to the model's frame.
+    centre_m = surface.centre_m
+    return [
+        (off, Rigid(turn.R, centre_m - turn.R @ centre_m + turn.t_m * model.diameter_m))
+        for off, turn in measured
+    ]
 
 
 def _deviations(turns: list[Rigid], surface: SurfaceDeviation) -> list[tuple[float, Rigid]]:
@@ -596,12 +594,6 @@ def _near_starts(surface: SurfaceDeviation) -> list[Float[Tensor, "3 3"]]:
     return starts
 
 
-def _in_model(turn: Rigid, surface: SurfaceDeviation, model: ObjectModel) -> Rigid:
-    """Write a turn about the centre of the surface, in diameters, in the model's frame."""
-    centre_m = surface.centre_m
-    return Rigid(turn.R, centre_m - turn.R @ centre_m + turn.t_m * model.diameter_m)
-
-
 def _alike(given: Symmetries, surface: SurfaceDeviation) -> tuple[list[bool], list[bool]]:
     """Mark the discrete symmetries, and the axes, whose copies lie on the surface."""
     circle = torch.arange(1, 8, dtype=torch.float64) * (math.pi / 4)
@@ -623,11 +615,3 @@ def _true(given: Symmetries, alike: tuple[list[bool], list[bool]]) -> Symmetries
     marked = zip(given.continuous, alike[1], strict=True)
     axes = tuple(axis for axis, is_alike in marked if is_alike)
     return Symmetries(discrete=discrete, continuous=axes, is_found=True)
-
-
-def _is_new(
-    R: Float[Tensor, "3 3"], others: list[Float[Tensor, "3 3"]], same: Float[Tensor, "s 3 3"]
-) -> bool:
-    """Whether a turn is far from the others and from all copies of them that look alike."""
-    every = torch.cat([other @ same for other in others])
-    return float(geodesic_rad(R.expand_as(every), every).min()) > _NEAR_SUPPRESSION_RAD

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import torch
 import torch.nn.functional as F
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from torch import Tensor
 
 from depthpose.core.camera import back_project
@@ -265,21 +265,34 @@ def _make_frame(solids: Sequence[Solid], config: ObjectsConfig, index: int) -> B
     placed = [
         Placed(solid=solid, camera_from_model=camera_from_world @ pose) for solid, pose in world
     ]
-    K = _intrinsics(config)
+    (fx, fy), (cx, cy) = config.focal_px, config.principal_point_px
+    K = torch.tensor([[fx, 0, cx], [0, fy, cy], [0, 0, 1]], dtype=torch.float64)
     width, height = config.image_px
-    corners = [_corners(thing) for thing in placed]
+    corners = [thing.camera_from_model.apply(thing.solid.triangles_m) for thing in placed]
     raster = rasterize(torch.cat(corners), K, width, height)
     owner = torch.cat([torch.full((len(c),), i) for i, c in enumerate(corners)])
     seen = torch.where(raster.primitive >= 0, owner[raster.primitive.clamp(min=0)], -1)
-    rgb = _picture(placed, raster, K, generator)
+    image = backdrop(height, width, generator)
+    light = random_light(placed[-1].camera_from_model.R[:, 2], generator)  # above the table
+    image[:, raster.primitive >= 0] = shade(placed, raster, K, light).mT
+    rgb = _exposed(image, generator)
     focal_px = (config.focal_px[0], config.focal_px[0])
     depth_m = measure(raster.depth_m, focal_px, config.sensor, generator)
-    objects = [
-        _annotated(thing, corners[i], seen == i, K)
-        for i, thing in enumerate(placed)
-        if thing.solid.number is not None
-    ]
-    shown = [thing for thing in objects if bool(thing.silhouette.any())]
+    shown: list[BopObject] = []
+    for i, thing in enumerate(placed):
+        if thing.solid.number is None:
+            continue
+        alone = rasterize(corners[i], K, width, height, with_barycentric=False)
+        silhouette = alone.depth_m.isfinite()
+        if bool(silhouette.any()):
+            shown.append(
+                BopObject(
+                    number=thing.solid.number,
+                    camera_from_model=thing.camera_from_model,
+                    visible=seen == i,
+                    silhouette=silhouette,
+                )
+            )
     return BopFrame(number=index, K=K, depth_m=depth_m, objects=shown, rgb=rgb)
 
 
@@ -336,40 +349,6 @@ def _viewpoint(config: ObjectsConfig, generator: torch.Generator) -> Rigid:
     R = torch.tensor([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]]) @ R
     target = torch.tensor([uniform(generator, -0.05, 0.05), uniform(generator, -0.05, 0.05), 0.03])
     return Rigid(R, -R @ (target + distance_m * torch.tensor(eye)))
-
-
-def _intrinsics(config: ObjectsConfig) -> Float[Tensor, "3 3"]:
-    (fx, fy), (cx, cy) = config.focal_px, config.principal_point_px
-    return torch.tensor([[fx, 0, cx], [0, fy, cy], [0, 0, 1]], dtype=torch.float64)
-
-
-def _corners(thing: Placed) -> Float[Tensor, "n 3 3"]:
-    return thing.camera_from_model.apply(thing.solid.triangles_m)
-
-
-def _annotated(
-    thing: Placed, corners: Float[Tensor, "n 3 3"], visible: Bool[Tensor, "h w"], K: Tensor
-) -> BopObject:
-    assert thing.solid.number is not None
-    height, width = visible.shape
-    alone = rasterize(corners, K, width, height, with_barycentric=False)
-    return BopObject(
-        number=thing.solid.number,
-        camera_from_model=thing.camera_from_model,
-        visible=visible,
-        silhouette=alone.depth_m.isfinite(),
-    )
-
-
-def _picture(
-    placed: Sequence[Placed], raster: Raster, K: Tensor, generator: torch.Generator
-) -> Float[Tensor, "3 h w"]:
-    height, width = raster.depth_m.shape
-    image = backdrop(height, width, generator)
-    table_up = placed[-1].camera_from_model.R[:, 2]
-    light = random_light(table_up, generator)
-    image[:, raster.primitive >= 0] = shade(placed, raster, K, light).mT
-    return _exposed(image, generator)
 
 
 def _exposed(image: Float[Tensor, "3 h w"], generator: torch.Generator) -> Float[Tensor, "3 h w"]:

@@ -11,7 +11,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from scipy.spatial import ConvexHull, KDTree, QhullError
 from torch import Tensor
 from torch.utils.data import DataLoader
@@ -198,11 +198,6 @@ def turn_view(
     return CleanView(depth_m=1 / (found * w), K=moved, camera_from_model=pose)
 
 
-def silhouette_of(view: CleanView) -> Bool[Tensor, "h w"]:
-    """Mark the pixels of the object."""
-    return view.depth_m.isfinite()
-
-
 def _interpolated(
     values: Float[Tensor, "h w"], u: Float[Tensor, "h2 w2"], v: Float[Tensor, "h2 w2"]
 ) -> Float[Tensor, "h2 w2"]:
@@ -270,8 +265,14 @@ class Objects:
         self.models = tuple(models)
         self.config = ObjectsConfig() if config is None else config
         self.cloud = CloudConfig() if cloud is None else cloud
+        nearest = self.config.distance_m[0]
         for model in self.models:
-            _refuse_near(model, self.config)
+            if nearest < model.diameter_m:
+                raise InputError(
+                    f"distance_m begins at {nearest:g} m, but object {model.name!r} is "
+                    f"{model.diameter_m:.3g} m wide: the camera would stand in it. Begin at "
+                    f"{1.5 * model.diameter_m:.2g} or farther, or correct the unit of the model."
+                )
         self._shapes: dict[int, Shape] = {}
         self._views: dict[tuple[int, int], _Stored] = {}
 
@@ -295,11 +296,16 @@ class Objects:
         Processes that are forked later share them. Without this each process draws a view when a
         sample first needs it, and keeps it for itself.
         """
-        bank = _Bank(self)
-        views = DataLoader(bank, batch_size=None, num_workers=workers)  # pyright: ignore[reportArgumentType]
-        for index, view in enumerate(views):
+        wanted = [(n, k) for k in range(self.config.views or 0) for n in range(len(self.models))]
+        views = DataLoader(
+            wanted,  # pyright: ignore[reportArgumentType]
+            batch_size=None,
+            num_workers=workers,
+            collate_fn=self._stored,
+        )
+        for place, view in zip(wanted, views, strict=True):
             # Tensors that a worker process sends hold file descriptors; copies do not.
-            self._views[bank.place(index)] = copy.deepcopy(view)
+            self._views[place] = copy.deepcopy(view)
 
     def sample(self, index: int) -> CloudSample:
         """Make the partial cloud of any index, also beyond the number of samples."""
@@ -318,7 +324,7 @@ class Objects:
         number = index % len(self.models)
         generator = sample_generator(index, self.config.seed)
         clean = self._clean_view(number, generator)
-        silhouette = silhouette_of(clean)
+        silhouette = clean.depth_m.isfinite()
         depth_m, visible = clean.depth_m, silhouette
         if self.config.with_background:
             depth_m = self._before_background(clean, self._shape(number), generator)
@@ -335,30 +341,19 @@ class Objects:
         most = self.config.mask_shift_px
         rows, columns = (whole(generator, 2 * most + 1) - most for _ in range(2))
         mask = shift_mask(mask, round(rows * scale), round(columns * scale))
-        return self._as_sample(index, clean, measured_m, mask, visible)
-
-    def _as_sample(
-        self,
-        index: int,
-        clean: CleanView,
-        measured_m: Float[Tensor, "h w"],
-        mask: Bool[Tensor, "h w"],
-        visible: Bool[Tensor, "h w"],
-    ) -> ViewSample:
-        model, pose = self.models[index % len(self.models)], clean.camera_from_model
-        given = ViewInput(
+        model = self.models[number]
+        view = ViewInput(
             name=f"{model.name}_{self.config.seed}_{index:06d}",
             depth_m=measured_m,
             mask=mask,
             K=clean.K,
             object=model.name,
         )
-        everything = max(int(silhouette_of(clean).sum()), 1)
         truth = PoseTruth(
-            camera_from_model=pose.float(),
-            visible_fraction=int(visible.sum()) / everything,
+            camera_from_model=clean.camera_from_model.float(),
+            visible_fraction=int(visible.sum()) / max(int(silhouette.sum()), 1),
         )
-        return ViewSample(input=given, truth=truth)
+        return ViewSample(input=view, truth=truth)
 
     def _clean_view(self, number: int, generator: torch.Generator) -> CleanView:
         """Draw the object anew, or turn the camera of a stored view."""
@@ -368,7 +363,7 @@ class Objects:
             turn = self._gaze(number, distance_m, K, generator)
             middle = turn[:, 2] * distance_m
             return draw_view(shape, pose_of_middle(shape, turn @ R, middle), K)
-        stored = self._stored(number, whole(generator, views))
+        stored = self._stored((number, whole(generator, views)))
         K = self.intrinsics(float(stored.K[0, 0]) / self.config.focal_px[0])
         turn = self._gaze(number, stored.middle_m, K, generator)
         before = CleanView(
@@ -378,20 +373,22 @@ class Objects:
         )
         return turn_view(before, turn, shape, K)
 
-    def _stored(self, number: int, place: int) -> _Stored:
-        if (number, place) not in self._views:
+    def _stored(self, key: tuple[int, int]) -> _Stored:
+        """Give a view by the number of its object and its own, drawn when it is first needed."""
+        if key not in self._views:
+            number, place = key
             index = place * len(self.models) + number
             R, distance_m, K = self._pose(sample_generator(index, self.config.seed + _BANK_SEED))
             shape = self._shape(number)
             middle = torch.tensor([0.0, 0.0, distance_m], dtype=torch.float64)
             view = draw_view(shape, pose_of_middle(shape, R, middle), K)
-            self._views[number, place] = _Stored(
+            self._views[key] = _Stored(
                 depth_m=(view.depth_m - distance_m).half(),
                 middle_m=distance_m,
                 K=view.K,
                 camera_from_model=view.camera_from_model,
             )
-        return self._views[number, place]
+        return self._views[key]
 
     def _shape(self, number: int) -> Shape:
         if number not in self._shapes:
@@ -453,29 +450,3 @@ class Objects:
         is_clutter = (levels < level) & ~(behind_m < clutter_m)
         behind_m = torch.where(is_clutter, clutter_m, behind_m)
         return torch.where(clean.depth_m.isfinite(), clean.depth_m, behind_m)
-
-
-class _Bank:
-    """The stored views of all objects by index."""
-
-    def __init__(self, objects: Objects) -> None:
-        self._objects = objects
-
-    def __len__(self) -> int:
-        return (self._objects.config.views or 0) * len(self._objects.models)
-
-    def __getitem__(self, index: int) -> _Stored:
-        return self._objects._stored(*self.place(index))
-
-    def place(self, index: int) -> tuple[int, int]:
-        return index % len(self._objects.models), index // len(self._objects.models)
-
-
-def _refuse_near(model: ObjectModel, config: ObjectsConfig) -> None:
-    nearest = config.distance_m[0]
-    if nearest < model.diameter_m:
-        raise InputError(
-            f"distance_m begins at {nearest:g} m, but object {model.name!r} is "
-            f"{model.diameter_m:.3g} m wide: the camera would stand in it. Begin at "
-            f"{1.5 * model.diameter_m:.2g} or farther, or correct the unit of the model."
-        )

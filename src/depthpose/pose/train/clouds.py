@@ -135,7 +135,8 @@ class TrainingClouds:
             sample = self._sample(index + attempt * len(self._class_of) * 2**32, generator)
             points = sample.input.points_m
             if refusal_of(points, self.cloud) is None:
-                return self._voxelised(sample, generator)
+                number = self._class_of[sample.input.object]
+                return voxelised_cloud(sample, number, self.cloud, generator)
         raise InputError(
             f"sample {index}: {_TRIES} samples in a row have fewer than "
             f"{self.cloud.min_points} points; bring the camera nearer (distance_m), or lower "
@@ -145,7 +146,17 @@ class TrainingClouds:
     @staticmethod
     def collate(clouds: Sequence[Cloud]) -> CloudBatch:
         """Put clouds one after the other."""
-        return collate_clouds(clouds)
+        numbers = [torch.full((len(c.points_m), 1), k) for k, c in enumerate(clouds)]
+        return CloudBatch(
+            points_m=torch.cat([c.points_m for c in clouds]),
+            coordinates=torch.cat(
+                [torch.cat([n, c.coordinates], 1) for n, c in zip(numbers, clouds, strict=True)]
+            ),
+            features=torch.cat([c.features for c in clouds]),
+            class_of=torch.tensor([c.class_number for c in clouds]),
+            R=torch.stack([c.R for c in clouds]),
+            t_m=torch.stack([c.t_m for c in clouds]),
+        )
 
     def _sample(self, index: int, generator: torch.Generator) -> CloudSample:
         # Sample i shows object i modulo their number.
@@ -156,9 +167,6 @@ class TrainingClouds:
         sample = self._real[place]
         angle = 2 * math.pi * float(torch.rand((), generator=generator))
         return _rolled(sample, angle) if self.frames.with_roll else sample
-
-    def _voxelised(self, sample: CloudSample, generator: torch.Generator) -> Cloud:
-        return voxelised_cloud(sample, self._class_of[sample.input.object], self.cloud, generator)
 
 
 def voxelised_cloud(
@@ -178,21 +186,6 @@ def voxelised_cloud(
         class_number=class_number,
         R=turn @ pose.R.float(),
         t_m=turn @ pose.t_m.float(),
-    )
-
-
-def collate_clouds(clouds: Sequence[Cloud]) -> CloudBatch:
-    """Put clouds one after the other."""
-    numbers = [torch.full((len(c.points_m), 1), k) for k, c in enumerate(clouds)]
-    return CloudBatch(
-        points_m=torch.cat([c.points_m for c in clouds]),
-        coordinates=torch.cat(
-            [torch.cat([n, c.coordinates], 1) for n, c in zip(numbers, clouds, strict=True)]
-        ),
-        features=torch.cat([c.features for c in clouds]),
-        class_of=torch.tensor([c.class_number for c in clouds]),
-        R=torch.stack([c.R for c in clouds]),
-        t_m=torch.stack([c.t_m for c in clouds]),
     )
 
 
@@ -273,7 +266,16 @@ def read_models(
         return tuple(make_part(p, n, config.mesh) for n, p in enumerate(config.parts, start=1))
     if not config.bop and not config.cad:
         raise InputError("there is no object to learn; name its CAD file (--cad FILE --unit mm)")
-    models = _from_bop(Path(config.bop), config) if config.bop else _from_cad(config)
+    if config.bop:
+        folder = Path(config.bop)
+        numbers = config.objects or _numbers(models_folder(folder))
+        models = tuple(read_bop_models(folder, numbers, config.mesh).values())
+    else:
+        models = tuple(
+            read_model(path, config.unit, number=number, config=config.mesh)
+            for number, path in enumerate(config.cad, start=1)
+        )
+        refuse_one_name(models)
     return tuple(
         with_found_symmetries(
             model,
@@ -283,21 +285,6 @@ def read_models(
         )
         for model in models
     )
-
-
-def _from_cad(config: ModelsConfig) -> tuple[ObjectModel, ...]:
-    models = tuple(
-        read_model(path, config.unit, number=number, config=config.mesh)
-        for number, path in enumerate(config.cad, start=1)
-    )
-    refuse_one_name(models)
-    return models
-
-
-def _from_bop(folder: Path, config: ModelsConfig) -> tuple[ObjectModel, ...]:
-    numbers: Sequence[int] = config.objects or _numbers(models_folder(folder))
-    models = read_bop_models(folder, numbers, config.mesh)
-    return tuple(models[number] for number in sorted(models))
 
 
 def _numbers(home: Path) -> list[int]:
@@ -359,12 +346,9 @@ class HeldOut:
             found["lines"].append(self._error(meet_lines(points, directions), cloud))
             if self.config.with_ransac:
                 found["ransac"].append(self._error(vote_ransac(points, directions), cloud))
-        missing = [math.inf] * (self._wanted - len(self._of(occlusion)))
+        wanted = self.config.number * len(self.models)
+        missing = [math.inf] * (wanted - len(self._of(occlusion)))
         return {method: torch.tensor(errors + missing) for method, errors in found.items()}
-
-    @property
-    def _wanted(self) -> int:
-        return self.config.number * len(self.models)
 
     def _error(self, vote: Vote, cloud: Cloud) -> float:
         """ADD to the nearest symmetric pose, in diameters."""
@@ -379,7 +363,7 @@ class HeldOut:
         device = next(network.parameters()).device
         for start in range(0, len(clouds), _TOGETHER):
             part = clouds[start : start + _TOGETHER]
-            seen = collate_clouds(part).seen.to(device)
+            seen = TrainingClouds.collate(part).seen.to(device)
             outputs = network.directions(seen).float()[..., :3]
             sizes = [len(cloud.points_m) for cloud in part]
             yield from zip(part, outputs.split(sizes), strict=True)

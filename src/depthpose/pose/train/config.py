@@ -14,7 +14,7 @@ from depthpose.pose.config import (
     CloudConfig,
     MeshConfig,
     ObjectsConfig,
-    refuse_range,
+    refuse_reversed,
 )
 from depthpose.pose.losses import POINT_LOSSES
 from depthpose.pose.network import ResUNetConfig
@@ -57,11 +57,7 @@ class ModelsConfig:
 
     def __post_init__(self) -> None:
         """Refuse a tolerance that nothing meets, or that everything does."""
-        if not 0 < self.symmetry_tolerance < 1:
-            raise InputError(
-                f"symmetry_tolerance is {self.symmetry_tolerance}, but it is a share of the "
-                "diameter, above 0 and below 1; take 0.02"
-            )
+        check_settings(self, symmetry_tolerance="(0, 1)")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -85,8 +81,7 @@ class FramesConfig:
         """Refuse no folder, and shares that are none."""
         if not self.folder:
             raise InputError("frames has no folder; name a data set, or leave frames out")
-        if not 0 < self.share <= 1:
-            raise InputError(f"share is {self.share}, but it is above 0 and at most 1; take 1.0")
+        check_settings(self, share="(0, 1]")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -104,13 +99,9 @@ class HeldOutConfig:
 
     def __post_init__(self) -> None:
         """Refuse a validation of nothing."""
-        if self.number < 1 or not self.occlusions:
-            raise InputError(
-                f"number is {self.number} and occlusions {self.occlusions}: nothing would be "
-                "measured; take 25 and (0.0, 0.3)"
-            )
-        for share in self.occlusions:
-            refuse_range("held_out.occlusions", (share, share), OCCLUSIONS, "0.0 and 0.3")
+        check_settings(self, number="[1, inf)", occlusions=OCCLUSIONS)
+        if not self.occlusions:
+            raise InputError("held_out.occlusions is (); nothing would be measured; take (0, 0.3)")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -175,10 +166,7 @@ class PoseTraining:
     def __post_init__(self) -> None:
         """Refuse an unknown loss and a negative number of views."""
         refuse_unknown("loss", self.loss, POINT_LOSSES)
-        if self.first_alone < 0:
-            raise InputError(f"first_alone is {self.first_alone}; take 0 or more synthetic views")
-        if self.confidence_weight < 0:
-            raise InputError(f"confidence_weight is {self.confidence_weight}; take 0 or more, 0.1")
+        check_settings(self, first_alone="[0, inf)", confidence_weight="[0, inf)")
 
 
 def own_part(start: str) -> PoseTraining:
@@ -305,8 +293,7 @@ class ImageAugmentConfig:
                 f"crop_px is {self.crop_px}, but the coarsest feature is 32 pixels wide; take "
                 "multiples of 32"
             )
-        if self.scale[0] > self.scale[1]:
-            raise InputError(f"scale must be a range, the lower end first, got {self.scale}")
+        refuse_reversed(self, "scale")
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -4,7 +4,6 @@ import dataclasses
 import shlex
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import Any
 
 import torch
@@ -30,7 +29,7 @@ from depthpose.pose.config import CloudConfig, RefusalConfig
 from depthpose.pose.estimator.alternatives import near_symmetry_lines
 from depthpose.pose.losses import choose_copies, confidence_loss, direction_loss, unit_directions
 from depthpose.pose.mesh import symmetry_transforms
-from depthpose.pose.network import ResUNet, ResUNetConfig, fold_norms, unfold_norms
+from depthpose.pose.network import ResUNet, fold_norms, unfold_norms
 from depthpose.pose.sparse import Voxels
 from depthpose.pose.train.clouds import (
     CloudBatch,
@@ -240,7 +239,10 @@ def train_pose(config: PoseTraining, run: Run) -> Path:
     if config.loop.workers > 1 and (config.frames is None or config.frames.share < 1):
         clouds.synthetic.draw_stored(config.loop.workers)
     held_out = HeldOut(models, config.objects, config.cloud, config.held_out)
-    network = _network_of(config.network)
+    if isinstance(config.network, PointNetConfig):
+        network = PointNet(config.network)
+    else:
+        network = ResUNet(config.network)
     if config.start is not None:
         _start_from(network, config.start, clouds)
     claim_run(config, run, config.models.cad)
@@ -263,26 +265,14 @@ def _save(
     """Write the weights, measure the file, and write its card."""
     if find_rank().rank:
         return path  # statistics of batch norm are rank 0's, and so is the file
-    weights = _as_written(packed(network, models, config), with_half=config.with_half)
-    write_pose_weights(path, weights, with_half=config.with_half)
-    table = score_held_out(read_pose_weights(path), config.objects, config.held_out)
+    write_pose_weights(path, packed(network, models, config), with_half=config.with_half)
+    weights = read_pose_weights(path)  # as the file holds them: 16 bits round them
+    table = score_held_out(weights, config.objects, config.held_out)
     write_json(path.with_suffix(".json"), {"held_out": table})
     write_card(
         path, train_words(path.stem, config), seconds, card_facts(weights), table_text(table)
     )
     return path
-
-
-def _as_written(weights: PoseWeights, *, with_half: bool) -> PoseWeights:
-    """Give what a file of these weights holds: 16 bits round them."""
-    with TemporaryDirectory() as home:
-        path = Path(home) / "weights.safetensors"
-        write_pose_weights(path, weights, with_half=with_half)
-        return read_pose_weights(path)
-
-
-def _network_of(config: ResUNetConfig | PointNetConfig) -> ResUNet | PointNet:
-    return PointNet(config) if isinstance(config, PointNetConfig) else ResUNet(config)
 
 
 def _start_from(network: ResUNet | PointNet, start: str, clouds: TrainingClouds) -> None:
@@ -306,11 +296,7 @@ def _start_from(network: ResUNet | PointNet, start: str, clouds: TrainingClouds)
                 f"{start}: was trained with {name} = {given.get(name)!r}, but the config says "
                 f"{value!r}. Give the config the weights' own."
             )
-    if (
-        isinstance(network, ResUNet)
-        and isinstance(found, ResUNet)
-        and network.config.norm != "none"
-    ):
+    if has_norms and isinstance(network, ResUNet) and isinstance(found, ResUNet):
         batch = clouds.collate([clouds[index] for index in range(_STATISTICS_CLOUDS)])
         unfold_norms(found, network, Voxels.from_points(batch.coordinates, batch.features))
         return

@@ -120,7 +120,9 @@ class AnnotatedImages:
             raise InputError(f"{config.folder}: split {config.split!r} has no picture (rgb)")
         self.objects = _known(config, images) if objects is None else objects
         self._class_of = {number: k for k, number in enumerate(self.objects.numbers, 1)}
-        self._images = _evenly(list(images.values()), config.limit)
+        every = list(images.values())
+        count = len(every) if config.limit is None else min(config.limit, len(every))
+        self._images = [every[k * len(every) // count] for k in range(count)]
         self._cache: dict[int, tuple[UInt8[Tensor, "3 h w"], UInt8[Tensor, "h w"]]] = {}
         self._with_cache = config.with_cache
 
@@ -261,14 +263,6 @@ def _known(config: ImagesConfig, images: dict[tuple[int, int], list[Instance]]) 
     return KnownObjects(names=names, numbers=tuple(wanted))
 
 
-def _evenly(
-    images: Sequence[Sequence[Instance]], limit: int | None
-) -> Sequence[Sequence[Instance]]:
-    if limit is None or limit >= len(images):
-        return images
-    return [images[k * len(images) // limit] for k in range(limit)]
-
-
 _TRIES = 20
 _SYMMETRY_STEP = 0.2
 """Turns about a continuous axis are tried every 23 degrees: half of that is far below the error
@@ -321,7 +315,13 @@ class TrainingCrops:
         """
         for attempt in range(_TRIES):
             # Far beyond any training, and the same object.
-            sample = self._view(index + attempt * len(self.models) * 2**32)
+            place = index + attempt * len(self.models) * 2**32
+            generator = sample_generator(place, self.seed)
+            frame = frame_place(self.config.frames, self._real, place, self.seed, generator)
+            if self._real is None or frame is None:
+                sample = self.synthetic.view(place)
+            else:
+                sample = self._real.view(self._real.instances[frame])
             number = self._class_of[sample.input.object]
             crop = cut_depth(sample.input, self.config.network, self.models[number].diameter_m)
             if crop is not None:
@@ -331,13 +331,6 @@ class TrainingCrops:
             f"{_TRIES} views in a row have fewer than {self.config.network.min_points} masked "
             "pixels with a depth; bring the camera nearer (distance_m), or lower min_points"
         )
-
-    def _view(self, index: int) -> ViewSample:
-        generator = sample_generator(index, self.seed)
-        place = frame_place(self.config.frames, self._real, index, self.seed, generator)
-        if self._real is None or place is None:
-            return self.synthetic.view(index)
-        return self._real.view(self._real.instances[place])
 
 
 class DepthImageTask:

@@ -1,6 +1,7 @@
 """Directions to keypoints to a pose: least squares, RANSAC, rigidity, Kabsch, covariances."""
 
 from dataclasses import replace
+from typing import NamedTuple
 
 import torch
 from jaxtyping import Bool, Float, Float64, Int64
@@ -17,8 +18,19 @@ _NEAREST = 0.1
 """Points nearer to a keypoint than this share of the mean distance weigh no more: a point on the
 keypoint would outweigh all others, and its direction means nothing."""
 
-Lines = tuple[Tensor, Tensor, Tensor]
-"""Points (..., 1, 3, n) about their mean, unit directions (..., k, 3, n), weights (..., k, n)."""
+
+class Lines(NamedTuple):
+    """Lines that vote for the keypoints of an object.
+
+    Attributes:
+        points: about their mean.
+        directions: of unit length.
+        weights: 0 leaves a line out.
+    """
+
+    points: Float[Tensor, "*batch 1 3 n"]
+    directions: Float[Tensor, "*batch k 3 n"]
+    weights: Float[Tensor, "*batch k n"]
 
 
 def meet_lines(
@@ -76,57 +88,40 @@ def prepare_lines(
             f"voting: {least} directions of some keypoint carry weight, but two lines at least "
             "fix a point. Give more points or a positive weight to more of them."
         )
-    return (local, n, w), centre_m
+    return Lines(local, n, w), centre_m
 
 
 def meet_prepared(lines: Lines, centre_m: Float[Tensor, "*batch 1 3"], refinements: int) -> Vote:
     """Do as :func:`meet_lines` does, for what :func:`prepare_lines` gave."""
-    w = lines[2]
-    if _is_single(lines):
+    local, n, w = lines
+    all_count = torch.ones_like(w[..., 0])
+    if n.ndim == 3 and n.dtype == torch.float64 and serves(*lines):
         from depthpose.pose.compiled.vote import met
 
-        p, covariance, condition = met(lines, refinements, _NEAREST)
-        every = torch.ones(len(w), dtype=w.dtype)
-        return Vote(
-            keypoints_m=p + centre_m, covariance_m2=covariance, condition=condition,
-            inlier_share=every,
-        )  # fmt: skip
+        p, covariance, condition = met(local, n, w, refinements, _NEAREST)
+        return Vote(keypoints_m=p + centre_m, covariance_m2=covariance, condition=condition,
+                    inlier_share=all_count)  # fmt: skip
     A, p = _nearest(lines)
-    condition = _condition(A)
-    gradient = None
+    values = torch.linalg.eigvalsh(A)
+    # Of a trace of 2, what lies below is the rounding of float32 sums.
+    is_real = values[..., 0] > 1e-7
+    condition = torch.where(is_real, values[..., 2] / values[..., 0].clamp(min=1e-7), torch.inf)
+    offset = p.to(n)[..., None] - local
+    gradient = offset - n * (n * offset).sum(-2, keepdim=True)
+    gradient = gradient * (w / w.sum(-1, keepdim=True))[..., None, :]
     for _ in range(refinements):
         A, gradient = _score(lines, p)
-        p = p + _short_step(A, gradient.sum(-1).double(), lines[0], p)
-    if refinements == 0:
-        gradient = _nearest_gradient(lines, p)
-    assert gradient is not None
-    covariance = _sandwich(A, gradient, (w > 0).sum(-1))
-    total = w.sum(-1)
+        p = p + _short_step(A, gradient.sum(-1).double(), local, p)
+    inverse, votes = torch.linalg.inv(_damped(A)), (w > 0).sum(-1)
+    # n lines of rank 2 fix 3 unknowns: few lines look surer than they are.
+    spare = (2 * votes.double() / (2 * votes - 3).clamp(min=1))[..., None, None]
+    covariance = spare * (inverse @ (gradient @ gradient.mT).double() @ inverse)
     return Vote(
         keypoints_m=p.to(centre_m) + centre_m,
         covariance_m2=covariance.to(centre_m),
         condition=condition.to(centre_m),
-        inlier_share=torch.ones_like(total),
+        inlier_share=all_count,
     )
-
-
-def locate(lines: Lines, refinements: int) -> Float64[Tensor, "*b k 3"]:
-    """Give the point alone, about the points' mean, without its covariance."""
-    if _is_single(lines):
-        from depthpose.pose.compiled.vote import met
-
-        return met(lines, refinements, _NEAREST)[0]
-    _, p = _nearest(lines)
-    for _ in range(refinements):
-        A, gradient = _score(lines, p)
-        p = p + _short_step(A, gradient.sum(-1).double(), lines[0], p)
-    return p
-
-
-def _is_single(lines: Lines) -> bool:
-    """Whether compiled functions serve: one object, on the processor, in float64."""
-    n = lines[1]
-    return n.ndim == 3 and n.dtype == torch.float64 and serves(*lines)
 
 
 def _nearest(lines: Lines) -> tuple[Float64[Tensor, "*b k 3 3"], Float64[Tensor, "*b k 3"]]:
@@ -141,29 +136,22 @@ def _nearest(lines: Lines) -> tuple[Float64[Tensor, "*b k 3 3"], Float64[Tensor,
     return A, torch.linalg.solve(_damped(A), b).squeeze(-1)
 
 
-def _nearest_gradient(lines: Lines, p: Tensor) -> Float[Tensor, "*b k 3 n"]:
-    local, n, w = lines
-    offset = p.to(n)[..., None] - local
-    rest = offset - n * (n * offset).sum(-2, keepdim=True)
-    return rest * (w / w.sum(-1, keepdim=True))[..., None, :]
-
-
 def _score(
     lines: Lines, p: Tensor
 ) -> tuple[Float64[Tensor, "*b k 3 3"], Float[Tensor, "*b k 3 n"]]:
     """Give the information matrix, and the gradient of each line, over the sum of weights."""
     local, n, w = lines
     offset = p.to(n)[..., None] - local
-    reach = offset.square().sum(-2).sqrt_()
-    scale = reach.mean(-1, keepdim=True).clamp(min=_SMALLEST)
-    q = offset / reach.clamp(min=_SMALLEST)[..., None, :]
-    reach = torch.maximum(reach, _NEAREST * scale)
+    distance = offset.square().sum(-2).sqrt_()
+    scale = distance.mean(-1, keepdim=True).clamp(min=_SMALLEST)
+    q = offset / distance.clamp(min=_SMALLEST)[..., None, :]
+    distance = torch.maximum(distance, _NEAREST * scale)
     cosine = (n * q).sum(-2)
-    pull = w / reach
+    pull = w / distance
     pull = pull / w.sum(-1, keepdim=True)
     gradient = (n - q * cosine[..., None, :]) * pull[..., None, :]
     # Outliers may not turn the matrix negative: each line counts as half at least.
-    amount = pull / reach * cosine.clamp(min=0.5)
+    amount = pull / distance * cosine.clamp(min=0.5)
     outer = ((q * amount[..., None, :]) @ q.mT).double()
     eye = torch.eye(3, dtype=torch.float64, device=n.device)
     return amount.sum(-1).double()[..., None, None] * eye - outer, gradient
@@ -175,20 +163,6 @@ def _short_step(A: Tensor, gradient: Tensor, local: Tensor, p: Tensor) -> Float6
     spread = local.square().sum(-2).mean(-1).double()
     limit = (p.square().sum(-1) + spread).sqrt()
     return step * (limit / step.norm(dim=-1).clamp(min=_SMALLEST)).clamp(max=1.0)[..., None]
-
-
-def _sandwich(A: Tensor, gradient: Tensor, votes: Tensor) -> Float64[Tensor, "*b k 3 3"]:
-    inverse = torch.linalg.inv(_damped(A))
-    # n lines of rank 2 fix 3 unknowns: few lines look surer than they are.
-    spare = (2 * votes.double() / (2 * votes - 3).clamp(min=1))[..., None, None]
-    return spare * (inverse @ (gradient @ gradient.mT).double() @ inverse)
-
-
-def _condition(A: Float64[Tensor, "*b k 3 3"]) -> Float64[Tensor, "*b k"]:
-    values = torch.linalg.eigvalsh(A)
-    # Of a trace of 2, what lies below is the rounding of float32 sums.
-    is_real = values[..., 0] > 1e-7
-    return torch.where(is_real, values[..., 2] / values[..., 0].clamp(min=1e-7), torch.inf)
 
 
 def _damped(A: Float64[Tensor, "*b k 3 3"]) -> Float64[Tensor, "*b k 3 3"]:
@@ -228,16 +202,20 @@ def vote_ransac(
     """
     config = VotingConfig() if config is None else config
     lines, centre_m = prepare_lines(points_m, directions, weight)
-    tried, is_crossing = cross_lines(lines, *draw_pairs(lines[2], config.hypotheses, config.seed))
+    tried, is_crossing = cross_lines(
+        lines, *draw_pairs(lines.weights, config.hypotheses, config.seed)
+    )
     inlier_test = InlierTest(lines, config)
     # Parallel pairs propose nothing, yet score 0 so that one always wins.
     best = torch.where(is_crossing, inlier_test.score(tried), 0).argmax(-1)[..., None, None]
     keypoint = tried.gather(-2, best.expand(*best.shape[:-1], 3))
     # Once toward what the best hypothesis gathered, then with those that agree on that.
     used, _ = _inliers(lines, inlier_test, keypoint)
-    keypoint = locate((*lines[:2], used), min(config.refinements, 1))[..., None, :]
-    used, share = _inliers(lines, inlier_test, keypoint.to(centre_m))
-    vote = meet_prepared((*lines[:2], used), centre_m, config.refinements)
+    again = meet_prepared(
+        lines._replace(weights=used), torch.zeros_like(centre_m), min(config.refinements, 1)
+    )
+    used, share = _inliers(lines, inlier_test, again.keypoints_m[..., None, :])
+    vote = meet_prepared(lines._replace(weights=used), centre_m, config.refinements)
     return replace(vote, inlier_share=share)
 
 
@@ -285,21 +263,21 @@ class InlierTest:
     """Says which lines agree with which hypotheses.
 
     Both tests compare polynomials in the hypothesis h, and so are two products of matrices:
-    ``reach = n . (h - x)`` and ``range^2 = |h|^2 - 2 h . x + |x|^2``. By angle a line agrees when
-    ``reach > cos range``, so that a vote that points away does not; by distance when ``range^2 -
-    reach^2 < limit^2``, whatever the sense of the vote (published practice).
+    ``along = n . (h - x)`` and ``range^2 = |h|^2 - 2 h . x + |x|^2``. By angle a line agrees when
+    ``along > cos range``, so that a vote that points away does not; by distance when ``range^2 -
+    along^2 < limit^2``, whatever the sense of the vote (published practice).
     """
 
     def __init__(self, lines: Lines, config: VotingConfig) -> None:
         local, n, w = lines
         self._limit = config.max_distance_m**2 if config.inlier_test == "distance" else None
-        reach = torch.cat([n, -(n * local).sum(-2, keepdim=True)], -2)
+        along = torch.cat([n, -(n * local).sum(-2, keepdim=True)], -2)
         square = local.square().sum(-2, keepdim=True)
         far = torch.cat([-2 * local, torch.ones_like(square), square], -2)
         # The scale of the test goes into the small factor, not into the large product.
         far = far * (config.min_cosine**2 if self._limit is None else 1.0)
         # Keypoints and objects are alike here: one axis.
-        self._reach = reach.detach().flatten(0, -3)
+        self._along = along.detach().flatten(0, -3)
         self._far = far.detach().expand(*n.shape[:-2], *far.shape[-2:]).flatten(0, -3)
         self._w = w.detach().flatten(0, -2)[:, None]
         self._is_weighted = not bool((w == 1).all())
@@ -330,12 +308,12 @@ class InlierTest:
     def _agree(self, tried: list[Tensor], memory: Tensor) -> Float[Tensor, "b h n"]:
         shape = (*tried[0].shape[:2], self._w.shape[-1])
         size = shape[0] * shape[1] * shape[2]
-        reach = torch.bmm(tried[0], self._reach, out=memory[0, :size].view(shape))
+        along = torch.bmm(tried[0], self._along, out=memory[0, :size].view(shape))
         far = torch.bmm(tried[1], self._far, out=memory[1, :size].view(shape))
         if self._limit is not None:
-            return far.addcmul_(reach, reach, value=-1).lt_(self._limit)
+            return far.addcmul_(along, along, value=-1).lt_(self._limit)
         # What points away reaches nothing, and no square is below its own share.
-        return far.addcmul_(reach.clamp_(min=0), reach, value=-1).lt_(0)
+        return far.addcmul_(along.clamp_(min=0), along, value=-1).lt_(0)
 
 
 def _polynomials(tried: Float[Tensor, "*batch k h 3"]) -> list[Tensor]:
@@ -357,7 +335,7 @@ def _inliers(
     lines: Lines, inlier_test: InlierTest, keypoint: Float[Tensor, "*batch k 1 3"]
 ) -> tuple[Float[Tensor, "*batch k n"], Float[Tensor, "*batch k"]]:
     """Give the weights of the lines that agree with a keypoint, and their share."""
-    w = lines[2]
+    w = lines.weights
     kept = inlier_test.agree(keypoint).squeeze(-2) * w
     is_enough = (kept > 0).sum(-1, keepdim=True) >= 3
     # Where fewer agree than fix a point with its covariance all votes are used; the share is 0.
@@ -394,11 +372,23 @@ def fit_pose(
     found, model = keypoints_m.double(), model_keypoints_m.double()
     model = model.expand_as(found)
     used = torch.ones_like(found[..., 0], dtype=torch.bool) if is_used is None else is_used
-    information = torch.linalg.inv(_with_floor(covariance_m2.double(), model))
-    information = information * used[..., None, None]
+    # No keypoint is known better than a millionth of the object, whatever its votes say.
+    spread = (model - model.mean(-2, keepdim=True)).square().sum(-1).mean(-1)
+    floor = (1e-12 * spread)[..., None, None, None] * torch.eye(3).to(model)
+    information = torch.linalg.inv(covariance_m2.double() + floor) * used[..., None, None]
     trace = information.diagonal(dim1=-2, dim2=-1).sum(-1)
-    pose = fit_rigid(model, found, _balanced(trace))
-    pose, H = _polished(pose, (model, found, information))
+    # One keypoint that looks exact must not decide alone; a rotation takes three.
+    most = 100 * trace.median(-1, keepdim=True).values.clamp(min=1e-300)
+    pose = fit_rigid(model, found, trace.clamp(max=most))
+    if serves(pose.R, model, found, information):
+        from depthpose.pose.compiled.vote import fitted
+
+        pose, H = fitted(pose, model, found, information, _STEPS)
+    else:
+        for _ in range(_STEPS):
+            H, step = _normal_equations(pose, model, found, information)
+            pose = perturb(pose, torch.linalg.solve(H, step))
+        H, _ = _normal_equations(pose, model, found, information)
     error_m = pose.apply(model) - found
     count = used.sum(-1)
     misfit = (error_m[..., None, :] @ information @ error_m[..., None]).sum((-1, -2, -3))
@@ -420,7 +410,10 @@ def free_motions(axes: tuple[Axis, ...], camera_from_model: Rigid) -> Float[Tens
     about the third too.
     """
     rows = []
-    for axis in _with_third(axes):
+    centre_m = Symmetries(continuous=axes).ball_centre_m
+    if centre_m is not None:  # turns about two axes of a ball make those about every axis
+        axes = tuple(Axis(direction=row, point_m=centre_m) for row in torch.eye(3).to(centre_m))
+    for axis in axes if centre_m is not None else axes[:1]:
         direction = camera_from_model.R @ axis.direction.to(camera_from_model.R)
         point_m = camera_from_model.apply(axis.point_m.to(camera_from_model.R)[None])[0]
         # Turning by w about a line through c moves c nowhere: w x c + v = 0.
@@ -429,52 +422,16 @@ def free_motions(axes: tuple[Axis, ...], camera_from_model: Rigid) -> Float[Tens
     return torch.stack(rows) if rows else camera_from_model.R.new_zeros(0, 6)
 
 
-def _with_third(axes: tuple[Axis, ...]) -> tuple[Axis, ...]:
-    """Give one axis, or three of a ball: turns about two make those about every axis."""
-    centre_m = Symmetries(continuous=axes).ball_centre_m
-    if centre_m is None:
-        return axes[:1]
-    return tuple(Axis(direction=row, point_m=centre_m) for row in torch.eye(3).to(centre_m))
-
-
-def _polished(
-    pose: Rigid, terms: tuple[Tensor, Tensor, Tensor]
-) -> tuple[Rigid, Float64[Tensor, "*batch 6 6"]]:
-    """Go to the most likely pose; give its information matrix too."""
-    if serves(pose.R, *terms):
-        from depthpose.pose.compiled.vote import fitted
-
-        return fitted(pose, terms, _STEPS)
-    for _ in range(_STEPS):
-        H, step = _normal_equations(pose, terms)
-        pose = perturb(pose, torch.linalg.solve(H, step))
-    return pose, _normal_equations(pose, terms)[0]
-
-
 def _normal_equations(
-    pose: Rigid, terms: tuple[Tensor, Tensor, Tensor]
+    pose: Rigid, model: Tensor, found: Tensor, information: Tensor
 ) -> tuple[Float64[Tensor, "*batch 6 6"], Float64[Tensor, "*batch 6"]]:
-    model, found, information = terms
+    """Give the information matrix of (rotation, translation), and the right side."""
     moved_m = pose.apply(model)
     eye = torch.eye(3, dtype=moved_m.dtype, device=moved_m.device).expand(*moved_m.shape, 3)
     J = torch.cat([-cross_matrix(moved_m), eye], -1)
     weighted = J.mT @ information
     step = (weighted @ (found - moved_m)[..., None]).sum(-3).squeeze(-1)
     return (weighted @ J).sum(-3), step
-
-
-def _with_floor(
-    covariance_m2: Float64[Tensor, "*batch k 3 3"], model: Float64[Tensor, "*batch k 3"]
-) -> Float64[Tensor, "*batch k 3 3"]:
-    # No keypoint is known better than a millionth of the object, whatever its votes say.
-    spread = (model - model.mean(-2, keepdim=True)).square().sum(-1).mean(-1)
-    eye = torch.eye(3, dtype=model.dtype, device=model.device)
-    return covariance_m2 + (1e-12 * spread)[..., None, None, None] * eye
-
-
-def _balanced(trace: Float64[Tensor, "*batch k"]) -> Float64[Tensor, "*batch k"]:
-    """Keep one keypoint that looks exact from deciding alone; a rotation takes three."""
-    return trace.clamp(max=100 * trace.median(-1, keepdim=True).values.clamp(min=1e-300))
 
 
 def distance_errors(
