@@ -37,7 +37,7 @@ def network(request: pytest.FixtureRequest) -> ResUNet:
     kernel = {"batch": 3, "none": 7}[request.param]
     config = ResUNetConfig(
         classes=2, keypoints=3, inputs=3, encoder=small, decoder=small, norm=request.param,
-        with_confidence=True, with_bias=request.param == "none", first_kernel=kernel,
+        with_bias=request.param == "none", first_kernel=kernel,
     )  # fmt: skip
     made = ResUNet(config)
     for name, tensor in made.named_buffers():

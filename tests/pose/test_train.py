@@ -17,12 +17,7 @@ from depthpose.core.config import read_config
 from depthpose.core.errors import InputError
 from depthpose.core.loop import AdamConfig, LoopConfig, Run
 from depthpose.core.rigid import Rigid
-from depthpose.pose.config import (
-    CloudConfig,
-    MeshConfig,
-    ObjectsConfig,
-    SensorConfig,
-)
+from depthpose.pose.config import CloudConfig, MeshConfig, ObjectsConfig, SensorConfig
 from depthpose.pose.datasets import write_bop_models, write_bop_scene
 from depthpose.pose.losses import unit_directions
 from depthpose.pose.network import ResUNet, ResUNetConfig, fold_norms
@@ -482,10 +477,6 @@ def test_a_config_is_read_and_opens_with_its_own_command(path: Path) -> None:
         (
             lambda: ModelsConfig(symmetry_tolerance=-1.0),
             "symmetry_tolerance must be in (0, 1), got -1.0",
-        ),
-        (
-            lambda: PoseTraining(confidence_weight=-1.0),
-            "confidence_weight must be in [0, inf), got -1.0",
         ),
     ],
 )

@@ -10,12 +10,7 @@ import torch.nn.functional as F
 from tests.pose.stopping import StoppedError, stop_after
 from tests.pose.synthetic_objects import bottle, bracket
 
-from depthpose.core.checkpoint import (
-    Checkpoint,
-    LicenceNotice,
-    read_checkpoint,
-    save_checkpoint,
-)
+from depthpose.core.checkpoint import Checkpoint, LicenceNotice, read_checkpoint, save_checkpoint
 from depthpose.core.errors import InputError
 from depthpose.core.files import write_image
 from depthpose.core.loop import AdamConfig, LoopConfig, Run, read_metrics

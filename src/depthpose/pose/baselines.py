@@ -4,7 +4,7 @@ import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import Any, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 import torch
@@ -54,6 +54,9 @@ class DepthImageConfig:
 class PointNetConfig:
     """Size of a PointNet for segmentation (Qi et al. 2017) whose outputs are directions."""
 
+    RETIRED: ClassVar[frozenset[str]] = frozenset({"with_confidence"})
+    """Settings of before, in older weights: no confidence is learnt any more."""
+
     classes: int = 13
     """Objects that one network knows."""
 
@@ -62,9 +65,6 @@ class PointNetConfig:
 
     with_transforms: bool = True
     """The two T-Nets, which turn points (3x3) and features (64x64) before they go on."""
-
-    with_confidence: bool = False
-    """A fourth output beside each direction: the logit of how far to trust it."""
 
     unit_m: float = 0.1
     """Points are given to the network in units of so many metres: of order one for an object."""
@@ -84,14 +84,9 @@ class PointNetConfig:
         check_settings(self, **dict.fromkeys(counts, "[1, inf)"), unit_m="(0, inf)")
 
     @property
-    def components(self) -> int:
-        """Numbers for each point and keypoint: a direction, and maybe a logit."""
-        return 4 if self.with_confidence else 3
-
-    @property
     def outputs(self) -> int:
         """Channels of the last layer."""
-        return self.classes * self.keypoints * self.components
+        return self.classes * self.keypoints * 3
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -412,7 +407,7 @@ class PointNet(nn.Module):
 
     def forward(
         self, points_m: Float[Tensor, "points 3"], cloud: Int[Tensor, " points"]
-    ) -> Float[Tensor, "points classes keypoints components"]:
+    ) -> Float[Tensor, "points classes keypoints 3"]:
         """Give the raw directions of each point to the keypoints of every class.
 
         Args:
@@ -421,9 +416,9 @@ class PointNet(nn.Module):
         """
         c = self.config
         outputs = self.final(self.features(points_m, cloud))
-        return outputs.view(len(outputs), c.classes, c.keypoints, c.components)
+        return outputs.view(len(outputs), c.classes, c.keypoints, 3)
 
-    def directions(self, seen: SeenPoints) -> Float[Tensor, "points keypoints components"]:
+    def directions(self, seen: SeenPoints) -> Float[Tensor, "points keypoints 3"]:
         """Answer for each point's own class: what every network that votes offers."""
         points_m, cloud = seen.points_m, seen.coordinates[:, 0].long()
         sizes = torch.bincount(cloud)

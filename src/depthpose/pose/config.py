@@ -257,10 +257,7 @@ class EstimateConfig:
     def __post_init__(self) -> None:
         """Refuse counts of nothing, and a certainty that is none."""
         check_settings(
-            self,
-            min_certainty="[0, 1]",
-            max_cloud_points="[100, inf)",
-            batch_voxels="[1, inf)",
+            self, min_certainty="[0, 1]", max_cloud_points="[100, inf)", batch_voxels="[1, inf)"
         )
         if self.rough_rigidity_diameters < self.voting.rigidity_diameters:
             raise InputError(

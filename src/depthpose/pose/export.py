@@ -79,11 +79,11 @@ def direction_graph(network: ResUNet) -> Graph:
 
     Inputs ``coordinates`` (voxels, 4; int64: cloud, x, y, z; each voxel once) and ``features``
     (voxels, ``config.inputs``; float32: the number 1 where there is one). Output ``directions``
-    (voxels, classes, keypoints, components), not normalised, in the order of the voxels given.
+    (voxels, classes, keypoints, 3), not normalised, in the order of the voxels given.
     """
     config = network.config
     writer = _Writer(fold_norms(network.eval()))
-    shape = ("voxels", config.classes, config.keypoints, config.components)
+    shape = ("voxels", config.classes, config.keypoints, 3)
     writer.graph.output("directions", writer.directions(shape), np.float32, shape)
     return writer.graph
 

@@ -5,7 +5,7 @@ import re
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import ClassVar, Literal
 
 import torch
 import torch.nn.functional as F
@@ -33,14 +33,14 @@ Widths = tuple[int, int, int, int]
 class ResUNetConfig:
     """Size of the network (FCGF's ResUNetBN2C, Choy et al. ICCV 2019, figure 3-3 of the thesis)."""
 
+    RETIRED: ClassVar[frozenset[str]] = frozenset({"with_confidence"})
+    """Settings of before, in older weights: no confidence is learnt any more."""
+
     classes: int = 13
     """Objects that one network knows; the segmentation says which of them a cloud is."""
 
     keypoints: int = 8
     """Keypoints of each object."""
-
-    with_confidence: bool = False
-    """A fourth output beside each direction: the logit of how far to trust it."""
 
     norm: Literal["batch", "none"] = "batch"
     """batch trains within hundreds of steps and is folded for use. none is the published network,
@@ -76,14 +76,9 @@ class ResUNetConfig:
             )
 
     @property
-    def components(self) -> int:
-        """Numbers for each point and keypoint: a direction, and maybe a logit."""
-        return 4 if self.with_confidence else 3
-
-    @property
     def outputs(self) -> int:
         """Channels of the last layer."""
-        return self.descriptor or self.classes * self.keypoints * self.components
+        return self.descriptor or self.classes * self.keypoints * 3
 
 
 BRANCH_SCALE = 0.25
@@ -169,49 +164,47 @@ class ResUNet(nn.Module):
                 self.mix.weight.mul_(NORMED_SCALE)
                 self.final.weight.mul_(NORMED_SCALE)
 
-    def forward(self, voxels: Voxels) -> Float[Tensor, "points classes keypoints components"]:
-        """Give the raw directions (and logits, where the config has them) of each point given.
+    def forward(self, voxels: Voxels) -> Float[Tensor, "points classes keypoints 3"]:
+        """Give the raw directions of each point given.
 
         They are not normalised: the loss pulls them to unit length, and the vote normalises.
         """
         assert self.config.descriptor is None, "a network of descriptors gives no directions"
         outputs = self.final(self._features(voxels)).at_points()
         c = self.config
-        return outputs.view(len(outputs), c.classes, c.keypoints, c.components)
+        return outputs.view(len(outputs), c.classes, c.keypoints, 3)
 
     def point_features(self, voxels: Voxels) -> Float[Tensor, "points width"]:
         """Give what the last layer sees of each point given: the features of figure 3-2."""
         return self._features(voxels).at_points()
 
-    def forward_class(
-        self, voxels: Voxels, number: int
-    ) -> Float[Tensor, "points keypoints components"]:
+    def forward_class(self, voxels: Voxels, number: int) -> Float[Tensor, "points keypoints 3"]:
         """Answer for one class alone, without computing the other classes' outputs."""
         return self._answer(self.point_features(voxels), number)
 
     def forward_classes(
         self, voxels: Voxels, class_of_point: Int[Tensor, " points"]
-    ) -> Float[Tensor, "points keypoints components"]:
+    ) -> Float[Tensor, "points keypoints 3"]:
         """Answer for each point's own class: several objects in one call."""
         features = self.point_features(voxels)
-        answers = features.new_empty(len(features), self.config.keypoints, self.config.components)
+        answers = features.new_empty(len(features), self.config.keypoints, 3)
         for number in class_of_point.unique().tolist():
             mine = class_of_point == number
             answers[mine] = self._answer(features[mine], number).to(answers)
         return answers
 
-    def directions(self, seen: SeenPoints) -> Float[Tensor, "points keypoints components"]:
+    def directions(self, seen: SeenPoints) -> Float[Tensor, "points keypoints 3"]:
         """Answer for each point's own class: what every network that votes offers."""
         voxels = Voxels.from_points(seen.coordinates, seen.features)
         return self.forward_classes(voxels, seen.class_of_point)
 
-    def _answer(self, features: Tensor, number: int) -> Float[Tensor, "n keypoints components"]:
+    def _answer(self, features: Tensor, number: int) -> Float[Tensor, "n keypoints 3"]:
         assert self.final.bias is not None
         assert 0 <= number < self.config.classes, f"class {number} of {self.config.classes}"
-        size = self.config.keypoints * self.config.components
+        size = self.config.keypoints * 3
         part = slice(number * size, (number + 1) * size)
         outputs = features @ self.final.weight[0, :, part] + self.final.bias[part]
-        return outputs.view(len(outputs), self.config.keypoints, self.config.components)
+        return outputs.view(len(outputs), self.config.keypoints, 3)
 
     def _features(self, voxels: Voxels) -> Voxels:
         seen: list[Voxels] = []

@@ -22,12 +22,7 @@ from depthpose.core.files.shards import read_bytes
 from depthpose.core.files.text import refuse_heavy
 from depthpose.core.rigid import Rigid
 from depthpose.core.run import claim_folder
-from depthpose.pose.datasets import (
-    BopDataset,
-    Detection,
-    Instance,
-    read_mask,
-)
+from depthpose.pose.datasets import BopDataset, Detection, Instance, read_mask
 from depthpose.pose.datasets.layouts import MOST, integer, make_pose, number, read_rows
 from depthpose.pose.types import (
     POSED,
@@ -365,9 +360,7 @@ def predict(
 
 
 def instance_jobs(
-    dataset: BopDataset,
-    names: Mapping[int, str],
-    mask_of: Callable[[Instance], Path] | None = None,
+    dataset: BopDataset, names: Mapping[int, str], mask_of: Callable[[Instance], Path] | None = None
 ) -> list[Job[ViewInput]]:
     """Take every annotated instance by its mask.
 

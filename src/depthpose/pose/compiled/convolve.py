@@ -53,11 +53,7 @@ def _add_row(out, row, weight):
 
 
 def convolved(
-    x: Tensor,
-    weight: Tensor,
-    table: Tensor,
-    fine_rows: int,
-    is_transposed: bool,
+    x: Tensor, weight: Tensor, table: Tensor, fine_rows: int, is_transposed: bool
 ) -> Tensor:
     """Convolve: ``out[o] = sum over neighbours (i, k) of o of x[i] @ weight[k]``.
 

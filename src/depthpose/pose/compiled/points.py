@@ -356,11 +356,7 @@ def _lay_planes(every, some, count, normals, bend):
 
 
 def compare_rays(
-    cloud: Tensor,
-    poses: Rigid,
-    points: Tensor,
-    rays: tuple[float, float, float, int],
-    limit: float,
+    cloud: Tensor, poses: Rigid, points: Tensor, rays: tuple[float, float, float, int], limit: float
 ) -> tuple[Tensor, Tensor]:
     """Compare a cloud with each pose of a surface.
 

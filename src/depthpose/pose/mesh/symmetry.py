@@ -210,9 +210,7 @@ def propose_symmetries(model: ObjectModel, tolerance: float = 0.02) -> list[Symm
     return sorted(found, key=lambda p: (p.kind != "continuous", -p.certainty))
 
 
-def symmetries_from_proposals(
-    proposals: list[SymmetryProposal],
-) -> Symmetries:
+def symmetries_from_proposals(proposals: list[SymmetryProposal]) -> Symmetries:
     """Take the sure ones: turns that an axis of revolution does not already say, and the axes.
 
     Without an axis the turns are completed to a group: two symmetries one after the other are one.

@@ -121,10 +121,7 @@ def random_clutter(generator: torch.Generator) -> Solid:
     corners = torch.tensor(mesh.triangles, dtype=torch.float32)
     normals = torch.tensor(mesh.face_normals, dtype=torch.float32)[:, None].expand(-1, 3, 3)
     return Solid(
-        triangles_m=corners,
-        normals=normals,
-        pattern=random_pattern(generator, size_m),
-        number=None,
+        triangles_m=corners, normals=normals, pattern=random_pattern(generator, size_m), number=None
     )
 
 
@@ -161,9 +158,7 @@ def random_light(up: Float[Tensor, "3"], generator: torch.Generator) -> Light:
     strength, warmth = uniform(generator, 0.3, 0.9), uniform(generator, -0.15, 0.15)
     colour = torch.tensor([1 + warmth, 1.0, 1 - warmth])
     return Light(
-        towards=towards,
-        lamp=strength * colour,
-        ambient=uniform(generator, 0.2, 0.6) * (2 - colour),
+        towards=towards, lamp=strength * colour, ambient=uniform(generator, 0.2, 0.6) * (2 - colour)
     )
 
 

@@ -11,9 +11,7 @@ from depthpose.pose.train.config import HeldOutConfig as HeldOutConfig
 from depthpose.pose.train.config import ModelsConfig as ModelsConfig
 from depthpose.pose.train.config import PointNetTraining as PointNetTraining
 from depthpose.pose.train.config import PoseTraining as PoseTraining
-from depthpose.pose.train.config import (
-    SegmentationTraining as SegmentationTraining,
-)
+from depthpose.pose.train.config import SegmentationTraining as SegmentationTraining
 from depthpose.pose.train.directions import PoseTask as PoseTask
 from depthpose.pose.train.directions import train_pose as train_pose
 from depthpose.pose.train.others import train_depth_image, train_segmentation

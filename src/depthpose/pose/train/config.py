@@ -105,11 +105,8 @@ class HeldOutConfig:
 
 
 @dataclass(frozen=True, kw_only=True)
-class PoseTraining:
-    """The direction network learns to point at keypoints."""
-
-    RETIRED: ClassVar[frozenset[str]] = frozenset({"calibration"})
-    """Settings of before: no risk is calibrated any more."""
+class ViewsTraining:
+    """What the trainings on views of known objects have in common."""
 
     models: ModelsConfig = field(default_factory=ModelsConfig)
     """What is learnt."""
@@ -119,6 +116,26 @@ class PoseTraining:
 
     frames: FramesConfig | None = None
     """Real frames to learn from, beside them."""
+
+    cloud: CloudConfig = field(default_factory=CloudConfig)
+    """How a view is lifted to a cloud."""
+
+    start: str | None = None
+    """Weights to begin with; of directions, those of other objects give all but the last layer."""
+
+    held_out: HeldOutConfig = field(default_factory=HeldOutConfig)
+    """Views of the validation."""
+
+    with_half: bool = False
+    """Write the weights in 16 bits."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class PoseTraining(ViewsTraining):
+    """The direction network learns to point at keypoints."""
+
+    RETIRED: ClassVar[frozenset[str]] = frozenset({"calibration", "confidence_weight"})
+    """Settings of before: no risk is calibrated any more, and no confidence learnt."""
 
     first_alone: int = 0
     """Synthetic views at the start that all show the first object. Several objects together take
@@ -136,22 +153,13 @@ class PoseTraining:
     )
     """The network; its classes and keypoints follow from the models."""
 
-    start: str | None = None
-    """Weights to begin with; those of other objects give all but the last layer."""
-
     loss: str = "mse"
     """Of the directions: mse, cosine, l1, or another of ``pose.losses.POINT_LOSSES``."""
-
-    confidence_weight: float = 0.1
-    """Of the loss of the confidences, where the network has them."""
 
     adam: AdamConfig = field(
         default_factory=lambda: AdamConfig(learning_rate=3e-3, schedule="cosine", warmup_steps=50)
     )
     """The optimiser."""
-
-    held_out: HeldOutConfig = field(default_factory=HeldOutConfig)
-    """Views of the validation."""
 
     loop: LoopConfig = field(
         default_factory=lambda: LoopConfig(
@@ -160,13 +168,10 @@ class PoseTraining:
     )
     """How long."""
 
-    with_half: bool = False
-    """Write the weights in 16 bits."""
-
     def __post_init__(self) -> None:
         """Refuse an unknown loss and a negative number of views."""
         refuse_unknown("loss", self.loss, POINT_LOSSES)
-        check_settings(self, first_alone="[0, inf)", confidence_weight="[0, inf)")
+        check_settings(self, first_alone="[0, inf)")
 
 
 def own_part(start: str) -> PoseTraining:
@@ -200,26 +205,11 @@ class PointNetTraining(PoseTraining):
 
 
 @dataclass(frozen=True, kw_only=True)
-class DepthImageTraining:
+class DepthImageTraining(ViewsTraining):
     """A network learns to regress the pose from the masked depth image."""
-
-    models: ModelsConfig = field(default_factory=ModelsConfig)
-    """What is learnt."""
-
-    objects: ObjectsConfig = field(default_factory=ObjectsConfig)
-    """Synthetic views to learn from."""
-
-    frames: FramesConfig | None = None
-    """Real frames to learn from, beside them."""
-
-    cloud: CloudConfig = field(default_factory=CloudConfig)
-    """How a view is lifted for the refinement that may follow."""
 
     network: DepthImageConfig = field(default_factory=DepthImageConfig)
     """The network; its classes follow from the models."""
-
-    start: str | None = None
-    """Weights to begin with."""
 
     surface_points: int = 500
     """Points of the model whose distances are the loss."""
@@ -229,18 +219,12 @@ class DepthImageTraining:
     )
     """The optimiser."""
 
-    held_out: HeldOutConfig = field(default_factory=HeldOutConfig)
-    """Views of the validation."""
-
     loop: LoopConfig = field(
         default_factory=lambda: LoopConfig(
             steps=10000, batch_size=16, clip_norm=1.0, ema_decay=0.999, save_every_steps=500
         )
     )
     """How long."""
-
-    with_half: bool = False
-    """Write the weights in 16 bits."""
 
     def __post_init__(self) -> None:
         """Refuse a loss of nothing."""

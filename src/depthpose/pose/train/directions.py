@@ -27,7 +27,7 @@ from depthpose.core.run import find_rank
 from depthpose.pose.baselines import PointNet, PointNetConfig
 from depthpose.pose.config import CloudConfig, RefusalConfig
 from depthpose.pose.estimator.alternatives import near_symmetry_lines
-from depthpose.pose.losses import choose_copies, confidence_loss, direction_loss, unit_directions
+from depthpose.pose.losses import direction_loss
 from depthpose.pose.mesh import symmetry_transforms
 from depthpose.pose.network import ResUNet, fold_norms, unfold_norms
 from depthpose.pose.sparse import Voxels
@@ -39,10 +39,7 @@ from depthpose.pose.train.clouds import (
     score_held_out,
     table_text,
 )
-from depthpose.pose.train.config import (
-    FramesConfig,
-    PoseTraining,
-)
+from depthpose.pose.train.config import PoseTraining, ViewsTraining
 from depthpose.pose.types import ObjectModel
 from depthpose.pose.weights import (
     AnyNetwork,
@@ -78,15 +75,13 @@ class PoseTask:
 
     def step(self, batch: CloudBatch) -> Iterator[Update]:
         """One update: all clouds at once."""
-        instance = batch.instance
-        outputs = self.network.directions(batch.seen).float()
-        found, copies_m = outputs[..., :3], self._posed(batch)
-        loss = direction_loss(found, batch.points_m, copies_m, instance, self.config.loss)
-        facts: dict[str, Tensor] = {"directions": loss.detach()}
-        if self.network.config.with_confidence:
-            trust = self._confidence(outputs, batch, copies_m)
-            loss, facts["confidence"] = loss + self.config.confidence_weight * trust, trust.detach()
-        yield Update("network", loss, facts)
+        directions = self.network.directions(batch.seen).float()
+        copies = self._copies_m.to(batch.R)[batch.class_of]
+        copies_m = copies @ batch.R.mT[:, None] + batch.t_m[:, None, None]
+        loss = direction_loss(
+            directions, batch.points_m, copies_m, batch.instance, self.config.loss
+        )
+        yield Update("network", loss, {"directions": loss.detach()})
 
     def validate(self) -> ValidationResult:
         """Pose held-out views with the current network."""
@@ -96,18 +91,6 @@ class PoseTask:
         result = self.held_out.look(self.network)
         self.network.train()
         return result
-
-    def _posed(self, batch: CloudBatch) -> Float[Tensor, "clouds copies keypoints 3"]:
-        copies = self._copies_m.to(batch.R)[batch.class_of]
-        return copies @ batch.R.mT[:, None] + batch.t_m[:, None, None]
-
-    def _confidence(
-        self, outputs: Tensor, batch: CloudBatch, copies_m: Float[Tensor, "clouds copies k 3"]
-    ) -> Float[Tensor, ""]:
-        found, logits, instance = outputs[..., :3], outputs[..., 3], batch.instance
-        copy = choose_copies(found, batch.points_m, copies_m, instance, self.config.loss)
-        truth_m = copies_m[torch.arange(len(copy), device=copy.device), copy][instance]
-        return confidence_loss(logits, found, unit_directions(batch.points_m, truth_m))
 
 
 def keypoint_copies(models: Sequence[ObjectModel]) -> Float[Tensor, "classes copies k 3"]:
@@ -151,7 +134,7 @@ def claim_run(config: Any, run: Run, files: Sequence[str] = ()) -> None:  # noqa
     run.claim(config, weights, more, without=("held_out", "calibration"))
 
 
-def train_words(what: str, config: Any) -> str:  # noqa: ANN401
+def train_words(what: str, config: ViewsTraining) -> str:
     """Give the command that trains this, with its CAD files, for the card."""
     cad = [word for path in config.models.cad for word in ("--cad", path)]
     unit = ["--unit", config.models.unit] if cad and config.models.unit else []
@@ -159,27 +142,18 @@ def train_words(what: str, config: Any) -> str:  # noqa: ANN401
 
 
 def packed(
-    network: AnyNetwork,
-    models: tuple[ObjectModel, ...],
-    config: Any,  # noqa: ANN401
+    network: AnyNetwork, models: tuple[ObjectModel, ...], config: ViewsTraining
 ) -> PoseWeights:
     """Put a trained network and its objects together, with what the card says of them."""
-    frames: FramesConfig | None = config.frames
-    cloud: CloudConfig = config.cloud
+    frames = "" if config.frames is None else f"{Path(config.frames.folder).name} and "
     names = ", ".join(model.name for model in models)
-    source = (
-        "synthetic views" if frames is None else f"{Path(frames.folder).name} and synthetic views"
-    )
-    facts = {
-        "trained_on": f"{source} of {names}",
-        "licence": config.models.licence,
-    }
+    facts = {"trained_on": f"{frames}synthetic views of {names}", "licence": config.models.licence}
     if config.models.terms:
         facts["terms"] = config.models.terms
     return PoseWeights(
         network=network.cpu().eval(),
         models=models,
-        cloud=cloud,
+        cloud=config.cloud,
         refusal=RefusalConfig(),
         facts=with_origin(facts, config),
     )

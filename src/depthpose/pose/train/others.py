@@ -337,10 +337,7 @@ class DepthImageTask:
     """ADD of the regressed pose against the nearest symmetric copy of the truth."""
 
     def __init__(
-        self,
-        network: DepthImageNet,
-        models: tuple[ObjectModel, ...],
-        config: DepthImageTraining,
+        self, network: DepthImageNet, models: tuple[ObjectModel, ...], config: DepthImageTraining
     ) -> None:
         self.config, self.models = config, models
         self.network = network.train()
