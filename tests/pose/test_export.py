@@ -71,7 +71,7 @@ def test_the_graph_is_the_network(network: ResUNet, session: object, coordinates
         expected = network(Voxels.from_points(coordinates, features))
     given = {"coordinates": coordinates.numpy(), "features": features.numpy()}
     (answer,) = session.run(None, given)  # pyright: ignore[reportAttributeAccessIssue]
-    assert answer.shape == (len(coordinates), 2, 3, 4)
+    assert answer.shape == (len(coordinates), 2, 3, 3)
     assert expected.std() > 1e-3
     np.testing.assert_allclose(answer, expected.numpy(), rtol=1e-4, atol=1e-5)
 
