@@ -12,7 +12,7 @@ import torch.nn.functional as F
 from jaxtyping import Float, Float64, Int
 from torch import Tensor, nn
 
-from depthpose.core.config_values import check_settings
+from depthpose.core.config import check_settings
 from depthpose.core.errors import import_open3d
 from depthpose.core.rigid import Rigid, turn_axis_to
 from depthpose.pose.cloud import cloud_from_depth

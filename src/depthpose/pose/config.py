@@ -3,7 +3,7 @@
 from dataclasses import dataclass, field
 from typing import ClassVar, Literal, get_args
 
-from depthpose.core.config_values import check_settings
+from depthpose.core.config import check_settings
 from depthpose.core.errors import InputError, refuse_seed
 
 VotingMethod = Literal["least squares", "ransac"]

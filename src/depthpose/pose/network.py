@@ -20,8 +20,7 @@ from depthpose.core.checkpoint import (
     read_published,
     save_checkpoint,
 )
-from depthpose.core.config import config_from_dict, config_to_dict
-from depthpose.core.config_values import check_settings
+from depthpose.core.config import check_settings, config_from_dict, config_to_dict
 from depthpose.core.errors import InputError
 from depthpose.pose.sparse import RowNorm, SparseConv, SparseConvTranspose, Voxels
 from depthpose.pose.types import SeenPoints

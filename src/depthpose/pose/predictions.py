@@ -18,7 +18,7 @@ from depthpose.core.config import config_from_dict
 from depthpose.core.errors import InputError, Notice, nearest_name
 from depthpose.core.files import write_json
 from depthpose.core.files.disk import refused_as, write_bytes
-from depthpose.core.files.shards import read_bytes
+from depthpose.core.files.store import read_bytes
 from depthpose.core.files.text import refuse_heavy
 from depthpose.core.rigid import Rigid
 from depthpose.core.run import claim_folder
