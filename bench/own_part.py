@@ -22,8 +22,8 @@ from depthpose.core.config import read_config
 from depthpose.pose.config import EstimateConfig
 from depthpose.pose.estimator import GeoPoseNet, Registration
 from depthpose.pose.metrics import is_within_diameter
+from depthpose.pose.train.clouds import held_out_objects, pose_error
 from depthpose.pose.train.config import PoseTraining
-from depthpose.pose.train.held_out import held_out_objects, pose_error
 from depthpose.pose.weights import PoseWeights, read_pose_weights
 from depthpose.report.page import markdown_table
 

@@ -23,7 +23,7 @@ import torch
 from depthpose.core.config import read_config
 from depthpose.core.files import write_json
 from depthpose.core.loop import Run
-from depthpose.pose.baselines.config import PointNetConfig
+from depthpose.pose.baselines import PointNetConfig
 from depthpose.pose.train import STAGES, PoseTraining
 from depthpose.pose.train.config import HeldOutConfig, ModelsConfig
 from depthpose.report.page import markdown_table, write_table

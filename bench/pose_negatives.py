@@ -23,6 +23,7 @@ from pathlib import Path
 from typing import Any, get_args
 
 import torch
+from negatives import SCALES, NegativeKind, negative_of
 
 from depthpose.core.checkpoint import find_weights
 from depthpose.core.loop import sample_generator
@@ -31,8 +32,7 @@ from depthpose.pose.estimator import GeoPoseNet, Registration
 from depthpose.pose.estimator.base import PoseEstimator
 from depthpose.pose.mesh import is_mirror_alike
 from depthpose.pose.synthetic import Objects
-from depthpose.pose.synthetic.negatives import SCALES, NegativeKind, negative_of
-from depthpose.pose.train.held_out import pose_error
+from depthpose.pose.train.clouds import pose_error
 from depthpose.pose.types import CloudSample, ObjectModel, ViewSample
 from depthpose.report.page import markdown_table
 

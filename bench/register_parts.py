@@ -19,14 +19,14 @@ from pathlib import Path
 from typing import Any, get_args
 
 import torch
+from negatives import NegativeKind, negative_kinds, negative_of, random_part, random_simple_part
 
 from depthpose.core.loop import sample_generator
 from depthpose.pose.config import ObjectsConfig
 from depthpose.pose.estimator import Registration
 from depthpose.pose.mesh import with_found_symmetries
-from depthpose.pose.synthetic import Objects, random_part, random_simple_part
-from depthpose.pose.synthetic.negatives import NegativeKind, negative_kinds, negative_of
-from depthpose.pose.train.held_out import pose_error
+from depthpose.pose.synthetic import Objects
+from depthpose.pose.train.clouds import pose_error
 from depthpose.pose.types import ObjectModel
 from depthpose.report.page import markdown_table
 

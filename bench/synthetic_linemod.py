@@ -30,7 +30,7 @@ from curves import draw_curves
 from depthpose.core.checkpoint import find_weights
 from depthpose.pose.baselines import FpfhEstimator
 from depthpose.pose.config import EstimateConfig, ObjectsConfig, SensorConfig, SensorKind
-from depthpose.pose.datasets.models import models_folder, read_bop_models, read_models_info
+from depthpose.pose.datasets.layouts import models_folder, read_bop_models, read_models_info
 from depthpose.pose.estimator import DepthImageRegressor, GeoPoseNet, Registration
 from depthpose.pose.mesh import sample_surface
 from depthpose.pose.metrics import add_m, adds_m, risk_coverage

@@ -18,7 +18,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from depthpose.pose.baselines.one_by_one import ransac_one_by_one
+from depthpose.pose.baselines import ransac_one_by_one
 from depthpose.pose.config import VotingConfig
 from depthpose.pose.voting import meet_lines, vote_ransac
 

@@ -14,7 +14,15 @@ import torch
 from tests.core.engine.doubles import InProcessEngine, unpacked
 from tests.depth.small_training import write_tiny_weights
 from tests.pose.synthetic_frames import draw_frame, frame_models, make_dataset, pose_in_frame
-from tests.pose.synthetic_objects import Oracle, bottle, bracket, cloud_of, pose_at, tiny_weights
+from tests.pose.synthetic_objects import (
+    Oracle,
+    bottle,
+    bracket,
+    cloud_of,
+    pose_at,
+    tiny_weights,
+    write_part,
+)
 from tests.test_cli_depth import write_doubtful_pairs
 from tests.test_cli_pose_predict import oracle_weights
 
@@ -31,7 +39,7 @@ from depthpose.core.files import (
 )
 from depthpose.pose.config import ObjectsConfig
 from depthpose.pose.datasets import write_bop_scene
-from depthpose.pose.synthetic import Objects, make_part, write_part
+from depthpose.pose.synthetic import Objects, make_part
 from depthpose.pose.weights import write_pose_weights
 
 RIG = {"width": 64, "height": 48, "K": [[70, 0, 31.5], [0, 70, 23.5], [0, 0, 1]], "baseline_m": 0.5}

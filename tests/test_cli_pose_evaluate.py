@@ -13,7 +13,7 @@ from tests.pose.synthetic_objects import tiny_weights
 
 from depthpose.cli import main
 from depthpose.core.checkpoint import file_sha256
-from depthpose.pose.baselines import fpfh
+from depthpose.pose import baselines
 from depthpose.pose.datasets import BopDataset, Detection, encode_rle, read_mask, write_detections
 from depthpose.pose.evaluate import frames_hash
 from depthpose.pose.predictions import read_predictions, write_bop_results, write_predictions
@@ -155,7 +155,7 @@ class KnowsNoPose:
 def test_registration_is_a_row_beside_weights(
     synthetic: BopDataset, weights: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(fpfh, "FpfhRegistration", KnowsNoPose)
+    monkeypatch.setattr(baselines, "FpfhRegistration", KnowsNoPose)
     words = ["--bop", str(synthetic.folder), "--weights", str(weights), "open3d", "--no-vsd"]
     assert main(["pose", "evaluate", *words, "--out", str(tmp_path / "out")]) == 0
     own = [row for row in rows_of(tmp_path / "out") if row["method"] == "open3d"]

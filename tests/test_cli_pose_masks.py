@@ -19,11 +19,11 @@ from depthpose.pose.datasets import (
     write_detections,
 )
 from depthpose.pose.predictions import read_predictions
-from depthpose.pose.resnet import normalise_colors
 from depthpose.pose.segmentation import (
     FCN,
     SegmentationConfig,
     SegmentationWeights,
+    normalise_colors,
     write_segmentation,
 )
 

@@ -39,9 +39,8 @@ from depthpose.core.files import (
 )
 from depthpose.pose.baselines import DepthImageConfig, DepthImageNet
 from depthpose.pose.datasets import BopDataset
-from depthpose.pose.datasets.results import read_results
 from depthpose.pose.metrics import add_m
-from depthpose.pose.predictions import read_predictions
+from depthpose.pose.predictions import read_bop_results, read_predictions
 from depthpose.pose.types import ObjectModel
 from depthpose.pose.weights import write_pose_weights
 
@@ -379,7 +378,7 @@ def test_a_data_set_gives_the_csv_and_pictures(
     assert main(["pose", "predict", *words]) == 0
     answered = [p for p in read_predictions(out) if p.estimate.is_posed]
     assert len(read_predictions(out)) == len(synthetic.instances)
-    results = read_results(out / f"depthpose_{synthetic.folder.name}-test.csv")
+    results = read_bop_results(out / f"depthpose_{synthetic.folder.name}-test.csv")
     assert len(results) == len(answered) > 0
     images = {(p.place.scene_id, p.place.image_id) for p in answered if p.place is not None}
     assert {f"{s:06d}_{i:06d}.pose.png" for s, i in images} == {p.name for p in out.glob("*.png")}

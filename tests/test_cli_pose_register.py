@@ -6,12 +6,13 @@ from pathlib import Path
 import pytest
 import torch
 from tests.pose.synthetic_frames import make_dataset
+from tests.pose.synthetic_objects import write_part
 
 from depthpose.cli import main
 from depthpose.core.camera import Camera, write_camera
 from depthpose.core.files import Cloud, read_cloud, write_cloud, write_depth_png, write_image
 from depthpose.pose.config import ObjectsConfig
-from depthpose.pose.synthetic import Objects, make_part, write_part
+from depthpose.pose.synthetic import Objects, make_part
 
 
 @pytest.fixture

@@ -15,10 +15,9 @@ from depthpose.cli import main, pose_methods
 from depthpose.cli.pose_inputs import cloud_jobs
 from depthpose.core.camera import Camera, back_project, write_camera
 from depthpose.core.files import read_cloud, write_depth_png
-from depthpose.pose.datasets.results import read_results
 from depthpose.pose.estimator import track as tracking_module
 from depthpose.pose.metrics import add_m
-from depthpose.pose.predictions import read_predictions
+from depthpose.pose.predictions import read_bop_results, read_predictions
 from depthpose.pose.types import PoseEstimate
 from depthpose.pose.weights import write_pose_weights
 
@@ -147,7 +146,7 @@ def test_the_objects_of_a_scene_are_followed(weights: Path, tmp_path: Path, word
     assert [p.place for p in found] == [(1, 0, 7), (1, 1, 7)]
     assert all(p.estimate.tracking is not None for p in found)
     answered = [p for p in found if p.estimate.is_posed]
-    assert len(read_results(tmp_path / "out/depthpose_made-test.csv")) == len(answered)
+    assert len(read_bop_results(tmp_path / "out/depthpose_made-test.csv")) == len(answered)
 
 
 @pytest.mark.parametrize(

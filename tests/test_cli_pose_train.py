@@ -6,11 +6,11 @@ import shutil
 from pathlib import Path
 
 import pytest
+from tests.pose.synthetic_objects import write_part
 
 from depthpose.cli import main
 from depthpose.core.config import read_config
 from depthpose.core.loop import Run
-from depthpose.pose.synthetic import write_part
 from depthpose.pose.train import STAGES, PoseTraining
 from depthpose.pose.weights import read_pose_weights
 

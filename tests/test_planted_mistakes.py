@@ -23,10 +23,11 @@ from depthpose.core.camera import (
 )
 from depthpose.core.errors import InputError
 from depthpose.core.files import write_depth_png
+from depthpose.core.units import Unit
 from depthpose.depth.disparity import disparity_advice, disparity_from_depth
 from depthpose.depth.estimator import refuse_unrectified
 from depthpose.depth.types import StereoInput
-from depthpose.pose.config import CloudConfig, EstimateConfig, Unit
+from depthpose.pose.config import CloudConfig, EstimateConfig
 from depthpose.pose.estimator.given import cloud_input, view_input
 from depthpose.pose.estimator.prepare import AnyInput, Refusal, prepare_cloud
 from depthpose.pose.mesh import read_model

@@ -4,10 +4,9 @@ import re
 from pathlib import Path
 
 import pytest
+from tests.pose.synthetic_objects import write_part
 from tests.written import ROOT, read_blocks, run
 from tests.written import commands as commands_of
-
-from depthpose.pose.synthetic import write_part
 
 README = (ROOT / "README.md").read_text()
 

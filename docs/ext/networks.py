@@ -265,7 +265,7 @@ def _sparse(conv: Any) -> str:  # noqa: ANN401 - of SparseConv
 
 def _product(net: ResUNet) -> str:
     c = net.config
-    return f"{c.classes} objects x {c.keypoints} keypoints x {c.components}"
+    return f"{c.classes} objects x {c.keypoints} keypoints x 3"
 
 
 def _answers(found: PoseNetworks) -> tuple[torch.Size, torch.Size]:

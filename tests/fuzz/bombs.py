@@ -42,10 +42,10 @@ from depthpose.depth.datasets.frames import read_plain_calibration
 from depthpose.depth.train import STAGES
 from depthpose.depth.weights import read_depth_weights
 from depthpose.pose.datasets import read_mask
-from depthpose.pose.datasets.linemod import read_yaml
+from depthpose.pose.datasets.layouts import read_yaml
 from depthpose.pose.datasets.masks import read_detections
-from depthpose.pose.datasets.results import read_results
 from depthpose.pose.mesh import read_model
+from depthpose.pose.predictions import read_bop_results
 
 Bomb = tuple[str, Callable[[], bytes | int], Callable[[Path], object]]
 """Name of the file; its bytes, or the size of a file of zeros; what reads it."""
@@ -173,7 +173,7 @@ BOMBS: dict[str, Bomb] = {
     "key values of lines": ("x.txt", lambda: 2**20 * b"\n", read_key_values),
     "metrics of lines": ("metrics.jsonl", lambda: LINES * b"\n", metrics),
     "metrics of rows": ("metrics.jsonl", lambda: 2**22 * b'{"step":1}\n' + b"\n", metrics),
-    "results of lines": ("x.csv", lambda: LINES * b"\n", read_results),
+    "results of lines": ("x.csv", lambda: LINES * b"\n", read_bop_results),
     "JSON of lists": ("x.json", lambda: b"[" + LINES // 3 * b"[]," + b"0]", read_json),
     "JSON of numbers": ("x.json", lambda: b"[" + 2**23 * b"1000," + b"x]", read_detections),
     "JSON of names": ("x.json", lambda: b"{" + b",".join(b'"%d":1' % i for i in range(2**21))

@@ -46,11 +46,10 @@ from depthpose.depth.synthesis import UNetGenerator
 from depthpose.depth.train import STAGES as DEPTH_STAGES
 from depthpose.depth.weights import read_depth_weights, write_depth_weights
 from depthpose.pose.datasets import open_bop, read_mask
-from depthpose.pose.datasets.linemod import read_yaml
+from depthpose.pose.datasets.layouts import read_yaml
 from depthpose.pose.datasets.masks import read_detections
-from depthpose.pose.datasets.results import BopResult, read_results, write_results
 from depthpose.pose.mesh import read_model
-from depthpose.pose.predictions import read_predictions
+from depthpose.pose.predictions import read_bop_results, read_predictions
 from depthpose.pose.train import STAGES as POSE_STAGES
 from depthpose.pose.weights import known_numbers, read_pose_weights, write_pose_weights
 
@@ -369,12 +368,9 @@ def open_bop_results(home: Path) -> dict[str, Kind]:
     from tests.pose.synthetic_frames import pose_in_frame
 
     from depthpose.pose.datasets.masks import Detection, write_detections
-    from depthpose.pose.predictions import Prediction, write_predictions
+    from depthpose.pose.predictions import Place, Prediction, write_bop_results, write_predictions
 
     pose = pose_in_frame(0.1, 3)
-    rows = [BopResult(scene_id=0, image_id=k, object_id=7, score=0.5, camera_from_model=pose,
-                      seconds=0.1) for k in range(3)]  # fmt: skip
-    write_results(home / "r.csv", rows)
     detection = Detection(scene_id=0, image_id=1, object_id=7, score=0.5,
                           segmentation=((3, 4, 13), 4, 5))  # fmt: skip
     write_detections(home / "d.json", [detection] * 2)
@@ -385,13 +381,15 @@ def open_bop_results(home: Path) -> dict[str, Kind]:
         covariance=torch.eye(6), free_motions=torch.zeros(0, 6), keypoints_m=torch.rand(8, 3),
         inlier_share=0.5, residual_m=0.1, certainty=0.9, signals={"x": 1.0}, seconds={"icp": 0.1},
     )  # fmt: skip
+    rows = [Prediction(estimate=estimate, place=Place(0, k, 7)) for k in range(3)]
+    write_bop_results(home / "r.csv", rows)
     refusal = PoseEstimate(name="c", object="b", status="doubtful", reason="why")
     write_predictions(home, [Prediction(estimate=estimate), Prediction(estimate=refusal)])
     gt = {1: [{"obj_id": 7, "cam_R_m2c": [1, 0, 0, 0, 1, 0, 0, 0, 1], "cam_t_m2c": [0, 0, 1]}]}
     write_json(home / "gt.json", gt)
     return {
         "BOP results": Kind(file="r.csv", good=(home / "r.csv").read_bytes(),
-                            damage=damage.hurt_text, readers=(read_results,)),
+                            damage=damage.hurt_text, readers=(read_bop_results,)),
         "BOP detections": Kind(file="d.json", good=(home / "d.json").read_bytes(),
                                damage=damage.hurt_json, readers=(read_detections,)),
         "poses": Kind(file="poses.json", good=(home / "poses.json").read_bytes(),

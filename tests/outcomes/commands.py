@@ -7,7 +7,7 @@ from pathlib import Path
 import torch
 from tests.depth.constant_selection import of_all_kinds, sure_of
 from tests.pose.synthetic_frames import frame_models, make_dataset
-from tests.pose.synthetic_objects import bracket, cloud_of, pose_at, tiny_weights
+from tests.pose.synthetic_objects import bracket, cloud_of, pose_at, tiny_weights, write_part
 from tests.pose.test_network import published_state
 from tests.raw_pairs import make_raw, write_kalibr
 from tests.synthetic_street import make_street, write_pairs
@@ -21,7 +21,7 @@ from depthpose.depth.types import StereoSample
 from depthpose.depth.weights import write_depth_weights
 from depthpose.pose.datasets import write_bop_models
 from depthpose.pose.network import ResUNet
-from depthpose.pose.synthetic import make_part, write_part
+from depthpose.pose.synthetic import make_part
 from depthpose.pose.weights import write_pose_weights
 
 VIEW = """

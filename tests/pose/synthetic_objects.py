@@ -1,5 +1,6 @@
 """An object whose sides all differ, its views, and a network that answers what a test says."""
 
+from pathlib import Path
 from typing import Any
 
 import torch
@@ -13,6 +14,7 @@ from depthpose.pose.estimator import GeoPoseNet
 from depthpose.pose.estimator.prepare import Prepared
 from depthpose.pose.mesh import make_model
 from depthpose.pose.network import ResUNet, ResUNetConfig
+from depthpose.pose.synthetic import PARTS
 from depthpose.pose.types import Axis, ObjectModel, Symmetries
 from depthpose.pose.weights import PoseWeights
 
@@ -140,3 +142,15 @@ class Oracle(GeoPoseNet):
         noise = torch.randn(directions.shape, generator=chance)
         is_wrong = torch.rand(len(points_m), generator=chance) < self.wrong
         return torch.where(is_wrong[:, None, None], noise, directions + self.noise * noise)
+
+
+def write_part(name: str, folder: Path) -> Path:
+    """Write a part as an STL file in millimetres, as a CAD program would; give the file."""
+    import trimesh
+
+    data = trimesh.Trimesh(*PARTS[name](), process=False).export(file_type="stl")
+    assert isinstance(data, bytes)
+    path = folder / f"{name}.stl"
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_bytes(data)
+    return path

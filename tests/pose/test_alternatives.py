@@ -23,10 +23,9 @@ from depthpose.pose.config import EstimateConfig
 from depthpose.pose.estimator.alternatives import difference_of, find_copies, share_out
 from depthpose.pose.mesh import (
     NearSymmetry,
-    kept,
     make_model,
-    near,
     near_symmetries,
+    symmetry,
     true_symmetries,
     turn_about,
 )
@@ -151,22 +150,22 @@ def test_what_was_found_is_kept_for_the_next_process(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("DEPTHPOSE_CACHE", str(tmp_path))
-    monkeypatch.setattr(kept, "_memory", OrderedDict())
+    monkeypatch.setattr(symmetry, "_memory", OrderedDict())
     model = replace(bar(), symmetries=Symmetries(is_found=True))
     found = near_symmetries(model)
     (path,) = tmp_path.glob("near_symmetries/*.json")
     assert found
     searches: list[ObjectModel] = []
-    search = near._search
+    search = symmetry._search
 
     def counted(model: ObjectModel) -> Any:  # noqa: ANN401
         searches.append(model)
         return search(model)
 
-    monkeypatch.setattr(near, "_search", counted)
+    monkeypatch.setattr(symmetry, "_search", counted)
 
     def again() -> tuple[NearSymmetry, ...]:
-        monkeypatch.setattr(kept, "_memory", OrderedDict())
+        monkeypatch.setattr(symmetry, "_memory", OrderedDict())
         return near_symmetries(model)
 
     assert all(

@@ -190,7 +190,7 @@ def test_whole_numbers_stay_below_their_count() -> None:
 @pytest.mark.parametrize(
     ("values", "text"),
     [
-        ({"number": 0}, "number is 0 and views 2000; both are 1 or more"),
+        ({"number": 0}, "number must be in [1, inf), got 0; the default is 1000"),
         ({"seed": -1}, "seed is -1; take 0 or more"),
         (
             {"seed": 2**64},
@@ -202,15 +202,15 @@ def test_whole_numbers_stay_below_their_count() -> None:
             "image_px is (640, 480); leave it out for the middle, (319.5, 239.5)",
         ),
         ({"image_px": (320, 240), "centre_px": (325.3, 242.0)}, "centre_px is (325.3, 242.0)"),
-        ({"image_px": (0, 480)}, "image_px is (0, 480)"),
-        ({"occluded_share": 1.5}, "occluded_share is 1.5, but a share is 0 to 1"),
-        ({"mask_error_px": -1}, "mask_error_px is -1; take 0 to 20, usually 3"),
-        ({"distance_m": (1.1, 0.6)}, "the lower end first; usual is (0.6, 1.1), in metres"),
-        ({"distance_m": (600.0, 1100.0)}, "distance_m is (600.0, 1100.0), but it is a range"),
-        ({"resolution": (0.0, 1.0)}, "resolution is (0.0, 1.0), but it is a range within 0.05"),
+        ({"image_px": (0, 480)}, "image_px must be in (0, inf), got (0, 480)"),
+        ({"occluded_share": 1.5}, "occluded_share must be in [0, 1], got 1.5"),
+        ({"mask_error_px": -1}, "mask_error_px must be in [0, 20], got -1; the default is 3"),
+        ({"distance_m": (1.1, 0.6)}, "distance_m must be a range, the lower end first"),
+        ({"distance_m": (600.0, 1100.0)}, "distance_m must be in [0.05, 20], got (600"),
+        ({"resolution": (0.0, 1.0)}, "resolution must be in [0.05, 4], got (0.0"),
         (
             {"occlusion": (0.0, 1.0)},
-            "occlusion is (0.0, 1.0), but it is a range within 0.0 to 0.95",
+            "occlusion must be in [0, 0.95], got (0.0, 1.0)",
         ),
     ],
 )
@@ -241,12 +241,12 @@ def test_the_principal_point_is_that_of_the_image(tmp_path: Path) -> None:
     ("values", "text"),
     [
         ({"kinds": ()}, "kinds is (); name one or more of structured light, active stereo, ti"),
-        ({"noise": (2.0, 1.0)}, "noise is (2.0, 1.0), but it is a range within 0.0 to 20.0"),
+        ({"noise": (2.0, 1.0)}, "noise must be a range, the lower end first, got (2.0, 1.0)"),
         (
             {"noise_correlation_px": (-1.0, 2.0)},
-            "noise_correlation_px is (-1.0, 2.0), but it is a range within 0.0 to 30.0",
+            "noise_correlation_px must be in [0, 30], got (-1.0, 2.0)",
         ),
-        ({"missing": (0.0, 1.0)}, "missing is (0.0, 1.0), but it is a range within 0.0 to 0.9"),
+        ({"missing": (0.0, 1.0)}, "missing must be in [0, 0.9], got (0.0, 1.0)"),
     ],
 )
 def test_bad_settings_of_a_sensor_are_refused(values: dict, text: str) -> None:

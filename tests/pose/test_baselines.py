@@ -16,6 +16,8 @@ from depthpose.core.errors import InputError, MissingExtraError
 from depthpose.core.render import rasterize
 from depthpose.core.rigid import Rigid, perturb, turn_axis_to
 from depthpose.pose.baselines import (
+    EMPTY,
+    DepthCrop,
     DepthImageConfig,
     DepthImageNet,
     FpfhConfig,
@@ -26,7 +28,6 @@ from depthpose.pose.baselines import (
     poses_of,
     rotation_from_6d,
 )
-from depthpose.pose.baselines.depth_image import EMPTY, DepthCrop
 from depthpose.pose.losses import model_point_loss
 from depthpose.pose.mesh import sample_surface
 from depthpose.pose.types import CloudInput, SeenPoints, ViewInput

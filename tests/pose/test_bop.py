@@ -25,10 +25,9 @@ from depthpose.pose.datasets import (
     write_bop_models,
     write_bop_scene,
 )
-from depthpose.pose.datasets.linemod import segnet_mask
-from depthpose.pose.datasets.models import read_bop_models
+from depthpose.pose.datasets.layouts import read_bop_models, segnet_mask
 from depthpose.pose.mesh import make_model, turn_about
-from depthpose.pose.train.task import keypoint_copies
+from depthpose.pose.train.directions import keypoint_copies
 from depthpose.pose.types import ObjectModel, Symmetries
 
 K = torch.tensor([[500.0, 0, 40], [0, 500, 30], [0, 0, 1]]).double()

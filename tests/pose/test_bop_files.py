@@ -10,18 +10,17 @@ from tests.pose.synthetic_frames import make_dataset
 from depthpose.core.errors import InputError
 from depthpose.core.rigid import Rigid
 from depthpose.pose.datasets import (
-    BopResult,
     Detection,
     decode_rle,
     encode_rle,
     open_bop,
     read_detections,
-    read_results,
     read_targets,
     write_detections,
-    write_results,
 )
 from depthpose.pose.datasets.masks import read_mask
+from depthpose.pose.predictions import Place, Prediction, read_bop_results, write_bop_results
+from depthpose.pose.types import PoseEstimate
 
 
 def test_masks_of_every_kind_are_read(tmp_path: Path) -> None:
@@ -51,22 +50,27 @@ def test_results_go_out_and_come_back(tmp_path: Path) -> None:
     q, _ = torch.linalg.qr(torch.randn(3, 3, generator=torch.Generator().manual_seed(0)).double())
     pose = Rigid(q * torch.linalg.det(q), torch.tensor([0.1, -0.2, 1 / 3], dtype=torch.float64))
     rows = [
-        BopResult(scene_id=1, image_id=i, object_id=5, score=0.5, camera_from_model=pose,
-                  seconds=None if i else 0.25)
-        for i in (0, 0, 1)
+        Prediction(estimate=PoseEstimate(name=f"row {k}", object="obj_000005", status="ok",
+                                         camera_from_model=pose, inlier_share=0.5,
+                                         seconds={} if i else {"image": 0.125}),
+                   place=Place(1, i, 5))
+        for k, i in enumerate((0, 0, 1), 1)
     ]  # fmt: skip
     path = tmp_path / "ours_lm-test.csv"
-    write_results(path, rows)
+    write_bop_results(path, rows)
     lines = path.read_text().splitlines()
     assert lines[0] == "scene_id,im_id,obj_id,score,R,t,time"
     assert lines[1].split(",")[5] == "100.0 -200.0 333.3333333333333"
     assert [line.split(",")[6] for line in lines[1:]] == ["0.25", "0.25", "-1"]
-    again = read_results(path)
+    again = read_bop_results(path)
     for row, other in zip(rows, again, strict=True):
-        assert torch.allclose(row.camera_from_model.R, other.camera_from_model.R, atol=1e-15)
-        assert torch.allclose(row.camera_from_model.t_m, other.camera_from_model.t_m, atol=1e-15)
-        for part in ("scene_id", "image_id", "object_id", "score", "seconds"):
-            assert getattr(row, part) == getattr(other, part)
+        found = other.estimate.camera_from_model
+        assert found is not None
+        assert torch.allclose(pose.R, found.R, atol=1e-15)
+        assert torch.allclose(pose.t_m, found.t_m, atol=1e-15)
+        assert row.place == other.place
+        for part in ("name", "object", "inlier_share", "seconds"):
+            assert getattr(row.estimate, part) == getattr(other.estimate, part)
 
 
 def test_bad_results_are_refused(tmp_path: Path) -> None:
@@ -84,7 +88,7 @@ def test_bad_results_are_refused(tmp_path: Path) -> None:
     ):
         path.write_text(text)
         with pytest.raises(InputError, match=said):
-            read_results(path)
+            read_bop_results(path)
 
 
 def test_run_lengths_are_coco_s(tmp_path: Path) -> None:

@@ -126,11 +126,11 @@ def test_samples_are_a_subset_in_order_and_reproducible() -> None:
 @pytest.mark.parametrize(
     ("setting", "value", "said"),
     [
-        ("voxel_m", 8.0, "0.008 means 8 mm"),
-        ("voxel_m", 0.0, "positive part of a metre"),
-        ("min_points", 2, "take 16"),
+        ("voxel_m", 8.0, r"voxel_m must be in \(0, 1\), got 8.0; the default is 0.008"),
+        ("voxel_m", 0.0, r"voxel_m must be in \(0, 1\), got 0.0"),
+        ("min_points", 2, r"min_points must be in \[3, inf\), got 2"),
         ("max_points", 10, "every cloud would be refused"),
-        ("max_offset_diameters", 0.0, "take 1"),
+        ("max_offset_diameters", 0.0, r"max_offset_diameters must be in \(0, inf\), got 0.0"),
     ],
 )
 def test_settings_out_of_range_are_refused(setting: str, value: object, said: str) -> None:

@@ -15,8 +15,8 @@ from torch import Tensor
 
 from depthpose.core.errors import Notice
 from depthpose.core.rigid import Rigid, rotation_by
+from depthpose.pose import compiled
 from depthpose.pose.cloud import local_planes
-from depthpose.pose.compiled import choice
 from depthpose.pose.config import IcpConfig, VotingConfig
 from depthpose.pose.estimator.scale import scale_of
 from depthpose.pose.network import ResUNet, ResUNetConfig
@@ -36,7 +36,7 @@ PARTS = ("bracket", "spool")
 def _without_gradients() -> Iterator[None]:
     with torch.no_grad():
         yield
-    choice.is_compiled.cache_clear()
+    compiled.is_compiled.cache_clear()
 
 
 def both(compute: Callable[[], T], monkeypatch: pytest.MonkeyPatch) -> tuple[T, T]:
@@ -44,8 +44,8 @@ def both(compute: Callable[[], T], monkeypatch: pytest.MonkeyPatch) -> tuple[T, 
     found = []
     for switch in ("0", "1"):
         monkeypatch.setenv("DEPTHPOSE_COMPILED", switch)
-        choice.is_compiled.cache_clear()
-        assert choice.is_compiled() == (switch == "1")
+        compiled.is_compiled.cache_clear()
+        assert compiled.is_compiled() == (switch == "1")
         found.append(compute())
     return found[0], found[1]
 
@@ -88,7 +88,7 @@ def test_nearest_surface_points(surface: Surface, monkeypatch: pytest.MonkeyPatc
 
 @pytest.mark.parametrize("count", [1, 7, 8, 9, 100])
 def test_trees_of_few_points(count: int) -> None:
-    from depthpose.pose.compiled.nearest import nearest_of, tree_of
+    from depthpose.pose.compiled.points import nearest_of, tree_of
 
     generator = torch.Generator().manual_seed(count)
     points = torch.randn(count, 3, generator=generator, dtype=torch.float64)
@@ -291,7 +291,7 @@ def test_without_a_folder_for_what_is_compiled(monkeypatch: pytest.MonkeyPatch) 
         return lambda function: function
 
     monkeypatch.setattr(numba, "njit", njit)
-    assert choice.compiled(test_networks) is inspect.unwrap(test_networks)
+    assert compiled.compiled(test_networks) is inspect.unwrap(test_networks)
     assert len(given) == 1
 
 
@@ -303,10 +303,10 @@ def test_what_is_compiled_is_kept_by_all_sources(
     names = []
     for text in ("one", "another"):
         (tmp_path / "loop.py").write_text(text)
-        monkeypatch.setattr(choice, "__file__", str(tmp_path / "choice.py"))
-        choice._digest.cache_clear()
-        names.append(choice._digest())
-    choice._digest.cache_clear()
+        monkeypatch.setattr(compiled, "__file__", str(tmp_path / "__init__.py"))
+        compiled._digest.cache_clear()
+        names.append(compiled._digest())
+    compiled._digest.cache_clear()
     assert names[0] != names[1]
     assert before == config.CACHE_DIR
 
@@ -316,10 +316,10 @@ def test_a_numba_that_cannot_be_imported_is_no_error(monkeypatch: pytest.MonkeyP
         raise ImportError(f"{name} needs NumPy 2.3 or less")
 
     monkeypatch.setenv("DEPTHPOSE_COMPILED", "1")
-    monkeypatch.setattr(choice, "import_module", fail)
-    choice.is_compiled.cache_clear()
+    monkeypatch.setattr(compiled, "import_module", fail)
+    compiled.is_compiled.cache_clear()
     with pytest.warns(Notice, match=r"numba needs NumPy 2.3 or less.*computed by torch"):
-        assert not choice.is_compiled()
+        assert not compiled.is_compiled()
 
 
 @pytest.mark.slow

@@ -18,8 +18,8 @@ from tests.pose.synthetic_frames import (
 from depthpose.core.errors import InputError
 from depthpose.core.rigid import Rigid, perturb
 from depthpose.pose.config import EvaluationConfig
-from depthpose.pose.datasets import BopDataset, Target
-from depthpose.pose.datasets.linemod import linemod_symmetries
+from depthpose.pose.datasets import BopDataset, BopTarget
+from depthpose.pose.datasets.layouts import linemod_symmetries
 from depthpose.pose.evaluate import (
     InstanceRow,
     ObjectRow,
@@ -196,7 +196,7 @@ def test_symmetry_or_the_rule_decides_which_of_the_two_adds(synthetic: BopDatase
 def test_targets_keep_the_most_visible(synthetic: BopDataset) -> None:
     hidden = replace(synthetic.instances[1], object_id=7, visible_fraction=0.2)
     some = replace(synthetic, instances=[hidden, *synthetic.instances])
-    target = Target(scene_id=1, image_id=0, object_id=7, count=1)
+    target = BopTarget(scene_id=1, image_id=0, object_id=7, count=1)
     assert [i.name for i in of_targets(some, [target]).instances] == [synthetic.instances[0].name]
     assert frames_hash(some.instances) != frames_hash(synthetic.instances)
     with pytest.raises(InputError, match="ask for 3 of object 7 in scene 1, image 0, but 2"):
@@ -222,7 +222,7 @@ def test_predictions_of_another_data_set_are_refused(synthetic: BopDataset) -> N
     with pytest.raises(InputError, match="none of the 6 predictions is of one of its 6 instances"):
         evaluate(synthetic, unknown)
     assert evaluate(synthetic, []).rows[0].refused == 1.0
-    with pytest.raises(InputError, match="vsd_delta_m is 15"):
+    with pytest.raises(InputError, match=r"vsd_delta_m must be in \(0, 1\), got 15"):
         EvaluationConfig(vsd_delta_m=15.0)
 
 

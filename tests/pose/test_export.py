@@ -12,8 +12,7 @@ from torch import Tensor
 from depthpose.cli import main
 from depthpose.core.errors import InputError
 from depthpose.pose.baselines import PointNet, PointNetConfig
-from depthpose.pose.export import pose_export
-from depthpose.pose.export.graph import direction_graph
+from depthpose.pose.export import direction_graph, pose_export
 from depthpose.pose.network import ResUNet, ResUNetConfig
 from depthpose.pose.sparse import Voxels, batch_coordinates
 from depthpose.pose.weights import write_pose_weights
@@ -38,7 +37,7 @@ def network(request: pytest.FixtureRequest) -> ResUNet:
     kernel = {"batch": 3, "none": 7}[request.param]
     config = ResUNetConfig(
         classes=2, keypoints=3, inputs=3, encoder=small, decoder=small, norm=request.param,
-        with_confidence=True, with_bias=request.param == "none", first_kernel=kernel,
+        with_bias=request.param == "none", first_kernel=kernel,
     )  # fmt: skip
     made = ResUNet(config)
     for name, tensor in made.named_buffers():
@@ -72,7 +71,7 @@ def test_the_graph_is_the_network(network: ResUNet, session: object, coordinates
         expected = network(Voxels.from_points(coordinates, features))
     given = {"coordinates": coordinates.numpy(), "features": features.numpy()}
     (answer,) = session.run(None, given)  # pyright: ignore[reportAttributeAccessIssue]
-    assert answer.shape == (len(coordinates), 2, 3, 4)
+    assert answer.shape == (len(coordinates), 2, 3, 3)
     assert expected.std() > 1e-3
     np.testing.assert_allclose(answer, expected.numpy(), rtol=1e-4, atol=1e-5)
 

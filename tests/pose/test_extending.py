@@ -21,7 +21,7 @@ from depthpose.core.files.cloud import CLOUD_READERS
 from depthpose.core.files.disk import AnyPath
 from depthpose.core.rigid import Rigid
 from depthpose.pose.datasets import LAYOUTS, Instance, Layout, is_bop, open_bop
-from depthpose.pose.datasets.frames import bop_instances
+from depthpose.pose.datasets.layouts import bop_instances
 from depthpose.pose.evaluate import METRICS, Metric
 from depthpose.pose.evaluate.errors import ErrorContext
 from depthpose.pose.losses import POINT_LOSSES, direction_loss
@@ -100,9 +100,9 @@ def test_extending_layouts(
     assert "own: 1 images, 2 instances" in capsys.readouterr().out
 
 
-def add_median(estimated: Rigid, instance: Instance, ruler: ErrorContext) -> float:
+def add_median(estimated: Rigid, instance: Instance, context: ErrorContext) -> float:
     """A metric of our own: the median distance of a model point [m]."""
-    points_m = ruler.model.vertices_m.double()
+    points_m = context.model.vertices_m.double()
     true = instance.camera_from_model
     gaps_m = (estimated.apply(points_m) - true.apply(points_m)).norm(dim=-1)
     return float(gaps_m.median())

@@ -1,16 +1,10 @@
-import math
-
 import pytest
 import torch
-import torch.nn.functional as F
 from torch import Tensor
 
 from depthpose.pose.losses import (
-    CONFIDENCE_SCALE_RAD,
     POINT_LOSSES,
     choose_copies,
-    confidence_loss,
-    confidence_target,
     direction_loss,
     instance_means,
     point_losses,
@@ -89,25 +83,3 @@ def test_no_points_no_loss() -> None:
     loss = direction_loss(found, torch.zeros(0, 3), torch.zeros(1, 1, 2, 3), nothing)
     loss.backward()
     assert float(loss.detach()) == 0
-    still = found.detach()
-    assert float(confidence_loss(torch.zeros(0, 2), still, still)) == 0
-
-
-def test_trust_is_one_for_a_right_vote_and_a_half_at_the_scale() -> None:
-    turned = torch.tensor([math.cos(CONFIDENCE_SCALE_RAD), math.sin(CONFIDENCE_SCALE_RAD), 0])
-    truth = torch.tensor([1.0, 0, 0]).expand(1, 3, 3)
-    found = torch.stack([3 * truth[0, 0], turned, -truth[0, 0]])[None]
-    target = confidence_target(found, truth)[0]
-    backwards = 1 / (1 + (math.pi / CONFIDENCE_SCALE_RAD) ** 2)
-    assert target.tolist() == pytest.approx([1, 0.5, backwards], rel=1e-5)
-
-
-def test_the_confidence_pays_cross_entropy_and_leaves_the_vote_alone() -> None:
-    found = torch.tensor([[[1.0, 0, 0]]], requires_grad=True)
-    logits = torch.tensor([[0.7]], requires_grad=True)
-    loss = confidence_loss(logits, found, torch.tensor([[[1.0, 0, 0]]]))
-    assert float(loss.detach()) == pytest.approx(-math.log(1 / (1 + math.exp(-0.7))))
-    loss.backward()
-    assert found.grad is None
-    assert logits.grad is not None
-    assert float(logits.grad) == pytest.approx(float(F.sigmoid(torch.tensor(0.7))) - 1)

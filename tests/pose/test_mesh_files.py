@@ -17,7 +17,7 @@ from depthpose.core.errors import InputError
 from depthpose.core.rigid import rotation_by
 from depthpose.pose.estimator import Registration
 from depthpose.pose.mesh import read_geometry, read_model, unit_advice
-from depthpose.pose.mesh.polygons import cut_polygons
+from depthpose.pose.mesh.files import cut_polygons
 
 # An L of 30 x 20 x 10 (mm), its caps concave: volume 4000, area 2 * 400 + 100 * 10.
 OUTLINE = [(0, 0), (30, 0), (30, 10), (10, 10), (10, 20), (0, 20)]

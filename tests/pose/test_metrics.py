@@ -9,7 +9,7 @@ from torch import Tensor
 
 from depthpose.core.rigid import Rigid
 from depthpose.pose.datasets import open_bop
-from depthpose.pose.evaluate.errors import make_ruler, measure
+from depthpose.pose.evaluate.errors import ErrorContext, measure
 from depthpose.pose.mesh import read_model, symmetries_from_bop, symmetry_transforms
 from depthpose.pose.metrics import (
     BOP_PIXELS,
@@ -76,12 +76,14 @@ def test_vsd_is_that_of_the_bop_toolkit(real: Path) -> None:
     data = open_bop(real / "pose/lm").of_objects("cat")
     assert len(data) == 1
     cat = data.objects[6]
-    ruler = make_ruler(cat, cat.diameter_m, is_adds=False, vsd_delta_m=VSD_DELTA_M)
+    context = ErrorContext(
+        model=cat, diameter_m=cat.diameter_m, is_adds=False, vsd_delta_m=VSD_DELTA_M
+    )
     first = reference["rows"][0]
     true = replace(data.instances[0], camera_from_model=pose_of(first["R_est"], first["t_est"]))
     assert tuple(reference["taus"]) == BOP_SHARES
     for row in reference["rows"]:
-        ours = measure(pose_of(row["R_est"], row["t_est"]), true, ruler)["vsd"]
+        ours = measure(pose_of(row["R_est"], row["t_est"]), true, context)["vsd"]
         assert ours.tolist() == pytest.approx(row["vsd"], abs=0.01)
 
 

@@ -1,6 +1,7 @@
 """A mirrored copy is not the object, unless the object is its own mirror image."""
 
 import pytest
+from bench.negatives import mirrored, negative_kinds
 from tests.pose.synthetic_objects import (
     Oracle,
     bottle,
@@ -17,7 +18,6 @@ from depthpose.pose.estimator.mirror import mirror_gain
 from depthpose.pose.mesh import is_mirror_alike, mirror_deviation
 from depthpose.pose.refine import refine_pose
 from depthpose.pose.surface import prepare_surface
-from depthpose.pose.synthetic.negatives import mirrored, negative_kinds
 from depthpose.pose.synthetic.parts import make_part
 from depthpose.pose.types import ObjectModel, PoseEstimate
 

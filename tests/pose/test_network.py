@@ -196,9 +196,9 @@ def test_moving_a_cloud_by_eight_voxels_changes_no_bit() -> None:
 
 
 def test_one_class_alone_answers_as_among_all() -> None:
-    network, voxels = tiny(with_confidence=True), Voxels.from_points(surface())
+    network, voxels = tiny(), Voxels.from_points(surface())
     outputs = network(voxels)
-    assert outputs.shape[1:] == (3, 4, 4)
+    assert outputs.shape[1:] == (3, 4, 3)
     for number in range(3):
         torch.testing.assert_close(network.forward_class(voxels, number), outputs[:, number])
     rows = torch.arange(len(outputs))
@@ -238,7 +238,7 @@ def test_few_voxels_train_too(points: int) -> None:
 
 
 def test_a_bare_network_comes_back(tmp_path: Path) -> None:
-    network = tiny(with_confidence=True)
+    network = tiny()
     path = tmp_path / "w.safetensors"
     write_network(path, network, {"licence": "MIT"})
     again, voxels = read_network(path), Voxels.from_points(surface())

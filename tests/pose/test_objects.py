@@ -124,7 +124,7 @@ def test_views_drawn_by_other_processes_are_the_same(monkeypatch: pytest.MonkeyP
     def draw(*_: object) -> None:
         raise AssertionError("every stored view is drawn already")
 
-    monkeypatch.setattr("depthpose.pose.synthetic.dataset.draw_view", draw)
+    monkeypatch.setattr("depthpose.pose.synthetic.views.draw_view", draw)
     found = [ahead.view(index).input.depth_m for index in range(12)]
     for mine, theirs in zip(found, expected, strict=True):
         assert torch.equal(mine.nan_to_num(), theirs)
@@ -274,5 +274,5 @@ def test_frames_refuse_what_they_cannot_show() -> None:
         next(make_frames([_numbered(1)], dataclasses.replace(_FRAME, distance_m=(0.2, 1.0)), 1))
     with pytest.raises(InputError, match="there is no object to show"):
         next(make_frames([], _FRAME, 1))
-    with pytest.raises(InputError, match=r"frame_objects is \(0, 2\), but it goes from 1 or more"):
+    with pytest.raises(InputError, match=r"frame_objects must be in \[1, inf\), got \(0, 2\)"):
         dataclasses.replace(_FRAME, frame_objects=(0, 2))

@@ -8,13 +8,13 @@ import torch
 
 from depthpose.core.errors import InputError, Notice
 from depthpose.core.rigid import Rigid, perturb
-from depthpose.pose.datasets import read_results
 from depthpose.pose.predictions import (
     Job,
     Place,
     Prediction,
     kept_predictions,
     predict,
+    read_bop_results,
     read_predictions,
     write_bop_results,
     write_predictions,
@@ -101,15 +101,17 @@ def test_the_csv_has_no_row_of_a_refusal_but_its_time(tmp_path: Path) -> None:
     ]
     path = tmp_path / "ours_lm-test.csv"
     write_bop_results(path, sent)
-    first, second = read_results(path)
-    assert (first.scene_id, first.image_id, first.object_id) == (1, 20, 6)
-    assert first.seconds == pytest.approx(0.122)
-    assert first.score == 0.5
-    assert (second.seconds, second.score) == (None, 0.75)
-    assert torch.allclose(first.camera_from_model.t_m, some_pose(0).t_m.double(), atol=1e-7)
+    first, second = read_bop_results(path)
+    assert first.place == (1, 20, 6)
+    assert first.estimate.seconds == {"image": pytest.approx(0.122)}
+    assert first.estimate.inlier_share == 0.5
+    assert (second.estimate.seconds, second.estimate.inlier_share) == ({}, 0.75)
+    assert first.estimate.camera_from_model is not None
+    t_m = first.estimate.camera_from_model.t_m
+    assert torch.allclose(t_m, some_pose(0).t_m.double(), atol=1e-7)
     write_bop_results(path, sent, with_alternatives=True)
-    scores = [(row.image_id, row.score) for row in read_results(path)]
-    assert scores == [(20, 0.5), (20, 0.375), (0, 0.75)]
+    scores = [(p.place, p.estimate.inlier_share) for p in read_bop_results(path)]
+    assert scores == [((1, 20, 6), 0.5), ((1, 20, 6), 0.375), ((2, 0, 6), 0.75)]
     with pytest.raises(InputError, match="a: belongs to no scene of a BOP data set"):
         write_bop_results(path, [Prediction(estimate=answer())])
 

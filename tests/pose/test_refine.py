@@ -13,7 +13,7 @@ from depthpose.core.rigid import Rigid, geodesic_rad, perturb
 from depthpose.pose.config import IcpConfig
 from depthpose.pose.datasets import open_bop
 from depthpose.pose.mesh import make_model, sample_surface
-from depthpose.pose.mesh.symmetry import turn_about
+from depthpose.pose.mesh.models import turn_about
 from depthpose.pose.metrics import add_m
 from depthpose.pose.refine import refine_best, refine_pose
 from depthpose.pose.surface import Surface, prepare_surface

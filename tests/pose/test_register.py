@@ -6,6 +6,8 @@ from pathlib import Path
 
 import pytest
 import torch
+from bench.negatives import random_part
+from tests.pose.synthetic_objects import write_part
 
 from depthpose import GeoPoseNet, Registration
 from depthpose.core.checkpoint import find_weights
@@ -15,7 +17,7 @@ from depthpose.pose.config import EstimateConfig, ObjectsConfig, VotingConfig
 from depthpose.pose.mesh import make_model, sample_surface
 from depthpose.pose.metrics import add_m
 from depthpose.pose.surface import prepare_surface
-from depthpose.pose.synthetic import Objects, make_part, random_part, write_part
+from depthpose.pose.synthetic import Objects, make_part
 from depthpose.pose.types import CloudSample, ObjectModel
 from depthpose.pose.voting.point_pairs import prepare_pairs, propose_poses
 from depthpose.pose.weights import read_pose_weights

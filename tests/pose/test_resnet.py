@@ -10,7 +10,7 @@ from torch import Tensor
 
 from depthpose.cli import main
 from depthpose.core.errors import InputError
-from depthpose.pose.resnet import (
+from depthpose.pose.segmentation import (
     ResNet18,
     import_resnet18,
     normalise_colors,

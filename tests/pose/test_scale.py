@@ -4,6 +4,7 @@ from typing import get_args
 
 import pytest
 import torch
+from bench.negatives import NegativeKind, mirrored, negative_of, scaled
 from tests.pose.synthetic_objects import Oracle, bracket, cloud_of, noisy, pose_at, tiny_weights
 
 from depthpose.core.loop import sample_generator
@@ -12,7 +13,6 @@ from depthpose.pose.config import EstimateConfig, RefusalConfig
 from depthpose.pose.estimator.scale import scale_of
 from depthpose.pose.refine import refine_pose
 from depthpose.pose.surface import prepare_surface
-from depthpose.pose.synthetic.negatives import NegativeKind, mirrored, negative_of, scaled
 from depthpose.pose.types import PoseEstimate
 
 TRUTH = pose_at(seed=1)

@@ -8,7 +8,7 @@ from tests.pose.synthetic_objects import bracket, tiny_weights
 
 from depthpose.core.errors import InputError
 from depthpose.core.rigid import Rigid
-from depthpose.pose.baselines.one_by_one import ransac_one_by_one
+from depthpose.pose.baselines import ransac_one_by_one
 from depthpose.pose.config import CloudConfig
 from depthpose.pose.estimator import GeoPoseNet
 from depthpose.pose.estimator.prepare import Prepared, prepare_cloud

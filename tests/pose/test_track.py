@@ -11,11 +11,7 @@ from depthpose.core.errors import InputError
 from depthpose.core.rigid import Rigid, rotation_by
 from depthpose.pose.estimator.track import TrackedObject, track
 from depthpose.pose.metrics import add_m
-from depthpose.pose.predictions import (
-    Prediction,
-    parse_prediction,
-    prediction_row,
-)
+from depthpose.pose.predictions import Prediction, parse_prediction, prediction_row
 from depthpose.pose.surface import compare_depths, prepare_surface
 from depthpose.pose.types import Alternative, PoseEstimate
 

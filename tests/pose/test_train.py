@@ -11,23 +11,18 @@ import pytest
 import torch
 import torch.nn.functional as F
 from tests.pose.stopping import StoppedError, stop_after
-from tests.pose.synthetic_objects import bottle, bracket, tiny_weights
+from tests.pose.synthetic_objects import bottle, bracket, tiny_weights, write_part
 
 from depthpose.core.config import read_config
 from depthpose.core.errors import InputError
 from depthpose.core.loop import AdamConfig, LoopConfig, Run
 from depthpose.core.rigid import Rigid
-from depthpose.pose.config import (
-    CloudConfig,
-    MeshConfig,
-    ObjectsConfig,
-    SensorConfig,
-)
+from depthpose.pose.config import CloudConfig, MeshConfig, ObjectsConfig, SensorConfig
 from depthpose.pose.datasets import write_bop_models, write_bop_scene
 from depthpose.pose.losses import unit_directions
 from depthpose.pose.network import ResUNet, ResUNetConfig, fold_norms
 from depthpose.pose.sparse import Voxels
-from depthpose.pose.synthetic import Objects, make_frames, write_part
+from depthpose.pose.synthetic import Objects, make_frames
 from depthpose.pose.train import (
     STAGES,
     FramesConfig,
@@ -39,14 +34,14 @@ from depthpose.pose.train import (
     read_models,
     train_pose,
 )
-from depthpose.pose.train.held_out import (
+from depthpose.pose.train.clouds import (
     HELD_OUT_SEED,
     HeldOut,
     held_out_objects,
     score_held_out,
     table_text,
 )
-from depthpose.pose.train.task import keypoint_copies, packed
+from depthpose.pose.train.directions import keypoint_copies, packed
 from depthpose.pose.types import ObjectModel, PoseEstimate, SeenPoints, Symmetries
 from depthpose.pose.weights import (
     PoseWeights,
@@ -386,7 +381,7 @@ def test_weights_are_measured_as_the_file_has_them(
         seen.append(weights)
         return {}
 
-    monkeypatch.setattr("depthpose.pose.train.runs.score_held_out", counted)
+    monkeypatch.setattr("depthpose.pose.train.directions.score_held_out", counted)
     path = train_pose(_training(with_half=True), Run(folder=tmp_path / "run"))
     written = read_pose_weights(path)
     (measured,) = seen
@@ -404,7 +399,7 @@ def test_held_out_views_are_right_ambiguous_wrong_or_refused(
     none = PoseEstimate(name="", object="", status="doubtful", reason="so")
     rows = [(sure, 0.02)] * 5 + [(sure, 0.4), (unsure, 0.01), (unsure, 0.5), (none, math.inf)] * 1
     answers = ([one for one, _ in rows], [error for _, error in rows])
-    monkeypatch.setattr("depthpose.pose.train.held_out._posed", lambda *_: answers)
+    monkeypatch.setattr("depthpose.pose.train.clouds._posed", lambda *_: answers)
     held_out = HeldOutConfig(number=4, occlusions=(0.0,))
     table = score_held_out(tiny_weights(*_models()), _VIEWS, held_out)
     shares = {"right": 5 / 9, "ambiguous": 2 / 9, "wrong": 1 / 9, "refused": 1 / 9, "median": 0.02}
@@ -470,13 +465,19 @@ def test_a_config_is_read_and_opens_with_its_own_command(path: Path) -> None:
 @pytest.mark.parametrize(
     ("make", "said"),
     [
-        (lambda: _training(first_alone=-1), "first_alone is -1; take 0 or more"),
+        (lambda: _training(first_alone=-1), "first_alone must be in [0, inf), got -1"),
         (FramesConfig, "frames has no folder"),
-        (lambda: FramesConfig(folder="x", share=0.0), "share is 0.0, but it is above 0"),
-        (lambda: HeldOutConfig(number=0), "nothing would be measured; take 25"),
-        (lambda: HeldOutConfig(occlusions=(0.0, 1.0)), "held_out.occlusions is (1.0, 1.0)"),
-        (lambda: ModelsConfig(symmetry_tolerance=-1.0), "symmetry_tolerance is -1.0"),
-        (lambda: PoseTraining(confidence_weight=-1.0), "confidence_weight is -1.0; take 0"),
+        (lambda: FramesConfig(folder="x", share=0.0), "share must be in (0, 1], got 0.0"),
+        (lambda: HeldOutConfig(number=0), "number must be in [1, inf), got 0"),
+        (lambda: HeldOutConfig(occlusions=()), "nothing would be measured; take (0, 0.3)"),
+        (
+            lambda: HeldOutConfig(occlusions=(0.0, 1.0)),
+            "occlusions must be in [0, 0.95], got (0.0, 1.0)",
+        ),
+        (
+            lambda: ModelsConfig(symmetry_tolerance=-1.0),
+            "symmetry_tolerance must be in (0, 1), got -1.0",
+        ),
     ],
 )
 def test_settings_that_cannot_be_are_refused(make, said: str) -> None:  # noqa: ANN001

@@ -10,12 +10,7 @@ import torch.nn.functional as F
 from tests.pose.stopping import StoppedError, stop_after
 from tests.pose.synthetic_objects import bottle, bracket
 
-from depthpose.core.checkpoint import (
-    Checkpoint,
-    LicenceNotice,
-    read_checkpoint,
-    save_checkpoint,
-)
+from depthpose.core.checkpoint import Checkpoint, LicenceNotice, read_checkpoint, save_checkpoint
 from depthpose.core.errors import InputError
 from depthpose.core.files import write_image
 from depthpose.core.loop import AdamConfig, LoopConfig, Run, read_metrics
@@ -24,8 +19,7 @@ from depthpose.pose.baselines import DepthImageConfig, PointNetConfig
 from depthpose.pose.config import CloudConfig, ObjectsConfig
 from depthpose.pose.datasets import BopFrame, BopObject, write_bop_models, write_bop_scene
 from depthpose.pose.estimator import DepthImageRegressor, GeoPoseNet
-from depthpose.pose.resnet import ResNet18
-from depthpose.pose.segmentation import SegmentationConfig, Segmenter
+from depthpose.pose.segmentation import ResNet18, SegmentationConfig, Segmenter
 from depthpose.pose.synthetic import Objects
 from depthpose.pose.train import (
     STAGES,
@@ -35,15 +29,17 @@ from depthpose.pose.train import (
     PointNetTraining,
     SegmentationTraining,
 )
-from depthpose.pose.train.depth_image import TrainingCrops, surface_points, symmetric_copies
-from depthpose.pose.train.images import (
+from depthpose.pose.train.config import ImageAugmentConfig, ImagesConfig
+from depthpose.pose.train.others import (
     AnnotatedImages,
     LabelledImage,
+    TrainingCrops,
     TrainingImages,
     cut_window,
     jitter_colors,
+    surface_points,
+    symmetric_copies,
 )
-from depthpose.pose.train.other_configs import ImageAugmentConfig, ImagesConfig
 
 LOOP = LoopConfig(steps=2, batch_size=2, device="cpu", log_every_steps=1)
 VIEWS = ObjectsConfig(number=8, views=2, resolution=(0.25, 0.25), distance_m=(0.6, 0.7))

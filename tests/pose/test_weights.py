@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 import torch
-from tests.pose.synthetic_objects import FACTS, bottle, bracket, tiny_weights
+from tests.pose.synthetic_objects import FACTS, bottle, bracket, tiny_weights, write_part
 
 from depthpose.cli import main
 from depthpose.core.checkpoint import Checkpoint, read_checkpoint, save_checkpoint
@@ -12,7 +12,7 @@ from depthpose.core.errors import InputError
 from depthpose.core.rigid import Rigid
 from depthpose.pose.config import CloudConfig, RefusalConfig
 from depthpose.pose.datasets import write_bop_models
-from depthpose.pose.synthetic import make_part, write_part
+from depthpose.pose.synthetic import make_part
 from depthpose.pose.types import ObjectModel, Symmetries
 from depthpose.pose.weights import (
     PoseWeights,

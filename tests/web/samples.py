@@ -2,6 +2,8 @@
 
 from pathlib import Path
 
+from tests.pose.synthetic_objects import write_part
+
 from depthpose.core.camera import Camera, write_camera
 from depthpose.core.files import Cloud, write_cloud, write_depth_png, write_image
 from depthpose.core.rigid import Rigid
@@ -10,7 +12,7 @@ from depthpose.depth.synthetic import Streets
 from depthpose.pose.cloud import cloud_from_depth
 from depthpose.pose.config import ObjectsConfig
 from depthpose.pose.datasets.write import write_mask
-from depthpose.pose.synthetic import Objects, make_part, write_part
+from depthpose.pose.synthetic import Objects, make_part
 
 PART = "flange"
 

@@ -19,7 +19,7 @@ from depthpose.core.files import MAP_SUFFIXES, cloud_suffixes, list_images
 from depthpose.core.files.disk import natural_order
 from depthpose.core.rigid import Rigid
 from depthpose.core.run import refuse_among_inputs
-from depthpose.pose.config import Unit
+from depthpose.core.units import Unit
 from depthpose.pose.datasets import BopDataset, encode_rle, object_names, read_labels
 from depthpose.pose.estimator.given import AnyMask, cloud_input, rigid_input, view_input
 from depthpose.pose.estimator.prepare import AnyInput

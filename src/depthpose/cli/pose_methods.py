@@ -20,8 +20,9 @@ from depthpose.core.errors import InputError
 from depthpose.core.files import read_image, write_json
 from depthpose.core.rigid import Rigid
 from depthpose.core.run import claim_folder
+from depthpose.core.units import Unit
 from depthpose.pose.baselines import DepthImageNet, FpfhConfig, FpfhEstimator
-from depthpose.pose.config import EstimateConfig, Unit
+from depthpose.pose.config import EstimateConfig
 from depthpose.pose.datasets import (
     LAYOUTS,
     BopDataset,
@@ -33,7 +34,7 @@ from depthpose.pose.datasets import (
     read_detections,
     write_detections,
 )
-from depthpose.pose.datasets.parse import integer, read_rows
+from depthpose.pose.datasets.layouts import integer, read_rows
 from depthpose.pose.estimator import DepthImageRegressor, GeoPoseNet, Registration
 from depthpose.pose.estimator.prepare import AnyInput
 from depthpose.pose.mesh import FIXED_UNITS, unit_of

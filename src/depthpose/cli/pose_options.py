@@ -6,13 +6,8 @@ from typing import Literal
 
 from depthpose.cli.arguments import Device, NewPath, Source, changed, group
 from depthpose.core.errors import InputError
-from depthpose.pose.config import (
-    DiameterTable,
-    EstimateConfig,
-    EvaluationConfig,
-    Unit,
-    VotingConfig,
-)
+from depthpose.core.units import Unit
+from depthpose.pose.config import DiameterTable, EstimateConfig, EvaluationConfig, VotingConfig
 
 Voting = Literal["ransac", "least-squares"]
 

@@ -21,7 +21,7 @@ from depthpose.core.engine import Files, Function, Item, Sample, is_url, shard_r
 from depthpose.core.errors import InputError
 from depthpose.core.files import cloud_suffixes, image_size, write_json
 from depthpose.core.files.images import LISTED_SUFFIXES
-from depthpose.pose.config import Unit
+from depthpose.core.units import Unit
 from depthpose.pose.datasets import BopDataset, open_bop
 from depthpose.pose.estimator.given import cloud_input, view_input
 from depthpose.pose.estimator.prepare import AnyInput

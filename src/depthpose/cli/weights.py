@@ -121,7 +121,7 @@ def import_weights(
 
         import_fcgf(file, out, classes=classes)
     elif kind == "resnet18":
-        from depthpose.pose.resnet import import_resnet18
+        from depthpose.pose.segmentation import import_resnet18
 
         import_resnet18(file, out)
     else:
@@ -198,7 +198,7 @@ def complete_weights(
     """
     from depthpose.core.checkpoint import find_weights
     from depthpose.core.run import refuse_to_replace
-    from depthpose.pose.datasets.models import read_bop_models
+    from depthpose.pose.datasets.layouts import read_bop_models
     from depthpose.pose.mesh import read_model
     from depthpose.pose.weights import complete_weights as complete
     from depthpose.pose.weights import known_numbers

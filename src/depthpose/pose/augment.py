@@ -75,8 +75,8 @@ def random_levels(height: int, width: int, generator: torch.Generator) -> Depth:
             angles = 2 * math.pi * turns / (turns[-1] + uniform(generator, 0.2, 0.8))
             far = 0.5 + torch.rand(sides, generator=generator)
             level = torch.full_like(along, -torch.inf)
-            for turn, reach in zip(angles.tolist(), far.tolist(), strict=True):
-                side = (math.cos(turn) * along + math.sin(turn) * across) / reach
+            for turn, extent in zip(angles.tolist(), far.tolist(), strict=True):
+                side = (math.cos(turn) * along + math.sin(turn) * across) / extent
                 level = torch.maximum(level, side)
             return level
 
@@ -172,11 +172,11 @@ def smooth_noise(size: tuple[int, int], width_px: float, generator: torch.Genera
 
     ``size`` is rows and columns; a Gaussian of deviation ``width_px`` 0 leaves the noise white.
     """
-    reach = math.ceil(3 * width_px)
-    white = torch.randn(size[0] + 2 * reach, size[1] + 2 * reach, generator=generator)
-    if reach == 0:
+    radius = math.ceil(3 * width_px)
+    white = torch.randn(size[0] + 2 * radius, size[1] + 2 * radius, generator=generator)
+    if radius == 0:
         return white
-    weights = (-0.5 * (torch.arange(-reach, reach + 1) / width_px).square()).exp()
+    weights = (-0.5 * (torch.arange(-radius, radius + 1) / width_px).square()).exp()
     weights = weights / weights.norm()
     along = F.conv2d(white[None, None], weights.view(1, 1, 1, -1))
     return F.conv2d(along, weights.view(1, 1, -1, 1))[0, 0]

@@ -65,7 +65,12 @@ def cloud_from_depth(
     """
     refuse_other_size(mask, depth_m)
     is_read = mask & torch.isfinite(depth_m) & (depth_m > 0)
-    points_m = _lifted(depth_m, is_read, K)
+    # As ``back_project`` does, for a fraction of the image.
+    v, u = is_read.nonzero(as_tuple=True)
+    (fx, skew, cx), (_, fy, cy), _ = K.tolist()
+    y = (v.to(depth_m) - cy) / fy
+    x = (u.to(depth_m) - cx - skew * y) / fx
+    points_m = torch.stack([x, y, torch.ones_like(x)], -1) * depth_m[is_read][:, None]
     if diameter_m is None or len(points_m) == 0:
         return points_m
     config = CloudConfig() if config is None else config
@@ -77,17 +82,6 @@ def object_points(given: CloudInput | ViewInput, diameter_m: float) -> Float[Ten
     if isinstance(given, ViewInput):
         return cloud_from_depth(given.depth_m, given.mask, given.K, diameter_m).float()
     return given.points_m[is_reading(given.points_m)].float()
-
-
-def _lifted(
-    depth_m: Float[Tensor, "h w"], is_read: Bool[Tensor, "h w"], K: Float[Tensor, "3 3"]
-) -> Float[Tensor, "n 3"]:
-    """Do as ``back_project`` for some pixels alone, a fraction of the image."""
-    v, u = is_read.nonzero(as_tuple=True)
-    (fx, skew, cx), (_, fy, cy), _ = K.tolist()
-    y = (v.to(depth_m) - cy) / fy
-    x = (u.to(depth_m) - cx - skew * y) / fx
-    return torch.stack([x, y, torch.ones_like(x)], -1) * depth_m[is_read][:, None]
 
 
 def refuse_other_size(mask: Bool[Tensor, "mask_h mask_w"], depth_m: Float[Tensor, "h w"]) -> None:
@@ -199,8 +193,14 @@ def voxelise(points_m: Float[Tensor, "n 3"], config: CloudConfig) -> VoxelGrid:
     row_of_point = rank.argsort()[cell]
     features = torch.ones(len(kept), 1, dtype=torch.float32, device=kept.device)
     if config.with_shape:
-        parts = (_means(places - cells, row_of_point), _planes(points_m, kept, turn))
-        features = torch.cat([features, *parts], 1)
+        # The mean of the points of each cell about its middle, in half cells, and their number.
+        inside = places - cells
+        counts = torch.bincount(row_of_point).to(inside)[:, None]
+        sums = inside.new_zeros(len(counts), 3).index_add(0, row_of_point, inside)
+        normals, bend = local_planes(points_m.double().cpu(), points_m[kept].double().cpu())
+        plane = torch.cat([normals @ turn.double().cpu().mT, bend], 1).to(sums)
+        shape = torch.cat([2 * sums / counts - 1, counts.log2(), plane], 1)
+        features = torch.cat([features, shape.float()], 1)
     return VoxelGrid(
         coordinates=cells[kept],
         kept=kept,
@@ -208,22 +208,6 @@ def voxelise(points_m: Float[Tensor, "n 3"], config: CloudConfig) -> VoxelGrid:
         grid_from_camera=turn,
         features=features,
     )
-
-
-def _means(inside: Float[Tensor, "n 3"], row_of_point: Int64[Tensor, " n"]) -> Float[Tensor, "m 4"]:
-    """Average the points of each cell about its middle, in half cells; count them."""
-    counts = torch.bincount(row_of_point).to(inside)[:, None]
-    sums = inside.new_zeros(len(counts), 3).index_add(0, row_of_point, inside)
-    return torch.cat([2 * sums / counts - 1, counts.log2()], 1).float()
-
-
-def _planes(
-    points_m: Float[Tensor, "n 3"], kept: Int64[Tensor, " m"], turn: Float[Tensor, "3 3"]
-) -> Float[Tensor, "m 4"]:
-    """Lay a plane through the nearest 20 of each kept point: its normal, and how bent it is."""
-    every, some = points_m.double().cpu(), points_m[kept].double().cpu()
-    normals, bend = local_planes(every, some)
-    return torch.cat([normals @ turn.double().cpu().mT, bend], 1).float().to(points_m.device)
 
 
 def local_planes(
@@ -236,7 +220,7 @@ def local_planes(
     """
     count = min(_NEIGHBOURS, len(every_m))
     if serves(every_m, some_m):
-        from depthpose.pose.compiled.planes import planes_of
+        from depthpose.pose.compiled.points import planes_of
 
         normals, bend = planes_of(every_m.numpy(), some_m.numpy(), count)
         return torch.from_numpy(normals), torch.from_numpy(bend)[:, None]

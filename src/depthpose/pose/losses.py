@@ -12,9 +12,6 @@ from depthpose.core.rigid import Rigid
 
 Directions = Float[Tensor, "points keypoints 3"]
 
-CONFIDENCE_SCALE_RAD = 0.1415
-"""Angle of a vote whose target confidence is a half: its cosine is 0.99, RANSAC's threshold."""
-
 
 def unit_directions(
     points_m: Float[Tensor, "points 3"], keypoints_m: Float[Tensor, "points keypoints 3"]
@@ -97,26 +94,6 @@ def direction_loss(
     means = instance_means(losses, instance, len(copies_m))
     seen = torch.bincount(instance, minlength=len(copies_m)) > 0
     return means.sum() / seen.sum()
-
-
-def confidence_target(
-    found: Directions, truth: Directions, scale_rad: float = CONFIDENCE_SCALE_RAD
-) -> Float[Tensor, "points keypoints"]:
-    """Give the confidence that each vote should have: 1 / (1 + (angle / scale)^2); no gradient."""
-    found = found.detach()
-    # atan2 keeps its digits near 0 and pi, where acos of a cosine loses half of them.
-    across = torch.linalg.cross(found, truth).norm(dim=-1)
-    angle_rad = torch.atan2(across, (found * truth).sum(-1))
-    return 1 / (1 + (angle_rad / scale_rad).square())
-
-
-def confidence_loss(
-    logits: Float[Tensor, "points keypoints"], found: Directions, truth: Directions
-) -> Float[Tensor, ""]:
-    """Binary cross entropy of the network's confidences against those its votes should have."""
-    if not len(logits):
-        return logits.sum()
-    return F.binary_cross_entropy_with_logits(logits, confidence_target(found, truth))
 
 
 def mask_loss(

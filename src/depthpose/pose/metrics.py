@@ -60,11 +60,7 @@ def add_m(estimated: Rigid, true: Rigid, points_m: Float[Tensor, "n 3"]) -> Floa
 
 
 def adds_m(
-    estimated: Rigid,
-    true: Rigid,
-    points_m: Float[Tensor, "n 3"],
-    *,
-    from_estimate: bool = False,
+    estimated: Rigid, true: Rigid, points_m: Float[Tensor, "n 3"], *, from_estimate: bool = False
 ) -> Float[Tensor, "*batch"]:
     """ADD-S [m]: mean distance of each point to the nearest at the other pose.
 
@@ -151,11 +147,7 @@ def mspd_px(
 
 
 def vsd(
-    estimated: Rigid,
-    true: Rigid,
-    view: View,
-    taus_m: Sequence[float],
-    delta_m: float = VSD_DELTA_M,
+    estimated: Rigid, true: Rigid, view: View, taus_m: Sequence[float], delta_m: float = VSD_DELTA_M
 ) -> Float[Tensor, " t"]:
     """VSD: share of the visible surface whose distance is off by ``tau`` or more, for each tau.
 
@@ -171,9 +163,15 @@ def vsd(
         taus_m: tolerances; BOP's are ``BOP_SHARES`` times the diameter.
         delta_m: tolerance of visibility.
     """
-    rays = _ray_lengths(view.depth_m, view.K)
-    depths = (view.depth_m, view.render(estimated), view.render(true))
-    measured, found, known = (_filled(depth) * rays for depth in depths)
+    # Distance from the centre of a point at depth 1, by pixel.
+    pixels, K = pixel_grid(*view.depth_m.shape, torch.float64), view.K
+    y = (pixels[..., 1] - K[1, 2]) / K[1, 1]
+    x = (pixels[..., 0] - K[0, 2] - K[0, 1] * y) / K[0, 0]
+    rays = (x * x + y * y + 1).sqrt()
+    measured, found, known = (
+        depth_m.double().nan_to_num(nan=0.0, posinf=0.0) * rays
+        for depth_m in (view.depth_m, view.render(estimated), view.render(true))
+    )
     is_known = _is_visible(known, measured, delta_m)
     is_found = _is_visible(found, measured, delta_m) | (is_known & (found > 0))
     both, either = is_known & is_found, is_known | is_found
@@ -242,19 +240,6 @@ def _symmetric_copies(true: Rigid, symmetries: Rigid, points: int) -> list[Rigid
         Rigid(pose.R @ rows, pose.t_m + (pose.R @ shift[..., None]).squeeze(-1))
         for rows, shift in zip(R.split(size), t_m.split(size), strict=True)
     ]
-
-
-def _ray_lengths(depth_m: Float[Tensor, "h w"], K: Float[Tensor, "3 3"]) -> Float[Tensor, "h w"]:
-    """Distance from the centre of a point at depth 1, by pixel."""
-    height, width = depth_m.shape
-    pixels = pixel_grid(height, width, torch.float64)
-    y = (pixels[..., 1] - K[1, 2]) / K[1, 1]
-    x = (pixels[..., 0] - K[0, 2] - K[0, 1] * y) / K[0, 0]
-    return (x * x + y * y + 1).sqrt()
-
-
-def _filled(depth_m: Float[Tensor, "h w"]) -> Float[Tensor, "h w"]:
-    return depth_m.double().nan_to_num(nan=0.0, posinf=0.0)
 
 
 def _is_visible(model: Tensor, measured: Tensor, delta_m: float) -> Bool[Tensor, "h w"]:

@@ -14,8 +14,7 @@ from torch.nn.functional import max_pool2d
 from depthpose.core.rigid import Rigid
 from depthpose.pose.compiled import serves
 from depthpose.pose.mesh import sample_surface, symmetry_transforms
-from depthpose.pose.mesh.sampling import fibonacci_directions
-from depthpose.pose.mesh.sides import across_walls, cell_of, outward_normals
+from depthpose.pose.mesh.models import across_walls, cell_of, fibonacci_directions, outward_normals
 from depthpose.pose.types import ObjectModel
 
 NEAR = 0.05
@@ -89,7 +88,7 @@ class Surface:
     def nearest(self, points_m: Float64[Tensor, "*batch n 3"]) -> Int64[Tensor, "*batch n"]:
         """Give the number of the surface point nearest to each point of the model frame."""
         if serves(points_m):
-            from depthpose.pose.compiled.nearest import nearest_of
+            from depthpose.pose.compiled.points import nearest_of
 
             return torch.from_numpy(nearest_of(points_m.numpy(), self.target.tree)[0])
         return torch.from_numpy(self.tree.query(points_m.numpy(), workers=1)[1])
@@ -187,7 +186,7 @@ def look_along_rays(
     middle = seen.median(0).values.floor()
     limit_m = 1.5 * NEAR * surface.diameter_m
     if serves(cloud_m, poses.R, poses.t_m):
-        from depthpose.pose.compiled.rays import compare_rays
+        from depthpose.pose.compiled.points import compare_rays
 
         rays = (scale, *middle.tolist(), _REACH)
         return compare_rays(cloud_m, poses, surface.points_m[::every], rays, limit_m)

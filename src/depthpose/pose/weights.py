@@ -113,7 +113,15 @@ def write_pose_weights(
         "network": config_to_dict(network.config),
         "cloud": config_to_dict(weights.cloud),
         "refusal": config_to_dict(weights.refusal),
-        "models": [_record_of(model) for model in weights.models],
+        "models": [
+            {
+                "name": model.name,
+                "number": model.number,
+                "diameter_m": model.diameter_m,
+                **symmetries_to_bop(model.symmetries),
+            }
+            for model in weights.models
+        ],
     }
     facts = dict(weights.facts)
     if isinstance(network, ResUNet):
@@ -143,22 +151,15 @@ def complete_weights(path: Path, meshes: Mapping[int, ObjectModel], out: Path) -
                 f"among {sorted(meshes)}. Give the data set that it was trained on."
             )
         model = meshes[number]
-        _refuse_another(model, keypoints_m, record, path)
+        off_m, own_m = gap_to_surface_m(keypoints_m, model), record["diameter_m"]
+        if off_m > _OFF * own_m or abs(model.diameter_m / own_m - 1) > _OTHER_SIZE:
+            raise InputError(
+                f"{path}: a keypoint of object {number} ({record['name']}, {own_m:.3g} m long) "
+                f"lies {off_m:.3g} m off the model {model.name} ({model.diameter_m:.3g} m long): "
+                "another object, frame or unit. Give the models that it was trained on."
+            )
         state |= {f"models.{k}.{name}": _small(getattr(model, name)) for name in _SURFACE}
     save_checkpoint(out, dataclasses.replace(checkpoint, state=state))
-
-
-def _refuse_another(
-    model: ObjectModel, keypoints_m: Tensor, record: Mapping[str, Any], path: Path
-) -> None:
-    """Refuse a mesh of another size, or that the keypoints do not lie on."""
-    off_m, own_m = gap_to_surface_m(keypoints_m, model), record["diameter_m"]
-    if off_m > _OFF * own_m or abs(model.diameter_m / own_m - 1) > _OTHER_SIZE:
-        raise InputError(
-            f"{path}: a keypoint of object {record['number']} ({record['name']}, {own_m:.3g} m "
-            f"long) lies {off_m:.3g} m off the model {model.name} ({model.diameter_m:.3g} m long): "
-            "another object, frame or unit. Give the models that it was trained on."
-        )
 
 
 def known_numbers(path: Path) -> tuple[int, ...]:
@@ -188,9 +189,12 @@ def read_pose_weights(path: Path) -> PoseWeights:
     checkpoint, source = read_checkpoint(path), str(path)
     network = _network_of(checkpoint, source)
     if not any(f"models.0.{name}" in checkpoint.state for name in _SURFACE):
+        word = quote(str(path))
+        with suppress(InputError):  # a name where it leads there
+            word = path.stem if find_weights(path.stem) == path else word
         raise InputError(
             f"{path}: came without its objects' meshes, which their licence keeps back. Put them "
-            f"in once: depthpose weights complete {_word_for(path)} --models FOLDER --out "
+            f"in once: depthpose weights complete {word} --models FOLDER --out "
             f"{quote(path.stem + '-complete.safetensors')}, with the data set's folder."
         )
     parts = {name: _part(checkpoint, name, source) for name in ("cloud", "refusal")}
@@ -199,7 +203,10 @@ def read_pose_weights(path: Path) -> PoseWeights:
         raise InputError(f"{path}: its config lists no 'models', so nothing could be posed.")
     with refused_as(path, "file of pose weights", "it is damaged, or of another version"):
         models = tuple(_read_model(checkpoint, k, source) for k in range(len(records)))
-    _refuse_strays(checkpoint, len(models), source)
+    known = ("network.", *(f"models.{k}." for k in range(len(models))))
+    strays = [name for name in checkpoint.state if not name.startswith(known)]
+    if strays:
+        raise InputError(f"{source}: tensor {strays[0]!r} is unexpected; it belongs to no part.")
     return PoseWeights(
         network=network,
         models=models,
@@ -207,14 +214,6 @@ def read_pose_weights(path: Path) -> PoseWeights:
         refusal=config_from_dict(parts["refusal"], RefusalConfig, source=source),
         facts={name: fact for name, fact in checkpoint.facts.items() if name != "norm_mode"},
     )
-
-
-def _word_for(path: Path) -> str:
-    """Give the word that names weights on the command line: a name where it leads there."""
-    with suppress(InputError):
-        if find_weights(path.stem) == path:
-            return path.stem
-    return quote(str(path))
 
 
 def read_pose_network(path: Path) -> AnyNetwork:
@@ -236,15 +235,6 @@ def _network_of(checkpoint: Checkpoint, source: str) -> AnyNetwork:
     config = config_from_dict(_part(checkpoint, "network", source), kind, source=source)
     held = dataclasses.replace(checkpoint, state=_under(checkpoint, "network."))
     return build_network(lambda: made(config), held, source).eval()
-
-
-def _record_of(model: ObjectModel) -> dict[str, Any]:
-    return {
-        "name": model.name,
-        "number": model.number,
-        "diameter_m": model.diameter_m,
-        **symmetries_to_bop(model.symmetries),
-    }
 
 
 def _read_model(checkpoint: Checkpoint, k: int, source: str) -> ObjectModel:
@@ -279,13 +269,6 @@ def _part(checkpoint: Checkpoint, name: str, source: str) -> Mapping[str, Any]:
     if not isinstance(part, Mapping):
         raise InputError(f"{source}: its config has no {name!r}; the file is of another version.")
     return part
-
-
-def _refuse_strays(checkpoint: Checkpoint, models: int, source: str) -> None:
-    known = ("network.", *(f"models.{k}." for k in range(models)))
-    strays = [name for name in checkpoint.state if not name.startswith(known)]
-    if strays:
-        raise InputError(f"{source}: tensor {strays[0]!r} is unexpected; it belongs to no part.")
 
 
 def _under(checkpoint: Checkpoint, prefix: str) -> dict[str, Tensor]:

@@ -16,7 +16,7 @@ from torch import Tensor
 
 from depthpose.core.errors import InputError
 from depthpose.core.rigid import Rigid
-from depthpose.pose.baselines.one_by_one import ransac_one_by_one
+from depthpose.pose.baselines import ransac_one_by_one
 from depthpose.pose.cloud import cloud_from_depth, refusal_of, sample_points, voxelise
 from depthpose.pose.config import VotingConfig
 from depthpose.pose.estimator import GeoPoseNet

@@ -5,10 +5,106 @@ have hundreds of points, and most of torch's time is the overhead of its calls. 
 each function compiles it; what was compiled is kept on disk until a source changes.
 """
 
-from depthpose.pose.compiled.choice import GRAZING as GRAZING
-from depthpose.pose.compiled.choice import LOOKED_UP as LOOKED_UP
-from depthpose.pose.compiled.choice import ON_RAY as ON_RAY
-from depthpose.pose.compiled.choice import SEARCHED as SEARCHED
-from depthpose.pose.compiled.choice import SLACK as SLACK
-from depthpose.pose.compiled.choice import is_compiled as is_compiled
-from depthpose.pose.compiled.choice import serves as serves
+import inspect
+import os
+import warnings
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from functools import cache
+from hashlib import sha256
+from importlib import import_module
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from depthpose.core.errors import Notice
+
+LOOKED_UP, SEARCHED, ON_RAY = 0, 1, 2
+"""How the sample of a surface that a point shows is found."""
+SLACK = 0.1
+"""Sine of the angle by which a surface may face away from the camera and still be seen."""
+GRAZING = 0.1
+"""Sine of the angle between a ray and a plane below which they meet nowhere near."""
+_SWITCH = "DEPTHPOSE_COMPILED"
+"""Environment variable; 0 keeps to torch."""
+
+
+@cache
+def is_compiled() -> bool:
+    """Whether numba can be imported, and the user did not switch it off (``DEPTHPOSE_COMPILED=0``).
+
+    Warns:
+        Notice: numba is installed and cannot be imported, for instance beside a NumPy that is newer
+            than it knows.
+    """
+    if os.environ.get(_SWITCH, "1") == "0" or find_spec("numba") is None:
+        return False
+    try:
+        import_module("numba")
+    except Exception as error:  # noqa: BLE001  whatever it is, torch computes the same
+        warnings.warn(
+            f"numba does not work here ({error}): poses are computed by torch, in two and a half "
+            f"times the time. Install another version of it, or set {_SWITCH}=0.",
+            Notice,
+            stacklevel=2,
+        )
+        return False
+    return True
+
+
+def serves(*tensors: Tensor) -> bool:
+    """Whether compiled functions serve for these: on the processor, and without gradients."""
+    with_gradients = torch.is_grad_enabled() and any(t.requires_grad for t in tensors)
+    return not with_gradients and all(t.device.type == "cpu" for t in tensors) and is_compiled()
+
+
+def finite_array(values: Tensor | np.ndarray) -> np.ndarray:
+    """Give what a compiled loop reads: contiguous, and finite, as cells and trees need it.
+
+    Raises:
+        ValueError: a value is not finite.
+    """
+    array = values.detach().numpy() if isinstance(values, Tensor) else values
+    if not np.isfinite(array).all():
+        raise ValueError("values must be finite; leave out what is not")
+    return np.ascontiguousarray(array)
+
+
+def compiled(function: Callable[..., Any]) -> Any:  # noqa: ANN401  numba's dispatcher
+    """Compile a function when it is first called; what was compiled is kept on disk."""
+    from numba import njit
+
+    # Tests check annotations by wrapping every function: numba wants what is inside.
+    inner = inspect.unwrap(function)
+    try:
+        with _cached_by_source():
+            return njit(cache=True, nogil=True, error_model="numpy")(inner)
+    except RuntimeError:  # no folder that may be written to
+        return njit(nogil=True, error_model="numpy")(inner)
+
+
+@contextmanager
+def _cached_by_source() -> Iterator[None]:
+    """Keep what is compiled in a folder for all sources as they are.
+
+    numba itself looks at the file of a function alone, and functions call those of other files.
+    """
+    config: Any = import_module("numba").config
+    before = config.CACHE_DIR
+    config.CACHE_DIR = str(Path(__file__).parent / "__pycache__" / f"numba-{_digest()}")
+    try:
+        yield
+    finally:
+        config.CACHE_DIR = before
+
+
+@cache
+def _digest() -> str:
+    digest = sha256()
+    for path in sorted(Path(__file__).parent.glob("*.py")):
+        digest.update(path.read_bytes())
+    return digest.hexdigest()[:16]

@@ -3,8 +3,8 @@
 import numpy as np
 from torch import Tensor
 
-from depthpose.pose.compiled.choice import compiled
-from depthpose.pose.compiled.nearest import Array
+from depthpose.pose.compiled import compiled
+from depthpose.pose.compiled.points import Array
 
 
 def rows_of(keys: Array, standing: Array, moves: list[int]) -> Array:
@@ -53,11 +53,7 @@ def _add_row(out, row, weight):
 
 
 def convolved(
-    x: Tensor,
-    weight: Tensor,
-    table: Tensor,
-    fine_rows: int,
-    is_transposed: bool,
+    x: Tensor, weight: Tensor, table: Tensor, fine_rows: int, is_transposed: bool
 ) -> Tensor:
     """Convolve: ``out[o] = sum over neighbours (i, k) of o of x[i] @ weight[k]``.
 

@@ -5,8 +5,8 @@ import torch
 from torch import Tensor
 
 from depthpose.core.rigid import Rigid
-from depthpose.pose.compiled.algebra import damp, rotation, solve
-from depthpose.pose.compiled.choice import LOOKED_UP, ON_RAY, SEARCHED, compiled, finite_array
+from depthpose.pose.compiled import LOOKED_UP, ON_RAY, SEARCHED, compiled, finite_array
+from depthpose.pose.compiled.points import damp, rotation, solve
 from depthpose.pose.compiled.target import Target, match
 
 

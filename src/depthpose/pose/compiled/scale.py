@@ -4,8 +4,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from depthpose.pose.compiled.algebra import damp, rotation, solve
-from depthpose.pose.compiled.choice import compiled, finite_array
+from depthpose.pose.compiled import compiled, finite_array
+from depthpose.pose.compiled.points import damp, rotation, solve
 from depthpose.pose.compiled.target import Target, find_places
 
 

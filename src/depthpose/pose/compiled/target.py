@@ -4,8 +4,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from depthpose.pose.compiled.choice import GRAZING, LOOKED_UP, ON_RAY, SLACK, compiled
-from depthpose.pose.compiled.nearest import Array, Tree, faces, neighbours, tree_of
+from depthpose.pose.compiled import GRAZING, LOOKED_UP, ON_RAY, SLACK, compiled
+from depthpose.pose.compiled.points import Array, Tree, faces, neighbours, tree_of
 
 
 class Target(NamedTuple):

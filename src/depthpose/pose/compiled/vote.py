@@ -1,26 +1,94 @@
-"""Lines to the point where they meet, for the keypoints of one object.
-
-The formulas are those of :mod:`depthpose.pose.voting`.
-"""
+"""Votes of lines to keypoints, and keypoints to a pose; the formulas are those of pose.voting."""
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from depthpose.pose.compiled.algebra import jacobi, solve
-from depthpose.pose.compiled.choice import compiled, finite_array
+from depthpose.core.rigid import Rigid
+from depthpose.pose.compiled import compiled, finite_array
+from depthpose.pose.compiled.points import jacobi, rotation, solve
+
+_FARTHEST = 1e9
+"""A step beyond this is none."""
+
+
+def fitted(
+    pose: Rigid, model: Tensor, found: Tensor, information: Tensor, steps: int
+) -> tuple[Rigid, Tensor]:
+    """Move poses to the least ``sum e^T W e`` with ``e = R m + t - p``.
+
+    Args:
+        pose: one or a batch, to begin with, float64.
+        model: keypoints of the model, (..., k, 3).
+        found: those that were found, (..., k, 3).
+        information: inverse covariances W, (..., k, 3, 3), 0 where a keypoint does not count.
+        steps: so many.
+
+    Returns:
+        The poses, and their information matrices of (rotation, translation), (..., 6, 6).
+    """
+    R, t_m = pose.R.contiguous().clone(), pose.t_m.contiguous().clone()
+    H = R.new_empty(*R.shape[:-2], 6, 6)
+    keypoints = (a.contiguous().numpy().reshape(-1, *a.shape[-2:]) for a in (model, found))
+    W = information.contiguous().numpy().reshape(-1, *information.shape[-3:])
+    poses = (R.view(-1, 3, 3).numpy(), t_m.view(-1, 3).numpy())
+    _fit(*poses, *keypoints, W, steps, H.view(-1, 6, 6).numpy())
+    return Rigid(R, t_m), H
+
+
+@compiled
+def _add_equations(R, t, model, found, information, H, b):
+    """Add up the normal equations, ``J = [-[R m + t]_x, I]``."""
+    H[:] = 0.0
+    b[:] = 0.0
+    J, WJ, moved = np.zeros((3, 6)), np.empty((3, 6)), np.empty(3)
+    J[0, 3] = J[1, 4] = J[2, 5] = 1.0
+    for i in range(len(model)):
+        W = information[i]
+        for c in range(3):
+            moved[c] = t[c]
+            for m in range(3):
+                moved[c] += R[c, m] * model[i, m]
+        x, y, z = moved
+        J[0, 1], J[0, 2], J[1, 0], J[1, 2], J[2, 0], J[2, 1] = z, -y, -z, x, y, -x
+        for c in range(3):
+            for k in range(6):
+                WJ[c, k] = W[c, 0] * J[0, k] + W[c, 1] * J[1, k] + W[c, 2] * J[2, k]
+        for k in range(6):
+            for c in range(3):
+                b[k] += WJ[c, k] * (found[i, c] - moved[c])
+                for m in range(6):
+                    H[k, m] += J[c, k] * WJ[c, m]
+
+
+@compiled
+def _fit(Rs, ts, model, found, information, steps, Hs):
+    H, b, motion, turn = np.empty((6, 6)), np.empty(6), np.empty(6), np.empty((3, 3))
+    for p in range(len(ts)):
+        R, t = Rs[p], ts[p]
+        for _ in range(steps):
+            _add_equations(R, t, model[p], found[p], information[p], H, b)
+            solve(H, b, motion)
+            if not np.abs(motion).max() < _FARTHEST:  # keypoints that fix nothing
+                break
+            rotation(motion[0], motion[1], motion[2], turn)
+            R[:] = turn @ R
+            t[:] = turn @ t + motion[3:]
+        _add_equations(R, t, model[p], found[p], information[p], Hs[p], b)
+
 
 _SMALLEST = 1e-12
 
 
 def met(
-    lines: tuple[Tensor, Tensor, Tensor], refinements: int, nearest: float
+    points: Tensor, directions: Tensor, weights: Tensor, refinements: int, nearest: float
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Find the point where the lines of each keypoint meet best.
 
     Args:
-        lines: points (1, 3, n) about their mean, unit directions (k, 3, n), weights (k, n), all
-            float64.
+        points: about their mean, (1, 3, n), float64 as the others.
+        directions: of unit length, (k, 3, n).
+        weights: (k, n).
         refinements: steps after the nearest point.
         nearest: points nearer to a keypoint than this share of the mean distance weigh no more.
 
@@ -30,10 +98,10 @@ def met(
     Raises:
         ValueError: a value is not finite.
     """
-    count = len(lines[1])
+    count = len(directions)
     out = [torch.empty(count, *shape, dtype=torch.float64) for shape in ((3,), (3, 3), ())]
-    given = (finite_array(a) for a in lines)
-    _meet(*given, refinements, nearest, *(a.numpy() for a in out))
+    arrays = (finite_array(a) for a in (points, directions, weights))
+    _meet(*arrays, refinements, nearest, *(a.numpy() for a in out))
     return out[0], out[1], out[2]
 
 
@@ -94,15 +162,15 @@ def _gradients(local, n, w, p, nearest, A, gradient):
     A[:] = 0.0
     for i in range(len(w)):
         x, y, z = p[0] - local[0, i], p[1] - local[1, i], p[2] - local[2, i]
-        reach = max(np.sqrt(x * x + y * y + z * z), _SMALLEST)
-        x, y, z = x / reach, y / reach, z / reach
-        reach = max(reach, least)
+        distance = max(np.sqrt(x * x + y * y + z * z), _SMALLEST)
+        x, y, z = x / distance, y / distance, z / distance
+        distance = max(distance, least)
         cosine = n[0, i] * x + n[1, i] * y + n[2, i] * z
-        pull = w[i] / reach / total
+        pull = w[i] / distance / total
         gradient[0, i] = (n[0, i] - x * cosine) * pull
         gradient[1, i] = (n[1, i] - y * cosine) * pull
         gradient[2, i] = (n[2, i] - z * cosine) * pull
-        _add_outer(A, pull / reach * max(cosine, 0.5), x, y, z)
+        _add_outer(A, pull / distance * max(cosine, 0.5), x, y, z)
     _mirror(A)
 
 

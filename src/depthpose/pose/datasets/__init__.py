@@ -1,14 +1,15 @@
-"""BOP's layout and that of Linemod_preprocessed: read, write and check; detections and results."""
+"""BOP's layout and that of Linemod_preprocessed: read, write and check; detections."""
 
 from depthpose.pose.datasets.check import check_bop as check_bop
 from depthpose.pose.datasets.dataset import BopDataset as BopDataset
 from depthpose.pose.datasets.dataset import is_bop as is_bop
 from depthpose.pose.datasets.dataset import open_bop as open_bop
-from depthpose.pose.datasets.frames import Instance as Instance
-from depthpose.pose.datasets.frames import Target as Target
-from depthpose.pose.datasets.frames import read_targets as read_targets
 from depthpose.pose.datasets.layouts import LAYOUTS as LAYOUTS
+from depthpose.pose.datasets.layouts import BopTarget as BopTarget
+from depthpose.pose.datasets.layouts import Instance as Instance
 from depthpose.pose.datasets.layouts import Layout as Layout
+from depthpose.pose.datasets.layouts import object_names as object_names
+from depthpose.pose.datasets.layouts import read_targets as read_targets
 from depthpose.pose.datasets.masks import Detection as Detection
 from depthpose.pose.datasets.masks import decode_rle as decode_rle
 from depthpose.pose.datasets.masks import encode_rle as encode_rle
@@ -19,10 +20,6 @@ from depthpose.pose.datasets.masks import read_detections as read_detections
 from depthpose.pose.datasets.masks import read_labels as read_labels
 from depthpose.pose.datasets.masks import read_mask as read_mask
 from depthpose.pose.datasets.masks import write_detections as write_detections
-from depthpose.pose.datasets.models import object_names as object_names
-from depthpose.pose.datasets.results import BopResult as BopResult
-from depthpose.pose.datasets.results import read_results as read_results
-from depthpose.pose.datasets.results import write_results as write_results
 from depthpose.pose.datasets.write import BopFrame as BopFrame
 from depthpose.pose.datasets.write import BopObject as BopObject
 from depthpose.pose.datasets.write import write_bop_models as write_bop_models

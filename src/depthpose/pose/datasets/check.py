@@ -14,9 +14,9 @@ from depthpose.core.files import image_size, read_depth_png
 from depthpose.core.findings import CheckReport, Problem, make_report, unreadable
 from depthpose.pose.cloud import cloud_from_depth, refusal_of
 from depthpose.pose.datasets.dataset import open_bop, read_instance_mask
-from depthpose.pose.datasets.frames import Instance
-from depthpose.pose.datasets.layouts import layout_of
-from depthpose.pose.datasets.models import (
+from depthpose.pose.datasets.layouts import (
+    Instance,
+    layout_of,
     model_path,
     models_folder,
     object_name,
@@ -193,13 +193,11 @@ def _check_content(instance: Instance, model: ObjectModel) -> Iterator[Problem]:
             "depth_scale and cam_t_m2c both for millimetres?"
         )
         yield Problem(path=instance.depth, kind="mismatch", message=message)
-    elif _share_in_mask(instance, model, mask) < _FEW_IN_MASK and not _is_occluded(instance):
+    elif _share_in_mask(instance, model, mask) < _FEW_IN_MASK and not (
+        instance.visible_fraction is not None and instance.visible_fraction < _FEW_IN_MASK
+    ):
         message = f"{instance.name}: the posed model does not lie on its mask; is it another's?"
         yield Problem(path=instance.mask, kind="mismatch", message=message)
-
-
-def _is_occluded(instance: Instance) -> bool:
-    return instance.visible_fraction is not None and instance.visible_fraction < _FEW_IN_MASK
 
 
 def _share_in_mask(instance: Instance, model: ObjectModel, mask: Bool[Tensor, "h w"]) -> float:

@@ -14,15 +14,16 @@ from depthpose.core.errors import InputError
 from depthpose.core.files import read_depth_png
 from depthpose.pose.cloud import cloud_from_depth, refuse_other_size
 from depthpose.pose.config import CloudConfig, MeshConfig
-from depthpose.pose.datasets.frames import Instance
-from depthpose.pose.datasets.layouts import find_layout, layout_of
-from depthpose.pose.datasets.masks import read_mask
-from depthpose.pose.datasets.models import (
+from depthpose.pose.datasets.layouts import (
+    Instance,
+    find_layout,
+    layout_of,
     models_folder,
     object_name,
     read_bop_models,
     read_models_info,
 )
+from depthpose.pose.datasets.masks import read_mask
 from depthpose.pose.types import (
     CloudInput,
     CloudSample,

@@ -1,17 +1,397 @@
-"""Layouts of pose data sets on the disk: which splits a folder has, and their instances."""
+"""Layouts of pose data sets on the disk (BOP, Linemod_preprocessed): annotations and models."""
 
-from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
+import math
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
-from depthpose.pose.datasets.frames import Instance, bop_instances, bop_scenes, bop_splits
-from depthpose.pose.datasets.linemod import (
-    linemod_instances,
-    linemod_splits,
-    linemod_symmetries,
-    segnet_mask,
-)
-from depthpose.pose.types import Symmetries
+import torch
+from jaxtyping import Float, Float64
+from torch import Tensor
+
+from depthpose.core.camera.pinhole import check_intrinsics
+from depthpose.core.errors import InputError
+from depthpose.core.files import read_json, read_text
+from depthpose.core.files.images import LISTED_SUFFIXES
+from depthpose.core.files.text import parse_yaml, refuse_heavy
+from depthpose.core.rigid import Rigid
+from depthpose.pose.config import MeshConfig
+from depthpose.pose.mesh import read_model, symmetries_from_bop, turn_about
+from depthpose.pose.types import ObjectModel, Symmetries
+
+_ROTATION_SLACK = 1e-2
+"""Published annotations are rounded; LineMOD's rotations are off by up to a few thousandths."""
+
+
+MOST = 10**9
+"""Of scenes, images and objects: their numbers name files."""
+
+
+def entry_number(key: object) -> int | None:
+    """Take the number that names a scene, an image or an object; None where it is none."""
+    text = str(key)
+    return int(text) if len(text) <= 9 and text.isascii() and text.isdecimal() else None
+
+
+def read_mapping(path: Path) -> dict[str, Any]:
+    """Read a JSON file that holds an object.
+
+    Raises:
+        InputError: it cannot be read, or holds something else.
+    """
+    content = read_json(path)
+    if not isinstance(content, dict):
+        raise InputError(f"{path}: holds a {type(content).__name__}, where names to values belong")
+    return content
+
+
+def read_rows(path: Path) -> list[dict[str, Any]]:
+    """Read a JSON file that holds a list of objects.
+
+    Raises:
+        InputError: it cannot be read, or holds something else.
+    """
+    content = read_json(path)
+    if not isinstance(content, list) or not all(isinstance(row, dict) for row in content):
+        raise InputError(f"{path}: is no list of objects, one an entry")
+    return content
+
+
+def numbers(entry: object, key: str, count: int, source: str) -> list[float]:
+    """Take ``count`` finite numbers.
+
+    Raises:
+        InputError: there are others, or none.
+    """
+    found = entry.get(key) if isinstance(entry, Mapping) else None
+    if not isinstance(found, list) or len(found) != count or not all(map(_is_number, found)):
+        raise InputError(f"{source}: {key} is {_short(found)}, where {count} numbers belong")
+    return [float(value) for value in found]
+
+
+def integer(entry: object, key: str, source: str) -> int:
+    """Take a whole number of 0 or more.
+
+    Raises:
+        InputError: it is something else, or missing.
+    """
+    found = entry.get(key) if isinstance(entry, Mapping) else None
+    if not isinstance(found, int) or isinstance(found, bool) or not 0 <= found <= MOST:
+        raise InputError(
+            f"{source}: {key} is {_short(found)}, where a number from 0 to {MOST} belongs"
+        )
+    return found
+
+
+def number(entry: object, key: str, default: float | None, source: str) -> float:
+    """Take a finite number; ``default`` where it is missing and there is one.
+
+    Raises:
+        InputError: it is something else.
+    """
+    found = entry.get(key, default) if isinstance(entry, Mapping) else None
+    if not _is_number(found):
+        raise InputError(f"{source}: {key} is {_short(found)}, where a number belongs")
+    assert isinstance(found, int | float)
+    return float(found)
+
+
+def pose_from_bop(entry: object, source: str) -> Rigid:
+    """Read ``cam_R_m2c`` (row by row) and ``cam_t_m2c`` (mm).
+
+    Raises:
+        InputError: the rotation is none, or a number is missing.
+    """
+    return make_pose(
+        numbers(entry, "cam_R_m2c", 9, source), numbers(entry, "cam_t_m2c", 3, source), source
+    )
+
+
+def make_pose(R: list[float], t_mm: list[float], source: str) -> Rigid:
+    """Make a pose of nine numbers row by row and three in mm, its rotation made exact.
+
+    Raises:
+        InputError: the nine numbers are far from a rotation.
+    """
+    rough = torch.tensor(R, dtype=torch.float64).reshape(3, 3)
+    u, sizes, vh = torch.linalg.svd(rough)
+    if float((sizes - 1).abs().max()) > _ROTATION_SLACK or float(torch.linalg.det(rough)) < 0:
+        raise InputError(
+            f"{source}: the rotation {_short(R)} is none: its determinant is "
+            f"{float(torch.linalg.det(rough)):.3f}, its stretches {_short(sizes.tolist())}. Write "
+            "a rotation, row by row"
+        )
+    return Rigid(u @ vh, torch.tensor(t_mm, dtype=torch.float64) * 0.001)
+
+
+def camera_from_bop(entry: object, source: str) -> tuple[Float64[Tensor, "3 3"], float]:
+    """Read ``cam_K`` and ``depth_scale`` (mm a unit) as K and metres a unit.
+
+    Raises:
+        InputError: K is none, or the scale not positive.
+    """
+    K = torch.tensor(numbers(entry, "cam_K", 9, source), dtype=torch.float64).reshape(3, 3)
+    try:
+        check_intrinsics(K)
+    except InputError as error:
+        raise InputError(f"{source}: {error}") from error
+    scale_mm = number(entry, "depth_scale", 1.0, source)
+    if scale_mm <= 0:
+        raise InputError(f"{source}: depth_scale is {scale_mm:g}; it is millimetres a unit")
+    return K, 0.001 * scale_mm
+
+
+def _is_number(value: object) -> bool:
+    # A whole number beyond 1e300 has no float.
+    return isinstance(value, int | float) and not isinstance(value, bool) and abs(value) < 1e300
+
+
+def _short(value: object) -> str:
+    text = repr(value)
+    return text if len(text) <= 80 else f"{text[:77]}..."
+
+
+_IMAGE_FOLDERS = ("rgb", "gray")
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Instance:
+    """One annotated object in one image.
+
+    Attributes:
+        scene_id: number of the scene.
+        image_id: number of the image in it.
+        index: place among the annotations of the image: names the mask.
+        object_id: BOP's ``obj_id``.
+        K: intrinsic matrix.
+        depth: the depth image.
+        depth_unit_m: metres a unit of it.
+        mask: of the visible part; None where there is no such file.
+        rgb: the picture, where there is one.
+        camera_from_model: the annotated pose.
+        visible_fraction: share of the silhouette that is seen, where it is given.
+        is_measured: whether the pose was annotated, not itself fitted to the same depth.
+    """
+
+    scene_id: int
+    image_id: int
+    index: int
+    object_id: int
+    K: Float[Tensor, "3 3"]
+    depth: Path
+    depth_unit_m: float
+    mask: Path | None
+    rgb: Path | None
+    camera_from_model: Rigid
+    visible_fraction: float | None = None
+    is_measured: bool = True
+
+    @property
+    def name(self) -> str:
+        """Scene, image and place among its annotations: unique in a split."""
+        return f"{self.scene_id:06d}_{self.image_id:06d}_{self.index:06d}"
+
+
+def bop_splits(folder: Path) -> list[str]:
+    """Name the folders that hold scenes."""
+    found = {path.parent.parent.name for path in folder.glob("*/*/scene_camera.json")}
+    return sorted(found)
+
+
+def bop_scenes(folder: Path, split: str) -> list[Path]:
+    """List the scenes of a split.
+
+    Raises:
+        InputError: there is no such split, or no scene in it.
+    """
+    scenes = sorted(path.parent for path in (folder / split).glob("*/scene_camera.json"))
+    if not scenes:
+        known = ", ".join(bop_splits(folder)) or "none"
+        raise InputError(
+            f"{folder}: no split {split!r} with a scene (SPLIT/000001/scene_camera.json). "
+            f"Here: {known}."
+        )
+    for scene in scenes:
+        if entry_number(scene.name) is None:
+            raise InputError(f"{scene}: scenes have numbers for names, as 000001; rename it")
+    return scenes
+
+
+def bop_instances(scene: Path) -> Iterator[Instance]:
+    """Read the annotations of one scene.
+
+    Raises:
+        InputError: a file is missing or damaged, or an entry is not what it must be.
+    """
+    cameras = read_mapping(scene / "scene_camera.json")
+    truths = read_mapping(scene / "scene_gt.json")
+    info_path = scene / "scene_gt_info.json"
+    infos = read_mapping(info_path) if info_path.is_file() else {}
+    wrong = [key for key in truths if entry_number(key) is None]
+    if wrong:
+        raise InputError(
+            f"scene_gt.json: {wrong[0][:80]!r} is no number of an image; name images 0, 1, ..."
+        )
+    for key in sorted(truths, key=int):
+        source = f"{scene / 'scene_gt.json'}: image {key}"
+        if key not in cameras:
+            raise InputError(f"{source} has no entry in scene_camera.json; add its camera")
+        entries, more = truths[key], infos.get(key, [])
+        if not isinstance(entries, list) or not isinstance(more, list):
+            raise InputError(f"{source}: is no list of annotations")
+        at_camera = f"{scene / 'scene_camera.json'}: image {int(key)}"
+        for index, entry in enumerate(entries):
+            K, unit_m = camera_from_bop(cameras[key], at_camera)
+            extra = more[index] if index < len(more) and isinstance(more[index], dict) else {}
+            yield _bop_instance(
+                scene, int(key), index, entry, extra, K, unit_m, f"{source}, annotation {index}"
+            )
+
+
+def _bop_instance(
+    scene: Path, image: int, index: int, entry: object, extra: dict[str, Any],
+    K: Float64[Tensor, "3 3"], unit_m: float, source: str,
+) -> Instance:  # fmt: skip
+    mask = scene / "mask_visib" / f"{image:06d}_{index:06d}.png"
+    tiff = scene / "depth" / f"{image:06d}.tif"  # of ITODD
+    pictures = (scene / folder / f"{image:06d}{suffix}"
+                for folder in _IMAGE_FOLDERS for suffix in LISTED_SUFFIXES)  # fmt: skip
+    visible = number(extra, "visib_fract", -1.0, source)
+    return Instance(
+        scene_id=int(scene.name),
+        image_id=image,
+        index=index,
+        object_id=integer(entry, "obj_id", source),
+        K=K,
+        depth=tiff if tiff.is_file() else tiff.with_suffix(".png"),
+        depth_unit_m=unit_m,
+        mask=mask if mask.is_file() else None,
+        rgb=next((path for path in pictures if path.is_file()), None),
+        camera_from_model=pose_from_bop(entry, source),
+        visible_fraction=visible if visible >= 0 else None,
+        is_measured=not str(extra.get("pose_source", "")).startswith("pseudo"),
+    )
+
+
+@dataclass(frozen=True, kw_only=True, order=True)
+class BopTarget:
+    """So many instances of an object in an image."""
+
+    scene_id: int
+    image_id: int
+    object_id: int
+    count: int
+
+
+def read_targets(path: str | Path) -> list[BopTarget]:
+    """Read a list of targets.
+
+    Raises:
+        InputError: it is missing or damaged.
+    """
+    path = Path(path)
+    targets = []
+    for row_number, row in enumerate(read_rows(path)):
+        source = f"{path}: entry {row_number}"
+        scene, image, wanted, count = (
+            integer(row, key, source) for key in ("scene_id", "im_id", "obj_id", "inst_count")
+        )
+        targets.append(BopTarget(scene_id=scene, image_id=image, object_id=wanted, count=count))
+    return targets
+
+
+_OF_YAML = {b"[": 750, b"{": 750, b",": 450, b":": 500, b"\n": 500, b"- ": 500}
+"""Bytes that a value takes while it is read, measured with PyYAML 6."""
+
+_MAX_BYTES = 2**22
+"""Of a list of images."""
+
+SYMMETRIC = (10, 11)
+"""Eggbox and glue: measured by ADD-S ever since Hinterstoisser et al. (2012)."""
+
+
+def linemod_splits(folder: Path) -> tuple[str, ...]:
+    """Name the splits of a folder; none where it is not laid out as Linemod_preprocessed."""
+    return ("train", "test") if any(folder.glob("data/[0-9][0-9]/gt.yml")) else ()
+
+
+def linemod_symmetries(number: int) -> Symmetries:
+    """Give what ``models_info.yml`` does not say: eggbox and glue, turned half about z, look alike.
+
+    BOP's ``models_info.json`` of the same meshes declares these turns.
+    """
+    if number not in SYMMETRIC:
+        return Symmetries()
+    up, origin = torch.tensor([0.0, 0.0, 1.0]).double(), torch.zeros(3).double()
+    return Symmetries(discrete=turn_about(up, origin, torch.tensor([math.pi]).double()))
+
+
+def read_yaml(path: Path) -> dict[Any, Any]:
+    """Read a YAML file of the data set.
+
+    Raises:
+        InputError: it cannot be read, or holds no mapping.
+    """
+    text = read_text(path)
+    refuse_heavy(path, text.encode(), _OF_YAML)
+    content = parse_yaml(path, text)
+    if not isinstance(content, dict):
+        raise InputError(f"{path}: holds a {type(content).__name__}, where names to values belong")
+    return content
+
+
+def linemod_instances(folder: Path, split: str) -> Iterator[Instance]:
+    """Read the annotations of a split: ``train`` or ``test``, by the lists beside the data.
+
+    The folder of an object shows others too (in object 2's they are annotated): its own alone
+    counts, as in every published number.
+
+    Raises:
+        InputError: a file is missing or damaged, or an entry is not what it must be.
+    """
+    for scene in sorted(folder.glob("data/[0-9][0-9]")):
+        listed = scene / f"{split}.txt"
+        if not listed.is_file():
+            raise InputError(f"{listed}: no such list; the splits are train and test")
+        truths, infos = read_yaml(scene / "gt.yml"), read_yaml(scene / "info.yml")
+        for line in read_text(listed, _MAX_BYTES).split():
+            if entry_number(line) is None:
+                raise InputError(f"{listed}: {line[:40]!r} is no number of an image")
+            yield _linemod_instance(scene, int(line), truths, infos)
+
+
+def _linemod_instance(
+    scene: Path, image: int, truths: dict[Any, Any], infos: dict[Any, Any]
+) -> Instance:
+    number = int(scene.name)
+    source = f"{scene / 'gt.yml'}: image {image}"
+    entries = truths.get(image)
+    if not isinstance(entries, list):
+        raise InputError(f"{source} has no annotation; is the list of another download?")
+    own = [e for e in entries if integer(e, "obj_id", source) == number]
+    if len(own) != 1:
+        raise InputError(f"{source} annotates object {number} {len(own)} times, where once belongs")
+    K, unit_m = camera_from_bop(infos.get(image), f"{scene / 'info.yml'}: image {image}")
+    mask, rgb = scene / "mask" / f"{image:04d}.png", scene / "rgb" / f"{image:04d}.png"
+    return Instance(
+        scene_id=number,
+        image_id=image,
+        index=entries.index(own[0]),
+        object_id=number,
+        K=K,
+        depth=scene / "depth" / f"{image:04d}.png",
+        depth_unit_m=unit_m,
+        mask=mask if mask.is_file() else None,
+        rgb=rgb if rgb.is_file() else None,
+        camera_from_model=pose_from_bop(own[0], source),
+    )
+
+
+def segnet_mask(folder: Path, instance: Instance) -> Path:
+    """Name the predicted mask that came with the data set (255 on the object)."""
+    home = folder / "segnet_results" / f"{instance.object_id:02d}_label"
+    return home / f"{instance.image_id:04d}_label.png"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -32,10 +412,6 @@ class Layout:
     predicted_mask: Callable[[Path, Instance], Path] | None = None
 
 
-def _bop_instances(folder: Path, split: str) -> Iterable[Instance]:
-    return (one for scene in bop_scenes(folder, split) for one in bop_instances(scene))
-
-
 LAYOUTS: dict[str, Layout] = {
     "Linemod_preprocessed": Layout(
         splits=linemod_splits,
@@ -43,7 +419,12 @@ LAYOUTS: dict[str, Layout] = {
         symmetries=linemod_symmetries,
         predicted_mask=segnet_mask,
     ),
-    "BOP": Layout(splits=bop_splits, instances=_bop_instances),
+    "BOP": Layout(
+        splits=bop_splits,
+        instances=lambda folder, split: (
+            one for scene in bop_scenes(folder, split) for one in bop_instances(scene)
+        ),
+    ),
 }
 """Name to layout: one more entry, and every command takes it. A folder is of the first that finds a
 split in it."""
@@ -58,3 +439,95 @@ def layout_of(folder: Path) -> tuple[str, Layout]:
     """Give the layout of a folder by name, BOP's where none fits."""
     name = find_layout(folder) or "BOP"
     return name, LAYOUTS[name]
+
+
+_MODEL_FOLDERS = ("models", "models_eval", "models_points")
+
+
+def models_folder(folder: Path) -> Path:
+    """Find the folder of models of a data set.
+
+    Raises:
+        InputError: there is none.
+    """
+    found = next((folder / name for name in _MODEL_FOLDERS if (folder / name).is_dir()), None)
+    if found is None:
+        raise InputError(f"{folder}: no folder {' or '.join(_MODEL_FOLDERS)}; put the meshes there")
+    return found
+
+
+def read_models_info(home: Path) -> dict[int, dict[str, Any]]:
+    """Read ``models_info.json`` or ``.yml`` by number of object; nothing where there is neither.
+
+    Raises:
+        InputError: it is damaged.
+    """
+    as_json, as_yaml = home / "models_info.json", home / "models_info.yml"
+    if as_json.is_file():
+        content: dict[Any, Any] = read_mapping(as_json)
+    elif as_yaml.is_file():
+        content = read_yaml(as_yaml)
+    else:
+        return {}
+    wrong = [k for k, v in content.items() if entry_number(k) is None or not isinstance(v, dict)]
+    if wrong:
+        raise InputError(
+            f"{home}: models_info entry {str(wrong[0])[:80]!r} is no object's; correct it"
+        )
+    return {int(key): entry for key, entry in content.items()}
+
+
+def model_path(home: Path, number: int) -> Path | None:
+    """Find the mesh of an object, whichever layout names it."""
+    named = (home / f"obj_{number:06d}.ply", home / f"obj_{number:02d}.ply")
+    return next((path for path in named if path.is_file()), None)
+
+
+def read_bop_models(
+    folder: Path, numbers: Iterable[int], config: MeshConfig | None = None
+) -> dict[int, ObjectModel]:
+    """Read models with their declared symmetries, diameters and names.
+
+    The diameter is the declared one, where there is one: published numbers are shares of it. The
+    two symmetric objects of Linemod_preprocessed, which declares none, get theirs.
+
+    Raises:
+        InputError: a mesh is missing, or something is damaged.
+    """
+    home = models_folder(folder)
+    infos, (_, layout) = read_models_info(home), layout_of(folder)
+    models: dict[int, ObjectModel] = {}
+    for wanted in sorted(set(numbers)):
+        path = model_path(home, wanted)
+        if path is None:
+            raise InputError(f"{home}: no obj_{wanted:06d}.ply for object {wanted}; put it there")
+        info, source = infos.get(wanted, {}), f"{home / 'models_info.json'}: object {wanted}"
+        symmetries = symmetries_from_bop(info, source=source)
+        if symmetries.is_none:
+            symmetries = layout.symmetries(wanted)
+        model = read_model(
+            path,
+            "mm",
+            name=object_name(wanted, info),
+            number=wanted,
+            symmetries=symmetries,
+            config=config,
+        )
+        declared_m = 0.001 * number(info, "diameter", 1000 * model.diameter_m, source)
+        models[wanted] = replace(model, diameter_m=declared_m)
+    return models
+
+
+def object_names(folder: Path) -> dict[int, str]:
+    """Say what samples call each object that ``models_info`` lists.
+
+    Raises:
+        InputError: there is no folder of models, or the file is damaged.
+    """
+    infos = read_models_info(models_folder(folder))
+    return {number: object_name(number, info) for number, info in infos.items()}
+
+
+def object_name(number: int, info: dict[str, Any]) -> str:
+    """Say what samples call an object."""
+    return str(info.get("name", f"obj_{number:06d}"))

@@ -13,7 +13,7 @@ from torch import Tensor
 from depthpose.core.errors import InputError
 from depthpose.core.files import read_json, write_json
 from depthpose.core.files.images import MAX_PIXELS, opened_image
-from depthpose.pose.datasets.parse import integer, number, read_rows
+from depthpose.pose.datasets.layouts import integer, number, read_rows
 
 Runs = tuple[tuple[int, ...], int, int]
 """Run lengths, height and width."""

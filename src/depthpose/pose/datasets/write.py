@@ -1,4 +1,4 @@
-"""Writing a data set in BOP's layout: what is written can be shared, checked and read back."""
+"""Data sets in BOP's layout: what is written can be shared, checked and read back."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass

@@ -10,7 +10,8 @@ from depthpose.core.camera import AnyCamera, choose_lens
 from depthpose.core.devices import each_in_own_arithmetic, own_arithmetic
 from depthpose.core.errors import InputError, nearest_name
 from depthpose.core.rigid import Rigid
-from depthpose.pose.config import EstimateConfig, RefusalConfig, Unit
+from depthpose.core.units import Unit
+from depthpose.pose.config import EstimateConfig, RefusalConfig
 from depthpose.pose.estimator.alternatives import PoseAmbiguities, find_copies
 from depthpose.pose.estimator.answer import with_status
 from depthpose.pose.estimator.find import SearchTargets, find_objects, nothing_found, which_object

@@ -22,7 +22,7 @@ from depthpose.core.camera.camera_file import intrinsics_of
 from depthpose.core.errors import InputError
 from depthpose.core.files import read_cloud, read_stored_depth
 from depthpose.core.rigid import Rigid
-from depthpose.pose.config import Unit, metres_of
+from depthpose.core.units import Unit, metres_of
 from depthpose.pose.datasets import mask_from_rle, number_objects, one_mask, read_labels
 from depthpose.pose.segmentation import label_parts
 from depthpose.pose.types import CloudInput, ViewInput

@@ -10,7 +10,7 @@ from depthpose.core.arrays import take_evenly
 from depthpose.core.rigid import Rigid
 from depthpose.pose.config import IcpConfig
 from depthpose.pose.estimator.scale import POINTS, distance_to
-from depthpose.pose.mesh.sampling import fibonacci_directions
+from depthpose.pose.mesh.models import fibonacci_directions
 from depthpose.pose.refine import refine_pose, refine_roughly
 from depthpose.pose.surface import Surface
 

@@ -13,8 +13,9 @@ from depthpose.core.arrays import take_evenly
 from depthpose.core.devices import own_arithmetic
 from depthpose.core.errors import InputError
 from depthpose.core.rigid import Rigid
+from depthpose.core.units import Unit
 from depthpose.pose.cloud import local_planes
-from depthpose.pose.config import CloudConfig, EstimateConfig, RefusalConfig, Unit
+from depthpose.pose.config import CloudConfig, EstimateConfig, RefusalConfig
 from depthpose.pose.estimator.alternatives import PoseAmbiguities, find_candidates
 from depthpose.pose.estimator.answer import (
     Clock,

@@ -1,11 +1,10 @@
-"""The errors of one estimate by each metric, and which estimate answers for which instance."""
+"""Errors of estimates against truth, by the conventions of those who published."""
 
 import math
 from collections import defaultdict
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
-from functools import lru_cache
-from pathlib import Path
+from dataclasses import dataclass, field, replace
+from functools import cached_property, lru_cache
 
 import numpy as np
 import torch
@@ -17,7 +16,7 @@ from depthpose.core.camera import project
 from depthpose.core.files import image_size, read_depth_png
 from depthpose.core.render import rasterize
 from depthpose.core.rigid import Rigid
-from depthpose.pose.datasets import Instance
+from depthpose.pose.datasets import BopDataset, Instance
 from depthpose.pose.mesh import symmetry_transforms, turn_about
 from depthpose.pose.metrics import (
     BOP_PIXELS,
@@ -43,37 +42,29 @@ _MARGIN_PX = 2
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class ErrorContext:
-    """What the errors of an object depend on; computed once.
+    """What the errors of an object depend on.
 
     Attributes:
         model: the object.
         diameter_m: of the table that was asked for.
-        symmetries: motions of the model that leave it as it is, the identity first.
         is_adds: whether ADD-S decides a success.
-        triangles_m: what of it VSD draws; a model of points is drawn as discs.
         vsd_delta_m: see ``EvaluationConfig``; None: VSD is not measured.
     """
 
     model: ObjectModel
     diameter_m: float
-    symmetries: Rigid
     is_adds: bool
-    triangles_m: Float[Tensor, "f 3 3"]
     vsd_delta_m: float | None
 
+    @cached_property
+    def symmetries(self) -> Rigid:
+        """Motions of the model that leave it as it is, the identity first."""
+        return symmetry_transforms(self.model.symmetries)
 
-def make_ruler(
-    model: ObjectModel, diameter_m: float, *, is_adds: bool, vsd_delta_m: float | None
-) -> ErrorContext:
-    """Prepare the errors of an object."""
-    return ErrorContext(
-        model=model,
-        diameter_m=diameter_m,
-        symmetries=symmetry_transforms(model.symmetries),
-        is_adds=is_adds,
-        triangles_m=drawn_triangles(model).double(),
-        vsd_delta_m=vsd_delta_m,
-    )
+    @cached_property
+    def triangles_m(self) -> Float[Tensor, "f 3 3"]:
+        """What of the model VSD draws; a model of points is drawn as discs."""
+        return drawn_triangles(self.model).double()
 
 
 Errors = Float[Tensor, " n"]
@@ -85,7 +76,7 @@ class Metric:
     """An error of a pose, and what the rows of objects say of it.
 
     Attributes:
-        measure: ``(estimated, instance, ruler)``, the first ``camera_from_model``, to the error.
+        measure: ``(estimated, instance, context)``, the first ``camera_from_model``, to the error.
         missing: the error of an instance without an answer.
         is_wanted: whether it is measured at all.
         summaries: columns of the rows of objects: name to a function of the errors (n, t) of all
@@ -100,58 +91,42 @@ class Metric:
     has_median: bool = False
 
 
-def measure(estimated: Rigid | None, instance: Instance, ruler: ErrorContext) -> dict[str, Errors]:
+def measure(
+    estimated: Rigid | None, instance: Instance, context: ErrorContext
+) -> dict[str, Errors]:
     """Measure one estimate by every metric of ``METRICS`` that is wanted.
 
     Args:
         estimated: ``camera_from_model``; None where there is no answer.
         instance: with its truth.
-        ruler: of its object.
+        context: of its object.
     """
     found: dict[str, Errors] = {}
     for name, metric in METRICS.items():
-        if metric.is_wanted(ruler):
+        if metric.is_wanted(context):
             error = metric.missing
             if estimated is not None:
-                error = metric.measure(estimated, instance, ruler)
+                error = metric.measure(estimated, instance, context)
             found[name] = torch.as_tensor(error, dtype=torch.float64).reshape(-1)
     return found
 
 
-def _add(estimated: Rigid, instance: Instance, ruler: ErrorContext) -> Tensor:
+def _add(estimated: Rigid, instance: Instance, context: ErrorContext) -> Tensor:
     """ADD, or ADD-S where that decides a success [m]."""
-    error_m = adds_m if ruler.is_adds else add_m
-    return error_m(estimated, instance.camera_from_model, ruler.model.vertices_m)
+    error_m = adds_m if context.is_adds else add_m
+    return error_m(estimated, instance.camera_from_model, context.model.vertices_m)
 
 
-def _adds(estimated: Rigid, instance: Instance, ruler: ErrorContext) -> Tensor:
-    return adds_m(estimated, instance.camera_from_model, ruler.model.vertices_m)
-
-
-def _mssd(estimated: Rigid, instance: Instance, ruler: ErrorContext) -> Tensor:
-    true = instance.camera_from_model
-    return mssd_m(estimated, true, ruler.model.vertices_m, ruler.symmetries)
-
-
-def _mspd(estimated: Rigid, instance: Instance, ruler: ErrorContext) -> Tensor:
+def _mspd(estimated: Rigid, instance: Instance, context: ErrorContext) -> Tensor:
     """MSPD, scaled to an image 640 wide [px]."""
-    true, points_m = instance.camera_from_model, ruler.model.vertices_m
+    true, points_m = instance.camera_from_model, context.model.vertices_m
     scale = BOP_WIDTH_PX / image_size(instance.depth)[0]
-    return scale * mspd_px(estimated, true, points_m, ruler.symmetries, instance.K)
+    return scale * mspd_px(estimated, true, points_m, context.symmetries, instance.K)
 
 
-def _rotation(estimated: Rigid, instance: Instance, ruler: ErrorContext) -> float:
-    copy = _nearest(estimated, instance, ruler)
-    return math.degrees(float(rotation_error_rad(estimated, copy)))
-
-
-def _translation(estimated: Rigid, instance: Instance, ruler: ErrorContext) -> Tensor:
-    return translation_error_m(estimated, _nearest(estimated, instance, ruler))
-
-
-def _nearest(estimated: Rigid, instance: Instance, ruler: ErrorContext) -> Rigid:
-    true, declared = instance.camera_from_model, ruler.model.symmetries
-    return nearest_copy(estimated, true, ruler.symmetries, declared)
+def _nearest(estimated: Rigid, instance: Instance, context: ErrorContext) -> Rigid:
+    true, declared = instance.camera_from_model, context.model.symmetries
+    return nearest_copy(estimated, true, context.symmetries, declared)
 
 
 def nearest_copy(
@@ -195,31 +170,25 @@ def _turned_to(pose: Rigid, R: Float[Tensor, "3 3"], symmetries: Symmetries) -> 
     return turns[errors.index(min(errors))]
 
 
-def _vsd(estimated: Rigid, instance: Instance, ruler: ErrorContext) -> Float[Tensor, "10"]:
-    assert ruler.vsd_delta_m is not None
+def _vsd(estimated: Rigid, instance: Instance, context: ErrorContext) -> Float[Tensor, "10"]:
+    assert context.vsd_delta_m is not None
     depth_m = _read_depth(instance.depth, instance.depth_unit_m)
     poses = (estimated, instance.camera_from_model)
-    left, top, right, bottom = _window(poses, instance.K, ruler.triangles_m, depth_m)
+    left, top, right, bottom = _window(poses, instance.K, context.triangles_m, depth_m)
     # What neither pose covers does not count: only the window about both is drawn.
     K = instance.K.double().clone()
     K[0, 2] -= left
     K[1, 2] -= top
     window = depth_m[top:bottom, left:right]
-    view = View(depth_m=window, K=K, render=_renderer(ruler.triangles_m, K, window))
-    taus_m = [share * ruler.diameter_m for share in BOP_SHARES]
-    return vsd(*poses, view, taus_m, ruler.vsd_delta_m)
-
-
-def _renderer(
-    triangles_m: Float[Tensor, "f 3 3"], K: Float[Tensor, "3 3"], window: Float[Tensor, "h w"]
-) -> Callable[[Rigid], Float[Tensor, "h w"]]:
     height, width = window.shape
 
     def render(pose: Rigid) -> Float[Tensor, "h w"]:
-        moved = _apply(pose, triangles_m)
-        return rasterize(moved, K, width, height, with_barycentric=False).depth_m
+        triangles_m = _apply(pose, context.triangles_m)
+        return rasterize(triangles_m, K, width, height, with_barycentric=False).depth_m
 
-    return render
+    view = View(depth_m=window, K=K, render=render)
+    taus_m = [share * context.diameter_m for share in BOP_SHARES]
+    return vsd(*poses, view, taus_m, context.vsd_delta_m)
 
 
 def _window(
@@ -241,28 +210,42 @@ def _apply(pose: Rigid, triangles_m: Float[Tensor, "f 3 3"]) -> Float[Tensor, "f
     return triangles_m @ pose.R.double().mT + pose.t_m.double()
 
 
-@lru_cache(maxsize=4)
-def _read_depth(path: Path, unit_m: float) -> Float[Tensor, "h w"]:
-    # Instances of one image follow each other.
-    return read_depth_png(path, unit_m)
-
+_read_depth = lru_cache(maxsize=4)(read_depth_png)
+"""Instances of one image follow each other."""
 
 METRICS = {
     "error_m": Metric(measure=_add, summaries={"auc": lambda errors, _: auc(errors[:, 0])}),
-    "adds_m": Metric(measure=_adds, summaries={"auc_adds": lambda errors, _: auc(errors[:, 0])}),
+    "adds_m": Metric(
+        measure=lambda pose, instance, context: adds_m(
+            pose, instance.camera_from_model, context.model.vertices_m
+        ),
+        summaries={"auc_adds": lambda errors, _: auc(errors[:, 0])},
+    ),
     "mssd_m": Metric(
-        measure=_mssd,
+        measure=lambda pose, instance, context: mssd_m(
+            pose, instance.camera_from_model, context.model.vertices_m, context.symmetries
+        ),
         summaries={"ar_mssd": lambda errors, d: average_recall(errors / d[:, None], BOP_SHARES)},
     ),
     "mspd_px": Metric(
         measure=_mspd, summaries={"ar_mspd": lambda errors, _: average_recall(errors, BOP_PIXELS)}
     ),
-    "rotation_deg": Metric(measure=_rotation, has_median=True),
-    "translation_m": Metric(measure=_translation, has_median=True),
+    "rotation_deg": Metric(
+        measure=lambda pose, instance, context: rotation_error_rad(
+            pose, _nearest(pose, instance, context)
+        ).rad2deg(),
+        has_median=True,
+    ),
+    "translation_m": Metric(
+        measure=lambda pose, instance, context: translation_error_m(
+            pose, _nearest(pose, instance, context)
+        ),
+        has_median=True,
+    ),
     "vsd": Metric(
         measure=_vsd,
         missing=(1.0,) * len(BOP_SHARES),
-        is_wanted=lambda ruler: ruler.vsd_delta_m is not None,
+        is_wanted=lambda context: context.vsd_delta_m is not None,
         summaries={"ar_vsd": lambda errors, _: average_recall(errors, BOP_SHARES)},
     ),
 }
@@ -318,7 +301,13 @@ def _assign(
     if len(instances) == 1 and answers:
         chosen[instances[0].name] = answers[0]
     elif answers:
-        costs = np.array([[_cost(i, e, model) for e in answers] for i in instances])
+        points_m = model.vertices_m[:: max(1, len(model.vertices_m) // _POINTS)]
+        costs = np.zeros((len(instances), len(answers)))
+        for (row, column), _ in np.ndenumerate(costs):
+            pose, true = answers[column].camera_from_model, instances[row].camera_from_model
+            assert pose is not None
+            error_m = float(adds_m(pose, true, points_m))
+            costs[row, column] = min(error_m, _NEAR_DIAMETERS * model.diameter_m)
         for row, column in zip(*linear_sum_assignment(costs), strict=True):
             chosen[instances[row].name] = answers[column]
     refusals = [estimate for estimate in estimates if not estimate.is_posed]
@@ -326,10 +315,75 @@ def _assign(
     return chosen | {i.name: e for i, e in zip(left, refusals, strict=False)}
 
 
-def _cost(instance: Instance, estimate: PoseEstimate, model: ObjectModel) -> float:
-    assert estimate.camera_from_model is not None
-    step = max(1, len(model.vertices_m) // _POINTS)
-    error_m = adds_m(
-        estimate.camera_from_model, instance.camera_from_model, model.vertices_m[::step]
-    )
-    return min(float(error_m), _NEAR_DIAMETERS * model.diameter_m)
+_TRIED = 40
+"""Instances that each change is tried on."""
+_MANY, _TIMES = 0.2, 3
+"""A change is said where so many are right by it, and so many times more than without."""
+_SCALES = {
+    1.0: "",
+    1000.0: "t were 1000 times larger (is it in metres? BOP's csv has millimetres)",
+    10.0: "t were 10 times larger (is it in centimetres? BOP's csv has millimetres)",
+    0.001: "t were 1000 times smaller (is it in mm? poses.json has metres, BOP's csv mm)",
+}
+_TURNS = {
+    "": lambda pose: pose,
+    "R were transposed (it is written row by row)": lambda pose: Rigid(pose.R.mT, pose.t_m),
+    "poses were inverted (they are camera_from_model)": lambda pose: pose.inverse(),
+    "y and z of the camera were negated (y is down, z forward; OpenGL's are y up, z backward)": (
+        lambda pose: Rigid(_FLIP.to(pose.R) @ pose.R, _FLIP.to(pose.t_m) @ pose.t_m)
+    ),
+}
+_FLIP = torch.diag(torch.tensor([1.0, -1.0, -1.0]))
+
+
+def convention_advice(
+    dataset: BopDataset,
+    predictions: Sequence[Prediction],
+    contexts: Mapping[int, ErrorContext],
+    limit: float,
+) -> str | None:
+    """Say by which change of all predictions many more were right; None where by none.
+
+    Args:
+        dataset: instances with truth.
+        predictions: of them.
+        contexts: of each object, by its number.
+        limit: the ADD (ADD-S) of a success, in diameters.
+    """
+    answers = [p for p in predictions if p.estimate.is_posed]
+    there = match(dataset.instances, answers, dataset.objects)
+    seen = [instance for instance in dataset.instances if instance.name in there]
+    some = seen[:: max(1, len(seen) // _TRIED)][:_TRIED]
+    places, names = {place_of(one) for one in some}, {one.name for one in some}
+    answers = [p for p in answers if p.place in places or p.estimate.name in names]
+
+    def count_right(scale: float, turn: str) -> int:
+        changed: list[Prediction] = []
+        for one in answers:
+            pose = one.estimate.camera_from_model
+            assert pose is not None
+            pose = _TURNS[turn](Rigid(pose.R.double(), pose.t_m.double()))
+            pose = Rigid(pose.R, pose.t_m * scale)
+            estimate = replace(one.estimate, camera_from_model=pose)
+            changed.append(replace(one, estimate=estimate))
+        found = match(some, changed, dataset.objects)
+        right = 0
+        for instance in some:
+            pose = found[instance.name].camera_from_model if instance.name in found else None
+            if pose is not None:
+                context = contexts[instance.object_id]
+                error_m = METRICS["error_m"].measure(pose, instance, context)
+                right += float(error_m) < limit * context.diameter_m
+        return right
+
+    now = count_right(1.0, "")
+    enough = max(min(3, len(some)), _MANY * len(some), _TIMES * now)
+    best, said = 0, ""
+    for turn in _TURNS if some and now < len(some) / _TIMES else ():
+        for scale, words in _SCALES.items():
+            right = count_right(scale, turn)
+            if right > best:
+                best, said = right, " and ".join(filter(None, (words, turn)))
+    if not said or best < enough:
+        return None
+    return f"{now} of {len(some)} answers that were tried are right, but {best} were if {said}"

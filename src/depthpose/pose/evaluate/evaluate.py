@@ -1,31 +1,376 @@
-"""Predictions measured on a data set: a row an instance, a row an object, the mean."""
+"""Predictions against truth: rows, and their summary."""
 
-from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass, replace
+import hashlib
+import math
+import statistics
+from collections import defaultdict
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
+from typing import Any
+
+import torch
 
 from depthpose.core.errors import InputError
 from depthpose.pose.config import EvaluationConfig
-from depthpose.pose.datasets import BopDataset, Instance
-from depthpose.pose.evaluate.conventions import convention_advice
-from depthpose.pose.evaluate.errors import ErrorContext, make_ruler, match, measure
-from depthpose.pose.evaluate.rows import Conditions, InstanceRow, ObjectRow, Origin, RiskRow
-from depthpose.pose.evaluate.summary import (
-    diameter_of,
-    frames_hash,
-    is_adds,
-    mean_row,
-    object_row,
-    risk_rows,
+from depthpose.pose.datasets import BopDataset, BopTarget, Instance
+from depthpose.pose.evaluate.errors import (
+    METRICS,
+    ErrorContext,
+    Errors,
+    convention_advice,
+    match,
+    measure,
 )
+from depthpose.pose.metrics import risk_coverage
 from depthpose.pose.predictions import (
     STAGES,
+    Place,
     Prediction,
+    place_of,
     read_bop_results,
     read_predictions,
     score_of,
 )
-from depthpose.pose.types import PoseEstimate
+from depthpose.pose.types import POSED, ObjectModel, PoseEstimate
+
+Number = float | None
+
+
+@dataclass(frozen=True, kw_only=True)
+class Origin:
+    """Whose predictions a row measures; the first columns of its row.
+
+    Attributes:
+        method: its name.
+        masks: kind of masks that it was given.
+        weights: file or name, where it has any.
+        weights_sha256: its first digits; of a file of predictions by others the file's own.
+    """
+
+    method: str
+    masks: str = ""
+    weights: str = ""
+    weights_sha256: str = ""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Conditions:
+    """What a number cannot be compared without; the last columns of its row.
+
+    Attributes:
+        diameters: whose table of diameters.
+        frames: data set and split.
+        frames_sha256: first digits of :func:`frames_hash`.
+    """
+
+    diameters: str
+    frames: str
+    frames_sha256: str
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class InstanceRow:
+    """One instance and the errors of its estimate.
+
+    Attributes:
+        instance: its name.
+        object: name of its model.
+        status: of the estimate; ``missing`` where there is none.
+        is_success: whether ADD (ADD-S of a symmetric object) is below a tenth of the diameter.
+        score: of the answer, larger is surer.
+        visible_fraction: share of the silhouette that is seen, where it is given.
+        truth: ``annotated``, or ``fitted`` to the same depth.
+        diameter_m: of the table that was asked for.
+        metric: ``ADD`` or ``ADD-S``.
+        errors: by the names of ``METRICS``; what is not measured is left out.
+        ms: milliseconds of each stage and in ``total``; None where it has not run.
+        reason: of a refusal.
+        origin: whose estimate it is.
+    """
+
+    instance: str
+    object: str
+    status: str
+    is_success: bool
+    score: Number
+    visible_fraction: Number
+    truth: str
+    diameter_m: float
+    metric: str
+    errors: Mapping[str, Errors]
+    ms: Mapping[str, Number]
+    reason: str
+    origin: Origin | None = None
+
+    def error(self, name: str) -> Number:
+        """Give an error by its name, or None where it is not measured or infinite."""
+        if name not in self.errors:
+            return None
+        mean = float(self.errors[name].mean())
+        return mean if math.isfinite(mean) else None
+
+    def columns(self) -> dict[str, Any]:
+        """Give the columns of a table, in its order."""
+        names = ("instance", "object", "status", "is_success", "score", "visible_fraction")
+        return {
+            **_method_of(self.origin),
+            **_fields_of(self, *names, "truth", "diameter_m", "metric"),
+            **{name: self.error(name) for name in METRICS},
+            **_times(self.ms),
+            "reason": self.reason,
+        }
+
+
+@dataclass(frozen=True, kw_only=True)
+class ObjectRow:
+    """The instances of an object, the ``mean`` of objects, or ``all`` instances.
+
+    Attributes:
+        object: what the row is called.
+        instances: how many.
+        annotated: how many of them have a pose that was annotated, not fitted.
+        success: share of instances.
+        refused: share of instances without an answer.
+        wrong: share of instances with an answer that is no success.
+        coverage: share of instances with an answer.
+        scores: the summaries of ``METRICS``, ``ar`` and medians; None where not measured.
+        ms: mean milliseconds of each stage and in ``total``.
+        metric: ``ADD`` or ``ADD-S``, where it is of one object.
+        diameter_m: the same.
+        conditions: of the evaluation.
+        origin: whose estimates they are.
+    """
+
+    object: str
+    instances: int
+    annotated: int
+    success: float
+    refused: float
+    wrong: float
+    coverage: float
+    scores: Mapping[str, Number]
+    ms: Mapping[str, Number]
+    metric: str | None = None
+    diameter_m: float | None = None
+    conditions: Conditions | None = None
+    origin: Origin | None = None
+
+    def columns(self) -> dict[str, Any]:
+        """Give the columns of a table, in its order."""
+        names = ("object", "instances", "annotated", "success", "refused", "wrong", "coverage")
+        return {
+            **({} if self.origin is None else asdict(self.origin)),
+            **_fields_of(self, *names),
+            **self.scores,
+            **_times(self.ms),
+            **({} if self.metric is None else _fields_of(self, "metric", "diameter_m")),
+            **({} if self.conditions is None else asdict(self.conditions)),
+        }
+
+
+@dataclass(frozen=True, kw_only=True)
+class RiskRow:
+    """How many answers are wrong if only the surest are given.
+
+    Attributes:
+        coverage: share of all instances that is answered.
+        answers: their number.
+        least_score: of the least sure of them.
+        risk: share of wrong ones among them.
+        conditions: of the evaluation.
+        origin: whose estimates they are.
+    """
+
+    coverage: float
+    answers: int
+    least_score: Number
+    risk: float
+    conditions: Conditions | None = None
+    origin: Origin | None = None
+
+    def columns(self) -> dict[str, Any]:
+        """Give the columns of a table, in its order."""
+        return {
+            **_method_of(self.origin),
+            **_fields_of(self, "coverage", "answers", "least_score", "risk"),
+            **({} if self.conditions is None else asdict(self.conditions)),
+        }
+
+
+def _method_of(origin: Origin | None) -> dict[str, Any]:
+    return {} if origin is None else {"method": origin.method, "masks": origin.masks}
+
+
+def _fields_of(row: object, *names: str) -> dict[str, Any]:
+    return {name: getattr(row, name) for name in names}
+
+
+def _times(ms: Mapping[str, Number]) -> dict[str, Any]:
+    return {f"ms_{stage}": value for stage, value in ms.items()}
+
+
+_RECALLS = ("ar_vsd", "ar_mssd", "ar_mspd")
+_DECILES = 10
+
+
+def object_row(name: str, rows: Sequence[InstanceRow]) -> ObjectRow:
+    """Sum up the instances of an object, or of all objects.
+
+    ``success``, ``refused`` and ``wrong`` add up to 1: an instance without an answer is refused.
+    Medians are of the answers alone; all else counts everything.
+
+    Args:
+        name: what the row is called.
+        rows: one an instance.
+    """
+    count = len(rows)
+    success = sum(row.is_success for row in rows) / count
+    coverage = sum(row.status in POSED for row in rows) / count
+    return ObjectRow(
+        object=name,
+        instances=count,
+        annotated=sum(row.truth == "annotated" for row in rows),
+        success=success,
+        refused=1 - coverage,
+        wrong=coverage - success,
+        coverage=coverage,
+        scores=_scores(rows),
+        ms={stage: _mean([row.ms[stage] for row in rows]) for stage in rows[0].ms},
+    )
+
+
+def mean_row(rows: Sequence[ObjectRow]) -> ObjectRow:
+    """Average the rows of objects: each object counts the same, as in LineMOD's tables."""
+    count = len(rows)
+    scores = {name: [row.scores[name] for row in rows] for name in rows[0].scores}
+    return ObjectRow(
+        object="mean",
+        instances=sum(row.instances for row in rows),
+        annotated=sum(row.annotated for row in rows),
+        success=sum(row.success for row in rows) / count,
+        refused=sum(row.refused for row in rows) / count,
+        wrong=sum(row.wrong for row in rows) / count,
+        coverage=sum(row.coverage for row in rows) / count,
+        # A recall of some objects alone would pass for that of all; a median is of the answers.
+        scores={
+            name: _mean(values) if None not in values or name.endswith("_median") else None
+            for name, values in scores.items()
+        },
+        ms={stage: _mean([row.ms[stage] for row in rows]) for stage in rows[0].ms},
+    )
+
+
+def risk_rows(rows: Sequence[InstanceRow]) -> list[RiskRow]:
+    """Say how many answers are wrong if only the surest are given: ten shares of all instances.
+
+    ``coverage`` 0.1 is the surest tenth of the instances. It ends with the answers.
+    """
+    answered = [row for row in rows if row.status in POSED and row.score is not None]
+    answered.sort(key=lambda row: -(row.score or 0.0))
+    ranks = torch.full((len(rows),), math.inf, dtype=torch.float64)
+    ranks[: len(answered)] = torch.arange(len(answered), dtype=torch.float64)
+    is_right = torch.zeros(len(rows), dtype=torch.bool)
+    is_right[: len(answered)] = torch.tensor([row.is_success for row in answered], dtype=torch.bool)
+    coverage, risk = risk_coverage(ranks, is_right)
+    tenths = (round(k * len(rows) / _DECILES) for k in range(1, _DECILES + 1))
+    counts = dict.fromkeys(min(count, len(answered)) for count in tenths)
+    return [
+        RiskRow(
+            coverage=float(coverage[count - 1]),
+            answers=count,
+            least_score=answered[count - 1].score,
+            risk=float(risk[count - 1]),
+        )
+        for count in counts
+        if count
+    ]
+
+
+def _scores(rows: Sequence[InstanceRow]) -> dict[str, Number]:
+    """Sum up every metric; then BOP's average recall; then the medians of the answers."""
+    answered = [row for row in rows if row.status in POSED]
+    diameters_m = torch.tensor([row.diameter_m for row in rows], dtype=torch.float64)
+    found: dict[str, Number] = {}
+    for name, metric in METRICS.items():
+        is_measured = all(name in row.errors for row in rows)
+        errors = torch.stack([row.errors[name] for row in rows]) if is_measured else None
+        for column, summary in metric.summaries.items():
+            found[column] = None if errors is None else summary(errors, diameters_m)
+    known = [value for value in map(found.get, _RECALLS) if value is not None]
+    found["ar"] = sum(known) / len(_RECALLS) if len(known) == len(_RECALLS) else None
+    for name in (name for name, metric in METRICS.items() if metric.has_median):
+        values = [float(row.errors[name].mean()) for row in answered if name in row.errors]
+        found[f"{name}_median"] = statistics.median(values) if values else None
+    return found
+
+
+def _mean(values: Sequence[Number]) -> Number:
+    known = [value for value in values if value is not None]
+    return sum(known) / len(known) if known else None
+
+
+def frames_hash(instances: Sequence[Instance]) -> str:
+    """Give the SHA-256 of the list of instances, a line each: scene, image, object, place."""
+    lines = (f"{i.scene_id} {i.image_id} {i.object_id} {i.index}\n" for i in instances)
+    return hashlib.sha256("".join(sorted(lines)).encode()).hexdigest()
+
+
+def of_targets(dataset: BopDataset, targets: Sequence[BopTarget]) -> BopDataset:
+    """Keep the instances that a list of targets asks for, the most visible where it takes fewer.
+
+    Raises:
+        InputError: a target is not annotated so many times.
+    """
+    found: dict[Place, list[Instance]] = defaultdict(list)
+    for instance in dataset.instances:
+        found[place_of(instance)].append(instance)
+    kept: list[Instance] = []
+    for target in targets:
+        place = Place(target.scene_id, target.image_id, target.object_id)
+        there = sorted(found[place], key=lambda i: -(i.visible_fraction or 0.0))
+        if len(there) < target.count:
+            raise InputError(
+                f"{dataset.folder}: the targets ask for {target.count} of object "
+                f"{target.object_id} in scene {target.scene_id}, image {target.image_id}, but "
+                f"{len(there)} are annotated in split {dataset.split!r}; give the list of this "
+                "very split"
+            )
+        kept += there[: target.count]
+    kept.sort(key=lambda i: (i.scene_id, i.image_id, i.index))
+    return replace(dataset, instances=kept)
+
+
+PVNET_DIAMETERS_M = {
+    1: 0.097430, 2: 0.286908, 4: 0.171593, 5: 0.193416, 6: 0.152633, 8: 0.259425, 9: 0.107131,
+    10: 0.176364, 11: 0.164857, 12: 0.148204, 13: 0.303153, 14: 0.285155, 15: 0.208394,
+}  # fmt: skip
+"""Of LineMOD's 13 objects by BOP's number, as PVNet's published evaluation has them."""
+
+_OTHER_DATA_SET = 0.25
+
+
+def diameter_of(model: ObjectModel, config: EvaluationConfig) -> float:
+    """Give the diameter [m] that the thresholds are shares of.
+
+    Raises:
+        InputError: PVNet's table is asked for an object that it does not have.
+    """
+    if config.diameters == "bop":
+        return model.diameter_m
+    printed_m = PVNET_DIAMETERS_M.get(model.number, 0.0)
+    if abs(printed_m / model.diameter_m - 1) > _OTHER_DATA_SET:
+        raise InputError(
+            f"object {model.number} ({model.name}) has a diameter of {model.diameter_m:.3f} m, "
+            "which is no object of PVNet's table of LineMOD; take the data set's diameters, bop"
+        )
+    return printed_m
+
+
+def is_adds(model: ObjectModel, config: EvaluationConfig) -> bool:
+    """Whether an object is measured by ADD-S."""
+    return config.adds == "all" or not model.symmetries.is_none
+
 
 SUCCESS_SHARE = 0.1
 
@@ -94,81 +439,70 @@ def evaluate(
     config = EvaluationConfig() if config is None else config
     found = match(dataset.instances, predictions, dataset.objects)
     _refuse_unknown(dataset, predictions, found)
-    rulers, stages = _rulers(dataset, config), _stages_of(predictions)
-    rows = [
-        _instance_row(one, found.get(one.name), rulers[one.object_id], stages)
-        for one in progress(dataset.instances)
-    ]
-    conditions = _conditions(dataset, config)
-    return Evaluation(
-        rows=[replace(row, conditions=conditions) for row in _sum_up(dataset, rows, rulers)],
-        per_instance=rows,
-        risk=[replace(row, conditions=conditions) for row in risk_rows(rows)],
-        advice=convention_advice(dataset, predictions, rulers, SUCCESS_SHARE),
-    )
-
-
-def _rulers(dataset: BopDataset, config: EvaluationConfig) -> dict[int, ErrorContext]:
-    return {
-        number: make_ruler(
-            model,
-            diameter_of(model, config),
+    contexts = {
+        number: ErrorContext(
+            model=model,
+            diameter_m=diameter_of(model, config),
             is_adds=is_adds(model, config),
             vsd_delta_m=config.vsd_delta_m if config.with_vsd else None,
         )
         for number, model in dataset.objects.items()
     }
+    # In the order of work; what a method of its own calls otherwise comes last.
+    seen = dict.fromkeys(stage for p in predictions for stage in p.estimate.seconds)
+    stages = [s for s in STAGES if s in seen] + [s for s in seen if s not in STAGES]
+    rows = [
+        _instance_row(one, found.get(one.name), contexts[one.object_id], stages)
+        for one in progress(dataset.instances)
+    ]
+    conditions = Conditions(
+        diameters=config.diameters,
+        frames=f"{dataset.folder.resolve().name} {dataset.split}",
+        frames_sha256=frames_hash(dataset.instances)[:12],
+    )
+    return Evaluation(
+        rows=[replace(row, conditions=conditions) for row in _sum_up(dataset, rows, contexts)],
+        per_instance=rows,
+        risk=[replace(row, conditions=conditions) for row in risk_rows(rows)],
+        advice=convention_advice(dataset, predictions, contexts, SUCCESS_SHARE),
+    )
 
 
 def _instance_row(
-    instance: Instance, estimate: PoseEstimate | None, ruler: ErrorContext, stages: list[str]
+    instance: Instance, estimate: PoseEstimate | None, context: ErrorContext, stages: list[str]
 ) -> InstanceRow:
     pose = None if estimate is None else estimate.camera_from_model
-    errors = measure(pose, instance, ruler)
+    errors = measure(pose, instance, context)
     seconds = {} if estimate is None else estimate.seconds
     ms = {stage: 1000 * seconds[stage] if stage in seconds else None for stage in stages}
     return InstanceRow(
         instance=instance.name,
-        object=ruler.model.name,
+        object=context.model.name,
         status="missing" if estimate is None else estimate.status,
-        is_success=float(errors["error_m"]) < SUCCESS_SHARE * ruler.diameter_m,
+        is_success=float(errors["error_m"]) < SUCCESS_SHARE * context.diameter_m,
         score=None if estimate is None or pose is None else score_of(estimate),
         visible_fraction=instance.visible_fraction,
         truth="annotated" if instance.is_measured else "fitted",
-        diameter_m=ruler.diameter_m,
-        metric="ADD-S" if ruler.is_adds else "ADD",
+        diameter_m=context.diameter_m,
+        metric="ADD-S" if context.is_adds else "ADD",
         errors=errors,
         ms={**ms, "total": 1000 * sum(seconds.values()) if seconds else None},
         reason="" if estimate is None else estimate.reason,
     )
 
 
-def _stages_of(predictions: Sequence[Prediction]) -> list[str]:
-    """Stages in the order of work; what a method of its own calls otherwise comes last."""
-    seen = dict.fromkeys(stage for p in predictions for stage in p.estimate.seconds)
-    return [s for s in STAGES if s in seen] + [s for s in seen if s not in STAGES]
-
-
 def _sum_up(
-    dataset: BopDataset, rows: list[InstanceRow], rulers: dict[int, ErrorContext]
+    dataset: BopDataset, rows: list[InstanceRow], contexts: dict[int, ErrorContext]
 ) -> list[ObjectRow]:
     summed: list[ObjectRow] = []
     numbers = [instance.object_id for instance in dataset.instances]
-    for number, ruler in sorted(rulers.items()):
+    for number, context in sorted(contexts.items()):
         own = [row for row, of in zip(rows, numbers, strict=True) if of == number]
-        row = object_row(ruler.model.name, own)
-        summed.append(replace(row, metric=own[0].metric, diameter_m=ruler.diameter_m))
+        row = object_row(context.model.name, own)
+        summed.append(replace(row, metric=own[0].metric, diameter_m=context.diameter_m))
     if len(summed) > 1:
         summed += [mean_row(summed), object_row("all", rows)]
     return summed
-
-
-def _conditions(dataset: BopDataset, config: EvaluationConfig) -> Conditions:
-    return Conditions(
-        diameters=config.diameters,
-        frames=f"{dataset.folder.resolve().name} {dataset.split}",
-        frames_sha256=frames_hash(dataset.instances)[:12],
-    )
 
 
 def _refuse_unknown(

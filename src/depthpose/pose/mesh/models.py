@@ -1,28 +1,378 @@
-"""Model files to :class:`ObjectModel`: with faces, or points alone."""
+"""Known objects: read or made, their symmetries as declared, and points of their surface."""
 
-from collections.abc import Sequence
+import math
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Float, Float64, Int64
-from scipy.spatial import ConvexHull, QhullError
+from jaxtyping import Float, Int64
+from scipy.spatial import ConvexHull, KDTree, QhullError
 from torch import Tensor
 
+from depthpose.core.arrays import take_evenly
 from depthpose.core.errors import InputError
 from depthpose.core.files import AnyPath
-from depthpose.pose.config import MeshConfig, Unit, metres_of
+from depthpose.core.rigid import Rigid
+from depthpose.core.units import Unit, metres_of
+from depthpose.pose.config import MeshConfig
 from depthpose.pose.mesh.files import read_geometry, unit_of
-from depthpose.pose.mesh.sampling import (
-    estimate_normals,
-    farthest_points,
-    fibonacci_directions,
-    sample_surface,
-)
-from depthpose.pose.types import ObjectModel, Symmetries
+from depthpose.pose.types import Axis, ObjectModel, Symmetries
 
-_COARSE = 1000
+BOP_STEP = 0.01
+"""BOP turns about a continuous axis so that no point moves more than this share of the diameter."""
+
+
+def turn_about(
+    direction: Float[Tensor, "3"], point_m: Float[Tensor, "3"], angle_rad: Float[Tensor, "*batch"]
+) -> Rigid:
+    """Turn about the line through ``point_m``, by the right-hand rule (Rodrigues)."""
+    x, y, z = (direction / direction.norm()).unbind()
+    zero = torch.zeros_like(x)
+    K = torch.stack([zero, -z, y, z, zero, -x, -y, x, zero]).reshape(3, 3)
+    angle = angle_rad[..., None, None].to(K)
+    R = torch.eye(3).to(K) + angle.sin() * K + (1 - angle.cos()) * (K @ K)
+    return Rigid(R, point_m - (R @ point_m[..., None]).squeeze(-1))
+
+
+def symmetry_transforms(symmetries: Symmetries, max_step: float = BOP_STEP) -> Rigid:
+    """List the transforms ``model_from_model`` that leave the object as it is.
+
+    The identity, the discrete ones, and each of them followed by turns about each continuous axis
+    (BOP: ``ceil(pi / max_step)`` equal steps of the full turn). BOP's toolkit leaves out the turn
+    by 0 where there is an axis; here it is in, so that an exact estimate has no error.
+
+    Returns:
+        A batch, the identity first.
+    """
+    eye = Rigid(torch.eye(3)[None], torch.zeros(1, 3))
+    discrete = symmetries.discrete
+    if discrete is not None:
+        eye = Rigid(torch.cat([eye.R.to(discrete.R), discrete.R]),
+                    torch.cat([eye.t_m.to(discrete.t_m), discrete.t_m]))  # fmt: skip
+    if not symmetries.continuous:
+        return eye
+    steps = math.ceil(math.pi / max_step)
+    angles = torch.arange(steps, dtype=torch.float64) * (2 * math.pi / steps)
+    every = [eye]
+    for axis in symmetries.continuous:
+        turns = turn_about(axis.direction.to(eye.R), axis.point_m.to(eye.R), angles[1:])
+        R = turns.R[:, None] @ eye.R[None]
+        t_m = (turns.R[:, None] @ eye.t_m[None, :, :, None]).squeeze(-1) + turns.t_m[:, None]
+        every.append(Rigid(R.flatten(0, 1), t_m.flatten(0, 1)))
+    return Rigid.cat(every)
+
+
+def symmetries_from_bop(info: Mapping[str, Any], *, source: str) -> Symmetries:
+    """Read ``symmetries_discrete`` (4x4, row by row) and ``symmetries_continuous``; both in mm.
+
+    ``symmetries_found`` is ours: true where they were found in the geometry.
+
+    Args:
+        info: an object's entry of ``models_info.json``.
+        source: what to call it in errors.
+
+    Raises:
+        InputError: an entry is no rigid transform or no axis.
+    """
+    turns, lines = (info.get(f"symmetries_{kind}", []) for kind in ("discrete", "continuous"))
+    if not isinstance(turns, list) or not isinstance(lines, list):
+        raise InputError(f"{source}: its symmetries are no lists; write [...] of them")
+    matrices = [_rigid_from_bop(row, source) for row in turns]
+    axes = tuple(_axis_from_bop(entry, source) for entry in lines)
+    is_found = info.get("symmetries_found", False) is True
+    if not matrices:
+        return Symmetries(continuous=axes, is_found=is_found)
+    stacked = torch.stack(matrices)
+    discrete = Rigid(stacked[:, :3, :3], stacked[:, :3, 3])
+    return Symmetries(discrete=discrete, continuous=axes, is_found=is_found)
+
+
+def symmetries_to_bop(symmetries: Symmetries) -> dict[str, Any]:
+    """Write symmetries as ``models_info.json`` has them; kinds without an entry are left out."""
+    info: dict[str, Any] = {}
+    if symmetries.discrete is not None:
+        R, t_mm = symmetries.discrete.R, 1000 * symmetries.discrete.t_m
+        top = torch.cat([R, t_mm[..., None]], -1).flatten(1).tolist()
+        info["symmetries_discrete"] = [[*row, 0.0, 0.0, 0.0, 1.0] for row in top]
+    if symmetries.continuous:
+        info["symmetries_continuous"] = [
+            {"axis": axis.direction.tolist(), "offset": (1000 * axis.point_m).tolist()}
+            for axis in symmetries.continuous
+        ]
+    if symmetries.is_found and info:
+        info["symmetries_found"] = True
+    return info
+
+
+def _rigid_from_bop(row: object, source: str) -> Float[Tensor, "4 4"]:
+    try:
+        matrix = torch.tensor(row, dtype=torch.float64).reshape(4, 4)
+    except (TypeError, ValueError, RuntimeError, OverflowError) as error:
+        raise InputError(
+            f"{source}: the symmetry {repr(row)[:80]} is not 16 numbers; write a 4x4 matrix row by "
+            "row"
+        ) from error
+    R = matrix[:3, :3]
+    is_rigid = torch.allclose(R @ R.T, torch.eye(3).double(), atol=1e-3) and torch.det(R) > 0
+    if not is_rigid or matrix[3].tolist() != [0, 0, 0, 1]:
+        raise InputError(
+            f"{source}: the symmetry {repr(row)[:200]} is no rigid motion; its upper left 3x3 is a "
+            "rotation, its last row 0 0 0 1"
+        )
+    matrix[:3, 3] *= 0.001
+    return matrix
+
+
+def _axis_from_bop(entry: object, source: str) -> Axis:
+    try:
+        assert isinstance(entry, Mapping)
+        direction = torch.tensor(entry["axis"], dtype=torch.float64).reshape(3)
+        offset_mm = torch.tensor(entry.get("offset", [0, 0, 0]), dtype=torch.float64).reshape(3)
+        length = float(direction.norm())
+        assert 0 < length < math.inf
+    except (AssertionError, KeyError, TypeError, ValueError, RuntimeError, OverflowError) as error:
+        raise InputError(
+            f'{source}: the continuous symmetry {repr(entry)[:80]} is not {{"axis": [x, y, z], '
+            '"offset": [x, y, z]} with an axis of some length'
+        ) from error
+    return Axis(direction=direction / length, point_m=0.001 * offset_mm)
+
+
+_NORMAL_NEIGHBOURS = 16
+_DENSE = 20_000
+_PLASTIC = 1.32471795724474602596
+
+
+def farthest_points(points_m: Float[Tensor, "n 3"], count: int) -> Int64[Tensor, " count"]:
+    """Choose points each of which is farthest from all before it; the first, from the centre.
+
+    The centre of the bounding box, as PVNet does: it does not depend on how densely a part is
+    meshed. Of equals the earliest in the file is taken, so that a mesh always has the same points.
+
+    Raises:
+        InputError: there are fewer different points than wanted.
+    """
+    points = points_m.double().cpu().numpy()
+    centre = (points.min(0) + points.max(0)) / 2
+    nearest = ((points - centre) ** 2).sum(-1)
+    chosen = []
+    for _ in range(count):
+        farthest = int(nearest.argmax())
+        if nearest[farthest] == 0 and chosen:
+            raise InputError(
+                f"the model has only {len(chosen)} different points, and {count} keypoints are to "
+                "be chosen among them; give a mesh with triangles, or more points"
+            )
+        chosen.append(farthest)
+        distance = ((points - points[farthest]) ** 2).sum(-1)
+        # All are measured to the chosen ones alone: the centre decides the first alone.
+        nearest = distance if len(chosen) == 1 else np.minimum(nearest, distance)
+    return torch.tensor(chosen)
+
+
+def sample_surface(
+    model: ObjectModel, count: int
+) -> tuple[Float[Tensor, "m 3"], Float[Tensor, "m 3"]]:
+    """Spread points evenly over the surface, always the same ones, with their outward normals.
+
+    Faces are entered in proportion to their area at equal steps, and each point placed by a
+    sequence of low discrepancy (Roberts 2018), which is more even than chance. A model of points
+    gives its own in even steps of their order, at most all.
+
+    Args:
+        model: the object.
+        count: how many; a model of points may have fewer.
+    """
+    if len(model.faces) == 0:
+        # Farthest points would be evener, and quadratic; point models are even as they come.
+        return take_evenly(model.vertices_m, count), take_evenly(model.normals, count)
+    corners = model.triangles_m.double()
+    doubled = torch.linalg.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    area = doubled.norm(dim=-1)
+    bounds = area.cumsum(0)
+    steps = (torch.arange(count, dtype=torch.float64) + 0.5) / count * bounds[-1]
+    face = torch.searchsorted(bounds, steps).clamp(max=len(area) - 1)
+    order = torch.arange(1, count + 1, dtype=torch.float64)
+    u, v = (order / _PLASTIC) % 1, (order / _PLASTIC**2) % 1
+    root = u.sqrt()
+    share = torch.stack([1 - root, root * (1 - v), root * v], -1)
+    points = (corners[face] * share[..., None]).sum(-2)
+    normals = doubled[face] / area[face, None].clamp(min=1e-300)
+    return points.to(model.vertices_m), normals.to(model.vertices_m)
+
+
+def gap_to_surface_m(points_m: Float[Tensor, "n 3"], model: ObjectModel) -> float:
+    """Say how far off a model's surface the farthest of some points lies [m].
+
+    The surface is its vertices and 20,000 points between them, a hundredth of the diameter apart:
+    the vertices of a coarse mesh alone are far from most of it.
+    """
+    surface_m = torch.cat([model.vertices_m, sample_surface(model, _DENSE)[0]])
+    return float(torch.cdist(points_m, surface_m).amin(1).max())
+
+
+def estimate_normals(points_m: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3"]:
+    """Estimate unit normals of bare points by the plane through the nearest 16, pointing outward.
+
+    Outward is away from the mean of the points: right for convex parts alone. What needs no side,
+    as point-to-plane distance, may use them everywhere.
+    """
+    points = points_m.double().cpu().numpy()
+    _, index = KDTree(points).query(points, k=min(_NORMAL_NEIGHBOURS, len(points)))
+    near = points[index.reshape(len(points), -1)]
+    near = near - near.mean(1, keepdims=True)
+    _, axes = np.linalg.eigh(near.transpose(0, 2, 1) @ near)
+    normals = axes[:, :, 0]
+    is_inward = ((points - points.mean(0)) * normals).sum(-1) < 0
+    normals[is_inward] *= -1
+    return torch.from_numpy(normals).to(points_m)
+
+
+def fibonacci_directions(count: int) -> Float[Tensor, "count 3"]:
+    """Spread unit vectors evenly over half of the sphere (an axis needs no sign)."""
+    i = torch.arange(count, dtype=torch.float64) + 0.5
+    z = 1 - i / count
+    angle = math.pi * (1 + 5**0.5) * i
+    radius = (1 - z * z).sqrt()
+    return torch.stack([radius * angle.cos(), radius * angle.sin(), z], -1)
+
+
+_SIDE_DIRECTIONS = 32
+_CELL = 2.0
+"""Side of a ray's cell in mean distances of samples: four samples in each on average."""
+_SAME = 0.5
+"""Up to so many mean distances from another's plane a sample is of the same sheet."""
+_SLANT = 0.3
+"""Least cosine at which a sample is looked at."""
+_SEEN = 0.1
+"""Least share of directions from which an outer side is seen."""
+_CLEARER = 0.4
+"""The inner side is seen in at most so many times the directions of the outer."""
+
+
+def cell_of(points: np.ndarray, tree: KDTree) -> float:
+    """Give the side of a cell in which a ray finds about four samples of a surface."""
+    near = tree.query(points[:: max(1, len(points) // 500)], k=min(5, len(points)))[0][:, -1]
+    return _CELL * float(np.median(near)) * np.sqrt(np.pi) / 2
+
+
+def outward_normals(points: np.ndarray, normals: np.ndarray, cell: float) -> np.ndarray:
+    """Turn normals to the side from which the surface is seen from afar.
+
+    What is thinner than half the distance of the samples, open sheets and what is never seen have
+    no outer side: their normals become 0.
+
+    Args:
+        points: (m, 3), samples of a surface.
+        normals: (m, 3), of either side.
+        cell: side of a ray's cell.
+    """
+    seen, looked = np.zeros((2, len(points))), np.full((2, len(points)), 1e-9)
+    for axis in fibonacci_directions(_SIDE_DIRECTIONS).numpy():
+        across = np.linalg.svd(axis[None])[2][1:]
+        flat = np.floor(points @ across.T / cell).astype(np.int64)
+        flat -= flat.min(0)
+        place = flat[:, 0] * (flat[:, 1].max() + 1) + flat[:, 1]
+        slant = normals @ axis
+        order = np.argsort(points @ axis)
+        first = np.empty(place.max() + 1, np.int64)
+        for way in (1, -1):  # toward a camera in this direction, and in the other
+            first[place[order[::way]]] = order[::way]
+            front = first[place]
+            off = ((points - points[front]) * normals[front]).sum(1)
+            is_seen = np.abs(off) < _SAME / _CELL * cell
+            for side in (0, 1):
+                facing = way * (1 - 2 * side) * slant > _SLANT
+                seen[side] += facing & is_seen
+                looked[side] += facing
+    share = seen / looked
+    outer = share.argmax(0)
+    is_clear = (share.max(0) > _SEEN) & (share.min(0) < _CLEARER * share.max(0))
+    return normals * ((1 - 2 * outer) * is_clear)[:, None]
+
+
+def across_walls(points: np.ndarray, outward: np.ndarray, limit: float) -> np.ndarray:
+    """Give for each sample the number of the nearest one of an opposite side, or -1, (m,).
+
+    Args:
+        points: (m, 3).
+        outward: (m, 3), of :func:`outward_normals`.
+        limit: the thickest wall.
+    """
+    across, nearest = np.full(len(points), -1), np.full(len(points), np.inf)
+    for column, sign in ((c, s) for c in range(3) for s in (1, -1)):
+        (own,) = np.nonzero(sign * outward[:, column] > 0.577)
+        if len(own) == 0:
+            continue
+        distance, found = KDTree(points[own]).query(points, distance_upper_bound=limit)
+        number = own[np.minimum(found, len(own) - 1)]
+        is_opposite = (outward[number] * outward).sum(1) < 0
+        is_better = is_opposite & (distance < nearest)
+        across = np.where(is_better, number, across)
+        nearest = np.where(is_better, distance, nearest)
+    return across
+
+
+_PER_METRE = {"mm": 1000.0, "cm": 100.0, "inches": 39.37}
+_MM = {"cm": 10.0, "inches": 25.4}
+_LARGEST_SHARE = 1.5
+"""A cloud is part of its object; noise and a grown mask may make it somewhat larger."""
+_SMALLEST_SHARE = 0.1
+"""What is occluded to less than a tenth of the diameter cannot be posed anyway."""
+_LIKELY_SHARE = 0.3
+"""A cloud that is too large is taken for one of another unit if that makes it as long as this."""
+_USUAL_SHARE, _AS_LIKELY = 0.7, 0.3
+"""What is seen of an object is about so long; of units that give it within 35 % all are named."""
+
+
+def unit_advice(model_diameter_m: float, points_m: Float[Tensor, "n 3"]) -> str | None:
+    """Say that the model and the cloud seem to be of different units; None where they agree.
+
+    The size of a cloud is twice the distance from its median that 95 % of the points stay within:
+    a few flying pixels do not change it.
+
+    Args:
+        model_diameter_m: of the model, in what was taken for metres.
+        points_m: of the object, in what was taken for metres.
+    """
+    if len(points_m) < 2:
+        return None
+    distance_m = (points_m - points_m.median(0).values).norm(dim=-1)
+    size_m = 2 * float(distance_m.kthvalue(1 + int(0.95 * (len(distance_m) - 1))).values)
+    if size_m <= 0:
+        return None
+    share = size_m / model_diameter_m
+    if _SMALLEST_SHARE <= share <= _LARGEST_SHARE:
+        return None
+    more, larger, smaller = max(share, 1 / share), "model", "cloud"
+    if share > 1:
+        larger, smaller = smaller, larger
+    # Five times too large is a mask of more than the object sooner than a sliver in inches.
+    least = _LIKELY_SHARE if share > 1 else _SMALLEST_SHARE
+    fits = {unit: share * factor if share < 1 else share / factor
+            for unit, factor in _PER_METRE.items()}  # fmt: skip
+    likely = {abs(math.log(fit / _USUAL_SHARE)): unit for unit, fit in fits.items()
+              if least <= fit <= _LARGEST_SHARE}  # fmt: skip
+    if likely:
+        best = min(likely)
+        units = " or ".join(unit for off, unit in likely.items() if off < best + _AS_LIKELY)
+        return f"your {larger} is {more:.0f} times larger than the {smaller}: is it in {units}?"
+    units = " or ".join(
+        unit for unit, mm in _MM.items()
+        if _LIKELY_SHARE <= (share * mm if share < 1 else share / mm) <= _LARGEST_SHARE
+    )  # fmt: skip
+    relation = "larger" if share > 1 else "smaller"
+    return (
+        f"the cloud is {more:.1f} times {relation} than the model: is this the right object, and "
+        f"does the mask fit it?{f' Or is the {smaller} in {units}?' if units else ''}"
+    )
+
+
+_COARSE_MESH = 1000
 """A mesh of fewer points (a CAD box has eight) also takes keypoints from inside its faces."""
 _LARGEST_M, _SMALLEST_M = 20.0, 0.002
 
@@ -54,7 +404,17 @@ def read_model(
     scale = metres_of(unit)
     vertices, faces = read_geometry(path)
     vertices_m = torch.from_numpy(vertices) * scale
-    _refuse_unit(path, vertices_m, unit)
+    extent_m = float((vertices_m.amax(0) - vertices_m.amin(0)).max())
+    if extent_m > _LARGEST_M and unit == "m":
+        raise InputError(
+            f"{path}: the model is {extent_m:g} m long, and no sensor sees it whole; is it in mm? "
+            "Then say unit mm (or cm)."
+        )
+    if 0 < extent_m < _SMALLEST_M and unit == "mm":
+        raise InputError(
+            f"{path}: the model is {extent_m * 1000:g} mm long, below what a sensor resolves; is "
+            "it in metres? Then say unit m; of BOP, whose models are in mm, multiply it by 1000."
+        )
     return make_model(
         vertices_m,
         torch.from_numpy(faces),
@@ -96,7 +456,10 @@ def make_model(
         keypoints_m=vertices_m[:0],
         symmetries=Symmetries() if symmetries is None else symmetries,
     )
-    return _with_keypoints(model, config.keypoints)
+    candidates = vertices_m
+    if len(faces) and len(candidates) < _COARSE_MESH:
+        candidates = torch.cat([candidates, sample_surface(model, 4096)[0]])
+    return replace(model, keypoints_m=candidates[farthest_points(candidates, config.keypoints)])
 
 
 def refuse_one_name(models: Sequence[ObjectModel]) -> None:
@@ -117,7 +480,7 @@ def refuse_one_name(models: Sequence[ObjectModel]) -> None:
 
 _HULL = 8000
 """Corners of a hull of which all pairs are compared; more take seconds."""
-_DIRECTIONS = 4096
+_HULL_DIRECTIONS = 4096
 """No direction is farther than 0.03 rad from one of these, whose cosine is 0.9995."""
 
 
@@ -133,29 +496,14 @@ def exact_diameter(points_m: Float[Tensor, "n 3"]) -> float:
         points = points[ConvexHull(points).vertices]
     everything = torch.from_numpy(points)
     if len(everything) > _HULL:
-        everything = everything[_farthest_each_way(everything)]
+        farthest = []
+        for some in fibonacci_directions(_HULL_DIRECTIONS).T.split(256, dim=1):
+            along = everything @ some
+            farthest += [along.argmax(0), along.argmin(0)]
+        everything = everything[torch.cat(farthest).unique()]
     exactly = "donot_use_mm_for_euclid_dist"
     rows = (torch.cdist(row, everything, compute_mode=exactly) for row in everything.split(1024))
     return max(float(row.max()) for row in rows)
-
-
-def _farthest_each_way(points: Float64[Tensor, "n 3"]) -> Int64[Tensor, " m"]:
-    """Number the points that lie farthest forwards or backwards in evenly spread directions."""
-    directions = fibonacci_directions(_DIRECTIONS).T
-    found = []
-    for some in directions.split(256, dim=1):
-        along = points @ some
-        found += [along.argmax(0), along.argmin(0)]
-    return torch.cat(found).unique()
-
-
-def _with_keypoints(model: ObjectModel, count: int) -> ObjectModel:
-    candidates = model.vertices_m
-    if len(model.faces) and len(candidates) < _COARSE:
-        candidates = torch.cat([candidates, sample_surface(model, 4096)[0]])
-    keypoints_m = candidates[farthest_points(candidates, count)]
-    fields = {**vars(model), "keypoints_m": keypoints_m}
-    return ObjectModel(**fields)
 
 
 def _vertex_normals(vertices_m: Tensor, faces: Tensor) -> Tensor:
@@ -166,17 +514,3 @@ def _vertex_normals(vertices_m: Tensor, faces: Tensor) -> Tensor:
     for corner in range(3):
         total.index_add_(0, faces[:, corner], doubled)
     return (total / total.norm(dim=-1, keepdim=True).clamp(min=1e-300)).to(vertices_m)
-
-
-def _refuse_unit(path: AnyPath, vertices_m: Tensor, unit: Unit) -> None:
-    extent_m = float((vertices_m.amax(0) - vertices_m.amin(0)).max())
-    if extent_m > _LARGEST_M and unit == "m":
-        raise InputError(
-            f"{path}: the model is {extent_m:g} m long, and no sensor sees it whole; is it in mm? "
-            "Then say unit mm (or cm)."
-        )
-    if 0 < extent_m < _SMALLEST_M and unit == "mm":
-        raise InputError(
-            f"{path}: the model is {extent_m * 1000:g} mm long, below what a sensor resolves; is "
-            "it in metres? Then say unit m; of BOP, whose models are in mm, multiply it by 1000."
-        )

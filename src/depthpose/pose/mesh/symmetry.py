@@ -1,132 +1,615 @@
-"""Declared symmetries: BOP's way of writing them, and as a set of transforms."""
+"""Symmetries found in a shape, near-symmetries, and how far it is from its mirror image."""
 
 import math
-from collections.abc import Mapping
-from typing import Any
+from collections import OrderedDict
+from collections.abc import Callable
+from contextlib import suppress
+from dataclasses import dataclass, replace
+from functools import cache, lru_cache
+from hashlib import sha256
+from pathlib import Path
+from typing import Any, NamedTuple, TypeVar
 
+import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Float64
+from scipy.spatial import KDTree
 from torch import Tensor
 
+from depthpose.core.arrays import take_evenly
 from depthpose.core.errors import InputError
-from depthpose.core.rigid import Rigid
-from depthpose.pose.types import Axis, Symmetries
+from depthpose.core.files import cache_folder, read_json, write_json
+from depthpose.core.rigid import Rigid, fit_rigid, geodesic_rad
+from depthpose.pose.mesh.models import (
+    fibonacci_directions,
+    sample_surface,
+    symmetry_transforms,
+    turn_about,
+)
+from depthpose.pose.types import Axis, ObjectModel, Symmetries
 
-BOP_STEP = 0.01
-"""BOP turns about a continuous axis so that no point moves more than this share of the diameter."""
+ValueT = TypeVar("ValueT")
 
-
-def turn_about(
-    direction: Float[Tensor, "3"], point_m: Float[Tensor, "3"], angle_rad: Float[Tensor, "*batch"]
-) -> Rigid:
-    """Turn about the line through ``point_m``, by the right-hand rule (Rodrigues)."""
-    x, y, z = (direction / direction.norm()).unbind()
-    zero = torch.zeros_like(x)
-    K = torch.stack([zero, -z, y, z, zero, -x, -y, x, zero]).reshape(3, 3)
-    angle = angle_rad[..., None, None].to(K)
-    R = torch.eye(3).to(K) + angle.sin() * K + (1 - angle.cos()) * (K @ K)
-    return Rigid(R, point_m - (R @ point_m[..., None]).squeeze(-1))
+_MOST_IN_MEMORY = 128
+"""Values in memory."""
+_memory: OrderedDict[str, Any] = OrderedDict()
 
 
-def symmetry_transforms(symmetries: Symmetries, max_step: float = BOP_STEP) -> Rigid:
-    """List the transforms ``model_from_model`` that leave the object as it is.
+def kept(
+    model: ObjectModel,
+    name: str,
+    compute: Callable[[ObjectModel], Any],
+    decode: Callable[[Any], ValueT],
+) -> ValueT:
+    """Give a value of a model that takes long to compute.
 
-    The identity, the discrete ones, and each of them followed by turns about each continuous axis
-    (BOP: ``ceil(pi / max_step)`` equal steps of the full turn). BOP's toolkit leaves out the turn
-    by 0 where there is an axis; here it is in, so that an exact estimate has no error.
-
-    Returns:
-        A batch, the identity first.
-    """
-    eye = Rigid(torch.eye(3)[None], torch.zeros(1, 3))
-    discrete = symmetries.discrete
-    if discrete is not None:
-        eye = Rigid(torch.cat([eye.R.to(discrete.R), discrete.R]),
-                    torch.cat([eye.t_m.to(discrete.t_m), discrete.t_m]))  # fmt: skip
-    if not symmetries.continuous:
-        return eye
-    steps = math.ceil(math.pi / max_step)
-    angles = torch.arange(steps, dtype=torch.float64) * (2 * math.pi / steps)
-    every = [eye]
-    for axis in symmetries.continuous:
-        turns = turn_about(axis.direction.to(eye.R), axis.point_m.to(eye.R), angles[1:])
-        R = turns.R[:, None] @ eye.R[None]
-        t_m = (turns.R[:, None] @ eye.t_m[None, :, :, None]).squeeze(-1) + turns.t_m[:, None]
-        every.append(Rigid(R.flatten(0, 1), t_m.flatten(0, 1)))
-    return Rigid.cat(every)
-
-
-def symmetries_from_bop(info: Mapping[str, Any], *, source: str) -> Symmetries:
-    """Read ``symmetries_discrete`` (4x4, row by row) and ``symmetries_continuous``; both in mm.
-
-    ``symmetries_found`` is ours: true where they were found in the geometry.
+    It is kept in ``$DEPTHPOSE_CACHE``, where that can be written to.
 
     Args:
-        info: an object's entry of ``models_info.json``.
-        source: what to call it in errors.
-
-    Raises:
-        InputError: an entry is no rigid transform or no axis.
+        model: of which vertices, faces and symmetries count.
+        name: of the value, and of its folder in the cache.
+        compute: gives the value in a form that JSON has.
+        decode: makes the value of that form; what it cannot read is computed again.
     """
-    turns, lines = (info.get(f"symmetries_{kind}", []) for kind in ("discrete", "continuous"))
-    if not isinstance(turns, list) or not isinstance(lines, list):
-        raise InputError(f"{source}: its symmetries are no lists; write [...] of them")
-    matrices = [_rigid_from_bop(row, source) for row in turns]
-    axes = tuple(_axis_from_bop(entry, source) for entry in lines)
-    is_found = info.get("symmetries_found", False) is True
-    if not matrices:
-        return Symmetries(continuous=axes, is_found=is_found)
-    stacked = torch.stack(matrices)
-    discrete = Rigid(stacked[:, :3, :3], stacked[:, :3, 3])
-    return Symmetries(discrete=discrete, continuous=axes, is_found=is_found)
+    place = f"{name}/{_key_of(model)}.json"
+    if place not in _memory:
+        path = cache_folder() / place
+        try:
+            _memory[place] = decode(read_json(path))
+        except (InputError, OSError, KeyError, TypeError, ValueError, RuntimeError):
+            value = compute(model)
+            with suppress(InputError, OSError):
+                write_json(path, value)
+            _memory[place] = decode(value)
+        while len(_memory) > _MOST_IN_MEMORY:
+            _memory.popitem(last=False)
+    return _memory[place]
 
 
-def symmetries_to_bop(symmetries: Symmetries) -> dict[str, Any]:
-    """Write symmetries as ``models_info.json`` has them; kinds without an entry are left out."""
-    info: dict[str, Any] = {}
+@lru_cache(maxsize=64)
+def _key_of(model: ObjectModel) -> str:
+    """Name a shape and its symmetries by their bytes, and by the code that computes."""
+    symmetries = model.symmetries
+    tensors = [model.vertices_m, model.faces]
     if symmetries.discrete is not None:
-        R, t_mm = symmetries.discrete.R, 1000 * symmetries.discrete.t_m
-        top = torch.cat([R, t_mm[..., None]], -1).flatten(1).tolist()
-        info["symmetries_discrete"] = [[*row, 0.0, 0.0, 0.0, 1.0] for row in top]
-    if symmetries.continuous:
-        info["symmetries_continuous"] = [
-            {"axis": axis.direction.tolist(), "offset": (1000 * axis.point_m).tolist()}
-            for axis in symmetries.continuous
-        ]
-    if symmetries.is_found and info:
-        info["symmetries_found"] = True
-    return info
+        tensors.append(symmetries.discrete.R)
+    tensors += [axis.direction for axis in symmetries.continuous]
+    digest = sha256(f"{symmetries.is_found} {_code()}".encode())
+    for tensor in tensors:
+        digest.update(tensor.contiguous().numpy().tobytes())
+    return digest.hexdigest()
 
 
-def _rigid_from_bop(row: object, source: str) -> Float[Tensor, "4 4"]:
-    try:
-        matrix = torch.tensor(row, dtype=torch.float64).reshape(4, 4)
-    except (TypeError, ValueError, RuntimeError, OverflowError) as error:
-        raise InputError(
-            f"{source}: the symmetry {repr(row)[:80]} is not 16 numbers; write a 4x4 matrix row by "
-            "row"
-        ) from error
-    R = matrix[:3, :3]
-    is_rigid = torch.allclose(R @ R.T, torch.eye(3).double(), atol=1e-3) and torch.det(R) > 0
-    if not is_rigid or matrix[3].tolist() != [0, 0, 0, 1]:
-        raise InputError(
-            f"{source}: the symmetry {repr(row)[:200]} is no rigid motion; its upper left 3x3 is a "
-            "rotation, its last row 0 0 0 1"
+@cache
+def _code() -> str:
+    """Name the sources of this package."""
+    digest = sha256()
+    for path in sorted(Path(__file__).parent.glob("*.py")):
+        digest.update(path.read_bytes())
+    return digest.hexdigest()
+
+
+_ORDERS = (2, 3, 4, 5, 6)
+_TRIED_ORDERS = range(2, 13)
+_TURNS = 36
+_COARSE = 0.04
+"""Deviation, in diameters, from which following the surface may still find a symmetry: an axis
+that is off by 4 degrees moves the surface by about as much."""
+_SAME_RAD = 0.15
+_SUPPRESSION_RAD = 0.25
+SURE = 0.5
+"""Certainty from which a proposal is taken: that of a copy that is off by the tolerance."""
+_MOST_AXES = 40
+"""A cube has 13 axes, an icosahedron 31."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class SymmetryProposal:
+    """One way in which an object may look alike.
+
+    Attributes:
+        kind: ``discrete`` or ``continuous``.
+        axis: what to turn about.
+        angle_rad: by how much; nothing for a continuous symmetry.
+        deviation: distance of the turned surface from the surface, in diameters: the largest but
+            for 2 % of the points, and for ``continuous`` over all turns.
+        certainty: 1 for an exact copy, 1/2 at the tolerance, toward 0 beyond.
+    """
+
+    kind: str
+    axis: Axis
+    angle_rad: float | None
+    deviation: float
+    certainty: float
+
+
+class SurfaceDeviation:
+    """Measures how far a turned surface lies from itself, in diameters."""
+
+    def __init__(self, model: ObjectModel) -> None:
+        dense, normals = sample_surface(model, 20000)
+        self.centre_m = dense.double().mean(0)
+        self.points = (dense.double() - self.centre_m) / model.diameter_m
+        self._normals = normals.double().numpy()
+        self._tree = KDTree(self.points.numpy())
+        self.few, self.many = (self._every(count) for count in (100, 1000))
+        self._rough_tree = KDTree(self._every(2500).numpy())
+
+    def _every(self, count: int) -> Float[Tensor, "m 3"]:
+        return take_evenly(self.points, count)
+
+    def nearest(self, moved: Float[Tensor, "*batch m 3"]) -> tuple[np.ndarray, np.ndarray]:
+        """Give distance and index of the nearest sample."""
+        distance, index = self._tree.query(moved.numpy(), workers=torch.get_num_threads())
+        return np.asarray(distance), np.asarray(index)
+
+    def rough_distance(self, R: Float[Tensor, "*batch 3 3"]) -> Float[Tensor, "*batch"]:
+        """Mean distance of few turned points to a rough surface: for thousands of turns."""
+        turned = (self.few @ R.mT).numpy()
+        distance, _ = self._rough_tree.query(turned, workers=torch.get_num_threads())
+        return torch.from_numpy(np.asarray(distance)).mean(-1)
+
+    def is_promising(self, R: Float[Tensor, "*batch 3 3"]) -> Tensor:
+        """Say coarsely, by few points, whether a turn is worth measuring."""
+        return self.rough_distance(R) <= _COARSE
+
+    def deviation(
+        self, R: Float[Tensor, "*batch 3 3"], shift: Float[Tensor, "*batch 3"] | None = None
+    ) -> Float[Tensor, "*batch"]:
+        """The 98th percentile of the distance to the surface, both ways.
+
+        Args:
+            R: turns about the centre of the surface.
+            shift: after the turn, in diameters.
+        """
+        turn = Rigid(R, torch.zeros_like(R[..., 0]) if shift is None else shift)
+        return torch.maximum(self._one_way(turn), self._one_way(turn.inverse()))
+
+    def _one_way(self, turn: Rigid) -> Float[Tensor, "*batch"]:
+        moved = self.many @ turn.R.mT + turn.t_m[..., None, :]
+        distance, index = self.nearest(moved)
+        gap = moved.numpy() - self.points.numpy()[index]
+        height = np.abs((gap * self._normals[index]).sum(-1))
+        # Between samples the plane says the distance; beside an edge, the sample does.
+        spacing = 2.0 / math.sqrt(len(self.points))
+        beside = np.maximum(distance - spacing, 0)
+        return torch.from_numpy(np.maximum(height, beside)).quantile(0.98, dim=-1)
+
+
+def propose_symmetries(model: ObjectModel, tolerance: float = 0.02) -> list[SymmetryProposal]:
+    """Search for turns that leave the shape as it is, and say how sure each is.
+
+    Every symmetry fixes the centre of the surface. Turns by a half to a sixth about the principal
+    axes and about 400 directions are tried coarsely; the promising ones follow the surface to an
+    exact axis; there, turns of order 2 to 12 and a full circle are measured. Texture does not
+    count: neither does it to a method that sees depth alone. Bumps smaller than the tolerance are
+    overlooked, so that a cup's handle is seen and its seam is not. Takes some seconds. A sphere is
+    reported as two axes of revolution.
+
+    Args:
+        model: the object.
+        tolerance: deviation in diameters at which the certainty is one half.
+
+    Returns:
+        Proposals of a certainty of 1/5 and more, continuous first, then the surest.
+    """
+    surface = SurfaceDeviation(model)
+    limit = 2 * tolerance
+    found: list[SymmetryProposal] = []
+    tried: list[Tensor] = []
+    for R in promising_turns(surface):
+        revolved = [p.axis.direction for p in found if p.kind == "continuous"]
+        if len(revolved) >= 2 or len(tried) >= _MOST_AXES:
+            break
+        if _is_known(_axis_of(R), tried, revolved):
+            continue
+        direction = _axis_of(_follow(surface, R))
+        if not _is_known(direction, tried, revolved):
+            tried.append(direction)
+            found += _measure(surface, direction, limit, tolerance)
+    return sorted(found, key=lambda p: (p.kind != "continuous", -p.certainty))
+
+
+def symmetries_from_proposals(proposals: list[SymmetryProposal]) -> Symmetries:
+    """Take the sure ones: turns that an axis of revolution does not already say, and the axes.
+
+    Without an axis the turns are completed to a group: two symmetries one after the other are one.
+    """
+    sure = [p for p in proposals if p.certainty >= SURE]
+    axes = tuple(p.axis for p in sure if p.kind == "continuous")
+    kept: list[Rigid] = []
+    for proposal in sure:
+        if proposal.angle_rad is None:
+            continue
+        turn = turn_about(proposal.axis.direction, proposal.axis.point_m,
+                          torch.tensor(proposal.angle_rad, dtype=torch.float64))  # fmt: skip
+        # A turn about an axis makes it one of those kept where both move the axis alike.
+        is_known = any(
+            float(geodesic_rad(turn.R, other.R)) < _SAME_RAD
+            or any(
+                float((turn.R @ axis.direction - other.R @ axis.direction).norm()) < _SAME_RAD
+                for axis in axes
+            )
+            for other in kept
         )
-    matrix[:3, 3] *= 0.001
-    return matrix
+        if not is_known:
+            kept.append(turn)
+    if not kept:
+        return Symmetries(continuous=axes)
+    kept = kept if axes else _completed(kept)
+    discrete = Rigid.stack(kept)
+    return Symmetries(discrete=discrete, continuous=axes)
 
 
-def _axis_from_bop(entry: object, source: str) -> Axis:
-    try:
-        assert isinstance(entry, Mapping)
-        direction = torch.tensor(entry["axis"], dtype=torch.float64).reshape(3)
-        offset_mm = torch.tensor(entry.get("offset", [0, 0, 0]), dtype=torch.float64).reshape(3)
-        length = float(direction.norm())
-        assert 0 < length < math.inf
-    except (AssertionError, KeyError, TypeError, ValueError, RuntimeError, OverflowError) as error:
-        raise InputError(
-            f'{source}: the continuous symmetry {repr(entry)[:80]} is not {{"axis": [x, y, z], '
-            '"offset": [x, y, z]} with an axis of some length'
-        ) from error
-    return Axis(direction=direction / length, point_m=0.001 * offset_mm)
+def with_found_symmetries(
+    model: ObjectModel,
+    on_message: Callable[[str], None] | None,
+    *,
+    is_taken: bool,
+    tolerance: float = 0.02,
+) -> ObjectModel:
+    """Look for the symmetries of a model that declares none, and count them if that is wanted.
+
+    Args:
+        model: a mesh, or points with normals.
+        on_message: called with what was found, taken or not; None: symmetries that are not taken
+            are not searched.
+        is_taken: give the model these symmetries.
+        tolerance: as for :func:`propose_symmetries`.
+    """
+    if not (is_taken or on_message) or not model.symmetries.is_none:
+        return model
+    proposals = propose_symmetries(model, tolerance)
+    found = replace(symmetries_from_proposals(proposals), is_found=True)
+    if found.is_none:
+        return model
+    turns = 0 if found.discrete is None else len(found.discrete.R)
+    certainty = min(p.certainty for p in proposals if p.certainty >= SURE)
+    if on_message is not None:
+        on_message(
+            f"{model.name}: looks the same after {turns} turns, about {len(found.continuous)} axes "
+            f"(certainty {certainty:.2f} and more); "
+            + (
+                "each copy counts as right"
+                if is_taken
+                else "if that is so, say --symmetries found: no network can distinguish the copies"
+            )
+        )
+    return replace(model, symmetries=found) if is_taken else model
+
+
+def _completed(turns: list[Rigid]) -> list[Rigid]:
+    """Add products until there is no new one; what passes 60 was no group (an icosahedron's)."""
+    every = list(turns)
+    eye = torch.eye(3, dtype=torch.float64)
+    for first in every:  # grows under way
+        for second in turns:
+            product = first @ second
+            known = [eye, *(turn.R for turn in every)]
+            if all(float(geodesic_rad(product.R, R)) > _SAME_RAD for R in known):
+                every.append(product)
+        if len(every) > 60:
+            return turns
+    return every
+
+
+def _proposal(
+    kind: str, axis: Axis, angle_rad: float | None, deviation: float, tolerance: float
+) -> SymmetryProposal:
+    certainty = 1 / (1 + (deviation / tolerance) ** 2)
+    return SymmetryProposal(
+        kind=kind, axis=axis, angle_rad=angle_rad, deviation=deviation, certainty=certainty
+    )
+
+
+def _turns(direction: Float[Tensor, "3"], angles: Float[Tensor, " a"]) -> Float[Tensor, "a 3 3"]:
+    return turn_about(direction, torch.zeros_like(direction), angles).R
+
+
+def promising_turns(surface: SurfaceDeviation) -> list[Float[Tensor, "3 3"]]:
+    """Try turns about principal axes and many directions; those that fit, the best first."""
+    spread = surface.points.T @ surface.points
+    candidates = torch.cat([torch.linalg.eigh(spread).eigenvectors.T, fibonacci_directions(400)])
+    angles = torch.tensor([2 * math.pi / order for order in _ORDERS], dtype=torch.float64)
+    turns = torch.stack([_turns(direction, angles) for direction in candidates]).flatten(0, 1)
+    coarse = surface.rough_distance(turns)
+    return [turns[i] for i in coarse.argsort().tolist() if coarse[i] <= _COARSE]
+
+
+def _is_known(direction: Tensor, tried: list[Tensor], revolved: list[Tensor]) -> bool:
+    """Whether an axis was tried, or follows: all lines across an axis of revolution are alike."""
+    near = math.cos(_SAME_RAD)
+    across = [a for a in revolved if abs(float(a @ direction)) < math.sin(_SAME_RAD)]
+    is_across = any(abs(float(a @ t)) < math.sin(_SAME_RAD) for a in across for t in tried)
+    return is_across or any(abs(float(direction @ t)) > near for t in tried)
+
+
+def _measure(
+    surface: SurfaceDeviation, direction: Tensor, limit: float, tolerance: float
+) -> list[SymmetryProposal]:
+    """Measure the full circle about an axis and, unless that is sure, turns of order 2 to 12.
+
+    A rough square block is nearly round, and surely square.
+    """
+    axis = Axis(direction=direction, point_m=surface.centre_m)
+    circle = _turns(direction, torch.arange(1, _TURNS) * (2 * math.pi / _TURNS))
+    found: list[SymmetryProposal] = []
+    if bool(surface.is_promising(circle).all()):
+        worst = float(surface.deviation(circle).max())
+        if worst <= limit:
+            found = [_proposal("continuous", axis, None, worst, tolerance)]
+        if worst <= tolerance:
+            return found
+    # Every turn of order 2 to 12, each once.
+    shares = sorted({k / order for order in _TRIED_ORDERS for k in range(1, order)})
+    angles = torch.tensor(shares, dtype=torch.float64) * (2 * math.pi)
+    angles = angles[surface.is_promising(_turns(direction, angles))]
+    if len(angles) == 0:
+        return found
+    deviation = surface.deviation(_turns(direction, angles))
+    kept: list[SymmetryProposal] = []
+    for i in deviation.argsort().tolist():
+        angle, value = float(angles[i]), float(deviation[i])
+        # A turn near a better one is the same symmetry (non-maximum suppression).
+        is_shadow = any(abs(angle - (p.angle_rad or 0)) < _SUPPRESSION_RAD for p in kept)
+        if value <= limit and not is_shadow:
+            kept.append(_proposal("discrete", axis, angle, value, tolerance))
+    return found + kept
+
+
+def _follow(surface: SurfaceDeviation, R: Float[Tensor, "3 3"]) -> Float[Tensor, "3 3"]:
+    """Refine the turned surface onto the surface (ICP about the fixed centre)."""
+    points = surface.many
+    weight = torch.ones(2 * len(points), dtype=torch.float64)
+    for _ in range(15):
+        _, index = surface.nearest(points @ R.mT)
+        target = surface.points[torch.from_numpy(index)]
+        # With each point its mirror image through the centre, the fit cannot shift.
+        R = fit_rigid(torch.cat([points, -points]), torch.cat([target, -target]), weight).R
+    return R
+
+
+def _axis_of(R: Float[Tensor, "3 3"]) -> Float[Tensor, "3"]:
+    """The direction that a rotation leaves alone; well defined for half turns too."""
+    _, _, vh = torch.linalg.svd(R - torch.eye(3, dtype=R.dtype))
+    return vh[-1]
+
+
+MIRROR_ALIKE = 0.03
+"""Deviation in diameters up to which the mirror image is as good as the model: as much as the size
+of an object may differ."""
+_MIRROR_PLANES = 400
+_MIRROR_STARTS = 8
+_APART_RAD = math.radians(25)
+_STEPS = 20
+_NEAREST = 0.9
+"""Points that count in each step of ICP."""
+_FLIP = torch.diag(torch.tensor([-1.0, 1.0, 1.0], dtype=torch.float64))
+
+
+def mirror_deviation(model: ObjectModel) -> float:
+    """Measure how far the mirror image of a model deviates from it, in diameters.
+
+    The mirror image is laid on the model by ICP from the best of 400 mirror planes and rotary
+    reflections; the deviation is the largest distance but for 2 % of the points. It takes about a
+    second, once for each shape: it is kept in ``$DEPTHPOSE_CACHE``.
+
+    Args:
+        model: the object, a mesh or points with normals.
+    """
+
+    def compute(model: ObjectModel) -> float:
+        surface = SurfaceDeviation(model)
+        turns = [refine_turn(surface, R @ _FLIP, _FLIP) for R in _mirror_starts(surface)]
+        R, shift = torch.stack([t.R for t in turns]) @ _FLIP, torch.stack([t.t_m for t in turns])
+        return float(surface.deviation(R, shift).min())
+
+    return kept(model, "mirror_deviation", compute, float)
+
+
+def is_mirror_alike(model: ObjectModel) -> bool:
+    """Whether the mirror image of a model is the model itself as far as a depth sensor can tell."""
+    return mirror_deviation(model) <= MIRROR_ALIKE
+
+
+def refine_turn(
+    surface: SurfaceDeviation, R: Float64[Tensor, "3 3"], flip: Float64[Tensor, "3 3"] | None = None
+) -> Rigid:
+    """Refine the turn of a surface about the middle of its box onto itself (ICP).
+
+    Args:
+        surface: of the model.
+        R: where it begins.
+        flip: turns the points before; a reflection lays the mirror image on the surface.
+    """
+    points = surface.many if flip is None else surface.many @ flip
+    middle = (surface.points.amin(0) + surface.points.amax(0)) / 2
+    turn = Rigid(R, middle - (R if flip is None else R @ flip) @ middle)
+    for _ in range(_STEPS):
+        moved = turn.apply(points)
+        distance, index = surface.nearest(moved)
+        near = torch.from_numpy(distance <= np.quantile(distance, _NEAREST)).double()
+        turn = fit_rigid(points, surface.points[torch.from_numpy(index)], near)
+    return turn
+
+
+def _mirror_starts(surface: SurfaceDeviation) -> list[Float64[Tensor, "3 3"]]:
+    """Choose reflections, or reflections with a quarter turn or a half, that fit roughly."""
+    axes = torch.linalg.eigh(surface.points.T @ surface.points).eigenvectors.T
+    normals = torch.cat([axes, fibonacci_directions(_MIRROR_PLANES)])
+    along = normals[:, :, None] * normals[:, None]
+    across = torch.eye(3, dtype=torch.float64) - along
+    crossed = torch.linalg.cross(normals[:, None], torch.eye(3, dtype=torch.float64)[None])
+    # By 0, 90, 180 and 270 degrees about the normal: cos (1 - nn') + sin [n] - nn'.
+    turns = [c * across + s * crossed - along for c, s in ((1, 0), (0, 1), (-1, 0), (0, -1))]
+    every = torch.cat(turns)
+    chosen: list[Float64[Tensor, "3 3"]] = []
+    for k in surface.rough_distance(every).argsort().tolist():
+        if len(chosen) == _MIRROR_STARTS:
+            break
+        apart_rad = [float(geodesic_rad(every[k] @ _FLIP, other @ _FLIP)) for other in chosen]
+        if all(angle > _APART_RAD for angle in apart_rad):
+            chosen.append(every[k])
+    return chosen
+
+
+ALIKE = 0.01
+"""Deviation in diameters up to which a symmetry that was found in a scan is one; a copy that
+deviates by more differs in dents that are seen from near by, and is another pose."""
+_TOLERANCE = 0.05
+"""Deviation in diameters at which a sensor's noise begins to mask the difference of two poses: real
+points of LineMOD and YCB lie 1.4 to 2.6 % of the diameter off the posed surface. Twice as much is
+tried."""
+_NEAR_SUPPRESSION_RAD = math.radians(35)
+"""Turns nearer to each other are one: ICP goes from one to the other."""
+_STEP = math.pi / 8
+"""An axis that nearly is one of revolution counts as eight turns."""
+_FINE_STEP = math.pi / 36
+_MOST_NEAR = 24
+_NEAR_STARTS = 24
+"""Turns that ICP refines."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class NearSymmetry:
+    """A turn after which the object looks nearly as before.
+
+    Attributes:
+        model_from_model: the turn.
+        deviation: distance of the turned surface from the surface, in diameters: the largest but
+            for 2 % of the points.
+    """
+
+    model_from_model: Rigid
+    deviation: float
+
+
+class _Known(NamedTuple):
+    """What is kept of a model.
+
+    Attributes:
+        near: turns that nearly look alike.
+        alike: which discrete symmetries that were found look alike, and which axes.
+    """
+
+    near: tuple[NearSymmetry, ...]
+    alike: tuple[list[bool], list[bool]]
+
+
+def near_symmetries(model: ObjectModel) -> tuple[NearSymmetry, ...]:
+    """Find the turns that leave a model nearly as it is, the nearest first.
+
+    Not among them are those of :func:`true_symmetries`, which are no other pose. They are searched
+    once for each shape, which takes a second or a few, and kept in ``$DEPTHPOSE_CACHE``.
+
+    Args:
+        model: the object, a mesh or points with normals.
+    """
+    return _look_up(model).near
+
+
+def true_symmetries(model: ObjectModel) -> Symmetries:
+    """Give the symmetries whose copies are one pose.
+
+    Declared ones are all. Of those that were found in the geometry, copies that lie 1 % of the
+    diameter and more off the surface are left out: near-symmetries.
+    """
+    if not model.symmetries.is_found:
+        return model.symmetries
+    return _true(model.symmetries, _look_up(model).alike)
+
+
+def _look_up(model: ObjectModel) -> _Known:
+    return kept(model, "near_symmetries", _search, _decoded)
+
+
+def _decoded(found: Any) -> _Known:  # noqa: ANN401
+    turns = torch.tensor([matrix for matrix, _ in found["near"]], dtype=torch.float64)
+    near = [
+        NearSymmetry(model_from_model=Rigid(M[:3, :3], M[:3, 3]), deviation=deviation)
+        for M, (_, deviation) in zip(turns.reshape(-1, 4, 4), found["near"], strict=True)
+    ]
+    discrete, axes = found["alike"]
+    return _Known(tuple(near), (discrete, axes))
+
+
+def _search(model: ObjectModel) -> dict[str, Any]:
+    surface = SurfaceDeviation(model)
+    alike = _alike(model.symmetries, surface)
+    same = symmetry_transforms(_true(model.symmetries, alike), _FINE_STEP).R.double()
+    near: list[tuple[Rigid, float]] = []
+    for off, turn in sorted(_measured(model, surface), key=lambda pair: pair[0]):
+        if len(near) == _MOST_NEAR or off > 2 * _TOLERANCE:
+            break
+        # New is what is far from the others and from all copies of them that look alike.
+        others = torch.cat([R @ same for R in (torch.eye(3).double(), *(one.R for one, _ in near))])
+        apart_rad = float(geodesic_rad(turn.R.expand_as(others), others).min())
+        if apart_rad > _NEAR_SUPPRESSION_RAD:
+            near.append((turn, off))
+    return {"near": [(turn.matrix().tolist(), off) for turn, off in near], "alike": alike}
+
+
+def _measured(model: ObjectModel, surface: SurfaceDeviation) -> list[tuple[float, Rigid]]:
+    """Measure symmetries that were found, and turns refined to where they fit best.
+
+    A scan whose points lie denser on one side has its centre where no symmetry has it.
+    """
+    found = symmetry_transforms(model.symmetries, _STEP).R.double()[1:]
+    exact = found if model.symmetries.is_found else found[:0]
+    tried = [Rigid(R, torch.zeros(3).double()) for R in exact]
+    tried += [refine_turn(surface, R) for R in _near_starts(surface)]
+    measured = _deviations(tried, surface)
+    good = [turn for off, turn in sorted(measured, key=lambda pair: pair[0]) if off <= _TOLERANCE]
+    # Two turns one after the other are one: of a can, upside down and then about its axis.
+    measured += _deviations([a @ b for a in good[:_NEAR_STARTS] for b in good[:3]], surface)
+    # About the centre of the surface, in diameters, to the model's frame.
+    centre_m = surface.centre_m
+    return [
+        (off, Rigid(turn.R, centre_m - turn.R @ centre_m + turn.t_m * model.diameter_m))
+        for off, turn in measured
+    ]
+
+
+def _deviations(turns: list[Rigid], surface: SurfaceDeviation) -> list[tuple[float, Rigid]]:
+    if not turns:
+        return []
+    R, shift = torch.stack([t.R for t in turns]), torch.stack([t.t_m for t in turns])
+    return list(zip(surface.deviation(R, shift).tolist(), turns, strict=True))
+
+
+def _near_starts(surface: SurfaceDeviation) -> list[Float[Tensor, "3 3"]]:
+    """Give quarter turns about the principal axes, and the best of thousands of other turns."""
+    axes = torch.linalg.eigh(surface.points.T @ surface.points).eigenvectors.T
+    quarters = torch.arange(1, 4).double() * (math.pi / 2)
+    zero = torch.zeros(3).double()
+    starts = [R for axis in axes for R in turn_about(axis, zero, quarters).R]
+    eye = torch.eye(3).double()
+    for R in promising_turns(surface):
+        if len(starts) == _NEAR_STARTS:
+            break
+        if all(float(geodesic_rad(R, other)) > _NEAR_SUPPRESSION_RAD for other in [eye, *starts]):
+            starts.append(R)
+    return starts
+
+
+def _alike(given: Symmetries, surface: SurfaceDeviation) -> tuple[list[bool], list[bool]]:
+    """Mark the discrete symmetries, and the axes, whose copies lie on the surface."""
+    circle = torch.arange(1, 8, dtype=torch.float64) * (math.pi / 4)
+    zero = torch.zeros(3).double()
+    turns = [turn_about(axis.direction.double(), zero, circle).R for axis in given.continuous]
+    axes = [float(surface.deviation(R).max()) <= ALIKE for R in turns]
+    if given.discrete is None:
+        return [], axes
+    return (surface.deviation(given.discrete.R.double()) <= ALIKE).tolist(), axes
+
+
+def _true(given: Symmetries, alike: tuple[list[bool], list[bool]]) -> Symmetries:
+    """Give the symmetries that were marked; declared ones are all true."""
+    if not given.is_found:
+        return given
+    discrete = given.discrete
+    if discrete is not None:
+        discrete = discrete[torch.tensor(alike[0])] if any(alike[0]) else None
+    marked = zip(given.continuous, alike[1], strict=True)
+    axes = tuple(axis for axis, is_alike in marked if is_alike)
+    return Symmetries(discrete=discrete, continuous=axes, is_found=True)

@@ -243,9 +243,7 @@ class Voxels:
 
     @classmethod
     def from_points(
-        cls,
-        coordinates: Int[Tensor, "points 4"],
-        features: Float[Tensor, "points c"] | None = None,
+        cls, coordinates: Int[Tensor, "points 4"], features: Float[Tensor, "points c"] | None = None
     ) -> "Voxels":
         """Make voxels from rows of (cloud, x, y, z).
 

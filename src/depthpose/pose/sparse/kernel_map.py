@@ -91,7 +91,7 @@ def batch_coordinates(clouds: Sequence[Int[Tensor, "_ 3"]]) -> Int[Tensor, "n 4"
 Moves = tuple[tuple[int, int, int], ...]
 
 MARGIN = 4
-"""Cells about the box: as far as a kernel may look beyond it (:func:`reach_beyond`). With fewer a
+"""Cells about the box: as far as a kernel may look beyond it (:func:`cells_beyond`). With fewer a
 look past one row's end would find the next row."""
 
 MAX_CELLS = 1 << 24
@@ -99,7 +99,7 @@ CELLS_PER_VOXEL = 512
 """A box with more cells than these is mostly air: binary search is then the cheaper."""
 
 
-def reach_beyond(kernel: int, stride: int) -> int:
+def cells_beyond(kernel: int, stride: int) -> int:
     """Cells that a kernel looks beyond the box of the finer level's voxels.
 
     A coarser voxel lies up to ``stride - 1`` cells below the lowest finer one in it. An odd kernel
@@ -360,8 +360,8 @@ class CoordinateCache:
         """
         assert stride & (stride - 1) == 0, f"stride must be a power of two, got {stride}"
         assert kernel % 2 or stride > 1, "an even kernel has no centre: it needs a stride"
-        reach = reach_beyond(kernel, stride)
-        assert reach <= MARGIN, f"kernel {kernel} with stride {stride} looks {reach} cells beyond"
+        beyond = cells_beyond(kernel, stride)
+        assert beyond <= MARGIN, f"kernel {kernel} with stride {stride} looks {beyond} cells beyond"
         levels = stride.bit_length() - 1
         fine = level - levels if is_transposed else level
         assert fine >= 0, f"level {level} has no level {levels} finer"

@@ -1,11 +1,8 @@
 """Synthetic views of known objects: partial clouds and depth windows, and whole frames."""
 
-from depthpose.pose.synthetic.dataset import Objects as Objects
 from depthpose.pose.synthetic.frames import make_frames as make_frames
 from depthpose.pose.synthetic.parts import PARTS as PARTS
 from depthpose.pose.synthetic.parts import make_part as make_part
-from depthpose.pose.synthetic.parts import random_part as random_part
-from depthpose.pose.synthetic.parts import random_simple_part as random_simple_part
-from depthpose.pose.synthetic.parts import write_part as write_part
+from depthpose.pose.synthetic.views import Objects as Objects
 from depthpose.pose.synthetic.views import drawn_triangles as drawn_triangles
 from depthpose.pose.synthetic.views import surfel_triangles as surfel_triangles

@@ -6,16 +6,14 @@ in millimetres, as CAD files are.
 
 import math
 from collections.abc import Callable
-from pathlib import Path
 
 import numpy as np
 import torch
 
 from depthpose.core.errors import InputError, nearest_name
-from depthpose.core.files.disk import write_bytes
 from depthpose.core.rigid import Rigid
-from depthpose.pose.augment import uniform, whole
-from depthpose.pose.config import MeshConfig, metres_of
+from depthpose.core.units import metres_of
+from depthpose.pose.config import MeshConfig
 from depthpose.pose.mesh import make_model, turn_about
 from depthpose.pose.types import Axis, ObjectModel, Symmetries
 
@@ -46,96 +44,16 @@ def make_part(name: str, number: int = 0, config: MeshConfig | None = None) -> O
     )
 
 
-def write_part(name: str, folder: Path) -> Path:
-    """Write a part as an STL file in millimetres, as a CAD program would; give the file.
-
-    Raises:
-        InputError: there is no such part, or the disk refuses.
-    """
-    import trimesh
-
-    if name not in PARTS:
-        raise InputError(f"no part is called {name!r}; {nearest_name(name, PARTS)}")
-    data = trimesh.Trimesh(*PARTS[name](), process=False).export(file_type="stl")
-    assert isinstance(data, bytes)
-    path = folder / f"{name}.stl"
-    write_bytes(path, data)
-    return path
-
-
-def random_part(generator: torch.Generator, name: str = "part") -> ObjectModel:
-    """Make a part of three to six boxes, tubes and cones that run into one another.
-
-    Args:
-        generator: of the sizes, in millimetres from 3 to 90, and places.
-        name: what samples call it.
-    """
-    pieces = []
-    for _ in range(3 + whole(generator, 4)):
-        turned = _random_solid(generator)
-        for axis in np.eye(3).tolist():
-            turned = _turned(turned, (axis[0], axis[1], axis[2]), 90.0 * whole(generator, 4))
-        if whole(generator, 4) == 0:
-            turned = _turned(turned, (0.0, 0.0, 1.0), uniform(generator, 0.0, 90.0))
-        pieces.append(_moved(turned, tuple(uniform(generator, -35.0, 35.0) for _ in range(3))))
-    vertices, faces = _joined(*pieces)
-    return make_model(torch.from_numpy(vertices) * metres_of("mm"), torch.from_numpy(faces),
-                      name=name)  # fmt: skip
-
-
-def random_simple_part(generator: torch.Generator, name: str = "part") -> ObjectModel:
-    """Make a box, a tube, a cup, or a profile of the shape of an L, T or U.
-
-    All but an L of unlike legs have symmetries, which the model does not name
-    (:func:`~depthpose.pose.mesh.with_found_symmetries` finds them).
-
-    Args:
-        generator: of kind and sizes, in millimetres.
-        name: what samples call it.
-    """
-    width, depth, length = (uniform(generator, 20.0, 90.0) for _ in range(3))
-    wall, bore = uniform(generator, 3.0, 10.0), uniform(generator, 0.3, 0.9)
-    foot, web, edge = _box((width, wall, length)), _box((wall, depth, length)), (width - wall) / 2
-    left, middle, right = (_moved(web, (x, depth / 2, 0.0)) for x in (-edge, 0.0, edge))
-    solids = [
-        _box((width, depth, length)),
-        _tube(width / 2, bore * width / 2, length),
-        _cup(width / 2, length, wall),
-        _joined(foot, left),
-        _joined(foot, middle),
-        _joined(foot, left, right),
-    ]
-    vertices, faces = solids[whole(generator, len(solids))]
-    return make_model(torch.from_numpy(vertices) * metres_of("mm"), torch.from_numpy(faces),
-                      name=name)  # fmt: skip
-
-
-def _cup(radius: float, height: float, wall: float) -> Mesh:
-    inner = radius - min(wall, radius / 2)
-    return _revolved([(0.0, 0.0), (radius, 0.0), (radius, height), (inner, height),
-                      (inner, radius - inner), (0.0, radius - inner)])  # fmt: skip
-
-
-def _random_solid(generator: torch.Generator) -> Mesh:
-    kind, height = whole(generator, 3), uniform(generator, 10.0, 90.0)
-    if kind == 0:
-        return _box((uniform(generator, 4.0, 80.0), uniform(generator, 4.0, 60.0), height))
-    low, high = uniform(generator, 3.0, 35.0), uniform(generator, 3.0, 35.0)
-    if kind == 1:
-        return _tube(low, uniform(generator, 0.2, 0.8) * low, height)
-    return _revolved([(0.0, 0.0), (low, 0.0), (high, height), (0.0, height)])
-
-
 def _bracket() -> Mesh:
     """An angle of two plates with an off-centre hole each, and a rib: no symmetry."""
     base = _plate((120.0, 70.0, 8.0), (25.0, 5.0), 12.0)
-    wall = _turned(_plate((70.0, 80.0, 8.0), (-10.0, 12.0), 20.0), (0.0, 1.0, 0.0), 90.0)
-    rib = _box((45.0, 8.0, 40.0))
-    return _joined(
+    wall = turned(_plate((70.0, 80.0, 8.0), (-10.0, 12.0), 20.0), (0.0, 1.0, 0.0), 90.0)
+    rib = box((45.0, 8.0, 40.0))
+    return joined(
         base,
-        _moved(wall, (-56.0, 0.0, 36.0)),
-        _moved(rib, (-32.0, 24.0, 22.0)),
-        _moved(_tube(9.0, 4.0, 22.0), (38.0, -18.0, 12.0)),
+        moved(wall, (-56.0, 0.0, 36.0)),
+        moved(rib, (-32.0, 24.0, 22.0)),
+        moved(tube(9.0, 4.0, 22.0), (38.0, -18.0, 12.0)),
     )
 
 
@@ -145,32 +63,30 @@ def _flange() -> Mesh:
     radius = 50 + 9 * np.tanh(4 * np.cos(_TEETH * angle))
     outer = np.stack([radius * np.cos(angle), radius * np.sin(angle)], 1)
     disc = _ring(outer, _circle(14.0), 14.0)
-    return _joined(disc, _moved(_tube(26.0, 14.0, 30.0), (0.0, 0.0, 20.0)))
+    return joined(disc, moved(tube(26.0, 14.0, 30.0), (0.0, 0.0, 20.0)))
 
 
 def _mug() -> Mesh:
     """A cup with a handle, wider above than below: no turn leaves it as it is."""
-    cup = _revolved(
+    cup = revolved(
         [(0.0, 0.0), (32.0, 0.0), (36.0, 6.0), (42.0, 95.0), (38.0, 95.0), (33.0, 10.0), (0.0, 6.0)]
     )
     bow = np.linspace(-1.25, 1.25, 24)
     path = np.stack([37 + 30 * np.cos(bow), 0 * bow, 52 + 30 * np.sin(bow)], 1)
-    return _joined(cup, _hose(path, 5.5))
+    return joined(cup, _hose(path, 5.5))
 
 
 def _connector() -> Mesh:
     """A plug: a body with a key, pins of two lengths and a bent cable: no symmetry."""
-    body, key = _box((60.0, 34.0, 26.0)), _box((26.0, 8.0, 7.0))
+    body, key = box((60.0, 34.0, 26.0)), box((26.0, 8.0, 7.0))
     pins = [
-        _moved(
-            _turned(_tube(3.5, 1.5, length), (0.0, 1.0, 0.0), 90.0), (30.0 + length / 2.0, y, 4.0)
-        )
+        moved(turned(tube(3.5, 1.5, length), (0.0, 1.0, 0.0), 90.0), (30.0 + length / 2.0, y, 4.0))
         for y, length in ((-9.0, 24.0), (3.0, 14.0))
     ]
     bend = np.linspace(0, 1.4, 20)
     path = np.stack([-28 - 40 * np.sin(bend), 6 + 0 * bend, 40 * (1 - np.cos(bend))], 1)
-    collar = _moved(_box((14.0, 44.0, 16.0)), (22.0, 0.0, -3.0))
-    return _joined(body, _moved(key, (-8.0, 6.0, 16.0)), collar, *pins, _hose(path, 7.0))
+    collar = moved(box((14.0, 44.0, 16.0)), (22.0, 0.0, -3.0))
+    return joined(body, moved(key, (-8.0, 6.0, 16.0)), collar, *pins, _hose(path, 7.0))
 
 
 def _spool() -> Mesh:
@@ -187,7 +103,7 @@ def _spool() -> Mesh:
         (8.0, 50.0),
         (0.0, 50.0),
     ]
-    return _revolved(profile)
+    return revolved(profile)
 
 
 PARTS: dict[str, Callable[[], Mesh]] = {
@@ -221,13 +137,13 @@ def _plate(size: tuple[float, float, float], hole_at: tuple[float, float], hole:
     unit, at = _circle(1.0), np.array(hole_at)
     low, high = -np.array(size[:2]) / 2 - at, np.array(size[:2]) / 2 - at
     with np.errstate(divide="ignore", invalid="ignore"):
-        reach = np.where(unit > 0, high / unit, np.where(unit < 0, low / unit, np.inf)).min(1)
+        extent = np.where(unit > 0, high / unit, np.where(unit < 0, low / unit, np.inf)).min(1)
     corners = np.array([[x, y] for x in (low[0], high[0]) for y in (low[1], high[1])])
-    outline = unit * reach[:, None]
+    outline = unit * extent[:, None]
     # The ray nearest to each corner goes to the corner itself, or the plate would lack its corners.
     for corner in corners:
         outline[np.argmax(unit @ (corner / np.linalg.norm(corner)))] = corner
-    return _moved(_ring(outline, _circle(hole / 2), size[2]), (*hole_at, 0.0))
+    return moved(_ring(outline, _circle(hole / 2), size[2]), (*hole_at, 0.0))
 
 
 def _ring(outer: np.ndarray, inner: np.ndarray, height: float) -> Mesh:
@@ -242,18 +158,20 @@ def _ring(outer: np.ndarray, inner: np.ndarray, height: float) -> Mesh:
     return _skin([*loops, loops[0]])
 
 
-def _tube(radius: float, bore: float, height: float) -> Mesh:
+def tube(radius: float, bore: float, height: float) -> Mesh:
+    """Make a round tube about z."""
     return _ring(_circle(radius), _circle(bore), height)
 
 
-def _box(size: tuple[float, float, float]) -> Mesh:
+def box(size: tuple[float, float, float]) -> Mesh:
+    """Make a box about the origin."""
     signs = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)])
     quads = [(0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3)]
     faces = [face for a, b, c, d in quads for face in ((a, b, c), (a, c, d))]
     return signs * (np.array(size) / 2), np.array(faces)
 
 
-def _revolved(profile: list[tuple[float, float]]) -> Mesh:
+def revolved(profile: list[tuple[float, float]]) -> Mesh:
     """Turn (radius, height) about z, from the lower end of the axis along the outside and back."""
     loops = [np.hstack([_circle(r), np.full((_ROUND, 1), z)]) for r, z in profile]
     return _skin(loops)
@@ -285,11 +203,13 @@ def _skin(loops: list[np.ndarray]) -> Mesh:
     return vertices, quads[area > 1e-9]
 
 
-def _moved(mesh: Mesh, shift: tuple[float, ...]) -> Mesh:
+def moved(mesh: Mesh, shift: tuple[float, ...]) -> Mesh:
+    """Shift a mesh."""
     return mesh[0] + np.array(shift), mesh[1]
 
 
-def _turned(mesh: Mesh, axis: tuple[float, float, float], degrees: float) -> Mesh:
+def turned(mesh: Mesh, axis: tuple[float, float, float], degrees: float) -> Mesh:
+    """Turn a mesh about an axis through the origin."""
     turn = turn_about(
         torch.tensor(axis, dtype=torch.float64),
         torch.zeros(3).double(),
@@ -298,7 +218,8 @@ def _turned(mesh: Mesh, axis: tuple[float, float, float], degrees: float) -> Mes
     return mesh[0] @ turn.R.numpy().T, mesh[1]
 
 
-def _joined(*meshes: Mesh) -> Mesh:
+def joined(*meshes: Mesh) -> Mesh:
+    """Put meshes into one."""
     starts = np.cumsum([0, *(len(vertices) for vertices, _ in meshes)])
     faces = [faces + start for (_, faces), start in zip(meshes, starts, strict=False)]
     return np.concatenate([vertices for vertices, _ in meshes]), np.concatenate(faces)

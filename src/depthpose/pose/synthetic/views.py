@@ -1,23 +1,45 @@
-"""Clean views of one object: drawn at a pose, or turned out of a view that was drawn before.
+"""Synthetic views of known objects, drawn at a pose or turned out of a view that was drawn before.
 
 A camera that turns about its own centre sees the same surface points, along other rays. A stored
 view is therefore a view from every direction of gaze, and only its pixels are interpolated: inverse
 depth, which is linear in the picture of a plane, so that flat parts stay exact.
-
-With the triangles that a camera may see of a model, and the box of their picture.
 """
 
+import copy
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from scipy.spatial import ConvexHull, KDTree, QhullError
 from torch import Tensor
+from torch.utils.data import DataLoader
 
+from depthpose.core.errors import InputError
+from depthpose.core.loop import sample_generator
 from depthpose.core.render import rasterize
 from depthpose.core.rigid import Rigid, turn_axis_to
-from depthpose.pose.types import ObjectModel
+from depthpose.pose.augment import (
+    grow_mask,
+    measure,
+    occlude,
+    random_levels,
+    random_rotation,
+    shift_mask,
+    uniform,
+    whole,
+)
+from depthpose.pose.cloud import cloud_from_depth
+from depthpose.pose.config import CloudConfig, ObjectsConfig
+from depthpose.pose.types import (
+    CloudInput,
+    CloudSample,
+    ObjectModel,
+    PoseTruth,
+    ViewInput,
+    ViewSample,
+)
 
 _CORNERS = 6
 """Of a disc: three quarters of its area, in four triangles."""
@@ -176,11 +198,6 @@ def turn_view(
     return CleanView(depth_m=1 / (found * w), K=moved, camera_from_model=pose)
 
 
-def silhouette_of(view: CleanView) -> Bool[Tensor, "h w"]:
-    """Mark the pixels of the object."""
-    return view.depth_m.isfinite()
-
-
 def _interpolated(
     values: Float[Tensor, "h w"], u: Float[Tensor, "h2 w2"], v: Float[Tensor, "h2 w2"]
 ) -> Float[Tensor, "h2 w2"]:
@@ -201,3 +218,235 @@ def _interpolated(
     found = torch.where(spread < _JUMP * smooth, smooth, nearest)
     is_inside = (x - 0.5).abs().maximum((y - 0.5).abs()) <= 1
     return torch.where(is_inside, found, torch.nan)
+
+
+_BANK_SEED = 0x0B7EC7
+_TILT_RAD = math.radians(75)
+"""A table is seen from no flatter an angle."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _Stored:
+    """A clean view in half the memory.
+
+    Attributes:
+        depth_m: less the distance of the middle, float16: to 0.1 mm for what is below 0.2 m.
+        middle_m: that distance.
+        K: of the window.
+        camera_from_model: the pose.
+    """
+
+    depth_m: Float[Tensor, "h w"]
+    middle_m: float
+    K: Float[Tensor, "3 3"]
+    camera_from_model: Rigid
+
+
+class Objects:
+    """Synthetic partial views, each a function of the seed and its index alone: no order, no state.
+
+    Args:
+        models: what is shown; sample i shows ``models[i % len(models)]``.
+        config: how the samples look.
+        cloud: how they are lifted to clouds.
+
+    Raises:
+        InputError: no model, or one that does not fit before the camera.
+    """
+
+    def __init__(
+        self,
+        models: Sequence[ObjectModel],
+        config: ObjectsConfig | None = None,
+        cloud: CloudConfig | None = None,
+    ) -> None:
+        if not models:
+            raise InputError("there is no object to show; give one model at least")
+        self.models = tuple(models)
+        self.config = ObjectsConfig() if config is None else config
+        self.cloud = CloudConfig() if cloud is None else cloud
+        nearest = self.config.distance_m[0]
+        for model in self.models:
+            if nearest < model.diameter_m:
+                raise InputError(
+                    f"distance_m begins at {nearest:g} m, but object {model.name!r} is "
+                    f"{model.diameter_m:.3g} m wide: the camera would stand in it. Begin at "
+                    f"{1.5 * model.diameter_m:.2g} or farther, or correct the unit of the model."
+                )
+        self._shapes: dict[int, Shape] = {}
+        self._views: dict[tuple[int, int], _Stored] = {}
+
+    def __len__(self) -> int:
+        """How many samples there are."""
+        return self.config.number
+
+    def __getitem__(self, index: int) -> CloudSample:
+        """Make one partial cloud.
+
+        Raises:
+            IndexError: there is no such sample.
+        """
+        if not 0 <= index < len(self):
+            raise IndexError(f"sample {index} of {len(self)}")
+        return self.sample(index)
+
+    def draw_stored(self, workers: int) -> None:
+        """Draw all stored views now, in so many processes.
+
+        Processes that are forked later share them. Without this each process draws a view when a
+        sample first needs it, and keeps it for itself.
+        """
+        wanted = [(n, k) for k in range(self.config.views or 0) for n in range(len(self.models))]
+        views = DataLoader(
+            wanted,  # pyright: ignore[reportArgumentType]
+            batch_size=None,
+            num_workers=workers,
+            collate_fn=self._stored,
+        )
+        for place, view in zip(wanted, views, strict=True):
+            # Tensors that a worker process sends hold file descriptors; copies do not.
+            self._views[place] = copy.deepcopy(view)
+
+    def sample(self, index: int) -> CloudSample:
+        """Make the partial cloud of any index, also beyond the number of samples."""
+        view = self.view(index)
+        given, model = view.input, self.models[index % len(self.models)]
+        points_m = cloud_from_depth(
+            given.depth_m, given.mask, given.K, model.diameter_m, self.cloud
+        )
+        return CloudSample(
+            input=CloudInput(name=given.name, points_m=points_m, object=given.object),
+            truth=view.truth,
+        )
+
+    def view(self, index: int) -> ViewSample:
+        """Make the window of depth and the mask that a sample is lifted from."""
+        number = index % len(self.models)
+        generator = sample_generator(index, self.config.seed)
+        clean = self._clean_view(number, generator)
+        silhouette = clean.depth_m.isfinite()
+        depth_m, visible = clean.depth_m, silhouette
+        if self.config.with_background:
+            depth_m = self._before_background(clean, self._shape(number), generator)
+        if uniform(generator, 0.0, 1.0) < self.config.occluded_share:
+            share = uniform(generator, *self.config.occlusion)
+            depth_m, visible = occlude(depth_m, silhouette, share, generator)
+        most = self.config.mask_error_px
+        grow_px = whole(generator, 2 * most + 1) - most
+        # Pixels of the full image.
+        scale = float(clean.K[0, 0]) / self.config.focal_px[0]
+        mask = grow_mask(visible, round(grow_px * scale))
+        focal_px = (float(clean.K[0, 0]), self.config.focal_px[0])
+        measured_m = measure(depth_m, focal_px, self.config.sensor, generator)
+        most = self.config.mask_shift_px
+        rows, columns = (whole(generator, 2 * most + 1) - most for _ in range(2))
+        mask = shift_mask(mask, round(rows * scale), round(columns * scale))
+        model = self.models[number]
+        view = ViewInput(
+            name=f"{model.name}_{self.config.seed}_{index:06d}",
+            depth_m=measured_m,
+            mask=mask,
+            K=clean.K,
+            object=model.name,
+        )
+        truth = PoseTruth(
+            camera_from_model=clean.camera_from_model.float(),
+            visible_fraction=int(visible.sum()) / max(int(silhouette.sum()), 1),
+        )
+        return ViewSample(input=view, truth=truth)
+
+    def _clean_view(self, number: int, generator: torch.Generator) -> CleanView:
+        """Draw the object anew, or turn the camera of a stored view."""
+        shape, views = self._shape(number), self.config.views
+        if views is None:
+            R, distance_m, K = self._pose(generator)
+            turn = self._gaze(number, distance_m, K, generator)
+            middle = turn[:, 2] * distance_m
+            return draw_view(shape, pose_of_middle(shape, turn @ R, middle), K)
+        stored = self._stored((number, whole(generator, views)))
+        K = self.intrinsics(float(stored.K[0, 0]) / self.config.focal_px[0])
+        turn = self._gaze(number, stored.middle_m, K, generator)
+        before = CleanView(
+            depth_m=stored.depth_m.float() + stored.middle_m,
+            K=stored.K,
+            camera_from_model=stored.camera_from_model,
+        )
+        return turn_view(before, turn, shape, K)
+
+    def _stored(self, key: tuple[int, int]) -> _Stored:
+        """Give a view by the number of its object and its own, drawn when it is first needed."""
+        if key not in self._views:
+            number, place = key
+            index = place * len(self.models) + number
+            R, distance_m, K = self._pose(sample_generator(index, self.config.seed + _BANK_SEED))
+            shape = self._shape(number)
+            middle = torch.tensor([0.0, 0.0, distance_m], dtype=torch.float64)
+            view = draw_view(shape, pose_of_middle(shape, R, middle), K)
+            self._views[key] = _Stored(
+                depth_m=(view.depth_m - distance_m).half(),
+                middle_m=distance_m,
+                K=view.K,
+                camera_from_model=view.camera_from_model,
+            )
+        return self._views[key]
+
+    def _shape(self, number: int) -> Shape:
+        if number not in self._shapes:
+            self._shapes[number] = make_shape(self.models[number])
+        return self._shapes[number]
+
+    def _pose(self, generator: torch.Generator) -> tuple[Tensor, float, Tensor]:
+        R = random_rotation(generator)
+        distance_m = uniform(generator, *self.config.distance_m)
+        return R, distance_m, self.intrinsics(uniform(generator, *self.config.resolution))
+
+    def intrinsics(self, scale: float = 1.0) -> Float[Tensor, "3 3"]:
+        """Intrinsic matrix of the sensor's image at so many times its size."""
+        (fx, fy), (cx, cy) = self.config.focal_px, self.config.principal_point_px
+        rows = [
+            [scale * fx, 0, scale * (cx + 0.5) - 0.5],
+            [0, scale * fy, scale * (cy + 0.5) - 0.5],
+        ]
+        return torch.tensor([*rows, [0, 0, 1]], dtype=torch.float64)
+
+    def _gaze(
+        self, number: int, distance_m: float, K: Tensor, generator: torch.Generator
+    ) -> Float[Tensor, "3 3"]:
+        """Look so that the object lies somewhere in the image, whole, and rolled at random."""
+        diameter = self.models[number].diameter_m
+        scale = float(K[0, 0]) / self.config.focal_px[0]
+        radius_px = float(K[0, 0]) * 0.5 * diameter / max(distance_m - 0.5 * diameter, 1e-3)
+        place = []
+        for size, middle in zip(self.config.image_px, K[:2, 2].tolist(), strict=True):
+            low, high = radius_px, scale * size - 1 - radius_px
+            place.append(uniform(generator, low, high) if low < high else middle)
+        roll_rad = uniform(generator, 0.0, 2 * math.pi)
+        pixel = torch.tensor([*place, 1.0], dtype=torch.float64)
+        return gaze(pixel_to_ray(K) @ pixel, roll_rad)
+
+    def _before_background(
+        self, clean: CleanView, shape: Shape, generator: torch.Generator
+    ) -> Float[Tensor, "h w"]:
+        """Put a table or wall behind the object, and something else beside it."""
+        pose = clean.camera_from_model
+        hull_m = shape.hull_m @ pose.R.mT + (pose.t_m + pose.R @ shape.middle_m)
+        tilt, side = uniform(generator, 0.0, _TILT_RAD), uniform(generator, 0.0, 2 * math.pi)
+        # It stands upright in the picture of its own pixel, so tilt is from the line of sight.
+        normal = gaze(hull_m.mean(0), side) @ torch.tensor(
+            [math.sin(tilt), 0.0, -math.cos(tilt)], dtype=torch.float64
+        )
+        gap_m = max(0.0, uniform(generator, -0.2, 0.3))
+        offset = float((hull_m @ normal).min()) - gap_m
+        a, b, c = (normal @ pixel_to_ray(clean.K)).tolist()
+        height, width = clean.depth_m.shape
+        slope = a * torch.arange(width)[None] + b * torch.arange(height)[:, None] + c
+        behind_m = torch.where(slope * offset > 0, offset / slope, torch.nan)
+        near, far = float(hull_m[:, 2].min()), float(hull_m[:, 2].max())
+        levels = random_levels(height, width, generator)
+        level = float(levels.amin()) + uniform(generator, 0.0, 0.6) * float(
+            levels.amax() - levels.amin()
+        )
+        clutter_m = uniform(generator, near, far + 0.2)
+        is_clutter = (levels < level) & ~(behind_m < clutter_m)
+        behind_m = torch.where(is_clutter, clutter_m, behind_m)
+        return torch.where(clean.depth_m.isfinite(), clean.depth_m, behind_m)

@@ -2,18 +2,24 @@
 
 from depthpose.pose.train.clouds import Cloud as Cloud
 from depthpose.pose.train.clouds import CloudBatch as CloudBatch
+from depthpose.pose.train.clouds import HeldOut as HeldOut
 from depthpose.pose.train.clouds import TrainingClouds as TrainingClouds
 from depthpose.pose.train.clouds import read_models as read_models
+from depthpose.pose.train.config import DepthImageTraining as DepthImageTraining
 from depthpose.pose.train.config import FramesConfig as FramesConfig
 from depthpose.pose.train.config import HeldOutConfig as HeldOutConfig
 from depthpose.pose.train.config import ModelsConfig as ModelsConfig
+from depthpose.pose.train.config import PointNetTraining as PointNetTraining
 from depthpose.pose.train.config import PoseTraining as PoseTraining
-from depthpose.pose.train.held_out import HeldOut as HeldOut
-from depthpose.pose.train.other_configs import DepthImageTraining as DepthImageTraining
-from depthpose.pose.train.other_configs import PointNetTraining as PointNetTraining
-from depthpose.pose.train.other_configs import (
-    SegmentationTraining as SegmentationTraining,
-)
-from depthpose.pose.train.runs import STAGES as STAGES
-from depthpose.pose.train.runs import train_pose as train_pose
-from depthpose.pose.train.task import PoseTask as PoseTask
+from depthpose.pose.train.config import SegmentationTraining as SegmentationTraining
+from depthpose.pose.train.directions import PoseTask as PoseTask
+from depthpose.pose.train.directions import train_pose as train_pose
+from depthpose.pose.train.others import train_depth_image, train_segmentation
+
+STAGES = {
+    "pose": (PoseTraining, train_pose),
+    "pointnet": (PointNetTraining, train_pose),
+    "depth-image": (DepthImageTraining, train_depth_image),
+    "segmentation": (SegmentationTraining, train_segmentation),
+}
+"""Config and function of each network, by its word on the command line."""

@@ -1,15 +1,24 @@
-"""Settings of a training of the direction network."""
+"""Settings of the trainings."""
 
 import dataclasses
 from dataclasses import dataclass, field
 from typing import ClassVar
 
+from depthpose.core.config import check_settings
 from depthpose.core.errors import InputError, refuse_unknown
 from depthpose.core.loop import AdamConfig, LoopConfig
-from depthpose.pose.config import CloudConfig, MeshConfig, ObjectsConfig, Unit
-from depthpose.pose.config.objects import OCCLUSIONS, refuse_range
+from depthpose.core.units import Unit
+from depthpose.pose.baselines import DepthImageConfig, PointNetConfig
+from depthpose.pose.config import (
+    OCCLUSIONS,
+    CloudConfig,
+    MeshConfig,
+    ObjectsConfig,
+    refuse_reversed,
+)
 from depthpose.pose.losses import POINT_LOSSES
 from depthpose.pose.network import ResUNetConfig
+from depthpose.pose.segmentation import SegmentationConfig
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -48,11 +57,7 @@ class ModelsConfig:
 
     def __post_init__(self) -> None:
         """Refuse a tolerance that nothing meets, or that everything does."""
-        if not 0 < self.symmetry_tolerance < 1:
-            raise InputError(
-                f"symmetry_tolerance is {self.symmetry_tolerance}, but it is a share of the "
-                "diameter, above 0 and below 1; take 0.02"
-            )
+        check_settings(self, symmetry_tolerance="(0, 1)")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -76,8 +81,7 @@ class FramesConfig:
         """Refuse no folder, and shares that are none."""
         if not self.folder:
             raise InputError("frames has no folder; name a data set, or leave frames out")
-        if not 0 < self.share <= 1:
-            raise InputError(f"share is {self.share}, but it is above 0 and at most 1; take 1.0")
+        check_settings(self, share="(0, 1]")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -95,21 +99,14 @@ class HeldOutConfig:
 
     def __post_init__(self) -> None:
         """Refuse a validation of nothing."""
-        if self.number < 1 or not self.occlusions:
-            raise InputError(
-                f"number is {self.number} and occlusions {self.occlusions}: nothing would be "
-                "measured; take 25 and (0.0, 0.3)"
-            )
-        for share in self.occlusions:
-            refuse_range("held_out.occlusions", (share, share), OCCLUSIONS, "0.0 and 0.3")
+        check_settings(self, number="[1, inf)", occlusions=OCCLUSIONS)
+        if not self.occlusions:
+            raise InputError("held_out.occlusions is (); nothing would be measured; take (0, 0.3)")
 
 
 @dataclass(frozen=True, kw_only=True)
-class PoseTraining:
-    """The direction network learns to point at keypoints."""
-
-    RETIRED: ClassVar[frozenset[str]] = frozenset({"calibration"})
-    """Settings of before: no risk is calibrated any more."""
+class ViewsTraining:
+    """What the trainings on views of known objects have in common."""
 
     models: ModelsConfig = field(default_factory=ModelsConfig)
     """What is learnt."""
@@ -119,6 +116,26 @@ class PoseTraining:
 
     frames: FramesConfig | None = None
     """Real frames to learn from, beside them."""
+
+    cloud: CloudConfig = field(default_factory=CloudConfig)
+    """How a view is lifted to a cloud."""
+
+    start: str | None = None
+    """Weights to begin with; of directions, those of other objects give all but the last layer."""
+
+    held_out: HeldOutConfig = field(default_factory=HeldOutConfig)
+    """Views of the validation."""
+
+    with_half: bool = False
+    """Write the weights in 16 bits."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class PoseTraining(ViewsTraining):
+    """The direction network learns to point at keypoints."""
+
+    RETIRED: ClassVar[frozenset[str]] = frozenset({"calibration", "confidence_weight"})
+    """Settings of before: no risk is calibrated any more, and no confidence learnt."""
 
     first_alone: int = 0
     """Synthetic views at the start that all show the first object. Several objects together take
@@ -136,22 +153,13 @@ class PoseTraining:
     )
     """The network; its classes and keypoints follow from the models."""
 
-    start: str | None = None
-    """Weights to begin with; those of other objects give all but the last layer."""
-
     loss: str = "mse"
     """Of the directions: mse, cosine, l1, or another of ``pose.losses.POINT_LOSSES``."""
-
-    confidence_weight: float = 0.1
-    """Of the loss of the confidences, where the network has them."""
 
     adam: AdamConfig = field(
         default_factory=lambda: AdamConfig(learning_rate=3e-3, schedule="cosine", warmup_steps=50)
     )
     """The optimiser."""
-
-    held_out: HeldOutConfig = field(default_factory=HeldOutConfig)
-    """Views of the validation."""
 
     loop: LoopConfig = field(
         default_factory=lambda: LoopConfig(
@@ -160,16 +168,10 @@ class PoseTraining:
     )
     """How long."""
 
-    with_half: bool = False
-    """Write the weights in 16 bits."""
-
     def __post_init__(self) -> None:
         """Refuse an unknown loss and a negative number of views."""
         refuse_unknown("loss", self.loss, POINT_LOSSES)
-        if self.first_alone < 0:
-            raise InputError(f"first_alone is {self.first_alone}; take 0 or more synthetic views")
-        if self.confidence_weight < 0:
-            raise InputError(f"confidence_weight is {self.confidence_weight}; take 0 or more, 0.1")
+        check_settings(self, first_alone="[0, inf)")
 
 
 def own_part(start: str) -> PoseTraining:
@@ -190,3 +192,131 @@ def own_part(start: str) -> PoseTraining:
         adam=dataclasses.replace(own.adam, learning_rate=1e-3),
         loop=dataclasses.replace(own.loop, steps=5300, validate_every_steps=2000, workers=1),
     )
+
+
+@dataclass(frozen=True, kw_only=True)
+class PointNetTraining(PoseTraining):
+    """The PointNet learns to point at keypoints: data, loss and voting are those of ours."""
+
+    network: PointNetConfig = field(  # pyright: ignore[reportIncompatibleVariableOverride]
+        default_factory=PointNetConfig
+    )
+    """The network; its classes and keypoints follow from the models."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class DepthImageTraining(ViewsTraining):
+    """A network learns to regress the pose from the masked depth image."""
+
+    network: DepthImageConfig = field(default_factory=DepthImageConfig)
+    """The network; its classes follow from the models."""
+
+    surface_points: int = 500
+    """Points of the model whose distances are the loss."""
+
+    adam: AdamConfig = field(
+        default_factory=lambda: AdamConfig(learning_rate=1e-3, schedule="cosine", warmup_steps=50)
+    )
+    """The optimiser."""
+
+    loop: LoopConfig = field(
+        default_factory=lambda: LoopConfig(
+            steps=10000, batch_size=16, clip_norm=1.0, ema_decay=0.999, save_every_steps=500
+        )
+    )
+    """How long."""
+
+    def __post_init__(self) -> None:
+        """Refuse a loss of nothing."""
+        check_settings(self, surface_points="[3, inf)")
+
+
+@dataclass(frozen=True, kw_only=True)
+class ImagesConfig:
+    """Annotated images of a folder in BOP's or LineMOD's layout."""
+
+    folder: str = ""
+    """Of the data set."""
+
+    split: str = "train"
+    """Which part of it."""
+
+    objects: tuple[int, ...] = ()
+    """Numbers of the objects to find; none: all that occur."""
+
+    limit: int | None = None
+    """At most so many images, evenly taken; None: all."""
+
+    with_cache: bool = True
+    """Keep images in memory after the first reading."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class ImageAugmentConfig:
+    """Random changes of an image and its masks."""
+
+    crop_px: tuple[int, int] = (384, 512)
+    """Rows and columns that are seen of an image at the network's size; multiples of 32."""
+
+    scale: tuple[float, float] = (0.75, 1.5)
+    """Times the network's own size."""
+
+    flip_share: float = 0.0
+    """Share of mirrored images. A mirrored object is another object, unless it is mirror-symmetric;
+    for segmentation alone it is one more appearance."""
+
+    jitter: float = 0.3
+    """Brightness, contrast and saturation change by up to this share, each color by a third of
+    it."""
+
+    def __post_init__(self) -> None:
+        """Refuse windows and ranges that cannot be."""
+        check_settings(self, scale="(0, 10]", flip_share="[0, 1]", jitter="[0, 1)")
+        if any(side < 32 or side % 32 for side in self.crop_px):
+            raise InputError(
+                f"crop_px is {self.crop_px}, but the coarsest feature is 32 pixels wide; take "
+                "multiples of 32"
+            )
+        refuse_reversed(self, "scale")
+
+
+@dataclass(frozen=True, kw_only=True)
+class SegmentationTraining:
+    """FCN learns the masks of known objects."""
+
+    images: ImagesConfig = field(default_factory=ImagesConfig)
+    """What is learnt from; pixels that no mask covers are background."""
+
+    held_out: ImagesConfig | None = None
+    """Images of the validation."""
+
+    network: SegmentationConfig = field(default_factory=SegmentationConfig)
+    """The network."""
+
+    start: str | None = None
+    """An encoder to begin with, as ``weights import resnet18`` leaves it; None: random numbers."""
+
+    augment: ImageAugmentConfig = field(default_factory=ImageAugmentConfig)
+    """Random changes."""
+
+    object_weight: float = 3.0
+    """A pixel of an object counts so many times a pixel of the background."""
+
+    adam: AdamConfig = field(
+        default_factory=lambda: AdamConfig(learning_rate=1e-3, schedule="cosine", warmup_steps=20)
+    )
+    """The optimiser."""
+
+    loop: LoopConfig = field(
+        default_factory=lambda: LoopConfig(
+            steps=2000, batch_size=4, clip_norm=1.0, save_every_steps=200
+        )
+    )
+    """How long."""
+
+    with_half: bool = False
+    """Write the weights in 16 bits."""
+
+    def __post_init__(self) -> None:
+        """Refuse a loss that ignores the objects."""
+        check_settings(self, object_weight="(0, inf)")

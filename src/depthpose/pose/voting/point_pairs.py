@@ -13,7 +13,7 @@ from torch import Tensor
 from torch.nn.functional import normalize
 
 from depthpose.core.rigid import Rigid
-from depthpose.pose.mesh.sampling import fibonacci_directions
+from depthpose.pose.mesh.models import fibonacci_directions
 from depthpose.pose.surface import Surface, look_along_rays
 
 _STEP = 0.05

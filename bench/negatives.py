@@ -1,16 +1,28 @@
-"""What is not a known object and may be taken for it: models to be seen in its place."""
+"""Random parts, and what is not a known object and may be taken for it: for benches and tests."""
 
 import dataclasses
 import math
 from collections.abc import Sequence
 from typing import Any, Literal, get_args
 
+import numpy as np
 import torch
 
 from depthpose.core.rigid import Rigid
+from depthpose.core.units import metres_of
 from depthpose.pose.augment import random_rotation, uniform, whole
 from depthpose.pose.mesh import is_mirror_alike, make_model
-from depthpose.pose.synthetic.parts import PARTS, make_part
+from depthpose.pose.synthetic.parts import (
+    PARTS,
+    Mesh,
+    box,
+    joined,
+    make_part,
+    moved,
+    revolved,
+    tube,
+    turned,
+)
 from depthpose.pose.types import ObjectModel
 
 NegativeKind = Literal[
@@ -125,3 +137,66 @@ def _hand(size_m: float, generator: torch.Generator) -> Any:  # noqa: ANN401  tr
         pose = Rigid((u @ vh).double(), at.double())
         pieces.append(finger.apply_transform(pose.matrix().numpy()))
     return trimesh.util.concatenate(pieces)
+
+
+def random_part(generator: torch.Generator, name: str = "part") -> ObjectModel:
+    """Make a part of three to six boxes, tubes and cones that run into one another.
+
+    Args:
+        generator: of the sizes, in millimetres from 3 to 90, and places.
+        name: what samples call it.
+    """
+    pieces = []
+    for _ in range(3 + whole(generator, 4)):
+        piece = _random_solid(generator)
+        for axis in np.eye(3).tolist():
+            piece = turned(piece, (axis[0], axis[1], axis[2]), 90.0 * whole(generator, 4))
+        if whole(generator, 4) == 0:
+            piece = turned(piece, (0.0, 0.0, 1.0), uniform(generator, 0.0, 90.0))
+        pieces.append(moved(piece, tuple(uniform(generator, -35.0, 35.0) for _ in range(3))))
+    vertices, faces = joined(*pieces)
+    return make_model(torch.from_numpy(vertices) * metres_of("mm"), torch.from_numpy(faces),
+                      name=name)  # fmt: skip
+
+
+def random_simple_part(generator: torch.Generator, name: str = "part") -> ObjectModel:
+    """Make a box, a tube, a cup, or a profile of the shape of an L, T or U.
+
+    All but an L of unlike legs have symmetries, which the model does not name
+    (:func:`~depthpose.pose.mesh.with_found_symmetries` finds them).
+
+    Args:
+        generator: of kind and sizes, in millimetres.
+        name: what samples call it.
+    """
+    width, depth, length = (uniform(generator, 20.0, 90.0) for _ in range(3))
+    wall, bore = uniform(generator, 3.0, 10.0), uniform(generator, 0.3, 0.9)
+    foot, web, edge = box((width, wall, length)), box((wall, depth, length)), (width - wall) / 2
+    left, middle, right = (moved(web, (x, depth / 2, 0.0)) for x in (-edge, 0.0, edge))
+    solids = [
+        box((width, depth, length)),
+        tube(width / 2, bore * width / 2, length),
+        _cup(width / 2, length, wall),
+        joined(foot, left),
+        joined(foot, middle),
+        joined(foot, left, right),
+    ]
+    vertices, faces = solids[whole(generator, len(solids))]
+    return make_model(torch.from_numpy(vertices) * metres_of("mm"), torch.from_numpy(faces),
+                      name=name)  # fmt: skip
+
+
+def _cup(radius: float, height: float, wall: float) -> Mesh:
+    inner = radius - min(wall, radius / 2)
+    return revolved([(0.0, 0.0), (radius, 0.0), (radius, height), (inner, height),
+                      (inner, radius - inner), (0.0, radius - inner)])  # fmt: skip
+
+
+def _random_solid(generator: torch.Generator) -> Mesh:
+    kind, height = whole(generator, 3), uniform(generator, 10.0, 90.0)
+    if kind == 0:
+        return box((uniform(generator, 4.0, 80.0), uniform(generator, 4.0, 60.0), height))
+    low, high = uniform(generator, 3.0, 35.0), uniform(generator, 3.0, 35.0)
+    if kind == 1:
+        return tube(low, uniform(generator, 0.2, 0.8) * low, height)
+    return revolved([(0.0, 0.0), (low, 0.0), (high, height), (0.0, height)])

@@ -1,20 +1,20 @@
-"""The sparse ResUNet and its kernel maps in ONNX operators: gather, multiply, add.
+"""Export of the direction network to ONNX: a dense graph, and its proof."""
 
-For kernel maps the clouds' common box is laid out as a table of cells for each level; a cell holds
-the row of its voxel, or one past the last row where it is empty. The neighbours of a kernel are
-then one gather. All tables count in cells of the finest level, so that one addition moves a voxel
-of any level.
-"""
-
-from typing import cast
+from collections.abc import Iterator
+from functools import partial
+from typing import Any, cast
 
 import numpy as np
+import torch
 from torch import Tensor, nn
 
-from depthpose.core.export import Graph, Value
-from depthpose.pose.network import ResUNet, fold_norms
-from depthpose.pose.network.resunet import Block, ConvNorm
-from depthpose.pose.sparse import SparseConv, kernel_offsets
+from depthpose.core.config import config_to_dict
+from depthpose.core.errors import InputError
+from depthpose.core.export import Case, Export, Graph, Limit, Value
+from depthpose.pose.mesh.models import sample_surface
+from depthpose.pose.network import Block, ConvNorm, ResUNet, fold_norms
+from depthpose.pose.sparse import SparseConv, Voxels, batch_coordinates, kernel_offsets
+from depthpose.pose.weights import PoseWeights
 
 LEVELS = 4
 MARGIN = 1 << (LEVELS - 1)
@@ -79,11 +79,11 @@ def direction_graph(network: ResUNet) -> Graph:
 
     Inputs ``coordinates`` (voxels, 4; int64: cloud, x, y, z; each voxel once) and ``features``
     (voxels, ``config.inputs``; float32: the number 1 where there is one). Output ``directions``
-    (voxels, classes, keypoints, components), not normalised, in the order of the voxels given.
+    (voxels, classes, keypoints, 3), not normalised, in the order of the voxels given.
     """
     config = network.config
     writer = _Writer(fold_norms(network.eval()))
-    shape = ("voxels", config.classes, config.keypoints, config.components)
+    shape = ("voxels", config.classes, config.keypoints, 3)
     writer.graph.output("directions", writer.directions(shape), np.float32, shape)
     return writer.graph
 
@@ -136,3 +136,64 @@ def _pairs(layers: nn.ModuleList, blocks: nn.ModuleList) -> list[tuple[ConvNorm,
 
 def _array(tensor: Tensor) -> np.ndarray:
     return tensor.detach().float().cpu().numpy()
+
+
+_POINTS = ((1,), (150,), (1500,), (700, 40, 1100))
+"""Points of each cloud of a case, before one a voxel is kept."""
+
+
+def pose_export(weights: PoseWeights, facts: dict[str, Any]) -> Export:
+    """Describe what is exported of weights: the network of directions.
+
+    Args:
+        weights: of the method, not of a baseline.
+        facts: what else a user of the file must know.
+
+    Raises:
+        InputError: weights of a baseline.
+    """
+    network = weights.network
+    if not isinstance(network, ResUNet):
+        raise InputError(
+            f"these weights are of a baseline ({type(network).__name__}); what is exported is the "
+            "sparse network: give weights of kind 'geoposenet'."
+        )
+    known = {
+        "cloud": config_to_dict(weights.cloud),
+        "objects": [model.name for model in weights.models],
+        "keypoints_m": [model.keypoints_m.tolist() for model in weights.models],
+    }
+    return Export(
+        graph=partial(direction_graph, network),
+        cases=partial(_cases, weights, network),
+        limits={"directions": Limit(value=1e-4)},
+        facts={
+            **facts, **known,
+            "what": "voxels (cloud, x, y, z) and their features -> directions to keypoints",
+        },
+    )  # fmt: skip
+
+
+def _cases(weights: PoseWeights, network: ResUNet) -> Iterator[Case]:
+    for counts in _POINTS:
+        coordinates = batch_coordinates(
+            [_cells(weights, count, k) for k, count in enumerate(counts)]
+        )
+        generator = torch.Generator().manual_seed(0)
+        features = torch.ones(len(coordinates), network.config.inputs)
+        if network.config.inputs > 1:
+            features = torch.randn(features.shape, generator=generator)
+        with torch.no_grad():
+            directions = network(Voxels.from_points(coordinates, features))
+        yield Case(
+            name=f"voxels {len(coordinates)}, clouds {len(counts)}",
+            inputs={"coordinates": coordinates.numpy(), "features": features.numpy()},
+            expected={"directions": directions.numpy()},
+        )
+
+
+def _cells(weights: PoseWeights, count: int, k: int) -> Tensor:
+    """Voxels of an object's surface, in no order."""
+    points_m, _ = sample_surface(weights.models[k % len(weights.models)], count)
+    cells = torch.floor(points_m / weights.cloud.voxel_m).long().unique(dim=0)
+    return cells[torch.randperm(len(cells), generator=torch.Generator().manual_seed(count))]

@@ -1,0 +1,481 @@
+"""Baselines: FPFH, PointNet, a regressed depth image."""
+
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import Any, ClassVar, NamedTuple
+
+import numpy as np
+import torch
+import torch.nn.functional as F
+from jaxtyping import Float, Float64, Int
+from torch import Tensor, nn
+
+from depthpose.core.config import check_settings
+from depthpose.core.errors import import_open3d
+from depthpose.core.rigid import Rigid, turn_axis_to
+from depthpose.pose.cloud import cloud_from_depth
+from depthpose.pose.mesh import sample_surface
+from depthpose.pose.segmentation import ResNet18
+from depthpose.pose.sparse import RowNorm
+from depthpose.pose.types import CloudInput, ObjectModel, PoseEstimate, SeenPoints, ViewInput
+
+
+@dataclass(frozen=True, kw_only=True)
+class DepthImageConfig:
+    """A masked crop of the depth image, regressed to a pose."""
+
+    classes: int = 1
+    """Objects that one network knows."""
+
+    crop_px: int = 128
+    """Side of the crop that the network sees."""
+
+    margin: float = 1.1
+    """The crop is so many times as wide as the object's box."""
+
+    contrast: float = 0.1
+    """The crop is divided by its mean depth; this much more or less than the mean is 1 or -1."""
+
+    widths: tuple[int, int, int, int] = (64, 128, 256, 512)
+    """Channels of the encoder's stages: those of ResNet-18."""
+
+    min_points: int = 16
+    """Fewer masked pixels with a depth are refused, not posed."""
+
+    def __post_init__(self) -> None:
+        """Refuse sizes that the network cannot have."""
+        counts = dict.fromkeys(("classes", "widths", "min_points"), "[1, inf)")
+        check_settings(self, **counts, crop_px="[32, inf)", margin="[1, inf)", contrast="(0, inf)")
+
+
+@dataclass(frozen=True, kw_only=True)
+class PointNetConfig:
+    """Size of a PointNet for segmentation (Qi et al. 2017) whose outputs are directions."""
+
+    RETIRED: ClassVar[frozenset[str]] = frozenset({"with_confidence"})
+    """Settings of before, in older weights: no confidence is learnt any more."""
+
+    classes: int = 13
+    """Objects that one network knows."""
+
+    keypoints: int = 8
+    """Keypoints of each object."""
+
+    with_transforms: bool = True
+    """The two T-Nets, which turn points (3x3) and features (64x64) before they go on."""
+
+    unit_m: float = 0.1
+    """Points are given to the network in units of so many metres: of order one for an object."""
+
+    local: tuple[int, int] = (64, 64)
+    """Channels of a point by itself."""
+
+    pooled: tuple[int, int, int] = (64, 128, 1024)
+    """Channels on the way to the maximum over all points."""
+
+    head: tuple[int, int, int] = (512, 256, 128)
+    """Channels of a point beside that maximum."""
+
+    def __post_init__(self) -> None:
+        """Refuse sizes that the network cannot have."""
+        counts = ("classes", "keypoints", "local", "pooled", "head")
+        check_settings(self, **dict.fromkeys(counts, "[1, inf)"), unit_m="(0, inf)")
+
+    @property
+    def outputs(self) -> int:
+        """Channels of the last layer."""
+        return self.classes * self.keypoints * 3
+
+
+@dataclass(frozen=True, kw_only=True)
+class FpfhConfig:
+    """FPFH features, RANSAC and ICP of Open3D."""
+
+    voxel_diameters: float = 0.03
+    """Side of a voxel in diameters of the object."""
+
+    iterations: int = 100_000
+    """Of RANSAC, at most."""
+
+    seed: int = 0
+    """Of RANSAC."""
+
+    def __post_init__(self) -> None:
+        """Refuse voxels without a size, and no iteration."""
+        check_settings(self, voxel_diameters="(0, inf)", iterations="[1, inf)")
+
+
+EMPTY = -2.0
+"""Of a pixel without the object: below all that a depth can be, -1 to 1."""
+
+
+class DepthCrop(NamedTuple):
+    """A crop, and where it lies; batched with leading axes.
+
+    Attributes:
+        image: depth over its mean, less one, over the contrast; ``EMPTY`` beside the object.
+        R: ``camera_from_crop``: turns the optical axis onto the ray through the crop's middle. An
+            object looks alike in the crop wherever in the image it is, if its rotation is said in
+            this frame.
+        middle_m: the point of that ray at the mean depth, in the camera frame.
+        side_m: width of the crop at the mean depth.
+    """
+
+    image: Float[Tensor, "*b 1 size size"]
+    R: Float[Tensor, "*b 3 3"]
+    middle_m: Float[Tensor, "*b 3"]
+    side_m: Float[Tensor, "*b"]
+
+
+def cut_depth(
+    view: ViewInput, config: DepthImageConfig, diameter_m: float | None = None
+) -> DepthCrop | None:
+    """Cut the object out of a view; None where fewer pixels than ``min_points`` have a depth.
+
+    Args:
+        view: depth and mask.
+        config: size, margin, contrast.
+        diameter_m: pixels farther than this from the median depth belong to something else; None
+            keeps all.
+    """
+    depth_m = torch.where(view.mask, view.depth_m, torch.nan)
+    is_seen = depth_m.isfinite() & (depth_m > 0)
+    if diameter_m is not None and bool(is_seen.any()):
+        is_seen &= (depth_m - depth_m[is_seen].median()).abs() <= diameter_m
+    if int(is_seen.sum()) < config.min_points:
+        return None
+    rows, columns = is_seen.nonzero(as_tuple=True)
+    low = torch.stack([columns.min(), rows.min()]).float() - 0.5
+    high = torch.stack([columns.max(), rows.max()]).float() + 0.5
+    middle_px, side_px = (low + high) / 2, config.margin * float((high - low).max())
+    mean_m = depth_m[is_seen].mean()
+    relief = ((depth_m / mean_m - 1) / config.contrast).clamp(-1, 1)
+    relief = torch.where(is_seen, relief, EMPTY)
+    # Resized by nearest neighbour: depth is not mixed over edges.
+    steps = (torch.arange(config.crop_px) + 0.5) / config.crop_px - 0.5
+    column, row = ((middle_px[axis] + side_px * steps).round().long() for axis in (0, 1))
+    height, width = relief.shape
+    is_inside = ((row >= 0) & (row < height))[:, None] & ((column >= 0) & (column < width))
+    image = relief[row.clamp(0, height - 1)[:, None], column.clamp(0, width - 1)]
+    K = view.K.to(depth_m)
+    ray = torch.linalg.solve(K, torch.cat([middle_px, torch.ones(1)]))
+    return DepthCrop(
+        image=torch.where(is_inside, image, EMPTY)[None],
+        R=turn_axis_to(ray).to(ray),
+        middle_m=ray * mean_m,
+        side_m=side_px * mean_m / K[0, 0],
+    )
+
+
+_NUMBERS = 9
+
+
+class DepthImageNet(nn.Module):
+    """A crop to nine numbers of each class: two columns of a rotation, and an offset.
+
+    The encoder of ResNet-18 with one channel in, its mean over the crop, and a linear layer.
+    """
+
+    def __init__(self, config: DepthImageConfig | None = None) -> None:
+        super().__init__()
+        self.config = config = config or DepthImageConfig()
+        self.encoder = ResNet18(inputs=1, widths=config.widths)
+        self.heads = nn.Linear(config.widths[3], config.classes * _NUMBERS)
+        with torch.no_grad():  # begin at the identity, in the middle of the crop
+            self.heads.weight.mul_(0.1)
+            start = torch.tensor([1.0, 0, 0, 0, 1, 0, 0, 0, 0])
+            self.heads.bias.copy_(start.repeat(config.classes))
+
+    def forward(
+        self, image: Float[Tensor, "b 1 h w"], number: Int[Tensor, " b"]
+    ) -> Float[Tensor, "b 9"]:
+        """Answer for each crop's own class."""
+        features = self.encoder(image)[-1].mean((-2, -1))
+        every = self.heads(features).view(len(image), self.config.classes, _NUMBERS)
+        return every[torch.arange(len(image), device=image.device), number]
+
+
+def poses_of(outputs: Float[Tensor, "b 9"], crop: DepthCrop) -> Rigid:
+    """Turn what the network says of crops into poses ``camera_from_model``."""
+    shift = crop.side_m[:, None] * outputs[:, 6:]
+    t_m = crop.middle_m + (crop.R @ shift[..., None]).squeeze(-1)
+    return Rigid(crop.R @ rotation_from_6d(outputs[:, :6]), t_m)
+
+
+def rotation_from_6d(numbers: Float[Tensor, "*b 6"]) -> Float[Tensor, "*b 3 3"]:
+    """Make a rotation of its first two columns, not yet of unit length nor orthogonal.
+
+    By Gram and Schmidt: continuous, as no form of three or four numbers is (Zhou et al., CVPR
+    2019). Undefined where the columns are parallel or zero.
+    """
+    first = F.normalize(numbers[..., :3], dim=-1)
+    second = numbers[..., 3:]
+    second = F.normalize(second - (first * second).sum(-1, keepdim=True) * first, dim=-1)
+    return torch.stack([first, second, torch.linalg.cross(first, second)], -1)
+
+
+_MODEL_POINTS = 20_000
+_NORMAL, _FEATURE, _CORRESPONDENCE, _ICP = 2.0, 5.0, 1.5, 0.4
+"""Radius for normals and for features (Rusu et al. 2009), reach of RANSAC's correspondences and of
+the point-to-plane ICP that follows, in voxels, as Open3D's tutorial has them."""
+_LEAST = 3
+"""Points that a pose takes; Open3D answers fewer with a crash or with the identity."""
+
+
+class FpfhRegistration:
+    """Poses of one object: its model is prepared once.
+
+    Raises:
+        MissingExtraError: Open3D is not installed.
+    """
+
+    def __init__(self, model: ObjectModel, config: FpfhConfig | None = None) -> None:
+        self.model, self.config = model, config or FpfhConfig()
+        self._open3d = import_open3d("registration by FPFH")
+        points_m, normals = sample_surface(model, _MODEL_POINTS)
+        cloud = self._cloud(points_m)
+        cloud.normals = self._open3d.utility.Vector3dVector(normals.double().numpy())
+        self._target, self._target_features = self._prepare(cloud)
+
+    def estimate(self, given: CloudInput) -> PoseEstimate:
+        """Pose a cloud; RANSAC that finds nothing is a refusal."""
+        began = time.perf_counter()
+        if len(given.points_m) < _LEAST:
+            reason = f"the cloud has {len(given.points_m)} points, and a pose takes {_LEAST}"
+            return PoseEstimate(
+                name=given.name, object=given.object, status="too few points", reason=reason
+            )
+        o3d = self._open3d
+        source, features = self._prepare(self._cloud(given.points_m))
+        o3d.utility.random.seed(self.config.seed)
+        # It prints a line for each cloud of which few features are mutually nearest.
+        with o3d.utility.VerbosityContextManager(o3d.utility.VerbosityLevel.Error):
+            found = self._ransac(source, features)
+        if len(found.correspondence_set):
+            r = o3d.pipelines.registration
+            found = r.registration_icp(
+                source, self._target, _ICP * self._voxel_m, found.transformation,
+                r.TransformationEstimationPointToPlane(),
+            )  # fmt: skip
+        seconds = {"registration": time.perf_counter() - began}
+        if not len(found.correspondence_set):
+            reason = "RANSAC found no pose that any correspondence of features agrees with"
+            return PoseEstimate(
+                name=given.name, object=given.object, status="votes do not meet",
+                reason=reason, seconds=seconds,
+            )  # fmt: skip
+        T = torch.from_numpy(np.array(found.transformation))
+        pose = Rigid(T[:3, :3], T[:3, 3]).inverse()
+        return PoseEstimate(
+            name=given.name,
+            object=given.object,
+            status="ok",
+            camera_from_model=Rigid(pose.R.to(given.points_m), pose.t_m.to(given.points_m)),
+            inlier_share=float(found.fitness),
+            residual_m=float(found.inlier_rmse),
+            seconds=seconds,
+        )
+
+    @property
+    def _voxel_m(self) -> float:
+        return self.config.voxel_diameters * self.model.diameter_m
+
+    def _cloud(self, points_m: Float[Tensor, "n 3"]) -> Any:  # noqa: ANN401 - Open3D has no types
+        cloud = self._open3d.geometry.PointCloud()
+        cloud.points = self._open3d.utility.Vector3dVector(points_m.double().cpu().numpy())
+        return cloud
+
+    def _prepare(self, cloud: Any) -> tuple[Any, Any]:  # noqa: ANN401
+        """Thin a cloud to voxels; normals of a measured one point to the camera."""
+        o3d, voxel_m = self._open3d, self._voxel_m
+        cloud = cloud.voxel_down_sample(voxel_m)
+        near = o3d.geometry.KDTreeSearchParamHybrid
+        if not cloud.has_normals():
+            cloud.estimate_normals(near(radius=_NORMAL * voxel_m, max_nn=30))
+            cloud.orient_normals_towards_camera_location(np.zeros(3))
+        features = o3d.pipelines.registration.compute_fpfh_feature(
+            cloud, near(radius=_FEATURE * voxel_m, max_nn=100)
+        )
+        return cloud, features
+
+    def _ransac(self, source: Any, features: Any) -> Any:  # noqa: ANN401
+        r = self._open3d.pipelines.registration
+        limit_m = _CORRESPONDENCE * self._voxel_m
+        return r.registration_ransac_based_on_feature_matching(
+            source, self._target, features, self._target_features, True, limit_m,
+            r.TransformationEstimationPointToPoint(False), 3,
+            [
+                r.CorrespondenceCheckerBasedOnEdgeLength(0.9),
+                r.CorrespondenceCheckerBasedOnDistance(limit_m),
+            ],
+            r.RANSACConvergenceCriteria(self.config.iterations, 0.999),
+        )  # fmt: skip
+
+
+class FpfhEstimator:
+    """Registration of several objects from their masked depth, called as the networks are.
+
+    Raises:
+        MissingExtraError: Open3D is not installed.
+    """
+
+    def __init__(self, models: Sequence[ObjectModel], config: FpfhConfig | None = None) -> None:
+        self._peers = {model.name: FpfhRegistration(model, config) for model in models}
+
+    def estimate_many(self, inputs: Sequence[ViewInput]) -> list[PoseEstimate]:
+        """Pose one after the other."""
+        estimates = []
+        for given in inputs:
+            peer = self._peers[given.object]
+            points_m = cloud_from_depth(given.depth_m, given.mask, given.K, peer.model.diameter_m)
+            cloud = CloudInput(name=given.name, points_m=points_m.float(), object=given.object)
+            estimates.append(peer.estimate(cloud))
+        return estimates
+
+
+def ransac_one_by_one(
+    points_m: Float64[np.ndarray, "n 3"],
+    directions: Float64[np.ndarray, "n k 3"],
+    hypotheses: int = 50,
+    min_cosine: float = 0.99,
+    seed: int = 0,
+) -> Float64[np.ndarray, "k 3"]:
+    """Find every keypoint with a loop over keypoints and hypotheses.
+
+    A hypothesis is the point nearest to the lines of two random points; its inliers are the points
+    whose unit direction comes within an angle of it; the best is refitted on its inliers.
+
+    Args:
+        points_m: where the votes start.
+        directions: of unit length.
+        hypotheses: tried for each keypoint; published practice is 50.
+        min_cosine: of the angle of an inlier.
+        seed: of the pairs.
+    """
+    random = np.random.default_rng(seed)
+    found = []
+    for k in range(directions.shape[1]):
+        n = directions[:, k]
+        best, chosen = -1, np.ones(len(n), bool)
+        for _ in range(hypotheses):
+            pair = random.choice(len(points_m), 2, replace=False)
+            try:
+                tried = np.linalg.solve(*_normal_equations(points_m[pair], n[pair]))
+            except np.linalg.LinAlgError:
+                continue
+            way = tried - points_m
+            inliers = (way * n).sum(1) / np.sqrt((way * way).sum(1)).clip(1e-300) > min_cosine
+            count = np.count_nonzero(inliers)
+            if count > best:
+                best, chosen = count, inliers
+        try:
+            refitted = np.linalg.solve(*_normal_equations(points_m[chosen], n[chosen]))
+        except np.linalg.LinAlgError:  # no inlier but parallel ones, or none: all votes count
+            refitted = np.linalg.lstsq(*_normal_equations(points_m, n), rcond=None)[0]
+        found.append(refitted)
+    return np.stack(found)
+
+
+def _normal_equations(points_m: np.ndarray, n: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Of the point nearest to the lines through ``points_m`` along ``n``; singular if parallel."""
+    A = len(points_m) * np.eye(3) - n.T @ n
+    return A, points_m.sum(0) - n.T @ (n * points_m).sum(1)
+
+
+_TRANSFORM_POOLED, _TRANSFORM_HEAD = (64, 128, 1024), (512, 256)
+
+
+class PointNet(nn.Module):
+    """Points to raw directions, each from itself and the maximum over its cloud.
+
+    Qi et al. (CVPR 2017), network for segmentation; clouds of any size, one after the other in
+    rows. Answers in the form that the sparse network gives, so that the same voting follows.
+    """
+
+    def __init__(self, config: PointNetConfig | None = None) -> None:
+        super().__init__()
+        self.config = config = config or PointNetConfig()
+        c = config
+        self.turn_points = _Transform(3) if c.with_transforms else None
+        self.local = _layers((3, *c.local))
+        self.turn_features = _Transform(c.local[1]) if c.with_transforms else None
+        self.pooled = _layers((c.local[1], *c.pooled))
+        self.head = _layers((c.local[1] + c.pooled[2], *c.head))
+        self.final = nn.Linear(c.head[2], c.outputs)
+
+    def forward(
+        self, points_m: Float[Tensor, "points 3"], cloud: Int[Tensor, " points"]
+    ) -> Float[Tensor, "points classes keypoints 3"]:
+        """Give the raw directions of each point to the keypoints of every class.
+
+        Args:
+            points_m: about the mean of their cloud.
+            cloud: which cloud each belongs to, 0, 1, ..., ascending.
+        """
+        c = self.config
+        outputs = self.final(self.features(points_m, cloud))
+        return outputs.view(len(outputs), c.classes, c.keypoints, 3)
+
+    def directions(self, seen: SeenPoints) -> Float[Tensor, "points keypoints 3"]:
+        """Answer for each point's own class: what every network that votes offers."""
+        points_m, cloud = seen.points_m, seen.coordinates[:, 0].long()
+        sizes = torch.bincount(cloud)
+        sums_m = points_m.new_zeros(len(sizes), 3).index_add(0, cloud, points_m)
+        local_m = points_m - (sums_m / sizes[:, None])[cloud]
+        rows = torch.arange(len(points_m), device=points_m.device)
+        return self(local_m, cloud)[rows, seen.class_of_point]
+
+    def features(
+        self, points_m: Float[Tensor, "points 3"], cloud: Int[Tensor, " points"]
+    ) -> Float[Tensor, "points width"]:
+        """Give what the last layer sees of each point."""
+        x = points_m / self.config.unit_m
+        count = int(cloud.max()) + 1
+        if self.turn_points is not None:
+            x = _turned(x, self.turn_points(x, cloud, count), cloud)
+        x = self.local(x)
+        if self.turn_features is not None:
+            x = _turned(x, self.turn_features(x, cloud, count), cloud)
+        whole = _largest(self.pooled(x), cloud, count)
+        return self.head(torch.cat([x, whole[cloud]], 1))
+
+
+class _Transform(nn.Module):
+    """T-Net: a matrix for each cloud, which begins as the identity."""
+
+    def __init__(self, width: int) -> None:
+        super().__init__()
+        self.width = width
+        self.pooled = _layers((width, *_TRANSFORM_POOLED))
+        self.head = _layers((_TRANSFORM_POOLED[-1], *_TRANSFORM_HEAD))
+        self.final = nn.Linear(_TRANSFORM_HEAD[-1], width * width)
+        nn.init.zeros_(self.final.weight)
+        nn.init.zeros_(self.final.bias)
+
+    def forward(
+        self, x: Float[Tensor, "points c"], cloud: Int[Tensor, " points"], count: int
+    ) -> Float[Tensor, "clouds c c"]:
+        matrix = self.final(self.head(_largest(self.pooled(x), cloud, count)))
+        eye = torch.eye(self.width, device=x.device, dtype=x.dtype)
+        return matrix.view(count, self.width, self.width) + eye
+
+
+def _layers(widths: Sequence[int]) -> nn.Sequential:
+    layers: list[nn.Module] = []
+    for inputs, outputs in pairwise(widths):
+        layers += [nn.Linear(inputs, outputs, bias=False), RowNorm(outputs), nn.ReLU()]
+    return nn.Sequential(*layers)
+
+
+def _turned(x: Tensor, turn: Tensor, cloud: Tensor) -> Float[Tensor, "points c"]:
+    """Multiply the rows of each cloud by its matrix."""
+    sizes = torch.bincount(cloud, minlength=len(turn)).tolist()
+    return torch.cat([part @ T for part, T in zip(x.split(sizes), turn, strict=True)])
+
+
+def _largest(x: Tensor, cloud: Tensor, count: int) -> Float[Tensor, "clouds c"]:
+    """Maximum over the points of each cloud."""
+    sizes = torch.bincount(cloud, minlength=count).tolist()
+    return torch.stack([part.amax(0) for part in x.split(sizes)])

@@ -1,0 +1,438 @@
+"""Points in space: small matrices, nearest neighbours, planes through them, what a camera sees."""
+
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from depthpose.core.rigid import Rigid
+from depthpose.pose.compiled import compiled, finite_array
+
+
+@compiled
+def solve(H, b, x):
+    """Solve a symmetric system, of which the lower half is read; ``H`` is used up.
+
+    By elimination with pivots, as rounding may make a positive matrix indefinite.
+    """
+    n = len(b)
+    for i in range(n):
+        x[i] = b[i]
+        for j in range(i):
+            H[j, i] = H[i, j]
+    for k in range(n):
+        pivot = k
+        for i in range(k + 1, n):
+            if abs(H[i, k]) > abs(H[pivot, k]):
+                pivot = i
+        if pivot != k:
+            x[k], x[pivot] = x[pivot], x[k]
+            for j in range(k, n):
+                H[k, j], H[pivot, j] = H[pivot, j], H[k, j]
+        for i in range(k + 1, n):
+            share = H[i, k] / H[k, k]
+            x[i] -= share * x[k]
+            for j in range(k + 1, n):
+                H[i, j] -= share * H[k, j]
+    for i in range(n - 1, -1, -1):
+        for j in range(i + 1, n):
+            x[i] -= H[i, j] * x[j]
+        x[i] /= H[i, i]
+
+
+@compiled
+def damp(H, least):
+    """Keep unknowns that nothing determines where they are."""
+    size = least
+    for k in range(len(H)):
+        size = max(size, H[k, k])
+    for k in range(len(H)):
+        H[k, k] += 1e-9 * size
+
+
+@compiled
+def rotation(x, y, z, R):
+    """Write the rotation by a rotation vector [rad]: Rodrigues' formula."""
+    square = x * x + y * y + z * z
+    angle = np.sqrt(square)
+    if angle < 1e-4:
+        s, c = 1 - square / 6, 0.5 - square / 24
+    else:
+        s, c = np.sin(angle) / angle, (1 - np.cos(angle)) / square
+    R[0, 0], R[1, 1], R[2, 2] = (
+        1 - c * (y * y + z * z),
+        1 - c * (x * x + z * z),
+        1 - c * (x * x + y * y),
+    )
+    R[0, 1], R[1, 0] = c * x * y - s * z, c * x * y + s * z
+    R[0, 2], R[2, 0] = c * x * z + s * y, c * x * z - s * y
+    R[1, 2], R[2, 1] = c * y * z - s * x, c * y * z + s * x
+
+
+@compiled
+def _rotate(A, V, p, q):
+    """Make one entry of a symmetric matrix zero (Jacobi), and turn its axes along."""
+    if A[p, q] == 0.0:
+        return
+    theta = (A[q, q] - A[p, p]) / (2 * A[p, q])
+    t = (1.0 if theta >= 0 else -1.0) / (abs(theta) + np.sqrt(theta * theta + 1))
+    c = 1 / np.sqrt(t * t + 1)
+    s = t * c
+    for k in range(3):
+        a, b = A[k, p], A[k, q]
+        A[k, p], A[k, q] = c * a - s * b, s * a + c * b
+    for k in range(3):
+        a, b = A[p, k], A[q, k]
+        A[p, k], A[q, k] = c * a - s * b, s * a + c * b
+    for k in range(3):
+        a, b = V[k, p], V[k, q]
+        V[k, p], V[k, q] = c * a - s * b, s * a + c * b
+
+
+@compiled
+def jacobi(A, V):
+    """Turn a symmetric 3x3 matrix into its eigenvalues, on the diagonal, and the vectors in V."""
+    V[:] = 0.0
+    V[0, 0] = V[1, 1] = V[2, 2] = 1.0
+    for _ in range(8):
+        _rotate(A, V, 0, 1)
+        _rotate(A, V, 0, 2)
+        _rotate(A, V, 1, 2)
+
+
+Array = np.ndarray
+_LEAF = 8
+"""Points of a range that is not parted any more."""
+
+
+class Tree(NamedTuple):
+    """Points in the order of a balanced k-d tree, whose ranges are halved down to few points.
+
+    Attributes:
+        points: (m, 3), float64.
+        order: number that each had before, (m,).
+        axes: across which axis each inner node is parted, (nodes,).
+        values: where, (nodes,).
+    """
+
+    points: Array
+    order: Array
+    axes: Array
+    values: Array
+
+
+def tree_of(points: Array) -> Tree:
+    """Sort points (m, 3) into a tree; one at least, float64.
+
+    Raises:
+        ValueError: one is not finite.
+    """
+    return Tree(*planted(finite_array(points)))
+
+
+def nearest_of(points: Array, tree: Tree) -> tuple[Array, Array]:
+    """Give the number of the point nearest to each of (..., 3), float64, and its distance.
+
+    Raises:
+        ValueError: one is not finite.
+    """
+    queries = finite_array(points).reshape(-1, 3)
+    index, distance = np.empty(len(queries), np.int64), np.empty(len(queries))
+    _nearest_many(queries, tree, index, distance)
+    return index.reshape(points.shape[:-1]), distance.reshape(points.shape[:-1])
+
+
+@compiled
+def planted(points):
+    """Give the fields of a :class:`Tree`."""
+    count = len(points)
+    order = np.arange(count)
+    depth = 0
+    while (count >> depth) > _LEAF:
+        depth += 1
+    axes = np.zeros((1 << depth) - 1, np.int64)
+    values = np.zeros((1 << depth) - 1)
+    for level in range(depth):
+        for k in range(1 << level):
+            low, high = _range_of(level, k, count)
+            axis = _widest(points, order, low, high)
+            middle = (low + high) // 2
+            _select(points, order, low, high - 1, middle, axis)
+            node = (1 << level) - 1 + k
+            axes[node], values[node] = axis, points[order[middle], axis]
+    return points[order], order, axes, values
+
+
+@compiled
+def _range_of(level, k, count):
+    low, high = 0, count
+    for bit in range(level - 1, -1, -1):
+        middle = (low + high) // 2
+        if (k >> bit) & 1:
+            low = middle
+        else:
+            high = middle
+    return low, high
+
+
+@compiled
+def _widest(points, order, low, high):
+    best, axis = -1.0, 0
+    for c in range(3):
+        least, most = np.inf, -np.inf
+        for i in range(low, high):
+            value = points[order[i], c]
+            least, most = min(least, value), max(most, value)
+        if most - least > best:
+            best, axis = most - least, c
+    return axis
+
+
+@compiled
+def _select(points, order, low, high, wanted, axis):
+    """Bring the one of rank ``wanted`` to its place, smaller ones before it."""
+    while low < high:
+        pivot = points[order[(low + high) // 2], axis]
+        i, j = low, high
+        while i <= j:
+            while points[order[i], axis] < pivot:
+                i += 1
+            while points[order[j], axis] > pivot:
+                j -= 1
+            if i <= j:
+                order[i], order[j] = order[j], order[i]
+                i += 1
+                j -= 1
+        if wanted <= j:
+            high = j
+        elif wanted >= i:
+            low = i
+        else:
+            return
+
+
+@compiled
+def neighbours(
+    x, y, z, points, axes, values, places, squares, stack, bounds, outward=None, eye=None, slack=0.0
+):
+    """Find the places of a tree nearest to a point: as many as ``places`` holds, the nearest first.
+
+    Args:
+        x: of the point.
+        y: of the point.
+        z: of the point.
+        points: of the tree.
+        axes: of the tree.
+        values: of the tree.
+        places: (k,), written; what was there stays where nothing is nearer.
+        squares: (k,), squared distances of ``places``, ascending: beyond them nothing is wanted.
+        stack: (64, 3) whole numbers, memory.
+        bounds: (64, 4), memory.
+        outward: (m, 3), normals of the places.
+        eye: (3,), a camera that a place must face; None: all count.
+        slack: of :func:`faces`, which is true from there.
+    """
+    inner, last, top = len(axes), len(places) - 1, 0
+    stack[0, 0], stack[0, 1], stack[0, 2] = 0, 0, len(points)
+    bounds[0, :] = 0.0
+    while top >= 0:
+        node, low, high = stack[top, 0], stack[top, 1], stack[top, 2]
+        gx, gy, gz, least = bounds[top, 0], bounds[top, 1], bounds[top, 2], bounds[top, 3]
+        top -= 1
+        if least >= squares[last]:
+            continue
+        while node < inner:
+            axis, middle = axes[node], (low + high) // 2
+            gap = (x if axis == 0 else y if axis == 1 else z) - values[node]
+            beyond = least - (gx if axis == 0 else gy if axis == 1 else gz) + gap * gap
+            is_low = gap < 0
+            if beyond < squares[last]:
+                top += 1
+                stack[top, 0] = 2 * node + (2 if is_low else 1)
+                stack[top, 1], stack[top, 2] = (middle, high) if is_low else (low, middle)
+                bounds[top, 0] = gap * gap if axis == 0 else gx
+                bounds[top, 1] = gap * gap if axis == 1 else gy
+                bounds[top, 2] = gap * gap if axis == 2 else gz
+                bounds[top, 3] = beyond
+            node = 2 * node + (1 if is_low else 2)
+            low, high = (low, middle) if is_low else (middle, high)
+        for place in range(low, high):
+            a, b, c = points[place, 0] - x, points[place, 1] - y, points[place, 2] - z
+            square = a * a + b * b + c * c
+            if square < squares[last] and (
+                eye is None or faces(place, points, outward, eye, slack)
+            ):
+                _insert(places, squares, last, place, square)
+
+
+@compiled
+def faces(place, points, outward, eye, least):
+    """Whether a surface point shows its outer side to a camera, or nearly."""
+    x, y, z = eye[0] - points[place, 0], eye[1] - points[place, 1], eye[2] - points[place, 2]
+    return outward[place, 0] * x + outward[place, 1] * y + outward[place, 2] * z >= least
+
+
+@compiled
+def _insert(places, squares, last, place, square):
+    """Put a neighbour among the nearest so far."""
+    k = last
+    while k > 0 and squares[k - 1] > square:
+        squares[k], places[k] = squares[k - 1], places[k - 1]
+        k -= 1
+    squares[k], places[k] = square, place
+
+
+@compiled
+def _nearest_many(queries, tree, index, distance):
+    stack, bounds = np.empty((64, 3), np.int64), np.empty((64, 4))
+    points, order, axes, values = tree
+    place, square = np.zeros(1, np.int64), np.empty(1)
+    for i in range(len(queries)):
+        x, y, z = queries[i, 0], queries[i, 1], queries[i, 2]
+        a, b, c = points[place[0], 0] - x, points[place[0], 1] - y, points[place[0], 2] - z
+        square[0] = a * a + b * b + c * c
+        neighbours(x, y, z, points, axes, values, place, square, stack, bounds)
+        index[i], distance[i] = order[place[0]], np.sqrt(square[0])
+
+
+def planes_of(every: Array, some: Array, count: int) -> tuple[Array, Array]:
+    """Lay a plane through the ``count`` points of ``every`` nearest to each of ``some``.
+
+    Returns:
+        Normals (m, 3) toward the origin, and how bent the cloud is there (m,), 0 to 1.
+
+    Raises:
+        ValueError: a point is not finite, or ``count`` is 0.
+    """
+    if count < 1:
+        raise ValueError(f"a plane goes through points, and count is {count}")
+    normals, bend = np.empty((len(some), 3)), np.empty(len(some))
+    given = (finite_array(a.astype(np.float64, copy=False)) for a in (every, some))
+    _lay_planes(*given, count, normals, bend)
+    return normals, bend
+
+
+@compiled
+def _lay_planes(every, some, count, normals, bend):
+    """Lay a plane through the ``count`` points nearest to each of some.
+
+    Args:
+        every: (n, 3), float64.
+        some: (m, 3).
+        count: of neighbours, n at most.
+        normals: (m, 3), written: of unit length, toward the origin.
+        bend: (m,), written: 0 flat, 1 as a ball.
+    """
+    points, _, axes, values = planted(every)
+    stack, bounds = np.empty((64, 3), np.int64), np.empty((64, 4))
+    places, squares = np.zeros(count, np.int64), np.empty(count)
+    A, V = np.empty((3, 3)), np.empty((3, 3))
+    mean = np.empty(3)
+    for i in range(len(some)):
+        x, y, z = some[i, 0], some[i, 1], some[i, 2]
+        squares[:] = np.inf
+        neighbours(x, y, z, points, axes, values, places, squares, stack, bounds)
+        mean[:] = 0.0
+        for p in places:
+            mean += points[p]
+        mean /= count
+        A[:] = 0.0
+        for p in places:
+            for k in range(3):
+                for m in range(3):
+                    A[k, m] += (points[p, k] - mean[k]) * (points[p, m] - mean[m])
+        jacobi(A, V)
+        least = 0
+        for k in range(1, 3):
+            if A[k, k] < A[least, least]:
+                least = k
+        along = V[0, least] * some[i, 0] + V[1, least] * some[i, 1] + V[2, least] * some[i, 2]
+        sign = -1.0 if along > 0 else 1.0
+        for k in range(3):
+            normals[i, k] = sign * V[k, least]
+        total = max(A[0, 0] + A[1, 1] + A[2, 2], 1e-30)
+        bend[i] = 3 * max(A[least, least], 0.0) / total
+
+
+def compare_rays(
+    cloud: Tensor, poses: Rigid, points: Tensor, rays: tuple[float, float, float, int], limit: float
+) -> tuple[Tensor, Tensor]:
+    """Compare a cloud with each pose of a surface.
+
+    Args:
+        cloud: (n, 3), before the camera, float64.
+        poses: a batch, ``camera_from_model``, float64.
+        points: (m, 3), of the surface.
+        rays: cells for a unit of slope, column and row of the middle cell, cells to each side.
+        limit: how far before a point the surface occludes it.
+
+    Returns:
+        For each pose the share of points that the surface would have occluded, and the share of the
+        surface's cells in which nothing was seen.
+
+    Raises:
+        ValueError: a value is not finite.
+    """
+    assert len(poses.R) == len(poses.t_m), "a translation for each rotation"
+    front = torch.empty(len(poses.R), dtype=torch.float64)
+    unseen = torch.empty_like(front)
+    given = (finite_array(a) for a in (cloud, poses.R, poses.t_m, points))
+    _look(*given, *rays, limit, front.numpy(), unseen.numpy())
+    return front, unseen
+
+
+@compiled
+def _cell(x, y, z, scale, column, row, half):
+    """Number the cell of a ray, those far off at the border."""
+    u = min(max(np.floor(x / z * scale - column), -half), half) + half
+    v = min(max(np.floor(y / z * scale - row), -half), half) + half
+    return int(u) * (2 * half + 1) + int(v)
+
+
+@compiled
+def _look(cloud, Rs, ts, points, scale, column, row, half, limit, front, unseen):
+    """Compare a cloud with each of several poses of a surface.
+
+    Args:
+        cloud: (n, 3), before the camera.
+        Rs: (b, 3, 3), rotations of the poses.
+        ts: (b, 3), translations.
+        points: (m, 3), of the surface.
+        scale: cells for a unit of a ray's slope.
+        column: of the middle cell.
+        row: of the middle cell.
+        half: cells to each side of it.
+        limit: how far before a point the surface occludes it.
+        front: (b,), written: share of points that the surface would have occluded.
+        unseen: (b,), written: share of the surface's cells in which nothing was seen.
+    """
+    cells = (2 * half + 1) ** 2
+    is_seen = np.zeros(cells, np.bool_)
+    theirs = np.empty(len(cloud), np.int64)
+    for i in range(len(cloud)):
+        theirs[i] = _cell(cloud[i, 0], cloud[i, 1], cloud[i, 2], scale, column, row, half)
+        is_seen[theirs[i]] = True
+    nearest = np.empty(cells)
+    for b in range(len(ts)):
+        R, t = Rs[b], ts[b]
+        nearest[:] = np.inf
+        for p in range(len(points)):
+            sx, sy, sz = points[p, 0], points[p, 1], points[p, 2]
+            z = R[2, 0] * sx + R[2, 1] * sy + R[2, 2] * sz + t[2]
+            if z <= 0:
+                continue
+            x = R[0, 0] * sx + R[0, 1] * sy + R[0, 2] * sz + t[0]
+            y = R[1, 0] * sx + R[1, 1] * sy + R[1, 2] * sz + t[1]
+            mine = _cell(x, y, max(z, 1e-6), scale, column, row, half)
+            nearest[mine] = min(nearest[mine], z)
+        total, missed = 0, 0
+        for k in range(cells):
+            if nearest[k] < np.inf:
+                total += 1
+                missed += not is_seen[k]
+        occluded = 0
+        for i in range(len(cloud)):
+            occluded += nearest[theirs[i]] < cloud[i, 2] - limit
+        front[b] = occluded / len(cloud) if total else 1.0
+        unseen[b] = missed / total if total else 1.0

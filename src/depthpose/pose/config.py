@@ -1,0 +1,456 @@
+"""Settings of pose estimation: clouds, meshes, refusal, estimates, synthetic objects."""
+
+from dataclasses import dataclass, field
+from typing import ClassVar, Literal, get_args
+
+from depthpose.core.config import check_settings
+from depthpose.core.errors import InputError, refuse_seed
+
+VotingMethod = Literal["least squares", "ransac"]
+InlierTest = Literal["angle", "distance"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class MeshConfig:
+    """What is taken from a model file."""
+
+    keypoints: int = 8
+    """Farthest points of the surface that the network's directions point at (4 to 20 usual)."""
+
+    def __post_init__(self) -> None:
+        """Refuse fewer keypoints than fix a pose."""
+        check_settings(self, keypoints="[4, inf)")
+
+
+@dataclass(frozen=True, kw_only=True)
+class CloudConfig:
+    """How a mask and a depth map become the cloud that the network sees."""
+
+    voxel_m: float = 0.008
+    """Side of a voxel; one point is kept in each. The published method takes 0.001."""
+
+    with_sight_axis: bool = True
+    """Turn the cloud so that it lies straight ahead before the grid is laid: what a camera sees of
+    an object at the side of its image is then what it sees in the middle. The published method
+    leaves the cloud as it is."""
+
+    with_shape: bool = False
+    """Give the network for each voxel where in it the points lie on average, how many they are, and
+    the normal and curvature there; the published method gives a constant 1."""
+
+    max_points: int | None = 1500
+    """At most so many points, chosen at random before voxelising; None: all."""
+
+    min_points: int = 16
+    """Fewer points are refused, not posed."""
+
+    max_offset_diameters: float = 1.0
+    """Points farther from the median of the masked points are flying pixels, and dropped."""
+
+    def __post_init__(self) -> None:
+        """Refuse sizes that leave nothing or mean another unit."""
+        check_settings(
+            self,
+            voxel_m="(0, 1)",
+            min_points="[3, inf)",
+            max_points="[3, inf)",
+            max_offset_diameters="(0, inf)",
+        )
+        if self.max_points is not None and self.max_points < self.min_points:
+            raise InputError(
+                f"max_points is {self.max_points}, below min_points {self.min_points}: every cloud "
+                "would be refused; raise it"
+            )
+
+    @property
+    def features(self) -> int:
+        """Numbers that the network gets of each voxel."""
+        return 9 if self.with_shape else 1
+
+
+@dataclass(frozen=True, kw_only=True)
+class VotingConfig:
+    """How directions become keypoints, and keypoints a pose."""
+
+    method: VotingMethod = "ransac"
+    """``least squares`` trusts every direction; ``ransac`` only those that agree."""
+
+    hypotheses: int = 128
+    """Pairs of points tried for each keypoint (published practice 50; PVNet 128 a round)."""
+
+    inlier_test: InlierTest = "angle"
+    """``angle``: a direction misses the keypoint by a small angle, and points toward it.
+    ``distance``: its line passes near."""
+
+    min_cosine: float = 0.99
+    """Inliers by angle: cosine between the direction and the way to the keypoint (8.1 degrees)."""
+
+    max_distance_m: float = 0.0005
+    """Inliers by distance: how far from its line the keypoint may lie."""
+
+    refinements: int = 3
+    """Steps from the point nearest to the lines to the most likely one under errors of angle.
+    Noisy lines draw the nearest point toward the cloud: a direction that errs by an angle misses a
+    far keypoint by more than a near one. 0: the published, biased answer."""
+
+    max_condition: float = 1000.0
+    """A keypoint whose normal matrix is worse conditioned does not count as found."""
+
+    rigidity_diameters: float = 0.1
+    """Distances between keypoints may differ from the model's by this share of its diameter."""
+
+    seed: int = 0
+    """Of the pairs: the same input gives the same answer."""
+
+    def __post_init__(self) -> None:
+        """Refuse values outside their range."""
+        check_settings(
+            self,
+            hypotheses="[1, inf)",
+            min_cosine="(0, 1)",
+            max_distance_m="(0, 1)",
+            refinements="[0, inf)",
+            max_condition="(1, inf)",
+            rigidity_diameters="(0, inf)",
+        )
+        refuse_seed(self.seed)
+
+
+@dataclass(frozen=True, kw_only=True)
+class IcpConfig:
+    """How a pose is brought onto the cloud."""
+
+    iterations: int = 30
+    """At most so many exact steps from one start; half of them after the best of several."""
+
+    start_distance_diameters: float = 0.1
+    """Points farther from the surface have weight 0 in the first step."""
+
+    end_distance_diameters: float = 0.05
+    """The same in the last: the limit shrinks from step to step. Below the sensor's noise the
+    answer grows worse (0.02 on a Kinect's cat: 2.7 % of the diameter, 0.05: 1.7 %)."""
+
+    cloud_points: int = 500
+    """At most so many points of the cloud, evenly taken: more are slower and no more exact."""
+
+    surface_points: int = 10000
+    """Points sampled on the model's surface."""
+
+    starts: int = 7
+    """From each fit of the keypoints so many: 1, it alone; up to 7, also turned by 15 degrees one
+    way and the other about each axis of the camera (``bench/refine_starts.py``)."""
+
+    def __post_init__(self) -> None:
+        """Refuse limits that grow, and counts of nothing."""
+        check_settings(
+            self,
+            starts="[1, 7]",
+            iterations="[1, inf)",
+            surface_points="[100, inf)",
+            cloud_points="[100, inf)",
+        )
+        if not 0 < self.end_distance_diameters <= self.start_distance_diameters:
+            raise InputError(
+                f"the distances go from {self.start_distance_diameters} to "
+                f"{self.end_distance_diameters} diameters, but the limit shrinks and stays "
+                "positive; take 0.1 and 0.05"
+            )
+
+
+_CANDIDATE_SLOPES = {
+    "tilt": 1.52,
+    "gap": 0.78,
+    "far": 2.02,
+    "front": 1.43,
+    "unseen": 0.75,
+    "disagree": 0.77,
+}
+"""Of a conditional logit on synthetic views of all shipped objects, regularised by a ridge
+(``bench/pose_candidates.py``): how likely each of several poses is that fit."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class RefusalConfig:
+    """When an estimate is withheld. The limits are shares of what was seen, on any sensor."""
+
+    RETIRED: ClassVar[frozenset[str]] = frozenset(
+        {"max_risk", "bias", "slopes", "means", "max_scale_error"}
+    )
+    """Settings of a calibrated risk, in weights written before 2026-11-26; they are left out."""
+
+    min_agreement: float = 0.8
+    """Of the posed surface that the camera saw, so much must lie where it saw something: an edge
+    of a real sensor takes a tenth, other objects leave a fifth and more."""
+
+    max_beyond: float = 0.03
+    """Of the object's readings so many may lie beside the posed silhouette, its border apart."""
+
+    min_explained: float = 0.75
+    """Of the object's readings so many must lie near the posed surface; the rest may be of what a
+    loose mask takes in."""
+
+    max_size_error: float = 0.03
+    """The size of the model that fits best may differ from 1 by so much beyond what the sensor
+    explains; 1: neither size nor mirror image is tested. Without ICP they are not."""
+
+    candidate_slopes: dict[str, float] = field(default_factory=lambda: dict(_CANDIDATE_SLOPES))
+    """Weight of each signal's logarithm as evidence against a pose among several that fit."""
+
+    min_hold: float = 0.02
+    """A motion that no symmetry allows must move the seen surface along its normals by this
+    share of what it moves the object's points; one that moves it within itself (of a plane or
+    ball) is not observable."""
+
+    def __post_init__(self) -> None:
+        """Refuse limits that are no share, or refuse everything."""
+        check_settings(
+            self,
+            min_agreement="[0, 1]",
+            max_beyond="[0, 1]",
+            min_explained="[0, 1]",
+            max_size_error="(0, 1]",
+            min_hold="[0, 1)",
+        )
+
+
+@dataclass(frozen=True, kw_only=True)
+class EstimateConfig:
+    """How a cloud becomes a pose."""
+
+    voting: VotingConfig = field(default_factory=VotingConfig)
+    """Directions to keypoints."""
+
+    icp: IcpConfig = field(default_factory=IcpConfig)
+    """How ICP refines the voted pose."""
+
+    with_icp: bool = True
+    """Whether it does; without, the voted pose is the answer."""
+
+    min_certainty: float = 0.9
+    """Below this certainty the status is ``ambiguous``, not ``ok``; pose and alternatives are given
+    all the same. 0: the likeliest pose is always the answer."""
+
+    up_to_symmetry: bool = False
+    """Whether copies of the object that look nearly alike count as one answer: its certainty is
+    then of them all, and they are not named as alternatives."""
+
+    register_refused: bool = False
+    """Whether what a network doubts is registered by its model alone: tenths of a second for each,
+    and more answers where much is occluded. An answer whose ``seconds`` name registration is
+    registration's, and so is its risk; it has no keypoints. Not used where an object is searched
+    for, as in ``find``, because it may not be there."""
+
+    rough_rigidity_diameters: float = 0.3
+    """In place of ``voting.rigidity_diameters`` where ICP refines the votes: it corrects rough
+    ones, and what does not fit then is refused. Where fewer than four keypoints agree all are
+    fitted, and ICP begins at both fits."""
+
+    max_cloud_points: int = 100_000
+    """Of a larger cloud so many points are taken, evenly in their order, before anything else."""
+
+    batch_voxels: int = 20_000
+    """Voxels in one call of the network: many clouds at once, in bounded memory."""
+
+    device: str = "cpu"
+    """Where the network runs: cpu, cuda, cuda:1, ..."""
+
+    def __post_init__(self) -> None:
+        """Refuse counts of nothing, and a certainty that is none."""
+        check_settings(
+            self, min_certainty="[0, 1]", max_cloud_points="[100, inf)", batch_voxels="[1, inf)"
+        )
+        if self.rough_rigidity_diameters < self.voting.rigidity_diameters:
+            raise InputError(
+                f"rough_rigidity_diameters is {self.rough_rigidity_diameters}, but the strict one, "
+                f"voting.rigidity_diameters, is {self.voting.rigidity_diameters}; take 0.3"
+            )
+        if self.register_refused and not self.with_icp:
+            raise InputError(
+                "registration refines by ICP; omit --no-icp (with_icp=False) or "
+                "--register-refused (register_refused=True)"
+            )
+
+
+DiameterTable = Literal["bop", "pvnet"]
+SymmetryRule = Literal["declared", "all"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class EvaluationConfig:
+    """How estimates are measured against the truth."""
+
+    diameters: DiameterTable = "bop"
+    """Whose diameters a success is a tenth of: those that the data set declares (``bop``), or
+    PVNet's of LineMOD, which differ by up to 16 %."""
+
+    adds: SymmetryRule = "declared"
+    """Which objects are measured by ADD-S: those declared symmetric (of LineMOD eggbox and glue),
+    or ``all``, as for YCB's, whose symmetries geometry alone cannot show."""
+
+    with_vsd: bool = True
+    """Draw both poses for VSD, and so for BOP's average recall: the slowest of the errors."""
+
+    vsd_delta_m: float = 0.015
+    """How far a surface may lie behind the measured one and count as visible (ITODD: 0.005)."""
+
+    def __post_init__(self) -> None:
+        """Refuse unknown names, and a tolerance out of range."""
+        check_settings(self, vsd_delta_m="(0, 1)")
+
+
+SensorKind = Literal["structured light", "active stereo", "time of flight", "laser", "none"]
+"""What measures depth, and so what its errors look like."""
+_LINEMOD_PX = (640, 480)
+_LINEMOD_CENTRE_PX = (325.2611, 242.04899)
+OCCLUSIONS = "[0, 0.95]"
+"""Share of a silhouette that something may occlude."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class SensorConfig:
+    """The errors of a depth sensor. Ranges are of what each sample draws."""
+
+    kinds: tuple[SensorKind, ...] = ("structured light",)
+    """One of these measures each sample. ``structured light``: disparity in steps of 1/8 px, noise
+    that grows with the squared distance (Nguyen et al. 2012), the projector's shadow. ``active
+    stereo``: finer steps, edges displaced by the window that is matched, a shadow on the other
+    side. ``time of flight``: mixed readings where depth jumps. ``laser``: little noise. ``none``:
+    no error."""
+
+    noise: tuple[float, float] = (0.5, 1.5)
+    """Times the noise of the kind."""
+
+    noise_correlation_px: tuple[float, float] | None = None
+    """Correlation length of the noise (deviation of the Gaussian that smooths it), in pixels of the
+    full image; None: 3 to 6 for ``active stereo``, else every pixel has its own. Measured on planes
+    by ``bench/sensors.py``: a Kinect 3, a RealSense 5."""
+
+    missing: tuple[float, float] = (0.0, 0.1)
+    """Share of readings lost beside those of shadows and grazing surfaces; half in patches."""
+
+    offset_m: tuple[float, float] = (-0.005, 0.005)
+    """Added to all readings of a view alike: real sensors are off by 3 to 6 mm as a whole. Not of
+    ``none``."""
+
+    def __post_init__(self) -> None:
+        """Refuse unknown kinds and empty ranges."""
+        if not self.kinds:
+            raise InputError(f"kinds is (); name one or more of {', '.join(get_args(SensorKind))}")
+        check_settings(
+            self,
+            noise="[0, 20]",
+            noise_correlation_px="[0, 30]",
+            missing="[0, 0.9]",
+            offset_m="[-0.1, 0.1]",
+        )
+        refuse_reversed(self, "noise", "noise_correlation_px", "missing", "offset_m")
+
+
+@dataclass(frozen=True, kw_only=True)
+class ObjectsConfig:
+    """Synthetic views of known objects. Ranges are of what each sample draws."""
+
+    INSTEAD: ClassVar[dict[str, str]] = {"image_px": "centre_px"}
+    """A config file that gives another image has that one's middle, not the default's."""
+
+    number: int = 1000
+    """Samples; sample i shows object i modulo their number."""
+
+    seed: int = 0
+    """Another seed, other samples."""
+
+    views: int | None = 2000
+    """Renderings of each object, rendered at first use and then kept; a sample turns the camera of
+    one of them at random, which shows the same surface. None: each sample is a rendering of its
+    own, for evaluation."""
+
+    distance_m: tuple[float, float] = (0.6, 1.1)
+    """From the camera to the middle of the object."""
+
+    image_px: tuple[int, int] = (640, 480)
+    """Width and height of the sensor's image; the object lies somewhere in it."""
+
+    focal_px: tuple[float, float] = (572.4114, 573.57043)
+    """fx and fy; LineMOD's Kinect."""
+
+    centre_px: tuple[float, float] | None = None
+    """Principal point, within the image; None: the middle of the image, or that of LineMOD's Kinect
+    in an image of 640x480. It is always known once the settings are made."""
+
+    resolution: tuple[float, float] = (0.4, 0.8)
+    """The image is so many times as large: coarser pictures are faster."""
+
+    occluded_share: float = 0.7
+    """Share of samples in which something occludes the object."""
+
+    occlusion: tuple[float, float] = (0.0, 0.5)
+    """Share of the silhouette that it occludes."""
+
+    with_background: bool = True
+    """Whether there is something behind and beside the object, which wrong masks take in."""
+
+    mask_error_px: int = 3
+    """The mask is grown or shrunk by up to so many pixels of the full image."""
+
+    mask_shift_px: int = 2
+    """And shifted by up to so many of them along each axis, as a predicted mask is."""
+
+    sensor: SensorConfig = field(default_factory=SensorConfig)
+    """What measures the depth."""
+
+    frame_objects: tuple[int, int] = (2, 6)
+    """Objects of a whole frame, no more than there are models."""
+
+    frame_clutter: tuple[int, int] = (0, 4)
+    """Boxes, balls and cans of no model among them."""
+
+    def __post_init__(self) -> None:
+        """Refuse counts of nothing, shares beyond one and empty ranges."""
+        check_settings(
+            self,
+            number="[1, inf)",
+            views="[1, inf)",
+            image_px="(0, inf)",
+            focal_px="(0, inf)",
+            distance_m="[0.05, 20]",
+            resolution="[0.05, 4]",
+            occluded_share="[0, 1]",
+            occlusion=OCCLUSIONS,
+            mask_error_px="[0, 20]",
+            mask_shift_px="[0, 20]",
+            frame_objects="[1, inf)",
+            frame_clutter="[0, inf)",
+        )
+        refuse_seed(self.seed)
+        refuse_reversed(
+            self, "distance_m", "resolution", "occlusion", "frame_objects", "frame_clutter"
+        )
+        width, height = self.image_px
+        middle = ((width - 1) / 2, (height - 1) / 2)
+        if self.centre_px is None:
+            usual = _LINEMOD_CENTRE_PX if self.image_px == _LINEMOD_PX else middle
+            object.__setattr__(self, "centre_px", usual)
+        x, y = self.principal_point_px
+        if not (-0.5 <= x <= width - 0.5 and -0.5 <= y <= height - 0.5):
+            raise InputError(
+                f"centre_px is {(x, y)}, but the principal point lies within the image, and "
+                f"image_px is {self.image_px}; leave it out for the middle, {middle}"
+            )
+
+    @property
+    def principal_point_px(self) -> tuple[float, float]:
+        """``centre_px``, or what it is where it was not given."""
+        assert self.centre_px is not None
+        return self.centre_px
+
+
+def refuse_reversed(config: object, *names: str) -> None:
+    """Refuse ranges whose upper end comes first.
+
+    Raises:
+        InputError: that is so.
+    """
+    for name in names:
+        ends = getattr(config, name)
+        if ends is not None and ends[0] > ends[1]:
+            raise InputError(f"{name} must be a range, the lower end first, got {ends}; turn it")

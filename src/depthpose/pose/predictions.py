@@ -1,0 +1,549 @@
+"""Predictions as files: records of what is done, and BOP results."""
+
+import csv
+import math
+import warnings
+from collections import Counter, defaultdict
+from collections.abc import Callable, Generator, Iterable, Mapping, Sequence
+from dataclasses import asdict, dataclass, field, replace
+from functools import partial
+from io import StringIO
+from pathlib import Path
+from typing import Any, Generic, NamedTuple, TypeVar, cast, get_args
+
+import torch
+from torch import Tensor
+
+from depthpose.core.config import config_from_dict
+from depthpose.core.errors import InputError, Notice, nearest_name
+from depthpose.core.files import write_json
+from depthpose.core.files.disk import refused_as, write_bytes
+from depthpose.core.files.store import read_bytes
+from depthpose.core.files.text import refuse_heavy
+from depthpose.core.rigid import Rigid
+from depthpose.core.run import claim_folder
+from depthpose.pose.datasets import BopDataset, Detection, Instance, read_mask
+from depthpose.pose.datasets.layouts import MOST, integer, make_pose, number, read_rows
+from depthpose.pose.types import (
+    POSED,
+    Alternative,
+    Fit,
+    Identity,
+    PoseEstimate,
+    Status,
+    Tracking,
+    ViewInput,
+)
+
+AnswerT = TypeVar("AnswerT", Fit, Identity)
+POSES = "poses.json"
+PICTURE, CLOUD = "pose.png", "pose.ply"
+"""What follows ``NAME.`` in the names of the files that show a pose."""
+STAGES = ("segmentation", "cloud", "network", "voting", "svd", "icp", "check", "registration")
+"""What an estimate's ``seconds`` are of, in order; a stage that was not run is missing."""
+
+_ROTATION_SLACK = 1e-4
+_PLACE = ("scene_id", "im_id", "obj_id")
+
+
+class Place(NamedTuple):
+    """Where in a BOP data set an estimate belongs."""
+
+    scene_id: int
+    image_id: int
+    object_id: int
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Prediction:
+    """An estimate as a file keeps it.
+
+    Attributes:
+        estimate: or refusal; from the annotated mask of an instance it bears the instance's name.
+        place: scene, image and object; None for a cloud of no data set.
+    """
+
+    estimate: PoseEstimate
+    place: Place | None = None
+
+
+def place_of(instance: Instance) -> Place:
+    """Say where an annotated object belongs."""
+    return Place(instance.scene_id, instance.image_id, instance.object_id)
+
+
+def is_started(folder: Path) -> bool:
+    """Whether a folder holds predictions."""
+    return (folder / POSES).is_file()
+
+
+def is_finished(prediction: Prediction) -> bool:
+    """Whether a rerun need not estimate it: an input that was unreadable may be repaired."""
+    return prediction.estimate.status != "unreadable"
+
+
+def write_predictions(folder: Path, predictions: Iterable[Prediction]) -> None:
+    """Write ``poses.json``: a list of estimates and refusals, in metres, radians and seconds.
+
+    Raises:
+        InputError: the disk refuses.
+    """
+    write_json(folder / POSES, [prediction_row(prediction) for prediction in predictions])
+
+
+def read_predictions(folder: Path) -> list[Prediction]:
+    """Read what :func:`write_predictions` wrote.
+
+    Raises:
+        InputError: the file is missing or damaged, or two estimates have one name.
+    """
+    path = folder / POSES
+    found = [parse_prediction(row, f"{path}: entry {i}") for i, row in enumerate(read_rows(path))]
+    names: set[str] = set()
+    for prediction in found:
+        name = prediction.estimate.name
+        if name in names:
+            raise InputError(f"{path}: two estimates are called {name!r}; keep one of them")
+        names.add(name)
+    return found
+
+
+def kept_predictions(folder: Path) -> list[Prediction]:
+    """Read what earlier runs of this folder left; a damaged file is as none, and a notice."""
+    try:
+        return read_predictions(folder) if is_started(folder) else []
+    except InputError as error:
+        warnings.warn(f"{error} - it is damaged, and made again", Notice, stacklevel=2)
+        return []
+
+
+def score_of(estimate: PoseEstimate) -> float:
+    """Say how sure an estimate is, 0..1: the chance of being right, where it is known.
+
+    Else the share of the votes that agree, or 1 where nothing is said.
+    """
+    if estimate.certainty is not None:
+        return estimate.certainty
+    return 1.0 if estimate.inlier_share is None else estimate.inlier_share
+
+
+def prediction_row(prediction: Prediction) -> dict[str, Any]:
+    """Give the JSON values of an entry of ``poses.json``."""
+    estimate, place = prediction.estimate, prediction.place
+    pose = estimate.camera_from_model
+    row: dict[str, Any] = {"name": estimate.name, "object": estimate.object}
+    row |= dict(zip(_PLACE, place, strict=True)) if place is not None else {}
+    row |= {"status": estimate.status, "reason": estimate.reason}
+    row["camera_from_model"] = None if pose is None else _matrix(pose)
+    for name in ("covariance", "free_motions", "keypoints_m"):
+        values: Tensor | None = getattr(estimate, name)
+        row[name] = None if values is None else values.double().tolist()
+    for name in ("origin_std_mm", "rotation_std_deg"):
+        values = getattr(estimate, name)
+        row[name] = None if values is None else [_finite(v) for v in values.tolist()]
+    for name in ("inlier_share", "residual_m", "certainty"):
+        value: float | None = getattr(estimate, name)
+        row[name] = None if value is None else _finite(value)
+    for name in ("fit", "identity"):
+        answer = getattr(estimate, name)
+        row[name] = None if answer is None else asdict(answer)
+    row["alternatives"] = [
+        {
+            "camera_from_model": _matrix(other.camera_from_model),
+            "probability": other.probability,
+            "difference": other.difference,
+        }
+        for other in estimate.alternatives
+    ]
+    if estimate.tracking is not None:
+        row["tracking"] = estimate.tracking
+    return row | {"signals": dict(estimate.signals), "seconds": dict(estimate.seconds)}
+
+
+def _finite(value: float) -> float | None:
+    """JSON has no infinity: a free axis has no deviation, nothing near the surface no distance."""
+    return value if math.isfinite(value) else None
+
+
+def _matrix(pose: Rigid) -> list[list[float]]:
+    top = torch.cat([pose.R.double(), pose.t_m.double()[:, None]], 1).tolist()
+    return [*top, [0.0, 0.0, 0.0, 1.0]]
+
+
+def parse_prediction(row: dict[str, Any], source: str) -> Prediction:
+    """Read what :func:`prediction_row` gave.
+
+    Args:
+        row: the values.
+        source: where they stand, for errors.
+
+    Raises:
+        InputError: a value is missing or impossible.
+    """
+    name, what = row.get("name"), row.get("object")
+    if not isinstance(name, str) or not isinstance(what, str):
+        raise InputError(f"{source}: name and object are {name!r} and {what!r}; write two words")
+    status, reason = row.get("status"), row.get("reason", "")
+    if status not in get_args(Status):
+        known = get_args(Status)
+        raise InputError(f"{source}: status {status!r}: {nearest_name(str(status), known)}")
+    tracking = row.get("tracking")
+    if tracking is not None and tracking not in get_args(Tracking):
+        raise InputError(f"{source}: tracking is {tracking!r}; write one of {get_args(Tracking)}")
+    pose = _pose(row.get("camera_from_model"), source)
+    if (pose is not None) != (status in POSED) or (status != "ok" and not reason):
+        raise InputError(
+            f"{source}: an estimate that is ok or ambiguous has a camera_from_model, a refused one "
+            f"none; all but ok have a reason; its status is {status!r}"
+        )
+    estimate = PoseEstimate(
+        name=name,
+        object=what,
+        status=cast("Status", status),
+        reason=str(reason),
+        camera_from_model=pose,
+        keypoints_m=_table(row, "keypoints_m", 3, source),
+        covariance=_table(row, "covariance", 6, source, rows=6),
+        free_motions=_table(row, "free_motions", 6, source),
+        inlier_share=_optional(row, "inlier_share", source),
+        residual_m=_optional(row, "residual_m", source),
+        fit=_fields_of(row, "fit", Fit, source),
+        certainty=_optional(row, "certainty", source),
+        identity=_fields_of(row, "identity", Identity, source),
+        alternatives=_alternatives(row.get("alternatives", []), source),
+        signals=_named(row, "signals", source),
+        seconds=_named(row, "seconds", source),
+        tracking=cast("Tracking | None", tracking),
+    )
+    has_place = any(row.get(key) is not None for key in _PLACE)
+    place = Place(*(integer(row, key, source) for key in _PLACE)) if has_place else None
+    return Prediction(estimate=estimate, place=place)
+
+
+def _pose(entry: object, source: str) -> Rigid | None:
+    if entry is None:
+        return None
+    matrix = _numbers(entry, 4, f"{source}: camera_from_model", rows=4)
+    R = matrix[:3, :3]
+    eye = torch.eye(3, dtype=torch.float64)
+    is_rotation = torch.allclose(R @ R.T, eye, atol=_ROTATION_SLACK) and torch.linalg.det(R) > 0
+    if not is_rotation or matrix[3].tolist() != [0, 0, 0, 1]:
+        raise InputError(
+            f"{source}: camera_from_model is no rigid transform; write 4 rows of 4, a rotation, "
+            "metres, and 0 0 0 1 below"
+        )
+    return Rigid(R.clone(), matrix[:3, 3].clone())
+
+
+def _alternatives(entries: object, source: str) -> tuple[Alternative, ...]:
+    if not isinstance(entries, list) or not all(isinstance(entry, dict) for entry in entries):
+        raise InputError(f"{source}: alternatives are no list of poses; write [...] of them")
+    found: list[Alternative] = []
+    for k, entry in enumerate(entries):
+        where = f"{source}: alternative {k}"
+        pose = _pose(entry.get("camera_from_model"), where)
+        if pose is None:
+            raise InputError(f"{where}: has no camera_from_model; leave it out, or write it")
+        probability = number(entry, "probability", None, where)
+        words = str(entry.get("difference", ""))
+        found.append(Alternative(camera_from_model=pose, probability=probability, difference=words))
+    return tuple(found)
+
+
+def _table(
+    row: dict[str, Any], key: str, width: int, source: str, rows: int | None = None
+) -> Tensor | None:
+    return None if row.get(key) is None else _numbers(row[key], width, f"{source}: {key}", rows)
+
+
+def _numbers(entry: object, width: int, source: str, rows: int | None = None) -> Tensor:
+    """Read a table of ``width`` columns, and of ``rows`` rows where that is given."""
+    try:
+        return torch.tensor(entry, dtype=torch.float64).reshape(rows or -1, width)
+    except (TypeError, ValueError, RuntimeError, OverflowError) as error:
+        count = "" if rows is None else f"{rows} "
+        raise InputError(
+            f"{source} is not {count}rows of {width} numbers; write them so"
+        ) from error
+
+
+def _fields_of(row: dict[str, Any], key: str, kind: type[AnswerT], source: str) -> AnswerT | None:
+    """Read one of the three answers; numbers that it does not say are None."""
+    entry = row.get(key)
+    if entry is None:
+        return None
+    if not isinstance(entry, dict):
+        raise InputError(f"{source}: {key} is {entry!r}, where names to values belong")
+    return config_from_dict(entry, kind, source=f"{source}: {key}")
+
+
+def _optional(row: dict[str, Any], key: str, source: str) -> float | None:
+    return None if row.get(key) is None else number(row, key, None, source)
+
+
+def _named(row: dict[str, Any], key: str, source: str) -> dict[str, float]:
+    found = row.get(key, {})
+    if not isinstance(found, dict):
+        raise InputError(f"{source}: {key} is {found!r}, where names to numbers belong")
+    return {str(name): number(found, name, None, source) for name in found}
+
+
+_SAVE_EVERY = 200
+
+Input = TypeVar("Input")
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Job(Generic[Input]):
+    """One thing to estimate: what it is called, where it belongs, and how its input is read.
+
+    Attributes:
+        name: that of the input: unique in a run.
+        read: gives the input; called only where the estimate is not there yet.
+        place: as :class:`Prediction` has it.
+        seconds: what was spent before, on its mask.
+        source: file or files that the input is read from.
+    """
+
+    name: str
+    read: Callable[[], Input]
+    place: Place | None = None
+    seconds: Mapping[str, float] = field(default_factory=dict)
+    source: Path | tuple[Path, ...] | None = None
+
+
+def predict(
+    estimate_many: Callable[[Sequence[Input]], Sequence[PoseEstimate]],
+    jobs: Iterable[Job[Input]],
+    folder: Path,
+    settings: dict[str, Any],
+    batch: int = 1,
+) -> Generator[str, None, None]:
+    """Estimate what is not finished yet, and yield each name; ``poses.json`` grows as it goes.
+
+    What was unreadable is tried again.
+
+    What was estimated is saved every 200 jobs, and when the work ends or is interrupted.
+
+    Args:
+        estimate_many: gives an estimate for each input, of the same name.
+        jobs: all that there are to do, the finished ones too.
+        folder: where ``poses.json`` goes; refused if other settings made what it holds.
+        settings: what decides the results.
+        batch: how many inputs are handed over at once. Each then takes an equal share of the time.
+    """
+    claim_folder(folder, settings, [POSES])
+    wanted = list(jobs)
+    done = {p.estimate.name: p for p in kept_predictions(folder)}
+    finished = {name for name, prediction in done.items() if is_finished(prediction)}
+    yield from (job.name for job in wanted if job.name in finished)
+    left = [job for job in wanted if job.name not in finished]
+    unsaved = 0
+    try:
+        for start in range(0, len(left), batch):
+            some = left[start : start + batch]
+            estimates = estimate_many([job.read() for job in some])
+            for job, estimate in zip(some, estimates, strict=True):
+                assert estimate.name == job.name, f"{estimate.name!r} is not {job.name!r}"
+                spent = {**job.seconds, **estimate.seconds}
+                done[job.name] = Prediction(
+                    estimate=replace(estimate, seconds=spent), place=job.place
+                )
+                unsaved += 1
+                yield job.name
+            if unsaved >= _SAVE_EVERY:
+                write_predictions(folder, done.values())
+                unsaved = 0
+    finally:
+        if unsaved or not is_started(folder):
+            write_predictions(folder, done.values())
+
+
+def instance_jobs(
+    dataset: BopDataset, names: Mapping[int, str], mask_of: Callable[[Instance], Path] | None = None
+) -> list[Job[ViewInput]]:
+    """Take every annotated instance by its mask.
+
+    Args:
+        dataset: what there is to estimate.
+        names: what the estimator calls each object, by its number.
+        mask_of: names the predicted mask of an instance, an image; None: the annotated masks.
+    """
+
+    def read(instance: Instance) -> ViewInput:
+        mask = None if mask_of is None else read_mask(mask_of(instance))
+        return replace(dataset.view(instance, mask).input, object=names[instance.object_id])
+
+    return [
+        Job(name=instance.name, read=partial(read, instance), place=place_of(instance))
+        for instance in dataset.instances
+    ]
+
+
+def detection_jobs(
+    dataset: BopDataset, names: Mapping[int, str], detections: Sequence[Detection]
+) -> list[Job[ViewInput]]:
+    """Take the surest detections of each object, as many as an image shows of it.
+
+    What is not detected has no job, and is missing in what is measured. The time of an image's
+    detection is shared by all its jobs.
+
+    Args:
+        dataset: what there is to find.
+        names: what the estimator calls each object, by its number.
+        detections: masks of any images; those of images that ``dataset`` has not are left out.
+
+    Raises:
+        InputError: no detection is of the data set.
+    """
+    shown: dict[Place, list[Instance]] = defaultdict(list)
+    for instance in dataset.instances:
+        shown[place_of(instance)].append(instance)
+    found: dict[Place, list[Detection]] = defaultdict(list)
+    for one in sorted(detections, key=lambda d: -d.score):
+        place = Place(one.scene_id, one.image_id, one.object_id)
+        if len(found[place]) < len(shown.get(place, ())):
+            found[place].append(one)
+    kept = [(place, k, one) for place, every in found.items() for k, one in enumerate(every)]
+    if not kept:
+        raise InputError(
+            f"{dataset.folder}: none of the {len(detections)} detections is of an image and object "
+            f"of split {dataset.split!r}; give those of this very split"
+        )
+    sharing = Counter(place[:2] for place, _, _ in kept)
+
+    def read(instance: Instance, name: str, one: Detection) -> ViewInput:
+        view = dataset.view(instance, one.mask).input
+        return replace(view, name=name, object=names[instance.object_id])
+
+    jobs: list[Job[ViewInput]] = []
+    for place, k, one in sorted(kept, key=lambda item: item[:2]):
+        name = f"{place.scene_id:06d}_{place.image_id:06d}_object{place.object_id}_{k}"
+        seconds = {} if one.seconds is None else {"segmentation": one.seconds / sharing[place[:2]]}
+        jobs.append(
+            Job(
+                name=name,
+                read=partial(read, shown[place][0], name, one),
+                place=place,
+                seconds=seconds,
+            )
+        )
+    return jobs
+
+
+_HEADER = ["scene_id", "im_id", "obj_id", "score", "R", "t", "time"]
+_SAME_TIME_S = 0.001
+"""BOP's toolkit refuses rows of an image whose times differ by more."""
+
+
+def results_name(dataset: BopDataset) -> str:
+    """Name the BOP csv of a data set: ``depthpose_DATASET-SPLIT.csv``."""
+    return f"depthpose_{dataset.folder.resolve().name}-{dataset.split}.csv"
+
+
+def alternatives_name(dataset: BopDataset) -> str:
+    """Name the csv that holds alternatives too: ``depthpose-alternatives_DATASET-SPLIT.csv``."""
+    return results_name(dataset).replace("depthpose_", "depthpose-alternatives_", 1)
+
+
+def read_bop_results(path: str | Path) -> list[Prediction]:
+    """Read anybody's BOP csv (mm, seconds) as predictions.
+
+    A row has a share of its image's time; its score is kept as the share of votes that agree.
+
+    Raises:
+        InputError: it is missing or damaged, or rows of an image have different times.
+    """
+    data = read_bytes(path)
+    refuse_heavy(path, data, {b"\n": 300, b",": 60})
+    with refused_as(path, "results file", "write it anew"):
+        rows = list(csv.reader(data.decode("utf-8-sig").splitlines()))
+    if not rows or [name.strip() for name in rows[0]] != _HEADER:
+        raise InputError(f"{path}: the first line is not {','.join(_HEADER)}; put it there")
+    found: list[tuple[Place, PoseEstimate]] = []
+    image_s: dict[tuple[int, int], float] = {}
+    for line, row in enumerate(rows[1:], 2):
+        if not row:
+            continue
+        place, score, pose, time_s = _parse_result(row, f"{path}: line {line}")
+        said = image_s.setdefault(place[:2], time_s)
+        if (said < 0) != (time_s < 0) or (time_s >= 0 and abs(said - time_s) > _SAME_TIME_S):
+            raise InputError(
+                f"{path}: scene {place.scene_id} image {place.image_id} took {said} s in one row "
+                f"and {time_s} s in another; time is that of the whole image, the same in all"
+            )
+        estimate = PoseEstimate(
+            name=f"row {len(found) + 1}",
+            object=f"obj_{place.object_id:06d}",
+            status="ok",
+            camera_from_model=pose,
+            inlier_share=score,
+        )
+        found.append((place, estimate))
+    rows_of = Counter(place[:2] for place, _ in found)
+    shares = {image: {"image": s / rows_of[image]} for image, s in image_s.items() if s >= 0}
+    return [
+        Prediction(estimate=replace(estimate, seconds=shares.get(place[:2], {})), place=place)
+        for place, estimate in found
+    ]
+
+
+def _parse_result(row: list[str], source: str) -> tuple[Place, float, Rigid, float]:
+    """Read place, score, pose and time [s] of one row."""
+    if len(row) != len(_HEADER):
+        raise InputError(f"{source}: {len(row)} values, where {len(_HEADER)} belong")
+    try:
+        place = Place(*(int(value) for value in row[:3]))
+        score, time_s = float(row[3]), float(row[6])
+        R, t_mm = ([float(value) for value in text.split()] for text in row[4:6])
+    except ValueError as error:
+        raise InputError(f"{source}: {error}; write numbers, R and t parted by blanks") from error
+    if not all(0 <= value <= MOST for value in place):
+        raise InputError(f"{source}: scene, image and object are numbers from 0 to {MOST}")
+    if len(R) != 9 or len(t_mm) != 3 or not all(map(math.isfinite, [score, time_s, *R, *t_mm])):
+        raise InputError(f"{source}: {len(R)} numbers of R and {len(t_mm)} of t, where 9 and 3 "
+                         "finite ones belong")  # fmt: skip
+    return place, score, make_pose(R, t_mm, source), time_s
+
+
+def write_bop_results(
+    path: str | Path, predictions: Iterable[Prediction], *, with_alternatives: bool = False
+) -> None:
+    """Write BOP's csv; refused ones have no row. An image's time is the sum over its estimates.
+
+    Args:
+        path: the csv. Numbers keep all their digits.
+        predictions: of a data set.
+        with_alternatives: give each alternative a row too, its probability the score. BOP's
+            measures take the surest rows of an image, so they are no row of the csv that is
+            measured.
+
+    Raises:
+        InputError: a pose belongs to no scene, or the disk refuses.
+    """
+    known = list(predictions)
+    image_s: dict[tuple[int, int], float] = defaultdict(float)
+    for prediction in known:
+        if prediction.place is not None:
+            image_s[prediction.place[:2]] += sum(prediction.estimate.seconds.values())
+    text = StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(_HEADER)
+    for prediction in known:
+        estimate, place = prediction.estimate, prediction.place
+        if estimate.camera_from_model is None:
+            continue
+        if place is None:
+            raise InputError(
+                f"{estimate.name}: belongs to no scene of a BOP data set, and its csv is of such; "
+                "leave it out"
+            )
+        answers = [(estimate.camera_from_model, score_of(estimate))]
+        if with_alternatives:
+            others = estimate.alternatives
+            answers += [(other.camera_from_model, other.probability) for other in others]
+        for pose, score in answers:
+            R = " ".join(repr(value) for value in pose.R.double().flatten().tolist())
+            t_mm = " ".join(repr(value) for value in (1000 * pose.t_m.double()).tolist())
+            writer.writerow([*place, score, R, t_mm, image_s[place[:2]] or -1])
+    write_bytes(path, text.getvalue().encode())

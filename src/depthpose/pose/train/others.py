@@ -1,0 +1,509 @@
+"""Training of the regressed depth image and of segmentation."""
+
+import dataclasses
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import NamedTuple
+
+import torch
+import torch.nn.functional as F
+from jaxtyping import Float, Int, UInt8
+from torch import Tensor, nn
+
+from depthpose.core.arrays import grey_of
+from depthpose.core.checkpoint import Checkpoint, find_weights, load_weights
+from depthpose.core.errors import InputError
+from depthpose.core.files import read_image
+from depthpose.core.loop import (
+    Run,
+    Update,
+    ValidationResult,
+    held_out_text,
+    make_adam,
+    releases_folder,
+    sample_generator,
+    shuffled_index,
+    write_card,
+)
+from depthpose.core.rigid import Rigid
+from depthpose.core.run import find_rank
+from depthpose.pose.augment import uniform, whole
+from depthpose.pose.baselines import DepthCrop, DepthImageNet, cut_depth, poses_of
+from depthpose.pose.config import EstimateConfig, RefusalConfig
+from depthpose.pose.datasets import Instance, open_bop
+from depthpose.pose.datasets.dataset import read_instance_mask
+from depthpose.pose.datasets.layouts import models_folder, object_name, read_models_info
+from depthpose.pose.estimator import DepthImageRegressor
+from depthpose.pose.losses import mask_loss, model_point_loss
+from depthpose.pose.mesh import sample_surface
+from depthpose.pose.metrics import is_within_diameter
+from depthpose.pose.segmentation import (
+    FCN,
+    KIND,
+    Overlap,
+    SegmentationConfig,
+    SegmentationWeights,
+    class_probabilities,
+    normalise_colors,
+    read_encoder_state,
+    write_segmentation,
+)
+from depthpose.pose.synthetic import Objects
+from depthpose.pose.train.clouds import (
+    epoch_samples,
+    frame_place,
+    held_out_objects,
+    open_frames,
+    pose_error,
+    read_models,
+)
+from depthpose.pose.train.config import (
+    DepthImageTraining,
+    ImageAugmentConfig,
+    ImagesConfig,
+    SegmentationTraining,
+)
+from depthpose.pose.train.directions import (
+    card_facts,
+    claim_run,
+    packed,
+    symmetric_copies,
+    train_words,
+    with_classes,
+    with_origin,
+)
+from depthpose.pose.types import ObjectModel, ViewSample
+from depthpose.pose.weights import PoseWeights, read_pose_weights, write_pose_weights
+
+
+class LabelledImage(NamedTuple):
+    """An image with the class of each pixel, or a batch of them.
+
+    Attributes:
+        image: RGB in [0, 1].
+        labels: 0 is the background, ``1 + i`` object i.
+    """
+
+    image: Float[Tensor, "*b 3 h w"]
+    labels: Int[Tensor, "*b h w"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class KnownObjects:
+    """The objects that a data set shows, in the order of the classes."""
+
+    names: tuple[str, ...]
+    numbers: tuple[int, ...]
+
+
+class AnnotatedImages:
+    """Images of a data set with their labels.
+
+    Args:
+        config: which.
+        objects: classes that are given; None: those that the images show.
+
+    Raises:
+        InputError: no picture, or no object in any.
+    """
+
+    def __init__(self, config: ImagesConfig, objects: KnownObjects | None = None) -> None:
+        if not config.folder:
+            raise InputError("there is no image to learn from; name a folder in BOP's layout")
+        dataset = open_bop(config.folder, config.split)
+        images: dict[tuple[int, int], list[Instance]] = {}
+        for instance in dataset.instances:
+            if instance.rgb is not None:
+                images.setdefault((instance.scene_id, instance.image_id), []).append(instance)
+        if not images:
+            raise InputError(f"{config.folder}: split {config.split!r} has no picture (rgb)")
+        self.objects = _known(config, images) if objects is None else objects
+        self._class_of = {number: k for k, number in enumerate(self.objects.numbers, 1)}
+        every = list(images.values())
+        count = len(every) if config.limit is None else min(config.limit, len(every))
+        self._images = [every[k * len(every) // count] for k in range(count)]
+        self._cache: dict[int, tuple[UInt8[Tensor, "3 h w"], UInt8[Tensor, "h w"]]] = {}
+        self._with_cache = config.with_cache
+
+    def __len__(self) -> int:
+        """How many images."""
+        return len(self._images)
+
+    def __getitem__(self, index: int) -> LabelledImage:
+        """Read one whole image.
+
+        Raises:
+            IndexError: there is no such image.
+            InputError: a file is missing or damaged, or a mask is of another size.
+        """
+        held = self._cache.get(index)
+        if held is None:
+            held = self._read(self._images[index])
+            if self._with_cache:
+                self._cache[index] = held
+        return LabelledImage(held[0].float() / 255, held[1].long())
+
+    def _read(
+        self, instances: Sequence[Instance]
+    ) -> tuple[UInt8[Tensor, "3 h w"], UInt8[Tensor, "h w"]]:
+        path = instances[0].rgb
+        assert path is not None
+        image = read_image(path)
+        labels = torch.zeros(image.shape[1:], dtype=torch.uint8)
+        for instance in instances:
+            number = self._class_of.get(instance.object_id)
+            if number is not None:
+                mask = read_instance_mask(instance)
+                if mask.shape != labels.shape:
+                    raise InputError(
+                        f"{instance.name}: the mask is {mask.shape[1]}x{mask.shape[0]}, but the "
+                        f"picture {labels.shape[1]}x{labels.shape[0]}; one of them is another's"
+                    )
+                labels[mask] = number
+        return (image * 255).round().to(torch.uint8), labels
+
+
+class TrainingImages:
+    """An image by sample index, randomly changed and cut.
+
+    Args:
+        images: to draw from.
+        config: how they are changed.
+        network: at what size it sees them.
+        seed: decides order and changes.
+    """
+
+    def __init__(
+        self,
+        images: AnnotatedImages,
+        config: ImageAugmentConfig,
+        network: SegmentationConfig,
+        seed: int,
+    ) -> None:
+        self.images, self.config, self.seed = images, config, seed
+        self._long_side_px = network.long_side_px
+
+    def __len__(self) -> int:
+        """Images of an epoch."""
+        return len(self.images)
+
+    def __getitem__(self, index: int) -> LabelledImage:
+        """Make the sample of an index."""
+        generator = sample_generator(index, self.seed)
+        given = self.images[shuffled_index(index, len(self), self.seed)]
+        scale = self._long_side_px / max(given.image.shape[-2:])
+        scale *= uniform(generator, *self.config.scale)
+        changed = cut_window(given, scale, self.config.crop_px, generator)
+        if uniform(generator, 0.0, 1.0) < self.config.flip_share:
+            changed = LabelledImage(*(part.flip(-1) for part in changed))
+        image = jitter_colors(changed.image, self.config.jitter, generator)
+        return LabelledImage(image, changed.labels)
+
+
+def cut_window(
+    given: LabelledImage, scale: float, size: tuple[int, int], generator: torch.Generator
+) -> LabelledImage:
+    """Scale an image and cut a window out of it; what lies beside a small image is background.
+
+    Half of the windows show the middle of an object: most of an image is background.
+    """
+    rows, columns = (max(1, round(side * scale)) for side in given.image.shape[-2:])
+    image = F.interpolate(given.image[None], (rows, columns), mode="bilinear", antialias=scale < 1)[
+        0
+    ].clamp(0, 1)
+    labels = F.interpolate(given.labels[None, None].float(), (rows, columns), mode="nearest-exact")
+    labels = labels[0, 0].long()
+    bottom, right = max(0, size[0] - rows), max(0, size[1] - columns)
+    image = F.pad(image[None], (0, right, 0, bottom), mode="replicate")[0]
+    labels = F.pad(labels, (0, right, 0, bottom))
+    top, left = _corner(labels, size, generator)
+    window = (slice(top, top + size[0]), slice(left, left + size[1]))
+    return LabelledImage(image[:, *window], labels[window])
+
+
+def jitter_colors(
+    image: Float[Tensor, "3 h w"], strength: float, generator: torch.Generator
+) -> Float[Tensor, "3 h w"]:
+    """Change brightness, contrast, saturation by 1 +- ``strength``, each color by a third of it."""
+    changes = 1 + strength * (2 * torch.rand(6, generator=generator) - 1)
+    brightness, contrast, saturation = changes[:3].tolist()
+    balance = 1 + (changes[3:, None, None] - 1) / 3
+    bright = image * brightness * balance
+    bright = (bright - bright.mean()) * contrast + bright.mean()
+    grey = grey_of(bright)
+    return (grey + (bright - grey) * saturation).clamp(0, 1)
+
+
+def _corner(
+    labels: Int[Tensor, "h w"], size: tuple[int, int], generator: torch.Generator
+) -> tuple[int, int]:
+    slack = [side - part for side, part in zip(labels.shape, size, strict=True)]
+    shown = labels.unique()[1:] if uniform(generator, 0.0, 1.0) < 0.5 else labels[:0, 0]
+    if not len(shown):
+        return whole(generator, slack[0] + 1), whole(generator, slack[1] + 1)
+    chosen = labels == shown[whole(generator, len(shown))]
+    middle = chosen.nonzero().float().mean(0).tolist()
+    corner = [
+        min(max(round(at - part / 2), 0), most)
+        for at, part, most in zip(middle, size, slack, strict=True)
+    ]
+    return corner[0], corner[1]
+
+
+def _known(config: ImagesConfig, images: dict[tuple[int, int], list[Instance]]) -> KnownObjects:
+    numbers = sorted({i.object_id for shown in images.values() for i in shown})
+    wanted = [n for n in numbers if not config.objects or n in config.objects]
+    if not wanted:
+        raise InputError(
+            f"{config.folder}: shows none of the objects {list(config.objects)}; it has {numbers}"
+        )
+    infos = read_models_info(models_folder(Path(config.folder)))
+    names = tuple(object_name(number, infos.get(number, {})) for number in wanted)
+    return KnownObjects(names=names, numbers=tuple(wanted))
+
+
+_TRIES = 20
+_SYMMETRY_STEP = 0.2
+"""Turns about a continuous axis are tried every 23 degrees: half of that is far below the error
+that this network is left with."""
+_MEASURED = (
+    "Synthetic views that no training saw, by occluded %, posed without ICP: the share with an "
+    "ADD, to the nearest symmetric pose, below a tenth of the diameter (add_10), and its median in "
+    "diameters."
+)
+"""What the numbers of validation are."""
+
+
+class CropSample(NamedTuple):
+    """A crop, or a batch of them, with truth."""
+
+    crop: DepthCrop
+    class_of: Int[Tensor, "*b"]
+    R: Float[Tensor, "*b 3 3"]
+    t_m: Float[Tensor, "*b 3"]
+
+
+class TrainingCrops:
+    """A crop of a view, synthetic or of a frame, by sample index.
+
+    Args:
+        models: the objects; class k is ``models[k]``.
+        config: which views, and how they are cut.
+        seed: of the order of frames.
+    """
+
+    def __init__(
+        self, models: Sequence[ObjectModel], config: DepthImageTraining, seed: int
+    ) -> None:
+        self.config, self.seed = config, seed
+        self.models = models
+        self.synthetic = Objects(models, config.objects, config.cloud)
+        self._class_of = {model.name: k for k, model in enumerate(models)}
+        frames = config.frames
+        self._real = None if frames is None else open_frames(frames, models, config.cloud)
+
+    def __len__(self) -> int:
+        """Samples of an epoch: each frame once, or as many as there are synthetic views."""
+        return epoch_samples(self.config.frames, self._real, len(self.synthetic))
+
+    def __getitem__(self, index: int) -> CropSample:
+        """Make the sample of an index; one with too few pixels is replaced by another.
+
+        Raises:
+            InputError: so many in a row have too few pixels that the config must be wrong.
+        """
+        for attempt in range(_TRIES):
+            # Far beyond any training, and the same object.
+            place = index + attempt * len(self.models) * 2**32
+            generator = sample_generator(place, self.seed)
+            frame = frame_place(self.config.frames, self._real, place, self.seed, generator)
+            if self._real is None or frame is None:
+                sample = self.synthetic.view(place)
+            else:
+                sample = self._real.view(self._real.instances[frame])
+            number = self._class_of[sample.input.object]
+            crop = cut_depth(sample.input, self.config.network, self.models[number].diameter_m)
+            if crop is not None:
+                pose = sample.truth.camera_from_model
+                return CropSample(crop, torch.tensor(number), pose.R.float(), pose.t_m.float())
+        raise InputError(
+            f"{_TRIES} views in a row have fewer than {self.config.network.min_points} masked "
+            "pixels with a depth; bring the camera nearer (distance_m), or lower min_points"
+        )
+
+
+class DepthImageTask:
+    """ADD of the regressed pose against the nearest symmetric copy of the truth."""
+
+    def __init__(
+        self, network: DepthImageNet, models: tuple[ObjectModel, ...], config: DepthImageTraining
+    ) -> None:
+        self.config, self.models = config, models
+        self.network = network.train()
+        self.modules: dict[str, nn.Module] = {"network": network}
+        self.optimizers = {"network": (make_adam(network.parameters(), config.adam), config.adam)}
+        self._points_m = surface_points(models, config.surface_points)
+        self._copies = symmetric_copies(models, _SYMMETRY_STEP).float()
+        self._diameter_m = torch.tensor([model.diameter_m for model in models])
+        self._views: dict[float, list[ViewSample]] = {}
+
+    def step(self, batch: CropSample) -> Iterator[Update]:
+        """One update: regress, move the model's points, compare; in diameters."""
+        which, device = batch.class_of, batch.R.device
+        outputs = self.network(batch.crop.image, which).float()
+        copies = Rigid(self._copies.R.to(device)[which], self._copies.t_m.to(device)[which])
+        points_m = self._points_m.to(device)[which]
+        truth = Rigid(batch.R, batch.t_m)
+        error_m = model_point_loss(poses_of(outputs, batch.crop), truth, points_m, copies)
+        yield Update("network", (error_m / self._diameter_m.to(device)[which]).mean(), {})
+
+    @torch.no_grad()
+    def validate(self) -> ValidationResult:
+        """Pose held-out views with the current network, without ICP."""
+        cpu = DepthImageNet(self.network.config)
+        cpu.load_state_dict(self.network.state_dict())
+        weights = PoseWeights(network=cpu, models=self.models, cloud=self.config.cloud,
+                              refusal=RefusalConfig(), facts={})  # fmt: skip
+        regressor = DepthImageRegressor(weights, EstimateConfig(with_icp=False))
+        numbers: dict[str, float] = {}
+        for occlusion in self.config.held_out.occlusions:
+            views = self._held_out(occlusion)
+            found = regressor.estimate_many([view.input for view in views])
+            errors = torch.tensor([
+                pose_error(estimate, view.truth, self.models[index % len(self.models)])
+                for index, (estimate, view) in enumerate(zip(found, views, strict=True))
+            ])  # fmt: skip
+            place = f"held_out/occluded_{round(100 * occlusion)}/regressed"
+            numbers[f"{place}_add_10"] = float(is_within_diameter(errors).float().mean())
+            numbers[f"{place}_median"] = float(errors.median())
+        return ValidationResult(numbers=numbers)
+
+    def _held_out(self, occlusion: float) -> list[ViewSample]:
+        if occlusion not in self._views:
+            c = self.config
+            synthetic = held_out_objects(self.models, c.objects, c.cloud, c.held_out, occlusion)
+            self._views[occlusion] = [synthetic.view(index) for index in range(len(synthetic))]
+        return self._views[occlusion]
+
+
+@releases_folder
+def train_depth_image(config: DepthImageTraining, run: Run) -> Path:
+    """Train the regression of depth images; give its weights file."""
+    torch.manual_seed(config.loop.seed)
+    models = read_models(config.models, run.on_message)
+    config = dataclasses.replace(config, network=with_classes(config.network, models, config.cloud))
+    network = DepthImageNet(config.network)
+    if config.start is not None:
+        found = read_pose_weights(find_weights(config.start)).network
+        if found.config != config.network:
+            raise InputError(
+                f"{config.start}: holds {found.config}, but the config says {config.network}. Give "
+                "the config the weights' own."
+            )
+        network.load_state_dict(found.state_dict())
+    claim_run(config, run, config.models.cad)
+    crops = TrainingCrops(models, config, config.loop.seed)
+    task = DepthImageTask(network, models, config)
+    seconds = run.train(task, crops, config.loop)
+    path = run.folder / "depth-image.safetensors"
+    if find_rank().rank:
+        return path
+    weights = packed(network, models, config)
+    write_pose_weights(path, weights, with_half=config.with_half)
+    measured = held_out_text(run.folder, _MEASURED)
+    write_card(path, train_words("depth-image", config), seconds, card_facts(weights), measured)
+    return path
+
+
+def surface_points(models: Sequence[ObjectModel], count: int) -> Float[Tensor, "classes n 3"]:
+    """Points of each object's surface; those of a sparse model of points come again."""
+    every = [sample_surface(model, count)[0] for model in models]
+    return torch.stack([points[torch.arange(count) % len(points)] for points in every])
+
+
+class SegmentationTask:
+    """Cross entropy of each pixel, objects weighing more."""
+
+    def __init__(self, network: FCN, config: SegmentationTraining, objects: KnownObjects) -> None:
+        self.config, self.objects = config, objects
+        self.network = network.train()
+        self.modules: dict[str, nn.Module] = {"network": network}
+        self.optimizers = {"network": (make_adam(network.parameters(), config.adam), config.adam)}
+        self._held_out = None
+        if config.held_out is not None:
+            self._held_out = AnnotatedImages(config.held_out, objects)
+
+    def step(self, batch: LabelledImage) -> Iterator[Update]:
+        """One update: label and compare."""
+        logits = self.network(normalise_colors(batch.image)).float()
+        loss = mask_loss(logits, batch.labels, self.config.object_weight)
+        overlap = Overlap(self.network.classes)
+        overlap.add(logits.argmax(1), batch.labels)
+        yield Update("network", loss, {"iou": overlap.iou()[1:].nanmean().nan_to_num(0.0)})
+
+    def validate(self) -> ValidationResult:
+        """Intersection over union on held-out images; the first with its labels as a picture."""
+        if self._held_out is None:
+            return ValidationResult()
+        self.network.eval()
+        overlap = Overlap(self.network.classes)
+        pictures = {}
+        for index in range(len(self._held_out)):
+            image, labels = self._held_out[index]
+            found = class_probabilities(self.network, image).argmax(0)
+            overlap.add(found, labels)
+            if index == 0:
+                pictures["found_truth"] = torch.cat(
+                    [_painted(image, part, self.network.classes) for part in (found, labels)], -1
+                )
+        self.network.train()
+        iou = overlap.iou()
+        numbers = {
+            f"held_out/iou_{name}": float(value)
+            for name, value in zip(("background", *self.objects.names), iou, strict=True)
+            if bool(value.isfinite())
+        }
+        numbers["held_out/iou_objects"] = float(iou[1:].nanmean())
+        return ValidationResult(numbers=numbers, pictures=pictures)
+
+
+@releases_folder
+def train_segmentation(config: SegmentationTraining, run: Run) -> Path:
+    """Train FCN; give its weights file."""
+    torch.manual_seed(config.loop.seed)
+    images = AnnotatedImages(config.images)
+    network = FCN(len(images.objects.names), config.network)
+    if config.start is not None:
+        path = find_weights(config.start)
+        held = Checkpoint(kind=KIND, config={}, state=read_encoder_state(path))
+        load_weights(network.encoder, held, str(path))
+    claim_run(config, run)
+    task = SegmentationTask(network, config, images.objects)
+    samples = TrainingImages(images, config.augment, config.network, config.loop.seed)
+    seconds = run.train(task, samples, config.loop)
+    path = run.folder / "segmentation.safetensors"
+    if find_rank().rank:
+        return path
+    licence = "not stated; that of the training data binds"
+    facts = {"trained_on": Path(config.images.folder).name, "licence": licence}
+    weights = SegmentationWeights(
+        network=network.cpu().eval(),
+        objects=images.objects.names,
+        numbers=images.objects.numbers,
+        facts=with_origin(facts, config),
+    )
+    write_segmentation(path, weights, with_half=config.with_half)
+    measured = held_out_text(run.folder, "Images that were held out: intersection over union.")
+    known = {"objects": ", ".join(weights.objects), **weights.facts}
+    write_card(path, "pose train --what segmentation", seconds, known, measured)
+    return path
+
+
+def _painted(image: torch.Tensor, labels: torch.Tensor, classes: int) -> torch.Tensor:
+    """Darken the background, and tint each object with a colour of its own."""
+    angle = 2 * torch.pi * torch.arange(classes) / max(classes - 1, 1)
+    phase = torch.tensor([0.0, 2.0, 4.0]) * torch.pi / 3
+    colors = 0.5 + 0.5 * (angle[:, None] + phase).cos()
+    tint = colors[labels].movedim(-1, 0)
+    return torch.where(labels > 0, 0.5 * image + 0.5 * tint, 0.3 * image)
