@@ -22,7 +22,7 @@ from pose_candidates import add_of
 from depthpose.core.checkpoint import find_weights
 from depthpose.pose.config import ObjectsConfig, SensorConfig
 from depthpose.pose.estimator import GeoPoseNet
-from depthpose.pose.estimator.alternatives import find_copies
+from depthpose.pose.estimator.candidates import find_copies
 from depthpose.pose.synthetic import Objects
 from depthpose.pose.weights import read_pose_weights
 from depthpose.report.page import markdown_table, write_table

@@ -24,7 +24,7 @@ from torch import Tensor
 from depthpose.core.rigid import Rigid
 from depthpose.pose.config import CloudConfig, EstimateConfig, RefusalConfig, VotingConfig
 from depthpose.pose.estimator import GeoPoseNet
-from depthpose.pose.estimator.prepare import Prepared
+from depthpose.pose.estimator.inputs import ObjectCloud
 from depthpose.pose.mesh import make_model
 from depthpose.pose.network import ResUNet, ResUNetConfig
 from depthpose.pose.types import CloudInput, ObjectModel
@@ -45,7 +45,9 @@ class NoisyTruth(GeoPoseNet):
 
     truth: Rigid
 
-    def _directions(self, clouds: list[Prepared], numbers: list[int]) -> tuple[list[Tensor], float]:
+    def _directions(
+        self, clouds: list[ObjectCloud], numbers: list[int]
+    ) -> tuple[list[Tensor], float]:
         _, seconds = super()._directions(clouds, numbers)
         return [
             self._true(cloud.points_m, n) for cloud, n in zip(clouds, numbers, strict=True)

@@ -28,8 +28,13 @@ from depthpose.depth.disparity import disparity_advice, disparity_from_depth
 from depthpose.depth.estimator import refuse_unrectified
 from depthpose.depth.types import StereoInput
 from depthpose.pose.config import CloudConfig, EstimateConfig
-from depthpose.pose.estimator.given import cloud_input, view_input
-from depthpose.pose.estimator.prepare import AnyInput, Refusal, prepare_cloud
+from depthpose.pose.estimator.inputs import (
+    AnyInput,
+    Refusal,
+    cloud_input,
+    prepare_cloud,
+    view_input,
+)
 from depthpose.pose.mesh import read_model
 from depthpose.pose.types import CloudInput, ViewInput
 

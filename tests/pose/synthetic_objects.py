@@ -11,7 +11,7 @@ from depthpose.core.render import rasterize
 from depthpose.core.rigid import Rigid
 from depthpose.pose.config import CloudConfig, MeshConfig, RefusalConfig
 from depthpose.pose.estimator import GeoPoseNet
-from depthpose.pose.estimator.prepare import Prepared
+from depthpose.pose.estimator.inputs import ObjectCloud
 from depthpose.pose.mesh import make_model
 from depthpose.pose.network import ResUNet, ResUNetConfig
 from depthpose.pose.synthetic import PARTS
@@ -127,7 +127,9 @@ class Oracle(GeoPoseNet):
         self.wrong = changes.get("wrong", 0.0)
         self.calls: list[int] = []
 
-    def _directions(self, clouds: list[Prepared], numbers: list[int]) -> tuple[list[Tensor], float]:
+    def _directions(
+        self, clouds: list[ObjectCloud], numbers: list[int]
+    ) -> tuple[list[Tensor], float]:
         self.calls.append(len(clouds))
         return [self._true(c.points_m, n) for c, n in zip(clouds, numbers, strict=True)], 0.01
 

@@ -20,7 +20,7 @@ from tests.pose.synthetic_objects import (
 
 from depthpose.core.rigid import Rigid, geodesic_rad
 from depthpose.pose.config import EstimateConfig
-from depthpose.pose.estimator.alternatives import difference_of, find_copies, share_out
+from depthpose.pose.estimator.candidates import difference_of, find_copies, share_out
 from depthpose.pose.mesh import (
     NearSymmetry,
     make_model,

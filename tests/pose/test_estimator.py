@@ -28,7 +28,7 @@ from depthpose.core.files import Cloud, write_cloud, write_depth_png, write_imag
 from depthpose.core.rigid import Rigid, geodesic_rad, rotation_by
 from depthpose.pose.config import CloudConfig, EstimateConfig, VotingConfig
 from depthpose.pose.estimator import GeoPoseNet
-from depthpose.pose.estimator.prepare import Prepared, prepare_cloud
+from depthpose.pose.estimator.inputs import ObjectCloud, prepare_cloud
 from depthpose.pose.mesh import (
     make_model,
     propose_symmetries,
@@ -202,7 +202,7 @@ def test_a_part_may_be_longer_than_its_distance() -> None:
     cloud = CloudInput(name="rail", points_m=back_project(depth_m, K)[mask], object=model.name)
     for given in (view, cloud):
         prepared = prepare_cloud(given, model, CloudConfig(), EstimateConfig())
-        assert isinstance(prepared, Prepared), prepared
+        assert isinstance(prepared, ObjectCloud), prepared
 
 
 def test_points_without_a_reading_take_no_others_place(part: ObjectModel) -> None:
@@ -213,7 +213,7 @@ def test_points_without_a_reading_take_no_others_place(part: ObjectModel) -> Non
     grid[:: 150_000 // len(points_m)][: len(points_m)] = points_m
     given = CloudInput(name="x", points_m=grid, object=part.name)
     prepared = prepare_cloud(given, part, CloudConfig(), EstimateConfig())
-    assert isinstance(prepared, Prepared)
+    assert isinstance(prepared, ObjectCloud)
     assert len(prepared.cloud_m) > 0.95 * len(points_m)
 
 

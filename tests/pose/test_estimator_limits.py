@@ -10,7 +10,7 @@ from torch.utils._python_dispatch import TorchDispatchMode
 
 from depthpose.core.rigid import Rigid
 from depthpose.pose.config import CloudConfig, EstimateConfig, VotingConfig
-from depthpose.pose.estimator.prepare import Prepared
+from depthpose.pose.estimator.inputs import ObjectCloud
 from depthpose.pose.types import PoseEstimate
 
 MILLIONS = 10_000_000
@@ -49,7 +49,9 @@ class _Noisy(Oracle):
 
     generator = torch.Generator().manual_seed(0)
 
-    def _directions(self, clouds: list[Prepared], numbers: list[int]) -> tuple[list[Tensor], float]:
+    def _directions(
+        self, clouds: list[ObjectCloud], numbers: list[int]
+    ) -> tuple[list[Tensor], float]:
         true, seconds = super()._directions(clouds, numbers)
         noise = [torch.randn(d.shape, generator=self.generator) for d in true]
         return [d + 0.03 * n for d, n in zip(true, noise, strict=True)], seconds

@@ -21,7 +21,7 @@ from depthpose.core.errors import InputError
 from depthpose.core.rigid import Rigid
 from depthpose.pose.config import RefusalConfig
 from depthpose.pose.estimator.find import nothing_found
-from depthpose.pose.estimator.prepare import AnyInput
+from depthpose.pose.estimator.inputs import AnyInput
 from depthpose.pose.metrics import add_m
 from depthpose.pose.regions import extent_m, find_regions, part_cloud, split_at_necks
 from depthpose.pose.types import CloudInput, ObjectModel, PoseEstimate, ViewInput

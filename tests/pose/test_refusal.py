@@ -24,7 +24,7 @@ from depthpose.core.rigid import Rigid
 from depthpose.pose.augment import grow_mask, shift_mask
 from depthpose.pose.config import EstimateConfig, IcpConfig, RefusalConfig
 from depthpose.pose.estimator.answer import misfit_of, with_status
-from depthpose.pose.estimator.evidence import observability, surface_signals
+from depthpose.pose.estimator.candidates import observability, surface_signals
 from depthpose.pose.estimator.fit import fit_of, seen_about
 from depthpose.pose.metrics import risk_coverage
 from depthpose.pose.surface import prepare_surface

@@ -11,7 +11,7 @@ from depthpose.core.rigid import Rigid
 from depthpose.pose.baselines import ransac_one_by_one
 from depthpose.pose.config import CloudConfig
 from depthpose.pose.estimator import GeoPoseNet
-from depthpose.pose.estimator.prepare import Prepared, prepare_cloud
+from depthpose.pose.estimator.inputs import ObjectCloud, prepare_cloud
 from depthpose.pose.evaluate import Conditions, ObjectRow, Origin
 from depthpose.pose.synthetic import Objects
 from depthpose.thesis.pose_tables import (
@@ -186,7 +186,7 @@ def test_votes_are_those_of_the_estimator() -> None:
     net = GeoPoseNet(weights)
     view = Objects([model]).view(1)
     prepared = prepare_cloud(view.input, model, weights.cloud, net.config)
-    assert isinstance(prepared, Prepared)
+    assert isinstance(prepared, ObjectCloud)
     case = next(cases_of(net, [view], 100_000))
     assert case is not None
     (outputs,), _ = net._directions([prepared], [0])

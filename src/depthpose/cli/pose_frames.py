@@ -39,7 +39,7 @@ from depthpose.core.rigid import Rigid
 from depthpose.core.run import find_rank
 from depthpose.pose.datasets import BopDataset, Instance, open_bop
 from depthpose.pose.estimator.find import explained_mask, nothing_found
-from depthpose.pose.estimator.prepare import AnyInput
+from depthpose.pose.estimator.inputs import AnyInput
 from depthpose.pose.predictions import (
     Job,
     Prediction,

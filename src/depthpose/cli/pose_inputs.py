@@ -21,8 +21,7 @@ from depthpose.core.rigid import Rigid
 from depthpose.core.run import refuse_among_inputs
 from depthpose.core.units import Unit
 from depthpose.pose.datasets import BopDataset, encode_rle, object_names, read_labels
-from depthpose.pose.estimator.given import AnyMask, cloud_input, rigid_input, view_input
-from depthpose.pose.estimator.prepare import AnyInput
+from depthpose.pose.estimator.inputs import AnyInput, AnyMask, cloud_input, rigid_input, view_input
 from depthpose.pose.predictions import Job, Place
 from depthpose.pose.types import PoseEstimate
 

@@ -36,7 +36,7 @@ from depthpose.pose.datasets import (
 )
 from depthpose.pose.datasets.layouts import integer, read_rows
 from depthpose.pose.estimator import DepthImageRegressor, GeoPoseNet, Registration
-from depthpose.pose.estimator.prepare import AnyInput
+from depthpose.pose.estimator.inputs import AnyInput
 from depthpose.pose.mesh import FIXED_UNITS, unit_of
 from depthpose.pose.predictions import (
     Job,

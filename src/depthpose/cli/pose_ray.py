@@ -23,8 +23,7 @@ from depthpose.core.files import cloud_suffixes, image_size, write_json
 from depthpose.core.files.images import LISTED_SUFFIXES
 from depthpose.core.units import Unit
 from depthpose.pose.datasets import BopDataset, open_bop
-from depthpose.pose.estimator.given import cloud_input, view_input
-from depthpose.pose.estimator.prepare import AnyInput
+from depthpose.pose.estimator.inputs import AnyInput, cloud_input, view_input
 from depthpose.pose.predictions import (
     Job,
     Prediction,

@@ -45,7 +45,7 @@ hold what they promise for four kinds of sensor (``bench/covariance.py``)."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Refined:
+class RefinedPose:
     """A refined pose, with leading batch axes of the poses that it began from.
 
     Attributes:
@@ -65,20 +65,17 @@ class Refined:
     inlier_share: Float[Tensor, "*batch"]
 
 
-class Best(NamedTuple):
+class BestStart(NamedTuple):
     """The best of several refined poses.
 
     Attributes:
         refined: it.
         start: number of the given pose that it began from.
-        scatter: share of all starts that ended at another pose: where many do, the cloud says
-            little about which is right.
         others: the best poses beside it, three at most, roughly refined.
     """
 
-    refined: Refined
+    refined: RefinedPose
     start: int
-    scatter: float
     others: Rigid
 
 
@@ -87,7 +84,7 @@ def refine_pose(
     initial: Rigid,
     surface: Surface,
     config: IcpConfig | None = None,
-) -> Refined:
+) -> RefinedPose:
     """Move poses so that the cloud lies on the surface; all of a batch at once.
 
     Every point of a partial cloud has a place on the whole model, so points seek the surface and
@@ -125,7 +122,7 @@ def refine_best(
     initial: Rigid,
     surface: Surface,
     config: IcpConfig | None = None,
-) -> Best:
+) -> BestStart:
     """Refine poses, and beside each ones turned from it; give what explains the cloud best.
 
     All begin with some of the points and a table of what lies near
@@ -163,10 +160,9 @@ def refine_best(
         short = replace(short, start_distance_diameters=config.end_distance_diameters)
         refined = refine_pose(points_m, tried[best], surface, short)
     found = refined.camera_from_model.double()
-    scatter = float((_distances(tried, found, surface) > _OTHER).double().mean())
     worth = worth.masked_fill(~_is_other(tried, found, surface), -torch.inf)
     others = _distinct(tried, worth, surface)
-    return Best(refined, best % len(given.R), scatter, others)
+    return BestStart(refined, best % len(given.R), others)
 
 
 def refine_roughly(
@@ -209,8 +205,10 @@ def _iterated(
     if serves(cloud, pose.R, pose.t_m):
         from depthpose.pose.compiled.icp import refined
 
-        settings = (limits_m, _CONVERGED, surface.diameter_m)
-        return refined(cloud, pose, surface.target, settings, is_exact=is_exact)
+        scale_m = surface.diameter_m
+        return refined(
+            cloud, pose, surface.target, limits_m, _CONVERGED, scale_m, is_exact=is_exact
+        )
     scale = torch.tensor([1.0] * 3 + [surface.diameter_m] * 3, dtype=torch.float64)
     moves = torch.ones_like(pose.t_m[..., :1])
     index, steps = torch.full((*pose.t_m.shape[:-1], len(cloud)), -1), len(limits_m) - 1
@@ -257,16 +255,6 @@ def _worth(
     worth = near - _spread_m(residual_m, weight) / surface.diameter_m - front - _UNSEEN * unseen
     worth[0] += _TRUST
     return worth
-
-
-def _distances(poses: Rigid, best: Rigid, surface: Surface) -> Float64[Tensor, " b"]:
-    """Mean distance to the best in diameters, of symmetric objects to its nearest points."""
-    # The risk was calibrated on it. It can be small at another pose: _is_other tells.
-    own_m = surface.points_m[:: max(1, len(surface.points_m) // 100)]
-    moved_m = (best.inverse() @ poses).apply(own_m)
-    if len(surface.copies.R) > 1:
-        own_m = surface.points_m[surface.boxes.look_up(moved_m)]
-    return (moved_m - own_m).norm(dim=-1).mean(-1) / surface.diameter_m
 
 
 def _is_other(poses: Rigid, best: Rigid, surface: Surface) -> Bool[Tensor, " b"]:
@@ -344,7 +332,7 @@ def _moved(pose: Rigid, motion: Float[Tensor, "*batch 6"], middle: Tensor) -> Ri
 
 def _result(
     points_m: Tensor, cloud: Tensor, pose: Rigid, equations: tuple[Tensor, ...], diameter_m: float
-) -> Refined:
+) -> RefinedPose:
     H, _, residual_m, weight, J = equations
     variance = (weight * residual_m.square()).sum(-1) / (weight.sum(-1) - 6).clamp(min=1)
     variance = variance * _inflation(cloud, H, (weight * residual_m)[..., None] * J, diameter_m)
@@ -354,7 +342,7 @@ def _result(
         [torch.cat([eye, zero], 1), torch.cat([cross_matrix(_middle(cloud)), eye], 1)]
     )
     covariance = shift @ (variance[..., None, None] * torch.linalg.inv(H)) @ shift.mT
-    return Refined(
+    return RefinedPose(
         camera_from_model=Rigid(pose.R.to(points_m), pose.t_m.to(points_m)),
         covariance=covariance.to(points_m),
         residual_m=_spread_m(residual_m, weight).to(points_m),

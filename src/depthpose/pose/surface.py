@@ -188,8 +188,9 @@ def look_along_rays(
     if serves(cloud_m, poses.R, poses.t_m):
         from depthpose.pose.compiled.points import compare_rays
 
-        rays = (scale, *middle.tolist(), _REACH)
-        return compare_rays(cloud_m, poses, surface.points_m[::every], rays, limit_m)
+        column, row = middle.tolist()
+        points_m = surface.points_m[::every]
+        return compare_rays(cloud_m, poses, points_m, scale, column, row, _REACH, limit_m)
     posed_m = poses.apply(surface.points_m[::every])
     depth_m = posed_m[..., 2]
     posed = posed_m[..., :2] / depth_m.clamp(min=1e-6)[..., None] * scale

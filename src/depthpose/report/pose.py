@@ -16,7 +16,7 @@ from depthpose.core.render import rasterize
 from depthpose.core.rigid import Rigid
 from depthpose.pose.cloud import object_points
 from depthpose.pose.datasets import Instance
-from depthpose.pose.estimator.prepare import AnyInput
+from depthpose.pose.estimator.inputs import AnyInput
 from depthpose.pose.mesh import sample_surface
 from depthpose.pose.synthetic import drawn_triangles
 from depthpose.pose.types import Identity, ObjectModel, PoseEstimate, ViewInput

@@ -14,7 +14,7 @@ from depthpose.core.run import refuse_to_replace
 
 if TYPE_CHECKING:  # a command of depth must not load what poses need, nor the other way round
     from depthpose.depth.types import DepthEstimate, StereoInput
-    from depthpose.pose.estimator.prepare import AnyInput
+    from depthpose.pose.estimator.inputs import AnyInput
     from depthpose.pose.types import ObjectModel, PoseEstimate
 
 LIVE = "live"

@@ -14,7 +14,7 @@ from depthpose.core.arrays import take_evenly
 from depthpose.core.draw import draw_lines
 from depthpose.core.errors import InputError
 from depthpose.pose.estimator import GeoPoseNet
-from depthpose.pose.estimator.prepare import AnyInput, Refusal, prepare_cloud
+from depthpose.pose.estimator.inputs import AnyInput, Refusal, prepare_cloud
 from depthpose.pose.mesh import sample_surface
 from depthpose.pose.network import ResUNet
 from depthpose.pose.sparse import Voxels

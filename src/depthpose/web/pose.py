@@ -24,7 +24,7 @@ from depthpose.pose.datasets.write import write_mask
 from depthpose.pose.estimator import GeoPoseNet, Registration
 from depthpose.pose.estimator.answer import with_status
 from depthpose.pose.estimator.find import explained_mask, nothing_found
-from depthpose.pose.estimator.given import cloud_input, view_input
+from depthpose.pose.estimator.inputs import cloud_input, view_input
 from depthpose.pose.mesh import (
     FIXED_UNITS,
     gap_to_surface_m,
@@ -99,7 +99,7 @@ def answer_pose(form: Form, net: GeoPoseNet) -> Answer:
         estimate = with_status(estimate, EstimateConfig(min_certainty=least).min_certainty)
     scene = pose_scene(seen, points_m, estimate, target.model)
     if estimate.keypoints_m is not None and voted is not None:
-        votes = vote_layer(voted.cloud.points_m, voted.outputs[..., :3], estimate.keypoints_m)
+        votes = vote_layer(voted.cloud.points_m, voted.directions[..., :3], estimate.keypoints_m)
         scene = replace(scene, layers=[*scene.layers, votes])
     folder = form.results()
     agreeing = "votes that agree" if isinstance(target.net, GeoPoseNet) else "points near the model"

@@ -14,7 +14,9 @@ def refined(
     cloud: Tensor,
     pose: Rigid,
     target: Target,
-    steps: tuple[list[float], float, float],
+    limits: list[float],
+    converged: float,
+    scale: float,
     *,
     is_exact: bool,
 ) -> tuple[Rigid, Tensor]:
@@ -24,14 +26,14 @@ def refined(
         cloud: (n, 3), float64, in the camera frame.
         pose: ``camera_from_model``, float64.
         target: the surface.
-        steps: limits of the steps and of what is found after them, turn and shift below which one
-            is the last, and the length by which a shift is measured.
+        limits: of the steps, and of what is found after them.
+        converged: turn and shift of a step below which it is the last.
+        scale: the length by which a shift is measured.
         is_exact: whether the nearest surface point is searched, or looked up.
 
     Raises:
         ValueError: a value is not finite.
     """
-    limits, converged, scale = steps
     assert pose.R.shape[:-2] == pose.t_m.shape[:-1], "a translation for each rotation"
     R, t_m = (torch.from_numpy(finite_array(a).copy()) for a in (pose.R, pose.t_m))
     given = (finite_array(cloud), R.view(-1, 3, 3).numpy(), t_m.view(-1, 3).numpy())

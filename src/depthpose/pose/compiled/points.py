@@ -356,7 +356,14 @@ def _lay_planes(every, some, count, normals, bend):
 
 
 def compare_rays(
-    cloud: Tensor, poses: Rigid, points: Tensor, rays: tuple[float, float, float, int], limit: float
+    cloud: Tensor,
+    poses: Rigid,
+    points: Tensor,
+    scale: float,
+    column: float,
+    row: float,
+    reach: int,
+    limit: float,
 ) -> tuple[Tensor, Tensor]:
     """Compare a cloud with each pose of a surface.
 
@@ -364,7 +371,10 @@ def compare_rays(
         cloud: (n, 3), before the camera, float64.
         poses: a batch, ``camera_from_model``, float64.
         points: (m, 3), of the surface.
-        rays: cells for a unit of slope, column and row of the middle cell, cells to each side.
+        scale: cells for a unit of slope.
+        column: of the middle cell.
+        row: of the middle cell.
+        reach: cells to each side of it.
         limit: how far before a point the surface occludes it.
 
     Returns:
@@ -378,7 +388,7 @@ def compare_rays(
     front = torch.empty(len(poses.R), dtype=torch.float64)
     unseen = torch.empty_like(front)
     given = (finite_array(a) for a in (cloud, poses.R, poses.t_m, points))
-    _look(*given, *rays, limit, front.numpy(), unseen.numpy())
+    _look(*given, scale, column, row, reach, limit, front.numpy(), unseen.numpy())
     return front, unseen
 
 

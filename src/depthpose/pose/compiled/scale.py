@@ -10,7 +10,9 @@ from depthpose.pose.compiled.target import Target, find_places
 
 
 def grown(
-    start: tuple[Tensor, Tensor, Tensor],
+    local: Tensor,
+    times: Tensor,
+    middle: Tensor,
     target: Target,
     limits: list[float],
     converged: float,
@@ -19,7 +21,9 @@ def grown(
     """Find the scale of a surface that fits points, from each of several scales.
 
     Args:
-        start: points (b, n, 3) in the model frame, scales (b,), the surface's middle (3,); float64.
+        local: points (b, n, 3) in the model frame, float64.
+        times: scales to begin from, (b,).
+        middle: of the surface, (3,).
         target: the surface.
         limits: of the steps.
         converged: turn and growth of a step below which it is the last.
@@ -31,7 +35,6 @@ def grown(
     Raises:
         ValueError: a point is not finite.
     """
-    local, times, middle = start
     local, times = torch.from_numpy(finite_array(local).copy()), times.clone()
     variance = torch.ones_like(times)
     arrays = (local.numpy(), times.numpy(), middle.numpy(), np.array(limits))

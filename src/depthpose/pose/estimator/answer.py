@@ -4,26 +4,26 @@ import math
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from typing import NamedTuple
 
 from jaxtyping import Float
 from torch import Tensor
 
 from depthpose.core.rigid import Rigid
 from depthpose.pose.config import EstimateConfig, RefusalConfig
-from depthpose.pose.estimator.alternatives import (
+from depthpose.pose.estimator.candidates import (
     Candidate,
     PoseAmbiguities,
     alternatives_among,
+    observability,
     share_out,
+    without_motions,
 )
-from depthpose.pose.estimator.evidence import observability, without_motions
 from depthpose.pose.estimator.fit import fit_of, seen_about
 from depthpose.pose.estimator.identity import identity_of
-from depthpose.pose.estimator.prepare import Prepared, Refusal
-from depthpose.pose.refine import Refined
+from depthpose.pose.estimator.inputs import ObjectCloud, Refusal
+from depthpose.pose.refine import RefinedPose
 from depthpose.pose.surface import Surface
-from depthpose.pose.types import Alternative, Fit, ObjectModel, PoseEstimate, PoseFit, Vote
+from depthpose.pose.types import Fit, ObjectModel, PoseEstimate, PoseFit, Vote
 from depthpose.pose.voting import free_motions
 
 
@@ -41,88 +41,58 @@ class Clock:
         self.last = now
 
 
-class Posed(NamedTuple):
-    """A cloud and the pose that was found for it; ``free``: the motions that symmetries allow."""
-
-    cloud: Prepared
-    pose: Rigid
-    model: ObjectModel
-    surface: Surface
-    free: Float[Tensor, "m 6"]
-
-
-class Found(NamedTuple):
-    """A pose, its covariance and residual, the evidence against it, and which others fit."""
-
-    pose: Rigid
-    covariance: Float[Tensor, "6 6"]
-    residual_m: float
-    signals: dict[str, float]
-    share: float
-    alternatives: tuple[Alternative, ...]
-
-
-def candidate_of(source: PoseFit | Refined) -> Candidate:
+def candidate_of(source: PoseFit | RefinedPose) -> Candidate:
     """Take a fitted or a refined pose as one that may be right."""
     return Candidate(source.camera_from_model.double(), source.covariance, float(source.residual_m))
 
 
-def choose(
+def answer_of(
+    cloud: ObjectCloud,
+    model: ObjectModel,
+    surface: Surface,
+    copies: PoseAmbiguities,
     candidates: Sequence[Candidate],
     evidence: Sequence[dict[str, float]],
-    copies: PoseAmbiguities,
-    refusal: RefusalConfig,
-) -> Found:
-    """Choose among the poses that fit by the evidence against each."""
-    shares = share_out(evidence, refusal.candidate_slopes)
-    number = int(shares.argsort(descending=True, stable=True)[0])
-    alternatives = alternatives_among(candidates, evidence, shares, copies)
-    return Found(*candidates[number], evidence[number], float(shares[number]), alternatives)
-
-
-def answer_of(model: ObjectModel, found: Found, vote: Vote | None = None) -> PoseEstimate:
-    """Make an answer of what was found; checked it is not yet."""
-    free = free_motions(model.symmetries.continuous, found.pose)
-    # Worked out in float64, given as points and models come: in float32.
-    return PoseEstimate(
-        name="",
-        object=model.name,
-        status="ok",
-        camera_from_model=found.pose.float(),
-        keypoints_m=None if vote is None else vote.keypoints_m.float(),
-        covariance=without_motions(found.covariance, free).float(),
-        free_motions=free.float(),
-        inlier_share=None if vote is None else float(vote.inlier_share.mean()),
-        residual_m=found.residual_m,
-        signals=found.signals,
-    )
-
-
-def judged(
-    posed: Posed,
-    found: Found,
-    answer: PoseEstimate,
     refusal: RefusalConfig,
     config: EstimateConfig,
     clock: Clock,
+    vote: Vote | None = None,
 ) -> PoseEstimate:
-    """Ask whether the pose fits, whether it is that object, and whether others are as likely."""
-    seen = seen_about(posed.cloud.cloud_m, posed.cloud.view, posed.surface.diameter_m)
-    fit = fit_of(seen, posed.pose, posed.surface)
-    reason, identity = misfit_of(fit, refusal) or _not_observable(posed, refusal), None
+    """Choose among poses by the evidence against each; ask whether it fits and is that object."""
+    seen = seen_about(cloud.cloud_m, cloud.view, surface.diameter_m)
+    shares = share_out(evidence, refusal.candidate_slopes)
+    number = int(shares.argsort(descending=True, stable=True)[0])
+    fit = fit_of(seen, candidates[number].pose, surface)
+    pose, covariance, residual_m = candidates[number]
+    free = free_motions(model.symmetries.continuous, pose)
+    reason, identity = misfit_of(fit, refusal), None
+    reason = reason or _not_observable(cloud.cloud_m, pose, surface, free, refusal)
     if reason is None and config.with_icp and refusal.max_size_error < 1:
-        identity = identity_of(
-            posed.cloud, posed.pose, posed.model, posed.surface, fit, seen, refusal.max_size_error
-        )
+        identity = identity_of(cloud, pose, model, surface, fit, seen, refusal.max_size_error)
         if identity.status == "contradicted":
             reason = Refusal(status="doubtful", reason=identity.reason)
     clock.note("check")
-    answer = replace(answer, fit=fit, identity=identity)
+    # Worked out in float64, given as points and models come: in float32.
+    answer = PoseEstimate(
+        name="",
+        object=model.name,
+        status="ok",
+        camera_from_model=pose.float(),
+        keypoints_m=None if vote is None else vote.keypoints_m.float(),
+        covariance=without_motions(covariance, free).float(),
+        free_motions=free.float(),
+        inlier_share=None if vote is None else float(vote.inlier_share.mean()),
+        residual_m=residual_m,
+        signals=evidence[number],
+        fit=fit,
+        identity=identity,
+        certainty=float(shares[number]),
+        alternatives=alternatives_among(candidates, evidence, shares, copies),
+        seconds=clock.seconds,
+    )
     if reason is not None:
         return withheld(answer.object, reason, clock, answer)
-    sure = replace(answer, certainty=found.share, alternatives=found.alternatives,
-                   seconds=clock.seconds)  # fmt: skip
-    return with_status(sure, config.min_certainty)
+    return with_status(answer, config.min_certainty)
 
 
 def with_status(answer: PoseEstimate, min_certainty: float) -> PoseEstimate:
@@ -161,8 +131,14 @@ def misfit_of(fit: Fit, limits: RefusalConfig) -> Refusal | None:
     return Refusal(status="doubtful", reason=reason)
 
 
-def _not_observable(posed: Posed, config: RefusalConfig) -> Refusal | None:
-    observable, motion = observability(posed.cloud.cloud_m, posed.pose, posed.surface, posed.free)
+def _not_observable(
+    cloud_m: Float[Tensor, "n 3"],
+    pose: Rigid,
+    surface: Surface,
+    free: Float[Tensor, "m 6"],
+    config: RefusalConfig,
+) -> Refusal | None:
+    observable, motion = observability(cloud_m, pose, surface, free)
     if observable >= config.min_hold:
         return None
     what = "turn" if float(motion[:3].norm()) > math.sqrt(0.5) else "shift"

@@ -12,19 +12,20 @@ from depthpose.core.errors import InputError, nearest_name
 from depthpose.core.rigid import Rigid
 from depthpose.core.units import Unit
 from depthpose.pose.config import EstimateConfig, RefusalConfig
-from depthpose.pose.estimator.alternatives import PoseAmbiguities, find_copies
 from depthpose.pose.estimator.answer import with_status
+from depthpose.pose.estimator.candidates import PoseAmbiguities, find_copies
 from depthpose.pose.estimator.find import SearchTargets, find_objects, nothing_found, which_object
-from depthpose.pose.estimator.given import (
+from depthpose.pose.estimator.inputs import (
     AnyArray,
+    AnyInput,
     AnyMask,
+    Refusal,
     cloud_input,
     labels_input,
     rigid_input,
     split_instances,
     view_input,
 )
-from depthpose.pose.estimator.prepare import AnyInput, Refusal
 from depthpose.pose.estimator.track import TrackedObject, track
 from depthpose.pose.surface import Surface, prepare_surface
 from depthpose.pose.types import CloudInput, ObjectModel, PoseEstimate, ViewInput

@@ -12,8 +12,8 @@ from torch import Tensor
 from depthpose.core.camera import back_project, project
 from depthpose.core.rigid import Rigid
 from depthpose.pose.config import RefusalConfig
-from depthpose.pose.estimator.alternatives import share_out
-from depthpose.pose.estimator.prepare import nothing_seen
+from depthpose.pose.estimator.candidates import share_out
+from depthpose.pose.estimator.inputs import nothing_seen
 from depthpose.pose.regions import extent_m, find_regions, part_cloud
 from depthpose.pose.surface import NEAR, Surface, prepare_surface
 from depthpose.pose.types import CloudInput, ObjectModel, PoseEstimate, ViewInput

@@ -1,6 +1,7 @@
-"""GeoPoseNet: clouds and depth images of known objects to poses.
+"""GeoPoseNet: clouds and depth images of known objects to poses, by a network's directions.
 
-Several clouds go through the network at once.
+Several clouds go through the network at once; the directions of each vote for keypoints, to which
+the pose is fitted, refined by ICP, and checked.
 """
 
 import time
@@ -15,21 +16,169 @@ from torch import Tensor
 from depthpose.core.checkpoint import find_weights, warn_of_terms
 from depthpose.core.devices import own_arithmetic, usable_device
 from depthpose.core.errors import InputError
+from depthpose.core.rigid import Rigid
 from depthpose.pose.baselines import DepthImageNet
-from depthpose.pose.config import EstimateConfig, RefusalConfig
+from depthpose.pose.config import EstimateConfig, RefusalConfig, VotingConfig
+from depthpose.pose.estimator.answer import (
+    Clock,
+    answer_of,
+    candidate_of,
+    misfit_of,
+    withheld,
+)
 from depthpose.pose.estimator.base import PoseEstimator, refused
-from depthpose.pose.estimator.pose import Voted, pose_from_directions
-from depthpose.pose.estimator.prepare import AnyInput, Prepared, Refusal, prepare_cloud
+from depthpose.pose.estimator.candidates import (
+    Candidate,
+    PoseAmbiguities,
+    evidence_of,
+    find_candidates,
+)
+from depthpose.pose.estimator.fit import fit_of, seen_about
+from depthpose.pose.estimator.inputs import AnyInput, ObjectCloud, Refusal, prepare_cloud
+from depthpose.pose.estimator.inputs import CloudDirections as CloudDirections
 from depthpose.pose.estimator.register import Registration
-from depthpose.pose.types import ObjectModel, PoseEstimate, SeenPoints, Status
+from depthpose.pose.refine import refine_best
+from depthpose.pose.surface import Surface
+from depthpose.pose.types import ObjectModel, PoseEstimate, PoseFit, SeenPoints, Status, Vote
+from depthpose.pose.voting import consistent_keypoints, fit_pose, meet_lines, vote_ransac
 from depthpose.pose.weights import DirectionNet, PoseWeights, read_pose_weights
 
+_LEAST = 4
+"""Keypoints that must agree: three fix a pose with nothing left to contradict it."""
 _DOUBTED: tuple[Status, ...] = ("votes do not meet", "keypoints do not fit", "doubtful")
 """What the network could not answer, and another method may; the rest is due to the input."""
 
 
+def pose_from_directions(
+    voted: CloudDirections,
+    model: ObjectModel,
+    surface: Surface,
+    copies: PoseAmbiguities,
+    refusal: RefusalConfig,
+    config: EstimateConfig,
+    *,
+    is_likely: bool = True,
+) -> PoseEstimate:
+    """Vote for the keypoints, fit the pose, refine and check it.
+
+    Args:
+        voted: the cloud and the network's directions (a fourth component is the logit of how far
+            to trust each).
+        model: the object.
+        surface: of it.
+        copies: what it may be confused with.
+        refusal: when the answer is withheld.
+        config: voting and ICP.
+        is_likely: whether the cloud is likely to show the object; else the other poses that fit are
+            not compared where the best does not fit by itself.
+    """
+    clock = Clock()
+    vote = cast_votes(voted, config.voting)
+    clock.note("voting")
+    fits = _fits(vote, model, config)
+    if isinstance(fits, Refusal):
+        return withheld(model.name, fits, clock)
+    clock.note("svd")
+    candidates = _refine(voted, fits, surface, copies, refusal, config, is_likely)
+    if isinstance(candidates, Refusal):
+        clock.note("icp")
+        return withheld(model.name, candidates, clock)
+    poses = Rigid.stack([one.pose for one in candidates])
+    evidence = evidence_of(voted, poses, model, copies, surface)
+    if config.with_icp:
+        clock.note("icp")
+    return answer_of(
+        voted.cloud, model, surface, copies, candidates, evidence, refusal, config, clock, vote
+    )
+
+
+def cast_votes(voted: CloudDirections, config: VotingConfig) -> Vote:
+    """Let the directions vote, by RANSAC or least squares, in float64."""
+    points = voted.cloud.points_m.double()
+    directions = voted.directions[..., :3].double()
+    weight = (
+        voted.directions[..., 3].double().sigmoid() if voted.directions.shape[-1] == 4 else None
+    )
+    if config.method == "ransac":
+        return vote_ransac(points, directions, weight, config)
+    return meet_lines(points, directions, weight, config.refinements)
+
+
+def _fits(vote: Vote, model: ObjectModel, config: EstimateConfig) -> PoseFit | Refusal:
+    """Fit the keypoints that agree; where ICP refines the fits, also all of them."""
+    found = (vote.condition <= config.voting.max_condition) & (vote.inlier_share > 0)
+    total = len(found)
+    if int(found.sum()) < _LEAST:
+        return Refusal(
+            status="votes do not meet",
+            reason=f"the directions meet at {int(found.sum())} of {total} keypoints, but {_LEAST} "
+            "are needed: too few points, or not the object that the mask promises",
+        )
+    strict, rough = config.voting.rigidity_diameters, config.rough_rigidity_diameters
+    limit_m = model.diameter_m * (rough if config.with_icp else strict)
+    used = consistent_keypoints(vote.keypoints_m, model.keypoints_m, limit_m, found)
+    choices = [used] if int(used.sum()) >= _LEAST else []
+    if config.with_icp and not torch.equal(used, found):
+        choices.append(found)
+    if not choices:
+        return Refusal(
+            status="keypoints do not fit",
+            reason=f"{int(used.sum())} of {total} keypoints have the model's distances within "
+            f"{limit_m:.2g} m, but {_LEAST} are needed: another object, or too much of it occluded",
+        )
+    count = len(choices)
+    return fit_pose(
+        vote.keypoints_m.expand(count, -1, -1),
+        vote.covariance_m2.expand(count, -1, -1, -1),
+        model.keypoints_m,
+        torch.stack(choices),
+    )
+
+
+def _refine(
+    voted: CloudDirections,
+    fits: PoseFit,
+    surface: Surface,
+    copies: PoseAmbiguities,
+    refusal: RefusalConfig,
+    config: EstimateConfig,
+    is_likely: bool,
+) -> list[Candidate] | Refusal:
+    cloud_m = voted.cloud.cloud_m
+    fit, refined = _row(fits, 0), None
+    others = _none_of(fit.camera_from_model)
+    if config.with_icp:
+        best = refine_best(cloud_m.double(), fits.camera_from_model, surface, config.icp)
+        if float(best.refined.inlier_share) > 0:
+            fit, refined = _row(fits, best.start), best.refined
+            others = best.others
+    first = candidate_of(fit if refined is None else refined)
+    icp = None if refined is None else config.icp
+    if not is_likely:
+        seen = seen_about(cloud_m, voted.cloud.view, surface.diameter_m)
+        refused = misfit_of(fit_of(seen, first.pose, surface), refusal)
+        if refused is not None:
+            return refused
+    return find_candidates(cloud_m, first, others, copies, surface, icp)
+
+
+def _none_of(pose: Rigid) -> Rigid:
+    return Rigid(pose.R.double().new_zeros(0, 3, 3), pose.t_m.double().new_zeros(0, 3))
+
+
+def _row(fits: PoseFit, number: int) -> PoseFit:
+    pose = fits.camera_from_model
+    return PoseFit(
+        camera_from_model=pose[number],
+        covariance=fits.covariance[number],
+        residual_m=fits.residual_m[number],
+        misfit=fits.misfit[number],
+        is_used=fits.is_used[number],
+    )
+
+
 def network_directions(
-    network: DirectionNet, clouds: list[Prepared], numbers: list[int], device: str
+    network: DirectionNet, clouds: list[ObjectCloud], numbers: list[int], device: str
 ) -> list[Float[Tensor, "n k c"]]:
     """Ask the network for the directions to the keypoints, in the camera frame, cloud by cloud.
 
@@ -58,10 +207,10 @@ def network_directions(
 
 
 def batches(
-    ready: list[tuple[int, Prepared, float]], most: int
-) -> Iterator[list[tuple[int, Prepared, float]]]:
+    ready: list[tuple[int, ObjectCloud, float]], most: int
+) -> Iterator[list[tuple[int, ObjectCloud, float]]]:
     """Group clouds so that each group has ``most`` voxels at most, or is one cloud."""
-    group: list[tuple[int, Prepared, float]] = []
+    group: list[tuple[int, ObjectCloud, float]] = []
     total = 0
     for item in ready:
         count = len(item[1].points_m)
@@ -199,7 +348,7 @@ class GeoPoseNet(PoseEstimator):
 
     @torch.no_grad()
     @own_arithmetic()
-    def estimate_with_votes(self, given: AnyInput) -> tuple[PoseEstimate, Voted | None]:
+    def estimate_with_votes(self, given: AnyInput) -> tuple[PoseEstimate, CloudDirections | None]:
         """Estimate one pose, and give what the network said of each keypoint at each point.
 
         What the network doubts is not registered here.
@@ -216,9 +365,9 @@ class GeoPoseNet(PoseEstimator):
 
     def _each(
         self, inputs: Sequence[AnyInput], *, is_likely: bool = True
-    ) -> Iterator[tuple[int, PoseEstimate, Voted | None]]:
+    ) -> Iterator[tuple[int, PoseEstimate, CloudDirections | None]]:
         """Give each input's number, estimate and votes: first what is refused, then by batches."""
-        ready: list[tuple[int, Prepared, float]] = []
+        ready: list[tuple[int, ObjectCloud, float]] = []
         for k, given in enumerate(inputs):
             start = time.perf_counter()
             model = self.weights.models[self._number(given.object)]
@@ -237,20 +386,27 @@ class GeoPoseNet(PoseEstimator):
             ):
                 share_s = network_s * len(outputs) / total
                 seconds = {"cloud": spent_s, "network": share_s}
-                voted = Voted(prepared, outputs)
+                voted = CloudDirections(prepared, outputs)
                 found = self._pose(inputs[k], number, voted, is_likely)
                 yield k, replace(found, seconds={**seconds, **found.seconds}), voted
 
     def _directions(
-        self, clouds: list[Prepared], numbers: list[int]
+        self, clouds: list[ObjectCloud], numbers: list[int]
     ) -> tuple[list[Float[Tensor, "n k c"]], float]:
         start = time.perf_counter()
         found = network_directions(self._network, clouds, numbers, self.config.device)
         return found, time.perf_counter() - start
 
-    def _pose(self, given: AnyInput, number: int, voted: Voted, is_likely: bool) -> PoseEstimate:
-        known = (self.weights.models[number], self._surface(number), self._copies_of(number))
+    def _pose(
+        self, given: AnyInput, number: int, voted: CloudDirections, is_likely: bool
+    ) -> PoseEstimate:
         found = pose_from_directions(
-            voted, known, self.weights.refusal, self.config, is_likely=is_likely
+            voted,
+            self.weights.models[number],
+            self._surface(number),
+            self._copies_of(number),
+            self.weights.refusal,
+            self.config,
+            is_likely=is_likely,
         )
         return replace(found, name=given.name)

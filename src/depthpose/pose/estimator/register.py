@@ -16,24 +16,22 @@ from depthpose.core.rigid import Rigid
 from depthpose.core.units import Unit
 from depthpose.pose.cloud import local_planes
 from depthpose.pose.config import CloudConfig, EstimateConfig, RefusalConfig
-from depthpose.pose.estimator.alternatives import PoseAmbiguities, find_candidates
 from depthpose.pose.estimator.answer import (
     Clock,
-    Posed,
     answer_of,
     candidate_of,
-    choose,
-    judged,
     withheld,
 )
 from depthpose.pose.estimator.base import PoseEstimator, refused
-from depthpose.pose.estimator.evidence import (
+from depthpose.pose.estimator.candidates import (
     CloudNormals,
+    PoseAmbiguities,
     cloud_normals,
+    find_candidates,
     surface_signals,
     tilt_of,
 )
-from depthpose.pose.estimator.prepare import AnyInput, Prepared, Refusal, prepare_cloud
+from depthpose.pose.estimator.inputs import AnyInput, ObjectCloud, Refusal, prepare_cloud
 from depthpose.pose.mesh import read_model, refuse_one_name, with_found_symmetries
 from depthpose.pose.refine import refine_best
 from depthpose.pose.surface import Surface
@@ -157,8 +155,9 @@ class Registration(PoseEstimator):
         normals, _ = local_planes(dense_m, some_m)
         proposals = propose_poses(some_m, normals, table, surface, _PROPOSALS, generator)
         seconds["voting"] = time.perf_counter() - began
-        known = (model, surface, copies)
-        found = pose_from_proposals(prepared, proposals, known, self.refusal, self.config)
+        found = pose_from_proposals(
+            prepared, proposals, model, surface, copies, self.refusal, self.config
+        )
         return replace(found, name=given.name, seconds={**seconds, **found.seconds})
 
     def _table(self, number: int) -> PairTable:
@@ -168,9 +167,11 @@ class Registration(PoseEstimator):
 
 
 def pose_from_proposals(
-    cloud: Prepared,
+    cloud: ObjectCloud,
     proposals: Rigid,
-    known: tuple[ObjectModel, Surface, PoseAmbiguities],
+    model: ObjectModel,
+    surface: Surface,
+    copies: PoseAmbiguities,
     refusal: RefusalConfig,
     config: EstimateConfig,
 ) -> PoseEstimate:
@@ -179,11 +180,12 @@ def pose_from_proposals(
     Args:
         cloud: of the object.
         proposals: poses, the likeliest first; one at least.
-        known: the object, its surface and what it may be confused with.
+        model: the object.
+        surface: of it.
+        copies: what it may be confused with.
         refusal: when the answer is withheld.
         config: of ICP, which begins at the proposals alone.
     """
-    model, surface, copies = known
     clock = Clock()
     icp = replace(config.icp, starts=1)
     best = refine_best(cloud.cloud_m.double(), proposals, surface, icp)
@@ -194,13 +196,8 @@ def pose_from_proposals(
     candidates = find_candidates(cloud.cloud_m, first, best.others, copies, surface, icp)
     normals = cloud_normals(cloud.cloud_m)
     evidence = [_evidence_of(cloud.cloud_m, normals, one.pose, surface) for one in candidates]
-    found = choose(candidates, evidence, copies, refusal)
     clock.note("icp")
-    answer = answer_of(model, found)
-    assert answer.free_motions is not None
-    free = answer.free_motions.double()
-    posed = Posed(cloud, found.pose, model, surface, free)
-    return judged(posed, found, answer, refusal, config, clock)
+    return answer_of(cloud, model, surface, copies, candidates, evidence, refusal, config, clock)
 
 
 def _evidence_of(

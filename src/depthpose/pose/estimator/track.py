@@ -13,16 +13,21 @@ from torch import Tensor
 
 from depthpose.core.arrays import take_evenly
 from depthpose.core.rigid import Rigid
+from depthpose.pose.cloud import cloud_from_depth
 from depthpose.pose.config import IcpConfig, RefusalConfig
-from depthpose.pose.estimator.evidence import observability, surface_signals, without_motions
-from depthpose.pose.estimator.prepare import AnyInput, Refusal
-from depthpose.pose.estimator.scene import MARGIN, scene_about
-from depthpose.pose.refine import Refined, refine_best
+from depthpose.pose.estimator.candidates import observability, surface_signals, without_motions
+from depthpose.pose.estimator.inputs import AnyInput, Refusal
+from depthpose.pose.refine import RefinedPose, refine_best
 from depthpose.pose.regions import is_on_plane, largest_plane
 from depthpose.pose.surface import NEAR, Surface, compare_depths
-from depthpose.pose.types import Alternative, CloudInput, ObjectModel, PoseEstimate
+from depthpose.pose.types import Alternative, CloudInput, ObjectModel, PoseEstimate, ViewInput
 from depthpose.pose.voting import free_motions
 
+MARGIN = 0.15
+"""Of the diameter: points so far from the surface at the last or the predicted pose may be the
+object's; between two frames it moves by less."""
+_MOST_POINTS = 10_000
+"""Of what a camera saw about the object, evenly taken."""
 _LEAST_POINTS = 60
 _THROUGH = 0.1
 """Where the camera saw through more of the posed surface, the object is not there."""
@@ -34,6 +39,45 @@ _BESIDE = 1000
 """Points beside the object that show them."""
 _ON = 3.0
 """Standard deviations of a plane's points: nearer ones are of it."""
+
+
+def scene_about(given: AnyInput, poses: Rigid, surface: Surface) -> Float64[Tensor, "n 3"]:
+    """Give all points in the direction of the object at one of several poses, and about it.
+
+    Args:
+        given: a cloud of more than the object, or a view, whose mask limits what is taken.
+        poses: a batch, ``camera_from_model``.
+        surface: of the model.
+    """
+    middles_m = (poses.R @ surface.points_m.mean(0)) + poses.t_m
+    middle_m = middles_m.mean(0)
+    radius_m = (0.5 + 2 * MARGIN) * surface.diameter_m
+    radius_m += float((middles_m - middle_m).norm(dim=-1).max())
+    if isinstance(given, ViewInput):
+        window = _window(given, middle_m, radius_m)
+        points_m = cloud_from_depth(window.depth_m, window.mask, window.K).double()
+        return take_evenly(points_m, _MOST_POINTS)
+    points_m = given.points_m.double()
+    points_m = points_m[points_m.isfinite().all(-1) & (points_m[:, 2] > 0)]
+    offset = points_m[:, :2] / points_m[:, 2:] - middle_m[:2] / middle_m[2]
+    near = offset.abs().amax(-1) < radius_m / (middle_m[2] - radius_m).clamp(min=0.1 * middle_m[2])
+    return take_evenly(points_m[near], _MOST_POINTS)
+
+
+def _window(view: ViewInput, middle_m: Float64[Tensor, "3"], radius_m: float) -> ViewInput:
+    """Cut the square about a ball out of a view."""
+    z_m = float(middle_m[2])
+    K, near_m = view.K.double(), max(z_m - radius_m, 0.1 * z_m)
+    u, v = (K @ (middle_m / z_m))[:2].tolist()
+    reach = [float(K[k, k]) * radius_m / near_m for k in range(2)]
+    height, width = view.depth_m.shape
+    left, right = (min(max(round(u + s * reach[0]), 0), width) for s in (-1, 1))
+    top, bottom = (min(max(round(v + s * reach[1]), 0), height) for s in (-1, 1))
+    part = (slice(top, bottom), slice(left, right))
+    shifted = K.clone()
+    shifted[0, 2] -= left
+    shifted[1, 2] -= top
+    return replace(view, depth_m=view.depth_m[part], mask=view.mask[part], K=shifted)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -187,7 +231,7 @@ def _is_support(
 
 
 def _accepted(
-    refined: Refined,
+    refined: RefinedPose,
     scene_m: Float64[Tensor, "n 3"],
     is_support: Bool[Tensor, " n"],
     known: TrackedObject,
@@ -215,7 +259,7 @@ def _accepted(
 
 
 def _answer(
-    refined: Refined,
+    refined: RefinedPose,
     free: Tensor,
     signals: dict[str, float],
     known: TrackedObject,

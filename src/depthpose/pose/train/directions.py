@@ -26,7 +26,7 @@ from depthpose.core.rigid import Rigid
 from depthpose.core.run import find_rank
 from depthpose.pose.baselines import PointNet, PointNetConfig
 from depthpose.pose.config import CloudConfig, RefusalConfig
-from depthpose.pose.estimator.alternatives import near_symmetry_lines
+from depthpose.pose.estimator.candidates import near_symmetry_lines
 from depthpose.pose.losses import direction_loss
 from depthpose.pose.mesh import symmetry_transforms
 from depthpose.pose.network import ResUNet, fold_norms, unfold_norms

@@ -234,17 +234,18 @@ def _vote(
     reference = torch.arange(count).repeat_interleave(_PEAKS)
     number, bin_ = best.indices.flatten() // _TURNS, best.indices.flatten() % _TURNS
     angle = (bin_ + 0.5) * (2 * math.pi / _TURNS)
-    return _poses(points_m, frames, table, (reference, number, angle.double()))
+    return _poses(points_m, frames, table, reference, number, angle.double())
 
 
 def _poses(
     points_m: Float64[Tensor, "n 3"],
     frames: Float64[Tensor, "n 3 3"],
     table: PairTable,
-    match: tuple[Int64[Tensor, " b"], Int64[Tensor, " b"], Float64[Tensor, " b"]],
+    reference: Int64[Tensor, " b"],
+    number: Int64[Tensor, " b"],
+    angle: Float64[Tensor, " b"],
 ) -> Rigid:
     """Lay model points and their normals on reference points, and turn about the normals."""
-    reference, number, angle = match
     one, zero, c, s = torch.ones_like(angle), torch.zeros_like(angle), angle.cos(), angle.sin()
     turn = torch.stack([one, zero, zero, zero, c, -s, zero, s, c], -1).reshape(-1, 3, 3)
     R = frames[reference] @ turn @ table.frames[number].mT
