@@ -15,6 +15,8 @@ from depthpose.pose.predictions import Prediction, parse_prediction, prediction_
 from depthpose.pose.surface import compare_depths, prepare_surface
 from depthpose.pose.types import Alternative, PoseEstimate
 
+HIDDEN = 0.68
+
 
 def moving(count: int, step_m: float = 0.008, step_deg: float = 2.0) -> list[Rigid]:
     """A bracket that goes to the right and turns, frame after frame."""
@@ -90,6 +92,24 @@ def test_a_part_that_is_hidden_does_not_lose_it() -> None:
     found = list(oracle(poses).track(frames, CAMERA, first=poses[0]))
     assert [e.tracking for e in found] == ["tracked"] * 4
     assert max(error_of(e, p) for e, p in zip(found, poses, strict=True)) < 0.005
+
+
+def test_it_is_followed_where_what_is_not_hidden_was_seen() -> None:
+    """A plate before most of it; a third that agrees is enough for what was followed there."""
+    poses, column, frames = moving(4), torch.arange(320).expand(240, 320), []
+    for k, pose in enumerate(poses):
+        _, mask = view_of(bracket(), pose)
+        cut = column[mask].double().quantile(HIDDEN)
+        hides = (column >= column[mask].min() - 5) & (column < cut)
+        frames.append(torch.where(hides, torch.tensor(0.45), frame(pose, k)))
+    surface = prepare_surface(bracket())
+    scene_m = back_project(frames[0].double(), K).reshape(-1, 3)
+    agrees, _, before = compare_depths(scene_m, poses[0].double(), surface)
+    assert agrees < 0.35, "else nothing is tested"
+    assert before > 0.5
+    found = list(oracle(poses).track(frames, CAMERA, first=poses[0]))
+    assert [e.tracking for e in found] == ["tracked"] * 4
+    assert max(error_of(e, p) for e, p in zip(found, poses, strict=True)) < 0.01
 
 
 def test_the_motion_goes_on_as_it_was() -> None:

@@ -33,6 +33,8 @@ _THROUGH = 0.1
 """Where the camera saw through more of the posed surface, the object is not there."""
 _SEEN = 0.35
 """Where less of the posed surface was seen, it may be anywhere."""
+_SEEN_BESIDE, _REST_SEEN = 0.2, 0.5
+"""Of an object that is followed and occluded less is enough, if so much of the rest was seen."""
 _SUPPORTS = 2
 """Planes beside the object that are looked for: a table and a wall."""
 _BESIDE = 1000
@@ -171,19 +173,22 @@ def _doubt_of(given: AnyInput, pose: Rigid | None, surface: Surface) -> Refusal 
     )
 
 
-def _contradiction(shares: tuple[float, float, float]) -> Refusal | None:
+def _contradiction(
+    shares: tuple[float, float, float], *, is_followed: bool = False
+) -> Refusal | None:
     """Say why a posed surface seen, seen through and occluded to these shares is not there."""
     agrees, through, before = shares
+    least = min(_SEEN, max(_SEEN_BESIDE, _REST_SEEN * (1 - before))) if is_followed else _SEEN
     if through > _THROUGH:
         return Refusal(
             status="doubtful", reason=f"the camera saw through {through:.0%} of the posed surface"
         )
-    if agrees >= _SEEN:
+    if agrees >= least:
         return None
     return Refusal(
         status="doubtful",
         reason=f"{agrees:.0%} of the posed surface was seen, {before:.0%} is occluded, and "
-        f"{_SEEN:.0%} must be seen",
+        f"{least:.0%} must be seen",
     )
 
 
@@ -240,7 +245,7 @@ def _accepted(
     """Accept a pose that the scene agrees with and that is observable."""
     surface, pose = known.surface, refined.camera_from_model.double()
     shares = compare_depths(scene_m, pose, surface)
-    if (contradiction := _contradiction(shares)) is not None:
+    if (contradiction := _contradiction(shares, is_followed=True)) is not None:
         return contradiction
     near = _is_near(scene_m, Rigid.stack([pose]), surface, NEAR)
     own_m = scene_m[near & ~is_support]
