@@ -124,10 +124,9 @@ def test_the_best_of_several_starts_is_found_and_named(
     best = refine_best(cloud, batch, surface)
     assert best.start == 1
     assert float(geodesic_rad(best.refined.camera_from_model.R, TRUE.R)) < 5e-3
-    assert best.scatter > 0.3
     assert 1 <= len(best.others.R) <= 3
     sure = refine_best(cloud, pose_near(TRUE, 5, 0.05, 0.002), surface)
-    assert (sure.start, sure.scatter, len(sure.others.R)) == (0, 0.0, 0)
+    assert (sure.start, len(sure.others.R)) == (0, 0)
 
 
 def test_a_pose_that_would_hide_what_was_seen_is_not_the_best() -> None:
