@@ -1,9 +1,10 @@
 """One image, or a rectified pair, to one depth estimate in metres."""
 
 import warnings
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence, Sized
 from dataclasses import replace
-from itertools import groupby
+from functools import partial
+from itertools import groupby, islice
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +12,7 @@ import torch
 from jaxtyping import Float
 from PIL import Image
 from torch import Tensor
+from tqdm import tqdm
 
 from depthpose.core.arrays import check_image
 from depthpose.core.camera import (
@@ -21,14 +23,14 @@ from depthpose.core.camera import (
     choose_lens,
 )
 from depthpose.core.checkpoint import find_weights, join_terms, warn_of_terms
-from depthpose.core.devices import own_arithmetic
+from depthpose.core.devices import each_in_threads, own_arithmetic
 from depthpose.core.errors import InputError, Notice, refuse_unknown, refused_memory
 from depthpose.depth.config import Answer, MatcherConfig, SGBMConfig
 from depthpose.depth.disparity import focal_size, resize_image, smallest_focal_px
 from depthpose.depth.estimator.inputs import (
     Picture,
     as_input,
-    as_inputs,
+    as_several,
     as_tensor,
     exif_focal_px,
     refuse_unrectified,
@@ -228,45 +230,81 @@ class FakestereoNet:
             match = match_to_infinity(self._match, pair.left, right, pair.camera)
             return replace(from_pair(pair, match), warning=warning)
 
-    @torch.no_grad()
     @own_arithmetic()
     def estimate_many(
         self,
-        images: Sequence[StereoInput] | Sequence[Picture] | Picture,
+        images: Iterable[StereoInput] | Iterable[Picture] | Picture,
         camera: AnyLens | None = None,
         *,
         focal_px: float | None = None,
         fov_deg: float | None = None,
         with_check: bool = True,
-    ) -> list[DepthEstimate]:
-        """Estimate depth of images, alone or as pairs; neighbours of one camera size go together.
+        batch: int = 1,
+        threads: int = 1,
+        with_progress: bool = False,
+    ) -> list[DepthEstimate | InputError]:
+        """Estimate depth of images, alone or as pairs: of each a result, or its error.
 
         An input with a right view is matched with it, as :meth:`estimate_pair` does.
 
         Args:
-            images: inputs; or pictures, or a batch of them as one array or tensor.
+            images: inputs; or pictures, or a batch of them as one array or tensor; a generator's
+                are taken as they are needed.
             camera: of the pictures, as for :meth:`estimate`; inputs have their own.
             focal_px: the same as its focal length alone [px].
             fov_deg: the same as its horizontal field of view [degrees].
             with_check: of pairs, as for :meth:`estimate`.
+            batch: so many neighbours of one size go through the networks together: faster on a
+                GPU, slower on a processor.
+            threads: so many batches are worked at at a time, in as many times the memory.
+            with_progress: show a bar on the terminal.
+
+        Returns:
+            An estimate for each image, or the :class:`~depthpose.core.errors.InputError` that
+            :meth:`estimate` raises for it.
 
         Raises:
-            InputError: as :meth:`estimate`; the first unusable image is named.
+            InputError: a camera, ``batch`` or ``threads`` that fits no image.
         """
-        estimates: list[DepthEstimate] = []
-        inputs = as_inputs(images, choose_lens(camera, focal_px, fov_deg))
+        if batch < 1:
+            raise InputError(f"batch is {batch}; take 1 or more images")
+        lens = choose_lens(camera, focal_px, fov_deg)
+        several = as_several(images)
+        named = iter((f"image {k}", one) for k, one in enumerate(several))
+        batches = iter(lambda: list(islice(named, batch)), [])
+        found: list[DepthEstimate | InputError] = []
+        total = len(several) if isinstance(several, Sized) else None
+        with tqdm(total=total, unit=" images", disable=not with_progress) as bar:
+            work = partial(self._estimate_some, lens=lens, with_check=with_check)
+            for some in each_in_threads(work, batches, threads):
+                found += some
+                bar.update(len(some))
+        return found
+
+    def _estimate_some(
+        self, named: Sequence[tuple[str, object]], lens: AnyLens | None, *, with_check: bool
+    ) -> list[DepthEstimate | InputError]:
+        """Estimate images together; where one of them is unusable, each alone."""
 
         def sizes_alone(image: StereoInput) -> list[tuple[int, int]] | None:
             return self.virtual_sizes(image) if image.right is None else None
 
-        for sizes, group in groupby(inputs, sizes_alone):
-            alike = list(group)
-            with refused_memory(alike[0].name):
-                if sizes is None:
-                    estimates += [self.estimate_pair(p, with_check=with_check) for p in alike]
+        found: list[DepthEstimate | InputError] = []
+        try:
+            inputs = [as_input(image, name, lens) for name, image in named]
+            for sizes, group in groupby(inputs, sizes_alone):
+                alike = list(group)
+                if sizes is None or len(alike) == 1:
+                    found += [self.estimate_pair(pair, with_check=with_check) for pair in alike]
                 else:
-                    estimates += self._estimate_alone(alike, sizes)
-        return estimates
+                    with refused_memory(alike[0].name):
+                        found += self._estimate_alone(alike, sizes)
+        except InputError as error:
+            if len(named) == 1:
+                return [error]
+            alone = (self._estimate_some([one], lens, with_check=with_check) for one in named)
+            return [one for (one,) in alone]
+        return found
 
     def virtual_sizes(self, image: StereoInput) -> list[tuple[int, int]]:
         """Rows and columns at which one image is looked at.
@@ -391,7 +429,7 @@ class DepthPipeline:
                 Notice,
                 stacklevel=3,
             )
-        (found,) = self.net.estimate_many([image], lens)
+        found = self.net.estimate(image, lens)
         assert found.depth_m is not None
         return {"predicted_depth": found.depth_m, "depth": _drawn(found.depth_m)}
 

@@ -4,20 +4,22 @@ Several clouds go through the network at once.
 """
 
 import time
-from collections.abc import Iterator, Sequence
-from dataclasses import replace
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
+from typing import cast
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from depthpose.core.checkpoint import find_weights, warn_of_terms
-from depthpose.core.devices import own_arithmetic, usable_device
+from depthpose.core.devices import each_in_threads, own_arithmetic, usable_device
 from depthpose.core.errors import InputError
 from depthpose.pose.baselines import DepthImageNet
 from depthpose.pose.config import EstimateConfig, RefusalConfig
-from depthpose.pose.estimator.base import PoseEstimator, refused
+from depthpose.pose.estimator.base import PoseEstimator, answered, or_unreadable, refused
 from depthpose.pose.estimator.pose import Voted, pose_from_directions
 from depthpose.pose.estimator.prepare import AnyInput, Prepared, Refusal, prepare_cloud
 from depthpose.pose.estimator.register import Registration
@@ -57,18 +59,16 @@ def network_directions(
     ]
 
 
-def batches(
-    ready: list[tuple[int, Prepared, float]], most: int
-) -> Iterator[list[tuple[int, Prepared, float]]]:
+def batches(clouds: Iterable["_Cloud"], most: int) -> Iterator[list["_Cloud"]]:
     """Group clouds so that each group has ``most`` voxels at most, or is one cloud."""
-    group: list[tuple[int, Prepared, float]] = []
+    group: list[_Cloud] = []
     total = 0
-    for item in ready:
-        count = len(item[1].points_m)
+    for one in clouds:
+        count = len(one.prepared.points_m) if isinstance(one.prepared, Prepared) else 0
         if group and total + count > most:
             yield group
             group, total = [], 0
-        group.append(item)
+        group.append(one)
         total += count
     if group:
         yield group
@@ -160,33 +160,17 @@ class GeoPoseNet(PoseEstimator):
         """When an answer is withheld."""
         return self.weights.refusal
 
-    @torch.no_grad()
-    @own_arithmetic()
-    def estimate_many(self, inputs: Sequence[AnyInput]) -> list[PoseEstimate]:
-        """Estimate many at once, of any objects: the network is called for all of them together.
+    def _each(
+        self, inputs: Iterable[AnyInput], threads: int, *, is_likely: bool = True
+    ) -> Iterator[PoseEstimate]:
+        """Ask the network for several clouds together, and register what it doubts.
 
         The answer for an input does not depend on those beside it, but for the rounding of the
-        network's sums. What the network doubts is then registered, where the config wants it.
-
-        Raises:
-            InputError: an unknown object, or a mask that does not fit its depth image.
+        network's sums. Only what is likely is registered, where the config wants it.
         """
-        estimates = self._in_order(inputs, is_likely=True)
-        if self._registration is None:
-            return estimates
-        return [
-            self._registered(given, found) if found.status in _DOUBTED else found
-            for given, found in zip(inputs, estimates, strict=True)
-        ]
-
-    @torch.no_grad()
-    @own_arithmetic()
-    def _try_many(self, inputs: Sequence[AnyInput]) -> list[PoseEstimate]:
-        return self._in_order(inputs, is_likely=False)
-
-    def _in_order(self, inputs: Sequence[AnyInput], *, is_likely: bool) -> list[PoseEstimate]:
-        found = {k: one for k, one, _ in self._each(inputs, is_likely=is_likely)}
-        return [found[k] for k in range(len(inputs))]
+        for given, found, _ in self._with_votes(inputs, threads, is_likely=is_likely):
+            is_doubted = is_likely and found.status in _DOUBTED
+            yield self._registered(given, found) if self._registration and is_doubted else found
 
     def _registered(self, given: AnyInput, doubted: PoseEstimate) -> PoseEstimate:
         """Answer by the model alone, else as the network did."""
@@ -209,37 +193,49 @@ class GeoPoseNet(PoseEstimator):
             the network was not run, as there is too little to pose.
 
         Raises:
-            InputError: as for :meth:`estimate_many`.
+            InputError: an unknown object, or a mask that does not fit its depth image.
         """
-        ((_, found, voted),) = self._each([given])
-        return found, voted
+        ((_, found, voted),) = self._with_votes([given], 1)
+        return answered(found), voted
 
-    def _each(
-        self, inputs: Sequence[AnyInput], *, is_likely: bool = True
-    ) -> Iterator[tuple[int, PoseEstimate, Voted | None]]:
-        """Give each input's number, estimate and votes: first what is refused, then by batches."""
-        ready: list[tuple[int, Prepared, float]] = []
-        for k, given in enumerate(inputs):
-            start = time.perf_counter()
+    def _with_votes(
+        self, inputs: Iterable[AnyInput], threads: int, *, is_likely: bool = True
+    ) -> Iterator[tuple[AnyInput, PoseEstimate, Voted | None]]:
+        prepared = each_in_threads(self._prepare, inputs, threads)
+        for some in batches(prepared, self.config.batch_voxels):
+            seen = [one for one in some if isinstance(one.prepared, Prepared)]
+            work = partial(self._pose, is_likely=is_likely)
+            posed = each_in_threads(work, self._ask(seen), threads)
+            for one in some:
+                if isinstance(one.prepared, Prepared):
+                    yield one.given, *next(posed)
+                else:
+                    yield one.given, one.prepared, None
+
+    def _prepare(self, given: AnyInput) -> "_Cloud":
+        start = time.perf_counter()
+
+        def prepare(given: AnyInput) -> Prepared | Refusal:
             model = self.weights.models[self._number(given.object)]
-            prepared = prepare_cloud(given, model, self.weights.cloud, self.config)
-            spent_s = time.perf_counter() - start
-            if isinstance(prepared, Refusal):
-                yield k, refused(given, prepared, {"cloud": spent_s}), None
-            else:
-                ready.append((k, prepared, spent_s))
-        for some in batches(ready, self.config.batch_voxels):
-            numbers = [self._number(inputs[k].object) for k, _, _ in some]
-            directions, network_s = self._directions([p for _, p, _ in some], numbers)
-            total = sum(map(len, directions))
-            for (k, prepared, spent_s), outputs, number in zip(
-                some, directions, numbers, strict=True
-            ):
-                share_s = network_s * len(outputs) / total
-                seconds = {"cloud": spent_s, "network": share_s}
-                voted = Voted(prepared, outputs)
-                found = self._pose(inputs[k], number, voted, is_likely)
-                yield k, replace(found, seconds={**seconds, **found.seconds}), voted
+            return prepare_cloud(given, model, self.weights.cloud, self.config)
+
+        prepared = or_unreadable(prepare, given)
+        spent_s = time.perf_counter() - start
+        if isinstance(prepared, Refusal):
+            prepared = refused(given, prepared, {"cloud": spent_s})
+        return _Cloud(given=given, prepared=prepared, spent_s=spent_s)
+
+    def _ask(self, clouds: list["_Cloud"]) -> Iterator["_Asked"]:
+        """Ask the network for clouds together; each has a share of the time."""
+        if not clouds:
+            return
+        numbers = [self._number(one.given.object) for one in clouds]
+        prepared = [cast(Prepared, one.prepared) for one in clouds]
+        outputs, spent_s = self._directions(prepared, numbers)
+        total = sum(map(len, outputs))
+        for one, cloud, output in zip(clouds, prepared, outputs, strict=True):
+            seconds = {"cloud": one.spent_s, "network": spent_s * len(output) / total}
+            yield _Asked(given=one.given, voted=Voted(cloud, output), seconds=seconds)
 
     def _directions(
         self, clouds: list[Prepared], numbers: list[int]
@@ -248,9 +244,28 @@ class GeoPoseNet(PoseEstimator):
         found = network_directions(self._network, clouds, numbers, self.config.device)
         return found, time.perf_counter() - start
 
-    def _pose(self, given: AnyInput, number: int, voted: Voted, is_likely: bool) -> PoseEstimate:
-        known = (self.weights.models[number], self._surface(number), self._copies_of(number))
-        found = pose_from_directions(
-            voted, known, self.weights.refusal, self.config, is_likely=is_likely
-        )
-        return replace(found, name=given.name)
+    def _pose(self, asked: "_Asked", *, is_likely: bool) -> tuple[PoseEstimate, Voted]:
+        def pose(given: AnyInput) -> PoseEstimate:
+            number = self._number(given.object)
+            known = (self.weights.models[number], self._surface(number), self._copies_of(number))
+            return pose_from_directions(
+                asked.voted, known, self.weights.refusal, self.config, is_likely=is_likely
+            )
+
+        found = or_unreadable(pose, asked.given)
+        seconds = {**asked.seconds, **found.seconds}
+        return replace(found, name=asked.given.name, seconds=seconds), asked.voted
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _Cloud:
+    given: AnyInput
+    prepared: Prepared | PoseEstimate
+    spent_s: float
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _Asked:
+    given: AnyInput
+    voted: Voted
+    seconds: dict[str, float]

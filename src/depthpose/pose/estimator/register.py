@@ -1,8 +1,9 @@
 """Registration: poses of objects by their models alone, without training."""
 
 import time
-from collections.abc import Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import torch
@@ -10,7 +11,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from depthpose.core.arrays import take_evenly
-from depthpose.core.devices import own_arithmetic
+from depthpose.core.devices import each_in_threads, own_arithmetic
 from depthpose.core.errors import InputError
 from depthpose.core.rigid import Rigid
 from depthpose.core.units import Unit
@@ -26,7 +27,7 @@ from depthpose.pose.estimator.answer import (
     judged,
     withheld,
 )
-from depthpose.pose.estimator.base import PoseEstimator, refused
+from depthpose.pose.estimator.base import PoseEstimator, or_unreadable, refused
 from depthpose.pose.estimator.evidence import (
     CloudNormals,
     cloud_normals,
@@ -130,15 +131,12 @@ class Registration(PoseEstimator):
             self._copies_of(number)
             self._table(number)
 
-    @torch.no_grad()
-    @own_arithmetic()
-    def estimate_many(self, inputs: Sequence[AnyInput]) -> list[PoseEstimate]:
-        """Estimate one after the other; a model is prepared when it is first asked for.
-
-        Raises:
-            InputError: an unknown object, or a mask that does not fit its depth image.
-        """
-        return [self._estimate(given) for given in inputs]
+    def _each(
+        self, inputs: Iterable[AnyInput], threads: int, *, is_likely: bool = True
+    ) -> Iterator[PoseEstimate]:
+        """Register one by one, whatever is likely; a model is prepared when first asked for."""
+        del is_likely
+        return each_in_threads(partial(or_unreadable, self._estimate), inputs, threads)
 
     def _estimate(self, given: AnyInput) -> PoseEstimate:
         number = self._number(given.object)
