@@ -52,6 +52,10 @@ def test_poses_of_a_part_that_no_training_saw_are_right_or_refused() -> None:
         assert {"voting", "icp", "check"} <= one.seconds.keys()
 
 
+def test_what_it_registers_is_said() -> None:
+    assert repr(registration()) == "Registration(of connector)"
+
+
 def test_two_threads_give_what_one_gives_and_an_error_costs_nothing() -> None:
     given = [view(part(), index).input for index in range(3)]
     given.insert(1, replace(given[0], object="conector"))

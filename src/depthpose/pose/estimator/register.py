@@ -115,6 +115,10 @@ class Registration(PoseEstimator):
         models = [read_model(path, unit, number=k) for k, path in enumerate(cad, start=1)]
         return cls([with_found_symmetries(m, None, is_taken=True) for m in models], config)
 
+    def __repr__(self) -> str:
+        """Say it in one line: the objects; a registration has no weights and no device."""
+        return f"Registration(of {', '.join(self.objects)})"
+
     @property
     def models(self) -> Sequence[ObjectModel]:
         """The objects."""
