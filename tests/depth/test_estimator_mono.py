@@ -1,8 +1,13 @@
 """One image: the virtual rig gives the scale, whatever camera took the image."""
 
+import base64
 import math
+import re
+import threading
 from collections.abc import Iterator
 from dataclasses import replace
+from functools import partial
+from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from typing import Any
 
@@ -33,7 +38,7 @@ from depthpose.depth.estimator.rig import join_matches
 from depthpose.depth.out_of_distribution import calibrate, measure_image_confidence, refuse_share
 from depthpose.depth.stereo import CallableMatcher, PSMNet, PSMNetMatcher
 from depthpose.depth.synthesis import SelectionGenerator, UNetGenerator, make_synthesiser
-from depthpose.depth.types import Match, StereoInput
+from depthpose.depth.types import DepthEstimate, Match, StereoInput
 from depthpose.depth.weights import read_generator, write_depth_weights
 
 
@@ -421,6 +426,69 @@ def test_code_for_the_pipeline_of_transformers_runs(generator: UNetGenerator) ->
     with pytest.raises(InputError, match="task is 'image-segmentation'; Known: 'depth-estimation'"):
         depthpose.pipeline("image-segmentation")
     assert depthpose.pipeline("depth-estimation", device=-1).net.weights == "default"
+
+
+def test_the_pipeline_takes_what_that_of_transformers_takes(
+    generator: UNetGenerator, tmp_path: Path
+) -> None:
+    """An address, base64, a generator, images=, a batch: each as the picture itself."""
+    pipe = DepthPipeline(
+        FakestereoNet(CallableMatcher(by_brightness), make_synthesiser(generator)), batch_size=2
+    )
+    Image.fromarray(RGB).save(tmp_path / "street.png")
+    plain = base64.b64encode((tmp_path / "street.png").read_bytes()).decode()
+    serve = partial(SimpleHTTPRequestHandler, directory=str(tmp_path))
+    server = ThreadingHTTPServer(("127.0.0.1", 0), serve)
+    threading.Thread(target=server.serve_forever, daemon=True).start()
+    address = f"http://127.0.0.1:{server.server_port}/"
+    try:
+        expected = pipe(RGB, focal_px=100.0)
+        assert isinstance(expected, dict)
+        pictures = [address + "street.png", plain, "data:image/png;base64," + plain, RGB]
+        for found in (
+            pipe(images=pictures, focal_px=100.0, timeout=10.0),
+            pipe((one for one in pictures), focal_px=100.0, batch_size=3),
+        ):
+            several = list(found)
+            assert len(several) == 4
+            for one in several:
+                assert isinstance(one, dict)
+                torch.testing.assert_close(one["predicted_depth"], expected["predicted_depth"])
+        with pytest.raises(InputError, match=r"/none.png: is no picture that can be read .*404"):
+            pipe(address + "none.png")
+    finally:
+        server.shutdown()
+        server.server_close()
+    with pytest.raises(InputError, match=r"data:image/png;base64,AAAA.*: is no picture"):
+        pipe("data:image/png;base64," + "A" * 400)
+    with pytest.raises(InputError, match=r"street\.jpg: no such file"):
+        pipe("street.jpg")
+    with pytest.raises(InputError, match="as the first argument or as images="):
+        pipe()
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        ({"torch_dtype": torch.float16}, "torch_dtype is torch.float16; networks run in float32"),
+        ({"dtype": "bfloat16"}, "torch_dtype is bfloat16; networks run in float32, omit it"),
+        ({"device": 0, "device_map": "auto"}, "device and device_map are both given"),
+        ({"device_map": {"": 0}}, "device_map is a mapping; the networks go to one device"),
+        ({"revision": "main"}, "revision is no option here; leave it out"),
+    ],
+)
+def test_what_the_pipeline_cannot_take_is_one_clear_line(
+    options: dict[str, Any], said: str
+) -> None:
+    with pytest.raises(InputError, match=f"^pipeline: {re.escape(said)}"):
+        depthpose.pipeline("depth-estimation", **options)
+
+
+def test_options_of_transformers_that_change_nothing_are_taken() -> None:
+    pipe = depthpose.pipeline(
+        "depth-estimation", device_map="cpu", torch_dtype="auto", batch_size=4, token=None
+    )
+    assert (pipe.net.weights, pipe.batch_size) == ("default", 4)
 
 
 def constant_matcher(disparity_px: float) -> CallableMatcher:

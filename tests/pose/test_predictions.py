@@ -7,11 +7,11 @@ from typing import Any, get_args
 
 import pytest
 import torch
-from depthpose.pose.predictions.records import VERSION
 
 from depthpose.core.errors import InputError, Notice
 from depthpose.core.rigid import Rigid, perturb
 from depthpose.pose.predictions import (
+    VERSION,
     Job,
     Place,
     Prediction,

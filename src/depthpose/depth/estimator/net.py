@@ -1,13 +1,18 @@
 """One image, or a rectified pair, to one depth estimate in metres."""
 
+import os
 import warnings
-from collections.abc import Iterable, Sequence, Sized
+from base64 import b64decode
+from collections.abc import Iterable, Iterator, Mapping, Sequence, Sized
 from dataclasses import replace
 from functools import partial
+from io import BytesIO
 from itertools import groupby, islice
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
+from urllib.request import urlopen
 
+import numpy as np
 import torch
 from jaxtyping import Float
 from PIL import Image
@@ -381,43 +386,71 @@ class DepthPipeline:
     """Pictures to ``{"predicted_depth", "depth"}``.
 
     Args:
-        net: estimates one image.
+        net: estimates images.
+        batch_size: pictures of one size in one call of its networks.
     """
 
-    def __init__(self, net: FakestereoNet) -> None:
+    def __init__(self, net: FakestereoNet, batch_size: int = 1) -> None:
         self.net = net
+        self.batch_size = batch_size
 
     def __call__(
         self,
-        inputs: Picture | Sequence[Picture],
+        inputs: Picture | Iterable[Picture] | None = None,
         camera: AnyCamera | None = None,
         *,
+        images: Picture | Iterable[Picture] | None = None,
         focal_px: float | None = None,
         fov_deg: float | None = None,
-    ) -> dict[str, Any] | list[dict[str, Any]]:
-        """Estimate one picture, or a list of them.
+        batch_size: int | None = None,
+        timeout: float | None = None,
+    ) -> dict[str, Any] | list[dict[str, Any]] | Iterator[dict[str, Any]]:
+        """Estimate one picture, a list of them, or what a generator or data set gives.
 
         Args:
-            inputs: as :meth:`FakestereoNet.estimate` takes them.
+            inputs: as :meth:`FakestereoNet.estimate` takes them, and as transformers does: the
+                address of a picture (http, https), or its file in base64.
             camera: of all pictures. Without it, ``focal_px`` and ``fov_deg`` a picture's EXIF is
                 taken, or else 0.75 widths, a phone's, with a notice: the metres are as wrong as
                 that is.
+            images: another name of ``inputs``.
             focal_px: the focal length alone [px].
             fov_deg: the horizontal field of view alone [degrees].
+            batch_size: pictures of one size in one call of the networks; None: the pipeline's.
+            timeout: of a download [s]; None: none.
 
         Returns:
             For each picture ``predicted_depth``, metres (H, W), NaN where there are none, and
             ``depth``, an 8-bit picture of Pillow's, the farthest white, as transformers draws it.
+            Of a list a list, of another iterable an iterator.
 
         Raises:
             InputError: as :meth:`FakestereoNet.estimate`.
         """
+        if (inputs is None) == (images is None):
+            raise InputError("give the pictures, as the first argument or as images=")
+        given = images if inputs is None else inputs
         lens = choose_lens(camera, focal_px, fov_deg)
-        if isinstance(inputs, list | tuple):
-            return [self._one(one, lens) for one in inputs]
-        return self._one(inputs, lens)
+        is_one = isinstance(given, str | Path | Image.Image | np.ndarray | Tensor)
+        pictures = [given] if is_one else cast("Iterable[Picture]", given)
+        found = self._each(pictures, lens, batch_size or self.batch_size, timeout)
+        if is_one:
+            return next(found)
+        return list(found) if isinstance(given, list | tuple) else found
 
-    def _one(self, picture: object, lens: AnyLens | None) -> dict[str, Any]:
+    def _each(
+        self, pictures: Iterable[Picture], lens: AnyLens | None, batch: int, timeout: float | None
+    ) -> Iterator[dict[str, Any]]:
+        left = iter(pictures)
+        while some := list(islice(left, batch)):
+            seen = [self._input(_opened(picture, timeout), lens) for picture in some]
+            for found in self.net.estimate_many(seen, batch=batch):
+                if isinstance(found, InputError):
+                    raise found
+                assert found.depth_m is not None
+                yield {"predicted_depth": found.depth_m, "depth": _drawn(found.depth_m)}
+
+    def _input(self, picture: Picture, lens: AnyLens | None) -> StereoInput:
         image = as_tensor(picture)
         if lens is None:
             lens = exif_focal_px(picture, "the picture")
@@ -427,31 +460,79 @@ class DepthPipeline:
                 f"no camera: a focal length of {lens:g} px is taken, a phone's; the metres are as "
                 "wrong as it is. Give focal_px= or camera=",
                 Notice,
-                stacklevel=3,
+                stacklevel=4,
             )
-        found = self.net.estimate(image, lens)
-        assert found.depth_m is not None
-        return {"predicted_depth": found.depth_m, "depth": _drawn(found.depth_m)}
+        return as_input(image, "the picture", lens)
 
 
 def pipeline(
-    task: str = "depth-estimation", model: str | Path | None = None, device: str | int = "cpu"
+    task: str = "depth-estimation",
+    model: str | Path | None = None,
+    device: str | int | torch.device | None = None,
+    *,
+    device_map: str | int | torch.device | None = None,
+    torch_dtype: str | torch.dtype | None = None,
+    dtype: str | torch.dtype | None = None,
+    batch_size: int = 1,
+    **others: object,
 ) -> DepthPipeline:
     """Build what transformers' function of this name builds, for the one task that is known.
 
     Args:
         task: depth-estimation.
         model: weights with a generator, by name or file; None: ``default``.
-        device: cpu, cuda, cuda:1, ...; or the number of a GPU, -1 for the CPU.
+        device: cpu, cuda, cuda:1, ...; or the number of a GPU, -1 for the CPU. None: the CPU.
+        device_map: a device in place of ``device``; ``auto``: the GPU where there is one.
+        torch_dtype: float32, the precision of the weights, or ``auto``, which is the same.
+        dtype: newer name of it.
+        batch_size: pictures of one size in one call of the networks.
+        others: options of transformers that have no meaning here; each is refused unless None.
 
     Raises:
-        InputError: another task, or no such weights.
+        InputError: another task, precision or option, or no such weights.
     """
     refuse_unknown("task", task, ["depth-estimation"])
-    if isinstance(device, int):
-        device = f"cuda:{device}" if device >= 0 else "cpu"
-    net = FakestereoNet.load(model or DEFAULT, config=MatcherConfig(device=device))
-    return DepthPipeline(net)
+    foreign = [name for name, value in others.items() if value is not None]
+    if foreign:
+        raise InputError(
+            f"pipeline: {foreign[0]} is no option here; leave it out (a model is a name of "
+            "'depthpose weights list', a file or hf://OWNER/NAME@REVISION)"
+        )
+    precision = torch_dtype if dtype is None else dtype
+    if precision not in (None, "auto", "float32", torch.float32):
+        raise InputError(f"pipeline: torch_dtype is {precision}; networks run in float32, omit it")
+    if device is not None and device_map is not None:
+        raise InputError("pipeline: device and device_map are both given; omit one of the two")
+    chosen = device_map if device is None else device
+    if chosen == "auto":
+        chosen = "cuda" if torch.cuda.is_available() else "cpu"
+    if isinstance(chosen, int):
+        chosen = f"cuda:{chosen}" if chosen >= 0 else "cpu"
+    if isinstance(chosen, Mapping):
+        raise InputError(
+            "pipeline: device_map is a mapping; the networks go to one device, as 'auto'"
+        )
+    net = FakestereoNet.load(model or DEFAULT, config=MatcherConfig(device=str(chosen or "cpu")))
+    return DepthPipeline(net, batch_size)
+
+
+def _opened(picture: Picture, timeout: float | None) -> Picture:
+    """Open an address or base64 text as transformers does; anything else stays as it is."""
+    if not isinstance(picture, str) or os.path.isfile(picture):  # noqa: PTH113  long text is no path
+        return picture
+    is_address = picture.startswith(("http://", "https://"))
+    try:
+        if is_address:
+            with urlopen(picture, timeout=timeout) as answer:  # noqa: S310  http alone
+                content = answer.read()
+        else:
+            content = b64decode(picture.partition("base64,")[2] or picture, validate=True)
+        return Image.open(BytesIO(content))
+    except (OSError, ValueError) as error:
+        if is_address or picture.startswith("data:"):
+            said = picture if is_address else f"{picture[:30]}..."
+            raise InputError(f"{said}: is no picture that can be read ({error})") from error
+        return picture
 
 
 def _drawn(depth_m: Float[Tensor, "h w"]) -> Image.Image:

@@ -8,11 +8,8 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
-<<<<<<< HEAD
 
 import torch
-=======
->>>>>>> 9e4f60a (poses.json: a version in each entry, a JSON schema, data frames of poses and tables)
 
 from depthpose.core.errors import InputError
 from depthpose.core.frame import data_frame
