@@ -51,7 +51,7 @@ from depthpose.depth.predictions import (
 )
 from depthpose.depth.types import StereoInput
 from depthpose.report.depth import DepthShown, depth_section
-from depthpose.report.page import MOST_VIEWS, Section, spread_evenly, write_page
+from depthpose.report.page import MOST_VIEWS, Film, Section, spread_evenly, write_page
 from depthpose.report.viewer import Viewer, open_viewer
 
 PAGE = "report.html"
@@ -373,6 +373,9 @@ def write_depth_page(
         if path.is_file()
     ]
     sections = [Section(title="What is here", text=text, rows=noted)]
+    said = f"depth, {range_m[0]:g} m bright to {range_m[1]:g} m dark"
+    films = [Film(path=p, caption=f"{p.name}: {said}") for p in sorted(out.glob(f"*{_VIDEO}"))]
+    sections += [Section(title="Videos", films=films)] if films else []
     for pair in pairs:
         estimate = read_estimate(out, pair.name, pair.camera)
         shown = DepthShown(pair=pair, estimate=estimate, range_m=range_m)
