@@ -143,14 +143,11 @@ def test_many_at_once_are_each_as_alone(part: ObjectModel) -> None:
 def test_what_cannot_be_taken_costs_the_others_nothing(
     part: ObjectModel, threads: int, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """An unknown object and a mask of another size have a reason; the rest is as alone."""
+    """Unknown objects have a reason; the rest is as alone."""
     truth = pose_at()
     net = Oracle(tiny_weights(part), [truth])
     seen = CloudInput(name="seen", points_m=cloud_of(part, truth), object="bracket")
-    depth_m, mask = view_of(part, truth)
-    cut = ViewInput(
-        name="cut", depth_m=depth_m, mask=mask[1:], K=CAMERA.K.float(), object="bracket"
-    )
+    cut = dataclasses.replace(seen, name="cut", object="")
     inputs = [
         seen,
         dataclasses.replace(seen, name="foreign", object="brackte"),

@@ -470,7 +470,7 @@ def pipeline(
     model: str | Path | None = None,
     device: str | int | torch.device | None = None,
     *,
-    device_map: str | int | torch.device | None = None,
+    device_map: str | int | torch.device | Mapping[str, Any] | None = None,
     torch_dtype: str | torch.dtype | None = None,
     dtype: str | torch.dtype | None = None,
     batch_size: int = 1,
