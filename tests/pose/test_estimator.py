@@ -161,10 +161,6 @@ def test_what_cannot_be_taken_costs_the_others_nothing(
     assert "do not know it; did you mean 'bracket'" in found[1].reason
     assert_close(found[0], truth)
     assert_close(found[3], truth)
-    with pytest.raises(InputError, match=r"takes CloudInput and ViewInput .*, not a str"):
-        net.estimate_many(["seen.ply"])  # pyright: ignore[reportArgumentType]
-    with pytest.raises(InputError, match=r"give one as \[input\]"):
-        net.estimate_many(seen)  # pyright: ignore[reportArgumentType]
 
 
 def test_calls_of_the_network_are_bounded(part: ObjectModel) -> None:

@@ -8,7 +8,6 @@ from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import cast
 
 import torch
 from jaxtyping import Float
@@ -202,40 +201,35 @@ class GeoPoseNet(PoseEstimator):
         self, inputs: Iterable[AnyInput], threads: int, *, is_likely: bool = True
     ) -> Iterator[tuple[AnyInput, PoseEstimate, Voted | None]]:
         prepared = each_in_threads(self._prepare, inputs, threads)
+        work = partial(self._pose, is_likely=is_likely)
         for some in batches(prepared, self.config.batch_voxels):
-            seen = [one for one in some if isinstance(one.prepared, Prepared)]
-            work = partial(self._pose, is_likely=is_likely)
-            posed = each_in_threads(work, self._ask(seen), threads)
-            for one in some:
-                if isinstance(one.prepared, Prepared):
-                    yield one.given, *next(posed)
-                else:
-                    yield one.given, one.prepared, None
+            yield from each_in_threads(work, self._ask(some), threads)
 
     def _prepare(self, given: AnyInput) -> "_Cloud":
-        start = time.perf_counter()
-
         def prepare(given: AnyInput) -> Prepared | Refusal:
             model = self.weights.models[self._number(given.object)]
             return prepare_cloud(given, model, self.weights.cloud, self.config)
 
+        start = time.perf_counter()
         prepared = or_unreadable(prepare, given)
-        spent_s = time.perf_counter() - start
+        seconds = {"cloud": time.perf_counter() - start}
         if isinstance(prepared, Refusal):
-            prepared = refused(given, prepared, {"cloud": spent_s})
-        return _Cloud(given=given, prepared=prepared, spent_s=spent_s)
+            prepared = refused(given, prepared, seconds)
+        return _Cloud(given=given, prepared=prepared, seconds=seconds)
 
-    def _ask(self, clouds: list["_Cloud"]) -> Iterator["_Asked"]:
+    def _ask(self, clouds: list["_Cloud"]) -> Iterator["_Cloud"]:
         """Ask the network for clouds together; each has a share of the time."""
-        if not clouds:
-            return
-        numbers = [self._number(one.given.object) for one in clouds]
-        prepared = [cast(Prepared, one.prepared) for one in clouds]
-        outputs, spent_s = self._directions(prepared, numbers)
-        total = sum(map(len, outputs))
-        for one, cloud, output in zip(clouds, prepared, outputs, strict=True):
-            seconds = {"cloud": one.spent_s, "network": spent_s * len(output) / total}
-            yield _Asked(given=one.given, voted=Voted(cloud, output), seconds=seconds)
+        ready = [(one, one.prepared) for one in clouds if isinstance(one.prepared, Prepared)]
+        numbers = [self._number(one.given.object) for one, _ in ready]
+        outputs, spent_s = self._directions([p for _, p in ready], numbers) if ready else ([], 0.0)
+        total, left = sum(map(len, outputs)), iter(outputs)
+        for one in clouds:
+            if isinstance(one.prepared, Prepared):
+                own = next(left)
+                seconds = {**one.seconds, "network": spent_s * len(own) / total}
+                yield replace(one, outputs=own, seconds=seconds)
+            else:
+                yield one
 
     def _directions(
         self, clouds: list[Prepared], numbers: list[int]
@@ -244,28 +238,31 @@ class GeoPoseNet(PoseEstimator):
         found = network_directions(self._network, clouds, numbers, self.config.device)
         return found, time.perf_counter() - start
 
-    def _pose(self, asked: "_Asked", *, is_likely: bool) -> tuple[PoseEstimate, Voted]:
+    def _pose(
+        self, one: "_Cloud", *, is_likely: bool
+    ) -> tuple[AnyInput, PoseEstimate, Voted | None]:
+        if isinstance(one.prepared, PoseEstimate):
+            return one.given, one.prepared, None
+        assert one.outputs is not None, "asked before"
+        voted = Voted(one.prepared, one.outputs)
+
         def pose(given: AnyInput) -> PoseEstimate:
             number = self._number(given.object)
             known = (self.weights.models[number], self._surface(number), self._copies_of(number))
             return pose_from_directions(
-                asked.voted, known, self.weights.refusal, self.config, is_likely=is_likely
+                voted, known, self.weights.refusal, self.config, is_likely=is_likely
             )
 
-        found = or_unreadable(pose, asked.given)
-        seconds = {**asked.seconds, **found.seconds}
-        return replace(found, name=asked.given.name, seconds=seconds), asked.voted
+        found = or_unreadable(pose, one.given)
+        seconds = {**one.seconds, **found.seconds}
+        return one.given, replace(found, name=one.given.name, seconds=seconds), voted
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class _Cloud:
+    """An input on its way: a cloud, what the network says of it, the seconds; or a refusal."""
+
     given: AnyInput
     prepared: Prepared | PoseEstimate
-    spent_s: float
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class _Asked:
-    given: AnyInput
-    voted: Voted
     seconds: dict[str, float]
+    outputs: Float[Tensor, "n k c"] | None = None
