@@ -44,6 +44,7 @@ python_maximum_signature_line_length = 88
 html_theme = "furo"
 html_title = f"depthpose {release}"
 html_static_path = ["static"]
+html_extra_path = ["poses.schema.json"]
 html_css_files = ["site.css"]
 html_copy_source = False
 html_show_sourcelink = False

@@ -269,6 +269,11 @@ def test_a_video_keeps_one_scale(home: Path, tmp_path: Path) -> None:
     ):
         wanted = draw_depth(read_map(file), 1.0, 40.0)
         assert float((picture - wanted).abs().mean()) < 0.05, file
+    page = (tmp_path / "out" / "report.html").read_text()
+    assert (
+        page.count('<video controls muted loop preload="metadata" src="data:video/mp4;base64,') == 1
+    )
+    assert "drive.color.mp4: depth, 1 m bright to 40 m dark" in page
 
 
 def test_a_frame_of_a_video_that_is_refused_leaves_the_others(

@@ -245,6 +245,33 @@ def frames(folder: Path) -> list[str]:
     return [*words, "--camera", str(folder / "camera.json"), "--object", "bracket"]
 
 
+@pytest.mark.parametrize("with_mask", [True, False])
+def test_a_focal_length_is_enough_of_a_camera(
+    weights: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], *, with_mask: bool
+) -> None:
+    """The answer is that of a camera file with this focal length and a centred axis."""
+    words = frames(tmp_path)
+    centred = torch.tensor([[500.0, 0, 159.5], [0, 500, 119.5], [0, 0, 1]], dtype=torch.float64)
+    camera = Camera(width=320, height=240, K=centred, depth_unit_m=0.001)
+    write_camera(tmp_path / "camera.json", camera)
+    words = words if with_mask else words[:2] + words[4:]
+    at = words.index("--camera")
+    bare = [*words[:at], "--focal-px", "500", "--unit", "mm", *words[at + 2 :]]
+    given = ["pose", "predict", "--weights", str(weights), "--out"]
+    assert main([*given, str(tmp_path / "file"), *words]) == 0
+    assert main([*given, str(tmp_path / "bare"), *bare]) == 0
+    expected, found = poses_of(tmp_path / "file"), poses_of(tmp_path / "bare")
+    assert any(row["status"] == "ok" for row in found.values())
+    for name, row in found.items():
+        assert row["camera_from_model"] == expected[name]["camera_from_model"]
+    without_unit = [word for word in bare if word not in ("--unit", "mm")]
+    assert main([*given, str(tmp_path / "no unit"), *without_unit]) == 1
+    assert "its depth is in whole numbers, and nothing says of what" in capsys.readouterr().err
+    bare[bare.index("--focal-px") + 1] = "0"
+    assert main([*given, str(tmp_path / "zero"), *bare]) != 0
+    assert "focal_px is 0.0: not a focal length in pixels" in capsys.readouterr().err
+
+
 def test_a_changed_mask_is_noticed(
     weights: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -439,7 +466,10 @@ def test_two_processes_share_the_work(
         (["--cloud", ".", "--bop", "."], "2 of --cloud, --depth and --bop are given"),
         (["--cloud", "."], "the weights know bracket, bottle; say which by --object"),
         (["--cloud", ".", "--object", "bracke"], "did you mean 'bracket'?"),
-        (["--depth", ".", "--object", "bottle"], "--depth needs --camera beside it"),
+        (["--depth", ".", "--object", "bottle"], "--depth needs --camera or --focal-px beside it"),
+        (["--depth", ".", "--camera", ".", "--focal-px", "9"], "--camera and --focal-px are both"),
+        (["--cloud", ".", "--focal-px", "9"], "leave --focal-px out"),
+        (["--bop", ".", "--focal-px", "9"], "--focal-px beside --bop: a data set says its cameras"),
         (["--cloud", ".", "--object", "bottle"], "no .ply, .pcd, .npy, .xyz, .txt file there"),
         (["--cloud", ".", "--object", "bottle", "--batch", "0"], "--batch 0: at least 1 input"),
         (["--cloud", ".", "--mask", ".", "--camera", "."], "leave --mask and --camera out"),

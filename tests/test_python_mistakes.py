@@ -90,6 +90,15 @@ MISTAKES = {
         "depth.estimate(torch.rand(2, 3, 48, 64), camera)",
         "(2, 3, 48, 64), a batch; give one image, or the batch to estimate_many(batch, camera)",
     ),
+    "many files": (
+        "pose.estimate_many(['a.ply'])",
+        "estimate_many takes CloudInput and ViewInput of depthpose.pose.types, not a str; files",
+    ),
+    "one input": (
+        "pose.estimate_many(CloudInput(name='a', points_m=points, object='flange'))",
+        "estimate_many takes several inputs; give one as [input]",
+    ),
+    "no thread": ("depth.estimate_many([], K, threads=0)", "threads is 0; take 1 or more, 2 where"),
     "voting": ("VotingConfig(method='ransack')", "method is 'ransack'; did you mean 'ransac'?"),
     "inliers": ("VotingConfig(inlier_test='x')", "inlier_test is 'x'; Known: 'angle', 'distance'"),
     "diameters": ("EvaluationConfig(diameters='BOP')", "diameters is 'BOP'; Known: 'bop'"),
@@ -111,6 +120,7 @@ from depthpose.depth.config import GeneratorConfig
 from depthpose.depth.synthesis import UNetGenerator, make_synthesiser
 from depthpose.pose.config import EstimateConfig, EvaluationConfig, VotingConfig
 from depthpose.pose.mesh import read_model
+from depthpose.pose.types import CloudInput
 
 pose, depth = GeoPoseNet.load("parts"), FakestereoNet.load("default", allow_ood=True)
 K = [[50.0, 0.0, 31.5], [0.0, 50.0, 23.5], [0.0, 0.0, 1.0]]

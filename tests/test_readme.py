@@ -1,12 +1,17 @@
 """What the README tells a newcomer to type, typed."""
 
 import re
+from io import BytesIO
 from pathlib import Path
+from typing import Any
 
+import numpy as np
 import pytest
 from tests.pose.synthetic_objects import write_part
 from tests.written import ROOT, read_blocks, run
 from tests.written import commands as commands_of
+
+from depthpose.core.files import read_depth_png
 
 README = (ROOT / "README.md").read_text()
 
@@ -41,6 +46,23 @@ def test_the_python_lines_run_and_end_in_metres(demo_folder: Path, page: str) ->
             exec(block.code, names)  # the pages are ours
     assert names["depth_m"].ndim == 2  # pyright: ignore[reportAttributeAccessIssue]
     assert demo_folder.is_dir()
+
+
+def test_the_service_of_the_page_answers(demo_folder: Path) -> None:
+    """The page's own lines: many inputs with an error among them, and a service for a part."""
+    testclient = pytest.importorskip("starlette.testclient")
+    names: dict[str, Any] = {}
+    for block in read_blocks(ROOT / "docs/services.md"):
+        exec(block.code, names)  # the pages are ours
+    with testclient.TestClient(names["app"]) as client:
+        depth_m = read_depth_png(demo_folder / "out/demo/part/depth.png", 0.0001)
+        body = BytesIO()
+        np.save(body, depth_m.numpy())
+        rows = client.post("/find", content=body.getvalue()).json()
+        assert {row["status"] for row in rows} <= {"ok", "ambiguous"}
+        refused = client.post("/find", content=b"no numbers")
+        assert refused.status_code == 400
+        assert refused.json()["error"]
 
 
 @pytest.mark.slow

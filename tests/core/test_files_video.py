@@ -1,10 +1,11 @@
+import shutil
 import sys
 from pathlib import Path
 
 import pytest
 import torch
 
-from depthpose.core.errors import InputError, MissingExtraError
+from depthpose.core.errors import InputError, MissingExtraError, Notice
 from depthpose.core.files import read_video, write_image, write_video
 
 pytest.importorskip("cv2")
@@ -30,6 +31,45 @@ def test_a_video_keeps_its_frames_rate_and_colours(tmp_path: Path, suffix: str) 
         assert image.shape == written.shape
         assert float((image - written).abs().mean()) < 0.03
     assert [path.name for path in tmp_path.iterdir()] == [path.name]
+
+
+def test_a_browser_plays_what_is_written(tmp_path: Path) -> None:
+    """MPEG-4 (mp4v), which was written before, has no size in it: it does not play."""
+    sync_api = pytest.importorskip("playwright.sync_api")
+    chromium = shutil.which("chromium")
+    if chromium is None:
+        pytest.skip("no Chromium here")
+    write_video(tmp_path / "drive.mp4", moving_square(7), fps=12.5)
+    (tmp_path / "page.html").write_text('<video muted src="drive.mp4"></video>')
+    with sync_api.sync_playwright() as play:
+        browser = play.chromium.launch(executable_path=chromium, args=["--no-sandbox"])
+        page = browser.new_page()
+        page.goto((tmp_path / "page.html").as_uri())
+        seen = page.evaluate("""() => new Promise(done => {
+            const video = document.querySelector("video");
+            const say = () => done([video.videoWidth, video.videoHeight, video.currentTime > 0]);
+            video.onended = video.onerror = say;
+            video.play().catch(say);
+        })""")
+        browser.close()
+    assert seen == [64, 48, True]
+
+
+def test_an_opencv_without_vp9_writes_mpeg_4_and_says_so(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    import cv2
+
+    writer = cv2.VideoWriter
+
+    def without(path: str, codec: int, fps: float, size: tuple[int, int]) -> object:
+        is_vp9 = codec == cv2.VideoWriter_fourcc(*"vp09")  # pyright: ignore[reportAttributeAccessIssue]
+        return writer() if is_vp9 else writer(path, codec, fps, size)
+
+    monkeypatch.setattr(cv2, "VideoWriter", without)
+    with pytest.warns(Notice, match=r"v.mp4: OpenCV encodes no VP9 here, so it is MPEG-4"):
+        assert write_video(tmp_path / "v.mp4", moving_square(3), fps=10.0) == 3
+    assert len(list(read_video(tmp_path / "v.mp4"))) == 3
 
 
 def test_a_video_is_read_again_from_its_start(tmp_path: Path) -> None:

@@ -198,7 +198,10 @@ def test_every_way_refuses_a_pair_that_is_none_and_warns_of_doubt(how: str) -> N
             return net.estimate(left, right=right, name="street", with_check=with_check)
         if how == "estimate_pair":
             return net.estimate_pair(pair, with_check=with_check)
-        return net.estimate_many([pair], with_check=with_check)[0]
+        found = net.estimate_many([pair], with_check=with_check)[0]
+        if isinstance(found, InputError):
+            raise found
+        return found
 
     left, right = torch.rand(2, 3, 80, 120, generator=torch.Generator().manual_seed(0))
     with pytest.raises(InputError, match=r"street: the images do not belong together: 0 of \d+"):

@@ -1,8 +1,15 @@
 """One image: the virtual rig gives the scale, whatever camera took the image."""
 
+import base64
 import math
+import re
+import threading
+from collections.abc import Iterator
 from dataclasses import replace
+from functools import partial
+from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -31,7 +38,7 @@ from depthpose.depth.estimator.rig import join_matches
 from depthpose.depth.out_of_distribution import calibrate, measure_image_confidence, refuse_share
 from depthpose.depth.stereo import CallableMatcher, PSMNet, PSMNetMatcher
 from depthpose.depth.synthesis import SelectionGenerator, UNetGenerator, make_synthesiser
-from depthpose.depth.types import Match, StereoInput
+from depthpose.depth.types import DepthEstimate, Match, StereoInput
 from depthpose.depth.weights import read_generator, write_depth_weights
 
 
@@ -52,6 +59,15 @@ def camera(width: int, height: int, focal_px: float, baseline_m: float | None = 
     if baseline_m is None:
         return Camera(width=width, height=height, K=K)
     return StereoRig(width=width, height=height, K=K, baseline_m=baseline_m)
+
+
+def each_of(net: FakestereoNet, images: Any, **options: Any) -> list[DepthEstimate]:  # noqa: ANN401
+    """Estimate many, and raise the first error."""
+    found = net.estimate_many(images, **options)
+    for one in found:
+        if isinstance(one, InputError):
+            raise one
+    return [one for one in found if isinstance(one, DepthEstimate)]
 
 
 def by_brightness(left: Tensor, _: Tensor) -> Tensor:
@@ -211,7 +227,7 @@ def test_many_images_give_what_each_gives_alone(generator: UNetGenerator, tmp_pa
         )
         for k, (width, height) in enumerate(sizes)
     ]
-    many = net.estimate_many(inputs)
+    many = each_of(net, inputs, batch=3)
     assert len(many) == 4
     for given, together in zip(inputs, many, strict=True):
         alone = net.estimate_pair(given)
@@ -232,11 +248,67 @@ def test_among_many_a_pair_is_matched_with_its_right_view(
     rig = camera(60, 40, 100.0, baseline_m=0.2)
     alone = StereoInput(name="alone", left=left, right=None, camera=rig)
     pair = StereoInput(name="pair", left=left, right=right, camera=rig)
-    many = net.estimate_many([alone, pair, pair, alone], with_check=False)
+    many = each_of(net, [alone, pair, pair, alone], with_check=False, batch=4)
     for given, found in zip([alone, pair, pair, alone], many, strict=True):
         one = net.estimate_pair(given, with_check=False)
         torch.testing.assert_close(found.disparity_px, one.disparity_px, rtol=1e-4, atol=1e-4)
         assert (found.right is None) == (given.right is not None)
+
+
+@pytest.mark.parametrize(("batch", "threads"), [(1, 1), (1, 2), (3, 1), (2, 2)])
+def test_what_cannot_be_used_costs_the_others_nothing(
+    generator: UNetGenerator, tmp_path: Path, batch: int, threads: int
+) -> None:
+    """A file that is none, a broken array and a pair without a baseline, among images."""
+    net = FakestereoNet(CallableMatcher(by_brightness), make_synthesiser(generator))
+    good = torch.rand(3, 40, 60, generator=torch.Generator().manual_seed(0))
+    pair = StereoInput(name="pair", left=good, right=good, camera=camera(60, 40, 100.0))
+    given = [good, tmp_path / "none.png", good * 255, pair, good.flip(-1)]
+    found = net.estimate_many(given, focal_px=100.0, batch=batch, threads=threads)
+    errors = [str(one) for one in found if isinstance(one, InputError)]
+    assert [isinstance(one, InputError) for one in found] == [False, True, True, True, False]
+    for error, said in zip(errors, ["none.png", "divide 8-bit values", "no baseline"], strict=True):
+        assert said in error
+    for one, image in ((found[0], good), (found[4], good.flip(-1))):
+        assert isinstance(one, DepthEstimate)
+        expected = net.estimate(image, focal_px=100.0)
+        torch.testing.assert_close(one.disparity_px, expected.disparity_px, rtol=1e-4, atol=1e-4)
+
+
+@pytest.mark.parametrize("threads", [1, 2])
+def test_images_of_a_generator_are_taken_as_they_are_needed(
+    generator: UNetGenerator, threads: int, capsys: pytest.CaptureFixture[str]
+) -> None:
+    taken: list[int] = []
+    ahead: list[int] = []
+
+    def pictures() -> Iterator[Tensor]:
+        for k in range(20):
+            taken.append(k)
+            yield torch.full((3, 40, 60), 0.3 + 0.01 * k)
+
+    def noted(left: Tensor, right: Tensor) -> Tensor:
+        ahead.append(len(taken))
+        return by_brightness(left, right)
+
+    net = FakestereoNet(CallableMatcher(noted), make_synthesiser(generator))
+    cores = torch.get_num_threads()
+    found = net.estimate_many(pictures(), focal_px=100.0, threads=threads, with_progress=True)
+    assert torch.get_num_threads() == cores
+    assert all(count <= k + threads for k, count in enumerate(ahead, 1))
+    assert "20 images" in capsys.readouterr().err
+    means = [float(one.disparity_px.mean()) for one in found if isinstance(one, DepthEstimate)]
+    assert len(means) == 20
+    assert means == sorted(means)
+
+
+def test_no_batch_and_no_thread_are_refused(generator: UNetGenerator) -> None:
+    net = FakestereoNet(CallableMatcher(by_brightness), make_synthesiser(generator))
+    image = torch.rand(1, 3, 40, 60)
+    with pytest.raises(InputError, match="batch is 0; take 1 or more"):
+        net.estimate_many(image, focal_px=100.0, batch=0)
+    with pytest.raises(InputError, match="threads is 0; take 1 or more"):
+        net.estimate_many(image, focal_px=100.0, threads=0)
 
 
 @pytest.mark.parametrize("with_right", [False, True])
@@ -255,7 +327,7 @@ def test_values_that_are_no_picture_are_refused(
         sees = StereoInput(
             name="street", left=given, right=given.flip(-1) if with_right else None, camera=rig
         )
-        for estimate in (net.estimate_pair, lambda one: net.estimate_many([one])):
+        for estimate in (net.estimate_pair, lambda one: each_of(net, [one])):
             with pytest.raises(InputError, match="street: the .*" + message):
                 estimate(sees)
     slightly_above = image * 1.2 - 0.1  # as bicubic resizing leaves it
@@ -326,11 +398,11 @@ def test_a_batch_is_estimated_image_by_image(generator: UNetGenerator) -> None:
     batch = torch.rand(3, 3, 40, 60)
     alone = [net.estimate(image, focal_px=100.0) for image in batch]
     pixels = [image.permute(1, 2, 0).numpy() for image in batch]
-    for together in (net.estimate_many(batch, focal_px=100.0),
-                     net.estimate_many(pixels, camera(60, 40, 100.0))):  # fmt: skip
+    for together in (each_of(net, batch, focal_px=100.0),
+                     each_of(net, pixels, camera=camera(60, 40, 100.0))):  # fmt: skip
         for one, other in zip(alone, together, strict=True):
             torch.testing.assert_close(one.disparity_px, other.disparity_px, rtol=1e-4, atol=1e-4)
-    (single,) = net.estimate_many(batch[0], focal_px=100.0)
+    (single,) = each_of(net, batch[0], focal_px=100.0)
     torch.testing.assert_close(single.disparity_px, alone[0].disparity_px, rtol=1e-4, atol=1e-4)
 
 
@@ -354,6 +426,69 @@ def test_code_for_the_pipeline_of_transformers_runs(generator: UNetGenerator) ->
     with pytest.raises(InputError, match="task is 'image-segmentation'; Known: 'depth-estimation'"):
         depthpose.pipeline("image-segmentation")
     assert depthpose.pipeline("depth-estimation", device=-1).net.weights == "default"
+
+
+def test_the_pipeline_takes_what_that_of_transformers_takes(
+    generator: UNetGenerator, tmp_path: Path
+) -> None:
+    """An address, base64, a generator, images=, a batch: each as the picture itself."""
+    pipe = DepthPipeline(
+        FakestereoNet(CallableMatcher(by_brightness), make_synthesiser(generator)), batch_size=2
+    )
+    Image.fromarray(RGB).save(tmp_path / "street.png")
+    plain = base64.b64encode((tmp_path / "street.png").read_bytes()).decode()
+    serve = partial(SimpleHTTPRequestHandler, directory=str(tmp_path))
+    server = ThreadingHTTPServer(("127.0.0.1", 0), serve)
+    threading.Thread(target=server.serve_forever, daemon=True).start()
+    address = f"http://127.0.0.1:{server.server_port}/"
+    try:
+        expected = pipe(RGB, focal_px=100.0)
+        assert isinstance(expected, dict)
+        pictures = [address + "street.png", plain, "data:image/png;base64," + plain, RGB]
+        for found in (
+            pipe(images=pictures, focal_px=100.0, timeout=10.0),
+            pipe((one for one in pictures), focal_px=100.0, batch_size=3),
+        ):
+            several = list(found)
+            assert len(several) == 4
+            for one in several:
+                assert isinstance(one, dict)
+                torch.testing.assert_close(one["predicted_depth"], expected["predicted_depth"])
+        with pytest.raises(InputError, match=r"/none.png: is no picture that can be read .*404"):
+            pipe(address + "none.png")
+    finally:
+        server.shutdown()
+        server.server_close()
+    with pytest.raises(InputError, match=r"data:image/png;base64,AAAA.*: is no picture"):
+        pipe("data:image/png;base64," + "A" * 400)
+    with pytest.raises(InputError, match=r"street\.jpg: no such file"):
+        pipe("street.jpg")
+    with pytest.raises(InputError, match="as the first argument or as images="):
+        pipe()
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        ({"torch_dtype": torch.float16}, "torch_dtype is torch.float16; networks run in float32"),
+        ({"dtype": "bfloat16"}, "torch_dtype is bfloat16; networks run in float32, omit it"),
+        ({"device": 0, "device_map": "auto"}, "device and device_map are both given"),
+        ({"device_map": {"": 0}}, "device_map is a mapping; the networks go to one device"),
+        ({"revision": "main"}, "revision is no option here; leave it out"),
+    ],
+)
+def test_what_the_pipeline_cannot_take_is_one_clear_line(
+    options: dict[str, Any], said: str
+) -> None:
+    with pytest.raises(InputError, match=f"^pipeline: {re.escape(said)}"):
+        depthpose.pipeline("depth-estimation", **options)
+
+
+def test_options_of_transformers_that_change_nothing_are_taken() -> None:
+    pipe = depthpose.pipeline(
+        "depth-estimation", device_map="cpu", torch_dtype="auto", batch_size=4, token=None
+    )
+    assert (pipe.net.weights, pipe.batch_size) == ("default", 4)
 
 
 def constant_matcher(disparity_px: float) -> CallableMatcher:
@@ -427,7 +562,7 @@ def test_a_generator_with_an_answer_of_its_own_needs_no_matcher(tmp_path: Path) 
     assert found is not None
     assert float(found.mean()) == pytest.approx(FOCAL_PX * BASELINE_M / 4, rel=1e-4)
     pair = StereoInput(name="street", left=image, right=image.flip(-1), camera=rig)
-    for estimate in (net.estimate_pair, lambda one: net.estimate_many([one])):
+    for estimate in (net.estimate_pair, lambda one: each_of(net, [one])):
         with pytest.raises(InputError, match=r"street: .*a pair needs a matcher.*matcher='sgbm'"):
             estimate(pair)
 

@@ -139,6 +139,30 @@ def test_many_at_once_are_each_as_alone(part: ObjectModel) -> None:
             assert torch.equal(alone.camera_from_model.t_m, found.camera_from_model.t_m)
 
 
+@pytest.mark.parametrize("threads", [1, 2])
+def test_what_cannot_be_taken_costs_the_others_nothing(
+    part: ObjectModel, threads: int, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Unknown objects have a reason; the rest is as alone."""
+    truth = pose_at()
+    net = Oracle(tiny_weights(part), [truth])
+    seen = CloudInput(name="seen", points_m=cloud_of(part, truth), object="bracket")
+    cut = dataclasses.replace(seen, name="cut", object="")
+    inputs = [
+        seen,
+        dataclasses.replace(seen, name="foreign", object="brackte"),
+        cut,
+        dataclasses.replace(seen, name="s"),
+    ]
+    found = net.estimate_many((one for one in inputs), threads=threads, with_progress=True)
+    assert "4 poses" in capsys.readouterr().err
+    assert [one.name for one in found] == ["seen", "foreign", "cut", "s"]
+    assert [one.status for one in found] == ["ok", "unreadable", "unreadable", "ok"]
+    assert "do not know it; did you mean 'bracket'" in found[1].reason
+    assert_close(found[0], truth)
+    assert_close(found[3], truth)
+
+
 def test_calls_of_the_network_are_bounded(part: ObjectModel) -> None:
     truth = pose_at()
     net = Oracle(tiny_weights(part), [truth], config=EstimateConfig(batch_voxels=1))

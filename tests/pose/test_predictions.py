@@ -1,7 +1,9 @@
 import json
+import sys
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Any, get_args
 
 import pytest
 import torch
@@ -9,6 +11,7 @@ import torch
 from depthpose.core.errors import InputError, Notice
 from depthpose.core.rigid import Rigid, perturb
 from depthpose.pose.predictions import (
+    VERSION,
     Job,
     Place,
     Prediction,
@@ -19,7 +22,7 @@ from depthpose.pose.predictions import (
     write_bop_results,
     write_predictions,
 )
-from depthpose.pose.types import Alternative, Fit, Identity, PoseEstimate
+from depthpose.pose.types import Alternative, Fit, Identity, PoseEstimate, Status
 
 
 def some_pose(seed: int) -> Rigid:
@@ -170,3 +173,66 @@ def test_damaged_results_are_made_again_with_a_notice(tmp_path: Path, content: s
     (tmp_path / "poses.json").write_text(content)
     with pytest.warns(Notice, match=r"poses\.json.* it is damaged, and made again"):
         assert kept_predictions(tmp_path) == []
+
+
+def schema() -> dict[str, Any]:
+    return json.loads((Path(__file__).parents[2] / "docs/poses.schema.json").read_text())
+
+
+def test_the_schema_describes_what_is_written(tmp_path: Path) -> None:
+    """Every kind of estimate is valid by it; another version, name or shape is not."""
+    jsonschema = pytest.importorskip("jsonschema")
+    tracked = replace(answer("t", 2), tracking="tracked", camera_from_model=some_pose(2))
+    sent = [
+        Prediction(estimate=answer(), place=Place(1, 20, 6)),
+        Prediction(estimate=refusal(), place=Place(1, 20, 5)),
+        Prediction(estimate=tracked),
+        Prediction(estimate=replace(answer("bare"), covariance=None, fit=None, identity=None)),
+        Prediction(estimate=replace(answer("far"), residual_m=torch.inf)),
+    ]
+    write_predictions(tmp_path, sent)
+    rows = json.loads((tmp_path / "poses.json").read_text())
+    validator = jsonschema.Draft202012Validator(schema())
+    validator.check_schema(schema())
+    assert [error.message for error in validator.iter_errors(rows)] == []
+    broken = [
+        {"version": 2},
+        {"status": "fine"},
+        {"camera_from_model": [[1, 0, 0], [0, 1, 0], [0, 0, 1]]},
+        {"certainty": 1.5},
+        {"pose": None},
+    ]
+    for change in broken:
+        assert not validator.is_valid([rows[0] | change]), change
+    for name in ("version", "reason", "alternatives"):
+        assert not validator.is_valid([{k: v for k, v in rows[0].items() if k != name}]), name
+
+
+def test_the_schema_knows_every_status() -> None:
+    known = schema()["$defs"]["estimate"]["properties"]
+    assert tuple(known["status"]["enum"]) == get_args(Status)
+    assert known["version"] == {"const": VERSION}
+
+
+def test_another_version_is_refused_and_none_is_taken(tmp_path: Path) -> None:
+    write_predictions(tmp_path, [Prediction(estimate=answer())])
+    (row,) = json.loads((tmp_path / "poses.json").read_text())
+    assert row.pop("version") == VERSION
+    (tmp_path / "poses.json").write_text(json.dumps([row]))
+    assert read_predictions(tmp_path)[0].estimate.name == "a"
+    (tmp_path / "poses.json").write_text(json.dumps([row | {"version": 2}]))
+    with pytest.raises(InputError, match="entry 0: version is 2, and this depthpose reads 1"):
+        read_predictions(tmp_path)
+
+
+def test_estimates_become_a_data_frame(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    pytest.importorskip("pandas")
+    write_predictions(tmp_path, [Prediction(estimate=answer()), Prediction(estimate=refusal())])
+    frame = read_predictions(tmp_path).to_frame()
+    assert list(frame["name"]) == ["a", "b"]
+    assert list(frame["status"]) == ["ok", "too few points"]
+    assert frame["fit.agrees"][0] == 0.875
+    assert frame["seconds.voting"][0] == 0.007
+    monkeypatch.setitem(sys.modules, "pandas", None)
+    with pytest.raises(ImportError, match=r"a data frame needs pandas, .*: pip install pandas"):
+        read_predictions(tmp_path).to_frame()

@@ -52,6 +52,23 @@ def test_poses_of_a_part_that_no_training_saw_are_right_or_refused() -> None:
         assert {"voting", "icp", "check"} <= one.seconds.keys()
 
 
+def test_what_it_registers_is_said() -> None:
+    assert repr(registration()) == "Registration(of connector)"
+
+
+def test_two_threads_give_what_one_gives_and_an_error_costs_nothing() -> None:
+    given = [view(part(), index).input for index in range(3)]
+    given.insert(1, replace(given[0], object="conector"))
+    alone = registration().estimate_many(given)
+    together = registration().estimate_many(iter(given), threads=2)
+    assert alone[1].status == together[1].status == "unreadable"
+    assert "did you mean 'connector'" in alone[1].reason
+    for one, other in zip(alone, together, strict=True):
+        assert one.status == other.status
+        if one.camera_from_model is not None and other.camera_from_model is not None:
+            assert torch.equal(one.camera_from_model.t_m, other.camera_from_model.t_m)
+
+
 @pytest.mark.parametrize("index", range(3))
 def test_a_foreign_part_is_refused(index: int) -> None:
     foreign = make_part("mug") if index == 0 else random_part(torch.Generator().manual_seed(index))

@@ -18,10 +18,12 @@ import torch
 from httpx2 import Response
 from starlette.testclient import TestClient
 from tests.depth.constant_selection import sure_of
+from tests.pose.synthetic_objects import CAMERA, pose_at, view_of
 from tests.web.samples import PART, write_street, write_view
 
+from depthpose.core.camera import write_camera
 from depthpose.core.errors import InputError
-from depthpose.core.files import write_map
+from depthpose.core.files import write_depth_png, write_map
 from depthpose.core.rigid import Rigid
 from depthpose.depth.estimator import FakestereoNet
 from depthpose.depth.stereo import CallableMatcher, LightMatcher
@@ -412,6 +414,28 @@ def test_a_depth_image_without_a_mask_is_searched(
     assert row["status"] == "ok", row["reason"]
     off_m = torch.tensor(row["camera_from_model"])[:3, 3] - truth.t_m
     assert float(off_m.norm()) < 0.005
+
+
+def test_every_instance_of_an_image_is_shown_and_taken_away(
+    page: TestClient, tmp_path: Path
+) -> None:
+    """Two of one part, side by side: a row, a layer and a file for each, one zip of all."""
+    poses = (pose_at(-0.13, 0.7, seed=1), pose_at(0.12, 0.8, seed=2))
+    seen, mask = view_of(make_part(PART), *poses)
+    wall = torch.full(mask.shape, 1.2)
+    write_depth_png(tmp_path / "depth.png", torch.where(mask, seen.float(), wall), 0.0001)
+    write_camera(tmp_path / "view.json", replace(CAMERA, depth_unit_m=0.0001))
+    found = ask(page, "pose", tmp_path, VIEW_ALONE, object=PART).json()
+    names = [row[0] for row in found["tables"]["found in this image"][1:]]
+    assert names == ["depth_0", "depth_1"]
+    files = {one["name"] for one in found["files"]}
+    assert files == {"poses.json", "depth.pose.png", "depth_0.pose.ply", "depth_1.pose.ply"}
+    assert "depth_1" in [layer["name"] for layer in found["scene"]["layers"]]
+    zipped = zipfile.ZipFile(io.BytesIO(page.get("/" + found["folder"] + "all.zip").content))
+    assert set(zipped.namelist()) == files
+    rows = json.loads(zipped.read("poses.json"))
+    places = torch.tensor([row["camera_from_model"] for row in rows])[:, :3, 3]
+    assert float((places[0] - places[1]).norm()) > 0.1
 
 
 @pytest.mark.parametrize(

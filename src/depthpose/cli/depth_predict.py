@@ -51,7 +51,7 @@ from depthpose.depth.predictions import (
 )
 from depthpose.depth.types import StereoInput
 from depthpose.report.depth import DepthShown, depth_section
-from depthpose.report.page import MOST_VIEWS, Section, spread_evenly, write_page
+from depthpose.report.page import MOST_VIEWS, Film, Section, spread_evenly, write_page
 from depthpose.report.viewer import Viewer, open_viewer
 
 PAGE = "report.html"
@@ -286,29 +286,31 @@ class Predictor:
         return StereoInput(name=name, left=image, right=None, camera=self.lens.camera_of(image))
 
     def _predict_chunk(self, inputs: list[StereoInput]) -> list[str]:
-        """Predict inputs together; where one of them is unusable, each alone."""
+        """Predict inputs together, and write what is found of each."""
         with_cloud, color_range = self.output.cloud, self.output.color_range
         wanted = [i for i in inputs if not is_finished(self.out, i.name, with_cloud=with_cloud)]
-        try:
-            distance = self.lens.scale.distance
-            for image, estimate in zip(wanted, self.net.estimate_many(wanted), strict=True):
+        distance = self.lens.scale.distance
+        found = self.net.estimate_many(wanted, batch=self.output.batch)
+        for image, one in zip(wanted, found, strict=True):
+            try:
+                if isinstance(one, InputError):
+                    raise one
+                estimate = one
                 if distance is not None:
-                    estimate = scale_by_distance(estimate, image.name, distance)  # noqa: PLW2901
+                    estimate = scale_by_distance(one, image.name, distance)
                 cloud_m = CLOUD_M if with_cloud else None
                 files = write_estimate(self.out, image, estimate, color_range, cloud_m)
                 note_result(self.out, image.name, files)
-                if estimate.warning:
-                    tqdm.write(f"depthpose: warning: {image.name}: {estimate.warning}", sys.stderr)
-                if estimate.ground is not None:
-                    tqdm.write(f"{image.name}: {estimate.ground}")
-                if self.viewer is not None:
-                    self.viewer.show_depth(image, estimate)
-        except InputError as error:
-            if len(inputs) > 1:
-                return [name for image in inputs for name in self._predict_chunk([image])]
-            self.failures[inputs[0].name] = error
-            return []
-        return [image.name for image in inputs]
+            except InputError as error:
+                self.failures[image.name] = error
+                continue
+            if estimate.warning:
+                tqdm.write(f"depthpose: warning: {image.name}: {estimate.warning}", sys.stderr)
+            if estimate.ground is not None:
+                tqdm.write(f"{image.name}: {estimate.ground}")
+            if self.viewer is not None:
+                self.viewer.show_depth(image, estimate)
+        return [image.name for image in inputs if image.name not in self.failures]
 
 
 def _size_of(source: Path) -> tuple[int, int]:
@@ -371,6 +373,9 @@ def write_depth_page(
         if path.is_file()
     ]
     sections = [Section(title="What is here", text=text, rows=noted)]
+    said = f"depth, {range_m[0]:g} m bright to {range_m[1]:g} m dark"
+    films = [Film(path=p, caption=f"{p.name}: {said}") for p in sorted(out.glob(f"*{_VIDEO}"))]
+    sections += [Section(title="Videos", films=films)] if films else []
     for pair in pairs:
         estimate = read_estimate(out, pair.name, pair.camera)
         shown = DepthShown(pair=pair, estimate=estimate, range_m=range_m)

@@ -68,7 +68,7 @@ def predict(
             f"--cloud {inputs.cloud}: the weights {weights} need depth images; give --depth, "
             "--mask and --camera, or weights that vote"
         )
-    if inputs.depth is not None and inputs.mask is None and inputs.camera is not None:
+    if inputs.depth is not None and inputs.mask is None and inputs.lens is not None:
         if view is not None:
             raise InputError("--view shows inputs that have a mask; omit it, or give --mask")
         return find_all(method, inputs, Path(out))

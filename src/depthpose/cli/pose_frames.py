@@ -62,7 +62,8 @@ def find_all(method: PoseMethod, inputs: OneObjectOptions, out: Path) -> int:
             images of one name.
     """
     assert inputs.depth is not None
-    assert inputs.camera is not None
+    lens = inputs.lens
+    assert lens is not None
     if inputs.object is None:
         objects = tuple(model.name for model in method.models)
     else:
@@ -77,7 +78,7 @@ def find_all(method: PoseMethod, inputs: OneObjectOptions, out: Path) -> int:
     if find_rank().world > 1:
         raise InputError("--depth without --mask is done by one process; give --mask, or start one")
     depth, unit = Path(inputs.depth), inputs.unit
-    jobs = frame_jobs(depth, inputs.camera, objects[0], unit, out)
+    jobs = frame_jobs(depth, lens, objects[0], unit, out)
     names = {job.name for job in jobs}
     for name in sorted(names):
         if (plain := re.sub(r"_\d+$", "", name)) != name and plain in names:
@@ -85,7 +86,7 @@ def find_all(method: PoseMethod, inputs: OneObjectOptions, out: Path) -> int:
                 f"two depth images are called {plain!r} and {name!r}, and so would be what is "
                 "found in the first; rename one"
             )
-    facts = camera_facts(inputs.camera) | ({} if unit is None else {"unit": unit})
+    facts = camera_facts(lens) | ({} if unit is None else {"unit": unit})
     settings = {**method.settings, "find": sorted(objects), **facts}
     claim(out, settings, jobs, depth, is_result_of)
     results = _find_left(jobs, objects, method, out)

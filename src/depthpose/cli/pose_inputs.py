@@ -92,13 +92,20 @@ def cloud_jobs(cloud: Path, unit: Unit, object: str, out: Path) -> list[Job[Any]
     return [_file_job(p, object, cloud_input, unit, object, p.stem) for p in files]
 
 
-def camera_facts(camera: Path) -> dict[str, str]:
-    """Give what of a camera file decides the poses, for the record of a run."""
+def camera_facts(camera: Path | float) -> dict[str, Any]:
+    """Give what of a camera file, or a focal length, decides the poses, for the record of a run."""
+    if not isinstance(camera, Path):
+        return {"focal_px": camera}
     return {"camera": str(camera.resolve()), "camera_sha256": file_sha256(camera)}
 
 
 def view_jobs(
-    depth: Path, mask: Path, camera: Path, object: str, unit: Unit | None, out: Path
+    depth: Path,
+    mask: Path,
+    camera: Path | float,
+    object: str,
+    unit: Unit | None,
+    out: Path,
 ) -> list[Job[Any]]:
     """Take a depth image, its mask and its camera, or images and masks of one name in two folders.
 
@@ -149,7 +156,7 @@ def _masks_of(path: Path) -> dict[str, AnyMask]:
 
 
 def frame_jobs(
-    depth: Path, camera: Path, object: str, unit: Unit | None, out: Path
+    depth: Path, camera: Path | float, object: str, unit: Unit | None, out: Path
 ) -> list[Job[Any]]:
     """Take whole depth images, without masks.
 

@@ -108,10 +108,23 @@ class OneObjectOptions:
     camera: Path | None = None
     """of the depth images; JSON file: {"width", "height", "K": 3x3, "depth_unit_m"}, or that of
     BOP, TUM RGB-D, ROS, OpenCV, KITTI or Middlebury."""
+    focal_px: float | None = None
+    """focal length of the depth images [px], in place of --camera; the axis meets their centre."""
     object: str | None = None
     """which of the objects that are known; of a data set its name or number, all by default."""
     unit: Unit | None = None
     """unit of clouds (default m), and of depth images whose camera file gives none."""
+
+    @property
+    def lens(self) -> Path | float | None:
+        """The camera file, or the focal length; None where neither is given.
+
+        Raises:
+            InputError: both are.
+        """
+        if self.camera is not None and self.focal_px is not None:
+            raise InputError("--camera and --focal-px are both given; omit one of the two")
+        return self.focal_px if self.camera is None else self.camera
 
 
 @group
@@ -194,7 +207,7 @@ def refuse_mixture(inputs: OneObjectOptions, dataset: DataSetOptions) -> None:
             f"{count} of --cloud, --depth and --bop are given; give one: a cloud, a depth image "
             "with --mask and --camera, or a data set"
         )
-    beside = {"mask": inputs.mask, "camera": inputs.camera}
+    beside = {"mask": inputs.mask, "camera": inputs.camera, "focal-px": inputs.focal_px}
     if dataset.bop is not None:
         refuse_beside("--bop", {**beside, "unit": inputs.unit})
     elif dataset != DataSetOptions():

@@ -139,12 +139,14 @@ def predict_files(
         unit = inputs.unit or "m"
         jobs = cloud_jobs(Path(inputs.cloud), unit, name, out)
         settings |= {"unit": unit}
-    elif inputs.depth is None or inputs.mask is None or inputs.camera is None:
-        raise InputError("--depth needs --camera beside it, and --mask unless it is to be found")
+    elif inputs.depth is None or inputs.mask is None or inputs.lens is None:
+        raise InputError(
+            "--depth needs --camera or --focal-px beside it, and --mask unless it is to be found"
+        )
     else:
         mask = Path(inputs.mask)
-        jobs = view_jobs(Path(inputs.depth), mask, inputs.camera, name, inputs.unit, out)
-        settings |= camera_facts(inputs.camera) | {"mask": str(mask.resolve())}
+        jobs = view_jobs(Path(inputs.depth), mask, inputs.lens, name, inputs.unit, out)
+        settings |= camera_facts(inputs.lens) | {"mask": str(mask.resolve())}
         settings |= {} if inputs.unit is None else {"unit": inputs.unit}
     claim(out, settings, jobs, Path(inputs.cloud or inputs.depth or out))
     predictions = predict_all(method, jobs, out, settings, batch, view)

@@ -15,7 +15,7 @@ from depthpose.cli.engine import EngineOptions, Inputs, run, say
 from depthpose.cli.pose_inputs import bop_jobs, estimate_jobs, input_job, object_named
 from depthpose.cli.pose_methods import MethodSource, PoseMethod, find_masks
 from depthpose.cli.pose_options import DataSetOptions, OneObjectOptions
-from depthpose.core.camera import Camera, read_camera
+from depthpose.core.camera import Camera, camera_of
 from depthpose.core.config import config_to_dict
 from depthpose.core.engine import Files, Function, Item, Sample, is_url, shard_results, stem
 from depthpose.core.errors import InputError
@@ -122,8 +122,8 @@ def predict_on_ray(
     options: OneObjectOptions, source: MethodSource, batch: int, out: str, engine: EngineOptions
 ) -> int:
     """Pose clouds, depth images and masks, manifests or tar shards by the workers of an engine."""
-    if options.depth is not None and options.camera is None:
-        raise InputError("--depth needs --camera beside it")
+    if options.depth is not None and options.lens is None:
+        raise InputError("--depth needs --camera or --focal-px beside it")
     files = cloud_files() if options.depth is None else VIEW_FILES
     words = [word for word in (options.cloud, options.depth, options.mask) if word is not None]
     inputs = Inputs.find(words, files)
@@ -137,8 +137,8 @@ def predict_on_ray(
     method = source.build("cpu")
     object = object_named(options.object or None, method)
     with inputs.first() as first:
-        size = None if options.camera is None else image_size(first[0])
-        camera = None if options.camera is None else read_camera(options.camera, size)
+        lens = options.lens
+        camera = None if lens is None else camera_of(lens, image_size(first[0]))
     work = PoseWork(
         source=source, object=object, unit=options.unit, camera=camera, files=files, batch=batch
     )

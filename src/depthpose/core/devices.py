@@ -2,7 +2,9 @@
 
 import os
 import warnings
-from collections.abc import Iterator
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import ExitStack, contextmanager, nullcontext
 from functools import cache, partial
 from typing import TypeVar, cast
@@ -11,6 +13,7 @@ import torch
 
 from depthpose.core.errors import InputError, Notice
 
+Given = TypeVar("Given")
 Made = TypeVar("Made")
 
 
@@ -52,6 +55,39 @@ def each_in_own_arithmetic(made: Iterator[Made]) -> Iterator[Made]:
         if one is nothing:
             return
         yield cast(Made, one)
+
+
+def each_in_threads(
+    work: Callable[[Given], Made], given: Iterable[Given], threads: int
+) -> Iterator[Made]:
+    """Do work for each of what is given, in its order, without gradients.
+
+    No more is taken at a time than the threads work at; they share torch's processor cores.
+
+    Raises:
+        InputError: fewer than one thread.
+    """
+    if threads < 1:
+        raise InputError(f"threads is {threads}; take 1 or more, 2 where two cores are free")
+    quiet = torch.no_grad()(work)
+    if threads == 1:
+        yield from map(quiet, given)
+        return
+    cores = torch.get_num_threads()
+    waiting: deque[Future[Made]] = deque()
+    share = (max(1, cores // threads),)
+    with ThreadPoolExecutor(threads, initializer=torch.set_num_threads, initargs=share) as pool:
+        try:
+            for one in given:
+                waiting.append(pool.submit(quiet, one))
+                if len(waiting) == threads:
+                    yield waiting.popleft().result()
+            while waiting:
+                yield waiting.popleft().result()
+        finally:
+            for future in waiting:
+                future.cancel()
+            torch.set_num_threads(cores)
 
 
 @cache

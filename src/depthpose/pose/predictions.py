@@ -20,6 +20,7 @@ from depthpose.core.files import write_json
 from depthpose.core.files.disk import refused_as, write_bytes
 from depthpose.core.files.store import read_bytes
 from depthpose.core.files.text import refuse_heavy
+from depthpose.core.frame import data_frame
 from depthpose.core.rigid import Rigid
 from depthpose.core.run import claim_folder
 from depthpose.pose.datasets import BopDataset, Detection, Instance, read_mask
@@ -37,6 +38,8 @@ from depthpose.pose.types import (
 
 AnswerT = TypeVar("AnswerT", Fit, Identity)
 POSES = "poses.json"
+VERSION = 1
+"""Of an entry of ``poses.json``; ``docs/poses.schema.json`` describes it."""
 PICTURE, CLOUD = "pose.png", "pose.ply"
 """What follows ``NAME.`` in the names of the files that show a pose."""
 STAGES = ("segmentation", "cloud", "network", "voting", "svd", "icp", "check", "registration")
@@ -67,6 +70,20 @@ class Prediction:
     place: Place | None = None
 
 
+class Predictions(list[Prediction]):
+    """Estimates in their order, which pandas may tabulate."""
+
+    def to_frame(self) -> Any:  # noqa: ANN401  pandas is no dependency
+        """Give a ``pandas.DataFrame``: a row an estimate, the columns those of ``poses.json``.
+
+        What has names itself is a column each, such as ``fit.agrees`` and ``seconds.icp``.
+
+        Raises:
+            ImportError: pandas is not installed.
+        """
+        return data_frame(prediction_row(one) for one in self)
+
+
 def place_of(instance: Instance) -> Place:
     """Say where an annotated object belongs."""
     return Place(instance.scene_id, instance.image_id, instance.object_id)
@@ -91,14 +108,15 @@ def write_predictions(folder: Path, predictions: Iterable[Prediction]) -> None:
     write_json(folder / POSES, [prediction_row(prediction) for prediction in predictions])
 
 
-def read_predictions(folder: Path) -> list[Prediction]:
+def read_predictions(folder: Path) -> Predictions:
     """Read what :func:`write_predictions` wrote.
 
     Raises:
         InputError: the file is missing or damaged, or two estimates have one name.
     """
     path = folder / POSES
-    found = [parse_prediction(row, f"{path}: entry {i}") for i, row in enumerate(read_rows(path))]
+    rows = enumerate(read_rows(path))
+    found = Predictions(parse_prediction(row, f"{path}: entry {i}") for i, row in rows)
     names: set[str] = set()
     for prediction in found:
         name = prediction.estimate.name
@@ -131,7 +149,7 @@ def prediction_row(prediction: Prediction) -> dict[str, Any]:
     """Give the JSON values of an entry of ``poses.json``."""
     estimate, place = prediction.estimate, prediction.place
     pose = estimate.camera_from_model
-    row: dict[str, Any] = {"name": estimate.name, "object": estimate.object}
+    row: dict[str, Any] = {"version": VERSION, "name": estimate.name, "object": estimate.object}
     row |= dict(zip(_PLACE, place, strict=True)) if place is not None else {}
     row |= {"status": estimate.status, "reason": estimate.reason}
     row["camera_from_model"] = None if pose is None else _matrix(pose)
@@ -180,6 +198,11 @@ def parse_prediction(row: dict[str, Any], source: str) -> Prediction:
     Raises:
         InputError: a value is missing or impossible.
     """
+    if row.get("version", VERSION) != VERSION:
+        raise InputError(
+            f"{source}: version is {row['version']!r}, and this depthpose reads {VERSION}; read it "
+            "with the depthpose that wrote it, or a newer one"
+        )
     name, what = row.get("name"), row.get("object")
     if not isinstance(name, str) or not isinstance(what, str):
         raise InputError(f"{source}: name and object are {name!r} and {what!r}; write two words")

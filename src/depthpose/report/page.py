@@ -12,6 +12,7 @@ from dataclasses import dataclass, field
 from importlib.resources import files
 from pathlib import Path
 from typing import Any, Literal
+from urllib.parse import quote
 
 import numpy as np
 import torch
@@ -222,6 +223,8 @@ _MOST_PIXELS = 480_000
 _QUALITY = 85
 _MOST_BYTES = 250_000
 """Largest picture file that goes onto a page as it is."""
+_MOST_FILM_BYTES = 8_000_000
+"""Largest video file on a page; a larger one is shown from beside it."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -270,8 +273,23 @@ class Drawing:
 
 
 @dataclass(frozen=True, kw_only=True)
+class Film:
+    """A video file beside the page; a small one is on the page itself."""
+
+    path: Path
+    caption: str
+
+    @property
+    def address(self) -> str:
+        """Its bytes as a ``data:`` address, or its name."""
+        if self.path.stat().st_size > _MOST_FILM_BYTES:
+            return quote(self.path.name)
+        return "data:video/mp4;base64," + base64.b64encode(self.path.read_bytes()).decode()
+
+
+@dataclass(frozen=True, kw_only=True)
 class Section:
-    """A part of a page, in this order: its heading, a paragraph, names and values, pictures.
+    """A part of a page, in this order: its heading, a paragraph, names and values, pictures, films.
 
     Then a table that sorts, small tables by what they show (rows of equal length), and 3D views.
     """
@@ -280,6 +298,7 @@ class Section:
     text: str = ""
     facts: Sequence[tuple[str, str]] = ()
     pictures: Sequence[Picture | Drawing] = field(default_factory=tuple)
+    films: Sequence[Film] = ()
     rows: Sequence[Row] = ()
     tables: Mapping[str, Sequence[Sequence[str]]] = field(default_factory=dict)
     scenes: Sequence[Scene] = field(default_factory=tuple)

@@ -1,12 +1,10 @@
 """The tab Pose: a depth image or cloud of a known object to its pose, or why there is none."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any, cast
-
-from jaxtyping import Float
-from torch import Tensor
 
 from depthpose.core.camera import Camera, write_camera
 from depthpose.core.errors import InputError, refuse_unknown
@@ -21,8 +19,9 @@ from depthpose.core.units import METRES, Unit
 from depthpose.pose.cloud import object_points
 from depthpose.pose.config import EstimateConfig, ObjectsConfig
 from depthpose.pose.datasets.write import write_mask
-from depthpose.pose.estimator import GeoPoseNet, Registration
+from depthpose.pose.estimator import CloudDirections, GeoPoseNet, Registration
 from depthpose.pose.estimator.answer import with_status
+from depthpose.pose.estimator.base import answered
 from depthpose.pose.estimator.find import explained_mask, nothing_found
 from depthpose.pose.estimator.inputs import cloud_input, view_input
 from depthpose.pose.mesh import (
@@ -35,6 +34,7 @@ from depthpose.pose.mesh import (
 from depthpose.pose.predictions import CLOUD, PICTURE, Prediction, write_predictions
 from depthpose.pose.synthetic import make_frames
 from depthpose.pose.types import CloudInput, ObjectModel, PoseEstimate, ViewInput
+from depthpose.report.page import Layer, Scene
 from depthpose.report.pose import (
     draw_pose,
     grey_depth,
@@ -71,6 +71,14 @@ class _Target:
     how: str
 
 
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _Seen:
+    """What was posed, and its answer."""
+
+    given: CloudInput | ViewInput
+    found: PoseEstimate
+
+
 def answer_pose(form: Form, net: GeoPoseNet) -> Answer:
     """Pose what a form asks for.
 
@@ -78,62 +86,78 @@ def answer_pose(form: Form, net: GeoPoseNet) -> Answer:
         InputError: a file that cannot be read, or an object that is unknown.
     """
     target = _target(form, net)
-    seen = _input(form, target.model)
-    estimate = voted = None
+    given = _input(form, target.model)
+    name, voted = given.name, None
     if "depth" in form.files and "mask" not in form.files:
-        # Without a mask the object is searched for; the mask is what its best pose explains.
-        assert isinstance(seen, ViewInput)
-        answers = target.net.find_in(seen, [target.model.name])
-        estimate = nothing_found(seen, target.model.name)
-        if answers:
-            estimate = replace(answers[0], name=seen.name)
-            assert estimate.camera_from_model is not None
-            mask = explained_mask(seen, estimate.camera_from_model, target.model)
-            seen = replace(seen, mask=mask)
-    points_m = object_points(seen, target.model.diameter_m)
-    if estimate is None and isinstance(target.net, GeoPoseNet):
-        estimate, voted = target.net.estimate_with_votes(seen)
-    elif estimate is None:
-        estimate = target.net.estimate_many([seen])[0]
+        seen = _found_alone(given, target)
+    elif isinstance(target.net, GeoPoseNet):
+        found, voted = target.net.estimate_with_votes(given)
+        seen = [_Seen(given=given, found=found)]
+    else:
+        seen = [_Seen(given=given, found=answered(target.net.estimate_many([given])[0]))]
     if (least := form.number("min_certainty")) is not None:
-        estimate = with_status(estimate, EstimateConfig(min_certainty=least).min_certainty)
-    scene = pose_scene(seen, points_m, estimate, target.model)
-    if estimate.keypoints_m is not None and voted is not None:
-        votes = vote_layer(voted.cloud.points_m, voted.directions[..., :3], estimate.keypoints_m)
-        scene = replace(scene, layers=[*scene.layers, votes])
+        limit = EstimateConfig(min_certainty=least).min_certainty
+        seen = [replace(one, found=with_status(one.found, limit)) for one in seen]
     folder = form.results()
+    best = seen[0]
     agreeing = "votes that agree" if isinstance(target.net, GeoPoseNet) else "points near the model"
     return Answer(
-        is_ok=estimate.is_posed,
-        said=pose_sentence(estimate),
-        facts=pose_facts(estimate, target.model, target.how, agreeing),
-        tables=pose_tables(estimate),
-        pictures=_write(folder, seen, points_m, estimate, target.model),
-        scene=scene,
+        is_ok=best.found.is_posed,
+        said=pose_sentence(best.found),
+        facts=pose_facts(best.found, target.model, target.how, agreeing),
+        tables=_instances(seen) | pose_tables(best.found),
+        pictures=_write(folder, name, seen, target.model),
+        scene=_scene(seen, target.model, voted),
         terms=net.terms if target.net is net else "",
         files=read_files(folder),
     )
 
 
-def _write(
-    folder: Path,
-    given: CloudInput | ViewInput,
-    points_m: Float[Tensor, "n 3"],
-    found: PoseEstimate,
-    model: ObjectModel,
-) -> list[Shown]:
-    """Write ``poses.json``, the cloud with the posed model, and the picture that is shown."""
-    pose = found.camera_from_model
-    write_predictions(folder, [Prediction(estimate=found)])
-    write_cloud(folder / f"{given.name}.{CLOUD}", posed_cloud(points_m, pose, model))
+def _found_alone(given: CloudInput | ViewInput, target: _Target) -> list[_Seen]:
+    """Search a depth image without a mask; give each pose with the pixels that it explains."""
+    assert isinstance(given, ViewInput)
+    answers = target.net.find_in(given, [target.model.name])
+    if not answers:
+        return [_Seen(given=given, found=nothing_found(given, target.model.name))]
+    seen: list[_Seen] = []
+    for k, answer in enumerate(answers):
+        name = f"{given.name}_{k}" if len(answers) > 1 else given.name
+        assert answer.camera_from_model is not None
+        mask = explained_mask(given, answer.camera_from_model, target.model)
+        own = replace(given, name=name, mask=mask)
+        seen.append(_Seen(given=own, found=replace(answer, name=name)))
+    return seen
+
+
+def _instances(seen: list[_Seen]) -> dict[str, Sequence[Sequence[str]]]:
+    """List what was found in a frame, where that is more than one."""
+    rows = [["", "status", "x [m]", "y [m]", "z [m]", "certainty"]]
+    for one in seen if len(seen) > 1 else ():
+        pose, certainty = one.found.camera_from_model, one.found.certainty
+        place = [] if pose is None else [f"{v:.4f}" for v in pose.t_m.tolist()]
+        sure = "" if certainty is None else f"{certainty:.3f}"
+        rows.append([one.given.name, one.found.status, *place, sure])
+    return {"found in this image": rows} if len(seen) > 1 else {}
+
+
+def _write(folder: Path, name: str, seen: list[_Seen], model: ObjectModel) -> list[Shown]:
+    """Write ``poses.json``, each cloud with the posed model, and the picture that is shown."""
+    write_predictions(folder, [Prediction(estimate=one.found) for one in seen])
+    for one in seen:
+        points_m = object_points(one.given, model.diameter_m)
+        cloud = posed_cloud(points_m, one.found.camera_from_model, model)
+        write_cloud(folder / f"{one.given.name}.{CLOUD}", cloud)
+    given = seen[0].given
     if not isinstance(given, ViewInput):
         return []
     picture, caption = grey_depth(given.depth_m), "depth image, near bright"
-    if pose is not None:
+    poses = [pose for one in seen if (pose := one.found.camera_from_model) is not None]
+    for pose in poses:
         picture = draw_pose(picture, pose, model, given.K.double())
-        caption += ", with the posed model"
-    write_image(folder / f"{given.name}.{PICTURE}", picture)
-    return [Shown(file=f"{given.name}.{PICTURE}", caption=caption)]
+    if poses:
+        caption += f", with the posed model{'s' * (len(poses) > 1)}"
+    write_image(folder / f"{name}.{PICTURE}", picture)
+    return [Shown(file=f"{name}.{PICTURE}", caption=caption)]
 
 
 def _target(form: Form, net: GeoPoseNet) -> _Target:
@@ -208,6 +232,20 @@ def _unit(form: Form, field: str) -> Unit:
 
 
 _UNIT_M = 0.0001
+
+
+def _scene(seen: list[_Seen], model: ObjectModel, voted: CloudDirections | None) -> Scene:
+    """Show the cloud, the posed model, the votes, and what else was found in the image."""
+    given, found = seen[0].given, seen[0].found
+    scene = pose_scene(given, object_points(given, model.diameter_m), found, model)
+    layers = list(scene.layers)
+    if found.keypoints_m is not None and voted is not None:
+        layers.append(vote_layer(voted.cloud.points_m, voted.directions, found.keypoints_m))
+    for one in seen[1:]:
+        points_m = object_points(one.given, model.diameter_m)
+        cloud = posed_cloud(points_m, one.found.camera_from_model, model)
+        layers.append(Layer(name=one.given.name, shape=cloud))
+    return replace(scene, layers=layers)
 
 
 def pose_example(net: GeoPoseNet) -> dict[str, Any]:

@@ -1,6 +1,7 @@
 """Videos, frame by frame; OpenCV (the extra ``opencv``) decodes and encodes."""
 
 import math
+import warnings
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,13 +12,14 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from depthpose.core.errors import InputError, import_opencv
+from depthpose.core.errors import InputError, Notice, import_opencv
 from depthpose.core.files.disk import AnyPath, atomic_write, refused_suffix
 
 VIDEO_SUFFIXES = (".mp4", ".avi", ".mov", ".mkv", ".webm", ".m4v")
 """Files that are taken for a video."""
 
-_CODECS = {".mp4": "mp4v", ".avi": "MJPG"}
+_CODECS = {".mp4": "vp09", ".avi": "MJPG"}
+"""VP9: what OpenCV's own wheels encode (they have no H.264) and current browsers play."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -83,7 +85,8 @@ def write_video(path: AnyPath, images: Iterable[Float[Tensor, "3 _ _"]], fps: fl
     """Write RGB images in [0, 1] as a video, whole or not at all; give how many there were.
 
     Args:
-        path: ``.mp4`` (MPEG-4) or ``.avi`` (motion JPEG).
+        path: ``.mp4`` (VP9, which browsers play) or ``.avi`` (motion JPEG). An OpenCV without
+            VP9 writes MPEG-4 in its place, with a :class:`Notice`.
         images: the frames, all of one size; taken one at a time.
         fps: frames a second.
 
@@ -116,6 +119,11 @@ def _encode(
                 size = width_height
                 codec = cv2.VideoWriter_fourcc(*_CODECS[path.suffix.lower()])
                 writer = cv2.VideoWriter(str(part), codec, float(fps), size)
+                if path.suffix.lower() == ".mp4" and not writer.isOpened():
+                    said = "OpenCV encodes no VP9 here, so it is MPEG-4, which no browser plays"
+                    warnings.warn(f"{path}: {said}", Notice, stacklevel=3)
+                    codec = cv2.VideoWriter_fourcc(*"mp4v")
+                    writer = cv2.VideoWriter(str(part), codec, float(fps), size)
             if width_height != size:
                 raise InputError(
                     f"{path}: frame {count} is {width_height[0]}x{width_height[1]}, but the first "

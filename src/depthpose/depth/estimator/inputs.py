@@ -84,20 +84,13 @@ def _rgb(values: Tensor, sides: tuple[int, int], what: str) -> Float[Tensor, "3 
     return check_image(scaled.expand(3, -1, -1), what.partition(" is ")[0])
 
 
-def as_inputs(images: object, camera: AnyLens | None) -> list[StereoInput]:
-    """Take inputs as they are, and pictures of one camera as inputs.
-
-    Raises:
-        InputError: as :func:`as_tensor`, or no camera of these images.
-    """
-    several = [images] if isinstance(images, str | Path | Image) else images
-    if isinstance(several, np.ndarray | Tensor) and several.ndim < 4:
-        several = [several]
-    assert isinstance(several, Iterable), "a caller's type"
-    return [
-        one if isinstance(one, StereoInput) else as_input(one, f"image {k}", camera)
-        for k, one in enumerate(several)
-    ]
+def as_several(images: object) -> Iterable[object]:
+    """Take one picture as a list of one; a batch, a list or a generator as it is."""
+    is_one = isinstance(images, str | Path | Image | StereoInput)
+    if is_one or (isinstance(images, np.ndarray | Tensor) and images.ndim < 4):
+        return [images]
+    assert isinstance(images, Iterable), "a caller's type"
+    return images
 
 
 def as_input(
@@ -105,9 +98,13 @@ def as_input(
 ) -> StereoInput:
     """Take a picture and what is known of its camera; without that, ask the picture's EXIF.
 
+    What is an input already stays it.
+
     Raises:
         InputError: as :func:`as_tensor`, or no camera of this image.
     """
+    if isinstance(image, StereoInput):
+        return image
     left = as_tensor(image)
     if camera is None and with_exif:
         camera = exif_focal_px(image, name)

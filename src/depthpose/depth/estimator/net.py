@@ -1,16 +1,23 @@
 """One image, or a rectified pair, to one depth estimate in metres."""
 
+import os
 import warnings
-from collections.abc import Sequence
+from base64 import b64decode
+from collections.abc import Iterable, Iterator, Mapping, Sequence, Sized
 from dataclasses import replace
-from itertools import groupby
+from functools import partial
+from io import BytesIO
+from itertools import groupby, islice
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
+from urllib.request import urlopen
 
+import numpy as np
 import torch
 from jaxtyping import Float
 from PIL import Image
 from torch import Tensor
+from tqdm import tqdm
 
 from depthpose.core.arrays import check_image
 from depthpose.core.camera import (
@@ -21,14 +28,14 @@ from depthpose.core.camera import (
     choose_lens,
 )
 from depthpose.core.checkpoint import find_weights, join_terms, warn_of_terms
-from depthpose.core.devices import own_arithmetic
+from depthpose.core.devices import each_in_threads, own_arithmetic
 from depthpose.core.errors import InputError, Notice, refuse_unknown, refused_memory
 from depthpose.depth.config import Answer, MatcherConfig, SGBMConfig
 from depthpose.depth.disparity import focal_size, resize_image, smallest_focal_px
 from depthpose.depth.estimator.inputs import (
     Picture,
     as_input,
-    as_inputs,
+    as_several,
     as_tensor,
     exif_focal_px,
     refuse_unrectified,
@@ -228,45 +235,81 @@ class FakestereoNet:
             match = match_to_infinity(self._match, pair.left, right, pair.camera)
             return replace(from_pair(pair, match), warning=warning)
 
-    @torch.no_grad()
     @own_arithmetic()
     def estimate_many(
         self,
-        images: Sequence[StereoInput] | Sequence[Picture] | Picture,
+        images: Iterable[StereoInput] | Iterable[Picture] | Picture,
         camera: AnyLens | None = None,
         *,
         focal_px: float | None = None,
         fov_deg: float | None = None,
         with_check: bool = True,
-    ) -> list[DepthEstimate]:
-        """Estimate depth of images, alone or as pairs; neighbours of one camera size go together.
+        batch: int = 1,
+        threads: int = 1,
+        with_progress: bool = False,
+    ) -> list[DepthEstimate | InputError]:
+        """Estimate depth of images, alone or as pairs: of each a result, or its error.
 
         An input with a right view is matched with it, as :meth:`estimate_pair` does.
 
         Args:
-            images: inputs; or pictures, or a batch of them as one array or tensor.
+            images: inputs; or pictures, or a batch of them as one array or tensor; a generator's
+                are taken as they are needed.
             camera: of the pictures, as for :meth:`estimate`; inputs have their own.
             focal_px: the same as its focal length alone [px].
             fov_deg: the same as its horizontal field of view [degrees].
             with_check: of pairs, as for :meth:`estimate`.
+            batch: so many neighbours of one size go through the networks together: faster on a
+                GPU, slower on a processor.
+            threads: so many batches are worked at at a time, in as many times the memory.
+            with_progress: show a bar on the terminal.
+
+        Returns:
+            An estimate for each image, or the :class:`~depthpose.core.errors.InputError` that
+            :meth:`estimate` raises for it.
 
         Raises:
-            InputError: as :meth:`estimate`; the first unusable image is named.
+            InputError: a camera, ``batch`` or ``threads`` that fits no image.
         """
-        estimates: list[DepthEstimate] = []
-        inputs = as_inputs(images, choose_lens(camera, focal_px, fov_deg))
+        if batch < 1:
+            raise InputError(f"batch is {batch}; take 1 or more images")
+        lens = choose_lens(camera, focal_px, fov_deg)
+        several = as_several(images)
+        named = iter((f"image {k}", one) for k, one in enumerate(several))
+        batches = iter(lambda: list(islice(named, batch)), [])
+        found: list[DepthEstimate | InputError] = []
+        total = len(several) if isinstance(several, Sized) else None
+        with tqdm(total=total, unit=" images", disable=not with_progress) as bar:
+            work = partial(self._estimate_some, lens=lens, with_check=with_check)
+            for some in each_in_threads(work, batches, threads):
+                found += some
+                bar.update(len(some))
+        return found
+
+    def _estimate_some(
+        self, named: Sequence[tuple[str, object]], lens: AnyLens | None, *, with_check: bool
+    ) -> list[DepthEstimate | InputError]:
+        """Estimate images together; where one of them is unusable, each alone."""
 
         def sizes_alone(image: StereoInput) -> list[tuple[int, int]] | None:
             return self.virtual_sizes(image) if image.right is None else None
 
-        for sizes, group in groupby(inputs, sizes_alone):
-            alike = list(group)
-            with refused_memory(alike[0].name):
-                if sizes is None:
-                    estimates += [self.estimate_pair(p, with_check=with_check) for p in alike]
+        found: list[DepthEstimate | InputError] = []
+        try:
+            inputs = [as_input(image, name, lens) for name, image in named]
+            for sizes, group in groupby(inputs, sizes_alone):
+                alike = list(group)
+                if sizes is None or len(alike) == 1:
+                    found += [self.estimate_pair(pair, with_check=with_check) for pair in alike]
                 else:
-                    estimates += self._estimate_alone(alike, sizes)
-        return estimates
+                    with refused_memory(alike[0].name):
+                        found += self._estimate_alone(alike, sizes)
+        except InputError as error:
+            if len(named) == 1:
+                return [error]
+            alone = (self._estimate_some([one], lens, with_check=with_check) for one in named)
+            return [one for (one,) in alone]
+        return found
 
     def virtual_sizes(self, image: StereoInput) -> list[tuple[int, int]]:
         """Rows and columns at which one image is looked at.
@@ -343,43 +386,71 @@ class DepthPipeline:
     """Pictures to ``{"predicted_depth", "depth"}``.
 
     Args:
-        net: estimates one image.
+        net: estimates images.
+        batch_size: pictures of one size in one call of its networks.
     """
 
-    def __init__(self, net: FakestereoNet) -> None:
+    def __init__(self, net: FakestereoNet, batch_size: int = 1) -> None:
         self.net = net
+        self.batch_size = batch_size
 
     def __call__(
         self,
-        inputs: Picture | Sequence[Picture],
+        inputs: Picture | Iterable[Picture] | None = None,
         camera: AnyCamera | None = None,
         *,
+        images: Picture | Iterable[Picture] | None = None,
         focal_px: float | None = None,
         fov_deg: float | None = None,
-    ) -> dict[str, Any] | list[dict[str, Any]]:
-        """Estimate one picture, or a list of them.
+        batch_size: int | None = None,
+        timeout: float | None = None,
+    ) -> dict[str, Any] | list[dict[str, Any]] | Iterator[dict[str, Any]]:
+        """Estimate one picture, a list of them, or what a generator or data set gives.
 
         Args:
-            inputs: as :meth:`FakestereoNet.estimate` takes them.
+            inputs: as :meth:`FakestereoNet.estimate` takes them, and as transformers does: the
+                address of a picture (http, https), or its file in base64.
             camera: of all pictures. Without it, ``focal_px`` and ``fov_deg`` a picture's EXIF is
                 taken, or else 0.75 widths, a phone's, with a notice: the metres are as wrong as
                 that is.
+            images: another name of ``inputs``.
             focal_px: the focal length alone [px].
             fov_deg: the horizontal field of view alone [degrees].
+            batch_size: pictures of one size in one call of the networks; None: the pipeline's.
+            timeout: of a download [s]; None: none.
 
         Returns:
             For each picture ``predicted_depth``, metres (H, W), NaN where there are none, and
             ``depth``, an 8-bit picture of Pillow's, the farthest white, as transformers draws it.
+            Of a list a list, of another iterable an iterator.
 
         Raises:
             InputError: as :meth:`FakestereoNet.estimate`.
         """
+        if (inputs is None) == (images is None):
+            raise InputError("give the pictures, as the first argument or as images=")
+        given = images if inputs is None else inputs
         lens = choose_lens(camera, focal_px, fov_deg)
-        if isinstance(inputs, list | tuple):
-            return [self._one(one, lens) for one in inputs]
-        return self._one(inputs, lens)
+        is_one = isinstance(given, str | Path | Image.Image | np.ndarray | Tensor)
+        pictures = [given] if is_one else cast("Iterable[Picture]", given)
+        found = self._each(pictures, lens, batch_size or self.batch_size, timeout)
+        if is_one:
+            return next(found)
+        return list(found) if isinstance(given, list | tuple) else found
 
-    def _one(self, picture: object, lens: AnyLens | None) -> dict[str, Any]:
+    def _each(
+        self, pictures: Iterable[Picture], lens: AnyLens | None, batch: int, timeout: float | None
+    ) -> Iterator[dict[str, Any]]:
+        left = iter(pictures)
+        while some := list(islice(left, batch)):
+            seen = [self._input(_opened(picture, timeout), lens) for picture in some]
+            for found in self.net.estimate_many(seen, batch=batch):
+                if isinstance(found, InputError):
+                    raise found
+                assert found.depth_m is not None
+                yield {"predicted_depth": found.depth_m, "depth": _drawn(found.depth_m)}
+
+    def _input(self, picture: Picture, lens: AnyLens | None) -> StereoInput:
         image = as_tensor(picture)
         if lens is None:
             lens = exif_focal_px(picture, "the picture")
@@ -389,31 +460,79 @@ class DepthPipeline:
                 f"no camera: a focal length of {lens:g} px is taken, a phone's; the metres are as "
                 "wrong as it is. Give focal_px= or camera=",
                 Notice,
-                stacklevel=3,
+                stacklevel=4,
             )
-        (found,) = self.net.estimate_many([image], lens)
-        assert found.depth_m is not None
-        return {"predicted_depth": found.depth_m, "depth": _drawn(found.depth_m)}
+        return as_input(image, "the picture", lens)
 
 
 def pipeline(
-    task: str = "depth-estimation", model: str | Path | None = None, device: str | int = "cpu"
+    task: str = "depth-estimation",
+    model: str | Path | None = None,
+    device: str | int | torch.device | None = None,
+    *,
+    device_map: str | int | torch.device | Mapping[str, Any] | None = None,
+    torch_dtype: str | torch.dtype | None = None,
+    dtype: str | torch.dtype | None = None,
+    batch_size: int = 1,
+    **others: object,
 ) -> DepthPipeline:
     """Build what transformers' function of this name builds, for the one task that is known.
 
     Args:
         task: depth-estimation.
         model: weights with a generator, by name or file; None: ``default``.
-        device: cpu, cuda, cuda:1, ...; or the number of a GPU, -1 for the CPU.
+        device: cpu, cuda, cuda:1, ...; or the number of a GPU, -1 for the CPU. None: the CPU.
+        device_map: a device in place of ``device``; ``auto``: the GPU where there is one.
+        torch_dtype: float32, the precision of the weights, or ``auto``, which is the same.
+        dtype: newer name of it.
+        batch_size: pictures of one size in one call of the networks.
+        others: options of transformers that have no meaning here; each is refused unless None.
 
     Raises:
-        InputError: another task, or no such weights.
+        InputError: another task, precision or option, or no such weights.
     """
     refuse_unknown("task", task, ["depth-estimation"])
-    if isinstance(device, int):
-        device = f"cuda:{device}" if device >= 0 else "cpu"
-    net = FakestereoNet.load(model or DEFAULT, config=MatcherConfig(device=device))
-    return DepthPipeline(net)
+    foreign = [name for name, value in others.items() if value is not None]
+    if foreign:
+        raise InputError(
+            f"pipeline: {foreign[0]} is no option here; leave it out (a model is a name of "
+            "'depthpose weights list', a file or hf://OWNER/NAME@REVISION)"
+        )
+    precision = torch_dtype if dtype is None else dtype
+    if precision not in (None, "auto", "float32", torch.float32):
+        raise InputError(f"pipeline: torch_dtype is {precision}; networks run in float32, omit it")
+    if device is not None and device_map is not None:
+        raise InputError("pipeline: device and device_map are both given; omit one of the two")
+    chosen = device_map if device is None else device
+    if chosen == "auto":
+        chosen = "cuda" if torch.cuda.is_available() else "cpu"
+    if isinstance(chosen, int):
+        chosen = f"cuda:{chosen}" if chosen >= 0 else "cpu"
+    if isinstance(chosen, Mapping):
+        raise InputError(
+            "pipeline: device_map is a mapping; the networks go to one device, as 'auto'"
+        )
+    net = FakestereoNet.load(model or DEFAULT, config=MatcherConfig(device=str(chosen or "cpu")))
+    return DepthPipeline(net, batch_size)
+
+
+def _opened(picture: Picture, timeout: float | None) -> Picture:
+    """Open an address or base64 text as transformers does; anything else stays as it is."""
+    if not isinstance(picture, str) or os.path.isfile(picture):  # noqa: PTH113  long text is no path
+        return picture
+    is_address = picture.startswith(("http://", "https://"))
+    try:
+        if is_address:
+            with urlopen(picture, timeout=timeout) as answer:  # noqa: S310  http alone
+                content = answer.read()
+        else:
+            content = b64decode(picture.partition("base64,")[2] or picture, validate=True)
+        return Image.open(BytesIO(content))
+    except (OSError, ValueError) as error:
+        if is_address or picture.startswith("data:"):
+            said = picture if is_address else f"{picture[:30]}..."
+            raise InputError(f"{said}: is no picture that can be read ({error})") from error
+        return picture
 
 
 def _drawn(depth_m: Float[Tensor, "h w"]) -> Image.Image:

@@ -10,6 +10,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from depthpose.core.errors import InputError
+from depthpose.core.frame import data_frame
 from depthpose.depth.datasets import Dataset
 from depthpose.depth.datasets import read_disparity as read_truth_disparity
 from depthpose.depth.evaluate.frames import (
@@ -164,6 +165,14 @@ class Evaluation:
     per_frame: list[FrameRow]
     deciles: list[DecileRow]
     skipped: dict[str, str]
+
+    def to_frame(self) -> Any:  # noqa: ANN401  pandas is no dependency
+        """Give ``per_frame`` as a ``pandas.DataFrame``; the columns are those of its table.
+
+        Raises:
+            ImportError: pandas is not installed.
+        """
+        return data_frame(row.columns() for row in self.per_frame)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

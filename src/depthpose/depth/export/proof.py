@@ -133,7 +133,7 @@ def _image_cases(weights: DepthWeights) -> Iterator[Case]:
         given = [StereoInput(name="proof", left=one, right=None, camera=camera) for one in images]
         inputs = {"image": images.numpy(), "K": camera.K.numpy()}
         # A depth beyond all bounds, or none, is a matter of the last bit of a disparity near zero.
-        found = net.estimate_many(given)
+        found = [net.estimate_pair(one) for one in given]
         case = _case(inputs, found, ("depth_m", *_PAIR_OUTPUTS, "right", *sky, *street))
         is_near = case.expected["disparity_px"] >= _LEAST_PX
         where = {"depth_m": is_near | case.expected["is_sky"] if sky else is_near}

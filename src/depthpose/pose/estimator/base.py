@@ -2,13 +2,17 @@
 
 import time
 from abc import ABC, abstractmethod
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence, Sized
 from dataclasses import replace
 from pathlib import Path
+from typing import TypeVar
+
+import torch
+from tqdm import tqdm
 
 from depthpose.core.camera import AnyCamera, choose_lens
 from depthpose.core.devices import each_in_own_arithmetic, own_arithmetic
-from depthpose.core.errors import InputError, nearest_name
+from depthpose.core.errors import InputError, nearest_name, refused_memory
 from depthpose.core.rigid import Rigid
 from depthpose.core.units import Unit
 from depthpose.pose.config import EstimateConfig, RefusalConfig
@@ -30,6 +34,7 @@ from depthpose.pose.estimator.track import TrackedObject, track
 from depthpose.pose.surface import Surface, prepare_surface
 from depthpose.pose.types import CloudInput, ObjectModel, PoseEstimate, ViewInput
 
+Made = TypeVar("Made")
 _NAME = "input"
 """What an input is called that came without a name."""
 
@@ -66,17 +71,49 @@ class PoseEstimator(ABC):
         """Names of the objects."""
         return tuple(self._numbers)
 
-    @abstractmethod
-    def estimate_many(self, inputs: Sequence[AnyInput]) -> list[PoseEstimate]:
-        """Estimate many at once, of any objects.
+    @torch.no_grad()
+    @own_arithmetic()
+    def estimate_many(
+        self, inputs: Iterable[AnyInput], *, threads: int = 1, with_progress: bool = False
+    ) -> list[PoseEstimate]:
+        """Estimate many, of any objects: of each a pose, or the reason why there is none.
+
+        What cannot be taken at all, as an unknown object or a mask that does not fit its depth
+        image, has the status ``unreadable`` and costs the others nothing.
+
+        Args:
+            inputs: clouds and views; a generator's are taken as they are needed.
+            threads: so many are worked at at a time.
+            with_progress: show a bar on the terminal.
 
         Raises:
-            InputError: an unknown object, or a mask that does not fit its depth image.
+            InputError: fewer than one thread, or inputs that are neither.
+        """
+        total = len(inputs) if isinstance(inputs, Sized) else None
+        with tqdm(total=total, unit=" poses", disable=not with_progress) as bar:
+            found: list[PoseEstimate] = []
+            for one in self._each(_typed(inputs), threads):
+                found.append(one)
+                bar.update()
+        return found
+
+    @abstractmethod
+    def _each(
+        self, inputs: Iterable[AnyInput], threads: int, *, is_likely: bool = True
+    ) -> Iterator[PoseEstimate]:
+        """Give each input's estimate, as :meth:`estimate_many`, in their order.
+
+        Args:
+            inputs: clouds and views.
+            threads: so many are worked at at a time.
+            is_likely: whether most of them show their object.
         """
 
+    @torch.no_grad()
+    @own_arithmetic()
     def _try_many(self, inputs: Sequence[AnyInput]) -> list[PoseEstimate]:
         """Estimate inputs of which most do not show their object."""
-        return self.estimate_many(inputs)
+        return [answered(one) for one in self._each(inputs, 1, is_likely=False)]
 
     @own_arithmetic()
     def estimate(
@@ -119,7 +156,7 @@ class PoseEstimator(ABC):
     def _which(self, given: AnyInput, names: Sequence[str]) -> PoseEstimate:
         """Estimate one input as each of several objects, and take the one that it shows."""
         if len(names) == 1:
-            return self.estimate_many([given])[0]
+            return answered(self.estimate_many([given])[0])
         estimates = self._try_many([replace(given, object=name) for name in names])
         return with_status(which_object(estimates, self.refusal), self.config.min_certainty)
 
@@ -304,6 +341,34 @@ class PoseEstimator(ABC):
             nearest = nearest_name(name, self.objects)
             raise InputError(f"object {name!r}: {self._holder} do not know it; {nearest}")
         return self._numbers[name]
+
+
+def or_unreadable(work: Callable[[AnyInput], Made], given: AnyInput) -> Made | PoseEstimate:
+    """Do work for an input; where it raises :class:`InputError`, the estimate says so."""
+    try:
+        with refused_memory(given.name):
+            return work(given)
+    except InputError as error:
+        return refused(given, Refusal(status="unreadable", reason=str(error)), {})
+
+
+def answered(found: PoseEstimate) -> PoseEstimate:
+    """Give an estimate, or raise the :class:`InputError` of an input that could not be taken."""
+    if found.status == "unreadable":
+        raise InputError(found.reason)
+    return found
+
+
+def _typed(inputs: Iterable[object]) -> Iterator[AnyInput]:
+    if isinstance(inputs, AnyInput):
+        raise InputError("estimate_many takes several inputs; give one as [input]")
+    for given in inputs:
+        if not isinstance(given, AnyInput):
+            raise InputError(
+                f"estimate_many takes CloudInput and ViewInput of depthpose.pose.types, not a "
+                f"{type(given).__name__}; files and arrays go to estimate(), one at a time"
+            )
+        yield given
 
 
 def refused(given: AnyInput, refusal: Refusal, seconds: dict[str, float]) -> PoseEstimate:

@@ -56,7 +56,7 @@ def disagreement(
         copies_m: for each pose the keypoints of the copies that the network could not distinguish
             from it; the copy counts at which the directions point best, by their mean cosine.
     """
-    directions = normalize(outputs[..., :3].double(), dim=-1)
+    directions = normalize(outputs.double(), dim=-1)
     points_m = cloud.points_m.double()
 
     def cosines(some_m: Tensor, few: int) -> Float64[Tensor, "*batch m k"]:

@@ -264,10 +264,10 @@ class Refusal:
 
 
 class CloudDirections(NamedTuple):
-    """A cloud and the network's directions at its points; a fourth component: logit of trust."""
+    """A cloud and the network's directions at its points."""
 
     cloud: ObjectCloud
-    directions: Float[Tensor, "n k c"]
+    directions: Float[Tensor, "n k 3"]
 
 
 def prepare_cloud(

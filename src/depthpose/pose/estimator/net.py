@@ -5,8 +5,9 @@ the pose is fitted, refined by ICP, and checked.
 """
 
 import time
-from collections.abc import Iterator, Sequence
-from dataclasses import replace
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 
 import torch
@@ -14,7 +15,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from depthpose.core.checkpoint import find_weights, warn_of_terms
-from depthpose.core.devices import own_arithmetic, usable_device
+from depthpose.core.devices import each_in_threads, own_arithmetic, usable_device
 from depthpose.core.errors import InputError
 from depthpose.core.rigid import Rigid
 from depthpose.pose.baselines import DepthImageNet
@@ -26,7 +27,7 @@ from depthpose.pose.estimator.answer import (
     misfit_of,
     withheld,
 )
-from depthpose.pose.estimator.base import PoseEstimator, refused
+from depthpose.pose.estimator.base import PoseEstimator, answered, or_unreadable, refused
 from depthpose.pose.estimator.candidates import (
     Candidate,
     PoseAmbiguities,
@@ -95,13 +96,10 @@ def pose_from_directions(
 def cast_votes(voted: CloudDirections, config: VotingConfig) -> Vote:
     """Let the directions vote, by RANSAC or least squares, in float64."""
     points = voted.cloud.points_m.double()
-    directions = voted.directions[..., :3].double()
-    weight = (
-        voted.directions[..., 3].double().sigmoid() if voted.directions.shape[-1] == 4 else None
-    )
+    directions = voted.directions.double()
     if config.method == "ransac":
-        return vote_ransac(points, directions, weight, config)
-    return meet_lines(points, directions, weight, config.refinements)
+        return vote_ransac(points, directions, config=config)
+    return meet_lines(points, directions, refinements=config.refinements)
 
 
 def _fits(vote: Vote, model: ObjectModel, config: EstimateConfig) -> PoseFit | Refusal:
@@ -179,7 +177,7 @@ def _row(fits: PoseFit, number: int) -> PoseFit:
 
 def network_directions(
     network: DirectionNet, clouds: list[ObjectCloud], numbers: list[int], device: str
-) -> list[Float[Tensor, "n k c"]]:
+) -> list[Float[Tensor, "n k 3"]]:
     """Ask the network for the directions to the keypoints, in the camera frame, cloud by cloud.
 
     Args:
@@ -201,34 +199,24 @@ def network_directions(
     )
     outputs = network.directions(seen.to(device)).float().cpu()
     return [
-        _in_camera(some, grid.grid_from_camera)
+        some @ grid.grid_from_camera
         for some, grid in zip(outputs.split(counts), grids, strict=True)
     ]
 
 
-def batches(
-    ready: list[tuple[int, ObjectCloud, float]], most: int
-) -> Iterator[list[tuple[int, ObjectCloud, float]]]:
+def batches(clouds: Iterable["_Cloud"], most: int) -> Iterator[list["_Cloud"]]:
     """Group clouds so that each group has ``most`` voxels at most, or is one cloud."""
-    group: list[tuple[int, ObjectCloud, float]] = []
+    group: list[_Cloud] = []
     total = 0
-    for item in ready:
-        count = len(item[1].points_m)
+    for one in clouds:
+        count = len(one.prepared.points_m) if isinstance(one.prepared, ObjectCloud) else 0
         if group and total + count > most:
             yield group
             group, total = [], 0
-        group.append(item)
+        group.append(one)
         total += count
     if group:
         yield group
-
-
-def _in_camera(
-    outputs: Float[Tensor, "n k c"], grid_from_camera: Float[Tensor, "3 3"]
-) -> Float[Tensor, "n k c"]:
-    """Turn directions back from the network's grid; further components stay."""
-    directions = outputs[..., :3] @ grid_from_camera
-    return torch.cat([directions, outputs[..., 3:]], -1)
 
 
 class GeoPoseNet(PoseEstimator):
@@ -309,33 +297,17 @@ class GeoPoseNet(PoseEstimator):
         """When an answer is withheld."""
         return self.weights.refusal
 
-    @torch.no_grad()
-    @own_arithmetic()
-    def estimate_many(self, inputs: Sequence[AnyInput]) -> list[PoseEstimate]:
-        """Estimate many at once, of any objects: the network is called for all of them together.
+    def _each(
+        self, inputs: Iterable[AnyInput], threads: int, *, is_likely: bool = True
+    ) -> Iterator[PoseEstimate]:
+        """Ask the network for several clouds together, and register what it doubts.
 
         The answer for an input does not depend on those beside it, but for the rounding of the
-        network's sums. What the network doubts is then registered, where the config wants it.
-
-        Raises:
-            InputError: an unknown object, or a mask that does not fit its depth image.
+        network's sums. Only what is likely is registered, where the config wants it.
         """
-        estimates = self._in_order(inputs, is_likely=True)
-        if self._registration is None:
-            return estimates
-        return [
-            self._registered(given, found) if found.status in _DOUBTED else found
-            for given, found in zip(inputs, estimates, strict=True)
-        ]
-
-    @torch.no_grad()
-    @own_arithmetic()
-    def _try_many(self, inputs: Sequence[AnyInput]) -> list[PoseEstimate]:
-        return self._in_order(inputs, is_likely=False)
-
-    def _in_order(self, inputs: Sequence[AnyInput], *, is_likely: bool) -> list[PoseEstimate]:
-        found = {k: one for k, one, _ in self._each(inputs, is_likely=is_likely)}
-        return [found[k] for k in range(len(inputs))]
+        for given, found, _ in self._with_votes(inputs, threads, is_likely=is_likely):
+            is_doubted = is_likely and found.status in _DOUBTED
+            yield self._registered(given, found) if self._registration and is_doubted else found
 
     def _registered(self, given: AnyInput, doubted: PoseEstimate) -> PoseEstimate:
         """Answer by the model alone, else as the network did."""
@@ -358,55 +330,82 @@ class GeoPoseNet(PoseEstimator):
             the network was not run, as there is too little to pose.
 
         Raises:
-            InputError: as for :meth:`estimate_many`.
+            InputError: an unknown object, or a mask that does not fit its depth image.
         """
-        ((_, found, voted),) = self._each([given])
-        return found, voted
+        ((_, found, voted),) = self._with_votes([given], 1)
+        return answered(found), voted
 
-    def _each(
-        self, inputs: Sequence[AnyInput], *, is_likely: bool = True
-    ) -> Iterator[tuple[int, PoseEstimate, CloudDirections | None]]:
-        """Give each input's number, estimate and votes: first what is refused, then by batches."""
-        ready: list[tuple[int, ObjectCloud, float]] = []
-        for k, given in enumerate(inputs):
-            start = time.perf_counter()
+    def _with_votes(
+        self, inputs: Iterable[AnyInput], threads: int, *, is_likely: bool = True
+    ) -> Iterator[tuple[AnyInput, PoseEstimate, CloudDirections | None]]:
+        prepared = each_in_threads(self._prepare, inputs, threads)
+        work = partial(self._pose, is_likely=is_likely)
+        for some in batches(prepared, self.config.batch_voxels):
+            yield from each_in_threads(work, self._ask(some), threads)
+
+    def _prepare(self, given: AnyInput) -> "_Cloud":
+        def prepare(given: AnyInput) -> ObjectCloud | Refusal:
             model = self.weights.models[self._number(given.object)]
-            prepared = prepare_cloud(given, model, self.weights.cloud, self.config)
-            spent_s = time.perf_counter() - start
-            if isinstance(prepared, Refusal):
-                yield k, refused(given, prepared, {"cloud": spent_s}), None
+            return prepare_cloud(given, model, self.weights.cloud, self.config)
+
+        start = time.perf_counter()
+        prepared = or_unreadable(prepare, given)
+        seconds = {"cloud": time.perf_counter() - start}
+        if isinstance(prepared, Refusal):
+            prepared = refused(given, prepared, seconds)
+        return _Cloud(given=given, prepared=prepared, seconds=seconds)
+
+    def _ask(self, clouds: list["_Cloud"]) -> Iterator["_Cloud"]:
+        """Ask the network for clouds together; each has a share of the time."""
+        ready = [(one, one.prepared) for one in clouds if isinstance(one.prepared, ObjectCloud)]
+        numbers = [self._number(one.given.object) for one, _ in ready]
+        outputs, spent_s = self._directions([p for _, p in ready], numbers) if ready else ([], 0.0)
+        total, left = sum(map(len, outputs)), iter(outputs)
+        for one in clouds:
+            if isinstance(one.prepared, ObjectCloud):
+                own = next(left)
+                seconds = {**one.seconds, "network": spent_s * len(own) / total}
+                yield replace(one, outputs=own, seconds=seconds)
             else:
-                ready.append((k, prepared, spent_s))
-        for some in batches(ready, self.config.batch_voxels):
-            numbers = [self._number(inputs[k].object) for k, _, _ in some]
-            directions, network_s = self._directions([p for _, p, _ in some], numbers)
-            total = sum(map(len, directions))
-            for (k, prepared, spent_s), outputs, number in zip(
-                some, directions, numbers, strict=True
-            ):
-                share_s = network_s * len(outputs) / total
-                seconds = {"cloud": spent_s, "network": share_s}
-                voted = CloudDirections(prepared, outputs)
-                found = self._pose(inputs[k], number, voted, is_likely)
-                yield k, replace(found, seconds={**seconds, **found.seconds}), voted
+                yield one
 
     def _directions(
         self, clouds: list[ObjectCloud], numbers: list[int]
-    ) -> tuple[list[Float[Tensor, "n k c"]], float]:
+    ) -> tuple[list[Float[Tensor, "n k 3"]], float]:
         start = time.perf_counter()
         found = network_directions(self._network, clouds, numbers, self.config.device)
         return found, time.perf_counter() - start
 
     def _pose(
-        self, given: AnyInput, number: int, voted: CloudDirections, is_likely: bool
-    ) -> PoseEstimate:
-        found = pose_from_directions(
-            voted,
-            self.weights.models[number],
-            self._surface(number),
-            self._copies_of(number),
-            self.weights.refusal,
-            self.config,
-            is_likely=is_likely,
-        )
-        return replace(found, name=given.name)
+        self, one: "_Cloud", *, is_likely: bool
+    ) -> tuple[AnyInput, PoseEstimate, CloudDirections | None]:
+        if isinstance(one.prepared, PoseEstimate):
+            return one.given, one.prepared, None
+        assert one.outputs is not None, "asked before"
+        voted = CloudDirections(one.prepared, one.outputs)
+
+        def pose(given: AnyInput) -> PoseEstimate:
+            number = self._number(given.object)
+            return pose_from_directions(
+                voted,
+                self.weights.models[number],
+                self._surface(number),
+                self._copies_of(number),
+                self.weights.refusal,
+                self.config,
+                is_likely=is_likely,
+            )
+
+        found = or_unreadable(pose, one.given)
+        seconds = {**one.seconds, **found.seconds}
+        return one.given, replace(found, name=one.given.name, seconds=seconds), voted
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _Cloud:
+    """An input on its way: a cloud, what the network says of it, the seconds; or a refusal."""
+
+    given: AnyInput
+    prepared: ObjectCloud | PoseEstimate
+    seconds: dict[str, float]
+    outputs: Float[Tensor, "n k 3"] | None = None

@@ -1,8 +1,9 @@
 """Registration: poses of objects by their models alone, without training."""
 
 import time
-from collections.abc import Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import torch
@@ -10,7 +11,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from depthpose.core.arrays import take_evenly
-from depthpose.core.devices import own_arithmetic
+from depthpose.core.devices import each_in_threads, own_arithmetic
 from depthpose.core.errors import InputError
 from depthpose.core.rigid import Rigid
 from depthpose.core.units import Unit
@@ -22,7 +23,7 @@ from depthpose.pose.estimator.answer import (
     candidate_of,
     withheld,
 )
-from depthpose.pose.estimator.base import PoseEstimator, refused
+from depthpose.pose.estimator.base import PoseEstimator, or_unreadable, refused
 from depthpose.pose.estimator.candidates import (
     CloudNormals,
     PoseAmbiguities,
@@ -112,6 +113,10 @@ class Registration(PoseEstimator):
         models = [read_model(path, unit, number=k) for k, path in enumerate(cad, start=1)]
         return cls([with_found_symmetries(m, None, is_taken=True) for m in models], config)
 
+    def __repr__(self) -> str:
+        """Say it in one line: the objects; a registration has no weights and no device."""
+        return f"Registration(of {', '.join(self.objects)})"
+
     @property
     def models(self) -> Sequence[ObjectModel]:
         """The objects."""
@@ -128,15 +133,12 @@ class Registration(PoseEstimator):
             self._copies_of(number)
             self._table(number)
 
-    @torch.no_grad()
-    @own_arithmetic()
-    def estimate_many(self, inputs: Sequence[AnyInput]) -> list[PoseEstimate]:
-        """Estimate one after the other; a model is prepared when it is first asked for.
-
-        Raises:
-            InputError: an unknown object, or a mask that does not fit its depth image.
-        """
-        return [self._estimate(given) for given in inputs]
+    def _each(
+        self, inputs: Iterable[AnyInput], threads: int, *, is_likely: bool = True
+    ) -> Iterator[PoseEstimate]:
+        """Register one by one, whatever is likely; a model is prepared when first asked for."""
+        del is_likely
+        return each_in_threads(partial(or_unreadable, self._estimate), inputs, threads)
 
     def _estimate(self, given: AnyInput) -> PoseEstimate:
         number = self._number(given.object)

@@ -12,6 +12,7 @@ from typing import Any
 import torch
 
 from depthpose.core.errors import InputError
+from depthpose.core.frame import data_frame
 from depthpose.pose.config import EvaluationConfig
 from depthpose.pose.datasets import BopDataset, BopTarget, Instance
 from depthpose.pose.evaluate.errors import (
@@ -392,6 +393,14 @@ class Evaluation:
     per_instance: list[InstanceRow]
     risk: list[RiskRow]
     advice: str | None = None
+
+    def to_frame(self) -> Any:  # noqa: ANN401  pandas is no dependency
+        """Give ``per_instance`` as a ``pandas.DataFrame``; the columns are those of its table.
+
+        Raises:
+            ImportError: pandas is not installed.
+        """
+        return data_frame(row.columns() for row in self.per_instance)
 
     def of(self, origin: Origin) -> "Evaluation":
         """Say in each row whose predictions it measures."""
