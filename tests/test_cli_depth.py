@@ -284,10 +284,12 @@ def test_a_frame_of_a_video_that_is_refused_leaves_the_others(
     refused = InputError("drive_000001: a black frame")
     estimate_alone = FakestereoNet._estimate_alone
 
-    def estimate(net: FakestereoNet, images: list[StereoInput]) -> list[DepthEstimate]:
+    def estimate(
+        net: FakestereoNet, images: list[StereoInput], sizes: list[tuple[int, int]]
+    ) -> list[DepthEstimate]:
         if any(image.name == "drive_000001" for image in images):
             raise refused
-        return estimate_alone(net, images)
+        return estimate_alone(net, images, sizes)
 
     out = tmp_path / "out"
     with patch.object(FakestereoNet, "_estimate_alone", estimate):

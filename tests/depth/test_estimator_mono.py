@@ -640,7 +640,7 @@ def test_how_probable_a_street_is_decides_where_the_weights_know_it() -> None:
     network.street.weight = nn.Parameter(across[None].float())
     network.street.bias = nn.Parameter(-(across @ (first + second))[None].float() / 2)
     net = FakestereoNet(None, make_synthesiser(network, speed="quick"), allow_ood=True)
-    street, other = net.estimate_many(images, camera(96, 64, FOCAL_PX))
+    street, other = each_of(net, images, camera=camera(96, 64, FOCAL_PX))
     assert (street.image_confidence, street.warning) == (pytest.approx(1.0, abs=1e-3), "")
     assert other.image_confidence == pytest.approx(0.0, abs=1e-3)
     assert "(probability of a street 0.00, below 0.50)" in other.warning

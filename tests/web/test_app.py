@@ -33,6 +33,7 @@ from depthpose.pose.metrics import adds_m
 from depthpose.pose.synthetic import make_part
 from depthpose.web import Limits, make_app
 from depthpose.web import pose as pose_tab
+from depthpose.web.answer import small_size
 
 URL = "http://127.0.0.1:8000"
 
@@ -347,10 +348,10 @@ def test_a_depth_map_of_floats_has_the_limit_of_a_picture(
     monkeypatch.setattr("depthpose.web.answer.MOST_PIXELS", 1000)
     path = tmp_path / f"d.{suffix}"
     write_map(path, torch.ones(20, 50))
-    assert pose_tab._size(path) == (50, 20)
+    assert small_size(path) == (50, 20)
     write_map(path, torch.ones(20, 51))
     with pytest.raises(InputError, match=r"d\.\w+ has 51x20 pixels, more than the 0\.001 million"):
-        pose_tab._size(path)
+        small_size(path)
 
 
 def assert_posed(page: TestClient, found: dict[str, Any], truth: Rigid, name: str) -> None:

@@ -164,7 +164,8 @@ def vsd(
         delta_m: tolerance of visibility.
     """
     # Distance from the centre of a point at depth 1, by pixel.
-    pixels, K = pixel_grid(*view.depth_m.shape, torch.float64), view.K
+    (height, width), K = view.depth_m.shape, view.K
+    pixels = pixel_grid(height, width, torch.float64)
     y = (pixels[..., 1] - K[1, 2]) / K[1, 1]
     x = (pixels[..., 0] - K[0, 2] - K[0, 1] * y) / K[0, 0]
     rays = (x * x + y * y + 1).sqrt()

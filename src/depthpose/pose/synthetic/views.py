@@ -301,7 +301,7 @@ class Objects:
             wanted,  # pyright: ignore[reportArgumentType]
             batch_size=None,
             num_workers=workers,
-            collate_fn=self._stored,
+            collate_fn=self._stored,  # pyright: ignore[reportArgumentType]
         )
         for place, view in zip(wanted, views, strict=True):
             # Tensors that a worker process sends hold file descriptors; copies do not.
