@@ -22,7 +22,6 @@ from tests.pose.synthetic_objects import CAMERA, pose_at, view_of
 from tests.web.samples import PART, write_street, write_view
 
 from depthpose.core.camera import write_camera
-from depthpose.core.errors import InputError
 from depthpose.core.files import write_depth_png, write_map
 from depthpose.core.rigid import Rigid
 from depthpose.depth.estimator import FakestereoNet
@@ -33,7 +32,6 @@ from depthpose.pose.metrics import adds_m
 from depthpose.pose.synthetic import make_part
 from depthpose.web import Limits, make_app
 from depthpose.web import pose as pose_tab
-from depthpose.web.answer import small_size
 
 URL = "http://127.0.0.1:8000"
 
@@ -343,15 +341,14 @@ def test_a_picture_of_too_many_pixels_is_refused(
 
 @pytest.mark.parametrize("suffix", ["npy", "pfm"])
 def test_a_depth_map_of_floats_has_the_limit_of_a_picture(
-    tmp_path: Path, suffix: str, monkeypatch: pytest.MonkeyPatch
+    page: TestClient, tmp_path: Path, suffix: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("depthpose.web.answer.MOST_PIXELS", 1000)
-    path = tmp_path / f"d.{suffix}"
-    write_map(path, torch.ones(20, 50))
-    assert small_size(path) == (50, 20)
-    write_map(path, torch.ones(20, 51))
-    with pytest.raises(InputError, match=r"d\.\w+ has 51x20 pixels, more than the 0\.001 million"):
-        small_size(path)
+    name = f"d.{suffix}"
+    for columns, said in ((50, "focal length: without it"), (51, f"{name} has 51x20 pixels")):
+        write_map(tmp_path / name, torch.ones(20, columns))
+        response = ask(page, "pose", tmp_path, {"depth": name}, object=PART)
+        assert refusal(response)[1].startswith(said)
 
 
 def assert_posed(page: TestClient, found: dict[str, Any], truth: Rigid, name: str) -> None:
