@@ -339,7 +339,7 @@ def test_a_path_that_leads_nowhere_is_refused_before_torch_is_loaded(
         ("pose predict --cloud . --out", "--out"),
         ("depth predict . --focal-px 9 --out=", "--out"),
         ("pose predict --out out --cloud", "--cloud"),
-        ("pose train --out out --held-out", "--held-out"),
+        ("depth train select --out out --held-out", "--held-out"),
     ],
 )
 def test_an_option_without_a_path_is_not_the_current_folder(

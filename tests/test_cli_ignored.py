@@ -26,7 +26,6 @@ IGNORED = [
     ("pose track", "--depth d --camera c --split test", "--split"),
     ("pose evaluate", "--bop b --csv a.csv --no-icp --masks truth", "--masks and --no-icp"),
     ("pose evaluate", "--bop b --weights register open3d --voting ransac", "--voting"),
-    ("pose calibrate", "w --negatives 0 --max-negative-share 0.1", "--max-negative-share"),
     ("depth predict", "a.png --engine ray --view a.rrd", "--view"),
     ("depth predict", "a.png --answer own --max_memory 1GB", "--max_memory"),
     ("depth match", "l r --engine ray --worker-gpus 1", "--worker-gpus"),
