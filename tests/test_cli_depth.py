@@ -429,7 +429,7 @@ def test_the_page_of_a_video_shows_its_frames(home: Path, tmp_path: Path) -> Non
     write_video(tmp_path / "drive.avi", frames, 5.0)
     assert predict(home, tmp_path, str(tmp_path / "drive.avi"), "--focal-px", "70") == 0
     shown = read_page(tmp_path / "report.html").texts["h2"][1:]
-    assert shown == [f"drive_{k:06d}" for k in (0, 2, 3, 4, 6, 7)]
+    assert shown == ["Videos", *(f"drive_{k:06d}" for k in (0, 2, 3, 4, 6, 7))]
 
 
 def test_one_broken_image_stops_no_other(

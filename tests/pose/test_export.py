@@ -66,14 +66,15 @@ def session(network: ResUNet) -> Iterator[object]:
     ids=["one voxel", "dense", "far apart", "negative and odd", "three clouds", "odd"],
 )
 def test_the_graph_is_the_network(network: ResUNet, session: object, coordinates: Tensor) -> None:
-    features = torch.randn(len(coordinates), 3)
+    # Large, since a small network may answer a single voxel of small features by zeros alone.
+    features = 10 * torch.randn(len(coordinates), 3, generator=torch.Generator().manual_seed(2))
     with torch.no_grad():
         expected = network(Voxels.from_points(coordinates, features))
     given = {"coordinates": coordinates.numpy(), "features": features.numpy()}
     (answer,) = session.run(None, given)  # pyright: ignore[reportAttributeAccessIssue]
     assert answer.shape == (len(coordinates), 2, 3, 3)
     assert expected.std() > 1e-3
-    np.testing.assert_allclose(answer, expected.numpy(), rtol=1e-4, atol=1e-5)
+    np.testing.assert_allclose(answer, expected.numpy(), rtol=1e-4, atol=1e-4)
 
 
 def test_the_command_writes_what_a_user_of_the_file_must_know(
