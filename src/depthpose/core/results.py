@@ -81,7 +81,8 @@ def _append(folder: Path, name: str, stamps: Mapping[str, Sequence[int]]) -> Non
     line = f"\n{json.dumps({'name': name, 'files': stamps})}\n".encode()
     file = os.open(folder / RESULTS, os.O_WRONLY | os.O_APPEND | os.O_CREAT, 0o666)
     try:
-        os.write(file, line)
+        while line:  # a full disk takes a part of it, and refuses the rest
+            line = line[os.write(file, line) :]
     finally:
         os.close(file)
 

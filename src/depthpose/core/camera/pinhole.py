@@ -352,7 +352,7 @@ def refuse_apart(left: Float64[np.ndarray, "3 _"], right: Float64[np.ndarray, "3
     within = {"fx": ((0, 0), _SAME_FOCAL * left[0, 0]), "fy": ((1, 1), _SAME_FOCAL * left[1, 1]),
               "cy": ((1, 2), _SAME_ROW_PX)}  # fmt: skip
     for name, (at, most) in within.items():
-        if not math.isclose(left[at], right[at], rel_tol=0, abs_tol=most):
+        if not math.isclose(left[at], right[at], rel_tol=0, abs_tol=abs(most)):
             raise InputError(
                 f"{name} of the left camera is {left[at]:g} and of the right one {right[at]:g}, "
                 "but a rectified pair shares fx, fy and cy; are they of two calibrations, "

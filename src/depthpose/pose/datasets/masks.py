@@ -46,17 +46,22 @@ def read_labels(path: Path) -> Int64[Tensor, "mask_h mask_w"]:
         return _read_json_mask(path).long()
     with opened_image(path) as image:
         if image.mode in ("LA", "PA", "RGBA", "RGBa", "La") or "transparency" in image.info:
-            pixels = np.asarray(image.convert("RGBA")).astype(np.int64)
+            pixels = np.asarray(image.convert("RGBA"))
         elif image.mode in ("1", "L", "I", "F") or image.mode.startswith("I;16"):
-            pixels = np.asarray(image).astype(np.int64)[..., None]
+            kind = np.int64 if image.mode == "F" else np.int32
+            pixels = np.asarray(image).astype(kind)[..., None]
         else:
-            pixels = np.asarray(image.convert("RGB")).astype(np.int64)
+            pixels = np.asarray(image.convert("RGB"))
         if image.format == "JPEG":  # what compression leaves about an edge is no object
             pixels = np.where(pixels > _HALF, 255, 0)
     values = pixels[..., 0]
     if pixels.shape[2] > 1 and (pixels[..., :3] != values[..., None]).any():
-        colours, places = np.unique(pixels[..., :3] @ [2**16, 2**8, 1], return_inverse=True)
-        values = places.reshape(values.shape) + (colours[0] != 0)
+        colour = values.astype(np.int32)
+        for part in (pixels[..., 1], pixels[..., 2]):
+            colour = colour * 2**8 + part
+        colours = np.unique(colour)
+        # Not by the inverse of np.unique, which takes five times the memory.
+        values = np.searchsorted(colours, colour).astype(np.int32) + (colours[0] != 0)
     is_opaque = pixels[..., 3] > _HALF if pixels.shape[2] == 4 else values != 0
     if pixels.shape[2] == 4 and 0 < is_opaque.sum() < is_opaque.size:
         is_shape = len(np.unique(values[is_opaque])) not in range(2, _MOST_LABELS)
@@ -90,9 +95,10 @@ def one_mask(labels: Int64[Tensor, "h w"], name: str) -> Bool[Tensor, "h w"]:
     Raises:
         InputError: there are several; which, and how large they are.
     """
-    found, pixels = labels[labels != 0].unique(return_counts=True)
+    found = np.unique(labels.cpu().numpy())
+    found = found[found != 0]
     if len(found) > 1:
-        said = [f"{k} ({n} px)" for k, n in zip(found.tolist(), pixels.tolist(), strict=True)]
+        said = [f"{k} ({int((labels == k).sum())} px)" for k in found.tolist()]
         raise InputError(
             f"{name}: shows {len(found)} objects, numbered {', '.join(said[:5])}"
             f"{', ...' if len(said) > 5 else ''}, where one mask is of one; give that of one "
