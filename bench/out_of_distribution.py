@@ -262,7 +262,7 @@ def measure(looks: list[dict[str, Any]]) -> list[dict[str, Any]]:
 
 
 def indoors(weights: str) -> dict[str, Any]:
-    """Give the error on Middlebury's Motorcycle, which is refused by default."""
+    """Give the error on Middlebury's Motorcycle, an indoor scene, and whether it is refused."""
     sample = read_motorcycle()
     assert sample is not None
     truth_m = sample.truth.depth_m
