@@ -27,7 +27,9 @@ source_suffix = {".md": "markdown", ".rst": "restructuredtext"}
 # A link that leads nowhere or a name that nobody documents fails the build (with -W).
 nitpicky = True
 # What a signature quotes or takes from others: shapes, and classes of torch and numpy.
-nitpick_ignore_regex = [("py:class", r"'.*'|AnyInput|Tensor|ndarray|(tuple|dict|jaxtyping|collections)\b.*")]
+nitpick_ignore_regex = [
+    ("py:class", r"'.*'|AnyInput|Tensor|ndarray|(tuple|dict|jaxtyping|collections)\b.*")
+]
 myst_heading_anchors = 4
 myst_enable_extensions = ["deflist"]
 
