@@ -88,7 +88,13 @@ def selection(
     monkeypatch: pytest.MonkeyPatch,
 ) -> Path:
     """Folder with ``w.safetensors``: a generator that selects, without a matcher."""
-    monkeypatch.setattr("depthpose.depth.export.graph.network_model", lambda *_: selection_network)
+
+    def exported_once(module: torch.nn.Module, images: list[torch.Tensor], multiple: int) -> Any:  # noqa: ANN401
+        if isinstance(module, DynamicSelection):
+            return selection_network
+        return network_model(module, images, multiple)
+
+    monkeypatch.setattr("depthpose.depth.export.graph.network_model", exported_once)
     write_depth_weights(tmp_path / "w.safetensors", generator=of_all_kinds(), facts=TERMS)
     return tmp_path
 

@@ -57,7 +57,7 @@ _FOREIGN = {
     r"^\[(LEFT|RIGHT)_CAM_": "the factory calibration of a ZED, which is that of its raw images: "
     "take fx, fy, cx, cy and the baseline of the rectified ones from its SDK "
     "(calibration_parameters)",
-    r"^\s*Intrinsic of ": "a list of a RealSense's cameras: take that of your stream and size",
+    r"^[ \t]*Intrinsic of ": "a list of a RealSense's cameras: take that of your stream and size",
 }
 """Signs of camera files that are not read."""
 _WRITE = (
