@@ -1,5 +1,6 @@
 """The nodes: parameters, topics and threads around :mod:`depthpose_ros.work`."""
 
+import math
 from collections.abc import Callable
 from typing import Any
 
@@ -68,14 +69,16 @@ class DepthImageNode(WorkNode):
     def __init__(self) -> None:
         super().__init__(
             "depth_image", weights="default", encoding="32FC1", device="cpu", speed="fine",
-            allow_ood=False,
+            allow_ood=False, camera_height_m=math.nan, camera_tilt_deg=math.nan,
         )  # fmt: skip
         net = FakestereoNet.load(
             self.value("weights"),
             config=MatcherConfig(device=self.value("device"), speed=self.value("speed")),
             allow_ood=self.value("allow_ood"),
         )
-        work = DepthFromImage(net, self.value("encoding"), self.warn)
+        mount = [self.value(name) for name in ("camera_height_m", "camera_tilt_deg")]
+        known = [None if math.isnan(number) else float(number) for number in mount]
+        work = DepthFromImage(net, self.value("encoding"), self.warn, *known)
         depth = self.create_publisher(Image, "~/depth", NEWEST)
         topics = {"image_rect": Image, "camera_info": CameraInfo}
         self.work_on(topics, 0.0, lambda *given: depth.publish(image_message(work(*given))))

@@ -2,7 +2,7 @@
 
 import threading
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 from depthpose import FakestereoNet, GeoPoseNet
@@ -24,11 +24,17 @@ from depthpose_ros.messages import (
 
 @dataclass
 class DepthFromImage:
-    """One rectified image and its camera to a depth image; ``warn`` is told of doubts."""
+    """One rectified image and its camera to a depth image; ``warn`` is told of doubts.
+
+    ``camera_info`` does not say where a camera is mounted: its height above the road [m], and its
+    tilt [degrees, negative downwards], set the scale where they are given.
+    """
 
     net: FakestereoNet
     encoding: str = "32FC1"
     warn: Callable[[str], None] = print
+    mount_height_m: float | None = None
+    tilt_deg: float | None = None
 
     def __call__(self, image: Any, info: Any) -> Image:  # noqa: ANN401
         """Estimate; stamp and frame are the image's.
@@ -36,7 +42,10 @@ class DepthFromImage:
         Raises:
             InputError: what the messages lack, or an image unlike those that the weights know.
         """
-        found = self.net.estimate(picture_of(image), camera_of(info))
+        camera = replace(
+            camera_of(info), mount_height_m=self.mount_height_m, tilt_deg=self.tilt_deg
+        )
+        found = self.net.estimate(picture_of(image), camera)
         if found.warning:
             self.warn(found.warning)
         assert found.depth_m is not None, "one image has a camera, and so metres"
