@@ -120,6 +120,11 @@ def test_what_stands_on_a_known_plane_keeps_its_size() -> None:
     torch.testing.assert_close(found.depth_m[wall], standing, rtol=2e-3, atol=0)
 
 
+def test_what_is_as_steep_as_a_bank_is_no_road() -> None:
+    assert fit_ground(road(3.5, -22, 0), CAMERA) is None
+    assert fit_ground(road(1.65, -12, 0), CAMERA) is not None
+
+
 def test_a_known_tilt_corrects_a_wrong_one() -> None:
     wrong = estimate(road(1.6, -1.5, 0))
     by_tilt, alone = (
