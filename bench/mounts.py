@@ -108,9 +108,9 @@ def main() -> None:
             found, truth_m = net.estimate_pair(image), look_at["depth_m"].astype(np.float32)
             row = {
                 "weights": weights,
-                "height": height_m,
-                "tilt": tilt_deg,
-                "field of view": fov_deg,
+                "height_m": height_m,
+                "tilt_deg": tilt_deg,
+                "fov_deg": fov_deg,
             }
             for name, mount in (
                 ("nothing", {}),
@@ -126,7 +126,7 @@ def main() -> None:
                 row[name] = abs_rel(depth_m.numpy(), truth_m)
             rows.append(row | {"road": found.ground is not None})
     write_table(options.out, rows, name="mounts")
-    for by in ("height", "tilt", "field of view"):
+    for by in ("height_m", "tilt_deg", "fov_deg"):
         print(markdown_table(means(rows, by)))
 
 

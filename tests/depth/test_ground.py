@@ -137,9 +137,10 @@ def test_a_known_tilt_corrects_a_wrong_one() -> None:
     assert errors[0] < errors[1]
 
 
-def test_a_tilt_that_puts_the_road_above_the_horizon_is_refused() -> None:
-    with pytest.raises(InputError, match=r"above the horizon of a tilt of 30 degrees"):
-        scale_by_mount(estimate(road(1.6, 0, 0)), seen(mount_height_m=1.6, tilt_deg=30.0))
+@pytest.mark.parametrize("tilt_deg", [30.0, -9.0])
+def test_a_tilt_that_the_road_contradicts_is_refused(tilt_deg: float) -> None:
+    with pytest.raises(InputError, match=r"degrees is given, and the road that is seen says 0.0"):
+        scale_by_mount(estimate(road(1.6, 0, 0)), seen(mount_height_m=1.6, tilt_deg=tilt_deg))
 
 
 def test_a_known_distance_sets_the_scale_by_the_median_around_it() -> None:

@@ -18,8 +18,10 @@ _DRAWS = 200
 _STRIPS = 8
 _LEAST_SHARE = 0.25
 """Of the points in the lower part of the image, on the plane; with less there is no ground."""
-_MOST_TILT, _MOST_ROLL = (math.tan(math.radians(angle)) for angle in (15, 10))
-"""Steeper planes were no road in any of 59 views by cameras tilted up to 7 degrees."""
+_MOST_TILT, _MOST_ROLL = (math.tan(math.radians(angle)) for angle in (25, 10))
+_MOST_ROAD_TILT_DEG, _MOST_TILT_APART_DEG = 15.0, 8.0
+"""Steeper planes were no road in any of 59 views by cameras tilted up to 7 degrees, and roads were
+at most 5.5 degrees off the true tilt."""
 _ON_PLANE, _FARTHEST_M = 0.15, 200.0
 """What is off the plane by less, in the logarithm of depth, lies on it; by twice as much, not."""
 _WINDOW_PX = 5
@@ -60,6 +62,8 @@ def fit_ground(depth_m: Float[Tensor, "h w"], camera: Camera) -> Ground | None:
     left_out = [_angles(_least_squares(rays[k], inverse[k])) for k in
                 (is_on & (strips != n) for n in range(_STRIPS)) if int(k.sum()) >= 30]  # fmt: skip
     found, parts = _angles(plane), torch.tensor(left_out)
+    if abs(found[1]) > _MOST_ROAD_TILT_DEG:
+        return None
     # The jackknife's deviation: how far the fit moves when a part of the columns is left out.
     spread = ((len(parts) - 1) / len(parts) * ((parts - parts.mean(0)) ** 2).sum(0)).sqrt()
     return Ground(
@@ -132,11 +136,10 @@ def scale_by_mount(found: DepthEstimate, image: StereoInput) -> DepthEstimate:
     rays, inverse, _ = _lower_points(found.depth_m, camera)
     known = rays @ _plane(mounted)
     is_on = ((rays @ _plane(ground) / inverse - 1).abs() < _INLIER) & (known > 0)
-    if int(is_on.sum()) < 30:
+    if abs(camera.tilt_deg - ground.tilt_deg) > _MOST_TILT_APART_DEG or int(is_on.sum()) < 30:
         raise InputError(
-            f"{name}: the road that is seen lies above the horizon of a tilt of "
-            f"{camera.tilt_deg:g} degrees; the estimate says {ground.tilt_deg:.1f}. Negative "
-            "is down; correct it, or omit it"
+            f"{name}: a tilt of {camera.tilt_deg:g} degrees is given, and the road that is seen "
+            f"says {ground.tilt_deg:.1f}. Negative is down; correct it, or omit it"
         )
     factor = (inverse[is_on] / known[is_on]).median() ** 0.5
     height, width = found.depth_m.shape
