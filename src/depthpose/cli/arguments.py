@@ -167,13 +167,6 @@ def refuse_empty(command: Callable[..., int], words: Sequence[str]) -> None:
     """Refuse an option that names a file or folder by nothing, which would be the current folder.
 
     A script whose variable is unset gives such a word.
-
-    Args:
-        command: whose options these are.
-        words: what follows its name.
-
-    Raises:
-        InputError: the option that is empty.
     """
     paths = {option for _, option, kind in _options_of(command) if kind is not None}
     for word, after in pairwise([*words, "end"]):
@@ -187,15 +180,7 @@ def refuse_empty(command: Callable[..., int], words: Sequence[str]) -> None:
 
 
 def refuse_missing(command: Callable[..., int], values: Mapping[str, Any]) -> None:
-    """Refuse paths and weights that do not exist.
-
-    Args:
-        command: what will be called.
-        values: its arguments by name.
-
-    Raises:
-        InputError: a path or weights that are not there.
-    """
+    """Refuse paths and weights that do not exist."""
     for name, option, kind in _options_of(command):
         if name not in values:
             continue
@@ -295,15 +280,7 @@ _RULES = (
 
 
 def refuse_ignored_options(command: str, words: Sequence[str]) -> None:
-    """Refuse what the command would ignore.
-
-    Args:
-        command: its name.
-        words: what follows the name.
-
-    Raises:
-        InputError: options that have no effect beside the others; why, and to leave them out.
-    """
+    """Refuse what the command would ignore."""
     typed: dict[str, list[str]] = {}
     spelled: dict[str, str] = {}
     here: list[str] = []
@@ -323,11 +300,7 @@ def refuse_ignored_options(command: str, words: Sequence[str]) -> None:
 
 
 def refuse_below(least: int, option: str, value: int, usual: str) -> None:
-    """Refuse a count that is too small.
-
-    Raises:
-        InputError: the option, its value, the least and a usual value are named.
-    """
+    """Refuse a count that is too small."""
     if value < least:
         raise InputError(f"{option} {value}: give {least} or more, such as {usual}")
 

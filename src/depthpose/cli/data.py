@@ -67,11 +67,7 @@ class ExportOptions:
     """units of the reconstruction per metre."""
 
     def refuse_unusable(self, format: str) -> None:
-        """Refuse a scale out of its range, and images of another format.
-
-        Raises:
-            InputError: which, and the rule.
-        """
+        """Refuse a scale out of its range, and images of another format."""
         if not (math.isfinite(self.scale) and self.scale > 0):
             raise InputError(
                 f"--scale {self.scale:g}: units per metre must be positive; 1 for metres"

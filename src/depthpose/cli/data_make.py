@@ -42,11 +42,7 @@ class StreetsOptions:
 
     @property
     def config(self) -> "StreetsConfig":
-        """Settings of the streets.
-
-        Raises:
-            InputError: a value is out of its range.
-        """
+        """Settings of the streets."""
         from depthpose.depth.config import StreetsConfig
 
         if self.number < 1 or self.first < 0 or not 0 <= self.seed <= 9999:
@@ -81,11 +77,7 @@ class ObjectsOptions:
 
     @property
     def config(self) -> "ObjectsConfig":
-        """Settings of the frames.
-
-        Raises:
-            InputError: a value is out of its range.
-        """
+        """Settings of the frames."""
         from depthpose.pose.config import ObjectsConfig, SensorConfig
 
         if self.number < 1:

@@ -90,9 +90,6 @@ def predict_all(dataset: Dataset, method: Method, rule: Protocol, folder: Path) 
 
     Where several processes run the command (``torchrun``, ``accelerate launch``), each predicts
     its share, and the first goes on when the files of all are there.
-
-    Returns:
-        The folder of the predictions.
     """
     frames = list(enumerate(dataset.frames))
     usable = [
@@ -126,11 +123,7 @@ class _Unchecked:
 
 
 def choose_methods(options: MethodOptions, config: MatcherConfig, dataset: Dataset) -> list[Method]:
-    """Build what is measured on a dataset: SGBM, weights and baselines, in this order.
-
-    Raises:
-        InputError: two have one name, or one needs right views and the dataset has none.
-    """
+    """Build what is measured on a dataset: SGBM, weights and baselines, in this order."""
     chosen: list[Method] = []
     if options.matcher == "sgbm":
         chosen.append(sgbm_method(with_filled_holes=options.holes == "fill"))
@@ -154,11 +147,7 @@ def choose_methods(options: MethodOptions, config: MatcherConfig, dataset: Datas
 
 
 def open_training(folders: Sequence[Path], without: Sequence[str], measured: Dataset) -> Dataset:
-    """Open the frames that a baseline is fitted to, none of which may be measured.
-
-    Raises:
-        InputError: no folder, or frames of both.
-    """
+    """Open the frames that a baseline is fitted to, none of which may be measured."""
     if not folders:
         raise InputError(
             "a baseline is fitted to training frames: give --train FOLDER, or several."
@@ -229,13 +218,7 @@ def measure_each(
 
 
 def signed(result: Evaluation, name: str, settings: dict[str, Any] | None) -> Evaluation:
-    """Add the source of the predictions to each row.
-
-    Args:
-        result: of one set of predictions.
-        name: of their folder.
-        settings: that made them, where they are ours.
-    """
+    """Add the source of the predictions to each row."""
     holes = {True: " (holes filled)", False: " (matched pixels)"}
     source = Source(method=name)
     if settings is not None:
@@ -309,14 +292,7 @@ def frame_sections(
     rows: Sequence[Sequence[FrameRow]],
     protocol: str,
 ) -> list[Section]:
-    """Show the worst, the median and the best frame of each set of predictions.
-
-    Args:
-        dataset: as it was measured.
-        folders: of the predictions.
-        rows: of each folder's frames, as they were measured.
-        protocol: by which.
-    """
+    """Show the worst, the median and the best frame of each set of predictions."""
     sections: list[Section] = []
     for folder, of_folder, most in zip(folders, rows, share_views(len(folders)), strict=True):
         cap_m = of_folder[0].cap_m
@@ -411,9 +387,6 @@ def measure_shards(
 
     Each frame is measured where its shard is read; the rows of all frames are collected here in the
     order of the data set, and summed as if one process had measured them.
-
-    Raises:
-        InputError: a prediction is missing or damaged, or no frame has truth.
     """
     items = result_items(predictions)
     names = {item.name for item in items}

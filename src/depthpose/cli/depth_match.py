@@ -48,11 +48,7 @@ def read_pair(name: str, left: Path, right: Path, rig: StereoRig) -> StereoInput
 
 
 def list_pairs(left: str, right: str) -> tuple[list[Path], list[Path]]:
-    """List the images of both sides, paired by their names or the numbers in them.
-
-    Raises:
-        InputError: a side has none, one has no partner, or two results had one name.
-    """
+    """List the images of both sides, paired by their names or the numbers in them."""
     lefts, rights = list_images(left), list_images(right)
     stems, others = ([path.stem for path in side] for side in (lefts, rights))
     if len(set(stems)) != len(stems):

@@ -56,12 +56,7 @@ class MethodSource:
     answer: Answer | None = None
 
     def build(self) -> Method:
-        """Build the networks on the device of the config.
-
-        Raises:
-            InputError: a matcher alone is asked to do without the right view, or weights without a
-                matcher for it.
-        """
+        """Build the networks on the device of the config."""
         if self.weights is None:
             return sgbm_method(with_filled_holes=False)
         if isinstance(self.weights, Weights):
@@ -124,11 +119,7 @@ class MethodSource:
         return f"{path.stem}-{name}", net, settings
 
     def packed(self) -> "MethodSource":
-        """Give the same with the weights in memory.
-
-        Raises:
-            InputError: other weights match the synthesised view.
-        """
+        """Give the same with the weights in memory."""
         if self.matcher not in (None, "sgbm"):
             raise InputError(
                 f"--matcher {self.matcher}: --engine ray takes sgbm or the weights' own; make one "

@@ -32,11 +32,7 @@ class MatcherOptions:
     3 times the time."""
 
     def refuse_matcher_options(self) -> None:
-        """Refuse what is for a matcher with weights, where none runs.
-
-        Raises:
-            InputError: that is given.
-        """
+        """Refuse what is for a matcher with weights, where none runs."""
         if self.precision != "fp32" or self.max_memory is not None:
             raise InputError(
                 "--precision and --max-memory are for a matcher with weights, and none runs here; "
@@ -45,11 +41,7 @@ class MatcherOptions:
 
     @property
     def config(self) -> MatcherConfig:
-        """Settings of the networks.
-
-        Raises:
-            InputError: a size that is none.
-        """
+        """Settings of the networks."""
         return MatcherConfig(
             device=self.device,
             precision=self.precision,
@@ -89,11 +81,7 @@ class ScaleOptions:
 
     @property
     def distance(self) -> tuple[float, float, float] | None:
-        """The known distance: column, row [px], metres.
-
-        Raises:
-            InputError: it is not three numbers.
-        """
+        """The known distance: column, row [px], metres."""
         if self.known_distance is None:
             return None
         try:
@@ -105,11 +93,7 @@ class ScaleOptions:
         return column, row, metres
 
     def refuse_unusable(self) -> None:
-        """Refuse numbers that are no height, no tilt and no distance, and a tilt alone.
-
-        Raises:
-            InputError: such a one is given.
-        """
+        """Refuse numbers that are no height, no tilt and no distance, and a tilt alone."""
         if self.camera_height is not None and not 0.1 <= self.camera_height <= 20:
             raise InputError(f"--camera-height {self.camera_height:g}: give 0.1 to 20 metres")
         if self.camera_tilt is not None and not -45 <= self.camera_tilt <= 45:
@@ -153,11 +137,7 @@ class PairNetworks:
 
     @property
     def used(self) -> str | None:
-        """The weights whose matcher matches; None where sgbm does.
-
-        Raises:
-            InputError: both options are given.
-        """
+        """The weights whose matcher matches; None where sgbm does."""
         if self.matcher is None:
             return "default" if self.weights is None else self.weights
         if self.weights is not None:
@@ -185,11 +165,7 @@ class ImageNetworks:
     place of refusing them."""
 
     def refuse_contradiction(self, matching: MatcherOptions) -> None:
-        """Refuse options that exclude each other.
-
-        Raises:
-            InputError: which, and what to omit.
-        """
+        """Refuse options that exclude each other."""
         if self.matcher is not None and self.answer is not None:
             raise InputError(
                 f"--answer {self.answer} and --matcher {self.matcher}: another matcher matches the "
@@ -214,11 +190,7 @@ class PredictOutput:
     """live shows each result in Rerun's viewer (an extra) as it comes; FILE.rrd records it."""
 
     def refuse_unusable(self) -> None:
-        """Refuse values out of their range.
-
-        Raises:
-            InputError: which, and the rule.
-        """
+        """Refuse values out of their range."""
         near, far = self.color_range
         if not 0 < near < far:
             raise InputError(
@@ -255,11 +227,7 @@ class MethodOptions:
     """names of frames to leave out of them."""
 
     def refuse_none(self) -> None:
-        """Refuse to measure nothing.
-
-        Raises:
-            InputError: no method is named.
-        """
+        """Refuse to measure nothing."""
         if not (self.weights or self.matcher or self.predictions or self.baseline):
             raise InputError(
                 "measure --weights FILE, --matcher sgbm, --predictions DIR or --baseline rows, or "
@@ -277,11 +245,7 @@ class ProtocolOptions:
     """metres beyond which truth does not count; a row each."""
 
     def refuse_unusable(self) -> None:
-        """Refuse caps that are no distances, a repeated one, and none at all.
-
-        Raises:
-            InputError: which, and the rule.
-        """
+        """Refuse caps that are no distances, a repeated one, and none at all."""
         if not self.cap:
             raise InputError("--cap without a value: give a distance in metres, such as 80")
         for cap_m in self.cap:
@@ -292,11 +256,7 @@ class ProtocolOptions:
 
 
 def refuse_ignored(weights: Sequence[str], matching: MatcherOptions) -> None:
-    """Refuse options of matchers with weights where no method has one.
-
-    Raises:
-        InputError: that is so.
-    """
+    """Refuse options of matchers with weights where no method has one."""
     if weights and all(name.startswith("sgbm:") for name in weights):
         matching.refuse_matcher_options()
     elif not weights and matching != type(matching)():
@@ -307,11 +267,7 @@ def refuse_ignored(weights: Sequence[str], matching: MatcherOptions) -> None:
 
 
 def parse_bytes(text: str | None) -> int | None:
-    """Read a size such as ``1GB``, ``800M`` or ``1500000`` (bytes); ``1GiB`` is 1024**3.
-
-    Raises:
-        InputError: not a number with such a unit.
-    """
+    """Read a size such as ``1GB``, ``800M`` or ``1500000`` (bytes); ``1GiB`` is 1024**3."""
     if text is None:
         return None
     size = re.fullmatch(r"\s*(\d+(?:\.\d+)?)\s*([KMGT]?)(i?)B?\s*", text, re.IGNORECASE)

@@ -90,9 +90,6 @@ def read_lens(options: LensOptions, sources: Sequence[Path], scale: ScaleOptions
     """Read what the user knows of the camera; where its file says no size, that of the images.
 
     Without any of it the EXIF of the images is asked.
-
-    Raises:
-        InputError: several are given, or none and the EXIF says none or several.
     """
     focal_px, fov = options.focal_px, options.fov
     named = {"--camera": options.camera, "--focal-px": focal_px, "--fov": fov}
@@ -153,12 +150,7 @@ def _exif_of_all(sources: Sequence[Path]) -> float:
 
 
 def find_sources(words: Sequence[str], out: Path) -> list[Path]:
-    """List images and videos.
-
-    Raises:
-        InputError: nothing there, two inputs whose results would have one name, or a folder of
-            inputs that is ``out`` too.
-    """
+    """List images and videos."""
     sources: list[Path] = []
     for word in words:
         sources += [Path(word)] if _is_video(Path(word)) else list_images(word)
@@ -352,15 +344,7 @@ def write_depth_page(
     failures: Sequence[str],
     range_m: tuple[float, float] = COLOR_RANGE_M,
 ) -> None:
-    """Write a page of some of the depth maps that a folder holds, of warnings and of what failed.
-
-    Args:
-        out: the folder.
-        names: of all that are there.
-        read: gives what some of them were made of, as far as that can still be read.
-        failures: why others are not there, a sentence each.
-        range_m: metres of the brightest and the darkest colour.
-    """
+    """Write a page of some depth maps of a folder (``read`` gives their inputs), and of warnings."""
     chosen = [names[k] for k in spread_evenly(len(names), MOST_VIEWS)]
     pairs = list(read(chosen))
     which = "all" if len(pairs) == len(names) else "spread evenly"

@@ -49,11 +49,7 @@ class EngineOptions:
         return self.engine == "ray"
 
     def build(self) -> "RayEngine":
-        """Make the engine of these options.
-
-        Raises:
-            InputError: an option is out of its range.
-        """
+        """Make the engine of these options."""
         from depthpose.core.engine import RayEngine
 
         if (self.workers or 1) < 1 or self.block < 1 or min(self.worker_cpus, self.worker_gpus) < 0:
@@ -81,11 +77,7 @@ class Inputs:
 
     @classmethod
     def find(cls, words: Sequence[str], files: "Files") -> "Inputs":
-        """List files, manifests and tar shards.
-
-        Raises:
-            InputError: nothing is there, sides that cannot be paired, or names that clash.
-        """
+        """List files, manifests and tar shards."""
         from depthpose.core.engine import find_items, find_tars, is_tar
 
         tars = [word for word in words if is_tar(word)]

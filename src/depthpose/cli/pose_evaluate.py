@@ -71,11 +71,7 @@ def open_instances(
 def measure_each(
     dataset: BopDataset, predictions: Sequence[Path], config: EvaluationConfig
 ) -> list[Evaluation]:
-    """Measure folders or csv files of predictions one by one; each row says whose it is.
-
-    Raises:
-        InputError: a record says that predictions are of another data set or split.
-    """
+    """Measure folders or csv files of predictions one by one; each row says whose it is."""
     evaluations: list[Evaluation] = []
     show = partial(tqdm, unit=" instances", disable=None)
     for path, origin in zip(predictions, describe(predictions), strict=True):
@@ -107,9 +103,6 @@ def describe(predictions: Sequence[Path]) -> list[Origin]:
     """Name whose predictions each of these are.
 
     Methods of one name that lie in two folders are two, and bear the folders' names too.
-
-    Raises:
-        InputError: predictions are given twice.
     """
     origins = [_describe_one(path) for path in predictions]
     homes = [path.resolve().parent for path in predictions]
@@ -216,13 +209,7 @@ def instance_sections(
     predictions: Sequence[Path],
     rows: Sequence[Sequence[InstanceRow]],
 ) -> list[Section]:
-    """Show the worst, the median and the best answer of each set of predictions, and a refusal.
-
-    Args:
-        dataset: as it was measured.
-        predictions: folders or csv files.
-        rows: of the instances of each, as they were measured.
-    """
+    """Show the worst, the median and the best answer of each set of predictions, and a refusal."""
     instances = {instance.name: instance for instance in dataset.instances}
     sections: list[Section] = []
     for path, of_path, most in zip(predictions, rows, share_views(len(predictions)), strict=True):

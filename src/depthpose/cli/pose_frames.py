@@ -56,10 +56,6 @@ def find_all(method: PoseMethod, inputs: OneObjectOptions, out: Path) -> int:
 
     What is found in NAME is called NAME_0, NAME_1, ...; an image where nothing is found has one
     entry, NAME, that says so. A rerun goes on where it was, and reads again what could not be read.
-
-    Raises:
-        InputError: weights that take no clouds, several processes, ``--register-refused``, or two
-            images of one name.
     """
     assert inputs.depth is not None
     lens = inputs.lens

@@ -36,11 +36,7 @@ class Unreadable:
 
 
 def object_named(name: str | None, method: PoseMethod) -> str:
-    """Give the object that is meant.
-
-    Raises:
-        InputError: none of that name, or several and none is named.
-    """
+    """Give the object that is meant."""
     known = [model.name for model in method.models]
     if name is None and len(known) > 1:
         raise InputError(f"the {method.holder} know {', '.join(known)}; say which by --object")
@@ -52,11 +48,7 @@ def object_named(name: str | None, method: PoseMethod) -> str:
 
 
 def read_pose(path: Path) -> Rigid:
-    """Read the 4x4 matrix of a pose from a text file; brackets and commas do no harm.
-
-    Raises:
-        InputError: it cannot be read, holds no 16 numbers, or they are no rigid transform.
-    """
+    """Read the 4x4 matrix of a pose from a text file; brackets and commas do no harm."""
     try:
         words = re.sub(r"[\[\],;]", " ", path.read_text()).split()
         values = torch.tensor([float(word) for word in words], dtype=torch.float64)
@@ -74,11 +66,7 @@ def read_pose(path: Path) -> Rigid:
 
 
 def cloud_jobs(cloud: Path, unit: Unit, object: str, out: Path) -> list[Job[Any]]:
-    """Take a cloud, or every one of a folder.
-
-    Raises:
-        InputError: there is none, two of one name, or the folder is ``out`` too.
-    """
+    """Take a cloud, or every one of a folder."""
     known = cloud_suffixes()
     files = [cloud]
     if cloud.is_dir():
@@ -110,10 +98,6 @@ def view_jobs(
     """Take a depth image, its mask and its camera, or images and masks of one name in two folders.
 
     Of a mask that numbers several objects each is an input: NAME_1, NAME_2, ...
-
-    Raises:
-        InputError: there is none, two have one name, a depth image has no mask, or a folder is
-            ``out`` too.
     """
     runs = sorted(mask.glob("*.json")) if mask.is_dir() else []  # of run lengths
     depths, pictures = _list_depths(depth), runs or list_images(mask)
@@ -158,11 +142,7 @@ def _masks_of(path: Path) -> dict[str, AnyMask]:
 def frame_jobs(
     depth: Path, camera: Path | float, object: str, unit: Unit | None, out: Path
 ) -> list[Job[Any]]:
-    """Take whole depth images, without masks.
-
-    Raises:
-        InputError: there is none, two have one name, or the folder is ``out`` too.
-    """
+    """Take whole depth images, without masks."""
     depths = _list_depths(depth)
     refuse_among_inputs(out, [depth], depths)
     _refuse_one_name(depths)
@@ -181,16 +161,7 @@ def _list_depths(depth: Path) -> list[Path]:
 
 
 def chosen_objects(dataset: BopDataset, method: PoseMethod, object: str | None) -> BopDataset:
-    """Keep the objects of a data set that the weights know, and say others; or the one named.
-
-    Args:
-        dataset: what there is.
-        method: what poses it.
-        object: what the data set or the weights call it, or its number.
-
-    Raises:
-        InputError: the weights know none, or there is no instance of the one.
-    """
+    """Keep the objects of a data set that the weights know, and say others; or the one named."""
     numbers = {model.name: model.number for model in method.models}
     if object is not None:
         is_theirs = object in object_names(dataset.folder).values()
@@ -217,11 +188,7 @@ def object_facts(dataset: BopDataset, object: str | None) -> dict[str, list[int]
 
 
 def bop_jobs(dataset: BopDataset, masks: Masks, method: PoseMethod) -> list[Job[Any]]:
-    """Take the instances of a data set by some masks.
-
-    Raises:
-        InputError: the weights do not know an object of it.
-    """
+    """Take the instances of a data set by some masks."""
     names = match_names(dataset, method.models)
     jobs = masks.jobs(names)
     return [_safe(job, names[job.place.object_id]) for job in jobs if job.place is not None]

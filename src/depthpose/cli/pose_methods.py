@@ -64,17 +64,7 @@ class Masks:
 def find_masks(
     kinds: Sequence[str], dataset: BopDataset, out: Path, device: str = "cpu"
 ) -> list[Masks]:
-    """Understand ``truth``, ``predicted``, files of BOP detections and segmentation weights.
-
-    Args:
-        kinds: which masks.
-        dataset: whose images are used.
-        out: where a segmentation writes what it finds.
-        device: of a segmentation.
-
-    Raises:
-        InputError: one is none of these, or the data set came without predicted masks.
-    """
+    """Understand ``truth``, ``predicted``, files of BOP detections and segmentation weights."""
     paths = [_path_of(kind) for kind in kinds]
     files = [
         (None, kind) if path is None else (path.parent, path.stem)
@@ -106,11 +96,7 @@ def find_masks(
 
 
 def mask_files(kinds: Sequence[str]) -> list[str]:
-    """Name masks as :func:`find_masks` takes them; files by what they hold.
-
-    Raises:
-        InputError: there is no such file.
-    """
+    """Name masks as :func:`find_masks` takes them; files by what they hold."""
     paths = [_path_of(kind) for kind in kinds]
     return [
         kind if path is None else named_file(path) for kind, path in zip(kinds, paths, strict=True)
@@ -118,11 +104,7 @@ def mask_files(kinds: Sequence[str]) -> list[str]:
 
 
 def named_file(path: Path) -> str:
-    """Name a file with the start of its SHA-256: another one of that name is another name.
-
-    Raises:
-        InputError: it cannot be read.
-    """
+    """Name a file with the start of its SHA-256: another one of that name is another name."""
     try:
         return f"{path.name} {file_sha256(path)[:12]}"
     except OSError as error:
@@ -284,15 +266,6 @@ def pose_methods(
     """Build the estimators of weights files of any kinds, given by their paths or by names.
 
     Files of one name are distinguished by their folders.
-
-    Args:
-        names: of weights, or paths; ``register`` and ``open3d`` have none: they take models.
-        config: of the estimators that have weights.
-        models: what registration looks for.
-
-    Raises:
-        InputError: there are no such weights, they pose nothing, or are given twice.
-        MissingExtraError: registration is wanted, and Open3D is not installed.
     """
     takers = {REGISTRATION: _open3d, REGISTER: _register}
     paths = [None if name in takers else find_weights(name) for name in names]
@@ -359,11 +332,7 @@ class MethodSource:
     models: Sequence[ObjectModel] = ()
 
     def build(self, device: str | None = None) -> PoseMethod:
-        """Build the estimator, on a device or on that of the config.
-
-        Raises:
-            InputError: as :func:`pose_methods`.
-        """
+        """Build the estimator, on a device or on that of the config."""
         config = self.config if device is None else replace(self.config, device=device)
         if self.weights is None:
             return _register(REGISTER, self.models, config)
@@ -386,18 +355,7 @@ def source_of(
     dataset: DataSetOptions | SequenceOptions,
     config: EstimateConfig,
 ) -> MethodSource:
-    """Say what the options of a command make an estimator from.
-
-    Args:
-        weights: of a network, by name or file.
-        register: whether CAD files alone are looked for, and which.
-        unit: of the CAD files, where ``register`` says none.
-        dataset: the data set that has its own models, if one is named.
-        config: of the estimator.
-
-    Raises:
-        InputError: options that do not go together, no unit, or a CAD file that cannot be read.
-    """
+    """Say what the options of a command make an estimator from."""
     if register.method == "network" and register.cad:
         raise InputError(
             "--cad: weights know their own objects; add --method register, or train weights of "
@@ -444,11 +402,7 @@ def _method(path: Path, name: str, config: EstimateConfig) -> PoseMethod:
 def predict_all(
     dataset: BopDataset, method: PoseMethod, masks: Masks, out: Path, batch: int = 1
 ) -> Path:
-    """Estimate every instance that is not estimated yet, and write ``poses.json`` and BOP's csv.
-
-    Returns:
-        The folder of the predictions.
-    """
+    """Estimate every instance that is not estimated yet, and write ``poses.json`` and BOP's csv."""
     jobs = masks.jobs(match_names(dataset, method.models))
     home = out / "predictions" / f"{method.name}_{masks.name}"
     settings = {**method.settings, "masks": masks.name, **masks.settings, **of_dataset(dataset)}
@@ -461,11 +415,7 @@ def predict_all(
 
 
 def match_names(dataset: BopDataset, models: Sequence[ObjectModel]) -> dict[int, str]:
-    """Find what a method calls each object of a data set: by its name, else by its number.
-
-    Raises:
-        InputError: the method does not know an object, or means another one of that number.
-    """
+    """Find what a method calls each object of a data set: by its name, else by its number."""
     by_name = {model.name: model for model in models}
     by_number = {model.number: model for model in models}
     names: dict[int, str] = {}

@@ -33,11 +33,7 @@ class PoseDataOptions:
 
     @property
     def folder(self) -> Path | None:
-        """The one data set that was named, if any.
-
-        Raises:
-            InputError: two were.
-        """
+        """The one data set that was named, if any."""
         if self.linemod is not None and self.bop is not None:
             raise InputError(
                 f"two data sets were named, {self.linemod} and {self.bop}; a table is of one."
@@ -117,11 +113,7 @@ class OneObjectOptions:
 
     @property
     def lens(self) -> Path | float | None:
-        """The camera file, or the focal length; None where neither is given.
-
-        Raises:
-            InputError: both are.
-        """
+        """The camera file, or the focal length; None where neither is given."""
         if self.camera is not None and self.focal_px is not None:
             raise InputError("--camera and --focal-px are both given; omit one of the two")
         return self.focal_px if self.camera is None else self.camera
@@ -163,11 +155,7 @@ class EstimateOptions:
 
     @property
     def config(self) -> EstimateConfig:
-        """Settings of the estimator, on the device of this process.
-
-        Raises:
-            InputError: a value is out of its range.
-        """
+        """Settings of the estimator, on the device of this process."""
         from depthpose.core.run import own_device  # --help must not load torch
 
         if self.batch < 1:
@@ -196,11 +184,7 @@ class RegisterOptions:
 
 
 def refuse_mixture(inputs: OneObjectOptions, dataset: DataSetOptions) -> None:
-    """Refuse none of the three kinds of input, or several, and options of another kind.
-
-    Raises:
-        InputError: which, and the rule.
-    """
+    """Refuse none of the three kinds of input, or several, and options of another kind."""
     count = sum(word is not None for word in (inputs.cloud, inputs.depth, dataset.bop))
     if count != 1:
         raise InputError(
@@ -227,15 +211,7 @@ _WHY = {
 
 
 def refuse_beside(option: str, others: Mapping[str, object]) -> None:
-    """Refuse options that would be ignored beside an input.
-
-    Args:
-        option: of the input, a key of ``_WHY``.
-        others: the values of such options by name.
-
-    Raises:
-        InputError: the names of those that are given.
-    """
+    """Refuse options that would be ignored beside an input."""
     named = " and ".join(f"--{name}" for name, value in others.items() if value is not None)
     if named:
         raise InputError(f"{named} beside {option}: {_WHY[option]}; leave {named} out")
@@ -269,11 +245,7 @@ class SequenceOptions:
     device: Device = "cpu"
 
     def refuse_unusable(self) -> None:
-        """Refuse none of the three kinds of input, or several, options of others, and processes.
-
-        Raises:
-            InputError: which, and the rule.
-        """
+        """Refuse none of the three kinds of input, or several, options of others, and processes."""
         from depthpose.core.run import find_rank
 
         if sum(place is not None for place in (self.depth, self.cloud, self.bop)) != 1:

@@ -197,11 +197,7 @@ def predict_dataset(
 
 def predict_all(method: PoseMethod, jobs: list[Job[Any]], out: Path, settings: dict[str, Any],
                 batch: int, view: str | None) -> list[Prediction] | None:  # fmt: skip
-    """Estimate what is not finished; several processes share the work through the files.
-
-    Returns:
-        All predictions in the order of the jobs; None in a process that is not the first.
-    """
+    """Estimate what is not finished; several processes share the work through the files."""
     process = find_rank()
     home = out if process.world == 1 else out / f"part-{process.rank}"
     done = _finished(out)
@@ -363,15 +359,7 @@ def write_pose_page(
     method: PoseMethod,
     dataset: BopDataset | None = None,
 ) -> None:
-    """Write a page of some of the predictions, and of the reason of each refusal.
-
-    Args:
-        out: its folder.
-        predictions: all, in the order of the jobs.
-        jobs: their inputs.
-        method: by which.
-        dataset: that they are of, if they are of one.
-    """
+    """Write a page of some of the predictions, and of the reason of each refusal."""
     sections = _answer_sections(predictions, jobs, method, dataset)
     counts = Counter(prediction.estimate.status for prediction in predictions)
     said = ", ".join(f"{count} {status}" for status, count in sorted(counts.items()))

@@ -150,11 +150,7 @@ def predict_on_ray(
 
 
 def refuse_unshared(masks: str, out: str) -> None:
-    """Refuse what the workers cannot share of a data set.
-
-    Raises:
-        InputError: ``out`` is in a store, or the masks are yet to be found by a segmentation.
-    """
+    """Refuse what the workers cannot share of a data set."""
     if is_url(out):
         raise InputError(
             f"--out {out}: poses of a data set come together in poses.json and BOP's csv, which "
@@ -177,21 +173,7 @@ def predict_instances(
     settings: dict[str, Any],
     engine: EngineOptions,
 ) -> list[Prediction]:
-    """Pose the instances of a data set by the workers of an engine, and write ``poses.json``.
-
-    Args:
-        source: of the estimator.
-        options: that name the data set and its masks.
-        dataset: the same, with the objects that are posed.
-        jobs: of its instances.
-        batch: inputs in one call of the network.
-        out: folder of the results.
-        settings: that decide them.
-        engine: where the work is done.
-
-    Returns:
-        The predictions in the order of the jobs.
-    """
+    """Pose the instances of a data set by the workers of an engine, and write ``poses.json``."""
     shipped = options.masks in ("truth", "predicted")
     work = BopWork(
         source=source.packed(),

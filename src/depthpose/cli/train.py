@@ -66,18 +66,7 @@ class TrainingOptions:
         default: object = None,
         workers: int | None = None,
     ) -> Any:  # noqa: ANN401 - an instance of kind
-        """Read the config of a training, or take its defaults, with what was said here.
-
-        Args:
-            path: of the config.
-            kind: its dataclass.
-            default: the config if none is named; None: the dataclass's own.
-            workers: processes that make samples beside the one that trains.
-
-        Raises:
-            InputError: a value is refused, or a warm-up longer than the config's own steps. A try
-                (``--steps``) may be shorter, and a run that goes on keeps its config.
-        """
+        """Read the config of a training, or take its defaults, with what was said here."""
         from depthpose.core.config import read_config
         from depthpose.core.loop import refuse_long_warmup  # --help must not load torch
 
@@ -203,11 +192,7 @@ class PairsOptions:
     otherwise."""
 
     def applied(self, config: "DepthConfig") -> "DepthConfig":
-        """Give the config of a training with these folders.
-
-        Raises:
-            InputError: the stage takes no held-out pairs.
-        """
+        """Give the config of a training with these folders."""
         from depthpose.depth.config import PairsConfig
         from depthpose.depth.train.config import AdaptTraining, StereoTraining
 
@@ -244,11 +229,7 @@ class BeginningOptions:
     weights import efficientnet-lite0'."""
 
     def applied(self, config: "DepthConfig", stage: str) -> "DepthConfig":
-        """Give the config of a stage with these weights.
-
-        Raises:
-            InputError: the stage takes none of these.
-        """
+        """Give the config of a stage with these weights."""
         settings = {field.name for field in dataclasses.fields(config)}
         if stage != "finetune":
             settings -= {"generator", "matcher"}
@@ -377,11 +358,7 @@ class LearntOptions:
         return own_part(self.start or _START) if is_own else None
 
     def applied(self, config: "PoseConfig") -> "PoseConfig":
-        """Give the config of a training with these.
-
-        Raises:
-            InputError: the training takes no CAD files, or learns from no data set.
-        """
+        """Give the config of a training with these."""
         from depthpose.pose.train import SegmentationTraining  # --help must not load torch
 
         if self.start is not None:

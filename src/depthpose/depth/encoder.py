@@ -150,21 +150,13 @@ def encoder_from_published(state: Mapping[str, Tensor]) -> LiteEncoder:
 
 
 def import_encoder(file: Path, out: Path) -> None:
-    """Turn the published classifier into an encoder's weights file, without running its code.
-
-    Raises:
-        InputError: not a checkpoint of that network.
-    """
+    """Turn the published classifier into an encoder's weights file, without running its code."""
     encoder = encoder_from_published(read_published(file, "EfficientNet-Lite0"))
     save_imported(out, KIND, encoder, file, {"trained_on": "ImageNet", "licence": "Apache-2.0"})
 
 
 def load_encoder(encoder: LiteEncoder, path: Path) -> None:
-    """Give an encoder of full width the weights of a file, as far as it reaches.
-
-    Raises:
-        InputError: not a file that :func:`import_encoder` wrote, or the encoder is narrower.
-    """
+    """Give an encoder of full width the weights of a file, as far as it reaches."""
     state = read_encoder(path).state_dict()
     own = encoder.state_dict()
     if any(state[name].shape != tensor.shape for name, tensor in own.items()):
@@ -176,11 +168,7 @@ def load_encoder(encoder: LiteEncoder, path: Path) -> None:
 
 
 def read_encoder(path: Path) -> LiteEncoder:
-    """Read an encoder that :func:`import_encoder` wrote.
-
-    Raises:
-        InputError: not such a file.
-    """
+    """Read an encoder that :func:`import_encoder` wrote."""
     encoder = LiteEncoder()
     load_weights(encoder, read_checkpoint(path, KIND), str(path))
     return encoder

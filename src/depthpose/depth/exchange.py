@@ -27,11 +27,7 @@ _DEPTH = ".depth_m.npy"
 
 
 def predicted_names(results: Path) -> list[str]:
-    """List the frames of a folder of ``depth predict`` or ``depth match`` that have metres.
-
-    Raises:
-        InputError: there is none.
-    """
+    """List the frames of a folder of ``depth predict`` or ``depth match`` that have metres."""
     names = sorted(path.name.removesuffix(_DEPTH) for path in results.glob(f"*{_DEPTH}"))
     if not names:
         raise InputError(
@@ -45,13 +41,6 @@ def colmap_files(results: Path, images: Path | None = None) -> dict[str, str]:
     """Say where in COLMAP's workspace the depth of each frame belongs.
 
     COLMAP calls a map by its image, suffix and all: ``stereo/depth_maps/a.jpg.geometric.bin``.
-
-    Args:
-        results: folder of predictions.
-        images: folder that COLMAP's names of images count from; by default that of each image.
-
-    Raises:
-        InputError: no predictions, or an image that lies elsewhere.
     """
     sources = read_sources(results)
     files = {}
@@ -68,14 +57,7 @@ def colmap_files(results: Path, images: Path | None = None) -> dict[str, str]:
 
 
 def write_colmap(results: Path, out: Path, files: Mapping[str, str], scale: float) -> Iterator[str]:
-    """Write the depth of each frame for COLMAP, and yield its name.
-
-    Args:
-        results: folder of predictions.
-        out: COLMAP's dense workspace.
-        files: of :func:`colmap_files`.
-        scale: units of the reconstruction a metre.
-    """
+    """Write the depth of each frame for COLMAP, and yield its name."""
     for name, file in files.items():
         write_colmap_map(out / file, _depth_m(results, name) * scale)
         yield name

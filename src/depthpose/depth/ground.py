@@ -31,13 +31,7 @@ _WINDOW_PX = 5
 def fit_ground(depth_m: Float[Tensor, "h w"], camera: Camera) -> Ground | None:
     """Fit a plane to the lower part of a depth map: RANSAC on inverse depth, then least squares.
 
-    Args:
-        depth_m: camera z; NaN where unknown.
-        camera: of the map.
-
-    Returns:
-        The plane, or None where a quarter of the lower part does not lie on one that could be
-        ground.
+    None where a quarter of the lower part does not lie on one that could be ground.
     """
     rays, inverse, strips = _lower_points(depth_m, camera)
     if len(inverse) < 60:
@@ -112,13 +106,6 @@ def scale_by_mount(found: DepthEstimate, image: StereoInput) -> DepthEstimate:
 
     How large things look says another scale, so that the square root of the ground's factor is
     taken. With a tilt too the plane is known, and what lies on the ground gets its depth.
-
-    Args:
-        found: an estimate of one image.
-        image: what was estimated; its camera has ``mount_height_m`` and ``tilt_deg`` where known.
-
-    Raises:
-        InputError: the height is known, and no ground was found.
     """
     camera, name = image.camera, image.name
     assert camera is not None and found.depth_m is not None  # noqa: PT018

@@ -17,15 +17,7 @@ _KIND = "selection"
 
 
 def measure_image_confidence(net: FakestereoNet, images: Iterable[StereoInput]) -> list[float]:
-    """Give the confidence in each image as a whole, 0..1 (``DepthEstimate.image_confidence``).
-
-    Args:
-        net: with a generator that selects, and ``allow_ood``.
-        images: right views are ignored.
-
-    Raises:
-        InputError: the generator has no confidence, or an image cannot be used.
-    """
+    """Give the confidence in each image as a whole, 0..1 (``DepthEstimate.image_confidence``)."""
     found: list[float] = []
     for image in images:
         image_confidence = net.estimate_pair(replace(image, right=None)).image_confidence
@@ -39,11 +31,7 @@ def measure_image_confidence(net: FakestereoNet, images: Iterable[StereoInput]) 
 
 
 def refuse_share(images: int, alarm_share: float) -> None:
-    """Refuse a share of images that so many of them cannot tell.
-
-    Raises:
-        InputError: it is no share, or less than one image.
-    """
+    """Refuse a share of images that so many of them cannot tell."""
     if not 0 < alarm_share < 1:
         raise InputError(f"alarm_share is {alarm_share:g}; it must be above 0 and below 1")
     if images * alarm_share < 1:

@@ -62,11 +62,7 @@ class KittiCalibration:
 
 
 def read_raw_calibration(folder: Path, width: int, height: int) -> KittiCalibration:
-    """Read a date's ``calib_cam_to_cam.txt`` and, where it is, ``calib_velo_to_cam.txt``.
-
-    Raises:
-        InputError: missing, or a matrix missing or of the wrong size.
-    """
+    """Read a date's ``calib_cam_to_cam.txt`` and, where it is, ``calib_velo_to_cam.txt``."""
     cameras = folder / "calib_cam_to_cam.txt"
     keys = read_key_values(cameras)
     left = kitti_matrix(cameras, keys, "P_rect_02", (3, 4))
@@ -90,9 +86,6 @@ def read_object_calibration(
 
     Texts of the KITTI 2012 and 2015 sets (``P2`` or ``P_rect_02``) are read too, and those of
     odometry, whose ``Tr`` goes to the rectified camera 0; of the grey pair, P0 and P1.
-
-    Raises:
-        InputError: missing, or a matrix missing or of the wrong size.
     """
     keys = read_key_values(path)
     names = ("P2", "P3") if "P2" in keys else ("P_rect_02", "P_rect_03")
@@ -118,9 +111,6 @@ def read_plain_calibration(path: Path, name: str, width: int, height: int) -> St
     Either ``focal_px``, ``cx``, ``cy`` and ``baseline_m`` for all pairs, a line each, or one line
     a pair: ``name width height focal_px cx cy baseline_m``, which may go on with ``focal_y_px
     cx_right_minus_left_px``.
-
-    Raises:
-        InputError: a value missing, or no line for this pair.
     """
     text = read_text(path, _MAX_PAIRS_BYTES)
     if re.search(r"^[ \t]*focal_px[ \t]*:", text, re.MULTILINE):
@@ -313,11 +303,7 @@ class Frame:
 
 
 def frame_input(frame: Frame) -> StereoInput:
-    """Read images and calibration of a frame.
-
-    Raises:
-        InputError: a file is missing or damaged, or the two views differ in size.
-    """
+    """Read images and calibration of a frame."""
     left = read_image(frame.left)
     right = None if frame.right is None else read_image(frame.right)
     if frame.right is not None and right is not None:
@@ -326,11 +312,7 @@ def frame_input(frame: Frame) -> StereoInput:
 
 
 def frame_truth(frame: Frame) -> StereoTruth:
-    """Read the truth that the dataset ships as maps; a LiDAR scan is for :func:`lidar_truth`.
-
-    Raises:
-        InputError: a map is damaged, or of another size than the left image.
-    """
+    """Read the truth that the dataset ships as maps; a LiDAR scan is for :func:`lidar_truth`."""
     depth_m = None if frame.depth is None else read_depth(frame.depth)
     disparity_px = None if frame.disparity is None else read_disparity(frame.disparity)
     is_sky = None if frame.sky is None else read_image(frame.sky)[0] > 0
@@ -342,11 +324,7 @@ def frame_truth(frame: Frame) -> StereoTruth:
 
 
 def frame_camera(frame: Frame) -> Camera | None:
-    """Read the camera of a frame, or None where it has no calibration; of a pair, the rig.
-
-    Raises:
-        InputError: the calibration is damaged, or that of images of another size.
-    """
+    """Read the camera of a frame, or None where it has no calibration; of a pair, the rig."""
     if frame.calibration is None:
         return None
     path, size = frame.calibration, image_size(frame.left)

@@ -82,11 +82,7 @@ def pack_frames(
 
 
 def packed_frames(folder: Path) -> Iterator[Frame]:
-    """List the frames of a packed data set; none where there is no index.
-
-    Raises:
-        InputError: the index is damaged.
-    """
+    """List the frames of a packed data set; none where there is no index."""
     index = folder / INDEX
     if not index.is_file():
         return
@@ -109,9 +105,6 @@ def local_folder(folder: Path | str) -> Path:
     """Give the folder itself; for a URL, a local one to which its shards come as they are read.
 
     It is in ``$DEPTHPOSE_CACHE``, by default ``~/.cache/depthpose``.
-
-    Raises:
-        InputError: the store does not answer, or holds no packed data set there.
     """
     text = str(folder)
     if _URL.match(text) is None:
@@ -189,11 +182,7 @@ class Layout:
 
 
 def find_frames(folder: Path) -> tuple[str, list[Frame]]:
-    """Recognise the layout of a folder and list its frames, sorted by name.
-
-    Raises:
-        InputError: no such folder, no known layout, or no image.
-    """
+    """Recognise the layout of a folder and list its frames, sorted by name."""
     if not folder.is_dir():
         raise InputError(f"{folder}: there is no such folder. Give the folder of a dataset.")
     folder = Path(os.path.abspath(folder))  # noqa: PTH100  '.' has no name, and a link keeps its own

@@ -34,12 +34,7 @@ _VALUES = (
 
 
 def as_tensor(image: object, name: str = "the image") -> Float[Tensor, "3 h w"]:
-    """Read a :data:`Picture`, or bring it to RGB in [0, 1]; a batch of one is its image.
-
-    Raises:
-        InputError: a shape that is none of an image, a batch of several, values other than 8-bit
-            numbers and floats in [0, 1], or a file that cannot be read.
-    """
+    """Read a :data:`Picture`, or bring it to RGB in [0, 1]; a batch of one is its image."""
     match image:
         case str() | Path():
             return read_image(Path(image))
@@ -60,13 +55,7 @@ def as_tensor(image: object, name: str = "the image") -> Float[Tensor, "3 h w"]:
 
 
 def _rgb(values: Tensor, sides: tuple[int, int], what: str) -> Float[Tensor, "3 h w"]:
-    """Bring three channels in [0, 1] to the front.
-
-    Args:
-        values: of one image, or a batch of one.
-        sides: where channels are looked for, the likelier side first.
-        what: it is, for errors.
-    """
+    """Bring three channels in [0, 1] to the front."""
     shape = tuple(values.shape)
     if values.ndim == 4 and shape[0] != 1:
         raise InputError(
@@ -99,9 +88,6 @@ def as_input(
     """Take a picture and what is known of its camera; without that, ask the picture's EXIF.
 
     What is an input already stays it.
-
-    Raises:
-        InputError: as :func:`as_tensor`, or no camera of this image.
     """
     if isinstance(image, StereoInput):
         return image

@@ -125,11 +125,7 @@ def join_matches(one: Match, other: Match) -> Match:
 
 
 def set_answer(found: DepthWeights | None, answer: Answer) -> None:
-    """Let depth of one image come from elsewhere than the weights say.
-
-    Raises:
-        InputError: the generator has no disparity of its own, or there is none.
-    """
+    """Let depth of one image come from elsewhere than the weights say."""
     generator = None if found is None else found.generator
     if isinstance(generator, SelectionGenerator):
         generator.config = replace(generator.config, answer=answer)
@@ -143,17 +139,7 @@ def set_answer(found: DepthWeights | None, answer: Answer) -> None:
 def check_distribution(
     name: str, found: DepthEstimate, config: GeneratorConfig | SelectionConfig, *, allow_ood: bool
 ) -> DepthEstimate:
-    """Refuse an image that is unlike what the weights know, or warn of it.
-
-    Args:
-        name: of the image, for the error.
-        found: its estimate, with the confidence of the whole image (0..1).
-        config: of the generator, with the least of it.
-        allow_ood: add a ``warning`` in place of refusing.
-
-    Raises:
-        InputError: the image is such, and that is not allowed.
-    """
+    """Refuse an image that is unlike what the weights know, or warn of it."""
     assert found.image_confidence is not None
     least = config.least_confidence if isinstance(config, SelectionConfig) else 0.0
     if found.image_confidence >= least:
@@ -179,18 +165,7 @@ def choose_matcher(
     own: DepthWeights | None,
     config: MatcherConfig | SGBMConfig | None,
 ) -> Matcher | None:
-    """Take the matcher that was named, or that of the weights; None where one image needs none.
-
-    Args:
-        weights: as the user named them.
-        found: what they hold.
-        matcher: as the user named it.
-        own: what weights of a matcher alone hold.
-        config: how the matcher runs.
-
-    Raises:
-        InputError: there is none, or one of another kind than the config.
-    """
+    """Take the matcher that was named, or that of the weights; None where one image needs none."""
     run = config if isinstance(config, MatcherConfig) else MatcherConfig()
     if isinstance(config, SGBMConfig) and matcher != "sgbm":
         raise InputError(
@@ -231,15 +206,6 @@ def match_to_infinity(
     What is farthest then has a disparity of 0 px, where matchers search, and what is nearest that
     of a rig whose principal points agree. Disparities of the views as given are returned.
     Where the right view shows nothing of the left one, the confidence is 0.
-
-    Args:
-        match: of pairs and their camera.
-        left: RGB in [0, 1].
-        right: of the same size, rectified.
-        camera: of the pair; None: its principal points are taken as equal.
-
-    Raises:
-        InputError: the principal points lie farther apart than the images are wide.
     """
     rig = camera if isinstance(camera, StereoRig) else None
     columns = 0 if rig is None else math.ceil(rig.cx_right_minus_left_px)

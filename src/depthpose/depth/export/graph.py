@@ -145,11 +145,7 @@ DYNAMIC_SHAPE_NETWORKS: dict[type[StereoNetwork], Callable[[Any], nn.Module]] = 
 
 
 def dynamic_shape_network(matcher: StereoNetwork) -> nn.Module:
-    """Give a matcher's network, with its post-processing, in a form with dynamic shapes.
-
-    Raises:
-        InputError: a matcher that has no such form.
-    """
+    """Give a matcher's network, with its post-processing, in a form with dynamic shapes."""
     if type(matcher) not in DYNAMIC_SHAPE_NETWORKS:
         known = ", ".join(kind.__name__ for kind in DYNAMIC_SHAPE_NETWORKS)
         raise InputError(
@@ -202,11 +198,7 @@ class DrawnValues:
 
 
 def drawn(left: Value, generator: Generator) -> DrawnValues:
-    """Draw right views.
-
-    Raises:
-        InputError: the generator is stochastic (dropout at test time).
-    """
+    """Draw right views."""
     if isinstance(generator, SelectionGenerator):
         return _selected(left, generator)
     if generator.config.test_mode != "running":
@@ -310,9 +302,6 @@ def image_graph(weights: DepthWeights) -> Graph:
     ``confidence`` (each batch, height, width) and ``right``, the drawn view; of networks that know
     the sky ``is_sky`` too (batch, height, width; bool), of weights that know streets
     ``image_confidence`` (batch), how probable one is.
-
-    Raises:
-        InputError: a network is missing, or the generator is stochastic (dropout at test time).
     """
     generator = weights.generator
     if generator is None or (weights.matcher is None and generator.config.answer != "own"):
@@ -353,9 +342,6 @@ def pair_graph(weights: DepthWeights) -> Graph:
     float64) where the weights were trained at one focal length. Outputs ``disparity_px`` and
     ``confidence`` (batch, height, width), and of a network that knows the sky ``is_sky`` (the same;
     bool), where disparity is 0.01 px. Elsewhere depth is ``fx * baseline / disparity``.
-
-    Raises:
-        InputError: there is no matcher in the weights.
     """
     if weights.matcher is None:
         raise InputError("these weights hold no matcher, only a generator; give a matcher's.")

@@ -65,17 +65,7 @@ class Target:
 
 
 def depth_export(weights: DepthWeights, what: str | None, facts: dict[str, Any]) -> Export:
-    """Describe the file that weights are exported to.
-
-    Args:
-        weights: of a generator and a matcher, of a generator with an answer of its own, or of a
-            matcher alone.
-        what: a key of ``TARGETS``; None: the first that fits the weights.
-        facts: what else a user of the file must know.
-
-    Raises:
-        InputError: an unknown target.
-    """
+    """Describe the file that weights are exported to."""
     if what is None:
         what = next(name for name, target in TARGETS.items() if target.fits(weights))
     refuse_unknown("what", what, TARGETS)

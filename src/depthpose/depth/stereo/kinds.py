@@ -54,11 +54,7 @@ class Footprint(ABC):
         """Peak memory of activations of one pair [bytes], with margin for the allocator."""
 
     def refuse_more_than(self, max_memory_bytes: int | None) -> None:
-        """Refuse a bound that a match would exceed.
-
-        Raises:
-            InputError: it does; the message says how much it takes.
-        """
+        """Refuse a bound that a match would exceed."""
         least = self.estimate_bytes()
         if max_memory_bytes is not None and least > max_memory_bytes:
             quick = "" if self.config.work_focal_px is None else " or speed='quick'"

@@ -176,13 +176,7 @@ def select_views(
     left: Float[Tensor, "b 3 h w"],
     size: tuple[int, int] | None = None,
 ) -> tuple[Selected, Selected]:
-    """Answer disparity, sky and confidence of the left and of the right view, with gradients.
-
-    Args:
-        generator: the network.
-        left: images of any size, RGB in [0, 1].
-        size: rows and columns of the answer, in whose pixels disparities are; None: the images'.
-    """
+    """Answer disparity, sky and confidence of the left and of the right view, with gradients."""
     height, width = left.shape[-2:]
     size = (height, width) if size is None else size
     multiple = generator.config.side_multiple_px

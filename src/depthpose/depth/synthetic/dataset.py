@@ -57,14 +57,7 @@ class Sight:
 def look(
     stage: Stage, K: Float64[Tensor, "3 3"], size: tuple[int, int], eye: Float[Tensor, "3"]
 ) -> Sight:
-    """Find what each pixel sees.
-
-    Args:
-        stage: the scene.
-        K: intrinsic matrix.
-        size: height and width of the picture [px].
-        eye: position of the camera in the left camera's frame [m].
-    """
+    """Find what each pixel sees from ``eye`` [m]; ``size`` is height and width [px]."""
     corners = stage.corners - eye
     raster = rasterize(corners, K, size[1], size[0], NEAR_M, with_barycentric=False)
     edges, volume = edge_functions(corners, K)
@@ -126,13 +119,7 @@ _OFFSETS = ((-0.375, -0.125), (0.125, -0.375), (0.375, 0.125), (-0.125, 0.375))
 
 
 def draw_light(stage: Stage, sight: Sight, *, with_antialiasing: bool) -> Float[Tensor, "h w 3"]:
-    """Give linear RGB, before any sensor.
-
-    Args:
-        stage: what is drawn.
-        sight: from where it is seen.
-        with_antialiasing: take four samples in pixels where an edge shows.
-    """
+    """Give linear RGB, before any sensor."""
     height, width = sight.raster.primitive.shape
     is_edge = torch.zeros(height * width, dtype=torch.bool)
     if with_antialiasing:
@@ -254,13 +241,7 @@ class Sensor:
 def draw_sensors(
     rng: np.random.Generator, light: Float[Tensor, "h w 3"], jpeg_share: float
 ) -> tuple[Sensor, Sensor]:
-    """Draw the cameras of a pair: alike, but for a little gain and colour.
-
-    Args:
-        rng: random numbers.
-        light: what the left one receives; the exposure is set by it, sky aside.
-        jpeg_share: how many pictures are compressed.
-    """
+    """Draw the cameras of a pair: alike, but for a little gain and colour."""
     luminance = light.mean(-1)
     metered = luminance[len(luminance) // 3 :].clamp(max=1.2).mean() + 1e-3
     # Rounded, for the last bits of a long mean depend on how many threads took part.
@@ -519,11 +500,7 @@ class Streets:
         return self.config.frames
 
     def __getitem__(self, index: int) -> StereoSample:
-        """Make one sample; its truth is exact, and NaN in the sky.
-
-        Raises:
-            IndexError: there is no such frame.
-        """
+        """Make one sample; its truth is exact, and NaN in the sky."""
         if not 0 <= index < len(self):
             raise IndexError(f"frame {index} of {len(self)}")
         frame = draw_street(self.config, index)

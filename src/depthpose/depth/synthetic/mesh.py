@@ -68,15 +68,7 @@ def place(
     scale: Values = 1.0,
     tints: Mapping[str, Color] | None = None,
 ) -> Mesh:
-    """Copy a model to its place.
-
-    Args:
-        mesh: a model, on the ground at the origin.
-        position: where to [m].
-        yaw_rad: turned about the vertical.
-        scale: factor, or one for each of the model's own x, y and z.
-        tints: colours by material, which multiply the model's own.
-    """
+    """Copy a model to its place."""
     factor = np.broadcast_to(np.asarray(scale, np.float32), 3)
     R = turn_y(yaw_rad).astype(np.float32)
     corners = (mesh.corners * factor) @ R.T + np.asarray(position, np.float32)

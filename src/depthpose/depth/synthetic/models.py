@@ -21,16 +21,7 @@ def add_ball(
     level: int = 2,
     dents: tuple[np.random.Generator, Number] | None = None,
 ) -> None:
-    """Add an ellipsoid.
-
-    Args:
-        builder: what to add to.
-        centre: its middle [m].
-        radii_m: one radius, or one an axis.
-        surface: what covers it.
-        level: how often the icosahedron is refined.
-        dents: random numbers and the depth of dents, as a share of the radius.
-    """
+    """Add an ellipsoid."""
     directions, faces = _sphere(level)
     radii = np.broadcast_to(np.asarray(radii_m, np.float64), 3)
     swell = np.ones(len(directions))
@@ -140,9 +131,7 @@ def leaf_color(rng: np.random.Generator) -> Color:
 def tree(number: int, coarseness: int = 0) -> Mesh:
     """Give tree model ``number``, about 10 m high: round crowns, columns and conifers.
 
-    Args:
-        number: which model.
-        coarseness: 0 to be seen from near, 1 from some 30 m, 2 from far away.
+    Coarseness 0 is to be seen from near, 1 from some 30 m, 2 from far away.
     """
     rng = np.random.default_rng([11, number])
     builder = MeshBuilder()
@@ -234,11 +223,7 @@ def add_wood_edge(
 ) -> None:
     """Add the dark, uneven front of a dense wood, which closes the view behind single trees.
 
-    Args:
-        builder: what to add to.
-        rng: random numbers.
-        line: x and s of its start, x and s of its end [m].
-        height_m: of the wood, more or less.
+    ``line`` is x and s of its start, then of its end [m].
     """
     x0, s0, x1, s1 = line
     count = max(3, int(np.hypot(x1 - x0, s1 - s0) / 1.5))

@@ -79,12 +79,7 @@ class Stage:
 
 
 def prepare(scene: StreetScene, pixels: int = 1242 * 375) -> Stage:
-    """Make a scene ready for drawing.
-
-    Args:
-        scene: what will be drawn.
-        pixels: how many the pictures will have: small ones need no fine shadows.
-    """
+    """Make a scene ready for drawing."""
     share = float(np.clip((pixels / (1242 * 375)) ** (1 / 3), 0.4, 1))
     mesh = scene.mesh
     corners = torch.from_numpy(mesh.corners)
@@ -408,12 +403,6 @@ def paint_road(
     """Give the colour of the asphalt with what is painted on it.
 
     Lines are narrower than a pixel far away, so they cover it by the share of its footprint.
-
-    Args:
-        scene: whose road it is.
-        albedo: colour of the bare asphalt.
-        place_m: x across and s along the road.
-        foot: width of a pixel's footprint [m], and the cosine of the angle it is seen at.
     """
     x, s = place_m.unbind(1)
     width_m, length_m = foot[0], foot[0] / foot[1].clamp(min=0.02)

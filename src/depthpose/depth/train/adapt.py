@@ -180,12 +180,7 @@ class AdaptationCheck:
 
 
 def refuse_worse(before: AdaptMetrics, after: AdaptMetrics) -> None:
-    """Refuse a matcher that lost more than it gained.
-
-    Raises:
-        InputError: the held-out pairs fit no better, by one of both measures worse, or
-            the streets are matched much worse.
-    """
+    """Refuse a matcher that lost more than it gained."""
     said = f"before {asdict(before)}, after {asdict(after)}"
     advice = "no weights are written; take fewer steps, a lower learning_rate, or more pairs"
     changes = [
@@ -211,9 +206,6 @@ def split_pairs(
     """Open a folder of pairs; give the numbers of those to train on, and of the last, held out.
 
     Frames that ``exclude`` names are neither.
-
-    Raises:
-        InputError: fewer than two pairs with calibration.
     """
     dataset = open_dataset(folder, split)
     usable = [
@@ -232,11 +224,7 @@ def split_pairs(
 
 
 def fine_focal_px(config: AdaptTraining, network: StereoNetwork) -> float:
-    """Give the focal length of a fine match of the first held-out pair, not enlarged [px].
-
-    Raises:
-        InputError: the first folder has fewer than two pairs with calibration.
-    """
+    """Give the focal length of a fine match of the first held-out pair, not enlarged [px]."""
     folder, split = config.pairs.folders[0], config.pairs.split
     dataset, _, back = split_pairs(folder, split, config.validation_share, config.pairs.exclude)
     camera = dataset.read_input(back[0]).camera

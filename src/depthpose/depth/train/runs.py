@@ -66,10 +66,6 @@ def start_from(network: Generator | StereoNetwork, found: nn.Module, source: str
     """Copy weights whose config is the network's own, but for what no weight depends on.
 
     What the network has beyond them keeps its beginning, where that has no effect.
-
-    Raises:
-        InputError: another kind of network, or a setting differs, so the weights would mean
-            something else.
     """
     if type(found) is not type(network):
         raise InputError(
@@ -326,9 +322,6 @@ def _at_virtual_focal(
     The generator that selects may be trained on other sizes too, by ``focal_px`` and
     ``augment.scale``: it answers pixels of the image before it, and these grow with the image. A
     U-Net works for its own rig only.
-
-    Raises:
-        InputError: pairs of a U-Net, or pairs held out, are to have another focal length or size.
     """
     focal_px = generator.virtual_focal_px
     sources = ("pairs", "more", "held_out")
