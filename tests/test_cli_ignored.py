@@ -114,7 +114,7 @@ def test_a_command_ends_its_work_though_nobody_can_read_it(
         sys.stdout.write("after\n")
         return 0
 
-    monkeypatch.setattr("depthpose.cli._command", lambda _: work())
+    monkeypatch.setattr("depthpose.cli._run", lambda _: work())
     monkeypatch.setattr(sys, "stdout", stream())
     assert main(["anything"]) == code
     assert made[0].read_text() == "whole"

@@ -12,7 +12,7 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from importlib import import_module
 from importlib.metadata import version
-from inspect import cleandoc, signature
+from inspect import cleandoc
 
 from depthpose import __version__
 from depthpose.cli.streams import lasting_streams
@@ -156,8 +156,23 @@ def main(words: Sequence[str] | None = None) -> int:
         The exit code: 0 done, 1 something in the input failed or the output cannot be written,
         2 unusable, 130 interrupted, 141 nobody reads the output.
     """
+    lock = sys.modules.get("depthpose.core.run")  # not imported for --help
+    before = lock.held_folders() if lock is not None else ()
     with lasting_streams() as output:
-        code = _command(list(sys.argv[1:] if words is None else words))
+        try:
+            with _notices_in_a_line():
+                code = _run(list(sys.argv[1:] if words is None else words))
+        except (InputError, MissingExtraError) as error:
+            code = _fail(f"error: {error}")
+        except KeyboardInterrupt as stop:
+            code = _fail(f"{str(stop) or 'interrupted'}; what was finished is kept", 130)
+        except Exception as error:
+            if (said := _explained(error)) is None:
+                raise
+            code = _fail(f"error: {said}")
+        finally:
+            if (lock := sys.modules.get("depthpose.core.run")) is not None:
+                lock.release_folders(but=before)
     if output.failure is None:
         return code
     if isinstance(output.failure, BrokenPipeError):  # nobody reads it any longer, as in '| head'
@@ -165,30 +180,6 @@ def main(words: Sequence[str] | None = None) -> int:
     reason = output.failure.strerror
     lost = f"standard output: cannot be written: {reason}; all files are written as without it"
     return _fail(f"error: {lost}", code or 1)
-
-
-def _command(words: list[str]) -> int:
-    if words in (["--version"], ["-V"]):
-        return _say_version()
-    name, rest = _split_command(words)
-    if name is None:
-        return _explain(words)
-    lock = sys.modules.get("depthpose.core.run")  # not imported for --help
-    before = lock.held_folders() if lock is not None else ()
-    try:
-        with _notices_in_a_line():
-            return _run(name, rest)
-    except (InputError, MissingExtraError) as error:
-        return _fail(f"error: {error}")
-    except KeyboardInterrupt as stop:
-        return _fail(f"{str(stop) or 'interrupted'}; what was finished is kept", 130)
-    except Exception as error:
-        if (said := _explained(error)) is None:
-            raise
-        return _fail(f"error: {said}")
-    finally:
-        if (lock := sys.modules.get("depthpose.core.run")) is not None:
-            lock.release_folders(but=before)
 
 
 def _fail(reason: str, code: int = 2) -> int:
@@ -240,55 +231,46 @@ def _notices_in_a_line() -> Iterator[None]:
         warnings.formatwarning = before
 
 
-def _split_command(words: list[str]) -> tuple[str | None, list[str]]:
-    for length in (3, 2, 1):
-        name = " ".join(words[:length])
-        if name in COMMANDS:
-            return name, words[length:]
-    return None, words
-
-
-def _run(name: str, rest: list[str]) -> int:
+def _run(words: list[str]) -> int:
+    """Read the words after ``depthpose`` as a command and its options, and call it."""
+    if words in (["--version"], ["-V"]):
+        return _say_version()
+    names = (" ".join(words[:length]) for length in (3, 2, 1))
+    name = next((name for name in names if name in COMMANDS), None)
+    if name is None:
+        return _explain(words)
+    rest = words[len(name.split()) :]
+    for word in rest:
+        option = word.partition("=")[0]
+        if remedy := _REMOVED_OPTIONS.get((words[0], option)):
+            raise InputError(f"'depthpose {name}' has no {option} any more: {remedy}")
     import tyro
 
-    _refuse_gone(name, rest)
-    home, _, function = COMMANDS[name][0].partition(":")
-    command: Callable[..., int] = getattr(import_module(f"depthpose.cli.{home}"), function)
-    text = cleandoc(command.__doc__ or "").partition("\nArgs:")[0]
-
     from depthpose.cli.arguments import (
-        in_words_of,
+        parser_of,
         refuse_empty,
         refuse_ignored_options,
         refuse_missing,
     )
 
-    @in_words_of(command)
-    def checked(*words: object, **options: object) -> int:
-        refuse_ignored_options(name, rest)
-        refuse_missing(command, signature(command).bind(*words, **options).arguments)
-        code = command(*words, **options)
-        sys.stdout.flush()
-        return code
-
+    home, _, function = COMMANDS[name][0].partition(":")
+    command: Callable[..., int] = getattr(import_module(f"depthpose.cli.{home}"), function)
     refuse_empty(command, rest)
     try:
-        return tyro.cli(
-            checked,
+        given = tyro.cli(
+            parser_of(command),
             prog=f"depthpose {name}",
-            description=text,
+            description=cleandoc(command.__doc__ or "").partition("\nArgs:")[0],
             args=rest,
             config=(tyro.conf.PositionalMetavarFromFieldName, tyro.conf.OmitArgPrefixes),
         )
     except SystemExit as stop:  # tyro has printed help (0) or the wrong arguments (2)
         return int(stop.code or 0)
-
-
-def _refuse_gone(name: str, rest: list[str]) -> None:
-    for word in rest:
-        option = word.partition("=")[0]
-        if remedy := _REMOVED_OPTIONS.get((name.partition(" ")[0], option)):
-            raise InputError(f"'depthpose {name}' has no {option} any more: {remedy}")
+    refuse_ignored_options(name, rest)
+    refuse_missing(command, given.arguments)
+    code = command(*given.args, **given.kwargs)
+    sys.stdout.flush()
+    return code
 
 
 def _explain(words: list[str]) -> int:
@@ -305,21 +287,17 @@ def _explain(words: list[str]) -> int:
         instead = _REMOVED_COMMANDS.get(f"{group} {verb}", nearest_name(verb, verbs))
         print(f"depthpose {group}: error: no command {verb!r}; {instead}", file=sys.stderr)
         return 2
-    print(_overview(inside, group), file=sys.stdout if asked_help else sys.stderr)
-    return 0 if asked_help else 2
-
-
-def _overview(commands: dict[str, str], group: str) -> str:
-    width = max(map(len, commands)) + 2
-    of_thesis = {n: what for n, what in commands.items() if n.partition(" ")[0] in _THESIS}
+    of_thesis = {n: what for n, what in inside.items() if n.partition(" ")[0] in _THESIS}
     parts = {
-        "commands": {n: what for n, what in commands.items() if n not in of_thesis},
+        "commands": {n: what for n, what in inside.items() if n not in of_thesis},
         "the tables and figures of the thesis": of_thesis,
     }
-    lines: list[str] = []
+    width = max(map(len, inside)) + 2
+    lines = [f"usage: depthpose {group or 'COMMAND'} ... [--help]", ""]
+    lines += ["The 6-DoF pose of a known object from a depth sensor, and metric depth from images."]
     for title, names in parts.items():
         if names:
-            lines += [f"{title}:", *(f"  {n:<{width}}{what}" for n, what in names.items()), ""]
-    usage = f"usage: depthpose {group or 'COMMAND'} ... [--help]"
-    what = "The 6-DoF pose of a known object from a depth sensor, and metric depth from images."
-    return "\n".join([usage, "", what, "", *lines, _EXIT_CODES])
+            lines += ["", f"{title}:", *(f"  {n:<{width}}{what}" for n, what in names.items())]
+    stream = sys.stdout if asked_help else sys.stderr
+    print("\n".join([*lines, "", _EXIT_CODES]), file=stream)
+    return 0 if asked_help else 2

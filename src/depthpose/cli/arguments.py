@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, is_dataclass
 from difflib import get_close_matches
 from enum import Enum
-from inspect import signature, unwrap
+from inspect import BoundArguments, signature, unwrap
 from itertools import pairwise
 from pathlib import Path
 from types import NoneType, UnionType
@@ -98,8 +98,8 @@ def group(options: type[Group]) -> type[Group]:
     return options
 
 
-def in_words_of(command: Callable[..., int]) -> Callable[[Callable[..., int]], Callable[..., int]]:
-    """Give a wrapper the signature of its command, with option types in words, for tyro.
+def parser_of(command: Callable[..., int]) -> Callable[..., BoundArguments]:
+    """Give tyro what parses a command's arguments: its signature, with option types in words.
 
     Groups of options, which are dataclasses, have words of their own.
     """
@@ -110,14 +110,14 @@ def in_words_of(command: Callable[..., int]) -> Callable[[Callable[..., int]], C
             hints[name] = _worded(hints[name])
     worded = [p.replace(annotation=hints[n]) for n, p in shape.parameters.items()]
 
-    def with_signature(wrapper: Callable[..., int]) -> Callable[..., int]:
-        function = unwrap(wrapper)  # tyro looks behind what checks types in tests, and so do we
-        function.__doc__, function.__module__ = command.__doc__, command.__module__
-        function.__annotations__ = hints
-        vars(function)["__signature__"] = shape.replace(parameters=worded)
-        return function
+    def parse(*words: object, **options: object) -> BoundArguments:
+        return shape.bind(*words, **options)
 
-    return with_signature
+    function = unwrap(parse)  # tyro looks behind what checks types in tests, and so do we
+    function.__doc__, function.__module__ = command.__doc__, command.__module__
+    function.__annotations__ = hints
+    vars(function)["__signature__"] = shape.replace(parameters=worded)
+    return function
 
 
 def _worded(hint: Any) -> Any:  # noqa: ANN401  any type
@@ -182,14 +182,17 @@ def refuse_empty(command: Callable[..., int], words: Sequence[str]) -> None:
 def refuse_missing(command: Callable[..., int], values: Mapping[str, Any]) -> None:
     """Refuse paths and weights that do not exist."""
     for name, option, kind in _options_of(command):
-        if name not in values:
+        if name not in values or kind in (None, _Names.NEW):
             continue
         value = values[name] if name == option else getattr(values[name], option)
         for one in value if isinstance(value, list | tuple) else [value]:
-            if kind is _Names.INPUT and one is not None:
+            if one is not None and kind is _Names.INPUT:
                 _refuse_path(str(one))
-            elif kind is _Names.WEIGHTS and one is not None:
-                _refuse_weights(one)
+            elif one is not None:
+                for prefix in _PREFIXES:
+                    one = one.removeprefix(prefix)  # noqa: PLW2901
+                if one not in _WORDS and not is_on_hub(one):
+                    find_weights(one)
 
 
 def _refuse_path(path: str) -> None:
@@ -200,13 +203,6 @@ def _refuse_path(path: str) -> None:
     near = get_close_matches(wanted.name, beside, n=1)
     hint = f"; did you mean {str(wanted.parent / near[0])!r}?" if near else "; check the path"
     raise InputError(f"{path}: there is no such file or folder{hint}")
-
-
-def _refuse_weights(name: str) -> None:
-    for prefix in _PREFIXES:
-        name = name.removeprefix(prefix)
-    if name not in _WORDS and not is_on_hub(name):
-        find_weights(name)
 
 
 Typed = Mapping[str, Sequence[str]]

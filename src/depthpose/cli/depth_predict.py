@@ -344,7 +344,7 @@ def write_depth_page(
     failures: Sequence[str],
     range_m: tuple[float, float] = COLOR_RANGE_M,
 ) -> None:
-    """Write a page of some depth maps of a folder (``read`` gives their inputs), and of warnings."""
+    """Write a page of some depth maps of a folder, whose inputs ``read`` gives, and of warnings."""
     chosen = [names[k] for k in spread_evenly(len(names), MOST_VIEWS)]
     pairs = list(read(chosen))
     which = "all" if len(pairs) == len(names) else "spread evenly"
