@@ -21,7 +21,7 @@ from depthpose.core.errors import InputError
 from depthpose.core.files import read_image, write_depth_png, write_image
 from depthpose.depth.datasets import open_dataset
 from depthpose.depth.disparity import disparity_from_depth
-from depthpose.depth.evaluate import DecileRow, Evaluation
+from depthpose.depth.evaluate import Evaluation, EvaluationRow
 from depthpose.depth.types import DepthEstimate, StereoInput
 from depthpose.thesis.depth import find_table
 
@@ -115,8 +115,13 @@ def test_table_2_2_is_made_by_one_command(
 
 
 def test_rows_of_confidence_name_the_speed() -> None:
-    row = DecileRow(
-        protocol="p", dataset="d", cap_m=80.0, frames=1, confidence_decile=1, error={"abs_rel": 0.1}
+    row = EvaluationRow(
+        protocol="p",
+        dataset="d",
+        cap_m=80.0,
+        frames=1,
+        confidence_decile=1,
+        metrics={"abs_rel": 0.1},
     )
     given = Evaluation(rows=[], per_frame=[], deciles=[row], skipped={})
     settings = {"matcher": "light", "weights": "default", "weights_sha256": 64 * "0"}

@@ -3,10 +3,10 @@ from dataclasses import replace
 import pytest
 
 from depthpose.core.errors import InputError
-from depthpose.depth.evaluate import MeanRow
+from depthpose.depth.evaluate import EvaluationRow
 from depthpose.thesis.depth import TABLES, find_table, join_published
 
-OURS = MeanRow(
+OURS = EvaluationRow(
     method="net",
     weights="w",
     protocol="eigen-raw",

@@ -61,6 +61,7 @@ def predict(
         matcher=networks.matcher,
         allow_ood=networks.allow_ood,
         answer=networks.answer,
+        use="images",
     )
     output.refuse_unusable()
     scale.refuse_unusable()
@@ -111,7 +112,7 @@ def match(
     from depthpose.cli.depth_methods import MethodSource
     from depthpose.core.run import refuse_among_inputs
 
-    method = MethodSource(weights=pairs.used, config=matching.config, with_right=True)
+    method = MethodSource(weights=pairs.used, config=matching.config, with_right=True, use="pairs")
     if method.weights is None and method.config != MatcherConfig():
         raise InputError(
             "--device, --speed, --precision, --max-memory, --tile and --left-right-check are for "

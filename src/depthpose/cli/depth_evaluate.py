@@ -4,7 +4,7 @@ import json
 import sys
 import tempfile
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -41,11 +41,10 @@ from depthpose.depth.estimator import FakestereoNet
 from depthpose.depth.evaluate import (
     PROTOCOLS,
     Evaluation,
-    FrameRow,
+    EvaluationRow,
     Measured,
     Protocol,
     Row,
-    Source,
     evaluate,
     frame_result,
     has_truth,
@@ -220,21 +219,18 @@ def measure_each(
 def signed(result: Evaluation, name: str, settings: dict[str, Any] | None) -> Evaluation:
     """Add the source of the predictions to each row."""
     holes = {True: " (holes filled)", False: " (matched pixels)"}
-    source = Source(method=name)
-    if settings is not None:
-        how = holes.get(settings.get("with_filled_holes", ""), "")
-        source = Source(
-            method=settings.get("matcher", "") + how,
-            input=settings.get("input", "both views"),
-            speed=settings.get("speed", ""),
-            weights=settings.get("weights", ""),
-            weights_sha256=settings.get("weights_sha256", "")[:12],
-        )
-    short = {field: getattr(source, field) for field in ("method", "input", "speed", "weights")}
+    known = settings or {"matcher": name, "input": ""}
+    source = {
+        "method": known.get("matcher", "") + holes.get(known.get("with_filled_holes", ""), ""),
+        "input": known.get("input", "both views"),
+        "speed": known.get("speed", ""),
+        "weights": known.get("weights", ""),
+    }
+    sha256 = known.get("weights_sha256", "")[:12]
     return Evaluation(
-        rows=[replace(row, **asdict(source)) for row in result.rows],
-        per_frame=[replace(row, **short) for row in result.per_frame],
-        deciles=[replace(row, **short) for row in result.deciles],
+        rows=[replace(row, weights_sha256=sha256, **source) for row in result.rows],
+        per_frame=[replace(row, **source) for row in result.per_frame],
+        deciles=[replace(row, **source) for row in result.deciles],
         skipped=result.skipped,
     )
 
@@ -289,7 +285,7 @@ def say_skipped(measured: Evaluation) -> None:
 def frame_sections(
     dataset: Dataset,
     folders: Sequence[Path],
-    rows: Sequence[Sequence[FrameRow]],
+    rows: Sequence[Sequence[EvaluationRow]],
     protocol: str,
 ) -> list[Section]:
     """Show the worst, the median and the best frame of each set of predictions."""

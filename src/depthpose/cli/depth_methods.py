@@ -19,6 +19,7 @@ from depthpose.depth.datasets import Dataset
 from depthpose.depth.estimator import FakestereoNet
 from depthpose.depth.predictions import Estimator
 from depthpose.depth.stereo import MATCHERS, SGBMMatcher, with_usable_precision
+from depthpose.depth.weights import Use
 
 
 class Method(NamedTuple):
@@ -46,6 +47,7 @@ class MethodSource:
             other weights, by name or file.
         allow_ood: answer out-of-distribution images too, as a measurement must.
         answer: where depth of one image comes from, in place of what the weights say.
+        use: build what these take alone; None: all networks.
     """
 
     weights: str | Weights | None
@@ -54,6 +56,7 @@ class MethodSource:
     matcher: str | None = None
     allow_ood: bool = True
     answer: Answer | None = None
+    use: Use | None = None
 
     def build(self) -> Method:
         """Build the networks on the device of the config."""
@@ -84,7 +87,11 @@ class MethodSource:
             name, net, own = self._matched_by_other(path, config, facts)
         else:
             net = FakestereoNet.load(
-                path, config=config, answer=self.answer, allow_ood=self.allow_ood
+                path,
+                config=config,
+                answer=self.answer,
+                allow_ood=self.allow_ood,
+                use=self.use,
             )
             name, own = path.stem, config_to_dict(config)
             name += "-both" if with_right and not is_matcher else ""

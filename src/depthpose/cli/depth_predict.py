@@ -181,8 +181,7 @@ def predict_all(
     assert isinstance(method.net, FakestereoNet), "weights build no other"
     with open_viewer(None if find_rank().rank else output.view) as viewer:
         predictor = Predictor(lens=lens, net=method.net, out=out, output=output, viewer=viewer)
-        images = {path.stem: path for path in mine if not _is_video(path)}
-        done = predictor.predict_images(images)
+        done = len(predictor.predict_images({p.stem: p for p in mine if not _is_video(p)}))
         for path in filter(_is_video, mine):
             done += predictor.predict_video(path)
     failures = list(predictor.failures.values())
@@ -191,28 +190,22 @@ def predict_all(
     for failure in failures:
         print(f"depthpose: failed: {failure}", file=sys.stderr)
     print(f"{done} depth maps are in {out}")
-    if find_rank().rank == 0:
-        _write_page(sources, lens, out, output, [str(failure) for failure in failures])
+    if find_rank().rank == 0:  # the page of what is finished: others may still be at work
+        finished = {source: _finished_names(source, out) for source in sources}
+
+        def read(names: Sequence[str]) -> Iterator[StereoInput]:
+            for source in sources:
+                wanted = [name for name in finished[source] if name in names]
+                with suppress(InputError):
+                    for name, image in _read_some(source, wanted):
+                        camera = lens.camera_of(image)
+                        yield StereoInput(name=name, left=image, right=None, camera=camera)
+
+        names = [name for some in finished.values() for name in some]
+        write_depth_page(
+            out, names, read, [str(failure) for failure in failures], output.color_range
+        )
     return 1 if failures else 0
-
-
-def _write_page(
-    sources: list[Path], lens: Lens, out: Path, output: PredictOutput, failures: list[str]
-) -> None:
-    """Write the page of what is finished: other processes may still be at work."""
-    done = {source: _finished_names(source, out) for source in sources}
-
-    def read(names: Sequence[str]) -> Iterator[StereoInput]:
-        for source in sources:
-            wanted = [name for name in done[source] if name in names]
-            with suppress(InputError):
-                for name, image in _read_some(source, wanted):
-                    camera = lens.camera_of(image)
-                    yield StereoInput(name=name, left=image, right=None, camera=camera)
-
-    write_depth_page(
-        out, [n for some in done.values() for n in some], read, failures, output.color_range
-    )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -226,9 +219,17 @@ class Predictor:
     viewer: Viewer | None = None
     failures: dict[str, InputError] = field(default_factory=dict)
 
-    def predict_images(self, sources: Mapping[str, Path]) -> int:
-        """Predict images, each with the name of its results; give how many are done."""
-        return len(self._predict(self._read(sources), len(sources), "images"))
+    def predict_images(self, sources: Mapping[str, Path]) -> list[str]:
+        """Predict images, each with the name of its results; give the names that are done."""
+
+        def read() -> Iterator[tuple[str, Tensor]]:
+            for name, source in sources.items():
+                try:
+                    yield name, read_image(source)
+                except InputError as error:
+                    self.failures[name] = error
+
+        return self._predict(read(), len(sources), "images")
 
     def predict_video(self, source: Path) -> int:
         """Predict a video's frames, and make a video of them; give how many are done."""
@@ -257,52 +258,43 @@ class Predictor:
             return 0
         return len(names)
 
-    def _read(self, sources: Mapping[str, Path]) -> Iterator[tuple[str, Tensor]]:
-        for name, source in sources.items():
-            try:
-                yield name, read_image(source)
-            except InputError as error:
-                self.failures[name] = error
-
     def _predict(
         self, frames: Iterator[tuple[str, Tensor]], total: int | None, what: str
     ) -> list[str]:
-        done: list[str] = []
+        """Predict frames, a batch together, and write what is found of each."""
+        names: list[str] = []
+        cloud_m, distance = CLOUD_M if self.output.cloud else None, self.lens.scale.distance
         with tqdm(total=total, desc=what, disable=None, unit=" images") as bar:
             while chunk := list(islice(frames, self.output.batch)):
-                done += self._predict_chunk([self._input(*frame) for frame in chunk])
+                inputs = [
+                    StereoInput(name=name, left=left, right=None, camera=self.lens.camera_of(left))
+                    for name, left in chunk
+                    if not is_finished(self.out, name, with_cloud=self.output.cloud)
+                ]
+                estimates = self.net.estimate_many(inputs, batch=self.output.batch)
+                for image, estimate in zip(inputs, estimates, strict=True):
+                    try:
+                        if isinstance(estimate, InputError):
+                            raise estimate
+                        scaled = estimate
+                        if distance is not None:
+                            scaled = scale_by_distance(estimate, image.name, distance)
+                        colors_m = self.output.color_range
+                        files = write_estimate(self.out, image, scaled, colors_m, cloud_m)
+                        note_result(self.out, image.name, files)
+                    except InputError as error:
+                        self.failures[image.name] = error
+                        continue
+                    if scaled.warning:
+                        said = f"depthpose: warning: {image.name}: {scaled.warning}"
+                        tqdm.write(said, sys.stderr)
+                    if scaled.ground is not None:
+                        tqdm.write(f"{image.name}: {scaled.ground}")
+                    if self.viewer is not None:
+                        self.viewer.show_depth(image, scaled)
+                names += [name for name, _ in chunk if name not in self.failures]
                 bar.update(len(chunk))
-        return done
-
-    def _input(self, name: str, image: Tensor) -> StereoInput:
-        return StereoInput(name=name, left=image, right=None, camera=self.lens.camera_of(image))
-
-    def _predict_chunk(self, inputs: list[StereoInput]) -> list[str]:
-        """Predict inputs together, and write what is found of each."""
-        with_cloud, color_range = self.output.cloud, self.output.color_range
-        wanted = [i for i in inputs if not is_finished(self.out, i.name, with_cloud=with_cloud)]
-        distance = self.lens.scale.distance
-        found = self.net.estimate_many(wanted, batch=self.output.batch)
-        for image, one in zip(wanted, found, strict=True):
-            try:
-                if isinstance(one, InputError):
-                    raise one
-                estimate = one
-                if distance is not None:
-                    estimate = scale_by_distance(one, image.name, distance)
-                cloud_m = CLOUD_M if with_cloud else None
-                files = write_estimate(self.out, image, estimate, color_range, cloud_m)
-                note_result(self.out, image.name, files)
-            except InputError as error:
-                self.failures[image.name] = error
-                continue
-            if estimate.warning:
-                tqdm.write(f"depthpose: warning: {image.name}: {estimate.warning}", sys.stderr)
-            if estimate.ground is not None:
-                tqdm.write(f"{image.name}: {estimate.ground}")
-            if self.viewer is not None:
-                self.viewer.show_depth(image, estimate)
-        return [image.name for image in inputs if image.name not in self.failures]
+        return names
 
 
 def _size_of(source: Path) -> tuple[int, int]:

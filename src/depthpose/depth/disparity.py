@@ -152,14 +152,16 @@ def smallest_focal_px(camera: Camera) -> float:
 
 
 def resize_image(
-    image: Float[Tensor, "3 _ _"], height: int, width: int
-) -> Float[Tensor, "3 {height} {width}"]:
-    """Resize bilinearly, averaging where it shrinks."""
-    if image.shape[1:] == (height, width):
+    image: Float[Tensor, "*batch 3 _ _"], height: int, width: int
+) -> Float[Tensor, "*batch 3 {height} {width}"]:
+    """Resize one image, or a batch, bilinearly, averaging where it shrinks."""
+    own = image.shape[-2:]
+    if own == (height, width):
         return image
-    shrinks = height < image.shape[1] or width < image.shape[2]
-    resized = F.interpolate(image[None], (height, width), mode="bilinear", antialias=shrinks)
-    return resized[0].clamp(0, 1)
+    images = image if image.ndim == 4 else image[None]
+    shrinks = height < own[0] or width < own[1]
+    resized = F.interpolate(images, (height, width), mode="bilinear", antialias=shrinks)
+    return resized.clamp(0, 1).reshape(*image.shape[:-2], height, width)
 
 
 def changed_match(match: Match, change: Callable[[Tensor], Tensor]) -> Match:

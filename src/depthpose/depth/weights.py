@@ -4,7 +4,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 from depthpose.core.checkpoint import (
     Checkpoint,
@@ -15,11 +15,13 @@ from depthpose.core.checkpoint import (
 )
 from depthpose.core.config import config_from_dict, config_to_dict
 from depthpose.core.errors import InputError
-from depthpose.depth.config import GeneratorConfig, SelectionConfig
+from depthpose.depth.config import Answer, GeneratorConfig, SelectionConfig
 from depthpose.depth.stereo import MATCHERS, StereoNetwork
 from depthpose.depth.synthesis import Generator, SelectionGenerator, UNetGenerator
 
 BOTH = "fakestereo"
+Use = Literal["images", "pairs"]
+"""What networks are for: depth of single images, or of real pairs."""
 _GENERATORS: dict[str, tuple[type, type]] = {
     "generator": (GeneratorConfig, UNetGenerator),
     "selection": (SelectionConfig, SelectionGenerator),
@@ -47,8 +49,15 @@ class DepthWeights:
     facts: Mapping[str, str]
 
 
-def read_depth_weights(path: Path) -> DepthWeights:
+def read_depth_weights(
+    path: Path, *, use: Use | None = None, answer: Answer | None = None
+) -> DepthWeights:
     """Read a weights file of any kind of generator or matcher.
+
+    Args:
+        path: the file.
+        use: build only the networks that this takes, if the file holds both; None: all.
+        answer: where depth of one image is to come from, in place of what the weights say.
 
     Raises:
         InputError: not such weights, or weights that do not fit their own config.
@@ -62,10 +71,14 @@ def read_depth_weights(path: Path) -> DepthWeights:
     is_both = checkpoint.kind == BOTH
     parts = _split(checkpoint, str(path)) if is_both else {checkpoint.kind: checkpoint}
     built: dict[str, Any] = {}
-    for kind, part in parts.items():
+    for kind, part in parts.items():  # a generator first
+        if use == "pairs" and is_both and kind in _GENERATORS:
+            continue
         kind_of_config, make = _networks()[kind]
         config = config_from_dict(part.config, kind_of_config, source=str(path))
         built[kind] = build_network(partial(make, config), part, str(path)).eval()
+        if use == "images" and kind in _GENERATORS and (answer or config.answer) == "own":
+            break  # it takes no matcher
     return DepthWeights(
         generator=next((built[kind] for kind in _GENERATORS if kind in built), None),
         matcher=next((built[kind] for kind in MATCHERS if kind in built), None),

@@ -11,7 +11,7 @@ from torch.nn import functional as F
 
 from depthpose.core.draw import depth_scale, draw_depth, draw_points
 from depthpose.core.errors import InputError, nearest_name
-from depthpose.depth.evaluate import MeanRow, Row
+from depthpose.depth.evaluate import EvaluationRow, Row
 from depthpose.depth.evaluate.evaluate import Cell
 from depthpose.depth.metrics import DepthErrors
 from depthpose.depth.types import DepthEstimate, StereoInput
@@ -84,7 +84,9 @@ def find_table(number: str) -> PublishedTable:
     return TABLES[number]
 
 
-def join_published(table: PublishedTable, ours: Sequence[tuple[str, MeanRow]]) -> list[JoinedRow]:
+def join_published(
+    table: PublishedTable, ours: Sequence[tuple[str, EvaluationRow]]
+) -> list[JoinedRow]:
     """Set our rows beside the printed ones, cap by cap: published, ours, difference.
 
     Args:

@@ -8,6 +8,7 @@ from dataclasses import replace
 from functools import partial
 from io import BytesIO
 from itertools import groupby, islice
+from operator import itemgetter
 from pathlib import Path
 from typing import Any, cast
 from urllib.request import urlopen
@@ -48,14 +49,13 @@ from depthpose.depth.estimator.rig import (
     from_virtual,
     join_matches,
     match_to_infinity,
-    set_answer,
     square_camera,
 )
 from depthpose.depth.ground import scale_by_distance, scale_by_mount
 from depthpose.depth.stereo import CameraMatcher, Matcher
-from depthpose.depth.synthesis import Synthesiser, make_synthesiser
+from depthpose.depth.synthesis import SelectionGenerator, Synthesiser, make_synthesiser
 from depthpose.depth.types import DepthEstimate, Match, StereoInput
-from depthpose.depth.weights import read_depth_weights
+from depthpose.depth.weights import Use, read_depth_weights
 
 DEFAULT = "default"
 """Name of the weights that are taken where none are named."""
@@ -124,6 +124,7 @@ class FakestereoNet:
         config: MatcherConfig | SGBMConfig | None = None,
         answer: Answer | None = None,
         allow_ood: bool = False,
+        use: Use | None = None,
     ) -> "FakestereoNet":
         """Build an estimator from weights, by file, folder, name or ``hf://OWNER/NAME``.
 
@@ -140,6 +141,7 @@ class FakestereoNet:
                 (:class:`~depthpose.depth.config.SelectionConfig`).
             allow_ood: answer images that are unlike what the weights know too, with a
                 ``warning`` in the estimate, in place of refusing them.
+            use: ``images`` or ``pairs``: build what these take alone, which is quicker. None: all.
 
         Raises:
             InputError: no such weights, no matcher in what was given, or an ``answer`` that these
@@ -147,21 +149,28 @@ class FakestereoNet:
         """
         if weights is None and matcher is None:
             weights = DEFAULT
-        main = None if weights is None else read_depth_weights(find_weights(weights))
-        if answer is not None:
-            set_answer(main, answer)
-        other = None
+        main = other = None
+        if weights is not None:
+            main = read_depth_weights(find_weights(weights), use=use, answer=answer)
+        generator = None if main is None else main.generator
+        if answer is not None and isinstance(generator, SelectionGenerator):
+            generator.config = replace(generator.config, answer=answer)
+        elif answer is not None and (generator is None or answer != generator.config.answer):
+            raise InputError(
+                f"answer is {answer!r}, which takes the weights of a generator that selects; omit "
+                "it: these have no generator, or a U-Net, which estimates no disparity."
+            )
         # Paths first: a Path has a method 'match' too, and would pass for a matcher.
         if isinstance(matcher, str | Path) and matcher != "sgbm":
-            other = read_depth_weights(find_weights(matcher))
+            other = read_depth_weights(find_weights(matcher), use="pairs")
         terms = join_terms(*(read.facts for read in (main, other) if read is not None))
         warn_of_terms({"terms": terms})
         run = config if isinstance(config, MatcherConfig) else MatcherConfig()
         chosen = choose_matcher(weights, main, matcher, other, config)
         names = " + ".join(str(name) for name, read in ((weights, main), (matcher, other)) if read)
-        if main is None or main.generator is None:
+        if generator is None:
             return cls(chosen, terms=terms, weights=names)
-        synthesiser = make_synthesiser(main.generator, run.device, run.speed)
+        synthesiser = make_synthesiser(generator, run.device, run.speed)
         return cls(chosen, synthesiser, terms=terms, weights=names, allow_ood=allow_ood)
 
     from_pretrained = load
@@ -220,8 +229,7 @@ class FakestereoNet:
     def estimate_pair(self, pair: StereoInput, *, with_check: bool = True) -> DepthEstimate:
         """Estimate depth of one input whose images are read already, as :meth:`estimate` does."""
         if pair.right is None:
-            with refused_memory(pair.name):
-                return self._estimate_alone([pair], self.virtual_sizes(pair))[0]
+            return self._estimate_alone([pair], self.virtual_sizes(pair))[0]
         right = usable_right(pair)
         if self.matcher is None:
             raise InputError(
@@ -290,20 +298,18 @@ class FakestereoNet:
         self, named: Sequence[tuple[str, object]], lens: AnyLens | None, *, with_check: bool
     ) -> list[DepthEstimate | InputError]:
         """Estimate images together; where one of them is unusable, each alone."""
-
-        def sizes_alone(image: StereoInput) -> list[tuple[int, int]] | None:
-            return self.virtual_sizes(image) if image.right is None else None
-
         found: list[DepthEstimate | InputError] = []
         try:
             inputs = [as_input(image, name, lens) for name, image in named]
-            for sizes, group in groupby(inputs, sizes_alone):
-                alike = list(group)
-                if sizes is None or len(alike) == 1:
+            sized = [
+                (one, None if one.right is not None else self.virtual_sizes(one)) for one in inputs
+            ]
+            for sizes, group in groupby(sized, itemgetter(1)):
+                alike = [one for one, _ in group]
+                if sizes is None:
                     found += [self.estimate_pair(pair, with_check=with_check) for pair in alike]
                 else:
-                    with refused_memory(alike[0].name):
-                        found += self._estimate_alone(alike, sizes)
+                    found += self._estimate_alone(alike, sizes)
         except InputError as error:
             if len(named) == 1:
                 return [error]
@@ -339,36 +345,40 @@ class FakestereoNet:
         used = [s for s in self.synthesiser.scales if s == 1 or s * rig_px <= own_px]
         return [focal_size(image.camera, scale * rig_px) for scale in used]
 
+    @torch.no_grad()
     def _estimate_alone(
         self, images: list[StereoInput], sizes: list[tuple[int, int]]
     ) -> list[DepthEstimate]:
         """Bring images to the virtual rig, draw their right views, match, and come back."""
         assert self.synthesiser is not None, "virtual_sizes checked it"
         rig = self.synthesiser.config
-        left, *larger = (
-            torch.stack([resize_image(image.left.float(), *size) for image in images])
-            for size in sizes
-        )
-        views = self.synthesiser.draw(left, *larger)
-        matches: list[Match] = []
-        if rig.answer != "own":  # matched or joined
-            camera = square_camera(sizes[0], rig.virtual_focal_px)
-            matches = self._match(list(zip(left, views.right, strict=True)), camera)
-        if rig.answer != "matched":  # own or joined
-            assert views.disparity_px is not None and views.confidence is not None  # noqa: PT018
-            parts = zip(views.disparity_px, views.confidence, strict=True)
-            own = [Match(disparity_px=px, confidence=sure) for px, sure in parts]
-            matches = list(map(join_matches, own, matches)) if matches else own
-        estimates = []
-        for n, (image, match) in enumerate(zip(images, matches, strict=True)):
-            is_sky = match.is_sky if views.is_sky is None else views.is_sky[n]
-            estimate = from_virtual(image, rig, match, views.right[n], is_sky)
-            estimate = scale_by_mount(estimate, image)
-            if views.confidence is not None:
-                sure = views.confidence[n].mean() if views.street is None else views.street[n]
-                estimate = replace(estimate, image_confidence=float(sure))
-                estimate = check_distribution(image.name, estimate, rig, allow_ood=self.allow_ood)
-            estimates.append(estimate)
+        with refused_memory(images[0].name):
+            left, *larger = (
+                torch.stack([resize_image(image.left.float(), *size) for image in images])
+                for size in sizes
+            )
+            views = self.synthesiser.draw(left, *larger)
+            matches: list[Match] = []
+            if rig.answer != "own":  # matched or joined
+                camera = square_camera(sizes[0], rig.virtual_focal_px)
+                matches = self._match(list(zip(left, views.right, strict=True)), camera)
+            if rig.answer != "matched":  # own or joined
+                assert views.disparity_px is not None and views.confidence is not None  # noqa: PT018
+                parts = zip(views.disparity_px, views.confidence, strict=True)
+                own = [Match(disparity_px=px, confidence=sure) for px, sure in parts]
+                matches = list(map(join_matches, own, matches)) if matches else own
+            estimates = []
+            for n, (image, match) in enumerate(zip(images, matches, strict=True)):
+                is_sky = match.is_sky if views.is_sky is None else views.is_sky[n]
+                estimate = from_virtual(image, rig, match, views.right[n], is_sky)
+                estimate = scale_by_mount(estimate, image)
+                if views.confidence is not None:
+                    sure = views.confidence[n].mean() if views.street is None else views.street[n]
+                    estimate = replace(estimate, image_confidence=float(sure))
+                    estimate = check_distribution(
+                        image.name, estimate, rig, allow_ood=self.allow_ood
+                    )
+                estimates.append(estimate)
         return estimates
 
     def _match(self, pairs: list[tuple[Tensor, Tensor]], camera: Camera | None) -> list[Match]:

@@ -13,7 +13,6 @@ from torch.nn import functional as F
 from depthpose.core.camera import Camera, StereoRig
 from depthpose.core.errors import InputError
 from depthpose.depth.config import (
-    Answer,
     GeneratorConfig,
     MatcherConfig,
     SelectionConfig,
@@ -29,7 +28,6 @@ from depthpose.depth.disparity import (
 )
 from depthpose.depth.stereo import Matcher, SGBMMatcher, make_matcher
 from depthpose.depth.stereo.light import LEAST_PX
-from depthpose.depth.synthesis import SelectionGenerator
 from depthpose.depth.types import DepthEstimate, Match, StereoInput
 from depthpose.depth.weights import DepthWeights
 
@@ -122,18 +120,6 @@ def join_matches(one: Match, other: Match) -> Match:
     logs = [match.disparity_px.clamp(min=1e-3).log() for match in (one, other)]
     log_px = torch.lerp(logs[0], logs[1].nan_to_num(0.0), share)
     return Match(disparity_px=log_px.exp(), confidence=torch.lerp(one.confidence, weight, share))
-
-
-def set_answer(found: DepthWeights | None, answer: Answer) -> None:
-    """Let depth of one image come from elsewhere than the weights say."""
-    generator = None if found is None else found.generator
-    if isinstance(generator, SelectionGenerator):
-        generator.config = replace(generator.config, answer=answer)
-    elif generator is None or answer != generator.config.answer:
-        raise InputError(
-            f"answer is {answer!r}, which takes the weights of a generator that selects; omit it: "
-            "these have no generator, or a U-Net, which estimates no disparity."
-        )
 
 
 def check_distribution(

@@ -4,13 +4,10 @@ A protocol fixes the truth, the pixels that count and how the prediction is prep
 two protocols do not compare; every row carries its protocol's name.
 """
 
-from depthpose.depth.evaluate.evaluate import DecileRow as DecileRow
 from depthpose.depth.evaluate.evaluate import Evaluation as Evaluation
-from depthpose.depth.evaluate.evaluate import FrameRow as FrameRow
-from depthpose.depth.evaluate.evaluate import MeanRow as MeanRow
+from depthpose.depth.evaluate.evaluate import EvaluationRow as EvaluationRow
 from depthpose.depth.evaluate.evaluate import Measured as Measured
 from depthpose.depth.evaluate.evaluate import Row as Row
-from depthpose.depth.evaluate.evaluate import Source as Source
 from depthpose.depth.evaluate.evaluate import evaluate as evaluate
 from depthpose.depth.evaluate.evaluate import measure_frame as measure_frame
 from depthpose.depth.evaluate.evaluate import ranking_metric as ranking_metric

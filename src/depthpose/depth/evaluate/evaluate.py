@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, fields, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -57,41 +58,25 @@ class Row:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Source(Row):
-    """Whose predictions were measured.
+class EvaluationRow(Row):
+    """Numbers of one frame, their mean over frames (each counts the same), or one decile of it.
 
     Attributes:
-        method: its name.
-        input: which images it was given.
-        speed: at which networks ran.
-        weights: name of the file.
-        weights_sha256: the first 12 digits.
-    """
-
-    method: str
-    input: str = ""
-    speed: str = ""
-    weights: str = ""
-    weights_sha256: str = ""
-
-
-@dataclass(frozen=True, kw_only=True)
-class MeanRow(Row):
-    """Means over frames, each of the same weight.
-
-    Attributes:
-        method: as in :class:`Source`, like the next four; None: not known.
+        method: whose predictions were measured; None, as the next four: not known.
         input: which images it was given.
         speed: at which networks ran.
         weights: name of the file.
         weights_sha256: the first 12 digits.
         protocol: by which the frames were measured.
         dataset: its name.
+        frame: of one frame, its name.
         cap_m: truth beyond it does not count; None for disparity.
-        frames: how many.
-        pixels: sum of the pixels compared.
+        frames: how many a mean is over.
+        pixels: that were compared, in all frames.
         coverage: share of the pixels with truth that have a prediction.
-        metrics: means of what all frames with a predicted pixel have, in the order of
+        confidence_decile: n, where the numbers are of the n-th tenth of the pixels, from the least
+            sure (1) to the surest (10).
+        metrics: what all frames with a predicted pixel have, in the order of
             ``depth.metrics.METRICS``, then those of the drawn view and of the confidence.
     """
 
@@ -102,51 +87,13 @@ class MeanRow(Row):
     weights_sha256: str | None = None
     protocol: str
     dataset: str
+    frame: str | None = None
     cap_m: float | None
-    frames: int
-    pixels: int
-    coverage: float
+    frames: int | None = None
+    pixels: int | None = None
+    coverage: float | None = None
+    confidence_decile: int | None = None
     metrics: Mapping[str, float]
-
-
-@dataclass(frozen=True, kw_only=True)
-class FrameRow(Row):
-    """Numbers of one frame; the fields are those of :class:`MeanRow`, ``frame`` is its name."""
-
-    method: str | None = None
-    input: str | None = None
-    speed: str | None = None
-    weights: str | None = None
-    protocol: str
-    dataset: str
-    frame: str
-    cap_m: float | None
-    pixels: int
-    coverage: float
-    metrics: Mapping[str, float]
-
-
-@dataclass(frozen=True, kw_only=True)
-class DecileRow(Row):
-    """Mean error of the n-th tenth of the pixels, from the least sure (1) to the surest (10).
-
-    Attributes:
-        confidence_decile: n.
-        error: the name of the error and its mean over frames.
-
-    The other fields are those of :class:`MeanRow`.
-    """
-
-    method: str | None = None
-    input: str | None = None
-    speed: str | None = None
-    weights: str | None = None
-    protocol: str
-    dataset: str
-    cap_m: float | None
-    frames: int
-    confidence_decile: int
-    error: Mapping[str, float]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -161,9 +108,9 @@ class Evaluation:
         skipped: frames that do not count, each with the reason.
     """
 
-    rows: list[MeanRow]
-    per_frame: list[FrameRow]
-    deciles: list[DecileRow]
+    rows: list[EvaluationRow]
+    per_frame: list[EvaluationRow]
+    deciles: list[EvaluationRow]
     skipped: dict[str, str]
 
     def to_frame(self) -> Any:  # noqa: ANN401  pandas is no dependency
@@ -283,12 +230,11 @@ def summarise(
             f"{dataset.name}: none of its {len(dataset)} frames has the truth that protocol "
             f"{protocol!r} needs ({rule.truth}). Choose another protocol or folder."
         )
-    return Evaluation(
-        rows=_mean_rows(dataset.name, protocol, measured),
+    row = partial(EvaluationRow, protocol=protocol, dataset=dataset.name)
+    evaluation = Evaluation(
+        rows=[],
         per_frame=[
-            FrameRow(
-                protocol=protocol,
-                dataset=dataset.name,
+            row(
                 frame=one.frame,
                 cap_m=one.cap_m,
                 pixels=one.pixels,
@@ -297,9 +243,33 @@ def summarise(
             )
             for one in measured
         ],
-        deciles=_decile_rows(dataset.name, protocol, measured),
+        deciles=[],
         skipped=skipped,
     )
+    for cap_m in dict.fromkeys(one.cap_m for one in measured):
+        of_cap = [one for one in measured if one.cap_m == cap_m]
+        answered = [one for one in of_cap if one.pixels]
+        if not answered:
+            raise InputError(f"{dataset.name}: no prediction has a pixel where there is truth")
+        names = [n for n in answered[0].metrics if all(n in one.metrics for one in answered)]
+        evaluation.rows.append(
+            row(
+                cap_m=cap_m,
+                frames=len(of_cap),
+                pixels=sum(one.pixels for one in of_cap),
+                coverage=sum(one.coverage for one in of_cap) / len(of_cap),
+                metrics={n: sum(one.metrics[n] for one in answered) / len(answered) for n in names},
+            )
+        )
+        deciles = [one.deciles for one in of_cap if one.deciles is not None]
+        errors = torch.stack(deciles).nanmean(0).tolist() if deciles else []
+        ranked_by = ranking_metric(cap_m).name
+        for n, error in enumerate(errors, 1):
+            metrics = {ranked_by: error}
+            evaluation.deciles.append(
+                row(cap_m=cap_m, frames=len(deciles), confidence_decile=n, metrics=metrics)
+            )
+    return evaluation
 
 
 def _measure_depth(prepared: Prepared, rule: Protocol, cap_m: float) -> Measured | None:
@@ -358,53 +328,6 @@ def _score(
     return replace(measured, metrics={**measured.metrics, **score}, deciles=deciles)
 
 
-def _mean_rows(dataset: str, protocol: str, measured: Sequence[Measured]) -> list[MeanRow]:
-    """One row for each cap; each frame counts the same."""
-    rows: list[MeanRow] = []
-    for cap_m, of_cap in _by_cap(measured).items():
-        answered = [one for one in of_cap if one.pixels]
-        if not answered:
-            raise InputError(f"{dataset}: no prediction has a pixel where there is truth")
-        names = [n for n in answered[0].metrics if all(n in one.metrics for one in answered)]
-        rows.append(
-            MeanRow(
-                protocol=protocol,
-                dataset=dataset,
-                cap_m=cap_m,
-                frames=len(of_cap),
-                pixels=sum(one.pixels for one in of_cap),
-                coverage=sum(one.coverage for one in of_cap) / len(of_cap),
-                metrics={n: sum(one.metrics[n] for one in answered) / len(answered) for n in names},
-            )
-        )
-    return rows
-
-
-def _decile_rows(dataset: str, protocol: str, measured: Sequence[Measured]) -> list[DecileRow]:
-    """Ten rows for each cap; each frame counts the same."""
-    rows: list[DecileRow] = []
-    for cap_m, of_cap in _by_cap(measured).items():
-        deciles = [one.deciles for one in of_cap if one.deciles is not None]
-        errors = torch.stack(deciles).nanmean(0).tolist() if deciles else []
-        rows += [
-            DecileRow(
-                protocol=protocol,
-                dataset=dataset,
-                cap_m=cap_m,
-                frames=len(deciles),
-                confidence_decile=n,
-                error={ranking_metric(cap_m).name: error},
-            )
-            for n, error in enumerate(errors, 1)
-        ]
-    return rows
-
-
 def ranking_metric(cap_m: float | None) -> Metric:
     """Give the metric by which frames are ranked: of depth up to a cap, or of disparity (None)."""
     return METRICS[RANKING["disparity" if cap_m is None else "depth"]]
-
-
-def _by_cap(measured: Sequence[Measured]) -> dict[float | None, list[Measured]]:
-    caps = dict.fromkeys(one.cap_m for one in measured)
-    return {cap_m: [one for one in measured if one.cap_m == cap_m] for cap_m in caps}

@@ -11,12 +11,13 @@ from torch import Tensor, nn
 from depthpose.core.arrays import check_image
 from depthpose.core.devices import usable_device
 from depthpose.depth.config import GeneratorConfig, SelectionConfig, Speed
+from depthpose.depth.disparity import resize_image
 from depthpose.depth.synthesis.networks import (
     Selected,
     SelectionGenerator,
     UNetGenerator,
     average,
-    select,
+    read_logits,
     shift_left,
 )
 
@@ -183,12 +184,16 @@ def select_views(
     # Even, since logits stand for two rows and two columns.
     rows = max(_near_multiple(height, multiple, ROWS_SHARE) // 2 * 2, 2)
     columns = max(_near_multiple(width, multiple, COLUMNS_SHARE) // 2 * 2, 2)
-    padded = pad_to_multiple(_resized(left, rows, columns), multiple)
+    padded = pad_to_multiple(resize_image(left, rows, columns), multiple)
     features = generator.encoder(padded)
     kept = (logits[..., : rows // 2, : columns // 2] for logits in generator.decode(features))
-    scale = size[1] / columns
-    first, second = (select(part, generator.planes * scale, size) for part in kept)
-    return replace(first, street=generator.find_street(features[-1])), second
+    planes = generator.planes * (size[1] / columns)
+    views = []
+    for logits in kept:
+        maps = (part[:, None] for part in read_logits(logits, planes))
+        log_px, sky, sure = (F.interpolate(part, size, mode="bilinear")[:, 0] for part in maps)
+        views.append(Selected(log_px.exp(), sky, sure))
+    return replace(views[0], street=generator.find_street(features[-1])), views[1]
 
 
 def draw_right(generator: Generator, left: Float[Tensor, "b 3 h w"]) -> Float[Tensor, "b 3 h w"]:
@@ -204,22 +209,14 @@ def draw_right(generator: Generator, left: Float[Tensor, "b 3 h w"]) -> Float[Te
     multiple = generator.config.side_multiple_px
     rows = _near_multiple(height, multiple, ROWS_SHARE)
     columns = _near_multiple(width, multiple, COLUMNS_SHARE)
-    padded = pad_to_multiple(2 * _resized(left, rows, columns) - 1, multiple)
+    padded = pad_to_multiple(2 * resize_image(left, rows, columns) - 1, multiple)
     drawn = (generator(padded)[..., :rows, :columns] + 1) / 2
-    return _resized(drawn, height, width)
+    return resize_image(drawn, height, width)
 
 
 def _near_multiple(side_px: int, multiple: int, share: float) -> int:
     nearest = max(round(side_px / multiple), 1) * multiple
     return nearest if abs(nearest - side_px) <= share * side_px else side_px
-
-
-def _resized(
-    image: Float[Tensor, "b 3 _ _"], height: int, width: int
-) -> Float[Tensor, "b 3 {height} {width}"]:
-    if image.shape[-2:] == (height, width):
-        return image
-    return F.interpolate(image, (height, width), mode="bilinear", antialias=True).clamp(0, 1)
 
 
 def pad_to_multiple(
