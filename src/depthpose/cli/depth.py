@@ -17,6 +17,7 @@ from depthpose.cli.depth_options import (
     ProtocolOptions,
     ScaleOptions,
     refuse_ignored,
+    refuse_unusable,
 )
 from depthpose.cli.engine import EngineOptions
 from depthpose.core.errors import InputError
@@ -63,9 +64,7 @@ def predict(
         answer=networks.answer,
         use="images",
     )
-    output.refuse_unusable()
-    scale.refuse_unusable()
-    networks.refuse_contradiction(matching)
+    refuse_unusable(scale, networks, matching, output)
     if engine.is_ray:
         from depthpose.cli.depth_ray import predict_on_ray
 

@@ -92,15 +92,6 @@ class ScaleOptions:
             ) from error
         return column, row, metres
 
-    def refuse_unusable(self) -> None:
-        """Refuse numbers that are no height, no tilt and no distance, and a tilt alone."""
-        if self.camera_height is not None and not 0.1 <= self.camera_height <= 20:
-            raise InputError(f"--camera-height {self.camera_height:g}: give 0.1 to 20 metres")
-        if self.camera_tilt is not None and not -45 <= self.camera_tilt <= 45:
-            raise InputError(f"--camera-tilt {self.camera_tilt:g}: give -45 to 45 degrees")
-        if self.distance is not None and self.camera_height is not None:
-            raise InputError("--known-distance and --camera-height both set the scale; omit one")
-
 
 @group
 class MatchOptions(MatcherOptions):
@@ -164,16 +155,6 @@ class ImageNetworks:
     """also answer out-of-distribution images, with a warning (NAME.warning.txt), in
     place of refusing them."""
 
-    def refuse_contradiction(self, matching: MatcherOptions) -> None:
-        """Refuse options that exclude each other."""
-        if self.matcher is not None and self.answer is not None:
-            raise InputError(
-                f"--answer {self.answer} and --matcher {self.matcher}: another matcher matches the "
-                "synthesised view; omit one."
-            )
-        if self.matcher == "sgbm":
-            matching.refuse_matcher_options()
-
 
 @group
 class PredictOutput:
@@ -189,15 +170,31 @@ class PredictOutput:
     view: View = None
     """live shows each result in Rerun's viewer (an extra) as it comes; FILE.rrd records it."""
 
-    def refuse_unusable(self) -> None:
-        """Refuse values out of their range."""
-        near, far = self.color_range
-        if not 0 < near < far:
-            raise InputError(
-                f"--color-range {self.color_range}: give near and far metres, near first."
-            )
-        if self.batch < 1:
-            raise InputError(f"--batch {self.batch}: give 1 or more images.")
+
+def refuse_unusable(
+    scale: ScaleOptions, networks: ImageNetworks, matching: MatcherOptions, output: PredictOutput
+) -> None:
+    """Refuse values out of their range, and options that exclude each other."""
+    near, far = output.color_range
+    if not 0 < near < far:
+        raise InputError(
+            f"--color-range {output.color_range}: give near and far metres, near first."
+        )
+    if output.batch < 1:
+        raise InputError(f"--batch {output.batch}: give 1 or more images.")
+    if scale.camera_height is not None and not 0.1 <= scale.camera_height <= 20:
+        raise InputError(f"--camera-height {scale.camera_height:g}: give 0.1 to 20 metres")
+    if scale.camera_tilt is not None and not -45 <= scale.camera_tilt <= 45:
+        raise InputError(f"--camera-tilt {scale.camera_tilt:g}: give -45 to 45 degrees")
+    if scale.distance is not None and scale.camera_height is not None:
+        raise InputError("--known-distance and --camera-height both set the scale; omit one")
+    if networks.matcher is not None and networks.answer is not None:
+        raise InputError(
+            f"--answer {networks.answer} and --matcher {networks.matcher}: another matcher matches "
+            "the synthesised view; omit one."
+        )
+    if networks.matcher == "sgbm":
+        matching.refuse_matcher_options()
 
 
 @group

@@ -181,7 +181,9 @@ def predict_all(
     assert isinstance(method.net, FakestereoNet), "weights build no other"
     with open_viewer(None if find_rank().rank else output.view) as viewer:
         predictor = Predictor(lens=lens, net=method.net, out=out, output=output, viewer=viewer)
-        done = len(predictor.predict_images({p.stem: p for p in mine if not _is_video(p)}))
+        images = {path.stem: path for path in mine if not _is_video(path)}
+        frames = predictor.read_images(images)
+        done = len(predictor.predict(frames, len(images), "images"))
         for path in filter(_is_video, mine):
             done += predictor.predict_video(path)
     failures = list(predictor.failures.values())
@@ -219,18 +221,6 @@ class Predictor:
     viewer: Viewer | None = None
     failures: dict[str, InputError] = field(default_factory=dict)
 
-    def predict_images(self, sources: Mapping[str, Path]) -> list[str]:
-        """Predict images, each with the name of its results; give the names that are done."""
-
-        def read() -> Iterator[tuple[str, Tensor]]:
-            for name, source in sources.items():
-                try:
-                    yield name, read_image(source)
-                except InputError as error:
-                    self.failures[name] = error
-
-        return self._predict(read(), len(sources), "images")
-
     def predict_video(self, source: Path) -> int:
         """Predict a video's frames, and make a video of them; give how many are done."""
         frames: list[str] = []
@@ -250,7 +240,7 @@ class Predictor:
 
         try:
             video = read_video(source)
-            names = self._predict(noted(), video.frames or None, source.name)
+            names = self.predict(noted(), video.frames or None, source.name)
             drawn = colors() if names else iter(())
             write_video(self.out / f"{source.stem}{_VIDEO}", drawn, video.fps)
         except InputError as error:
@@ -258,10 +248,18 @@ class Predictor:
             return 0
         return len(names)
 
-    def _predict(
+    def read_images(self, sources: Mapping[str, Path]) -> Iterator[tuple[str, Tensor]]:
+        """Read images, each with the name of its results."""
+        for name, source in sources.items():
+            try:
+                yield name, read_image(source)
+            except InputError as error:
+                self.failures[name] = error
+
+    def predict(
         self, frames: Iterator[tuple[str, Tensor]], total: int | None, what: str
     ) -> list[str]:
-        """Predict frames, a batch together, and write what is found of each."""
+        """Predict named frames, a batch together, and write their files; give what is done."""
         names: list[str] = []
         cloud_m, distance = CLOUD_M if self.output.cloud else None, self.lens.scale.distance
         with tqdm(total=total, desc=what, disable=None, unit=" images") as bar:

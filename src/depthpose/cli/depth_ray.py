@@ -42,7 +42,8 @@ class PredictWork:
 
         def predict(samples: Sequence[Sample], out: Path) -> list[str]:
             predictor = Predictor(lens=self.lens, net=net, out=out, output=self.output)
-            predictor.predict_images({sample.name: sample.files[0] for sample in samples})
+            files = {sample.name: sample.files[0] for sample in samples}
+            predictor.predict(predictor.read_images(files), len(files), "images")
             return [str(predictor.failures.get(sample.name, "")) for sample in samples]
 
         return predict

@@ -76,11 +76,9 @@ def resize_disparity(
 
     Disparity is what is interpolated, never depth: depth is not linear between two pixels.
     """
-    own_width = disparity_px.shape[1]
     if disparity_px.shape == (height, width):
         return disparity_px
-    resized = F.interpolate(disparity_px[None, None], (height, width), mode="bilinear")[0, 0]
-    return resized * (width / own_width)
+    return resized_map(disparity_px, height, width) * (width / disparity_px.shape[1])
 
 
 def warp_right_to_left(

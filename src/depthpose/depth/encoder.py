@@ -47,14 +47,14 @@ class LiteEncoder(nn.Module):
 
     def __init__(self, width: float = 1.0, levels: int = 5) -> None:
         super().__init__()
-        stem = _scaled(_STEM, width)
+        stem = max(round(_STEM * width), 1)
         self.stem = _ConvNorm(3, stem, 3, 2)
         blocks: list[nn.Module] = []
         inputs, self._taps, self._frozen = stem, [], 0
         self.channels: list[int] = []
         stages = _STAGES[: _LAST_AT_STRIDE[levels - 1] + 1]
         for number, (count, kernel, stride, expansion, channels) in enumerate(stages):
-            outputs = _scaled(channels, width)
+            outputs = max(round(channels * width), 1)
             for place in range(count):
                 step = stride if place == 0 else 1
                 blocks.append(_InvertedResidual(inputs, outputs, kernel, step, expansion))
@@ -121,10 +121,6 @@ class _InvertedResidual(nn.Module):
         y = x if self.expand is None else F.relu6(self.expand(x))
         y = self.project(F.relu6(self.depthwise(y)))
         return x + y if self._is_residual else y
-
-
-def _scaled(channels: int, width: float) -> int:
-    return max(round(channels * width), 1)
 
 
 def encoder_from_published(state: Mapping[str, Tensor]) -> LiteEncoder:

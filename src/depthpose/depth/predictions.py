@@ -14,7 +14,6 @@ from depthpose.core.config import config_from_dict
 from depthpose.core.draw import draw_depth, draw_disparity
 from depthpose.core.errors import InputError
 from depthpose.core.files import (
-    Cloud,
     read_depth_png,
     read_disparity_png,
     read_image,
@@ -79,7 +78,7 @@ def write_estimate(
     ``NAME.color.png``, ``NAME.right.png`` (synthesised), ``NAME.sky.png`` (8 bit, 255 in the sky),
     ``NAME.ground.json`` (:class:`~depthpose.depth.types.Ground`), ``NAME.warning.txt`` and
     ``NAME.disparity_px.npy``, each where the estimate has it, and ``NAME.cloud.ply``
-    (:func:`estimate_cloud`) of what is nearer than ``cloud_m``, if that is given. The disparity is
+    (``DepthEstimate.cloud``) of what is nearer than ``cloud_m``, if that is given. The disparity is
     that of the frame's own rig.
     """
     written: list[Path] = []
@@ -89,7 +88,7 @@ def write_estimate(
         return written[-1]
 
     if cloud_m is not None:
-        write_cloud(new(CLOUD), estimate_cloud(pair, estimate, cloud_m))
+        write_cloud(new(CLOUD), replace(estimate, seen=pair).cloud(cloud_m))
     if estimate.warning:
         write_bytes(new("warning.txt"), f"{estimate.warning}\n".encode())
     if estimate.ground is not None:
@@ -111,15 +110,6 @@ def write_estimate(
     write_image(new("color.png"), picture)
     write_map(new("disparity_px.npy"), estimate.disparity_px)
     return written
-
-
-def estimate_cloud(pair: StereoInput, estimate: DepthEstimate, far_m: float = 80.0) -> Cloud:
-    """Give ``DepthEstimate.cloud`` of what was estimated from this input.
-
-    Raises:
-        InputError: there are no metres, because there was no camera, or no baseline.
-    """
-    return replace(estimate, seen=pair).cloud(far_m)
 
 
 def is_finished(folder: Path, name: str, *, with_cloud: bool = False) -> bool:
@@ -192,20 +182,20 @@ def _first(base: Path, endings: tuple[str, ...]) -> Path | None:
 
 def read_confidence(folder: Path, name: str) -> Float[Tensor, "h w"] | None:
     """Read the confidence beside a prediction, or None where there is none."""
-    path = _file(folder / name, "confidence.npy")
-    return read_map(path) if path.is_file() else None
+    path = _first(folder / name, ("confidence.npy",))
+    return None if path is None else read_map(path)
 
 
 def read_drawn_view(folder: Path, name: str) -> Float[Tensor, "3 h w"] | None:
     """Read the right view that a prediction was made through, or None where none was drawn."""
-    path = _file(folder / name, "right.png")
-    return read_image(path) if path.is_file() else None
+    path = _first(folder / name, ("right.png",))
+    return None if path is None else read_image(path)
 
 
 def read_sky(folder: Path, name: str) -> Bool[Tensor, "h w"] | None:
     """Read where a prediction says sky, or None where its weights do not know it."""
-    path = _file(folder / name, "sky.png")
-    return read_image(path)[0] > 0 if path.is_file() else None
+    path = _first(folder / name, ("sky.png",))
+    return None if path is None else read_image(path)[0] > 0
 
 
 def read_estimate(folder: Path, name: str, camera: Camera | None) -> DepthEstimate:
@@ -215,14 +205,14 @@ def read_estimate(folder: Path, name: str, camera: Camera | None) -> DepthEstima
         InputError: there is no prediction of that name, or a file of it is damaged.
     """
     disparity_px = read_disparity(folder, name, camera)
-    base = folder / name
-    depth_m, right = _file(base, "depth_m.npy"), _file(base, "right.png")
-    warning, ground = _file(base, "warning.txt"), _file(base, "ground.json")
-    metres = read_map(depth_m) if depth_m.is_file() else None
+    depth_m, warning, ground = (
+        _first(folder / name, (ending,)) for ending in ("depth_m.npy", "warning.txt", "ground.json")
+    )
+    metres = None if depth_m is None else read_map(depth_m)
     if metres is None and isinstance(camera, StereoRig):
         metres = depth_from_disparity(disparity_px, camera)
     plane = None
-    if ground.is_file():
+    if ground is not None:
         content = read_json(ground)
         if not isinstance(content, dict):
             kind = type(content).__name__
@@ -232,10 +222,10 @@ def read_estimate(folder: Path, name: str, camera: Camera | None) -> DepthEstima
         depth_m=metres,
         disparity_px=disparity_px,
         confidence=read_confidence(folder, name),
-        right=read_image(right) if right.is_file() else None,
+        right=read_drawn_view(folder, name),
         is_sky=read_sky(folder, name),
         ground=plane,
-        warning=read_text(warning).strip() if warning.is_file() else "",
+        warning="" if warning is None else read_text(warning).strip(),
     )
 
 

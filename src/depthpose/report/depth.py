@@ -1,6 +1,6 @@
 """Depth on a page: picture, depth, confidence, right view, error, and the cloud in 3D."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Float
@@ -17,7 +17,7 @@ from depthpose.core.draw import (
     draw_share,
     rising_scale,
 )
-from depthpose.depth.predictions import COLOR_RANGE_M, estimate_cloud
+from depthpose.depth.predictions import COLOR_RANGE_M
 from depthpose.depth.types import DepthEstimate, StereoInput
 from depthpose.report.page import Drawing, Layer, Scene, Section, colored_points
 
@@ -126,7 +126,7 @@ def depth_scene(
     """Show the points nearer than ``far_m`` in the colours of the image."""
     return Scene(
         caption=f"{caption} up to {far_m:g} m, in the camera's frame",
-        layers=[Layer(name="points", shape=estimate_cloud(pair, found, far_m))],
+        layers=[Layer(name="points", shape=replace(found, seen=pair).cloud(far_m))],
     )
 
 

@@ -1,7 +1,6 @@
 """What an estimate can take: pictures of any form, pairs that are pairs."""
 
 import warnings
-from collections.abc import Iterable
 from pathlib import Path
 
 import numpy as np
@@ -71,15 +70,6 @@ def _rgb(values: Tensor, sides: tuple[int, int], what: str) -> Float[Tensor, "3 
     planes = planes.movedim(side, 0)[:3]
     scaled = planes.float() / 255 if planes.dtype == torch.uint8 else planes.float()
     return check_image(scaled.expand(3, -1, -1), what.partition(" is ")[0])
-
-
-def as_several(images: object) -> Iterable[object]:
-    """Take one picture as a list of one; a batch, a list or a generator as it is."""
-    is_one = isinstance(images, str | Path | Image | StereoInput)
-    if is_one or (isinstance(images, np.ndarray | Tensor) and images.ndim < 4):
-        return [images]
-    assert isinstance(images, Iterable), "a caller's type"
-    return images
 
 
 def as_input(

@@ -36,7 +36,6 @@ from depthpose.depth.disparity import focal_size, resize_image, smallest_focal_p
 from depthpose.depth.estimator.inputs import (
     Picture,
     as_input,
-    as_several,
     as_tensor,
     exif_focal_px,
     refuse_unrectified,
@@ -282,7 +281,10 @@ class FakestereoNet:
         if batch < 1:
             raise InputError(f"batch is {batch}; take 1 or more images")
         lens = choose_lens(camera, focal_px, fov_deg)
-        several = as_several(images)
+        is_one = isinstance(images, str | Path | Image.Image | StereoInput)
+        if is_one or (isinstance(images, np.ndarray | Tensor) and images.ndim < 4):
+            images = [cast("Picture", images)]
+        several = cast("Iterable[object]", images)
         named = iter((f"image {k}", one) for k, one in enumerate(several))
         batches = iter(lambda: list(islice(named, batch)), [])
         found: list[DepthEstimate | InputError] = []
