@@ -224,7 +224,7 @@ def add_ground(builder: MeshBuilder, rng: np.random.Generator, road: Road) -> No
                 far = road.edge_m(side) + side * _WIDE_M
                 _strip(builder, (road.edge_m(side), far), (0.0, 0.0), asphalt, stations)
             else:
-                _side_strips(builder, rng, road, side, (walk, grass, land, stations))
+                _side_strips(builder, rng, road, side, walk, grass, land, stations)
 
 
 def _asphalt(rng: np.random.Generator) -> Surface:
@@ -238,10 +238,12 @@ def _side_strips(
     rng: np.random.Generator,
     road: Road,
     side: int,
-    stuff: tuple[Surface, Surface, Surface, Float64[np.ndarray, " n"]],
+    walk: Surface,
+    grass: Surface,
+    land: Surface,
+    stations: Float64[np.ndarray, " n"],
 ) -> None:
     """From the road's edge outwards: kerb, verge, pavement, land."""
-    walk, grass, land, stations = stuff
     x, high = road.edge_m(side), -road.curb_m
     curb = Surface("curb", (0.3, 0.29, 0.28), 1.0)
     strip = lambda width, heights, surface: _strip(  # noqa: E731
@@ -327,291 +329,266 @@ _DETAIL_M = 45.0
 
 
 def add_roadside(builder: MeshBuilder, rng: np.random.Generator, road: Road) -> None:
-    """Fill both sides of the road."""
+    """Fill both sides of the road, and close the view at its end."""
     for side in (-1, 1):
+        beside = Roadside(builder=builder, rng=rng, road=road, side=side)
         if road.place == "city":
-            _houses(builder, rng, road, side)
+            beside.add_houses()
         elif road.place == "suburb":
-            _gardens(builder, rng, road, side)
+            beside.add_gardens()
         elif road.place == "avenue":
-            _avenue(builder, rng, road, side)
+            beside.add_avenue()
         else:
-            _country(builder, rng, road, side)
-        _kerb(builder, rng, road, side)
-        _woods(builder, rng, road, side)
-    _horizon(builder, rng, road)
-
-
-def _houses(builder: MeshBuilder, rng: np.random.Generator, road: Road, side: int) -> None:
-    if road.walk_m > 2 and rng.random() < 0.55:
-        _tree_row(builder, rng, road, side, road.edge_m(side) + side * 0.9)
-    s, set_back = rng.uniform(-12, -4), rng.uniform(0, 3) * (rng.random() < 0.4)
-    tall = rng.uniform(6, 17)
-    while s < _FAR_M:
-        length = rng.uniform(8, 20)
-        if _is_free(road, side, s, length):
-            height = tall * rng.uniform(0.75, 1.25)
-            back = set_back + rng.uniform(0, 0.6)
-            _house(builder, rng, road, side, (s, s + length, back, height))
-        elif rng.random() < 0.5:
-            _tree(builder, rng, road.plot_m(side) + side * rng.uniform(6, 12), s, None)
-        s += length + (rng.uniform(2, 9) if rng.random() < 0.3 else 0.0)
-
-
-def _gardens(builder: MeshBuilder, rng: np.random.Generator, road: Road, side: int) -> None:
-    """Houses behind hedges and fences, with trees and bushes about them."""
-    s, back = rng.uniform(-12, -2), rng.uniform(2.5, 7)
-    border = int(rng.integers(4))
-    while s < _FAR_M:
-        length = rng.uniform(8, 15)
-        if not _is_free(road, side, s, length):
-            s += length
-            continue
-        if rng.random() < 0.78:
-            _house(
-                builder,
-                rng,
-                road,
-                side,
-                (s, s + length, back * rng.uniform(0.8, 1.3), rng.uniform(3.5, 7.5)),
-            )
-        border = int(rng.integers(4)) if rng.random() < 0.5 else border
-        _border(builder, rng, road, side, (s, s + length + 3, border))
-        for _ in range(int(rng.integers(0, 3))):
-            x = road.plot_m(side) + side * rng.uniform(1.3, back + 1)
-            _tree(builder, rng, x, s + rng.uniform(0, length), rng.uniform(3, 9))
-        for _ in range(int(rng.integers(1, 5))):
-            x = road.plot_m(side) + side * rng.uniform(0.9, 3)
-            _bush(builder, rng, x, s + rng.uniform(0, length), rng.uniform(0.6, 1.9))
-        s += length + rng.uniform(1.5, 7)
-
-
-def _avenue(builder: MeshBuilder, rng: np.random.Generator, road: Road, side: int) -> None:
-    """A wide road: rows of trees, hedges or rails, and set-back houses or nothing behind."""
-    has_row, has_border, has_houses = rng.random(3) < (0.7, 0.5, 0.35)
-    rail = int(rng.integers(4))
-    if has_row:
-        x = road.edge_m(side) + side * rng.uniform(1.2, max(1.5, road.verge_m))
-        _tree_row(builder, rng, road, side, x)
-    if has_border:
-        _border(builder, rng, road, side, (-8, 100, rail))
-    s = rng.uniform(-10, 5)
-    while s < _FAR_M:
-        length = rng.uniform(10, 26)
-        if has_houses and rng.random() < 0.7 and _is_free(road, side, s, length):
-            _house(
-                builder, rng, road, side, (s, s + length, rng.uniform(5, 22), rng.uniform(5, 16))
-            )
-        else:
-            _copse(builder, rng, road, side, (s, length, rng.uniform(4, 14)))
-        s += length + rng.uniform(0, 10)
-
-
-def _tree_row(
-    builder: MeshBuilder, rng: np.random.Generator, road: Road, side: int, x: Number
-) -> None:
-    step, height = rng.uniform(6, 14), rng.uniform(5, 13)
-    for s in np.arange(rng.uniform(-8, 6), _FAR_M, step):
-        if not road.is_side_street(s, side, 2) and rng.random() < 0.85:
-            place_m = (x + rng.normal(0, 0.3), s + rng.normal(0, 0.8))
-            _tree(builder, rng, *place_m, height * rng.uniform(0.8, 1.2))
-
-
-def _country(builder: MeshBuilder, rng: np.random.Generator, road: Road, side: int) -> None:
-    """Open fields with some trees, or a forest's edge."""
-    is_forest = road.place == "forest"
-    is_open = not is_forest and rng.random() < 0.55
-    edge, height = rng.uniform(1.0, 4.5), rng.uniform(9, 15)
-    s = rng.uniform(-10, -4)
-    while s < _FAR_M + 30:
-        if is_forest:
-            for depth in (0.0, 4.5) if s < 60 else (0.0,):
-                x = road.plot_m(side) + side * (edge + depth + rng.uniform(0, 2.5))
-                _tree(builder, rng, x, s + rng.uniform(-2, 2), height * rng.uniform(0.75, 1.25))
-            if rng.random() < 0.8:
-                x = road.plot_m(side) + side * (edge + rng.uniform(-0.4, 1.5))
-                _bush(builder, rng, x, s + rng.uniform(0, 3), rng.uniform(0.8, 2.6))
-            s += rng.uniform(2.6, 5) + max(0.0, s) * 0.04
-        else:
-            chance = 0.25 if is_open else 0.9
-            if rng.random() < chance:
-                _copse(builder, rng, road, side, (s, 12.0, 25.0 if is_open else 7.0))
-            s += rng.uniform(8, 18)
-    if not is_forest and rng.random() < 0.45:
-        _border(builder, rng, road, side, (-8, 90, int(rng.integers(4))))
-
-
-def _woods(builder: MeshBuilder, rng: np.random.Generator, road: Road, side: int) -> None:
-    """The front of a wood: right behind a forest's first trees, far behind elsewhere."""
-    is_forest = road.place == "forest"
-    chance = {"forest": 0.9, "city": 0.1, "suburb": 0.35}.get(road.place, 0.55)
-    if rng.random() > chance:
-        return
-    near, height = (rng.uniform(8, 13), 13.0) if is_forest else (rng.uniform(14, 55), 9.0)
-    start = rng.uniform(-10, 0) if is_forest else rng.uniform(-10, 60)
-    x = road.plot_m(side) + side * near
-    stop, other = start + rng.uniform(60, 200), x + side * rng.uniform(-2, 15)
-    height *= rng.uniform(0.7, 1.3)
-    add_wood_edge(builder, rng, (x, start, other, stop), height)
-
-
-def _copse(
-    builder: MeshBuilder,
-    rng: np.random.Generator,
-    road: Road,
-    side: int,
-    where: tuple[Number, Number, Number],
-) -> None:
-    s, length, depth = where
-    for _ in range(int(rng.integers(1, 7))):
-        x = road.plot_m(side) + side * (1.5 + depth * rng.uniform(0, 1))
-        if not road.is_side_street(s + length / 2, side, length / 2):
-            _tree(builder, rng, x, s + rng.uniform(0, length), rng.uniform(4, 13))
-    for _ in range(int(rng.integers(0, 4))):
-        x = road.plot_m(side) + side * (0.8 + depth * rng.uniform(0, 0.6))
-        if not road.is_side_street(s + length / 2, side, length / 2):
-            _bush(builder, rng, x, s + rng.uniform(0, length), rng.uniform(0.7, 2.2))
-
-
-def _kerb(builder: MeshBuilder, rng: np.random.Generator, road: Road, side: int) -> None:
-    """Lamps in a row; signs, lights, posts and boxes here and there; poles with wires."""
-    x, y = road.edge_m(side) + side * (0.5 if road.walk_m else 1.3), -road.curb_m
-    _lamps(builder, rng, road, side)
-    s = rng.uniform(3, 12)
-    is_town = road.place not in ("rural", "forest")
-    while s < 70:
-        if not road.is_side_street(s, side, 0.5):
-            where = (x + side * rng.uniform(0, 0.4), y, s)
-            _kerb_thing(builder, rng, where, side, is_town=is_town)
-        s += rng.uniform(3, 14) * (1 if is_town else 1.8)
-    for street in road.side_streets:
-        if side in street.sides and rng.random() < 0.4:
-            light = traffic_light(int(rng.integers(4)))
-            builder.add(place(light, (x, y, street.s_m - street.half_m - 1), 0, (-side, 1, 1)))
-    if rng.random() < 0.25:
-        _wires(builder, rng, x + side * rng.uniform(0.5, 3))
-
-
-def _lamps(builder: MeshBuilder, rng: np.random.Generator, road: Road, side: int) -> None:
-    if rng.random() > {"forest": 0.1, "rural": 0.3}.get(road.place, 0.7):
-        return
-    x, y = road.edge_m(side) + side * (0.5 if road.walk_m else 1.3), -road.curb_m
-    yaw = 0.0 if side < 0 else np.pi
-    number, step = int(rng.integers(6)), rng.uniform(16, 34)
-    for s in np.arange(rng.uniform(2, 25), 110, step):
-        if not road.is_side_street(s, side):
-            builder.add(place(lamp(number), (x, y, s), yaw))
-
-
-def _kerb_thing(
-    builder: MeshBuilder,
-    rng: np.random.Generator,
-    where: tuple[Number, Number, Number],
-    side: int,
-    *,
-    is_town: bool,
-) -> None:
-    kind = rng.random()
-    if kind < 0.4:
-        model = sign(int(rng.integers(20)))
-        builder.add(place(model, where, rng.normal(0, 0.12) + np.pi * (rng.random() < 0.2)))
-    elif kind < 0.8 or not is_town:
-        number = int(rng.choice([0, 1, 2, 3, 4, 5])) if is_town else 3
-        builder.add(place(small_thing(number), where, rng.normal(0, 0.1)))
-    else:
-        _tree(builder, rng, where[0] + side * 0.4, where[2], rng.uniform(3.5, 7))
-
-
-def _wires(builder: MeshBuilder, rng: np.random.Generator, x: Number) -> None:
-    """Wooden poles with cables between them."""
-    height, step = rng.uniform(6, 8), rng.uniform(22, 38)
-    places = np.arange(rng.uniform(-15, 10), 120, step)
-    builder.begin_thing()
-    for s in places:
-        builder.tube((x, 0.2, s), (x, -height, s), (0.12, 0.09), WOOD, 8)
-        builder.box((x, -height + 0.3, s), (1.4, 0.1, 0.1), WOOD)
-    for start, stop in pairwise(places):
-        for shift in (-0.6, 0.6):
-            ends = [np.array([x + shift, -height + 0.22, s]) for s in (start, stop)]
-            add_wires(builder, *ends)
-
-
-def _house(
-    builder: MeshBuilder,
-    rng: np.random.Generator,
-    road: Road,
-    side: int,
-    where: tuple[Number, Number, Number, Number],
-) -> None:
-    start, stop, back, height = where
-    plot = Plot(
-        x_m=road.plot_m(side) + side * (back + 0.15),
-        z_m=(start, stop),
-        side=side,
-        depth_m=rng.uniform(7, 12),
-        height_m=height,
-        ground_m=-road.curb_m + 0.2,
-    )
-    add_house(builder, rng, plot, draw_style(rng, with_details=start < _DETAIL_M))
-
-
-def _border(
-    builder: MeshBuilder,
-    rng: np.random.Generator,
-    road: Road,
-    side: int,
-    where: tuple[Number, Number, int],
-) -> None:
-    """A line of hedge or fence pieces at the back of the pavement; kind 0 is none."""
-    start, stop, kind = where
-    if kind == 0:
-        return
-    number, height = int(rng.integers(20)), rng.uniform(0.7, 1.9)
-    color = leaf_color(rng)
-    for s in np.arange(start + 2, min(stop, 95), FENCE_M):
-        if road.is_side_street(s, side, 2.2):
-            continue
-        where_m = (road.plot_m(side) + side * 0.45, -road.curb_m, s)
-        if kind == 1:
-            model = hedge(int(rng.integers(HEDGES)))
-            builder.add(place(model, where_m, 0, (1, height, 1), {"leaf": color}))
-        else:
-            builder.add(place(fence(number), where_m))
-
-
-def _tree(
-    builder: MeshBuilder, rng: np.random.Generator, x: Number, s: float, height: Number | None
-) -> None:
-    tall = rng.uniform(5, 12) if height is None else height
-    number = int(rng.integers(TREES))
-    wide = tall * rng.uniform(0.85, 1.15)
-    model = tree(number, int(s > 24) + int(s > 48 or abs(x) > 25))
-    scale = np.array([wide, tall, wide]) / 10
-    tints = {"leaf": leaf_color(rng)}
-    builder.add(place(model, (x, 0, s), rng.uniform(0, 6.28), scale, tints))
-
-
-def _bush(
-    builder: MeshBuilder, rng: np.random.Generator, x: Number, s: float, size: Number
-) -> None:
-    model = bush(int(rng.integers(BUSHES)), int(s > 20))
-    scale = size * rng.uniform(0.7, 1.3, 3)
-    tints = {"leaf": leaf_color(rng)}
-    builder.add(place(model, (x, 0, s), rng.uniform(0, 6.28), scale, tints))
-
-
-def _is_free(road: Road, side: int, s: Number, length: float) -> bool:
-    return not road.is_side_street(s + length / 2, side, length / 2 + 1)
-
-
-def _horizon(builder: MeshBuilder, rng: np.random.Generator, road: Road) -> None:
-    """Trees across the end of the road's straight part, so that the view is closed somewhere."""
-    if rng.random() < 0.85:
+            beside.add_country()
+        beside.add_kerb()
+        beside.add_woods()
+    if rng.random() < 0.85:  # trees across the end of the road's straight part
         for _ in range(int(rng.integers(30, 90))):
-            side = int(rng.choice([-1, 1]))
-            x = road.plot_m(side) + side * rng.uniform(2, 90)
-            _tree(builder, rng, x, rng.uniform(90, 230), rng.uniform(7, 16))
+            beside = Roadside(builder=builder, rng=rng, road=road, side=int(rng.choice([-1, 1])))
+            x = beside.x_m(rng.uniform(2, 90))
+            beside.add_tree(x, rng.uniform(90, 230), rng.uniform(7, 16))
     if rng.random() < 0.6:
         s, half = rng.uniform(170, 300), rng.uniform(60, 160)
         line = (-half, s, half, s + rng.uniform(-40, 40))
         add_wood_edge(builder, rng, line, rng.uniform(7, 14))
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Roadside:
+    """One side of a road, to be filled: every method adds to the mesh of the builder.
+
+    Attributes:
+        builder: what is added to.
+        rng: random numbers.
+        road: its plan.
+        side: 1 right, -1 left.
+    """
+
+    builder: MeshBuilder
+    rng: np.random.Generator
+    road: Road
+    side: int
+
+    def x_m(self, beyond_m: Number) -> Number:
+        """Give x so far beyond the beginning of the plots."""
+        return self.road.plot_m(self.side) + self.side * beyond_m
+
+    def is_free(self, s: Number, length: float) -> bool:
+        """Whether no side street lies in a stretch."""
+        return not self.road.is_side_street(s + length / 2, self.side, length / 2 + 1)
+
+    def add_houses(self) -> None:
+        """Houses at the pavement, wall to wall."""
+        rng, road, side = self.rng, self.road, self.side
+        if road.walk_m > 2 and rng.random() < 0.55:
+            self.add_tree_row(road.edge_m(side) + side * 0.9)
+        s, set_back = rng.uniform(-12, -4), rng.uniform(0, 3) * (rng.random() < 0.4)
+        tall = rng.uniform(6, 17)
+        while s < _FAR_M:
+            length = rng.uniform(8, 20)
+            if self.is_free(s, length):
+                height = tall * rng.uniform(0.75, 1.25)
+                self.add_house(s, length, set_back + rng.uniform(0, 0.6), height)
+            elif rng.random() < 0.5:
+                self.add_tree(self.x_m(rng.uniform(6, 12)), s, None)
+            s += length + (rng.uniform(2, 9) if rng.random() < 0.3 else 0.0)
+
+    def add_gardens(self) -> None:
+        """Houses behind hedges and fences, with trees and bushes about them."""
+        rng = self.rng
+        s, back = rng.uniform(-12, -2), rng.uniform(2.5, 7)
+        border = int(rng.integers(4))
+        while s < _FAR_M:
+            length = rng.uniform(8, 15)
+            if not self.is_free(s, length):
+                s += length
+                continue
+            if rng.random() < 0.78:
+                self.add_house(s, length, back * rng.uniform(0.8, 1.3), rng.uniform(3.5, 7.5))
+            border = int(rng.integers(4)) if rng.random() < 0.5 else border
+            self.add_border(s, s + length + 3, border)
+            for _ in range(int(rng.integers(0, 3))):
+                x = self.x_m(rng.uniform(1.3, back + 1))
+                self.add_tree(x, s + rng.uniform(0, length), rng.uniform(3, 9))
+            for _ in range(int(rng.integers(1, 5))):
+                x = self.x_m(rng.uniform(0.9, 3))
+                self.add_bush(x, s + rng.uniform(0, length), rng.uniform(0.6, 1.9))
+            s += length + rng.uniform(1.5, 7)
+
+    def add_avenue(self) -> None:
+        """A wide road: rows of trees, hedges or rails, and set-back houses or nothing behind."""
+        rng, road, side = self.rng, self.road, self.side
+        has_row, has_border, has_houses = rng.random(3) < (0.7, 0.5, 0.35)
+        rail = int(rng.integers(4))
+        if has_row:
+            reach = rng.uniform(1.2, max(1.5, road.verge_m))
+            self.add_tree_row(road.edge_m(side) + side * reach)
+        if has_border:
+            self.add_border(-8, 100, rail)
+        s = rng.uniform(-10, 5)
+        while s < _FAR_M:
+            length = rng.uniform(10, 26)
+            if has_houses and rng.random() < 0.7 and self.is_free(s, length):
+                self.add_house(s, length, rng.uniform(5, 22), rng.uniform(5, 16))
+            else:
+                self.add_copse(s, length, rng.uniform(4, 14))
+            s += length + rng.uniform(0, 10)
+
+    def add_tree_row(self, x: Number) -> None:
+        """Trees along the road, at even distances."""
+        rng = self.rng
+        step, height = rng.uniform(6, 14), rng.uniform(5, 13)
+        for s in np.arange(rng.uniform(-8, 6), _FAR_M, step):
+            if not self.road.is_side_street(s, self.side, 2) and rng.random() < 0.85:
+                place_m = (x + rng.normal(0, 0.3), s + rng.normal(0, 0.8))
+                self.add_tree(*place_m, height * rng.uniform(0.8, 1.2))
+
+    def add_country(self) -> None:
+        """Open fields with some trees, or a forest's edge."""
+        rng = self.rng
+        is_forest = self.road.place == "forest"
+        is_open = not is_forest and rng.random() < 0.55
+        edge, height = rng.uniform(1.0, 4.5), rng.uniform(9, 15)
+        s = rng.uniform(-10, -4)
+        while s < _FAR_M + 30:
+            if is_forest:
+                for depth in (0.0, 4.5) if s < 60 else (0.0,):
+                    x = self.x_m(edge + depth + rng.uniform(0, 2.5))
+                    self.add_tree(x, s + rng.uniform(-2, 2), height * rng.uniform(0.75, 1.25))
+                if rng.random() < 0.8:
+                    x = self.x_m(edge + rng.uniform(-0.4, 1.5))
+                    self.add_bush(x, s + rng.uniform(0, 3), rng.uniform(0.8, 2.6))
+                s += rng.uniform(2.6, 5) + max(0.0, s) * 0.04
+            else:
+                if rng.random() < (0.25 if is_open else 0.9):
+                    self.add_copse(s, 12.0, 25.0 if is_open else 7.0)
+                s += rng.uniform(8, 18)
+        if not is_forest and rng.random() < 0.45:
+            self.add_border(-8, 90, int(rng.integers(4)))
+
+    def add_woods(self) -> None:
+        """The front of a wood: right behind a forest's first trees, far behind elsewhere."""
+        rng = self.rng
+        is_forest = self.road.place == "forest"
+        chance = {"forest": 0.9, "city": 0.1, "suburb": 0.35}.get(self.road.place, 0.55)
+        if rng.random() > chance:
+            return
+        near, height = (rng.uniform(8, 13), 13.0) if is_forest else (rng.uniform(14, 55), 9.0)
+        start = rng.uniform(-10, 0) if is_forest else rng.uniform(-10, 60)
+        x = self.x_m(near)
+        stop, other = start + rng.uniform(60, 200), x + self.side * rng.uniform(-2, 15)
+        height *= rng.uniform(0.7, 1.3)
+        add_wood_edge(self.builder, rng, (x, start, other, stop), height)
+
+    def add_copse(self, s: Number, length: Number, depth: Number) -> None:
+        """Some trees and bushes."""
+        rng = self.rng
+        is_street = self.road.is_side_street(s + length / 2, self.side, length / 2)
+        for _ in range(int(rng.integers(1, 7))):
+            x = self.x_m(1.5 + depth * rng.uniform(0, 1))
+            if not is_street:
+                self.add_tree(x, s + rng.uniform(0, length), rng.uniform(4, 13))
+        for _ in range(int(rng.integers(0, 4))):
+            x = self.x_m(0.8 + depth * rng.uniform(0, 0.6))
+            if not is_street:
+                self.add_bush(x, s + rng.uniform(0, length), rng.uniform(0.7, 2.2))
+
+    def add_kerb(self) -> None:
+        """Lamps in a row; signs, lights, posts and boxes here and there; poles with wires."""
+        rng, road, side = self.rng, self.road, self.side
+        x, y = road.edge_m(side) + side * (0.5 if road.walk_m else 1.3), -road.curb_m
+        if rng.random() <= {"forest": 0.1, "rural": 0.3}.get(road.place, 0.7):
+            number, step = int(rng.integers(6)), rng.uniform(16, 34)
+            for s in np.arange(rng.uniform(2, 25), 110, step):
+                if not road.is_side_street(s, side):
+                    self.builder.add(place(lamp(number), (x, y, s), 0.0 if side < 0 else np.pi))
+        s = rng.uniform(3, 12)
+        is_town = road.place not in ("rural", "forest")
+        while s < 70:
+            if not road.is_side_street(s, side, 0.5):
+                self.add_kerb_thing(x + side * rng.uniform(0, 0.4), s, is_town=is_town)
+            s += rng.uniform(3, 14) * (1 if is_town else 1.8)
+        for street in road.side_streets:
+            if side in street.sides and rng.random() < 0.4:
+                light = traffic_light(int(rng.integers(4)))
+                where = (x, y, street.s_m - street.half_m - 1)
+                self.builder.add(place(light, where, 0, (-side, 1, 1)))
+        if rng.random() < 0.25:
+            self.add_wires(x + side * rng.uniform(0.5, 3))
+
+    def add_kerb_thing(self, x: Number, s: Number, *, is_town: bool) -> None:
+        """A sign, a small thing or a tree."""
+        rng, where = self.rng, (x, -self.road.curb_m, s)
+        kind = rng.random()
+        if kind < 0.4:
+            model = sign(int(rng.integers(20)))
+            yaw = rng.normal(0, 0.12) + np.pi * (rng.random() < 0.2)
+            self.builder.add(place(model, where, yaw))
+        elif kind < 0.8 or not is_town:
+            number = int(rng.choice([0, 1, 2, 3, 4, 5])) if is_town else 3
+            self.builder.add(place(small_thing(number), where, rng.normal(0, 0.1)))
+        else:
+            self.add_tree(x + self.side * 0.4, s, rng.uniform(3.5, 7))
+
+    def add_wires(self, x: Number) -> None:
+        """Wooden poles with cables between them."""
+        rng, builder = self.rng, self.builder
+        height, step = rng.uniform(6, 8), rng.uniform(22, 38)
+        places = np.arange(rng.uniform(-15, 10), 120, step)
+        builder.begin_thing()
+        for s in places:
+            builder.tube((x, 0.2, s), (x, -height, s), (0.12, 0.09), WOOD, 8)
+            builder.box((x, -height + 0.3, s), (1.4, 0.1, 0.1), WOOD)
+        for start, stop in pairwise(places):
+            for shift in (-0.6, 0.6):
+                ends = [np.array([x + shift, -height + 0.22, s]) for s in (start, stop)]
+                add_wires(builder, *ends)
+
+    def add_house(self, s: Number, length: Number, back: Number, height: float) -> None:
+        """A house so far behind the pavement."""
+        plot = Plot(
+            x_m=self.x_m(back + 0.15),
+            z_m=(s, s + length),
+            side=self.side,
+            depth_m=self.rng.uniform(7, 12),
+            height_m=height,
+            ground_m=-self.road.curb_m + 0.2,
+        )
+        style = draw_style(self.rng, with_details=s < _DETAIL_M)
+        add_house(self.builder, self.rng, plot, style)
+
+    def add_border(self, start: Number, stop: Number, kind: int) -> None:
+        """A line of hedge or fence pieces at the back of the pavement; kind 0 is none."""
+        if kind == 0:
+            return
+        rng = self.rng
+        number, height = int(rng.integers(20)), rng.uniform(0.7, 1.9)
+        color = leaf_color(rng)
+        for s in np.arange(start + 2, min(stop, 95), FENCE_M):
+            if self.road.is_side_street(s, self.side, 2.2):
+                continue
+            where = (self.x_m(0.45), -self.road.curb_m, s)
+            if kind == 1:
+                model = hedge(int(rng.integers(HEDGES)))
+                self.builder.add(place(model, where, 0, (1, height, 1), {"leaf": color}))
+            else:
+                self.builder.add(place(fence(number), where))
+
+    def add_tree(self, x: Number, s: Number, height: Number | None) -> None:
+        """A tree of some kind, coarser where it is far away."""
+        rng = self.rng
+        tall = rng.uniform(5, 12) if height is None else height
+        number = int(rng.integers(TREES))
+        wide = tall * rng.uniform(0.85, 1.15)
+        model = tree(number, int(s > 24) + int(s > 48 or abs(x) > 25))
+        scale = np.array([wide, tall, wide]) / 10
+        tints = {"leaf": leaf_color(rng)}
+        self.builder.add(place(model, (x, 0, s), rng.uniform(0, 6.28), scale, tints))
+
+    def add_bush(self, x: Number, s: Number, size: Number) -> None:
+        """A bush of some kind, coarser where it is far away."""
+        rng = self.rng
+        model = bush(int(rng.integers(BUSHES)), int(s > 20))
+        scale = size * rng.uniform(0.7, 1.3, 3)
+        tints = {"leaf": leaf_color(rng)}
+        self.builder.add(place(model, (x, 0, s), rng.uniform(0, 6.28), scale, tints))
