@@ -41,8 +41,10 @@ def add_ball(
 def add_leaves(
     builder: MeshBuilder,
     rng: np.random.Generator,
-    where: tuple[Values, Values],
-    leaves: tuple[int, Number],
+    centre: Values,
+    radii: Values,
+    count: int,
+    length_m: Number,
     surface: Surface,
     is_block: bool = False,
 ) -> None:
@@ -51,12 +53,13 @@ def add_leaves(
     Args:
         builder: what to add to.
         rng: random numbers.
-        where: centre and radii of an ellipsoid, or of a block [m].
-        leaves: how many, and how long one is [m].
+        centre: of an ellipsoid, or of a block [m].
+        radii: of it, along each axis [m].
+        count: how many.
+        length_m: how long one is.
         surface: colour and material; every leaf gets a shade of its own.
         is_block: fill the surface of a block, as a clipped hedge, not of an ellipsoid.
     """
-    (centre, radii), (count, length_m) = where, leaves
     places, outward = (_on_block if is_block else _in_ball)(rng, count)
     points = places * np.asarray(radii) + np.asarray(centre)
     along = _unit(rng.normal(size=(count, 3)) + 0.7 * np.cross(outward, [0.3, 1, 0.2]))
@@ -164,7 +167,7 @@ def _broadleaf(
         centre = top + np.array([out * np.cos(turn), height - 0.4, out * np.sin(turn)])
         builder.tube(top, centre, (thick_m * 0.4, 0.03), bark, 5)
         radii = radius_m * rng.uniform(0.42, 0.68) * np.array([1, rng.uniform(0.7, 0.95), 1])
-        _clump(builder, rng, (centre, radii), (leaves[0] // blobs, leaves[1]))
+        _clump(builder, rng, centre, radii, leaves[0] // blobs, leaves[1])
 
 
 def _conifer(builder: MeshBuilder, rng: np.random.Generator, leaves: tuple[int, Number]) -> None:
@@ -175,20 +178,25 @@ def _conifer(builder: MeshBuilder, rng: np.random.Generator, leaves: tuple[int, 
         share = tier / tiers
         radius_m = rng.uniform(1.8, 2.4) * (1 - share) + 0.25
         radii = np.array([radius_m, 0.75, radius_m])
-        _clump(builder, rng, ((0, -1.2 - 8.6 * share, 0), radii), (leaves[0] // tiers, leaves[1]))
+        centre = (0, -1.2 - 8.6 * share, 0)
+        _clump(builder, rng, centre, radii, leaves[0] // tiers, leaves[1])
 
 
 def _clump(
-    builder: MeshBuilder, rng: np.random.Generator, where: tuple, leaves: tuple[int, Number]
+    builder: MeshBuilder,
+    rng: np.random.Generator,
+    centre: Values,
+    radii: Values,
+    count: int,
+    length_m: Number,
 ) -> None:
     """A dark core that occludes what is behind, and leaves about it."""
-    centre, radii = where
     light = rng.uniform(0.8, 1.15)
     core = Surface("leaf", (0.3 * light, 0.3 * light, 0.3 * light), 0.9, int(rng.integers(3)))
-    is_near = leaves[1] < 0.4
+    is_near = length_m < 0.4
     add_ball(builder, centre, np.asarray(radii) * 0.76, core, int(is_near), (rng, 0.25))
     surface = Surface("leaf", (light * 0.7, light * 0.7, light * 0.7), 0.9, int(rng.integers(3)))
-    add_leaves(builder, rng, where, leaves, surface)
+    add_leaves(builder, rng, centre, radii, count, length_m, surface)
 
 
 @cache
@@ -199,7 +207,7 @@ def bush(number: int, coarseness: int = 0) -> Mesh:
     for _ in range(int(rng.integers(1, 4))):
         radii = np.array([0.55, 0.5, 0.55]) * rng.uniform(0.7, 1.1)
         centre = (rng.normal(0, 0.25), -radii[1] * 0.85, rng.normal(0, 0.25))
-        _clump(builder, rng, (centre, radii), _BUSH_LEAVES[coarseness])
+        _clump(builder, rng, centre, radii, *_BUSH_LEAVES[coarseness])
     return builder.finish()
 
 
@@ -211,7 +219,8 @@ def hedge(number: int) -> Mesh:
     variant = int(rng.integers(3))
     builder.box((0, -0.48, 0), (0.6, 0.96, 4.0), Surface("leaf", (0.42, 0.42, 0.42), 0.8, variant))
     surface = Surface("leaf", (0.7, 0.7, 0.7), 0.9, variant)
-    add_leaves(builder, rng, ((0, -0.5, 0), (0.35, 0.5, 2.0)), (420, 0.13), surface, is_block=True)
+    size = (0.35, 0.5, 2.0)
+    add_leaves(builder, rng, (0, -0.5, 0), size, 420, 0.13, surface, is_block=True)
     return builder.finish()
 
 
@@ -246,11 +255,9 @@ def add_wood_edge(
     leaf = surface._replace(tint=(0.6 * r, 0.6 * g, 0.6 * b))
     for start in range(0, count - 4, 4):
         if s[start] < 80:  # farther away they would be less than a pixel
-            middle, reach = (
-                (x[start + 2], -0.52 * height_m, s[start + 2]),
-                (1.3, 0.55 * height_m, 3.6),
-            )
-            add_leaves(builder, rng, (middle, reach), (300, 0.5), leaf, is_block=True)
+            middle = (x[start + 2], -0.52 * height_m, s[start + 2])
+            size = (1.3, 0.55 * height_m, 3.6)
+            add_leaves(builder, rng, middle, size, 300, 0.5, leaf, is_block=True)
 
 
 _GREY = Surface("metal", (0.25, 0.26, 0.27))

@@ -421,8 +421,9 @@ def _lattice(b: MeshBuilder, rng: np.random.Generator, centre: np.ndarray, size_
 
 def _leaves(b: MeshBuilder, rng: np.random.Generator, centre: np.ndarray, size_m: float) -> None:
     radii = size_m * rng.uniform(0.4, 1.2, 3)
-    leaves = int(rng.integers(100, 1200)), size_m * rng.uniform(0.03, 0.2)
-    add_leaves(b, rng, (centre, radii), leaves, _surface(rng, size_m), bool(rng.random() < 0.3))
+    count, length_m = int(rng.integers(100, 1200)), size_m * rng.uniform(0.03, 0.2)
+    surface, is_block = _surface(rng, size_m), bool(rng.random() < 0.3)
+    add_leaves(b, rng, centre, radii, count, length_m, surface, is_block)
 
 
 _SHAPES: tuple[Callable[[MeshBuilder, np.random.Generator, np.ndarray, float], None], ...] = (
