@@ -16,7 +16,7 @@ from stereo_speed import network_for, out_folder, plain_match, random_pair, size
 
 from depthpose.depth.config import MatcherConfig
 from depthpose.depth.stereo import PSMNetMatcher
-from depthpose.depth.stereo.kinds import PSMNetFootprint
+from depthpose.depth.stereo.kinds import psmnet_bytes
 
 PLAIN = 0
 """Marks the plain network, in place of a bound."""
@@ -62,8 +62,7 @@ def least_bytes(size: tuple[int, int], weights: Path | None) -> int:
     """The least bound that is accepted."""
     config = network_for(weights).config
     h, w = (max(config.min_side_px, -(-side // 16) * 16) for side in size)
-    footprint = PSMNetFootprint(config=config, height=h, width=w, dtype=torch.float32)
-    return footprint.estimate_bytes()
+    return psmnet_bytes(config, h, w, torch.float32)
 
 
 def main() -> None:

@@ -22,7 +22,7 @@ from depthpose.depth.stereo import (
     psmnet,
     tile_change_px,
 )
-from depthpose.depth.stereo.kinds import PSMNetFootprint
+from depthpose.depth.stereo.kinds import psmnet_bytes
 from depthpose.depth.stereo.network_matcher import (
     Tiling,
     lower_where_disagreeing,
@@ -228,12 +228,11 @@ def test_a_bound_is_met_or_refused_with_the_least_that_works(size: tuple[int, in
 
 
 def test_the_published_size_takes_less_than_1_gb_of_a_pair_of_kitti() -> None:
-    footprint = PSMNetFootprint(config=PSMNetConfig(), height=384, width=1248, dtype=torch.float32)
-    assert footprint.estimate_bytes() < 1_000_000_000
-    half = replace(footprint, dtype=torch.bfloat16)
-    assert half.estimate_bytes() < footprint.estimate_bytes()
-    fewer = replace(footprint, rows=8)
-    assert fewer.estimate_bytes() < footprint.estimate_bytes()
+    network, size = PSMNetConfig(), (384, 1248)
+    whole = psmnet_bytes(network, *size, torch.float32)
+    assert whole < 1_000_000_000
+    assert psmnet_bytes(network, *size, torch.bfloat16) < whole
+    assert psmnet_bytes(network, *size, torch.float32, rows=8) < whole
 
 
 @pytest.mark.parametrize("overlap", [0, 8])
@@ -327,18 +326,16 @@ def test_unknown_device_is_refused() -> None:
 
 _PSMNET = """
 from depthpose.depth.stereo import PSMNet, PSMNetMatcher as Matcher
-from depthpose.depth.stereo.kinds import PSMNetFootprint
+from depthpose.depth.stereo.kinds import psmnet_bytes
 network = PSMNet().eval()
-footprint = PSMNetFootprint(config=network.config, height=256, width=1024, dtype=torch.float32)
-least = footprint.estimate_bytes()
+least = psmnet_bytes(network.config, 256, 1024, torch.float32)
 """
 _LIGHT = """
 from depthpose.depth.config import LightConfig
 from depthpose.depth.stereo import LightMatcher as Matcher, LightStereo
-from depthpose.depth.stereo.kinds import LightFootprint
+from depthpose.depth.stereo.kinds import light_bytes
 network = LightStereo(LightConfig(with_agreement=True, with_refinement=True)).eval()
-footprint = LightFootprint(config=network.config, height=256, width=1024, dtype=torch.float32)
-least = footprint.estimate_bytes()
+least = light_bytes(network.config, 256, 1024, torch.float32)
 """
 
 

@@ -24,7 +24,7 @@ from depthpose.depth.config import (
 )
 from depthpose.depth.encoder import LiteEncoder, load_encoder
 from depthpose.depth.stereo import LightMatcher, LightStereo, PSMNet, make_matcher, normalise
-from depthpose.depth.stereo.kinds import LightFootprint
+from depthpose.depth.stereo.kinds import light_bytes
 from depthpose.depth.stereo.light import (
     Refinement,
     agreement_around,
@@ -256,8 +256,7 @@ def test_some_rows_at_a_time_give_the_same_numbers(compares: bool) -> None:
 def test_a_bound_on_memory_is_met_or_refused() -> None:
     left, right = shifted_pair(64, 96, 5)
     network = random_network()
-    footprint = LightFootprint(config=SMALL, height=64, width=96, dtype=torch.float32)
-    least = footprint.estimate_bytes()
+    least = light_bytes(SMALL, 64, 96, torch.float32)
     LightMatcher(network, MatcherConfig(max_memory_bytes=least)).match(left, right)
     with pytest.raises(InputError, match=f"too small for images of 64x96.*takes {least}"):
         LightMatcher(network, MatcherConfig(max_memory_bytes=least - 1)).match(left, right)

@@ -76,37 +76,6 @@ class DisparityErrors:
     d1_all: float
 
 
-@dataclass(frozen=True)
-class ViewErrors:
-    """How like the real right view a drawn one is.
-
-    Attributes:
-        right_l1: mean absolute difference, colours in [0, 1].
-        right_psnr_db: peak signal-to-noise ratio [dB].
-        right_sharpness: mean size of the drawn view's gradient as a share of the real one's: 1 as
-            sharp, less blurred.
-    """
-
-    right_l1: float
-    right_psnr_db: float
-    right_sharpness: float
-
-
-@dataclass(frozen=True)
-class ConfidenceScore:
-    """How well a confidence orders the pixels of one image by their error.
-
-    Attributes:
-        ause: area between the sparsification curves of the confidence and of an oracle.
-        ause_random: the same of a confidence that knows nothing.
-        ause_share: their ratio: 0 an oracle, 1 no better than chance, above 1 misleading.
-    """
-
-    ause: float
-    ause_random: float
-    ause_share: float
-
-
 def measure(
     of: Quantity, predicted: Float[Tensor, " n"], true: Float[Tensor, " n"]
 ) -> dict[str, float]:
@@ -218,14 +187,18 @@ def sparsification_area(
 
 def score_confidence(
     error: Float[Tensor, " n"], confidence: Float[Tensor, " n"]
-) -> ConfidenceScore:
+) -> dict[str, float]:
     """Compare a confidence with an oracle and with chance; see :func:`sparsification_area`.
 
-    Where all errors are equal every order is as good as the oracle's, and the share is 0.
+    Returns:
+        ``ause`` of the confidence, ``ause_random`` of one that knows nothing, and their ratio
+        ``ause_share``: 0 an oracle, 1 no better than chance, above 1 misleading. Where all errors
+        are equal every order is as good as the oracle's, and the share is 0.
     """
     ause = sparsification_area(error, confidence)
     ause_random = sparsification_area(error, torch.zeros_like(error))
-    return ConfidenceScore(ause, ause_random, ause / ause_random if ause_random > 0 else 0.0)
+    share = ause / ause_random if ause_random > 0 else 0.0
+    return {"ause": ause, "ause_random": ause_random, "ause_share": share}
 
 
 def error_by_decile(
@@ -259,16 +232,22 @@ def _shared_error(error: Float[Tensor, " n"], key: Float[Tensor, " n"]) -> Float
     return mean[group]
 
 
-def view_errors(drawn: Float[Tensor, "3 h w"], real: Float[Tensor, "3 h w"]) -> ViewErrors:
-    """Compare a drawn right view with the real one, both RGB in [0, 1]."""
+def view_errors(drawn: Float[Tensor, "3 h w"], real: Float[Tensor, "3 h w"]) -> dict[str, float]:
+    """Compare a drawn right view with the real one, both RGB in [0, 1].
+
+    Returns:
+        ``right_l1``: mean absolute difference; ``right_psnr_db``: peak signal-to-noise ratio [dB];
+        ``right_sharpness``: mean size of the drawn view's gradient as a share of the real one's: 1
+        as sharp, less blurred.
+    """
     difference = drawn.double() - real.double()
     mean_square = difference.square().mean().clamp(min=1e-12)
     gradient, real_gradient = (
         image.diff(dim=2).abs().double().mean() + image.diff(dim=1).abs().double().mean()
         for image in (drawn, real)
     )
-    return ViewErrors(
-        right_l1=float(difference.abs().mean()),
-        right_psnr_db=float(-10 * torch.log10(mean_square)),
-        right_sharpness=float(gradient / real_gradient.clamp(min=1e-12)),
-    )
+    return {
+        "right_l1": float(difference.abs().mean()),
+        "right_psnr_db": float(-10 * torch.log10(mean_square)),
+        "right_sharpness": float(gradient / real_gradient.clamp(min=1e-12)),
+    }

@@ -1,7 +1,7 @@
 """Each frame measured, the means over frames, and the rows that hold them."""
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import asdict, dataclass, fields, replace
+from dataclasses import dataclass, fields, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -323,7 +323,7 @@ def _score(
     """Add AUSE and error by decile of the confidence, where there is one."""
     if confidence is None:
         return measured
-    score = asdict(score_confidence(error, confidence[mask]))
+    score = score_confidence(error, confidence[mask])
     deciles = error_by_decile(error, confidence[mask])
     return replace(measured, metrics={**measured.metrics, **score}, deciles=deciles)
 

@@ -1,6 +1,6 @@
 """The named protocols, and one frame: truth and prediction of one size, ready to be compared."""
 
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
@@ -132,14 +132,12 @@ class FrameResult:
 
     Attributes:
         estimate: at the size of the image.
-        compared: what its numbers are of.
         error: absolute disparity error [px], or absolute depth error as a share of the truth; NaN
             where nothing is compared.
         true_depth_m: the truth that counts as depth; None where it is a disparity without a rig.
     """
 
     estimate: DepthEstimate
-    compared: Compared
     error: Float[Tensor, "h w"]
     true_depth_m: Float[Tensor, "h w"] | None
 
@@ -183,7 +181,7 @@ def frame_result(
         right=read_drawn_view(predictions, prepared.frame.name),
         is_sky=is_sky,
     )
-    return FrameResult(estimate=estimate, compared=compared, error=error, true_depth_m=true_m)
+    return FrameResult(estimate=estimate, error=error, true_depth_m=true_m)
 
 
 def compare_depth(prepared: Prepared, rule: Protocol, cap_m: float) -> Compared:
@@ -274,7 +272,7 @@ def _measure_view(frame: Frame, predictions: Path) -> dict[str, float]:
             f"{predictions}: the drawn view of {frame.name} is {drawn.shape[2]}x{drawn.shape[1]}, "
             f"but its right image is {real.shape[2]}x{real.shape[1]}; predict it again"
         )
-    return asdict(view_errors(drawn, real))
+    return view_errors(drawn, real)
 
 
 def _truth(dataset: Dataset, index: int, rule: Protocol) -> Float[Tensor, "h w"]:

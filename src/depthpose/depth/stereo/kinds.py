@@ -4,7 +4,6 @@ Batch norm is folded into the convolution before it: the same function, one pass
 """
 
 import copy
-from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cache
@@ -29,101 +28,78 @@ OVERHEAD_BYTES = 128 << 20
 """... plus this, which the first convolutions take for themselves whatever the size."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class Footprint(ABC):
-    """A network at a size of images, as far as memory is concerned.
+PSMNET_ROWS, LIGHT_ROWS = 32, 16
+"""Rows at quarter size that are computed at a time."""
 
-    Volumes are held whole: a bound can be met or refused, not traded for time.
 
-    Attributes:
-        config: the network.
-        height: rows of the padded image [px].
-        width: columns of the padded image [px].
-        dtype: what the network computes in.
-        rows: at quarter size, computed at a time.
+def psmnet_bytes(
+    config: PSMNetConfig, height: int, width: int, dtype: torch.dtype, rows: int = PSMNET_ROWS
+) -> int:
+    """Peak memory of activations of one padded pair [bytes], with margin for the allocator.
+
+    Two volumes of the largest size are held whole; ``rows`` at quarter size are computed at a time.
     """
+    h, w = height // 4, width // 4
+    row_bytes = config.width * w * dtype.itemsize
+    map_bytes = row_bytes * h
+    bins = config.max_disparity_px // 4
+    volume_bytes = map_bytes * bins
 
-    config: PSMNetConfig | LightConfig
-    height: int
-    width: int
-    dtype: torch.dtype
-    rows: int
+    def slab_bytes(halo: int) -> int:
+        return min(rows + 2 * halo, h) * row_bytes * bins
 
-    @abstractmethod
-    def estimate_bytes(self) -> int:
-        """Peak memory of activations of one pair [bytes], with margin for the allocator."""
-
-    def refuse_more_than(self, max_memory_bytes: int | None) -> None:
-        """Refuse a bound that a match would exceed."""
-        least = self.estimate_bytes()
-        if max_memory_bytes is not None and least > max_memory_bytes:
-            quick = "" if self.config.work_focal_px is None else " or speed='quick'"
-            raise InputError(
-                f"max_memory_bytes={max_memory_bytes} is too small for images of "
-                f"{self.height}x{self.width} (padded): this matcher takes {least}; allow "
-                f"that, take precision='bf16'{quick}, or match tiles (tile_px)"
-            )
+    levels = 6 + len(config.pools)
+    cost_bytes = 4 * bins * h * w
+    # Costs are computed in float32.
+    head_slabs = 2 if dtype.itemsize >= 4 else 4
+    stages = (
+        # Five half-size maps in the first stage; joined levels, twice, in the last.
+        2 * map_bytes * max(5 * 4, 2 * levels + 12),
+        # ``cost0``; of some rows the concatenation, and what a convolution makes of it.
+        volume_bytes + 2 * map_bytes + 3 * slab_bytes(4),
+        # ``cost0``, what is added to it, three half-size volumes; some rows in the head.
+        2 * volume_bytes + 3 * volume_bytes // 4 + head_slabs * slab_bytes(2) + 3 * cost_bytes,
+        4 * cost_bytes + 16 * height * width + 5 * CHUNK_BYTES,
+    )
+    return int(MARGIN * max(stages)) + OVERHEAD_BYTES
 
 
-@dataclass(frozen=True, kw_only=True)
-class PSMNetFootprint(Footprint):
-    """PSMNet at a size of images: two volumes of the largest size are held whole."""
+def light_bytes(
+    config: LightConfig, height: int, width: int, dtype: torch.dtype, rows: int = LIGHT_ROWS
+) -> int:
+    """Peak memory of activations of one padded pair [bytes], with margin for the allocator.
 
-    config: PSMNetConfig
-    rows: int = 32
+    One volume of the largest size is held whole; ``rows`` at quarter size are computed at a time.
+    """
+    pixels = height * width // 16
+    slab_pixels = min((rows + 4) * width // 4, pixels)
+    halves = 2 if config.with_agreement or config.with_refinement else 1
+    kept = pixels * (halves * 4 * 16 + 3 * config.width) * dtype.itemsize
+    # Both views in float32: at this size, normalised, padded.
+    images = 6 * 3 * 4 * height * width
+    # A volume at quarter size, the smaller ones, and three of the rows at a time.
+    widest = max(config.groups, config.volume_widths[0])
+    voxel_bytes = widest * (config.max_disparity_px // 4) * dtype.itemsize
+    volumes = voxel_bytes * (7 * pixels // 4 + 3 * slab_pixels)
+    # Weights that enlarge maps, thrice, and what they are made of at half size; the refinement
+    # takes less.
+    joined = 4 * (16 + config.width + 32) * dtype.itemsize
+    compared = 4 * (4 * 16 + 9 + 3 * 9) * 4 if config.with_agreement else 0
+    weights = slab_pixels * (joined + compared + 3 * 4 * 36 * 4)
+    return int(MARGIN * (images + kept + max(volumes, weights))) + OVERHEAD_BYTES // 2
 
-    def estimate_bytes(self) -> int:
-        """Peak memory of activations of one pair [bytes], with margin for the allocator."""
-        height, width = self.height // 4, self.width // 4
-        row_bytes = self.config.width * width * self.dtype.itemsize
-        map_bytes = row_bytes * height
-        bins = self.config.max_disparity_px // 4
-        volume_bytes = map_bytes * bins
 
-        def slab_bytes(halo: int) -> int:
-            return min(self.rows + 2 * halo, height) * row_bytes * bins
-
-        levels = 6 + len(self.config.pools)
-        cost_bytes = 4 * bins * height * width
-        # Costs are computed in float32.
-        head_slabs = 2 if self.dtype.itemsize >= 4 else 4
-        stages = (
-            # Five half-size maps in the first stage; joined levels, twice, in the last.
-            2 * map_bytes * max(5 * 4, 2 * levels + 12),
-            # ``cost0``; of some rows the concatenation, and what a convolution makes of it.
-            volume_bytes + 2 * map_bytes + 3 * slab_bytes(4),
-            # ``cost0``, what is added to it, three half-size volumes; some rows in the head.
-            2 * volume_bytes + 3 * volume_bytes // 4 + head_slabs * slab_bytes(2) + 3 * cost_bytes,
-            4 * cost_bytes + 16 * self.height * self.width + 5 * CHUNK_BYTES,
+def refuse_more_memory(
+    least: int, max_memory_bytes: int | None, height: int, width: int, *, has_quick: bool
+) -> None:
+    """Refuse a bound that a match would exceed: volumes are held whole, and cannot be traded."""
+    if max_memory_bytes is not None and least > max_memory_bytes:
+        quick = " or speed='quick'" if has_quick else ""
+        raise InputError(
+            f"max_memory_bytes={max_memory_bytes} is too small for images of {height}x{width} "
+            f"(padded): this matcher takes {least}; allow that, take precision='bf16'{quick}, or "
+            "match tiles (tile_px)"
         )
-        return int(MARGIN * max(stages)) + OVERHEAD_BYTES
-
-
-@dataclass(frozen=True, kw_only=True)
-class LightFootprint(Footprint):
-    """The light network at a size of images: one volume of the largest size is held whole."""
-
-    config: LightConfig
-    rows: int = 16
-
-    def estimate_bytes(self) -> int:
-        """Peak memory of activations of one pair [bytes], with margin for the allocator."""
-        pixels = self.height * self.width // 16
-        slab_pixels = min((self.rows + 4) * self.width // 4, pixels)
-        halves = 2 if self.config.with_agreement or self.config.with_refinement else 1
-        kept = pixels * (halves * 4 * 16 + 3 * self.config.width) * self.dtype.itemsize
-        # Both views in float32: at this size, normalised, padded.
-        images = 6 * 3 * 4 * self.height * self.width
-        # A volume at quarter size, the smaller ones, and three of the rows at a time.
-        widest = max(self.config.groups, self.config.volume_widths[0])
-        voxel_bytes = widest * (self.config.max_disparity_px // 4) * self.dtype.itemsize
-        volumes = voxel_bytes * (7 * pixels // 4 + 3 * slab_pixels)
-        # Weights that enlarge maps, thrice, and what they are made of at half size; the refinement
-        # takes less.
-        joined = 4 * (16 + self.config.width + 32) * self.dtype.itemsize
-        compared = 4 * (4 * 16 + 9 + 3 * 9) * 4 if self.config.with_agreement else 0
-        weights = slab_pixels * (joined + compared + 3 * 4 * 36 * 4)
-        return int(MARGIN * (images + kept + max(volumes, weights))) + OVERHEAD_BYTES // 2
 
 
 Conv = nn.Conv2d | nn.Conv3d | nn.ConvTranspose3d
@@ -273,7 +249,7 @@ class PSMNetMatcher(NetworkMatcher):
             head.cost = VolumeConv(cost, cost.weight, torch.zeros(1), wide)
         fold_volumes(self._network, like)
         fold_features(self._network.features, like)
-        self._network.rows = PSMNetFootprint.rows
+        self._network.rows = PSMNET_ROWS
         if self.config.with_compile:
             self._network.features.compile()
 
@@ -284,8 +260,9 @@ class PSMNetMatcher(NetworkMatcher):
             InputError: a memory bound that is too small for them.
         """
         height, width = left.shape[-2:]
-        footprint = PSMNetFootprint(config=network, height=height, width=width, dtype=self.dtype)
-        footprint.refuse_more_than(self.config.max_memory_bytes)
+        least, most = psmnet_bytes(network, height, width, self.dtype), self.config.max_memory_bytes
+        has_quick = network.work_focal_px is not None
+        refuse_more_memory(least, most, height, width, has_quick=has_quick)
         near, far = (one.to(self.dtype, memory_format=torch.channels_last) for one in (left, right))
         costs = self._network.costs(near, far, network.max_disparity_px)[-1][:, 0]
         found = [
@@ -321,7 +298,7 @@ class LightMatcher(NetworkMatcher):
         folded = fold_volumes(copy.deepcopy(network).eval().to(self.device), like)
         self._network = fold_features(folded, like)
         # A GPU has the memory, and is busy with whole volumes alone.
-        self._network.rows = LightFootprint.rows if self.device.type == "cpu" else None
+        self._network.rows = LIGHT_ROWS if self.device.type == "cpu" else None
         if self.config.with_compile:
             self._network.features.compile()
 
@@ -332,14 +309,10 @@ class LightMatcher(NetworkMatcher):
             InputError: a memory bound that is too small for them.
         """
         height, width = left.shape[-2:]
-        footprint = LightFootprint(
-            config=network,
-            height=height,
-            width=width,
-            dtype=self.dtype,
-            rows=self._network.rows or height // 4,
-        )
-        footprint.refuse_more_than(self.config.max_memory_bytes)
+        rows, most = self._network.rows or height // 4, self.config.max_memory_bytes
+        least = light_bytes(network, height, width, self.dtype, rows)
+        has_quick = network.work_focal_px is not None
+        refuse_more_memory(least, most, height, width, has_quick=has_quick)
         read = self._network.read(
             left.to(self.dtype),
             right.to(self.dtype),

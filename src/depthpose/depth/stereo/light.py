@@ -60,18 +60,6 @@ class ViewFeatures(NamedTuple):
     levels: tuple[Features, ...]
 
 
-class Seen(NamedTuple):
-    """Inputs of the upsampling.
-
-    Attributes:
-        left: features of the left view.
-        right_half: of the right view at 1/2 of its sides, where both are compared.
-    """
-
-    left: ViewFeatures
-    right_half: Features | None
-
-
 class ConvexUpsampling(nn.Module):
     """Weights of the nine neighbours at 1/4 size, for each pixel of the image.
 
@@ -89,9 +77,13 @@ class ConvexUpsampling(nn.Module):
         if self.agreement is not None:
             nn.init.zeros_(self.agreement.weight)
 
-    def forward(self, seen: Seen, quarter_px: Quarter) -> Float[Tensor, "b 9 4 h2 w2"]:
-        """Answer weights that sum to one, for the four pixels of each one at half size."""
-        left, right_half = seen
+    def forward(
+        self, left: ViewFeatures, right_half: Features | None, quarter_px: Quarter
+    ) -> Float[Tensor, "b 9 4 h2 w2"]:
+        """Answer weights that sum to one, for the four pixels of each one at half size.
+
+        With agreement they take the right view's features at half size too.
+        """
         wide = F.interpolate(left.levels[0], scale_factor=2.0, mode="nearest")
         x = self.hidden(torch.cat([left.half, wide], 1))
         if self.compared is not None and self.agreement is not None:
@@ -479,20 +471,20 @@ class LightStereo(StereoNetwork):
         Raises:
             InputError: the images' size does not suit the network.
         """
-        scores, seen = self.scores(left, right, max_disparity_px)
+        scores, near, right_half = self.scores(left, right, max_disparity_px)
         quarter_px = mean_of_best(scores, self.config.candidates)
         quarters = [quarter_px]
         if with_confidence or self.sky_head is not None:
             with torch.no_grad():
                 quarters.append(self._confidence(scores, quarter_px))
         if self.sky_head is not None:
-            quarters.append(self.sky_head(seen.left.levels, *quarters))
+            quarters.append(self.sky_head(near.levels, *quarters))
         coarse_px = mean_of_all(scores)[:, None] if self.training else None
         del scores
-        found_px, *rest = self.enlarge(torch.stack(quarters, 1), seen).unbind(1)
+        found_px, *rest = self.enlarge(torch.stack(quarters, 1), near, right_half).unbind(1)
         heads = (found_px,)
         if self.refinement is not None:
-            parts = (found_px, seen.left.half, seen.right_half)
+            parts = (found_px, near.half, right_half)
             half_rows = None if self.rows is None else 2 * self.rows
             heads = (found_px, by_rows(self.refinement, parts, halo=5, rows=half_rows))
         if coarse_px is None:
@@ -517,7 +509,12 @@ class LightStereo(StereoNetwork):
         parts = zip(scores.split(self.rows, 2), quarter_px.split(self.rows, 1), strict=True)
         return torch.cat([confidence_near(*part) for part in parts], 1)
 
-    def enlarge(self, quarters: Float[Tensor, "b k h4 w4"], seen: Seen) -> Float[Tensor, "b k h w"]:
+    def enlarge(
+        self,
+        quarters: Float[Tensor, "b k h4 w4"],
+        left: ViewFeatures,
+        right_half: Features | None,
+    ) -> Float[Tensor, "b k h w"]:
         """Bring maps to the images' size by weights that follow the first, the disparity [px]."""
 
         def enlarged(
@@ -526,16 +523,16 @@ class LightStereo(StereoNetwork):
             left_quarter: Features,
             right_half: Features | None,
         ) -> Tensor:
-            near = Seen(ViewFeatures(left_half, (left_quarter,)), right_half)
-            weights = self.enlargement(near, quarters[:, 0])
+            near = ViewFeatures(left_half, (left_quarter,))
+            weights = self.enlargement(near, right_half, quarters[:, 0])
             return torch.stack([enlarge(one, weights) for one in quarters.unbind(1)], 1)
 
-        parts = (quarters, seen.left.half, seen.left.levels[0], seen.right_half)
+        parts = (quarters, left.half, left.levels[0], right_half)
         return by_rows(enlarged, parts, halo=2, rows=self.rows)
 
     def scores(
         self, left: Float[Tensor, "b 3 h w"], right: Float[Tensor, "b 3 h w"], max_disparity_px: int
-    ) -> tuple[Scores, Seen]:
+    ) -> tuple[Scores, ViewFeatures, Features | None]:
         """Answer a score for each disparity at 1/4 size, and what the enlargement sees.
 
         Scores are float32 at least: 8 bits would round the expectation to whole pixels.
@@ -554,4 +551,4 @@ class LightStereo(StereoNetwork):
         bins = max_disparity_px // STEP_PX
         scores = self.aggregation(*described, bins, near.levels, self.rows)
         wide = torch.promote_types(scores.dtype, torch.float32)
-        return scores.to(wide), Seen(near, right_half)
+        return scores.to(wide), near, right_half
