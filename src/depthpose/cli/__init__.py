@@ -35,10 +35,7 @@ COMMANDS = {
         "what is installed, and a test of depth and pose; or what files are",
     ),
     "serve": ("serve:serve", "depth and poses by a page in your browser, on this machine"),
-    "pose predict": (
-        "pose:predict",
-        "a cloud, a masked depth image, or a data set, to poses",
-    ),
+    "pose predict": ("pose:predict", "a cloud, a masked depth image, or a data set, to poses"),
     "pose track": ("pose:track", "follow an object through depth images or clouds"),
     "pose train": ("train:train_pose", "your CAD file, or a config, to a network that poses it"),
     "pose evaluate": ("pose:evaluate", "measure poses on a BOP or LineMOD data set"),
@@ -48,10 +45,7 @@ COMMANDS = {
         "train:train_depth",
         "stages view, select, stereo, adapt, finetune of generator and matcher",
     ),
-    "depth calibrate": (
-        "train:calibrate",
-        "set when an image is refused as out of distribution",
-    ),
+    "depth calibrate": ("train:calibrate", "set when an image is refused as out of distribution"),
     "depth evaluate": ("depth:evaluate", "measure predictions by a named protocol"),
     "data make streets": (
         "data_make:make_streets",
@@ -65,26 +59,17 @@ COMMANDS = {
         "data:rectify",
         "raw pairs and their calibration to rectified pairs that depth match takes",
     ),
-    "data check": (
-        "data:check",
-        "read a whole data set and list what is wrong",
-    ),
+    "data check": ("data:check", "read a whole data set and list what is wrong"),
     "data label": (
         "data:label",
         "truth for pairs that have none, by a matcher, where both views agree",
     ),
-    "data pack": (
-        "data:pack",
-        "a data set as tar shards: few large files, from a disk or a store",
-    ),
+    "data pack": ("data:pack", "a data set as tar shards: few large files, from a disk or a store"),
     "data export-depth": (
         "data:export_depth",
         "predicted depth as COLMAP's and nerfstudio's files",
     ),
-    "data duplicates": (
-        "data:duplicates",
-        "find evaluation images that are in a training set",
-    ),
+    "data duplicates": ("data:duplicates", "find evaluation images that are in a training set"),
     "weights list": ("weights:list_weights", "list the weights"),
     "weights show": ("weights:show_weights", "print what a weights file holds"),
     "weights pack": ("weights:pack_weights", "one file of a generator and a matcher, with a card"),
@@ -99,22 +84,13 @@ COMMANDS = {
     "weights import": ("weights:import_weights", "import a published checkpoint, safely"),
     "export depth": ("weights:export_depth", "depth as an ONNX file, proven to agree"),
     "export pose": ("weights:export_pose", "the network of directions as an ONNX file"),
-    "reproduce": (
-        "thesis:reproduce",
-        "a table of chapter 2: published rows, ours, difference",
-    ),
+    "reproduce": ("thesis:reproduce", "a table of chapter 2: published rows, ours, difference"),
     "reproduce all": (
         "thesis:reproduce_all",
         "all tables of a chapter, trainings included, from KITTI or LineMOD on disk",
     ),
-    "reproduce 3.1": (
-        "thesis:table_3_1",
-        "the method beside its baselines, by object",
-    ),
-    "reproduce 3.2": (
-        "thesis:table_3_2",
-        "LineMOD: published rows, ours, difference",
-    ),
+    "reproduce 3.1": ("thesis:table_3_1", "the method beside its baselines, by object"),
+    "reproduce 3.2": ("thesis:table_3_2", "LineMOD: published rows, ours, difference"),
     "reproduce 3.3": ("thesis:table_3_3", "RANSAC against least squares"),
     "figure": ("thesis:figure", "a figure of chapter 2 from your frames and weights"),
     "figure 3-2": ("thesis:figure_3_2", "features of points in one colour scale (t-SNE)"),

@@ -229,7 +229,6 @@ class FakestereoNet:
         """Estimate depth of one input whose images are read already, as :meth:`estimate` does."""
         if pair.right is None:
             return self._estimate_alone([pair], self.virtual_sizes(pair))[0]
-        right = usable_right(pair)
         if self.matcher is None:
             raise InputError(
                 f"{pair.name}: there is a right image, and these weights answer one image alone: "
@@ -238,8 +237,11 @@ class FakestereoNet:
                 "of both."
             )
         warning = refuse_unrectified(pair) if with_check else ""
+        if not with_check:
+            usable_right(pair)
+        assert pair.right is not None, "checked before"
         with refused_memory(pair.name):
-            match = match_to_infinity(self._match, pair.left, right, pair.camera)
+            match = match_to_infinity(self._match, pair.left, pair.right, pair.camera)
             return replace(from_pair(pair, match), warning=warning)
 
     @own_arithmetic()

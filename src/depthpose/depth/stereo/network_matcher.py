@@ -132,18 +132,34 @@ class NetworkMatcher(ABC):
         """
         for left, right in pairs:
             check_pair(left, right)
-        trained = self.network_config
-        if camera is None or trained.work_focal_px is None:
-            return self._match_alike(pairs, trained)
-        size = self.work_size(camera)
-        # A larger size needs more disparities; the same filters look through them.
-        larger = min(self.work_focal_px(camera) / trained.work_focal_px, self.most_disparities)
-        steps = math.ceil(round(trained.max_disparity_px * larger, 3) / trained.step_px)
-        network = replace(trained, max_disparity_px=steps * trained.step_px)
-        resized = [(resize_image(one, *size), resize_image(other, *size)) for one, other in pairs]
-        matches = self._match_alike(resized, network)
-        sizes = [left.shape[1:] for left, _ in pairs]
-        return [resized_match(match, *own) for match, own in zip(matches, sizes, strict=True)]
+        trained = network = self.network_config
+        views = pairs
+        if camera is not None and trained.work_focal_px is not None:
+            size = self.work_size(camera)
+            # A larger size needs more disparities; the same filters look through them.
+            larger = min(self.work_focal_px(camera) / trained.work_focal_px, self.most_disparities)
+            steps = math.ceil(round(trained.max_disparity_px * larger, 3) / trained.step_px)
+            network = replace(trained, max_disparity_px=steps * trained.step_px)
+            views = [tuple(resize_image(view, *size) for view in pair) for pair in pairs]
+        is_bounded = self.config.tile_px is not None or self.config.max_memory_bytes is not None
+        together = not is_bounded and len({left.shape for left, _ in views}) == 1
+        matches: list[Match] = []
+        for group in [views] if together else [[pair] for pair in views]:
+            left, right = (
+                normalise(torch.stack(side).to(self.device, torch.float32))
+                for side in zip(*group, strict=True)
+            )
+            found = self._match_one_way(left, right, network)
+            if self.config.with_left_right_check:
+                mirrored = self._match_one_way(right.flip(-1), left.flip(-1), network)
+                other_px = [match.disparity_px.flip(-1) for match in mirrored]
+                found = list(map(lower_where_disagreeing, found, other_px))
+            matches += found
+        home = pairs[0][0].device
+        return [
+            resized_match(changed_match(match, lambda values: values.to(home)), *left.shape[1:])
+            for match, (left, _) in zip(matches, pairs, strict=True)
+        ]
 
     def work_size(self, camera: Camera) -> tuple[int, int]:
         """Rows and columns at which images of a camera are matched [px]."""
@@ -160,27 +176,6 @@ class NetworkMatcher(ABC):
             return trained_px
         share = math.sqrt(self.fine_pixels / (camera.height * camera.width))
         return max(trained_px, float(camera.K[0, 0]) * min(share, self.most_enlarged))
-
-    def _match_alike(
-        self, pairs: Sequence[tuple[Tensor, Tensor]], network: NetworkConfig
-    ) -> list[Match]:
-        """Match pairs at the size that they have: all together, or each alone."""
-        is_bounded = self.config.tile_px is not None or self.config.max_memory_bytes is not None
-        together = not is_bounded and len({left.shape for left, _ in pairs}) == 1
-        home = pairs[0][0].device
-        matches: list[Match] = []
-        for group in [pairs] if together else [[pair] for pair in pairs]:
-            left, right = (
-                normalise(torch.stack(views).to(self.device, torch.float32))
-                for views in zip(*group, strict=True)
-            )
-            seen = self._match_one_way(left, right, network)
-            if self.config.with_left_right_check:
-                mirrored = self._match_one_way(right.flip(-1), left.flip(-1), network)
-                other_px = [match.disparity_px.flip(-1) for match in mirrored]
-                seen = list(map(lower_where_disagreeing, seen, other_px))
-            matches += [changed_match(match, lambda values: values.to(home)) for match in seen]
-        return matches
 
     def _match_one_way(self, left: Views, right: Views, network: NetworkConfig) -> list[Match]:
         """Match normalised pairs of any size: in tiles, or padded and cropped back."""
