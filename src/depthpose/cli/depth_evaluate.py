@@ -98,7 +98,12 @@ def predict_all(dataset: Dataset, method: Method, rule: Protocol, folder: Path) 
     ]
     process = find_rank()
     mine = [usable[k] for k in process.share(len(usable))]
-    readers = {dataset.frames[i].name: partial(_read, dataset, i, method.with_right) for i in mine}
+
+    def read(index: int) -> StereoInput:
+        pair = dataset.read_input(index)
+        return pair if method.with_right else replace(pair, right=None)  # what it must not see
+
+    readers = {dataset.frames[i].name: partial(read, i) for i in mine}
     chosen = [dataset.frames[i] for i in usable]
     sources = {f.name: f.seen_files(with_right=method.with_right) for f in chosen}
     home = folder / method.name
@@ -157,12 +162,6 @@ def open_training(folders: Sequence[Path], without: Sequence[str], measured: Dat
     return training
 
 
-def _read(dataset: Dataset, index: int, with_right: bool) -> StereoInput:
-    """Read an input; what a method must not see is not in it."""
-    pair = dataset.read_input(index)
-    return pair if with_right else replace(pair, right=None)
-
-
 def measure(
     dataset: Dataset,
     folders: Sequence[Path],
@@ -180,7 +179,7 @@ def measure(
     write_table(out, rows)
     write_details(measured, out)
     page = out / "report.html"
-    about = describe_protocol(protocol)
+    about = f"{protocol}: {PROTOCOLS[protocol].summary}."
     unknown = sum(frame.right is not None and not frame.calibration for frame in dataset.frames)
     if unknown:
         said = (
@@ -268,11 +267,6 @@ def detail_sections(measured: Evaluation) -> list[Section]:
         Section(title="Skipped frames", rows=without_truth),
     ]
     return [section for section in sections if section.rows]
-
-
-def describe_protocol(protocol: str) -> str:
-    """Say in a line how the numbers were measured."""
-    return f"{protocol}: {PROTOCOLS[protocol].summary}."
 
 
 def say_skipped(measured: Evaluation) -> None:

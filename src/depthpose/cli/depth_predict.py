@@ -106,7 +106,11 @@ def read_lens(options: LensOptions, sources: Sequence[Path], scale: ScaleOptions
     size = None
     for source in sources:
         with suppress(InputError):  # an image that cannot be read fails by itself, later
-            size = _size_of(source)
+            if _is_video(source):
+                _, frame = next(iter(read_video(source)))
+                size = frame.shape[2], frame.shape[1]
+            else:
+                size = image_size(source)
             break
     read = read_camera(options.camera, size)
     if isinstance(read, StereoRig):
@@ -293,13 +297,6 @@ class Predictor:
                 names += [name for name, _ in chunk if name not in self.failures]
                 bar.update(len(chunk))
         return names
-
-
-def _size_of(source: Path) -> tuple[int, int]:
-    if not _is_video(source):
-        return image_size(source)
-    _, frame = next(iter(read_video(source)))
-    return frame.shape[2], frame.shape[1]
 
 
 def _is_video(path: Path) -> bool:

@@ -70,7 +70,10 @@ def look_at_all(files: Sequence[Path]) -> int:
     seen: list[Seen] = []
     for path in ordered:
         size = next((other.size for other in seen if other.size is not None), None)
-        seen.append(_look_at(path, size))
+        try:
+            seen.append(_read(path, size))
+        except InputError as error:
+            seen.append(Seen(path=path, odd=[str(error).removeprefix(f"{path}: ")]))
     for one in seen:
         one.odd += _beside(one, seen)
     for path in files:
@@ -87,14 +90,6 @@ def look_at_all(files: Sequence[Path]) -> int:
 
 def _is_camera_like(path: Path) -> bool:
     return path.is_dir() or path.suffix.lower() in CAMERA_SUFFIXES
-
-
-def _look_at(path: Path, size: Size | None) -> Seen:
-    try:
-        seen = _read(path, size)
-    except InputError as error:
-        return Seen(path=path, odd=[str(error).removeprefix(f"{path}: ")])
-    return seen
 
 
 def _read(path: Path, size: Size | None) -> Seen:

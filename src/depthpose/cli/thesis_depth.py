@@ -12,7 +12,6 @@ from tqdm import tqdm
 
 from depthpose.cli.depth_evaluate import (
     columns,
-    describe_protocol,
     detail_sections,
     join,
     measure_each,
@@ -84,7 +83,7 @@ def reproduce_table(
     write_table(out, rows)
     write_details(measured, out)
     how = (
-        f"Ours: {describe_protocol(protocol)} The printed rows are of the 697 frames of "
+        f"Ours: {protocol}: {rule.summary}. The printed rows are of the 697 frames of "
         "eigen-test. Difference: ours minus the thesis's own row. A row of another protocol, or of "
         "other frames (see the columns), does not compare with the printed ones."
     )

@@ -35,7 +35,8 @@ def degrade(image: Picture, config: DegradeConfig, generator: torch.Generator) -
         image = image[torch.randperm(3, generator=generator)]
     image = _recoloured(image, config.colour, draw)
     if draw.share(config.haze_share):
-        image = _hazy(image, draw)
+        grey = torch.full_like(image, draw.between(0.5, 1.0))
+        image = torch.lerp(image, grey, draw.between(0.0, 0.4))
     if draw.share(config.glare_share):
         image = _glaring(image, draw)
     if draw.share(config.blur_share):
@@ -77,16 +78,10 @@ def _recoloured(image: Picture, strength: float, draw: _Draw) -> Picture:
         draw.between(1 - strength, 1 + strength) for _ in range(4)
     )
     tint = torch.tensor([draw.between(1 - strength / 3, 1 + strength / 3) for _ in range(3)])
-    grey = grey_of(image)
-    image = grey + (image - grey) * saturation
+    image = _saturate(image, saturation)
     mean = image.mean()
     image = ((image - mean) * contrast + mean) * exposure * tint[:, None, None]
     return image.clamp(0, 1) ** gamma
-
-
-def _hazy(image: Picture, draw: _Draw) -> Picture:
-    """Add haze to the image: a share of one light grey everywhere."""
-    return torch.lerp(image, torch.full_like(image, draw.between(0.5, 1.0)), draw.between(0.0, 0.4))
 
 
 def _glaring(image: Picture, draw: _Draw) -> Picture:
@@ -141,7 +136,8 @@ def augment(pair: TrainingPair, config: AugmentConfig, generator: torch.Generato
         InputError: the pair is smaller than half of the crop.
     """
     scaled = scale_pair(pair, _draw_scale(config, generator, pair.left.shape[-2:]))
-    cropped = crop_pair(scaled, _common_size(scaled, config.crop_px), generator)
+    (height, width), (rows, columns) = scaled.left.shape[-2:], config.crop_px
+    cropped = crop_pair(scaled, (min(height, rows), min(width, columns)), generator)
     if float(torch.rand((), generator=generator)) < config.flip_share:
         cropped = flip_and_swap(cropped)
     coloured = jitter_colors(cropped, config.jitter, generator)
@@ -224,11 +220,6 @@ def pad_pair(pair: TrainingPair, size_px: tuple[int, int]) -> TrainingPair:
         left_px=F.pad(pair.left_px, beyond, value=torch.nan),
         right_px=F.pad(pair.right_px, beyond, value=torch.nan),
     )
-
-
-def _common_size(pair: TrainingPair, crop_px: tuple[int, int]) -> tuple[int, int]:
-    height, width = pair.left.shape[-2:]
-    return min(height, crop_px[0]), min(width, crop_px[1])
 
 
 def jitter_colors(pair: TrainingPair, strength: float, generator: torch.Generator) -> TrainingPair:

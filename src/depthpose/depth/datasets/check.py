@@ -299,15 +299,15 @@ def _best_shift(
 def _fine_structure(dataset: Dataset, index: int) -> Float[Tensor, "zooms rows columns"]:
     """Make grey thumbnails of the image and of its middle, one a zoom, contrast evened out."""
     image = read_image(dataset.frames[index].left).mean(0, keepdim=True)
-    grey = torch.stack([shrink(_middle(image, zoom), _ROWS, _COLUMNS) for zoom in _ZOOMS])
+    height, width = image.shape[1:]
+    parts = []
+    for zoom in _ZOOMS:
+        top, left = (round(side * (1 - 1 / zoom) / 2) for side in (height, width))
+        middle = image[:, top : height - top, left : width - left]
+        parts.append(shrink(middle, _ROWS, _COLUMNS))
+    grey = torch.stack(parts)
     detail = grey - _blur(grey)
     return (detail / (_blur(detail**2).sqrt() + 0.01))[:, 0]
-
-
-def _middle(image: Float[Tensor, "c h w"], zoom: float) -> Float[Tensor, "c rows columns"]:
-    height, width = image.shape[1:]
-    top, left = (round(side * (1 - 1 / zoom) / 2) for side in (height, width))
-    return image[:, top : height - top, left : width - left]
 
 
 def _blur(image: Float[Tensor, "n c h w"]) -> Float[Tensor, "n c h w"]:

@@ -133,16 +133,11 @@ def _shipped(name: str) -> Split:
     frames = tuple(
         (drive, frame)
         for drive, _, ranges in (line.partition(" ") for line in text.splitlines())
-        for frame in _expand(ranges)
+        for ends in (word.split("-") for word in ranges.split())  # "0-3 7" is 0, 1, 2, 3, 7
+        for frame in range(int(ends[0]), int(ends[-1]) + 1)
     )
     assert len(frames) == count
     return Split(name=name, frames=frames)
-
-
-def _expand(ranges: str) -> list[int]:
-    """``"0-3 7"`` to ``[0, 1, 2, 3, 7]``."""
-    ends = [[int(end) for end in word.split("-")] for word in ranges.split()]
-    return [frame for end in ends for frame in range(end[0], end[-1] + 1)]
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -224,7 +224,12 @@ def prepare(dataset: Dataset, index: int, predictions: Path, rule: Protocol) -> 
         return f"no truth of the kind {rule.truth}"
     if frame.right is None and not has_prediction(predictions, frame.name):
         return NO_PREDICTION
-    truth = _truth(dataset, index, rule)
+    if rule.truth in ("velodyne_x", "camera_z"):
+        truth = lidar_truth(frame, rule.truth)
+    else:
+        shipped = dataset.read_truth(index)
+        truth = shipped.disparity_px if rule.truth == "disparity" else shipped.depth_m
+    assert truth is not None, "has_truth said so"
     height, width = truth.shape
     camera, depth_m = dataset.read_rig(index), None
     if rule.truth != "disparity" and (camera is None or not has_disparity(predictions, frame.name)):
@@ -273,12 +278,3 @@ def _measure_view(frame: Frame, predictions: Path) -> dict[str, float]:
             f"but its right image is {real.shape[2]}x{real.shape[1]}; predict it again"
         )
     return view_errors(drawn, real)
-
-
-def _truth(dataset: Dataset, index: int, rule: Protocol) -> Float[Tensor, "h w"]:
-    if rule.truth in ("velodyne_x", "camera_z"):
-        return lidar_truth(dataset.frames[index], rule.truth)
-    shipped = dataset.read_truth(index)
-    truth = shipped.disparity_px if rule.truth == "disparity" else shipped.depth_m
-    assert truth is not None  # has_truth said so
-    return truth

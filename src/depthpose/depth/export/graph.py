@@ -249,7 +249,10 @@ def _selected(left: Value, generator: SelectionGenerator) -> DrawnValues:
 def _shifted(left: Value, shift_px: Value) -> Value:
     """Look the left image up at ``x + shift``; beyond the border the border repeats."""
     size = size_of(left)
-    places = [_numbers(side(size)) for side in (rows, columns)]
+    places = [  # 0, 1, ... of each side
+        left.graph.op("Range", 0, side(size).op("Squeeze", [0]), 1).cast(np.float32)
+        for side in (rows, columns)
+    ]
     row = places[0].op("Unsqueeze", [1])
     y, x = (
         (values * np.float32(2) + np.float32(1)) / side(size).cast(np.float32) - np.float32(1)
@@ -259,12 +262,6 @@ def _shifted(left: Value, shift_px: Value) -> Value:
         v.op("Expand", shift_px.op("Shape")).op("Unsqueeze", [-1]) for v in (x, y)), axis=-1
     )  # fmt: skip
     return left.op("GridSample", grid, mode="bilinear", padding_mode="border", align_corners=0)
-
-
-def _numbers(count: Value) -> Value:
-    """Give 0, 1, ... as float32."""
-    whole = count.op("Squeeze", [0])
-    return count.graph.op("Range", 0, whole, 1).cast(np.float32)
 
 
 def _near_multiple(size: Value, multiple: int) -> Value:
@@ -321,8 +318,10 @@ def image_graph(weights: DepthWeights) -> Graph:
     found = _answered(left, seen, weights.matcher, rig)
     disparity_px = resized_map(found.disparity_px, full) * ratio(full, small)
     confidence = resized_map(found.confidence, full)
-    focal_m_px = _focal_m_px(K, rig)
-    depth_m = _depth(disparity_px, focal_m_px)
+    fx = K.op("Reshape", [-1]).op("Gather", 0).cast(np.float32)
+    focal_m_px = fx * np.float32(rig.virtual_baseline_m)  # depth is that over disparity
+    depth_m = focal_m_px / disparity_px
+    depth_m = disparity_px.op("Greater", np.float32(0)).op("Where", depth_m, np.float32(np.nan))
     if found.sky is not None:
         is_sky = resized_map(found.sky, full).op("Greater", np.float32(0.5))
         depth_m = is_sky.op("Where", np.float32(np.nan), depth_m)
@@ -432,17 +431,6 @@ def _matched(
     disparity_px, confidence, *sky = (resized_map(m, size) for m in found)
     is_sky = [values.op("Greater", np.float32(0.5)).cast(np.float32) for values in sky]
     return _Maps(disparity_px * ratio(size, work), confidence, *is_sky)
-
-
-def _focal_m_px(K: Value, rig: GeneratorConfig | SelectionConfig) -> Value:
-    """Give focal length times the imitated baseline: depth is that over disparity."""
-    fx = K.op("Reshape", [-1]).op("Gather", 0).cast(np.float32)
-    return fx * np.float32(rig.virtual_baseline_m)
-
-
-def _depth(disparity_px: Value, focal_m_px: Value) -> Value:
-    depth_m = focal_m_px / disparity_px
-    return disparity_px.op("Greater", np.float32(0)).op("Where", depth_m, np.float32(np.nan))
 
 
 def _output_maps(graph: Graph, *maps: Value | None) -> None:

@@ -82,7 +82,9 @@ def _pair_export(weights: DepthWeights, facts: dict[str, Any]) -> Export:
 
 
 def _image_export(weights: DepthWeights, facts: dict[str, Any]) -> Export:
-    rig = {} if weights.generator is None else _rig_facts(weights)
+    names = ("virtual_focal_px", "virtual_baseline_m", "answer")
+    generator = weights.generator
+    rig = {} if generator is None else {name: getattr(generator.config, name) for name in names}
     selects = isinstance(weights.generator, SelectionGenerator)
     chooses = selects or isinstance(weights.matcher, _FLIPPING)
     return Export(
@@ -98,13 +100,6 @@ TARGETS = {
     "pair": Target(fits=lambda weights: weights.matcher is not None, export=_pair_export),
 }
 """One image to depth, a rectified pair to disparity: a new target is a function and one entry."""
-
-
-def _rig_facts(weights: DepthWeights) -> dict[str, Any]:
-    assert weights.generator is not None
-    rig = weights.generator.config
-    names = ("virtual_focal_px", "virtual_baseline_m", "answer")
-    return {name: getattr(rig, name) for name in names}
 
 
 def _image_cases(weights: DepthWeights) -> Iterator[Case]:

@@ -157,16 +157,12 @@ def _edge_pixels(stage: Stage, raster: Raster) -> Bool[Tensor, "h w"]:
         ((slice(1, None), slice(None)), (slice(None, -1), slice(None))),
     ):
         is_other = raster.primitive[one] != raster.primitive[other]
-        is_bent = _aligned(normal[one], normal[other]) < 0.9
+        x, y, z = (normal[one] * normal[other]).unbind(-1)
+        is_bent = (x + y + z).abs() < 0.9
         differs = is_other & ((kind[one] != kind[other]) | is_bent)
         edge[one] |= differs
         edge[other] |= differs
     return edge
-
-
-def _aligned(one: Float[Tensor, "h w 3"], other: Float[Tensor, "h w 3"]) -> Float[Tensor, "h w"]:
-    both = one * other
-    return (both[..., 0] + both[..., 1] + both[..., 2]).abs()
 
 
 def _light_of_edges(stage: Stage, sight: Sight, mixed: Int[Tensor, " n"]) -> Float[Tensor, "n 3"]:

@@ -31,7 +31,7 @@ from depthpose.depth.synthetic.models import (
     traffic_light,
     tree,
 )
-from depthpose.depth.synthetic.textures import Color, Number, Surface
+from depthpose.depth.synthetic.textures import Number, Surface
 
 Place = Literal["city", "suburb", "avenue", "rural", "forest"]
 PLACES: dict[Place, float] = {
@@ -206,7 +206,9 @@ def bend(mesh: Mesh, road: Road) -> Mesh:
 
 def add_ground(builder: MeshBuilder, rng: np.random.Generator, road: Road) -> None:
     """Add the carriageway, pavements, verges and the land beside."""
-    asphalt = _asphalt(rng)
+    light = rng.uniform(0.7, 1.45)
+    color = (0.105 * light, 0.105 * light, 0.107 * light)
+    asphalt = Surface("road", color, 3.0, int(rng.integers(4)))
     variants = [int(v) for v in rng.integers(0, 6, 4)]
     grey, green = rng.uniform(0.6, 1.2), rng.uniform(0.75, 1.4)
     warm = 1 + 0.2 * rng.normal()
@@ -225,12 +227,6 @@ def add_ground(builder: MeshBuilder, rng: np.random.Generator, road: Road) -> No
                 _strip(builder, (road.edge_m(side), far), (0.0, 0.0), asphalt, stations)
             else:
                 _side_strips(builder, rng, road, side, walk, grass, land, stations)
-
-
-def _asphalt(rng: np.random.Generator) -> Surface:
-    light = rng.uniform(0.7, 1.45)
-    color: Color = (0.105 * light, 0.105 * light, 0.107 * light)
-    return Surface("road", color, 3.0, int(rng.integers(4)))
 
 
 def _side_strips(

@@ -70,7 +70,11 @@ class TrainingPairs:
     ) -> None:
         self.config, self.seed = config, seed
         self._places = _find_places(config, needs_truth=needs_truth, is_mixed=is_mixed)
-        said = (f"{_name(place.source)}: {place.truth}" for place in self._places if place.truth)
+        said = []
+        for source, _, truth in self._places:
+            if truth:
+                name = source.name if isinstance(source, Dataset) else _STREETS
+                said.append(f"{name}: {truth}")
         self.truths = tuple(dict.fromkeys(said))
         if baseline_m is not None:
             self._check_baselines(baseline_m)
@@ -258,10 +262,6 @@ def _choose_truth(
 
 _STREETS = "synthetic streets"
 """As ``run.json`` names them: a resumed training compares the names."""
-
-
-def _name(source: Dataset | Streets) -> str:
-    return source.name if isinstance(source, Dataset) else _STREETS
 
 
 def _spread(items: Sequence[_Place], count: int | None) -> list[_Place]:
