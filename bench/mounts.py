@@ -22,7 +22,7 @@ from depthpose.core.errors import InputError
 from depthpose.depth.config import MatcherConfig
 from depthpose.depth.estimator import FakestereoNet
 from depthpose.depth.ground import scale_by_mount
-from depthpose.depth.synthetic.dataset import draw_light, draw_sensors, expose, look
+from depthpose.depth.synthetic.dataset import draw_light, draw_sensors, expose, view_from
 from depthpose.depth.synthetic.scene import make_scene
 from depthpose.depth.synthetic.shading import prepare
 from depthpose.depth.types import StereoInput
@@ -57,7 +57,7 @@ def draw(street: int, height_m: float, tilt_deg: int, fov_deg: int) -> dict[str,
     mesh = turned.part(corners[:, :, 2].max(1) > -BEHIND_M)
     seen = dataclasses.replace(scene, mesh=mesh, camera_from_world=R)
     stage = prepare(seen, WIDTH * HEIGHT)
-    sight = look(stage, camera(fov_deg).K, (HEIGHT, WIDTH), torch.zeros(3))
+    sight = view_from(stage, camera(fov_deg).K, (HEIGHT, WIDTH), torch.zeros(3))
     light = draw_light(stage, sight, with_antialiasing=True)
     seed = [street, int(height_m * 100), 9 - tilt_deg, fov_deg]
     sensor, _ = draw_sensors(np.random.default_rng(seed), light, 0.3)

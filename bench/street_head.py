@@ -30,7 +30,7 @@ from depthpose.core.checkpoint import find_weights
 from depthpose.depth.disparity import resize_image
 from depthpose.depth.synthesis import SelectionGenerator
 from depthpose.depth.synthesis.synthesiser import pad_to_multiple
-from depthpose.depth.synthetic.dataset import draw_light, draw_sensors, expose, look
+from depthpose.depth.synthetic.dataset import draw_light, draw_sensors, expose, view_from
 from depthpose.depth.synthetic.scene import make_scene
 from depthpose.depth.synthetic.shading import prepare
 from depthpose.depth.synthetic.textures import NUMBER
@@ -79,7 +79,7 @@ def view(seed: int, index: int) -> StereoInput | None:
     ).part(corners[:, :, 2].max(1) > -12)
     stage = prepare(dataclasses.replace(scene, mesh=mesh, camera_from_world=R), ROWS * COLUMNS)
     K = torch.tensor([[f, 0, cx], [0, f, cy], [0, 0, 1]], dtype=torch.float64)
-    sight = look(stage, K, (ROWS, COLUMNS), torch.zeros(3))
+    sight = view_from(stage, K, (ROWS, COLUMNS), torch.zeros(3))
     if float((sight.raster.depth_m < 2).float().mean()) > 0.15:
         return None
     light = draw_light(stage, sight, with_antialiasing=True)

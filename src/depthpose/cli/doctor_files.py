@@ -48,7 +48,7 @@ _MOST = 0.5
 
 
 @dataclass(kw_only=True)
-class Seen:
+class FileFacts:
     """A file, what it is, what is odd, and what the others are compared with."""
 
     path: Path
@@ -67,13 +67,13 @@ def look_at_all(files: Sequence[Path]) -> int:
     """Print what each file is and what is odd; give the exit code."""
     # What has a size comes first: a camera file may need it.
     ordered = sorted(files, key=_is_camera_like)
-    seen: list[Seen] = []
+    seen: list[FileFacts] = []
     for path in ordered:
         size = next((other.size for other in seen if other.size is not None), None)
         try:
             seen.append(_read(path, size))
         except InputError as error:
-            seen.append(Seen(path=path, odd=[str(error).removeprefix(f"{path}: ")]))
+            seen.append(FileFacts(path=path, odd=[str(error).removeprefix(f"{path}: ")]))
     for one in seen:
         one.odd += _beside(one, seen)
     for path in files:
@@ -92,7 +92,7 @@ def _is_camera_like(path: Path) -> bool:
     return path.is_dir() or path.suffix.lower() in CAMERA_SUFFIXES
 
 
-def _read(path: Path, size: Size | None) -> Seen:
+def _read(path: Path, size: Size | None) -> FileFacts:
     suffix = path.suffix.lower()
     if _is_camera_like(path):
         return _read_words(path, size)
@@ -107,7 +107,7 @@ def _read(path: Path, size: Size | None) -> Seen:
     return _of_picture(path)
 
 
-def _read_words(path: Path, size: Size | None) -> Seen:
+def _read_words(path: Path, size: Size | None) -> FileFacts:
     """A camera; or a mask in run lengths, or points in text."""
     if path.suffix.lower() == ".json":
         content = read_json(path)
@@ -122,7 +122,7 @@ def _read_words(path: Path, size: Size | None) -> Seen:
     return _of_points(path, read_cloud(path).points.double())
 
 
-def _of_camera(path: Path, camera: Camera) -> Seen:
+def _of_camera(path: Path, camera: Camera) -> FileFacts:
     fx, fy = float(camera.K[0, 0]), float(camera.K[1, 1])
     wide = math.degrees(2 * math.atan(camera.width / (2 * fx)))
     what = f"camera of {camera.width}x{camera.height}, fx {fx:.1f} px, {wide:.0f} degrees wide"
@@ -136,10 +136,10 @@ def _of_camera(path: Path, camera: Camera) -> Seen:
             f"fx {fx:.1f} and fy {fy:.1f} differ by {abs(fx / fy - 1):.0%}, as of an image "
             "that was squeezed in one direction; was K scaled as the image was?"
         )
-    return Seen(path=path, what=what, odd=odd, camera=camera)
+    return FileFacts(path=path, what=what, odd=odd, camera=camera)
 
 
-def _of_picture(path: Path) -> Seen:
+def _of_picture(path: Path) -> FileFacts:
     what, units = "", None
     with opened_image(path) as image:
         if image.mode == "I;16":
@@ -157,10 +157,10 @@ def _of_picture(path: Path) -> Seen:
     low, high = picture.aminmax()
     if all(bool(((row == low) | (row == high)).all()) for row in picture):
         return _of_mask(path, picture[0] > 0)
-    return Seen(path=path, what=what, size=size, image=picture)
+    return FileFacts(path=path, what=what, size=size, image=picture)
 
 
-def _of_mask(path: Path, mask: Tensor) -> Seen:
+def _of_mask(path: Path, mask: Tensor) -> FileFacts:
     height, width = mask.shape
     share = float(mask.float().mean())
     edge = torch.cat([mask[0], mask[-1], mask[:, 0], mask[:, -1]]).float().mean()
@@ -168,14 +168,14 @@ def _of_mask(path: Path, mask: Tensor) -> Seen:
     if share > _MOST and float(edge) > _MOST:
         odd.append(f"it covers {share:.0%} of the image and its border: is it inverted?")
     what = f"mask of {width}x{height}, {share:.1%} of the image"
-    return Seen(path=path, what=what, odd=odd, size=(width, height), mask=mask)
+    return FileFacts(path=path, what=what, odd=odd, size=(width, height), mask=mask)
 
 
-def _of_depth(path: Path, units: Tensor) -> Seen:
+def _of_depth(path: Path, units: Tensor) -> FileFacts:
     """16-bit depth: its unit stands nowhere in the file."""
     height, width = units.shape
     known = units[units.isfinite()]
-    seen = Seen(path=path, size=(width, height), depth_units=units)
+    seen = FileFacts(path=path, size=(width, height), depth_units=units)
     if len(known) == 0:
         seen.what, seen.odd = f"16-bit depth of {width}x{height}", ["every pixel is 0: no reading"]
         return seen
@@ -192,7 +192,7 @@ def _of_depth(path: Path, units: Tensor) -> Seen:
     return seen
 
 
-def _of_map(path: Path) -> Seen:
+def _of_map(path: Path) -> FileFacts:
     if path.suffix.lower() == ".npy":
         stored = read_numbers(path)
         if stored.dtype.kind != "f" and stored.ndim == 2:
@@ -210,7 +210,7 @@ def _of_map(path: Path) -> Seen:
         values = read_map(path)
     known = values[values.isfinite()]
     height, width = values.shape
-    seen = Seen(path=path, what=f"map of {width}x{height}", size=(width, height))
+    seen = FileFacts(path=path, what=f"map of {width}x{height}", size=(width, height))
     if len(known) == 0:
         seen.odd.append("no value is known")
         return seen
@@ -225,27 +225,27 @@ def _of_map(path: Path) -> Seen:
     return seen
 
 
-def _of_points(path: Path, points: Tensor) -> Seen:
+def _of_points(path: Path, points: Tensor) -> FileFacts:
     away = float(points.median(0).values.norm())
     unit = "metres" if away < _ONLY_M else "millimetres" if away > _ONLY_MM else "metres or mm"
     what = f"{len(points)} points, {away:.4g} from the origin: {unit}"
     odd = [said] if (said := frame_advice(points)) is not None else []
     if away < float((points - points.median(0).values).norm(dim=-1).median()):
         odd = ["it lies about the origin: centred, or in a model's frame, not in the camera's"]
-    return Seen(path=path, what=what, odd=odd, cloud=points)
+    return FileFacts(path=path, what=what, odd=odd, cloud=points)
 
 
-def _of_model(path: Path, points: Tensor, faces: int) -> Seen:
+def _of_model(path: Path, points: Tensor, faces: int) -> FileFacts:
     diameter = exact_diameter(points)
     if diameter > _ONLY_MM:
         unit = "millimetres (--unit mm)"
     else:
         unit = "metres (--unit m)" if diameter < _ONLY_M else "metres or millimetres; measure it"
     what = f"mesh of {len(points)} points and {faces} faces, {diameter:.4g} across: {unit}"
-    return Seen(path=path, what=what, model=points)
+    return FileFacts(path=path, what=what, model=points)
 
 
-def _beside(one: Seen, seen: Sequence[Seen]) -> Iterator[str]:
+def _beside(one: FileFacts, seen: Sequence[FileFacts]) -> Iterator[str]:
     """Say what is odd about a file beside the others."""
     for other in seen:
         if other.camera is not None:
@@ -260,7 +260,7 @@ def _beside(one: Seen, seen: Sequence[Seen]) -> Iterator[str]:
                 yield f"beside {other.path.name}: {advice}"
 
 
-def _beside_camera(one: Seen, camera: Camera) -> Iterator[str]:
+def _beside_camera(one: FileFacts, camera: Camera) -> Iterator[str]:
     if one.size is not None:
         try:
             check_image_matches_camera(camera, *one.size, "it")
@@ -276,7 +276,7 @@ def _beside_camera(one: Seen, camera: Camera) -> Iterator[str]:
         )
 
 
-def _look_at_pair(seen: Sequence[Seen]) -> tuple[str, bool] | None:
+def _look_at_pair(seen: Sequence[FileFacts]) -> tuple[str, bool] | None:
     """Compare two pictures of one size: a pair, the left one first."""
     pictures = [one for one in seen if one.image is not None]
     if len(pictures) != 2 or pictures[0].size != pictures[1].size:

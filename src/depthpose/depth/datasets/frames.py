@@ -378,7 +378,7 @@ def lidar_truth(frame: Frame, depth: LidarDepth) -> Float[Tensor, "h w"]:
     """Draw the LiDAR scan of a frame into its left image; NaN where no point falls.
 
     Where there is no scan but a drawn one (``lidar_depth/`` of a plain folder, ``velodyne_raw`` of
-    KITTI's depth-prediction set; camera z), it serves ``camera_z`` as it is.
+    KITTI's depth-prediction set; camera z), it is taken for ``camera_z`` as it is.
 
     Raises:
         InputError: no scan (see :func:`has_lidar`), or one without calibration.

@@ -241,7 +241,7 @@ def prepare(dataset: Dataset, index: int, predictions: Path, rule: Protocol) -> 
                 f"predict depth ({frame.name}.depth_m.npy), or give the frame its baseline"
             )
         K = torch.tensor([[width, 0, 0], [0, width, 0], [0, 0, 1]], dtype=torch.float64)
-        camera = StereoRig(width=width, height=height, K=K, baseline_m=1.0)  # any serves for depth
+        camera = StereoRig(width=width, height=height, K=K, baseline_m=1.0)  # depth takes any
     is_stereo = rule.truth == "disparity"
     found_px = read_disparity(predictions, frame.name, camera, with_disparity_png=is_stereo)
     predicted_px = resize_disparity(found_px, height, width)

@@ -10,6 +10,7 @@ from functools import cache
 from typing import Any, TypeVar, cast
 
 import torch
+import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor, nn
 
@@ -172,15 +173,16 @@ class VolumeConv(nn.Module):
     def forward(self, volume: Volume) -> Volume:
         """Convolve a volume, in the type of the weights."""
         volume = volume.to(self.weight.dtype)
+        is_usable = volume.device.type == "cpu" and volume.dtype in (torch.float32, torch.bfloat16)
+        # oneDNN is called by name: PyTorch's own choice takes a slow path for few rows.
+        by_name = is_usable and has_onednn_operators()
         if self.is_transposed:
-            transposed = _onednn_transposed if _has_onednn(volume) else _transposed
-            return transposed(volume, self.weight, self.bias)
-        convolved = _onednn_convolved if _has_onednn(volume) else _convolved
-        return convolved(volume, self.weight, self.bias, self.stride)
-
-
-def _convolved(volume: Tensor, weight: Tensor, bias: Tensor, stride: int) -> Tensor:
-    return nn.functional.conv3d(volume, weight, bias, stride, 1)
+            if by_name:
+                return _onednn_transposed(volume, self.weight, self.bias)
+            return F.conv_transpose3d(volume, self.weight, self.bias, 2, 1, 1)
+        if by_name:
+            return _onednn_convolved(volume, self.weight, self.bias, self.stride)
+        return F.conv3d(volume, self.weight, self.bias, self.stride, 1)
 
 
 def _onednn_convolved(volume: Tensor, weight: Tensor, bias: Tensor, stride: int) -> Tensor:
@@ -188,20 +190,10 @@ def _onednn_convolved(volume: Tensor, weight: Tensor, bias: Tensor, stride: int)
     return torch.mkldnn_convolution(volume, weight, bias, (1, 1, 1), strides, (1, 1, 1), 1)
 
 
-def _transposed(volume: Tensor, weight: Tensor, bias: Tensor) -> Tensor:
-    return nn.functional.conv_transpose3d(volume, weight, bias, 2, 1, 1)
-
-
 def _onednn_transposed(volume: Tensor, weight: Tensor, bias: Tensor) -> Tensor:
     sizes = ((1, 1, 1), (1, 1, 1), (2, 2, 2), (1, 1, 1), 1)
     args = (volume, weight, bias, *sizes, "none", [], "")
     return torch.ops.mkldnn._convolution_transpose_pointwise(*args)
-
-
-def _has_onednn(x: Tensor) -> bool:
-    """Whether to call oneDNN by name: PyTorch's own choice takes a slow path for few rows."""
-    is_usable = x.device.type == "cpu" and x.dtype in (torch.float32, torch.bfloat16)
-    return is_usable and has_onednn_operators()
 
 
 @cache
@@ -221,7 +213,10 @@ def has_onednn_operators() -> bool:
             )
     except (AttributeError, RuntimeError, TypeError):
         return False
-    wanted = (_convolved(volume, weight, bias, 1), _transposed(volume, weight, bias))
+    wanted = (
+        F.conv3d(volume, weight, bias, 1, 1),
+        F.conv_transpose3d(volume, weight, bias, 2, 1, 1),
+    )
     both = zip(found, wanted, strict=True)
     return all(one.shape == other.shape and torch.allclose(one, other) for one, other in both)
 

@@ -5,6 +5,7 @@ picture, and a LiDAR of 64 beams as KITTI's; then frames and the dataset of them
 """
 
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -25,8 +26,13 @@ from depthpose.depth.types import StereoInput, StereoSample, StereoTruth
 
 NEAR_M = 0.3
 
-Seen = tuple[Int[Tensor, " n"], Float[Tensor, "n 3"], Float[Tensor, " n"]]
-"""Triangles (-1 where none is met), barycentric shares and depths [m]."""
+
+class Nearest(NamedTuple):
+    """The nearest triangles on some rays: -1 where there is none, barycentric shares, depth."""
+
+    primitive: Int[Tensor, " n"]
+    shares: Float[Tensor, "n 3"]
+    depth_m: Float[Tensor, " n"]
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -54,7 +60,7 @@ class Sight:
         return torch.stack([a * u + b * v + c, d * v + e, torch.ones_like(u)], 1).float()
 
 
-def look(
+def view_from(
     stage: Stage, K: Float64[Tensor, "3 3"], size: tuple[int, int], eye: Float[Tensor, "3"]
 ) -> Sight:
     """Find what each pixel sees from ``eye`` [m]; ``size`` is height and width [px]."""
@@ -68,7 +74,7 @@ def look(
 
 def nearest_at(
     sight: Sight, candidates: Int[Tensor, "n m"], places: list[Float64[Tensor, "n 2"]]
-) -> list[Seen]:
+) -> list[Nearest]:
     """Look between the pixel centres, at triangles that were seen near by.
 
     Args:
@@ -98,7 +104,7 @@ def nearest_at(
         primitive = torch.where(inverse > 0, candidates[row, first], -1)
         chosen = torch.stack([weight[row, first] for weight in weights], 1)
         shares = (chosen / inverse[:, None]).float()
-        found.append((primitive, shares, (1 / inverse).float()))
+        found.append(Nearest(primitive, shares, (1 / inverse).float()))
     return found
 
 
@@ -136,14 +142,14 @@ def _centres(index: Int[Tensor, " n"], width: int) -> Float64[Tensor, "n 2"]:
     return torch.stack([index % width, index // width], 1).double()
 
 
-def _seen_at(sight: Sight, index: Int[Tensor, " n"]) -> Seen:
+def _seen_at(sight: Sight, index: Int[Tensor, " n"]) -> Nearest:
     raster = sight.raster
     assert raster.barycentric is not None
     shares, primitive, depth_m = (
         values.flatten(0, 1).index_select(0, index)
         for values in (raster.barycentric, raster.primitive, raster.depth_m)
     )
-    return primitive, shares, depth_m
+    return Nearest(primitive, shares, depth_m)
 
 
 def _edge_pixels(stage: Stage, raster: Raster) -> Bool[Tensor, "h w"]:
@@ -174,21 +180,21 @@ def _light_of_edges(stage: Stage, sight: Sight, mixed: Int[Tensor, " n"]) -> Flo
     found = []
     for seen in nearest_at(sight, candidates, places):
         # A gap between all that was seen near by: take what the pixel's centre sees.
-        is_lost = (seen[0] < 0) & (candidates >= 0).all(1)
+        is_lost = (seen.primitive < 0) & (candidates >= 0).all(1)
         found.append([
             torch.where(is_lost if one.ndim == 1 else is_lost[:, None], instead, one)
             for one, instead in zip(seen, own, strict=True)
         ])  # fmt: skip
     primitive, shares, depth = (torch.cat(parts) for parts in zip(*found, strict=True))
-    light = _light(stage, sight, torch.cat(places), (primitive, shares, depth))
+    light = _light(stage, sight, torch.cat(places), Nearest(primitive, shares, depth))
     # A glint in a quarter of a pixel would outshine the rest, as it does not in a sensor.
     return light.clamp(max=4).reshape(len(_OFFSETS), -1, 3).mean(0)
 
 
 def _light(
-    stage: Stage, sight: Sight, pixels: Float64[Tensor, "n 2"], seen: Seen
+    stage: Stage, sight: Sight, pixels: Float64[Tensor, "n 2"], nearest: Nearest
 ) -> Float[Tensor, "n 3"]:
-    primitive, shares, depth = seen
+    primitive, shares, depth = nearest
     rays = sight.rays(pixels)
     length = rays.norm(dim=1)
     towards = rays / length[:, None]
@@ -335,7 +341,7 @@ def scan(stage: Stage, rng: np.random.Generator) -> Float[Tensor, "n 4"]:
     K = torch.tensor(
         [[_FOCAL_PX, 0, width / 2], [0, _FOCAL_PX, 40], [0, 0, 1]], dtype=torch.float64
     )
-    sight = look(stage, K, _SIZE_PX, torch.tensor(_ORIGIN_M))
+    sight = view_from(stage, K, _SIZE_PX, torch.tensor(_ORIGIN_M))
     pixels = (towards @ K.T)[:, :2] / towards[:, 2:]
     column = pixels[:, 0].round().long().clamp(0, width - 1)
     row = pixels[:, 1].round().long().clamp(0, height - 1)
@@ -430,12 +436,12 @@ def draw_scene(
     """
     rng = np.random.default_rng([73, *seed])
     stage = prepare(scene, rig.width * rig.height)
-    left = look(stage, rig.K, (rig.height, rig.width), torch.zeros(3))
+    left = view_from(stage, rig.K, (rig.height, rig.width), torch.zeros(3))
     # The right camera, whose rows are off by a fraction of a pixel as real ones are.
     K = rig.K.clone()
     K[0, 2] += rig.cx_right_minus_left_px
     K[1, 2] += rng.normal(0, 1) * config.rectification_error_px
-    right = look(stage, K, (rig.height, rig.width), torch.tensor([rig.baseline_m, 0.0, 0.0]))
+    right = view_from(stage, K, (rig.height, rig.width), torch.tensor([rig.baseline_m, 0.0, 0.0]))
     light, other_light = (
         draw_light(stage, sight, with_antialiasing=config.with_antialiasing)
         for sight in (left, right)

@@ -288,8 +288,9 @@ def _surfaces(stage: Stage, hits: Hits, focal_px: float) -> _Surfaces:
     albedo *= _stain(stage, hits.points)[:, None]
     is_road = (material == NUMBER["road"]).nonzero()[:, 0]
     if len(is_road):
-        foot = (footprint_m[is_road], facing[is_road].abs())
-        albedo[is_road] = paint_road(stage.scene, albedo[is_road], uv[is_road] * 3.0, foot)
+        place_m, width_m = uv[is_road] * 3.0, footprint_m[is_road]
+        length_m = width_m / facing[is_road].abs().clamp(min=0.02)
+        albedo[is_road] = paint_road(stage.scene, albedo[is_road], place_m, width_m, length_m)
     return _Surfaces(material=material, albedo=albedo, normal=normal, plane=plane)
 
 
@@ -398,15 +399,16 @@ def paint_road(
     scene: StreetScene,
     albedo: Float[Tensor, "n 3"],
     place_m: Float[Tensor, "n 2"],
-    foot: tuple[Float[Tensor, " n"], Float[Tensor, " n"]],
+    width_m: Float[Tensor, " n"],
+    length_m: Float[Tensor, " n"],
 ) -> Float[Tensor, "n 3"]:
-    """Give the colour of the asphalt with what is painted on it.
+    """Give the colour of the asphalt with what is painted on it, at places (x, s) of the road.
 
-    Lines are narrower than a pixel far away, so they cover it by the share of its footprint.
+    Lines are narrower than a pixel far away, so they cover it by the share of its footprint, which
+    has this width and length.
     """
     x, s = place_m.unbind(1)
-    width_m, length_m = foot[0], foot[0] / foot[1].clamp(min=0.02)
-    cover = _cover(scene.markings, x, s, (width_m, length_m))
+    cover = _cover(scene.markings, x, s, width_m, length_m)
     wear = torch.sigmoid(3 * (_looked_up(textures().stains, x * 0.13, s * 0.13) + 1.4))
     paint = (cover * scene.markings.brightness * (0.3 + 0.7 * wear))[:, None]
     worn = albedo * _wear(scene, x, s)[:, None]
@@ -414,10 +416,9 @@ def paint_road(
 
 
 def _cover(
-    markings: Markings, x: Tensor, s: Tensor, foot: tuple[Tensor, Tensor]
+    markings: Markings, x: Tensor, s: Tensor, width_m: Tensor, length_m: Tensor
 ) -> Float[Tensor, " n"]:
     """How much of each pixel is painted."""
-    width_m, length_m = foot
     cover = torch.zeros_like(x)
     for at, half, period, dash in markings.lines.tolist():
         line = _inside(x - at, half, width_m)

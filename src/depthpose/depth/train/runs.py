@@ -130,7 +130,7 @@ def train_view(config: ViewTraining, run: Run) -> Path:
     if config.start is not None:
         start_from(generator, read_generator(find_weights(config.start)), config.start)
     facts, seconds = _run_stage(ViewTask(generator, config, held_out), pairs, config, run)
-    return _leave(run, "view", facts, seconds, generator=generator)
+    return _write_weights(run, "view", facts, seconds, generator=generator)
 
 
 @releases_folder
@@ -159,7 +159,7 @@ def train_select(config: SelectTraining, run: Run) -> Path:
         start_from(generator, read_generator(find_weights(config.start)), config.start)
     held_out = _held_out(config.held_out, needs_truth=True)
     facts, seconds = _run_stage(SelectTask(generator, config, held_out), samples, config, run)
-    return _leave(run, "select", facts, seconds, generator=generator)
+    return _write_weights(run, "select", facts, seconds, generator=generator)
 
 
 @releases_folder
@@ -171,7 +171,7 @@ def train_stereo(config: StereoTraining, run: Run) -> Path:
     held_out = _held_out(config.held_out, needs_truth=True)
     matcher = make_matcher_network(config)
     facts, seconds = _run_stage(StereoTask(matcher, config, held_out), pairs, config, run)
-    return _leave(run, "stereo", facts, seconds, matcher=matcher)
+    return _write_weights(run, "stereo", facts, seconds, matcher=matcher)
 
 
 @releases_folder
@@ -228,7 +228,7 @@ def train_finetune(config: FinetuneTraining, run: Run) -> Path:
     held_out = _held_out(config.held_out, needs_truth=True)
     task = FinetuneTask(generator, matcher, config, held_out)
     facts, seconds = _run_stage(task, pairs, config, run)
-    return _leave(run, "finetune", facts, seconds, generator=generator, matcher=matcher)
+    return _write_weights(run, "finetune", facts, seconds, generator=generator, matcher=matcher)
 
 
 STAGES = {
@@ -294,7 +294,7 @@ def _facts(
     return bound_facts(facts, began_with)
 
 
-def _leave(
+def _write_weights(
     run: Run,
     stage: str,
     facts: Mapping[str, str],
