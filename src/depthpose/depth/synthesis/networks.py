@@ -281,6 +281,15 @@ class Selected:
         return self.sky > 0.5
 
 
+def select(logits: Logits, planes: Planes, size: tuple[int, int]) -> Selected:
+    """Read disparity, sky and confidence off logits, and bring them to ``size``."""
+    log_px, sky, sure = (
+        F.interpolate(part[:, None], size, mode="bilinear")[:, 0]
+        for part in read_logits(logits, planes)
+    )
+    return Selected(log_px.exp(), sky, sure)
+
+
 def average(views: Sequence[Selected], limits_px: Sequence[float]) -> Selected:
     """Give the mean of what was found in one view at several sizes, as sure as the first.
 

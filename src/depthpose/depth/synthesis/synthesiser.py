@@ -17,7 +17,7 @@ from depthpose.depth.synthesis.networks import (
     SelectionGenerator,
     UNetGenerator,
     average,
-    read_logits,
+    select,
     shift_left,
 )
 
@@ -188,12 +188,8 @@ def select_views(
     features = generator.encoder(padded)
     kept = (logits[..., : rows // 2, : columns // 2] for logits in generator.decode(features))
     planes = generator.planes * (size[1] / columns)
-    views = []
-    for logits in kept:
-        maps = (part[:, None] for part in read_logits(logits, planes))
-        log_px, sky, sure = (F.interpolate(part, size, mode="bilinear")[:, 0] for part in maps)
-        views.append(Selected(log_px.exp(), sky, sure))
-    return replace(views[0], street=generator.find_street(features[-1])), views[1]
+    first, second = (select(logits, planes, size) for logits in kept)
+    return replace(first, street=generator.find_street(features[-1])), second
 
 
 def draw_right(generator: Generator, left: Float[Tensor, "b 3 h w"]) -> Float[Tensor, "b 3 h w"]:
