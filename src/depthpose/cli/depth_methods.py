@@ -3,7 +3,6 @@
 import hashlib
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import Any, NamedTuple, cast, get_args
 
 from tqdm import tqdm
@@ -83,19 +82,27 @@ class MethodSource:
         }
         if not is_matcher:
             facts["input"] = "both views" if with_right else "left view"
-        if self.matcher is not None:
-            name, net, own = self._matched_by_other(path, config, facts)
-        else:
-            net = FakestereoNet.load(
-                path,
-                config=config,
-                answer=self.answer,
-                allow_ood=self.allow_ood,
-                use=self.use,
-            )
-            name, own = path.stem, config_to_dict(config)
-            name += "-both" if with_right and not is_matcher else ""
-            name += "" if self.answer is None else f"-{self.answer}"
+        own, matcher, answer = config_to_dict(config), None, self.answer
+        if self.matcher is None:
+            name = path.stem + ("-both" if with_right and not is_matcher else "")
+            name += "" if answer is None else f"-{answer}"
+        else:  # OpenCV, or other weights, match the view of the generator
+            other, answer = self.matcher, "matched"
+            if self.matcher == "sgbm":
+                sgbm = SGBMConfig(with_filled_holes=True)
+                matcher, own = SGBMMatcher(sgbm), {**own, **config_to_dict(sgbm)}
+            else:
+                matcher = find_weights(self.matcher)
+                other, facts["matcher_sha256"] = matcher.stem, file_sha256(matcher)
+            name, facts["matcher"] = f"{path.stem}-{other}", f"{kind} with {other}"
+        net = FakestereoNet.load(
+            path,
+            matcher=matcher,
+            config=config,
+            answer=answer,
+            allow_ood=self.allow_ood,
+            use=self.use,
+        )
         if with_right and net.matcher is None:
             raise InputError(
                 f"{path}: answers depth of one image, and holds no matcher, which a pair needs. "
@@ -105,25 +112,6 @@ class MethodSource:
             facts["answer"] = net.synthesiser.config.answer
             facts["scales"] = list(net.synthesiser.scales)
         return Method(name, net, {**facts, **own}, with_right)
-
-    def _matched_by_other(
-        self, path: Path, config: MatcherConfig, facts: dict[str, Any]
-    ) -> tuple[str, FakestereoNet, dict[str, Any]]:
-        """Let OpenCV, or other weights, match the view of a generator; facts take their names."""
-        settings = config_to_dict(config)
-        if self.matcher == "sgbm":
-            name, sgbm = "sgbm", SGBMConfig(with_filled_holes=True)
-            matcher, settings = SGBMMatcher(sgbm), {**settings, **config_to_dict(sgbm)}
-        else:
-            assert self.matcher is not None
-            matcher = find_weights(self.matcher)
-            name = matcher.stem
-            facts["matcher_sha256"] = file_sha256(matcher)
-        facts["matcher"] += f" with {name}"
-        net = FakestereoNet.load(
-            path, matcher=matcher, config=config, answer="matched", allow_ood=self.allow_ood
-        )
-        return f"{path.stem}-{name}", net, settings
 
     def packed(self) -> "MethodSource":
         """Give the same with the weights in memory."""
