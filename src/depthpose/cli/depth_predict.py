@@ -73,18 +73,6 @@ class Lens:
         mount = {"mount_height_m": self.scale.camera_height, "tilt_deg": self.scale.camera_tilt}
         return replace(camera, **{key: value for key, value in mount.items() if value is not None})
 
-    def facts(self) -> dict[str, Any]:
-        """Give what is known as JSON values: it decides the results."""
-        known: dict[str, Any] = {"focal_px": self.camera}
-        if isinstance(self.camera, FieldOfView):
-            known = {"fov_deg": self.camera.degrees}
-        elif isinstance(self.camera, Camera):
-            keys = camera_keys(self.camera)
-            known = {key: keys[key] for key in ("K", "mount_height_m", "tilt_deg") if key in keys}
-        return known | {
-            key: value for key, value in asdict(self.scale).items() if value is not None
-        }
-
 
 def read_lens(options: LensOptions, sources: Sequence[Path], scale: ScaleOptions) -> Lens:
     """Read what the user knows of the camera; where its file says no size, that of the images.
@@ -361,5 +349,12 @@ def _count(number: int, what: str) -> str:
 
 
 def settings_of(method: dict[str, Any], lens: Lens, output: PredictOutput) -> dict[str, Any]:
-    """Give what decides the results, for the record of a run."""
-    return {**method, "camera": lens.facts(), "color_range_m": list(output.color_range)}
+    """Give what decides the results, as JSON values, for the record of a run."""
+    known: dict[str, Any] = {"focal_px": lens.camera}
+    if isinstance(lens.camera, FieldOfView):
+        known = {"fov_deg": lens.camera.degrees}
+    elif isinstance(lens.camera, Camera):
+        keys = camera_keys(lens.camera)
+        known = {key: keys[key] for key in ("K", "mount_height_m", "tilt_deg") if key in keys}
+    known |= {key: value for key, value in asdict(lens.scale).items() if value is not None}
+    return {**method, "camera": known, "color_range_m": list(output.color_range)}

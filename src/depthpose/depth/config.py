@@ -502,9 +502,7 @@ class SelectionConfig:
     """Least and largest disparity at the virtual rig [px]: 165 to 2.25 m at the default rig."""
 
     answer: Answer = "own"
-    """Where depth of one image comes from. own: the generator's disparity of the left view;
-    matched: the matcher, on the image and the right view that the generator drew; joined: the mean
-    of both, weighed by their confidence."""
+    """Where depth of one image comes from; see ``Answer``."""
 
     with_street: bool = False
     """Has a layer that reads off the encoder's features how surely the image shows a street."""

@@ -137,16 +137,11 @@ def focal_size(camera: Camera, focal_px: float) -> tuple[int, int]:
     columns = max(round(camera.width * focal_px / float(camera.K[0, 0])), 1)
     if rows * columns > max(MOST_ENLARGED_PIXELS, camera.height * camera.width):
         raise InputError(
-            f"a focal length of {smallest_focal_px(camera):g} px would enlarge the image of "
+            f"a focal length of {float(camera.K.diagonal()[:2].min()):g} px would enlarge the image of "
             f"{camera.width}x{camera.height} to {columns}x{rows}; is it in millimetres? Give it in "
             "pixels: millimetres / width of the sensor in millimetres x columns of the image"
         )
     return rows, columns
-
-
-def smallest_focal_px(camera: Camera) -> float:
-    """Give the smaller of the focal lengths along x and y [px]."""
-    return float(camera.K.diagonal()[:2].min())
 
 
 def resize_image(

@@ -32,7 +32,7 @@ from depthpose.core.checkpoint import find_weights, join_terms, warn_of_terms
 from depthpose.core.devices import each_in_threads, own_arithmetic
 from depthpose.core.errors import InputError, Notice, refuse_unknown, refused_memory
 from depthpose.depth.config import Answer, MatcherConfig, SGBMConfig
-from depthpose.depth.disparity import focal_size, resize_image, smallest_focal_px
+from depthpose.depth.disparity import focal_size, resize_image
 from depthpose.depth.estimator.inputs import (
     Picture,
     as_input,
@@ -345,7 +345,8 @@ class FakestereoNet:
             )
         height, width = image.left.shape[1:]
         check_image_matches_camera(image.camera, width, height, image.name)
-        rig_px, own_px = self.synthesiser.config.virtual_focal_px, smallest_focal_px(image.camera)
+        rig_px = self.synthesiser.config.virtual_focal_px
+        own_px = float(image.camera.K.diagonal()[:2].min())
         used = [s for s in self.synthesiser.scales if s == 1 or s * rig_px <= own_px]
         return [focal_size(image.camera, scale * rig_px) for scale in used]
 

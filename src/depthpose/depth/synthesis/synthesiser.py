@@ -111,7 +111,9 @@ class SelectionSynthesiser:
         Raises:
             InputError: an image is no such.
         """
-        sizes = [_checked(images, self.device) for images in (left, *larger)]
+        for image in (image for images in (left, *larger) for image in images):
+            check_image(image, "the left image")
+        sizes = [images.to(self.device, torch.float32) for images in (left, *larger)]
         size = (left.shape[-2], left.shape[-1])
         most_px = float(self.generator.planes[-1])
         limits_px = [most_px * size[1] / images.shape[-1] for images in sizes]
@@ -159,17 +161,13 @@ class UNetSynthesiser:
             InputError: an image is no such.
         """
         assert not larger, "it has one scale"
-        given = _checked(left, self.device)
+        for image in left:
+            check_image(image, "the left image")
+        images = left.to(self.device, torch.float32)
         # The statistics of test mode 'batch' are those of one image: a batch would change them.
-        groups = given.split(1) if self.config.test_mode == "batch" else [given]
+        groups = images.split(1) if self.config.test_mode == "batch" else [images]
         drawn = [draw_right(self.generator, part) for part in groups]
         return SynthesisedViews(right=torch.cat(drawn).to(left.device))
-
-
-def _checked(left: Float[Tensor, "b 3 h w"], device: torch.device) -> Float[Tensor, "b 3 h w"]:
-    for image in left:
-        check_image(image, "the left image")
-    return left.to(device, torch.float32)
 
 
 def select_views(
