@@ -136,8 +136,9 @@ def focal_size(camera: Camera, focal_px: float) -> tuple[int, int]:
     rows = max(round(camera.height * focal_px / float(camera.K[1, 1])), 1)
     columns = max(round(camera.width * focal_px / float(camera.K[0, 0])), 1)
     if rows * columns > max(MOST_ENLARGED_PIXELS, camera.height * camera.width):
+        smallest_px = float(camera.K.diagonal()[:2].min())
         raise InputError(
-            f"a focal length of {float(camera.K.diagonal()[:2].min()):g} px would enlarge the image of "
+            f"a focal length of {smallest_px:g} px would enlarge the image of "
             f"{camera.width}x{camera.height} to {columns}x{rows}; is it in millimetres? Give it in "
             "pixels: millimetres / width of the sensor in millimetres x columns of the image"
         )
