@@ -23,7 +23,7 @@ from depthpose.depth.stereo import (
     tile_change_px,
 )
 from depthpose.depth.stereo.kinds import psmnet_bytes
-from depthpose.depth.stereo.network_matcher import (
+from depthpose.depth.stereo.matcher import (
     Tiling,
     lower_where_disagreeing,
     match_tiles,

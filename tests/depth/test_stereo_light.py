@@ -35,8 +35,7 @@ from depthpose.depth.stereo.light import (
     mean_of_all,
     mean_of_best,
 )
-from depthpose.depth.stereo.matcher import CameraMatcher
-from depthpose.depth.stereo.network_matcher import pad_top_right
+from depthpose.depth.stereo.matcher import CameraMatcher, pad_top_right
 from depthpose.depth.train import StereoTask
 from depthpose.depth.train.config import StereoTraining
 from depthpose.depth.train.runs import make_matcher_network, train_stereo

@@ -16,7 +16,7 @@ from depthpose.depth.config import Answer, GeneratorConfig, SelectionConfig
 from depthpose.depth.estimator.rig import SKY_M
 from depthpose.depth.stereo import StereoNetwork
 from depthpose.depth.stereo.light import LEAST_PX, LightStereo
-from depthpose.depth.stereo.network_matcher import IMAGENET_MEAN, IMAGENET_STD, NetworkConfig
+from depthpose.depth.stereo.matcher import IMAGENET_MEAN, IMAGENET_STD, NetworkConfig
 from depthpose.depth.stereo.psmnet import WINDOW_PX, PSMNet, interpolation_matrix, linear_taps
 from depthpose.depth.synthesis import Generator, SelectionGenerator, UNetGenerator
 from depthpose.depth.synthesis.networks import read_logits

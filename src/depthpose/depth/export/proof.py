@@ -16,7 +16,7 @@ from depthpose.depth.config import MatcherConfig
 from depthpose.depth.estimator import FakestereoNet
 from depthpose.depth.export.graph import image_graph, pair_graph
 from depthpose.depth.stereo import LightStereo, StereoNetwork, make_matcher
-from depthpose.depth.stereo.network_matcher import NetworkConfig
+from depthpose.depth.stereo.matcher import NetworkConfig
 from depthpose.depth.synthesis import SelectionGenerator, make_synthesiser
 from depthpose.depth.types import DepthEstimate, StereoInput
 from depthpose.depth.weights import DepthWeights

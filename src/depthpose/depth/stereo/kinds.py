@@ -17,8 +17,7 @@ from torch import Tensor, nn
 from depthpose.core.errors import InputError
 from depthpose.depth.config import LightConfig, MatcherConfig, PSMNetConfig
 from depthpose.depth.stereo.light import LightStereo
-from depthpose.depth.stereo.matcher import Matcher
-from depthpose.depth.stereo.network_matcher import NetworkMatcher, StereoNetwork, Views
+from depthpose.depth.stereo.matcher import Matcher, NetworkMatcher, StereoNetwork, Views
 from depthpose.depth.stereo.psmnet import CHUNK_BYTES, ConvNorm, PSMNet, Size, expected_disparity
 from depthpose.depth.types import Match
 

@@ -23,7 +23,7 @@ from torch import Tensor, nn
 from depthpose.core.errors import InputError
 from depthpose.depth.config import LightConfig
 from depthpose.depth.encoder import LiteEncoder
-from depthpose.depth.stereo.network_matcher import IMAGENET_MEAN, IMAGENET_STD, Maps, StereoNetwork
+from depthpose.depth.stereo.matcher import IMAGENET_MEAN, IMAGENET_STD, Maps, StereoNetwork
 from depthpose.depth.stereo.psmnet import (
     Shape,
     by_rows,

@@ -1,16 +1,34 @@
-"""Protocols of stereo matchers; a function of the user's and OpenCV's StereoSGBM as matchers."""
+"""Matchers: a function of the user's, OpenCV's StereoSGBM, and a network with weights.
 
+What networks share: normalisation, padding, the working focal length, tiles, the left-right check.
+"""
+
+import math
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
-from typing import Any, Protocol, runtime_checkable
+from copy import copy
+from dataclasses import replace
+from typing import Any, ClassVar, NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
 import torch
-from torch import Tensor
+import torch.nn.functional as F
+from jaxtyping import Float
+from torch import Tensor, nn
 
 from depthpose.core.arrays import check_image
 from depthpose.core.camera import Camera
+from depthpose.core.devices import usable_device, usable_precision
 from depthpose.core.errors import InputError, import_opencv
-from depthpose.depth.config import SGBMConfig
+from depthpose.depth.config import LightConfig, MatcherConfig, PSMNetConfig, SGBMConfig
+from depthpose.depth.disparity import (
+    changed_match,
+    focal_size,
+    left_right_difference_px,
+    resize_image,
+    resized_match,
+)
+from depthpose.depth.encoder import LiteEncoder
 from depthpose.depth.types import Match
 
 
@@ -219,7 +237,7 @@ def fill_holes(disparity_px: Tensor) -> Tensor:
     before = column.where(valid, -1).cummax(1).values
     after = column.where(valid, values.shape[1]).flip(1).cummin(1).values.flip(1)
     # An absent neighbour is infinite, so the smaller of the two is the one that is there.
-    padded = torch.nn.functional.pad(values, (0, 1), value=torch.inf)
+    padded = F.pad(values, (0, 1), value=torch.inf)
     before = before.where(before >= 0, values.shape[1])
     filled = torch.minimum(padded.gather(1, before), padded.gather(1, after))
     rows = torch.arange(len(valid), device=valid.device)
@@ -231,3 +249,302 @@ def _opencv_image(image: Tensor) -> np.ndarray:
     """Convert to the 8-bit BGR that OpenCV reads from a file."""
     bytes_ = (image.detach().cpu().clamp(0, 1) * 255).round().to(torch.uint8)
     return np.ascontiguousarray(bytes_.flip(0).permute(1, 2, 0).numpy())
+
+
+IMAGENET_MEAN = (0.485, 0.456, 0.406)
+IMAGENET_STD = (0.229, 0.224, 0.225)
+DTYPES = {"fp32": torch.float32, "bf16": torch.bfloat16}
+
+Views = Float[Tensor, "b 3 h w"]
+Maps = Float[Tensor, "b h w"]
+
+NetworkConfig = PSMNetConfig | LightConfig
+
+AGREEMENT_PX = 3.0
+"""Difference of left and right disparity at which their agreement is down to 1/e."""
+
+
+class StereoNetwork(nn.Module):
+    """A stereo network: a normalised pair to disparity maps for the losses; the last is the output.
+
+    Attributes:
+        config: its sizes and conventions; it has ``max_disparity_px``.
+    """
+
+    config: Any
+
+    def forward_with_sky(self, left: Views, right: Views) -> tuple[tuple[Maps, ...], Maps | None]:
+        """Give the disparity maps [px], and P(sky) where the network has that class."""
+        return self(left, right), None
+
+    @property
+    def encoder(self) -> LiteEncoder | None:
+        """The part that may begin with weights of ImageNet, which trains more slowly."""
+        return None
+
+    @property
+    def sky(self) -> nn.Module | None:
+        """The class of the sky, which may be trained alone."""
+        return None
+
+
+class NetworkMatcher(ABC):
+    """A network with pre- and post-processing: normalisation, padding, device, tiles.
+
+    A kind of network adds :meth:`run`. Where the processor has no bf16, ``config`` says fp32 in its
+    place.
+
+    Raises:
+        InputError: the device does not exist on this machine.
+    """
+
+    fine_pixels: ClassVar[int]
+    """Pixels of a fine match at most."""
+    most_enlarged: ClassVar[float] = 1.0
+    """Times the size of the images at which a fine match may be."""
+    most_disparities: ClassVar[float] = 1.5
+    """Times the disparities of training that a fine match looks through at most."""
+
+    def __init__(self, network: NetworkConfig, config: MatcherConfig | None = None) -> None:
+        config = config or MatcherConfig()
+        self.device = usable_device(config.device)
+        self.config = with_usable_precision(config)
+        self.network_config = network
+
+    @abstractmethod
+    def run(self, left: Views, right: Views, network: Any) -> list[Match]:  # noqa: ANN401
+        """Match normalised pairs whose sides suit the network.
+
+        Args:
+            left: left views.
+            right: right views, the same size.
+            network: the network's config, perhaps with more disparities than it was trained with.
+
+        Raises:
+            InputError: a memory bound that is too small for them.
+        """
+
+    @property
+    def dtype(self) -> torch.dtype:
+        """What the network computes in."""
+        return DTYPES[self.config.precision]
+
+    @torch.no_grad()
+    def match(self, left: Tensor, right: Tensor) -> Match:
+        """Match one pair of any size.
+
+        Raises:
+            InputError: unusable images, or a memory bound that is too small for them.
+        """
+        return self.match_many([(left, right)])[0]
+
+    @torch.no_grad()
+    def match_many(
+        self, pairs: Sequence[tuple[Tensor, Tensor]], camera: Camera | None = None
+    ) -> list[Match]:
+        """Match pairs; those of one size together, unless memory is bounded or there are tiles.
+
+        Pairs of a known camera are matched at the size of :meth:`work_size`. A processor is busy
+        with one pair; it is a GPU that gains from several.
+
+        Raises:
+            InputError: as :meth:`match`.
+        """
+        for left, right in pairs:
+            check_pair(left, right)
+        trained = network = self.network_config
+        views = pairs
+        if camera is not None and trained.work_focal_px is not None:
+            size = self.work_size(camera)
+            # A larger size needs more disparities; the same filters look through them.
+            larger = min(self.work_focal_px(camera) / trained.work_focal_px, self.most_disparities)
+            steps = math.ceil(round(trained.max_disparity_px * larger, 3) / trained.step_px)
+            network = replace(trained, max_disparity_px=steps * trained.step_px)
+            views = [tuple(resize_image(view, *size) for view in pair) for pair in pairs]
+        is_bounded = self.config.tile_px is not None or self.config.max_memory_bytes is not None
+        together = not is_bounded and len({left.shape for left, _ in views}) == 1
+        matches: list[Match] = []
+        for group in [views] if together else [[pair] for pair in views]:
+            left, right = (
+                normalise(torch.stack(side).to(self.device, torch.float32))
+                for side in zip(*group, strict=True)
+            )
+            found = self._match_one_way(left, right, network)
+            if self.config.with_left_right_check:
+                mirrored = self._match_one_way(right.flip(-1), left.flip(-1), network)
+                other_px = [match.disparity_px.flip(-1) for match in mirrored]
+                found = list(map(lower_where_disagreeing, found, other_px))
+            matches += found
+        home = pairs[0][0].device
+        return [
+            resized_match(changed_match(match, lambda values: values.to(home)), *left.shape[1:])
+            for match, (left, _) in zip(matches, pairs, strict=True)
+        ]
+
+    def work_size(self, camera: Camera) -> tuple[int, int]:
+        """Rows and columns at which images of a camera are matched [px]."""
+        if self.network_config.work_focal_px is None:
+            return camera.height, camera.width
+        return focal_size(camera, self.work_focal_px(camera))
+
+    def work_focal_px(self, camera: Camera) -> float:
+        """Focal length at which images of a camera are matched [px]."""
+        trained_px = self.network_config.work_focal_px
+        if trained_px is None:
+            return float(camera.K[0, 0])
+        if self.config.speed == "quick":
+            return trained_px
+        share = math.sqrt(self.fine_pixels / (camera.height * camera.width))
+        return max(trained_px, float(camera.K[0, 0]) * min(share, self.most_enlarged))
+
+    def _match_one_way(self, left: Views, right: Views, network: NetworkConfig) -> list[Match]:
+        """Match normalised pairs of any size: in tiles, or padded and cropped back."""
+        if self.config.tile_px is not None:
+            tiling = Tiling(
+                *self.config.tile_px, self.config.tile_overlap_px, network.max_disparity_px
+            )
+
+            def match_tile(one: Tensor, other: Tensor) -> Match:
+                return self._match_padded(one[None], other[None], network)[0]
+
+            return [
+                match_tiles(match_tile, *pair, tiling) for pair in zip(left, right, strict=True)
+            ]
+        return self._match_padded(left, right, network)
+
+    def _match_padded(self, left: Views, right: Views, network: NetworkConfig) -> list[Match]:
+        h, w = left.shape[-2:]
+        padded = self.run(pad_top_right(left, network), pad_top_right(right, network), network)
+        return [changed_match(match, lambda values: values[-h:, :w]) for match in padded]
+
+
+def with_usable_precision(config: MatcherConfig) -> MatcherConfig:
+    """Give a config whose precision its device computes in; says so where it is another."""
+    is_bf16 = usable_precision(config.precision, config.device) == "bf16"
+    return replace(config, precision="bf16" if is_bf16 else "fp32")
+
+
+def normalise(image: Float[Tensor, "*batch 3 h w"]) -> Float[Tensor, "*batch 3 h w"]:
+    """RGB in [0, 1] to what the network was trained on: ImageNet's mean 0 and deviation 1."""
+    mean = image.new_tensor(IMAGENET_MEAN)[:, None, None]
+    return (image - mean) / image.new_tensor(IMAGENET_STD)[:, None, None]
+
+
+def pad_top_right(
+    image: Float[Tensor, "*batch 3 h w"], network: NetworkConfig
+) -> Float[Tensor, "*batch 3 h2 w2"]:
+    """Pad a normalised image with zeros, top and right, to a size that suits the network.
+
+    Top and right, as PSMNet's authors do: columns stay where they are, so disparity does too.
+    """
+    step, least = network.step_px, network.min_side_px
+    h, w = (max(least, -(-side // step) * step) for side in image.shape[-2:])
+    return F.pad(image, (0, w - image.shape[-1], h - image.shape[-2], 0))
+
+
+def lower_where_disagreeing(found: Match, right_px: Float[Tensor, "h w"]) -> Match:
+    """Lower the confidence where the right view's own disparity is another.
+
+    Halved at least where the matching point lies outside the right view: nothing there can
+    agree, and nothing contradicts. That of the sky is kept.
+    """
+    difference_px = left_right_difference_px(found.disparity_px, right_px)
+    agreement = torch.exp(-difference_px / AGREEMENT_PX).nan_to_num(0.0)
+    confidence = agreement if found.confidence is None else found.confidence * (1 + agreement) / 2
+    if found.confidence is not None and found.is_sky is not None:
+        confidence = torch.where(found.is_sky, found.confidence, confidence)
+    return replace(found, confidence=confidence)
+
+
+def tile_change_px(
+    matcher: NetworkMatcher, left: Tensor, right: Tensor, camera: Camera | None = None
+) -> float:
+    """Mean difference that tiles make to the disparity of a pair [px].
+
+    Args:
+        matcher: with tiles.
+        left: left image, ``(3, H, W)`` RGB in [0, 1].
+        right: right image, the same size.
+        camera: of the left image, which decides the size at which the pair is matched.
+
+    Raises:
+        InputError: the matcher uses no tiles, or the pair is unusable.
+    """
+    if matcher.config.tile_px is None:
+        raise InputError("tile_change_px needs a matcher with tiles; set tile_px in its config")
+    whole = copy(matcher)
+    whole.config = replace(matcher.config, tile_px=None)
+    tiled, untiled = (one.match_many([(left, right)], camera)[0] for one in (matcher, whole))
+    return float((tiled.disparity_px - untiled.disparity_px).abs().mean())
+
+
+Image = Float[Tensor, "3 h w"]
+
+
+class Tiling(NamedTuple):
+    """Size of a tile's own part, what neighbours share, and what lies to the left besides [px].
+
+    A left pixel at x matches a right one at x - disparity, so each tile sees
+    ``max_disparity_px`` more columns on its left than it answers for.
+    """
+
+    rows: int
+    columns: int
+    overlap: int
+    max_disparity_px: int
+
+
+class Span(NamedTuple):
+    """One tile along one axis: what it sees, from where it counts, and its weights there."""
+
+    seen: slice
+    counted: slice
+    weight: Float[Tensor, " n"]
+
+
+def match_tiles(
+    match: Callable[[Image, Image], Match], left: Image, right: Image, tiling: Tiling
+) -> Match:
+    """Match tile by tile and blend the answers linearly where tiles overlap."""
+    h, w = left.shape[-2:]
+    total = left.new_zeros(4, h, w)
+    with_confidence = with_sky = True
+    for y in _spans(h, tiling.rows, tiling.overlap, 0):
+        for x in _spans(w, tiling.columns, tiling.overlap, tiling.max_disparity_px):
+            tile = match(left[:, y.seen, x.seen], right[:, y.seen, x.seen])
+            inner = (_inside(y), _inside(x))
+            weight = (y.weight[:, None] * x.weight).to(left)
+            total[0, y.counted, x.counted] += weight
+            total[1, y.counted, x.counted] += weight * tile.disparity_px[inner]
+            with_confidence, with_sky = tile.confidence is not None, tile.is_sky is not None
+            if tile.confidence is not None:
+                total[2, y.counted, x.counted] += weight * tile.confidence[inner]
+            if tile.is_sky is not None:
+                total[3, y.counted, x.counted] += weight * tile.is_sky[inner]
+    disparity_px, confidence, sky = total[1:] / total[0]
+    return Match(
+        disparity_px=disparity_px,
+        confidence=confidence if with_confidence else None,
+        is_sky=sky > 0.5 if with_sky else None,
+    )
+
+
+def _inside(span: Span) -> slice:
+    first = span.counted.start - span.seen.start
+    return slice(first, first + span.counted.stop - span.counted.start)
+
+
+def _spans(length: int, step: int, overlap: int, max_disparity_px: int) -> list[Span]:
+    spans = []
+    for own_first in range(0, length, step):
+        own_stop = min(own_first + step, length)
+        first, stop = max(own_first - overlap, 0), min(own_stop + overlap, length)
+        at = torch.arange(first, stop) + 0.5
+        ramp = max(2 * overlap, 1)
+        rising = (at - own_first + overlap) / ramp if own_first else torch.ones_like(at)
+        falling = (own_stop + overlap - at) / ramp if own_stop < length else torch.ones_like(at)
+        weight = rising.clamp(0, 1) * falling.clamp(0, 1)
+        spans.append(
+            Span(slice(max(first - max_disparity_px, 0), stop), slice(first, stop), weight)
+        )
+    return spans

@@ -14,7 +14,7 @@ from torch import Tensor, nn
 
 from depthpose.core.errors import InputError
 from depthpose.depth.config import PSMNetConfig
-from depthpose.depth.stereo.network_matcher import Maps, StereoNetwork
+from depthpose.depth.stereo.matcher import Maps, StereoNetwork
 
 CHUNK_BYTES = 6 << 20
 """Size of one piece of the soft arg-min; it fits the caches."""

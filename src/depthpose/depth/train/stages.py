@@ -30,7 +30,7 @@ from depthpose.depth.losses import (
     view_loss,
 )
 from depthpose.depth.stereo import StereoNetwork, normalise
-from depthpose.depth.stereo.network_matcher import pad_top_right
+from depthpose.depth.stereo.matcher import pad_top_right
 from depthpose.depth.synthesis import (
     Generator,
     SelectionGenerator,
