@@ -242,11 +242,11 @@ def test_some_rows_at_a_time_give_the_same_numbers(compares: bool) -> None:
     network = random_network(replace(SMALL, with_agreement=compares, with_refinement=compares))
     left, right = torch.randn(2, 2, 3, 96, 64, generator=torch.Generator().manual_seed(0))
     with torch.no_grad():
-        scores, _ = network.scores(left, right, 32)
+        scores, *_ = network.scores(left, right, 32)
         found = network(left, right)[-1]
         for rows in (2, 6, 16, 24, 100):
             network.rows = rows
-            some, _ = network.scores(left, right, 32)
+            some, *_ = network.scores(left, right, 32)
             torch.testing.assert_close(some, scores, atol=1e-4, rtol=1e-4)
             difference = (network(left, right)[-1] - found).abs()  # equal scores may change places
             assert float((difference > 1e-2).float().mean()) < 0.01
