@@ -87,7 +87,8 @@ class MethodSource:
             name = path.stem + ("-both" if with_right and not is_matcher else "")
             name += "" if answer is None else f"-{answer}"
         else:  # OpenCV, or other weights, match the view of the generator
-            other, answer = self.matcher, "matched"
+            other = self.matcher
+            answer = "matched"
             if self.matcher == "sgbm":
                 sgbm = SGBMConfig(with_filled_holes=True)
                 matcher, own = SGBMMatcher(sgbm), {**own, **config_to_dict(sgbm)}
