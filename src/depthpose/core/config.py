@@ -21,15 +21,6 @@ def refuse_distorted(content: Mapping[Any, Any], kind: type, source: str, prefix
 
     These are text or one number where a list belongs, truth values and text where a number
     belongs, and numbers that are not finite, unless the setting's default is not finite itself.
-
-    Args:
-        content: values by the names of their settings; all are known.
-        kind: the dataclass of these settings.
-        source: where the values come from, for the error.
-        prefix: begins the names of the settings in errors, as ``inner.``.
-
-    Raises:
-        InputError: that is so.
     """
     hints = get_type_hints(kind)
     fields = {field.name: field for field in dataclasses.fields(kind)}

@@ -99,12 +99,7 @@ class Graph:
         return Value(self, out)
 
     def call(self, network: Any, *inputs: Value) -> tuple[Value, ...]:  # noqa: ANN401
-        """Put a whole model's nodes here and give its outputs.
-
-        Args:
-            network: an ONNX model, from :func:`depthpose.core.export.network_model`.
-            inputs: in the order of the model's own.
-        """
+        """Put a whole model's nodes here and give its outputs."""
         prefix = self._new_name("network") + "/"
         inner = self._onnx.compose.add_prefix(network, prefix).graph
         for given, wanted in zip(inputs, inner.input, strict=True):
@@ -115,11 +110,7 @@ class Graph:
         return tuple(Value(self, output.name) for output in inner.output)
 
     def model(self, facts: Mapping[str, Any]) -> Any:  # noqa: ANN401
-        """Close the graph.
-
-        Args:
-            facts: for users of the file, each in its metadata, as text or JSON.
-        """
+        """Close the graph."""
         helper = self._onnx.helper
         graph = helper.make_graph(
             self._nodes, "depthpose", self._inputs, self._outputs, self._constants
@@ -162,11 +153,7 @@ _PACKAGES = (
 
 
 def import_export() -> Any:  # noqa: ANN401  what protobuf generates carries no types
-    """Import ONNX, and make sure that what goes with it is there too.
-
-    Raises:
-        MissingExtraError: one of the three is not installed.
-    """
+    """Import ONNX, and make sure that what goes with it is there too."""
     for name in _PACKAGES:
         import_extra(name, "onnx, onnxruntime and onnxscript", "export", "export")
     return import_module("onnx")
@@ -213,12 +200,7 @@ class Limit:
 def measure_differences(
     path: Path, cases: Iterable[Case], limits: Mapping[str, Limit]
 ) -> list[Row]:
-    """Run a file with onnxruntime on each case, on the CPU, and give a row for each output.
-
-    Raises:
-        InputError: an output is NaN where PyTorch's is not, or the other way round, or off by
-            more than its limit, on more pixels than may flip; or there is no number to compare.
-    """
+    """Run a file with onnxruntime on each case, on the CPU, and give a row for each output."""
     session = import_module("onnxruntime").InferenceSession(
         str(path), providers=["CPUExecutionProvider"]
     )
@@ -235,11 +217,7 @@ def measure_differences(
 
 
 def refuse_beyond(rows: Iterable[Row]) -> None:
-    """Raise where a difference is beyond its limit.
-
-    Raises:
-        InputError: the first such row.
-    """
+    """Raise where a difference is beyond its limit."""
     for row in rows:
         difference, limit = row[f"{row['limited']} difference"], row["limit"]
         if not difference <= limit:  # pyright: ignore[reportOperatorIssue]  NaN fails too
@@ -312,16 +290,7 @@ class Export:
 
 
 def freeze(path: Path, export: Export) -> list[Row]:
-    """Write ``NAME.onnx``, once it agrees with PyTorch, and ``NAME.proof.json`` beside it.
-
-    Returns:
-        The differences, a row for each input and output.
-
-    Raises:
-        InputError: another suffix, a file that is there already, a place that cannot be written,
-            or answers that differ.
-        MissingExtraError: the extra ``export`` is not installed.
-    """
+    """Write ``NAME.onnx``, once it agrees with PyTorch, and ``NAME.proof.json`` beside it."""
     if path.suffix != ".onnx":
         raise InputError(f"{path}: the graph is written as ONNX; end the name in .onnx.")
     for file in (path, proof_path(path)):

@@ -38,11 +38,7 @@ _PHONE = 0.75
 
 
 def answer_depth(form: Form, net: FakestereoNet) -> Answer:
-    """Estimate what a form asks for.
-
-    Raises:
-        InputError: a file that cannot be read, or a camera that cannot be.
-    """
+    """Estimate what a form asks for."""
     began = time.perf_counter()
     pair, focal = _input(form)
     near_m, far_m = (

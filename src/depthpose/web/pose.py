@@ -80,11 +80,7 @@ class _Seen:
 
 
 def answer_pose(form: Form, net: GeoPoseNet) -> Answer:
-    """Pose what a form asks for.
-
-    Raises:
-        InputError: a file that cannot be read, or an object that is unknown.
-    """
+    """Pose what a form asks for."""
     target = _target(form, net)
     given = _input(form, target.model)
     name, voted = given.name, None
@@ -249,11 +245,7 @@ def _scene(seen: list[_Seen], model: ObjectModel, voted: CloudDirections | None)
 
 
 def pose_example(net: GeoPoseNet) -> dict[str, Any]:
-    """Render a frame of the first object that the weights know, on a table: depth, mask, camera.
-
-    Raises:
-        InputError: weights without meshes.
-    """
+    """Render a frame of the first object that the weights know, on a table: depth, mask, camera."""
     model = net.weights.models[0]
     near_m = 4 * model.diameter_m
     config = ObjectsConfig(

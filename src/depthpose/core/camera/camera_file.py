@@ -70,11 +70,7 @@ _TUM_SIZE, _TUM_UNIT_M = (640, 480), 1 / 5000
 
 
 def facts_from_text(path: AnyPath, text: str) -> CameraFacts | None:
-    """Take the camera of a text file; None where it is none that is known.
-
-    Raises:
-        InputError: it is one, and damaged.
-    """
+    """Take the camera of a text file; None where it is none that is known."""
     if _MIDDLEBURY.search(text):
         return middlebury_facts(path, text)
     if _KITTI.search(text):
@@ -90,11 +86,7 @@ def facts_from_text(path: AnyPath, text: str) -> CameraFacts | None:
 
 
 def middlebury_facts(path: AnyPath, text: str) -> CameraFacts:
-    """Take Middlebury 2014's ``calib.txt``: cam0, doffs, baseline in millimetres, size.
-
-    Raises:
-        InputError: a value missing or not a number, or ``cam1`` contradicts the others.
-    """
+    """Take Middlebury 2014's ``calib.txt``: cam0, doffs, baseline in millimetres, size."""
     values = dict(re.findall(r"^[ \t]*(\w+)[ \t]*=(.*)$", text, re.MULTILINE))
     try:
         K, right = (
@@ -139,9 +131,6 @@ def plain_facts(path: AnyPath, keys: Mapping[str, list[float]]) -> CameraFacts:
     """Take ``focal_px``, ``cx``, ``cy`` and ``baseline_m``, a line each.
 
     Also ``width`` and ``height``, ``focal_y_px`` and ``cx_right_minus_left_px`` if given.
-
-    Raises:
-        InputError: a value is missing.
     """
     focal_px, cx, cy, baseline_m = (
         _number(path, keys, key) for key in ("focal_px", "cx", "cy", "baseline_m")
@@ -164,11 +153,7 @@ def plain_facts(path: AnyPath, keys: Mapping[str, list[float]]) -> CameraFacts:
 def kitti_matrix(
     path: AnyPath, keys: Mapping[str, list[float]], name: str, shape: tuple[int, int]
 ) -> Matrix:
-    """Take a matrix of a KITTI calibration.
-
-    Raises:
-        InputError: it is missing, or of another size.
-    """
+    """Take a matrix of a KITTI calibration."""
     if name not in keys:
         raise InputError(f"{path}: has no line '{name}:', which a KITTI calibration holds.")
     if len(keys[name]) != shape[0] * shape[1]:
@@ -260,11 +245,7 @@ _MM = 0.001
 
 
 def facts_from_json(content: object) -> CameraFacts:
-    """Take the camera of a JSON file: ours, BOP's ``camera.json`` or its ``scene_camera.json``.
-
-    Raises:
-        InputError: it is none of them, or a value is wrong.
-    """
+    """Take the camera of a JSON file: ours, BOP's ``camera.json`` or its ``scene_camera.json``."""
     if isinstance(content, list) and len(content) in (3, 9):
         return CameraFacts(kind="a matrix", K=_matrix(content))
     if isinstance(content, dict) and "K" not in content:
@@ -434,11 +415,7 @@ def write_camera(path: AnyPath, camera: Camera) -> None:
 
 
 def check_image_matches_camera(camera: Camera, width: int, height: int, name: str) -> None:
-    """Refuse an image whose size is not the camera's.
-
-    Raises:
-        InputError: the sizes differ; where the aspect agrees, resizing is offered.
-    """
+    """Refuse an image whose size is not the camera's."""
     if (width, height) == (camera.width, camera.height):
         return
     # Scaled sizes are rounded to whole pixels, so the aspect agrees to within one.
@@ -585,11 +562,7 @@ def centred_camera(size: Size, focal_px: float) -> Camera:
 
 
 def intrinsics_of(K: object) -> Float[Tensor, "3 3"]:
-    """Take a 3x3 list, array or tensor of any real numbers as an intrinsic matrix, in float64.
-
-    Raises:
-        InputError: it is none.
-    """
+    """Take a 3x3 list, array or tensor of any real numbers as an intrinsic matrix, in float64."""
     values = K.detach().cpu().numpy() if isinstance(K, Tensor) else K
     try:
         matrix = torch.from_numpy(np.array("none" if K is None else values, dtype=np.float64))

@@ -112,11 +112,7 @@ class StereoRig(Camera):
 
 
 def check_intrinsics(K: Tensor) -> None:
-    """Refuse a matrix that is no intrinsic matrix.
-
-    Raises:
-        InputError: the shape, the type or a value of ``K`` is wrong.
-    """
+    """Refuse a matrix that is no intrinsic matrix."""
     form = "[[fx, skew, cx], [0, fy, cy], [0, 0, 1]]"
     if not isinstance(K, Tensor):
         raise InputError(
@@ -317,10 +313,6 @@ def facts_from_projections(
 
     A rectified camera at x = b has ``P[0, 3] = -fx b``. KITTI counts both from camera 0, ROS and
     OpenCV from the left one.
-
-    Raises:
-        InputError: a focal length is not positive, the two are not those of one rectified pair, or
-            the pair stands one above the other.
     """
     K = torch.from_numpy(left[:, :3].copy())
     if right is None:
@@ -344,11 +336,7 @@ def facts_from_projections(
 
 
 def refuse_apart(left: Float64[np.ndarray, "3 _"], right: Float64[np.ndarray, "3 _"]) -> None:
-    """Refuse two matrices that are not those of one rectified pair: only cx may differ.
-
-    Raises:
-        InputError: fx, fy or cy differ.
-    """
+    """Refuse two matrices that are not those of one rectified pair: only cx may differ."""
     within = {"fx": ((0, 0), _SAME_FOCAL * left[0, 0]), "fy": ((1, 1), _SAME_FOCAL * left[1, 1]),
               "cy": ((1, 2), _SAME_ROW_PX)}  # fmt: skip
     for name, (at, most) in within.items():
@@ -361,15 +349,7 @@ def refuse_apart(left: Float64[np.ndarray, "3 _"], right: Float64[np.ndarray, "3
 
 
 def camera_from_facts(facts: CameraFacts, size: Size | None) -> Camera:
-    """Make the camera of a file; refuse what cannot be that of an undistorted image in pixels.
-
-    Args:
-        facts: values of the file.
-        size: of the image, for files that do not say it.
-
-    Raises:
-        InputError: distortion, an unknown size, or a value in another unit or of another image.
-    """
+    """Make the camera of a file; refuse what cannot be that of an undistorted image in pixels."""
     if not all(abs(k) <= _NO_DISTORTION for k in facts.distortion):
         after = "and give the camera of the result"
         if facts.size or size:
@@ -386,11 +366,7 @@ def camera_from_facts(facts: CameraFacts, size: Size | None) -> Camera:
 
 
 def make_camera(facts: CameraFacts, size: Size | None) -> Camera:
-    """Make a camera, or a rig where there is a baseline, without asking whether it is likely.
-
-    Raises:
-        InputError: the size is missing, or a value is impossible for a camera.
-    """
+    """Make a camera, or a rig where there is a baseline, without asking whether it is likely."""
     known = facts.size or size
     if known is None:
         raise InputError(
@@ -489,16 +465,7 @@ def _refuse_normalised(K: Float[Tensor, "3 3"], width: int, height: int) -> None
 
 
 def refuse_baseline(length: float, remedy: str, most_m: float = WIDE_BASELINE_M) -> None:
-    """Refuse a distance between two cameras that no rig has.
-
-    Args:
-        length: what was taken for metres.
-        remedy: how to correct it, where ``most_m`` allows more than what is common.
-        most_m: from which on it is too long.
-
-    Raises:
-        InputError: it is too short, or too long: the likely unit is said.
-    """
+    """Refuse a distance between two cameras that no rig has."""
     if length < _LEAST_FILE_BASELINE_M:
         raise InputError(
             f"baseline_m is {length:g}, less than two lenses can stand apart; write metres, once "
@@ -516,11 +483,7 @@ def refuse_baseline(length: float, remedy: str, most_m: float = WIDE_BASELINE_M)
 
 
 def refuse_squeezed(K: Float[Tensor, "3 3"]) -> None:
-    """Refuse a K whose two focal lengths are not those of one lens.
-
-    Raises:
-        InputError: that is so.
-    """
+    """Refuse a K whose two focal lengths are not those of one lens."""
     fx, fy = float(K[0, 0]), float(K[1, 1])
     if not 1 / _MAX_SQUEEZE < fy / fx < _MAX_SQUEEZE:
         raise InputError(

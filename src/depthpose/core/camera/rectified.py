@@ -157,12 +157,7 @@ def _find_corners(grey: Grey) -> Places:
 
 
 def _match(source: Grey, target: Grey, corners: Places) -> tuple[Places, Places, int]:
-    """Find corners in the whole of another image.
-
-    Returns:
-        Those with a mutual match, their places there, and how many look like some place there,
-        or like many.
-    """
+    """Give corners with a mutual match, their places, and how many look like some place there."""
     matched, is_alike, is_sole = _search(source, target, corners)
     alike = int(is_alike.sum())
     corners, matched = corners[is_alike & is_sole], matched[is_alike & is_sole]

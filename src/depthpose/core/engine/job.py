@@ -100,11 +100,7 @@ def run_job(job: Job, engine: Engine) -> list[Done]:
 
 
 def claim(out: str, settings: Mapping[str, Any]) -> None:
-    """Claim a folder, local or in a store, for a run with these settings, or continue it.
-
-    Raises:
-        InputError: it holds a run with other settings; the first difference is named.
-    """
+    """Claim a folder, local or in a store, for a run with these settings, or continue it."""
     record = join(out, RECORD)
     if exists(record):
         try:
@@ -363,11 +359,7 @@ def _keep_to_this_machine() -> None:
 
 
 def _import_ray() -> Any:  # noqa: ANN401  Ray is loaded where it is used
-    """Import Ray, which sends no statistics of its use unless it is set to.
-
-    Raises:
-        MissingExtraError: it is not installed, or too old to ask for a password.
-    """
+    """Import Ray, which sends no statistics of its use unless it is set to."""
     os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
     import_extra("ray.data", "ray[data]", "ray", "--engine ray")
     ray = import_module("ray")

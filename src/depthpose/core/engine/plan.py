@@ -103,11 +103,7 @@ def stem(url: str) -> str:
 
 
 def refuse_name(name: str, source: str) -> None:
-    """Refuse a name that would lead out of the folder of the results.
-
-    Raises:
-        InputError: it is empty, absolute or holds ``..``.
-    """
+    """Refuse a name that would lead out of the folder of the results."""
     parts = PurePosixPath(name).parts
     if not parts or name.startswith("/") or ".." in parts or "\0" in name or "\\" in name:
         raise InputError(
@@ -116,11 +112,7 @@ def refuse_name(name: str, source: str) -> None:
 
 
 def import_pyarrow(purpose: str) -> Any:  # noqa: ANN401  pyarrow carries no types
-    """Import Parquet's reader and writer, which the extra ``ray`` brings.
-
-    Raises:
-        MissingExtraError: it is not installed.
-    """
+    """Import Parquet's reader and writer, which the extra ``ray`` brings."""
     import_extra("pyarrow.parquet", "pyarrow", "ray", purpose)
     return import_module("pyarrow")
 
@@ -230,15 +222,6 @@ def make_plan(out: str, items: Sequence[Item], tars: Sequence[str], size: int) -
 
     The plan is a file in ``out``, so that a shard means the same inputs in every run, whatever
     has been added to a folder since.
-
-    Args:
-        out: folder of the results.
-        items: listed inputs.
-        tars: tar shards, a block each.
-        size: inputs of a block.
-
-    Raises:
-        InputError: an earlier run gave a name to another file, or the place refuses.
     """
     known = _read_plan(join(out, PLAN))
     files = {item.name: item.files for block in known for item in block.items}

@@ -41,17 +41,7 @@ _GROUP_BYTES = 64 * 2**20
 
 @contextmanager
 def shard_writer(path: Path, form: ShardFormat, endings: Sequence[str]) -> Iterator[AddResult]:
-    """Write a shard, the same bytes for the same results.
-
-    Args:
-        path: a local file.
-        form: tar holds members ``NAME.ENDING``; Parquet has a row for each name, with columns
-            ``name``, ``reason`` and the content of each ending.
-        endings: that a result may have.
-
-    Raises:
-        MissingExtraError: Parquet without the extra ``ray``.
-    """
+    """Write a tar of ``NAME.ENDING``, or Parquet of a row a name; equal results, equal bytes."""
     if form == "tar":
         with tarfile.open(path, "w", format=tarfile.PAX_FORMAT) as tar:
 
@@ -117,11 +107,7 @@ def read_shard(
 
 
 def read_tar(url: str) -> Iterator[tuple[str, bytes]]:
-    """Read the files of a tar shard, plain or compressed, from its beginning to its end.
-
-    Raises:
-        InputError: it is not there, is no intact tar file, or holds a link or one name twice.
-    """
+    """Read the files of a tar shard, plain or compressed, from its beginning to its end."""
     seen: set[str] = set()
     try:
         with opened(url) as file, tarfile.open(fileobj=file, mode="r|*") as tar:

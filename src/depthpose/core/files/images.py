@@ -257,11 +257,7 @@ def list_images(path: AnyPath) -> list[Path]:
 
 @contextmanager
 def opened_image(path: AnyPath) -> Iterator[Image.Image]:
-    """Open a picture's header; whatever decoding raises inside the block is an input error.
-
-    Raises:
-        InputError: the file is missing, too large, damaged or not a picture.
-    """
+    """Open a picture's header; whatever decoding raises inside the block is an input error."""
     data = read_bytes(path)
     with (
         refused_as(path, "picture", "give an intact PNG or JPEG"),

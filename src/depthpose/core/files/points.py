@@ -51,11 +51,7 @@ class Ragged:
 def split_records(
     path: AnyPath, body: memoryview, fields: list[Field], count: int, order: str = "<"
 ) -> Columns:
-    """Take ``count`` packed records apart into columns, without a copy.
-
-    Raises:
-        InputError: ``body`` is shorter than the records that the header declares.
-    """
+    """Take ``count`` packed records apart into columns, without a copy."""
     # Named by place, since a file may use one name for several fields of padding.
     with refused_as(path, "list of fields", "save it again"):
         dtype = np.dtype([(f"{i}", order + f.code, (f.count,)) for i, f in enumerate(fields)])
@@ -65,11 +61,7 @@ def split_records(
 
 
 def text_rows(path: AnyPath, body: memoryview) -> Iterator[str]:
-    """Give the lines of a body in text; empty ones do not count.
-
-    Raises:
-        InputError: there is more text than is read.
-    """
+    """Give the lines of a body in text; empty ones do not count."""
     if len(body) > MAX_TEXT_BYTES:
         raise InputError(
             f"{path}: {len(body)} bytes of points in text, more than {MAX_TEXT_BYTES}; save it as "
@@ -87,11 +79,7 @@ def plain_numbers(line: str) -> str:
 
 
 def split_rows(path: AnyPath, rows: Iterator[str], fields: list[Field], count: int) -> Columns:
-    """Take the next ``count`` rows of text apart into columns of the declared types.
-
-    Raises:
-        InputError: rows are missing or ragged, or a value does not fit its type.
-    """
+    """Take the next ``count`` rows of text apart into columns of the declared types."""
     table = parse_rows(path, islice(rows, count))
     if len(table) < count:
         raise _truncated(path, f"{count} points", len(table))
@@ -113,11 +101,7 @@ def _truncated(path: AnyPath, what: str, rows: int) -> InputError:
 
 
 def parse_rows(path: AnyPath, rows: Iterable[str]) -> np.ndarray:
-    """Parse rows of equally many numbers, parted by blanks, to float64; taken one at a time.
-
-    Raises:
-        InputError: a value is no number, or the rows are ragged.
-    """
+    """Parse rows of equally many numbers, parted by blanks, to float64; taken one at a time."""
     with refused_as(path, "table of numbers", "give every row as many values, with decimal points"):
         table = np.loadtxt(rows, dtype=np.float64, comments=None, ndmin=2)
     return table if table.size else np.empty((0, 0))
@@ -166,27 +150,12 @@ class _Element:
 
 
 def read_ply(path: AnyPath) -> Columns:
-    """Read the columns of the ``vertex`` element alone.
-
-    Raises:
-        InputError: the file is missing, truncated or damaged.
-    """
+    """Read the columns of the ``vertex`` element alone."""
     return read_ply_elements(path, "vertex")[0]
 
 
 def read_ply_elements(path: AnyPath, last: str | None = None) -> tuple[Columns, dict[str, Ragged]]:
-    """Read the columns of the ``vertex`` element, and the lists of the others.
-
-    Args:
-        path: the file.
-        last: the element behind which nothing is read; None: every byte must belong to one.
-
-    Returns:
-        The columns; the lists by ``ELEMENT PROPERTY``.
-
-    Raises:
-        InputError: the file is missing, damaged, or shorter or longer than its header says.
-    """
+    """Read the columns of the ``vertex`` element, and the lists of the others."""
     data = read_bytes(path)
     end = _END.search(data, 0, _MAX_HEADER)
     if not data.startswith(b"ply") or end is None:
@@ -368,11 +337,7 @@ _DATA = re.compile(rb"(?:^|\n)DATA[ \t]+(ascii|binary|binary_compressed)[ \t]*(?
 
 
 def read_pcd(path: AnyPath) -> Columns:
-    """Read the columns of a PCD file; ``rgb`` stays packed.
-
-    Raises:
-        InputError: the file is missing, truncated or damaged.
-    """
+    """Read the columns of a PCD file; ``rgb`` stays packed."""
     data = read_bytes(path)
     end = _DATA.search(data, 0, _MAX_PCD_HEADER)
     if end is None:
@@ -423,9 +388,6 @@ def decompress_lzf(packed: memoryview, size: int) -> bytes:
 
     A control byte below 32 announces that many literal bytes and one; any other holds a length
     (3 bits, 7: a further byte is added) and a distance (13 bits) back into what is there already.
-
-    Raises:
-        ValueError: the stream does not unpack to exactly ``size`` bytes.
     """
     out = bytearray()
     at = 0
