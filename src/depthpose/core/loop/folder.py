@@ -205,26 +205,13 @@ class Parts:
         }
 
     def restore(self, state: Mapping[str, Any]) -> None:
-        """Take everything from a state that fits."""
-        for name, module in self.modules.items():
-            module.load_state_dict(state["modules"][name])
-        for name, optimizer in self.optimizers.items():
-            optimizer.load_state_dict(state["optimizers"][name])
-        if self.scaler.is_enabled() and state["scaler"]:
-            self.scaler.load_state_dict(state["scaler"])
-        for name, held in self.average.items():
-            for key, tensor in state["average"][name].items():
-                held[key].copy_(tensor)
-
-    def misfits(self, state: Mapping[str, Any]) -> list[str]:
-        """Say what a state has missing, more, or in another shape."""
+        """Take over a state; one that does not fit is refused with what differs."""
         problems: list[str] = []
-        for name, module in self.modules.items():
-            faults = misfits(module.state_dict(), state["modules"][name])
-            problems += [f"{name}: {fault}" for fault in faults]
-        for name, held in self.average.items():
-            faults = misfits(held, state["average"][name])
-            problems += [f"average of {name}: {fault}" for fault in faults]
+        own = self.state()
+        for words, name in (("", "modules"), ("average of ", "average")):
+            for key, tensors in own[name].items():
+                faults = misfits(tensors, state[name][key])
+                problems += [f"{words}{key}: {fault}" for fault in faults]
         for name, optimizer in self.optimizers.items():
             saved = state["optimizers"][name]
             counts, saved_counts = (
@@ -237,15 +224,26 @@ class Parts:
                     f"{counts}"
                 )
                 continue
-            shapes = [p.shape for group in optimizer.param_groups for p in group["params"]]
+            optimizer.load_state_dict(saved)
             problems += [
                 f"optimiser of {name}: {key} of parameter {k} is {tuple(value.shape)}, not "
-                f"{tuple(shapes[k])}"
-                for k, values in saved["state"].items()
+                f"{tuple(parameter.shape)}"
+                for k, (parameter, values) in enumerate(optimizer.state.items())
                 for key, value in values.items()
-                if isinstance(value, Tensor) and value.ndim and value.shape != shapes[k]
+                if value.ndim and value.shape != parameter.shape
             ]
-        return problems
+        if problems:
+            raise InputError(
+                f"{len(problems)} tensors do not fit this network: {', '.join(problems[:3])}; it "
+                "is the state of another one"
+            )
+        for name, module in self.modules.items():
+            module.load_state_dict(state["modules"][name])
+        for name, tensors in self.average.items():
+            for key, tensor in tensors.items():
+                tensor.copy_(state["average"][name][key])
+        if self.scaler.is_enabled() and state["scaler"]:
+            self.scaler.load_state_dict(state["scaler"])
 
 
 def saved_states(folder: Path) -> list[Path]:
@@ -277,9 +275,14 @@ def restore_last(folder: Path, parts: Parts) -> tuple[Path, int, float]:
     damages: list[str] = []
     for path in saved_states(folder):
         try:
-            step, seconds = _restore(path, parts)
+            state = _read_state(path)
+            remedy = "it is damaged, or of another training"
+            with refused_as(path, "state of this training", remedy):
+                parts.restore(state)
+                step, seconds = state["step"], float(state.get("seconds", 0.0))
         except InputError as error:
-            damages.append(str(error))
+            said = str(error)
+            damages.append(said if said.startswith(f"{path}") else f"{path}: {said}")
             continue
         if path.name != STATE:
             reason = "; ".join(damages) or f"{folder}: there is no {STATE}"
@@ -290,18 +293,6 @@ def restore_last(folder: Path, parts: Parts) -> tuple[Path, int, float]:
         f"{'; '.join(damages)}; no state is left to go on from. Take another folder, whose "
         "training may 'start' from weights, or delete these states to begin anew"
     )
-
-
-def _restore(path: Path, parts: Parts) -> tuple[int, float]:
-    state = _read_state(path)
-    with refused_as(path, "state of this training", "it is damaged, or of another training"):
-        if problems := parts.misfits(state):
-            raise InputError(
-                f"{path}: {len(problems)} tensors do not fit this network: "
-                f"{', '.join(problems[:3])}; it is the state of another one"
-            )
-        parts.restore(state)
-        return state["step"], float(state.get("seconds", 0.0))  # older states do not know it
 
 
 def _saved_step(folder: Path) -> int:
