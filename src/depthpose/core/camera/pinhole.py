@@ -359,7 +359,41 @@ def camera_from_facts(facts: CameraFacts, size: Size | None) -> Camera:
             f"and only images without are understood; undistort them by {facts.undistort}, {after}"
         )
     camera = make_camera(facts, size)
-    _refuse_units(camera, is_metric=facts.is_metric)
+    fx = float(camera.K[0, 0])
+    shown = f"{camera.width}x{camera.height}"
+    _refuse_normalised(camera.K, camera.width, camera.height)
+    if fx < _MM_FX_SHARE * camera.width:
+        raise InputError(
+            f"K has fx {fx:g} for {shown} pixels, so it looks like millimetres; divide by the "
+            "width of a pixel in mm"
+        )
+    if fx > _MAX_FX_SHARE * camera.width:
+        raise InputError(
+            f"K has fx {fx:g} for {shown} pixels, which sees less than 0.3 degrees; give it in "
+            "pixels of this image"
+        )
+    refuse_squeezed(camera.K)
+    refuse_outside(camera.K, camera.width, camera.height)
+    if isinstance(camera, StereoRig):
+        how = 'written as ours: width, height, K, "baseline_m"'
+        how = "made in Python, as a StereoRig" if facts.is_metric else how
+        most_m = _FILE_BASELINE_M if facts.is_metric else WIDE_BASELINE_M
+        refuse_baseline(camera.baseline_m, f"a rig that is truly this wide is {how}", most_m)
+        if abs(camera.cx_right_minus_left_px) >= camera.width:
+            raise InputError(
+                f"the principal points differ by {camera.cx_right_minus_left_px:g} px, more than "
+                f"the image of {shown} is wide; are both cameras of one size? Copy them anew"
+            )
+    if camera.depth_unit_m is not None and camera.depth_unit_m < _LEAST_UNIT_M:
+        raise InputError(
+            f"depth_unit_m is {camera.depth_unit_m:g}, finer than any sensor's; it is metres a "
+            "unit: 0.001 means millimetres"
+        )
+    if camera.depth_unit_m is not None and camera.depth_unit_m > 1:
+        raise InputError(
+            f"depth_unit_m is {camera.depth_unit_m:g}, which looks like units a metre; it is "
+            f"metres a unit: write {1 / camera.depth_unit_m:g}"
+        )
     if facts.size is None:
         refuse_other_resolution(camera.K, camera.width, camera.height)
     return camera
@@ -490,42 +524,4 @@ def refuse_squeezed(K: Float[Tensor, "3 3"]) -> None:
             f"K has fx {fx:g} and fy {fy:g}, as if pixels were {max(fx / fy, fy / fx):.2g} times "
             "longer than wide; multiply both by what its direction was scaled by. Where pixels "
             "truly are so, scale the image, and K with it, until they are square"
-        )
-
-
-def _refuse_units(camera: Camera, *, is_metric: bool) -> None:
-    fx = float(camera.K[0, 0])
-    size = f"{camera.width}x{camera.height}"
-    _refuse_normalised(camera.K, camera.width, camera.height)
-    if fx < _MM_FX_SHARE * camera.width:
-        raise InputError(
-            f"K has fx {fx:g} for {size} pixels, so it looks like millimetres; divide by the "
-            "width of a pixel in mm"
-        )
-    if fx > _MAX_FX_SHARE * camera.width:
-        raise InputError(
-            f"K has fx {fx:g} for {size} pixels, which sees less than 0.3 degrees; give it in "
-            "pixels of this image"
-        )
-    refuse_squeezed(camera.K)
-    refuse_outside(camera.K, camera.width, camera.height)
-    if isinstance(camera, StereoRig):
-        how = 'written as ours: width, height, K, "baseline_m"'
-        how = "made in Python, as a StereoRig" if is_metric else how
-        most_m = _FILE_BASELINE_M if is_metric else WIDE_BASELINE_M
-        refuse_baseline(camera.baseline_m, f"a rig that is truly this wide is {how}", most_m)
-        if abs(camera.cx_right_minus_left_px) >= camera.width:
-            raise InputError(
-                f"the principal points differ by {camera.cx_right_minus_left_px:g} px, more than "
-                f"the image of {size} is wide; are both cameras of one size? Copy them anew"
-            )
-    if camera.depth_unit_m is not None and camera.depth_unit_m < _LEAST_UNIT_M:
-        raise InputError(
-            f"depth_unit_m is {camera.depth_unit_m:g}, finer than any sensor's; it is metres a "
-            "unit: 0.001 means millimetres"
-        )
-    if camera.depth_unit_m is not None and camera.depth_unit_m > 1:
-        raise InputError(
-            f"depth_unit_m is {camera.depth_unit_m:g}, which looks like units a metre; it is "
-            f"metres a unit: write {1 / camera.depth_unit_m:g}"
         )

@@ -37,7 +37,16 @@ def read_storage(path: AnyPath, text: str) -> Names | None:
     if len(text) > _MAX_TEXT:
         return None
     if text.lstrip().startswith("<"):
-        return _read_xml(path, text)
+        if _DECLARATION.search(text):
+            raise InputError(
+                f"{path}: XML with declarations (<!...>), which no camera needs; drop them"
+            )
+        with refused_as(path, "camera file", "correct it there"):
+            root = ElementTree.fromstring(text)  # noqa: S314  entities are refused above
+        if root.tag != "opencv_storage":
+            return None
+        nodes = {node.tag: {leaf.tag: leaf.text for leaf in node} or node.text for node in root}
+        return named(nodes)
     body = _YAML_HEAD.sub("", text)
     with refused_as(path, "camera file", f"correct it there; known are {KNOWN_FILES}"):
         refuse_yaml_bomb(path, body)
@@ -95,18 +104,6 @@ def _of_opencv(loader: Any, _suffix: str, node: yaml.Node) -> object:  # noqa: A
 
 
 _Loader.add_multi_constructor("tag:yaml.org,2002:opencv-", _of_opencv)
-
-
-def _read_xml(path: AnyPath, text: str) -> Names | None:
-    if _DECLARATION.search(text):
-        raise InputError(
-            f"{path}: XML with declarations (<!...>), which no camera needs; drop them"
-        )
-    with refused_as(path, "camera file", "correct it there"):
-        root = ElementTree.fromstring(text)  # noqa: S314  entities are refused above
-    if root.tag != "opencv_storage":
-        return None
-    return named({node.tag: {leaf.tag: leaf.text for leaf in node} or node.text for node in root})
 
 
 _SUFFIXES = (".yaml", ".yml", ".xml")

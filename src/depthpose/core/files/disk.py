@@ -77,6 +77,17 @@ def refused_as(path: AnyPath, kind: str, remedy: str) -> Iterator[None]:
 
 
 @contextmanager
+def naming(path: AnyPath) -> Iterator[None]:
+    """Begin the message of an :class:`InputError` with the file that it is of."""
+    try:
+        yield
+    except InputError as error:
+        if str(error).startswith(f"{path}"):
+            raise
+        raise InputError(f"{path}: {error}") from error
+
+
+@contextmanager
 def refused_write(path: AnyPath) -> Iterator[None]:
     """Turn what a disk refuses to take into an :class:`InputError`.
 
