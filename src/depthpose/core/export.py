@@ -7,8 +7,7 @@ where it shrinks. The proof: largest and mean difference to PyTorch's answers, a
 import json
 import logging
 import warnings
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from importlib import import_module
 from importlib.metadata import version
@@ -337,15 +336,21 @@ def network_model(module: nn.Module, images: Sequence[Tensor], multiple: int) ->
     batch = torch.export.Dim("batch", min=1, max=MOST)
     rows, columns = (torch.export.Dim(name, min=1, max=MOST) for name in ("rows", "columns"))
     free = {0: batch, 2: multiple * rows, 3: multiple * columns}
-    with _quiet(), torch.no_grad():
-        program = torch.onnx.export(
-            module,
-            tuple(images),
-            dynamo=True,
-            opset_version=OPSET,
-            dynamic_shapes=tuple(free for _ in images),
-            verbose=False,
-        )
+    logger = logging.getLogger("torch.onnx")  # its messages are of the exporter's inside
+    level = logger.level
+    logger.setLevel(logging.ERROR)
+    try:
+        with warnings.catch_warnings(action="ignore"), torch.no_grad():
+            program = torch.onnx.export(
+                module,
+                tuple(images),
+                dynamo=True,
+                opset_version=OPSET,
+                dynamic_shapes=tuple(free for _ in images),
+                verbose=False,
+            )
+    finally:
+        logger.setLevel(level)
     assert program is not None
     model = onnx.inliner.inline_local_functions(program.model_proto)
     # Stack traces, paths and names of lines would identify the exporting machine.
@@ -354,17 +359,3 @@ def network_model(module: nn.Module, images: Sequence[Tensor], multiple: int) ->
         part.doc_string = ""
     del model.graph.value_info[:]
     return model
-
-
-@contextmanager
-def _quiet() -> Iterator[None]:
-    """Suppress the exporter's internal messages; the proof decides."""
-    logger = logging.getLogger("torch.onnx")
-    level = logger.level
-    logger.setLevel(logging.ERROR)
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
-            yield
-    finally:
-        logger.setLevel(level)

@@ -65,8 +65,7 @@ def refused_as(path: AnyPath, kind: str, remedy: str) -> Iterator[None]:
     sizes are checked by us.
     """
     try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
+        with warnings.catch_warnings(action="ignore"):
             yield
     except InputError:
         raise
