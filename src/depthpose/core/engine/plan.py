@@ -77,7 +77,14 @@ def find_items(words: Sequence[str], files: Files) -> list[Item]:
     else:
         listed = [url for word in others for url in list_files(word, files.suffixes)]
         items += [Item(stem(url), (url,)) for url in listed]
-    _refuse_twice(items)
+    first: dict[str, Item] = {}
+    for item in items:
+        other = first.setdefault(item.name, item)
+        if other is not item:
+            raise InputError(
+                f"{other.files[0]} and {item.files[0]} would both be {item.name!r} in the "
+                "results; give a manifest with a column 'name'"
+            )
     return items
 
 
@@ -133,7 +140,11 @@ def _pair(words: Sequence[str], files: Files) -> list[Item]:
 
 
 def _read_manifest(url: str, roles: Sequence[str]) -> Iterator[Item]:
-    rows = _parquet_rows(url) if url.lower().endswith(".parquet") else _csv_rows(url)
+    rows = (
+        parquet_rows(url, "a Parquet manifest")
+        if url.lower().endswith(".parquet")
+        else _csv_rows(url)
+    )
     folder = url.rpartition("/")[0] or "."
     for number, row in enumerate(rows, 1):
         missing = [role for role in roles if not isinstance(row.get(role), str) or not row[role]]
@@ -142,15 +153,15 @@ def _read_manifest(url: str, roles: Sequence[str]) -> Iterator[Item]:
                 f"{url}: row {number} has no {missing[0]!r}; the columns are "
                 f"{', '.join(roles)} (paths or URLs) and, if you like, name"
             )
-        files = tuple(_beside(row[role], folder) for role in roles)
+        paths = [row[role] for role in roles]
+        is_full = [is_url(path) or path.startswith("/") for path in paths]
+        files = tuple(
+            path if full else absolute(join(folder, path))
+            for path, full in zip(paths, is_full, strict=True)
+        )
         name = row.get("name") or stem(files[0])
         refuse_name(str(name), f"{url}: row {number}")
         yield Item(str(name), files)
-
-
-def _beside(path: str, folder: str) -> str:
-    """Read a relative path from its manifest's folder."""
-    return path if is_url(path) or path.startswith("/") else absolute(join(folder, path))
 
 
 def _csv_rows(url: str) -> Iterator[Mapping[str, Any]]:
@@ -161,25 +172,15 @@ def _csv_rows(url: str) -> Iterator[Mapping[str, Any]]:
         raise InputError(f"{url}: not a CSV table in UTF-8 ({error}); save it so") from error
 
 
-def _parquet_rows(url: str) -> Iterator[Mapping[str, Any]]:
-    arrow = import_pyarrow("a Parquet manifest")
+def parquet_rows(url: str, purpose: str) -> Iterator[dict[str, Any]]:
+    """Read the rows of a Parquet file one by one, few at a time."""
+    arrow = import_pyarrow(purpose)
     try:
         file = arrow.parquet.ParquetFile(io.BytesIO(read_from(url)))
-        for batch in file.iter_batches():
+        for batch in file.iter_batches(batch_size=8):
             yield from batch.to_pylist()
     except (arrow.ArrowException, OSError) as error:
         raise InputError(f"{url}: not a Parquet file ({error}); write it anew") from error
-
-
-def _refuse_twice(items: Sequence[Item]) -> None:
-    first: dict[str, Item] = {}
-    for item in items:
-        other = first.setdefault(item.name, item)
-        if other is not item:
-            raise InputError(
-                f"{other.files[0]} and {item.files[0]} would both be {item.name!r} in the "
-                "results; give a manifest with a column 'name'"
-            )
 
 
 PLAN = "plan.jsonl"
