@@ -168,14 +168,14 @@ def _refuse_misfits(network: nn.Module, checkpoint: Checkpoint, source: str) -> 
         )
 
 
-def misfits(wanted: Mapping[str, Tensor], given: Mapping[str, Tensor]) -> list[str]:
+def misfits(wanted: Mapping[str, Tensor], tensors: Mapping[str, Tensor]) -> list[str]:
     """Say in order of the names which tensors are missing, unexpected or of another shape."""
-    problems = [f"{name} is missing" for name in wanted.keys() - given.keys()]
-    problems += [f"{name} is unexpected" for name in given.keys() - wanted.keys()]
+    problems = [f"{name} is missing" for name in wanted.keys() - tensors.keys()]
+    problems += [f"{name} is unexpected" for name in tensors.keys() - wanted.keys()]
     problems += [
-        f"{name} is {tuple(given[name].shape)}, not {tuple(tensor.shape)}"
+        f"{name} is {tuple(tensors[name].shape)}, not {tuple(tensor.shape)}"
         for name, tensor in wanted.items()
-        if name in given and given[name].shape != tensor.shape
+        if name in tensors and tensors[name].shape != tensor.shape
     ]
     return sorted(problems)
 

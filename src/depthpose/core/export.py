@@ -101,8 +101,8 @@ class Graph:
         """Put a whole model's nodes here and give its outputs."""
         prefix = self._new_name("network") + "/"
         inner = self._onnx.compose.add_prefix(network, prefix).graph
-        for given, wanted in zip(inputs, inner.input, strict=True):
-            node = self._onnx.helper.make_node("Identity", [given.name], [wanted.name])
+        for value, wanted in zip(inputs, inner.input, strict=True):
+            node = self._onnx.helper.make_node("Identity", [value.name], [wanted.name])
             self._nodes.append(node)
         self._nodes += inner.node
         self._constants += inner.initializer
@@ -122,11 +122,11 @@ class Graph:
         self._onnx.checker.check_model(model, full_check=True)
         return model
 
-    def _name_of(self, given: Any) -> str:  # noqa: ANN401
-        if isinstance(given, Value):
-            return given.name
+    def _name_of(self, value: Any) -> str:  # noqa: ANN401
+        if isinstance(value, Value):
+            return value.name
         name = self._new_name("constant")
-        self._constants.append(self._onnx.numpy_helper.from_array(np.asarray(given), name))
+        self._constants.append(self._onnx.numpy_helper.from_array(np.asarray(value), name))
         return name
 
     def _new_name(self, kind: str) -> str:

@@ -90,7 +90,7 @@ _TURN_RAD, _TILT_RAD = math.radians(35), math.radians(20)
 
 @torch.inference_mode()
 def seen_points(
-    net: GeoPoseNet, given: AnyInput
+    net: GeoPoseNet, pose_input: AnyInput
 ) -> tuple[Float[Tensor, "n 3"], Float[Tensor, "n c"]] | None:
     """Give the points that the network sees, in the camera frame, and its features of them.
 
@@ -99,8 +99,8 @@ def seen_points(
     network = net.weights.network
     if not isinstance(network, ResUNet):
         raise InputError("figure 3-2 shows features of the sparse network; give weights of it")
-    model = next(m for m in net.weights.models if m.name == given.object)
-    prepared = prepare_cloud(given, model, net.weights.cloud, net.config)
+    model = next(m for m in net.weights.models if m.name == pose_input.object)
+    prepared = prepare_cloud(pose_input, model, net.weights.cloud, net.config)
     if isinstance(prepared, Refusal):
         return None
     grid = prepared.voxels

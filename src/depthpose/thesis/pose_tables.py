@@ -316,8 +316,8 @@ def cases_of(
     numbers = {model.name: k for k, model in enumerate(net.weights.models)}
     for view in views:
         number = numbers[view.input.object]
-        model, given = net.weights.models[number], view.input
-        cloud = cloud_from_depth(given.depth_m, given.mask, given.K, model.diameter_m).float()
+        model, seen = net.weights.models[number], view.input
+        cloud = cloud_from_depth(seen.depth_m, seen.mask, seen.K, model.diameter_m).float()
         generator = torch.Generator().manual_seed(0)
         points_m = sample_points(cloud, points, generator)
         if refusal_of(points_m, net.weights.cloud) is not None:
