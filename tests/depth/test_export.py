@@ -3,13 +3,14 @@ import json
 import re
 import subprocess
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 import torch
-from tests.depth.constant_selection import CONFIG, of_all_kinds
+from tests.depth.constant_selection import CONFIG, SHORT_STAGES, of_all_kinds
 from tests.depth.test_stereo_light import SMALL
 
 from depthpose.cli import main
@@ -72,6 +73,14 @@ def of_streets() -> SelectionGenerator:
     )
     generator.street = torch.nn.Linear(3 * generator.encoder.channels[-1], 1)
     return generator
+
+
+@pytest.fixture(scope="module", autouse=True)
+def short_encoder() -> Iterator[None]:
+    """An encoder of 8 blocks in place of 16: an export takes time for every operator."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("depthpose.depth.encoder._STAGES", SHORT_STAGES)
+        yield
 
 
 @pytest.fixture(scope="module")

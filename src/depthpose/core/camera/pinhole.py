@@ -274,32 +274,18 @@ _CORNER = 0.1
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class CameraFacts:
-    """Values of a camera file, before it is a camera: the image's size may be missing.
+    """Values of a camera file, before it is a camera: the image's size may be missing."""
 
-    Attributes:
-        kind: what the file is, for errors.
-        K: intrinsic matrix of the undistorted image [px].
-        size: of the image, where the file has it.
-        baseline_m: where there is a rig.
-        cx_right_minus_left_px: difference of the principal points of a rig.
-        is_metric: whether the format says the unit of the baseline.
-        depth_unit_m: metres per unit of the depth images, where the file has it.
-        mount_height_m: height of the camera above the road, where the file has it.
-        tilt_deg: of the camera, positive upwards, where the file has it.
-        distortion: coefficients of the lens; none, or zeros, for a pinhole.
-        undistort: what takes the distortion out of an image.
-    """
-
-    kind: str
+    kind: str  # of file, for errors
     K: Float[Tensor, "3 3"]
     size: Size | None = None
     baseline_m: float | None = None
     cx_right_minus_left_px: float = 0.0
-    is_metric: bool = False
+    is_metric: bool = False  # whether the format says the unit of the baseline
     depth_unit_m: float | None = None
     mount_height_m: float | None = None
     tilt_deg: float | None = None
-    distortion: tuple[float, ...] = ()
+    distortion: tuple[float, ...] = ()  # coefficients; none, or zeros, of a pinhole
     undistort: str = "cv2.undistort(image, K, distortion)"
 
 

@@ -25,19 +25,12 @@ Columns = dict[str, np.ndarray]
 
 @dataclass(frozen=True, kw_only=True)
 class Field:
-    """One named column of a record: ``count`` numbers of one type.
-
-    Attributes:
-        name: as the file names it.
-        code: numpy's type code without byte order, such as ``f4``.
-        count: numbers a record; a field of several is stepped over.
-        size_code: of a list, the type of the number of its values; None: it is no list.
-    """
+    """One named column of a record."""
 
     name: str
-    code: str
-    count: int = 1
-    size_code: str | None = None
+    code: str  # numpy's, without byte order, as "f4"
+    count: int = 1  # numbers a record; a field of several is stepped over
+    size_code: str | None = None  # of a list, the type of its length; None: it is no list
 
 
 @dataclass(frozen=True, eq=False)
