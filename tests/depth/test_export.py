@@ -58,7 +58,7 @@ def calm_matcher() -> PSMNet:
 
 def tiny_weights(**settings: object) -> DepthWeights:
     torch.manual_seed(0)
-    rig = {"width": 2, "levels": 4, "virtual_focal_px": 90.0, "virtual_baseline_m": 0.5}
+    rig = {"width": 2, "levels": 2, "virtual_focal_px": 90.0, "virtual_baseline_m": 0.5}
     generator = UNetGenerator(GeneratorConfig(**rig | settings)).eval()  # pyright: ignore[reportArgumentType]
     matcher = tiny_matcher(work_focal_px=70.0)
     return DepthWeights(generator=generator, matcher=matcher, facts=TERMS)
