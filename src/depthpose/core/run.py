@@ -234,12 +234,15 @@ def claim_folder(
     if not record.exists():
         write_once(record, run_record(settings))
     is_alone = find_rank().world == 1
-    if is_alone and _is_empty(folder) and _has_other_settings(record, settings):
-        lock_folder(record, is_shared=False)
-        if _is_empty(folder):  # a run that failed before its first result
-            (folder / _SOURCES).unlink(missing_ok=True)
-            rewrite_record(record, run_record(settings))
-            return
+    if is_alone and _is_empty(folder):  # a run that failed before its first result
+        earlier = _read_record(record)
+        there = earlier.get("settings") if isinstance(earlier, dict) else None
+        if isinstance(there, dict) and _flat(there) != _flat(settings):
+            lock_folder(record, is_shared=False)
+            if _is_empty(folder):
+                (folder / _SOURCES).unlink(missing_ok=True)
+                rewrite_record(record, run_record(settings))
+                return
     refuse_other_settings(folder, _read_record(record), settings, remedy)
     if lock_folder(record, is_shared=not is_alone):
         remove_parts(folder)
@@ -253,12 +256,6 @@ def _read_record(record: Path) -> object:
             f"{error}. What made the results is not known any more: choose another folder, or "
             "delete this one"
         ) from error
-
-
-def _has_other_settings(record: Path, settings: Mapping[str, Any]) -> bool:
-    earlier = _read_record(record)
-    there = earlier.get("settings") if isinstance(earlier, dict) else None
-    return isinstance(there, dict) and _flat(there) != _flat(settings)
 
 
 def _is_empty(folder: Path) -> bool:
@@ -302,7 +299,16 @@ def claim_names(
     }
     known = _known_sources(folder)
     made = {*results, *(_FRAME.sub("", stem) for stem in results)}
-    wanted = {name: _entry(files) for name, files in sources.items()}
+    wanted: dict[str, list[str]] = {}
+    for name, files in sources.items():
+        every = [files] if isinstance(files, Path) else list(files)
+        stamps: list[str] = []  # size and time, by which a change is noticed
+        for path in every:
+            with suppress(OSError):
+                facts = path.stat()
+                if path.is_file():
+                    stamps.append(f"{facts.st_size} bytes of {facts.st_mtime_ns}")
+        wanted[name] = [str(every[0].resolve()), ", ".join(stamps)]
     for name, (path, stamp) in wanted.items():
         earlier, before = _source(known.get(name, [path, stamp]))
         if earlier != path:
@@ -332,12 +338,6 @@ def claim_names(
         write_json(record, known | wanted)
 
 
-def _entry(files: Path | Sequence[Path]) -> list[str]:
-    """Give the first of some files, and the stamps of all."""
-    every = [files] if isinstance(files, Path) else list(files)
-    return [str(every[0].resolve()), ", ".join(filter(None, map(_stamp, every)))]
-
-
 def read_sources(folder: Path) -> dict[str, Path]:
     """Give the file that each result of ``folder`` was made from, by the name of the result."""
     paths = {name: _source(entry)[0] for name, entry in _known_sources(folder).items()}
@@ -358,15 +358,6 @@ def _source(entry: object) -> tuple[str, str]:
     entry = entry if isinstance(entry, list) else [entry, ""]
     path, stamp = [*entry, "", ""][:2]
     return path if isinstance(path, str) else "", stamp if isinstance(stamp, str) else ""
-
-
-def _stamp(path: Path) -> str:
-    """Size and time of a file, by which a change is noticed; empty for what is none."""
-    try:
-        facts = path.stat()
-    except OSError:
-        return ""
-    return f"{facts.st_size} bytes of {facts.st_mtime_ns}" if path.is_file() else ""
 
 
 def refuse_to_replace(path: Path) -> None:

@@ -140,11 +140,14 @@ def _pair(words: Sequence[str], files: Files) -> list[Item]:
 
 
 def _read_manifest(url: str, roles: Sequence[str]) -> Iterator[Item]:
-    rows = (
-        parquet_rows(url, "a Parquet manifest")
-        if url.lower().endswith(".parquet")
-        else _csv_rows(url)
-    )
+    if url.lower().endswith(".parquet"):
+        rows: Iterable[Mapping[str, Any]] = parquet_rows(url, "a Parquet manifest")
+    else:
+        try:
+            text = io.StringIO(read_from(url).decode("utf-8-sig"), newline="")
+            rows = list(csv.DictReader(text, strict=True))
+        except (UnicodeDecodeError, csv.Error) as error:
+            raise InputError(f"{url}: not a CSV table in UTF-8 ({error}); save it so") from error
     folder = url.rpartition("/")[0] or "."
     for number, row in enumerate(rows, 1):
         missing = [role for role in roles if not isinstance(row.get(role), str) or not row[role]]
@@ -162,14 +165,6 @@ def _read_manifest(url: str, roles: Sequence[str]) -> Iterator[Item]:
         name = row.get("name") or stem(files[0])
         refuse_name(str(name), f"{url}: row {number}")
         yield Item(str(name), files)
-
-
-def _csv_rows(url: str) -> Iterator[Mapping[str, Any]]:
-    try:
-        text = read_from(url).decode("utf-8-sig")
-        yield from csv.DictReader(io.StringIO(text, newline=""), strict=True)
-    except (UnicodeDecodeError, csv.Error) as error:
-        raise InputError(f"{url}: not a CSV table in UTF-8 ({error}); save it so") from error
 
 
 def parquet_rows(url: str, purpose: str) -> Iterator[dict[str, Any]]:
@@ -224,7 +219,11 @@ def make_plan(out: str, items: Sequence[Item], tars: Sequence[str], size: int) -
     The plan is a file in ``out``, so that a shard means the same inputs in every run, whatever
     has been added to a folder since.
     """
-    known = _read_plan(join(out, PLAN))
+    known: list[Block] = []
+    plan = join(out, PLAN)
+    with suppress(ValueError, KeyError, TypeError, AttributeError):  # what is damaged, and follows
+        for line in read_from(plan).splitlines() if exists(plan) else ():
+            known.append(Block.from_json(line.decode()))  # noqa: PERF401  those before the damage
     files = {item.name: item.files for block in known for item in block.items}
     for item in items:
         if files.get(item.name, item.files) != item.files:
@@ -243,14 +242,5 @@ def make_plan(out: str, items: Sequence[Item], tars: Sequence[str], size: int) -
     ]
     if lots:
         lines = "".join(f"{block.to_json()}\n" for block in blocks)
-        publish_bytes(lines.encode(), join(out, PLAN))
-    return blocks
-
-
-def _read_plan(url: str) -> list[Block]:
-    """Read a plan up to where it is damaged; what follows is planned again."""
-    blocks: list[Block] = []
-    with suppress(ValueError, KeyError, TypeError, AttributeError):
-        for line in read_from(url).splitlines() if exists(url) else ():
-            blocks.append(Block.from_json(line.decode()))  # noqa: PERF401  those before the damage
+        publish_bytes(lines.encode(), plan)
     return blocks

@@ -341,7 +341,14 @@ def read_pcd(path: AnyPath) -> Columns:
         if not line.startswith("#")
     )
     header = {words[0]: words[1:] for words in lines if words}
-    fields, count = _parse_fields(path, header), _parse_count(path, header)
+    fields = _parse_fields(path, header)
+    match header.get("POINTS"), header.get("WIDTH"), header.get("HEIGHT"):
+        case [points], _, _ if _is_count(points):
+            count = int(points)
+        case None, [width], [height] if _is_count(width) and _is_count(height):
+            count = int(width) * int(height)
+        case _:
+            raise InputError(f"{path}: the PCD header says no number of POINTS; add that line")
     body = memoryview(data)[end.end() :]
     if end[1] == b"binary":
         return split_records(path, body, fields, count)
@@ -397,7 +404,10 @@ def decompress_lzf(packed: memoryview, size: int) -> bytes:
             at += 1
         start = len(out) - ((control & 31) << 8) - _byte(packed, at) - 1
         at += 1
-        _repeat(out, start, length + 2)
+        if start < 0:
+            raise ValueError("the compressed bytes refer to before their beginning")
+        piece = out[start : start + length + 2]  # shorter where source and target overlap
+        out += (piece * ((length + 2) // len(piece) + 1))[: length + 2]
     if len(out) != size or at > len(packed):
         raise ValueError(f"the compressed bytes do not unpack to {size}")
     return bytes(out)
@@ -407,13 +417,6 @@ def _byte(packed: memoryview, at: int) -> int:
     if at >= len(packed):
         raise ValueError("the compressed bytes end in the middle of a reference")
     return packed[at]
-
-
-def _repeat(out: bytearray, start: int, length: int) -> None:
-    if start < 0:
-        raise ValueError("the compressed bytes refer to before their beginning")
-    piece = out[start : start + length]  # shorter than length where source and target overlap
-    out += (piece * (length // len(piece) + 1))[:length]
 
 
 def _split_compressed(path: AnyPath, body: memoryview, fields: list[Field], count: int) -> Columns:
@@ -453,16 +456,6 @@ def _parse_fields(path: AnyPath, header: dict[str, list[str]]) -> list[Field]:
     if len(set(real)) != len(real):
         raise InputError(f"{path}: PCD fields {names} repeat a name; keep one of them")
     return [Field(name=n, code=_PCD_CODES[k, s], count=int(c)) for n, k, s, c in rows]
-
-
-def _parse_count(path: AnyPath, header: dict[str, list[str]]) -> int:
-    match header.get("POINTS"), header.get("WIDTH"), header.get("HEIGHT"):
-        case [points], _, _ if _is_count(points):
-            return int(points)
-        case None, [width], [height] if _is_count(width) and _is_count(height):
-            return int(width) * int(height)
-        case _:
-            raise InputError(f"{path}: the PCD header says no number of POINTS; add that line")
 
 
 def _is_count(text: str) -> bool:

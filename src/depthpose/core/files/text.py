@@ -176,19 +176,14 @@ def read_key_values(path: AnyPath) -> dict[str, list[float]]:
             raise InputError(f"{path}: line {number}, {text[:60]!r}, is not 'KEY: numbers'")
         if match[1] in values:
             raise InputError(f"{path}: line {number} gives {match[1]!r} again; keep one of them")
-        numbers = _numbers(match[2])
+        numbers: list[float] = []
+        with suppress(ValueError):  # a date, or other words
+            numbers = [float(word) for word in match[2].translate(_BRACKETS).split()]
         if not all(map(math.isfinite, numbers)):
             raise InputError(f"{path}: line {number}, {match[1]!r}, holds NaN or infinity")
         if numbers:
             values[match[1]] = numbers
     return values
-
-
-def _numbers(text: str) -> list[float]:
-    try:
-        return [float(word) for word in text.translate(_BRACKETS).split()]
-    except ValueError:
-        return []
 
 
 def refuse_number(text: str) -> NoReturn:

@@ -125,7 +125,8 @@ def read_metrics(folder: Path) -> list[dict[str, Any]]:
         if (
             isinstance(row, dict)
             and isinstance(row.get("step"), int)
-            and all(map(_is_number, row.values()))
+            # A whole number of 2**63 and beyond is no count, and none that is shown.
+            and all(type(v) is float or (type(v) is int and abs(v) < 2**63) for v in row.values())
         ):
             rows.append(row)
         elif line.endswith("\n"):
@@ -134,11 +135,6 @@ def read_metrics(folder: Path) -> list[dict[str, Any]]:
                 "holds curves alone, and no training goes on from it."
             )
     return rows
-
-
-def _is_number(value: object) -> bool:
-    # A whole number of 2**63 and beyond is no count, and none that is shown.
-    return isinstance(value, float) or (type(value) is int and abs(value) < 2**63)
 
 
 def card_text(name: str, facts: Mapping[str, str], measured: str = "") -> str:
