@@ -56,7 +56,8 @@ _MODELS = {
 """Models of distortion by name: whether it is that of a fisheye lens."""
 _COUNTS = {False: (4, 5, 8, 12, 14), True: (4,)}
 _MAX_BASELINE_M = 10.0
-_MOST_UNLIKE = 1.5
+_MAX_FOCAL_RATIO = 1.5
+"""Of the two cameras of a pair; more are of images of two sizes."""
 _KNOWN = (
     "a camchain of Kalibr, OpenCV's K1, D1, K2, D2, R and T (in one file, or intrinsics.yml and "
     "extrinsics.yml in a folder), or a folder with left.yaml and right.yaml of ROS"
@@ -281,7 +282,7 @@ def _pair(
     if left.is_fisheye != right.is_fisheye:
         raise InputError("one lens is a fisheye and the other is none; calibrate both as one kind")
     one, other = float(left.K[0, 0]), float(right.K[0, 0])
-    if not 1 / _MOST_UNLIKE < one / other < _MOST_UNLIKE:
+    if not 1 / _MAX_FOCAL_RATIO < one / other < _MAX_FOCAL_RATIO:
         raise InputError(
             f"fx is {one:g} on the left and {other:g} on the right, as of images of two sizes; "
             "scale one camera matrix and its images to those of the other"
