@@ -6,7 +6,6 @@ import torch
 import torch.nn.functional as F
 from torch import nn
 
-from depthpose.depth import encoder
 from depthpose.depth.config import Answer, SelectionConfig
 from depthpose.depth.synthesis import SelectionGenerator
 
@@ -19,12 +18,6 @@ CONFIG = SelectionConfig(
     virtual_focal_px=FOCAL_PX,
     virtual_baseline_m=BASELINE_M,
 )
-
-
-SHORT_STAGES = tuple(
-    (2 if number == 1 else 1, *stage[1:]) for number, stage in enumerate(encoder._STAGES)
-)
-"""Of the encoder: one block a stage, and two of the second, which has a residual then."""
 
 
 def sure_of(plane: int, answer: Answer = "own") -> SelectionGenerator:

@@ -3,14 +3,13 @@ import json
 import re
 import subprocess
 import sys
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 import torch
-from tests.depth.constant_selection import CONFIG, SHORT_STAGES, of_all_kinds
+from tests.depth.constant_selection import CONFIG, of_all_kinds
 from tests.depth.test_stereo_light import SMALL
 
 from depthpose.cli import main
@@ -58,7 +57,7 @@ def calm_matcher() -> PSMNet:
 
 def tiny_weights(**settings: object) -> DepthWeights:
     torch.manual_seed(0)
-    rig = {"width": 2, "levels": 2, "virtual_focal_px": 90.0, "virtual_baseline_m": 0.5}
+    rig = {"width": 2, "levels": 4, "virtual_focal_px": 90.0, "virtual_baseline_m": 0.5}
     generator = UNetGenerator(GeneratorConfig(**rig | settings)).eval()  # pyright: ignore[reportArgumentType]
     matcher = tiny_matcher(work_focal_px=70.0)
     return DepthWeights(generator=generator, matcher=matcher, facts=TERMS)
@@ -73,14 +72,6 @@ def of_streets() -> SelectionGenerator:
     )
     generator.street = torch.nn.Linear(3 * generator.encoder.channels[-1], 1)
     return generator
-
-
-@pytest.fixture(scope="module", autouse=True)
-def short_encoder() -> Iterator[None]:
-    """An encoder of 8 blocks in place of 16: an export takes time for every operator."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("depthpose.depth.encoder._STAGES", SHORT_STAGES)
-        yield
 
 
 @pytest.fixture(scope="module")

@@ -95,7 +95,7 @@ def _over_defaults(content: Mapping[Any, Any], kind: type) -> dict[str, Any]:
     A setting given instead of another (``INSTEAD`` in its class) removes that one's default.
     """
     laid: dict[str, Any] = dict(content)
-    for field in dataclasses.fields(kind):  # pyright: ignore[reportArgumentType]
+    for field in dataclasses.fields(kind):
         own, default = content.get(field.name), _default_of(field)
         if isinstance(own, Mapping) and dataclasses.is_dataclass(default):
             rivals = getattr(type(default), "INSTEAD", {})
