@@ -29,7 +29,7 @@ pytestmark = [
     pytest.mark.filterwarnings("default"),
 ]
 KILLS = int(os.environ.get("DEPTHPOSE_KILLS", "2"))
-PREDICTING_KILLS = int(os.environ.get("DEPTHPOSE_PREDICTING_KILLS", "20"))
+PREDICTING_KILLS = int(os.environ.get("DEPTHPOSE_PREDICTING_KILLS", "8"))
 _PAGE = 4096
 """Bytes that such a disk gives at once."""
 SHARES = (0.0, 0.3, 0.8)

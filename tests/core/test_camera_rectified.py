@@ -89,7 +89,7 @@ def test_a_vertical_offset_is_recognised_and_measured(down_px: float) -> None:
     assert "rectify the pair" in report.message
 
 
-@pytest.mark.parametrize("down_px", [-6, 12, 30, -80, 120])
+@pytest.mark.parametrize("down_px", [-6, 30, 120])
 def test_an_offset_of_any_size_is_measured(down_px: int) -> None:
     report = check_rectified(*pair(down_px))
     assert report.is_rectified is False
@@ -107,7 +107,7 @@ def test_a_small_rotation_is_recognised(degrees: float) -> None:
     assert float(found[1]) == pytest.approx(-degrees, abs=0.15)
 
 
-@pytest.mark.parametrize("degrees", [15.0, -20.0, 30.0, -45.0, 60.0, 75.0, -90.0, 90.0])
+@pytest.mark.parametrize("degrees", [15.0, -45.0, 75.0, -90.0])
 def test_a_large_rotation_is_named(degrees: float) -> None:
     left, right = pair()
     report = check_rectified(left, moved(right, degrees, 1.0))
@@ -117,7 +117,7 @@ def test_a_large_rotation_is_named(degrees: float) -> None:
     assert float(found[1]) == pytest.approx(degrees, abs=2)
 
 
-@pytest.mark.parametrize("scale", [0.7, 0.9, 1.05, 1.2, 1.35, 1.5])
+@pytest.mark.parametrize("scale", [0.7, 1.05, 1.5])
 def test_another_scale_is_named(scale: float) -> None:
     left, right = pair()
     report = check_rectified(left, moved(right, 0.0, scale))
@@ -177,7 +177,7 @@ def test_where_too_little_matches_it_cannot_tell(left: torch.Tensor, right: torc
     assert "cannot tell whether the pair is rectified" in report.message
 
 
-@pytest.mark.parametrize("seed", [1, 2, 3])
+@pytest.mark.parametrize("seed", [1, 2])
 def test_images_of_two_scenes_do_not_belong_together(seed: int) -> None:
     report = check_rectified(texture(240, 480), texture(240, 480, seed))
     assert report.is_pair is False
@@ -223,7 +223,7 @@ def test_a_wall_is_a_pair() -> None:
     assert (report.is_pair, report.is_rectified, report.is_swapped) == (True, True, False)
 
 
-@pytest.mark.parametrize("apart_px", [-150.0, -40.0, 40.0, 66.0, 150.0])
+@pytest.mark.parametrize("apart_px", [-150.0, 40.0, 66.0])
 def test_known_principal_points_apart_are_no_swap(apart_px: float) -> None:
     left, right = pair()
     cut = int(abs(apart_px))

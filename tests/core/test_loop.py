@@ -641,7 +641,7 @@ def test_a_kill_while_the_state_is_written_leaves_no_half_file(tmp_path: Path) -
 
 
 @pytest.mark.slow
-def test_twenty_kills_change_nothing(tmp_path: Path) -> None:
+def test_eight_kills_change_nothing(tmp_path: Path) -> None:
     whole, killed = tmp_path / "whole", tmp_path / "killed"
     for folder in (whole, killed):
         folder.mkdir()
@@ -651,7 +651,7 @@ def test_twenty_kills_change_nothing(tmp_path: Path) -> None:
         capture_output=True,
     )  # fmt: skip
     moments, kills = random.Random(0), 0
-    while kills < 20:
+    while kills < 8:
         words = [sys.executable, *program(killed, steps, 1, 0.1)]
         process = subprocess.Popen(words, env=environment(), stderr=subprocess.DEVNULL)
         _wait_for_progress(killed, process)

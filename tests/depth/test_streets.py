@@ -37,8 +37,8 @@ KITTI_EIGHTH = resize_camera(kitti_rig(), 155, 47)
 @pytest.fixture(scope="module")
 def frames() -> list[StreetFrame]:
     config = replace(PLAIN, with_lidar=True)
-    streets = [draw_street(config, index) for index in (0, 3, 8)]
-    clutter = [draw_street(replace(config, clutter_share=1.0), index) for index in (0, 2)]
+    streets = [draw_street(config, index) for index in (0, 8)]
+    clutter = [draw_street(replace(config, clutter_share=1.0), index) for index in (0,)]
     return streets + clutter
 
 
@@ -63,8 +63,8 @@ def test_a_frame_is_a_function_of_seed_and_index() -> None:
 def test_clutter_takes_its_share_and_leaves_the_streets_as_they_are() -> None:
     config = StreetsConfig(scale=0.05)
     half = replace(config, clutter_share=0.5)
-    streets = [bool(draw_street(half, i).is_road.any()) for i in range(24)]
-    assert 6 <= sum(streets) <= 18
+    streets = [bool(draw_street(half, i).is_road.any()) for i in range(10)]
+    assert 2 <= sum(streets) <= 8
     first = streets.index(True)
     assert torch.equal(draw_street(half, first).left, draw_street(config, first).left)
 
@@ -73,7 +73,7 @@ def test_clutter_is_within_reach_of_a_matcher_and_of_all_kinds() -> None:
     scenes = [make_clutter((0, index)) for index in range(20)]
     materials = {int(m) for scene in scenes for m in np.unique(scene.mesh.material)}
     assert len(materials) >= 20
-    for scene in scenes[:6]:
+    for scene in scenes[:3]:
         disparity_px = 8 * draw_scene(scene, KITTI_EIGHTH, PLAIN).disparity_px.nan_to_num(0)
         assert float(disparity_px.quantile(0.95)) < 128
         assert float(disparity_px.std()) > 5
@@ -224,7 +224,7 @@ def test_frames_are_pictures(frames: list[StreetFrame]) -> None:
             assert 0.6 < float(image.max()) <= 1
             assert 0.2 < float(image.mean()) < 0.75
             assert float(image.std()) > 0.08
-    for street in frames[:3]:
+    for street in frames[:2]:
         assert 0.1 < float(street.is_road.float().mean()) < 0.6
 
 

@@ -35,7 +35,7 @@ def shown(estimate: PoseEstimate, truth: Rigid | None = None) -> Section:
     depth_m, mask = view_of(bracket(), POSE)
     view = ViewInput(name="one", depth_m=depth_m, mask=mask, K=K, object="bracket")
     return pose_section(
-        "one", PoseShown(given=view, estimate=estimate, model=bracket(), truth=truth)
+        "one", PoseShown(input=view, estimate=estimate, model=bracket(), truth=truth)
     )
 
 
@@ -86,7 +86,7 @@ def test_a_refusal_says_why_and_shows_the_mask() -> None:
 
 def test_a_cloud_has_no_picture() -> None:
     cloud = CloudInput(name="one", points_m=cloud_of(bracket(), POSE), object="bracket")
-    section = pose_section("one", PoseShown(given=cloud, estimate=FOUND_HERE, model=bracket()))
+    section = pose_section("one", PoseShown(input=cloud, estimate=FOUND_HERE, model=bracket()))
     assert not section.pictures
     assert "all else" not in [layer.name for layer in section.scenes[0].layers]
 
@@ -95,7 +95,7 @@ def test_an_empty_mask_is_not_shown_from_near_by() -> None:
     depth_m, mask = view_of(bracket(), POSE)
     view = ViewInput(name="one", depth_m=depth_m, mask=mask & False, K=K, object="bracket")
     estimate = replace(REFUSED, reason="nothing")
-    section = pose_section("one", PoseShown(given=view, estimate=estimate, model=bracket()))
+    section = pose_section("one", PoseShown(input=view, estimate=estimate, model=bracket()))
     assert len(section.pictures) == 1
 
 

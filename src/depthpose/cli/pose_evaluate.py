@@ -249,7 +249,7 @@ def _shown(dataset: BopDataset, instance: Instance, estimate: PoseEstimate) -> P
     if (pose := estimate.camera_from_model) is not None:
         truth = nearest_copy(pose, truth, symmetry_transforms(model.symmetries), model.symmetries)
     return PoseShown(
-        given=dataset.view(instance).input,
+        input=dataset.view(instance).input,
         estimate=estimate,
         model=model,
         image=None if instance.rgb is None else read_image(instance.rgb),

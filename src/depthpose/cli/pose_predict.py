@@ -398,7 +398,7 @@ def _answer_sections(
         rgb = None if place is None else image_of[place[:2]]
         image = None if rgb is None else read_image(rgb)
         model = models[estimate.object]
-        shown = PoseShown(given=shown_input, estimate=estimate, model=model, image=image)
+        shown = PoseShown(input=shown_input, estimate=estimate, model=model, image=image)
         sections.append(pose_section(estimate.name, shown))
     return sections
 

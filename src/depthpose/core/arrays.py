@@ -30,16 +30,7 @@ def grey_of(image: Float[Tensor, "3 h w"]) -> Float[Tensor, "h w"]:
 
 
 def check_image(image: object, name: str, slack: float = 0.5) -> Image:
-    """Give an image back, or refuse what is none, with a remedy.
-
-    Args:
-        image: what a caller gave.
-        name: what to call it.
-        slack: how far values may leave [0, 1], as bicubic resizing makes them.
-
-    Raises:
-        InputError: not a tensor, not ``(3, H, W)``, not float, empty, not finite or not in [0, 1].
-    """
+    """Give an RGB image back, or refuse what is none; values may leave [0, 1] by ``slack``."""
     if not isinstance(image, Tensor):
         raise InputError(
             f"{name} must be a tensor, got {type(image).__name__}; read files with "

@@ -168,14 +168,14 @@ def _refuse_misfits(network: nn.Module, checkpoint: Checkpoint, source: str) -> 
         )
 
 
-def misfits(wanted: Mapping[str, Tensor], given: Mapping[str, Tensor]) -> list[str]:
+def misfits(wanted: Mapping[str, Tensor], tensors: Mapping[str, Tensor]) -> list[str]:
     """Say in order of the names which tensors are missing, unexpected or of another shape."""
-    problems = [f"{name} is missing" for name in wanted.keys() - given.keys()]
-    problems += [f"{name} is unexpected" for name in given.keys() - wanted.keys()]
+    problems = [f"{name} is missing" for name in wanted.keys() - tensors.keys()]
+    problems += [f"{name} is unexpected" for name in tensors.keys() - wanted.keys()]
     problems += [
-        f"{name} is {tuple(given[name].shape)}, not {tuple(tensor.shape)}"
+        f"{name} is {tuple(tensors[name].shape)}, not {tuple(tensor.shape)}"
         for name, tensor in wanted.items()
-        if name in given and given[name].shape != tensor.shape
+        if name in tensors and tensors[name].shape != tensor.shape
     ]
     return sorted(problems)
 
@@ -237,15 +237,7 @@ def read_published(path: Path, network: str) -> Mapping[str, Tensor]:
 def save_imported(
     out: Path, kind: str, network: nn.Module, source: Path, facts: Mapping[str, str]
 ) -> None:
-    """Write the weights of an imported network, with the checksum of the file that they are from.
-
-    Args:
-        out: the ``.safetensors`` file to write.
-        kind: of the checkpoint.
-        network: with the weights.
-        source: the published file.
-        facts: what the card says of them: ``trained_on``, ``licence``.
-    """
+    """Write the weights of an imported network, with the checksum of their source."""
     origin = {"origin": f"imported from a file with sha256 {file_sha256(source)}"}
     state = network.state_dict()
     save_checkpoint(out, Checkpoint(kind=kind, config={}, state=state, facts={**origin, **facts}))
@@ -275,15 +267,7 @@ def join_terms(*cards: Mapping[str, str]) -> str:
 
 
 def bound_facts(facts: Mapping[str, str], made_of: Iterable[str | Path]) -> dict[str, str]:
-    """Add to a card the terms of the weights that something is made of.
-
-    Args:
-        facts: the card, with terms of its own if it has any.
-        made_of: what names weights, as for :func:`find_weights`.
-
-    Raises:
-        InputError: there are no such weights.
-    """
+    """Add to a card the terms of the weights that something is made of."""
     cards = [read_checkpoint(find_weights(name)).facts for name in made_of]
     terms = join_terms(facts, *cards)
     return {**facts, "terms": terms} if terms else dict(facts)

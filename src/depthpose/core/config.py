@@ -2,40 +2,22 @@
 
 import dataclasses
 import math
+import types
 from collections.abc import Mapping
+from contextlib import suppress
 from functools import cache
 from pathlib import Path
-from typing import Any, Literal, TypeVar, get_args, get_origin, get_type_hints
+from typing import Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
 
-import dacite
 import yaml
 
 from depthpose.core.errors import InputError, nearest_name, refuse_unknown
 
-LONGEST = 500
+ConfigT = TypeVar("ConfigT")
+_LONGEST = 500
 """Letters of a value that an error shows."""
-
-
-def refuse_distorted(content: Mapping[Any, Any], kind: type, source: str, prefix: str = "") -> None:
-    """Refuse what would be cast to something else than was meant.
-
-    These are text or one number where a list belongs, truth values and text where a number
-    belongs, and numbers that are not finite, unless the setting's default is not finite itself.
-
-    Args:
-        content: values by the names of their settings; all are known.
-        kind: the dataclass of these settings.
-        source: where the values come from, for the error.
-        prefix: begins the names of the settings in errors, as ``inner.``.
-
-    Raises:
-        InputError: that is so.
-    """
-    hints = get_type_hints(kind)
-    fields = {field.name: field for field in dataclasses.fields(kind)}
-    for name, value in content.items():
-        if not isinstance(value, float) or value != default_of(fields[name]):
-            _refuse(value, hints[name], source, f"{prefix}{name}")
+_MAX_BYTES = 2**17
+"""Largest config file: a hundred times the largest of ours."""
 
 
 def check_settings(config: Any, **ranges: str) -> None:  # noqa: ANN401  any dataclass
@@ -54,7 +36,7 @@ def check_settings(config: Any, **ranges: str) -> None:  # noqa: ANN401  any dat
         for word in value if isinstance(value, tuple) else (value,):
             if word is not None:
                 refuse_unknown(name, word, words)
-    defaults = {field.name: default_of(field) for field in dataclasses.fields(config)}
+    defaults = {field.name: _default_of(field) for field in dataclasses.fields(config)}
     for name, interval in ranges.items():
         value, default = getattr(config, name), defaults[name]
         low, high = (float(end) for end in interval[1:-1].split(", "))
@@ -66,7 +48,7 @@ def check_settings(config: Any, **ranges: str) -> None:  # noqa: ANN401  any dat
             if not (is_above and is_below):
                 known = default is not dataclasses.MISSING and default is not None
                 remedy = f"; the default is {default}" if known else ""
-                raise InputError(f"{name} must be in {interval}, got {shown(value)}{remedy}")
+                raise InputError(f"{name} must be in {interval}, got {_shown(value)}{remedy}")
 
 
 @cache
@@ -81,93 +63,10 @@ def _words_of(kind: type) -> dict[str, tuple[str, ...]]:
     return words
 
 
-def default_of(field: dataclasses.Field[Any]) -> object:
-    """Give the default of a setting; ``dataclasses.MISSING`` where it has none."""
+def _default_of(field: dataclasses.Field[Any]) -> object:
     if field.default_factory is not dataclasses.MISSING:
         return field.default_factory()
     return field.default
-
-
-def dataclass_in(hint: object) -> type | None:
-    """Give the dataclass that a type is, or may be; None where there is none."""
-    candidates = (hint, *get_args(hint))
-    return next(
-        (c for c in candidates if isinstance(c, type) and dataclasses.is_dataclass(c)), None
-    )
-
-
-def shown(value: object) -> str:
-    """Show a value in an error, not beyond some length."""
-    text = repr(value)
-    return text if len(text) <= LONGEST else f"{text[:LONGEST]}..."
-
-
-def _refuse(value: object, hint: object, source: str, name: str) -> None:
-    nested = dataclass_in(hint)
-    choices = [hint, *get_args(hint)]
-    listed = next((c for c in choices if get_origin(c) is tuple), None)
-    if value is None and type(None) in choices:
-        return
-    if nested is not None:
-        if isinstance(value, Mapping):
-            refuse_distorted(value, nested, source, f"{name}.")
-    elif listed is not None:
-        _refuse_list(value, get_args(listed), source, name)
-    elif get_origin(hint) is dict:
-        for key, item in value.items() if isinstance(value, Mapping) else ():
-            _refuse(item, get_args(hint)[1], source, f"{name}.{key}")
-    elif float in choices or int in choices:
-        _refuse_number(value, source, name, is_whole=float not in choices)
-
-
-def _refuse_list(value: object, hints: tuple[Any, ...], source: str, name: str) -> None:
-    is_free = hints[-1] is Ellipsis
-    if not isinstance(value, list | tuple):
-        count = "a list" if is_free else f"a list of {len(hints)} values"
-        raise InputError(
-            f"{source}: {name} is {shown(value)}, but {count} is needed: "
-            f"{_as_list(value, 1 if is_free else len(hints))}"
-        )
-    if not is_free and len(value) != len(hints):
-        raise InputError(
-            f"{source}: {name} is {shown(value)}, but {len(hints)} values are needed: give so many"
-        )
-    each = hints[:1] * len(value) if is_free else hints
-    for place, (item, hint) in enumerate(zip(value, each, strict=True)):
-        _refuse(item, hint, source, f"{name}[{place}]")
-
-
-def _as_list(value: object, count: int) -> str:
-    if isinstance(value, str | int | float):
-        return f"write [{', '.join([str(value)[:LONGEST]] * count)}]"
-    return "write its values in brackets, or leave the key out"
-
-
-def _refuse_number(value: object, source: str, name: str, *, is_whole: bool) -> None:
-    sort = "a whole number" if is_whole else "a number"
-    if isinstance(value, bool):
-        raise InputError(f"{source}: {name} is {value}, but {sort} is needed: write one")
-    if is_whole:
-        return  # a wrong type; no cast makes it right
-    try:
-        is_finite = math.isfinite(float(value))  # pyright: ignore[reportArgumentType]
-    except (TypeError, ValueError):
-        raise InputError(
-            f"{source}: {name} is {shown(value)}, but {sort} is needed: write one"
-        ) from None
-    except OverflowError:
-        is_finite = False
-    if not is_finite:
-        raise InputError(
-            f"{source}: {name} is {shown(value)}, but a finite number is needed: write one, or "
-            "leave the key out for the default"
-        )
-
-
-ConfigT = TypeVar("ConfigT")
-
-_MAX_BYTES = 2**17
-"""Largest config file: a hundred times the largest of ours."""
 
 
 def read_config(path: Path, kind: type[ConfigT]) -> ConfigT:
@@ -187,43 +86,7 @@ def read_config(path: Path, kind: type[ConfigT]) -> ConfigT:
             f"{path}: holds a {type(content).__name__}, but a config is a mapping of names to "
             "values, one 'name: value' a line."
         )
-    content = _without_retired(content, kind)
-    _refuse_unknown_keys(content, kind, str(path), prefix="")
     return config_from_dict(_over_defaults(content, kind), kind, source=str(path))
-
-
-def config_from_dict(content: Mapping[Any, Any], kind: type[ConfigT], *, source: str) -> ConfigT:
-    """Build the dataclass ``kind`` from a mapping; ``source`` names the mapping in errors.
-
-    Raises:
-        InputError: an unknown key, a wrong type, or a value that ``kind`` refuses.
-    """
-    content = _without_retired(content, kind)
-    _refuse_unknown_keys(content, kind, source, prefix="")
-    refuse_distorted(content, kind, source)
-    try:
-        return dacite.from_dict(kind, content, dacite.Config(cast=[tuple, float, Path]))
-    except dacite.WrongTypeError as error:
-        raise InputError(
-            f"{source}: {error.field_path} is {shown(error.value)}, which is not of type "
-            f"{error.field_type}. Give a value of that type."
-        ) from error
-    except (dacite.DaciteError, ValueError, TypeError, OverflowError, AttributeError) as error:
-        raise InputError(f"{source}: {str(error)[:LONGEST]}") from error
-
-
-def config_to_dict(config: object) -> dict[str, Any]:
-    """Give every setting of a config with its value, nested, ready for YAML and JSON."""
-    plain = dataclasses.asdict(config)  # pyright: ignore[reportArgumentType]
-    return {name: _plain_value(value) for name, value in plain.items()}
-
-
-def write_config(path: Path, config: object) -> None:
-    """Write every setting of ``config``, defaults too, so that the file is a full record."""
-    from depthpose.core.files import atomic_write  # here: options load without torch
-
-    with atomic_write(path) as temporary:
-        temporary.write_text(yaml.safe_dump(config_to_dict(config), sort_keys=False))
 
 
 def _over_defaults(content: Mapping[Any, Any], kind: type) -> dict[str, Any]:
@@ -233,21 +96,125 @@ def _over_defaults(content: Mapping[Any, Any], kind: type) -> dict[str, Any]:
     """
     laid: dict[str, Any] = dict(content)
     for field in dataclasses.fields(kind):
-        own = content.get(field.name)
-        default = default_of(field)
+        own, default = content.get(field.name), _default_of(field)
         if isinstance(own, Mapping) and dataclasses.is_dataclass(default):
             rivals = getattr(type(default), "INSTEAD", {})
             left_out = {rivals[name] for name in own if name in rivals}
             kept = {k: v for k, v in config_to_dict(default).items() if k not in left_out}
-            nested = _over_defaults(own, type(default))
-            laid[field.name] = kept | nested
+            laid[field.name] = kept | _over_defaults(own, type(default))
     return laid
 
 
-def _without_retired(content: Mapping[Any, Any], kind: type) -> Mapping[Any, Any]:
-    """Leave out settings of before that mean nothing any more (``RETIRED`` in their class)."""
-    retired = getattr(kind, "RETIRED", ())
-    return {name: value for name, value in content.items() if name not in retired}
+def config_from_dict(content: Mapping[Any, Any], kind: type[ConfigT], *, source: str) -> ConfigT:
+    """Build the dataclass ``kind`` from a mapping; ``source`` names the mapping in errors.
+
+    Names of settings of before (``RETIRED`` in their class) are left out.
+
+    Raises:
+        InputError: an unknown key, a wrong type, or a value that ``kind`` refuses.
+    """
+    return _build(content, kind, source, "")
+
+
+def _build(content: Mapping[Any, Any], kind: type[Any], source: str, prefix: str) -> Any:  # noqa: ANN401
+    hints = get_type_hints(kind)
+    defaults = {field.name: _default_of(field) for field in dataclasses.fields(kind)}
+    values: dict[str, Any] = {}
+    for key, value in content.items():
+        if key in getattr(kind, "RETIRED", ()):
+            continue
+        if key not in defaults:
+            raise InputError(
+                f"{source}: unknown key {_shown(prefix + str(key))}; "
+                f"{nearest_name(str(key)[:_LONGEST], defaults)}"
+            )
+        # A default may be infinite, where no other number may.
+        is_default = isinstance(value, float) and value == defaults[key]
+        name = f"{prefix}{key}"
+        values[key] = value if is_default else _value_of(value, hints[key], source, name)
+    try:
+        return kind(**values)
+    except (ValueError, TypeError, OverflowError, AttributeError) as error:
+        raise InputError(f"{source}: {str(error)[:_LONGEST]}") from error
+
+
+def _value_of(value: Any, hint: Any, source: str, name: str) -> Any:  # noqa: ANN401, PLR0911
+    """Give a value of the type that a setting has; nothing is cast to what was not meant."""
+    if get_origin(hint) in (Union, types.UnionType):
+        if value is None and type(None) in get_args(hint):
+            return None
+        *others, hint = (choice for choice in get_args(hint) if choice is not type(None))
+        for other in others:
+            with suppress(InputError):
+                return _value_of(value, other, source, name)
+    if get_origin(hint) is tuple:
+        return tuple(_list_of(value, get_args(hint), source, name))
+    if get_origin(hint) is list:
+        return _list_of(value, (*get_args(hint), ...), source, name)
+    if get_origin(hint) is dict and isinstance(value, Mapping):
+        kind = get_args(hint)[1]
+        return {k: _value_of(item, kind, source, f"{name}.{k}") for k, item in value.items()}
+    if get_origin(hint) is Literal and value in get_args(hint):
+        return value
+    if dataclasses.is_dataclass(hint) and isinstance(value, Mapping):
+        assert isinstance(hint, type)
+        return _build(value, hint, source, f"{name}.")
+    if hint is float:
+        return _number_of(value, source, name)
+    if hint is int and isinstance(value, bool):
+        raise InputError(f"{source}: {name} is {value}, but a whole number is needed: write one")
+    if hint is Path and isinstance(value, str):
+        return Path(value)
+    if isinstance(hint, type) and isinstance(value, hint):
+        return value
+    raise InputError(
+        f"{source}: {name} is {_shown(value)}, which is not of type {hint}. Give a value of that "
+        "type."
+    )
+
+
+def _list_of(value: object, hints: tuple[Any, ...], source: str, name: str) -> list[Any]:
+    is_free = hints[-1] is Ellipsis
+    if not isinstance(value, list | tuple):
+        count = "a list" if is_free else f"a list of {len(hints)} values"
+        remedy = "write its values in brackets, or leave the key out"
+        if isinstance(value, str | int | float):
+            times = 1 if is_free else len(hints)
+            remedy = f"write [{', '.join([str(value)[:_LONGEST]] * times)}]"
+        raise InputError(f"{source}: {name} is {_shown(value)}, but {count} is needed: {remedy}")
+    if not is_free and len(value) != len(hints):
+        raise InputError(
+            f"{source}: {name} is {_shown(value)}, but {len(hints)} values are needed: give so many"
+        )
+    each = hints[:1] * len(value) if is_free else hints
+    pairs = enumerate(zip(value, each, strict=True))
+    return [_value_of(item, hint, source, f"{name}[{k}]") for k, (item, hint) in pairs]
+
+
+def _number_of(value: Any, source: str, name: str) -> float:  # noqa: ANN401
+    said = f"{source}: {name} is {_shown(value)}, but a"
+    try:
+        number = float("none" if isinstance(value, bool) else value)
+    except OverflowError:
+        number = math.inf
+    except (TypeError, ValueError):
+        raise InputError(f"{said} number is needed: write one") from None
+    if not math.isfinite(number):
+        raise InputError(
+            f"{said} finite number is needed: write one, or leave the key out for the default"
+        )
+    return number
+
+
+def _shown(value: object) -> str:
+    text = repr(value)
+    return text if len(text) <= _LONGEST else f"{text[:_LONGEST]}..."
+
+
+def config_to_dict(config: object) -> dict[str, Any]:
+    """Give every setting of a config with its value, nested, ready for YAML and JSON."""
+    plain = dataclasses.asdict(config)  # pyright: ignore[reportArgumentType]
+    return {name: _plain_value(value) for name, value in plain.items()}
 
 
 def _plain_value(value: object) -> object:
@@ -262,15 +229,9 @@ def _plain_value(value: object) -> object:
             return value
 
 
-def _refuse_unknown_keys(content: Mapping[Any, Any], kind: type, source: str, prefix: str) -> None:
-    hints = get_type_hints(kind)
-    known = [field.name for field in dataclasses.fields(kind)]
-    for key, value in content.items():
-        if key not in known:
-            raise InputError(
-                f"{source}: unknown key {shown(prefix + str(key))}; "
-                f"{nearest_name(str(key)[:LONGEST], known)}"
-            )
-        nested = dataclass_in(hints[key])
-        if nested is not None and isinstance(value, Mapping):
-            _refuse_unknown_keys(value, nested, source, f"{prefix}{key}.")
+def write_config(path: Path, config: object) -> None:
+    """Write every setting of ``config``, defaults too, so that the file is a full record."""
+    from depthpose.core.files import atomic_write  # here: options load without torch
+
+    with atomic_write(path) as temporary:
+        temporary.write_text(yaml.safe_dump(config_to_dict(config), sort_keys=False))

@@ -13,7 +13,7 @@ import torch
 
 from depthpose.core.errors import InputError, Notice
 
-Given = TypeVar("Given")
+Item = TypeVar("Item")
 Made = TypeVar("Made")
 
 
@@ -58,9 +58,9 @@ def each_in_own_arithmetic(made: Iterator[Made]) -> Iterator[Made]:
 
 
 def each_in_threads(
-    work: Callable[[Given], Made], given: Iterable[Given], threads: int
+    work: Callable[[Item], Made], items: Iterable[Item], threads: int
 ) -> Iterator[Made]:
-    """Do work for each of what is given, in its order, without gradients.
+    """Do work for each item, in its order, without gradients.
 
     No more is taken at a time than the threads work at; they share torch's processor cores.
 
@@ -71,14 +71,14 @@ def each_in_threads(
         raise InputError(f"threads is {threads}; take 1 or more, 2 where two cores are free")
     quiet = torch.no_grad()(work)
     if threads == 1:
-        yield from map(quiet, given)
+        yield from map(quiet, items)
         return
     cores = torch.get_num_threads()
     waiting: deque[Future[Made]] = deque()
     share = (max(1, cores // threads),)
     with ThreadPoolExecutor(threads, initializer=torch.set_num_threads, initargs=share) as pool:
         try:
-            for one in given:
+            for one in items:
                 waiting.append(pool.submit(quiet, one))
                 if len(waiting) == threads:
                     yield waiting.popleft().result()
@@ -136,12 +136,7 @@ def computes_bf16(device: str | torch.device) -> bool:
 
 
 def usable_precision(wanted: str, device: str | torch.device) -> str:
-    """Give ``wanted``; ``fp32`` and a :class:`PrecisionNotice` where this machine has no bf16.
-
-    Args:
-        wanted: fp32, bf16 or fp16.
-        device: where it is computed.
-    """
+    """Give ``wanted``; ``fp32`` and a :class:`PrecisionNotice` where this machine has no bf16."""
     if wanted != "bf16" or computes_bf16(device):
         return wanted
     notice = "this processor has no arithmetic for bf16 (AVX-512, AMX); fp32 is taken in its place"

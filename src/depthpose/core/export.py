@@ -7,8 +7,7 @@ where it shrinks. The proof: largest and mean difference to PyTorch's answers, a
 import json
 import logging
 import warnings
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from importlib import import_module
 from importlib.metadata import version
@@ -99,27 +98,18 @@ class Graph:
         return Value(self, out)
 
     def call(self, network: Any, *inputs: Value) -> tuple[Value, ...]:  # noqa: ANN401
-        """Put a whole model's nodes here and give its outputs.
-
-        Args:
-            network: an ONNX model, from :func:`depthpose.core.export.network_model`.
-            inputs: in the order of the model's own.
-        """
+        """Put a whole model's nodes here and give its outputs."""
         prefix = self._new_name("network") + "/"
         inner = self._onnx.compose.add_prefix(network, prefix).graph
-        for given, wanted in zip(inputs, inner.input, strict=True):
-            node = self._onnx.helper.make_node("Identity", [given.name], [wanted.name])
+        for value, wanted in zip(inputs, inner.input, strict=True):
+            node = self._onnx.helper.make_node("Identity", [value.name], [wanted.name])
             self._nodes.append(node)
         self._nodes += inner.node
         self._constants += inner.initializer
         return tuple(Value(self, output.name) for output in inner.output)
 
     def model(self, facts: Mapping[str, Any]) -> Any:  # noqa: ANN401
-        """Close the graph.
-
-        Args:
-            facts: for users of the file, each in its metadata, as text or JSON.
-        """
+        """Close the graph."""
         helper = self._onnx.helper
         graph = helper.make_graph(
             self._nodes, "depthpose", self._inputs, self._outputs, self._constants
@@ -132,11 +122,11 @@ class Graph:
         self._onnx.checker.check_model(model, full_check=True)
         return model
 
-    def _name_of(self, given: Any) -> str:  # noqa: ANN401
-        if isinstance(given, Value):
-            return given.name
+    def _name_of(self, value: Any) -> str:  # noqa: ANN401
+        if isinstance(value, Value):
+            return value.name
         name = self._new_name("constant")
-        self._constants.append(self._onnx.numpy_helper.from_array(np.asarray(given), name))
+        self._constants.append(self._onnx.numpy_helper.from_array(np.asarray(value), name))
         return name
 
     def _new_name(self, kind: str) -> str:
@@ -162,11 +152,7 @@ _PACKAGES = (
 
 
 def import_export() -> Any:  # noqa: ANN401  what protobuf generates carries no types
-    """Import ONNX, and make sure that what goes with it is there too.
-
-    Raises:
-        MissingExtraError: one of the three is not installed.
-    """
+    """Import ONNX, and make sure that what goes with it is there too."""
     for name in _PACKAGES:
         import_extra(name, "onnx, onnxruntime and onnxscript", "export", "export")
     return import_module("onnx")
@@ -213,12 +199,7 @@ class Limit:
 def measure_differences(
     path: Path, cases: Iterable[Case], limits: Mapping[str, Limit]
 ) -> list[Row]:
-    """Run a file with onnxruntime on each case, on the CPU, and give a row for each output.
-
-    Raises:
-        InputError: an output is NaN where PyTorch's is not, or the other way round, or off by
-            more than its limit, on more pixels than may flip; or there is no number to compare.
-    """
+    """Run a file with onnxruntime on each case, on the CPU, and give a row for each output."""
     session = import_module("onnxruntime").InferenceSession(
         str(path), providers=["CPUExecutionProvider"]
     )
@@ -235,11 +216,7 @@ def measure_differences(
 
 
 def refuse_beyond(rows: Iterable[Row]) -> None:
-    """Raise where a difference is beyond its limit.
-
-    Raises:
-        InputError: the first such row.
-    """
+    """Raise where a difference is beyond its limit."""
     for row in rows:
         difference, limit = row[f"{row['limited']} difference"], row["limit"]
         if not difference <= limit:  # pyright: ignore[reportOperatorIssue]  NaN fails too
@@ -312,16 +289,7 @@ class Export:
 
 
 def freeze(path: Path, export: Export) -> list[Row]:
-    """Write ``NAME.onnx``, once it agrees with PyTorch, and ``NAME.proof.json`` beside it.
-
-    Returns:
-        The differences, a row for each input and output.
-
-    Raises:
-        InputError: another suffix, a file that is there already, a place that cannot be written,
-            or answers that differ.
-        MissingExtraError: the extra ``export`` is not installed.
-    """
+    """Write ``NAME.onnx``, once it agrees with PyTorch, and ``NAME.proof.json`` beside it."""
     if path.suffix != ".onnx":
         raise InputError(f"{path}: the graph is written as ONNX; end the name in .onnx.")
     for file in (path, proof_path(path)):
@@ -368,15 +336,21 @@ def network_model(module: nn.Module, images: Sequence[Tensor], multiple: int) ->
     batch = torch.export.Dim("batch", min=1, max=MOST)
     rows, columns = (torch.export.Dim(name, min=1, max=MOST) for name in ("rows", "columns"))
     free = {0: batch, 2: multiple * rows, 3: multiple * columns}
-    with _quiet(), torch.no_grad():
-        program = torch.onnx.export(
-            module,
-            tuple(images),
-            dynamo=True,
-            opset_version=OPSET,
-            dynamic_shapes=tuple(free for _ in images),
-            verbose=False,
-        )
+    logger = logging.getLogger("torch.onnx")  # its messages are of the exporter's inside
+    level = logger.level
+    logger.setLevel(logging.ERROR)
+    try:
+        with warnings.catch_warnings(action="ignore"), torch.no_grad():
+            program = torch.onnx.export(
+                module,
+                tuple(images),
+                dynamo=True,
+                opset_version=OPSET,
+                dynamic_shapes=tuple(free for _ in images),
+                verbose=False,
+            )
+    finally:
+        logger.setLevel(level)
     assert program is not None
     model = onnx.inliner.inline_local_functions(program.model_proto)
     # Stack traces, paths and names of lines would identify the exporting machine.
@@ -385,17 +359,3 @@ def network_model(module: nn.Module, images: Sequence[Tensor], multiple: int) ->
         part.doc_string = ""
     del model.graph.value_info[:]
     return model
-
-
-@contextmanager
-def _quiet() -> Iterator[None]:
-    """Suppress the exporter's internal messages; the proof decides."""
-    logger = logging.getLogger("torch.onnx")
-    level = logger.level
-    logger.setLevel(logging.ERROR)
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
-            yield
-    finally:
-        logger.setLevel(level)

@@ -52,13 +52,13 @@ class CheckReport:
         return f"{self.layout}: {parts}; {verdict}, {len(self.notices)} notices"
 
 
-def make_report(layout: str, counts: dict[str, int], found: list[Problem]) -> CheckReport:
+def make_report(layout: str, counts: dict[str, int], remarks: list[Problem]) -> CheckReport:
     """Part what is wrong from what is only worth knowing."""
     return CheckReport(
         layout=layout,
         counts=counts,
-        problems=[problem for problem in found if problem.kind != "note"],
-        notices=[problem for problem in found if problem.kind == "note"],
+        problems=[problem for problem in remarks if problem.kind != "note"],
+        notices=[problem for problem in remarks if problem.kind == "note"],
     )
 
 

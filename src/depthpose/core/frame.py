@@ -6,11 +6,7 @@ from typing import Any
 
 
 def data_frame(rows: Iterable[Mapping[str, Any]]) -> Any:  # noqa: ANN401  pandas is no dependency
-    """Give rows as a ``pandas.DataFrame``; a mapping is a column ``NAME.ENTRY`` for each entry.
-
-    Raises:
-        ImportError: pandas is not installed; how to install it.
-    """
+    """Give rows as a ``pandas.DataFrame``; a mapping is a column ``NAME.ENTRY`` for each entry."""
     try:
         pandas = import_module("pandas")
     except ImportError as error:

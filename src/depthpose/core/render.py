@@ -41,24 +41,15 @@ class Raster:
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class _Prepared:
-    """Triangles that may be seen, in pixels.
+class _Triangles:
+    """Triangles that may be seen, in pixels."""
 
-    Attributes:
-        edges: per corner the line opposite to it; not negative inside.
-        plane: depth, or its inverse, at (u, v, 1).
-        first: first column and row that each may cover.
-        last: last column and row.
-        number: which triangle of the caller's it is.
-        is_inverse: whether ``plane`` gives 1 / depth (a pinhole) or depth (parallel rays).
-    """
-
-    edges: Float64[Tensor, "n 3 3"]
-    plane: Float64[Tensor, "n 3"]
-    first: Int64[Tensor, "n 2"]
-    last: Int64[Tensor, "n 2"]
-    number: Int64[Tensor, " n"]
-    is_inverse: bool
+    edges: Float64[Tensor, "n 3 3"]  # of each corner the line opposite to it; not negative inside
+    plane: Float64[Tensor, "n 3"]  # depth, or its inverse, at (u, v, 1)
+    first: Int64[Tensor, "n 2"]  # column and row from which on each may cover pixels
+    last: Int64[Tensor, "n 2"]  # the last ones
+    number: Int64[Tensor, " n"]  # which triangle of the caller's it is
+    is_inverse: bool  # whether plane gives 1 / depth (a pinhole) or depth (parallel rays)
 
 
 def rasterize(
@@ -94,7 +85,7 @@ def rasterize(
     number, first, last = _pinhole_boxes(corners, (width, height), near_m)
     raw, volume = _edges(corners.index_select(0, number))
     scale = torch.where(volume != 0, 1 / volume, 0)
-    prepared = _Prepared(
+    visible = _Triangles(
         edges=raw * volume.sign()[:, None, None],
         plane=raw.sum(1) * scale[:, None],
         first=first,
@@ -102,7 +93,7 @@ def rasterize(
         number=number,
         is_inverse=True,
     )
-    depth_m, primitive = _nearest(prepared, (width, height), near_m)
+    depth_m, primitive = _nearest(visible, (width, height), near_m)
     barycentric = None
     if with_barycentric:
         barycentric = barycentric_shares(*edge_functions(triangles, K), primitive)
@@ -137,7 +128,7 @@ def rasterize_orthographic(
     scale = torch.where(volume != 0, 1 / volume, 0)[:, None, None]
     # Sorting keys are the bits of a float, which ascend for positive numbers alone.
     above_m = (flat.index_select(0, number)[..., 2] - nearest_m)[..., None]
-    prepared = _Prepared(
+    visible = _Triangles(
         edges=raw * volume.sign()[:, None, None],
         plane=(raw * scale * above_m).sum(1),
         first=first,
@@ -145,7 +136,7 @@ def rasterize_orthographic(
         number=number,
         is_inverse=False,
     )
-    depth_m, primitive = _nearest(prepared, (width, height), 0.0)
+    depth_m, primitive = _nearest(visible, (width, height), 0.0)
     barycentric = barycentric_shares(*_edges(corners), primitive) if with_barycentric else None
     depth_m = (depth_m + nearest_m).to(triangles_px.dtype)
     return Raster(depth_m=depth_m, primitive=primitive, barycentric=barycentric)
@@ -242,14 +233,14 @@ def _boxes(
 
 
 def _nearest(
-    prepared: _Prepared, size: tuple[int, int], near_m: float
+    visible: _Triangles, size: tuple[int, int], near_m: float
 ) -> tuple[Float64[Tensor, "h w"], Int64[Tensor, "h w"]]:
     width, height = size
-    device = prepared.edges.device
+    device = visible.edges.device
     buffer = torch.full((width * height,), _EMPTY, dtype=torch.int64, device=device)
-    rows = prepared.last[:, 1] - prepared.first[:, 1] + 1
+    rows = visible.last[:, 1] - visible.first[:, 1] + 1
     for part in _chunks(rows, _MAX_ROWS):
-        _draw(prepared, part, buffer, width, near_m)
+        _draw(visible, part, buffer, width, near_m)
     is_seen = buffer != _EMPTY
     primitive = torch.where(is_seen, buffer & 0xFFFFFFFF, -1)
     depth_m = (buffer >> 32).int().view(torch.float32).double()
@@ -257,26 +248,26 @@ def _nearest(
     return depth_m.reshape(height, width), primitive.reshape(height, width)
 
 
-def _draw(prepared: _Prepared, part: slice, buffer: Tensor, width: int, near_m: float) -> None:
+def _draw(visible: _Triangles, part: slice, buffer: Tensor, width: int, near_m: float) -> None:
     """Enter some triangles into the buffer: first their rows, then the pixels of each row."""
-    which, row = _expand(prepared.first[part, 1], prepared.last[part, 1])
+    which, row = _expand(visible.first[part, 1], visible.last[part, 1])
     which = which + part.start
     v = row.double()
-    across, down, constant = prepared.edges.index_select(0, which).unbind(-1)
+    across, down, constant = visible.edges.index_select(0, which).unbind(-1)
     slope, offset = across, torch.addcmul(constant, down, v[:, None])
-    start, stop = _span(slope, offset, prepared.first[which, 0], prepared.last[which, 0])
+    start, stop = _span(slope, offset, visible.first[which, 0], visible.last[which, 0])
     kept = (start <= stop).nonzero()[:, 0]
     which, row, start, stop, v = (
         values.index_select(0, kept) for values in (which, row, start, stop, v)
     )
-    plane = prepared.plane.index_select(0, which)
+    plane = visible.plane.index_select(0, which)
     at_row = plane[:, 1] * v + plane[:, 2]
-    number = prepared.number.index_select(0, which)
+    number = visible.number.index_select(0, which)
     for some in _chunks(stop - start + 1, _MAX_PIXELS):
         span, u = _expand(start[some], stop[some])
         start_value = at_row[some].index_select(0, span)
         value = torch.addcmul(start_value, plane[some, 0].index_select(0, span), u)
-        depth = (1 / value if prepared.is_inverse else value.clamp(min=0)).float()
+        depth = (1 / value if visible.is_inverse else value.clamp(min=0)).float()
         key = (depth.view(torch.int32).long() << 32) | number[some].index_select(0, span)
         # Where 1 / depth is not positive, the plane is met behind the camera.
         key = torch.where((depth >= near_m) & depth.isfinite(), key, _EMPTY)

@@ -39,11 +39,7 @@ def is_unchanged(path: Path, stamp: Sequence[int]) -> bool:
 
 
 def note_result(folder: Path, name: str, files: Iterable[Path]) -> None:
-    """Remember that a result is finished, and its files; none: that it is to be made again.
-
-    Raises:
-        InputError: the disk refuses.
-    """
+    """Remember that a result is finished, and its files; none: that it is to be made again."""
     with refused_write(folder / RESULTS):
         _append(folder, name, {f.relative_to(folder).as_posix(): file_stamp(f) for f in files})
 

@@ -52,18 +52,6 @@ def lock_folder(record: Path, *, is_shared: bool, timeout_s: float = 10.0) -> bo
 
     A POSIX lock: it ends with the process, however that ends, and workers do not inherit it.
     Where the file system or the machine has none, nothing is held.
-
-    Args:
-        record: a file in the folder that no command replaces.
-        is_shared: let other processes of the same launch in.
-        timeout_s: how long another command may take to end.
-
-    Returns:
-        Whether the folder is this process's alone from now on.
-
-    Raises:
-        InputError: another command holds the folder, and goes on holding it; or nothing can be
-            written there.
     """
     if fcntl is None:
         return False
@@ -117,11 +105,7 @@ def held_folders() -> frozenset[Path]:
 
 
 def release_folders(but: Collection[Path] = ()) -> None:
-    """Let other commands into the folders that this process has claimed.
-
-    Args:
-        but: records of folders that it goes on holding.
-    """
+    """Let other commands into the folders that this process has claimed."""
     for record in [record for record in _locks if record not in but]:
         os.close(_locks.pop(record))
 
@@ -250,12 +234,15 @@ def claim_folder(
     if not record.exists():
         write_once(record, run_record(settings))
     is_alone = find_rank().world == 1
-    if is_alone and _is_empty(folder) and _has_other_settings(record, settings):
-        lock_folder(record, is_shared=False)
-        if _is_empty(folder):  # a run that failed before its first result
-            (folder / _SOURCES).unlink(missing_ok=True)
-            rewrite_record(record, run_record(settings))
-            return
+    if is_alone and _is_empty(folder):  # a run that failed before its first result
+        earlier = _read_record(record)
+        there = earlier.get("settings") if isinstance(earlier, dict) else None
+        if isinstance(there, dict) and _flat(there) != _flat(settings):
+            lock_folder(record, is_shared=False)
+            if _is_empty(folder):
+                (folder / _SOURCES).unlink(missing_ok=True)
+                rewrite_record(record, run_record(settings))
+                return
     refuse_other_settings(folder, _read_record(record), settings, remedy)
     if lock_folder(record, is_shared=not is_alone):
         remove_parts(folder)
@@ -269,12 +256,6 @@ def _read_record(record: Path) -> object:
             f"{error}. What made the results is not known any more: choose another folder, or "
             "delete this one"
         ) from error
-
-
-def _has_other_settings(record: Path, settings: Mapping[str, Any]) -> bool:
-    earlier = _read_record(record)
-    there = earlier.get("settings") if isinstance(earlier, dict) else None
-    return isinstance(there, dict) and _flat(there) != _flat(settings)
 
 
 def _is_empty(folder: Path) -> bool:
@@ -318,7 +299,16 @@ def claim_names(
     }
     known = _known_sources(folder)
     made = {*results, *(_FRAME.sub("", stem) for stem in results)}
-    wanted = {name: _entry(files) for name, files in sources.items()}
+    wanted: dict[str, list[str]] = {}
+    for name, files in sources.items():
+        every = [files] if isinstance(files, Path) else list(files)
+        stamps: list[str] = []  # size and time, by which a change is noticed
+        for path in every:
+            with suppress(OSError):
+                facts = path.stat()
+                if path.is_file():
+                    stamps.append(f"{facts.st_size} bytes of {facts.st_mtime_ns}")
+        wanted[name] = [str(every[0].resolve()), ", ".join(stamps)]
     for name, (path, stamp) in wanted.items():
         earlier, before = _source(known.get(name, [path, stamp]))
         if earlier != path:
@@ -348,12 +338,6 @@ def claim_names(
         write_json(record, known | wanted)
 
 
-def _entry(files: Path | Sequence[Path]) -> list[str]:
-    """Give the first of some files, and the stamps of all."""
-    every = [files] if isinstance(files, Path) else list(files)
-    return [str(every[0].resolve()), ", ".join(filter(None, map(_stamp, every)))]
-
-
 def read_sources(folder: Path) -> dict[str, Path]:
     """Give the file that each result of ``folder`` was made from, by the name of the result."""
     paths = {name: _source(entry)[0] for name, entry in _known_sources(folder).items()}
@@ -376,36 +360,14 @@ def _source(entry: object) -> tuple[str, str]:
     return path if isinstance(path, str) else "", stamp if isinstance(stamp, str) else ""
 
 
-def _stamp(path: Path) -> str:
-    """Size and time of a file, by which a change is noticed; empty for what is none."""
-    try:
-        facts = path.stat()
-    except OSError:
-        return ""
-    return f"{facts.st_size} bytes of {facts.st_mtime_ns}" if path.is_file() else ""
-
-
 def refuse_to_replace(path: Path) -> None:
-    """Refuse to write one file over another that is there already.
-
-    Raises:
-        InputError: there is one.
-    """
+    """Refuse to write one file over another that is there already."""
     if os.path.lexists(path):
         raise InputError(f"{path}: is there already; delete it, or give another name")
 
 
 def refuse_among_inputs(out: Path, words: Iterable[str | Path], files: Iterable[Path]) -> None:
-    """Refuse results in a folder whose files are inputs: the next run would take them for such.
-
-    Args:
-        out: where the results go.
-        words: as given: files, folders or patterns.
-        files: that they name.
-
-    Raises:
-        InputError: ``out`` holds such files, and they were not named one by one.
-    """
+    """Refuse results in a folder whose files are inputs: the next run would take them for such."""
     named = {Path(word) for word in words}
     if any(path not in named and path.parent.resolve() == out.resolve() for path in files):
         raise InputError(
@@ -440,11 +402,7 @@ def refuse_other_settings(
     settings: Mapping[str, Any],
     remedy: str = "choose another, or delete this one",
 ) -> None:
-    """Refuse a folder whose record has other settings.
-
-    Raises:
-        InputError: the first difference is named.
-    """
+    """Refuse a folder whose record has other settings."""
     earlier = record.get("settings") if isinstance(record, dict) else None
     if not isinstance(earlier, dict):
         raise InputError(f"{folder}/{RECORD}: not a record of a run. Choose another folder.")

@@ -12,10 +12,6 @@ METRES: dict[str, float] = {"m": 1.0, "cm": 0.01, "mm": 0.001}
 
 
 def metres_of(unit: str) -> float:
-    """Give the metres of a unit.
-
-    Raises:
-        InputError: there is no unit of that name.
-    """
+    """Give the metres of a unit."""
     refuse_unknown("unit", unit, METRES)
     return METRES[unit]

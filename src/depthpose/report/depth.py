@@ -89,9 +89,11 @@ def depth_section(
     return Section(title=title, text=text, facts=facts, pictures=pictures, scenes=scenes)
 
 
-def depth_facts(pair: StereoInput, found: DepthEstimate, focal: str = "") -> list[tuple[str, str]]:
+def depth_facts(
+    pair: StereoInput, estimate: DepthEstimate, focal: str = ""
+) -> list[tuple[str, str]]:
     """Say the sizes and the metres of an estimate; ``focal``: words behind the focal length."""
-    camera, depth_m = pair.camera, found.depth_m
+    camera, depth_m = pair.camera, estimate.depth_m
     height, width = pair.left.shape[1:]
     facts = [("size", f"{width} x {height} px")]
     if isinstance(camera, Camera):
@@ -104,29 +106,29 @@ def depth_facts(pair: StereoInput, found: DepthEstimate, focal: str = "") -> lis
         if len(known_m):
             low, middle, high = np.percentile(known_m.numpy(), (1, 50, 99))
             facts.append(("1, 50, 99 % are nearer than", f"{low:.2f}, {middle:.2f}, {high:.2f} m"))
-    if found.is_sky is not None:
-        facts.append(("sky", f"{float(found.is_sky.float().mean()):.1%} of the pixels"))
-    if found.ground is not None:
-        facts.append(("ground", str(found.ground)))
-    if found.warning:
-        facts.insert(0, ("warning", found.warning))
-    if found.confidence is not None:
-        facts.append(("mean confidence", f"{float(found.confidence.nanmean()):.2f}"))
+    if estimate.is_sky is not None:
+        facts.append(("sky", f"{float(estimate.is_sky.float().mean()):.1%} of the pixels"))
+    if estimate.ground is not None:
+        facts.append(("ground", str(estimate.ground)))
+    if estimate.warning:
+        facts.insert(0, ("warning", estimate.warning))
+    if estimate.confidence is not None:
+        facts.append(("mean confidence", f"{float(estimate.confidence.nanmean()):.2f}"))
     return facts
 
 
-def grey_caption(found: DepthEstimate) -> str:
+def grey_caption(estimate: DepthEstimate) -> str:
     """Say what grey is in the picture of an estimate."""
-    return "grey: none" if found.is_sky is None else "grey: sky or no answer"
+    return "grey: none" if estimate.is_sky is None else "grey: sky or no answer"
 
 
 def depth_scene(
-    pair: StereoInput, found: DepthEstimate, far_m: float, caption: str = "The cloud"
+    pair: StereoInput, estimate: DepthEstimate, far_m: float, caption: str = "The cloud"
 ) -> Scene:
     """Show the points nearer than ``far_m`` in the colours of the image."""
     return Scene(
         caption=f"{caption} up to {far_m:g} m, in the camera's frame",
-        layers=[Layer(name="points", shape=replace(found, seen=pair).cloud(far_m))],
+        layers=[Layer(name="points", shape=replace(estimate, seen=pair).cloud(far_m))],
     )
 
 

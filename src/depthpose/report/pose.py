@@ -139,10 +139,10 @@ def pose_layers(
     return [*layers, box, Layer(name="its axes (x red, y green, z blue)", shape=axes)]
 
 
-def alternative_layers(found: PoseEstimate, model: ObjectModel) -> list[Layer]:
+def alternative_layers(estimate: PoseEstimate, model: ObjectModel) -> list[Layer]:
     """Show each alternative by its axes and its box, not shown at first."""
     layers: list[Layer] = []
-    for other in found.alternatives:
+    for other in estimate.alternatives:
         pose = other.camera_from_model.double()
         ends_m = pose.apply(box_edges(model).double().flatten(0, 1)).unflatten(0, (12, 2)).float()
         said = f"{other.difference}, {other.probability:.0%}"
@@ -240,14 +240,14 @@ class PoseShown:
     """An estimate or a refusal as a page shows it.
 
     Attributes:
-        given: what was seen.
+        input: what was seen.
         estimate: its result.
         model: the object.
         image: what the pose is drawn over, of the view's camera; None: its depth in grey.
         truth: ``camera_from_model``, where it is known.
     """
 
-    given: AnyInput
+    input: AnyInput
     estimate: PoseEstimate
     model: ObjectModel
     image: Float[Tensor, "3 h w"] | None = None
@@ -257,8 +257,8 @@ class PoseShown:
 def pose_section(title: str, shown: PoseShown, text: str = "", rows: Sequence[Row] = ()) -> Section:
     """Show one estimate: sentence and numbers, the picture, the cloud with the model in 3D."""
     estimate, model = shown.estimate, shown.model
-    points_m = object_points(shown.given, model.diameter_m)
-    scene = pose_scene(shown.given, points_m, estimate, model, shown.truth)
+    points_m = object_points(shown.input, model.diameter_m)
+    scene = pose_scene(shown.input, points_m, estimate, model, shown.truth)
     return Section(
         title=title,
         text=f"{text} {pose_sentence(estimate)}".strip(),
@@ -270,22 +270,22 @@ def pose_section(title: str, shown: PoseShown, text: str = "", rows: Sequence[Ro
     )
 
 
-def pose_sentence(found: PoseEstimate) -> str:
+def pose_sentence(estimate: PoseEstimate) -> str:
     """Give where the object is, or why it is refused."""
-    if found.camera_from_model is None:
-        return f"Refused ({found.status}): {found.reason}."
-    x, y, z = found.camera_from_model.t_m.tolist()
-    said = f"The {found.object} is at x {x:.4f}, y {y:.4f}, z {z:.4f} m in the camera's frame."
-    if found.status == "ambiguous":
-        said += f" It is ambiguous: {found.reason}."
-    if not found.alternatives:
+    if estimate.camera_from_model is None:
+        return f"Refused ({estimate.status}): {estimate.reason}."
+    x, y, z = estimate.camera_from_model.t_m.tolist()
+    said = f"The {estimate.object} is at x {x:.4f}, y {y:.4f}, z {z:.4f} m in the camera's frame."
+    if estimate.status == "ambiguous":
+        said += f" It is ambiguous: {estimate.reason}."
+    if not estimate.alternatives:
         return said
-    return f"{said} Other poses fit as well: {'; '.join(alternative_lines(found))}."
+    return f"{said} Other poses fit as well: {'; '.join(alternative_lines(estimate))}."
 
 
-def alternative_lines(found: PoseEstimate) -> list[str]:
+def alternative_lines(estimate: PoseEstimate) -> list[str]:
     """Say of each alternative how it differs from the pose, and how likely it is."""
-    return [f"{one.difference}, {one.probability:.0%}" for one in found.alternatives]
+    return [f"{one.difference}, {one.probability:.0%}" for one in estimate.alternatives]
 
 
 def identity_words(identity: Identity) -> str:
@@ -297,7 +297,7 @@ def identity_words(identity: Identity) -> str:
 
 
 def pose_facts(
-    found: PoseEstimate,
+    estimate: PoseEstimate,
     model: ObjectModel,
     how: str = "",
     agreeing: str = "votes or points that agree",
@@ -305,51 +305,51 @@ def pose_facts(
     """Say what is known of an estimate besides its pose.
 
     Args:
-        found: the estimate.
+        estimate: the estimate.
         model: the object.
         how: by what it was found; empty: not said.
         agreeing: what the estimate's ``inlier_share`` is of.
     """
-    facts = [("object", f"{found.object}, {model.diameter_m:.4f} m long")]
+    facts = [("object", f"{estimate.object}, {model.diameter_m:.4f} m long")]
     if how:
         facts.append(("by", how))
-    if found.fit is not None:
+    if estimate.fit is not None:
         facts += [
-            ("fits", f"{found.fit.agrees:.1%} of the posed surface that was seen agrees"),
-            ("seen", f"{found.fit.seen:.0%} of the surface that faces the camera"),
-            ("the sensor's noise there", f"{1000 * found.fit.noise_m:.1f} mm"),
+            ("fits", f"{estimate.fit.agrees:.1%} of the posed surface that was seen agrees"),
+            ("seen", f"{estimate.fit.seen:.0%} of the surface that faces the camera"),
+            ("the sensor's noise there", f"{1000 * estimate.fit.noise_m:.1f} mm"),
         ]
-    if found.identity is not None:
-        facts.append(("identity", identity_words(found.identity)))
-    if found.certainty is not None:
-        facts.append(("certainty of this pose", f"{found.certainty:.3f}"))
-    facts += [("another pose that fits", line) for line in alternative_lines(found)]
-    if found.inlier_share is not None:
-        facts.append((agreeing, f"{found.inlier_share:.0%}"))
-    if found.residual_m is not None and math.isfinite(found.residual_m):
-        facts.append(("distance left (RMS)", f"{1000 * found.residual_m:.2f} mm"))
-    if found.free_motions is not None and len(found.free_motions):
-        free = f"{len(found.free_motions)} (a declared symmetry; the covariance leaves them out)"
+    if estimate.identity is not None:
+        facts.append(("identity", identity_words(estimate.identity)))
+    if estimate.certainty is not None:
+        facts.append(("certainty of this pose", f"{estimate.certainty:.3f}"))
+    facts += [("another pose that fits", line) for line in alternative_lines(estimate)]
+    if estimate.inlier_share is not None:
+        facts.append((agreeing, f"{estimate.inlier_share:.0%}"))
+    if estimate.residual_m is not None and math.isfinite(estimate.residual_m):
+        facts.append(("distance left (RMS)", f"{1000 * estimate.residual_m:.2f} mm"))
+    if estimate.free_motions is not None and len(estimate.free_motions):
+        free = f"{len(estimate.free_motions)} (a declared symmetry; the covariance leaves them out)"
         facts.append(("free motions", free))
-    if found.seconds:
-        stages = ", ".join(f"{name} {1000 * s:.0f}" for name, s in found.seconds.items())
+    if estimate.seconds:
+        stages = ", ".join(f"{name} {1000 * s:.0f}" for name, s in estimate.seconds.items())
         facts.append(("ms", stages))
     return facts
 
 
-def pose_tables(found: PoseEstimate) -> dict[str, Sequence[Sequence[str]]]:
+def pose_tables(estimate: PoseEstimate) -> dict[str, Sequence[Sequence[str]]]:
     """Show the pose, and how far it may be off along each axis."""
     tables: dict[str, Sequence[Sequence[str]]] = {}
-    pose = found.camera_from_model
+    pose = estimate.camera_from_model
     if pose is not None:
         rows = torch.cat([pose.R, pose.t_m[:, None]], 1).tolist()
         tables["camera_from_model: R | t [m]"] = [[f"{v:.5f}" for v in row] for row in rows]
-    if pose is not None and found.covariance is not None:
-        assert found.origin_std_mm is not None
-        assert found.rotation_std_deg is not None
+    if pose is not None and estimate.covariance is not None:
+        assert estimate.origin_std_mm is not None
+        assert estimate.rotation_std_deg is not None
         stds = {
-            "place of the model's origin along the camera's axes [mm]": found.origin_std_mm,
-            "rotation about the model's axes [deg]": found.rotation_std_deg,
+            "place of the model's origin along the camera's axes [mm]": estimate.origin_std_mm,
+            "rotation about the model's axes [deg]": estimate.rotation_std_deg,
         }
         tables["standard deviations about this answer alone"] = [
             ["", "x", "y", "z"],
@@ -359,30 +359,30 @@ def pose_tables(found: PoseEstimate) -> dict[str, Sequence[Sequence[str]]]:
             ),
         ]
         tables["covariance at the camera's origin, of rotation [rad] and translation [m]"] = [
-            [f"{v:.2e}" for v in row] for row in found.covariance.tolist()
+            [f"{v:.2e}" for v in row] for row in estimate.covariance.tolist()
         ]
     return tables
 
 
 def pose_scene(
-    given: AnyInput,
+    pose_input: AnyInput,
     points_m: Float[Tensor, "n 3"],
-    found: PoseEstimate,
+    estimate: PoseEstimate,
     model: ObjectModel,
     truth: Rigid | None = None,
 ) -> Scene:
     """Show what was seen, the posed model, its keypoints, and the truth where it is known."""
     layers = [Layer(name="the object, as seen", shape=colored_points(points_m, _SEEN))]
-    pose = found.camera_from_model
+    pose = estimate.camera_from_model
     if pose is not None:
         layers += pose_layers(pose, model, with_box=truth is not None)
-        layers += alternative_layers(found, model)
+        layers += alternative_layers(estimate, model)
     if truth is not None:
         layers += pose_layers(truth, model, is_true=True)
-    if found.keypoints_m is not None:
-        layers += keypoint_layers(found.keypoints_m, pose, model)
-    if isinstance(given, ViewInput):
-        around_m = back_project(given.depth_m, given.K)[~given.mask]
+    if estimate.keypoints_m is not None:
+        layers += keypoint_layers(estimate.keypoints_m, pose, model)
+    if isinstance(pose_input, ViewInput):
+        around_m = back_project(pose_input.depth_m, pose_input.K)[~pose_input.mask]
         around_m = around_m[around_m.isfinite().all(-1)].float()
         around = colored_points(take_evenly(around_m, _AROUND_POINTS), _AROUND)
         layers.append(Layer(name="all else", shape=around, is_shown=False))
@@ -393,7 +393,7 @@ def pose_scene(
 def draw_boxes(
     image: Float[Tensor, "3 h w"],
     truth: Rigid | None,
-    found: Rigid | None,
+    estimated: Rigid | None,
     model: ObjectModel,
     K: Float[Tensor, "3 3"],
 ) -> Float[Tensor, "3 h w"]:
@@ -402,12 +402,12 @@ def draw_boxes(
     Args:
         image: it is not changed.
         truth: ``camera_from_model``, where it is known.
-        found: the estimate, where there is one.
+        estimated: the estimate, where there is one.
         model: the object.
         K: intrinsic matrix of the image.
     """
-    if found is not None:
-        image = draw_pose(image, found, model, K.double())
+    if estimated is not None:
+        image = draw_pose(image, estimated, model, K.double())
     if truth is not None:
         image = draw_pose(image, truth, model, K.double(), is_true=True)
     return image
@@ -439,7 +439,7 @@ def close_up(
 
 def _drawings(shown: PoseShown) -> list[Drawing]:
     """Draw the whole picture and the object from near by; the mask where there is no pose."""
-    view = shown.given
+    view = shown.input
     if not isinstance(view, ViewInput):
         return []
     image = grey_depth(view.depth_m) if shown.image is None else shown.image

@@ -53,14 +53,14 @@ class Viewer:
             self._stream.save(path)
         self._count = 0
 
-    def show_depth(self, given: "StereoInput", estimate: "DepthEstimate") -> None:
+    def show_depth(self, pair: "StereoInput", estimate: "DepthEstimate") -> None:
         """Show an image, its depth before the camera, the right view and the confidence."""
         rr = self._rerun
-        self._next(given.name)
-        if (camera := given.camera) is not None:
+        self._next(pair.name)
+        if (camera := pair.camera) is not None:
             size = [camera.width, camera.height]
             self._log("camera", rr.Pinhole(image_from_camera=camera.K.numpy(), resolution=size))
-        self._log("camera/image", rr.Image(_bytes(given.left)))
+        self._log("camera/image", rr.Image(_bytes(pair.left)))
         if estimate.depth_m is not None:
             depth_m = estimate.depth_m.nan_to_num(0.0).cpu().numpy()  # 0: no reading
             self._log("camera/depth", rr.DepthImage(depth_m, meter=1.0))
@@ -70,18 +70,22 @@ class Viewer:
             grey = estimate.confidence.nan_to_num(0.0).expand(3, -1, -1)
             self._log("confidence", rr.Image(_bytes(grey)))
 
-    def show_pose(self, given: "AnyInput", estimate: "PoseEstimate", model: "ObjectModel") -> None:
+    def show_pose(
+        self, pose_input: "AnyInput", estimate: "PoseEstimate", model: "ObjectModel"
+    ) -> None:
         """Show the cloud, the posed model and its keypoints; or why there is no pose."""
         from depthpose.pose.cloud import object_points
 
         rr = self._rerun
-        self._next(given.name)
+        self._next(pose_input.name)
         self._log("seen", rr.Clear(recursive=True))
         self._log("posed", rr.Clear(recursive=True))
-        self._log("seen", self._points(object_points(given, model.diameter_m), _SEEN))
+        self._log("seen", self._points(object_points(pose_input, model.diameter_m), _SEEN))
         pose = estimate.camera_from_model
         if pose is None:
-            self._log("reason", rr.TextLog(f"{given.name}: {estimate.status}: {estimate.reason}"))
+            self._log(
+                "reason", rr.TextLog(f"{pose_input.name}: {estimate.status}: {estimate.reason}")
+            )
             return
         posed_m = pose.apply(model.vertices_m.to(pose.R))
         if len(model.faces):
@@ -96,7 +100,7 @@ class Viewer:
         for k, other in enumerate(estimate.alternatives):
             other_m = other.camera_from_model.apply(model.vertices_m.to(pose.R))
             self._log(f"posed/alternative {k + 1}", self._points(other_m, _OTHER))
-            said = f"{given.name}: {other.difference}, {other.probability:.0%}"
+            said = f"{pose_input.name}: {other.difference}, {other.probability:.0%}"
             self._log("alternatives", rr.TextLog(said))
         keypoints_m = pose.apply(model.keypoints_m.to(pose.R))
         radius_m = 0.02 * model.diameter_m

@@ -40,11 +40,7 @@ def spectral(share: Float[Tensor, " n"]) -> Float[Tensor, "n 3"]:
 def arrange_grid(
     pictures: Sequence[Float[Tensor, "3 _ _"]], columns: int
 ) -> Float[Tensor, "3 h w"]:
-    """Lay pictures out in rows on white, each in a cell as large as the largest.
-
-    Raises:
-        InputError: there is no picture.
-    """
+    """Lay pictures out in rows on white, each in a cell as large as the largest."""
     if not pictures:
         raise InputError("a figure of no picture cannot be arranged; give one at least.")
     height = max(picture.shape[1] for picture in pictures)
@@ -94,20 +90,17 @@ _TURN_RAD, _TILT_RAD = math.radians(35), math.radians(20)
 
 @torch.inference_mode()
 def seen_points(
-    net: GeoPoseNet, given: AnyInput
+    net: GeoPoseNet, pose_input: AnyInput
 ) -> tuple[Float[Tensor, "n 3"], Float[Tensor, "n c"]] | None:
     """Give the points that the network sees, in the camera frame, and its features of them.
 
     The features are those before the last layer; None where the input cannot be posed.
-
-    Raises:
-        InputError: the weights are of another kind.
     """
     network = net.weights.network
     if not isinstance(network, ResUNet):
         raise InputError("figure 3-2 shows features of the sparse network; give weights of it")
-    model = next(m for m in net.weights.models if m.name == given.object)
-    prepared = prepare_cloud(given, model, net.weights.cloud, net.config)
+    model = next(m for m in net.weights.models if m.name == pose_input.object)
+    prepared = prepare_cloud(pose_input, model, net.weights.cloud, net.config)
     if isinstance(prepared, Refusal):
         return None
     grid = prepared.voxels
@@ -221,13 +214,6 @@ def embed_line(features: Float[Tensor, "n c"], perplexity: float = 40.0) -> Floa
 
     Begins along the principal component, and so always gives the same answer; gradient descent
     with momentum and gains. Time and memory grow with the square of ``n``: thousands, not more.
-
-    Args:
-        features: of any scale.
-        perplexity: how many neighbours a point has, about.
-
-    Raises:
-        InputError: there are fewer points than three neighbourhoods.
     """
     if not 1 <= perplexity < math.inf:
         raise InputError(f"t-SNE with a perplexity of {perplexity:g}: take 5 to 50, at least 1")

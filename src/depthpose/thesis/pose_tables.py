@@ -156,9 +156,6 @@ def linemod_number(model: ObjectModel) -> int:
     """Give BOP's number of the object of LineMOD that a model is, by its name and diameter.
 
     A model without a name is known by its number and diameter.
-
-    Raises:
-        InputError: it is none of them.
     """
     is_named = model.name != f"obj_{model.number:06d}"
     number = _NUMBERS.get(model.name.lower(), 0) if is_named else model.number
@@ -312,9 +309,6 @@ def cases_of(
 
     The points are chosen at random, the same each time. Each votes from its own place; points of
     one voxel share the network's direction. The net's objects have the names in the views.
-
-    Raises:
-        InputError: the weights are of another kind.
     """
     network = net.weights.network
     if not isinstance(network, ResUNet):
@@ -322,8 +316,8 @@ def cases_of(
     numbers = {model.name: k for k, model in enumerate(net.weights.models)}
     for view in views:
         number = numbers[view.input.object]
-        model, given = net.weights.models[number], view.input
-        cloud = cloud_from_depth(given.depth_m, given.mask, given.K, model.diameter_m).float()
+        model, seen = net.weights.models[number], view.input
+        cloud = cloud_from_depth(seen.depth_m, seen.mask, seen.K, model.diameter_m).float()
         generator = torch.Generator().manual_seed(0)
         points_m = sample_points(cloud, points, generator)
         if refusal_of(points_m, net.weights.cloud) is not None:

@@ -99,22 +99,14 @@ class Form:
     files: Mapping[str, Path]
 
     def file(self, field: str) -> Path:
-        """Give the file of a field.
-
-        Raises:
-            InputError: none was chosen.
-        """
+        """Give the file of a field."""
         if field not in self.files:
             what, suffixes = KINDS[field]
             raise InputError(f"{field}: no file; choose {what} ({', '.join(suffixes)})")
         return self.files[field]
 
     def number(self, field: str) -> float | None:
-        """Give the number of a field; None where it was left empty.
-
-        Raises:
-            InputError: it is none.
-        """
+        """Give the number of a field; None where it was left empty."""
         text = self.fields.get(field, "").strip()
         if not text:
             return None
@@ -127,15 +119,7 @@ class Form:
         return value
 
     def camera(self, keys: Mapping[str, Any], size: tuple[int, int] | None = None) -> Camera:
-        """Read the camera file that was sent, or make a camera of the fields.
-
-        Args:
-            keys: of a camera file, from the fields; taken where no file was sent.
-            size: of the image (width, height), for files that do not say it.
-
-        Raises:
-            InputError: as :func:`depthpose.core.camera.read_camera`.
-        """
+        """Read the camera file that was sent, or make a camera of the fields."""
         if "camera" in self.files:
             return read_camera(self.files["camera"], size)
         path = self.folder / _FIELDS
@@ -144,12 +128,7 @@ class Form:
         return read_camera(path)
 
     def pinhole_keys(self, size: tuple[int, int], focal_px: float | None) -> dict[str, Any]:
-        """Give size and K of a camera file from the fields; the principal point may be the centre.
-
-        Args:
-            size: of the image (width, height).
-            focal_px: the focal length [px].
-        """
+        """Give size and K of a camera from the fields; the principal point may be the centre."""
         cx, cy = self.number("cx_px"), self.number("cy_px")
         cx, cy = (size[0] - 1) / 2 if cx is None else cx, (size[1] - 1) / 2 if cy is None else cy
         K = [[focal_px, 0.0, cx], [0.0, focal_px, cy], [0.0, 0.0, 1.0]]
@@ -169,22 +148,14 @@ def without_paths(text: str, folder: Path) -> str:
 
 
 def small_size(path: Path) -> tuple[int, int]:
-    """Give a picture's width and height before it is read.
-
-    Raises:
-        InputError: it has more pixels than this page takes.
-    """
+    """Give a picture's width and height before it is read."""
     width, height = image_size(path)
     refuse_large(path.name, width, height)
     return width, height
 
 
 def refuse_large(name: str, width: int, height: int) -> None:
-    """Refuse a picture or map of more pixels than this page takes.
-
-    Raises:
-        InputError: it has more.
-    """
+    """Refuse a picture or map of more pixels than this page takes."""
     if width * height > MOST_PIXELS:
         raise InputError(
             f"{name} has {width}x{height} pixels, more than the {MOST_PIXELS / 1e6:g} million "
@@ -193,11 +164,7 @@ def refuse_large(name: str, width: int, height: int) -> None:
 
 
 def keep_file(folder: Path, field: str, sent_name: str, data: bytes) -> Path:
-    """Write a file that was sent, under its own name where that is harmless.
-
-    Raises:
-        InputError: the form has no such field, or its type is another.
-    """
+    """Write a file that was sent, under its own name where that is harmless."""
     if field not in KINDS:
         raise InputError(f"{field!r} is no file field of this page; known are {', '.join(KINDS)}")
     what, suffixes = KINDS[field]

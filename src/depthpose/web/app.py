@@ -100,9 +100,6 @@ def refuse_size(request: Request, most: int) -> None:
     """Refuse what is too large before it is read.
 
     A server reads no more than the announced size, except of a body in chunks.
-
-    Raises:
-        HTTPException: no size, or too large a one.
     """
     text = request.headers.get("content-length", "")
     if not text.isdecimal() or "transfer-encoding" in request.headers:
@@ -186,11 +183,7 @@ class Queue:
         self._tickets: list[str] = []
 
     def refuse_full(self) -> None:
-        """Refuse one more.
-
-        Raises:
-            HTTPException: too many wait.
-        """
+        """Refuse one more."""
         if len(self._tickets) > self._most:  # one of them is at work
             raise HTTPException(503, _FULL)
 
@@ -239,11 +232,7 @@ async def has_gone(receive: Receive) -> bool:
 
 
 def paced(receive: Receive) -> Receive:
-    """Give a request's body as long as it keeps a pace.
-
-    Raises:
-        HTTPException: when it is awaited: the client sends too slowly.
-    """
+    """Give a request's body as long as it keeps a pace."""
     start, size = time.monotonic(), 0
 
     async def receive_in_time() -> MutableMapping[str, Any]:

@@ -38,11 +38,7 @@ _PHONE = 0.75
 
 
 def answer_depth(form: Form, net: FakestereoNet) -> Answer:
-    """Estimate what a form asks for.
-
-    Raises:
-        InputError: a file that cannot be read, or a camera that cannot be.
-    """
+    """Estimate what a form asks for."""
     began = time.perf_counter()
     pair, focal = _input(form)
     near_m, far_m = (
@@ -149,10 +145,12 @@ def _refuse_work(pair: StereoInput, net: FakestereoNet) -> None:
         )
 
 
-def _pictures(pair: StereoInput, found: DepthEstimate, range_m: tuple[float, float]) -> list[Shown]:
+def _pictures(
+    pair: StereoInput, estimate: DepthEstimate, range_m: tuple[float, float]
+) -> list[Shown]:
     name = pair.name
     colors = (
-        f"near bright and far dark, {{:g}} m to {{:g}} m by the logarithm; {grey_caption(found)}"
+        f"near bright and far dark, {{:g}} m to {{:g}} m by the logarithm; {grey_caption(estimate)}"
     )
     pictures = [
         Shown(file=f"{name}.input.jpg", caption="the image"),
@@ -164,9 +162,9 @@ def _pictures(pair: StereoInput, found: DepthEstimate, range_m: tuple[float, flo
             scale=depth_scale(*range_m),
         ),
     ]
-    if found.right is not None:
+    if estimate.right is not None:
         pictures.append(Shown(file=f"{name}.right.png", caption="right view, synthesised"))
-    if found.confidence is not None:
+    if estimate.confidence is not None:
         pictures.append(
             Shown(
                 file=f"{name}.confidence.png",
@@ -178,19 +176,19 @@ def _pictures(pair: StereoInput, found: DepthEstimate, range_m: tuple[float, flo
     return pictures
 
 
-def _sentence(pair: StereoInput, found: DepthEstimate) -> str:
-    assert found.depth_m is not None
-    known_m = found.depth_m[found.depth_m.isfinite()]
+def _sentence(pair: StereoInput, estimate: DepthEstimate) -> str:
+    assert estimate.depth_m is not None
+    known_m = estimate.depth_m[estimate.depth_m.isfinite()]
     images = "one image" if pair.right is None else "both images"
-    is_sky = found.is_sky
+    is_sky = estimate.is_sky
     sky = 0.0 if is_sky is None else float(is_sky.float().mean())
-    warning = f"Careful: {found.warning}. " if found.warning else ""
+    warning = f"Careful: {estimate.warning}. " if estimate.warning else ""
     if len(known_m) == 0:
         why = f"; {sky:.0%} of the image is taken for sky." if is_sky is not None else "."
         if pair.right is not None and sky < _ALL_SKY:
             why = ": is the pair rectified, and are left and right as they should be?"
         return f"{warning}No pixel got a depth from {images}{why}"
-    share, middle_m = len(known_m) / found.depth_m.numel(), float(known_m.median())
+    share, middle_m = len(known_m) / estimate.depth_m.numel(), float(known_m.median())
     return (
         f"{warning}Depth from {images} for {share:.0%} of the pixels; half of these are nearer "
         f"than {middle_m:.2f} m.{f' {sky:.0%} are sky.' if is_sky is not None else ''}"

@@ -75,37 +75,35 @@ class _Target:
 class _Seen:
     """What was posed, and its answer."""
 
-    given: CloudInput | ViewInput
-    found: PoseEstimate
+    input: CloudInput | ViewInput
+    estimate: PoseEstimate
 
 
 def answer_pose(form: Form, net: GeoPoseNet) -> Answer:
-    """Pose what a form asks for.
-
-    Raises:
-        InputError: a file that cannot be read, or an object that is unknown.
-    """
+    """Pose what a form asks for."""
     target = _target(form, net)
-    given = _input(form, target.model)
-    name, voted = given.name, None
+    pose_input = _input(form, target.model)
+    name, voted = pose_input.name, None
     if "depth" in form.files and "mask" not in form.files:
-        seen = _found_alone(given, target)
+        seen = _found_alone(pose_input, target)
     elif isinstance(target.net, GeoPoseNet):
-        found, voted = target.net.estimate_with_votes(given)
-        seen = [_Seen(given=given, found=found)]
+        estimate, voted = target.net.estimate_with_votes(pose_input)
+        seen = [_Seen(input=pose_input, estimate=estimate)]
     else:
-        seen = [_Seen(given=given, found=answered(target.net.estimate_many([given])[0]))]
+        seen = [
+            _Seen(input=pose_input, estimate=answered(target.net.estimate_many([pose_input])[0]))
+        ]
     if (least := form.number("min_certainty")) is not None:
         limit = EstimateConfig(min_certainty=least).min_certainty
-        seen = [replace(one, found=with_status(one.found, limit)) for one in seen]
+        seen = [replace(one, estimate=with_status(one.estimate, limit)) for one in seen]
     folder = form.results()
     best = seen[0]
     agreeing = "votes that agree" if isinstance(target.net, GeoPoseNet) else "points near the model"
     return Answer(
-        is_ok=best.found.is_posed,
-        said=pose_sentence(best.found),
-        facts=pose_facts(best.found, target.model, target.how, agreeing),
-        tables=_instances(seen) | pose_tables(best.found),
+        is_ok=best.estimate.is_posed,
+        said=pose_sentence(best.estimate),
+        facts=pose_facts(best.estimate, target.model, target.how, agreeing),
+        tables=_instances(seen) | pose_tables(best.estimate),
         pictures=_write(folder, name, seen, target.model),
         scene=_scene(seen, target.model, voted),
         terms=net.terms if target.net is net else "",
@@ -113,47 +111,47 @@ def answer_pose(form: Form, net: GeoPoseNet) -> Answer:
     )
 
 
-def _found_alone(given: CloudInput | ViewInput, target: _Target) -> list[_Seen]:
+def _found_alone(pose_input: CloudInput | ViewInput, target: _Target) -> list[_Seen]:
     """Search a depth image without a mask; give each pose with the pixels that it explains."""
-    assert isinstance(given, ViewInput)
-    answers = target.net.find_in(given, [target.model.name])
+    assert isinstance(pose_input, ViewInput)
+    answers = target.net.find_in(pose_input, [target.model.name])
     if not answers:
-        return [_Seen(given=given, found=nothing_found(given, target.model.name))]
+        return [_Seen(input=pose_input, estimate=nothing_found(pose_input, target.model.name))]
     seen: list[_Seen] = []
     for k, answer in enumerate(answers):
-        name = f"{given.name}_{k}" if len(answers) > 1 else given.name
+        name = f"{pose_input.name}_{k}" if len(answers) > 1 else pose_input.name
         assert answer.camera_from_model is not None
-        mask = explained_mask(given, answer.camera_from_model, target.model)
-        own = replace(given, name=name, mask=mask)
-        seen.append(_Seen(given=own, found=replace(answer, name=name)))
+        mask = explained_mask(pose_input, answer.camera_from_model, target.model)
+        own = replace(pose_input, name=name, mask=mask)
+        seen.append(_Seen(input=own, estimate=replace(answer, name=name)))
     return seen
 
 
 def _instances(seen: list[_Seen]) -> dict[str, Sequence[Sequence[str]]]:
-    """List what was found in a frame, where that is more than one."""
+    """List what was estimate in a frame, where that is more than one."""
     rows = [["", "status", "x [m]", "y [m]", "z [m]", "certainty"]]
     for one in seen if len(seen) > 1 else ():
-        pose, certainty = one.found.camera_from_model, one.found.certainty
+        pose, certainty = one.estimate.camera_from_model, one.estimate.certainty
         place = [] if pose is None else [f"{v:.4f}" for v in pose.t_m.tolist()]
         sure = "" if certainty is None else f"{certainty:.3f}"
-        rows.append([one.given.name, one.found.status, *place, sure])
+        rows.append([one.input.name, one.estimate.status, *place, sure])
     return {"found in this image": rows} if len(seen) > 1 else {}
 
 
 def _write(folder: Path, name: str, seen: list[_Seen], model: ObjectModel) -> list[Shown]:
     """Write ``poses.json``, each cloud with the posed model, and the picture that is shown."""
-    write_predictions(folder, [Prediction(estimate=one.found) for one in seen])
+    write_predictions(folder, [Prediction(estimate=one.estimate) for one in seen])
     for one in seen:
-        points_m = object_points(one.given, model.diameter_m)
-        cloud = posed_cloud(points_m, one.found.camera_from_model, model)
-        write_cloud(folder / f"{one.given.name}.{CLOUD}", cloud)
-    given = seen[0].given
-    if not isinstance(given, ViewInput):
+        points_m = object_points(one.input, model.diameter_m)
+        cloud = posed_cloud(points_m, one.estimate.camera_from_model, model)
+        write_cloud(folder / f"{one.input.name}.{CLOUD}", cloud)
+    pose_input = seen[0].input
+    if not isinstance(pose_input, ViewInput):
         return []
-    picture, caption = grey_depth(given.depth_m), "depth image, near bright"
-    poses = [pose for one in seen if (pose := one.found.camera_from_model) is not None]
+    picture, caption = grey_depth(pose_input.depth_m), "depth image, near bright"
+    poses = [pose for one in seen if (pose := one.estimate.camera_from_model) is not None]
     for pose in poses:
-        picture = draw_pose(picture, pose, model, given.K.double())
+        picture = draw_pose(picture, pose, model, pose_input.K.double())
     if poses:
         caption += f", with the posed model{'s' * (len(poses) > 1)}"
     write_image(folder / f"{name}.{PICTURE}", picture)
@@ -235,25 +233,21 @@ _UNIT_M = 0.0001
 
 
 def _scene(seen: list[_Seen], model: ObjectModel, voted: CloudDirections | None) -> Scene:
-    """Show the cloud, the posed model, the votes, and what else was found in the image."""
-    given, found = seen[0].given, seen[0].found
-    scene = pose_scene(given, object_points(given, model.diameter_m), found, model)
+    """Show the cloud, the posed model, the votes, and what else was estimate in the image."""
+    pose_input, estimate = seen[0].input, seen[0].estimate
+    scene = pose_scene(pose_input, object_points(pose_input, model.diameter_m), estimate, model)
     layers = list(scene.layers)
-    if found.keypoints_m is not None and voted is not None:
-        layers.append(vote_layer(voted.cloud.points_m, voted.directions, found.keypoints_m))
+    if estimate.keypoints_m is not None and voted is not None:
+        layers.append(vote_layer(voted.cloud.points_m, voted.directions, estimate.keypoints_m))
     for one in seen[1:]:
-        points_m = object_points(one.given, model.diameter_m)
-        cloud = posed_cloud(points_m, one.found.camera_from_model, model)
-        layers.append(Layer(name=one.given.name, shape=cloud))
+        points_m = object_points(one.input, model.diameter_m)
+        cloud = posed_cloud(points_m, one.estimate.camera_from_model, model)
+        layers.append(Layer(name=one.input.name, shape=cloud))
     return replace(scene, layers=layers)
 
 
 def pose_example(net: GeoPoseNet) -> dict[str, Any]:
-    """Render a frame of the first object that the weights know, on a table: depth, mask, camera.
-
-    Raises:
-        InputError: weights without meshes.
-    """
+    """Render a frame of the first object that the weights know, on a table: depth, mask, camera."""
     model = net.weights.models[0]
     near_m = 4 * model.diameter_m
     config = ObjectsConfig(

@@ -4,7 +4,6 @@ from depthpose.core.camera.camera_file import AnyCamera as AnyCamera
 from depthpose.core.camera.camera_file import AnyLens as AnyLens
 from depthpose.core.camera.camera_file import FieldOfView as FieldOfView
 from depthpose.core.camera.camera_file import camera_of as camera_of
-from depthpose.core.camera.camera_file import centred_camera as centred_camera
 from depthpose.core.camera.camera_file import (
     check_image_matches_camera as check_image_matches_camera,
 )

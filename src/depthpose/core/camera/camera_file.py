@@ -44,6 +44,7 @@ from depthpose.core.camera.stored_camera import (
 )
 from depthpose.core.errors import InputError, nearest_name
 from depthpose.core.files import AnyPath, read_json, read_key_values, read_text, write_json
+from depthpose.core.files.disk import naming
 from depthpose.core.files.text import MAX_LIST_BYTES
 
 Matrix = Float64[np.ndarray, "rows columns"]
@@ -69,53 +70,21 @@ _TUM = {(517.3, 516.5, 318.6, 255.3), (520.9, 521.0, 325.1, 249.7), (535.4, 539.
 _TUM_SIZE, _TUM_UNIT_M = (640, 480), 1 / 5000
 
 
-def facts_from_text(path: AnyPath, text: str) -> CameraFacts | None:
-    """Take the camera of a text file; None where it is none that is known.
-
-    Raises:
-        InputError: it is one, and damaged.
-    """
-    if _MIDDLEBURY.search(text):
-        return middlebury_facts(path, text)
-    if _KITTI.search(text):
-        return _kitti_facts(path)
-    if _PLAIN.search(text):
-        return plain_facts(path, read_key_values(path))
-    if _COLMAP.search(text):
-        return _colmap_facts(text)
-    for sign, what in _FOREIGN.items():
-        if re.search(sign, text, re.MULTILINE):
-            raise InputError(f"{what}. {_WRITE}")
-    return _bare_facts(text)
-
-
-def middlebury_facts(path: AnyPath, text: str) -> CameraFacts:
-    """Take Middlebury 2014's ``calib.txt``: cam0, doffs, baseline in millimetres, size.
-
-    Raises:
-        InputError: a value missing or not a number, or ``cam1`` contradicts the others.
-    """
-    values = dict(re.findall(r"^[ \t]*(\w+)[ \t]*=(.*)$", text, re.MULTILINE))
-    try:
-        K, right = (
-            np.array(re.sub(r"[\[\];,]", " ", text).split(), np.float64).reshape(3, 3)
-            for text in (values["cam0"], values.get("cam1", values["cam0"]))
-        )
-        size = (
-            _whole({"width": float(values["width"])}, "width"),
-            _whole({"height": float(values["height"])}, "height"),
-        )
-        baseline_mm, difference_px = float(values["baseline"]), float(values["doffs"])
-    except KeyError as error:
-        raise InputError(
-            f"{path}: has no line {error.args[0]}=...; a Middlebury calib.txt holds cam0, doffs, "
-            "baseline, width and height."
-        ) from error
-    except (ValueError, OverflowError) as error:  # no 9 numbers have no 3x3
-        raise InputError(f"{path}: not a Middlebury calibration ({error}).") from error
+def _middlebury_facts(path: AnyPath) -> CameraFacts:
+    """Middlebury's ``calib.txt``: cam0, doffs, baseline in millimetres, size; cam1 is checked."""
+    keys = read_key_values(path)
+    for name in ("cam0", "doffs", "baseline", "width", "height"):
+        if name not in keys:
+            raise InputError(
+                f"{path}: has no line {name}=...; a Middlebury calib.txt holds cam0, doffs, "
+                "baseline, width and height."
+            )
+    K = kitti_matrix(path, keys, "cam0", (3, 3))
+    right = kitti_matrix(path, keys, "cam1", (3, 3)) if "cam1" in keys else K
+    baseline_mm, difference_px = (_number(path, keys, name) for name in ("baseline", "doffs"))
     refuse_apart(K, right)
     apart_px = right[0, 2] - K[0, 2]
-    if "cam1" in values and abs(apart_px - difference_px) > SAME_DIFFERENCE_PX:
+    if "cam1" in keys and abs(apart_px - difference_px) > SAME_DIFFERENCE_PX:
         raise InputError(
             f"{path}: doffs is {difference_px:g}, but cx of cam1 less that of cam0 is {apart_px:g}"
             "; write the true one of the two"
@@ -128,7 +97,7 @@ def middlebury_facts(path: AnyPath, text: str) -> CameraFacts:
     return CameraFacts(
         kind="a Middlebury calibration",
         K=torch.from_numpy(K),
-        size=size,
+        size=_size({name: _number(path, keys, name) for name in ("width", "height")}),
         baseline_m=baseline_mm / 1000,
         cx_right_minus_left_px=difference_px,
         is_metric=True,
@@ -139,9 +108,6 @@ def plain_facts(path: AnyPath, keys: Mapping[str, list[float]]) -> CameraFacts:
     """Take ``focal_px``, ``cx``, ``cy`` and ``baseline_m``, a line each.
 
     Also ``width`` and ``height``, ``focal_y_px`` and ``cx_right_minus_left_px`` if given.
-
-    Raises:
-        InputError: a value is missing.
     """
     focal_px, cx, cy, baseline_m = (
         _number(path, keys, key) for key in ("focal_px", "cx", "cy", "baseline_m")
@@ -164,13 +130,9 @@ def plain_facts(path: AnyPath, keys: Mapping[str, list[float]]) -> CameraFacts:
 def kitti_matrix(
     path: AnyPath, keys: Mapping[str, list[float]], name: str, shape: tuple[int, int]
 ) -> Matrix:
-    """Take a matrix of a KITTI calibration.
-
-    Raises:
-        InputError: it is missing, or of another size.
-    """
+    """Take a matrix of a calibration of ``KEY: numbers`` lines, as KITTI's."""
     if name not in keys:
-        raise InputError(f"{path}: has no line '{name}:', which a KITTI calibration holds.")
+        raise InputError(f"{path}: has no line '{name}:', which such a calibration holds.")
     if len(keys[name]) != shape[0] * shape[1]:
         raise InputError(
             f"{path}: {name} holds {len(keys[name])} numbers instead of {shape[0] * shape[1]}. "
@@ -260,11 +222,7 @@ _MM = 0.001
 
 
 def facts_from_json(content: object) -> CameraFacts:
-    """Take the camera of a JSON file: ours, BOP's ``camera.json`` or its ``scene_camera.json``.
-
-    Raises:
-        InputError: it is none of them, or a value is wrong.
-    """
+    """Take the camera of a JSON file: ours, BOP's ``camera.json`` or its ``scene_camera.json``."""
     if isinstance(content, list) and len(content) in (3, 9):
         return CameraFacts(kind="a matrix", K=_matrix(content))
     if isinstance(content, dict) and "K" not in content:
@@ -401,11 +359,8 @@ def read_camera(path: AnyPath, size: Size | None = None) -> Camera | StereoRig:
             without a size where none is given, or a value cannot be that of a camera in pixels
             and metres.
     """
-    try:
+    with naming(path):
         return camera_from_facts(_read_facts(path), size)
-    except InputError as error:
-        said = str(error)
-        raise InputError(said if said.startswith(f"{path}") else f"{path}: {said}") from error
 
 
 def read_rig(path: AnyPath, size: Size | None = None) -> StereoRig:
@@ -434,11 +389,7 @@ def write_camera(path: AnyPath, camera: Camera) -> None:
 
 
 def check_image_matches_camera(camera: Camera, width: int, height: int, name: str) -> None:
-    """Refuse an image whose size is not the camera's.
-
-    Raises:
-        InputError: the sizes differ; where the aspect agrees, resizing is offered.
-    """
+    """Refuse an image whose size is not the camera's."""
     if (width, height) == (camera.width, camera.height):
         return
     # Scaled sizes are rounded to whole pixels, so the aspect agrees to within one.
@@ -464,7 +415,18 @@ def _read_facts(path: AnyPath) -> CameraFacts:
     text = read_text(path, MAX_LIST_BYTES)
     if re.match(r"\s*(\{|\[\s*[-+\[\d])", text):
         return _json_facts(read_json(path))
-    facts = facts_from_text(path, text)
+    for sign, read in (
+        (_MIDDLEBURY, lambda: _middlebury_facts(path)),
+        (_KITTI, lambda: _kitti_facts(path)),
+        (_PLAIN, lambda: plain_facts(path, read_key_values(path))),
+        (_COLMAP, lambda: _colmap_facts(text)),
+    ):
+        if sign.search(text):
+            return read()
+    for sign, what in _FOREIGN.items():
+        if re.search(sign, text, re.MULTILINE):
+            raise InputError(f"{what}. {_WRITE}")
+    facts = _bare_facts(text)
     if facts is None:
         names = read_storage(path, text)
         facts = None if names is None else _with_own_keys(facts_from_names(names), names)
@@ -550,7 +512,11 @@ def camera_of(camera: AnyLens | None, size: Size) -> Camera | None:
     if isinstance(camera, np.generic | np.ndarray | Tensor) and camera.ndim == 0:
         return centred_camera(size, float(camera))
     if isinstance(camera, Mapping):
-        return camera_from_facts(_from_mapping(camera, size), size)
+        keys = {key: np.asarray(value).tolist() for key, value in camera.items()}
+        has_size = bool({"width", "height"} & keys.keys())
+        facts = _json_facts(keys if has_size else {"width": size[0], "height": size[1], **keys})
+        # Without a size of its own the matrix may be that of another resolution: that is checked.
+        return camera_from_facts(facts if has_size else replace(facts, size=None), size)
     return camera_from_facts(CameraFacts(kind="a matrix K", K=intrinsics_of(camera)), size)
 
 
@@ -585,11 +551,7 @@ def centred_camera(size: Size, focal_px: float) -> Camera:
 
 
 def intrinsics_of(K: object) -> Float[Tensor, "3 3"]:
-    """Take a 3x3 list, array or tensor of any real numbers as an intrinsic matrix, in float64.
-
-    Raises:
-        InputError: it is none.
-    """
+    """Take a 3x3 list, array or tensor of any real numbers as an intrinsic matrix, in float64."""
     values = K.detach().cpu().numpy() if isinstance(K, Tensor) else K
     try:
         matrix = torch.from_numpy(np.array("none" if K is None else values, dtype=np.float64))
@@ -601,12 +563,3 @@ def intrinsics_of(K: object) -> Float[Tensor, "3 3"]:
         ) from error
     check_intrinsics(matrix)
     return matrix
-
-
-def _from_mapping(camera: Mapping[str, Any], size: Size) -> CameraFacts:
-    keys = {key: np.asarray(value).tolist() for key, value in camera.items()}
-    if {"width", "height"} & keys.keys():
-        return _json_facts(keys)
-    # Without a size of its own the matrix may be that of another resolution: that is checked.
-    facts = _json_facts({"width": size[0], "height": size[1], **keys})
-    return replace(facts, size=None)

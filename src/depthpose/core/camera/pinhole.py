@@ -112,11 +112,7 @@ class StereoRig(Camera):
 
 
 def check_intrinsics(K: Tensor) -> None:
-    """Refuse a matrix that is no intrinsic matrix.
-
-    Raises:
-        InputError: the shape, the type or a value of ``K`` is wrong.
-    """
+    """Refuse a matrix that is no intrinsic matrix."""
     form = "[[fx, skew, cx], [0, fy, cy], [0, 0, 1]]"
     if not isinstance(K, Tensor):
         raise InputError(
@@ -278,32 +274,18 @@ _CORNER = 0.1
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class CameraFacts:
-    """Values of a camera file, before it is a camera: the image's size may be missing.
+    """Values of a camera file, before it is a camera: the image's size may be missing."""
 
-    Attributes:
-        kind: what the file is, for errors.
-        K: intrinsic matrix of the undistorted image [px].
-        size: of the image, where the file has it.
-        baseline_m: where there is a rig.
-        cx_right_minus_left_px: difference of the principal points of a rig.
-        is_metric: whether the format says the unit of the baseline.
-        depth_unit_m: metres per unit of the depth images, where the file has it.
-        mount_height_m: height of the camera above the road, where the file has it.
-        tilt_deg: of the camera, positive upwards, where the file has it.
-        distortion: coefficients of the lens; none, or zeros, for a pinhole.
-        undistort: what takes the distortion out of an image.
-    """
-
-    kind: str
+    kind: str  # of file, for errors
     K: Float[Tensor, "3 3"]
     size: Size | None = None
     baseline_m: float | None = None
     cx_right_minus_left_px: float = 0.0
-    is_metric: bool = False
+    is_metric: bool = False  # whether the format says the unit of the baseline
     depth_unit_m: float | None = None
     mount_height_m: float | None = None
     tilt_deg: float | None = None
-    distortion: tuple[float, ...] = ()
+    distortion: tuple[float, ...] = ()  # coefficients; none, or zeros, of a pinhole
     undistort: str = "cv2.undistort(image, K, distortion)"
 
 
@@ -317,10 +299,6 @@ def facts_from_projections(
 
     A rectified camera at x = b has ``P[0, 3] = -fx b``. KITTI counts both from camera 0, ROS and
     OpenCV from the left one.
-
-    Raises:
-        InputError: a focal length is not positive, the two are not those of one rectified pair, or
-            the pair stands one above the other.
     """
     K = torch.from_numpy(left[:, :3].copy())
     if right is None:
@@ -344,11 +322,7 @@ def facts_from_projections(
 
 
 def refuse_apart(left: Float64[np.ndarray, "3 _"], right: Float64[np.ndarray, "3 _"]) -> None:
-    """Refuse two matrices that are not those of one rectified pair: only cx may differ.
-
-    Raises:
-        InputError: fx, fy or cy differ.
-    """
+    """Refuse two matrices that are not those of one rectified pair: only cx may differ."""
     within = {"fx": ((0, 0), _SAME_FOCAL * left[0, 0]), "fy": ((1, 1), _SAME_FOCAL * left[1, 1]),
               "cy": ((1, 2), _SAME_ROW_PX)}  # fmt: skip
     for name, (at, most) in within.items():
@@ -361,15 +335,7 @@ def refuse_apart(left: Float64[np.ndarray, "3 _"], right: Float64[np.ndarray, "3
 
 
 def camera_from_facts(facts: CameraFacts, size: Size | None) -> Camera:
-    """Make the camera of a file; refuse what cannot be that of an undistorted image in pixels.
-
-    Args:
-        facts: values of the file.
-        size: of the image, for files that do not say it.
-
-    Raises:
-        InputError: distortion, an unknown size, or a value in another unit or of another image.
-    """
+    """Make the camera of a file; refuse what cannot be that of an undistorted image in pixels."""
     if not all(abs(k) <= _NO_DISTORTION for k in facts.distortion):
         after = "and give the camera of the result"
         if facts.size or size:
@@ -379,18 +345,48 @@ def camera_from_facts(facts: CameraFacts, size: Size | None) -> Camera:
             f"and only images without are understood; undistort them by {facts.undistort}, {after}"
         )
     camera = make_camera(facts, size)
-    _refuse_units(camera, is_metric=facts.is_metric)
+    fx = float(camera.K[0, 0])
+    shown = f"{camera.width}x{camera.height}"
+    _refuse_normalised(camera.K, camera.width, camera.height)
+    if fx < _MM_FX_SHARE * camera.width:
+        raise InputError(
+            f"K has fx {fx:g} for {shown} pixels, so it looks like millimetres; divide by the "
+            "width of a pixel in mm"
+        )
+    if fx > _MAX_FX_SHARE * camera.width:
+        raise InputError(
+            f"K has fx {fx:g} for {shown} pixels, which sees less than 0.3 degrees; give it in "
+            "pixels of this image"
+        )
+    refuse_squeezed(camera.K)
+    refuse_outside(camera.K, camera.width, camera.height)
+    if isinstance(camera, StereoRig):
+        how = 'written as ours: width, height, K, "baseline_m"'
+        how = "made in Python, as a StereoRig" if facts.is_metric else how
+        most_m = _FILE_BASELINE_M if facts.is_metric else WIDE_BASELINE_M
+        refuse_baseline(camera.baseline_m, f"a rig that is truly this wide is {how}", most_m)
+        if abs(camera.cx_right_minus_left_px) >= camera.width:
+            raise InputError(
+                f"the principal points differ by {camera.cx_right_minus_left_px:g} px, more than "
+                f"the image of {shown} is wide; are both cameras of one size? Copy them anew"
+            )
+    if camera.depth_unit_m is not None and camera.depth_unit_m < _LEAST_UNIT_M:
+        raise InputError(
+            f"depth_unit_m is {camera.depth_unit_m:g}, finer than any sensor's; it is metres a "
+            "unit: 0.001 means millimetres"
+        )
+    if camera.depth_unit_m is not None and camera.depth_unit_m > 1:
+        raise InputError(
+            f"depth_unit_m is {camera.depth_unit_m:g}, which looks like units a metre; it is "
+            f"metres a unit: write {1 / camera.depth_unit_m:g}"
+        )
     if facts.size is None:
         refuse_other_resolution(camera.K, camera.width, camera.height)
     return camera
 
 
 def make_camera(facts: CameraFacts, size: Size | None) -> Camera:
-    """Make a camera, or a rig where there is a baseline, without asking whether it is likely.
-
-    Raises:
-        InputError: the size is missing, or a value is impossible for a camera.
-    """
+    """Make a camera, or a rig where there is a baseline, without asking whether it is likely."""
     known = facts.size or size
     if known is None:
         raise InputError(
@@ -489,16 +485,7 @@ def _refuse_normalised(K: Float[Tensor, "3 3"], width: int, height: int) -> None
 
 
 def refuse_baseline(length: float, remedy: str, most_m: float = WIDE_BASELINE_M) -> None:
-    """Refuse a distance between two cameras that no rig has.
-
-    Args:
-        length: what was taken for metres.
-        remedy: how to correct it, where ``most_m`` allows more than what is common.
-        most_m: from which on it is too long.
-
-    Raises:
-        InputError: it is too short, or too long: the likely unit is said.
-    """
+    """Refuse a distance between two cameras that no rig has."""
     if length < _LEAST_FILE_BASELINE_M:
         raise InputError(
             f"baseline_m is {length:g}, less than two lenses can stand apart; write metres, once "
@@ -516,53 +503,11 @@ def refuse_baseline(length: float, remedy: str, most_m: float = WIDE_BASELINE_M)
 
 
 def refuse_squeezed(K: Float[Tensor, "3 3"]) -> None:
-    """Refuse a K whose two focal lengths are not those of one lens.
-
-    Raises:
-        InputError: that is so.
-    """
+    """Refuse a K whose two focal lengths are not those of one lens."""
     fx, fy = float(K[0, 0]), float(K[1, 1])
     if not 1 / _MAX_SQUEEZE < fy / fx < _MAX_SQUEEZE:
         raise InputError(
             f"K has fx {fx:g} and fy {fy:g}, as if pixels were {max(fx / fy, fy / fx):.2g} times "
             "longer than wide; multiply both by what its direction was scaled by. Where pixels "
             "truly are so, scale the image, and K with it, until they are square"
-        )
-
-
-def _refuse_units(camera: Camera, *, is_metric: bool) -> None:
-    fx = float(camera.K[0, 0])
-    size = f"{camera.width}x{camera.height}"
-    _refuse_normalised(camera.K, camera.width, camera.height)
-    if fx < _MM_FX_SHARE * camera.width:
-        raise InputError(
-            f"K has fx {fx:g} for {size} pixels, so it looks like millimetres; divide by the "
-            "width of a pixel in mm"
-        )
-    if fx > _MAX_FX_SHARE * camera.width:
-        raise InputError(
-            f"K has fx {fx:g} for {size} pixels, which sees less than 0.3 degrees; give it in "
-            "pixels of this image"
-        )
-    refuse_squeezed(camera.K)
-    refuse_outside(camera.K, camera.width, camera.height)
-    if isinstance(camera, StereoRig):
-        how = 'written as ours: width, height, K, "baseline_m"'
-        how = "made in Python, as a StereoRig" if is_metric else how
-        most_m = _FILE_BASELINE_M if is_metric else WIDE_BASELINE_M
-        refuse_baseline(camera.baseline_m, f"a rig that is truly this wide is {how}", most_m)
-        if abs(camera.cx_right_minus_left_px) >= camera.width:
-            raise InputError(
-                f"the principal points differ by {camera.cx_right_minus_left_px:g} px, more than "
-                f"the image of {size} is wide; are both cameras of one size? Copy them anew"
-            )
-    if camera.depth_unit_m is not None and camera.depth_unit_m < _LEAST_UNIT_M:
-        raise InputError(
-            f"depth_unit_m is {camera.depth_unit_m:g}, finer than any sensor's; it is metres a "
-            "unit: 0.001 means millimetres"
-        )
-    if camera.depth_unit_m is not None and camera.depth_unit_m > 1:
-        raise InputError(
-            f"depth_unit_m is {camera.depth_unit_m:g}, which looks like units a metre; it is "
-            f"metres a unit: write {1 / camera.depth_unit_m:g}"
         )

@@ -157,12 +157,7 @@ def _find_corners(grey: Grey) -> Places:
 
 
 def _match(source: Grey, target: Grey, corners: Places) -> tuple[Places, Places, int]:
-    """Find corners in the whole of another image.
-
-    Returns:
-        Those with a mutual match, their places there, and how many look like some place there,
-        or like many.
-    """
+    """Give corners with a mutual match, their places, and how many look like some place there."""
     matched, is_alike, is_sole = _search(source, target, corners)
     alike = int(is_alike.sum())
     corners, matched = corners[is_alike & is_sole], matched[is_alike & is_sole]
@@ -206,16 +201,16 @@ def _unit(patches: Tensor) -> Tensor:
 
 
 def _place_finely(
-    left: Float[Tensor, "3 h w"], right: Float[Tensor, "3 h w"], places: Places, found: Places
+    left: Float[Tensor, "3 h w"], right: Float[Tensor, "3 h w"], places: Places, matched: Places
 ) -> tuple[Float[Tensor, "n 2"], Float[Tensor, "n 2"]]:
     """Give where matches lie, from the centre, and their shifts, right less left [px]."""
     one, other = (_grey(image, _FINE_PIXELS) for image in (left, right))
     larger = one.shape[1] / _grey(left, _COARSE_PIXELS).shape[1]
-    places, found = (((p + 0.5) * larger - 0.5).round().long() for p in (places, found))
+    places, matched = (((p + 0.5) * larger - 0.5).round().long() for p in (places, matched))
     rim = _FINE_RADIUS + _REACH
     padded = functional.pad(one, (rim,) * 4), functional.pad(other, (rim,) * 4)
     patches = _unit(_windows(padded[0], places + _REACH, 2 * _FINE_RADIUS + 1))
-    windows = _windows(padded[1], found, 2 * rim + 1)
+    windows = _windows(padded[1], matched, 2 * rim + 1)
     steps = windows.unfold(1, 2 * _FINE_RADIUS + 1, 1).unfold(2, 2 * _FINE_RADIUS + 1, 1)
     scores = (_unit(steps) * patches[:, None, None]).sum((-2, -1))
     best, index = scores.flatten(1).max(1)
@@ -226,7 +221,7 @@ def _place_finely(
     n = torch.arange(len(places))
     x = column + _peak(*(scores[n, row, column + i] for i in (-1, 0, 1)))
     y = row + _peak(*(scores[n, row + i, column] for i in (-1, 0, 1)))
-    shift = found - places + torch.stack([x, y], -1) - _REACH
+    shift = matched - places + torch.stack([x, y], -1) - _REACH
     scale = one.shape[1] / left.shape[2]
     centre = torch.tensor([one.shape[1], one.shape[0]]) / 2
     return ((places - centre) / scale)[is_good], (shift / scale)[is_good]

@@ -33,6 +33,7 @@ from depthpose.core.camera.stored_camera import (
 )
 from depthpose.core.errors import InputError, import_opencv
 from depthpose.core.files import AnyPath, read_json, read_text
+from depthpose.core.files.disk import naming
 from depthpose.core.files.text import MAX_LIST_BYTES
 from depthpose.core.rigid import Rigid
 
@@ -55,7 +56,8 @@ _MODELS = {
 """Models of distortion by name: whether it is that of a fisheye lens."""
 _COUNTS = {False: (4, 5, 8, 12, 14), True: (4,)}
 _MAX_BASELINE_M = 10.0
-_MOST_UNLIKE = 1.5
+_MAX_FOCAL_RATIO = 1.5
+"""Of the two cameras of a pair; more are of images of two sizes."""
 _KNOWN = (
     "a camchain of Kalibr, OpenCV's K1, D1, K2, D2, R and T (in one file, or intrinsics.yml and "
     "extrinsics.yml in a folder), or a folder with left.yaml and right.yaml of ROS"
@@ -111,17 +113,27 @@ def read_raw_pair(
         InputError: the file is missing or damaged, describes no two cameras, is of a lens of
             another model, or a value cannot be right: the rotation, the distance, the order.
     """
-    try:
+    with naming(path):
         pair = _read(Path(path), unit_m or 1.0, is_fisheye)
+        R, length = pair.right_from_left.R, float(pair.right_from_left.t_m.norm())
+        if not length:
+            raise InputError("T is 0: both cameras stand in one place; calibrate as a pair")
         said = "--unit cm or mm scales it, and --unit m says that it is in metres"
-        length = float(pair.right_from_left.t_m.norm())
-        if length:
-            refuse_baseline(length, said, _MAX_BASELINE_M if unit_m else WIDE_BASELINE_M)
-        _refuse_unlikely(pair)
-    except InputError as error:
-        said = str(error)
-        raise InputError(said if said.startswith(f"{path}") else f"{path}: {said}") from error
-    return pair
+        refuse_baseline(length, said, _MAX_BASELINE_M if unit_m else WIDE_BASELINE_M)
+        if not torch.allclose(R @ R.mT, torch.eye(3).double(), atol=1e-3) or torch.det(R) < 0:
+            raise InputError(f"R is {R.tolist()}, which is no rotation; copy it anew")
+        x, y, z = pair.right_from_left.inverse().t_m.tolist()
+        if abs(x) < max(abs(y), abs(z)):
+            raise InputError(
+                f"the second camera stands at ({x:g}, {y:g}, {z:g}) m of the first, above or "
+                "before it more than beside it; turn the images by 90 degrees and calibrate those"
+            )
+        if x < 0:
+            raise InputError(
+                "its second camera stands to the left of its first; exchange the two in the file: "
+                "R becomes its transpose, T becomes -R^T T"
+            )
+        return pair
 
 
 def _read(path: Path, unit_m: float, is_fisheye: bool | None) -> RawPair:
@@ -135,9 +147,8 @@ def _read(path: Path, unit_m: float, is_fisheye: bool | None) -> RawPair:
     names = named(content) if isinstance(content, Mapping) else read_storage(path, text)
     if names is None:
         raise InputError(f"no calibration of two cameras; known are {_KNOWN}")
-    if "cam0" in names:
-        return _from_kalibr(names, unit_m, is_fisheye)
-    return _from_opencv(names, unit_m, is_fisheye)
+    read = _from_kalibr if "cam0" in names else _from_opencv
+    return read(names, unit_m, is_fisheye)
 
 
 def _from_opencv(names: Names, unit_m: float, is_fisheye: bool | None) -> RawPair:
@@ -271,32 +282,13 @@ def _pair(
     if left.is_fisheye != right.is_fisheye:
         raise InputError("one lens is a fisheye and the other is none; calibrate both as one kind")
     one, other = float(left.K[0, 0]), float(right.K[0, 0])
-    if not 1 / _MOST_UNLIKE < one / other < _MOST_UNLIKE:
+    if not 1 / _MAX_FOCAL_RATIO < one / other < _MAX_FOCAL_RATIO:
         raise InputError(
             f"fx is {one:g} on the left and {other:g} on the right, as of images of two sizes; "
             "scale one camera matrix and its images to those of the other"
         )
     R, t_m = (torch.from_numpy(np.array(part, np.float64)) for part in motion)
     return RawPair(left=left, right=right, right_from_left=Rigid(R, t_m), size=size)
-
-
-def _refuse_unlikely(pair: RawPair) -> None:
-    R = pair.right_from_left.R
-    if not torch.allclose(R @ R.mT, torch.eye(3).double(), atol=1e-3) or torch.det(R) < 0:
-        raise InputError(f"R is {R.tolist()}, which is no rotation; copy it anew")
-    x, y, z = pair.right_from_left.inverse().t_m.tolist()
-    if not pair.right_from_left.t_m.any():
-        raise InputError("T is 0: both cameras stand in one place; calibrate as a pair")
-    if abs(x) < max(abs(y), abs(z)):
-        raise InputError(
-            f"the second camera stands at ({x:g}, {y:g}, {z:g}) m of the first, above or before it "
-            "more than beside it; turn the images by 90 degrees and calibrate those"
-        )
-    if x < 0:
-        raise InputError(
-            "its second camera stands to the left of its first; exchange the two in the file: "
-            "R becomes its transpose, T becomes -R^T T"
-        )
 
 
 Maps = tuple[np.ndarray, np.ndarray]

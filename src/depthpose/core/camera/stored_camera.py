@@ -33,15 +33,20 @@ _MAX_TEXT = 2**18
 
 
 def read_storage(path: AnyPath, text: str) -> Names | None:
-    """Parse YAML (OpenCV's kind too), or the XML of OpenCV; None where it is neither.
-
-    Raises:
-        InputError: it is damaged, or refers to something outside or to itself.
-    """
+    """Parse YAML (OpenCV's kind too), or the XML of OpenCV; None where it is neither."""
     if len(text) > _MAX_TEXT:
         return None
     if text.lstrip().startswith("<"):
-        return _read_xml(path, text)
+        if _DECLARATION.search(text):
+            raise InputError(
+                f"{path}: XML with declarations (<!...>), which no camera needs; drop them"
+            )
+        with refused_as(path, "camera file", "correct it there"):
+            root = ElementTree.fromstring(text)  # noqa: S314  entities are refused above
+        if root.tag != "opencv_storage":
+            return None
+        nodes = {node.tag: {leaf.tag: leaf.text for leaf in node} or node.text for node in root}
+        return named(nodes)
     body = _YAML_HEAD.sub("", text)
     with refused_as(path, "camera file", f"correct it there; known are {KNOWN_FILES}"):
         refuse_yaml_bomb(path, body)
@@ -101,18 +106,6 @@ def _of_opencv(loader: Any, _suffix: str, node: yaml.Node) -> object:  # noqa: A
 _Loader.add_multi_constructor("tag:yaml.org,2002:opencv-", _of_opencv)
 
 
-def _read_xml(path: AnyPath, text: str) -> Names | None:
-    if _DECLARATION.search(text):
-        raise InputError(
-            f"{path}: XML with declarations (<!...>), which no camera needs; drop them"
-        )
-    with refused_as(path, "camera file", "correct it there"):
-        root = ElementTree.fromstring(text)  # noqa: S314  entities are refused above
-    if root.tag != "opencv_storage":
-        return None
-    return named({node.tag: {leaf.tag: leaf.text for leaf in node} or node.text for node in root})
-
-
 _SUFFIXES = (".yaml", ".yml", ".xml")
 CAMERA_SUFFIXES = (".json", *_SUFFIXES, ".txt", ".conf")
 """Suffixes of the files that a camera may be read from."""
@@ -134,11 +127,7 @@ _RECTIFY = (
 
 
 def facts_from_names(names: Names) -> CameraFacts | None:
-    """Take the camera that some names describe; None where they describe none.
-
-    Raises:
-        InputError: a value is no number, or there are too many or too few of them.
-    """
+    """Take the camera that some names describe; None where they describe none."""
     if "cam0" in names and "cam1" in names:
         raise InputError(
             "a camchain of Kalibr, whose images are not rectified; 'depthpose data rectify' "
@@ -167,11 +156,7 @@ def is_ros(names: Names) -> bool:
 
 
 def read_folder(folder: Path) -> CameraFacts:
-    """Read a camera of two files: the left and right ``camera_info`` of ROS, or OpenCV's two.
-
-    Raises:
-        InputError: there are others, or they do not belong together.
-    """
+    """Read a camera of two files: the left and right ``camera_info`` of ROS, or OpenCV's two."""
     first, second = read_two_files(folder)
     if is_ros(first) and is_ros(second) and "p2" not in first | second:
         return facts_from_ros_pair(first, second)
@@ -182,11 +167,7 @@ def read_folder(folder: Path) -> CameraFacts:
 
 
 def read_two_files(folder: Path) -> tuple[Names, Names]:
-    """Read what the two files of a folder say, in the order of their names.
-
-    Raises:
-        InputError: there are more or fewer, or one is damaged.
-    """
+    """Read what the two files of a folder say, in the order of their names."""
     with refused_as(folder, "folder", "check who may read it"):
         files = sorted(p for p in folder.iterdir() if p.suffix.lower() in _SUFFIXES)
     read = [read_storage(path, read_text(path, MAX_LIST_BYTES)) for path in files]
@@ -313,11 +294,7 @@ def _lens_remedy(names: Names, of_pinhole: str) -> str:
 
 
 def lens_of(names: Names) -> tuple[float, ...]:
-    """Take every coefficient of every lens: whatever is called distortion, and loose k1, p1.
-
-    Raises:
-        InputError: coefficients that are no numbers, which would be ignored silently.
-    """
+    """Take every coefficient of every lens: whatever is called distortion, and loose k1, p1."""
     coefficients = [scalar(names, name) for name in _DISTORTION_KEYS]
     for name, value in names.items():
         is_list = name in _D or name.startswith(("distcoef", "distortioncoef"))

@@ -85,7 +85,7 @@ def run_job(job: Job, engine: Engine) -> list[Done]:
     done = _whole(out, blocks)
     left = [block for block in blocks if block.shard not in done]
     if left:
-        done |= {_shard(one): one for one in engine(left, job.work, out, job.form)}
+        done |= {one.name: one for one in engine(left, job.work, out, job.form)}
     lost = [block.shard for block in blocks if block.shard not in done]
     if lost:
         raise InputError(
@@ -100,11 +100,7 @@ def run_job(job: Job, engine: Engine) -> list[Done]:
 
 
 def claim(out: str, settings: Mapping[str, Any]) -> None:
-    """Claim a folder, local or in a store, for a run with these settings, or continue it.
-
-    Raises:
-        InputError: it holds a run with other settings; the first difference is named.
-    """
+    """Claim a folder, local or in a store, for a run with these settings, or continue it."""
     record = join(out, RECORD)
     if exists(record):
         try:
@@ -143,13 +139,14 @@ def result_items(out: str) -> list[Item]:
     The name changes with the record, so that a shard that was made anew is a new input.
     """
     folder = join(absolute(out), SHARDS)
-    return [
-        Item(
-            f"{_shard(done)}-{hashlib.sha256(_untimed(done).encode()).hexdigest()[:12]}",
-            (join(folder, f"{_shard(done)}.json"), join(folder, done.shard)),
-        )
-        for done in read_results(out)
-    ]
+    items = []
+    for done in read_results(out):
+        # A copy changes the time of a shard, and nothing else.
+        untimed = replace(done, stamp=(done.stamp[0], done.stamp[2])).to_json()
+        mark = hashlib.sha256(untimed.encode()).hexdigest()[:12]
+        files = (join(folder, f"{done.name}.json"), join(folder, done.shard))
+        items.append(Item(f"{done.name}-{mark}", files))
+    return items
 
 
 def read_results(out: str) -> list[Done]:
@@ -183,7 +180,7 @@ def _whole(out: str, blocks: Sequence[Block]) -> dict[str, Done]:
     done: dict[str, Done] = {}
     for block in blocks:
         one = records.get(block.shard)
-        is_ours = one is not None and one.block in (None, block.checksum)
+        is_ours = one is not None and one.block == block.checksum
         if one is None or not is_ours or not _is_unchanged(folder, one, sizes):
             if f"{block.shard}.json" in sizes:
                 remove(join(folder, f"{block.shard}.json"))
@@ -194,23 +191,14 @@ def _whole(out: str, blocks: Sequence[Block]) -> dict[str, Done]:
 
 def _is_unchanged(folder: str, done: Done, sizes: Mapping[str, int]) -> bool:
     path = local_path(join(folder, done.shard))
-    if path is None or not done.stamp:  # of a store sizes alone; older records have none
-        return sizes.get(done.shard) in (done.stamp[:1] or sizes.values())
+    if path is None:  # of a store sizes alone are compared
+        return sizes.get(done.shard) == done.stamp[0]
     is_unchanged_file = is_unchanged(path, done.stamp)
     if is_unchanged_file and (time_ns := path.stat().st_mtime_ns) != done.stamp[1]:  # a copy
         stamp = (done.stamp[0], time_ns, done.stamp[2])
-        record = join(folder, f"{_shard(done)}.json")
+        record = join(folder, f"{done.name}.json")
         publish_bytes(replace(done, stamp=stamp).to_json().encode(), record)
     return is_unchanged_file
-
-
-def _untimed(done: Done) -> str:
-    """Write a record without the time of its shard, which a copy changes."""
-    return replace(done, stamp=(*done.stamp[:1], *done.stamp[2:])).to_json()
-
-
-def _shard(done: Done) -> str:
-    return done.shard.rpartition(".")[0]
 
 
 def _write_manifest(out: str, every: Sequence[Done]) -> None:
@@ -363,11 +351,7 @@ def _keep_to_this_machine() -> None:
 
 
 def _import_ray() -> Any:  # noqa: ANN401  Ray is loaded where it is used
-    """Import Ray, which sends no statistics of its use unless it is set to.
-
-    Raises:
-        MissingExtraError: it is not installed, or too old to ask for a password.
-    """
+    """Import Ray, which sends no statistics of its use unless it is set to."""
     os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
     import_extra("ray.data", "ray[data]", "ray", "--engine ray")
     ray = import_module("ray")

@@ -77,7 +77,14 @@ def find_items(words: Sequence[str], files: Files) -> list[Item]:
     else:
         listed = [url for word in others for url in list_files(word, files.suffixes)]
         items += [Item(stem(url), (url,)) for url in listed]
-    _refuse_twice(items)
+    first: dict[str, Item] = {}
+    for item in items:
+        other = first.setdefault(item.name, item)
+        if other is not item:
+            raise InputError(
+                f"{other.files[0]} and {item.files[0]} would both be {item.name!r} in the "
+                "results; give a manifest with a column 'name'"
+            )
     return items
 
 
@@ -103,11 +110,7 @@ def stem(url: str) -> str:
 
 
 def refuse_name(name: str, source: str) -> None:
-    """Refuse a name that would lead out of the folder of the results.
-
-    Raises:
-        InputError: it is empty, absolute or holds ``..``.
-    """
+    """Refuse a name that would lead out of the folder of the results."""
     parts = PurePosixPath(name).parts
     if not parts or name.startswith("/") or ".." in parts or "\0" in name or "\\" in name:
         raise InputError(
@@ -116,11 +119,7 @@ def refuse_name(name: str, source: str) -> None:
 
 
 def import_pyarrow(purpose: str) -> Any:  # noqa: ANN401  pyarrow carries no types
-    """Import Parquet's reader and writer, which the extra ``ray`` brings.
-
-    Raises:
-        MissingExtraError: it is not installed.
-    """
+    """Import Parquet's reader and writer, which the extra ``ray`` brings."""
     import_extra("pyarrow.parquet", "pyarrow", "ray", purpose)
     return import_module("pyarrow")
 
@@ -141,7 +140,14 @@ def _pair(words: Sequence[str], files: Files) -> list[Item]:
 
 
 def _read_manifest(url: str, roles: Sequence[str]) -> Iterator[Item]:
-    rows = _parquet_rows(url) if url.lower().endswith(".parquet") else _csv_rows(url)
+    if url.lower().endswith(".parquet"):
+        rows: Iterable[Mapping[str, Any]] = parquet_rows(url, "a Parquet manifest")
+    else:
+        try:
+            text = io.StringIO(read_from(url).decode("utf-8-sig"), newline="")
+            rows = list(csv.DictReader(text, strict=True))
+        except (UnicodeDecodeError, csv.Error) as error:
+            raise InputError(f"{url}: not a CSV table in UTF-8 ({error}); save it so") from error
     folder = url.rpartition("/")[0] or "."
     for number, row in enumerate(rows, 1):
         missing = [role for role in roles if not isinstance(row.get(role), str) or not row[role]]
@@ -150,44 +156,26 @@ def _read_manifest(url: str, roles: Sequence[str]) -> Iterator[Item]:
                 f"{url}: row {number} has no {missing[0]!r}; the columns are "
                 f"{', '.join(roles)} (paths or URLs) and, if you like, name"
             )
-        files = tuple(_beside(row[role], folder) for role in roles)
+        paths = [row[role] for role in roles]
+        is_full = [is_url(path) or path.startswith("/") for path in paths]
+        files = tuple(
+            path if full else absolute(join(folder, path))
+            for path, full in zip(paths, is_full, strict=True)
+        )
         name = row.get("name") or stem(files[0])
         refuse_name(str(name), f"{url}: row {number}")
         yield Item(str(name), files)
 
 
-def _beside(path: str, folder: str) -> str:
-    """Read a relative path from its manifest's folder."""
-    return path if is_url(path) or path.startswith("/") else absolute(join(folder, path))
-
-
-def _csv_rows(url: str) -> Iterator[Mapping[str, Any]]:
-    try:
-        text = read_from(url).decode("utf-8-sig")
-        yield from csv.DictReader(io.StringIO(text, newline=""), strict=True)
-    except (UnicodeDecodeError, csv.Error) as error:
-        raise InputError(f"{url}: not a CSV table in UTF-8 ({error}); save it so") from error
-
-
-def _parquet_rows(url: str) -> Iterator[Mapping[str, Any]]:
-    arrow = import_pyarrow("a Parquet manifest")
+def parquet_rows(url: str, purpose: str) -> Iterator[dict[str, Any]]:
+    """Read the rows of a Parquet file one by one, few at a time."""
+    arrow = import_pyarrow(purpose)
     try:
         file = arrow.parquet.ParquetFile(io.BytesIO(read_from(url)))
-        for batch in file.iter_batches():
+        for batch in file.iter_batches(batch_size=8):
             yield from batch.to_pylist()
     except (arrow.ArrowException, OSError) as error:
         raise InputError(f"{url}: not a Parquet file ({error}); write it anew") from error
-
-
-def _refuse_twice(items: Sequence[Item]) -> None:
-    first: dict[str, Item] = {}
-    for item in items:
-        other = first.setdefault(item.name, item)
-        if other is not item:
-            raise InputError(
-                f"{other.files[0]} and {item.files[0]} would both be {item.name!r} in the "
-                "results; give a manifest with a column 'name'"
-            )
 
 
 PLAN = "plan.jsonl"
@@ -230,17 +218,12 @@ def make_plan(out: str, items: Sequence[Item], tars: Sequence[str], size: int) -
 
     The plan is a file in ``out``, so that a shard means the same inputs in every run, whatever
     has been added to a folder since.
-
-    Args:
-        out: folder of the results.
-        items: listed inputs.
-        tars: tar shards, a block each.
-        size: inputs of a block.
-
-    Raises:
-        InputError: an earlier run gave a name to another file, or the place refuses.
     """
-    known = _read_plan(join(out, PLAN))
+    known: list[Block] = []
+    plan = join(out, PLAN)
+    with suppress(ValueError, KeyError, TypeError, AttributeError):  # what is damaged, and follows
+        for line in read_from(plan).splitlines() if exists(plan) else ():
+            known.append(Block.from_json(line.decode()))  # noqa: PERF401  those before the damage
     files = {item.name: item.files for block in known for item in block.items}
     for item in items:
         if files.get(item.name, item.files) != item.files:
@@ -259,14 +242,5 @@ def make_plan(out: str, items: Sequence[Item], tars: Sequence[str], size: int) -
     ]
     if lots:
         lines = "".join(f"{block.to_json()}\n" for block in blocks)
-        publish_bytes(lines.encode(), join(out, PLAN))
-    return blocks
-
-
-def _read_plan(url: str) -> list[Block]:
-    """Read a plan up to where it is damaged; what follows is planned again."""
-    blocks: list[Block] = []
-    with suppress(ValueError, KeyError, TypeError, AttributeError):
-        for line in read_from(url).splitlines() if exists(url) else ():
-            blocks.append(Block.from_json(line.decode()))  # noqa: PERF401  those before the damage
+        publish_bytes(lines.encode(), plan)
     return blocks

@@ -15,7 +15,7 @@ from itertools import islice
 from pathlib import Path, PurePosixPath
 from typing import Any, Literal, Protocol, runtime_checkable
 
-from depthpose.core.engine.plan import Block, Files, Item, import_pyarrow, refuse_name
+from depthpose.core.engine.plan import Block, Files, Item, import_pyarrow, parquet_rows, refuse_name
 from depthpose.core.errors import InputError
 from depthpose.core.files.disk import refused_write
 from depthpose.core.files.store import (
@@ -41,17 +41,7 @@ _GROUP_BYTES = 64 * 2**20
 
 @contextmanager
 def shard_writer(path: Path, form: ShardFormat, endings: Sequence[str]) -> Iterator[AddResult]:
-    """Write a shard, the same bytes for the same results.
-
-    Args:
-        path: a local file.
-        form: tar holds members ``NAME.ENDING``; Parquet has a row for each name, with columns
-            ``name``, ``reason`` and the content of each ending.
-        endings: that a result may have.
-
-    Raises:
-        MissingExtraError: Parquet without the extra ``ray``.
-    """
+    """Write a tar of ``NAME.ENDING``, or Parquet of a row a name; equal results, equal bytes."""
     if form == "tar":
         with tarfile.open(path, "w", format=tarfile.PAX_FORMAT) as tar:
 
@@ -102,12 +92,23 @@ def read_shard(
         InputError: the shard is not there, or is damaged.
     """
     if url.endswith(".parquet"):
-        yield from _read_parquet(url)
+        for row in parquet_rows(url, "results in Parquet"):
+            if "name" not in row:
+                raise InputError(f"{url}: not a Parquet shard (no 'name'); make it anew")
+            contents = {end: row[end] for end in endings if row.get(end) is not None}
+            if contents:
+                yield row["name"], contents
         return
     files: dict[str, bytes] = {}
     last = ""
     for member, data in read_tar(url):
-        name = _name_of(member, names, endings, url)
+        dots = [k for k, letter in enumerate(member) if letter == "."]
+        fits = (member[:k] for k in dots if member[:k] in names and member[k + 1 :] in endings)
+        name = next(fits, None)
+        if name is None:
+            raise InputError(
+                f"{url}: holds {member!r}, which its record does not name; make it anew"
+            )
         if name != last and files:
             yield last, files
             files = {}
@@ -117,11 +118,7 @@ def read_shard(
 
 
 def read_tar(url: str) -> Iterator[tuple[str, bytes]]:
-    """Read the files of a tar shard, plain or compressed, from its beginning to its end.
-
-    Raises:
-        InputError: it is not there, is no intact tar file, or holds a link or one name twice.
-    """
+    """Read the files of a tar shard, plain or compressed, from its beginning to its end."""
     seen: set[str] = set()
     try:
         with opened(url) as file, tarfile.open(fileobj=file, mode="r|*") as tar:
@@ -141,27 +138,6 @@ def read_tar(url: str) -> Iterator[tuple[str, bytes]]:
                     yield member.name, content.read()
     except (tarfile.TarError, EOFError, OSError) as error:
         raise InputError(f"{url}: not an intact tar file ({error}); make it anew") from error
-
-
-def _read_parquet(url: str) -> Iterator[tuple[str, dict[str, bytes]]]:
-    arrow = import_pyarrow("results in Parquet")
-    try:
-        file = arrow.parquet.ParquetFile(io.BytesIO(read_from(url)))
-        for batch in file.iter_batches(batch_size=8):
-            for row in batch.to_pylist():
-                name, _ = row.pop("name"), row.pop("reason")
-                files = {ending: data for ending, data in row.items() if data is not None}
-                if files:
-                    yield name, files
-    except (arrow.ArrowException, OSError, KeyError) as error:
-        raise InputError(f"{url}: not a Parquet shard ({error}); make it anew") from error
-
-
-def _name_of(member: str, names: Collection[str], endings: Collection[str], url: str) -> str:
-    for k, letter in enumerate(member):
-        if letter == "." and member[:k] in names and member[k + 1 :] in endings:
-            return member[:k]
-    raise InputError(f"{url}: holds {member!r}, which its record does not name; make it anew")
 
 
 SHARDS = "shards"
@@ -222,9 +198,14 @@ class Done:
 
     shard: str
     entries: tuple[tuple[str, str], ...]
-    endings: tuple[str, ...] = ()
-    stamp: tuple[int, ...] = ()
-    block: int | None = None
+    endings: tuple[str, ...]
+    stamp: tuple[int, ...]
+    block: int
+
+    @property
+    def name(self) -> str:
+        """Name of the shard, without its suffix."""
+        return self.shard.rpartition(".")[0]
 
     @property
     def failures(self) -> list[tuple[str, str]]:
@@ -239,14 +220,8 @@ class Done:
     def from_json(cls, text: str | bytes) -> "Done":
         """Read what :meth:`to_json` wrote."""
         row = json.loads(text)
-        entries = tuple((name, reason) for name, reason in row["entries"])
-        return cls(
-            shard=row["shard"],
-            entries=entries,
-            endings=tuple(row["endings"]),
-            stamp=tuple(row.get("stamp", ())),
-            block=row.get("block"),
-        )
+        row["entries"] = tuple((name, reason) for name, reason in row["entries"])
+        return cls(**row | {key: tuple(row[key]) for key in ("endings", "stamp")})
 
 
 class Runner:
@@ -304,7 +279,12 @@ class Runner:
                 reasons = iter(self._function([one.sample for one in chunk if one.sample], results))
                 for one in chunk:
                     reason = next(reasons) if one.sample else one.reason
-                    files = _take(results, one.name, self._work.endings)
+                    files: dict[str, bytes] = {}
+                    for ending in self._work.endings:
+                        path = results / f"{one.name}.{ending}"
+                        if path.is_file():
+                            files[ending] = path.read_bytes()
+                            path.unlink()
                     add(one.name, {} if reason else files, reason)
                     yield one.name, reason
                     for path in one.sample.files if one.sample else ():
@@ -368,21 +348,16 @@ def _tar_samples(tar: str, wanted: Files, scratch: Path) -> Iterator[_Opened]:
                 yield _grouped(tar, key, files, wanted)
                 files = {}
             key = next_key
-            role, suffix = _role(ending, wanted)
-            if role is not None:
+            role, dot, suffix = f".{ending}".rpartition(".")
+            suffix = f"{dot}{suffix}"
+            role = role.removeprefix(".") or (wanted.roles[0] if len(wanted.roles) == 1 else "")
+            if role in wanted.roles and suffix.lower() in wanted.suffixes:
                 files[role] = Path(tempfile.mkdtemp(dir=scratch)) / f"{role}{suffix}"
                 files[role].write_bytes(data)
         if key:
             yield _grouped(tar, key, files, wanted)
     except InputError as error:
         yield _Opened(name=PurePosixPath(tar).name, reason=str(error))
-
-
-def _role(ending: str, wanted: Files) -> tuple[str | None, str]:
-    role, dot, suffix = f".{ending}".rpartition(".")
-    name = role.removeprefix(".") or (wanted.roles[0] if len(wanted.roles) == 1 else "")
-    is_ours = name in wanted.roles and f"{dot}{suffix}".lower() in wanted.suffixes
-    return (name if is_ours else None), f"{dot}{suffix}"
 
 
 def _grouped(tar: str, key: str, files: dict[str, Path], wanted: Files) -> _Opened:
@@ -399,14 +374,3 @@ def _grouped(tar: str, key: str, files: dict[str, Path], wanted: Files) -> _Open
             shutil.rmtree(file.parent, ignore_errors=True)
         return _Opened(name=key, reason=reason)
     return _Opened(name=key, sample=Sample(key, tuple(files[role] for role in wanted.roles)))
-
-
-def _take(results: Path, name: str, endings: Sequence[str]) -> dict[str, bytes]:
-    """Take the files of one result out of the folder."""
-    contents: dict[str, bytes] = {}
-    for ending in endings:
-        path = results / f"{name}.{ending}"
-        if path.is_file():
-            contents[ending] = path.read_bytes()
-            path.unlink()
-    return contents

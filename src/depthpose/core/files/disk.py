@@ -21,15 +21,7 @@ MAX_FILE_BYTES = 2**28
 
 
 def read_file(path: AnyPath, most: int = MAX_FILE_BYTES) -> bytes:
-    """Read a regular file whole.
-
-    Args:
-        path: the file.
-        most: bytes beyond which it is refused unread: files of its kind are smaller.
-
-    Raises:
-        InputError: there is no such file, or it is a folder, a device, too large or unreadable.
-    """
+    """Read a regular file whole."""
     with refused_read(path):
         status = Path(path).stat()
         if stat.S_ISDIR(status.st_mode):
@@ -73,8 +65,7 @@ def refused_as(path: AnyPath, kind: str, remedy: str) -> Iterator[None]:
     sizes are checked by us.
     """
     try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
+        with warnings.catch_warnings(action="ignore"):
             yield
     except InputError:
         raise
@@ -82,6 +73,17 @@ def refused_as(path: AnyPath, kind: str, remedy: str) -> Iterator[None]:
         text = _ADDRESS.sub("", f"{type(error).__name__}: {error}")
         said = " ".join(text.split())[:200]
         raise InputError(f"{path}: not a readable {kind} ({said}); {remedy}") from error
+
+
+@contextmanager
+def naming(path: AnyPath) -> Iterator[None]:
+    """Begin the message of an :class:`InputError` with the file that it is of."""
+    try:
+        yield
+    except InputError as error:
+        if str(error).startswith(f"{path}"):
+            raise
+        raise InputError(f"{path}: {error}") from error
 
 
 @contextmanager
@@ -188,14 +190,6 @@ def find_partners(first: Sequence[str], second: Sequence[str], said: str) -> lis
     Names belong together that are equal; else those that are equal without what all names of their
     side share (``left_0004`` and ``right_0004``, ``1_L`` and ``1_R``), numbers by value. Two lone
     names belong together unless each has numbers and none of them is the other's.
-
-    Args:
-        first: names of the files of one side, without suffix.
-        second: of the other.
-        said: what to call the two.
-
-    Raises:
-        InputError: some have no partner; they are named.
     """
     keys: tuple[Sequence[Hashable], Sequence[Hashable]] = first, second
     if not set(first) & set(second):

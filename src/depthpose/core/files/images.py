@@ -111,8 +111,8 @@ def from_16_bit(values: np.ndarray, name: AnyPath) -> np.ndarray:
     if not _LEAST_SPAN <= high - low < _FULL_SPAN:
         return values.astype(np.float32) / 65535
     black = low if low > high - low else 0
-    if (folder := Path(name).parent) not in _SAID:
-        _SAID.add(folder)
+    if (folder := Path(name).parent) not in _REPORTED:
+        _REPORTED.add(folder)
         said = (
             f"{name}: of 16 bits, and its values are {low} to {high}: {black} is taken as black "
             f"and {high} as white; so are those of other pictures there"
@@ -131,8 +131,8 @@ _LEAST_SPAN, _FULL_SPAN = 64, 2**14
 """Masks and labels have fewer values than a picture; more than 14 bits are taken for all 16."""
 
 
-_SAID: set[Path] = set()
-"""Folders of which it was said."""
+_REPORTED: set[Path] = set()
+"""Folders whose range of values has been reported."""
 
 
 def _deep_ppm(image: Image.Image) -> np.ndarray | None:
@@ -257,11 +257,7 @@ def list_images(path: AnyPath) -> list[Path]:
 
 @contextmanager
 def opened_image(path: AnyPath) -> Iterator[Image.Image]:
-    """Open a picture's header; whatever decoding raises inside the block is an input error.
-
-    Raises:
-        InputError: the file is missing, too large, damaged or not a picture.
-    """
+    """Open a picture's header; whatever decoding raises inside the block is an input error."""
     data = read_bytes(path)
     with (
         refused_as(path, "picture", "give an intact PNG or JPEG"),

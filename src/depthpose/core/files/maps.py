@@ -80,11 +80,7 @@ def write_map(path: AnyPath, map: Float[Tensor, "h w"]) -> None:
 
 
 def read_npy(path: AnyPath) -> np.ndarray:
-    """Read a float array of any shape as float32; never unpickles.
-
-    Raises:
-        InputError: the file is missing, damaged, or of another type than float16, 32 or 64.
-    """
+    """Read a float array of any shape as float32; never unpickles."""
     array = read_numbers(path)
     if array.dtype.kind != "f":
         raise InputError(
@@ -95,11 +91,7 @@ def read_npy(path: AnyPath) -> np.ndarray:
 
 
 def read_numbers(path: AnyPath) -> np.ndarray:
-    """Read an array of floats or whole numbers of any shape as it is; never unpickles.
-
-    Raises:
-        InputError: the file is missing, damaged, or of another type.
-    """
+    """Read an array of floats or whole numbers of any shape as it is; never unpickles."""
     stream = BytesIO(read_bytes(path))
     with refused_as(path, "NPY file", "save it again with numpy.save"):
         version = np.lib.format.read_magic(stream)

@@ -25,19 +25,12 @@ Columns = dict[str, np.ndarray]
 
 @dataclass(frozen=True, kw_only=True)
 class Field:
-    """One named column of a record: ``count`` numbers of one type.
-
-    Attributes:
-        name: as the file names it.
-        code: numpy's type code without byte order, such as ``f4``.
-        count: numbers a record; a field of several is stepped over.
-        size_code: of a list, the type of the number of its values; None: it is no list.
-    """
+    """One named column of a record."""
 
     name: str
-    code: str
-    count: int = 1
-    size_code: str | None = None
+    code: str  # numpy's, without byte order, as "f4"
+    count: int = 1  # numbers a record; a field of several is stepped over
+    size_code: str | None = None  # of a list, the type of its length; None: it is no list
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,11 +44,7 @@ class Ragged:
 def split_records(
     path: AnyPath, body: memoryview, fields: list[Field], count: int, order: str = "<"
 ) -> Columns:
-    """Take ``count`` packed records apart into columns, without a copy.
-
-    Raises:
-        InputError: ``body`` is shorter than the records that the header declares.
-    """
+    """Take ``count`` packed records apart into columns, without a copy."""
     # Named by place, since a file may use one name for several fields of padding.
     with refused_as(path, "list of fields", "save it again"):
         dtype = np.dtype([(f"{i}", order + f.code, (f.count,)) for i, f in enumerate(fields)])
@@ -65,11 +54,7 @@ def split_records(
 
 
 def text_rows(path: AnyPath, body: memoryview) -> Iterator[str]:
-    """Give the lines of a body in text; empty ones do not count.
-
-    Raises:
-        InputError: there is more text than is read.
-    """
+    """Give the lines of a body in text; empty ones do not count."""
     if len(body) > MAX_TEXT_BYTES:
         raise InputError(
             f"{path}: {len(body)} bytes of points in text, more than {MAX_TEXT_BYTES}; save it as "
@@ -87,11 +72,7 @@ def plain_numbers(line: str) -> str:
 
 
 def split_rows(path: AnyPath, rows: Iterator[str], fields: list[Field], count: int) -> Columns:
-    """Take the next ``count`` rows of text apart into columns of the declared types.
-
-    Raises:
-        InputError: rows are missing or ragged, or a value does not fit its type.
-    """
+    """Take the next ``count`` rows of text apart into columns of the declared types."""
     table = parse_rows(path, islice(rows, count))
     if len(table) < count:
         raise _truncated(path, f"{count} points", len(table))
@@ -113,11 +94,7 @@ def _truncated(path: AnyPath, what: str, rows: int) -> InputError:
 
 
 def parse_rows(path: AnyPath, rows: Iterable[str]) -> np.ndarray:
-    """Parse rows of equally many numbers, parted by blanks, to float64; taken one at a time.
-
-    Raises:
-        InputError: a value is no number, or the rows are ragged.
-    """
+    """Parse rows of equally many numbers, parted by blanks, to float64; taken one at a time."""
     with refused_as(path, "table of numbers", "give every row as many values, with decimal points"):
         table = np.loadtxt(rows, dtype=np.float64, comments=None, ndmin=2)
     return table if table.size else np.empty((0, 0))
@@ -166,27 +143,12 @@ class _Element:
 
 
 def read_ply(path: AnyPath) -> Columns:
-    """Read the columns of the ``vertex`` element alone.
-
-    Raises:
-        InputError: the file is missing, truncated or damaged.
-    """
+    """Read the columns of the ``vertex`` element alone."""
     return read_ply_elements(path, "vertex")[0]
 
 
 def read_ply_elements(path: AnyPath, last: str | None = None) -> tuple[Columns, dict[str, Ragged]]:
-    """Read the columns of the ``vertex`` element, and the lists of the others.
-
-    Args:
-        path: the file.
-        last: the element behind which nothing is read; None: every byte must belong to one.
-
-    Returns:
-        The columns; the lists by ``ELEMENT PROPERTY``.
-
-    Raises:
-        InputError: the file is missing, damaged, or shorter or longer than its header says.
-    """
+    """Read the columns of the ``vertex`` element, and the lists of the others."""
     data = read_bytes(path)
     end = _END.search(data, 0, _MAX_HEADER)
     if not data.startswith(b"ply") or end is None:
@@ -368,11 +330,7 @@ _DATA = re.compile(rb"(?:^|\n)DATA[ \t]+(ascii|binary|binary_compressed)[ \t]*(?
 
 
 def read_pcd(path: AnyPath) -> Columns:
-    """Read the columns of a PCD file; ``rgb`` stays packed.
-
-    Raises:
-        InputError: the file is missing, truncated or damaged.
-    """
+    """Read the columns of a PCD file; ``rgb`` stays packed."""
     data = read_bytes(path)
     end = _DATA.search(data, 0, _MAX_PCD_HEADER)
     if end is None:
@@ -383,7 +341,14 @@ def read_pcd(path: AnyPath) -> Columns:
         if not line.startswith("#")
     )
     header = {words[0]: words[1:] for words in lines if words}
-    fields, count = _parse_fields(path, header), _parse_count(path, header)
+    fields = _parse_fields(path, header)
+    match header.get("POINTS"), header.get("WIDTH"), header.get("HEIGHT"):
+        case [points], _, _ if _is_count(points):
+            count = int(points)
+        case None, [width], [height] if _is_count(width) and _is_count(height):
+            count = int(width) * int(height)
+        case _:
+            raise InputError(f"{path}: the PCD header says no number of POINTS; add that line")
     body = memoryview(data)[end.end() :]
     if end[1] == b"binary":
         return split_records(path, body, fields, count)
@@ -423,9 +388,6 @@ def decompress_lzf(packed: memoryview, size: int) -> bytes:
 
     A control byte below 32 announces that many literal bytes and one; any other holds a length
     (3 bits, 7: a further byte is added) and a distance (13 bits) back into what is there already.
-
-    Raises:
-        ValueError: the stream does not unpack to exactly ``size`` bytes.
     """
     out = bytearray()
     at = 0
@@ -442,7 +404,10 @@ def decompress_lzf(packed: memoryview, size: int) -> bytes:
             at += 1
         start = len(out) - ((control & 31) << 8) - _byte(packed, at) - 1
         at += 1
-        _repeat(out, start, length + 2)
+        if start < 0:
+            raise ValueError("the compressed bytes refer to before their beginning")
+        piece = out[start : start + length + 2]  # shorter where source and target overlap
+        out += (piece * ((length + 2) // len(piece) + 1))[: length + 2]
     if len(out) != size or at > len(packed):
         raise ValueError(f"the compressed bytes do not unpack to {size}")
     return bytes(out)
@@ -452,13 +417,6 @@ def _byte(packed: memoryview, at: int) -> int:
     if at >= len(packed):
         raise ValueError("the compressed bytes end in the middle of a reference")
     return packed[at]
-
-
-def _repeat(out: bytearray, start: int, length: int) -> None:
-    if start < 0:
-        raise ValueError("the compressed bytes refer to before their beginning")
-    piece = out[start : start + length]  # shorter than length where source and target overlap
-    out += (piece * (length // len(piece) + 1))[:length]
 
 
 def _split_compressed(path: AnyPath, body: memoryview, fields: list[Field], count: int) -> Columns:
@@ -498,16 +456,6 @@ def _parse_fields(path: AnyPath, header: dict[str, list[str]]) -> list[Field]:
     if len(set(real)) != len(real):
         raise InputError(f"{path}: PCD fields {names} repeat a name; keep one of them")
     return [Field(name=n, code=_PCD_CODES[k, s], count=int(c)) for n, k, s, c in rows]
-
-
-def _parse_count(path: AnyPath, header: dict[str, list[str]]) -> int:
-    match header.get("POINTS"), header.get("WIDTH"), header.get("HEIGHT"):
-        case [points], _, _ if _is_count(points):
-            return int(points)
-        case None, [width], [height] if _is_count(width) and _is_count(height):
-            return int(width) * int(height)
-        case _:
-            raise InputError(f"{path}: the PCD header says no number of POINTS; add that line")
 
 
 def _is_count(text: str) -> bool:

@@ -104,11 +104,7 @@ def absolute(path: str) -> str:
 
 
 def read_from(url: str) -> bytes:
-    """Read a file whole.
-
-    Raises:
-        InputError: it is not there, or cannot be read.
-    """
+    """Read a file whole."""
     path = local_path(url)
     if path is not None:
         return read_file(path)
@@ -117,11 +113,7 @@ def read_from(url: str) -> bytes:
 
 
 def exists(url: str) -> bool:
-    """Whether there is a file.
-
-    Raises:
-        InputError: the store does not answer.
-    """
+    """Whether there is a file."""
     path = local_path(url)
     if path is not None:
         return path.is_file()
@@ -130,11 +122,7 @@ def exists(url: str) -> bool:
 
 
 def read_all(folder: str, suffix: str) -> dict[str, bytes]:
-    """Read the files of a folder, not below it, whose names end so; none where there is no folder.
-
-    Raises:
-        InputError: the store does not answer.
-    """
+    """Read the files of a folder, not below it, by suffix; none where there is no folder."""
     path = local_path(folder)
     if path is not None:
         return {p.name: read_file(p) for p in sorted(path.glob(f"*{suffix}")) if _shown(p.name)}
@@ -149,9 +137,6 @@ def publish(file: Path, url: str) -> None:
 
     On a disk it is copied beside the place and renamed; an object store shows an upload only when
     it is complete.
-
-    Raises:
-        InputError: the place cannot be written to, or its kind of store may show half a file.
     """
     path = local_path(url)
     if path is not None:
@@ -172,11 +157,7 @@ def publish_bytes(data: bytes, url: str) -> None:
 
 
 def refuse_unsafe(url: str) -> None:
-    """Refuse a place for results where a killed upload may leave half a file.
-
-    Raises:
-        InputError: neither a disk nor a known object store.
-    """
+    """Refuse a place for results where a killed upload may leave half a file."""
     protocol = url.partition("://")[0]
     if local_path(url) is None and protocol not in _STORES:
         raise InputError(
@@ -201,22 +182,14 @@ def local_copy(url: str, scratch: Path) -> Path:
 
 
 def fetch(url: str, path: Path) -> None:
-    """Copy a file to the disk, whole or not at all.
-
-    Raises:
-        InputError: it is not there or cannot be read, or the disk refuses.
-    """
+    """Copy a file to the disk, whole or not at all."""
     with atomic_write(path) as part, _file_system(url, "read") as (fs, inner):
         fs.get_file(inner, str(part))
 
 
 @contextmanager
 def opened(url: str) -> Iterator[Any]:
-    """Open a file for reading from its beginning to its end.
-
-    Raises:
-        InputError: it is not there.
-    """
+    """Open a file for reading from its beginning to its end."""
     with _file_system(url, "read") as (fs, inner):
         file = fs.open(inner, "rb")
     with file:
@@ -259,31 +232,19 @@ def list_files(path: str, suffixes: Sequence[str]) -> list[str]:
 
 
 def list_sizes(folder: str) -> dict[str, int]:
-    """Give the sizes [bytes] of the files of a folder, by name; none where there is no folder.
-
-    Raises:
-        InputError: the store does not answer.
-    """
+    """Give the sizes [bytes] of the files of a folder, by name; none where there is no folder."""
     with _file_system(folder, "listed") as (fs, inner):
         return {PurePosixPath(e["name"]).name: int(e["size"]) for e in _details(fs, inner)}
 
 
 def remove(url: str) -> None:
-    """Remove a file.
-
-    Raises:
-        InputError: it cannot be.
-    """
+    """Remove a file."""
     with _file_system(url, "removed") as (fs, inner):
         fs.rm_file(inner)
 
 
 def list_tree(url: str) -> dict[str, str]:
-    """List all files below a folder: their URLs by their names in it; none without a folder.
-
-    Raises:
-        InputError: the store does not answer.
-    """
+    """List all files below a folder: their URLs by their names in it; none without a folder."""
     with _file_system(url, "listed") as (fs, inner):
         root = inner.rstrip("/")
         names = [path.removeprefix(root).lstrip("/") for path in fs.find(inner)]

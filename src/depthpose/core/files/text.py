@@ -35,11 +35,7 @@ class YamlLoader(_PLAIN):
     """Plain values alone, and no key twice."""
 
     def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
-        """Give a mapping; of a key that stands twice the first value would be lost.
-
-        Raises:
-            ValueError: there is one.
-        """
+        """Give a mapping; of a key that stands twice the first value would be lost."""
         seen: set[tuple[str, str]] = set()
         for key, _ in node.value:
             if not isinstance(key, yaml.ScalarNode) or key.tag == _MERGE:
@@ -93,16 +89,7 @@ def read_json(path: AnyPath) -> object:
 
 
 def refuse_heavy(path: AnyPath, data: bytes, memory_of: Mapping[bytes, int]) -> None:
-    """Refuse a tree in text that would fill the memory.
-
-    Args:
-        path: of the file, for the error.
-        data: its content.
-        memory_of: bytes that a value takes once it is read, by the sign that marks it.
-
-    Raises:
-        InputError: together they are more than is allowed.
-    """
+    """Refuse a tree in text that would fill the memory."""
     a_letter = 2 if data.isascii() else 5
     need = a_letter * len(data) + sum(size * data.count(sign) for sign, size in memory_of.items())
     if need > _MOST_MEMORY:
@@ -113,16 +100,7 @@ def refuse_heavy(path: AnyPath, data: bytes, memory_of: Mapping[bytes, int]) -> 
 
 
 def parse_yaml(path: AnyPath, text: str) -> object:
-    """Parse YAML of plain values; references (``*name``) are followed within a bound.
-
-    Args:
-        path: of the file, for the error.
-        text: its content.
-
-    Raises:
-        InputError: it is no YAML, refers to itself, is so deep that a loader would crash, or would
-            fill the memory once its references are followed.
-    """
+    """Parse YAML of plain values; references (``*name``) are followed within a bound."""
     refuse_yaml_bomb(path, text)
     with refused_as(path, "YAML file", "correct it there"):
         return yaml.load(text, YamlLoader)  # noqa: S506  a safe loader
@@ -132,9 +110,6 @@ def refuse_yaml_bomb(path: AnyPath, text: str) -> None:
     """Refuse YAML that refers to itself, is too deep, or grows beyond all bounds by references.
 
     What is no YAML passes: the parser refuses it.
-
-    Raises:
-        InputError: that is so.
     """
     sizes: dict[str, int] = {}
     unfinished: list[tuple[str | None, int]] = []
@@ -201,19 +176,14 @@ def read_key_values(path: AnyPath) -> dict[str, list[float]]:
             raise InputError(f"{path}: line {number}, {text[:60]!r}, is not 'KEY: numbers'")
         if match[1] in values:
             raise InputError(f"{path}: line {number} gives {match[1]!r} again; keep one of them")
-        numbers = _numbers(match[2])
+        numbers: list[float] = []
+        with suppress(ValueError):  # a date, or other words
+            numbers = [float(word) for word in match[2].translate(_BRACKETS).split()]
         if not all(map(math.isfinite, numbers)):
             raise InputError(f"{path}: line {number}, {match[1]!r}, holds NaN or infinity")
         if numbers:
             values[match[1]] = numbers
     return values
-
-
-def _numbers(text: str) -> list[float]:
-    try:
-        return [float(word) for word in text.translate(_BRACKETS).split()]
-    except ValueError:
-        return []
 
 
 def refuse_number(text: str) -> NoReturn:

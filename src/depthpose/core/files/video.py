@@ -100,58 +100,40 @@ def write_video(path: AnyPath, images: Iterable[Float[Tensor, "3 _ _"]], fps: fl
     if not 0 < fps < math.inf:
         raise InputError(f"{path}: fps is {fps:g}, but a video has a positive rate; give, say, 10")
     cv2 = import_opencv("writing a video")
+    writer, first, count, readable = None, (0, 0), 0, 0
     with atomic_write(path) as part:
-        return _encode(cv2, (Path(path), part), images, fps)
-
-
-def _encode(
-    cv2: Any,  # noqa: ANN401  OpenCV's classes carry no types
-    paths: tuple[Path, Path],
-    images: Iterable[Float[Tensor, "3 _ _"]],
-    fps: float,
-) -> int:
-    path, part = paths
-    writer, size, count = None, (0, 0), 0
-    try:
-        for image in images:
-            width_height = (image.shape[2], image.shape[1])
-            if writer is None:
-                size = width_height
-                codec = cv2.VideoWriter_fourcc(*_CODECS[path.suffix.lower()])
-                writer = cv2.VideoWriter(str(part), codec, float(fps), size)
-                if path.suffix.lower() == ".mp4" and not writer.isOpened():
-                    said = "OpenCV encodes no VP9 here, so it is MPEG-4, which no browser plays"
-                    warnings.warn(f"{path}: {said}", Notice, stacklevel=3)
-                    codec = cv2.VideoWriter_fourcc(*"mp4v")
+        try:
+            for image in images:
+                size = (image.shape[2], image.shape[1])
+                if writer is None:
+                    first, codec = size, cv2.VideoWriter_fourcc(*_CODECS[suffix])
                     writer = cv2.VideoWriter(str(part), codec, float(fps), size)
-            if width_height != size:
-                raise InputError(
-                    f"{path}: frame {count} is {width_height[0]}x{width_height[1]}, but the first "
-                    f"one is {size[0]}x{size[1]}; a video has one size"
-                )
-            pixels = image.detach().cpu().clamp(0, 1).mul(255).round().byte().permute(1, 2, 0)
-            writer.write(np.ascontiguousarray(pixels.numpy()[..., ::-1]))
-            count += 1
-    finally:
-        if writer is not None:
-            writer.release()
-    readable = _count_frames(cv2, part)  # the encoder does not report a full disk
-    if count == 0 or readable != count:
-        raise InputError(
-            f"{path}: the encoder wrote {readable} of {count} frames; free the space if the disk "
-            "is full, else try .avi, or PNGs"
-        )
-    return count
-
-
-def _count_frames(cv2: Any, path: Path) -> int:  # noqa: ANN401
-    """Count the frames that can be read back."""
-    if not path.is_file() or path.stat().st_size == 0:
-        return 0
-    capture, count = cv2.VideoCapture(str(path)), 0
-    while capture.isOpened() and capture.grab():
-        count += 1
-    capture.release()
+                    if suffix == ".mp4" and not writer.isOpened():
+                        said = "OpenCV encodes no VP9 here, so it is MPEG-4, which no browser plays"
+                        warnings.warn(f"{path}: {said}", Notice, stacklevel=2)
+                        codec = cv2.VideoWriter_fourcc(*"mp4v")
+                        writer = cv2.VideoWriter(str(part), codec, float(fps), size)
+                if size != first:
+                    raise InputError(
+                        f"{path}: frame {count} is {size[0]}x{size[1]}, but the first one is "
+                        f"{first[0]}x{first[1]}; a video has one size"
+                    )
+                pixels = image.detach().cpu().clamp(0, 1).mul(255).round().byte().permute(1, 2, 0)
+                writer.write(np.ascontiguousarray(pixels.numpy()[..., ::-1]))
+                count += 1
+        finally:
+            if writer is not None:
+                writer.release()
+        if part.is_file() and part.stat().st_size:  # the encoder does not report a full disk
+            capture = cv2.VideoCapture(str(part))
+            while capture.isOpened() and capture.grab():
+                readable += 1
+            capture.release()
+        if count == 0 or readable != count:
+            raise InputError(
+                f"{path}: the encoder wrote {readable} of {count} frames; free the space if the "
+                "disk is full, else try .avi, or PNGs"
+            )
     return count
 
 

@@ -4,7 +4,6 @@ from depthpose.core.loop.folder import RunLogger as RunLogger
 from depthpose.core.loop.folder import card_text as card_text
 from depthpose.core.loop.folder import held_out_text as held_out_text
 from depthpose.core.loop.folder import read_metrics as read_metrics
-from depthpose.core.loop.folder import run_files as run_files
 from depthpose.core.loop.folder import write_card as write_card
 from depthpose.core.loop.loop import Interrupted as Interrupted
 from depthpose.core.loop.loop import Progress as Progress

@@ -29,7 +29,7 @@ from torch import Tensor, nn
 from depthpose.core.checkpoint import misfits, read_torch_file
 from depthpose.core.errors import InputError, Notice, import_extra
 from depthpose.core.files import atomic_write, read_text, remove_parts, write_image
-from depthpose.core.files.disk import refused_as, refused_write
+from depthpose.core.files.disk import naming, refused_as, refused_write
 from depthpose.core.files.text import refuse_heavy
 from depthpose.core.loop.task import ValidationResult
 from depthpose.core.run import environment
@@ -125,7 +125,8 @@ def read_metrics(folder: Path) -> list[dict[str, Any]]:
         if (
             isinstance(row, dict)
             and isinstance(row.get("step"), int)
-            and all(map(_is_number, row.values()))
+            # A whole number of 2**63 and beyond is no count, and none that is shown.
+            and all(type(v) is float or (type(v) is int and abs(v) < 2**63) for v in row.values())
         ):
             rows.append(row)
         elif line.endswith("\n"):
@@ -134,11 +135,6 @@ def read_metrics(folder: Path) -> list[dict[str, Any]]:
                 "holds curves alone, and no training goes on from it."
             )
     return rows
-
-
-def _is_number(value: object) -> bool:
-    # A whole number of 2**63 and beyond is no count, and none that is shown.
-    return isinstance(value, float) or (type(value) is int and abs(value) < 2**63)
 
 
 def card_text(name: str, facts: Mapping[str, str], measured: str = "") -> str:
@@ -205,26 +201,13 @@ class Parts:
         }
 
     def restore(self, state: Mapping[str, Any]) -> None:
-        """Take everything from a state that fits."""
-        for name, module in self.modules.items():
-            module.load_state_dict(state["modules"][name])
-        for name, optimizer in self.optimizers.items():
-            optimizer.load_state_dict(state["optimizers"][name])
-        if self.scaler.is_enabled() and state["scaler"]:
-            self.scaler.load_state_dict(state["scaler"])
-        for name, held in self.average.items():
-            for key, tensor in state["average"][name].items():
-                held[key].copy_(tensor)
-
-    def misfits(self, state: Mapping[str, Any]) -> list[str]:
-        """Say what a state has missing, more, or in another shape."""
+        """Take over a state; one that does not fit is refused with what differs."""
         problems: list[str] = []
-        for name, module in self.modules.items():
-            faults = misfits(module.state_dict(), state["modules"][name])
-            problems += [f"{name}: {fault}" for fault in faults]
-        for name, held in self.average.items():
-            faults = misfits(held, state["average"][name])
-            problems += [f"average of {name}: {fault}" for fault in faults]
+        own = self.state()
+        for words, name in (("", "modules"), ("average of ", "average")):
+            for key, tensors in own[name].items():
+                faults = misfits(tensors, state[name][key])
+                problems += [f"{words}{key}: {fault}" for fault in faults]
         for name, optimizer in self.optimizers.items():
             saved = state["optimizers"][name]
             counts, saved_counts = (
@@ -237,15 +220,26 @@ class Parts:
                     f"{counts}"
                 )
                 continue
-            shapes = [p.shape for group in optimizer.param_groups for p in group["params"]]
+            optimizer.load_state_dict(saved)
             problems += [
                 f"optimiser of {name}: {key} of parameter {k} is {tuple(value.shape)}, not "
-                f"{tuple(shapes[k])}"
-                for k, values in saved["state"].items()
+                f"{tuple(parameter.shape)}"
+                for k, (parameter, values) in enumerate(optimizer.state.items())
                 for key, value in values.items()
-                if isinstance(value, Tensor) and value.ndim and value.shape != shapes[k]
+                if value.ndim and value.shape != parameter.shape
             ]
-        return problems
+        if problems:
+            raise InputError(
+                f"{len(problems)} tensors do not fit this network: {', '.join(problems[:3])}; it "
+                "is the state of another one"
+            )
+        for name, module in self.modules.items():
+            module.load_state_dict(state["modules"][name])
+        for name, tensors in self.average.items():
+            for key, tensor in tensors.items():
+                tensor.copy_(state["average"][name][key])
+        if self.scaler.is_enabled() and state["scaler"]:
+            self.scaler.load_state_dict(state["scaler"])
 
 
 def saved_states(folder: Path) -> list[Path]:
@@ -277,7 +271,11 @@ def restore_last(folder: Path, parts: Parts) -> tuple[Path, int, float]:
     damages: list[str] = []
     for path in saved_states(folder):
         try:
-            step, seconds = _restore(path, parts)
+            state = _read_state(path)
+            remedy = "it is damaged, or of another training"
+            with naming(path), refused_as(path, "state of this training", remedy):
+                parts.restore(state)
+                step, seconds = state["step"], float(state.get("seconds", 0.0))
         except InputError as error:
             damages.append(str(error))
             continue
@@ -290,18 +288,6 @@ def restore_last(folder: Path, parts: Parts) -> tuple[Path, int, float]:
         f"{'; '.join(damages)}; no state is left to go on from. Take another folder, whose "
         "training may 'start' from weights, or delete these states to begin anew"
     )
-
-
-def _restore(path: Path, parts: Parts) -> tuple[int, float]:
-    state = _read_state(path)
-    with refused_as(path, "state of this training", "it is damaged, or of another training"):
-        if problems := parts.misfits(state):
-            raise InputError(
-                f"{path}: {len(problems)} tensors do not fit this network: "
-                f"{', '.join(problems[:3])}; it is the state of another one"
-            )
-        parts.restore(state)
-        return state["step"], float(state.get("seconds", 0.0))  # older states do not know it
 
 
 def _saved_step(folder: Path) -> int:

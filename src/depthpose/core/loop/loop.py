@@ -147,8 +147,7 @@ class Run:
             )
         training.steps = training.step if self.finish else training.steps
         with StopRequest() as request:
-            training.take_steps(self.on_step, request)
-        return training.seconds
+            return training.take_steps(self.on_step, request)
 
 
 def releases_folder(stage: Callable[[_Config, Run], Path]) -> Callable[[_Config, Run], Path]:
@@ -202,15 +201,13 @@ class _Training:
             self.logger.has_good_last = path.name == STATE
         self.logger.open(self.step)
 
-    @property
-    def seconds(self) -> float:
-        """What it took until now, with the runs before this one."""
-        return time.monotonic() - self.began
-
     def take_steps(
         self, on_step: Callable[[Progress], None] | None, request: "StopRequest"
-    ) -> None:
-        """Take the remaining steps; if asked to finish, the current step is the last."""
+    ) -> float:
+        """Take the remaining steps, the current one as the last if asked to finish; give seconds.
+
+        They are those of the whole training, with the runs before this one.
+        """
         batches = self._batches()
         while self.step < self.steps:
             self._take_step([next(batches) for _ in range(self.config.accumulate)])
@@ -232,8 +229,8 @@ class _Training:
                     self._load(own)
                 self.accelerator.wait_for_everyone()
             if stop or self._is_due(self.config.save_every_steps):
-                state = {"step": self.step, "seconds": self.seconds, **self.parts.state()}
-                self.logger.save(state)
+                seconds = time.monotonic() - self.began
+                self.logger.save({"step": self.step, "seconds": seconds, **self.parts.state()})
             if on_step is not None and self.accelerator.is_main_process:
                 on_step(Progress(step=self.step, steps=self.steps, numbers=numbers))
             if stop and self.step < self.steps:
@@ -246,6 +243,7 @@ class _Training:
         self.accelerator.wait_for_everyone()  # none leaves while another still needs it
         self._load(self.parts.average)  # what is exported
         self.logger.close()
+        return time.monotonic() - self.began
 
     def _batches(self) -> Iterator[Any]:
         """Load this process's micro-batches, from the first that is still to do.
