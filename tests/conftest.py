@@ -1,5 +1,4 @@
 import contextlib
-import fcntl
 import os
 import shutil
 import tempfile
@@ -7,6 +6,7 @@ from pathlib import Path
 
 import pytest
 import torch
+from filelock import FileLock  # torch brings it
 from hypothesis import settings
 
 
@@ -28,8 +28,7 @@ def after_demo(tmp_path_factory: pytest.TempPathFactory) -> Path:
     home = tmp_path_factory.getbasetemp()
     if "PYTEST_XDIST_WORKER" in os.environ:
         home = home.parent
-    with (home / "demo.lock").open("w") as lock:
-        fcntl.flock(lock, fcntl.LOCK_EX)
+    with FileLock(home / "demo.lock"):
         made = home / "demo-made"
         if not (made / "out/demo/report.html").is_file():
             made.mkdir(exist_ok=True)

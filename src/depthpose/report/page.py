@@ -377,6 +377,31 @@ def column_names(rows: Sequence[Row]) -> list[str]:
     return list(dict.fromkeys(name for row in rows for name in row))
 
 
+_ABOUT = {
+    "abs_rel": "mean of |predicted - true| / true",
+    "alternatives": "other poses that fit as well, and their probability",
+    "ar": "BOP's average recall: the mean of ar_vsd, ar_mssd and ar_mspd",
+    "auc": "area under the recall of ADD(-S) up to 10 cm",
+    "ause": "how badly the confidence ranks the errors: 0 as the errors themselves",
+    "certainty": "probability that this pose, and none that looks alike, is the right one",
+    "coverage": "share that has an answer",
+    "d1": "share of pixels whose depth is within a factor of 1.25; d2, d3: of its powers",
+    "d1_all": "share of pixels off by more than 3 px and by more than 5 % of the truth",
+    "epe_px": "mean error of disparity",
+    "error_mm": "ADD, or ADD-S where the part is symmetric",
+    "fit": "share of what the camera saw of the posed surface that agrees with it",
+    "identity": "whether copies of other sizes and the mirror image are excluded",
+    "ms_total": "milliseconds of the whole estimate; ms_network: of its network",
+    "of_diameter": "the error as a share of the part's diameter; right below a tenth",
+    "refused": "share without an answer",
+    "rmse": "root of the mean squared error of depth [m]",
+    "success": "share with ADD(-S) below a tenth of the diameter; 84 % of 25 stand for 65 to 94 %",
+    "visible_fraction": "share of the part's pixels that nothing hides",
+    "wrong": "share with an answer that is no success",
+}
+"""What the head of a column says of it when it is pointed at."""
+
+
 def show_value(value: object) -> str:
     """Show a value to a person: four digits after the point, nothing for None."""
     match value:
@@ -402,7 +427,9 @@ def write_page(
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    pages.globals.update(show_value=show_value, column_names=column_names, page_file=page_file)
+    pages.globals.update(
+        show_value=show_value, column_names=column_names, page_file=page_file, about=_ABOUT
+    )
     html = pages.get_template("report.html").render(
         title=title, sections=sections, environment=environment
     )
