@@ -84,8 +84,9 @@ def _extras() -> Iterator[str]:
         except metadata.PackageNotFoundError:
             lacking[extra].append(package)
     for extra, packages in lacking.items():
-        how = f"lacks {', '.join(packages)}: {install_command(extra)}"
+        how = f"lacks {', '.join(packages)}"
         yield f"extra {extra}: {how if packages else 'installed'}"
+    yield f"another extra: {install_command('EXTRA')}"
 
 
 def _tried(what: str, work: Callable[[], str]) -> bool:
