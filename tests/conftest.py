@@ -1,7 +1,5 @@
 import atexit
 import contextlib
-import fcntl
-import hashlib
 import os
 import shutil
 import tempfile
@@ -9,6 +7,7 @@ from pathlib import Path
 
 import pytest
 import torch
+from filelock import FileLock  # torch brings it
 from hypothesis import settings
 
 
@@ -30,8 +29,7 @@ def after_demo(tmp_path_factory: pytest.TempPathFactory) -> Path:
     home = tmp_path_factory.getbasetemp()
     if "PYTEST_XDIST_WORKER" in os.environ:
         home = home.parent
-    with (home / "demo.lock").open("w") as lock:
-        fcntl.flock(lock, fcntl.LOCK_EX)
+    with FileLock(home / "demo.lock"):
         made = home / "demo-made"
         if not (made / "out/demo/report.html").is_file():
             made.mkdir(exist_ok=True)
@@ -58,21 +56,11 @@ def weights(tmp_path_factory: pytest.TempPathFactory) -> Path:
 settings.register_profile("no deadline", deadline=None)
 settings.load_profile("no deadline")
 
-# Nothing of a test stays in the user's cache, nor comes from there. Processes of one run share a
-# folder: they inherit it of the one that starts them. What is computed of a model (four seconds
-# each) is shared with later runs of the same code too.
+# Nothing of a test stays in the user's cache, nor comes from there. Processes of one run share what
+# is computed of a model once: they inherit the folder of the one that starts them.
 if "PYTEST_XDIST_WORKER" not in os.environ:
-    _root, _code = Path(__file__).parents[1], hashlib.sha256()
-    for _file in sorted((_root / "src/depthpose").glob("[cp]o[rs]e/**/*.py")):  # core and pose
-        _code.update(_file.read_bytes())
-    _cache = Path(tempfile.mkdtemp(prefix="depthpose-cache-"))
-    for _name in ("near_symmetries", "mirror_deviation"):
-        _kept = _root / ".pytest_cache/depthpose" / _code.hexdigest()[:16] / _name
-        with contextlib.suppress(OSError):  # of a folder that cannot be written to
-            _kept.mkdir(parents=True, exist_ok=True)
-            (_cache / _name).symlink_to(_kept)
-    os.environ["DEPTHPOSE_CACHE"] = str(_cache)
-    atexit.register(shutil.rmtree, _cache, ignore_errors=True)
+    os.environ["DEPTHPOSE_CACHE"] = tempfile.mkdtemp(prefix="depthpose-cache-")
+    atexit.register(shutil.rmtree, os.environ["DEPTHPOSE_CACHE"], ignore_errors=True)
 
 # One thread each, as 'make test' has it: sums of several threads are added in another order, and a
 # short training may then end elsewhere. Programs that a test starts inherit it.

@@ -237,6 +237,39 @@ def test_a_release_is_checked_before_it_is_published() -> None:
     known = [c.rpartition(" ")[2] for c in PROJECT["project"]["classifiers"] if "Python ::" in c]
     assert set(known) <= set(tried)
     assert jobs["publish"]["permissions"] == {"id-token": "write"}
+    assert jobs["pages"]["needs"] == "publish"
+    assert '.ci/pages site "$GITHUB_REF_NAME"' in said
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="a script of bash")
+def test_each_version_of_the_pages_has_a_folder(tmp_path: Path) -> None:
+    names = {f"GIT_{who}_{what}": "a@b" for who in ("AUTHOR", "COMMITTER")
+             for what in ("NAME", "EMAIL")}  # fmt: skip
+
+    def call(*words: str, at: Path = tmp_path) -> str:
+        done = subprocess.run(
+            words, cwd=at, env={**os.environ, **names}, capture_output=True, text=True, check=True
+        )
+        return done.stdout
+
+    call("git", "init", "--quiet", "--bare", "origin")
+    call("git", "clone", "--quiet", "origin", "clone")
+    clone, site = tmp_path / "clone", tmp_path / "site"
+    (clone / "file").write_text("of the project")
+    call("git", "add", "file", at=clone)
+    call("git", "commit", "--quiet", "--message", "one", at=clone)
+    site.mkdir()
+    for version in ("v0.9.0", "v0.10.0", "v0.9.1", "v0.9.1"):
+        (site / "index.html").write_text(f"pages of {version}")
+        call(str(ROOT / ".ci/pages"), str(site), version, at=clone)
+    listed = call("git", "ls-tree", "-r", "--name-only", "gh-pages", at=tmp_path / "origin")
+    kept = [f"{version}/index.html" for version in ("v0.10.0", "v0.9.0", "v0.9.1")]
+    assert listed.split() == [".nojekyll", "index.html", *kept]
+    index = call("git", "show", "gh-pages:index.html", at=tmp_path / "origin")
+    assert re.findall(r'href="([^"]+)"', index) == [kept[0], kept[2], kept[1]]
+    of_last = call("git", "show", "gh-pages:v0.9.1/index.html", at=tmp_path / "origin")
+    assert of_last == "pages of v0.9.1"
+    assert (clone / "file").read_text() == "of the project"
 
 
 def test_the_release_checklist_names_what_is_there() -> None:

@@ -49,10 +49,9 @@ Nets = Mapping[str, tuple[str, FakestereoNet]]
 
 _STREET_TEXT = (
     "A synthetic street of a seed that no training used; its depth is known exactly. Distances "
-    "from 3 m (bright) to 80 m (dark); the sky is grey. epe_px and d1_all measure disparity, the "
-    "other columns depth, over all pixels nearer than 80 m, occluded ones too. Depth from one "
-    "image is an estimate from what streets usually look like: good for road, cars and house "
-    "fronts at a usual camera's height, too near far away, and for streets alone."
+    "from 3 m (bright) to 80 m (dark); the sky is grey. Measured over all pixels nearer than 80 m, "
+    "occluded ones too. Depth from one image is an estimate from what streets usually look like: "
+    "good for road, cars and house fronts at a usual camera's height, too near far away."
 )
 _MOTORCYCLE_TEXT = (
     "A real pair: Motorcycle of the Middlebury 2014 benchmark (Scharstein et al., GCPR 2014), as "
@@ -195,10 +194,7 @@ _TEXT = (
     "Five synthetic parts on a table, with the noise and the shadows of a structured-light sensor. "
     "The network was trained on synthetic views of these parts alone; the masks are given. Blue: "
     "the estimated pose, as box and silhouette; green and dashed: the box of the truth. An "
-    "estimate is right below a tenth of the diameter (ADD, or ADD-S where a part is symmetric); "
-    "an uncertain one is refused with a reason. error_mm is that error, of_diameter its share of "
-    "the diameter, visible_fraction the share of a part's pixels that nothing hides; ms_network "
-    "and ms_total are the milliseconds of the network and of the whole estimate."
+    "estimate is right below a tenth of the diameter; an uncertain one is refused with a reason."
 )
 
 

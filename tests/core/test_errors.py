@@ -29,7 +29,7 @@ def test_a_missing_extra_says_what_to_install() -> None:
     error = MissingExtraError("cv2", "opencv", "SGBM")
     assert str(error) == (
         "SGBM needs cv2, which is not installed: pip install -e '.[opencv]' in the clone of "
-        "depthpose"
+        "depthpose, or pip install 'WHEEL[opencv]' with the file of the wheel"
     )
 
 

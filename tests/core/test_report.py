@@ -59,6 +59,18 @@ def test_the_page_stands_alone_and_escapes_what_it_shows(tmp_path: Path) -> None
     assert 'src="p.png' not in html
 
 
+def test_the_head_of_a_column_says_what_it_is(tmp_path: Path) -> None:
+    rows = [{"success": 0.84, "instances": 25, "d1_all": 0.1}]
+    write_page(tmp_path / "page.html", "Title", [Section(title="One", rows=rows)], {})
+    heads = (tmp_path / "page.html").read_text().split("<th ")[1:]
+    said = [re.search(r'title="([^"]+)"', head.partition(">")[0]) for head in heads]
+    assert said[0] is not None
+    assert "65 to 94 %" in said[0][1], "of few views a share is no point"
+    assert said[1] is None
+    assert said[2] is not None
+    assert "3 px" in said[2][1]
+
+
 def test_a_page_holds_its_scenes_and_the_viewer_once(tmp_path: Path) -> None:
     cloud = Layer(name="</script><b>", shape=Cloud(points=torch.zeros(2, 3)))
     scene = Scene(caption="a <cloud>", layers=[cloud])

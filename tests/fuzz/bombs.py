@@ -8,7 +8,6 @@ process of its own.
 
 import json
 import os
-import resource
 import struct
 import sys
 import time
@@ -208,6 +207,8 @@ def blow(path: Path, read: Callable[[Path], object]) -> dict[str, object]:
         outcome, said = "refused", str(error)
     except BaseException as error:  # noqa: BLE001 - what comes is what is looked for
         outcome, said = type(error).__name__, str(error)
+    import resource  # not on Windows
+
     peak_kib = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     seconds = time.process_time() - began
     return {"outcome": outcome, "said": said[:300], "mb": peak_kib / 1000, "s": seconds}

@@ -17,6 +17,8 @@ READ = ("key values of lines",)
 
 @pytest.fixture(scope="module")
 def found(tmp_path_factory: pytest.TempPathFactory) -> dict[str, dict[str, Any]]:
+    if not hasattr(os, "fork"):
+        pytest.skip("a system without fork")
     folder = tmp_path_factory.mktemp("bombs")
     command = [sys.executable, "-m", "tests.fuzz.bombs", str(folder)]
     source = {"PYTHONPATH": os.pathsep.join([str(ROOT / "src"), str(ROOT)])}

@@ -3,7 +3,6 @@
 Each kind of file has its own seed, so a case comes back by its number.
 """
 
-import resource
 import time
 from pathlib import Path
 from random import Random
@@ -16,6 +15,7 @@ from depthpose.core.errors import InputError
 CASES = 200
 """Of each kind."""
 _LONGEST_S = 20
+resource = pytest.importorskip("resource", reason="a system that says no peak of memory")
 _REFUSED_AS_THEY_ARE = ("sparse glb", "run record", "real *camera*.json")
 """Begin as files that their readers refuse: three points, other settings, a camera without size."""
 _MOST_KIB = 700_000

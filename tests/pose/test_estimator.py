@@ -514,6 +514,7 @@ def test_estimates_and_networks_are_one_readable_line() -> None:
         "GeoPoseNet(ResUNet of bracket, flange, mug, connector, spool, weights 'parts', cpu)"
     )
     assert repr(GeoPoseNet.from_pretrained("parts")) == repr(net)
+    assert repr(GeoPoseNet.load("ycb")) == "GeoPoseNet(ResUNet of 21 objects, weights 'ycb', cpu)"
     pose = Rigid(torch.eye(3), torch.tensor([0.1, -0.25, 1.0]))
     found = PoseEstimate(
         name="a", object="mug", status="ok", camera_from_model=pose, certainty=0.99

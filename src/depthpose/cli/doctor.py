@@ -5,17 +5,11 @@ import sys
 from collections.abc import Callable, Iterator
 from importlib import metadata
 from time import perf_counter
-from typing import TYPE_CHECKING
 
 import tyro
 
 from depthpose.cli.arguments import NewPath
 from depthpose.core.errors import InputError, install_command
-
-if TYPE_CHECKING:
-    from torch import Tensor
-
-    from depthpose.depth.estimator import FakestereoNet
 
 _REQUIREMENT = re.compile(r"([\w.-]+)[^;]*(?:;.*extra == ['\"](\w+)['\"])?")
 _EXTRAS_OF_OURS = ("dev",)
@@ -84,8 +78,9 @@ def _extras() -> Iterator[str]:
         except metadata.PackageNotFoundError:
             lacking[extra].append(package)
     for extra, packages in lacking.items():
-        how = f"lacks {', '.join(packages)}: {install_command(extra)}"
+        how = f"lacks {', '.join(packages)}"
         yield f"extra {extra}: {how if packages else 'installed'}"
+    yield f"another extra: {install_command('EXTRA')}"
 
 
 def _tried(what: str, work: Callable[[], str]) -> bool:
@@ -100,7 +95,7 @@ def _tried(what: str, work: Callable[[], str]) -> bool:
 
 
 def _try_depth() -> str:
-    """Match a pair of known disparity; without a matcher, take one image."""
+    """Match a pair of known disparity."""
     import torch
 
     from depthpose.depth.estimator import FakestereoNet
@@ -109,32 +104,13 @@ def _try_depth() -> str:
     scene = torch.nn.functional.interpolate(noise[None], scale_factor=4, mode="bicubic")[0]
     scene = scene.clamp(0, 1)
     left, right = scene[..., :-_SHIFT_PX], scene[..., _SHIFT_PX:]
-    net = FakestereoNet.load("default", allow_ood=True)  # of noise
-    if net.matcher is None:
-        return _try_one_image(net, left)
+    net = FakestereoNet.load("default")
     estimate = net.estimate(left, None, right=right, with_check=False)
     median_px = float(estimate.disparity_px[:, 2 * _SHIFT_PX :].median())
     said = f"a pair shifted by {_SHIFT_PX} px was matched at {median_px:.2f} px"
     if abs(median_px - _SHIFT_PX) > 1:
         raise RuntimeError(said)
     return said
-
-
-def _try_one_image(net: "FakestereoNet", image: "Tensor") -> str:
-    """Estimate the depth of one image."""
-    import torch
-
-    from depthpose.core.camera import Camera
-
-    height, width = image.shape[1:]
-    K = torch.tensor([[width, 0, width / 2], [0, width, height / 2], [0, 0, 1]]).double()
-    estimate = net.estimate(image, Camera(width=width, height=height, K=K))
-    assert estimate.depth_m is not None
-    known_m = estimate.depth_m[estimate.depth_m.isfinite()]
-    said = f"one image got a depth for {len(known_m) / estimate.depth_m.numel():.0%} of its pixels"
-    if not len(known_m):
-        raise RuntimeError(said)
-    return f"{said}, {float(known_m.median()):.1f} m in the middle"
 
 
 def _try_pose() -> str:

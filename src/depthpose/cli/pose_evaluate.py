@@ -43,10 +43,8 @@ from depthpose.report.page import (
 from depthpose.report.pose import PoseShown, pose_section
 
 HOW = (
-    "Success: ADD (ADD-S of a symmetric object) below 10 % of the diameter. Refused: no answer, or "
-    "no estimate at all; wrong: an answer that is no success. Both stay in every number. AUC: area "
-    "to 10 cm. ar, ar_vsd, ar_mssd, ar_mspd: BOP's average recalls. The row 'mean' counts each "
-    "object the same, 'all' each instance, as BOP does."
+    "Refused and wrong answers stay in every number. The row 'mean' counts each object the same, "
+    "'all' each instance, as BOP does."
 )
 
 _SHOWN = ("method", "masks", "object", "instances", "success", "wrong", "refused", "auc", "ar",

@@ -27,7 +27,8 @@ class MissingExtraError(ImportError):
 
 def install_command(extra: str) -> str:
     """Say how an extra is installed; the package index has no release yet."""
-    return f"pip install -e '.[{extra}]' in the clone of depthpose"
+    clone = f"pip install -e '.[{extra}]' in the clone of depthpose"
+    return f"{clone}, or pip install 'WHEEL[{extra}]' with the file of the wheel"
 
 
 class Notice(UserWarning):

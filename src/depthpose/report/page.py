@@ -6,7 +6,6 @@
 import base64
 import csv
 import io
-from base64 import b64encode
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from importlib.resources import files
@@ -16,7 +15,7 @@ from urllib.parse import quote
 
 import numpy as np
 import torch
-from jaxtyping import Float, Float64, Int64
+from jaxtyping import Float, Int64
 from jinja2 import Environment, PackageLoader, StrictUndefined
 from torch import Tensor
 
@@ -126,6 +125,7 @@ def _most(shape: Cloud | Lines) -> int:
 
 
 def _encoded(layer: Layer) -> dict[str, Any]:
+    """Store places as steps of 1/65535 of their extent: of a street of 80 m, 1.2 mm."""
     shape = layer.shape
     if isinstance(shape, Cloud):
         kind, places, color = "points", shape.points, shape.color
@@ -135,28 +135,19 @@ def _encoded(layer: Layer) -> dict[str, Any]:
     kept = _spread(len(places), _most(shape))
     places, color = places[kept], color[kept]
     bytes_of_color = (color.detach().cpu().clamp(0, 1) * 255).round().byte().numpy()
+    flat_m = places.detach().cpu().numpy().astype(np.float64).reshape(-1, 3)
+    low = flat_m.min(0) if len(flat_m) else np.zeros(3)
+    step = (flat_m.max(0) - low) / 65535 if len(flat_m) else np.zeros(3)
+    steps = np.round((flat_m - low) / np.where(step > 0, step, 1))
     return {
         "name": layer.name,
         "kind": kind,
         "shown": layer.is_shown,
         "count": len(places),
-        **_encoded_places(places.detach().cpu().numpy().astype(np.float64).reshape(-1, 3)),
-        "colors": _base64(bytes_of_color),
-    }
-
-
-def _encoded_places(places_m: Float64[np.ndarray, "n 3"]) -> dict[str, Any]:
-    """Store places as steps of 1/65535 of their extent: half the size of float32.
-
-    A street of 80 m has steps of 1.2 mm, a table of 1.5 m of 0.02 mm.
-    """
-    low = places_m.min(0) if len(places_m) else np.zeros(3)
-    step = (places_m.max(0) - low) / 65535 if len(places_m) else np.zeros(3)
-    steps = np.round((places_m - low) / np.where(step > 0, step, 1))
-    return {
         "low": low.tolist(),
         "step": step.tolist(),
         "places": _base64(steps.astype("<u2")),
+        "colors": _base64(bytes_of_color),
     }
 
 
@@ -172,7 +163,7 @@ def _spread(count: int, most: int) -> Int64[Tensor, " m"]:
 
 
 def _base64(values: np.ndarray) -> str:
-    return b64encode(np.ascontiguousarray(values).tobytes()).decode()
+    return base64.b64encode(np.ascontiguousarray(values).tobytes()).decode()
 
 
 MOST_VIEWS = 6
@@ -377,6 +368,31 @@ def column_names(rows: Sequence[Row]) -> list[str]:
     return list(dict.fromkeys(name for row in rows for name in row))
 
 
+_ABOUT = {
+    "abs_rel": "mean of |predicted - true| / true",
+    "alternatives": "other poses that fit as well, and their probability",
+    "ar": "BOP's average recall: the mean of ar_vsd, ar_mssd and ar_mspd",
+    "auc": "area under the recall of ADD(-S) up to 10 cm",
+    "ause": "how badly the confidence ranks the errors: 0 as the errors themselves",
+    "certainty": "probability that this pose, and none that looks alike, is the right one",
+    "coverage": "share that has an answer",
+    "d1": "share of pixels whose depth is within a factor of 1.25; d2, d3: of its powers",
+    "d1_all": "share of pixels off by more than 3 px and by more than 5 % of the truth",
+    "epe_px": "mean error of disparity",
+    "error_mm": "ADD, or ADD-S where the part is symmetric",
+    "fit": "share of what the camera saw of the posed surface that agrees with it",
+    "identity": "whether copies of other sizes and the mirror image are excluded",
+    "ms_total": "milliseconds of the whole estimate; ms_network: of its network",
+    "of_diameter": "the error as a share of the part's diameter; right below a tenth",
+    "refused": "share without an answer",
+    "rmse": "root of the mean squared error of depth [m]",
+    "success": "share with ADD(-S) below a tenth of the diameter; 84 % of 25 stand for 65 to 94 %",
+    "visible_fraction": "share of the part's pixels that nothing hides",
+    "wrong": "share with an answer that is no success",
+}
+"""What the head of a column says of it when it is pointed at."""
+
+
 def show_value(value: object) -> str:
     """Show a value to a person: four digits after the point, nothing for None."""
     match value:
@@ -402,7 +418,9 @@ def write_page(
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    pages.globals.update(show_value=show_value, column_names=column_names, page_file=page_file)
+    pages.globals.update(
+        show_value=show_value, column_names=column_names, page_file=page_file, about=_ABOUT
+    )
     html = pages.get_template("report.html").render(
         title=title, sections=sections, environment=environment
     )

@@ -71,6 +71,10 @@ class PoseEstimator(ABC):
         """Names of the objects."""
         return tuple(self._numbers)
 
+    def _objects_in_short(self) -> str:
+        count = len(self.objects)
+        return ", ".join(self.objects) if count <= 5 else f"{count} objects"
+
     @torch.no_grad()
     @own_arithmetic()
     def estimate_many(

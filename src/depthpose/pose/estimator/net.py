@@ -278,7 +278,7 @@ class GeoPoseNet(PoseEstimator):
 
     def __repr__(self) -> str:
         """Say it in one line: the network, its objects, weights, device."""
-        said = f"{type(self._network).__name__} of {', '.join(self.objects)}"
+        said = f"{type(self._network).__name__} of {self._objects_in_short()}"
         named = f", weights {self.name!r}" if self.name else ""
         return f"GeoPoseNet({said}{named}, {self.config.device})"
 

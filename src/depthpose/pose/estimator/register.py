@@ -115,7 +115,7 @@ class Registration(PoseEstimator):
 
     def __repr__(self) -> str:
         """Say it in one line: the objects; a registration has no weights and no device."""
-        return f"Registration(of {', '.join(self.objects)})"
+        return f"Registration(of {self._objects_in_short()})"
 
     @property
     def models(self) -> Sequence[ObjectModel]:

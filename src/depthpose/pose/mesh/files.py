@@ -52,8 +52,8 @@ def unit_of(path: AnyPath, unit: Unit | None) -> Unit:
     found = unit or FIXED_UNITS.get(Path(path).suffix.lower())
     if found is None:
         raise InputError(
-            f"{path}: no unit is given, and such a file does not say its own; give --unit mm (of a "
-            "CAD file beside a cloud --cad-unit mm), or unit: mm in a config"
+            f"{path}: no unit is given, and such a file does not say its own; give --unit mm, "
+            "where depth or a cloud is given too --cad-unit mm, or unit: mm in a config"
         )
     return found
 
