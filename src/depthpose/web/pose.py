@@ -32,6 +32,7 @@ from depthpose.pose.mesh import (
     with_found_symmetries,
 )
 from depthpose.pose.predictions import CLOUD, PICTURE, Prediction, write_predictions
+from depthpose.pose.surface import prepare_surface
 from depthpose.pose.synthetic import make_frames
 from depthpose.pose.types import CloudInput, ObjectModel, PoseEstimate, ViewInput
 from depthpose.report.page import Layer, Scene
@@ -123,7 +124,7 @@ def _found_alone(given: CloudInput | ViewInput, target: _Target) -> list[_Seen]:
     for k, answer in enumerate(answers):
         name = f"{given.name}_{k}" if len(answers) > 1 else given.name
         assert answer.camera_from_model is not None
-        mask = explained_mask(given, answer.camera_from_model, target.model)
+        mask = explained_mask(given, answer.camera_from_model, prepare_surface(target.model))
         own = replace(given, name=name, mask=mask)
         seen.append(_Seen(given=own, found=replace(answer, name=name)))
     return seen
