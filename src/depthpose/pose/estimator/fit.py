@@ -17,6 +17,8 @@ from depthpose.pose.types import Fit, ViewInput
 BORDER_PX = 2
 """Readings so near an edge may be of either side: stereo and structured light match windows, and
 a mask ends so far from the silhouette."""
+SHOWN = 0.95
+"""Of what was seen of the surface so much agrees at a right pose that a sensor reads well."""
 _NOISES = 3.0
 _WIDEST = 2.0
 """Times the usual limit, whatever the noise: beyond, what was read is no surface."""
