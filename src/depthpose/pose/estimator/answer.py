@@ -63,6 +63,7 @@ def answer_of(
     shares = share_out(evidence, refusal.candidate_slopes)
     number = int(shares.argsort(descending=True, stable=True)[0])
     fit = fit_of(seen, candidates[number].pose, surface)
+    shares = shares * min(1.0, fit.agrees / SHOWN)  # the rest is that of a pose that was not found
     pose, covariance, residual_m = candidates[number]
     free = free_motions(model.symmetries.continuous, pose)
     reason, identity = misfit_of(fit, refusal), None
@@ -86,7 +87,7 @@ def answer_of(
         signals=evidence[number],
         fit=fit,
         identity=identity,
-        certainty=float(shares[number]) * min(1.0, fit.agrees / SHOWN),  # the rest: none of these
+        certainty=float(shares[number]),
         alternatives=alternatives_among(candidates, evidence, shares, copies),
         seconds=clock.seconds,
     )
