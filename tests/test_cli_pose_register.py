@@ -1,17 +1,21 @@
 """``pose predict --method register``: a CAD file alone to the poses of clouds and depth images."""
 
+import csv
 import json
 from pathlib import Path
 
 import pytest
 import torch
-from tests.pose.synthetic_frames import make_dataset
+from tests.pose.synthetic_frames import draw_frame, frame_models, make_dataset
 from tests.pose.synthetic_objects import write_part
 
 from depthpose.cli import main
 from depthpose.core.camera import Camera, write_camera
 from depthpose.core.files import Cloud, read_cloud, write_cloud, write_depth_png, write_image
 from depthpose.pose.config import ObjectsConfig
+from depthpose.pose.datasets import write_bop_models, write_bop_scene
+from depthpose.pose.estimator.inputs import rigid_input
+from depthpose.pose.metrics import add_m
 from depthpose.pose.synthetic import Objects, make_part
 
 
@@ -67,6 +71,33 @@ def test_a_data_set_brings_its_models(tmp_path: Path) -> None:
     data = make_dataset(tmp_path / "made", frames=1)
     assert predict("--bop", data.folder, "--out", tmp_path / "out") == 0
     assert len(rows(tmp_path / "out")) == len(data)
+
+
+def test_targets_of_the_challenge_give_its_csv(tmp_path: Path) -> None:
+    data = tmp_path / "tless"  # whose folder of scenes has a type in its name
+    part = frame_models()[0]
+    frames = [draw_frame(number, [part, part]) for number in range(3)]
+    write_bop_models(data, [part])
+    write_bop_scene(data, "test_primesense", 2, frames)
+    target = {"scene_id": 2, "obj_id": 7}
+    targets = [{"im_id": 0, "inst_count": 2, **target}, {"im_id": 2, "inst_count": 1, **target}]
+    (data / "test_targets_bop19.json").write_text(json.dumps(targets))
+    words = ["--bop", data, "--split", "test_primesense", "--out", tmp_path / "out"]
+    assert predict(*words, "--targets", "test_targets_bop19.json") == 0
+    text = (tmp_path / "out/depthpose_tless-test-primesense.csv").read_text()
+    head, *answers = csv.reader(text.splitlines())
+    assert head == ["scene_id", "im_id", "obj_id", "score", "R", "t", "time"]
+    assert [row[:3] for row in answers] == [["2", "0", "7"], ["2", "0", "7"], ["2", "2", "7"]]
+    for _, image, _, score, R, t_mm, _ in answers:
+        pose = torch.eye(4)
+        pose[:3, :3] = torch.tensor([float(word) for word in R.split(" ")]).reshape(3, 3)
+        pose[:3, 3] = torch.tensor([float(word) for word in t_mm.split(" ")]) / 1000
+        truths = (thing.camera_from_model for thing in frames[int(image)].objects)
+        errors = [float(add_m(rigid_input(pose), true, part.vertices_m)) for true in truths]
+        assert min(errors) < 0.005
+        assert 0 < float(score) <= 1
+    assert answers[0][6] == answers[1][6] != answers[2][6]
+    assert float(answers[0][6]) > 0
 
 
 def test_a_cad_file_is_followed_through_frames(

@@ -140,5 +140,6 @@ def test_damaged_detections_are_refused(tmp_path: Path) -> None:
 def test_targets(tmp_path: Path) -> None:
     rows = [{"im_id": 3, "inst_count": 1, "obj_id": 5, "scene_id": 2}]
     (tmp_path / "t.json").write_text(json.dumps(rows))
-    (target,) = read_targets(tmp_path / "t.json")
+    (target,) = read_targets("t.json", tmp_path)
+    assert [target] == read_targets(tmp_path / "t.json")
     assert (target.scene_id, target.image_id, target.object_id, target.count) == (2, 3, 5, 1)

@@ -3,14 +3,24 @@
 import math
 from typing import Any
 
+import pytest
 import torch
-from tests.pose.synthetic_objects import Oracle, bracket, cloud_of, pose_at, tiny_weights
+from tests.pose.synthetic_objects import (
+    CAMERA,
+    Oracle,
+    bracket,
+    cloud_of,
+    pose_at,
+    tiny_weights,
+)
 from torch import Tensor
 from torch.utils._python_dispatch import TorchDispatchMode
 
 from depthpose.core.rigid import Rigid
 from depthpose.pose.config import CloudConfig, EstimateConfig, VotingConfig
+from depthpose.pose.estimator import Registration
 from depthpose.pose.estimator.inputs import ObjectCloud
+from depthpose.pose.mesh import make_model
 from depthpose.pose.types import PoseEstimate
 
 MILLIONS = 10_000_000
@@ -84,3 +94,29 @@ def test_the_covariance_of_an_estimate_says_how_far_it_is_off() -> None:
     assert abs(mean - 6) < 4 * spread
     # 16.8 is passed by one of a hundred.
     assert sum(misfit > 16.8 for misfit in misfits) <= 5
+
+
+def _plane() -> Tensor:
+    return (0.7 + 0.0005 * torch.arange(240.0))[:, None].repeat(1, 320)
+
+
+@pytest.mark.parametrize(
+    ("depth_m", "times"),
+    [
+        (torch.full((240, 320), torch.nan), 1.0),
+        (_plane(), 1.0),
+        (_plane() + 0.05 * (torch.arange(320) > 200), 30.0),
+    ],
+    ids=["every reading missing", "one plane", "a model larger than the view"],
+)
+def test_an_image_that_shows_nothing_of_use_is_refused_with_a_reason(
+    depth_m: Tensor, times: float
+) -> None:
+    part = bracket()
+    net = Registration([make_model(times * part.vertices_m, part.faces, name="part")])
+    with _Largest() as largest:
+        found = net.estimate(depth=depth_m, mask=torch.ones(240, 320), camera=CAMERA)
+        assert not found.is_posed
+        assert found.reason
+        assert net.find(depth_m, CAMERA) == []
+    assert largest.bytes < 100e6

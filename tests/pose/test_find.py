@@ -10,6 +10,7 @@ from tests.pose.synthetic_objects import (
     K,
     Oracle,
     bottle,
+    box_faces,
     bracket,
     pose_at,
     tiny_weights,
@@ -20,10 +21,12 @@ from depthpose.core.camera import back_project
 from depthpose.core.errors import InputError
 from depthpose.core.rigid import Rigid
 from depthpose.pose.config import RefusalConfig
-from depthpose.pose.estimator.find import nothing_found
+from depthpose.pose.estimator.find import is_cut_out, nothing_found
 from depthpose.pose.estimator.inputs import AnyInput
+from depthpose.pose.mesh import make_model
 from depthpose.pose.metrics import add_m
 from depthpose.pose.regions import extent_m, find_regions, part_cloud, split_at_necks
+from depthpose.pose.surface import prepare_surface
 from depthpose.pose.types import CloudInput, ObjectModel, PoseEstimate, ViewInput
 
 TRUTHS = [pose_at(-0.13, 0.7, seed=1), pose_at(0.12, 0.9, seed=2)]
@@ -127,6 +130,44 @@ def test_two_instances_are_found_and_an_unknown_thing_is_not() -> None:
         poses = [e.camera_from_model for e in found]
         errors += [min(float(add_m(p, truth, model.vertices_m)) for p in poses if p is not None)]
     assert max(errors) < 0.003
+
+
+def plate() -> ObjectModel:
+    """A flat part, 16 by 14 cm."""
+    corners, faces = box_faces()
+    return make_model(corners * torch.tensor([0.16, 0.14, 0.012]), faces, name="plate", number=7)
+
+
+@pytest.mark.parametrize(
+    ("model", "beside", "is_cut"),
+    [
+        (plate(), "nothing", False),
+        (plate(), "a neighbour of its height", False),
+        (plate(), "a panel", True),
+        (plate(), "a strip of its width", True),
+        (bracket(), "a panel", False),
+    ],
+)
+def test_a_piece_of_a_larger_plane_is_no_flat_part(
+    model: ObjectModel, beside: str, is_cut: bool
+) -> None:
+    pose = (
+        Rigid(torch.eye(3), torch.tensor([0.0, 0.0, 0.7])) if model.name == "plate" else TRUTHS[0]
+    )
+    seen, mask = view_of(model, pose)
+    top_m = float(seen[mask].median())
+    columns, rows = mask.any(0).nonzero()[:, 0], mask.any(1).nonzero()[:, 0]
+    depth_m = torch.full((240, 320), 1.2)
+    if beside == "a panel":
+        depth_m[:, 20:300] = top_m
+    elif beside == "a strip of its width":
+        depth_m[:, columns[0] : columns[-1] + 1] = top_m
+    elif beside == "a neighbour of its height":
+        depth_m[rows[0] : rows[-1] + 1, columns[-1] :] = top_m
+    depth_m = torch.where(mask, seen.float(), depth_m)
+    depth_m += 0.001 * torch.randn(240, 320, generator=torch.Generator().manual_seed(0))
+    view = ViewInput(name="", depth_m=depth_m, mask=mask, K=K.float(), object=model.name)
+    assert is_cut_out(view, pose, prepare_surface(model)) == is_cut
 
 
 def test_what_the_camera_saw_through_a_found_pose_counts() -> None:

@@ -22,10 +22,16 @@ from depthpose.core.config import config_from_dict
 from depthpose.core.errors import InputError
 from depthpose.core.rigid import Rigid
 from depthpose.pose.augment import grow_mask, shift_mask
-from depthpose.pose.config import EstimateConfig, IcpConfig, RefusalConfig
-from depthpose.pose.estimator.answer import misfit_of, with_status
-from depthpose.pose.estimator.candidates import observability, surface_signals
+from depthpose.pose.config import CloudConfig, EstimateConfig, IcpConfig, RefusalConfig
+from depthpose.pose.estimator.answer import Clock, answer_of, misfit_of, with_status
+from depthpose.pose.estimator.candidates import (
+    Candidate,
+    find_copies,
+    observability,
+    surface_signals,
+)
 from depthpose.pose.estimator.fit import fit_of, seen_about
+from depthpose.pose.estimator.inputs import ObjectCloud, prepare_cloud
 from depthpose.pose.metrics import risk_coverage
 from depthpose.pose.surface import prepare_surface
 from depthpose.pose.types import Fit, ObjectModel, PoseEstimate, ViewInput
@@ -123,13 +129,41 @@ def test_a_misfit_is_refused_with_its_numbers() -> None:
     assert "75% of the object's readings are nowhere near the posed" in elsewhere.reason
 
 
+def test_a_pose_of_which_some_disagrees_is_not_certain_though_no_other_was_found() -> None:
+    view = seen_in(bracket())
+    behind = view.depth_m.clone()
+    rows = view.mask.any(1).nonzero()[:, 0]
+    own_rows = rows[int(0.78 * len(rows)) :]
+    behind[own_rows] = torch.where(view.mask[own_rows], behind[own_rows] + 0.05, behind[own_rows])
+    found = []
+    for depth_m in (view.depth_m, behind):
+        cloud = prepare_cloud(
+            replace(view, depth_m=depth_m), bracket(), CloudConfig(), EstimateConfig()
+        )
+        assert isinstance(cloud, ObjectCloud)
+        alone = [Candidate(TRUTH.double(), torch.eye(6), 0.001)]
+        copies = find_copies(bracket(), up_to_symmetry=False)
+        evidence = [dict.fromkeys(RefusalConfig().candidate_slopes, 0.1)]
+        refusal = RefusalConfig(max_beyond=1.0, max_size_error=1.0)
+        found.append(answer_of(
+            cloud, bracket(), SURFACE, copies, alone, evidence, refusal, EstimateConfig(), Clock()
+        ))  # fmt: skip
+    assert (found[0].status, found[0].certainty) == ("ok", 1.0)
+    assert found[1].fit is not None
+    assert 0.8 < found[1].fit.agrees < 0.85
+    assert found[1].status == "ambiguous"
+    assert found[1].certainty == pytest.approx(found[1].fit.agrees / 0.95)
+
+
 def test_an_answer_below_the_wanted_certainty_is_ambiguous() -> None:
     pose = Rigid(torch.eye(3), torch.zeros(3))
     sure = PoseEstimate(name="a", object="b", status="ok", camera_from_model=pose, certainty=0.6)
     found = with_status(sure, 0.9)
     assert (found.status, found.is_ok, found.is_posed) == ("ambiguous", False, True)
     assert found.camera_from_model is pose
-    assert found.reason == ("this pose has a certainty of 60%, below min_certainty 90%: others fit")
+    assert found.reason == (
+        "this pose has a certainty of 60%, below min_certainty 90%: others may fit"
+    )
     assert with_status(found, 0.5).status == "ok"
     assert with_status(found, 0.5).reason == ""
     refused = PoseEstimate(name="a", object="b", status="doubtful", reason="so")

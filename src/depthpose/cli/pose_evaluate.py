@@ -58,7 +58,7 @@ def open_instances(
     """Open what is to be measured, and say what it is."""
     dataset = open_bop(bop, split)
     if targets is not None:
-        dataset = of_targets(dataset, read_targets(targets))
+        dataset = of_targets(dataset, read_targets(targets, bop))
     if objects:
         dataset = dataset.of_objects(*objects)
     names = ", ".join(model.name for model in dataset.objects.values())

@@ -48,6 +48,7 @@ from depthpose.pose.predictions import (
     place_of,
     write_predictions,
 )
+from depthpose.pose.surface import prepare_surface
 from depthpose.pose.types import PoseEstimate, ViewInput
 
 
@@ -130,7 +131,7 @@ def explained_job(job: Job[Any], estimate: PoseEstimate, method: PoseMethod) -> 
         view, pose = job.read(), estimate.camera_from_model
         if model is None or pose is None or not isinstance(view, ViewInput):
             return view
-        mask = explained_mask(view, pose, model)
+        mask = explained_mask(view, pose, prepare_surface(model))
         return replace(view, name=estimate.name, mask=mask, object=model.name)
 
     return replace(job, name=estimate.name, read=read)

@@ -56,8 +56,9 @@ class PoseMeasureOptions:
     masks: tuple[str, ...] = ("truth",)
     """truth; predicted (those that came with Linemod_preprocessed); a JSON file of BOP detections;
     or weights of a segmentation. Each is a row of its own."""
-    targets: Path | None = None
-    """a BOP list of targets, such as test_targets_bop19.json; by default all instances."""
+    targets: NewPath | None = None
+    """a BOP list of targets, such as test_targets_bop19.json: a file, or its name in the folder of
+    the data set; by default all instances."""
     diameters: DiameterTable = "bop"
     """bop: as the data set declares them; pvnet: PVNet's table of LineMOD."""
     voting: Voting = "ransac"
@@ -130,6 +131,9 @@ class DataSetOptions:
     masks: str = "truth"
     """truth (the annotated ones), predicted (those that came with Linemod_preprocessed), a JSON
     file of BOP detections, or weights of a segmentation, by name or file."""
+    targets: NewPath | None = None
+    """a BOP list of targets, such as test_targets_bop19.json: a file, or its name in the folder of
+    the data set; by default all instances."""
 
 
 @group
@@ -196,8 +200,8 @@ def refuse_mixture(inputs: OneObjectOptions, dataset: DataSetOptions) -> None:
         refuse_beside("--bop", {**beside, "unit": inputs.unit})
     elif dataset != DataSetOptions():
         raise InputError(
-            "--split and --masks are of a data set, and --bop names none; the mask of a depth "
-            "image is given by --mask"
+            "--split, --masks and --targets are of a data set, and --bop names none; the mask of a "
+            "depth image is given by --mask"
         )
     elif inputs.cloud is not None:
         refuse_beside("--cloud", beside)

@@ -47,7 +47,8 @@ from depthpose.core.run import (
     wait_for,
 )
 from depthpose.pose.cloud import object_points
-from depthpose.pose.datasets import BopDataset, open_bop
+from depthpose.pose.datasets import BopDataset, open_bop, read_targets
+from depthpose.pose.evaluate import of_targets
 from depthpose.pose.predictions import (
     CLOUD,
     PICTURE,
@@ -173,7 +174,10 @@ def predict_dataset(
 
         refuse_unshared(options.masks, out)
     method, home = source.build("cpu" if engine.is_ray else None), Path(out)
-    dataset = chosen_objects(open_bop(options.bop, options.split), method, object)
+    dataset = open_bop(options.bop, options.split)
+    if options.targets is not None:
+        dataset = of_targets(dataset, read_targets(options.targets, options.bop))
+    dataset = chosen_objects(dataset, method, object)
     (masks,) = find_masks([options.masks], dataset, home, source.config.device)
     jobs = bop_jobs(dataset, masks, method)
     settings = {**method.settings, "estimate": config_to_dict(source.config)}

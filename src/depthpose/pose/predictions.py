@@ -461,7 +461,8 @@ _SAME_TIME_S = 0.001
 
 def results_name(dataset: BopDataset) -> str:
     """Name the BOP csv of a data set: ``depthpose_DATASET-SPLIT.csv``."""
-    return f"depthpose_{dataset.folder.resolve().name}-{dataset.split}.csv"
+    split = dataset.split.replace("_", "-")  # as test_primesense; BOP's toolkit parts names at _
+    return f"depthpose_{dataset.folder.resolve().name}-{split}.csv"
 
 
 def alternatives_name(dataset: BopDataset) -> str:

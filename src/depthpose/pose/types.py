@@ -338,8 +338,8 @@ class PoseEstimate:
         inlier_share: share of the votes that agree, 0..1.
         residual_m: root mean square distance: of keypoints, or of points to the surface after ICP.
         fit: whether the pose fits what the camera saw; None where it was not compared.
-        certainty: chance that this very pose is right and none of the alternatives, where one is;
-            None where they were not compared.
+        certainty: chance that this very pose is right, and none of the alternatives nor, where
+            some of what was seen does not agree, one that was not found; None: not compared.
         identity: whether it is this object; None where that was not asked.
         alternatives: other poses that fit, the likeliest first.
         signals: by what the poses that fit were compared, by name; kept for refusals too.

@@ -32,6 +32,7 @@ from depthpose.pose.mesh import (
     with_found_symmetries,
 )
 from depthpose.pose.predictions import CLOUD, PICTURE, Prediction, write_predictions
+from depthpose.pose.surface import prepare_surface
 from depthpose.pose.synthetic import make_frames
 from depthpose.pose.types import CloudInput, ObjectModel, PoseEstimate, ViewInput
 from depthpose.report.page import Layer, Scene
@@ -121,7 +122,7 @@ def _found_alone(pose_input: CloudInput | ViewInput, target: _Target) -> list[_S
     for k, answer in enumerate(answers):
         name = f"{pose_input.name}_{k}" if len(answers) > 1 else pose_input.name
         assert answer.camera_from_model is not None
-        mask = explained_mask(pose_input, answer.camera_from_model, target.model)
+        mask = explained_mask(pose_input, answer.camera_from_model, prepare_surface(target.model))
         own = replace(pose_input, name=name, mask=mask)
         seen.append(_Seen(input=own, estimate=replace(answer, name=name)))
     return seen

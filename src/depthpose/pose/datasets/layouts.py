@@ -284,13 +284,13 @@ class BopTarget:
     count: int
 
 
-def read_targets(path: str | Path) -> list[BopTarget]:
-    """Read a list of targets.
+def read_targets(path: str | Path, folder: str | Path = ".") -> list[BopTarget]:
+    """Read a list of targets: a file, or the name of one in the folder of its data set.
 
     Raises:
         InputError: it is missing or damaged.
     """
-    path = Path(path)
+    path = Path(path) if Path(path).is_file() else Path(folder, path)
     targets = []
     for row_number, row in enumerate(read_rows(path)):
         source = f"{path}: entry {row_number}"

@@ -18,7 +18,7 @@ from depthpose.pose.estimator.candidates import (
     share_out,
     without_motions,
 )
-from depthpose.pose.estimator.fit import fit_of, seen_about
+from depthpose.pose.estimator.fit import SHOWN, fit_of, seen_about
 from depthpose.pose.estimator.identity import identity_of
 from depthpose.pose.estimator.inputs import ObjectCloud, Refusal
 from depthpose.pose.refine import RefinedPose
@@ -63,6 +63,7 @@ def answer_of(
     shares = share_out(evidence, refusal.candidate_slopes)
     number = int(shares.argsort(descending=True, stable=True)[0])
     fit = fit_of(seen, candidates[number].pose, surface)
+    shares = shares * min(1.0, fit.agrees / SHOWN)  # the rest is that of a pose that was not found
     pose, covariance, residual_m = candidates[number]
     free = free_motions(model.symmetries.continuous, pose)
     reason, identity = misfit_of(fit, refusal), None
@@ -101,7 +102,9 @@ def with_status(answer: PoseEstimate, min_certainty: float) -> PoseEstimate:
         return answer
     if answer.certainty is None or answer.certainty >= min_certainty:
         return replace(answer, status="ok", reason="")
-    others = f"{len(answer.alternatives)} others fit too" if answer.alternatives else "others fit"
+    others = (
+        f"{len(answer.alternatives)} others fit too" if answer.alternatives else "others may fit"
+    )
     reason = (
         f"this pose has a certainty of {answer.certainty:.0%}, below min_certainty "
         f"{min_certainty:.0%}: {others}"

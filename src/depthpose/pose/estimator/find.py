@@ -11,11 +11,19 @@ from torch import Tensor
 
 from depthpose.core.camera import back_project, project
 from depthpose.core.rigid import Rigid
+from depthpose.pose.augment import grow_mask
 from depthpose.pose.config import RefusalConfig
 from depthpose.pose.estimator.candidates import share_out
+from depthpose.pose.estimator.fit import BORDER_PX
 from depthpose.pose.estimator.inputs import nothing_seen
-from depthpose.pose.regions import extent_m, find_regions, part_cloud
-from depthpose.pose.surface import NEAR, Surface, prepare_surface
+from depthpose.pose.regions import (
+    extent_m,
+    find_regions,
+    is_on_plane,
+    largest_plane,
+    part_cloud,
+)
+from depthpose.pose.surface import NEAR, Surface
 from depthpose.pose.types import CloudInput, ObjectModel, PoseEstimate, ViewInput
 
 _SMALLEST, _LARGEST = 0.25, 1.25
@@ -37,6 +45,12 @@ _SHARED = 0.3
 """Answers that explain so large a share of the same points are of one thing; one of them stays."""
 _SUNK = 0.15
 """Where a table or wall lies before more of the posed surface, there is no such object."""
+_FLAT = 0.9
+"""What lies on one plane by so large a share is flat: anything of its outline looks the same."""
+_CONTINUED = 0.4
+"""Where the plane goes on beside so much of it, the outline is a cut through something larger."""
+_RIM = 0.05
+"""Width of what is looked at beside it, in diameters."""
 _NAMED = 0.02
 """Other objects of a larger share are named."""
 _ONE = 0.8
@@ -105,8 +119,8 @@ def find_objects(view: ViewInput, known: SearchTargets) -> list[PoseEstimate]:
     several objects answer they share the probability of one by the evidence against each, and where
     none has most of it none is answered. What an
     answer leaves unexplained of its region is tried once more. An answer is left out through whose
-    surface the camera saw, or that lies behind a plane that was seen, or that explains not quite
-    all of its region; of answers that explain the same points the best stays.
+    surface the camera saw, or that lies behind a plane that was seen, or is cut out of one, or that
+    explains not quite all of its region; of answers that explain the same points the best stays.
 
     Args:
         view: depth and camera; its mask limits where is looked.
@@ -275,21 +289,21 @@ def _is_explained(cloud: Tensor, pose: Rigid, surface: Surface) -> Tensor:
     return distance_m < NEAR * surface.diameter_m
 
 
-def explained_mask(view: ViewInput, pose: Rigid, model: ObjectModel) -> Bool[Tensor, "h w"]:
-    """Mark the pixels of a depth image whose points lie on a posed object."""
+def explained_mask(view: ViewInput, pose: Rigid, surface: Surface) -> Bool[Tensor, "h w"]:
+    """Mark the pixels of a depth image whose points lie on a posed surface."""
     points_m = back_project(view.depth_m.double(), view.K.double())
     is_read = points_m.isfinite().all(-1) & view.mask
     near = is_read.clone()
-    middle_m = pose.apply(model.vertices_m.mean(0, keepdim=True).to(pose.R)).double()
-    near[is_read] = (points_m[is_read] - middle_m).norm(dim=-1) < model.diameter_m
+    middle_m = pose.double().apply(surface.points_m.mean(0, keepdim=True))
+    near[is_read] = (points_m[is_read] - middle_m).norm(dim=-1) < surface.diameter_m
     explained = torch.zeros_like(near)
     if bool(near.any()):
-        explained[near] = _is_explained(points_m[near], pose, prepare_surface(model))
+        explained[near] = _is_explained(points_m[near], pose, surface)
     return explained
 
 
 def _is_possible(scene: _Scene, estimate: PoseEstimate, known: SearchTargets) -> bool:
-    """Whether the camera saw enough of the surface, not through it, and no plane before it."""
+    """Whether enough of the surface was seen, no plane before it, and more than a cut of one."""
     pose, signals = estimate.camera_from_model, estimate.signals
     assert pose is not None
     if signals["unseen"] > _HIDDEN:
@@ -305,7 +319,28 @@ def _is_possible(scene: _Scene, estimate: PoseEstimate, known: SearchTargets) ->
         return False
     is_before = seen_m < posed_m[inside, 2] - NEAR * surface.diameter_m
     is_sunk = is_before & scene.is_plane[v[inside], u[inside]]
-    return float(is_sunk[is_read].double().mean()) <= _SUNK
+    if float(is_sunk[is_read].double().mean()) > _SUNK:
+        return False
+    return not is_cut_out(scene.view, pose, surface)
+
+
+def is_cut_out(view: ViewInput, pose: Rigid, surface: Surface) -> bool:
+    """Whether what lies on a posed surface is flat, and goes on in its plane beyond the outline.
+
+    Args:
+        view: depth and camera; its mask limits what may lie on the surface, not what goes on.
+        pose: of the object.
+        surface: of its model.
+    """
+    own = explained_mask(view, pose, surface)
+    points_m = back_project(view.depth_m.double(), view.K.double())
+    plane = largest_plane(points_m[own], torch.Generator().manual_seed(0))
+    if plane is None or float(is_on_plane(points_m[own], plane).double().mean()) < _FLAT:
+        return False
+    pixel_m = float(points_m[own][:, 2].median() / view.K[0, 0])
+    reach = BORDER_PX + math.ceil(_RIM * surface.diameter_m / pixel_m)
+    rim = grow_mask(own, reach) & ~grow_mask(own, BORDER_PX)
+    return float(is_on_plane(points_m[rim], plane).double().mean()) > _CONTINUED
 
 
 def _without_overlap(answers: Sequence[_Answer], known: SearchTargets) -> list[_Answer]:

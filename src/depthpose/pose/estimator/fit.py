@@ -10,12 +10,15 @@ from torch.nn.functional import max_pool2d
 from depthpose.core.arrays import take_evenly
 from depthpose.core.camera import back_project
 from depthpose.core.rigid import Rigid
+from depthpose.pose.augment import grow_mask
 from depthpose.pose.surface import NEAR, Surface
 from depthpose.pose.types import Fit, ViewInput
 
 BORDER_PX = 2
 """Readings so near an edge may be of either side: stereo and structured light match windows, and
 a mask ends so far from the silhouette."""
+SHOWN = 0.95
+"""Of what was seen of the surface so much agrees at a right pose that a sensor reads well."""
 _NOISES = 3.0
 _WIDEST = 2.0
 """Times the usual limit, whatever the noise: beyond, what was read is no surface."""
@@ -72,7 +75,7 @@ def seen_about(cloud_m: Float[Tensor, "n 3"], view: ViewInput | None, diameter_m
     place = ((v - top) * (right - left) + u - left)[inside]
     own = torch.zeros(bottom - top, right - left, dtype=torch.bool)
     own.view(-1)[place] = True
-    own = _eroded(_dilated(own, 1), 1)  # of a large cloud some points are left out
+    own = grow_mask(grow_mask(own, 1), -1)  # of a large cloud some points are left out
     if view is None:
         drawn_m = torch.full((own.numel(),), torch.inf, dtype=torch.float64)
         drawn_m.scatter_reduce_(0, place, cloud_m[inside, 2], "amin")
@@ -116,7 +119,7 @@ def fit_of(seen: Seen, pose: Rigid, surface: Surface) -> Fit:
     if len(depth_m) == 0:
         return nothing
     off_m = _nearest_reading(seen.depth_m, u, v, depth_m) * area
-    own = _eroded(seen.is_own, BORDER_PX)
+    own = grow_mask(seen.is_own, -BORDER_PX)
     own = own if bool(own.any()) else seen.is_own  # thin things are all border
     agrees = float(area[off_m.abs() <= limit_m].sum())
     through = float(area[off_m > limit_m].sum())
@@ -182,12 +185,12 @@ def _drawn(
     drawn_m = torch.full((rows * columns,), torch.inf, dtype=torch.float64)
     drawn_m.scatter_reduce_(0, number, depth_m, "amin")
     about_m = -max_pool2d(-drawn_m.view(1, rows, columns), 3, 1, 1)
-    filled = _eroded(_dilated(drawn_m.view(rows, columns).isfinite(), 1), 1)
+    filled = grow_mask(grow_mask(drawn_m.view(rows, columns).isfinite(), 1), -1)
     return _Buffer(
         low=low,
         side_px=side_px,
         side_m=side_m,
-        is_near=_dilated(filled, border),
+        is_near=grow_mask(filled, border),
         nearest_m=about_m.flatten()[number],
     )
 
@@ -212,7 +215,7 @@ def _nearest_reading(
 
 def _noise_m(depth_m: Float64[Tensor, "h w"], is_own: Bool[Tensor, "h w"]) -> float:
     """Give the noise of the readings by their second differences, which a slope does not change."""
-    own_m, found = torch.where(_eroded(is_own, 1), depth_m, torch.nan), []
+    own_m, found = torch.where(grow_mask(is_own, -1), depth_m, torch.nan), []
     for along_m in (own_m, own_m.T):
         ends_m = along_m[:, : -2 * _LAG_PX] + along_m[:, 2 * _LAG_PX :]
         bent_m = (ends_m - 2 * along_m[:, _LAG_PX:-_LAG_PX]).flatten()
@@ -235,13 +238,3 @@ def _camera_of(cloud_m: Float64[Tensor, "n 3"]) -> Float64[Tensor, "3 3"]:
 def _inside(pixel: Int64[Tensor, "n 2"], image: Float64[Tensor, "h w"]) -> Bool[Tensor, " n"]:
     size = torch.tensor(image.shape).flip(0)
     return ((pixel >= 0) & (pixel < size)).all(-1)
-
-
-def _dilated(mask: Bool[Tensor, "h w"], steps: int) -> Bool[Tensor, "h w"]:
-    if steps == 0:
-        return mask
-    return max_pool2d(mask.float()[None], 2 * steps + 1, 1, steps)[0] > 0
-
-
-def _eroded(mask: Bool[Tensor, "h w"], steps: int) -> Bool[Tensor, "h w"]:
-    return ~_dilated(~mask, steps)

@@ -10,7 +10,7 @@ from depthpose.core.arrays import take_evenly
 from depthpose.core.rigid import Rigid, rotation_by
 from depthpose.pose.compiled import serves
 from depthpose.pose.config import IcpConfig
-from depthpose.pose.estimator.fit import BORDER_PX, Seen
+from depthpose.pose.estimator.fit import BORDER_PX, SHOWN, Seen
 from depthpose.pose.estimator.inputs import ObjectCloud
 from depthpose.pose.mesh import is_mirror_alike
 from depthpose.pose.mesh.models import fibonacci_directions
@@ -49,8 +49,6 @@ _MIRROR_GAIN = 0.02
 synthetic views it was at most 0.004, where the mirror image is not nearly the model."""
 _OTHER_SIZES = 0.1
 """Sizes so far from 1 must be excluded for an identity to be confirmed."""
-_SHOWN = 0.95
-"""And so much of what was seen of the surface must agree."""
 _BESIDE = 0.005
 """And no more of the readings may lie beside the silhouette, as those of a larger copy do."""
 
@@ -288,7 +286,7 @@ def identity_of(
         reason = f"{_size_words(scale)}, which a sensor's errors may explain"
     elif fit.beyond > _BESIDE:
         reason = f"{fit.beyond:.1%} of the object's readings lie beside the posed silhouette"
-    elif fit.agrees < _SHOWN:
+    elif fit.agrees < SHOWN:
         reason = f"{1 - fit.agrees:.0%} of what was seen of the surface does not agree"
     return Identity(status="not excluded" if reason else "confirmed", reason=reason, **measured)
 

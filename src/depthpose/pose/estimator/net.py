@@ -42,7 +42,7 @@ from depthpose.pose.refine import refine_best
 from depthpose.pose.surface import Surface
 from depthpose.pose.types import ObjectModel, PoseEstimate, PoseFit, SeenPoints, Status, Vote
 from depthpose.pose.voting import consistent_keypoints, fit_pose, meet_lines, vote_ransac
-from depthpose.pose.weights import DirectionNet, PoseWeights, read_pose_weights
+from depthpose.pose.weights import PoseWeights, read_pose_weights
 
 _LEAST = 4
 """Keypoints that must agree: three fix a pose with nothing left to contradict it."""
@@ -173,35 +173,6 @@ def _row(fits: PoseFit, number: int) -> PoseFit:
         misfit=fits.misfit[number],
         is_used=fits.is_used[number],
     )
-
-
-def network_directions(
-    network: DirectionNet, clouds: list[ObjectCloud], numbers: list[int], device: str
-) -> list[Float[Tensor, "n k 3"]]:
-    """Ask the network for the directions to the keypoints, in the camera frame, cloud by cloud.
-
-    Args:
-        network: of directions, in eval mode.
-        clouds: their points and voxels.
-        numbers: the object's number of each.
-        device: where the network is.
-    """
-    counts = [len(cloud.points_m) for cloud in clouds]
-    cloud_of_point = torch.repeat_interleave(torch.arange(len(clouds)), torch.tensor(counts))
-    grids = [cloud.voxels for cloud in clouds]
-    coordinates = torch.cat([grid.coordinates for grid in grids])
-    turned = (c.points_m @ c.voxels.grid_from_camera.mT for c in clouds)
-    seen = SeenPoints(
-        points_m=torch.cat(list(turned)),
-        coordinates=torch.cat([cloud_of_point[:, None], coordinates], 1),
-        features=torch.cat([grid.features for grid in grids]),
-        class_of_point=torch.tensor(numbers)[cloud_of_point],
-    )
-    outputs = network.directions(seen.to(device)).float().cpu()
-    return [
-        some @ grid.grid_from_camera
-        for some, grid in zip(outputs.split(counts), grids, strict=True)
-    ]
 
 
 def batches(clouds: Iterable["_Cloud"], most: int) -> Iterator[list["_Cloud"]]:
@@ -372,8 +343,20 @@ class GeoPoseNet(PoseEstimator):
     def _directions(
         self, clouds: list[ObjectCloud], numbers: list[int]
     ) -> tuple[list[Float[Tensor, "n k 3"]], float]:
+        """Ask for the directions to the keypoints in the camera frame; give the seconds too."""
         start = time.perf_counter()
-        found = network_directions(self._network, clouds, numbers, self.config.device)
+        counts = [len(cloud.points_m) for cloud in clouds]
+        cloud_of_point = torch.repeat_interleave(torch.arange(len(clouds)), torch.tensor(counts))
+        grids = [cloud.voxels for cloud in clouds]
+        coordinates = torch.cat([grid.coordinates for grid in grids])
+        seen = SeenPoints(
+            points_m=torch.cat([c.points_m @ c.voxels.grid_from_camera.mT for c in clouds]),
+            coordinates=torch.cat([cloud_of_point[:, None], coordinates], 1),
+            features=torch.cat([grid.features for grid in grids]),
+            class_of_point=torch.tensor(numbers)[cloud_of_point],
+        )
+        outputs = self._network.directions(seen.to(self.config.device)).float().cpu().split(counts)
+        found = [some @ grid.grid_from_camera for some, grid in zip(outputs, grids, strict=True)]
         return found, time.perf_counter() - start
 
     def _pose(

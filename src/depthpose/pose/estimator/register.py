@@ -17,22 +17,16 @@ from depthpose.core.rigid import Rigid
 from depthpose.core.units import Unit
 from depthpose.pose.cloud import local_planes
 from depthpose.pose.config import CloudConfig, EstimateConfig, RefusalConfig
-from depthpose.pose.estimator.answer import (
-    Clock,
-    answer_of,
-    candidate_of,
-    withheld,
-)
+from depthpose.pose.estimator.answer import Clock, answer_of, candidate_of, withheld
 from depthpose.pose.estimator.base import PoseEstimator, or_unreadable, refused
 from depthpose.pose.estimator.candidates import (
     CloudNormals,
-    PoseAmbiguities,
     cloud_normals,
     find_candidates,
     surface_signals,
     tilt_of,
 )
-from depthpose.pose.estimator.inputs import AnyInput, ObjectCloud, Refusal, prepare_cloud
+from depthpose.pose.estimator.inputs import AnyInput, Refusal, prepare_cloud
 from depthpose.pose.mesh import read_model, refuse_one_name, with_found_symmetries
 from depthpose.pose.refine import refine_best
 from depthpose.pose.surface import Surface
@@ -157,49 +151,26 @@ class Registration(PoseEstimator):
         normals, _ = local_planes(dense_m, some_m)
         proposals = propose_poses(some_m, normals, table, surface, _PROPOSALS, generator)
         seconds["voting"] = time.perf_counter() - began
-        found = pose_from_proposals(
-            prepared, proposals, model, surface, copies, self.refusal, self.config
+        clock, icp = Clock(seconds), replace(self.config.icp, starts=1)
+        best = refine_best(prepared.cloud_m.double(), proposals, surface, icp)
+        if float(best.refined.inlier_share) == 0:
+            reason = "no pose lays the model near the points: another object, or too little of it"
+            none = Refusal(status="votes do not meet", reason=reason)
+            return replace(withheld(model.name, none, clock), name=given.name)
+        first = candidate_of(best.refined)
+        candidates = find_candidates(prepared.cloud_m, first, best.others, copies, surface, icp)
+        normals = cloud_normals(prepared.cloud_m)
+        evidence = [_evidence_of(prepared.cloud_m, normals, c.pose, surface) for c in candidates]
+        clock.note("icp")
+        found = answer_of(
+            prepared, model, surface, copies, candidates, evidence, self.refusal, self.config, clock
         )
-        return replace(found, name=given.name, seconds={**seconds, **found.seconds})
+        return replace(found, name=given.name)
 
     def _table(self, number: int) -> PairTable:
         if number not in self._tables:
             self._tables[number] = prepare_pairs(self._surface(number))
         return self._tables[number]
-
-
-def pose_from_proposals(
-    cloud: ObjectCloud,
-    proposals: Rigid,
-    model: ObjectModel,
-    surface: Surface,
-    copies: PoseAmbiguities,
-    refusal: RefusalConfig,
-    config: EstimateConfig,
-) -> PoseEstimate:
-    """Refine the best of proposed poses and check it; no network takes part.
-
-    Args:
-        cloud: of the object.
-        proposals: poses, the likeliest first; one at least.
-        model: the object.
-        surface: of it.
-        copies: what it may be confused with.
-        refusal: when the answer is withheld.
-        config: of ICP, which begins at the proposals alone.
-    """
-    clock = Clock()
-    icp = replace(config.icp, starts=1)
-    best = refine_best(cloud.cloud_m.double(), proposals, surface, icp)
-    if float(best.refined.inlier_share) == 0:
-        reason = "no pose lays the model near the points: another object, or too little of it"
-        return withheld(model.name, Refusal(status="votes do not meet", reason=reason), clock)
-    first = candidate_of(best.refined)
-    candidates = find_candidates(cloud.cloud_m, first, best.others, copies, surface, icp)
-    normals = cloud_normals(cloud.cloud_m)
-    evidence = [_evidence_of(cloud.cloud_m, normals, one.pose, surface) for one in candidates]
-    clock.note("icp")
-    return answer_of(cloud, model, surface, copies, candidates, evidence, refusal, config, clock)
 
 
 def _evidence_of(
