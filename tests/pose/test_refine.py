@@ -295,7 +295,7 @@ def test_an_offset_of_the_sensor_is_in_the_covariance_along_the_ray() -> None:
              for offset_m in (0.0, 0.004)]  # fmt: skip
     more = found[1].covariance - found[0].covariance
     middle_m = cloud_m.mean(0)
-    along_m = torch.cat([torch.zeros(3), middle_m / middle_m[2]]).double()
+    along_m = torch.cat([torch.zeros(3), middle_m / middle_m.norm()]).double()
     assert torch.allclose(more, 0.004**2 * torch.outer(along_m, along_m), atol=2e-7)
 
 

@@ -343,9 +343,9 @@ def _result(
     H, _, residual_m, weight, J = equations
     limit_m = config.end_distance_diameters * diameter_m
     local = _covariance(cloud, H, J, weight, residual_m, limit_m, diameter_m)
-    # With all depths the middle moves along its ray.
     middle_m = _middle(cloud)
-    offset_m = config.sensor_offset_m * torch.cat([torch.zeros(3), middle_m / middle_m[2]])
+    ray = torch.nn.functional.normalize(middle_m, dim=0)
+    offset_m = config.sensor_offset_m * torch.cat([torch.zeros(3), ray])
     local = local + torch.outer(offset_m, offset_m)
     eye, zero = torch.eye(3, dtype=torch.float64), torch.zeros(3, 3, dtype=torch.float64)
     # w x (p - c) + v = w x p + (v + c x w)
