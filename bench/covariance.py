@@ -1,10 +1,11 @@
 """Whether poses err as much as they say, for four kinds of sensor.
 
-    python bench/covariance.py [--views 2] [--repeats 8]
+    python bench/covariance.py [--views 2] [--repeats 8] [--offset-m 0.005]
 
 Parts of the shipped weights ``parts`` are rendered 0.7 m away and measured again and again by each
-kind of synthetic sensor, without the offset of all readings that no covariance holds; ICP begins at
-the true pose. Bias is how far the mean of the poses is off
+kind of synthetic sensor; ICP begins at the true pose. All readings of a measurement are off by up
+to ``--offset-m`` along the ray; where that is given, the covariance has the product's default for
+it, and none where it is 0. Bias is how far the mean of the poses is off
 at the middle of the object, along the ray and in all [mm], the mean over views; scatter and claimed
 are standard deviations there, all three axes together. Squares are squared errors in units of the
 covariance (Mahalanobis), whose median is 5.3 where errors are normal. Coverage is the share of
@@ -25,7 +26,7 @@ from depthpose.core.render import rasterize
 from depthpose.core.rigid import Rigid, cross_matrix
 from depthpose.pose.augment import measure, random_rotation
 from depthpose.pose.cloud import cloud_from_depth
-from depthpose.pose.config import SensorConfig, SensorKind
+from depthpose.pose.config import IcpConfig, SensorConfig, SensorKind
 from depthpose.pose.refine import refine_pose
 from depthpose.pose.surface import prepare_surface
 from depthpose.report.page import markdown_table
@@ -44,7 +45,7 @@ def errors_of(found: Rigid, true: Rigid) -> Tensor:
 
 
 def view_rows(
-    kind: SensorKind, number: int, seed: int, repeats: int, noise: float
+    kind: SensorKind, number: int, seed: int, repeats: int, noise: float, offset_m: float
 ) -> dict[str, Tensor]:
     """Measure one view of a part again and again; errors at its middle, and what was claimed."""
     model = PARTS[number]
@@ -57,11 +58,12 @@ def view_rows(
     mask = clean_m.isfinite()
     clean_m = torch.where(mask, clean_m, BEHIND_M).float()
     offs, squares, spreads = [], [], []
-    sensor = SensorConfig(kinds=(kind,), noise=(noise, noise), offset_m=(0.0, 0.0))
+    sensor = SensorConfig(kinds=(kind,), noise=(noise, noise), offset_m=(-offset_m, offset_m))
+    icp = IcpConfig() if offset_m else IcpConfig(sensor_offset_m=0.0)
     for _ in range(repeats):
         depth_m = measure(clean_m, (FOCAL_PX, FOCAL_PX), sensor, generator)
         cloud_m = cloud_from_depth(depth_m, mask & depth_m.isfinite(), K.float())
-        refined = refine_pose(cloud_m.double(), true, surface)
+        refined = refine_pose(cloud_m.double(), true, surface, icp)
         off = errors_of(refined.camera_from_model, true)
         squares.append(off @ torch.linalg.solve(refined.covariance, off))
         offs.append(1000 * by @ off)
@@ -80,12 +82,13 @@ def main() -> None:
     parser.add_argument("--views", type=int, default=2)
     parser.add_argument("--repeats", type=int, default=8)
     parser.add_argument("--noise", type=float, default=1.0, help="times the noise of the kind")
+    parser.add_argument("--offset-m", type=float, default=0.0, help="of all readings, at most")
     words = parser.parse_args()
     torch.set_num_threads(1)
     rows = []
     for kind in KINDS:
         every = [
-            view_rows(kind, number, 100 * number + view, words.repeats, words.noise)
+            view_rows(kind, number, 100 * number + view, words.repeats, words.noise, words.offset_m)
             for number in range(len(PARTS))
             for view in range(words.views)
         ]

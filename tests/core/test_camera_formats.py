@@ -93,6 +93,18 @@ READ: dict[str, tuple[str, tuple[float, ...], tuple[float | None, ...]]] = {
     "matrix": ("500 0 320\n0 501 240\n0 0 1\n", (500, 501, 320, 240), (None, None, None)),
     "matrix and baseline": ("500 0 320 0 501 240 0 0 1\n0.12\n", (500, 501, 320, 240),
                             (0.12, 0, None)),
+    "matrix of four columns": ("500 0 320 0\n0 501 240 0\n0 0 1 0\n", (500, 501, 320, 240),
+                               (None, None, None)),
+    "projection": ("500 0 320 -60 0 501 240 0 0 0 1 0", (500, 501, 320, 240), (0.12, 0, None)),
+    "matrix of 16": ("500 0 320 0 0 501 240 0 0 0 1 0 0 0 0 1", (500, 501, 320, 240),
+                     (None, None, None)),
+    "BOP, one image": (json.dumps({"cam_K": FLAT, "depth_scale": 0.1}), (500, 501, 320, 240),
+                       (None, None, 0.0001)),
+    "BOP and a baseline": (json.dumps({**BOP, "height": 480, "baseline_m": 0.05}),
+                           (500, 501, 320.5, 240.5), (0.05, 0, 0.0001)),
+    "RealSense and a baseline": (json.dumps({**REALSENSE, "baseline_m": 0.05}),
+                                 (500, 501, 320, 240), (0.05, 0, None)),
+    "ROS echo, twice": (ECHO + ECHO, (500, 501, 320, 240), (0.06, 0, None)),
     "BOP": (json.dumps({**BOP, "height": 480}), (500, 501, 320.5, 240.5), (None, None, 0.0001)),
     "BOP scene": (json.dumps(SCENE), (500, 501, 320, 240), (None, None, 0.001)),
     "Middlebury, commas": (
@@ -264,6 +276,20 @@ WRONG: dict[str, tuple[str, str]] = {
         "K: [500, 0, 320, 0, 500, 240, 0, 0, 1]\nD: '[-0.3, 0.1]'",
         "its d are no list of numbers; write",
     ),
+    "transposed": ("500 0 0\n0 500 0\n320 240 1\n", "it looks transposed"),
+    "a baseline of some unit": (
+        json.dumps({**REALSENSE, "baseline": 50}),
+        "its 'baseline' may be in any unit; write basel",
+    ),
+    "two messages": (
+        ECHO + ECHO.replace("500", "400"),
+        "describes several cameras, one after the other",
+    ),
+    "level pair of two lengths": (
+        "K1: [500, 0, 320, 0, 500, 240, 0, 0, 1]\nK2: [540, 0, 320, 0, 540, 240, 0, 0, 1]\n"
+        "T: [-0.1, 0, 0]",
+        "fx of the left camera is 500 and of the right one 540",
+    ),
     "no centre": ("500 500 0 0", r"lies in the corner .* take the centre, \(319\.5, 239\.5\)"),
 }
 
@@ -280,6 +306,8 @@ def test_what_cannot_be_a_camera_says_why(tmp_path: Path, name: str) -> None:
 def test_a_rectified_pair_without_projections_is_a_rig(tmp_path: Path) -> None:
     text = "K1: [500, 0, 320, 0, 500, 240, 0, 0, 1]\nT: [-0.1, 0, 0]"
     assert read_rig(saved(tmp_path, text), SIZE).baseline_m == 0.1
+    text += "\nK2: [500, 0, 331, 0, 500, 240, 0, 0, 1]"
+    assert read_rig(saved(tmp_path, text), SIZE).cx_right_minus_left_px == 11
 
 
 @pytest.fixture(scope="module")

@@ -187,6 +187,10 @@ def scan_rows(between: str = " ", *, decimal: str = ".", first: int | None = Non
         "x y z\n" + scan_rows(),
         '"ID";"X";"Y";"Z"\n' + scan_rows(";", decimal=",", first=77),
         "//X Y Z\n" + scan_rows(),
+        "# z y x\n" + "".join(f"{z} {y} {x}\n" for x, y, z in SCAN),
+        "# all of it\n" + scan_rows(),
+        "".join(f"{n} {row}\n" for n, row in zip("3479", scan_rows().splitlines(), strict=True)),
+        scan_rows(";", decimal=",") + "1,#QNAN;1,#QNAN;1,#QNAN\n",
         "4\n" + scan_rows(),
         "-nan(ind) 1.#QNAN -1.#IND00\n" + scan_rows() + "nan(0x8) 2 3 # far\n",
     ],
@@ -213,7 +217,14 @@ def test_columns_are_taken_by_their_names_and_a_count_is_none(tmp_path: Path) ->
 @pytest.mark.parametrize(
     ("text", "said"),
     [
-        (scan_rows(",", decimal=","), "commas both part numbers and are decimal signs"),
+        (scan_rows(",", decimal=","), "commas may part numbers or be decimal signs"),
+        ("0,1,0,2,0,7\n0,2,0,2,0,7\n", r"decimal signs .* a first line of names \(x,y,z"),
+        ("1.000,5 2.000,5 3.000,5\n" * 4, "commas may part numbers or be decimal signs"),
+        ((scan_rows() * 2).replace("\n", " "), r"1 rows of 24 .* save the transpose"),
+        (
+            "".join(f"30{n} 200 {row}\n" for n, row in enumerate(scan_rows().splitlines())),
+            r"two whole numbers \(300 and 200\), which look like a pixel's place",
+        ),
         ("a b c\n" + scan_rows(), "begins by 'a b c', neither numbers nor names of columns"),
         ("x y z r\n" + scan_rows(), "names 4 columns, but rows have 3"),
         ("5\n" + scan_rows(), "declares 5 points but 4 rows follow"),

@@ -18,7 +18,7 @@ from depthpose.pose.datasets import (
     read_labels,
     read_mask,
 )
-from depthpose.pose.estimator.inputs import split_instances, view_input
+from depthpose.pose.estimator.inputs import labels_input, split_instances, view_input
 
 MASK = torch.tensor([[False, True, False], [True, False, False]])
 # Column by column: one of the background, two of the object, three of the background.
@@ -123,3 +123,17 @@ def test_an_array_of_labels_asks_which(tmp_path: Path) -> None:
     jobs = view_jobs(*given, "part", "mm", tmp_path / "out")
     assert [job.name for job in jobs] == ["d_1", "d_2"]
     assert [int(job.read().mask.sum()) for job in jobs] == [400, 900]
+
+
+def test_what_compression_mixes_is_no_label_map(tmp_path: Path) -> None:
+    Image.fromarray(LABELS * 100).save(tmp_path / "m.jpg", quality=95)
+    with pytest.raises(InputError, match=r"a JPEG of more grey than white, .* save masks as PNG"):
+        read_labels(tmp_path / "m.jpg")
+
+
+def test_of_probabilities_those_above_a_half_are_the_object() -> None:
+    likely = np.where(ONE, 0.9, 0.02)
+    assert np.array_equal(labels_input(likely, "m").numpy(), ONE)
+    for wrong in (np.where(ONE, 3.5, -3.5), np.where(ONE, 0.5, np.nan)):
+        with pytest.raises(InputError, match=r"fractions outside \[0, 1\], or NaN; give True"):
+            labels_input(wrong, "m")

@@ -107,6 +107,8 @@ GOOD: dict[str, Callable[[], str | bytes]] = {
     "old Mac, continued.obj": lambda: (VERTICES + faces_of_obj()).replace(" 4 ", " \\\n4 ").replace(
         "\n", "\r"),
     "before its points.obj": lambda: faces_of_obj() + VERTICES,
+    "old faces.obj": lambda: VERTICES + faces_of_obj().replace("f ", "fo "),
+    "capitals.obj": (VERTICES + faces_of_obj()).upper,
     "text.ply": text_ply,
     "text, CR.ply": lambda: text_ply().replace("\n", "\r"),
     "indexes.ply": lambda: text_ply("vertex_indexes"),
@@ -138,7 +140,12 @@ DAMAGED: dict[str, tuple[Callable[[], str | bytes], str]] = {
     "beyond.obj": (lambda: VERTICES + "f 1 2 99\n", "line 13 names point 99 of 12"),
     "comma.obj": (lambda: VERTICES.replace("v 0 0 0", "v 0,5 0 0"), "line 1, 'v 0,5 0 0', does"),
     "crossing.obj": (lambda: VERTICES + "f 1 3 2 4\n", "face 0 crosses itself"),
-    "curves.obj": (lambda: VERTICES + "surf 0 1 0 1 1 2 3 4\n", "free-form surfaces alone"),
+    "cut in a face.obj": (lambda: VERTICES + "f 1 2 3\nf 4 5\n", "face 1 has 2 corners, and 3 to"),
+    "wires.obj": (lambda: VERTICES + "l 1 2\n", "surfaces or lines alone, and no triangles"),
+    "short loop.stl": (lambda: "solid a\nfacet\nouter loop\nvertex 0 0 0\nvertex 1 0 0\nendloop\n"
+                       "vertex 0 1 0\nvertex 0 0 1\nendloop\nendsolid a\n", "0 has 2 corners"),
+    "json.glb": (lambda: '{"asset": {"version": "2.0"}}', "not by 'glTF'; export it as binary GLB"),
+    "curves.obj": (lambda: VERTICES + "surf 0 1 0 1 1 2 3 4\n", "surfaces or lines alone"),
     "cut.ply": (lambda: text_ply().rsplit("\n", 3)[0], "8 face but 6 rows follow; it is trunc"),
     "cut in a row.ply": (lambda: text_ply()[:-4], "row 8 of face, '4 5 0 6', is not what the"),
     "more.ply": (lambda: text_ply(count=6), r"2 rows follow what its header declares \(12 vertex"),
@@ -168,6 +175,9 @@ def test_a_damaged_model_is_refused_where_it_is_damaged(tmp_path: Path, name: st
         ({"extensionsRequired": ["KHR_draco_mesh_compression"]}, "needs 'KHR_draco_mesh_compr"),
         ({"extensionsRequired": ["EXT_meshopt_compression"]}, "needs 'EXT_meshopt_compression'"),
         ({"buffers": [{"uri": "part.bin", "byteLength": 9}]}, "in another file, 'part.bin'"),
+        ({"nodes": [{"mesh": 0, "skin": 0}], "skins": [{"joints": [0]}]}, "needs 'a skin'"),
+        ({"nodes": [{"mesh": 0, "weights": [0.0, 1.0]}]}, "needs 'morph targets'"),
+        ({"nodes": [{"mesh": 0, "weights": [0.0]}]}, None),
         ({"extensionsRequired": ["KHR_materials_unlit"]}, None),
         ({"extensionsUsed": ["KHR_draco_mesh_compression"]}, None),
     ],
@@ -185,6 +195,17 @@ def test_what_a_glb_needs_is_named_where_it_is_not_read(
     else:
         with pytest.raises(InputError, match=said):
             read_geometry(path)
+
+
+def test_moved_points_of_a_sparse_glb_are_not_ignored(tmp_path: Path) -> None:
+    good = trimesh.creation.box((0.1, 0.2, 0.3)).export(file_type="glb")
+    assert isinstance(good, bytes)
+    (size,) = struct.unpack("<I", good[12:16])
+    scene = json.loads(good[20 : 20 + size])
+    place = scene["meshes"][0]["primitives"][0]["attributes"]["POSITION"]
+    scene["accessors"][place]["sparse"] = {"count": 1}
+    with pytest.raises(InputError, match="needs 'sparse accessors'"):
+        read_geometry(saved(tmp_path, "a.glb", pack_glb(scene, good[20 + size :])))
 
 
 def test_a_glb_is_in_metres_and_other_files_say_no_unit(tmp_path: Path) -> None:

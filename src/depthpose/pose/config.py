@@ -136,6 +136,11 @@ class IcpConfig:
     surface_points: int = 10000
     """Points sampled on the model's surface."""
 
+    sensor_offset_m: float = 0.004
+    """Standard deviation of an offset of all readings along the ray, which no residual shows: it is
+    added to the covariance of a pose. Depth cameras are off by 3 to 6 mm as a whole
+    (``bench/sensors.py``); 0 where yours is calibrated at the distance of the object."""
+
     starts: int = 7
     """From each fit of the keypoints so many: 1, it alone; up to 7, also turned by 15 degrees one
     way and the other about each axis of the camera (``bench/refine_starts.py``)."""
@@ -148,6 +153,7 @@ class IcpConfig:
             iterations="[1, inf)",
             surface_points="[100, inf)",
             cloud_points="[100, inf)",
+            sensor_offset_m="[0, 1]",
         )
         if not 0 < self.end_distance_diameters <= self.start_distance_diameters:
             raise InputError(

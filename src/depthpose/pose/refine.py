@@ -39,9 +39,11 @@ roughly must explain the cloud better by as much than where it ended exactly to 
 
 _BLOCKS = (0.15, 0.2, 0.3, 0.4)
 """Sides of blocks of points whose errors may be alike, in diameters."""
-_TAKEN_UP = 1.5
-"""Power of the ratio by which errors within a block exceed independent ones, such that intervals
-hold what they promise for four kinds of sensor (``bench/covariance.py``)."""
+_REST = 0.03
+"""Of what holds a pose so much is always taken to be left where a block is left out: else a block
+that alone holds a direction would make it infinitely uncertain."""
+_LEAST_SLOPE = 0.25
+"""Least information of the weighted residuals, over that of constant weights."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -51,10 +53,10 @@ class RefinedPose:
     Attributes:
         camera_from_model: the pose.
         covariance: of (rotation, translation) as :class:`~depthpose.pose.types.PoseFit` says, from
-            the curvature of the sum and the residuals, of which neighbours may be alike; what the
-            surface does not fix (a turn of a ball) is far too uncertain to be missed. Local: of
-            this minimum alone, whether it is the right one or not. An error that a sensor makes
-            everywhere, such as an offset along the ray, is not in it.
+            the residuals, of which neighbours may be alike, and an offset of all readings along the
+            ray (``IcpConfig.sensor_offset_m``); what the surface does not fix (a turn of a ball) is
+            far too uncertain to be missed. Local: of this minimum alone, whether it is the right
+            one or not.
         residual_m: root mean square distance to the surface, of the points that count.
         inlier_share: share of the points within the last limit of the surface.
     """
@@ -114,7 +116,7 @@ def refine_pose(
     pose, index = _iterated(cloud, initial.double(), surface, limits_m, is_exact=True)
     end_m = config.end_distance_diameters * surface.diameter_m
     equations = _normal_equations(cloud, pose, surface, end_m, index, ON_RAY)
-    return _result(points_m, cloud, pose, equations, surface.diameter_m)
+    return _result(points_m, cloud, pose, equations, config, surface.diameter_m)
 
 
 def refine_best(
@@ -331,46 +333,80 @@ def _moved(pose: Rigid, motion: Float[Tensor, "*batch 6"], middle: Tensor) -> Ri
 
 
 def _result(
-    points_m: Tensor, cloud: Tensor, pose: Rigid, equations: tuple[Tensor, ...], diameter_m: float
+    points_m: Tensor,
+    cloud: Tensor,
+    pose: Rigid,
+    equations: tuple[Tensor, ...],
+    config: IcpConfig,
+    diameter_m: float,
 ) -> RefinedPose:
     H, _, residual_m, weight, J = equations
-    variance = (weight * residual_m.square()).sum(-1) / (weight.sum(-1) - 6).clamp(min=1)
-    variance = variance * _inflation(cloud, H, (weight * residual_m)[..., None] * J, diameter_m)
+    limit_m = config.end_distance_diameters * diameter_m
+    local = _covariance(cloud, H, J, weight, residual_m, limit_m, diameter_m)
+    middle_m = _middle(cloud)
+    ray = torch.nn.functional.normalize(middle_m, dim=0)
+    offset_m = config.sensor_offset_m * torch.cat([torch.zeros(3), ray])
+    local = local + torch.outer(offset_m, offset_m)
     eye, zero = torch.eye(3, dtype=torch.float64), torch.zeros(3, 3, dtype=torch.float64)
     # w x (p - c) + v = w x p + (v + c x w)
-    shift = torch.cat(
-        [torch.cat([eye, zero], 1), torch.cat([cross_matrix(_middle(cloud)), eye], 1)]
-    )
-    covariance = shift @ (variance[..., None, None] * torch.linalg.inv(H)) @ shift.mT
+    shift = torch.cat([torch.cat([eye, zero], 1), torch.cat([cross_matrix(middle_m), eye], 1)])
     return RefinedPose(
         camera_from_model=Rigid(pose.R.to(points_m), pose.t_m.to(points_m)),
-        covariance=covariance.to(points_m),
+        covariance=(shift @ local @ shift.mT).to(points_m),
         residual_m=_spread_m(residual_m, weight).to(points_m),
         inlier_share=(weight > 0).to(points_m).mean(-1),
     )
 
 
-def _inflation(
-    cloud: Float64[Tensor, "n 3"], H: Tensor, pulls: Tensor, diameter_m: float
-) -> Float64[Tensor, "*batch"]:
-    """Say by how much neighbours that err alike raise the variance.
+def _covariance(
+    cloud: Float64[Tensor, "n 3"],
+    H: Float64[Tensor, "*batch 6 6"],
+    J: Float64[Tensor, "*batch n 6"],
+    weight: Float64[Tensor, "*batch n"],
+    residual_m: Float64[Tensor, "*batch n"],
+    limit_m: float,
+    diameter_m: float,
+) -> Float64[Tensor, "*batch 6 6"]:
+    """Say how uncertain a motion about the middle of the cloud is, by the residuals.
 
-    Independent errors pull a block of the view as much as its points, squares added (Liang and
-    Zeger 1986). Of several sizes of blocks the largest ratio counts: nobody knows how far errors
-    reach. The fit has taken up a part of what they share; hence the power.
+    Independent errors give ``s^2 / A``, where ``A`` has the slope of the weighted residual (Huber
+    1981): Tukey's weights hold less than they weigh. Neighbours may err alike, and the fit takes up
+    what few points alone hold: how far it moves where a block of the view is left out (MacKinnon
+    and White's jackknife) says both. Of several sizes of blocks that of the largest moves counts,
+    for nobody knows how far errors reach; there are few blocks, so each direction is as uncertain
+    as all are in the mean, over independent errors, or more.
     """
-    inverse = torch.linalg.inv(H)
+    root = weight.sqrt()
+    slope = root * (root - 4 * (residual_m / limit_m).square())
+    half = torch.linalg.cholesky(H)
+    bent = torch.linalg.solve_triangular(half, J.mT * slope[..., None, :] @ J, upper=False)
+    bent = torch.linalg.solve_triangular(half, bent.mT, upper=False)
+    values, ways = torch.linalg.eigh(bent)
+    A = half @ (ways * values.clamp(min=_LEAST_SLOPE)[..., None, :]) @ ways.mT @ half.mT
+    inverse = torch.linalg.inv(A)
+    variance = (weight * residual_m.square()).sum(-1) / (weight.sum(-1) - 6).clamp(min=1)
+    own = torch.linalg.cholesky(variance.clamp(min=1e-20)[..., None, None] * inverse)
+    pulls = (weight * residual_m)[..., None] * J
+    shares = (slope[..., None] * J)[..., None] * J[..., None, :]
     flat_m = cloud[:, :2] / cloud[:, 2:] * cloud[:, 2].mean()
-    own = (pulls @ inverse * pulls).sum((-2, -1)).clamp(min=1e-30)
-    most = torch.ones_like(own)
+    eye = torch.eye(6, dtype=torch.float64)
+    most, ways = torch.ones_like(values), eye.expand_as(A)
     for side in _BLOCKS:
         cells = (flat_m / (side * diameter_m)).floor() @ torch.tensor([1.0, 1e6]).double()
         _, block = cells.unique(return_inverse=True)
         count = int(block.max()) + 1
-        sums = pulls.new_zeros(*pulls.shape[:-2], count, 6).index_add_(-2, block, pulls)
-        shared = (sums @ inverse * sums).sum((-2, -1)) * (count / max(count - 1, 1))
-        most = torch.maximum(most, shared / own)
-    return most**_TAKEN_UP
+        pull = pulls.new_zeros(*pulls.shape[:-2], count, 6).index_add_(-2, block, pulls)
+        held = shares.new_zeros(*shares.shape[:-3], count, 6, 6).index_add_(-3, block, shares)
+        rest = eye * (1 + _REST) - held @ inverse[..., None, :, :]
+        moves = torch.linalg.solve(rest, pull[..., None]).squeeze(-1) @ inverse
+        moves = torch.linalg.solve_triangular(own, moves.mT, upper=False)
+        values, found = torch.linalg.eigh(moves @ moves.mT)
+        is_more = values.sum(-1, keepdim=True) > most.sum(-1, keepdim=True)
+        most = torch.where(is_more, values, most)
+        ways = torch.where(is_more[..., None], found, ways)
+    least = most.mean(-1, keepdim=True).clamp(min=1)
+    spread = own @ ways
+    return (spread * torch.maximum(most, least)[..., None, :]) @ spread.mT
 
 
 def _spread_m(

@@ -34,6 +34,7 @@ from depthpose.core.camera.pinhole import (
 )
 from depthpose.core.camera.stored_camera import (
     Names,
+    baseline_of,
     facts_from_names,
     is_ros,
     lens_of,
@@ -183,19 +184,24 @@ def _colmap_facts(text: str) -> CameraFacts:
 
 
 def _bare_facts(text: str) -> CameraFacts | None:
-    """Take bare numbers: ``fx fy cx cy``, with distortion behind, or K, with a baseline behind."""
+    """Take bare numbers: ``fx fy cx cy``, with distortion behind; K, with a baseline behind; P."""
     lines = (line.partition("#")[0] for line in text.splitlines())
     words = " ".join(lines).replace(",", " ").split()
     try:
         numbers = [float(word) for word in words[:20]]
     except ValueError:
         return None
-    if len(numbers) in (9, 10) and numbers[6:9] == [0, 0, 1]:
-        return CameraFacts(
-            kind="a matrix",
-            K=torch.tensor(numbers[:9], dtype=torch.float64).reshape(3, 3),
-            baseline_m=numbers[9] if len(numbers) == 10 else None,
-        )
+    count, baseline_m = len(numbers), None
+    if count == 10:
+        baseline_m = numbers[9]
+    elif count in (12, 16) and numbers[3] and numbers[0]:
+        baseline_m = -numbers[3] / numbers[0]
+    is_projection = count in (12, 16) and numbers[8:11] == [0, 0, 1]
+    is_K = count in (9, 10) and [0, 0, 1] in (numbers[6:9], numbers[2:9:3])
+    if is_projection or is_K:
+        width = 4 if is_projection else 3
+        rows = torch.tensor(numbers[: 3 * width], dtype=torch.float64).reshape(3, width)
+        return CameraFacts(kind="a matrix", K=rows[:, :3].contiguous(), baseline_m=baseline_m)
     if len(numbers) not in (4, 8, 9, 12):
         return None
     is_tum = tuple(numbers[:4]) in _TUM
@@ -226,6 +232,8 @@ def facts_from_json(content: object) -> CameraFacts:
     if isinstance(content, list) and len(content) in (3, 9):
         return CameraFacts(kind="a matrix", K=_matrix(content))
     if isinstance(content, dict) and "K" not in content:
+        if "cam_K" in content:
+            return _from_scene({"0": content})
         inner = content.get("intrinsic", content)
         if isinstance(inner, dict) and "intrinsic_matrix" in inner:
             K = _matrix(inner["intrinsic_matrix"])
@@ -258,6 +266,7 @@ def _from_bop(keys: dict[str, Any]) -> CameraFacts:
         kind="a camera of BOP",
         K=intrinsics(fx, fy, cx, cy),
         size=_size(keys) if {"width", "height"} <= keys.keys() else None,
+        baseline_m=baseline_of(named(keys)),
         depth_unit_m=_bop_unit_m(keys),
         distortion=lens_of(named(keys)),
     )
@@ -282,7 +291,9 @@ def _from_scene(images: dict[str, dict[str, Any]]) -> CameraFacts:
 
 
 def _bop_unit_m(keys: dict[str, Any]) -> float | None:
-    return _MM * _json_number(keys, "depth_scale") if "depth_scale" in keys else None
+    if "depth_scale" in keys:
+        return _MM * _json_number(keys, "depth_scale")
+    return _json_number(keys, "depth_unit_m") if "depth_unit_m" in keys else None
 
 
 def _check_keys(content: object) -> dict[str, Any]:

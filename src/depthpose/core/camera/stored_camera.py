@@ -52,7 +52,19 @@ def read_storage(path: AnyPath, text: str) -> Names | None:
         refuse_yaml_bomb(path, body)
         loader = _Loader(body)
         content = loader.get_data() if loader.check_data() else None
-    return named(content) if isinstance(content, Mapping) else None
+        others = []
+        while loader.check_data():
+            others.append(loader.get_data())
+    if not isinstance(content, Mapping):
+        return None
+    names = named(content)
+    for other in others:  # of a recorded topic they differ in the time alone
+        if isinstance(other, Mapping) and named(other) | {"header": 0} != names | {"header": 0}:
+            raise InputError(
+                f"{path}: describes several cameras, one after the other; write each into a file "
+                "of its own (those of a pair into a folder)"
+            )
+    return names
 
 
 def named(content: Mapping[Any, Any]) -> Names:
@@ -110,6 +122,7 @@ _SUFFIXES = (".yaml", ".yml", ".xml")
 CAMERA_SUFFIXES = (".json", *_SUFFIXES, ".txt", ".conf")
 """Suffixes of the files that a camera may be read from."""
 _K = ("k", "cameramatrix", "intrinsicmatrix", "k1", "m1", "cameramatrix1", "cameramatrixleft")
+_K_RIGHT = ("k2", "m2", "cameramatrix2", "cameramatrixright")
 _D = ("d", "d1", "d2", "coeffs")
 _P = ("p", "projectionmatrix", "p1")
 _WIDTH, _HEIGHT = ("width", "imagewidth"), ("height", "imageheight")
@@ -251,9 +264,13 @@ def _from_intrinsics(names: Names, distortion: tuple[float, ...]) -> CameraFacts
     if K is None:
         return _from_lengths(names, distortion)
     kind = "a camera_info of ROS" if is_ros(names) else "a camera of OpenCV"
-    facts = CameraFacts(
-        kind=kind, K=torch.from_numpy(K), size=size_of(names), baseline_m=_level_baseline(names)
-    )
+    right, baseline_m = matrix(names, _K_RIGHT, 9), _level_baseline(names)
+    right = K if right is None else right
+    right_x = 0.0 if baseline_m is None else -right[0, 0] * baseline_m
+    facts = CameraFacts(kind=kind, K=torch.from_numpy(K), size=size_of(names))
+    if baseline_m is not None:
+        pair = [np.c_[one, [x, 0, 0]] for one, x in ((K, 0.0), (right, right_x))]
+        facts = facts_from_projections(kind, *pair, size_of(names))
     return replace(facts, distortion=distortion, undistort=_lens_remedy(names, facts.undistort))
 
 
@@ -269,9 +286,22 @@ def _from_lengths(names: Names, distortion: tuple[float, ...]) -> CameraFacts | 
         kind="a camera of RealSense" if is_realsense else "fx, fy, cx, cy",
         K=intrinsics(fx, fy, cx, cy),
         size=size_of(names),
+        baseline_m=baseline_of(names),
         depth_unit_m=scalar(names, "depthscale") if is_realsense else None,
         distortion=distortion,
     )
+
+
+def baseline_of(names: Names) -> float | None:
+    """Take ``baseline_m``.
+
+    Raises:
+        InputError: a baseline under another name, which does not say metres.
+    """
+    for name in names:
+        if name.startswith("baseline") and name != "baselinem":
+            raise InputError(f"its {name!r} may be in any unit; write baseline_m, in metres")
+    return scalar(names, "baselinem")
 
 
 def _level_baseline(names: Names) -> float | None:

@@ -1,7 +1,7 @@
 """Point clouds: PLY, PCD, NPY, text and KITTI's binary scans."""
 
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from io import BytesIO, TextIOWrapper
 from itertools import chain, islice
@@ -33,7 +33,9 @@ _ENCODERS = {".ply": encode_ply, ".pcd": encode_pcd}
 _COLOR = ("red", "green", "blue")
 _PARTS = re.compile(r"[\s,;]+")
 _LOOKED_AT = 100
-"""Rows of text by which it is understood."""
+"""Rows by which a table is understood."""
+_MOST_COLUMNS = 12
+"""Of so few rows that more are points, side by side."""
 _MAX_SCAN_BYTES = 2**26
 """Largest scan of a LiDAR that is read, thirty times KITTI's."""
 
@@ -133,10 +135,24 @@ def _from_columns(path: AnyPath, columns: Columns) -> Cloud:
 def _from_rows(path: AnyPath, table: np.ndarray) -> Cloud:
     if table.ndim != 2 or table.shape[1] < 3:
         raise InputError(f"{path}: points are rows of 3 numbers or more, got shape {table.shape}")
-    # A column that counts the points is none of their coordinates.
-    column = table[:, 0]
-    is_long = table.shape[1] > 3 and len(table) > 3 and bool(np.isfinite(column).all())
-    first = int(is_long and column[0] % 1 == 0 and bool((np.diff(column) == 1).all()))
+    if len(table) < 5 and table.shape[1] > _MOST_COLUMNS:
+        raise InputError(
+            f"{path}: {len(table)} rows of {table.shape[1]} numbers, where each row is a point; "
+            "save the transpose (array.T)"
+        )
+    # Columns that number the points, or say where in an image they were, are no coordinates.
+    is_whole = (table[:_LOOKED_AT] == np.trunc(table[:_LOOKED_AT])).all(0)
+    with np.errstate(invalid="ignore"):
+        steps = np.diff(table[:, 0])
+    is_long = table.shape[1] > 3 and len(table) > 3 and bool(is_whole[0])
+    if is_long and table.shape[1] > 4 and is_whole[1] and not is_whole[2:5].any():
+        raise InputError(
+            f"{path}: rows begin by two whole numbers ({table[0, 0]:g} and {table[0, 1]:g}), which "
+            "look like a pixel's place; leave them out, or name the columns in a first line "
+            "(u v x y z)"
+        )
+    counts = (steps > 0).all() and ((steps == 1).all() or not is_whole[1:4].any())
+    first = int(is_long and counts)
     return _finite_cloud(path, to_float32(table[:, first : first + 3]), None)
 
 
@@ -168,11 +184,11 @@ def _finite_cloud(path: AnyPath, points: np.ndarray, color: np.ndarray | None) -
 
 def _read_text(path: AnyPath) -> Cloud:
     text = TextIOWrapper(BytesIO(read_bytes(path, MAX_TEXT_BYTES)), "utf-8-sig")
-    lines = (plain_numbers(line).partition("#")[0].strip() for line in text if not line.isspace())
-    rows = (line for line in lines if line and not line.startswith("//"))
+    noted: list[str] = []
+    rows = _rows_of(text, noted)
     with refused_as(path, "text", "save it as UTF-8"):
         head = list(islice(rows, _LOOKED_AT))
-    first = [word.strip("\"'").lower() for word in _PARTS.split(head[0])] if head else []
+    first = _names_in(head[0]) if head else []
     names = [] if all(map(_is_number, first)) else first
     if names and not set("xyz") <= set(names):
         raise InputError(
@@ -182,8 +198,12 @@ def _read_text(path: AnyPath) -> Cloud:
     head = head[1:] if names else head
     is_count = len(head) > 1 and head[0].isdecimal() and len(_PARTS.split(head[1])) > 2
     count = int(head[0]) if is_count else None
-    rows = chain(head[1:] if is_count else head, rows)
-    table = parse_rows(path, map(_blank_separated(path, head), rows))
+    body = head[1:] if is_count else head
+    width = len(_PARTS.split(body[0])) if body else 0
+    comments = [] if names else [found for line in noted if len(found := _names_in(line)) == width]
+    names = next((found for found in comments if set("xyz") <= set(found)), names)
+    rows = chain(body, rows)
+    table = parse_rows(path, map(_blank_separated(path, body, names), rows))
     if count not in (None, len(table)):
         raise InputError(f"{path}: declares {count} points but {len(table)} rows follow")
     if not names:
@@ -191,6 +211,24 @@ def _read_text(path: AnyPath) -> Cloud:
     if table.shape[1] != len(names):
         raise InputError(f"{path}: names {len(names)} columns, but rows have {table.shape[1]}")
     return _from_rows(path, table[:, [names.index(axis) for axis in "xyz"]])
+
+
+def _rows_of(text: Iterable[str], noted: list[str]) -> Iterator[str]:
+    """Give rows without comments, which go to ``noted`` as far as they stand before the first."""
+    is_begun = False
+    for line in text:
+        row, _, said = plain_numbers(line).partition("#")
+        if row.lstrip().startswith("//"):
+            row, said = "", row.strip().removeprefix("//")
+        if row := row.strip():
+            is_begun = True
+            yield row
+        elif not is_begun:
+            noted.append(said)
+
+
+def _names_in(line: str) -> list[str]:
+    return [word.strip("\"'").lower() for word in _PARTS.split(line.strip())]
 
 
 def _is_number(word: str) -> bool:
@@ -201,16 +239,20 @@ def _is_number(word: str) -> bool:
     return True
 
 
-def _blank_separated(path: AnyPath, head: list[str]) -> Callable[[str], str]:
+def _blank_separated(path: AnyPath, head: list[str], names: list[str]) -> Callable[[str], str]:
     """Understand by the first rows what commas mean; give what makes blanks of separators."""
     text = " ".join(head)
-    commas = [word.rstrip(",").count(",") for word in re.split(r"[\s;]+", text)]
-    if "." not in text and max(commas) == 1:
+    words = [re.split(r"[\s;]+", row.strip(" ;,")) for row in head]
+    commas = [word.rstrip(",").count(",") for row in words for word in row]
+    is_decimal = max(commas) == 1 and all(len(row) > 2 for row in words)
+    if max(commas) == 1 and "." not in text:
         return lambda row: re.sub(r",(?=\s|$)|;", " ", row).replace(",", ".")
-    if "." not in text and max(commas) and re.search(r"(?<!\d)0\d", text):
+    # Of 0,1,0,2,0,7 nobody knows whether there are six numbers or three.
+    is_both = not names and max(commas) > 4 and max(commas) % 2 == 1 and "." not in text
+    if (is_decimal and min(commas) == 1) or is_both:
         raise InputError(
-            f"{path}: commas both part numbers and are decimal signs ({head[-1][:60]!r}); "
-            "save it with decimal points"
+            f"{path}: commas may part numbers or be decimal signs ({head[-1][:60]!r}); save it "
+            "with decimal points, or with a first line of names (x,y,z,...)"
         )
     return lambda row: row.replace(",", " ").replace(";", " ")
 

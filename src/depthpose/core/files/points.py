@@ -18,7 +18,7 @@ from depthpose.core.files.disk import AnyPath, refused_as
 from depthpose.core.files.store import read_bytes
 from depthpose.core.files.text import MAX_TEXT_BYTES
 
-_WORDS = re.compile(r"[-+]?(?:nan\(\w*\)|1\.#(?:QNAN|SNAN|IND|INF)\w*)")
+_WORDS = re.compile(r"[-+]?(?:nan\(\w*\)|1[.,]#(?:QNAN|SNAN|IND|INF)\w*)")
 Columns = dict[str, np.ndarray]
 """One array a name, all equally long."""
 

@@ -17,7 +17,7 @@ from depthpose.pose.datasets.layouts import integer, number, read_rows
 
 Runs = tuple[tuple[int, ...], int, int]
 """Run lengths, height and width."""
-_MOST_LABELS, _HALF = 64, 127
+_MOST_LABELS, _HALF, _SOFT = 64, 127, 32
 _MOST_BITS = 40
 """Of a run length in text: no image has as many pixels."""
 
@@ -40,7 +40,7 @@ def read_labels(path: Path) -> Int64[Tensor, "mask_h mask_w"]:
     a ``segmentation``, or a list of one of these.
 
     Raises:
-        InputError: it is missing, no picture, or no list of one mask.
+        InputError: it is missing, no picture, a JPEG of numbered objects, or no list of one mask.
     """
     if path.suffix.lower() == ".json":
         return _read_json_mask(path).long()
@@ -53,6 +53,12 @@ def read_labels(path: Path) -> Int64[Tensor, "mask_h mask_w"]:
         else:
             pixels = np.asarray(image.convert("RGB"))
         if image.format == "JPEG":  # what compression leaves about an edge is no object
+            is_grey = (pixels > _SOFT) & (pixels < 255 - _SOFT)
+            if is_grey.sum() > (pixels >= 255 - _SOFT).sum():
+                raise InputError(
+                    f"{path}: a JPEG of more grey than white, whose numbers of objects are lost by "
+                    "its compression; save masks as PNG"
+                )
             pixels = np.where(pixels > _HALF, 255, 0)
     values = pixels[..., 0]
     if pixels.shape[2] > 1 and (pixels[..., :3] != values[..., None]).any():

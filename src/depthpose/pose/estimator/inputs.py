@@ -157,6 +157,8 @@ def split_instances(labels: Int64[Tensor, "h w"]) -> list[Bool[Tensor, "h w"]]:
 def labels_input(mask: AnyMask, name: str) -> Int64[Tensor, "_ _"]:
     """Take a mask to the numbers of its objects, as :func:`read_labels` gives them.
 
+    Of fractions in [0, 1], which are probabilities, those above a half are the object.
+
     Raises:
         InputError: a file that cannot be read, or no mask.
     """
@@ -165,8 +167,14 @@ def labels_input(mask: AnyMask, name: str) -> Int64[Tensor, "_ _"]:
     if isinstance(mask, Mapping):
         return mask_from_rle(mask, name).long()
     values = _tensor(mask)
-    is_whole = not values.is_floating_point() or bool((values % 1 == 0).all())
-    whole = values.long() if is_whole else (values != 0).long()
+    if values.is_floating_point() and not bool((values % 1 == 0).all()):
+        if not bool(((values >= 0) & (values <= 1)).all()):
+            raise InputError(
+                f"{name}: the mask holds fractions outside [0, 1], or NaN; give True and False "
+                "(logits > 0), whole numbers of objects, or probabilities"
+            )
+        values = values > 0.5
+    whole = values.long()
     return number_objects(whole.numpy()) if whole.ndim == 2 else whole
 
 

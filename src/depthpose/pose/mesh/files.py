@@ -130,7 +130,7 @@ def _read_ply(path: AnyPath) -> tuple[np.ndarray, Ragged]:
 
 
 def _rows_of(path: AnyPath, data: bytes) -> Iterator[tuple[int, list[bytes]]]:
-    """Give the words of each line, however lines end, and its number; comments are left out."""
+    """Give the words of each line and its number: the first in lower case, without comments."""
     if len(data) > _MOST_TEXT:
         raise InputError(
             f"{path}: {len(data)} bytes of text, more than the {_MOST_TEXT} that are read; save it "
@@ -145,7 +145,7 @@ def _rows_of(path: AnyPath, data: bytes) -> Iterator[tuple[int, list[bytes]]]:
         words = (before + line).partition(b"#")[0].split()
         before = b""
         if words:
-            yield number, words
+            yield number, [words[0].lower(), *words[1:]]
 
 
 def _place(path: AnyPath, line: int, words: list[bytes]) -> list[float]:
@@ -184,7 +184,7 @@ def _read_text_stl(path: AnyPath, data: bytes) -> tuple[np.ndarray, Ragged]:
     """Read facets of one or more solids; a loop of four corners and more is a polygon."""
     places, ends, last = array("d"), array("q", [0]), b""
     for number, words in _rows_of(path, data):
-        last = words[0].lower()
+        last = words[0]
         if last == b"vertex":
             places.extend(_place(path, number, words))
         elif last == b"endloop":
@@ -199,12 +199,12 @@ def _read_text_stl(path: AnyPath, data: bytes) -> tuple[np.ndarray, Ragged]:
 
 def _read_obj(path: AnyPath) -> tuple[np.ndarray, Ragged]:
     """Read vertices and polygons; negative numbers count back from the line they stand in."""
-    places, sizes, corners, is_curved = array("d"), array("q"), array("q"), False
+    places, sizes, corners, is_other = array("d"), array("q"), array("q"), False
     highest, highest_line = 0, 0
     for number, words in _rows_of(path, read_bytes(path)):
         if words[0] == b"v":
             places.extend(_place(path, number, words))
-        elif words[0] == b"f":
+        elif words[0] in (b"f", b"fo"):  # fo of old writers is the same
             there, named = len(places) // 3, [0]
             with suppress(ValueError):
                 named = [int(word.partition(b"/")[0]) for word in words[1:]] or [0]
@@ -217,11 +217,11 @@ def _read_obj(path: AnyPath) -> tuple[np.ndarray, Ragged]:
                 highest, highest_line = max(named), number
             sizes.append(len(named))
             corners.extend(k - 1 if k > 0 else there + k for k in named)
-        is_curved |= words[0] in (b"surf", b"curv", b"curv2")
+        is_other |= words[0] in (b"surf", b"curv", b"curv2", b"l")
     vertices = np.array(places).reshape(-1, 3)
-    if highest > len(vertices) or (is_curved and not sizes):
+    if highest > len(vertices) or (is_other and not sizes):
         said = f"line {highest_line} names point {highest} of {len(vertices)}; it is damaged"
-        said = said if sizes else "holds free-form surfaces alone, and no triangles"
+        said = said if sizes else "holds free-form surfaces or lines alone, and no triangles"
         raise InputError(f"{path}: {said}. Export it again.")
     return vertices, Ragged(np.array(sizes, np.int64), np.array(corners, np.int64))
 
@@ -243,6 +243,8 @@ def _read_glb(path: AnyPath) -> tuple[np.ndarray, np.ndarray]:
 
 def _refuse_scene(path: AnyPath, data: bytes) -> None:
     """Refuse a GLB by the JSON at its head: accessors without bytes hold as many zeros as said."""
+    if not data.startswith(b"glTF"):
+        raise InputError(f"{path}: begins by {data[:12]!r}, not by 'glTF'; export it as binary GLB")
     with refused_as(path, "GLB", "export it again"):
         (size,) = struct.unpack("<I", data[12:16])
         if size > _MOST_SCENE_BYTES:
@@ -263,6 +265,12 @@ def _refuse_scene(path: AnyPath, data: bytes) -> None:
         needed += ["TRIANGLE_FAN" for part in parts if part.get("mode") == 6]
         places = [p["attributes"]["POSITION"] for p in parts if "POSITION" in p["attributes"]]
         needed += ["normalized positions" for k in places if accessors[k].get("normalized")]
+        read = [*places, *(part["indices"] for part in parts if "indices" in part)]
+        needed += ["sparse accessors" for k in read if accessors[k].get("sparse")]
+        meshes = [node for node in scene.get("nodes", []) if "mesh" in node]
+        needed += ["a skin" for node in meshes if "skin" in node]
+        weights = [one.get("weights", []) for one in (*scene.get("meshes", []), *meshes)]
+        needed += ["morph targets" for some in weights if any(some)]
         links = [str(buffer.get("uri") or "data:") for buffer in scene.get("buffers", [])]
         outside = [link for link in links if not link.startswith("data:")]
     if outside:
@@ -304,8 +312,7 @@ def cut_polygons(
 ) -> np.ndarray:
     """Cut simple polygons without holes into triangles of the same corners, in their order.
 
-    A polygon that is not planar is cut as it looks along the normal of its area (Newell's); one
-    of fewer than three corners is none.
+    A polygon that is not planar is cut as it looks along the normal of its area (Newell's).
 
     Args:
         path: of the file, for errors.
@@ -317,8 +324,8 @@ def cut_polygons(
         Triangles (t, 3).
 
     Raises:
-        InputError: a corner is none of the vertices, a polygon has more corners than are cut, or
-            polygons cross themselves.
+        InputError: a corner is none of the vertices, a polygon has one or two corners or more than
+            are cut, or polygons cross themselves.
     """
     starts = np.cumsum(sizes) - sizes
     wrong = (corners < 0) | (corners >= len(vertices))
@@ -329,10 +336,11 @@ def cut_polygons(
             f"{path}: face {face} names point {corners[at]}, but the {len(vertices)} points are "
             f"numbered 0 .. {len(vertices) - 1}; the file is damaged. Export it again."
         )
-    if sizes.max(initial=0) > _MOST_CORNERS:
+    wrong = ((sizes > 0) & (sizes < 3)) | (sizes > _MOST_CORNERS)
+    if wrong.any():
         raise InputError(
-            f"{path}: face {sizes.argmax()} has {sizes.max()} corners, more than {_MOST_CORNERS}; "
-            "export it as triangles"
+            f"{path}: face {wrong.argmax()} has {sizes[wrong.argmax()]} corners, and 3 to "
+            f"{_MOST_CORNERS} are read; the file is truncated, or export it as triangles"
         )
     found, owners = [np.empty((0, 3), np.int64)], [np.empty(0, np.int64)]
     overlap, area = np.zeros(len(sizes)), 0.0
