@@ -269,8 +269,8 @@ def _from_intrinsics(names: Names, distortion: tuple[float, ...]) -> CameraFacts
     right_x = 0.0 if baseline_m is None else -right[0, 0] * baseline_m
     facts = CameraFacts(kind=kind, K=torch.from_numpy(K), size=size_of(names))
     if baseline_m is not None:
-        pair = [np.c_[one, [x, 0, 0]] for one, x in ((K, 0.0), (right, right_x))]
-        facts = facts_from_projections(kind, *pair, size_of(names))
+        left, right = np.c_[K, [0, 0, 0]], np.c_[right, [right_x, 0, 0]]
+        facts = facts_from_projections(kind, left, right, size_of(names))
     return replace(facts, distortion=distortion, undistort=_lens_remedy(names, facts.undistort))
 
 
