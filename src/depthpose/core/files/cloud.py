@@ -244,11 +244,12 @@ def _blank_separated(path: AnyPath, head: list[str], names: list[str]) -> Callab
     text = " ".join(head)
     words = [re.split(r"[\s;]+", row.strip(" ;,")) for row in head]
     commas = [word.rstrip(",").count(",") for row in words for word in row]
-    is_decimal = max(commas) == 1 and all(len(row) > 2 for row in words)
-    if max(commas) == 1 and "." not in text:
+    most = max(commas, default=0)
+    is_decimal = most == 1 and all(len(row) > 2 for row in words)
+    if most == 1 and "." not in text:
         return lambda row: re.sub(r",(?=\s|$)|;", " ", row).replace(",", ".")
     # Of 0,1,0,2,0,7 nobody knows whether there are six numbers or three.
-    is_both = not names and max(commas) > 4 and max(commas) % 2 == 1 and "." not in text
+    is_both = not names and most > 4 and most % 2 == 1 and "." not in text
     if (is_decimal and min(commas) == 1) or is_both:
         raise InputError(
             f"{path}: commas may part numbers or be decimal signs ({head[-1][:60]!r}); save it "
