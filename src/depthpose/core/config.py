@@ -89,12 +89,12 @@ def read_config(path: Path, kind: type[ConfigT]) -> ConfigT:
     return config_from_dict(_over_defaults(content, kind), kind, source=str(path))
 
 
-def _over_defaults(content: Mapping[Any, Any], kind: type) -> dict[str, Any]:
+def _over_defaults(content: Mapping[Any, Any], kind: type) -> dict[Any, Any]:
     """Merge nested differences into the defaults of ``kind``, which may differ from their class's.
 
     A setting given instead of another (``INSTEAD`` in its class) removes that one's default.
     """
-    laid: dict[str, Any] = dict(content)
+    laid = dict(content)
     for field in dataclasses.fields(kind):
         own, default = content.get(field.name), _default_of(field)
         if isinstance(own, Mapping) and dataclasses.is_dataclass(default):

@@ -217,6 +217,8 @@ def _rows_of(text: Iterable[str], noted: list[str]) -> Iterator[str]:
     """Give rows without comments, which go to ``noted`` as far as they stand before the first."""
     is_begun = False
     for line in text:
+        if line.isspace():
+            continue
         row, _, said = plain_numbers(line).partition("#")
         if row.lstrip().startswith("//"):
             row, said = "", row.strip().removeprefix("//")
