@@ -47,9 +47,8 @@ class View:
 
 def mount_of(points: np.ndarray) -> tuple[float, float] | None:
     """Give height [m] and tilt [degrees] by a plane through points of a scan, (n, 3), by RANSAC."""
-    z = points[:, 2]
-    slope = np.abs(points[:, 0]) < 6
-    near = points[(z > GROUND_M[0]) & (z < GROUND_M[1]) & slope & (points[:, 1] > 0.8)]
+    x, y, z = points.T
+    near = points[(z > GROUND_M[0]) & (z < GROUND_M[1]) & (np.abs(x) < 6) & (y > 0.8)]
     if len(near) < 100:
         return None
     rng = np.random.default_rng(0)
@@ -162,7 +161,7 @@ def measured(view: View, net: FakestereoNet) -> list[dict[str, Any]]:
     assert camera is not None
     found = net.estimate_pair(view.image)
     rows: list[dict[str, Any]] = []
-    for given, number in zip(MOUNTS, range(3), strict=True):
+    for number, given in enumerate(MOUNTS):
         keys = ("mount_height_m", "tilt_deg")[:number]
         known = dict(zip(keys, view.mount or (), strict=False))
         asked = replace(view.image, camera=replace(camera, **known))

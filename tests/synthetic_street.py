@@ -5,8 +5,6 @@ is a function of the surface point alone, so both views of the pair see the same
 x right, y down, z forward, metres, origin at the left camera.
 """
 
-import hashlib
-from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
@@ -17,8 +15,7 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from depthpose.core.camera import StereoRig
-from depthpose.core.errors import InputError
-from depthpose.core.files import atomic_write, write_disparity_png, write_image
+from depthpose.core.files import write_disparity_png, write_image
 from depthpose.depth.disparity import disparity_from_depth
 from depthpose.depth.types import StereoInput, StereoSample, StereoTruth
 
@@ -94,19 +91,11 @@ def make_street(scale: float = 1.0) -> StereoSample:
 @cache
 def _drawn(scale: float) -> StereoSample:
     rig = _kitti_like_rig(scale)
-    # Half of KITTI's size takes ten seconds of processor time: kept for later runs of this code.
-    code = hashlib.sha256(Path(__file__).read_bytes()).hexdigest()[:16]
-    kept = Path(__file__).parents[1] / f".pytest_cache/depthpose/street-{code}-{scale:g}.pt"
-    if kept.is_file():
-        left, right, depth_m = torch.load(kept, weights_only=True)
-    else:
-        solids = _street_solids()
-        left, right = (_draw_view(rig, solids, x_m) for x_m in (0.0, rig.baseline_m))
-        depth = _cast(torch.zeros(3), _pixel_rays(rig, 0.0, 0.0), solids).depth
-        depth_m = depth.reshape(rig.height, rig.width)
-        depth_m = torch.where(torch.isfinite(depth_m), depth_m, torch.nan)
-        with suppress(InputError), atomic_write(kept) as part:
-            torch.save([left, right, depth_m], part)
+    solids = _street_solids()
+    left, right = (_draw_view(rig, solids, x_m) for x_m in (0.0, rig.baseline_m))
+    depth = _cast(torch.zeros(3), _pixel_rays(rig, 0.0, 0.0), solids).depth
+    depth_m = depth.reshape(rig.height, rig.width)
+    depth_m = torch.where(torch.isfinite(depth_m), depth_m, torch.nan)
     true_px = disparity_from_depth(depth_m, rig)
     return StereoSample(
         input=StereoInput(name="street", left=left, right=right, camera=rig),
