@@ -237,7 +237,15 @@ def read_published(path: Path, network: str) -> Mapping[str, Tensor]:
 def save_imported(
     out: Path, kind: str, network: nn.Module, source: Path, facts: Mapping[str, str]
 ) -> None:
-    """Write the weights of an imported network, with the checksum of their source."""
+    """Write the weights of an imported network, with the checksum of the file that they are from.
+
+    Args:
+        out: the ``.safetensors`` file to write.
+        kind: of the checkpoint.
+        network: with the weights.
+        source: the published file.
+        facts: what the card says of them: ``trained_on``, ``licence``.
+    """
     origin = {"origin": f"imported from a file with sha256 {file_sha256(source)}"}
     state = network.state_dict()
     save_checkpoint(out, Checkpoint(kind=kind, config={}, state=state, facts={**origin, **facts}))
@@ -267,7 +275,15 @@ def join_terms(*cards: Mapping[str, str]) -> str:
 
 
 def bound_facts(facts: Mapping[str, str], made_of: Iterable[str | Path]) -> dict[str, str]:
-    """Add to a card the terms of the weights that something is made of."""
+    """Add to a card the terms of the weights that something is made of.
+
+    Args:
+        facts: the card, with terms of its own if it has any.
+        made_of: what names weights, as for :func:`find_weights`.
+
+    Raises:
+        InputError: there are no such weights.
+    """
     cards = [read_checkpoint(find_weights(name)).facts for name in made_of]
     terms = join_terms(facts, *cards)
     return {**facts, "terms": terms} if terms else dict(facts)

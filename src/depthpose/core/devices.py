@@ -136,7 +136,12 @@ def computes_bf16(device: str | torch.device) -> bool:
 
 
 def usable_precision(wanted: str, device: str | torch.device) -> str:
-    """Give ``wanted``; ``fp32`` and a :class:`PrecisionNotice` where this machine has no bf16."""
+    """Give ``wanted``; ``fp32`` and a :class:`PrecisionNotice` where this machine has no bf16.
+
+    Args:
+        wanted: fp32, bf16 or fp16.
+        device: where it is computed.
+    """
     if wanted != "bf16" or computes_bf16(device):
         return wanted
     notice = "this processor has no arithmetic for bf16 (AVX-512, AMX); fp32 is taken in its place"

@@ -52,6 +52,18 @@ def lock_folder(record: Path, *, is_shared: bool, timeout_s: float = 10.0) -> bo
 
     A POSIX lock: it ends with the process, however that ends, and workers do not inherit it.
     Where the file system or the machine has none, nothing is held.
+
+    Args:
+        record: a file in the folder that no command replaces.
+        is_shared: let other processes of the same launch in.
+        timeout_s: how long another command may take to end.
+
+    Returns:
+        Whether the folder is this process's alone from now on.
+
+    Raises:
+        InputError: another command holds the folder, and goes on holding it; or nothing can be
+            written there.
     """
     if fcntl is None:
         return False
@@ -105,7 +117,11 @@ def held_folders() -> frozenset[Path]:
 
 
 def release_folders(but: Collection[Path] = ()) -> None:
-    """Let other commands into the folders that this process has claimed."""
+    """Let other commands into the folders that this process has claimed.
+
+    Args:
+        but: records of folders that it goes on holding.
+    """
     for record in [record for record in _locks if record not in but]:
         os.close(_locks.pop(record))
 
@@ -361,13 +377,26 @@ def _source(entry: object) -> tuple[str, str]:
 
 
 def refuse_to_replace(path: Path) -> None:
-    """Refuse to write one file over another that is there already."""
+    """Refuse to write one file over another that is there already.
+
+    Raises:
+        InputError: there is one.
+    """
     if os.path.lexists(path):
         raise InputError(f"{path}: is there already; delete it, or give another name")
 
 
 def refuse_among_inputs(out: Path, words: Iterable[str | Path], files: Iterable[Path]) -> None:
-    """Refuse results in a folder whose files are inputs: the next run would take them for such."""
+    """Refuse results in a folder whose files are inputs: the next run would take them for such.
+
+    Args:
+        out: where the results go.
+        words: as given: files, folders or patterns.
+        files: that they name.
+
+    Raises:
+        InputError: ``out`` holds such files, and they were not named one by one.
+    """
     named = {Path(word) for word in words}
     if any(path not in named and path.parent.resolve() == out.resolve() for path in files):
         raise InputError(
@@ -402,7 +431,11 @@ def refuse_other_settings(
     settings: Mapping[str, Any],
     remedy: str = "choose another, or delete this one",
 ) -> None:
-    """Refuse a folder whose record has other settings."""
+    """Refuse a folder whose record has other settings.
+
+    Raises:
+        InputError: the first difference is named.
+    """
     earlier = record.get("settings") if isinstance(record, dict) else None
     if not isinstance(earlier, dict):
         raise InputError(f"{folder}/{RECORD}: not a record of a run. Choose another folder.")

@@ -74,7 +74,11 @@ class JoinedRow(Row):
 
 
 def find_table(number: str) -> PublishedTable:
-    """Give a table by its number in the thesis."""
+    """Give a table by its number in the thesis.
+
+    Raises:
+        InputError: there is none of that number.
+    """
     if number not in TABLES:
         raise InputError(f"table {number!r}: {nearest_name(number, TABLES)}")
     return TABLES[number]
@@ -83,7 +87,13 @@ def find_table(number: str) -> PublishedTable:
 def join_published(
     table: PublishedTable, ours: Sequence[tuple[str, EvaluationRow]]
 ) -> list[JoinedRow]:
-    """Set our rows beside the printed ones, cap by cap: published, ours, difference."""
+    """Set our rows beside the printed ones, cap by cap: published, ours, difference.
+
+    Args:
+        table: the printed table.
+        ours: for each of our rows the name of the thesis's own method that it stands for (one of
+            ``table.own``, or empty where it stands for none, as a baseline), and the row.
+    """
     rows = [
         JoinedRow(
             source="published",
@@ -218,7 +228,17 @@ def draw_figure_2_1(
     mono: DepthEstimate,
     stereo: DepthEstimate,
 ) -> list[Drawing]:
-    """Make the six panels of figure 2-1, in its order."""
+    """Make the six panels of figure 2-1, in its order.
+
+    Args:
+        pair: the frame, with its real right view.
+        lidar_m: one scan drawn into the left image, NaN where no point falls.
+        mono: the estimate from the left view alone, with the right view that it synthesised.
+        stereo: the estimate from the real pair, by the same matcher.
+
+    Raises:
+        InputError: the frame has no right view, or the estimate no synthesised one.
+    """
     if pair.right is None or mono.right is None:
         lacking = "the frame has no right view" if pair.right is None else "no view was synthesised"
         raise InputError(f"{pair.name}: figure 2-1 compares two right views, but {lacking}.")
@@ -233,7 +253,11 @@ def draw_figure_2_1(
 
 
 def arrange(columns: Sequence[Sequence[Drawing]], width_px: int = 621) -> Float[Tensor, "3 h w"]:
-    """Lay panels out on white in columns ``width_px`` wide, over the depth scale."""
+    """Lay panels out on white in columns ``width_px`` wide, over the depth scale.
+
+    Raises:
+        InputError: there is no panel.
+    """
     if not any(columns):
         raise InputError("a figure of no panel cannot be arranged; give a frame at least.")
     shrunk = [[shrink_to_width(panel.image, width_px) for panel in column] for column in columns]

@@ -40,7 +40,11 @@ def spectral(share: Float[Tensor, " n"]) -> Float[Tensor, "n 3"]:
 def arrange_grid(
     pictures: Sequence[Float[Tensor, "3 _ _"]], columns: int
 ) -> Float[Tensor, "3 h w"]:
-    """Lay pictures out in rows on white, each in a cell as large as the largest."""
+    """Lay pictures out in rows on white, each in a cell as large as the largest.
+
+    Raises:
+        InputError: there is no picture.
+    """
     if not pictures:
         raise InputError("a figure of no picture cannot be arranged; give one at least.")
     height = max(picture.shape[1] for picture in pictures)
@@ -214,6 +218,13 @@ def embed_line(features: Float[Tensor, "n c"], perplexity: float = 40.0) -> Floa
 
     Begins along the principal component, and so always gives the same answer; gradient descent
     with momentum and gains. Time and memory grow with the square of ``n``: thousands, not more.
+
+    Args:
+        features: of any scale.
+        perplexity: how many neighbours a point has, about.
+
+    Raises:
+        InputError: there are fewer points than three neighbourhoods.
     """
     if not 1 <= perplexity < math.inf:
         raise InputError(f"t-SNE with a perplexity of {perplexity:g}: take 5 to 50, at least 1")

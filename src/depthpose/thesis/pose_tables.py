@@ -156,6 +156,9 @@ def linemod_number(model: ObjectModel) -> int:
     """Give BOP's number of the object of LineMOD that a model is, by its name and diameter.
 
     A model without a name is known by its number and diameter.
+
+    Raises:
+        InputError: it is none of them.
     """
     is_named = model.name != f"obj_{model.number:06d}"
     number = _NUMBERS.get(model.name.lower(), 0) if is_named else model.number
@@ -309,6 +312,9 @@ def cases_of(
 
     The points are chosen at random, the same each time. Each votes from its own place; points of
     one voxel share the network's direction. The net's objects have the names in the views.
+
+    Raises:
+        InputError: the weights are of another kind.
     """
     network = net.weights.network
     if not isinstance(network, ResUNet):

@@ -400,7 +400,11 @@ def write_camera(path: AnyPath, camera: Camera) -> None:
 
 
 def check_image_matches_camera(camera: Camera, width: int, height: int, name: str) -> None:
-    """Refuse an image whose size is not the camera's."""
+    """Refuse an image whose size is not the camera's.
+
+    Raises:
+        InputError: the sizes differ; where the aspect agrees, resizing is offered.
+    """
     if (width, height) == (camera.width, camera.height):
         return
     # Scaled sizes are rounded to whole pixels, so the aspect agrees to within one.
