@@ -18,7 +18,7 @@ from depthpose.pose.datasets import open_bop
 from depthpose.pose.mesh import make_model, sample_surface
 from depthpose.pose.mesh.models import turn_about
 from depthpose.pose.metrics import add_m
-from depthpose.pose.refine import refine_best, refine_pose
+from depthpose.pose.refine import _covariance, refine_best, refine_pose
 from depthpose.pose.surface import Surface, prepare_surface
 from depthpose.pose.types import ObjectModel, Symmetries
 
@@ -349,3 +349,17 @@ def test_nothing_and_no_numbers_are_refused() -> None:
         for refine in (refine_pose, refine_best):
             with pytest.raises(InputError, match=said):
                 refine(cloud, start, surface)
+
+
+def test_a_covariance_of_few_points_is_finite_and_symmetric() -> None:
+    """Four points fix six directions to rounding alone, which a factorisation refused."""
+    torch.manual_seed(11)
+    cloud_m = 0.05 * torch.randn(4, 3).double() + torch.tensor([0.0, 0.0, 0.7])
+    J = torch.randn(2, 4, 6).double() * torch.tensor([0.1, 0.1, 0.1, 1.0, 1.0, 1.0])
+    weight, residual_m = torch.rand(2, 4).double(), 0.001 * torch.randn(2, 4).double()
+    H = (weight[..., None] * J).mT @ J
+    size = H.diagonal(dim1=-2, dim2=-1).amax(-1)[..., None, None]
+    H = H + 1e-9 * size * torch.eye(6).double()
+    found = _covariance(cloud_m, H, J, weight, residual_m, 0.01, 0.2)
+    assert found.isfinite().all()
+    assert torch.allclose(found, found.mT, rtol=1e-6, atol=0)

@@ -382,15 +382,18 @@ def _covariance(
     bent = torch.linalg.solve_triangular(half, J.mT * slope[..., None, :] @ J, upper=False)
     bent = torch.linalg.solve_triangular(half, bent.mT, upper=False)
     values, ways = torch.linalg.eigh(bent)
-    A = half @ (ways * values.clamp(min=_LEAST_SLOPE)[..., None, :]) @ ways.mT @ half.mT
-    inverse = torch.linalg.inv(A)
     variance = (weight * residual_m.square()).sum(-1) / (weight.sum(-1) - 6).clamp(min=1)
-    own = torch.linalg.cholesky(variance.clamp(min=1e-20)[..., None, None] * inverse)
+    # Of s^2 / A a root, and the root's inverse: A itself may be singular to rounding.
+    spread_m = variance.clamp(min=1e-20).sqrt()[..., None, None]
+    size = values.clamp(min=_LEAST_SLOPE).sqrt()[..., None, :]
+    own = spread_m * torch.linalg.solve_triangular(half.mT, ways / size, upper=True)
+    from_own = (half @ ways * size).mT / spread_m
+    inverse = own @ own.mT / spread_m.square()
     pulls = (weight * residual_m)[..., None] * J
     shares = (slope[..., None] * J)[..., None] * J[..., None, :]
     flat_m = cloud[:, :2] / cloud[:, 2:] * cloud[:, 2].mean()
     eye = torch.eye(6, dtype=torch.float64)
-    most, ways = torch.ones_like(values), eye.expand_as(A)
+    most, ways = torch.ones_like(values), eye.expand_as(own)
     for side in _BLOCKS:
         cells = (flat_m / (side * diameter_m)).floor() @ torch.tensor([1.0, 1e6]).double()
         _, block = cells.unique(return_inverse=True)
@@ -399,7 +402,7 @@ def _covariance(
         held = shares.new_zeros(*shares.shape[:-3], count, 6, 6).index_add_(-3, block, shares)
         rest = eye * (1 + _REST) - held @ inverse[..., None, :, :]
         moves = torch.linalg.solve(rest, pull[..., None]).squeeze(-1) @ inverse
-        moves = torch.linalg.solve_triangular(own, moves.mT, upper=False)
+        moves = from_own @ moves.mT
         values, found = torch.linalg.eigh(moves @ moves.mT)
         is_more = values.sum(-1, keepdim=True) > most.sum(-1, keepdim=True)
         most = torch.where(is_more, values, most)
