@@ -242,6 +242,28 @@ def test_objects_of_a_frame_stand_on_one_table_and_not_in_each_other() -> None:
                 assert float(torch.cdist(cloud, other).min()) > 1e-4
 
 
+def test_copies_of_a_pile_touch_and_do_not_cut_into_each_other() -> None:
+    ball = trimesh.creation.icosphere(3, 0.03)
+    model = make_model(torch.tensor(ball.vertices) + 0.1, torch.tensor(ball.faces), name="ball")
+    model = dataclasses.replace(model, number=7)
+    settings = dataclasses.replace(_FRAME, frame_pile=8)
+    for frame in make_frames([model], settings, 2):
+        assert len(frame.objects) == 8
+        assert {shown.number for shown in frame.objects} == {7}
+        middle_m = torch.stack(
+            [shown.camera_from_model.apply(torch.full((1, 3), 0.1))[0] for shown in frame.objects]
+        )
+        apart_m = torch.cdist(middle_m, middle_m) + torch.eye(8)
+        assert float(apart_m.min()) > 0.05  # cells of 4 mm: they may overlap by a little
+        assert sum(bool((row < 0.07).any()) for row in apart_m) >= 4
+        assert any(bool((shown.silhouette & ~shown.visible).any()) for shown in frame.objects)
+
+
+def test_a_pile_of_hundreds_is_refused() -> None:
+    with pytest.raises(InputError, match=r"frame_pile must be in"):
+        dataclasses.replace(_FRAME, frame_pile=201)
+
+
 def test_frames_are_numbered_and_repeatable() -> None:
     models = [_numbered(1)]
     frames = list(make_frames(models, _FRAME, 3))

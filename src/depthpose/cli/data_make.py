@@ -72,6 +72,8 @@ class ObjectsOptions:
         "structured light"
     )
     """kind of depth sensor whose errors are simulated."""
+    pile: int = 0
+    """each frame shows so many copies of one part, dropped onto each other."""
     symmetries: Literal["none", "found"] = "none"
     """found: declare the symmetries that are found from a part's shape; none: only print them."""
 
@@ -92,7 +94,11 @@ class ObjectsOptions:
             raise InputError(f"--split {self.split}: a name of letters and digits, not 'models'")
         sensor = SensorConfig(kinds=(self.sensor,))
         return ObjectsConfig(
-            seed=self.seed, distance_m=self.distance, sensor=sensor, number=self.number
+            seed=self.seed,
+            distance_m=self.distance,
+            sensor=sensor,
+            number=self.number,
+            frame_pile=self.pile,
         )
 
 

@@ -410,6 +410,10 @@ class ObjectsConfig:
     frame_clutter: tuple[int, int] = (0, 4)
     """Boxes, balls and cans of no model among them."""
 
+    frame_pile: int = 0
+    """A frame shows so many copies of one model, dropped onto each other, in place of
+    ``frame_objects`` and ``frame_clutter``; 0: no pile."""
+
     def __post_init__(self) -> None:
         """Refuse counts of nothing, shares beyond one and empty ranges."""
         check_settings(
@@ -426,6 +430,7 @@ class ObjectsConfig:
             mask_shift_px="[0, 20]",
             frame_objects="[1, inf)",
             frame_clutter="[0, inf)",
+            frame_pile="[0, 200]",
         )
         refuse_seed(self.seed)
         refuse_reversed(

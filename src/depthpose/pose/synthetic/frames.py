@@ -17,6 +17,7 @@ from depthpose.core.rigid import Rigid
 from depthpose.pose.augment import measure, random_rotation, uniform, whole
 from depthpose.pose.config import ObjectsConfig
 from depthpose.pose.datasets import BopFrame, BopObject
+from depthpose.pose.mesh import sample_surface
 from depthpose.pose.synthetic.views import surfel_triangles
 from depthpose.pose.types import ObjectModel
 
@@ -224,8 +225,8 @@ def make_frames(
 ) -> Iterator[BopFrame]:
     """Make frames of several objects on a table, as BOP lays them out.
 
-    Frame i is a function of the seed and i alone. A frame shows each object once at most; poses
-    and depths are exact, sensor errors lie over the depth alone.
+    Frame i is a function of the seed and i alone. A frame shows each object once at most, or a pile
+    of one of them (``frame_pile``); poses are exact, sensor errors lie over the depth alone.
 
     Args:
         models: the objects; their numbers become ``obj_id``.
@@ -250,12 +251,17 @@ def make_frames(
         )
     solids = [solid_of(model) for model in models]
     for index in range(first, first + number):
-        yield _make_frame(solids, config, index)
+        yield _make_frame(models, solids, config, index)
 
 
-def _make_frame(solids: Sequence[Solid], config: ObjectsConfig, index: int) -> BopFrame:
+def _make_frame(
+    models: Sequence[ObjectModel], solids: Sequence[Solid], config: ObjectsConfig, index: int
+) -> BopFrame:
     generator = sample_generator(index, config.seed + _FRAMES_SEED)
-    world = _arranged(solids, config, generator)
+    if config.frame_pile:
+        world = _piled(models, solids, config, generator)
+    else:
+        world = _arranged(solids, config, generator)
     camera_from_world = _viewpoint(config, generator)
     placed = [
         Placed(solid=solid, camera_from_model=camera_from_world @ pose) for solid, pose in world
@@ -326,6 +332,50 @@ def _free_place(
                                   -float(corners[:, 2].min())])  # fmt: skip
             return Rigid(R, shift), (x, y, radius_m)
     return None, (0.0, 0.0, 0.0)
+
+
+_CELL_M = 0.004
+_DROPS = 10
+
+
+def _piled(
+    models: Sequence[ObjectModel],
+    solids: Sequence[Solid],
+    config: ObjectsConfig,
+    generator: torch.Generator,
+) -> list[tuple[Solid, Rigid]]:
+    """Drop copies of one thing straight down until they touch, in the table's frame (z up).
+
+    Of several random rotations and places the one whose middle comes to lie lowest is taken.
+    Nothing slides or tips over afterwards.
+    """
+    which = whole(generator, len(solids))
+    points = sample_surface(models[which], 20000)[0]
+    middle = (points.amin(0) + points.amax(0)) / 2
+    points = points - middle
+    radius_m = float(points.norm(dim=1).max())
+    reach_m = 0.6 * radius_m * math.sqrt(config.frame_pile)
+    cells = math.ceil((reach_m + radius_m) / _CELL_M)
+    height_m = torch.zeros((2 * cells + 1) ** 2)
+    placed: list[tuple[Solid, Rigid]] = []
+    for _ in range(config.frame_pile):
+        drops: list[tuple[float, Rigid, Tensor, Tensor]] = []
+        for _ in range(_DROPS):
+            R = random_rotation(generator).float()
+            x, y = (uniform(generator, -reach_m, reach_m) for _ in range(2))
+            turned = points @ R.mT + torch.tensor([x, y, 0.0])
+            column, row = ((turned[:, :2] / _CELL_M).round().long() + cells).unbind(1)
+            cell = row * (2 * cells + 1) + column
+            bottom = torch.full_like(height_m, math.inf)
+            bottom = bottom.scatter_reduce(0, cell, turned[:, 2], "amin")
+            z = float((height_m - bottom)[bottom.isfinite()].max())
+            t = torch.tensor([x, y, z]) - R @ middle
+            drops.append((z, Rigid(R, t), cell, turned[:, 2] + z))
+        _, pose, cell, top = min(drops, key=lambda drop: drop[0])
+        height_m = height_m.scatter_reduce(0, cell, top, "amax")
+        placed.append((solids[which], pose))
+    floor = Rigid(torch.eye(3), torch.zeros(3))
+    return [*placed, (table_of(uniform(generator, 0.8, 3.0), generator), floor)]
 
 
 def _viewpoint(config: ObjectsConfig, generator: torch.Generator) -> Rigid:
