@@ -13,8 +13,7 @@ from depthpose.core.errors import InputError
 Image = Float[Tensor, "3 h w"]
 """RGB in [0, 1], float32: red first. OpenCV's images are BGR, blue first."""
 
-_LUMA = (0.299, 0.587, 0.114)
-"""Shares of red, green and blue in the brightness, ITU-R BT.601."""
+_LUMA = (0.299, 0.587, 0.114)  # shares of red, green and blue in the brightness, ITU-R BT.601
 
 
 def take_evenly(rows: Shaped[Tensor, "n ..."], count: int) -> Shaped[Tensor, "m ..."]:

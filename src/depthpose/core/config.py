@@ -14,10 +14,8 @@ import yaml
 from depthpose.core.errors import InputError, nearest_name, refuse_unknown
 
 ConfigT = TypeVar("ConfigT")
-_LONGEST = 500
-"""Letters of a value that an error shows."""
-_MAX_BYTES = 2**17
-"""Largest config file: a hundred times the largest of ours."""
+_LONGEST = 500  # letters of a value that an error shows
+_MAX_BYTES = 2**17  # largest config file: a hundred times the largest of ours
 
 
 def check_settings(config: Any, **ranges: str) -> None:  # noqa: ANN401  any dataclass

@@ -16,8 +16,7 @@ _NEAR_TO_FAR = (
     (0.57, 0.16, 0.47), (0.33, 0.12, 0.45), (0.14, 0.08, 0.30), (0.02, 0.02, 0.10),
 )  # fmt: skip
 _INVALID = (0.5, 0.5, 0.5)
-_DIMMED = 0.35
-"""Brightness of a picture under points."""
+_DIMMED = 0.35  # brightness of a picture under points
 _LEAST_GAP = 0.08
 """Least distance of two marks on a bar, as a share of its length: nearer ones would touch."""
 

@@ -131,8 +131,7 @@ def _explained(name: str) -> Iterator[None]:
 SHIPPED = Path(__file__).parents[1] / "weights"
 """Folder of the weights that come with the package."""
 
-_IN_REPOSITORY = ("kitti-nc", "linemod-nc", "bunny-nc", "ycb")
-"""Weights that stay out of the wheel."""
+_IN_REPOSITORY = ("kitti-nc", "linemod-nc", "bunny-nc", "ycb")  # weights that stay out of the wheel
 
 
 def find_weights(name: str | Path) -> Path:

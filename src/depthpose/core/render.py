@@ -20,8 +20,7 @@ from depthpose.core.errors import InputError
 
 _EMPTY = (1 << 63) - 1
 _MAX_ROWS = 1 << 20
-_MAX_PIXELS = 1 << 18
-"""How much is expanded at a time: some 200 MB at most, whatever the scene."""
+_MAX_PIXELS = 1 << 18  # how much is expanded at a time: some 200 MB at most, whatever the scene
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

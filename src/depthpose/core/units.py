@@ -7,8 +7,7 @@ from depthpose.core.errors import refuse_unknown
 Unit = Literal["m", "cm", "mm"]
 """Unit of the lengths in a model, a cloud, a depth image or a calibration."""
 
-METRES: dict[str, float] = {"m": 1.0, "cm": 0.01, "mm": 0.001}
-"""Metres a unit."""
+METRES: dict[str, float] = {"m": 1.0, "cm": 0.01, "mm": 0.001}  # metres a unit
 
 
 def metres_of(unit: str) -> float:

@@ -5,8 +5,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from depthpose.core.engine import Done, Files, Function, Sample, read_results, shard_results
-from depthpose.core.engine.plan import Block
-from depthpose.core.engine.work import Runner, ShardFormat, Work
+from depthpose.core.engine.work import Block, Runner, ShardFormat, Work
 from depthpose.core.errors import InputError
 from depthpose.core.files import read_text
 

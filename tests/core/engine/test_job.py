@@ -18,8 +18,7 @@ from depthpose.core.engine import (
     result_items,
     run_job,
 )
-from depthpose.core.engine.plan import Block
-from depthpose.core.engine.work import ShardFormat, Work, read_shard
+from depthpose.core.engine.work import Block, ShardFormat, Work, read_shard
 from depthpose.core.errors import InputError
 
 

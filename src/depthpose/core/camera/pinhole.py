@@ -16,12 +16,9 @@ from torch import Tensor
 
 from depthpose.core.errors import InputError
 
-MAX_SIDE_PX = 2**20
-"""Largest image side: a larger number in a file is a mistake, and is refused."""
-MAX_BASELINE_M = 100
-"""No rig on the ground is this wide: such a number was in millimetres."""
-MIN_BASELINE_M = 1e-4
-"""No two lenses stand so near: such a number was divided once too often."""
+MAX_SIDE_PX = 2**20  # largest image side: a larger number in a file is a mistake, and is refused
+MAX_BASELINE_M = 100  # no rig on the ground is this wide: such a number was in millimetres
+MIN_BASELINE_M = 1e-4  # no two lenses stand so near: such a number was divided once too often
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -230,8 +227,7 @@ def resize_camera(camera: AnyCamera, width: int, height: int) -> AnyCamera:
     return resized
 
 
-Size = tuple[int, int]
-"""Width and height [px]."""
+Size = tuple[int, int]  # width and height [px]
 
 KNOWN_FILES = (
     "our JSON (width, height, K), BOP's camera.json, KITTI's calibration (P2 or P_rect_02), "
@@ -245,8 +241,7 @@ OPTIONAL_KEYS = ("depth_unit_m", "mount_height_m", "tilt_deg")
 """What any camera may have beside its matrix."""
 
 _NORMALISED_FX = 2
-_MM_FX_SHARE = 0.1
-"""A focal length below a tenth of the width sees 157 degrees: no pinhole does."""
+_MM_FX_SHARE = 0.1  # a focal length below a tenth of the width sees 157 degrees: no pinhole does
 _MAX_FX_SHARE = 200
 _LEAST_UNIT_M = 1e-6
 """Smallest unit of depth images: with a smaller one, 16 bits would end before 7 cm."""
@@ -255,8 +250,7 @@ _FILE_BASELINE_M = 5.0
 WIDE_BASELINE_M = 2.0
 """Wider than cars' rigs; centimetres, or squares of a board, in a file that names no unit."""
 _LEAST_FILE_BASELINE_M = 1e-3
-_MAX_CM = 30
-"""A longer baseline, less the unit, is in millimetres."""
+_MAX_CM = 30  # a longer baseline, less the unit, is in millimetres
 _SAME_FOCAL = 1e-3
 _SAME_ROW_PX = 0.5
 SAME_DIFFERENCE_PX = 1.0

@@ -56,8 +56,7 @@ _MODELS = {
 """Models of distortion by name: whether it is that of a fisheye lens."""
 _COUNTS = {False: (4, 5, 8, 12, 14), True: (4,)}
 _MAX_BASELINE_M = 10.0
-_MAX_FOCAL_RATIO = 1.5
-"""Of the two cameras of a pair; more are of images of two sizes."""
+_MAX_FOCAL_RATIO = 1.5  # of the two cameras of a pair; more are of images of two sizes
 _KNOWN = (
     "a camchain of Kalibr, OpenCV's K1, D1, K2, D2, R and T (in one file, or intrinsics.yml and "
     "extrinsics.yml in a folder), or a folder with left.yaml and right.yaml of ROS"

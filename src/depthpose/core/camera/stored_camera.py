@@ -28,8 +28,7 @@ Names = dict[str, Any]
 
 _YAML_HEAD = re.compile(r"\A\s*%YAML[^\n]*\n")
 _DECLARATION = re.compile(r"<!(?!--)")
-_MAX_TEXT = 2**18
-"""Longest YAML or XML that is parsed: ten times the largest camera file."""
+_MAX_TEXT = 2**18  # longest YAML or XML that is parsed: ten times the largest camera file
 
 
 def read_storage(path: AnyPath, text: str) -> Names | None:

@@ -13,29 +13,27 @@ import os
 import secrets
 import socket
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from importlib import import_module
 from typing import Any
 
 import numpy as np
 
-from depthpose.core.engine.plan import PLAN, Block, Item, make_plan
-from depthpose.core.engine.work import SHARDS, Done, Runner, ShardFormat, Work, read_shard
-from depthpose.core.errors import InputError, MissingExtraError, import_extra
-from depthpose.core.files import remove_parts
-from depthpose.core.files.store import (
-    absolute,
-    exists,
-    join,
-    list_sizes,
-    local_path,
-    publish_bytes,
-    read_all,
-    read_from,
-    refuse_unsafe,
-    remove,
+from depthpose.core.engine.work import (
+    PLAN,
+    SHARDS,
+    Block,
+    Done,
+    Item,
+    Runner,
+    ShardFormat,
+    Work,
+    make_plan,
+    read_shard,
 )
+from depthpose.core.errors import InputError, MissingExtraError, import_extra
+from depthpose.core.files import remove_parts, store
 from depthpose.core.results import is_unchanged
 from depthpose.core.run import RECORD, not_ours, refuse_other_settings, run_record
 
@@ -78,8 +76,8 @@ def run_job(job: Job, engine: Engine) -> list[Done]:
         InputError: the folder holds results of other settings or inputs, or refuses; or two
             samples of tar shards have one name.
     """
-    out = absolute(job.out)
-    refuse_unsafe(out)
+    out = store.absolute(job.out)
+    store.refuse_unsafe(out)
     claim(out, {**job.settings, "shards": job.form})
     blocks = make_plan(out, job.items, job.tars, job.block)
     done = _whole(out, blocks)
@@ -92,32 +90,46 @@ def run_job(job: Job, engine: Engine) -> list[Done]:
             f"{out}: {len(lost)} of {len(blocks)} shards are missing, first {lost[0]}; start "
             "again: what is finished is kept"
         )
-    if (folder := local_path(join(out, SHARDS))) is not None:
+    if (folder := store.local_path(store.join(out, SHARDS))) is not None:
         remove_parts(folder)  # of killed workers: all have ended
+    text = io.StringIO()
+    table = csv.writer(text, lineterminator="\n")
+    table.writerow(["name", "shard", "reason"])
     every = [done[block.shard] for block in blocks]
-    _write_manifest(out, every)
+    seen: dict[str, str] = {}
+    for one in every:
+        for name, reason in one.entries:
+            if name in seen:
+                raise InputError(
+                    f"{out}: {seen[name]} and {one.shard} hold two results called {name!r}; give "
+                    "the samples of tar shards names of their own"
+                )
+            seen[name] = one.shard
+            table.writerow([name, one.shard, reason])
+    manifest = text.getvalue().encode(errors="surrogateescape")
+    store.publish_bytes(manifest, store.join(out, MANIFEST))
     return every
 
 
 def claim(out: str, settings: Mapping[str, Any]) -> None:
     """Claim a folder, local or in a store, for a run with these settings, or continue it."""
-    record = join(out, RECORD)
-    if exists(record):
+    record = store.join(out, RECORD)
+    if store.exists(record):
         try:
-            earlier = json.loads(read_from(record))
+            earlier = json.loads(store.read_from(record))
         except ValueError as error:
             raise InputError(f"{record}: no JSON ({error}); choose another folder") from error
         refuse_other_settings(out, earlier, settings)
         return
     for name in (MANIFEST, PLAN, SHARDS):
-        if exists(join(out, name)):
-            raise not_ours(join(out, name))
-    publish_bytes(f"{json.dumps(run_record(settings), indent=2)}\n".encode(), record)
+        if store.exists(store.join(out, name)):
+            raise not_ours(store.join(out, name))
+    store.publish_bytes(f"{json.dumps(run_record(settings), indent=2)}\n".encode(), record)
 
 
 def is_job(out: str) -> bool:
     """Whether a folder holds shards of a job."""
-    return exists(join(absolute(out), PLAN))
+    return store.exists(store.join(store.absolute(out), PLAN))
 
 
 def read_job_settings(out: str) -> dict[str, Any]:
@@ -126,9 +138,9 @@ def read_job_settings(out: str) -> dict[str, Any]:
     Raises:
         InputError: there are none.
     """
-    record = join(absolute(out), RECORD)
+    record = store.join(store.absolute(out), RECORD)
     try:
-        return dict(json.loads(read_from(record))["settings"])
+        return dict(json.loads(store.read_from(record))["settings"])
     except (ValueError, KeyError, TypeError) as error:
         raise InputError(f"{record}: not a record of a run. Choose another folder.") from error
 
@@ -138,20 +150,20 @@ def result_items(out: str) -> list[Item]:
 
     The name changes with the record, so that a shard that was made anew is a new input.
     """
-    folder = join(absolute(out), SHARDS)
+    folder = store.join(store.absolute(out), SHARDS)
     items = []
     for done in read_results(out):
         # A copy changes the time of a shard, and nothing else.
         untimed = replace(done, stamp=(done.stamp[0], done.stamp[2])).to_json()
         mark = hashlib.sha256(untimed.encode()).hexdigest()[:12]
-        files = (join(folder, f"{done.name}.json"), join(folder, done.shard))
+        files = (store.join(folder, f"{done.name}.json"), store.join(folder, done.shard))
         items.append(Item(f"{done.name}-{mark}", files))
     return items
 
 
 def read_results(out: str) -> list[Done]:
     """Say what an earlier job left, shard by shard; nothing where there was none."""
-    return [one for _, one in sorted(_finished(absolute(out)).items())]
+    return [one for _, one in sorted(_finished(store.absolute(out)).items())]
 
 
 def shard_results(out: str, done: Done) -> Iterator[tuple[str, dict[str, bytes]]]:
@@ -161,13 +173,13 @@ def shard_results(out: str, done: Done) -> Iterator[tuple[str, dict[str, bytes]]
         InputError: the shard is not there, or is damaged.
     """
     names = {name for name, reason in done.entries if not reason}
-    return read_shard(join(absolute(out), SHARDS, done.shard), names, done.endings)
+    return read_shard(store.join(store.absolute(out), SHARDS, done.shard), names, done.endings)
 
 
 def _finished(out: str) -> dict[str, Done]:
     """Read the records of shards; one that is damaged is as none."""
     records: dict[str, Done] = {}
-    for name, text in read_all(join(out, SHARDS), ".json").items():
+    for name, text in store.read_all(store.join(out, SHARDS), ".json").items():
         with suppress(ValueError, KeyError, TypeError):
             records[name.removesuffix(".json")] = Done.from_json(text)
     return records
@@ -175,51 +187,30 @@ def _finished(out: str) -> dict[str, Done]:
 
 def _whole(out: str, blocks: Sequence[Block]) -> dict[str, Done]:
     """Give what is done without failures, its shard as it was written; other records go."""
-    folder = join(out, SHARDS)
-    sizes, records = list_sizes(folder), _finished(out)
+    folder = store.join(out, SHARDS)
+    sizes, records = store.list_sizes(folder), _finished(out)
     done: dict[str, Done] = {}
     for block in blocks:
-        one = records.get(block.shard)
-        is_ours = one is not None and one.block == block.checksum
-        if one is None or not is_ours or not _is_unchanged(folder, one, sizes):
-            if f"{block.shard}.json" in sizes:
-                remove(join(folder, f"{block.shard}.json"))
-        elif not one.failures:
-            done[block.shard] = one
+        one, record = records.get(block.shard), store.join(folder, f"{block.shard}.json")
+        path = None if one is None else store.local_path(store.join(folder, one.shard))
+        if one is None or one.block != block.checksum:
+            is_whole = False
+        elif path is None:  # of a store sizes alone are compared
+            is_whole = sizes.get(one.shard) == one.stamp[0]
+        else:
+            is_whole = is_unchanged(path, one.stamp)
+            if is_whole and (time_ns := path.stat().st_mtime_ns) != one.stamp[1]:  # a copy
+                one = replace(one, stamp=(one.stamp[0], time_ns, one.stamp[2]))
+                store.publish_bytes(one.to_json().encode(), record)
+        if one is not None and is_whole:
+            if not one.failures:
+                done[block.shard] = one
+        elif f"{block.shard}.json" in sizes:
+            store.remove(record)
     return done
 
 
-def _is_unchanged(folder: str, done: Done, sizes: Mapping[str, int]) -> bool:
-    path = local_path(join(folder, done.shard))
-    if path is None:  # of a store sizes alone are compared
-        return sizes.get(done.shard) == done.stamp[0]
-    is_unchanged_file = is_unchanged(path, done.stamp)
-    if is_unchanged_file and (time_ns := path.stat().st_mtime_ns) != done.stamp[1]:  # a copy
-        stamp = (done.stamp[0], time_ns, done.stamp[2])
-        record = join(folder, f"{done.name}.json")
-        publish_bytes(replace(done, stamp=stamp).to_json().encode(), record)
-    return is_unchanged_file
-
-
-def _write_manifest(out: str, every: Sequence[Done]) -> None:
-    text = io.StringIO()
-    table = csv.writer(text, lineterminator="\n")
-    table.writerow(["name", "shard", "reason"])
-    seen: dict[str, str] = {}
-    for done in every:
-        for name, reason in done.entries:
-            if name in seen:
-                raise InputError(
-                    f"{out}: {seen[name]} and {done.shard} hold two results called {name!r}; give "
-                    "the samples of tar shards names of their own"
-                )
-            seen[name] = done.shard
-            table.writerow([name, done.shard, reason])
-    publish_bytes(text.getvalue().encode(errors="surrogateescape"), join(out, MANIFEST))
-
-
-_LEAST_VERSION = (2, 52)
-"""The first version of Ray that has passwords."""
+_LEAST_VERSION = (2, 52)  # the first version of Ray that has passwords
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -249,10 +240,19 @@ class RayEngine:
             MissingExtraError: Ray is not installed.
         """
         if self.address is None:
-            _keep_to_this_machine()
+            # A cluster that is started here listens to this machine alone, and asks for a password:
+            # whoever reaches a port of Ray may run any code. Ray reads these as it is imported.
+            # Without clusters of several machines, which is what its name is about, a node is
+            # 127.0.0.1.
+            os.environ.setdefault("RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER", "0")
+            os.environ.setdefault("RAY_AUTH_MODE", "token")
+            if "RAY_AUTH_TOKEN_PATH" not in os.environ:
+                os.environ.setdefault("RAY_AUTH_TOKEN", secrets.token_hex(32))
         ray = _import_ray()
-        cores = None if self.workers is None else max(1.0, self.workers * self.worker_cpus)
-        with _connected(ray, self.address, cores):
+        is_ours = not ray.is_initialized()
+        if is_ours:
+            self._connect(ray)
+        try:
             # In a list the work stays a reference, which a worker that starts again reads again.
             shipped = [ray.put(work)]
             lines = [{"block": block.to_json()} for block in blocks]
@@ -276,9 +276,34 @@ class RayEngine:
                 for row in rows:
                     yield Done.from_json(row["done"])
             except ray.exceptions.RayError as error:
-                raise _cause(error) from error
+                inner: BaseException | None = error  # one of ours may be behind Ray's own
+                while inner is not None and not isinstance(inner, InputError):
+                    inner = getattr(inner, "cause", None) or inner.__cause__
+                if inner is None:
+                    raise
+                raise InputError(str(getattr(inner, "cause", inner))) from error
+        finally:
+            if is_ours:
+                ray.shutdown()
 
-    def _capacity(self, ray: Any) -> int:  # noqa: ANN401  Ray is loaded where it is used
+    def _connect(self, ray: Any) -> None:  # noqa: ANN401  Ray is loaded where it is used
+        here: dict[str, Any] = {}
+        if self.address is None:
+            cores = None if self.workers is None else max(1.0, self.workers * self.worker_cpus)
+            here = {"num_cpus": cores, "include_dashboard": False}
+        try:
+            host, _, port = (self.address or "").rpartition(":")
+            if host and "/" not in host and port.isdecimal():
+                # Ray waits for minutes where nothing answers.
+                socket.create_connection((host, int(port)), timeout=10).close()
+            ray.init(address=self.address or "local", **here)
+        except (OSError, ValueError, RuntimeError) as error:
+            raise InputError(
+                f"--address {self.address}: no Ray cluster answers there ({error}); start one by "
+                "'ray start --head', or omit the address"
+            ) from error
+
+    def _capacity(self, ray: Any) -> int:  # noqa: ANN401
         """Say how many workers fit into the cluster."""
         there: Mapping[str, float] = ray.cluster_resources()
         asked = {"CPU": self.worker_cpus, "GPU": self.worker_gpus}
@@ -302,52 +327,6 @@ class _Worker:
     def __call__(self, batch: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
         lines = [self._runner.run(Block.from_json(str(line))).to_json() for line in batch["block"]]
         return {"done": np.array(lines, dtype=object)}
-
-
-@contextmanager
-def _connected(ray: Any, address: str | None, cores: float | None) -> Iterator[None]:  # noqa: ANN401
-    """Stay connected to a cluster; one that was started for this ends with it."""
-    is_ours = not ray.is_initialized()
-    if is_ours:
-        here = {"num_cpus": cores, "include_dashboard": False} if address is None else {}
-        try:
-            host, _, port = (address or "").rpartition(":")
-            if host and "/" not in host and port.isdecimal():
-                # Ray waits for minutes where nothing answers.
-                socket.create_connection((host, int(port)), timeout=10).close()
-            ray.init(address=address or "local", **here)
-        except (OSError, ValueError, RuntimeError) as error:
-            raise InputError(
-                f"--address {address}: no Ray cluster answers there ({error}); start one by 'ray "
-                "start --head', or omit the address"
-            ) from error
-    try:
-        yield
-    finally:
-        if is_ours:
-            ray.shutdown()
-
-
-def _cause(error: BaseException) -> BaseException:
-    """Find the error of ours that a worker raised behind Ray's own, if there is one."""
-    inner: BaseException | None = error
-    while inner is not None:
-        if isinstance(inner, InputError):
-            return InputError(str(getattr(inner, "cause", inner)))
-        inner = getattr(inner, "cause", None) or inner.__cause__
-    return error
-
-
-def _keep_to_this_machine() -> None:
-    """Let a cluster that is started here listen to this machine alone, and ask for a password.
-
-    Whoever reaches a port of Ray may run any code. Ray reads these variables as it is imported.
-    """
-    # Without clusters of several machines, which is what its name is about, a node is 127.0.0.1.
-    os.environ.setdefault("RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER", "0")
-    os.environ.setdefault("RAY_AUTH_MODE", "token")
-    if "RAY_AUTH_TOKEN_PATH" not in os.environ:
-        os.environ.setdefault("RAY_AUTH_TOKEN", secrets.token_hex(32))
 
 
 def _import_ray() -> Any:  # noqa: ANN401  Ray is loaded where it is used

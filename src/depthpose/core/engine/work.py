@@ -1,42 +1,231 @@
-"""One block of inputs to one shard of results, whole or not at all.
+"""The inputs of a job, their blocks, and one block to one shard of results, whole or not at all.
 
+Inputs are found in folders, patterns, manifests and tar shards; blocks are fixed by the first run.
 Shards are tar files in WebDataset's layout, or Parquet.
 """
 
+import csv
 import io
 import json
 import shutil
 import tarfile
 import tempfile
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+import zlib
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass
-from itertools import islice
+from importlib import import_module
+from itertools import groupby, islice
 from pathlib import Path, PurePosixPath
 from typing import Any, Literal, Protocol, runtime_checkable
 
-from depthpose.core.engine.plan import Block, Files, Item, import_pyarrow, parquet_rows, refuse_name
-from depthpose.core.errors import InputError
-from depthpose.core.files.disk import refused_write
-from depthpose.core.files.store import (
-    exists,
-    join,
-    local_copy,
-    local_path,
-    opened,
-    publish,
-    publish_bytes,
-    read_from,
-)
+from depthpose.core.errors import InputError, import_extra
+from depthpose.core.files import store
+from depthpose.core.files.disk import find_partners, refused_write
 from depthpose.core.results import file_stamp
 
+PLAN, SHARDS = "plan.jsonl", "shards"
 ShardFormat = Literal["tar", "parquet"]
+_GROUP_BYTES = 64 * 2**20
+"""Size from which on the rows so far are written as one row group of Parquet."""
+
+
+@dataclass(frozen=True, slots=True)
+class Files:
+    """What an input is made of.
+
+    Attributes:
+        roles: a word for each of its files, such as ``("left", "right")``. They are the columns of
+            a manifest; a member of a tar shard is ``KEY.ROLE.SUFFIX``, of a single role
+            ``KEY.SUFFIX`` does.
+        suffixes: that the files may have, in lower case, with the dot.
+    """
+
+    roles: tuple[str, ...]
+    suffixes: tuple[str, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class Item:
+    """One input.
+
+    Attributes:
+        name: that of its results: unique in a job, relative, without a suffix.
+        files: paths or URLs, in the order of the roles of the work.
+    """
+
+    name: str
+    files: tuple[str, ...]
+
+
+def find_items(words: Sequence[str], files: Files) -> list[Item]:
+    """Find inputs that are no tar shards.
+
+    Args:
+        words: one file, folder or pattern for each role, paired by their names or the numbers in
+            them; or of a single role any number of them; or manifests.
+        files: what an input is made of.
+
+    Raises:
+        InputError: nothing is there, sides that cannot be paired, or two inputs of one name.
+    """
+    manifests = [word for word in words if word.lower().endswith((".parquet", ".csv"))]
+    others = [word for word in words if word not in manifests]
+    items = [item for word in manifests for item in _read_manifest(word, files.roles)]
+    if others and len(others) != len(files.roles) > 1:
+        raise InputError(
+            f"{', '.join(others)}: an input has {' and '.join(files.roles)}; give a path for each "
+            "of them, or one manifest"
+        )
+    sides = [store.list_files(word, files.suffixes) for word in others]
+    if len(files.roles) == 1:
+        items += [Item(stem(url), (url,)) for side in sides for url in side]
+    else:
+        names = [[stem(url) for url in side] for side in sides]
+        for k, word in enumerate(others[1:], 1):
+            # Else two files were named.
+            if [stem(others[0])] != names[0] or [stem(word)] != names[k]:
+                partners = find_partners(names[0], names[k], f"{others[0]} and {word}")
+                sides[k] = [sides[k][partner] for partner in partners]
+        items += [Item(stem(some[0]), some) for some in zip(*sides, strict=True)]
+    first: dict[str, Item] = {}
+    for item in items:
+        other = first.setdefault(item.name, item)
+        if other is not item:
+            raise InputError(
+                f"{other.files[0]} and {item.files[0]} would both be {item.name!r} in the "
+                "results; give a manifest with a column 'name'"
+            )
+    return items
+
+
+def _read_manifest(url: str, roles: Sequence[str]) -> Iterator[Item]:
+    if url.lower().endswith(".parquet"):
+        rows: Iterable[Mapping[str, Any]] = _parquet_rows(url, "a Parquet manifest")
+    else:
+        try:
+            text = io.StringIO(store.read_from(url).decode("utf-8-sig"), newline="")
+            rows = list(csv.DictReader(text, strict=True))
+        except (UnicodeDecodeError, csv.Error) as error:
+            raise InputError(f"{url}: not a CSV table in UTF-8 ({error}); save it so") from error
+    folder = url.rpartition("/")[0] or "."
+    for number, row in enumerate(rows, 1):
+        missing = [role for role in roles if not isinstance(row.get(role), str) or not row[role]]
+        if missing:
+            raise InputError(
+                f"{url}: row {number} has no {missing[0]!r}; the columns are "
+                f"{', '.join(roles)} (paths or URLs) and, if you like, name"
+            )
+        files = tuple(
+            path
+            if store.is_url(path) or path.startswith("/")
+            else store.absolute(store.join(folder, path))
+            for path in (row[role] for role in roles)
+        )
+        name = str(row.get("name") or stem(files[0]))
+        _refuse_name(name, f"{url}: row {number}")
+        yield Item(name, files)
+
+
+def find_tars(words: Iterable[str]) -> list[str]:
+    """List tar shards: files themselves, or those of a pattern."""
+    listed = (url for word in words for url in store.list_files(word, (".tar", ".tgz", ".gz")))
+    return list(dict.fromkeys(filter(is_tar, listed)))
+
+
+def is_tar(word: str) -> bool:
+    """Whether a word names tar shards."""
+    return word.lower().endswith((".tar", ".tar.gz", ".tgz"))
+
+
+def stem(url: str) -> str:
+    """Name the result of a file: its name without the suffix."""
+    return PurePosixPath(url).stem
+
+
+def _refuse_name(name: str, source: str) -> None:
+    """Refuse a name that would lead out of the folder of the results."""
+    parts = PurePosixPath(name).parts
+    if not parts or name.startswith("/") or ".." in parts or "\0" in name or "\\" in name:
+        raise InputError(
+            f"{source}: the name {name!r} is no name of a result; write letters, digits and '/'"
+        )
+
+
+def _import_pyarrow(purpose: str) -> Any:  # noqa: ANN401  pyarrow carries no types
+    import_extra("pyarrow.parquet", "pyarrow", "ray", purpose)
+    return import_module("pyarrow")
+
+
+def _parquet_rows(url: str, purpose: str) -> Iterator[dict[str, Any]]:
+    """Read the rows of a Parquet file one by one, few at a time."""
+    arrow = _import_pyarrow(purpose)
+    try:
+        file = arrow.parquet.ParquetFile(io.BytesIO(store.read_from(url)))
+        for batch in file.iter_batches(batch_size=8):
+            yield from batch.to_pylist()
+    except (arrow.ArrowException, OSError) as error:
+        raise InputError(f"{url}: not a Parquet file ({error}); write it anew") from error
+
+
+@dataclass(frozen=True, slots=True)
+class Block:
+    """Inputs whose results are one shard, named without a suffix: listed ones, or a tar shard's."""
+
+    shard: str
+    items: tuple[Item, ...] = ()
+    tar: str | None = None  # path or URL of a WebDataset shard that holds the inputs
+
+    def to_json(self) -> str:
+        """Write it as a line."""
+        row = {"shard": self.shard, "items": [[i.name, *i.files] for i in self.items]}
+        return json.dumps(row if self.tar is None else {"shard": self.shard, "tar": self.tar})
+
+    @property
+    def checksum(self) -> int:
+        """CRC-32 of what it is made of."""
+        return zlib.crc32(self.to_json().encode())
+
+    @classmethod
+    def from_json(cls, line: str) -> "Block":
+        """Read what :meth:`to_json` wrote."""
+        row = json.loads(line)
+        items = tuple(Item(name, tuple(files)) for name, *files in row.get("items", ()))
+        return cls(row["shard"], items, row.get("tar"))
+
+
+def make_plan(out: str, items: Sequence[Item], tars: Sequence[str], size: int) -> list[Block]:
+    """Divide inputs into blocks as an earlier run did; what is new gets blocks of its own.
+
+    The plan is a file in ``out``, so that a shard means the same inputs in every run, whatever
+    has been added to a folder since.
+    """
+    blocks: list[Block] = []
+    plan = store.join(out, PLAN)
+    with suppress(ValueError, KeyError, TypeError, AttributeError):  # what is damaged, and follows
+        for line in store.read_from(plan).splitlines() if store.exists(plan) else ():
+            blocks.append(Block.from_json(line.decode()))  # noqa: PERF401  those before the damage
+    files = {item.name: item.files for block in blocks for item in block.items}
+    for item in items:
+        if files.get(item.name, item.files) != item.files:
+            raise InputError(
+                f"{out}: {item.name!r} is the result of {files[item.name][0]}, not of "
+                f"{item.files[0]}; two files of one name need two folders: choose another"
+            )
+    known, there = len(blocks), {block.tar for block in blocks}
+    new = [item for item in items if item.name not in files]
+    for k in range(0, len(new), size):
+        blocks.append(Block(f"{len(blocks):06d}", tuple(new[k : k + size])))
+    for tar in tars:
+        if tar not in there:
+            blocks.append(Block(f"{len(blocks):06d}", tar=tar))
+    if len(blocks) > known:
+        store.publish_bytes("".join(f"{b.to_json()}\n" for b in blocks).encode(), plan)
+    return blocks
 
 
 AddResult = Callable[[str, Mapping[str, bytes], str], None]
 """Adds a result to a shard: its name, contents by their endings, or why there are none."""
-_GROUP_BYTES = 64 * 2**20
-"""Size from which on the rows so far are written as one row group of Parquet."""
 
 
 @contextmanager
@@ -53,7 +242,7 @@ def shard_writer(path: Path, form: ShardFormat, endings: Sequence[str]) -> Itera
 
             yield add_members
         return
-    arrow = import_pyarrow("results in Parquet")
+    arrow = _import_pyarrow("results in Parquet")
     fields = [("name", arrow.string()), ("reason", arrow.string())]
     schema = arrow.schema([*fields, *((ending, arrow.binary()) for ending in endings)])
     rows: list[dict[str, Any]] = []
@@ -61,21 +250,18 @@ def shard_writer(path: Path, form: ShardFormat, endings: Sequence[str]) -> Itera
     # Maps hardly shrink, and pictures are compressed already.
     with arrow.parquet.ParquetWriter(path, schema, compression="zstd") as writer:
 
-        def flush() -> None:
-            if rows:
-                writer.write_table(arrow.Table.from_pylist(rows, schema))
-            rows.clear()
-
         def add_row(name: str, files: Mapping[str, bytes], reason: str) -> None:
             nonlocal held_bytes
             rows.append({"name": name, "reason": reason, **files})
             held_bytes += sum(map(len, files.values()))
             if held_bytes > _GROUP_BYTES:
-                flush()
+                writer.write_table(arrow.Table.from_pylist(rows, schema))
+                rows.clear()
                 held_bytes = 0
 
         yield add_row
-        flush()
+        if rows:
+            writer.write_table(arrow.Table.from_pylist(rows, schema))
 
 
 def read_shard(
@@ -92,36 +278,30 @@ def read_shard(
         InputError: the shard is not there, or is damaged.
     """
     if url.endswith(".parquet"):
-        for row in parquet_rows(url, "results in Parquet"):
+        for row in _parquet_rows(url, "results in Parquet"):
             if "name" not in row:
                 raise InputError(f"{url}: not a Parquet shard (no 'name'); make it anew")
             contents = {end: row[end] for end in endings if row.get(end) is not None}
             if contents:
                 yield row["name"], contents
         return
-    files: dict[str, bytes] = {}
-    last = ""
-    for member, data in read_tar(url):
-        dots = [k for k, letter in enumerate(member) if letter == "."]
-        fits = (member[:k] for k in dots if member[:k] in names and member[k + 1 :] in endings)
-        name = next(fits, None)
-        if name is None:
-            raise InputError(
-                f"{url}: holds {member!r}, which its record does not name; make it anew"
-            )
-        if name != last and files:
-            yield last, files
-            files = {}
-        last, files[member[len(name) + 1 :]] = name, data
-    if files:
-        yield last, files
+
+    def split(member: str) -> tuple[str, str]:
+        for k in (k for k, letter in enumerate(member) if letter == "."):
+            if member[:k] in names and member[k + 1 :] in endings:
+                return member[:k], member[k + 1 :]
+        raise InputError(f"{url}: holds {member!r}, which its record does not name; make it anew")
+
+    members = ((*split(member), data) for member, data in read_tar(url))
+    for name, group in groupby(members, lambda member: member[0]):
+        yield name, {ending: data for _, ending, data in group}
 
 
 def read_tar(url: str) -> Iterator[tuple[str, bytes]]:
     """Read the files of a tar shard, plain or compressed, from its beginning to its end."""
     seen: set[str] = set()
     try:
-        with opened(url) as file, tarfile.open(fileobj=file, mode="r|*") as tar:
+        with store.opened(url) as file, tarfile.open(fileobj=file, mode="r|*") as tar:
             for member in tar:
                 if not (member.isfile() or member.isdir()):
                     raise InputError(
@@ -140,9 +320,6 @@ def read_tar(url: str) -> Iterator[tuple[str, bytes]]:
         raise InputError(f"{url}: not an intact tar file ({error}); make it anew") from error
 
 
-SHARDS = "shards"
-
-
 @dataclass(frozen=True, slots=True)
 class Sample:
     """One input, its files at hand.
@@ -150,10 +327,69 @@ class Sample:
     Attributes:
         name: that of its results.
         files: local paths, in the order of the roles.
+        reason: why there are none; a :data:`Function` is given no such sample.
     """
 
     name: str
-    files: tuple[Path, ...]
+    files: tuple[Path, ...] = ()
+    reason: str = ""
+
+
+@contextmanager
+def first_sample(items: Sequence[Item], tars: Sequence[str], files: Files) -> Iterator[Sample]:
+    """Give the first input, to look at before any work.
+
+    Raises:
+        InputError: it cannot be read.
+    """
+    block = Block("", tuple(items[:1])) if items else Block("", tar=tars[0])
+    with tempfile.TemporaryDirectory(prefix="depthpose-") as scratch:
+        sample = next(_samples(block, files, Path(scratch)))
+        if sample.reason:
+            raise InputError(sample.reason)
+        yield sample
+
+
+def _samples(block: Block, wanted: Files, scratch: Path) -> Iterator[Sample]:
+    """Bring the inputs of a block here; the members of a tar shard's share a key, as neighbours."""
+    for item in block.items:
+        try:
+            sample = Sample(item.name, tuple(store.local_copy(url, scratch) for url in item.files))
+        except InputError as error:
+            sample = Sample(item.name, reason=str(error))
+        yield sample
+    if block.tar is None:
+        return
+    is_single = len(wanted.roles) == 1
+    try:
+        for key, members in groupby(read_tar(block.tar), lambda member: _key_of(member[0])):
+            files: dict[str, Path] = {}
+            for member, data in members:
+                ending = PurePosixPath(member).name.partition(".")[2]
+                role, _, suffix = ending.rpartition(".")
+                role = role or (wanted.roles[0] if is_single else "")
+                if role in wanted.roles and f".{suffix}".lower() in wanted.suffixes:
+                    files[role] = Path(tempfile.mkdtemp(dir=scratch)) / f"{role}.{suffix}"
+                    files[role].write_bytes(data)
+            missing, reason = [role for role in wanted.roles if role not in files], ""
+            if missing:
+                reason = f"{block.tar}: {key!r} has no {missing[0]}; a sample holds "
+                reason += ", ".join(wanted.roles)
+            try:
+                _refuse_name(key, block.tar)
+            except InputError as error:
+                reason = str(error)
+            for file in files.values() if reason else ():
+                shutil.rmtree(file.parent, ignore_errors=True)
+            there = () if reason else tuple(files[role] for role in wanted.roles)
+            yield Sample(key, there, reason)
+    except InputError as error:
+        yield Sample(PurePosixPath(block.tar).name, reason=str(error))
+
+
+def _key_of(member: str) -> str:
+    path = PurePosixPath(member)
+    return str(path.parent / path.name.partition(".")[0])
 
 
 Function = Callable[[Sequence[Sample], Path], Sequence[str]]
@@ -225,13 +461,7 @@ class Done:
 
 
 class Runner:
-    """Does blocks one after the other; what the work needs is loaded at the first.
-
-    Args:
-        work: what is done.
-        out: folder of the results.
-        form: of the shards.
-    """
+    """Does blocks one after the other; what the work needs is loaded at the first."""
 
     def __init__(self, work: Work, out: str, form: ShardFormat) -> None:
         self._work, self._out = work, out
@@ -242,22 +472,19 @@ class Runner:
         """Do a block, unless a shard of it without failures is there.
 
         The record ``SHARD.json`` is written after the shard: where it is, the shard is whole.
-
-        Raises:
-            InputError: the place of the results refuses.
         """
-        record = join(self._out, SHARDS, f"{block.shard}.json")
-        if exists(record):
-            done = Done.from_json(read_from(record))
+        record = store.join(self._out, SHARDS, f"{block.shard}.json")
+        if store.exists(record):
+            done = Done.from_json(store.read_from(record))
             if not done.failures:
                 return done
         temporary = tempfile.TemporaryDirectory(prefix="depthpose-")
         with refused_write(temporary.name), temporary as scratch:
             file = Path(scratch) / f"{block.shard}.{self._form}"
             entries = tuple(self._write(block, file, Path(scratch)))
-            url = join(self._out, SHARDS, file.name)
-            publish(file, url)
-            stamp = tuple(file_stamp(local_path(url) or file))
+            url = store.join(self._out, SHARDS, file.name)
+            store.publish(file, url)
+            stamp = tuple(file_stamp(store.local_path(url) or file))
         done = Done(
             shard=file.name,
             entries=entries,
@@ -265,7 +492,7 @@ class Runner:
             stamp=stamp,
             block=block.checksum,
         )
-        publish_bytes(done.to_json().encode(), record)
+        store.publish_bytes(done.to_json().encode(), record)
         return done
 
     def _write(self, block: Block, file: Path, scratch: Path) -> Iterator[tuple[str, str]]:
@@ -276,9 +503,9 @@ class Runner:
         results.mkdir()
         with shard_writer(file, self._form, self._work.endings) as add:
             while chunk := list(islice(samples, self._work.batch)):
-                reasons = iter(self._function([one.sample for one in chunk if one.sample], results))
+                reasons = iter(self._function([one for one in chunk if not one.reason], results))
                 for one in chunk:
-                    reason = next(reasons) if one.sample else one.reason
+                    reason = one.reason or next(reasons)
                     files: dict[str, bytes] = {}
                     for ending in self._work.endings:
                         path = results / f"{one.name}.{ending}"
@@ -287,7 +514,7 @@ class Runner:
                             path.unlink()
                     add(one.name, {} if reason else files, reason)
                     yield one.name, reason
-                    for path in one.sample.files if one.sample else ():
+                    for path in one.files:
                         if scratch in path.parents:  # a copy, alone in its folder
                             shutil.rmtree(path.parent, ignore_errors=True)
 
@@ -297,80 +524,3 @@ def run_here(blocks: Sequence[Block], work: Work, out: str, form: ShardFormat) -
     runner = Runner(work, out, form)
     for block in blocks:
         yield runner.run(block)
-
-
-@dataclass(frozen=True, kw_only=True)
-class _Opened:
-    """An input whose files are at hand, or the reason why not."""
-
-    name: str
-    sample: Sample | None = None
-    reason: str = ""
-
-
-@contextmanager
-def first_sample(items: Sequence[Item], tars: Sequence[str], files: Files) -> Iterator[Sample]:
-    """Give the first input, to look at before any work.
-
-    Raises:
-        InputError: it cannot be read.
-    """
-    block = Block("", tuple(items[:1])) if items else Block("", tar=tars[0])
-    with tempfile.TemporaryDirectory(prefix="depthpose-") as scratch:
-        one = next(_samples(block, files, Path(scratch)))
-        if one.sample is None:
-            raise InputError(one.reason)
-        yield one.sample
-
-
-def _samples(block: Block, wanted: Files, scratch: Path) -> Iterator[_Opened]:
-    if block.tar is not None:
-        yield from _tar_samples(block.tar, wanted, scratch)
-        return
-    for item in block.items:
-        try:
-            files = tuple(local_copy(url, scratch) for url in item.files)
-        except InputError as error:
-            yield _Opened(name=item.name, reason=str(error))
-            continue
-        yield _Opened(name=item.name, sample=Sample(item.name, files))
-
-
-def _tar_samples(tar: str, wanted: Files, scratch: Path) -> Iterator[_Opened]:
-    """Group the members of a WebDataset shard by their key, which neighbours share."""
-    key, files = "", dict[str, Path]()
-    try:
-        for member, data in read_tar(tar):
-            path = PurePosixPath(member)
-            start, _, ending = path.name.partition(".")
-            next_key = str(path.parent / start)
-            if next_key != key and key:
-                yield _grouped(tar, key, files, wanted)
-                files = {}
-            key = next_key
-            role, dot, suffix = f".{ending}".rpartition(".")
-            suffix = f"{dot}{suffix}"
-            role = role.removeprefix(".") or (wanted.roles[0] if len(wanted.roles) == 1 else "")
-            if role in wanted.roles and suffix.lower() in wanted.suffixes:
-                files[role] = Path(tempfile.mkdtemp(dir=scratch)) / f"{role}{suffix}"
-                files[role].write_bytes(data)
-        if key:
-            yield _grouped(tar, key, files, wanted)
-    except InputError as error:
-        yield _Opened(name=PurePosixPath(tar).name, reason=str(error))
-
-
-def _grouped(tar: str, key: str, files: dict[str, Path], wanted: Files) -> _Opened:
-    missing = [role for role in wanted.roles if role not in files]
-    reason = ""
-    if missing:
-        reason = f"{tar}: {key!r} has no {missing[0]}; a sample holds {', '.join(wanted.roles)}"
-    try:
-        refuse_name(key, tar)
-    except InputError as error:
-        reason = str(error)
-    if reason:
-        for file in files.values():
-            shutil.rmtree(file.parent, ignore_errors=True)
-        return _Opened(name=key, reason=reason)
-    return _Opened(name=key, sample=Sample(key, tuple(files[role] for role in wanted.roles)))

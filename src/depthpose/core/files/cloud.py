@@ -32,12 +32,9 @@ from depthpose.core.files.text import MAX_TEXT_BYTES
 _ENCODERS = {".ply": encode_ply, ".pcd": encode_pcd}
 _COLOR = ("red", "green", "blue")
 _PARTS = re.compile(r"[\s,;]+")
-_LOOKED_AT = 100
-"""Rows by which a table is understood."""
-_MOST_COLUMNS = 12
-"""Of so few rows that more are points, side by side."""
-_MAX_SCAN_BYTES = 2**26
-"""Largest scan of a LiDAR that is read, thirty times KITTI's."""
+_LOOKED_AT = 100  # rows by which a table is understood
+_MOST_COLUMNS = 12  # of so few rows that more are points, side by side
+_MAX_SCAN_BYTES = 2**26  # largest scan of a LiDAR that is read, thirty times KITTI's
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

@@ -16,8 +16,7 @@ from depthpose.core.errors import InputError
 AnyPath = str | os.PathLike[str]
 """A path as users give it."""
 
-MAX_FILE_BYTES = 2**28
-"""Largest file that is read whole; a bigger one is a mistake or an attack."""
+MAX_FILE_BYTES = 2**28  # largest file that is read whole; a bigger one is a mistake or an attack
 
 
 def read_file(path: AnyPath, most: int = MAX_FILE_BYTES) -> bytes:
@@ -51,10 +50,8 @@ def refused_read(path: AnyPath) -> Iterator[None]:
         raise InputError(f"{os.fspath(path)!r}: not a file name: {error}") from error
 
 
-_ADDRESS = re.compile(r"<[^<>]* at 0x[0-9a-fA-F]+>")
-"""What Python shows of an object in memory."""
-_PART = ".part-"
-"""Begins the names of files that are being written."""
+_ADDRESS = re.compile(r"<[^<>]* at 0x[0-9a-fA-F]+>")  # what Python shows of an object in memory
+_PART = ".part-"  # begins the names of files that are being written
 
 
 @contextmanager

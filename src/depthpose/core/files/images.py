@@ -27,8 +27,7 @@ from depthpose.core.files.disk import (
 )
 from depthpose.core.files.store import read_bytes
 
-WRITTEN_SUFFIXES = (".png", ".jpg", ".jpeg")
-"""Suffixes of pictures that can be written."""
+WRITTEN_SUFFIXES = (".png", ".jpg", ".jpeg")  # suffixes of pictures that can be written
 LISTED_SUFFIXES = (*WRITTEN_SUFFIXES, ".tif", ".tiff", ".bmp", ".ppm", ".pgm", ".pnm", ".webp")
 """Suffixes of pictures in a listed folder; a file that is named may have any."""
 FAST_PNG = {"compress_level": 1}
@@ -131,8 +130,7 @@ _LEAST_SPAN, _FULL_SPAN = 64, 2**14
 """Masks and labels have fewer values than a picture; more than 14 bits are taken for all 16."""
 
 
-_REPORTED: set[Path] = set()
-"""Folders whose range of values has been reported."""
+_REPORTED: set[Path] = set()  # folders whose range of values has been reported
 
 
 def _deep_ppm(image: Image.Image) -> np.ndarray | None:

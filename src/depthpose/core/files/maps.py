@@ -150,8 +150,7 @@ def _read_pfm(path: AnyPath) -> Float32[Tensor, "h w"]:
     return torch.from_numpy(array)
 
 
-KITTI_UNIT = 1 / 256
-"""KITTI stores metres and pixels of disparity times 256."""
+KITTI_UNIT = 1 / 256  # KITTI stores metres and pixels of disparity times 256
 
 
 def read_depth_png(path: AnyPath, unit_m: float = KITTI_UNIT) -> Float32[Tensor, "h w"]:

@@ -19,8 +19,7 @@ from depthpose.core.files.store import read_bytes
 from depthpose.core.files.text import MAX_TEXT_BYTES
 
 _WORDS = re.compile(r"[-+]?(?:nan\(\w*\)|1[.,]#(?:QNAN|SNAN|IND|INF)\w*)")
-Columns = dict[str, np.ndarray]
-"""One array a name, all equally long."""
+Columns = dict[str, np.ndarray]  # one array a name, all equally long
 
 
 @dataclass(frozen=True, kw_only=True)

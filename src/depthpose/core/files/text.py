@@ -15,13 +15,11 @@ from depthpose.core.files.store import read_bytes
 
 MAX_TEXT_BYTES = 2**26
 """Largest text: a table of a million points, annotations of ten thousand images."""
-MAX_LIST_BYTES = 2**20
-"""Largest text that lists a few numbers: a calibration, a camera, a config."""
+MAX_LIST_BYTES = 2**20  # largest text that lists a few numbers: a calibration, a camera, a config
 _MOST_MEMORY = 700_000_000
 """Memory [bytes] that JSON or YAML may take once it is read, estimated by counting its signs."""
 _MOST_DEPTH = 50
-_MOST_VALUES = 2_000_000
-"""Most values of YAML whose references are written out."""
+_MOST_VALUES = 2_000_000  # most values of YAML whose references are written out
 _PLAIN: type[Any] = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
 """Ten times faster where PyYAML was built with libyaml, as its wheels are."""
 _MERGE = "tag:yaml.org,2002:merge"

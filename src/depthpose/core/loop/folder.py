@@ -1,15 +1,4 @@
-"""The run folder: metrics, pictures, TensorBoard, the states to resume from, and the card.
-
-::
-
-    config.yaml        every setting (written by the caller)
-    run.json           settings, versions, machine, commit
-    metrics.jsonl      one line each log step
-    pictures/          what validation drew
-    tensorboard/       the same for TensorBoard
-    state.pt           the last state: what ``resume`` reads
-    state.before.pt    the one before it, read where the last is damaged
-"""
+"""The run folder: metrics, pictures, TensorBoard, the states to resume from, and the card."""
 
 import json
 import os
@@ -34,12 +23,10 @@ from depthpose.core.files.text import refuse_heavy
 from depthpose.core.loop.task import ValidationResult
 from depthpose.core.run import environment
 
-STATE, BEFORE = "state.pt", "state.before.pt"
+STATE, BEFORE = "state.pt", "state.before.pt"  # the last, and the one before, if that is damaged
 _NEEDED = ("step", "modules", "optimizers", "scaler", "average")
-_METRICS = "metrics.jsonl"
-_PICTURES = "pictures"
-_HELD_OUT = "held_out/"
-"""Begins the names of numbers that validation found."""
+_METRICS, _PICTURES = "metrics.jsonl", "pictures"
+_HELD_OUT = "held_out/"  # begins the names of numbers that validation found
 
 
 def run_files(weights: str) -> list[str]:
@@ -159,9 +146,13 @@ def write_card(
     where = ", ".join(here[name] for name in ("machine", "gpu") if name in here)
     took = f"{seconds:.0f} s" if seconds < 120 else f"{seconds / 60:.0f} min"
     took = took if seconds < 7200 else f"{seconds / 3600:.1f} h"
+    step = 0  # of the last state that is whole
+    for path in reversed(saved_states(folder)):
+        with suppress(InputError):
+            step = _read_state(path)["step"]
     made = {
         "command": f"`depthpose {words} --config config.yaml --out {shlex.quote(folder.name)}`",
-        "time": f"{_saved_step(folder)} steps in {took} on {where}; {here['date']}",
+        "time": f"{step} steps in {took} on {where}; {here['date']}",
     }
     with atomic_write(weights.with_suffix(".md")) as part:
         part.write_text(card_text(weights.stem, {**facts, **made}, measured))
@@ -181,15 +172,12 @@ def held_out_text(folder: Path, sentence: str) -> str:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Parts:
-    """What a state is of: everything of a training that its steps change, by name.
-
-    The scaler's state is empty but in fp16; ``average`` holds moving averages of the weights.
-    """
+    """What a state is of: everything of a training that its steps change, by name."""
 
     modules: Mapping[str, nn.Module]
     optimizers: Mapping[str, Any]
-    scaler: torch.amp.GradScaler
-    average: Mapping[str, dict[str, Tensor]]
+    scaler: torch.amp.GradScaler  # its state is empty but in fp16
+    average: Mapping[str, dict[str, Tensor]]  # moving averages of the weights
 
     def state(self) -> dict[str, Any]:
         """Give what is written."""
@@ -202,18 +190,17 @@ class Parts:
 
     def restore(self, state: Mapping[str, Any]) -> None:
         """Take over a state; one that does not fit is refused with what differs."""
-        problems: list[str] = []
         own = self.state()
-        for words, name in (("", "modules"), ("average of ", "average")):
-            for key, tensors in own[name].items():
-                faults = misfits(tensors, state[name][key])
-                problems += [f"{words}{key}: {fault}" for fault in faults]
+        problems = [
+            f"{words}{key}: {fault}"
+            for words, name in (("", "modules"), ("average of ", "average"))
+            for key, tensors in own[name].items()
+            for fault in misfits(tensors, state[name][key])
+        ]
         for name, optimizer in self.optimizers.items():
             saved = state["optimizers"][name]
-            counts, saved_counts = (
-                [len(group["params"]) for group in groups]
-                for groups in (optimizer.param_groups, saved["param_groups"])
-            )
+            counts = [len(group["params"]) for group in optimizer.param_groups]
+            saved_counts = [len(group["params"]) for group in saved["param_groups"]]
             if counts != saved_counts:
                 problems.append(
                     f"optimiser of {name}: it moved groups of {saved_counts} parameters, not of "
@@ -264,10 +251,7 @@ def write_state(folder: Path, state: Mapping[str, Any], *, keeps_last: bool) -> 
 
 
 def restore_last(folder: Path, parts: Parts) -> tuple[Path, int, float]:
-    """Go on from the last state, or, where it is damaged, with a notice from the one before it.
-
-    Gives the state that was taken, its step, and the seconds of training until then.
-    """
+    """Go on from the last state that is whole; give its path, step and seconds of training."""
     damages: list[str] = []
     for path in saved_states(folder):
         try:
@@ -288,14 +272,6 @@ def restore_last(folder: Path, parts: Parts) -> tuple[Path, int, float]:
         f"{'; '.join(damages)}; no state is left to go on from. Take another folder, whose "
         "training may 'start' from weights, or delete these states to begin anew"
     )
-
-
-def _saved_step(folder: Path) -> int:
-    """Give the step of the last state that is whole; 0 where there is none."""
-    for path in saved_states(folder):
-        with suppress(InputError):
-            return _read_state(path)["step"]
-    return 0
 
 
 def _read_state(path: Path) -> Mapping[str, Any]:

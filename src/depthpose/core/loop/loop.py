@@ -37,8 +37,7 @@ from depthpose.core.loop.folder import (
 from depthpose.core.loop.task import LoopConfig, Samples, Task, mixed_seed
 from depthpose.core.run import claim_folder, find_rank, held_folders, release_folders
 
-SECOND_CTRL_C_S = 3.0
-"""Between the first Ctrl-C, which stops, and the second, which finishes."""
+SECOND_CTRL_C_S = 3.0  # between the first Ctrl-C, which stops, and the second, which finishes
 
 _TYPES = {"fp32": None, "bf16": torch.bfloat16, "fp16": torch.float16}
 _FREE = ("workers", "device", "save_every_steps", "validate_every_steps", "log_every_steps")
@@ -170,7 +169,18 @@ class _Training:
     ) -> None:
         """Bring everything to the device and, where asked, to the state of an earlier run."""
         self.task, self.samples, self.config = task, samples, config
-        self.accelerator = _make_accelerator(config)
+        accelerate = import_extra("accelerate", "accelerate", "train", "training")
+        # The other processes wait while rank 0 validates.
+        patience = accelerate.InitProcessGroupKwargs(timeout=timedelta(hours=2))
+        try:  # without precision: accelerate keeps that of a process's first training
+            self.accelerator = accelerate.Accelerator(
+                mixed_precision="no", cpu=config.device == "cpu", kwargs_handlers=[patience]
+            )
+        except ValueError as error:
+            raise InputError(
+                f"device {config.device!r} cannot be used in this process, which has trained on "
+                f"another; start this training in a process of its own ({error})"
+            ) from error
         self.precision = Precision(config, self.accelerator.device)
         self.world = self.accelerator.num_processes
         self.steps = config.total_steps(len(samples), self.world)
@@ -204,10 +214,7 @@ class _Training:
     def take_steps(
         self, on_step: Callable[[Progress], None] | None, request: "StopRequest"
     ) -> float:
-        """Take the remaining steps, the current one as the last if asked to finish; give seconds.
-
-        They are those of the whole training, with the runs before this one.
-        """
+        """Take the remaining steps, or up to the current one; give the whole training's seconds."""
         batches = self._batches()
         while self.step < self.steps:
             self._take_step([next(batches) for _ in range(self.config.accumulate)])
@@ -246,13 +253,11 @@ class _Training:
         return time.monotonic() - self.began
 
     def _batches(self) -> Iterator[Any]:
-        """Load this process's micro-batches, from the first that is still to do.
-
-        Micro-batch m of a step belongs to place ``m // world`` of process ``m % world``: N
-        processes see in a step what one process sees that accumulates N times as much.
-        """
+        """Load this process's micro-batches, from the first that is still to do."""
         from accelerate.utils import send_to_device
 
+        # Micro-batch m of a step belongs to place m // world of process m % world: N processes see
+        # in a step what one process sees that accumulates N times as much.
         rank, size = self.accelerator.process_index, self.config.batch_size
         places = range(self.step * self.config.accumulate, self.steps * self.config.accumulate)
         starts = ((place * self.world + rank) * size for place in places)
@@ -296,8 +301,17 @@ class _Training:
             if owner is None:
                 break
             self._move(owner)
-        if self.config.ema_decay is not None:
-            self._update_average(self.config.ema_decay)
+        if self.config.ema_decay is None:
+            return
+        decay = min(self.config.ema_decay, (1 + self.step) / (10 + self.step))
+        with torch.no_grad():
+            for name, module in self.task.modules.items():
+                for key, tensor in module.state_dict().items():
+                    held = self.parts.average[name][key]
+                    if tensor.is_floating_point():
+                        held.lerp_(tensor, 1 - decay)
+                    else:
+                        held.copy_(tensor)
 
     def _move(self, name: str) -> None:
         """Average the gradients over processes and step the optimiser."""
@@ -343,21 +357,6 @@ class _Training:
             return is_asked
         flag = torch.tensor([float(is_asked)], device=self.accelerator.device)
         return bool(float(self.accelerator.reduce(flag, "sum")) > 0)
-
-
-def _make_accelerator(config: LoopConfig) -> Any:  # noqa: ANN401 - accelerate is an extra
-    """Set up accelerate without precision: it keeps that of a process's first training."""
-    accelerate = import_extra("accelerate", "accelerate", "train", "training")
-    # The other processes wait while rank 0 validates.
-    patience = accelerate.InitProcessGroupKwargs(timeout=timedelta(hours=2))
-    on_cpu = config.device == "cpu"
-    try:
-        return accelerate.Accelerator(mixed_precision="no", cpu=on_cpu, kwargs_handlers=[patience])
-    except ValueError as error:
-        raise InputError(
-            f"device {config.device!r} cannot be used in this process, which has trained on "
-            f"another; start this training in a process of its own ({error})"
-        ) from error
 
 
 class Precision:
