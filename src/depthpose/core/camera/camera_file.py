@@ -69,6 +69,8 @@ _WRITE = (
 _TUM = {(517.3, 516.5, 318.6, 255.3), (520.9, 521.0, 325.1, 249.7), (535.4, 539.2, 320.1, 247.6)}
 """Published intrinsics of TUM RGB-D's three cameras, which belong to no other data."""
 _TUM_SIZE, _TUM_UNIT_M = (640, 480), 1 / 5000
+_DOFFS = "cx_right_minus_left_px"
+_PLAIN_KEYS = ("width", "height", "focal_y_px", _DOFFS)
 
 
 def _middlebury_facts(path: AnyPath) -> CameraFacts:
@@ -106,24 +108,17 @@ def _middlebury_facts(path: AnyPath) -> CameraFacts:
 
 
 def plain_facts(path: AnyPath, keys: Mapping[str, list[float]]) -> CameraFacts:
-    """Take ``focal_px``, ``cx``, ``cy`` and ``baseline_m``, a line each.
-
-    Also ``width`` and ``height``, ``focal_y_px`` and ``cx_right_minus_left_px`` if given.
-    """
-    focal_px, cx, cy, baseline_m = (
-        _number(path, keys, key) for key in ("focal_px", "cx", "cy", "baseline_m")
-    )
-    has_size = {"width", "height"} <= keys.keys()
-    focal_y_px = _number(path, keys, "focal_y_px") if "focal_y_px" in keys else focal_px
-    shift = "cx_right_minus_left_px"
+    """Take the keys, a line each: :data:`_PLAIN_KEYS` where they are given, the others always."""
+    wanted = ("focal_px", "cx", "cy", "baseline_m", *(key for key in _PLAIN_KEYS if key in keys))
+    said = {key: _number(path, keys, key) for key in wanted}
+    focal_px = said["focal_px"]
+    has_size = {"width", "height"} <= said.keys()
     return CameraFacts(
         kind="a calibration",
-        K=intrinsics(focal_px, focal_y_px, cx, cy),
-        size=(int(_number(path, keys, "width")), int(_number(path, keys, "height")))
-        if has_size
-        else None,
-        baseline_m=baseline_m,
-        cx_right_minus_left_px=_number(path, keys, shift) if shift in keys else 0.0,
+        K=intrinsics(focal_px, said.get("focal_y_px", focal_px), said["cx"], said["cy"]),
+        size=(int(said["width"]), int(said["height"])) if has_size else None,
+        baseline_m=said["baseline_m"],
+        cx_right_minus_left_px=said.get(_DOFFS, 0.0),
         is_metric=True,
     )
 
@@ -221,17 +216,20 @@ def _number(path: AnyPath, keys: Mapping[str, list[float]], name: str) -> float:
 
 
 _NEEDED = ("width", "height", "K")
-_RIG = ("baseline_m", "cx_right_minus_left_px")
-_KEYS = (*_NEEDED, *_RIG, *OPTIONAL_KEYS)
+_KEYS = (*_NEEDED, "baseline_m", _DOFFS, *OPTIONAL_KEYS)
 _BOP = ("fx", "fy", "cx", "cy")
-_MM = 0.001
 
 
 def facts_from_json(content: object) -> CameraFacts:
     """Take the camera of a JSON file: ours, BOP's ``camera.json`` or its ``scene_camera.json``."""
     if isinstance(content, list) and len(content) in (3, 9):
         return CameraFacts(kind="a matrix", K=_matrix(content))
-    if isinstance(content, dict) and "K" not in content:
+    if not isinstance(content, dict):
+        raise InputError(
+            f"a camera is a JSON object with the keys {', '.join(_KEYS)}, "
+            f"not a {type(content).__name__}"
+        )
+    if "K" not in content:
         if "cam_K" in content:
             return _from_scene({"0": content})
         inner = content.get("intrinsic", content)
@@ -243,33 +241,22 @@ def facts_from_json(content: object) -> CameraFacts:
                 kind="a camera of Open3D", K=K.T.contiguous() if is_by_columns else K, size=size
             )
         if content.keys() >= set(_BOP):
-            return _from_bop(content)
+            fx, fy, cx, cy = (_json_number(content, key) for key in _BOP)
+            return CameraFacts(
+                kind="a camera of BOP",
+                K=intrinsics(fx, fy, cx, cy),
+                size=_size(content) if {"width", "height"} <= content.keys() else None,
+                baseline_m=baseline_of(named(content)),
+                depth_unit_m=_bop_unit_m(content),
+                distortion=lens_of(named(content)),
+            )
         if content and all(isinstance(v, dict) and "cam_K" in v for v in content.values()):
             return _from_scene(content)
-    keys = _check_keys(content)
-    optional: dict[str, Any] = {k: _json_number(keys, k) for k in OPTIONAL_KEYS if k in keys}
-    return CameraFacts(
-        kind="a camera",
-        K=_matrix(keys["K"]),
-        size=_size(keys),
-        baseline_m=_json_number(keys, "baseline_m") if "baseline_m" in keys else None,
-        cx_right_minus_left_px=_json_number({_RIG[1]: 0, **keys}, _RIG[1]),
-        is_metric=True,
-        **optional,
-    )
-
-
-def _from_bop(keys: dict[str, Any]) -> CameraFacts:
-    """BOP: ``fx``, ``fy``, ``cx``, ``cy``, ``width``, ``height``; ``depth_scale`` in mm a unit."""
-    fx, fy, cx, cy = (_json_number(keys, key) for key in _BOP)
-    return CameraFacts(
-        kind="a camera of BOP",
-        K=intrinsics(fx, fy, cx, cy),
-        size=_size(keys) if {"width", "height"} <= keys.keys() else None,
-        baseline_m=baseline_of(named(keys)),
-        depth_unit_m=_bop_unit_m(keys),
-        distortion=lens_of(named(keys)),
-    )
+    _check_keys(content)
+    known = ("baseline_m", _DOFFS, *OPTIONAL_KEYS)
+    said: dict[str, Any] = {key: _json_number(content, key) for key in known if key in content}
+    size = _size(content)
+    return CameraFacts(kind="a camera", K=_matrix(content["K"]), size=size, is_metric=True, **said)
 
 
 def _from_scene(images: dict[str, dict[str, Any]]) -> CameraFacts:
@@ -292,16 +279,11 @@ def _from_scene(images: dict[str, dict[str, Any]]) -> CameraFacts:
 
 def _bop_unit_m(keys: dict[str, Any]) -> float | None:
     if "depth_scale" in keys:
-        return _MM * _json_number(keys, "depth_scale")
+        return 0.001 * _json_number(keys, "depth_scale")  # millimetres a unit
     return _json_number(keys, "depth_unit_m") if "depth_unit_m" in keys else None
 
 
-def _check_keys(content: object) -> dict[str, Any]:
-    if not isinstance(content, dict):
-        raise InputError(
-            f"a camera is a JSON object with the keys {', '.join(_KEYS)}, "
-            f"not a {type(content).__name__}"
-        )
+def _check_keys(content: dict[str, Any]) -> None:
     if not content.keys() & set(_KEYS):
         keys = ", ".join(map(repr, content))
         raise InputError(f"no camera that is known; its keys are {keys:.80}. Known: {KNOWN_FILES}")
@@ -313,18 +295,14 @@ def _check_keys(content: object) -> dict[str, Any]:
         raise InputError(f"missing {', '.join(map(repr, missing))}; add it to the camera")
     if "cx_right_minus_left_px" in content and "baseline_m" not in content:
         raise InputError("'cx_right_minus_left_px' needs 'baseline_m' beside it; add it")
-    return content
 
 
 def _size(keys: dict[str, Any]) -> Size:
-    return _whole(keys, "width"), _whole(keys, "height")
-
-
-def _whole(keys: dict[str, Any], key: str) -> int:
-    value = keys[key]
-    if not _is_number(value) or value != int(value) or abs(value) > MAX_SIDE_PX:
-        raise InputError(f"{key!r} is {repr(value)[:80]}; give a whole number of pixels")
-    return int(value)
+    for key in ("width", "height"):
+        value = keys[key]
+        if not _is_number(value) or value != int(value) or abs(value) > MAX_SIDE_PX:
+            raise InputError(f"{key!r} is {repr(value)[:80]}; give a whole number of pixels")
+    return int(keys["width"]), int(keys["height"])
 
 
 def _json_number(keys: dict[str, Any], key: str) -> float:
@@ -345,14 +323,9 @@ def _matrix(value: object) -> Float[Tensor, "3 3"]:
     return torch.tensor([[float(x) for x in row] for row in rows], dtype=torch.float64)
 
 
-def _is_number(value: object) -> bool:
+def _is_number(value: Any) -> bool:  # noqa: ANN401
     # A whole number beyond 1e300 has no float.
-    if isinstance(value, bool) or not isinstance(value, int | float):
-        return False
-    return abs(value) < 1e300
-
-
-_DOFFS = "cx_right_minus_left_px"
+    return type(value) in (int, float) and abs(value) < 1e300
 
 
 def read_camera(path: AnyPath, size: Size | None = None) -> Camera | StereoRig:
@@ -553,11 +526,7 @@ def choose_lens(
 
 
 def centred_camera(size: Size, focal_px: float) -> Camera:
-    """Make the camera of which the focal length alone is known; its axis meets the centre.
-
-    Raises:
-        InputError: no focal length in pixels.
-    """
+    """Make the camera of which the focal length alone is known; its axis meets the centre."""
     if not 1 < focal_px < 1e6:
         raise InputError(f"focal_px is {focal_px}: not a focal length in pixels; KITTI's is 721.5")
     width, height = size

@@ -6,6 +6,7 @@ checked: from any format to one :class:`Camera`.
 
 import json
 import math
+import sys
 from dataclasses import dataclass, replace
 from typing import Any, TypeVar
 
@@ -45,28 +46,29 @@ class Camera:
     tilt_deg: float | None = None
 
     def __post_init__(self) -> None:
-        for name, size in (("width", self.width), ("height", self.height)):
-            if not 1 <= size <= MAX_SIDE_PX:
-                raise InputError(
-                    f"{name} is {str(size)[:20]}, but an image has 1 to {MAX_SIDE_PX} pixels in a "
-                    "row or column; correct it"
-                )
+        for name, (least, most, rule) in _RULES.items():
+            value = getattr(self, name, None)
+            if value is not None and not least <= value <= most:
+                raise InputError(f"{name} is {str(value)[:24]}, but {rule}")
         check_intrinsics(self.K)
-        if self.depth_unit_m is not None and not 0 < self.depth_unit_m < math.inf:
-            raise InputError(
-                f"depth_unit_m is {self.depth_unit_m}, but a unit is a positive number of metres; "
-                "0.001 means millimetres"
-            )
-        if self.mount_height_m is not None and not 0.1 <= self.mount_height_m <= 20:
-            raise InputError(
-                f"mount_height_m is {self.mount_height_m}, but a camera stands 0.1 to 20 m above "
-                "the road; give metres"
-            )
-        if self.tilt_deg is not None and not -45 <= self.tilt_deg <= 45:
-            raise InputError(
-                f"tilt_deg is {self.tilt_deg}, but a road is seen at -45 to 45 degrees; negative "
-                "looks down"
-            )
+
+
+_SIDE = (1, MAX_SIDE_PX, f"an image has 1 to {MAX_SIDE_PX} pixels in a row or column; correct it")
+_TINY, _HUGE = math.ulp(0.0), sys.float_info.max
+_RULES = {
+    "width": _SIDE,
+    "height": _SIDE,
+    "depth_unit_m": (
+        _TINY, _HUGE, "a unit is a positive number of metres; 0.001 means millimetres"
+    ),
+    "mount_height_m": (0.1, 20, "a camera stands 0.1 to 20 m above the road; give metres"),
+    "tilt_deg": (-45, 45, "a road is seen at -45 to 45 degrees; negative looks down"),
+    "baseline_m": (
+        _TINY, _HUGE, "the right camera stands at a positive x; are left and right exchanged? Give "
+        "its distance from the left one in metres"
+    ),
+}  # fmt: skip
+"""Least and most of a camera's numbers, and why."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -87,11 +89,6 @@ class StereoRig(Camera):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if not 0 < self.baseline_m < math.inf:
-            raise InputError(
-                f"baseline_m is {self.baseline_m}, but the right camera stands at a positive x; "
-                "are left and right exchanged? Give its distance from the left one in metres"
-            )
         if self.baseline_m >= MAX_BASELINE_M:
             raise InputError(
                 f"baseline_m is {self.baseline_m:g}, which looks like millimetres; divide by 1000"
@@ -289,17 +286,14 @@ def facts_from_projections(
     right: Float64[np.ndarray, "3 4"] | None,
     size: Size | None = None,
 ) -> CameraFacts:
-    """Take the rectified projections of a pair, or of one camera, apart.
-
-    A rectified camera at x = b has ``P[0, 3] = -fx b``. KITTI counts both from camera 0, ROS and
-    OpenCV from the left one.
-    """
+    """Take the rectified projections of a pair, or of one camera, apart: ``P[0, 3] = -fx x``."""
     K = torch.from_numpy(left[:, :3].copy())
     if right is None:
         return CameraFacts(kind=kind, K=K, size=size)
     if not (left[0, 0] > 0 and right[0, 0] > 0):
         raise InputError("the focal lengths of the two projections are not positive; copy it anew")
     refuse_apart(left, right)
+    # KITTI counts x from camera 0, ROS and OpenCV from the left one.
     with np.errstate(all="ignore"):  # what overflows is refused as a baseline
         baseline_m = left[0, 3] / left[0, 0] - right[0, 3] / right[0, 0]
         down_m = left[1, 3] / left[1, 1] - right[1, 3] / right[1, 1]
@@ -342,16 +336,11 @@ def camera_from_facts(facts: CameraFacts, size: Size | None) -> Camera:
     fx = float(camera.K[0, 0])
     shown = f"{camera.width}x{camera.height}"
     _refuse_normalised(camera.K, camera.width, camera.height)
-    if fx < _MM_FX_SHARE * camera.width:
-        raise InputError(
-            f"K has fx {fx:g} for {shown} pixels, so it looks like millimetres; divide by the "
-            "width of a pixel in mm"
-        )
-    if fx > _MAX_FX_SHARE * camera.width:
-        raise InputError(
-            f"K has fx {fx:g} for {shown} pixels, which sees less than 0.3 degrees; give it in "
-            "pixels of this image"
-        )
+    if not _MM_FX_SHARE <= fx / camera.width <= _MAX_FX_SHARE:
+        what = "which sees less than 0.3 degrees; give it in pixels of this image"
+        if fx < _MM_FX_SHARE * camera.width:
+            what = "so it looks like millimetres; divide by the width of a pixel in mm"
+        raise InputError(f"K has fx {fx:g} for {shown} pixels, {what}")
     refuse_squeezed(camera.K)
     refuse_outside(camera.K, camera.width, camera.height)
     if isinstance(camera, StereoRig):
@@ -364,16 +353,12 @@ def camera_from_facts(facts: CameraFacts, size: Size | None) -> Camera:
                 f"the principal points differ by {camera.cx_right_minus_left_px:g} px, more than "
                 f"the image of {shown} is wide; are both cameras of one size? Copy them anew"
             )
-    if camera.depth_unit_m is not None and camera.depth_unit_m < _LEAST_UNIT_M:
-        raise InputError(
-            f"depth_unit_m is {camera.depth_unit_m:g}, finer than any sensor's; it is metres a "
-            "unit: 0.001 means millimetres"
-        )
-    if camera.depth_unit_m is not None and camera.depth_unit_m > 1:
-        raise InputError(
-            f"depth_unit_m is {camera.depth_unit_m:g}, which looks like units a metre; it is "
-            f"metres a unit: write {1 / camera.depth_unit_m:g}"
-        )
+    unit_m = camera.depth_unit_m or 1.0
+    if not _LEAST_UNIT_M <= unit_m <= 1:
+        what = "finer than any sensor's; it is metres a unit: 0.001 means millimetres"
+        if unit_m > 1:
+            what = f"which looks like units a metre; it is metres a unit: write {1 / unit_m:g}"
+        raise InputError(f"depth_unit_m is {unit_m:g}, {what}")
     if facts.size is None:
         refuse_other_resolution(camera.K, camera.width, camera.height)
     return camera

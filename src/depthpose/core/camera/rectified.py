@@ -1,10 +1,8 @@
 """Check from the images alone that two images are a rectified pair, and left and right in order.
 
-Corners of one image are sought in the whole of the other, on a reduced copy, by zero-mean
-normalised cross-correlation (Lewis 1995); corners are chosen by the smaller eigenvalue of the
-structure tensor (Shi and Tomasi 1994). A match is kept where it is good, has no rival and is
-mutual; then it is placed to a fraction of a pixel on a larger copy. Where the matches lie shows
-what was done to the pair.
+Corners (Shi and Tomasi 1994) of one image are sought in the whole of the other, on a reduced copy,
+by zero-mean normalised cross-correlation (Lewis 1995); a match that is good, has no rival and is
+mutual is placed to a fraction of a pixel on a larger copy.
 """
 
 import math

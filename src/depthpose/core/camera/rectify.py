@@ -18,6 +18,7 @@ from depthpose.core.camera.pinhole import (
     camera_from_facts,
     check_intrinsics,
     facts_from_projections,
+    intrinsics,
     refuse_baseline,
     refuse_squeezed,
 )
@@ -168,7 +169,12 @@ def _from_opencv(names: Names, unit_m: float, is_fisheye: bool | None) -> RawPai
 
 def _from_ros(first: Names, second: Names, unit_m: float, is_fisheye: bool | None) -> RawPair:
     """Two ``camera_info``: the rotations to the rectified frame and the right one's ``Tx``."""
-    shifts = [_ros_shift(names) for names in (first, second)]
+    shifts: list[float] = []  # Tx / fx: less the camera's x in the rectified frame
+    for names in (first, second):
+        P = matrix(names, ("projectionmatrix", "p"), 12)
+        if P is None or P[0, 0] <= 0:
+            raise InputError("no projection_matrix with a focal length; calibrate as a pair")
+        shifts.append(float(P[0, 3] / P[0, 0]))
     if (shifts[0] == 0) == (shifts[1] == 0):
         raise InputError(
             f"the projections of the two camera_info have Tx / fx {shifts[0]:g} and {shifts[1]:g}, "
@@ -180,12 +186,9 @@ def _from_ros(first: Names, second: Names, unit_m: float, is_fisheye: bool | Non
     both = (first, second) if shifts[0] == 0 else (second, first)
     cameras, turns = [], []
     for side, names in zip(("left", "right"), both, strict=True):
-        K, D = (
-            matrix(names, ("cameramatrix", "k"), 9),
-            _first(names, ("distortioncoefficients", "d")),
-        )
+        K, D = matrix(names, ("cameramatrix", "k"), 9), ("distortioncoefficients", "d")
         kind = _kind(names.get("distortionmodel"), is_fisheye)
-        cameras.append(_camera(K, D, kind, f"the {side} camera"))
+        cameras.append(_camera(K, _first(names, D), kind, f"the {side} camera"))
         turn = matrix(names, ("rectificationmatrix", "r"), 9)
         if turn is None:
             raise InputError(f"no rectification_matrix of the {side} camera; write the whole pair")
@@ -193,14 +196,6 @@ def _from_ros(first: Names, second: Names, unit_m: float, is_fisheye: bool | Non
     along = np.array([unit_m * (shifts[0] or shifts[1]), 0, 0])
     motion = (turns[1].T @ turns[0], turns[1].T @ along)
     return _pair(cameras[0], cameras[1], motion, size_of(first))
-
-
-def _ros_shift(names: Names) -> float:
-    """Give ``Tx / fx`` of a projection: less the camera's x in the rectified frame."""
-    P = matrix(names, ("projectionmatrix", "p"), 12)
-    if P is None or P[0, 0] <= 0:
-        raise InputError("no projection_matrix with a focal length; calibrate as a pair")
-    return float(P[0, 3] / P[0, 0])
 
 
 def _from_kalibr(names: Names, unit_m: float, is_fisheye: bool | None) -> RawPair:
@@ -215,25 +210,20 @@ def _from_kalibr(names: Names, unit_m: float, is_fisheye: bool | None) -> RawPai
     if sizes[0] != sizes[1]:
         raise InputError("cam0 and cam1 have images of two sizes; a pair has one")
     size = None if sizes[0] is None else (int(sizes[0][0]), int(sizes[0][-1]))
-    left, right = (
-        _kalibr_camera(one, who, is_fisheye) for one, who in ((first, "cam0"), (second, "cam1"))
-    )
-    return _pair(left, right, (motion[:3, :3], unit_m * motion[:3, 3]), size)
-
-
-def _kalibr_camera(names: Names, who: str, is_fisheye: bool | None) -> RawCamera:
-    if names.get("cameramodel", "pinhole") != "pinhole":
-        raise InputError(
-            f"{who} has camera_model {names['cameramodel']!r}; calibrate it as pinhole-radtan, or "
-            "as pinhole-equi where it is a fisheye lens"
-        )
-    values = numbers(names.get("intrinsics"))
-    if values is None or len(values) != 4:
-        raise InputError(f"{who} has no intrinsics [fx, fy, cx, cy]; copy the camchain anew")
-    fx, fy, cx, cy = values
-    K = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
-    kind = _kind(names.get("distortionmodel"), is_fisheye)
-    return _camera(K, numbers(names.get("distortioncoeffs")), kind, who)
+    cameras = []
+    for one, who in ((first, "cam0"), (second, "cam1")):
+        if one.get("cameramodel", "pinhole") != "pinhole":
+            raise InputError(
+                f"{who} has camera_model {one['cameramodel']!r}; calibrate it as pinhole-radtan, "
+                "or as pinhole-equi where it is a fisheye lens"
+            )
+        values = numbers(one.get("intrinsics"))
+        if values is None or len(values) != 4:
+            raise InputError(f"{who} has no intrinsics [fx, fy, cx, cy]; copy the camchain anew")
+        kind = _kind(one.get("distortionmodel"), is_fisheye)
+        lens = numbers(one.get("distortioncoeffs"))
+        cameras.append(_camera(intrinsics(*values).numpy(), lens, kind, who))
+    return _pair(cameras[0], cameras[1], (motion[:3, :3], unit_m * motion[:3, 3]), size)
 
 
 def _first(names: Names, known: tuple[str, ...]) -> list[float] | None:
@@ -269,10 +259,10 @@ def _camera(
             f"{who} has {len(distortion)} coefficients of distortion, and {model} has "
             f"{' or '.join(map(str, counts))}; look at its model"
         )
-    intrinsics = torch.from_numpy(np.ascontiguousarray(K, np.float64))
-    check_intrinsics(intrinsics)
-    refuse_squeezed(intrinsics)
-    return RawCamera(K=intrinsics, distortion=tuple(distortion), is_fisheye=is_fisheye)
+    own_K = torch.from_numpy(np.ascontiguousarray(K, np.float64))
+    check_intrinsics(own_K)
+    refuse_squeezed(own_K)
+    return RawCamera(K=own_K, distortion=tuple(distortion), is_fisheye=is_fisheye)
 
 
 def _pair(
@@ -328,7 +318,13 @@ class Rectifier:
         """
         for image, name in ((left, "the left image"), (right, "the right image")):
             self.refuse_other_size(image, name)
-        return _warp(left, self.left_maps), _warp(right, self.right_maps)
+        cv2 = import_opencv("rectifying a pair")
+        warped: list[Tensor] = []
+        for image, maps in ((left, self.left_maps), (right, self.right_maps)):
+            pixels = np.ascontiguousarray(image.permute(1, 2, 0).numpy())
+            cubic = torch.from_numpy(cv2.remap(pixels, *maps, cv2.INTER_CUBIC))
+            warped.append(cubic.permute(2, 0, 1).clamp(0, 1).contiguous())
+        return warped[0], warped[1]
 
     def refuse_other_size(self, image: Float32[Tensor, "3 h w"], name: str) -> None:
         """Refuse an image that is not of the calibration's size.
@@ -361,36 +357,20 @@ def make_rectifier(pair: RawPair, size: Size, keep: float = 0.0) -> Rectifier:
         raise InputError(f"--keep {keep:g}: 0 keeps what both lenses show, 1 keeps all; take 0")
     size = pair.size or size
     R, t = (part.numpy() for part in (pair.right_from_left.R, pair.right_from_left.t_m[:, None]))
-    lenses = (*_numbers(pair.left), *_numbers(pair.right))
-    flags = cv2.CALIB_ZERO_DISPARITY
+    left, right = ((one.K.numpy(), np.array(one.distortion)) for one in (pair.left, pair.right))
+    flags, make_maps = cv2.CALIB_ZERO_DISPARITY, cv2.initUndistortRectifyMap
     if pair.left.is_fisheye:
+        make_maps = cv2.fisheye.initUndistortRectifyMap
         R1, R2, P1, P2, *_ = cv2.fisheye.stereoRectify(
-            *lenses, size, R, t, flags, newImageSize=size, balance=keep
+            *left, *right, size, R, t, flags, newImageSize=size, balance=keep
         )
     else:
-        R1, R2, P1, P2, *_ = cv2.stereoRectify(*lenses, size, R, t, flags=flags, alpha=keep)
+        R1, R2, P1, P2, *_ = cv2.stereoRectify(*left, *right, size, R, t, flags=flags, alpha=keep)
     rig = camera_from_facts(facts_from_projections("the rectified pair", P1, P2, size), size)
     assert isinstance(rig, StereoRig), "two projections have a baseline"
     return Rectifier(
         rig=rig,
         rectified_from_raw=Rigid(torch.from_numpy(R1), torch.zeros(3).double()),
-        left_maps=_maps(pair.left, R1, P1, size),
-        right_maps=_maps(pair.right, R2, P2, size),
+        left_maps=make_maps(*left, R1, P1[:, :3], size, cv2.CV_32FC1),
+        right_maps=make_maps(*right, R2, P2[:, :3], size, cv2.CV_32FC1),
     )
-
-
-def _warp(image: Float32[Tensor, "3 h w"], maps: Maps) -> Float32[Tensor, "3 h w"]:
-    cv2 = import_opencv("rectifying a pair")
-    pixels = np.ascontiguousarray(image.permute(1, 2, 0).numpy())
-    warped = cv2.remap(pixels, *maps, cv2.INTER_CUBIC)
-    return torch.from_numpy(warped).permute(2, 0, 1).clamp(0, 1).contiguous()
-
-
-def _maps(camera: RawCamera, R: np.ndarray, P: np.ndarray, size: Size) -> Maps:
-    cv2 = import_opencv("rectifying a pair")
-    make = cv2.fisheye.initUndistortRectifyMap if camera.is_fisheye else cv2.initUndistortRectifyMap
-    return make(*_numbers(camera), R, P[:, :3], size, cv2.CV_32FC1)
-
-
-def _numbers(camera: RawCamera) -> tuple[np.ndarray, np.ndarray]:
-    return camera.K.numpy(), np.array(camera.distortion)

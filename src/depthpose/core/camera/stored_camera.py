@@ -107,11 +107,13 @@ class _Loader(YamlLoader):
 
 
 def _of_opencv(loader: Any, _suffix: str, node: yaml.Node) -> object:  # noqa: ANN401 - yaml's
-    if isinstance(node, yaml.MappingNode):
-        return loader.construct_mapping(node, deep=True)
-    if isinstance(node, yaml.SequenceNode):
-        return loader.construct_sequence(node, deep=True)
-    return loader.construct_scalar(node)
+    kind = {
+        yaml.MappingNode: loader.construct_mapping,
+        yaml.SequenceNode: loader.construct_sequence,
+    }
+    return (
+        kind[type(node)](node, deep=True) if type(node) in kind else loader.construct_scalar(node)
+    )
 
 
 _Loader.add_multi_constructor("tag:yaml.org,2002:opencv-", _of_opencv)
@@ -263,12 +265,19 @@ def _from_intrinsics(names: Names, distortion: tuple[float, ...]) -> CameraFacts
     if K is None:
         return _from_lengths(names, distortion)
     kind = "a camera_info of ROS" if is_ros(names) else "a camera of OpenCV"
-    right, baseline_m = matrix(names, _K_RIGHT, 9), _level_baseline(names)
-    right = K if right is None else right
-    right_x = 0.0 if baseline_m is None else -right[0, 0] * baseline_m
     facts = CameraFacts(kind=kind, K=torch.from_numpy(K), size=size_of(names))
-    if baseline_m is not None:
-        left, right = np.c_[K, [0, 0, 0]], np.c_[right, [right_x, 0, 0]]
+    T, R = numbers(names.get("t")), numbers(names.get("r"))  # of stereoCalibrate
+    if T is not None and len(T) == 3:
+        has_R = R is not None and len(R) == 9
+        is_turned = has_R and not np.allclose(R, np.eye(3).ravel(), atol=_LEVEL)
+        if is_turned or max(abs(T[1]), abs(T[2])) > _LEVEL * abs(T[0]):
+            raise InputError(
+                "R and T of a pair that is not rectified, and no P1 and P2; rectify the images by "
+                "'depthpose data rectify', or by cv2.stereoRectify and write its P1 and P2 too"
+            )
+        right = matrix(names, _K_RIGHT, 9)
+        right = K if right is None else right
+        left, right = np.c_[K, [0, 0, 0]], np.c_[right, [right[0, 0] * T[0], 0, 0]]
         facts = facts_from_projections(kind, left, right, size_of(names))
     return replace(facts, distortion=distortion, undistort=_lens_remedy(names, facts.undistort))
 
@@ -292,29 +301,11 @@ def _from_lengths(names: Names, distortion: tuple[float, ...]) -> CameraFacts | 
 
 
 def baseline_of(names: Names) -> float | None:
-    """Take ``baseline_m``.
-
-    Raises:
-        InputError: a baseline under another name, which does not say metres.
-    """
+    """Take ``baseline_m``; under another name it does not say metres, and is refused."""
     for name in names:
         if name.startswith("baseline") and name != "baselinem":
             raise InputError(f"its {name!r} may be in any unit; write baseline_m, in metres")
     return scalar(names, "baselinem")
-
-
-def _level_baseline(names: Names) -> float | None:
-    """Take T of ``stereoCalibrate`` where it is that of a rectified pair: along x alone."""
-    T, R = numbers(names.get("t")), numbers(names.get("r"))
-    if T is None or len(T) != 3:
-        return None
-    is_turned = R is not None and len(R) == 9 and not np.allclose(R, np.eye(3).ravel(), atol=_LEVEL)
-    if is_turned or max(abs(T[1]), abs(T[2])) > _LEVEL * abs(T[0]):
-        raise InputError(
-            "R and T of a pair that is not rectified, and no P1 and P2; rectify the images by "
-            "'depthpose data rectify', or by cv2.stereoRectify and write its P1 and P2 too"
-        )
-    return -T[0]
 
 
 def _lens_remedy(names: Names, of_pinhole: str) -> str:
