@@ -8,11 +8,11 @@ every time.
 """
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
-from jaxtyping import Float, Float64, Int64
+from jaxtyping import Bool, Float, Float64, Int64
 from torch import Tensor
 
 from depthpose.core.camera.pinhole import check_intrinsics
@@ -37,18 +37,6 @@ class Raster:
     depth_m: Float[Tensor, "h w"]
     primitive: Int64[Tensor, "h w"]
     barycentric: Float[Tensor, "h w 3"] | None
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class _Triangles:
-    """Triangles that may be seen, in pixels."""
-
-    edges: Float64[Tensor, "n 3 3"]  # of each corner the line opposite to it; not negative inside
-    plane: Float64[Tensor, "n 3"]  # depth, or its inverse, at (u, v, 1)
-    first: Int64[Tensor, "n 2"]  # column and row from which on each may cover pixels
-    last: Int64[Tensor, "n 2"]  # the last ones
-    number: Int64[Tensor, " n"]  # which triangle of the caller's it is
-    is_inverse: bool  # whether plane gives 1 / depth (a pinhole) or depth (parallel rays)
 
 
 def rasterize(
@@ -81,22 +69,14 @@ def rasterize(
     if not near_m > 0:
         raise InputError(f"near_m is {near_m}, but a camera sees what is in front; take 0.01")
     corners = triangles.double() @ K.to(triangles.device).mT
-    number, first, last = _pinhole_boxes(corners, (width, height), near_m)
-    raw, volume = _edges(corners.index_select(0, number))
-    scale = torch.where(volume != 0, 1 / volume, 0)
-    visible = _Triangles(
-        edges=raw * volume.sign()[:, None, None],
-        plane=raw.sum(1) * scale[:, None],
-        first=first,
-        last=last,
-        number=number,
-        is_inverse=True,
-    )
-    depth_m, primitive = _nearest(visible, (width, height), near_m)
-    barycentric = None
-    if with_barycentric:
-        barycentric = barycentric_shares(*edge_functions(triangles, K), primitive)
-    return Raster(depth_m=depth_m.to(triangles.dtype), primitive=primitive, barycentric=barycentric)
+    is_front = corners[..., 2] >= near_m
+    all_front = is_front.all(1)[:, None, None]
+    pixels = corners[..., :2] / torch.where(all_front, corners[..., 2:], 1)
+    # What crosses the plane of the camera may appear anywhere.
+    anywhere = pixels.new_tensor([[-1.0, -1.0], [0, 0], [float(width), float(height)]])
+    pixels = torch.where(all_front, pixels, anywhere)
+    raster = _draw(corners, pixels, is_front, None, width, height, near_m, with_barycentric)
+    return replace(raster, depth_m=raster.depth_m.to(triangles.dtype))
 
 
 def rasterize_orthographic(
@@ -122,23 +102,10 @@ def rasterize_orthographic(
     flat = triangles_px.double()
     nearest_m = flat[..., 2].amin() if len(flat) else flat.new_zeros(())
     corners = torch.cat([flat[..., :2], torch.ones_like(flat[..., 2:])], -1)
-    number, first, last = _boxes(flat[..., :2], (width, height))
-    raw, volume = _edges(corners.index_select(0, number))
-    scale = torch.where(volume != 0, 1 / volume, 0)[:, None, None]
     # Sorting keys are the bits of a float, which ascend for positive numbers alone.
-    above_m = (flat.index_select(0, number)[..., 2] - nearest_m)[..., None]
-    visible = _Triangles(
-        edges=raw * volume.sign()[:, None, None],
-        plane=(raw * scale * above_m).sum(1),
-        first=first,
-        last=last,
-        number=number,
-        is_inverse=False,
-    )
-    depth_m, primitive = _nearest(visible, (width, height), 0.0)
-    barycentric = barycentric_shares(*_edges(corners), primitive) if with_barycentric else None
-    depth_m = (depth_m + nearest_m).to(triangles_px.dtype)
-    return Raster(depth_m=depth_m, primitive=primitive, barycentric=barycentric)
+    above_m = flat[..., 2] - nearest_m
+    raster = _draw(corners, flat[..., :2], None, above_m, width, height, 0.0, with_barycentric)
+    return replace(raster, depth_m=(raster.depth_m + nearest_m).to(triangles_px.dtype))
 
 
 def edge_functions(
@@ -190,87 +157,74 @@ def _check(triangles: Tensor, width: int, height: int) -> None:
 def _edges(
     corners: Float64[Tensor, "n 3 3"],
 ) -> tuple[Float64[Tensor, "n 3 3"], Float64[Tensor, " n"]]:
-    """Lines opposite to the corners, and the determinant, of homogeneous pixels.
+    """Lines opposite to the corners, and the determinant, of homogeneous pixels."""
 
-    Products are rounded one by one, so that the edge two triangles share has, up to the sign, the
-    same three numbers in both: nothing shows through between them.
-    """
+    def cross(a: Tensor, b: Tensor) -> Tensor:
+        # Products are rounded one by one, so that the edge two triangles share has, up to the sign,
+        # the same three numbers in both: nothing shows through between them.
+        (ax, ay, az), (bx, by, bz) = a.unbind(-1), b.unbind(-1)
+        parts = [(ay * bz, az * by), (az * bx, ax * bz), (ax * by, ay * bx)]
+        return torch.stack([one - other for one, other in parts], -1)
+
     a, b, c = corners.unbind(1)
-    edges = torch.stack([_cross(b, c), _cross(c, a), _cross(a, b)], 1)
+    edges = torch.stack([cross(b, c), cross(c, a), cross(a, b)], 1)
     return edges, (a * edges[:, 0]).sum(-1)
 
 
-def _cross(a: Tensor, b: Tensor) -> Tensor:
-    (ax, ay, az), (bx, by, bz) = a.unbind(-1), b.unbind(-1)
-    parts = [(ay * bz, az * by), (az * bx, ax * bz), (ax * by, ay * bx)]
-    return torch.stack([one - other for one, other in parts], -1)
-
-
-def _pinhole_boxes(
-    corners: Float64[Tensor, "n 3 3"], size: tuple[int, int], near_m: float
-) -> tuple[Int64[Tensor, " m"], Int64[Tensor, "m 2"], Int64[Tensor, "m 2"]]:
-    is_front = corners[..., 2] >= near_m
-    all_front = is_front.all(1)[:, None, None]
-    pixels = corners[..., :2] / torch.where(all_front, corners[..., 2:], 1)
-    # What crosses the plane of the camera may appear anywhere.
-    anywhere = pixels.new_tensor([[-1.0, -1.0], [0, 0], [float(size[0]), float(size[1])]])
-    pixels = torch.where(all_front, pixels, anywhere)
-    number, first, last = _boxes(pixels, size)
-    is_seen = is_front[number].any(1)
-    return number[is_seen], first[is_seen], last[is_seen]
-
-
-def _boxes(
-    pixels: Float64[Tensor, "n 3 2"], size: tuple[int, int]
-) -> tuple[Int64[Tensor, " m"], Int64[Tensor, "m 2"], Int64[Tensor, "m 2"]]:
-    """Bounding boxes of those that cover a pixel centre, and the numbers of their triangles."""
-    limit = pixels.new_tensor([size[0] - 1, size[1] - 1])
+def _draw(
+    corners: Float64[Tensor, "n 3 3"],
+    pixels: Float64[Tensor, "n 3 2"],
+    is_front: Bool[Tensor, "n 3"] | None,
+    above_m: Float64[Tensor, "n 3"] | None,
+    width: int,
+    height: int,
+    near_m: float,
+    with_barycentric: bool,
+) -> Raster:
+    """Draw triangles of homogeneous pixels; by parallel rays where ``above_m`` is their depth."""
+    # Those whose box covers a pixel centre, each with its first and last column and row.
     first = pixels.amin(1).ceil().clamp(min=0)
-    last = torch.minimum(pixels.amax(1).floor(), limit)
-    number = (first <= last).all(1).nonzero()[:, 0]
-    return number, first[number].long(), last[number].long()
-
-
-def _nearest(
-    visible: _Triangles, size: tuple[int, int], near_m: float
-) -> tuple[Float64[Tensor, "h w"], Int64[Tensor, "h w"]]:
-    width, height = size
-    device = visible.edges.device
-    buffer = torch.full((width * height,), _EMPTY, dtype=torch.int64, device=device)
-    rows = visible.last[:, 1] - visible.first[:, 1] + 1
-    for part in _chunks(rows, _MAX_ROWS):
-        _draw(visible, part, buffer, width, near_m)
-    is_seen = buffer != _EMPTY
-    primitive = torch.where(is_seen, buffer & 0xFFFFFFFF, -1)
+    last = torch.minimum(pixels.amax(1).floor(), pixels.new_tensor([width - 1, height - 1]))
+    is_seen = (first <= last).all(1) & (True if is_front is None else is_front.any(1))
+    number = is_seen.nonzero()[:, 0]
+    first, last = first[number].long(), last[number].long()
+    raw, volume = _edges(corners.index_select(0, number))
+    scale = torch.where(volume != 0, 1 / volume, 0)[:, None]
+    edges = raw * volume.sign()[:, None, None]  # not negative inside
+    plane = raw.sum(1) * scale  # 1 / depth at (u, v, 1), or, of parallel rays, the depth
+    if above_m is not None:
+        plane = (raw * scale[..., None] * above_m.index_select(0, number)[..., None]).sum(1)
+    buffer = torch.full((width * height,), _EMPTY, dtype=torch.int64, device=corners.device)
+    for part in _chunks(last[:, 1] - first[:, 1] + 1, _MAX_ROWS):
+        # First the rows of some triangles, then the pixels of each row.
+        which, row = _expand(first[part, 1], last[part, 1])
+        which = which + part.start
+        v = row.double()
+        across, down, constant = edges.index_select(0, which).unbind(-1)
+        offset = torch.addcmul(constant, down, v[:, None])
+        start, stop = _span(across, offset, first[which, 0], last[which, 0])
+        kept = (start <= stop).nonzero()[:, 0]
+        which, row, start, stop, v = (
+            values.index_select(0, kept) for values in (which, row, start, stop, v)
+        )
+        slope, down, constant = plane.index_select(0, which).unbind(-1)
+        at_row = down * v + constant
+        names = number.index_select(0, which)
+        for some in _chunks(stop - start + 1, _MAX_PIXELS):
+            span, u = _expand(start[some], stop[some])
+            at_start = at_row[some].index_select(0, span)
+            value = torch.addcmul(at_start, slope[some].index_select(0, span), u)
+            depth = (1 / value if above_m is None else value.clamp(min=0)).float()
+            key = (depth.view(torch.int32).long() << 32) | names[some].index_select(0, span)
+            # Where 1 / depth is not positive, the plane is met behind the camera.
+            key = torch.where((depth >= near_m) & depth.isfinite(), key, _EMPTY)
+            buffer.scatter_reduce_(0, (row * width)[some].index_select(0, span) + u, key, "amin")
+    is_drawn = buffer != _EMPTY
+    primitive = torch.where(is_drawn, buffer & 0xFFFFFFFF, -1).reshape(height, width)
     depth_m = (buffer >> 32).int().view(torch.float32).double()
-    depth_m = torch.where(is_seen, depth_m, torch.nan)
-    return depth_m.reshape(height, width), primitive.reshape(height, width)
-
-
-def _draw(visible: _Triangles, part: slice, buffer: Tensor, width: int, near_m: float) -> None:
-    """Enter some triangles into the buffer: first their rows, then the pixels of each row."""
-    which, row = _expand(visible.first[part, 1], visible.last[part, 1])
-    which = which + part.start
-    v = row.double()
-    across, down, constant = visible.edges.index_select(0, which).unbind(-1)
-    slope, offset = across, torch.addcmul(constant, down, v[:, None])
-    start, stop = _span(slope, offset, visible.first[which, 0], visible.last[which, 0])
-    kept = (start <= stop).nonzero()[:, 0]
-    which, row, start, stop, v = (
-        values.index_select(0, kept) for values in (which, row, start, stop, v)
-    )
-    plane = visible.plane.index_select(0, which)
-    at_row = plane[:, 1] * v + plane[:, 2]
-    number = visible.number.index_select(0, which)
-    for some in _chunks(stop - start + 1, _MAX_PIXELS):
-        span, u = _expand(start[some], stop[some])
-        start_value = at_row[some].index_select(0, span)
-        value = torch.addcmul(start_value, plane[some, 0].index_select(0, span), u)
-        depth = (1 / value if visible.is_inverse else value.clamp(min=0)).float()
-        key = (depth.view(torch.int32).long() << 32) | number[some].index_select(0, span)
-        # Where 1 / depth is not positive, the plane is met behind the camera.
-        key = torch.where((depth >= near_m) & depth.isfinite(), key, _EMPTY)
-        buffer.scatter_reduce_(0, (row * width)[some].index_select(0, span) + u, key, "amin")
+    depth_m = torch.where(is_drawn, depth_m, torch.nan).reshape(height, width)
+    shares = barycentric_shares(*_edges(corners), primitive) if with_barycentric else None
+    return Raster(depth_m=depth_m, primitive=primitive, barycentric=shares)
 
 
 def _span(
