@@ -56,21 +56,16 @@ def save_checkpoint(path: Path, checkpoint: Checkpoint) -> None:
         )
     metadata = {"kind": checkpoint.kind, "config": json.dumps(dict(checkpoint.config))}
     state = {name: tensor.detach().cpu().contiguous() for name, tensor in checkpoint.state.items()}
-    # safetensors' own writer does not name a full disk.
-    write_bytes(path, _in_order(save(state, metadata={**checkpoint.facts, **metadata})))
-
-
-def _in_order(content: bytes) -> bytes:
-    """Sort the header of a safetensors file.
-
-    Its writer writes the metadata in random order, so equal weights would get different checksums.
-    """
+    content = save(state, metadata={**checkpoint.facts, **metadata})
+    # Its header has the metadata in random order, so equal weights would get different checksums.
     size = int.from_bytes(content[:8], "little")
     header = json.dumps(
         json.loads(content[8 : 8 + size]), sort_keys=True, separators=(",", ":"), ensure_ascii=False
     ).encode()
     assert len(header) <= size, "the same entries, no longer than before"
-    return b"".join([content[:8], header.ljust(size), memoryview(content)[8 + size :]])
+    # safetensors' own writer does not name a full disk.
+    rest = memoryview(content)[8 + size :]
+    write_bytes(path, b"".join([content[:8], header.ljust(size), rest]))
 
 
 def read_checkpoint(path: Path, kind: str | None = None) -> Checkpoint:
@@ -85,8 +80,7 @@ def read_checkpoint(path: Path, kind: str | None = None) -> Checkpoint:
             with numbers that are not finite.
     """
     path = Path(path)
-    with _opened_safetensors(path) as file:
-        metadata = dict(file.metadata() or {})
+    with _opened_safetensors(path) as (metadata, tensors):
         if "kind" not in metadata or "config" not in metadata:
             raise InputError(
                 f"{path}: no 'kind' and 'config' in its metadata, so no depthpose weights. A "
@@ -103,7 +97,8 @@ def read_checkpoint(path: Path, kind: str | None = None) -> Checkpoint:
             raise InputError(f"{path}: its 'config' is not JSON ({error}).") from error
         if not isinstance(config, dict):
             raise InputError(f"{path}: its 'config' is not a mapping.")
-        return Checkpoint(kind=held, config=config, state=_tensors(path, file), facts=metadata)
+        state = _finite(path, dict(tensors))
+        return Checkpoint(kind=held, config=config, state=state, facts=metadata)
 
 
 def load_weights(network: nn.Module, checkpoint: Checkpoint, source: str) -> None:
@@ -141,10 +136,7 @@ def build_network(make: Callable[[], NetworkT], checkpoint: Checkpoint, source: 
 
 
 class _WithoutDrawing(TorchFunctionMode):
-    """Draws no random weights, which are replaced anyway.
-
-    On the meta device torch would first import its compiler for that, a second and more.
-    """
+    """Draws no random weights: on the meta device torch would import its compiler for that, 1 s."""
 
     def __torch_function__(
         self,
@@ -222,8 +214,8 @@ def read_published(path: Path, network: str) -> Mapping[str, Tensor]:
     """
     path = Path(path)
     if path.suffix == ".safetensors":
-        with _opened_safetensors(path) as file:
-            return _tensors(path, file)
+        with _opened_safetensors(path) as (_, tensors):
+            return _finite(path, dict(tensors))
     content = read_torch_file(path)
     state = content.get("state_dict", content)
     if not isinstance(state, Mapping) or not all(isinstance(v, Tensor) for v in state.values()):
@@ -296,17 +288,16 @@ def file_sha256(path: Path) -> str:
 
 
 @contextmanager
-def _opened_safetensors(path: Path) -> Iterator[Any]:
-    """Open the header of a file; whatever is raised of what it holds is an input error."""
+def _opened_safetensors(
+    path: Path,
+) -> Iterator[tuple[dict[str, str], Iterator[tuple[str, Tensor]]]]:
+    """Give metadata and tensors of a file; whatever its bytes raise is an input error."""
     if not path.is_file():
         raise InputError(f"{path}: there is no such weights file.")
     remedy = "a published checkpoint is imported by 'depthpose weights import'"
     with refused_as(path, "safetensors file", remedy), safe_open(path, framework="pt") as file:
-        yield file
-
-
-def _tensors(path: Path, file: Any) -> Mapping[str, Tensor]:  # noqa: ANN401  safetensors' own
-    return _finite(path, {name: file.get_tensor(name) for name in file.keys()})  # noqa: SIM118
+        tensors = ((name, file.get_tensor(name)) for name in file.keys())  # noqa: SIM118
+        yield dict(file.metadata() or {}), tensors
 
 
 def _finite(path: Path, state: Mapping[str, Tensor]) -> Mapping[str, Tensor]:

@@ -34,7 +34,7 @@ def check_settings(config: Any, **ranges: str) -> None:  # noqa: ANN401  any dat
         for word in value if isinstance(value, tuple) else (value,):
             if word is not None:
                 refuse_unknown(name, word, words)
-    defaults = {field.name: _default_of(field) for field in dataclasses.fields(config)}
+    defaults = _defaults_of(type(config))
     for name, interval in ranges.items():
         value, default = getattr(config, name), defaults[name]
         low, high = (float(end) for end in interval[1:-1].split(", "))
@@ -61,10 +61,11 @@ def _words_of(kind: type) -> dict[str, tuple[str, ...]]:
     return words
 
 
-def _default_of(field: dataclasses.Field[Any]) -> object:
-    if field.default_factory is not dataclasses.MISSING:
-        return field.default_factory()
-    return field.default
+def _defaults_of(kind: type) -> dict[str, Any]:
+    return {
+        f.name: f.default if f.default_factory is dataclasses.MISSING else f.default_factory()
+        for f in dataclasses.fields(kind)
+    }
 
 
 def read_config(path: Path, kind: type[ConfigT]) -> ConfigT:
@@ -77,8 +78,7 @@ def read_config(path: Path, kind: type[ConfigT]) -> ConfigT:
     from depthpose.core.files.text import parse_yaml
 
     content = parse_yaml(path, read_text(path, _MAX_BYTES))
-    if content is None:
-        content = {}
+    content = {} if content is None else content
     if not isinstance(content, Mapping):
         raise InputError(
             f"{path}: holds a {type(content).__name__}, but a config is a mapping of names to "
@@ -88,18 +88,15 @@ def read_config(path: Path, kind: type[ConfigT]) -> ConfigT:
 
 
 def _over_defaults(content: Mapping[Any, Any], kind: type) -> dict[Any, Any]:
-    """Merge nested differences into the defaults of ``kind``, which may differ from their class's.
-
-    A setting given instead of another (``INSTEAD`` in its class) removes that one's default.
-    """
+    """Merge nested differences into the defaults of ``kind``."""
     laid = dict(content)
-    for field in dataclasses.fields(kind):
-        own, default = content.get(field.name), _default_of(field)
+    for name, default in _defaults_of(kind).items():
+        own = content.get(name)
         if isinstance(own, Mapping) and dataclasses.is_dataclass(default):
-            rivals = getattr(type(default), "INSTEAD", {})
-            left_out = {rivals[name] for name in own if name in rivals}
+            rivals = getattr(type(default), "INSTEAD", {})  # given, it removes the other's default
+            left_out = {rivals[key] for key in own if key in rivals}
             kept = {k: v for k, v in config_to_dict(default).items() if k not in left_out}
-            laid[field.name] = kept | _over_defaults(own, type(default))
+            laid[name] = kept | _over_defaults(own, type(default))
     return laid
 
 
@@ -116,7 +113,7 @@ def config_from_dict(content: Mapping[Any, Any], kind: type[ConfigT], *, source:
 
 def _build(content: Mapping[Any, Any], kind: type[Any], source: str, prefix: str) -> Any:  # noqa: ANN401
     hints = get_type_hints(kind)
-    defaults = {field.name: _default_of(field) for field in dataclasses.fields(kind)}
+    defaults = _defaults_of(kind)
     values: dict[str, Any] = {}
     for key, value in content.items():
         if key in getattr(kind, "RETIRED", ()):
@@ -211,20 +208,15 @@ def _shown(value: object) -> str:
 
 def config_to_dict(config: object) -> dict[str, Any]:
     """Give every setting of a config with its value, nested, ready for YAML and JSON."""
-    plain = dataclasses.asdict(config)  # pyright: ignore[reportArgumentType]
-    return {name: _plain_value(value) for name, value in plain.items()}
 
+    def plain(value: Any) -> Any:  # noqa: ANN401
+        if isinstance(value, dict):
+            return {name: plain(item) for name, item in value.items()}
+        if isinstance(value, tuple | list):
+            return [plain(item) for item in value]
+        return str(value) if isinstance(value, Path) else value
 
-def _plain_value(value: object) -> object:
-    match value:
-        case dict():
-            return {name: _plain_value(item) for name, item in value.items()}
-        case tuple() | list():
-            return [_plain_value(item) for item in value]
-        case Path():
-            return str(value)
-        case _:
-            return value
+    return plain(dataclasses.asdict(config))  # pyright: ignore[reportArgumentType]
 
 
 def write_config(path: Path, config: object) -> None:

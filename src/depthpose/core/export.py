@@ -9,8 +9,10 @@ import logging
 import warnings
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import partialmethod
 from importlib import import_module
 from importlib.metadata import version
+from itertools import count
 from pathlib import Path
 from typing import Any, Literal
 
@@ -47,29 +49,17 @@ class Value:
         """Cut out a part; numbers are lists, or values of int64."""
         return self.op("Slice", starts, ends, list(axes))
 
-    def __add__(self, other: Any) -> "Value":  # noqa: ANN401
-        return self.op("Add", other)
-
-    def __sub__(self, other: Any) -> "Value":  # noqa: ANN401
-        return self.op("Sub", other)
-
-    def __mul__(self, other: Any) -> "Value":  # noqa: ANN401
-        return self.op("Mul", other)
-
-    def __truediv__(self, other: Any) -> "Value":  # noqa: ANN401
-        return self.op("Div", other)
-
-    def __mod__(self, other: Any) -> "Value":  # noqa: ANN401
-        return self.op("Mod", other)
+    __add__ = partialmethod(op, "Add")
+    __sub__ = partialmethod(op, "Sub")
+    __mul__ = partialmethod(op, "Mul")
+    __truediv__ = partialmethod(op, "Div")
+    __mod__ = partialmethod(op, "Mod")
 
 
 class Graph:
     """Nodes in the order in which they are written.
 
     Inputs of an operator are values, arrays, or numbers: an int becomes int64, a float float64.
-
-    Raises:
-        MissingExtraError: the extra ``export`` is not installed.
     """
 
     def __init__(self) -> None:
@@ -78,28 +68,37 @@ class Graph:
         self._constants: list[Any] = []
         self._inputs: list[Any] = []
         self._outputs: list[Any] = []
-        self._number = 0
+        self._names = count(1)
 
     def input(self, name: str, dtype: type, shape: Shape) -> Value:
         """Add an input of the graph."""
-        self._inputs.append(self._described(name, dtype, shape))
+        described = self._onnx.helper.make_tensor_value_info(name, _onnx_type(dtype), list(shape))
+        self._inputs.append(described)
         return Value(self, name)
 
     def output(self, name: str, value: Value, dtype: type, shape: Shape) -> None:
         """Make a value an output of the graph."""
+        described = self._onnx.helper.make_tensor_value_info(name, _onnx_type(dtype), list(shape))
         self._nodes.append(self._onnx.helper.make_node("Identity", [value.name], [name]))
-        self._outputs.append(self._described(name, dtype, shape))
+        self._outputs.append(described)
 
     def op(self, kind: str, *inputs: Any, **attributes: Any) -> Value:  # noqa: ANN401
         """Add an operator and give its first output; None leaves an optional input out."""
-        out = self._new_name(kind)
-        names = ["" if value is None else self._name_of(value) for value in inputs]
+        out = f"{kind}_{next(self._names)}"
+        names: list[str] = []
+        for value in inputs:
+            if value is None or isinstance(value, Value):
+                names.append("" if value is None else value.name)
+                continue
+            names.append(f"constant_{next(self._names)}")
+            tensor = self._onnx.numpy_helper.from_array(np.asarray(value), names[-1])
+            self._constants.append(tensor)
         self._nodes.append(self._onnx.helper.make_node(kind, names, [out], **attributes))
         return Value(self, out)
 
     def call(self, network: Any, *inputs: Value) -> tuple[Value, ...]:  # noqa: ANN401
         """Put a whole model's nodes here and give its outputs."""
-        prefix = self._new_name("network") + "/"
+        prefix = f"network_{next(self._names)}/"
         inner = self._onnx.compose.add_prefix(network, prefix).graph
         for value, wanted in zip(inputs, inner.input, strict=True):
             node = self._onnx.helper.make_node("Identity", [value.name], [wanted.name])
@@ -122,38 +121,15 @@ class Graph:
         self._onnx.checker.check_model(model, full_check=True)
         return model
 
-    def _name_of(self, value: Any) -> str:  # noqa: ANN401
-        if isinstance(value, Value):
-            return value.name
-        name = self._new_name("constant")
-        self._constants.append(self._onnx.numpy_helper.from_array(np.asarray(value), name))
-        return name
-
-    def _new_name(self, kind: str) -> str:
-        self._number += 1
-        return f"{kind}_{self._number}"
-
-    def _described(self, name: str, dtype: type, shape: Shape) -> Any:  # noqa: ANN401
-        return self._onnx.helper.make_tensor_value_info(name, _onnx_type(dtype), list(shape))
-
 
 def _onnx_type(dtype: type) -> int:
     return import_export().helper.np_dtype_to_tensor_dtype(np.dtype(dtype))
 
 
-_PACKAGES = (
-    "onnx",
-    "onnx.compose",
-    "onnx.inliner",
-    "onnx.numpy_helper",
-    "onnxscript",
-    "onnxruntime",
-)
-
-
 def import_export() -> Any:  # noqa: ANN401  what protobuf generates carries no types
     """Import ONNX, and make sure that what goes with it is there too."""
-    for name in _PACKAGES:
+    parts = ("onnx.compose", "onnx.inliner", "onnx.numpy_helper", "onnxscript", "onnxruntime")
+    for name in ("onnx", *parts):
         import_extra(name, "onnx, onnxruntime and onnxscript", "export", "export")
     return import_module("onnx")
 
@@ -163,19 +139,12 @@ Row = dict[str, str | float]
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Case:
-    """One input and what PyTorch answers.
+    """One input and what PyTorch answers, by the names of the graph's inputs and outputs."""
 
-    Attributes:
-        name: its size, for the table.
-        inputs: by the names of the graph's inputs.
-        expected: by the names of its outputs; what is not named is not compared.
-        where: the part of an output that is compared, where it is not all of it.
-    """
-
-    name: str
+    name: str  # its size, for the table
     inputs: Mapping[str, np.ndarray]
-    expected: Mapping[str, np.ndarray]
-    where: Mapping[str, np.ndarray] = field(default_factory=dict)
+    expected: Mapping[str, np.ndarray]  # what is not named is not compared
+    where: Mapping[str, np.ndarray] = field(default_factory=dict)  # the part that is, if not all
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -213,18 +182,6 @@ def measure_differences(
     if not rows:
         raise InputError("no output is compared with PyTorch's; nothing is written. Name a case.")
     return rows
-
-
-def refuse_beyond(rows: Iterable[Row]) -> None:
-    """Raise where a difference is beyond its limit."""
-    for row in rows:
-        difference, limit = row[f"{row['limited']} difference"], row["limit"]
-        if not difference <= limit:  # pyright: ignore[reportOperatorIssue]  NaN fails too
-            raise InputError(
-                f"{row['output']} of {row['input']}: PyTorch and onnxruntime differ by "
-                f"{difference:.3g} ({row['limited']}), the limit is {limit:.3g}; nothing is "
-                "written. Install other versions of onnxscript and onnxruntime, and report this."
-            )
 
 
 def _row(case: str, output: str, answer: np.ndarray, expected: np.ndarray, limit: Limit) -> Row:
@@ -273,19 +230,12 @@ def _row(case: str, output: str, answer: np.ndarray, expected: np.ndarray, limit
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Export:
-    """What is written, and what it is compared with.
-
-    Attributes:
-        graph: writes the graph.
-        cases: makes the inputs and PyTorch's answers.
-        limits: how far each output may be off.
-        facts: for users of the file, in its metadata.
-    """
+    """What is written, and what it is compared with."""
 
     graph: Callable[[], Graph]
     cases: Callable[[], Iterable[Case]]
     limits: Mapping[str, Limit]
-    facts: Mapping[str, Any]
+    facts: Mapping[str, Any]  # for users of the file, in its metadata
 
 
 def freeze(path: Path, export: Export) -> list[Row]:
@@ -300,7 +250,15 @@ def freeze(path: Path, export: Export) -> list[Row]:
         facts = {**export.facts, "depthpose": version("depthpose")}
         onnx.save(export.graph().model(facts), str(part))
         rows = measure_differences(part, export.cases(), export.limits)
-        refuse_beyond(rows)
+        for row in rows:
+            difference, limit = row[f"{row['limited']} difference"], row["limit"]
+            if not difference <= limit:  # pyright: ignore[reportOperatorIssue]  NaN fails too
+                raise InputError(
+                    f"{row['output']} of {row['input']}: PyTorch and onnxruntime differ by "
+                    f"{difference:.3g} ({row['limited']}), the limit is {limit:.3g}; nothing is "
+                    "written. Install other versions of onnxscript and onnxruntime, and report "
+                    "this."
+                )
         runtimes = {name: version(name) for name in ("onnx", "onnxscript", "onnxruntime")}
         record = {
             "file": path.name,

@@ -334,17 +334,6 @@ class _Training:
         scaler.update()
         optimizer.zero_grad()
 
-    @torch.no_grad()
-    def _update_average(self, most: float) -> None:
-        decay = min(most, (1 + self.step) / (10 + self.step))
-        for name, module in self.task.modules.items():
-            for key, tensor in module.state_dict().items():
-                held = self.parts.average[name][key]
-                if tensor.is_floating_point():
-                    held.lerp_(tensor, 1 - decay)
-                else:
-                    held.copy_(tensor)
-
     def _load(self, states: Mapping[str, dict[str, Tensor]]) -> None:
         for name, state in states.items():
             self.task.modules[name].load_state_dict(state)
