@@ -4,8 +4,8 @@ from pathlib import Path
 
 import pytest
 
-from depthpose.core import results
-from depthpose.core.results import RESULTS, is_whole, note_result, noted_files
+from depthpose.core import run
+from depthpose.core.run import RESULTS, is_whole, note_result, noted_files
 
 
 def make(folder: Path, name: str = "a") -> list[Path]:
@@ -65,8 +65,8 @@ def test_files_are_read_again_once_after_a_copy(
 ) -> None:
     files = make(tmp_path)
     read: list[Path] = []
-    checksum = results._checksum
-    monkeypatch.setattr(results, "_checksum", lambda path: (read.append(path), checksum(path))[1])
+    checksum = run._checksum
+    monkeypatch.setattr(run, "_checksum", lambda path: (read.append(path), checksum(path))[1])
     assert is_whole(tmp_path, "a", ["a.npy"])
     assert read == [], "sizes and times are enough"
     os.utime(files[0], ns=(5, 5))

@@ -7,13 +7,14 @@ import pytest
 from depthpose.core.devices import computes_bf16, usable_device
 from depthpose.core.errors import InputError
 from depthpose.core.loop import LoopConfig, Run
-from depthpose.core.results import is_whole, note_result
 from depthpose.core.run import (
     ProcessRank,
     claim_folder,
     claim_names,
     environment,
     find_rank,
+    is_whole,
+    note_result,
     own_device,
     read_settings,
     read_sources,

@@ -14,8 +14,7 @@ from depthpose.core.camera import StereoRig, read_rig
 from depthpose.core.errors import InputError
 from depthpose.core.files import image_size, list_images, read_image
 from depthpose.core.files.disk import find_partners
-from depthpose.core.results import note_result
-from depthpose.core.run import claim_folder, claim_names, find_rank
+from depthpose.core.run import claim_folder, claim_names, find_rank, note_result
 from depthpose.depth.estimator import FakestereoNet
 from depthpose.depth.predictions import CLOUD_M, ENDINGS, is_finished, write_estimate
 from depthpose.depth.stereo import NetworkMatcher, tile_change_px

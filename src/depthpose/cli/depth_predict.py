@@ -31,12 +31,12 @@ from depthpose.core.files import (
     write_video,
 )
 from depthpose.core.files.text import read_text
-from depthpose.core.results import note_result
 from depthpose.core.run import (
     claim_folder,
     claim_names,
     environment,
     find_rank,
+    note_result,
     refuse_among_inputs,
 )
 from depthpose.depth.estimator import FakestereoNet

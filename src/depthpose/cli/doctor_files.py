@@ -27,8 +27,7 @@ from depthpose.core.files import (
     read_json,
     read_map,
 )
-from depthpose.core.files.images import opened_image, value_range
-from depthpose.core.files.maps import read_numbers
+from depthpose.core.files.images import opened_image, read_numbers, value_range
 from depthpose.pose.cloud import frame_advice
 from depthpose.pose.datasets import mask_from_rle
 from depthpose.pose.mesh import exact_diameter, mesh_suffixes, read_geometry, unit_advice

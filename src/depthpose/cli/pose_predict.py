@@ -35,7 +35,6 @@ from depthpose.cli.pose_options import DataSetOptions, OneObjectOptions
 from depthpose.core.config import config_to_dict
 from depthpose.core.errors import InputError
 from depthpose.core.files import read_image, write_cloud, write_image
-from depthpose.core.results import is_whole, note_result
 from depthpose.core.rigid import numbers_text
 from depthpose.core.run import (
     ProcessRank,
@@ -43,6 +42,8 @@ from depthpose.core.run import (
     claim_names,
     environment,
     find_rank,
+    is_whole,
+    note_result,
     read_sources,
     wait_for,
 )

@@ -14,8 +14,7 @@ from depthpose.core.config import check_settings
 from depthpose.core.errors import InputError
 from depthpose.core.files import atomic_write, write_disparity_png, write_image
 from depthpose.core.files.text import read_text
-from depthpose.core.results import is_whole, note_result
-from depthpose.core.run import claim_folder, claim_names
+from depthpose.core.run import claim_folder, claim_names, is_whole, note_result
 from depthpose.depth.datasets import Dataset
 from depthpose.depth.disparity import left_right_difference_px
 from depthpose.depth.estimator import FakestereoNet, refuse_unrectified

@@ -27,8 +27,7 @@ from depthpose.core.files import (
 )
 from depthpose.core.files.disk import write_bytes
 from depthpose.core.files.text import read_text
-from depthpose.core.results import is_whole, note_result
-from depthpose.core.run import claim_folder, claim_names
+from depthpose.core.run import claim_folder, claim_names, is_whole, note_result
 from depthpose.depth.disparity import depth_from_disparity, disparity_from_depth
 from depthpose.depth.metrics import SMALLEST_DEPTH_M
 from depthpose.depth.types import DepthEstimate, Ground, StereoInput

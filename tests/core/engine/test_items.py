@@ -6,7 +6,7 @@ from tests.core.engine.doubles import write_texts
 
 from depthpose.core.engine import Files, find_items, find_tars, local_copy
 from depthpose.core.errors import InputError
-from depthpose.core.files.store import list_files, publish_bytes, read_all
+from depthpose.core.files.disk import list_files, publish_bytes, read_all
 
 ONE = Files(roles=("text",), suffixes=(".txt",))
 TWO = Files(roles=("left", "right"), suffixes=(".txt",))

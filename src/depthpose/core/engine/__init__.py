@@ -24,6 +24,6 @@ from depthpose.core.engine.work import is_tar as is_tar
 from depthpose.core.engine.work import read_shard as read_shard
 from depthpose.core.engine.work import run_here as run_here
 from depthpose.core.engine.work import stem as stem
-from depthpose.core.files.store import absolute as absolute
-from depthpose.core.files.store import is_url as is_url
-from depthpose.core.files.store import local_copy as local_copy
+from depthpose.core.files.disk import absolute as absolute
+from depthpose.core.files.disk import is_url as is_url
+from depthpose.core.files.disk import local_copy as local_copy

@@ -33,9 +33,8 @@ from depthpose.core.engine.work import (
     read_shard,
 )
 from depthpose.core.errors import InputError, MissingExtraError, import_extra
-from depthpose.core.files import remove_parts, store
-from depthpose.core.results import is_unchanged
-from depthpose.core.run import RECORD, not_ours, refuse_other_settings, run_record
+from depthpose.core.files import disk, remove_parts
+from depthpose.core.run import RECORD, is_unchanged, not_ours, refuse_other_settings, run_record
 
 MANIFEST = "manifest.csv"
 
@@ -76,8 +75,8 @@ def run_job(job: Job, engine: Engine) -> list[Done]:
         InputError: the folder holds results of other settings or inputs, or refuses; or two
             samples of tar shards have one name.
     """
-    out = store.absolute(job.out)
-    store.refuse_unsafe(out)
+    out = disk.absolute(job.out)
+    disk.refuse_unsafe(out)
     claim(out, {**job.settings, "shards": job.form})
     blocks = make_plan(out, job.items, job.tars, job.block)
     done = _whole(out, blocks)
@@ -90,7 +89,7 @@ def run_job(job: Job, engine: Engine) -> list[Done]:
             f"{out}: {len(lost)} of {len(blocks)} shards are missing, first {lost[0]}; start "
             "again: what is finished is kept"
         )
-    if (folder := store.local_path(store.join(out, SHARDS))) is not None:
+    if (folder := disk.local_path(disk.join(out, SHARDS))) is not None:
         remove_parts(folder)  # of killed workers: all have ended
     text = io.StringIO()
     table = csv.writer(text, lineterminator="\n")
@@ -107,29 +106,29 @@ def run_job(job: Job, engine: Engine) -> list[Done]:
             seen[name] = one.shard
             table.writerow([name, one.shard, reason])
     manifest = text.getvalue().encode(errors="surrogateescape")
-    store.publish_bytes(manifest, store.join(out, MANIFEST))
+    disk.publish_bytes(manifest, disk.join(out, MANIFEST))
     return every
 
 
 def claim(out: str, settings: Mapping[str, Any]) -> None:
     """Claim a folder, local or in a store, for a run with these settings, or continue it."""
-    record = store.join(out, RECORD)
-    if store.exists(record):
+    record = disk.join(out, RECORD)
+    if disk.exists(record):
         try:
-            earlier = json.loads(store.read_from(record))
+            earlier = json.loads(disk.read_from(record))
         except ValueError as error:
             raise InputError(f"{record}: no JSON ({error}); choose another folder") from error
         refuse_other_settings(out, earlier, settings)
         return
     for name in (MANIFEST, PLAN, SHARDS):
-        if store.exists(store.join(out, name)):
-            raise not_ours(store.join(out, name))
-    store.publish_bytes(f"{json.dumps(run_record(settings), indent=2)}\n".encode(), record)
+        if disk.exists(disk.join(out, name)):
+            raise not_ours(disk.join(out, name))
+    disk.publish_bytes(f"{json.dumps(run_record(settings), indent=2)}\n".encode(), record)
 
 
 def is_job(out: str) -> bool:
     """Whether a folder holds shards of a job."""
-    return store.exists(store.join(store.absolute(out), PLAN))
+    return disk.exists(disk.join(disk.absolute(out), PLAN))
 
 
 def read_job_settings(out: str) -> dict[str, Any]:
@@ -138,9 +137,9 @@ def read_job_settings(out: str) -> dict[str, Any]:
     Raises:
         InputError: there are none.
     """
-    record = store.join(store.absolute(out), RECORD)
+    record = disk.join(disk.absolute(out), RECORD)
     try:
-        return dict(json.loads(store.read_from(record))["settings"])
+        return dict(json.loads(disk.read_from(record))["settings"])
     except (ValueError, KeyError, TypeError) as error:
         raise InputError(f"{record}: not a record of a run. Choose another folder.") from error
 
@@ -150,20 +149,20 @@ def result_items(out: str) -> list[Item]:
 
     The name changes with the record, so that a shard that was made anew is a new input.
     """
-    folder = store.join(store.absolute(out), SHARDS)
+    folder = disk.join(disk.absolute(out), SHARDS)
     items = []
     for done in read_results(out):
         # A copy changes the time of a shard, and nothing else.
         untimed = replace(done, stamp=(done.stamp[0], done.stamp[2])).to_json()
         mark = hashlib.sha256(untimed.encode()).hexdigest()[:12]
-        files = (store.join(folder, f"{done.name}.json"), store.join(folder, done.shard))
+        files = (disk.join(folder, f"{done.name}.json"), disk.join(folder, done.shard))
         items.append(Item(f"{done.name}-{mark}", files))
     return items
 
 
 def read_results(out: str) -> list[Done]:
     """Say what an earlier job left, shard by shard; nothing where there was none."""
-    return [one for _, one in sorted(_finished(store.absolute(out)).items())]
+    return [one for _, one in sorted(_finished(disk.absolute(out)).items())]
 
 
 def shard_results(out: str, done: Done) -> Iterator[tuple[str, dict[str, bytes]]]:
@@ -173,13 +172,13 @@ def shard_results(out: str, done: Done) -> Iterator[tuple[str, dict[str, bytes]]
         InputError: the shard is not there, or is damaged.
     """
     names = {name for name, reason in done.entries if not reason}
-    return read_shard(store.join(store.absolute(out), SHARDS, done.shard), names, done.endings)
+    return read_shard(disk.join(disk.absolute(out), SHARDS, done.shard), names, done.endings)
 
 
 def _finished(out: str) -> dict[str, Done]:
     """Read the records of shards; one that is damaged is as none."""
     records: dict[str, Done] = {}
-    for name, text in store.read_all(store.join(out, SHARDS), ".json").items():
+    for name, text in disk.read_all(disk.join(out, SHARDS), ".json").items():
         with suppress(ValueError, KeyError, TypeError):
             records[name.removesuffix(".json")] = Done.from_json(text)
     return records
@@ -187,12 +186,12 @@ def _finished(out: str) -> dict[str, Done]:
 
 def _whole(out: str, blocks: Sequence[Block]) -> dict[str, Done]:
     """Give what is done without failures, its shard as it was written; other records go."""
-    folder = store.join(out, SHARDS)
-    sizes, records = store.list_sizes(folder), _finished(out)
+    folder = disk.join(out, SHARDS)
+    sizes, records = disk.list_sizes(folder), _finished(out)
     done: dict[str, Done] = {}
     for block in blocks:
-        one, record = records.get(block.shard), store.join(folder, f"{block.shard}.json")
-        path = None if one is None else store.local_path(store.join(folder, one.shard))
+        one, record = records.get(block.shard), disk.join(folder, f"{block.shard}.json")
+        path = None if one is None else disk.local_path(disk.join(folder, one.shard))
         if one is None or one.block != block.checksum:
             is_whole = False
         elif path is None:  # of a store sizes alone are compared
@@ -201,12 +200,12 @@ def _whole(out: str, blocks: Sequence[Block]) -> dict[str, Done]:
             is_whole = is_unchanged(path, one.stamp)
             if is_whole and (time_ns := path.stat().st_mtime_ns) != one.stamp[1]:  # a copy
                 one = replace(one, stamp=(one.stamp[0], time_ns, one.stamp[2]))
-                store.publish_bytes(one.to_json().encode(), record)
+                disk.publish_bytes(one.to_json().encode(), record)
         if one is not None and is_whole:
             if not one.failures:
                 done[block.shard] = one
         elif f"{block.shard}.json" in sizes:
-            store.remove(record)
+            disk.remove(record)
     return done
 
 

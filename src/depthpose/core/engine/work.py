@@ -20,9 +20,9 @@ from pathlib import Path, PurePosixPath
 from typing import Any, Literal, Protocol, runtime_checkable
 
 from depthpose.core.errors import InputError, import_extra
-from depthpose.core.files import store
+from depthpose.core.files import disk
 from depthpose.core.files.disk import find_partners, refused_write
-from depthpose.core.results import file_stamp
+from depthpose.core.run import file_stamp
 
 PLAN, SHARDS = "plan.jsonl", "shards"
 ShardFormat = Literal["tar", "parquet"]
@@ -77,7 +77,7 @@ def find_items(words: Sequence[str], files: Files) -> list[Item]:
             f"{', '.join(others)}: an input has {' and '.join(files.roles)}; give a path for each "
             "of them, or one manifest"
         )
-    sides = [store.list_files(word, files.suffixes) for word in others]
+    sides = [disk.list_files(word, files.suffixes) for word in others]
     if len(files.roles) == 1:
         items += [Item(stem(url), (url,)) for side in sides for url in side]
     else:
@@ -104,7 +104,7 @@ def _read_manifest(url: str, roles: Sequence[str]) -> Iterator[Item]:
         rows: Iterable[Mapping[str, Any]] = _parquet_rows(url, "a Parquet manifest")
     else:
         try:
-            text = io.StringIO(store.read_from(url).decode("utf-8-sig"), newline="")
+            text = io.StringIO(disk.read_from(url).decode("utf-8-sig"), newline="")
             rows = list(csv.DictReader(text, strict=True))
         except (UnicodeDecodeError, csv.Error) as error:
             raise InputError(f"{url}: not a CSV table in UTF-8 ({error}); save it so") from error
@@ -118,8 +118,8 @@ def _read_manifest(url: str, roles: Sequence[str]) -> Iterator[Item]:
             )
         files = tuple(
             path
-            if store.is_url(path) or path.startswith("/")
-            else store.absolute(store.join(folder, path))
+            if disk.is_url(path) or path.startswith("/")
+            else disk.absolute(disk.join(folder, path))
             for path in (row[role] for role in roles)
         )
         name = str(row.get("name") or stem(files[0]))
@@ -129,7 +129,7 @@ def _read_manifest(url: str, roles: Sequence[str]) -> Iterator[Item]:
 
 def find_tars(words: Iterable[str]) -> list[str]:
     """List tar shards: files themselves, or those of a pattern."""
-    listed = (url for word in words for url in store.list_files(word, (".tar", ".tgz", ".gz")))
+    listed = (url for word in words for url in disk.list_files(word, (".tar", ".tgz", ".gz")))
     return list(dict.fromkeys(filter(is_tar, listed)))
 
 
@@ -161,7 +161,7 @@ def _parquet_rows(url: str, purpose: str) -> Iterator[dict[str, Any]]:
     """Read the rows of a Parquet file one by one, few at a time."""
     arrow = _import_pyarrow(purpose)
     try:
-        file = arrow.parquet.ParquetFile(io.BytesIO(store.read_from(url)))
+        file = arrow.parquet.ParquetFile(io.BytesIO(disk.read_from(url)))
         for batch in file.iter_batches(batch_size=8):
             yield from batch.to_pylist()
     except (arrow.ArrowException, OSError) as error:
@@ -201,9 +201,9 @@ def make_plan(out: str, items: Sequence[Item], tars: Sequence[str], size: int) -
     has been added to a folder since.
     """
     blocks: list[Block] = []
-    plan = store.join(out, PLAN)
+    plan = disk.join(out, PLAN)
     with suppress(ValueError, KeyError, TypeError, AttributeError):  # what is damaged, and follows
-        for line in store.read_from(plan).splitlines() if store.exists(plan) else ():
+        for line in disk.read_from(plan).splitlines() if disk.exists(plan) else ():
             blocks.append(Block.from_json(line.decode()))  # noqa: PERF401  those before the damage
     files = {item.name: item.files for block in blocks for item in block.items}
     for item in items:
@@ -220,7 +220,7 @@ def make_plan(out: str, items: Sequence[Item], tars: Sequence[str], size: int) -
         if tar not in there:
             blocks.append(Block(f"{len(blocks):06d}", tar=tar))
     if len(blocks) > known:
-        store.publish_bytes("".join(f"{b.to_json()}\n" for b in blocks).encode(), plan)
+        disk.publish_bytes("".join(f"{b.to_json()}\n" for b in blocks).encode(), plan)
     return blocks
 
 
@@ -301,7 +301,7 @@ def read_tar(url: str) -> Iterator[tuple[str, bytes]]:
     """Read the files of a tar shard, plain or compressed, from its beginning to its end."""
     seen: set[str] = set()
     try:
-        with store.opened(url) as file, tarfile.open(fileobj=file, mode="r|*") as tar:
+        with disk.opened(url) as file, tarfile.open(fileobj=file, mode="r|*") as tar:
             for member in tar:
                 if not (member.isfile() or member.isdir()):
                     raise InputError(
@@ -354,7 +354,7 @@ def _samples(block: Block, wanted: Files, scratch: Path) -> Iterator[Sample]:
     """Bring the inputs of a block here; the members of a tar shard's share a key, as neighbours."""
     for item in block.items:
         try:
-            sample = Sample(item.name, tuple(store.local_copy(url, scratch) for url in item.files))
+            sample = Sample(item.name, tuple(disk.local_copy(url, scratch) for url in item.files))
         except InputError as error:
             sample = Sample(item.name, reason=str(error))
         yield sample
@@ -428,7 +428,7 @@ class Done:
         shard: name of the shard, with its suffix.
         entries: name and "" or the reason of its failure, for each input.
         endings: that the files of a result may have.
-        stamp: size, time and checksum of the shard (``file_stamp`` of core.results).
+        stamp: size, time and checksum of the shard (``file_stamp`` of core.run).
         block: checksum of the inputs.
     """
 
@@ -473,18 +473,18 @@ class Runner:
 
         The record ``SHARD.json`` is written after the shard: where it is, the shard is whole.
         """
-        record = store.join(self._out, SHARDS, f"{block.shard}.json")
-        if store.exists(record):
-            done = Done.from_json(store.read_from(record))
+        record = disk.join(self._out, SHARDS, f"{block.shard}.json")
+        if disk.exists(record):
+            done = Done.from_json(disk.read_from(record))
             if not done.failures:
                 return done
         temporary = tempfile.TemporaryDirectory(prefix="depthpose-")
         with refused_write(temporary.name), temporary as scratch:
             file = Path(scratch) / f"{block.shard}.{self._form}"
             entries = tuple(self._write(block, file, Path(scratch)))
-            url = store.join(self._out, SHARDS, file.name)
-            store.publish(file, url)
-            stamp = tuple(file_stamp(store.local_path(url) or file))
+            url = disk.join(self._out, SHARDS, file.name)
+            disk.publish(file, url)
+            stamp = tuple(file_stamp(disk.local_path(url) or file))
         done = Done(
             shard=file.name,
             entries=entries,
@@ -492,7 +492,7 @@ class Runner:
             stamp=stamp,
             block=block.checksum,
         )
-        store.publish_bytes(done.to_json().encode(), record)
+        disk.publish_bytes(done.to_json().encode(), record)
         return done
 
     def _write(self, block: Block, file: Path, scratch: Path) -> Iterator[tuple[str, str]]:

@@ -14,8 +14,8 @@ from jaxtyping import Float32
 from torch import Tensor
 
 from depthpose.core.errors import InputError, import_open3d
-from depthpose.core.files.disk import AnyPath, refused_as, refused_suffix, write_bytes
-from depthpose.core.files.maps import read_npy, to_float32
+from depthpose.core.files.disk import AnyPath, read_bytes, refused_as, refused_suffix, write_bytes
+from depthpose.core.files.images import read_npy, to_float32
 from depthpose.core.files.points import (
     Columns,
     encode_pcd,
@@ -26,7 +26,6 @@ from depthpose.core.files.points import (
     read_ply,
     unpack_rgb,
 )
-from depthpose.core.files.store import read_bytes
 from depthpose.core.files.text import MAX_TEXT_BYTES
 
 _ENCODERS = {".ply": encode_ply, ".pcd": encode_pcd}
@@ -126,7 +125,17 @@ def _from_columns(path: AnyPath, columns: Columns) -> Cloud:
     if missing and columns:
         raise InputError(f"{path}: no {missing} among the columns {list(columns)}; name them x y z")
     points = np.stack([to_float32(columns[n]) for n in "xyz"], -1) if columns else np.empty((0, 3))
-    return _finite_cloud(path, to_float32(points), _color(path, columns))
+    packed, color = columns.get("rgb", columns.get("rgba")), None
+    if packed is not None and packed.dtype.itemsize == 4:
+        color = to_float32(unpack_rgb(packed)) / np.float32(255)
+    elif columns.keys() >= set(_COLOR):
+        color = np.stack([columns[name] for name in _COLOR], -1)
+        if color.dtype.kind != "f":
+            color = color / np.iinfo(color.dtype).max
+        if not ((color >= 0) & (color <= 1)).all():
+            raise InputError(f"{path}: colours beyond [0, 1]; store floats in [0, 1], or uchar")
+        color = to_float32(color)
+    return _finite_cloud(path, to_float32(points), color)
 
 
 def _from_rows(path: AnyPath, table: np.ndarray) -> Cloud:
@@ -151,20 +160,6 @@ def _from_rows(path: AnyPath, table: np.ndarray) -> Cloud:
     counts = (steps > 0).all() and ((steps == 1).all() or not is_whole[1:4].any())
     first = int(is_long and counts)
     return _finite_cloud(path, to_float32(table[:, first : first + 3]), None)
-
-
-def _color(path: AnyPath, columns: Columns) -> np.ndarray | None:
-    packed = columns.get("rgb", columns.get("rgba"))
-    if packed is not None and packed.dtype.itemsize == 4:
-        return to_float32(unpack_rgb(packed)) / np.float32(255)
-    if not columns.keys() >= set(_COLOR):
-        return None
-    color = np.stack([columns[name] for name in _COLOR], -1)
-    if color.dtype.kind != "f":
-        color = color / np.iinfo(color.dtype).max
-    if not ((color >= 0) & (color <= 1)).all():
-        raise InputError(f"{path}: colours beyond [0, 1]; store floats in [0, 1], or uchar")
-    return to_float32(color)
 
 
 def _finite_cloud(path: AnyPath, points: np.ndarray, color: np.ndarray | None) -> Cloud:

@@ -14,8 +14,7 @@ from typing import Any
 import numpy as np
 
 from depthpose.core.errors import InputError
-from depthpose.core.files.disk import AnyPath, refused_as
-from depthpose.core.files.store import read_bytes
+from depthpose.core.files.disk import AnyPath, read_bytes, refused_as
 from depthpose.core.files.text import MAX_TEXT_BYTES
 
 _WORDS = re.compile(r"[-+]?(?:nan\(\w*\)|1[.,]#(?:QNAN|SNAN|IND|INF)\w*)")
@@ -78,12 +77,21 @@ def split_rows(path: AnyPath, rows: Iterator[str], fields: list[Field], count: i
     width = sum(f.count for f in fields)
     if count and table.shape[1] != width:
         raise InputError(f"{path}: rows of {table.shape[1]} values where {width} are declared")
+    columns: Columns = {}
     starts = accumulate((f.count for f in fields), initial=0)
-    return {
-        f.name: _as_type(path, table[:, start], f)
-        for f, start in zip(fields, starts, strict=False)
-        if count
-    }
+    for f, start in zip(fields if count else (), starts, strict=False):
+        column, dtype = table[:, start], np.dtype(f.code)
+        if dtype.kind != "f":
+            limits = np.iinfo(dtype)
+            if not ((column >= limits.min) & (column <= limits.max)).all():
+                raise InputError(
+                    f"{path}: {f.name!r} holds a value outside {dtype.name}; correct it"
+                )
+            # As floats, 64-bit limits round up to what does not fit: those columns stay floats.
+            dtype = column.dtype if dtype.itemsize == 8 else dtype
+        with np.errstate(over="ignore"):
+            columns[f.name] = column.astype(dtype)
+    return columns
 
 
 def _truncated(path: AnyPath, what: str, rows: int) -> InputError:
@@ -108,18 +116,6 @@ def need_bytes(path: AnyPath, have: int, need: int, what: str) -> None:
         )
 
 
-def _as_type(path: AnyPath, column: np.ndarray, field: Field) -> np.ndarray:
-    dtype = np.dtype(field.code)
-    if dtype.kind == "f":
-        with np.errstate(over="ignore"):
-            return column.astype(dtype)
-    limits = np.iinfo(dtype)
-    if not ((column >= limits.min) & (column <= limits.max)).all():
-        raise InputError(f"{path}: {field.name!r} holds a value outside {dtype.name}; correct it")
-    # As floats, 64-bit limits round up to what does not fit: those columns stay floats.
-    return column if dtype.itemsize == 8 else column.astype(dtype)
-
-
 _CODES = {
     **{"char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4", "uint": "u4"},
     **{"int8": "i1", "uint8": "u1", "int16": "i2", "uint16": "u2", "int32": "i4", "uint32": "u4"},
@@ -130,8 +126,7 @@ _MAX_HEADER = 2**16
 _END = re.compile(rb"(?:^|[\r\n])end_header[ \t]*(?:\r\n|\n|\r)")
 
 
-_MOST_RUNS = 500_000
-"""Most runs of equally long binary lists (each run is read at once); more take over ten seconds."""
+_MOST_RUNS = 500_000  # of equally long binary lists, each read at once; more take over 10 s
 
 
 @dataclass(kw_only=True)
@@ -153,7 +148,6 @@ def read_ply_elements(path: AnyPath, last: str | None = None) -> tuple[Columns, 
     if not data.startswith(b"ply") or end is None:
         raise InputError(f"{path}: no PLY header ('ply' ... 'end_header'); is it a PLY file?")
     order, elements = _parse_header(path, data[: end.start()].decode("latin-1").splitlines())
-    _refuse_vertices(path, elements)
     body = memoryview(data)[end.end() :]
     rows = None if order else text_rows(path, body)
     columns: Columns = {}
@@ -300,10 +294,6 @@ def _parse_header(path: AnyPath, lines: list[str]) -> tuple[str, list[_Element]]
                 )
     if order is None:
         raise InputError(f"{path}: the PLY header names no format; use {', '.join(_ORDERS)} 1.0")
-    return order, elements
-
-
-def _refuse_vertices(path: AnyPath, elements: list[_Element]) -> None:
     names = [e.name for e in elements]
     if names.count("vertex") != 1:
         raise InputError(f"{path}: elements {names}, where exactly one 'vertex' is needed")
@@ -315,6 +305,7 @@ def _refuse_vertices(path: AnyPath, elements: list[_Element]) -> None:
                 f"{path}: {one.name} properties {properties} are none, a list or repeat a name; "
                 "give each vertex x, y and z"
             )
+    return order, elements
 
 
 _PCD_CODES = {
@@ -322,24 +313,19 @@ _PCD_CODES = {
     **{("I", size): f"i{size}" for size in "1248"},
     **{("U", size): f"u{size}" for size in "1248"},
 }
-_MAX_PCD_HEADER = 2**16
-_MAX_PACKED, _MAX_UNPACKED = 2**25, 2**27
-"""Largest compressed points, unpacked byte by byte: eight million points."""
+_MAX_PACKED, _MAX_UNPACKED = 2**25, 2**27  # of compressed points: eight million, byte by byte
 _DATA = re.compile(rb"(?:^|\n)DATA[ \t]+(ascii|binary|binary_compressed)[ \t]*(?:\r\n|\n)")
 
 
 def read_pcd(path: AnyPath) -> Columns:
     """Read the columns of a PCD file; ``rgb`` stays packed."""
     data = read_bytes(path)
-    end = _DATA.search(data, 0, _MAX_PCD_HEADER)
+    end = _DATA.search(data, 0, _MAX_HEADER)
     if end is None:
         raise InputError(f"{path}: no PCD header ('FIELDS' ... 'DATA'); is it a PCD file?")
-    lines = (
-        line.split()
-        for line in (data[: end.start()].decode("latin-1")).splitlines()
-        if not line.startswith("#")
-    )
-    header = {words[0]: words[1:] for words in lines if words}
+    lines = data[: end.start()].decode("latin-1").splitlines()
+    rows = (line.split() for line in lines if not line.startswith("#"))
+    header = {words[0]: words[1:] for words in rows if words}
     fields = _parse_fields(path, header)
     match header.get("POINTS"), header.get("WIDTH"), header.get("HEIGHT"):
         case [points], _, _ if _is_count(points):
@@ -397,12 +383,12 @@ def decompress_lzf(packed: memoryview, size: int) -> bytes:
             out += packed[at : at + control + 1]
             at += control + 1
             continue
-        length = control >> 5
-        if length == 7:
-            length += _byte(packed, at)
-            at += 1
-        start = len(out) - ((control & 31) << 8) - _byte(packed, at) - 1
-        at += 1
+        more = (control >> 5) // 7  # bytes of the length that follow
+        if at + more >= len(packed):
+            raise ValueError("the compressed bytes end in the middle of a reference")
+        length = (control >> 5) + more * packed[at]
+        start = len(out) - ((control & 31) << 8) - packed[at + more] - 1
+        at += more + 1
         if start < 0:
             raise ValueError("the compressed bytes refer to before their beginning")
         piece = out[start : start + length + 2]  # shorter where source and target overlap
@@ -410,12 +396,6 @@ def decompress_lzf(packed: memoryview, size: int) -> bytes:
     if len(out) != size or at > len(packed):
         raise ValueError(f"the compressed bytes do not unpack to {size}")
     return bytes(out)
-
-
-def _byte(packed: memoryview, at: int) -> int:
-    if at >= len(packed):
-        raise ValueError("the compressed bytes end in the middle of a reference")
-    return packed[at]
 
 
 def _split_compressed(path: AnyPath, body: memoryview, fields: list[Field], count: int) -> Columns:

@@ -10,8 +10,7 @@ from typing import Any, NoReturn
 import yaml
 
 from depthpose.core.errors import InputError
-from depthpose.core.files.disk import AnyPath, refused_as, write_bytes
-from depthpose.core.files.store import read_bytes
+from depthpose.core.files.disk import AnyPath, read_bytes, refused_as, write_bytes
 
 MAX_TEXT_BYTES = 2**26
 """Largest text: a table of a million points, annotations of ten thousand images."""
@@ -77,12 +76,22 @@ def read_json(path: AnyPath) -> object:
     data = read_bytes(path)
     refuse_heavy(path, data, _OF_JSON)
     text = _decoded(path, data)
+
+    def once_each(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+        seen: dict[str, Any] = {}
+        for key, value in pairs:
+            if key in seen:
+                raise ValueError(f"key {key!r} is given twice")
+            seen[key] = value
+        return seen
+
+    def finite(word: str) -> float:
+        value = float(word)
+        return value if math.isfinite(value) else refuse_number(word)
+
     with refused_as(path, "JSON file", "correct it there"):
         return json.loads(
-            text,
-            parse_constant=refuse_number,
-            parse_float=_finite,
-            object_pairs_hook=_once_each,
+            text, parse_constant=refuse_number, parse_float=finite, object_pairs_hook=once_each
         )
 
 
@@ -105,13 +114,10 @@ def parse_yaml(path: AnyPath, text: str) -> object:
 
 
 def refuse_yaml_bomb(path: AnyPath, text: str) -> None:
-    """Refuse YAML that refers to itself, is too deep, or grows beyond all bounds by references.
-
-    What is no YAML passes: the parser refuses it.
-    """
+    """Refuse YAML that refers to itself, is too deep, or grows beyond all bounds by references."""
     sizes: dict[str, int] = {}
     unfinished: list[tuple[str | None, int]] = []
-    with suppress(yaml.YAMLError):
+    with suppress(yaml.YAMLError):  # what is no YAML the parser refuses
         for event in yaml.parse(text, YamlLoader):
             anchor, size = getattr(event, "anchor", None), 0
             match event:
@@ -187,17 +193,3 @@ def read_key_values(path: AnyPath) -> dict[str, list[float]]:
 def refuse_number(text: str) -> NoReturn:
     """Refuse NaN and infinity, which Python's parser of JSON would take."""
     raise ValueError(f"{text} is not a JSON number")
-
-
-def _finite(text: str) -> float:
-    value = float(text)
-    return value if math.isfinite(value) else refuse_number(text)
-
-
-def _once_each(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-    seen: dict[str, Any] = {}
-    for key, value in pairs:
-        if key in seen:
-            raise ValueError(f"key {key!r} is given twice")
-        seen[key] = value
-    return seen

@@ -30,10 +30,9 @@ from depthpose.core.files import (
     write_image,
     write_json,
 )
-from depthpose.core.files.disk import write_bytes
+from depthpose.core.files.disk import SOURCE, write_bytes
 from depthpose.core.files.images import LISTED_SUFFIXES
-from depthpose.core.files.store import SOURCE
-from depthpose.core.results import is_whole, note_result
+from depthpose.core.run import is_whole, note_result
 from depthpose.depth.datasets.frames import Frame
 
 INDEX = "index.json"
@@ -118,7 +117,7 @@ def local_folder(folder: Path | str) -> Path:
 
 def _fetch_small(url: str, here: Path) -> None:
     """Fetch calibration and, last, the index."""
-    from depthpose.core.files.store import exists, fetch, join, list_tree  # fsspec takes time
+    from depthpose.core.files.disk import exists, fetch, join, list_tree  # fsspec takes time
 
     if not exists(join(url, INDEX)):
         raise InputError(f"{url}: holds no {INDEX}; 'depthpose data pack' makes one")
