@@ -187,17 +187,15 @@ def _list_of(value: object, hints: tuple[Any, ...], source: str, name: str) -> l
 
 
 def _number_of(value: Any, source: str, name: str) -> float:  # noqa: ANN401
-    said = f"{source}: {name} is {_shown(value)}, but a"
+    what = "finite number is needed: write one, or leave the key out for the default"
     try:
         number = float("none" if isinstance(value, bool) else value)
     except OverflowError:
         number = math.inf
     except (TypeError, ValueError):
-        raise InputError(f"{said} number is needed: write one") from None
+        number, what = math.nan, "number is needed: write one"
     if not math.isfinite(number):
-        raise InputError(
-            f"{said} finite number is needed: write one, or leave the key out for the default"
-        )
+        raise InputError(f"{source}: {name} is {_shown(value)}, but a {what}")
     return number
 
 

@@ -17,8 +17,7 @@ _NEAR_TO_FAR = (
 )  # fmt: skip
 _INVALID = (0.5, 0.5, 0.5)
 _DIMMED = 0.35  # brightness of a picture under points
-_LEAST_GAP = 0.08
-"""Least distance of two marks on a bar, as a share of its length: nearer ones would touch."""
+_LEAST_GAP = 0.08  # of two marks on a bar, as a share of its length: nearer ones would touch
 
 
 @dataclass(frozen=True, kw_only=True)

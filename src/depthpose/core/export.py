@@ -26,8 +26,7 @@ from depthpose.core.files import atomic_write, write_json
 from depthpose.core.run import environment, refuse_to_replace
 
 OPSET = 18
-Shape = Sequence[int | str]
-"""Sides of a tensor; text names a side that is known only when the graph runs."""
+Shape = Sequence[int | str]  # text names a side that is known only when the graph runs
 
 
 class Value:
@@ -277,8 +276,7 @@ def proof_path(path: Path) -> Path:
     return path.with_suffix(".proof.json")
 
 
-MOST = 1 << 10
-"""Largest multiple of a side that is given to the exporter; the graph itself has no bound."""
+MOST = 1 << 10  # multiple of a side for the exporter; the graph itself has no bound
 
 
 def network_model(module: nn.Module, images: Sequence[Tensor], multiple: int) -> Any:  # noqa: ANN401

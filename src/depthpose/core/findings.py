@@ -1,5 +1,6 @@
 """What the check of a folder finds: everything wrong, a line each."""
 
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -65,10 +66,7 @@ def make_report(layout: str, counts: dict[str, int], remarks: list[Problem]) -> 
 def unreadable(path: Path, error: InputError) -> Problem:
     """Say that a file cannot be read, and why: a Git LFS pointer is the commonest reason."""
     message = str(error).removeprefix(f"{path}: ")
-    try:
-        with path.open("rb") as file:
-            if file.read(len(_LFS_POINTER)) == _LFS_POINTER:
-                message = "is a Git LFS pointer, not the file; run 'git lfs pull' at its source"
-    except OSError:
-        pass
+    with suppress(OSError), path.open("rb") as file:
+        if file.read(len(_LFS_POINTER)) == _LFS_POINTER:
+            message = "is a Git LFS pointer, not the file; run 'git lfs pull' at its source"
     return Problem(path=path, kind="unreadable", message=message)

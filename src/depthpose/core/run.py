@@ -47,8 +47,7 @@ def write_once(record: Path, content: Mapping[str, Any]) -> None:
         own.unlink(missing_ok=True)
 
 
-_locks: dict[Path, int] = {}
-"""Records of the folders that this process writes to, locked, and their descriptors."""
+_locks: dict[Path, int] = {}  # records of the folders that are locked, and their descriptors
 
 
 def lock_folder(record: Path, *, is_shared: bool, timeout_s: float = 10.0) -> bool:

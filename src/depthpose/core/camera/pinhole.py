@@ -234,32 +234,24 @@ KNOWN_FILES = (
 )
 """Formats of camera files, for errors."""
 
-OPTIONAL_KEYS = ("depth_unit_m", "mount_height_m", "tilt_deg")
-"""What any camera may have beside its matrix."""
+OPTIONAL_KEYS = ("depth_unit_m", "mount_height_m", "tilt_deg")  # beside the matrix
 
 _NORMALISED_FX = 2
 _MM_FX_SHARE = 0.1  # a focal length below a tenth of the width sees 157 degrees: no pinhole does
 _MAX_FX_SHARE = 200
-_LEAST_UNIT_M = 1e-6
-"""Smallest unit of depth images: with a smaller one, 16 bits would end before 7 cm."""
-_FILE_BASELINE_M = 5.0
-"""Common rigs in millimetres or centimetres (50 to 120 mm) pass as a plane's, never in a file."""
-WIDE_BASELINE_M = 2.0
-"""Wider than cars' rigs; centimetres, or squares of a board, in a file that names no unit."""
+_LEAST_UNIT_M = 1e-6  # of depth images: with a smaller unit 16 bits would end before 7 cm
+_FILE_BASELINE_M = 5.0  # rigs of 50 to 120, in mm or cm, pass as a plane's, never in a file
+WIDE_BASELINE_M = 2.0  # wider than cars' rigs: cm, or squares of a board, where no unit is named
 _LEAST_FILE_BASELINE_M = 1e-3
 _MAX_CM = 30  # a longer baseline, less the unit, is in millimetres
 _SAME_FOCAL = 1e-3
 _SAME_ROW_PX = 0.5
 SAME_DIFFERENCE_PX = 1.0
-_MAX_SQUEEZE = 1.8
-"""Largest ratio of fx to fy, or fy to fx; KITTI's images squeezed to 512x256 have 1.66."""
+_MAX_SQUEEZE = 1.8  # of fx to fy, or fy to fx; KITTI's images squeezed to 512x256 have 1.66
 _NO_DISTORTION = 1e-8
-_OFF_CENTRE = 0.1
-"""Share of the size by which a principal point may leave the centre; KITTI's stays below 0.04."""
-_SAME_SHARE = 0.05
-"""Largest difference of the two shares (along x and y) that still means another resolution."""
-_QUARTER = 0.25
-"""Share of the size beyond which a point off the centre is doubted, whatever its direction."""
+_OFF_CENTRE = 0.1  # share of the size that a principal point may be off; KITTI's is below 0.04
+_SAME_SHARE = 0.05  # of two shares (along x, along y) that still mean another resolution
+_QUARTER = 0.25  # share of the size beyond which a point off the centre is doubted anyway
 _CORNER = 0.1
 
 

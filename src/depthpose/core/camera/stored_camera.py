@@ -23,8 +23,7 @@ from depthpose.core.files import AnyPath, read_text
 from depthpose.core.files.disk import refused_as
 from depthpose.core.files.text import MAX_LIST_BYTES, YamlLoader, refuse_yaml_bomb
 
-Names = dict[str, Any]
-"""Values by name; names in small letters and digits alone, for everyone spells them otherwise."""
+Names = dict[str, Any]  # values by name; names in small letters and digits alone
 
 _YAML_HEAD = re.compile(r"\A\s*%YAML[^\n]*\n")
 _DECLARATION = re.compile(r"<!(?!--)")
@@ -151,17 +150,31 @@ def facts_from_names(names: Names) -> CameraFacts | None:
     if settings is not None:
         return _from_settings(names, settings)
     left, right = published(names, _P, 12), matrix(names, ("p2",), 12)
-    distortion = lens_of(names)
+    distortion, undistort = lens_of(names), _RECTIFY
+    kind = "a camera_info of ROS" if is_ros(names) else "a camera of OpenCV"
     if right is not None:
         facts = facts_from_projections("a rig of OpenCV", _need(left, "P1"), right, size_of(names))
-        return replace(facts, distortion=distortion, undistort=_RECTIFY)
-    Q = matrix(names, ("q",), 16)
-    if Q is not None:
-        facts = _from_reprojection(Q, size_of(names))
-        return replace(facts, distortion=distortion, undistort=_RECTIFY)
-    if left is not None and left[0, 0] != 0:
-        return _from_projection(names, left, distortion)
-    return _from_intrinsics(names, distortion)
+    elif (Q := matrix(names, ("q",), 16)) is not None:
+        # (x, y, z, w) = Q (u, v, disparity, 1), with Q[3, 2] = 1 / baseline.
+        with np.errstate(all="ignore"):
+            baseline_m = float(1 / Q[3, 2])
+        facts = CameraFacts(
+            kind="a rig of OpenCV",
+            K=intrinsics(Q[2, 3], Q[2, 3], -Q[0, 3], -Q[1, 3]),
+            size=size_of(names),
+            baseline_m=baseline_m,
+            cx_right_minus_left_px=float(Q[3, 3]) * baseline_m,
+        )
+    elif left is not None and left[0, 0] != 0:
+        if left[0, 3] == 0 and left[1, 3] == 0:  # of a single camera
+            undistort = _lens_remedy(names, _UNDISTORT_P)
+            facts = facts_from_projections(kind, left, None, size_of(names))
+        else:  # of the right one of a pair: Tx = -fx B
+            first = np.c_[left[:, :3], [0, 0, 0]]
+            facts = facts_from_projections(kind, first, left, size_of(names))
+    else:
+        return _from_intrinsics(names, kind, distortion)
+    return replace(facts, distortion=distortion, undistort=undistort)
 
 
 def is_ros(names: Names) -> bool:
@@ -217,19 +230,6 @@ def _from_settings(names: Names, who: str) -> CameraFacts:
     )
 
 
-def _from_projection(names: Names, P: np.ndarray, distortion: tuple[float, ...]) -> CameraFacts:
-    """One ``camera_info``: of a single camera, or of the right one of a pair (``Tx = -fx B``)."""
-    kind, size = "a camera_info of ROS" if is_ros(names) else "a camera of OpenCV", size_of(names)
-    if P[0, 3] == 0 and P[1, 3] == 0:
-        facts = facts_from_projections(kind, P, None, size)
-        return replace(facts, distortion=distortion, undistort=_lens_remedy(names, _UNDISTORT_P))
-    left = P.copy()
-    left[:, 3] = 0
-    return replace(
-        facts_from_projections(kind, left, P, size), distortion=distortion, undistort=_RECTIFY
-    )
-
-
 def facts_from_ros_pair(first: Names, second: Names) -> CameraFacts:
     """Take the two cameras of a pair; the left one is that without ``Tx``."""
     P, other = (_need(published(names, _P, 12), "projection_matrix") for names in (first, second))
@@ -246,25 +246,10 @@ def facts_from_ros_pair(first: Names, second: Names) -> CameraFacts:
     return replace(facts, distortion=(*lens_of(first), *lens_of(second)), undistort=_RECTIFY)
 
 
-def _from_reprojection(Q: np.ndarray, size: Size | None) -> CameraFacts:
-    """OpenCV's Q: ``(x, y, z, w) = Q (u, v, disparity, 1)``, with ``Q[3, 2] = 1 / baseline``."""
-    with np.errstate(all="ignore"):
-        baseline_m = float(1 / Q[3, 2])
-    f, cx, cy = Q[2, 3], -Q[0, 3], -Q[1, 3]
-    return CameraFacts(
-        kind="a rig of OpenCV",
-        K=intrinsics(f, f, cx, cy),
-        size=size,
-        baseline_m=baseline_m,
-        cx_right_minus_left_px=float(Q[3, 3]) * baseline_m,
-    )
-
-
-def _from_intrinsics(names: Names, distortion: tuple[float, ...]) -> CameraFacts | None:
+def _from_intrinsics(names: Names, kind: str, distortion: tuple[float, ...]) -> CameraFacts | None:
     K = published(names, _K, 9)
     if K is None:
         return _from_lengths(names, distortion)
-    kind = "a camera_info of ROS" if is_ros(names) else "a camera of OpenCV"
     facts = CameraFacts(kind=kind, K=torch.from_numpy(K), size=size_of(names))
     T, R = numbers(names.get("t")), numbers(names.get("r"))  # of stereoCalibrate
     if T is not None and len(T) == 3:

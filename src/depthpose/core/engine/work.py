@@ -26,8 +26,7 @@ from depthpose.core.run import file_stamp
 
 PLAN, SHARDS = "plan.jsonl", "shards"
 ShardFormat = Literal["tar", "parquet"]
-_GROUP_BYTES = 64 * 2**20
-"""Size from which on the rows so far are written as one row group of Parquet."""
+_GROUP_BYTES = 64 * 2**20  # from which on the rows so far are one row group of Parquet
 
 
 @dataclass(frozen=True, slots=True)

@@ -23,7 +23,7 @@ from depthpose.core.files.points import (
     parse_rows,
     plain_numbers,
     read_pcd,
-    read_ply,
+    read_ply_elements,
     unpack_rgb,
 )
 from depthpose.core.files.text import MAX_TEXT_BYTES
@@ -253,7 +253,7 @@ def _blank_separated(path: AnyPath, head: list[str], names: list[str]) -> Callab
 
 
 CLOUD_READERS: dict[str, Callable[[AnyPath], Cloud]] = {
-    ".ply": lambda path: _from_columns(path, read_ply(path)),
+    ".ply": lambda path: _from_columns(path, read_ply_elements(path, "vertex")[0]),
     ".pcd": lambda path: _from_columns(path, read_pcd(path)),
     ".npy": lambda path: _from_rows(path, read_npy(path)),
     ".xyz": _read_text,

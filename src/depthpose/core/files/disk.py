@@ -225,8 +225,7 @@ def _without_shared(texts: list[str]) -> list[str]:
     return [re.sub(r"\d+", lambda found: str(int(found[0])), text) for text in texts]
 
 
-SOURCE = "source.json"
-"""Beside shards that are fetched when they are first read: ``{"url": ...}``, where from."""
+SOURCE = "source.json"  # beside shards fetched when first read: {"url": ...}, where from
 _STORES = ("s3", "s3a", "gs", "gcs", "az", "abfs", "abfss")
 """Stores in which an upload appears whole or not at all."""
 

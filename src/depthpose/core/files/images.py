@@ -33,8 +33,7 @@ LISTED_SUFFIXES = (*WRITTEN_SUFFIXES, ".tif", ".tiff", ".bmp", ".ppm", ".pgm", "
 FAST_PNG = {"compress_level": 1}
 """Four times faster than zlib's usual 6 and a third larger at most: at 6, writing the pictures of
 an estimate took as long as the estimate."""
-MAX_PIXELS = 2**25
-"""A small file may declare any size; this many pixels are 0.4 GB of floats, before any work."""
+MAX_PIXELS = 2**25  # 0.4 GB of floats; a small file may declare any size
 
 # Named one by one: Pillow also opens formats that start other programs.
 _FORMATS = ("PNG", "JPEG", "BMP", "PPM", "TIFF", "WEBP", "GIF")
@@ -268,8 +267,7 @@ def _rgb_or_grey(path: AnyPath, image: Image.Image) -> np.ndarray:
 _EXIF_IFD = 0x8769
 _FOCAL_MM, _FOCAL_35MM = 0x920A, 0xA405
 _RESOLUTION, _RESOLUTION_UNIT, _PIXELS = 0xA20E, 0xA210, 0xA002
-_MM = {2: 25.4, 3: 10.0, 4: 1.0, 5: 0.001}
-"""Millimetres of each unit of resolution: inch, centimetre, millimetre, micrometre."""
+_MM = {2: 25.4, 3: 10.0, 4: 1.0, 5: 0.001}  # of a unit of resolution: inch, cm, mm, micrometre
 _DIAGONAL_MM = math.hypot(36, 24)
 
 

@@ -136,11 +136,6 @@ class _Element:
     fields: list[Field] = field(default_factory=list)
 
 
-def read_ply(path: AnyPath) -> Columns:
-    """Read the columns of the ``vertex`` element alone."""
-    return read_ply_elements(path, "vertex")[0]
-
-
 def read_ply_elements(path: AnyPath, last: str | None = None) -> tuple[Columns, dict[str, Ragged]]:
     """Read the columns of the ``vertex`` element, and the lists of the others."""
     data = read_bytes(path)

@@ -12,11 +12,9 @@ import yaml
 from depthpose.core.errors import InputError
 from depthpose.core.files.disk import AnyPath, read_bytes, refused_as, write_bytes
 
-MAX_TEXT_BYTES = 2**26
-"""Largest text: a table of a million points, annotations of ten thousand images."""
+MAX_TEXT_BYTES = 2**26  # a table of a million points, annotations of ten thousand images
 MAX_LIST_BYTES = 2**20  # largest text that lists a few numbers: a calibration, a camera, a config
-_MOST_MEMORY = 700_000_000
-"""Memory [bytes] that JSON or YAML may take once it is read, estimated by counting its signs."""
+_MOST_MEMORY = 700_000_000  # [bytes] of JSON or YAML once it is read, by counting its signs
 _MOST_DEPTH = 50
 _MOST_VALUES = 2_000_000  # most values of YAML whose references are written out
 _PLAIN: type[Any] = getattr(yaml, "CSafeLoader", yaml.SafeLoader)

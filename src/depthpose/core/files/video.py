@@ -18,8 +18,7 @@ from depthpose.core.files.disk import AnyPath, atomic_write, refused_suffix
 VIDEO_SUFFIXES = (".mp4", ".avi", ".mov", ".mkv", ".webm", ".m4v")
 """Files that are taken for a video."""
 
-_CODECS = {".mp4": "vp09", ".avi": "MJPG"}
-"""VP9: what OpenCV's own wheels encode (they have no H.264) and current browsers play."""
+_CODECS = {".mp4": "vp09", ".avi": "MJPG"}  # VP9: OpenCV's own wheels have no H.264
 
 
 @dataclass(frozen=True, kw_only=True)
