@@ -108,7 +108,7 @@ def _middlebury_facts(path: AnyPath) -> CameraFacts:
 
 
 def plain_facts(path: AnyPath, keys: Mapping[str, list[float]]) -> CameraFacts:
-    """Take the keys, a line each: :data:`_PLAIN_KEYS` where they are given, the others always."""
+    """Take the keys, a line each: ``_PLAIN_KEYS`` where they are given, the others always."""
     wanted = ("focal_px", "cx", "cy", "baseline_m", *(key for key in _PLAIN_KEYS if key in keys))
     said = {key: _number(path, keys, key) for key in wanted}
     focal_px = said["focal_px"]

@@ -326,7 +326,7 @@ class Sample:
     Attributes:
         name: that of its results.
         files: local paths, in the order of the roles.
-        reason: why there are none; a :data:`Function` is given no such sample.
+        reason: why there are none; a ``Function`` is given no such sample.
     """
 
     name: str
