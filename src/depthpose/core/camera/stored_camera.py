@@ -253,8 +253,8 @@ def _from_intrinsics(names: Names, kind: str, distortion: tuple[float, ...]) -> 
     facts = CameraFacts(kind=kind, K=torch.from_numpy(K), size=size_of(names))
     T, R = numbers(names.get("t")), numbers(names.get("r"))  # of stereoCalibrate
     if T is not None and len(T) == 3:
-        has_R = R is not None and len(R) == 9
-        is_turned = has_R and not np.allclose(R, np.eye(3).ravel(), atol=_LEVEL)
+        eye = np.eye(3).ravel()
+        is_turned = R is not None and len(R) == 9 and not np.allclose(R, eye, atol=_LEVEL)
         if is_turned or max(abs(T[1]), abs(T[2])) > _LEVEL * abs(T[0]):
             raise InputError(
                 "R and T of a pair that is not rectified, and no P1 and P2; rectify the images by "

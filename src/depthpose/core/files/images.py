@@ -78,21 +78,22 @@ def picture_tensor(image: Image.Image, name: AnyPath) -> Float32[Tensor, "3 h w"
 def _decoded(name: AnyPath, image: Image.Image) -> np.ndarray:
     """Give RGB or grey, upright, of 8 or 16 bits."""
     turn, parts = _UPRIGHT.get(_orientation(image)), [image]
-    file = getattr(image, "fp", None)
-    tiles = [] if file is None else getattr(image, "tile", None) or []
+    file: Any = getattr(image, "fp", None)
+    tiles: Any = [] if file is None else getattr(image, "tile", None) or []
     raws = [tile.args if isinstance(tile.args, str) else tile.args[0] for tile in tiles]
     if raws and all(re.fullmatch("RGBA?;16[BLN]", str(raw)) for raw in raws):
         # Pillow keeps the upper byte of a colour; opened again, bytes exchanged, the lower one.
         at = file.tell()
         file.seek(0)
-        parts.append(Image.open(BytesIO(file.read()), formats=_FORMATS))
+        other = Image.open(BytesIO(file.read()), formats=_FORMATS)
         file.seek(at)
         little = "LN" if sys.byteorder == "little" else "L"
         swapped = [raw[:-1] + ("B" if raw[-1] in little else "L") for raw in raws]
-        parts[1].tile = [
+        other.tile = [
             tile._replace(args=raw if isinstance(tile.args, str) else (raw, *tile.args[1:]))
             for tile, raw in zip(tiles, swapped, strict=True)
         ]
+        parts.append(other)
     elif raws and image.format == "PPM" and image.mode == "RGB" and tiles[0].codec_name == "ppm":
         most = tiles[0].args[1] if isinstance(tiles[0].args, tuple) else 255
         if most > 255:  # of which Pillow keeps 8 bits too
