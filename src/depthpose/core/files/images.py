@@ -78,14 +78,15 @@ def picture_tensor(image: Image.Image, name: AnyPath) -> Float32[Tensor, "3 h w"
 def _decoded(name: AnyPath, image: Image.Image) -> np.ndarray:
     """Give RGB or grey, upright, of 8 or 16 bits."""
     turn, parts = _UPRIGHT.get(_orientation(image)), [image]
-    file: Any = getattr(image, "fp", None)
-    tiles: Any = [] if file is None else getattr(image, "tile", None) or []
+    opened: Any = image  # a picture that is not of a file has neither
+    tiles = [] if getattr(image, "fp", None) is None else getattr(image, "tile", None) or []
     raws = [tile.args if isinstance(tile.args, str) else tile.args[0] for tile in tiles]
     if raws and all(re.fullmatch("RGBA?;16[BLN]", str(raw)) for raw in raws):
         # Pillow keeps the upper byte of a colour; opened again, bytes exchanged, the lower one.
+        file = opened.fp
         at = file.tell()
         file.seek(0)
-        other = Image.open(BytesIO(file.read()), formats=_FORMATS)
+        other: Any = Image.open(BytesIO(file.read()), formats=_FORMATS)
         file.seek(at)
         little = "LN" if sys.byteorder == "little" else "L"
         swapped = [raw[:-1] + ("B" if raw[-1] in little else "L") for raw in raws]
@@ -97,8 +98,8 @@ def _decoded(name: AnyPath, image: Image.Image) -> np.ndarray:
     elif raws and image.format == "PPM" and image.mode == "RGB" and tiles[0].codec_name == "ppm":
         most = tiles[0].args[1] if isinstance(tiles[0].args, tuple) else 255
         if most > 255:  # of which Pillow keeps 8 bits too
-            file.seek(tiles[0].offset)
-            values = np.frombuffer(file.read(6 * image.width * image.height), ">u2")
+            opened.fp.seek(tiles[0].offset)
+            values = np.frombuffer(opened.fp.read(6 * image.width * image.height), ">u2")
             whole = values.reshape(image.height, image.width, 3).astype(np.float64)
             return (whole * (65535 / most)).round().clip(0, 65535).astype(np.uint16)
     pixels, *low = (
