@@ -22,7 +22,7 @@ from tests.pages.read_page import read_page
 from tests.synthetic_street import make_street
 
 from depthpose.cli import main
-from depthpose.cli.depth_match import list_pairs
+from depthpose.cli.depth_predict import list_pairs
 from depthpose.cli.train import Lines
 from depthpose.core.checkpoint import find_weights, read_checkpoint
 from depthpose.core.draw import draw_depth
@@ -811,5 +811,5 @@ def test_confidence_of_an_earlier_method_does_not_stay(
 def test_pairs_in_folders_go_by_name(tmp_path: Path) -> None:
     for name in ("left/x/1.png", "left/y/0.png", "right/0.png", "right/1.png"):
         write_image(tmp_path / name, torch.rand(3, 20, 30))
-    lefts, rights = list_pairs(str(tmp_path / "left/*/*.png"), str(tmp_path / "right"))
-    assert [path.stem for path in lefts] == [path.stem for path in rights] == ["1", "0"]
+    pairs = list_pairs(str(tmp_path / "left/*/*.png"), str(tmp_path / "right"))
+    assert [(left.stem, right.stem) for left, right in pairs] == [("1", "1"), ("0", "0")]

@@ -27,7 +27,7 @@ from tests.test_cli_depth import write_doubtful_pairs
 from tests.test_cli_pose_predict import oracle_weights
 
 from depthpose.cli import engine, main
-from depthpose.cli.depth_ray import PAIRS
+from depthpose.cli.depth_predict import PAIRS
 from depthpose.core.engine import find_items
 from depthpose.core.errors import InputError
 from depthpose.core.files import (

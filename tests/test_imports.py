@@ -39,7 +39,7 @@ def test_the_command_line_loads_nothing_heavy() -> None:
 
 
 def test_a_command_loads_its_own_networks_alone() -> None:
-    loaded = modules_after("import depthpose.cli.depth, depthpose.cli.depth_match")
+    loaded = modules_after("import depthpose.cli.depth, depthpose.cli.depth_predict")
     assert "depthpose.depth.estimator" in loaded
     assert not {name for name in loaded if name.startswith("depthpose.pose")}
     loaded = modules_after("import depthpose.cli.pose, depthpose.cli.pose_frames")

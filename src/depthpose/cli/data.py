@@ -353,21 +353,20 @@ def rectify(
     """
     from tqdm import tqdm
 
-    from depthpose.cli.depth_match import list_pairs
+    from depthpose.cli.depth_predict import list_pairs
     from depthpose.core.camera import make_rectifier, write_camera
     from depthpose.core.files import image_size, write_image
     from depthpose.core.run import claim_folder, claim_names
 
     calibration = rectifying.read(camera)
-    lefts, rights = list_pairs(left, right)
+    pairs = list_pairs(left, right)
     homes = {(out / side).resolve() for side in _SIDES}
-    if any(path.parent.resolve() in homes for path in (*lefts, *rights)):
+    if any(path.parent.resolve() in homes for pair in pairs for path in pair):
         raise InputError(
             f"--out {out}: the inputs lie in its left or right, where the results would be written "
             "over them; choose another folder"
         )
-    rectifier = make_rectifier(calibration, image_size(lefts[0]), rectifying.keep)
-    pairs = list(zip(lefts, rights, strict=True))
+    rectifier = make_rectifier(calibration, image_size(pairs[0][0]), rectifying.keep)
     _check_rows(rectifier, pairs, is_refused=rectifying.check)
     settings = {
         "command": "data rectify",
@@ -381,7 +380,7 @@ def rectify(
             "is_fisheye": camera_of_side.is_fisheye,
         }
     claim_folder(out, settings, [*_SIDES, "camera.json"])
-    claim_names(out, {first.stem: (first, second) for first, second in pairs})
+    claim_names(out, {pair[0].stem: pair for pair in pairs})
     for first, second in tqdm(pairs, unit=" pairs", leave=False, disable=None):
         for side, image in zip(_SIDES, _rectified(rectifier, first, second), strict=True):
             write_image(out / side / f"{first.stem}.png", image)

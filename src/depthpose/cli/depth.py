@@ -1,6 +1,7 @@
 """``depthpose depth ...``."""
 
 import re
+from collections.abc import Sequence
 from pathlib import Path
 
 import tyro
@@ -50,8 +51,8 @@ def predict(
         images: images, folders of them, quoted patterns such as 'left/*.png', or videos.
         out: folder for the results.
     """
+    from depthpose.cli import depth_predict as work
     from depthpose.cli.depth_methods import MethodSource
-    from depthpose.cli.depth_predict import find_sources, predict_all, read_lens
 
     if not images:
         raise InputError("name images, folders of them, patterns or videos to predict from")
@@ -66,15 +67,20 @@ def predict(
     )
     refuse_unusable(scale, networks, matching, output)
     if engine.is_ray:
-        from depthpose.cli.depth_ray import predict_on_ray
+        work.refuse_videos(images)
+        method = method.packed()
 
-        return predict_on_ray(images, lens, scale, method.packed(), output, out, engine)
-    sources = find_sources(images, Path(out))
-    known = read_lens(lens, sources, scale)
-    built = method.build()
+    def work_of(sources: Sequence[Path]) -> work.DepthWork:
+        known = work.read_lens(lens, sources, scale)
+        return work.DepthWork(method=method, lens=known, output=output)
+
+    if engine.is_ray:
+        return work.estimate_by_engine(images, work.IMAGES, work_of, out, engine)
+    sources = work.find_sources(images, Path(out))
+    this, built = work_of(sources), method.build()
     if built.settings.get("answer") == "own":
         matching.refuse_matcher_options()
-    return predict_all(sources, known, built, Path(out), output)
+    return work.estimate_all([(path,) for path in sources], this, built, Path(out))
 
 
 def match(
@@ -107,8 +113,10 @@ def match(
             Middlebury, ROS or OpenCV; for ROS and OpenCV also a folder with both cameras' files.
         out: folder for the results.
     """
-    from depthpose.cli.depth_match import Pairs, match_all, say_tile_change
+    from depthpose.cli import depth_predict as work
     from depthpose.cli.depth_methods import MethodSource
+    from depthpose.core.camera import read_rig
+    from depthpose.core.files import image_size
     from depthpose.core.run import refuse_among_inputs
 
     method = MethodSource(weights=pairs.used, config=matching.config, with_right=True, use="pairs")
@@ -117,22 +125,27 @@ def match(
             "--device, --speed, --precision, --max-memory, --tile and --left-right-check are for "
             "matchers with weights; sgbm takes none."
         )
-    if engine.is_ray:
-        from depthpose.cli.depth_ray import match_on_ray
+    method = method.packed() if engine.is_ray else method
 
+    def work_of(files: Sequence[Path]) -> work.DepthWork:
+        lens = work.Lens(camera=read_rig(camera, image_size(files[0])))
+        output = PredictOutput(cloud=pairs.cloud)
+        return work.DepthWork(
+            method=method, lens=lens, output=output, with_check=pairs.check, files=work.PAIRS
+        )
+
+    if engine.is_ray:
         sides = [left] if right is None else [left, right]
-        return match_on_ray(
-            sides, camera, method.packed(), out, engine,
-            with_cloud=pairs.cloud, with_check=pairs.check,
-        )  # fmt: skip
+        return work.estimate_by_engine(sides, work.PAIRS, work_of, out, engine)
     if right is None:
         raise InputError(f"{left}: there is no right image beside it; give it second")
-    files = Pairs.find(left, right, camera)
-    refuse_among_inputs(Path(out), (left, right), (*files.left, *files.right))
+    files = work.list_pairs(left, right)
+    this = work_of(files[0])
+    refuse_among_inputs(Path(out), (left, right), [path for pair in files for path in pair])
     built = method.build()
     if matching.tile is not None:
-        say_tile_change(files, built)
-    return match_all(files, built, Path(out), with_cloud=pairs.cloud, with_check=pairs.check)
+        work.say_tile_change(this.lens.input_of(files[0][0].stem, *files[0]), built)
+    return work.estimate_all(files, this, built, Path(out))
 
 
 def evaluate(

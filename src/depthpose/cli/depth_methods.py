@@ -75,11 +75,8 @@ class MethodSource:
                 f"{path}: matches pairs, but depth from one image is asked for. Give weights that "
                 "synthesise the right view."
             )
-        facts: dict[str, Any] = {
-            "matcher": kind,
-            "weights": path.stem,
-            "weights_sha256": file_sha256(path),
-        }
+        facts: dict[str, Any] = {"matcher": kind, "weights": path.stem}
+        facts["weights_sha256"] = file_sha256(path)
         if not is_matcher:
             facts["input"] = "both views" if with_right else "left view"
         own, matcher, answer = config_to_dict(config), None, self.answer
@@ -87,8 +84,7 @@ class MethodSource:
             name = path.stem + ("-both" if with_right and not is_matcher else "")
             name += "" if answer is None else f"-{answer}"
         else:  # OpenCV, or other weights, match the view of the generator
-            other = self.matcher
-            answer = "matched"
+            other, answer = self.matcher, "matched"
             if self.matcher == "sgbm":
                 sgbm = SGBMConfig(with_filled_holes=True)
                 matcher, own = SGBMMatcher(sgbm), {**own, **config_to_dict(sgbm)}
@@ -97,13 +93,9 @@ class MethodSource:
                 other, facts["matcher_sha256"] = matcher.stem, file_sha256(matcher)
             name, facts["matcher"] = f"{path.stem}-{other}", f"{kind} with {other}"
         net = FakestereoNet.load(
-            path,
-            matcher=matcher,
-            config=config,
-            answer=answer,
-            allow_ood=self.allow_ood,
+            path, matcher=matcher, config=config, answer=answer, allow_ood=self.allow_ood,
             use=self.use,
-        )
+        )  # fmt: skip
         if with_right and net.matcher is None:
             raise InputError(
                 f"{path}: answers depth of one image, and holds no matcher, which a pair needs. "
@@ -122,9 +114,8 @@ class MethodSource:
                 "file of both by 'depthpose weights pack G --matcher S --trained-on DATA --licence "
                 "L --out W'"
             )
-        if not isinstance(self.weights, str):
-            return self
-        return replace(self, weights=Weights.read(self.weights))
+        is_named = isinstance(self.weights, str)
+        return replace(self, weights=Weights.read(self.weights)) if is_named else self
 
     def settings(self) -> dict[str, Any]:
         """Say what decides the results; this machine need not have the workers' device."""
@@ -133,23 +124,18 @@ class MethodSource:
 
 
 def named_method(word: str, config: MatcherConfig) -> Method:
-    """Build the method of a name: weights by file or name, perhaps with ``both:`` and the like.
-
-    ``own:NAME``, ``matched:NAME`` and ``joined:NAME`` say what depth of one image comes from,
-    ``quick:NAME`` and ``fine:NAME`` how much time the match of a real pair may take.
-    """
+    """Build the method of a name: weights by file or name, perhaps with ``both:`` and the like."""
     how, _, name = word.rpartition(":")
-    if how in get_args(Answer):
-        answer = cast("Answer", how)
-        return MethodSource(weights=name, config=config, with_right=False, answer=answer).build()
+    source = MethodSource(weights=name, config=config, with_right=how not in get_args(Answer))
+    if how in get_args(Answer):  # what depth of one image comes from
+        return replace(source, answer=cast("Answer", how)).build()
     if how == "both":
-        return MethodSource(weights=name, config=config, with_right=True).build()
-    if how in get_args(Speed):
-        config = replace(config, speed=how)
-        method = MethodSource(weights=name, config=config, with_right=True).build()
+        return source.build()
+    if how in get_args(Speed):  # how much time the match of a real pair may take
+        method = replace(source, config=replace(config, speed=how)).build()
         return method._replace(name=f"{method.name}-{how}")
     if how == "sgbm":
-        return MethodSource(weights=name, config=config, with_right=False, matcher="sgbm").build()
+        return replace(source, with_right=False, matcher="sgbm").build()
     return MethodSource(weights=word, config=config).build()
 
 

@@ -1,11 +1,12 @@
-"""The work behind ``depthpose depth predict``."""
+"""The work behind ``depthpose depth predict`` and ``depth match``, here or by an engine."""
 
 import re
 import sys
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass, field, replace
+from functools import partial
 from itertools import islice
 from pathlib import Path
 from typing import Any
@@ -14,11 +15,13 @@ import torch
 from torch import Tensor
 from tqdm import tqdm
 
-from depthpose.cli.depth_methods import Method
+from depthpose.cli.depth_methods import Method, MethodSource
 from depthpose.cli.depth_options import LensOptions, PredictOutput, ScaleOptions
+from depthpose.cli.engine import EngineOptions, Inputs, say
 from depthpose.core.camera import Camera, FieldOfView, StereoRig, camera_of, read_camera
 from depthpose.core.camera.pinhole import camera_keys
 from depthpose.core.draw import draw_depth
+from depthpose.core.engine import Files, Function, Sample
 from depthpose.core.errors import InputError
 from depthpose.core.files import (
     VIDEO_SUFFIXES,
@@ -30,6 +33,8 @@ from depthpose.core.files import (
     read_video,
     write_video,
 )
+from depthpose.core.files.disk import find_partners
+from depthpose.core.files.images import LISTED_SUFFIXES
 from depthpose.core.files.text import read_text
 from depthpose.core.run import (
     claim_folder,
@@ -41,44 +46,63 @@ from depthpose.core.run import (
 )
 from depthpose.depth.estimator import FakestereoNet
 from depthpose.depth.ground import scale_by_distance
-from depthpose.depth.predictions import (
-    CLOUD_M,
-    COLOR_RANGE_M,
-    ENDINGS,
-    is_finished,
-    read_estimate,
-    write_estimate,
-)
+from depthpose.depth.predictions import CLOUD_M, ENDINGS, is_finished, read_estimate, write_estimate
+from depthpose.depth.stereo import NetworkMatcher, tile_change_px
 from depthpose.depth.types import StereoInput
 from depthpose.report.depth import DepthShown, depth_section
 from depthpose.report.page import MOST_VIEWS, Film, Section, spread_evenly, write_page
 from depthpose.report.viewer import Viewer, open_viewer
 
-PAGE = "report.html"
+IMAGES = Files(roles=("image",), suffixes=LISTED_SUFFIXES)
+PAIRS = Files(roles=("left", "right"), suffixes=LISTED_SUFFIXES)
+_PAGE = "report.html"
 _VIDEO = ".color.mp4"
 _SAME_FOCAL = 0.01
+Named = Iterable[tuple[str, Callable[[], StereoInput]]]
+"""Names of inputs, and how each is read."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Lens:
-    """What is known of the camera, and what sets the scale."""
+    """What is known of the camera of images, or the rig of pairs, and what sets the scale."""
 
     camera: Camera | FieldOfView | float
-    scale: ScaleOptions
+    scale: ScaleOptions = field(default_factory=ScaleOptions)
 
-    def camera_of(self, image: Tensor) -> Camera:
-        """Make the camera of an image."""
+    def input_of(self, name: str, left: Tensor | Path, right: Path | None = None) -> StereoInput:
+        """Make the input of an image or a pair, read already or not."""
+        image = read_image(left) if isinstance(left, Path) else left
         camera = camera_of(self.camera, (image.shape[2], image.shape[1]))
         assert camera is not None
         mount = {"mount_height_m": self.scale.camera_height, "tilt_deg": self.scale.camera_tilt}
-        return replace(camera, **{key: value for key, value in mount.items() if value is not None})
+        camera = replace(camera, **{key: v for key, v in mount.items() if v is not None})
+        other = None if right is None else read_image(right)
+        return StereoInput(name=name, left=image, right=other, camera=camera)
+
+    def inputs_of(self, files: Sequence[Path]) -> Iterator[tuple[str, Callable[[], StereoInput]]]:
+        """Give the one input of an image or a pair, or every frame of a video."""
+        if not _is_video(files[0]):
+            yield files[0].stem, partial(self.input_of, files[0].stem, *files)
+            return
+        for name, frame in read_video(files[0]):
+            yield name, partial(self.input_of, name, frame)
+
+    def facts(self) -> dict[str, Any]:
+        """Give what decides depth, as JSON values, for the record of a run."""
+        known: dict[str, Any] = {"focal_px": self.camera}
+        if isinstance(self.camera, FieldOfView):
+            known = {"fov_deg": self.camera.degrees}
+        elif isinstance(self.camera, StereoRig):
+            known = {"K": self.camera.K.tolist(), "baseline_m": self.camera.baseline_m}
+            known["cx_right_minus_left_px"] = self.camera.cx_right_minus_left_px
+        elif isinstance(self.camera, Camera):
+            keys = camera_keys(self.camera)
+            known = {key: keys[key] for key in ("K", "mount_height_m", "tilt_deg") if key in keys}
+        return known | {key: v for key, v in asdict(self.scale).items() if v is not None}
 
 
 def read_lens(options: LensOptions, sources: Sequence[Path], scale: ScaleOptions) -> Lens:
-    """Read what the user knows of the camera; where its file says no size, that of the images.
-
-    Without any of it the EXIF of the images is asked.
-    """
+    """Read what the user knows of the camera; without any of it the EXIF of the images is asked."""
     focal_px, fov = options.focal_px, options.fov
     named = {"--camera": options.camera, "--focal-px": focal_px, "--fov": fov}
     words = [word for word, value in named.items() if value is not None]
@@ -91,7 +115,7 @@ def read_lens(options: LensOptions, sources: Sequence[Path], scale: ScaleOptions
     if options.camera is None:
         focal_px = _exif_of_all(sources) if focal_px is None else focal_px
         return Lens(camera=focal_px, scale=scale)
-    size = None
+    size = None  # of the images, for a camera file that says none
     for source in sources:
         with suppress(InputError):  # an image that cannot be read fails by itself, later
             if _is_video(source):
@@ -112,12 +136,10 @@ def _exif_of_all(sources: Sequence[Path]) -> float:
     """Read the focal length that the EXIF of all images says, and say it."""
     known: dict[str, tuple[float, str]] = {}
     for source in sources:
-        focal = None
-        if not _is_video(source):
-            try:
-                focal = read_exif_focal(source)
-            except InputError:  # what cannot be read fails by itself, later
-                continue
+        try:
+            focal = None if _is_video(source) else read_exif_focal(source)
+        except InputError:  # what cannot be read fails by itself, later
+            continue
         if focal is None:
             raise InputError(
                 f"metres from one image need its focal length, and {source.name} has none in its "
@@ -130,12 +152,12 @@ def _exif_of_all(sources: Sequence[Path]) -> float:
             "no image can be read; give --camera, --focal-px or --fov, and intact ones"
         )
     (first, (focal_px, tags)), *others = known.items()
-    other = next((one for one in others if abs(one[1][0] / focal_px - 1) > _SAME_FOCAL), None)
-    if other is not None:
-        raise InputError(
-            f"the EXIF of {first} says a focal length of {focal_px:.0f} px and that of {other[0]} "
-            f"{other[1][0]:.0f} px; predict them apart"
-        )
+    for other, (other_px, _) in others:
+        if abs(other_px / focal_px - 1) > _SAME_FOCAL:
+            raise InputError(
+                f"the EXIF of {first} says a focal length of {focal_px:.0f} px and that of {other} "
+                f"{other_px:.0f} px; predict them apart"
+            )
     print(f"a focal length of {focal_px:.0f} px, by the EXIF of {first} ({tags}); of a cropped "
           "picture it is another", file=sys.stderr)  # fmt: skip
     return focal_px
@@ -150,66 +172,142 @@ def find_sources(words: Sequence[str], out: Path) -> list[Path]:
     twice = next((stem for stem, times in stems.items() if times > 1), None)
     if twice is not None:
         raise InputError(f"two inputs are called {twice!r}, and so would their results be.")
-    frames = [re.fullmatch(re.escape(path.stem) + r"_\d{6}", stem) for path in sources
-              if _is_video(path) for stem in stems]  # fmt: skip
-    if (frame := next(filter(None, frames), None)) is not None:
-        raise InputError(
-            f"an input is called {frame[0]!r}, as a frame of a video would be, and so would their "
-            "results; rename one of the two"
-        )
+    for video in filter(_is_video, sources):
+        frame = next((stem for stem in stems if _frame_of(video, stem)), None)
+        if frame is not None:
+            raise InputError(
+                f"an input is called {frame!r}, as a frame of a video would be, and so would their "
+                "results; rename one of the two"
+            )
     refuse_among_inputs(out, words, sources)
     return sources
 
 
-def predict_all(
-    sources: list[Path], lens: Lens, method: Method, out: Path, output: PredictOutput
+def refuse_videos(words: Sequence[str]) -> None:
+    """Refuse videos, which workers take none of."""
+    video = next((word for word in words if _is_video(Path(word))), None)
+    if video is not None:
+        raise InputError(f"{video}: --engine ray takes no videos; omit --engine for them")
+
+
+def _frame_of(video: Path, name: str) -> bool:
+    """Whether a frame of a video has this name."""
+    return re.fullmatch(re.escape(video.stem) + r"_\d{6}", name) is not None
+
+
+def _is_video(path: Path) -> bool:
+    return path.suffix.lower() in VIDEO_SUFFIXES
+
+
+def list_pairs(left: str, right: str) -> list[tuple[Path, Path]]:
+    """List the images of both sides, paired by their names or the numbers in them."""
+    lefts, rights = list_images(left), list_images(right)
+    stems, others = ([path.stem for path in side] for side in (lefts, rights))
+    if len(set(stems)) != len(stems):
+        twice = next(stem for stem in stems if stems.count(stem) > 1)
+        raise InputError(f"{left}: two images are called {twice!r}, so would their results.")
+    if (lefts, rights) != ([Path(left)], [Path(right)]):
+        rights = [rights[k] for k in find_partners(stems, others, f"{left} and {right}")]
+    return list(zip(lefts, rights, strict=True))
+
+
+def say_tile_change(pair: StereoInput, method: Method) -> None:
+    """Print how far tiles move the disparity of a pair from that of the whole image."""
+    assert pair.right is not None
+    assert isinstance(method.net, FakestereoNet)
+    if not isinstance(method.net.matcher, NetworkMatcher):
+        raise InputError(f"--tile: {method.name} matches no tiles; omit --tile")
+    change_px = tile_change_px(method.net.matcher, pair.left, pair.right, pair.camera)
+    print(f"tiles change the disparity of {pair.name} by {change_px:.4f} px on average")
+
+
+@dataclass(frozen=True, kw_only=True)
+class DepthWork:
+    """Images or pairs to the files of their depth, in this process or by workers of an engine."""
+
+    method: MethodSource
+    lens: Lens
+    output: PredictOutput
+    with_check: bool = True
+    files: Files = IMAGES
+    endings: Sequence[str] = ENDINGS
+
+    @property
+    def batch(self) -> int:
+        """Images that go through the networks together."""
+        return self.output.batch
+
+    def settings(self, method: dict[str, Any]) -> dict[str, Any]:
+        """Give what decides the results, as JSON values, for the record of a run."""
+        own = {} if self.files == PAIRS else {"color_range_m": list(self.output.color_range)}
+        return {**method, "camera": self.lens.facts(), **own}
+
+    def start(self) -> Function:
+        """Build the networks."""
+        method = self.method.build()
+
+        def estimate(samples: Sequence[Sample], out: Path) -> list[str]:
+            predictor = Predictor(self, method, out)
+            named = [
+                (one.name, partial(self.lens.input_of, one.name, *map(Path, one.files)))
+                for one in samples
+            ]
+            predictor.predict(named, len(samples), "images")
+            return [str(predictor.failures.get(sample.name, "")) for sample in samples]
+
+        return estimate
+
+
+def estimate_by_engine(
+    words: Sequence[str],
+    files: Files,
+    work_of: Callable[[Sequence[Path]], DepthWork],
+    out: str,
+    engine: EngineOptions,
 ) -> int:
-    """Predict what is not finished; an image that fails is named and stops no other."""
-    claim_folder(out, settings_of(method.settings, lens, output), [PAGE])
-    videos = [source.stem for source in sources if _is_video(source)]
+    """Estimate images or pairs, manifests or tar shards, by the workers of an engine."""
+    inputs = Inputs.find(words, files)
+    with inputs.first() as first:
+        work = work_of(first)
+    settings = work.settings(work.method.settings())
+    what = "pairs" if files == PAIRS else "depth maps"
+    return say(engine.run(work, inputs, out, settings), out, what)
+
+
+def estimate_all(
+    sources: Sequence[tuple[Path, ...]], work: DepthWork, method: Method, out: Path
+) -> int:
+    """Estimate what is not finished; an input that fails is named and stops no other."""
+    claim_folder(out, work.settings(method.settings), [_PAGE])
+    videos = [files[0].stem for files in sources if _is_video(files[0])]
     endings = [f".{end}" for end in ENDINGS] + [_VIDEO]
-    claim_names(out, {source.stem: source for source in sources}, endings, videos)
+    claim_names(out, {files[0].stem: files for files in sources}, endings, videos)
     mine = [sources[k] for k in find_rank().share(len(sources))]
-    assert isinstance(method.net, FakestereoNet), "weights build no other"
-    with open_viewer(None if find_rank().rank else output.view) as viewer:
-        predictor = Predictor(lens=lens, net=method.net, out=out, output=output, viewer=viewer)
-        images = {path.stem: path for path in mine if not _is_video(path)}
-        frames = predictor.read_images(images)
-        done = len(predictor.predict(frames, len(images), "images"))
-        for path in filter(_is_video, mine):
-            done += predictor.predict_video(path)
+    with open_viewer(None if find_rank().rank else work.output.view) as viewer:
+        predictor = Predictor(work, method, out, viewer)
+        stills = [files for files in mine if not _is_video(files[0])]
+        named = (one for files in stills for one in work.lens.inputs_of(files))
+        done = len(predictor.predict(named, len(stills), "images"))
+        done += sum(predictor.predict_video(video) for video, *_ in mine if _is_video(video))
     failures = list(predictor.failures.values())
     if failures and not done and len(sources) == 1:
         raise failures[0]
     for failure in failures:
         print(f"depthpose: failed: {failure}", file=sys.stderr)
-    print(f"{done} depth maps are in {out}")
-    if find_rank().rank == 0:  # the page of what is finished: others may still be at work
-        finished = {source: _finished_names(source, out) for source in sources}
-
-        def read(names: Sequence[str]) -> Iterator[StereoInput]:
-            for source in sources:
-                wanted = [name for name in finished[source] if name in names]
-                with suppress(InputError):
-                    for name, image in _read_some(source, wanted):
-                        camera = lens.camera_of(image)
-                        yield StereoInput(name=name, left=image, right=None, camera=camera)
-
-        names = [name for some in finished.values() for name in some]
-        write_depth_page(
-            out, names, read, [str(failure) for failure in failures], output.color_range
-        )
+    count = f"{done} of {len(mine)} pairs" if work.files == PAIRS else f"{done} depth maps"
+    print(f"{count} are in {out}")
+    if find_rank().rank == 0:
+        _write_page(work, sources, out, failures)
     return 1 if failures else 0
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True)
 class Predictor:
-    """Images in, files out; what fails is remembered in ``failures``, by its name."""
+    """Inputs in, files out; what fails is remembered in ``failures``, by its name."""
 
-    lens: Lens
-    net: FakestereoNet
+    work: DepthWork
+    method: Method
     out: Path
-    output: PredictOutput
     viewer: Viewer | None = None
     failures: dict[str, InputError] = field(default_factory=dict)
 
@@ -217,10 +315,10 @@ class Predictor:
         """Predict a video's frames, and make a video of them; give how many are done."""
         frames: list[str] = []
 
-        def noted() -> Iterator[tuple[str, Tensor]]:
+        def named() -> Named:
             for name, image in video:
                 frames.append(name)
-                yield name, image
+                yield name, partial(self.work.lens.input_of, name, image)
 
         def colors() -> Iterator[Tensor]:
             """Draw each frame's depth, in grey where there is none, so that none is missing."""
@@ -228,11 +326,11 @@ class Predictor:
             unknown = torch.full_like(read_map(first), torch.nan)
             for name in frames:
                 depth_m = read_map(self.out / f"{name}.depth_m.npy") if name in done else unknown
-                yield draw_depth(depth_m, *self.output.color_range)
+                yield draw_depth(depth_m, *self.work.output.color_range)
 
         try:
             video = read_video(source)
-            names = self.predict(noted(), video.frames or None, source.name)
+            names = self.predict(named(), video.frames or None, source.name)
             drawn = colors() if names else iter(())
             write_video(self.out / f"{source.stem}{_VIDEO}", drawn, video.fps)
         except InputError as error:
@@ -240,121 +338,96 @@ class Predictor:
             return 0
         return len(names)
 
-    def read_images(self, sources: Mapping[str, Path]) -> Iterator[tuple[str, Tensor]]:
-        """Read images, each with the name of its results."""
-        for name, source in sources.items():
-            try:
-                yield name, read_image(source)
-            except InputError as error:
-                self.failures[name] = error
+    def predict(self, named: Named, total: int | None, what: str) -> list[str]:
+        """Estimate inputs, a batch together, and write their files; give the names that are done.
 
-    def predict(
-        self, frames: Iterator[tuple[str, Tensor]], total: int | None, what: str
-    ) -> list[str]:
-        """Predict named frames, a batch together, and write their files; give what is done."""
+        What an earlier run finished is not even read.
+        """
         names: list[str] = []
-        cloud_m, distance = CLOUD_M if self.output.cloud else None, self.lens.scale.distance
-        with tqdm(total=total, desc=what, disable=None, unit=" images") as bar:
-            while chunk := list(islice(frames, self.output.batch)):
-                inputs = [
-                    StereoInput(name=name, left=left, right=None, camera=self.lens.camera_of(left))
-                    for name, left in chunk
-                    if not is_finished(self.out, name, with_cloud=self.output.cloud)
-                ]
-                estimates = self.net.estimate_many(inputs, batch=self.output.batch)
-                for image, estimate in zip(inputs, estimates, strict=True):
+        output, scale, net = self.work.output, self.work.lens.scale, self.method.net
+        assert isinstance(net, FakestereoNet), "weights build no other"
+        coming = iter(named)
+        with tqdm(total=total, desc=what, disable=None, unit=f" {what}") as bar:
+            while chunk := list(islice(coming, output.batch)):
+                inputs: list[StereoInput] = []
+                for name, read in chunk:
+                    try:
+                        if not is_finished(self.out, name, with_cloud=output.cloud):
+                            inputs.append(read())
+                    except InputError as error:
+                        self.failures[name] = error
+                check = self.work.with_check
+                estimates = net.estimate_many(inputs, with_check=check, batch=output.batch)
+                for one, estimate in zip(inputs, estimates, strict=True):
                     try:
                         if isinstance(estimate, InputError):
                             raise estimate
-                        scaled = estimate
-                        if distance is not None:
-                            scaled = scale_by_distance(estimate, image.name, distance)
-                        colors_m = self.output.color_range
-                        files = write_estimate(self.out, image, scaled, colors_m, cloud_m)
-                        note_result(self.out, image.name, files)
+                        if scale.distance is not None:
+                            estimate = scale_by_distance(estimate, one.name, scale.distance)  # noqa: PLW2901
+                        cloud_m = CLOUD_M if output.cloud else None
+                        files = write_estimate(self.out, one, estimate, output.color_range, cloud_m)
+                        note_result(self.out, one.name, files)
                     except InputError as error:
-                        self.failures[image.name] = error
+                        self.failures[one.name] = error
                         continue
-                    if scaled.warning:
-                        said = f"depthpose: warning: {image.name}: {scaled.warning}"
+                    if estimate.warning:
+                        said = f"depthpose: warning: {one.name}: {estimate.warning}"
                         tqdm.write(said, sys.stderr)
-                    if scaled.ground is not None:
-                        tqdm.write(f"{image.name}: {scaled.ground}")
+                    if estimate.ground is not None:
+                        tqdm.write(f"{one.name}: {estimate.ground}")
                     if self.viewer is not None:
-                        self.viewer.show_depth(image, scaled)
+                        self.viewer.show_depth(one, estimate)
                 names += [name for name, _ in chunk if name not in self.failures]
                 bar.update(len(chunk))
         return names
 
 
-def _is_video(path: Path) -> bool:
-    return path.suffix.lower() in VIDEO_SUFFIXES
+def _write_page(
+    work: DepthWork,
+    sources: Sequence[tuple[Path, ...]],
+    out: Path,
+    failures: Sequence[InputError],
+) -> None:
+    """Write a page of some results, and of warnings: others may still be at work."""
+    finished = {files: _finished_names(files[0], out) for files in sources}
+    names = [name for some in finished.values() for name in some]
+    chosen = [names[k] for k in spread_evenly(len(names), MOST_VIEWS)]
+    shown: list[StereoInput] = []
+    for files, own in finished.items():
+        wanted = [name for name in own if name in chosen]
+        with suppress(InputError):
+            for name, read in work.lens.inputs_of(files) if wanted else ():
+                if name in wanted:
+                    shown.append(read())
+                if name == wanted[-1]:
+                    break
+    near_m, far_m = work.output.color_range
+    which = "all" if len(shown) == len(names) else "spread evenly"
+    text = f"Shown: {len(shown)} of {_count(len(names), 'depth map')} in this folder ({which})."
+    rows = [{"not estimated, because": str(reason)} for reason in failures]
+    doubts = {name: out / f"{name}.warning.txt" for name in names}
+    rows += [{"warning": f"{name}: {read_text(path).strip()}"}
+             for name, path in doubts.items() if path.is_file()]  # fmt: skip
+    sections = [Section(title="What is here", text=text, rows=rows)]
+    said = f"depth, {near_m:g} m bright to {far_m:g} m dark"
+    films = [Film(path=p, caption=f"{p.name}: {said}") for p in sorted(out.glob(f"*{_VIDEO}"))]
+    sections += [Section(title="Videos", films=films)] if films else []
+    for one in shown:
+        estimate = read_estimate(out, one.name, one.camera)
+        drawn = DepthShown(pair=one, estimate=estimate, range_m=(near_m, far_m))
+        sections.append(depth_section(one.name, drawn))
+    write_page(out / _PAGE, f"Depth of {_count(len(names), 'image')}", sections, environment())
+    print(f"the page: {out / _PAGE}")
 
 
 def _finished_names(source: Path, out: Path) -> list[str]:
-    """List what is finished of an image, or of a video's frames."""
+    """List what is finished of an image or a pair, or of a video's frames."""
     if not _is_video(source):
         return [source.stem] if is_finished(out, source.stem) else []
-    frame = re.compile(re.escape(source.stem) + r"_\d{6}\.disparity_px\.npy")
-    names = sorted(path.name for path in out.iterdir() if frame.fullmatch(path.name))
-    return [name.removesuffix(".disparity_px.npy") for name in names]
-
-
-def _read_some(source: Path, wanted: Sequence[str]) -> Iterator[tuple[str, Tensor]]:
-    """Read an image again, or some frames of a video, no further than to the last of them."""
-    if wanted and not _is_video(source):
-        yield source.stem, read_image(source)
-    elif wanted:
-        for name, image in read_video(source):
-            if name in wanted:
-                yield name, image
-            if name == wanted[-1]:
-                return
-
-
-def write_depth_page(
-    out: Path,
-    names: Sequence[str],
-    read: Callable[[Sequence[str]], Iterator[StereoInput]],
-    failures: Sequence[str],
-    range_m: tuple[float, float] = COLOR_RANGE_M,
-) -> None:
-    """Write a page of some depth maps of a folder, whose inputs ``read`` gives, and of warnings."""
-    chosen = [names[k] for k in spread_evenly(len(names), MOST_VIEWS)]
-    pairs = list(read(chosen))
-    which = "all" if len(pairs) == len(names) else "spread evenly"
-    text = f"Shown: {len(pairs)} of {_count(len(names), 'depth map')} in this folder ({which})."
-    noted = [{"not estimated, because": reason} for reason in failures]
-    doubts = {name: out / f"{name}.warning.txt" for name in names}
-    noted += [
-        {"warning": f"{name}: {read_text(path).strip()}"}
-        for name, path in doubts.items()
-        if path.is_file()
-    ]
-    sections = [Section(title="What is here", text=text, rows=noted)]
-    said = f"depth, {range_m[0]:g} m bright to {range_m[1]:g} m dark"
-    films = [Film(path=p, caption=f"{p.name}: {said}") for p in sorted(out.glob(f"*{_VIDEO}"))]
-    sections += [Section(title="Videos", films=films)] if films else []
-    for pair in pairs:
-        estimate = read_estimate(out, pair.name, pair.camera)
-        shown = DepthShown(pair=pair, estimate=estimate, range_m=range_m)
-        sections.append(depth_section(pair.name, shown))
-    page = out / PAGE
-    write_page(page, f"Depth of {_count(len(names), 'image')}", sections, environment())
-    print(f"the page: {page}")
+    ending = ".disparity_px.npy"
+    names = sorted(path.name.removesuffix(ending) for path in out.glob(f"*{ending}"))
+    return [name for name in names if _frame_of(source, name)]
 
 
 def _count(number: int, what: str) -> str:
     return f"{number} {what}{'' if number == 1 else 's'}"
-
-
-def settings_of(method: dict[str, Any], lens: Lens, output: PredictOutput) -> dict[str, Any]:
-    """Give what decides the results, as JSON values, for the record of a run."""
-    known: dict[str, Any] = {"focal_px": lens.camera}
-    if isinstance(lens.camera, FieldOfView):
-        known = {"fov_deg": lens.camera.degrees}
-    elif isinstance(lens.camera, Camera):
-        keys = camera_keys(lens.camera)
-        known = {key: keys[key] for key in ("K", "mount_height_m", "tilt_deg") if key in keys}
-    known |= {key: value for key, value in asdict(lens.scale).items() if value is not None}
-    return {**method, "camera": known, "color_range_m": list(output.color_range)}

@@ -60,11 +60,26 @@ class EngineOptions:
         if not self.worker_cpus + self.worker_gpus:
             raise InputError("a worker needs a core or a GPU; give --worker-cpus 1")
         return RayEngine(
-            address=self.address,
-            workers=self.workers,
-            worker_cpus=self.worker_cpus,
-            worker_gpus=self.worker_gpus,
+            address=self.address, workers=self.workers,
+            worker_cpus=self.worker_cpus, worker_gpus=self.worker_gpus,
+        )  # fmt: skip
+
+    def run(
+        self, work: "Work", inputs: "Inputs", out: str, settings: dict[str, Any]
+    ) -> "Sequence[Done]":
+        """Do the work on all inputs, and give what is done."""
+        from depthpose.core.engine import Job, run_job
+
+        job = Job(
+            work=work,
+            items=inputs.items,
+            tars=inputs.tars,
+            out=out,
+            settings=settings,
+            form=self.shards,
+            block=self.block,
         )
+        return run_job(job, self.build())
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -96,10 +111,10 @@ class Inputs:
 
 @dataclass(frozen=True, kw_only=True)
 class Weights:
-    """A weights file that travels to the workers; none where a method needs none."""
+    """A weights file that travels to the workers, in memory."""
 
-    name: str = ""
-    data: bytes = field(default=b"", repr=False)
+    name: str
+    data: bytes = field(repr=False)
 
     @classmethod
     def read(cls, word: str) -> "Weights":
@@ -119,24 +134,6 @@ class Weights:
             with refused_write(path):
                 path.write_bytes(self.data)
             yield str(path)
-
-
-def run(
-    work: "Work", inputs: Inputs, out: str, settings: dict[str, Any], engine: EngineOptions
-) -> "Sequence[Done]":
-    """Do the work on all inputs by the engine of the options, and give what is done."""
-    from depthpose.core.engine import Job, run_job
-
-    job = Job(
-        work=work,
-        items=inputs.items,
-        tars=inputs.tars,
-        out=out,
-        settings=settings,
-        form=engine.shards,
-        block=engine.block,
-    )
-    return run_job(job, engine.build())
 
 
 def say(every: "Sequence[Done]", out: str, what: str) -> int:

@@ -11,7 +11,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from depthpose.cli.engine import EngineOptions, Inputs, run, say
+from depthpose.cli.engine import EngineOptions, Inputs, say
 from depthpose.cli.pose_inputs import bop_jobs, estimate_jobs, input_job, object_named
 from depthpose.cli.pose_methods import MethodSource, PoseMethod, find_masks
 from depthpose.cli.pose_options import DataSetOptions, OneObjectOptions
@@ -146,7 +146,7 @@ def predict_on_ray(
     settings |= {"unit": options.unit}
     if camera is not None:
         settings |= {"K": camera.K.tolist(), "depth_unit_m": camera.depth_unit_m}
-    return say(run(work, inputs, out, settings, engine), out, "inputs")
+    return say(engine.run(work, inputs, out, settings), out, "inputs")
 
 
 def refuse_unshared(masks: str, out: str) -> None:
@@ -186,7 +186,7 @@ def predict_instances(
     inputs = Inputs(items=[Item(job.name, ()) for job in jobs], tars=(), files=NO_FILES)
     known: dict[str, Prediction] = {}
     failed: dict[str, str] = {}
-    for done in run(work, inputs, out, settings, engine):
+    for done in engine.run(work, inputs, out, settings):
         failed |= dict(done.failures)
         for name, files in shard_results(out, done):
             known[name] = parse_prediction(json.loads(files[ENDING]), f"{done.shard}: {name}")
