@@ -13,7 +13,7 @@ from torch.nn.functional import huber_loss
 
 from depthpose.cli import main
 from depthpose.cli.pose_inputs import cloud_jobs
-from depthpose.cli.pose_ray import cloud_files
+from depthpose.cli.pose_predict import cloud_files
 from depthpose.core.config import config_from_dict
 from depthpose.core.errors import InputError
 from depthpose.core.files import Cloud, cloud_suffixes, read_cloud

@@ -114,8 +114,9 @@ class MethodSource:
                 "file of both by 'depthpose weights pack G --matcher S --trained-on DATA --licence "
                 "L --out W'"
             )
-        is_named = isinstance(self.weights, str)
-        return replace(self, weights=Weights.read(self.weights)) if is_named else self
+        if not isinstance(self.weights, str):
+            return self
+        return replace(self, weights=Weights.read(self.weights))
 
     def settings(self) -> dict[str, Any]:
         """Say what decides the results; this machine need not have the workers' device."""

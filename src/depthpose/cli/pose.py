@@ -52,15 +52,13 @@ def predict(
     """
     from depthpose.cli.pose_frames import find_all
     from depthpose.cli.pose_methods import source_of
-    from depthpose.cli.pose_predict import predict_dataset, predict_files
+    from depthpose.cli.pose_predict import predict_dataset, predict_files, predict_on_ray
 
     refuse_mixture(inputs, dataset)
     source = source_of(weights, register, inputs.unit, dataset, estimates.config)
     if dataset.bop is not None:
         return predict_dataset(source, dataset, inputs.object, out, estimates.batch, view, engine)
     if engine.is_ray:
-        from depthpose.cli.pose_ray import predict_on_ray
-
         return predict_on_ray(inputs, source, estimates.batch, out, engine)
     method = source.build()
     if inputs.cloud is not None and not method.takes_clouds:

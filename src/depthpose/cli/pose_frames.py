@@ -4,40 +4,29 @@ import re
 from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 from typing import Any
 
 import torch
 from tqdm import tqdm
 
-from depthpose.cli.pose_inputs import (
-    Unreadable,
-    camera_facts,
-    chosen_objects,
-    cloud_jobs,
-    frame_jobs,
-    input_job,
-    object_named,
-    read_pose,
-    unread,
-)
+from depthpose.cli import pose_inputs
+from depthpose.cli.pose_inputs import camera_facts, object_named
 from depthpose.cli.pose_methods import PoseMethod, match_names, named_file, of_dataset
 from depthpose.cli.pose_options import OneObjectOptions, SequenceOptions
 from depthpose.cli.pose_predict import (
     claim,
     claim_bop,
+    finish,
     is_result_of,
     say_result,
-    write_bop_files,
     write_files,
-    write_pose_page,
 )
 from depthpose.core.errors import InputError
 from depthpose.core.files import read_depth_png
 from depthpose.core.rigid import Rigid
 from depthpose.core.run import find_rank
-from depthpose.pose.datasets import BopDataset, Instance, open_bop
+from depthpose.pose.datasets import Instance, open_bop
 from depthpose.pose.estimator.find import explained_mask, nothing_found
 from depthpose.pose.estimator.inputs import AnyInput
 from depthpose.pose.predictions import (
@@ -58,12 +47,11 @@ def find_all(method: PoseMethod, inputs: OneObjectOptions, out: Path) -> int:
     What is found in NAME is called NAME_0, NAME_1, ...; an image where nothing is found has one
     entry, NAME, that says so. A rerun goes on where it was, and reads again what could not be read.
     """
-    assert inputs.depth is not None
     lens = inputs.lens
+    assert inputs.depth is not None
     assert lens is not None
-    if inputs.object is None:
-        objects = tuple(model.name for model in method.models)
-    else:
+    objects = tuple(method.models_by_name)
+    if inputs.object is not None:
         objects = (object_named(inputs.object, method),)
     if method.find is None:
         raise InputError("--depth without --mask: these weights need masked views; give --mask")
@@ -75,7 +63,7 @@ def find_all(method: PoseMethod, inputs: OneObjectOptions, out: Path) -> int:
     if find_rank().world > 1:
         raise InputError("--depth without --mask is done by one process; give --mask, or start one")
     depth, unit = Path(inputs.depth), inputs.unit
-    jobs = frame_jobs(depth, lens, objects[0], unit, out)
+    jobs = pose_inputs.frame_jobs(depth, lens, objects[0], unit, out)
     names = {job.name for job in jobs}
     for name in sorted(names):
         if (plain := re.sub(r"_\d+$", "", name)) != name and plain in names:
@@ -86,48 +74,35 @@ def find_all(method: PoseMethod, inputs: OneObjectOptions, out: Path) -> int:
     facts = camera_facts(lens) | ({} if unit is None else {"unit": unit})
     settings = {**method.settings, "find": sorted(objects), **facts}
     claim(out, settings, jobs, depth, is_result_of)
-    results = _find_left(jobs, objects, method, out)
-    claim(out, settings, [job for _, job in results], depth, is_result_of)
-    answered = [pair for pair in results if pair[0].estimate.is_posed]
-    answers, own = [prediction for prediction, _ in answered], [job for _, job in answered]
-    write_files(answers, own, out, method)
-    write_pose_page(out, answers, own, method)
-    return say_result([prediction for prediction, _ in results], out)
-
-
-def _find_left(
-    jobs: Sequence[Job[Any]], objects: tuple[str, ...], method: PoseMethod, out: Path
-) -> list[tuple[Prediction, Job[Any]]]:
-    """Search the images of which no earlier run left a result; all are written after each."""
     left = [p for p in kept_predictions(out) if is_finished(p)]
     results: list[tuple[Prediction, Job[Any]]] = []
     for job in tqdm(jobs, disable=None, unit=" images"):
         own = [p for p in left if is_result_of(p.estimate.name, job.name)]
         left = [p for p in left if p not in own]
-        results += [(p, explained_job(job, p.estimate, method)) for p in own] or list(
-            _find(method, job, objects)
-        )
+        here = own or _find(method, job, objects)
+        results += [(one, explained_job(job, one.estimate, method)) for one in here]
         write_predictions(out, [*(prediction for prediction, _ in results), *left])
-    return results
+    claim(out, settings, [job for _, job in results], depth, is_result_of)
+    answered = [pair for pair in results if pair[0].estimate.is_posed]
+    write_files([p for p, _ in answered], [job for _, job in answered], out, method)
+    return say_result([prediction for prediction, _ in results], out)
 
 
-def _find(
-    method: PoseMethod, job: Job[Any], objects: tuple[str, ...]
-) -> Iterator[tuple[Prediction, Job[Any]]]:
+def _find(method: PoseMethod, job: Job[Any], objects: tuple[str, ...]) -> list[Prediction]:
+    """Search one image; what cannot be read, or shows nothing, has one prediction too."""
     assert method.find is not None
     view = job.read()
-    if isinstance(view, Unreadable):
-        yield Prediction(estimate=unread(view)), job
-        return
-    for one in method.find(view, objects) or [nothing_found(view, ", ".join(objects))]:
-        yield Prediction(estimate=one), explained_job(job, one, method)
+    if isinstance(view, PoseEstimate):  # that says why it cannot be read
+        return [Prediction(estimate=view)]
+    answers = method.find(view, objects) or [nothing_found(view, ", ".join(objects))]
+    return [Prediction(estimate=one) for one in answers]
 
 
 def explained_job(job: Job[Any], estimate: PoseEstimate, method: PoseMethod) -> Job[Any]:
     """Take what was found in a whole depth image as if a mask had given it."""
-    model = next((m for m in method.models if m.name == estimate.object), None)
+    model = method.models_by_name.get(estimate.object)
 
-    def read() -> AnyInput | Unreadable:
+    def read() -> AnyInput | PoseEstimate:
         view, pose = job.read(), estimate.camera_from_model
         if model is None or pose is None or not isinstance(view, ViewInput):
             return view
@@ -139,69 +114,58 @@ def explained_job(job: Job[Any], estimate: PoseEstimate, method: PoseMethod) -> 
 
 def track_folder(method: PoseMethod, frames: SequenceOptions, out: Path) -> int:
     """Follow one object through depth images with a camera, or clouds; give the exit code."""
-    unit, first = frames.unit, frames.first
-    start = None if first is None else read_pose(first)
+    unit = frames.unit
+    start = None if frames.first is None else pose_inputs.read_pose(frames.first)
     name = object_named(frames.object, method)
     settings = {**method.settings, "track": name} | ({} if unit is None else {"unit": unit})
     if frames.cloud is not None:
-        jobs = cloud_jobs(frames.cloud, unit or "m", name, out)
+        jobs = pose_inputs.cloud_jobs(frames.cloud, unit or "m", name, out)
     else:
         assert frames.depth is not None
         assert frames.camera is not None
-        jobs = frame_jobs(frames.depth, frames.camera, name, unit, out)
+        jobs = pose_inputs.frame_jobs(frames.depth, frames.camera, name, unit, out)
         settings |= camera_facts(frames.camera)
-    if first is not None:
-        settings |= {"first": named_file(first)}
+    if frames.first is not None:
+        settings |= {"first": named_file(frames.first)}
     claim(out, settings, jobs, frames.cloud or frames.depth or out)
     predictions = _kept(_followed(method, jobs, name, start), out)
-    shown = _shown(predictions, jobs, method)
-    write_files(predictions, shown, out, method)
-    write_pose_page(out, predictions, shown, method)
-    return _say(predictions, out)
+    code = finish(predictions, _explained(predictions, jobs, method), out, method)
+    return _say_kinds(predictions, code)
 
 
 def track_bop(method: PoseMethod, frames: SequenceOptions, out: Path) -> int:
     """Follow each known object of each scene, or one; give the exit code."""
     assert frames.bop is not None
-    dataset = chosen_objects(open_bop(frames.bop, frames.split), method, frames.object)
+    dataset = open_bop(frames.bop, frames.split)
+    dataset = pose_inputs.chosen_objects(dataset, method, frames.object)
     names = match_names(dataset, method.models)
     settings = {**method.settings, **of_dataset(dataset), "track": sorted(names.values())}
     claim_bop(out, settings, dataset)
-    sequences = list(_sequences(dataset, names))
+    images: dict[tuple[int, int], dict[int, Instance]] = {}
+    for one in sorted(dataset.instances, key=lambda i: (i.image_id, i.index)):
+        images.setdefault((one.scene_id, one.object_id), {}).setdefault(one.image_id, one)
+    sequences = [
+        (names[number], [_frame_job(one, names[number]) for one in some.values()])
+        for (_, number), some in sorted(images.items())
+    ]
     jobs = [job for _, own in sequences for job in own]
     coming = (one for name, own in sequences for one in _followed(method, own, name))
     predictions = _kept(coming, out)
-    write_bop_files(predictions, dataset, out, method)
-    write_pose_page(out, predictions, _shown(predictions, jobs, method), method, dataset)
-    return _say(predictions, out)
+    code = finish(predictions, _explained(predictions, jobs, method), out, method, dataset)
+    return _say_kinds(predictions, code)
 
 
-def _sequences(dataset: BopDataset, names: dict[int, str]) -> Iterator[tuple[str, list[Job[Any]]]]:
-    """Give the frames of each object of each scene, in the order of their images."""
-    frames: dict[tuple[int, int], dict[int, Instance]] = {}
-    for one in sorted(dataset.instances, key=lambda i: (i.image_id, i.index)):
-        frames.setdefault((one.scene_id, one.object_id), {}).setdefault(one.image_id, one)
-    for (_, number), images in sorted(frames.items()):
-        name = names[number]
-        yield (
-            name,
-            [
-                input_job(one.name, name, partial(_whole_view, one, name), place_of(one))
-                for one in images.values()
-            ],
+def _frame_job(instance: Instance, name: str) -> Job[Any]:
+    """Take the depth image of an instance without its mask."""
+
+    def read() -> ViewInput:
+        depth_m = read_depth_png(instance.depth, instance.depth_unit_m)
+        everywhere = torch.ones_like(depth_m, dtype=torch.bool)
+        return ViewInput(
+            name=instance.name, depth_m=depth_m, mask=everywhere, K=instance.K, object=name
         )
 
-
-def _whole_view(instance: Instance, name: str) -> ViewInput:
-    """Give the depth image of an instance without its mask."""
-    depth_m = read_depth_png(instance.depth, instance.depth_unit_m)
-    return ViewInput(
-        name=instance.name,
-        depth_m=depth_m,
-        mask=torch.ones_like(depth_m, dtype=torch.bool),
-        K=instance.K,
-        object=name,
-    )
+    return pose_inputs.input_job(instance.name, name, read, place_of(instance))
 
 
 def _kept(coming: Iterable[Prediction], out: Path) -> list[Prediction]:
@@ -218,9 +182,8 @@ def _kept(coming: Iterable[Prediction], out: Path) -> list[Prediction]:
     finally:
         names = {one.estimate.name for one in predictions}
         if predictions:
-            write_predictions(
-                out, [*predictions, *(p for p in left if p.estimate.name not in names)]
-            )
+            others = [p for p in left if p.estimate.name not in names]
+            write_predictions(out, [*predictions, *others])
     return predictions
 
 
@@ -234,8 +197,8 @@ def _followed(
     def readable() -> Iterator[Any]:
         for job in tqdm(jobs, disable=None, unit=" frames"):
             frame = job.read()
-            if isinstance(frame, Unreadable):
-                skipped.append(unread(frame))
+            if isinstance(frame, PoseEstimate):
+                skipped.append(frame)
             else:
                 yield frame
 
@@ -249,7 +212,7 @@ def _followed(
         yield Prediction(estimate=one, place=places[one.name])
 
 
-def _shown(
+def _explained(
     predictions: Sequence[Prediction], jobs: Sequence[Job[Any]], method: PoseMethod
 ) -> list[Job[Any]]:
     """Give of each frame what the pose explains."""
@@ -257,9 +220,8 @@ def _shown(
     return [explained_job(job, prediction.estimate, method) for prediction, job in pairs]
 
 
-def _say(predictions: list[Prediction], out: Path) -> int:
-    """Print what became of the frames beside what 'pose predict' says."""
-    code = say_result(predictions, out)
+def _say_kinds(predictions: list[Prediction], code: int) -> int:
+    """Print what became of the frames; give the exit code."""
     kinds = Counter(p.estimate.tracking for p in predictions if p.estimate.tracking is not None)
     print(", ".join(f"{kinds[kind]} {kind}" for kind in ("tracked", "found", "lost")))
     return code

@@ -5,7 +5,7 @@ import sys
 from collections import Counter
 from collections.abc import Callable, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -26,18 +26,9 @@ from depthpose.pose.predictions import Job, Place
 from depthpose.pose.types import PoseEstimate
 
 
-@dataclass(frozen=True, kw_only=True)
-class Unreadable:
-    """An input that could not be read, in the place of what it would have been."""
-
-    name: str
-    object: str
-    reason: str
-
-
 def object_named(name: str | None, method: PoseMethod) -> str:
     """Give the object that is meant."""
-    known = [model.name for model in method.models]
+    known = list(method.models_by_name)
     if name is None and len(known) > 1:
         raise InputError(f"the {method.holder} know {', '.join(known)}; say which by --object")
     if name is not None and name not in known:
@@ -65,6 +56,13 @@ def read_pose(path: Path) -> Rigid:
         raise InputError(f"--first {path}: {error}") from error
 
 
+def camera_facts(camera: Path | float) -> dict[str, Any]:
+    """Give what of a camera file, or a focal length, decides the poses, for the record of a run."""
+    if not isinstance(camera, Path):
+        return {"focal_px": camera}
+    return {"camera": str(camera.resolve()), "camera_sha256": file_sha256(camera)}
+
+
 def cloud_jobs(cloud: Path, unit: Unit, object: str, out: Path) -> list[Job[Any]]:
     """Take a cloud, or every one of a folder."""
     known = cloud_suffixes()
@@ -77,14 +75,10 @@ def cloud_jobs(cloud: Path, unit: Unit, object: str, out: Path) -> list[Job[Any]
         raise InputError(f"{cloud}: no {', '.join(known)} file there; give a cloud, or a folder")
     _refuse_one_name(files)
     refuse_among_inputs(out, [cloud], files)
-    return [_file_job(p, object, cloud_input, unit, object, p.stem) for p in files]
-
-
-def camera_facts(camera: Path | float) -> dict[str, Any]:
-    """Give what of a camera file, or a focal length, decides the poses, for the record of a run."""
-    if not isinstance(camera, Path):
-        return {"focal_px": camera}
-    return {"camera": str(camera.resolve()), "camera_sha256": file_sha256(camera)}
+    return [
+        input_job(p.stem, object, partial(cloud_input, p, unit, object, p.stem), source=p)
+        for p in files
+    ]
 
 
 def view_jobs(
@@ -146,7 +140,12 @@ def frame_jobs(
     depths = _list_depths(depth)
     refuse_among_inputs(out, [depth], depths)
     _refuse_one_name(depths)
-    return [_file_job(p, object, view_input, None, camera, object, p.stem, unit) for p in depths]
+    return [
+        input_job(
+            p.stem, object, partial(view_input, p, None, camera, object, p.stem, unit), source=p
+        )
+        for p in depths
+    ]
 
 
 def _list_depths(depth: Path) -> list[Path]:
@@ -158,6 +157,18 @@ def _list_depths(depth: Path) -> list[Path]:
         if not maps:
             raise
         return sorted(maps, key=natural_order)
+
+
+def _refuse_one_name(files: Sequence[Path]) -> None:
+    """Results bear the names of their inputs, without the suffix."""
+    first: dict[str, Path] = {}
+    for path in files:
+        other = first.setdefault(path.stem, path)
+        if other != path:
+            raise InputError(
+                f"{path.parent}: {other.name} and {path.name} would both be {path.stem!r} in the "
+                "results; rename one, or move it to another folder"
+            )
 
 
 def chosen_objects(dataset: BopDataset, method: PoseMethod, object: str | None) -> BopDataset:
@@ -175,16 +186,9 @@ def chosen_objects(dataset: BopDataset, method: PoseMethod, object: str | None) 
             f"{', '.join(numbers)}; give {method.holder} of its objects"
         )
     if left_out:
-        print(
-            f"left out, as the {method.holder} do not know them: objects {left_out}",
-            file=sys.stderr,
-        )
+        said = f"left out, as the {method.holder} do not know them: objects {left_out}"
+        print(said, file=sys.stderr)
     return dataset.of_objects(*known)
-
-
-def object_facts(dataset: BopDataset, object: str | None) -> dict[str, list[int]]:
-    """Give the number of the one object that was chosen, for the record of a run."""
-    return {} if object is None else {"objects": sorted({i.object_id for i in dataset.instances})}
 
 
 def bop_jobs(dataset: BopDataset, masks: Masks, method: PoseMethod) -> list[Job[Any]]:
@@ -197,7 +201,7 @@ def bop_jobs(dataset: BopDataset, masks: Masks, method: PoseMethod) -> list[Job[
 def input_job(
     name: str,
     object: str,
-    read: Any,  # noqa: ANN401  any reader
+    read: Callable[[], AnyInput],
     place: Place | None = None,
     source: Path | tuple[Path, ...] | None = None,
 ) -> Job[Any]:
@@ -205,56 +209,25 @@ def input_job(
     return _safe(Job(name=name, read=read, place=place, source=source), object)
 
 
-def _file_job(path: Path, object: str, read: Callable[..., AnyInput], *rest: object) -> Job[Any]:
-    """Take one file, called as it is; ``read`` is given it and the rest."""
-    return input_job(path.stem, object, partial(read, path, *rest), source=path)
-
-
 def _safe(job: Job[Any], object: str) -> Job[Any]:
-    """Let an input that cannot be read stop no other."""
+    """Let the job of what cannot be read give the estimate that says so."""
 
-    def read() -> AnyInput | Unreadable:
+    def read() -> AnyInput | PoseEstimate:
         try:
             return job.read()
         except InputError as error:
-            return Unreadable(name=job.name, object=object, reason=str(error))
+            said = f"cannot be read: {error}"
+            return PoseEstimate(name=job.name, object=object, status="unreadable", reason=said)
 
     return replace(job, read=read)
-
-
-def _refuse_one_name(files: Sequence[Path]) -> None:
-    """Results bear the names of their inputs, without the suffix."""
-    first: dict[str, Path] = {}
-    for path in files:
-        other = first.setdefault(path.stem, path)
-        if other != path:
-            raise InputError(
-                f"{path.parent}: {other.name} and {path.name} would both be {path.stem!r} in the "
-                "results; rename one, or move it to another folder"
-            )
-
-
-def estimate_jobs(method: PoseMethod, jobs: Sequence[Job[Any]]) -> list[PoseEstimate]:
-    """Estimate some inputs together; what cannot be read has the status ``unreadable``."""
-    return list(safely(method)([job.read() for job in jobs]))
 
 
 def safely(method: PoseMethod) -> EstimateMany:
     """Let a method skip what could not be read."""
 
     def estimate_many(inputs: Sequence[Any]) -> list[PoseEstimate]:
-        readable = [one for one in inputs if not isinstance(one, Unreadable)]
+        readable = [one for one in inputs if not isinstance(one, PoseEstimate)]
         estimates = iter(method.estimate_many(readable))
-        return [unread(one) if isinstance(one, Unreadable) else next(estimates) for one in inputs]
+        return [one if isinstance(one, PoseEstimate) else next(estimates) for one in inputs]
 
     return estimate_many
-
-
-def unread(missing: Unreadable) -> PoseEstimate:
-    """Give the estimate of an input that could not be read."""
-    return PoseEstimate(
-        name=missing.name,
-        object=missing.object,
-        status="unreadable",
-        reason=f"cannot be read: {missing.reason}",
-    )

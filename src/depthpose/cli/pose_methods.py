@@ -3,6 +3,7 @@
 import sys
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
 from hashlib import sha256
@@ -66,13 +67,11 @@ def find_masks(
 ) -> list[Masks]:
     """Understand ``truth``, ``predicted``, files of BOP detections and segmentation weights."""
     paths = [_path_of(kind) for kind in kinds]
-    files = [
-        (None, kind) if path is None else (path.parent, path.stem)
-        for kind, path in zip(kinds, paths, strict=True)
-    ]
+    names = _names_of(kinds, paths)
     masks: list[Masks] = []
-    for kind, path, name in zip(kinds, paths, distinct_names(files), strict=True):
+    for kind, path, name in zip(kinds, paths, names, strict=True):
         settings: dict[str, Any] = {}
+        jobs = partial(instance_jobs, dataset)
         if path is not None:
             is_list = path.suffix == ".json"
             detections = (
@@ -80,9 +79,7 @@ def find_masks(
             )
             jobs = partial(detection_jobs, dataset, detections=detections)
             settings = {"masks_sha256": file_sha256(path)}
-        elif kind == "truth":
-            jobs = partial(instance_jobs, dataset)
-        else:
+        elif kind == "predicted":
             mask_of = LAYOUTS[dataset.layout].predicted_mask
             if mask_of is None:
                 raise InputError(
@@ -97,10 +94,21 @@ def find_masks(
 
 def mask_files(kinds: Sequence[str]) -> list[str]:
     """Name masks as :func:`find_masks` takes them; files by what they hold."""
-    paths = [_path_of(kind) for kind in kinds]
-    return [
-        kind if path is None else named_file(path) for kind, path in zip(kinds, paths, strict=True)
-    ]
+    paths = [(kind, _path_of(kind)) for kind in kinds]
+    return [kind if path is None else named_file(path) for kind, path in paths]
+
+
+def _path_of(kind: str) -> Path | None:
+    if kind in ("truth", "predicted"):
+        return None
+    return Path(kind) if kind.endswith(".json") else find_weights(kind)
+
+
+def _names_of(words: Sequence[str], paths: Sequence[Path | None]) -> list[str]:
+    """Name files by their stems, told apart by their folders, and what is no file by its word."""
+    return distinct_names(
+        [(None, w) if p is None else (p.parent, p.stem) for w, p in zip(words, paths, strict=True)]
+    )
 
 
 def named_file(path: Path) -> str:
@@ -120,12 +128,6 @@ def of_dataset(dataset: BopDataset) -> dict[str, Any]:
     }
 
 
-def _path_of(kind: str) -> Path | None:
-    if kind in ("truth", "predicted"):
-        return None
-    return Path(kind) if kind.endswith(".json") else find_weights(kind)
-
-
 def _segmented(
     path: Path, name: str, dataset: BopDataset, out: Path, device: str
 ) -> list[Detection]:
@@ -138,17 +140,13 @@ def _segmented(
     home = out / "detections" / name
     claim_folder(home, {"weights_sha256": file_sha256(path), **of_dataset(dataset)})
     file, record = home.parent / f"{name}.json", home / "images.json"
-    try:
-        rows = read_rows(record) if record.is_file() else []
-        done = {
-            (integer(row, "scene_id", str(record)), integer(row, "im_id", str(record)))
-            for row in rows
-        }
-        known = (
-            [d for d in read_detections(file) if (d.scene_id, d.image_id) in done] if done else []
-        )
-    except InputError:  # damaged or missing: all is segmented again
-        done, known = set(), []
+    done: set[tuple[int, int]] = set()
+    known: list[Detection] = []
+    with suppress(InputError):  # damaged or missing: all is segmented again
+        earlier, said = read_detections(file), str(record)
+        rows = read_rows(record)
+        done = {(integer(row, "scene_id", said), integer(row, "im_id", said)) for row in rows}
+        known = [d for d in earlier if (d.scene_id, d.image_id) in done]
     images = {(i.scene_id, i.image_id): i for i in dataset.instances}
     left = [images[place] for place in sorted(images.keys() - done)]
     if left:
@@ -192,17 +190,17 @@ def _detect(
         start = perf_counter()
         objects = segmenter.segment(read_image(shown.rgb))
         spent_s = perf_counter() - start
-        for name, masks in objects.masks.items():
-            for mask, score in zip(masks, objects.scores[name].tolist(), strict=True):
-                if name in numbers:
-                    yield Detection(
-                        scene_id=shown.scene_id,
-                        image_id=shown.image_id,
-                        object_id=numbers[name],
-                        score=score,
-                        segmentation=encode_rle(mask),
-                        seconds=spent_s,
-                    )
+        for name in [name for name in objects.masks if name in numbers]:
+            pairs = zip(objects.masks[name], objects.scores[name].tolist(), strict=True)
+            for mask, score in pairs:
+                yield Detection(
+                    scene_id=shown.scene_id,
+                    image_id=shown.image_id,
+                    object_id=numbers[name],
+                    score=score,
+                    segmentation=encode_rle(mask),
+                    seconds=spent_s,
+                )
 
 
 def distinct_names(files: Sequence[tuple[Path | None, str]]) -> list[str]:
@@ -259,6 +257,11 @@ class PoseMethod:
     track: Callable[[Iterable[AnyInput], str, Rigid | None], Iterator[PoseEstimate]] | None = None
     holder: str = "weights"
 
+    @property
+    def models_by_name(self) -> dict[str, ObjectModel]:
+        """The objects by their names."""
+        return {model.name: model for model in self.models}
+
 
 def pose_methods(
     names: Sequence[str], config: EstimateConfig, models: Sequence[ObjectModel] = ()
@@ -269,11 +272,9 @@ def pose_methods(
     """
     takers = {REGISTRATION: _open3d, REGISTER: _register}
     paths = [None if name in takers else find_weights(name) for name in names]
-    labels = distinct_names(
-        [(p.parent, p.stem) if p else (None, n) for p, n in zip(paths, names, strict=True)]
-    )
+    labels = _names_of(names, paths)
     return [
-        _method(path, label, config) if path else takers[name](label, models, config)
+        _network(path, label, config) if path else takers[name](label, models, config)
         for path, name, label in zip(paths, names, labels, strict=True)
     ]
 
@@ -316,15 +317,32 @@ def _register(name: str, models: Sequence[ObjectModel], config: EstimateConfig) 
     )
 
 
+def _network(path: Path, name: str, config: EstimateConfig) -> PoseMethod:
+    known = read_pose_weights(path)
+    warn_of_terms(known.facts)
+    is_regressor = isinstance(known.network, DepthImageNet)
+    net = DepthImageRegressor(known, config) if is_regressor else GeoPoseNet(known, config)
+    name += "" if config.voting.method == "ransac" else "-least-squares"
+    name += "" if config.with_icp else "-without-icp"
+    facts = {"kind": read_checkpoint(path).kind, "weights": path.stem}
+    facts |= {"weights_sha256": file_sha256(path)}
+    return PoseMethod(
+        name=name,
+        estimate_many=net.estimate_many,
+        takes_clouds=not is_regressor,
+        models=known.models,
+        settings={**facts, "estimate": config_to_dict(config)},
+        find=None if isinstance(net, DepthImageRegressor) else net.find_in,
+        track=None if isinstance(net, DepthImageRegressor) else net.track_in,
+    )
+
+
 @dataclass(frozen=True, kw_only=True, eq=False)
 class MethodSource:
     """What an estimator is made from, in this process or by the workers of an engine.
 
-    Attributes:
-        config: of the estimator.
-        weights: of a network, by name or file, or packed to travel; None: ``models`` are registered
-            without training.
-        models: what registration looks for.
+    ``weights``: of a network, by name or file, or packed to travel; None: ``models`` are registered
+    without training.
     """
 
     config: EstimateConfig
@@ -377,26 +395,6 @@ def source_of(
         return MethodSource(config=config, models=models)
     models = Registration.load(*register.cad, unit=cad_unit).models if register.cad else ()
     return MethodSource(config=config, models=tuple(models))
-
-
-def _method(path: Path, name: str, config: EstimateConfig) -> PoseMethod:
-    known = read_pose_weights(path)
-    warn_of_terms(known.facts)
-    is_regressor = isinstance(known.network, DepthImageNet)
-    net = DepthImageRegressor(known, config) if is_regressor else GeoPoseNet(known, config)
-    suffix = "" if config.voting.method == "ransac" else "-least-squares"
-    suffix += "" if config.with_icp else "-without-icp"
-    facts = {"kind": read_checkpoint(path).kind, "weights": path.stem}
-    facts |= {"weights_sha256": file_sha256(path)}
-    return PoseMethod(
-        name=name + suffix,
-        estimate_many=net.estimate_many,
-        takes_clouds=not is_regressor,
-        models=known.models,
-        settings={**facts, "estimate": config_to_dict(config)},
-        find=None if isinstance(net, DepthImageRegressor) else net.find_in,
-        track=None if isinstance(net, DepthImageRegressor) else net.track_in,
-    )
 
 
 def predict_all(

@@ -1,43 +1,49 @@
-"""The work behind ``depthpose pose predict``."""
+"""The work behind ``depthpose pose predict``, here or by an engine."""
 
+import json
 import operator
 import re
 import sys
 import time
 from collections import Counter, defaultdict
 from collections.abc import Callable, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 from scipy.spatial.transform import Rotation
 from tqdm import tqdm
 
-from depthpose.cli.engine import EngineOptions
+from depthpose.cli.engine import EngineOptions, Inputs, say
 from depthpose.cli.pose_inputs import (
-    Unreadable,
     bop_jobs,
     camera_facts,
     chosen_objects,
     cloud_jobs,
-    object_facts,
+    input_job,
     object_named,
     safely,
     view_jobs,
 )
-from depthpose.cli.pose_methods import (
-    MethodSource,
-    PoseMethod,
-    find_masks,
-    of_dataset,
-)
+from depthpose.cli.pose_methods import MethodSource, PoseMethod, find_masks, of_dataset
 from depthpose.cli.pose_options import DataSetOptions, OneObjectOptions
+from depthpose.core.camera import Camera, camera_of
 from depthpose.core.config import config_to_dict
+from depthpose.core.engine import Files, Function, Item, Sample, is_url, shard_results, stem
 from depthpose.core.errors import InputError
-from depthpose.core.files import read_image, write_cloud, write_image
+from depthpose.core.files import (
+    cloud_suffixes,
+    image_size,
+    read_image,
+    write_cloud,
+    write_image,
+    write_json,
+)
+from depthpose.core.files.images import LISTED_SUFFIXES
+from depthpose.core.results import is_whole, note_result
 from depthpose.core.rigid import numbers_text
 from depthpose.core.run import (
-    ProcessRank,
     claim_folder,
     claim_names,
     environment,
@@ -47,8 +53,10 @@ from depthpose.core.run import (
     read_sources,
     wait_for,
 )
+from depthpose.core.units import Unit
 from depthpose.pose.cloud import object_points
 from depthpose.pose.datasets import BopDataset, open_bop, read_targets
+from depthpose.pose.estimator.inputs import AnyInput, cloud_input, view_input
 from depthpose.pose.evaluate import of_targets
 from depthpose.pose.predictions import (
     CLOUD,
@@ -59,12 +67,14 @@ from depthpose.pose.predictions import (
     alternatives_name,
     is_finished,
     kept_predictions,
+    parse_prediction,
     predict,
+    prediction_row,
     results_name,
     write_bop_results,
     write_predictions,
 )
-from depthpose.pose.types import ObjectModel, PoseEstimate, ViewInput
+from depthpose.pose.types import PoseEstimate, ViewInput
 from depthpose.report.page import Section, choose_answers, plain_table, write_page
 from depthpose.report.pose import (
     PoseShown,
@@ -75,16 +85,17 @@ from depthpose.report.pose import (
     pose_section,
     posed_cloud,
 )
-from depthpose.report.viewer import Viewer, open_viewer
+from depthpose.report.viewer import open_viewer
 
-PAGE = "report.html"
+_PAGE = "report.html"
 _MOST_SHOWN = 20
 """Of the answers, on the terminal; poses.json holds all."""
-_FRAME = """camera_from_model: x right, y down, z forward
-certainty: the chance that the pose is right and not one of its alternatives"""
-
 _SAID = 5
 """Of so many inputs the alternatives are printed; of all they are in poses.json."""
+_MOST_ROWS = 1000
+"""Of the answers, in the table of the page."""
+_FRAME = """camera_from_model: x right, y down, z forward
+certainty: the chance that the pose is right and not one of its alternatives"""
 
 
 def claim(
@@ -96,25 +107,18 @@ def claim(
 ) -> None:
     """Claim a folder for the poses of clouds or depth images.
 
-    Args:
-        out: the folder.
-        settings: that decide the results.
-        jobs: inputs.
-        source: of those that name none.
-        is_result: whether a result of the first name is of the input of the second.
-
-    Raises:
-        InputError: it is another run's, or holds a file of somebody else that would be written
-            over.
+    ``source``: of jobs that name none; ``is_result``: whether a result of the first name is of the
+    input of the second.
     """
-    claim_folder(out, settings, [POSES, PAGE])
+    claim_folder(out, settings, [POSES, _PAGE])
     if find_rank().world == 1 and not read_sources(out):  # lost: of what the poses are
         (out / POSES).unlink(missing_ok=True)
-    endings = [f".{end}" for end in (PICTURE, CLOUD)]
     done = _finished(out)
-    sources = {job.name: job.source or source for job in jobs}
     claim_names(
-        out, sources, endings, is_finished=lambda name: any(is_result(n, name) for n in done)
+        out,
+        {job.name: job.source or source for job in jobs},
+        [f".{end}" for end in (PICTURE, CLOUD)],
+        is_finished=lambda name: any(is_result(n, name) for n in done),
     )
 
 
@@ -124,39 +128,35 @@ def is_result_of(name: str, image: str) -> bool:
 
 
 def claim_bop(out: Path, settings: dict[str, Any], dataset: BopDataset) -> None:
-    """Claim a folder for the poses of a data set; raises as :func:`claim`."""
-    images = {(i.scene_id, i.image_id) for i in dataset.instances}
-    pictures = (_picture_name(*image) for image in sorted(images))
+    """Claim a folder for the poses of a data set."""
+    images = sorted({(i.scene_id, i.image_id) for i in dataset.instances})
+    pictures = [_picture_name(*image) for image in images]
     tables = [results_name(dataset), alternatives_name(dataset)]
-    claim_folder(out, settings, [POSES, PAGE, *tables, *pictures])
+    claim_folder(out, settings, [POSES, _PAGE, *tables, *pictures])
 
 
 def predict_files(
     method: PoseMethod, inputs: OneObjectOptions, out: Path, batch: int, view: str | None
 ) -> int:
     """Pose clouds, or masked depth images, in this process; give the exit code."""
-    name = object_named(inputs.object, method)
+    name, lens = object_named(inputs.object, method), inputs.lens
     settings = {**method.settings, "object": name}
     if inputs.cloud is not None:
-        unit = inputs.unit or "m"
-        jobs = cloud_jobs(Path(inputs.cloud), unit, name, out)
+        unit, source = inputs.unit or "m", Path(inputs.cloud)
+        jobs = cloud_jobs(source, unit, name, out)
         settings |= {"unit": unit}
-    elif inputs.depth is None or inputs.mask is None or inputs.lens is None:
+    elif inputs.depth is None or inputs.mask is None or lens is None:
         raise InputError(
             "--depth needs --camera or --focal-px beside it, and --mask unless it is to be found"
         )
     else:
-        mask = Path(inputs.mask)
-        jobs = view_jobs(Path(inputs.depth), mask, inputs.lens, name, inputs.unit, out)
-        settings |= camera_facts(inputs.lens) | {"mask": str(mask.resolve())}
+        source, mask = Path(inputs.depth), Path(inputs.mask)
+        jobs = view_jobs(source, mask, lens, name, inputs.unit, out)
+        settings |= camera_facts(lens) | {"mask": str(mask.resolve())}
         settings |= {} if inputs.unit is None else {"unit": inputs.unit}
-    claim(out, settings, jobs, Path(inputs.cloud or inputs.depth or out))
+    claim(out, settings, jobs, source)
     predictions = predict_all(method, jobs, out, settings, batch, view)
-    if predictions is None:
-        return 0
-    write_files(predictions, jobs, out, method)
-    write_pose_page(out, predictions, jobs, method)
-    return say_result(predictions, out)
+    return 0 if predictions is None else finish(predictions, jobs, out, method)
 
 
 def predict_dataset(
@@ -171,9 +171,7 @@ def predict_dataset(
     """Pose the objects of a data set, or one, here or by an engine; give the exit code."""
     assert options.bop is not None
     if engine.is_ray:
-        from depthpose.cli.pose_ray import refuse_unshared
-
-        refuse_unshared(options.masks, out)
+        _refuse_unshared(options.masks, out)
     method, home = source.build("cpu" if engine.is_ray else None), Path(out)
     dataset = open_bop(options.bop, options.split)
     if options.targets is not None:
@@ -182,144 +180,60 @@ def predict_dataset(
     (masks,) = find_masks([options.masks], dataset, home, source.config.device)
     jobs = bop_jobs(dataset, masks, method)
     settings = {**method.settings, "estimate": config_to_dict(source.config)}
-    settings |= {**of_dataset(dataset), "masks": masks.name, **object_facts(dataset, object)}
-    settings |= {**masks.settings, **({"shards": engine.shards} if engine.is_ray else {})}
+    settings |= {**of_dataset(dataset), "masks": masks.name, **masks.settings}
+    if object is not None:
+        settings["objects"] = sorted({i.object_id for i in dataset.instances})
+    if engine.is_ray:
+        settings["shards"] = engine.shards
     claim_bop(home, settings, dataset)
     if engine.is_ray:
-        from depthpose.cli.pose_ray import predict_instances
-
-        predictions = predict_instances(
-            source, options, dataset, jobs, batch, out, settings, engine
+        masks_file = Path(options.masks)
+        work = BopWork(
+            source=source.packed(),
+            folder=str(dataset.folder.resolve()),
+            split=options.split,
+            masks=str(masks_file.resolve()) if masks_file.suffix == ".json" else options.masks,
+            objects=tuple(sorted({instance.object_id for instance in dataset.instances})),
+            batch=batch,
         )
+        predictions = _predict_on_ray(work, jobs, out, settings, engine)
     else:
         predictions = predict_all(method, jobs, home, settings, batch, view)
-    if predictions is None:
-        return 0
-    write_bop_files(predictions, dataset, home, method)
-    write_pose_page(home, predictions, jobs, method, dataset)
-    return say_result(predictions, home)
+    return 0 if predictions is None else finish(predictions, jobs, home, method, dataset)
 
 
-def predict_all(method: PoseMethod, jobs: list[Job[Any]], out: Path, settings: dict[str, Any],
-                batch: int, view: str | None) -> list[Prediction] | None:  # fmt: skip
-    """Estimate what is not finished; several processes share the work through the files."""
+def predict_all(
+    method: PoseMethod,
+    jobs: list[Job[Any]],
+    out: Path,
+    settings: dict[str, Any],
+    batch: int,
+    view: str | None,
+) -> list[Prediction] | None:
+    """Estimate what is not finished; several processes share the work through the files.
+
+    Gives all predictions in the first of them, None in the others.
+    """
     process = find_rank()
     home = out if process.world == 1 else out / f"part-{process.rank}"
     done = _finished(out)
     left = [jobs[k] for k in process.share(len(jobs)) if jobs[k].name not in done]
     if left:
         with open_viewer(None if process.rank else view) as viewer:
-            shown = method if viewer is None else _watched(method, viewer)
+
+            def estimate_many(inputs: Sequence[Any]) -> list[PoseEstimate]:
+                estimates = list(method.estimate_many(inputs))
+                for one, estimate in zip(inputs, estimates, strict=True):
+                    if viewer is not None:
+                        viewer.show_pose(one, estimate, method.models_by_name[one.object])
+                return estimates
+
+            shown = replace(method, estimate_many=estimate_many)
             names = predict(safely(shown), left, home, settings, batch)
             for _ in tqdm(names, total=len(left), disable=None, unit=" poses"):
                 pass
     if process.rank:
         return None
-    return _gather(jobs, out, process)
-
-
-def say_result(predictions: list[Prediction], out: Path) -> int:
-    """Print how many were posed and why others were not; give the exit code."""
-    failed = [p.estimate for p in predictions if not is_finished(p)]
-    shown = [p.estimate for p in predictions if is_finished(p)]
-    for estimate in failed:
-        print(f"depthpose: failed: {estimate.name}: {estimate.reason}", file=sys.stderr)
-    if shown:
-        print(plain_table([_answer_row(estimate) for estimate in shown[:_MOST_SHOWN]]), end="")
-        print(_FRAME)
-    if len(shown) == 1 and not shown[0].is_ok:
-        what = "refused" if shown[0].camera_from_model is None else shown[0].status
-        print(f"{what}: {shown[0].reason}")
-    for prediction in predictions[:_SAID]:
-        for line in alternative_lines(prediction.estimate):
-            print(f"{prediction.estimate.name}: {line}")
-    statuses = Counter(estimate.status for estimate in shown)
-    said = ", ".join(f"{count} {status}" for status, count in sorted(statuses.items()))
-    inputs = "1 input" if len(predictions) == 1 else f"{len(predictions)} inputs"
-    print(f"{inputs}: {said or 'none readable'}; {out / 'poses.json'}")
-    return 1 if failed else 0
-
-
-def _answer_row(estimate: PoseEstimate) -> dict[str, Any]:
-    """Say what was found of one input: object, status, translation, quaternion, the answers."""
-    row: dict[str, Any] = {
-        "input": estimate.name,
-        "object": estimate.object,
-        "status": estimate.status,
-    }
-    pose = estimate.camera_from_model
-    if pose is not None:
-        quaternion = Rotation.from_matrix(pose.R.double().numpy()).as_quat()
-        row |= {"x, y, z [m]": numbers_text(pose.t_m.tolist())}
-        row |= {"qx, qy, qz, qw": numbers_text(quaternion.tolist())}
-    fit, certainty, identity = estimate.fit, estimate.certainty, estimate.identity
-    row["fit"] = None if fit is None else f"{fit.agrees:.3f}"
-    row["certainty"] = None if certainty is None else f"{certainty:.3f}"
-    row["identity"] = None if identity is None else identity.status
-    return row if estimate.tracking is None else row | {"tracking": estimate.tracking}
-
-
-def write_files(
-    predictions: list[Prediction], jobs: list[Job[Any]], out: Path, method: PoseMethod
-) -> None:
-    """Write NAME.pose.ply, and NAME.pose.png where there is a depth image."""
-    for prediction, job in zip(predictions, jobs, strict=True):
-        estimate = prediction.estimate
-        pose = estimate.camera_from_model
-        if pose is None:
-            continue
-        view, model = job.read(), _model(method, estimate.object)
-        points_m = object_points(view, model.diameter_m)
-        files = [out / f"{job.name}.{CLOUD}"]
-        write_cloud(files[0], posed_cloud(points_m, pose, model))
-        if isinstance(view, ViewInput):
-            picture = draw_pose(grey_depth(view.depth_m), pose, model, view.K)
-            files.append(out / f"{job.name}.{PICTURE}")
-            write_image(files[1], picture)
-        note_result(out, job.name, files)
-
-
-def write_bop_files(
-    predictions: list[Prediction], dataset: BopDataset, out: Path, method: PoseMethod
-) -> None:
-    """Write BOP's csv, and a picture SCENE_IMAGE.pose.png of each image."""
-    write_bop_results(out / results_name(dataset), predictions)
-    if any(p.estimate.alternatives for p in predictions):
-        write_bop_results(out / alternatives_name(dataset), predictions, with_alternatives=True)
-    image_of = {(i.scene_id, i.image_id): i for i in dataset.instances}
-    posed: dict[tuple[int, int], list[PoseEstimate]] = defaultdict(list)
-    for prediction in predictions:
-        if prediction.place is not None and prediction.estimate.is_posed:
-            posed[prediction.place[:2]].append(prediction.estimate)
-    for (scene, image), estimates in posed.items():
-        name = _picture_name(scene, image)
-        if not is_whole(out, name, [name]):
-            instance = image_of[scene, image]
-            picture = picture_of(instance)
-            for estimate in estimates:
-                assert estimate.camera_from_model is not None
-                model = _model(method, estimate.object)
-                picture = draw_pose(picture, estimate.camera_from_model, model, instance.K)
-            write_image(out / name, picture)
-            note_result(out, name, [out / name])
-
-
-def _picture_name(scene: int, image: int) -> str:
-    return f"{scene:06d}_{image:06d}.{PICTURE}"
-
-
-def _finished(out: Path) -> set[str]:
-    return {name for name, prediction in _known(out).items() if is_finished(prediction)}
-
-
-def _known(out: Path) -> dict[str, Prediction]:
-    folders = [out, *sorted(out.glob("part-*"))]
-    every = [p for folder in folders for p in kept_predictions(folder)]
-    # What was read at last counts, whatever another part said of an earlier try.
-    return {p.estimate.name: p for p in sorted(every, key=is_finished)}
-
-
-def _gather(jobs: list[Job[Any]], out: Path, process: ProcessRank) -> list[Prediction]:
     if process.world > 1:
         seen: dict[str, Any] = {"at": -10.0, "names": set()}
 
@@ -337,92 +251,334 @@ def _gather(jobs: list[Job[Any]], out: Path, process: ProcessRank) -> list[Predi
     return predictions
 
 
-def _model(method: PoseMethod, name: str) -> ObjectModel:
-    return next(model for model in method.models if model.name == name)
+def _finished(out: Path) -> set[str]:
+    return {name for name, prediction in _known(out).items() if is_finished(prediction)}
 
 
-def _watched(method: PoseMethod, viewer: Viewer) -> PoseMethod:
-    """Give a method whose every estimate is shown as soon as it is there."""
-    models = {model.name: model for model in method.models}
-
-    def estimate_many(inputs: Sequence[Any]) -> list[PoseEstimate]:
-        estimates = list(method.estimate_many(inputs))
-        for view, estimate in zip(inputs, estimates, strict=True):
-            viewer.show_pose(view, estimate, models[view.object])
-        return estimates
-
-    return replace(method, estimate_many=estimate_many)
+def _known(out: Path) -> dict[str, Prediction]:
+    folders = [out, *sorted(out.glob("part-*"))]
+    every = [p for folder in folders for p in kept_predictions(folder)]
+    # What was read at last counts, whatever another part said of an earlier try.
+    return {p.estimate.name: p for p in sorted(every, key=is_finished)}
 
 
-_MOST_ROWS = 1000
-
-
-def write_pose_page(
+def finish(
+    predictions: list[Prediction],
+    jobs: list[Job[Any]],
     out: Path,
-    predictions: Sequence[Prediction],
-    jobs: Sequence[Job[Any]],
+    method: PoseMethod,
+    dataset: BopDataset | None = None,
+) -> int:
+    """Write clouds, pictures, BOP's csv and the page, and say what was found; the exit code."""
+    write_files(predictions, jobs, out, method, dataset)
+    return say_result(predictions, out)
+
+
+def write_files(
+    predictions: list[Prediction],
+    jobs: list[Job[Any]],
+    out: Path,
     method: PoseMethod,
     dataset: BopDataset | None = None,
 ) -> None:
-    """Write a page of some of the predictions, and of the reason of each refusal."""
-    sections = _answer_sections(predictions, jobs, method, dataset)
-    counts = Counter(prediction.estimate.status for prediction in predictions)
-    said = ", ".join(f"{count} {status}" for status, count in sorted(counts.items()))
-    rows = [_row(p.estimate) for p in sorted(predictions, key=lambda p: p.estimate.is_posed)]
-    number, shown = len(predictions), len(sections)
-    text = f"{number} inputs: {said}. Shown below: {shown}"
-    text += "." if shown == number else ", answers and refusals spread evenly."
-    if number > _MOST_ROWS:
-        text += f" The table holds the first {_MOST_ROWS}, refusals before answers; all are in "
-        text += "poses.json."
-    results = Section(title="What was found", text=text, rows=rows[:_MOST_ROWS])
-    page = out / PAGE
-    title = f"Poses of {number} input{'s' * (number != 1)}"
-    write_page(page, title, [results, *sections], environment())
-    print(f"the page: {page}")
-
-
-def _answer_sections(
-    predictions: Sequence[Prediction],
-    jobs: Sequence[Job[Any]],
-    method: PoseMethod,
-    dataset: BopDataset | None,
-) -> list[Section]:
-    """Show some of the inputs that could be read, answered and refused."""
-    instances = () if dataset is None else dataset.instances
-    image_of = {(i.scene_id, i.image_id): i.rgb for i in instances}
-    models = {model.name: model for model in method.models}
-    readable = [k for k, prediction in enumerate(predictions) if is_finished(prediction)]
-    answered = [predictions[k].estimate.is_posed for k in readable]
-    sections: list[Section] = []
-    for k in (readable[chosen] for chosen in choose_answers(answered)):
-        shown_input = jobs[k].read()
-        if isinstance(shown_input, Unreadable):  # by now; it was read when it was estimated
+    """Write the files of poses, or of a data set's, and the page."""
+    if dataset is not None:
+        _write_bop_files(predictions, dataset, out, method)
+    for prediction, job in zip(predictions, jobs, strict=True) if dataset is None else ():
+        pose = prediction.estimate.camera_from_model
+        if pose is None:
             continue
-        estimate, place = predictions[k].estimate, predictions[k].place
-        rgb = None if place is None else image_of[place[:2]]
-        image = None if rgb is None else read_image(rgb)
-        model = models[estimate.object]
-        shown = PoseShown(input=shown_input, estimate=estimate, model=model, image=image)
-        sections.append(pose_section(estimate.name, shown))
-    return sections
+        view, model = job.read(), method.models_by_name[prediction.estimate.object]
+        points_m = object_points(view, model.diameter_m)
+        files = [out / f"{job.name}.{CLOUD}"]
+        write_cloud(files[0], posed_cloud(points_m, pose, model))
+        if isinstance(view, ViewInput):
+            files.append(out / f"{job.name}.{PICTURE}")
+            write_image(files[1], draw_pose(grey_depth(view.depth_m), pose, model, view.K))
+        note_result(out, job.name, files)
+    _write_page(out, predictions, jobs, method, dataset)
 
 
-def _row(estimate: PoseEstimate) -> dict[str, Any]:
-    pose = estimate.camera_from_model
-    x_m, y_m, z_m = (None, None, None) if pose is None else pose.t_m.double().tolist()
-    tracking = {} if estimate.tracking is None else {"tracking": estimate.tracking}
+def _write_bop_files(
+    predictions: list[Prediction], dataset: BopDataset, out: Path, method: PoseMethod
+) -> None:
+    """Write BOP's csv, and a picture SCENE_IMAGE.pose.png of each image."""
+    write_bop_results(out / results_name(dataset), predictions)
+    if any(p.estimate.alternatives for p in predictions):
+        write_bop_results(out / alternatives_name(dataset), predictions, with_alternatives=True)
+    image_of = {(i.scene_id, i.image_id): i for i in dataset.instances}
+    posed: dict[tuple[int, int], list[PoseEstimate]] = defaultdict(list)
+    for prediction in predictions:
+        if prediction.place is not None and prediction.estimate.is_posed:
+            posed[prediction.place[:2]].append(prediction.estimate)
+    for image, estimates in posed.items():
+        name = _picture_name(*image)
+        if not is_whole(out, name, [name]):
+            picture = picture_of(image_of[image])
+            for estimate in estimates:
+                assert estimate.camera_from_model is not None
+                model = method.models_by_name[estimate.object]
+                pose, K = estimate.camera_from_model, image_of[image].K
+                picture = draw_pose(picture, pose, model, K)
+            write_image(out / name, picture)
+            note_result(out, name, [out / name])
+
+
+def _picture_name(scene: int, image: int) -> str:
+    return f"{scene:06d}_{image:06d}.{PICTURE}"
+
+
+def say_result(predictions: list[Prediction], out: Path) -> int:
+    """Print how many were posed and why others were not; give the exit code."""
+    failed = [p.estimate for p in predictions if not is_finished(p)]
+    shown = [p.estimate for p in predictions if is_finished(p)]
+    for estimate in failed:
+        print(f"depthpose: failed: {estimate.name}: {estimate.reason}", file=sys.stderr)
+    if shown:
+        print(plain_table([_printed_row(estimate) for estimate in shown[:_MOST_SHOWN]]), end="")
+        print(_FRAME)
+    if len(shown) == 1 and not shown[0].is_ok:
+        what = "refused" if shown[0].camera_from_model is None else shown[0].status
+        print(f"{what}: {shown[0].reason}")
+    for prediction in predictions[:_SAID]:
+        for line in alternative_lines(prediction.estimate):
+            print(f"{prediction.estimate.name}: {line}")
+    inputs = "1 input" if len(predictions) == 1 else f"{len(predictions)} inputs"
+    print(f"{inputs}: {_statuses(shown) or 'none readable'}; {out / 'poses.json'}")
+    return 1 if failed else 0
+
+
+def _statuses(estimates: Sequence[PoseEstimate]) -> str:
+    counts = Counter(estimate.status for estimate in estimates)
+    return ", ".join(f"{count} {status}" for status, count in sorted(counts.items()))
+
+
+def _printed_row(estimate: PoseEstimate) -> dict[str, Any]:
+    """Say what was found of one input: object, status, translation, quaternion, the answers."""
+    pose, fit = estimate.camera_from_model, estimate.fit
+    certainty, identity = estimate.certainty, estimate.identity
+    place = {} if pose is None else {
+        "x, y, z [m]": numbers_text(pose.t_m.tolist()),
+        "qx, qy, qz, qw": numbers_text(Rotation.from_matrix(pose.R.double()).as_quat().tolist()),
+    }  # fmt: skip
     return {
         "input": estimate.name,
         "object": estimate.object,
         "status": estimate.status,
-        **tracking,
-        "x_m": x_m,
-        "y_m": y_m,
-        "z_m": z_m,
-        "fit": None if estimate.fit is None else estimate.fit.agrees,
-        "identity": None if estimate.identity is None else estimate.identity.status,
+        **place,
+        "fit": None if fit is None else f"{fit.agrees:.3f}",
+        "certainty": None if certainty is None else f"{certainty:.3f}",
+        "identity": None if identity is None else identity.status,
+        **({} if estimate.tracking is None else {"tracking": estimate.tracking}),
+    }
+
+
+def _write_page(
+    out: Path,
+    predictions: Sequence[Prediction],
+    jobs: Sequence[Job[Any]],
+    method: PoseMethod,
+    dataset: BopDataset | None,
+) -> None:
+    """Write a page of some of the predictions, and of the reason of each refusal."""
+    instances = () if dataset is None else dataset.instances
+    image_of = {(i.scene_id, i.image_id): i.rgb for i in instances}
+    readable = [k for k, prediction in enumerate(predictions) if is_finished(prediction)]
+    sections: list[Section] = []
+    for k in choose_answers([predictions[k].estimate.is_posed for k in readable]):
+        estimate, place = predictions[readable[k]].estimate, predictions[readable[k]].place
+        shown_input = jobs[readable[k]].read()
+        if isinstance(shown_input, PoseEstimate):  # unreadable by now
+            continue
+        rgb = None if place is None else image_of[place[:2]]
+        shown = PoseShown(
+            input=shown_input,
+            estimate=estimate,
+            model=method.models_by_name[estimate.object],
+            image=None if rgb is None else read_image(rgb),
+        )
+        sections.append(pose_section(estimate.name, shown))
+    number = len(predictions)
+    estimates = [prediction.estimate for prediction in predictions]
+    text = f"{number} inputs: {_statuses(estimates)}. Shown below: {len(sections)}"
+    text += "." if len(sections) == number else ", answers and refusals spread evenly."
+    if number > _MOST_ROWS:
+        text += f" The table holds the first {_MOST_ROWS}, refusals before answers; all are in "
+        text += "poses.json."
+    rows = [_page_row(one) for one in sorted(estimates, key=lambda one: one.is_posed)[:_MOST_ROWS]]
+    results = Section(title="What was found", text=text, rows=rows)
+    title = f"Poses of {number} input{'s' * (number != 1)}"
+    write_page(out / _PAGE, title, [results, *sections], environment())
+    print(f"the page: {out / _PAGE}")
+
+
+def _page_row(estimate: PoseEstimate) -> dict[str, Any]:
+    pose, fit, identity = estimate.camera_from_model, estimate.fit, estimate.identity
+    place = [None] * 3 if pose is None else pose.t_m.double().tolist()
+    return {
+        "input": estimate.name,
+        "object": estimate.object,
+        "status": estimate.status,
+        **({} if estimate.tracking is None else {"tracking": estimate.tracking}),
+        **dict(zip(("x_m", "y_m", "z_m"), place, strict=True)),
+        "fit": None if fit is None else fit.agrees,
+        "identity": None if identity is None else identity.status,
         "certainty": estimate.certainty,
         "alternatives": "; ".join(alternative_lines(estimate)),
         "reason": estimate.reason,
     }
+
+
+VIEW_FILES = Files(roles=("depth", "mask"), suffixes=(*LISTED_SUFFIXES, ".json"))
+NO_FILES = Files(roles=(), suffixes=())
+ENDING = "pose.json"
+"""Of the one file of a result: an entry of ``poses.json``."""
+
+
+def cloud_files() -> Files:
+    """Give the kinds of files that are clouds."""
+    return Files(roles=("cloud",), suffixes=cloud_suffixes())
+
+
+@dataclass(frozen=True, kw_only=True)
+class PoseWork:
+    """Clouds, or depth images and masks, to poses or the reasons for none."""
+
+    source: MethodSource
+    object: str
+    unit: Unit | None
+    camera: Camera | None
+    files: Files
+    batch: int
+    endings: Sequence[str] = (ENDING,)
+
+    def start(self) -> Function:
+        """Build the estimator."""
+        method = self.source.build()
+
+        def predict(samples: Sequence[Sample], out: Path) -> list[str]:
+            jobs = [input_job(s.name, self.object, partial(self._read, s)) for s in samples]
+            return _write_estimates(method, jobs, out)
+
+        return predict
+
+    def _read(self, sample: Sample) -> AnyInput:
+        if self.camera is None:
+            return cloud_input(sample.files[0], self.unit or "m", self.object, sample.name)
+        depth, mask = sample.files
+        return view_input(depth, mask, self.camera, self.object, sample.name, self.unit)
+
+
+@dataclass(frozen=True, kw_only=True)
+class BopWork:
+    """Objects of a data set, by their names, to poses or the reasons for none.
+
+    All workers see the folder of the data set and a file of detections, if ``masks`` is one;
+    ``objects`` are the numbers that the estimator knows.
+    """
+
+    source: MethodSource
+    folder: str
+    split: str
+    masks: str
+    objects: tuple[int, ...]
+    batch: int
+    files: Files = NO_FILES
+    endings: Sequence[str] = (ENDING,)
+
+    def start(self) -> Function:
+        """Build the estimator and open the data set."""
+        method = self.source.build()
+        dataset = open_bop(Path(self.folder), self.split).of_objects(*self.objects)
+        (masks,) = find_masks([self.masks], dataset, Path())
+        jobs = {job.name: job for job in bop_jobs(dataset, masks, method)}
+
+        def predict(samples: Sequence[Sample], out: Path) -> list[str]:
+            return _write_estimates(method, [jobs[sample.name] for sample in samples], out)
+
+        return predict
+
+
+def _write_estimates(method: PoseMethod, jobs: Sequence[Job[Any]], out: Path) -> list[str]:
+    """Estimate some inputs and write an entry of each; give for each "" or why it failed."""
+    reasons: list[str] = []
+    for job, estimate in zip(jobs, safely(method)([job.read() for job in jobs]), strict=True):
+        spent = {**job.seconds, **estimate.seconds}
+        prediction = Prediction(estimate=replace(estimate, seconds=spent), place=job.place)
+        write_json(out / f"{job.name}.{ENDING}", prediction_row(prediction))
+        reasons.append("" if is_finished(prediction) else estimate.reason)
+    return reasons
+
+
+def predict_on_ray(
+    options: OneObjectOptions, source: MethodSource, batch: int, out: str, engine: EngineOptions
+) -> int:
+    """Pose clouds, depth images and masks, manifests or tar shards by the workers of an engine."""
+    if options.depth is not None and options.lens is None:
+        raise InputError("--depth needs --camera or --focal-px beside it")
+    files = cloud_files() if options.depth is None else VIEW_FILES
+    words = [word for word in (options.cloud, options.depth, options.mask) if word is not None]
+    inputs = Inputs.find(words, files)
+    for item in inputs.items if len(words) == 2 else ():  # one manifest pairs as it likes
+        depth, mask = map(stem, item.files)
+        if depth != mask and len(inputs.items) > 1:
+            raise InputError(
+                f"{words[1]}: no mask called {depth!r}; a mask has the name of its depth image"
+            )
+    source = source.packed()
+    method = source.build("cpu")
+    object = object_named(options.object or None, method)
+    with inputs.first() as first:
+        lens = options.lens
+        camera = None if lens is None else camera_of(lens, image_size(first[0]))
+    work = PoseWork(
+        source=source, object=object, unit=options.unit, camera=camera, files=files, batch=batch
+    )
+    settings = {**method.settings, "estimate": config_to_dict(source.config), "object": object}
+    settings |= {"unit": options.unit}
+    if camera is not None:
+        settings |= {"K": camera.K.tolist(), "depth_unit_m": camera.depth_unit_m}
+    return say(engine.run(work, inputs, out, settings), out, "inputs")
+
+
+def _refuse_unshared(masks: str, out: str) -> None:
+    """Refuse what the workers cannot share of a data set."""
+    if is_url(out):
+        raise InputError(
+            f"--out {out}: poses of a data set come together in poses.json and BOP's csv, which "
+            "need a disk; give a folder, and copy it"
+        )
+    if masks not in ("truth", "predicted") and not masks.endswith(".json"):
+        raise InputError(
+            f"--masks {masks}: workers take masks that are there already; give truth, predicted, "
+            "or a file of BOP detections, such as 'pose evaluate --masks WEIGHTS' leaves"
+        )
+
+
+def _predict_on_ray(
+    work: BopWork,
+    jobs: Sequence[Job[Any]],
+    out: str,
+    settings: dict[str, Any],
+    engine: EngineOptions,
+) -> list[Prediction]:
+    """Pose the instances of a data set by the workers of an engine, and write ``poses.json``."""
+    inputs = Inputs(items=[Item(job.name, ()) for job in jobs], tars=(), files=NO_FILES)
+    known: dict[str, Prediction] = {}
+    failed: dict[str, str] = {}
+    for done in engine.run(work, inputs, out, settings):
+        failed |= dict(done.failures)
+        for name, files in shard_results(out, done):
+            known[name] = parse_prediction(json.loads(files[ENDING]), f"{done.shard}: {name}")
+    for job in jobs:
+        if job.name not in known:
+            lost = PoseEstimate(
+                name=job.name,
+                object=job.read().object,
+                status="unreadable",
+                reason=failed[job.name],
+            )
+            known[job.name] = Prediction(estimate=lost, place=job.place)
+    predictions = [known[job.name] for job in jobs]
+    write_predictions(Path(out), predictions)
+    return predictions
