@@ -13,6 +13,7 @@ from contextlib import contextmanager
 from importlib import import_module
 from importlib.metadata import version
 from inspect import cleandoc
+from typing import Any
 
 from depthpose import __version__
 from depthpose.cli.streams import lasting_streams
@@ -27,13 +28,9 @@ from depthpose.core.errors import (
 
 COMMANDS = {
     "demo": (
-        "demo:demo",
-        "synthetic parts, a real pair, a street from one image: out/demo/report.html",
-    ),
+        "demo:demo", "synthetic parts, a real pair, a street from one image: out/demo/report.html"),
     "doctor": (
-        "doctor:doctor",
-        "what is installed, and a test of depth and pose; or what files are",
-    ),
+        "doctor:doctor", "what is installed, and a test of depth and pose; or what files are"),
     "serve": ("serve:serve", "depth and poses by a page in your browser, on this machine"),
     "pose predict": ("pose:predict", "a cloud, a masked depth image, or a data set, to poses"),
     "pose track": ("pose:track", "follow an object through depth images or clouds"),
@@ -48,39 +45,29 @@ COMMANDS = {
     "depth calibrate": ("train:calibrate", "set when an image is refused as out of distribution"),
     "depth evaluate": ("depth:evaluate", "measure predictions by a named protocol"),
     "data make streets": (
-        "data_make:make_streets",
+        "data:make_streets",
         "synthetic streets with exact disparity and LiDAR, in KITTI's raw layout",
     ),
     "data make objects": (
-        "data_make:make_objects",
-        "synthetic frames of your CAD files on a table, in BOP's layout",
-    ),
+        "data:make_objects", "synthetic frames of your CAD files on a table, in BOP's layout"),
     "data rectify": (
         "data:rectify",
         "raw pairs and their calibration to rectified pairs that depth match takes",
     ),
     "data check": ("data:check", "read a whole data set and list what is wrong"),
     "data label": (
-        "data:label",
-        "truth for pairs that have none, by a matcher, where both views agree",
-    ),
+        "data:label", "truth for pairs that have none, by a matcher, where both views agree"),
     "data pack": ("data:pack", "a data set as tar shards: few large files, from a disk or a store"),
     "data export-depth": (
-        "data:export_depth",
-        "predicted depth as COLMAP's and nerfstudio's files",
-    ),
+        "data:export_depth", "predicted depth as COLMAP's and nerfstudio's files"),
     "data duplicates": ("data:duplicates", "find evaluation images that are in a training set"),
     "weights list": ("weights:list_weights", "list the weights"),
     "weights show": ("weights:show_weights", "print what a weights file holds"),
     "weights pack": ("weights:pack_weights", "one file of a generator and a matcher, with a card"),
     "weights complete": (
-        "weights:complete_weights",
-        "add meshes to pose weights that came without",
-    ),
+        "weights:complete_weights", "add meshes to pose weights that came without"),
     "weights push": (
-        "weights:push_weights",
-        "upload weights and their card to the Hugging Face hub",
-    ),
+        "weights:push_weights", "upload weights and their card to the Hugging Face hub"),
     "weights import": ("weights:import_weights", "import a published checkpoint, safely"),
     "export depth": ("weights:export_depth", "depth as an ONNX file, proven to agree"),
     "export pose": ("weights:export_pose", "the network of directions as an ONNX file"),
@@ -96,7 +83,7 @@ COMMANDS = {
     "figure 3-2": ("thesis:figure_3_2", "features of points in one colour scale (t-SNE)"),
     "figure 3-4": ("thesis:figure_3_4", "true and predicted directions to a keypoint"),
     "figure 3-5": ("thesis:figure_3_5", "boxes of true and estimated poses"),
-}
+}  # fmt: skip
 _REMOVED_OPTIONS = {
     ("export", "--format"): "ONNX is the one format; omit --format",
     ("reproduce", "--made"): "synthetic views are asked for by --synthetic",
@@ -123,14 +110,10 @@ _OF_A_PATH = (errno.EACCES, errno.EPERM, errno.ENAMETOOLONG, errno.ELOOP, errno.
 
 
 def main(words: Sequence[str] | None = None) -> int:
-    """Run one command.
+    """Run the command of these words, by default the process's own, and give the exit code.
 
-    Args:
-        words: what follows ``depthpose``; the process's own arguments by default.
-
-    Returns:
-        The exit code: 0 done, 1 something in the input failed or the output cannot be written,
-        2 unusable, 130 interrupted, 141 nobody reads the output.
+    0: done. 1: something in the input failed, or the output cannot be written. 2: unusable.
+    130: interrupted. 141: nobody reads the output.
     """
     lock = sys.modules.get("depthpose.core.run")  # not imported for --help
     before = lock.held_folders() if lock is not None else ()
@@ -178,27 +161,15 @@ def _explained(error: Exception) -> str | None:
     )
 
 
-def _say_version() -> int:
-    """Print the versions that a bug report needs."""
-    from depthpose.cli.doctor import device_names
-
-    versions = f"torch {version('torch')}, Python {platform.python_version()}"
-    print(f"depthpose {__version__} ({versions}, {device_names()})")
-    return 0
-
-
 @contextmanager
 def _notices_in_a_line() -> Iterator[None]:
     """Show our notices without the file and line of the code that gives them."""
     before = warnings.formatwarning
 
-    def shown(
-        message: Warning | str, category: type[Warning], filename: str, lineno: int,
-        line: str | None = None,
-    ) -> str:  # fmt: skip
+    def shown(message: Warning | str, category: type[Warning], *place: Any, **line: Any) -> str:  # noqa: ANN401
         if issubclass(category, Notice):
             return f"depthpose: {message}\n"
-        return before(message, category, filename, lineno, line)
+        return before(message, category, *place, **line)
 
     warnings.formatwarning = shown
     try:
@@ -210,7 +181,11 @@ def _notices_in_a_line() -> Iterator[None]:
 def _run(words: list[str]) -> int:
     """Read the words after ``depthpose`` as a command and its options, and call it."""
     if words in (["--version"], ["-V"]):
-        return _say_version()
+        from depthpose.cli.doctor import device_names
+
+        versions = f"torch {version('torch')}, Python {platform.python_version()}"
+        print(f"depthpose {__version__} ({versions}, {device_names()})")  # for a bug report
+        return 0
     names = (" ".join(words[:length]) for length in (3, 2, 1))
     name = next((name for name in names if name in COMMANDS), None)
     if name is None:
@@ -222,19 +197,14 @@ def _run(words: list[str]) -> int:
             raise InputError(f"'depthpose {name}' has no {option} any more: {remedy}")
     import tyro
 
-    from depthpose.cli.arguments import (
-        parser_of,
-        refuse_empty,
-        refuse_ignored_options,
-        refuse_missing,
-    )
+    from depthpose.cli import arguments
 
     home, _, function = COMMANDS[name][0].partition(":")
     command: Callable[..., int] = getattr(import_module(f"depthpose.cli.{home}"), function)
-    refuse_empty(command, rest)
+    arguments.refuse_empty(command, rest)
     try:
         given = tyro.cli(
-            parser_of(command),
+            arguments.parser_of(command),
             prog=f"depthpose {name}",
             description=cleandoc(command.__doc__ or "").partition("\nArgs:")[0],
             args=rest,
@@ -242,8 +212,8 @@ def _run(words: list[str]) -> int:
         )
     except SystemExit as stop:  # tyro has printed help (0) or the wrong arguments (2)
         return int(stop.code or 0)
-    refuse_ignored_options(name, rest)
-    refuse_missing(command, given.arguments)
+    arguments.refuse_ignored_options(name, rest)
+    arguments.refuse_missing(command, given.arguments)
     code = command(*given.args, **given.kwargs)
     sys.stdout.flush()
     return code
@@ -263,17 +233,14 @@ def _explain(words: list[str]) -> int:
         instead = _REMOVED_COMMANDS.get(f"{group} {verb}", nearest_name(verb, verbs))
         print(f"depthpose {group}: error: no command {verb!r}; {instead}", file=sys.stderr)
         return 2
-    of_thesis = {n: what for n, what in inside.items() if n.partition(" ")[0] in _THESIS}
-    parts = {
-        "commands": {n: what for n, what in inside.items() if n not in of_thesis},
-        "the tables and figures of the thesis": of_thesis,
-    }
     width = max(map(len, inside)) + 2
     lines = [f"usage: depthpose {group or 'COMMAND'} ... [--help]", ""]
     lines += ["The 6-DoF pose of a known object from a depth sensor, and metric depth from images."]
-    for title, names in parts.items():
+    parts = {"commands": False, "the tables and figures of the thesis": True}
+    for title, is_thesis in parts.items():
+        names = [n for n in inside if (n.partition(" ")[0] in _THESIS) == is_thesis]
         if names:
-            lines += ["", f"{title}:", *(f"  {n:<{width}}{what}" for n, what in names.items())]
+            lines += ["", f"{title}:", *(f"  {n:<{width}}{inside[n]}" for n in names)]
     stream = sys.stdout if asked_help else sys.stderr
     print("\n".join([*lines, "", _EXIT_CODES]), file=stream)
     return 0 if asked_help else 2

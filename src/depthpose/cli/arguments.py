@@ -4,9 +4,9 @@ Types become words (``{None}|PATH`` is PATH), and a default that is nothing is n
 weights that do not exist are refused before anything is loaded.
 """
 
-import dataclasses
+import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, is_dataclass
+from dataclasses import dataclass, is_dataclass, replace
 from difflib import get_close_matches
 from enum import Enum
 from inspect import BoundArguments, signature, unwrap
@@ -54,7 +54,7 @@ WeightsName = Annotated[str, _Names.WEIGHTS]
 
 _WORDS = ("sgbm", "nothing", "open3d", "register")
 """What may be said in place of weights."""
-_PREFIXES = ("both:", "sgbm:", "own:", "matched:", "joined:", "quick:", "fine:")
+_PREFIXES = "^(both|sgbm|own|matched|joined|quick|fine):"
 """Before the name of weights: how they are used."""
 _POSITIONAL = get_args(tyro.conf.Positional[int])[1]
 _OF_TYPES = {Path: "PATH", str: "TEXT", int: "N", float: "NUMBER"}
@@ -87,10 +87,7 @@ View = Annotated[str | None, shown_as("live|FILE.rrd")]
 
 @dataclass_transform(frozen_default=True, kw_only_default=True)
 def group(options: type[Group]) -> type[Group]:
-    """Make a class a frozen dataclass of options, each shown with its type in words.
-
-    A parameter of a command that is one gives the command all of its fields as options.
-    """
+    """Make a class a frozen dataclass of options, all of which a command gets by a parameter."""
     options = dataclass(frozen=True, kw_only=True)(options)
     for name, hint in get_type_hints(options, include_extras=True).items():
         if name in options.__annotations__:
@@ -99,10 +96,7 @@ def group(options: type[Group]) -> type[Group]:
 
 
 def parser_of(command: Callable[..., int]) -> Callable[..., BoundArguments]:
-    """Give tyro what parses a command's arguments: its signature, with option types in words.
-
-    Groups of options, which are dataclasses, have words of their own.
-    """
+    """Give tyro what parses a command's arguments: its signature, with option types in words."""
     hints = get_type_hints(command, include_extras=True)
     shape = signature(command)
     for name, parameter in shape.parameters.items():
@@ -164,10 +158,7 @@ def _options_of(command: Callable[..., int]) -> Iterator[tuple[str, str, _Names 
 
 
 def refuse_empty(command: Callable[..., int], words: Sequence[str]) -> None:
-    """Refuse an option that names a file or folder by nothing, which would be the current folder.
-
-    A script whose variable is unset gives such a word.
-    """
+    """Refuse a file or folder without a name, as of a script whose variable is unset."""
     paths = {option for _, option, kind in _options_of(command) if kind is not None}
     for word, after in pairwise([*words, "end"]):
         option, sign, value = word.partition("=")
@@ -189,10 +180,9 @@ def refuse_missing(command: Callable[..., int], values: Mapping[str, Any]) -> No
             if one is not None and kind is _Names.INPUT:
                 _refuse_path(str(one))
             elif one is not None:
-                for prefix in _PREFIXES:
-                    one = one.removeprefix(prefix)  # noqa: PLW2901
-                if one not in _WORDS and not is_on_hub(one):
-                    find_weights(one)
+                bare = re.sub(_PREFIXES, "", one)
+                if bare not in _WORDS and not is_on_hub(bare):
+                    find_weights(bare)
 
 
 def _refuse_path(path: str) -> None:
@@ -303,4 +293,4 @@ def refuse_below(least: int, option: str, value: int, usual: str) -> None:
 
 def changed(config: Config, **values: object) -> Config:
     """Give a config with other values; None leaves a setting as it is."""
-    return dataclasses.replace(config, **{k: v for k, v in values.items() if v is not None})
+    return replace(config, **{k: v for k, v in values.items() if v is not None})

@@ -1,6 +1,7 @@
 """``depthpose data ...``."""
 
 import math
+import re
 import sys
 from collections.abc import Iterable
 from dataclasses import asdict
@@ -10,70 +11,190 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import tyro
 
-from depthpose.cli.arguments import Device, NewPath, Source, WeightsName, group
+from depthpose.cli.arguments import Device, NewPath, Source, WeightsName
 from depthpose.core.errors import InputError
 from depthpose.core.units import Unit, metres_of
 
-if TYPE_CHECKING:
+if TYPE_CHECKING:  # --help must not load torch
     from torch import Tensor
 
-    from depthpose.core.camera import RawPair, RectificationReport, Rectifier
-    from depthpose.depth.estimator import FakestereoNet
-    from depthpose.depth.labels import LabelConfig
+    from depthpose.core.camera import Rectifier
+
+_FRAMES_A_SCENE = 50
+_SCENES_A_SEED = 1000
+_MOST_SEED = 10**6 - 1
+"""Of frames of objects: a scene has nine digits at most, three of them beside the seed's."""
 
 
-@group
-class LabelOptions:
-    """What matches the pairs, and what counts as known."""
+def make_streets(
+    out: NewPath,
+    number: int = 100,
+    first: int = 0,
+    seed: int = 0,
+    scale: float = 1.0,
+    with_antialiasing: bool = True,
+    with_lidar: bool = True,
+    clutter_share: float = 0.0,
+) -> int:
+    """Render synthetic street scenes with exact disparity, in KITTI's raw layout.
 
-    weights: WeightsName = "default"
-    """with a matcher, by name or file; their terms hold for the labels too."""
-    device: Device = "cpu"
-    max_difference_px: float = 1.0
-    """largest difference of the two views' disparities."""
-    max_difference_share: float = 0.03
-    """the same as a share of the disparity; the larger limit counts."""
-    min_confidence: float = 0.5
-    """least confidence of the matcher."""
+    Existing frames are skipped, so an interrupted run can be resumed, and a later run with another
+    --first adds to it; runs at the same time need a folder each. Each rig of KITTI's five recording
+    days gets a date of its own, 2100_01_01 to 2100_01_05, which no real drive has.
 
-    @property
-    def config(self) -> "LabelConfig":
-        """Limits of the labels."""
-        from depthpose.depth.labels import LabelConfig  # --help must not load torch
+    Args:
+        out: folder to write to.
+        number: how many frames.
+        first: number of the first one.
+        seed: of the random streets, and number of the drives.
+        scale: size of the images: 0.5 gives half as many rows and columns.
+        with_antialiasing: smooth edges.
+        with_lidar: scan each scene with a LiDAR of 64 beams.
+        clutter_share: share of scenes that show random shapes before a ground, a wall or in a box
+            instead of a street; for training matchers.
+    """
+    from depthpose.core.run import claim_folder
+    from depthpose.depth.config import StreetsConfig
+    from depthpose.depth.datasets import RawFrame, has_calibration, has_raw_frame, write_raw_frame
+    from depthpose.depth.synthetic import camera_from_velodyne, draw_street, rig_number
 
-        return LabelConfig(
-            largest_difference_px=self.max_difference_px,
-            largest_share=self.max_difference_share,
-            least_confidence=self.min_confidence,
+    if number < 1 or first < 0 or not 0 <= seed <= 9999:
+        raise InputError(
+            f"--number {number} --first {first} --seed {seed}: at least 1 frame, from 0 on, and a "
+            "seed of four digits at most"
         )
+    config = StreetsConfig(
+        seed=seed,
+        scale=scale,
+        clutter_share=clutter_share,
+        with_antialiasing=with_antialiasing,
+        with_lidar=with_lidar,
+    )
+    # Seeds have drives of their own, so they may share a folder.
+    days = [f"2100_01_{day:02d}" for day in range(1, 6)]
+    claim_folder(out, {k: v for k, v in asdict(config).items() if k != "seed"}, days)
+    indices = range(first, first + number)
+    drives = {k: f"{days[rig_number(config, k)]}_drive_{seed:04d}_sync" for k in indices}
+    dates = {drive[:10]: index for index, drive in drives.items()}
+    lost = {index for date, index in dates.items() if not has_calibration(out, date)}
+    wanted = [i for i in indices if i in lost or not has_raw_frame(out, drives[i], i)]
+    for index in _shown(wanted, None, "frames"):
+        frame = draw_street(config, index)
+        raw = RawFrame(
+            left=frame.left,
+            right=frame.right,
+            rig=frame.rig,
+            disparity_px=frame.disparity_px,
+            occluded=frame.occluded,
+            is_sky=frame.is_sky,
+            points=frame.lidar_points,
+            camera_from_velodyne=camera_from_velodyne(),
+        )
+        write_raw_frame(out, drives[index], index, raw)
+    print(f"{out}: {len(wanted)} frames made, {number - len(wanted)} were there")
+    return 0
 
-    def load(self) -> "FakestereoNet":
-        """Build the matcher of the weights."""
-        from depthpose.depth.config import MatcherConfig
-        from depthpose.depth.estimator import FakestereoNet  # --help must not load torch
 
-        return FakestereoNet.load(self.weights, config=MatcherConfig(device=self.device))
+def make_objects(
+    cad: tuple[Path, ...],
+    out: NewPath,
+    unit: Unit = "mm",
+    number: int = 100,
+    split: str = "train",
+    seed: int = 0,
+    distance: tuple[float, float] = (0.6, 1.1),
+    sensor: Literal[
+        "structured light", "active stereo", "time of flight", "laser", "none"
+    ] = "structured light",
+    pile: int = 0,
+    symmetries: Literal["none", "found"] = "none",
+) -> int:
+    """Render frames of objects on a table, with image, depth, masks and poses, in BOP's layout.
+
+    A scene has 50 frames; existing scenes are skipped, so an interrupted run can be resumed.
+    'depthpose data check OUT' checks the result.
+
+        depthpose data make objects --cad part.stl clamp.stl --unit mm --out synthetic --number 500
+
+    Args:
+        cad: model files with a surface or points; the first is object 1.
+        out: folder to write to.
+        unit: of the numbers in the files.
+        number: how many frames.
+        split: name of the part of the data set.
+        seed: of the random frames.
+        distance: nearest and farthest view [m].
+        sensor: kind of depth sensor whose errors are simulated.
+        pile: each frame shows so many copies of one part, dropped onto each other.
+        symmetries: found: declare the symmetries that are found from a part's shape; none: only
+            print them.
+    """
+    from tqdm import tqdm
+
+    from depthpose.core.checkpoint import file_sha256
+    from depthpose.core.config import config_to_dict
+    from depthpose.core.results import note_result
+    from depthpose.core.run import claim_folder
+    from depthpose.pose.config import ObjectsConfig, SensorConfig
+    from depthpose.pose.datasets import write_bop_models, write_bop_scene
+    from depthpose.pose.mesh import read_model, refuse_one_name, with_found_symmetries
+    from depthpose.pose.synthetic import make_frames
+
+    if number < 1:
+        raise InputError(f"--number {number}: at least 1 frame")
+    if not 0 <= seed <= _MOST_SEED or number > _SCENES_A_SEED * _FRAMES_A_SCENE:
+        raise InputError(
+            f"--seed {seed} --number {number}: scenes are numbered by the seed; take a seed of 0 "
+            f"to {_MOST_SEED}, and at most {_SCENES_A_SEED * _FRAMES_A_SCENE} frames of each"
+        )
+    if not re.fullmatch(r"[\w-]+", split) or split == "models":
+        raise InputError(f"--split {split}: a name of letters and digits, not 'models'")
+    kind = SensorConfig(kinds=(sensor,))
+    config = ObjectsConfig(
+        seed=seed, distance_m=distance, sensor=kind, number=number, frame_pile=pile
+    )
+    # What decides the frames; of another seed, other scenes: they may share the folder.
+    settings = {k: v for k, v in config_to_dict(config).items() if k not in ("number", "seed")}
+    settings["cad"] = {
+        f"object {k}": {"file": path.name, "sha256": file_sha256(path)}
+        for k, path in enumerate(cad, start=1)
+    }
+    settings |= {"unit": unit, "symmetries": symmetries}
+    models = [read_model(path, unit, number=k) for k, path in enumerate(cad, start=1)]
+    refuse_one_name(models)
+    is_taken = symmetries == "found"
+    models = [with_found_symmetries(model, tqdm.write, is_taken=is_taken) for model in models]
+    claim_folder(out, settings, ["models", split])
+    write_bop_models(out, models)
+    scenes = {
+        seed * _SCENES_A_SEED + k: range(first, min(first + _FRAMES_A_SCENE, number))
+        for k, first in enumerate(range(0, number, _FRAMES_A_SCENE))
+    }
+    wanted = {k: scene for k, scene in scenes.items() if not _is_made(out, split, k, scene)}
+    total = sum(map(len, wanted.values()))
+    with tqdm(total=total, unit=" frames", leave=False, disable=None) as bar:
+        for k, scene in wanted.items():
+            made = []
+            for frame in make_frames(models, config, len(scene), scene.start):
+                made.append(frame)
+                bar.update()
+            home = write_bop_scene(out, split, k, made)
+            files = sorted(path for path in home.rglob("*") if path.is_file())
+            note_result(out, home.relative_to(out).as_posix(), files)
+    print(f"{out}: {len(wanted)} scenes made, {len(scenes) - len(wanted)} were there")
+    return 0
 
 
-@group
-class ExportOptions:
-    """Whose files are written."""
+def _is_made(out: Path, split: str, scene: int, frames: range) -> bool:
+    """Whether a scene exists with all of its frames, every file as it was written."""
+    from depthpose.core.files import read_json
+    from depthpose.core.results import is_whole
 
-    files: Literal["png", "npy"] = "png"
-    """of nerfstudio: png holds at most 65.535 m, farther pixels are unknown; npy holds all."""
-    images: Path | None = None
-    """of colmap: folder that image names are relative to; by default that of each image."""
-    scale: float = 1.0
-    """units of the reconstruction per metre."""
-
-    def refuse_unusable(self, format: str) -> None:
-        """Refuse a scale out of its range, and images of another format."""
-        if not (math.isfinite(self.scale) and self.scale > 0):
-            raise InputError(
-                f"--scale {self.scale:g}: units per metre must be positive; 1 for metres"
-            )
-        if self.images is not None and format != "colmap":
-            raise InputError(f"--images {self.images} is for --format colmap; remove it")
+    home = f"{split}/{scene:06d}"
+    if not is_whole(out, home, [f"{home}/scene_camera.json"]):
+        return False
+    there = read_json(out / home / "scene_camera.json")
+    return isinstance(there, dict) and {str(n) for n in frames} <= set(there)
 
 
 def check(
@@ -197,7 +318,11 @@ def duplicates(
 def label(
     path: tyro.conf.Positional[Path],
     out: NewPath,
-    labels: LabelOptions = LabelOptions(),
+    weights: WeightsName = "default",
+    device: Device = "cpu",
+    max_difference_px: float = 1.0,
+    max_difference_share: float = 0.03,
+    min_confidence: float = 0.5,
 ) -> int:
     """Make truth for pairs that have none: match them both ways, keep where both views agree.
 
@@ -209,18 +334,29 @@ def label(
     Args:
         path: a dataset with right views and calibration.
         out: folder to write to.
+        weights: with a matcher, by name or file; their terms hold for the labels too.
+        max_difference_px: largest difference of the two views' disparities.
+        max_difference_share: the same as a share of the disparity; the larger limit counts.
+        min_confidence: least confidence of the matcher.
     """
     from depthpose.core.checkpoint import file_sha256, find_weights
+    from depthpose.depth.config import MatcherConfig
     from depthpose.depth.datasets import open_dataset
-    from depthpose.depth.labels import label_pairs
+    from depthpose.depth.estimator import FakestereoNet
+    from depthpose.depth.labels import LabelConfig, label_pairs
 
-    config = labels.config
+    config = LabelConfig(
+        largest_difference_px=max_difference_px,
+        largest_share=max_difference_share,
+        least_confidence=min_confidence,
+    )
     dataset = open_dataset(path)
-    sha256 = file_sha256(find_weights(labels.weights))
+    sha256 = file_sha256(find_weights(weights))
     settings = {"dataset": dataset.name, "weights_sha256": sha256, **asdict(config)}
     failures: list[InputError] = []
     noted = failures if len(dataset) > 1 else None
-    labelled = label_pairs(labels.load(), dataset, config, out, settings, failures=noted)
+    net = FakestereoNet.load(weights, config=MatcherConfig(device=device))
+    labelled = label_pairs(net, dataset, config, out, settings, failures=noted)
     shares = [share for _, share in _shown(labelled, None, "pairs")]
     for failure in failures:
         print(f"depthpose: failed: {failure}", file=sys.stderr)
@@ -234,7 +370,9 @@ def export_depth(
     results: tyro.conf.Positional[Path],
     format: Literal["colmap", "nerfstudio"],
     out: NewPath,
-    export: ExportOptions = ExportOptions(),
+    files: Literal["png", "npy"] = "png",
+    images: Path | None = None,
+    scale: float = 1.0,
 ) -> int:
     """Write depth of 'depth predict' or 'depth match' as files of COLMAP or nerfstudio.
 
@@ -253,30 +391,35 @@ def export_depth(
         results: folder of predictions.
         format: program whose format is written.
         out: folder to write to: COLMAP's dense workspace, or nerfstudio's data set.
+        files: of nerfstudio: png holds at most 65.535 m, farther pixels are unknown; npy holds all.
+        images: of colmap: folder that image names are relative to; by default that of each image.
+        scale: units of the reconstruction per metre.
     """
     from depthpose.core.run import claim_folder
     from depthpose.depth import exchange
 
-    export.refuse_unusable(format)
+    if not (math.isfinite(scale) and scale > 0):
+        raise InputError(f"--scale {scale:g}: units per metre must be positive; 1 for metres")
+    if images is not None and format != "colmap":
+        raise InputError(f"--images {images} is for --format colmap; remove it")
     settings = {"command": "data export-depth", "results": str(results.resolve())}
-    settings |= {"scale": export.scale, "format": format}
+    settings |= {"scale": scale, "format": format}
     if format == "colmap":
-        named = exchange.colmap_files(results, export.images)
+        named = exchange.colmap_files(results, images)
         claim_folder(out, settings, named.values())
-        written = exchange.write_colmap(results, out, named, export.scale)
+        written = exchange.write_colmap(results, out, named, scale)
         list(_shown(written, len(named), "frames"))
         print(f"{out}: depth of {len(named)} images in stereo/depth_maps")
         return 0
-    named = exchange.nerfstudio_files(results, export.files)
+    named = exchange.nerfstudio_files(results, files)
     frames = exchange.nerfstudio_frames(out, named)
-    files = [*named.values(), exchange.TRANSFORMS_DEPTH]
-    claim_folder(out, settings | {"files": export.files}, files)
-    written = exchange.write_nerfstudio(results, out, named, export.scale)
+    claim_folder(out, settings | {"files": files}, [*named.values(), exchange.TRANSFORMS_DEPTH])
+    written = exchange.write_nerfstudio(results, out, named, scale)
     lost = sum(_shown(written, len(named), "frames"))
+    beside = "there is no transforms.json"
     if frames is not None:
         exchange.write_transforms(out, frames)
-    there = "there is no transforms.json"
-    beside = there if frames is None else "transforms_depth.json names them"
+        beside = "transforms_depth.json names them"
     print(f"{out}: depth of {len(named)} frames in depths; {beside}")
     if lost:
         print(
@@ -300,36 +443,15 @@ _SIDES = ("left", "right")
 _ASK = "were the cameras moved since, or are the images scaled or cropped? Calibrate anew"
 
 
-@group
-class RectifyOptions:
-    """What the calibration says, and what is kept of the images."""
-
-    unit: Unit | None = None
-    """of the translation between the cameras: that of the calibration board (default m)."""
-    fisheye: bool = False
-    """the lenses are fisheyes (OpenCV's cv2.fisheye); ROS and Kalibr files have it."""
-    keep: float = 0.0
-    """0 keeps only what the raw images show, 1 all of it, with black borders."""
-    check: bool = True
-    """refuse what is swapped or differs by more than a row."""
-
-    def read(self, camera: Path) -> "RawPair":
-        """Read the calibration of both cameras."""
-        from depthpose.core.camera import read_raw_pair
-
-        return read_raw_pair(
-            camera,
-            unit_m=metres_of(self.unit) if self.unit else None,
-            is_fisheye=self.fisheye or None,
-        )
-
-
 def rectify(
     left: tyro.conf.Positional[Source],
     right: tyro.conf.Positional[Source],
     camera: Path,
     out: NewPath,
-    rectifying: RectifyOptions = RectifyOptions(),
+    unit: Unit | None = None,
+    fisheye: bool = False,
+    keep: float = 0.0,
+    check: bool = True,
 ) -> int:
     """Rectify raw stereo pairs by the calibration of their two cameras, with OpenCV.
 
@@ -350,15 +472,18 @@ def rectify(
             D2, R, T (YAML, XML, JSON), or a folder with its intrinsics.yml and extrinsics.yml or
             with left.yaml and right.yaml of ROS.
         out: folder for the results.
+        unit: of the translation between the cameras: that of the calibration board (default m).
+        fisheye: the lenses are fisheyes (OpenCV's cv2.fisheye); ROS and Kalibr files have it.
+        keep: 0 keeps only what the raw images show, 1 all of it, with black borders.
+        check: refuse what is swapped or differs by more than a row.
     """
-    from tqdm import tqdm
-
     from depthpose.cli.depth_predict import list_pairs
-    from depthpose.core.camera import make_rectifier, write_camera
+    from depthpose.core.camera import make_rectifier, read_raw_pair, write_camera
     from depthpose.core.files import image_size, write_image
     from depthpose.core.run import claim_folder, claim_names
 
-    calibration = rectifying.read(camera)
+    unit_m = metres_of(unit) if unit else None
+    calibration = read_raw_pair(camera, unit_m=unit_m, is_fisheye=fisheye or None)
     pairs = list_pairs(left, right)
     homes = {(out / side).resolve() for side in _SIDES}
     if any(path.parent.resolve() in homes for pair in pairs for path in pair):
@@ -366,22 +491,16 @@ def rectify(
             f"--out {out}: the inputs lie in its left or right, where the results would be written "
             "over them; choose another folder"
         )
-    rectifier = make_rectifier(calibration, image_size(pairs[0][0]), rectifying.keep)
-    _check_rows(rectifier, pairs, is_refused=rectifying.check)
-    settings = {
-        "command": "data rectify",
-        "right_from_left": calibration.right_from_left.matrix().tolist(),
-        "keep": rectifying.keep,
-    }
-    for side, camera_of_side in zip(_SIDES, (calibration.left, calibration.right), strict=True):
-        settings[side] = {
-            "K": camera_of_side.K.tolist(),
-            "D": list(camera_of_side.distortion),
-            "is_fisheye": camera_of_side.is_fisheye,
-        }
+    rectifier = make_rectifier(calibration, image_size(pairs[0][0]), keep)
+    _check_rows(rectifier, pairs, is_refused=check)
+    settings: dict[str, Any] = {"command": "data rectify", "keep": keep}
+    settings["right_from_left"] = calibration.right_from_left.matrix().tolist()
+    for side, one in zip(_SIDES, (calibration.left, calibration.right), strict=True):
+        lens = {"K": one.K.tolist(), "D": list(one.distortion), "is_fisheye": one.is_fisheye}
+        settings[side] = lens
     claim_folder(out, settings, [*_SIDES, "camera.json"])
     claim_names(out, {pair[0].stem: pair for pair in pairs})
-    for first, second in tqdm(pairs, unit=" pairs", leave=False, disable=None):
+    for first, second in _shown(pairs, None, "pairs"):
         for side, image in zip(_SIDES, _rectified(rectifier, first, second), strict=True):
             write_image(out / side / f"{first.stem}.png", image)
     write_camera(out / "camera.json", rectifier.rig)
@@ -389,13 +508,13 @@ def rectify(
     return 0
 
 
-def _rectified(rectifier: "Rectifier", first: Path, second: Path) -> tuple["Tensor", "Tensor"]:
+def _rectified(rectifier: "Rectifier", *pair: Path) -> tuple["Tensor", "Tensor"]:
     from depthpose.core.files import read_image
 
-    images = [read_image(path) for path in (first, second)]
-    for path, image in zip((first, second), images, strict=True):
-        rectifier.refuse_other_size(image, str(path))
-    return rectifier.rectify(*images)
+    left, right = (read_image(path) for path in pair)
+    rectifier.refuse_other_size(left, str(pair[0]))
+    rectifier.refuse_other_size(right, str(pair[1]))
+    return rectifier.rectify(left, right)
 
 
 def _check_rows(
@@ -418,8 +537,8 @@ def _check_rows(
     ]
     known = [report for report in reports if report.is_rectified is not None]
     if not known:
-        unknown = f"depthpose: the rows cannot be checked: {reports[0].message}"
-        print(unknown, file=sys.stderr)
+        said = f"depthpose: the rows cannot be checked: {reports[0].message}"
+        print(said, file=sys.stderr)
         return
     measured = [report for report in known if report.matches] or known
     offset_px = median(abs(report.vertical_offset_px) for report in measured)
@@ -428,22 +547,17 @@ def _check_rows(
         f"{median(report.vertical_spread_px for report in measured):.2f} px "
         f"({sum(report.matches for report in known)} matches)"
     )
-    wrong = _what_is_wrong(known)
+    wrong = ""
+    if 2 * sum(bool(report.is_swapped) for report in known) > len(known):
+        wrong = "left and right look swapped (disparities are negative); exchange LEFT and RIGHT"
+    elif 2 * sum(report.is_wrong for report in known) > len(known):
+        wrong = (
+            "they are not rectified by it, so this is not the calibration of these images, or "
+            f"LEFT and RIGHT are exchanged; {_ASK}"
+        )
     if wrong and is_refused:
         raise InputError(f"{said}: {wrong}. Nothing was written (--no-check writes all the same)")
     print(said)
     if wrong or offset_px > _WARN_PX:
         wrong = wrong or f"that is above {_WARN_PX:g} px, which costs depth far away; {_ASK}"
         print(f"depthpose: {wrong}", file=sys.stderr)
-
-
-def _what_is_wrong(known: "list[RectificationReport]") -> str | None:
-    """Say what is wrong with more than half of the pairs."""
-    if 2 * sum(bool(report.is_swapped) for report in known) > len(known):
-        return "left and right look swapped (disparities are negative); exchange LEFT and RIGHT"
-    if 2 * sum(report.is_wrong for report in known) > len(known):
-        return (
-            "they are not rectified by it, so this is not the calibration of these images, or "
-            f"LEFT and RIGHT are exchanged; {_ASK}"
-        )
-    return None

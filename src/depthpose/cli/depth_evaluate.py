@@ -11,12 +11,7 @@ from typing import Any
 
 from tqdm import tqdm
 
-from depthpose.cli.depth_methods import (
-    Method,
-    baseline_method,
-    named_method,
-    sgbm_method,
-)
+from depthpose.cli.depth_methods import Method, baseline_method, named_method, sgbm_method
 from depthpose.cli.depth_options import MethodOptions
 from depthpose.cli.engine import EngineOptions
 from depthpose.core.engine import (
@@ -53,20 +48,11 @@ from depthpose.depth.evaluate import (
     summarise,
 )
 from depthpose.depth.metrics import METRICS
-from depthpose.depth.predictions import (
-    is_finished,
-    predict,
-)
+from depthpose.depth.predictions import is_finished, predict
 from depthpose.depth.types import DepthEstimate, StereoInput
+from depthpose.report import page
 from depthpose.report.depth import DepthError, DepthShown, depth_section
-from depthpose.report.page import (
-    Section,
-    choose_ranked,
-    plain_table,
-    share_views,
-    write_page,
-    write_table,
-)
+from depthpose.report.page import Section
 
 _SAID_ABOVE = ("method", "input", "speed", "weights", "protocol", "dataset")
 """Columns that the title of a frame's part of the page says already."""
@@ -87,26 +73,22 @@ def open_frames(data: Path, split: str | None) -> Dataset:
 def predict_all(dataset: Dataset, method: Method, rule: Protocol, folder: Path) -> Path:
     """Predict every frame that has truth to compare with, and a right view if it is needed.
 
-    Where several processes run the command (``torchrun``, ``accelerate launch``), each predicts
-    its share, and the first goes on when the files of all are there.
+    Of several processes each predicts its share, and the first goes on when all files are there.
     """
-    frames = list(enumerate(dataset.frames))
+    process, home = find_rank(), folder / method.name
     usable = [
-        i
-        for i, frame in frames
+        (i, frame)
+        for i, frame in enumerate(dataset.frames)
         if has_truth(frame, rule) and (frame.right is not None or not method.with_right)
     ]
-    process = find_rank()
-    mine = [usable[k] for k in process.share(len(usable))]
 
     def read(index: int) -> StereoInput:
         pair = dataset.read_input(index)
         return pair if method.with_right else replace(pair, right=None)  # what it must not see
 
-    readers = {dataset.frames[i].name: partial(read, i) for i in mine}
-    chosen = [dataset.frames[i] for i in usable]
-    sources = {f.name: f.seen_files(with_right=method.with_right) for f in chosen}
-    home = folder / method.name
+    mine = [usable[k] for k in process.share(len(usable))]
+    readers = {frame.name: partial(read, i) for i, frame in mine}
+    sources = {f.name: f.seen_files(with_right=method.with_right) for _, f in usable}
     net = _Unchecked(method.net) if isinstance(method.net, FakestereoNet) else method.net
     written = predict(net, readers, home, method.settings, sources)
     for _ in tqdm(written, method.name, total=len(readers), disable=None, unit=" frames"):
@@ -176,9 +158,7 @@ def measure(
     each = measure_each(dataset, folders, protocol, caps_m)
     measured = join([*each, *ready])
     rows = columns(measured.rows)
-    write_table(out, rows)
-    write_details(measured, out)
-    page = out / "report.html"
+    page.write_table(out, rows)
     about = f"{protocol}: {PROTOCOLS[protocol].summary}."
     unknown = sum(frame.right is not None and not frame.calibration for frame in dataset.frames)
     if unknown:
@@ -192,14 +172,15 @@ def measure(
     sections = [
         Section(title="Mean over frames", text=about, rows=rows),
         *frame_sections(dataset, folders, [one.per_frame for one in each], protocol),
-        *detail_sections(measured),
+        *write_details(measured, out),
     ]
-    write_page(page, f"{protocol} on {dataset.name}", sections, environment())
+    title = f"{protocol} on {dataset.name}"
+    page.write_page(out / "report.html", title, sections, environment())
     metrics = [metric.name for metric in METRICS.values() if metric.is_printed]
     about_row = ["method", "weights", "speed", "cap_m", "frames", "coverage"]
-    print(plain_table(rows, [*about_row, *metrics, "ause"]))  # files hold every column
+    print(page.plain_table(rows, [*about_row, *metrics, "ause"]))  # files hold every column
     say_skipped(measured)
-    print(f"every column: {out / 'table.md'}, rows.csv; the page: {page}")
+    print(f"every column: {out / 'table.md'}, rows.csv; the page: {out / 'report.html'}")
     return 0
 
 
@@ -207,12 +188,11 @@ def measure_each(
     dataset: Dataset, folders: Sequence[Path], protocol: str, caps_m: Sequence[float]
 ) -> list[Evaluation]:
     """Measure folders of predictions one by one; each row says whose it is."""
-    evaluations: list[Evaluation] = []
     show = partial(tqdm, unit=" frames", disable=None)
-    for folder in folders:
-        result = evaluate(dataset, folder, protocol, caps_m, show)
-        evaluations.append(signed(result, folder.name, read_settings(folder)))
-    return evaluations
+    return [
+        signed(evaluate(dataset, one, protocol, caps_m, show), one.name, read_settings(one))
+        for one in folders
+    ]
 
 
 def signed(result: Evaluation, name: str, settings: dict[str, Any] | None) -> Evaluation:
@@ -226,11 +206,11 @@ def signed(result: Evaluation, name: str, settings: dict[str, Any] | None) -> Ev
         "weights": known.get("weights", ""),
     }
     sha256 = known.get("weights_sha256", "")[:12]
-    return Evaluation(
+    return replace(
+        result,
         rows=[replace(row, weights_sha256=sha256, **source) for row in result.rows],
         per_frame=[replace(row, **source) for row in result.per_frame],
         deciles=[replace(row, **source) for row in result.deciles],
-        skipped=result.skipped,
     )
 
 
@@ -244,27 +224,21 @@ def join(each: Sequence[Evaluation]) -> Evaluation:
     )
 
 
-def write_details(measured: Evaluation, out: Path) -> None:
-    """Write each frame's numbers, and the error by confidence where there is any."""
-    write_table(out, columns(measured.per_frame), name="frames")
-    if measured.deciles:
-        write_table(out, columns(measured.deciles), name="confidence")
-        return
-    for ending in ("csv", "json", "md"):  # of another method that was measured here before
-        (out / f"confidence.{ending}").unlink(missing_ok=True)
-
-
-def detail_sections(measured: Evaluation) -> list[Section]:
-    """Make the parts of a page below its table."""
-    without_truth = [{"frame": name, "why": why} for name, why in measured.skipped.items()]
+def write_details(measured: Evaluation, out: Path) -> list[Section]:
+    """Write each frame's numbers, and the error by confidence; give them as parts of a page."""
+    frames, deciles = columns(measured.per_frame), columns(measured.deciles)
+    page.write_table(out, frames, name="frames")
+    if deciles:
+        page.write_table(out, deciles, name="confidence")
+    else:  # those of another method that was measured here before
+        for file in page.table_files("confidence"):
+            (out / file).unlink(missing_ok=True)
+    text = "Mean error of the least sure tenth of each frame's pixels (1) to the surest (10)"
+    skipped = [{"frame": name, "why": why} for name, why in measured.skipped.items()]
     sections = [
-        Section(
-            title="Error by confidence",
-            text="Mean error of the least sure tenth of each frame's pixels (1) to the surest (10)",
-            rows=columns(measured.deciles),
-        ),
-        Section(title="Each frame", rows=columns(measured.per_frame)),
-        Section(title="Skipped frames", rows=without_truth),
+        Section(title="Error by confidence", text=text, rows=deciles),
+        Section(title="Each frame", rows=frames),
+        Section(title="Skipped frames", rows=skipped),
     ]
     return [section for section in sections if section.rows]
 
@@ -283,18 +257,21 @@ def frame_sections(
     protocol: str,
 ) -> list[Section]:
     """Show the worst, the median and the best frame of each set of predictions."""
+    places = {frame.name: i for i, frame in enumerate(dataset.frames)}
     sections: list[Section] = []
-    for folder, of_folder, most in zip(folders, rows, share_views(len(folders)), strict=True):
+    shares = page.share_views(len(folders))
+    for folder, of_folder, most in zip(folders, rows, shares, strict=True):
         cap_m = of_folder[0].cap_m
         of_cap = [row for row in of_folder if row.cap_m == cap_m and row.pixels]
         metric = ranking_metric(cap_m)
         sign = 1 if metric.better == "lower" else -1
         cap = "" if cap_m is None else f", truth up to {cap_m:g} m"
-        for role, k in choose_ranked([sign * row.metrics[metric.name] for row in of_cap], most):
+        errors = [sign * row.metrics[metric.name] for row in of_cap]
+        for role, k in page.choose_ranked(errors, most):
             row, value = of_cap[k], of_cap[k].metrics[metric.name]
             frames = f"{len(of_cap)} frame{'' if len(of_cap) == 1 else 's'}"
             text = f"The {role} of {frames} by {metric.name}: {value:.4f}{cap}."
-            index = next(i for i, frame in enumerate(dataset.frames) if frame.name == row.frame)
+            index = places[row.frame or ""]
             result = frame_result(dataset, index, folder, protocol, row.cap_m)
             error = DepthError(
                 error=result.error,
@@ -315,14 +292,7 @@ RESULTS = Files(roles=("record", "shard"), suffixes=(".json", ".tar", ".parquet"
 
 @dataclass(frozen=True, kw_only=True)
 class ShardTruth:
-    """Shards of predictions to the numbers of their frames; every worker reads the truth.
-
-    Attributes:
-        data: folder of the data set, which all workers see.
-        split: of it.
-        protocol: how prediction and truth are compared.
-        caps_m: metres beyond which truth does not count.
-    """
+    """Shards of predictions to the numbers of their frames; every worker reads the truth."""
 
     data: str
     split: str | None
@@ -350,24 +320,24 @@ class ShardTruth:
         measured: dict[str, Any] = {}
         try:
             done = Done.from_json(record.read_bytes())
-            names = {name for name, reason in done.entries if not reason}
+            names = {name for name, reason in done.entries if not reason and name in places}
             for name, files in read_shard(str(shard), names, done.endings):
-                if name not in places:
-                    continue
                 with tempfile.TemporaryDirectory(prefix="depthpose-") as folder:
                     for ending, data in files.items():
                         path = Path(folder) / f"{name}.{ending}"
                         path.parent.mkdir(parents=True, exist_ok=True)
                         path.write_bytes(data)
-                    rows = measure_frame(
-                        dataset, places[name], Path(folder), self.protocol, self.caps_m
-                    )
+                    rows = self.measure_frame(dataset, places[name], Path(folder))
                 is_said = isinstance(rows, str)
                 measured[name] = rows if is_said else [row.to_values() for row in rows]
         except InputError as error:
             return str(error)
         (out / f"{sample.name}.{ENDING}").write_text(json.dumps(measured))
         return ""
+
+    def measure_frame(self, dataset: Dataset, index: int, folder: Path) -> list[Measured] | str:
+        """Measure one frame; a word where it has no truth."""
+        return measure_frame(dataset, index, folder, self.protocol, self.caps_m)
 
 
 def measure_shards(
@@ -378,30 +348,24 @@ def measure_shards(
     Each frame is measured where its shard is read; the rows of all frames are collected here in the
     order of the data set, and summed as if one process had measured them.
     """
-    items = result_items(predictions)
-    names = {item.name for item in items}
-    before = read_job_settings(predictions)
-    settings = {
-        "predictions": before, "data": truth.data, "split": truth.split,
-        "protocol": truth.protocol, "caps_m": list(truth.caps_m),
-    }  # fmt: skip
-    home = str(out / "measured" / stem(predictions.rstrip("/")))
+    items, before = result_items(predictions), read_job_settings(predictions)
+    name, names = stem(predictions.rstrip("/")), {item.name for item in items}
+    about = {"data": truth.data, "split": truth.split, "protocol": truth.protocol}
+    settings = {"predictions": before, **about, "caps_m": list(truth.caps_m)}
+    home = str(out / "measured" / name)
     job = Job(work=truth, items=items, out=home, settings=settings, block=1)
     rows: dict[str, list[Measured] | str] = {}
     for done in run_job(job, engine.build() if engine.is_ray else run_here):
-        for name, reason in done.failures:
-            if name in names:
+        for failed, reason in done.failures:
+            if failed in names:
                 raise InputError(f"{home}: {reason}")
-        for name, files in shard_results(home, done):
-            of_frames = json.loads(files[ENDING]) if name in names else {}
+        for item, files in shard_results(home, done):
+            of_frames = json.loads(files[ENDING]) if item in names else {}
             for frame, some in of_frames.items():
                 is_said = isinstance(some, str)
                 rows[frame] = some if is_said else [Measured.from_values(one) for one in some]
     with tempfile.TemporaryDirectory() as nothing:
         for index, frame in enumerate(dataset.frames):
             if frame.name not in rows:  # it has no truth, or its absence is an error
-                rows[frame.name] = measure_frame(
-                    dataset, index, Path(nothing), truth.protocol, truth.caps_m
-                )
-    name = stem(predictions.rstrip("/"))
+                rows[frame.name] = truth.measure_frame(dataset, index, Path(nothing))
     return signed(summarise(dataset, truth.protocol, rows), name, before)

@@ -31,15 +31,8 @@ from depthpose.pose.evaluate import (
 )
 from depthpose.pose.mesh import symmetry_transforms
 from depthpose.pose.types import PoseEstimate
-from depthpose.report.page import (
-    Section,
-    choose_ranked,
-    plain_table,
-    share_views,
-    spread_evenly,
-    write_page,
-    write_table,
-)
+from depthpose.report import page
+from depthpose.report.page import Section
 from depthpose.report.pose import PoseShown, pose_section
 
 HOW = (
@@ -80,10 +73,9 @@ def measure_each(
                     f"{path}: predictions of the {what} {theirs!r}, but {own!r} is measured; give "
                     f"those of this very {what}, or measure that one"
                 )
-        one = evaluate(dataset, read_any(path), config, show).of(origin)
-        if one.advice is not None:
-            print(f"{path}: {one.advice}", file=sys.stderr)
-        evaluations.append(one)
+        evaluations.append(evaluate(dataset, read_any(path), config, show).of(origin))
+        if (advice := evaluations[-1].advice) is not None:
+            print(f"{path}: {advice}", file=sys.stderr)
     return evaluations
 
 
@@ -102,37 +94,32 @@ def describe(predictions: Sequence[Path]) -> list[Origin]:
 
     Methods of one name that lie in two folders are two, and bear the folders' names too.
     """
-    origins = [_describe_one(path) for path in predictions]
-    homes = [path.resolve().parent for path in predictions]
-    rows = Counter((home, one.method, one.masks) for home, one in zip(homes, origins, strict=True))
-    twice = [key for key, count in rows.items() if count > 1]
-    if twice:
-        home, method, masks = twice[0]
-        raise InputError(
-            f"{home}: two predictions by {method!r}, masks {masks!r}, are given, and their rows "
-            "would be one; give one of them, or rename it"
+    origins: list[Origin] = []
+    for path in predictions:
+        settings = read_settings(path) if path.is_dir() else None
+        if settings is None:  # a file of others is its own fingerprint
+            sha256 = "" if path.is_dir() else file_sha256(path)[:12]
+            origins.append(Origin(method=path.stem, weights_sha256=sha256))
+            continue
+        masks = settings.get("masks", "")
+        origin = Origin(
+            method=path.name.removesuffix(f"_{masks}"),
+            masks=masks,
+            weights=settings.get("weights", ""),
+            weights_sha256=settings.get("weights_sha256", "")[:12],
         )
-    own = list({(home, one.method): None for home, one in zip(homes, origins, strict=True)})
+        origins.append(origin)
+    pairs = list(zip([path.resolve().parent for path in predictions], origins, strict=True))
+    rows = Counter((home, one.method, one.masks) for home, one in pairs)
+    for (home, method, masks), count in rows.items():
+        if count > 1:
+            raise InputError(
+                f"{home}: two predictions by {method!r}, masks {masks!r}, are given, and their "
+                "rows would be one; give one of them, or rename it"
+            )
+    own = list({(home, one.method): None for home, one in pairs})
     names = dict(zip(own, distinct_names(own), strict=True))
-    return [
-        replace(one, method=names[home, one.method])
-        for home, one in zip(homes, origins, strict=True)
-    ]
-
-
-def _describe_one(path: Path) -> Origin:
-    settings = read_settings(path) if path.is_dir() else None
-    if settings is None:
-        # A file of others is its own fingerprint.
-        sha256 = "" if path.is_dir() else file_sha256(path)[:12]
-        return Origin(method=path.stem, weights_sha256=sha256)
-    masks = settings.get("masks", "")
-    return Origin(
-        method=path.name.removesuffix(f"_{masks}"),
-        masks=masks,
-        weights=settings.get("weights", ""),
-        weights_sha256=settings.get("weights_sha256", "")[:12],
-    )
+    return [replace(one, method=names[home, one.method]) for home, one in pairs]
 
 
 def table_of(rows: Iterable[ObjectRow | InstanceRow | RiskRow]) -> list[dict[str, Any]]:
@@ -148,8 +135,7 @@ def measure(
     measured = join(each)
     rows = table_of(measured.rows)
     said = HOW if measured.advice is None else f"{measured.advice}. {HOW}"
-    write_table(out, rows)
-    write_details(measured, out)
+    page.write_table(out, rows)
     by_masks: dict[tuple[str, str], dict[str, Any]] = {}
     for row in measured.rows:
         assert row.origin is not None
@@ -160,33 +146,26 @@ def measure(
         Section(title="Success by masks", text=said, rows=list(by_masks.values())),
         Section(title="All numbers", rows=rows),
         *instance_sections(dataset, predictions, [one.per_instance for one in each]),
-        *detail_sections(measured),
+        *write_details(measured, out),
     ]
-    page = out / "report.html"
     title = f"Poses on {dataset.folder.resolve().name}, {dataset.split}"
-    write_page(page, title, sections, environment())
-    print(plain_table(rows, _SHOWN))
-    print(f"every column: {out / 'table.md'}, rows.csv; the page: {page}")
+    page.write_page(out / "report.html", title, sections, environment())
+    print(page.plain_table(rows, _SHOWN))
+    print(f"every column: {out / 'table.md'}, rows.csv; the page: {out / 'report.html'}")
     return 0
 
 
-def write_details(measured: Evaluation, out: Path) -> None:
-    """Write each instance's numbers, and the risk by coverage."""
-    write_table(out, table_of(measured.per_instance), name="instances")
-    if measured.risk:
-        write_table(out, table_of(measured.risk), name="risk")
-
-
-def detail_sections(measured: Evaluation) -> list[Section]:
-    """Make the parts of a page below its tables."""
-    failed = [row for row in measured.per_instance if not row.is_success]
+def write_details(measured: Evaluation, out: Path) -> list[Section]:
+    """Write each instance's numbers, and the risk by coverage; give them as parts of a page."""
+    risk = table_of(measured.risk)
+    page.write_table(out, table_of(measured.per_instance), name="instances")
+    if risk:
+        page.write_table(out, risk, name="risk")
+    failed = table_of(row for row in measured.per_instance if not row.is_success)
+    text = "How many answers are wrong if only the surest are given."
     sections = [
-        Section(
-            title="Risk by coverage",
-            text="How many answers are wrong if only the surest are given.",
-            rows=table_of(measured.risk),
-        ),
-        Section(title="Each instance that is no success", rows=table_of(failed)),
+        Section(title="Risk by coverage", text=text, rows=risk),
+        Section(title="Each instance that is no success", rows=failed),
     ]
     return [section for section in sections if section.rows]
 
@@ -210,14 +189,14 @@ def instance_sections(
     """Show the worst, the median and the best answer of each set of predictions, and a refusal."""
     instances = {instance.name: instance for instance in dataset.instances}
     sections: list[Section] = []
-    for path, of_path, most in zip(predictions, rows, share_views(len(predictions)), strict=True):
+    shares = page.share_views(len(predictions))
+    for path, of_path, most in zip(predictions, rows, shares, strict=True):
         if not most:
             continue
         estimates = match(dataset.instances, read_any(path), dataset.objects)
         for role, row in _choose(of_path, most):
-            instance = instances[row.instance]
-            shown = _shown(dataset, instance, estimates[instance.name])
-            title = f"{path.stem}: {row.object} in {instance.name}, {role}"
+            shown = _shown(dataset, instances[row.instance], estimates[row.instance])
+            title = f"{path.stem}: {row.object} in {row.instance}, {role}"
             columns = row.columns()
             own = {name: columns[name] for name in _MEASURED}
             sections.append(pose_section(title, shown, _OF_TRUTH, rows=[own]))
@@ -231,12 +210,13 @@ def _choose(rows: Sequence[InstanceRow], most: int) -> list[tuple[str, InstanceR
     shares = [(errors[row.instance] or 0.0) / row.diameter_m for row in answers]
     chosen = [
         (f"{role} answer of {len(answers)}", answers[k])
-        for role, k in choose_ranked(shares, min(most, 3))
+        for role, k in page.choose_ranked(shares, min(most, 3))
     ]
     refused = [r for r in rows if errors[r.instance] is None and r.status != "missing"]
     few = min(most - len(chosen), 1)
     chosen += [
-        (f"one of {len(refused)} refused", refused[k]) for k in spread_evenly(len(refused), few)
+        (f"one of {len(refused)} refused", refused[k])
+        for k in page.spread_evenly(len(refused), few)
     ]
     return chosen
 

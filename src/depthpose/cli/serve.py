@@ -1,27 +1,16 @@
 """``depthpose serve``."""
 
-from depthpose.cli.arguments import WeightsName, group
+from depthpose.cli.arguments import WeightsName
 from depthpose.core.errors import InputError, MissingExtraError
 
 
-@group
-class ServeOptions:
-    """Where the page is, and what answers."""
-
-    host: str = "127.0.0.1"
-    """127.0.0.1 is this machine alone; with 0.0.0.0 everyone who can reach this machine can use the
-    page: there is no password and no encryption."""
-    port: int = 8000
-    """of the page; 0 takes a free one."""
-    weights: WeightsName = "default"
-    """of the depth networks, by name or file ('depthpose weights list')."""
-    pose_weights: WeightsName = "parts"
-    """of a pose network, by name or file."""
-    max_upload_mb: int = 64
-    """all files of one request together [1e6 bytes]."""
-
-
-def serve(page: ServeOptions = ServeOptions()) -> int:
+def serve(
+    host: str = "127.0.0.1",
+    port: int = 8000,
+    weights: WeightsName = "default",
+    pose_weights: WeightsName = "parts",
+    max_upload_mb: int = 64,
+) -> int:
     """Serve a page for your browser: drop an image, a pair, a depth image or a cloud onto it.
 
     Tab Depth: depth, the synthesised right view, confidence and a cloud. Tab Pose: votes, the posed
@@ -31,30 +20,38 @@ def serve(page: ServeOptions = ServeOptions()) -> int:
 
         depthpose serve
         depthpose serve --pose-weights my_part/pose.safetensors --port 8080
+
+    Args:
+        host: 127.0.0.1 is this machine alone; with 0.0.0.0 everyone who can reach this machine can
+            use the page: there is no password and no encryption.
+        port: of the page; 0 takes a free one.
+        weights: of the depth networks, by name or file ('depthpose weights list').
+        pose_weights: of a pose network, by name or file.
+        max_upload_mb: all files of one request together [1e6 bytes].
     """
     try:
-        from depthpose.web import Limits, known_names, make_app, open_socket, run, taken_address
+        from depthpose import web
     except ModuleNotFoundError as error:
         package = (error.name or "starlette").partition(".")[0]
         raise MissingExtraError(package, "serve", "the page in the browser") from error
     from depthpose.depth.estimator import FakestereoNet
     from depthpose.pose.estimator import GeoPoseNet
 
-    if page.max_upload_mb < 1:
-        raise InputError(f"--max-upload-mb {page.max_upload_mb}: take 1 at least; 64 is usual")
-    taken = open_socket(page.host, page.port)
-    address = taken_address(taken)
-    names = known_names(page.host, address)
-    limits = Limits(upload_bytes=page.max_upload_mb * 10**6, hosts=names)
-    depth = FakestereoNet.load(page.weights, allow_ood=True)
-    app = make_app(depth, GeoPoseNet.load(page.pose_weights), limits)
+    if max_upload_mb < 1:
+        raise InputError(f"--max-upload-mb {max_upload_mb}: take 1 at least; 64 is usual")
+    taken = web.open_socket(host, port)
+    address = web.taken_address(taken)
+    names = web.known_names(host, address)
+    limits = web.Limits(upload_bytes=max_upload_mb * 10**6, hosts=names)
+    depth = FakestereoNet.load(weights, allow_ood=True)
+    app = web.make_app(depth, GeoPoseNet.load(pose_weights), limits)
     shown = f"[{address}]" if address.version == 6 else address
     print(f"http://{shown}:{taken.getsockname()[1]}/  (Ctrl+C stops it)", flush=True)
     if not address.is_loopback:
         print("whoever can reach this address may use the page: no password, no encryption",
               flush=True)  # fmt: skip
     try:
-        run(app, taken)
+        web.run(app, taken)
     except KeyboardInterrupt:
         print("stopped")
     return 0

@@ -8,101 +8,24 @@ from typing import TYPE_CHECKING, Literal, NamedTuple
 
 import tyro
 
-from depthpose.cli.arguments import NewPath, WeightsName, group, refuse_below
+from depthpose.cli.arguments import NewPath, WeightsName, refuse_below
 from depthpose.cli.depth_options import MatcherOptions, ProtocolOptions, refuse_ignored
 from depthpose.cli.pose_options import PoseDataOptions, PoseTableOptions
 from depthpose.core.errors import InputError
-from depthpose.depth.config import MatcherConfig
 
 if TYPE_CHECKING:
-    from depthpose.cli.depth_methods import Method
-    from depthpose.depth.datasets import Dataset
     from depthpose.thesis.depth import PublishedTable
-
-
-@group
-class RowOptions:
-    """The methods of a table, a row each."""
-
-    weights: tuple[WeightsName, ...] = ()
-    """weights files; 2.2 takes a stereo matcher's too."""
-    matcher: Literal["sgbm"] | None = None
-    """sgbm: OpenCV's StereoSGBM as a row of table 2.2."""
-    beside: tuple[str, ...] | None = None
-    """tables 2.1 and 2.3: weights of other methods, a row each; by default those that ship.
-    '--beside' without a name: none."""
-    train: tuple[Path, ...] = ()
-    """training folders, for two baselines (best depth of each row, nearest image)."""
-    train_without: tuple[str, ...] = ()
-    """names of training frames to leave out."""
-
-    def refuse_unusable(self, table: "PublishedTable") -> None:
-        """Refuse, before any work, rows that a table does not have, and those that it lacks."""
-        if self.beside is not None and table.with_right:
-            raise InputError(
-                f"--beside {' '.join(self.beside)}: adds methods of one image, and table "
-                f"{table.number} is of pairs; leave it out, or give more --weights"
-            )
-        if self.train_without and not self.train:
-            raise InputError(
-                f"--train-without {' '.join(self.train_without)}: leaves frames out of --train, "
-                "and none is given; give its folders, or leave this out"
-            )
-        if self.matcher is not None and not table.with_right:
-            raise InputError(
-                f"--matcher {self.matcher}: matches pairs, and table {table.number} is of one "
-                "image; table 2.2 takes it."
-            )
-        if not self.weights and self.matcher is None:
-            more = " or --matcher sgbm" if table.with_right else ""
-            raise InputError(
-                f"table {table.number}: there is nothing to measure; give --weights FILE{more}."
-            )
-        if len(table.own) > 1 and len(self.weights) != len(table.own):
-            rows = " and ".join(f"'{name}'" for name in table.own)
-            raise InputError(
-                f"table {table.number}: has the rows {rows}, but {len(self.weights)} weights were "
-                "given; give one for each, in this order."
-            )
-
-    def methods(
-        self, table: "PublishedTable", config: MatcherConfig, dataset: "Dataset"
-    ) -> "list[tuple[str, Method]]":
-        """Build each method for a dataset, with the thesis's own row that it stands for, if any."""
-        from depthpose.cli.depth_evaluate import open_training
-        from depthpose.cli.depth_methods import MethodSource, baseline_method, sgbm_method
-
-        def method_of(name: str) -> "Method":
-            return MethodSource(weights=name, config=config, with_right=table.with_right).build()
-
-        is_by_place = len(table.own) == len(self.weights)
-        owns = table.own if is_by_place else [table.own[0]] * len(self.weights)
-        chosen = [(own, method_of(file)) for own, file in zip(owns, self.weights, strict=True)]
-        names = [method.name for _, method in chosen]
-        if len(set(names)) < len(names):
-            raise InputError(
-                f"two weights are called {names[0]!r}, and so would their predictions be: rename "
-                "one."
-            )
-        if self.matcher is not None:
-            chosen.append((table.own[0], sgbm_method(with_filled_holes=True)))
-        if not table.with_right:
-            named = ("default",) if self.beside is None else self.beside
-            others = map(method_of, named)
-            chosen += [("", other) for other in others if other.name not in names]
-        if self.train:
-            training = open_training(self.train, self.train_without, dataset)
-            baselines = [baseline_method(name, training) for name in ("rows", "nearest")]
-            # A baseline uses no right image, but is measured on the frames of the other rows.
-            chosen += [("", one._replace(with_right=table.with_right)) for one in baselines]
-        return chosen
 
 
 def reproduce(
     table: tyro.conf.Positional[Literal["2.1", "2.2", "2.3"]],
     kitti: Path,
     out: NewPath,
-    rows: RowOptions = RowOptions(),
+    weights: tuple[WeightsName, ...] = (),
+    matcher: Literal["sgbm"] | None = None,
+    beside: tuple[str, ...] | None = None,
+    train: tuple[Path, ...] = (),
+    train_without: tuple[str, ...] = (),
     split: str = "eigen-test",
     pictures: int = 3,
     comparison: ProtocolOptions = ProtocolOptions(),
@@ -121,10 +44,17 @@ def reproduce(
         table: number in the thesis.
         kitti: KITTI raw with LiDAR; or any folder that 'depth evaluate' takes, with --split all.
         out: folder to write to.
+        weights: weights files, a row each; 2.2 takes a stereo matcher's too.
+        matcher: sgbm: OpenCV's StereoSGBM as a row of table 2.2.
+        beside: tables 2.1 and 2.3: weights of other methods, a row each; by default those that
+            ship. '--beside' without a name: none.
+        train: training folders, for two baselines (best depth of each row, nearest image).
+        train_without: names of training frames to leave out.
         split: eigen-test (697 frames), another split, a file of frames, or all.
         pictures: how many frames the page shows.
     """
-    from depthpose.cli.depth_evaluate import open_frames
+    from depthpose.cli.depth_evaluate import open_frames, open_training
+    from depthpose.cli.depth_methods import Method, MethodSource, baseline_method, sgbm_method
     from depthpose.cli.thesis_depth import reproduce_table
     from depthpose.depth.evaluate import find_protocol
     from depthpose.thesis.depth import find_table
@@ -136,13 +66,73 @@ def reproduce(
         )
     comparison.refuse_unusable()
     refuse_below(0, "--pictures", pictures, "3")
-    rows.refuse_unusable(published)
-    refuse_ignored(rows.weights, matching)
+    _refuse_rows(published, weights, matcher, beside, train, train_without)
+    refuse_ignored(weights, matching)
     dataset = open_frames(kitti, None if split == "all" else split)
-    methods = rows.methods(published, matching.config, dataset)
+
+    def method_of(name: str) -> Method:
+        right = published.with_right
+        return MethodSource(weights=name, config=matching.config, with_right=right).build()
+
+    # Each method, with the thesis's own row that it stands for, if any.
+    own = published.own
+    owns = own if len(own) == len(weights) else [own[0]] * len(weights)
+    methods = [(row, method_of(file)) for row, file in zip(owns, weights, strict=True)]
+    names = [method.name for _, method in methods]
+    if len(set(names)) < len(names):
+        raise InputError(
+            f"two weights are called {names[0]!r}, and so would their predictions be: rename one."
+        )
+    if matcher is not None:
+        methods.append((own[0], sgbm_method(with_filled_holes=True)))
+    if not published.with_right:
+        others = map(method_of, ("default",) if beside is None else beside)
+        methods += [("", other) for other in others if other.name not in names]
+    if train:
+        training = open_training(train, train_without, dataset)
+        baselines = [baseline_method(name, training) for name in ("rows", "nearest")]
+        # A baseline uses no right image, but is measured on the frames of the other rows.
+        methods += [("", one._replace(with_right=published.with_right)) for one in baselines]
     return reproduce_table(
         published, dataset, methods, out, comparison.protocol, comparison.cap, pictures
     )
+
+
+def _refuse_rows(
+    table: "PublishedTable",
+    weights: Sequence[str],
+    matcher: str | None,
+    beside: Sequence[str] | None,
+    train: Sequence[Path],
+    train_without: Sequence[str],
+) -> None:
+    """Refuse, before any work, rows that a table does not have, and those that it lacks."""
+    if beside is not None and table.with_right:
+        raise InputError(
+            f"--beside {' '.join(beside)}: adds methods of one image, and table {table.number} is "
+            "of pairs; leave it out, or give more --weights"
+        )
+    if train_without and not train:
+        raise InputError(
+            f"--train-without {' '.join(train_without)}: leaves frames out of --train, and none is "
+            "given; give its folders, or leave this out"
+        )
+    if matcher is not None and not table.with_right:
+        raise InputError(
+            f"--matcher {matcher}: matches pairs, and table {table.number} is of one image; table "
+            "2.2 takes it."
+        )
+    if not weights and matcher is None:
+        more = " or --matcher sgbm" if table.with_right else ""
+        raise InputError(
+            f"table {table.number}: there is nothing to measure; give --weights FILE{more}."
+        )
+    if len(table.own) > 1 and len(weights) != len(table.own):
+        rows = " and ".join(f"'{name}'" for name in table.own)
+        raise InputError(
+            f"table {table.number}: has the rows {rows}, but {len(weights)} weights were given; "
+            "give one for each, in this order."
+        )
 
 
 def figure(
@@ -384,14 +374,6 @@ class Step(NamedTuple):
     of: Sequence[Path] = ()
     is_replaced: bool = False
 
-    @property
-    def is_done(self) -> bool:
-        """Whether what it makes is there, and not older than what it is made of."""
-        if not self.makes.is_file():
-            return False
-        made = self.makes.stat().st_mtime
-        return all(path.is_file() and path.stat().st_mtime <= made for path in self.of)
-
 
 def reproduce_all(
     out: NewPath,
@@ -456,15 +438,14 @@ def _depth_steps(
     train = partial(_training, kitti, configs, device)
     how = ("--kitti", str(kitti), "--split", split, "--protocol", protocol)
     table = partial(_table, home, device, how)
+    finetune = train("depth/finetune.yaml", ("depth", "train", "finetune", *begin), tuned)
     return [
         train("depth/view.yaml", ("depth", "train", "view"), generator),
         train("depth/stereo.yaml", ("depth", "train", "stereo"), matcher),
         Step("both in one file", (*pack, *_TRAINED_ON), apart, (generator, matcher), True),
         table("2.1", (apart,)),
         table("2.2", (matcher,)),
-        train("depth/finetune.yaml", ("depth", "train", "finetune", *begin), tuned)._replace(
-            of=(generator, matcher)
-        ),
+        finetune._replace(of=(generator, matcher)),
         table("2.3", (apart, tuned)),
     ]
 
@@ -476,12 +457,13 @@ def _pose_steps(linemod: Path, configs: Path, home: Path, device: str) -> list[S
     dataset = open_bop(linemod, "test")
     print(f"{linemod}: {len(dataset.instances)} instances to test on")
     _claim(home, linemod, configs, [f"pose/{name}.yaml" for name in _POSE], {})
-    steps: list[Step] = []
-    for name, what in _POSE.items():
-        words, makes = ("pose", "train", "--what", what), home / f"{what}/{what}.safetensors"
-        steps.append(_training(linemod, configs, device, f"pose/{name}.yaml", words, makes))
+    train, data = partial(_training, linemod, configs, device), ("--linemod", str(linemod))
+    steps = [
+        train(f"pose/{name}.yaml", ("pose", "train", "--what", what),
+              home / f"{what}/{what}.safetensors")
+        for name, what in _POSE.items()
+    ]  # fmt: skip
     ours, pointnet, depth_image, masks = [step.makes for step in steps]
-    data = ("--linemod", str(linemod))
     shown = (*data, "--no-icp", "--masks", "truth", str(masks))
     for number, weights in (("3.1", (ours, pointnet, depth_image)), ("3.2", (ours,))):
         table = _table(home, device, shown, number, weights)
@@ -496,7 +478,8 @@ def walk(steps: Sequence[Step]) -> int:
     code = 0
     for number, step in enumerate(steps, 1):
         head = f"[{number}/{len(steps)}] {step.what}"
-        if step.is_done:
+        made = step.makes.stat().st_mtime if step.makes.is_file() else -1
+        if made >= 0 and all(p.is_file() and p.stat().st_mtime <= made for p in step.of):
             print(f"{head}: done, {step.makes}", flush=True)
             continue
         print(f"{head}: depthpose {shlex.join(step.words)}", flush=True)

@@ -10,15 +10,7 @@ from jaxtyping import Float
 from torch import Tensor
 from tqdm import tqdm
 
-from depthpose.cli.depth_evaluate import (
-    columns,
-    detail_sections,
-    join,
-    measure_each,
-    predict_all,
-    say_skipped,
-    write_details,
-)
+from depthpose.cli import depth_evaluate as evaluation
 from depthpose.cli.depth_methods import Method
 from depthpose.core.errors import InputError, nearest_name
 from depthpose.core.files import write_image
@@ -26,17 +18,8 @@ from depthpose.core.run import claim_folder, environment, find_rank
 from depthpose.depth.datasets import Dataset, Frame, has_lidar, lidar_truth
 from depthpose.depth.evaluate import find_protocol
 from depthpose.depth.predictions import has_prediction, read_estimate
-from depthpose.report.page import (
-    Drawing,
-    Picture,
-    Section,
-    markdown_table,
-    spread_evenly,
-    table_files,
-    write_markdown,
-    write_page,
-    write_table,
-)
+from depthpose.report import page
+from depthpose.report.page import Drawing, Picture, Section
 from depthpose.thesis.depth import (
     DEPTH_SCALE,
     PublishedTable,
@@ -69,19 +52,17 @@ def reproduce_table(
         "caps_m": list(caps_m),
         "methods": {method.name: method.settings for _, method in methods},
     }
-    results = (*table_files("rows", "frames", "confidence"), "report.md", "report.html")
+    results = (*page.table_files("rows", "frames", "confidence"), "report.md", "report.html")
     claim_folder(out, settings, (*results, "predictions", "figures"))
-    rule = find_protocol(protocol)
-    home = out / "predictions"
-    folders = [predict_all(dataset, method, rule, home) for _, method in methods]
+    rule, home = find_protocol(protocol), out / "predictions"
+    folders = [evaluation.predict_all(dataset, method, rule, home) for _, method in methods]
     if find_rank().rank > 0:
         return 0
-    measured = join(measure_each(dataset, folders, protocol, caps_m))
+    measured = evaluation.join(evaluation.measure_each(dataset, folders, protocol, caps_m))
     owns = [own for own, _ in methods for _ in caps_m]
     joined = join_published(table, list(zip(owns, measured.rows, strict=True)))
-    rows = columns(joined)
-    write_table(out, rows)
-    write_details(measured, out)
+    rows = evaluation.columns(joined)
+    page.write_table(out, rows)
     how = (
         f"Ours: {protocol}: {rule.summary}. The printed rows are of the 697 frames of "
         "eigen-test. Difference: ours minus the thesis's own row. A row of another protocol, or of "
@@ -90,16 +71,20 @@ def reproduce_table(
     sections = [
         Section(title="Published rows, ours, and difference", text=how, rows=rows),
         *_picture_sections(dataset, [method for _, method in methods], pictures, out),
-        *detail_sections(measured),
+        *evaluation.write_details(measured, out),
         Section(title="Settings", rows=[row for _, m in methods for row in _setting_rows(m)]),
     ]
-    title = f"{table.title}, on {dataset.name}"
-    write_markdown(out / "report.md", title, sections, environment())
-    write_page(out / "report.html", title, sections, environment())
-    print(markdown_table(rows))
-    say_skipped(measured)
-    print(f"the page: {out / 'report.html'}")
+    write_report(f"{table.title}, on {dataset.name}", sections, out)
+    evaluation.say_skipped(measured)
     return 0
+
+
+def write_report(title: str, sections: Sequence[Section], out: Path) -> None:
+    """Write report.md and report.html of a table, and print its rows."""
+    page.write_markdown(out / "report.md", title, sections, environment())
+    page.write_page(out / "report.html", title, sections, environment())
+    print(page.markdown_table(sections[0].rows))
+    print(f"the page: {out / 'report.html'}")
 
 
 def choose_frames(dataset: Dataset, names: Sequence[str], number: int) -> list[int]:
@@ -118,7 +103,7 @@ def choose_frames(dataset: Dataset, names: Sequence[str], number: int) -> list[i
     chosen = [i for i in pairs if has_lidar(dataset.frames[i], "camera_z")] or pairs
     if not chosen:
         raise InputError(f"{dataset.name}: no frame has a right view, which the figures show.")
-    return [chosen[place] for place in spread_evenly(len(chosen), max(1, number))]
+    return [chosen[place] for place in page.spread_evenly(len(chosen), max(1, number))]
 
 
 def write_figure(
@@ -130,24 +115,21 @@ def write_figure(
     settings = {"command": f"figure {number}", **about, "method": method.settings}
     claim_folder(out, settings, (f"figure-{number}.png", "panels", "report.html"))
     columns: list[list[Drawing]] = []
-    for index in tqdm(indices, unit=" frames", disable=None):
-        pair, lidar_m = dataset.read_input(index), _lidar(dataset.frames[index])
-        estimate = method.net.estimate_pair(
-            pair if method.with_right else replace(pair, right=None)
-        )
+    sections: list[Section] = []
+    for index, frame in zip(tqdm(indices, unit=" frames", disable=None), frames, strict=True):
+        pair, lidar_m = dataset.read_input(index), _lidar(frame)
+        seen = pair if method.with_right else replace(pair, right=None)
+        estimate = method.net.estimate_pair(seen)
         if number == "2-5":
             columns.append(draw_figure_2_5(pair, lidar_m, estimate))
         else:
             stereo = method.net.estimate_pair(pair)
             columns.append(draw_figure_2_1(pair, lidar_m, estimate, stereo))
+        sections.append(_panel_section(frame.name, columns[-1], out / "panels" / frame.name))
     path = out / f"figure-{number}.png"
     write_image(path, arrange(columns))
-    sections = [
-        _panel_section(frame.name, panels, out / "panels" / frame.name)
-        for frame, panels in zip(frames, columns, strict=True)
-    ]
     sections.append(Section(title="Settings", rows=_setting_rows(method)))
-    write_page(out / "report.html", f"Figure {number}", sections, environment())
+    page.write_page(out / "report.html", f"Figure {number}", sections, environment())
     captions = "; ".join(panel.caption for panel in columns[0])
     print(f"{path}: each column from top to bottom: {captions}. {DEPTH_SCALE}; see the bar below.")
     return 0
@@ -169,14 +151,9 @@ def _picture_sections(
             if place == 0 and estimate.right is not None and pair.right is not None:
                 stereo = method.net.estimate_pair(pair)
                 figures["2-1"] = draw_figure_2_1(pair, lidar_m, estimate, stereo)
-            sections += [
-                _panel_section(
-                    f"Figure {figure}: {method.name}, {pair.name}",
-                    panels,
-                    home / f"{figure}_{pair.name}",
-                )
-                for figure, panels in figures.items()
-            ]
+            for figure, panels in figures.items():
+                title = f"Figure {figure}: {method.name}, {pair.name}"
+                sections.append(_panel_section(title, panels, home / f"{figure}_{pair.name}"))
     return sections
 
 

@@ -13,10 +13,11 @@ from tqdm import tqdm
 from depthpose.cli import pose_evaluate, pose_methods
 from depthpose.cli.arguments import refuse_below
 from depthpose.cli.pose_options import PoseDataOptions, PoseTableOptions
+from depthpose.cli.thesis_depth import write_report
 from depthpose.core.checkpoint import file_sha256, find_weights
 from depthpose.core.config import config_to_dict
 from depthpose.core.errors import InputError
-from depthpose.core.files import read_image, write_image
+from depthpose.core.files import write_image
 from depthpose.core.run import claim_folder, environment
 from depthpose.pose.config import ObjectsConfig
 from depthpose.pose.datasets import BopDataset, Instance
@@ -27,17 +28,8 @@ from depthpose.pose.predictions import read_predictions
 from depthpose.pose.synthetic import Objects
 from depthpose.pose.types import ViewSample
 from depthpose.pose.voting import vote_ransac
-from depthpose.report.page import (
-    Drawing,
-    Picture,
-    Section,
-    markdown_table,
-    spread_evenly,
-    table_files,
-    write_markdown,
-    write_page,
-    write_table,
-)
+from depthpose.report import page
+from depthpose.report.page import Drawing, Picture, Section
 from depthpose.report.pose import close_up, draw_boxes, grey_depth, picture_of
 from depthpose.thesis import pose_figures, pose_tables
 
@@ -58,12 +50,12 @@ class Views:
     facts: dict[str, Any]
     settings: dict[str, Any]
 
-    def picture(self, index: int) -> Float[Tensor, "3 h w"]:
-        """Give the picture of a view, or its depth in grey."""
-        instance = self.instances[index]
-        if instance is not None and instance.rgb is not None:
-            return read_image(instance.rgb)
-        return grey_depth(self.samples[index].input.depth_m)
+    def close_up(self, index: int) -> tuple[Float[Tensor, "3 h w"], Float[Tensor, "3 3"]]:
+        """Give the picture of a view near its object, or its depth in grey, and its camera."""
+        instance, seen = self.instances[index], self.samples[index].input
+        has_picture = instance is not None and instance.rgb is not None
+        picture = picture_of(instance) if has_picture else grey_depth(seen.depth_m)
+        return close_up(picture, seen.mask, seen.K)
 
 
 def open_views(net: GeoPoseNet, data: PoseDataOptions, number: int | None, synthetic: int) -> Views:
@@ -83,7 +75,7 @@ def open_views(net: GeoPoseNet, data: PoseDataOptions, number: int | None, synth
         "frames_sha256": frames_hash(dataset.instances)[:12],
     }
     if number is not None and number < len(dataset):
-        kept = [dataset.instances[i] for i in spread_evenly(len(dataset), number)]
+        kept = [dataset.instances[i] for i in page.spread_evenly(len(dataset), number)]
         dataset = replace(dataset, instances=kept)
     names = pose_methods.match_names(dataset, net.weights.models)
     samples: list[ViewSample] = []
@@ -130,7 +122,7 @@ def reproduce_by_object(
         "masks": pose_methods.mask_files(how.masks) if methods else [],
         "csv": [pose_methods.named_file(path) for path in csv],
     }
-    results = (*table_files("rows", "all", "instances", "risk"), "report.md", "report.html")
+    results = (*page.table_files("rows", "all", "instances", "risk"), "report.md", "report.html")
     claim_folder(out, settings, (*results, "predictions", "detections", "figures"))
     shown = pose_methods.find_masks(how.masks, dataset, out, how.device) if methods else []
     folders = [pose_methods.predict_all(dataset, m, one, out) for m in methods for one in shown]
@@ -139,18 +131,17 @@ def reproduce_by_object(
     )
     joined = pose_tables.join_by_object(measured.rows, numbers, with_published=is_printed)
     rows, every = [row.columns() for row in joined], pose_evaluate.table_of(measured.rows)
-    write_table(out, rows)
-    write_table(out, every, name="all")
-    pose_evaluate.write_details(measured, out)
+    page.write_table(out, rows)
+    page.write_table(out, every, name="all")
     sections = [
         Section(title="Percent by object", text=f"{_HOW} {_DIFFERENCES[number]}", rows=rows),
         Section(title="All numbers", text=pose_evaluate.HOW, rows=every),
         *_picture_sections(dataset, folders, how.pictures, out),
-        *pose_evaluate.detail_sections(measured),
+        *pose_evaluate.write_details(measured, out),
     ]
-    return _write(
-        f"{pose_tables.TITLES[number]}, on {dataset.folder.resolve().name}", sections, out
-    )
+    title = f"{pose_tables.TITLES[number]}, on {dataset.folder.resolve().name}"
+    write_report(title, sections, out)
+    return 0
 
 
 _HOW = (
@@ -178,7 +169,7 @@ def _picture_sections(
     for folder in folders:
         known = {p.estimate.name: p.estimate for p in read_predictions(folder)}
         pictures: list[Picture] = []
-        for instance in (dataset.instances[i] for i in spread_evenly(len(dataset), number)):
+        for instance in (dataset.instances[i] for i in page.spread_evenly(len(dataset), number)):
             estimate = known.get(instance.name)
             if estimate is None:  # of a detection: it bears no instance's name
                 continue
@@ -205,14 +196,14 @@ def reproduce_voting(
     sha256 = file_sha256(path)
     facts = {"weights": path.stem, "weights_sha256": sha256[:12], **views.facts}
     own = {"command": "reproduce 3.3", "weights_sha256": sha256, "points": list(points)}
-    claim_folder(out, own | views.settings, [*table_files("rows"), "report.md", "report.html"])
+    claim_folder(out, own | views.settings, [*page.table_files("rows"), "report.md", "report.html"])
     rows: list[dict[str, Any]] = []
     for count in points:
         cases = list(
             pose_tables.cases_of(net, tqdm(views.samples, f"{count} points", disable=None), count)
         )
         rows += [row.columns() | facts for row in pose_tables.compare_voting(cases, count)]
-    write_table(out, rows)
+    page.write_table(out, rows)
     text = (
         "Success: percent of instances whose ADD(-S) is below 10 % of the diameter, without ICP; "
         "milliseconds: processor time of one thread for all keypoints of a cloud, the median. "
@@ -220,14 +211,7 @@ def reproduce_voting(
         "Times faster: than the loop. All rows of a block saw the same directions."
     )
     sections = [Section(title="RANSAC against least squares", text=text, rows=rows)]
-    return _write(f"{pose_tables.TITLES['3.3']}, {facts['frames']}", sections, out)
-
-
-def _write(title: str, sections: Sequence[Section], out: Path) -> int:
-    write_markdown(out / "report.md", title, sections, environment())
-    write_page(out / "report.html", title, sections, environment())
-    print(markdown_table(sections[0].rows))
-    print(f"the page: {out / 'report.html'}")
+    write_report(f"{pose_tables.TITLES['3.3']}, {facts['frames']}", sections, out)
     return 0
 
 
@@ -254,7 +238,7 @@ def write_figure(number: str, text: str, panels: Sequence[Drawing], out: Path, c
         write_image(file, panel.image)
         pictures.append(Picture(path=file, caption=panel.caption))
     section = Section(title="Panels", text=text, pictures=pictures)
-    write_page(out / "report.html", f"Figure {number}", [section], environment())
+    page.write_page(out / "report.html", f"Figure {number}", [section], environment())
     print(f"{path}: {'; '.join(panel.caption for panel in panels)}. {text}")
     return 0
 
@@ -298,7 +282,7 @@ def field_panels(net: GeoPoseNet, views: Views, keypoint: int | None) -> list[Dr
     error_m, index, k, case, true_m, voted_m = max(errors, key=lambda one: one[0])
     exact = torch.nn.functional.normalize(true_m - case.points_m, dim=-1)
     view = views.samples[index]
-    image, _ = close_up(views.picture(index), view.input.mask, view.input.K)
+    image, _ = views.close_up(index)
     return [
         Drawing(image=image, caption=f"(a) {view.input.name}, keypoint {k}"),
         Drawing(
@@ -317,11 +301,11 @@ def box_panels(net: GeoPoseNet, views: Views) -> list[Drawing]:
     models = {model.name: model for model in net.weights.models}
     panels: list[Drawing] = []
     for k, view in enumerate(views.samples):
-        estimate = net.estimate_many([view.input])[0]
+        (estimate,) = net.estimate_many([view.input])
+        picture, K = views.close_up(k)
         true, found = view.truth.camera_from_model, estimate.camera_from_model
-        picture, K = close_up(views.picture(k), view.input.mask, view.input.K)
-        image = draw_boxes(picture, true, found, models[view.input.object], K)
         name = view.input.name
+        image = draw_boxes(picture, true, found, models[view.input.object], K)
         caption = name if estimate.is_posed else f"{name}: refused, {estimate.reason}"
         panels.append(Drawing(image=image, caption=caption))
     return panels

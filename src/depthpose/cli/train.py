@@ -1,10 +1,10 @@
 """``depthpose depth train``, ``depth calibrate`` and ``pose train``, and their progress."""
 
-import dataclasses
 import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import fields, replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
@@ -26,17 +26,6 @@ from depthpose.depth.config import MatcherConfig
 
 if TYPE_CHECKING:  # --help must not load torch
     from depthpose.core.loop import Progress
-    from depthpose.depth.train.config import (
-        AdaptTraining,
-        FinetuneTraining,
-        SelectTraining,
-        StereoTraining,
-        ViewTraining,
-    )
-    from depthpose.pose.train import DepthImageTraining, PoseTraining, SegmentationTraining
-
-    DepthConfig = ViewTraining | SelectTraining | StereoTraining | AdaptTraining | FinetuneTraining
-    PoseConfig = PoseTraining | DepthImageTraining | SegmentationTraining
 
 
 @group
@@ -60,56 +49,49 @@ class TrainingOptions:
     """live draws the losses in Rerun's viewer (an extra); FILE.rrd records them."""
 
     def read(
-        self,
-        path: Path | None,
-        kind: type,
-        default: object = None,
-        workers: int | None = None,
+        self, path: Path | None, kind: type, default: object = None, workers: int | None = None
     ) -> Any:  # noqa: ANN401 - an instance of kind
         """Read the config of a training, or take its defaults, with what was said here."""
         from depthpose.core.config import read_config
-        from depthpose.core.loop import refuse_long_warmup  # --help must not load torch
+        from depthpose.core.loop import refuse_long_warmup
 
         config: Any = (default or kind()) if path is None else read_config(path, kind)
         if not (self.resume or self.finish):
             own = config.loop.steps
             refuse_long_warmup(config, None if own is None else max(own, self.steps or 0))
-        loop = changed(
-            config.loop,
-            seed=self.seed,
-            device=self.device,
-            precision=self.precision,
-            workers=workers,
-        )
+        own = {"seed": self.seed, "device": self.device, "precision": self.precision}
+        loop = changed(config.loop, workers=workers, **own)
         if self.steps is not None:
-            loop = dataclasses.replace(loop, steps=self.steps, epochs=None)
-        return dataclasses.replace(config, loop=loop)
+            loop = replace(loop, steps=self.steps, epochs=None)
+        return replace(config, loop=loop)
 
+    def run(
+        self,
+        run_stage: Callable[[Any, Any], Path],
+        config: object,
+        out: Path,
+        *,
+        with_messages: bool = False,
+    ) -> int:
+        """Train, show how far it is, and print where the weights and their card are."""
+        from depthpose.core.loop import Run
+        from depthpose.core.run import find_rank
 
-def _train(
-    run_stage: Callable[[Any, Any], Path], config: object, out: Path, options: TrainingOptions,
-    *, with_messages: bool,
-) -> int:  # fmt: skip
-    """Run a training, show how far it is, and print where its weights and their card are."""
-    from depthpose.core.loop import Run
-    from depthpose.core.run import find_rank
-
-    is_first = find_rank().rank == 0
-    with progress_bar(options.view) as on_step:
-        on_message = partial(print, flush=True) if with_messages and is_first else None
-        run = Run(
-            folder=out,
-            resume=options.resume,
-            finish=options.finish,
-            on_step=on_step,
-            on_message=on_message,
-        )
-        path = run_stage(config, run)
-    if is_first:
-        print(f"trained weights: {path}")
-        card = path.with_suffix(".md")
-        print(card.read_text() if card.is_file() else "", end="")
-    return 0
+        is_first = find_rank().rank == 0
+        with progress_bar(self.view) as on_step:
+            run = Run(
+                folder=out,
+                resume=self.resume,
+                finish=self.finish,
+                on_step=on_step,
+                on_message=partial(print, flush=True) if with_messages and is_first else None,
+            )
+            path = run_stage(config, run)
+        if is_first:
+            print(f"trained weights: {path}")
+            card = path.with_suffix(".md")
+            print(card.read_text() if card.is_file() else "", end="")
+        return 0
 
 
 @contextmanager
@@ -123,11 +105,11 @@ def progress_bar(view: str | None = None) -> "Iterator[Callable[[Progress], None
     # Opened before the length is known; other processes than the first never show a step.
     is_first = find_rank().rank == 0
     is_logged = is_first and not (sys.stdout.isatty() and sys.stderr.isatty())
+    lines = Lines() if is_logged else None
     with (
         tqdm(unit=" steps", disable=None if is_first else True) as bar,
         open_viewer(view if is_first else None) as viewer,
     ):
-        lines = Lines() if is_logged else None
 
         def show(progress: "Progress") -> None:
             if bar.total is None:
@@ -145,12 +127,7 @@ def progress_bar(view: str | None = None) -> "Iterator[Callable[[Progress], None
 
 
 class Lines:
-    """A line a minute, for a log: the first step, the last, and what is left between them.
-
-    Args:
-        every_s: seconds between two lines.
-        clock: seconds that only grow.
-    """
+    """A line a minute, for a log: the first step, the last, and what is left between them."""
 
     def __init__(self, every_s: float = 60.0, clock: Callable[[], float] = time.monotonic) -> None:
         self._every_s, self._clock = every_s, clock
@@ -162,10 +139,9 @@ class Lines:
         """Print a line where one is due; the latest numbers stand in it."""
         now_s = self._clock()
         self._numbers = progress.numbers or self._numbers
-        is_end = progress.step >= progress.steps
         if self._began is None:
             self._began = (progress.step, now_s)
-        elif not is_end and now_s - self._last_s < self._every_s:
+        elif progress.step < progress.steps and now_s - self._last_s < self._every_s:
             return
         self._last_s = now_s
         first, began_s = self._began
@@ -181,70 +157,35 @@ _LOOKED_AT = 20
 """Held-out pairs of a folder, by default."""
 
 
-@group
-class PairsOptions:
-    """What a training learns from."""
+def _with_pairs(config: Any, data: tuple[str, ...], held_out: tuple[str, ...]) -> Any:  # noqa: ANN401
+    """Give the config of a training with these folders."""
+    from depthpose.depth.config import PairsConfig
+    from depthpose.depth.train.config import AdaptTraining, StereoTraining
 
-    data: tuple[Source, ...] = ()
-    """folders of pairs; they replace the config's."""
-    held_out: tuple[Source, ...] = ()
-    """folders of pairs for validation alone; 20 of each, evenly spaced, unless the config says
-    otherwise."""
-
-    def applied(self, config: "DepthConfig") -> "DepthConfig":
-        """Give the config of a training with these folders."""
-        from depthpose.depth.config import PairsConfig
-        from depthpose.depth.train.config import AdaptTraining, StereoTraining
-
-        pairs = changed(config.pairs, folders=self.data or None)
-        if not self.held_out:
-            return dataclasses.replace(config, pairs=pairs)
-        if isinstance(config, AdaptTraining):
-            raise InputError(
-                "--held-out has no meaning for 'adapt', which holds out a share of the pairs "
-                "itself (validation_share in the config); leave it out."
-            )
-        # A generator is measured at the focal length of its own rig, whatever it is trained on.
-        focal_px = pairs.focal_px if isinstance(config, StereoTraining) else None
-        held_out = config.held_out or PairsConfig(
-            focal_px=focal_px, truth=pairs.truth, limit=_LOOKED_AT
+    pairs = changed(config.pairs, folders=data or None)
+    if not held_out:
+        return replace(config, pairs=pairs)
+    if isinstance(config, AdaptTraining):
+        raise InputError(
+            "--held-out has no meaning for 'adapt', which holds out a share of the pairs itself "
+            "(validation_share in the config); leave it out."
         )
-        held_out = dataclasses.replace(held_out, folders=self.held_out)
-        return dataclasses.replace(config, pairs=pairs, held_out=held_out)
-
-
-@group
-class BeginningOptions:
-    """Weights that a training begins with."""
-
-    generator: WeightsName | None = None
-    """finetune: weights of the generator to begin with."""
-    matcher: WeightsName | None = None
-    """finetune: weights whose matcher matches the synthesised view, by name or file; they are not
-    changed."""
-    start: WeightsName | None = None
-    """view, select, stereo, adapt: weights to begin with; adapt takes 'default' by default."""
-    encoder: WeightsName | None = None
-    """select, stereo with a light network: weights of the encoder to begin with, of 'depthpose
-    weights import efficientnet-lite0'."""
-
-    def applied(self, config: "DepthConfig", stage: str) -> "DepthConfig":
-        """Give the config of a stage with these weights."""
-        settings = {field.name for field in dataclasses.fields(config)}
-        if stage != "finetune":
-            settings -= {"generator", "matcher"}
-        for name, value in vars(self).items():
-            if value is not None and name not in settings:
-                raise InputError(f"--{name} has no meaning for '{stage}'; see --help.")
-        return changed(config, **vars(self))
+    # A generator is measured at the focal length of its own rig, whatever it is trained on.
+    focal_px = pairs.focal_px if isinstance(config, StereoTraining) else None
+    own = PairsConfig(focal_px=focal_px, truth=pairs.truth, limit=_LOOKED_AT)
+    return replace(config, pairs=pairs, held_out=replace(config.held_out or own, folders=held_out))
 
 
 def train_depth(
     stage: tyro.conf.Positional[Literal["view", "select", "stereo", "adapt", "finetune"]],
     out: NewPath,
     config: Path | None = None,
-    pairs: PairsOptions = PairsOptions(),
-    beginning: BeginningOptions = BeginningOptions(),
+    data: tuple[Source, ...] = (),
+    held_out: tuple[Source, ...] = (),
+    generator: WeightsName | None = None,
+    matcher: WeightsName | None = None,
+    start: WeightsName | None = None,
+    encoder: WeightsName | None = None,
     training: TrainingOptions = TrainingOptions(),
 ) -> int:
     """Train a generator, a matcher, or a generator through a matcher, in stages.
@@ -269,12 +210,27 @@ def train_depth(
         stage: what is trained: view, select, stereo, adapt or finetune.
         out: the run folder.
         config: YAML with what differs from the thesis's settings.
+        data: folders of pairs to learn from; they replace the config's.
+        held_out: folders of pairs for validation alone; 20 of each, evenly spaced, unless the
+            config says otherwise.
+        generator: finetune: weights of the generator to begin with.
+        matcher: finetune: weights whose matcher matches the synthesised view, by name or file; they
+            are not changed.
+        start: view, select, stereo, adapt: weights to begin with; adapt takes 'default' by default.
+        encoder: select, stereo with a light network: weights of the encoder to begin with, of
+            'depthpose weights import efficientnet-lite0'.
     """
     from depthpose.depth.train import STAGES
 
     kind, run_stage = STAGES[stage]
-    settings = beginning.applied(pairs.applied(training.read(config, kind)), stage)
-    return _train(run_stage, settings, out, training, with_messages=False)
+    settings = _with_pairs(training.read(config, kind), data, held_out)
+    known = {field.name for field in fields(settings)}
+    known -= set() if stage == "finetune" else {"generator", "matcher"}
+    begin = {"generator": generator, "matcher": matcher, "start": start, "encoder": encoder}
+    for name, value in begin.items():
+        if value is not None and name not in known:
+            raise InputError(f"--{name} has no meaning for '{stage}'; see --help.")
+    return training.run(run_stage, changed(settings, **begin), out)
 
 
 def calibrate(
@@ -330,72 +286,52 @@ _NOTHING = "nothing"
 """The word for no weights."""
 
 
-@group
-class LearntOptions:
-    """What is learnt, and from what."""
+def _with_object(
+    config: Any,  # noqa: ANN401  of any of the networks
+    cad: tuple[str, ...],
+    unit: Unit | None,
+    symmetries: str | None,
+    data: str | None,
+    start: str | None,
+) -> Any:  # noqa: ANN401
+    """Give the config of a training with this object, data set and start."""
+    from depthpose.pose.train import SegmentationTraining
 
-    cad: tuple[Source, ...] = ()
-    """model files; one network learns them all."""
-    unit: Unit | None = None
-    """of the numbers in the files."""
-    symmetries: Literal["none", "found"] | None = None
-    """found: detect symmetries of the part and count equivalent poses as one; by default they are
-    only printed."""
-    data: Source | None = None
-    """folder of a data set; it takes the place of the config's, for models and frames."""
-    what: Literal["pose", "segmentation", "depth-image", "pointnet"] = "pose"
-    """pose: the network of directions; segmentation: the masks for it; depth-image and pointnet:
-    baselines."""
-    start: WeightsName | None = None
-    """weights to begin with, by name or file. A CAD file without a config begins with 'parts';
-    'nothing' begins anew and takes twice the steps."""
-
-    def default(self) -> "PoseTraining | None":
-        """Give the settings of a training without a config, where they are not the network's."""
-        from depthpose.pose.train.config import own_part
-
-        is_own = self.what == "pose" and self.cad and self.start != _NOTHING
-        return own_part(self.start or _START) if is_own else None
-
-    def applied(self, config: "PoseConfig") -> "PoseConfig":
-        """Give the config of a training with these."""
-        from depthpose.pose.train import SegmentationTraining  # --help must not load torch
-
-        if self.start is not None:
-            start = None if self.start == _NOTHING else self.start
-            config = dataclasses.replace(config, start=start)
-        if self.cad or self.unit or self.symmetries:
-            if isinstance(config, SegmentationTraining):
-                raise InputError(
-                    "--cad has no meaning for 'segmentation', which learns from pictures: make "
-                    "them by 'depthpose data make objects --cad ...' and name the folder in the "
-                    "config"
-                )
-            models = changed(config.models, cad=self.cad or None, unit=self.unit)
-            if self.cad:  # they take the place of a data set's models
-                models = dataclasses.replace(models, bop=None, objects=(), parts=())
-            is_found = None if self.symmetries is None else self.symmetries == "found"
-            models = changed(models, with_found_symmetries=is_found)
-            config = dataclasses.replace(config, models=models)
-        if self.data is None:
-            return config
-        changes = {}
-        if (models := getattr(config, "models", None)) is not None and models.bop is not None:
-            changes["models"] = dataclasses.replace(models, bop=self.data)
-        for part in ("frames", "images", "held_out"):
-            if hasattr(getattr(config, part, None), "folder"):
-                changes[part] = dataclasses.replace(getattr(config, part), folder=self.data)
-        if not changes:
+    if start is not None:
+        config = replace(config, start=None if start == _NOTHING else start)
+    if cad or unit or symmetries:
+        if isinstance(config, SegmentationTraining):
             raise InputError(
-                f"--data {self.data}: the config learns from no data set; see --cad and --what"
+                "--cad has no meaning for 'segmentation', which learns from pictures: make them by "
+                "'depthpose data make objects --cad ...' and name the folder in the config"
             )
-        return dataclasses.replace(config, **changes)
+        is_found = None if symmetries is None else symmetries == "found"
+        models = changed(config.models, cad=cad or None, unit=unit, with_found_symmetries=is_found)
+        if cad:  # they take the place of a data set's models
+            models = replace(models, bop=None, objects=(), parts=())
+        config = replace(config, models=models)
+    if data is None:
+        return config
+    changes = {}
+    if (models := getattr(config, "models", None)) is not None and models.bop is not None:
+        changes["models"] = replace(models, bop=data)
+    for part in ("frames", "images", "held_out"):
+        if hasattr(getattr(config, part, None), "folder"):
+            changes[part] = replace(getattr(config, part), folder=data)
+    if not changes:
+        raise InputError(f"--data {data}: the config learns from no data set; see --cad and --what")
+    return replace(config, **changes)
 
 
 def train_pose(
     out: NewPath,
     config: Path | None = None,
-    learnt: LearntOptions = LearntOptions(),
+    cad: tuple[Source, ...] = (),
+    unit: Unit | None = None,
+    symmetries: Literal["none", "found"] | None = None,
+    data: Source | None = None,
+    what: Literal["pose", "segmentation", "depth-image", "pointnet"] = "pose",
+    start: WeightsName | None = None,
     workers: int | None = None,
     training: TrainingOptions = TrainingOptions(),
 ) -> int:
@@ -413,13 +349,26 @@ def train_pose(
     Args:
         out: the run folder.
         config: YAML with what differs from the defaults.
+        cad: model files; one network learns them all.
+        unit: of the numbers in the files.
+        symmetries: found: detect symmetries of the part and count equivalent poses as one; by
+            default they are only printed.
+        data: folder of a data set; it takes the place of the config's, for models and frames.
+        what: pose: the network of directions; segmentation: the masks for it; depth-image and
+            pointnet: baselines.
+        start: weights to begin with, by name or file. A CAD file without a config begins with
+            'parts'; 'nothing' begins anew and takes twice the steps.
         workers: processes that render views beside the one that trains.
     """
     from depthpose.pose.mesh import unit_of
     from depthpose.pose.train import STAGES
+    from depthpose.pose.train.config import own_part
 
-    kind, run_stage = STAGES[learnt.what]
-    settings = training.read(config, kind, default=learnt.default(), workers=workers)
-    for path in learnt.cad:
-        unit_of(path, learnt.unit)
-    return _train(run_stage, learnt.applied(settings), out, training, with_messages=True)
+    kind, run_stage = STAGES[what]
+    is_own = what == "pose" and cad and start != _NOTHING
+    default = own_part(start or _START) if is_own else None
+    settings = training.read(config, kind, default=default, workers=workers)
+    for path in cad:
+        unit_of(path, unit)
+    settings = _with_object(settings, cad, unit, symmetries, data, start)
+    return training.run(run_stage, settings, out, with_messages=True)

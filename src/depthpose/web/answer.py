@@ -20,14 +20,9 @@ from depthpose.report.page import Scene
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Shown:
-    """A picture among the files.
+    """A picture among the files, with what its colours mean.
 
-    Attributes:
-        file: its name.
-        caption: what it shows, with its scale.
-        values: file with a number for each pixel, which the page shows under the pointer.
-        unit: of these numbers.
-        scale: what its colours mean.
+    ``values``: file with a number for each pixel, which the page shows under the pointer.
     """
 
     file: str
@@ -39,17 +34,9 @@ class Shown:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Answer:
-    """An estimate, or a refusal.
+    """An estimate, or a refusal: a sentence and what is shown below it, and files to download.
 
-    Attributes:
-        is_ok: whether there is an estimate.
-        said: one sentence: the result, or why there is none.
-        facts: name and value, in order.
-        tables: by title, rows of equal length.
-        pictures: some of the files.
-        scene: the 3D view.
-        terms: of the weights, where they restrict use.
-        files: to download, by name.
+    ``terms``: of the weights, where they restrict use.
     """
 
     is_ok: bool
@@ -86,13 +73,7 @@ _LONGEST_NAME = 60
 
 @dataclass(frozen=True, kw_only=True)
 class Form:
-    """Fields and files of one request.
-
-    Attributes:
-        folder: of its files and results; it is removed with the request.
-        fields: text as typed.
-        files: by field.
-    """
+    """Fields as typed, and files, of one request, whose folder is removed with it."""
 
     folder: Path
     fields: Mapping[str, str]

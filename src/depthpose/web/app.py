@@ -55,12 +55,7 @@ _MOST_FILES, _MOST_FIELDS, _LONGEST_FIELD = 6, 30, 4096
 
 
 class HostCheck:
-    """Refuses requests from other pages, and tells the browser what this page may load.
-
-    Args:
-        app: what answers all other requests.
-        hosts: host names under which the page may be requested; None: any.
-    """
+    """Refuses requests from other pages, and tells the browser what this page may load."""
 
     def __init__(self, app: ASGIApp, hosts: tuple[str, ...] | None) -> None:
         self._app, self._hosts = app, hosts
@@ -97,16 +92,11 @@ def refuse_other_host(request: Request, hosts: tuple[str, ...] | None) -> Respon
 
 
 def refuse_size(request: Request, most: int) -> None:
-    """Refuse what is too large before it is read.
-
-    A server reads no more than the announced size, except of a body in chunks.
-    """
+    """Refuse what is too large before it is read: a server reads no more than is announced."""
     text = request.headers.get("content-length", "")
     if not text.isdecimal() or "transfer-encoding" in request.headers:
-        raise HTTPException(
-            411,
-            "the request has no Content-Length, or comes in chunks; send it whole, with its size",
-        )
+        said = "the request has no Content-Length, or comes in chunks; send it whole, with its size"
+        raise HTTPException(411, said)
     if int(text) > most:
         raise HTTPException(
             413,
@@ -116,12 +106,7 @@ def refuse_size(request: Request, most: int) -> None:
 
 
 async def read_form(request: Request, folder: Path) -> Form:
-    """Read the fields, and put the files into the folder.
-
-    Raises:
-        InputError: a file of a type that its field does not take.
-        HTTPException: more files or fields than the page has, or no form at all.
-    """
+    """Read the fields, and put the files into the folder."""
     fields: dict[str, str] = {}
     files: dict[str, Path] = {}
     async with request.form(
@@ -135,15 +120,6 @@ async def read_form(request: Request, folder: Path) -> Form:
             elif value.filename:
                 files[name] = keep_file(folder, name, value.filename, await value.read())
     return Form(folder=folder, fields=fields, files=files)
-
-
-def zip_files(files: Mapping[str, bytes]) -> bytes:
-    """Put files into one ZIP, as they are: most are compressed already."""
-    packed = io.BytesIO()
-    with zipfile.ZipFile(packed, "w") as archive:
-        for name, data in files.items():
-            archive.writestr(name, data)
-    return packed.getvalue()
 
 
 async def error_response(_: Request, error: Exception) -> Response:
@@ -171,11 +147,7 @@ _FULL = "too many requests wait for one computation; try again later"
 
 
 class Queue:
-    """Computations, one at a time.
-
-    Args:
-        most: requests that may wait for the one that is computed.
-    """
+    """Computations, one at a time; so many requests may wait for the one that is computed."""
 
     def __init__(self, most: int) -> None:
         self._most = most
@@ -194,18 +166,9 @@ class Queue:
     async def compute(
         self, ticket: str, work: Callable[[], Result], is_gone: Callable[[], Awaitable[bool]]
     ) -> Result | None:
-        """Compute in a thread once all earlier computations are done.
+        """Compute in a thread once all earlier computations are done; None: the client has left.
 
-        Args:
-            ticket: name by which the client asks for its place in the queue.
-            work: what is computed.
-            is_gone: whether the client has left.
-
-        Returns:
-            The result; None where the client has left: then nothing was computed.
-
-        Raises:
-            HTTPException: too many wait.
+        By the ticket the client asks for its place in the queue; 503 where too many wait.
         """
         self.refuse_full()
         self._tickets.append(ticket)
@@ -219,11 +182,9 @@ class Queue:
 
 
 async def has_gone(receive: Receive) -> bool:
-    """Whether the client of a request that was read whole has closed its connection.
-
-    What is still to come of the request is read first, and the server gets a moment to see the
-    end of a connection from which it had stopped reading.
-    """
+    """Whether the client of a request that was read whole has closed its connection."""
+    # What is still to come of the request is read first, and the server gets a moment to see the
+    # end of a connection from which it had stopped reading.
     with anyio.move_on_after(MOMENT_S):
         while (await receive())["type"] != "http.disconnect":
             pass
@@ -259,12 +220,8 @@ TICKET = "x-ticket"
 """Header of a request: a random name, by which the page asks for its place in the queue."""
 _RESULTS = 3
 """Answers whose files are kept in memory for downloads."""
-_TYPES = {
-    ".png": "image/png",
-    ".jpg": "image/jpeg",
-    ".json": "application/json",
-    ".zip": "application/zip",
-}
+_TYPES = {".png": "image/png", ".jpg": "image/jpeg", ".json": "application/json",
+          ".zip": "application/zip"}  # fmt: skip
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -332,9 +289,7 @@ class Pages:
 
     async def example(self, request: Request) -> Response:
         """Give files and fields to fill a form with; they are made at the first request."""
-        make = self._examples.get(request.path_params["kind"])
-        if make is None:
-            raise HTTPException(404, f"only {' and '.join(self._kinds)} are estimated here")
+        make = _of_kind(self._examples, request)
         try:
             made = await self._queue.compute("", make, partial(has_gone, request.receive))
         except InputError as error:
@@ -348,9 +303,7 @@ class Pages:
     async def estimate(self, request: Request) -> Response:
         """Answer a form."""
         refuse_size(request, self._limits.upload_bytes)
-        estimate = self._kinds.get(request.path_params["kind"])
-        if estimate is None:
-            raise HTTPException(404, f"only {' and '.join(self._kinds)} are estimated here")
+        estimate = _of_kind(self._kinds, request)
         self._queue.refuse_full()
         with TemporaryDirectory(prefix="depthpose-") as folder:
             try:
@@ -382,17 +335,21 @@ class Pages:
             raise HTTPException(
                 404, f"only the last {_RESULTS} answers are kept, and not {name!r}; ask again"
             )
-        data = files[name] if name in files else zip_files(files)
+        if name == "all.zip" and name not in files:
+            packed = io.BytesIO()
+            with zipfile.ZipFile(packed, "w") as archive:  # most files are compressed already
+                for one, data in files.items():
+                    archive.writestr(one, data)
+            files = {name: packed.getvalue()}
         media_type = _TYPES.get(Path(name).suffix, "application/octet-stream")
         headers = {"Content-Disposition": f'attachment; filename="{name}"'}
-        return Response(data, media_type=media_type, headers=headers)
+        return Response(files[name], media_type=media_type, headers=headers)
 
     def _keep(self, answer: Answer) -> dict[str, Any]:
         key = secrets.token_urlsafe(12)
         self._kept[key] = answer.files
         while len(self._kept) > _RESULTS:
             self._kept.popitem(last=False)
-        sizes = [{"name": name, "bytes": len(data)} for name, data in answer.files.items()]
         return {
             "ok": answer.is_ok,
             "said": answer.said,
@@ -401,9 +358,15 @@ class Pages:
             "tables": dict(answer.tables),
             "pictures": [_picture(picture, answer.files) for picture in answer.pictures],
             "scene": answer.scene.encoded(),
-            "files": sizes,
+            "files": [{"name": n, "bytes": len(data)} for n, data in answer.files.items()],
             "folder": f"results/{key}/",
         }
+
+
+def _of_kind(known: Mapping[str, Result], request: Request) -> Result:
+    if (kind := request.path_params["kind"]) not in known:
+        raise HTTPException(404, f"only {' and '.join(known)} are estimated here")
+    return known[kind]
 
 
 def _picture(shown: Shown, files: Mapping[str, bytes]) -> dict[str, Any]:
@@ -414,13 +377,7 @@ def _picture(shown: Shown, files: Mapping[str, bytes]) -> dict[str, Any]:
 
 
 def make_app(depth: FakestereoNet, pose: GeoPoseNet, limits: Limits | None = None) -> Starlette:
-    """Build the application.
-
-    Args:
-        depth: for the tab Depth.
-        pose: for the tab Pose.
-        limits: what is refused.
-    """
+    """Build the application, with networks for the tabs Depth and Pose."""
     limits = Limits() if limits is None else limits
     pages = Pages(depth, pose, limits)
 
@@ -445,11 +402,7 @@ _LEAVE_S = 2
 
 
 def open_socket(host: str, port: int) -> socket.socket:
-    """Take a port before anything heavy is loaded; port 0 takes a free one.
-
-    Raises:
-        InputError: there is no such address here, or the port is in use.
-    """
+    """Take a port before anything heavy is loaded; port 0 takes a free one."""
     if not 0 <= port < 2**16:
         raise InputError(f"port {port}: there are 0 (any that is free) to 65535; 8000 is usual")
     family = socket.AF_INET6 if ":" in host else socket.AF_INET
@@ -472,10 +425,7 @@ def taken_address(taken: socket.socket) -> IPv4Address | IPv6Address:
 def known_names(host: str, address: IPv4Address | IPv6Address) -> tuple[str, ...] | None:
     """Give the host names under which a page may be requested; None: any, it is open to all.
 
-    Args:
-        host: the address as the user wrote it. '', '0', '0x0' and '::0' mean all addresses too, so
-            it does not say whether the page is open.
-        address: what was taken for it.
+    How the address was written does not say that: '', '0' and '0x0' mean all addresses too.
     """
     return None if address.is_unspecified else (*LOOPBACK, host.lower(), str(address))
 

@@ -94,10 +94,8 @@ def _input(form: Form) -> tuple[StereoInput, str]:
         focal_px, tags = (_PHONE * width, "") if exif is None else exif
         origin = f" (EXIF: {tags})" if tags else _GUESSED
     doffs_px = form.number("cx_right_minus_left_px")
-    rig = {
-        "baseline_m": baseline_m,
-        "cx_right_minus_left_px": None if baseline_m is None else doffs_px,
-    }
+    rig = {"baseline_m": baseline_m}
+    rig["cx_right_minus_left_px"] = None if baseline_m is None else doffs_px
     rig |= {key: form.number(key) for key in ("mount_height_m", "tilt_deg")}
     keys = form.pinhole_keys((width, height), focal_px) | rig
     camera = form.camera(keys, (width, height))
@@ -148,31 +146,26 @@ def _refuse_work(pair: StereoInput, net: FakestereoNet) -> None:
 def _pictures(
     pair: StereoInput, estimate: DepthEstimate, range_m: tuple[float, float]
 ) -> list[Shown]:
-    name = pair.name
-    colors = (
-        f"near bright and far dark, {{:g}} m to {{:g}} m by the logarithm; {grey_caption(estimate)}"
+    name, (near_m, far_m) = pair.name, range_m
+    said = f"near bright and far dark, {near_m:g} m to {far_m:g} m by the logarithm"
+    depth = Shown(
+        file=f"{name}.color.png",
+        caption=f"depth: {said}; {grey_caption(estimate)}",
+        values=f"{name}.depth_m.npy",
+        unit="m",
+        scale=depth_scale(*range_m),
     )
-    pictures = [
-        Shown(file=f"{name}.input.jpg", caption="the image"),
-        Shown(
-            file=f"{name}.color.png",
-            caption=f"depth: {colors.format(*range_m)}",
-            values=f"{name}.depth_m.npy",
-            unit="m",
-            scale=depth_scale(*range_m),
-        ),
-    ]
+    pictures = [Shown(file=f"{name}.input.jpg", caption="the image"), depth]
     if estimate.right is not None:
         pictures.append(Shown(file=f"{name}.right.png", caption="right view, synthesised"))
     if estimate.confidence is not None:
-        pictures.append(
-            Shown(
-                file=f"{name}.confidence.png",
-                caption="confidence: bright is high, dark low",
-                values=f"{name}.confidence.npy",
-                scale=rising_scale("confidence", 1.0),
-            )
+        confidence = Shown(
+            file=f"{name}.confidence.png",
+            caption="confidence: bright is high, dark low",
+            values=f"{name}.confidence.npy",
+            scale=rising_scale("confidence", 1.0),
         )
+        pictures.append(confidence)
     return pictures
 
 
