@@ -30,7 +30,7 @@ def serve(
         max_upload_mb: all files of one request together [1e6 bytes].
     """
     try:
-        from depthpose import web
+        from depthpose.web import Limits, known_names, make_app, open_socket, run, taken_address
     except ModuleNotFoundError as error:
         package = (error.name or "starlette").partition(".")[0]
         raise MissingExtraError(package, "serve", "the page in the browser") from error
@@ -39,19 +39,19 @@ def serve(
 
     if max_upload_mb < 1:
         raise InputError(f"--max-upload-mb {max_upload_mb}: take 1 at least; 64 is usual")
-    taken = web.open_socket(host, port)
-    address = web.taken_address(taken)
-    names = web.known_names(host, address)
-    limits = web.Limits(upload_bytes=max_upload_mb * 10**6, hosts=names)
+    taken = open_socket(host, port)
+    address = taken_address(taken)
+    names = known_names(host, address)
+    limits = Limits(upload_bytes=max_upload_mb * 10**6, hosts=names)
     depth = FakestereoNet.load(weights, allow_ood=True)
-    app = web.make_app(depth, GeoPoseNet.load(pose_weights), limits)
+    app = make_app(depth, GeoPoseNet.load(pose_weights), limits)
     shown = f"[{address}]" if address.version == 6 else address
     print(f"http://{shown}:{taken.getsockname()[1]}/  (Ctrl+C stops it)", flush=True)
     if not address.is_loopback:
         print("whoever can reach this address may use the page: no password, no encryption",
               flush=True)  # fmt: skip
     try:
-        web.run(app, taken)
+        run(app, taken)
     except KeyboardInterrupt:
         print("stopped")
     return 0
