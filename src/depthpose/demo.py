@@ -28,16 +28,9 @@ from depthpose.pose.estimator import GeoPoseNet
 from depthpose.pose.evaluate import evaluate
 from depthpose.pose.predictions import CLOUD, Prediction, place_of, write_predictions
 from depthpose.pose.synthetic import make_frames
+from depthpose.report import page as pages
 from depthpose.report.depth import DepthError, DepthShown, depth_section
-from depthpose.report.page import (
-    Layer,
-    Picture,
-    Scene,
-    Section,
-    table_files,
-    write_page,
-    write_table,
-)
+from depthpose.report.page import Layer, Picture, Scene, Section
 from depthpose.report.pose import draw_pose, grey_depth, pose_layers, posed_cloud
 
 _STREETS_SEED = 9
@@ -66,15 +59,18 @@ def show_depth(
     """Estimate depth of both scenes; give a row for each method, and the parts of the page."""
     street = Streets(StreetsConfig(seed=_STREETS_SEED, scale=scale))[_STREET]
     street = replace(street, input=replace(street.input, name="street"))
+    scenes = [
+        (read_motorcycle(), _MOTORCYCLE_TEXT, (1.5, 8.0)),
+        (street, _STREET_TEXT, (3.0, 80.0)),
+    ]
     network = FakestereoNet.load(weights)
-    scenes = [(street, _STREET_TEXT, (3.0, 80.0))]
-    if (motorcycle := read_motorcycle()) is not None:
-        scenes.insert(0, (motorcycle, _MOTORCYCLE_TEXT, (1.5, 8.0)))
-    rows, sections = [], []
+    rows: list[dict[str, Any]] = []
+    sections: list[Section] = []
     for sample, text, range_m in scenes:
-        more, shown = _show_scene(out, sample, _nets(network, sample), text, range_m)
-        rows += more
-        sections += shown
+        if sample is not None:
+            more, shown = _show_scene(out, sample, _nets(network, sample), text, range_m)
+            rows += more
+            sections += shown
     return rows, sections
 
 
@@ -121,15 +117,12 @@ def _show_scene(
         title = f"{pair.name}: {method}, {views}"
         sections.append(depth_section(title, shown, with_image=False))
     best, scale = next(iter(nets)), depth_scale(*range_m)
+    colors, true = homes[best] / f"{pair.name}.color.png", folder / "depth.color.png"
     pictures = [
         Picture(path=folder / "left.png", caption="left image"),
         Picture(path=folder / "right.png", caption="right image"),
-        Picture(
-            path=homes[best] / f"{pair.name}.color.png",
-            caption=f"depth from both: {best}",
-            scale=scale,
-        ),
-        Picture(path=folder / "depth.color.png", caption="true depth; grey: none", scale=scale),
+        Picture(path=colors, caption=f"depth from both: {best}", scale=scale),
+        Picture(path=true, caption="true depth; grey: none", scale=scale),
     ]
     opening = Section(title=f"The {pair.name}", text=text, rows=rows, pictures=pictures)
     return rows, [opening, *sections]
@@ -150,11 +143,8 @@ def _measure(sample: StereoSample, estimate: DepthEstimate) -> dict[str, Any]:
 
 
 def read_motorcycle() -> StereoSample | None:
-    """Read the pair with its true disparity, or None where scikit-image is not installed.
-
-    Calibration is that of scikit-image's documentation: images a quarter of the original size,
-    principal points 31.086 px apart, baseline 193.001 mm.
-    """
+    """Read the pair with its true disparity, or None where scikit-image is not installed."""
+    # Images a quarter of the original size; calibration by scikit-image's documentation.
     try:
         from skimage.data import stereo_motorcycle
     except ImportError:
@@ -290,25 +280,20 @@ def make_demo(
 ) -> DemoResult:
     """Pose synthetic parts on a table; estimate depth of a real pair and a synthetic street.
 
-    Args:
-        out: folder for the data, the estimates, the tables and the page ``report.html``.
-        weights: of the depth networks, by name or file.
-        parts: weights of a pose network for the parts, by name or file.
-        scale: size of the street's images as a share of KITTI's.
-        on_message: called with what is done next.
-
-    Raises:
-        InputError: ``out`` holds files that the demo did not write and would replace.
+    ``scale``: size of the street's images as a share of KITTI's; ``on_message`` is called with what
+    is done next.
     """
-    claim_folder(out, {"command": "demo"}, [*_FOLDERS, *table_files("depths", "poses"), _PAGE])
+    claim_folder(
+        out, {"command": "demo"}, [*_FOLDERS, *pages.table_files("depths", "poses"), _PAGE]
+    )
     on_message = on_message or (lambda _: None)
     on_message("synthetic parts on a table are posed from a depth image ...")
     poses, of_pose = show_poses(out, parts)
     on_message("depth of a real pair and of a synthetic street ...")
     depths, of_depth = show_depth(out, weights, scale)
-    write_table(out, depths, name="depths")
-    write_table(out, poses, name="poses")
+    pages.write_table(out, depths, name="depths")
+    pages.write_table(out, poses, name="poses")
     page = out / _PAGE
     title = "depthpose: a depth sensor to poses, images to metric depth"
-    write_page(page, title, [*of_pose, *of_depth], environment())
+    pages.write_page(page, title, [*of_pose, *of_depth], environment())
     return DemoResult(page, depths, poses)

@@ -6,20 +6,8 @@ from pathlib import Path
 
 import tyro
 
+from depthpose.cli import depth_options as options
 from depthpose.cli.arguments import NewPath, NewPlace, Source
-from depthpose.cli.depth_options import (
-    ImageNetworks,
-    LensOptions,
-    MatcherOptions,
-    MatchOptions,
-    MethodOptions,
-    PairNetworks,
-    PredictOutput,
-    ProtocolOptions,
-    ScaleOptions,
-    refuse_ignored,
-    refuse_unusable,
-)
 from depthpose.cli.engine import EngineOptions
 from depthpose.core.errors import InputError
 from depthpose.depth.config import MatcherConfig
@@ -28,11 +16,11 @@ from depthpose.depth.config import MatcherConfig
 def predict(
     images: tyro.conf.Positional[tuple[Source, ...]],
     out: NewPlace,
-    lens: LensOptions = LensOptions(),
-    scale: ScaleOptions = ScaleOptions(),
-    networks: ImageNetworks = ImageNetworks(),
-    matching: MatcherOptions = MatcherOptions(),
-    output: PredictOutput = PredictOutput(),
+    lens: options.LensOptions = options.LensOptions(),
+    scale: options.ScaleOptions = options.ScaleOptions(),
+    networks: options.ImageNetworks = options.ImageNetworks(),
+    matching: options.MatcherOptions = options.MatcherOptions(),
+    output: options.PredictOutput = options.PredictOutput(),
     engine: EngineOptions = EngineOptions(),
 ) -> int:
     """Depth in metres from single images, by a synthesised right view.
@@ -65,7 +53,7 @@ def predict(
         answer=networks.answer,
         use="images",
     )
-    refuse_unusable(scale, networks, matching, output)
+    options.refuse_unusable(scale, networks, matching, output)
     if engine.is_ray:
         work.refuse_videos(images)
         method = method.packed()
@@ -89,8 +77,8 @@ def match(
     *,
     camera: Path,
     out: NewPlace,
-    pairs: PairNetworks = PairNetworks(),
-    matching: MatchOptions = MatchOptions(),
+    pairs: options.PairNetworks = options.PairNetworks(),
+    matching: options.MatchOptions = options.MatchOptions(),
     engine: EngineOptions = EngineOptions(),
 ) -> int:
     """Match real stereo pairs to metric depth.
@@ -129,7 +117,7 @@ def match(
 
     def work_of(files: Sequence[Path]) -> work.DepthWork:
         lens = work.Lens(camera=read_rig(camera, image_size(files[0])))
-        output = PredictOutput(cloud=pairs.cloud)
+        output = options.PredictOutput(cloud=pairs.cloud)
         return work.DepthWork(
             method=method, lens=lens, output=output, with_check=pairs.check, files=work.PAIRS
         )
@@ -152,9 +140,9 @@ def evaluate(
     data: Path,
     out: NewPath,
     split: str | None = None,
-    methods: MethodOptions = MethodOptions(),
-    comparison: ProtocolOptions = ProtocolOptions(),
-    matching: MatcherOptions = MatcherOptions(),
+    methods: options.MethodOptions = options.MethodOptions(),
+    comparison: options.ProtocolOptions = options.ProtocolOptions(),
+    matching: options.MatcherOptions = options.MatcherOptions(),
     engine: EngineOptions = EngineOptions(),
 ) -> int:
     """Measure depth on a dataset by a named protocol, and write rows, a table and a page.
@@ -188,7 +176,7 @@ def evaluate(
     from depthpose.report.page import table_files
 
     methods.refuse_none()
-    refuse_ignored(methods.weights, matching)
+    options.refuse_ignored(methods.weights, matching)
     comparison.refuse_unusable()
     rule = find_protocol(comparison.protocol)
     dataset = open_frames(data, split)

@@ -14,20 +14,7 @@ from tqdm import tqdm
 from depthpose.cli.depth_methods import Method, baseline_method, named_method, sgbm_method
 from depthpose.cli.depth_options import MethodOptions
 from depthpose.cli.engine import EngineOptions
-from depthpose.core.engine import (
-    Done,
-    Files,
-    Function,
-    Job,
-    Sample,
-    read_job_settings,
-    read_shard,
-    result_items,
-    run_here,
-    run_job,
-    shard_results,
-    stem,
-)
+from depthpose.core import engine as jobs
 from depthpose.core.errors import InputError
 from depthpose.core.run import environment, find_rank, read_settings, wait_for
 from depthpose.depth.config import MatcherConfig
@@ -287,7 +274,7 @@ def frame_sections(
 
 
 ENDING = "measured.json"
-RESULTS = Files(roles=("record", "shard"), suffixes=(".json", ".tar", ".parquet"))
+RESULTS = jobs.Files(roles=("record", "shard"), suffixes=(".json", ".tar", ".parquet"))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -298,30 +285,30 @@ class ShardTruth:
     split: str | None
     protocol: str
     caps_m: tuple[float, ...]
-    files: Files = RESULTS
+    files: jobs.Files = RESULTS
     endings: Sequence[str] = (ENDING,)
     batch: int = 1
 
-    def start(self) -> Function:
+    def start(self) -> jobs.Function:
         """Open the data set."""
         dataset = open_dataset(Path(self.data), self.split)
         places = {frame.name: index for index, frame in enumerate(dataset.frames)}
 
-        def measure(samples: Sequence[Sample], out: Path) -> list[str]:
+        def measure(samples: Sequence[jobs.Sample], out: Path) -> list[str]:
             return [self._measure_shard(dataset, places, sample, out) for sample in samples]
 
         return measure
 
     def _measure_shard(
-        self, dataset: Dataset, places: Mapping[str, int], sample: Sample, out: Path
+        self, dataset: Dataset, places: Mapping[str, int], sample: jobs.Sample, out: Path
     ) -> str:
         """Measure each frame by the files of its prediction; give why not where that fails."""
         record, shard = sample.files
         measured: dict[str, Any] = {}
         try:
-            done = Done.from_json(record.read_bytes())
+            done = jobs.Done.from_json(record.read_bytes())
             names = {name for name, reason in done.entries if not reason and name in places}
-            for name, files in read_shard(str(shard), names, done.endings):
+            for name, files in jobs.read_shard(str(shard), names, done.endings):
                 with tempfile.TemporaryDirectory(prefix="depthpose-") as folder:
                     for ending, data in files.items():
                         path = Path(folder) / f"{name}.{ending}"
@@ -348,18 +335,18 @@ def measure_shards(
     Each frame is measured where its shard is read; the rows of all frames are collected here in the
     order of the data set, and summed as if one process had measured them.
     """
-    items, before = result_items(predictions), read_job_settings(predictions)
-    name, names = stem(predictions.rstrip("/")), {item.name for item in items}
+    items, before = jobs.result_items(predictions), jobs.read_job_settings(predictions)
+    name, names = jobs.stem(predictions.rstrip("/")), {item.name for item in items}
     about = {"data": truth.data, "split": truth.split, "protocol": truth.protocol}
     settings = {"predictions": before, **about, "caps_m": list(truth.caps_m)}
     home = str(out / "measured" / name)
-    job = Job(work=truth, items=items, out=home, settings=settings, block=1)
+    job = jobs.Job(work=truth, items=items, out=home, settings=settings, block=1)
     rows: dict[str, list[Measured] | str] = {}
-    for done in run_job(job, engine.build() if engine.is_ray else run_here):
+    for done in jobs.run_job(job, engine.build() if engine.is_ray else jobs.run_here):
         for failed, reason in done.failures:
             if failed in names:
                 raise InputError(f"{home}: {reason}")
-        for item, files in shard_results(home, done):
+        for item, files in jobs.shard_results(home, done):
             of_frames = json.loads(files[ENDING]) if item in names else {}
             for frame, some in of_frames.items():
                 is_said = isinstance(some, str)

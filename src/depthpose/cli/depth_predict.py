@@ -18,6 +18,7 @@ from tqdm import tqdm
 from depthpose.cli.depth_methods import Method, MethodSource
 from depthpose.cli.depth_options import LensOptions, PredictOutput, ScaleOptions
 from depthpose.cli.engine import EngineOptions, Inputs, say
+from depthpose.core import run
 from depthpose.core.camera import Camera, FieldOfView, StereoRig, camera_of, read_camera
 from depthpose.core.camera.pinhole import camera_keys
 from depthpose.core.draw import draw_depth
@@ -36,14 +37,7 @@ from depthpose.core.files import (
 from depthpose.core.files.disk import find_partners
 from depthpose.core.files.images import LISTED_SUFFIXES
 from depthpose.core.files.text import read_text
-from depthpose.core.run import (
-    claim_folder,
-    claim_names,
-    environment,
-    find_rank,
-    note_result,
-    refuse_among_inputs,
-)
+from depthpose.core.results import note_result
 from depthpose.depth.estimator import FakestereoNet
 from depthpose.depth.ground import scale_by_distance
 from depthpose.depth.predictions import CLOUD_M, ENDINGS, is_finished, read_estimate, write_estimate
@@ -179,7 +173,7 @@ def find_sources(words: Sequence[str], out: Path) -> list[Path]:
                 f"an input is called {frame!r}, as a frame of a video would be, and so would their "
                 "results; rename one of the two"
             )
-    refuse_among_inputs(out, words, sources)
+    run.refuse_among_inputs(out, words, sources)
     return sources
 
 
@@ -278,12 +272,12 @@ def estimate_all(
     sources: Sequence[tuple[Path, ...]], work: DepthWork, method: Method, out: Path
 ) -> int:
     """Estimate what is not finished; an input that fails is named and stops no other."""
-    claim_folder(out, work.settings(method.settings), [_PAGE])
+    run.claim_folder(out, work.settings(method.settings), [_PAGE])
     videos = [files[0].stem for files in sources if _is_video(files[0])]
     endings = [f".{end}" for end in ENDINGS] + [_VIDEO]
-    claim_names(out, {files[0].stem: files for files in sources}, endings, videos)
-    mine = [sources[k] for k in find_rank().share(len(sources))]
-    with open_viewer(None if find_rank().rank else work.output.view) as viewer:
+    run.claim_names(out, {files[0].stem: files for files in sources}, endings, videos)
+    mine = [sources[k] for k in run.find_rank().share(len(sources))]
+    with open_viewer(None if run.find_rank().rank else work.output.view) as viewer:
         predictor = Predictor(work, method, out, viewer)
         stills = [files for files in mine if not _is_video(files[0])]
         named = (one for files in stills for one in work.lens.inputs_of(files))
@@ -296,7 +290,7 @@ def estimate_all(
         print(f"depthpose: failed: {failure}", file=sys.stderr)
     count = f"{done} of {len(mine)} pairs" if work.files == PAIRS else f"{done} depth maps"
     print(f"{count} are in {out}")
-    if find_rank().rank == 0:
+    if run.find_rank().rank == 0:
         _write_page(work, sources, out, failures)
     return 1 if failures else 0
 
@@ -416,7 +410,7 @@ def _write_page(
         estimate = read_estimate(out, one.name, one.camera)
         drawn = DepthShown(pair=one, estimate=estimate, range_m=(near_m, far_m))
         sections.append(depth_section(one.name, drawn))
-    write_page(out / _PAGE, f"Depth of {_count(len(names), 'image')}", sections, environment())
+    write_page(out / _PAGE, f"Depth of {_count(len(names), 'image')}", sections, run.environment())
     print(f"the page: {out / _PAGE}")
 
 

@@ -9,25 +9,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from depthpose.core.camera import (
-    CAMERA_SUFFIXES,
-    Camera,
-    StereoRig,
-    check_image_matches_camera,
-    check_rectified,
-    read_camera,
-    suspicious_centre,
-)
+from depthpose.core import camera as cameras
+from depthpose.core import files
 from depthpose.core.errors import InputError
-from depthpose.core.files import (
-    MAP_SUFFIXES,
-    cloud_suffixes,
-    read_cloud,
-    read_image,
-    read_json,
-    read_map,
-)
-from depthpose.core.files.images import opened_image, read_numbers, value_range
+from depthpose.core.files.images import opened_image, value_range
+from depthpose.core.files.maps import read_numbers
 from depthpose.pose.cloud import frame_advice
 from depthpose.pose.datasets import mask_from_rle
 from depthpose.pose.mesh import exact_diameter, mesh_suffixes, read_geometry, unit_advice
@@ -56,16 +42,16 @@ class FileFacts:
     size: Size | None = None
     image: Tensor | None = None
     depth_units: Tensor | None = None
-    camera: Camera | None = None
+    camera: cameras.Camera | None = None
     mask: Tensor | None = None
     cloud: Tensor | None = None
     model: Tensor | None = None
 
 
-def look_at_all(files: Sequence[Path]) -> int:
+def look_at_all(paths: Sequence[Path]) -> int:
     """Print what each file is and what is odd; give the exit code."""
     # What has a size comes first: a camera file may need it.
-    ordered = sorted(files, key=_is_camera_like)
+    ordered = sorted(paths, key=_is_camera_like)
     seen: list[FileFacts] = []
     for path in ordered:
         size = next((other.size for other in seen if other.size is not None), None)
@@ -75,7 +61,7 @@ def look_at_all(files: Sequence[Path]) -> int:
             seen.append(FileFacts(path=path, odd=[str(error).removeprefix(f"{path}: ")]))
     for one in seen:
         one.odd += _beside(one, seen)
-    for path in files:
+    for path in paths:
         one = next(s for s in seen if s.path == path)
         print(f"{path}: {one.what}" if one.what else f"{path}: cannot be used")
         for said in one.odd:
@@ -88,48 +74,48 @@ def look_at_all(files: Sequence[Path]) -> int:
 
 
 def _is_camera_like(path: Path) -> bool:
-    return path.is_dir() or path.suffix.lower() in CAMERA_SUFFIXES
+    return path.is_dir() or path.suffix.lower() in cameras.CAMERA_SUFFIXES
 
 
 def _read(path: Path, size: Size | None) -> FileFacts:
     suffix = path.suffix.lower()
     if _is_camera_like(path):
         return _read_words(path, size)
-    if suffix in MAP_SUFFIXES:
+    if suffix in files.MAP_SUFFIXES:
         return _of_map(path)
     if suffix in mesh_suffixes():
         vertices, faces = read_geometry(path)
         points = torch.from_numpy(vertices)
         return _of_model(path, points, len(faces)) if len(faces) else _of_points(path, points)
-    if suffix in cloud_suffixes():
-        return _of_points(path, read_cloud(path).points.double())
+    if suffix in files.cloud_suffixes():
+        return _of_points(path, files.read_cloud(path).points.double())
     return _of_picture(path)
 
 
 def _read_words(path: Path, size: Size | None) -> FileFacts:
     """A camera; or a mask in run lengths, or points in text."""
     if path.suffix.lower() == ".json":
-        content = read_json(path)
+        content = files.read_json(path)
         one = content[0] if isinstance(content, list) and len(content) == 1 else content
         if isinstance(one, dict) and {"counts", "segmentation"} & one.keys():
             return _of_mask(path, mask_from_rle(one, str(path)))
     try:
-        return _of_camera(path, read_camera(path, size))
+        return _of_camera(path, cameras.read_camera(path, size))
     except InputError as error:
         if path.suffix.lower() != ".txt" or "no camera that is known" not in str(error):
             raise
-    return _of_points(path, read_cloud(path).points.double())
+    return _of_points(path, files.read_cloud(path).points.double())
 
 
-def _of_camera(path: Path, camera: Camera) -> FileFacts:
+def _of_camera(path: Path, camera: cameras.Camera) -> FileFacts:
     fx, fy = float(camera.K[0, 0]), float(camera.K[1, 1])
     wide = math.degrees(2 * math.atan(camera.width / (2 * fx)))
     what = f"camera of {camera.width}x{camera.height}, fx {fx:.1f} px, {wide:.0f} degrees wide"
-    if isinstance(camera, StereoRig):
+    if isinstance(camera, cameras.StereoRig):
         what += f", baseline {camera.baseline_m:.4g} m"
     if camera.depth_unit_m is not None:
         what += f", depth in units of {camera.depth_unit_m:.4g} m"
-    odd = [said] if (said := suspicious_centre(camera)) is not None else []
+    odd = [said] if (said := cameras.suspicious_centre(camera)) is not None else []
     if abs(fx / fy - 1) > _SQUARE:
         odd.append(
             f"fx {fx:.1f} and fy {fy:.1f} differ by {abs(fx / fy - 1):.0%}, as of an image "
@@ -150,7 +136,7 @@ def _of_picture(path: Path) -> FileFacts:
         if unknown > _FEW_UNKNOWN or rough < _ROUGH:
             return _of_depth(path, torch.where(known, units, torch.nan))
         what = f", 16 bits a value, from {low} to {high}"
-    picture = read_image(path)
+    picture = files.read_image(path)
     size = (picture.shape[2], picture.shape[1])
     what = f"picture of {size[0]}x{size[1]}{what}"
     low, high = picture.aminmax()
@@ -198,15 +184,15 @@ def _of_map(path: Path) -> FileFacts:
             units = torch.from_numpy(stored.astype("float32"))
             return _of_depth(path, torch.where(units > 0, units, torch.nan))
         try:
-            values = read_map(path)
+            values = files.read_map(path)
         except InputError as error:
             if "a map is (H, W)" not in str(error):
                 raise
-            return _of_points(path, read_cloud(path).points.double())
+            return _of_points(path, files.read_cloud(path).points.double())
         if values.shape[1] in (3, 4):
-            return _of_points(path, read_cloud(path).points.double())
+            return _of_points(path, files.read_cloud(path).points.double())
     else:
-        values = read_map(path)
+        values = files.read_map(path)
     known = values[values.isfinite()]
     height, width = values.shape
     seen = FileFacts(path=path, what=f"map of {width}x{height}", size=(width, height))
@@ -259,10 +245,10 @@ def _beside(one: FileFacts, seen: Sequence[FileFacts]) -> Iterator[str]:
                 yield f"beside {other.path.name}: {advice}"
 
 
-def _beside_camera(one: FileFacts, camera: Camera) -> Iterator[str]:
+def _beside_camera(one: FileFacts, camera: cameras.Camera) -> Iterator[str]:
     if one.size is not None:
         try:
-            check_image_matches_camera(camera, *one.size, "it")
+            cameras.check_image_matches_camera(camera, *one.size, "it")
         except InputError as error:
             yield str(error)
     if one.depth_units is None or camera.depth_unit_m is None:
@@ -284,7 +270,7 @@ def _look_at_pair(seen: Sequence[FileFacts]) -> tuple[str, bool] | None:
     assert left is not None
     assert right is not None
     names = f"{pictures[0].path.name} and {pictures[1].path.name} as a pair"
-    report = check_rectified(left, right)
+    report = cameras.check_rectified(left, right)
     return (
         f"{names}{chr(10) + '  odd' if report.is_wrong else ''}: {report.message}",
         report.is_wrong,

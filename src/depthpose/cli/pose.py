@@ -3,17 +3,9 @@
 from dataclasses import replace
 from pathlib import Path
 
+from depthpose.cli import pose_options as options
 from depthpose.cli.arguments import NewPath, NewPlace, View, WeightsName
 from depthpose.cli.engine import EngineOptions
-from depthpose.cli.pose_options import (
-    DataSetOptions,
-    EstimateOptions,
-    OneObjectOptions,
-    PoseMeasureOptions,
-    RegisterOptions,
-    SequenceOptions,
-    refuse_mixture,
-)
 from depthpose.core.errors import InputError
 from depthpose.pose.config import EstimateConfig, SymmetryRule
 
@@ -21,10 +13,10 @@ from depthpose.pose.config import EstimateConfig, SymmetryRule
 def predict(
     out: NewPlace,
     weights: WeightsName = "parts",
-    inputs: OneObjectOptions = OneObjectOptions(),
-    dataset: DataSetOptions = DataSetOptions(),
-    estimates: EstimateOptions = EstimateOptions(),
-    register: RegisterOptions = RegisterOptions(),
+    inputs: options.OneObjectOptions = options.OneObjectOptions(),
+    dataset: options.DataSetOptions = options.DataSetOptions(),
+    estimates: options.EstimateOptions = options.EstimateOptions(),
+    register: options.RegisterOptions = options.RegisterOptions(),
     view: View = None,
     engine: EngineOptions = EngineOptions(),
 ) -> int:
@@ -54,7 +46,7 @@ def predict(
     from depthpose.cli.pose_methods import source_of
     from depthpose.cli.pose_predict import predict_dataset, predict_files, predict_on_ray
 
-    refuse_mixture(inputs, dataset)
+    options.refuse_mixture(inputs, dataset)
     source = source_of(weights, register, inputs.unit, dataset, estimates.config)
     if dataset.bop is not None:
         return predict_dataset(source, dataset, inputs.object, out, estimates.batch, view, engine)
@@ -82,7 +74,7 @@ def evaluate(
     predictions: tuple[Path, ...] = (),
     objects: tuple[str, ...] = (),
     adds: SymmetryRule = "declared",
-    estimates: PoseMeasureOptions = PoseMeasureOptions(vsd=True),
+    estimates: options.PoseMeasureOptions = options.PoseMeasureOptions(vsd=True),
 ) -> int:
     """Measure poses on a BOP or Linemod_preprocessed data set, and write rows, a table and a page.
 
@@ -127,8 +119,8 @@ def evaluate(
 def track(
     out: NewPath,
     weights: WeightsName = "parts",
-    frames: SequenceOptions = SequenceOptions(),
-    register: RegisterOptions = RegisterOptions(),
+    frames: options.SequenceOptions = options.SequenceOptions(),
+    register: options.RegisterOptions = options.RegisterOptions(),
 ) -> int:
     """Follow a known object through depth images, clouds or the scenes of a data set.
 

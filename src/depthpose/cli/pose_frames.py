@@ -10,18 +10,10 @@ from typing import Any
 import torch
 from tqdm import tqdm
 
-from depthpose.cli import pose_inputs
+from depthpose.cli import pose_inputs, pose_predict
 from depthpose.cli.pose_inputs import camera_facts, object_named
 from depthpose.cli.pose_methods import PoseMethod, match_names, named_file, of_dataset
 from depthpose.cli.pose_options import OneObjectOptions, SequenceOptions
-from depthpose.cli.pose_predict import (
-    claim,
-    claim_bop,
-    finish,
-    is_result_of,
-    say_result,
-    write_files,
-)
 from depthpose.core.errors import InputError
 from depthpose.core.files import read_depth_png
 from depthpose.core.rigid import Rigid
@@ -73,19 +65,19 @@ def find_all(method: PoseMethod, inputs: OneObjectOptions, out: Path) -> int:
             )
     facts = camera_facts(lens) | ({} if unit is None else {"unit": unit})
     settings = {**method.settings, "find": sorted(objects), **facts}
-    claim(out, settings, jobs, depth, is_result_of)
+    pose_predict.claim(out, settings, jobs, depth, pose_predict.is_result_of)
     left = [p for p in kept_predictions(out) if is_finished(p)]
     results: list[tuple[Prediction, Job[Any]]] = []
     for job in tqdm(jobs, disable=None, unit=" images"):
-        own = [p for p in left if is_result_of(p.estimate.name, job.name)]
+        own = [p for p in left if pose_predict.is_result_of(p.estimate.name, job.name)]
         left = [p for p in left if p not in own]
         here = own or _find(method, job, objects)
         results += [(one, explained_job(job, one.estimate, method)) for one in here]
         write_predictions(out, [*(prediction for prediction, _ in results), *left])
-    claim(out, settings, [job for _, job in results], depth, is_result_of)
+    pose_predict.claim(out, settings, [job for _, job in results], depth, pose_predict.is_result_of)
     answered = [pair for pair in results if pair[0].estimate.is_posed]
-    write_files([p for p, _ in answered], [job for _, job in answered], out, method)
-    return say_result([prediction for prediction, _ in results], out)
+    pose_predict.write_files([p for p, _ in answered], [job for _, job in answered], out, method)
+    return pose_predict.say_result([prediction for prediction, _ in results], out)
 
 
 def _find(method: PoseMethod, job: Job[Any], objects: tuple[str, ...]) -> list[Prediction]:
@@ -127,9 +119,9 @@ def track_folder(method: PoseMethod, frames: SequenceOptions, out: Path) -> int:
         settings |= camera_facts(frames.camera)
     if frames.first is not None:
         settings |= {"first": named_file(frames.first)}
-    claim(out, settings, jobs, frames.cloud or frames.depth or out)
+    pose_predict.claim(out, settings, jobs, frames.cloud or frames.depth or out)
     predictions = _kept(_followed(method, jobs, name, start), out)
-    code = finish(predictions, _explained(predictions, jobs, method), out, method)
+    code = pose_predict.finish(predictions, _explained(predictions, jobs, method), out, method)
     return _say_kinds(predictions, code)
 
 
@@ -140,7 +132,7 @@ def track_bop(method: PoseMethod, frames: SequenceOptions, out: Path) -> int:
     dataset = pose_inputs.chosen_objects(dataset, method, frames.object)
     names = match_names(dataset, method.models)
     settings = {**method.settings, **of_dataset(dataset), "track": sorted(names.values())}
-    claim_bop(out, settings, dataset)
+    pose_predict.claim_bop(out, settings, dataset)
     images: dict[tuple[int, int], dict[int, Instance]] = {}
     for one in sorted(dataset.instances, key=lambda i: (i.image_id, i.index)):
         images.setdefault((one.scene_id, one.object_id), {}).setdefault(one.image_id, one)
@@ -151,7 +143,9 @@ def track_bop(method: PoseMethod, frames: SequenceOptions, out: Path) -> int:
     jobs = [job for _, own in sequences for job in own]
     coming = (one for name, own in sequences for one in _followed(method, own, name))
     predictions = _kept(coming, out)
-    code = finish(predictions, _explained(predictions, jobs, method), out, method, dataset)
+    code = pose_predict.finish(
+        predictions, _explained(predictions, jobs, method), out, method, dataset
+    )
     return _say_kinds(predictions, code)
 
 

@@ -22,32 +22,13 @@ from depthpose.core.files import read_image, write_json
 from depthpose.core.rigid import Rigid
 from depthpose.core.run import claim_folder
 from depthpose.core.units import Unit
+from depthpose.pose import datasets, predictions
 from depthpose.pose.baselines import DepthImageNet, FpfhConfig, FpfhEstimator
 from depthpose.pose.config import EstimateConfig
-from depthpose.pose.datasets import (
-    LAYOUTS,
-    BopDataset,
-    Detection,
-    Instance,
-    encode_rle,
-    object_names,
-    open_bop,
-    read_detections,
-    write_detections,
-)
 from depthpose.pose.datasets.layouts import integer, read_rows
 from depthpose.pose.estimator import DepthImageRegressor, GeoPoseNet, Registration
 from depthpose.pose.estimator.inputs import AnyInput
 from depthpose.pose.mesh import FIXED_UNITS, unit_of
-from depthpose.pose.predictions import (
-    Job,
-    detection_jobs,
-    instance_jobs,
-    predict,
-    read_predictions,
-    results_name,
-    write_bop_results,
-)
 from depthpose.pose.segmentation import Segmenter
 from depthpose.pose.types import ObjectModel, PoseEstimate, ViewInput
 from depthpose.pose.weights import read_pose_weights
@@ -58,12 +39,12 @@ class Masks:
     """Which pixels a method is given: what to call them, and the jobs that they make."""
 
     name: str
-    jobs: Callable[[Mapping[int, str]], list[Job[ViewInput]]]
+    jobs: Callable[[Mapping[int, str]], list[predictions.Job[ViewInput]]]
     settings: Mapping[str, Any]
 
 
 def find_masks(
-    kinds: Sequence[str], dataset: BopDataset, out: Path, device: str = "cpu"
+    kinds: Sequence[str], dataset: datasets.BopDataset, out: Path, device: str = "cpu"
 ) -> list[Masks]:
     """Understand ``truth``, ``predicted``, files of BOP detections and segmentation weights."""
     paths = [_path_of(kind) for kind in kinds]
@@ -71,22 +52,24 @@ def find_masks(
     masks: list[Masks] = []
     for kind, path, name in zip(kinds, paths, names, strict=True):
         settings: dict[str, Any] = {}
-        jobs = partial(instance_jobs, dataset)
+        jobs = partial(predictions.instance_jobs, dataset)
         if path is not None:
-            is_list = path.suffix == ".json"
-            detections = (
-                read_detections(path) if is_list else _segmented(path, name, dataset, out, device)
-            )
-            jobs = partial(detection_jobs, dataset, detections=detections)
+            if path.suffix == ".json":
+                detections = datasets.read_detections(path)
+            else:
+                detections = _segmented(path, name, dataset, out, device)
+            jobs = partial(predictions.detection_jobs, dataset, detections=detections)
             settings = {"masks_sha256": file_sha256(path)}
         elif kind == "predicted":
-            mask_of = LAYOUTS[dataset.layout].predicted_mask
+            mask_of = datasets.LAYOUTS[dataset.layout].predicted_mask
             if mask_of is None:
                 raise InputError(
                     f"{dataset.folder}: came without predicted masks, as Linemod_preprocessed has "
                     "them; give --masks a file of BOP detections, or weights of a segmentation"
                 )
-            jobs = partial(instance_jobs, dataset, mask_of=partial(mask_of, dataset.folder))
+            jobs = partial(
+                predictions.instance_jobs, dataset, mask_of=partial(mask_of, dataset.folder)
+            )
             settings = {"masks_of": "segnet_results"}
         masks.append(Masks(name=name, jobs=jobs, settings=settings))
     return masks
@@ -119,7 +102,7 @@ def named_file(path: Path) -> str:
         raise InputError(f"{path}: cannot be read ({error.strerror}); give another file") from error
 
 
-def of_dataset(dataset: BopDataset) -> dict[str, Any]:
+def of_dataset(dataset: datasets.BopDataset) -> dict[str, Any]:
     """Settings that say which data set results are of, wherever its folder lies."""
     return {
         "dataset": dataset.folder.resolve().name,
@@ -129,8 +112,8 @@ def of_dataset(dataset: BopDataset) -> dict[str, Any]:
 
 
 def _segmented(
-    path: Path, name: str, dataset: BopDataset, out: Path, device: str
-) -> list[Detection]:
+    path: Path, name: str, dataset: datasets.BopDataset, out: Path, device: str
+) -> list[datasets.Detection]:
     """Segment the images that are not segmented yet, for every object that the weights know.
 
     Other objects or images may be asked for next time: what is there stays, what lacks is added.
@@ -141,9 +124,9 @@ def _segmented(
     claim_folder(home, {"weights_sha256": file_sha256(path), **of_dataset(dataset)})
     file, record = home.parent / f"{name}.json", home / "images.json"
     done: set[tuple[int, int]] = set()
-    known: list[Detection] = []
+    known: list[datasets.Detection] = []
     with suppress(InputError):  # damaged or missing: all is segmented again
-        earlier, said = read_detections(file), str(record)
+        earlier, said = datasets.read_detections(file), str(record)
         rows = read_rows(record)
         done = {(integer(row, "scene_id", said), integer(row, "im_id", said)) for row in rows}
         known = [d for d in earlier if (d.scene_id, d.image_id) in done]
@@ -151,15 +134,15 @@ def _segmented(
     left = [images[place] for place in sorted(images.keys() - done)]
     if left:
         known += _detect(segmenter, left, numbers)
-        write_detections(file, known)
+        datasets.write_detections(file, known)
         places = sorted(done | images.keys())
         write_json(record, [{"scene_id": scene, "im_id": image} for scene, image in places])
     return known
 
 
-def _numbers_of(segmenter: Segmenter, dataset: BopDataset, path: Path) -> dict[str, int]:
+def _numbers_of(segmenter: Segmenter, dataset: datasets.BopDataset, path: Path) -> dict[str, int]:
     """Find what a data set numbers each object of the weights: by its name, else by its number."""
-    names = object_names(dataset.folder)
+    names = datasets.object_names(dataset.folder)
     by_name = {name: number for number, name in names.items()}
     own = dict(zip(segmenter.weights.objects, segmenter.weights.numbers, strict=True))
     numbers = {
@@ -181,8 +164,8 @@ def _numbers_of(segmenter: Segmenter, dataset: BopDataset, path: Path) -> dict[s
 
 
 def _detect(
-    segmenter: Segmenter, images: Sequence[Instance], numbers: Mapping[str, int]
-) -> Iterable[Detection]:
+    segmenter: Segmenter, images: Sequence[datasets.Instance], numbers: Mapping[str, int]
+) -> Iterable[datasets.Detection]:
     """Segment each picture once; what it took is its time."""
     for shown in tqdm(images, "segmentation", disable=None, unit=" images"):
         if shown.rgb is None:
@@ -193,12 +176,12 @@ def _detect(
         for name in [name for name in objects.masks if name in numbers]:
             pairs = zip(objects.masks[name], objects.scores[name].tolist(), strict=True)
             for mask, score in pairs:
-                yield Detection(
+                yield datasets.Detection(
                     scene_id=shown.scene_id,
                     image_id=shown.image_id,
                     object_id=numbers[name],
                     score=score,
-                    segmentation=encode_rle(mask),
+                    segmentation=datasets.encode_rle(mask),
                     seconds=spent_s,
                 )
 
@@ -391,28 +374,30 @@ def source_of(
     if register.method == "network":
         return MethodSource(config=config, weights=weights)
     if dataset.bop is not None:
-        models = tuple(open_bop(dataset.bop, dataset.split).objects.values())
+        models = tuple(datasets.open_bop(dataset.bop, dataset.split).objects.values())
         return MethodSource(config=config, models=models)
     models = Registration.load(*register.cad, unit=cad_unit).models if register.cad else ()
     return MethodSource(config=config, models=tuple(models))
 
 
 def predict_all(
-    dataset: BopDataset, method: PoseMethod, masks: Masks, out: Path, batch: int = 1
+    dataset: datasets.BopDataset, method: PoseMethod, masks: Masks, out: Path, batch: int = 1
 ) -> Path:
     """Estimate every instance that is not estimated yet, and write ``poses.json`` and BOP's csv."""
     jobs = masks.jobs(match_names(dataset, method.models))
     home = out / "predictions" / f"{method.name}_{masks.name}"
     settings = {**method.settings, "masks": masks.name, **masks.settings, **of_dataset(dataset)}
-    written = predict(method.estimate_many, jobs, home, settings, batch)
+    written = predictions.predict(method.estimate_many, jobs, home, settings, batch)
     label = f"{method.name}, {masks.name} masks"
     for _ in tqdm(written, label, total=len(jobs), disable=None, unit=" instances"):
         pass
-    write_bop_results(home / results_name(dataset), read_predictions(home))
+    predictions.write_bop_results(
+        home / predictions.results_name(dataset), predictions.read_predictions(home)
+    )
     return home
 
 
-def match_names(dataset: BopDataset, models: Sequence[ObjectModel]) -> dict[int, str]:
+def match_names(dataset: datasets.BopDataset, models: Sequence[ObjectModel]) -> dict[int, str]:
     """Find what a method calls each object of a data set: by its name, else by its number."""
     by_name = {model.name: model for model in models}
     by_number = {model.number: model for model in models}

@@ -15,19 +15,11 @@ from typing import Any
 from scipy.spatial.transform import Rotation
 from tqdm import tqdm
 
+from depthpose.cli import pose_inputs
 from depthpose.cli.engine import EngineOptions, Inputs, say
-from depthpose.cli.pose_inputs import (
-    bop_jobs,
-    camera_facts,
-    chosen_objects,
-    cloud_jobs,
-    input_job,
-    object_named,
-    safely,
-    view_jobs,
-)
 from depthpose.cli.pose_methods import MethodSource, PoseMethod, find_masks, of_dataset
 from depthpose.cli.pose_options import DataSetOptions, OneObjectOptions
+from depthpose.core import run
 from depthpose.core.camera import Camera, camera_of
 from depthpose.core.config import config_to_dict
 from depthpose.core.engine import Files, Function, Item, Sample, is_url, shard_results, stem
@@ -43,16 +35,6 @@ from depthpose.core.files import (
 from depthpose.core.files.images import LISTED_SUFFIXES
 from depthpose.core.results import is_whole, note_result
 from depthpose.core.rigid import numbers_text
-from depthpose.core.run import (
-    claim_folder,
-    claim_names,
-    environment,
-    find_rank,
-    is_whole,
-    note_result,
-    read_sources,
-    wait_for,
-)
 from depthpose.core.units import Unit
 from depthpose.pose.cloud import object_points
 from depthpose.pose.datasets import BopDataset, open_bop, read_targets
@@ -75,16 +57,8 @@ from depthpose.pose.predictions import (
     write_predictions,
 )
 from depthpose.pose.types import PoseEstimate, ViewInput
+from depthpose.report import pose as drawn
 from depthpose.report.page import Section, choose_answers, plain_table, write_page
-from depthpose.report.pose import (
-    PoseShown,
-    alternative_lines,
-    draw_pose,
-    grey_depth,
-    picture_of,
-    pose_section,
-    posed_cloud,
-)
 from depthpose.report.viewer import open_viewer
 
 _PAGE = "report.html"
@@ -110,11 +84,11 @@ def claim(
     ``source``: of jobs that name none; ``is_result``: whether a result of the first name is of the
     input of the second.
     """
-    claim_folder(out, settings, [POSES, _PAGE])
-    if find_rank().world == 1 and not read_sources(out):  # lost: of what the poses are
+    run.claim_folder(out, settings, [POSES, _PAGE])
+    if run.find_rank().world == 1 and not run.read_sources(out):  # lost: of what the poses are
         (out / POSES).unlink(missing_ok=True)
     done = _finished(out)
-    claim_names(
+    run.claim_names(
         out,
         {job.name: job.source or source for job in jobs},
         [f".{end}" for end in (PICTURE, CLOUD)],
@@ -132,18 +106,18 @@ def claim_bop(out: Path, settings: dict[str, Any], dataset: BopDataset) -> None:
     images = sorted({(i.scene_id, i.image_id) for i in dataset.instances})
     pictures = [_picture_name(*image) for image in images]
     tables = [results_name(dataset), alternatives_name(dataset)]
-    claim_folder(out, settings, [POSES, _PAGE, *tables, *pictures])
+    run.claim_folder(out, settings, [POSES, _PAGE, *tables, *pictures])
 
 
 def predict_files(
     method: PoseMethod, inputs: OneObjectOptions, out: Path, batch: int, view: str | None
 ) -> int:
     """Pose clouds, or masked depth images, in this process; give the exit code."""
-    name, lens = object_named(inputs.object, method), inputs.lens
+    name, lens = pose_inputs.object_named(inputs.object, method), inputs.lens
     settings = {**method.settings, "object": name}
     if inputs.cloud is not None:
         unit, source = inputs.unit or "m", Path(inputs.cloud)
-        jobs = cloud_jobs(source, unit, name, out)
+        jobs = pose_inputs.cloud_jobs(source, unit, name, out)
         settings |= {"unit": unit}
     elif inputs.depth is None or inputs.mask is None or lens is None:
         raise InputError(
@@ -151,8 +125,8 @@ def predict_files(
         )
     else:
         source, mask = Path(inputs.depth), Path(inputs.mask)
-        jobs = view_jobs(source, mask, lens, name, inputs.unit, out)
-        settings |= camera_facts(lens) | {"mask": str(mask.resolve())}
+        jobs = pose_inputs.view_jobs(source, mask, lens, name, inputs.unit, out)
+        settings |= pose_inputs.camera_facts(lens) | {"mask": str(mask.resolve())}
         settings |= {} if inputs.unit is None else {"unit": inputs.unit}
     claim(out, settings, jobs, source)
     predictions = predict_all(method, jobs, out, settings, batch, view)
@@ -176,9 +150,9 @@ def predict_dataset(
     dataset = open_bop(options.bop, options.split)
     if options.targets is not None:
         dataset = of_targets(dataset, read_targets(options.targets, options.bop))
-    dataset = chosen_objects(dataset, method, object)
+    dataset = pose_inputs.chosen_objects(dataset, method, object)
     (masks,) = find_masks([options.masks], dataset, home, source.config.device)
-    jobs = bop_jobs(dataset, masks, method)
+    jobs = pose_inputs.bop_jobs(dataset, masks, method)
     settings = {**method.settings, "estimate": config_to_dict(source.config)}
     settings |= {**of_dataset(dataset), "masks": masks.name, **masks.settings}
     if object is not None:
@@ -214,7 +188,7 @@ def predict_all(
 
     Gives all predictions in the first of them, None in the others.
     """
-    process = find_rank()
+    process = run.find_rank()
     home = out if process.world == 1 else out / f"part-{process.rank}"
     done = _finished(out)
     left = [jobs[k] for k in process.share(len(jobs)) if jobs[k].name not in done]
@@ -229,7 +203,7 @@ def predict_all(
                 return estimates
 
             shown = replace(method, estimate_many=estimate_many)
-            names = predict(safely(shown), left, home, settings, batch)
+            names = predict(pose_inputs.safely(shown), left, home, settings, batch)
             for _ in tqdm(names, total=len(left), disable=None, unit=" poses"):
                 pass
     if process.rank:
@@ -243,7 +217,7 @@ def predict_all(
                 seen["names"], seen["at"] = set(_known(out)), time.monotonic()
             return name in seen["names"]
 
-        wait_for([job.name for job in jobs], is_there)
+        run.wait_for([job.name for job in jobs], is_there)
     known = _known(out)
     predictions = [known.pop(job.name) for job in jobs]
     # Inputs of earlier runs stay in the file.
@@ -291,10 +265,12 @@ def write_files(
         view, model = job.read(), method.models_by_name[prediction.estimate.object]
         points_m = object_points(view, model.diameter_m)
         files = [out / f"{job.name}.{CLOUD}"]
-        write_cloud(files[0], posed_cloud(points_m, pose, model))
+        write_cloud(files[0], drawn.posed_cloud(points_m, pose, model))
         if isinstance(view, ViewInput):
             files.append(out / f"{job.name}.{PICTURE}")
-            write_image(files[1], draw_pose(grey_depth(view.depth_m), pose, model, view.K))
+            write_image(
+                files[1], drawn.draw_pose(drawn.grey_depth(view.depth_m), pose, model, view.K)
+            )
         note_result(out, job.name, files)
     _write_page(out, predictions, jobs, method, dataset)
 
@@ -314,12 +290,12 @@ def _write_bop_files(
     for image, estimates in posed.items():
         name = _picture_name(*image)
         if not is_whole(out, name, [name]):
-            picture = picture_of(image_of[image])
+            picture = drawn.picture_of(image_of[image])
             for estimate in estimates:
                 assert estimate.camera_from_model is not None
                 model = method.models_by_name[estimate.object]
                 pose, K = estimate.camera_from_model, image_of[image].K
-                picture = draw_pose(picture, pose, model, K)
+                picture = drawn.draw_pose(picture, pose, model, K)
             write_image(out / name, picture)
             note_result(out, name, [out / name])
 
@@ -341,7 +317,7 @@ def say_result(predictions: list[Prediction], out: Path) -> int:
         what = "refused" if shown[0].camera_from_model is None else shown[0].status
         print(f"{what}: {shown[0].reason}")
     for prediction in predictions[:_SAID]:
-        for line in alternative_lines(prediction.estimate):
+        for line in drawn.alternative_lines(prediction.estimate):
             print(f"{prediction.estimate.name}: {line}")
     inputs = "1 input" if len(predictions) == 1 else f"{len(predictions)} inputs"
     print(f"{inputs}: {_statuses(shown) or 'none readable'}; {out / 'poses.json'}")
@@ -391,13 +367,13 @@ def _write_page(
         if isinstance(shown_input, PoseEstimate):  # unreadable by now
             continue
         rgb = None if place is None else image_of[place[:2]]
-        shown = PoseShown(
+        shown = drawn.PoseShown(
             input=shown_input,
             estimate=estimate,
             model=method.models_by_name[estimate.object],
             image=None if rgb is None else read_image(rgb),
         )
-        sections.append(pose_section(estimate.name, shown))
+        sections.append(drawn.pose_section(estimate.name, shown))
     number = len(predictions)
     estimates = [prediction.estimate for prediction in predictions]
     text = f"{number} inputs: {_statuses(estimates)}. Shown below: {len(sections)}"
@@ -408,7 +384,7 @@ def _write_page(
     rows = [_page_row(one) for one in sorted(estimates, key=lambda one: one.is_posed)[:_MOST_ROWS]]
     results = Section(title="What was found", text=text, rows=rows)
     title = f"Poses of {number} input{'s' * (number != 1)}"
-    write_page(out / _PAGE, title, [results, *sections], environment())
+    write_page(out / _PAGE, title, [results, *sections], run.environment())
     print(f"the page: {out / _PAGE}")
 
 
@@ -424,7 +400,7 @@ def _page_row(estimate: PoseEstimate) -> dict[str, Any]:
         "fit": None if fit is None else fit.agrees,
         "identity": None if identity is None else identity.status,
         "certainty": estimate.certainty,
-        "alternatives": "; ".join(alternative_lines(estimate)),
+        "alternatives": "; ".join(drawn.alternative_lines(estimate)),
         "reason": estimate.reason,
     }
 
@@ -457,7 +433,9 @@ class PoseWork:
         method = self.source.build()
 
         def predict(samples: Sequence[Sample], out: Path) -> list[str]:
-            jobs = [input_job(s.name, self.object, partial(self._read, s)) for s in samples]
+            jobs = [
+                pose_inputs.input_job(s.name, self.object, partial(self._read, s)) for s in samples
+            ]
             return _write_estimates(method, jobs, out)
 
         return predict
@@ -491,7 +469,7 @@ class BopWork:
         method = self.source.build()
         dataset = open_bop(Path(self.folder), self.split).of_objects(*self.objects)
         (masks,) = find_masks([self.masks], dataset, Path())
-        jobs = {job.name: job for job in bop_jobs(dataset, masks, method)}
+        jobs = {job.name: job for job in pose_inputs.bop_jobs(dataset, masks, method)}
 
         def predict(samples: Sequence[Sample], out: Path) -> list[str]:
             return _write_estimates(method, [jobs[sample.name] for sample in samples], out)
@@ -502,7 +480,9 @@ class BopWork:
 def _write_estimates(method: PoseMethod, jobs: Sequence[Job[Any]], out: Path) -> list[str]:
     """Estimate some inputs and write an entry of each; give for each "" or why it failed."""
     reasons: list[str] = []
-    for job, estimate in zip(jobs, safely(method)([job.read() for job in jobs]), strict=True):
+    for job, estimate in zip(
+        jobs, pose_inputs.safely(method)([job.read() for job in jobs]), strict=True
+    ):
         spent = {**job.seconds, **estimate.seconds}
         prediction = Prediction(estimate=replace(estimate, seconds=spent), place=job.place)
         write_json(out / f"{job.name}.{ENDING}", prediction_row(prediction))
@@ -527,7 +507,7 @@ def predict_on_ray(
             )
     source = source.packed()
     method = source.build("cpu")
-    object = object_named(options.object or None, method)
+    object = pose_inputs.object_named(options.object or None, method)
     with inputs.first() as first:
         lens = options.lens
         camera = None if lens is None else camera_of(lens, image_size(first[0]))

@@ -53,8 +53,8 @@ class Views:
     def close_up(self, index: int) -> tuple[Float[Tensor, "3 h w"], Float[Tensor, "3 3"]]:
         """Give the picture of a view near its object, or its depth in grey, and its camera."""
         instance, seen = self.instances[index], self.samples[index].input
-        has_picture = instance is not None and instance.rgb is not None
-        picture = picture_of(instance) if has_picture else grey_depth(seen.depth_m)
+        picture = None if instance is None or instance.rgb is None else picture_of(instance)
+        picture = grey_depth(seen.depth_m) if picture is None else picture
         return close_up(picture, seen.mask, seen.K)
 
 
