@@ -6,16 +6,11 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any, cast
 
+from depthpose.core import files
 from depthpose.core.camera import Camera, write_camera
 from depthpose.core.errors import InputError, refuse_unknown
-from depthpose.core.files import (
-    MAP_SUFFIXES,
-    read_stored_depth,
-    write_cloud,
-    write_depth_png,
-    write_image,
-)
 from depthpose.core.units import METRES, Unit
+from depthpose.pose import mesh
 from depthpose.pose.cloud import object_points
 from depthpose.pose.config import EstimateConfig, ObjectsConfig
 from depthpose.pose.datasets.write import write_mask
@@ -24,28 +19,12 @@ from depthpose.pose.estimator.answer import with_status
 from depthpose.pose.estimator.base import answered
 from depthpose.pose.estimator.find import explained_mask, nothing_found
 from depthpose.pose.estimator.inputs import cloud_input, view_input
-from depthpose.pose.mesh import (
-    FIXED_UNITS,
-    gap_to_surface_m,
-    read_model,
-    sample_surface,
-    with_found_symmetries,
-)
 from depthpose.pose.predictions import CLOUD, PICTURE, Prediction, write_predictions
 from depthpose.pose.surface import prepare_surface
 from depthpose.pose.synthetic import make_frames
 from depthpose.pose.types import CloudInput, ObjectModel, PoseEstimate, ViewInput
+from depthpose.report import pose as report
 from depthpose.report.page import Layer, Scene
-from depthpose.report.pose import (
-    draw_pose,
-    grey_depth,
-    pose_facts,
-    pose_scene,
-    pose_sentence,
-    pose_tables,
-    posed_cloud,
-    vote_layer,
-)
 from depthpose.web.answer import (
     EXAMPLE_SEED,
     Answer,
@@ -102,9 +81,9 @@ def answer_pose(form: Form, net: GeoPoseNet) -> Answer:
     agreeing = "votes that agree" if isinstance(target.net, GeoPoseNet) else "points near the model"
     return Answer(
         is_ok=best.estimate.is_posed,
-        said=pose_sentence(best.estimate),
-        facts=pose_facts(best.estimate, target.model, target.how, agreeing),
-        tables=_instances(seen) | pose_tables(best.estimate),
+        said=report.pose_sentence(best.estimate),
+        facts=report.pose_facts(best.estimate, target.model, target.how, agreeing),
+        tables=_instances(seen) | report.pose_tables(best.estimate),
         pictures=_write(folder, name, seen, target.model),
         scene=_scene(seen, target.model, voted),
         terms=net.terms if target.net is net else "",
@@ -144,18 +123,18 @@ def _write(folder: Path, name: str, seen: list[_Seen], model: ObjectModel) -> li
     write_predictions(folder, [Prediction(estimate=one.estimate) for one in seen])
     for one in seen:
         points_m = object_points(one.input, model.diameter_m)
-        cloud = posed_cloud(points_m, one.estimate.camera_from_model, model)
-        write_cloud(folder / f"{one.input.name}.{CLOUD}", cloud)
+        cloud = report.posed_cloud(points_m, one.estimate.camera_from_model, model)
+        files.write_cloud(folder / f"{one.input.name}.{CLOUD}", cloud)
     pose_input = seen[0].input
     if not isinstance(pose_input, ViewInput):
         return []
-    picture, caption = grey_depth(pose_input.depth_m), "depth image, near bright"
+    picture, caption = report.grey_depth(pose_input.depth_m), "depth image, near bright"
     poses = [pose for one in seen if (pose := one.estimate.camera_from_model) is not None]
     for pose in poses:
-        picture = draw_pose(picture, pose, model, pose_input.K.double())
+        picture = report.draw_pose(picture, pose, model, pose_input.K.double())
     if poses:
         caption += f", with the posed model{'s' * (len(poses) > 1)}"
-    write_image(folder / f"{name}.{PICTURE}", picture)
+    files.write_image(folder / f"{name}.{PICTURE}", picture)
     return [Shown(file=f"{name}.{PICTURE}", caption=caption)]
 
 
@@ -173,12 +152,14 @@ def _target(form: Form, net: GeoPoseNet) -> _Target:
             raise InputError(f"object {name!r}: the weights know {', '.join(net.objects)}")
         return _Target(model=known[0], net=net, how="network, by the weights' own model")
     cad = form.file("cad")
-    model = read_model(cad, FIXED_UNITS.get(cad.suffix.lower()) or _unit(form, "cad_unit"))
+    model = mesh.read_model(
+        cad, mesh.FIXED_UNITS.get(cad.suffix.lower()) or _unit(form, "cad_unit")
+    )
     for own in models:
         if _is_same(own, model):
             how = f"network; the CAD file is the weights' {own.name!r}"
             return _Target(model=own, net=net, how=how)
-    model = with_found_symmetries(model, None, is_taken=True)
+    model = mesh.with_found_symmetries(model, None, is_taken=True)
     how = "the CAD file alone, without training"
     return _Target(model=model, net=Registration([model], net.config), how=how)
 
@@ -187,8 +168,8 @@ def _is_same(own: ObjectModel, model: ObjectModel) -> bool:
     """Whether a CAD file is the object that the weights know, in the same frame."""
     if abs(model.diameter_m / own.diameter_m - 1) > _SAME:
         return False
-    off_m = gap_to_surface_m(own.keypoints_m, model)
-    back_m = gap_to_surface_m(sample_surface(model, 500)[0], own)
+    off_m = mesh.gap_to_surface_m(own.keypoints_m, model)
+    back_m = mesh.gap_to_surface_m(mesh.sample_surface(model, 500)[0], own)
     return max(off_m, back_m) < _SAME * own.diameter_m
 
 
@@ -202,8 +183,8 @@ def _input(form: Form, model: ObjectModel) -> CloudInput | ViewInput:
     mask = form.file("mask") if "mask" in form.files else None
     if mask is not None:
         small_size(mask)
-    if depth.suffix.lower() in MAP_SUFFIXES:
-        height, width = read_stored_depth(depth).shape
+    if depth.suffix.lower() in files.MAP_SUFFIXES:
+        height, width = files.read_stored_depth(depth).shape
         refuse_large(depth.name, width, height)
         size = (width, height)
     else:
@@ -236,13 +217,17 @@ _UNIT_M = 0.0001
 def _scene(seen: list[_Seen], model: ObjectModel, voted: CloudDirections | None) -> Scene:
     """Show the cloud, the posed model, the votes, and what else was estimate in the image."""
     pose_input, estimate = seen[0].input, seen[0].estimate
-    scene = pose_scene(pose_input, object_points(pose_input, model.diameter_m), estimate, model)
+    scene = report.pose_scene(
+        pose_input, object_points(pose_input, model.diameter_m), estimate, model
+    )
     layers = list(scene.layers)
     if estimate.keypoints_m is not None and voted is not None:
-        layers.append(vote_layer(voted.cloud.points_m, voted.directions, estimate.keypoints_m))
+        layers.append(
+            report.vote_layer(voted.cloud.points_m, voted.directions, estimate.keypoints_m)
+        )
     for one in seen[1:]:
         points_m = object_points(one.input, model.diameter_m)
-        cloud = posed_cloud(points_m, one.estimate.camera_from_model, model)
+        cloud = report.posed_cloud(points_m, one.estimate.camera_from_model, model)
         layers.append(Layer(name=one.input.name, shape=cloud))
     return replace(scene, layers=layers)
 
@@ -262,7 +247,7 @@ def pose_example(net: GeoPoseNet) -> dict[str, Any]:
     camera = Camera(width=width, height=height, K=frame.K.double(), depth_unit_m=_UNIT_M)
     with TemporaryDirectory(prefix="depthpose-") as name:
         folder = Path(name)
-        write_depth_png(folder / "depth.png", frame.depth_m, _UNIT_M)
+        files.write_depth_png(folder / "depth.png", frame.depth_m, _UNIT_M)
         write_mask(folder / "mask.png", frame.objects[0].visible)
         write_camera(folder / "camera.json", camera)
         return example_form(folder, {"object": model.name})
