@@ -133,8 +133,7 @@ def make_objects(
 
     from depthpose.core.checkpoint import file_sha256
     from depthpose.core.config import config_to_dict
-    from depthpose.core.results import note_result
-    from depthpose.core.run import claim_folder
+    from depthpose.core.run import claim_folder, note_result
     from depthpose.pose.config import ObjectsConfig, SensorConfig
     from depthpose.pose.datasets import write_bop_models, write_bop_scene
     from depthpose.pose.mesh import read_model, refuse_one_name, with_found_symmetries
@@ -188,7 +187,7 @@ def make_objects(
 def _is_made(out: Path, split: str, scene: int, frames: range) -> bool:
     """Whether a scene exists with all of its frames, every file as it was written."""
     from depthpose.core.files import read_json
-    from depthpose.core.results import is_whole
+    from depthpose.core.run import is_whole
 
     home = f"{split}/{scene:06d}"
     if not is_whole(out, home, [f"{home}/scene_camera.json"]):

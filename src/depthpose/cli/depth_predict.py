@@ -37,7 +37,7 @@ from depthpose.core.files import (
 from depthpose.core.files.disk import find_partners
 from depthpose.core.files.images import LISTED_SUFFIXES
 from depthpose.core.files.text import read_text
-from depthpose.core.results import note_result
+from depthpose.core.run import note_result
 from depthpose.depth.estimator import FakestereoNet
 from depthpose.depth.ground import scale_by_distance
 from depthpose.depth.predictions import CLOUD_M, ENDINGS, is_finished, read_estimate, write_estimate

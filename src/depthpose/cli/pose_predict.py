@@ -33,8 +33,8 @@ from depthpose.core.files import (
     write_json,
 )
 from depthpose.core.files.images import LISTED_SUFFIXES
-from depthpose.core.results import is_whole, note_result
 from depthpose.core.rigid import numbers_text
+from depthpose.core.run import is_whole, note_result
 from depthpose.core.units import Unit
 from depthpose.pose.cloud import object_points
 from depthpose.pose.datasets import BopDataset, open_bop, read_targets
