@@ -37,21 +37,13 @@ class Nearest(NamedTuple):
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Sight:
-    """Visibility from one camera.
+    """Visibility from one camera."""
 
-    Attributes:
-        raster: visibility at the pixel centres.
-        K: intrinsic matrix.
-        eye: position of the camera in the left camera's frame [m]; it looks along z.
-        edges: edge functions of all triangles; see ``core.render``.
-        volume: what they are divided by.
-    """
-
-    raster: Raster
+    raster: Raster  # visibility at the pixel centres
     K: Float64[Tensor, "3 3"]
-    eye: Float[Tensor, "3"]
-    edges: Float64[Tensor, "n 3 3"]
-    volume: Float64[Tensor, " n"]
+    eye: Float[Tensor, "3"]  # its place in the left camera's frame [m]; it looks along z
+    edges: Float64[Tensor, "n 3 3"]  # edge functions of all triangles; see ``core.render``
+    volume: Float64[Tensor, " n"]  # what they are divided by
 
     def rays(self, pixels: Float64[Tensor, "n 2"]) -> Float[Tensor, "n 3"]:
         """Directions of pixels, with z = 1."""
@@ -75,15 +67,10 @@ def view_from(
 def nearest_at(
     sight: Sight, candidates: Int[Tensor, "n m"], places: list[Float64[Tensor, "n 2"]]
 ) -> list[Nearest]:
-    """Look between the pixel centres, at triangles that were seen near by.
+    """Find the nearest of some candidates on the rays between the pixel centres.
 
-    Args:
-        sight: from where.
-        candidates: triangles that may be met; -1 none.
-        places: one or more lists of pixels (u, v) [px], which share their candidates.
-
-    Returns:
-        For each list, the nearest of the candidates on each pixel's ray.
+    Candidates are triangles that were seen near by, -1 none; each list of pixels (u, v) [px] in
+    ``places`` shares them, and has an answer of its own.
     """
     which = candidates.clamp(min=0).flatten()
     volume = sight.volume.index_select(0, which)[:, None]
@@ -133,8 +120,22 @@ def draw_light(stage: Stage, sight: Sight, *, with_antialiasing: bool) -> Float[
     light = torch.zeros(height * width, 3)
     whole, mixed = (~is_edge).nonzero()[:, 0], is_edge.nonzero()[:, 0]
     light[whole] = _light(stage, sight, _centres(whole, width), _seen_at(sight, whole))
-    if len(mixed):
-        light[mixed] = _light_of_edges(stage, sight, mixed)
+    if len(mixed):  # the mean light of four places in each pixel
+        candidates = neighbours(sight.raster.primitive, mixed)
+        own = _seen_at(sight, mixed)
+        places = [_centres(mixed, width) + torch.tensor(o, dtype=torch.float64) for o in _OFFSETS]
+        found = []
+        for seen in nearest_at(sight, candidates, places):
+            # A gap between all that was seen near by: take what the pixel's centre sees.
+            is_lost = (seen.primitive < 0) & (candidates >= 0).all(1)
+            found.append([
+                torch.where(is_lost if one.ndim == 1 else is_lost[:, None], instead, one)
+                for one, instead in zip(seen, own, strict=True)
+            ])  # fmt: skip
+        nearest = Nearest(*(torch.cat(parts) for parts in zip(*found, strict=True)))
+        of_places = _light(stage, sight, torch.cat(places), nearest)
+        # A glint in a quarter of a pixel would outshine the rest, as it does not in a sensor.
+        light[mixed] = of_places.clamp(max=4).reshape(len(_OFFSETS), -1, 3).mean(0)
     return light.reshape(height, width, 3)
 
 
@@ -145,11 +146,8 @@ def _centres(index: Int[Tensor, " n"], width: int) -> Float64[Tensor, "n 2"]:
 def _seen_at(sight: Sight, index: Int[Tensor, " n"]) -> Nearest:
     raster = sight.raster
     assert raster.barycentric is not None
-    shares, primitive, depth_m = (
-        values.flatten(0, 1).index_select(0, index)
-        for values in (raster.barycentric, raster.primitive, raster.depth_m)
-    )
-    return Nearest(primitive, shares, depth_m)
+    parts = raster.primitive, raster.barycentric, raster.depth_m
+    return Nearest(*(values.flatten(0, 1).index_select(0, index) for values in parts))
 
 
 def _edge_pixels(stage: Stage, raster: Raster) -> Bool[Tensor, "h w"]:
@@ -158,10 +156,8 @@ def _edge_pixels(stage: Stage, raster: Raster) -> Bool[Tensor, "h w"]:
     kind = torch.where(raster.primitive >= 0, stage.kind[seen], -1)
     normal = stage.attributes[:, 18:21].index_select(0, seen.flatten()).unflatten(0, seen.shape)
     edge = torch.zeros_like(kind, dtype=torch.bool)
-    for one, other in (
-        ((slice(None), slice(1, None)), (slice(None), slice(None, -1))),
-        ((slice(1, None), slice(None)), (slice(None, -1), slice(None))),
-    ):
+    every, after, before = slice(None), slice(1, None), slice(None, -1)
+    for one, other in (((every, after), (every, before)), ((after, every), (before, every))):
         is_other = raster.primitive[one] != raster.primitive[other]
         x, y, z = (normal[one] * normal[other]).unbind(-1)
         is_bent = (x + y + z).abs() < 0.9
@@ -169,26 +165,6 @@ def _edge_pixels(stage: Stage, raster: Raster) -> Bool[Tensor, "h w"]:
         edge[one] |= differs
         edge[other] |= differs
     return edge
-
-
-def _light_of_edges(stage: Stage, sight: Sight, mixed: Int[Tensor, " n"]) -> Float[Tensor, "n 3"]:
-    """Mean light of four places in each edge pixel."""
-    candidates = neighbours(sight.raster.primitive, mixed)
-    centre = _centres(mixed, sight.raster.primitive.shape[1])
-    own = _seen_at(sight, mixed)
-    places = [centre + torch.tensor(offset, dtype=torch.float64) for offset in _OFFSETS]
-    found = []
-    for seen in nearest_at(sight, candidates, places):
-        # A gap between all that was seen near by: take what the pixel's centre sees.
-        is_lost = (seen.primitive < 0) & (candidates >= 0).all(1)
-        found.append([
-            torch.where(is_lost if one.ndim == 1 else is_lost[:, None], instead, one)
-            for one, instead in zip(seen, own, strict=True)
-        ])  # fmt: skip
-    primitive, shares, depth = (torch.cat(parts) for parts in zip(*found, strict=True))
-    light = _light(stage, sight, torch.cat(places), Nearest(primitive, shares, depth))
-    # A glint in a quarter of a pixel would outshine the rest, as it does not in a sensor.
-    return light.clamp(max=4).reshape(len(_OFFSETS), -1, 3).mean(0)
 
 
 def _light(
@@ -199,9 +175,8 @@ def _light(
     length = rays.norm(dim=1)
     towards = rays / length[:, None]
     light = torch.empty_like(rays)
-    sky = (primitive < 0).nonzero()[:, 0]
+    sky, hit = (primitive < 0).nonzero()[:, 0], (primitive >= 0).nonzero()[:, 0]
     light[sky] = sky_light(stage, towards[sky])
-    hit = (primitive >= 0).nonzero()[:, 0]
     hits = Hits(
         primitive=primitive.index_select(0, hit),
         barycentric=shares.index_select(0, hit),
@@ -215,29 +190,17 @@ def _light(
 
 @dataclass(frozen=True, kw_only=True)
 class Sensor:
-    """How one camera of a pair turns light into numbers.
+    """How one camera of a pair turns light into numbers."""
 
-    Attributes:
-        exposure: factor of the light, by channel.
-        blur: share of a pixel's light that falls on its neighbours, in each direction.
-        glare: share of the light that the lens scatters widely.
-        black: light below which there is only black.
-        vignette: loss in the corners.
-        noise: deviation of full light's noise, and of darkness'.
-        gamma: exponent of the tone curve.
-        jpeg_quality: None: not compressed.
-        noise_seed: of this picture.
-    """
-
-    exposure: tuple[float, float, float]
-    blur: float
-    glare: float
-    black: float
-    vignette: float
-    noise: tuple[float, float]
-    gamma: float
-    jpeg_quality: int | None
-    noise_seed: int
+    exposure: tuple[float, float, float]  # factor of the light, by channel
+    blur: float  # share of a pixel's light that falls on its neighbours, in each direction
+    glare: float  # share of the light that the lens scatters widely
+    black: float  # light below which there is only black
+    vignette: float  # loss in the corners
+    noise: tuple[float, float]  # deviation of full light's noise, and of darkness'
+    gamma: float  # exponent of the tone curve
+    jpeg_quality: int | None  # None: not compressed
+    noise_seed: int  # of this picture
 
 
 def draw_sensors(
@@ -275,7 +238,15 @@ def expose(light: Float[Tensor, "h w 3"], sensor: Sensor) -> Float[Tensor, "3 h 
     y = torch.linspace(-1, 1, height)[:, None] * height / width
     x = torch.linspace(-1, 1, width)[None]
     signal = signal * (1 - sensor.vignette * (x**2 + y**2) / 1.1)
-    signal = _blurred(_with_glare(signal, sensor.glare), sensor.blur)
+    blocks = (max(height // 32, 1), max(width // 32, 1))
+    small = F.avg_pool2d(F.adaptive_avg_pool2d(signal.clamp(max=6)[None], blocks), 3, 1, 1)
+    wide = F.interpolate(small, (height, width), mode="bilinear")[0]
+    signal = torch.lerp(signal.clamp(max=8), wide, sensor.glare)
+    for axis, size in ((1, height), (2, width)):
+        before = signal.narrow(axis, 0, 1), signal.narrow(axis, 0, size - 1)
+        after = signal.narrow(axis, 1, size - 1), signal.narrow(axis, size - 1, 1)
+        beside = torch.cat(before, axis) + torch.cat(after, axis)
+        signal = signal * (1 - sensor.blur) + beside * (sensor.blur / 2)
     generator = torch.Generator().manual_seed(sensor.noise_seed)
     shot, dark = sensor.noise
     deviation = (signal * shot**2 + dark**2).sqrt()
@@ -285,25 +256,6 @@ def expose(light: Float[Tensor, "h w 3"], sensor: Sensor) -> Float[Tensor, "3 h 
     signal = (signal * 1.12 / (1 + 0.12 * signal.clamp(min=0))).clamp(0, 1)
     picture = (signal ** (1 / sensor.gamma) * 255 + 0.5).floor() / 255
     return picture if sensor.jpeg_quality is None else through_jpeg(picture, sensor.jpeg_quality)
-
-
-def _with_glare(signal: Float[Tensor, "3 h w"], share: float) -> Float[Tensor, "3 h w"]:
-    height, width = signal.shape[1:]
-    small = F.adaptive_avg_pool2d(
-        signal.clamp(max=6)[None], (max(height // 32, 1), max(width // 32, 1))
-    )
-    wide = F.interpolate(F.avg_pool2d(small, 3, 1, 1), (height, width), mode="bilinear")[0]
-    return torch.lerp(signal.clamp(max=8), wide, share)
-
-
-def _blurred(signal: Float[Tensor, "3 h w"], share: float) -> Float[Tensor, "3 h w"]:
-    for axis in (1, 2):
-        size = signal.shape[axis]
-        before = signal.narrow(axis, 0, 1), signal.narrow(axis, 0, size - 1)
-        after = signal.narrow(axis, 1, size - 1), signal.narrow(axis, size - 1, 1)
-        beside = torch.cat(before, axis) + torch.cat(after, axis)
-        signal = signal * (1 - share) + beside * (share / 2)
-    return signal
 
 
 _BEAMS_RAD = np.deg2rad(np.concatenate([np.linspace(2, -8.33, 32), np.linspace(-8.87, -24.33, 32)]))
@@ -348,26 +300,19 @@ def scan(stage: Stage, rng: np.random.Generator) -> Float[Tensor, "n 4"]:
     candidates = neighbours(sight.raster.primitive, row * width + column)
     primitive, _, depth_m = nearest_at(sight, candidates, [pixels])[0]
     range_m = depth_m / towards[:, 2]
-    returned = _returned(stage, rng, primitive, range_m)
+    # Few beams come back from glass, fewer from afar and from what is dark.
+    chance, seen = torch.from_numpy(rng.random(len(primitive))), primitive.clamp(min=0)
+    material, tint = stage.material[seen], stage.attributes[seen, 15:18].mean(1)
+    is_glass = (material == NUMBER["glass"]) | (material == NUMBER["pane"])
+    dark = (0.12 - tint).clamp(min=0) * 2.5
+    lost = 0.03 + 0.0025 * range_m + 0.65 * is_glass + dark * (range_m / 40).clamp(max=1)
+    kept = (primitive >= 0) & (range_m < _MAX_RANGE_M) & (chance > lost)
+    returned = kept.nonzero()[:, 0]
     noise = torch.from_numpy(rng.normal(0, _NOISE_M, len(returned)))
     far = range_m[returned].double() + noise
     x, y, z = (towards[returned] * far[:, None]).unbind(1)
-    light = stage.attributes[primitive[returned], 15:18].mean(1).clamp(0.02, 0.99)
+    light = tint[returned].clamp(0.02, 0.99)
     return torch.stack([z, -x, -y, light.double()], 1).float()
-
-
-def _returned(
-    stage: Stage, rng: np.random.Generator, primitive: Tensor, range_m: Tensor
-) -> Int[Tensor, " m"]:
-    """Which beams come back: few from glass, fewer from afar and from what is dark."""
-    chance = torch.from_numpy(rng.random(len(primitive)))
-    seen = primitive.clamp(min=0)
-    material = stage.material[seen]
-    is_glass = (material == NUMBER["glass"]) | (material == NUMBER["pane"])
-    dark = (0.12 - stage.attributes[seen, 15:18].mean(1)).clamp(min=0) * 2.5
-    lost = 0.03 + 0.0025 * range_m + 0.65 * is_glass + dark * (range_m / 40).clamp(max=1)
-    kept = (primitive >= 0) & (range_m < _MAX_RANGE_M) & (chance > lost)
-    return kept.nonzero()[:, 0]
 
 
 _OCCLUSION_SHARE = 1e-4
@@ -470,9 +415,8 @@ def _occluded(left: Sight, right: Sight, rig: StereoRig) -> Bool[Tensor, "h w"]:
     primitive, depth_m = left.raster.primitive.flatten(), left.raster.depth_m.flatten()
     occluded = torch.zeros(height * width, dtype=torch.bool)
     index = (primitive >= 0).nonzero()[:, 0]
-    pixels = torch.stack([index % width, index // width], 1).double()
-    disparity_px = disparity_from_depth(depth_m[None, index], rig)[0].double()
-    pixels[:, 0] -= disparity_px
+    pixels = _centres(index, width)
+    pixels[:, 0] -= disparity_from_depth(depth_m[None, index], rig)[0].double()
     pixels[:, 1] += right.K[1, 2] - left.K[1, 2]
     near = pixels.round().long()
     is_outside = (near[:, 0] < 0) | (near[:, 0] >= width)

@@ -17,25 +17,15 @@ Rotation = Float[np.ndarray, "3 3"]
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Mesh:
-    """Triangles, each for itself: no corner is shared.
+    """Triangles, each for itself: no corner is shared."""
 
-    Attributes:
-        corners: positions [m].
-        uv: place in the texture, in tiles.
-        normals: at the corners, smooth where the surface is round.
-        tint: linear colour.
-        material: number of the material.
-        layer: number of the texture.
-        thing: which object the triangle belongs to.
-    """
-
-    corners: Float32[np.ndarray, "n 3 3"]
-    uv: Float32[np.ndarray, "n 3 2"]
-    normals: Float32[np.ndarray, "n 3 3"]
-    tint: Float32[np.ndarray, "n 3"]
-    material: Int[np.ndarray, " n"]
-    layer: Int[np.ndarray, " n"]
-    thing: Int[np.ndarray, " n"]
+    corners: Float32[np.ndarray, "n 3 3"]  # positions [m]
+    uv: Float32[np.ndarray, "n 3 2"]  # place in the texture, in tiles
+    normals: Float32[np.ndarray, "n 3 3"]  # at the corners, smooth where the surface is round
+    tint: Float32[np.ndarray, "n 3"]  # linear colour
+    material: Int[np.ndarray, " n"]  # number of the material
+    layer: Int[np.ndarray, " n"]  # number of the texture
+    thing: Int[np.ndarray, " n"]  # which object the triangle belongs to
 
     def __len__(self) -> int:
         return len(self.corners)
@@ -47,18 +37,8 @@ class Mesh:
 
 def join(meshes: Sequence[Mesh]) -> Mesh:
     """Put meshes together as one."""
-    return Mesh(
-        **{
-            field.name: np.concatenate([getattr(mesh, field.name) for mesh in meshes])
-            for field in fields(Mesh)
-        }
-    )
-
-
-def turn_y(angle_rad: Number) -> Rotation:
-    """Rotate about the vertical; a positive angle turns z towards x, to the right."""
-    c, s = np.cos(angle_rad), np.sin(angle_rad)
-    return np.array([[c, 0, s], [0, 1, 0], [-s, 0, c]])
+    parts = {f.name: [getattr(mesh, f.name) for mesh in meshes] for f in fields(Mesh)}
+    return Mesh(**{name: np.concatenate(values) for name, values in parts.items()})
 
 
 def place(
@@ -68,9 +48,10 @@ def place(
     scale: Values = 1.0,
     tints: Mapping[str, Color] | None = None,
 ) -> Mesh:
-    """Copy a model to its place."""
+    """Copy a model to its place; a positive yaw turns z towards x, to the right."""
     factor = np.broadcast_to(np.asarray(scale, np.float32), 3)
-    R = turn_y(yaw_rad).astype(np.float32)
+    c, s = np.cos(yaw_rad), np.sin(yaw_rad)
+    R = np.array([[c, 0, s], [0, 1, 0], [-s, 0, c]]).astype(np.float32)
     corners = (mesh.corners * factor) @ R.T + np.asarray(position, np.float32)
     tint = mesh.tint
     for material, color in (tints or {}).items():
@@ -83,19 +64,24 @@ NEAREST_M = 2.5
 """A car drives where nothing is nearer to its camera: with a baseline of 0.53 m and half of
 KITTI's resolution that is a disparity of 77 px."""
 
+_CUBE = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], np.float32)
+_FACES = [[0, 1, 3, 2], [5, 4, 6, 7], [4, 5, 1, 0], [2, 3, 7, 6], [4, 0, 2, 6], [1, 5, 7, 3]]
+_FACE_WIDTH = [2, 2, 2, 2, 0, 0]
+_FACE_HEIGHT = [1, 1, 0, 0, 1, 1]
+
 
 class MeshBuilder:
-    """Collects triangles; every method adds to what is there."""
+    """Collects triangles; every method adds to what is there. ``rng`` draws what is random."""
 
-    def __init__(self) -> None:
+    def __init__(self, rng: np.random.Generator) -> None:
+        self.rng = rng
         self._parts: list[Mesh] = []
         self._boxes: list[tuple] = []
         self._thing = 0
 
-    def begin_thing(self) -> int:
+    def begin_thing(self) -> None:
         """Say that what follows is another object."""
         self._thing += 1
-        return self._thing
 
     def add(self, mesh: Mesh) -> None:
         """Add a placed model as one object, unless it would stand against the camera."""
@@ -112,29 +98,16 @@ class MeshBuilder:
         normals: Values | None = None,
         tint: Values | None = None,
     ) -> None:
-        """Add triangles (n, 3, 3).
+        """Add triangles (n, 3, 3) [m].
 
-        Args:
-            corners: positions [m].
-            uv_m: place on the surface [m], broadcast to (n, 3, 2).
-            surface: what covers them.
-            normals: at the corners; those of the planes by default.
-            tint: colours, one a triangle, instead of the surface's.
+        ``uv_m`` is the place on the surface [m], broadcast to (n, 3, 2); normals are those of the
+        planes by default; ``tint`` holds colours, one a triangle, instead of the surface's.
         """
         positions = np.asarray(corners, np.float32)
-        n = len(positions)
-        flat = plane_normals(positions)[:, None] if normals is None else normals
-        color = surface.tint if tint is None else tint
+        uv = np.asarray(uv_m, np.float32) / surface.tile_m
+        material, color = NUMBER[surface.material], surface.tint if tint is None else tint
         self._parts.append(
-            Mesh(
-                corners=positions,
-                uv=_full(np.asarray(uv_m, np.float32) / surface.tile_m, (n, 3, 2)),
-                normals=_full(flat, (n, 3, 3)),
-                tint=_full(np.clip(color, 0.005, 0.97), (n, 3)),
-                material=np.full(n, NUMBER[surface.material], np.int32),
-                layer=np.full(n, surface.layer, np.int32),
-                thing=np.full(n, self._thing, np.int32),
-            )
+            _mesh(positions, uv, normals, color, material, surface.layer, self._thing)
         )
 
     def quads(
@@ -152,8 +125,7 @@ class MeshBuilder:
             normals = _halves(_full(normals, (n, 4, 3)))
         if tint is not None:
             tint = np.tile(_full(tint, (n, 3)), (2, 1))
-        uv = _halves(_full(uv_m, (n, 4, 2)))
-        self.triangles(_halves(faces), uv, surface, normals, tint)
+        self.triangles(_halves(faces), _halves(_full(uv_m, (n, 4, 2))), surface, normals, tint)
 
     def rectangle(self, corner: Values, along: Values, up: Values, surface: Surface) -> None:
         """Add one rectangle: a corner and its two sides [m]."""
@@ -178,18 +150,19 @@ class MeshBuilder:
         self,
         start: Values,
         stop: Values,
-        radii_m: tuple[Number, Number],
+        radii_m: Number | tuple[Number, Number],
         surface: Surface,
         sides: int = 8,
     ) -> None:
-        """Add a cone's frustum without ends, from one point to another."""
+        """Add a cone's frustum without ends, from one point to another; one radius: a cylinder."""
+        first, last = radii_m if isinstance(radii_m, tuple) else (radii_m, radii_m)
         p, q = np.asarray(start, np.float64), np.asarray(stop, np.float64)
         length = float(np.linalg.norm(q - p))
         across, other = _across((q - p) / length)
         angle = np.linspace(0, 2 * np.pi, sides + 1)
         ring = np.cos(angle)[:, None] * across + np.sin(angle)[:, None] * other
-        low, high = p + ring * radii_m[0], q + ring * radii_m[1]
-        around = angle * max(radii_m)
+        low, high = p + ring * first, q + ring * last
+        around = angle * max(first, last)
         below, above = (np.stack([around, 0 * around + d], -1) for d in (0.0, length))
         self.quads(between(low, high), between(below, above), surface, between(ring, ring))
 
@@ -209,21 +182,57 @@ class MeshBuilder:
         self.triangles(faces, places, surface)
 
     def finish(self) -> Mesh:
-        """Give all that was added, as one mesh."""
-        if self._boxes:
-            self._parts.append(_boxes(self._boxes))
-            self._boxes = []
+        """Give all that was added, as one mesh; boxes one by one would cost more than all else."""
+        if not self._boxes:
+            return join(self._parts)
+        centres, sizes, turns, tapers, surfaces, things = zip(*self._boxes, strict=True)
+        centre, size, R, taper = (np.array(v, np.float32) for v in (centres, sizes, turns, tapers))
+        vertices = _CUBE * (size / 2)[:, None]
+        vertices[:, _CUBE[:, 1] < 0] *= np.stack([taper, 0 * taper + 1, taper], 1)[:, None]
+        vertices = np.einsum("kij,kvj->kvi", R, vertices) + centre[:, None]
+        uv = np.zeros((len(surfaces), 6, 4, 2), np.float32)
+        tile = np.array([surface.tile_m for surface in surfaces], np.float32)[:, None]
+        uv[:, :, 1:3, 0] = (size[:, _FACE_WIDTH] / tile)[:, :, None]
+        uv[:, :, 2:, 1] = (size[:, _FACE_HEIGHT] / tile)[:, :, None]
+        row = np.tile(np.repeat(np.arange(len(surfaces)), 6), 2)  # six faces, in both halves
+        boxes = _mesh(
+            _halves(vertices[:, _FACES].reshape(-1, 4, 3)),
+            _halves(uv.reshape(-1, 4, 2)),
+            None,
+            np.array([surface.tint for surface in surfaces])[row],
+            np.array([NUMBER[surface.material] for surface in surfaces])[row],
+            np.array([surface.layer for surface in surfaces])[row],
+            np.array(things)[row],
+        )
+        self._parts, self._boxes = [*self._parts, boxes], []
         return join(self._parts)
 
 
-def plane_normals(corners: Float32[np.ndarray, "n 3 3"]) -> Float32[np.ndarray, "n 3"]:
-    """Give the unit normals of triangles; 0 for those without area."""
-    (ax, ay, az), (bx, by, bz) = (
-        (corners[:, 1] - corners[:, 0]).T,
-        (corners[:, 2] - corners[:, 0]).T,
+def _mesh(
+    corners: Float32[np.ndarray, "n 3 3"],
+    uv: Values,
+    normals: Values | None,
+    tint: Values,
+    material: Values,
+    layer: Values,
+    thing: Values,
+) -> Mesh:
+    """Make triangles of what is broadcast to them; without normals, those of their planes."""
+    n = len(corners)
+    if normals is None:
+        (ax, ay, az), (bx, by, bz) = ((corners[:, k] - corners[:, 0]).T for k in (1, 2))
+        across = np.stack([ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx], 1)
+        normals = (across / (np.sqrt((across**2).sum(1, keepdims=True)) + 1e-12))[:, None]
+    each = lambda number: np.array(np.broadcast_to(number, n), np.int32)  # noqa: E731
+    return Mesh(
+        corners=corners,
+        uv=_full(uv, (n, 3, 2)),
+        normals=_full(normals, (n, 3, 3)),
+        tint=_full(np.clip(tint, 0.005, 0.97), (n, 3)),
+        material=each(material),
+        layer=each(layer),
+        thing=each(thing),
     )
-    normal = np.stack([ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx], 1)
-    return normal / (np.sqrt((normal**2).sum(1, keepdims=True)) + 1e-12)
 
 
 def _full(values: Values, shape: tuple[int, ...]) -> Float32[np.ndarray, "..."]:
@@ -245,35 +254,3 @@ def _across(direction: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     across = np.cross(aside, direction)
     across /= np.linalg.norm(across)
     return across, np.cross(direction, across)
-
-
-_CUBE = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], np.float32)
-_FACES = [[0, 1, 3, 2], [5, 4, 6, 7], [4, 5, 1, 0], [2, 3, 7, 6], [4, 0, 2, 6], [1, 5, 7, 3]]
-_FACE_WIDTH = [2, 2, 2, 2, 0, 0]
-_FACE_HEIGHT = [1, 1, 0, 0, 1, 1]
-
-
-def _boxes(boxes: list[tuple]) -> Mesh:
-    """Make all boxes in one go: one by one they would cost more than all else."""
-    centre, size, R, taper = (np.array([b[i] for b in boxes], np.float32) for i in range(4))
-    surfaces: list[Surface] = [box[4] for box in boxes]
-    vertices = _CUBE * (size / 2)[:, None]
-    vertices[:, _CUBE[:, 1] < 0] *= np.stack([taper, 0 * taper + 1, taper], 1)[:, None]
-    vertices = np.einsum("kij,kvj->kvi", R, vertices) + centre[:, None]
-    faces = vertices[:, _FACES].reshape(-1, 4, 3)
-    uv = np.zeros((len(boxes), 6, 4, 2), np.float32)
-    tile = np.array([surface.tile_m for surface in surfaces], np.float32)[:, None]
-    uv[:, :, 1:3, 0] = (size[:, _FACE_WIDTH] / tile)[:, :, None]
-    uv[:, :, 2:, 1] = (size[:, _FACE_HEIGHT] / tile)[:, :, None]
-    corners = _halves(faces)
-    each = lambda values, kind: np.tile(np.repeat(np.array(values, kind), 6, 0), (2,))  # noqa: E731
-    tint = np.array([np.clip(surface.tint, 0.005, 0.97) for surface in surfaces], np.float32)
-    return Mesh(
-        corners=corners,
-        uv=_halves(uv.reshape(-1, 4, 2)),
-        normals=np.repeat(plane_normals(corners)[:, None], 3, 1),
-        tint=np.tile(np.repeat(tint, 6, 0), (2, 1)),
-        material=each([NUMBER[surface.material] for surface in surfaces], np.int32),
-        layer=each([surface.layer for surface in surfaces], np.int32),
-        thing=each([box[5] for box in boxes], np.int32),
-    )

@@ -18,8 +18,6 @@ from depthpose.depth.synthetic.models import (
     FENCE_M,
     HEDGES,
     TREES,
-    WOOD,
-    add_wires,
     add_wood_edge,
     bush,
     fence,
@@ -49,46 +47,27 @@ _WIDE_M = 400.0
 
 @dataclass(frozen=True, kw_only=True)
 class SideStreet:
-    """A street that joins.
+    """A street that joins."""
 
-    Attributes:
-        s_m: where, along the road.
-        half_m: half its width.
-        sides: 1 right, -1 left.
-    """
-
-    s_m: Number
-    half_m: float
-    sides: tuple[int, ...]
+    s_m: Number  # where, along the road
+    half_m: float  # half its width
+    sides: tuple[int, ...]  # 1 right, -1 left
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Road:
-    """The plan of a road.
+    """The plan of a road."""
 
-    Attributes:
-        place: what kind of place it runs through.
-        left_m: x of its left edge.
-        right_m: x of its right edge.
-        lanes: how many there are.
-        parking_m: width of the strip for parked cars, on the left and on the right.
-        walk_m: width of the pavement; 0: none.
-        curb_m: how much higher the pavement is.
-        verge_m: width of the grass between road and pavement.
-        side_streets: streets that join.
-        centre: table of the centre line: s, x, y, z [m] and heading [rad].
-    """
-
-    place: Place
-    left_m: Number
+    place: Place  # what kind of place it runs through
+    left_m: Number  # x of its left edge
     right_m: float
-    lanes: int
-    parking_m: tuple[Number, Number]
-    walk_m: Number
-    curb_m: float
-    verge_m: Number
+    lanes: int  # how many there are
+    parking_m: tuple[Number, Number]  # width of the strip for parked cars, on the left and right
+    walk_m: Number  # width of the pavement; 0: none
+    curb_m: float  # how much higher the pavement is
+    verge_m: Number  # width of the grass between road and pavement
     side_streets: tuple[SideStreet, ...]
-    centre: Float64[np.ndarray, "n 5"]
+    centre: Float64[np.ndarray, "n 5"]  # of the road: s, x, y, z [m] and heading [rad]
 
     @property
     def lane_m(self) -> float:
@@ -98,10 +77,6 @@ class Road:
     def edge_m(self, side: int) -> float:
         """Give x of the edge on one side."""
         return self.right_m if side > 0 else self.left_m
-
-    def plot_m(self, side: int) -> float:
-        """Give x where the ground behind pavement and verge begins."""
-        return self.edge_m(side) + side * (self.verge_m + self.walk_m)
 
     def is_side_street(self, s_m: Number, side: int, margin_m: Number = 0.0) -> bool:
         """Whether a side street joins here."""
@@ -126,36 +101,33 @@ def draw_road(rng: np.random.Generator) -> Road:
     if lanes == 2 and rng.random() < 0.12:  # a narrow street without lanes, driven in the middle
         right_m = width_m / 2 + rng.normal(0, 0.4)
     has_walk = place in ("city", "suburb") or (place == "avenue" and rng.random() < 0.7)
-    return Road(
-        place=place,
-        left_m=float(right_m - width_m),
-        right_m=float(right_m),
-        lanes=lanes,
-        parking_m=(float(parking[0]), float(parking[1])),
-        walk_m=rng.uniform(1.4, 4.0) if has_walk else 0.0,
-        curb_m=rng.uniform(0.06, 0.15) if has_walk else 0.0,
-        verge_m=rng.uniform(1, 5) if place == "avenue" else 0.0,
-        side_streets=_draw_side_streets(rng, place),
-        centre=_draw_centre(rng, place),
-    )
-
-
-def _draw_side_streets(rng: np.random.Generator, place: Place) -> tuple[SideStreet, ...]:
+    walk_m, curb_m = (rng.uniform(1.4, 4.0), rng.uniform(0.06, 0.15)) if has_walk else (0.0, 0.0)
+    verge_m = rng.uniform(1, 5) if place == "avenue" else 0.0
     often = {"city": 0.7, "suburb": 0.65, "avenue": 0.6}.get(place, 0.2)
     streets, s = [], rng.uniform(4, 40)
     while rng.random() < often and s < 110:
         sides = ((1,), (-1,), (-1, 1))[rng.choice(3, p=[0.3, 0.3, 0.4])]
         streets.append(SideStreet(s_m=s, half_m=rng.uniform(2.8, 6), sides=sides))
         s += rng.uniform(25, 60)
-    return tuple(streets)
+    return Road(
+        place=place,
+        left_m=float(right_m - width_m),
+        right_m=float(right_m),
+        lanes=lanes,
+        parking_m=(float(parking[0]), float(parking[1])),
+        walk_m=walk_m,
+        curb_m=curb_m,
+        verge_m=verge_m,
+        side_streets=tuple(streets),
+        centre=_draw_centre(rng, place),
+    )
 
 
 def _draw_centre(rng: np.random.Generator, place: Place) -> Float64[np.ndarray, "n 5"]:
     """Integrate curvature and slope; at the car the road is level and leads ahead."""
     s = np.arange(-BEHIND_M - 2, AHEAD_M + 2, 1.0)
-    curvature = np.zeros_like(s)
-    is_bent = rng.random() < {"city": 0.35, "avenue": 0.45}.get(place, 0.65)
-    if is_bent:
+    curvature, slope = np.zeros_like(s), np.zeros_like(s)
+    if rng.random() < {"city": 0.35, "avenue": 0.45}.get(place, 0.65):
         start = rng.uniform(-5, 45)
         for _ in range(3):
             radius = rng.uniform(45, 400) * rng.choice([-1, 1])
@@ -163,7 +135,6 @@ def _draw_centre(rng: np.random.Generator, place: Place) -> Float64[np.ndarray, 
             ramp = np.clip((s - start) / 12, 0, 1) * np.clip((start + length - s) / 12, 0, 1)
             curvature += ramp / radius
             start += length + rng.uniform(0, 60)
-    slope = np.zeros_like(s)
     if rng.random() < 0.55:
         for _ in range(3):
             where, width = rng.uniform(10, 160), rng.uniform(15, 50)
@@ -171,9 +142,9 @@ def _draw_centre(rng: np.random.Generator, place: Place) -> Float64[np.ndarray, 
         slope -= np.interp(0.0, s, slope)
     heading = np.cumsum(curvature)
     heading -= np.interp(0.0, s, heading)
-    x, z, y = np.cumsum(np.sin(heading)), np.cumsum(np.cos(heading)), -np.cumsum(slope)
-    at_car = [np.interp(0.0, s, values) for values in (x, y, z)]
-    return np.stack([s, x - at_car[0], y - at_car[1], z - at_car[2], heading], 1)
+    line = np.cumsum(np.sin(heading)), -np.cumsum(slope), np.cumsum(np.cos(heading))
+    x, y, z = (values - np.interp(0.0, s, values) for values in line)
+    return np.stack([s, x, y, z, heading], 1)
 
 
 def bend(mesh: Mesh, road: Road) -> Mesh:
@@ -192,46 +163,43 @@ def bend(mesh: Mesh, road: Road) -> Mesh:
     across = points[:, 0] / (1 + inward**4) ** 0.25
     cos, sin = np.cos(heading), np.sin(heading)
     bent = np.stack([x + across * cos, y + points[:, 1], z - across * sin], 1)
-    normals = mesh.normals.reshape(-1, 3)
-    turned = np.stack(
-        [normals[:, 0] * cos + normals[:, 2] * sin, normals[:, 1],
-         normals[:, 2] * cos - normals[:, 0] * sin], 1)  # fmt: skip
-    shape = mesh.corners.shape
-    return replace(
-        mesh,
-        corners=bent.reshape(shape).astype(np.float32),
-        normals=turned.reshape(shape).astype(np.float32),
-    )
+    nx, ny, nz = mesh.normals.reshape(-1, 3).T
+    turned = np.stack([nx * cos + nz * sin, ny, nz * cos - nx * sin], 1)
+    corners, normals = (v.reshape(-1, 3, 3).astype(np.float32) for v in (bent, turned))
+    return replace(mesh, corners=corners, normals=normals)
 
 
-def add_ground(builder: MeshBuilder, rng: np.random.Generator, road: Road) -> None:
-    """Add the carriageway, pavements, verges and the land beside."""
+def add_ground(b: MeshBuilder, road: Road) -> None:
+    """Add the carriageway, pavements, verges and the land beside, side streets between them."""
+    rng = b.rng
     light = rng.uniform(0.7, 1.45)
     color = (0.105 * light, 0.105 * light, 0.107 * light)
     asphalt = Surface("road", color, 3.0, int(rng.integers(4)))
     variants = [int(v) for v in rng.integers(0, 6, 4)]
     grey, green = rng.uniform(0.6, 1.2), rng.uniform(0.75, 1.4)
     warm = 1 + 0.2 * rng.normal()
-    walk = Surface(
-        "pavement", (0.2 * grey, 0.19 * grey, 0.18 * grey), rng.uniform(1.6, 3.2), variants[1]
-    )
+    color = (0.2 * grey, 0.19 * grey, 0.18 * grey)
+    walk = Surface("pavement", color, rng.uniform(1.6, 3.2), variants[1])
     grass = Surface("grass", (0.075 * green * warm, 0.088 * green, 0.02 * green), 3.0, variants[2])
-    builder.begin_thing()
-    _strip(builder, (road.left_m, road.right_m), (0.0, 0.0), asphalt, _stations(road, 0))
+    b.begin_thing()
+    _strip(b, (road.left_m, road.right_m), (0.0, 0.0), asphalt, _stations(road, 0))
     land = walk if road.place == "city" and rng.random() < 0.7 else grass
     for side in (-1, 1):
-        for stations, is_street in _pieces(road, side):
-            builder.begin_thing()
-            if is_street:
-                far = road.edge_m(side) + side * _WIDE_M
-                _strip(builder, (road.edge_m(side), far), (0.0, 0.0), asphalt, stations)
+        stations = _stations(road, side)
+        middle = (stations[1:] + stations[:-1]) / 2
+        is_street = np.array([road.is_side_street(float(s), side) for s in middle])
+        starts = [0, *(np.flatnonzero(is_street[1:] != is_street[:-1]) + 1), len(is_street)]
+        for first, last in pairwise(starts):
+            b.begin_thing()
+            piece, edge = stations[first : last + 1], road.edge_m(side)
+            if is_street[first]:
+                _strip(b, (edge, edge + side * _WIDE_M), (0.0, 0.0), asphalt, piece)
             else:
-                _side_strips(builder, rng, road, side, walk, grass, land, stations)
+                _add_side(b, road, side, walk, grass, land, piece)
 
 
-def _side_strips(
-    builder: MeshBuilder,
-    rng: np.random.Generator,
+def _add_side(
+    b: MeshBuilder,
     road: Road,
     side: int,
     walk: Surface,
@@ -239,12 +207,13 @@ def _side_strips(
     land: Surface,
     stations: Float64[np.ndarray, " n"],
 ) -> None:
-    """From the road's edge outwards: kerb, verge, pavement, land."""
-    x, high = road.edge_m(side), -road.curb_m
-    curb = Surface("curb", (0.3, 0.29, 0.28), 1.0)
-    strip = lambda width, heights, surface: _strip(  # noqa: E731
-        builder, (x, x + side * width), heights, surface, stations
-    )
+    """From the road's edge outwards: kerb, verge, pavement, land; banks at both ends."""
+    rng, high, curb = b.rng, -road.curb_m, Surface("curb", (0.3, 0.29, 0.28), 1.0)
+    x = edge = road.edge_m(side)
+
+    def strip(width: Number, heights: tuple[Number, Number], surface: Surface) -> None:
+        _strip(b, (x, x + side * width), heights, surface, stations)
+
     if road.curb_m:
         strip(0.0, (0.0, high), curb)
         strip(0.15, (high, high), curb)
@@ -252,33 +221,24 @@ def _side_strips(
     else:
         strip(rng.uniform(0.3, 1.2), (0.0, 0.02), Surface("dirt", (0.2, 0.165, 0.12), 2.0))
         x += side * 0.3
-    if road.verge_m:
-        strip(road.verge_m, (high, high), grass)
-        x += side * road.verge_m
-    if road.walk_m:
-        strip(road.walk_m, (high, high), walk)
-        x += side * road.walk_m
-    rise = rng.normal(0, 0.8) if road.place in ("rural", "forest") else rng.normal(0, 0.1)
+    for width, surface in ((road.verge_m, grass), (road.walk_m, walk)):
+        if width:
+            strip(width, (high, high), surface)
+            x += side * width
+    rise = rng.normal(0, 0.8 if road.place in ("rural", "forest") else 0.1)
     strip(8.0, (high, high - 0.3 * rise), land)
     x += side * 8
     strip(_WIDE_M, (high - 0.3 * rise, high - 3 * rise), land)
-    edge = road.edge_m(side)
     profile = [(edge, high), (x - side * 8, high), (x, high - 0.3 * rise),
                (x + side * _WIDE_M, high - 3 * rise)]  # fmt: skip
     for s in (stations[0], stations[-1]):
-        _add_bank(builder, profile, float(s), curb if road.curb_m else land)
-
-
-def _add_bank(
-    builder: MeshBuilder, profile: list[tuple[Number, Number]], s: Number, surface: Surface
-) -> None:
-    """Close the step between the land and a side street at y = 0, which one would see through."""
-    faces = [
-        [(x, y, s), (other_x, other_y, s), (other_x, 0.0, s), (x, 0.0, s)]
-        for (x, y), (other_x, other_y) in pairwise(profile)
-    ]
-    corners = np.array(faces, np.float32)
-    builder.quads(corners, corners[..., :2], surface)
+        # Between the land and a side street at y = 0 there is a step, which one would see through.
+        faces = [
+            [(x0, y0, s), (x1, y1, s), (x1, 0.0, s), (x0, 0.0, s)]
+            for (x0, y0), (x1, y1) in pairwise(profile)
+        ]
+        corners = np.array(faces, np.float32)
+        b.quads(corners, corners[..., :2], curb if road.curb_m else land)
 
 
 def _stations(road: Road, side: int) -> Float64[np.ndarray, " n"]:
@@ -292,92 +252,79 @@ def _stations(road: Road, side: int) -> Float64[np.ndarray, " n"]:
     return np.unique(np.concatenate([*even, cuts]))
 
 
-def _pieces(road: Road, side: int) -> list[tuple[Float64[np.ndarray, " n"], bool]]:
-    """Stretches of one side between and across its side streets; whether each is a street."""
-    stations = _stations(road, side)
-    middle = (stations[1:] + stations[:-1]) / 2
-    is_street = np.array([road.is_side_street(float(s), side) for s in middle])
-    starts = [0, *(np.flatnonzero(is_street[1:] != is_street[:-1]) + 1), len(is_street)]
-    return [(stations[a : b + 1], bool(is_street[a])) for a, b in pairwise(starts)]
-
-
 def _strip(
-    builder: MeshBuilder,
+    b: MeshBuilder,
     x_m: tuple[Number, Number],
     y_m: tuple[Number, Number],
     surface: Surface,
     stations: Float[np.ndarray, " n"],
 ) -> None:
     """Add a band along the road; its texture lies in road coordinates (x, s)."""
-    start, stop = stations[:-1], stations[1:]
-    is_wall = x_m[0] == x_m[1]
-    u = (y_m[0], y_m[1]) if is_wall else x_m
-    corner = lambda i, s: np.stack([0 * s + x_m[i], 0 * s + y_m[i], s], 1)  # noqa: E731
-    place = lambda i, s: np.stack([0 * s + u[i], s], 1)  # noqa: E731
-    turns = ((0, start), (1, start), (1, stop), (0, stop))
-    faces = np.stack([corner(i, s) for i, s in turns], 1)
-    builder.quads(faces, np.stack([place(i, s) for i, s in turns], 1), surface)
+    u_m = y_m if x_m[0] == x_m[1] else x_m  # a wall's texture goes up
+    turns = ((0, stations[:-1]), (1, stations[:-1]), (1, stations[1:]), (0, stations[1:]))
+    faces = [np.stack([0 * s + x_m[i], 0 * s + y_m[i], s], 1) for i, s in turns]
+    places = [np.stack([0 * s + u_m[i], s], 1) for i, s in turns]
+    b.quads(np.stack(faces, 1), np.stack(places, 1), surface)
 
 
 _FAR_M = 130.0
 _DETAIL_M = 45.0
 """Beyond this, what is finer than a pixel is left out."""
+_WOOD = Surface("wood", (0.16, 0.12, 0.09))
+_DARK = Surface("metal", (0.03, 0.035, 0.035))
 
 
-def add_roadside(builder: MeshBuilder, rng: np.random.Generator, road: Road) -> None:
+def add_roadside(b: MeshBuilder, road: Road) -> None:
     """Fill both sides of the road, and close the view at its end."""
-    for side in (-1, 1):
-        beside = Roadside(builder=builder, rng=rng, road=road, side=side)
-        if road.place == "city":
-            beside.add_houses()
-        elif road.place == "suburb":
-            beside.add_gardens()
-        elif road.place == "avenue":
-            beside.add_avenue()
-        else:
-            beside.add_country()
+    rng, sides = b.rng, {side: _Roadside(b, road, side) for side in (-1, 1)}
+    for beside in sides.values():
+        beside.add_plots()
         beside.add_kerb()
         beside.add_woods()
     if rng.random() < 0.85:  # trees across the end of the road's straight part
         for _ in range(int(rng.integers(30, 90))):
-            beside = Roadside(builder=builder, rng=rng, road=road, side=int(rng.choice([-1, 1])))
+            beside = sides[int(rng.choice([-1, 1]))]
             x = beside.x_m(rng.uniform(2, 90))
             beside.add_tree(x, rng.uniform(90, 230), rng.uniform(7, 16))
     if rng.random() < 0.6:
         s, half = rng.uniform(170, 300), rng.uniform(60, 160)
-        line = (-half, s, half, s + rng.uniform(-40, 40))
-        add_wood_edge(builder, rng, line, rng.uniform(7, 14))
+        stop = (half, s + rng.uniform(-40, 40))
+        add_wood_edge(b, (-half, s), stop, rng.uniform(7, 14))
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class Roadside:
-    """One side of a road, to be filled: every method adds to the mesh of the builder.
+class _Roadside:
+    """One side of a road, 1 right, -1 left: every method adds to the mesh of the builder."""
 
-    Attributes:
-        builder: what is added to.
-        rng: random numbers.
-        road: its plan.
-        side: 1 right, -1 left.
-    """
-
-    builder: MeshBuilder
-    rng: np.random.Generator
-    road: Road
-    side: int
+    def __init__(self, b: MeshBuilder, road: Road, side: int) -> None:
+        self.b, self.rng, self.road, self.side = b, b.rng, road, side
+        self.edge_m = road.edge_m(side)
 
     def x_m(self, beyond_m: Number) -> Number:
-        """Give x so far beyond the beginning of the plots."""
-        return self.road.plot_m(self.side) + self.side * beyond_m
+        """Give x so far beyond the beginning of the plots, behind pavement and verge."""
+        plot_m = self.edge_m + self.side * (self.road.verge_m + self.road.walk_m)
+        return plot_m + self.side * beyond_m
 
     def is_free(self, s: Number, length: float) -> bool:
         """Whether no side street lies in a stretch."""
         return not self.road.is_side_street(s + length / 2, self.side, length / 2 + 1)
 
+    def add_plots(self) -> None:
+        """What a place has behind the pavement."""
+        match self.road.place:
+            case "city":
+                self.add_houses()
+            case "suburb":
+                self.add_gardens()
+            case "avenue":
+                self.add_avenue()
+            case _:
+                self.add_country()
+
     def add_houses(self) -> None:
         """Houses at the pavement, wall to wall."""
-        rng, road, side = self.rng, self.road, self.side
-        if road.walk_m > 2 and rng.random() < 0.55:
-            self.add_tree_row(road.edge_m(side) + side * 0.9)
+        rng = self.rng
+        if self.road.walk_m > 2 and rng.random() < 0.55:
+            self.add_tree_row(self.edge_m + self.side * 0.9)
         s, set_back = rng.uniform(-12, -4), rng.uniform(0, 3) * (rng.random() < 0.4)
         tall = rng.uniform(6, 17)
         while s < _FAR_M:
@@ -413,12 +360,12 @@ class Roadside:
 
     def add_avenue(self) -> None:
         """A wide road: rows of trees, hedges or rails, and set-back houses or nothing behind."""
-        rng, road, side = self.rng, self.road, self.side
+        rng = self.rng
         has_row, has_border, has_houses = rng.random(3) < (0.7, 0.5, 0.35)
         rail = int(rng.integers(4))
         if has_row:
-            reach = rng.uniform(1.2, max(1.5, road.verge_m))
-            self.add_tree_row(road.edge_m(side) + side * reach)
+            beyond = rng.uniform(1.2, max(1.5, self.road.verge_m))
+            self.add_tree_row(self.edge_m + self.side * beyond)
         if has_border:
             self.add_border(-8, 100, rail)
         s = rng.uniform(-10, 5)
@@ -429,15 +376,6 @@ class Roadside:
             else:
                 self.add_copse(s, length, rng.uniform(4, 14))
             s += length + rng.uniform(0, 10)
-
-    def add_tree_row(self, x: Number) -> None:
-        """Trees along the road, at even distances."""
-        rng = self.rng
-        step, height = rng.uniform(6, 14), rng.uniform(5, 13)
-        for s in np.arange(rng.uniform(-8, 6), _FAR_M, step):
-            if not self.road.is_side_street(s, self.side, 2) and rng.random() < 0.85:
-                place_m = (x + rng.normal(0, 0.3), s + rng.normal(0, 0.8))
-                self.add_tree(*place_m, height * rng.uniform(0.8, 1.2))
 
     def add_country(self) -> None:
         """Open fields with some trees, or a forest's edge."""
@@ -464,17 +402,13 @@ class Roadside:
 
     def add_woods(self) -> None:
         """The front of a wood: right behind a forest's first trees, far behind elsewhere."""
-        rng = self.rng
-        is_forest = self.road.place == "forest"
-        chance = {"forest": 0.9, "city": 0.1, "suburb": 0.35}.get(self.road.place, 0.55)
-        if rng.random() > chance:
+        rng, is_forest = self.rng, self.road.place == "forest"
+        if rng.random() > {"forest": 0.9, "city": 0.1, "suburb": 0.35}.get(self.road.place, 0.55):
             return
         near, height = (rng.uniform(8, 13), 13.0) if is_forest else (rng.uniform(14, 55), 9.0)
-        start = rng.uniform(-10, 0) if is_forest else rng.uniform(-10, 60)
-        x = self.x_m(near)
-        stop, other = start + rng.uniform(60, 200), x + self.side * rng.uniform(-2, 15)
-        height *= rng.uniform(0.7, 1.3)
-        add_wood_edge(self.builder, rng, (x, start, other, stop), height)
+        s, x = rng.uniform(-10, 0 if is_forest else 60), self.x_m(near)
+        stop, other = s + rng.uniform(60, 200), x + self.side * rng.uniform(-2, 15)
+        add_wood_edge(self.b, (x, s), (other, stop), height * rng.uniform(0.7, 1.3))
 
     def add_copse(self, s: Number, length: Number, depth: Number) -> None:
         """Some trees and bushes."""
@@ -492,12 +426,12 @@ class Roadside:
     def add_kerb(self) -> None:
         """Lamps in a row; signs, lights, posts and boxes here and there; poles with wires."""
         rng, road, side = self.rng, self.road, self.side
-        x, y = road.edge_m(side) + side * (0.5 if road.walk_m else 1.3), -road.curb_m
+        x, y = self.edge_m + side * (0.5 if road.walk_m else 1.3), -road.curb_m
         if rng.random() <= {"forest": 0.1, "rural": 0.3}.get(road.place, 0.7):
             number, step = int(rng.integers(6)), rng.uniform(16, 34)
             for s in np.arange(rng.uniform(2, 25), 110, step):
                 if not road.is_side_street(s, side):
-                    self.builder.add(place(lamp(number), (x, y, s), 0.0 if side < 0 else np.pi))
+                    self.b.add(place(lamp(number), (x, y, s), 0.0 if side < 0 else np.pi))
         s = rng.uniform(3, 12)
         is_town = road.place not in ("rural", "forest")
         while s < 70:
@@ -508,7 +442,7 @@ class Roadside:
             if side in street.sides and rng.random() < 0.4:
                 light = traffic_light(int(rng.integers(4)))
                 where = (x, y, street.s_m - street.half_m - 1)
-                self.builder.add(place(light, where, 0, (-side, 1, 1)))
+                self.b.add(place(light, where, 0, (-side, 1, 1)))
         if rng.random() < 0.25:
             self.add_wires(x + side * rng.uniform(0.5, 3))
 
@@ -519,39 +453,44 @@ class Roadside:
         if kind < 0.4:
             model = sign(int(rng.integers(20)))
             yaw = rng.normal(0, 0.12) + np.pi * (rng.random() < 0.2)
-            self.builder.add(place(model, where, yaw))
+            self.b.add(place(model, where, yaw))
         elif kind < 0.8 or not is_town:
             number = int(rng.choice([0, 1, 2, 3, 4, 5])) if is_town else 3
-            self.builder.add(place(small_thing(number), where, rng.normal(0, 0.1)))
+            self.b.add(place(small_thing(number), where, rng.normal(0, 0.1)))
         else:
             self.add_tree(x + self.side * 0.4, s, rng.uniform(3.5, 7))
 
     def add_wires(self, x: Number) -> None:
-        """Wooden poles with cables between them."""
-        rng, builder = self.rng, self.builder
+        """Wooden poles with cables between them, which hang."""
+        b, rng = self.b, self.rng
         height, step = rng.uniform(6, 8), rng.uniform(22, 38)
         places = np.arange(rng.uniform(-15, 10), 120, step)
-        builder.begin_thing()
+        b.begin_thing()
         for s in places:
-            builder.tube((x, 0.2, s), (x, -height, s), (0.12, 0.09), WOOD, 8)
-            builder.box((x, -height + 0.3, s), (1.4, 0.1, 0.1), WOOD)
-        for start, stop in pairwise(places):
+            b.tube((x, 0.2, s), (x, -height, s), (0.12, 0.09), _WOOD, 8)
+            b.box((x, -height + 0.3, s), (1.4, 0.1, 0.1), _WOOD)
+        share = np.linspace(0, 1, 7)[:, None]
+        for ends in pairwise(places):
             for shift in (-0.6, 0.6):
-                ends = [np.array([x + shift, -height + 0.22, s]) for s in (start, stop)]
-                add_wires(builder, *ends)
+                start, stop = (np.array([x + shift, -height + 0.22, s]) for s in ends)
+                points = start * (1 - share) + stop * share
+                sag = (4 * share * (1 - share))[:, 0] * 0.02
+                points[:, 1] += sag * np.linalg.norm(stop - start)
+                for one, other in pairwise(points):
+                    b.tube(one, other, 0.018, _DARK, 3)
 
     def add_house(self, s: Number, length: Number, back: Number, height: float) -> None:
         """A house so far behind the pavement."""
         plot = Plot(
             x_m=self.x_m(back + 0.15),
-            z_m=(s, s + length),
+            start_m=s,
+            stop_m=s + length,
             side=self.side,
             depth_m=self.rng.uniform(7, 12),
             height_m=height,
             ground_m=-self.road.curb_m + 0.2,
         )
-        style = draw_style(self.rng, with_details=s < _DETAIL_M)
-        add_house(self.builder, self.rng, plot, style)
+        add_house(self.b, plot, draw_style(self.rng, with_details=s < _DETAIL_M))
 
     def add_border(self, start: Number, stop: Number, kind: int) -> None:
         """A line of hedge or fence pieces at the back of the pavement; kind 0 is none."""
@@ -566,25 +505,33 @@ class Roadside:
             where = (self.x_m(0.45), -self.road.curb_m, s)
             if kind == 1:
                 model = hedge(int(rng.integers(HEDGES)))
-                self.builder.add(place(model, where, 0, (1, height, 1), {"leaf": color}))
+                self.b.add(place(model, where, 0, (1, height, 1), {"leaf": color}))
             else:
-                self.builder.add(place(fence(number), where))
+                self.b.add(place(fence(number), where))
+
+    def add_tree_row(self, x: Number) -> None:
+        """Trees along the road, at even distances."""
+        rng = self.rng
+        step, height = rng.uniform(6, 14), rng.uniform(5, 13)
+        for s in np.arange(rng.uniform(-8, 6), _FAR_M, step):
+            if not self.road.is_side_street(s, self.side, 2) and rng.random() < 0.85:
+                place_m = (x + rng.normal(0, 0.3), s + rng.normal(0, 0.8))
+                self.add_tree(*place_m, height * rng.uniform(0.8, 1.2))
 
     def add_tree(self, x: Number, s: Number, height: Number | None) -> None:
         """A tree of some kind, coarser where it is far away."""
-        rng = self.rng
-        tall = rng.uniform(5, 12) if height is None else height
-        number = int(rng.integers(TREES))
-        wide = tall * rng.uniform(0.85, 1.15)
+        tall = self.rng.uniform(5, 12) if height is None else height
+        number = int(self.rng.integers(TREES))
+        wide = tall * self.rng.uniform(0.85, 1.15)
         model = tree(number, int(s > 24) + int(s > 48 or abs(x) > 25))
-        scale = np.array([wide, tall, wide]) / 10
-        tints = {"leaf": leaf_color(rng)}
-        self.builder.add(place(model, (x, 0, s), rng.uniform(0, 6.28), scale, tints))
+        self.add_plant(model, x, s, np.array([wide, tall, wide]) / 10)
 
     def add_bush(self, x: Number, s: Number, size: Number) -> None:
         """A bush of some kind, coarser where it is far away."""
-        rng = self.rng
-        model = bush(int(rng.integers(BUSHES)), int(s > 20))
-        scale = size * rng.uniform(0.7, 1.3, 3)
-        tints = {"leaf": leaf_color(rng)}
-        self.builder.add(place(model, (x, 0, s), rng.uniform(0, 6.28), scale, tints))
+        model = bush(int(self.rng.integers(BUSHES)), int(s > 20))
+        self.add_plant(model, x, s, size * self.rng.uniform(0.7, 1.3, 3))
+
+    def add_plant(self, model: Mesh, x: Number, s: Number, scale: np.ndarray) -> None:
+        """A model turned at random, with leaves of some colour."""
+        tints = {"leaf": leaf_color(self.rng)}
+        self.b.add(place(model, (x, 0, s), self.rng.uniform(0, 6.28), scale, tints))

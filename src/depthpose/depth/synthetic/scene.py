@@ -19,7 +19,7 @@ from depthpose.depth.config import StreetsConfig
 from depthpose.depth.synthetic.mesh import Mesh, MeshBuilder, Rotation, between, join
 from depthpose.depth.synthetic.models import add_ball, add_leaves
 from depthpose.depth.synthetic.road import Place, Road, add_ground, add_roadside, bend, draw_road
-from depthpose.depth.synthetic.textures import Color, Surface, Values
+from depthpose.depth.synthetic.textures import Surface, Values
 from depthpose.depth.synthetic.traffic import add_traffic
 
 Vector = Float64[np.ndarray, "3"]
@@ -27,27 +27,16 @@ Vector = Float64[np.ndarray, "3"]
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Weather:
-    """What lights a scene.
+    """What lights a scene."""
 
-    Attributes:
-        sun: unit vector towards the sun, in the world's frame (y down).
-        sun_color: linear light of the sun; small where clouds cover it.
-        zenith: light of the sky overhead.
-        horizon: light of the sky low down.
-        is_overcast: no shadows are cast.
-        cloud: 0 a clear sky, 1 covered.
-        haze_m: distance at which two thirds of the light are the haze's.
-        shift: where clouds and unevenness lie in their textures.
-    """
-
-    sun: Vector
-    sun_color: Vector
-    zenith: Vector
-    horizon: Vector
-    is_overcast: bool
-    cloud: float
-    haze_m: float
-    shift: tuple[float, float]
+    sun: Vector  # unit vector towards the sun, in the world's frame (y down)
+    sun_color: Vector  # linear light of the sun; small where clouds cover it
+    zenith: Vector  # light of the sky overhead
+    horizon: Vector  # light of the sky low down
+    is_overcast: bool  # no shadows are cast
+    cloud: float  # 0 a clear sky, 1 covered
+    haze_m: float  # distance at which two thirds of the light are the haze's
+    shift: tuple[float, float]  # where clouds and unevenness lie in their textures
 
 
 def draw_weather(rng: np.random.Generator) -> Weather:
@@ -76,25 +65,18 @@ def draw_weather(rng: np.random.Generator) -> Weather:
     )
 
 
-_HILLS_M = 900.0
-
-
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Markings:
     """Paint on the road, in its own coordinates (x across, s along) [m].
 
-    Attributes:
-        lines: along the road, a row each: x, half width, period and length of the dashes (equal
-            where the line is whole).
-        bars: across it, a row each: s, half length, first and last x, and 1 where it is striped.
-        brightness: of the paint.
-        wheel_tracks: x of the left lane's left edge, and the width of the lanes.
+    Lines along it have a row each: x, half width, period and length of the dashes (equal where the
+    line is whole); bars across it: s, half length, first and last x, and 1 where it is striped.
     """
 
     lines: Float64[np.ndarray, "n 4"]
     bars: Float64[np.ndarray, "m 5"]
-    brightness: float
-    wheel_tracks: tuple[float, float]
+    brightness: float  # of the paint
+    wheel_tracks: tuple[float, float]  # x of the left lane's left edge, width of the lanes
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -125,16 +107,23 @@ def make_scene(seed: tuple[int, ...], mount_height_m: float = 1.65) -> StreetSce
     """
     rng = np.random.default_rng([71, *seed])
     road = draw_road(rng)
-    builder = MeshBuilder()
-    add_ground(builder, rng, road)
-    add_roadside(builder, rng, road)
-    add_traffic(builder, rng, road)
+    builder, far = MeshBuilder(rng), MeshBuilder(rng)
+    add_ground(builder, road)
+    add_roadside(builder, road)
+    add_traffic(builder, road)
     street = bend(builder.finish(), road)
-    far = MeshBuilder()
-    _add_hills(far, rng)
+    _add_hills(far)
     hills = far.finish()
     hills = replace(hills, thing=hills.thing + street.thing.max() + 1)
-    rotation, position = _mount(rng, mount_height_m)
+    # The camera's attitude: near level, now and then turned off the road's direction.
+    pitch, roll = rng.normal(0, 0.012), rng.normal(0, 0.009)
+    yaw = rng.normal(0, 0.03) if rng.random() < 0.8 else rng.normal(0, 0.2)
+    c, s = np.cos([pitch, yaw, roll]), np.sin([pitch, yaw, roll])
+    about_x = np.array([[1, 0, 0], [0, c[0], -s[0]], [0, s[0], c[0]]])
+    about_y = np.array([[c[1], 0, s[1]], [0, 1, 0], [-s[1], 0, c[1]]])
+    about_z = np.array([[c[2], -s[2], 0], [s[2], c[2], 0], [0, 0, 1]])
+    position = np.array([rng.normal(0, 0.05), -mount_height_m + rng.normal(0, 0.04), 0.0])
+    rotation = about_z @ about_x @ about_y
     turn = rotation.T.astype(np.float32)
     mesh = join([street, hills])
     corners = (mesh.corners - position.astype(np.float32)) @ turn
@@ -148,43 +137,26 @@ def make_scene(seed: tuple[int, ...], mount_height_m: float = 1.65) -> StreetSce
     )
 
 
-def _mount(
-    rng: np.random.Generator, height_m: float
-) -> tuple[Float64[np.ndarray, "3 3"], Float64[np.ndarray, "3"]]:
-    """Attitude of the camera: near level, now and then turned off the road's direction."""
-    pitch, roll = rng.normal(0, 0.012), rng.normal(0, 0.009)
-    yaw = rng.normal(0, 0.03) if rng.random() < 0.8 else rng.normal(0, 0.2)
-    c, s = np.cos([pitch, yaw, roll]), np.sin([pitch, yaw, roll])
-    about_x = np.array([[1, 0, 0], [0, c[0], -s[0]], [0, s[0], c[0]]])
-    about_y = np.array([[c[1], 0, s[1]], [0, 1, 0], [-s[1], 0, c[1]]])
-    about_z = np.array([[c[2], -s[2], 0], [s[2], c[2], 0], [0, 0, 1]])
-    position = np.array([rng.normal(0, 0.05), -height_m + rng.normal(0, 0.04), 0.0])
-    return about_z @ about_x @ about_y, position
-
-
-def _add_hills(builder: MeshBuilder, rng: np.random.Generator) -> None:
-    """A ring of far hills or woods."""
-    angle = np.linspace(-1.35, 1.35, 120)
+def _add_hills(b: MeshBuilder) -> None:
+    """A ring of far hills or woods, 900 m away."""
+    rng, angle = b.rng, np.linspace(-1.35, 1.35, 120)
     wave = np.zeros_like(angle)
     for often in (3, 7, 17, 43):
         wave += np.sin(angle * often + rng.uniform(0, 6.28)) / often**0.7
     height = rng.uniform(8, 40) * np.clip(0.55 + 0.45 * wave, 0.1, None)
-    x, z = _HILLS_M * np.sin(angle), _HILLS_M * np.cos(angle)
-    low = np.stack([x, 0 * x + 90, z], 1)
-    high = np.stack([x, -height, z], 1)
-    along = np.arange(len(angle)) * 12.0
-    under, over = np.stack([along, 0 * along - 90], 1), np.stack([along, height], 1)
-    faces, uv = between(low, high), between(under, over)
-    surface = Surface("hills", (0.045, 0.065, 0.03), 150.0, int(rng.integers(2)))
-    builder.quads(faces, uv, surface)
+    x, z, along = 900 * np.sin(angle), 900 * np.cos(angle), np.arange(len(angle)) * 12.0
+    faces = between(np.stack([x, 0 * x + 90, z], 1), np.stack([x, -height, z], 1))
+    uv = between(np.stack([along, 0 * along - 90], 1), np.stack([along, height], 1))
+    b.quads(faces, uv, Surface("hills", (0.045, 0.065, 0.03), 150.0, int(rng.integers(2))))
 
 
 def _draw_markings(rng: np.random.Generator, road: Road) -> Markings:
+    """Lines; stop lines and zebra crossings before side streets, dashes across their mouths."""
     is_marked = road.place in ("avenue", "rural", "forest") or rng.random() < 0.5
     dash, half = rng.uniform(2, 6), rng.uniform(0.05, 0.08)
     period = dash * rng.uniform(2, 3)
     first = road.left_m + road.parking_m[0]
-    lines = []
+    lines, bars = [], []
     for k in range(road.lanes + 1) if is_marked else ():
         is_edge = k in (0, road.lanes)
         is_whole = is_edge or (k == road.lanes // 2 and rng.random() < 0.3)
@@ -193,17 +165,6 @@ def _draw_markings(rng: np.random.Generator, road: Road) -> Markings:
             continue
         x = first + k * road.lane_m + inset
         lines.append((x, half, period, period if is_whole else dash))
-    return Markings(
-        lines=np.array(lines, float).reshape(-1, 4),
-        bars=_draw_bars(rng, road),
-        brightness=rng.uniform(0.4, 0.75),
-        wheel_tracks=(first, road.lane_m),
-    )
-
-
-def _draw_bars(rng: np.random.Generator, road: Road) -> Float64[np.ndarray, "m 5"]:
-    """Stop lines and zebra crossings before side streets, and dashed lines across their mouths."""
-    bars = []
     for street in road.side_streets:
         start = street.s_m - street.half_m
         if rng.random() < 0.4:
@@ -211,7 +172,12 @@ def _draw_bars(rng: np.random.Generator, road: Road) -> Float64[np.ndarray, "m 5
         if rng.random() < 0.4:
             middle = (road.left_m + road.right_m) / 2
             bars.append((start - 6, 0.2, middle, road.right_m, 0.0))
-    return np.array(bars, float).reshape(-1, 5)
+    return Markings(
+        lines=np.array(lines, float).reshape(-1, 4),
+        bars=np.array(bars, float).reshape(-1, 5),
+        brightness=rng.uniform(0.4, 0.75),
+        wheel_tracks=(first, road.lane_m),
+    )
 
 
 KITTI_RIGS = (
@@ -251,11 +217,18 @@ def kitti_rig(number: int = 0) -> StereoRig:
 
 def draw_rig(rng: np.random.Generator, config: StreetsConfig) -> tuple[StereoRig, float]:
     """Draw the rig of a frame, scaled and cropped as asked, and the height of its mount [m]."""
-    is_kitti = config.rigs == "kitti" or rng.random() < 0.5
-    if is_kitti:
+    if config.rigs == "kitti" or rng.random() < 0.5:
         rig, mount_m = kitti_rig(int(rng.choice(len(KITTI_RIGS), p=_KITTI_SHARES))), 1.65
     else:
-        rig, mount_m = _other_rig(rng), rng.uniform(1.1, 2.2)
+        width = int(rng.integers(900, 1600))
+        height = int(width / rng.uniform(1.6, 3.3))
+        fx = width * rng.uniform(0.45, 1.1)
+        fy = fx * (1 + rng.normal(0, 0.004))
+        cx, cy = width * (0.5 + rng.normal(0, 0.015)), height * (0.5 + rng.normal(0, 0.03))
+        K = torch.tensor([[fx, 0, cx], [0, fy, cy], [0, 0, 1]], dtype=torch.float64)
+        baseline_m = _log_uniform(rng, 0.12, 0.8)
+        rig = StereoRig(width=width, height=height, K=K, baseline_m=baseline_m)
+        mount_m = rng.uniform(1.1, 2.2)
     width, height = (max(1, round(side * config.scale)) for side in (rig.width, rig.height))
     rig = resize_camera(rig, width, height)
     if config.crop is None:
@@ -266,15 +239,8 @@ def draw_rig(rng: np.random.Generator, config: StreetsConfig) -> tuple[StereoRig
     return crop_camera(rig, left, top, columns, rows), mount_m
 
 
-def _other_rig(rng: np.random.Generator) -> StereoRig:
-    width = int(rng.integers(900, 1600))
-    height = int(width / rng.uniform(1.6, 3.3))
-    focal_px = width * rng.uniform(0.45, 1.1)
-    ratio = 1 + rng.normal(0, 0.004)
-    cx, cy = width * (0.5 + rng.normal(0, 0.015)), height * (0.5 + rng.normal(0, 0.03))
-    K = torch.tensor([[focal_px, 0, cx], [0, focal_px * ratio, cy], [0, 0, 1]], dtype=torch.float64)
-    baseline_m = float(np.exp(rng.uniform(np.log(0.12), np.log(0.8))))
-    return StereoRig(width=width, height=height, K=K, baseline_m=baseline_m)
+def _log_uniform(rng: np.random.Generator, low: float, high: float) -> float:
+    return float(np.exp(rng.uniform(np.log(low), np.log(high))))
 
 
 _DEPTHS_M = (3.5, 45.0)
@@ -285,10 +251,6 @@ _RICH = ("pavement", "grass", "brick", "stone", "concrete", "roof", "bark", "lea
          "pane", "plate", "sign", "poster", "cloth", "dirt", "hills")  # fmt: skip
 _PLAIN_SHARE = 0.3
 
-_NO_MARKINGS = Markings(
-    lines=np.zeros((0, 4)), bars=np.zeros((0, 5)), brightness=0.5, wheel_tracks=(0.0, 3.0)
-)
-
 
 def make_clutter(seed: tuple[int, ...]) -> StreetScene:
     """Make the clutter that belongs to ``seed``.
@@ -297,39 +259,65 @@ def make_clutter(seed: tuple[int, ...]) -> StreetScene:
         seed: any whole numbers.
     """
     rng = np.random.default_rng([74, *seed])
-    builder = MeshBuilder()
-    _BACKDROPS[int(rng.integers(len(_BACKDROPS)))](builder, rng)
+    b = MeshBuilder(rng)
+    _add_backdrop(b)
     for _ in range(int(rng.integers(12, 60))):
-        builder.begin_thing()
-        _add_shape(builder, rng)
+        b.begin_thing()
+        z = _log_uniform(rng, *_DEPTHS_M)
+        centre = np.array([rng.uniform(-0.95, 0.95) * z, rng.uniform(-0.3, 0.3) * z, z])
+        size_m = min(z, 25.0) * _log_uniform(rng, 0.03, 0.3)
+        _SHAPES[int(rng.integers(len(_SHAPES)))](b, centre, size_m)
+    mesh = b.finish()
+    # Nothing may come nearer than the rig's largest disparity allows; but a backdrop reaches behind
+    # the camera, and its triangles are large.
+    is_far = mesh.corners[:, :, 2].min(1) > 0.85 * _DEPTHS_M[0]
+    kept = is_far | (np.ptp(mesh.corners, axis=1).max(1) > _DEPTHS_M[0])
     return StreetScene(
-        mesh=_in_front(builder.finish()),
-        markings=_NO_MARKINGS,
+        mesh=mesh.part(kept),
+        markings=Markings(
+            lines=np.zeros((0, 4)), bars=np.zeros((0, 5)), brightness=0.5, wheel_tracks=(0.0, 3.0)
+        ),
         weather=draw_weather(rng),
         camera_from_world=np.eye(3),
         place="clutter",
     )
 
 
-def _in_front(mesh: Mesh) -> Mesh:
-    """Leave out triangles that come nearer than the rig's largest disparity allows."""
-    kept = mesh.corners[:, :, 2].min(1) > 0.85 * _DEPTHS_M[0]
-    # A backdrop reaches behind the camera; its triangles are large and stay.
-    size = np.ptp(mesh.corners, axis=1).max(1)
-    return mesh.part(kept | (size > _DEPTHS_M[0]))
+def _add_backdrop(b: MeshBuilder) -> None:
+    """A ground, somewhat aslant; a wall across the view and a ground; or the inside of a box."""
+    rng = b.rng
 
+    def sheet(corner: Values, along: Values, up: Values) -> None:
+        b.begin_thing()
+        b.rectangle(corner, along, up, _surface(rng, rng.uniform(0.5, 4)))
 
-def _color(rng: np.random.Generator) -> Color:
-    """Any colour, from nearly black to nearly white, mostly pale."""
-    grey = float(np.exp(rng.uniform(np.log(0.03), np.log(0.8))))
-    r, g, b = np.clip(grey * np.exp(rng.normal(0, rng.choice([0.05, 0.4, 1.0]), 3)), 0.01, 0.9)
-    return (float(r), float(g), float(b))
+    kind = int(rng.integers(3))
+    if kind == 2:
+        half, depth = rng.uniform(3, 14), rng.uniform(8, 45)
+        floor, top = rng.uniform(1, 3), rng.uniform(-6, -2)
+        up = [0, -(floor - top), 0]
+        sheet([-half, floor, 0], [2 * half, 0, 0], [0, 0, depth])
+        sheet([-half, floor, depth], [2 * half, 0, 0], up)
+        for x in (-half, half):
+            sheet([x, floor, 0], [0, 0, depth], up)
+        if rng.random() < 0.6:
+            sheet([-half, top, 0], [2 * half, 0, 0], [0, 0, depth])
+        return
+    if kind == 1:
+        turn, z = rng.uniform(-0.9, 0.9), rng.uniform(18, 60)
+        along = np.array([np.cos(turn), rng.normal(0, 0.1), np.sin(turn)]) * 300
+        sheet(np.array([0, 20, z]) - along / 2, along, [0, -40, rng.normal(0, 10)])
+    y, slope = rng.uniform(1.0, 3.0), rng.normal(0, 0.02)
+    sheet([-150, y, 0], [300, rng.normal(0, 8), 0], [0, slope * 300, 300])
 
 
 def _surface(rng: np.random.Generator, size_m: float) -> Surface:
+    """Anything of any colour, from nearly black to nearly white, mostly pale."""
     names = _PLAIN if rng.random() < _PLAIN_SHARE else _RICH
-    tile_m = size_m * float(np.exp(rng.uniform(np.log(0.15), np.log(3))))
-    return Surface(names[int(rng.integers(len(names)))], _color(rng), tile_m, int(rng.integers(8)))
+    tile_m = size_m * _log_uniform(rng, 0.15, 3)
+    material, grey = names[int(rng.integers(len(names)))], _log_uniform(rng, 0.03, 0.8)
+    color = np.clip(grey * np.exp(rng.normal(0, rng.choice([0.05, 0.4, 1.0]), 3)), 0.01, 0.9)
+    return Surface(material, tuple(color.tolist()), tile_m, int(rng.integers(8)))
 
 
 def _rotation(rng: np.random.Generator) -> Rotation:
@@ -339,130 +327,82 @@ def _rotation(rng: np.random.Generator) -> Rotation:
     return q * np.sign(np.linalg.det(q))
 
 
-def _add_shape(builder: MeshBuilder, rng: np.random.Generator) -> None:
-    near, far = np.log(_DEPTHS_M)
-    z = float(np.exp(rng.uniform(near, far)))
-    centre = np.array([rng.uniform(-0.95, 0.95) * z, rng.uniform(-0.3, 0.3) * z, z])
-    size_m = min(z, 25.0) * float(np.exp(rng.uniform(np.log(0.03), np.log(0.3))))
-    shape = _SHAPES[int(rng.integers(len(_SHAPES)))]
-    shape(builder, rng, centre, size_m)
+def _ball(b: MeshBuilder, centre: np.ndarray, size_m: float) -> None:
+    radii = size_m / 2 * b.rng.uniform(0.5, 1.5, 3)
+    dents = b.rng.uniform(0, 0.5) if b.rng.random() < 0.6 else 0.0
+    add_ball(b, centre, radii, _surface(b.rng, size_m), 3, dents)
 
 
-def _ball(b: MeshBuilder, rng: np.random.Generator, centre: np.ndarray, size_m: float) -> None:
-    radii = size_m / 2 * rng.uniform(0.5, 1.5, 3)
-    dents = (rng, rng.uniform(0, 0.5)) if rng.random() < 0.6 else None
-    add_ball(b, centre, radii, _surface(rng, size_m), 3, dents)
+def _box(b: MeshBuilder, centre: np.ndarray, size_m: float) -> None:
+    R = _rotation(b.rng) if b.rng.random() < 0.5 else np.eye(3)
+    sides = size_m * np.exp(b.rng.normal(0, 0.6, 3))
+    b.box(centre, sides, _surface(b.rng, size_m), R, b.rng.uniform(0.4, 1))
 
 
-def _box(b: MeshBuilder, rng: np.random.Generator, centre: np.ndarray, size_m: float) -> None:
-    R = _rotation(rng) if rng.random() < 0.5 else np.eye(3)
-    sides = size_m * np.exp(rng.normal(0, 0.6, 3))
-    b.box(centre, sides, _surface(rng, size_m), R, rng.uniform(0.4, 1))
+def _card(b: MeshBuilder, centre: np.ndarray, size_m: float) -> None:
+    R = _rotation(b.rng)
+    along, up = R[0] * size_m * b.rng.uniform(0.5, 2), R[1] * size_m * b.rng.uniform(0.5, 2)
+    b.rectangle(centre - (along + up) / 2, along, up, _surface(b.rng, size_m))
 
 
-def _card(b: MeshBuilder, rng: np.random.Generator, centre: np.ndarray, size_m: float) -> None:
-    R = _rotation(rng)
-    along, up = R[0] * size_m * rng.uniform(0.5, 2), R[1] * size_m * rng.uniform(0.5, 2)
-    b.rectangle(centre - (along + up) / 2, along, up, _surface(rng, size_m))
-
-
-def _pole(b: MeshBuilder, rng: np.random.Generator, centre: np.ndarray, size_m: float) -> None:
-    half = _rotation(rng)[0] * size_m * rng.uniform(0.7, 3)
-    if rng.random() < 0.5:
+def _pole(b: MeshBuilder, centre: np.ndarray, size_m: float) -> None:
+    half = _rotation(b.rng)[0] * size_m * b.rng.uniform(0.7, 3)
+    if b.rng.random() < 0.5:
         half = half * [0.05, 1, 0.05]
-    radius = size_m * float(np.exp(rng.uniform(np.log(0.01), np.log(0.2))))
-    b.tube(centre - half, centre + half, (radius, radius * rng.uniform(0.3, 1)),
-           _surface(rng, size_m), 10)  # fmt: skip
+    radius = size_m * _log_uniform(b.rng, 0.01, 0.2)
+    radii = (radius, radius * b.rng.uniform(0.3, 1))
+    b.tube(centre - half, centre + half, radii, _surface(b.rng, size_m), 10)
 
 
-def _fence(b: MeshBuilder, rng: np.random.Generator, centre: np.ndarray, size_m: float) -> None:
+def _fence(b: MeshBuilder, centre: np.ndarray, size_m: float) -> None:
     """Bars side by side: what repeats has many matches."""
-    turn = rng.uniform(-0.8, 0.8)
-    along = np.array([np.cos(turn), 0, np.sin(turn)]) * size_m * rng.uniform(1, 3)
-    up = np.array([0, size_m / 2, 0])
-    surface = _surface(rng, size_m)
-    count = int(rng.integers(4, 20))
-    radius = float(np.linalg.norm(along)) / count * rng.uniform(0.05, 0.3)
+    turn = b.rng.uniform(-0.8, 0.8)
+    along = np.array([np.cos(turn), 0, np.sin(turn)]) * size_m * b.rng.uniform(1, 3)
+    up, surface = np.array([0, size_m / 2, 0]), _surface(b.rng, size_m)
+    count = int(b.rng.integers(4, 20))
+    radius = float(np.linalg.norm(along)) / count * b.rng.uniform(0.05, 0.3)
     for share in np.linspace(-0.5, 0.5, count):
-        b.tube(centre + share * along - up, centre + share * along + up, (radius, radius), surface)
+        b.tube(centre + share * along - up, centre + share * along + up, radius, surface)
     for height in (-0.8, 0.8):
-        ends = centre + height * up - along / 2, centre + height * up + along / 2
-        b.tube(*ends, (radius, radius), surface)
+        b.tube(centre + height * up - along / 2, centre + height * up + along / 2, radius, surface)
 
 
-def _wheel(b: MeshBuilder, rng: np.random.Generator, centre: np.ndarray, size_m: float) -> None:
+def _wheel(b: MeshBuilder, centre: np.ndarray, size_m: float) -> None:
     """A rim with spokes: what lies behind is seen through the gaps."""
+    rng = b.rng
     R = _rotation(rng) if rng.random() < 0.5 else np.eye(3)
-    surface = _surface(rng, size_m)
-    radius = size_m * rng.uniform(0.5, 1.2)
+    surface, radius = _surface(rng, size_m), size_m * rng.uniform(0.5, 1.2)
     angles = np.linspace(0, 2 * np.pi, 25)
     rim = centre + radius * (np.cos(angles)[:, None] * R[0] + np.sin(angles)[:, None] * R[1])
     thick = radius * rng.uniform(0.03, 0.2)
     for start, end in pairwise(rim):
-        b.tube(start, end, (thick, thick), surface, 6)
+        b.tube(start, end, thick, surface, 6)
     thin = radius * rng.uniform(0.01, 0.08)
     for place in np.linspace(0, 24, int(rng.integers(3, 14)), endpoint=False).astype(int):
         b.tube(centre, rim[place], (thin * rng.uniform(1, 2), thin), surface, 6)
 
 
-def _lattice(b: MeshBuilder, rng: np.random.Generator, centre: np.ndarray, size_m: float) -> None:
+def _lattice(b: MeshBuilder, centre: np.ndarray, size_m: float) -> None:
     """Flat bars that cross, as shelves, window frames and the backs of benches do."""
+    rng = b.rng
     R = _rotation(rng) if rng.random() < 0.3 else np.eye(3)
     sides = size_m * rng.uniform(0.6, 2.5, 2)
     surface, deep = _surface(rng, size_m), size_m * float(np.exp(rng.uniform(-4, 0)))
     for axis in (0, 1):
         count = int(rng.integers(2, 8))
-        wide = sides[axis] / count * rng.uniform(0.05, 0.4)
+        bar = np.array([*sides, deep])
+        bar[axis] = sides[axis] / count * rng.uniform(0.05, 0.4)
         for share in np.linspace(-0.5, 0.5, count):
-            bar = np.array([*sides, deep])
-            bar[axis] = wide
             b.box(centre + share * sides[axis] * R[:, axis], bar, surface, R)
 
 
-def _leaves(b: MeshBuilder, rng: np.random.Generator, centre: np.ndarray, size_m: float) -> None:
-    radii = size_m * rng.uniform(0.4, 1.2, 3)
-    count, length_m = int(rng.integers(100, 1200)), size_m * rng.uniform(0.03, 0.2)
-    surface, is_block = _surface(rng, size_m), bool(rng.random() < 0.3)
-    add_leaves(b, rng, centre, radii, count, length_m, surface, is_block)
+def _leaves(b: MeshBuilder, centre: np.ndarray, size_m: float) -> None:
+    radii = size_m * b.rng.uniform(0.4, 1.2, 3)
+    count, length_m = int(b.rng.integers(100, 1200)), size_m * b.rng.uniform(0.03, 0.2)
+    surface, is_block = _surface(b.rng, size_m), bool(b.rng.random() < 0.3)
+    add_leaves(b, centre, radii, count, length_m, surface, is_block)
 
 
-_SHAPES: tuple[Callable[[MeshBuilder, np.random.Generator, np.ndarray, float], None], ...] = (
+_SHAPES: tuple[Callable[[MeshBuilder, np.ndarray, float], None], ...] = (
     _ball, _box, _box, _card, _pole, _pole, _fence, _wheel, _lattice, _leaves,
 )  # fmt: skip
-
-
-def _ground(builder: MeshBuilder, rng: np.random.Generator) -> None:
-    """A plane below, somewhat aslant, and the sky."""
-    y, slope = rng.uniform(1.0, 3.0), rng.normal(0, 0.02)
-    _sheet(builder, rng, [-150, y, 0], [300, rng.normal(0, 8), 0], [0, slope * 300, 300])
-
-
-def _wall(builder: MeshBuilder, rng: np.random.Generator) -> None:
-    """A plane across the view, turned to either side, and a ground."""
-    turn, z = rng.uniform(-0.9, 0.9), rng.uniform(18, 60)
-    along = np.array([np.cos(turn), rng.normal(0, 0.1), np.sin(turn)]) * 300
-    _sheet(builder, rng, np.array([0, 20, z]) - along / 2, along, [0, -40, rng.normal(0, 10)])
-    _ground(builder, rng)
-
-
-def _box_inside(builder: MeshBuilder, rng: np.random.Generator) -> None:
-    """Four walls and a floor, with a ceiling or without."""
-    half, depth = rng.uniform(3, 14), rng.uniform(8, 45)
-    floor, top = rng.uniform(1, 3), rng.uniform(-6, -2)
-    height = floor - top
-    _sheet(builder, rng, [-half, floor, 0], [2 * half, 0, 0], [0, 0, depth])
-    _sheet(builder, rng, [-half, floor, depth], [2 * half, 0, 0], [0, -height, 0])
-    for x in (-half, half):
-        _sheet(builder, rng, [x, floor, 0], [0, 0, depth], [0, -height, 0])
-    if rng.random() < 0.6:
-        _sheet(builder, rng, [-half, top, 0], [2 * half, 0, 0], [0, 0, depth])
-
-
-_BACKDROPS = (_ground, _wall, _box_inside)
-
-
-def _sheet(
-    builder: MeshBuilder, rng: np.random.Generator, corner: Values, along: Values, up: Values
-) -> None:
-    builder.begin_thing()
-    builder.rectangle(corner, along, up, _surface(rng, rng.uniform(0.5, 4)))

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 from torch import Tensor
 from torch.nn import functional as F
 
@@ -25,64 +25,43 @@ _GROUND = ("road", "pavement", "grass", "dirt", "curb", "hills")
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class LightMap:
-    """How far along the light the first surface lies: what is beyond is in shadow.
-
-    Attributes:
-        depth_m: the map.
-        rotation: from the camera's frame to that of the light.
-        low: the light-frame corner of the map [m].
-        pixels_per_m: scale of its columns and rows.
-        texel_m: the larger of its two pixel sizes.
-    """
+    """How far along the light the first surface lies: what is beyond is in shadow."""
 
     depth_m: Float[Tensor, "side side"]
-    rotation: Float[Tensor, "3 3"]
-    low: Float[Tensor, "2"]
-    pixels_per_m: Float[Tensor, "2"]
-    texel_m: float
+    rotation: Float[Tensor, "3 3"]  # from the camera's frame to that of the light
+    low: Float[Tensor, "2"]  # the light-frame corner of the map [m]
+    pixels_per_m: Float[Tensor, "2"]  # scale of its columns and rows
+    texel_m: float  # the larger of its two pixel sizes
 
-    def place(self, points: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3"]:
+    def place(self, points: Float[Tensor, "n 3"]) -> tuple[Tensor, Tensor, Tensor]:
         """Column and row [px], and depth along the light [m]."""
         turned = points @ self.rotation.T
-        pixels = (turned[:, :2] - self.low) * self.pixels_per_m
-        return torch.cat([pixels, turned[:, 2:]], 1)
+        column, row = ((turned[:, :2] - self.low) * self.pixels_per_m).unbind(1)
+        return column, row, turned[:, 2]
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Stage:
-    """What drawing looks up.
-
-    Attributes:
-        scene: what is drawn.
-        corners: triangles in the left camera's frame [m].
-        attributes: a row a triangle: uv (6), normals (9), tint (3), plane normal (3) and texels a
-            metre (1).
-        material: number of the material.
-        layer: number of the texture.
-        kind: equal where no edge shows between two triangles: same thing, same material.
-        to_sun: unit vector towards the sun, in the camera's frame.
-        up: the same towards the sky.
-        sun_maps: near and far shadows; none under clouds.
-        sky_map: what lies above.
-    """
+    """What drawing looks up; vectors are unit vectors in the left camera's frame."""
 
     scene: StreetScene
-    corners: Float[Tensor, "n 3 3"]
+    corners: Float[Tensor, "n 3 3"]  # triangles in the left camera's frame [m]
+    # A row a triangle: uv (6), normals (9), tint (3), plane normal (3) and texels a metre (1).
     attributes: Float[Tensor, "n 22"]
-    material: Int[Tensor, " n"]
-    layer: Int[Tensor, " n"]
-    kind: Int[Tensor, " n"]
+    material: Int[Tensor, " n"]  # number of the material
+    layer: Int[Tensor, " n"]  # number of the texture
+    kind: Int[Tensor, " n"]  # equal where no edge shows: same thing, same material
     to_sun: Float[Tensor, "3"]
-    up: Float[Tensor, "3"]
-    sun_maps: list[LightMap]
-    sky_map: LightMap
+    up: Float[Tensor, "3"]  # towards the sky
+    sun_maps: list[LightMap]  # near and far shadows; none under clouds
+    sky_map: LightMap  # what lies above
 
 
 def prepare(scene: StreetScene, pixels: int = 1242 * 375) -> Stage:
     """Make a scene ready for drawing."""
     share = float(np.clip((pixels / (1242 * 375)) ** (1 / 3), 0.4, 1))
     mesh = scene.mesh
-    corners = torch.from_numpy(mesh.corners)
+    corners, uv = torch.from_numpy(mesh.corners), torch.from_numpy(mesh.uv)
     turn = torch.from_numpy(scene.camera_from_world).float()
     to_sun = turn @ torch.from_numpy(scene.weather.sun).float()
     up = turn @ torch.tensor([0.0, -1, 0])
@@ -90,42 +69,36 @@ def prepare(scene: StreetScene, pixels: int = 1242 * 375) -> Stage:
     hides = torch.ones(len(MATERIALS), dtype=torch.bool)
     hides[[NUMBER[name] for name in _GROUND]] = False
     casters = corners[hides[material]]
+    across = torch.linalg.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    a, b = uv[:, 1] - uv[:, 0], uv[:, 2] - uv[:, 0]
+    tiles = (a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]).abs()
+    texels_per_m = (tiles / across.norm(dim=1).clamp(min=1e-12)).sqrt().clamp(1e-4, 50) * SIDE_PX
+    normals, tint = torch.from_numpy(mesh.normals), torch.from_numpy(mesh.tint)
+    parts = uv.flatten(1), normals.flatten(1), tint, F.normalize(across, dim=1)
     maps = () if scene.weather.is_overcast else _SUN_MAPS
     return Stage(
         scene=scene,
         corners=corners,
-        attributes=_attributes(scene, corners),
+        attributes=torch.cat([*parts, texels_per_m[:, None]], 1),
         material=material,
         layer=torch.from_numpy(mesh.layer.astype(np.int64)),
         kind=torch.from_numpy(mesh.thing.astype(np.int64)) * len(MATERIALS) + material,
         to_sun=to_sun,
         up=up,
-        sun_maps=[_light_map(casters, to_sun, one, share) for one in maps],
-        sky_map=_light_map(casters, up, _SKY_MAP, share),
+        sun_maps=[_light_map(casters, to_sun, *one, share) for one in maps],
+        sky_map=_light_map(casters, up, *_SKY_MAP, share),
     )
-
-
-def _attributes(scene: StreetScene, corners: Float[Tensor, "n 3 3"]) -> Float[Tensor, "n 22"]:
-    uv = torch.from_numpy(scene.mesh.uv)
-    side, other = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
-    across = torch.linalg.cross(side, other)
-    area = across.norm(dim=1)
-    a, b = uv[:, 1] - uv[:, 0], uv[:, 2] - uv[:, 0]
-    tiles = (a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]).abs()
-    texels_per_m = (tiles / area.clamp(min=1e-12)).sqrt().clamp(1e-4, 50) * SIDE_PX
-    normals, tint = torch.from_numpy(scene.mesh.normals), torch.from_numpy(scene.mesh.tint)
-    plane = F.normalize(across, dim=1)
-    return torch.cat([uv.flatten(1), normals.flatten(1), tint, plane, texels_per_m[:, None]], 1)
 
 
 def _light_map(
     corners: Float[Tensor, "n 3 3"],
     to_light: Float[Tensor, "3"],
-    region: tuple[float, tuple[float, float], int],
+    half_m: float,
+    reach_m: tuple[float, float],
+    full_px: int,
     share: float,
 ) -> LightMap:
     """Draw the depth along a light over a part of the scene before the camera."""
-    half_m, reach_m, full_px = region
     side_px = round(full_px * share)
     away = F.normalize(-to_light, dim=0)
     aside = torch.tensor([1.0, 0, 0]) if abs(float(away[0])) < 0.9 else torch.tensor([0.0, 0, 1])
@@ -147,157 +120,119 @@ def _light_map(
     )
 
 
-def sunlit_share(
+def _sunlit_share(
     stage: Stage, points: Float[Tensor, "n 3"], normals: Float[Tensor, "n 3"]
 ) -> Float[Tensor, " n"]:
     """How much of the sun reaches each point: 0 in shadow, 1 lit, soft over a texel."""
     lit = torch.ones(len(points))
     # From the far map to the near one, which is finer and has the last word.
     for light in reversed(stage.sun_maps):
-        share, is_inside = _share_before(light, points, normals)
-        lit = torch.where(is_inside, share, lit)
+        # Lifted off the surface, or its own texels would shade it in stripes.
+        column, row, depth_m = light.place(points + normals * (2 * light.texel_m))
+        side = len(light.depth_m)
+        is_inside = (column > 1) & (row > 1) & (column < side - 3) & (row < side - 3)
+        left, top = column.floor().clamp(1, side - 3), row.floor().clamp(1, side - 3)
+        across, down = column - left, row - top
+        start = top.long() * side + left.long()
+        flat, limit = light.depth_m.flatten(), depth_m - 0.8 * light.texel_m
+        a, b, c, d = (
+            (flat.index_select(0, start + step) >= limit).float() for step in (0, 1, side, side + 1)
+        )
+        upper, lower = torch.lerp(a, b, across), torch.lerp(c, d, across)
+        lit = torch.where(is_inside, torch.lerp(upper, lower, down).clamp(0, 1), lit)
     return lit
 
 
-def _share_before(
-    light: LightMap, points: Float[Tensor, "n 3"], normals: Float[Tensor, "n 3"]
-) -> tuple[Float[Tensor, " n"], Bool[Tensor, " n"]]:
-    # Lifted off the surface, or its own texels would shade it in stripes.
-    placed = light.place(points + normals * (2 * light.texel_m))
-    side = len(light.depth_m)
-    column, row = placed[:, 0], placed[:, 1]
-    is_inside = (column > 1) & (row > 1) & (column < side - 3) & (row < side - 3)
-    left, top = column.floor().clamp(1, side - 3), row.floor().clamp(1, side - 3)
-    across, down = column - left, row - top
-    start = top.long() * side + left.long()
-    flat = light.depth_m.flatten()
-    limit = placed[:, 2] - 0.8 * light.texel_m
-    a, b, c, d = (
-        (flat.index_select(0, start + step) >= limit).float() for step in (0, 1, side, side + 1)
-    )
-    upper, lower = torch.lerp(a, b, across), torch.lerp(c, d, across)
-    return torch.lerp(upper, lower, down).clamp(0, 1), is_inside
-
-
-def open_share(stage: Stage, points: Float[Tensor, "n 3"]) -> Float[Tensor, " n"]:
+def _open_share(light: LightMap, points: Float[Tensor, "n 3"]) -> Float[Tensor, " n"]:
     """How open each point is to the sky above, from a few places around it."""
-    light = stage.sky_map
-    placed = light.place(points)
+    column, row, depth_m = light.place(points)
     side = len(light.depth_m)
-    column, row = placed[:, 0], placed[:, 1]
     is_inside = (column > 10) & (row > 10) & (column < side - 11) & (row < side - 11)
     start = row.clamp(10, side - 11).long() * side + column.clamp(10, side - 11).long()
     flat = light.depth_m.flatten()
     hidden = torch.zeros(len(points))
     for x, y in ((5, 2), (-2, 5), (-5, -2), (2, -5), (1, 1)):
-        above_m = placed[:, 2] - flat.index_select(0, start + (y * side + x)) - 0.08
+        above_m = depth_m - flat.index_select(0, start + (y * side + x)) - 0.08
         hidden += torch.where(above_m > 0, 1 / (1 + 0.25 * above_m.clamp(min=0)), 0)
     return torch.where(is_inside, 1 - 0.17 * hidden, 1.0)
 
 
-_SPECULAR = torch.tensor([material.specular for material in MATERIALS.values()])
-_TRANSLUCENCY = torch.tensor([material.translucency for material in MATERIALS.values()])
-_GLOW = torch.tensor([material.glow for material in MATERIALS.values()])
+_SPECULAR, _TRANSLUCENCY, _GLOW = torch.tensor(
+    [(m.specular, m.translucency, m.glow) for m in MATERIALS.values()]
+).T
 _CHUNK = 1 << 17
 """Points shaded at a time, which bounds the memory."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Hits:
-    """Where rays hit triangles.
+    """Where rays hit triangles."""
 
-    Attributes:
-        primitive: number of the triangle.
-        barycentric: shares of its corners.
-        points: in the left camera's frame [m].
-        towards: unit vectors along the rays.
-        distance_m: from the camera.
-    """
-
-    primitive: Int[Tensor, " n"]
-    barycentric: Float[Tensor, "n 3"]
-    points: Float[Tensor, "n 3"]
-    towards: Float[Tensor, "n 3"]
-    distance_m: Float[Tensor, " n"]
-
-    def part(self, start: int, stop: int) -> "Hits":
-        """Some of them."""
-        names = ("primitive", "barycentric", "points", "towards", "distance_m")
-        return Hits(**{name: getattr(self, name)[start:stop] for name in names})
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class _Surfaces:
-    """What is known of the surface at each hit.
-
-    ``normal`` is smooth, ``plane`` the triangle's own; both look to the camera. ``uv`` is in tiles.
-    """
-
-    material: Int[Tensor, " n"]
-    albedo: Float[Tensor, "n 3"]
-    normal: Float[Tensor, "n 3"]
-    plane: Float[Tensor, "n 3"]
+    primitive: Int[Tensor, " n"]  # number of the triangle
+    barycentric: Float[Tensor, "n 3"]  # shares of its corners
+    points: Float[Tensor, "n 3"]  # in the left camera's frame [m]
+    towards: Float[Tensor, "n 3"]  # unit vectors along the rays
+    distance_m: Float[Tensor, " n"]  # from the camera
 
 
 def shade(stage: Stage, hits: Hits, focal_px: float) -> Float[Tensor, "n 3"]:
     """Give the light from each hit towards the camera."""
-    count = len(hits.primitive)
-    parts = [
-        _shade(stage, hits.part(start, start + _CHUNK), focal_px)
-        for start in range(0, count, _CHUNK)
-    ]
-    return torch.cat(parts) if parts else torch.zeros(0, 3)
+    parts = {name: values.split(_CHUNK) for name, values in vars(hits).items()}
+    chunks = (
+        Hits(**dict(zip(parts, some, strict=True))) for some in zip(*parts.values(), strict=True)
+    )
+    return torch.cat([_shade(stage, some, focal_px) for some in chunks])
 
 
 def _shade(stage: Stage, hits: Hits, focal_px: float) -> Float[Tensor, "n 3"]:
-    surfaces = _surfaces(stage, hits, focal_px)
-    weather = stage.scene.weather
+    rows = stage.attributes.index_select(0, hits.primitive)
+    material, layer = (n.index_select(0, hits.primitive) for n in (stage.material, stage.layer))
+    # The triangle's own normal, and a smooth one; both look to the camera.
+    plane = rows[:, 18:21]
+    facing = _dot(plane, hits.towards)
+    plane = torch.where(facing[:, None] > 0, -plane, plane)
+    normal = _mix(rows[:, 6:15], hits.barycentric)
+    normal = normal / _dot(normal, normal).sqrt()[:, None]
+    normal = torch.where((_dot(normal, plane) < 0)[:, None], -normal, normal)
+    uv, footprint_m = _mix(rows[:, :6], hits.barycentric), hits.distance_m / focal_px
+    # A compromise between the footprint's width and its length, which grows when seen aslant.
+    level = torch.log2(footprint_m * rows[:, 21] * facing.abs().clamp(min=0.03) ** -0.6 + 1e-9)
+    albedo = sample_texture(textures(), layer, uv, level) * rows[:, 15:18]
+    # Unevenness over metres hides that textures repeat.
+    weather, points = stage.scene.weather, hits.points
+    u = points[:, 0] * 0.021 + points[:, 1] * 0.013 + weather.shift[0]
+    stains = _looked_up(textures().stains, u, points[:, 2] * 0.021 + weather.shift[1])
+    albedo *= (1 + 0.07 * stains)[:, None]
+    is_road = (material == NUMBER["road"]).nonzero()[:, 0]
+    if len(is_road):
+        place_m, width_m = uv[is_road] * 3.0, footprint_m[is_road]
+        length_m = width_m / facing[is_road].abs().clamp(min=0.02)
+        albedo[is_road] = _paint_road(stage.scene, albedo[is_road], place_m, width_m, length_m)
+    slant, through = normal @ stage.to_sun, _TRANSLUCENCY[material]
+    faced = (plane @ stage.to_sun > 0).float()
+    sun = (1 - through) * slant.clamp(min=0) * faced + through * slant.abs()
+    lit = torch.ones_like(sun)
+    if stage.sun_maps:
+        reached = (sun > 0).nonzero()[:, 0]
+        lit[reached] = _sunlit_share(stage, points[reached], plane[reached])
     sun_color = torch.from_numpy(weather.sun_color).float()
-    sun, lit = _sunlight(stage, hits, surfaces)
-    upward = 0.5 + 0.5 * (surfaces.normal @ stage.up)
-    openness = open_share(stage, hits.points + 0.05 * surfaces.plane)
+    upward = 0.5 + 0.5 * (normal @ stage.up)
+    openness = _open_share(stage.sky_map, points + 0.05 * plane)
     sky = torch.from_numpy(0.5 * (weather.zenith + weather.horizon)).float()
     ambient = ((0.09 + 0.26 * upward) * openness)[:, None] * sky
     # Light that the ground throws back.
     bounced = ((1 - upward) * openness * 0.045)[:, None] * sun_color
-    color = surfaces.albedo * (sun[:, None] * sun_color + ambient + bounced)
-    color += surfaces.albedo * (2 * _GLOW[surfaces.material])[:, None]
-    _add_mirrored(stage, hits, surfaces, lit, color)
+    color = albedo * ((sun * lit)[:, None] * sun_color + ambient + bounced)
+    color += albedo * (2 * _GLOW[material])[:, None]
+    _add_mirrored(stage, hits.towards, normal, _SPECULAR[material], lit, color)
     thick = 1 - torch.exp(-hits.distance_m / weather.haze_m)
     haze = torch.from_numpy(weather.horizon).float() * 0.7
     return torch.lerp(color, haze.expand_as(color), thick[:, None])
 
 
-def _surfaces(stage: Stage, hits: Hits, focal_px: float) -> _Surfaces:
-    rows = stage.attributes.index_select(0, hits.primitive)
-    shares = hits.barycentric
-    material, layer = (
-        numbers.index_select(0, hits.primitive) for numbers in (stage.material, stage.layer)
-    )
-    uv = _mix(rows[:, :6], shares, 2)
-    plane = rows[:, 18:21]
-    facing = _dot(plane, hits.towards)
-    plane = torch.where(facing[:, None] > 0, -plane, plane)
-    normal = _mix(rows[:, 6:15], shares, 3)
-    normal = normal / _dot(normal, normal).sqrt()[:, None]
-    normal = torch.where((_dot(normal, plane) < 0)[:, None], -normal, normal)
-    footprint_m = hits.distance_m / focal_px
-    # A compromise between the footprint's width and its length, which grows when seen aslant.
-    level = torch.log2(footprint_m * rows[:, 21] * facing.abs().clamp(min=0.03) ** -0.6 + 1e-9)
-    albedo = sample_texture(textures(), layer, uv, level) * rows[:, 15:18]
-    albedo *= _stain(stage, hits.points)[:, None]
-    is_road = (material == NUMBER["road"]).nonzero()[:, 0]
-    if len(is_road):
-        place_m, width_m = uv[is_road] * 3.0, footprint_m[is_road]
-        length_m = width_m / facing[is_road].abs().clamp(min=0.02)
-        albedo[is_road] = paint_road(stage.scene, albedo[is_road], place_m, width_m, length_m)
-    return _Surfaces(material=material, albedo=albedo, normal=normal, plane=plane)
-
-
-def _mix(
-    values: Float[Tensor, "n triple"], shares: Float[Tensor, "n 3"], width: int
-) -> Float[Tensor, "n m"]:
-    a, b, c = values[:, :width], values[:, width : 2 * width], values[:, 2 * width :]
+def _mix(values: Float[Tensor, "n triple"], shares: Float[Tensor, "n 3"]) -> Float[Tensor, "n m"]:
+    """Interpolate between the values of three corners."""
+    a, b, c = values.chunk(3, 1)
     return a * shares[:, :1] + b * shares[:, 1:2] + c * shares[:, 2:]
 
 
@@ -306,44 +241,22 @@ def _dot(one: Float[Tensor, "n 3"], other: Float[Tensor, "n 3"]) -> Float[Tensor
     return one[:, 0] * other[:, 0] + one[:, 1] * other[:, 1] + one[:, 2] * other[:, 2]
 
 
-def _stain(stage: Stage, points: Float[Tensor, "n 3"]) -> Float[Tensor, " n"]:
-    """Unevenness over metres, which hides that textures repeat."""
-    x, y = stage.scene.weather.shift
-    u = points[:, 0] * 0.021 + points[:, 1] * 0.013 + x
-    return 1 + 0.07 * _looked_up(textures().stains, u, points[:, 2] * 0.021 + y)
-
-
-def _sunlight(
-    stage: Stage, hits: Hits, surfaces: _Surfaces
-) -> tuple[Float[Tensor, " n"], Float[Tensor, " n"]]:
-    """The sun's light on each point, and the share of the sun that is not hidden from it."""
-    slant = surfaces.normal @ stage.to_sun
-    through = _TRANSLUCENCY[surfaces.material]
-    faced = (surfaces.plane @ stage.to_sun > 0).float()
-    light = (1 - through) * slant.clamp(min=0) * faced + through * slant.abs()
-    lit = torch.ones_like(light)
-    if stage.sun_maps:
-        reached = (light > 0).nonzero()[:, 0]
-        lit[reached] = sunlit_share(stage, hits.points[reached], surfaces.plane[reached])
-    return light * lit, lit
-
-
 def _add_mirrored(
     stage: Stage,
-    hits: Hits,
-    surfaces: _Surfaces,
+    towards: Float[Tensor, "n 3"],
+    normal: Float[Tensor, "n 3"],
+    mirror: Float[Tensor, " n"],
     lit: Float[Tensor, " n"],
     color: Float[Tensor, "n 3"],
 ) -> None:
     """Mix in what glass, paint and metal mirror: the sky, a made-up skyline, the sun."""
-    mirror = _SPECULAR[surfaces.material]
     some = (mirror > 0).nonzero()[:, 0]
     if not len(some):
         return
-    normal, towards = surfaces.normal[some], hits.towards[some]
+    normal, towards, mirror = normal[some], towards[some], mirror[some]
     aligned = _dot(towards, normal)
     mirrored = towards - 2 * aligned[:, None] * normal
-    share = mirror[some] + (1 - mirror[some]) * (1 + aligned.clamp(-1, 0)) ** 5
+    share = mirror + (1 - mirror) * (1 + aligned.clamp(-1, 0)) ** 5
     light = sky_light(stage, mirrored, with_sun=False)
     turn = torch.atan2(mirrored[:, 0], mirrored[:, 2])
     shift = 6.3 * stage.scene.weather.shift[0]
@@ -360,15 +273,17 @@ def sky_light(
     stage: Stage, towards: Float[Tensor, "n 3"], *, with_sun: bool = True
 ) -> Float[Tensor, "n 3"]:
     """Give the light of the sky (and of the ground, below) from each direction."""
-    weather = stage.scene.weather
+    weather, height = stage.scene.weather, towards @ stage.up
     zenith, horizon, sun_color = (
         torch.from_numpy(color).float()
         for color in (weather.zenith, weather.horizon, weather.sun_color)
     )
-    height = towards @ stage.up
-    color = torch.lerp(horizon.expand(len(height), 3), zenith.expand(len(height), 3),
-                       (height.clamp(0, 1) ** 0.33)[:, None])  # fmt: skip
-    cover, is_sky = _clouds(stage, towards, height)
+    share = (height.clamp(0, 1) ** 0.33)[:, None]
+    color = torch.lerp(horizon.expand(len(height), 3), zenith.expand(len(height), 3), share)
+    far = towards / height.clamp(min=0.03)[:, None]
+    u, v = far[:, 0] * 0.05 + weather.shift[0], far[:, 2] * 0.05 + weather.shift[1]
+    density = _looked_up(textures().clouds, u, v)
+    cover = torch.sigmoid(3 * (density - 1.4 + 2.2 * weather.cloud)) * (height * 6).clamp(0, 1)
     lit = (horizon * 0.9 + sun_color * 0.12).expand_as(color)
     color = torch.lerp(color, lit, (0.8 * cover)[:, None])
     toward_sun = (towards @ stage.to_sun).clamp(min=0)
@@ -377,25 +292,13 @@ def sky_light(
         glow = glow + 4 * toward_sun**1500
     color = color + glow[:, None] * sun_color
     ground = 0.3 * (horizon + 0.25 * sun_color) * 0.5
-    return torch.where(is_sky[:, None], color, ground.expand_as(color))
-
-
-def _clouds(
-    stage: Stage, towards: Float[Tensor, "n 3"], height: Float[Tensor, " n"]
-) -> tuple[Float[Tensor, " n"], Bool[Tensor, " n"]]:
-    weather = stage.scene.weather
-    is_sky = height > -0.02
-    far = towards / height.clamp(min=0.03)[:, None]
-    u, v = far[:, 0] * 0.05 + weather.shift[0], far[:, 2] * 0.05 + weather.shift[1]
-    density = _looked_up(textures().clouds, u, v)
-    cover = torch.sigmoid(3 * (density - 1.4 + 2.2 * weather.cloud))
-    return cover * (height * 6).clamp(0, 1), is_sky
+    return torch.where((height > -0.02)[:, None], color, ground.expand_as(color))
 
 
 _PATCH_M = 9.0
 
 
-def paint_road(
+def _paint_road(
     scene: StreetScene,
     albedo: Float[Tensor, "n 3"],
     place_m: Float[Tensor, "n 2"],
@@ -405,13 +308,28 @@ def paint_road(
     """Give the colour of the asphalt with what is painted on it, at places (x, s) of the road.
 
     Lines are narrower than a pixel far away, so they cover it by the share of its footprint, which
-    has this width and length.
+    has this width and length. It is darker where wheels roll, where it was mended, and on covers.
     """
     x, s = place_m.unbind(1)
     cover = _cover(scene.markings, x, s, width_m, length_m)
     wear = torch.sigmoid(3 * (_looked_up(textures().stains, x * 0.13, s * 0.13) + 1.4))
     paint = (cover * scene.markings.brightness * (0.3 + 0.7 * wear))[:, None]
-    worn = albedo * _wear(scene, x, s)[:, None]
+    first, lane_m = scene.markings.wheel_tracks
+    within = ((x - first) / lane_m) % 1
+    left, right = (torch.exp(-(((within - at) / 0.09) ** 2)) for at in (0.25, 0.75))
+    factor = 1 - 0.08 * (left + right)
+    cell = torch.floor(s / _PATCH_M)
+    chance = torch.sin(cell * 12.9898 + 97 * scene.weather.shift[0]) * 43758.5453
+    chance = chance - chance.floor()
+    along = s - cell * _PATCH_M
+    middle = first + chance * 2 * lane_m
+    is_patch = ((x - middle).abs() < 0.5 + chance) & ((along - 4).abs() < 1 + 2.5 * chance)
+    factor = torch.where(is_patch & (chance > 0.6), factor * (0.45 + 0.45 * chance), factor)
+    is_cover = ((x - middle) ** 2 + (along - 2) ** 2 < 0.1) & (chance < 0.35)
+    factor = torch.where(is_cover, factor * 0.5, factor)
+    # Tar in the seams between lanes.
+    seam = torch.exp(-(((within - 0.02 - 0.015 * torch.sin(s * 0.7)) / 0.012) ** 2))
+    worn = albedo * (factor * (1 - 0.35 * seam * (scene.weather.shift[1] > 0.5)))[:, None]
     return torch.lerp(worn, worn.new_tensor([0.8, 0.8, 0.77]).expand_as(worn), paint)
 
 
@@ -438,28 +356,6 @@ def _inside(off: Tensor, half: float, foot: Tensor) -> Tensor:
     """Share of a footprint that lies within ``half`` of a line."""
     foot = foot.clamp(min=1e-3)
     return ((half - off.abs()) / foot + 0.5).clamp(0, 1) * (2 * half / foot).clamp(max=1)
-
-
-def _wear(scene: StreetScene, x: Tensor, s: Tensor) -> Float[Tensor, " n"]:
-    """Darker where wheels roll, where it was mended, and on covers."""
-    first, lane_m = scene.markings.wheel_tracks
-    within = ((x - first) / lane_m) % 1
-    tracks = torch.exp(-(((within - 0.25) / 0.09) ** 2)) + torch.exp(
-        -(((within - 0.75) / 0.09) ** 2)
-    )
-    factor = 1 - 0.08 * tracks
-    cell = torch.floor(s / _PATCH_M)
-    chance = torch.sin(cell * 12.9898 + 97 * scene.weather.shift[0]) * 43758.5453
-    chance = chance - chance.floor()
-    along = s - cell * _PATCH_M
-    middle = first + chance * 2 * lane_m
-    is_patch = ((x - middle).abs() < 0.5 + chance) & ((along - 4).abs() < 1 + 2.5 * chance)
-    factor = torch.where(is_patch & (chance > 0.6), factor * (0.45 + 0.45 * chance), factor)
-    is_cover = ((x - middle) ** 2 + (along - 2) ** 2 < 0.1) & (chance < 0.35)
-    factor = torch.where(is_cover, factor * 0.5, factor)
-    # Tar in the seams between lanes.
-    seam = torch.exp(-(((within - 0.02 - 0.015 * torch.sin(s * 0.7)) / 0.012) ** 2))
-    return factor * (1 - 0.35 * seam * (scene.weather.shift[1] > 0.5))
 
 
 def _looked_up(field: Tensor, u: Tensor, v: Tensor) -> Tensor:

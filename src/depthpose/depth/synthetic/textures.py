@@ -25,19 +25,12 @@ Color = tuple[Number, Number, Number]
 
 
 class Material(NamedTuple):
-    """How a material takes light.
+    """How a material takes light."""
 
-    Attributes:
-        variants: how many different textures there are of it.
-        specular: mirror reflection seen straight on, 0..1.
-        translucency: share of the light that comes through from behind.
-        glow: light of its own, as a share of its colour.
-    """
-
-    variants: int
-    specular: float = 0.0
-    translucency: float = 0.0
-    glow: float = 0.0
+    variants: int  # how many different textures there are of it
+    specular: float = 0.0  # mirror reflection seen straight on, 0..1
+    translucency: float = 0.0  # share of the light that comes through from behind
+    glow: float = 0.0  # light of its own, as a share of its colour
 
 
 MATERIALS: dict[str, Material] = {
@@ -64,19 +57,12 @@ LAYERS = sum(_counts)
 
 
 class Surface(NamedTuple):
-    """What a part of a mesh is covered with.
+    """What a part of a mesh is covered with."""
 
-    Attributes:
-        material: a name of ``MATERIALS``.
-        tint: colour that the texture modulates.
-        tile_m: length that one tile of the texture covers.
-        variant: which of the material's textures; any whole number.
-    """
-
-    material: str
-    tint: Color = (1.0, 1.0, 1.0)
-    tile_m: Number = 1.0
-    variant: int = 0
+    material: str  # a name of ``MATERIALS``
+    tint: Color = (1.0, 1.0, 1.0)  # colour that the texture modulates
+    tile_m: Number = 1.0  # length that one tile of the texture covers
+    variant: int = 0  # which of the material's textures; any whole number
 
     @property
     def layer(self) -> int:
@@ -91,23 +77,18 @@ LEVELS = 9
 
 Plane = Float[np.ndarray, "256 256"]
 Picture = Float[np.ndarray, "256 256 3"]
+_y, _x = np.mgrid[:SIDE_PX, :SIDE_PX].astype(np.float32) / SIDE_PX
+"""Places in a texture, in tiles."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Textures:
-    """Every texture at every size.
+    """Every texture at every size."""
 
-    Attributes:
-        texels: all in one list, a level after the other.
-        starts: where each level begins.
-        clouds: a field of noise for clouds.
-        stains: a field of noise for unevenness over metres.
-    """
-
-    texels: Float16[Tensor, "n 3"]
-    starts: Int[Tensor, " levels"]
-    clouds: Float[Tensor, "256 256"]
-    stains: Float[Tensor, "256 256"]
+    texels: Float16[Tensor, "n 3"]  # all in one list, a level after the other
+    starts: Int[Tensor, " levels"]  # where each level begins
+    clouds: Float[Tensor, "256 256"]  # a field of noise for clouds
+    stains: Float[Tensor, "256 256"]  # a field of noise for unevenness over metres
 
 
 @cache
@@ -117,7 +98,10 @@ def textures() -> Textures:
     stack = np.ones((LAYERS, SIDE_PX, SIDE_PX, 3), np.float32)
     for name, material in MATERIALS.items():
         for variant in range(material.variants):
-            stack[FIRST_LAYER[name] + variant] = _PAINTERS[name](_Noise(rng), variant)
+            painted = _PAINTERS[name](_Noise(rng), variant)
+            stack[FIRST_LAYER[name] + variant] = (
+                painted if painted.ndim == 3 else painted[..., None]
+            )
     level, levels = np.clip(stack, 0.02, 3), []
     for _ in range(LEVELS):
         levels.append(level.reshape(-1, 3))
@@ -139,14 +123,7 @@ def sample_texture(
     uv: Float[Tensor, "n 2"],
     level: Float[Tensor, " n"],
 ) -> Float[Tensor, "n 3"]:
-    """Look textures up, bilinearly in the nearest level.
-
-    Args:
-        textures: all of them.
-        layer: which texture.
-        uv: where, in tiles.
-        level: 0 the largest picture, 1 the one of half its size, ...
-    """
+    """Look textures up, bilinearly in the nearest level; 0 is the largest picture, 1 half of it."""
     whole = level.round().clamp(0, LEVELS - 1).long()
     side = SIDE_PX >> whole
     place = uv * side[:, None] - 0.5
@@ -158,11 +135,10 @@ def sample_texture(
     left, right = column & mask, (column + 1) & mask
     above, below = start + (row & mask) * side, start + ((row + 1) & mask) * side
     texels = textures.texels
-    corners = (
+    a, b, c, d = (
         texels.index_select(0, index).float()
         for index in (above + left, above + right, below + left, below + right)
     )
-    a, b, c, d = corners
     across, down = share[:, :1], share[:, 1:]
     top, bottom = torch.lerp(a, b, across), torch.lerp(c, d, across)
     return torch.lerp(top, bottom, down)
@@ -203,11 +179,10 @@ class _Noise:
         self, rows: int, columns: int, joint: Number, spread: Number
     ) -> tuple[Plane, Picture, Plane]:
         """A bond: 1 on the bricks and 0 in the joints, a shade for each, the height in its row."""
-        y, x = np.mgrid[:SIDE_PX, :SIDE_PX].astype(np.float32) / SIDE_PX
-        row = np.floor(y * rows).astype(int)
-        across = x * columns + 0.5 * (row % 2)
+        row = np.floor(_y * rows).astype(int)
+        across = _x * columns + 0.5 * (row % 2)
         column = np.floor(across).astype(int) % columns
-        in_row, in_column = (y * rows) % 1, across % 1
+        in_row, in_column = (_y * rows) % 1, across % 1
         edge = np.minimum(
             np.minimum(in_column, 1 - in_column) * rows / columns, np.minimum(in_row, 1 - in_row)
         )
@@ -217,34 +192,34 @@ class _Noise:
         return is_brick, shade[row, column].astype(np.float32), in_row
 
 
-def _grey(plane: Plane) -> Picture:
-    return np.repeat(plane[..., None], 3, 2)
+Painter = Callable[[_Noise, int], Plane | Picture]
+"""Paints one variant of a texture, grey or in colours."""
 
 
-def _mottled(**shares: float) -> Callable[[_Noise, int], Picture]:
+def _mottled(**shares: float) -> Painter:
     """Grey with noise of the named kinds, drawn in their order."""
 
-    def paint(noise: _Noise, _variant: int) -> Picture:
+    def paint(noise: _Noise, _variant: int) -> Plane:
         plane = np.ones((SIDE_PX, SIDE_PX), np.float32)
         for kind, share in shares.items():
             plane = plane + share * getattr(noise, kind)()
-        return _grey(plane)
+        return plane
 
     return paint
 
 
-def _road(noise: _Noise, variant: int) -> Picture:
-    cracks = np.clip(1 - np.abs(noise.smooth(1.8, (2, 60))) / 0.035, 0, 1) * np.clip(
-        noise.broad() - 0.4 * variant % 1, 0, 1
-    )
+def _road(noise: _Noise, variant: int) -> Plane:
+    cracks = np.clip(1 - np.abs(noise.smooth(1.8, (2, 60))) / 0.035, 0, 1)
+    cracks = cracks * np.clip(noise.broad() - 0.4 * variant % 1, 0, 1)
     rough, fine, broad = noise.rough(), noise.fine(), noise.broad()
-    return _grey(1 + (0.24 + 0.05 * variant) * fine + 0.14 * rough + 0.06 * broad - 0.6 * cracks)
+    return 1 + (0.24 + 0.05 * variant) * fine + 0.14 * rough + 0.06 * broad - 0.6 * cracks
 
 
 def _pavement(noise: _Noise, variant: int) -> Picture:
     rows, columns = ((4, 4), (12, 6), (8, 8))[variant]
     is_slab, shade, _ = noise.bricks(rows, columns, 0.05, 0.07)
-    return shade * _grey((1 + 0.08 * noise.rough() + 0.14 * noise.fine()) * (0.55 + 0.45 * is_slab))
+    grains = 1 + 0.08 * noise.rough() + 0.14 * noise.fine()
+    return shade * (grains * (0.55 + 0.45 * is_slab))[..., None]
 
 
 def _grass(noise: _Noise, variant: int) -> Picture:
@@ -257,32 +232,28 @@ def _grass(noise: _Noise, variant: int) -> Picture:
 
 def _brick(noise: _Noise, variant: int) -> Picture:
     is_brick, shade, _ = noise.bricks(24, (8, 6, 10)[variant], 0.1, 0.16)
-    wall = shade * _grey(1 + 0.1 * noise.fine() + 0.08 * noise.rough())
-    joint = _grey(1.3 + 0.08 * noise.fine()) * np.array([0.9, 1.3, 1.5])
-    return np.where(is_brick[..., None] > 0.5, wall, joint) * _grey(1 + 0.1 * noise.broad())
+    wall = shade * (1 + 0.1 * noise.fine() + 0.08 * noise.rough())[..., None]
+    joint = (1.3 + 0.08 * noise.fine())[..., None] * np.array([0.9, 1.3, 1.5])
+    return np.where(is_brick[..., None] > 0.5, wall, joint) * (1 + 0.1 * noise.broad())[..., None]
 
 
-def _plaster(noise: _Noise, variant: int) -> Picture:
+def _plaster(noise: _Noise, variant: int) -> Plane:
     streaks = np.clip(noise.smooth(2.2, (1, 60), (0.25, 1)) - 0.6, 0, 2)
     fine, rough, broad = noise.fine(), noise.rough(), noise.broad()
-    return _grey(1 + 0.05 * fine + 0.06 * rough + 0.07 * broad - (0.06 + 0.06 * variant) * streaks)
+    return 1 + 0.05 * fine + 0.06 * rough + 0.07 * broad - (0.06 + 0.06 * variant) * streaks
 
 
 def _stone(noise: _Noise, variant: int) -> Picture:
     rows, columns = ((8, 5), (6, 3), (12, 6))[variant]
     is_stone, shade, _ = noise.bricks(rows, columns, 0.06, 0.14)
-    return shade * _grey(
-        (1 + 0.09 * noise.fine() + 0.12 * noise.rough()) * (0.55 + 0.45 * is_stone)
-    )
+    grains = 1 + 0.09 * noise.fine() + 0.12 * noise.rough()
+    return shade * (grains * (0.55 + 0.45 * is_stone))[..., None]
 
 
 def _roof(noise: _Noise, variant: int) -> Picture:
     _, shade, in_row = noise.bricks((14, 20, 10)[variant], 12, 0.04, 0.13)
-    return shade * _grey((0.55 + 0.65 * in_row) * (1 + 0.09 * noise.fine() + 0.1 * noise.broad()))
-
-
-def _bark(noise: _Noise, _variant: int) -> Picture:
-    return _grey(1 + 0.38 * noise.smooth(1.2, (4, 128), (0.18, 1)) + 0.12 * noise.fine())
+    grains = 1 + 0.09 * noise.fine() + 0.1 * noise.broad()
+    return shade * ((0.55 + 0.65 * in_row) * grains)[..., None]
 
 
 def _leaf(noise: _Noise, _variant: int) -> Picture:
@@ -295,65 +266,50 @@ def _leaf(noise: _Noise, _variant: int) -> Picture:
 def _wood(noise: _Noise, variant: int) -> Picture:
     is_board, shade, _ = noise.bricks(1, 6, 0.03 * variant + 1e-3, 0.08)
     grain = 0.2 * noise.smooth(1.4, (2, 128), (0.15, 1)) + 0.05 * noise.fine()
-    return shade * _grey((1 + grain) * (0.5 + 0.5 * is_board))
+    return shade * ((1 + grain) * (0.5 + 0.5 * is_board))[..., None]
 
 
-def _metal(noise: _Noise, variant: int) -> Picture:
-    return _grey(1 + 0.06 * noise.fine() + (0.08 + 0.1 * variant) * noise.broad())
-
-
-def _side(noise: _Noise, variant: int) -> Picture:
+def _side(noise: _Noise, variant: int) -> Plane:
     """A car's flank from rear (u = 0) to front, sill (v = 0) to roof: doors, handles, a strip."""
-    y, x = np.mgrid[:SIDE_PX, :SIDE_PX].astype(np.float32) / SIDE_PX
-    picture = 1 + 0.04 * noise.broad() + 0.1 * np.clip((y - 0.2) * 2, -0.5, 0.6)
-    gap = lambda where, width: np.clip(1 - np.abs(x - where) / width, 0, 1)  # noqa: E731
-    is_door = (y > 0.16) & (y < 0.62)
+    picture = 1 + 0.04 * noise.broad() + 0.1 * np.clip((_y - 0.2) * 2, -0.5, 0.6)
+    is_door = (_y > 0.16) & (_y < 0.62)
     for where in ((0.3, 0.5, 0.7), (0.34, 0.68), (0.28, 0.49, 0.72))[variant]:
-        picture -= 0.8 * gap(where, 0.006) * is_door
-        handle = (np.abs(x - where - 0.04) < 0.018) & (np.abs(y - 0.52) < 0.01)
+        picture -= 0.8 * np.clip(1 - np.abs(_x - where) / 0.006, 0, 1) * is_door
+        handle = (np.abs(_x - where - 0.04) < 0.018) & (np.abs(_y - 0.52) < 0.01)
         picture[handle] = 0.35
-    picture[np.abs(y - 0.34) < 0.012 * (variant > 0)] *= 0.55
-    picture[y < 0.15] *= 0.3
-    dirt = np.clip((0.32 - y) * 3, 0, 1) * (0.5 + 0.3 * noise.rough())
-    return _grey(picture * (1 - 0.35 * dirt))
+    picture[np.abs(_y - 0.34) < 0.012 * (variant > 0)] *= 0.55
+    picture[_y < 0.15] *= 0.3
+    dirt = np.clip((0.32 - _y) * 3, 0, 1) * (0.5 + 0.3 * noise.rough())
+    return picture * (1 - 0.35 * dirt)
 
 
-def _pane(noise: _Noise, variant: int) -> Picture:
+def _pane(noise: _Noise, variant: int) -> Plane:
     """Curtains, blinds, or the dark of a room."""
-    y, x = np.mgrid[:SIDE_PX, :SIDE_PX].astype(np.float32) / SIDE_PX
-    curtain = np.clip(np.abs(x - 0.5) * 2 - 0.55, 0, 1) * 2.5 * (1 + 0.3 * np.sin(x * 90))
-    blind = 0.35 * np.sign(np.sin(y * np.pi * 40)) * (y > (0.2, 0.55, 2)[variant])
-    return _grey(0.75 + 0.4 * y + 0.15 * noise.broad() + curtain * (variant != 1) + blind)
+    curtain = np.clip(np.abs(_x - 0.5) * 2 - 0.55, 0, 1) * 2.5 * (1 + 0.3 * np.sin(_x * 90))
+    blind = 0.35 * np.sign(np.sin(_y * np.pi * 40)) * (_y > (0.2, 0.55, 2)[variant])
+    return 0.75 + 0.4 * _y + 0.15 * noise.broad() + curtain * (variant != 1) + blind
 
 
-def _wheel(_noise: _Noise, variant: int) -> Picture:
-    y, x = np.mgrid[:SIDE_PX, :SIDE_PX].astype(np.float32) / SIDE_PX - 0.5
+def _wheel(_noise: _Noise, variant: int) -> Plane:
+    y, x = _y - 0.5, _x - 0.5
     turn, out = np.arctan2(y, x), np.hypot(x, y)
     spokes = np.cos(turn * (5, 7)[variant]) > -0.1
-    return _grey(np.where((spokes | (out > 0.42) | (out < 0.12)), 1.1, 0.15).astype(np.float32))
+    return np.where((spokes | (out > 0.42) | (out < 0.12)), 1.1, 0.15).astype(np.float32)
 
 
 def _plate(noise: _Noise, _variant: int) -> Picture:
     picture = np.ones((SIDE_PX, SIDE_PX, 3), np.float32)
-    for k in range(7):
-        x = 22 + k * 31
+    for x in range(22, 22 + 7 * 31, 31):
         picture[10:50, x : x + int(noise.rng.integers(8, 22))] = 0.08
     picture[:, :14] = (0.1, 0.2, 0.9)
     return picture
 
 
-def _lamp(noise: _Noise, _variant: int) -> Picture:
-    x = np.arange(SIDE_PX, dtype=np.float32)[None] / SIDE_PX
-    return _grey(1 + 0.15 * np.sign(np.sin(x * 40 * np.pi)) + 0 * noise.broad())
-
-
 def _sign(noise: _Noise, variant: int) -> Picture:
     """Dark figures on a light ground: bars, arrows, words."""
-    picture = np.ones((SIDE_PX, SIDE_PX, 3), np.float32)
-    rng = noise.rng
-    color = np.array([(0.1, 0.1, 0.1), (0.05, 0.05, 0.05), (1.0, 0.08, 0.08), (0.1, 0.2, 0.9)])[
-        variant % 4
-    ]
+    picture, rng = np.ones((SIDE_PX, SIDE_PX, 3), np.float32), noise.rng
+    colors = [(0.1, 0.1, 0.1), (0.05, 0.05, 0.05), (1.0, 0.08, 0.08), (0.1, 0.2, 0.9)]
+    color = np.array(colors[variant % 4])
     for _ in range((3, 5, 8, 14, 24, 4)[variant]):
         width, height = rng.integers(10, 110), rng.integers(8, 60)
         x, y = rng.integers(30, 220 - width // 2), rng.integers(30, 220 - height // 2)
@@ -362,8 +318,7 @@ def _sign(noise: _Noise, variant: int) -> Picture:
 
 
 def _poster(noise: _Noise, _variant: int) -> Picture:
-    picture = np.ones((SIDE_PX, SIDE_PX, 3), np.float32)
-    rng = noise.rng
+    picture, rng = np.ones((SIDE_PX, SIDE_PX, 3), np.float32), noise.rng
     for _ in range(50):
         width, height = rng.integers(6, 90), rng.integers(4, 60)
         x, y = rng.integers(0, SIDE_PX, 2)
@@ -371,27 +326,25 @@ def _poster(noise: _Noise, _variant: int) -> Picture:
     return picture
 
 
-def _cloth(noise: _Noise, variant: int) -> Picture:
-    x = np.arange(SIDE_PX, dtype=np.float32)[None] / SIDE_PX
-    stripes = np.sign(np.sin(x * 2 * np.pi * 6)) * (0, 0.18, 0, 0.3)[variant]
+def _cloth(noise: _Noise, variant: int) -> Plane:
+    stripes = np.sign(np.sin(_x[:1] * 2 * np.pi * 6)) * (0, 0.18, 0, 0.3)[variant]
     folds = noise.smooth(2.0, (2, 30), (0.4, 1))
-    return _grey(1 + 0.16 * folds + 0.07 * noise.fine() + stripes)
-
-
-def _hills(noise: _Noise, _variant: int) -> Picture:
-    return _grey(1 + 0.4 * noise.smooth(1.0, (16, 128)) + 0.15 * noise.broad())
+    return 1 + 0.16 * folds + 0.07 * noise.fine() + stripes
 
 
 _dirt = _mottled(rough=0.2, fine=0.18, broad=0.12)
-_PAINTERS = {
+_PAINTERS: dict[str, Painter] = {
     "road": _road, "pavement": _pavement, "grass": _grass, "dirt": _dirt, "curb": _dirt,
-    "brick": _brick, "plaster": _plaster, "stone": _stone, "roof": _roof, "bark": _bark,
-    "leaf": _leaf, "wood": _wood, "metal": _metal, "side": _side, "pane": _pane,
-    "wheel": _wheel, "plate": _plate, "lamp": _lamp, "sign": _sign, "poster": _poster,
-    "cloth": _cloth, "hills": _hills,
+    "brick": _brick, "plaster": _plaster, "stone": _stone, "roof": _roof,
+    "leaf": _leaf, "wood": _wood, "side": _side, "pane": _pane,
+    "wheel": _wheel, "plate": _plate, "sign": _sign, "poster": _poster, "cloth": _cloth,
     "concrete": _mottled(fine=0.07, rough=0.09, broad=0.08),
     "paint": _mottled(broad=0.03, fine=0.012),
     "glass": _mottled(broad=0.15),
     "tyre": _mottled(fine=0.2, rough=0.15),
     "skin": _mottled(broad=0.06),
+    "bark": lambda n, _: 1 + 0.38 * n.smooth(1.2, (4, 128), (0.18, 1)) + 0.12 * n.fine(),
+    "metal": lambda n, variant: 1 + 0.06 * n.fine() + (0.08 + 0.1 * variant) * n.broad(),
+    "lamp": lambda n, _: 1 + 0.15 * np.sign(np.sin(_x * 40 * np.pi)) + 0 * n.broad(),
+    "hills": lambda n, _: 1 + 0.4 * n.smooth(1.0, (16, 128)) + 0.15 * n.broad(),
 }  # fmt: skip

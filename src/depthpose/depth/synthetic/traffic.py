@@ -15,26 +15,15 @@ from depthpose.depth.synthetic.models import add_ball
 from depthpose.depth.synthetic.road import Road
 from depthpose.depth.synthetic.textures import Color, Number, Surface
 
-Ring = Float[np.ndarray, "10 3"]
-
 
 class Body(NamedTuple):
-    """The shape of a kind of vehicle.
+    """The shape of a kind of vehicle; lengths and heights of its parts are shares of its own."""
 
-    Attributes:
-        size_m: length, width and height.
-        stations: share of the length (-0.5 rear, 0.5 front), and heights of belt and roof as
-            shares of the height.
-        glazed: stations between this pair have windows.
-        wheels: shares of the length where the axles are.
-        share: how often it is met.
-    """
-
-    size_m: tuple[Number, Number, Number]
-    stations: tuple[tuple[Number, Number, Number], ...]
-    glazed: tuple[int, int]
-    wheels: tuple[float, ...]
-    share: Number
+    size_m: tuple[Number, Number, Number]  # length, width and height
+    stations: tuple[tuple[Number, Number, Number], ...]  # length (rear -0.5), belt, roof
+    glazed: tuple[int, int]  # stations between this pair have windows
+    wheels: tuple[float, ...]  # where the axles are
+    share: Number  # how often it is met
 
 
 _HATCH = ((-0.5, 0.4, 0.45), (-0.49, 0.6, 0.62), (-0.45, 0.62, 0.66), (-0.35, 0.62, 0.96),
@@ -71,53 +60,49 @@ _PAINTS: list[tuple[Color, float]] = [
 _BLACK = Surface("tyre", (0.02, 0.02, 0.022))
 
 
-def paint_color(rng: np.random.Generator) -> Color:
-    """Draw a colour of cars: silver, black, grey and white before all others."""
-    shares = np.array([share for _, share in _PAINTS])
-    color, _ = _PAINTS[rng.choice(len(_PAINTS), p=shares / shares.sum())]
-    light = rng.uniform(0.8, 1.15)
-    return color[0] * light, color[1] * light, color[2] * light
-
-
-def draw_kind(rng: np.random.Generator) -> str:
-    """Draw a kind of vehicle."""
-    shares = np.array([body.share for body in BODIES.values()])
-    return list(BODIES)[rng.choice(len(shares), p=shares / shares.sum())]
-
-
 @cache
 def vehicle(kind: str, number: int) -> Mesh:
     """Give model ``number`` of a kind, white, looking along z."""
-    rng = np.random.default_rng([21, list(BODIES).index(kind), number])
+    b = MeshBuilder(np.random.default_rng([21, list(BODIES).index(kind), number]))
     body = BODIES[kind]
-    size = np.array(body.size_m) * rng.uniform(0.95, 1.05, 3)
-    builder = MeshBuilder()
-    _shell(builder, rng, body, size)
-    _wheels(builder, body, size, number)
-    _trim(builder, size)
-    return builder.finish()
-
-
-def _shell(
-    builder: MeshBuilder, rng: np.random.Generator, body: Body, size: Float[np.ndarray, "3"]
-) -> None:
+    size = np.array(body.size_m) * b.rng.uniform(0.95, 1.05, 3)
     shift = np.zeros((len(body.stations), 3))
-    shift[2:-2, 0] = rng.normal(0, 0.008, len(shift) - 4)
+    shift[2:-2, 0] = b.rng.normal(0, 0.008, len(shift) - 4)
     stations = np.array(body.stations) + shift
     rings = [_ring(station, size) for station in stations]
     for i, (rear, front) in enumerate(pairwise(rings)):
         is_glazed = body.glazed[0] <= i < body.glazed[1]
         is_steep = abs(stations[i + 1, 2] - stations[i, 2]) > 0.2
         for j in range(9):
-            is_window = is_glazed and (j in (2, 6) or (is_steep and j in (3, 4, 5)))
-            _panel(builder, (rear, front), j, size, is_window=bool(is_window))
+            face = np.stack([rear[j], rear[j + 1], front[j + 1], front[j]])
+            if is_glazed and (j in (2, 6) or (is_steep and j in (3, 4, 5))):
+                _add_window(b, face)
+            elif j in (3, 4, 5):
+                b.quads([face], [np.stack([face[:, 0], face[:, 2]], -1)], Surface("paint"))
+            else:
+                uv = np.stack([face[:, 2] / size[0] + 0.5, -face[:, 1] / size[2]], -1)
+                b.quads([face], [uv], Surface("side", variant=int(size[0] * 100)))
     for ring in (rings[0], rings[-1]):
         hub = np.broadcast_to(ring.mean(0), ring.shape)
         faces = np.stack([hub, ring, np.roll(ring, -1, 0)], 1)
-        builder.triangles(faces, faces[..., :2], Surface("paint"))
+        b.triangles(faces, faces[..., :2], Surface("paint"))
+    radius = 0.31 if size[2] < 2.5 else 0.47
+    rim = Surface("wheel", (0.4, 0.41, 0.43), 1.0, number)
+    for side in (-1, 1):
+        axis = (side, 0, 0)
+        for share in body.wheels:
+            hub = np.array([side * (size[1] / 2 + 0.01), -radius, share * size[0]])
+            b.disc(hub - [side * 0.004, 0.02, 0], axis, radius * 1.18, _BLACK, 16)
+            b.tube(hub - [side * 0.22, 0, 0], hub, radius, _BLACK, 16)
+            b.disc(hub + np.array([side * 0.003, 0, 0]), axis, radius, _BLACK, 16)
+            b.disc(hub + np.array([side * 0.012, 0, 0]), axis, radius * 0.66, rim, 12)
+    _add_trim(b, *size)
+    return b.finish()
 
 
-def _ring(station: Float[np.ndarray, "3"], size: Float[np.ndarray, "3"]) -> Ring:
+def _ring(
+    station: Float[np.ndarray, "3"], size: Float[np.ndarray, "3"]
+) -> Float[np.ndarray, "10 3"]:
     """One cross-section: sill, flank, belt, roof edge and roof of one side, then the other's."""
     length, width, height = size
     place, belt, roof = station[0], station[1] * height, station[2] * height
@@ -131,30 +116,10 @@ def _ring(station: Float[np.ndarray, "3"], size: Float[np.ndarray, "3"]) -> Ring
     return np.array(one + [(-a, b, c) for a, b, c in reversed(one)])
 
 
-def _panel(
-    builder: MeshBuilder,
-    rings: tuple[Ring, Ring],
-    j: int,
-    size: Float[np.ndarray, "3"],
-    *,
-    is_window: bool,
-) -> None:
-    face = np.stack([rings[0][j], rings[0][j + 1], rings[1][j + 1], rings[1][j]])
-    if is_window:
-        _window(builder, face)
-        return
-    is_flank = j in (0, 1, 2, 6, 7, 8)
-    uv = np.stack([face[:, 2] / size[0] + 0.5, -face[:, 1] / size[2]], -1)
-    # The roof's picture starts at the top of the side's, where there is plain paint.
-    uv = uv if is_flank else np.stack([face[:, 0], face[:, 2]], -1)
-    surface = Surface("side", variant=int(size[0] * 100)) if is_flank else Surface("paint")
-    builder.quads([face], [uv], surface)
-
-
-def _window(builder: MeshBuilder, face: Float[np.ndarray, "4 3"]) -> None:
-    """A pane in a painted frame, so that pillars part the windows."""
+def _add_window(b: MeshBuilder, face: Float[np.ndarray, "4 3"]) -> None:
+    """A pane in a painted frame, so that pillars part the windows; it looks outwards."""
     uv = [[0, 0], [1, 0], [1, 1], [0, 1]]
-    builder.quads([face], [uv], Surface("tyre", (0.015, 0.015, 0.017)))
+    b.quads([face], [uv], Surface("tyre", (0.015, 0.015, 0.017)))
     middle = face.mean(0)
     outward = np.cross(face[1] - face[0], face[3] - face[0])
     outward *= 0.006 / (np.linalg.norm(outward) + 1e-9)
@@ -162,47 +127,30 @@ def _window(builder: MeshBuilder, face: Float[np.ndarray, "4 3"]) -> None:
     # Towards the outside: a body's panes look away from its middle.
     if outward @ (middle - np.array([0, middle[1] * 0.5, 0])) < 0:
         outward = -outward
-    builder.quads(
-        [middle + (face - middle) * 0.93 + outward], [uv], Surface("glass", (0.03, 0.035, 0.04))
-    )
+    pane = middle + (face - middle) * 0.93 + outward
+    b.quads([pane], [uv], Surface("glass", (0.03, 0.035, 0.04)))
 
 
-def _wheels(builder: MeshBuilder, body: Body, size: Float[np.ndarray, "3"], number: int) -> None:
-    radius = 0.31 if size[2] < 2.5 else 0.47
-    rim = Surface("wheel", (0.4, 0.41, 0.43), 1.0, number)
-    for side in (-1, 1):
-        outside = side * (size[1] / 2 + 0.01)
-        for share in body.wheels:
-            hub = np.array([outside, -radius, share * size[0]])
-            inside = hub - [side * 0.22, 0, 0]
-            arch = hub - [side * 0.004, 0.02, 0]
-            builder.disc(arch, (side, 0, 0), radius * 1.18, _BLACK, 16)
-            builder.tube(inside, hub, (radius, radius), _BLACK, 16)
-            builder.disc(hub + np.array([side * 0.003, 0, 0]), (side, 0, 0), radius, _BLACK, 16)
-            builder.disc(hub + np.array([side * 0.012, 0, 0]), (side, 0, 0), radius * 0.66, rim, 12)
-
-
-def _trim(builder: MeshBuilder, size: Float[np.ndarray, "3"]) -> None:
-    length, width, height = size
-    low = min(height, 1.6)
+def _add_trim(b: MeshBuilder, length: float, width: float, height: float) -> None:
+    """Lights, mirrors, plates and bumpers."""
+    low, sill = min(height, 1.6), 0.16 * min(height, 1.8) + 0.03
     white, red = Surface("lamp", (0.8, 0.81, 0.83)), Surface("lamp", (0.4, 0.02, 0.02))
-    sill = 0.16 * min(height, 1.8) + 0.03
-    builder.box((0, -sill + 0.02, 0), (width * 0.9, 0.14, length * 0.94), _BLACK)
+    b.box((0, -sill + 0.02, 0), (width * 0.9, 0.14, length * 0.94), _BLACK)
     for side in (-1, 1):
         front, rear = side * width * 0.36, side * width * 0.4
-        builder.box((front, -0.46 * low, 0.487 * length), (0.32, 0.13, 0.08), white)
-        builder.box((rear, -0.55 * low, -0.488 * length), (0.2, 0.22, 0.06), red)
+        b.box((front, -0.46 * low, 0.487 * length), (0.32, 0.13, 0.08), white)
+        b.box((rear, -0.55 * low, -0.488 * length), (0.2, 0.22, 0.06), red)
         mirror = (side * (width / 2 + 0.08), -0.66 * min(height, 2), 0.2 * length)
-        builder.box(mirror, (0.18, 0.13, 0.1), Surface("paint"))
+        b.box(mirror, (0.18, 0.13, 0.1), Surface("paint"))
     plate = Surface("plate", (0.8, 0.8, 0.76), 0.52)
-    builder.box((0, -0.42 * low, -0.502 * length), (0.52, 0.12, 0.03), plate)
-    builder.box((0, -0.28 * low, 0.503 * length), (0.52, 0.12, 0.03), plate)
-    builder.box((0, -0.33 * low, 0.495 * length), (width * 0.55, 0.12, 0.04), _BLACK)
-    builder.box((0, -0.24 * low, -0.496 * length), (width * 0.94, 0.16, 0.06), _BLACK)
+    b.box((0, -0.42 * low, -0.502 * length), (0.52, 0.12, 0.03), plate)
+    b.box((0, -0.28 * low, 0.503 * length), (0.52, 0.12, 0.03), plate)
+    b.box((0, -0.33 * low, 0.495 * length), (width * 0.55, 0.12, 0.04), _BLACK)
+    b.box((0, -0.24 * low, -0.496 * length), (width * 0.94, 0.16, 0.06), _BLACK)
     if height > 1.9:  # what is loft from glass elsewhere stands upright here
         pane = Surface("glass", (0.03, 0.03, 0.035))
         where = (0, -0.74 * height, -0.499 * length)
-        builder.box(where, (width * 0.72, height * 0.28, 0.02), pane)
+        b.box(where, (width * 0.72, height * 0.28, 0.02), pane)
 
 
 WALKERS = 10
@@ -216,109 +164,95 @@ _RUBBER = Surface("tyre", (0.025, 0.025, 0.028))
 @cache
 def walker(number: int) -> Mesh:
     """Give a person on foot, looking along z, caught at some moment of a step."""
-    rng = np.random.default_rng([31, number])
-    builder = MeshBuilder()
-    height, step = rng.uniform(1.55, 1.9), rng.uniform(-0.28, 0.28)
-    coat, trousers = _cloth(rng, 0.45), _cloth(rng, 0.22)
+    b = MeshBuilder(np.random.default_rng([31, number]))
+    height, step = b.rng.uniform(1.55, 1.9), b.rng.uniform(-0.28, 0.28)
+    coat, trousers = _cloth(b, 0.45), _cloth(b, 0.22)
     for side in (-1, 1):
         foot, hip = (side * 0.1, -0.04, side * step), np.array([side * 0.09, -0.48 * height, 0])
-        builder.tube(foot, hip, (0.06, 0.09), trousers)
-        builder.box((foot[0], -0.04, foot[2] + 0.05), (0.09, 0.08, 0.26), _RUBBER)
+        b.tube(foot, hip, (0.06, 0.09), trousers)
+        b.box((foot[0], -0.04, foot[2] + 0.05), (0.09, 0.08, 0.26), _RUBBER)
         hand = (side * 0.27, -0.47 * height, -side * step * 0.8)
-        builder.tube(hand, (side * 0.2, -0.81 * height, 0), (0.045, 0.06), coat)
-    _trunk(builder, rng, (0, -0.48 * height, 0), (0, -0.82 * height, 0.02), coat)
-    _head(builder, rng, (0, -0.93 * height, 0.03))
-    if rng.random() < 0.4:
-        builder.box((0.3, -0.4 * height, 0), (0.12, 0.3, 0.34), _cloth(rng, 0.4))
-    return builder.finish()
+        b.tube(hand, (side * 0.2, -0.81 * height, 0), (0.045, 0.06), coat)
+    hip, neck = np.array([0, -0.48 * height, 0]), np.array([0, -0.82 * height, 0.02])
+    _add_upper_body(b, hip, neck, np.array([0, -0.93 * height, 0.03]), coat)
+    if b.rng.random() < 0.4:
+        b.box((0.3, -0.4 * height, 0), (0.12, 0.3, 0.34), _cloth(b, 0.4))
+    return b.finish()
 
 
 @cache
 def rider(number: int) -> Mesh:
     """Give a person on a bicycle, riding along z."""
-    rng = np.random.default_rng([32, number])
-    builder = MeshBuilder()
-    frame = Surface("metal", tuple(rng.uniform(0.03, 0.4, 3)))
-    _bicycle(builder, frame)
-    coat, trousers = _cloth(rng, 0.45), _cloth(rng, 0.22)
-    hip, neck = np.array([0, -0.98, -0.22]), np.array([0, -1.5, 0.02])
-    for side in (-1, 1):
-        knee, pedal = (side * 0.1, -0.68, 0.15), (side * 0.1, -0.28 - 0.13 * side, 0.0)
-        builder.tube(pedal, knee, (0.05, 0.065), trousers)
-        builder.tube(knee, hip + np.array([side * 0.08, 0, 0]), (0.065, 0.09), trousers)
-        builder.tube(
-            (side * 0.25, -1.08, 0.42), neck + np.array([side * 0.18, 0, 0]), (0.04, 0.055), coat
-        )
-    _trunk(builder, rng, tuple(hip), tuple(neck), coat)
-    _head(builder, rng, (0, -1.7, 0.08))
-    return builder.finish()
-
-
-def _bicycle(builder: MeshBuilder, frame: Surface) -> None:
+    b = MeshBuilder(np.random.default_rng([32, number]))
+    frame = Surface("metal", tuple(b.rng.uniform(0.03, 0.4, 3)))
     for z in (-0.52, 0.52):
         angle = np.linspace(0, 2 * np.pi, 19)
         rim = np.stack([0 * angle, -0.34 + 0.33 * np.cos(angle), z + 0.33 * np.sin(angle)], 1)
         for start, stop in pairwise(rim):
-            builder.tube(start, stop, (0.02, 0.02), _RUBBER, 4)
-        builder.tube((-0.05, -0.34, z), (0.05, -0.34, z), (0.03, 0.03), frame, 5)
+            b.tube(start, stop, 0.02, _RUBBER, 4)
+        b.tube((-0.05, -0.34, z), (0.05, -0.34, z), 0.03, frame, 5)
         for spoke in rim[:-1:3]:
-            builder.tube((0, -0.34, z), spoke, (0.005, 0.005), frame, 3)
+            b.tube((0, -0.34, z), spoke, 0.005, frame, 3)
     joints = {"rear": (-0.34, -0.52), "front": (-0.34, 0.52), "saddle": (-0.9, -0.2),
               "pedals": (-0.3, -0.02), "head": (-0.86, 0.36), "bar": (-1.05, 0.36)}  # fmt: skip
     links = ("rear saddle", "rear pedals", "pedals saddle", "pedals head", "saddle head",
              "head front", "head bar")  # fmt: skip
     for link in links:
         start, stop = ((0.0, *joints[name]) for name in link.split())
-        builder.tube(start, stop, (0.022, 0.022), frame, 5)
-    builder.tube((-0.28, -1.06, 0.36), (0.28, -1.06, 0.36), (0.016, 0.016), _RUBBER, 4)
-    builder.box((0, -0.94, -0.22), (0.16, 0.06, 0.26), _RUBBER)
+        b.tube(start, stop, 0.022, frame, 5)
+    b.tube((-0.28, -1.06, 0.36), (0.28, -1.06, 0.36), 0.016, _RUBBER, 4)
+    b.box((0, -0.94, -0.22), (0.16, 0.06, 0.26), _RUBBER)
+    coat, trousers = _cloth(b, 0.45), _cloth(b, 0.22)
+    hip, neck = np.array([0, -0.98, -0.22]), np.array([0, -1.5, 0.02])
+    for side in (-1, 1):
+        knee, pedal = (side * 0.1, -0.68, 0.15), (side * 0.1, -0.28 - 0.13 * side, 0.0)
+        b.tube(pedal, knee, (0.05, 0.065), trousers)
+        b.tube(knee, hip + np.array([side * 0.08, 0, 0]), (0.065, 0.09), trousers)
+        shoulder = neck + np.array([side * 0.18, 0, 0])
+        b.tube((side * 0.25, -1.08, 0.42), shoulder, (0.04, 0.055), coat)
+    _add_upper_body(b, hip, neck, np.array([0, -1.7, 0.08]), coat)
+    return b.finish()
 
 
-def _trunk(
-    builder: MeshBuilder, rng: np.random.Generator, hip: tuple, neck: tuple, coat: Surface
+def _add_upper_body(
+    b: MeshBuilder, hip: np.ndarray, neck: np.ndarray, head: np.ndarray, coat: Surface
 ) -> None:
-    low, high = np.array(hip), np.array(neck)
-    builder.tube(low, (low + high) / 2, (0.17, 0.2), coat, 10)
-    builder.tube((low + high) / 2, high, (0.2, 0.16), coat, 10)
-    add_ball(builder, high, (0.2, 0.09, 0.13), coat, 1)
-    if rng.random() < 0.3:
-        middle = low * 0.35 + high * 0.65 - [0, 0, 0.2]
-        builder.box(middle, (0.3, 0.42, 0.18), _cloth(rng, 0.4))
+    middle = (hip + neck) / 2
+    b.tube(hip, middle, (0.17, 0.2), coat, 10)
+    b.tube(middle, neck, (0.2, 0.16), coat, 10)
+    add_ball(b, neck, (0.2, 0.09, 0.13), coat, 1)
+    if b.rng.random() < 0.3:
+        bag = hip * 0.35 + neck * 0.65 - [0, 0, 0.2]
+        b.box(bag, (0.3, 0.42, 0.18), _cloth(b, 0.4))
+    skin = Surface("skin", _SKINS[b.rng.integers(len(_SKINS))])
+    hair = Surface("cloth", tuple(b.rng.uniform(0.01, 0.25) * np.array([1, 0.8, 0.6])))
+    b.tube(head + np.array([0, 0.2, 0]), head, 0.06, skin, 6)
+    add_ball(b, head, (0.085, 0.125, 0.1), skin, 2)
+    add_ball(b, head - [0, 0.03, 0.02], (0.098, 0.11, 0.105), hair, 2)
 
 
-def _head(builder: MeshBuilder, rng: np.random.Generator, centre: tuple) -> None:
-    middle = np.array(centre)
-    skin = Surface("skin", _SKINS[rng.integers(len(_SKINS))])
-    r, g, b = rng.uniform(0.01, 0.25) * np.array([1, 0.8, 0.6])
-    builder.tube(middle + np.array([0, 0.2, 0]), middle, (0.06, 0.06), skin, 6)
-    add_ball(builder, middle, (0.085, 0.125, 0.1), skin, 2)
-    add_ball(
-        builder, middle - [0, 0.03, 0.02], (0.098, 0.11, 0.105), Surface("cloth", (r, g, b)), 2
-    )
-
-
-def _cloth(rng: np.random.Generator, light: Number) -> Surface:
-    r, g, b = rng.uniform(0.1, 1, 3) * rng.uniform(0.15, 1) * light
-    return Surface("cloth", (r, g, b), 0.6, int(rng.integers(4)))
+def _cloth(b: MeshBuilder, light: Number) -> Surface:
+    color = b.rng.uniform(0.1, 1, 3) * b.rng.uniform(0.15, 1) * light
+    return Surface("cloth", tuple(color), 0.6, int(b.rng.integers(4)))
 
 
 _FAR_M = 110.0
 
 
-def add_traffic(builder: MeshBuilder, rng: np.random.Generator, road: Road) -> None:
+def add_traffic(b: MeshBuilder, road: Road) -> None:
     """Fill the road and its pavements."""
-    traffic = Traffic(builder, rng, road)
+    traffic = _Traffic(b, road)
     traffic.add_parked()
     traffic.add_driving()
     traffic.add_crossing()
     traffic.add_people()
 
 
-class Traffic:
+class _Traffic:
     """Vehicles and people on a road, none where another one is; every method adds to the mesh."""
 
-    def __init__(self, builder: MeshBuilder, rng: np.random.Generator, road: Road) -> None:
-        self.builder, self.rng, self.road = builder, rng, road
+    def __init__(self, b: MeshBuilder, road: Road) -> None:
+        self.b, self.rng, self.road = b, b.rng, road
         # x, s, half width and half length of the camera's own car, and of sight before it [m].
         self._taken = [(0.0, 0.5, 1.5, 4.5)]
 
@@ -373,16 +307,19 @@ class Traffic:
 
     def add_vehicle(self, x: Number, s: Number, yaw: Number) -> None:
         """A vehicle of some kind and colour, if its place is free."""
-        rng, kind = self.rng, draw_kind(self.rng)
+        rng, shares = self.rng, np.array([body.share for body in BODIES.values()])
+        kind = list(BODIES)[rng.choice(len(shares), p=shares / shares.sum())]
         length, width, _ = BODIES[kind].size_m
         c, t = abs(np.cos(yaw)), abs(np.sin(yaw))
         half_x, half_s = (width * c + length * t) / 2 + 0.1, (length * c + width * t) / 2 + 0.3
         if not self.claim(x, s, half_x, half_s):
             return
-        color = paint_color(rng)
+        shares = np.array([share for _, share in _PAINTS])
+        color, _ = _PAINTS[rng.choice(len(_PAINTS), p=shares / shares.sum())]
+        color = tuple(np.array(color) * rng.uniform(0.8, 1.15))
         model = vehicle(kind, int(rng.integers(MODELS)))
         tints = {"paint": color, "side": color}
-        self.builder.add(place(model, (x, 0, s), yaw, rng.uniform(0.96, 1.04, 3), tints))
+        self.b.add(place(model, (x, 0, s), yaw, rng.uniform(0.96, 1.04, 3), tints))
 
     def add_people(self) -> None:
         """People on foot, on the pavement and now and then the road, and on bicycles."""
@@ -400,11 +337,11 @@ class Traffic:
             turns = rng.choice([0, np.pi, np.pi / 2, -np.pi / 2], p=[0.35, 0.35, 0.15, 0.15])
             yaw = float(turns) + rng.normal(0, 0.2) + (np.pi / 2 if on_road else 0)
             y = 0.0 if on_road else -road.curb_m
-            self.builder.add(place(walker(int(rng.integers(WALKERS))), (x, y, s), yaw))
+            self.b.add(place(walker(int(rng.integers(WALKERS))), (x, y, s), yaw))
         for _ in range(int(rng.poisson(mean * 0.3))):
             side = int(rng.choice([-1, 1]))
             x = road.edge_m(side) - side * (road.parking_m[(side + 1) // 2] + rng.uniform(0.3, 0.9))
             s = rng.uniform(6, 45)
             if self.claim(x, s, 0.4, 1.0):
                 yaw = rng.normal(0, 0.08) + (0 if side > 0 else np.pi)
-                self.builder.add(place(rider(int(rng.integers(RIDERS))), (x, 0, s), yaw))
+                self.b.add(place(rider(int(rng.integers(RIDERS))), (x, 0, s), yaw))
