@@ -11,8 +11,7 @@ from torch.nn import functional as F
 
 from depthpose.core.draw import depth_scale, draw_depth, draw_points
 from depthpose.core.errors import InputError, nearest_name
-from depthpose.depth.evaluate import EvaluationRow, Row
-from depthpose.depth.evaluate.evaluate import Cell
+from depthpose.depth.evaluate import Cell, EvaluationRow, Row
 from depthpose.depth.metrics import DepthErrors
 from depthpose.depth.types import DepthEstimate, StereoInput
 from depthpose.report.page import Drawing

@@ -1,0 +1,523 @@
+"""Named protocols to rows: predictions are files, metrics read files.
+
+A protocol fixes the truth, the pixels that count and how the prediction is prepared. Numbers of
+two protocols do not compare; every row carries its protocol's name.
+"""
+
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, fields
+from functools import partial
+from pathlib import Path
+from typing import Any, Literal
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from depthpose.core.camera import StereoRig
+from depthpose.core.errors import InputError, nearest_name
+from depthpose.core.files import read_image
+from depthpose.core.frame import data_frame
+from depthpose.depth.datasets import Dataset, Frame, has_lidar, lidar_truth
+from depthpose.depth.datasets import read_disparity as read_truth_disparity
+from depthpose.depth.disparity import (
+    depth_from_disparity,
+    disparity_advice,
+    disparity_from_depth,
+    resize_disparity,
+    resized_map,
+)
+from depthpose.depth.metrics import (
+    METRICS,
+    RANKING,
+    SMALLEST_DEPTH_M,
+    Metric,
+    error_by_decile,
+    garg_crop,
+    measure,
+    score_confidence,
+    view_errors,
+)
+from depthpose.depth.predictions import (
+    EXPECTED,
+    has_disparity,
+    has_prediction,
+    read_confidence,
+    read_depth,
+    read_disparity,
+    read_drawn_view,
+    read_sky,
+)
+from depthpose.depth.types import DepthEstimate
+
+NO_PREDICTION = "no right view to match, and no prediction"
+Cell = str | int | float
+"""What a table holds."""
+
+
+@dataclass(frozen=True)
+class Protocol:
+    """How a prediction is compared with the truth.
+
+    In all protocols of depth truth counts between 0.001 m and the cap, and predictions are clamped
+    to that range.
+
+    Attributes:
+        summary: one line for people.
+        truth: ``velodyne_x`` and ``camera_z`` project one LiDAR scan; ``depth`` and ``disparity``
+            read the truth that the dataset ships.
+        with_crop: only truth inside the crop of Garg et al. counts.
+    """
+
+    summary: str
+    truth: Literal["velodyne_x", "camera_z", "depth", "disparity"]
+    with_crop: bool = False
+
+
+PROTOCOLS = {
+    "eigen-raw": Protocol(
+        "one LiDAR scan, depth = LiDAR x, Garg crop: monodepth's, and the thesis's",
+        "velodyne_x",
+        with_crop=True,
+    ),
+    "eigen-raw-camera": Protocol("the same with depth = camera z", "camera_z", with_crop=True),
+    "eigen-improved": Protocol("annotated depth maps, no crop: monodepth2's", "depth"),
+    "eigen-improved-garg": Protocol(
+        "annotated depth maps, Garg crop: BTS's, AdaBins'", "depth", with_crop=True
+    ),
+    "kitti-2015": Protocol(
+        "disparity: EPE and D1 (> 3 px and > 5 %), all pixels and those both views see", "disparity"
+    ),
+}
+
+
+def find_protocol(name: str) -> Protocol:
+    """Give a protocol by name.
+
+    Raises:
+        InputError: there is none; the error names the nearest.
+    """
+    if name not in PROTOCOLS:
+        raise InputError(f"protocol {name!r}: {nearest_name(name, PROTOCOLS)}")
+    return PROTOCOLS[name]
+
+
+def has_truth(frame: Frame, rule: Protocol) -> bool:
+    """Whether a frame has the truth that a protocol needs, by its files alone."""
+    match rule.truth:
+        case "disparity":
+            return frame.disparity is not None
+        case "depth":
+            return frame.depth is not None
+        case _:
+            return has_lidar(frame, rule.truth)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Row:
+    """A row whose columns are its fields, in order.
+
+    A field that is None is no column; a mapping is a column for each of its entries.
+    """
+
+    def columns(self) -> dict[str, Cell]:
+        """Give the columns by name, as files and printed tables hold them."""
+        found: dict[str, Cell] = {}
+        for field in fields(self):
+            value = getattr(self, field.name)
+            if isinstance(value, Mapping):
+                found |= value
+            elif value is not None:
+                found[field.name] = value
+        return found
+
+
+@dataclass(frozen=True, kw_only=True)
+class EvaluationRow(Row):
+    """Numbers of one frame, their mean over frames (each counts the same), or one decile of it.
+
+    Attributes:
+        method: whose predictions were measured; None, as the next four: not known.
+        input: which images it was given.
+        speed: at which networks ran.
+        weights: name of the file.
+        weights_sha256: the first 12 digits.
+        protocol: by which the frames were measured.
+        dataset: its name.
+        frame: of one frame, its name.
+        cap_m: truth beyond it does not count; None for disparity.
+        frames: how many a mean is over.
+        pixels: that were compared, in all frames.
+        coverage: share of the pixels with truth that have a prediction.
+        confidence_decile: n, where the numbers are of the n-th tenth of the pixels, from the least
+            sure (1) to the surest (10).
+        metrics: what all frames with a predicted pixel have, in the order of
+            ``depth.metrics.METRICS``, then those of the drawn view and of the confidence.
+    """
+
+    method: str | None = None
+    input: str | None = None
+    speed: str | None = None
+    weights: str | None = None
+    weights_sha256: str | None = None
+    protocol: str
+    dataset: str
+    frame: str | None = None
+    cap_m: float | None
+    frames: int | None = None
+    pixels: int | None = None
+    coverage: float | None = None
+    confidence_decile: int | None = None
+    metrics: Mapping[str, float]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Evaluation:
+    """What evaluating one set of predictions gave.
+
+    Attributes:
+        rows: means over frames, one row for each cap.
+        per_frame: one row for each frame and cap.
+        deciles: mean error of the least sure tenth of each frame's pixels (1) to the surest (10),
+            for predictions with a confidence.
+        skipped: frames that do not count, each with the reason.
+    """
+
+    rows: list[EvaluationRow]
+    per_frame: list[EvaluationRow]
+    deciles: list[EvaluationRow]
+    skipped: dict[str, str]
+
+    def to_frame(self) -> Any:  # noqa: ANN401  pandas is no dependency
+        """Give ``per_frame`` as a ``pandas.DataFrame``; the columns are those of its table.
+
+        Raises:
+            ImportError: pandas is not installed.
+        """
+        return data_frame(row.columns() for row in self.per_frame)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Measured:
+    """One frame's numbers by one cap (None for disparity), and its error by decile."""
+
+    frame: str
+    cap_m: float | None
+    pixels: int
+    coverage: float
+    metrics: Mapping[str, float]
+    deciles: Float[Tensor, "10"] | None = None
+
+    def to_values(self) -> dict[str, Any]:
+        """Give it as JSON values, exactly."""
+        cap = {} if self.cap_m is None else {"cap_m": self.cap_m}
+        counts = {"pixels": self.pixels, "coverage": self.coverage}
+        return {
+            "row": {"frame": self.frame, **cap, **counts, **self.metrics},
+            "deciles": None if self.deciles is None else self.deciles.tolist(),
+        }
+
+    @classmethod
+    def from_values(cls, values: Mapping[str, Any]) -> "Measured":
+        """Read what :meth:`to_values` gave."""
+        row, deciles = dict(values["row"]), values["deciles"]
+        return cls(
+            frame=row.pop("frame"),
+            cap_m=row.pop("cap_m", None),
+            pixels=row.pop("pixels"),
+            coverage=row.pop("coverage"),
+            metrics=row,
+            deciles=None if deciles is None else torch.tensor(deciles, dtype=torch.float64),
+        )
+
+
+def evaluate(
+    dataset: Dataset,
+    predictions: Path,
+    protocol: str,
+    caps_m: Sequence[float] = (80.0, 50.0),
+    progress: Callable[[Sequence[int]], Iterable[int]] = iter,
+) -> Evaluation:
+    """Measure the predictions in a folder by a named protocol.
+
+    Args:
+        dataset: frames with truth; those without are listed as skipped.
+        predictions: folder of ``NAME.disparity_px.npy`` (see ``predictions``).
+        protocol: a key of ``PROTOCOLS``.
+        caps_m: truth beyond a cap does not count and predictions are clamped to it; one row each.
+        progress: wraps the sequence of frames, to show how far it is.
+
+    Raises:
+        InputError: an unknown protocol, a missing prediction, or no frame with truth.
+    """
+    found = {
+        dataset.frames[index].name: measure_frame(dataset, index, predictions, protocol, caps_m)
+        for index in progress(range(len(dataset)))
+    }
+    return summarise(dataset, protocol, found)
+
+
+def measure_frame(
+    dataset: Dataset, index: int, predictions: Path, protocol: str, caps_m: Sequence[float]
+) -> list[Measured] | str:
+    """Measure one frame by each cap, or say why it does not count.
+
+    Raises:
+        InputError: an unknown protocol, or a missing or damaged prediction.
+    """
+    rule = find_protocol(protocol)
+    prepared = _prepare(dataset, index, predictions, rule)
+    if isinstance(prepared, str):
+        return prepared
+    caps = [None] if rule.truth == "disparity" else caps_m
+    measured = [_measure(prepared, rule, cap_m) for cap_m in caps]
+    return [one for one in measured if one is not None] or "no truth within the caps and the crop"
+
+
+def summarise(
+    dataset: Dataset, protocol: str, found: Mapping[str, list[Measured] | str]
+) -> Evaluation:
+    """Make the rows of a table of its frames, the same ones wherever they were measured.
+
+    Args:
+        dataset: whose order of frames counts.
+        protocol: by which they were measured.
+        found: of each frame's name what :func:`measure_frame` gave.
+
+    Raises:
+        InputError: no frame has truth.
+    """
+    rule = find_protocol(protocol)
+    each = {frame.name: found[frame.name] for frame in dataset.frames}
+    skipped = {name: why for name, why in each.items() if isinstance(why, str)}
+    measured = [one for some in each.values() if not isinstance(some, str) for one in some]
+    if not measured and NO_PREDICTION in skipped.values():
+        name = next(name for name, why in skipped.items() if why == NO_PREDICTION)
+        raise InputError(
+            f"{dataset.name}: no frame has both truth and a prediction; {name!r} has the truth and "
+            f"{NO_PREDICTION}. Predictions are called {EXPECTED}"
+        )
+    if not measured:
+        raise InputError(
+            f"{dataset.name}: none of its {len(dataset)} frames has the truth that protocol "
+            f"{protocol!r} needs ({rule.truth}). Choose another protocol or folder."
+        )
+    row = partial(EvaluationRow, protocol=protocol, dataset=dataset.name)
+    names = ("frame", "cap_m", "pixels", "coverage", "metrics")
+    per_frame = [row(**{name: getattr(one, name) for name in names}) for one in measured]
+    evaluation = Evaluation(rows=[], per_frame=per_frame, deciles=[], skipped=skipped)
+    for cap_m in dict.fromkeys(one.cap_m for one in measured):
+        of_cap = [one for one in measured if one.cap_m == cap_m]
+        answered = [one for one in of_cap if one.pixels]
+        if not answered:
+            raise InputError(f"{dataset.name}: no prediction has a pixel where there is truth")
+        names = [n for n in answered[0].metrics if all(n in one.metrics for one in answered)]
+        evaluation.rows.append(
+            row(
+                cap_m=cap_m,
+                frames=len(of_cap),
+                pixels=sum(one.pixels for one in of_cap),
+                coverage=sum(one.coverage for one in of_cap) / len(of_cap),
+                metrics={n: sum(one.metrics[n] for one in answered) / len(answered) for n in names},
+            )
+        )
+        deciles = [one.deciles for one in of_cap if one.deciles is not None]
+        errors = torch.stack(deciles).nanmean(0).tolist() if deciles else []
+        ranked_by = ranking_metric(cap_m).name
+        for n, error in enumerate(errors, 1):
+            metrics = {ranked_by: error}
+            evaluation.deciles.append(
+                row(cap_m=cap_m, frames=len(deciles), confidence_decile=n, metrics=metrics)
+            )
+    return evaluation
+
+
+def ranking_metric(cap_m: float | None) -> Metric:
+    """Give the metric by which frames are ranked: of depth up to a cap, or of disparity (None)."""
+    return METRICS[RANKING["disparity" if cap_m is None else "depth"]]
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class FrameResult:
+    """The maps of a frame that show where its error is.
+
+    Attributes:
+        estimate: at the size of the image.
+        error: absolute disparity error [px], or absolute depth error as a share of the truth; NaN
+            where nothing is compared.
+        true_depth_m: the truth that counts as depth; None where it is a disparity without a rig.
+    """
+
+    estimate: DepthEstimate
+    error: Float[Tensor, "h w"]
+    true_depth_m: Float[Tensor, "h w"] | None
+
+
+def frame_result(
+    dataset: Dataset, index: int, predictions: Path, protocol: str, cap_m: float | None
+) -> FrameResult:
+    """Read one frame again as :func:`evaluate` measured it.
+
+    Args:
+        dataset: as it was measured.
+        index: of the frame.
+        predictions: the folder.
+        protocol: a key of ``PROTOCOLS``.
+        cap_m: of the row; None for a protocol of disparity.
+
+    Raises:
+        InputError: the frame does not count, or a file is damaged.
+    """
+    rule, name = find_protocol(protocol), dataset.frames[index].name
+    prepared = _prepare(dataset, index, predictions, rule)
+    if isinstance(prepared, str):
+        raise InputError(f"{name}: {prepared}; choose a frame that counts")
+    rig = prepared.rig
+    depth_m = None if rig is None else depth_from_disparity(prepared.disparity_px, rig)
+    is_sky = read_sky(predictions, name)
+    if is_sky is not None and depth_m is not None and is_sky.shape == depth_m.shape:
+        depth_m = torch.where(is_sky, torch.nan, depth_m)
+    predicted, truth = _compared(prepared, rule, cap_m)
+    error, true_m = (predicted - truth).abs(), truth
+    if cap_m is None:
+        true_m = None if rig is None else depth_from_disparity(truth, rig)
+    else:
+        error = error / truth
+    estimate = DepthEstimate(
+        depth_m=depth_m,
+        disparity_px=prepared.disparity_px,
+        confidence=prepared.confidence,
+        right=read_drawn_view(predictions, name),
+        is_sky=is_sky,
+    )
+    return FrameResult(estimate=estimate, error=error, true_depth_m=true_m)
+
+
+def clamped_depth(
+    disparity_px: Float[Tensor, "h w"], rig: StereoRig, cap_m: float
+) -> Float[Tensor, "h w"]:
+    """Turn disparity into depth as the published script does: infinity to 0, then the clamp.
+
+    NaN (no prediction) stays NaN; zero and negative disparity become the smallest depth, as there.
+    """
+    depth_m = depth_from_disparity(disparity_px, rig).nan_to_num(0.0)
+    clamped_m = depth_m.clamp(SMALLEST_DEPTH_M, cap_m)
+    return torch.where(torch.isnan(disparity_px), torch.nan, clamped_m)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _Prepared:
+    """A frame's truth and prediction, brought to the size of the image."""
+
+    frame: Frame
+    truth: Float[Tensor, "h w"]
+    disparity_px: Float[Tensor, "h w"]
+    depth_m: Float[Tensor, "h w"] | None  # of what was predicted as depth alone, which is compared
+    confidence: Float[Tensor, "h w"] | None
+    rig: StereoRig | None
+    view: dict[str, float]  # errors of the drawn right view
+
+
+def _prepare(dataset: Dataset, index: int, predictions: Path, rule: Protocol) -> _Prepared | str:
+    """Read truth and prediction of a frame, or say why it does not count."""
+    frame, is_stereo = dataset.frames[index], rule.truth == "disparity"
+    if not has_truth(frame, rule):
+        return f"no truth of the kind {rule.truth}"
+    if frame.right is None and not has_prediction(predictions, frame.name):
+        return NO_PREDICTION
+    if rule.truth in ("velodyne_x", "camera_z"):
+        truth = lidar_truth(frame, rule.truth)
+    else:
+        shipped = dataset.read_truth(index)
+        truth = shipped.disparity_px if is_stereo else shipped.depth_m
+    assert truth is not None, "has_truth said so"
+    height, width = truth.shape
+    rig, depth_m = dataset.read_rig(index), None
+    if not is_stereo and (rig is None or not has_disparity(predictions, frame.name)):
+        depth_m = read_depth(predictions, frame.name)
+    if not is_stereo and rig is None:
+        if depth_m is None:
+            raise InputError(
+                f"{frame.name}: no calibration of a pair, so its disparity cannot become metres; "
+                f"predict depth ({frame.name}.depth_m.npy), or give the frame its baseline"
+            )
+        K = torch.tensor([[width, 0, 0], [0, width, 0], [0, 0, 1]], dtype=torch.float64)
+        rig = StereoRig(width=width, height=height, K=K, baseline_m=1.0)  # depth takes any
+    found_px = read_disparity(predictions, frame.name, rig, with_disparity_png=is_stereo)
+    predicted_px = resize_disparity(found_px, height, width)
+    true_px = truth if is_stereo or rig is None else disparity_from_depth(truth, rig)
+    # With principal points apart, the disparity of far points is negative.
+    apart_px = 0.0 if rig is None else rig.cx_right_minus_left_px
+    if (advice := disparity_advice(predicted_px + apart_px, true_px + apart_px)) is not None:
+        raise InputError(f"{predictions / frame.name}: {advice}")
+    confidence = read_confidence(predictions, frame.name)
+    if confidence is not None and confidence.shape != truth.shape:
+        confidence = resized_map(confidence, height, width)
+    drawn, view = read_drawn_view(predictions, frame.name), {}
+    if drawn is not None and frame.right is not None:
+        real = read_image(frame.right)
+        if real.shape != drawn.shape:
+            raise InputError(
+                f"{predictions}: the drawn view of {frame.name} is "
+                f"{drawn.shape[2]}x{drawn.shape[1]}, but its right image is "
+                f"{real.shape[2]}x{real.shape[1]}; predict it again"
+            )
+        view = view_errors(drawn, real)
+    return _Prepared(
+        frame=frame,
+        truth=truth,
+        disparity_px=predicted_px,
+        depth_m=depth_m if depth_m is not None and depth_m.shape == truth.shape else None,
+        confidence=confidence,
+        rig=rig,
+        view=view,
+    )
+
+
+def _compared(
+    prepared: _Prepared, rule: Protocol, cap_m: float | None
+) -> tuple[Float[Tensor, "h w"], Float[Tensor, "h w"]]:
+    """Prepare prediction and truth as the protocol says; NaN where there is none or none counts."""
+    truth, predicted_m = prepared.truth, prepared.depth_m
+    if cap_m is None:
+        return prepared.disparity_px, truth
+    counts = (truth > SMALLEST_DEPTH_M) & (truth < cap_m)
+    if rule.with_crop:
+        counts &= garg_crop(*truth.shape)
+    if predicted_m is None:
+        assert prepared.rig is not None
+        predicted_m = clamped_depth(prepared.disparity_px, prepared.rig, cap_m)
+    return predicted_m.clamp(SMALLEST_DEPTH_M, cap_m), torch.where(counts, truth, torch.nan)
+
+
+def _measure(prepared: _Prepared, rule: Protocol, cap_m: float | None) -> Measured | None:
+    """Measure one frame up to a cap; None where no truth counts."""
+    predicted, truth = _compared(prepared, rule, cap_m)
+    counts = torch.isfinite(truth)
+    mask = counts & torch.isfinite(predicted)
+    if not bool(counts.any()):
+        return None
+    metrics, deciles, pixels = {}, None, int(mask.sum())
+    if pixels:
+        predicted, truth = predicted[mask], truth[mask]
+        error = (predicted - truth).abs()
+        metrics = measure("disparity" if cap_m is None else "depth", predicted, truth)
+        if cap_m is not None:
+            error = error / truth
+        elif prepared.frame.disparity_noc is not None:
+            seen_px = read_truth_disparity(prepared.frame.disparity_noc)
+            seen = torch.isfinite(seen_px) & torch.isfinite(prepared.disparity_px)
+            if bool(seen.any()):
+                metrics |= measure("disparity_noc", prepared.disparity_px[seen], seen_px[seen])
+        metrics |= prepared.view
+        if prepared.confidence is not None:
+            metrics |= score_confidence(error, prepared.confidence[mask])
+            deciles = error_by_decile(error, prepared.confidence[mask])
+    return Measured(
+        frame=prepared.frame.name,
+        cap_m=cap_m,
+        pixels=pixels,
+        coverage=float(mask.sum() / counts.sum()),
+        metrics=metrics,
+        deciles=deciles,
+    )
