@@ -36,9 +36,12 @@ from depthpose.depth.config import (
 from depthpose.depth.datasets import open_dataset
 from depthpose.depth.estimator import FakestereoNet
 from depthpose.depth.stereo import make_matcher
-from depthpose.depth.synthesis import SelectionGenerator, SynthesisedViews
-from depthpose.depth.synthesis.networks import mix_shifts
-from depthpose.depth.synthesis.synthesiser import SelectionSynthesiser
+from depthpose.depth.synthesis import (
+    SelectionGenerator,
+    SelectionSynthesiser,
+    SynthesisedViews,
+    mix_shifts,
+)
 from depthpose.depth.train import STAGES
 from depthpose.depth.train.config import SelectTraining, ViewTraining
 from depthpose.depth.weights import read_generator, read_matcher, write_depth_weights

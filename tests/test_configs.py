@@ -12,8 +12,7 @@ from depthpose.depth.augment import TrainingPair
 from depthpose.depth.datasets import open_dataset, read_split
 from depthpose.depth.disparity import focal_size
 from depthpose.depth.stereo import PSMNet
-from depthpose.depth.synthesis import UNetGenerator
-from depthpose.depth.synthesis.synthesiser import ROWS_SHARE
+from depthpose.depth.synthesis import ROWS_SHARE, UNetGenerator
 from depthpose.depth.synthetic import kitti_rig
 from depthpose.depth.train import STAGES, FinetuneTask, ViewTask
 from depthpose.depth.train.config import FinetuneTraining, StereoTraining, ViewTraining

@@ -13,15 +13,16 @@ from torch import Tensor
 from depthpose.core.errors import InputError
 from depthpose.depth.config import SelectionConfig
 from depthpose.depth.encoder import LiteEncoder, import_encoder, read_encoder
-from depthpose.depth.synthesis import SelectionGenerator, make_synthesiser
-from depthpose.depth.synthesis.networks import (
+from depthpose.depth.synthesis import (
+    SelectionGenerator,
+    draw_right,
     log_expectation,
     make_planes,
+    make_synthesiser,
     mix_shifts,
     select,
     shift_left,
 )
-from depthpose.depth.synthesis.synthesiser import draw_right
 
 TINY = SelectionConfig(
     encoder_width=0.1,

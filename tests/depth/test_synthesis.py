@@ -8,9 +8,10 @@ from depthpose.depth.synthesis import (
     PatchDiscriminator,
     PixelDiscriminator,
     UNetGenerator,
+    draw_right,
     make_synthesiser,
+    pad_to_multiple,
 )
-from depthpose.depth.synthesis.synthesiser import draw_right, pad_to_multiple
 
 
 def parameters(module: nn.Module) -> int:

@@ -10,8 +10,7 @@ from depthpose.core.camera import Camera
 from depthpose.core.errors import InputError
 from depthpose.depth.config import SelectionConfig, Speed
 from depthpose.depth.estimator import FakestereoNet
-from depthpose.depth.synthesis import SelectionSynthesiser
-from depthpose.depth.synthesis.networks import Selected, average
+from depthpose.depth.synthesis import Selected, SelectionSynthesiser, average
 from depthpose.depth.types import StereoInput
 
 

@@ -17,6 +17,7 @@ from depthpose.core.loop import Update, ValidationResult, make_adam, sample_gene
 from depthpose.depth.augment import TrainingPair, degrade
 from depthpose.depth.config import DegradeConfig
 from depthpose.depth.disparity import right_disparity_from_left
+from depthpose.depth.encoder import LiteEncoder
 from depthpose.depth.losses import (
     DISPARITY_LOSSES,
     adversarial_loss,
@@ -34,11 +35,13 @@ from depthpose.depth.stereo.matcher import pad_top_right
 from depthpose.depth.synthesis import (
     Generator,
     SelectionGenerator,
+    SelectionSynthesiser,
     UNetGenerator,
+    draw_right,
+    log_expectation,
     make_discriminator,
+    mix_shifts,
 )
-from depthpose.depth.synthesis.networks import log_expectation, mix_shifts
-from depthpose.depth.synthesis.synthesiser import SelectionSynthesiser, draw_right
 from depthpose.depth.train.config import (
     FinetuneTraining,
     SelectTraining,
@@ -46,6 +49,13 @@ from depthpose.depth.train.config import (
     ViewTraining,
 )
 from depthpose.depth.train.pairs import TrainingPairs
+
+
+def _groups(network: nn.Module, encoder: LiteEncoder, rate: float) -> list[dict[str, object]]:
+    """What is learnt, the encoder apart, at a share of the learning rate."""
+    ours = list(encoder.parameters())
+    rest = [p for p in network.parameters() if p not in set(ours)]
+    return [{"params": [p for p in ours if p.requires_grad], "rate": rate}, {"params": rest}]
 
 
 class StereoTask:
@@ -65,16 +75,10 @@ class StereoTask:
             self._alone.requires_grad_(True)
         self._train()
         self.modules: dict[str, nn.Module] = {"matcher": matcher}
-        self.optimizers = {"matcher": (make_adam(self._groups(), config.adam), config.adam)}
-
-    def _groups(self) -> list[dict[str, object]]:
-        if self._alone is not None or self.matcher.encoder is None:
-            return [{"params": [p for p in self.matcher.parameters() if p.requires_grad]}]
-        encoder = list(self.matcher.encoder.parameters())
-        ours = set(encoder)
-        rest = [p for p in self.matcher.parameters() if p not in ours]
-        learnt = [p for p in encoder if p.requires_grad]
-        return [{"params": learnt, "rate": self.config.encoder_rate}, {"params": rest}]
+        groups = [{"params": [p for p in matcher.parameters() if p.requires_grad]}]
+        if self._alone is None and matcher.encoder is not None:
+            groups = _groups(matcher, matcher.encoder, config.encoder_rate)
+        self.optimizers = {"matcher": (make_adam(groups, config.adam), config.adam)}
 
     def _train(self) -> None:
         self.matcher.train()
@@ -109,6 +113,7 @@ class StereoTask:
         return result
 
 
+@torch.no_grad()
 def validate_pairs(
     matcher: StereoNetwork, held_out: TrainingPairs, draw: Callable[[Tensor], Tensor] | None = None
 ) -> ValidationResult:
@@ -117,10 +122,17 @@ def validate_pairs(
     What is taken for sky has a disparity of 0.
     """
     errors, bad, missed, false, pictures = [], [], [], [], {}
+    device = next(matcher.parameters()).device
     for index in range(len(held_out)):
         pair = held_out.read(index)
         right = pair.right if draw is None else draw(pair.left)
-        found, is_sky = match_whole(matcher, pair.left, right)
+        views = (normalise(view.to(device)) for view in (pair.left, right))
+        heads, sky = matcher.forward_with_sky(
+            *(pad_top_right(v, matcher.config)[None] for v in views)
+        )
+        height, width = pair.left.shape[-2:]
+        found = heads[-1][0, -height:, :width].float().cpu()
+        is_sky = None if sky is None else sky[0, -height:, :width].cpu() > 0.5
         is_known = valid_disparity(pair.left_px[None], matcher.config.max_disparity_px)[0]
         is_true_sky = pair.left_px == 0
         if is_sky is not None:
@@ -145,19 +157,6 @@ def validate_pairs(
 
 
 @torch.no_grad()
-def match_whole(
-    matcher: StereoNetwork, left: Float[Tensor, "3 h w"], right: Float[Tensor, "3 h w"]
-) -> tuple[Float[Tensor, "h w"], Bool[Tensor, "h w"] | None]:
-    """Match one pair of any size with the network as it stands [px]; say where it sees the sky."""
-    device = next(matcher.parameters()).device
-    height, width = left.shape[-2:]
-    padded = [pad_top_right(normalise(v.to(device)), matcher.config)[None] for v in (left, right)]
-    heads, sky = matcher.forward_with_sky(*padded)
-    found = heads[-1][0, -height:, :width].float().cpu()
-    return found, None if sky is None else sky[0, -height:, :width].cpu() > 0.5
-
-
-@torch.no_grad()
 def mean_error_px(
     found_px: Float[Tensor, "b h w"], truth_px: Float[Tensor, "b h w"], max_px: int
 ) -> Float[Tensor, ""]:
@@ -176,19 +175,13 @@ class ViewTask:
         self.config, self.held_out = config, held_out
         self.generator = generator.train()
         self.modules: dict[str, nn.Module] = {"generator": generator}
-        self.optimizers = {
-            "generator": (
-                make_adam(generator.parameters(), config.generator_adam),
-                config.generator_adam,
-            )
-        }
+        adam = config.generator_adam
+        self.optimizers = {"generator": (make_adam(generator.parameters(), adam), adam)}
         if config.discriminator != "none":
             discriminator = make_discriminator(config.discriminator, config.discriminator_width)
             self.modules["discriminator"] = discriminator.train()
-            self.optimizers["discriminator"] = (
-                make_adam(discriminator.parameters(), config.discriminator_adam),
-                config.discriminator_adam,
-            )
+            adam = config.discriminator_adam
+            self.optimizers["discriminator"] = (make_adam(discriminator.parameters(), adam), adam)
 
     def step(self, batch: TrainingPair) -> Iterator[Update]:
         """Draw once; the discriminator learns from it, then scores it anew."""
@@ -279,25 +272,14 @@ class FinetuneTask:
 
 
 class SelectionSample(NamedTuple):
-    """What one step of the selecting generator sees of an image.
+    """What one step of the selecting generator sees; disparity is NaN if unknown, 0 in the sky."""
 
-    Disparities are NaN where unknown, and 0 in the sky.
-
-    Attributes:
-        seen: the left image as a camera may deliver it: the network's input.
-        left: the left image itself, which the right view is drawn from.
-        right: the right image.
-        left_px: disparity of the left view.
-        right_px: disparity of the right view.
-        has_right: whether there is a right image; else ``right`` repeats the left one.
-    """
-
-    seen: Float[Tensor, "*b 3 h w"]
-    left: Float[Tensor, "*b 3 h w"]
+    seen: Float[Tensor, "*b 3 h w"]  # the left image as a camera may deliver it: the input
+    left: Float[Tensor, "*b 3 h w"]  # the left image itself, which the right view is drawn from
     right: Float[Tensor, "*b 3 h w"]
     left_px: Float[Tensor, "*b h w"]
     right_px: Float[Tensor, "*b h w"]
-    has_right: Bool[Tensor, "*b"]
+    has_right: Bool[Tensor, "*b"]  # whether there is a right image; else ``right`` is the left one
 
 
 class SelectionSamples:
@@ -329,16 +311,11 @@ class SelectionSamples:
         before, now = int(sample_index * self.more_share), int((sample_index + 1) * self.more_share)
         pair = self.sources[1][before] if now > before else self.sources[0][sample_index - before]
         seen = degrade(pair.left, self.config, sample_generator(sample_index, self.seed + 1))
-        return as_sample(pair, seen)
-
-
-def as_sample(pair: TrainingPair, seen: Float[Tensor, "3 h w"]) -> SelectionSample:
-    """Make a sample of a pair; one image that stands for both views has no right one."""
-    left, right, left_px, right_px, _ = pair
-    has_right = torch.tensor(not torch.equal(left, right))
-    if not has_right:
-        right_px = right_disparity_from_left(left_px)
-    return SelectionSample(seen, left, right, left_px, right_px, has_right)
+        left, right, left_px, right_px, _ = pair
+        has_right = torch.tensor(not torch.equal(left, right))
+        if not has_right:  # one image stands for both views
+            right_px = right_disparity_from_left(left_px)
+        return SelectionSample(seen, left, right, left_px, right_px, has_right)
 
 
 _CAP_M = 80.0
@@ -357,14 +334,8 @@ class SelectTask:
             generator.encoder.freeze_early()
         self.modules: dict[str, nn.Module] = {"generator": generator}
         self._train()
-        self.optimizers = {"generator": (make_adam(self._groups(), config.adam), config.adam)}
-
-    def _groups(self) -> list[dict[str, object]]:
-        encoder = [p for p in self.generator.encoder.parameters() if p.requires_grad]
-        rest = [
-            p for name, p in self.generator.named_parameters() if not name.startswith("encoder.")
-        ]
-        return [{"params": encoder, "rate": self.config.encoder_rate}, {"params": rest}]
+        groups = _groups(generator, generator.encoder, config.encoder_rate)
+        self.optimizers = {"generator": (make_adam(groups, config.adam), config.adam)}
 
     def _train(self) -> None:
         self.generator.train()
@@ -404,37 +375,31 @@ class SelectTask:
 
     @torch.no_grad()
     def validate(self) -> ValidationResult:
-        """Depth of held-out left images; of the first, drawn view and disparity as a picture."""
+        """Relative error of held-out left images, share within 25 % (d1), share of missed sky."""
         if self.held_out is None:
             return ValidationResult()
         self.generator.eval()
-        device = next(self.generator.parameters()).device
-        result = held_out_depth(SelectionSynthesiser(self.generator, device), self.held_out)
+        device, rig = next(self.generator.parameters()).device, self.generator.config
+        synthesiser = SelectionSynthesiser(self.generator, device)
+        far_px = rig.virtual_focal_px * rig.virtual_baseline_m / _CAP_M
+        errors, within, missed, pictures = [], [], [], {}
+        for index in range(len(self.held_out)):
+            pair = self.held_out.read(index)
+            drawn = synthesiser.draw(pair.left[None])
+            assert drawn.disparity_px is not None and drawn.is_sky is not None  # noqa: PT018
+            is_sky = drawn.is_sky[0]
+            found_px = torch.where(is_sky, 0.0, drawn.disparity_px[0]).clamp(min=far_px)
+            if index == 0:
+                views = [pair.left, pair.right, drawn.right[0], draw_disparity(found_px)]
+                pictures["left_right_drawn_disparity"] = torch.cat(views, 1)
+            is_known, is_true_sky = pair.left_px >= far_px, pair.left_px == 0
+            if bool(is_known.any()):
+                ratio = pair.left_px[is_known] / found_px[is_known]
+                errors.append(float((ratio - 1).abs().mean()))
+                within.append(float((torch.maximum(ratio, 1 / ratio) < 1.25).float().mean()))
+            if bool(is_true_sky.any()):
+                missed.append(float((~is_sky[is_true_sky]).float().mean()))
         self._train()
-        return result
-
-
-def held_out_depth(synthesiser: SelectionSynthesiser, held_out: TrainingPairs) -> ValidationResult:
-    """Relative error of depth (AbsRel), share within 25 % (d1), share of the sky that is missed."""
-    rig = synthesiser.config
-    far_px = rig.virtual_focal_px * rig.virtual_baseline_m / _CAP_M
-    errors, within, missed, pictures = [], [], [], {}
-    for index in range(len(held_out)):
-        pair = held_out.read(index)
-        drawn = synthesiser.draw(pair.left[None])
-        assert drawn.disparity_px is not None and drawn.is_sky is not None  # noqa: PT018
-        is_sky = drawn.is_sky[0]
-        found_px = torch.where(is_sky, 0.0, drawn.disparity_px[0]).clamp(min=far_px)
-        if index == 0:
-            views = [pair.left, pair.right, drawn.right[0], draw_disparity(found_px)]
-            pictures["left_right_drawn_disparity"] = torch.cat(views, 1)
-        is_known, is_true_sky = pair.left_px >= far_px, pair.left_px == 0
-        if bool(is_known.any()):
-            ratio = pair.left_px[is_known] / found_px[is_known]
-            errors.append(float((ratio - 1).abs().mean()))
-            within.append(float((torch.maximum(ratio, 1 / ratio) < 1.25).float().mean()))
-        if bool(is_true_sky.any()):
-            missed.append(float((~is_sky[is_true_sky]).float().mean()))
-    numbers = {"abs_rel": errors, "d1": within, "sky_missed": missed}
-    means = {f"held_out/{k}": sum(v) / len(v) for k, v in numbers.items() if v}
-    return ValidationResult(numbers=means, pictures=pictures)
+        numbers = {"abs_rel": errors, "d1": within, "sky_missed": missed}
+        means = {f"held_out/{k}": sum(v) / len(v) for k, v in numbers.items() if v}
+        return ValidationResult(numbers=means, pictures=pictures)
