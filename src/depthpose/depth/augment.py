@@ -4,7 +4,6 @@ Degradations are what a camera, weather and files do to a picture; truth never c
 """
 
 import math
-from collections.abc import Sequence
 from io import BytesIO
 from typing import NamedTuple
 
@@ -30,23 +29,42 @@ def degrade(image: Picture, config: DegradeConfig, generator: torch.Generator) -
         config: how much, and how often.
         generator: decides.
     """
-    draw = _Draw(generator)
-    if draw.share(config.hue_share):
+
+    def between(low: float, high: float) -> float:
+        return low + (high - low) * float(torch.rand((), generator=generator))
+
+    if between(0.0, 1.0) < config.hue_share:
         image = image[torch.randperm(3, generator=generator)]
-    image = _recoloured(image, config.colour, draw)
-    if draw.share(config.haze_share):
-        grey = torch.full_like(image, draw.between(0.5, 1.0))
-        image = torch.lerp(image, grey, draw.between(0.0, 0.4))
-    if draw.share(config.glare_share):
-        image = _glaring(image, draw)
-    if draw.share(config.blur_share):
-        image = _blurred(image, draw.between(0.3, config.blur_px))
-    if draw.share(config.noise_share):
+    low, high = 1 - config.colour, 1 + config.colour
+    exposure, contrast, saturation, gamma = (between(low, high) for _ in range(4))
+    third = config.colour / 3
+    tint = torch.tensor([between(1 - third, 1 + third) for _ in range(3)])
+    image = _saturate(image, saturation)
+    mean = image.mean()
+    image = ((image - mean) * contrast + mean) * exposure * tint[:, None, None]
+    image = image.clamp(0, 1) ** gamma
+    if between(0.0, 1.0) < config.haze_share:
+        grey = torch.full_like(image, between(0.5, 1.0))
+        image = torch.lerp(image, grey, between(0.0, 0.4))
+    if between(0.0, 1.0) < config.glare_share:  # it fades from one place on: a low sun, a lamp
+        height, width = image.shape[1:]
+        y = torch.linspace(0, 1, height)[:, None] - between(0.0, 0.6)
+        x = (torch.linspace(0, 1, width) - between(0.0, 1.0)) * width / height
+        reach = between(0.2, 0.8)
+        image = image + between(0.1, 0.6) * torch.exp(-(x**2 + y**2) / (2 * reach**2))
+    if between(0.0, 1.0) < config.blur_share:
+        places, deviation_px = torch.arange(-3.0, 4.0), between(0.3, config.blur_px)
+        kernel = torch.exp(-(places**2) / (2 * deviation_px**2))
+        kernel = kernel / kernel.sum()
+        padded = F.pad(image[:, None], (3, 3, 3, 3), mode="replicate")
+        blurred = F.conv2d(padded, kernel[None, None, None])
+        image = F.conv2d(blurred, kernel[None, None, :, None])[:, 0]
+    if between(0.0, 1.0) < config.noise_share:
         noise = torch.randn(image.shape, generator=generator)
-        image = image + noise * draw.between(0.0, config.noise)
+        image = image + noise * between(0.0, config.noise)
     image = image.clamp(0, 1)
-    if draw.share(config.jpeg_share):
-        image = through_jpeg(image, int(draw.between(40.0, 95.0)))
+    if between(0.0, 1.0) < config.jpeg_share:
+        image = through_jpeg(image, int(between(40.0, 95.0)))
     return image
 
 
@@ -57,49 +75,6 @@ def through_jpeg(image: Picture, quality: int) -> Picture:
     Image.fromarray(pixels).save(file, "JPEG", quality=quality, subsampling=0)
     decoded = np.array(Image.open(file), np.float32) / 255
     return torch.from_numpy(decoded).permute(2, 0, 1).contiguous()
-
-
-class _Draw:
-    """Random numbers of one image."""
-
-    def __init__(self, generator: torch.Generator) -> None:
-        self.generator = generator
-
-    def between(self, low: float, high: float) -> float:
-        return low + (high - low) * float(torch.rand((), generator=self.generator))
-
-    def share(self, share: float) -> bool:
-        return self.between(0.0, 1.0) < share
-
-
-def _recoloured(image: Picture, strength: float, draw: _Draw) -> Picture:
-    """Scale exposure, contrast, saturation and each channel by 1 +- ``strength``; bend by gamma."""
-    exposure, contrast, saturation, gamma = (
-        draw.between(1 - strength, 1 + strength) for _ in range(4)
-    )
-    tint = torch.tensor([draw.between(1 - strength / 3, 1 + strength / 3) for _ in range(3)])
-    image = _saturate(image, saturation)
-    mean = image.mean()
-    image = ((image - mean) * contrast + mean) * exposure * tint[:, None, None]
-    return image.clamp(0, 1) ** gamma
-
-
-def _glaring(image: Picture, draw: _Draw) -> Picture:
-    """Add light that fades from one place on: a low sun, a lamp."""
-    height, width = image.shape[1:]
-    y = torch.linspace(0, 1, height)[:, None] - draw.between(0.0, 0.6)
-    x = (torch.linspace(0, 1, width) - draw.between(0.0, 1.0)) * width / height
-    reach = draw.between(0.2, 0.8)
-    return image + draw.between(0.1, 0.6) * torch.exp(-(x**2 + y**2) / (2 * reach**2))
-
-
-def _blurred(image: Picture, deviation_px: float) -> Picture:
-    places = torch.arange(-3.0, 4.0)
-    kernel = torch.exp(-(places**2) / (2 * deviation_px**2))
-    kernel = kernel / kernel.sum()
-    padded = F.pad(image[:, None], (3, 3, 3, 3), mode="replicate")
-    blurred = F.conv2d(F.conv2d(padded, kernel[None, None, None]), kernel[None, None, :, None])
-    return blurred[:, 0]
 
 
 _UNKNOWN = torch.tensor(torch.nan)
@@ -135,7 +110,12 @@ def augment(pair: TrainingPair, config: AugmentConfig, generator: torch.Generato
     Raises:
         InputError: the pair is smaller than half of the crop.
     """
-    scaled = scale_pair(pair, _draw_scale(config, generator, pair.left.shape[-2:]))
+    low, high = config.scale
+    drawn = low + (high - low) * float(torch.rand((), generator=generator))
+    # None at which half of the crop would be black, if a larger one is allowed.
+    sides = zip(config.crop_px, pair.left.shape[-2:], strict=True)
+    half = max((crop + 1) / 2 / side for crop, side in sides)
+    scaled = scale_pair(pair, max(drawn, min(half, high)))
     (height, width), (rows, columns) = scaled.left.shape[-2:], config.crop_px
     cropped = crop_pair(scaled, (min(height, rows), min(width, columns)), generator)
     if float(torch.rand((), generator=generator)) < config.flip_share:
@@ -163,16 +143,16 @@ def scale_pair(pair: TrainingPair, scale: float) -> TrainingPair:
     if scale == 1.0:
         return pair
     size = (max(math.floor(height * scale + 0.5), 1), max(math.floor(width * scale + 0.5), 1))
-    images = [
+    ratio = size[1] / width
+    left, right = (
         F.interpolate(i[None], size, mode="bilinear", antialias=scale < 1)[0].clamp(0, 1)
         for i in (pair.left, pair.right)
-    ]
-    ratio = size[1] / width
-    maps = [
+    )
+    left_px, right_px = (
         F.interpolate(m[None, None], size, mode="nearest-exact")[0, 0] * ratio
         for m in (pair.left_px, pair.right_px)
-    ]
-    return TrainingPair(images[0], images[1], maps[0], maps[1], pair.focal_px * ratio)
+    )
+    return TrainingPair(left, right, left_px, right_px, pair.focal_px * ratio)
 
 
 def crop_pair(
@@ -246,7 +226,15 @@ def set_apart(
         ends = config.misaligned_px * (2 * torch.rand(2, generator=generator) - 1)
         pair = pair._replace(right=shift_rows(pair.right, *ends.tolist()))
     if float(torch.rand((), generator=generator)) < config.erased_share:
-        pair = pair._replace(right=erase_patch(pair.right, generator))
+        # A patch of a sixth to a third of each side gets the mean colour.
+        patch = []
+        for side in pair.right.shape[1:]:
+            size = int(side * (1 + float(torch.rand((), generator=generator))) / 6)
+            first = int(torch.randint(side - size + 1, (), generator=generator))
+            patch.append(slice(first, first + size))
+        erased = pair.right.clone()
+        erased[:, patch[0], patch[1]] = pair.right.mean((1, 2))[:, None, None]
+        pair = pair._replace(right=erased)
     return pair
 
 
@@ -265,28 +253,6 @@ def shift_rows(
     return F.grid_sample(image[None], grid[None], padding_mode="border", align_corners=False)[0]
 
 
-def erase_patch(
-    image: Float[Tensor, "3 h w"], generator: torch.Generator
-) -> Float[Tensor, "3 h w"]:
-    """Give a patch of a sixth to a third of each side the mean colour of the image."""
-    sides = []
-    for side in image.shape[1:]:
-        size = int(side * (1 + float(torch.rand((), generator=generator))) / 6)
-        first = int(torch.randint(side - size + 1, (), generator=generator))
-        sides.append(slice(first, first + size))
-    erased = image.clone()
-    erased[:, sides[0], sides[1]] = image.mean((1, 2))[:, None, None]
-    return erased
-
-
 def _saturate(image: Float[Tensor, "3 h w"], factor: float) -> Float[Tensor, "3 h w"]:
     grey = grey_of(image)
     return grey + (image - grey) * factor
-
-
-def _draw_scale(config: AugmentConfig, generator: torch.Generator, size: Sequence[int]) -> float:
-    """Draw a scale; none at which half of the crop would be black, if a larger one is allowed."""
-    low, high = config.scale
-    drawn = low + (high - low) * float(torch.rand((), generator=generator))
-    half = max((crop + 1) / 2 / side for crop, side in zip(config.crop_px, size, strict=True))
-    return max(drawn, min(half, high))

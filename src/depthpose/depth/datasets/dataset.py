@@ -88,7 +88,7 @@ def read_split(name: str | Path) -> Split:
     text = read_text(path, _MAX_BYTES)
     known = _MONODEPTH_SHA256.get(hashlib.sha256(text.encode()).hexdigest())
     if known is not None:
-        return _shipped(known)
+        return _known(known)
     lines = ((i, line.strip()) for i, line in enumerate(text.splitlines(), 1))
     frames = {_parse_line(path, i, line) for i, line in lines if line} - {None}
     if not frames:
@@ -118,14 +118,9 @@ def _parse_line(path: Path, number: int, line: str) -> tuple[str, int] | None:
 
 @cache
 def _known(name: str) -> Split:
-    if name not in _JOINED:
-        return _shipped(name)
-    frames = {frame for part in _JOINED[name] for frame in _shipped(part).frames}
-    return Split(name=name, frames=tuple(sorted(frames)))
-
-
-@cache
-def _shipped(name: str) -> Split:
+    if name in _JOINED:
+        joined = {frame for part in _JOINED[name] for frame in _known(part).frames}
+        return Split(name=name, frames=tuple(sorted(joined)))
     count, sha256 = _SHIPPED[name]
     text = resources.files("depthpose.depth.datasets").joinpath(f"lists/{name}.txt").read_text()
     if hashlib.sha256(text.encode()).hexdigest() != sha256:
@@ -196,9 +191,16 @@ def open_dataset(folder: Path | str, split: str | Path | None = None) -> Dataset
     if split is None:
         return Dataset(name=name, layout=layout, frames=frames)
     chosen = read_split(split)
-    return Dataset(
-        name=f"{name} {chosen.name}", layout=layout, frames=_select(folder, frames, chosen)
-    )
+    by_name = {frame.name: frame for frame in frames}
+    missing = [name for name in chosen.names if name not in by_name]
+    if missing:
+        raise InputError(
+            f"{folder}: {len(missing)} of the {len(chosen.names)} frames of {chosen.name} are "
+            f"missing, first {', '.join(missing[:3])}. 'depthpose data check' lists them all; "
+            "without a split what is there is used."
+        )
+    kept = [by_name[name] for name in chosen.names]
+    return Dataset(name=f"{name} {chosen.name}", layout=layout, frames=kept)
 
 
 def join_datasets(datasets: Sequence[Dataset], without: Sequence[str] = ()) -> Dataset:
@@ -257,15 +259,3 @@ def read_known_depth(dataset: Dataset, index: int) -> Float[Tensor, "h w"] | Non
         return truth.depth_m
     rig = dataset.read_rig(index)
     return None if rig is None else depth_from_disparity(truth.disparity_px, rig)
-
-
-def _select(folder: Path, frames: list[Frame], split: Split) -> list[Frame]:
-    by_name = {frame.name: frame for frame in frames}
-    missing = [name for name in split.names if name not in by_name]
-    if missing:
-        raise InputError(
-            f"{folder}: {len(missing)} of the {len(split.names)} frames of {split.name} are "
-            f"missing, first {', '.join(missing[:3])}. 'depthpose data check' lists them all; "
-            "without a split what is there is used."
-        )
-    return [by_name[name] for name in split.names]

@@ -6,6 +6,7 @@ the published Eigen evaluation to the bit.
 
 import re
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
@@ -63,19 +64,15 @@ class KittiCalibration:
 
 def read_raw_calibration(folder: Path, width: int, height: int) -> KittiCalibration:
     """Read a date's ``calib_cam_to_cam.txt`` and, where it is, ``calib_velo_to_cam.txt``."""
-    cameras = folder / "calib_cam_to_cam.txt"
+    cameras, lidar = folder / "calib_cam_to_cam.txt", folder / "calib_velo_to_cam.txt"
     keys = read_key_values(cameras)
-    left = kitti_matrix(cameras, keys, "P_rect_02", (3, 4))
-    _check_size(cameras, keys, width, height)
-    right = kitti_matrix(cameras, keys, "P_rect_03", (3, 4))
-    rig = _projected_rig(cameras, left, right, (width, height))
-    lidar = folder / "calib_velo_to_cam.txt"
+    rig, left = _projected_rig(cameras, keys, ("P_rect_02", "P_rect_03"), (width, height))
     if not lidar.is_file():
         return KittiCalibration(rig=rig, pixels_from_velodyne=None)
-    rectify = _square(kitti_matrix(cameras, keys, "R_rect_00", (3, 3)))
+    rectify = kitti_matrix(cameras, keys, "R_rect_00", (3, 3))
     of_lidar = read_key_values(lidar)
     R, t = kitti_matrix(lidar, of_lidar, "R", (3, 3)), kitti_matrix(lidar, of_lidar, "T", (3, 1))
-    composed = _compose(lidar, left, rectify, _square(np.hstack([R, t])))
+    composed = _composed(lidar, left, rectify, np.hstack([R, t]))
     return KittiCalibration(rig=rig, pixels_from_velodyne=composed)
 
 
@@ -90,18 +87,12 @@ def read_object_calibration(
     keys = read_key_values(path)
     names = ("P2", "P3") if "P2" in keys else ("P_rect_02", "P_rect_03")
     names = ("P0", "P1") if is_grey else names
-    left, right = (kitti_matrix(path, keys, name, (3, 4)) for name in names)
-    _check_size(path, keys, width, height)
-    rig = _projected_rig(path, left, right, (width, height))
+    rig, left = _projected_rig(path, keys, names, (width, height))
     moved = next((name for name in ("Tr_velo_to_cam", "Tr") if name in keys), None)
     if moved is None:
         return KittiCalibration(rig=rig, pixels_from_velodyne=None)
-    turned = np.eye(3) if moved == "Tr" else kitti_matrix(path, keys, "R0_rect", (3, 3))
-    rectify, camera_from_velodyne = (
-        _square(turned),
-        _square(kitti_matrix(path, keys, moved, (3, 4))),
-    )
-    composed = _compose(path, left, rectify, camera_from_velodyne)
+    rectify = np.eye(3) if moved == "Tr" else kitti_matrix(path, keys, "R0_rect", (3, 3))
+    composed = _composed(path, left, rectify, kitti_matrix(path, keys, moved, (3, 4)))
     return KittiCalibration(rig=rig, pixels_from_velodyne=composed)
 
 
@@ -117,7 +108,13 @@ def read_plain_calibration(path: Path, name: str, width: int, height: int) -> St
         keys = read_key_values(path)
         return _rig(path, plain_facts(path, keys), (width, height))
     lines = re.findall(rf"^[ \t]*{re.escape(name)}[ \t]+(.+)$", text, re.MULTILINE)
-    own = [numbers for line in lines if len(numbers := _numbers_of(line)) >= 6]
+    own: list[list[float]] = []
+    for line in lines:
+        numbers: list[float] = []
+        with suppress(ValueError):  # what begins the line counts
+            for word in line.split():
+                numbers.append(float(word))  # noqa: PERF401  those before an error stay
+        own += [numbers] if len(numbers) >= 6 else []
     if lines and not own:
         raise InputError(
             f"{path}: the line of {name!r} is no calibration: {lines[0][:80]!r} does not begin "
@@ -140,17 +137,6 @@ def read_plain_calibration(path: Path, name: str, width: int, height: int) -> St
         raise InputError(f"{path}: the line of {name!r} is no calibration ({error}).") from error
 
 
-def _numbers_of(line: str) -> list[float]:
-    """Give the numbers that begin a line."""
-    numbers = list[float]()
-    for word in line.split():
-        try:
-            numbers.append(float(word))
-        except ValueError:
-            break
-    return numbers
-
-
 def _rig(path: Path, facts: CameraFacts, size: Size | None) -> StereoRig:
     try:
         rig = camera_from_facts(facts, size)
@@ -160,41 +146,35 @@ def _rig(path: Path, facts: CameraFacts, size: Size | None) -> StereoRig:
     return rig
 
 
-def _projected_rig(path: Path, left: Matrix, right: Matrix, size: Size) -> StereoRig:
+def _projected_rig(
+    path: Path, keys: Mapping[str, list[float]], names: tuple[str, str], size: Size
+) -> tuple[StereoRig, Matrix]:
+    """The rig of two projections, and that of the left camera."""
+    left, right = (kitti_matrix(path, keys, name, (3, 4)) for name in names)
+    said = kitti_size(keys) or size
+    if said != size:
+        raise InputError(
+            f"{path}: S_rect_02 says {said[0]}x{said[1]}, but the image is {size[0]}x{size[1]}. It "
+            "was cropped or scaled: give its own calibration, in a folder of pairs."
+        )
     try:
         facts = facts_from_projections("a KITTI calibration", left, right)
     except InputError as error:
         raise InputError(f"{path}: {error}") from error
-    return _rig(path, facts, size)
+    return _rig(path, facts, size), left
 
 
-def _compose(
-    path: Path,
-    left: Matrix,
-    rectify: Float64[np.ndarray, "4 4"],
-    camera_from_velodyne: Float64[np.ndarray, "4 4"],
+def _composed(
+    path: Path, left: Matrix, rectify: Matrix, camera_from_velodyne: Matrix
 ) -> Float64[np.ndarray, "3 4"]:
+    """LiDAR points to pixels; a 3x3 rotation or a 3x4 transform is extended to 4x4."""
+    turned, moved = np.eye(4), np.eye(4)
+    turned[:3, :3], moved[:3] = rectify, camera_from_velodyne
     with np.errstate(all="ignore"):
-        composed = left @ rectify @ camera_from_velodyne
+        composed = left @ turned @ moved
     if not np.isfinite(composed).all():
         raise InputError(f"{path}: its matrices multiply to infinity. Copy the file anew.")
     return composed
-
-
-def _check_size(path: Path, keys: Mapping[str, list[float]], width: int, height: int) -> None:
-    size = kitti_size(keys) or (width, height)
-    if size != (width, height):
-        raise InputError(
-            f"{path}: S_rect_02 says {size[0]}x{size[1]}, but the image is {width}x{height}. It "
-            "was cropped or scaled: give its own calibration, in a folder of pairs."
-        )
-
-
-def _square(matrix: Matrix) -> Float64[np.ndarray, "4 4"]:
-    """Extend a 3x3 rotation or a 3x4 transform to 4x4."""
-    extended = np.eye(4)
-    extended[: matrix.shape[0], : matrix.shape[1]] = matrix
-    return extended
 
 
 LidarDepth = Literal["velodyne_x", "camera_z"]
@@ -230,30 +210,21 @@ def project_lidar(
     value_m = homogeneous[:, 0].astype(np.float64) if depth == "velodyne_x" else projected[:, 2]
     is_inside = ((pixel >= 0) & (pixel < (width, height))).all(1)
     u, v = pixel[is_inside].astype(np.int64).T
-    written = _write_in_order(u, v, value_m[is_inside], (height, width))
-    written[written < 0] = 0
-    with np.errstate(over="ignore"):
-        as_float32 = torch.from_numpy(written.astype(np.float32))
-    return torch.where(as_float32 > 0, as_float32, torch.nan)
-
-
-def _write_in_order(
-    u: np.ndarray, v: np.ndarray, value_m: Float64[np.ndarray, " n"], size: tuple[int, int]
-) -> Float64[np.ndarray, "h w"]:
-    height, width = size
-    canvas = np.zeros((height, width))
     # The last point of a pixel wins: keep one write a pixel, for NumPy promises no order.
-    flat = v * width + u
-    last_of_reversed = np.unique(flat[::-1], return_index=True)
-    canvas.flat[last_of_reversed[0]] = value_m[::-1][last_of_reversed[1]]
+    value_m, written = value_m[is_inside], np.zeros((height, width))
+    pixels, last = np.unique((v * width + u)[::-1], return_index=True)
+    written.flat[pixels] = value_m[::-1][last]
     shared = v * (width - 1) + u - 1
     index, first, count = np.unique(shared, return_index=True, return_counts=True)
     smallest = np.full(len(index), np.inf)
     np.minimum.at(smallest, np.searchsorted(index, shared), value_m)
     # Colliding groups never write the same pixel twice: each pixel has one shared index.
     again = count > 1
-    canvas[v[first[again]], u[first[again]]] = smallest[again]
-    return canvas
+    written[v[first[again]], u[first[again]]] = smallest[again]
+    written[written < 0] = 0
+    with np.errstate(over="ignore"):
+        as_float32 = torch.from_numpy(written.astype(np.float32))
+    return torch.where(as_float32 > 0, as_float32, torch.nan)
 
 
 CalibrationStyle = Literal["raw", "object", "grey", "middlebury", "plain", "camera"]
@@ -360,10 +331,9 @@ def kitti_calibration(frame: Frame) -> KittiCalibration:
 
 def known_truths(frame: Frame) -> tuple[TruthKind, ...]:
     """Say which kinds of truth a frame has."""
-    is_annotated = frame.depth is not None and not _is_plain(frame)
     kinds: dict[TruthKind, bool] = {
         "scan": has_lidar(frame, "camera_z"),
-        "annotated": is_annotated,
+        "annotated": frame.depth is not None and not _is_plain(frame),
         "disparity": frame.disparity is not None,
     }
     return tuple(kind for kind, is_there in kinds.items() if is_there)

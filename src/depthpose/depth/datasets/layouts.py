@@ -8,7 +8,6 @@ import tarfile
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, fields
 from functools import partial
-from itertools import groupby
 from pathlib import Path
 from typing import Any
 
@@ -63,18 +62,29 @@ def pack_frames(
     """
     rows: list[dict[str, Any]] = []
     kept: dict[Path, str] = {}
-    shards = 0
-    for number, group in groupby(_numbered(frames, shard_bytes), key=lambda pair: pair[0]):
-        name = f"{number:06d}.tar"
+    remaining, shards = list(frames), 0
+    while remaining:
+        name, size = f"{shards:06d}.tar", 0
         with atomic_write(out / name) as part, tarfile.open(part, "w") as tar:
-            for _, frame in group:
-                key = f"{len(rows):08d}"
+            while remaining:
+                frame, key = remaining.pop(0), f"{len(rows):08d}"
                 row = {"name": frame.name, "style": frame.style}
-                row |= {what: f"{name}/{file}" for what, file in _add(tar, key, frame)}
+                for what in _PARTS:
+                    path = getattr(frame, what)
+                    if path is None:
+                        continue
+                    data = read_bytes(path)
+                    member = tarfile.TarInfo(f"{key}.{what}{path.suffix.lower()}")
+                    member.size = len(data)
+                    tar.addfile(member, io.BytesIO(data))
+                    row[what] = f"{name}/{member.name}"
+                    size += len(data)
                 if frame.calibration is not None:
                     row["calibration"] = _keep(frame.calibration, out, kept)
                 rows.append(row)
                 show(frame.name)
+                if size >= shard_bytes:
+                    break
         shards += 1
     write_json(out / INDEX, {"frames": rows})
     return shards
@@ -110,13 +120,6 @@ def local_folder(folder: Path | str) -> Path:
         return Path(folder)
     url = _URL.sub(r"\1://", text, count=1).rstrip("/")  # a Path has made one slash of two
     here = cache_folder() / "shards" / hashlib.sha256(url.encode()).hexdigest()[:16]
-    _fetch_small(url, here)
-    write_json(here / SOURCE, {"url": url})
-    return here
-
-
-def _fetch_small(url: str, here: Path) -> None:
-    """Fetch calibration and, last, the index."""
     from depthpose.core.files.disk import exists, fetch, join, list_tree  # fsspec takes time
 
     if not exists(join(url, INDEX)):
@@ -125,33 +128,8 @@ def _fetch_small(url: str, here: Path) -> None:
         if ".." not in Path(name).parts:
             fetch(of_file, here / _CALIBRATION / name)
     fetch(join(url, INDEX), here / INDEX)
-
-
-def _numbered(frames: list[Frame], shard_bytes: int) -> Iterator[tuple[int, Frame]]:
-    """Say which shard each frame goes into."""
-    number, size = 0, 0
-    for frame in frames:
-        if size >= shard_bytes:
-            number, size = number + 1, 0
-        size += sum(path.stat().st_size for _, path in _files(frame))
-        yield number, frame
-
-
-def _files(frame: Frame) -> Iterator[tuple[str, Path]]:
-    for part in _PARTS:
-        path = getattr(frame, part)
-        if path is not None:
-            yield part, path
-
-
-def _add(tar: tarfile.TarFile, key: str, frame: Frame) -> Iterator[tuple[str, str]]:
-    """Copy the files of a frame; give what each is, and its name."""
-    for part, path in _files(frame):
-        data = read_bytes(path)
-        member = tarfile.TarInfo(f"{key}.{part}{path.suffix.lower()}")
-        member.size = len(data)
-        tar.addfile(member, io.BytesIO(data))
-        yield part, member.name
+    write_json(here / SOURCE, {"url": url})
+    return here
 
 
 def _keep(calibration: Path, out: Path, kept: dict[Path, str]) -> str:
@@ -169,15 +147,10 @@ def _keep(calibration: Path, out: Path, kept: dict[Path, str]) -> str:
 
 @dataclass(frozen=True, kw_only=True)
 class Layout:
-    """How the files of a dataset lie in its folder.
+    """How the files of a dataset lie in its folder."""
 
-    Attributes:
-        find: gives the frames of a folder; none where it has another layout.
-        parts: the files and folders by which people recognise it.
-    """
-
-    find: Callable[[Path], Iterable[Frame]]
-    parts: str
+    find: Callable[[Path], Iterable[Frame]]  # the frames of a folder; none in another layout
+    parts: str  # the files and folders by which people recognise it
 
 
 def find_frames(folder: Path) -> tuple[str, list[Frame]]:
@@ -192,9 +165,8 @@ def find_frames(folder: Path) -> tuple[str, list[Frame]]:
     found = ", ".join(path.name for path in children[:8]) or "nothing"
     inside = [path.name for path in children[:50] if path.is_dir() and _recognise(path)]
     hint = f" Open one of its folders instead: {', '.join(inside)}." if inside else ""
-    if any(
-        path.name.endswith("_extract") for path in (folder, *children, *folder.glob("*/*_extract"))
-    ):
+    drives = (folder, *children, *folder.glob("*/*_extract"))
+    if any(path.name.endswith("_extract") for path in drives):
         hint += (
             " Drives called _extract hold KITTI's raw images, which are neither rectified nor "
             "synchronised: take those called _sync."
@@ -218,25 +190,22 @@ def _raw(folder: Path) -> Iterable[Frame]:
     itself = [folder] if folder.name.endswith("_sync") else []
     for drive in sorted([*itself, *folder.glob("*_sync"), *folder.glob("*/*_sync")]):
         date = drive.parent
-        right, disparity, disparity_noc, sky = (
-            _by_stem(drive / part) for part in ("image_03/data", "disp_occ", "disp_noc", "sky")
-        )
-        annotated = _by_stem(_depth_folder(drive, "groundtruth", "data_depth_annotated"))
-        scans = _by_stem(_depth_folder(drive, "velodyne_raw", "data_depth_velodyne"))
-        points = _by_stem(drive / "velodyne_points/data", (".bin",))
+        parts = {
+            "right": _by_stem(drive / "image_03/data"),
+            "velodyne": _by_stem(drive / "velodyne_points/data", (".bin",)),
+            "scan": _by_stem(_depth_folder(drive, "velodyne_raw", "data_depth_velodyne")),
+            "depth": _by_stem(_depth_folder(drive, "groundtruth", "data_depth_annotated")),
+            "disparity": _by_stem(drive / "disp_occ"),
+            "disparity_noc": _by_stem(drive / "disp_noc"),
+            "sky": _by_stem(drive / "sky"),
+        }
         for left in _images(drive / "image_02/data"):
             yield Frame(
                 name=f"{drive.name}_{left.stem}",
                 left=left,
-                right=right.get(left.stem),
                 calibration=date if (date / "calib_cam_to_cam.txt").exists() else None,
                 style="raw",
-                velodyne=points.get(left.stem),
-                scan=scans.get(left.stem),
-                depth=annotated.get(left.stem),
-                disparity=disparity.get(left.stem),
-                disparity_noc=disparity_noc.get(left.stem),
-                sky=sky.get(left.stem),
+                **{part: files.get(left.stem) for part, files in parts.items()},
             )
 
 
@@ -272,19 +241,18 @@ def _odometry(folder: Path) -> Iterable[Frame]:
     """A sequence of KITTI odometry, or the folder of all: in colour, else in grey."""
     homes = [folder, *sorted(folder.glob("*")), *sorted(folder.glob("*sequences/*"))]
     for home in (*homes, *sorted(folder.glob("dataset/sequences/*"))):
-        one, other = (
-            ("image_2", "image_3") if (home / "image_2").is_dir() else ("image_0", "image_1")
-        )
         if not (home / "calib.txt").is_file():
             continue
-        right, points = _by_stem(home / other), _by_stem(home / "velodyne", (".bin",))
-        for left in _images(home / one):
+        is_grey = not (home / "image_2").is_dir()
+        right = _by_stem(home / ("image_1" if is_grey else "image_3"))
+        points = _by_stem(home / "velodyne", (".bin",))
+        for left in _images(home / ("image_0" if is_grey else "image_2")):
             yield Frame(
                 name=left.stem if home == folder else f"{home.name}_{left.stem}",
                 left=left,
                 right=right.get(left.stem),
                 calibration=home / "calib.txt",
-                style="object" if one == "image_2" else "grey",
+                style="grey" if is_grey else "object",
                 velodyne=points.get(left.stem),
             )
 
@@ -294,25 +262,23 @@ def _benchmark(folder: Path, one: str, other: str, ending: str) -> Iterable[Fram
     home = folder / "training" if (folder / "training" / one).is_dir() else folder
     lefts = _images(home / one)
     is_stereo = any(left.stem.endswith("_10") for left in lefts)  # its testing folder too
-    right, depth, disparity, disparity_noc = (
-        _by_stem(home / part)
-        for part in (other, "gt_depth_map", f"disp_occ{ending}", f"disp_noc{ending}")
-    )
+    parts = {
+        "right": _by_stem(home / other),
+        "velodyne": _by_stem(home / "velodyne", (".bin",)),
+        "depth": _by_stem(home / "gt_depth_map"),
+        "disparity": _by_stem(home / f"disp_occ{ending}"),
+        "disparity_noc": _by_stem(home / f"disp_noc{ending}"),
+    }
     texts = _by_stem(home / "calib_cam_to_cam", (".txt",)) | _by_stem(home / "calib", (".txt",))
-    points = _by_stem(home / "velodyne", (".bin",))
     for left in lefts:
         if is_stereo and not left.stem.endswith("_10"):
             continue
         yield Frame(
             name=left.stem,
             left=left,
-            right=right.get(left.stem),
             calibration=texts.get(left.stem) or texts.get(left.stem.removesuffix("_10")),
             style="object",
-            velodyne=points.get(left.stem),
-            depth=depth.get(left.stem),
-            disparity=disparity.get(left.stem),
-            disparity_noc=disparity_noc.get(left.stem),
+            **{part: files.get(left.stem) for part, files in parts.items()},
         )
 
 
@@ -335,18 +301,15 @@ def _middlebury(folder: Path) -> Iterable[Frame]:
 def _pairs(folder: Path) -> Iterable[Frame]:
     cameras = _by_stem(folder, (".json", ".yaml", ".yml"))
     camera, text = cameras.get("camera"), folder / "calib.txt"
-    right, depth, disparity = (
-        _by_stem(folder / part) for part in ("right", "lidar_depth", "disp_occ")
-    )
+    folders = {"right": "right", "depth": "lidar_depth", "disparity": "disp_occ"}
+    parts = {part: _by_stem(folder / name) for part, name in folders.items()}
     for left in _images(folder / "left"):
         yield Frame(
             name=left.stem,
             left=left,
-            right=right.get(left.stem),
             calibration=camera or (text if text.is_file() else None),
             style="camera" if camera else "plain",
-            depth=depth.get(left.stem),
-            disparity=disparity.get(left.stem),
+            **{part: files.get(left.stem) for part, files in parts.items()},
         )
 
 

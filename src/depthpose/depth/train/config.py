@@ -60,7 +60,6 @@ class ViewTraining:
     """How long."""
 
     def __post_init__(self) -> None:
-        """Refuse an unknown loss, and a network and a weight that are none."""
         refuse_unknown("gan_mode", self.gan_mode, ADVERSARIAL_LOSSES)
         check_settings(self, discriminator_width="[1, inf)", l1_weight="[0, inf)")
 
@@ -126,7 +125,6 @@ class SelectTraining:
     """How long."""
 
     def __post_init__(self) -> None:
-        """Refuse weights and shares that are none, and an unknown loss."""
         refuse_unknown("disparity_loss", self.disparity_loss, DISPARITY_LOSSES)
         check_settings(
             self,
@@ -186,7 +184,6 @@ class StereoTraining:
     """How long."""
 
     def __post_init__(self) -> None:
-        """Refuse a share that is none, and two networks."""
         # A config that a run has written holds the defaults of ``matcher`` beside ``light``.
         if self.light is not None and self.matcher != PSMNetConfig():
             raise InputError(
@@ -259,7 +256,6 @@ class AdaptTraining:
     """How long."""
 
     def __post_init__(self) -> None:
-        """Refuse weights and counts that are none, and views changed each on its own."""
         check_settings(
             self,
             photometric_weight="[0, inf)",
@@ -302,7 +298,6 @@ class FinetuneTraining:
     """How long."""
 
     def __post_init__(self) -> None:
-        """Refuse a weight that is none."""
         check_settings(self, l1_weight="[0, inf)")
 
 

@@ -1,13 +1,11 @@
 """Pairs, on disk or rendered, as training samples by index."""
 
 from collections import Counter
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Sequence
 from hashlib import sha256
 from typing import NamedTuple
 
 import torch
-from jaxtyping import Float
-from torch import Tensor
 
 from depthpose.core.camera import StereoRig
 from depthpose.core.errors import InputError
@@ -70,12 +68,11 @@ class TrainingPairs:
     ) -> None:
         self.config, self.seed = config, seed
         self._places = _find_places(config, needs_truth=needs_truth, is_mixed=is_mixed)
-        said = []
-        for source, _, truth in self._places:
-            if truth:
-                name = source.name if isinstance(source, Dataset) else _STREETS
-                said.append(f"{name}: {truth}")
-        self.truths = tuple(dict.fromkeys(said))
+        names = (
+            (source.name if isinstance(source, Dataset) else _STREETS, truth)
+            for source, _, truth in self._places
+        )
+        self.truths = tuple(dict.fromkeys(f"{name}: {truth}" for name, truth in names if truth))
         if baseline_m is not None:
             self._check_baselines(baseline_m)
         self._cache: dict[int, TrainingPair] = {}
@@ -86,18 +83,14 @@ class TrainingPairs:
     @property
     def frames(self) -> list[Frame]:
         """Those of folders, not what is rendered."""
-        return [
-            place.source.frames[place.number]
-            for place in self._places
-            if isinstance(place.source, Dataset)
-        ]
+        found = ((source, number) for source, number, _ in self._places)
+        return [source.frames[n] for source, n in found if isinstance(source, Dataset)]
 
     def __getitem__(self, sample_index: int) -> TrainingPair:
         """Make the n-th sample."""
         index = shuffled_index(sample_index, len(self), self.seed)
-        return augment(
-            self.read(index), self.config.augment, sample_generator(sample_index, self.seed)
-        )
+        generator = sample_generator(sample_index, self.seed)
+        return augment(self.read(index), self.config.augment, generator)
 
     def read(self, index: int) -> TrainingPair:
         """Read one whole pair at the config's focal length, unchanged otherwise."""
@@ -128,7 +121,16 @@ class TrainingPairs:
 
     def _check_baselines(self, wanted_m: float) -> None:
         """Check every rig before any work: another baseline would change the metric scale."""
-        for name, rig in self._rigs():
+        rigs: dict[str, StereoRig | None] = {}
+        for number, (source, place, _) in enumerate(self._places):
+            if isinstance(source, Dataset):
+                rigs[self._frame_name(number)] = source.read_rig(place)
+            elif source.config.rigs != "kitti":
+                rigs[self._frame_name(number)] = street_rig(source.config, place)[0]
+        made = self.config.streets
+        if made is not None and made.rigs == "kitti":  # five rigs, and perhaps millions of streets
+            rigs |= {f"street with KITTI's rig {n}": kitti_rig(n) for n in range(5)}
+        for name, rig in rigs.items():
             if rig is None:
                 raise InputError(
                     f"{name}: has no calibration, and the generator imitates one rig; add one, or "
@@ -141,26 +143,30 @@ class TrainingPairs:
                     "virtual_baseline_m to that rig's."
                 )
 
-    def _rigs(self) -> Iterator[tuple[str, StereoRig | None]]:
-        for number, (source, place, _) in enumerate(self._places):
-            if isinstance(source, Dataset):
-                yield self._frame_name(number), source.read_rig(place)
-            elif source.config.rigs != "kitti":
-                yield self._frame_name(number), street_rig(source.config, place)[0]
-        made = self.config.streets
-        if made is not None and made.rigs == "kitti":  # five rigs, and perhaps millions of streets
-            yield from ((f"street with KITTI's rig {n}", kitti_rig(n)) for n in range(5))
-
 
 def _read_pair(place: _Place) -> TrainingPair:
-    """Read a pair as it is, and its truth where one is asked for."""
+    """Read a pair as it is, and its truth where one is asked for; 0 in the sky, where known."""
     source, index, kind = place
     left_px = right_px = None
     if isinstance(source, Dataset):
-        given = source.read_input(index)
+        given, name = source.read_input(index), source.frames[index].name
         rig = given.camera if isinstance(given.camera, StereoRig) else None
-        if kind is not None:
-            left_px = _truth_on_disk(source, index, kind, rig)
+        if kind == "disparity":
+            truth = source.read_truth(index)
+            assert truth.disparity_px is not None, "frames without truth were left out"
+            left_px = truth.disparity_px
+            left_px = left_px if truth.is_sky is None else torch.where(truth.is_sky, 0.0, left_px)
+        elif kind is not None and rig is None:
+            raise InputError(
+                f"{name}: has depth as its truth but no calibration of the pair, so it cannot "
+                "become disparity; add the calibration, or exclude the frame"
+            )
+        elif kind is not None and rig is not None:
+            depth_m = source.read_truth(index).depth_m
+            if kind == "scan":
+                depth_m = lidar_truth(source.frames[index], "camera_z")
+            assert depth_m is not None, "frames without truth were left out"
+            left_px = disparity_from_depth(depth_m, rig)
     else:
         made = source[index]
         given, rig = made.input, made.input.camera
@@ -174,28 +180,6 @@ def _read_pair(place: _Place) -> TrainingPair:
         return TrainingPair(given.left, given.left, left_px, left_px, focal_px)
     right_px = right_disparity_from_left(left_px) if right_px is None else right_px
     return TrainingPair(given.left, given.right, left_px, right_px, focal_px)
-
-
-def _truth_on_disk(
-    dataset: Dataset, index: int, kind: TruthKind, rig: StereoRig | None
-) -> Float[Tensor, "h w"]:
-    """Disparity of the left view by one kind of truth; 0 in the sky, where that is known."""
-    frame = dataset.frames[index]
-    if kind == "disparity":
-        truth = dataset.read_truth(index)
-        assert truth.disparity_px is not None, "frames without truth were left out"
-        if truth.is_sky is None:
-            return truth.disparity_px
-        return torch.where(truth.is_sky, 0.0, truth.disparity_px)
-    if rig is None:
-        raise InputError(
-            f"{frame.name}: has depth as its truth but no calibration of the pair, so it cannot "
-            "become disparity; add the calibration, or exclude the frame"
-        )
-    is_scan = kind == "scan"
-    depth_m = lidar_truth(frame, "camera_z") if is_scan else dataset.read_truth(index).depth_m
-    assert depth_m is not None, "frames without truth were left out"
-    return disparity_from_depth(depth_m, rig)
 
 
 def _find_places(config: PairsConfig, *, needs_truth: bool, is_mixed: bool) -> list[_Place]:
@@ -224,12 +208,24 @@ def _usable(
     dataset: Dataset, config: PairsConfig, *, needs_truth: bool, is_mixed: bool
 ) -> list[_Place]:
     """Frames of a folder that can be learnt from, all with one kind of truth if it is needed."""
+    name, wanted = dataset.name, config.truth
     there = {
         index: known_truths(frame)
         for index, frame in enumerate(dataset.frames)
         if (frame.right is not None or is_mixed) and frame.name not in config.exclude
     }
-    kind = _choose_truth(dataset.name, there.values(), config.truth) if needs_truth else None
+    kind: TruthKind | None = None
+    if needs_truth:
+        counts: Counter[TruthKind] = Counter(kind for kinds in there.values() for kind in kinds)
+        said = ", ".join(f"{kind} of {count} frames" for kind, count in counts.items())
+        if wanted is not None and counts and wanted not in counts:
+            raise InputError(f"{name}: no frame has truth: {wanted}; there is {said}")
+        if wanted is None and len(counts) > 1:
+            raise InputError(
+                f"{name}: has several kinds of truth ({said}), and one kind alone is learnt from; "
+                f"set truth in pairs (or held_out) of the config to one of {', '.join(counts)}"
+            )
+        kind = wanted or next(iter(counts), None)
     places = [
         _Place(dataset, index, kind if kind in kinds else None) for index, kinds in there.items()
     ]
@@ -240,24 +236,8 @@ def _usable(
     if not found:
         what = " or ".join if is_mixed else " and ".join
         parts = ["a right view", "a truth"] if needs_truth or is_mixed else ["a right view"]
-        raise InputError(f"{dataset.name}: no frame has {what(parts)}; nothing to train on.")
+        raise InputError(f"{name}: no frame has {what(parts)}; nothing to train on.")
     return found
-
-
-def _choose_truth(
-    name: str, kinds: Iterable[Sequence[TruthKind]], wanted: TruthKind | None
-) -> TruthKind | None:
-    """One kind of truth for all frames of a folder."""
-    counts: Counter[TruthKind] = Counter(kind for of_frame in kinds for kind in of_frame)
-    said = ", ".join(f"{kind} of {count} frames" for kind, count in counts.items())
-    if wanted is not None and counts and wanted not in counts:
-        raise InputError(f"{name}: no frame has truth: {wanted}; there is {said}")
-    if wanted is None and len(counts) > 1:
-        raise InputError(
-            f"{name}: has several kinds of truth ({said}), and one kind alone is learnt from; set "
-            f"truth in pairs (or held_out) of the config to one of {', '.join(counts)}"
-        )
-    return wanted or next(iter(counts), None)
 
 
 _STREETS = "synthetic streets"
