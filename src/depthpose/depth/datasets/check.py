@@ -132,7 +132,7 @@ def _check_images(frame: Frame, *, with_decoding: bool) -> Iterator[Problem]:
         with suppress(InputError):  # which is told by itself
             rig = frame_camera(frame)
         apart_px = rig.cx_right_minus_left_px if isinstance(rig, StereoRig) else 0.0
-        report = check_rectified(*images, apart_px)
+        report = check_rectified(images[0], images[1], apart_px)
         if report.is_wrong or report.is_rectified is None:
             message = f"beside {frame.left.name}: {report.message}"
             yield _problem(frame.right, "mismatch" if report.is_wrong else "note", message)

@@ -18,5 +18,5 @@ from depthpose.depth.stereo.matcher import normalise as normalise
 from depthpose.depth.stereo.matcher import tile_change_px as tile_change_px
 from depthpose.depth.stereo.matcher import with_usable_precision as with_usable_precision
 from depthpose.depth.stereo.psmnet import PSMNet as PSMNet
-from depthpose.depth.stereo.published import import_psmnet as import_psmnet
-from depthpose.depth.stereo.published import psmnet_from_published as psmnet_from_published
+from depthpose.depth.stereo.psmnet import import_psmnet as import_psmnet
+from depthpose.depth.stereo.psmnet import psmnet_from_published as psmnet_from_published

@@ -45,9 +45,7 @@ def psmnet_bytes(
     bins = config.max_disparity_px // 4
     volume_bytes = map_bytes * bins
 
-    def slab_bytes(halo: int) -> int:
-        return min(rows + 2 * halo, h) * row_bytes * bins
-
+    slab2_bytes, slab4_bytes = (min(rows + 2 * halo, h) * row_bytes * bins for halo in (2, 4))
     levels = 6 + len(config.pools)
     cost_bytes = 4 * bins * h * w
     # Costs are computed in float32.
@@ -56,9 +54,9 @@ def psmnet_bytes(
         # Five half-size maps in the first stage; joined levels, twice, in the last.
         2 * map_bytes * max(5 * 4, 2 * levels + 12),
         # ``cost0``; of some rows the concatenation, and what a convolution makes of it.
-        volume_bytes + 2 * map_bytes + 3 * slab_bytes(4),
+        volume_bytes + 2 * map_bytes + 3 * slab4_bytes,
         # ``cost0``, what is added to it, three half-size volumes; some rows in the head.
-        2 * volume_bytes + 3 * volume_bytes // 4 + head_slabs * slab_bytes(2) + 3 * cost_bytes,
+        2 * volume_bytes + 3 * volume_bytes // 4 + head_slabs * slab2_bytes + 3 * cost_bytes,
         4 * cost_bytes + 16 * height * width + 5 * CHUNK_BYTES,
     )
     return int(MARGIN * max(stages)) + OVERHEAD_BYTES
@@ -87,19 +85,6 @@ def light_bytes(
     compared = 4 * (4 * 16 + 9 + 3 * 9) * 4 if config.with_agreement else 0
     weights = slab_pixels * (joined + compared + 3 * 4 * 36 * 4)
     return int(MARGIN * (images + kept + max(volumes, weights))) + OVERHEAD_BYTES // 2
-
-
-def refuse_more_memory(
-    least: int, max_memory_bytes: int | None, height: int, width: int, *, has_quick: bool
-) -> None:
-    """Refuse a bound that a match would exceed: volumes are held whole, and cannot be traded."""
-    if max_memory_bytes is not None and least > max_memory_bytes:
-        quick = " or speed='quick'" if has_quick else ""
-        raise InputError(
-            f"max_memory_bytes={max_memory_bytes} is too small for images of {height}x{width} "
-            f"(padded): this matcher takes {least}; allow that, take precision='bf16'{quick}, or "
-            "match tiles (tile_px)"
-        )
 
 
 Conv = nn.Conv2d | nn.Conv3d | nn.ConvTranspose3d
@@ -185,13 +170,13 @@ class VolumeConv(nn.Module):
 
 
 def _onednn_convolved(volume: Tensor, weight: Tensor, bias: Tensor, stride: int) -> Tensor:
-    strides = (stride,) * 3
-    return torch.mkldnn_convolution(volume, weight, bias, (1, 1, 1), strides, (1, 1, 1), 1)
+    ones, strides = (1, 1, 1), (stride,) * 3
+    return torch.mkldnn_convolution(volume, weight, bias, ones, strides, ones, 1)
 
 
 def _onednn_transposed(volume: Tensor, weight: Tensor, bias: Tensor) -> Tensor:
-    sizes = ((1, 1, 1), (1, 1, 1), (2, 2, 2), (1, 1, 1), 1)
-    args = (volume, weight, bias, *sizes, "none", [], "")
+    ones, twos = (1, 1, 1), (2, 2, 2)
+    args = (volume, weight, bias, ones, ones, twos, ones, 1, "none", [], "")
     return torch.ops.mkldnn._convolution_transpose_pointwise(*args)
 
 
@@ -206,17 +191,14 @@ def has_onednn_operators() -> bool:
     volume, weight, bias = torch.ones(1, 2, 4, 4, 4), torch.ones(2, 2, 3, 3, 3), torch.ones(2)
     try:
         with torch.no_grad():
-            found = (
-                _onednn_convolved(volume, weight, bias, 1),
-                _onednn_transposed(volume, weight, bias),
-            )
+            convolved = _onednn_convolved(volume, weight, bias, 1)
+            transposed = _onednn_transposed(volume, weight, bias)
     except (AttributeError, RuntimeError, TypeError):
         return False
-    wanted = (
-        F.conv3d(volume, weight, bias, 1, 1),
-        F.conv_transpose3d(volume, weight, bias, 2, 1, 1),
+    both = (
+        (convolved, F.conv3d(volume, weight, bias, 1, 1)),
+        (transposed, F.conv_transpose3d(volume, weight, bias, 2, 1, 1)),
     )
-    both = zip(found, wanted, strict=True)
     return all(one.shape == other.shape and torch.allclose(one, other) for one, other in both)
 
 
@@ -247,22 +229,18 @@ class PSMNetMatcher(NetworkMatcher):
         if self.config.with_compile:
             self._network.features.compile()
 
-    def run(self, left: Views, right: Views, network: PSMNetConfig) -> list[Match]:
-        """Match normalised pairs whose sides suit the network.
+    def activation_bytes(self, network: PSMNetConfig, height: int, width: int) -> int:
+        """Peak memory of activations of one pair of suitable sides [bytes]."""
+        return psmnet_bytes(network, height, width, self.dtype)
 
-        Raises:
-            InputError: a memory bound that is too small for them.
-        """
-        height, width = left.shape[-2:]
-        least, most = psmnet_bytes(network, height, width, self.dtype), self.config.max_memory_bytes
-        has_quick = network.work_focal_px is not None
-        refuse_more_memory(least, most, height, width, has_quick=has_quick)
+    def run(self, left: Views, right: Views, network: PSMNetConfig) -> list[Match]:
+        """Match normalised pairs whose sides suit the network."""
         near, far = (one.to(self.dtype, memory_format=torch.channels_last) for one in (left, right))
         costs = self._network.costs(near, far, network.max_disparity_px)[-1][:, 0]
         found = [
             expected_disparity(
                 cost.permute(1, 2, 0).contiguous(),
-                Size(network.max_disparity_px, height, width),
+                Size(network.max_disparity_px, *left.shape[-2:]),
                 align_corners=network.align_corners,
                 with_confidence=self.config.with_confidence,
             )
@@ -296,17 +274,13 @@ class LightMatcher(NetworkMatcher):
         if self.config.with_compile:
             self._network.features.compile()
 
-    def run(self, left: Views, right: Views, network: LightConfig) -> list[Match]:
-        """Match normalised pairs whose sides suit the network.
+    def activation_bytes(self, network: LightConfig, height: int, width: int) -> int:
+        """Peak memory of activations of one pair of suitable sides [bytes]."""
+        rows = self._network.rows or height // 4
+        return light_bytes(network, height, width, self.dtype, rows)
 
-        Raises:
-            InputError: a memory bound that is too small for them.
-        """
-        height, width = left.shape[-2:]
-        rows, most = self._network.rows or height // 4, self.config.max_memory_bytes
-        least = light_bytes(network, height, width, self.dtype, rows)
-        has_quick = network.work_focal_px is not None
-        refuse_more_memory(least, most, height, width, has_quick=has_quick)
+    def run(self, left: Views, right: Views, network: LightConfig) -> list[Match]:
+        """Match normalised pairs whose sides suit the network."""
         read = self._network.read(
             left.to(self.dtype),
             right.to(self.dtype),

@@ -49,12 +49,7 @@ _REFINED = 32
 
 
 class ViewFeatures(NamedTuple):
-    """Features of a view.
-
-    Attributes:
-        half: at 1/2 of the image's sides.
-        levels: at 1/4, 1/8, 1/16 and 1/32.
-    """
+    """Features of a view, at 1/2 of the image's sides, and at 1/4, 1/8, 1/16 and 1/32."""
 
     half: Features
     levels: tuple[Features, ...]
@@ -80,10 +75,7 @@ class ConvexUpsampling(nn.Module):
     def forward(
         self, left: ViewFeatures, right_half: Features | None, quarter_px: Quarter
     ) -> Float[Tensor, "b 9 4 h2 w2"]:
-        """Answer weights that sum to one, for the four pixels of each one at half size.
-
-        With agreement they take the right view's features at half size too.
-        """
+        """Answer weights that sum to one, for the four pixels of each one at half size."""
         wide = F.interpolate(left.levels[0], scale_factor=2.0, mode="nearest")
         x = self.hidden(torch.cat([left.half, wide], 1))
         if self.compared is not None and self.agreement is not None:
@@ -143,17 +135,14 @@ class Refinement(nn.Module):
         self.groups = groups
         self.compared = conv_norm_2d(STEM, STEM)
         seen = groups * len(_OFFSETS) + STEM + 4
+        widths, dilations = (seen, _REFINED, _REFINED), (1, 2, 1)
         self.layers = nn.ModuleList(
-            [
-                conv_norm_2d(seen, _REFINED),
-                conv_norm_2d(_REFINED, _REFINED, Shape(dilation=2)),
-                conv_norm_2d(_REFINED, _REFINED),
-            ]
+            conv_norm_2d(width, _REFINED, Shape(dilation=dilation))
+            for width, dilation in zip(widths, dilations, strict=True)
         )
         self.correction = nn.Conv2d(_REFINED, 4, 1)
-        nn.init.zeros_(self.correction.weight)
-        assert self.correction.bias is not None
-        nn.init.zeros_(self.correction.bias)
+        for parameter in self.correction.parameters():
+            nn.init.zeros_(parameter)
 
     def forward(self, enlarged_px: Maps, left_half: Features, right_half: Features) -> Maps:
         """Correct a disparity of the left view [px] by features of both views at half size."""
@@ -179,8 +168,7 @@ def _neighbours(quarter: Quarter) -> Float[Tensor, "b 9 h2 w2"]:
 
 def enlarge(quarter: Quarter, weights: Float[Tensor, "b 9 4 h2 w2"]) -> Float[Tensor, "b h w"]:
     """Bring a map to full size: each pixel is a mean of nine neighbours, weighed."""
-    wide = _neighbours(quarter)
-    return F.pixel_shuffle((weights * wide[:, :, None]).sum(1), 2)[:, 0]
+    return F.pixel_shuffle((weights * _neighbours(quarter)[:, :, None]).sum(1), 2)[:, 0]
 
 
 def unit_groups(features: Float[Tensor, "b c h w"], groups: int) -> Float[Tensor, "b g k h w"]:
@@ -215,9 +203,8 @@ def mean_of_all(scores: Scores) -> Quarter:
 
 
 def confidence_near(scores: Scores, disparity_px: Quarter) -> Quarter:
-    """Give the probability of what lies within 15 % of a disparity.
+    """Give the probability of what lies within 15 % of a disparity, as selecting generators do.
 
-    As the confidence of a generator that selects: depth is then off by no more than about that.
     Between the disparities that have a score, scores are interpolated.
     """
     bins = scores.shape[1]
@@ -233,11 +220,7 @@ def confidence_near(scores: Scores, disparity_px: Quarter) -> Quarter:
 
 
 class SkyHead(nn.Module):
-    """Probability of the sky at 1/4 size; it begins as unlikely everywhere.
-
-    Args:
-        widths: channels of the left view's features at 1/4, 1/8, 1/16 and 1/32.
-    """
+    """Probability of the sky at 1/4 size, by features of these widths; it begins as unlikely."""
 
     def __init__(self, widths: tuple[int, ...]) -> None:
         super().__init__()
@@ -249,9 +232,8 @@ class SkyHead(nn.Module):
         )
         self.hidden = conv_norm_2d(quarter + _SKY_WIDTH + 2, _SKY_WIDTH)
         self.logit = nn.Conv2d(_SKY_WIDTH, 1, 1)
-        nn.init.zeros_(self.logit.weight)
-        assert self.logit.bias is not None
-        nn.init.constant_(self.logit.bias, -2.0)
+        for parameter, value in zip(self.logit.parameters(), (0.0, -2.0), strict=True):
+            nn.init.constant_(parameter, value)
 
     def forward(
         self, levels: tuple[Features, ...], quarter_px: Quarter, confidence: Quarter
@@ -273,18 +255,15 @@ class SkyHead(nn.Module):
 class Reading(NamedTuple):
     """What the scores say about the left view.
 
-    Attributes:
-        heads: disparity [px], the last one the answer: while training that of all scores, enlarged
-            without the image, that before the refinement, and that after it; in eval mode the last
-            alone. What it says in the sky means nothing where the network has that class.
-        confidence: 0..1, in the sky its probability; None where it was not asked for.
-        sky: probability of the sky, or None where the network has no such class. In eval mode at
-            most a half where the confidence of the match is higher: white walls look like the sky.
+    While training there is a head of all scores, enlarged without the image, one before the
+    refinement, and one after it; in eval mode the last alone. What a head says in the sky means
+    nothing where the network has that class; in eval mode the sky is at most a half where the
+    confidence of the match is higher: white walls look like the sky.
     """
 
-    heads: tuple[Maps, ...]
-    confidence: Maps | None
-    sky: Maps | None
+    heads: tuple[Maps, ...]  # disparity [px], the last one the answer
+    confidence: Maps | None  # 0..1, in the sky its probability; None where it was not asked for
+    sky: Maps | None  # its probability; None where the network has no such class
 
 
 Volume = Float[Tensor, "b _ _ _ _"]
@@ -324,9 +303,8 @@ class LightFeatures(nn.Module):
         quarter = half
         for layer in self.quarter:
             quarter = F.relu(layer(quarter))
-        skips = self.encoder(
-            F.avg_pool2d(image, 2) * self.deviation.to(image) + self.mean.to(image)
-        )
+        small = F.avg_pool2d(image, 2) * self.deviation.to(image) + self.mean.to(image)
+        skips = self.encoder(small)
         levels = [F.relu(self.top(skips[3]))]
         seen = (skips[2], skips[1], torch.cat([skips[0], quarter], 1))
         for layer, skip in zip(self.decoder, seen, strict=True):
@@ -379,10 +357,8 @@ class Aggregation(nn.Module):
 
         With ``rows``, and no gradient, one volume of the largest size is held, instead of four.
         """
-        guides = [
-            torch.sigmoid(guide(level))[:, :, None]
-            for guide, level in zip(self.guides, levels, strict=True)
-        ]
+        both = zip(self.guides, levels, strict=True)
+        guides = [torch.sigmoid(guide(level))[:, :, None] for guide, level in both]
 
         def begin(left: Features, right: Features, guide: Volume) -> Volume:
             volume = correlation_volume(left, right, bins, self.config.groups)
@@ -476,7 +452,9 @@ class LightStereo(StereoNetwork):
         quarters = [quarter_px]
         if with_confidence or self.sky_head is not None:
             with torch.no_grad():
-                quarters.append(self._confidence(scores, quarter_px))
+                # By rows: probabilities between the scores are the largest volume.
+                parts = (scores, quarter_px)
+                quarters.append(by_rows(confidence_near, parts, halo=0, rows=self.rows))
         if self.sky_head is not None:
             quarters.append(self.sky_head(near.levels, *quarters))
         coarse_px = mean_of_all(scores)[:, None] if self.training else None
@@ -487,9 +465,8 @@ class LightStereo(StereoNetwork):
             parts = (found_px, near.half, right_half)
             half_rows = None if self.rows is None else 2 * self.rows
             heads = (found_px, by_rows(self.refinement, parts, halo=5, rows=half_rows))
-        if coarse_px is None:
-            heads = heads[-1:]
-        else:
+        heads = heads[-1:] if coarse_px is None else heads
+        if coarse_px is not None:
             wide_px = F.interpolate(coarse_px, scale_factor=4.0, mode="bilinear")[:, 0]
             heads = (wide_px, *heads)
         confidence = rest[0] if with_confidence else None
@@ -502,29 +479,13 @@ class LightStereo(StereoNetwork):
             confidence = torch.where(sky > 0.5, sky, sure * (1 - sky))
         return Reading(heads, confidence, sky)
 
-    def _confidence(self, scores: Scores, quarter_px: Quarter) -> Quarter:
-        """By rows: probabilities between the scores are the largest volume."""
-        if self.rows is None:
-            return confidence_near(scores, quarter_px)
-        parts = zip(scores.split(self.rows, 2), quarter_px.split(self.rows, 1), strict=True)
-        return torch.cat([confidence_near(*part) for part in parts], 1)
-
     def enlarge(
-        self,
-        quarters: Float[Tensor, "b k h4 w4"],
-        left: ViewFeatures,
-        right_half: Features | None,
+        self, quarters: Float[Tensor, "b k h4 w4"], left: ViewFeatures, right_half: Features | None
     ) -> Float[Tensor, "b k h w"]:
         """Bring maps to the images' size by weights that follow the first, the disparity [px]."""
 
-        def enlarged(
-            quarters: Tensor,
-            left_half: Features,
-            left_quarter: Features,
-            right_half: Features | None,
-        ) -> Tensor:
-            near = ViewFeatures(left_half, (left_quarter,))
-            weights = self.enlargement(near, right_half, quarters[:, 0])
+        def enlarged(quarters: Tensor, half: Tensor, quarter: Tensor, right: Tensor) -> Tensor:
+            weights = self.enlargement(ViewFeatures(half, (quarter,)), right, quarters[:, 0])
             return torch.stack([enlarge(one, weights) for one in quarters.unbind(1)], 1)
 
         parts = (quarters, left.half, left.levels[0], right_half)

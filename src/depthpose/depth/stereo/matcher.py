@@ -122,7 +122,20 @@ class CallableMatcher:
                 f"the wrapped matcher answered shape {tuple(disparity_px.shape)} for images of "
                 f"{size}; let it answer one disparity a pixel"
             )
-        _check_values(disparity_px)
+        if bool(disparity_px.isinf().any()):
+            raise InputError(
+                "the wrapped matcher answered infinite disparity; use NaN for no answer"
+            )
+        if bool(disparity_px.isnan().all()):
+            raise InputError(
+                "the wrapped matcher answered NaN for every pixel; is the pair rectified?"
+            )
+        if bool((disparity_px < 0).any()):
+            raise InputError(
+                f"the wrapped matcher answered negative disparity (least "
+                f"{float(disparity_px.nan_to_num(0).min()):.4g} px); is the pair swapped? NaN says "
+                f"no answer"
+            )
         return Match(disparity_px=disparity_px)
 
 
@@ -135,35 +148,11 @@ def check_pair(left: object, right: object) -> None:
     """
     first, second = check_image(left, "left image", 1e-3), check_image(right, "right image", 1e-3)
     if first.shape != second.shape:
+        sizes = [f"{image.shape[-2]}x{image.shape[-1]}" for image in (first, second)]
         raise InputError(
-            f"left image is {_size(first)} and right image {_size(second)}; a rectified pair has "
-            f"one size: crop or resize both alike"
+            f"left image is {sizes[0]} and right image {sizes[1]}; a rectified pair has one size: "
+            "crop or resize both alike"
         )
-
-
-def _size(image: Tensor) -> str:
-    return f"{image.shape[-2]}x{image.shape[-1]}"
-
-
-def _check_values(disparity_px: Tensor) -> None:
-    if bool(disparity_px.isinf().any()):
-        raise InputError("the wrapped matcher answered infinite disparity; use NaN for no answer")
-    if bool(disparity_px.isnan().all()):
-        raise InputError("the wrapped matcher answered NaN for every pixel; is the pair rectified?")
-    if bool((disparity_px < 0).any()):
-        raise InputError(
-            f"the wrapped matcher answered negative disparity (least "
-            f"{float(disparity_px.nan_to_num(0).min()):.4g} px); is the pair swapped? NaN says no "
-            f"answer"
-        )
-
-
-_MODES = {
-    "sgbm": "STEREO_SGBM_MODE_SGBM",
-    "hh": "STEREO_SGBM_MODE_HH",
-    "sgbm_3way": "STEREO_SGBM_MODE_SGBM_3WAY",
-    "hh4": "STEREO_SGBM_MODE_HH4",
-}
 
 
 class SGBMMatcher:
@@ -191,17 +180,8 @@ class SGBMMatcher:
                 f"images are {left.shape[-1]} px wide and num_disparities is "
                 f"{self.config.num_disparities}; take a smaller multiple of 16"
             )
-        found = self._matcher().compute(_opencv_image(left), _opencv_image(right))
-        disparity_px = torch.from_numpy(found.astype(np.float32) / 16).to(left.device)
-        disparity_px = disparity_px.where(disparity_px > 0, torch.nan)
-        if not self.config.with_filled_holes:
-            return Match(disparity_px=disparity_px)
-        confidence = torch.isfinite(disparity_px).to(torch.float32)
-        return Match(disparity_px=fill_holes(disparity_px), confidence=confidence)
-
-    def _matcher(self) -> Any:  # noqa: ANN401  OpenCV's classes carry no types
         config = self.config
-        return self._cv2.StereoSGBM_create(
+        matcher = self._cv2.StereoSGBM_create(
             minDisparity=0,
             numDisparities=config.num_disparities,
             blockSize=config.block_size,
@@ -212,8 +192,19 @@ class SGBMMatcher:
             uniquenessRatio=config.uniqueness_ratio,
             speckleWindowSize=config.speckle_window_size,
             speckleRange=config.speckle_range,
-            mode=getattr(self._cv2, _MODES[config.mode]),
+            mode=getattr(self._cv2, f"STEREO_SGBM_MODE_{config.mode.upper()}"),
         )
+        # The 8-bit BGR that OpenCV reads from a file.
+        images = ((view.detach().cpu().clamp(0, 1) * 255).round().byte() for view in (left, right))
+        found = matcher.compute(
+            *(np.ascontiguousarray(image.flip(0).permute(1, 2, 0).numpy()) for image in images)
+        )
+        disparity_px = torch.from_numpy(found.astype(np.float32) / 16).to(left.device)
+        disparity_px = disparity_px.where(disparity_px > 0, torch.nan)
+        if not self.config.with_filled_holes:
+            return Match(disparity_px=disparity_px)
+        confidence = torch.isfinite(disparity_px).to(torch.float32)
+        return Match(disparity_px=fill_holes(disparity_px), confidence=confidence)
 
 
 def fill_holes(disparity_px: Tensor) -> Tensor:
@@ -243,12 +234,6 @@ def fill_holes(disparity_px: Tensor) -> Tensor:
     rows = torch.arange(len(valid), device=valid.device)
     filled_rows = rows[valid.any(1)]
     return filled[filled_rows[(rows[:, None] - filled_rows).abs().argmin(1)]]
-
-
-def _opencv_image(image: Tensor) -> np.ndarray:
-    """Convert to the 8-bit BGR that OpenCV reads from a file."""
-    bytes_ = (image.detach().cpu().clamp(0, 1) * 255).round().to(torch.uint8)
-    return np.ascontiguousarray(bytes_.flip(0).permute(1, 2, 0).numpy())
 
 
 IMAGENET_MEAN = (0.485, 0.456, 0.406)
@@ -320,9 +305,11 @@ class NetworkMatcher(ABC):
             right: right views, the same size.
             network: the network's config, perhaps with more disparities than it was trained with.
 
-        Raises:
-            InputError: a memory bound that is too small for them.
         """
+
+    @abstractmethod
+    def activation_bytes(self, network: Any, height: int, width: int) -> int:  # noqa: ANN401
+        """Peak memory of activations of one pair of suitable sides [bytes]."""
 
     @property
     def dtype(self) -> torch.dtype:
@@ -399,23 +386,30 @@ class NetworkMatcher(ABC):
 
     def _match_one_way(self, left: Views, right: Views, network: NetworkConfig) -> list[Match]:
         """Match normalised pairs of any size: in tiles, or padded and cropped back."""
-        if self.config.tile_px is not None:
-            tiling = Tiling(
-                *self.config.tile_px, self.config.tile_overlap_px, network.max_disparity_px
-            )
+        if self.config.tile_px is None:
+            return self._match_padded(left, right, network)
+        overlap_px, most_px = self.config.tile_overlap_px, network.max_disparity_px
+        tiling = Tiling(*self.config.tile_px, overlap_px, most_px)
 
-            def match_tile(one: Tensor, other: Tensor) -> Match:
-                return self._match_padded(one[None], other[None], network)[0]
+        def match_tile(one: Tensor, other: Tensor) -> Match:
+            return self._match_padded(one[None], other[None], network)[0]
 
-            return [
-                match_tiles(match_tile, *pair, tiling) for pair in zip(left, right, strict=True)
-            ]
-        return self._match_padded(left, right, network)
+        return [match_tiles(match_tile, *pair, tiling) for pair in zip(left, right, strict=True)]
 
     def _match_padded(self, left: Views, right: Views, network: NetworkConfig) -> list[Match]:
         h, w = left.shape[-2:]
-        padded = self.run(pad_top_right(left, network), pad_top_right(right, network), network)
-        return [changed_match(match, lambda values: values[-h:, :w]) for match in padded]
+        left, right = (pad_top_right(views, network) for views in (left, right))
+        height, width = left.shape[-2:]
+        least, most = self.activation_bytes(network, height, width), self.config.max_memory_bytes
+        if most is not None and least > most:  # volumes are held whole, and cannot be traded
+            quick = "" if network.work_focal_px is None else " or speed='quick'"
+            raise InputError(
+                f"max_memory_bytes={most} is too small for images of {height}x{width} (padded): "
+                f"this matcher takes {least}; allow that, take precision='bf16'{quick}, or match "
+                "tiles (tile_px)"
+            )
+        matches = self.run(left, right, network)
+        return [changed_match(match, lambda values: values[-h:, :w]) for match in matches]
 
 
 def with_usable_precision(config: MatcherConfig) -> MatcherConfig:
@@ -499,6 +493,7 @@ class Span(NamedTuple):
 
     seen: slice
     counted: slice
+    inside: slice  # what counts, in what is seen
     weight: Float[Tensor, " n"]
 
 
@@ -512,7 +507,7 @@ def match_tiles(
     for y in _spans(h, tiling.rows, tiling.overlap, 0):
         for x in _spans(w, tiling.columns, tiling.overlap, tiling.max_disparity_px):
             tile = match(left[:, y.seen, x.seen], right[:, y.seen, x.seen])
-            inner = (_inside(y), _inside(x))
+            inner = (y.inside, x.inside)
             weight = (y.weight[:, None] * x.weight).to(left)
             total[0, y.counted, x.counted] += weight
             total[1, y.counted, x.counted] += weight * tile.disparity_px[inner]
@@ -529,11 +524,6 @@ def match_tiles(
     )
 
 
-def _inside(span: Span) -> slice:
-    first = span.counted.start - span.seen.start
-    return slice(first, first + span.counted.stop - span.counted.start)
-
-
 def _spans(length: int, step: int, overlap: int, max_disparity_px: int) -> list[Span]:
     spans = []
     for own_first in range(0, length, step):
@@ -544,7 +534,7 @@ def _spans(length: int, step: int, overlap: int, max_disparity_px: int) -> list[
         rising = (at - own_first + overlap) / ramp if own_first else torch.ones_like(at)
         falling = (own_stop + overlap - at) / ramp if own_stop < length else torch.ones_like(at)
         weight = rising.clamp(0, 1) * falling.clamp(0, 1)
-        spans.append(
-            Span(slice(max(first - max_disparity_px, 0), stop), slice(first, stop), weight)
-        )
+        seen = slice(max(first - max_disparity_px, 0), stop)
+        inside = slice(first - seen.start, stop - seen.start)
+        spans.append(Span(seen, slice(first, stop), inside, weight))
     return spans

@@ -4,7 +4,9 @@ The features of one view come first: residual layers and a spatial pyramid, at 1
 be computed some rows at a time, and the disparity expected from one of costs some rows at a time.
 """
 
-from collections.abc import Callable, Sequence
+import re
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
 from typing import NamedTuple, cast
 
 import torch
@@ -12,6 +14,8 @@ import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor, nn
 
+from depthpose.core.checkpoint import Checkpoint, file_sha256, read_published, save_checkpoint
+from depthpose.core.config import config_to_dict
 from depthpose.core.errors import InputError
 from depthpose.depth.config import PSMNetConfig
 from depthpose.depth.stereo.matcher import Maps, StereoNetwork
@@ -122,41 +126,26 @@ def expected_disparity(
         chunk_bytes: largest size of one full-size piece; about four are alive at a time.
         with_confidence: answer also the probability within ``WINDOW_PX`` of the expectation.
     """
-    vertical = linear_taps(cost.shape[0], size.rows, cost, align_corners=align_corners)
-    horizontal = linear_taps(cost.shape[1], size.columns, cost, align_corners=align_corners)
-    deep = linear_taps(cost.shape[2], size.bins, cost, align_corners=align_corners)
+    down, across, deep = (
+        linear_taps(small, large, cost, align_corners=align_corners)
+        for small, large in zip(cost.shape, (size.rows, size.columns, size.bins), strict=True)
+    )
     matrix = interpolation_matrix(deep, cost.shape[2]).T.contiguous()
+    bins = torch.arange(size.bins, device=cost.device).to(cost)
     disparity_px = cost.new_empty(size.rows, size.columns)
     confidence = torch.empty_like(disparity_px) if with_confidence else None
     step = max(1, chunk_bytes // (size.columns * size.bins * cost.element_size()))
     for first in range(0, size.rows, step):
         y = slice(first, first + step)
-        rows = _mix(cost, Taps(*(t[y] for t in vertical)), 0)
-        probability = (_mix(rows, horizontal, 1) @ matrix).softmax(-1)
-        _reduce(probability, disparity_px[y], None if confidence is None else confidence[y])
+        rows = torch.lerp(cost[down.low[y]], cost[down.high[y]], down.share[y, None, None])
+        low, high = (rows.index_select(1, taps) for taps in (across.low, across.high))
+        probability = (torch.lerp(low, high, across.share[:, None]) @ matrix).softmax(-1)
+        torch.matmul(probability, bins, out=disparity_px[y])
+        if confidence is not None:
+            near = (bins - disparity_px[y, :, None]).abs_() <= WINDOW_PX
+            torch.sum(probability.mul_(near), -1, out=confidence[y])
+            confidence[y].clamp_(0, 1)
     return disparity_px, confidence
-
-
-def _mix(x: Tensor, taps: Taps, axis: int) -> Tensor:
-    shape = [1] * x.ndim
-    shape[axis] = -1
-    return torch.lerp(
-        x.index_select(axis, taps.low), x.index_select(axis, taps.high), taps.share.view(shape)
-    )
-
-
-def _reduce(
-    probability: Float[Tensor, "n w d"],
-    disparity_px: Float[Tensor, "n w"],
-    confidence: Float[Tensor, "n w"] | None,
-) -> None:
-    """Write expectation, and the probability near it, into the given rows."""
-    bins = torch.arange(probability.shape[-1], device=probability.device).to(probability)
-    torch.matmul(probability, bins, out=disparity_px)
-    if confidence is not None:
-        near = (bins - disparity_px[..., None]).abs_() <= WINDOW_PX
-        torch.sum(probability.mul_(near), -1, out=confidence)
-        confidence.clamp_(0, 1)
 
 
 class ConvNorm(nn.Module):
@@ -223,9 +212,8 @@ class FeatureExtractor(nn.Module):
         c = config.width
         self.align_corners = config.align_corners
         self.pools = config.pools
-        self.stem = nn.ModuleList(
-            [conv_norm_2d(3, c, Shape(3, 2)), conv_norm_2d(c, c), conv_norm_2d(c, c)]
-        )
+        stem = conv_norm_2d(3, c, Shape(3, 2)), conv_norm_2d(c, c), conv_norm_2d(c, c)
+        self.stem = nn.ModuleList(stem)
         counts = config.blocks
         self.stages = nn.ModuleList(
             [
@@ -442,3 +430,106 @@ def _initialise(module: nn.Module) -> None:
     if isinstance(module, nn.Conv2d | nn.Conv3d):
         taps = module.weight[0, 0].numel()
         nn.init.normal_(module.weight, 0, (2 / (taps * module.out_channels)) ** 0.5)
+
+
+_PARTS = {"0": "conv", "1": "norm"}
+_HOURGLASS = ("down1", "same1", "down2", "same2", "up2", "up1")
+_PUBLISHED_NAMES = {
+    "feature_extraction.": (
+        (r"firstconv\.([024])\.([01])\.", lambda m: f"stem.{int(m[1]) // 2}.{_PARTS[m[2]]}."),
+        (r"layer(\d)\.", lambda m: f"stages.{int(m[1]) - 1}."),
+        (r"conv1\.0\.([01])\.", lambda m: f"first.{_PARTS[m[1]]}."),
+        (r"conv2\.([01])\.", lambda m: f"second.{_PARTS[m[1]]}."),
+        (r"downsample\.([01])\.", lambda m: f"shortcut.{_PARTS[m[1]]}."),
+        (r"branch(\d)\.1\.([01])\.", lambda m: f"pyramid.{int(m[1]) - 1}.{_PARTS[m[2]]}."),
+        (r"lastconv\.0\.([01])\.", lambda m: f"fuse.{_PARTS[m[1]]}."),
+        (r"lastconv\.2\.", lambda _: "project."),
+    ),
+    "": (
+        (r"^(dres[01])\.([02])\.([01])\.", lambda m: f"{m[1]}.{int(m[2]) // 2}.{_PARTS[m[3]]}."),
+        (
+            r"^dres([234])\.conv([1-6])(?:\.0)?\.([01])\.",
+            lambda m: f"hourglasses.{int(m[1]) - 2}.{_HOURGLASS[int(m[2]) - 1]}.{_PARTS[m[3]]}.",
+        ),
+        (r"^classif(\d)\.0\.([01])\.", lambda m: f"heads.{int(m[1]) - 1}.hidden.{_PARTS[m[2]]}."),
+        (r"^classif(\d)\.2\.", lambda m: f"heads.{int(m[1]) - 1}.cost."),
+    ),
+}
+"""Patterns of the authors' names, of the feature extractor and of the rest, and ours."""
+
+
+def _our_name(published: str) -> str:
+    """Translate one published name; an unknown one comes back as it is and is refused later."""
+    name = published.removeprefix("module.")
+    prefix = next(prefix for prefix in _PUBLISHED_NAMES if name.startswith(prefix))
+    name = name.removeprefix(prefix)
+    for pattern, ours in _PUBLISHED_NAMES[prefix]:
+        name = re.sub(pattern, ours, name)
+    return f"features.{name}" if prefix else name
+
+
+def psmnet_from_published(state: Mapping[str, Tensor], *, align_corners: bool) -> PSMNet:
+    """Make a PSMNet of default size, in eval mode, from the authors' state dict.
+
+    Args:
+        state: what their checkpoint holds under ``state_dict``, with or without ``module.``.
+        align_corners: True for their weights of 2018 (KITTI 2015), False for those of 2021. The
+            file does not say, and a wrong choice costs about a pixel.
+
+    Raises:
+        InputError: a name is missing, unknown or holds another shape; nothing is half loaded.
+    """
+    network = PSMNet(PSMNetConfig(align_corners=align_corners))
+    wanted = network.state_dict()
+    given = {_our_name(name): (name, value) for name, value in state.items()}
+    # The count of batches steers nothing at inference; files older than 2018 do not hold it.
+    needed = {name for name in wanted if not name.endswith("num_batches_tracked")}
+    shapes = [
+        f"{given[name][0]} is {tuple(given[name][1].shape)} and should be {tuple(value.shape)}"
+        for name, value in wanted.items()
+        if name in given and given[name][1].shape != value.shape
+    ]
+    unknown = sorted(given[name][0] for name in set(given) - set(wanted))
+    faults = [
+        f"{what}: {', '.join(names[:5])}{f' and {len(names) - 5} more' if names[5:] else ''}"
+        for what, names in (
+            ("missing", sorted(needed - set(given))),
+            ("unknown", unknown),
+            ("misshaped", shapes),
+        )
+        if names
+    ]
+    if faults:
+        raise InputError(
+            f"these are not the weights of the published stacked-hourglass PSMNet: "
+            f"{'; '.join(faults)}. Give the value that the file holds under 'state_dict'"
+        )
+    network.load_state_dict({**wanted, **{name: value for name, (_, value) in given.items()}})
+    return network.eval()
+
+
+def import_psmnet(file: Path, out: Path, *, align_corners: bool) -> None:
+    """Turn the authors' checkpoint into a weights file of ours.
+
+    Args:
+        file: their ``.tar`` (a PyTorch file, not an archive to unpack), read without its code.
+        out: the ``.safetensors`` file to write.
+        align_corners: see :func:`psmnet_from_published`; it is recorded in ``out``.
+
+    Raises:
+        InputError: not a checkpoint of the published network.
+    """
+    state = read_published(file, "checkpoint of PSMNet")
+    try:
+        network = psmnet_from_published(state, align_corners=align_corners)
+    except InputError as error:
+        raise InputError(f"{file}: {error}") from error
+    facts = {
+        "align_corners": str(align_corners).lower(),
+        "origin": f"imported from a file with sha256 {file_sha256(file)}",
+        "trained_on": "not recorded in the published file",
+        "licence": "as published by its authors",
+    }
+    config = config_to_dict(network.config)
+    state = network.state_dict()
+    save_checkpoint(out, Checkpoint(kind="psmnet", config=config, state=state, facts=facts))

@@ -214,7 +214,10 @@ def _add_trim(b: MeshBuilder, plot: Plot, style: Style) -> None:
     door = Surface("wood", tuple(rng.uniform(0.03, 0.35, 3)), 1.0, int(rng.integers(2)))
     b.box((x, y - 1.05, door_z), (0.1, 2.1, 1.1), door)
     if rng.random() < 0.25:
-        slab, rail = Surface("concrete", (0.42, 0.42, 0.4), 2.0), Surface("metal", (0.05,) * 3)
+        slab, rail = (
+            Surface("concrete", (0.42, 0.42, 0.4), 2.0),
+            Surface("metal", (0.05, 0.05, 0.05)),
+        )
         z, outer = rng.uniform(start + 1.5, stop - 1.5), x - side * 0.98
         for storey in range(1, int((plot.height_m - 0.6) // style.storey_m)):
             up = y - storey * style.storey_m

@@ -219,15 +219,16 @@ def _mesh(
 ) -> Mesh:
     """Make triangles of what is broadcast to them; without normals, those of their planes."""
     n = len(corners)
-    if normals is None:
+    flat = normals
+    if flat is None:
         (ax, ay, az), (bx, by, bz) = ((corners[:, k] - corners[:, 0]).T for k in (1, 2))
         across = np.stack([ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx], 1)
-        normals = (across / (np.sqrt((across**2).sum(1, keepdims=True)) + 1e-12))[:, None]
+        flat = (across / (np.sqrt((across**2).sum(1, keepdims=True)) + 1e-12))[:, None]
     each = lambda number: np.array(np.broadcast_to(number, n), np.int32)  # noqa: E731
     return Mesh(
         corners=corners,
         uv=_full(uv, (n, 3, 2)),
-        normals=_full(normals, (n, 3, 3)),
+        normals=_full(flat, (n, 3, 3)),
         tint=_full(np.clip(tint, 0.005, 0.97), (n, 3)),
         material=each(material),
         layer=each(layer),

@@ -156,9 +156,10 @@ def _add_clump(
 ) -> None:
     """A dark core that occludes what is behind, and leaves about it."""
     light = b.rng.uniform(0.8, 1.15)
-    core = Surface("leaf", (0.3 * light,) * 3, 0.9, int(b.rng.integers(3)))
+    dark, pale = 0.3 * light, light * 0.7
+    core = Surface("leaf", (dark, dark, dark), 0.9, int(b.rng.integers(3)))
     add_ball(b, centre, radii * 0.76, core, int(length_m < 0.4), 0.25)
-    surface = Surface("leaf", (light * 0.7,) * 3, 0.9, int(b.rng.integers(3)))
+    surface = Surface("leaf", (pale, pale, pale), 0.9, int(b.rng.integers(3)))
     add_leaves(b, centre, radii, count, length_m, surface)
 
 
