@@ -15,7 +15,6 @@ from urllib.request import urlopen
 
 import numpy as np
 import torch
-from jaxtyping import Float
 from PIL import Image
 from torch import Tensor
 from tqdm import tqdm
@@ -31,7 +30,7 @@ from depthpose.core.camera import (
 from depthpose.core.checkpoint import find_weights, join_terms, warn_of_terms
 from depthpose.core.devices import each_in_threads, own_arithmetic
 from depthpose.core.errors import InputError, Notice, refuse_unknown, refused_memory
-from depthpose.depth.config import Answer, MatcherConfig, SGBMConfig
+from depthpose.depth.config import Answer, MatcherConfig, SelectionConfig, SGBMConfig
 from depthpose.depth.disparity import focal_size, resize_image
 from depthpose.depth.estimator.inputs import (
     Picture,
@@ -42,8 +41,6 @@ from depthpose.depth.estimator.inputs import (
     usable_right,
 )
 from depthpose.depth.estimator.rig import (
-    check_distribution,
-    choose_matcher,
     from_pair,
     from_virtual,
     join_matches,
@@ -51,7 +48,7 @@ from depthpose.depth.estimator.rig import (
     square_camera,
 )
 from depthpose.depth.ground import scale_by_distance, scale_by_mount
-from depthpose.depth.stereo import CameraMatcher, Matcher
+from depthpose.depth.stereo import CameraMatcher, Matcher, SGBMMatcher, make_matcher
 from depthpose.depth.synthesis import SelectionGenerator, Synthesiser, make_synthesiser
 from depthpose.depth.types import DepthEstimate, Match, StereoInput
 from depthpose.depth.weights import Use, read_depth_weights
@@ -165,7 +162,33 @@ class FakestereoNet:
         terms = join_terms(*(read.facts for read in (main, other) if read is not None))
         warn_of_terms({"terms": terms})
         run = config if isinstance(config, MatcherConfig) else MatcherConfig()
-        chosen = choose_matcher(weights, main, matcher, other, config)
+        if isinstance(config, SGBMConfig) and matcher != "sgbm":
+            raise InputError(
+                f"config is of SGBM, but matcher is {matcher!r}; give matcher='sgbm' or a "
+                "MatcherConfig"
+            )
+        holder = main if other is None else other
+        if matcher == "sgbm":
+            if main is not None and generator is None:
+                raise InputError(
+                    f"weights is {str(weights)!r} and matcher is 'sgbm', which takes no weights of "
+                    "a matcher. Omit one of the two."
+                )
+            chosen = SGBMMatcher(config if isinstance(config, SGBMConfig) else SGBMConfig())
+        elif matcher is not None and not isinstance(matcher, str | Path):
+            chosen = matcher
+        elif holder is not None and holder.matcher is not None:
+            chosen = make_matcher(holder.matcher, run)
+        elif matcher is None and generator is not None and generator.config.answer == "own":
+            chosen = None
+        else:
+            given = (None if name is None else str(name) for name in (weights, matcher))
+            raise InputError(
+                "weights is {!r} and matcher is {!r}: there is no matcher in that. Give "
+                "weights='psmnet.safetensors' or matcher='sgbm', which needs none; a generator and "
+                "a matcher become one file by 'depthpose weights pack G --matcher S --trained-on "
+                "DATA --licence L --out W'.".format(*given)
+            )
         names = " + ".join(str(name) for name, read in ((weights, main), (matcher, other)) if read)
         if generator is None:
             return cls(chosen, terms=terms, weights=names)
@@ -242,7 +265,7 @@ class FakestereoNet:
         assert pair.right is not None, "checked before"
         with refused_memory(pair.name):
             match = match_to_infinity(self._match, pair.left, pair.right, pair.camera)
-            return replace(from_pair(pair, match), warning=warning)
+            return from_pair(pair, match, warning)
 
     @own_arithmetic()
     def estimate_many(
@@ -379,12 +402,32 @@ class FakestereoNet:
                 estimate = scale_by_mount(estimate, image)
                 if views.confidence is not None:
                     sure = views.confidence[n].mean() if views.street is None else views.street[n]
-                    estimate = replace(estimate, image_confidence=float(sure))
-                    estimate = check_distribution(
-                        image.name, estimate, rig, allow_ood=self.allow_ood
+                    estimate = self._checked(
+                        image.name, replace(estimate, image_confidence=float(sure))
                     )
                 estimates.append(estimate)
         return estimates
+
+    def _checked(self, name: str, estimate: DepthEstimate) -> DepthEstimate:
+        """Refuse an image that is unlike what the weights know, or warn of it."""
+        assert self.synthesiser is not None and estimate.image_confidence is not None  # noqa: PT018
+        config = self.synthesiser.config
+        if not isinstance(config, SelectionConfig):
+            return estimate
+        if estimate.image_confidence >= config.least_confidence:
+            return estimate
+        said = (
+            f"out of distribution for these weights ("
+            f"{'probability of a street' if config.with_street else 'mean confidence'} "
+            f"{estimate.image_confidence:.2f}, below {config.least_confidence:.2f}), so its depth "
+            "is a guess"
+        )
+        if not self.allow_ood:
+            raise InputError(
+                f"{name}: {said}. Check that it is upright and that the focal length is its own; "
+                "--allow-ood (in Python, allow_ood=True) answers it all the same."
+            )
+        return replace(estimate, warning=said)
 
     def _match(self, pairs: list[tuple[Tensor, Tensor]], camera: Camera | None) -> list[Match]:
         assert self.matcher is not None, "checked before"
@@ -458,26 +501,31 @@ class DepthPipeline:
     ) -> Iterator[dict[str, Any]]:
         left = iter(pictures)
         while some := list(islice(left, batch)):
-            seen = [self._input(_opened(picture, timeout), lens) for picture in some]
+            seen: list[StereoInput] = []
+            for picture in some:
+                opened = _opened(picture, timeout)
+                image = as_tensor(opened)
+                known = exif_focal_px(opened, "the picture") if lens is None else lens
+                if known is None:
+                    known = _PHONE * image.shape[2]
+                    warnings.warn(
+                        f"no camera: a focal length of {known:g} px is taken, a phone's; the "
+                        "metres are as wrong as it is. Give focal_px= or camera=",
+                        Notice,
+                        stacklevel=3,
+                    )
+                seen.append(as_input(image, "the picture", known))
             for found in self.net.estimate_many(seen, batch=batch):
                 if isinstance(found, InputError):
                     raise found
                 assert found.depth_m is not None
-                yield {"predicted_depth": found.depth_m, "depth": _drawn(found.depth_m)}
-
-    def _input(self, picture: Picture, lens: AnyLens | None) -> StereoInput:
-        image = as_tensor(picture)
-        if lens is None:
-            lens = exif_focal_px(picture, "the picture")
-        if lens is None:
-            lens = _PHONE * image.shape[2]
-            warnings.warn(
-                f"no camera: a focal length of {lens:g} px is taken, a phone's; the metres are as "
-                "wrong as it is. Give focal_px= or camera=",
-                Notice,
-                stacklevel=4,
-            )
-        return as_input(image, "the picture", lens)
+                # From the nearest (black) to the farthest (white); what has none is white too.
+                depth_m = found.depth_m
+                known_m = depth_m[depth_m.isfinite()]
+                low, high = known_m.aminmax() if len(known_m) else torch.tensor([0.0, 1.0])
+                share = ((depth_m - low) / (high - low).clamp(min=1e-6)).nan_to_num(1.0)
+                drawn = Image.fromarray((255 * share.clamp(0, 1)).byte().cpu().numpy())
+                yield {"predicted_depth": depth_m, "depth": drawn}
 
 
 def pipeline(
@@ -548,11 +596,3 @@ def _opened(picture: Picture, timeout: float | None) -> Picture:
             said = picture if is_address else f"{picture[:30]}..."
             raise InputError(f"{said}: is no picture that can be read ({error})") from error
         return picture
-
-
-def _drawn(depth_m: Float[Tensor, "h w"]) -> Image.Image:
-    """Draw depth from the nearest (black) to the farthest (white); what has none is white too."""
-    known = depth_m[depth_m.isfinite()]
-    low, high = known.aminmax() if len(known) else (torch.zeros(()), torch.ones(()))
-    share = ((depth_m - low) / (high - low).clamp(min=1e-6)).nan_to_num(1.0)
-    return Image.fromarray((255 * share.clamp(0, 1)).byte().cpu().numpy())

@@ -1,9 +1,8 @@
-"""The rig of a generator or a matcher and the way there and back; the matcher an estimator gets."""
+"""The rig of a generator or a matcher, and the way there and back."""
 
 import math
 from collections.abc import Callable
 from dataclasses import replace
-from pathlib import Path
 
 import torch
 from jaxtyping import Bool, Float
@@ -12,24 +11,16 @@ from torch.nn import functional as F
 
 from depthpose.core.camera import Camera, StereoRig
 from depthpose.core.errors import InputError
-from depthpose.depth.config import (
-    GeneratorConfig,
-    MatcherConfig,
-    SelectionConfig,
-    SGBMConfig,
-)
+from depthpose.depth.config import GeneratorConfig, SelectionConfig
 from depthpose.depth.disparity import (
     changed_match,
     depth_from_disparity,
     disparity_from_depth,
     resize_image,
-    resized_map,
     resized_match,
 )
-from depthpose.depth.stereo import Matcher, SGBMMatcher, make_matcher
 from depthpose.depth.stereo.light import LEAST_PX
 from depthpose.depth.types import DepthEstimate, Match, StereoInput
-from depthpose.depth.weights import DepthWeights
 
 SKY_M = 10_000.0
 """What the disparity of the sky says: protocols take a disparity of zero for none, or for near."""
@@ -47,31 +38,31 @@ def square_camera(size: tuple[int, int], focal_px: float) -> Camera:
     return Camera(width=columns, height=rows, K=K)
 
 
-def from_pair(pair: StereoInput, match: Match) -> DepthEstimate:
+def from_pair(pair: StereoInput, match: Match, warning: str = "") -> DepthEstimate:
     """Give what was found in a rectified pair: metres where its camera has a baseline."""
-    disparity_px, depth_m = match.disparity_px, None
-    is_sky = None if match.is_sky is None else _without_specks(match.is_sky)
+    px, depth_m, is_sky = match.disparity_px, None, _without_specks(match.is_sky)
     rig = pair.camera if isinstance(pair.camera, StereoRig) else None
     if is_sky is not None:
-        far_px = torch.full_like(disparity_px, LEAST_PX)
+        far_px = torch.full_like(px, LEAST_PX)
         if rig is not None:
-            far_px = disparity_from_depth(torch.full_like(disparity_px, SKY_M), rig)
-        disparity_px = torch.where(is_sky, far_px, disparity_px)
+            far_px = disparity_from_depth(torch.full_like(px, SKY_M), rig)
+        px = torch.where(is_sky, far_px, px)
     if rig is not None:
-        depth_m = depth_from_disparity(disparity_px, rig)
+        depth_m = depth_from_disparity(px, rig)
         depth_m = depth_m if is_sky is None else torch.where(is_sky, torch.nan, depth_m)
     return DepthEstimate(
         depth_m=depth_m,
-        disparity_px=disparity_px,
+        disparity_px=px,
         confidence=match.confidence,
         is_sky=is_sky,
+        warning=warning,
         seen=pair,
     )
 
 
-def _without_specks(is_sky: Bool[Tensor, "h w"]) -> Bool[Tensor, "h w"]:
+def _without_specks(is_sky: Bool[Tensor, "h w"] | None) -> Bool[Tensor, "h w"] | None:
     """Take a few pixels of sky in an image for none: a lamp or a window, at the match's depth."""
-    return is_sky & (is_sky.float().mean() >= _LEAST_SKY)
+    return None if is_sky is None else is_sky & (is_sky.float().mean() >= _LEAST_SKY)
 
 
 def from_virtual(
@@ -85,20 +76,16 @@ def from_virtual(
     camera = image.camera
     assert camera is not None
     height, width = image.left.shape[1:]
-    seen = resized_match(match, height, width)
+    seen = resized_match(replace(match, is_sky=is_sky), height, width)
     imitated = StereoRig(width=width, height=height, K=camera.K, baseline_m=rig.virtual_baseline_m)
-    depth_m = depth_from_disparity(seen.disparity_px, imitated)
-    disparity_px = seen.disparity_px
+    px, is_sky = seen.disparity_px, _without_specks(seen.is_sky)
+    depth_m = depth_from_disparity(px, imitated)
     if is_sky is not None:
-        is_sky = _without_specks(resized_map(is_sky.float(), height, width) > 0.5)
         depth_m = torch.where(is_sky, SKY_M, depth_m)
-        sky_px = float(camera.K[0, 0]) * rig.virtual_baseline_m / SKY_M
-        disparity_px = torch.where(is_sky, sky_px, disparity_px)
-    if isinstance(camera, StereoRig):
-        disparity_px = disparity_from_depth(depth_m, camera)
+        px = torch.where(is_sky, float(camera.K[0, 0]) * rig.virtual_baseline_m / SKY_M, px)
     return DepthEstimate(
         depth_m=depth_m if is_sky is None else torch.where(is_sky, torch.nan, depth_m),
-        disparity_px=disparity_px,
+        disparity_px=disparity_from_depth(depth_m, camera) if isinstance(camera, StereoRig) else px,
         confidence=seen.confidence,
         right=resize_image(right, height, width),
         is_sky=is_sky,
@@ -122,65 +109,6 @@ def join_matches(one: Match, other: Match) -> Match:
     return Match(disparity_px=log_px.exp(), confidence=torch.lerp(one.confidence, weight, share))
 
 
-def check_distribution(
-    name: str, found: DepthEstimate, config: GeneratorConfig | SelectionConfig, *, allow_ood: bool
-) -> DepthEstimate:
-    """Refuse an image that is unlike what the weights know, or warn of it."""
-    assert found.image_confidence is not None
-    least = config.least_confidence if isinstance(config, SelectionConfig) else 0.0
-    if found.image_confidence >= least:
-        return found
-    is_street = isinstance(config, SelectionConfig) and config.with_street
-    said = (
-        f"out of distribution for these weights ("
-        f"{'probability of a street' if is_street else 'mean confidence'} "
-        f"{found.image_confidence:.2f}, below {least:.2f}), so its depth is a guess"
-    )
-    if not allow_ood:
-        raise InputError(
-            f"{name}: {said}. Check that it is upright and that the focal length is its own; "
-            "--allow-ood (in Python, allow_ood=True) answers it all the same."
-        )
-    return replace(found, warning=said)
-
-
-def choose_matcher(
-    weights: str | Path | None,
-    found: DepthWeights | None,
-    matcher: str | Path | Matcher | None,
-    own: DepthWeights | None,
-    config: MatcherConfig | SGBMConfig | None,
-) -> Matcher | None:
-    """Take the matcher that was named, or that of the weights; None where one image needs none."""
-    run = config if isinstance(config, MatcherConfig) else MatcherConfig()
-    if isinstance(config, SGBMConfig) and matcher != "sgbm":
-        raise InputError(
-            f"config is of SGBM, but matcher is {matcher!r}; give matcher='sgbm' or a MatcherConfig"
-        )
-    if matcher == "sgbm":
-        if found is not None and found.generator is None:
-            raise InputError(
-                f"weights is {str(weights)!r} and matcher is 'sgbm', which takes no weights of a "
-                "matcher. Omit one of the two."
-            )
-        return SGBMMatcher(config if isinstance(config, SGBMConfig) else SGBMConfig())
-    if matcher is not None and not isinstance(matcher, str | Path):
-        return matcher
-    holder = found if own is None else own
-    if holder is not None and holder.matcher is not None:
-        return make_matcher(holder.matcher, run)
-    generator = None if found is None else found.generator
-    if matcher is None and generator is not None and generator.config.answer == "own":
-        return None
-    raise InputError(
-        f"weights is {None if weights is None else str(weights)!r} and matcher is "
-        f"{None if matcher is None else str(matcher)!r}: there is no matcher in that. Give "
-        "weights='psmnet.safetensors' or matcher='sgbm', which needs none; a generator and a "
-        "matcher become one file by 'depthpose weights pack G --matcher S --trained-on DATA "
-        "--licence L --out W'."
-    )
-
-
 def match_to_infinity(
     match: Callable[[list[tuple[Tensor, Tensor]], Camera | None], list[Match]],
     left: Float[Tensor, "3 h w"],
@@ -194,8 +122,7 @@ def match_to_infinity(
     Where the right view shows nothing of the left one, the confidence is 0.
     """
     rig = camera if isinstance(camera, StereoRig) else None
-    columns = 0 if rig is None else math.ceil(rig.cx_right_minus_left_px)
-    if rig is None or columns == 0:
+    if rig is None or (columns := math.ceil(rig.cx_right_minus_left_px)) == 0:
         return match([(left, right)], camera)[0]
     width, apart_px = left.shape[2], rig.cx_right_minus_left_px
     if abs(columns) >= width:
