@@ -8,10 +8,9 @@ Labels of the initial matcher, where both views agreed at full size, regularise 
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool
 from torch import Tensor, nn
 
 from depthpose.core.checkpoint import file_sha256, find_weights
@@ -48,8 +47,11 @@ class AdaptTask:
     """
 
     def __init__(self, matcher: StereoNetwork, config: AdaptTraining) -> None:
-        self.config, self.matcher = config, matcher
-        _keep_statistics(matcher)
+        self.config, self.matcher = config, matcher.train()
+        for part in matcher.modules():
+            # Statistics stay those of the training before: one or two pairs have none.
+            if isinstance(part, nn.BatchNorm2d | nn.BatchNorm3d):
+                part.eval()
         self.modules: dict[str, nn.Module] = {"matcher": matcher}
         parameters = [p for p in matcher.parameters() if p.requires_grad]
         self.optimizers = {"matcher": (make_adam(parameters, config.adam), config.adam)}
@@ -60,10 +62,14 @@ class AdaptTask:
         others = torch.cat([batch.right, batch.left.flip(-1)])
         heads = [head.float() for head in self.matcher(normalise(views), normalise(others))]
         found_px, count = heads[-1], len(batch.left)
-        error = _photometric_loss(views, others, found_px, count)
+        # The mean difference where both ways agree; the first ``count`` are left views.
+        looked_up = torch.stack(list(map(warp_right_to_left, others, found_px)))
+        both = zip(found_px, found_px.roll(count, 0).flip(-1), strict=True)
+        is_seen = torch.stack([is_consistent(one, back, _LIMITS) for one, back in both])
+        error = photometric_error(views, looked_up.nan_to_num(0.0))
+        error = torch.where(is_seen, error, 0.0).sum() / is_seen.sum().clamp(min=1)
         smooth = smoothness_loss(found_px, views)
-        network: Any = self.matcher.config
-        max_disparity_px = network.max_disparity_px
+        max_disparity_px = self.matcher.config.max_disparity_px
         label = heads_loss([head[:count] for head in heads], batch.left_px, max_disparity_px)
         config = self.config
         loss = config.photometric_weight * error + config.smooth_weight * smooth
@@ -76,47 +82,16 @@ class AdaptTask:
         return ValidationResult()
 
 
-def _keep_statistics(matcher: nn.Module) -> None:
-    """Leave batch norm at the statistics of the training before: one or two pairs have none."""
-    matcher.train()
-    for part in matcher.modules():
-        if isinstance(part, nn.BatchNorm2d | nn.BatchNorm3d):
-            part.eval()
-
-
-def _photometric_loss(
-    views: Float[Tensor, "b 3 h w"],
-    others: Float[Tensor, "b 3 h w"],
-    found_px: Float[Tensor, "b h w"],
-    count: int,
-) -> Float[Tensor, ""]:
-    """Mean difference where both ways agree; the first ``count`` are left views."""
-    looked_up = torch.stack(list(map(warp_right_to_left, others, found_px)))
-    back_px = found_px.roll(count, 0).flip(-1)
-    is_seen = torch.stack(
-        [is_consistent(*both, _LIMITS) for both in zip(found_px, back_px, strict=True)]
-    )
-    error = photometric_error(views, looked_up.nan_to_num(0.0))
-    return torch.where(is_seen, error, 0.0).sum() / is_seen.sum().clamp(min=1)
-
-
 @dataclass(frozen=True, kw_only=True)
 class AdaptMetrics:
-    """What a matcher does on held-out pairs, and on synthetic streets.
+    """What a matcher does on held-out pairs, and on synthetic streets (None without any)."""
 
-    Attributes:
-        photometric: difference of left views and right ones looked up, where the start's two
-            disparities agreed.
-        disagreeing: share of pixels whose disparities of both views do not agree, or that are newly
-            taken for sky.
-        street_d1: share of bad disparities on synthetic streets; None without any.
-        street_epe_px: mean error there [px]; None likewise.
-    """
-
+    # Difference of left views and right ones looked up, where the start's two disparities agreed.
     photometric: float
+    # Share of pixels whose disparities of both views do not agree, or that are newly taken for sky.
     disagreeing: float
-    street_d1: float | None
-    street_epe_px: float | None
+    street_d1: float | None  # share of bad disparities
+    street_epe_px: float | None  # mean error [px]
 
 
 class AdaptationCheck:
@@ -156,27 +131,21 @@ class AdaptationCheck:
             error = photometric_error(pair.left[None], looked_up.nan_to_num(0.0)[None])[0]
             errors.append(error[counts].mean())
             apart.append((~agrees).float().mean())
-        bad, off_px = self._on_streets(net)
-        return AdaptMetrics(
-            photometric=float(torch.stack(errors).mean()),
-            disagreeing=float(torch.stack(apart).mean()),
-            street_d1=bad,
-            street_epe_px=off_px,
-        )
-
-    def _on_streets(self, net: FakestereoNet) -> tuple[float, float] | tuple[None, None]:
         bad, off_px = [], []
         for street in self.streets:
             truth_px = street.truth.disparity_px
             assert truth_px is not None
             found_px = net.estimate_pair(street.input, with_check=False).disparity_px
             counts = truth_px > 0
-            errors = disparity_errors(found_px[counts], truth_px[counts])
-            bad.append(errors.d1_all)
-            off_px.append(errors.epe_px)
-        if not bad:
-            return None, None
-        return sum(bad) / len(bad), sum(off_px) / len(off_px)
+            of_street = disparity_errors(found_px[counts], truth_px[counts])
+            bad.append(of_street.d1_all)
+            off_px.append(of_street.epe_px)
+        return AdaptMetrics(
+            photometric=float(torch.stack(errors).mean()),
+            disagreeing=float(torch.stack(apart).mean()),
+            street_d1=sum(bad) / len(bad) if bad else None,
+            street_epe_px=sum(off_px) / len(off_px) if bad else None,
+        )
 
 
 def refuse_worse(before: AdaptMetrics, after: AdaptMetrics) -> None:
@@ -184,11 +153,8 @@ def refuse_worse(before: AdaptMetrics, after: AdaptMetrics) -> None:
     said = f"before {asdict(before)}, after {asdict(after)}"
     advice = "no weights are written; take fewer steps, a lower learning_rate, or more pairs"
     changes = [
-        new / max(old, 1e-9) - 1
-        for old, new in (
-            (before.photometric, after.photometric),
-            (before.disagreeing, after.disagreeing),
-        )
+        getattr(after, name) / max(getattr(before, name), 1e-9) - 1
+        for name in ("photometric", "disagreeing")
     ]
     # NaN, where no pixel could be compared, is no gain either.
     if not (all(c <= _NOTHING for c in changes) and any(c <= -_NOTHING for c in changes)):

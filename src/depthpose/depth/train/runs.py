@@ -1,6 +1,6 @@
 """A config to a trained weights file: how networks begin, and the stages as commands run them."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any, TypeVar, cast
@@ -12,7 +12,7 @@ from depthpose.core.checkpoint import bound_facts, file_sha256, find_weights, wa
 from depthpose.core.config import config_to_dict
 from depthpose.core.errors import InputError
 from depthpose.core.files import write_json
-from depthpose.core.loop import LoopConfig, Run, Task, held_out_text, releases_folder, write_card
+from depthpose.core.loop import Run, Task, held_out_text, releases_folder, write_card
 from depthpose.core.run import find_rank
 from depthpose.depth.config import GeneratorConfig, MatcherConfig, PairsConfig, SelectionConfig
 from depthpose.depth.datasets import refuse_common
@@ -123,8 +123,8 @@ def train_view(config: ViewTraining, run: Run) -> Path:
     """Train the generator; give its weights file."""
     torch.manual_seed(config.loop.seed)
     config = _at_virtual_focal(config, config.generator)
-    rig_m = config.generator.virtual_baseline_m
-    pairs = _pairs(config.pairs, config.loop, needs_truth=False, baseline_m=rig_m)
+    baseline_m = config.generator.virtual_baseline_m
+    pairs = TrainingPairs(config.pairs, config.loop.seed, needs_truth=False, baseline_m=baseline_m)
     held_out = _held_out(config.held_out, needs_truth=False)
     generator = UNetGenerator(config.generator)
     if config.start is not None:
@@ -138,37 +138,42 @@ def train_select(config: SelectTraining, run: Run) -> Path:
     """Train the generator that selects; give its weights file."""
     refuse_frozen_random(config)
     torch.manual_seed(config.loop.seed)
-    rig = config.generator
+    rig, seed = config.generator, config.loop.seed
     config = _at_virtual_focal(config, rig)
     sources = [
         TrainingPairs(
-            pairs,
-            config.loop.seed,
-            needs_truth=True,
-            is_mixed=True,
-            baseline_m=rig.virtual_baseline_m,
+            pairs, seed, needs_truth=True, is_mixed=True, baseline_m=rig.virtual_baseline_m
         )
         for pairs in (config.pairs, config.more)
         if pairs is not None
     ]
-    samples = SelectionSamples(sources, config.more_share, config.degrade, config.loop.seed)
+    samples = SelectionSamples(sources, config.more_share, config.degrade, seed)
     generator = SelectionGenerator(rig)
     if config.encoder is not None:
         load_encoder(generator.encoder, find_weights(config.encoder))
     if config.start is not None:
         start_from(generator, read_generator(find_weights(config.start)), config.start)
-    held_out = _held_out(config.held_out, needs_truth=True)
-    facts, seconds = _run_stage(SelectTask(generator, config, held_out), samples, config, run)
+    task = SelectTask(generator, config, _held_out(config.held_out))
+    facts, seconds = _run_stage(task, samples, config, run)
     return _write_weights(run, "select", facts, seconds, generator=generator)
 
 
 @releases_folder
 def train_stereo(config: StereoTraining, run: Run) -> Path:
     """Train the matcher; give its weights file."""
-    _refuse_wrong_gradients(config)
+    # Seen with torch 2.13: gradients of a 3x3x3 convolution over two planes in 16 bits are values
+    # near 1e35 or NaN where one, three or more planes agree with fp32 within 0.5 %.
+    step_px = config.network.step_px
+    is_two_deep = config.network.max_disparity_px == 2 * step_px
+    if is_two_deep and config.loop.precision == "bf16" and not torch.cuda.is_available():
+        raise InputError(
+            f"max_disparity_px is {2 * step_px} and precision bf16: at its coarsest the volume is "
+            "two planes deep, and a CPU's 16-bit gradients of its convolutions are wrong. Take "
+            f"max_disparity_px {3 * step_px}, or precision fp32."
+        )
     torch.manual_seed(config.loop.seed)
-    pairs = _pairs(config.pairs, config.loop, needs_truth=True)
-    held_out = _held_out(config.held_out, needs_truth=True)
+    pairs = TrainingPairs(config.pairs, config.loop.seed, needs_truth=True)
+    held_out = _held_out(config.held_out)
     matcher = make_matcher_network(config)
     facts, seconds = _run_stage(StereoTask(matcher, config, held_out), pairs, config, run)
     return _write_weights(run, "stereo", facts, seconds, matcher=matcher)
@@ -189,15 +194,14 @@ def train_adapt(config: AdaptTraining, run: Run) -> Path:
         pairs = replace(config.pairs, focal_px=fine_focal_px(config, matcher))
         config = replace(config, pairs=pairs)
     labelled, kept = label_folders(config, run.folder / "labels")
-    pairs = _pairs(labelled, config.loop, needs_truth=True)
+    pairs = TrainingPairs(labelled, config.loop.seed, needs_truth=True)
     facts, seconds = _run_stage(AdaptTask(matcher, config), pairs, config, run)
     facts = facts | {"truth": "none; pseudo-labels of the initial weights regularise it"}
     path = run.folder / "matcher.safetensors"
     if find_rank().rank:
         return path
-    check = AdaptationCheck(
-        kept, config.streets, MatcherConfig(device=str(next(matcher.parameters()).device))
-    )
+    device = str(next(matcher.parameters()).device)
+    check = AdaptationCheck(kept, config.streets, MatcherConfig(device=device))
     before = read_matcher(find_weights(config.start))
     found = [check.measure(network) for network in (before, matcher.eval())]
     write_json(run.folder / "adapt.json", [asdict(metrics) for metrics in found])
@@ -223,10 +227,9 @@ def train_finetune(config: FinetuneTraining, run: Run) -> Path:
         generator.street = None
     matcher = read_matcher(find_weights(config.matcher))
     config = _at_virtual_focal(config, generator.config)
-    rig_m = generator.config.virtual_baseline_m
-    pairs = _pairs(config.pairs, config.loop, needs_truth=True, baseline_m=rig_m)
-    held_out = _held_out(config.held_out, needs_truth=True)
-    task = FinetuneTask(generator, matcher, config, held_out)
+    baseline_m = generator.config.virtual_baseline_m
+    pairs = TrainingPairs(config.pairs, config.loop.seed, needs_truth=True, baseline_m=baseline_m)
+    task = FinetuneTask(generator, matcher, config, _held_out(config.held_out))
     facts, seconds = _run_stage(task, pairs, config, run)
     return _write_weights(run, "finetune", facts, seconds, generator=generator, matcher=matcher)
 
@@ -243,22 +246,22 @@ STAGES = {
 
 def _run_stage(
     task: Task,
-    pairs: TrainingPairs | SelectionSamples,
+    samples: TrainingPairs | SelectionSamples,
     config: Any,  # noqa: ANN401
     run: Run,
 ) -> tuple[dict[str, str], float]:
-    """Claim the folder for this config, then train; give the facts of the card, and the seconds."""
+    """Claim the folder for this config, then train; give the facts of the card, and the seconds.
+
+    The facts are made before anything is measured, with the terms of the weights of the start.
+    """
+    settings = (getattr(config, setting, None) for setting in _BEGINS_WITH)
     named = {
-        setting: name
-        for setting in _BEGINS_WITH
-        if isinstance(name := getattr(config, setting, None), str)
+        k: name for k, name in zip(_BEGINS_WITH, settings, strict=True) if isinstance(name, str)
     }
-    more: dict[str, Any] = {
-        f"{setting}_sha256": file_sha256(find_weights(name)) for setting, name in named.items()
-    }
-    if pairs.truths:
-        more["truth"] = list(pairs.truths)
-    sources = pairs.sources if isinstance(pairs, SelectionSamples) else [pairs]
+    more: dict[str, Any] = {f"{k}_sha256": file_sha256(find_weights(v)) for k, v in named.items()}
+    if samples.truths:
+        more["truth"] = list(samples.truths)
+    sources = samples.sources if isinstance(samples, SelectionSamples) else [samples]
     frames = [frame for source in sources for frame in source.frames]
     if frames:
         more["frames_sha256"] = name_frames(frames)
@@ -266,32 +269,23 @@ def _run_stage(
     if held_out is not None:
         remedy = "give --held-out other pairs, or exclude these in the config"
         refuse_common(frames, held_out.frames, "pairs held out", remedy)
-    facts = _facts(config, pairs.truths, tuple(named.values()))
-    warn_of_terms(facts)
-    run.claim(config, ("generator", "matcher", "fakestereo"), more, ("held_out",))
-    return facts, run.train(task, pairs, config.loop)
-
-
-def _facts(
-    config: Any,  # noqa: ANN401
-    truths: Sequence[str],
-    began_with: Sequence[str],
-) -> dict[str, str]:
-    """Make the card before anything is measured, with the terms of the weights of the start."""
-    sources = [pairs for pairs in (config.pairs, getattr(config, "more", None)) if pairs]
-    data = [Path(folder).name for pairs in sources for folder in pairs.folders]
-    if any(pairs.streets for pairs in sources):
-        data.append("synthetic streets")
+    trained = [pairs for pairs in (config.pairs, getattr(config, "more", None)) if pairs]
+    data = [Path(folder).name for pairs in trained for folder in pairs.folders]
+    data += ["synthetic streets"] if any(pairs.streets for pairs in trained) else []
     facts = {
         "trained_on": ", ".join(data),
         "stage": type(config).__name__,
         "licence": "not stated; that of the training data binds",
     }
-    if truths:
-        facts["truth"] = ", ".join(truths)
+    if samples.truths:
+        facts["truth"] = ", ".join(samples.truths)
+    began_with = tuple(named.values())
     if began_with:
         facts["began_with"] = ", ".join(Path(name).stem for name in began_with)
-    return bound_facts(facts, began_with)
+    facts = bound_facts(facts, began_with)
+    warn_of_terms(facts)
+    run.claim(config, ("generator", "matcher", "fakestereo"), more, ("held_out",))
+    return facts, run.train(task, samples, config.loop)
 
 
 def _write_weights(
@@ -344,27 +338,5 @@ def _at_virtual_focal(
     )
 
 
-def _refuse_wrong_gradients(config: StereoTraining) -> None:
-    """Refuse the one depth of volume whose weight gradients oneDNN gets wrong in 16 bits.
-
-    Seen with torch 2.13: a 3x3x3 convolution over two planes gives values near 1e35 or NaN where
-    one, three or more planes agree with fp32 within 0.5 %.
-    """
-    step_px = config.network.step_px
-    is_two_deep = config.network.max_disparity_px == 2 * step_px
-    if is_two_deep and config.loop.precision == "bf16" and not torch.cuda.is_available():
-        raise InputError(
-            f"max_disparity_px is {2 * step_px} and precision bf16: at its coarsest the volume is "
-            "two planes deep, and a CPU's 16-bit gradients of its convolutions are wrong. Take "
-            f"max_disparity_px {3 * step_px}, or precision fp32."
-        )
-
-
-def _pairs(
-    config: PairsConfig, loop: LoopConfig, *, needs_truth: bool, baseline_m: float | None = None
-) -> TrainingPairs:
-    return TrainingPairs(config, loop.seed, needs_truth=needs_truth, baseline_m=baseline_m)
-
-
-def _held_out(config: PairsConfig | None, *, needs_truth: bool) -> TrainingPairs | None:
+def _held_out(config: PairsConfig | None, *, needs_truth: bool = True) -> TrainingPairs | None:
     return None if config is None else TrainingPairs(config, 0, needs_truth=needs_truth)
