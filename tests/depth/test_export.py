@@ -22,11 +22,11 @@ from depthpose.depth.config import (
     PSMNetConfig,
 )
 from depthpose.depth.estimator import FakestereoNet
-from depthpose.depth.export import depth_export
-from depthpose.depth.export.graph import (
+from depthpose.depth.export import (
     DynamicLightStereo,
     DynamicPSMNet,
     DynamicSelection,
+    depth_export,
     gathered_volume,
 )
 from depthpose.depth.stereo import LightStereo, PSMNet
@@ -94,7 +94,7 @@ def selection(
             return selection_network
         return network_model(module, images, multiple)
 
-    monkeypatch.setattr("depthpose.depth.export.graph.network_model", exported_once)
+    monkeypatch.setattr("depthpose.depth.export.network_model", exported_once)
     write_depth_weights(tmp_path / "w.safetensors", generator=of_all_kinds(), facts=TERMS)
     return tmp_path
 

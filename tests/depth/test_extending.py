@@ -26,8 +26,7 @@ from depthpose.depth.datasets import open_dataset
 from depthpose.depth.datasets.frames import Frame
 from depthpose.depth.datasets.layouts import LAYOUTS, Layout
 from depthpose.depth.estimator import FakestereoNet
-from depthpose.depth.export import TARGETS, depth_export
-from depthpose.depth.export.proof import Target
+from depthpose.depth.export import TARGETS, Target, depth_export
 from depthpose.depth.losses import ADVERSARIAL_LOSSES, DISPARITY_LOSSES, adversarial_loss
 from depthpose.depth.metrics import METRICS, Metric
 from depthpose.depth.stereo import MATCHERS, MatcherKind, StereoNetwork

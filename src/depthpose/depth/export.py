@@ -1,0 +1,538 @@
+"""Depth as one ONNX graph, the estimator's own steps included, and its comparison with PyTorch."""
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+from typing import Any, NamedTuple, cast
+
+import numpy as np
+import torch
+import torch.nn.functional as F
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from depthpose.core.camera import Camera, StereoRig
+from depthpose.core.errors import InputError, refuse_unknown
+from depthpose.core.export import Case, Export, Graph, Limit, Value, network_model
+from depthpose.depth.config import MatcherConfig
+from depthpose.depth.estimator import FakestereoNet
+from depthpose.depth.estimator.rig import SKY_M
+from depthpose.depth.stereo import LightStereo, PSMNet, StereoNetwork, make_matcher
+from depthpose.depth.stereo.light import LEAST_PX
+from depthpose.depth.stereo.matcher import IMAGENET_MEAN, IMAGENET_STD, NetworkConfig
+from depthpose.depth.stereo.psmnet import WINDOW_PX, interpolation_matrix, linear_taps
+from depthpose.depth.synthesis import (
+    COLUMNS_SHARE,
+    ROWS_SHARE,
+    Generator,
+    SelectionGenerator,
+    make_synthesiser,
+    read_logits,
+)
+from depthpose.depth.types import DepthEstimate, StereoInput
+from depthpose.depth.weights import DepthWeights
+
+_0, _1, _2, _HALF = np.float32(0), np.float32(1), np.float32(2), np.float32(0.5)
+
+
+def _size_of(image: Value) -> Value:
+    """Rows and columns of images."""
+    return image.op("Shape", start=2, end=4)
+
+
+def _rows(size: Value) -> Value:
+    """The first of two sides, as a list of one."""
+    return size.slice([0], [1], [0])
+
+
+def _columns(size: Value) -> Value:
+    """The second of two sides, as a list of one."""
+    return size.slice([1], [2], [0])
+
+
+def _focal_size(size: Value, focal_px: Any, wanted_px: float) -> Value:  # noqa: ANN401
+    """Rows and columns at which an image has the wanted focal length."""
+    scaled = (size.cast(np.float64) * float(wanted_px)) / focal_px
+    return scaled.op("Round").op("Max", 1.0).cast(np.int64)
+
+
+def _resized_image(image: Value, size: Value) -> Value:
+    """Resize images, averaging where they shrink."""
+    resized = image.op("Resize", None, None, size, mode="linear", axes=[2, 3],
+                       antialias=1, exclude_outside=1)  # fmt: skip
+    return resized.op("Clip", _0, _1)
+
+
+def _resized_map(values: Value, size: Value) -> Value:
+    """Resize maps (batch, height, width) without averaging."""
+    lifted = values.op("Unsqueeze", [1])
+    return lifted.op("Resize", None, None, size, mode="linear", axes=[2, 3]).op("Squeeze", [1])
+
+
+def _ratio(wide: Value, narrow: Value) -> Value:
+    """How many times as wide, for disparities."""
+    many, few = (_columns(size).cast(np.float64) for size in (wide, narrow))
+    return (many / few).cast(np.float32)
+
+
+Maps = Float[Tensor, "b rows columns"]
+
+
+class DynamicPSMNet(nn.Module):
+    """PSMNet with its soft arg-min, in eval mode.
+
+    Disparities are few and fixed, so their interpolation is a matrix; rows and columns are resized.
+    """
+
+    matrix: Tensor
+
+    def __init__(self, network: PSMNet) -> None:
+        super().__init__()
+        self.network = network
+        config = network.config
+        self.bins = config.max_disparity_px // 4
+        taps = linear_taps(
+            self.bins, config.max_disparity_px, torch.zeros(1), align_corners=config.align_corners
+        )
+        self.register_buffer("matrix", interpolation_matrix(taps, self.bins)[..., None, None])
+
+    def forward(
+        self, left: Float[Tensor, "b 3 h w"], right: Float[Tensor, "b 3 h w"]
+    ) -> tuple[Float[Tensor, "b h w"], Float[Tensor, "b h w"]]:
+        """Give disparity [px] and confidence of normalised images."""
+        near, far = self.network.features(left), self.network.features(right)
+        cost = self.network.costs_of(gathered_volume(near, far, self.bins))[-1][:, 0]
+        align = self.network.config.align_corners
+        wide = F.interpolate(cost, left.shape[-2:], mode="bilinear", align_corners=align)
+        probability = F.conv2d(wide, self.matrix).softmax(1)
+        steps_px = torch.arange(self.network.config.max_disparity_px).to(cost)[:, None, None]
+        disparity_px = (probability * steps_px).sum(1)
+        is_near = (steps_px - disparity_px[:, None]).abs() <= WINDOW_PX
+        return disparity_px, (probability * is_near).sum(1).clamp(0, 1)
+
+
+class DynamicLightStereo(nn.Module):
+    """The light network with what its matcher makes of its scores."""
+
+    def __init__(self, network: LightStereo) -> None:
+        super().__init__()
+        self.network = network
+
+    def forward(
+        self, left: Float[Tensor, "b 3 h w"], right: Float[Tensor, "b 3 h w"]
+    ) -> tuple[Maps, ...]:
+        """Give disparity [px], confidence and, with that class, the sky of normalised images."""
+        max_disparity_px = self.network.config.max_disparity_px
+        read = self.network.read(left, right, max_disparity_px, with_confidence=True)
+        assert read.confidence is not None
+        sky = () if read.sky is None else ((read.sky > 0.5).float(),)
+        return read.heads[-1], read.confidence, *sky
+
+
+DYNAMIC_SHAPE_NETWORKS: dict[type[StereoNetwork], Callable[[Any], nn.Module]] = {
+    PSMNet: DynamicPSMNet,
+    LightStereo: DynamicLightStereo,
+}
+"""Each kind of matcher network in its form with dynamic shapes: a new kind is one entry."""
+
+
+class DynamicSelection(nn.Module):
+    """The generator that selects, and what its logits say, at half of the image's sides."""
+
+    def __init__(self, generator: SelectionGenerator) -> None:
+        super().__init__()
+        self.generator = generator
+
+    def forward(self, image: Float[Tensor, "b 3 h w"]) -> tuple[Tensor, ...]:
+        """Give log of disparity, sky and confidence of the left view; the first two of the right.
+
+        Disparity is counted in pixels of the image's width. Where the weights know streets, how
+        probable one is follows, (b,).
+        """
+        features = self.generator.encoder(image)
+        left, right = (
+            read_logits(logits, self.generator.planes) for logits in self.generator.decode(features)
+        )
+        street = self.generator.find_street(features[-1])
+        return *left, *right[:2], *(() if street is None else (street,))
+
+
+def gathered_volume(
+    left: Float[Tensor, "b c h w"], right: Float[Tensor, "b c h w"], bins: int
+) -> Float[Tensor, "b c2 {bins} h w"]:
+    """Make ``concatenation_volume`` by one gather in place of a copy a disparity."""
+    column = torch.arange(left.shape[-1]) - torch.arange(bins)[:, None]
+    is_inside = (column >= 0).to(left.dtype)
+    sides = [left[..., None, :] * is_inside, right[..., column.clamp(min=0)] * is_inside]
+    return torch.cat(sides, 1).transpose(2, 3)
+
+
+class _Maps(NamedTuple):
+    """Disparity [px], confidence, and 1 in the sky where it is known."""
+
+    disparity_px: Value
+    confidence: Value
+    sky: Value | None = None
+
+
+class _Drawn(NamedTuple):
+    """Right views; what the generator itself says of the left one, and how probable a street is."""
+
+    right: Value
+    own: _Maps | None = None
+    street: Value | None = None
+
+
+def _drawn(left: Value, generator: Generator) -> _Drawn:
+    """What ``draw_right`` or ``select_views`` and ``shift_left`` do."""
+    size, multiple = _size_of(left), generator.config.side_multiple_px
+    near = _near_multiple(size, multiple)
+    example = torch.rand(2, 3, 2 * multiple, 3 * multiple)
+    if not isinstance(generator, SelectionGenerator):
+        if generator.config.test_mode != "running":
+            raise InputError(
+                "the generator's test_mode is 'batch': it draws with dropout, other views each "
+                "time, so no file can agree with it; export weights whose test_mode is 'running'."
+            )
+        image = _resized_image(left, near) * _2 - _1
+        network = network_model(generator, [example], multiple)
+        (found,) = left.graph.call(network, _mirrored(image, near, multiple))
+        cropped = (found + _1).slice([0, 0], near, [2, 3]) / _2
+        return _Drawn(_resized_image(cropped, size))
+    even = (near / 2 * 2).op("Max", 2)  # since logits stand for two rows and two columns
+    image = _mirrored(_resized_image(left, even), even, multiple)
+    network = network_model(DynamicSelection(generator).eval(), [example], multiple)
+    outputs = left.graph.call(network, image)
+    maps = [m.slice([0, 0], even / 2, [1, 2]) for m in outputs[:5]]
+    log_px, sky, sure, right_log_px, right_sky = (_resized_map(m, size) for m in maps)
+    scale, is_sky = _ratio(size, even), sky.op("Greater", _HALF)
+    confidence = is_sky.op("Where", sky, sure * (sky * np.float32(-1) + _1))
+    own = _Maps(log_px.op("Exp") * scale, confidence, is_sky.cast(np.float32))
+    right_px = right_sky.op("Greater", _HALF).op("Where", _0, right_log_px.op("Exp") * scale)
+    street = outputs[5] if generator.config.with_street else None
+    return _Drawn(_shifted(left, right_px), own, street)
+
+
+def _shifted(left: Value, shift_px: Value) -> Value:
+    """Look the left image up at ``x + shift``; beyond the border the border repeats."""
+    size, graph = _size_of(left), left.graph
+    row, column = (  # 0, 1, ... of each side
+        graph.op("Range", 0, side(size).op("Squeeze", [0]), 1).cast(np.float32)
+        for side in (_rows, _columns)
+    )
+    y, x = (
+        (values * _2 + _1) / side(size).cast(np.float32) - _1
+        for values, side in ((row.op("Unsqueeze", [1]), _rows), (shift_px + column, _columns))
+    )
+    parts = (v.op("Expand", shift_px.op("Shape")).op("Unsqueeze", [-1]) for v in (x, y))
+    grid = graph.op("Concat", *parts, axis=-1)
+    return left.op("GridSample", grid, mode="bilinear", padding_mode="border", align_corners=0)
+
+
+def _near_multiple(size: Value, multiple: int) -> Value:
+    """The multiple that a side is close to, or the side itself."""
+    sides = size.cast(np.float64)
+    nearest = (sides / float(multiple)).op("Round").op("Max", 1.0) * float(multiple)
+    off = (nearest - sides).op("Abs")
+    is_near = off.op("LessOrEqual", sides * np.array([ROWS_SHARE, COLUMNS_SHARE]))
+    return is_near.op("Where", nearest, sides).cast(np.int64)
+
+
+def _mirrored(image: Value, size: Value, multiple: int) -> Value:
+    """Mirror the right and lower border until both sides are multiples."""
+    lacking = (size + (multiple - 1)) / multiple * multiple - size
+    none = [0, 0]
+    pads = image.graph.op("Concat", none, none, none, lacking, axis=0)
+    return image.op("Pad", pads, mode="reflect")
+
+
+_IMAGES = ("batch", 3, "height", "width")
+_MAPS = ("batch", "height", "width")
+
+
+def image_graph(weights: DepthWeights) -> Graph:
+    """Write one image to depth: what ``FakestereoNet.estimate`` does without a right view.
+
+    Inputs ``image`` (batch, 3, height, width; RGB in [0, 1]) and ``K`` (3, 3; float64, of all
+    images). Outputs ``depth_m``, ``disparity_px`` (of the imitated rig, in the image's pixels),
+    ``confidence`` (each batch, height, width) and ``right``, the drawn view; of networks that know
+    the sky ``is_sky`` too (batch, height, width; bool), of weights that know streets
+    ``image_confidence`` (batch), how probable one is.
+    """
+    generator = weights.generator
+    if generator is None or (weights.matcher is None and generator.config.answer != "own"):
+        raise InputError(
+            f"depth from one image needs a generator and a matcher, and these weights lack the "
+            f"{'generator' if generator is None else 'matcher'}; 'depthpose weights pack' makes "
+            "one file of both."
+        )
+    rig = generator.config
+    graph = Graph()
+    image = graph.input("image", np.float32, _IMAGES)
+    K = graph.input("K", np.float64, (3, 3)).op("Reshape", [-1])
+    full = _size_of(image)
+    small = _focal_size(full, K.op("Gather", [4, 0]), rig.virtual_focal_px)
+    left = _resized_image(image, small)
+    right, own, street = _drawn(left, generator)
+    found = own
+    if rig.answer != "own":  # matched or joined
+        assert weights.matcher is not None, "checked before"
+        found = _matched(left, right, np.array([rig.virtual_focal_px] * 2), weights.matcher)
+        if own is not None:
+            found = found._replace(sky=own.sky) if rig.answer == "matched" else _joined(own, found)
+    assert found is not None
+    disparity_px = _resized_map(found.disparity_px, full) * _ratio(full, small)
+    # Depth is that over disparity.
+    focal_m_px = K.op("Gather", 0).cast(np.float32) * np.float32(rig.virtual_baseline_m)
+    is_known = disparity_px.op("Greater", _0)
+    depth_m = is_known.op("Where", focal_m_px / disparity_px, np.float32(np.nan))
+    if found.sky is not None:
+        is_sky = _resized_map(found.sky, full).op("Greater", _HALF)
+        depth_m = is_sky.op("Where", np.float32(np.nan), depth_m)
+        disparity_px = is_sky.op("Where", focal_m_px / np.float32(SKY_M), disparity_px)
+        graph.output("is_sky", is_sky, np.bool_, _MAPS)
+    graph.output("depth_m", depth_m, np.float32, _MAPS)
+    graph.output("disparity_px", disparity_px, np.float32, _MAPS)
+    graph.output("confidence", _resized_map(found.confidence, full), np.float32, _MAPS)
+    graph.output("right", _resized_image(right, full), np.float32, _IMAGES)
+    if street is not None:
+        graph.output("image_confidence", street, np.float32, ("batch",))
+    return graph
+
+
+def pair_graph(weights: DepthWeights) -> Graph:
+    """Write a rectified pair to disparity: what ``FakestereoNet.estimate`` does with ``right=``.
+
+    Inputs ``left`` and ``right`` (batch, 3, height, width; RGB in [0, 1]), and ``K`` (3, 3;
+    float64) where the weights were trained at one focal length. Outputs ``disparity_px`` and
+    ``confidence`` (batch, height, width), and of a network that knows the sky ``is_sky`` (the same;
+    bool), where disparity is 0.01 px. Elsewhere depth is ``fx * baseline / disparity``.
+    """
+    if weights.matcher is None:
+        raise InputError("these weights hold no matcher, only a generator; give a matcher's.")
+    graph = Graph()
+    left = graph.input("left", np.float32, _IMAGES)
+    right = graph.input("right", np.float32, _IMAGES)
+    focal_px = None
+    if cast("NetworkConfig", weights.matcher.config).work_focal_px is not None:
+        K = graph.input("K", np.float64, (3, 3))
+        focal_px = K.op("Reshape", [-1]).op("Gather", [4, 0])
+    disparity_px, confidence, sky = _matched(left, right, focal_px, weights.matcher)
+    if sky is not None:
+        is_sky = sky.op("Greater", _HALF)
+        disparity_px = is_sky.op("Where", np.float32(LEAST_PX), disparity_px)
+        graph.output("is_sky", is_sky, np.bool_, _MAPS)
+    graph.output("disparity_px", disparity_px, np.float32, _MAPS)
+    graph.output("confidence", confidence, np.float32, _MAPS)
+    return graph
+
+
+def _joined(one: _Maps, other: _Maps) -> _Maps:
+    """What ``join_matches`` does: the mean of the logarithms, weighed by confidence."""
+    is_known = other.disparity_px.op("Greater", _0)
+    weight = is_known.op("Where", other.confidence, _0)
+    if other.sky is not None:
+        weight = weight * (other.sky * np.float32(-1) + _1)
+    share = weight / (weight + one.confidence).op("Max", np.float32(1e-6))
+    own, matched = (
+        maps.disparity_px.op("Max", np.float32(1e-3)).op("Log") for maps in (one, other)
+    )
+    confidence = one.confidence + (weight - one.confidence) * share
+    return _Maps((own + (matched - own) * share).op("Exp"), confidence, one.sky)
+
+
+def _matched(
+    left: Value, right: Value, focal_px: Value | np.ndarray | None, matcher: StereoNetwork
+) -> _Maps:
+    """Match at the focal length that the weights want, and come back to the images' size."""
+    if type(matcher) not in DYNAMIC_SHAPE_NETWORKS:
+        known = ", ".join(kind.__name__ for kind in DYNAMIC_SHAPE_NETWORKS)
+        raise InputError(
+            f"the matcher is {type(matcher).__name__}, and no file is made of it; give weights of "
+            f"one of {known}."
+        )
+    network = DYNAMIC_SHAPE_NETWORKS[type(matcher)](matcher).eval()
+    config, graph = cast("NetworkConfig", matcher.config), left.graph
+    size = work = _size_of(left)
+    if config.work_focal_px is not None:
+        work = _focal_size(size, focal_px, config.work_focal_px)
+    least, step = config.min_side_px, config.step_px
+    lacking = ((work + (step - 1)) / step * step).op("Max", least) - work
+    above, beside = _rows(lacking), _columns(lacking)
+    pads = graph.op("Concat", [0, 0], above, [0, 0, 0, 0], beside, axis=0)
+    mean, deviation = (
+        np.array(v, np.float32)[:, None, None] for v in (IMAGENET_MEAN, IMAGENET_STD)
+    )
+    padded = [
+        ((_resized_image(view, work) - mean) / deviation).op("Pad", pads) for view in (left, right)
+    ]
+    example = [torch.rand(2, 3, least + step, least + 2 * step) for _ in range(2)]
+    found = graph.call(network_model(network, example, step), *padded)
+    first = graph.op("Concat", above, [0], axis=0)
+    last = graph.op("Concat", [1 << 62], _columns(work), axis=0)
+    disparity_px, confidence, *sky = (
+        _resized_map(m.slice(first, last, [1, 2]), size) for m in found
+    )
+    is_sky = [values.op("Greater", _HALF).cast(np.float32) for values in sky]
+    return _Maps(disparity_px * _ratio(size, work), confidence, *is_sky)
+
+
+_LIMITS = {
+    "depth_m": Limit(value=0.01, is_relative=True),
+    "disparity_px": Limit(value=0.05),
+    # A disparity is near the answer or not: where one lies on that border, confidence jumps.
+    "confidence": Limit(value=1e-3, of="mean"),
+    "right": Limit(value=1e-3),
+    "image_confidence": Limit(value=1e-3),
+}
+_FLIPS = 1e-3
+"""Share of pixels that may be sky in one answer alone, with all that follows from it."""
+_FLIPPING_LIMITS = {
+    name: limit if limit.of == "mean" else replace(limit, flips=_FLIPS)
+    for name, limit in _LIMITS.items()
+} | {"is_sky": Limit(value=_FLIPS, of="mean")}
+"""Where two scores tie, the last bit decides between candidates."""
+_FLIPPING: tuple[type[StereoNetwork], ...] = (LightStereo,)
+"""Matchers that choose between candidates."""
+_SIZES = ((256, 512, 1.0, 1), (375, 1242, 2.0, 1), (190, 300, 0.8, 2), (233, 401, 1.3, 1))
+"""Rows, columns, focal length over the one that the weights want, images: a multiple of what the
+networks take; one that is stretched to it; one that is enlarged; one that is padded."""
+_SHIFT_PX = 6
+_SKY = (0.72, 0.82, 0.95)
+"""RGB of the sky at its brightest."""
+_QUICK = MatcherConfig(speed="quick")
+"""Graphs match pairs at the focal length of the weights' training."""
+_LEAST_PX = 1.0
+"""Disparity from which depths are compared."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Target:
+    """What a graph computes."""
+
+    fits: Callable[[DepthWeights], bool]  # whether it is what weights are exported as by default
+    export: Callable[[DepthWeights, dict[str, Any]], Export]  # of weights, and facts for its user
+
+
+def depth_export(weights: DepthWeights, what: str | None, facts: dict[str, Any]) -> Export:
+    """Describe the file that weights are exported to."""
+    if what is None:
+        what = next(name for name, target in TARGETS.items() if target.fits(weights))
+    refuse_unknown("what", what, TARGETS)
+    return TARGETS[what].export(weights, facts)
+
+
+def _pair_export(weights: DepthWeights, facts: dict[str, Any]) -> Export:
+    return Export(
+        graph=lambda: pair_graph(weights),
+        cases=lambda: _pair_cases(weights),
+        limits=_FLIPPING_LIMITS if isinstance(weights.matcher, _FLIPPING) else _LIMITS,
+        facts={**facts, "what": "rectified pair, RGB in [0, 1] -> disparity [px], ..."},
+    )
+
+
+def _image_export(weights: DepthWeights, facts: dict[str, Any]) -> Export:
+    generator, names = weights.generator, ("virtual_focal_px", "virtual_baseline_m", "answer")
+    rig = {} if generator is None else {name: getattr(generator.config, name) for name in names}
+    chooses = isinstance(generator, SelectionGenerator) or isinstance(weights.matcher, _FLIPPING)
+    return Export(
+        graph=lambda: image_graph(weights),
+        cases=lambda: _image_cases(weights),
+        limits=_FLIPPING_LIMITS if chooses else _LIMITS,
+        facts={**facts, **rig, "what": "image, RGB in [0, 1], and K [px] -> depth [m], ..."},
+    )
+
+
+TARGETS = {
+    "image": Target(fits=lambda weights: weights.generator is not None, export=_image_export),
+    "pair": Target(fits=lambda weights: weights.matcher is not None, export=_pair_export),
+}
+"""One image to depth, a rectified pair to disparity: a new target is a function and one entry."""
+
+
+def _image_cases(weights: DepthWeights) -> Iterator[Case]:
+    assert weights.generator is not None
+    matcher = None if weights.matcher is None else make_matcher(weights.matcher, _QUICK)
+    # The scenes of the proof need not be like the images that the weights were trained on.
+    synthesiser = make_synthesiser(weights.generator, speed=_QUICK.speed)
+    net = FakestereoNet(matcher, synthesiser, allow_ood=True)
+    selects = isinstance(weights.generator, SelectionGenerator)
+    sky = ("is_sky",) if selects or _sees_sky(weights.matcher) else ()
+    street = ("image_confidence",) if getattr(weights.generator, "street", None) else ()
+    for size in _SIZES:
+        scenes, _ = _scenes(*size)
+        images = _under_sky(scenes) if sky else scenes
+        camera = _camera(size, weights.generator.config.virtual_focal_px)
+        given = [StereoInput(name="proof", left=one, right=None, camera=camera) for one in images]
+        inputs = {"image": images.numpy(), "K": camera.K.numpy()}
+        # A depth beyond all bounds, or none, is a matter of the last bit of a disparity near zero.
+        found = [net.estimate_pair(one) for one in given]
+        case = _case(
+            inputs, found, ("depth_m", "disparity_px", "confidence", "right", *sky, *street)
+        )
+        is_near = case.expected["disparity_px"] >= _LEAST_PX
+        where = {"depth_m": is_near | case.expected["is_sky"] if sky else is_near}
+        yield replace(case, where=where)
+
+
+def _pair_cases(weights: DepthWeights) -> Iterator[Case]:
+    assert weights.matcher is not None
+    net = FakestereoNet(make_matcher(weights.matcher, _QUICK))
+    sky = ("is_sky",) if _sees_sky(weights.matcher) else ()
+    work_px = cast("NetworkConfig", weights.matcher.config).work_focal_px
+    for size in _SIZES:
+        left, right = _scenes(*size)
+        if sky:
+            left, right = _under_sky(left), _under_sky(right)
+        inputs = {"left": left.numpy(), "right": right.numpy()}
+        rig = None
+        if work_px is not None:
+            camera = _camera(size, work_px)
+            rig = StereoRig(width=camera.width, height=camera.height, K=camera.K, baseline_m=0.5)
+            inputs["K"] = camera.K.numpy()
+        found = [
+            net.estimate_pair(
+                StereoInput(name="proof", left=one, right=other, camera=rig), with_check=False
+            )
+            for one, other in zip(left, right, strict=True)
+        ]
+        yield _case(inputs, found, ("disparity_px", "confidence", *sky))
+
+
+def _sees_sky(matcher: StereoNetwork | None) -> bool:
+    return matcher is not None and getattr(matcher.config, "with_sky", False)
+
+
+def _case(
+    inputs: dict[str, np.ndarray], found: list[DepthEstimate], outputs: tuple[str, ...]
+) -> Case:
+    expected = {
+        name: torch.stack([torch.as_tensor(getattr(one, name)) for one in found]).numpy()
+        for name in outputs
+    }
+    shape = next(iter(inputs.values())).shape
+    return Case(name="x".join(map(str, shape)), inputs=inputs, expected=expected)
+
+
+def _camera(size: tuple[int, int, float, int], focal_px: float) -> Camera:
+    rows, columns, share, _ = size
+    f = share * focal_px
+    K = torch.tensor([[f, 0, columns / 2], [0, f, rows / 2], [0, 0, 1]], dtype=torch.float64)
+    return Camera(width=columns, height=rows, K=K)
+
+
+def _under_sky(images: Tensor) -> Tensor:
+    """Lay a bright, smooth sky over the upper two fifths, for weights that know the sky."""
+    rows = images.shape[2] * 2 // 5
+    sky = torch.tensor(_SKY)[:, None, None] * torch.linspace(0.9, 1.0, rows)[:, None]
+    hazy = torch.lerp(images[:, :, :rows], sky, 0.97)
+    return torch.cat([hazy, images[:, :, rows:]], 2)
+
+
+def _scenes(rows: int, columns: int, share: float, count: int) -> tuple[Tensor, Tensor]:
+    """Make images of smooth noise, and the same moved to the left: pairs that match everywhere."""
+    shift = round(_SHIFT_PX * share)
+    noise = torch.rand(
+        count, 3, rows // 6, columns // 6, generator=torch.Generator().manual_seed(0)
+    )
+    scene = F.interpolate(noise, (rows, columns + shift), mode="bicubic").clamp(0, 1)
+    return scene[..., :columns].contiguous(), scene[..., shift:].contiguous()
