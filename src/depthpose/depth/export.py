@@ -309,6 +309,7 @@ def pair_graph(weights: DepthWeights) -> Graph:
     """
     if weights.matcher is None:
         raise InputError("these weights hold no matcher, only a generator; give a matcher's.")
+    _dynamic_shape_network(weights.matcher)  # refuses what has none, before its config is read
     graph = Graph()
     left = graph.input("left", np.float32, _IMAGES)
     right = graph.input("right", np.float32, _IMAGES)
@@ -340,17 +341,21 @@ def _joined(one: _Maps, other: _Maps) -> _Maps:
     return _Maps((own + (matched - own) * share).op("Exp"), confidence, one.sky)
 
 
-def _matched(
-    left: Value, right: Value, focal_px: Value | np.ndarray | None, matcher: StereoNetwork
-) -> _Maps:
-    """Match at the focal length that the weights want, and come back to the images' size."""
+def _dynamic_shape_network(matcher: StereoNetwork) -> nn.Module:
     if type(matcher) not in DYNAMIC_SHAPE_NETWORKS:
         known = ", ".join(kind.__name__ for kind in DYNAMIC_SHAPE_NETWORKS)
         raise InputError(
             f"the matcher is {type(matcher).__name__}, and no file is made of it; give weights of "
             f"one of {known}."
         )
-    network = DYNAMIC_SHAPE_NETWORKS[type(matcher)](matcher).eval()
+    return DYNAMIC_SHAPE_NETWORKS[type(matcher)](matcher).eval()
+
+
+def _matched(
+    left: Value, right: Value, focal_px: Value | np.ndarray | None, matcher: StereoNetwork
+) -> _Maps:
+    """Match at the focal length that the weights want, and come back to the images' size."""
+    network = _dynamic_shape_network(matcher)
     config, graph = cast("NetworkConfig", matcher.config), left.graph
     size = work = _size_of(left)
     if config.work_focal_px is not None:
