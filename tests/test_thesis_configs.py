@@ -43,7 +43,7 @@ NO_WEIGHT_FOLLOWS = frozenset({
     "encoder", "encoder_rate", "with_frozen_stem",
     "confidence_weight", "adam.halvings", "generator_adam.halvings", "discriminator_adam.halvings",
     # These follow from the models.
-    "network.classes", "network.keypoints", "network.inputs", "network.descriptor",
+    "network.classes", "network.keypoints", "network.inputs",
 })  # fmt: skip
 ONLY_LOOKED_AT = ("held_out.", "objects.")
 """Made views teach nothing where all samples are frames (share 1)."""

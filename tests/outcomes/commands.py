@@ -8,7 +8,6 @@ import torch
 from tests.depth.constant_selection import of_all_kinds, sure_of
 from tests.pose.synthetic_frames import frame_models, make_dataset
 from tests.pose.synthetic_objects import bracket, cloud_of, pose_at, tiny_weights, write_part
-from tests.pose.test_network import published_state
 from tests.raw_pairs import make_raw, write_kalibr
 from tests.synthetic_street import make_street, write_pairs
 from tests.test_cli_engine import make_home
@@ -20,7 +19,7 @@ from depthpose.core.files import Cloud, write_cloud, write_depth_png, write_imag
 from depthpose.depth.types import StereoSample
 from depthpose.depth.weights import write_depth_weights
 from depthpose.pose.datasets import write_bop_models
-from depthpose.pose.network import ResUNet
+from depthpose.pose.segmentation import ResNet18
 from depthpose.pose.synthetic import make_part
 from depthpose.pose.weights import write_pose_weights
 
@@ -101,7 +100,7 @@ COMMANDS: Sequence[Command] = (
         "packed.safetensors",
     ),
     Command("weights complete {home}/bare.safetensors --models {home}/parts", "whole.safetensors"),
-    Command("weights import fcgf {home}/fcgf.pth --classes 2", "fcgf.safetensors"),
+    Command("weights import resnet18 {home}/resnet18.pth", "resnet18.safetensors"),
     Command("export pose --weights {home}/p.safetensors", "pose.onnx"),
     Command("export depth --weights {home}/k.safetensors", "depth.onnx"),
     Command(
@@ -132,8 +131,7 @@ def make_inputs(home: Path) -> Path:
     part = make_part("bracket", 3)
     write_bop_models(home / "parts", [part])
     write_pose_weights(home / "bare.safetensors", tiny_weights(part), with_meshes=False)
-    assert isinstance(weights.network, ResUNet)
-    torch.save({"state_dict": published_state(weights.network)}, home / "fcgf.pth")
+    torch.save(ResNet18().state_dict(), home / "resnet18.pth")
     for k in range(2):
         cloud = Cloud(points=cloud_of(bracket(), pose_at(seed=k)))
         write_cloud(home / "clouds" / f"{k}.ply", cloud)

@@ -76,11 +76,10 @@ def show_weights(weights: tyro.conf.Positional[WeightsName]) -> int:
 
 
 def import_weights(
-    kind: tyro.conf.Positional[Literal["psmnet", "fcgf", "resnet18", "efficientnet-lite0"]],
+    kind: tyro.conf.Positional[Literal["psmnet", "resnet18", "efficientnet-lite0"]],
     file: tyro.conf.Positional[Path],
     out: NewPath,
     align_corners: Literal["true", "false"] | None = None,
-    classes: int | None = None,
 ) -> int:
     """Turn a published checkpoint into a weights file of depthpose.
 
@@ -88,24 +87,21 @@ def import_weights(
     than tensors is refused.
 
     Args:
-        kind: the network: psmnet, the stacked hourglass; fcgf, the sparse ResUNetBN2C, as
-            MinkowskiEngine stores it; resnet18, an encoder trained on ImageNet, which segmentation
-            can start from (.pth of tensors or .safetensors); efficientnet-lite0, an
-            encoder that 'depth train select' can start from.
+        kind: the network: psmnet, the stacked hourglass; resnet18, an encoder trained on
+            ImageNet, which segmentation can start from (.pth of tensors or .safetensors);
+            efficientnet-lite0, an encoder that 'depth train select' can start from.
         file: the published checkpoint, e.g. pretrained_model_KITTI2015.tar (do not unpack it).
         out: the .safetensors file to write.
         align_corners: psmnet: how the checkpoint was trained to upsample (not in the file):
             true for the authors' first weights (2018, PyTorch 0.4), false for those of 2021
             (PyTorch 1.8.1). A wrong choice costs about 1 px of disparity.
-        classes: fcgf: number of objects, where the outputs are directions; leave it out for
-            descriptors.
     """
     from depthpose.core.run import refuse_to_replace
 
-    own = {"psmnet": ("--align-corners", align_corners), "fcgf": ("--classes", classes)}
-    for other, (option, value) in own.items():
-        if value is not None and kind != other:
-            raise InputError(f"{option} {value}: is for {other}, and {kind} ignores it; omit it")
+    if align_corners is not None and kind != "psmnet":
+        raise InputError(
+            f"--align-corners {align_corners}: is for psmnet, and {kind} ignores it; omit it"
+        )
     refuse_to_replace(out)
     if kind == "psmnet":
         from depthpose.depth.stereo import import_psmnet
@@ -116,10 +112,6 @@ def import_weights(
                 "(of 2021): the file does not say, and a wrong choice costs about a pixel."
             )
         import_psmnet(file, out, align_corners=align_corners == "true")
-    elif kind == "fcgf":
-        from depthpose.pose.network import import_fcgf
-
-        import_fcgf(file, out, classes=classes)
     elif kind == "resnet18":
         from depthpose.pose.segmentation import import_resnet18
 

@@ -22,11 +22,7 @@ MARGIN = 1 << (LEVELS - 1)
 
 
 class KernelMaps:
-    """Writes the maps of all levels into a graph, each once.
-
-    Args:
-        coordinates: (cloud, x, y, z) of each voxel, int64; distinct.
-    """
+    """Writes the maps of all levels into a graph, each once."""
 
     def __init__(self, coordinates: Value) -> None:
         self._graph = coordinates.graph
@@ -143,15 +139,7 @@ _POINTS = ((1,), (150,), (1500,), (700, 40, 1100))
 
 
 def pose_export(weights: PoseWeights, facts: dict[str, Any]) -> Export:
-    """Describe what is exported of weights: the network of directions.
-
-    Args:
-        weights: of the method, not of a baseline.
-        facts: what else a user of the file must know.
-
-    Raises:
-        InputError: weights of a baseline.
-    """
+    """Describe what is exported of weights: the network of directions."""
     network = weights.network
     if not isinstance(network, ResUNet):
         raise InputError(

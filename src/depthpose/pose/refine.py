@@ -13,8 +13,7 @@ from depthpose.core.errors import InputError
 from depthpose.core.rigid import Rigid, cross_matrix, perturb, rotation_by
 from depthpose.pose.compiled import LOOKED_UP, ON_RAY, SEARCHED, serves
 from depthpose.pose.config import IcpConfig
-from depthpose.pose.match import match
-from depthpose.pose.surface import Surface, look_along_rays
+from depthpose.pose.surface import Surface, look_along_rays, match
 
 _CONVERGED = 3e-4
 """Stop when a step turns by less than this [rad] and shifts by less than this in diameters."""

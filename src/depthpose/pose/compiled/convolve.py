@@ -8,24 +8,14 @@ from depthpose.pose.compiled.points import Array
 
 
 def rows_of(keys: Array, standing: Array, moves: list[int]) -> Array:
-    """Give the row of each key ``standing + move``; one past the last where there is none.
-
-    Args:
-        keys: (n,), ascending.
-        standing: (m,), ascending.
-        moves: packed.
-
-    Returns:
-        (moves, m), int32.
-    """
-    rows = np.empty((len(moves), len(standing)), np.int32)
-    _find_rows(keys, standing, np.array(moves, np.int64), rows)
-    return rows
+    """Give the row of each key ``standing + move``; one past the last where there is none."""
+    return _find_rows(keys, standing, np.array(moves, np.int64))
 
 
 @compiled
-def _find_rows(keys, standing, moves, rows):
+def _find_rows(keys, standing, moves):
     """Walk along both ascending lists at once."""
+    rows = np.empty((len(moves), len(standing)), np.int32)
     for k in range(len(moves)):
         row = 0
         for j in range(len(standing)):
@@ -34,6 +24,7 @@ def _find_rows(keys, standing, moves, rows):
                 row += 1
             is_there = row < len(keys) and keys[row] == wanted
             rows[k, j] = row if is_there else len(keys)
+    return rows
 
 
 @compiled
@@ -55,16 +46,7 @@ def _add_row(out, row, weight):
 def convolved(
     x: Tensor, weight: Tensor, table: Tensor, fine_rows: int, is_transposed: bool
 ) -> Tensor:
-    """Convolve: ``out[o] = sum over neighbours (i, k) of o of x[i] @ weight[k]``.
-
-    Args:
-        x: (rows in, c in), float32 on the processor.
-        weight: (volume, c in, c out).
-        table: (volume, coarse rows), int32: the fine row that each coarse row has at each offset;
-            one past the last where it has none.
-        fine_rows: number of the fine rows.
-        is_transposed: from the coarse rows to the fine ones.
-    """
+    """Convolve: ``out[o] = sum over neighbours (i, k) of o of x[i] @ weight[k]``."""
     coarse_rows = table.shape[1]
     read, written = (coarse_rows, fine_rows) if is_transposed else (fine_rows, coarse_rows)
     assert x.shape == (read, weight.shape[1]), "a row for each voxel, a channel for each weight"

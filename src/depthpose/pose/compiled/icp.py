@@ -1,13 +1,153 @@
-"""Steps of point-to-plane ICP for a batch of poses."""
+"""Point-to-plane ICP: what of a surface a point shows, steps of poses, and of a scale beside."""
+
+from typing import NamedTuple
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from depthpose.core.rigid import Rigid
-from depthpose.pose.compiled import LOOKED_UP, ON_RAY, SEARCHED, compiled, finite_array
-from depthpose.pose.compiled.points import damp, rotation, solve
-from depthpose.pose.compiled.target import Target, match
+from depthpose.pose.compiled import (
+    GRAZING,
+    LOOKED_UP,
+    ON_RAY,
+    SEARCHED,
+    SLACK,
+    compiled,
+    finite_array,
+)
+from depthpose.pose.compiled.points import (
+    Array,
+    Tree,
+    damp,
+    faces,
+    neighbours,
+    rotation,
+    solve,
+    tree_of,
+)
+
+
+class Target(NamedTuple):
+    """A surface, and the table by which what is near is looked up without searching.
+
+    Attributes:
+        tree: of the surface points.
+        normals: of these, in the tree's order, (m, 3).
+        low: corner of the table, (3,).
+        side: of its boxes.
+        counts: boxes along each axis, (3,).
+        table: place in the tree of the point nearest to the middle of each box.
+        outward: normals on the outer side, 0 where none is known, (m, 3).
+        across: place of the point on the other side of a wall, or -1, (m,).
+        ball: middle and radius; a camera within it sees no side, (4,).
+    """
+
+    tree: Tree
+    normals: Array
+    low: Array
+    side: float
+    counts: Array
+    table: Array
+    outward: Array
+    across: Array
+    ball: Array
+
+
+def target_of(
+    points: Array,
+    normals: Array,
+    boxes: tuple[Array, float, Array, Array],
+    outward: Array,
+    across: Array,
+    ball: Array,
+) -> Target:
+    """Prepare a surface once."""
+    low, side, counts, nearest = boxes
+    tree = tree_of(points)
+    place = np.full(len(points) + 1, -1)
+    place[tree.order] = np.arange(len(points))
+    table = place[nearest].astype(np.int32)  # half of the memory: it is read at random
+    normals, outward = (np.ascontiguousarray(a[tree.order]) for a in (normals, outward))
+    far = place[across[tree.order]].astype(np.int32)
+    return Target(tree, normals, low, side, counts, table, outward, far, ball)
+
+
+@compiled
+def match(cloud, R, t, limit, target, how, local, eye, places):
+    """Find for each point of a cloud the place of a surface point that the camera may see."""
+    for c in range(3):
+        eye[c] = -(R[0, c] * t[0] + R[1, c] * t[1] + R[2, c] * t[2])
+    for i in range(len(cloud)):
+        x, y, z = cloud[i, 0] - t[0], cloud[i, 1] - t[1], cloud[i, 2] - t[2]
+        for c in range(3):
+            local[i, c] = R[0, c] * x + R[1, c] * y + R[2, c] * z
+    sought = _meet_planes(local, eye, target, places) if how == ON_RAY else local
+    least = _least(eye, target.ball)
+    find_places(sought, limit, target, how != LOOKED_UP, places, eye, least)
+
+
+@compiled
+def _least(eye, ball):
+    """What :func:`faces` must give; anything where the camera is within the ball."""
+    x, y, z = eye[0] - ball[0], eye[1] - ball[1], eye[2] - ball[2]
+    distance = np.sqrt(x * x + y * y + z * z)
+    return -SLACK * distance if distance > ball[3] else -np.inf
+
+
+@compiled
+def _meet_planes(local, eye, target, places):
+    """Give where each ray meets the plane of its sample; a point without one stays."""
+    meet = local.copy()
+    for i in range(len(local)):
+        place = places[i]
+        if place < 0:
+            continue
+        x, y, z = local[i, 0] - eye[0], local[i, 1] - eye[1], local[i, 2] - eye[2]
+        mx, my, mz = target.normals[place, 0], target.normals[place, 1], target.normals[place, 2]
+        point, slope = target.tree.points[place], mx * x + my * y + mz * z
+        if slope * slope > GRAZING * GRAZING * (x * x + y * y + z * z):
+            off = mx * (point[0] - local[i, 0])
+            off += my * (point[1] - local[i, 1]) + mz * (point[2] - local[i, 2])
+            share = off / slope
+            meet[i, 0] += share * x
+            meet[i, 1] += share * y
+            meet[i, 2] += share * z
+        else:
+            meet[i] = point
+    return meet
+
+
+@compiled
+def find_places(local, limit, target, is_exact, places, eye=None, least=0.0):
+    """Find the place of the surface point near each point."""
+    points, axes, values = target.tree.points, target.tree.axes, target.tree.values
+    low, side, counts, outward = target.low, target.side, target.counts, target.outward
+    stack, bounds = np.empty((64, 3), np.int64), np.empty((64, 4))
+    found, square = np.empty(1, np.int64), np.empty(1)
+    for i in range(len(local)):
+        x, y, z = local[i, 0], local[i, 1], local[i, 2]
+        place = places[i]
+        if not is_exact or place < 0:
+            u = min(max(int((x - low[0]) / side), 0), counts[0] - 1)
+            v = min(max(int((y - low[1]) / side), 0), counts[1] - 1)
+            w = min(max(int((z - low[2]) / side), 0), counts[2] - 1)
+            place = int(target.table[(u * counts[1] + v) * counts[2] + w])
+            if eye is not None and not faces(place, points, outward, eye, least):
+                place = int(target.across[place])
+        if eye is not None and place >= 0 and not faces(place, points, outward, eye, least):
+            place = -1
+        if is_exact:
+            found[0], square[0] = -1, limit * limit
+            if place >= 0:
+                a, b, c = points[place, 0] - x, points[place, 1] - y, points[place, 2] - z
+                if a * a + b * b + c * c < limit * limit:
+                    found[0], square[0] = place, a * a + b * b + c * c
+            neighbours(
+                x, y, z, points, axes, values, found, square, stack, bounds, outward, eye, least
+            )
+            place = found[0]
+        places[i] = place
 
 
 def refined(
@@ -20,20 +160,7 @@ def refined(
     *,
     is_exact: bool,
 ) -> tuple[Rigid, Tensor]:
-    """Refine a pose or a batch of poses; give them and the number of each point's sample, or -1.
-
-    Args:
-        cloud: (n, 3), float64, in the camera frame.
-        pose: ``camera_from_model``, float64.
-        target: the surface.
-        limits: of the steps, and of what is found after them.
-        converged: turn and shift of a step below which it is the last.
-        scale: the length by which a shift is measured.
-        is_exact: whether the nearest surface point is searched, or looked up.
-
-    Raises:
-        ValueError: a value is not finite.
-    """
+    """Refine a pose or a batch of poses; give them and the number of each point's sample, or -1."""
     assert pose.R.shape[:-2] == pose.t_m.shape[:-1], "a translation for each rotation"
     R, t_m = (torch.from_numpy(finite_array(a).copy()) for a in (pose.R, pose.t_m))
     given = (finite_array(cloud), R.view(-1, 3, 3).numpy(), t_m.view(-1, 3).numpy())
@@ -92,19 +219,7 @@ def _move(turn, motion, middle, R, t):
 
 @compiled
 def _refine(cloud, Rs, ts, limits, scale, converged, target, is_exact, every):
-    """Move poses in place, step by step, each until it moves no more.
-
-    Args:
-        cloud: (n, 3), in the camera frame.
-        Rs: (b, 3, 3), rotations ``camera_from_model``.
-        ts: (b, 3), translations.
-        limits: (steps + 1,), distances up to which a point counts; the last moves nothing.
-        scale: length that a shift is measured by.
-        converged: turn [rad] and shift of a step below which it is the last.
-        target: the surface.
-        is_exact: whether the nearest point is searched, or looked up.
-        every: (b, n), -1; written: places of the surface points.
-    """
+    """Move poses in place, step by step, each until it moves no more."""
     middle = np.zeros(3)
     for i in range(len(cloud)):
         middle += cloud[i]
@@ -131,3 +246,101 @@ def _refine(cloud, Rs, ts, limits, scale, converged, target, is_exact, every):
                 most = max(most, abs(motion[c]) / (1.0 if c < 3 else scale))
             if most < converged and how != SEARCHED and limit <= limits[-1]:
                 break
+
+
+def grown(
+    local: Tensor,
+    times: Tensor,
+    middle: Tensor,
+    target: Target,
+    limits: list[float],
+    converged: float,
+    is_exact: bool,
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Find the scale of a surface that fits points, from each of several scales."""
+    local, times = torch.from_numpy(finite_array(local).copy()), times.clone()
+    variance = torch.ones_like(times)
+    arrays = (local.numpy(), times.numpy(), middle.numpy(), np.array(limits))
+    _grow(*arrays, target, is_exact, converged, variance.numpy())
+    return times, local, variance
+
+
+@compiled
+def _linearise(points, places, times, middle, limit, surface, normals, rows):
+    """Write each point's derivatives by turn, shift and growth, residual and weight: (n, 9)."""
+    for i in range(len(points)):
+        row, place = rows[i], places[i]
+        row[8] = 0.0
+        if place < 0:
+            continue
+        ax = times * (surface[place, 0] - middle[0])
+        ay = times * (surface[place, 1] - middle[1])
+        az = times * (surface[place, 2] - middle[2])
+        gx = points[i, 0] - middle[0] - ax
+        gy = points[i, 1] - middle[1] - ay
+        gz = points[i, 2] - middle[2] - az
+        share = 1 - (gx * gx + gy * gy + gz * gz) / (limit * limit)
+        if share <= 0:
+            continue
+        nx, ny, nz = normals[place, 0], normals[place, 1], normals[place, 2]
+        row[0], row[1], row[2] = ay * nz - az * ny, az * nx - ax * nz, ax * ny - ay * nx
+        row[3], row[4], row[5], row[6] = nx, ny, nz, nx * ax + ny * ay + nz * az
+        row[7], row[8] = nx * gx + ny * gy + nz * gz, share * share
+
+
+@compiled
+def _step(rows, motion):
+    """Solve for turn, shift and growth; give the variance of the growth."""
+    H, b, total = np.zeros((7, 7)), np.zeros(7), 0.0
+    for i in range(len(rows)):
+        weight = rows[i, 8]
+        if weight == 0:
+            continue
+        total += weight
+        for k in range(7):
+            scaled = weight * rows[i, k]
+            b[k] += scaled * rows[i, 7]
+            for m in range(k + 1):
+                H[k, m] += scaled * rows[i, m]
+    damp(H, 1e-9)
+    factor, unit, column = H.copy(), np.zeros(7), np.empty(7)
+    solve(factor, b, motion)
+    unit[6] = 1.0
+    solve(H, unit, column)
+    square = 0.0
+    for i in range(len(rows)):
+        if rows[i, 8] > 0:
+            left = rows[i, 7]
+            for k in range(7):
+                left -= rows[i, k] * motion[k]
+            square += rows[i, 8] * left * left
+    return max(square / max(total - 7, 1.0) * column[6], 0.0)
+
+
+@compiled
+def _grow(local, times, middle, limits, target, is_exact, converged, variance):
+    """Move points and grow a surface about its middle, step by step, in place."""
+    count = local.shape[1]
+    places = np.full((len(times), count), -1)
+    surface, normals = target.tree.points, target.normals
+    own, rows = np.empty((count, 3)), np.empty((count, 9))
+    motion, turn = np.empty(7), np.empty((3, 3))
+    for limit in limits:
+        most = 0.0
+        for p in range(len(times)):
+            s, points = times[p], local[p]
+            own[:] = (points - middle) / s + middle  # beside the surface of its own size
+            find_places(own, limit / s, target, is_exact, places[p])
+            _linearise(points, places[p], s, middle, limit, surface, normals, rows)
+            variance[p] = _step(rows, motion)
+            times[p] = min(max(s * (1 + min(max(motion[6], -0.1), 0.1)), 0.5), 2.0)
+            rotation(motion[0], motion[1], motion[2], turn)
+            for i in range(count):  # by the inverse of the surface's motion
+                x = points[i, 0] - middle[0] - motion[3]
+                y = points[i, 1] - middle[1] - motion[4]
+                z = points[i, 2] - middle[2] - motion[5]
+                for c in range(3):
+                    points[i, c] = x * turn[0, c] + y * turn[1, c] + z * turn[2, c] + middle[c]
+            most = max(most, abs(motion[0]), abs(motion[1]), abs(motion[2]), abs(motion[6]))
+        if most < converged:
+            break

@@ -123,23 +123,13 @@ class Tree(NamedTuple):
 
 
 def tree_of(points: Array) -> Tree:
-    """Sort points (m, 3) into a tree; one at least, float64.
-
-    Raises:
-        ValueError: one is not finite.
-    """
+    """Sort points (m, 3) into a tree; one at least, float64."""
     return Tree(*planted(finite_array(points)))
 
 
 def nearest_of(points: Array, tree: Tree) -> tuple[Array, Array]:
-    """Give the number of the point nearest to each of (..., 3), float64, and its distance.
-
-    Raises:
-        ValueError: one is not finite.
-    """
-    queries = finite_array(points).reshape(-1, 3)
-    index, distance = np.empty(len(queries), np.int64), np.empty(len(queries))
-    _nearest_many(queries, tree, index, distance)
+    """Give the number of the point nearest to each of (..., 3), float64, and its distance."""
+    index, distance = _nearest_many(finite_array(points).reshape(-1, 3), tree)
     return index.reshape(points.shape[:-1]), distance.reshape(points.shape[:-1])
 
 
@@ -155,38 +145,25 @@ def planted(points):
     values = np.zeros((1 << depth) - 1)
     for level in range(depth):
         for k in range(1 << level):
-            low, high = _range_of(level, k, count)
-            axis = _widest(points, order, low, high)
+            low, high = 0, count
+            for bit in range(level - 1, -1, -1):
+                if (k >> bit) & 1:
+                    low = (low + high) // 2
+                else:
+                    high = (low + high) // 2
+            widest, axis = -1.0, 0
+            for c in range(3):
+                least, most = np.inf, -np.inf
+                for i in range(low, high):
+                    value = points[order[i], c]
+                    least, most = min(least, value), max(most, value)
+                if most - least > widest:
+                    widest, axis = most - least, c
             middle = (low + high) // 2
             _select(points, order, low, high - 1, middle, axis)
             node = (1 << level) - 1 + k
             axes[node], values[node] = axis, points[order[middle], axis]
     return points[order], order, axes, values
-
-
-@compiled
-def _range_of(level, k, count):
-    low, high = 0, count
-    for bit in range(level - 1, -1, -1):
-        middle = (low + high) // 2
-        if (k >> bit) & 1:
-            low = middle
-        else:
-            high = middle
-    return low, high
-
-
-@compiled
-def _widest(points, order, low, high):
-    best, axis = -1.0, 0
-    for c in range(3):
-        least, most = np.inf, -np.inf
-        for i in range(low, high):
-            value = points[order[i], c]
-            least, most = min(least, value), max(most, value)
-        if most - least > best:
-            best, axis = most - least, c
-    return axis
 
 
 @compiled
@@ -216,23 +193,7 @@ def _select(points, order, low, high, wanted, axis):
 def neighbours(
     x, y, z, points, axes, values, places, squares, stack, bounds, outward=None, eye=None, slack=0.0
 ):
-    """Find the places of a tree nearest to a point: as many as ``places`` holds, the nearest first.
-
-    Args:
-        x: of the point.
-        y: of the point.
-        z: of the point.
-        points: of the tree.
-        axes: of the tree.
-        values: of the tree.
-        places: (k,), written; what was there stays where nothing is nearer.
-        squares: (k,), squared distances of ``places``, ascending: beyond them nothing is wanted.
-        stack: (64, 3) whole numbers, memory.
-        bounds: (64, 4), memory.
-        outward: (m, 3), normals of the places.
-        eye: (3,), a camera that a place must face; None: all count.
-        slack: of :func:`faces`, which is true from there.
-    """
+    """Find the places of a tree nearest to a point, as many as ``places`` holds, nearest first."""
     inner, last, top = len(axes), len(places) - 1, 0
     stack[0, 0], stack[0, 1], stack[0, 2] = 0, 0, len(points)
     bounds[0, :] = 0.0
@@ -263,7 +224,11 @@ def neighbours(
             if square < squares[last] and (
                 eye is None or faces(place, points, outward, eye, slack)
             ):
-                _insert(places, squares, last, place, square)
+                k = last
+                while k > 0 and squares[k - 1] > square:
+                    squares[k], places[k] = squares[k - 1], places[k - 1]
+                    k -= 1
+                squares[k], places[k] = square, place
 
 
 @compiled
@@ -274,17 +239,8 @@ def faces(place, points, outward, eye, least):
 
 
 @compiled
-def _insert(places, squares, last, place, square):
-    """Put a neighbour among the nearest so far."""
-    k = last
-    while k > 0 and squares[k - 1] > square:
-        squares[k], places[k] = squares[k - 1], places[k - 1]
-        k -= 1
-    squares[k], places[k] = square, place
-
-
-@compiled
-def _nearest_many(queries, tree, index, distance):
+def _nearest_many(queries, tree):
+    index, distance = np.empty(len(queries), np.int64), np.empty(len(queries))
     stack, bounds = np.empty((64, 3), np.int64), np.empty((64, 4))
     points, order, axes, values = tree
     place, square = np.zeros(1, np.int64), np.empty(1)
@@ -294,36 +250,23 @@ def _nearest_many(queries, tree, index, distance):
         square[0] = a * a + b * b + c * c
         neighbours(x, y, z, points, axes, values, place, square, stack, bounds)
         index[i], distance[i] = order[place[0]], np.sqrt(square[0])
+    return index, distance
 
 
 def planes_of(every: Array, some: Array, count: int) -> tuple[Array, Array]:
     """Lay a plane through the ``count`` points of ``every`` nearest to each of ``some``.
 
-    Returns:
-        Normals (m, 3) toward the origin, and how bent the cloud is there (m,), 0 to 1.
-
-    Raises:
-        ValueError: a point is not finite, or ``count`` is 0.
+    Gives normals (m, 3) toward the origin, and how bent the cloud is there (m,), 0 to 1.
     """
-    if count < 1:
-        raise ValueError(f"a plane goes through points, and count is {count}")
-    normals, bend = np.empty((len(some), 3)), np.empty(len(some))
-    given = (finite_array(a.astype(np.float64, copy=False)) for a in (every, some))
-    _lay_planes(*given, count, normals, bend)
-    return normals, bend
+    assert count > 0, "a plane goes through points"
+    return _lay_planes(
+        *(finite_array(a.astype(np.float64, copy=False)) for a in (every, some)), count
+    )
 
 
 @compiled
-def _lay_planes(every, some, count, normals, bend):
-    """Lay a plane through the ``count`` points nearest to each of some.
-
-    Args:
-        every: (n, 3), float64.
-        some: (m, 3).
-        count: of neighbours, n at most.
-        normals: (m, 3), written: of unit length, toward the origin.
-        bend: (m,), written: 0 flat, 1 as a ball.
-    """
+def _lay_planes(every, some, count):
+    normals, bend = np.empty((len(some), 3)), np.empty(len(some))
     points, _, axes, values = planted(every)
     stack, bounds = np.empty((64, 3), np.int64), np.empty((64, 4))
     places, squares = np.zeros(count, np.int64), np.empty(count)
@@ -353,6 +296,7 @@ def _lay_planes(every, some, count, normals, bend):
             normals[i, k] = sign * V[k, least]
         total = max(A[0, 0] + A[1, 1] + A[2, 2], 1e-30)
         bend[i] = 3 * max(A[least, least], 0.0) / total
+    return normals, bend
 
 
 def compare_rays(
@@ -365,31 +309,11 @@ def compare_rays(
     reach: int,
     limit: float,
 ) -> tuple[Tensor, Tensor]:
-    """Compare a cloud with each pose of a surface.
-
-    Args:
-        cloud: (n, 3), before the camera, float64.
-        poses: a batch, ``camera_from_model``, float64.
-        points: (m, 3), of the surface.
-        scale: cells for a unit of slope.
-        column: of the middle cell.
-        row: of the middle cell.
-        reach: cells to each side of it.
-        limit: how far before a point the surface occludes it.
-
-    Returns:
-        For each pose the share of points that the surface would have occluded, and the share of the
-        surface's cells in which nothing was seen.
-
-    Raises:
-        ValueError: a value is not finite.
-    """
+    """Compare a cloud with each pose of a surface."""
     assert len(poses.R) == len(poses.t_m), "a translation for each rotation"
-    front = torch.empty(len(poses.R), dtype=torch.float64)
-    unseen = torch.empty_like(front)
     given = (finite_array(a) for a in (cloud, poses.R, poses.t_m, points))
-    _look(*given, scale, column, row, reach, limit, front.numpy(), unseen.numpy())
-    return front, unseen
+    front, unseen = _look(*given, scale, column, row, reach, limit)
+    return torch.from_numpy(front), torch.from_numpy(unseen)
 
 
 @compiled
@@ -401,22 +325,8 @@ def _cell(x, y, z, scale, column, row, half):
 
 
 @compiled
-def _look(cloud, Rs, ts, points, scale, column, row, half, limit, front, unseen):
-    """Compare a cloud with each of several poses of a surface.
-
-    Args:
-        cloud: (n, 3), before the camera.
-        Rs: (b, 3, 3), rotations of the poses.
-        ts: (b, 3), translations.
-        points: (m, 3), of the surface.
-        scale: cells for a unit of a ray's slope.
-        column: of the middle cell.
-        row: of the middle cell.
-        half: cells to each side of it.
-        limit: how far before a point the surface occludes it.
-        front: (b,), written: share of points that the surface would have occluded.
-        unseen: (b,), written: share of the surface's cells in which nothing was seen.
-    """
+def _look(cloud, Rs, ts, points, scale, column, row, half, limit):
+    front, unseen = np.empty(len(ts)), np.empty(len(ts))
     cells = (2 * half + 1) ** 2
     is_seen = np.zeros(cells, np.bool_)
     theirs = np.empty(len(cloud), np.int64)
@@ -446,3 +356,4 @@ def _look(cloud, Rs, ts, points, scale, column, row, half, limit, front, unseen)
             occluded += nearest[theirs[i]] < cloud[i, 2] - limit
         front[b] = occluded / len(cloud) if total else 1.0
         unseen[b] = missed / total if total else 1.0
+    return front, unseen

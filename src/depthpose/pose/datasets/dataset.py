@@ -195,11 +195,7 @@ def is_bop(folder: str | Path) -> bool:
 
 
 def read_instance_mask(instance: Instance) -> Bool[Tensor, "mask_h mask_w"]:
-    """Read the annotated mask of the visible part.
-
-    Raises:
-        InputError: there is none, or it is damaged.
-    """
+    """Read the annotated mask of the visible part."""
     if instance.mask is None:
         raise InputError(
             f"{instance.name}: there is no mask beside {instance.depth.parent}; render mask_visib, "

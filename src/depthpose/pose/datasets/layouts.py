@@ -35,11 +35,7 @@ def entry_number(key: object) -> int | None:
 
 
 def read_mapping(path: Path) -> dict[str, Any]:
-    """Read a JSON file that holds an object.
-
-    Raises:
-        InputError: it cannot be read, or holds something else.
-    """
+    """Read a JSON file that holds an object."""
     content = read_json(path)
     if not isinstance(content, dict):
         raise InputError(f"{path}: holds a {type(content).__name__}, where names to values belong")
@@ -47,11 +43,7 @@ def read_mapping(path: Path) -> dict[str, Any]:
 
 
 def read_rows(path: Path) -> list[dict[str, Any]]:
-    """Read a JSON file that holds a list of objects.
-
-    Raises:
-        InputError: it cannot be read, or holds something else.
-    """
+    """Read a JSON file that holds a list of objects."""
     content = read_json(path)
     if not isinstance(content, list) or not all(isinstance(row, dict) for row in content):
         raise InputError(f"{path}: is no list of objects, one an entry")
@@ -59,11 +51,7 @@ def read_rows(path: Path) -> list[dict[str, Any]]:
 
 
 def numbers(entry: object, key: str, count: int, source: str) -> list[float]:
-    """Take ``count`` finite numbers.
-
-    Raises:
-        InputError: there are others, or none.
-    """
+    """Take ``count`` finite numbers."""
     found = entry.get(key) if isinstance(entry, Mapping) else None
     if not isinstance(found, list) or len(found) != count or not all(map(_is_number, found)):
         raise InputError(f"{source}: {key} is {_short(found)}, where {count} numbers belong")
@@ -71,11 +59,7 @@ def numbers(entry: object, key: str, count: int, source: str) -> list[float]:
 
 
 def integer(entry: object, key: str, source: str) -> int:
-    """Take a whole number of 0 or more.
-
-    Raises:
-        InputError: it is something else, or missing.
-    """
+    """Take a whole number of 0 or more."""
     found = entry.get(key) if isinstance(entry, Mapping) else None
     if not isinstance(found, int) or isinstance(found, bool) or not 0 <= found <= MOST:
         raise InputError(
@@ -85,11 +69,7 @@ def integer(entry: object, key: str, source: str) -> int:
 
 
 def number(entry: object, key: str, default: float | None, source: str) -> float:
-    """Take a finite number; ``default`` where it is missing and there is one.
-
-    Raises:
-        InputError: it is something else.
-    """
+    """Take a finite number; ``default`` where it is missing and there is one."""
     found = entry.get(key, default) if isinstance(entry, Mapping) else None
     if not _is_number(found):
         raise InputError(f"{source}: {key} is {_short(found)}, where a number belongs")
@@ -98,22 +78,14 @@ def number(entry: object, key: str, default: float | None, source: str) -> float
 
 
 def pose_from_bop(entry: object, source: str) -> Rigid:
-    """Read ``cam_R_m2c`` (row by row) and ``cam_t_m2c`` (mm).
-
-    Raises:
-        InputError: the rotation is none, or a number is missing.
-    """
+    """Read ``cam_R_m2c`` (row by row) and ``cam_t_m2c`` (mm)."""
     return make_pose(
         numbers(entry, "cam_R_m2c", 9, source), numbers(entry, "cam_t_m2c", 3, source), source
     )
 
 
 def make_pose(R: list[float], t_mm: list[float], source: str) -> Rigid:
-    """Make a pose of nine numbers row by row and three in mm, its rotation made exact.
-
-    Raises:
-        InputError: the nine numbers are far from a rotation.
-    """
+    """Make a pose of nine numbers row by row and three in mm, its rotation made exact."""
     rough = torch.tensor(R, dtype=torch.float64).reshape(3, 3)
     u, sizes, vh = torch.linalg.svd(rough)
     if float((sizes - 1).abs().max()) > _ROTATION_SLACK or float(torch.linalg.det(rough)) < 0:
@@ -126,11 +98,7 @@ def make_pose(R: list[float], t_mm: list[float], source: str) -> Rigid:
 
 
 def camera_from_bop(entry: object, source: str) -> tuple[Float64[Tensor, "3 3"], float]:
-    """Read ``cam_K`` and ``depth_scale`` (mm a unit) as K and metres a unit.
-
-    Raises:
-        InputError: K is none, or the scale not positive.
-    """
+    """Read ``cam_K`` and ``depth_scale`` (mm a unit) as K and metres a unit."""
     K = torch.tensor(numbers(entry, "cam_K", 9, source), dtype=torch.float64).reshape(3, 3)
     try:
         check_intrinsics(K)
@@ -200,11 +168,7 @@ def bop_splits(folder: Path) -> list[str]:
 
 
 def bop_scenes(folder: Path, split: str) -> list[Path]:
-    """List the scenes of a split.
-
-    Raises:
-        InputError: there is no such split, or no scene in it.
-    """
+    """List the scenes of a split."""
     scenes = sorted(path.parent for path in (folder / split).glob("*/scene_camera.json"))
     if not scenes:
         known = ", ".join(bop_splits(folder)) or "none"
@@ -219,11 +183,7 @@ def bop_scenes(folder: Path, split: str) -> list[Path]:
 
 
 def bop_instances(scene: Path) -> Iterator[Instance]:
-    """Read the annotations of one scene.
-
-    Raises:
-        InputError: a file is missing or damaged, or an entry is not what it must be.
-    """
+    """Read the annotations of one scene."""
     cameras = read_mapping(scene / "scene_camera.json")
     truths = read_mapping(scene / "scene_gt.json")
     info_path = scene / "scene_gt_info.json"
@@ -328,11 +288,7 @@ def linemod_symmetries(number: int) -> Symmetries:
 
 
 def read_yaml(path: Path) -> dict[Any, Any]:
-    """Read a YAML file of the data set.
-
-    Raises:
-        InputError: it cannot be read, or holds no mapping.
-    """
+    """Read a YAML file of the data set."""
     text = read_text(path)
     refuse_heavy(path, text.encode(), _OF_YAML)
     content = parse_yaml(path, text)
@@ -346,9 +302,6 @@ def linemod_instances(folder: Path, split: str) -> Iterator[Instance]:
 
     The folder of an object shows others too (in object 2's they are annotated): its own alone
     counts, as in every published number.
-
-    Raises:
-        InputError: a file is missing or damaged, or an entry is not what it must be.
     """
     for scene in sorted(folder.glob("data/[0-9][0-9]")):
         listed = scene / f"{split}.txt"
@@ -445,11 +398,7 @@ _MODEL_FOLDERS = ("models", "models_eval", "models_points")
 
 
 def models_folder(folder: Path) -> Path:
-    """Find the folder of models of a data set.
-
-    Raises:
-        InputError: there is none.
-    """
+    """Find the folder of models of a data set."""
     found = next((folder / name for name in _MODEL_FOLDERS if (folder / name).is_dir()), None)
     if found is None:
         raise InputError(f"{folder}: no folder {' or '.join(_MODEL_FOLDERS)}; put the meshes there")
@@ -457,11 +406,7 @@ def models_folder(folder: Path) -> Path:
 
 
 def read_models_info(home: Path) -> dict[int, dict[str, Any]]:
-    """Read ``models_info.json`` or ``.yml`` by number of object; nothing where there is neither.
-
-    Raises:
-        InputError: it is damaged.
-    """
+    """Read ``models_info.json`` or ``.yml`` by number of object; nothing where there is neither."""
     as_json, as_yaml = home / "models_info.json", home / "models_info.yml"
     if as_json.is_file():
         content: dict[Any, Any] = read_mapping(as_json)
@@ -490,9 +435,6 @@ def read_bop_models(
 
     The diameter is the declared one, where there is one: published numbers are shares of it. The
     two symmetric objects of Linemod_preprocessed, which declares none, get theirs.
-
-    Raises:
-        InputError: a mesh is missing, or something is damaged.
     """
     home = models_folder(folder)
     infos, (_, layout) = read_models_info(home), layout_of(folder)

@@ -153,11 +153,7 @@ def encode_rle(mask: Bool[Tensor, "h w"]) -> Runs:
 
 
 def read_runs(entry: object, source: str) -> Runs:
-    """Take COCO's run lengths, compressed (text) or not, and their size; nothing is decoded.
-
-    Raises:
-        InputError: there are none, or they do not add up to the size.
-    """
+    """Take COCO's run lengths, compressed (text) or not, and their size; nothing is decoded."""
     what = f"{source}: the segmentation is no run lengths"
     if isinstance(entry, list) and entry:
         raise InputError(

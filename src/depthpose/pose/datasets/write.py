@@ -124,11 +124,7 @@ def _write_images(scene: Path, frame: BopFrame) -> None:
 
 
 def write_mask(path: Path, mask: Bool[Tensor, "h w"]) -> None:
-    """Write a mask as an 8-bit PNG, 255 on the object.
-
-    Raises:
-        InputError: the disk refuses.
-    """
+    """Write a mask as an 8-bit PNG, 255 on the object."""
     encoded = BytesIO()
     Image.fromarray(mask.cpu().numpy().astype(np.uint8) * 255).save(encoded, "PNG")
     write_bytes(path, encoded.getvalue())

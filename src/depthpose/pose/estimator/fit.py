@@ -54,13 +54,7 @@ class Seen:
 
 
 def seen_about(cloud_m: Float[Tensor, "n 3"], view: ViewInput | None, diameter_m: float) -> Seen:
-    """Cut the window of an object out of its view; a cloud alone is drawn as its camera saw it.
-
-    Args:
-        cloud_m: of the object, in the camera frame.
-        view: that shows it; its mask does not matter.
-        diameter_m: of the object.
-    """
+    """Cut the window of an object out of its view; a cloud alone is drawn as its camera saw it."""
     cloud_m = cloud_m.double()
     K = _camera_of(cloud_m) if view is None else view.K.double()
     u, v = (cloud_m @ K.T)[:, :2].div(cloud_m[:, 2:]).round().long().unbind(-1)
@@ -95,11 +89,6 @@ def fit_of(seen: Seen, pose: Rigid, surface: Surface) -> Fit:
     nearest in depth counts: the sensor's edges are blurred. Beyond the noise they lie on the
     surface, behind it (the camera saw through the surface), or before it: as part of the object,
     which contradicts the pose, or of something that occludes it.
-
-    Args:
-        seen: the window.
-        pose: ``camera_from_model``.
-        surface: of the model.
     """
     pose = pose.double()
     points_m, normals = pose.apply(surface.points_m), surface.normals @ pose.R.mT

@@ -74,11 +74,6 @@ def scale_of(cloud_m: Float[Tensor, "n 3"], pose: Rigid, surface: Surface) -> Sc
 
     Point-to-plane ICP with a seventh unknown: the model grows about its middle ``c`` by ``s``,
     which moves its point ``p`` across the surface by ``n . (p - c) s``.
-
-    Args:
-        cloud_m: of the object, in the camera frame.
-        pose: after ICP.
-        surface: of the model.
     """
     local_m = pose.inverse().apply(take_evenly(cloud_m.double(), POINTS))
     middle_m = (surface.points_m.amin(0) + surface.points_m.amax(0)) / 2
@@ -106,7 +101,7 @@ def _grow(
     widths = (1 + (_WIDE - 1) * max(0.0, 1 - 2 * step / _STEPS) for step in range(_STEPS))
     limits_m = [NEAR * surface.diameter_m * width for width in widths]
     if serves(local_m, times):
-        from depthpose.pose.compiled.scale import grown
+        from depthpose.pose.compiled.icp import grown
 
         times, local_m, variance = grown(
             local_m, times, middle_m, surface.target, limits_m, _CONVERGED, is_exact
@@ -175,14 +170,7 @@ def distance_to(
     *,
     is_exact: bool,
 ) -> Float64[Tensor, "*batch"]:
-    """Root mean square distance of points to a surface, in limits of nearness, cut off at 1.
-
-    Args:
-        local_m: in the model frame, where the surface has its own size.
-        surface: of the model.
-        times: by which all lengths are measured; None: 1.
-        is_exact: whether the nearest point is searched, or looked up.
-    """
+    """Root mean square distance of points to a surface, in limits of nearness, cut off at 1."""
     gap_m = (local_m - surface.points_m[surface.find(local_m, is_exact=is_exact)]).norm(dim=-1)
     if times is not None:
         gap_m = times[..., None] * gap_m
@@ -193,16 +181,6 @@ def mirror_gain(cloud_m: Float[Tensor, "n 3"], pose: Rigid, surface: Surface) ->
     """Measure by how much nearer the points lie to the mirror image of the model, where it fits.
 
     The cloud is mirrored in place of the model, so that ICP finds a pose.
-
-    Args:
-        cloud_m: of the object, in the camera frame.
-        pose: after ICP.
-        surface: of the model.
-
-    Returns:
-        By how much the mirror image lowers the root mean square distance of the points to the
-        surface, in units of the distance up to which a point is near; negative where the model
-        itself fits better.
     """
     local_m = pose.inverse().apply(take_evenly(cloud_m.double(), POINTS))
     middle_m = (surface.points_m.amin(0) + surface.points_m.amax(0)) / 2
@@ -239,17 +217,7 @@ def identity_of(
     seen: Seen,
     max_size_error: float,
 ) -> Identity:
-    """Fit another size and the mirror image, and say whether one of them is what was seen.
-
-    Args:
-        cloud: of the object.
-        pose: after ICP.
-        model: the object.
-        surface: of it.
-        fit: of the pose.
-        seen: what the camera saw, for the width of its pixels.
-        max_size_error: by how much the size may differ beyond what the sensor explains.
-    """
+    """Fit another size and the mirror image, and say whether one of them is what was seen."""
     scale = scale_of(cloud.cloud_m, pose, surface)
     mirror = None
     if not is_mirror_alike(model):

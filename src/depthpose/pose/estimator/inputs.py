@@ -57,11 +57,7 @@ _THIN = 0.002
 
 
 def cloud_input(cloud: AnyArray, unit: Unit, object: str, name: str) -> CloudInput:
-    """Take points in a unit to a cloud in metres.
-
-    Raises:
-        InputError: a file that cannot be read, or no rows of three numbers.
-    """
+    """Take points in a unit to a cloud in metres."""
     points = read_cloud(cloud).points if isinstance(cloud, str | Path) else _tensor(cloud)
     if points.ndim != 2 or points.shape[1] != 3:
         raise InputError(
@@ -81,20 +77,7 @@ def view_input(
     name: str,
     unit: Unit | None = None,
 ) -> ViewInput:
-    """Take a depth image, a mask and a camera to a view in metres.
-
-    Args:
-        depth: a file (16-bit PNG or TIFF; NPY, PFM or TIFF of floats), whole numbers, or metres.
-        mask: the object's pixels, of one object alone; None: all.
-        camera: of the depth image.
-        object: which one.
-        name: of the view.
-        unit: of the depth; None: what the camera says, and metres where there are floats.
-
-    Raises:
-        InputError: a file that cannot be read, sizes that disagree, whole numbers without a unit,
-            a matrix that belongs to another image.
-    """
+    """Take a depth image, a mask and a camera to a view in metres."""
     values = _values(depth, name)
     height, width = values.shape
     is_said = isinstance(camera, str | Path | Mapping | float | int)
@@ -115,11 +98,7 @@ def view_input(
 
 
 def rigid_input(pose: Rigid | AnyArray) -> Rigid:
-    """Take a transform, or its 4x4 matrix in metres.
-
-    Raises:
-        InputError: another shape, or no rotation.
-    """
+    """Take a transform, or its 4x4 matrix in metres."""
     if isinstance(pose, Rigid):
         return pose
     matrix = torch.zeros(0) if isinstance(pose, str | Path) else _tensor(pose).double()
@@ -158,9 +137,6 @@ def labels_input(mask: AnyMask, name: str) -> Int64[Tensor, "_ _"]:
     """Take a mask to the numbers of its objects, as :func:`read_labels` gives them.
 
     Of fractions in [0, 1], which are probabilities, those above a half are the object.
-
-    Raises:
-        InputError: a file that cannot be read, or no mask.
     """
     if isinstance(mask, str | Path):
         return read_labels(Path(mask))
@@ -281,11 +257,7 @@ class CloudDirections(NamedTuple):
 def prepare_cloud(
     given: AnyInput, model: ObjectModel, cloud: CloudConfig, config: EstimateConfig
 ) -> ObjectCloud | Refusal:
-    """Lift, thin, drop flying pixels, check, sample and put on the grid of the network.
-
-    Raises:
-        InputError: mask and depth differ in size.
-    """
+    """Lift, thin, drop flying pixels, check, sample and put on the grid of the network."""
     points_m = _points_of(given, config.max_cloud_points)
     if isinstance(points_m, Refusal):
         return points_m

@@ -60,19 +60,7 @@ def pose_from_directions(
     *,
     is_likely: bool = True,
 ) -> PoseEstimate:
-    """Vote for the keypoints, fit the pose, refine and check it.
-
-    Args:
-        voted: the cloud and the network's directions (a fourth component is the logit of how far
-            to trust each).
-        model: the object.
-        surface: of it.
-        copies: what it may be confused with.
-        refusal: when the answer is withheld.
-        config: voting and ICP.
-        is_likely: whether the cloud is likely to show the object; else the other poses that fit are
-            not compared where the best does not fit by itself.
-    """
+    """Vote for the keypoints, fit the pose, refine and check it."""
     clock = Clock()
     vote = cast_votes(voted, config.voting)
     clock.note("voting")

@@ -44,13 +44,7 @@ _ON = 3.0
 
 
 def scene_about(given: AnyInput, poses: Rigid, surface: Surface) -> Float64[Tensor, "n 3"]:
-    """Give all points in the direction of the object at one of several poses, and about it.
-
-    Args:
-        given: a cloud of more than the object, or a view, whose mask limits what is taken.
-        poses: a batch, ``camera_from_model``.
-        surface: of the model.
-    """
+    """Give all points in the direction of the object at one of several poses, and about it."""
     middles_m = (poses.R @ surface.points_m.mean(0)) + poses.t_m
     middle_m = middles_m.mean(0)
     radius_m = (0.5 + 2 * MARGIN) * surface.diameter_m
@@ -113,18 +107,7 @@ class _Last:
 def track(
     frames: Iterable[AnyInput], known: TrackedObject, first: Rigid | None = None
 ) -> Iterator[PoseEstimate]:
-    """Estimate one object in frame after frame, each from the pose of the frame before.
-
-    Args:
-        frames: in their order, of the same camera. A cloud may be of the object alone or of all
-            about it; the mask of a view limits where is looked.
-        known: what is followed.
-        first: the pose in the first frame, as far as it is known; None: it is looked for.
-
-    Yields:
-        An estimate for each frame, whose ``tracking`` says how it came about. One that is lost has
-        no pose, and the reason.
-    """
+    """Estimate one object in frame after frame, each from the pose of the frame before."""
     last = None if first is None else _Last(pose=first.double(), moved=None, origin=None)
     for given in frames:
         estimate = _next(given, last, known)

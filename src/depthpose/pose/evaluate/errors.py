@@ -94,13 +94,7 @@ class Metric:
 def measure(
     estimated: Rigid | None, instance: Instance, context: ErrorContext
 ) -> dict[str, Errors]:
-    """Measure one estimate by every metric of ``METRICS`` that is wanted.
-
-    Args:
-        estimated: ``camera_from_model``; None where there is no answer.
-        instance: with its truth.
-        context: of its object.
-    """
+    """Measure one estimate by every metric of ``METRICS`` that is wanted."""
     found: dict[str, Errors] = {}
     for name, metric in METRICS.items():
         if metric.is_wanted(context):
@@ -342,14 +336,7 @@ def convention_advice(
     contexts: Mapping[int, ErrorContext],
     limit: float,
 ) -> str | None:
-    """Say by which change of all predictions many more were right; None where by none.
-
-    Args:
-        dataset: instances with truth.
-        predictions: of them.
-        contexts: of each object, by its number.
-        limit: the ADD (ADD-S) of a success, in diameters.
-    """
+    """Say by which change of all predictions many more were right; None where by none."""
     answers = [p for p in predictions if p.estimate.is_posed]
     there = match(dataset.instances, answers, dataset.objects)
     seen = [instance for instance in dataset.instances if instance.name in there]

@@ -220,10 +220,6 @@ def object_row(name: str, rows: Sequence[InstanceRow]) -> ObjectRow:
 
     ``success``, ``refused`` and ``wrong`` add up to 1: an instance without an answer is refused.
     Medians are of the answers alone; all else counts everything.
-
-    Args:
-        name: what the row is called.
-        rows: one an instance.
     """
     count = len(rows)
     success = sum(row.is_success for row in rows) / count

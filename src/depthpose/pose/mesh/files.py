@@ -313,19 +313,6 @@ def cut_polygons(
     """Cut simple polygons without holes into triangles of the same corners, in their order.
 
     A polygon that is not planar is cut as it looks along the normal of its area (Newell's).
-
-    Args:
-        path: of the file, for errors.
-        vertices: (n, 3).
-        sizes: how many corners each polygon has.
-        corners: of all polygons, one after the other: rows of ``vertices``.
-
-    Returns:
-        Triangles (t, 3).
-
-    Raises:
-        InputError: a corner is none of the vertices, a polygon has one or two corners or more than
-            are cut, or polygons cross themselves.
     """
     starts = np.cumsum(sizes) - sizes
     wrong = (corners < 0) | (corners >= len(vertices))

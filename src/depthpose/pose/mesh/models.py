@@ -265,11 +265,6 @@ def outward_normals(points: np.ndarray, normals: np.ndarray, cell: float) -> np.
 
     What is thinner than half the distance of the samples, open sheets and what is never seen have
     no outer side: their normals become 0.
-
-    Args:
-        points: (m, 3), samples of a surface.
-        normals: (m, 3), of either side.
-        cell: side of a ray's cell.
     """
     seen, looked = np.zeros((2, len(points))), np.full((2, len(points)), 1e-9)
     for axis in fibonacci_directions(_SIDE_DIRECTIONS).numpy():
@@ -296,13 +291,7 @@ def outward_normals(points: np.ndarray, normals: np.ndarray, cell: float) -> np.
 
 
 def across_walls(points: np.ndarray, outward: np.ndarray, limit: float) -> np.ndarray:
-    """Give for each sample the number of the nearest one of an opposite side, or -1, (m,).
-
-    Args:
-        points: (m, 3).
-        outward: (m, 3), of :func:`outward_normals`.
-        limit: the thickest wall.
-    """
+    """Give for each sample the number of the nearest one of an opposite side, or -1, (m,)."""
     across, nearest = np.full(len(points), -1), np.full(len(points), np.inf)
     for column, sign in ((c, s) for c in range(3) for s in (1, -1)):
         (own,) = np.nonzero(sign * outward[:, column] > 0.577)

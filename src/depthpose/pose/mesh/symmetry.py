@@ -44,12 +44,6 @@ def kept(
     """Give a value of a model that takes long to compute.
 
     It is kept in ``$DEPTHPOSE_CACHE``, where that can be written to.
-
-    Args:
-        model: of which vertices, faces and symmetries count.
-        name: of the value, and of its folder in the cache.
-        compute: gives the value in a form that JSON has.
-        decode: makes the value of that form; what it cannot read is computed again.
     """
     place = f"{name}/{_key_of(model)}.json"
     if place not in _memory:
@@ -156,12 +150,7 @@ class SurfaceDeviation:
     def deviation(
         self, R: Float[Tensor, "*batch 3 3"], shift: Float[Tensor, "*batch 3"] | None = None
     ) -> Float[Tensor, "*batch"]:
-        """The 98th percentile of the distance to the surface, both ways.
-
-        Args:
-            R: turns about the centre of the surface.
-            shift: after the turn, in diameters.
-        """
+        """The 98th percentile of the distance to the surface, both ways."""
         turn = Rigid(R, torch.zeros_like(R[..., 0]) if shift is None else shift)
         return torch.maximum(self._one_way(turn), self._one_way(turn.inverse()))
 
@@ -415,13 +404,7 @@ def is_mirror_alike(model: ObjectModel) -> bool:
 def refine_turn(
     surface: SurfaceDeviation, R: Float64[Tensor, "3 3"], flip: Float64[Tensor, "3 3"] | None = None
 ) -> Rigid:
-    """Refine the turn of a surface about the middle of its box onto itself (ICP).
-
-    Args:
-        surface: of the model.
-        R: where it begins.
-        flip: turns the points before; a reflection lays the mirror image on the surface.
-    """
+    """Refine the turn of a surface about the middle of its box onto itself (ICP)."""
     points = surface.many if flip is None else surface.many @ flip
     middle = (surface.points.amin(0) + surface.points.amax(0)) / 2
     turn = Rigid(R, middle - (R if flip is None else R @ flip) @ middle)

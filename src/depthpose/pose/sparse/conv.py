@@ -1,12 +1,10 @@
 """The sparse convolution, ``conv(features, weight, kernel_map)``, and as a module on voxels.
 
 Every way of computing it is gather, multiply, add up; the ways differ in how much is gathered at
-once. Without gradients small ones go through a compiled loop, where numba is installed. Products
-go in blocks of rows through the faster of torch's two CPU libraries.
+once. Without gradients small ones go through a compiled loop, where numba is installed.
 """
 
 from dataclasses import dataclass
-from functools import cache
 from typing import Any
 
 import torch
@@ -18,59 +16,6 @@ from torch.autograd.function import once_differentiable
 from depthpose.core.errors import InputError
 from depthpose.pose.compiled import serves
 from depthpose.pose.sparse.kernel_map import CoordinateCache, KernelMap, pack, unpack
-
-BLOCK_PRODUCTS = 1 << 23
-"""Multiplications in a block: fewer cost more calls, more fall out of the cache (measured)."""
-
-
-def block_rows(x: Tensor, kernel: Tensor) -> int:
-    """Rows to multiply at once; all of them where oneDNN does not serve.
-
-    On an AMD processor oneDNN makes a convolution of 10,000 voxels 1.4 times as fast as MKL does,
-    but it compiles code for each new shape, which takes milliseconds: blocks keep to one shape,
-    and ragged ends go to MKL.
-    """
-    if not _has_onednn(x):
-        return 1 << 62
-    return max(1, BLOCK_PRODUCTS // kernel.numel())
-
-
-def multiply(
-    rows: Float[Tensor, "n inputs"], kernel: Float[Tensor, "inputs outputs"], block: int
-) -> Float[Tensor, "n outputs"]:
-    """Multiply up to ``block`` rows."""
-    if len(rows) < block or not _has_onednn(rows):
-        return torch.mm(rows, kernel)
-    return torch.ops.mkldnn._linear_pointwise(rows, kernel.T, None, "none", [], "")
-
-
-def add_product(out: Tensor, x: Tensor, kernel: Tensor) -> Tensor:
-    """Add ``x @ kernel`` to ``out`` in place."""
-    block = block_rows(x, kernel)
-    for part, rows in zip(out.split(block), x.split(block), strict=True):
-        if len(rows) < block:
-            part.addmm_(rows, kernel)
-        else:
-            part.add_(multiply(rows, kernel, block))
-    return out
-
-
-def _has_onednn(x: Tensor) -> bool:
-    return x.device.type == "cpu" and x.dtype == torch.float32 and _has_private_product()
-
-
-@cache
-def _has_private_product() -> bool:
-    """Whether this torch multiplies through oneDNN, by an operator private to it."""
-    if not torch.backends.mkldnn.is_available():
-        return False
-    rows, kernel = torch.ones(2, 3, dtype=torch.float32), torch.ones(3, 4, dtype=torch.float32)
-    try:
-        product = torch.ops.mkldnn._linear_pointwise(rows, kernel.T, None, "none", [], "")
-    except (AttributeError, RuntimeError, TypeError):  # renamed, not built in, other arguments
-        return False
-    return torch.equal(product, torch.full_like(product, 3.0))
-
 
 GRID_PRODUCTS = 1 << 20
 """Where the fullest offset takes up to this many multiplications, all offsets are one batched
@@ -134,18 +79,9 @@ class _Convolution(torch.autograd.Function):
         m: KernelMap = ctx.kernel_map
         gradient = gradient.contiguous()
         wants_x, wants_weight, _ = ctx.needs_input_grad
-        if _is_narrow(x, m):
-            # The first layer's input is no parameter's child: its gradient is seldom wanted.
-            for_x = _convolve(gradient, weight.mT, m.transposed) if wants_x else None
-            of_table = (_table(x, m) @ gradient).view(weight.shape) if wants_weight else None
-            return for_x, of_table, None
-        way = _gradients_by_grid if _is_gridded(x, weight, m) else _gradients_by_offset
-        for_x, for_weight = way(gradient, x, weight, m, wants_x, wants_weight)
-        if m.centre is not None and for_x is not None:
-            add_product(for_x, gradient, weight[m.centre].T)
-        if m.centre is not None and for_weight is not None:
-            torch.mm(x.T, gradient, out=for_weight[m.centre])
-        return for_x, for_weight, None
+        # The first layer's input is no parameter's child: its gradient is seldom wanted.
+        for_x = _convolve(gradient, weight.mT, m.transposed) if wants_x else None
+        return for_x, _weight_gradient(gradient, x, weight, m) if wants_weight else None, None
 
 
 def _convolve(x: Tensor, weight: Tensor, m: KernelMap) -> Tensor:
@@ -156,42 +92,23 @@ def _convolve(x: Tensor, weight: Tensor, m: KernelMap) -> Tensor:
     else:  # an offset at a time: its pairs write each row once at most
         out, kernels = x.new_zeros(m.outputs, weight.shape[2]), weight.unbind()
         for offset, read, write in m.by_offset():
-            _add_rows(out, write, x, read, kernels[offset])
-    return out if m.centre is None else add_product(out, x, weight[m.centre])
+            out.index_add_(0, write, x.index_select(0, read) @ kernels[offset])
+    return out if m.centre is None else out.addmm_(x, weight[m.centre])
 
 
-def _add_rows(out: Tensor, write: Tensor, x: Tensor, read: Tensor, kernel: Tensor) -> None:
-    """Add ``x[read] @ kernel`` to the rows ``write`` of ``out``, block by block."""
-    block = block_rows(x, kernel)
-    for reads, writes in zip(read.split(block), write.split(block), strict=True):
-        out.index_add_(0, writes, multiply(x.index_select(0, reads), kernel, block))
-
-
-def _gradients_by_grid(
-    gradient: Tensor, x: Tensor, weight: Tensor, m: KernelMap, wants_x: bool, wants_weight: bool
-) -> tuple[Tensor | None, Tensor | None]:
-    pulls = _read(gradient, m.transposed)
-    for_x = for_weight = None
-    if wants_x:
-        for_x = m.transposed.sum_by_output(torch.bmm(pulls, weight.mT).flatten(0, 1))
-    if wants_weight:
-        for_weight = torch.bmm(_read(x, m).mT, pulls)
-    return for_x, for_weight
-
-
-def _gradients_by_offset(
-    gradient: Tensor, x: Tensor, weight: Tensor, m: KernelMap, wants_x: bool, wants_weight: bool
-) -> tuple[Tensor | None, Tensor | None]:
-    for_x = torch.zeros_like(x) if wants_x else None
-    for_weight = torch.zeros_like(weight) if wants_weight else None
-    kernels, pulled = weight.mT.unbind(), () if for_weight is None else for_weight.unbind()
-    for offset, read, write in m.by_offset():
-        if for_weight is not None:
+def _weight_gradient(gradient: Tensor, x: Tensor, weight: Tensor, m: KernelMap) -> Tensor:
+    if _is_narrow(x, m):
+        return (_table(x, m) @ gradient).view(weight.shape)
+    if _is_gridded(x, weight, m):
+        found = torch.bmm(_read(x, m).mT, _read(gradient, m.transposed))
+    else:
+        found = torch.zeros_like(weight)
+        for offset, read, write in m.by_offset():
             pulls = gradient.index_select(0, write)
-            torch.mm(x.index_select(0, read).T, pulls, out=pulled[offset])
-        if for_x is not None:
-            _add_rows(for_x, read, gradient, write, kernels[offset])
-    return for_x, for_weight
+            torch.mm(x.index_select(0, read).T, pulls, out=found[offset])
+    if m.centre is not None:
+        torch.mm(x.T, gradient, out=found[m.centre])
+    return found
 
 
 def _read(x: Tensor, m: KernelMap) -> Tensor:

@@ -35,11 +35,7 @@ Keys = Int64[Tensor, " _"]
 
 
 def pack(coordinates: Int[Tensor, "n 4"]) -> Keys:
-    """Pack rows of (cloud, x, y, z) into keys.
-
-    Raises:
-        InputError: a coordinate or the number of clouds does not fit.
-    """
+    """Pack rows of (cloud, x, y, z) into keys."""
     if len(coordinates):
         lowest, highest = coordinates.amin(0).tolist(), coordinates.amax(0).tolist()
         if lowest[0] < 0 or highest[0] >= CLOUD_LIMIT:

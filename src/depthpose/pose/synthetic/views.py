@@ -150,11 +150,7 @@ def pixel_to_ray(K: Float[Tensor, "3 3"]) -> Float[Tensor, "3 3"]:
 def window_of(
     shape: Shape, pose: Rigid, K: Float[Tensor, "3 3"]
 ) -> tuple[Float[Tensor, "3 3"], int, int]:
-    """Cut the window in which an object lies, with a margin.
-
-    Returns:
-        Its intrinsic matrix, width and height.
-    """
+    """Cut the window in which an object lies, with a margin."""
     corners = shape.hull_m @ pose.R.mT + (pose.t_m + pose.R @ shape.middle_m)
     pixels = (corners @ K.mT)[:, :2] / corners[:, 2:]
     left, top = (pixels.amin(0).floor() - MARGIN_PX).tolist()
@@ -177,14 +173,7 @@ def draw_view(shape: Shape, pose: Rigid, K: Float[Tensor, "3 3"]) -> CleanView:
 def turn_view(
     view: CleanView, turn: Float[Tensor, "3 3"], shape: Shape, K: Float[Tensor, "3 3"]
 ) -> CleanView:
-    """See a view with the camera turned: ``x_new = turn @ x_old``.
-
-    Args:
-        view: drawn before.
-        turn: ``new_from_old`` camera.
-        shape: of the object, for the window.
-        K: intrinsic matrix of the new image.
-    """
+    """See a view with the camera turned: ``x_new = turn @ x_old``."""
     old = view.camera_from_model
     pose = Rigid(turn @ old.R, turn @ old.t_m)
     moved, width, height = window_of(shape, pose, K)

@@ -212,11 +212,7 @@ def frame_place(
 def open_frames(
     frames: FramesConfig, models: Sequence[ObjectModel], cloud: CloudConfig
 ) -> BopDataset:
-    """Open the real frames of a training, of its objects alone.
-
-    Raises:
-        InputError: an object has another name there.
-    """
+    """Open the real frames of a training, of its objects alone."""
     dataset = open_bop(frames.folder, frames.split, cloud=cloud)
     dataset = dataset.of_objects(*(model.number for model in models))
     known = {model.number: model.name for model in models}

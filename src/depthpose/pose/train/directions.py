@@ -116,16 +116,7 @@ _TURNS_ON_CARD = 3
 
 
 def claim_run(config: Any, run: Run, files: Sequence[str] = ()) -> None:  # noqa: ANN401
-    """Make the folder this config's own.
-
-    Args:
-        config: of any training; it has ``loop``, ``start`` and perhaps ``held_out``.
-        run: where.
-        files: that decide what is learnt, beside the config: their content is remembered.
-
-    Raises:
-        InputError: the folder is another config's.
-    """
+    """Make the folder this config's own."""
     more: dict[str, Any] = {"sha256": [file_sha256(Path(path)) for path in files]}
     if config.start is not None:
         more["start_sha256"] = file_sha256(find_weights(config.start))
@@ -254,9 +245,6 @@ def _start_from(network: ResUNet | PointNet, start: str, clouds: TrainingClouds)
 
     Written weights are folded: they have no norms, but biases. Batch norm takes both up. New
     input features of a voxel get weights of zero.
-
-    Raises:
-        InputError: a network of another shape.
     """
     found = read_pose_network(find_weights(start))
     if isinstance(found, ResUNet) and isinstance(network, ResUNet):

@@ -98,15 +98,7 @@ class KnownObjects:
 
 
 class AnnotatedImages:
-    """Images of a data set with their labels.
-
-    Args:
-        config: which.
-        objects: classes that are given; None: those that the images show.
-
-    Raises:
-        InputError: no picture, or no object in any.
-    """
+    """Images of a data set with their labels."""
 
     def __init__(self, config: ImagesConfig, objects: KnownObjects | None = None) -> None:
         if not config.folder:
@@ -131,12 +123,7 @@ class AnnotatedImages:
         return len(self._images)
 
     def __getitem__(self, index: int) -> LabelledImage:
-        """Read one whole image.
-
-        Raises:
-            IndexError: there is no such image.
-            InputError: a file is missing or damaged, or a mask is of another size.
-        """
+        """Read one whole image."""
         held = self._cache.get(index)
         if held is None:
             held = self._read(self._images[index])
@@ -165,14 +152,7 @@ class AnnotatedImages:
 
 
 class TrainingImages:
-    """An image by sample index, randomly changed and cut.
-
-    Args:
-        images: to draw from.
-        config: how they are changed.
-        network: at what size it sees them.
-        seed: decides order and changes.
-    """
+    """An image by sample index, randomly changed and cut."""
 
     def __init__(
         self,
@@ -285,13 +265,7 @@ class CropSample(NamedTuple):
 
 
 class TrainingCrops:
-    """A crop of a view, synthetic or of a frame, by sample index.
-
-    Args:
-        models: the objects; class k is ``models[k]``.
-        config: which views, and how they are cut.
-        seed: of the order of frames.
-    """
+    """A crop of a view, synthetic or of a frame, by sample index."""
 
     def __init__(
         self, models: Sequence[ObjectModel], config: DepthImageTraining, seed: int
@@ -308,11 +282,7 @@ class TrainingCrops:
         return epoch_samples(self.config.frames, self._real, len(self.synthetic))
 
     def __getitem__(self, index: int) -> CropSample:
-        """Make the sample of an index; one with too few pixels is replaced by another.
-
-        Raises:
-            InputError: so many in a row have too few pixels that the config must be wrong.
-        """
+        """Make the sample of an index; one with too few pixels is replaced by another."""
         for attempt in range(_TRIES):
             # Far beyond any training, and the same object.
             place = index + attempt * len(self.models) * 2**32

@@ -70,11 +70,7 @@ def prepare_lines(
     directions: Float[Tensor, "*batch n k 3"],
     weight: Float[Tensor, "*batch n k"] | None,
 ) -> tuple[Lines, Float[Tensor, "*batch 1 3"]]:
-    """Turn coordinates before points, about the points' mean, with unit directions.
-
-    Raises:
-        InputError: fewer than two lines of a keypoint have weight.
-    """
+    """Turn coordinates before points, about the points' mean, with unit directions."""
     centre_m = points_m.mean(-2, keepdim=True)
     local = (points_m - centre_m).mT[..., None, :, :].contiguous()
     n = directions.movedim(-3, -1).contiguous()
