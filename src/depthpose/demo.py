@@ -23,7 +23,7 @@ from depthpose.depth.synthetic import Streets
 from depthpose.depth.types import DepthEstimate, StereoInput, StereoSample, StereoTruth
 from depthpose.pose.config import ObjectsConfig
 from depthpose.pose.datasets import open_bop, write_bop_models, write_bop_scene
-from depthpose.pose.datasets.write import write_mask
+from depthpose.pose.datasets.dataset import write_mask
 from depthpose.pose.estimator import GeoPoseNet
 from depthpose.pose.evaluate import evaluate
 from depthpose.pose.predictions import CLOUD, Prediction, place_of, write_predictions

@@ -10,9 +10,8 @@ from tests.pose.synthetic_frames import draw_frame, frame_models
 from depthpose.core.files import write_depth_png, write_image
 from depthpose.pose.config import MeshConfig
 from depthpose.pose.datasets import BopDataset, open_bop
-from depthpose.pose.datasets.dataset import read_instance_mask
+from depthpose.pose.datasets.dataset import read_instance_mask, write_bop_models, write_mask
 from depthpose.pose.datasets.layouts import segnet_mask
-from depthpose.pose.datasets.write import write_bop_models, write_mask
 from depthpose.pose.mesh import make_model
 from depthpose.pose.types import ObjectModel
 from depthpose.thesis.pose_tables import LINEMOD_DIAMETERS_M

@@ -27,7 +27,7 @@ from depthpose.pose.datasets import (
 )
 from depthpose.pose.datasets.layouts import read_bop_models, segnet_mask
 from depthpose.pose.mesh import make_model, turn_about
-from depthpose.pose.train.directions import keypoint_copies
+from depthpose.pose.train.poses import keypoint_copies
 from depthpose.pose.types import ObjectModel, Symmetries
 
 K = torch.tensor([[500.0, 0, 40], [0, 500, 30], [0, 0, 1]]).double()

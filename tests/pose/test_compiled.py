@@ -18,7 +18,7 @@ from depthpose.core.rigid import Rigid, rotation_by
 from depthpose.pose import compiled
 from depthpose.pose.cloud import local_planes
 from depthpose.pose.config import IcpConfig, VotingConfig
-from depthpose.pose.estimator.identity import scale_of
+from depthpose.pose.estimator.fit import scale_of
 from depthpose.pose.network import ResUNet, ResUNetConfig
 from depthpose.pose.refine import RefinedPose, refine_best, refine_pose, refine_roughly
 from depthpose.pose.sparse import Voxels, conv

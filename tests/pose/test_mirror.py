@@ -14,7 +14,7 @@ from tests.pose.synthetic_objects import (
 
 from depthpose.core.rigid import Rigid
 from depthpose.pose.config import RefusalConfig
-from depthpose.pose.estimator.identity import mirror_gain
+from depthpose.pose.estimator.fit import mirror_gain
 from depthpose.pose.mesh import is_mirror_alike, mirror_deviation
 from depthpose.pose.refine import refine_pose
 from depthpose.pose.surface import prepare_surface

@@ -10,7 +10,7 @@ from tests.pose.synthetic_objects import Oracle, bracket, cloud_of, noisy, pose_
 from depthpose.core.loop import sample_generator
 from depthpose.core.rigid import Rigid
 from depthpose.pose.config import EstimateConfig, RefusalConfig
-from depthpose.pose.estimator.identity import scale_of
+from depthpose.pose.estimator.fit import scale_of
 from depthpose.pose.refine import refine_pose
 from depthpose.pose.surface import prepare_surface
 from depthpose.pose.types import PoseEstimate

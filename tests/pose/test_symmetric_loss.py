@@ -10,7 +10,7 @@ from depthpose.pose.network import ResUNet, ResUNetConfig
 from depthpose.pose.synthetic import make_part
 from depthpose.pose.train import PoseTask, PoseTraining
 from depthpose.pose.train.clouds import CloudBatch
-from depthpose.pose.train.directions import keypoint_copies
+from depthpose.pose.train.poses import keypoint_copies
 from depthpose.pose.types import SeenPoints
 
 _SMALL = ResUNetConfig(classes=1, first_kernel=3, encoder=(4, 4, 8, 8), decoder=(4, 4, 4, 8))

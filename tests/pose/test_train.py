@@ -41,7 +41,7 @@ from depthpose.pose.train.clouds import (
     score_held_out,
     table_text,
 )
-from depthpose.pose.train.directions import keypoint_copies, packed
+from depthpose.pose.train.poses import keypoint_copies, packed
 from depthpose.pose.types import ObjectModel, PoseEstimate, SeenPoints, Symmetries
 from depthpose.pose.weights import (
     PoseWeights,
@@ -381,7 +381,7 @@ def test_weights_are_measured_as_the_file_has_them(
         seen.append(weights)
         return {}
 
-    monkeypatch.setattr("depthpose.pose.train.directions.score_held_out", counted)
+    monkeypatch.setattr("depthpose.pose.train.poses.score_held_out", counted)
     path = train_pose(_training(with_half=True), Run(folder=tmp_path / "run"))
     written = read_pose_weights(path)
     (measured,) = seen

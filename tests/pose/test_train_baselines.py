@@ -30,16 +30,14 @@ from depthpose.pose.train import (
     SegmentationTraining,
 )
 from depthpose.pose.train.config import ImageAugmentConfig, ImagesConfig
-from depthpose.pose.train.others import (
+from depthpose.pose.train.masks import (
     AnnotatedImages,
     LabelledImage,
-    TrainingCrops,
     TrainingImages,
     cut_window,
     jitter_colors,
-    surface_points,
-    symmetric_copies,
 )
+from depthpose.pose.train.poses import TrainingCrops, surface_points, symmetric_copies
 
 LOOP = LoopConfig(steps=2, batch_size=2, device="cpu", log_every_steps=1)
 VIEWS = ObjectsConfig(number=8, views=2, resolution=(0.25, 0.25), distance_m=(0.6, 0.7))

@@ -11,7 +11,7 @@ from depthpose.depth.config import StreetsConfig
 from depthpose.depth.synthetic import Streets
 from depthpose.pose.cloud import cloud_from_depth
 from depthpose.pose.config import ObjectsConfig
-from depthpose.pose.datasets.write import write_mask
+from depthpose.pose.datasets.dataset import write_mask
 from depthpose.pose.synthetic import Objects, make_part
 
 PART = "flange"

@@ -45,7 +45,6 @@ class DepthImageConfig:
     """Fewer masked pixels with a depth are refused, not posed."""
 
     def __post_init__(self) -> None:
-        """Refuse sizes that the network cannot have."""
         counts = dict.fromkeys(("classes", "widths", "min_points"), "[1, inf)")
         check_settings(self, **counts, crop_px="[32, inf)", margin="[1, inf)", contrast="(0, inf)")
 
@@ -79,7 +78,6 @@ class PointNetConfig:
     """Channels of a point beside that maximum."""
 
     def __post_init__(self) -> None:
-        """Refuse sizes that the network cannot have."""
         counts = ("classes", "keypoints", "local", "pooled", "head")
         check_settings(self, **dict.fromkeys(counts, "[1, inf)"), unit_m="(0, inf)")
 
@@ -103,7 +101,6 @@ class FpfhConfig:
     """Of RANSAC."""
 
     def __post_init__(self) -> None:
-        """Refuse voxels without a size, and no iteration."""
         check_settings(self, voxel_diameters="(0, inf)", iterations="[1, inf)")
 
 

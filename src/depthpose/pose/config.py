@@ -18,7 +18,6 @@ class MeshConfig:
     """Farthest points of the surface that the network's directions point at (4 to 20 usual)."""
 
     def __post_init__(self) -> None:
-        """Refuse fewer keypoints than fix a pose."""
         check_settings(self, keypoints="[4, inf)")
 
 
@@ -48,7 +47,6 @@ class CloudConfig:
     """Points farther from the median of the masked points are flying pixels, and dropped."""
 
     def __post_init__(self) -> None:
-        """Refuse sizes that leave nothing or mean another unit."""
         check_settings(
             self,
             voxel_m="(0, 1)",
@@ -103,7 +101,6 @@ class VotingConfig:
     """Of the pairs: the same input gives the same answer."""
 
     def __post_init__(self) -> None:
-        """Refuse values outside their range."""
         check_settings(
             self,
             hypotheses="[1, inf)",
@@ -146,7 +143,6 @@ class IcpConfig:
     way and the other about each axis of the camera (``bench/refine_starts.py``)."""
 
     def __post_init__(self) -> None:
-        """Refuse limits that grow, and counts of nothing."""
         check_settings(
             self,
             starts="[1, 7]",
@@ -208,7 +204,6 @@ class RefusalConfig:
     ball) is not observable."""
 
     def __post_init__(self) -> None:
-        """Refuse limits that are no share, or refuse everything."""
         check_settings(
             self,
             min_agreement="[0, 1]",
@@ -261,7 +256,6 @@ class EstimateConfig:
     """Where the network runs: cpu, cuda, cuda:1, ..."""
 
     def __post_init__(self) -> None:
-        """Refuse counts of nothing, and a certainty that is none."""
         check_settings(
             self, min_certainty="[0, 1]", max_cloud_points="[100, inf)", batch_voxels="[1, inf)"
         )
@@ -300,7 +294,6 @@ class EvaluationConfig:
     """How far a surface may lie behind the measured one and count as visible (ITODD: 0.005)."""
 
     def __post_init__(self) -> None:
-        """Refuse unknown names, and a tolerance out of range."""
         check_settings(self, vsd_delta_m="(0, 1)")
 
 
@@ -339,7 +332,6 @@ class SensorConfig:
     ``none``."""
 
     def __post_init__(self) -> None:
-        """Refuse unknown kinds and empty ranges."""
         if not self.kinds:
             raise InputError(f"kinds is (); name one or more of {', '.join(get_args(SensorKind))}")
         check_settings(
@@ -415,7 +407,6 @@ class ObjectsConfig:
     ``frame_objects`` and ``frame_clutter``; 0: no pile."""
 
     def __post_init__(self) -> None:
-        """Refuse counts of nothing, shares beyond one and empty ranges."""
         check_settings(
             self,
             number="[1, inf)",

@@ -212,11 +212,24 @@ def parse_prediction(row: dict[str, Any], source: str) -> Prediction:
     tracking = row.get("tracking")
     if tracking is not None and tracking not in get_args(Tracking):
         raise InputError(f"{source}: tracking is {tracking!r}; write one of {get_args(Tracking)}")
-    pose = _pose(row.get("camera_from_model"), source)
+    pose = _pose(row, source)
     if (pose is not None) != (status in POSED) or (status != "ok" and not reason):
         raise InputError(
             f"{source}: an estimate that is ok or ambiguous has a camera_from_model, a refused one "
             f"none; all but ok have a reason; its status is {status!r}"
+        )
+    entries, alternatives = row.get("alternatives", []), list[Alternative]()
+    if not isinstance(entries, list) or not all(isinstance(entry, dict) for entry in entries):
+        raise InputError(f"{source}: alternatives are no list of poses; write [...] of them")
+    for k, entry in enumerate(entries):
+        where = f"{source}: alternative {k}"
+        other = _pose(entry, where)
+        if other is None:
+            raise InputError(f"{where}: has no camera_from_model; leave it out, or write it")
+        probability = number(entry, "probability", None, where)
+        words = str(entry.get("difference", ""))
+        alternatives.append(
+            Alternative(camera_from_model=other, probability=probability, difference=words)
         )
     estimate = PoseEstimate(
         name=name,
@@ -232,7 +245,7 @@ def parse_prediction(row: dict[str, Any], source: str) -> Prediction:
         fit=_fields_of(row, "fit", Fit, source),
         certainty=_optional(row, "certainty", source),
         identity=_fields_of(row, "identity", Identity, source),
-        alternatives=_alternatives(row.get("alternatives", []), source),
+        alternatives=tuple(alternatives),
         signals=_named(row, "signals", source),
         seconds=_named(row, "seconds", source),
         tracking=cast("Tracking | None", tracking),
@@ -242,10 +255,10 @@ def parse_prediction(row: dict[str, Any], source: str) -> Prediction:
     return Prediction(estimate=estimate, place=place)
 
 
-def _pose(entry: object, source: str) -> Rigid | None:
-    if entry is None:
+def _pose(row: dict[str, Any], source: str) -> Rigid | None:
+    matrix = _table(row, "camera_from_model", 4, source, rows=4)
+    if matrix is None:
         return None
-    matrix = _numbers(entry, 4, f"{source}: camera_from_model", rows=4)
     R = matrix[:3, :3]
     eye = torch.eye(3, dtype=torch.float64)
     is_rotation = torch.allclose(R @ R.T, eye, atol=_ROTATION_SLACK) and torch.linalg.det(R) > 0
@@ -257,35 +270,18 @@ def _pose(entry: object, source: str) -> Rigid | None:
     return Rigid(R.clone(), matrix[:3, 3].clone())
 
 
-def _alternatives(entries: object, source: str) -> tuple[Alternative, ...]:
-    if not isinstance(entries, list) or not all(isinstance(entry, dict) for entry in entries):
-        raise InputError(f"{source}: alternatives are no list of poses; write [...] of them")
-    found: list[Alternative] = []
-    for k, entry in enumerate(entries):
-        where = f"{source}: alternative {k}"
-        pose = _pose(entry.get("camera_from_model"), where)
-        if pose is None:
-            raise InputError(f"{where}: has no camera_from_model; leave it out, or write it")
-        probability = number(entry, "probability", None, where)
-        words = str(entry.get("difference", ""))
-        found.append(Alternative(camera_from_model=pose, probability=probability, difference=words))
-    return tuple(found)
-
-
 def _table(
     row: dict[str, Any], key: str, width: int, source: str, rows: int | None = None
 ) -> Tensor | None:
-    return None if row.get(key) is None else _numbers(row[key], width, f"{source}: {key}", rows)
-
-
-def _numbers(entry: object, width: int, source: str, rows: int | None = None) -> Tensor:
     """Read a table of ``width`` columns, and of ``rows`` rows where that is given."""
+    if row.get(key) is None:
+        return None
     try:
-        return torch.tensor(entry, dtype=torch.float64).reshape(rows or -1, width)
+        return torch.tensor(row[key], dtype=torch.float64).reshape(rows or -1, width)
     except (TypeError, ValueError, RuntimeError, OverflowError) as error:
         count = "" if rows is None else f"{rows} "
         raise InputError(
-            f"{source} is not {count}rows of {width} numbers; write them so"
+            f"{source}: {key} is not {count}rows of {width} numbers; write them so"
         ) from error
 
 
@@ -488,7 +484,22 @@ def read_bop_results(path: str | Path) -> list[Prediction]:
     for line, row in enumerate(rows[1:], 2):
         if not row:
             continue
-        place, score, pose, time_s = _parse_result(row, f"{path}: line {line}")
+        source = f"{path}: line {line}"
+        if len(row) != len(_HEADER):
+            raise InputError(f"{source}: {len(row)} values, where {len(_HEADER)} belong")
+        try:
+            place = Place(*(int(value) for value in row[:3]))
+            score, time_s = float(row[3]), float(row[6])
+            R, t_mm = ([float(value) for value in text.split()] for text in row[4:6])
+        except ValueError as error:
+            raise InputError(
+                f"{source}: {error}; write numbers, R and t parted by blanks"
+            ) from error
+        if not all(0 <= value <= MOST for value in place):
+            raise InputError(f"{source}: scene, image and object are numbers from 0 to {MOST}")
+        if len(R) != 9 or len(t_mm) != 3 or not all(map(math.isfinite, [score, time_s, *R, *t_mm])):
+            raise InputError(f"{source}: {len(R)} numbers of R and {len(t_mm)} of t, where 9 and 3 "
+                             "finite ones belong")  # fmt: skip
         said = image_s.setdefault(place[:2], time_s)
         if (said < 0) != (time_s < 0) or (time_s >= 0 and abs(said - time_s) > _SAME_TIME_S):
             raise InputError(
@@ -499,7 +510,7 @@ def read_bop_results(path: str | Path) -> list[Prediction]:
             name=f"row {len(found) + 1}",
             object=f"obj_{place.object_id:06d}",
             status="ok",
-            camera_from_model=pose,
+            camera_from_model=make_pose(R, t_mm, source),
             inlier_share=score,
         )
         found.append((place, estimate))
@@ -509,24 +520,6 @@ def read_bop_results(path: str | Path) -> list[Prediction]:
         Prediction(estimate=replace(estimate, seconds=shares.get(place[:2], {})), place=place)
         for place, estimate in found
     ]
-
-
-def _parse_result(row: list[str], source: str) -> tuple[Place, float, Rigid, float]:
-    """Read place, score, pose and time [s] of one row."""
-    if len(row) != len(_HEADER):
-        raise InputError(f"{source}: {len(row)} values, where {len(_HEADER)} belong")
-    try:
-        place = Place(*(int(value) for value in row[:3]))
-        score, time_s = float(row[3]), float(row[6])
-        R, t_mm = ([float(value) for value in text.split()] for text in row[4:6])
-    except ValueError as error:
-        raise InputError(f"{source}: {error}; write numbers, R and t parted by blanks") from error
-    if not all(0 <= value <= MOST for value in place):
-        raise InputError(f"{source}: scene, image and object are numbers from 0 to {MOST}")
-    if len(R) != 9 or len(t_mm) != 3 or not all(map(math.isfinite, [score, time_s, *R, *t_mm])):
-        raise InputError(f"{source}: {len(R)} numbers of R and {len(t_mm)} of t, where 9 and 3 "
-                         "finite ones belong")  # fmt: skip
-    return place, score, make_pose(R, t_mm, source), time_s
 
 
 def write_bop_results(

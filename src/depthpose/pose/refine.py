@@ -111,11 +111,29 @@ def refine_pose(
     config = IcpConfig() if config is None else config
     _refuse_no_points(points_m)
     cloud = take_evenly(points_m.double(), config.cloud_points)
-    limits_m = _limits(config, surface.diameter_m)
+    # The limit shrinks in even ratios over half of the steps; then it is kept, and checked by.
+    start, end = config.start_distance_diameters, config.end_distance_diameters
+    half = max(1, config.iterations // 2)
+    shares = [start * (end / start) ** min(1.0, i / half) for i in range(config.iterations)]
+    limits_m = [share * surface.diameter_m for share in (*shares, end)]
     pose, index = _iterated(cloud, initial.double(), surface, limits_m, is_exact=True)
-    end_m = config.end_distance_diameters * surface.diameter_m
-    equations = _normal_equations(cloud, pose, surface, end_m, index, ON_RAY)
-    return _result(points_m, cloud, pose, equations, config, surface.diameter_m)
+    H, _, residual_m, weight, J = _normal_equations(
+        cloud, pose, surface, limits_m[-1], index, ON_RAY
+    )
+    local = _covariance(cloud, H, J, weight, residual_m, limits_m[-1], surface.diameter_m)
+    middle_m = cloud.mean(0)
+    ray = torch.nn.functional.normalize(middle_m, dim=0)
+    offset_m = config.sensor_offset_m * torch.cat([torch.zeros(3), ray])
+    local = local + torch.outer(offset_m, offset_m)
+    eye, zero = torch.eye(3, dtype=torch.float64), torch.zeros(3, 3, dtype=torch.float64)
+    # w x (p - c) + v = w x p + (v + c x w)
+    shift = torch.cat([torch.cat([eye, zero], 1), torch.cat([cross_matrix(middle_m), eye], 1)])
+    return RefinedPose(
+        camera_from_model=Rigid(pose.R.to(points_m), pose.t_m.to(points_m)),
+        covariance=(shift @ local @ shift.mT).to(points_m),
+        residual_m=_spread_m(residual_m, weight).to(points_m),
+        inlier_share=(weight > 0).to(points_m).mean(-1),
+    )
 
 
 def refine_best(
@@ -162,8 +180,13 @@ def refine_best(
         refined = refine_pose(points_m, tried[best], surface, short)
     found = refined.camera_from_model.double()
     worth = worth.masked_fill(~_is_other(tried, found, surface), -torch.inf)
-    others = _distinct(tried, worth, surface)
-    return BestStart(refined, best % len(given.R), others)
+    others: list[int] = []  # from the best down, each another than those before
+    for k in worth.argsort(descending=True).tolist():
+        if len(others) == _MOST_OTHERS or worth[k] == -torch.inf:
+            break
+        if all(bool(_is_other(tried[[k]], tried[one], surface)) for one in others):
+            others.append(k)
+    return BestStart(refined, best % len(given.R), tried[others])
 
 
 def refine_roughly(
@@ -221,7 +244,10 @@ def _iterated(
             break
         H, pull, *_ = _normal_equations(cloud, pose, surface, limit_m, index, how)
         motion = torch.linalg.solve(H, pull) * moves
-        pose = _moved(pose, motion, _middle(cloud))
+        # About the middle itself: a turn by w about the camera, which is D away, with the shift
+        # that makes it one about the object to first order would leave the object w^2 D / 2 off.
+        turned = perturb(Rigid(pose.R, pose.t_m - cloud.mean(0)), motion)
+        pose = Rigid(turned.R, turned.t_m + cloud.mean(0))
         if limit_m <= limits_m[-1] and how != SEARCHED:
             moves = ((motion / scale).abs() >= _CONVERGED).any(-1, keepdim=True).double()
             if not bool(moves.any()):
@@ -266,29 +292,6 @@ def _is_other(poses: Rigid, best: Rigid, surface: Surface) -> Bool[Tensor, " b"]
     return gap_m.amin(-1) > _OTHER * surface.diameter_m
 
 
-def _distinct(poses: Rigid, worth: Float64[Tensor, " b"], surface: Surface) -> Rigid:
-    """Choose poses from the best down, each another than those before; worthless ones are none."""
-    chosen: list[int] = []
-    for k in worth.argsort(descending=True).tolist():
-        if len(chosen) == _MOST_OTHERS or worth[k] == -torch.inf:
-            break
-        if all(bool(_is_other(poses[[k]], poses[c], surface)) for c in chosen):
-            chosen.append(k)
-    return poses[chosen]
-
-
-def _limits(config: IcpConfig, diameter_m: float) -> list[float]:
-    """Shrink the limit in even ratios over half of the steps; then keep it, and check by it."""
-    start, end = config.start_distance_diameters, config.end_distance_diameters
-    half = max(1, config.iterations // 2)
-    shares = [start * (end / start) ** min(1.0, i / half) for i in range(config.iterations)]
-    return [share * diameter_m for share in (*shares, end)]
-
-
-def _middle(cloud: Float[Tensor, "n 3"]) -> Float[Tensor, "3"]:
-    return cloud.mean(0)
-
-
 def _normal_equations(
     cloud: Float[Tensor, "n 3"],
     pose: Rigid,
@@ -309,7 +312,7 @@ def _normal_equations(
         along = (gap * cloud).sum(-1).square() / cloud.square().sum(-1)
         square = square - along + residual_m.square()
     weight = torch.where(index >= 0, (1 - square / limit_m**2).clamp(min=0).square(), 0.0)
-    arm = target - _middle(cloud)
+    arm = target - cloud.mean(0)
     # Moving the model by (w, v) moves its point by w x arm + v, and lowers the residual.
     J = torch.cat([torch.linalg.cross(arm, normal), normal], -1)
     weighted = J.mT * weight[..., None, :]
@@ -318,43 +321,6 @@ def _normal_equations(
     size = H.diagonal(dim1=-2, dim2=-1).amax(-1)[..., None, None].clamp(min=1e-6)
     H = H + 1e-9 * size * torch.eye(6, dtype=torch.float64)
     return H, (weighted @ residual_m[..., None]).squeeze(-1), residual_m, weight, J
-
-
-def _moved(pose: Rigid, motion: Float[Tensor, "*batch 6"], middle: Tensor) -> Rigid:
-    """Turn a pose about a point and shift it.
-
-    About the point itself: a turn by w about the camera, which is D away, with the shift that makes
-    it one about the object to first order would leave the object ``w^2 D / 2`` off.
-    """
-    centred = Rigid(pose.R, pose.t_m - middle)
-    turned = perturb(centred, motion)
-    return Rigid(turned.R, turned.t_m + middle)
-
-
-def _result(
-    points_m: Tensor,
-    cloud: Tensor,
-    pose: Rigid,
-    equations: tuple[Tensor, ...],
-    config: IcpConfig,
-    diameter_m: float,
-) -> RefinedPose:
-    H, _, residual_m, weight, J = equations
-    limit_m = config.end_distance_diameters * diameter_m
-    local = _covariance(cloud, H, J, weight, residual_m, limit_m, diameter_m)
-    middle_m = _middle(cloud)
-    ray = torch.nn.functional.normalize(middle_m, dim=0)
-    offset_m = config.sensor_offset_m * torch.cat([torch.zeros(3), ray])
-    local = local + torch.outer(offset_m, offset_m)
-    eye, zero = torch.eye(3, dtype=torch.float64), torch.zeros(3, 3, dtype=torch.float64)
-    # w x (p - c) + v = w x p + (v + c x w)
-    shift = torch.cat([torch.cat([eye, zero], 1), torch.cat([cross_matrix(middle_m), eye], 1)])
-    return RefinedPose(
-        camera_from_model=Rigid(pose.R.to(points_m), pose.t_m.to(points_m)),
-        covariance=(shift @ local @ shift.mT).to(points_m),
-        residual_m=_spread_m(residual_m, weight).to(points_m),
-        inlier_share=(weight > 0).to(points_m).mean(-1),
-    )
 
 
 def _covariance(

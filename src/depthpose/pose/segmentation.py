@@ -71,10 +71,11 @@ class ResNet18(nn.Module):
         self.widths = widths
         self.conv1 = nn.Conv2d(inputs, widths[0], 7, 2, 3, bias=False)
         self.bn1 = nn.BatchNorm2d(widths[0])
-        self.layer1 = _stage(widths[0], widths[0], 1)
-        self.layer2 = _stage(widths[0], widths[1], 2)
-        self.layer3 = _stage(widths[1], widths[2], 2)
-        self.layer4 = _stage(widths[2], widths[3], 2)
+        before = (widths[0], *widths)
+        self.layer1, self.layer2, self.layer3, self.layer4 = (
+            nn.Sequential(BasicBlock(a, b, stride), BasicBlock(b, b, 1))
+            for a, b, stride in zip(before, widths, (1, 2, 2, 2), strict=False)
+        )
         for module in self.modules():
             if isinstance(module, nn.Conv2d):
                 nn.init.kaiming_normal_(module.weight, mode="fan_out", nonlinearity="relu")
@@ -146,10 +147,6 @@ def read_encoder_state(path: Path) -> Mapping[str, Tensor]:
     return read_checkpoint(path, ENCODER_KIND).state
 
 
-def _stage(inputs: int, outputs: int, stride: int) -> nn.Sequential:
-    return nn.Sequential(BasicBlock(inputs, outputs, stride), BasicBlock(outputs, outputs, 1))
-
-
 KIND = "segmentation"
 
 
@@ -175,7 +172,6 @@ class SegmentationConfig:
     """Parts below this share of the image's pixels are no object (150 pixels of 640x480)."""
 
     def __post_init__(self) -> None:
-        """Refuse sizes that the network cannot have."""
         check_settings(self, widths="[1, inf)", long_side_px="[32, inf)", min_share="[0, 1)")
 
 

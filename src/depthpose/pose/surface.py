@@ -146,6 +146,13 @@ def prepare_surface(model: ObjectModel, count: int = 10_000) -> Surface:
     cell_m = cell_of(points_m.numpy(), tree)
     outward = outward_normals(points_m.numpy(), normals.numpy(), cell_m)
     across = across_walls(points_m.numpy(), outward, 3 * NEAR * model.diameter_m)
+    low_m = points_m.amin(0) - _MARGIN * model.diameter_m
+    size_m = points_m.amax(0) + _MARGIN * model.diameter_m - low_m
+    side_m = float(size_m.max()) / _BOXES
+    counts = (size_m / side_m).ceil().clamp(min=1).long()
+    middles = [(torch.arange(int(count)) + 0.5) * side_m for count in counts]
+    grid_m = torch.cartesian_prod(*middles).double() + low_m
+    nearest = torch.from_numpy(tree.query(grid_m.numpy(), workers=1)[1])
     return Surface(
         points_m=points_m,
         normals=normals,
@@ -154,7 +161,7 @@ def prepare_surface(model: ObjectModel, count: int = 10_000) -> Surface:
         diameter_m=model.diameter_m,
         copies=symmetry_transforms(model.symmetries, _TURN_STEP).double(),
         tree=tree,
-        boxes=_boxes_about(points_m, model.diameter_m, tree),
+        boxes=Boxes(low_m=low_m, side_m=side_m, counts=counts, nearest=nearest),
     )
 
 
@@ -323,14 +330,3 @@ def compare_depths(
     agrees = is_posed & is_read & ~through & ~before
     total = int(is_posed.sum())
     return int(agrees.sum()) / total, int(through.sum()) / total, int(before.sum()) / total
-
-
-def _boxes_about(points_m: Float64[Tensor, "m 3"], diameter_m: float, tree: KDTree) -> Boxes:
-    low_m = points_m.amin(0) - _MARGIN * diameter_m
-    size_m = points_m.amax(0) + _MARGIN * diameter_m - low_m
-    side_m = float(size_m.max()) / _BOXES
-    counts = (size_m / side_m).ceil().clamp(min=1).long()
-    middles = [(torch.arange(int(count)) + 0.5) * side_m for count in counts]
-    grid_m = torch.cartesian_prod(*middles).double() + low_m
-    nearest = torch.from_numpy(tree.query(grid_m.numpy(), workers=1)[1])
-    return Boxes(low_m=low_m, side_m=side_m, counts=counts, nearest=nearest)

@@ -13,7 +13,7 @@ from depthpose.core.units import METRES, Unit
 from depthpose.pose import mesh
 from depthpose.pose.cloud import object_points
 from depthpose.pose.config import EstimateConfig, ObjectsConfig
-from depthpose.pose.datasets.write import write_mask
+from depthpose.pose.datasets.dataset import write_mask
 from depthpose.pose.estimator import CloudDirections, GeoPoseNet, Registration
 from depthpose.pose.estimator.answer import with_status
 from depthpose.pose.estimator.base import answered

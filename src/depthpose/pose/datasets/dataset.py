@@ -1,29 +1,53 @@
-"""A data set of any known layout as samples."""
+"""A data set of any known layout as samples, its check before hours of work, and writing BOP's."""
 
 import hashlib
-from collections.abc import Sequence
+from collections import Counter
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from io import BytesIO
 from pathlib import Path
+from typing import Any
 
+import numpy as np
 import torch
-from jaxtyping import Bool
+from jaxtyping import Bool, Float
+from PIL import Image
 from torch import Tensor
 
+from depthpose.core.camera import project
 from depthpose.core.errors import InputError
-from depthpose.core.files import read_depth_png
-from depthpose.pose.cloud import cloud_from_depth, refuse_other_size
+from depthpose.core.files import (
+    image_size,
+    read_depth_png,
+    write_depth_png,
+    write_image,
+    write_json,
+)
+from depthpose.core.files.disk import write_bytes
+from depthpose.core.findings import CheckReport, Problem, make_report, unreadable
+from depthpose.core.rigid import Rigid
+from depthpose.pose.cloud import cloud_from_depth, refusal_of, refuse_other_size
 from depthpose.pose.config import CloudConfig, MeshConfig
 from depthpose.pose.datasets.layouts import (
     Instance,
     find_layout,
     layout_of,
+    model_path,
     models_folder,
     object_name,
     read_bop_models,
     read_models_info,
 )
-from depthpose.pose.datasets.masks import read_mask
+from depthpose.pose.datasets.masks import mask_box, read_mask
+from depthpose.pose.mesh import (
+    exact_diameter,
+    read_model,
+    sample_surface,
+    symmetries_from_bop,
+    symmetries_to_bop,
+    unit_advice,
+)
 from depthpose.pose.types import (
     CloudInput,
     CloudSample,
@@ -167,7 +191,12 @@ def open_bop(
     """
     folder = Path(folder)
     name, layout = layout_of(folder)
-    instances = list(layout.instances(folder, split))
+    instances, said = list(layout.instances(folder, split)), hashlib.sha256()
+    for one in instances:
+        pose = one.camera_from_model
+        said.update(f"{one.name} {one.object_id} {one.depth_unit_m}".encode())
+        numbers = torch.cat([one.K.flatten(), pose.R.flatten(), pose.t_m]).double().numpy()
+        said.update(numbers.tobytes())
     return BopDataset(
         folder=folder,
         split=split,
@@ -175,18 +204,8 @@ def open_bop(
         instances=instances,
         mesh_config=MeshConfig() if mesh is None else mesh,
         cloud_config=CloudConfig() if cloud is None else cloud,
-        sha256=_annotations_sha256(instances),
+        sha256=said.hexdigest(),
     )
-
-
-def _annotations_sha256(instances: Sequence[Instance]) -> str:
-    said = hashlib.sha256()
-    for one in instances:
-        pose = one.camera_from_model
-        said.update(f"{one.name} {one.object_id} {one.depth_unit_m}".encode())
-        numbers = torch.cat([one.K.flatten(), pose.R.flatten(), pose.t_m]).double().numpy()
-        said.update(numbers.tobytes())
-    return said.hexdigest()
 
 
 def is_bop(folder: str | Path) -> bool:
@@ -202,3 +221,301 @@ def read_instance_mask(instance: Instance) -> Bool[Tensor, "mask_h mask_w"]:
             "or give masks of your own"
         )
     return read_mask(instance.mask)
+
+
+_DIAMETER_SLACK = 0.01
+_FAR_DIAMETERS = 1.0
+_FEW_IN_MASK = 0.5
+
+Models = dict[int, ObjectModel]
+
+
+def check_bop(
+    folder: str | Path,
+    split: str | None = None,
+    *,
+    with_decoding: bool = True,
+    progress: Callable[[int, int], None] | None = None,
+) -> CheckReport:
+    """Check every file of a data set: are they there and whole, and do they agree?
+
+    Units are checked too: a cloud a thousand times smaller than its model, or a metre away from
+    its annotated pose, is reported.
+
+    Args:
+        folder: of the data set.
+        split: check only this one; None: all.
+        with_decoding: decode depth and masks and compare them with poses; else only headers.
+        progress: called with the number of instances done and of all.
+
+    Raises:
+        InputError: there is no such split.
+    """
+    folder = Path(folder)
+    name, layout = layout_of(folder)
+    known = layout.splits(folder)
+    if split is not None and split not in known:
+        raise InputError(f"{folder}: no split {split!r}. Here: {', '.join(known) or 'none'}.")
+    found: list[Problem] = []
+    instances: list[Instance] = []
+    for one in known if split is None else [split]:
+        try:
+            instances += open_bop(folder, one).instances
+        except InputError as error:
+            found.append(Problem(path=folder, kind="unreadable", message=str(error)))
+    models, more = _check_models(folder, {i.object_id for i in instances})
+    found += more
+    for done, instance in enumerate(instances, 1):
+        found += _check_instance(instance, models, with_decoding=with_decoding)
+        if progress is not None:
+            progress(done, len(instances))
+    counts = {
+        "images": len({(i.depth.parent, i.image_id) for i in instances}),
+        "instances": len(instances),
+        "masks": sum(i.mask is not None for i in instances),
+        "objects": len({i.object_id for i in instances}),
+        "models": len(models),
+    }
+    return make_report(name, counts, found)
+
+
+def _check_models(folder: Path, numbers: set[int]) -> tuple[Models, list[Problem]]:
+    try:
+        home = models_folder(folder)
+        infos = read_models_info(home)
+    except InputError as error:
+        return {}, [Problem(path=folder, kind="missing", message=str(error))]
+    models: Models = {}
+    found: list[Problem] = []
+    for number in sorted(numbers):
+        path = model_path(home, number)
+        if path is None:
+            message = f"has no mesh of object {number}, which is annotated"
+            found.append(Problem(path=home, kind="missing", message=message))
+            continue
+        try:
+            symmetries_from_bop(infos.get(number, {}), source=f"object {number}")
+            models[number] = read_model(path, "mm", number=number)
+        except InputError as error:
+            found.append(unreadable(path, error))
+            continue
+        declared_mm = infos.get(number, {}).get("diameter")
+        measured_mm = 1000 * exact_diameter(models[number].vertices_m)
+        if not isinstance(declared_mm, int | float):
+            message = "has no declared diameter; that of the mesh is taken"
+            found.append(Problem(path=path, kind="note", message=message))
+        elif abs(measured_mm - declared_mm) > _DIAMETER_SLACK * declared_mm:
+            message = f"is {measured_mm:.1f} mm across, but models_info says {declared_mm:.1f} mm"
+            found.append(Problem(path=path, kind="mismatch", message=message))
+    # Estimators know objects by name, and refuse two of one.
+    names = {n: object_name(n, infos.get(n, {})) for n in numbers}
+    for name, count in sorted(Counter(names.values()).items()):
+        if count > 1:
+            own = " and ".join(str(n) for n in sorted(names) if names[n] == name)
+            message = f"calls objects {own} {name!r}; rename all but one in models_info"
+            found.append(Problem(path=home, kind="mismatch", message=message))
+    return models, found
+
+
+def _check_instance(
+    instance: Instance, models: Models, *, with_decoding: bool
+) -> Iterator[Problem]:
+    if instance.mask is None:
+        message = f"has no mask_visib of annotation {instance.index}"
+        yield Problem(path=instance.depth, kind="note", message=message)
+    if not instance.is_measured:
+        message = f"annotation {instance.index} is itself fitted to this depth; quote no accuracy"
+        yield Problem(path=instance.depth, kind="note", message=message)
+    paths = [p for p in (instance.depth, instance.mask, instance.rgb) if p is not None]
+    try:
+        sizes = {path: image_size(path) for path in paths}
+    except InputError as error:
+        path = next((p for p in paths if str(p) in str(error)), instance.depth)
+        kind = "unreadable" if path.is_file() else "missing"
+        problem = unreadable(path, error)
+        yield Problem(path=path, kind=kind, message=problem.message)
+        return
+    width, height = sizes[instance.depth]
+    for path, size in sizes.items():
+        if size != (width, height):
+            message = f"is {size[0]}x{size[1]}, but its depth image is {width}x{height}"
+            yield Problem(path=path, kind="mismatch", message=message)
+            return
+    if with_decoding and instance.mask is not None and instance.object_id in models:
+        yield from _check_content(instance, models[instance.object_id])
+
+
+def _check_content(instance: Instance, model: ObjectModel) -> Iterator[Problem]:
+    try:
+        mask = read_instance_mask(instance)
+        depth_m = read_depth_png(instance.depth, instance.depth_unit_m)
+    except InputError as error:
+        path = instance.mask if str(instance.mask) in str(error) else instance.depth
+        assert path is not None
+        yield unreadable(path, error)
+        return
+    assert instance.mask is not None
+    cloud = cloud_from_depth(depth_m, mask, instance.K)
+    refusal = refusal_of(cloud)
+    if refusal is not None:
+        # Instances that are fully occluded are annotated too: no fault, but no test either.
+        yield Problem(path=instance.mask, kind="note", message=refusal)
+        return
+    advice = unit_advice(model.diameter_m, cloud[cloud[:, 2] < 3 * cloud[:, 2].median()])
+    centre_m = instance.camera_from_model.apply(model.vertices_m.double()).mean(0)
+    away_m = float((cloud.double().median(0).values - centre_m).norm())
+    if advice is not None and away_m > _FAR_DIAMETERS * model.diameter_m:
+        yield Problem(path=instance.depth, kind="mismatch", message=f"{instance.name}: {advice}")
+    elif away_m > _FAR_DIAMETERS * model.diameter_m:
+        message = (
+            f"{instance.name}: the cloud lies {away_m:.2f} m from the annotated pose; are "
+            "depth_scale and cam_t_m2c both for millimetres?"
+        )
+        yield Problem(path=instance.depth, kind="mismatch", message=message)
+    elif _share_in_mask(instance, model, mask) < _FEW_IN_MASK and not (
+        instance.visible_fraction is not None and instance.visible_fraction < _FEW_IN_MASK
+    ):
+        message = f"{instance.name}: the posed model does not lie on its mask; is it another's?"
+        yield Problem(path=instance.mask, kind="mismatch", message=message)
+
+
+def _share_in_mask(instance: Instance, model: ObjectModel, mask: Bool[Tensor, "h w"]) -> float:
+    """Share of the model's points whose pixel is in the mask, grown by a pixel or two."""
+    surface, _ = sample_surface(model, 500)
+    points = instance.camera_from_model.apply(surface.double())
+    pixels = project(points, instance.K).nan_to_num(-9).round().long()
+    height, width = mask.shape
+    grown = torch.nn.functional.max_pool2d(mask[None].float(), 5, 1, 2)[0] > 0
+    u, v = pixels[:, 0], pixels[:, 1]
+    is_inside = (u >= 0) & (v >= 0) & (u < width) & (v < height)
+    hit = grown[v.clamp(0, height - 1), u.clamp(0, width - 1)] & is_inside
+    return float(hit.double().mean())
+
+
+_DEPTH_UNIT_M = 0.0001
+"""Tenths of a millimetre reach 6.5 m and are finer than any sensor that is imitated."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class BopObject:
+    """One object of a frame.
+
+    Attributes:
+        number: its ``obj_id``.
+        camera_from_model: its pose.
+        visible: its pixels that nothing occludes.
+        silhouette: all its pixels in the image, occluded ones too.
+    """
+
+    number: int
+    camera_from_model: Rigid
+    visible: Bool[Tensor, "h w"]
+    silhouette: Bool[Tensor, "h w"]
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class BopFrame:
+    """One image of a scene.
+
+    Attributes:
+        number: its ``im_id``.
+        K: intrinsic matrix.
+        depth_m: NaN where there is no reading.
+        objects: what is annotated.
+        rgb: the picture, if there is one.
+    """
+
+    number: int
+    K: Float[Tensor, "3 3"]
+    depth_m: Float[Tensor, "h w"]
+    objects: Sequence[BopObject]
+    rgb: Float[Tensor, "3 h w"] | None = None
+
+
+def write_bop_scene(
+    folder: Path, split: str, scene_id: int, frames: Sequence[BopFrame]
+) -> Path:  # fmt: skip
+    """Write a scene whole: images and masks first, so that its JSON never names what is missing.
+
+    Returns:
+        The folder of the scene.
+
+    Raises:
+        InputError: the disk refuses.
+    """
+    scene = folder / split / f"{scene_id:06d}"
+    truths: dict[str, list[dict[str, Any]]] = {}
+    infos: dict[str, list[dict[str, Any]]] = {}
+    for frame in frames:
+        name = f"{frame.number:06d}"
+        own, more = list[dict[str, Any]](), list[dict[str, Any]]()
+        truths[str(frame.number)], infos[str(frame.number)] = own, more
+        write_depth_png(scene / "depth" / f"{name}.png", frame.depth_m, _DEPTH_UNIT_M)
+        if frame.rgb is not None:
+            write_image(scene / "rgb" / f"{name}.png", frame.rgb)
+        for index, shown in enumerate(frame.objects):
+            write_mask(scene / "mask_visib" / f"{name}_{index:06d}.png", shown.visible)
+            write_mask(scene / "mask" / f"{name}_{index:06d}.png", shown.silhouette)
+            pose, full = shown.camera_from_model, int(shown.silhouette.sum())
+            visible = int(shown.visible.sum())
+            own.append(
+                {
+                    "cam_R_m2c": pose.R.double().flatten().tolist(),
+                    "cam_t_m2c": (1000 * pose.t_m.double()).tolist(),
+                    "obj_id": shown.number,
+                }
+            )
+            more.append(
+                {
+                    "bbox_obj": mask_box(shown.silhouette),
+                    "bbox_visib": mask_box(shown.visible),
+                    "px_count_all": full,
+                    "px_count_valid": int((shown.silhouette & frame.depth_m.isfinite()).sum()),
+                    "px_count_visib": visible,
+                    "visib_fract": visible / full if full else 0.0,
+                }
+            )
+    scale_mm = 1000 * _DEPTH_UNIT_M
+    cameras = {
+        str(f.number): {"cam_K": f.K.flatten().tolist(), "depth_scale": scale_mm} for f in frames
+    }
+    write_json(scene / "scene_gt_info.json", infos)
+    write_json(scene / "scene_gt.json", truths)
+    write_json(scene / "scene_camera.json", cameras)
+    return scene
+
+
+def write_bop_models(folder: Path, models: Sequence[ObjectModel]) -> Path:
+    """Write ``models/obj_NNNNNN.ply`` in mm, and ``models_info.json`` with symmetries.
+
+    Returns:
+        The folder of models.
+
+    Raises:
+        InputError: the disk refuses.
+    """
+    import trimesh
+
+    home = folder / "models"
+    info: dict[str, Any] = {}
+    for model in models:
+        vertices = 1000 * model.vertices_m.double().numpy()
+        mesh = trimesh.Trimesh(vertices, model.faces.numpy(), process=False)
+        shape = mesh if len(model.faces) else trimesh.PointCloud(vertices)
+        data = shape.export(file_type="ply")
+        assert isinstance(data, bytes)
+        write_bytes(home / f"obj_{model.number:06d}.ply", data)
+        low, size = vertices.min(0), np.ptp(vertices, axis=0)
+        entry: dict[str, Any] = {"diameter": 1000 * model.diameter_m, "name": model.name}
+        entry |= {f"min_{axis}": float(low[i]) for i, axis in enumerate("xyz")}
+        entry |= {f"size_{axis}": float(size[i]) for i, axis in enumerate("xyz")}
+        info[str(model.number)] = entry | symmetries_to_bop(model.symmetries)
+    write_json(home / "models_info.json", info)
+    return home
+
+
+def write_mask(path: Path, mask: Bool[Tensor, "h w"]) -> None:
+    """Write a mask as an 8-bit PNG, 255 on the object."""
+    encoded = BytesIO()
+    Image.fromarray(mask.cpu().numpy().astype(np.uint8) * 255).save(encoded, "PNG")
+    write_bytes(path, encoded.getvalue())

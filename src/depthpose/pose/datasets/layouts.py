@@ -201,37 +201,31 @@ def bop_instances(scene: Path) -> Iterator[Instance]:
         if not isinstance(entries, list) or not isinstance(more, list):
             raise InputError(f"{source}: is no list of annotations")
         at_camera = f"{scene / 'scene_camera.json'}: image {int(key)}"
+        image = f"{int(key):06d}"
+        tiff = scene / "depth" / f"{image}.tif"  # of ITODD
+        pictures = (scene / folder / f"{image}{suffix}"
+                    for folder in _IMAGE_FOLDERS for suffix in LISTED_SUFFIXES)  # fmt: skip
+        rgb = next((path for path in pictures if path.is_file()), None)
         for index, entry in enumerate(entries):
             K, unit_m = camera_from_bop(cameras[key], at_camera)
             extra = more[index] if index < len(more) and isinstance(more[index], dict) else {}
-            yield _bop_instance(
-                scene, int(key), index, entry, extra, K, unit_m, f"{source}, annotation {index}"
+            mask = scene / "mask_visib" / f"{image}_{index:06d}.png"
+            here = f"{source}, annotation {index}"
+            visible = number(extra, "visib_fract", -1.0, here)
+            yield Instance(
+                scene_id=int(scene.name),
+                image_id=int(key),
+                index=index,
+                object_id=integer(entry, "obj_id", here),
+                K=K,
+                depth=tiff if tiff.is_file() else tiff.with_suffix(".png"),
+                depth_unit_m=unit_m,
+                mask=mask if mask.is_file() else None,
+                rgb=rgb,
+                camera_from_model=pose_from_bop(entry, here),
+                visible_fraction=visible if visible >= 0 else None,
+                is_measured=not str(extra.get("pose_source", "")).startswith("pseudo"),
             )
-
-
-def _bop_instance(
-    scene: Path, image: int, index: int, entry: object, extra: dict[str, Any],
-    K: Float64[Tensor, "3 3"], unit_m: float, source: str,
-) -> Instance:  # fmt: skip
-    mask = scene / "mask_visib" / f"{image:06d}_{index:06d}.png"
-    tiff = scene / "depth" / f"{image:06d}.tif"  # of ITODD
-    pictures = (scene / folder / f"{image:06d}{suffix}"
-                for folder in _IMAGE_FOLDERS for suffix in LISTED_SUFFIXES)  # fmt: skip
-    visible = number(extra, "visib_fract", -1.0, source)
-    return Instance(
-        scene_id=int(scene.name),
-        image_id=image,
-        index=index,
-        object_id=integer(entry, "obj_id", source),
-        K=K,
-        depth=tiff if tiff.is_file() else tiff.with_suffix(".png"),
-        depth_unit_m=unit_m,
-        mask=mask if mask.is_file() else None,
-        rgb=next((path for path in pictures if path.is_file()), None),
-        camera_from_model=pose_from_bop(entry, source),
-        visible_fraction=visible if visible >= 0 else None,
-        is_measured=not str(extra.get("pose_source", "")).startswith("pseudo"),
-    )
 
 
 @dataclass(frozen=True, kw_only=True, order=True)
@@ -311,34 +305,33 @@ def linemod_instances(folder: Path, split: str) -> Iterator[Instance]:
         for line in read_text(listed, _MAX_BYTES).split():
             if entry_number(line) is None:
                 raise InputError(f"{listed}: {line[:40]!r} is no number of an image")
-            yield _linemod_instance(scene, int(line), truths, infos)
-
-
-def _linemod_instance(
-    scene: Path, image: int, truths: dict[Any, Any], infos: dict[Any, Any]
-) -> Instance:
-    number = int(scene.name)
-    source = f"{scene / 'gt.yml'}: image {image}"
-    entries = truths.get(image)
-    if not isinstance(entries, list):
-        raise InputError(f"{source} has no annotation; is the list of another download?")
-    own = [e for e in entries if integer(e, "obj_id", source) == number]
-    if len(own) != 1:
-        raise InputError(f"{source} annotates object {number} {len(own)} times, where once belongs")
-    K, unit_m = camera_from_bop(infos.get(image), f"{scene / 'info.yml'}: image {image}")
-    mask, rgb = scene / "mask" / f"{image:04d}.png", scene / "rgb" / f"{image:04d}.png"
-    return Instance(
-        scene_id=number,
-        image_id=image,
-        index=entries.index(own[0]),
-        object_id=number,
-        K=K,
-        depth=scene / "depth" / f"{image:04d}.png",
-        depth_unit_m=unit_m,
-        mask=mask if mask.is_file() else None,
-        rgb=rgb if rgb.is_file() else None,
-        camera_from_model=pose_from_bop(own[0], source),
-    )
+            image, number = int(line), int(scene.name)
+            source = f"{scene / 'gt.yml'}: image {image}"
+            entries = truths.get(image)
+            if not isinstance(entries, list):
+                raise InputError(f"{source} has no annotation; is the list of another download?")
+            own = [e for e in entries if integer(e, "obj_id", source) == number]
+            if len(own) != 1:
+                raise InputError(
+                    f"{source} annotates object {number} {len(own)} times, where once belongs"
+                )
+            at_camera = f"{scene / 'info.yml'}: image {image}"
+            K, unit_m = camera_from_bop(infos.get(image), at_camera)
+            depth, mask, rgb = (
+                scene / name / f"{image:04d}.png" for name in ("depth", "mask", "rgb")
+            )
+            yield Instance(
+                scene_id=number,
+                image_id=image,
+                index=entries.index(own[0]),
+                object_id=number,
+                K=K,
+                depth=depth,
+                depth_unit_m=unit_m,
+                mask=mask if mask.is_file() else None,
+                rgb=rgb if rgb.is_file() else None,
+                camera_from_model=pose_from_bop(own[0], source),
+            )
 
 
 def segnet_mask(folder: Path, instance: Instance) -> Path:

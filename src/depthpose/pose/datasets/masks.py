@@ -43,7 +43,14 @@ def read_labels(path: Path) -> Int64[Tensor, "mask_h mask_w"]:
         InputError: it is missing, no picture, a JPEG of numbered objects, or no list of one mask.
     """
     if path.suffix.lower() == ".json":
-        return _read_json_mask(path).long()
+        content = read_json(path)
+        entries = content if isinstance(content, list) else [content]
+        if len(entries) != 1:
+            raise InputError(
+                f"{path}: holds {len(entries)} masks, where one is needed; leave one there, or "
+                "name a list of BOP detections by --masks, beside --bop"
+            )
+        return mask_from_rle(entries[0], str(path)).long()
     with opened_image(path) as image:
         if image.mode in ("LA", "PA", "RGBA", "RGBa", "La") or "transparency" in image.info:
             pixels = np.asarray(image.convert("RGBA"))
@@ -111,18 +118,6 @@ def one_mask(labels: Int64[Tensor, "h w"], name: str) -> Bool[Tensor, "h w"]:
             "(mask == 1), or take each as an instance (estimate_instances, pose predict)"
         )
     return labels != 0
-
-
-def _read_json_mask(path: Path) -> Bool[Tensor, "h w"]:
-    content = read_json(path)
-    entries = content if isinstance(content, list) else [content]
-    if len(entries) != 1:
-        raise InputError(
-            f"{path}: holds {len(entries)} masks, where one is needed; leave one there, or name a "
-            "list of BOP detections by --masks, beside --bop"
-        )
-    (entry,) = entries
-    return mask_from_rle(entry, str(path))
 
 
 def mask_from_rle(entry: object, source: str) -> Bool[Tensor, "h w"]:
@@ -229,7 +224,21 @@ def read_detections(path: str | Path) -> list[Detection]:
         InputError: it is missing or damaged, or an entry has no mask.
     """
     path = Path(path)
-    return [_read(row, f"{path}: entry {i}") for i, row in enumerate(read_rows(path))]
+    found: list[Detection] = []
+    for place, row in enumerate(read_rows(path)):
+        source = f"{path}: entry {place}"
+        seconds = number(row, "time", -1.0, source)
+        found.append(
+            Detection(
+                scene_id=integer(row, "scene_id", source),
+                image_id=integer(row, "image_id", source),
+                object_id=integer(row, "category_id", source),
+                score=number(row, "score", None, source),
+                segmentation=read_runs(row.get("segmentation"), source),
+                seconds=seconds if seconds >= 0 else None,
+            )
+        )
+    return found
 
 
 def write_detections(path: str | Path, detections: Sequence[Detection]) -> None:
@@ -238,7 +247,14 @@ def write_detections(path: str | Path, detections: Sequence[Detection]) -> None:
     Raises:
         InputError: the disk refuses.
     """
-    write_json(Path(path), [_row(detection) for detection in detections])
+    rows: list[dict[str, Any]] = []
+    for one in detections:
+        counts, height, width = one.segmentation
+        row = {"scene_id": one.scene_id, "image_id": one.image_id, "category_id": one.object_id}
+        row |= {"score": one.score, "bbox": mask_box(one.mask)}
+        row["segmentation"] = {"size": [height, width], "counts": list(counts)}
+        rows.append(row | {"time": -1.0 if one.seconds is None else one.seconds})
+    write_json(Path(path), rows)
 
 
 def mask_box(mask: Bool[Tensor, "h w"]) -> list[int]:
@@ -248,28 +264,3 @@ def mask_box(mask: Bool[Tensor, "h w"]) -> list[int]:
         return [-1] * 4
     left, top = int(columns.min()), int(rows.min())
     return [left, top, int(columns.max()) - left + 1, int(rows.max()) - top + 1]
-
-
-def _row(detection: Detection) -> dict[str, Any]:
-    counts, height, width = detection.segmentation
-    return {
-        "scene_id": detection.scene_id,
-        "image_id": detection.image_id,
-        "category_id": detection.object_id,
-        "score": detection.score,
-        "bbox": mask_box(detection.mask),
-        "segmentation": {"size": [height, width], "counts": list(counts)},
-        "time": -1.0 if detection.seconds is None else detection.seconds,
-    }
-
-
-def _read(row: dict[str, Any], source: str) -> Detection:
-    seconds = number(row, "time", -1.0, source)
-    return Detection(
-        scene_id=integer(row, "scene_id", source),
-        image_id=integer(row, "image_id", source),
-        object_id=integer(row, "category_id", source),
-        score=number(row, "score", None, source),
-        segmentation=read_runs(row.get("segmentation"), source),
-        seconds=seconds if seconds >= 0 else None,
-    )

@@ -18,8 +18,7 @@ from depthpose.pose.estimator.candidates import (
     share_out,
     without_motions,
 )
-from depthpose.pose.estimator.fit import SHOWN, fit_of, seen_about
-from depthpose.pose.estimator.identity import identity_of
+from depthpose.pose.estimator.fit import SHOWN, fit_of, identity_of, seen_about
 from depthpose.pose.estimator.inputs import ObjectCloud, Refusal
 from depthpose.pose.refine import RefinedPose
 from depthpose.pose.surface import Surface

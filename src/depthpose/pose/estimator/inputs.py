@@ -78,7 +78,9 @@ def view_input(
     unit: Unit | None = None,
 ) -> ViewInput:
     """Take a depth image, a mask and a camera to a view in metres."""
-    values = _values(depth, name)
+    values = read_stored_depth(depth) if isinstance(depth, str | Path) else _tensor(depth)
+    if values.ndim != 2:
+        raise InputError(f"{name}: the depth is of shape {tuple(values.shape)}, not (h, w)")
     height, width = values.shape
     is_said = isinstance(camera, str | Path | Mapping | float | int)
     known = camera_of(camera, (width, height)) if is_said else camera
@@ -93,7 +95,18 @@ def view_input(
             f"{name}: the mask is of shape {tuple(pixels.shape)}, but the depth image of "
             f"{(height, width)}; give the mask of this very image"
         )
-    K = _intrinsics(known, width, height, name)
+    if isinstance(known, Camera):
+        check_image_matches_camera(known, width, height, name)
+    K = known.K if isinstance(known, Camera) else intrinsics_of(known)
+    try:
+        # A crop may leave the centre; its camera says the size, which was compared above.
+        refuse = refuse_outside if isinstance(known, Camera) else refuse_other_resolution
+        refuse(K, width, height)
+    except InputError as error:
+        raise InputError(
+            f"{name}: K is of another image or size: {error}. Resizing an image by s makes fx, fy, "
+            "cx and cy s times as large"
+        ) from error
     return ViewInput(name=name, depth_m=depth_m, mask=pixels, K=K, object=object)
 
 
@@ -154,14 +167,6 @@ def labels_input(mask: AnyMask, name: str) -> Int64[Tensor, "_ _"]:
     return number_objects(whole.numpy()) if whole.ndim == 2 else whole
 
 
-def _values(depth: AnyArray, name: str) -> Shaped[Tensor, "h w"]:
-    """Read depth as it is stored: whole numbers of a PNG, or floats."""
-    values = read_stored_depth(depth) if isinstance(depth, str | Path) else _tensor(depth)
-    if values.ndim != 2:
-        raise InputError(f"{name}: the depth is of shape {tuple(values.shape)}, not (h, w)")
-    return values
-
-
 def _metres(
     values: Shaped[Tensor, "h w"], said_m: float | None, unit: Unit | None, name: str
 ) -> Float[Tensor, "h w"]:
@@ -181,24 +186,6 @@ def _metres(
             "KITTI), unit mm, or metres as floats"
         )
     return torch.where(values > 0, values.double() * unit_m, torch.nan).float()
-
-
-def _intrinsics(camera: AnyLens | None, width: int, height: int, name: str) -> Float[Tensor, "3 3"]:
-    is_bare = not isinstance(camera, Camera)
-    if isinstance(camera, Camera):
-        check_image_matches_camera(camera, width, height, name)
-        K = camera.K
-    else:
-        K = intrinsics_of(camera)
-    try:
-        # A crop may leave the centre; its camera says the size, which was compared above.
-        (refuse_other_resolution if is_bare else refuse_outside)(K, width, height)
-    except InputError as error:
-        raise InputError(
-            f"{name}: K is of another image or size: {error}. Resizing an image by s makes fx, fy, "
-            "cx and cy s times as large"
-        ) from error
-    return K
 
 
 def _tensor(values: Any) -> Tensor:  # noqa: ANN401  whatever a caller has
@@ -258,41 +245,26 @@ def prepare_cloud(
     given: AnyInput, model: ObjectModel, cloud: CloudConfig, config: EstimateConfig
 ) -> ObjectCloud | Refusal:
     """Lift, thin, drop flying pixels, check, sample and put on the grid of the network."""
-    points_m = _points_of(given, config.max_cloud_points)
-    if isinstance(points_m, Refusal):
-        return points_m
-    if (few := refusal_of(points_m, cloud)) is not None:
-        return Refusal(status="too few points", reason=few)
+    if isinstance(given, ViewInput):
+        points_m = cloud_from_depth(given.depth_m, given.mask, given.K).float()
+        nothing = nothing_seen(given) if len(points_m) == 0 else ""
+    else:
+        points_m = given.points_m.float()
+        is_zero = bool((points_m == 0).all(-1).any())
+        nothing = "the cloud has no point with finite coordinates"
+        nothing = "the cloud is (0, 0, 0), no reading, in every point" if is_zero else nothing
+        nothing = "the cloud is empty" if len(points_m) == 0 else nothing
+    points_m = take_evenly(points_m[is_reading(points_m)], config.max_cloud_points)
+    if len(points_m) == 0:
+        return Refusal(status="too few points", reason=nothing)
     kept_m = points_m[~is_flying(points_m, cloud.max_offset_diameters * model.diameter_m)]
-    refusal = (
-        _place_refusal(given, points_m, kept_m, model)
-        or _size_refusal(given, points_m, kept_m, model)
-        or _shape_refusal(given, kept_m, model, cloud)
-    )
-    if refusal is not None:
+    if (refusal := _refusal_of(given, points_m, kept_m, model, cloud)) is not None:
         return refusal
     generator = torch.Generator().manual_seed(config.voting.seed)
     sampled_m = sample_points(kept_m, cloud.max_points, generator)
     voxels = voxelise(sampled_m, cloud)
     view = given if isinstance(given, ViewInput) else given.view
     return ObjectCloud(cloud_m=kept_m, points_m=sampled_m[voxels.kept], voxels=voxels, view=view)
-
-
-def _points_of(given: AnyInput, most: int) -> Float[Tensor, "n 3"] | Refusal:
-    if isinstance(given, ViewInput):
-        points_m = cloud_from_depth(given.depth_m, given.mask, given.K).float()
-        if len(points_m) == 0:
-            return Refusal(status="too few points", reason=nothing_seen(given))
-    else:
-        points_m = given.points_m.float()
-    read_m = take_evenly(points_m[is_reading(points_m)], most)
-    if len(read_m) == 0:
-        is_zero = bool((points_m == 0).all(-1).any())
-        finite = "is (0, 0, 0), no reading, in every point"
-        what = finite if is_zero else "has no point with finite coordinates"
-        what = "is empty" if len(points_m) == 0 else what
-        return Refusal(status="too few points", reason=f"the cloud {what}")
-    return read_m
 
 
 def nothing_seen(view: ViewInput) -> str:
@@ -305,71 +277,38 @@ def nothing_seen(view: ViewInput) -> str:
     return f"none of the {masked} masked pixels has a depth reading"
 
 
-def _place_refusal(
+def _refusal_of(
     given: AnyInput,
     points_m: Float[Tensor, "n 3"],
     kept_m: Float[Tensor, "m 3"],
     model: ObjectModel,
+    cloud: CloudConfig,
 ) -> Refusal | None:
-    """Refuse what is not before the camera; a cloud about the origin is in no other axes."""
-    is_centred = isinstance(given, CloudInput) and _is_centred(points_m, model)
-    if is_centred and unit_advice(model.diameter_m, _sized(points_m, kept_m)) is None:
-        return Refusal(
-            status="unusable input",
-            reason="the cloud lies about the origin, where the camera is: it was centred, or is in "
-            "the frame of the model; give it in the camera's frame, as it was seen",
-        )
-    turned = frame_advice(points_m)
-    return None if turned is None else Refusal(status="unusable input", reason=turned)
-
-
-def _sized(points_m: Float[Tensor, "n 3"], kept_m: Float[Tensor, "m 3"]) -> Float[Tensor, "k 3"]:
-    """Give the points whose size is the object's: without flying pixels, if those are few."""
-    return kept_m if len(kept_m) > _MOST * len(points_m) else points_m
-
-
-def _size_refusal(
-    given: AnyInput,
-    points_m: Float[Tensor, "n 3"],
-    kept_m: Float[Tensor, "m 3"],
-    model: ObjectModel,
-) -> Refusal | None:
-    """Refuse what is not of this object's size; some background in the mask is none of that."""
-    some_m = _sized(points_m, kept_m)
-    advice = unit_advice(model.diameter_m, some_m)
-    if advice is None or (some_m is kept_m and "larger than the model" in advice):
-        return None
-    hint = _view_hint(given) if isinstance(given, ViewInput) else ""
-    reason = f"{advice} (the object is {model.diameter_m:.3g} m long{hint})"
-    return Refusal(status="unusable input", reason=reason)
-
-
-def _is_centred(points_m: Float[Tensor, "n 3"], model: ObjectModel) -> bool:
-    """Whether a cloud lies about the origin; one that was seen is wholly before the camera."""
-    is_near = float(points_m.median(0).values.norm()) < model.diameter_m / 2
+    """Refuse a cloud by its place, its size and its shape; ``kept_m`` has no flying pixels."""
+    if (few := refusal_of(points_m, cloud)) is not None:
+        return Refusal(status="too few points", reason=few)
+    # Of the object's size is what is left without flying pixels, if those are few.
+    sized_m = kept_m if len(kept_m) > _MOST * len(points_m) else points_m
+    advice = unit_advice(model.diameter_m, sized_m)
+    # What was seen is wholly before the camera; a cloud about the origin is in no other axes.
+    is_about_origin = float(points_m.median(0).values.norm()) < model.diameter_m / 2
     least_m = float(take_evenly(points_m[:, 2], 10_000).quantile(0.05))
-    return is_near and least_m < _BEFORE * model.diameter_m
-
-
-def _view_hint(view: ViewInput) -> str:
-    """Say what else than the object changes the size of a cloud from a depth image."""
-    edge = torch.cat([view.mask[0], view.mask[-1], view.mask[:, 0], view.mask[:, -1]])
-    if float(view.mask.float().mean()) > _MOST and float(edge.float().mean()) > _MOST:
-        share = float(view.mask.float().mean())
-        return f"; the mask covers {share:.0%} of the image and its border: is it inverted?"
-    return (
-        "; a mask of more than it, or a K of another image size, changes the size of its cloud "
-        "too, and so does another depth unit: 0.001 m of most sensors, 0.0002 m of TUM RGB-D, "
-        "1/256 m of KITTI"
-    )
-
-
-def _shape_refusal(
-    given: AnyInput, points_m: Float[Tensor, "n 3"], model: ObjectModel, cloud: CloudConfig
-) -> Refusal | None:
-    if (reason := refusal_of(points_m, cloud)) is not None:
-        return Refusal(status="too few points", reason=reason)
-    centred = points_m.double() - points_m.double().mean(0)
+    is_centred = is_about_origin and least_m < _BEFORE * model.diameter_m
+    unusable = frame_advice(points_m)
+    if isinstance(given, CloudInput) and is_centred and advice is None:
+        unusable = (
+            "the cloud lies about the origin, where the camera is: it was centred, or is in "
+            "the frame of the model; give it in the camera's frame, as it was seen"
+        )
+    # Some background in the mask is not of another size.
+    elif not unusable and advice and not (sized_m is kept_m and "larger than the model" in advice):
+        hint = _view_hint(given) if isinstance(given, ViewInput) else ""
+        unusable = f"{advice} (the object is {model.diameter_m:.3g} m long{hint})"
+    if unusable is not None:
+        return Refusal(status="unusable input", reason=unusable)
+    if (few := refusal_of(kept_m, cloud)) is not None:
+        return Refusal(status="too few points", reason=few)
+    centred = kept_m.double() - kept_m.double().mean(0)
     extent_m = torch.linalg.eigvalsh(centred.T @ centred / len(centred)).clamp(min=0).sqrt()
     flat = int((extent_m < _THIN * model.diameter_m).sum())
     if flat == 0:
@@ -381,4 +320,17 @@ def _shape_refusal(
         reason=f"the points lie {shape}, so that motions along it change nothing that is seen; "
         "look from a side that shows more of the object"
         f"{', or give the mask of this image: this one may lie on the background' * beside}",
+    )
+
+
+def _view_hint(view: ViewInput) -> str:
+    """Say what else than the object changes the size of a cloud from a depth image."""
+    edge = torch.cat([view.mask[0], view.mask[-1], view.mask[:, 0], view.mask[:, -1]])
+    share = float(view.mask.float().mean())
+    if share > _MOST and float(edge.float().mean()) > _MOST:
+        return f"; the mask covers {share:.0%} of the image and its border: is it inverted?"
+    return (
+        "; a mask of more than it, or a K of another image size, changes the size of its cloud "
+        "too, and so does another depth unit: 0.001 m of most sensors, 0.0002 m of TUM RGB-D, "
+        "1/256 m of KITTI"
     )

@@ -1,7 +1,7 @@
 """GeoPoseNet: clouds and depth images of known objects to poses, by a network's directions.
 
 Several clouds go through the network at once; the directions of each vote for keypoints, to which
-the pose is fitted, refined by ICP, and checked.
+the pose is fitted, refined by ICP, and checked. A baseline regresses the pose from the depth image.
 """
 
 import time
@@ -18,7 +18,8 @@ from depthpose.core.checkpoint import find_weights, warn_of_terms
 from depthpose.core.devices import each_in_threads, own_arithmetic, usable_device
 from depthpose.core.errors import InputError
 from depthpose.core.rigid import Rigid
-from depthpose.pose.baselines import DepthImageNet
+from depthpose.pose.baselines import DepthCrop, DepthImageNet, cut_depth, poses_of
+from depthpose.pose.cloud import cloud_from_depth, refusal_of
 from depthpose.pose.config import EstimateConfig, RefusalConfig, VotingConfig
 from depthpose.pose.estimator.answer import (
     Clock,
@@ -39,8 +40,16 @@ from depthpose.pose.estimator.inputs import AnyInput, ObjectCloud, Refusal, prep
 from depthpose.pose.estimator.inputs import CloudDirections as CloudDirections
 from depthpose.pose.estimator.register import Registration
 from depthpose.pose.refine import refine_best
-from depthpose.pose.surface import Surface
-from depthpose.pose.types import ObjectModel, PoseEstimate, PoseFit, SeenPoints, Status, Vote
+from depthpose.pose.surface import Surface, prepare_surface
+from depthpose.pose.types import (
+    ObjectModel,
+    PoseEstimate,
+    PoseFit,
+    SeenPoints,
+    Status,
+    ViewInput,
+    Vote,
+)
 from depthpose.pose.voting import consistent_keypoints, fit_pose, meet_lines, vote_ransac
 from depthpose.pose.weights import PoseWeights, read_pose_weights
 
@@ -68,10 +77,21 @@ def pose_from_directions(
     if isinstance(fits, Refusal):
         return withheld(model.name, fits, clock)
     clock.note("svd")
-    candidates = _refine(voted, fits, surface, copies, refusal, config, is_likely)
-    if isinstance(candidates, Refusal):
-        clock.note("icp")
-        return withheld(model.name, candidates, clock)
+    cloud_m = voted.cloud.cloud_m
+    pose, icp = fits.camera_from_model, None
+    first = Candidate(pose[0].double(), fits.covariance[0], float(fits.residual_m[0]))
+    others = pose[[]].double()
+    if config.with_icp:
+        best = refine_best(cloud_m.double(), pose, surface, config.icp)
+        if float(best.refined.inlier_share) > 0:
+            first, others, icp = candidate_of(best.refined), best.others, config.icp
+    if not is_likely:
+        seen = seen_about(cloud_m, voted.cloud.view, surface.diameter_m)
+        misfit = misfit_of(fit_of(seen, first.pose, surface), refusal)
+        if misfit is not None:
+            clock.note("icp")
+            return withheld(model.name, misfit, clock)
+    candidates = find_candidates(cloud_m, first, others, copies, surface, icp)
     poses = Rigid.stack([one.pose for one in candidates])
     evidence = evidence_of(voted, poses, model, copies, surface)
     if config.with_icp:
@@ -118,48 +138,6 @@ def _fits(vote: Vote, model: ObjectModel, config: EstimateConfig) -> PoseFit | R
         vote.covariance_m2.expand(count, -1, -1, -1),
         model.keypoints_m,
         torch.stack(choices),
-    )
-
-
-def _refine(
-    voted: CloudDirections,
-    fits: PoseFit,
-    surface: Surface,
-    copies: PoseAmbiguities,
-    refusal: RefusalConfig,
-    config: EstimateConfig,
-    is_likely: bool,
-) -> list[Candidate] | Refusal:
-    cloud_m = voted.cloud.cloud_m
-    fit, refined = _row(fits, 0), None
-    others = _none_of(fit.camera_from_model)
-    if config.with_icp:
-        best = refine_best(cloud_m.double(), fits.camera_from_model, surface, config.icp)
-        if float(best.refined.inlier_share) > 0:
-            fit, refined = _row(fits, best.start), best.refined
-            others = best.others
-    first = candidate_of(fit if refined is None else refined)
-    icp = None if refined is None else config.icp
-    if not is_likely:
-        seen = seen_about(cloud_m, voted.cloud.view, surface.diameter_m)
-        refused = misfit_of(fit_of(seen, first.pose, surface), refusal)
-        if refused is not None:
-            return refused
-    return find_candidates(cloud_m, first, others, copies, surface, icp)
-
-
-def _none_of(pose: Rigid) -> Rigid:
-    return Rigid(pose.R.double().new_zeros(0, 3, 3), pose.t_m.double().new_zeros(0, 3))
-
-
-def _row(fits: PoseFit, number: int) -> PoseFit:
-    pose = fits.camera_from_model
-    return PoseFit(
-        camera_from_model=pose[number],
-        covariance=fits.covariance[number],
-        residual_m=fits.residual_m[number],
-        misfit=fits.misfit[number],
-        is_used=fits.is_used[number],
     )
 
 
@@ -265,17 +243,14 @@ class GeoPoseNet(PoseEstimator):
         network's sums. Only what is likely is registered, where the config wants it.
         """
         for given, found, _ in self._with_votes(inputs, threads, is_likely=is_likely):
-            is_doubted = is_likely and found.status in _DOUBTED
-            yield self._registered(given, found) if self._registration and is_doubted else found
-
-    def _registered(self, given: AnyInput, doubted: PoseEstimate) -> PoseEstimate:
-        """Answer by the model alone, else as the network did."""
-        assert self._registration is not None
-        start = time.perf_counter()
-        (found,) = self._registration.estimate_many([given])
-        spent_s = time.perf_counter() - start
-        best = found if found.is_posed else doubted
-        return replace(best, seconds={**doubted.seconds, "registration": spent_s})
+            if self._registration is None or not is_likely or found.status not in _DOUBTED:
+                yield found
+                continue
+            start = time.perf_counter()
+            (registered,) = self._registration.estimate_many([given])
+            spent_s = time.perf_counter() - start
+            best = registered if registered.is_posed else found
+            yield replace(best, seconds={**found.seconds, "registration": spent_s})
 
     @torch.no_grad()
     @own_arithmetic()
@@ -314,13 +289,13 @@ class GeoPoseNet(PoseEstimator):
             prepared = refused(given, prepared, seconds)
         return _Cloud(given=given, prepared=prepared, seconds=seconds)
 
-    def _ask(self, clouds: list["_Cloud"]) -> Iterator["_Cloud"]:
-        """Ask the network for clouds together; each has a share of the time."""
-        ready = [(one, one.prepared) for one in clouds if isinstance(one.prepared, ObjectCloud)]
+    def _ask(self, group: list["_Cloud"]) -> Iterator["_Cloud"]:
+        """Ask the network for the directions of clouds together; each has a share of the time."""
+        ready = [(one, one.prepared) for one in group if isinstance(one.prepared, ObjectCloud)]
         numbers = [self._number(one.given.object) for one, _ in ready]
         outputs, spent_s = self._directions([p for _, p in ready], numbers) if ready else ([], 0.0)
         total, left = sum(map(len, outputs)), iter(outputs)
-        for one in clouds:
+        for one in group:
             if isinstance(one.prepared, ObjectCloud):
                 own = next(left)
                 seconds = {**one.seconds, "network": spent_s * len(own) / total}
@@ -359,10 +334,10 @@ class GeoPoseNet(PoseEstimator):
             number = self._number(given.object)
             return pose_from_directions(
                 voted,
-                self.weights.models[number],
+                self.models[number],
                 self._surface(number),
                 self._copies_of(number),
-                self.weights.refusal,
+                self.refusal,
                 self.config,
                 is_likely=is_likely,
             )
@@ -380,3 +355,107 @@ class _Cloud:
     prepared: ObjectCloud | PoseEstimate
     seconds: dict[str, float]
     outputs: Float[Tensor, "n k 3"] | None = None
+
+
+class DepthImageRegressor:
+    """The baseline as an estimator. It refuses nothing but views with too little of the object.
+
+    Args:
+        weights: of kind ``depth-image``.
+        config: whether ICP follows, and the device; the rest is of voting.
+
+    Raises:
+        InputError: the weights are of another kind, or ``register_refused`` is set.
+    """
+
+    def __init__(self, weights: PoseWeights, config: EstimateConfig | None = None) -> None:
+        if not isinstance(weights.network, DepthImageNet):
+            raise InputError(
+                "these weights cast votes and regress no depth image; load them as GeoPoseNet"
+            )
+        self.config = EstimateConfig() if config is None else config
+        if self.config.register_refused:
+            raise InputError(
+                "a regressed depth image refuses nothing that could be registered; omit "
+                "--register-refused (register_refused=True)"
+            )
+        self.weights = weights
+        self._network = weights.network.to(usable_device(self.config.device)).eval()
+        self._numbers = {model.name: k for k, model in enumerate(weights.models)}
+        self._surfaces: dict[int, Surface] = {}
+
+    @classmethod
+    @own_arithmetic()
+    def load(
+        cls, weights: str | Path, config: EstimateConfig | None = None
+    ) -> "DepthImageRegressor":
+        """Build an estimator from weights, by file or by name.
+
+        Raises:
+            InputError: no such weights, or of another kind.
+        """
+        found = read_pose_weights(find_weights(weights))
+        warn_of_terms(found.facts)
+        return cls(found, config)
+
+    @property
+    def objects(self) -> tuple[str, ...]:
+        """Names of the objects that the weights know."""
+        return tuple(self._numbers)
+
+    @torch.no_grad()
+    @own_arithmetic()
+    def estimate_many(self, inputs: Sequence[ViewInput]) -> list[PoseEstimate]:
+        """Estimate one after the other.
+
+        Raises:
+            InputError: an object that the weights do not know.
+        """
+        return [self._estimate(given) for given in inputs]
+
+    def _estimate(self, given: ViewInput) -> PoseEstimate:
+        if given.object not in self._numbers:
+            raise InputError(
+                f"object {given.object!r}: the weights do not know it; they know "
+                f"{', '.join(self.objects)}"
+            )
+        number = self._numbers[given.object]
+        model, clock = self.weights.models[number], Clock()
+        assert isinstance(self._network, DepthImageNet)
+        config = self._network.config
+        crop = cut_depth(given, config, model.diameter_m)
+        if crop is None:
+            reason = f"fewer than {config.min_points} masked pixels have a depth"
+            return refused(given, Refusal(status="too few points", reason=reason), {})
+        batch = DepthCrop(*(part[None].to(self.config.device) for part in crop))
+        numbers = torch.tensor([number], device=self.config.device)
+        poses = poses_of(self._network(batch.image, numbers), batch)
+        found = PoseEstimate(
+            name=given.name,
+            object=given.object,
+            status="ok",
+            camera_from_model=Rigid(poses.R[0].cpu().float(), poses.t_m[0].cpu().float()),
+            seconds=clock.seconds,
+        )
+        clock.note("network")
+        if not self.config.with_icp:
+            return found
+        if number not in self._surfaces:
+            self._surfaces[number] = prepare_surface(model, self.config.icp.surface_points)
+        points_m = cloud_from_depth(
+            given.depth_m, given.mask, given.K, model.diameter_m, self.weights.cloud
+        ).float()
+        if (few := refusal_of(points_m, self.weights.cloud)) is not None:
+            return replace(found, status="too few points", reason=few, camera_from_model=None)
+        pose, surface = found.camera_from_model, self._surfaces[number]
+        assert pose is not None
+        refined = refine_best(points_m, pose, surface, self.config.icp).refined
+        clock.note("icp")
+        if float(refined.inlier_share) == 0:  # nothing near the surface: ICP had no say
+            return found
+        return replace(
+            found,
+            camera_from_model=refined.camera_from_model,
+            covariance=refined.covariance,
+            residual_m=float(refined.residual_m),
+        )

@@ -17,10 +17,10 @@ from depthpose.pose.cloud import cloud_from_depth
 from depthpose.pose.config import IcpConfig, RefusalConfig
 from depthpose.pose.estimator.candidates import observability, surface_signals, without_motions
 from depthpose.pose.estimator.inputs import AnyInput, Refusal
-from depthpose.pose.refine import RefinedPose, refine_best
+from depthpose.pose.refine import refine_best
 from depthpose.pose.regions import is_on_plane, largest_plane
 from depthpose.pose.surface import NEAR, Surface, compare_depths
-from depthpose.pose.types import Alternative, CloudInput, ObjectModel, PoseEstimate, ViewInput
+from depthpose.pose.types import CloudInput, ObjectModel, PoseEstimate, ViewInput
 from depthpose.pose.voting import free_motions
 
 MARGIN = 0.15
@@ -50,30 +50,24 @@ def scene_about(given: AnyInput, poses: Rigid, surface: Surface) -> Float64[Tens
     radius_m = (0.5 + 2 * MARGIN) * surface.diameter_m
     radius_m += float((middles_m - middle_m).norm(dim=-1).max())
     if isinstance(given, ViewInput):
-        window = _window(given, middle_m, radius_m)
-        points_m = cloud_from_depth(window.depth_m, window.mask, window.K).double()
+        # The square about a ball, cut out of the view.
+        z_m, K = float(middle_m[2]), given.K.double().clone()
+        near_m = max(z_m - radius_m, 0.1 * z_m)
+        u, v = (K @ (middle_m / z_m))[:2].tolist()
+        across, down = (float(K[k, k]) * radius_m / near_m for k in range(2))
+        height, width = given.depth_m.shape
+        left, right = (min(max(round(u + s * across), 0), width) for s in (-1, 1))
+        top, bottom = (min(max(round(v + s * down), 0), height) for s in (-1, 1))
+        part = (slice(top, bottom), slice(left, right))
+        K[0, 2] -= left
+        K[1, 2] -= top
+        points_m = cloud_from_depth(given.depth_m[part], given.mask[part], K).double()
         return take_evenly(points_m, _MOST_POINTS)
     points_m = given.points_m.double()
     points_m = points_m[points_m.isfinite().all(-1) & (points_m[:, 2] > 0)]
     offset = points_m[:, :2] / points_m[:, 2:] - middle_m[:2] / middle_m[2]
     near = offset.abs().amax(-1) < radius_m / (middle_m[2] - radius_m).clamp(min=0.1 * middle_m[2])
     return take_evenly(points_m[near], _MOST_POINTS)
-
-
-def _window(view: ViewInput, middle_m: Float64[Tensor, "3"], radius_m: float) -> ViewInput:
-    """Cut the square about a ball out of a view."""
-    z_m = float(middle_m[2])
-    K, near_m = view.K.double(), max(z_m - radius_m, 0.1 * z_m)
-    u, v = (K @ (middle_m / z_m))[:2].tolist()
-    reach = [float(K[k, k]) * radius_m / near_m for k in range(2)]
-    height, width = view.depth_m.shape
-    left, right = (min(max(round(u + s * reach[0]), 0), width) for s in (-1, 1))
-    top, bottom = (min(max(round(v + s * reach[1]), 0), height) for s in (-1, 1))
-    part = (slice(top, bottom), slice(left, right))
-    shifted = K.clone()
-    shifted[0, 2] -= left
-    shifted[1, 2] -= top
-    return replace(view, depth_m=view.depth_m[part], mask=view.mask[part], K=shifted)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -119,41 +113,34 @@ def track(
             pose = estimate.camera_from_model.double()
             if estimate.tracking == "found" or last is None:
                 last = _Last(pose=pose, moved=None, origin=estimate)
-            else:
-                last = replace(last, pose=pose, moved=_motion(last.pose, pose))
+            else:  # the turn about the object's origin, and its shift
+                moved = Rigid(pose.R @ last.pose.R.mT, pose.t_m - last.pose.t_m)
+                last = replace(last, pose=pose, moved=moved)
         yield estimate
 
 
 def _next(given: AnyInput, last: _Last | None, known: TrackedObject) -> PoseEstimate:
     """Follow the object into a frame, or look for it there."""
-    seconds = {}
+    followed_s = 0.0
     if last is not None:
         began = time.perf_counter()
         followed = _follow(given, last, known)
-        seconds = {"icp": time.perf_counter() - began}
+        followed_s = time.perf_counter() - began
         if isinstance(followed, PoseEstimate):
-            return replace(followed, name=given.name, seconds=seconds)
+            return replace(followed, name=given.name, seconds={"icp": followed_s})
     found = known.look(given)
-    spent = {**found.seconds}
-    spent["icp"] = spent.get("icp", 0.0) + seconds.get("icp", 0.0)
-    doubt = _doubt_of(given, found.camera_from_model, known.surface)
+    spent = {**found.seconds, "icp": found.seconds.get("icp", 0.0) + followed_s}
+    doubt, pose = None, found.camera_from_model
+    if pose is not None:  # compared with the frame, as one that was followed is
+        scene_m = scene_about(given, Rigid.stack([pose.double()]), known.surface)
+        doubt = _contradiction(compare_depths(scene_m, pose.double(), known.surface))
     if doubt is not None:
         return PoseEstimate(
             name=given.name, object=found.object, status=doubt.status, reason=doubt.reason,
             signals=found.signals, seconds=spent, tracking="lost",
         )  # fmt: skip
-    tracking = "lost" if found.camera_from_model is None else "found"
+    tracking = "lost" if pose is None else "found"
     return replace(found, name=given.name, seconds=spent, tracking=tracking)
-
-
-def _doubt_of(given: AnyInput, pose: Rigid | None, surface: Surface) -> Refusal | None:
-    """Compare a pose that was found with the frame, as one that was followed is."""
-    if pose is None:
-        return None
-    pose = pose.double()
-    return _contradiction(
-        compare_depths(scene_about(given, Rigid.stack([pose]), surface), pose, surface)
-    )
 
 
 def _contradiction(
@@ -176,9 +163,15 @@ def _contradiction(
 
 
 def _follow(given: AnyInput, last: _Last, known: TrackedObject) -> PoseEstimate | Refusal:
-    """Refine the last pose and the predicted one, and check the better."""
-    surface = known.surface
-    starts = _starts(last)
+    """Refine the last pose and the predicted one; take the better if the scene agrees with it.
+
+    What else the object may be stays what it was where it was found.
+    """
+    surface, starts = known.surface, [last.pose]
+    if last.moved is not None:  # the pose that goes on as it moved last
+        moved = Rigid(last.moved.R @ last.pose.R, last.pose.t_m + last.moved.t_m)
+        starts.insert(0, moved)
+    starts = Rigid.stack(starts)
     scene_m = scene_about(given, starts, surface)
     near = _is_near(scene_m, starts, surface, MARGIN)
     is_support = _is_support(scene_m, near, last.pose.apply(surface.points_m))
@@ -189,7 +182,41 @@ def _follow(given: AnyInput, last: _Last, known: TrackedObject) -> PoseEstimate 
             reason=f"{len(cloud_m)} points lie where the object was, below {_LEAST_POINTS}",
         )
     refined = refine_best(cloud_m, starts, surface, replace(known.icp, starts=1)).refined
-    return _accepted(refined, scene_m, is_support, known, last)
+    pose = refined.camera_from_model.double()
+    shares = compare_depths(scene_m, pose, surface)
+    if (contradiction := _contradiction(shares, is_followed=True)) is not None:
+        return contradiction
+    own_m = scene_m[_is_near(scene_m, Rigid.stack([pose]), surface, NEAR) & ~is_support]
+    free = free_motions(known.model.symmetries.continuous, pose)
+    observable, _ = observability(own_m, pose, surface, free)
+    if observable < known.refusal.min_hold:
+        return Refusal(
+            status="not observable",
+            reason="the seen part of the object does not fix its pose (observability "
+            f"{observable:.1%})",
+        )
+    (signals,) = surface_signals(own_m, pose[None], surface)
+    answer = PoseEstimate(
+        name="",
+        object=known.model.name,
+        status="ok",
+        camera_from_model=refined.camera_from_model.float(),
+        covariance=without_motions(refined.covariance, free).float(),
+        free_motions=free.float(),
+        residual_m=float(refined.residual_m),
+        signals=signals | {"through": shares[1], "before": shares[2]},
+        tracking="tracked",
+    )
+    if (origin := last.origin) is None:
+        return answer
+    assert origin.camera_from_model is not None
+    back = origin.camera_from_model.double().inverse()
+    carried = tuple(
+        replace(a, camera_from_model=(pose @ (back @ a.camera_from_model.double())).float())
+        for a in origin.alternatives
+    )
+    return replace(answer, status=origin.status, reason=origin.reason,
+                   certainty=origin.certainty, alternatives=carried)  # fmt: skip
 
 
 def _is_support(
@@ -216,85 +243,6 @@ def _is_support(
     # What is as flat as the noise cannot be parted from what it lies on; else it was taken away.
     few = int((near & ~is_support).sum()) < max(_LEAST_POINTS, 0.2 * int(near.sum()))
     return torch.zeros_like(near) if few and float(is_flat.double().mean()) > 0.9 else is_support
-
-
-def _accepted(
-    refined: RefinedPose,
-    scene_m: Float64[Tensor, "n 3"],
-    is_support: Bool[Tensor, " n"],
-    known: TrackedObject,
-    last: _Last,
-) -> PoseEstimate | Refusal:
-    """Accept a pose that the scene agrees with and that is observable."""
-    surface, pose = known.surface, refined.camera_from_model.double()
-    shares = compare_depths(scene_m, pose, surface)
-    if (contradiction := _contradiction(shares, is_followed=True)) is not None:
-        return contradiction
-    near = _is_near(scene_m, Rigid.stack([pose]), surface, NEAR)
-    own_m = scene_m[near & ~is_support]
-    free = free_motions(known.model.symmetries.continuous, pose)
-    observable, _ = observability(own_m, pose, surface, free)
-    if observable < known.refusal.min_hold:
-        return Refusal(
-            status="not observable",
-            reason="the seen part of the object does not fix its pose (observability "
-            f"{observable:.1%})",
-        )
-    _, through, before = shares
-    (signals,) = surface_signals(own_m, pose[None], surface)
-    signals |= {"through": through, "before": before}
-    return _answer(refined, free, signals, known, last)
-
-
-def _answer(
-    refined: RefinedPose,
-    free: Tensor,
-    signals: dict[str, float],
-    known: TrackedObject,
-    last: _Last,
-) -> PoseEstimate:
-    """Give the pose; what else it may be stays what it was where the object was found."""
-    pose, origin = refined.camera_from_model, last.origin
-    return PoseEstimate(
-        name="",
-        object=known.model.name,
-        status="ok" if origin is None else origin.status,
-        reason="" if origin is None else origin.reason,
-        camera_from_model=pose.float(),
-        covariance=without_motions(refined.covariance, free).float(),
-        free_motions=free.float(),
-        residual_m=float(refined.residual_m),
-        certainty=None if origin is None else origin.certainty,
-        alternatives=() if origin is None else _carried(origin, pose.double()),
-        signals=signals,
-        tracking="tracked",
-    )
-
-
-def _carried(origin: PoseEstimate, pose: Rigid) -> tuple[Alternative, ...]:
-    """Move the alternatives of the first answer along with the object."""
-    assert origin.camera_from_model is not None
-    back = origin.camera_from_model.double().inverse()
-
-    def moved(other: Alternative) -> Rigid:
-        there = pose @ (back @ other.camera_from_model.double())
-        return there.float()
-
-    return tuple(replace(a, camera_from_model=moved(a)) for a in origin.alternatives)
-
-
-def _starts(last: _Last) -> Rigid:
-    """The pose that goes on as it moved last, and the last pose itself."""
-    every = [last.pose]
-    if last.moved is not None:
-        turned = Rigid(last.moved.R @ last.pose.R, last.pose.t_m + last.moved.t_m)
-        every.insert(0, turned)
-    return Rigid.stack(every)
-
-
-def _motion(before: Rigid, after: Rigid) -> Rigid:
-    """The turn about the object's origin, and its shift."""
-    return Rigid(after.R @ before.R.mT, after.t_m - before.t_m)
 
 
 def _is_near(

@@ -105,19 +105,6 @@ def measure(
     return found
 
 
-def _add(estimated: Rigid, instance: Instance, context: ErrorContext) -> Tensor:
-    """ADD, or ADD-S where that decides a success [m]."""
-    error_m = adds_m if context.is_adds else add_m
-    return error_m(estimated, instance.camera_from_model, context.model.vertices_m)
-
-
-def _mspd(estimated: Rigid, instance: Instance, context: ErrorContext) -> Tensor:
-    """MSPD, scaled to an image 640 wide [px]."""
-    true, points_m = instance.camera_from_model, context.model.vertices_m
-    scale = BOP_WIDTH_PX / image_size(instance.depth)[0]
-    return scale * mspd_px(estimated, true, points_m, context.symmetries, instance.K)
-
-
 def _nearest(estimated: Rigid, instance: Instance, context: ErrorContext) -> Rigid:
     true, declared = instance.camera_from_model, context.model.symmetries
     return nearest_copy(estimated, true, context.symmetries, declared)
@@ -167,10 +154,16 @@ def _turned_to(pose: Rigid, R: Float[Tensor, "3 3"], symmetries: Symmetries) -> 
 def _vsd(estimated: Rigid, instance: Instance, context: ErrorContext) -> Float[Tensor, "10"]:
     assert context.vsd_delta_m is not None
     depth_m = _read_depth(instance.depth, instance.depth_unit_m)
-    poses = (estimated, instance.camera_from_model)
-    left, top, right, bottom = _window(poses, instance.K, context.triangles_m, depth_m)
+    poses, K = (estimated, instance.camera_from_model), instance.K.double().clone()
     # What neither pose covers does not count: only the window about both is drawn.
-    K = instance.K.double().clone()
+    size = torch.tensor(depth_m.shape).flip(0)
+    points_m = torch.cat([_apply(pose, context.triangles_m).reshape(-1, 3) for pose in poses])
+    pixels = project(points_m, K)
+    low, high = torch.zeros_like(size), size
+    if bool(pixels.isfinite().all()):  # else something lies behind the camera
+        low = (pixels.amin(0) - _MARGIN_PX).clamp(min=0).minimum(size - 1).long()
+        high = (pixels.amax(0) + _MARGIN_PX + 1).clamp(min=1).minimum(size).long()
+    (left, top), (right, bottom) = low.tolist(), torch.maximum(high, low + 1).tolist()
     K[0, 2] -= left
     K[1, 2] -= top
     window = depth_m[top:bottom, left:right]
@@ -185,21 +178,6 @@ def _vsd(estimated: Rigid, instance: Instance, context: ErrorContext) -> Float[T
     return vsd(*poses, view, taus_m, context.vsd_delta_m)
 
 
-def _window(
-    poses: tuple[Rigid, Rigid], K: Tensor, triangles_m: Tensor, depth_m: Float[Tensor, "h w"]
-) -> tuple[int, int, int, int]:
-    """Left, top, right and bottom of what either pose covers; everything behind the camera."""
-    height, width = depth_m.shape
-    points = torch.cat([_apply(pose, triangles_m).reshape(-1, 3) for pose in poses])
-    pixels = project(points, K.double())
-    if not bool(pixels.isfinite().all()):
-        return 0, 0, width, height
-    low, high = pixels.amin(0) - _MARGIN_PX, pixels.amax(0) + _MARGIN_PX + 1
-    left, top = (int(low[i].clamp(0, size - 1)) for i, size in enumerate((width, height)))
-    right, bottom = (int(high[i].clamp(1, size)) for i, size in enumerate((width, height)))
-    return left, top, max(right, left + 1), max(bottom, top + 1)
-
-
 def _apply(pose: Rigid, triangles_m: Float[Tensor, "f 3 3"]) -> Float[Tensor, "f 3 3"]:
     return triangles_m @ pose.R.double().mT + pose.t_m.double()
 
@@ -208,7 +186,12 @@ _read_depth = lru_cache(maxsize=4)(read_depth_png)
 """Instances of one image follow each other."""
 
 METRICS = {
-    "error_m": Metric(measure=_add, summaries={"auc": lambda errors, _: auc(errors[:, 0])}),
+    "error_m": Metric(  # ADD, or ADD-S where that decides a success
+        measure=lambda pose, instance, context: (adds_m if context.is_adds else add_m)(
+            pose, instance.camera_from_model, context.model.vertices_m
+        ),
+        summaries={"auc": lambda errors, _: auc(errors[:, 0])},
+    ),
     "adds_m": Metric(
         measure=lambda pose, instance, context: adds_m(
             pose, instance.camera_from_model, context.model.vertices_m
@@ -221,8 +204,18 @@ METRICS = {
         ),
         summaries={"ar_mssd": lambda errors, d: average_recall(errors / d[:, None], BOP_SHARES)},
     ),
-    "mspd_px": Metric(
-        measure=_mspd, summaries={"ar_mspd": lambda errors, _: average_recall(errors, BOP_PIXELS)}
+    "mspd_px": Metric(  # scaled to an image 640 wide
+        measure=lambda pose, instance, context: (
+            (BOP_WIDTH_PX / image_size(instance.depth)[0])
+            * mspd_px(
+                pose,
+                instance.camera_from_model,
+                context.model.vertices_m,
+                context.symmetries,
+                instance.K,
+            )
+        ),
+        summaries={"ar_mspd": lambda errors, _: average_recall(errors, BOP_PIXELS)},
     ),
     "rotation_deg": Metric(
         measure=lambda pose, instance, context: rotation_error_rad(

@@ -5,7 +5,7 @@ import math
 import statistics
 from collections import defaultdict
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -71,7 +71,33 @@ class Conditions:
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class InstanceRow:
+class _Row:
+    conditions: Conditions | None = None
+    origin: Origin | None = None
+
+    def columns(self) -> dict[str, Any]:
+        """Give the columns of a table, in its order."""
+        found = {} if self.origin is None else asdict(self.origin)
+        if not isinstance(self, ObjectRow):
+            found = {name: found[name] for name in ("method", "masks") if name in found}
+        for one in fields(self):
+            value = getattr(self, one.name)
+            if isinstance(self, InstanceRow) and one.name == "errors":
+                found |= {name: self.error(name) for name in METRICS}
+            elif one.name == "ms":
+                found |= {f"ms_{stage}": number for stage, number in value.items()}
+            elif isinstance(value, Mapping):
+                found |= value
+            elif one.name not in _LAST and not (value is None and one.default is None):
+                found[one.name] = value
+        return found | ({} if self.conditions is None else asdict(self.conditions))
+
+
+_LAST = ("conditions", "origin")
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class InstanceRow(_Row):
     """One instance and the errors of its estimate.
 
     Attributes:
@@ -102,7 +128,6 @@ class InstanceRow:
     errors: Mapping[str, Errors]
     ms: Mapping[str, Number]
     reason: str
-    origin: Origin | None = None
 
     def error(self, name: str) -> Number:
         """Give an error by its name, or None where it is not measured or infinite."""
@@ -111,20 +136,9 @@ class InstanceRow:
         mean = float(self.errors[name].mean())
         return mean if math.isfinite(mean) else None
 
-    def columns(self) -> dict[str, Any]:
-        """Give the columns of a table, in its order."""
-        names = ("instance", "object", "status", "is_success", "score", "visible_fraction")
-        return {
-            **_method_of(self.origin),
-            **_fields_of(self, *names, "truth", "diameter_m", "metric"),
-            **{name: self.error(name) for name in METRICS},
-            **_times(self.ms),
-            "reason": self.reason,
-        }
-
 
 @dataclass(frozen=True, kw_only=True)
-class ObjectRow:
+class ObjectRow(_Row):
     """The instances of an object, the ``mean`` of objects, or ``all`` instances.
 
     Attributes:
@@ -154,24 +168,10 @@ class ObjectRow:
     ms: Mapping[str, Number]
     metric: str | None = None
     diameter_m: float | None = None
-    conditions: Conditions | None = None
-    origin: Origin | None = None
-
-    def columns(self) -> dict[str, Any]:
-        """Give the columns of a table, in its order."""
-        names = ("object", "instances", "annotated", "success", "refused", "wrong", "coverage")
-        return {
-            **({} if self.origin is None else asdict(self.origin)),
-            **_fields_of(self, *names),
-            **self.scores,
-            **_times(self.ms),
-            **({} if self.metric is None else _fields_of(self, "metric", "diameter_m")),
-            **({} if self.conditions is None else asdict(self.conditions)),
-        }
 
 
 @dataclass(frozen=True, kw_only=True)
-class RiskRow:
+class RiskRow(_Row):
     """How many answers are wrong if only the surest are given.
 
     Attributes:
@@ -187,28 +187,6 @@ class RiskRow:
     answers: int
     least_score: Number
     risk: float
-    conditions: Conditions | None = None
-    origin: Origin | None = None
-
-    def columns(self) -> dict[str, Any]:
-        """Give the columns of a table, in its order."""
-        return {
-            **_method_of(self.origin),
-            **_fields_of(self, "coverage", "answers", "least_score", "risk"),
-            **({} if self.conditions is None else asdict(self.conditions)),
-        }
-
-
-def _method_of(origin: Origin | None) -> dict[str, Any]:
-    return {} if origin is None else {"method": origin.method, "masks": origin.masks}
-
-
-def _fields_of(row: object, *names: str) -> dict[str, Any]:
-    return {name: getattr(row, name) for name in names}
-
-
-def _times(ms: Mapping[str, Number]) -> dict[str, Any]:
-    return {f"ms_{stage}": value for stage, value in ms.items()}
 
 
 _RECALLS = ("ar_vsd", "ar_mssd", "ar_mspd")
@@ -443,7 +421,16 @@ def evaluate(
     """
     config = EvaluationConfig() if config is None else config
     found = match(dataset.instances, predictions, dataset.objects)
-    _refuse_unknown(dataset, predictions, found)
+    if len(dataset) == 0:
+        raise InputError(f"{dataset.folder}: split {dataset.split!r} has no instance to measure")
+    # A file of another data set would be measured as all missing, and look like a bad method.
+    if predictions and not found:
+        one = predictions[0]
+        raise InputError(
+            f"{dataset.folder}: none of the {len(predictions)} predictions is of one of its "
+            f"{len(dataset)} instances; the first is of {one.place or one.estimate.name!r}. Give "
+            "the predictions of this very split"
+        )
     contexts = {
         number: ErrorContext(
             model=model,
@@ -465,8 +452,16 @@ def evaluate(
         frames=f"{dataset.folder.resolve().name} {dataset.split}",
         frames_sha256=frames_hash(dataset.instances)[:12],
     )
+    summed: list[ObjectRow] = []
+    numbers = [instance.object_id for instance in dataset.instances]
+    for number, context in sorted(contexts.items()):
+        own = [row for row, of in zip(rows, numbers, strict=True) if of == number]
+        row = object_row(context.model.name, own)
+        summed.append(replace(row, metric=own[0].metric, diameter_m=context.diameter_m))
+    if len(summed) > 1:
+        summed += [mean_row(summed), object_row("all", rows)]
     return Evaluation(
-        rows=[replace(row, conditions=conditions) for row in _sum_up(dataset, rows, contexts)],
+        rows=[replace(row, conditions=conditions) for row in summed],
         per_instance=rows,
         risk=[replace(row, conditions=conditions) for row in risk_rows(rows)],
         advice=convention_advice(dataset, predictions, contexts, SUCCESS_SHARE),
@@ -494,32 +489,3 @@ def _instance_row(
         ms={**ms, "total": 1000 * sum(seconds.values()) if seconds else None},
         reason="" if estimate is None else estimate.reason,
     )
-
-
-def _sum_up(
-    dataset: BopDataset, rows: list[InstanceRow], contexts: dict[int, ErrorContext]
-) -> list[ObjectRow]:
-    summed: list[ObjectRow] = []
-    numbers = [instance.object_id for instance in dataset.instances]
-    for number, context in sorted(contexts.items()):
-        own = [row for row, of in zip(rows, numbers, strict=True) if of == number]
-        row = object_row(context.model.name, own)
-        summed.append(replace(row, metric=own[0].metric, diameter_m=context.diameter_m))
-    if len(summed) > 1:
-        summed += [mean_row(summed), object_row("all", rows)]
-    return summed
-
-
-def _refuse_unknown(
-    dataset: BopDataset, predictions: Sequence[Prediction], found: dict[str, PoseEstimate]
-) -> None:
-    """A file of another data set would be measured as all missing, and look like a bad method."""
-    if len(dataset) == 0:
-        raise InputError(f"{dataset.folder}: split {dataset.split!r} has no instance to measure")
-    if predictions and not found:
-        one = predictions[0]
-        raise InputError(
-            f"{dataset.folder}: none of the {len(predictions)} predictions is of one of its "
-            f"{len(dataset)} instances; the first is of {one.place or one.estimate.name!r}. Give "
-            "the predictions of this very split"
-        )

@@ -60,9 +60,8 @@ def symmetry_transforms(symmetries: Symmetries, max_step: float = BOP_STEP) -> R
     every = [eye]
     for axis in symmetries.continuous:
         turns = turn_about(axis.direction.to(eye.R), axis.point_m.to(eye.R), angles[1:])
-        R = turns.R[:, None] @ eye.R[None]
-        t_m = (turns.R[:, None] @ eye.t_m[None, :, :, None]).squeeze(-1) + turns.t_m[:, None]
-        every.append(Rigid(R.flatten(0, 1), t_m.flatten(0, 1)))
+        turned = turns[:, None] @ eye[None]
+        every.append(Rigid(turned.R.flatten(0, 1), turned.t_m.flatten(0, 1)))
     return Rigid.cat(every)
 
 
@@ -84,10 +83,10 @@ def symmetries_from_bop(info: Mapping[str, Any], *, source: str) -> Symmetries:
     matrices = [_rigid_from_bop(row, source) for row in turns]
     axes = tuple(_axis_from_bop(entry, source) for entry in lines)
     is_found = info.get("symmetries_found", False) is True
-    if not matrices:
-        return Symmetries(continuous=axes, is_found=is_found)
-    stacked = torch.stack(matrices)
-    discrete = Rigid(stacked[:, :3, :3], stacked[:, :3, 3])
+    discrete = None
+    if matrices:
+        stacked = torch.stack(matrices)
+        discrete = Rigid(stacked[:, :3, :3], stacked[:, :3, 3])
     return Symmetries(discrete=discrete, continuous=axes, is_found=is_found)
 
 
@@ -434,7 +433,16 @@ def make_model(
         kept, faces = torch.unique(faces, return_inverse=True)
         vertices_m = vertices_m[kept]
     vertices_m = vertices_m.float()
-    normals = _vertex_normals(vertices_m, faces) if len(faces) else estimate_normals(vertices_m)
+    if len(faces):  # the mean of the normals of the faces at a vertex, each by its area
+        corners = vertices_m.double()[faces]
+        sides = corners[:, 1:] - corners[:, :1]
+        doubled = torch.linalg.cross(sides[:, 0], sides[:, 1])
+        total = torch.zeros(len(vertices_m), 3, dtype=torch.float64)
+        for corner in range(3):
+            total.index_add_(0, faces[:, corner], doubled)
+        normals = (total / total.norm(dim=-1, keepdim=True).clamp(min=1e-300)).to(vertices_m)
+    else:
+        normals = estimate_normals(vertices_m)
     model = ObjectModel(
         name=name,
         number=number,
@@ -493,13 +501,3 @@ def exact_diameter(points_m: Float[Tensor, "n 3"]) -> float:
     exactly = "donot_use_mm_for_euclid_dist"
     rows = (torch.cdist(row, everything, compute_mode=exactly) for row in everything.split(1024))
     return max(float(row.max()) for row in rows)
-
-
-def _vertex_normals(vertices_m: Tensor, faces: Tensor) -> Tensor:
-    """Mean of the normals of the faces at a vertex, each by its area."""
-    corners = vertices_m.double()[faces]
-    doubled = torch.linalg.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    total = torch.zeros(len(vertices_m), 3, dtype=torch.float64)
-    for corner in range(3):
-        total.index_add_(0, faces[:, corner], doubled)
-    return (total / total.norm(dim=-1, keepdim=True).clamp(min=1e-300)).to(vertices_m)

@@ -2,13 +2,13 @@
 
 import math
 from collections import OrderedDict
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from functools import cache, lru_cache
+from functools import lru_cache
 from hashlib import sha256
 from pathlib import Path
-from typing import Any, NamedTuple, TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 import torch
@@ -68,21 +68,15 @@ def _key_of(model: ObjectModel) -> str:
     if symmetries.discrete is not None:
         tensors.append(symmetries.discrete.R)
     tensors += [axis.direction for axis in symmetries.continuous]
-    digest = sha256(f"{symmetries.is_found} {_code()}".encode())
+    digest = sha256(f"{symmetries.is_found}".encode())
+    for path in sorted(Path(__file__).parent.glob("*.py")):
+        digest.update(path.read_bytes())
     for tensor in tensors:
         digest.update(tensor.contiguous().numpy().tobytes())
     return digest.hexdigest()
 
 
-@cache
-def _code() -> str:
-    """Name the sources of this package."""
-    digest = sha256()
-    for path in sorted(Path(__file__).parent.glob("*.py")):
-        digest.update(path.read_bytes())
-    return digest.hexdigest()
-
-
+_EYE = torch.eye(3, dtype=torch.float64)
 _ORDERS = (2, 3, 4, 5, 6)
 _TRIED_ORDERS = range(2, 13)
 _TURNS = 36
@@ -126,11 +120,9 @@ class SurfaceDeviation:
         self.points = (dense.double() - self.centre_m) / model.diameter_m
         self._normals = normals.double().numpy()
         self._tree = KDTree(self.points.numpy())
-        self.few, self.many = (self._every(count) for count in (100, 1000))
-        self._rough_tree = KDTree(self._every(2500).numpy())
-
-    def _every(self, count: int) -> Float[Tensor, "m 3"]:
-        return take_evenly(self.points, count)
+        self.few, self.many = (take_evenly(self.points, count) for count in (100, 1000))
+        self._rough_tree = KDTree(take_evenly(self.points, 2500).numpy())
+        self.axes = torch.linalg.eigh(self.points.T @ self.points).eigenvectors.T
 
     def nearest(self, moved: Float[Tensor, "*batch m 3"]) -> tuple[np.ndarray, np.ndarray]:
         """Give distance and index of the nearest sample."""
@@ -143,14 +135,10 @@ class SurfaceDeviation:
         distance, _ = self._rough_tree.query(turned, workers=torch.get_num_threads())
         return torch.from_numpy(np.asarray(distance)).mean(-1)
 
-    def is_promising(self, R: Float[Tensor, "*batch 3 3"]) -> Tensor:
-        """Say coarsely, by few points, whether a turn is worth measuring."""
-        return self.rough_distance(R) <= _COARSE
-
     def deviation(
         self, R: Float[Tensor, "*batch 3 3"], shift: Float[Tensor, "*batch 3"] | None = None
     ) -> Float[Tensor, "*batch"]:
-        """The 98th percentile of the distance to the surface, both ways."""
+        """The 98th percentile of the distance to the surface, both ways, after turn and shift."""
         turn = Rigid(R, torch.zeros_like(R[..., 0]) if shift is None else shift)
         return torch.maximum(self._one_way(turn), self._one_way(turn.inverse()))
 
@@ -270,16 +258,18 @@ def with_found_symmetries(
 def _completed(turns: list[Rigid]) -> list[Rigid]:
     """Add products until there is no new one; what passes 60 was no group (an icosahedron's)."""
     every = list(turns)
-    eye = torch.eye(3, dtype=torch.float64)
     for first in every:  # grows under way
         for second in turns:
             product = first @ second
-            known = [eye, *(turn.R for turn in every)]
-            if all(float(geodesic_rad(product.R, R)) > _SAME_RAD for R in known):
+            if _is_apart(product.R, [_EYE, *(turn.R for turn in every)], _SAME_RAD):
                 every.append(product)
         if len(every) > 60:
             return turns
     return every
+
+
+def _is_apart(R: Tensor, others: Iterable[Tensor], limit_rad: float) -> bool:
+    return all(float(geodesic_rad(R, other)) > limit_rad for other in others)
 
 
 def _proposal(
@@ -297,8 +287,7 @@ def _turns(direction: Float[Tensor, "3"], angles: Float[Tensor, " a"]) -> Float[
 
 def promising_turns(surface: SurfaceDeviation) -> list[Float[Tensor, "3 3"]]:
     """Try turns about principal axes and many directions; those that fit, the best first."""
-    spread = surface.points.T @ surface.points
-    candidates = torch.cat([torch.linalg.eigh(spread).eigenvectors.T, fibonacci_directions(400)])
+    candidates = torch.cat([surface.axes, fibonacci_directions(400)])
     angles = torch.tensor([2 * math.pi / order for order in _ORDERS], dtype=torch.float64)
     turns = torch.stack([_turns(direction, angles) for direction in candidates]).flatten(0, 1)
     coarse = surface.rough_distance(turns)
@@ -323,7 +312,7 @@ def _measure(
     axis = Axis(direction=direction, point_m=surface.centre_m)
     circle = _turns(direction, torch.arange(1, _TURNS) * (2 * math.pi / _TURNS))
     found: list[SymmetryProposal] = []
-    if bool(surface.is_promising(circle).all()):
+    if bool((surface.rough_distance(circle) <= _COARSE).all()):
         worst = float(surface.deviation(circle).max())
         if worst <= limit:
             found = [_proposal("continuous", axis, None, worst, tolerance)]
@@ -332,7 +321,7 @@ def _measure(
     # Every turn of order 2 to 12, each once.
     shares = sorted({k / order for order in _TRIED_ORDERS for k in range(1, order)})
     angles = torch.tensor(shares, dtype=torch.float64) * (2 * math.pi)
-    angles = angles[surface.is_promising(_turns(direction, angles))]
+    angles = angles[surface.rough_distance(_turns(direction, angles)) <= _COARSE]
     if len(angles) == 0:
         return found
     deviation = surface.deviation(_turns(direction, angles))
@@ -418,11 +407,10 @@ def refine_turn(
 
 def _mirror_starts(surface: SurfaceDeviation) -> list[Float64[Tensor, "3 3"]]:
     """Choose reflections, or reflections with a quarter turn or a half, that fit roughly."""
-    axes = torch.linalg.eigh(surface.points.T @ surface.points).eigenvectors.T
-    normals = torch.cat([axes, fibonacci_directions(_MIRROR_PLANES)])
+    normals = torch.cat([surface.axes, fibonacci_directions(_MIRROR_PLANES)])
     along = normals[:, :, None] * normals[:, None]
-    across = torch.eye(3, dtype=torch.float64) - along
-    crossed = torch.linalg.cross(normals[:, None], torch.eye(3, dtype=torch.float64)[None])
+    across = _EYE - along
+    crossed = torch.linalg.cross(normals[:, None], _EYE[None])
     # By 0, 90, 180 and 270 degrees about the normal: cos (1 - nn') + sin [n] - nn'.
     turns = [c * across + s * crossed - along for c, s in ((1, 0), (0, 1), (-1, 0), (0, -1))]
     every = torch.cat(turns)
@@ -430,8 +418,7 @@ def _mirror_starts(surface: SurfaceDeviation) -> list[Float64[Tensor, "3 3"]]:
     for k in surface.rough_distance(every).argsort().tolist():
         if len(chosen) == _MIRROR_STARTS:
             break
-        apart_rad = [float(geodesic_rad(every[k] @ _FLIP, other @ _FLIP)) for other in chosen]
-        if all(angle > _APART_RAD for angle in apart_rad):
+        if _is_apart(every[k], chosen, _APART_RAD):
             chosen.append(every[k])
     return chosen
 
@@ -467,18 +454,6 @@ class NearSymmetry:
     deviation: float
 
 
-class _Known(NamedTuple):
-    """What is kept of a model.
-
-    Attributes:
-        near: turns that nearly look alike.
-        alike: which discrete symmetries that were found look alike, and which axes.
-    """
-
-    near: tuple[NearSymmetry, ...]
-    alike: tuple[list[bool], list[bool]]
-
-
 def near_symmetries(model: ObjectModel) -> tuple[NearSymmetry, ...]:
     """Find the turns that leave a model nearly as it is, the nearest first.
 
@@ -488,7 +463,7 @@ def near_symmetries(model: ObjectModel) -> tuple[NearSymmetry, ...]:
     Args:
         model: the object, a mesh or points with normals.
     """
-    return _look_up(model).near
+    return kept(model, "near_symmetries", _search, _decoded)[0]
 
 
 def true_symmetries(model: ObjectModel) -> Symmetries:
@@ -499,33 +474,38 @@ def true_symmetries(model: ObjectModel) -> Symmetries:
     """
     if not model.symmetries.is_found:
         return model.symmetries
-    return _true(model.symmetries, _look_up(model).alike)
+    return _true(model.symmetries, kept(model, "near_symmetries", _search, _decoded)[1])
 
 
-def _look_up(model: ObjectModel) -> _Known:
-    return kept(model, "near_symmetries", _search, _decoded)
-
-
-def _decoded(found: Any) -> _Known:  # noqa: ANN401
+def _decoded(
+    found: Any,  # noqa: ANN401
+) -> tuple[tuple[NearSymmetry, ...], tuple[list[bool], list[bool]]]:
+    """Give the turns that nearly look alike; which found symmetries and axes look alike."""
     turns = torch.tensor([matrix for matrix, _ in found["near"]], dtype=torch.float64)
     near = [
         NearSymmetry(model_from_model=Rigid(M[:3, :3], M[:3, 3]), deviation=deviation)
         for M, (_, deviation) in zip(turns.reshape(-1, 4, 4), found["near"], strict=True)
     ]
     discrete, axes = found["alike"]
-    return _Known(tuple(near), (discrete, axes))
+    return tuple(near), (discrete, axes)
 
 
 def _search(model: ObjectModel) -> dict[str, Any]:
     surface = SurfaceDeviation(model)
-    alike = _alike(model.symmetries, surface)
+    # Which discrete symmetries, and which axes, have copies that lie on the surface.
+    given, circle = model.symmetries, torch.arange(1, 8, dtype=torch.float64) * (math.pi / 4)
+    turns = [_turns(axis.direction.double(), circle) for axis in given.continuous]
+    axes, discrete = [float(surface.deviation(R).max()) <= ALIKE for R in turns], list[bool]()
+    if given.discrete is not None:
+        discrete = (surface.deviation(given.discrete.R.double()) <= ALIKE).tolist()
+    alike = (discrete, axes)
     same = symmetry_transforms(_true(model.symmetries, alike), _FINE_STEP).R.double()
     near: list[tuple[Rigid, float]] = []
     for off, turn in sorted(_measured(model, surface), key=lambda pair: pair[0]):
         if len(near) == _MOST_NEAR or off > 2 * _TOLERANCE:
             break
         # New is what is far from the others and from all copies of them that look alike.
-        others = torch.cat([R @ same for R in (torch.eye(3).double(), *(one.R for one, _ in near))])
+        others = torch.cat([R @ same for R in (_EYE, *(one.R for one, _ in near))])
         apart_rad = float(geodesic_rad(turn.R.expand_as(others), others).min())
         if apart_rad > _NEAR_SUPPRESSION_RAD:
             near.append((turn, off))
@@ -540,7 +520,15 @@ def _measured(model: ObjectModel, surface: SurfaceDeviation) -> list[tuple[float
     found = symmetry_transforms(model.symmetries, _STEP).R.double()[1:]
     exact = found if model.symmetries.is_found else found[:0]
     tried = [Rigid(R, torch.zeros(3).double()) for R in exact]
-    tried += [refine_turn(surface, R) for R in _near_starts(surface)]
+    # From quarter turns about the principal axes, and the best of thousands of other turns.
+    quarters = torch.arange(1, 4).double() * (math.pi / 2)
+    starts = [R for axis in surface.axes for R in _turns(axis, quarters)]
+    for R in promising_turns(surface):
+        if len(starts) == _NEAR_STARTS:
+            break
+        if _is_apart(R, [_EYE, *starts], _NEAR_SUPPRESSION_RAD):
+            starts.append(R)
+    tried += [refine_turn(surface, R) for R in starts]
     measured = _deviations(tried, surface)
     good = [turn for off, turn in sorted(measured, key=lambda pair: pair[0]) if off <= _TOLERANCE]
     # Two turns one after the other are one: of a can, upside down and then about its axis.
@@ -558,32 +546,6 @@ def _deviations(turns: list[Rigid], surface: SurfaceDeviation) -> list[tuple[flo
         return []
     R, shift = torch.stack([t.R for t in turns]), torch.stack([t.t_m for t in turns])
     return list(zip(surface.deviation(R, shift).tolist(), turns, strict=True))
-
-
-def _near_starts(surface: SurfaceDeviation) -> list[Float[Tensor, "3 3"]]:
-    """Give quarter turns about the principal axes, and the best of thousands of other turns."""
-    axes = torch.linalg.eigh(surface.points.T @ surface.points).eigenvectors.T
-    quarters = torch.arange(1, 4).double() * (math.pi / 2)
-    zero = torch.zeros(3).double()
-    starts = [R for axis in axes for R in turn_about(axis, zero, quarters).R]
-    eye = torch.eye(3).double()
-    for R in promising_turns(surface):
-        if len(starts) == _NEAR_STARTS:
-            break
-        if all(float(geodesic_rad(R, other)) > _NEAR_SUPPRESSION_RAD for other in [eye, *starts]):
-            starts.append(R)
-    return starts
-
-
-def _alike(given: Symmetries, surface: SurfaceDeviation) -> tuple[list[bool], list[bool]]:
-    """Mark the discrete symmetries, and the axes, whose copies lie on the surface."""
-    circle = torch.arange(1, 8, dtype=torch.float64) * (math.pi / 4)
-    zero = torch.zeros(3).double()
-    turns = [turn_about(axis.direction.double(), zero, circle).R for axis in given.continuous]
-    axes = [float(surface.deviation(R).max()) <= ALIKE for R in turns]
-    if given.discrete is None:
-        return [], axes
-    return (surface.deviation(given.discrete.R.double()) <= ALIKE).tolist(), axes
 
 
 def _true(given: Symmetries, alike: tuple[list[bool], list[bool]]) -> Symmetries:

@@ -27,15 +27,7 @@ _COLOUR_SEED = 0xC0102
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Pattern:
-    """Colour of a point: a base colour, and waves of brightness and hue through space.
-
-    Attributes:
-        base: linear RGB.
-        waves: how each colour follows each wave.
-        frequencies: of the waves [rad/m].
-        phases: theirs.
-        gloss: share of light that is mirrored.
-    """
+    """Colour of a point: linear RGB, waves of brightness and hue [rad/m], and a share of gloss."""
 
     base: Float[Tensor, "3"]
     waves: Float[Tensor, "w 3"]
@@ -51,14 +43,7 @@ class Pattern:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Solid:
-    """One thing of a scene.
-
-    Attributes:
-        triangles_m: in its own frame.
-        normals: of their corners.
-        pattern: its colour.
-        number: its ``obj_id``; None: no known object.
-    """
+    """One thing of a scene, in its own frame; ``number``: its ``obj_id``, None of clutter."""
 
     triangles_m: Float[Tensor, "n 3 3"]
     normals: Float[Tensor, "n 3 3"]
@@ -140,13 +125,7 @@ def table_of(side_m: float, generator: torch.Generator) -> Solid:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Light:
-    """A lamp far away, and light from everywhere.
-
-    Attributes:
-        towards: unit vector to the lamp, in the camera's frame.
-        lamp: its linear RGB.
-        ambient: that of the surroundings.
-    """
+    """A lamp far away, toward a unit vector of the camera's frame, and light from everywhere."""
 
     towards: Float[Tensor, "3"]
     lamp: Float[Tensor, "3"]
@@ -182,9 +161,16 @@ def shade(
         corners = thing.solid.normals[primitive[own] - start]
         normal = (corners * share[own, :, None]).sum(1) @ thing.camera_from_model.R.mT
         local = thing.camera_from_model.inverse().apply(points[own])
-        lit = _lit(points[own], F.normalize(normal, dim=-1), light, thing.solid.pattern.gloss)
-        base, mirrored = lit
-        colour[own] = thing.solid.pattern.at(local) * base + mirrored
+        normal, sight = F.normalize(normal, dim=-1), F.normalize(-points[own], dim=-1)
+        # Both sides of a thin part are seen.
+        normal = normal * torch.where((normal * sight).sum(-1, keepdim=True) < 0, -1.0, 1.0)
+        facing = (normal @ light.towards).clamp(min=0)[:, None]
+        half = F.normalize(sight + light.towards, dim=-1)
+        shine = (normal * half).sum(-1, keepdim=True).clamp(min=0) ** (1 / math.radians(2))
+        # From below comes half of what comes from above.
+        open_sky = 0.75 + 0.25 * (normal @ light.towards)[:, None]
+        pattern, base = thing.solid.pattern, light.ambient * open_sky + light.lamp * facing
+        colour[own] = pattern.at(local) * base + pattern.gloss * shine * light.lamp
         start = stop
     return colour
 
@@ -199,21 +185,6 @@ def backdrop(
         smooth = F.interpolate(blots, (height, width), mode="bilinear", align_corners=False)
         image = image + uniform(generator, 0.0, 0.25) * smooth[0]
     return image.clamp(0, 1)
-
-
-def _lit(
-    points: Float[Tensor, "n 3"], normal: Float[Tensor, "n 3"], light: Light, gloss: float
-) -> tuple[Float[Tensor, "n 3"], Float[Tensor, "n 3"]]:
-    """Light that a white surface would scatter, and what it mirrors."""
-    sight = F.normalize(-points, dim=-1)
-    # Both sides of a thin part are seen.
-    normal = normal * torch.where((normal * sight).sum(-1, keepdim=True) < 0, -1.0, 1.0)
-    facing = (normal @ light.towards).clamp(min=0)[:, None]
-    half = F.normalize(sight + light.towards, dim=-1)
-    shine = (normal * half).sum(-1, keepdim=True).clamp(min=0) ** (1 / math.radians(2))
-    # From below comes half of what comes from above.
-    open_sky = 0.75 + 0.25 * (normal @ light.towards)[:, None]
-    return light.ambient * open_sky + light.lamp * facing, gloss * shine * light.lamp
 
 
 _TRIES = 30
@@ -310,28 +281,20 @@ def _arranged(
     placed: list[tuple[Solid, Rigid]] = []
     circles: list[tuple[float, float, float]] = []
     for solid in chosen:
-        pose, circle = _free_place(solid, circles, generator)
-        if pose is not None:
-            placed.append((solid, pose))
-            circles.append(circle)
+        R = random_rotation(generator).float()
+        corners = solid.triangles_m.reshape(-1, 3) @ R.mT
+        middle = (corners.amin(0) + corners.amax(0)) / 2
+        radius_m = float((corners - middle)[:, :2].norm(dim=1).max())
+        for attempt in range(_TRIES):  # a free place, farther off each time
+            reach_m = 0.08 + 0.015 * attempt + 0.03 * len(circles)
+            x, y = (uniform(generator, -reach_m, reach_m) for _ in range(2))
+            if all(math.hypot(x - a, y - b) > radius_m + r for a, b, r in circles):
+                shift = torch.tensor([x - float(middle[0]), y - float(middle[1]),
+                                      -float(corners[:, 2].min())])  # fmt: skip
+                placed.append((solid, Rigid(R, shift)))
+                circles.append((x, y, radius_m))
+                break
     return [*placed, (table_of(uniform(generator, 0.8, 3.0), generator), floor)]
-
-
-def _free_place(
-    solid: Solid, circles: Sequence[tuple[float, float, float]], generator: torch.Generator
-) -> tuple[Rigid | None, tuple[float, float, float]]:
-    R = random_rotation(generator).float()
-    corners = solid.triangles_m.reshape(-1, 3) @ R.mT
-    middle = (corners.amin(0) + corners.amax(0)) / 2
-    radius_m = float((corners - middle)[:, :2].norm(dim=1).max())
-    for attempt in range(_TRIES):
-        reach_m = 0.08 + 0.015 * attempt + 0.03 * len(circles)
-        x, y = (uniform(generator, -reach_m, reach_m) for _ in range(2))
-        if all(math.hypot(x - a, y - b) > radius_m + r for a, b, r in circles):
-            shift = torch.tensor([x - float(middle[0]), y - float(middle[1]),
-                                  -float(corners[:, 2].min())])  # fmt: skip
-            return Rigid(R, shift), (x, y, radius_m)
-    return None, (0.0, 0.0, 0.0)
 
 
 _CELL_M = 0.004

@@ -91,19 +91,9 @@ def _connector() -> Mesh:
 
 def _spool() -> Mesh:
     """A body of revolution with unlike ends: only its axis can be known."""
-    profile = [
-        (0.0, 0.0),
-        (34.0, 0.0),
-        (34.0, 7.0),
-        (14.0, 14.0),
-        (12.0, 55.0),
-        (24.0, 62.0),
-        (24.0, 70.0),
-        (8.0, 70.0),
-        (8.0, 50.0),
-        (0.0, 50.0),
-    ]
-    return revolved(profile)
+    radii = (0.0, 34.0, 34.0, 14.0, 12.0, 24.0, 24.0, 8.0, 8.0, 0.0)
+    heights = (0.0, 0.0, 7.0, 14.0, 55.0, 62.0, 70.0, 70.0, 50.0, 50.0)
+    return revolved(list(zip(radii, heights, strict=True)))
 
 
 PARTS: dict[str, Callable[[], Mesh]] = {

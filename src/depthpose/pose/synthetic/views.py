@@ -8,7 +8,8 @@ depth, which is linear in the picture of a plane, so that flat parts stay exact.
 import copy
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from contextlib import suppress
+from dataclasses import dataclass, replace
 
 import torch
 from jaxtyping import Float
@@ -75,15 +76,6 @@ def surfel_triangles(model: ObjectModel) -> Float[Tensor, "n 3 3"]:
     return corners[:, fan].flatten(0, 1).to(model.vertices_m)
 
 
-def hull_points(triangles_m: Float[Tensor, "n 3 3"]) -> Float[Tensor, "m 3"]:
-    """Give the corners of the convex hull: their picture's box is the whole object's."""
-    points = triangles_m.reshape(-1, 3).double()
-    try:
-        return points[torch.from_numpy(ConvexHull(points.numpy()).vertices).long()]
-    except (QhullError, ValueError):  # flat: every corner counts
-        return points
-
-
 MARGIN_PX = 8
 """Around the object: what lies behind it must be seen where a mask is too large."""
 _JUMP = 0.02
@@ -92,13 +84,7 @@ _JUMP = 0.02
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Shape:
-    """What is drawn of an object, about the middle of its bounding box.
-
-    Attributes:
-        triangles_m: in the model frame.
-        hull_m: the corners of their convex hull, about the middle.
-        middle_m: of the bounding box, in the model frame.
-    """
+    """What is drawn of an object; the corners of its hull are about the middle of its box."""
 
     triangles_m: Float[Tensor, "n 3 3"]
     hull_m: Float[Tensor, "m 3"]
@@ -107,25 +93,29 @@ class Shape:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class CleanView:
-    """An object alone, without any error.
+    """An object alone, without any error, in a window of the image.
 
     Attributes:
-        depth_m: of a window of the image; NaN beside the object.
+        depth_m: less ``distance_m``; NaN beside the object.
         K: intrinsic matrix of the window.
         camera_from_model: the pose.
+        distance_m: taken off the depths of stored views, whose float16 is then exact to 0.1 mm.
     """
 
     depth_m: Float[Tensor, "h w"]
     K: Float[Tensor, "3 3"]
     camera_from_model: Rigid
+    distance_m: float = 0.0
 
 
 def make_shape(model: ObjectModel) -> Shape:
     """Prepare an object for many views."""
     triangles = drawn_triangles(model)
     corners = triangles.reshape(-1, 3).double()
-    middle = (corners.amin(0) + corners.amax(0)) / 2
-    return Shape(triangles_m=triangles, hull_m=hull_points(triangles) - middle, middle_m=middle)
+    middle, hull_m = (corners.amin(0) + corners.amax(0)) / 2, corners
+    with suppress(QhullError, ValueError):  # flat: every corner counts
+        hull_m = corners[torch.from_numpy(ConvexHull(corners.numpy()).vertices).long()]
+    return Shape(triangles_m=triangles, hull_m=hull_m - middle, middle_m=middle)
 
 
 def pose_of_middle(shape: Shape, R: Float[Tensor, "3 3"], middle_m: Float[Tensor, "3"]) -> Rigid:
@@ -182,9 +172,8 @@ def turn_view(
     (a, b, c), (d, e, f), (g, h, i) = (view.K @ ray_from_pixel).tolist()
     u, v = torch.arange(width)[None], torch.arange(height)[:, None]
     w = g * u + h * v + i
-    stored = 1 / view.depth_m
-    found = _interpolated(stored, (a * u + b * v + c) / w, (d * u + e * v + f) / w)
-    return CleanView(depth_m=1 / (found * w), K=moved, camera_from_model=pose)
+    inverse_m = _interpolated(1 / view.depth_m, (a * u + b * v + c) / w, (d * u + e * v + f) / w)
+    return CleanView(depth_m=1 / (inverse_m * w), K=moved, camera_from_model=pose)
 
 
 def _interpolated(
@@ -194,17 +183,14 @@ def _interpolated(
     height, width = values.shape
     left, top = u.floor().clamp_(0, width - 2), v.floor().clamp_(0, height - 2)
     x, y = u - left, v - top
-    index = (top * width + left).long()
-    flat = values.reshape(-1)
-    a, b = flat[index], flat[index + 1]
-    c, d = flat[index + width], flat[index + width + 1]
+    index, flat = (top * width + left).long(), values.reshape(-1)
+    a, b, c, d = (flat[index + beyond] for beyond in (0, 1, width, width + 1))
     smooth = torch.lerp(torch.lerp(a, b, x), torch.lerp(c, d, x), y)
     nearest = torch.where(y < 0.5, torch.where(x < 0.5, a, b), torch.where(x < 0.5, c, d))
     # A comparison with NaN is false: where a corner sees nothing, the nearest decides.
-    spread = torch.maximum(torch.maximum(a, b), torch.maximum(c, d)) - torch.minimum(
-        torch.minimum(a, b), torch.minimum(c, d)
-    )
-    found = torch.where(spread < _JUMP * smooth, smooth, nearest)
+    highest = torch.maximum(torch.maximum(a, b), torch.maximum(c, d))
+    lowest = torch.minimum(torch.minimum(a, b), torch.minimum(c, d))
+    found = torch.where(highest - lowest < _JUMP * smooth, smooth, nearest)
     is_inside = (x - 0.5).abs().maximum((y - 0.5).abs()) <= 1
     return torch.where(is_inside, found, torch.nan)
 
@@ -212,23 +198,6 @@ def _interpolated(
 _BANK_SEED = 0x0B7EC7
 _TILT_RAD = math.radians(75)
 """A table is seen from no flatter an angle."""
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class _Stored:
-    """A clean view in half the memory.
-
-    Attributes:
-        depth_m: less the distance of the middle, float16: to 0.1 mm for what is below 0.2 m.
-        middle_m: that distance.
-        K: of the window.
-        camera_from_model: the pose.
-    """
-
-    depth_m: Float[Tensor, "h w"]
-    middle_m: float
-    K: Float[Tensor, "3 3"]
-    camera_from_model: Rigid
 
 
 class Objects:
@@ -263,7 +232,7 @@ class Objects:
                     f"{1.5 * model.diameter_m:.2g} or farther, or correct the unit of the model."
                 )
         self._shapes: dict[int, Shape] = {}
-        self._views: dict[tuple[int, int], _Stored] = {}
+        self._views: dict[tuple[int, int], CleanView] = {}
 
     def __len__(self) -> int:
         """How many samples there are."""
@@ -354,15 +323,11 @@ class Objects:
             return draw_view(shape, pose_of_middle(shape, turn @ R, middle), K)
         stored = self._stored((number, whole(generator, views)))
         K = self.intrinsics(float(stored.K[0, 0]) / self.config.focal_px[0])
-        turn = self._gaze(number, stored.middle_m, K, generator)
-        before = CleanView(
-            depth_m=stored.depth_m.float() + stored.middle_m,
-            K=stored.K,
-            camera_from_model=stored.camera_from_model,
-        )
-        return turn_view(before, turn, shape, K)
+        turn = self._gaze(number, stored.distance_m, K, generator)
+        depth_m = stored.depth_m.float() + stored.distance_m
+        return turn_view(replace(stored, depth_m=depth_m, distance_m=0.0), turn, shape, K)
 
-    def _stored(self, key: tuple[int, int]) -> _Stored:
+    def _stored(self, key: tuple[int, int]) -> CleanView:
         """Give a view by the number of its object and its own, drawn when it is first needed."""
         if key not in self._views:
             number, place = key
@@ -371,12 +336,8 @@ class Objects:
             shape = self._shape(number)
             middle = torch.tensor([0.0, 0.0, distance_m], dtype=torch.float64)
             view = draw_view(shape, pose_of_middle(shape, R, middle), K)
-            self._views[key] = _Stored(
-                depth_m=(view.depth_m - distance_m).half(),
-                middle_m=distance_m,
-                K=view.K,
-                camera_from_model=view.camera_from_model,
-            )
+            depth_m = (view.depth_m - distance_m).half()
+            self._views[key] = replace(view, depth_m=depth_m, distance_m=distance_m)
         return self._views[key]
 
     def _shape(self, number: int) -> Shape:

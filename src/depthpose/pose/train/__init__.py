@@ -12,14 +12,14 @@ from depthpose.pose.train.config import ModelsConfig as ModelsConfig
 from depthpose.pose.train.config import PointNetTraining as PointNetTraining
 from depthpose.pose.train.config import PoseTraining as PoseTraining
 from depthpose.pose.train.config import SegmentationTraining as SegmentationTraining
-from depthpose.pose.train.directions import PoseTask as PoseTask
-from depthpose.pose.train.directions import train_pose as train_pose
-from depthpose.pose.train.others import train_depth_image, train_segmentation
+from depthpose.pose.train.masks import train_segmentation
+from depthpose.pose.train.poses import PoseTask as PoseTask
+from depthpose.pose.train.poses import train_pose as train_pose
 
 STAGES = {
     "pose": (PoseTraining, train_pose),
     "pointnet": (PointNetTraining, train_pose),
-    "depth-image": (DepthImageTraining, train_depth_image),
+    "depth-image": (DepthImageTraining, train_pose),
     "segmentation": (SegmentationTraining, train_segmentation),
 }
 """Config and function of each network, by its word on the command line."""

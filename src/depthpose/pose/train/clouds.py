@@ -2,7 +2,7 @@
 
 import dataclasses
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -15,7 +15,7 @@ from depthpose.core.loop import ValidationResult, sample_generator, shuffled_ind
 from depthpose.core.rigid import Rigid
 from depthpose.pose.cloud import refusal_of, sample_points, voxelise
 from depthpose.pose.config import CloudConfig, EstimateConfig, ObjectsConfig
-from depthpose.pose.datasets import BopDataset, open_bop
+from depthpose.pose.datasets import open_bop
 from depthpose.pose.datasets.layouts import models_folder, read_bop_models, read_models_info
 from depthpose.pose.estimator import GeoPoseNet
 from depthpose.pose.mesh import (
@@ -29,18 +29,17 @@ from depthpose.pose.metrics import add_of_nearest_m, is_within_diameter
 from depthpose.pose.synthetic import Objects, make_part
 from depthpose.pose.train.config import FramesConfig, HeldOutConfig, ModelsConfig
 from depthpose.pose.types import (
-    CloudInput,
     CloudSample,
     ObjectModel,
     PoseEstimate,
     PoseTruth,
     SeenPoints,
-    Vote,
 )
 from depthpose.pose.voting import fit_pose, meet_lines, vote_ransac
 from depthpose.pose.weights import DirectionNet, PoseWeights
 
-_TRIES = 20
+TRIES = 20
+"""Samples in a row that may show too little."""
 
 
 class Cloud(NamedTuple):
@@ -89,7 +88,48 @@ class CloudBatch(NamedTuple):
         )
 
 
-class TrainingClouds:
+class TrainingViews:
+    """What is learnt from by sample index: synthetic views, real frames, or both."""
+
+    def __init__(
+        self,
+        models: Sequence[ObjectModel],
+        synthetic: ObjectsConfig,
+        frames: FramesConfig | None,
+        cloud: CloudConfig,
+        seed: int,
+    ) -> None:
+        self.models, self.cloud, self.seed = models, cloud, seed
+        self.synthetic = Objects(models, synthetic, cloud)
+        self._class_of = {model.name: k for k, model in enumerate(models)}
+        self._frames, self._real = frames, None
+        if frames is not None:
+            dataset = open_bop(frames.folder, frames.split, cloud=cloud)
+            self._real = dataset.of_objects(*(model.number for model in models))
+            known = {model.number: model.name for model in models}
+            for number, found in self._real.objects.items():
+                if known[number] != found.name:
+                    raise InputError(
+                        f"{frames.folder}: object {number} is called {found.name!r} there, and "
+                        f"{known[number]!r} here; take the models from this folder (models: bop)"
+                    )
+
+    def __len__(self) -> int:
+        """Samples of an epoch: each frame once, or as many as there are synthetic views."""
+        if self._frames is None or self._real is None:
+            return len(self.synthetic)
+        return max(1, round(len(self._real) / self._frames.share))
+
+    def _place(self, index: int, generator: torch.Generator) -> int | None:
+        """Choose which instance of the frames a sample shows; None: it is a synthetic view."""
+        if self._frames is None or self._real is None:
+            return None
+        if float(torch.rand((), generator=generator)) >= self._frames.share:
+            return None
+        return shuffled_index(index, len(self._real), self.seed)
+
+
+class TrainingClouds(TrainingViews):
     """A cloud by sample index, synthetic or of a frame.
 
     Args:
@@ -113,15 +153,8 @@ class TrainingClouds:
         seed: int,
         first_alone: int = 0,
     ) -> None:
-        self.cloud, self.seed, self.frames = cloud, seed, frames
+        super().__init__(models, synthetic, frames, cloud, seed)
         self._first_alone = first_alone
-        self.synthetic = Objects(models, synthetic, cloud)
-        self._class_of = {model.name: k for k, model in enumerate(models)}
-        self._real = None if frames is None else open_frames(frames, models, cloud)
-
-    def __len__(self) -> int:
-        """Samples of an epoch: each frame once, or as many as there are synthetic views."""
-        return epoch_samples(self.frames, self._real, len(self.synthetic))
 
     def __getitem__(self, index: int) -> Cloud:
         """Make the sample of an index; one with too few points is replaced by another.
@@ -130,15 +163,14 @@ class TrainingClouds:
             InputError: so many in a row have too few points that the config must be wrong.
         """
         generator = sample_generator(index, self.seed)
-        for attempt in range(_TRIES):
+        for attempt in range(TRIES):
             # Far beyond any training, and the same object.
-            sample = self._sample(index + attempt * len(self._class_of) * 2**32, generator)
-            points = sample.input.points_m
-            if refusal_of(points, self.cloud) is None:
+            sample = self._sample(index + attempt * len(self.models) * 2**32, generator)
+            if refusal_of(sample.input.points_m, self.cloud) is None:
                 number = self._class_of[sample.input.object]
                 return voxelised_cloud(sample, number, self.cloud, generator)
         raise InputError(
-            f"sample {index}: {_TRIES} samples in a row have fewer than "
+            f"sample {index}: {TRIES} samples in a row have fewer than "
             f"{self.cloud.min_points} points; bring the camera nearer (distance_m), or lower "
             "min_points"
         )
@@ -160,13 +192,24 @@ class TrainingClouds:
 
     def _sample(self, index: int, generator: torch.Generator) -> CloudSample:
         # Sample i shows object i modulo their number.
-        index = index * len(self._class_of) if index < self._first_alone else index
-        place = frame_place(self.frames, self._real, index, self.seed, generator)
-        if self._real is None or self.frames is None or place is None:
+        index = index * len(self.models) if index < self._first_alone else index
+        place = self._place(index, generator)
+        if self._real is None or self._frames is None or place is None:
             return self.synthetic.sample(index)
         sample = self._real[place]
-        angle = 2 * math.pi * float(torch.rand((), generator=generator))
-        return _rolled(sample, angle) if self.frames.with_roll else sample
+        angle_rad = 2 * math.pi * float(torch.rand((), generator=generator))
+        if not self._frames.with_roll:
+            return sample
+        # The camera is turned about its optical axis: cloud and pose turn with it.
+        cosine, sine = math.cos(angle_rad), math.sin(angle_rad)
+        turn = torch.tensor([[cosine, -sine, 0.0], [sine, cosine, 0.0], [0.0, 0.0, 1.0]])
+        pose = sample.truth.camera_from_model
+        turned = Rigid(turn @ pose.R.float(), turn @ pose.t_m.float())
+        points_m = sample.input.points_m.float() @ turn.mT
+        return CloudSample(
+            input=dataclasses.replace(sample.input, points_m=points_m),
+            truth=dataclasses.replace(sample.truth, camera_from_model=turned),
+        )
 
 
 def voxelised_cloud(
@@ -186,59 +229,6 @@ def voxelised_cloud(
         class_number=class_number,
         R=turn @ pose.R.float(),
         t_m=turn @ pose.t_m.float(),
-    )
-
-
-def epoch_samples(frames: FramesConfig | None, real: BopDataset | None, synthetic: int) -> int:
-    """Samples of an epoch: each frame once, or as many as there are synthetic views."""
-    if frames is None or real is None:
-        return synthetic
-    return max(1, round(len(real) / frames.share))
-
-
-def frame_place(
-    frames: FramesConfig | None,
-    real: BopDataset | None,
-    index: int,
-    seed: int,
-    generator: torch.Generator,
-) -> int | None:
-    """Choose which instance of the frames a sample shows; None: it is a synthetic view."""
-    if frames is None or real is None or float(torch.rand((), generator=generator)) >= frames.share:
-        return None
-    return shuffled_index(index, len(real), seed)
-
-
-def open_frames(
-    frames: FramesConfig, models: Sequence[ObjectModel], cloud: CloudConfig
-) -> BopDataset:
-    """Open the real frames of a training, of its objects alone."""
-    dataset = open_bop(frames.folder, frames.split, cloud=cloud)
-    dataset = dataset.of_objects(*(model.number for model in models))
-    known = {model.number: model.name for model in models}
-    for number, found in dataset.objects.items():
-        if known[number] != found.name:
-            raise InputError(
-                f"{frames.folder}: object {number} is called {found.name!r} there, and "
-                f"{known[number]!r} here; take the models from this folder (models: bop)"
-            )
-    return dataset
-
-
-def _rolled(sample: CloudSample, angle_rad: float) -> CloudSample:
-    """Turn the camera about its optical axis: cloud and pose turn with it."""
-    cosine, sine = math.cos(angle_rad), math.sin(angle_rad)
-    turn = torch.tensor([[cosine, -sine, 0.0], [sine, cosine, 0.0], [0.0, 0.0, 1.0]])
-    given, pose = sample.input, sample.truth.camera_from_model
-    points_m = given.points_m.float() @ turn.mT
-    turned = Rigid(turn @ pose.R.float(), turn @ pose.t_m.float())
-    return CloudSample(
-        input=CloudInput(name=given.name, points_m=points_m, object=given.object),
-        truth=PoseTruth(
-            camera_from_model=turned,
-            visible_fraction=sample.truth.visible_fraction,
-            is_measured=sample.truth.is_measured,
-        ),
     )
 
 
@@ -263,8 +253,14 @@ def read_models(
     if not config.bop and not config.cad:
         raise InputError("there is no object to learn; name its CAD file (--cad FILE --unit mm)")
     if config.bop:
-        folder = Path(config.bop)
-        numbers = config.objects or _numbers(models_folder(folder))
+        folder, numbers = Path(config.bop), config.objects
+        if not numbers:
+            home = models_folder(folder)
+            files = [path.stem.removeprefix("obj_") for path in home.glob("obj_*.ply")]
+            there = {int(name) for name in files if name.isdigit()} | set(read_models_info(home))
+            numbers = tuple(sorted(there))
+            if not numbers:
+                raise InputError(f"{home}: holds no obj_NNNNNN.ply; put the models there")
         models = tuple(read_bop_models(folder, numbers, config.mesh).values())
     else:
         models = tuple(
@@ -281,15 +277,6 @@ def read_models(
         )
         for model in models
     )
-
-
-def _numbers(home: Path) -> list[int]:
-    known = read_models_info(home)
-    files = [path.stem.removeprefix("obj_") for path in home.glob("obj_*.ply")]
-    found = sorted({int(name) for name in files if name.isdigit()} | set(known))
-    if not found:
-        raise InputError(f"{home}: holds no obj_NNNNNN.ply; put the models there")
-    return found
 
 
 HELD_OUT_SEED = 0x4E1D
@@ -329,56 +316,57 @@ class HeldOut:
         numbers: dict[str, float] = {}
         for occlusion in self.config.occlusions:
             for method, errors in self._errors(network, occlusion).items():
-                place = f"held_out/occluded_{round(100 * occlusion)}/{method}"
-                numbers[f"{place}_add_10"] = float(is_within_diameter(errors).float().mean())
-                numbers[f"{place}_median"] = float(errors.median())
+                numbers |= held_out_numbers(occlusion, method, errors)
         return ValidationResult(numbers=numbers)
 
     def _errors(self, network: DirectionNet, occlusion: float) -> dict[str, Float[Tensor, " n"]]:
-        methods = ["lines", "ransac"] if self.config.with_ransac else ["lines"]
-        found: dict[str, list[float]] = {method: [] for method in methods}
-        for cloud, directions in self._directions(network, self._of(occlusion)):
-            points = cloud.points_m.to(directions)
-            found["lines"].append(self._error(meet_lines(points, directions), cloud))
-            if self.config.with_ransac:
-                found["ransac"].append(self._error(vote_ransac(points, directions), cloud))
-        wanted = self.config.number * len(self.models)
-        missing = [math.inf] * (wanted - len(self._of(occlusion)))
-        return {method: torch.tensor(errors + missing) for method, errors in found.items()}
-
-    def _error(self, vote: Vote, cloud: Cloud) -> float:
-        """ADD to the nearest symmetric pose, in diameters."""
-        model = self.models[cloud.class_number]
-        fit = fit_pose(vote.keypoints_m.cpu(), vote.covariance_m2.cpu(), model.keypoints_m)
-        truth, points = Rigid(cloud.R, cloud.t_m), self._surfaces[cloud.class_number]
-        return _share(fit.camera_from_model, truth, model, points)
-
-    def _directions(
-        self, network: DirectionNet, clouds: Sequence[Cloud]
-    ) -> Iterator[tuple[Cloud, Float[Tensor, "n k 3"]]]:
+        """ADD to the nearest symmetric pose, in diameters, by the method that votes."""
+        methods = {"lines": meet_lines}
+        if self.config.with_ransac:
+            methods["ransac"] = vote_ransac
+        errors: dict[str, list[float]] = {method: [] for method in methods}
+        clouds = self._of(occlusion)
         device = next(network.parameters()).device
         for start in range(0, len(clouds), _TOGETHER):
             part = clouds[start : start + _TOGETHER]
             seen = TrainingClouds.collate(part).seen.to(device)
             outputs = network.directions(seen).float()[..., :3]
-            sizes = [len(cloud.points_m) for cloud in part]
-            yield from zip(part, outputs.split(sizes), strict=True)
+            each = outputs.split([len(cloud.points_m) for cloud in part])
+            for cloud, directions in zip(part, each, strict=True):
+                model = self.models[cloud.class_number]
+                truth, surface_m = Rigid(cloud.R, cloud.t_m), self._surfaces[cloud.class_number]
+                for method, vote_of in methods.items():
+                    vote = vote_of(cloud.points_m.to(directions), directions)
+                    keypoints_m, covariance_m2 = vote.keypoints_m.cpu(), vote.covariance_m2.cpu()
+                    fit = fit_pose(keypoints_m, covariance_m2, model.keypoints_m)
+                    errors[method].append(_share(fit.camera_from_model, truth, model, surface_m))
+        missing = [math.inf] * (self.config.number * len(self.models) - len(clouds))
+        return {method: torch.tensor(some + missing) for method, some in errors.items()}
 
     def _of(self, occlusion: float) -> list[Cloud]:
         if occlusion not in self._clouds:
+            own = self._clouds[occlusion] = []
             objects = held_out_objects(
                 self.models, self._synthetic, self._cloud, self.config, occlusion
             )
-            self._clouds[occlusion] = list(self._voxelised(objects))
+            for index in range(len(objects)):
+                sample = objects[index]
+                if refusal_of(sample.input.points_m, self._cloud) is None:
+                    generator = sample_generator(index, HELD_OUT_SEED)
+                    number = index % len(self.models)
+                    own.append(voxelised_cloud(sample, number, self._cloud, generator))
         return self._clouds[occlusion]
 
-    def _voxelised(self, objects: Objects) -> Iterator[Cloud]:
-        for index in range(len(objects)):
-            sample = objects[index]
-            if refusal_of(sample.input.points_m, self._cloud) is None:
-                generator = sample_generator(index, HELD_OUT_SEED)
-                number = index % len(self.models)
-                yield voxelised_cloud(sample, number, self._cloud, generator)
+
+def held_out_numbers(
+    occlusion: float, method: str, errors: Float[Tensor, " n"]
+) -> dict[str, float]:
+    """Name the share of right ones among errors in diameters, and their median."""
+    place = f"held_out/occluded_{round(100 * occlusion)}/{method}"
+    return {
+        f"{place}_add_10": float(is_within_diameter(errors).float().mean()),
+        f"{place}_median": float(errors.median()),
+    }
 
 
 def held_out_objects(
@@ -463,12 +451,11 @@ def _posed(weights: PoseWeights, objects: Objects) -> tuple[list[PoseEstimate], 
     net = GeoPoseNet(weights, EstimateConfig())
     estimates, errors = [], []
     for start in range(0, len(objects), _CLOUDS_AT_ONCE):
-        samples = [
-            objects.view(i) for i in range(start, min(start + _CLOUDS_AT_ONCE, len(objects)))
-        ]
+        places = range(start, min(start + _CLOUDS_AT_ONCE, len(objects)))
+        samples = [objects.view(place) for place in places]
         found = net.estimate_many([sample.input for sample in samples])
         estimates += found
-        for offset, (estimate, sample) in enumerate(zip(found, samples, strict=True)):
-            model = weights.models[(start + offset) % len(weights.models)]
+        for place, estimate, sample in zip(places, found, samples, strict=True):
+            model = weights.models[place % len(weights.models)]
             errors.append(pose_error(estimate, sample.truth, model))
     return estimates, errors

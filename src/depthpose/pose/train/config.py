@@ -56,7 +56,6 @@ class ModelsConfig:
     """Said whenever the weights are loaded; for licences that bind the user."""
 
     def __post_init__(self) -> None:
-        """Refuse a tolerance that nothing meets, or that everything does."""
         check_settings(self, symmetry_tolerance="(0, 1)")
 
 
@@ -78,7 +77,6 @@ class FramesConfig:
     alone; the depth images of the regressing baseline are not turned."""
 
     def __post_init__(self) -> None:
-        """Refuse no folder, and shares that are none."""
         if not self.folder:
             raise InputError("frames has no folder; name a data set, or leave frames out")
         check_settings(self, share="(0, 1]")
@@ -98,7 +96,6 @@ class HeldOutConfig:
     """Vote by RANSAC too."""
 
     def __post_init__(self) -> None:
-        """Refuse a validation of nothing."""
         check_settings(self, number="[1, inf)", occlusions=OCCLUSIONS)
         if not self.occlusions:
             raise InputError("held_out.occlusions is (); nothing would be measured; take (0, 0.3)")
@@ -169,7 +166,6 @@ class PoseTraining(ViewsTraining):
     """How long."""
 
     def __post_init__(self) -> None:
-        """Refuse an unknown loss and a negative number of views."""
         refuse_unknown("loss", self.loss, POINT_LOSSES)
         check_settings(self, first_alone="[0, inf)")
 
@@ -224,7 +220,6 @@ class DepthImageTraining(ViewsTraining):
     """How long."""
 
     def __post_init__(self) -> None:
-        """Refuse a loss of nothing."""
         check_settings(self, surface_points="[3, inf)")
 
 
@@ -267,7 +262,6 @@ class ImageAugmentConfig:
     it."""
 
     def __post_init__(self) -> None:
-        """Refuse windows and ranges that cannot be."""
         check_settings(self, scale="(0, 10]", flip_share="[0, 1]", jitter="[0, 1)")
         if any(side < 32 or side % 32 for side in self.crop_px):
             raise InputError(
@@ -315,5 +309,4 @@ class SegmentationTraining:
     """Write the weights in 16 bits."""
 
     def __post_init__(self) -> None:
-        """Refuse a loss that ignores the objects."""
         check_settings(self, object_weight="(0, inf)")

@@ -20,13 +20,7 @@ keypoint would outweigh all others, and its direction means nothing."""
 
 
 class Lines(NamedTuple):
-    """Lines that vote for the keypoints of an object.
-
-    Attributes:
-        points: about their mean.
-        directions: of unit length.
-        weights: 0 leaves a line out.
-    """
+    """Lines through points about their mean, of unit directions; a weight of 0 leaves one out."""
 
     points: Float[Tensor, "*batch 1 3 n"]
     directions: Float[Tensor, "*batch k 3 n"]
@@ -97,7 +91,12 @@ def meet_prepared(lines: Lines, centre_m: Float[Tensor, "*batch 1 3"], refinemen
         p, covariance, condition = met(local, n, w, refinements, _NEAREST)
         return Vote(keypoints_m=p + centre_m, covariance_m2=covariance, condition=condition,
                     inlier_share=all_count)  # fmt: skip
-    A, p = _nearest(lines)
+    along, total = (n * local).sum(-2, keepdim=True), w.sum(-1).double()[..., None, None]
+    wn, eye = n * w[..., None, :], torch.eye(3, dtype=torch.float64, device=n.device)
+    # Over the sum of weights, the damping is a pure number.
+    A = (total * eye - (wn @ n.mT).double()) / total
+    b = (local @ w[..., None] - wn @ along.mT).double() / total
+    p = torch.linalg.solve(_damped(A), b).squeeze(-1)
     values = torch.linalg.eigvalsh(A)
     # Of a trace of 2, what lies below is the rounding of float32 sums.
     is_real = values[..., 0] > 1e-7
@@ -106,8 +105,24 @@ def meet_prepared(lines: Lines, centre_m: Float[Tensor, "*batch 1 3"], refinemen
     gradient = offset - n * (n * offset).sum(-2, keepdim=True)
     gradient = gradient * (w / w.sum(-1, keepdim=True))[..., None, :]
     for _ in range(refinements):
-        A, gradient = _score(lines, p)
-        p = p + _short_step(A, gradient.sum(-1).double(), local, p)
+        # The information matrix, and the gradient of each line, over the sum of weights.
+        offset = p.to(n)[..., None] - local
+        distance = offset.square().sum(-2).sqrt_()
+        scale = distance.mean(-1, keepdim=True).clamp(min=_SMALLEST)
+        q = offset / distance.clamp(min=_SMALLEST)[..., None, :]
+        distance = torch.maximum(distance, _NEAREST * scale)
+        cosine = (n * q).sum(-2)
+        pull = w / distance / w.sum(-1, keepdim=True)
+        gradient = (n - q * cosine[..., None, :]) * pull[..., None, :]
+        # Outliers may not turn the matrix negative: each line counts as half at least.
+        amount = pull / distance * cosine.clamp(min=0.5)
+        outer = ((q * amount[..., None, :]) @ q.mT).double()
+        A = amount.sum(-1).double()[..., None, None] * eye - outer
+        step = torch.linalg.solve(_damped(A), gradient.sum(-1).double()[..., None]).squeeze(-1)
+        # Within the distance of the keypoint to the points.
+        spread = local.square().sum(-2).mean(-1).double()
+        limit = (p.square().sum(-1) + spread).sqrt()
+        p = p + step * (limit / step.norm(dim=-1).clamp(min=_SMALLEST)).clamp(max=1.0)[..., None]
     inverse, votes = torch.linalg.inv(_damped(A)), (w > 0).sum(-1)
     # n lines of rank 2 fix 3 unknowns: few lines look surer than they are.
     spare = (2 * votes.double() / (2 * votes - 3).clamp(min=1))[..., None, None]
@@ -118,47 +133,6 @@ def meet_prepared(lines: Lines, centre_m: Float[Tensor, "*batch 1 3"], refinemen
         condition=condition.to(centre_m),
         inlier_share=all_count,
     )
-
-
-def _nearest(lines: Lines) -> tuple[Float64[Tensor, "*b k 3 3"], Float64[Tensor, "*b k 3"]]:
-    local, n, w = lines
-    wn = n * w[..., None, :]
-    along = (n * local).sum(-2, keepdim=True)
-    total = w.sum(-1).double()[..., None, None]
-    A = total * torch.eye(3, dtype=torch.float64, device=n.device) - (wn @ n.mT).double()
-    b = (local @ w[..., None]) - wn @ along.mT
-    # Over the sum of weights, the damping is a pure number.
-    A, b = A / total, b.double() / total
-    return A, torch.linalg.solve(_damped(A), b).squeeze(-1)
-
-
-def _score(
-    lines: Lines, p: Tensor
-) -> tuple[Float64[Tensor, "*b k 3 3"], Float[Tensor, "*b k 3 n"]]:
-    """Give the information matrix, and the gradient of each line, over the sum of weights."""
-    local, n, w = lines
-    offset = p.to(n)[..., None] - local
-    distance = offset.square().sum(-2).sqrt_()
-    scale = distance.mean(-1, keepdim=True).clamp(min=_SMALLEST)
-    q = offset / distance.clamp(min=_SMALLEST)[..., None, :]
-    distance = torch.maximum(distance, _NEAREST * scale)
-    cosine = (n * q).sum(-2)
-    pull = w / distance
-    pull = pull / w.sum(-1, keepdim=True)
-    gradient = (n - q * cosine[..., None, :]) * pull[..., None, :]
-    # Outliers may not turn the matrix negative: each line counts as half at least.
-    amount = pull / distance * cosine.clamp(min=0.5)
-    outer = ((q * amount[..., None, :]) @ q.mT).double()
-    eye = torch.eye(3, dtype=torch.float64, device=n.device)
-    return amount.sum(-1).double()[..., None, None] * eye - outer, gradient
-
-
-def _short_step(A: Tensor, gradient: Tensor, local: Tensor, p: Tensor) -> Float64[Tensor, "*b k 3"]:
-    """Solve for the step, and keep it within the distance of the keypoint to the points."""
-    step = torch.linalg.solve(_damped(A), gradient[..., None]).squeeze(-1)
-    spread = local.square().sum(-2).mean(-1).double()
-    limit = (p.square().sum(-1) + spread).sqrt()
-    return step * (limit / step.norm(dim=-1).clamp(min=_SMALLEST)).clamp(max=1.0)[..., None]
 
 
 def _damped(A: Float64[Tensor, "*b k 3 3"]) -> Float64[Tensor, "*b k 3 3"]:

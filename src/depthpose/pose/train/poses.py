@@ -1,0 +1,402 @@
+"""Training of networks that pose: of directions, and of the regressed depth image."""
+
+import dataclasses
+import shlex
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor, nn
+
+from depthpose.core.checkpoint import bound_facts, file_sha256, find_weights, warn_of_terms
+from depthpose.core.config import config_to_dict
+from depthpose.core.errors import InputError
+from depthpose.core.files import write_json
+from depthpose.core.loop import (
+    Run,
+    Update,
+    ValidationResult,
+    held_out_text,
+    make_adam,
+    releases_folder,
+    sample_generator,
+    write_card,
+)
+from depthpose.core.rigid import Rigid
+from depthpose.core.run import find_rank
+from depthpose.pose.baselines import (
+    DepthCrop,
+    DepthImageNet,
+    PointNet,
+    PointNetConfig,
+    cut_depth,
+    poses_of,
+)
+from depthpose.pose.config import CloudConfig, EstimateConfig, RefusalConfig
+from depthpose.pose.estimator import DepthImageRegressor
+from depthpose.pose.estimator.candidates import near_symmetry_lines
+from depthpose.pose.losses import direction_loss, model_point_loss
+from depthpose.pose.mesh import sample_surface, symmetry_transforms
+from depthpose.pose.network import ResUNet, fold_norms, unfold_norms
+from depthpose.pose.sparse import Voxels
+from depthpose.pose.train.clouds import (
+    TRIES,
+    CloudBatch,
+    HeldOut,
+    TrainingClouds,
+    TrainingViews,
+    held_out_numbers,
+    held_out_objects,
+    pose_error,
+    read_models,
+    score_held_out,
+    table_text,
+)
+from depthpose.pose.train.config import DepthImageTraining, PoseTraining, ViewsTraining
+from depthpose.pose.types import ObjectModel, ViewSample
+from depthpose.pose.weights import (
+    AnyNetwork,
+    DirectionNet,
+    PoseWeights,
+    read_pose_network,
+    read_pose_weights,
+    write_pose_weights,
+)
+
+_SYMMETRY_STEP = 0.05
+"""Turns about a continuous axis are tried every 5.7 degrees; the vote's own error is larger."""
+
+
+class PoseTask:
+    """Directions from each point to the keypoints of its object (thesis, 3.3).
+
+    A symmetric object's copy of the truth is chosen once for each cloud.
+    """
+
+    def __init__(
+        self,
+        network: DirectionNet,
+        models: Sequence[ObjectModel],
+        config: PoseTraining,
+        held_out: HeldOut | None,
+    ) -> None:
+        self.config, self.held_out = config, held_out
+        self.network = network.train()
+        self.modules: dict[str, nn.Module] = {"network": network}
+        self.optimizers = {"network": (make_adam(network.parameters(), config.adam), config.adam)}
+        self._copies_m = keypoint_copies(models)
+
+    def step(self, batch: CloudBatch) -> Iterator[Update]:
+        """One update: all clouds at once."""
+        directions = self.network.directions(batch.seen).float()
+        copies = self._copies_m.to(batch.R)[batch.class_of]
+        copies_m = copies @ batch.R.mT[:, None] + batch.t_m[:, None, None]
+        loss = direction_loss(
+            directions, batch.points_m, copies_m, batch.instance, self.config.loss
+        )
+        yield Update("network", loss, {"directions": loss.detach()})
+
+    def validate(self) -> ValidationResult:
+        """Pose held-out views with the current network."""
+        if self.held_out is None:
+            return ValidationResult()
+        self.network.eval()
+        result = self.held_out.look(self.network)
+        self.network.train()
+        return result
+
+
+def keypoint_copies(models: Sequence[ObjectModel]) -> Float[Tensor, "classes copies k 3"]:
+    """Keypoints of each object under each of its symmetries; the first is repeated to the most."""
+    turns = symmetric_copies(models, _SYMMETRY_STEP)
+    keypoints_m = torch.stack([model.keypoints_m.double() for model in models])
+    return (keypoints_m[:, None] @ turns.R.mT + turns.t_m[:, :, None]).float()
+
+
+def symmetric_copies(models: Sequence[ObjectModel], step_rad: float) -> Rigid:
+    """``model_from_model`` of each object (classes, copies); the identity fills the shorter."""
+    every = [symmetry_transforms(model.symmetries, step_rad).double() for model in models]
+    most = max(len(copies.R) for copies in every)
+    R = torch.eye(3).double().repeat(len(models), most, 1, 1)
+    t_m = torch.zeros(len(models), most, 3).double()
+    for k, copies in enumerate(every):
+        R[k, : len(copies.R)], t_m[k, : len(copies.R)] = copies.R, copies.t_m
+    return Rigid(R, t_m)
+
+
+_TURNS_ON_CARD = 3
+"""Turns of an object that look nearly alike, on a card."""
+
+
+def claim_run(config: Any, run: Run, files: Sequence[str] = ()) -> None:  # noqa: ANN401
+    """Make the folder this config's own."""
+    more: dict[str, Any] = {"sha256": [file_sha256(Path(path)) for path in files]}
+    if config.start is not None:
+        more["start_sha256"] = file_sha256(find_weights(config.start))
+        warn_of_terms(bound_facts({}, [config.start]))
+    weights = ("pose", "pointnet", "depth-image", "segmentation")
+    run.claim(config, weights, more, without=("held_out", "calibration"))
+
+
+def packed(
+    network: AnyNetwork, models: tuple[ObjectModel, ...], config: ViewsTraining
+) -> PoseWeights:
+    """Put a trained network and its objects together, with what the card says of them."""
+    frames = "" if config.frames is None else f"{Path(config.frames.folder).name} and "
+    names = ", ".join(model.name for model in models)
+    facts = {"trained_on": f"{frames}synthetic views of {names}", "licence": config.models.licence}
+    if config.models.terms:
+        facts["terms"] = config.models.terms
+    return PoseWeights(
+        network=network.cpu().eval(),
+        models=models,
+        cloud=config.cloud,
+        refusal=RefusalConfig(),
+        facts=with_origin(facts, config),
+    )
+
+
+def card_facts(weights: PoseWeights) -> dict[str, str]:
+    """Put before the facts of weights their objects, sizes, and turns that look nearly alike."""
+    known = ", ".join(f"{m.name} ({1000 * m.diameter_m:.0f} mm)" for m in weights.models)
+    lines = {model.name: near_symmetry_lines(model) for model in weights.models}
+    near = "; ".join(
+        f"{name}: {', '.join(some[:_TURNS_ON_CARD])}" for name, some in lines.items() if some
+    )
+    return {"objects": known} | ({"nearly_alike": near} if near else {}) | dict(weights.facts)
+
+
+def with_origin(facts: Mapping[str, str], config: Any) -> dict[str, str]:  # noqa: ANN401
+    """Add to a card the stage, and the weights that it began with: their terms bind it too."""
+    origin = {**facts, "stage": type(config).__name__}
+    if config.start is None:
+        return origin
+    return bound_facts({**origin, "began_with": Path(config.start).stem}, [config.start])
+
+
+def with_classes(
+    network: Any,  # noqa: ANN401
+    models: Sequence[ObjectModel],
+    cloud: CloudConfig,
+) -> Any:  # noqa: ANN401
+    """Give a network's config the classes and keypoints of the objects, the inputs of the cloud."""
+    sizes = {
+        "classes": len(models),
+        "keypoints": len(models[0].keypoints_m),
+        "inputs": cloud.features,
+    }
+    known = {field.name for field in dataclasses.fields(network)}
+    return dataclasses.replace(network, **{k: v for k, v in sizes.items() if k in known})
+
+
+_IMAGE_SYMMETRY_STEP = 0.2
+"""Turns about a continuous axis are tried every 23 degrees: half of that is far below the error
+that this network is left with."""
+_MEASURED = (
+    "Synthetic views that no training saw, by occluded %, posed without ICP: the share with an "
+    "ADD, to the nearest symmetric pose, below a tenth of the diameter (add_10), and its median in "
+    "diameters."
+)
+"""What the numbers of validation are."""
+
+
+class CropSample(NamedTuple):
+    """A crop, or a batch of them, with truth."""
+
+    crop: DepthCrop
+    class_of: Int[Tensor, "*b"]
+    R: Float[Tensor, "*b 3 3"]
+    t_m: Float[Tensor, "*b 3"]
+
+
+class TrainingCrops(TrainingViews):
+    """A crop of a view, synthetic or of a frame, by sample index."""
+
+    def __init__(
+        self, models: Sequence[ObjectModel], config: DepthImageTraining, seed: int
+    ) -> None:
+        super().__init__(models, config.objects, config.frames, config.cloud, seed)
+        self.config = config.network
+
+    def __getitem__(self, index: int) -> CropSample:
+        """Make the sample of an index; one with too few pixels is replaced by another."""
+        for attempt in range(TRIES):
+            # Far beyond any training, and the same object.
+            place = index + attempt * len(self.models) * 2**32
+            frame = self._place(place, sample_generator(place, self.seed))
+            if self._real is None or frame is None:
+                sample = self.synthetic.view(place)
+            else:
+                sample = self._real.view(self._real.instances[frame])
+            number = self._class_of[sample.input.object]
+            crop = cut_depth(sample.input, self.config, self.models[number].diameter_m)
+            if crop is not None:
+                pose = sample.truth.camera_from_model
+                return CropSample(crop, torch.tensor(number), pose.R.float(), pose.t_m.float())
+        raise InputError(
+            f"{TRIES} views in a row have fewer than {self.config.min_points} masked "
+            "pixels with a depth; bring the camera nearer (distance_m), or lower min_points"
+        )
+
+
+class DepthImageTask:
+    """ADD of the regressed pose against the nearest symmetric copy of the truth."""
+
+    def __init__(
+        self, network: DepthImageNet, models: tuple[ObjectModel, ...], config: DepthImageTraining
+    ) -> None:
+        self.config, self.models = config, models
+        self.network = network.train()
+        self.modules: dict[str, nn.Module] = {"network": network}
+        self.optimizers = {"network": (make_adam(network.parameters(), config.adam), config.adam)}
+        self._points_m = surface_points(models, config.surface_points)
+        self._copies = symmetric_copies(models, _IMAGE_SYMMETRY_STEP).float()
+        self._diameter_m = torch.tensor([model.diameter_m for model in models])
+        self._views: dict[float, list[ViewSample]] = {}
+
+    def step(self, batch: CropSample) -> Iterator[Update]:
+        """One update: regress, move the model's points, compare; in diameters."""
+        which, device = batch.class_of, batch.R.device
+        outputs = self.network(batch.crop.image, which).float()
+        copies = Rigid(self._copies.R.to(device)[which], self._copies.t_m.to(device)[which])
+        points_m = self._points_m.to(device)[which]
+        truth = Rigid(batch.R, batch.t_m)
+        error_m = model_point_loss(poses_of(outputs, batch.crop), truth, points_m, copies)
+        yield Update("network", (error_m / self._diameter_m.to(device)[which]).mean(), {})
+
+    @torch.no_grad()
+    def validate(self) -> ValidationResult:
+        """Pose held-out views with the current network, without ICP."""
+        cpu = DepthImageNet(self.network.config)
+        cpu.load_state_dict(self.network.state_dict())
+        weights = PoseWeights(network=cpu, models=self.models, cloud=self.config.cloud,
+                              refusal=RefusalConfig(), facts={})  # fmt: skip
+        regressor = DepthImageRegressor(weights, EstimateConfig(with_icp=False))
+        numbers: dict[str, float] = {}
+        for occlusion in self.config.held_out.occlusions:
+            if occlusion not in self._views:
+                c = self.config
+                drawn = held_out_objects(self.models, c.objects, c.cloud, c.held_out, occlusion)
+                self._views[occlusion] = [drawn.view(index) for index in range(len(drawn))]
+            views = self._views[occlusion]
+            found = regressor.estimate_many([view.input for view in views])
+            errors = torch.tensor([
+                pose_error(estimate, view.truth, self.models[index % len(self.models)])
+                for index, (estimate, view) in enumerate(zip(found, views, strict=True))
+            ])  # fmt: skip
+            numbers |= held_out_numbers(occlusion, "regressed", errors)
+        return ValidationResult(numbers=numbers)
+
+
+def surface_points(models: Sequence[ObjectModel], count: int) -> Float[Tensor, "classes n 3"]:
+    """Points of each object's surface; those of a sparse model of points come again."""
+    every = [sample_surface(model, count)[0] for model in models]
+    return torch.stack([points[torch.arange(count) % len(points)] for points in every])
+
+
+_STATISTICS_CLOUDS = 64
+"""Clouds from which batch norm statistics, lost by folding, are computed again."""
+
+
+@releases_folder
+def train_pose(config: PoseTraining | DepthImageTraining, run: Run) -> Path:
+    """Train a network that poses, ours or a baseline; give its weights file.
+
+    Args:
+        config: of the training; the class of its network decides which it is.
+        run: where.
+
+    Raises:
+        InputError: settings, models or weights to begin with that do not fit.
+    """
+    torch.manual_seed(config.loop.seed)
+    models = read_models(config.models, run.on_message)
+    config = dataclasses.replace(config, network=with_classes(config.network, models, config.cloud))
+    if isinstance(config, DepthImageTraining):
+        word, samples = "depth-image", TrainingCrops(models, config, config.loop.seed)
+        network = DepthImageNet(config.network)
+        task = DepthImageTask(network, models, config)
+    else:
+        samples = TrainingClouds(
+            models,
+            config.objects,
+            config.frames,
+            config.cloud,
+            config.loop.seed,
+            first_alone=config.first_alone,
+        )
+        if config.loop.workers > 1 and (config.frames is None or config.frames.share < 1):
+            samples.synthetic.draw_stored(config.loop.workers)
+        is_pointnet = isinstance(config.network, PointNetConfig)
+        word = "pointnet" if is_pointnet else "pose"
+        network = PointNet(config.network) if is_pointnet else ResUNet(config.network)
+        held_out = HeldOut(models, config.objects, config.cloud, config.held_out)
+        task = PoseTask(network, models, config, held_out)
+    if config.start is not None:
+        _start_from(network, config.start, samples)
+    claim_run(config, run, config.models.cad)
+    seconds = run.train(task, samples, config.loop)
+    path = run.folder / f"{word}.safetensors"
+    if run.on_message is not None and isinstance(config, PoseTraining):
+        run.on_message("trained; now it is measured on synthetic views: a minute or more")
+    if find_rank().rank:
+        return path  # statistics of batch norm are rank 0's, and so is the file
+    learnt = fold_norms(network) if isinstance(network, ResUNet) else network
+    write_pose_weights(path, packed(learnt, models, config), with_half=config.with_half)
+    weights = read_pose_weights(path)  # as the file holds them: 16 bits round them
+    if isinstance(config, DepthImageTraining):
+        measured = held_out_text(run.folder, _MEASURED)
+    else:
+        table = score_held_out(weights, config.objects, config.held_out)
+        write_json(path.with_suffix(".json"), {"held_out": table})
+        measured = table_text(table)
+    cad = [word for file in config.models.cad for word in ("--cad", file)]
+    unit = ["--unit", config.models.unit] if cad and config.models.unit else []
+    command = shlex.join(["pose", "train", "--what", word, *cad, *unit])
+    write_card(path, command, seconds, card_facts(weights), measured)
+    return path
+
+
+def _start_from(network: AnyNetwork, start: str, samples: TrainingViews) -> None:
+    """Copy weights; of other objects, all but the last layer, except of a depth image's.
+
+    Written weights are folded: they have no norms, but biases. Batch norm takes both up. New
+    input features of a voxel get weights of zero.
+    """
+    found = read_pose_network(find_weights(start))
+    if isinstance(network, DepthImageNet):
+        if found.config != network.config:
+            raise InputError(
+                f"{start}: holds {found.config}, but the config says {network.config}. Give "
+                "the config the weights' own."
+            )
+        network.load_state_dict(found.state_dict())
+        return
+    if isinstance(found, ResUNet) and isinstance(network, ResUNet):
+        more = network.config.inputs - found.config.inputs
+        if more > 0:
+            state, first = found.state_dict(), "down.0.conv.weight"
+            silent = state[first].new_zeros(len(state[first]), more, state[first].shape[2])
+            found = ResUNet(dataclasses.replace(found.config, inputs=network.config.inputs))
+            found.load_state_dict({**state, first: torch.cat([state[first], silent], 1)})
+            found.eval()
+    wanted, given = config_to_dict(network.config), config_to_dict(found.config)
+    has_norms = isinstance(network, ResUNet) and network.config.norm == "batch"
+    free = ("classes", "norm", "with_bias") if has_norms else ("classes",)
+    for name, value in wanted.items():
+        if name not in free and given.get(name) != value:
+            raise InputError(
+                f"{start}: was trained with {name} = {given.get(name)!r}, but the config says "
+                f"{value!r}. Give the config the weights' own."
+            )
+    if has_norms and isinstance(network, ResUNet) and isinstance(found, ResUNet):
+        assert isinstance(samples, TrainingClouds)
+        batch = samples.collate([samples[index] for index in range(_STATISTICS_CLOUDS)])
+        unfold_norms(found, network, Voxels.from_points(batch.coordinates, batch.features))
+        return
+    state = found.state_dict()
+    if found.config.classes != network.config.classes:
+        state |= {k: v for k, v in network.state_dict().items() if k.startswith("final.")}
+    network.load_state_dict(state)
