@@ -12,8 +12,8 @@ A synthetic table has two to all of the objects, each at most once, between othe
 sensor's errors. An instance counts if half its silhouette and 200 pixels are visible. Right is an
 answer of that object with ADD (ADD-S where symmetries are declared or were found) below 10 % of the
 diameter; an answer is wrong where neither it nor an alternative that it names fits an instance,
-however occluded. A pile has 20 of one object, each dropped straight down at a random turn until it
-touches; of these an instance counts if 70 % of its silhouette is visible.
+however occluded. A pile has 20 of one object; of these an instance counts if 70 % of its silhouette
+is visible.
 """
 
 import argparse
@@ -27,17 +27,13 @@ import torch
 from depthpose.core.camera import Camera
 from depthpose.core.checkpoint import find_weights
 from depthpose.core.files import read_depth_png, read_json
-from depthpose.core.render import rasterize
 from depthpose.core.rigid import Rigid
-from depthpose.pose.augment import measure as measure_depth
-from depthpose.pose.augment import random_rotation
 from depthpose.pose.config import ObjectsConfig
 from depthpose.pose.datasets import open_bop
 from depthpose.pose.estimator import GeoPoseNet, Registration
 from depthpose.pose.mesh import read_model, sample_surface, with_found_symmetries
 from depthpose.pose.metrics import add_share
 from depthpose.pose.synthetic import make_frames
-from depthpose.pose.synthetic.views import drawn_triangles
 from depthpose.pose.types import ObjectModel, PoseEstimate
 from depthpose.report.page import markdown_table
 
@@ -67,66 +63,19 @@ class Frame(NamedTuple):
     known: list[ObjectModel] | None = None
 
 
-def synthetic_tables(models: Sequence[ObjectModel], number: int) -> Iterator[Frame]:
-    """Generate tables of another seed than any training."""
-    config = ObjectsConfig(seed=SEED, distance_m=(0.6, 1.0))
+def synthetic_frames(models: Sequence[ObjectModel], number: int, pile: int) -> Iterator[Frame]:
+    """Generate tables, or piles of so many, of another seed than any training."""
+    config = ObjectsConfig(seed=SEED, distance_m=(0.6, 1.0), frame_pile=pile)
+    least = 0.7 if pile else 0.5
     by_number = {model.number: model for model in models}
     for frame in make_frames(models, config, number):
         shown = []
         for thing in frame.objects:
             pixels = int(thing.visible.sum())
-            counts = pixels >= 200 and pixels >= 0.5 * int(thing.silhouette.sum())
+            counts = pixels >= 200 and pixels >= least * int(thing.silhouette.sum())
             shown.append(Shown(by_number[thing.number], thing.camera_from_model, counts))
-        yield Frame(f"table {frame.number}", frame.depth_m, frame.K, shown)
-
-
-def piles(models: Sequence[ObjectModel], number: int) -> Iterator[Frame]:
-    """Drop 20 of one object, another in each pile, into a heap on a table."""
-    config = ObjectsConfig()
-    K = torch.tensor([[572.4, 0, 320], [0, 573.6, 240], [0, 0, 1]]).double()
-    for index in range(number):
-        model = models[index % len(models)]
-        generator = torch.Generator().manual_seed(SEED + index)
-        triangles, poses = drawn_triangles(model), dropped(model, generator)
-        distance_m = 0.6 + 0.4 * float(torch.rand((), generator=generator))
-        down = torch.diag(torch.tensor([1.0, -1.0, -1.0]))
-        camera = Rigid(down, torch.tensor([0.0, 0.0, distance_m]))
-        poses = [camera @ pose for pose in poses]
-        corners = [pose.apply(triangles) for pose in poses]
-        table = torch.tensor([[-2.0, -2, 0], [2, -2, 0], [2, 2, 0], [-2, 2, 0]])
-        corners.append(camera.apply(table[torch.tensor([[0, 1, 2], [0, 2, 3]])]))
-        drawn = rasterize(torch.cat(corners), K, 640, 480, with_barycentric=False)
-        owner = torch.cat([torch.full((len(c),), k) for k, c in enumerate(corners)])
-        seen = torch.where(drawn.primitive >= 0, owner[drawn.primitive.clamp(min=0)], -1)
-        shown = []
-        for k, pose in enumerate(poses):
-            alone = rasterize(corners[k], K, 640, 480, with_barycentric=False).primitive >= 0
-            visible = int((seen == k).sum())
-            counts = visible >= 200 and visible >= 0.7 * int(alone.sum())
-            shown.append(Shown(model, pose, counts))
-        depth_m = measure_depth(drawn.depth_m, (572.4, 573.6), config.sensor, generator)
-        yield Frame(f"pile {index} {model.name}", depth_m, K, shown)
-
-
-def dropped(model: ObjectModel, generator: torch.Generator, number: int = 20) -> list[Rigid]:
-    """Let copies fall straight down, each until it touches the table or what lies there."""
-    cell_m, reach_m = model.diameter_m / 60, 1.3 * model.diameter_m
-    points_m = sample_surface(model, 20_000)[0]
-    side = int(2 * (reach_m + model.diameter_m) / cell_m) + 2
-    top_m, poses = torch.zeros(side * side), list[Rigid]()
-    for _ in range(number):
-        R = random_rotation(generator).float()
-        middle_m = (points_m.amin(0) + points_m.amax(0)) / 2
-        across_m = reach_m * (2 * torch.rand(2, generator=generator) - 1)
-        turned_m = (points_m - middle_m) @ R.mT
-        cell = ((turned_m[:, :2] + across_m) / cell_m).floor().long() + side // 2
-        column, row = cell.unbind(-1)
-        place, low_m = row * side + column, turned_m[:, 2]
-        height_m = float((top_m[place] - low_m).max())
-        top_m = top_m.scatter_reduce(0, place, low_m + height_m, "amax")
-        shift_m = torch.tensor([*across_m.tolist(), height_m])
-        poses.append(Rigid(R, shift_m - R @ middle_m))
-    return poses
+        known = None if pile else list(models)
+        yield Frame(f"frame {frame.number}", frame.depth_m, frame.K, shown, known)
 
 
 def real_frames(folder: Path, models: Sequence[ObjectModel] | None) -> Iterator[Frame]:
@@ -228,15 +177,12 @@ def main() -> None:
         if words.real:
             frames = real_frames(words.real, None if words.register else models)
         else:
-            frames = piles(models, words.piles) if words.piles else synthetic_tables(
-                models, words.tables)  # fmt: skip
+            frames = synthetic_frames(models, words.piles or words.tables, 20 * bool(words.piles))
         rows, alone = [], bool(words.register and words.real)
         for frame in (part for whole in frames for part in searches(whole, alone)):
             height, width = frame.depth_m.shape
             camera = Camera(width=width, height=height, K=frame.K)
             known = frame.known or [thing.model for thing in frame.shown]
-            if not words.real and not words.piles:
-                known = list(models)
             used = registration(known) if words.register else net
             asked = [model.name for model in known if model.name in used.objects]
             began, cpu = time.perf_counter(), time.process_time()
