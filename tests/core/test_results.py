@@ -48,10 +48,15 @@ def test_whatever_is_damaged_is_noticed(
     assert is_whole(tmp_path, "other", ["other.npy"])
 
 
-def test_a_result_without_a_note_is_finished_where_its_last_file_is(tmp_path: Path) -> None:
-    (tmp_path / "b.npy").write_bytes(b"1")
-    assert is_whole(tmp_path, "b", ["b.npy"])
-    assert not is_whole(tmp_path, "b", ["b.npy", "b.ply"])
+@pytest.mark.parametrize("damage", [Path.unlink, lambda file: os.truncate(file, 9)])
+def test_a_result_of_which_the_note_is_lost_is_made_again(
+    tmp_path: Path, damage: Callable[[Path], object]
+) -> None:
+    make(tmp_path)
+    damage(tmp_path / RESULTS)
+    assert not is_whole(tmp_path, "a", ["a.npy"]), "no file is known to be whole"
+    make(tmp_path)
+    assert is_whole(tmp_path, "a", ["a.npy"])
 
 
 def test_what_was_not_noted_is_not_finished_with_it(tmp_path: Path) -> None:

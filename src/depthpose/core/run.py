@@ -493,13 +493,11 @@ def is_whole(folder: Path, name: str, needed: Collection[str]) -> bool:
     Args:
         folder: of the results.
         name: of the result.
-        needed: files, relative to the folder, without which it is not finished. Where nothing is
-            noted of the result, they alone decide: they are written last, and whole.
+        needed: files, relative to the folder, without which it is not finished. Of a result of
+            which nothing is noted, as after a loss of the notes, no file is known to be whole.
     """
-    noted = _results(folder).get(name)
-    if noted is None:
-        return all((folder / file).is_file() for file in needed)
-    if not noted.keys() >= set(needed):
+    noted = _results(folder).get(name, {})
+    if not noted or not noted.keys() >= set(needed):
         return False
     if not all(is_unchanged(folder / file, stamp) for file, stamp in noted.items()):
         return False
