@@ -166,6 +166,13 @@ def test_brackets_in_the_name_of_a_folder_are_no_pattern(tmp_path: Path) -> None
     assert [Path(path).name for path in found] == ["a.PNG", "b.tif"]
 
 
+def test_pictures_that_are_not_read_are_named(tmp_path: Path) -> None:
+    for name in ("a.png", "b.JFIF", "c.gif", "d.HEIC", "e.avif", ".f.heic", "times.txt"):
+        (tmp_path / name).touch()
+    with pytest.warns(Notice, match=r"2 files are left out, d\.HEIC first: save them as PNG"):
+        assert [p.name for p in list_images(tmp_path)] == ["a.png", "b.JFIF", "c.gif"]
+
+
 @pytest.mark.parametrize("wanted", ["", "nothing", "*.bmp", "empty"])
 def test_listing_nothing_names_what_was_sought(tmp_path: Path, wanted: str) -> None:
     (tmp_path / "empty").mkdir()

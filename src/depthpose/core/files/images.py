@@ -27,9 +27,18 @@ from depthpose.core.files.disk import (
     write_bytes,
 )
 
-WRITTEN_SUFFIXES = (".png", ".jpg", ".jpeg")  # suffixes of pictures that can be written
-LISTED_SUFFIXES = (*WRITTEN_SUFFIXES, ".tif", ".tiff", ".bmp", ".ppm", ".pgm", ".pnm", ".webp")
+WRITTEN_SUFFIXES = (".png", ".jpg", ".jpeg")
+"""Suffixes of pictures that can be written."""
+LISTED_SUFFIXES = (
+    *WRITTEN_SUFFIXES, ".jpe", ".jfif", ".tif", ".tiff", ".bmp", ".ppm", ".pgm", ".pnm", ".pbm",
+    ".gif", ".apng", ".webp",
+)  # fmt: skip
 """Suffixes of pictures in a listed folder; a file that is named may have any."""
+_UNREAD = re.compile(
+    r"\.(heic|heif|avif|jp2|j2k|jxl|tga|dib|exr|hdr|dng|cr[23w]|nef|arw|orf|rw2|raw|pfm|svg|psd)",
+    re.IGNORECASE,
+)
+"""Suffixes of pictures that are not read: in a folder they are named."""
 FAST_PNG = {"compress_level": 1}
 """Four times faster than zlib's usual 6 and a third larger at most: at 6, writing the pictures of
 an estimate took as long as the estimate."""
@@ -223,6 +232,10 @@ def list_images(path: AnyPath) -> list[Path]:
         raise InputError(f"{str(path)!r}: cannot be listed: {error}") from error
     shown = (p for p in files if p.suffix.lower() in LISTED_SUFFIXES and p.name[0] != ".")
     pictures = sorted(shown, key=natural_order)
+    unread = [p.name for p in files if _UNREAD.fullmatch(p.suffix) and p.name[0] != "."]
+    if unread and pictures:
+        said = f"{path}: {len(unread)} files are left out, {min(unread)} first: save them as PNG"
+        warnings.warn(said, Notice, stacklevel=2)
     if not pictures:
         raise InputError(
             f"{path}: no {', '.join(LISTED_SUFFIXES)} file there; "
