@@ -48,6 +48,11 @@ def test_a_package_that_is_not_there_is_not_a_package_that_does_not_load(
     with pytest.raises(InputError, match=r"is installed and does not load: libusb-1\.0\.so\.0: "):
         import_open3d("registration")
 
+    full = "libopenblas.so: failed to map segment from shared object"  # under ulimit -v
+    (tmp_path / "open3d.py").write_text(f"raise ImportError({full!r}, name='open3d')\n")
+    with pytest.raises(InputError, match=r"needs open3d: the memory is full \(libopenblas"):
+        import_open3d("registration")
+
 
 @pytest.mark.parametrize(
     "error",

@@ -86,6 +86,8 @@ def import_extra(module: str, package: str, extra: str, purpose: str) -> Any:  #
         names = (module, module.partition(".")[0])
         if isinstance(error, ModuleNotFoundError) and error.name in names:
             raise MissingExtraError(package, extra, purpose) from error
+        if is_of_memory(error):
+            raise InputError(f"{purpose} needs {package}: {full_memory(error)}") from error
         raise InputError(
             f"{purpose} needs {package}, which is installed and does not load: {error}; a library "
             "of the system is missing, or the package is damaged"
