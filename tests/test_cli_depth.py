@@ -467,6 +467,7 @@ def test_one_image_of_another_camera_stops_no_other_of_its_batch(
         (["--fov", "90", "--known-distance", "1,2"], "write X,Y,METRES, such as 640,300,12.5"),
         (["--fov", "90", "--camera-height", "150"], "--camera-height 150: give 0.1 to 20 metres"),
         (["--fov", "90", "--camera-tilt", "-80"], "--camera-tilt -80: give -45 to 45 degrees"),
+        (["--fov", "90", "--camera-tilt", "-8"], "give the height, or omit the tilt"),
         (
             ["--fov", "90", "--camera-height", "1.4", "--known-distance", "1,2,3"],
             "both set the scale; omit one",

@@ -63,6 +63,14 @@ class Lens:
     camera: Camera | FieldOfView | float
     scale: ScaleOptions = field(default_factory=ScaleOptions)
 
+    def __post_init__(self) -> None:
+        mount_m = self.scale.camera_height or getattr(self.camera, "mount_height_m", None)
+        if self.scale.camera_tilt is not None and mount_m is None:
+            raise InputError(
+                "--camera-tilt says where the road is together with --camera-height, or the "
+                "camera file's mount_height_m; give the height, or omit the tilt"
+            )
+
     def input_of(self, name: str, left: Tensor | Path, right: Path | None = None) -> StereoInput:
         """Make the input of an image or a pair, read already or not."""
         image = read_image(left) if isinstance(left, Path) else left
