@@ -5,12 +5,14 @@ from pathlib import Path
 
 import pytest
 import torch
+from PIL import Image
 
 from depthpose.core.camera import Camera, StereoRig, write_camera
-from depthpose.core.errors import InputError
+from depthpose.core.errors import InputError, Notice
 from depthpose.core.files import write_depth_png, write_disparity_png, write_image, write_map
-from depthpose.depth.datasets import Dataset, open_dataset
-from depthpose.depth.disparity import depth_from_disparity
+from depthpose.core.results import note_result
+from depthpose.depth.datasets import Dataset, check_dataset, open_dataset
+from depthpose.depth.disparity import depth_from_disparity, disparity_advice
 from depthpose.depth.estimator import FakestereoNet
 from depthpose.depth.evaluate import (
     Measured,
@@ -123,6 +125,69 @@ def test_a_prediction_that_is_missing_is_not_called_a_truth(alone: Dataset, tmp_
     write_map(tmp_path / "a.disparity_px.npy", torch.full((H, W), 4.0))
     with pytest.raises(InputError, match=r"a: no calibration of a pair, .*a\.depth_m\.npy"):
         evaluate(alone, tmp_path, "eigen-raw-camera")
+
+
+@pytest.mark.parametrize("ending", ["depth_m.NPY", "depth_m.PFM", "PNG"])
+def test_a_prediction_in_capitals_is_read(alone: Dataset, tmp_path: Path, ending: str) -> None:
+    write = write_depth_png if ending == "PNG" else write_map
+    write(tmp_path / "p" / f"a.{ending.lower()}", torch.full((H, W), 10.0))
+    (tmp_path / "p" / f"a.{ending.lower()}").rename(tmp_path / "p" / f"a.{ending}")
+    assert evaluate(alone, tmp_path / "p", "eigen-raw-camera").rows[0].metrics["abs_rel"] == 0
+
+
+def test_negative_depth_is_refused(alone: Dataset, tmp_path: Path) -> None:
+    write_map(tmp_path / "a.depth_m.npy", torch.full((H, W), -10.0))
+    with pytest.raises(InputError, match=r"a\.depth_m\.npy: its depth is negative; save metres"):
+        evaluate(alone, tmp_path, "eigen-raw-camera")
+
+
+def test_what_a_poor_estimate_could_be_too_is_a_notice() -> None:
+    true_px = 2 + torch.rand(40, 50)
+    for factor, said in (
+        (256 / 1000, "3.91 times .* PNG of millimetres"),
+        (1000 / 256, "its truth a PNG of millimetres"),
+        (16.0, "pixels x 16"),
+    ):
+        with pytest.warns(Notice, match=said):
+            assert disparity_advice(factor * true_px, true_px) is None
+    with pytest.warns(Notice, match="is it inverse depth"):
+        assert disparity_advice(6 / true_px, true_px) is None
+    for fair in (1.2 * true_px, true_px + torch.randn(40, 50) / 4, torch.full((40, 50), 3.0)):
+        assert disparity_advice(fair, true_px) is None
+
+
+@pytest.mark.parametrize("unknown", [0.0, -1.0, 64.0, 65535.0, 1e30])
+@pytest.mark.parametrize("kind", ["npy", "pfm", "tif"])
+def test_what_no_disparity_can_be_is_no_truth(
+    pairs: Dataset, tmp_path: Path, unknown: float, kind: str
+) -> None:
+    home = tmp_path / "data"
+    for k, name in enumerate("ab"):
+        (home / "disp_occ" / f"{name}.png").unlink()
+        true_px = truth_px(k)
+        true_px[:, 20:] = unknown
+        if kind == "tif":
+            Image.fromarray(true_px.numpy()).save(home / "disp_occ" / f"{name}.tif")
+        else:
+            write_map(home / "disp_occ" / f"{name}.{kind}", true_px)
+    folder = write_predictions(tmp_path / "p", lambda px: px)
+    found = evaluate(open_dataset(home), folder, "kitti-2015")
+    assert found.rows[0].metrics["epe_px"] == 0
+    assert {row.pixels for row in found.per_frame} == {20 * H}
+
+
+def test_views_with_numbered_names_are_pairs_and_others_are_named(tmp_path: Path) -> None:
+    for name in ("left_0001", "left_0010"):
+        write_image(tmp_path / "left" / f"{name}.png", torch.rand(3, H, W))
+        write_image(
+            tmp_path / "right" / f"{name.replace('left', 'right')}.png", torch.rand(3, H, W)
+        )
+    write_camera(tmp_path / "camera.json", rig())
+    partners = {f.name: f.right.name for f in open_dataset(tmp_path).frames if f.right}
+    assert partners == {"left_0001": "right_0001.png", "left_0010": "right_0010.png"}
+    (tmp_path / "right/right_0010.png").rename(tmp_path / "right/right_0011.png")
+    (problem,) = [p for p in check_dataset(tmp_path).problems if p.kind == "missing"]
+    assert (problem.path.name, problem.message[:31]) == ("right", "holds no file of a frame's name")
 
 
 def test_a_png_of_kitti_is_disparity_where_disparity_is_measured(
@@ -307,9 +372,10 @@ def test_predicting_goes_on_where_it_stopped(pairs: Dataset, tmp_path: Path) -> 
 def test_disparity_alone_is_written_without_metres(tmp_path: Path) -> None:
     pair = StereoInput(name="x", left=torch.rand(3, H, W), right=None, camera=None)
     estimate = DepthEstimate(depth_m=None, disparity_px=truth_px(0), right=torch.rand(3, H, W))
-    write_estimate(tmp_path, pair, estimate)
+    files = write_estimate(tmp_path, pair, estimate)
     written = sorted(path.name for path in tmp_path.iterdir())
     assert written == ["x.color.png", "x.disparity_px.npy", "x.right.png"]
+    note_result(tmp_path, "x", files)
     assert is_finished(tmp_path, "x")
     with pytest.raises(InputError, match="a cloud needs metres"):
         write_estimate(tmp_path, pair, estimate, cloud_m=80.0)

@@ -1,5 +1,6 @@
 """Disparity to depth and back, warping, the left-right check, and maps at other sizes."""
 
+import warnings
 from collections.abc import Callable
 from dataclasses import fields
 
@@ -9,7 +10,7 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from depthpose.core.camera import Camera, StereoRig
-from depthpose.core.errors import InputError
+from depthpose.core.errors import InputError, Notice
 from depthpose.depth.types import Match
 
 _MISTAKES = {
@@ -18,10 +19,18 @@ _MISTAKES = {
     256.0: "is its depth metres x 256, as KITTI's PNG holds it (divide by 256)?",
     1 / 256: "is its disparity pixels x 256, as KITTI's PNG holds it (divide by 256)?",
 }
+_DOUBTS = {
+    1000 / 256: "is it a PNG of millimetres, read as metres x 256?",
+    256 / 1000: "is its truth a PNG of millimetres, read as metres x 256?",
+    1 / 16: "is its disparity pixels x 16, as OpenCV's matchers give it?",
+}
+"""What may have been meant by a scale that a poor estimate could have too."""
 """What was likely meant, by how many times farther than the truth a prediction lies."""
 _ABOUT = 1.4
 """No estimate is wrong by 250 or 1000 in the median, and a slip is met to within this factor."""
+_said: set[str] = set()
 _NEARLY_ALL = 0.9
+_NEAR, _OPPOSITE = 1.1, -0.8
 MOST_ENLARGED_PIXELS = 8_000_000
 """An image is not enlarged beyond this to reach the focal length of a network."""
 
@@ -29,7 +38,10 @@ MOST_ENLARGED_PIXELS = 8_000_000
 def disparity_advice(
     predicted_px: Float[Tensor, "h w"], true_px: Float[Tensor, "h w"]
 ) -> str | None:
-    """Say that a prediction is of another unit or sign than pixels; None where it seems not."""
+    """Say that a prediction is of another unit or sign than pixels; None where it seems not.
+
+    What a poor estimate could be too is a notice, and None.
+    """
     counts = torch.isfinite(predicted_px) & torch.isfinite(true_px)
     if not bool(counts.any()):
         return None
@@ -45,6 +57,18 @@ def disparity_advice(
     for factor, question in _MISTAKES.items():
         if factor / _ABOUT < farther < factor * _ABOUT:
             return f"it lies {farther:.4g} times as far as the truth: {question}"
+    doubts = [
+        f"lies about {factor:.3g} times as far as the truth: {question}"
+        for factor, question in _DOUBTS.items()
+        if factor / _NEAR < farther < factor * _NEAR
+    ]
+    both = torch.stack([predicted_px, true_px]).double().clamp_min(1e-3).log()
+    if len(true_px) > 1 and float(both.corrcoef()[0, 1]) < _OPPOSITE:
+        doubts.append("is the nearer the farther its truth is: is it inverse depth?")
+    for doubt in doubts:
+        if doubt not in _said:
+            _said.add(doubt)  # of a whole data set once
+            warnings.warn(f"a prediction {doubt}", Notice, stacklevel=2)
     return None
 
 

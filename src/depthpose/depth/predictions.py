@@ -51,6 +51,7 @@ EXPECTED = (
     "NAME.depth.png (metres x 256), or NAME.png as KITTI's benchmarks take it"
 )
 
+_NEARLY_ALL = 0.9
 CLOUD = "cloud.ply"
 ENDINGS = (
     "depth_m.npy", "depth.png", "confidence.npy", "right.png", "sky.png", "color.png",
@@ -148,12 +149,14 @@ def read_disparity(
         raise InputError(
             f"{folder}: no prediction for frame {name!r}. Expected {EXPECTED.replace('NAME', name)}"
         )
-    if with_disparity_png and path == _file(base, _KITTI):
+    if with_disparity_png and path == _first(base, (_KITTI,)):
         return read_disparity_png(path)
     depth_m = read_depth(folder, name)
     assert depth_m is not None
     if not isinstance(camera, StereoRig):
         raise InputError(f"{path}: depth becomes disparity by a rig, and this frame has none.")
+    if float((depth_m < 0).float().mean()) > _NEARLY_ALL:
+        raise InputError(f"{path}: its depth is negative; save metres in front of the camera")
     # The map may have a size of its own: its disparity is counted in its own pixels.
     least_m = depth_m.clamp(min=SMALLEST_DEPTH_M)
     return disparity_from_depth(least_m, camera) * (depth_m.shape[1] / camera.width)
@@ -167,7 +170,7 @@ def read_depth(folder: Path, name: str) -> Float[Tensor, "h w"] | None:
     path = _first(folder / name, (*_DEPTH, _KITTI))
     if path is None:
         return None
-    return read_depth_png(path) if path.suffix == ".png" else read_map(path)
+    return read_depth_png(path) if path.suffix.lower() == ".png" else read_map(path)
 
 
 def has_disparity(folder: Path, name: str) -> bool:
@@ -176,7 +179,9 @@ def has_disparity(folder: Path, name: str) -> bool:
 
 
 def _first(base: Path, endings: tuple[str, ...]) -> Path | None:
-    return next((path for end in endings if (path := _file(base, end)).is_file()), None)
+    files = (_file(base, end) for end in endings)
+    both = (path for file in files for path in (file, file.with_suffix(file.suffix.upper())))
+    return next((path for path in both if path.is_file()), None)
 
 
 def read_confidence(folder: Path, name: str) -> Float[Tensor, "h w"] | None:

@@ -390,7 +390,8 @@ def read_npy(path: AnyPath) -> np.ndarray:
     if array.dtype.kind != "f":
         raise InputError(
             f"{path}: holds {array.dtype}, not float16, 32 or 64; save floats in the unit that is "
-            "meant (millimetres as whole numbers: .astype('float32') / 1000 are metres)"
+            "meant (millimetres as whole numbers: .astype('float32') / 1000 are metres; disparity "
+            "of OpenCV's matchers: / 16 are pixels)"
         )
     return to_float32(array)
 

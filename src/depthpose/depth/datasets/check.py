@@ -13,7 +13,7 @@ from torch.nn import functional as F
 
 from depthpose.core.camera import StereoRig, check_rectified
 from depthpose.core.errors import InputError
-from depthpose.core.files import image_size, read_image, read_points_bin
+from depthpose.core.files import MAP_SUFFIXES, image_size, read_image, read_points_bin
 from depthpose.core.files.images import LISTED_SUFFIXES
 from depthpose.core.findings import CheckReport, Problem, make_report, unreadable
 from depthpose.depth.datasets.dataset import Dataset, read_split
@@ -22,7 +22,6 @@ from depthpose.depth.datasets.frames import (
     frame_camera,
     kitti_calibration,
     read_depth,
-    read_disparity,
 )
 from depthpose.depth.datasets.layouts import find_frames
 
@@ -91,7 +90,9 @@ def _check_folder(folder: Path, frames: list[Frame]) -> Iterator[Problem]:
     if len({path.suffix.lower() in (".jpg", ".jpeg") for path in views}) > 1:
         yield _problem(folder, "note", "mixes PNG and JPEG images")
     # The folders are listed, not the frames: a split leaves many pairs out on purpose.
-    folders = {(f.left.parent, f.right.parent) for f in frames if f.right is not None}
+    folders = {
+        (f.left.parent, f.right.parent) for f in frames if f.right and f.right.stem == f.left.stem
+    }
     for left, right in sorted(folders):
         if left == right or not left.is_dir():  # packed
             continue
@@ -100,10 +101,11 @@ def _check_folder(folder: Path, frames: list[Frame]) -> Iterator[Problem]:
             is_view = path.suffix.lower() in LISTED_SUFFIXES and path.name[0] != "."
             if is_view and path.stem not in stems:
                 yield _problem(path, "missing", "has no left view")
-    for name, part in (("lidar_depth", "depth"), ("disp_occ", "disparity")):
+    for name, part in (("right", "right"), ("lidar_depth", "depth"), ("disp_occ", "disparity")):
         is_there = (folder / name).is_dir() and any((folder / name).iterdir())
         if is_there and not any(getattr(frame, part) for frame in frames):
-            message = "holds no map of a frame's name in a format that is read: .png, .npy or .pfm"
+            known = ", ".join((*LISTED_SUFFIXES, *(() if part == "right" else MAP_SUFFIXES)))
+            message = f"holds no file of a frame's name in a format that is read: {known}"
             yield _problem(folder / name, "missing", message)
 
 
@@ -168,7 +170,7 @@ def _check_measurements(frame: Frame) -> Iterator[Problem]:
 
 def _check_truth(path: Path, size: tuple[int, int], *, is_depth: bool) -> Iterator[Problem]:
     try:
-        truth = read_depth(path) if is_depth else read_disparity(path)
+        truth = read_depth(path)
     except InputError as error:
         yield unreadable(path, error)
         return

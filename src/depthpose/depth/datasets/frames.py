@@ -34,14 +34,14 @@ from depthpose.core.errors import InputError
 from depthpose.core.files import (
     MAP_SUFFIXES,
     image_size,
-    read_depth_png,
-    read_disparity_png,
     read_image,
     read_key_values,
     read_map,
     read_points_bin,
+    read_stored_depth,
     read_text,
 )
+from depthpose.core.files.maps import KITTI_UNIT
 from depthpose.depth.config import TruthKind
 from depthpose.depth.types import StereoInput, StereoTruth
 
@@ -390,15 +390,17 @@ def _check_map_size(path: Path, values: Shaped[Tensor, "*any h w"], size: tuple[
 
 
 def read_disparity(path: Path) -> Float[Tensor, "h w"]:
-    """Read true disparity from a 16-bit PNG, PFM or NPY; NaN where it is unknown, 0 or below."""
-    return _known(path) if path.suffix.lower() in MAP_SUFFIXES else read_disparity_png(path)
+    """Read true disparity from a 16-bit PNG or TIFF, a TIFF of floats, PFM or NPY.
+
+    NaN where it is unknown, 0 or below, or so large that no pixel of the right image is meant.
+    """
+    values = read_depth(path)
+    return torch.where(values < values.shape[1], values, torch.nan)
 
 
 def read_depth(path: Path) -> Float[Tensor, "h w"]:
-    """Read true depth [m] from a 16-bit PNG (x 256), PFM or NPY; NaN where it is unknown."""
-    return _known(path) if path.suffix.lower() in MAP_SUFFIXES else read_depth_png(path)
-
-
-def _known(path: Path) -> Float[Tensor, "h w"]:
-    values = read_map(path)
-    return torch.where(values > 0, values, torch.nan)
+    """Read true depth [m] as :func:`read_disparity`, of 16 bits x 256; NaN where it is unknown."""
+    values = read_map(path) if path.suffix.lower() in MAP_SUFFIXES else read_stored_depth(path)
+    if not values.is_floating_point():
+        values = values * KITTI_UNIT
+    return torch.where((values > 0) & (values < torch.inf), values, torch.nan)

@@ -6,6 +6,7 @@ import os
 import re
 import tarfile
 from collections.abc import Callable, Iterable, Iterator
+from contextlib import suppress
 from dataclasses import dataclass, fields
 from functools import partial
 from pathlib import Path
@@ -29,7 +30,7 @@ from depthpose.core.files import (
     write_image,
     write_json,
 )
-from depthpose.core.files.disk import SOURCE, write_bytes
+from depthpose.core.files.disk import SOURCE, find_partners, write_bytes
 from depthpose.core.files.images import LISTED_SUFFIXES
 from depthpose.core.run import is_whole, note_result
 from depthpose.depth.datasets.frames import Frame
@@ -303,7 +304,13 @@ def _pairs(folder: Path) -> Iterable[Frame]:
     camera, text = cameras.get("camera"), folder / "calib.txt"
     folders = {"right": "right", "depth": "lidar_depth", "disparity": "disp_occ"}
     parts = {part: _by_stem(folder / name) for part, name in folders.items()}
-    for left in _images(folder / "left"):
+    lefts, right = _images(folder / "left"), parts["right"]
+    if right and not any(left.stem in right for left in lefts):
+        with suppress(InputError):  # left_0004 and right_0004
+            order = find_partners([left.stem for left in lefts], list(right), str(folder))
+            views = list(right.values())
+            parts["right"] = {left.stem: views[k] for left, k in zip(lefts, order, strict=True)}
+    for left in lefts:
         yield Frame(
             name=left.stem,
             left=left,
