@@ -153,6 +153,10 @@ def test_an_example_fills_the_form_and_is_answered(page: Page, address: str, kin
     page.wait_for_timeout(500)
     width = page.evaluate("document.documentElement.scrollWidth")
     assert width <= 400, "a phone need not scroll sideways"
+    cut = page.locator(f"#{kind} .table").evaluate_all(
+        "tables => tables.map(table => table.scrollWidth - table.clientWidth)"
+    )
+    assert all(more <= 1 for more in cut), "nor in a table"
 
 
 def test_terms_of_the_weights_are_read_with_the_answer(
