@@ -543,7 +543,7 @@ def test_maps_that_belong_to_no_frame_are_a_problem(tmp_path: Path) -> None:
     (tmp_path / "lidar_depth/a.png").rename(tmp_path / "lidar_depth/a.mat")
     (problem,) = check_dataset(tmp_path).problems
     assert (
-        "lidar_depth: holds no map of a frame's name" in str(problem.path) + ": " + problem.message
+        "lidar_depth: holds no file of a frame's name" in str(problem.path) + ": " + problem.message
     )
 
 
