@@ -10,7 +10,7 @@ from PIL import Image
 from depthpose.core.camera import Camera, StereoRig, write_camera
 from depthpose.core.errors import InputError, Notice
 from depthpose.core.files import write_depth_png, write_disparity_png, write_image, write_map
-from depthpose.core.results import note_result
+from depthpose.core.run import note_result
 from depthpose.depth.datasets import Dataset, check_dataset, open_dataset
 from depthpose.depth.disparity import depth_from_disparity, disparity_advice
 from depthpose.depth.estimator import FakestereoNet

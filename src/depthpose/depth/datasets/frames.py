@@ -41,7 +41,7 @@ from depthpose.core.files import (
     read_stored_depth,
     read_text,
 )
-from depthpose.core.files.maps import KITTI_UNIT
+from depthpose.core.files.images import KITTI_UNIT
 from depthpose.depth.config import TruthKind
 from depthpose.depth.types import StereoInput, StereoTruth
 
