@@ -21,6 +21,7 @@ if TYPE_CHECKING:  # --help must not load torch
     from depthpose.core.camera import Rectifier
 
 _FRAMES_A_SCENE = 50
+_Sensor = Literal["structured light", "active stereo", "time of flight", "laser", "none"]
 _SCENES_A_SEED = 1000
 _MOST_SEED = 10**6 - 1
 """Of frames of objects: a scene has nine digits at most, three of them beside the seed's."""
@@ -103,9 +104,7 @@ def make_objects(
     split: str = "train",
     seed: int = 0,
     distance: tuple[float, float] = (0.6, 1.1),
-    sensor: Literal[
-        "structured light", "active stereo", "time of flight", "laser", "none"
-    ] = "structured light",
+    sensor: _Sensor = "structured light",
     pile: int = 0,
     symmetries: Literal["none", "found"] = "none",
 ) -> int:
@@ -126,8 +125,7 @@ def make_objects(
         distance: nearest and farthest view [m].
         sensor: kind of depth sensor whose errors are simulated.
         pile: each frame shows so many copies of one part, dropped onto each other.
-        symmetries: found: declare the symmetries that are found from a part's shape; none: only
-            print them.
+        symmetries: found: declare those that a part's shape shows; none: only print them.
     """
     from tqdm import tqdm
 
@@ -161,8 +159,8 @@ def make_objects(
     settings |= {"unit": unit, "symmetries": symmetries}
     models = [read_model(path, unit, number=k) for k, path in enumerate(cad, start=1)]
     refuse_one_name(models)
-    is_taken = symmetries == "found"
-    models = [with_found_symmetries(model, tqdm.write, is_taken=is_taken) for model in models]
+    known = partial(with_found_symmetries, on_message=tqdm.write, is_taken=symmetries == "found")
+    models = [known(model) for model in models]
     claim_folder(out, settings, ["models", split])
     write_bop_models(out, models)
     scenes = {
@@ -170,16 +168,12 @@ def make_objects(
         for k, first in enumerate(range(0, number, _FRAMES_A_SCENE))
     }
     wanted = {k: scene for k, scene in scenes.items() if not _is_made(out, split, k, scene)}
-    total = sum(map(len, wanted.values()))
-    with tqdm(total=total, unit=" frames", leave=False, disable=None) as bar:
-        for k, scene in wanted.items():
-            made = []
-            for frame in make_frames(models, config, len(scene), scene.start):
-                made.append(frame)
-                bar.update()
-            home = write_bop_scene(out, split, k, made)
-            files = sorted(path for path in home.rglob("*") if path.is_file())
-            note_result(out, home.relative_to(out).as_posix(), files)
+    bar = partial(tqdm, unit=" frames", leave=False, disable=None)
+    for k, scene in wanted.items():
+        made = bar(make_frames(models, config, len(scene), scene.start), f"{k}", len(scene))
+        home = write_bop_scene(out, split, k, list(made))
+        files = sorted(path for path in home.rglob("*") if path.is_file())
+        note_result(out, home.relative_to(out).as_posix(), files)
     print(f"{out}: {len(wanted)} scenes made, {len(scenes) - len(wanted)} were there")
     return 0
 

@@ -135,13 +135,11 @@ class FakestereoNet:
             config: how the matcher runs.
             answer: where depth of one image comes from, in place of what the weights say
                 (:class:`~depthpose.depth.config.SelectionConfig`).
-            allow_ood: answer images that are unlike what the weights know too, with a
-                ``warning`` in the estimate, in place of refusing them.
+            allow_ood: answer images unlike what the weights know too, with a ``warning``.
             use: ``images`` or ``pairs``: build what these take alone, which is quicker. None: all.
 
         Raises:
-            InputError: no such weights, no matcher in what was given, or an ``answer`` that these
-                weights cannot give.
+            InputError: no such weights, no matcher in them, or an ``answer`` that they cannot give.
         """
         if weights is None and matcher is None:
             weights = DEFAULT
@@ -162,12 +160,12 @@ class FakestereoNet:
         terms = join_terms(*(read.facts for read in (main, other) if read is not None))
         warn_of_terms({"terms": terms})
         run = config if isinstance(config, MatcherConfig) else MatcherConfig()
+        holder = other or main
         if isinstance(config, SGBMConfig) and matcher != "sgbm":
             raise InputError(
                 f"config is of SGBM, but matcher is {matcher!r}; give matcher='sgbm' or a "
                 "MatcherConfig"
             )
-        holder = main if other is None else other
         if matcher == "sgbm":
             if main is not None and generator is None:
                 raise InputError(
@@ -182,17 +180,17 @@ class FakestereoNet:
         elif matcher is None and generator is not None and generator.config.answer == "own":
             chosen = None
         else:
-            given = (None if name is None else str(name) for name in (weights, matcher))
             raise InputError(
-                "weights is {!r} and matcher is {!r}: there is no matcher in that. Give "
+                f"weights is {weights and str(weights)!r} and matcher is "
+                f"{matcher and str(matcher)!r}: there is no matcher in that. Give "
                 "weights='psmnet.safetensors' or matcher='sgbm', which needs none; a generator and "
                 "a matcher become one file by 'depthpose weights pack G --matcher S --trained-on "
-                "DATA --licence L --out W'.".format(*given)
+                "DATA --licence L --out W'."
             )
         names = " + ".join(str(name) for name, read in ((weights, main), (matcher, other)) if read)
-        if generator is None:
-            return cls(chosen, terms=terms, weights=names)
-        synthesiser = make_synthesiser(generator, run.device, run.speed)
+        synthesiser = None
+        if generator is not None:
+            synthesiser = make_synthesiser(generator, run.device, run.speed)
         return cls(chosen, synthesiser, terms=terms, weights=names, allow_ood=allow_ood)
 
     from_pretrained = load

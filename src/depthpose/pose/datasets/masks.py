@@ -250,7 +250,11 @@ def write_detections(path: str | Path, detections: Sequence[Detection]) -> None:
     rows: list[dict[str, Any]] = []
     for one in detections:
         counts, height, width = one.segmentation
-        row = {"scene_id": one.scene_id, "image_id": one.image_id, "category_id": one.object_id}
+        row: dict[str, Any] = {
+            "scene_id": one.scene_id,
+            "image_id": one.image_id,
+            "category_id": one.object_id,
+        }
         row |= {"score": one.score, "bbox": mask_box(one.mask)}
         row["segmentation"] = {"size": [height, width], "counts": list(counts)}
         rows.append(row | {"time": -1.0 if one.seconds is None else one.seconds})

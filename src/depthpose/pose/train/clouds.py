@@ -34,6 +34,7 @@ from depthpose.pose.types import (
     PoseEstimate,
     PoseTruth,
     SeenPoints,
+    Vote,
 )
 from depthpose.pose.voting import fit_pose, meet_lines, vote_ransac
 from depthpose.pose.weights import DirectionNet, PoseWeights
@@ -321,7 +322,7 @@ class HeldOut:
 
     def _errors(self, network: DirectionNet, occlusion: float) -> dict[str, Float[Tensor, " n"]]:
         """ADD to the nearest symmetric pose, in diameters, by the method that votes."""
-        methods = {"lines": meet_lines}
+        methods: dict[str, Callable[[Tensor, Tensor], Vote]] = {"lines": meet_lines}
         if self.config.with_ransac:
             methods["ransac"] = vote_ransac
         errors: dict[str, list[float]] = {method: [] for method in methods}

@@ -329,9 +329,10 @@ def train_pose(config: PoseTraining | DepthImageTraining, run: Run) -> Path:
         )
         if config.loop.workers > 1 and (config.frames is None or config.frames.share < 1):
             samples.synthetic.draw_stored(config.loop.workers)
-        is_pointnet = isinstance(config.network, PointNetConfig)
-        word = "pointnet" if is_pointnet else "pose"
-        network = PointNet(config.network) if is_pointnet else ResUNet(config.network)
+        if isinstance(config.network, PointNetConfig):
+            word, network = "pointnet", PointNet(config.network)
+        else:
+            word, network = "pose", ResUNet(config.network)
         held_out = HeldOut(models, config.objects, config.cloud, config.held_out)
         task = PoseTask(network, models, config, held_out)
     if config.start is not None:
