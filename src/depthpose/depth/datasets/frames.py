@@ -165,7 +165,10 @@ def _projected_rig(
 
 
 def _composed(
-    path: Path, left: Matrix, rectify: Matrix, camera_from_velodyne: Matrix
+    path: Path,
+    left: Float64[np.ndarray, "3 4"],
+    rectify: Float64[np.ndarray, "3 3"],
+    camera_from_velodyne: Float64[np.ndarray, "3 4"],
 ) -> Float64[np.ndarray, "3 4"]:
     """LiDAR points to pixels; a 3x3 rotation or a 3x4 transform is extended to 4x4."""
     turned, moved = np.eye(4), np.eye(4)

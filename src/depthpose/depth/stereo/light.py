@@ -486,7 +486,9 @@ class LightStereo(StereoNetwork):
     ) -> Float[Tensor, "b k h w"]:
         """Bring maps to the images' size by weights that follow the first, the disparity [px]."""
 
-        def enlarged(quarters: Tensor, half: Tensor, quarter: Tensor, right: Tensor) -> Tensor:
+        def enlarged(
+            quarters: Tensor, half: Tensor, quarter: Tensor, right: Tensor | None
+        ) -> Tensor:
             weights = self.enlargement(ViewFeatures(half, (quarter,)), right, quarters[:, 0])
             return torch.stack([enlarge(one, weights) for one in quarters.unbind(1)], 1)
 

@@ -314,7 +314,7 @@ def _add_backdrop(b: MeshBuilder) -> None:
 def _surface(rng: np.random.Generator, size_m: float) -> Surface:
     """Anything of any colour, from nearly black to nearly white, mostly pale."""
     names = _PLAIN if rng.random() < _PLAIN_SHARE else _RICH
-    tile_m = size_m * _log_uniform(rng, 0.15, 3)
+    tile_m = size_m * _log_uniform(rng, 0.15, 3.0)
     material, grey = names[int(rng.integers(len(names)))], _log_uniform(rng, 0.03, 0.8)
     color = np.clip(grey * np.exp(rng.normal(0, rng.choice([0.05, 0.4, 1.0]), 3)), 0.01, 0.9)
     return Surface(material, tuple(color.tolist()), tile_m, int(rng.integers(8)))
