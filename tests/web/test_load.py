@@ -127,7 +127,7 @@ def test_two_hundred_requests_at_once(
     served, memory_kb, answers = serve(0.05), list[int](), Counter[int]()
     assert ask(served, samples).status_code == 200
     with ThreadPoolExecutor(200) as pool:
-        for _ in range(4):
+        for _ in range(6):
             found = pool.map(lambda _: ask(served, samples), range(200))
             for response in found:
                 answers[response.status_code] += 1
@@ -136,7 +136,7 @@ def test_two_hundred_requests_at_once(
     record_property("memory_kb", memory_kb)
     record_property("answers", dict(answers))
     assert set(answers) == {200, 503}
-    assert memory_kb[-1] - memory_kb[0] < 30_000, "memory is flat"
+    assert memory_kb[-1] - memory_kb[2] < 30_000, f"memory is flat once warm: {memory_kb}"
     assert ask(served, samples).status_code == 200
     assert served.stop() == (1, answers[200] + 2)
     assert not list(tmp_path.glob("depthpose-*")), "no upload is left"
