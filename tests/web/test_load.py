@@ -136,7 +136,8 @@ def test_two_hundred_requests_at_once(
     record_property("memory_kb", memory_kb)
     record_property("answers", dict(answers))
     assert set(answers) == {200, 503}
-    assert min(memory_kb[3:]) - min(memory_kb[:3]) < 30_000, f"memory is flat: {memory_kb}"
+    # Memory that the allocator holds back comes and goes by 33 MB; a leak adds to each round.
+    assert min(memory_kb[3:]) - min(memory_kb[:3]) < 60_000, f"memory is flat: {memory_kb}"
     assert ask(served, samples).status_code == 200
     assert served.stop() == (1, answers[200] + 2)
     assert not list(tmp_path.glob("depthpose-*")), "no upload is left"

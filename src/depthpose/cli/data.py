@@ -14,6 +14,7 @@ import tyro
 from depthpose.cli.arguments import Device, NewPath, Source, WeightsName
 from depthpose.core.errors import InputError
 from depthpose.core.units import Unit, metres_of
+from depthpose.pose.config import SensorKind
 
 if TYPE_CHECKING:  # --help must not load torch
     from torch import Tensor
@@ -21,7 +22,6 @@ if TYPE_CHECKING:  # --help must not load torch
     from depthpose.core.camera import Rectifier
 
 _FRAMES_A_SCENE = 50
-_Sensor = Literal["structured light", "active stereo", "time of flight", "laser", "none"]
 _SCENES_A_SEED = 1000
 _MOST_SEED = 10**6 - 1
 """Of frames of objects: a scene has nine digits at most, three of them beside the seed's."""
@@ -104,7 +104,7 @@ def make_objects(
     split: str = "train",
     seed: int = 0,
     distance: tuple[float, float] = (0.6, 1.1),
-    sensor: _Sensor = "structured light",
+    sensor: SensorKind = "structured light",
     pile: int = 0,
     symmetries: Literal["none", "found"] = "none",
 ) -> int:
@@ -168,10 +168,9 @@ def make_objects(
         for k, first in enumerate(range(0, number, _FRAMES_A_SCENE))
     }
     wanted = {k: scene for k, scene in scenes.items() if not _is_made(out, split, k, scene)}
-    bar = partial(tqdm, unit=" frames", leave=False, disable=None)
     for k, scene in wanted.items():
-        made = bar(make_frames(models, config, len(scene), scene.start), f"{k}", len(scene))
-        home = write_bop_scene(out, split, k, list(made))
+        made = make_frames(models, config, len(scene), scene.start)
+        home = write_bop_scene(out, split, k, list(_shown(made, len(scene), "frames")))
         files = sorted(path for path in home.rglob("*") if path.is_file())
         note_result(out, home.relative_to(out).as_posix(), files)
     print(f"{out}: {len(wanted)} scenes made, {len(scenes) - len(wanted)} were there")
