@@ -25,6 +25,7 @@ from depthpose.pose.sparse import Voxels, conv
 from depthpose.pose.surface import Surface, look_along_rays, prepare_surface
 from depthpose.pose.synthetic.parts import make_part
 from depthpose.pose.voting import fit_pose, meet_lines, vote_ransac
+from depthpose.pose.voting.point_pairs import prepare_pairs, vote_poses
 
 pytest.importorskip("numba")
 
@@ -320,6 +321,22 @@ def test_a_numba_that_cannot_be_imported_is_no_error(monkeypatch: pytest.MonkeyP
     compiled.is_compiled.cache_clear()
     with pytest.warns(Notice, match=r"numba needs NumPy 2.3 or less.*computed by torch"):
         assert not compiled.is_compiled()
+
+
+def test_votes_of_point_pairs(monkeypatch: pytest.MonkeyPatch) -> None:
+    part = prepare_surface(make_part("bracket"), 4000)
+    generator = torch.Generator().manual_seed(2)
+    chosen = torch.randperm(len(part.points_m), generator=generator)[:150]
+    pose = poses(part, 1)[0]
+    points_m, normals = pose.apply(part.points_m[chosen]), part.normals[chosen] @ pose.R.mT
+    table, references = prepare_pairs(part), torch.arange(25)
+    first, second = both(
+        lambda: vote_poses(points_m, normals, references, table, 3, partners=120), monkeypatch
+    )
+    assert len(first[1]) == 75
+    assert is_near(first[1], second[1], 1e-4 * float(first[1].max()))
+    is_same = (first[0].t_m - second[0].t_m).norm(dim=-1) < 1e-9
+    assert float(is_same.double().mean()) > 0.9, "but for ties"
 
 
 @pytest.mark.slow

@@ -1,6 +1,5 @@
-"""Known objects in depth without masks: planes go, regions are parted, answers do not overlap."""
+"""Known objects in depth without masks: what is answered, once each, and what is not."""
 
-from collections.abc import Sequence
 from dataclasses import replace
 
 import pytest
@@ -22,12 +21,10 @@ from depthpose.core.errors import InputError
 from depthpose.core.rigid import Rigid
 from depthpose.pose.config import RefusalConfig
 from depthpose.pose.estimator.find import is_cut_out, nothing_found
-from depthpose.pose.estimator.inputs import AnyInput
 from depthpose.pose.mesh import make_model
 from depthpose.pose.metrics import add_m
-from depthpose.pose.regions import extent_m, find_regions, part_cloud, split_at_necks
 from depthpose.pose.surface import prepare_surface
-from depthpose.pose.types import CloudInput, ObjectModel, PoseEstimate, ViewInput
+from depthpose.pose.types import CloudInput, ObjectModel, ViewInput
 
 TRUTHS = [pose_at(-0.13, 0.7, seed=1), pose_at(0.12, 0.9, seed=2)]
 REFUSAL = RefusalConfig()
@@ -45,79 +42,6 @@ def table(with_thing: bool = True) -> torch.Tensor:
     seen, mask = view_of(bracket(), *TRUTHS)
     noise = 0.0005 * torch.randn(240, 320, generator=torch.Generator().manual_seed(0))
     return torch.where(mask, seen.float(), depth_m) + noise
-
-
-def test_planes_go_and_regions_stay() -> None:
-    depth_m = table()
-    regions, _, is_plane = find_regions(depth_m, K.float(), bracket().diameter_m)
-    _, mask = view_of(bracket(), *TRUTHS)
-    assert len(regions) == 3
-    assert float(is_plane[~mask].float().mean()) > 0.95
-    assert not bool(is_plane[mask].any())
-    assert abs(sum(map(len, regions[:2])) - int(mask.sum())) < 0.02 * int(mask.sum())
-    assert extent_m(regions[2]) < 0.1
-    assert extent_m(torch.rand(2**20 + 5, 3)) == pytest.approx(1.4, abs=0.1), "of a fine scanner"
-    # A wall no wider than an object may be an object's side: it stays.
-    assert max(map(len, find_regions(depth_m, K.float(), 5.0)[0])) > 0.5 * 320 * 240
-
-
-def test_a_plane_through_several_objects_is_no_plane() -> None:
-    """Five blocks of one height in front of a wall: no plane through all of them cuts bands out."""
-    depth_m = torch.full((240, 320), 1.2)
-    mask = torch.zeros(240, 320).bool()
-    for k in range(5):
-        block = (slice(60, 180), slice(20 + 60 * k, 60 + 60 * k))
-        depth_m[block] = (0.9 + 0.001 * torch.arange(120).float())[:, None]
-        mask[block] = True
-    regions = find_regions(depth_m, K.float(), 0.15)
-    assert bool(regions.is_plane[~mask].all())
-    assert not bool(regions.is_plane[mask].any())
-    assert [len(cloud) for cloud in regions.clouds_m] == [120 * 40] * 5
-
-
-@pytest.mark.parametrize("scale", [1, 4])
-def test_two_things_that_touch_are_split_at_their_neck(scale: int) -> None:
-    mask = torch.zeros(100, 140).bool()
-    mask[20:70, 10:60] = mask[30:70, 70:120] = mask[45:51, 60:70] = True
-    mask = mask.repeat_interleave(scale, 0).repeat_interleave(scale, 1)
-    pieces = split_at_necks(mask)
-    assert sorted(int(piece.sum()) // scale**2 // 100 for piece in pieces) == [20, 25]
-    assert not bool((pieces[0] & pieces[1]).any())
-    assert bool((pieces[0] | pieces[1]).eq(mask).all())
-    assert split_at_necks(mask[: 70 * scale, : 60 * scale]) == [], "one thing without a neck"
-
-
-def test_a_region_that_is_too_small_for_an_object_is_not_tried() -> None:
-    """Of a bracket a fragment is left that is long enough for it, but thin."""
-    asked = []
-
-    class Counting(Oracle):
-        def _try_many(self, inputs: Sequence[AnyInput]) -> list[PoseEstimate]:
-            asked.extend(inputs)
-            return super()._try_many(inputs)
-
-    depth_m = torch.full((240, 320), 1.25)
-    depth_m[100, 100:150] = depth_m[101, 100:150] = 0.9
-    net = Counting(tiny_weights(bracket(), refusal=REFUSAL), TRUTHS)
-    assert net.find(depth_m, CAMERA) == []
-    assert asked == []
-    depth_m[80:120, 100:150] = 0.9
-    net.find(depth_m, CAMERA)
-    assert len(asked) == 1
-
-
-def test_a_depth_image_without_readings_has_no_region() -> None:
-    regions, _, is_plane = find_regions(torch.full((24, 32), torch.nan), K.float(), 0.2)
-    assert regions == []
-    assert not bool(is_plane.any())
-
-
-def test_what_is_too_long_is_parted_by_place() -> None:
-    generator = torch.Generator().manual_seed(0)
-    blobs = [0.02 * torch.randn(500, 3, generator=generator) + torch.tensor([0.3 * k, 0, 1.0])
-             for k in range(3)]  # fmt: skip
-    parts = part_cloud(torch.cat(blobs), 3)
-    assert sorted(len(part) for part in parts) == [500, 500, 500]
 
 
 def test_two_instances_are_found_and_an_unknown_thing_is_not() -> None:

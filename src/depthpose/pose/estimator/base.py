@@ -19,6 +19,7 @@ from depthpose.pose.config import EstimateConfig, RefusalConfig
 from depthpose.pose.estimator.answer import with_status
 from depthpose.pose.estimator.candidates import PoseAmbiguities, find_copies
 from depthpose.pose.estimator.find import SearchTargets, find_objects, nothing_found, which_object
+from depthpose.pose.estimator.hypotheses import Views, prepare_views
 from depthpose.pose.estimator.inputs import (
     AnyArray,
     AnyInput,
@@ -33,6 +34,7 @@ from depthpose.pose.estimator.inputs import (
 from depthpose.pose.estimator.track import TrackedObject, track
 from depthpose.pose.surface import Surface, prepare_surface
 from depthpose.pose.types import CloudInput, ObjectModel, PoseEstimate, ViewInput
+from depthpose.pose.voting.point_pairs import PairTable, prepare_pairs
 
 Made = TypeVar("Made")
 _NAME = "input"
@@ -55,6 +57,7 @@ class PoseEstimator(ABC):
         self._numbers = {model.name: k for k, model in enumerate(models)}
         self._surfaces: dict[int, Surface] = {}
         self._copies: dict[int, PoseAmbiguities] = {}
+        self._shapes: dict[int, tuple[PairTable, Views]] = {}
 
     @property
     @abstractmethod
@@ -118,6 +121,12 @@ class PoseEstimator(ABC):
     def _try_many(self, inputs: Sequence[AnyInput]) -> list[PoseEstimate]:
         """Estimate inputs of which most do not show their object."""
         return [answered(one) for one in self._each(inputs, 1, is_likely=False)]
+
+    @abstractmethod
+    def _pose_near(
+        self, inputs: Sequence[CloudInput], poses: Sequence[Rigid]
+    ) -> list[PoseEstimate]:
+        """Estimate clouds by the poses that were proposed for each."""
 
     @own_arithmetic()
     def estimate(
@@ -210,8 +219,8 @@ class PoseEstimator(ABC):
     ) -> list[PoseEstimate]:
         """Find and pose known objects in a depth image without masks, the best answer first.
 
-        Dominant planes are taken away, the rest is parted where its depth jumps, and every region
-        is tried for every object of its size. What nothing fits, or what is refused, is left out.
+        Point pairs of the whole image vote for poses of each object; where the image agrees with
+        one, the object is estimated from the points there. What is refused is left out.
 
         Args:
             depth: as for :meth:`estimate`.
@@ -232,14 +241,15 @@ class PoseEstimator(ABC):
         view = view_input(depth, None, camera, names[0], _NAME, unit)
         return self.find_in(view, names)
 
+    @torch.no_grad()
     @own_arithmetic()
     def find_in(self, view: ViewInput, objects: Sequence[str]) -> list[PoseEstimate]:
         """Do as :meth:`find` does for a view; its mask limits where is looked."""
         known = SearchTargets(
-            models={name: self.models[self._number(name)] for name in objects},
+            names=objects,
             surface_of=lambda name: self._surface(self._number(name)),
-            refusal=self.refusal,
-            estimate_many=self._try_many,
+            shape_of=lambda name: self._shape(self._number(name)),
+            pose_near=self._pose_near,
         )
         return find_objects(view, known)
 
@@ -336,6 +346,12 @@ class PoseEstimator(ABC):
             up_to_symmetry = self.config.up_to_symmetry
             self._copies[number] = find_copies(self.models[number], up_to_symmetry=up_to_symmetry)
         return self._copies[number]
+
+    def _shape(self, number: int) -> tuple[PairTable, Views]:
+        if number not in self._shapes:
+            surface = self._surface(number)
+            self._shapes[number] = (prepare_pairs(surface), prepare_views(surface))
+        return self._shapes[number]
 
     def _number(self, name: str) -> int:
         if not isinstance(name, str):

@@ -1,50 +1,50 @@
-"""Known objects in a depth image without a mask: regions, hypotheses, and answers that agree."""
+"""Known objects in a depth image without a mask: votes propose poses, the image judges them."""
 
 import math
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float64
 from torch import Tensor
 
-from depthpose.core.camera import back_project, project
+from depthpose.core.camera import back_project
 from depthpose.core.rigid import Rigid
 from depthpose.pose.augment import grow_mask
+from depthpose.pose.cloud import cloud_from_depth
 from depthpose.pose.config import RefusalConfig
-from depthpose.pose.estimator.candidates import share_out
+from depthpose.pose.estimator.candidates import log_signal, share_out
 from depthpose.pose.estimator.fit import BORDER_PX
-from depthpose.pose.estimator.inputs import nothing_seen
-from depthpose.pose.regions import (
-    extent_m,
-    find_regions,
-    is_on_plane,
-    largest_plane,
-    part_cloud,
+from depthpose.pose.estimator.hypotheses import (
+    Agreement,
+    Views,
+    compare_with_image,
+    is_no_side,
+    propose_in_frame,
 )
+from depthpose.pose.estimator.inputs import nothing_seen
+from depthpose.pose.frame import Frame, is_on_plane, largest_plane, prepare_frame
 from depthpose.pose.surface import NEAR, Surface
-from depthpose.pose.types import CloudInput, ObjectModel, PoseEstimate, ViewInput
+from depthpose.pose.types import CloudInput, PoseEstimate, ViewInput
+from depthpose.pose.voting.point_pairs import PairTable
 
-_SMALLEST, _LARGEST = 0.25, 1.25
-"""Shares of an object's diameter between which the extent of a region may lie."""
-_AREA = 0.3
-"""A region of less than this share of an object's smallest silhouette leaves most of it unseen."""
-_TOGETHER = 1.25
-"""Two regions may be parts of one object where together they are no longer than this: the length
-of a bent thing, measured from its median, comes out too long."""
-_MOST_PAIRS = 20
-_FRAGMENT = 0.03
-"""A region of fewer points than this share of another adds nothing to it."""
-_HIDDEN = 0.5
-"""Of the surface that faces the camera: where more is unseen, the rest fits too many places."""
-_REST = 0.25
-"""A region of which so large a share is unexplained is tried again without the rest."""
-_LEAST_POINTS = 60
+_HOPELESS = 6.0
+"""Log odds that the image alone adds, from which nothing else makes a pose right."""
+_LEAST_WORTH = 0.25
+"""Poses with which the image agrees less are not judged."""
+_MOST_JUDGED, _LEAST_JUDGED = 40, 4
+"""Poses that are judged in an image, and of each object at least."""
+_MOST_TOGETHER, _NEARLY = 8, 0.2
+"""Poses of one object at one place at most, and by how much the image may agree less with those
+that say too which points are its own."""
+_LEAST_PIXELS = 100
+"""Of the whole image: fewer show no shape."""
 _SHARED = 0.3
 """Answers that explain so large a share of the same points are of one thing; one of them stays."""
-_SUNK = 0.15
-"""Where a table or wall lies before more of the posed surface, there is no such object."""
+_RIVAL = 0.5
+"""Poses of two objects that explain so much of the same points share the probability of one."""
 _FLAT = 0.9
 """What lies on one plane by so large a share is flat: anything of its outline looks the same."""
 _CONTINUED = 0.4
@@ -55,12 +55,6 @@ _NAMED = 0.02
 """Other objects of a larger share are named."""
 _ONE = 0.8
 """Where no object among several has so large a share of the probability, none is answered."""
-_WHOLE, _HALF = 0.9, 0.5
-"""An answer explains so much of its region, or half of it and leaves enough for another object:
-a region slightly larger than the object is another object, but for what a sensor adds to its edge:
-of real objects 0.93 and 0.94 were explained."""
-
-EstimateMany = Callable[[Sequence[CloudInput]], list[PoseEstimate]]
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -68,78 +62,190 @@ class SearchTargets:
     """What is looked for.
 
     Attributes:
-        models: the objects, by name.
+        names: of the objects.
         surface_of: gives the surface of an object by its name.
-        refusal: how its candidates are compared.
-        estimate_many: clouds to poses.
+        shape_of: gives its point pairs and what a camera sees of it.
+        pose_near: clouds and the poses that were proposed for them to estimates.
     """
 
-    models: Mapping[str, ObjectModel]
+    names: Sequence[str]
     surface_of: Callable[[str], Surface]
-    refusal: RefusalConfig
-    estimate_many: EstimateMany
+    shape_of: Callable[[str], tuple[PairTable, Views]]
+    pose_near: Callable[[Sequence[CloudInput], Sequence[Rigid]], list[PoseEstimate]]
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class _Scene:
-    """A view, and which of its pixels show a plane that was taken away."""
+class _Candidate:
+    """A pose of an object, log odds of its being wrong, and the pixels of a frame on it."""
 
-    view: ViewInput
-    is_plane: Bool[Tensor, "h w"]
+    object: str
+    pose: Rigid
+    doubt: float
+    explained: Bool[Tensor, "h w"]
 
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class _Answer:
-    """An answer for a region, and which of all readings it explains."""
-
-    estimate: PoseEstimate
-    points_m: Float[Tensor, "n 3"]
-    explained: Tensor
-    share: float
-
-    @property
-    def is_whole(self) -> bool:
-        """Whether what it leaves of its region is nothing, or something of its own."""
-        explained = float(self.explained.double().mean())
-        return explained >= _WHOLE or _HALF <= explained <= 1 - _REST
-
-    @property
-    def worth(self) -> float:
-        """How sure it is, and how much it explains: of two that are equally sure the larger."""
-        fit = self.estimate.fit
-        agrees = 1.0 if fit is None else fit.agrees
-        return agrees * self.share * float(self.explained.double().mean())
+    def shared_with(self, other: "_Candidate") -> float:
+        """Share of the smaller one's pixels that both explain."""
+        both = float((self.explained & other.explained).sum())
+        return both / max(1.0, min(float(self.explained.sum()), float(other.explained.sum())))
 
 
 def find_objects(view: ViewInput, known: SearchTargets) -> list[PoseEstimate]:
     """Pose every known object that a depth image shows, the surest first; what is none is left out.
 
-    Regions are tried for every object whose size they may have; so are their pieces beside narrow
-    necks, pairs of them that may be parts of one object, and parts of one that is too long. Where
-    several objects answer they share the probability of one by the evidence against each, and where
-    none has most of it none is answered. What an
-    answer leaves unexplained of its region is tried once more. An answer is left out through whose
-    surface the camera saw, or that lies behind a plane that was seen, or is cut out of one, or that
-    explains not quite all of its region; of answers that explain the same points the best stays.
+    Point pairs of the whole image vote for poses of each object. Those with which the image agrees
+    are gathered by the points that they explain, from which the object is estimated. Where poses of
+    several objects explain the same, they share the probability of one by the evidence against
+    each, and where none has most of it none is answered.
 
     Args:
         view: depth and camera; its mask limits where is looked.
         known: what for.
     """
-    largest_m = max(model.diameter_m for model in known.models.values())
-    depth_m = torch.where(view.mask, view.depth_m, torch.nan)
-    regions = find_regions(depth_m, view.K, largest_m)
-    whole = regions.clouds_m
-    clouds = [*whole, *regions.pieces_m, *_pairs(whole, largest_m), *_parts(whole, largest_m)]
-    scene = _Scene(view=view, is_plane=regions.is_plane)
-    answers = _estimate_regions(clouds, scene, known)
-    rest = [answer.points_m[~answer.explained] for answer in answers]
-    again = [cloud for cloud, answer in zip(rest, answers, strict=True)
-             if len(cloud) >= max(_LEAST_POINTS, _REST * len(answer.points_m))]  # fmt: skip
-    answers += _estimate_regions(again, scene, known)
-    kept = _without_overlap([a for a in answers if a.is_whole], known)
-    kept = [answer for answer in kept if answer.share >= _ONE]  # the others may be another object
-    return [replace(a.estimate, name=f"{view.name}_{k}") for k, a in enumerate(kept)]
+    frame = prepare_frame(torch.where(view.mask, view.depth_m, torch.nan), view.K)
+    groups: list[list[_Candidate]] = []
+    for one in _candidates(frame, known):
+        same = (some for some in groups if some[0].object == one.object)
+        own = next((some for some in same if one.shared_with(some[0]) > _RIVAL), None)
+        if own is None:
+            groups.append([one])
+        elif len(own) < _MOST_TOGETHER:
+            own.append(one)
+    found = _without_rivals(_judged(groups, frame, view, known))
+    return [replace(one, name=f"{view.name}_{k}") for k, one in enumerate(found)]
+
+
+def _candidates(frame: Frame, known: SearchTargets) -> list[_Candidate]:
+    """Propose poses of every object, the best of all first."""
+    most = max(_LEAST_JUDGED, _MOST_JUDGED // len(known.names))
+
+    def propose(name: str) -> list[_Candidate]:
+        surface, (table, views) = known.surface_of(name), known.shape_of(name)
+        poses, seen = propose_in_frame(frame, surface, table, views, len(known.names))
+        doubts, found = _doubts_of(seen), list[_Candidate]()
+        likely = (seen.worth >= _LEAST_WORTH) & (doubts < _HOPELESS)
+        for k in likely.nonzero()[:most, 0].tolist():
+            own = _explained(frame, poses[k], surface)
+            if int(own.sum()) * frame.step**2 >= _LEAST_PIXELS:
+                doubt = float(doubts[k])
+                found.append(_Candidate(object=name, pose=poses[k], doubt=doubt, explained=own))
+        return found
+
+    with ThreadPoolExecutor(torch.get_num_threads()) as pool:
+        every = [one for some in pool.map(propose, known.names) for one in some]
+    return sorted(every, key=lambda one: one.doubt)
+
+
+def _judged(
+    groups: Sequence[Sequence[_Candidate]], frame: Frame, view: ViewInput, known: SearchTargets
+) -> list[tuple[_Candidate, PoseEstimate]]:
+    """Estimate each object from the points that its poses explain; leave out what is refused."""
+    inputs: list[CloudInput] = []
+    height, width = view.depth_m.shape
+    for k, some in enumerate(groups):
+        likely = [one for one in some if one.doubt < some[0].doubt + _NEARLY]
+        mask = torch.stack([one.explained for one in likely]).any(0)
+        mask = mask.repeat_interleave(frame.step, 0).repeat_interleave(frame.step, 1)
+        cloud_m = cloud_from_depth(view.depth_m, mask[:height, :width] & view.mask, view.K)
+        name = f"{view.name}_{k}"
+        inputs.append(CloudInput(name=name, points_m=cloud_m, object=some[0].object, view=view))
+    poses = [Rigid.stack([one.pose for one in some]) for some in groups]
+    answers: list[tuple[_Candidate, PoseEstimate]] = []
+    for estimate in known.pose_near(inputs, poses) if inputs else []:
+        if estimate.camera_from_model is None:
+            continue
+        surface, views = known.surface_of(estimate.object), known.shape_of(estimate.object)[1]
+        pose = estimate.camera_from_model.double()
+        seen = compare_with_image(frame, Rigid.stack([pose]), surface, views)
+        doubt = _doubt_of(seen, estimate)
+        if doubt < 0 and not is_cut_out(view, pose, surface):
+            own = _explained(frame, pose, surface)
+            one = _Candidate(object=estimate.object, pose=pose, doubt=doubt, explained=own)
+            answers.append((one, estimate))
+    return answers
+
+
+def _doubts_of(seen: Agreement) -> Float64[Tensor, " b"]:
+    """Give what the image adds to the log odds of poses' being wrong."""
+    against, goes_on = 2.9 * seen.against, 20.0 * seen.goes_on
+    return against + goes_on + 3.2 * (1 - seen.parted)
+
+
+def _doubt_of(seen: Agreement, estimate: PoseEstimate) -> float:
+    """Give the log odds of a pose's being wrong."""
+    fit, size = estimate.fit, estimate.identity
+    assert fit is not None
+    off = 0.0
+    if size is not None and size.size is not None and size.size_deviation is not None:
+        off = max(0.0, abs(size.size - 1) - 2 * size.size_deviation)
+    logs = {name: log_signal(estimate.signals[name]) for name in ("tilt", "unseen")}
+    doubt = 26.0 * (1 - fit.agrees) + 14.0 * (1 - fit.explained) + 16.0 * off
+    return doubt + 0.37 * logs["tilt"] + 0.7 * logs["unseen"] + float(_doubts_of(seen)[0]) - 0.46
+
+
+def _without_rivals(answers: Sequence[tuple[_Candidate, PoseEstimate]]) -> list[PoseEstimate]:
+    """Keep answers from the surest down that explain what none before does, if they are likely."""
+    kept, taken = list[PoseEstimate](), list[_Candidate]()
+    for one, estimate in sorted(answers, key=lambda answer: answer[0].doubt):
+        if any(one.shared_with(other) > _SHARED for other in taken):
+            continue
+        taken.append(one)
+        rivals = {one.object: (one.doubt, estimate)}
+        for other, its in answers:
+            if one.shared_with(other) > _RIVAL:
+                rivals.setdefault(other.object, (other.doubt, its))
+        doubts = torch.tensor([doubt for doubt, _ in rivals.values()], dtype=torch.float64)
+        best, share = _given_others([its for _, its in rivals.values()], (-doubts).softmax(0))
+        if share >= _ONE:  # else it may be another object
+            kept.append(best)
+    return kept
+
+
+def _is_near(points_m: Tensor, pose: Rigid, surface: Surface) -> Tensor:
+    local_m = pose.double().inverse().apply(points_m.double())
+    distance_m = (local_m - surface.points_m[surface.nearest(local_m)]).norm(dim=-1)
+    return distance_m < NEAR * surface.diameter_m
+
+
+def _on_surface(
+    points_m: Float64[Tensor, "h w 3"], is_read: Bool[Tensor, "h w"], pose: Rigid, surface: Surface
+) -> Bool[Tensor, "h w"]:
+    """Mark the pixels whose points lie on a posed surface."""
+    middle_m = pose.double().apply(surface.points_m.mean(0, keepdim=True))
+    found = is_read.clone()
+    found[is_read] = (points_m[is_read] - middle_m).norm(dim=-1) < surface.diameter_m
+    if bool(found.any()):
+        found[found.clone()] = _is_near(points_m[found], pose, surface)
+    return found
+
+
+def _explained(frame: Frame, pose: Rigid, surface: Surface) -> Bool[Tensor, "h w"]:
+    is_read = (frame.depth_m > 0) & ~is_no_side(frame, surface)
+    return _on_surface(frame.points_m, is_read, pose, surface)
+
+
+def explained_mask(view: ViewInput, pose: Rigid, surface: Surface) -> Bool[Tensor, "h w"]:
+    """Mark the pixels of a depth image whose points lie on a posed surface."""
+    points_m = back_project(view.depth_m.double(), view.K.double())
+    return _on_surface(points_m, points_m.isfinite().all(-1) & view.mask, pose, surface)
+
+
+def is_cut_out(view: ViewInput, pose: Rigid, surface: Surface) -> bool:
+    """Whether what lies on a posed surface is flat, and goes on in its plane beyond the outline.
+
+    Args:
+        view: depth and camera; its mask limits what may lie on the surface, not what goes on.
+        pose: of the object.
+        surface: of its model.
+    """
+    own = explained_mask(view, pose, surface)
+    points_m = back_project(view.depth_m.double(), view.K.double())
+    plane = largest_plane(points_m[own], torch.Generator().manual_seed(0))
+    if plane is None or float(is_on_plane(points_m[own], plane).double().mean()) < _FLAT:
+        return False
+    pixel_m = float(points_m[own][:, 2].median() / view.K[0, 0])
+    reach = BORDER_PX + math.ceil(_RIM * surface.diameter_m / pixel_m)
+    rim = grow_mask(own, reach) & ~grow_mask(own, BORDER_PX)
+    return float(is_on_plane(points_m[rim], plane).double().mean()) > _CONTINUED
 
 
 def nothing_found(view: ViewInput, object: str, spent_s: float = 0.0) -> PoseEstimate:
@@ -163,60 +269,6 @@ def nothing_found(view: ViewInput, object: str, spent_s: float = 0.0) -> PoseEst
         "mask, or look from nearer by",
         seconds=spent,
     )
-
-
-def _pairs(clouds: Sequence[Tensor], largest_m: float) -> list[Tensor]:
-    """Join regions that may be two parts of one object, something before it or a thin place."""
-    joined: list[Tensor] = []
-    for a, first in enumerate(clouds):
-        for second in clouds[a + 1 :]:
-            apart_m = float((first.median(0).values - second.median(0).values).norm())
-            if apart_m > largest_m or len(second) < _FRAGMENT * len(first):
-                continue
-            both = torch.cat([first, second])
-            if extent_m(both) <= _TOGETHER * largest_m:
-                joined.append(both)
-    return joined[:_MOST_PAIRS]
-
-
-def _parts(clouds: Sequence[Tensor], largest_m: float) -> list[Tensor]:
-    """Split regions that are too long for one object."""
-    parts: list[Tensor] = []
-    for cloud in clouds:
-        times = extent_m(cloud) / largest_m
-        if _LARGEST < times < math.inf:
-            parts += part_cloud(cloud, min(4, 1 + round(times)))
-    return [part for part in parts if len(part) >= _LEAST_POINTS]
-
-
-def _estimate_regions(
-    clouds: Sequence[Tensor], scene: _Scene, known: SearchTargets
-) -> list[_Answer]:
-    """Estimate every object of its size from every cloud; give the best of each cloud."""
-    view, inputs = scene.view, list[tuple[int, CloudInput]]()
-    for k, cloud in enumerate(clouds):
-        inputs += [
-            (k, CloudInput(name=f"{view.name}_{k}", points_m=cloud, object=name, view=view))
-            for name in _of_this_size(cloud, view, known)
-        ]
-    found = known.estimate_many([given for _, given in inputs]) if inputs else []
-    of_cloud: dict[int, list[PoseEstimate]] = {}
-    for (k, _), estimate in zip(inputs, found, strict=True):
-        if estimate.is_posed and _is_possible(scene, estimate, known):
-            of_cloud.setdefault(k, []).append(estimate)
-    return [_best(some, clouds[k], known) for k, some in of_cloud.items()]
-
-
-def _of_this_size(cloud: Tensor, view: ViewInput, known: SearchTargets) -> list[str]:
-    """Name the objects that a region may be, by how long it is and what area it has."""
-    size_m, pixel_m = extent_m(cloud), 1 / (view.K[0, 0] * view.K[1, 1]).double().sqrt()
-    area_m2 = float((cloud[:, 2].double() * pixel_m).square().sum())
-    return [
-        name
-        for name, model in known.models.items()
-        if _SMALLEST * model.diameter_m <= size_m <= _LARGEST * model.diameter_m
-        and area_m2 >= _AREA * known.surface_of(name).least_silhouette_m2
-    ]
 
 
 def which_object(estimates: Sequence[PoseEstimate], refusal: RefusalConfig) -> PoseEstimate:
@@ -267,94 +319,3 @@ def _given_others(some: Sequence[PoseEstimate], shares: Tensor) -> tuple[PoseEst
         identity = replace(estimate.identity, status="not excluded", other=second, reason=reason)
         found = replace(found, identity=identity)
     return found, share
-
-
-def _best(some: Sequence[PoseEstimate], cloud: Tensor, known: SearchTargets) -> _Answer:
-    """Choose among objects that answered for one cloud; the others lower its certainty."""
-    shares = share_out([estimate.signals for estimate in some], known.refusal.candidate_slopes)
-    estimate, share = _given_others(some, shares)
-    pose = estimate.camera_from_model
-    assert pose is not None
-    return _Answer(
-        estimate=estimate,
-        points_m=cloud,
-        explained=_is_explained(cloud, pose, known.surface_of(estimate.object)),
-        share=share,
-    )
-
-
-def _is_explained(cloud: Tensor, pose: Rigid, surface: Surface) -> Tensor:
-    local_m = pose.double().inverse().apply(cloud.double())
-    distance_m = (local_m - surface.points_m[surface.nearest(local_m)]).norm(dim=-1)
-    return distance_m < NEAR * surface.diameter_m
-
-
-def explained_mask(view: ViewInput, pose: Rigid, surface: Surface) -> Bool[Tensor, "h w"]:
-    """Mark the pixels of a depth image whose points lie on a posed surface."""
-    points_m = back_project(view.depth_m.double(), view.K.double())
-    is_read = points_m.isfinite().all(-1) & view.mask
-    near = is_read.clone()
-    middle_m = pose.double().apply(surface.points_m.mean(0, keepdim=True))
-    near[is_read] = (points_m[is_read] - middle_m).norm(dim=-1) < surface.diameter_m
-    explained = torch.zeros_like(near)
-    if bool(near.any()):
-        explained[near] = _is_explained(points_m[near], pose, surface)
-    return explained
-
-
-def _is_possible(scene: _Scene, estimate: PoseEstimate, known: SearchTargets) -> bool:
-    """Whether enough of the surface was seen, no plane before it, and more than a cut of one."""
-    pose, signals = estimate.camera_from_model, estimate.signals
-    assert pose is not None
-    if signals["unseen"] > _HIDDEN:
-        return False
-    surface = known.surface_of(estimate.object)
-    posed_m = pose.double().apply(surface.points_m)
-    u, v = project(posed_m, scene.view.K.double()).round().long().unbind(-1)
-    height, width = scene.view.depth_m.shape
-    inside = (u >= 0) & (u < width) & (v >= 0) & (v < height) & (posed_m[:, 2] > 0)
-    seen_m = scene.view.depth_m.double()[v[inside], u[inside]]
-    is_read = seen_m.isfinite() & (seen_m > 0)
-    if not bool(is_read.any()):
-        return False
-    is_before = seen_m < posed_m[inside, 2] - NEAR * surface.diameter_m
-    is_sunk = is_before & scene.is_plane[v[inside], u[inside]]
-    if float(is_sunk[is_read].double().mean()) > _SUNK:
-        return False
-    return not is_cut_out(scene.view, pose, surface)
-
-
-def is_cut_out(view: ViewInput, pose: Rigid, surface: Surface) -> bool:
-    """Whether what lies on a posed surface is flat, and goes on in its plane beyond the outline.
-
-    Args:
-        view: depth and camera; its mask limits what may lie on the surface, not what goes on.
-        pose: of the object.
-        surface: of its model.
-    """
-    own = explained_mask(view, pose, surface)
-    points_m = back_project(view.depth_m.double(), view.K.double())
-    plane = largest_plane(points_m[own], torch.Generator().manual_seed(0))
-    if plane is None or float(is_on_plane(points_m[own], plane).double().mean()) < _FLAT:
-        return False
-    pixel_m = float(points_m[own][:, 2].median() / view.K[0, 0])
-    reach = BORDER_PX + math.ceil(_RIM * surface.diameter_m / pixel_m)
-    rim = grow_mask(own, reach) & ~grow_mask(own, BORDER_PX)
-    return float(is_on_plane(points_m[rim], plane).double().mean()) > _CONTINUED
-
-
-def _without_overlap(answers: Sequence[_Answer], known: SearchTargets) -> list[_Answer]:
-    """Keep answers from the best down that explain points which none before does."""
-    kept: list[_Answer] = []
-    for answer in sorted(answers, key=lambda a: -a.worth):
-        own = answer.points_m[answer.explained]
-        if len(own) == 0:
-            continue
-        taken = torch.zeros(len(own), dtype=torch.bool)
-        for other in kept:
-            pose = other.estimate.camera_from_model
-            assert pose is not None
-            taken |= _is_explained(own, pose, known.surface_of(other.estimate.object))
-        if float(taken.double().mean()) < _SHARED:
-            kept.append(answer)
-    return kept

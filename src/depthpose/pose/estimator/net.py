@@ -38,16 +38,16 @@ from depthpose.pose.estimator.candidates import (
 from depthpose.pose.estimator.fit import fit_of, seen_about
 from depthpose.pose.estimator.inputs import AnyInput, ObjectCloud, Refusal, prepare_cloud
 from depthpose.pose.estimator.inputs import CloudDirections as CloudDirections
-from depthpose.pose.estimator.register import Registration
+from depthpose.pose.estimator.register import CANDIDATE_SLOPES, Registration
 from depthpose.pose.refine import refine_best
-from depthpose.pose.surface import Surface, prepare_surface
+from depthpose.pose.surface import Surface
 from depthpose.pose.types import (
+    CloudInput,
     ObjectModel,
     PoseEstimate,
     PoseFit,
     SeenPoints,
     Status,
-    ViewInput,
     Vote,
 )
 from depthpose.pose.voting import consistent_keypoints, fit_pose, meet_lines, vote_ransac
@@ -186,11 +186,9 @@ class GeoPoseNet(PoseEstimator):
                 "DepthImageRegressor"
             )
         self._network = weights.network.to(usable_device(self.config.device)).eval()
-        self._registration = (
-            Registration(weights.models, replace(self.config, register_refused=False))
-            if self.config.register_refused
-            else None
-        )
+        self._registration: Registration | None = None
+        if self.config.register_refused:
+            self._by_models()  # models without a surface are refused at once
 
     @classmethod
     @own_arithmetic()
@@ -243,14 +241,28 @@ class GeoPoseNet(PoseEstimator):
         network's sums. Only what is likely is registered, where the config wants it.
         """
         for given, found, _ in self._with_votes(inputs, threads, is_likely=is_likely):
-            if self._registration is None or not is_likely or found.status not in _DOUBTED:
+            if not (self.config.register_refused and is_likely and found.status in _DOUBTED):
                 yield found
                 continue
             start = time.perf_counter()
-            (registered,) = self._registration.estimate_many([given])
+            (registered,) = self._by_models().estimate_many([given])
             spent_s = time.perf_counter() - start
             best = registered if registered.is_posed else found
             yield replace(best, seconds={**found.seconds, "registration": spent_s})
+
+    def _by_models(self) -> Registration:
+        """Give the registration of the same objects, which shares what was prepared of them."""
+        if self._registration is None:
+            config = replace(self.config, register_refused=False, with_icp=True)
+            limits = replace(self.refusal, candidate_slopes=CANDIDATE_SLOPES)
+            self._registration = Registration(self.models, config, limits)
+            self._registration._surfaces, self._registration._copies = self._surfaces, self._copies
+        return self._registration
+
+    def _pose_near(
+        self, inputs: Sequence[CloudInput], poses: Sequence[Rigid]
+    ) -> list[PoseEstimate]:
+        return self._by_models()._pose_near(inputs, poses)
 
     @torch.no_grad()
     @own_arithmetic()

@@ -30,8 +30,8 @@ from depthpose.pose.estimator.inputs import AnyInput, Refusal, prepare_cloud
 from depthpose.pose.mesh import read_model, refuse_one_name, with_found_symmetries
 from depthpose.pose.refine import refine_best
 from depthpose.pose.surface import Surface
-from depthpose.pose.types import ObjectModel, PoseEstimate
-from depthpose.pose.voting.point_pairs import PairTable, prepare_pairs, propose_poses, thin
+from depthpose.pose.types import CloudInput, ObjectModel, PoseEstimate
+from depthpose.pose.voting.point_pairs import propose_poses, thin
 
 CANDIDATE_SLOPES = {
     name: slope for name, slope in RefusalConfig().candidate_slopes.items() if name != "disagree"
@@ -85,7 +85,6 @@ class Registration(PoseEstimator):
             )
         super().__init__(models, config)
         self._models, self._refusal = tuple(models), refusal or REFUSAL
-        self._tables: dict[int, PairTable] = {}
 
     @classmethod
     @own_arithmetic()
@@ -125,7 +124,7 @@ class Registration(PoseEstimator):
         """Prepare every model now, about a second each; else it is done when first asked for."""
         for number in range(len(self.models)):
             self._copies_of(number)
-            self._table(number)
+            self._shape(number)
 
     def _each(
         self, inputs: Iterable[AnyInput], threads: int, *, is_likely: bool = True
@@ -134,10 +133,16 @@ class Registration(PoseEstimator):
         del is_likely
         return each_in_threads(partial(or_unreadable, self._estimate), inputs, threads)
 
-    def _estimate(self, given: AnyInput) -> PoseEstimate:
+    def _pose_near(
+        self, inputs: Sequence[CloudInput], poses: Sequence[Rigid]
+    ) -> list[PoseEstimate]:
+        """Refine the poses that were proposed, without votes of the clouds alone."""
+        return [self._estimate(*both) for both in zip(inputs, poses, strict=True)]
+
+    def _estimate(self, given: AnyInput, poses: Rigid | None = None) -> PoseEstimate:
+        """Estimate a pose, from those that were proposed if there are any."""
         number = self._number(given.object)
-        model, surface = self.models[number], self._surface(number)
-        copies, table = self._copies_of(number), self._table(number)
+        model, surface, copies = self.models[number], self._surface(number), self._copies_of(number)
         began = time.perf_counter()
         cloud = CloudConfig(voxel_m=min(0.9, _VOXEL * model.diameter_m), max_points=None)
         prepared = prepare_cloud(given, model, cloud, self.config)
@@ -145,11 +150,7 @@ class Registration(PoseEstimator):
         if isinstance(prepared, Refusal):
             return refused(given, prepared, seconds)
         began = time.perf_counter()
-        generator = torch.Generator().manual_seed(self.config.voting.seed)
-        dense_m = take_evenly(prepared.cloud_m.double(), _SMOOTHED)
-        some_m = dense_m[thin(dense_m, torch.zeros_like(dense_m), _VOXEL * model.diameter_m)]
-        normals, _ = local_planes(dense_m, some_m)
-        proposals = propose_poses(some_m, normals, table, surface, _PROPOSALS, generator)
+        proposals = self._proposals(prepared.cloud_m, number) if poses is None else poses
         seconds["voting"] = time.perf_counter() - began
         clock, icp = Clock(seconds), replace(self.config.icp, starts=1)
         best = refine_best(prepared.cloud_m.double(), proposals, surface, icp)
@@ -167,10 +168,13 @@ class Registration(PoseEstimator):
         )
         return replace(found, name=given.name)
 
-    def _table(self, number: int) -> PairTable:
-        if number not in self._tables:
-            self._tables[number] = prepare_pairs(self._surface(number))
-        return self._tables[number]
+    def _proposals(self, cloud_m: Float[Tensor, "n 3"], number: int) -> Rigid:
+        surface, table = self._surface(number), self._shape(number)[0]
+        generator = torch.Generator().manual_seed(self.config.voting.seed)
+        dense_m = take_evenly(cloud_m.double(), _SMOOTHED)
+        some_m = dense_m[thin(dense_m, torch.zeros_like(dense_m), _VOXEL * surface.diameter_m)]
+        normals, _ = local_planes(dense_m, some_m)
+        return propose_poses(some_m, normals, table, surface, _PROPOSALS, generator)
 
 
 def _evidence_of(

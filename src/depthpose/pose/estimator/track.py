@@ -17,8 +17,8 @@ from depthpose.pose.cloud import cloud_from_depth
 from depthpose.pose.config import IcpConfig, RefusalConfig
 from depthpose.pose.estimator.candidates import observability, surface_signals, without_motions
 from depthpose.pose.estimator.inputs import AnyInput, Refusal
+from depthpose.pose.frame import is_on_plane, largest_plane
 from depthpose.pose.refine import refine_best
-from depthpose.pose.regions import is_on_plane, largest_plane
 from depthpose.pose.surface import NEAR, Surface, compare_depths
 from depthpose.pose.types import CloudInput, ObjectModel, PoseEstimate, ViewInput
 from depthpose.pose.voting import free_motions

@@ -8,22 +8,25 @@ import math
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Bool, Float64, Int64
+from jaxtyping import Bool, Float32, Float64, Int32, Int64
 from torch import Tensor
 from torch.nn.functional import normalize
 
 from depthpose.core.rigid import Rigid
+from depthpose.pose.compiled import serves
 from depthpose.pose.mesh.models import fibonacci_directions
 from depthpose.pose.surface import Surface, look_along_rays
 
-_STEP = 0.05
+STEP = 0.07
 """Of the diameter: distance of the points of the model, and a bin of the distances of a pair."""
 _ANGLES = 15
 """Bins of an angle from 0 to 180 degrees."""
-_DISTANCES = 21
+_DISTANCES = 15
+_REACH = 1.05
+"""Of the diameter: the longest pair."""
 _TURNS = 30
 """Bins of the turn about the normal of a reference point."""
-_MOST_ALIKE = 40
+_MOST_ALIKE = 150
 """Pairs of the model with the same feature, of which so many vote: those of a plane are all alike
 and say little."""
 _MODEL, _COARSER = 800, 1.1
@@ -55,8 +58,7 @@ class PairTable:
     Attributes:
         points_m: of the surface as it is seen from outside, some 0.05 diameters apart.
         frames: of each point its normal, toward who sees it, and two tangents, as columns.
-        keys: features that there are, ascending.
-        bounds: pairs ``bounds[k]`` to ``bounds[k + 1]`` have feature ``keys[k]``.
+        bounds: pairs ``bounds[k]`` to ``bounds[k + 1]`` have feature ``k``.
         first: number of the first point of each pair.
         turn_rad: angle of the second point about the normal of the first, from its first tangent.
         diameter_m: of the object.
@@ -64,10 +66,9 @@ class PairTable:
 
     points_m: Float64[Tensor, "m 3"]
     frames: Float64[Tensor, "m 3 3"]
-    keys: Int64[Tensor, " k"]
-    bounds: Int64[Tensor, " k+1"]
-    first: Int64[Tensor, " pairs"]
-    turn_rad: Float64[Tensor, " pairs"]
+    bounds: Int32[Tensor, " bounds"]
+    first: Int32[Tensor, " pairs"]
+    turn_rad: Float32[Tensor, " pairs"]
     diameter_m: float
 
 
@@ -78,7 +79,7 @@ def prepare_pairs(surface: Surface) -> PairTable:
         surface: of the model; normals may point to either side.
     """
     points_m, normals = _seen_from_outside(surface)
-    step_m = _STEP * surface.diameter_m
+    step_m = STEP * surface.diameter_m
     while len(kept := thin(points_m, normals, step_m)) > _MODEL:
         step_m *= _COARSER
     points_m, frames = points_m[kept], _frames(normals[kept])
@@ -90,15 +91,14 @@ def prepare_pairs(surface: Surface) -> PairTable:
     feature = _key(feature.floor().long())[chance]
     feature, order = feature.sort(stable=True)
     order = chance[order]
-    keys, sizes = feature.unique_consecutive(return_counts=True)
+    sizes = torch.bincount(feature, minlength=(_DISTANCES + 1) * _ANGLES**3)
     bounds = torch.cat([sizes.new_zeros(1), sizes.cumsum(0)])
     return PairTable(
         points_m=points_m,
         frames=frames,
-        keys=keys,
-        bounds=bounds,
-        first=first[order],
-        turn_rad=turn_rad[order],
+        bounds=bounds.int(),
+        first=first[order].int(),
+        turn_rad=turn_rad[order].float(),
         diameter_m=surface.diameter_m,
     )
 
@@ -123,7 +123,8 @@ def propose_poses(
     """
     chosen = torch.randperm(len(points_m), generator=generator)
     points_m, normals = points_m[chosen[:_SCENE]], normals[chosen[:_SCENE]]
-    poses = _vote(points_m, _frames(normals), table)
+    references = torch.arange(min(_REFERENCES, len(points_m)))
+    poses, _ = vote_poses(points_m, normals, references, table, _PEAKS)
     scores = _scores(points_m, normals, poses, surface)
     best = scores.argsort(descending=True, stable=True)[:count]
     return poses[best]
@@ -189,7 +190,7 @@ def _features(
         [local_m[:, 0] / safe_m, (m * way_m).sum(-1) / safe_m, (n * m).sum(-1)], -1
     )
     angles = cosines.clamp(-1, 1).arccos() * (_ANGLES / math.pi)
-    bins = torch.cat([(distance_m / (_STEP * diameter_m))[:, None], angles], 1)
+    bins = torch.cat([(distance_m / (STEP * diameter_m))[:, None], angles], 1)
     return bins, torch.atan2(local_m[:, 2], local_m[:, 1])
 
 
@@ -208,33 +209,94 @@ def _neighbours(feature: Float64[Tensor, "p 4"]) -> Int64[Tensor, "p 5"]:
     return torch.cat([_key(own)[:, None], _key(moved)], 1)
 
 
-def _vote(
-    points_m: Float64[Tensor, "n 3"], frames: Float64[Tensor, "n 3 3"], table: PairTable
-) -> Rigid:
-    """Let every pair of a reference point vote for a model point and a turn about its normal."""
-    count, models = min(_REFERENCES, len(points_m)), len(table.points_m)
-    far_m = torch.cdist(points_m[:count], points_m)
-    used = (far_m > _STEP * table.diameter_m) & (far_m < 1.05 * table.diameter_m)
-    first, second = used.nonzero(as_tuple=True)
-    feature, turn_rad = _features(points_m, frames, first, second, table.diameter_m)
+def vote_poses(
+    points_m: Float64[Tensor, "n 3"],
+    normals: Float64[Tensor, "n 3"],
+    references: Int64[Tensor, " r"],
+    table: PairTable,
+    peaks: int,
+    partners: int | None = None,
+) -> tuple[Rigid, Float64[Tensor, " b"]]:
+    """Let every pair of a reference point vote for a model point and a turn about its normal.
+
+    A pair asks for its own feature and, in each of its four values, the next bin beside it. Rare
+    features weigh more, and a turn votes once for a feature: flat parts would drown the rest
+    (Hinterstoisser et al., Going Further with Point Pair Features, ECCV 2016).
+
+    Args:
+        points_m: of the scene, about 0.05 diameters apart, in the camera frame.
+        normals: theirs, toward the camera.
+        references: numbers of the points that vote with each of the others.
+        table: pairs of the model.
+        peaks: poses that each reference proposes.
+        partners: the first so many of the points are those others; None: all are.
+
+    Returns:
+        Poses and their votes, reference after reference.
+    """
+    frames = _frames(normals)
+    partners = len(points_m) if partners is None else min(partners, len(points_m))
+    if serves(points_m):
+        from depthpose.pose.compiled.pairs import pair_peaks
+
+        pairs = (table.bounds.numpy(), table.first.numpy(), table.turn_rad.numpy())
+        step_m = STEP * table.diameter_m
+        reach = (step_m, step_m, _REACH * table.diameter_m)
+        found = pair_peaks(
+            (points_m.numpy(), frames.numpy()), partners, references.numpy(), pairs,
+            (len(table.points_m), peaks, _MOST_ALIKE), reach, (_DISTANCES, _ANGLES, _TURNS),
+        )  # fmt: skip
+        number, bin_, votes = (torch.from_numpy(a).flatten() for a in found)
+    else:
+        chunks = [_peaks(points_m, frames, partners, some, table, peaks)
+                  for some in references.split(20)]  # fmt: skip
+        number, bin_, votes = (torch.cat(parts) for parts in zip(*chunks, strict=True))
+    angle = (bin_ + 0.5) * (2 * math.pi / _TURNS)
+    reference = references.repeat_interleave(peaks)
+    return _poses(points_m, frames, table, reference, number, angle.double()), votes
+
+
+def _peaks(
+    points_m: Float64[Tensor, "n 3"],
+    frames: Float64[Tensor, "n 3 3"],
+    partners: int,
+    references: Int64[Tensor, " r"],
+    table: PairTable,
+    peaks: int,
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Vote without numba: numbers of model points, bins of turns and votes."""
+    count, models = len(references), len(table.points_m)
+    far_m = (points_m[references, None] - points_m[:partners]).norm(dim=-1)
+    used = (far_m > STEP * table.diameter_m) & (far_m < _REACH * table.diameter_m)
+    row, second = used.nonzero(as_tuple=True)
+    feature, turn_rad = _features(points_m, frames, references[row], second, table.diameter_m)
     keys = _neighbours(feature)
-    row = torch.searchsorted(table.keys, keys).clamp(max=len(table.keys) - 1)
-    size = (table.bounds[row + 1] - table.bounds[row]).clamp(max=_MOST_ALIKE)
-    size = torch.where(table.keys[row] == keys, size, 0).flatten()
-    asked = torch.repeat_interleave(torch.arange(len(size)), size)
-    offset = torch.arange(len(asked)) - (size.cumsum(0) - size)[asked]
-    pair = table.bounds[row.flatten()[asked]] + offset
-    scene = asked // keys.shape[1]
+    size = (table.bounds[keys + 1] - table.bounds[keys]).long()
+    same = (keys[:, 1:] == keys[:, :1]).nonzero(as_tuple=True)
+    size[:, 1:][same] = 0
+    turn_bin = ((turn_rad + math.pi) / (2 * math.pi) * _TURNS).long().clamp(max=_TURNS - 1)
+    said = (row[:, None] * len(table.bounds) + keys) * _TURNS + turn_bin[:, None]
+    said = torch.where(size > 0, said, -1).flatten()
+    _, place = said.unique(return_inverse=True)
+    first = torch.full((int(place.max()) + 1 if len(place) else 0,), len(said))
+    first = first.scatter_reduce_(0, place, torch.arange(len(said)), "amin")
+    first = first[said[first] >= 0].sort().values
+    size = size.flatten()[first]
+    few = size.clamp(max=_MOST_ALIKE)
+    asked = torch.repeat_interleave(torch.arange(len(few)), few)
+    offset = torch.arange(len(asked)) - (few.cumsum(0) - few)[asked]
+    pair = table.bounds[keys.flatten()[first][asked]] + offset
+    scene = first[asked] // keys.shape[1]
     turn = (turn_rad[scene] - table.turn_rad[pair]) / (2 * math.pi) % 1
     bin_ = (turn * _TURNS).long().clamp(max=_TURNS - 1)
-    cell = (first[scene] * models + table.first[pair]) * _TURNS + bin_
-    votes = torch.bincount(cell, minlength=count * models * _TURNS).reshape(count, models, _TURNS)
+    cell = (row[scene] * models + table.first[pair]) * _TURNS + bin_
+    weight = 1 / size[asked].double().sqrt()
+    votes = torch.bincount(cell, weight, minlength=count * models * _TURNS)
+    votes = votes.reshape(count, models, _TURNS)
     votes = 2 * votes + votes.roll(1, -1) + votes.roll(-1, -1)
-    best = votes.flatten(1).topk(_PEAKS)
-    reference = torch.arange(count).repeat_interleave(_PEAKS)
-    number, bin_ = best.indices.flatten() // _TURNS, best.indices.flatten() % _TURNS
-    angle = (bin_ + 0.5) * (2 * math.pi / _TURNS)
-    return _poses(points_m, frames, table, reference, number, angle.double())
+    most, bins = votes.max(-1)
+    best = most.topk(min(peaks, models))
+    return best.indices.flatten(), bins.gather(1, best.indices).flatten(), best.values.flatten()
 
 
 def _poses(

@@ -1,0 +1,274 @@
+"""A whole depth image as an object is searched in it: points, normals, and planes that are none."""
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Float64, Int64
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import connected_components
+from torch import Tensor
+from torch.nn.functional import normalize, pad
+
+from depthpose.core.arrays import take_evenly
+from depthpose.core.camera import back_project
+
+_MOST_PIXELS = 110_000
+"""Of a larger image every n-th row and column is used."""
+_WINDOW = 3
+"""Pixels to each side of one through which its plane is laid."""
+_FILLED = 0.4
+"""Least share of the window that is of the same surface."""
+_BENDINGS = 3
+"""A sensor bends walls: what lies on a plane is found again so often, each time bent as it was."""
+_ALONG = math.cos(math.radians(20))
+_JUMP_M = 0.004
+_JUMP_PER_M = 0.012
+"""Neighbours are of one surface up to this difference in depth, and this share of it."""
+_TOLERANCE_M = 0.004
+_TOLERANCE_PER_M = 0.003
+"""Points lie on a plane up to 4 mm, and 3 mm for the square of their depth in metres: a Kinect's
+noise grows so."""
+_PLANES = 6
+_HYPOTHESES = 400
+_SAMPLE = 4000
+_LEAST_SHARE = 0.04
+"""Of the readings: a plane of fewer is no table or wall."""
+_LEAST_POINTS = 60
+_WIDER, _LONGER = 1.3, 3.0
+"""A plane that is wider than an object by so much is none of its sides; nor is one that is so much
+longer, but for sides of several that lie in one plane and touch."""
+
+
+Plane = tuple[Float64[Tensor, "3"], Float64[Tensor, ""]]
+"""Unit normal, and the distance [m] of the origin along it."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Frame:
+    """A depth image, thinned to some hundred thousand pixels.
+
+    Attributes:
+        step: every so many rows and columns of the image are used.
+        depth_m: 0 where there is no reading.
+        K: of the thinned image.
+        points_m: in the camera frame.
+        normals: toward the camera.
+        is_smooth: where a normal is known.
+        plane_m: of the plane that a pixel shows: objects up to this diameter have no such side; 0
+            where it shows none.
+    """
+
+    step: int
+    depth_m: Float64[Tensor, "h w"]
+    K: Float64[Tensor, "3 3"]
+    points_m: Float64[Tensor, "h w 3"]
+    normals: Float64[Tensor, "h w 3"]
+    is_smooth: Bool[Tensor, "h w"]
+    plane_m: Float64[Tensor, "h w"]
+
+
+def prepare_frame(depth_m: Float[Tensor, "h w"], K: Float[Tensor, "3 3"]) -> Frame:
+    """Lay a plane through the neighbours of each pixel, and find the widest planes.
+
+    Planes are found one after the other by RANSAC (Fischler and Bolles 1981) and refitted.
+
+    Args:
+        depth_m: along the optical axis; NaN or 0 where there is no reading.
+        K: intrinsic matrix.
+    """
+    step = math.ceil(math.sqrt(depth_m.numel() / _MOST_PIXELS))
+    depth_m = depth_m[::step, ::step].double()
+    depth_m = torch.where(depth_m.isfinite() & (depth_m > 0), depth_m, 0.0)
+    K = K.double() / torch.tensor([[step], [step], [1]])
+    points_m = back_project(depth_m, K)
+    normals, is_smooth = _normals(depth_m, points_m, K)
+    plane_m = _planes(depth_m, points_m, normals)
+    return Frame(
+        step=step, depth_m=depth_m, K=K, points_m=points_m, normals=normals, is_smooth=is_smooth,
+        plane_m=plane_m,
+    )  # fmt: skip
+
+
+def _normals(
+    depth_m: Float64[Tensor, "h w"], points_m: Float64[Tensor, "h w 3"], K: Float64[Tensor, "3 3"]
+) -> tuple[Float64[Tensor, "h w 3"], Bool[Tensor, "h w"]]:
+    """Fit 1 / depth, which is linear in the picture of a plane, in a window of the same surface."""
+    height, width = depth_m.shape
+    inverse = torch.where(depth_m > 0, 1 / depth_m, 0.0)
+    limit = (_JUMP_M + _JUMP_PER_M * depth_m) * inverse.square()
+    padded, side = pad(inverse, (_WINDOW,) * 4), 2 * _WINDOW + 1
+    n, x, y, q, xx, xy, yy, xq, yq = depth_m.new_zeros(9, height, width)
+    for down in range(-_WINDOW, _WINDOW + 1):
+        for right in range(-_WINDOW, _WINDOW + 1):
+            top, left = _WINDOW + down, _WINDOW + right
+            other = padded[top : top + height, left : left + width]
+            gap = other - inverse
+            is_same = ((other > 0) & (gap.abs() < limit)).to(depth_m)
+            gap = gap * is_same
+            n += is_same
+            x += right * is_same
+            y += down * is_same
+            q += gap
+            xx += right * right * is_same
+            xy += right * down * is_same
+            yy += down * down * is_same
+            xq += right * gap
+            yq += down * gap
+    count = n.clamp(min=1)
+    x, y, q = x / count, y / count, q / count
+    xx, xy, yy = xx / count - x * x, xy / count - x * y, yy / count - y * y
+    xq, yq = xq / count - x * q, yq / count - y * q
+    spread = xx * yy - xy * xy
+    a = (xq * yy - yq * xy) / spread.clamp(min=1e-9)
+    b = (yq * xx - xq * xy) / spread.clamp(min=1e-9)
+    # n . X = -1 for the ray (x', y', 1): 1 / depth = -(n_x x' + n_y y' + n_z).
+    along = torch.stack([a * K[0, 0], b * K[1, 1]], -1)
+    ray = torch.where((depth_m > 0)[..., None], points_m[..., :2] * inverse[..., None], 0.0)
+    last = inverse + q - a * x - b * y - (along * ray).sum(-1)
+    normals = -normalize(torch.cat([along, last[..., None]], -1), dim=-1)
+    return normals, (n >= _FILLED * side * side) & (spread > 0.3) & (depth_m > 0)
+
+
+def _planes(
+    depth_m: Float64[Tensor, "h w"],
+    points_m: Float64[Tensor, "h w 3"],
+    normals: Float64[Tensor, "h w 3"],
+) -> Float64[Tensor, "h w"]:
+    """Find the planes of an image; give each of their pixels what objects have no such side."""
+    is_left = depth_m > 0
+    plane_m = torch.zeros_like(depth_m)
+    least = max(_LEAST_POINTS, _LEAST_SHARE * int(is_left.sum()))
+    generator = torch.Generator().manual_seed(0)
+    for _ in range(_PLANES):
+        plane = largest_plane(points_m[is_left], generator)
+        if plane is None:
+            break
+        near = is_on_plane(points_m, plane) & is_left
+        if int(near.sum()) < least:
+            break
+        bent = near | _bent(points_m, plane, near, is_left & ((normals @ plane[0]).abs() > _ALONG))
+        label = label_regions(depth_m, bent)
+        sizes = torch.bincount(label[near], minlength=int(label.max()) + 1)
+        piece = near & (label == sizes.argmax())
+        is_left &= ~near
+        if int(piece.sum()) >= least:
+            whole = torch.bincount(label[bent], minlength=len(sizes))
+            joined = (sizes > 0.5 * whole)[label] & bent
+            plane_m[joined] = _no_side_m(points_m[piece])
+            is_left &= ~joined
+    return plane_m
+
+
+def _bent(
+    points_m: Float64[Tensor, "h w 3"],
+    plane: Plane,
+    near: Bool[Tensor, "h w"],
+    is_along: Bool[Tensor, "h w"],
+) -> Bool[Tensor, "h w"]:
+    """Mark what is turned as a plane and lies on it as the sensor bends it, by a quadratic."""
+    off_m = points_m @ plane[0] - plane[1]
+    x, y = (points_m[..., :2] / points_m[..., 2:].clamp(min=1e-6)).unbind(-1)
+    terms = torch.stack([torch.ones_like(x), x, y, x * x, x * y, y * y], -1)
+    found = near & is_along
+    for _ in range(_BENDINGS):
+        A, b = (take_evenly(grid[found], _SAMPLE) for grid in (terms, off_m))
+        if len(b) < _LEAST_POINTS:
+            break
+        bend_m = terms @ torch.linalg.lstsq(A, b[:, None]).solution
+        found = is_along & ((off_m - bend_m[..., 0]).abs() < _tolerance_m(points_m))
+    return found
+
+
+def _no_side_m(points_m: Float64[Tensor, "n 3"]) -> float:
+    """Give the diameter up to which an object has no side as wide or as long as a plane."""
+    some = take_evenly(points_m, _SAMPLE)
+    offset = some - some.mean(0)
+    _, axes = torch.linalg.eigh(offset.T @ offset)
+    along = offset @ axes[:, 1:]
+    width_m, length_m = (along.quantile(0.95, 0) - along.quantile(0.05, 0)).tolist()
+    return max(width_m / _WIDER, length_m / _LONGER)
+
+
+def largest_plane(points_m: Float64[Tensor, "n 3"], generator: torch.Generator) -> Plane | None:
+    """Give the plane that most points lie on; None for fewer than 60 points.
+
+    Args:
+        points_m: in the camera frame.
+        generator: of the hypotheses of RANSAC.
+    """
+    some = take_evenly(points_m, _SAMPLE)
+    if len(some) < _LEAST_POINTS:
+        return None
+    triple = torch.randint(len(some), (_HYPOTHESES, 3), generator=generator)
+    a, b, c = some[triple].unbind(1)
+    normal = torch.linalg.cross(b - a, c - a)
+    length = normal.norm(dim=-1, keepdim=True)
+    normal = normal / length.clamp(min=1e-12)
+    offset = (normal * a).sum(-1)
+    on = (some @ normal.T - offset).abs() < _tolerance_m(some)[:, None]
+    on &= length[:, 0] > 1e-8
+    best = int(on.sum(0).argmax())
+    plane = (normal[best], offset[best])
+    for _ in range(3):
+        near = some[is_on_plane(some, plane)]
+        if len(near) < 3:
+            return None
+        middle = near.mean(0)
+        _, axes = torch.linalg.eigh((near - middle).T @ (near - middle))
+        plane = (axes[:, 0], axes[:, 0] @ middle)
+    return plane
+
+
+def _tolerance_m(points_m: Float64[Tensor, "*batch 3"]) -> Float64[Tensor, "*batch"]:
+    return _TOLERANCE_M + _TOLERANCE_PER_M * points_m[..., 2].square()
+
+
+def is_on_plane(points_m: Float64[Tensor, "*batch 3"], plane: Plane) -> Bool[Tensor, "*batch"]:
+    """Whether points lie on a plane, as far as a depth sensor measures it.
+
+    Args:
+        points_m: in the camera frame.
+        plane: as :func:`largest_plane` gives it.
+    """
+    normal, offset = plane
+    return (points_m @ normal - offset).abs() < _tolerance_m(points_m)
+
+
+def label_regions(
+    depth_m: Float[Tensor, "h w"], is_left: Bool[Tensor, "h w"]
+) -> Int64[Tensor, "h w"]:
+    """Number the pixels that hang together: neighbours, at corners too, without a jump in depth.
+
+    Args:
+        depth_m: of each pixel.
+        is_left: the pixels that count; what is beside them has the number of a region of its own.
+    """
+    height, width = depth_m.shape
+    index = torch.arange(height * width).reshape(height, width)
+    rows, columns = [], []
+    for down, right in ((0, 1), (1, 0), (1, 1), (1, -1)):
+        a, b = _beside(index, down, right)
+        z_a, z_b = _beside(depth_m, down, right)
+        both = torch.logical_and(*_beside(is_left, down, right))
+        joined = both & ((z_a - z_b).abs() < _JUMP_M + _JUMP_PER_M * torch.minimum(z_a, z_b))
+        rows.append(a[joined])
+        columns.append(b[joined])
+    a, b = torch.cat(rows).numpy(), torch.cat(columns).numpy()
+    size = height * width
+    graph = coo_matrix((np.ones(len(a), np.int8), (a, b)), shape=(size, size))
+    return (
+        torch.from_numpy(connected_components(graph, directed=False)[1])
+        .long()
+        .reshape(height, width)
+    )
+
+
+def _beside(grid: Tensor, down: int, right: int) -> tuple[Tensor, Tensor]:
+    """Give each pixel and its neighbour so many rows down and columns to the right."""
+    height, width = grid.shape
+    left = max(0, -right)
+    first = grid[: height - down, left : width - max(0, right)]
+    second = grid[down:, left + right : width - max(0, right) + right]
+    return first, second

@@ -1,0 +1,133 @@
+"""Objects by their models alone in whole depth images: planes, votes, and what is answered."""
+
+import time
+
+import pytest
+import torch
+from tests.pose.synthetic_objects import CAMERA, K, bracket, pose_at, view_of
+
+from depthpose.core.camera import Camera
+from depthpose.core.rigid import Rigid
+from depthpose.pose.estimator import Registration
+from depthpose.pose.estimator.hypotheses import compare_with_image, prepare_views, propose_in_frame
+from depthpose.pose.frame import prepare_frame
+from depthpose.pose.metrics import add_m
+from depthpose.pose.surface import prepare_surface
+from depthpose.pose.voting.point_pairs import prepare_pairs
+
+TRUTHS = [pose_at(-0.13, 0.7, seed=1), pose_at(0.12, 0.9, seed=2)]
+
+
+@pytest.fixture(scope="module")
+def net() -> Registration:
+    made = Registration([bracket()])
+    made.prepare()
+    return made
+
+
+def table() -> torch.Tensor:
+    """Two brackets before a wall that leans back, seen with noise of half a millimetre."""
+    v = torch.arange(240)[:, None].expand(240, 320)
+    seen, mask = view_of(bracket(), *TRUTHS)
+    noise = 0.0005 * torch.randn(240, 320, generator=torch.Generator().manual_seed(0))
+    return torch.where(mask, seen.float(), 1.25 - 0.0005 * v.float()) + noise
+
+
+def test_planes_go_and_objects_stay() -> None:
+    depth_m = table()
+    _, mask = view_of(bracket(), *TRUTHS)
+    frame = prepare_frame(depth_m, K.float())
+    is_plane = frame.plane_m >= bracket().diameter_m
+    assert float(is_plane[~mask].float().mean()) > 0.95
+    assert not bool(is_plane[mask].any())
+    # A wall no wider than an object may be an object's side: it stays.
+    assert not bool((frame.plane_m >= 5.0).any())
+
+
+def test_normals_are_those_of_the_surface() -> None:
+    depth_m, mask = view_of(bracket(), TRUTHS[0])
+    frame = prepare_frame(depth_m, K)
+    surface = prepare_surface(bracket())
+    assert frame.step == 1
+    assert not bool(frame.is_smooth[~mask].any())
+    inner = frame.is_smooth & mask
+    local_m = TRUTHS[0].inverse().apply(frame.points_m[inner].float()).double()
+    index = surface.nearest(local_m)
+    cosine = (frame.normals[inner] * (surface.normals[index] @ TRUTHS[0].R.double().mT)).sum(-1)
+    assert float((cosine.abs() > 0.98).double().mean()) > 0.85, "all but those at edges"
+    assert bool(((frame.normals * frame.points_m).sum(-1)[inner] < 0).all()), "toward the camera"
+
+
+def test_a_large_image_is_thinned() -> None:
+    lens = torch.diag(torch.tensor([900.0, 900, 1]))
+    frame = prepare_frame(torch.full((1200, 1600), 1.0), lens)
+    assert frame.step == 5
+    assert frame.depth_m.shape == (240, 320)
+    assert float(frame.K[0, 0]) == 180
+
+
+def test_a_plane_through_several_objects_is_no_plane() -> None:
+    """Five blocks of one height in front of a wall: no plane through all of them cuts bands out."""
+    depth_m = torch.full((240, 320), 1.2)
+    mask = torch.zeros(240, 320).bool()
+    for k in range(5):
+        block = (slice(60, 180), slice(20 + 60 * k, 60 + 60 * k))
+        depth_m[block] = (0.9 + 0.001 * torch.arange(120).float())[:, None]
+        mask[block] = True
+    is_plane = prepare_frame(depth_m, K.float()).plane_m >= 0.15
+    assert bool(is_plane[~mask].all())
+    assert not bool(is_plane[mask].any())
+
+
+def test_the_image_agrees_with_the_true_pose_and_with_none_beside_it() -> None:
+    model, truth = bracket(), TRUTHS[0].double()
+    surface = prepare_surface(model)
+    views, frame = prepare_views(surface), prepare_frame(table(), K)
+    aside = [Rigid(truth.R, truth.t_m + torch.tensor(shift).double())
+             for shift in ([0.05, 0, 0], [0, 0, 0.06], [0, 0, -0.06])]  # fmt: skip
+    seen = compare_with_image(frame, Rigid.stack([truth, *aside]), surface, views)
+    assert float(seen.worth[0]) > 0.7
+    assert float(seen.worth[1:].max()) < 0.3
+    assert float(seen.goes_on[0]) < 0.02
+    assert float(seen.parted[0]) > 0.8
+    assert float(seen.spread[0]) < 0.02
+
+
+def test_point_pairs_propose_every_instance() -> None:
+    model = bracket()
+    surface = prepare_surface(model)
+    frame = prepare_frame(table(), K)
+    views = prepare_views(surface)
+    poses, seen = propose_in_frame(frame, surface, prepare_pairs(surface), views)
+    assert bool((seen.worth.diff() <= 0).all())
+    for truth in TRUTHS:
+        errors = [float(add_m(pose.float(), truth, model.vertices_m)) for pose in
+                  (poses[k] for k in range(5))]  # fmt: skip
+        assert min(errors) < 0.03 * model.diameter_m
+
+
+@pytest.mark.parametrize(
+    "depth_m",
+    [
+        torch.full((240, 320), torch.nan),
+        torch.full((240, 320), 0.7),
+        0.5 + 0.4 * torch.rand(240, 320, generator=torch.Generator().manual_seed(0)),
+        torch.full((3, 2), 0.5),
+    ],
+    ids=["no reading", "a wall", "noise", "six pixels"],
+)
+def test_where_nothing_is_nothing_is_found_soon(depth_m: torch.Tensor, net: Registration) -> None:
+    height, width = depth_m.shape
+    small = torch.tensor([[500.0, 0, width / 2], [0, 500, height / 2], [0, 0, 1]]).double()
+    began = time.process_time()
+    assert net.find(depth_m, Camera(width=width, height=height, K=small)) == []
+    assert time.process_time() - began < 10
+
+
+def test_every_instance_is_found_once_and_nothing_else(net: Registration) -> None:
+    found = net.find(table(), CAMERA)
+    assert [estimate.name for estimate in found] == ["input_0", "input_1"]
+    for truth in TRUTHS:
+        poses = [e.camera_from_model for e in found]
+        errors = [float(add_m(p, truth, bracket().vertices_m)) for p in poses if p is not None]
+        assert min(errors) < 0.01
