@@ -40,7 +40,7 @@ from depthpose.pose.estimator.inputs import AnyInput, ObjectCloud, Refusal, prep
 from depthpose.pose.estimator.inputs import CloudDirections as CloudDirections
 from depthpose.pose.estimator.register import CANDIDATE_SLOPES, Registration
 from depthpose.pose.refine import refine_best
-from depthpose.pose.surface import Surface
+from depthpose.pose.surface import Surface, prepare_surface
 from depthpose.pose.types import (
     CloudInput,
     ObjectModel,
@@ -48,6 +48,7 @@ from depthpose.pose.types import (
     PoseFit,
     SeenPoints,
     Status,
+    ViewInput,
     Vote,
 )
 from depthpose.pose.voting import consistent_keypoints, fit_pose, meet_lines, vote_ransac
