@@ -9,7 +9,12 @@ from tests.pose.synthetic_objects import CAMERA, K, bracket, pose_at, view_of
 from depthpose.core.camera import Camera
 from depthpose.core.rigid import Rigid
 from depthpose.pose.estimator import Registration
-from depthpose.pose.estimator.hypotheses import compare_with_image, prepare_views, propose_in_frame
+from depthpose.pose.estimator.hypotheses import (
+    compare_with_image,
+    doubts_of,
+    prepare_views,
+    propose_in_frame,
+)
 from depthpose.pose.frame import prepare_frame
 from depthpose.pose.metrics import add_m
 from depthpose.pose.surface import prepare_surface
@@ -90,7 +95,9 @@ def test_the_image_agrees_with_the_true_pose_and_with_none_beside_it() -> None:
     assert float(seen.worth[1:].max()) < 0.3
     assert float(seen.goes_on[0]) < 0.02
     assert float(seen.parted[0]) > 0.8
-    assert float(seen.spread[0]) < 0.02
+    doubts = doubts_of(frame, Rigid.stack([truth, *aside]), surface, views)
+    assert float(doubts[0]) < -2
+    assert float(doubts[1:].min()) > 0
 
 
 def test_point_pairs_propose_every_instance() -> None:

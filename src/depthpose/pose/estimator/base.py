@@ -250,6 +250,7 @@ class PoseEstimator(ABC):
             surface_of=lambda name: self._surface(self._number(name)),
             shape_of=lambda name: self._shape(self._number(name)),
             pose_near=self._pose_near,
+            max_size_error=self.refusal.max_size_error,
         )
         return find_objects(view, known)
 

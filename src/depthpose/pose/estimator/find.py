@@ -15,12 +15,11 @@ from depthpose.core.rigid import Rigid
 from depthpose.pose.augment import grow_mask
 from depthpose.pose.cloud import cloud_from_depth
 from depthpose.pose.config import RefusalConfig
-from depthpose.pose.estimator.candidates import log_signal, share_out
-from depthpose.pose.estimator.fit import BORDER_PX
+from depthpose.pose.estimator.candidates import share_out
+from depthpose.pose.estimator.fit import BORDER_PX, SURE, sensor_size_error
 from depthpose.pose.estimator.hypotheses import (
-    Agreement,
     Views,
-    compare_with_image,
+    doubts_of,
     is_no_side,
     propose_in_frame,
 )
@@ -32,6 +31,8 @@ from depthpose.pose.voting.point_pairs import PairTable
 
 _HOPELESS = 6.0
 """Log odds that the image alone adds, from which nothing else makes a pose right."""
+_WORSE = 2.0
+"""An answer whose log odds are by so much worse than those of the best of its object is none."""
 _LEAST_WORTH = 0.25
 """Poses with which the image agrees less are not judged."""
 _MOST_JUDGED, _LEAST_JUDGED = 40, 4
@@ -66,12 +67,14 @@ class SearchTargets:
         surface_of: gives the surface of an object by its name.
         shape_of: gives its point pairs and what a camera sees of it.
         pose_near: clouds and the poses that were proposed for them to estimates.
+        max_size_error: of :class:`RefusalConfig`.
     """
 
     names: Sequence[str]
     surface_of: Callable[[str], Surface]
     shape_of: Callable[[str], tuple[PairTable, Views]]
     pose_near: Callable[[Sequence[CloudInput], Sequence[Rigid]], list[PoseEstimate]]
+    max_size_error: float
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -121,7 +124,7 @@ def _candidates(frame: Frame, known: SearchTargets) -> list[_Candidate]:
     def propose(name: str) -> list[_Candidate]:
         surface, (table, views) = known.surface_of(name), known.shape_of(name)
         poses, seen = propose_in_frame(frame, surface, table, views, len(known.names))
-        doubts, found = _doubts_of(seen), list[_Candidate]()
+        doubts, found = seen.rough_doubt, list[_Candidate]()
         likely = (seen.worth >= _LEAST_WORTH) & (doubts < _HOPELESS)
         for k in likely.nonzero()[:most, 0].tolist():
             own = _explained(frame, poses[k], surface)
@@ -154,32 +157,30 @@ def _judged(
         if estimate.camera_from_model is None:
             continue
         surface, views = known.surface_of(estimate.object), known.shape_of(estimate.object)[1]
-        pose = estimate.camera_from_model.double()
-        seen = compare_with_image(frame, Rigid.stack([pose]), surface, views)
-        doubt = _doubt_of(seen, estimate)
-        if doubt < 0 and not is_cut_out(view, pose, surface):
+        pose, fit = estimate.camera_from_model.double(), estimate.fit
+        assert fit is not None
+        doubt = float(doubts_of(frame, pose[None], surface, views)) + 3.47 * (1 - fit.agrees)
+        is_other = _is_other_size(estimate, view, surface, known.max_size_error)
+        if doubt < 0 and not is_other and not is_cut_out(view, pose, surface):
             own = _explained(frame, pose, surface)
             one = _Candidate(object=estimate.object, pose=pose, doubt=doubt, explained=own)
             answers.append((one, estimate))
-    return answers
+    least = {one.object: one.doubt for one, _ in sorted(answers, key=lambda a: -a[0].doubt)}
+    return [both for both in answers if both[0].doubt < least[both[0].object] + _WORSE]
 
 
-def _doubts_of(seen: Agreement) -> Float64[Tensor, " b"]:
-    """Give what the image adds to the log odds of poses' being wrong."""
-    against, goes_on = 2.9 * seen.against, 20.0 * seen.goes_on
-    return against + goes_on + 3.2 * (1 - seen.parted)
+def _is_other_size(estimate: PoseEstimate, view: ViewInput, surface: Surface, most: float) -> bool:
+    """Whether the size that fits best is none that the sensor explains, however little it gains.
 
-
-def _doubt_of(seen: Agreement, estimate: PoseEstimate) -> float:
-    """Give the log odds of a pose's being wrong."""
-    fit, size = estimate.fit, estimate.identity
-    assert fit is not None
-    off = 0.0
-    if size is not None and size.size is not None and size.size_deviation is not None:
-        off = max(0.0, abs(size.size - 1) - 2 * size.size_deviation)
-    logs = {name: log_signal(estimate.signals[name]) for name in ("tilt", "unseen")}
-    doubt = 26.0 * (1 - fit.agrees) + 14.0 * (1 - fit.explained) + 16.0 * off
-    return doubt + 0.37 * logs["tilt"] + 0.7 * logs["unseen"] + float(_doubts_of(seen)[0]) - 0.46
+    With a mask it must gain too, as what is asked for is likely there.
+    """
+    identity, pose = estimate.identity, estimate.camera_from_model
+    if identity is None or identity.size is None or identity.size_deviation is None:
+        return False
+    assert pose is not None
+    distance_m = float(pose.apply(surface.points_m.mean(0, keepdim=True).float())[0, 2])
+    most += sensor_size_error(distance_m, float(view.K[0, 0]), surface.diameter_m)
+    return abs(identity.size - 1) > most + SURE * identity.size_deviation
 
 
 def _without_rivals(answers: Sequence[tuple[_Candidate, PoseEstimate]]) -> list[PoseEstimate]:

@@ -208,7 +208,7 @@ steps do not bring it nearer: in 123 views the gain was then -0.035 at most."""
 _FLIP = torch.tensor([-1.0, 1.0, 1.0], dtype=torch.float64)
 _OFFSET_M = 0.006
 """Sensors are off along the ray as a whole by 3 to 6 mm: so much nearer, a thing looks larger."""
-_SURE = 2.0
+SURE = 2.0
 """Standard deviations."""
 _SIZE_GAIN = 0.05
 """Where another size gains less (0.25 % of the diameter), what is seen of the surface fits at many,
@@ -349,6 +349,11 @@ def mirror_gain(cloud_m: Float[Tensor, "n 3"], pose: Rigid, surface: Surface) ->
     return float(own - distance_to(exact_m, surface, is_exact=True).min())
 
 
+def sensor_size_error(distance_m: float, focal_px: float, diameter_m: float) -> float:
+    """Give the share by which an offset and displaced edges of a sensor may change a size."""
+    return _OFFSET_M / distance_m + 2 * BORDER_PX * distance_m / focal_px / diameter_m
+
+
 def identity_of(
     cloud: ObjectCloud,
     pose: Rigid,
@@ -364,10 +369,9 @@ def identity_of(
     if not is_mirror_alike(model):
         mirror = mirror_gain(cloud.cloud_m, pose, surface)
     distance_m = float(cloud.cloud_m[:, 2].double().median())
-    border_m = BORDER_PX * distance_m / float(seen.K[0, 0])
-    sensor = _OFFSET_M / distance_m + 2 * border_m / surface.diameter_m
+    sensor = sensor_size_error(distance_m, float(seen.K[0, 0]), surface.diameter_m)
     off = abs(scale.times - 1)
-    is_other_size = off > max_size_error + sensor + _SURE * scale.sigma and scale.gain > _SIZE_GAIN
+    is_other_size = off > max_size_error + sensor + SURE * scale.sigma and scale.gain > _SIZE_GAIN
     words = (
         f"{scale.times:.2f} times the model's size fits best (standard deviation {scale.sigma:.2f})"
     )
@@ -389,13 +393,13 @@ def identity_of(
                 "of another size, another object, or a wrong unit or camera"
             ),
         )
-    elif off + _SURE * scale.sigma > _OTHER_SIZES + sensor:
+    elif off + SURE * scale.sigma > _OTHER_SIZES + sensor:
         reason = f"what was seen does not fix the size: {words}"
     elif mirror is not None and mirror > -_MIRROR_GAIN:
         reason = f"the mirror image of {model.name} fits what was seen as well"
     elif scale.gain > _SIZE_GAIN:
         reason = f"{words}, which a sensor's errors may explain"
-    elif off > max(_NEAR_SIZE, _SURE * scale.sigma) + _OFFSET_M / distance_m:
+    elif off > max(_NEAR_SIZE, SURE * scale.sigma) + _OFFSET_M / distance_m:
         reason = f"{words}, and not that of the model"
     elif fit.beyond > _BESIDE:
         reason = f"{fit.beyond:.1%} of the object's readings lie beside the posed silhouette"

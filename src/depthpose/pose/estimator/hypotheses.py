@@ -10,7 +10,7 @@ from torch import Tensor
 from torch.nn.functional import avg_pool2d, max_pool2d, normalize, pad
 
 from depthpose.core.camera import project
-from depthpose.core.rigid import Rigid, perturb
+from depthpose.core.rigid import Rigid, perturb, rotation_by
 from depthpose.pose.frame import Frame
 from depthpose.pose.mesh.models import fibonacci_directions
 from depthpose.pose.surface import NEAR, Surface
@@ -37,6 +37,9 @@ _TURNED = 0.7
 """Cosine of the angle between the normals of the image and of the posed surface, at least."""
 _HELD = 0.02
 """Damping of ICP: a motion that moves the readings across the surface by less is hardly taken."""
+_ASIDE, _ASIDE_RAD = 0.2, math.radians(30)
+"""A pose is compared with those moved across the view by so much of the diameter, and turned by
+so much: where a wall or noise agrees with it, it agrees as well with these."""
 _BESIDE = 0.08
 """Of the diameter: where what is beside a silhouette is no farther than so much from its border in
 depth, the same surface goes on."""
@@ -244,17 +247,20 @@ class Agreement(NamedTuple):
     Attributes:
         worth: share of the surface that was seen where it should be, less what contradicts: 1 at
             most.
-        spread: standard deviation of the distances of what was seen there, in diameters.
         goes_on: share of what is beside the silhouette in which the same surface goes on.
         parted: share of it in which the camera saw a table or wall, or far behind.
         against: share of the surface through which the camera saw, or a table before it.
     """
 
     worth: Float64[Tensor, " b"]
-    spread: Float64[Tensor, " b"]
     goes_on: Float64[Tensor, " b"]
     parted: Float64[Tensor, " b"]
     against: Float64[Tensor, " b"]
+
+    @property
+    def rough_doubt(self) -> Float64[Tensor, " b"]:
+        """What this says against each pose, of those that are not refined yet."""
+        return 2.9 * self.against + 20.0 * self.goes_on + 3.2 * (1 - self.parted)
 
 
 def compare_with_image(
@@ -282,9 +288,6 @@ def compare_with_image(
     number = posed_m[..., 2].isfinite().sum(1).clamp(min=1)
     read = at.is_read.sum(1).maximum(number / 2).double()
     good = agrees.sum(1) - against.sum(1) - 0.5 * partly.sum(1)
-    own = fits & is_side
-    own_m, count = torch.where(own, gap_m, 0.0), own.sum(1).clamp(min=1)
-    spread_m2 = own_m.square().sum(1) / count - (own_m.sum(1) / count).square()
     at = _look_up(frame, beside_m)
     gap_m, limit_m = at.depth_m - beside_m[..., 2], _BESIDE * surface.diameter_m
     is_level, is_table = at.is_read & (gap_m.abs() < limit_m), no_side[at.pixel]
@@ -293,11 +296,35 @@ def compare_with_image(
     goes_on = (is_level & ~is_table).sum(1) / beside
     return Agreement(
         worth=good / read - 0.6 * goes_on,
-        spread=spread_m2.clamp(min=0).sqrt() / surface.diameter_m,
         goes_on=goes_on,
         parted=is_parted.sum(1) / beside,
         against=against.sum(1) / read,
     )
+
+
+def doubts_of(frame: Frame, poses: Rigid, surface: Surface, views: Views) -> Float64[Tensor, " b"]:
+    """Give the log odds of poses' being wrong, by the image alone.
+
+    What counts is by how much better the image agrees with a pose than with those beside it, what
+    contradicts it, and whether its silhouette is one: logistic regression on synthetic frames.
+
+    Args:
+        frame: the image.
+        poses: of the model, refined.
+        surface: of the model.
+        views: what a camera sees of it.
+    """
+    seen, middle_m = compare_with_image(frame, poses, surface, views), _middle_m(surface)
+    ways = torch.cat([torch.eye(3, dtype=torch.float64), -torch.eye(3, dtype=torch.float64)])
+    across_m = ways[[0, 1, 3, 4]] * _ASIDE * surface.diameter_m
+    R = poses.R[:, None] @ rotation_by(_ASIDE_RAD * ways)
+    turned = Rigid(R, poses.apply(middle_m[None]) - R @ middle_m)
+    shifted = Rigid(poses.R[:, None].expand(-1, 4, 3, 3), poses.t_m[:, None] + across_m)
+    beside = Rigid(torch.cat([shifted.R, turned.R], 1).flatten(0, 1),
+                   torch.cat([shifted.t_m, turned.t_m], 1).flatten(0, 1))  # fmt: skip
+    worth = compare_with_image(frame, beside, surface, views).worth.reshape(-1, len(ways) + 4)
+    alike = 4.15 * worth[:, :4].amax(1) + 6.44 * worth[:, 4:].mean(1) - 10.59 * seen.worth
+    return alike + 4.97 * seen.goes_on - 6.66 * seen.parted + 4.91 * seen.against + 12.34
 
 
 def _posed(
