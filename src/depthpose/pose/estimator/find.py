@@ -29,9 +29,9 @@ from depthpose.pose.surface import NEAR, Surface
 from depthpose.pose.types import CloudInput, PoseEstimate, ViewInput
 from depthpose.pose.voting.point_pairs import PairTable
 
-_HOPELESS = 6.0
+_HOPELESS = 4.0
 """Log odds that the image alone adds, from which nothing else makes a pose right."""
-_WORSE = 2.0
+_WORSE = 3.0
 """An answer whose log odds are by so much worse than those of the best of its object is none."""
 _LEAST_WORTH = 0.25
 """Poses with which the image agrees less are not judged."""
