@@ -9,15 +9,18 @@ from tests.pose.synthetic_objects import CAMERA, K, bracket, pose_at, view_of
 from depthpose.core.camera import Camera
 from depthpose.core.rigid import Rigid
 from depthpose.pose.estimator import Registration
+from depthpose.pose.estimator.find import is_other_size
 from depthpose.pose.estimator.hypotheses import (
     compare_with_image,
     doubts_of,
     prepare_views,
     propose_in_frame,
 )
+from depthpose.pose.estimator.inputs import view_input
 from depthpose.pose.frame import prepare_frame
 from depthpose.pose.metrics import add_m
 from depthpose.pose.surface import prepare_surface
+from depthpose.pose.types import Identity, PoseEstimate
 from depthpose.pose.voting.point_pairs import prepare_pairs
 
 TRUTHS = [pose_at(-0.13, 0.7, seed=1), pose_at(0.12, 0.9, seed=2)]
@@ -138,3 +141,17 @@ def test_every_instance_is_found_once_and_nothing_else(net: Registration) -> Non
         poses = [e.camera_from_model for e in found]
         errors = [float(add_m(p, truth, bracket().vertices_m)) for p in poses if p is not None]
         assert min(errors) < 0.01
+
+
+@pytest.mark.parametrize(
+    ("size", "deviation", "is_other"),
+    [(1.0, 0.01, False), (1.32, 0.053, True), (1.21, 0.094, False), (0.8, 0.02, True)],
+)
+def test_what_is_surely_of_another_size_is_another_thing(
+    size: float, deviation: float, is_other: bool
+) -> None:
+    view = view_input(table(), None, CAMERA, "bracket", "a", None)
+    identity = Identity(status="not excluded", size=size, size_deviation=deviation)
+    found = PoseEstimate(name="a", object="bracket", status="ok", camera_from_model=TRUTHS[0],
+                         identity=identity)  # fmt: skip
+    assert is_other_size(found, view, prepare_surface(bracket()), 0.03) == is_other

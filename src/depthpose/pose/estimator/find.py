@@ -160,7 +160,7 @@ def _judged(
         pose, fit = estimate.camera_from_model.double(), estimate.fit
         assert fit is not None
         doubt = float(doubts_of(frame, pose[None], surface, views)) + 3.47 * (1 - fit.agrees)
-        is_other = _is_other_size(estimate, view, surface, known.max_size_error)
+        is_other = is_other_size(estimate, view, surface, known.max_size_error)
         if doubt < 0 and not is_other and not is_cut_out(view, pose, surface):
             own = _explained(frame, pose, surface)
             one = _Candidate(object=estimate.object, pose=pose, doubt=doubt, explained=own)
@@ -169,10 +169,16 @@ def _judged(
     return [both for both in answers if both[0].doubt < least[both[0].object] + _WORSE]
 
 
-def _is_other_size(estimate: PoseEstimate, view: ViewInput, surface: Surface, most: float) -> bool:
+def is_other_size(estimate: PoseEstimate, view: ViewInput, surface: Surface, most: float) -> bool:
     """Whether the size that fits best is none that the sensor explains, however little it gains.
 
     With a mask it must gain too, as what is asked for is likely there.
+
+    Args:
+        estimate: with a pose.
+        view: in which it was found.
+        surface: of the model.
+        most: by so much a thing may differ in size from its model.
     """
     identity, pose = estimate.identity, estimate.camera_from_model
     if identity is None or identity.size is None or identity.size_deviation is None:
