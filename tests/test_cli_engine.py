@@ -272,6 +272,7 @@ def test_clouds_have_the_poses_of_the_plain_command(
         assert {**row, "seconds": 0} == {**wanted[name], "seconds": 0}
 
 
+@pytest.mark.slow
 def test_a_cad_file_alone_is_registered_by_workers_too(
     tmp_path: Path, double: InProcessEngine
 ) -> None:

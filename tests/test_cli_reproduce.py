@@ -359,6 +359,7 @@ def test_two_processes_share_the_frames_and_the_first_measures(
 
 
 @pytest.mark.data
+@pytest.mark.slow
 def test_published_weights_make_table_2_2(real: Path, tmp_path: Path) -> None:
     weights, published = tmp_path / "w.safetensors", "reference/psmnet/published_kitti2015.tar"
     imported = ["weights", "import", "psmnet", str(real / published), "--align-corners", "true"]
