@@ -11,8 +11,6 @@ from types import MappingProxyType
 
 from depthpose.core.run import claim_folder
 
-_context = multiprocessing.get_context("forkserver" if hasattr(os, "fork") else "spawn")
-
 
 def start(
     function: Callable[..., None],
@@ -25,7 +23,7 @@ def start(
     # Named here, and not on import: a process has one server, and other tests have another list.
     loaded = [__name__, "tests.core.loop_task", "accelerate", "torch.utils.tensorboard"]
     multiprocessing.set_forkserver_preload(loaded)
-    process = _context.Process(
+    process = multiprocessing.get_context("forkserver").Process(
         target=_run, args=(function, words, options, said, dict(environment))
     )
     process.start()
