@@ -83,7 +83,8 @@ def turned_jpeg() -> bytes:
     return encoded("JPEG", exif=exif.tobytes())
 
 
-CLOUD = Cloud(points=torch.rand(3, 3), color=torch.rand(3, 3))
+SEEDED = torch.Generator().manual_seed(0)
+CLOUD = Cloud(points=torch.rand(3, 3, generator=SEEDED), color=torch.rand(3, 3, generator=SEEDED))
 CASES: dict[str, tuple[str, tuple[Reader, ...], bytes]] = {
     "png": (".png", (read_image, image_size), encoded("PNG")),
     "palette": (".png", (read_image,), encoded("PNG", "P", transparency=bytes(9))),
@@ -96,10 +97,14 @@ CASES: dict[str, tuple[str, tuple[Reader, ...], bytes]] = {
     "depth": (
         ".png",
         (read_depth_png, read_disparity_png),
-        written(write_depth_png, "x.png", torch.rand(5, 6) * 200),
+        written(write_depth_png, "x.png", torch.rand(5, 6, generator=SEEDED) * 200),
     ),
-    "npy": (".npy", (read_map, read_cloud), written(write_map, "x.npy", torch.rand(4, 3))),
-    "pfm": (".pfm", (read_map,), written(write_map, "x.pfm", torch.rand(4, 3))),
+    "npy": (
+        ".npy",
+        (read_map, read_cloud),
+        written(write_map, "x.npy", torch.rand(4, 3, generator=SEEDED)),
+    ),
+    "pfm": (".pfm", (read_map,), written(write_map, "x.pfm", torch.rand(4, 3, generator=SEEDED))),
     "ply": (".ply", (read_cloud,), written(write_cloud, "x.ply", CLOUD)),
     "text ply": (".ply", (read_cloud,), TEXT_PLY),
     "pcd": (".pcd", (read_cloud,), written(write_cloud, "x.pcd", CLOUD)),

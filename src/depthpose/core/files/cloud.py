@@ -147,8 +147,8 @@ def _from_rows(path: AnyPath, table: np.ndarray) -> Cloud:
             "save the transpose (array.T)"
         )
     # Columns that number the points, or say where in an image they were, are no coordinates.
-    is_whole = (table[:_LOOKED_AT] == np.trunc(table[:_LOOKED_AT])).all(0)
     with np.errstate(invalid="ignore"):
+        is_whole = (table[:_LOOKED_AT] == np.trunc(table[:_LOOKED_AT])).all(0)
         steps = np.diff(table[:, 0])
     is_long = table.shape[1] > 3 and len(table) > 3 and bool(is_whole[0])
     if is_long and table.shape[1] > 4 and is_whole[1] and not is_whole[2:5].any():
