@@ -19,7 +19,7 @@ from depthpose.pose.datasets import Instance
 from depthpose.pose.estimator.inputs import AnyInput
 from depthpose.pose.mesh import sample_surface
 from depthpose.pose.synthetic import drawn_triangles
-from depthpose.pose.types import Identity, ObjectModel, PoseEstimate, ViewInput
+from depthpose.pose.types import ObjectModel, PoseEstimate, ViewInput
 from depthpose.report.page import (
     Drawing,
     Layer,
@@ -288,14 +288,6 @@ def alternative_lines(estimate: PoseEstimate) -> list[str]:
     return [f"{one.difference}, {one.probability:.0%}" for one in estimate.alternatives]
 
 
-def identity_words(identity: Identity) -> str:
-    """Say whether it is the object, and the size that fits best."""
-    said = identity.status + (f" ({identity.reason})" if identity.reason else "")
-    if identity.size is not None and identity.size_deviation is not None:
-        said += f"; size {identity.size:.3f} +- {identity.size_deviation:.3f} of the model's"
-    return said
-
-
 def pose_facts(
     estimate: PoseEstimate,
     model: ObjectModel,
@@ -320,7 +312,11 @@ def pose_facts(
             ("the sensor's noise there", f"{1000 * estimate.fit.noise_m:.1f} mm"),
         ]
     if estimate.identity is not None:
-        facts.append(("identity", identity_words(estimate.identity)))
+        identity = estimate.identity
+        said = identity.status + (f" ({identity.reason})" if identity.reason else "")
+        if identity.size is not None and identity.size_deviation is not None:
+            said += f"; size {identity.size:.3f} +- {identity.size_deviation:.3f} of the model's"
+        facts.append(("identity", said))
     if estimate.certainty is not None:
         facts.append(("certainty of this pose", f"{estimate.certainty:.3f}"))
     facts += [("another pose that fits", line) for line in alternative_lines(estimate)]
