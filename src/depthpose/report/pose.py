@@ -139,20 +139,6 @@ def pose_layers(
     return [*layers, box, Layer(name="its axes (x red, y green, z blue)", shape=axes)]
 
 
-def alternative_layers(estimate: PoseEstimate, model: ObjectModel) -> list[Layer]:
-    """Show each alternative by its axes and its box, not shown at first."""
-    layers: list[Layer] = []
-    for other in estimate.alternatives:
-        pose = other.camera_from_model.double()
-        ends_m = pose.apply(box_edges(model).double().flatten(0, 1)).unflatten(0, (12, 2)).float()
-        said = f"{other.difference}, {other.probability:.0%}"
-        box = colored_lines(ends_m, OTHER)
-        layers.append(Layer(name=f"box if {said}", shape=box, is_shown=False))
-        axes = frame_axes(pose.t_m, pose.R, model.diameter_m / 2)
-        layers.append(Layer(name=f"axes if {said}", shape=axes, is_shown=False))
-    return layers
-
-
 def keypoint_layers(
     voted_m: Float[Tensor, "k 3"], pose: Rigid | None, model: ObjectModel
 ) -> list[Layer]:
@@ -372,7 +358,14 @@ def pose_scene(
     pose = estimate.camera_from_model
     if pose is not None:
         layers += pose_layers(pose, model, with_box=truth is not None)
-        layers += alternative_layers(estimate, model)
+        for other in estimate.alternatives:  # by axes and box, not shown at first
+            placed = other.camera_from_model.double()
+            ends_m = placed.apply(box_edges(model).double().flatten(0, 1)).unflatten(0, (12, 2))
+            said = f"{other.difference}, {other.probability:.0%}"
+            box = colored_lines(ends_m.float(), OTHER)
+            layers.append(Layer(name=f"box if {said}", shape=box, is_shown=False))
+            axes = frame_axes(placed.t_m, placed.R, model.diameter_m / 2)
+            layers.append(Layer(name=f"axes if {said}", shape=axes, is_shown=False))
     if truth is not None:
         layers += pose_layers(truth, model, is_true=True)
     if estimate.keypoints_m is not None:
