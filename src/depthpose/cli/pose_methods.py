@@ -125,9 +125,9 @@ def _segmented(
     wanted = {instance.object_id for instance in dataset.instances}
     lost = sorted(wanted - set(numbers.values()))
     if len(lost) == len(wanted):
-        known = ", ".join(f"{name} ({number})" for name, number in own.items())
+        theirs = ", ".join(f"{name} ({number})" for name, number in own.items())
         raise InputError(
-            f"{path}: segments {known}, but {dataset.folder} shows objects {lost}; give weights "
+            f"{path}: segments {theirs}, but {dataset.folder} shows objects {lost}; give weights "
             "of its objects"
         )
     if lost:
