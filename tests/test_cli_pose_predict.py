@@ -467,7 +467,10 @@ def test_two_processes_share_the_work(
         (["--cloud", "."], "the weights know bracket, bottle; say which by --object"),
         (["--cloud", ".", "--object", "bracke"], "did you mean 'bracket'?"),
         (["--depth", ".", "--object", "bottle"], "--depth needs --camera or --focal-px beside it"),
-        (["--depth", ".", "--camera", ".", "--focal-px", "9"], "--focal-px: has no effect here; --camera has the focal length"),
+        (
+            ["--depth", ".", "--camera", ".", "--focal-px", "9"],
+            "--focal-px: has no effect here; --camera has the focal length",
+        ),
         (["--cloud", ".", "--focal-px", "9"], "Leave --focal-px out"),
         (
             ["--bop", ".", "--focal-px", "9"],

@@ -138,7 +138,8 @@ def test_table_3_3_votes_on_frames_and_on_synthetic_views(
         (["--points", "60", "60"], "--points 60 is given twice"),
         (["--points"], "--points without a value"),
         (["--synthetic", "0"], "--synthetic 0: give 1 or more, such as 40"),
-        (["--synthetic", "2", "--bop", "."], "rendered where no data set is given. Leave --synthetic out"),
+        (["--synthetic", "2", "--bop", "."],
+             "rendered where no data set is given. Leave --synthetic out"),
     ],
 )  # fmt: skip
 def test_options_of_table_3_3_are_never_ignored(
