@@ -292,7 +292,7 @@ def test_a_cad_file_alone_is_registered_by_workers_too(
 @pytest.mark.parametrize(
     ("words", "said"),
     [
-        (["--workers", "2"], "are for --engine ray; add it"),
+        (["--workers", "2"], "--engine ray takes it, and is not given"),
         ([*RAY, "--block", "0"], "--block 0"),
         ([*RAY, "--worker-cpus", "0"], "needs a core or a GPU"),
     ],

@@ -334,19 +334,35 @@ class Sample:
     reason: str = ""
 
 
-@contextmanager
-def first_sample(items: Sequence[Item], tars: Sequence[str], files: Files) -> Iterator[Sample]:
-    """Give the first input, to look at before any work.
+@dataclass(frozen=True, kw_only=True)
+class Inputs:
+    """Inputs of a command: listed ones, tar shards of them, and what each is made of."""
 
-    Raises:
-        InputError: it cannot be read.
-    """
-    block = Block("", tuple(items[:1])) if items else Block("", tar=tars[0])
-    with tempfile.TemporaryDirectory(prefix="depthpose-") as scratch:
-        sample = next(_samples(block, files, Path(scratch)))
-        if sample.reason:
-            raise InputError(sample.reason)
-        yield sample
+    items: Sequence[Item]
+    tars: Sequence[str] = ()
+    files: Files
+
+    @classmethod
+    def find(cls, words: Sequence[str], files: Files) -> "Inputs":
+        """List files, manifests and tar shards."""
+        tars = [word for word in words if is_tar(word)]
+        others = [word for word in words if not is_tar(word)]
+        items = find_items(others, files) if others else []
+        return cls(items=items, tars=find_tars(tars), files=files)
+
+    @contextmanager
+    def first(self) -> Iterator[Sequence[Path]]:
+        """Give the files of the first input, to look at before any work.
+
+        Raises:
+            InputError: it cannot be read.
+        """
+        block = Block("", tuple(self.items[:1]), None if self.items else self.tars[0])
+        with tempfile.TemporaryDirectory(prefix="depthpose-") as scratch:
+            sample = next(_samples(block, self.files, Path(scratch)))
+            if sample.reason:
+                raise InputError(sample.reason)
+            yield sample.files
 
 
 def _samples(block: Block, wanted: Files, scratch: Path) -> Iterator[Sample]:

@@ -24,7 +24,6 @@ from depthpose.core.files.points import (
     plain_numbers,
     read_pcd,
     read_ply_elements,
-    unpack_rgb,
 )
 from depthpose.core.files.text import MAX_TEXT_BYTES
 
@@ -127,7 +126,13 @@ def _from_columns(path: AnyPath, columns: Columns) -> Cloud:
     points = np.stack([to_float32(columns[n]) for n in "xyz"], -1) if columns else np.empty((0, 3))
     packed, color = columns.get("rgb", columns.get("rgba")), None
     if packed is not None and packed.dtype.itemsize == 4:
-        color = to_float32(unpack_rgb(packed)) / np.float32(255)
+        if packed.dtype.kind == "f":
+            bits = packed.astype(np.float32).view(np.uint32)
+        else:
+            bits = packed.astype(np.int64).astype(np.uint32)
+        color = to_float32(
+            np.stack([(bits >> shift) & 255 for shift in (16, 8, 0)], -1).astype(np.uint8)
+        ) / np.float32(255)
     elif columns.keys() >= set(_COLOR):
         color = np.stack([columns[name] for name in _COLOR], -1)
         if color.dtype.kind != "f":
