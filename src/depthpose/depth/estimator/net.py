@@ -1,5 +1,6 @@
 """One image, or a rectified pair, to one depth estimate in metres."""
 
+import math
 import os
 import warnings
 from base64 import b64decode
@@ -17,6 +18,7 @@ import numpy as np
 import torch
 from PIL import Image
 from torch import Tensor
+from torch.nn import functional as F
 from tqdm import tqdm
 
 from depthpose.core.arrays import check_image
@@ -24,6 +26,7 @@ from depthpose.core.camera import (
     AnyCamera,
     AnyLens,
     Camera,
+    StereoRig,
     check_image_matches_camera,
     choose_lens,
 )
@@ -31,7 +34,7 @@ from depthpose.core.checkpoint import find_weights, join_terms, warn_of_terms
 from depthpose.core.devices import each_in_threads, own_arithmetic
 from depthpose.core.errors import InputError, Notice, refuse_unknown, refused_memory
 from depthpose.depth.config import Answer, MatcherConfig, SelectionConfig, SGBMConfig
-from depthpose.depth.disparity import focal_size, resize_image
+from depthpose.depth.disparity import changed_match, focal_size, resize_image
 from depthpose.depth.estimator.inputs import (
     Picture,
     as_input,
@@ -44,7 +47,6 @@ from depthpose.depth.estimator.rig import (
     from_pair,
     from_virtual,
     join_matches,
-    match_to_infinity,
     square_camera,
 )
 from depthpose.depth.ground import scale_by_distance, scale_by_mount
@@ -262,7 +264,7 @@ class FakestereoNet:
             usable_right(pair)
         assert pair.right is not None, "checked before"
         with refused_memory(pair.name):
-            match = match_to_infinity(self._match, pair.left, pair.right, pair.camera)
+            (match,) = self._match([(pair.left, pair.right)], pair.camera)
             return from_pair(pair, match, warning)
 
     @own_arithmetic()
@@ -398,40 +400,73 @@ class FakestereoNet:
                 is_sky = match.is_sky if views.is_sky is None else views.is_sky[n]
                 estimate = from_virtual(image, rig, match, views.right[n], is_sky)
                 estimate = scale_by_mount(estimate, image)
-                if views.confidence is not None:
-                    sure = views.confidence[n].mean() if views.street is None else views.street[n]
-                    estimate = self._checked(
-                        image.name, replace(estimate, image_confidence=float(sure))
-                    )
                 estimates.append(estimate)
+                if views.confidence is None:
+                    continue
+                mean = views.confidence[n].mean() if views.street is None else views.street[n]
+                sure, said = float(mean), ""
+                if isinstance(rig, SelectionConfig) and sure < rig.least_confidence:
+                    what = "probability of a street" if rig.with_street else "mean confidence"
+                    said = (
+                        f"out of distribution for these weights ({what} {sure:.2f}, below "
+                        f"{rig.least_confidence:.2f}), so its depth is a guess"
+                    )
+                if said and not self.allow_ood:
+                    raise InputError(
+                        f"{image.name}: {said}. Check that it is upright and that the focal length "
+                        "is its own; --allow-ood (in Python, allow_ood=True) answers it all the "
+                        "same."
+                    )
+                estimates[n] = replace(estimate, image_confidence=sure, warning=said)
         return estimates
 
-    def _checked(self, name: str, estimate: DepthEstimate) -> DepthEstimate:
-        """Refuse an image that is unlike what the weights know, or warn of it."""
-        assert self.synthesiser is not None and estimate.image_confidence is not None  # noqa: PT018
-        config = self.synthesiser.config
-        if not isinstance(config, SelectionConfig):
-            return estimate
-        if estimate.image_confidence >= config.least_confidence:
-            return estimate
-        said = (
-            f"out of distribution for these weights ("
-            f"{'probability of a street' if config.with_street else 'mean confidence'} "
-            f"{estimate.image_confidence:.2f}, below {config.least_confidence:.2f}), so its depth "
-            "is a guess"
-        )
-        if not self.allow_ood:
-            raise InputError(
-                f"{name}: {said}. Check that it is upright and that the focal length is its own; "
-                "--allow-ood (in Python, allow_ood=True) answers it all the same."
-            )
-        return replace(estimate, warning=said)
-
     def _match(self, pairs: list[tuple[Tensor, Tensor]], camera: Camera | None) -> list[Match]:
+        """Match pairs; with principal points apart, after views were moved by their difference.
+
+        What is farthest then has a disparity of 0 px, where matchers search, and what is nearest
+        that of a rig whose principal points agree. Disparities of the views as given are returned.
+        Where the right view shows nothing of the left one, the confidence is 0.
+        """
         assert self.matcher is not None, "checked before"
+        rig = camera if isinstance(camera, StereoRig) else None
+        apart_px, width = 0.0 if rig is None else rig.cx_right_minus_left_px, pairs[0][0].shape[2]
+        columns = math.ceil(apart_px)
+        added = max(columns, 0)
+        if rig is not None and columns != 0:
+            if abs(columns) >= width:
+                raise InputError(
+                    f"cx_right_minus_left_px is {apart_px:g}, and the images are {width} px wide: "
+                    "the two views share nothing that is far away. Take both principal points from "
+                    "one calibration of images of this size."
+                )
+            K = rig.K.clone()
+            K[0, 2] += added
+            apart_px -= columns
+            camera = replace(rig, width=width + added, K=K, cx_right_minus_left_px=apart_px)
+            # New columns repeat the border; those cut off the right view show nothing of the left.
+            repeat = partial(F.pad, mode="replicate")
+            moved = (
+                (
+                    repeat(left[None], (added, 0, 0, 0)),
+                    repeat(right[None], (added - columns, added, 0, 0)),
+                )
+                for left, right in pairs
+            )
+            pairs = [(left[0], right[0, ..., : width + added]) for left, right in moved]
         if isinstance(self.matcher, CameraMatcher):
-            return self.matcher.match_many(pairs, camera)
-        return [self.matcher.match(*pair) for pair in pairs]
+            found = self.matcher.match_many(pairs, camera)
+        else:
+            found = [self.matcher.match(*pair) for pair in pairs]
+        if columns == 0:
+            return found
+        cut = [changed_match(wide, lambda values: values[:, added:]) for wide in found]
+        # The right view shows none of the first columns, even at infinity.
+        is_outside = torch.arange(width, device=cut[0].disparity_px.device) < -columns
+        sure = (None if m.confidence is None else m.confidence.where(~is_outside, 0.0) for m in cut)
+        return [
+            replace(match, disparity_px=match.disparity_px - columns, confidence=confidence)
+            for match, confidence in zip(cut, sure, strict=True)
+        ]
 
 
 _PHONE = 0.75

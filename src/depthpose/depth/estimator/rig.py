@@ -1,19 +1,14 @@
 """The rig of a generator or a matcher, and the way there and back."""
 
-import math
-from collections.abc import Callable
 from dataclasses import replace
 
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
-from torch.nn import functional as F
 
 from depthpose.core.camera import Camera, StereoRig
-from depthpose.core.errors import InputError
 from depthpose.depth.config import GeneratorConfig, SelectionConfig
 from depthpose.depth.disparity import (
-    changed_match,
     depth_from_disparity,
     disparity_from_depth,
     resize_image,
@@ -107,41 +102,3 @@ def join_matches(one: Match, other: Match) -> Match:
     logs = [match.disparity_px.clamp(min=1e-3).log() for match in (one, other)]
     log_px = torch.lerp(logs[0], logs[1].nan_to_num(0.0), share)
     return Match(disparity_px=log_px.exp(), confidence=torch.lerp(one.confidence, weight, share))
-
-
-def match_to_infinity(
-    match: Callable[[list[tuple[Tensor, Tensor]], Camera | None], list[Match]],
-    left: Float[Tensor, "3 h w"],
-    right: Float[Tensor, "3 h w"],
-    camera: Camera | None,
-) -> Match:
-    """Match a pair; with principal points apart, after its views were moved by their difference.
-
-    What is farthest then has a disparity of 0 px, where matchers search, and what is nearest that
-    of a rig whose principal points agree. Disparities of the views as given are returned.
-    Where the right view shows nothing of the left one, the confidence is 0.
-    """
-    rig = camera if isinstance(camera, StereoRig) else None
-    if rig is None or (columns := math.ceil(rig.cx_right_minus_left_px)) == 0:
-        return match([(left, right)], camera)[0]
-    width, apart_px = left.shape[2], rig.cx_right_minus_left_px
-    if abs(columns) >= width:
-        raise InputError(
-            f"cx_right_minus_left_px is {apart_px:g}, and the images are {width} px wide: the "
-            "two views share nothing that is far away. Take both principal points from one "
-            "calibration of images of this size."
-        )
-    added = max(columns, 0)
-    K = rig.K.clone()
-    K[0, 2] += added
-    moved = replace(rig, width=width + added, K=K, cx_right_minus_left_px=apart_px - columns)
-    # New columns repeat the border; those cut off the right view show nothing of the left one.
-    wide_left = F.pad(left[None], (added, 0, 0, 0), mode="replicate")[0]
-    wide_right = F.pad(right[None], (added - columns, added, 0, 0), mode="replicate")[0]
-    (wide,) = match([(wide_left, wide_right[..., : width + added])], moved)
-    cut = changed_match(wide, lambda values: values[:, added:])
-    confidence = cut.confidence
-    if confidence is not None:  # the right view shows none of the first columns, even at infinity
-        is_outside = torch.arange(width, device=confidence.device) < -columns
-        confidence = torch.where(is_outside, 0.0, confidence)
-    return replace(cut, disparity_px=cut.disparity_px - columns, confidence=confidence)

@@ -452,7 +452,9 @@ class LightStereo(StereoNetwork):
         quarters = [quarter_px]
         if with_confidence or self.sky_head is not None:
             with torch.no_grad():
-                quarters.append(self._confidence(scores, quarter_px))
+                # By rows: probabilities between the scores are the largest volume.
+                parts = (scores, quarter_px)
+                quarters.append(by_rows(confidence_near, parts, halo=0, rows=self.rows))
         if self.sky_head is not None:
             quarters.append(self.sky_head(near.levels, *quarters))
         coarse_px = mean_of_all(scores)[:, None] if self.training else None
@@ -476,10 +478,6 @@ class LightStereo(StereoNetwork):
         if confidence is not None:
             confidence = torch.where(sky > 0.5, sky, sure * (1 - sky))
         return Reading(heads, confidence, sky)
-
-    def _confidence(self, scores: Scores, quarter_px: Quarter) -> Quarter:
-        """By rows: probabilities between the scores are the largest volume."""
-        return by_rows(confidence_near, (scores, quarter_px), halo=0, rows=self.rows)
 
     def enlarge(
         self, quarters: Float[Tensor, "b k h4 w4"], left: ViewFeatures, right_half: Features | None

@@ -234,14 +234,12 @@ class FeatureExtractor(nn.Module):
             x = F.relu(layer(x))
         raw = self.stages[1](self.stages[0](x))
         last = self.stages[3](self.stages[2](raw))
-        levels = [self._pool(last, i) for i in reversed(range(len(self.pools)))]
+        levels = []
+        for layer, pool in zip(reversed(self.pyramid), reversed(self.pools), strict=True):
+            pooled = F.relu(layer(F.avg_pool2d(last, pool)))
+            size, align = last.shape[-2:], self.align_corners
+            levels.append(F.interpolate(pooled, size, mode="bilinear", align_corners=align))
         return self.project(F.relu(self.fuse(torch.cat([raw, last, *levels], 1))))
-
-    def _pool(self, x: Float[Tensor, "b c h w"], level: int) -> Float[Tensor, "b k h w"]:
-        pooled = F.relu(self.pyramid[level](F.avg_pool2d(x, self.pools[level])))
-        return F.interpolate(
-            pooled, size=x.shape[-2:], mode="bilinear", align_corners=self.align_corners
-        )
 
 
 Features = Float[Tensor, "b _ _ _"]

@@ -17,8 +17,7 @@ from depthpose.core.run import find_rank
 from depthpose.depth.config import GeneratorConfig, MatcherConfig, PairsConfig, SelectionConfig
 from depthpose.depth.datasets import refuse_common
 from depthpose.depth.encoder import load_encoder
-from depthpose.depth.stereo import StereoNetwork
-from depthpose.depth.stereo.kinds import make_network
+from depthpose.depth.stereo import MATCHERS, StereoNetwork
 from depthpose.depth.synthesis import Generator, SelectionGenerator, UNetGenerator
 from depthpose.depth.train.adapt import (
     AdaptationCheck,
@@ -86,7 +85,8 @@ def start_from(network: Generator | StereoNetwork, found: nn.Module, source: str
 
 def make_matcher_network(config: StereoTraining) -> StereoNetwork:
     """Make the network that a config trains, with the weights that it begins with."""
-    matcher = make_network(config.network)
+    kind = next(k for k in MATCHERS.values() if isinstance(config.network, k.config))
+    matcher = kind.network(config.network)
     if config.encoder is not None:
         if matcher.encoder is None:
             raise InputError(
