@@ -16,7 +16,7 @@ from depthpose.depth.augment import TrainingPair
 from depthpose.depth.config import LightConfig, MatcherConfig
 from depthpose.depth.disparity import resized_match
 from depthpose.depth.estimator import FakestereoNet
-from depthpose.depth.estimator.rig import from_pair, join_matches
+from depthpose.depth.estimator.net import from_pair, join_matches
 from depthpose.depth.export import depth_export
 from depthpose.depth.labels import LabelConfig, label_pair
 from depthpose.depth.losses import sky_loss

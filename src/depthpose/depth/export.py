@@ -15,7 +15,7 @@ from depthpose.core.errors import InputError, refuse_unknown
 from depthpose.core.export import Case, Export, Graph, Limit, Value, network_model
 from depthpose.depth.config import MatcherConfig
 from depthpose.depth.estimator import FakestereoNet
-from depthpose.depth.estimator.rig import SKY_M
+from depthpose.depth.estimator.net import SKY_M
 from depthpose.depth.stereo import LightStereo, PSMNet, StereoNetwork, make_matcher
 from depthpose.depth.stereo.light import LEAST_PX
 from depthpose.depth.stereo.matcher import IMAGENET_MEAN, IMAGENET_STD, NetworkConfig
@@ -100,7 +100,8 @@ class DynamicPSMNet(nn.Module):
     ) -> tuple[Float[Tensor, "b h w"], Float[Tensor, "b h w"]]:
         """Give disparity [px] and confidence of normalised images."""
         near, far = self.network.features(left), self.network.features(right)
-        cost = self.network.costs_of(gathered_volume(near, far, self.bins))[-1][:, 0]
+        cost0 = self.network.aggregate(gathered_volume(near, far, self.bins))
+        cost = self.network.refine(cost0)[-1][:, 0]
         align = self.network.config.align_corners
         wide = F.interpolate(cost, left.shape[-2:], mode="bilinear", align_corners=align)
         probability = F.conv2d(wide, self.matrix).softmax(1)
@@ -415,7 +416,9 @@ class Target:
     """What a graph computes."""
 
     fits: Callable[[DepthWeights], bool]  # whether it is what weights are exported as by default
-    export: Callable[[DepthWeights, dict[str, Any]], Export]  # of weights, and facts for its user
+    graph: Callable[[DepthWeights], Graph]
+    cases: Callable[[DepthWeights], Iterator[Case]]  # what the graph must agree with
+    what: str  # it takes and gives, for its user
 
 
 def depth_export(weights: DepthWeights, what: str | None, facts: dict[str, Any]) -> Export:
@@ -423,35 +426,16 @@ def depth_export(weights: DepthWeights, what: str | None, facts: dict[str, Any])
     if what is None:
         what = next(name for name, target in TARGETS.items() if target.fits(weights))
     refuse_unknown("what", what, TARGETS)
-    return TARGETS[what].export(weights, facts)
-
-
-def _pair_export(weights: DepthWeights, facts: dict[str, Any]) -> Export:
-    return Export(
-        graph=lambda: pair_graph(weights),
-        cases=lambda: _pair_cases(weights),
-        limits=_FLIPPING_LIMITS if isinstance(weights.matcher, _FLIPPING) else _LIMITS,
-        facts={**facts, "what": "rectified pair, RGB in [0, 1] -> disparity [px], ..."},
-    )
-
-
-def _image_export(weights: DepthWeights, facts: dict[str, Any]) -> Export:
-    generator, names = weights.generator, ("virtual_focal_px", "virtual_baseline_m", "answer")
+    target, generator = TARGETS[what], weights.generator if what == "image" else None
+    names = ("virtual_focal_px", "virtual_baseline_m", "answer")
     rig = {} if generator is None else {name: getattr(generator.config, name) for name in names}
     chooses = isinstance(generator, SelectionGenerator) or isinstance(weights.matcher, _FLIPPING)
     return Export(
-        graph=lambda: image_graph(weights),
-        cases=lambda: _image_cases(weights),
+        graph=lambda: target.graph(weights),
+        cases=lambda: target.cases(weights),
         limits=_FLIPPING_LIMITS if chooses else _LIMITS,
-        facts={**facts, **rig, "what": "image, RGB in [0, 1], and K [px] -> depth [m], ..."},
+        facts={**facts, **rig, "what": target.what},
     )
-
-
-TARGETS = {
-    "image": Target(fits=lambda weights: weights.generator is not None, export=_image_export),
-    "pair": Target(fits=lambda weights: weights.matcher is not None, export=_pair_export),
-}
-"""One image to depth, a rectified pair to disparity: a new target is a function and one entry."""
 
 
 def _image_cases(weights: DepthWeights) -> Iterator[Case]:
@@ -501,6 +485,23 @@ def _pair_cases(weights: DepthWeights) -> Iterator[Case]:
             for one, other in zip(left, right, strict=True)
         ]
         yield _case(inputs, found, ("disparity_px", "confidence", *sky))
+
+
+TARGETS = {
+    "image": Target(
+        fits=lambda weights: weights.generator is not None,
+        graph=image_graph,
+        cases=_image_cases,
+        what="image, RGB in [0, 1], and K [px] -> depth [m], ...",
+    ),
+    "pair": Target(
+        fits=lambda weights: weights.matcher is not None,
+        graph=pair_graph,
+        cases=_pair_cases,
+        what="rectified pair, RGB in [0, 1] -> disparity [px], ...",
+    ),
+}
+"""One image to depth, a rectified pair to disparity: a new target is one entry."""
 
 
 def _sees_sky(matcher: StereoNetwork | None) -> bool:

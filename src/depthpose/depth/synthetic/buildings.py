@@ -137,18 +137,8 @@ def _add_windows(b: MeshBuilder, wall: _Wall, style: Style, length: Number, heig
     after = [1, 2, 3, 0]
     reveal = np.stack([outer, outer[:, after], inner[:, after], inner], 2).reshape(-1, 4, 3)
     b.quads(reveal, _SQUARE * [0.5, 0.1], Surface("plaster", style.wall.tint))
-    if style.with_details:
-        _add_frames(b, wall, style, windows)
-
-
-def _rectangles(x0: np.ndarray, x1: np.ndarray, y0: np.ndarray, y1: np.ndarray) -> np.ndarray:
-    """Corners (..., 4, 2) of rectangles, in turn."""
-    return np.stack([np.stack(c, -1) for c in ((x0, y0), (x1, y0), (x1, y1), (x0, y1))], -2)
-
-
-def _add_frames(
-    b: MeshBuilder, wall: _Wall, style: Style, windows: Float[np.ndarray, "n 4 2"]
-) -> None:
+    if not style.with_details:
+        return
     (left, low), (right, high) = windows[:, 0].T, windows[:, 2].T
     middle, bar = (left + right) / 2, 0.07
     frames = np.concatenate(
@@ -166,6 +156,11 @@ def _add_frames(
     b.quads(front, sill, stone)
     top = np.stack([front[:, 3], front[:, 2], wall.at(sill)[:, 2], wall.at(sill)[:, 3]], 1)
     b.quads(top, _SQUARE * [1, 0.12], stone)
+
+
+def _rectangles(x0: np.ndarray, x1: np.ndarray, y0: np.ndarray, y1: np.ndarray) -> np.ndarray:
+    """Corners (..., 4, 2) of rectangles, in turn."""
+    return np.stack([np.stack(c, -1) for c in ((x0, y0), (x1, y0), (x1, y1), (x0, y1))], -2)
 
 
 def _add_gable_roof(b: MeshBuilder, plot: Plot, style: Style) -> None:

@@ -22,7 +22,6 @@ from depthpose.depth.synthesis import Generator, SelectionGenerator, UNetGenerat
 from depthpose.depth.train.adapt import (
     AdaptationCheck,
     AdaptTask,
-    adapted_text,
     fine_focal_px,
     label_folders,
     refuse_worse,
@@ -207,7 +206,15 @@ def train_adapt(config: AdaptTraining, run: Run) -> Path:
     write_json(run.folder / "adapt.json", [asdict(metrics) for metrics in found])
     refuse_worse(*found)
     write_depth_weights(path, matcher=matcher, facts=facts)
-    write_card(path, "depth train adapt", seconds, facts, adapted_text(*found))
+    text = [
+        "Held-out pairs, and synthetic streets:",
+        "",
+        "| | before | after |",
+        "| --- | --- | --- |",
+    ]
+    both = zip(asdict(found[0]).items(), asdict(found[1]).values(), strict=True)
+    text += [f"| {name} | {old:.4g} | {new:.4g} |" for (name, old), new in both if old is not None]
+    write_card(path, "depth train adapt", seconds, facts, "\n".join(text))
     return path
 
 
