@@ -210,23 +210,20 @@ def _drawn(left: Value, generator: Generator) -> _Drawn:
     own = _Maps(log_px.op("Exp") * scale, confidence, is_sky.cast(np.float32))
     right_px = right_sky.op("Greater", _HALF).op("Where", _0, right_log_px.op("Exp") * scale)
     street = outputs[5] if generator.config.with_street else None
-    return _Drawn(_shifted(left, right_px), own, street)
-
-
-def _shifted(left: Value, shift_px: Value) -> Value:
-    """Look the left image up at ``x + shift``; beyond the border the border repeats."""
-    size, graph = _size_of(left), left.graph
+    # Look the left image up at ``x + shift``; beyond the border the border repeats.
+    graph = left.graph
     row, column = (  # 0, 1, ... of each side
         graph.op("Range", 0, side(size).op("Squeeze", [0]), 1).cast(np.float32)
         for side in (_rows, _columns)
     )
     y, x = (
         (values * _2 + _1) / side(size).cast(np.float32) - _1
-        for values, side in ((row.op("Unsqueeze", [1]), _rows), (shift_px + column, _columns))
+        for values, side in ((row.op("Unsqueeze", [1]), _rows), (right_px + column, _columns))
     )
-    parts = (v.op("Expand", shift_px.op("Shape")).op("Unsqueeze", [-1]) for v in (x, y))
+    parts = (v.op("Expand", right_px.op("Shape")).op("Unsqueeze", [-1]) for v in (x, y))
     grid = graph.op("Concat", *parts, axis=-1)
-    return left.op("GridSample", grid, mode="bilinear", padding_mode="border", align_corners=0)
+    right = left.op("GridSample", grid, mode="bilinear", padding_mode="border", align_corners=0)
+    return _Drawn(right, own, street)
 
 
 def _near_multiple(size: Value, multiple: int) -> Value:

@@ -294,6 +294,7 @@ class NetworkMatcher(ABC):
         config = config or MatcherConfig()
         self.device = usable_device(config.device)
         self.config = with_usable_precision(config)
+        self.dtype = DTYPES[self.config.precision]
         self.network_config = network
 
     @abstractmethod
@@ -310,11 +311,6 @@ class NetworkMatcher(ABC):
     @abstractmethod
     def activation_bytes(self, network: Any, height: int, width: int) -> int:  # noqa: ANN401
         """Peak memory of activations of one pair of suitable sides [bytes]."""
-
-    @property
-    def dtype(self) -> torch.dtype:
-        """What the network computes in."""
-        return DTYPES[self.config.precision]
 
     @torch.no_grad()
     def match(self, left: Tensor, right: Tensor) -> Match:

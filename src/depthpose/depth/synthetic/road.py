@@ -442,27 +442,23 @@ class _Roadside:
                 light = traffic_light(int(rng.integers(4)))
                 where = (x, y, street.s_m - street.half_m - 1)
                 self.b.add(place(light, where, 0, (-side, 1, 1)))
-        if rng.random() < 0.25:
-            self.add_wires(x + side * rng.uniform(0.5, 3))
-
-    def add_wires(self, x: Number) -> None:
-        """Wooden poles with cables between them, which hang."""
-        b, rng = self.b, self.rng
-        height, step = rng.uniform(6, 8), rng.uniform(22, 38)
-        places = np.arange(rng.uniform(-15, 10), 120, step)
-        b.begin_thing()
-        for s in places:
-            b.tube((x, 0.2, s), (x, -height, s), (0.12, 0.09), _WOOD, 8)
-            b.box((x, -height + 0.3, s), (1.4, 0.1, 0.1), _WOOD)
-        share = np.linspace(0, 1, 7)[:, None]
-        for ends in pairwise(places):
-            for shift in (-0.6, 0.6):
-                start, stop = (np.array([x + shift, -height + 0.22, s]) for s in ends)
-                points = start * (1 - share) + stop * share
-                sag = (4 * share * (1 - share))[:, 0] * 0.02
-                points[:, 1] += sag * np.linalg.norm(stop - start)
-                for one, other in pairwise(points):
-                    b.tube(one, other, 0.018, _DARK, 3)
+        if rng.random() < 0.25:  # wooden poles with cables between them, which hang
+            at = x + side * rng.uniform(0.5, 3)
+            height, gap = rng.uniform(6, 8), rng.uniform(22, 38)
+            places = np.arange(rng.uniform(-15, 10), 120, gap)
+            self.b.begin_thing()
+            for s in places:
+                self.b.tube((at, 0.2, s), (at, -height, s), (0.12, 0.09), _WOOD, 8)
+                self.b.box((at, -height + 0.3, s), (1.4, 0.1, 0.1), _WOOD)
+            share = np.linspace(0, 1, 7)[:, None]
+            for ends in pairwise(places):
+                for shift in (-0.6, 0.6):
+                    start, stop = (np.array([at + shift, -height + 0.22, s]) for s in ends)
+                    points = start * (1 - share) + stop * share
+                    sag = (4 * share * (1 - share))[:, 0] * 0.02
+                    points[:, 1] += sag * np.linalg.norm(stop - start)
+                    for one, other in pairwise(points):
+                        self.b.tube(one, other, 0.018, _DARK, 3)
 
     def add_house(self, s: Number, length: Number, back: Number, height: float) -> None:
         """A house so far behind the pavement."""

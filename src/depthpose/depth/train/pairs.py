@@ -73,9 +73,31 @@ class TrainingPairs:
             for source, _, truth in self._places
         )
         self.truths = tuple(dict.fromkeys(f"{name}: {truth}" for name, truth in names if truth))
-        if baseline_m is not None:
-            self._check_baselines(baseline_m)
         self._cache: dict[int, TrainingPair] = {}
+        if baseline_m is None:
+            return
+        # Every rig before any work: another baseline would change the metric scale.
+        rigs: dict[str, StereoRig | None] = {}
+        for number, (source, place, _) in enumerate(self._places):
+            if isinstance(source, Dataset):
+                rigs[self._frame_name(number)] = source.read_rig(place)
+            elif source.config.rigs != "kitti":
+                rigs[self._frame_name(number)] = street_rig(source.config, place)[0]
+        made = self.config.streets
+        if made is not None and made.rigs == "kitti":  # five rigs, and perhaps millions of streets
+            rigs |= {f"street with KITTI's rig {n}": kitti_rig(n) for n in range(5)}
+        for name, rig in rigs.items():
+            if rig is None:
+                raise InputError(
+                    f"{name}: has no calibration, and the generator imitates one rig; add one, or "
+                    "exclude the frame"
+                )
+            if abs(rig.baseline_m / baseline_m - 1) > BASELINE_TOLERANCE:
+                raise InputError(
+                    f"{name}: its baseline is {rig.baseline_m:.4f} m, but the generator imitates "
+                    f"one rig of {baseline_m} m. Train it on pairs of one rig, and set "
+                    "virtual_baseline_m to that rig's."
+                )
 
     def __len__(self) -> int:
         return len(self._places)
@@ -155,30 +177,6 @@ class TrainingPairs:
     def _frame_name(self, index: int) -> str:
         source, place, _ = self._places[index]
         return source.frames[place].name if isinstance(source, Dataset) else f"street {place}"
-
-    def _check_baselines(self, wanted_m: float) -> None:
-        """Check every rig before any work: another baseline would change the metric scale."""
-        rigs: dict[str, StereoRig | None] = {}
-        for number, (source, place, _) in enumerate(self._places):
-            if isinstance(source, Dataset):
-                rigs[self._frame_name(number)] = source.read_rig(place)
-            elif source.config.rigs != "kitti":
-                rigs[self._frame_name(number)] = street_rig(source.config, place)[0]
-        made = self.config.streets
-        if made is not None and made.rigs == "kitti":  # five rigs, and perhaps millions of streets
-            rigs |= {f"street with KITTI's rig {n}": kitti_rig(n) for n in range(5)}
-        for name, rig in rigs.items():
-            if rig is None:
-                raise InputError(
-                    f"{name}: has no calibration, and the generator imitates one rig; add one, or "
-                    "exclude the frame"
-                )
-            if abs(rig.baseline_m / wanted_m - 1) > BASELINE_TOLERANCE:
-                raise InputError(
-                    f"{name}: its baseline is {rig.baseline_m:.4f} m, but the generator imitates "
-                    f"one rig of {wanted_m} m. Train it on pairs of one rig, and set "
-                    "virtual_baseline_m to that rig's."
-                )
 
 
 def _find_places(config: PairsConfig, *, needs_truth: bool, is_mixed: bool) -> list[_Place]:
