@@ -11,7 +11,7 @@ from typing import Literal
 import numpy as np
 from jaxtyping import Float, Float64
 
-from depthpose.depth.synthetic.buildings import Plot, add_house, draw_style
+from depthpose.depth.synthetic.buildings import Plot, add_house
 from depthpose.depth.synthetic.mesh import Mesh, MeshBuilder, place
 from depthpose.depth.synthetic.models import (
     BUSHES,
@@ -471,7 +471,7 @@ class _Roadside:
             height_m=height,
             ground_m=-self.road.curb_m + 0.2,
         )
-        add_house(self.b, plot, draw_style(self.rng, with_details=s < _DETAIL_M))
+        add_house(self.b, plot, with_details=s < _DETAIL_M)
 
     def add_border(self, start: Number, stop: Number, kind: int) -> None:
         """A line of hedge or fence pieces at the back of the pavement; kind 0 is none."""
