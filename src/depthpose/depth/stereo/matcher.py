@@ -122,20 +122,16 @@ class CallableMatcher:
                 f"the wrapped matcher answered shape {tuple(disparity_px.shape)} for images of "
                 f"{size}; let it answer one disparity a pixel"
             )
-        if bool(disparity_px.isinf().any()):
-            raise InputError(
-                "the wrapped matcher answered infinite disparity; use NaN for no answer"
-            )
-        if bool(disparity_px.isnan().all()):
-            raise InputError(
-                "the wrapped matcher answered NaN for every pixel; is the pair rectified?"
-            )
-        if bool((disparity_px < 0).any()):
-            raise InputError(
-                f"the wrapped matcher answered negative disparity (least "
-                f"{float(disparity_px.nan_to_num(0).min()):.4g} px); is the pair swapped? NaN says "
-                f"no answer"
-            )
+        least_px = float(disparity_px.nan_to_num(0).min())
+        faults = {
+            "infinite disparity; use NaN for no answer": disparity_px.isinf().any(),
+            "NaN for every pixel; is the pair rectified?": disparity_px.isnan().all(),
+            f"negative disparity (least {least_px:.4g} px); is the pair swapped? NaN says no "
+            "answer": least_px < 0,
+        }
+        for fault, is_there in faults.items():
+            if is_there:
+                raise InputError(f"the wrapped matcher answered {fault}")
         return Match(disparity_px=disparity_px)
 
 
