@@ -22,7 +22,7 @@ from depthpose.depth.disparity import disparity_from_depth
 from depthpose.depth.synthetic.scene import StreetScene, make_clutter, make_scene, street_rig
 from depthpose.depth.synthetic.shading import Hits, Stage, prepare, shade, sky_light
 from depthpose.depth.synthetic.textures import NUMBER
-from depthpose.depth.types import StereoInput, StereoSample, StereoTruth
+from depthpose.depth.types import RawFrame, StereoInput, StereoSample, StereoTruth
 
 NEAR_M = 0.3
 
@@ -317,32 +317,18 @@ _OCCLUSION_SHARE = 1e-4
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class StreetFrame:
-    """A synthetic pair and everything that is known about it.
+class StreetFrame(RawFrame):
+    """A synthetic pair and everything that is known about it, exactly.
 
     Attributes:
-        left: left image.
-        right: right image.
-        disparity_px: of the left image, exact; NaN in the sky.
-        right_disparity_px: of the right image.
+        right_disparity_px: of the right image; NaN in the sky, as that of the left one.
         depth_m: of the left image, camera z; NaN in the sky.
-        occluded: left pixels whose point the right camera does not see: hidden, or outside.
-        is_sky: left pixels that see the sky.
         is_road: left pixels that see the carriageway.
-        lidar_points: x forward, y left, z up [m], reflectance; None where not asked for.
-        rig: the cameras.
     """
 
-    left: Float[Tensor, "3 h w"]
-    right: Float[Tensor, "3 h w"]
-    disparity_px: Float[Tensor, "h w"]
     right_disparity_px: Float[Tensor, "h w"]
     depth_m: Float[Tensor, "h w"]
-    occluded: Bool[Tensor, "h w"]
-    is_sky: Bool[Tensor, "h w"]
     is_road: Bool[Tensor, "h w"]
-    lidar_points: Float[Tensor, "n 4"] | None
-    rig: StereoRig
 
 
 def draw_street(config: StreetsConfig, index: int) -> StreetFrame:
@@ -402,6 +388,7 @@ def draw_scene(
         is_sky=primitive < 0,
         is_road=(primitive >= 0) & (stage.material[primitive.clamp(min=0)] == NUMBER["road"]),
         lidar_points=points,
+        camera_from_velodyne=camera_from_velodyne(),
         rig=rig,
     )
 
