@@ -15,16 +15,25 @@ _MOST_FOCAL_PX = 20_000
 
 
 class Settings:
-    """Base of settings whose types say ranges: ``Annotated[float, "[0, 1)"]``.
+    """Base of settings whose types say ranges: ``Annotated[int, "[16, inf)", 16]``.
+
+    A number behind the range is one that the setting is a multiple of.
 
     Raises:
-        InputError: a number outside its range, or a word that the type does not know.
+        InputError: a number that breaks these rules, or a word that the type does not know.
     """
 
     def __post_init__(self) -> None:
         hints = get_type_hints(type(self), include_extras=True)
-        ranges = {n: h.__metadata__[0] for n, h in hints.items() if get_origin(h) is Annotated}
-        check_settings(self, **ranges)
+        rules = {n: h.__metadata__ for n, h in hints.items() if get_origin(h) is Annotated}
+        check_settings(self, **{name: rule[0] for name, rule in rules.items()})
+        for name, (_, *steps) in rules.items():
+            value = getattr(self, name)
+            if any(value % step for step in steps):
+                raise InputError(
+                    f"{name} must be a multiple of {steps[0]}, got {value}; take "
+                    f"{getattr(type(self), name)}"
+                )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -176,8 +185,9 @@ Speed = Literal["quick", "fine"]
 class PSMNetConfig(Settings):
     """Size and conventions of the stereo network (Chang and Chen 2018, stacked hourglass)."""
 
-    max_disparity_px: Annotated[int, "[16, 16384]"] = 192
-    """Disparities 0 .. max_disparity_px - 1 are considered; a multiple of 16."""
+    max_disparity_px: Annotated[int, "[16, 16384]", 16] = 192
+    """Disparities 0 .. max_disparity_px - 1 are considered; a multiple of 16, for the volume is a
+    quarter of it and is halved twice."""
 
     width: Annotated[int, "[1, inf)"] = 32
     """Channels of the first layers; all others are 1, 2 or 4 times it."""
@@ -196,11 +206,6 @@ class PSMNetConfig(Settings):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if self.max_disparity_px % 16:
-            raise InputError(
-                "max_disparity_px must be a multiple of 16 (the volume is a quarter of it and is "
-                f"halved twice), got {self.max_disparity_px}; take 192"
-            )
         if not 1 <= len(self.pools) <= 16:
             raise InputError(f"pools must hold 1 to 16 windows, got {self.pools}")
 
@@ -217,8 +222,8 @@ class PSMNetConfig(Settings):
 class LightConfig(Settings):
     """Size and conventions of the light stereo network."""
 
-    max_disparity_px: Annotated[int, "[32, 16384]"] = 192
-    """Disparities below this are considered; a multiple of 32."""
+    max_disparity_px: Annotated[int, "[32, 16384]", 32] = 192
+    """Disparities below this are considered; a multiple of 32: the volume is halved three times."""
 
     groups: Annotated[int, "[1, inf)"] = 8
     """Channels of the correlation volume: features are correlated in so many groups."""
@@ -253,11 +258,6 @@ class LightConfig(Settings):
     def __post_init__(self) -> None:
         super().__post_init__()
         check_settings(self, candidates=f"[1, {self.max_disparity_px // 4}]")
-        if self.max_disparity_px % 32:
-            raise InputError(
-                "max_disparity_px must be a multiple of 32 (the volume is a quarter of it and is "
-                f"halved three times), got {self.max_disparity_px}; take 192"
-            )
         if self.width % self.groups:
             raise InputError(
                 f"width must be a multiple of groups, got width={self.width} and "
@@ -316,7 +316,7 @@ class SGBMConfig(Settings):
     The names follow OpenCV's documentation of ``StereoSGBM``.
     """
 
-    num_disparities: Annotated[int, "[16, inf)"] = 192
+    num_disparities: Annotated[int, "[16, inf)", 16] = 192
     """Disparities 0 .. num_disparities - 1 are considered; a multiple of 16.
 
     Where the principal points of a rig differ by ``d = cx_right - cx_left``, its views are first
@@ -355,10 +355,6 @@ class SGBMConfig(Settings):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if self.num_disparities % 16:
-            raise InputError(
-                f"num_disparities must be a multiple of 16, got {self.num_disparities}"
-            )
         if self.block_size % 2 == 0:
             raise InputError(f"block_size must be odd, got {self.block_size}")
         if not 0 < self.p1 < self.p2:
