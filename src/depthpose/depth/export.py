@@ -413,9 +413,7 @@ class Target:
     """What a graph computes."""
 
     fits: Callable[[DepthWeights], bool]  # whether it is what weights are exported as by default
-    graph: Callable[[DepthWeights], Graph]
-    cases: Callable[[DepthWeights], Iterator[Case]]  # what the graph must agree with
-    what: str  # it takes and gives, for its user
+    export: Callable[[DepthWeights, dict[str, Any]], Export]  # of weights, and facts for its user
 
 
 def depth_export(weights: DepthWeights, what: str | None, facts: dict[str, Any]) -> Export:
@@ -423,16 +421,35 @@ def depth_export(weights: DepthWeights, what: str | None, facts: dict[str, Any])
     if what is None:
         what = next(name for name, target in TARGETS.items() if target.fits(weights))
     refuse_unknown("what", what, TARGETS)
-    target, generator = TARGETS[what], weights.generator if what == "image" else None
-    names = ("virtual_focal_px", "virtual_baseline_m", "answer")
+    return TARGETS[what].export(weights, facts)
+
+
+def _pair_export(weights: DepthWeights, facts: dict[str, Any]) -> Export:
+    return Export(
+        graph=lambda: pair_graph(weights),
+        cases=lambda: _pair_cases(weights),
+        limits=_FLIPPING_LIMITS if isinstance(weights.matcher, _FLIPPING) else _LIMITS,
+        facts={**facts, "what": "rectified pair, RGB in [0, 1] -> disparity [px], ..."},
+    )
+
+
+def _image_export(weights: DepthWeights, facts: dict[str, Any]) -> Export:
+    generator, names = weights.generator, ("virtual_focal_px", "virtual_baseline_m", "answer")
     rig = {} if generator is None else {name: getattr(generator.config, name) for name in names}
     chooses = isinstance(generator, SelectionGenerator) or isinstance(weights.matcher, _FLIPPING)
     return Export(
-        graph=lambda: target.graph(weights),
-        cases=lambda: target.cases(weights),
+        graph=lambda: image_graph(weights),
+        cases=lambda: _image_cases(weights),
         limits=_FLIPPING_LIMITS if chooses else _LIMITS,
-        facts={**facts, **rig, "what": target.what},
+        facts={**facts, **rig, "what": "image, RGB in [0, 1], and K [px] -> depth [m], ..."},
     )
+
+
+TARGETS = {
+    "image": Target(fits=lambda weights: weights.generator is not None, export=_image_export),
+    "pair": Target(fits=lambda weights: weights.matcher is not None, export=_pair_export),
+}
+"""One image to depth, a rectified pair to disparity: a new target is a function and one entry."""
 
 
 def _image_cases(weights: DepthWeights) -> Iterator[Case]:
@@ -482,23 +499,6 @@ def _pair_cases(weights: DepthWeights) -> Iterator[Case]:
             for one, other in zip(left, right, strict=True)
         ]
         yield _case(inputs, found, ("disparity_px", "confidence", *sky))
-
-
-TARGETS = {
-    "image": Target(
-        fits=lambda weights: weights.generator is not None,
-        graph=image_graph,
-        cases=_image_cases,
-        what="image, RGB in [0, 1], and K [px] -> depth [m], ...",
-    ),
-    "pair": Target(
-        fits=lambda weights: weights.matcher is not None,
-        graph=pair_graph,
-        cases=_pair_cases,
-        what="rectified pair, RGB in [0, 1] -> disparity [px], ...",
-    ),
-}
-"""One image to depth, a rectified pair to disparity: a new target is one entry."""
 
 
 def _sees_sky(matcher: StereoNetwork | None) -> bool:
