@@ -1,8 +1,7 @@
 """Pairs, on disk or rendered, as training samples by index."""
 
 from collections import Counter
-from collections.abc import Iterable, Sequence
-from hashlib import sha256
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import torch
@@ -26,15 +25,6 @@ class _Place(NamedTuple):
     source: Dataset | Streets
     number: int
     truth: TruthKind | None
-
-
-def name_frames(frames: Iterable[Frame]) -> str:
-    """Give a hash of the names of frames and the sizes of their left images."""
-    digest = sha256()
-    for frame in frames:
-        size = frame.left.stat().st_size if frame.left.is_file() else 0  # 0: in a shard
-        digest.update(f"{frame.name} {size}\n".encode())
-    return digest.hexdigest()
 
 
 class TrainingPairs:

@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import asdict, replace
+from hashlib import sha256
 from pathlib import Path
 from typing import Any, TypeVar, cast
 
@@ -33,7 +34,7 @@ from depthpose.depth.train.config import (
     StereoTraining,
     ViewTraining,
 )
-from depthpose.depth.train.pairs import TrainingPairs, name_frames
+from depthpose.depth.train.pairs import TrainingPairs
 from depthpose.depth.train.stages import (
     FinetuneTask,
     SelectionSamples,
@@ -271,7 +272,11 @@ def _run_stage(
     sources = samples.sources if isinstance(samples, SelectionSamples) else [samples]
     frames = [frame for source in sources for frame in source.frames]
     if frames:
-        more["frames_sha256"] = name_frames(frames)
+        digest = sha256()  # of their names and the sizes of their left images
+        for frame in frames:
+            size = frame.left.stat().st_size if frame.left.is_file() else 0  # 0: in a shard
+            digest.update(f"{frame.name} {size}\n".encode())
+        more["frames_sha256"] = digest.hexdigest()
     held_out: TrainingPairs | None = getattr(task, "held_out", None)
     if held_out is not None:
         remedy = "give --held-out other pairs, or exclude these in the config"
