@@ -271,6 +271,15 @@ class Selected:
         return self.sky > 0.5
 
 
+def select(logits: Logits, planes: Planes, size: tuple[int, int]) -> Selected:
+    """Read disparity, sky and confidence off logits, and bring them to ``size``."""
+    log_px, sky, sure = (
+        F.interpolate(part[:, None], size, mode="bilinear")[:, 0]
+        for part in read_logits(logits, planes)
+    )
+    return Selected(log_px.exp(), sky, sure)
+
+
 def average(views: Sequence[Selected], limits_px: Sequence[float]) -> Selected:
     """Give the mean of what was found in one view at several sizes, as sure as the first.
 
@@ -512,14 +521,8 @@ def select_views(
     features = generator.encoder(padded)
     kept = (logits[..., : rows // 2, : columns // 2] for logits in generator.decode(features))
     planes = generator.planes * (size[1] / columns)
-    views = []
-    for logits in kept:
-        log_px, sky, sure = (
-            F.interpolate(part[:, None], size, mode="bilinear")[:, 0]
-            for part in read_logits(logits, planes)
-        )
-        views.append(Selected(log_px.exp(), sky, sure))
-    return replace(views[0], street=generator.find_street(features[-1])), views[1]
+    first, second = (select(logits, planes, size) for logits in kept)
+    return replace(first, street=generator.find_street(features[-1])), second
 
 
 def draw_right(generator: Generator, left: Float[Tensor, "b 3 h w"]) -> Float[Tensor, "b 3 h w"]:
