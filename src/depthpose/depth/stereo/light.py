@@ -453,21 +453,7 @@ class LightStereo(StereoNetwork):
         Raises:
             InputError: the images' size does not suit the network.
         """
-        h, w = left.shape[-2:]
-        if h % 32 or w % 32:
-            raise InputError(
-                f"the light matcher takes sides that are multiples of 32, got {h}x{w}; pad the "
-                "pair, as LightMatcher does"
-            )
-        near, far = self.features(left), self.features(right)
-        described = self.describe(near.levels[0]), self.describe(far.levels[0])
-        compares = self.config.with_agreement or self.config.with_refinement
-        right_half = far.half if compares else None
-        del far
-        bins = max_disparity_px // STEP_PX
-        scores = self.aggregation(*described, bins, near.levels, self.rows)
-        # In float32 at least: 8 bits would round the expectation to whole pixels.
-        scores = scores.to(torch.promote_types(scores.dtype, torch.float32))
+        scores, near, right_half = self.scores(left, right, max_disparity_px)
         quarter_px = mean_of_best(scores, self.config.candidates)
         quarters = [quarter_px]
         if with_confidence or self.sky_head is not None:
@@ -499,3 +485,26 @@ class LightStereo(StereoNetwork):
         if confidence is not None:
             confidence = torch.where(sky > 0.5, sky, sure * (1 - sky))
         return Reading(heads, confidence, sky)
+
+    def scores(
+        self, left: Float[Tensor, "b 3 h w"], right: Float[Tensor, "b 3 h w"], max_disparity_px: int
+    ) -> tuple[Scores, ViewFeatures, Features | None]:
+        """Answer a score for each disparity at 1/4 size, and what the enlargement sees.
+
+        Scores are float32 at least: 8 bits would round the expectation to whole pixels.
+        """
+        h, w = left.shape[-2:]
+        if h % 32 or w % 32:
+            raise InputError(
+                f"the light matcher takes sides that are multiples of 32, got {h}x{w}; pad the "
+                "pair, as LightMatcher does"
+            )
+        near, far = self.features(left), self.features(right)
+        described = self.describe(near.levels[0]), self.describe(far.levels[0])
+        compares = self.config.with_agreement or self.config.with_refinement
+        right_half = far.half if compares else None
+        del far
+        bins = max_disparity_px // STEP_PX
+        scores = self.aggregation(*described, bins, near.levels, self.rows)
+        wide = torch.promote_types(scores.dtype, torch.float32)
+        return scores.to(wide), near, right_half
