@@ -56,8 +56,8 @@ def make_streets(
     """
     from depthpose.core.run import claim_folder
     from depthpose.depth.config import StreetsConfig
-    from depthpose.depth.datasets import RawFrame, has_calibration, has_raw_frame, write_raw_frame
-    from depthpose.depth.synthetic import camera_from_velodyne, draw_street, rig_number
+    from depthpose.depth.datasets import has_calibration, has_raw_frame, write_raw_frame
+    from depthpose.depth.synthetic import draw_street, rig_number
 
     if number < 1 or first < 0 or not 0 <= seed <= 9999:
         raise InputError(
@@ -80,18 +80,7 @@ def make_streets(
     lost = {index for date, index in dates.items() if not has_calibration(out, date)}
     wanted = [i for i in indices if i in lost or not has_raw_frame(out, drives[i], i)]
     for index in _shown(wanted, None, "frames"):
-        frame = draw_street(config, index)
-        raw = RawFrame(
-            left=frame.left,
-            right=frame.right,
-            rig=frame.rig,
-            disparity_px=frame.disparity_px,
-            occluded=frame.occluded,
-            is_sky=frame.is_sky,
-            points=frame.lidar_points,
-            camera_from_velodyne=camera_from_velodyne(),
-        )
-        write_raw_frame(out, drives[index], index, raw)
+        write_raw_frame(out, drives[index], index, draw_street(config, index))
     print(f"{out}: {len(wanted)} frames made, {number - len(wanted)} were there")
     return 0
 

@@ -12,7 +12,7 @@ from depthpose.core.errors import InputError
 from depthpose.core.files import read_exif_focal, read_image, write_image
 from depthpose.depth.config import StreetsConfig
 from depthpose.depth.estimator import FakestereoNet
-from depthpose.depth.estimator.rig import square_camera
+from depthpose.depth.estimator.net import square_camera
 from depthpose.depth.predictions import COLOR_RANGE_M, write_estimate
 from depthpose.depth.stereo import CameraMatcher
 from depthpose.depth.synthetic import Streets

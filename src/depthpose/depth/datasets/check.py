@@ -140,8 +140,24 @@ def _check_images(frame: Frame, *, with_decoding: bool) -> Iterator[Problem]:
             yield _problem(frame.right, "mismatch" if report.is_wrong else "note", message)
     yield from _check_measurements(frame)
     for path in (frame.scan, frame.depth, frame.disparity, frame.disparity_noc):
-        if path is not None and size is not None:
-            yield from _check_truth(path, size, is_depth=path in (frame.scan, frame.depth))
+        if path is None or size is None:
+            continue
+        try:
+            truth = read_depth(path)
+        except InputError as error:
+            yield unreadable(path, error)
+            continue
+        found = truth.shape[1], truth.shape[0]
+        if found != size:
+            message = f"is {found[0]}x{found[1]}, but its left image is {size[0]}x{size[1]}"
+            yield _problem(path, "mismatch", message)
+        if not bool(torch.isfinite(truth).any()):
+            yield _problem(path, "empty", "holds no value")
+        largest, is_depth = float(truth.nan_to_num(0.0).max()), path in (frame.scan, frame.depth)
+        limit, unit = (_MAX_DEPTH_M, "m") if is_depth else (found[0], "px")
+        if largest > limit:
+            message = f"holds {largest:g} {unit}, beyond {limit} {unit}; is its unit 1/256?"
+            yield _problem(path, "mismatch", message)
 
 
 def _check_measurements(frame: Frame) -> Iterator[Problem]:
@@ -166,25 +182,6 @@ def _check_measurements(frame: Frame) -> Iterator[Problem]:
                 yield _problem(frame.velodyne, "empty", "holds no LiDAR point")
         except InputError as error:
             yield unreadable(frame.velodyne, error)
-
-
-def _check_truth(path: Path, size: tuple[int, int], *, is_depth: bool) -> Iterator[Problem]:
-    try:
-        truth = read_depth(path)
-    except InputError as error:
-        yield unreadable(path, error)
-        return
-    height, width = truth.shape
-    if (width, height) != size:
-        message = f"is {width}x{height}, but its left image is {size[0]}x{size[1]}"
-        yield _problem(path, "mismatch", message)
-    if not bool(torch.isfinite(truth).any()):
-        yield _problem(path, "empty", "holds no value")
-    largest = float(truth.nan_to_num(0.0).max())
-    limit, unit = (_MAX_DEPTH_M, "m") if is_depth else (width, "px")
-    if largest > limit:
-        message = f"holds {largest:g} {unit}, beyond {limit} {unit}; is its unit 1/256?"
-        yield _problem(path, "mismatch", message)
 
 
 _ROWS, _COLUMNS = 40, 128
