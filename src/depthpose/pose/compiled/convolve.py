@@ -4,17 +4,14 @@ import numpy as np
 from torch import Tensor
 
 from depthpose.pose.compiled import compiled
-from depthpose.pose.compiled.points import Array
-
-
-def rows_of(keys: Array, standing: Array, moves: list[int]) -> Array:
-    """Give the row of each key ``standing + move``; one past the last where there is none."""
-    return _find_rows(keys, standing, np.array(moves, np.int64))
 
 
 @compiled
-def _find_rows(keys, standing, moves):
-    """Walk along both ascending lists at once."""
+def rows_of(keys, standing, moves):
+    """Give the row of each key ``standing + move``, one past the last where there is none.
+
+    Both lists ascend: it walks along them at once.
+    """
     rows = np.empty((len(moves), len(standing)), np.int32)
     for k in range(len(moves)):
         row = 0

@@ -45,26 +45,20 @@ class PoseEstimator(ABC):
     Args:
         models: the objects.
         config: ICP, limits, device.
+        refusal: when an answer is withheld.
     """
 
     _holder = "the weights"
     """What knows the objects, in errors."""
 
-    def __init__(self, models: Sequence[ObjectModel], config: EstimateConfig | None) -> None:
+    def __init__(
+        self, models: Sequence[ObjectModel], config: EstimateConfig | None, refusal: RefusalConfig
+    ) -> None:
         self.config = EstimateConfig() if config is None else config
+        self.models, self.refusal = tuple(models), refusal
         self._numbers = {model.name: k for k, model in enumerate(models)}
         self._surfaces: dict[int, Surface] = {}
         self._copies: dict[int, PoseAmbiguities] = {}
-
-    @property
-    @abstractmethod
-    def models(self) -> Sequence[ObjectModel]:
-        """The objects."""
-
-    @property
-    @abstractmethod
-    def refusal(self) -> RefusalConfig:
-        """When an answer is withheld."""
 
     @property
     def objects(self) -> tuple[str, ...]:
