@@ -241,7 +241,7 @@ def fibonacci_directions(count: int) -> Float[Tensor, "count 3"]:
 
 
 _SIDE_DIRECTIONS = 32
-_CELL = 2.0
+CELL = 2.0
 """Side of a ray's cell in mean distances of samples: four samples in each on average."""
 _SAME = 0.5
 """Up to so many mean distances from another's plane a sample is of the same sheet."""
@@ -251,12 +251,6 @@ _SEEN = 0.1
 """Least share of directions from which an outer side is seen."""
 _CLEARER = 0.4
 """The inner side is seen in at most so many times the directions of the outer."""
-
-
-def cell_of(points: np.ndarray, tree: KDTree) -> float:
-    """Give the side of a cell in which a ray finds about four samples of a surface."""
-    near = tree.query(points[:: max(1, len(points) // 500)], k=min(5, len(points)))[0][:, -1]
-    return _CELL * float(np.median(near)) * np.sqrt(np.pi) / 2
 
 
 def outward_normals(points: np.ndarray, normals: np.ndarray, cell: float) -> np.ndarray:
@@ -278,7 +272,7 @@ def outward_normals(points: np.ndarray, normals: np.ndarray, cell: float) -> np.
             first[place[order[::way]]] = order[::way]
             front = first[place]
             off = ((points - points[front]) * normals[front]).sum(1)
-            is_seen = np.abs(off) < _SAME / _CELL * cell
+            is_seen = np.abs(off) < _SAME / CELL * cell
             for side in (0, 1):
                 facing = way * (1 - 2 * side) * slant > _SLANT
                 seen[side] += facing & is_seen

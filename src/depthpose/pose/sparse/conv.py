@@ -233,19 +233,11 @@ class SparseConv(nn.Module):
         self.kernel, self.stride = kernel, stride
         self.weight = nn.Parameter(torch.empty(kernel**3, inputs, outputs))
         self.bias = nn.Parameter(torch.zeros(outputs)) if has_bias else None
-        nn.init.normal_(self.weight, std=(2 / self.fan_in) ** 0.5)
-
-    @property
-    def fan_in(self) -> float:
-        """Numbers that one output is summed from, on a surface.
-
-        Voxels of a surface fill about 1.5 k^2 of a kernel's k^3 cells (counted: 13 to 14 of 27).
-        Where it is transposed, each coarse voxel feeds about 4 fine ones.
-        """
-        taps = 1.5 * self.kernel**2 if self.kernel > 1 else 1.0
-        if self.is_transposed:
-            taps = max(1.0, taps / self.stride**2)
-        return taps * self.weight.shape[1]
+        # Voxels of a surface fill about 1.5 k^2 of a kernel's k^3 cells (counted: 13 to 14 of 27).
+        # Where it is transposed, each coarse voxel feeds about 4 fine ones.
+        taps = 1.5 * kernel**2 if kernel > 1 else 1.0
+        taps = max(1.0, taps / stride**2) if self.is_transposed else taps
+        nn.init.normal_(self.weight, std=(2 / (taps * inputs)) ** 0.5)
 
     def forward(self, voxels: Voxels) -> Voxels:
         """Convolve."""

@@ -342,7 +342,7 @@ class CoordinateCache:
         """
         assert stride & (stride - 1) == 0, f"stride must be a power of two, got {stride}"
         assert kernel % 2 or stride > 1, "an even kernel has no centre: it needs a stride"
-        # A coarser voxel lies up to stride - 1 cells below the lowest finer one in it; an odd kernel
+        # A coarser voxel lies up to stride - 1 cells below the lowest finer one; an odd kernel
         # looks both ways from it, an even one forward alone.
         beyond = kernel // 2 + stride - 1 if kernel % 2 else max(kernel, stride) - 1
         assert beyond <= MARGIN, f"kernel {kernel} with stride {stride} looks {beyond} cells beyond"
