@@ -127,28 +127,23 @@ def nearest_copy(
     one = Rigid(estimated.R.double().expand_as(R), estimated.t_m.double().expand_as(t_m))
     nearest = int(rotation_error_rad(one, copies).argmin())
     copy = copies[nearest]
-    return copy if declared is None else _turned_to(copy, estimated.R.double(), declared)
-
-
-def _turned_to(pose: Rigid, R: Float[Tensor, "3 3"], symmetries: Symmetries) -> Rigid:
-    """Turn a pose about the axes of revolution of its object until it is nearest to ``R``."""
-    if not symmetries.continuous:
-        return pose
-    relative = pose.R.mT @ R
-    centre_m = symmetries.ball_centre_m
+    if declared is None or not declared.continuous:
+        return copy
+    # Turned about the axes of revolution until it is nearest.
+    wanted, centre_m = estimated.R.double(), declared.ball_centre_m
+    relative = copy.R.mT @ wanted
     if centre_m is not None:
-        turn = Rigid(relative, centre_m.to(R) - relative @ centre_m.to(R))
-        return pose @ turn
+        centre_m = centre_m.to(wanted)
+        return copy @ Rigid(relative, centre_m - relative @ centre_m)
     turns = []
-    for axis in symmetries.continuous:
-        a = axis.direction.to(R) / axis.direction.norm()
+    for axis in declared.continuous:
+        a = axis.direction.to(wanted) / axis.direction.norm()
         # The trace of relative^T turn(angle) is largest there.
         skew = relative - relative.mT
         across = torch.stack([skew[2, 1], skew[0, 2], skew[1, 0]])
         angle = torch.atan2(a @ across, relative.trace() - a @ relative @ a)
-        turns.append(pose @ turn_about(a, axis.point_m.to(R), angle))
-    errors = [float(rotation_error_rad(Rigid(R, pose.t_m), one)) for one in turns]
-    return turns[errors.index(min(errors))]
+        turns.append(copy @ turn_about(a, axis.point_m.to(wanted), angle))
+    return min(turns, key=lambda one: float(rotation_error_rad(Rigid(wanted, copy.t_m), one)))
 
 
 def _vsd(estimated: Rigid, instance: Instance, context: ErrorContext) -> Float[Tensor, "10"]:

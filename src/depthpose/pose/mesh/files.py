@@ -78,24 +78,12 @@ def read_geometry(path: AnyPath) -> tuple[np.ndarray, np.ndarray]:
         )
     if isinstance(faces, np.ndarray):
         faces = Ragged(np.full(len(faces), faces.shape[1]), faces.reshape(-1))
-    triangles = cut_polygons(path, vertices, faces.sizes, faces.values.astype(np.int64))
-    return vertices, _sound_faces(path, vertices, triangles)
-
-
-def mesh_suffixes() -> tuple[str, ...]:
-    """Name the suffixes of model files that may have faces, in lower case."""
-    return tuple(MESH_READERS)
-
-
-def _sound_faces(path: AnyPath, vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    """Drop faces without area, and all but the first of those on the same three points.
-
-    A face and its reverse would cancel in the normals. Holes are no flaw.
-    """
+    faces = cut_polygons(path, vertices, faces.sizes, faces.values.astype(np.int64))
     if len(faces) == 0:
-        return faces
-    corners = vertices[faces]
-    sides = corners[:, 1:] - corners[:, :1]
+        return vertices, faces
+    # Dropped are faces without area, and all but the first of those on the same three points: a
+    # face and its reverse would cancel in the normals. Holes are no flaw.
+    sides = vertices[faces[:, 1:]] - vertices[faces[:, :1]]
     area = np.linalg.norm(np.cross(sides[:, 0], sides[:, 1]), axis=-1) / 2
     square = float(np.ptp(vertices, axis=0).max()) ** 2
     if area.sum() <= _LEAST_AREA * square:
@@ -106,9 +94,13 @@ def _sound_faces(path: AnyPath, vertices: np.ndarray, faces: np.ndarray) -> np.n
     # By place, not by number: STL repeats the points of every face.
     _, place = np.unique(vertices, axis=0, return_inverse=True)
     _, first = np.unique(np.sort(place.reshape(-1)[faces], axis=-1), axis=0, return_index=True)
-    is_first = np.zeros(len(faces), bool)
-    is_first[first] = True
-    return faces[is_first & (area > _NO_AREA * square)]
+    is_first = np.isin(np.arange(len(faces)), first)
+    return vertices, faces[is_first & (area > _NO_AREA * square)]
+
+
+def mesh_suffixes() -> tuple[str, ...]:
+    """Name the suffixes of model files that may have faces, in lower case."""
+    return tuple(MESH_READERS)
 
 
 def _read_ply(path: AnyPath) -> tuple[np.ndarray, Ragged]:

@@ -80,14 +80,44 @@ def symmetries_from_bop(info: Mapping[str, Any], *, source: str) -> Symmetries:
     turns, lines = (info.get(f"symmetries_{kind}", []) for kind in ("discrete", "continuous"))
     if not isinstance(turns, list) or not isinstance(lines, list):
         raise InputError(f"{source}: its symmetries are no lists; write [...] of them")
-    matrices = [_rigid_from_bop(row, source) for row in turns]
-    axes = tuple(_axis_from_bop(entry, source) for entry in lines)
-    is_found = info.get("symmetries_found", False) is True
-    discrete = None
-    if matrices:
-        stacked = torch.stack(matrices)
-        discrete = Rigid(stacked[:, :3, :3], stacked[:, :3, 3])
-    return Symmetries(discrete=discrete, continuous=axes, is_found=is_found)
+    motions: list[Rigid] = []
+    for row in turns:
+        try:
+            matrix = torch.tensor(row, dtype=torch.float64).reshape(4, 4)
+        except (TypeError, ValueError, RuntimeError, OverflowError) as error:
+            raise InputError(
+                f"{source}: the symmetry {repr(row)[:80]} is not 16 numbers; write a 4x4 matrix "
+                "row by row"
+            ) from error
+        R = matrix[:3, :3]
+        is_rigid = torch.allclose(R @ R.T, torch.eye(3).double(), atol=1e-3) and torch.det(R) > 0
+        if not is_rigid or matrix[3].tolist() != [0, 0, 0, 1]:
+            raise InputError(
+                f"{source}: the symmetry {repr(row)[:200]} is no rigid motion; its upper left 3x3 "
+                "is a rotation, its last row 0 0 0 1"
+            )
+        motions.append(Rigid(R, 0.001 * matrix[:3, 3]))
+    axes: list[Axis] = []
+    for entry in lines:
+        try:
+            assert isinstance(entry, Mapping)
+            direction = torch.tensor(entry["axis"], dtype=torch.float64).reshape(3)
+            offset_mm = torch.tensor(entry.get("offset", [0, 0, 0]), dtype=torch.float64).reshape(3)
+            length = float(direction.norm())
+            assert 0 < length < math.inf
+        except (
+            AssertionError, KeyError, TypeError, ValueError, RuntimeError, OverflowError
+        ) as error:  # fmt: skip
+            raise InputError(
+                f'{source}: the continuous symmetry {repr(entry)[:80]} is not {{"axis": [x, y, z], '
+                '"offset": [x, y, z]} with an axis of some length'
+            ) from error
+        axes.append(Axis(direction=direction / length, point_m=0.001 * offset_mm))
+    return Symmetries(
+        discrete=Rigid.stack(motions) if motions else None,
+        continuous=tuple(axes),
+        is_found=info.get("symmetries_found", False) is True,
+    )
 
 
 def symmetries_to_bop(symmetries: Symmetries) -> dict[str, Any]:
@@ -105,40 +135,6 @@ def symmetries_to_bop(symmetries: Symmetries) -> dict[str, Any]:
     if symmetries.is_found and info:
         info["symmetries_found"] = True
     return info
-
-
-def _rigid_from_bop(row: object, source: str) -> Float[Tensor, "4 4"]:
-    try:
-        matrix = torch.tensor(row, dtype=torch.float64).reshape(4, 4)
-    except (TypeError, ValueError, RuntimeError, OverflowError) as error:
-        raise InputError(
-            f"{source}: the symmetry {repr(row)[:80]} is not 16 numbers; write a 4x4 matrix row by "
-            "row"
-        ) from error
-    R = matrix[:3, :3]
-    is_rigid = torch.allclose(R @ R.T, torch.eye(3).double(), atol=1e-3) and torch.det(R) > 0
-    if not is_rigid or matrix[3].tolist() != [0, 0, 0, 1]:
-        raise InputError(
-            f"{source}: the symmetry {repr(row)[:200]} is no rigid motion; its upper left 3x3 is a "
-            "rotation, its last row 0 0 0 1"
-        )
-    matrix[:3, 3] *= 0.001
-    return matrix
-
-
-def _axis_from_bop(entry: object, source: str) -> Axis:
-    try:
-        assert isinstance(entry, Mapping)
-        direction = torch.tensor(entry["axis"], dtype=torch.float64).reshape(3)
-        offset_mm = torch.tensor(entry.get("offset", [0, 0, 0]), dtype=torch.float64).reshape(3)
-        length = float(direction.norm())
-        assert 0 < length < math.inf
-    except (AssertionError, KeyError, TypeError, ValueError, RuntimeError, OverflowError) as error:
-        raise InputError(
-            f'{source}: the continuous symmetry {repr(entry)[:80]} is not {{"axis": [x, y, z], '
-            '"offset": [x, y, z]} with an axis of some length'
-        ) from error
-    return Axis(direction=direction / length, point_m=0.001 * offset_mm)
 
 
 _NORMAL_NEIGHBOURS = 16
