@@ -218,10 +218,10 @@ class RefusalConfig:
 class EstimateConfig:
     """How a cloud becomes a pose."""
 
-    voting: VotingConfig = field(default_factory=VotingConfig)
+    voting: VotingConfig = VotingConfig()
     """Directions to keypoints."""
 
-    icp: IcpConfig = field(default_factory=IcpConfig)
+    icp: IcpConfig = IcpConfig()
     """How ICP refines the voted pose."""
 
     with_icp: bool = True
@@ -393,7 +393,7 @@ class ObjectsConfig:
     mask_shift_px: int = 2
     """And shifted by up to so many of them along each axis, as a predicted mask is."""
 
-    sensor: SensorConfig = field(default_factory=SensorConfig)
+    sensor: SensorConfig = SensorConfig()
     """What measures the depth."""
 
     frame_objects: tuple[int, int] = (2, 6)
