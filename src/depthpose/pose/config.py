@@ -305,6 +305,18 @@ OCCLUSIONS = "[0, 0.95]"
 """Share of a silhouette that something may occlude."""
 
 
+def refuse_reversed(config: object, *names: str) -> None:
+    """Refuse ranges whose upper end comes first.
+
+    Raises:
+        InputError: that is so.
+    """
+    for name in names:
+        ends = getattr(config, name)
+        if ends is not None and ends[0] > ends[1]:
+            raise InputError(f"{name} must be a range, the lower end first, got {ends}; turn it")
+
+
 @dataclass(frozen=True, kw_only=True)
 class SensorConfig:
     """The errors of a depth sensor. Ranges are of what each sample draws."""
@@ -444,15 +456,3 @@ class ObjectsConfig:
         """``centre_px``, or what it is where it was not given."""
         assert self.centre_px is not None
         return self.centre_px
-
-
-def refuse_reversed(config: object, *names: str) -> None:
-    """Refuse ranges whose upper end comes first.
-
-    Raises:
-        InputError: that is so.
-    """
-    for name in names:
-        ends = getattr(config, name)
-        if ends is not None and ends[0] > ends[1]:
-            raise InputError(f"{name} must be a range, the lower end first, got {ends}; turn it")

@@ -49,8 +49,8 @@ def convolved(
     assert x.shape == (read, weight.shape[1]), "a row for each voxel, a channel for each weight"
     assert len(weight) == len(table), "a weight for each offset"
     out = x.new_zeros(written, weight.shape[2])
-    given = (a.detach().contiguous().numpy() for a in (x, weight, table))
-    _convolve(*given, is_transposed, out.numpy())
+    x, weight, table = x.detach().contiguous(), weight.detach().contiguous(), table.contiguous()
+    _convolve(x.numpy(), weight.numpy(), table.numpy(), is_transposed, out.numpy())
     return out
 
 

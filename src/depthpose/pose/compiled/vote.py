@@ -175,19 +175,6 @@ def _gradients(local, n, w, p, nearest, A, gradient):
 
 
 @compiled
-def _nearest_gradients(local, n, w, p, gradient):
-    total = 0.0
-    for i in range(len(w)):
-        total += w[i]
-    for i in range(len(w)):
-        x, y, z = p[0] - local[0, i], p[1] - local[1, i], p[2] - local[2, i]
-        along = n[0, i] * x + n[1, i] * y + n[2, i] * z
-        gradient[0, i] = (x - n[0, i] * along) * w[i] / total
-        gradient[1, i] = (y - n[1, i] * along) * w[i] / total
-        gradient[2, i] = (z - n[2, i] * along) * w[i] / total
-
-
-@compiled
 def _meet(local, n, w, refinements, nearest, points, covariances, conditions):
     local = local[0]
     count = local.shape[1]
@@ -214,7 +201,15 @@ def _meet(local, n, w, refinements, nearest, points, covariances, conditions):
             for c in range(3):
                 p[c] += step[c] * min(limit / size, 1.0)
         if refinements == 0:
-            _nearest_gradients(local, n[k], w[k], p, gradient)
+            total = 0.0
+            for i in range(count):
+                total += w[k, i]
+            for i in range(count):
+                x, y, z = p[0] - local[0, i], p[1] - local[1, i], p[2] - local[2, i]
+                along = n[k, 0, i] * x + n[k, 1, i] * y + n[k, 2, i] * z
+                gradient[0, i] = (x - n[k, 0, i] * along) * w[k, i] / total
+                gradient[1, i] = (y - n[k, 1, i] * along) * w[k, i] / total
+                gradient[2, i] = (z - n[k, 2, i] * along) * w[k, i] / total
         for c in range(3):
             unit[:] = 0.0
             unit[c] = 1.0

@@ -265,36 +265,27 @@ def match(
             assert prediction.place is not None
             offered[prediction.place].append(prediction.estimate)
     for place, estimates in offered.items():
-        found |= _assign(waiting[place], estimates, models[place.object_id])
+        left, model = waiting[place], models[place.object_id]
+        ranked = sorted((e for e in estimates if e.is_posed), key=score_of, reverse=True)
+        answers = ranked[: len(left)]
+        points_m = model.vertices_m[:: max(1, len(model.vertices_m) // _POINTS)]
+        costs = np.zeros((len(left), len(answers)))
+        for row, column in np.ndindex(costs.shape if len(left) > 1 else (0, 0)):
+            pose, true = answers[column].camera_from_model, left[row].camera_from_model
+            assert pose is not None
+            error_m = float(adds_m(pose, true, points_m))
+            costs[row, column] = min(error_m, _NEAR_DIAMETERS * model.diameter_m)
+        for row, column in zip(*linear_sum_assignment(costs), strict=True):
+            found[left[row].name] = answers[column]
+        refusals = [estimate for estimate in estimates if not estimate.is_posed]
+        left = [instance for instance in left if instance.name not in found]
+        found |= {i.name: e for i, e in zip(left, refusals, strict=False)}
     return found
 
 
 def _is_own(prediction: Prediction, places: Mapping[str, Place]) -> bool:
     place = places.get(prediction.estimate.name)
     return place is not None and prediction.place in (None, place)
-
-
-def _assign(
-    instances: list[Instance], estimates: list[PoseEstimate], model: ObjectModel
-) -> dict[str, PoseEstimate]:
-    ranked = sorted((e for e in estimates if e.is_posed), key=score_of, reverse=True)
-    answers = ranked[: len(instances)]
-    chosen: dict[str, PoseEstimate] = {}
-    if len(instances) == 1 and answers:
-        chosen[instances[0].name] = answers[0]
-    elif answers:
-        points_m = model.vertices_m[:: max(1, len(model.vertices_m) // _POINTS)]
-        costs = np.zeros((len(instances), len(answers)))
-        for (row, column), _ in np.ndenumerate(costs):
-            pose, true = answers[column].camera_from_model, instances[row].camera_from_model
-            assert pose is not None
-            error_m = float(adds_m(pose, true, points_m))
-            costs[row, column] = min(error_m, _NEAR_DIAMETERS * model.diameter_m)
-        for row, column in zip(*linear_sum_assignment(costs), strict=True):
-            chosen[instances[row].name] = answers[column]
-    refusals = [estimate for estimate in estimates if not estimate.is_posed]
-    left = [instance for instance in instances if instance.name not in chosen]
-    return chosen | {i.name: e for i, e in zip(left, refusals, strict=False)}
 
 
 _TRIED = 40

@@ -393,7 +393,11 @@ def distance_errors(
     keypoints_m: Float[Tensor, "*batch k 3"], model_keypoints_m: Float[Tensor, "k 3"]
 ) -> Float[Tensor, "*batch k k"]:
     """Found minus known distance of each pair of keypoints [m]: 28 pairs of 8, each twice."""
-    return _distances(keypoints_m) - _distances(model_keypoints_m.to(keypoints_m))
+    found, known = (
+        (points_m[..., :, None, :] - points_m[..., None, :, :]).norm(dim=-1)
+        for points_m in (keypoints_m, model_keypoints_m.to(keypoints_m))
+    )
+    return found - known
 
 
 def consistent_keypoints(
@@ -430,7 +434,3 @@ def consistent_keypoints(
         worst = torch.nn.functional.one_hot(blame.argmax(-1), count).bool()
         stays = stays & ~(worst & broken.any((-1, -2))[..., None])
     return stays
-
-
-def _distances(points_m: Float[Tensor, "*batch k 3"]) -> Float[Tensor, "*batch k k"]:
-    return (points_m[..., :, None, :] - points_m[..., None, :, :]).norm(dim=-1)
