@@ -81,7 +81,20 @@ class _Convolution(torch.autograd.Function):
         wants_x, wants_weight, _ = ctx.needs_input_grad
         # The first layer's input is no parameter's child: its gradient is seldom wanted.
         for_x = _convolve(gradient, weight.mT, m.transposed) if wants_x else None
-        return for_x, _weight_gradient(gradient, x, weight, m) if wants_weight else None, None
+        if not wants_weight:
+            return for_x, None, None
+        if _is_narrow(x, m):
+            return for_x, (_table(x, m) @ gradient).view(weight.shape), None
+        if _is_gridded(x, weight, m):
+            found = torch.bmm(_read(x, m).mT, _read(gradient, m.transposed))
+        else:
+            found = torch.zeros_like(weight)
+            for offset, read, write in m.by_offset():
+                pulls = gradient.index_select(0, write)
+                torch.mm(x.index_select(0, read).T, pulls, out=found[offset])
+        if m.centre is not None:
+            torch.mm(x.T, gradient, out=found[m.centre])
+        return for_x, found, None
 
 
 def _convolve(x: Tensor, weight: Tensor, m: KernelMap) -> Tensor:
@@ -94,21 +107,6 @@ def _convolve(x: Tensor, weight: Tensor, m: KernelMap) -> Tensor:
         for offset, read, write in m.by_offset():
             out.index_add_(0, write, x.index_select(0, read) @ kernels[offset])
     return out if m.centre is None else out.addmm_(x, weight[m.centre])
-
-
-def _weight_gradient(gradient: Tensor, x: Tensor, weight: Tensor, m: KernelMap) -> Tensor:
-    if _is_narrow(x, m):
-        return (_table(x, m) @ gradient).view(weight.shape)
-    if _is_gridded(x, weight, m):
-        found = torch.bmm(_read(x, m).mT, _read(gradient, m.transposed))
-    else:
-        found = torch.zeros_like(weight)
-        for offset, read, write in m.by_offset():
-            pulls = gradient.index_select(0, write)
-            torch.mm(x.index_select(0, read).T, pulls, out=found[offset])
-    if m.centre is not None:
-        torch.mm(x.T, gradient, out=found[m.centre])
-    return found
 
 
 def _read(x: Tensor, m: KernelMap) -> Tensor:
