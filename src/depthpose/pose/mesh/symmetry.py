@@ -487,45 +487,32 @@ def _search(model: ObjectModel) -> dict[str, Any]:
         discrete = (surface.deviation(given.discrete.R.double()) <= ALIKE).tolist()
     alike = (discrete, axes)
     same = symmetry_transforms(_marked(given, alike) if given.is_found else given, _FINE_STEP).R
-    near: list[tuple[Rigid, float]] = []
-    for off, turn in sorted(_measured(model, surface), key=lambda pair: pair[0]):
-        if len(near) == _MOST_NEAR or off > 2 * _TOLERANCE:
-            break
-        # New is what is far from the others and from all copies of them that look alike.
-        others = torch.cat([R @ same.double() for R in (_EYE, *(one.R for one, _ in near))])
-        apart_rad = float(geodesic_rad(turn.R.expand_as(others), others).min())
-        if apart_rad > _NEAR_SUPPRESSION_RAD:
-            near.append((turn, off))
-    return {"near": [(turn.matrix().tolist(), off) for turn, off in near], "alike": alike}
-
-
-def _measured(model: ObjectModel, surface: SurfaceDeviation) -> list[tuple[float, Rigid]]:
-    """Measure symmetries that were found, and turns refined to where they fit best.
-
-    A scan whose points lie denser on one side has its centre where no symmetry has it.
-    """
-    found = symmetry_transforms(model.symmetries, _STEP).R.double()[1:]
-    exact = found if model.symmetries.is_found else found[:0]
-    tried = [Rigid(R, torch.zeros(3).double()) for R in exact]
+    # Symmetries that were found, and turns refined to where they fit best: a scan whose points lie
+    # denser on one side has its centre where no symmetry has it.
+    copies = symmetry_transforms(given, _STEP).R.double()[1:]
+    tried = [Rigid(R, torch.zeros(3).double()) for R in (copies if given.is_found else copies[:0])]
     # From quarter turns about the principal axes, and the best of thousands of other turns.
     quarters = torch.arange(1, 4).double() * (math.pi / 2)
     starts = [R for axis in surface.axes for R in _turns(axis, quarters)]
     for R in promising_turns(surface):
-        if len(starts) == _NEAR_STARTS:
-            break
-        if _is_apart(R, [_EYE, *starts], _NEAR_SUPPRESSION_RAD):
+        if len(starts) < _NEAR_STARTS and _is_apart(R, [_EYE, *starts], _NEAR_SUPPRESSION_RAD):
             starts.append(R)
     tried += [refine_turn(surface, R) for R in starts]
     measured = _deviations(tried, surface)
     good = [turn for off, turn in sorted(measured, key=lambda pair: pair[0]) if off <= _TOLERANCE]
     # Two turns one after the other are one: of a can, upside down and then about its axis.
     measured += _deviations([a @ b for a in good[:_NEAR_STARTS] for b in good[:3]], surface)
-    # About the centre of the surface, in diameters, to the model's frame.
-    centre_m = surface.centre_m
-    return [
-        (off, Rigid(turn.R, centre_m - turn.R @ centre_m + turn.t_m * model.diameter_m))
-        for off, turn in measured
-    ]
+    near: list[tuple[Rigid, float]] = []
+    for off, turn in sorted(measured, key=lambda pair: pair[0]):
+        if len(near) == _MOST_NEAR or off > 2 * _TOLERANCE:
+            break
+        # New is what is far from the others and from all copies of them that look alike.
+        others = torch.cat([R @ same.double() for R in (_EYE, *(one.R for one, _ in near))])
+        apart_rad = float(geodesic_rad(turn.R.expand_as(others), others).min())
+        if apart_rad > _NEAR_SUPPRESSION_RAD:  # from the surface's centre and unit to the model's
+            shift_m = surface.centre_m - turn.R @ surface.centre_m + turn.t_m * model.diameter_m
+            near.append((Rigid(turn.R, shift_m), off))
+    return {"near": [(turn.matrix().tolist(), off) for turn, off in near], "alike": alike}
 
 
 def _deviations(turns: list[Rigid], surface: SurfaceDeviation) -> list[tuple[float, Rigid]]:

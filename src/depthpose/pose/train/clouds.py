@@ -156,7 +156,16 @@ class TrainingClouds(TrainingViews):
         generator = sample_generator(index, self.seed)
         for attempt in range(TRIES):
             # Far beyond any training, and the same object.
-            sample = self._sample(index + attempt * len(self.models) * 2**32, generator)
+            place = index + attempt * len(self.models) * 2**32
+            # Sample i shows object i modulo their number.
+            place *= len(self.models) if place < self._first_alone else 1
+            frame = self._place(place, generator)
+            if self._real is None or self._frames is None or frame is None:
+                sample = self.synthetic.sample(place)
+            else:
+                sample = self._real[frame]
+                angle_rad = 2 * math.pi * float(torch.rand((), generator=generator))
+                sample = _rolled(sample, angle_rad) if self._frames.with_roll else sample
             if refusal_of(sample.input.points_m, self.cloud) is None:
                 number = self._class_of[sample.input.object]
                 return voxelised_cloud(sample, number, self.cloud, generator)
@@ -181,26 +190,18 @@ class TrainingClouds(TrainingViews):
             t_m=torch.stack([c.t_m for c in clouds]),
         )
 
-    def _sample(self, index: int, generator: torch.Generator) -> CloudSample:
-        # Sample i shows object i modulo their number.
-        index = index * len(self.models) if index < self._first_alone else index
-        place = self._place(index, generator)
-        if self._real is None or self._frames is None or place is None:
-            return self.synthetic.sample(index)
-        sample = self._real[place]
-        angle_rad = 2 * math.pi * float(torch.rand((), generator=generator))
-        if not self._frames.with_roll:
-            return sample
-        # The camera is turned about its optical axis: cloud and pose turn with it.
-        cosine, sine = math.cos(angle_rad), math.sin(angle_rad)
-        turn = torch.tensor([[cosine, -sine, 0.0], [sine, cosine, 0.0], [0.0, 0.0, 1.0]])
-        pose = sample.truth.camera_from_model
-        turned = Rigid(turn @ pose.R.float(), turn @ pose.t_m.float())
-        points_m = sample.input.points_m.float() @ turn.mT
-        return CloudSample(
-            input=dataclasses.replace(sample.input, points_m=points_m),
-            truth=dataclasses.replace(sample.truth, camera_from_model=turned),
-        )
+
+def _rolled(sample: CloudSample, angle_rad: float) -> CloudSample:
+    """Turn the camera about its optical axis: cloud and pose turn with it."""
+    cosine, sine = math.cos(angle_rad), math.sin(angle_rad)
+    turn = torch.tensor([[cosine, -sine, 0.0], [sine, cosine, 0.0], [0.0, 0.0, 1.0]])
+    pose = sample.truth.camera_from_model
+    turned = Rigid(turn @ pose.R.float(), turn @ pose.t_m.float())
+    points_m = sample.input.points_m.float() @ turn.mT
+    return CloudSample(
+        input=dataclasses.replace(sample.input, points_m=points_m),
+        truth=dataclasses.replace(sample.truth, camera_from_model=turned),
+    )
 
 
 def voxelised_cloud(
