@@ -218,12 +218,15 @@ def object_row(name: str, rows: Sequence[InstanceRow]) -> ObjectRow:
 def _mean_row(rows: Sequence[ObjectRow]) -> ObjectRow:
     """Average the rows of objects: each object counts the same, as in LineMOD's tables."""
     scores = {name: [row.scores[name] for row in rows] for name in rows[0].scores}
-    shares = ("success", "refused", "wrong", "coverage")
+    count = len(rows)
     return ObjectRow(
         object="mean",
         instances=sum(row.instances for row in rows),
         annotated=sum(row.annotated for row in rows),
-        **{name: sum(getattr(row, name) for row in rows) / len(rows) for name in shares},
+        success=sum(row.success for row in rows) / count,
+        refused=sum(row.refused for row in rows) / count,
+        wrong=sum(row.wrong for row in rows) / count,
+        coverage=sum(row.coverage for row in rows) / count,
         # A recall of some objects alone would pass for that of all; a median is of the answers.
         scores={
             name: _mean(values) if None not in values or name.endswith("_median") else None
