@@ -52,6 +52,12 @@ def test_a_copy_of_another_size_is_contradicted_with_its_size() -> None:
         assert found.is_ok
         assert found.identity is not None
         assert found.identity.status == "confirmed", found.identity
+    for times in (0.94, 1.065):
+        found = estimated(times)
+        assert found.is_ok
+        assert found.identity is not None
+        assert found.identity.status == "not excluded", found.identity
+        assert found.identity.reason.startswith(f"{found.identity.size:.2f} times the model's size")
     assert estimated(0.85, max_size_error=1.0).is_ok
     assert estimated(0.85, max_size_error=1.0).identity is None
 

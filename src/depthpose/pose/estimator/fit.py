@@ -218,6 +218,8 @@ _MIRROR_GAIN = 0.02
 synthetic views it was at most 0.004, where the mirror image is not nearly the model."""
 _OTHER_SIZES = 0.1
 """Sizes so far from 1 must be excluded for an identity to be confirmed."""
+_NEAR_SIZE = 0.05
+"""And the size that fits is as near to 1, beside its deviation and an offset of the sensor."""
 _BESIDE = 0.005
 """And no more of the readings may lie beside the silhouette, as those of a larger copy do."""
 
@@ -393,6 +395,8 @@ def identity_of(
         reason = f"the mirror image of {model.name} fits what was seen as well"
     elif scale.gain > _SIZE_GAIN:
         reason = f"{words}, which a sensor's errors may explain"
+    elif off > max(_NEAR_SIZE, _SURE * scale.sigma) + _OFFSET_M / distance_m:
+        reason = f"{words}, and not that of the model"
     elif fit.beyond > _BESIDE:
         reason = f"{fit.beyond:.1%} of the object's readings lie beside the posed silhouette"
     elif fit.agrees < SHOWN:
