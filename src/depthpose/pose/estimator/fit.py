@@ -373,21 +373,17 @@ def identity_of(
     )
     status, reason = "not excluded", ""
     if mirror is not None and mirror > max(_MIRROR_GAIN, scale.gain if is_other_size else 0.0):
-        status, reason = (
-            "contradicted",
-            (
-                f"the mirror image of {model.name} fits better (by {NEAR * mirror:.2%} of the "
-                "diameter): a mirrored copy, another object, or a camera whose x or y axis points "
-                "the other way"
-            ),
+        status = "contradicted"
+        reason = (
+            f"the mirror image of {model.name} fits better (by {NEAR * mirror:.2%} of the "
+            "diameter): a mirrored copy, another object, or a camera whose x or y axis points "
+            "the other way"
         )
     elif is_other_size:
-        status, reason = (
-            "contradicted",
-            (
-                f"{words}, and the sensor explains {max_size_error + sensor:.0%}: a copy "
-                "of another size, another object, or a wrong unit or camera"
-            ),
+        status = "contradicted"
+        reason = (
+            f"{words}, and the sensor explains {max_size_error + sensor:.0%}: a copy "
+            "of another size, another object, or a wrong unit or camera"
         )
     elif off + _SURE * scale.sigma > _OTHER_SIZES + sensor:
         reason = f"what was seen does not fix the size: {words}"
