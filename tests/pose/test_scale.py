@@ -10,7 +10,7 @@ from tests.pose.synthetic_objects import Oracle, bracket, cloud_of, noisy, pose_
 from depthpose.core.loop import sample_generator
 from depthpose.core.rigid import Rigid
 from depthpose.pose.config import EstimateConfig, RefusalConfig
-from depthpose.pose.estimator.fit import scale_of
+from depthpose.pose.estimator.fit import Scale, scale_of
 from depthpose.pose.refine import refine_pose
 from depthpose.pose.surface import prepare_surface
 from depthpose.pose.types import PoseEstimate
@@ -54,6 +54,18 @@ def test_a_copy_of_another_size_is_contradicted_with_its_size() -> None:
         assert found.identity.status == "confirmed", found.identity
     assert estimated(0.85, max_size_error=1.0).is_ok
     assert estimated(0.85, max_size_error=1.0).identity is None
+
+
+@pytest.mark.parametrize(("times", "status"), [(1.04, "confirmed"), (1.07, "not excluded")])
+def test_an_identity_is_confirmed_where_the_size_that_fits_is_near(
+    times: float, status: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    scale = Scale(times, sigma=0.02, gain=0.03)
+    monkeypatch.setattr("depthpose.pose.estimator.fit.scale_of", lambda *_: scale)
+    identity = estimated(1.0).identity
+    assert identity is not None
+    assert identity.status == status
+    assert identity.reason.endswith(", and not that of the model") == (status == "not excluded")
 
 
 def test_without_icp_nobody_asks_whether_it_is_the_object() -> None:

@@ -218,6 +218,8 @@ _MIRROR_GAIN = 0.02
 synthetic views it was at most 0.004, where the mirror image is not nearly the model."""
 _OTHER_SIZES = 0.1
 """Sizes so far from 1 must be excluded for an identity to be confirmed."""
+_NEAR_SIZE = 0.05
+"""And the size that fits is as near to 1, beside its deviation and an offset of the sensor."""
 _BESIDE = 0.005
 """And no more of the readings may lie beside the silhouette, as those of a larger copy do."""
 
@@ -371,21 +373,17 @@ def identity_of(
     )
     status, reason = "not excluded", ""
     if mirror is not None and mirror > max(_MIRROR_GAIN, scale.gain if is_other_size else 0.0):
-        status, reason = (
-            "contradicted",
-            (
-                f"the mirror image of {model.name} fits better (by {NEAR * mirror:.2%} of the "
-                "diameter): a mirrored copy, another object, or a camera whose x or y axis points "
-                "the other way"
-            ),
+        status = "contradicted"
+        reason = (
+            f"the mirror image of {model.name} fits better (by {NEAR * mirror:.2%} of the "
+            "diameter): a mirrored copy, another object, or a camera whose x or y axis points "
+            "the other way"
         )
     elif is_other_size:
-        status, reason = (
-            "contradicted",
-            (
-                f"{words}, and the sensor explains {max_size_error + sensor:.0%}: a copy "
-                "of another size, another object, or a wrong unit or camera"
-            ),
+        status = "contradicted"
+        reason = (
+            f"{words}, and the sensor explains {max_size_error + sensor:.0%}: a copy "
+            "of another size, another object, or a wrong unit or camera"
         )
     elif off + _SURE * scale.sigma > _OTHER_SIZES + sensor:
         reason = f"what was seen does not fix the size: {words}"
@@ -393,6 +391,8 @@ def identity_of(
         reason = f"the mirror image of {model.name} fits what was seen as well"
     elif scale.gain > _SIZE_GAIN:
         reason = f"{words}, which a sensor's errors may explain"
+    elif off > max(_NEAR_SIZE, _SURE * scale.sigma) + _OFFSET_M / distance_m:
+        reason = f"{words}, and not that of the model"
     elif fit.beyond > _BESIDE:
         reason = f"{fit.beyond:.1%} of the object's readings lie beside the posed silhouette"
     elif fit.agrees < SHOWN:
