@@ -516,11 +516,12 @@ def _check_rows(
         return
     measured = [report for report in known if report.matches] or known
     offset_px = median(abs(report.vertical_offset_px) for report in measured)
-    said = (
-        f"rows of {len(known)} pairs: they differ by {offset_px:.2f} px, with a spread of "
-        f"{median(report.vertical_spread_px for report in measured):.2f} px "
-        f"({sum(report.matches for report in known)} matches)"
-    )
+    spread_px = median(report.vertical_spread_px for report in measured)
+    differ = f"they differ by {offset_px:.2f} px, with a spread of {spread_px:.2f} px"
+    if not math.isfinite(offset_px):
+        differ = "no difference is common to their matches"
+    matches = sum(report.matches for report in known)
+    said = f"rows of {len(known)} pairs: {differ} ({matches} matches)"
     wrong = ""
     if 2 * sum(bool(report.is_swapped) for report in known) > len(known):
         wrong = "left and right look swapped (disparities are negative); exchange LEFT and RIGHT"

@@ -58,6 +58,7 @@ _MODELS = {
 """Models of distortion by name: whether it is that of a fisheye lens."""
 _COUNTS = {False: (4, 5, 8, 12, 14), True: (4,)}
 _MAX_BASELINE_M = 10.0
+_MAX_ENLARGED = 4  # of a raw image by its rectification
 _MAX_FOCAL_RATIO = 1.5  # of the two cameras of a pair; more are of images of two sizes
 _KNOWN = (
     "a camchain of Kalibr, OpenCV's K1, D1, K2, D2, R and T (in one file, or intrinsics.yml and "
@@ -336,7 +337,7 @@ def make_rectifier(pair: RawPair, size: Size, keep: float = 0.0) -> Rectifier:
         keep: 0: only what the raw images show; 1: all that they show, with black borders.
 
     Raises:
-        InputError: ``keep`` is out of range, or the lens bends too much for a flat image.
+        InputError: ``keep`` is out of range, or the lens bends more than any can.
         MissingExtraError: OpenCV is not installed.
     """
     cv2 = import_opencv("rectifying a pair")
@@ -355,6 +356,13 @@ def make_rectifier(pair: RawPair, size: Size, keep: float = 0.0) -> Rectifier:
         R1, R2, P1, P2, *_ = cv2.stereoRectify(*left, *right, size, R, t, flags=flags, alpha=keep)
     rig = camera_from_facts(facts_from_projections("the rectified pair", P1, P2, size), size)
     assert isinstance(rig, StereoRig), "two projections have a baseline"
+    raw_px, found_px = float(pair.left.K[0, 0]), float(rig.K[0, 0])
+    if found_px > _MAX_ENLARGED * raw_px:
+        raise InputError(
+            f"rectified, fx would be {found_px:.0f} px where the raw lens has {raw_px:.0f}: so "
+            f"much no lens bends; check the distortion {pair.left.distortion} and the rotation, or "
+            "whether the lens is a fisheye (--fisheye)"
+        )
     return Rectifier(
         rig=rig,
         rectified_from_raw=Rigid(torch.from_numpy(R1), torch.zeros(3).double()),

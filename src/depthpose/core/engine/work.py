@@ -375,10 +375,11 @@ def _samples(block: Block, wanted: Files, scratch: Path) -> Iterator[Sample]:
         yield sample
     if block.tar is None:
         return
-    is_single = len(wanted.roles) == 1
+    is_single, is_empty = len(wanted.roles) == 1, True
     try:
         for key, members in groupby(read_tar(block.tar), lambda member: _key_of(member[0])):
             files: dict[str, Path] = {}
+            is_empty = False
             for member, data in members:
                 ending = PurePosixPath(member).name.partition(".")[2]
                 role, _, suffix = ending.rpartition(".")
@@ -400,6 +401,10 @@ def _samples(block: Block, wanted: Files, scratch: Path) -> Iterator[Sample]:
             yield Sample(key, there, reason)
     except InputError as error:
         yield Sample(PurePosixPath(block.tar).name, reason=str(error))
+    else:
+        if is_empty:
+            reason = f"{block.tar}: holds no file; pack inputs into it, or leave it out"
+            yield Sample(PurePosixPath(block.tar).name, reason=reason)
 
 
 def _key_of(member: str) -> str:
@@ -521,6 +526,9 @@ class Runner:
                 reasons = iter(self._function([one for one in chunk if not one.reason], results))
                 for one in chunk:
                     reason = one.reason or next(reasons)
+                    for path in one.files:
+                        if scratch in path.parents:  # of a copy the name alone says something
+                            reason = reason.replace(str(path), path.name)
                     files: dict[str, bytes] = {}
                     for ending in self._work.endings:
                         path = results / f"{one.name}.{ending}"

@@ -39,6 +39,7 @@ _UNREAD = re.compile(
     re.IGNORECASE,
 )
 """Suffixes of pictures that are not read: in a folder they are named."""
+_ARCHIVE = re.compile(r".*\.(tar|tar\.\w+|tgz|zip|7z|rar|gz|bz2|xz|zst)", re.IGNORECASE)
 FAST_PNG = {"compress_level": 1}
 """Four times faster than zlib's usual 6 and a third larger at most: at 6, writing the pictures of
 an estimate took as long as the estimate."""
@@ -219,7 +220,7 @@ def list_images(path: AnyPath) -> list[Path]:
     """
     wanted = Path(path)
     try:
-        if wanted.is_file():
+        if wanted.is_file() and not _ARCHIVE.fullmatch(wanted.name):
             return [wanted]
         if wanted.is_dir():
             files = list(wanted.iterdir())
@@ -237,10 +238,10 @@ def list_images(path: AnyPath) -> list[Path]:
         said = f"{path}: {len(unread)} files are left out, {min(unread)} first: save them as PNG"
         warnings.warn(said, Notice, stacklevel=2)
     if not pictures:
-        raise InputError(
-            f"{path}: no {', '.join(LISTED_SUFFIXES)} file there; "
-            "give a picture, a folder of pictures or a pattern such as 'left/*.png'"
-        )
+        remedy = "give a picture, a folder of pictures or a pattern such as 'left/*.png'"
+        if any(_ARCHIVE.fullmatch(p.name) for p in files):
+            remedy = "unpack the archive (with --engine ray, .tar and .tar.gz are read)"
+        raise InputError(f"{path}: no {', '.join(LISTED_SUFFIXES)} file there; {remedy}")
     return pictures
 
 
