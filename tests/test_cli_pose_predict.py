@@ -287,7 +287,7 @@ def test_masks_of_a_data_set_are_refused_beside_a_depth_image(
 ) -> None:
     words = ["pose", "predict", *frames(tmp_path), "--weights", str(weights), "--masks", "m.png"]
     assert main([*words, "--out", str(tmp_path / "out")]) == 2
-    assert "--split, --masks and --targets are of a data set" in capsys.readouterr().err
+    assert "--masks: has no effect here; --bop names no data set" in capsys.readouterr().err
 
 
 def test_a_search_without_masks_registers_nothing(

@@ -33,7 +33,7 @@ from depthpose.pose.predictions import (
     read_predictions,
     score_of,
 )
-from depthpose.pose.types import POSED, ObjectModel
+from depthpose.pose.types import POSED, ObjectModel, PoseEstimate
 
 Number = float | None
 
@@ -215,10 +215,10 @@ def object_row(name: str, rows: Sequence[InstanceRow]) -> ObjectRow:
     )
 
 
-def _mean_row(rows: Sequence[ObjectRow]) -> ObjectRow:
+def mean_row(rows: Sequence[ObjectRow]) -> ObjectRow:
     """Average the rows of objects: each object counts the same, as in LineMOD's tables."""
-    scores = {name: [row.scores[name] for row in rows] for name in rows[0].scores}
     count = len(rows)
+    scores = {name: [row.scores[name] for row in rows] for name in rows[0].scores}
     return ObjectRow(
         object="mean",
         instances=sum(row.instances for row in rows),
@@ -443,29 +443,10 @@ def evaluate(
     # In the order of work; what a method of its own calls otherwise comes last.
     seen = dict.fromkeys(stage for p in predictions for stage in p.estimate.seconds)
     stages = [s for s in STAGES if s in seen] + [s for s in seen if s not in STAGES]
-    rows: list[InstanceRow] = []
-    for one in progress(dataset.instances):
-        estimate, context = found.get(one.name), contexts[one.object_id]
-        pose = None if estimate is None else estimate.camera_from_model
-        errors = measure(pose, one, context)
-        seconds = {} if estimate is None else estimate.seconds
-        ms = {stage: 1000 * seconds[stage] if stage in seconds else None for stage in stages}
-        rows.append(
-            InstanceRow(
-                instance=one.name,
-                object=context.model.name,
-                status="missing" if estimate is None else estimate.status,
-                is_success=float(errors["error_m"]) < SUCCESS_SHARE * context.diameter_m,
-                score=None if estimate is None or pose is None else score_of(estimate),
-                visible_fraction=one.visible_fraction,
-                truth="annotated" if one.is_measured else "fitted",
-                diameter_m=context.diameter_m,
-                metric="ADD-S" if context.is_adds else "ADD",
-                errors=errors,
-                ms={**ms, "total": 1000 * sum(seconds.values()) if seconds else None},
-                reason="" if estimate is None else estimate.reason,
-            )
-        )
+    rows = [
+        _instance_row(one, found.get(one.name), contexts[one.object_id], stages)
+        for one in progress(dataset.instances)
+    ]
     conditions = Conditions(
         diameters=config.diameters,
         frames=f"{dataset.folder.resolve().name} {dataset.split}",
@@ -478,10 +459,33 @@ def evaluate(
         row = object_row(context.model.name, own)
         summed.append(replace(row, metric=own[0].metric, diameter_m=context.diameter_m))
     if len(summed) > 1:
-        summed += [_mean_row(summed), object_row("all", rows)]
+        summed += [mean_row(summed), object_row("all", rows)]
     return Evaluation(
         rows=[replace(row, conditions=conditions) for row in summed],
         per_instance=rows,
         risk=[replace(row, conditions=conditions) for row in risk_rows(rows)],
         advice=convention_advice(dataset, predictions, contexts, SUCCESS_SHARE),
+    )
+
+
+def _instance_row(
+    instance: Instance, estimate: PoseEstimate | None, context: ErrorContext, stages: list[str]
+) -> InstanceRow:
+    pose = None if estimate is None else estimate.camera_from_model
+    errors = measure(pose, instance, context)
+    seconds = {} if estimate is None else estimate.seconds
+    ms = {stage: 1000 * seconds[stage] if stage in seconds else None for stage in stages}
+    return InstanceRow(
+        instance=instance.name,
+        object=context.model.name,
+        status="missing" if estimate is None else estimate.status,
+        is_success=float(errors["error_m"]) < SUCCESS_SHARE * context.diameter_m,
+        score=None if estimate is None or pose is None else score_of(estimate),
+        visible_fraction=instance.visible_fraction,
+        truth="annotated" if instance.is_measured else "fitted",
+        diameter_m=context.diameter_m,
+        metric="ADD-S" if context.is_adds else "ADD",
+        errors=errors,
+        ms={**ms, "total": 1000 * sum(seconds.values()) if seconds else None},
+        reason="" if estimate is None else estimate.reason,
     )
