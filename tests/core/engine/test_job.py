@@ -12,9 +12,9 @@ from tests.core.engine.doubles import InProcessEngine, ReverseWork, unpacked, wr
 
 from depthpose.core.engine import (
     Done,
+    Inputs,
     Job,
     find_items,
-    first_sample,
     read_results,
     result_items,
     run_job,
@@ -306,6 +306,6 @@ def test_an_empty_tar_is_named_and_the_others_are_done(tmp_path: Path) -> None:
     assert other.entries == (("1", ""),)
     with (
         pytest.raises(InputError, match="holds no file"),
-        first_sample([], [str(empty)], job.work.files),
+        Inputs(items=[], tars=[str(empty)], files=job.work.files).first(),
     ):
         pass
