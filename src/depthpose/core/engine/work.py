@@ -375,7 +375,8 @@ def _samples(block: Block, wanted: Files, scratch: Path) -> Iterator[Sample]:
         yield sample
     if block.tar is None:
         return
-    is_single, is_empty = len(wanted.roles) == 1, True
+    is_single = len(wanted.roles) == 1
+    is_empty = True
     try:
         for key, members in groupby(read_tar(block.tar), lambda member: _key_of(member[0])):
             files: dict[str, Path] = {}

@@ -39,7 +39,8 @@ _UNREAD = re.compile(
     re.IGNORECASE,
 )
 """Suffixes of pictures that are not read: in a folder they are named."""
-_ARCHIVE = re.compile(r".*\.(tar|tar\.\w+|tgz|zip|7z|rar|gz|bz2|xz|zst)", re.IGNORECASE)
+_ARCHIVES = (".tar", ".tgz", ".gz", ".bz2", ".xz", ".zst", ".lz4", ".zip", ".7z", ".rar")
+"""Suffixes of archives, which are no pictures whatever they hold."""
 FAST_PNG = {"compress_level": 1}
 """Four times faster than zlib's usual 6 and a third larger at most: at 6, writing the pictures of
 an estimate took as long as the estimate."""
@@ -220,7 +221,7 @@ def list_images(path: AnyPath) -> list[Path]:
     """
     wanted = Path(path)
     try:
-        if wanted.is_file() and not _ARCHIVE.fullmatch(wanted.name):
+        if wanted.is_file() and wanted.suffix.lower() not in _ARCHIVES:
             return [wanted]
         if wanted.is_dir():
             files = list(wanted.iterdir())
@@ -239,7 +240,7 @@ def list_images(path: AnyPath) -> list[Path]:
         warnings.warn(said, Notice, stacklevel=2)
     if not pictures:
         remedy = "give a picture, a folder of pictures or a pattern such as 'left/*.png'"
-        if any(_ARCHIVE.fullmatch(p.name) for p in files):
+        if any(p.suffix.lower() in _ARCHIVES for p in files):
             remedy = "unpack the archive (with --engine ray, .tar and .tar.gz are read)"
         raise InputError(f"{path}: no {', '.join(LISTED_SUFFIXES)} file there; {remedy}")
     return pictures
