@@ -10,8 +10,8 @@ export DEPTHPOSE_DATA ?= $(wildcard $(CURDIR)/../shared/data)
 # Tests side by side, one thread each: threads of torch in every worker would fight for cores. Who
 # has none left takes some of another's; the slow ones share what a file sets up, and stay together.
 PYTEST := OMP_NUM_THREADS=1 $(BIN)/python -m pytest --numprocesses auto --maxprocesses 8
-# Shapes and types of every call, checked while tests run: slower, so the quick tests do without,
-# unless 'make test TYPES=1' (as .ci/run has it).
+# Shapes and types of every call, checked while tests run: slower, so only with TYPES=1, as .ci/run
+# has it for the quick tests. Most slow ones start commands, and in those processes nothing is checked.
 TYPES ?=
 CHECKED := --jaxtyping-packages=depthpose,beartype.beartype
 
@@ -43,7 +43,7 @@ test: $(READY)
 	$(PYTEST) --dist worksteal $(if $(TYPES),$(CHECKED))
 
 test-slow: $(READY)
-	$(PYTEST) --dist loadfile $(CHECKED) -m slow
+	$(PYTEST) --dist loadfile $(if $(TYPES),$(CHECKED)) -m slow
 
 check: $(READY)
 	$(BIN)/ruff format --check .

@@ -116,7 +116,7 @@ def test_help_lists_the_stages_and_sets_the_thesis_apart(
         (
             ["depth", "match", ".", ".", "--camera", ".", "--out", "o", "--matcher", "sgbm",
              "--weights", "default"],
-            "--weights default and --matcher sgbm: one of the two matches the pair",
+            "--weights: has no effect here; --matcher matches the pair",
         ),
         (["depth", "match", "l", "r", "--camera", "c.json", "--out", "o", "--matcher", "sgbm"],
          "l: there is no such file or folder"),
@@ -135,9 +135,9 @@ def test_help_lists_the_stages_and_sets_the_thesis_apart(
          "--cap -1: a distance in metres, above 0"),
         (["depth", "evaluate", "--data", ".", "--matcher", "sgbm", "--device", "cuda",
           "--out", "o"],
-         "are for networks, and none is measured; leave them out"),
+         "--device: has no effect here; no network is measured"),
         (["depth", "evaluate", "--data", ".", "--weights", "sgbm:default", "--precision",
-          "bf16", "--out", "o"], "--precision and --max-memory are for a matcher with weights"),
+          "bf16", "--out", "o"], "no matcher with weights runs"),
         (["weights", "list", "--folder", "nowhere"], "nowhere: there is no such file or folder"),
         (["data", "check", "x" * 300], "File name too long"),
     ],
@@ -248,7 +248,7 @@ def test_options_of_psmnet_are_refused_with_sgbm(
     pair_folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert match(pair_folder, tmp_path / "o", "--matcher", "sgbm", "--tile", "64", "64") == 2
-    assert "are for matchers with weights; sgbm takes none" in capsys.readouterr().err
+    assert "has no effect here; sgbm has no weights" in capsys.readouterr().err
     assert not (tmp_path / "o").exists()
 
 

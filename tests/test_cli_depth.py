@@ -172,7 +172,7 @@ def test_where_depth_comes_from_is_one_word(
     capsys.readouterr()
     other = ["--answer", "own", "--matcher", "sgbm", "--out", str(tmp_path / "x")]
     assert main(["depth", "predict", *words, *other]) == 2
-    assert "another matcher matches the synthesised view; omit one" in capsys.readouterr().err
+    assert "the depth is that of --matcher on the synthesised view" in capsys.readouterr().err
 
 
 def test_a_threshold_is_chosen_on_a_folder(
@@ -462,7 +462,10 @@ def test_one_image_of_another_camera_stops_no_other_of_its_batch(
     ("words", "message"),
     [
         ([], "0.png has none in its EXIF: give --camera FILE, --focal-px, or --fov"),
-        (["--focal-px", "70", "--fov", "90"], "--focal-px and --fov all give the focal length"),
+        (
+            ["--focal-px", "70", "--fov", "90"],
+            "--fov: has no effect here; --focal-px is the focal length",
+        ),
         (["--fov", "190"], "spans 1 to 170 degrees"),
         (["--fov", "90", "--known-distance", "1,2"], "write X,Y,METRES, such as 640,300,12.5"),
         (["--fov", "90", "--camera-height", "150"], "--camera-height 150: give 0.1 to 20 metres"),
@@ -470,7 +473,7 @@ def test_one_image_of_another_camera_stops_no_other_of_its_batch(
         (["--fov", "90", "--camera-tilt", "-8"], "give the height, or omit the tilt"),
         (
             ["--fov", "90", "--camera-height", "1.4", "--known-distance", "1,2,3"],
-            "both set the scale; omit one",
+            "--known-distance: has no effect here; --camera-height sets the scale",
         ),
         (["--focal-px", "0.5"], "not a focal length in pixels"),
         (["--focal-px", "70", "--color-range", "9", "3"], "near first"),

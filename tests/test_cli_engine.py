@@ -272,6 +272,7 @@ def test_clouds_have_the_poses_of_the_plain_command(
         assert {**row, "seconds": 0} == {**wanted[name], "seconds": 0}
 
 
+@pytest.mark.slow
 def test_a_cad_file_alone_is_registered_by_workers_too(
     tmp_path: Path, double: InProcessEngine
 ) -> None:
@@ -291,7 +292,7 @@ def test_a_cad_file_alone_is_registered_by_workers_too(
 @pytest.mark.parametrize(
     ("words", "said"),
     [
-        (["--workers", "2"], "are for --engine ray; add it"),
+        (["--workers", "2"], "--engine ray takes it, and is not given"),
         ([*RAY, "--block", "0"], "--block 0"),
         ([*RAY, "--worker-cpus", "0"], "needs a core or a GPU"),
     ],

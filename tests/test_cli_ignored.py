@@ -9,8 +9,8 @@ from pathlib import Path
 import pytest
 
 from depthpose.cli import main
-from depthpose.cli.arguments import refuse_ignored_options
 from depthpose.cli.depth_options import parse_bytes
+from depthpose.cli.rules import refuse_ignored_options
 from depthpose.cli.streams import Output, lasting_streams
 from depthpose.core.errors import InputError
 
@@ -23,12 +23,18 @@ IGNORED = [
     ("pose predict", "--hypotheses=64 --voting=least-squares", "--hypotheses"),
     ("pose predict", "--depth d.png --camera c.json --batch 4", "--batch"),
     ("pose predict", "--cloud c.ply --engine ray --view live", "--view"),
+    ("pose predict", "--cad p.stl --cloud c.ply", "--cad"),
+    ("pose predict", "--bop b --masks truth --mask m", "--mask"),
+    ("pose predict", "--depth d --mask m --camera c --masks truth", "--masks"),
     ("pose track", "--depth d --camera c --split test", "--split"),
     ("pose evaluate", "--bop b --csv a.csv --no-icp --masks truth", "--masks and --no-icp"),
     ("pose evaluate", "--bop b --weights register open3d --voting ransac", "--voting"),
     ("depth predict", "a.png --engine ray --view a.rrd", "--view"),
     ("depth predict", "a.png --answer own --max_memory 1GB", "--max_memory"),
+    ("depth predict", "a.png --camera c --focal-px 7 --fov 9", "--focal-px and --fov"),
+    ("depth predict", "a.png --block 8 --workers 2", "--workers and --block"),
     ("depth match", "l r --engine ray --worker-gpus 1", "--worker-gpus"),
+    ("depth match", "l r --matcher sgbm --left-right-check", "--left-right-check"),
     ("depth evaluate", "--weights a --holes leave", "--holes"),
     ("depth evaluate", "--weights a --train t", "--train"),
     ("depth evaluate", "--baseline rows --train-without a", "--train-without"),
@@ -45,6 +51,7 @@ USED = [
     ("pose evaluate", "--bop b --weights register parts --voting ransac --no-icp"),
     ("depth predict", "a.png --engine ray --worker-gpus 0.5 --device cuda:1"),
     ("depth predict", "a.png --view live"),
+    ("pose predict", "--depth d.csv --camera c --engine ray --batch 4"),
     ("depth evaluate", "--matcher sgbm --holes leave --baseline rows --train t"),
     ("depth evaluate", "--weights quick:a b --speed fine --protocol eigen-raw --cap 50"),
     ("reproduce all", "--kitti k --split all"),

@@ -178,7 +178,7 @@ def _search_again(words: list[str], out: Path, capsys: pytest.CaptureFixture[str
     assert "two depth images are called 'wall' and 'wall_1'" in capsys.readouterr().err
     (depth / "wall_1.png").unlink()
     assert main([*words, str(out), "--view", "x.rrd"]) == 2
-    assert "--view shows inputs that have a mask" in capsys.readouterr().err
+    assert "--view: has no effect here; an image without --mask" in capsys.readouterr().err
 
 
 def test_results_never_take_the_place_of_inputs(
@@ -287,7 +287,7 @@ def test_masks_of_a_data_set_are_refused_beside_a_depth_image(
 ) -> None:
     words = ["pose", "predict", *frames(tmp_path), "--weights", str(weights), "--masks", "m.png"]
     assert main([*words, "--out", str(tmp_path / "out")]) == 2
-    assert "--split, --masks and --targets are of a data set" in capsys.readouterr().err
+    assert "--masks: has no effect here; --bop names no data set" in capsys.readouterr().err
 
 
 def test_a_search_without_masks_registers_nothing(
@@ -296,7 +296,7 @@ def test_a_search_without_masks_registers_nothing(
     depth, _, *rest = frames(tmp_path)[1:]
     words = ["--depth", depth, *rest[1:], "--weights", str(weights), "--register-refused"]
     assert main(["pose", "predict", *words, "--out", str(tmp_path / "out")]) == 2
-    assert "--register-refused: without a mask the object is searched for" in (
+    assert "--register-refused: has no effect here; an image without --mask" in (
         capsys.readouterr().err
     )
 
@@ -467,13 +467,22 @@ def test_two_processes_share_the_work(
         (["--cloud", "."], "the weights know bracket, bottle; say which by --object"),
         (["--cloud", ".", "--object", "bracke"], "did you mean 'bracket'?"),
         (["--depth", ".", "--object", "bottle"], "--depth needs --camera or --focal-px beside it"),
-        (["--depth", ".", "--camera", ".", "--focal-px", "9"], "--camera and --focal-px are both"),
-        (["--cloud", ".", "--focal-px", "9"], "leave --focal-px out"),
-        (["--bop", ".", "--focal-px", "9"], "--focal-px beside --bop: a data set says its cameras"),
+        (
+            ["--depth", ".", "--camera", ".", "--focal-px", "9"],
+            "--focal-px: has no effect here; --camera has the focal length",
+        ),
+        (["--cloud", ".", "--focal-px", "9"], "Leave --focal-px out"),
+        (
+            ["--bop", ".", "--focal-px", "9"],
+            "--focal-px: has no effect here; a data set says its cameras",
+        ),
         (["--cloud", ".", "--object", "bottle"], "no .ply, .pcd, .npy, .xyz, .txt file there"),
         (["--cloud", ".", "--object", "bottle", "--batch", "0"], "--batch 0: at least 1 input"),
-        (["--cloud", ".", "--mask", ".", "--camera", "."], "leave --mask and --camera out"),
-        (["--bop", ".", "--mask", ".", "--unit", "m"], "--mask and --unit beside --bop: a data"),
+        (["--cloud", ".", "--mask", ".", "--camera", "."], "Leave --mask and --camera out"),
+        (
+            ["--bop", ".", "--mask", ".", "--unit", "m"],
+            "--mask and --unit: has no effect here; a data",
+        ),
     ],
 )
 def test_what_cannot_be_predicted_is_refused(

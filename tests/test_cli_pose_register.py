@@ -123,8 +123,8 @@ def test_a_cad_file_is_followed_through_frames(
         ("--method register --cloud scan.ply", "give --cad part.stl --unit mm, or --bop"),
         ("--method register --cad connector.stl --cloud scan.ply", "give --unit mm"),
         ("--cad connector.stl --unit mm --cloud scan.ply", "add --method register"),
-        ("--method register --cad connector.stl --bop .", "leave --cad out"),
-        ("--cad-unit mm --cloud scan.ply", "no CAD file is given; leave it out"),
+        ("--method register --cad connector.stl --bop .", "Leave --cad out"),
+        ("--cad-unit mm --cloud scan.ply", "no CAD file is given. Leave --cad-unit out"),
         ("--method register --cad scan.txt --unit mm --cloud scan.ply", "triangles, such as STL"),
     ],
 )  # fmt: skip

@@ -133,12 +133,13 @@ def test_table_3_3_votes_on_frames_and_on_synthetic_views(
     ("words", "message"),
     [
         (["--objects", "flange", "--split", "foo"],
-         "--objects flange and --split foo: chooses from a data set, and none is named"),
+         "--objects and --split: has no effect here; it chooses from a data set"),
         (["--points", "-5"], "--points -5: give 1 or more, such as 500"),
         (["--points", "60", "60"], "--points 60 is given twice"),
         (["--points"], "--points without a value"),
         (["--synthetic", "0"], "--synthetic 0: give 1 or more, such as 40"),
-        (["--synthetic", "2", "--bop", "."], "rendered where no data set is given, and . is"),
+        (["--synthetic", "2", "--bop", "."],
+             "rendered where no data set is given. Leave --synthetic out"),
     ],
 )  # fmt: skip
 def test_options_of_table_3_3_are_never_ignored(

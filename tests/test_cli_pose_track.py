@@ -155,9 +155,9 @@ def test_the_objects_of_a_scene_are_followed(weights: Path, tmp_path: Path, word
         ([], "give one of --depth with --camera, --cloud and --bop"),
         (["--depth", ".", "--cloud", "."], "give one of --depth with --camera"),
         (["--depth", "."], "--depth needs --camera beside it"),
-        (["--bop", ".", "--camera", ".", "--unit", "m"], "leave --camera and --unit out"),
-        (["--bop", ".", "--first", "."], "--first beside --bop"),
-        (["--cloud", ".", "--camera", "."], "--camera beside --cloud: a cloud is of"),
+        (["--bop", ".", "--camera", ".", "--unit", "m"], "Leave --camera and --unit out"),
+        (["--bop", ".", "--first", "."], "--first: has no effect here"),
+        (["--cloud", ".", "--camera", "."], "--camera: has no effect here; a cloud is of"),
     ],
 )
 def test_wrong_words_are_refused(

@@ -1,6 +1,7 @@
 """``data rectify``, as a user runs it, on synthetic pairs whose cameras and depth are known."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -229,3 +230,22 @@ def test_keep_out_of_range_is_refused(drawn: DrawnPair) -> None:
     assert drawn.pair.size is not None
     with pytest.raises(InputError, match=r"--keep 2: 0 keeps what both lenses show"):
         make_rectifier(drawn.pair, drawn.pair.size, 2.0)
+
+
+def test_distortion_that_no_lens_has_is_refused(drawn: DrawnPair) -> None:
+    assert drawn.pair.size is not None
+    bent = replace(drawn.pair.left, distortion=(50.0, 200.0, 0.0, 0.0), is_fisheye=False)
+    pair = replace(drawn.pair, left=bent, right=bent)
+    with pytest.raises(InputError, match="so much no lens bends; check the distortion"):
+        make_rectifier(pair, drawn.pair.size, 0.0)
+
+
+def test_a_mirrored_right_view_has_no_common_difference(
+    home: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    right = read_image(home / "raw/right.png")
+    write_image(home / "raw/right.png", right.flip(1))
+    assert rectify(home) == 2
+    said = capsys.readouterr().err
+    assert "nan" not in said
+    assert "this is not the calibration of these images" in said

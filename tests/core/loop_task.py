@@ -1,6 +1,5 @@
-"""A small adversarial task for tests of the loop; also a program, to be killed and launched."""
+"""A small adversarial task for tests of the loop."""
 
-import sys
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -73,17 +72,24 @@ def write_slowly(path: Path, data: bytes) -> None:
         time.sleep(60)
 
 
-if __name__ == "__main__":
-    folder, steps, accumulate, pause_s = Path(sys.argv[1]), *map(float, sys.argv[2:5])
+def train_toy(
+    folder: Path,
+    steps: int,
+    *,
+    accumulate: int = 1,
+    pause_s: float = 0.0,
+    workers: int = 0,
+    with_slow_disk: bool = False,
+) -> None:
+    """Train, or go on: for processes to be killed and launched."""
     config = LoopConfig(
-        steps=int(steps),
+        steps=steps,
         batch_size=4,
-        accumulate=int(accumulate),
+        accumulate=accumulate,
         save_every_steps=3,
-        workers=int((sys.argv[5:] or ["0"])[0]),
+        workers=workers,
         device="cpu",
     )
-    if sys.argv[6:] == ["slow disk"]:
+    if with_slow_disk:
         Path.write_bytes = write_slowly  # pyright: ignore[reportAttributeAccessIssue]
-    toy = ToyTask(pause_s)
-    Run(folder=folder, resume=True).train(toy, ToySamples(), config)
+    Run(folder=folder, resume=True).train(ToyTask(pause_s), ToySamples(), config)

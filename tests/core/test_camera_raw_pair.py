@@ -174,5 +174,5 @@ def test_a_camchain_given_for_a_rectified_camera_names_the_command(tmp_path: Pat
 
 def test_two_camera_info_of_single_cameras_are_no_pair(tmp_path: Path, drawn: DrawnPair) -> None:
     folder = write_ros(tmp_path / "calibration", drawn, 0.0)
-    with pytest.raises(InputError, match=r"Tx / fx 0 and -?0, .*calibrate as a pair"):
+    with pytest.raises(InputError, match=r"Tx 0 and -?0, .*calibrate them as a pair"):
         read_raw_pair(folder)

@@ -235,3 +235,11 @@ def test_text_that_cannot_be_understood_is_named(tmp_path: Path, text: str, said
     (tmp_path / "x.xyz").write_text(text)
     with pytest.raises(InputError, match=said):
         read_cloud(tmp_path / "x.xyz")
+
+
+def test_a_signalling_nan_is_read_without_a_warning(tmp_path: Path) -> None:
+    """One that the long fuzz of readers found: NumPy rounds it with a warning."""
+    table = np.ones((4, 3), np.float32)
+    table.view(np.uint32)[2, 0] = 0x7FA00000
+    np.save(tmp_path / "x.npy", table)
+    assert read_cloud(tmp_path / "x.npy").points[:, 1].eq(1).all()

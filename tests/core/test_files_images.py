@@ -271,3 +271,11 @@ def test_partners_share_a_name_or_a_number(first: str, second: str, places: list
 def test_files_without_a_partner_are_named(first: str, second: str, lone: str) -> None:
     with pytest.raises(InputError, match=re.escape(f"number is there for {lone}; remove these")):
         find_partners(first.split(), second.split(), "two folders")
+
+
+@pytest.mark.parametrize("name", ["frames.tar", "frames.TGZ", "frames.tar.xz", "frames.zip"])
+def test_an_archive_is_named_for_what_it_is(tmp_path: Path, name: str) -> None:
+    file = tmp_path / name
+    file.write_bytes(b"PK")
+    with pytest.raises(InputError, match="unpack the archive"):
+        list_images(file)

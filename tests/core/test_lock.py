@@ -2,14 +2,14 @@
 
 import errno
 import os
-import subprocess
-import sys
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
+from multiprocessing.process import BaseProcess
 from pathlib import Path
 
 import pytest
+from tests.core.forked import hold, start
 from tests.core.loop_task import ToySamples, ToyTask
 
 from depthpose.core.errors import InputError
@@ -24,32 +24,25 @@ from depthpose.core.run import (
     write_once,
 )
 
-HOLDER = """
-import sys, time
-from pathlib import Path
-from depthpose.core.run import claim_folder
-for a in sys.argv[3:] or [1]:
-    claim_folder(Path(sys.argv[1]), {"a": int(a)})
-print("held", flush=True)
-time.sleep(float(sys.argv[2]))
-"""
-
 
 @contextmanager
 def holder(
     folder: Path, seconds: int, settings: str = "1", **environment: str
-) -> Iterator["subprocess.Popen[str]"]:
+) -> Iterator[BaseProcess]:
     """Start a process that claims a folder, and wait until it has."""
-    words = [sys.executable, "-c", HOLDER, str(folder), str(seconds), *settings]
-    own = {**os.environ, **environment}
-    with subprocess.Popen(words, stdout=subprocess.PIPE, text=True, env=own) as process:
-        assert process.stdout is not None
-        assert process.stdout.readline() == "held\n"
-        try:
-            yield process
-        finally:
-            process.kill()
-            release_folders()
+    said = folder.parent / f"{folder.name}.said"
+    process = start(hold, folder, seconds, settings, said=said, environment=environment)
+    deadline = time.monotonic() + 60
+    while not (said.exists() and said.read_text().endswith("held\n")):
+        assert process.is_alive() or seconds == 0, said.read_text()
+        assert time.monotonic() < deadline
+        time.sleep(0.01)
+    try:
+        yield process
+    finally:
+        process.kill()
+        process.join()
+        release_folders()
 
 
 def test_a_second_command_is_refused_until_the_first_is_gone(tmp_path: Path) -> None:
@@ -64,7 +57,8 @@ def test_a_second_command_waits_for_one_that_ends(tmp_path: Path) -> None:
     with holder(tmp_path, 1) as process:
         began = time.monotonic()
         lock_folder(tmp_path / RECORD, is_shared=False, timeout_s=60.0)
-        assert process.wait() == 0
+        process.join()
+        assert process.exitcode == 0
         assert time.monotonic() - began < 60
 
 
@@ -85,7 +79,8 @@ def test_a_folder_that_is_let_go_is_free(tmp_path: Path) -> None:
     claim_folder(tmp_path, {"a": 1})
     release_folders()
     with holder(tmp_path, 0) as process:
-        assert process.wait() == 0
+        process.join()
+        assert process.exitcode == 0
 
 
 def test_a_training_lets_its_folder_go(tmp_path: Path) -> None:
@@ -102,7 +97,8 @@ def test_a_training_lets_its_folder_go(tmp_path: Path) -> None:
     stage(config, Run(folder=tmp_path.resolve()))
     assert not held_folders()
     with holder(tmp_path, 0) as process:
-        assert process.wait() == 0
+        process.join()
+        assert process.exitcode == 0
 
 
 @pytest.mark.parametrize("settings", ["11", "01", "011", "010"])

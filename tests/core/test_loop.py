@@ -2,18 +2,19 @@ import json
 import os
 import random
 import signal
-import subprocess
-import sys
+import socket
 import time
 from collections.abc import Callable
 from dataclasses import replace
+from multiprocessing.process import BaseProcess
 from pathlib import Path
 from typing import Any
 
 import pytest
 import torch
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
-from tests.core.loop_task import ToySamples, ToyTask, weights
+from tests.core.forked import start
+from tests.core.loop_task import ToySamples, ToyTask, train_toy, weights
 from torch import Tensor
 
 from depthpose.core.devices import PrecisionNotice, computes_bf16
@@ -33,8 +34,6 @@ from depthpose.core.loop import (
     write_card,
 )
 from depthpose.core.loop.loop import Precision
-
-PROGRAM = Path(__file__).with_name("loop_task.py")
 
 
 def loop(**changes: object) -> LoopConfig:
@@ -570,21 +569,11 @@ def test_bad_settings_of_adam_are_refused(changes: dict[str, object], message: s
         AdamConfig(**changes)  # pyright: ignore[reportArgumentType]
 
 
-def program(folder: Path, steps: int, accumulate: int, pause_s: float = 0.0) -> list[str]:
-    return [str(PROGRAM), str(folder), str(steps), str(accumulate), str(pause_s)]
-
-
-def environment() -> dict[str, str]:
-    return {**os.environ, "PYTHONPATH": str(PROGRAM.parents[2]), "OMP_NUM_THREADS": "1"}
-
-
 def test_two_processes_equal_one_that_accumulates(tmp_path: Path) -> None:
     """Weights agree to float32 rounding; batch norm statistics are each process's own."""
     one, two = tmp_path / "one", tmp_path / "two"
-    launch = ["-m", "torch.distributed.run", "--standalone", "--nproc_per_node", "2"]
-    for folder, words in ((one, program(one, 6, 2)), (two, [*launch, *program(two, 6, 1)])):
-        folder.mkdir()
-        _launch([sys.executable, *words])
+    train_toy(one, 6, accumulate=2)
+    _launch(two)
     states = [torch.load(f / "state.pt", weights_only=True)["modules"] for f in (one, two)]
     for network in states[0]:
         for name, tensor in states[0][network].items():
@@ -598,27 +587,40 @@ def test_two_processes_equal_one_that_accumulates(tmp_path: Path) -> None:
         torch.testing.assert_close(*moments, rtol=1e-4, atol=1e-6)
 
 
-def _launch(words: list[str]) -> None:
-    """Run a training; once more where a busy machine missed the rendezvous of its processes."""
+def _launch(folder: Path) -> None:
+    """Train in two processes; once more where a busy machine missed their rendezvous."""
     for attempt in range(2):
-        done = subprocess.run(words, env=environment(), capture_output=True, check=False)
-        if done.returncode == 0:
+        with socket.socket() as free:
+            free.bind(("127.0.0.1", 0))
+            port = free.getsockname()[1]
+        launch = {"WORLD_SIZE": "2", "MASTER_ADDR": "127.0.0.1", "MASTER_PORT": str(port)}
+        said = [folder.with_name(f"{attempt}-{rank}.said") for rank in range(2)]
+        both = [
+            start(train_toy, folder, 6, said=said[rank],
+                  environment={**launch, "RANK": str(rank), "LOCAL_RANK": str(rank)})
+            for rank in range(2)
+        ]  # fmt: skip
+        for process in both:
+            process.join(120)
+            process.kill()
+            process.join()
+        if [process.exitcode for process in both] == [0, 0]:
             return
-        assert attempt == 0, done.stderr.decode()[-3000:]
+        assert attempt == 0, [path.read_text()[-3000:] for path in said]
 
 
 def test_a_signal_to_the_whole_job_saves_the_state(tmp_path: Path) -> None:
     """Schedulers signal every process of a job, the workers that make samples too."""
-    words = [sys.executable, *program(tmp_path, 4000, 1, 0.05), "2"]
-    process = subprocess.Popen(
-        words, env=environment(), stderr=subprocess.PIPE, start_new_session=True
-    )
-    _wait_for_progress(tmp_path, process)
+    folder, file = tmp_path / "run", tmp_path / "said"
+    process = start(train_toy, folder, 4000, pause_s=0.05, workers=2, said=file)
+    _wait_for_progress(folder, process)
+    assert process.pid is not None
     os.killpg(process.pid, signal.SIGTERM)
-    _, said = process.communicate(timeout=60)
-    assert b"stopped after step" in said, said.decode()[-2000:]
-    step = torch.load(tmp_path / "state.pt", weights_only=True)["step"]
-    assert f"stopped after step {step} ".encode() in said
+    process.join(60)
+    said = file.read_text()
+    assert "stopped after step" in said, said[-2000:]
+    step = torch.load(folder / "state.pt", weights_only=True)["step"]
+    assert f"stopped after step {step} " in said
 
 
 def test_a_kill_while_the_state_is_written_leaves_no_half_file(tmp_path: Path) -> None:
@@ -626,13 +628,12 @@ def test_a_kill_while_the_state_is_written_leaves_no_half_file(tmp_path: Path) -
     trained(whole, loop())
     interrupted(killed, loop(), after=5)
     before = (killed / "state.pt").read_bytes()
-    words = [sys.executable, *program(killed, 12, 1), "0", "slow disk"]
-    process = subprocess.Popen(words, env=environment(), stderr=subprocess.DEVNULL)
+    process = start(train_toy, killed, 12, with_slow_disk=True, said=tmp_path / "said")
     deadline = time.monotonic() + 120
     while not list(killed.glob(".part-*.pt")) and time.monotonic() < deadline:
         time.sleep(0.02)
     process.kill()
-    process.wait()
+    process.join()
     assert list(killed.glob(".part-*.pt"))
     assert (killed / "state.pt").read_bytes() == before
     trained(killed, loop(), resume=True)
@@ -643,40 +644,31 @@ def test_a_kill_while_the_state_is_written_leaves_no_half_file(tmp_path: Path) -
 @pytest.mark.slow
 def test_eight_kills_change_nothing(tmp_path: Path) -> None:
     whole, killed = tmp_path / "whole", tmp_path / "killed"
-    for folder in (whole, killed):
-        folder.mkdir()
     steps = 400
-    subprocess.run(
-        [sys.executable, *program(whole, steps, 1)], check=True, env=environment(),
-        capture_output=True,
-    )  # fmt: skip
+    train_toy(whole, steps)
     moments, kills = random.Random(0), 0
     while kills < 8:
-        words = [sys.executable, *program(killed, steps, 1, 0.1)]
-        process = subprocess.Popen(words, env=environment(), stderr=subprocess.DEVNULL)
+        process = start(train_toy, killed, steps, pause_s=0.1, said=tmp_path / "said")
         _wait_for_progress(killed, process)
         time.sleep(moments.uniform(0.0, 1.0))
         process.kill()
-        process.wait()
+        process.join()
         kills += 1
         state = killed / "state.pt"
         reached = torch.load(state, weights_only=True)["step"]
         last = max((row["step"] for row in read_metrics(killed)), default=0)
         assert last - 3 <= reached <= steps  # what is lost is what came after the last save
-    subprocess.run(
-        [sys.executable, *program(killed, steps, 1)], check=True, env=environment(),
-        capture_output=True,
-    )  # fmt: skip
+    train_toy(killed, steps)
     assert_same_state(whole, killed)
     assert not list(killed.glob(".part-*"))
 
 
-def _wait_for_progress(folder: Path, process: subprocess.Popen[bytes]) -> None:
+def _wait_for_progress(folder: Path, process: BaseProcess) -> None:
     """Let the process load and begin, so that the kill meets training, not importing."""
     state = folder / "state.pt"
     before = state.stat().st_mtime_ns if state.exists() else 0
     deadline = time.monotonic() + 60
-    while time.monotonic() < deadline and process.poll() is None:
+    while time.monotonic() < deadline and process.is_alive():
         if state.exists() and state.stat().st_mtime_ns != before:
             return
         time.sleep(0.02)

@@ -190,7 +190,7 @@ def test_a_frame_without_depth_is_refused_before_anything_is_written(
     ("words", "said"),
     [
         (["--scale", "0"], "--scale 0: units per metre must be positive"),
-        (["--images", "."], "--images . is for --format colmap"),
+        (["--images", "."], "--images: has no effect here; it is for --format colmap"),
     ],
 )
 def test_options_that_make_no_sense_are_refused(

@@ -158,6 +158,7 @@ def test_the_sizeless_network_is_the_network(align_corners: bool) -> None:
     assert 0 <= confidence.min() <= confidence.max() <= 1
 
 
+@pytest.mark.slow
 def test_depth_from_one_image_is_the_estimators_at_every_size(exported: Path) -> None:
     record = json.loads((exported / "depth.proof.json").read_text())
     found = {(row["input"], row["output"]): row for row in record["differences"]}
@@ -249,6 +250,7 @@ def test_another_sky_is_no_proof(selection: Path) -> None:
     assert not (selection / "depth.onnx").exists()
 
 
+@pytest.mark.slow
 def test_inference_without_torch_as_the_documentation_says(exported: Path) -> None:
     infer_as_documented(exported, least_px=1.0)
 

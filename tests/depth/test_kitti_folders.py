@@ -500,12 +500,18 @@ def test_no_bytes_let_another_error_escape(tmp_path: Path, noise: bytes) -> None
         ("kitti_object", 12, {"right views": 12, "LiDAR scans": 3, "depth maps": 7}),
         ("kitti_2015", 1, {"right views": 1, "disparity maps": 1}),
         ("middlebury/2014_trainingQ", 1, {"disparity maps": 1}),
-        ("street_pairs/kitti2015_eval_drives", 25, {"disparity maps": 25, "depth maps": 25}),
-        ("street_pairs/kitti_object_more", 15, {"calibrations": 15, "depth maps": 15}),
+        pytest.param(
+            "street_pairs/kitti2015_eval_drives", 25, {"disparity maps": 25, "depth maps": 25},
+            marks=pytest.mark.slow,
+        ),
+        pytest.param(
+            "street_pairs/kitti_object_more", 15, {"calibrations": 15, "depth maps": 15},
+            marks=pytest.mark.slow,
+        ),
         ("street_pairs/kitti_raw_0056", 4, {"right views": 4}),
         ("street_pairs/kitti_single", 3, {"calibrations": 3}),
     ],
-)
+)  # fmt: skip
 def test_the_real_samples_pass_the_check(
     real: Path, folder: str, count: int, parts: dict[str, int]
 ) -> None:

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from tests.synthetic_street import make_street
 
 from depthpose.core.errors import InputError
 from depthpose.core.files import write_depth_png, write_disparity_png, write_image, write_map
@@ -224,3 +225,28 @@ def test_a_line_of_two_frames_or_of_none_is_refused(line: str, tmp_path: Path) -
 def test_a_split_name_too_long_for_the_disk_is_refused() -> None:
     with pytest.raises(InputError, match="no such file"):
         read_split("a" * 5000)
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        (lambda d: d, ""),
+        (lambda d: 2 * d, "0.5 times its disparities it agrees with"),
+        (lambda d: d / 16, "16 times its disparities it agrees with"),
+        (lambda d: d.flip(0), "upside down it agrees with"),
+        (lambda d: torch.full_like(d, 30.0), "matches between left and right: is it of this pair"),
+    ],
+    ids=["true", "twice", "sixteenth", "turned", "constant"],
+)
+def test_truth_that_the_pair_contradicts_is_named(
+    tmp_path: Path, change: Callable[[torch.Tensor], torch.Tensor], said: str
+) -> None:
+    street = make_street(0.5)
+    assert street.input.right is not None
+    assert street.truth.disparity_px is not None
+    write_image(tmp_path / "left/a.png", street.input.left)
+    write_image(tmp_path / "right/a.png", street.input.right)
+    write_disparity_png(tmp_path / "disp_occ/a.png", change(street.truth.disparity_px))
+    problems = [p.message for p in check_dataset(tmp_path).problems if p.kind == "mismatch"]
+    assert len(problems) == bool(said)
+    assert said in " ".join(problems)

@@ -16,12 +16,12 @@ from depthpose.depth.augment import TrainingPair
 from depthpose.depth.config import LightConfig, MatcherConfig
 from depthpose.depth.disparity import resized_match
 from depthpose.depth.estimator import FakestereoNet
-from depthpose.depth.estimator.rig import from_pair, join_matches
+from depthpose.depth.estimator.net import from_pair, join_matches
 from depthpose.depth.export import depth_export
 from depthpose.depth.labels import LabelConfig, label_pair
 from depthpose.depth.losses import sky_loss
 from depthpose.depth.predictions import read_sky, write_estimate
-from depthpose.depth.stereo import LightMatcher, LightStereo, StereoNetwork, normalise
+from depthpose.depth.stereo import LightMatcher, LightStereo, StereoNetwork, light, normalise
 from depthpose.depth.train import StereoTask
 from depthpose.depth.train.adapt import AdaptationCheck
 from depthpose.depth.train.config import StereoTraining
@@ -141,7 +141,7 @@ def test_what_is_surely_matched_is_not_the_sky(
     network = partly_sky().train(is_training)
     left, right = torch.randn(2, 2, 3, 64, 96, generator=torch.Generator().manual_seed(1)).unbind()
     for where, name, value in (
-        (network, "_confidence", confidence),
+        (light, "confidence_near", confidence),
         (network.sky, "forward", 0.97),
     ):
         monkeypatch.setattr(

@@ -10,7 +10,6 @@ from depthpose.cli import main
 from depthpose.core.errors import InputError
 from depthpose.depth.config import StreetsConfig
 from depthpose.depth.datasets import (
-    RawFrame,
     has_calibration,
     has_raw_frame,
     lidar_truth,
@@ -18,7 +17,7 @@ from depthpose.depth.datasets import (
     write_raw_frame,
 )
 from depthpose.depth.disparity import disparity_from_depth
-from depthpose.depth.synthetic import camera_from_velodyne, draw_street
+from depthpose.depth.synthetic import draw_street
 
 
 @pytest.fixture(scope="module")
@@ -73,17 +72,7 @@ def test_what_is_read_is_metric(synthetic: Path) -> None:
 
 def test_one_date_has_one_calibration(tmp_path: Path) -> None:
     drive = "2100_02_01_drive_0001_sync"
-    frame = draw_street(StreetsConfig(scale=0.05), 0)
-    raw = RawFrame(
-        left=frame.left,
-        right=frame.right,
-        rig=frame.rig,
-        disparity_px=frame.disparity_px,
-        occluded=frame.occluded,
-        is_sky=frame.is_sky,
-        points=None,
-        camera_from_velodyne=camera_from_velodyne(),
-    )
+    raw = draw_street(StreetsConfig(scale=0.05), 0)
     write_raw_frame(tmp_path, drive, 3, raw)
     other = replace(raw, rig=replace(raw.rig, baseline_m=0.6))
     with pytest.raises(InputError, match="another rig or scale"):

@@ -39,11 +39,12 @@ from depthpose.core.files import (
 from depthpose.core.loop import read_metrics
 from depthpose.core.run import claim_folder, claim_names, read_settings
 from depthpose.depth.config import GeneratorConfig, PSMNetConfig
-from depthpose.depth.datasets import RawFrame, open_dataset, read_split, write_raw_frame
+from depthpose.depth.datasets import open_dataset, read_split, write_raw_frame
 from depthpose.depth.datasets.frames import read_object_calibration, read_plain_calibration
 from depthpose.depth.stereo import PSMNet
 from depthpose.depth.synthesis import UNetGenerator
 from depthpose.depth.train import STAGES as DEPTH_STAGES
+from depthpose.depth.types import RawFrame
 from depthpose.depth.weights import read_depth_weights, write_depth_weights
 from depthpose.pose.datasets import open_bop, read_mask
 from depthpose.pose.datasets.layouts import read_yaml
@@ -412,7 +413,7 @@ def _kitti() -> dict[str, Kind]:
     frame = RawFrame(
         left=image, right=image, rig=rig, disparity_px=torch.full((24, 64), 5.0),
         occluded=torch.zeros(24, 64, dtype=torch.bool),
-        is_sky=torch.zeros(24, 64, dtype=torch.bool), points=points,
+        is_sky=torch.zeros(24, 64, dtype=torch.bool), lidar_points=points,
         camera_from_velodyne=torch.tensor([[0.0, -1, 0, 0], [0, 0, -1, 0], [1, 0, 0, 0],
                                            [0, 0, 0, 1]], dtype=torch.float64).numpy(),
     )  # fmt: skip

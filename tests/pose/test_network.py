@@ -17,6 +17,7 @@ from depthpose.pose.network import (
     unfold_norms,
 )
 from depthpose.pose.sparse import Voxels
+from depthpose.pose.types import SeenPoints
 
 TINY = ResUNetConfig(
     classes=3, keypoints=4, first_kernel=3, encoder=(4, 6, 8, 10), decoder=(5, 6, 7, 8)
@@ -147,7 +148,13 @@ def test_one_class_alone_answers_as_among_all() -> None:
     for number in range(3):
         torch.testing.assert_close(network.forward_class(voxels, number), outputs[:, number])
     rows = torch.arange(len(outputs))
-    chosen = network.forward_classes(voxels, rows % 3)
+    seen = SeenPoints(
+        points_m=torch.zeros(len(rows), 3),
+        coordinates=surface(),
+        features=torch.ones(len(rows), 1),
+        class_of_point=rows % 3,
+    )
+    chosen = network.directions(seen)
     torch.testing.assert_close(chosen, outputs[rows, rows % 3])
     assert network.point_features(voxels).shape[1] == TINY.decoder[0]
 

@@ -223,9 +223,10 @@ def test_held_out_views_are_not_those_that_are_trained_on() -> None:
     held_out = HeldOut(models, _VIEWS, _CLOUD, HeldOutConfig(number=2))
     trained = TrainingClouds(models, _VIEWS, None, _CLOUD, 0)
     known = [trained[i].R for i in range(8)]
-    for cloud in held_out._of(0.3):
-        assert not any(torch.allclose(cloud.R, R) for R in known)
     numbers = held_out.look(ResUNet(_SMALL).eval()).numbers
+    assert len(held_out._clouds[0.3]) > 0
+    for cloud in held_out._clouds[0.3]:
+        assert not any(torch.allclose(cloud.R, R) for R in known)
     assert set(numbers) == {
         f"held_out/occluded_{o}/{m}_{k}"
         for o in (0, 30)

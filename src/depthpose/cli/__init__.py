@@ -189,7 +189,31 @@ def _run(words: list[str]) -> int:
     names = (" ".join(words[:length]) for length in (3, 2, 1))
     name = next((name for name in names if name in COMMANDS), None)
     if name is None:
-        return _explain(words)
+        asked_help = {"-h", "--help"} & set(words)
+        group = words[0] if words and not words[0].startswith("-") else ""
+        known = {name.partition(" ")[0] for name in COMMANDS}
+        if group and group not in known:
+            return _fail(f"error: no command {group!r}; {nearest_name(group, known)}")
+        inside = {name: what for name, (_, what) in COMMANDS.items() if name.startswith(group)}
+        verb = next((word for word in words[1:] if not word.startswith("-")), "")
+        if group and verb:
+            verbs = [name.partition(" ")[2] for name in inside]
+            instead = _REMOVED_COMMANDS.get(f"{group} {verb}", nearest_name(verb, verbs))
+            print(f"depthpose {group}: error: no command {verb!r}; {instead}", file=sys.stderr)
+            return 2
+        width = max(map(len, inside)) + 2
+        lines = [f"usage: depthpose {group or 'COMMAND'} ... [--help]", ""]
+        lines += [
+            "The 6-DoF pose of a known object from a depth sensor, and metric depth from images."
+        ]
+        parts = {"commands": False, "the tables and figures of the thesis": True}
+        for title, is_thesis in parts.items():
+            names = [n for n in inside if (n.partition(" ")[0] in _THESIS) == is_thesis]
+            if names:
+                lines += ["", f"{title}:", *(f"  {n:<{width}}{inside[n]}" for n in names)]
+        stream = sys.stdout if asked_help else sys.stderr
+        print("\n".join([*lines, "", _EXIT_CODES]), file=stream)
+        return 0 if asked_help else 2
     rest = words[len(name.split()) :]
     for word in rest:
         option = word.partition("=")[0]
@@ -197,7 +221,7 @@ def _run(words: list[str]) -> int:
             raise InputError(f"'depthpose {name}' has no {option} any more: {remedy}")
     import tyro
 
-    from depthpose.cli import arguments
+    from depthpose.cli import arguments, rules
 
     home, _, function = COMMANDS[name][0].partition(":")
     command: Callable[..., int] = getattr(import_module(f"depthpose.cli.{home}"), function)
@@ -212,35 +236,8 @@ def _run(words: list[str]) -> int:
         )
     except SystemExit as stop:  # tyro has printed help (0) or the wrong arguments (2)
         return int(stop.code or 0)
-    arguments.refuse_ignored_options(name, rest)
+    rules.refuse_ignored_options(name, rest)
     arguments.refuse_missing(command, given.arguments)
     code = command(*given.args, **given.kwargs)
     sys.stdout.flush()
     return code
-
-
-def _explain(words: list[str]) -> int:
-    """Print the commands of the group that was named, or refuse what is no command."""
-    asked_help = {"-h", "--help"} & set(words)
-    group = words[0] if words and not words[0].startswith("-") else ""
-    known = {name.partition(" ")[0] for name in COMMANDS}
-    if group and group not in known:
-        return _fail(f"error: no command {group!r}; {nearest_name(group, known)}")
-    inside = {name: what for name, (_, what) in COMMANDS.items() if name.startswith(group)}
-    verb = next((word for word in words[1:] if not word.startswith("-")), "")
-    if group and verb:
-        verbs = [name.partition(" ")[2] for name in inside]
-        instead = _REMOVED_COMMANDS.get(f"{group} {verb}", nearest_name(verb, verbs))
-        print(f"depthpose {group}: error: no command {verb!r}; {instead}", file=sys.stderr)
-        return 2
-    width = max(map(len, inside)) + 2
-    lines = [f"usage: depthpose {group or 'COMMAND'} ... [--help]", ""]
-    lines += ["The 6-DoF pose of a known object from a depth sensor, and metric depth from images."]
-    parts = {"commands": False, "the tables and figures of the thesis": True}
-    for title, is_thesis in parts.items():
-        names = [n for n in inside if (n.partition(" ")[0] in _THESIS) == is_thesis]
-        if names:
-            lines += ["", f"{title}:", *(f"  {n:<{width}}{inside[n]}" for n in names)]
-    stream = sys.stdout if asked_help else sys.stderr
-    print("\n".join([*lines, "", _EXIT_CODES]), file=stream)
-    return 0 if asked_help else 2

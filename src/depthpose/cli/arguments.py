@@ -18,7 +18,6 @@ from typing import (
     Any,
     ClassVar,
     Literal,
-    NamedTuple,
     Protocol,
     TypeVar,
     Union,
@@ -177,112 +176,19 @@ def refuse_missing(command: Callable[..., int], values: Mapping[str, Any]) -> No
             continue
         value = values[name] if name == option else getattr(values[name], option)
         for one in value if isinstance(value, list | tuple) else [value]:
-            if one is not None and kind is _Names.INPUT:
-                _refuse_path(str(one))
-            elif one is not None:
+            if kind is _Names.WEIGHTS and one is not None:
                 bare = re.sub(_PREFIXES, "", one)
                 if bare not in _WORDS and not is_on_hub(bare):
                     find_weights(bare)
-
-
-def _refuse_path(path: str) -> None:
-    if any(mark in path for mark in ("://", "*", "?", "[", "{")) or Path(path).exists():
-        return
-    wanted = Path(path)
-    beside = [p.name for p in wanted.parent.iterdir()] if wanted.parent.is_dir() else []
-    near = get_close_matches(wanted.name, beside, n=1)
-    hint = f"; did you mean {str(wanted.parent / near[0])!r}?" if near else "; check the path"
-    raise InputError(f"{path}: there is no such file or folder{hint}")
-
-
-Typed = Mapping[str, Sequence[str]]
-"""Options as they were typed, without dashes, and the words after each."""
-
-
-class _Rule(NamedTuple):
-    """In which case some commands ignore options, and why."""
-
-    commands: tuple[str, ...]
-    case: Callable[[Typed], bool]
-    options: tuple[str, ...]
-    why: str
-
-
-def _has_value(option: str, *values: str) -> Callable[[Typed], bool]:
-    return lambda typed: bool(set(typed.get(option, ())) & set(values))
-
-
-def _without(*options: str) -> Callable[[Typed], bool]:
-    return lambda typed: not any(option in typed for option in options)
-
-
-def _all_begin(option: str, *prefixes: str) -> Callable[[Typed], bool]:
-    return lambda typed: all(word.startswith(prefixes) for word in typed.get(option, [""]))
-
-
-def _has_idle_gpus(typed: Typed) -> bool:
-    on_cpu = typed.get("device", ["cpu"])[:1] == ["cpu"]
-    return on_cpu and typed.get("worker-gpus", ["0"])[:1] not in (["0"], ["0.0"])
-
-
-_POSES = ("pose predict", "pose track")
-_MEASURED = ("pose evaluate",)
-_RULES = (
-    _Rule(_POSES, _has_value("method", "register"),
-          ("weights", "voting", "hypotheses", "batch", "device"),
-          "--method register fits the CAD file alone, one input after the other on the processor"),
-    _Rule(("pose predict",), _has_value("voting", "least-squares"), ("hypotheses",),
-          "--voting least-squares draws no hypotheses"),
-    _Rule(("pose predict",), lambda typed: "depth" in typed and "mask" not in typed, ("batch",),
-          "an image without --mask is searched alone"),
-    _Rule(("pose predict", "depth predict"), _has_value("engine", "ray"), ("view",),
-          "the workers of --engine ray show nothing"),
-    _Rule(("pose predict", "depth predict", "depth match"), _has_idle_gpus, ("worker-gpus",),
-          "the workers compute on the processor without --device cuda"),
-    _Rule(("pose track",), _without("bop"), ("split",), "it is of a data set; give --bop"),
-    _Rule(_MEASURED, _without("weights"), ("masks", "voting", "icp", "device"),
-          "nothing is estimated: --csv and --predictions are measured as they are"),
-    _Rule(_MEASURED, _all_begin("weights", "register", "open3d"), ("voting", "device"),
-          "register and open3d do not vote, and compute on the processor"),
-    _Rule(("depth predict",), _has_value("answer", "own"), ("precision", "max-memory"),
-          "they are for a matcher with weights, and with --answer own none runs"),
-    _Rule(("depth evaluate",), _without("baseline", "floor"), ("train", "train-without"),
-          "they are for --baseline; add it"),
-    _Rule(("depth evaluate",), _without("train"), ("train-without",),
-          "it leaves frames out of --train, and none is given"),
-    _Rule(("depth evaluate",), _without("matcher"), ("holes",), "it is for --matcher sgbm"),
-    _Rule(("depth evaluate",), _has_value("protocol", "kitti-2015"), ("cap",),
-          "--protocol kitti-2015 measures disparity, without a limit in metres"),
-    _Rule(("depth evaluate",), _all_begin("weights", "quick:", "fine:"), ("speed",),
-          "'quick:' and 'fine:' say the speed of these weights"),
-    _Rule(("depth evaluate",), _all_begin("weights", "own:"), ("precision", "max-memory"),
-          "they are for a matcher with weights, and with 'own:' none runs"),
-    _Rule(("data export-depth",), _has_value("format", "colmap"), ("files",),
-          "--format colmap has one kind of file; --files is for nerfstudio"),
-    _Rule(("weights complete",), lambda typed: all(Path(w).is_dir() for w in typed["models"]),
-          ("unit",), "the models of a data set are in mm; --unit is for a model file"),
-    _Rule(("reproduce all",), _without("kitti"), ("split", "protocol"), "they are for --kitti"),
-)  # fmt: skip
-
-
-def refuse_ignored_options(command: str, words: Sequence[str]) -> None:
-    """Refuse what the command would ignore."""
-    typed: dict[str, list[str]] = {}
-    spelled: dict[str, str] = {}
-    here: list[str] = []
-    for word in words:
-        if word.startswith("--"):
-            option, sign, value = word.removeprefix("--").partition("=")
-            name = option.replace("_", "-").removeprefix("no-")
-            spelled[name], here = f"--{option}", typed.setdefault(name, [])
-            here += [value] if sign else []
-        else:
-            here.append(word)
-    for rule in _RULES:
-        ignored = [name for name in rule.options if name in typed]
-        if command in rule.commands and ignored and rule.case(typed):
-            named = " and ".join(spelled[name] for name in ignored)
-            raise InputError(f"{named}: has no effect here; {rule.why}. Leave {named} out")
+            elif one is not None and not any(mark in str(one) for mark in ("://", *"*?[{")):
+                wanted = Path(one)
+                if wanted.exists():
+                    continue
+                home = wanted.parent
+                beside = [path.name for path in home.iterdir()] if home.is_dir() else []
+                near = get_close_matches(wanted.name, beside, n=1)
+                hint = f"did you mean {str(home / near[0])!r}?" if near else "check the path"
+                raise InputError(f"{one}: there is no such file or folder; {hint}")
 
 
 def refuse_below(least: int, option: str, value: int, usual: str) -> None:

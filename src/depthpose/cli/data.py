@@ -56,8 +56,8 @@ def make_streets(
     """
     from depthpose.core.run import claim_folder
     from depthpose.depth.config import StreetsConfig
-    from depthpose.depth.datasets import RawFrame, has_calibration, has_raw_frame, write_raw_frame
-    from depthpose.depth.synthetic import camera_from_velodyne, draw_street, rig_number
+    from depthpose.depth.datasets import has_calibration, has_raw_frame, write_raw_frame
+    from depthpose.depth.synthetic import draw_street, rig_number
 
     if number < 1 or first < 0 or not 0 <= seed <= 9999:
         raise InputError(
@@ -80,18 +80,7 @@ def make_streets(
     lost = {index for date, index in dates.items() if not has_calibration(out, date)}
     wanted = [i for i in indices if i in lost or not has_raw_frame(out, drives[i], i)]
     for index in _shown(wanted, None, "frames"):
-        frame = draw_street(config, index)
-        raw = RawFrame(
-            left=frame.left,
-            right=frame.right,
-            rig=frame.rig,
-            disparity_px=frame.disparity_px,
-            occluded=frame.occluded,
-            is_sky=frame.is_sky,
-            points=frame.lidar_points,
-            camera_from_velodyne=camera_from_velodyne(),
-        )
-        write_raw_frame(out, drives[index], index, raw)
+        write_raw_frame(out, drives[index], index, draw_street(config, index))
     print(f"{out}: {len(wanted)} frames made, {number - len(wanted)} were there")
     return 0
 
@@ -392,8 +381,6 @@ def export_depth(
 
     if not (math.isfinite(scale) and scale > 0):
         raise InputError(f"--scale {scale:g}: units per metre must be positive; 1 for metres")
-    if images is not None and format != "colmap":
-        raise InputError(f"--images {images} is for --format colmap; remove it")
     settings = {"command": "data export-depth", "results": str(results.resolve())}
     settings |= {"scale": scale, "format": format}
     if format == "colmap":
@@ -534,11 +521,12 @@ def _check_rows(
         return
     measured = [report for report in known if report.matches] or known
     offset_px = median(abs(report.vertical_offset_px) for report in measured)
-    said = (
-        f"rows of {len(known)} pairs: they differ by {offset_px:.2f} px, with a spread of "
-        f"{median(report.vertical_spread_px for report in measured):.2f} px "
-        f"({sum(report.matches for report in known)} matches)"
-    )
+    spread_px = median(report.vertical_spread_px for report in measured)
+    differ = f"they differ by {offset_px:.2f} px, with a spread of {spread_px:.2f} px"
+    if not math.isfinite(offset_px):
+        differ = "no difference is common to their matches"
+    matches = sum(report.matches for report in known)
+    said = f"rows of {len(known)} pairs: {differ} ({matches} matches)"
     wrong = ""
     if 2 * sum(bool(report.is_swapped) for report in known) > len(known):
         wrong = "left and right look swapped (disparities are negative); exchange LEFT and RIGHT"

@@ -10,7 +10,6 @@ from depthpose.cli import depth_options as options
 from depthpose.cli.arguments import NewPath, NewPlace, Source
 from depthpose.cli.engine import EngineOptions
 from depthpose.core.errors import InputError
-from depthpose.depth.config import MatcherConfig
 
 
 def predict(
@@ -53,7 +52,7 @@ def predict(
         answer=networks.answer,
         use="images",
     )
-    options.refuse_unusable(scale, networks, matching, output)
+    options.refuse_unusable(scale, output)
     if engine.is_ray:
         work.refuse_videos(images)
         method = method.packed()
@@ -66,8 +65,12 @@ def predict(
         return work.estimate_by_engine(images, work.IMAGES, work_of, out, engine)
     sources = work.find_sources(images, Path(out))
     this, built = work_of(sources), method.build()
-    if built.settings.get("answer") == "own":
-        matching.refuse_matcher_options()
+    is_plain = (matching.precision, matching.max_memory) == ("fp32", None)
+    if built.settings.get("answer") == "own" and not is_plain:
+        raise InputError(
+            "--precision and --max-memory are for a matcher with weights, and none runs here; "
+            "leave them out"
+        )
     return work.estimate_all([(path,) for path in sources], this, built, Path(out))
 
 
@@ -106,13 +109,11 @@ def match(
     from depthpose.core.camera import read_rig
     from depthpose.core.files import image_size
     from depthpose.core.run import refuse_among_inputs
+    from depthpose.depth.estimator import FakestereoNet
+    from depthpose.depth.stereo import NetworkMatcher, tile_change_px
 
-    method = MethodSource(weights=pairs.used, config=matching.config, with_right=True, use="pairs")
-    if method.weights is None and method.config != MatcherConfig():
-        raise InputError(
-            "--device, --speed, --precision, --max-memory, --tile and --left-right-check are for "
-            "matchers with weights; sgbm takes none."
-        )
+    used = None if pairs.matcher == "sgbm" else pairs.matcher or pairs.weights or "default"
+    method = MethodSource(weights=used, config=matching.config, with_right=True, use="pairs")
     method = method.packed() if engine.is_ray else method
 
     def work_of(files: Sequence[Path]) -> work.DepthWork:
@@ -132,7 +133,13 @@ def match(
     refuse_among_inputs(Path(out), (left, right), [path for pair in files for path in pair])
     built = method.build()
     if matching.tile is not None:
-        work.say_tile_change(this.lens.input_of(files[0][0].stem, *files[0]), built)
+        pair = this.lens.input_of(files[0][0].stem, *files[0])
+        assert pair.right is not None
+        assert isinstance(built.net, FakestereoNet)
+        if not isinstance(built.net.matcher, NetworkMatcher):
+            raise InputError(f"--tile: {built.name} matches no tiles; omit --tile")
+        change_px = tile_change_px(built.net.matcher, pair.left, pair.right, pair.camera)
+        print(f"tiles change the disparity of {pair.name} by {change_px:.4f} px on average")
     return work.estimate_all(files, this, built, Path(out))
 
 
@@ -175,8 +182,11 @@ def evaluate(
     from depthpose.depth.evaluate import find_protocol
     from depthpose.report.page import table_files
 
-    methods.refuse_none()
-    options.refuse_ignored(methods.weights, matching)
+    if not (methods.weights or methods.matcher or methods.predictions or methods.baseline):
+        raise InputError(
+            "measure --weights FILE, --matcher sgbm, --predictions DIR or --baseline rows, or "
+            "several."
+        )
     comparison.refuse_unusable()
     rule = find_protocol(comparison.protocol)
     dataset = open_frames(data, split)

@@ -23,7 +23,6 @@ from depthpose.depth.estimator import FakestereoNet
 from depthpose.depth.evaluate import (
     PROTOCOLS,
     Evaluation,
-    EvaluationRow,
     Measured,
     Protocol,
     Row,
@@ -156,9 +155,37 @@ def measure(
         )
         print(f"depthpose: {said}", file=sys.stderr)
         about += f" {said}."
+    places = {frame.name: i for i, frame in enumerate(dataset.frames)}
+    sections: list[Section] = []
+    shares = page.share_views(len(folders))
+    for folder, of_folder, most in zip(
+        folders, [one.per_frame for one in each], shares, strict=True
+    ):
+        cap_m = of_folder[0].cap_m
+        of_cap = [row for row in of_folder if row.cap_m == cap_m and row.pixels]
+        metric = ranking_metric(cap_m)
+        sign = 1 if metric.better == "lower" else -1
+        cap = "" if cap_m is None else f", truth up to {cap_m:g} m"
+        errors = [sign * row.metrics[metric.name] for row in of_cap]
+        for role, k in page.choose_ranked(errors, most):
+            row, value = of_cap[k], of_cap[k].metrics[metric.name]
+            frames = f"{len(of_cap)} frame{'' if len(of_cap) == 1 else 's'}"
+            text = f"The {role} of {frames} by {metric.name}: {value:.4f}{cap}."
+            index = places[row.frame or ""]
+            result = frame_result(dataset, index, folder, protocol, row.cap_m)
+            error = DepthError(
+                error=result.error,
+                is_disparity=PROTOCOLS[protocol].truth == "disparity",
+                true_depth_m=result.true_depth_m,
+            )
+            pair = dataset.read_input(index)
+            shown = DepthShown(pair=pair, estimate=result.estimate, error=error)
+            own = {name: v for name, v in row.columns().items() if name not in _SAID_ABOVE}
+            title = f"{folder.name}: {row.frame}, {role}"
+            sections.append(replace(depth_section(title, shown, text), rows=[own]))
     sections = [
         Section(title="Mean over frames", text=about, rows=rows),
-        *frame_sections(dataset, folders, [one.per_frame for one in each], protocol),
+        *sections,
         *write_details(measured, out),
     ]
     title = f"{protocol} on {dataset.name}"
@@ -235,42 +262,6 @@ def say_skipped(measured: Evaluation) -> None:
     for name, why in measured.skipped.items():
         print(f"skipped: {name}: {why}", file=sys.stderr)
     print(f"{len(measured.skipped)} frames skipped")
-
-
-def frame_sections(
-    dataset: Dataset,
-    folders: Sequence[Path],
-    rows: Sequence[Sequence[EvaluationRow]],
-    protocol: str,
-) -> list[Section]:
-    """Show the worst, the median and the best frame of each set of predictions."""
-    places = {frame.name: i for i, frame in enumerate(dataset.frames)}
-    sections: list[Section] = []
-    shares = page.share_views(len(folders))
-    for folder, of_folder, most in zip(folders, rows, shares, strict=True):
-        cap_m = of_folder[0].cap_m
-        of_cap = [row for row in of_folder if row.cap_m == cap_m and row.pixels]
-        metric = ranking_metric(cap_m)
-        sign = 1 if metric.better == "lower" else -1
-        cap = "" if cap_m is None else f", truth up to {cap_m:g} m"
-        errors = [sign * row.metrics[metric.name] for row in of_cap]
-        for role, k in page.choose_ranked(errors, most):
-            row, value = of_cap[k], of_cap[k].metrics[metric.name]
-            frames = f"{len(of_cap)} frame{'' if len(of_cap) == 1 else 's'}"
-            text = f"The {role} of {frames} by {metric.name}: {value:.4f}{cap}."
-            index = places[row.frame or ""]
-            result = frame_result(dataset, index, folder, protocol, row.cap_m)
-            error = DepthError(
-                error=result.error,
-                is_disparity=PROTOCOLS[protocol].truth == "disparity",
-                true_depth_m=result.true_depth_m,
-            )
-            pair = dataset.read_input(index)
-            shown = DepthShown(pair=pair, estimate=result.estimate, error=error)
-            own = {name: v for name, v in row.columns().items() if name not in _SAID_ABOVE}
-            title = f"{folder.name}: {row.frame}, {role}"
-            sections.append(replace(depth_section(title, shown, text), rows=[own]))
-    return sections
 
 
 ENDING = "measured.json"

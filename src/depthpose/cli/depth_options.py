@@ -2,7 +2,6 @@
 
 import math
 import re
-from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Literal
@@ -30,14 +29,6 @@ class MatcherOptions:
     """quick: at the size that the weights were trained at; fine: one image is looked at in a larger
     size too, a pair matched at up to 280,000 pixels (PSMNet) or 650,000 (light), for KITTI in about
     3 times the time."""
-
-    def refuse_matcher_options(self) -> None:
-        """Refuse what is for a matcher with weights, where none runs."""
-        if self.precision != "fp32" or self.max_memory is not None:
-            raise InputError(
-                "--precision and --max-memory are for a matcher with weights, and none runs here; "
-                "leave them out"
-            )
 
     @property
     def config(self) -> MatcherConfig:
@@ -126,18 +117,6 @@ class PairNetworks:
     """refuse pairs that are swapped, not rectified or no pair, and warn where this cannot be
     told."""
 
-    @property
-    def used(self) -> str | None:
-        """The weights whose matcher matches; None where sgbm does."""
-        if self.matcher is None:
-            return "default" if self.weights is None else self.weights
-        if self.weights is not None:
-            raise InputError(
-                f"--weights {self.weights} and --matcher {self.matcher}: one of the two matches "
-                "the pair; omit the other"
-            )
-        return None if self.matcher == "sgbm" else self.matcher
-
 
 @group
 class ImageNetworks:
@@ -171,10 +150,8 @@ class PredictOutput:
     """live shows each result in Rerun's viewer (an extra) as it comes; FILE.rrd records it."""
 
 
-def refuse_unusable(
-    scale: ScaleOptions, networks: ImageNetworks, matching: MatcherOptions, output: PredictOutput
-) -> None:
-    """Refuse values out of their range, and options that exclude each other."""
+def refuse_unusable(scale: ScaleOptions, output: PredictOutput) -> None:
+    """Refuse values out of their range."""
     near, far = output.color_range
     if not 0 < near < far:
         raise InputError(
@@ -186,15 +163,6 @@ def refuse_unusable(
         raise InputError(f"--camera-height {scale.camera_height:g}: give 0.1 to 20 metres")
     if scale.camera_tilt is not None and not -45 <= scale.camera_tilt <= 45:
         raise InputError(f"--camera-tilt {scale.camera_tilt:g}: give -45 to 45 degrees")
-    if scale.distance is not None and scale.camera_height is not None:
-        raise InputError("--known-distance and --camera-height both set the scale; omit one")
-    if networks.matcher is not None and networks.answer is not None:
-        raise InputError(
-            f"--answer {networks.answer} and --matcher {networks.matcher}: another matcher matches "
-            "the synthesised view; omit one."
-        )
-    if networks.matcher == "sgbm":
-        matching.refuse_matcher_options()
 
 
 @group
@@ -223,14 +191,6 @@ class MethodOptions:
     train_without: tuple[str, ...] = ()
     """names of frames to leave out of them."""
 
-    def refuse_none(self) -> None:
-        """Refuse to measure nothing."""
-        if not (self.weights or self.matcher or self.predictions or self.baseline):
-            raise InputError(
-                "measure --weights FILE, --matcher sgbm, --predictions DIR or --baseline rows, or "
-                "several."
-            )
-
 
 @group
 class ProtocolOptions:
@@ -250,17 +210,6 @@ class ProtocolOptions:
                 raise InputError(f"--cap {cap_m:g}: a distance in metres, above 0")
             if self.cap.count(cap_m) > 1:
                 raise InputError(f"--cap {cap_m:g} is given twice; each cap is a row: give it once")
-
-
-def refuse_ignored(weights: Sequence[str], matching: MatcherOptions) -> None:
-    """Refuse options of matchers with weights where no method has one."""
-    if weights and all(name.startswith("sgbm:") for name in weights):
-        matching.refuse_matcher_options()
-    elif not weights and matching != type(matching)():
-        raise InputError(
-            "--device, --precision, --max-memory and --speed are for networks, and none is "
-            "measured; leave them out"
-        )
 
 
 def parse_bytes(text: str | None) -> int | None:

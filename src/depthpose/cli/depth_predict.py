@@ -17,12 +17,12 @@ from tqdm import tqdm
 
 from depthpose.cli.depth_methods import Method, MethodSource
 from depthpose.cli.depth_options import LensOptions, PredictOutput, ScaleOptions
-from depthpose.cli.engine import EngineOptions, Inputs, say
+from depthpose.cli.engine import EngineOptions, say
 from depthpose.core import run
 from depthpose.core.camera import Camera, FieldOfView, StereoRig, camera_of, read_camera
 from depthpose.core.camera.pinhole import camera_keys
 from depthpose.core.draw import draw_depth
-from depthpose.core.engine import Files, Function, Sample
+from depthpose.core.engine import Files, Function, Inputs, Sample
 from depthpose.core.errors import InputError
 from depthpose.core.files import (
     VIDEO_SUFFIXES,
@@ -41,7 +41,6 @@ from depthpose.core.run import note_result
 from depthpose.depth.estimator import FakestereoNet
 from depthpose.depth.ground import scale_by_distance
 from depthpose.depth.predictions import CLOUD_M, ENDINGS, is_finished, read_estimate, write_estimate
-from depthpose.depth.stereo import NetworkMatcher, tile_change_px
 from depthpose.depth.types import StereoInput
 from depthpose.report.depth import DepthShown, depth_section
 from depthpose.report.page import MOST_VIEWS, Film, Section, spread_evenly, write_page
@@ -106,16 +105,40 @@ class Lens:
 def read_lens(options: LensOptions, sources: Sequence[Path], scale: ScaleOptions) -> Lens:
     """Read what the user knows of the camera; without any of it the EXIF of the images is asked."""
     focal_px, fov = options.focal_px, options.fov
-    named = {"--camera": options.camera, "--focal-px": focal_px, "--fov": fov}
-    words = [word for word, value in named.items() if value is not None]
-    if len(words) > 1:
-        raise InputError(f"{' and '.join(words)} all give the focal length; omit all but one")
     if focal_px is not None and not 1 < focal_px < 1e6:
         raise InputError(f"--focal-px {focal_px}: not a focal length in pixels; KITTI's is 721.5.")
     if fov is not None:
         return Lens(camera=FieldOfView(fov), scale=scale)
+    if options.camera is None and focal_px is None:  # what the EXIF of all images says
+        known: dict[str, tuple[float, str]] = {}
+        for source in sources:
+            try:
+                focal = None if _is_video(source) else read_exif_focal(source)
+            except InputError:  # what cannot be read fails by itself, later
+                continue
+            if focal is None:
+                raise InputError(
+                    f"metres from one image need its focal length, and {source.name} has none in "
+                    "its EXIF: give --camera FILE, --focal-px, or --fov, the angle from left to "
+                    "right (a phone's main camera has about 0.75 times the image's width, or 67 "
+                    "degrees)"
+                )
+            known[source.name] = focal
+        if not known:
+            raise InputError(
+                "no image can be read; give --camera, --focal-px or --fov, and intact ones"
+            )
+        (first, (focal_px, tags)), *others = known.items()
+        for other, (other_px, _) in others:
+            if abs(other_px / focal_px - 1) > _SAME_FOCAL:
+                raise InputError(
+                    f"the EXIF of {first} says a focal length of {focal_px:.0f} px and that of "
+                    f"{other} {other_px:.0f} px; predict them apart"
+                )
+        print(f"a focal length of {focal_px:.0f} px, by the EXIF of {first} ({tags}); of a cropped "
+              "picture it is another", file=sys.stderr)  # fmt: skip
     if options.camera is None:
-        focal_px = _exif_of_all(sources) if focal_px is None else focal_px
+        assert focal_px is not None
         return Lens(camera=focal_px, scale=scale)
     size = None  # of the images, for a camera file that says none
     for source in sources:
@@ -132,37 +155,6 @@ def read_lens(options: LensOptions, sources: Sequence[Path], scale: ScaleOptions
         keys = {key: getattr(read, key) for key in ("mount_height_m", "tilt_deg")}
         read = Camera(width=read.width, height=read.height, K=read.K, **keys)
     return Lens(camera=read, scale=scale)
-
-
-def _exif_of_all(sources: Sequence[Path]) -> float:
-    """Read the focal length that the EXIF of all images says, and say it."""
-    known: dict[str, tuple[float, str]] = {}
-    for source in sources:
-        try:
-            focal = None if _is_video(source) else read_exif_focal(source)
-        except InputError:  # what cannot be read fails by itself, later
-            continue
-        if focal is None:
-            raise InputError(
-                f"metres from one image need its focal length, and {source.name} has none in its "
-                "EXIF: give --camera FILE, --focal-px, or --fov, the angle from left to right (a "
-                "phone's main camera has about 0.75 times the image's width, or 67 degrees)"
-            )
-        known[source.name] = focal
-    if not known:
-        raise InputError(
-            "no image can be read; give --camera, --focal-px or --fov, and intact ones"
-        )
-    (first, (focal_px, tags)), *others = known.items()
-    for other, (other_px, _) in others:
-        if abs(other_px / focal_px - 1) > _SAME_FOCAL:
-            raise InputError(
-                f"the EXIF of {first} says a focal length of {focal_px:.0f} px and that of {other} "
-                f"{other_px:.0f} px; predict them apart"
-            )
-    print(f"a focal length of {focal_px:.0f} px, by the EXIF of {first} ({tags}); of a cropped "
-          "picture it is another", file=sys.stderr)  # fmt: skip
-    return focal_px
 
 
 def find_sources(words: Sequence[str], out: Path) -> list[Path]:
@@ -211,16 +203,6 @@ def list_pairs(left: str, right: str) -> list[tuple[Path, Path]]:
     if (lefts, rights) != ([Path(left)], [Path(right)]):
         rights = [rights[k] for k in find_partners(stems, others, f"{left} and {right}")]
     return list(zip(lefts, rights, strict=True))
-
-
-def say_tile_change(pair: StereoInput, method: Method) -> None:
-    """Print how far tiles move the disparity of a pair from that of the whole image."""
-    assert pair.right is not None
-    assert isinstance(method.net, FakestereoNet)
-    if not isinstance(method.net.matcher, NetworkMatcher):
-        raise InputError(f"--tile: {method.name} matches no tiles; omit --tile")
-    change_px = tile_change_px(method.net.matcher, pair.left, pair.right, pair.camera)
-    print(f"tiles change the disparity of {pair.name} by {change_px:.4f} px on average")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -299,7 +281,37 @@ def estimate_all(
     count = f"{done} of {len(mine)} pairs" if work.files == PAIRS else f"{done} depth maps"
     print(f"{count} are in {out}")
     if run.find_rank().rank == 0:
-        _write_page(work, sources, out, failures)
+        finished = {files: _finished_names(files[0], out) for files in sources}
+        names = [name for some in finished.values() for name in some]
+        chosen = [names[k] for k in spread_evenly(len(names), MOST_VIEWS)]
+        shown: list[StereoInput] = []
+        for files, own in finished.items():
+            wanted = [name for name in own if name in chosen]
+            with suppress(InputError):
+                for name, read in work.lens.inputs_of(files) if wanted else ():
+                    if name in wanted:
+                        shown.append(read())
+                    if name == wanted[-1]:
+                        break
+        near_m, far_m = work.output.color_range
+        which = "all" if len(shown) == len(names) else "spread evenly"
+        text = f"Shown: {len(shown)} of {_count(len(names), 'depth map')} in this folder ({which})."
+        rows = [{"not estimated, because": str(reason)} for reason in failures]
+        doubts = {name: out / f"{name}.warning.txt" for name in names}
+        rows += [{"warning": f"{name}: {read_text(path).strip()}"}
+                 for name, path in doubts.items() if path.is_file()]  # fmt: skip
+        sections = [Section(title="What is here", text=text, rows=rows)]
+        said = f"depth, {near_m:g} m bright to {far_m:g} m dark"
+        films = [Film(path=p, caption=f"{p.name}: {said}") for p in sorted(out.glob(f"*{_VIDEO}"))]
+        sections += [Section(title="Videos", films=films)] if films else []
+        for one in shown:
+            estimate = read_estimate(out, one.name, one.camera)
+            drawn = DepthShown(pair=one, estimate=estimate, range_m=(near_m, far_m))
+            sections.append(depth_section(one.name, drawn))
+        write_page(
+            out / _PAGE, f"Depth of {_count(len(names), 'image')}", sections, run.environment()
+        )
+        print(f"the page: {out / _PAGE}")
     return 1 if failures else 0
 
 
@@ -382,44 +394,6 @@ class Predictor:
                 names += [name for name, _ in chunk if name not in self.failures]
                 bar.update(len(chunk))
         return names
-
-
-def _write_page(
-    work: DepthWork,
-    sources: Sequence[tuple[Path, ...]],
-    out: Path,
-    failures: Sequence[InputError],
-) -> None:
-    """Write a page of some results, and of warnings: others may still be at work."""
-    finished = {files: _finished_names(files[0], out) for files in sources}
-    names = [name for some in finished.values() for name in some]
-    chosen = [names[k] for k in spread_evenly(len(names), MOST_VIEWS)]
-    shown: list[StereoInput] = []
-    for files, own in finished.items():
-        wanted = [name for name in own if name in chosen]
-        with suppress(InputError):
-            for name, read in work.lens.inputs_of(files) if wanted else ():
-                if name in wanted:
-                    shown.append(read())
-                if name == wanted[-1]:
-                    break
-    near_m, far_m = work.output.color_range
-    which = "all" if len(shown) == len(names) else "spread evenly"
-    text = f"Shown: {len(shown)} of {_count(len(names), 'depth map')} in this folder ({which})."
-    rows = [{"not estimated, because": str(reason)} for reason in failures]
-    doubts = {name: out / f"{name}.warning.txt" for name in names}
-    rows += [{"warning": f"{name}: {read_text(path).strip()}"}
-             for name, path in doubts.items() if path.is_file()]  # fmt: skip
-    sections = [Section(title="What is here", text=text, rows=rows)]
-    said = f"depth, {near_m:g} m bright to {far_m:g} m dark"
-    films = [Film(path=p, caption=f"{p.name}: {said}") for p in sorted(out.glob(f"*{_VIDEO}"))]
-    sections += [Section(title="Videos", films=films)] if films else []
-    for one in shown:
-        estimate = read_estimate(out, one.name, one.camera)
-        drawn = DepthShown(pair=one, estimate=estimate, range_m=(near_m, far_m))
-        sections.append(depth_section(one.name, drawn))
-    write_page(out / _PAGE, f"Depth of {_count(len(names), 'image')}", sections, run.environment())
-    print(f"the page: {out / _PAGE}")
 
 
 def _finished_names(source: Path, out: Path) -> list[str]:

@@ -2,7 +2,6 @@
 
 import re
 import sys
-from collections.abc import Callable, Iterator
 from importlib import metadata
 from time import perf_counter
 
@@ -43,28 +42,6 @@ def doctor(files: tyro.conf.Positional[tuple[NewPath, ...]] = ()) -> int:
 
     for name, value in {**environment(), "device": device_names(), "weights in": SHIPPED}.items():
         print(f"{name}: {value}")
-    print(*_extras(), sep="\n")
-    for path in sorted(SHIPPED.glob("*.safetensors")):
-        try:
-            known = read_checkpoint(path)
-            print(f"weights {path.stem}: {known.kind}, {known.facts.get('licence', 'no licence')}")
-        except InputError as error:
-            print(f"weights {path.stem}: {error}")
-    tries = {"depth": _try_depth, "pose": _try_pose}
-    works = [_tried(what, work) for what, work in tries.items()]
-    return 0 if all(works) else 1
-
-
-def device_names() -> str:
-    """Name what computes: the GPUs, or the processor alone."""
-    import torch
-
-    gpus = [torch.cuda.get_device_name(i) for i in range(torch.cuda.device_count())]
-    return ", ".join(f"cuda:{i} {name}" for i, name in enumerate(gpus)) or "cpu alone"
-
-
-def _extras() -> Iterator[str]:
-    """Give a line for each extra: what it needs, or the command that installs it."""
     lacking: dict[str, list[str]] = {}
     for line in metadata.requires("depthpose") or ():
         requirement = _REQUIREMENT.match(line)
@@ -78,20 +55,34 @@ def _extras() -> Iterator[str]:
         except metadata.PackageNotFoundError:
             lacking[extra].append(package)
     for extra, packages in lacking.items():
-        how = f"lacks {', '.join(packages)}"
-        yield f"extra {extra}: {how if packages else 'installed'}"
-    yield f"another extra: {install_command('EXTRA')}"
+        said = f"lacks {', '.join(packages)}" if packages else "installed"
+        print(f"extra {extra}: {said}")
+    print(f"another extra: {install_command('EXTRA')}")
+    for path in sorted(SHIPPED.glob("*.safetensors")):
+        try:
+            known = read_checkpoint(path)
+            print(f"weights {path.stem}: {known.kind}, {known.facts.get('licence', 'no licence')}")
+        except InputError as error:
+            print(f"weights {path.stem}: {error}")
+    code = 0
+    for what, work in {"depth": _try_depth, "pose": _try_pose}.items():
+        began = perf_counter()
+        try:
+            said = work()
+        except Exception as error:  # noqa: BLE001 - whatever it is, it is what is asked for
+            print(f"{what}: failed: {type(error).__name__}: {error}", file=sys.stderr)
+            code = 1
+        else:
+            print(f"{what}: {said}, {perf_counter() - began:.1f} s with loading")
+    return code
 
 
-def _tried(what: str, work: Callable[[], str]) -> bool:
-    began = perf_counter()
-    try:
-        said = work()
-    except Exception as error:  # noqa: BLE001 - whatever it is, it is what is asked for
-        print(f"{what}: failed: {type(error).__name__}: {error}", file=sys.stderr)
-        return False
-    print(f"{what}: {said}, {perf_counter() - began:.1f} s with loading")
-    return True
+def device_names() -> str:
+    """Name what computes: the GPUs, or the processor alone."""
+    import torch
+
+    gpus = [torch.cuda.get_device_name(i) for i in range(torch.cuda.device_count())]
+    return ", ".join(f"cuda:{i} {name}" for i, name in enumerate(gpus)) or "cpu alone"
 
 
 def _try_depth() -> str:

@@ -65,10 +65,16 @@ def look_at_all(paths: Sequence[Path]) -> int:
         print(f"{path}: {one.what}" if one.what else f"{path}: cannot be used")
         for said in one.odd:
             print(f"  odd: {said}")
-    pair = _look_at_pair(seen)
-    if pair is not None:
-        print(pair[0])
-    is_odd = any(one.odd for one in seen) or (pair is not None and pair[1])
+    is_odd = any(one.odd for one in seen)
+    pictures = [one for one in seen if one.image is not None]
+    if len(pictures) == 2 and pictures[0].size == pictures[1].size:  # a pair, the left one first
+        left, right = (one.image for one in pictures)
+        assert left is not None
+        assert right is not None
+        report = cameras.check_rectified(left, right)
+        said = f"{chr(10)}  odd: {report.message}" if report.is_wrong else f": {report.message}"
+        print(f"{pictures[0].path.name} and {pictures[1].path.name} as a pair{said}")
+        is_odd = is_odd or report.is_wrong
     return 1 if is_odd else 0
 
 
@@ -85,7 +91,13 @@ def _read(path: Path, size: Size | None) -> FileFacts:
     if suffix in mesh_suffixes():
         vertices, faces = read_geometry(path)
         points = torch.from_numpy(vertices)
-        return _of_model(path, points, len(faces)) if len(faces) else _of_points(path, points)
+        if not len(faces):
+            return _of_points(path, points)
+        diameter = exact_diameter(points)
+        unit = "metres (--unit m)" if diameter < _ONLY_M else "metres or millimetres; measure it"
+        unit = "millimetres (--unit mm)" if diameter > _ONLY_MM else unit
+        what = f"mesh of {len(points)} points and {len(faces)} faces, {diameter:.4g} across: {unit}"
+        return FileFacts(path=path, what=what, model=points)
     if suffix in files.cloud_suffixes():
         return _of_points(path, files.read_cloud(path).points.double())
     return _of_picture(path)
@@ -219,22 +231,21 @@ def _of_points(path: Path, points: Tensor) -> FileFacts:
     return FileFacts(path=path, what=what, odd=odd, cloud=points)
 
 
-def _of_model(path: Path, points: Tensor, faces: int) -> FileFacts:
-    diameter = exact_diameter(points)
-    if diameter > _ONLY_MM:
-        unit = "millimetres (--unit mm)"
-    else:
-        unit = "metres (--unit m)" if diameter < _ONLY_M else "metres or millimetres; measure it"
-    what = f"mesh of {len(points)} points and {faces} faces, {diameter:.4g} across: {unit}"
-    return FileFacts(path=path, what=what, model=points)
-
-
 def _beside(one: FileFacts, seen: Sequence[FileFacts]) -> Iterator[str]:
     """Say what is odd about a file beside the others."""
     for other in seen:
-        if other.camera is not None:
-            for said in _beside_camera(one, other.camera):
-                yield f"beside {other.path.name}: {said}"
+        if (camera := other.camera) is not None and one.size is not None:
+            try:
+                cameras.check_image_matches_camera(camera, *one.size, "it")
+            except InputError as error:
+                yield f"beside {other.path.name}: {error}"
+        if camera is not None and one.depth_units is not None and camera.depth_unit_m is not None:
+            median_m = float(one.depth_units.nanmedian()) * camera.depth_unit_m
+            if not _NEAR_M < median_m < _FAR_M:
+                yield (
+                    f"beside {other.path.name}: its median is {median_m:.3g} m by the camera's "
+                    f"depth_unit_m {camera.depth_unit_m:g}; 0.001 means millimetres"
+                )
         is_depth = other.depth_units is not None
         if one.mask is not None and is_depth and other.size != one.size:
             yield f"it is not of the size of {other.path.name}; give the mask of this very image"
@@ -242,35 +253,3 @@ def _beside(one: FileFacts, seen: Sequence[FileFacts]) -> Iterator[str]:
             advice = unit_advice(exact_diameter(one.model), other.cloud)
             if advice is not None:
                 yield f"beside {other.path.name}: {advice}"
-
-
-def _beside_camera(one: FileFacts, camera: cameras.Camera) -> Iterator[str]:
-    if one.size is not None:
-        try:
-            cameras.check_image_matches_camera(camera, *one.size, "it")
-        except InputError as error:
-            yield str(error)
-    if one.depth_units is None or camera.depth_unit_m is None:
-        return
-    median_m = float(one.depth_units.nanmedian()) * camera.depth_unit_m
-    if not _NEAR_M < median_m < _FAR_M:
-        yield (
-            f"its median is {median_m:.3g} m by the camera's depth_unit_m "
-            f"{camera.depth_unit_m:g}; 0.001 means millimetres"
-        )
-
-
-def _look_at_pair(seen: Sequence[FileFacts]) -> tuple[str, bool] | None:
-    """Compare two pictures of one size: a pair, the left one first."""
-    pictures = [one for one in seen if one.image is not None]
-    if len(pictures) != 2 or pictures[0].size != pictures[1].size:
-        return None
-    left, right = (one.image for one in pictures)
-    assert left is not None
-    assert right is not None
-    names = f"{pictures[0].path.name} and {pictures[1].path.name} as a pair"
-    report = cameras.check_rectified(left, right)
-    return (
-        f"{names}{chr(10) + '  odd' if report.is_wrong else ''}: {report.message}",
-        report.is_wrong,
-    )

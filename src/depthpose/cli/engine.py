@@ -12,7 +12,7 @@ from depthpose.cli.arguments import group, shown_as
 from depthpose.core.errors import InputError
 
 if TYPE_CHECKING:  # --help imports this module and must answer at once
-    from depthpose.core.engine import Done, Files, Item, RayEngine
+    from depthpose.core.engine import Done, Inputs, RayEngine
     from depthpose.core.engine.work import Work
 
 
@@ -40,12 +40,7 @@ class EngineOptions:
 
     @property
     def is_ray(self) -> bool:
-        """Whether a cluster does the work; the other options are refused without."""
-        if self.engine == "here" and self != EngineOptions():
-            raise InputError(
-                "--address, --workers, --worker-cpus, --worker-gpus, --block and --shards are for "
-                "--engine ray; add it, or remove them"
-            )
+        """Whether a cluster does the work."""
         return self.engine == "ray"
 
     def build(self) -> "RayEngine":
@@ -80,33 +75,6 @@ class EngineOptions:
             block=self.block,
         )
         return run_job(job, self.build())
-
-
-@dataclass(frozen=True, kw_only=True)
-class Inputs:
-    """Inputs of a command."""
-
-    items: "Sequence[Item]"
-    tars: Sequence[str]
-    files: "Files"
-
-    @classmethod
-    def find(cls, words: Sequence[str], files: "Files") -> "Inputs":
-        """List files, manifests and tar shards."""
-        from depthpose.core.engine import find_items, find_tars, is_tar
-
-        tars = [word for word in words if is_tar(word)]
-        others = [word for word in words if not is_tar(word)]
-        items = find_items(others, files) if others else []
-        return cls(items=items, tars=find_tars(tars), files=files)
-
-    @contextmanager
-    def first(self) -> Iterator[Sequence[Path]]:
-        """Give the files of the first input, to be checked before any work."""
-        from depthpose.core.engine import first_sample
-
-        with first_sample(self.items, self.tars, self.files) as sample:
-            yield sample.files
 
 
 @dataclass(frozen=True, kw_only=True)

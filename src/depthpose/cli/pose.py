@@ -46,7 +46,12 @@ def predict(
     from depthpose.cli.pose_methods import source_of
     from depthpose.cli.pose_predict import predict_dataset, predict_files, predict_on_ray
 
-    options.refuse_mixture(inputs, dataset)
+    count = sum(word is not None for word in (inputs.cloud, inputs.depth, dataset.bop))
+    if count != 1:
+        raise InputError(
+            f"{count} of --cloud, --depth and --bop are given; give one: a cloud, a depth image "
+            "with --mask and --camera, or a data set"
+        )
     source = source_of(weights, register, inputs.unit, dataset, estimates.config)
     if dataset.bop is not None:
         return predict_dataset(source, dataset, inputs.object, out, estimates.batch, view, engine)
@@ -59,8 +64,6 @@ def predict(
             "--mask and --camera, or weights that vote"
         )
     if inputs.depth is not None and inputs.mask is None and inputs.lens is not None:
-        if view is not None:
-            raise InputError("--view shows inputs that have a mask; omit it, or give --mask")
         return find_all(method, inputs, Path(out))
     return predict_files(method, inputs, Path(out), estimates.batch, view)
 
@@ -141,8 +144,14 @@ def track(
     """
     from depthpose.cli.pose_frames import track_bop, track_folder
     from depthpose.cli.pose_methods import source_of
+    from depthpose.core.run import find_rank
 
-    frames.refuse_unusable()
+    if sum(place is not None for place in (frames.depth, frames.cloud, frames.bop)) != 1:
+        raise InputError("give one of --depth with --camera, --cloud and --bop")
+    if frames.depth is not None and frames.camera is None:
+        raise InputError("--depth needs --camera beside it")
+    if find_rank().world > 1:
+        raise InputError("a sequence is followed by one process; start one")
     config = EstimateConfig(device=frames.device, min_certainty=frames.min_certainty)
     method = source_of(weights, register, frames.unit, frames, config).build()
     if method.track is None:

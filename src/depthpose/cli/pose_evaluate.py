@@ -16,7 +16,7 @@ from depthpose.core.errors import InputError
 from depthpose.core.files import read_image
 from depthpose.core.run import environment, read_settings
 from depthpose.pose.config import EvaluationConfig
-from depthpose.pose.datasets import BopDataset, Instance, open_bop, read_targets
+from depthpose.pose.datasets import BopDataset, open_bop, read_targets
 from depthpose.pose.evaluate import (
     Evaluation,
     InstanceRow,
@@ -30,7 +30,6 @@ from depthpose.pose.evaluate import (
     read_any,
 )
 from depthpose.pose.mesh import symmetry_transforms
-from depthpose.pose.types import PoseEstimate
 from depthpose.report import page
 from depthpose.report.page import Section
 from depthpose.report.pose import PoseShown, pose_section
@@ -142,10 +141,38 @@ def measure(
         method, masks = row.origin.method, row.origin.masks
         entry = by_masks.setdefault((method, row.object), {"method": method, "object": row.object})
         entry[f"{masks or 'their'} masks"] = row.success
+    instances = {instance.name: instance for instance in dataset.instances}
+    sections: list[Section] = []
+    shares = page.share_views(len(predictions))
+    for path, of_path, most in zip(
+        predictions, [one.per_instance for one in each], shares, strict=True
+    ):
+        if not most:
+            continue
+        estimates = match(dataset.instances, read_any(path), dataset.objects)
+        for role, row in _choose(of_path, most):
+            instance, estimate = instances[row.instance], estimates[row.instance]
+            model, truth = dataset.objects[instance.object_id], instance.camera_from_model
+            # Of copies that look alike the one nearest to the estimate.
+            if (pose := estimate.camera_from_model) is not None:
+                truth = nearest_copy(
+                    pose, truth, symmetry_transforms(model.symmetries), model.symmetries
+                )
+            shown = PoseShown(
+                input=dataset.view(instance).input,
+                estimate=estimate,
+                model=model,
+                image=None if instance.rgb is None else read_image(instance.rgb),
+                truth=truth,
+            )
+            title = f"{path.stem}: {row.object} in {row.instance}, {role}"
+            columns = row.columns()
+            own = {name: columns[name] for name in _MEASURED}
+            sections.append(pose_section(title, shown, _OF_TRUTH, rows=[own]))
     sections = [
         Section(title="Success by masks", text=said, rows=list(by_masks.values())),
         Section(title="All numbers", rows=rows),
-        *instance_sections(dataset, predictions, [one.per_instance for one in each]),
+        *sections,
         *write_details(measured, out),
     ]
     title = f"Poses on {dataset.folder.resolve().name}, {dataset.split}"
@@ -181,28 +208,6 @@ _MEASURED = (
 )  # fmt: skip
 
 
-def instance_sections(
-    dataset: BopDataset,
-    predictions: Sequence[Path],
-    rows: Sequence[Sequence[InstanceRow]],
-) -> list[Section]:
-    """Show the worst, the median and the best answer of each set of predictions, and a refusal."""
-    instances = {instance.name: instance for instance in dataset.instances}
-    sections: list[Section] = []
-    shares = page.share_views(len(predictions))
-    for path, of_path, most in zip(predictions, rows, shares, strict=True):
-        if not most:
-            continue
-        estimates = match(dataset.instances, read_any(path), dataset.objects)
-        for role, row in _choose(of_path, most):
-            shown = _shown(dataset, instances[row.instance], estimates[row.instance])
-            title = f"{path.stem}: {row.object} in {row.instance}, {role}"
-            columns = row.columns()
-            own = {name: columns[name] for name in _MEASURED}
-            sections.append(pose_section(title, shown, _OF_TRUTH, rows=[own]))
-    return sections
-
-
 def _choose(rows: Sequence[InstanceRow], most: int) -> list[tuple[str, InstanceRow]]:
     """Choose answers by their error in diameters, and the middle one of the refusals."""
     errors = {row.instance: row.error("error_m") for row in rows}
@@ -219,17 +224,3 @@ def _choose(rows: Sequence[InstanceRow], most: int) -> list[tuple[str, InstanceR
         for k in page.spread_evenly(len(refused), few)
     ]
     return chosen
-
-
-def _shown(dataset: BopDataset, instance: Instance, estimate: PoseEstimate) -> PoseShown:
-    """Show an estimate beside the truth: of copies that look alike the one nearest to it."""
-    model, truth = dataset.objects[instance.object_id], instance.camera_from_model
-    if (pose := estimate.camera_from_model) is not None:
-        truth = nearest_copy(pose, truth, symmetry_transforms(model.symmetries), model.symmetries)
-    return PoseShown(
-        input=dataset.view(instance).input,
-        estimate=estimate,
-        model=model,
-        image=None if instance.rgb is None else read_image(instance.rgb),
-        truth=truth,
-    )

@@ -18,7 +18,7 @@ from depthpose.core.errors import InputError
 from depthpose.core.files import read_depth_png
 from depthpose.core.rigid import Rigid
 from depthpose.core.run import find_rank
-from depthpose.pose.datasets import Instance, open_bop
+from depthpose.pose.datasets import BopDataset, Instance, open_bop
 from depthpose.pose.estimator.find import explained_mask, nothing_found
 from depthpose.pose.estimator.inputs import AnyInput
 from depthpose.pose.predictions import (
@@ -47,11 +47,6 @@ def find_all(method: PoseMethod, inputs: OneObjectOptions, out: Path) -> int:
         objects = (object_named(inputs.object, method),)
     if method.find is None:
         raise InputError("--depth without --mask: these weights need masked views; give --mask")
-    if method.settings["estimate"]["register_refused"]:
-        raise InputError(
-            "--register-refused: without a mask the object is searched for and may not be there, "
-            "and nothing is registered then; omit it, or give --mask"
-        )
     if find_rank().world > 1:
         raise InputError("--depth without --mask is done by one process; give --mask, or start one")
     depth, unit = Path(inputs.depth), inputs.unit
@@ -71,23 +66,18 @@ def find_all(method: PoseMethod, inputs: OneObjectOptions, out: Path) -> int:
     for job in tqdm(jobs, disable=None, unit=" images"):
         own = [p for p in left if pose_predict.is_result_of(p.estimate.name, job.name)]
         left = [p for p in left if p not in own]
-        here = own or _find(method, job, objects)
-        results += [(one, explained_job(job, one.estimate, method)) for one in here]
+        view = None if own else job.read()
+        if isinstance(view, PoseEstimate):  # that says why it cannot be read
+            own = [Prediction(estimate=view)]
+        elif view is not None:
+            found = method.find(view, objects) or [nothing_found(view, ", ".join(objects))]
+            own = [Prediction(estimate=one) for one in found]
+        results += [(one, explained_job(job, one.estimate, method)) for one in own]
         write_predictions(out, [*(prediction for prediction, _ in results), *left])
     pose_predict.claim(out, settings, [job for _, job in results], depth, pose_predict.is_result_of)
     answered = [pair for pair in results if pair[0].estimate.is_posed]
     pose_predict.write_files([p for p, _ in answered], [job for _, job in answered], out, method)
     return pose_predict.say_result([prediction for prediction, _ in results], out)
-
-
-def _find(method: PoseMethod, job: Job[Any], objects: tuple[str, ...]) -> list[Prediction]:
-    """Search one image; what cannot be read, or shows nothing, has one prediction too."""
-    assert method.find is not None
-    view = job.read()
-    if isinstance(view, PoseEstimate):  # that says why it cannot be read
-        return [Prediction(estimate=view)]
-    answers = method.find(view, objects) or [nothing_found(view, ", ".join(objects))]
-    return [Prediction(estimate=one) for one in answers]
 
 
 def explained_job(job: Job[Any], estimate: PoseEstimate, method: PoseMethod) -> Job[Any]:
@@ -120,9 +110,7 @@ def track_folder(method: PoseMethod, frames: SequenceOptions, out: Path) -> int:
     if frames.first is not None:
         settings |= {"first": named_file(frames.first)}
     pose_predict.claim(out, settings, jobs, frames.cloud or frames.depth or out)
-    predictions = _kept(_followed(method, jobs, name, start), out)
-    code = pose_predict.finish(predictions, _explained(predictions, jobs, method), out, method)
-    return _say_kinds(predictions, code)
+    return _finish(method, _followed(method, jobs, name, start), jobs, out)
 
 
 def track_bop(method: PoseMethod, frames: SequenceOptions, out: Path) -> int:
@@ -142,11 +130,7 @@ def track_bop(method: PoseMethod, frames: SequenceOptions, out: Path) -> int:
     ]
     jobs = [job for _, own in sequences for job in own]
     coming = (one for name, own in sequences for one in _followed(method, own, name))
-    predictions = _kept(coming, out)
-    code = pose_predict.finish(
-        predictions, _explained(predictions, jobs, method), out, method, dataset
-    )
-    return _say_kinds(predictions, code)
+    return _finish(method, coming, jobs, out, dataset)
 
 
 def _frame_job(instance: Instance, name: str) -> Job[Any]:
@@ -162,10 +146,17 @@ def _frame_job(instance: Instance, name: str) -> Job[Any]:
     return pose_inputs.input_job(instance.name, name, read, place_of(instance))
 
 
-def _kept(coming: Iterable[Prediction], out: Path) -> list[Prediction]:
-    """Take predictions as they come; they are written where the work is interrupted, too.
+def _finish(
+    method: PoseMethod,
+    coming: Iterable[Prediction],
+    jobs: Sequence[Job[Any]],
+    out: Path,
+    dataset: BopDataset | None = None,
+) -> int:
+    """Take predictions as they come, write their files, and print what became of the frames.
 
-    What an earlier run found of frames that this one did not reach stays in the file.
+    They are written where the work is interrupted, too; what an earlier run found of frames that
+    this one did not reach stays in the file.
     """
     left = kept_predictions(out)
     predictions: list[Prediction] = []
@@ -178,7 +169,12 @@ def _kept(coming: Iterable[Prediction], out: Path) -> list[Prediction]:
         if predictions:
             others = [p for p in left if p.estimate.name not in names]
             write_predictions(out, [*predictions, *others])
-    return predictions
+    pairs = zip(predictions, jobs, strict=True)
+    explained = [explained_job(job, prediction.estimate, method) for prediction, job in pairs]
+    code = pose_predict.finish(predictions, explained, out, method, dataset)
+    kinds = Counter(p.estimate.tracking for p in predictions if p.estimate.tracking is not None)
+    print(", ".join(f"{kinds[kind]} {kind}" for kind in ("tracked", "found", "lost")))
+    return code
 
 
 def _followed(
@@ -204,18 +200,3 @@ def _followed(
         skipped.clear()
     for one in skipped:
         yield Prediction(estimate=one, place=places[one.name])
-
-
-def _explained(
-    predictions: Sequence[Prediction], jobs: Sequence[Job[Any]], method: PoseMethod
-) -> list[Job[Any]]:
-    """Give of each frame what the pose explains."""
-    pairs = zip(predictions, jobs, strict=True)
-    return [explained_job(job, prediction.estimate, method) for prediction, job in pairs]
-
-
-def _say_kinds(predictions: list[Prediction], code: int) -> int:
-    """Print what became of the frames; give the exit code."""
-    kinds = Counter(p.estimate.tracking for p in predictions if p.estimate.tracking is not None)
-    print(", ".join(f"{kinds[kind]} {kind}" for kind in ("tracked", "found", "lost")))
-    return code

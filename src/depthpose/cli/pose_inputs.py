@@ -106,12 +106,19 @@ def view_jobs(
         raise InputError(
             f"{mask}: no mask called {lost[0]!r}; a mask has the name of its depth image"
         )
-    jobs = [
-        input_job(p.stem + end, object,
-                  partial(view_input, p, one, camera, object, p.stem + end, unit),
-                  source=(p, masks[p.stem]))
-        for p in depths for end, one in _masks_of(masks[p.stem]).items()
-    ]  # fmt: skip
+    jobs: list[Job[Any]] = []
+    for path in depths:
+        own: dict[str, AnyMask] = {"": masks[path.stem]}
+        with suppress(InputError):  # it will be said where the mask is read
+            labels = read_labels(masks[path.stem])
+            numbers = labels[labels != 0].unique().tolist()
+            runs = {k: encode_rle(labels == k)[0] for k in numbers if len(numbers) > 1}
+            size = list(labels.shape)
+            own = {f"_{k}": {"size": size, "counts": list(r)} for k, r in runs.items()} or own
+        for end, one in own.items():
+            name = path.stem + end
+            read = partial(view_input, path, one, camera, object, name, unit)
+            jobs.append(input_job(name, object, read, source=(path, masks[path.stem])))
     twice = [name for name, count in Counter(job.name for job in jobs).items() if count > 1]
     if twice:
         raise InputError(
@@ -119,18 +126,6 @@ def view_jobs(
             "number of its mask; rename the other"
         )
     return jobs
-
-
-def _masks_of(path: Path) -> dict[str, AnyMask]:
-    """Give the mask of each object that a picture numbers, by what its name ends in."""
-    with suppress(InputError):  # it will be said where the mask is read
-        labels = read_labels(path)
-        numbers = labels[labels != 0].unique().tolist()
-        if len(numbers) > 1:
-            runs = {f"_{k}": encode_rle(labels == k) for k in numbers}
-            size = list(labels.shape)
-            return {end: {"size": size, "counts": list(r[0])} for end, r in runs.items()}
-    return {"": path}
 
 
 def frame_jobs(

@@ -47,7 +47,7 @@ def find_masks(
     kinds: Sequence[str], dataset: datasets.BopDataset, out: Path, device: str = "cpu"
 ) -> list[Masks]:
     """Understand ``truth``, ``predicted``, files of BOP detections and segmentation weights."""
-    paths = [_path_of(kind) for kind in kinds]
+    paths = [mask_path(kind) for kind in kinds]
     names = _names_of(kinds, paths)
     masks: list[Masks] = []
     for kind, path, name in zip(kinds, paths, names, strict=True):
@@ -75,13 +75,8 @@ def find_masks(
     return masks
 
 
-def mask_files(kinds: Sequence[str]) -> list[str]:
-    """Name masks as :func:`find_masks` takes them; files by what they hold."""
-    paths = [(kind, _path_of(kind)) for kind in kinds]
-    return [kind if path is None else named_file(path) for kind, path in paths]
-
-
-def _path_of(kind: str) -> Path | None:
+def mask_path(kind: str) -> Path | None:
+    """Give the file of a kind of masks as :func:`find_masks` takes it; None where it is a word."""
     if kind in ("truth", "predicted"):
         return None
     return Path(kind) if kind.endswith(".json") else find_weights(kind)
@@ -119,7 +114,24 @@ def _segmented(
     Other objects or images may be asked for next time: what is there stays, what lacks is added.
     """
     segmenter = Segmenter.load(path, device)
-    numbers = _numbers_of(segmenter, dataset, path)
+    names = datasets.object_names(dataset.folder)
+    by_name = {name: number for number, name in names.items()}
+    own = dict(zip(segmenter.weights.objects, segmenter.weights.numbers, strict=True))
+    numbers = {
+        name: by_name.get(name, number)
+        for name, number in own.items()
+        if name in by_name or names.get(number) not in own
+    }
+    wanted = {instance.object_id for instance in dataset.instances}
+    lost = sorted(wanted - set(numbers.values()))
+    if len(lost) == len(wanted):
+        theirs = ", ".join(f"{name} ({number})" for name, number in own.items())
+        raise InputError(
+            f"{path}: segments {theirs}, but {dataset.folder} shows objects {lost}; give weights "
+            "of its objects"
+        )
+    if lost:
+        print(f"{path}: segments no objects {lost}; each is missing", file=sys.stderr)
     home = out / "detections" / name
     claim_folder(home, {"weights_sha256": file_sha256(path), **of_dataset(dataset)})
     file, record = home.parent / f"{name}.json", home / "images.json"
@@ -133,57 +145,31 @@ def _segmented(
     images = {(i.scene_id, i.image_id): i for i in dataset.instances}
     left = [images[place] for place in sorted(images.keys() - done)]
     if left:
-        known += _detect(segmenter, left, numbers)
-        datasets.write_detections(file, known)
-        places = sorted(done | images.keys())
-        write_json(record, [{"scene_id": scene, "im_id": image} for scene, image in places])
-    return known
-
-
-def _numbers_of(segmenter: Segmenter, dataset: datasets.BopDataset, path: Path) -> dict[str, int]:
-    """Find what a data set numbers each object of the weights: by its name, else by its number."""
-    names = datasets.object_names(dataset.folder)
-    by_name = {name: number for number, name in names.items()}
-    own = dict(zip(segmenter.weights.objects, segmenter.weights.numbers, strict=True))
-    numbers = {
-        name: by_name.get(name, number)
-        for name, number in own.items()
-        if name in by_name or names.get(number) not in own
-    }
-    wanted = {instance.object_id for instance in dataset.instances}
-    lost = sorted(wanted - set(numbers.values()))
-    if len(lost) == len(wanted):
-        known = ", ".join(f"{name} ({number})" for name, number in own.items())
-        raise InputError(
-            f"{path}: segments {known}, but {dataset.folder} shows objects {lost}; give weights "
-            "of its objects"
-        )
-    if lost:
-        print(f"{path}: segments no objects {lost}; each is missing", file=sys.stderr)
-    return numbers
-
-
-def _detect(
-    segmenter: Segmenter, images: Sequence[datasets.Instance], numbers: Mapping[str, int]
-) -> Iterable[datasets.Detection]:
-    """Segment each picture once; what it took is its time."""
-    for shown in tqdm(images, "segmentation", disable=None, unit=" images"):
-        if shown.rgb is None:
-            raise InputError(f"{shown.name}: has no picture, and a segmentation needs pictures")
-        start = perf_counter()
-        objects = segmenter.segment(read_image(shown.rgb))
-        spent_s = perf_counter() - start
-        for name in [name for name in objects.masks if name in numbers]:
-            pairs = zip(objects.masks[name], objects.scores[name].tolist(), strict=True)
-            for mask, score in pairs:
-                yield datasets.Detection(
+        for shown in tqdm(left, "segmentation", disable=None, unit=" images"):
+            if shown.rgb is None:
+                raise InputError(f"{shown.name}: has no picture, and a segmentation needs pictures")
+            start = perf_counter()
+            objects = segmenter.segment(read_image(shown.rgb))
+            spent_s = perf_counter() - start
+            known += [
+                datasets.Detection(
                     scene_id=shown.scene_id,
                     image_id=shown.image_id,
-                    object_id=numbers[name],
+                    object_id=numbers[object],
                     score=score,
                     segmentation=datasets.encode_rle(mask),
                     seconds=spent_s,
                 )
+                for object in objects.masks
+                if object in numbers
+                for mask, score in zip(
+                    objects.masks[object], objects.scores[object].tolist(), strict=True
+                )
+            ]
+        datasets.write_detections(file, known)
+        places = sorted(done | images.keys())
+        write_json(record, [{"scene_id": scene, "im_id": image} for scene, image in places])
+    return known
 
 
 def distinct_names(files: Sequence[tuple[Path | None, str]]) -> list[str]:
@@ -357,15 +343,6 @@ def source_of(
     config: EstimateConfig,
 ) -> MethodSource:
     """Say what the options of a command make an estimator from."""
-    if register.method == "network" and register.cad:
-        raise InputError(
-            "--cad: weights know their own objects; add --method register, or train weights of "
-            "this part by 'depthpose pose train --cad'"
-        )
-    if register.cad_unit and not register.cad:
-        raise InputError("--cad-unit is the unit of --cad, and no CAD file is given; leave it out")
-    if register.cad and dataset.bop is not None:
-        raise InputError("--cad: the models of --bop are taken; leave --cad out")
     # The unit of clouds is not that of CAD files that have their own.
     has_own = all(Path(path).suffix.lower() in FIXED_UNITS for path in register.cad)
     cad_unit = register.cad_unit or (None if has_own else unit)

@@ -1,6 +1,5 @@
 """Options that several pose commands take: each is declared, and described, once."""
 
-from collections.abc import Mapping
 from pathlib import Path
 from typing import Literal
 
@@ -33,19 +32,7 @@ class PoseDataOptions:
 
     @property
     def folder(self) -> Path | None:
-        """The one data set that was named, if any."""
-        if self.linemod is not None and self.bop is not None:
-            raise InputError(
-                f"two data sets were named, {self.linemod} and {self.bop}; a table is of one."
-            )
-        if self.linemod is None and self.bop is None:
-            named = [f"--objects {' '.join(self.objects)}"] if self.objects else []
-            named += [f"--split {self.split}"] if self.split != "test" else []
-            if named:
-                raise InputError(
-                    f"{' and '.join(named)}: chooses from a data set, and none is named; give "
-                    "--linemod or --bop, or leave it out"
-                )
+        """The data set that was named, if any."""
         return self.linemod or self.bop
 
 
@@ -115,8 +102,6 @@ class OneObjectOptions:
     @property
     def lens(self) -> Path | float | None:
         """The camera file, or the focal length; None where neither is given."""
-        if self.camera is not None and self.focal_px is not None:
-            raise InputError("--camera and --focal-px are both given; omit one of the two")
         return self.focal_px if self.camera is None else self.camera
 
 
@@ -187,40 +172,6 @@ class RegisterOptions:
     """of the CAD files; as --unit by default, and of GLB metres."""
 
 
-def refuse_mixture(inputs: OneObjectOptions, dataset: DataSetOptions) -> None:
-    """Refuse none of the three kinds of input, or several, and options of another kind."""
-    count = sum(word is not None for word in (inputs.cloud, inputs.depth, dataset.bop))
-    if count != 1:
-        raise InputError(
-            f"{count} of --cloud, --depth and --bop are given; give one: a cloud, a depth image "
-            "with --mask and --camera, or a data set"
-        )
-    beside = {"mask": inputs.mask, "camera": inputs.camera, "focal-px": inputs.focal_px}
-    if dataset.bop is not None:
-        refuse_beside("--bop", {**beside, "unit": inputs.unit})
-    elif dataset != DataSetOptions():
-        raise InputError(
-            "--split, --masks and --targets are of a data set, and --bop names none; the mask of a "
-            "depth image is given by --mask"
-        )
-    elif inputs.cloud is not None:
-        refuse_beside("--cloud", beside)
-
-
-_WHY = {
-    "--bop": "a data set says its cameras and units itself, and its masks are chosen by --masks",
-    "--cloud": "a cloud is of the object alone, in the camera's frame",
-}
-"""What makes other options meaningless beside an input."""
-
-
-def refuse_beside(option: str, others: Mapping[str, object]) -> None:
-    """Refuse options that would be ignored beside an input."""
-    named = " and ".join(f"--{name}" for name, value in others.items() if value is not None)
-    if named:
-        raise InputError(f"{named} beside {option}: {_WHY[option]}; leave {named} out")
-
-
 @group
 class SequenceOptions:
     """The frames, and what is followed in them."""
@@ -247,23 +198,3 @@ class SequenceOptions:
     min_certainty: float = 0.9
     """below it a pose that is found is ambiguous, not ok, and so are those that follow from it."""
     device: Device = "cpu"
-
-    def refuse_unusable(self) -> None:
-        """Refuse none of the three kinds of input, or several, options of others, and processes."""
-        from depthpose.core.run import find_rank
-
-        if sum(place is not None for place in (self.depth, self.cloud, self.bop)) != 1:
-            raise InputError("give one of --depth with --camera, --cloud and --bop")
-        if self.depth is not None and self.camera is None:
-            raise InputError("--depth needs --camera beside it")
-        if self.bop is not None:
-            refuse_beside("--bop", {"camera": self.camera, "unit": self.unit})
-            if self.first is not None:
-                raise InputError(
-                    "--first beside --bop: a data set has many sequences and one pose is given; "
-                    "leave --first out, or give the frames of one sequence by --depth"
-                )
-        if self.cloud is not None:
-            refuse_beside("--cloud", {"camera": self.camera})
-        if find_rank().world > 1:
-            raise InputError("a sequence is followed by one process; start one")

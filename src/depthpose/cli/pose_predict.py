@@ -16,13 +16,13 @@ from scipy.spatial.transform import Rotation
 from tqdm import tqdm
 
 from depthpose.cli import pose_inputs
-from depthpose.cli.engine import EngineOptions, Inputs, say
+from depthpose.cli.engine import EngineOptions, say
 from depthpose.cli.pose_methods import MethodSource, PoseMethod, find_masks, of_dataset
 from depthpose.cli.pose_options import DataSetOptions, OneObjectOptions
 from depthpose.core import run
 from depthpose.core.camera import Camera, camera_of
 from depthpose.core.config import config_to_dict
-from depthpose.core.engine import Files, Function, Item, Sample, is_url, shard_results, stem
+from depthpose.core.engine import Files, Function, Inputs, Item, Sample, is_url, shard_results, stem
 from depthpose.core.errors import InputError
 from depthpose.core.files import (
     cloud_suffixes,
@@ -68,6 +68,9 @@ _SAID = 5
 """Of so many inputs the alternatives are printed; of all they are in poses.json."""
 _MOST_ROWS = 1000
 """Of the answers, in the table of the page."""
+_PRINTED = ("input", "object", "status", "x, y, z [m]", "qx, qy, qz, qw", "fit", "certainty",
+            "identity", "tracking")  # fmt: skip
+"""Columns on the terminal."""
 _FRAME = """camera_from_model: x right, y down, z forward
 certainty: the chance that the pose is right and not one of its alternatives"""
 
@@ -145,7 +148,17 @@ def predict_dataset(
     """Pose the objects of a data set, or one, here or by an engine; give the exit code."""
     assert options.bop is not None
     if engine.is_ray:
-        _refuse_unshared(options.masks, out)
+        if is_url(out):
+            raise InputError(
+                f"--out {out}: poses of a data set come together in poses.json and BOP's csv, "
+                "which need a disk; give a folder, and copy it"
+            )
+        if options.masks not in ("truth", "predicted") and not options.masks.endswith(".json"):
+            raise InputError(
+                f"--masks {options.masks}: workers take masks that are there already; give "
+                "truth, predicted, or a file of BOP detections, such as 'pose evaluate --masks "
+                "WEIGHTS' leaves"
+            )
     method, home = source.build("cpu" if engine.is_ray else None), Path(out)
     dataset = open_bop(options.bop, options.split)
     if options.targets is not None:
@@ -170,7 +183,24 @@ def predict_dataset(
             objects=tuple(sorted({instance.object_id for instance in dataset.instances})),
             batch=batch,
         )
-        predictions = _predict_on_ray(work, jobs, out, settings, engine)
+        inputs = Inputs(items=[Item(job.name, ()) for job in jobs], files=NO_FILES)
+        known: dict[str, Prediction] = {}
+        failed: dict[str, str] = {}
+        for done in engine.run(work, inputs, out, settings):
+            failed |= dict(done.failures)
+            for name, files in shard_results(out, done):
+                known[name] = parse_prediction(json.loads(files[ENDING]), f"{done.shard}: {name}")
+        for job in jobs:
+            if job.name not in known:
+                lost = PoseEstimate(
+                    name=job.name,
+                    object=job.read().object,
+                    status="unreadable",
+                    reason=failed[job.name],
+                )
+                known[job.name] = Prediction(estimate=lost, place=job.place)
+        predictions = [known[job.name] for job in jobs]
+        write_predictions(Path(out), predictions)
     else:
         predictions = predict_all(method, jobs, home, settings, batch, view)
     return 0 if predictions is None else finish(predictions, jobs, home, method, dataset)
@@ -257,7 +287,25 @@ def write_files(
 ) -> None:
     """Write the files of poses, or of a data set's, and the page."""
     if dataset is not None:
-        _write_bop_files(predictions, dataset, out, method)
+        write_bop_results(out / results_name(dataset), predictions)
+        if any(p.estimate.alternatives for p in predictions):
+            write_bop_results(out / alternatives_name(dataset), predictions, with_alternatives=True)
+        image_of = {(i.scene_id, i.image_id): i for i in dataset.instances}
+        posed: dict[tuple[int, int], list[PoseEstimate]] = defaultdict(list)
+        for prediction in predictions:
+            if prediction.place is not None and prediction.estimate.is_posed:
+                posed[prediction.place[:2]].append(prediction.estimate)
+        for image, estimates in posed.items():
+            name = _picture_name(*image)
+            if not is_whole(out, name, [name]):
+                picture = drawn.picture_of(image_of[image])
+                for estimate in estimates:
+                    assert estimate.camera_from_model is not None
+                    model = method.models_by_name[estimate.object]
+                    pose, K = estimate.camera_from_model, image_of[image].K
+                    picture = drawn.draw_pose(picture, pose, model, K)
+                write_image(out / name, picture)
+                note_result(out, name, [out / name])
     for prediction, job in zip(predictions, jobs, strict=True) if dataset is None else ():
         pose = prediction.estimate.camera_from_model
         if pose is None:
@@ -275,31 +323,6 @@ def write_files(
     _write_page(out, predictions, jobs, method, dataset)
 
 
-def _write_bop_files(
-    predictions: list[Prediction], dataset: BopDataset, out: Path, method: PoseMethod
-) -> None:
-    """Write BOP's csv, and a picture SCENE_IMAGE.pose.png of each image."""
-    write_bop_results(out / results_name(dataset), predictions)
-    if any(p.estimate.alternatives for p in predictions):
-        write_bop_results(out / alternatives_name(dataset), predictions, with_alternatives=True)
-    image_of = {(i.scene_id, i.image_id): i for i in dataset.instances}
-    posed: dict[tuple[int, int], list[PoseEstimate]] = defaultdict(list)
-    for prediction in predictions:
-        if prediction.place is not None and prediction.estimate.is_posed:
-            posed[prediction.place[:2]].append(prediction.estimate)
-    for image, estimates in posed.items():
-        name = _picture_name(*image)
-        if not is_whole(out, name, [name]):
-            picture = drawn.picture_of(image_of[image])
-            for estimate in estimates:
-                assert estimate.camera_from_model is not None
-                model = method.models_by_name[estimate.object]
-                pose, K = estimate.camera_from_model, image_of[image].K
-                picture = drawn.draw_pose(picture, pose, model, K)
-            write_image(out / name, picture)
-            note_result(out, name, [out / name])
-
-
 def _picture_name(scene: int, image: int) -> str:
     return f"{scene:06d}_{image:06d}.{PICTURE}"
 
@@ -311,7 +334,18 @@ def say_result(predictions: list[Prediction], out: Path) -> int:
     for estimate in failed:
         print(f"depthpose: failed: {estimate.name}: {estimate.reason}", file=sys.stderr)
     if shown:
-        print(plain_table([_printed_row(estimate) for estimate in shown[:_MOST_SHOWN]]), end="")
+        rows: list[dict[str, Any]] = []
+        for estimate in shown[:_MOST_SHOWN]:
+            row, pose = _row(estimate), estimate.camera_from_model
+            if pose is not None:
+                quaternion = Rotation.from_matrix(pose.R.double()).as_quat()
+                row["x, y, z [m]"] = numbers_text(pose.t_m.tolist())
+                row["qx, qy, qz, qw"] = numbers_text(quaternion.tolist())
+            certain = {
+                key: value for key in ("fit", "certainty") if (value := row[key]) is not None
+            }
+            rows.append(row | {key: f"{value:.3f}" for key, value in certain.items()})
+        print(plain_table(rows, _PRINTED), end="")
         print(_FRAME)
     if len(shown) == 1 and not shown[0].is_ok:
         what = "refused" if shown[0].camera_from_model is None else shown[0].status
@@ -324,29 +358,27 @@ def say_result(predictions: list[Prediction], out: Path) -> int:
     return 1 if failed else 0
 
 
-def _statuses(estimates: Sequence[PoseEstimate]) -> str:
-    counts = Counter(estimate.status for estimate in estimates)
-    return ", ".join(f"{count} {status}" for status, count in sorted(counts.items()))
-
-
-def _printed_row(estimate: PoseEstimate) -> dict[str, Any]:
-    """Say what was found of one input: object, status, translation, quaternion, the answers."""
-    pose, fit = estimate.camera_from_model, estimate.fit
-    certainty, identity = estimate.certainty, estimate.identity
-    place = {} if pose is None else {
-        "x, y, z [m]": numbers_text(pose.t_m.tolist()),
-        "qx, qy, qz, qw": numbers_text(Rotation.from_matrix(pose.R.double()).as_quat().tolist()),
-    }  # fmt: skip
+def _row(estimate: PoseEstimate) -> dict[str, Any]:
+    """Say what was found of one input, as the page and the terminal show it."""
+    pose, fit, identity = estimate.camera_from_model, estimate.fit, estimate.identity
+    place = [None] * 3 if pose is None else pose.t_m.double().tolist()
     return {
         "input": estimate.name,
         "object": estimate.object,
         "status": estimate.status,
-        **place,
-        "fit": None if fit is None else f"{fit.agrees:.3f}",
-        "certainty": None if certainty is None else f"{certainty:.3f}",
-        "identity": None if identity is None else identity.status,
         **({} if estimate.tracking is None else {"tracking": estimate.tracking}),
+        **dict(zip(("x_m", "y_m", "z_m"), place, strict=True)),
+        "fit": None if fit is None else fit.agrees,
+        "identity": None if identity is None else identity.status,
+        "certainty": estimate.certainty,
+        "alternatives": "; ".join(drawn.alternative_lines(estimate)),
+        "reason": estimate.reason,
     }
+
+
+def _statuses(estimates: Sequence[PoseEstimate]) -> str:
+    counts = Counter(estimate.status for estimate in estimates)
+    return ", ".join(f"{count} {status}" for status, count in sorted(counts.items()))
 
 
 def _write_page(
@@ -381,28 +413,11 @@ def _write_page(
     if number > _MOST_ROWS:
         text += f" The table holds the first {_MOST_ROWS}, refusals before answers; all are in "
         text += "poses.json."
-    rows = [_page_row(one) for one in sorted(estimates, key=lambda one: one.is_posed)[:_MOST_ROWS]]
+    rows = [_row(one) for one in sorted(estimates, key=lambda one: one.is_posed)[:_MOST_ROWS]]
     results = Section(title="What was found", text=text, rows=rows)
     title = f"Poses of {number} input{'s' * (number != 1)}"
     write_page(out / _PAGE, title, [results, *sections], run.environment())
     print(f"the page: {out / _PAGE}")
-
-
-def _page_row(estimate: PoseEstimate) -> dict[str, Any]:
-    pose, fit, identity = estimate.camera_from_model, estimate.fit, estimate.identity
-    place = [None] * 3 if pose is None else pose.t_m.double().tolist()
-    return {
-        "input": estimate.name,
-        "object": estimate.object,
-        "status": estimate.status,
-        **({} if estimate.tracking is None else {"tracking": estimate.tracking}),
-        **dict(zip(("x_m", "y_m", "z_m"), place, strict=True)),
-        "fit": None if fit is None else fit.agrees,
-        "identity": None if identity is None else identity.status,
-        "certainty": estimate.certainty,
-        "alternatives": "; ".join(drawn.alternative_lines(estimate)),
-        "reason": estimate.reason,
-    }
 
 
 VIEW_FILES = Files(roles=("depth", "mask"), suffixes=(*LISTED_SUFFIXES, ".json"))
@@ -519,46 +534,3 @@ def predict_on_ray(
     if camera is not None:
         settings |= {"K": camera.K.tolist(), "depth_unit_m": camera.depth_unit_m}
     return say(engine.run(work, inputs, out, settings), out, "inputs")
-
-
-def _refuse_unshared(masks: str, out: str) -> None:
-    """Refuse what the workers cannot share of a data set."""
-    if is_url(out):
-        raise InputError(
-            f"--out {out}: poses of a data set come together in poses.json and BOP's csv, which "
-            "need a disk; give a folder, and copy it"
-        )
-    if masks not in ("truth", "predicted") and not masks.endswith(".json"):
-        raise InputError(
-            f"--masks {masks}: workers take masks that are there already; give truth, predicted, "
-            "or a file of BOP detections, such as 'pose evaluate --masks WEIGHTS' leaves"
-        )
-
-
-def _predict_on_ray(
-    work: BopWork,
-    jobs: Sequence[Job[Any]],
-    out: str,
-    settings: dict[str, Any],
-    engine: EngineOptions,
-) -> list[Prediction]:
-    """Pose the instances of a data set by the workers of an engine, and write ``poses.json``."""
-    inputs = Inputs(items=[Item(job.name, ()) for job in jobs], tars=(), files=NO_FILES)
-    known: dict[str, Prediction] = {}
-    failed: dict[str, str] = {}
-    for done in engine.run(work, inputs, out, settings):
-        failed |= dict(done.failures)
-        for name, files in shard_results(out, done):
-            known[name] = parse_prediction(json.loads(files[ENDING]), f"{done.shard}: {name}")
-    for job in jobs:
-        if job.name not in known:
-            lost = PoseEstimate(
-                name=job.name,
-                object=job.read().object,
-                status="unreadable",
-                reason=failed[job.name],
-            )
-            known[job.name] = Prediction(estimate=lost, place=job.place)
-    predictions = [known[job.name] for job in jobs]
-    write_predictions(Path(out), predictions)
-    return predictions

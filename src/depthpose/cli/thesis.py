@@ -1,15 +1,14 @@
 """``depthpose reproduce ...`` and ``depthpose figure ...``."""
 
 import shlex
-from collections.abc import Mapping, Sequence
-from functools import partial
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal, NamedTuple
 
 import tyro
 
 from depthpose.cli.arguments import NewPath, WeightsName, refuse_below
-from depthpose.cli.depth_options import MatcherOptions, ProtocolOptions, refuse_ignored
+from depthpose.cli.depth_options import MatcherOptions, ProtocolOptions
 from depthpose.cli.pose_options import PoseDataOptions, PoseTableOptions
 from depthpose.core.errors import InputError
 
@@ -66,8 +65,7 @@ def reproduce(
         )
     comparison.refuse_unusable()
     refuse_below(0, "--pictures", pictures, "3")
-    _refuse_rows(published, weights, matcher, beside, train, train_without)
-    refuse_ignored(weights, matching)
+    _refuse_rows(published, weights, matcher, beside)
     dataset = open_frames(kitti, None if split == "all" else split)
 
     def method_of(name: str) -> Method:
@@ -103,19 +101,12 @@ def _refuse_rows(
     weights: Sequence[str],
     matcher: str | None,
     beside: Sequence[str] | None,
-    train: Sequence[Path],
-    train_without: Sequence[str],
 ) -> None:
     """Refuse, before any work, rows that a table does not have, and those that it lacks."""
     if beside is not None and table.with_right:
         raise InputError(
             f"--beside {' '.join(beside)}: adds methods of one image, and table {table.number} is "
             "of pairs; leave it out, or give more --weights"
-        )
-    if train_without and not train:
-        raise InputError(
-            f"--train-without {' '.join(train_without)}: leaves frames out of --train, and none is "
-            "given; give its folders, or leave this out"
         )
     if matcher is not None and not table.with_right:
         raise InputError(
@@ -255,11 +246,6 @@ def table_3_3(
     """
     from depthpose.cli.thesis_pose import reproduce_voting
 
-    if synthetic is not None and data.folder is not None:
-        raise InputError(
-            f"--synthetic {synthetic}: views are rendered where no data set is given, and "
-            f"{data.folder} is; leave one out"
-        )
     number = 40 if synthetic is None else synthetic
     refuse_below(1, "--synthetic", number, "40")
     if not points:
@@ -292,14 +278,10 @@ def figure_3_2(
         number: how many clouds.
         perplexity: of t-SNE.
     """
-    from depthpose.cli.thesis_pose import feature_panels, open_figure, write_figure
+    from depthpose.cli.thesis_pose import feature_panels, write_figure
 
-    net, views = open_figure("3-2", weights, out, data, number, perplexity=perplexity)
-    text = (
-        "Alike features have alike colours (t-SNE to one number for all clouds, Spectral); the "
-        "model is black, each cloud posed on it by the truth."
-    )
-    return write_figure("3-2", text, feature_panels(net, views, perplexity), out, columns=4)
+    how = {"perplexity": perplexity}
+    return write_figure("3-2", weights, data, number, out, feature_panels, columns=4, **how)
 
 
 def figure_3_4(
@@ -323,11 +305,10 @@ def figure_3_4(
         number: how many views are looked at.
         keypoint: only this one, from 0 on.
     """
-    from depthpose.cli.thesis_pose import field_panels, open_figure, write_figure
+    from depthpose.cli.thesis_pose import field_panels, write_figure
 
-    net, views = open_figure("3-4", weights, out, data, number, keypoint=keypoint)
-    text = "Plane of x (right) and y (down); star: true keypoint; cross: voted, by RANSAC."
-    return write_figure("3-4", text, field_panels(net, views, keypoint), out, columns=3)
+    how = {"keypoint": keypoint}
+    return write_figure("3-4", weights, data, number, out, field_panels, columns=3, **how)
 
 
 def figure_3_5(
@@ -345,20 +326,9 @@ def figure_3_5(
         out: folder for the figure.
         number: how many views.
     """
-    from depthpose.cli.thesis_pose import BOXES, box_panels, open_figure, write_figure
+    from depthpose.cli.thesis_pose import box_panels, write_figure
 
-    net, views = open_figure("3-5", weights, out, data, number)
-    return write_figure("3-5", BOXES, box_panels(net, views), out, columns=3)
-
-
-_TRAINED_ON = ("--trained-on", "KITTI raw", "--licence", "not stated; that of KITTI binds")
-_POSE = {
-    "thesis": "pose",
-    "thesis-pointnet": "pointnet",
-    "thesis-depth-image": "depth-image",
-    "thesis-masks": "segmentation",
-}
-"""Configs of chapter 3, the network that each trains, and the name of its weights."""
+    return write_figure("3-5", weights, data, number, out, box_panels, columns=3)
 
 
 class Step(NamedTuple):
@@ -373,6 +343,51 @@ class Step(NamedTuple):
     makes: Path
     of: Sequence[Path] = ()
     is_replaced: bool = False
+
+
+_TRAIN = " --data {data} --device {device} --resume --config {configs}/"
+_TABLE_2 = (
+    " --kitti {data} --split {split} --protocol {protocol} --device {gpu} --out {home}/table-"
+)
+_TABLE_3 = " --linemod {data} --no-icp --masks truth {home}/segmentation/segmentation.safetensors"
+_TABLE_3 += " --device {gpu} --out {home}/table-"
+_GENERATOR, _MATCHER = "view/generator.safetensors", "stereo/matcher.safetensors"
+_POSE, _MASKS = "pose/pose.safetensors", "segmentation/segmentation.safetensors"
+_BASELINES = "pointnet/pointnet.safetensors", "depth-image/depth-image.safetensors"
+_STEPS = {
+    "depth": (
+        (_GENERATOR, "", "depth train view --out {home}/view" + _TRAIN + "depth/view.yaml"),
+        (_MATCHER, "", "depth train stereo --out {home}/stereo" + _TRAIN + "depth/stereo.yaml"),
+        ("apart.safetensors", f"{_GENERATOR} {_MATCHER}",
+         f"weights pack {{home}}/{_GENERATOR} --matcher {{home}}/{_MATCHER} "
+         "--out {home}/apart.safetensors --trained-on {trained_on} --licence {licence}"),
+        ("table-2.1/report.html", "apart.safetensors",
+         "reproduce 2.1 --weights {home}/apart.safetensors" + _TABLE_2 + "2.1"),
+        ("table-2.2/report.html", _MATCHER,
+         f"reproduce 2.2 --weights {{home}}/{_MATCHER}{_TABLE_2}2.2"),
+        ("finetune/fakestereo.safetensors", f"{_GENERATOR} {_MATCHER}",
+         f"depth train finetune --generator {{home}}/{_GENERATOR} --matcher {{home}}/{_MATCHER} "
+         "--out {home}/finetune" + _TRAIN + "depth/finetune.yaml"),
+        ("table-2.3/report.html", "apart.safetensors finetune/fakestereo.safetensors",
+         "reproduce 2.3 --weights {home}/apart.safetensors {home}/finetune/fakestereo.safetensors"
+         + _TABLE_2 + "2.3"),
+    ),
+    "pose": (
+        *((f"{what}/{what}.safetensors", "",
+           f"pose train --what {what} --out {{home}}/{what}{_TRAIN}pose/{config}.yaml")
+          for what, config in (
+              ("pose", "thesis"), ("pointnet", "thesis-pointnet"),
+              ("depth-image", "thesis-depth-image"), ("segmentation", "thesis-masks"))),
+        ("table-3.1/report.html", " ".join([_POSE, *_BASELINES, _MASKS]),
+         f"reproduce 3.1 --weights {{home}}/{_POSE} {{home}}/{_BASELINES[0]} "
+         f"{{home}}/{_BASELINES[1]}{_TABLE_3}3.1"),
+        ("table-3.2/report.html", f"{_POSE} {_MASKS}",
+         f"reproduce 3.2 --weights {{home}}/{_POSE}{_TABLE_3}3.2"),
+        ("table-3.3/report.html", _POSE,
+         f"reproduce 3.3 --weights {{home}}/{_POSE} --linemod {{data}} --out {{home}}/table-3.3"),
+    ),
+}  # fmt: skip
+"""By chapter: the file that each step makes, those that it is made of, and its command."""
 
 
 def reproduce_all(
@@ -405,7 +420,12 @@ def reproduce_all(
         protocol: how depth is compared; eigen-raw is the thesis's.
         device: auto: a GPU where there is one; cpu: none.
     """
-    from depthpose.core.run import find_rank
+    import torch
+
+    from depthpose.cli.depth_evaluate import open_frames
+    from depthpose.core.checkpoint import file_sha256
+    from depthpose.core.run import claim_folder, find_rank
+    from depthpose.pose.datasets import open_bop
 
     if kitti is None and linemod is None:
         raise InputError("there is nothing to reproduce from: give --kitti or --linemod FOLDER.")
@@ -414,61 +434,38 @@ def reproduce_all(
             "'reproduce all' runs its steps one after the other in one process; launch the "
             "trainings that it prints one by one, then run it again"
         )
-    steps: list[Step] = []
-    if kitti is not None:
-        steps += _depth_steps(kitti, configs, out / "depth", device, split, protocol)
+    if kitti is not None:  # read now, not only after days of training
+        open_frames(kitti, None if split == "all" else split)
     if linemod is not None:
-        steps += _pose_steps(linemod, configs, out / "pose", device)
+        print(f"{linemod}: {len(open_bop(linemod, 'test').instances)} instances to test on")
+    is_gpu = device == "auto" and torch.cuda.is_available()
+    steps: list[Step] = []
+    for chapter, data in (("depth", kitti), ("pose", linemod)):
+        if data is None:
+            continue
+        home, commands = out / chapter, [words.split() for _, _, words in _STEPS[chapter]]
+        named = [words[-1] for words in commands if words[-2] == "--config"]
+        files = [name.removeprefix("{configs}/") for name in named]
+        if missing := [name for name in files if not (configs / name).is_file()]:
+            raise InputError(
+                f"{configs}: there is no {missing[0]}; give the folder of the thesis's configs, "
+                "which is in the repository, by --configs"
+            )
+        sums = {name: file_sha256(configs / name) for name in files}
+        how = {"split": split, "protocol": protocol} if chapter == "depth" else {}
+        claim_folder(home, {"data": str(data.resolve()), "configs": sums, **how})
+        values = {
+            "data": data, "home": home, "configs": configs, "device": device,
+            "gpu": "cuda" if is_gpu else "cpu", "split": split, "protocol": protocol,
+            "trained_on": "KITTI raw", "licence": "not stated; that of KITTI binds",
+        }  # fmt: skip
+        for (makes, of, _), words in zip(_STEPS[chapter], commands, strict=True):
+            what = "both in one file" if words[0] == "weights" else f"table {words[1]}"
+            what = f"training by {words[-1].partition('/')[2]}" if "--config" in words else what
+            made_of = [home / name for name in of.split()]
+            filled = [word.format(**values) for word in words]
+            steps.append(Step(what, filled, home / makes, made_of, words[0] == "weights"))
     return walk(steps)
-
-
-def _depth_steps(
-    kitti: Path, configs: Path, home: Path, device: str, split: str, protocol: str
-) -> list[Step]:
-    """List the steps from KITTI to tables 2.1, 2.2 and 2.3."""
-    from depthpose.cli.depth_evaluate import open_frames
-
-    open_frames(kitti, None if split == "all" else split)  # not only after days of training
-    names = [f"depth/{stage}.yaml" for stage in ("view", "stereo", "finetune")]
-    _claim(home, kitti, configs, names, {"split": split, "protocol": protocol})
-    generator, matcher = home / "view/generator.safetensors", home / "stereo/matcher.safetensors"
-    apart, tuned = home / "apart.safetensors", home / "finetune/fakestereo.safetensors"
-    begin = ("--generator", str(generator), "--matcher", str(matcher))
-    pack = ("weights", "pack", str(generator), "--matcher", str(matcher), "--out", str(apart))
-    train = partial(_training, kitti, configs, device)
-    how = ("--kitti", str(kitti), "--split", split, "--protocol", protocol)
-    table = partial(_table, home, device, how)
-    finetune = train("depth/finetune.yaml", ("depth", "train", "finetune", *begin), tuned)
-    return [
-        train("depth/view.yaml", ("depth", "train", "view"), generator),
-        train("depth/stereo.yaml", ("depth", "train", "stereo"), matcher),
-        Step("both in one file", (*pack, *_TRAINED_ON), apart, (generator, matcher), True),
-        table("2.1", (apart,)),
-        table("2.2", (matcher,)),
-        finetune._replace(of=(generator, matcher)),
-        table("2.3", (apart, tuned)),
-    ]
-
-
-def _pose_steps(linemod: Path, configs: Path, home: Path, device: str) -> list[Step]:
-    """List the steps from Linemod_preprocessed to tables 3.1, 3.2 and 3.3."""
-    from depthpose.pose.datasets import open_bop
-
-    dataset = open_bop(linemod, "test")
-    print(f"{linemod}: {len(dataset.instances)} instances to test on")
-    _claim(home, linemod, configs, [f"pose/{name}.yaml" for name in _POSE], {})
-    train, data = partial(_training, linemod, configs, device), ("--linemod", str(linemod))
-    steps = [
-        train(f"pose/{name}.yaml", ("pose", "train", "--what", what),
-              home / f"{what}/{what}.safetensors")
-        for name, what in _POSE.items()
-    ]  # fmt: skip
-    ours, pointnet, depth_image, masks = [step.makes for step in steps]
-    shown = (*data, "--no-icp", "--masks", "truth", str(masks))
-    for number, weights in (("3.1", (ours, pointnet, depth_image)), ("3.2", (ours,))):
-        table = _table(home, device, shown, number, weights)
-        steps.append(table._replace(of=(*weights, masks)))
-    return [*steps, _table(home, device, data, "3.3", (ours,))]
 
 
 def walk(steps: Sequence[Step]) -> int:
@@ -491,42 +488,3 @@ def walk(steps: Sequence[Step]) -> int:
             return own
         code = max(code, own)
     return code
-
-
-def _training(
-    data: Path, configs: Path, device: str, config: str, words: Sequence[str], makes: Path
-) -> Step:
-    """Make the step of a training, which is resumed if it was stopped."""
-    end = ("--config", str(configs / config), "--data", str(data))
-    end += ("--out", str(makes.parent), "--device", device, "--resume")
-    return Step(f"training by {config}", (*words, *end), makes)
-
-
-def _table(
-    home: Path, device: str, words: Sequence[str], number: str, weights: Sequence[Path]
-) -> Step:
-    import torch
-
-    out = home / f"table-{number}"
-    every = ("reproduce", number, *words, "--weights", *map(str, weights), "--out", str(out))
-    if number != "3.3":  # it has no such option
-        is_gpu = device == "auto" and torch.cuda.is_available()
-        every += ("--device", "cuda" if is_gpu else "cpu")
-    return Step(f"table {number}", every, out / "report.html", weights)
-
-
-def _claim(
-    home: Path, data: Path, configs: Path, names: Sequence[str], settings: Mapping[str, str]
-) -> None:
-    """Claim the folder for this data, these configs and this protocol."""
-    from depthpose.core.checkpoint import file_sha256
-    from depthpose.core.run import claim_folder
-
-    missing = [name for name in names if not (configs / name).is_file()]
-    if missing:
-        raise InputError(
-            f"{configs}: there is no {missing[0]}; give the folder of the thesis's configs, which "
-            "is in the repository, by --configs"
-        )
-    files = {name: file_sha256(configs / name) for name in names}
-    claim_folder(home, {"data": str(data.resolve()), "configs": files, **settings})

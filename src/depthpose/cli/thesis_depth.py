@@ -68,9 +68,24 @@ def reproduce_table(
         "eigen-test. Difference: ours minus the thesis's own row. A row of another protocol, or of "
         "other frames (see the columns), does not compare with the printed ones."
     )
+    sections: list[Section] = []
+    for _, method in methods if pictures > 0 else ():
+        folder, home = (out / kind / method.name for kind in ("predictions", "figures"))
+        frames = [f for f in dataset.frames if has_prediction(folder, f.name)]
+        shown = replace(dataset, frames=frames)
+        for place, index in enumerate(choose_frames(shown, (), pictures)):
+            pair, lidar_m = shown.read_input(index), _lidar(frames[index])
+            estimate = read_estimate(folder, pair.name, pair.camera)
+            figures = {"2-5": draw_figure_2_5(pair, lidar_m, estimate)}
+            if place == 0 and estimate.right is not None and pair.right is not None:
+                stereo = method.net.estimate_pair(pair)
+                figures["2-1"] = draw_figure_2_1(pair, lidar_m, estimate, stereo)
+            for figure, panels in figures.items():
+                title = f"Figure {figure}: {method.name}, {pair.name}"
+                sections.append(_panel_section(title, panels, home / f"{figure}_{pair.name}"))
     sections = [
         Section(title="Published rows, ours, and difference", text=how, rows=rows),
-        *_picture_sections(dataset, [method for _, method in methods], pictures, out),
+        *sections,
         *evaluation.write_details(measured, out),
         Section(title="Settings", rows=[row for _, m in methods for row in _setting_rows(m)]),
     ]
@@ -133,28 +148,6 @@ def write_figure(
     captions = "; ".join(panel.caption for panel in columns[0])
     print(f"{path}: each column from top to bottom: {captions}. {DEPTH_SCALE}; see the bar below.")
     return 0
-
-
-def _picture_sections(
-    dataset: Dataset, methods: Sequence[Method], number: int, out: Path
-) -> list[Section]:
-    """Draw some frames of each method, from the files that were measured."""
-    sections: list[Section] = []
-    for method in methods if number > 0 else ():
-        folder, home = (out / kind / method.name for kind in ("predictions", "figures"))
-        frames = [f for f in dataset.frames if has_prediction(folder, f.name)]
-        shown = replace(dataset, frames=frames)
-        for place, index in enumerate(choose_frames(shown, (), number)):
-            pair, lidar_m = shown.read_input(index), _lidar(frames[index])
-            estimate = read_estimate(folder, pair.name, pair.camera)
-            figures = {"2-5": draw_figure_2_5(pair, lidar_m, estimate)}
-            if place == 0 and estimate.right is not None and pair.right is not None:
-                stereo = method.net.estimate_pair(pair)
-                figures["2-1"] = draw_figure_2_1(pair, lidar_m, estimate, stereo)
-            for figure, panels in figures.items():
-                title = f"Figure {figure}: {method.name}, {pair.name}"
-                sections.append(_panel_section(title, panels, home / f"{figure}_{pair.name}"))
-    return sections
 
 
 def _panel_section(title: str, panels: Sequence[Drawing], home: Path) -> Section:

@@ -1,6 +1,6 @@
 """Tables and figures of chapter 3: predict, measure, join with the printed rows, draw, write."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -38,7 +38,13 @@ _SYNTHETIC_SEED = 3303
 _MOST_POINTS = 4000
 """Of a t-SNE: its time grows with the square."""
 _SCAN_POINTS = 1500
-BOXES = "Boxes: truth green and dashed, estimate blue and solid."
+_TEXTS = {
+    "3-2": "Alike features have alike colours (t-SNE to one number for all clouds, Spectral); the "
+    "model is black, each cloud posed on it by the truth.",
+    "3-4": "Plane of x (right) and y (down); star: true keypoint; cross: voted, by RANSAC.",
+    "3-5": "Boxes: truth green and dashed, estimate blue and solid.",
+}
+"""What stands below each figure."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -119,7 +125,12 @@ def reproduce_by_object(
         **_settings_of(dataset),
         "rule": config_to_dict(how.evaluation),
         "methods": {method.name: dict(method.settings) for method in methods},
-        "masks": pose_methods.mask_files(how.masks) if methods else [],
+        "masks": [
+            kind
+            if (path := pose_methods.mask_path(kind)) is None
+            else pose_methods.named_file(path)
+            for kind in (how.masks if methods else ())
+        ],
         "csv": [pose_methods.named_file(path) for path in csv],
     }
     results = (*page.table_files("rows", "all", "instances", "risk"), "report.md", "report.html")
@@ -133,10 +144,30 @@ def reproduce_by_object(
     rows, every = [row.columns() for row in joined], pose_evaluate.table_of(measured.rows)
     page.write_table(out, rows)
     page.write_table(out, every, name="all")
+    sections: list[Section] = []
+    for folder in folders:
+        known = {p.estimate.name: p.estimate for p in read_predictions(folder)}
+        pictures: list[Picture] = []
+        for instance in (
+            dataset.instances[i] for i in page.spread_evenly(len(dataset), how.pictures)
+        ):
+            estimate = known.get(instance.name)
+            if estimate is None:  # of a detection: it bears no instance's name
+                continue
+            picture, K = close_up(picture_of(instance), read_instance_mask(instance), instance.K)
+            true, found = instance.camera_from_model, estimate.camera_from_model
+            model = dataset.objects[instance.object_id]
+            path = out / "figures" / folder.name / f"3-5_{instance.name}.jpg"
+            write_image(path, draw_boxes(picture, true, found, model, K))
+            caption = instance.name if estimate.is_posed else f"{instance.name}: {estimate.reason}"
+            pictures.append(Picture(path=path, caption=caption))
+        if pictures:
+            title = f"Figure 3-5: {folder.name}"
+            sections.append(Section(title=title, text=_TEXTS["3-5"], pictures=pictures))
     sections = [
         Section(title="Percent by object", text=f"{_HOW} {_DIFFERENCES[number]}", rows=rows),
         Section(title="All numbers", text=pose_evaluate.HOW, rows=every),
-        *_picture_sections(dataset, folders, how.pictures, out),
+        *sections,
         *pose_evaluate.write_details(measured, out),
     ]
     title = f"{pose_tables.TITLES[number]}, on {dataset.folder.resolve().name}"
@@ -159,31 +190,6 @@ _DIFFERENCES = {
         "The thesis's own row is not in the text that is at hand."
     ),
 }
-
-
-def _picture_sections(
-    dataset: BopDataset, folders: Sequence[Path], number: int, out: Path
-) -> list[Section]:
-    """Draw some instances of each set of predictions, from the files that were measured."""
-    sections: list[Section] = []
-    for folder in folders:
-        known = {p.estimate.name: p.estimate for p in read_predictions(folder)}
-        pictures: list[Picture] = []
-        for instance in (dataset.instances[i] for i in page.spread_evenly(len(dataset), number)):
-            estimate = known.get(instance.name)
-            if estimate is None:  # of a detection: it bears no instance's name
-                continue
-            picture, K = close_up(picture_of(instance), read_instance_mask(instance), instance.K)
-            true, found = instance.camera_from_model, estimate.camera_from_model
-            model = dataset.objects[instance.object_id]
-            path = out / "figures" / folder.name / f"3-5_{instance.name}.jpg"
-            write_image(path, draw_boxes(picture, true, found, model, K))
-            caption = instance.name if estimate.is_posed else f"{instance.name}: {estimate.reason}"
-            pictures.append(Picture(path=path, caption=caption))
-        if pictures:
-            title = f"Figure 3-5: {folder.name}"
-            sections.append(Section(title=title, text=BOXES, pictures=pictures))
-    return sections
 
 
 def reproduce_voting(
@@ -215,30 +221,32 @@ def reproduce_voting(
     return 0
 
 
-def open_figure(
-    figure: str, weights: str, out: Path, data: PoseDataOptions, number: int, **settings: object
-) -> tuple[GeoPoseNet, Views]:
-    """Load the weights, open the views, and claim the folder for a figure by these and settings."""
+def write_figure(
+    figure: str,
+    weights: str,
+    data: PoseDataOptions,
+    number: int,
+    out: Path,
+    draw: Callable[..., list[Drawing]],
+    columns: int,
+    **settings: object,
+) -> int:
+    """Draw panels of so many views by the network and the settings; write them, figure and page."""
     refuse_below(1, "--number", number, "4")
     net = GeoPoseNet.load(weights)
     views = open_views(net, data, number, number)
     own = {"command": f"figure {figure}", "weights_sha256": file_sha256(find_weights(weights))}
-    files = (f"figure-{figure}.png", "panels", "report.html")
-    claim_folder(out, {**own, **views.settings, **settings}, files)
-    return net, views
-
-
-def write_figure(number: str, text: str, panels: Sequence[Drawing], out: Path, columns: int) -> int:
-    """Write the figure, each panel, and a page that explains it, to a folder that is claimed."""
-    path = out / f"figure-{number}.png"
+    path, text = out / f"figure-{figure}.png", _TEXTS[figure]
+    claim_folder(out, {**own, **views.settings, **settings}, (path.name, "panels", "report.html"))
+    panels = draw(net, views, **settings)
     write_image(path, pose_figures.arrange_grid([panel.image for panel in panels], columns))
     pictures: list[Picture] = []
     for k, panel in enumerate(panels, 1):
-        file = out / "panels" / f"{number}.{k}.png"
+        file = out / "panels" / f"{figure}.{k}.png"
         write_image(file, panel.image)
         pictures.append(Picture(path=file, caption=panel.caption))
     section = Section(title="Panels", text=text, pictures=pictures)
-    page.write_page(out / "report.html", f"Figure {number}", [section], environment())
+    page.write_page(out / "report.html", f"Figure {figure}", [section], environment())
     print(f"{path}: {'; '.join(panel.caption for panel in panels)}. {text}")
     return 0
 

@@ -157,25 +157,6 @@ _LOOKED_AT = 20
 """Held-out pairs of a folder, by default."""
 
 
-def _with_pairs(config: Any, data: tuple[str, ...], held_out: tuple[str, ...]) -> Any:  # noqa: ANN401
-    """Give the config of a training with these folders."""
-    from depthpose.depth.config import PairsConfig
-    from depthpose.depth.train.config import AdaptTraining, StereoTraining
-
-    pairs = changed(config.pairs, folders=data or None)
-    if not held_out:
-        return replace(config, pairs=pairs)
-    if isinstance(config, AdaptTraining):
-        raise InputError(
-            "--held-out has no meaning for 'adapt', which holds out a share of the pairs itself "
-            "(validation_share in the config); leave it out."
-        )
-    # A generator is measured at the focal length of its own rig, whatever it is trained on.
-    focal_px = pairs.focal_px if isinstance(config, StereoTraining) else None
-    own = PairsConfig(focal_px=focal_px, truth=pairs.truth, limit=_LOOKED_AT)
-    return replace(config, pairs=pairs, held_out=replace(config.held_out or own, folders=held_out))
-
-
 def train_depth(
     stage: tyro.conf.Positional[Literal["view", "select", "stereo", "adapt", "finetune"]],
     out: NewPath,
@@ -220,10 +201,23 @@ def train_depth(
         encoder: select, stereo with a light network: weights of the encoder to begin with, of
             'depthpose weights import efficientnet-lite0'.
     """
+    from depthpose.depth.config import PairsConfig
     from depthpose.depth.train import STAGES
 
     kind, run_stage = STAGES[stage]
-    settings = _with_pairs(training.read(config, kind), data, held_out)
+    settings = training.read(config, kind)
+    settings = replace(settings, pairs=changed(settings.pairs, folders=data or None))
+    if held_out and stage == "adapt":
+        raise InputError(
+            "--held-out has no meaning for 'adapt', which holds out a share of the pairs itself "
+            "(validation_share in the config); leave it out."
+        )
+    if held_out:
+        # A generator is measured at the focal length of its own rig, whatever it is trained on.
+        focal_px = settings.pairs.focal_px if stage == "stereo" else None
+        own = PairsConfig(focal_px=focal_px, truth=settings.pairs.truth, limit=_LOOKED_AT)
+        pairs = replace(settings.held_out or own, folders=held_out)
+        settings = replace(settings, held_out=pairs)
     known = {field.name for field in fields(settings)}
     known -= set() if stage == "finetune" else {"generator", "matcher"}
     begin = {"generator": generator, "matcher": matcher, "start": start, "encoder": encoder}
@@ -286,43 +280,6 @@ _NOTHING = "nothing"
 """The word for no weights."""
 
 
-def _with_object(
-    config: Any,  # noqa: ANN401  of any of the networks
-    cad: tuple[str, ...],
-    unit: Unit | None,
-    symmetries: str | None,
-    data: str | None,
-    start: str | None,
-) -> Any:  # noqa: ANN401
-    """Give the config of a training with this object, data set and start."""
-    from depthpose.pose.train import SegmentationTraining
-
-    if start is not None:
-        config = replace(config, start=None if start == _NOTHING else start)
-    if cad or unit or symmetries:
-        if isinstance(config, SegmentationTraining):
-            raise InputError(
-                "--cad has no meaning for 'segmentation', which learns from pictures: make them by "
-                "'depthpose data make objects --cad ...' and name the folder in the config"
-            )
-        is_found = None if symmetries is None else symmetries == "found"
-        models = changed(config.models, cad=cad or None, unit=unit, with_found_symmetries=is_found)
-        if cad:  # they take the place of a data set's models
-            models = replace(models, bop=None, objects=(), parts=())
-        config = replace(config, models=models)
-    if data is None:
-        return config
-    changes = {}
-    if (models := getattr(config, "models", None)) is not None and models.bop is not None:
-        changes["models"] = replace(models, bop=data)
-    for part in ("frames", "images", "held_out"):
-        if hasattr(getattr(config, part, None), "folder"):
-            changes[part] = replace(getattr(config, part), folder=data)
-    if not changes:
-        raise InputError(f"--data {data}: the config learns from no data set; see --cad and --what")
-    return replace(config, **changes)
-
-
 def train_pose(
     out: NewPath,
     config: Path | None = None,
@@ -370,5 +327,29 @@ def train_pose(
     settings = training.read(config, kind, default=default, workers=workers)
     for path in cad:
         unit_of(path, unit)
-    settings = _with_object(settings, cad, unit, symmetries, data, start)
+    if start is not None:
+        settings = replace(settings, start=None if start == _NOTHING else start)
+    if cad or unit or symmetries:
+        if what == "segmentation":
+            raise InputError(
+                "--cad has no meaning for 'segmentation', which learns from pictures: make them by "
+                "'depthpose data make objects --cad ...' and name the folder in the config"
+            )
+        found = None if symmetries is None else symmetries == "found"
+        own = {"cad": cad or None, "unit": unit, "with_found_symmetries": found}
+        models = changed(settings.models, **own)
+        if cad:  # they take the place of a data set's models
+            models = replace(models, bop=None, objects=(), parts=())
+        settings = replace(settings, models=models)
+    if data is not None:
+        changes = {}
+        if (models := getattr(settings, "models", None)) is not None and models.bop is not None:
+            changes["models"] = replace(models, bop=data)
+        for part in ("frames", "images", "held_out"):
+            if hasattr(getattr(settings, part, None), "folder"):
+                changes[part] = replace(getattr(settings, part), folder=data)
+        if not changes:
+            said = "the config learns from no data set; see --cad and --what"
+            raise InputError(f"--data {data}: {said}")
+        settings = replace(settings, **changes)
     return training.run(run_stage, settings, out, with_messages=True)

@@ -164,25 +164,6 @@ class Limit:
     flips: float = 0.0
 
 
-def measure_differences(
-    path: Path, cases: Iterable[Case], limits: Mapping[str, Limit]
-) -> list[Row]:
-    """Run a file with onnxruntime on each case, on the CPU, and give a row for each output."""
-    session = import_module("onnxruntime").InferenceSession(
-        str(path), providers=["CPUExecutionProvider"]
-    )
-    rows: list[Row] = []
-    for case in cases:
-        answers = session.run(list(case.expected), dict(case.inputs))
-        for (name, expected), answer in zip(case.expected.items(), answers, strict=True):
-            if name in case.where and answer.shape == expected.shape:
-                answer, expected = (m[case.where[name]] for m in (answer, expected))  # noqa: PLW2901
-            rows.append(_row(case.name, name, answer, expected, limits[name]))
-    if not rows:
-        raise InputError("no output is compared with PyTorch's; nothing is written. Name a case.")
-    return rows
-
-
 def _row(case: str, output: str, answer: np.ndarray, expected: np.ndarray, limit: Limit) -> Row:
     answer, expected = (np.asarray(values, np.float64) for values in (answer, expected))
     is_nan = np.isnan(answer), np.isnan(expected)
@@ -248,7 +229,20 @@ def freeze(path: Path, export: Export) -> list[Row]:
         part.touch()  # a place that cannot be written is refused before the work
         facts = {**export.facts, "depthpose": version("depthpose")}
         onnx.save(export.graph().model(facts), str(part))
-        rows = measure_differences(part, export.cases(), export.limits)
+        session = import_module("onnxruntime").InferenceSession(
+            str(part), providers=["CPUExecutionProvider"]
+        )
+        rows: list[Row] = []
+        for case in export.cases():
+            answers = session.run(list(case.expected), dict(case.inputs))
+            for (name, expected), answer in zip(case.expected.items(), answers, strict=True):
+                if name in case.where and answer.shape == expected.shape:
+                    answer, expected = (m[case.where[name]] for m in (answer, expected))  # noqa: PLW2901
+                rows.append(_row(case.name, name, answer, expected, export.limits[name]))
+        if not rows:
+            raise InputError(
+                "no output is compared with PyTorch's; nothing is written. Name a case."
+            )
         for row in rows:
             difference, limit = row[f"{row['limited']} difference"], row["limit"]
             if not difference <= limit:  # pyright: ignore[reportOperatorIssue]  NaN fails too

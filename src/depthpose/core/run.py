@@ -95,20 +95,6 @@ def lock_folder(record: Path, *, is_shared: bool, timeout_s: float = 10.0) -> bo
             return held is None and not is_shared
 
 
-def rewrite_record(record: Path, content: Mapping[str, Any]) -> None:
-    """Write other content into the record of a folder that this process has locked.
-
-    Through the file that holds the lock: another one would let it go when it is closed.
-    """
-    file = _locks.get(record.resolve())
-    if file is None:  # no locks here
-        write_json(record, content)
-        return
-    data = f"{json.dumps(content, indent=2)}\n".encode()
-    os.pwrite(file, data, 0)
-    os.ftruncate(file, len(data))
-
-
 def _close(record: Path, file: int) -> None:
     _locks.pop(record.resolve(), None)
     os.close(file)
@@ -260,7 +246,14 @@ def claim_folder(
             lock_folder(record, is_shared=False)
             if _is_empty(folder):
                 (folder / _SOURCES).unlink(missing_ok=True)
-                rewrite_record(record, run_record(settings))
+                file, content = _locks.get(record.resolve()), run_record(settings)
+                if file is None:  # no locks here
+                    write_json(record, content)
+                    return
+                # Through the file that holds the lock, which closing another would let go.
+                data = f"{json.dumps(content, indent=2)}\n".encode()
+                os.pwrite(file, data, 0)
+                os.ftruncate(file, len(data))
                 return
     refuse_other_settings(folder, _read_record(record), settings, remedy)
     if lock_folder(record, is_shared=not is_alone):

@@ -55,8 +55,15 @@ class RowDepthBaseline:
         weight = np.zeros((_ROWS, _STEPS))
         for index in progress(range(len(dataset))):
             known_m, rig = read_known_depth(dataset, index), dataset.read_rig(index)
-            if known_m is not None and rig is not None:
-                weight += _count(known_m, rig)
+            if known_m is None or rig is None:
+                continue
+            true_m = known_m.double().numpy()
+            v, u = np.nonzero((true_m > _NEAR_M) & (true_m < _FAR_M))
+            true_m = true_m[v, u]
+            row = np.rint(_canonical_row(v, rig)).astype(np.int64).clip(0, _ROWS - 1)
+            step = np.log(true_m / _NEAR_M) / np.log(_FAR_M / _NEAR_M) * _STEPS
+            flat, share = row * _STEPS + step.astype(np.int64), 1 / true_m / max(len(true_m), 1)
+            weight += np.bincount(flat, share, _ROWS * _STEPS).reshape(_ROWS, _STEPS)
         has_truth = weight.sum(1) > 0
         if not has_truth.any():
             raise _nothing_to_learn(dataset)
@@ -145,18 +152,6 @@ def fill_by_pyramid(values: Float[Tensor, "h w"]) -> Float[Tensor, "h w"]:
     coarse = fill_by_pyramid(torch.where(count > 0, total / count, torch.nan))
     fine = coarse.repeat_interleave(2, 0).repeat_interleave(2, 1)
     return torch.where(is_known, values, fine[: values.shape[0], : values.shape[1]])
-
-
-def _count(known_m: Float[Tensor, "h w"], rig: StereoRig) -> Float64[np.ndarray, "rows steps"]:
-    """Weigh each true depth of a frame by its inverse, into its row and its step of depth."""
-    true_m = known_m.double().numpy()
-    v, u = np.nonzero((true_m > _NEAR_M) & (true_m < _FAR_M))
-    true_m = true_m[v, u]
-    row = np.rint(_canonical_row(v, rig)).astype(np.int64).clip(0, _ROWS - 1)
-    step = np.log(true_m / _NEAR_M) / np.log(_FAR_M / _NEAR_M) * _STEPS
-    flat = row * _STEPS + step.astype(np.int64)
-    share = 1 / true_m / max(len(true_m), 1)
-    return np.bincount(flat, share, _ROWS * _STEPS).reshape(_ROWS, _STEPS)
 
 
 def _canonical_row(v: np.ndarray, camera: Camera) -> Float64[np.ndarray, " rows"]:

@@ -1,7 +1,7 @@
 """Settings of depth: frozen dataclasses that refuse unusable values."""
 
 from dataclasses import dataclass, field
-from typing import ClassVar, Literal
+from typing import Annotated, ClassVar, Literal, get_origin, get_type_hints
 
 from depthpose.core.config import check_settings
 from depthpose.core.errors import InputError
@@ -14,109 +14,113 @@ _MOST_FOCAL_PX = 20_000
 """Of pairs: several times that of the largest images; beyond it they would fill the memory."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class DegradeConfig:
-    """Augmentation of the input image alone, for transfer from synthetic to real images."""
+class Settings:
+    """Base of settings whose types say ranges: ``Annotated[int, "[16, inf)", 16]``.
 
-    colour: float = 0.35
-    """Exposure, contrast, saturation, gamma are scaled by 1 +- this, channels by a third of it."""
+    A number behind the range is one that the setting is a multiple of.
 
-    hue_share: float = 0.1
-    """Share of images whose channels are exchanged."""
-
-    haze_share: float = 0.2
-    """Share of images with haze."""
-
-    glare_share: float = 0.2
-    """Share of images with a light in them."""
-
-    blur_share: float = 0.4
-    """Share of images that are blurred."""
-
-    blur_px: float = 1.2
-    """Largest standard deviation of the blur [px]."""
-
-    noise_share: float = 0.6
-    """Share of images with noise."""
-
-    noise: float = 0.04
-    """Largest standard deviation of the noise; white is 1."""
-
-    jpeg_share: float = 0.3
-    """Share of images that go through JPEG."""
+    Raises:
+        InputError: a number that breaks these rules, or a word that the type does not know.
+    """
 
     def __post_init__(self) -> None:
-        shares = [f"{name}_share" for name in ("hue", "haze", "glare", "blur", "noise", "jpeg")]
-        check_settings(
-            self,
-            **dict.fromkeys(shares, "[0, 1]"),
-            colour="[0, 1)",
-            blur_px="[0.3, inf)",
-            noise="[0, inf)",
-        )
+        hints = get_type_hints(type(self), include_extras=True)
+        rules = {n: h.__metadata__ for n, h in hints.items() if get_origin(h) is Annotated}
+        check_settings(self, **{name: rule[0] for name, rule in rules.items()})
+        for name, (_, *steps) in rules.items():
+            value = getattr(self, name)
+            if any(value % step for step in steps):
+                raise InputError(
+                    f"{name} must be a multiple of {steps[0]}, got {value}; take "
+                    f"{getattr(type(self), name)}"
+                )
 
 
 @dataclass(frozen=True, kw_only=True)
-class AugmentConfig:
+class DegradeConfig(Settings):
+    """Augmentation of the input image alone, for transfer from synthetic to real images."""
+
+    colour: Annotated[float, "[0, 1)"] = 0.35
+    """Exposure, contrast, saturation, gamma are scaled by 1 +- this, channels by a third of it."""
+
+    hue_share: Annotated[float, "[0, 1]"] = 0.1
+    """Share of images whose channels are exchanged."""
+
+    haze_share: Annotated[float, "[0, 1]"] = 0.2
+    """Share of images with haze."""
+
+    glare_share: Annotated[float, "[0, 1]"] = 0.2
+    """Share of images with a light in them."""
+
+    blur_share: Annotated[float, "[0, 1]"] = 0.4
+    """Share of images that are blurred."""
+
+    blur_px: Annotated[float, "[0.3, inf)"] = 1.2
+    """Largest standard deviation of the blur [px]."""
+
+    noise_share: Annotated[float, "[0, 1]"] = 0.6
+    """Share of images with noise."""
+
+    noise: Annotated[float, "[0, inf)"] = 0.04
+    """Largest standard deviation of the noise; white is 1."""
+
+    jpeg_share: Annotated[float, "[0, 1]"] = 0.3
+    """Share of images that go through JPEG."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class AugmentConfig(Settings):
     """Random changes of a training pair (thesis, 2.4.2)."""
 
-    crop_px: tuple[int, int] = (256, 512)
+    crop_px: Annotated[tuple[int, int], "[1, inf)"] = (256, 512)
     """Rows and columns of the crop."""
 
-    scale: tuple[float, float] = (1.0, 1.0)
+    scale: Annotated[tuple[float, float], "(0, 10]"] = (1.0, 1.0)
     """Range of the size at which a pair is seen. A pair smaller than the crop is padded with black
     on the right and below, never enlarged: another size would be another focal length."""
 
-    jitter: float = 0.2
+    jitter: Annotated[float, "[0, 1)"] = 0.2
     """Brightness, contrast and saturation are each scaled by 1 +- this."""
 
-    flip_share: float = 0.5
+    flip_share: Annotated[float, "[0, 1]"] = 0.5
     """Share of pairs that are mirrored and swapped."""
 
     per_view: DegradeConfig | None = None
     """Changes of each view on its own, as two cameras differ; None: none."""
 
-    erased_share: float = 0.0
+    erased_share: Annotated[float, "[0, 1]"] = 0.0
     """Share of pairs with a patch of the right view in one colour: what only one camera sees."""
 
-    misaligned_px: float = 0.0
+    misaligned_px: Annotated[float, "[0, 10)"] = 0.0
     """Rows of the right view are off by up to this at either border, as after a worn calibration
     [px]."""
 
     def __post_init__(self) -> None:
-        check_settings(
-            self,
-            crop_px="[1, inf)",
-            scale="(0, 10]",
-            jitter="[0, 1)",
-            flip_share="[0, 1]",
-            erased_share="[0, 1]",
-            misaligned_px="[0, 10)",
-        )
+        super().__post_init__()
         if self.scale[0] > self.scale[1]:
             raise InputError(f"scale must be a range, the lower end first, got {self.scale}")
 
 
 @dataclass(frozen=True, kw_only=True)
-class StreetsConfig:
+class StreetsConfig(Settings):
     """What synthetic street scenes are like."""
 
-    seed: int = 0
+    seed: Annotated[int, "[0, inf)"] = 0
     """Another seed, other streets."""
 
-    frames: int = 100_000
+    frames: Annotated[int, "[0, inf)"] = 100_000
     """How many there are; each is rendered on demand."""
 
     rigs: Literal["kitti", "varied"] = "kitti"
     """kitti: the five rigs of KITTI's recording days; varied: half of the frames with others."""
 
-    scale: float = 1.0
+    scale: Annotated[float, "[0.02, 4]"] = 1.0
     """Size of the pictures as a share of the rig's: 0.5 draws half as many rows and columns."""
 
-    crop: tuple[int, int] | None = None
+    crop: Annotated[tuple[int, int] | None, "[1, inf)"] = None
     """Rows and columns of a window that alone is drawn, somewhere in each frame; None: all."""
 
-    clutter_share: float = 0.0
+    clutter_share: Annotated[float, "[0, 1]"] = 0.0
     """Share of the scenes that are clutter in place of a street: shapes of all kinds and surfaces,
     floating before a ground, a wall or in a box."""
 
@@ -126,27 +130,15 @@ class StreetsConfig:
     with_lidar: bool = False
     """Scan each scene with a LiDAR too."""
 
-    jpeg_share: float = 0.5
+    jpeg_share: Annotated[float, "[0, 1]"] = 0.5
     """Share of the pairs that went through JPEG."""
 
-    rectification_error_px: float = 0.1
+    rectification_error_px: Annotated[float, "[0, 10)"] = 0.1
     """Deviation of the rows by which the right view is off, as after a real calibration."""
-
-    def __post_init__(self) -> None:
-        check_settings(
-            self,
-            seed="[0, inf)",
-            frames="[0, inf)",
-            scale="[0.02, 4]",
-            crop="[1, inf)",
-            jpeg_share="[0, 1]",
-            clutter_share="[0, 1]",
-            rectification_error_px="[0, 10)",
-        )
 
 
 @dataclass(frozen=True, kw_only=True)
-class PairsConfig:
+class PairsConfig(Settings):
     """Which pairs a training sees, and how."""
 
     folders: tuple[str, ...] = ()
@@ -166,10 +158,10 @@ class PairsConfig:
     None: the one kind that a folder has; a folder with several is refused. Streets that are
     rendered while training have exact disparity, whatever this says."""
 
-    limit: int | None = None
+    limit: Annotated[int | None, "[1, inf)"] = None
     """Take so many pairs of each folder, and so many streets, spread evenly; None: all."""
 
-    focal_px: float | None = None
+    focal_px: Annotated[float | None, f"(0, {_MOST_FOCAL_PX}]"] = None
     """Bring every pair to this focal length [px]; None: that of the generator, or sizes as they
     are. Before ``augment.scale``: give the largest focal length that it is to make, and scales up
     to 1, and no image is enlarged."""
@@ -179,9 +171,6 @@ class PairsConfig:
 
     augment: AugmentConfig = field(default_factory=AugmentConfig)
     """Random changes."""
-
-    def __post_init__(self) -> None:
-        check_settings(self, limit="[1, inf)", focal_px=f"(0, {_MOST_FOCAL_PX}]")
 
 
 BaselineName = Literal["rows", "nearest"]
@@ -193,41 +182,30 @@ Speed = Literal["quick", "fine"]
 
 
 @dataclass(frozen=True, kw_only=True)
-class PSMNetConfig:
+class PSMNetConfig(Settings):
     """Size and conventions of the stereo network (Chang and Chen 2018, stacked hourglass)."""
 
-    max_disparity_px: int = 192
-    """Disparities 0 .. max_disparity_px - 1 are considered; a multiple of 16."""
+    max_disparity_px: Annotated[int, "[16, 16384]", 16] = 192
+    """Disparities 0 .. max_disparity_px - 1 are considered; a multiple of 16, for the volume is a
+    quarter of it and is halved twice."""
 
-    width: int = 32
+    width: Annotated[int, "[1, inf)"] = 32
     """Channels of the first layers; all others are 1, 2 or 4 times it."""
 
-    blocks: tuple[int, int, int, int] = (3, 16, 3, 3)
+    blocks: Annotated[tuple[int, int, int, int], "[1, 1000]"] = (3, 16, 3, 3)
     """Residual blocks of the four stages of the feature extractor."""
 
-    pools: tuple[int, ...] = (64, 32, 16, 8)
+    pools: Annotated[tuple[int, ...], "[1, 1024]"] = (64, 32, 16, 8)
     """Windows of the spatial pyramid, in quarter-size pixels, largest first."""
 
     align_corners: bool = True
     """How the weights expect maps to be enlarged: True for the published KITTI 2015 weights."""
 
-    work_focal_px: float | None = None
+    work_focal_px: Annotated[float | None, "(0, inf)"] = None
     """Pairs are brought to this focal length before matching [px]; None: matched as they are."""
 
     def __post_init__(self) -> None:
-        check_settings(
-            self,
-            max_disparity_px="[16, 16384]",
-            width="[1, inf)",
-            blocks="[1, 1000]",
-            pools="[1, 1024]",
-            work_focal_px="(0, inf)",
-        )
-        if self.max_disparity_px % 16:
-            raise InputError(
-                "max_disparity_px must be a multiple of 16 (the volume is a quarter of it and is "
-                f"halved twice), got {self.max_disparity_px}; take 192"
-            )
+        super().__post_init__()
         if not 1 <= len(self.pools) <= 16:
             raise InputError(f"pools must hold 1 to 16 windows, got {self.pools}")
 
@@ -241,25 +219,25 @@ class PSMNetConfig:
 
 
 @dataclass(frozen=True, kw_only=True)
-class LightConfig:
+class LightConfig(Settings):
     """Size and conventions of the light stereo network."""
 
-    max_disparity_px: int = 192
-    """Disparities below this are considered; a multiple of 32."""
+    max_disparity_px: Annotated[int, "[32, 16384]", 32] = 192
+    """Disparities below this are considered; a multiple of 32: the volume is halved three times."""
 
-    groups: int = 8
+    groups: Annotated[int, "[1, inf)"] = 8
     """Channels of the correlation volume: features are correlated in so many groups."""
 
-    width: int = 48
+    width: Annotated[int, "[1, inf)"] = 48
     """Features of each pixel that is matched; a multiple of ``groups``."""
 
-    volume_widths: tuple[int, int, int, int] = (8, 16, 32, 48)
+    volume_widths: Annotated[tuple[int, int, int, int], "[1, inf)"] = (8, 16, 32, 48)
     """Channels of the volume at 1/4, 1/8, 1/16 and 1/32 of the image's sides."""
 
     candidates: int = 2
     """Disparities of the highest scores whose mean is the answer."""
 
-    encoder_width: float = 1.0
+    encoder_width: Annotated[float, "(0, 4]"] = 1.0
     """Channels of the encoder as a share of EfficientNet-Lite0's; ImageNet's weights need 1."""
 
     with_agreement: bool = False
@@ -274,25 +252,12 @@ class LightConfig:
     """Whether the sky is a class of its own, beside the disparities; weights without it can be
     trained on with it."""
 
-    work_focal_px: float | None = None
+    work_focal_px: Annotated[float | None, "(0, inf)"] = None
     """Pairs are brought to this focal length before matching [px]; None: matched as they are."""
 
     def __post_init__(self) -> None:
-        check_settings(
-            self,
-            max_disparity_px="[32, 16384]",
-            groups="[1, inf)",
-            width="[1, inf)",
-            volume_widths="[1, inf)",
-            candidates=f"[1, {self.max_disparity_px // 4}]",
-            encoder_width="(0, 4]",
-            work_focal_px="(0, inf)",
-        )
-        if self.max_disparity_px % 32:
-            raise InputError(
-                "max_disparity_px must be a multiple of 32 (the volume is a quarter of it and is "
-                f"halved three times), got {self.max_disparity_px}; take 192"
-            )
+        super().__post_init__()
+        check_settings(self, candidates=f"[1, {self.max_disparity_px // 4}]")
         if self.width % self.groups:
             raise InputError(
                 f"width must be a multiple of groups, got width={self.width} and "
@@ -307,7 +272,7 @@ class LightConfig:
 
 
 @dataclass(frozen=True, kw_only=True)
-class MatcherConfig:
+class MatcherConfig(Settings):
     """How a stereo network is run on a pair of images."""
 
     device: str = "cpu"
@@ -325,13 +290,13 @@ class MatcherConfig:
     the disparities: for KITTI 3 to 5 times the time. Weights that match pairs as they are have one
     speed."""
 
-    max_memory_bytes: int | None = None
+    max_memory_bytes: Annotated[int | None, "[1, inf)"] = None
     """Bound on the memory of activations, exact (no tiles); None: no bound."""
 
-    tile_px: tuple[int, int] | None = None
+    tile_px: Annotated[tuple[int, int] | None, "[1, inf)"] = None
     """Rows and columns of tiles that are matched one by one and blended: approximate."""
 
-    tile_overlap_px: int = 64
+    tile_overlap_px: Annotated[int, "[0, inf)"] = 64
     """Overlap of neighbouring tiles, beyond the disparity range to the left of each."""
 
     with_confidence: bool = True
@@ -343,27 +308,22 @@ class MatcherConfig:
     with_compile: bool = False
     """Compile the feature extractor: pays after many images of one size."""
 
-    def __post_init__(self) -> None:
-        check_settings(
-            self, max_memory_bytes="[1, inf)", tile_px="[1, inf)", tile_overlap_px="[0, inf)"
-        )
-
 
 @dataclass(frozen=True, kw_only=True)
-class SGBMConfig:
+class SGBMConfig(Settings):
     """Semi-global block matching of OpenCV (Hirschmueller 2008), with the settings of our tables.
 
     The names follow OpenCV's documentation of ``StereoSGBM``.
     """
 
-    num_disparities: int = 192
+    num_disparities: Annotated[int, "[16, inf)", 16] = 192
     """Disparities 0 .. num_disparities - 1 are considered; a multiple of 16.
 
     Where the principal points of a rig differ by ``d = cx_right - cx_left``, its views are first
     moved by this difference, so disparities grow by d: for a range given of the images as they are
     (Middlebury's ``ndisp``), take d more."""
 
-    block_size: int = 3
+    block_size: Annotated[int, "[1, inf)"] = 3
     """Side of the matched window [px], odd."""
 
     p1: int = 8 * 3 * 9
@@ -394,11 +354,7 @@ class SGBMConfig:
     """Fill pixels without an answer as the KITTI devkit does: the smaller neighbour of the row."""
 
     def __post_init__(self) -> None:
-        check_settings(self, num_disparities="[16, inf)", block_size="[1, inf)")
-        if self.num_disparities % 16:
-            raise InputError(
-                f"num_disparities must be a multiple of 16, got {self.num_disparities}"
-            )
+        super().__post_init__()
         if self.block_size % 2 == 0:
             raise InputError(f"block_size must be odd, got {self.block_size}")
         if not 0 < self.p1 < self.p2:
@@ -412,17 +368,17 @@ generator drew. joined: the mean of both, weighed by their confidence."""
 
 
 @dataclass(frozen=True, kw_only=True)
-class GeneratorConfig:
+class GeneratorConfig(Settings):
     """Size and conventions of the view synthesis network (pix2pix's U-Net), and its rig.
 
     The generator draws what one rig would have seen, so its weights carry that rig: an image is
     brought to ``virtual_focal_px`` before, and depth is virtual focal x baseline / disparity.
     """
 
-    width: int = 64
+    width: Annotated[int, "[1, inf)"] = 64
     """Channels of the first level; they double up to eight times it."""
 
-    levels: int = 8
+    levels: Annotated[int, "[2, 10]"] = 8
     """Halvings down to the bottleneck; image sides are padded to multiples of 2 ** levels."""
 
     with_dropout: bool = True
@@ -431,21 +387,12 @@ class GeneratorConfig:
     test_mode: Literal["running", "batch"] = "running"
     """Norm at test: the statistics of training without dropout, or the image's own with it."""
 
-    virtual_focal_px: float = 493.0
+    virtual_focal_px: Annotated[float, "(0, inf)"] = 493.0
     """Focal length of the imitated rig [px]; by default that at which KITTI's images have the 256
     rows of the thesis's crops: with fewer of the rows a network must guess the horizon."""
 
-    virtual_baseline_m: float = 0.5327
+    virtual_baseline_m: Annotated[float, "(0, inf)"] = 0.5327
     """Baseline of the imitated rig [m]."""
-
-    def __post_init__(self) -> None:
-        check_settings(
-            self,
-            width="[1, inf)",
-            levels="[2, 10]",
-            virtual_focal_px="(0, inf)",
-            virtual_baseline_m="(0, inf)",
-        )
 
     @property
     def widths(self) -> tuple[int, ...]:
@@ -462,7 +409,7 @@ class GeneratorConfig:
 
 
 @dataclass(frozen=True, kw_only=True)
-class SelectionConfig:
+class SelectionConfig(Settings):
     """Size and conventions of the network that selects the right view, and its rig.
 
     It answers, for each pixel of either view, a distribution over disparities and the sky. As with
@@ -472,16 +419,16 @@ class SelectionConfig:
     encoder_kind: Literal["efficientnet-lite0"] = "efficientnet-lite0"
     """The encoder."""
 
-    encoder_width: float = 1.0
+    encoder_width: Annotated[float, "(0, 4]"] = 1.0
     """Channels of the encoder as a share of Lite0's; ImageNet's weights are of 1."""
 
-    widths: tuple[int, int, int, int] = (96, 64, 48, 32)
+    widths: Annotated[tuple[int, int, int, int], "[1, inf)"] = (96, 64, 48, 32)
     """Channels of the decoder at strides 16, 8, 4 and 2."""
 
-    planes: int = 32
+    planes: Annotated[int, "[2, inf)"] = 32
     """Disparities that are distinguished, evenly spaced in their logarithm."""
 
-    disparity_px: tuple[float, float] = (1.2, 88.0)
+    disparity_px: Annotated[tuple[float, float], "(0, inf)"] = (1.2, 88.0)
     """Least and largest disparity at the virtual rig [px]: 165 to 2.25 m at the default rig."""
 
     answer: Answer = "own"
@@ -490,32 +437,22 @@ class SelectionConfig:
     with_street: bool = False
     """Has a layer that reads off the encoder's features how surely the image shows a street."""
 
-    least_confidence: float = 0.0
+    least_confidence: Annotated[float, "[0, 1)"] = 0.0
     """Probability of a street below which an image is out of distribution, or mean confidence where
     ``with_street`` is false; 0: not checked. 'depthpose depth calibrate' finds it."""
 
-    virtual_focal_px: float = 372.0
+    virtual_focal_px: Annotated[float, "(0, inf)"] = 372.0
     """Focal length of the imitated rig [px]: half of KITTI's, as wide as 640 columns."""
 
-    virtual_baseline_m: float = 0.5327
+    virtual_baseline_m: Annotated[float, "(0, inf)"] = 0.5327
     """Baseline of the imitated rig [m]."""
 
-    scales: tuple[float, ...] = (1.0, 1.4)
+    scales: Annotated[tuple[float, ...], "[1, 4]"] = (1.0, 1.4)
     """Sizes at which the fine speed looks at an image, as shares of that at the virtual focal
     length, 1 the first; it averages. The quick speed looks once."""
 
     def __post_init__(self) -> None:
-        check_settings(
-            self,
-            encoder_width="(0, 4]",
-            widths="[1, inf)",
-            planes="[2, inf)",
-            disparity_px="(0, inf)",
-            least_confidence="[0, 1)",
-            virtual_focal_px="(0, inf)",
-            virtual_baseline_m="(0, inf)",
-            scales="[1, 4]",
-        )
+        super().__post_init__()
         if self.disparity_px[0] >= self.disparity_px[1]:
             raise InputError(
                 f"disparity_px must be a range, the smaller end first, got {self.disparity_px}"

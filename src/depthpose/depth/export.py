@@ -15,7 +15,7 @@ from depthpose.core.errors import InputError, refuse_unknown
 from depthpose.core.export import Case, Export, Graph, Limit, Value, network_model
 from depthpose.depth.config import MatcherConfig
 from depthpose.depth.estimator import FakestereoNet
-from depthpose.depth.estimator.rig import SKY_M
+from depthpose.depth.estimator.net import SKY_M
 from depthpose.depth.stereo import LightStereo, PSMNet, StereoNetwork, make_matcher
 from depthpose.depth.stereo.light import LEAST_PX
 from depthpose.depth.stereo.matcher import IMAGENET_MEAN, IMAGENET_STD, NetworkConfig
@@ -100,7 +100,8 @@ class DynamicPSMNet(nn.Module):
     ) -> tuple[Float[Tensor, "b h w"], Float[Tensor, "b h w"]]:
         """Give disparity [px] and confidence of normalised images."""
         near, far = self.network.features(left), self.network.features(right)
-        cost = self.network.costs_of(gathered_volume(near, far, self.bins))[-1][:, 0]
+        cost0 = self.network.aggregate(gathered_volume(near, far, self.bins))
+        cost = self.network.refine(cost0)[-1][:, 0]
         align = self.network.config.align_corners
         wide = F.interpolate(cost, left.shape[-2:], mode="bilinear", align_corners=align)
         probability = F.conv2d(wide, self.matrix).softmax(1)
@@ -209,23 +210,20 @@ def _drawn(left: Value, generator: Generator) -> _Drawn:
     own = _Maps(log_px.op("Exp") * scale, confidence, is_sky.cast(np.float32))
     right_px = right_sky.op("Greater", _HALF).op("Where", _0, right_log_px.op("Exp") * scale)
     street = outputs[5] if generator.config.with_street else None
-    return _Drawn(_shifted(left, right_px), own, street)
-
-
-def _shifted(left: Value, shift_px: Value) -> Value:
-    """Look the left image up at ``x + shift``; beyond the border the border repeats."""
-    size, graph = _size_of(left), left.graph
+    # Look the left image up at ``x + shift``; beyond the border the border repeats.
+    graph = left.graph
     row, column = (  # 0, 1, ... of each side
         graph.op("Range", 0, side(size).op("Squeeze", [0]), 1).cast(np.float32)
         for side in (_rows, _columns)
     )
     y, x = (
         (values * _2 + _1) / side(size).cast(np.float32) - _1
-        for values, side in ((row.op("Unsqueeze", [1]), _rows), (shift_px + column, _columns))
+        for values, side in ((row.op("Unsqueeze", [1]), _rows), (right_px + column, _columns))
     )
-    parts = (v.op("Expand", shift_px.op("Shape")).op("Unsqueeze", [-1]) for v in (x, y))
+    parts = (v.op("Expand", right_px.op("Shape")).op("Unsqueeze", [-1]) for v in (x, y))
     grid = graph.op("Concat", *parts, axis=-1)
-    return left.op("GridSample", grid, mode="bilinear", padding_mode="border", align_corners=0)
+    right = left.op("GridSample", grid, mode="bilinear", padding_mode="border", align_corners=0)
+    return _Drawn(right, own, street)
 
 
 def _near_multiple(size: Value, multiple: int) -> Value:

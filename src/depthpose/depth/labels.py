@@ -4,17 +4,18 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
+from typing import Annotated
 
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
 from depthpose.core.camera import StereoRig
-from depthpose.core.config import check_settings
 from depthpose.core.errors import InputError
 from depthpose.core.files import atomic_write, write_disparity_png, write_image
 from depthpose.core.files.text import read_text
 from depthpose.core.run import claim_folder, claim_names, is_whole, note_result
+from depthpose.depth.config import Settings
 from depthpose.depth.datasets import Dataset
 from depthpose.depth.disparity import left_right_difference_px
 from depthpose.depth.estimator import FakestereoNet, refuse_unrectified
@@ -22,23 +23,15 @@ from depthpose.depth.types import DepthEstimate, StereoInput
 
 
 @dataclass(frozen=True, kw_only=True)
-class LabelConfig:
+class LabelConfig(Settings):
     """What counts as known."""
 
-    largest_difference_px: float = 1.0
+    largest_difference_px: Annotated[float, "[0, inf)"] = 1.0
     """Of the disparities of both views at one point, at the image's size."""
-    largest_share: float = 0.03
+    largest_share: Annotated[float, "[0, inf)"] = 0.03
     """Of the same in shares of the disparity; the larger of both limits holds."""
-    least_confidence: float = 0.5
+    least_confidence: Annotated[float, "[0, 1)"] = 0.5
     """Of the matcher in the left view, where it has one."""
-
-    def __post_init__(self) -> None:
-        check_settings(
-            self,
-            largest_difference_px="[0, inf)",
-            largest_share="[0, inf)",
-            least_confidence="[0, 1)",
-        )
 
 
 def label_pairs(

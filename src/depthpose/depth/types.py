@@ -5,10 +5,10 @@ from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Float64
 from torch import Tensor
 
-from depthpose.core.camera import Camera, back_project
+from depthpose.core.camera import Camera, StereoRig, back_project
 from depthpose.core.errors import InputError
 from depthpose.core.files import Cloud
 
@@ -56,6 +56,31 @@ class StereoSample:
 
     input: StereoInput
     truth: StereoTruth
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class RawFrame:
+    """A pair with its truth, as it is written to a folder of KITTI's raw layout.
+
+    Attributes:
+        left: left image (camera 2).
+        right: right image (camera 3).
+        rig: the cameras.
+        disparity_px: of the left image; NaN where unknown.
+        occluded: left pixels that the right view does not show.
+        is_sky: left pixels that show the sky.
+        lidar_points: one LiDAR scan, x forward, y left, z up [m] and reflectance; or None.
+        camera_from_velodyne: from the LiDAR to the left camera.
+    """
+
+    left: Float[Tensor, "3 h w"]
+    right: Float[Tensor, "3 h w"]
+    rig: StereoRig
+    disparity_px: Float[Tensor, "h w"]
+    occluded: Bool[Tensor, "h w"]
+    is_sky: Bool[Tensor, "h w"]
+    lidar_points: Float[Tensor, "n 4"] | None
+    camera_from_velodyne: Float64[np.ndarray, "4 4"]
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

@@ -69,7 +69,21 @@ def read_depth_weights(
             f"{', '.join(map(repr, _networks()))} or {BOTH!r}."
         )
     is_both = checkpoint.kind == BOTH
-    parts = _split(checkpoint, str(path)) if is_both else {checkpoint.kind: checkpoint}
+    parts = {} if is_both else {checkpoint.kind: checkpoint}
+    for kind in _networks() if is_both else ():  # its config names the networks
+        if kind not in checkpoint.config:
+            continue
+        config, prefix = checkpoint.config[kind], f"{kind}."
+        if not isinstance(config, Mapping):
+            raise InputError(f"{path}: its config has no {kind!r}; the file is damaged.")
+        given = checkpoint.state.items()
+        state = {key.removeprefix(prefix): t for key, t in given if key.startswith(prefix)}
+        parts[kind] = Checkpoint(kind=kind, config=config, state=state)
+    if is_both and not (set(parts) & set(_GENERATORS) and set(parts) & set(MATCHERS)):
+        raise InputError(
+            f"{path}: its config names {sorted(checkpoint.config)}, but it should hold a "
+            "generator and a matcher; the file is damaged."
+        )
     built: dict[str, Any] = {}
     for kind, part in parts.items():  # a generator first
         if use == "pairs" and is_both and kind in _GENERATORS:
@@ -142,21 +156,3 @@ def write_depth_weights(
         kind, config = BOTH, configs
         state = {f"{name}.{key}": t for name, s in states.items() for key, t in s.items()}
     save_checkpoint(path, Checkpoint(kind=kind, config=config, state=state, facts=facts))
-
-
-def _split(checkpoint: Checkpoint, source: str) -> dict[str, Checkpoint]:
-    """Take a file of several networks apart; its config names them."""
-    parts: dict[str, Checkpoint] = {}
-    for kind in (kind for kind in _networks() if kind in checkpoint.config):
-        given, prefix = checkpoint.state.items(), f"{kind}."
-        state = {key.removeprefix(prefix): t for key, t in given if key.startswith(prefix)}
-        config = checkpoint.config[kind]
-        if not isinstance(config, Mapping):
-            raise InputError(f"{source}: its config has no {kind!r}; the file is damaged.")
-        parts[kind] = Checkpoint(kind=kind, config=config, state=state)
-    if not set(parts) & set(_GENERATORS) or not set(parts) & set(MATCHERS):
-        raise InputError(
-            f"{source}: its config names {sorted(checkpoint.config)}, but it should hold a "
-            "generator and a matcher; the file is damaged."
-        )
-    return parts

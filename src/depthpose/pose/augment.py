@@ -146,7 +146,14 @@ def measure(
     white = noise * smooth_noise((depth_m.shape[0], depth_m.shape[1]), width_px, generator)
     if kind == "structured light":
         is_lost |= _is_shadowed(depth_m, focal_px[0])
-        read_m = _jittered(depth_m, generator)
+        # Each pixel reads one that is a pixel or none away: edges are blurred. At the ends of a row
+        # it reads beyond; windows have a margin there.
+        height, width = depth_m.shape
+        steps, index = torch.tensor([-1, 0, 0, 1]), torch.arange(height * width)
+        moves = (steps[:, None] * width + steps).flatten()
+        index += moves[torch.randint(16, (height * width,), generator=generator)]
+        index = index.clamp_(0, height * width - 1)
+        read_m = depth_m.reshape(-1)[index].view(height, width)
         # Nguyen, Izadi and Lovell 2012: sigma_z = 0.0012 + 0.0019 (z - 0.4)^2 [m].
         read_m = read_m + white * (0.0012 + 0.0019 * (read_m - 0.4).square())
         scale = _STEPS_A_PIXEL * focal_px[1] * _KINECT_BASELINE_M
@@ -159,7 +166,14 @@ def measure(
         scale = _STEREO_STEPS_A_PIXEL * focal_px[1] * _STEREO_BASELINE_M
         read_m = scale / (scale / read_m).round()
     elif kind == "time of flight":
-        read_m = _mixed(depth_m, generator)
+        # A pixel is mixed with its right or lower neighbour where depth jumps.
+        share = torch.rand(depth_m.shape, generator=generator)
+        right, lower = depth_m.roll(-1, 1), depth_m.roll(-1, 0)
+        right[:, -1], lower[-1] = depth_m[:, -1], depth_m[-1]
+        read_m = depth_m
+        for other in (right, lower):
+            is_jump = (other - read_m).abs() > _JUMP * read_m
+            read_m = torch.where(is_jump, torch.lerp(read_m, other, share), read_m)
         read_m = read_m + white * (0.001 + 0.002 * read_m.square())
     else:
         read_m = depth_m + 0.0005 * white
@@ -212,17 +226,6 @@ def _gaps(depth_m: Depth, share: float, generator: torch.Generator) -> Mask:
     return single | (patches <= some.kthvalue(count).values) if count else single
 
 
-def _jittered(depth_m: Depth, generator: torch.Generator) -> Depth:
-    """Read each pixel at one that is a pixel or none away: structured light blurs edges."""
-    height, width = depth_m.shape
-    steps = torch.tensor([-1, 0, 0, 1])
-    # At the ends of a row it reads beyond; windows have a margin there.
-    moves = (steps[:, None] * width + steps).flatten()
-    index = torch.arange(height * width)
-    index += moves[torch.randint(16, (height * width,), generator=generator)]
-    return depth_m.reshape(-1)[index.clamp_(0, height * width - 1)].view(height, width)
-
-
 def _displaced(depth_m: Depth, scale: float, generator: torch.Generator) -> Depth:
     """Read each pixel some pixels away, by the same way as its neighbours: edges wander.
 
@@ -235,14 +238,3 @@ def _displaced(depth_m: Depth, scale: float, generator: torch.Generator) -> Dept
     rows = (torch.arange(height)[:, None] + dy).clamp(0, height - 1)
     columns = (torch.arange(width) + dx).clamp(0, width - 1)
     return depth_m[rows, columns]
-
-
-def _mixed(depth_m: Depth, generator: torch.Generator) -> Depth:
-    """Mix what a pixel sees with its right or lower neighbour where depth jumps."""
-    share = torch.rand(depth_m.shape, generator=generator)
-    right, lower = depth_m.roll(-1, 1), depth_m.roll(-1, 0)
-    right[:, -1], lower[-1] = depth_m[:, -1], depth_m[-1]
-    for other in (right, lower):
-        is_jump = (other - depth_m).abs() > _JUMP * depth_m
-        depth_m = torch.where(is_jump, torch.lerp(depth_m, other, share), depth_m)
-    return depth_m

@@ -230,6 +230,7 @@ class FpfhRegistration:
 
     def __init__(self, model: ObjectModel, config: FpfhConfig | None = None) -> None:
         self.model, self.config = model, config or FpfhConfig()
+        self._voxel_m = self.config.voxel_diameters * model.diameter_m
         self._open3d = import_open3d("registration by FPFH")
         points_m, normals = sample_surface(model, _MODEL_POINTS)
         cloud = self._cloud(points_m)
@@ -248,10 +249,18 @@ class FpfhRegistration:
         source, features = self._prepare(self._cloud(given.points_m))
         o3d.utility.random.seed(self.config.seed)
         # It prints a line for each cloud of which few features are mutually nearest.
+        r, limit_m = o3d.pipelines.registration, _CORRESPONDENCE * self._voxel_m
         with o3d.utility.VerbosityContextManager(o3d.utility.VerbosityLevel.Error):
-            found = self._ransac(source, features)
+            found = r.registration_ransac_based_on_feature_matching(
+                source, self._target, features, self._target_features, True, limit_m,
+                r.TransformationEstimationPointToPoint(False), 3,
+                [
+                    r.CorrespondenceCheckerBasedOnEdgeLength(0.9),
+                    r.CorrespondenceCheckerBasedOnDistance(limit_m),
+                ],
+                r.RANSACConvergenceCriteria(self.config.iterations, 0.999),
+            )  # fmt: skip
         if len(found.correspondence_set):
-            r = o3d.pipelines.registration
             found = r.registration_icp(
                 source, self._target, _ICP * self._voxel_m, found.transformation,
                 r.TransformationEstimationPointToPlane(),
@@ -275,10 +284,6 @@ class FpfhRegistration:
             seconds=seconds,
         )
 
-    @property
-    def _voxel_m(self) -> float:
-        return self.config.voxel_diameters * self.model.diameter_m
-
     def _cloud(self, points_m: Float[Tensor, "n 3"]) -> Any:  # noqa: ANN401 - Open3D has no types
         cloud = self._open3d.geometry.PointCloud()
         cloud.points = self._open3d.utility.Vector3dVector(points_m.double().cpu().numpy())
@@ -296,19 +301,6 @@ class FpfhRegistration:
             cloud, near(radius=_FEATURE * voxel_m, max_nn=100)
         )
         return cloud, features
-
-    def _ransac(self, source: Any, features: Any) -> Any:  # noqa: ANN401
-        r = self._open3d.pipelines.registration
-        limit_m = _CORRESPONDENCE * self._voxel_m
-        return r.registration_ransac_based_on_feature_matching(
-            source, self._target, features, self._target_features, True, limit_m,
-            r.TransformationEstimationPointToPoint(False), 3,
-            [
-                r.CorrespondenceCheckerBasedOnEdgeLength(0.9),
-                r.CorrespondenceCheckerBasedOnDistance(limit_m),
-            ],
-            r.RANSACConvergenceCriteria(self.config.iterations, 0.999),
-        )  # fmt: skip
 
 
 class FpfhEstimator:

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from depthpose.core.errors import InputError
 from depthpose.core.rigid import turn_axis_to
-from depthpose.pose.compiled import serves
+from depthpose.pose.compiled import finite_array, serves
 from depthpose.pose.config import CloudConfig
 from depthpose.pose.types import CloudInput, ViewInput
 
@@ -222,7 +222,8 @@ def local_planes(
     if serves(every_m, some_m):
         from depthpose.pose.compiled.points import planes_of
 
-        normals, bend = planes_of(every_m.numpy(), some_m.numpy(), count)
+        assert count > 0, "a plane goes through points"
+        normals, bend = planes_of(finite_array(every_m), finite_array(some_m), count)
         return torch.from_numpy(normals), torch.from_numpy(bend)[:, None]
     index = KDTree(every_m.numpy()).query(some_m.numpy(), k=count, workers=1)[1]
     near_m = every_m[torch.as_tensor(index).reshape(len(some_m), count)]

@@ -218,10 +218,10 @@ class RefusalConfig:
 class EstimateConfig:
     """How a cloud becomes a pose."""
 
-    voting: VotingConfig = field(default_factory=VotingConfig)
+    voting: VotingConfig = VotingConfig()
     """Directions to keypoints."""
 
-    icp: IcpConfig = field(default_factory=IcpConfig)
+    icp: IcpConfig = IcpConfig()
     """How ICP refines the voted pose."""
 
     with_icp: bool = True
@@ -303,6 +303,18 @@ _LINEMOD_PX = (640, 480)
 _LINEMOD_CENTRE_PX = (325.2611, 242.04899)
 OCCLUSIONS = "[0, 0.95]"
 """Share of a silhouette that something may occlude."""
+
+
+def refuse_reversed(config: object, *names: str) -> None:
+    """Refuse ranges whose upper end comes first.
+
+    Raises:
+        InputError: that is so.
+    """
+    for name in names:
+        ends = getattr(config, name)
+        if ends is not None and ends[0] > ends[1]:
+            raise InputError(f"{name} must be a range, the lower end first, got {ends}; turn it")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -393,7 +405,7 @@ class ObjectsConfig:
     mask_shift_px: int = 2
     """And shifted by up to so many of them along each axis, as a predicted mask is."""
 
-    sensor: SensorConfig = field(default_factory=SensorConfig)
+    sensor: SensorConfig = SensorConfig()
     """What measures the depth."""
 
     frame_objects: tuple[int, int] = (2, 6)
@@ -444,15 +456,3 @@ class ObjectsConfig:
         """``centre_px``, or what it is where it was not given."""
         assert self.centre_px is not None
         return self.centre_px
-
-
-def refuse_reversed(config: object, *names: str) -> None:
-    """Refuse ranges whose upper end comes first.
-
-    Raises:
-        InputError: that is so.
-    """
-    for name in names:
-        ends = getattr(config, name)
-        if ends is not None and ends[0] > ends[1]:
-            raise InputError(f"{name} must be a range, the lower end first, got {ends}; turn it")

@@ -35,7 +35,12 @@ class KernelMaps:
         x = sides.slice([1], [2], [0])
         self._strides = self._graph.op("Concat", x * y * z, y * z, z, [1], axis=0)
         self._cells = sides.op("ReduceProd", [0], keepdims=1)
-        self._level_cells = [self._cells_of(level) for level in range(LEVELS)]
+        self._level_cells: list[Value] = []
+        for level in range(LEVELS):  # the cell of each voxel; the finest keeps the order given
+            corner = self._places - self._places % np.array([1, *[1 << level] * 3])
+            places = (corner + np.array([0, *[MARGIN] * 3])) * self._strides
+            cells = places.op("ReduceSum", [1], keepdims=0)
+            self._level_cells.append(cells.op("Unique", sorted=1) if level else cells)
         self._rows = [self._table(cells) for cells in self._level_cells]
         self._maps: dict[tuple[int, int, int], Value] = {}
 
@@ -54,14 +59,6 @@ class KernelMaps:
             cells = self._level_cells[level_out].op("Unsqueeze", [1]) + moves
             self._maps[key] = self._rows[level_in].op("Gather", cells)
         return self._maps[key]
-
-    def _cells_of(self, level: int) -> Value:
-        """Cell of each voxel of a level; the finest keeps the order given."""
-        corner = self._places - self._places % np.array([1, *[1 << level] * 3])
-        cells = ((corner + np.array([0, *[MARGIN] * 3])) * self._strides).op(
-            "ReduceSum", [1], keepdims=0
-        )
-        return cells if level == 0 else cells.op("Unique", sorted=1)
 
     def _table(self, cells: Value) -> Value:
         count = cells.op("Shape")

@@ -6,7 +6,7 @@ from typing import ClassVar, Literal
 
 import torch
 import torch.nn.functional as F
-from jaxtyping import Float, Int
+from jaxtyping import Float
 from torch import Tensor, nn
 
 from depthpose.core.config import check_settings
@@ -165,21 +165,15 @@ class ResUNet(nn.Module):
         """Answer for one class alone, without computing the other classes' outputs."""
         return self._answer(self.point_features(voxels), number)
 
-    def forward_classes(
-        self, voxels: Voxels, class_of_point: Int[Tensor, " points"]
-    ) -> Float[Tensor, "points keypoints 3"]:
-        """Answer for each point's own class: several objects in one call."""
-        features = self.point_features(voxels)
-        answers = features.new_empty(len(features), self.config.keypoints, 3)
-        for number in class_of_point.unique().tolist():
-            mine = class_of_point == number
-            answers[mine] = self._answer(features[mine], number).to(answers)
-        return answers
-
     def directions(self, seen: SeenPoints) -> Float[Tensor, "points keypoints 3"]:
         """Answer for each point's own class: what every network that votes offers."""
         voxels = Voxels.from_points(seen.coordinates, seen.features)
-        return self.forward_classes(voxels, seen.class_of_point)
+        features = self._features(voxels).at_points()
+        answers = features.new_empty(len(features), self.config.keypoints, 3)
+        for number in seen.class_of_point.unique().tolist():
+            mine = seen.class_of_point == number
+            answers[mine] = self._answer(features[mine], number).to(answers)
+        return answers
 
     def _answer(self, features: Tensor, number: int) -> Float[Tensor, "n keypoints 3"]:
         assert self.final.bias is not None

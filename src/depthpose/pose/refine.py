@@ -162,7 +162,13 @@ def refine_best(
     config = IcpConfig() if config is None else config
     _refuse_no_points(points_m)
     given = Rigid(initial.R.reshape(-1, 3, 3), initial.t_m.reshape(-1, 3))
-    starts = _starts(given.double(), surface, config.starts)
+    # The poses, then all of them turned once, twice ... about the middle of the object.
+    poses, axes = given.double(), torch.eye(3, dtype=torch.float64)
+    middle_m = poses.R @ surface.points_m.mean(0) + poses.t_m
+    axes = torch.cat([torch.zeros(1, 3).double(), axes, -axes])[: config.starts]
+    turns = rotation_by(_TURN_RAD * axes)[:, None]
+    turned_m = (turns @ (poses.t_m - middle_m)[..., None]).squeeze(-1) + middle_m
+    starts = Rigid((turns @ poses.R).flatten(0, 1), turned_m.flatten(0, 1))
     tried = refine_roughly(points_m, starts, surface, config)
     end_m = config.end_distance_diameters * surface.diameter_m
     worth = _worth(points_m, tried, surface, end_m)
@@ -253,16 +259,6 @@ def _iterated(
             if not bool(moves.any()):
                 break
     return pose, index
-
-
-def _starts(poses: Rigid, surface: Surface, count: int) -> Rigid:
-    """Give the poses, then all of them turned once, twice ... about the middle of the object."""
-    middle_m = poses.R @ surface.points_m.mean(0) + poses.t_m
-    axes = torch.eye(3, dtype=torch.float64)
-    axes = torch.cat([torch.zeros(1, 3).double(), axes, -axes])[:count]
-    turns = rotation_by(_TURN_RAD * axes)[:, None]
-    turned_m = (turns @ (poses.t_m - middle_m)[..., None]).squeeze(-1) + middle_m
-    return Rigid((turns @ poses.R).flatten(0, 1), turned_m.flatten(0, 1))
 
 
 def _worth(

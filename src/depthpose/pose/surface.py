@@ -12,9 +12,9 @@ from torch import Tensor
 from torch.nn.functional import max_pool2d
 
 from depthpose.core.rigid import Rigid
-from depthpose.pose.compiled import GRAZING, LOOKED_UP, ON_RAY, SLACK, serves
+from depthpose.pose.compiled import GRAZING, LOOKED_UP, ON_RAY, SLACK, finite_array, serves
 from depthpose.pose.mesh import sample_surface, symmetry_transforms
-from depthpose.pose.mesh.models import across_walls, cell_of, fibonacci_directions, outward_normals
+from depthpose.pose.mesh.models import CELL, across_walls, fibonacci_directions, outward_normals
 from depthpose.pose.types import ObjectModel
 
 NEAR = 0.05
@@ -131,19 +131,34 @@ class Surface:
     @cached_property
     def target(self) -> Any:  # noqa: ANN401  a tuple of numba's
         """Points, normals and table as compiled functions take them."""
-        from depthpose.pose.compiled.icp import target_of
+        from depthpose.pose.compiled.icp import Target
+        from depthpose.pose.compiled.points import tree_of
 
-        boxes = self.boxes
-        table = (boxes.low_m.numpy(), boxes.side_m, boxes.counts.numpy(), boxes.nearest.numpy())
-        sides = (self.outward.numpy(), self.across.numpy(), self.ball_m.numpy())
-        return target_of(self.points_m.numpy(), self.normals.numpy(), table, *sides)
+        tree, boxes = tree_of(self.points_m.numpy()), self.boxes
+        place = np.full(len(self.points_m) + 1, -1)
+        place[tree.order] = np.arange(len(self.points_m))
+        return Target(
+            tree,
+            np.ascontiguousarray(self.normals.numpy()[tree.order]),
+            boxes.low_m.numpy(),
+            boxes.side_m,
+            boxes.counts.numpy(),
+            place[boxes.nearest.numpy()].astype(np.int32),  # half of the memory: read at random
+            np.ascontiguousarray(self.outward.numpy()[tree.order]),
+            place[self.across.numpy()[tree.order]].astype(np.int32),
+            self.ball_m.numpy(),
+        )
 
 
 def prepare_surface(model: ObjectModel, count: int = 10_000) -> Surface:
     """Sample a model once for many clouds."""
     points_m, normals = (part.double() for part in sample_surface(model, count))
     tree = KDTree(points_m.numpy())
-    cell_m = cell_of(points_m.numpy(), tree)
+    # A cell in which a ray finds about four samples.
+    near_m = tree.query(points_m.numpy()[:: max(1, len(points_m) // 500)], k=min(5, len(points_m)))[
+        0
+    ]
+    cell_m = CELL * float(np.median(near_m[:, -1])) * np.sqrt(np.pi) / 2
     outward = outward_normals(points_m.numpy(), normals.numpy(), cell_m)
     across = across_walls(points_m.numpy(), outward, 3 * NEAR * model.diameter_m)
     low_m = points_m.amin(0) - _MARGIN * model.diameter_m
@@ -259,9 +274,10 @@ def look_along_rays(
     if serves(cloud_m, poses.R, poses.t_m):
         from depthpose.pose.compiled.points import compare_rays
 
-        column, row = middle.tolist()
         points_m = surface.points_m[::every]
-        return compare_rays(cloud_m, poses, points_m, scale, column, row, _REACH, limit_m)
+        given = (finite_array(a) for a in (cloud_m, poses.R, poses.t_m, points_m))
+        front, unseen = compare_rays(*given, scale, *middle.tolist(), _REACH, limit_m)
+        return torch.from_numpy(front), torch.from_numpy(unseen)
     posed_m = poses.apply(surface.points_m[::every])
     depth_m = posed_m[..., 2]
     posed = posed_m[..., :2] / depth_m.clamp(min=1e-6)[..., None] * scale

@@ -202,14 +202,45 @@ def read_pose_weights(path: Path) -> PoseWeights:
     if not isinstance(records, list) or not records:
         raise InputError(f"{path}: its config lists no 'models', so nothing could be posed.")
     with refused_as(path, "file of pose weights", "it is damaged, or of another version"):
-        models = tuple(_read_model(checkpoint, k, source) for k in range(len(records)))
+        models: list[ObjectModel] = []
+        for k, record in enumerate(records):
+            state = _under(checkpoint, f"models.{k}.")
+            lost = [name for name in _TENSORS if name not in state]
+            lost += [name for name in ("name", "number", "diameter_m") if name not in record]
+            if lost:
+                raise InputError(
+                    f"{source}: model {k} has no {lost[0]!r}; the file is of another version."
+                )
+            vertices, faces = state["vertices_m"], state["faces"].long()
+            shapes = {name: tuple(tensor.shape[1:]) for name, tensor in state.items()}
+            if set(shapes.values()) != {(3,)} or len(state["normals"]) != len(vertices):
+                raise InputError(
+                    f"{source}: model {k} has tensors of shapes {shapes}; each is (n, 3)."
+                )
+            if len(faces) and not 0 <= int(faces.min()) <= int(faces.max()) < len(vertices):
+                raise InputError(
+                    f"{source}: a face of model {k} names vertex {int(faces.max())} of "
+                    f"{len(vertices)}; the file is damaged."
+                )
+            models.append(
+                ObjectModel(
+                    name=str(record["name"]),
+                    number=int(record["number"]),
+                    vertices_m=vertices,
+                    faces=faces,
+                    normals=state["normals"],
+                    diameter_m=float(record["diameter_m"]),
+                    keypoints_m=state["keypoints_m"],
+                    symmetries=symmetries_from_bop(record, source=f"{source}: model {k}"),
+                )
+            )
     known = ("network.", *(f"models.{k}." for k in range(len(models))))
     strays = [name for name in checkpoint.state if not name.startswith(known)]
     if strays:
         raise InputError(f"{source}: tensor {strays[0]!r} is unexpected; it belongs to no part.")
     return PoseWeights(
         network=network,
-        models=models,
+        models=tuple(models),
         cloud=config_from_dict(parts["cloud"], CloudConfig, source=source),
         refusal=config_from_dict(parts["refusal"], RefusalConfig, source=source),
         facts={name: fact for name, fact in checkpoint.facts.items() if name != "norm_mode"},
@@ -235,33 +266,6 @@ def _network_of(checkpoint: Checkpoint, source: str) -> AnyNetwork:
     config = config_from_dict(_part(checkpoint, "network", source), kind, source=source)
     held = dataclasses.replace(checkpoint, state=_under(checkpoint, "network."))
     return build_network(lambda: made(config), held, source).eval()
-
-
-def _read_model(checkpoint: Checkpoint, k: int, source: str) -> ObjectModel:
-    record, state = checkpoint.config["models"][k], _under(checkpoint, f"models.{k}.")
-    lost = [name for name in _TENSORS if name not in state]
-    lost += [name for name in ("name", "number", "diameter_m") if name not in record]
-    if lost:
-        raise InputError(f"{source}: model {k} has no {lost[0]!r}; the file is of another version.")
-    vertices, faces = state["vertices_m"], state["faces"].long()
-    shapes = {name: tuple(tensor.shape[1:]) for name, tensor in state.items()}
-    if set(shapes.values()) != {(3,)} or len(state["normals"]) != len(vertices):
-        raise InputError(f"{source}: model {k} has tensors of shapes {shapes}; each is (n, 3).")
-    if len(faces) and not 0 <= int(faces.min()) <= int(faces.max()) < len(vertices):
-        raise InputError(
-            f"{source}: a face of model {k} names vertex {int(faces.max())} of {len(vertices)}; "
-            "the file is damaged."
-        )
-    return ObjectModel(
-        name=str(record["name"]),
-        number=int(record["number"]),
-        vertices_m=vertices,
-        faces=faces,
-        normals=state["normals"],
-        diameter_m=float(record["diameter_m"]),
-        keypoints_m=state["keypoints_m"],
-        symmetries=symmetries_from_bop(record, source=f"{source}: model {k}"),
-    )
 
 
 def _part(checkpoint: Checkpoint, name: str, source: str) -> Mapping[str, Any]:

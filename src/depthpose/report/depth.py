@@ -59,7 +59,7 @@ def depth_section(
     title: str, shown: DepthShown, text: str = "", *, with_image: bool = True
 ) -> Section:
     """Show one estimate: the facts, pictures with the bars of their colours, the cloud in 3D."""
-    estimate = shown.estimate
+    estimate, (near_m, far_m) = shown.estimate, shown.range_m
     pictures = [Drawing(image=shown.pair.left, caption="image")] if with_image else []
     if estimate.depth_m is None:
         disparity = Drawing(
@@ -75,7 +75,30 @@ def depth_section(
             scale=depth_scale(*shown.range_m),
         )
         pictures.append(depth)
-    pictures += _error_drawings(shown)
+    true_m = None
+    if shown.error is not None:
+        error, left, true_m = shown.error.error, shown.pair.left, shown.error.true_depth_m
+        is_sparse = float(error.isfinite().double().mean()) < _SPARSE
+        where = "over the dimmed image" if is_sparse else "grey: not compared"
+        if shown.error.is_disparity:
+            top, what = WORST_PX, "disparity error"
+            scale = rising_scale("disparity error [px]", top, has_more=True)
+        else:
+            top, what = WORST_SHARE, "depth error as a share of the truth"
+            scale = rising_scale("depth error [%]", 100 * top, has_more=True)
+        if true_m is not None:
+            if is_sparse:
+                image = draw_points(left, true_m, far_m, _RADIUS_PX, near_m)
+            else:
+                image = draw_depth(true_m, near_m, far_m)
+            said, bar = f"true depth; {where}", depth_scale(near_m, far_m)
+            pictures.append(Drawing(image=image, caption=said, scale=bar))
+        if is_sparse:
+            image = draw_error_points(left, error, top, _RADIUS_PX)
+        else:
+            image = draw_share(1 - error / top)
+        caption = f"{what}: dark is right, bright is wrong; {where}"
+        pictures.append(Drawing(image=image, caption=caption, scale=scale))
     if estimate.confidence is not None:
         confidence = Drawing(
             image=draw_share(1 - estimate.confidence),
@@ -85,7 +108,17 @@ def depth_section(
         pictures.append(confidence)
     if estimate.right is not None:
         pictures.append(Drawing(image=estimate.right, caption="right view as drawn"))
-    facts, scenes = depth_facts(shown.pair, estimate), _scenes(title, shown)
+    scenes: list[Scene] = []
+    if estimate.depth_m is not None and (camera := shown.pair.camera) is not None:
+        scenes = [depth_scene(shown.pair, estimate, far_m, f"{title}: the cloud")]
+        if true_m is not None:
+            points_m = back_project(true_m, camera.K).reshape(-1, 3).float()
+            points_m = points_m[points_m.isfinite().all(-1) & (points_m[:, 2] <= far_m)]
+            points_m = take_evenly(points_m, _TRUE_POINTS)
+            layer = Layer(name="true points", shape=colored_points(points_m, _TRUE))
+            said, layers = f"{scenes[0].caption}; the truth in green", [*scenes[0].layers, layer]
+            scenes = [Scene(caption=said, layers=layers)]
+    facts = depth_facts(shown.pair, estimate)
     return Section(title=title, text=text, facts=facts, pictures=pictures, scenes=scenes)
 
 
@@ -130,49 +163,3 @@ def depth_scene(
         caption=f"{caption} up to {far_m:g} m, in the camera's frame",
         layers=[Layer(name="points", shape=replace(estimate, seen=pair).cloud(far_m))],
     )
-
-
-def _error_drawings(shown: DepthShown) -> list[Drawing]:
-    """Draw the truth where it is to be shown, and the error."""
-    if shown.error is None:
-        return []
-    error, left, true_m = shown.error.error, shown.pair.left, shown.error.true_depth_m
-    is_sparse = float(error.isfinite().double().mean()) < _SPARSE
-    where = "over the dimmed image" if is_sparse else "grey: not compared"
-    if shown.error.is_disparity:
-        top, what = WORST_PX, "disparity error"
-        scale = rising_scale("disparity error [px]", top, has_more=True)
-    else:
-        top, what = WORST_SHARE, "depth error as a share of the truth"
-        scale = rising_scale("depth error [%]", 100 * top, has_more=True)
-    if is_sparse:
-        image = draw_error_points(left, error, top, _RADIUS_PX)
-    else:
-        image = draw_share(1 - error / top)
-    caption = f"{what}: dark is right, bright is wrong; {where}"
-    drawing = Drawing(image=image, caption=caption, scale=scale)
-    if true_m is None:
-        return [drawing]
-    near_m, far_m = shown.range_m
-    if is_sparse:
-        image = draw_points(left, true_m, far_m, _RADIUS_PX, near_m)
-    else:
-        image = draw_depth(true_m, near_m, far_m)
-    scale = depth_scale(near_m, far_m)
-    return [Drawing(image=image, caption=f"true depth; {where}", scale=scale), drawing]
-
-
-def _scenes(title: str, shown: DepthShown) -> list[Scene]:
-    """Show the cloud where there are metres, and the true points in green."""
-    camera = shown.pair.camera
-    if shown.estimate.depth_m is None or camera is None:
-        return []
-    far_m = shown.range_m[1]
-    scene = depth_scene(shown.pair, shown.estimate, far_m, f"{title}: the cloud")
-    if shown.error is None or shown.error.true_depth_m is None:
-        return [scene]
-    true_m = back_project(shown.error.true_depth_m, camera.K).reshape(-1, 3).float()
-    true_m = true_m[true_m.isfinite().all(-1) & (true_m[:, 2] <= far_m)]
-    true_m = take_evenly(true_m, _TRUE_POINTS)
-    layer = Layer(name="true points", shape=colored_points(true_m, _TRUE))
-    return [Scene(caption=f"{scene.caption}; the truth in green", layers=[*scene.layers, layer])]

@@ -19,7 +19,7 @@ from depthpose.pose.datasets import Instance
 from depthpose.pose.estimator.inputs import AnyInput
 from depthpose.pose.mesh import sample_surface
 from depthpose.pose.synthetic import drawn_triangles
-from depthpose.pose.types import Identity, ObjectModel, PoseEstimate, ViewInput
+from depthpose.pose.types import ObjectModel, PoseEstimate, ViewInput
 from depthpose.report.page import (
     Drawing,
     Layer,
@@ -137,20 +137,6 @@ def pose_layers(
     axes = frame_axes(pose.t_m, pose.R, model.diameter_m / 2)
     box = Layer(name="its box", shape=colored_lines(box_m, FOUND), is_shown=with_box)
     return [*layers, box, Layer(name="its axes (x red, y green, z blue)", shape=axes)]
-
-
-def alternative_layers(estimate: PoseEstimate, model: ObjectModel) -> list[Layer]:
-    """Show each alternative by its axes and its box, not shown at first."""
-    layers: list[Layer] = []
-    for other in estimate.alternatives:
-        pose = other.camera_from_model.double()
-        ends_m = pose.apply(box_edges(model).double().flatten(0, 1)).unflatten(0, (12, 2)).float()
-        said = f"{other.difference}, {other.probability:.0%}"
-        box = colored_lines(ends_m, OTHER)
-        layers.append(Layer(name=f"box if {said}", shape=box, is_shown=False))
-        axes = frame_axes(pose.t_m, pose.R, model.diameter_m / 2)
-        layers.append(Layer(name=f"axes if {said}", shape=axes, is_shown=False))
-    return layers
 
 
 def keypoint_layers(
@@ -288,14 +274,6 @@ def alternative_lines(estimate: PoseEstimate) -> list[str]:
     return [f"{one.difference}, {one.probability:.0%}" for one in estimate.alternatives]
 
 
-def identity_words(identity: Identity) -> str:
-    """Say whether it is the object, and the size that fits best."""
-    said = identity.status + (f" ({identity.reason})" if identity.reason else "")
-    if identity.size is not None and identity.size_deviation is not None:
-        said += f"; size {identity.size:.3f} +- {identity.size_deviation:.3f} of the model's"
-    return said
-
-
 def pose_facts(
     estimate: PoseEstimate,
     model: ObjectModel,
@@ -320,7 +298,11 @@ def pose_facts(
             ("the sensor's noise there", f"{1000 * estimate.fit.noise_m:.1f} mm"),
         ]
     if estimate.identity is not None:
-        facts.append(("identity", identity_words(estimate.identity)))
+        identity = estimate.identity
+        said = identity.status + (f" ({identity.reason})" if identity.reason else "")
+        if identity.size is not None and identity.size_deviation is not None:
+            said += f"; size {identity.size:.3f} +- {identity.size_deviation:.3f} of the model's"
+        facts.append(("identity", said))
     if estimate.certainty is not None:
         facts.append(("certainty of this pose", f"{estimate.certainty:.3f}"))
     facts += [("another pose that fits", line) for line in alternative_lines(estimate)]
@@ -376,7 +358,14 @@ def pose_scene(
     pose = estimate.camera_from_model
     if pose is not None:
         layers += pose_layers(pose, model, with_box=truth is not None)
-        layers += alternative_layers(estimate, model)
+        for other in estimate.alternatives:  # by axes and box, not shown at first
+            placed = other.camera_from_model.double()
+            ends_m = placed.apply(box_edges(model).double().flatten(0, 1)).unflatten(0, (12, 2))
+            said = f"{other.difference}, {other.probability:.0%}"
+            box = colored_lines(ends_m.float(), OTHER)
+            layers.append(Layer(name=f"box if {said}", shape=box, is_shown=False))
+            axes = frame_axes(placed.t_m, placed.R, model.diameter_m / 2)
+            layers.append(Layer(name=f"axes if {said}", shape=axes, is_shown=False))
     if truth is not None:
         layers += pose_layers(truth, model, is_true=True)
     if estimate.keypoints_m is not None:

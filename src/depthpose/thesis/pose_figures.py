@@ -184,7 +184,16 @@ def draw_field(
         barbs = tips - _HEAD * shafts + 0.5 * _HEAD * side * across
         lines.append(torch.stack([tips, barbs], 1))
     image = draw_lines(torch.ones(3, size_px, size_px), torch.cat(lines), _INK, width_px=1)
-    image = _draw_star(image, place(marks[:1])[0])
+    angle = torch.arange(10, dtype=torch.float64) * torch.pi / 5 - torch.pi / 2
+    reach = torch.where(torch.arange(10) % 2 == 0, 12.0, 5.0).double()
+    tips = place(marks[:1]) + torch.stack([angle.cos(), angle.sin()], 1) * reach[:, None]
+    # Filled by spokes: a star is small.
+    steps = torch.linspace(0, 1, 40, dtype=torch.float64)[:, None, None]
+    rim = (tips[None] * (1 - steps) + tips.roll(-1, 0)[None] * steps).flatten(0, 1)
+    spokes = torch.stack([place(marks[:1]).expand_as(rim), rim], 1)
+    image = draw_lines(image, spokes, _YELLOW, width_px=2)
+    edges = torch.stack([tips, tips.roll(-1, 0)], 1)
+    image = draw_lines(image, edges, (0.0, 0.0, 0.0), width_px=1)
     if voted_m is None:
         return image
     at = place(marks[1:])
@@ -192,18 +201,6 @@ def draw_field(
     image = draw_lines(image, at + arms * 1.2, (1.0, 1.0, 1.0), width_px=6)
     image = draw_lines(image, at + arms, _RED, width_px=4)
     return draw_discs(image, torch.cat([at, torch.zeros(1, 1)], 1), torch.tensor([_RED]), 2.0)
-
-
-def _draw_star(image: Float[Tensor, "3 h w"], at: Float[Tensor, "2"]) -> Float[Tensor, "3 h w"]:
-    angle = torch.arange(10, dtype=torch.float64) * torch.pi / 5 - torch.pi / 2
-    reach = torch.where(torch.arange(10) % 2 == 0, 12.0, 5.0).double()
-    tips = at + torch.stack([angle.cos(), angle.sin()], 1) * reach[:, None]
-    # Filled by spokes: a star is small.
-    steps = torch.linspace(0, 1, 40, dtype=torch.float64)[:, None, None]
-    rim = (tips[None] * (1 - steps) + tips.roll(-1, 0)[None] * steps).flatten(0, 1)
-    spokes = torch.stack([at.expand_as(rim), rim], 1)
-    image = draw_lines(image, spokes, _YELLOW, width_px=2)
-    return draw_lines(image, torch.stack([tips, tips.roll(-1, 0)], 1), (0.0, 0.0, 0.0), width_px=1)
 
 
 _STEPS = 300
@@ -264,7 +261,10 @@ def joint_probabilities(
     low, high = torch.full_like(near, 1e-12), torch.full_like(near, 1e12)
     for _ in range(_SEARCH):
         precision = (low * high).sqrt()
-        is_wide = _entropy(shifted, precision) > math.log(perplexity)
+        rows = torch.exp(-shifted * precision)
+        total = rows.sum(1, keepdim=True)
+        mean = torch.where(rows > 0, shifted * rows, 0).sum(1, keepdim=True) / total
+        is_wide = total.log() + precision * mean > math.log(perplexity)  # entropy over its limit
         low, high = torch.where(is_wide, precision, low), torch.where(is_wide, high, precision)
     rows = torch.exp(-shifted * high)
     rows = rows / rows.sum(1, keepdim=True)
@@ -277,10 +277,3 @@ def kl_gradient(P: Float64[Tensor, "n n"], y: Float64[Tensor, " n"]) -> Float64[
     near = 1 / (1 + gap.square())
     near.fill_diagonal_(0)
     return 4 * ((P - near / near.sum()) * near * gap).sum(1)
-
-
-def _entropy(shifted: Tensor, precision: Tensor) -> Float64[Tensor, "n 1"]:
-    rows = torch.exp(-shifted * precision)
-    total = rows.sum(1, keepdim=True)
-    mean = torch.where(rows > 0, shifted * rows, 0).sum(1, keepdim=True) / total
-    return total.log() + precision * mean

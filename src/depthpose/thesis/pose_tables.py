@@ -367,7 +367,12 @@ def compare_voting(cases: Sequence[VotingCase | None], points: int) -> list[Voti
                 start = time.thread_time()
                 keypoints_m = vote(case)
                 seconds.append(time.thread_time() - start)
-                successes += _is_success(case, keypoints_m.double())
+                alike = torch.eye(3, dtype=torch.float64).expand(len(keypoints_m), 3, 3)
+                fit = fit_pose(keypoints_m.double(), alike, case.model.keypoints_m)
+                some_m = case.model.vertices_m[:: max(1, len(case.model.vertices_m) // _ADD_POINTS)]
+                pose, diameter_m = fit.camera_from_model, case.model.diameter_m
+                share = add_share(pose, case.truth, some_m, diameter_m, is_adds=case.is_adds)
+                successes += bool(is_within_diameter(torch.tensor(share)))
         finally:
             torch.set_num_threads(threads)
         row = VotingRow(
@@ -405,12 +410,3 @@ def _ways() -> Iterator[tuple[str, int | None, str, Callable[[VotingCase], Tenso
             yield ("RANSAC, ours", hypotheses, test, partial(ransac, config=config))
     yield ("least squares, published", None, "", partial(lines, refinements=0))
     yield ("least squares, ours", None, "", partial(lines, refinements=3))
-
-
-def _is_success(case: VotingCase, keypoints_m: Float[Tensor, "k 3"]) -> bool:
-    alike = torch.eye(3, dtype=torch.float64).expand(len(keypoints_m), 3, 3)
-    pose = fit_pose(keypoints_m, alike, case.model.keypoints_m).camera_from_model
-    step = max(1, len(case.model.vertices_m) // _ADD_POINTS)
-    points_m, diameter_m = case.model.vertices_m[::step], case.model.diameter_m
-    share = add_share(pose, case.truth, points_m, diameter_m, is_adds=case.is_adds)
-    return bool(is_within_diameter(torch.tensor(share)))

@@ -91,37 +91,6 @@ def refuse_other_host(request: Request, hosts: tuple[str, ...] | None) -> Respon
     return None
 
 
-def refuse_size(request: Request, most: int) -> None:
-    """Refuse what is too large before it is read: a server reads no more than is announced."""
-    text = request.headers.get("content-length", "")
-    if not text.isdecimal() or "transfer-encoding" in request.headers:
-        said = "the request has no Content-Length, or comes in chunks; send it whole, with its size"
-        raise HTTPException(411, said)
-    if int(text) > most:
-        raise HTTPException(
-            413,
-            f"the files are {int(text) / 1e6:.1f} MB together, more than the {most / 1e6:.0f} MB "
-            "allowed; send smaller ones, or start 'depthpose serve' with a larger --max-upload-mb",
-        )
-
-
-async def read_form(request: Request, folder: Path) -> Form:
-    """Read the fields, and put the files into the folder."""
-    fields: dict[str, str] = {}
-    files: dict[str, Path] = {}
-    async with request.form(
-        max_files=_MOST_FILES, max_fields=_MOST_FIELDS, max_part_size=_LONGEST_FIELD
-    ) as form:
-        for name, value in form.multi_items():
-            if not isinstance(value, UploadFile):
-                fields[name] = value
-            elif name in files:
-                raise InputError(f"{name}: two files; choose one")
-            elif value.filename:
-                files[name] = keep_file(folder, name, value.filename, await value.read())
-    return Form(folder=folder, fields=fields, files=files)
-
-
 async def error_response(_: Request, error: Exception) -> Response:
     """Answer a refusal with its message."""
     assert isinstance(error, HTTPException)
@@ -302,7 +271,20 @@ class Pages:
 
     async def estimate(self, request: Request) -> Response:
         """Answer a form."""
-        refuse_size(request, self._limits.upload_bytes)
+        # What is too large is refused unread: a server reads no more than is announced.
+        text, most = request.headers.get("content-length", ""), self._limits.upload_bytes
+        if not text.isdecimal() or "transfer-encoding" in request.headers:
+            raise HTTPException(
+                411, "the request has no Content-Length, or comes in chunks; send it whole, with "
+                "its size",
+            )  # fmt: skip
+        if int(text) > most:
+            raise HTTPException(
+                413,
+                f"the files are {int(text) / 1e6:.1f} MB together, more than the {most / 1e6:.0f} "
+                "MB allowed; send smaller ones, or start 'depthpose serve' with a larger "
+                "--max-upload-mb",
+            )
         estimate = _of_kind(self._kinds, request)
         self._queue.refuse_full()
         with TemporaryDirectory(prefix="depthpose-") as folder:
@@ -323,7 +305,19 @@ class Pages:
             raise HTTPException(503, "too many uploads at the same time; try again later")
         self._uploads += 1
         try:
-            return await read_form(Request(request.scope, paced(request.receive)), folder)
+            fields: dict[str, str] = {}
+            files: dict[str, Path] = {}
+            async with Request(request.scope, paced(request.receive)).form(
+                max_files=_MOST_FILES, max_fields=_MOST_FIELDS, max_part_size=_LONGEST_FIELD
+            ) as form:
+                for name, value in form.multi_items():
+                    if not isinstance(value, UploadFile):
+                        fields[name] = value
+                    elif name in files:
+                        raise InputError(f"{name}: two files; choose one")
+                    elif value.filename:
+                        files[name] = keep_file(folder, name, value.filename, await value.read())
+            return Form(folder=folder, fields=fields, files=files)
         finally:
             self._uploads -= 1
 

@@ -12,7 +12,7 @@ from depthpose.core.errors import InputError
 from depthpose.core.files import read_exif_focal, read_image, write_image
 from depthpose.depth.config import StreetsConfig
 from depthpose.depth.estimator import FakestereoNet
-from depthpose.depth.estimator.rig import square_camera
+from depthpose.depth.estimator.net import square_camera
 from depthpose.depth.predictions import COLOR_RANGE_M, write_estimate
 from depthpose.depth.stereo import CameraMatcher
 from depthpose.depth.synthetic import Streets
@@ -55,7 +55,31 @@ def answer_depth(form: Form, net: FakestereoNet) -> Answer:
             "the weights of this page take one image alone: remove the right image, or start "
             "'depthpose serve' with --weights that have a matcher"
         )
-    _refuse_work(pair, net)
+    assert pair.camera is not None
+    camera, focal_px = pair.camera, float(pair.camera.K[0, 0])
+    rig = None if pair.right is not None or net.synthesiser is None else net.synthesiser.config
+    height, width = pair.left.shape[1:]
+    sizes = []
+    if rig is not None:
+        sizes += net.virtual_sizes(pair)
+        camera = square_camera(sizes[0], rig.virtual_focal_px)
+    if rig is None or rig.answer != "own":
+        own = (camera.height, camera.width)
+        matcher = net.matcher
+        sizes.append(matcher.work_size(camera) if isinstance(matcher, CameraMatcher) else own)
+    rows, columns = max(sizes, key=math.prod)
+    if (rows, columns) == (height, width) and rows * columns > _MOST_WORK_PIXELS:
+        raise InputError(
+            f"{pair.name} has {width}x{height} pixels; these weights match pairs as "
+            f"they are, and this page computes {_MOST_WORK_PIXELS / 1e6:g} million at most; scale "
+            "both images down, and the focal length with them, or use the command line"
+        )
+    if rows * columns > _MOST_WORK_PIXELS:
+        raise InputError(
+            f"a focal length of {focal_px:g} px for {width}x{height} pixels "
+            f"would be resized to {columns}x{rows}, more than this page computes; is it in "
+            f"millimetres? A phone's is about {_PHONE} widths"
+        )
     estimate = net.estimate_pair(pair)
     seconds = time.perf_counter() - began
     assert estimate.depth_m is not None
@@ -112,35 +136,6 @@ def _input(form: Form) -> tuple[StereoInput, str]:
     right = read_image(form.file("right")) if has_right else None
     pair = StereoInput(name=path.stem, left=read_image(path), right=right, camera=camera)
     return pair, origin
-
-
-def _refuse_work(pair: StereoInput, net: FakestereoNet) -> None:
-    """Refuse what is too large for the networks: a small focal length enlarges an image."""
-    assert pair.camera is not None
-    camera, focal_px = pair.camera, float(pair.camera.K[0, 0])
-    rig = None if pair.right is not None or net.synthesiser is None else net.synthesiser.config
-    height, width = pair.left.shape[1:]
-    sizes = []
-    if rig is not None:
-        sizes += net.virtual_sizes(pair)
-        camera = square_camera(sizes[0], rig.virtual_focal_px)
-    if rig is None or rig.answer != "own":
-        own = (camera.height, camera.width)
-        matcher = net.matcher
-        sizes.append(matcher.work_size(camera) if isinstance(matcher, CameraMatcher) else own)
-    rows, columns = max(sizes, key=math.prod)
-    if (rows, columns) == (height, width) and rows * columns > _MOST_WORK_PIXELS:
-        raise InputError(
-            f"{pair.name} has {width}x{height} pixels; these weights match pairs as "
-            f"they are, and this page computes {_MOST_WORK_PIXELS / 1e6:g} million at most; scale "
-            "both images down, and the focal length with them, or use the command line"
-        )
-    if rows * columns > _MOST_WORK_PIXELS:
-        raise InputError(
-            f"a focal length of {focal_px:g} px for {width}x{height} pixels "
-            f"would be resized to {columns}x{rows}, more than this page computes; is it in "
-            f"millimetres? A phone's is about {_PHONE} widths"
-        )
 
 
 def _pictures(

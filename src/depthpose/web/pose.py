@@ -1,6 +1,5 @@
 """The tab Pose: a depth image or cloud of a known object to its pose, or why there is none."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -14,7 +13,7 @@ from depthpose.pose import mesh
 from depthpose.pose.cloud import object_points
 from depthpose.pose.config import EstimateConfig, ObjectsConfig
 from depthpose.pose.datasets.dataset import write_mask
-from depthpose.pose.estimator import CloudDirections, GeoPoseNet, Registration
+from depthpose.pose.estimator import GeoPoseNet, Registration
 from depthpose.pose.estimator.answer import with_status
 from depthpose.pose.estimator.base import answered
 from depthpose.pose.estimator.find import explained_mask, nothing_found
@@ -24,7 +23,7 @@ from depthpose.pose.surface import prepare_surface
 from depthpose.pose.synthetic import make_frames
 from depthpose.pose.types import CloudInput, ObjectModel, PoseEstimate, ViewInput
 from depthpose.report import pose as report
-from depthpose.report.page import Layer, Scene
+from depthpose.report.page import Layer
 from depthpose.web.answer import (
     EXAMPLE_SEED,
     Answer,
@@ -79,13 +78,33 @@ def answer_pose(form: Form, net: GeoPoseNet) -> Answer:
     folder = form.results()
     best = seen[0]
     agreeing = "votes that agree" if isinstance(target.net, GeoPoseNet) else "points near the model"
+    found = [["", "status", "x [m]", "y [m]", "z [m]", "certainty"]]
+    for one in seen if len(seen) > 1 else ():
+        pose, certainty = one.estimate.camera_from_model, one.estimate.certainty
+        place = [] if pose is None else [f"{v:.4f}" for v in pose.t_m.tolist()]
+        sure = "" if certainty is None else f"{certainty:.3f}"
+        found.append([one.input.name, one.estimate.status, *place, sure])
+    pose_input, estimate = seen[0].input, seen[0].estimate
+    scene = report.pose_scene(
+        pose_input, object_points(pose_input, target.model.diameter_m), estimate, target.model
+    )
+    layers = list(scene.layers)
+    if estimate.keypoints_m is not None and voted is not None:
+        layers.append(
+            report.vote_layer(voted.cloud.points_m, voted.directions, estimate.keypoints_m)
+        )
+    for one in seen[1:]:
+        points_m = object_points(one.input, target.model.diameter_m)
+        cloud = report.posed_cloud(points_m, one.estimate.camera_from_model, target.model)
+        layers.append(Layer(name=one.input.name, shape=cloud))
     return Answer(
         is_ok=best.estimate.is_posed,
         said=report.pose_sentence(best.estimate),
         facts=report.pose_facts(best.estimate, target.model, target.how, agreeing),
-        tables=_instances(seen) | report.pose_tables(best.estimate),
+        tables=({"found in this image": found} if len(seen) > 1 else {})
+        | report.pose_tables(best.estimate),
         pictures=_write(folder, name, seen, target.model),
-        scene=_scene(seen, target.model, voted),
+        scene=replace(scene, layers=layers),
         terms=net.terms if target.net is net else "",
         files=read_files(folder),
     )
@@ -105,17 +124,6 @@ def _found_alone(pose_input: CloudInput | ViewInput, target: _Target) -> list[_S
         own = replace(pose_input, name=name, mask=mask)
         seen.append(_Seen(input=own, estimate=replace(answer, name=name)))
     return seen
-
-
-def _instances(seen: list[_Seen]) -> dict[str, Sequence[Sequence[str]]]:
-    """List what was estimate in a frame, where that is more than one."""
-    rows = [["", "status", "x [m]", "y [m]", "z [m]", "certainty"]]
-    for one in seen if len(seen) > 1 else ():
-        pose, certainty = one.estimate.camera_from_model, one.estimate.certainty
-        place = [] if pose is None else [f"{v:.4f}" for v in pose.t_m.tolist()]
-        sure = "" if certainty is None else f"{certainty:.3f}"
-        rows.append([one.input.name, one.estimate.status, *place, sure])
-    return {"found in this image": rows} if len(seen) > 1 else {}
 
 
 def _write(folder: Path, name: str, seen: list[_Seen], model: ObjectModel) -> list[Shown]:
@@ -212,24 +220,6 @@ def _unit(form: Form, field: str) -> Unit:
 
 
 _UNIT_M = 0.0001
-
-
-def _scene(seen: list[_Seen], model: ObjectModel, voted: CloudDirections | None) -> Scene:
-    """Show the cloud, the posed model, the votes, and what else was estimate in the image."""
-    pose_input, estimate = seen[0].input, seen[0].estimate
-    scene = report.pose_scene(
-        pose_input, object_points(pose_input, model.diameter_m), estimate, model
-    )
-    layers = list(scene.layers)
-    if estimate.keypoints_m is not None and voted is not None:
-        layers.append(
-            report.vote_layer(voted.cloud.points_m, voted.directions, estimate.keypoints_m)
-        )
-    for one in seen[1:]:
-        points_m = object_points(one.input, model.diameter_m)
-        cloud = report.posed_cloud(points_m, one.estimate.camera_from_model, model)
-        layers.append(Layer(name=one.input.name, shape=cloud))
-    return replace(scene, layers=layers)
 
 
 def pose_example(net: GeoPoseNet) -> dict[str, Any]:

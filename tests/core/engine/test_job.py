@@ -12,6 +12,7 @@ from tests.core.engine.doubles import InProcessEngine, ReverseWork, unpacked, wr
 
 from depthpose.core.engine import (
     Done,
+    Inputs,
     Job,
     find_items,
     read_results,
@@ -290,3 +291,21 @@ def test_links_and_names_that_are_there_twice_are_said(tmp_path: Path) -> None:
     (one, other) = run_job(job_of(tmp_path, [], tars=[str(twice), str(link)]), InProcessEngine())
     assert "holds '1.txt' twice; keep one of the two" in one.failures[-1][1]
     assert "'2.txt' is a link or device, and no file" in other.failures[-1][1]
+
+
+def test_an_empty_tar_is_named_and_the_others_are_done(tmp_path: Path) -> None:
+    empty, full = tmp_path / "empty.tar", tmp_path / "full.tar"
+    tarfile.open(empty, "w").close()
+    with tarfile.open(full, "w") as tar:
+        info = tarfile.TarInfo("1.txt")
+        info.size = 3
+        tar.addfile(info, io.BytesIO(b"one"))
+    job = job_of(tmp_path, [], tars=[str(empty), str(full)])
+    (one, other) = run_job(job, InProcessEngine())
+    assert "holds no file; pack inputs into it, or leave it out" in one.failures[0][1]
+    assert other.entries == (("1", ""),)
+    with (
+        pytest.raises(InputError, match="holds no file"),
+        Inputs(items=[], tars=[str(empty)], files=job.work.files).first(),
+    ):
+        pass

@@ -36,11 +36,12 @@ from depthpose.core.camera.stored_camera import (
     Names,
     baseline_of,
     facts_from_names,
+    facts_from_ros_pair,
     is_ros,
     lens_of,
     named,
-    read_folder,
     read_storage,
+    read_two_files,
     scalar,
 )
 from depthpose.core.errors import InputError, nearest_name
@@ -252,7 +253,17 @@ def facts_from_json(content: object) -> CameraFacts:
             )
         if content and all(isinstance(v, dict) and "cam_K" in v for v in content.values()):
             return _from_scene(content)
-    _check_keys(content)
+    if not content.keys() & set(_KEYS):
+        keys = ", ".join(map(repr, content))
+        raise InputError(f"no camera that is known; its keys are {keys:.80}. Known: {KNOWN_FILES}")
+    for key in content:
+        if key not in _KEYS:
+            raise InputError(f"unknown key {key!r}; {nearest_name(key, _KEYS)}")
+    missing = [key for key in _NEEDED if key not in content]
+    if missing:
+        raise InputError(f"missing {', '.join(map(repr, missing))}; add it to the camera")
+    if "cx_right_minus_left_px" in content and "baseline_m" not in content:
+        raise InputError("'cx_right_minus_left_px' needs 'baseline_m' beside it; add it")
     known = ("baseline_m", _DOFFS, *OPTIONAL_KEYS)
     said: dict[str, Any] = {key: _json_number(content, key) for key in known if key in content}
     size = _size(content)
@@ -281,20 +292,6 @@ def _bop_unit_m(keys: dict[str, Any]) -> float | None:
     if "depth_scale" in keys:
         return 0.001 * _json_number(keys, "depth_scale")  # millimetres a unit
     return _json_number(keys, "depth_unit_m") if "depth_unit_m" in keys else None
-
-
-def _check_keys(content: dict[str, Any]) -> None:
-    if not content.keys() & set(_KEYS):
-        keys = ", ".join(map(repr, content))
-        raise InputError(f"no camera that is known; its keys are {keys:.80}. Known: {KNOWN_FILES}")
-    for key in content:
-        if key not in _KEYS:
-            raise InputError(f"unknown key {key!r}; {nearest_name(key, _KEYS)}")
-    missing = [key for key in _NEEDED if key not in content]
-    if missing:
-        raise InputError(f"missing {', '.join(map(repr, missing))}; add it to the camera")
-    if "cx_right_minus_left_px" in content and "baseline_m" not in content:
-        raise InputError("'cx_right_minus_left_px' needs 'baseline_m' beside it; add it")
 
 
 def _size(keys: dict[str, Any]) -> Size:
@@ -397,7 +394,13 @@ def check_image_matches_camera(camera: Camera, width: int, height: int, name: st
 
 def _read_facts(path: AnyPath) -> CameraFacts:
     if Path(path).is_dir():
-        return read_folder(Path(path))
+        first, second = read_two_files(Path(path))
+        if is_ros(first) and is_ros(second) and "p2" not in first | second:
+            return facts_from_ros_pair(first, second)
+        facts = facts_from_names(first | second)
+        if facts is None:
+            raise InputError("its two files together describe no camera")
+        return facts
     if Path(path).name == "cameras.bin":
         raise InputError("of COLMAP cameras.txt is read: colmap model_converter --output_type TXT")
     text = read_text(path, MAX_LIST_BYTES)

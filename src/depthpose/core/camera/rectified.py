@@ -6,7 +6,7 @@ mutual is placed to a fraction of a pixel on a larger copy.
 """
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -66,6 +66,8 @@ class RectificationReport:
         is_rectified: whether rows agree; None with too few matches.
         is_swapped: whether the left image is the right one; None with too few matches.
         message: the finding, and the remedy where there is one.
+        places_px: column and row in the left image of each match [px].
+        disparities_px: column of each match in the left image less that in the right one [px].
     """
 
     vertical_offset_px: float = math.nan
@@ -77,6 +79,12 @@ class RectificationReport:
     is_rectified: bool | None = None
     is_swapped: bool | None = None
     message: str
+    places_px: Float[Tensor, "n 2"] = field(
+        default_factory=lambda: torch.zeros(0, 2), repr=False, compare=False
+    )
+    disparities_px: Float[Tensor, " n"] = field(
+        default_factory=lambda: torch.zeros(0), repr=False, compare=False
+    )
 
     @property
     def is_wrong(self) -> bool:
@@ -135,7 +143,9 @@ def check_rectified(
                 )
                 return replace(unlike, is_pair=False, message=said)
         where, shift_px = _place_finely(left, right, places, matched)
-    return _report(where, shift_px, len(corners), left.shape[-1], apart_px)
+    report = _report(where, shift_px, len(corners), left.shape[-1], apart_px)
+    centre = torch.tensor([left.shape[-1], left.shape[-2]]) / 2
+    return replace(report, places_px=where + centre, disparities_px=-shift_px[:, 0].float())
 
 
 def _find_corners(grey: Grey) -> Places:

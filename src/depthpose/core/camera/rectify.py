@@ -30,6 +30,7 @@ from depthpose.core.camera.stored_camera import (
     numbers,
     read_storage,
     read_two_files,
+    ros_pair,
     size_of,
 )
 from depthpose.core.errors import InputError, import_opencv
@@ -57,6 +58,7 @@ _MODELS = {
 """Models of distortion by name: whether it is that of a fisheye lens."""
 _COUNTS = {False: (4, 5, 8, 12, 14), True: (4,)}
 _MAX_BASELINE_M = 10.0
+_MAX_ENLARGED = 4  # of a raw image by its rectification
 _MAX_FOCAL_RATIO = 1.5  # of the two cameras of a pair; more are of images of two sizes
 _KNOWN = (
     "a camchain of Kalibr, OpenCV's K1, D1, K2, D2, R and T (in one file, or intrinsics.yml and "
@@ -140,7 +142,24 @@ def _read(path: Path, unit_m: float, is_fisheye: bool | None) -> RawPair:
     if path.is_dir():
         first, second = read_two_files(path)
         if is_ros(first) and is_ros(second) and "p2" not in first | second:
-            return _from_ros(first, second, unit_m, is_fisheye)
+            both = ros_pair(first, second)
+            P = matrix(both[1], ("projectionmatrix", "p"), 12)
+            if P is None or P[0, 0] <= 0:
+                raise InputError("no projection_matrix with a focal length; calibrate as a pair")
+            cameras, turns = [], []
+            for side, names in zip(("left", "right"), both, strict=True):
+                K, D = matrix(names, ("cameramatrix", "k"), 9), ("distortioncoefficients", "d")
+                kind = _kind(names.get("distortionmodel"), is_fisheye)
+                cameras.append(_camera(K, _first(names, D), kind, f"the {side} camera"))
+                turn = matrix(names, ("rectificationmatrix", "r"), 9)
+                if turn is None:
+                    raise InputError(
+                        f"no rectification_matrix of the {side} camera; write the whole pair"
+                    )
+                turns.append(turn)
+            along = np.array([unit_m * P[0, 3] / P[0, 0], 0, 0])
+            motion = (turns[1].T @ turns[0], turns[1].T @ along)
+            return _pair(cameras[0], cameras[1], motion, size_of(first))
         return _from_opencv(first | second, unit_m, is_fisheye)
     text = read_text(path, MAX_LIST_BYTES)
     content = read_json(path) if text.lstrip()[:1] == "{" else None
@@ -165,37 +184,6 @@ def _from_opencv(names: Names, unit_m: float, is_fisheye: bool | None) -> RawPai
     if R is None or T is None or len(T) != 3:
         raise InputError("no R of 9 numbers and T of 3, from camera 1 to 2; write both")
     return _pair(left, right, (R, unit_m * np.array(T)), size_of(names))
-
-
-def _from_ros(first: Names, second: Names, unit_m: float, is_fisheye: bool | None) -> RawPair:
-    """Two ``camera_info``: the rotations to the rectified frame and the right one's ``Tx``."""
-    shifts: list[float] = []  # Tx / fx: less the camera's x in the rectified frame
-    for names in (first, second):
-        P = matrix(names, ("projectionmatrix", "p"), 12)
-        if P is None or P[0, 0] <= 0:
-            raise InputError("no projection_matrix with a focal length; calibrate as a pair")
-        shifts.append(float(P[0, 3] / P[0, 0]))
-    if (shifts[0] == 0) == (shifts[1] == 0):
-        raise InputError(
-            f"the projections of the two camera_info have Tx / fx {shifts[0]:g} and {shifts[1]:g}, "
-            "where that of the left one is 0 and that of the right one less the baseline; "
-            "calibrate as a pair"
-        )
-    if size_of(first) != size_of(second):
-        raise InputError("the two camera_info are of images of two sizes; a pair has one")
-    both = (first, second) if shifts[0] == 0 else (second, first)
-    cameras, turns = [], []
-    for side, names in zip(("left", "right"), both, strict=True):
-        K, D = matrix(names, ("cameramatrix", "k"), 9), ("distortioncoefficients", "d")
-        kind = _kind(names.get("distortionmodel"), is_fisheye)
-        cameras.append(_camera(K, _first(names, D), kind, f"the {side} camera"))
-        turn = matrix(names, ("rectificationmatrix", "r"), 9)
-        if turn is None:
-            raise InputError(f"no rectification_matrix of the {side} camera; write the whole pair")
-        turns.append(turn)
-    along = np.array([unit_m * (shifts[0] or shifts[1]), 0, 0])
-    motion = (turns[1].T @ turns[0], turns[1].T @ along)
-    return _pair(cameras[0], cameras[1], motion, size_of(first))
 
 
 def _from_kalibr(names: Names, unit_m: float, is_fisheye: bool | None) -> RawPair:
@@ -349,7 +337,7 @@ def make_rectifier(pair: RawPair, size: Size, keep: float = 0.0) -> Rectifier:
         keep: 0: only what the raw images show; 1: all that they show, with black borders.
 
     Raises:
-        InputError: ``keep`` is out of range, or the lens bends too much for a flat image.
+        InputError: ``keep`` is out of range, or the lens bends more than any can.
         MissingExtraError: OpenCV is not installed.
     """
     cv2 = import_opencv("rectifying a pair")
@@ -368,6 +356,13 @@ def make_rectifier(pair: RawPair, size: Size, keep: float = 0.0) -> Rectifier:
         R1, R2, P1, P2, *_ = cv2.stereoRectify(*left, *right, size, R, t, flags=flags, alpha=keep)
     rig = camera_from_facts(facts_from_projections("the rectified pair", P1, P2, size), size)
     assert isinstance(rig, StereoRig), "two projections have a baseline"
+    raw_px, found_px = float(pair.left.K[0, 0]), float(rig.K[0, 0])
+    if found_px > _MAX_ENLARGED * raw_px:
+        raise InputError(
+            f"rectified, fx would be {found_px:.0f} px where the raw lens has {raw_px:.0f}: so "
+            f"much no lens bends; check the distortion {pair.left.distortion} and the rotation, or "
+            "whether the lens is a fisheye (--fisheye)"
+        )
     return Rectifier(
         rig=rig,
         rectified_from_raw=Rigid(torch.from_numpy(R1), torch.zeros(3).double()),

@@ -148,7 +148,28 @@ def facts_from_names(names: Names) -> CameraFacts | None:
         )
     settings = next((who for who in ("camera", "camera1") if f"{who}fx" in names), None)
     if settings is not None:
-        return _from_settings(names, settings)
+        fx, fy, cx, cy = (
+            scalar(names, f"{settings}{key}") or 0.0 for key in ("fx", "fy", "cx", "cy")
+        )
+        width, height = (scalar(names, f"camera{key}") for key in ("width", "height"))
+        baseline_m, product = scalar(names, "stereob"), scalar(names, "camerabf")
+        factor = scalar(names, "depthmapfactor") or scalar(names, "rgbddepthmapfactor")
+        is_rgbd = factor is not None
+        if baseline_m is None and product is not None and not is_rgbd and fx > 0:
+            baseline_m = product / fx  # of an RGB-D camera it is a made-up one
+        bent = [
+            value
+            for key in _DISTORTION_KEYS
+            if (value := scalar(names, f"{settings}{key}")) is not None
+        ]
+        return CameraFacts(
+            kind="settings of ORB-SLAM",
+            K=intrinsics(fx, fy, cx, cy),
+            size=None if width is None or height is None else (int(width), int(height)),
+            baseline_m=None if is_rgbd else baseline_m,
+            depth_unit_m=1 / factor if factor else None,
+            distortion=tuple(bent),
+        )
     left, right = published(names, _P, 12), matrix(names, ("p2",), 12)
     distortion, undistort = lens_of(names), _RECTIFY
     kind = "a camera_info of ROS" if is_ros(names) else "a camera of OpenCV"
@@ -182,17 +203,6 @@ def is_ros(names: Names) -> bool:
     return any(name in names for name in _ROS)
 
 
-def read_folder(folder: Path) -> CameraFacts:
-    """Read a camera of two files: the left and right ``camera_info`` of ROS, or OpenCV's two."""
-    first, second = read_two_files(folder)
-    if is_ros(first) and is_ros(second) and "p2" not in first | second:
-        return facts_from_ros_pair(first, second)
-    facts = facts_from_names(first | second)
-    if facts is None:
-        raise InputError("its two files together describe no camera")
-    return facts
-
-
 def read_two_files(folder: Path) -> tuple[Names, Names]:
     """Read what the two files of a folder say, in the order of their names."""
     with refused_as(folder, "folder", "check who may read it"):
@@ -208,48 +218,44 @@ def read_two_files(folder: Path) -> tuple[Names, Names]:
     return first, second
 
 
-def _from_settings(names: Names, who: str) -> CameraFacts:
-    """ORB-SLAM: ``Camera.fx``, ``Camera.bf`` (fx times baseline) or ``Stereo.b``, depth factor."""
-    fx, fy, cx, cy = (scalar(names, f"{who}{key}") or 0.0 for key in ("fx", "fy", "cx", "cy"))
-    width, height = (scalar(names, f"camera{key}") for key in ("width", "height"))
-    baseline_m, product = scalar(names, "stereob"), scalar(names, "camerabf")
-    factor = scalar(names, "depthmapfactor") or scalar(names, "rgbddepthmapfactor")
-    is_rgbd = factor is not None
-    if baseline_m is None and product is not None and not is_rgbd and fx > 0:
-        baseline_m = product / fx  # of an RGB-D camera it is a made-up one
-    bent = [
-        value for key in _DISTORTION_KEYS if (value := scalar(names, f"{who}{key}")) is not None
-    ]
-    return CameraFacts(
-        kind="settings of ORB-SLAM",
-        K=intrinsics(fx, fy, cx, cy),
-        size=None if width is None or height is None else (int(width), int(height)),
-        baseline_m=None if is_rgbd else baseline_m,
-        depth_unit_m=1 / factor if factor else None,
-        distortion=tuple(bent),
-    )
-
-
 def facts_from_ros_pair(first: Names, second: Names) -> CameraFacts:
     """Take the two cameras of a pair; the left one is that without ``Tx``."""
-    P, other = (_need(published(names, _P, 12), "projection_matrix") for names in (first, second))
-    left, right = (P, other) if P[0, 3] == 0 else (other, P)
-    if left[0, 3] != 0 or right[0, 3] == 0:
+    left, right = ros_pair(first, second)
+    P, other = (_need(published(names, _P, 12), "projection_matrix") for names in (left, right))
+    facts = facts_from_projections("a pair of camera_info", P, other, size_of(first))
+    return replace(facts, distortion=(*lens_of(first), *lens_of(second)), undistort=_RECTIFY)
+
+
+def ros_pair(first: Names, second: Names) -> tuple[Names, Names]:
+    """Give the left ``camera_info`` of a pair and the right one, which has a ``Tx``."""
+    Tx = [_need(matrix(one, _P, 12), "projection_matrix")[0, 3] for one in (first, second)]
+    if (Tx[0] == 0) == (Tx[1] == 0):
         raise InputError(
-            f"the projections of the two camera_info have Tx {P[0, 3]:g} and {other[0, 3]:g}, "
-            "where the left one has 0 and the right one -fx times the baseline; calibrate them as "
-            "a pair"
+            f"the projections of the two camera_info have Tx {Tx[0]:g} and {Tx[1]:g}, where the "
+            "left one has 0 and the right one -fx times the baseline; calibrate them as a pair"
         )
     if size_of(first) != size_of(second):
         raise InputError("the two camera_info are of images of two sizes; a pair has one")
-    facts = facts_from_projections("a pair of camera_info", left, right, size_of(first))
-    return replace(facts, distortion=(*lens_of(first), *lens_of(second)), undistort=_RECTIFY)
+    return (first, second) if Tx[0] == 0 else (second, first)
 
 
 def _from_intrinsics(names: Names, kind: str, distortion: tuple[float, ...]) -> CameraFacts | None:
     K = published(names, _K, 9)
     if K is None:
-        return _from_lengths(names, distortion)
+        is_realsense = "ppx" in names
+        which = ("fx", "fy", "ppx", "ppy") if is_realsense else ("fx", "fy", "cx", "cy")
+        values = [value for name in which if (value := scalar(names, name)) is not None]
+        if len(values) < len(which):
+            return None
+        fx, fy, cx, cy = values
+        return CameraFacts(
+            kind="a camera of RealSense" if is_realsense else "fx, fy, cx, cy",
+            K=intrinsics(fx, fy, cx, cy),
+            size=size_of(names),
+            baseline_m=baseline_of(names),
+            depth_unit_m=scalar(names, "depthscale") if is_realsense else None,
+            distortion=distortion,
+        )
     facts = CameraFacts(kind=kind, K=torch.from_numpy(K), size=size_of(names))
     T, R = numbers(names.get("t")), numbers(names.get("r"))  # of stereoCalibrate
     if T is not None and len(T) == 3:
@@ -265,24 +271,6 @@ def _from_intrinsics(names: Names, kind: str, distortion: tuple[float, ...]) -> 
         left, right = np.c_[K, [0, 0, 0]], np.c_[right, [right[0, 0] * T[0], 0, 0]]
         facts = facts_from_projections(kind, left, right, size_of(names))
     return replace(facts, distortion=distortion, undistort=_lens_remedy(names, facts.undistort))
-
-
-def _from_lengths(names: Names, distortion: tuple[float, ...]) -> CameraFacts | None:
-    """RealSense's fx, fy, ppx, ppy; or fx, fy, cx, cy."""
-    is_realsense = "ppx" in names
-    which = ("fx", "fy", "ppx", "ppy") if is_realsense else ("fx", "fy", "cx", "cy")
-    values = [value for name in which if (value := scalar(names, name)) is not None]
-    if len(values) < len(which):
-        return None
-    fx, fy, cx, cy = values
-    return CameraFacts(
-        kind="a camera of RealSense" if is_realsense else "fx, fy, cx, cy",
-        K=intrinsics(fx, fy, cx, cy),
-        size=size_of(names),
-        baseline_m=baseline_of(names),
-        depth_unit_m=scalar(names, "depthscale") if is_realsense else None,
-        distortion=distortion,
-    )
 
 
 def baseline_of(names: Names) -> float | None:

@@ -14,13 +14,12 @@ from depthpose.core.engine.job import shard_results as shard_results
 from depthpose.core.engine.work import Done as Done
 from depthpose.core.engine.work import Files as Files
 from depthpose.core.engine.work import Function as Function
+from depthpose.core.engine.work import Inputs as Inputs
 from depthpose.core.engine.work import Item as Item
 from depthpose.core.engine.work import Sample as Sample
 from depthpose.core.engine.work import ShardFormat as ShardFormat
 from depthpose.core.engine.work import find_items as find_items
 from depthpose.core.engine.work import find_tars as find_tars
-from depthpose.core.engine.work import first_sample as first_sample
-from depthpose.core.engine.work import is_tar as is_tar
 from depthpose.core.engine.work import read_shard as read_shard
 from depthpose.core.engine.work import run_here as run_here
 from depthpose.core.engine.work import stem as stem

@@ -79,7 +79,26 @@ def run_job(job: Job, engine: Engine) -> list[Done]:
     disk.refuse_unsafe(out)
     claim(out, {**job.settings, "shards": job.form})
     blocks = make_plan(out, job.items, job.tars, job.block)
-    done = _whole(out, blocks)
+    folder = disk.join(out, SHARDS)
+    sizes, records = disk.list_sizes(folder), _finished(out)
+    done: dict[str, Done] = {}
+    for block in blocks:
+        one, record = records.get(block.shard), disk.join(folder, f"{block.shard}.json")
+        path = None if one is None else disk.local_path(disk.join(folder, one.shard))
+        if one is None or one.block != block.checksum:
+            is_whole = False
+        elif path is None:  # of a store sizes alone are compared
+            is_whole = sizes.get(one.shard) == one.stamp[0]
+        else:
+            is_whole = is_unchanged(path, one.stamp)
+            if is_whole and (time_ns := path.stat().st_mtime_ns) != one.stamp[1]:  # a copy
+                one = replace(one, stamp=(one.stamp[0], time_ns, one.stamp[2]))
+                disk.publish_bytes(one.to_json().encode(), record)
+        if one is not None and is_whole:
+            if not one.failures:
+                done[block.shard] = one
+        elif f"{block.shard}.json" in sizes:
+            disk.remove(record)
     left = [block for block in blocks if block.shard not in done]
     if left:
         done |= {one.name: one for one in engine(left, job.work, out, job.form)}
@@ -182,31 +201,6 @@ def _finished(out: str) -> dict[str, Done]:
         with suppress(ValueError, KeyError, TypeError):
             records[name.removesuffix(".json")] = Done.from_json(text)
     return records
-
-
-def _whole(out: str, blocks: Sequence[Block]) -> dict[str, Done]:
-    """Give what is done without failures, its shard as it was written; other records go."""
-    folder = disk.join(out, SHARDS)
-    sizes, records = disk.list_sizes(folder), _finished(out)
-    done: dict[str, Done] = {}
-    for block in blocks:
-        one, record = records.get(block.shard), disk.join(folder, f"{block.shard}.json")
-        path = None if one is None else disk.local_path(disk.join(folder, one.shard))
-        if one is None or one.block != block.checksum:
-            is_whole = False
-        elif path is None:  # of a store sizes alone are compared
-            is_whole = sizes.get(one.shard) == one.stamp[0]
-        else:
-            is_whole = is_unchanged(path, one.stamp)
-            if is_whole and (time_ns := path.stat().st_mtime_ns) != one.stamp[1]:  # a copy
-                one = replace(one, stamp=(one.stamp[0], time_ns, one.stamp[2]))
-                disk.publish_bytes(one.to_json().encode(), record)
-        if one is not None and is_whole:
-            if not one.failures:
-                done[block.shard] = one
-        elif f"{block.shard}.json" in sizes:
-            disk.remove(record)
-    return done
 
 
 _LEAST_VERSION = (2, 52)  # the first version of Ray that has passwords

@@ -334,19 +334,35 @@ class Sample:
     reason: str = ""
 
 
-@contextmanager
-def first_sample(items: Sequence[Item], tars: Sequence[str], files: Files) -> Iterator[Sample]:
-    """Give the first input, to look at before any work.
+@dataclass(frozen=True, kw_only=True)
+class Inputs:
+    """Inputs of a command: listed ones, tar shards of them, and what each is made of."""
 
-    Raises:
-        InputError: it cannot be read.
-    """
-    block = Block("", tuple(items[:1])) if items else Block("", tar=tars[0])
-    with tempfile.TemporaryDirectory(prefix="depthpose-") as scratch:
-        sample = next(_samples(block, files, Path(scratch)))
-        if sample.reason:
-            raise InputError(sample.reason)
-        yield sample
+    items: Sequence[Item]
+    tars: Sequence[str] = ()
+    files: Files
+
+    @classmethod
+    def find(cls, words: Sequence[str], files: Files) -> "Inputs":
+        """List files, manifests and tar shards."""
+        tars = [word for word in words if is_tar(word)]
+        others = [word for word in words if not is_tar(word)]
+        items = find_items(others, files) if others else []
+        return cls(items=items, tars=find_tars(tars), files=files)
+
+    @contextmanager
+    def first(self) -> Iterator[Sequence[Path]]:
+        """Give the files of the first input, to look at before any work.
+
+        Raises:
+            InputError: it cannot be read.
+        """
+        block = Block("", tuple(self.items[:1]), None if self.items else self.tars[0])
+        with tempfile.TemporaryDirectory(prefix="depthpose-") as scratch:
+            sample = next(_samples(block, self.files, Path(scratch)))
+            if sample.reason:
+                raise InputError(sample.reason)
+            yield sample.files
 
 
 def _samples(block: Block, wanted: Files, scratch: Path) -> Iterator[Sample]:
@@ -360,9 +376,11 @@ def _samples(block: Block, wanted: Files, scratch: Path) -> Iterator[Sample]:
     if block.tar is None:
         return
     is_single = len(wanted.roles) == 1
+    is_empty = True
     try:
         for key, members in groupby(read_tar(block.tar), lambda member: _key_of(member[0])):
             files: dict[str, Path] = {}
+            is_empty = False
             for member, data in members:
                 ending = PurePosixPath(member).name.partition(".")[2]
                 role, _, suffix = ending.rpartition(".")
@@ -384,6 +402,10 @@ def _samples(block: Block, wanted: Files, scratch: Path) -> Iterator[Sample]:
             yield Sample(key, there, reason)
     except InputError as error:
         yield Sample(PurePosixPath(block.tar).name, reason=str(error))
+    else:
+        if is_empty:
+            reason = f"{block.tar}: holds no file; pack inputs into it, or leave it out"
+            yield Sample(PurePosixPath(block.tar).name, reason=reason)
 
 
 def _key_of(member: str) -> str:
@@ -505,6 +527,9 @@ class Runner:
                 reasons = iter(self._function([one for one in chunk if not one.reason], results))
                 for one in chunk:
                     reason = one.reason or next(reasons)
+                    for path in one.files:
+                        if scratch in path.parents:  # of a copy the name alone says something
+                            reason = reason.replace(str(path), path.name)
                     files: dict[str, bytes] = {}
                     for ending in self._work.endings:
                         path = results / f"{one.name}.{ending}"

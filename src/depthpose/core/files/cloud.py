@@ -24,7 +24,6 @@ from depthpose.core.files.points import (
     plain_numbers,
     read_pcd,
     read_ply_elements,
-    unpack_rgb,
 )
 from depthpose.core.files.text import MAX_TEXT_BYTES
 
@@ -127,7 +126,13 @@ def _from_columns(path: AnyPath, columns: Columns) -> Cloud:
     points = np.stack([to_float32(columns[n]) for n in "xyz"], -1) if columns else np.empty((0, 3))
     packed, color = columns.get("rgb", columns.get("rgba")), None
     if packed is not None and packed.dtype.itemsize == 4:
-        color = to_float32(unpack_rgb(packed)) / np.float32(255)
+        if packed.dtype.kind == "f":
+            bits = packed.astype(np.float32).view(np.uint32)
+        else:
+            bits = packed.astype(np.int64).astype(np.uint32)
+        color = to_float32(
+            np.stack([(bits >> shift) & 255 for shift in (16, 8, 0)], -1).astype(np.uint8)
+        ) / np.float32(255)
     elif columns.keys() >= set(_COLOR):
         color = np.stack([columns[name] for name in _COLOR], -1)
         if color.dtype.kind != "f":
@@ -147,8 +152,8 @@ def _from_rows(path: AnyPath, table: np.ndarray) -> Cloud:
             "save the transpose (array.T)"
         )
     # Columns that number the points, or say where in an image they were, are no coordinates.
-    is_whole = (table[:_LOOKED_AT] == np.trunc(table[:_LOOKED_AT])).all(0)
     with np.errstate(invalid="ignore"):
+        is_whole = (table[:_LOOKED_AT] == np.trunc(table[:_LOOKED_AT])).all(0)
         steps = np.diff(table[:, 0])
     is_long = table.shape[1] > 3 and len(table) > 3 and bool(is_whole[0])
     if is_long and table.shape[1] > 4 and is_whole[1] and not is_whole[2:5].any():

@@ -209,20 +209,16 @@ def _own_parts(first: Sequence[str], second: Sequence[str]) -> tuple[list[Any], 
         if all(len(set(column)) == 1 for column in columns):
             continue  # the side, or what both share
         for side, column in enumerate(columns):
-            parts = _without_shared(column)
+            texts = column
+            for turn in (1, -1):
+                turned = [text[::turn] for text in texts]
+                low, high = min(turned), max(turned)  # what these two share, all share
+                ends = (k for k, (a, b) in enumerate(zip(low, high, strict=False)) if a != b)
+                shared = re.sub(r"\d+$", "", low[: next(ends, len(low))])
+                texts = [text[len(shared) :][::turn] for text in turned]
+            parts = [re.sub(r"\d+", lambda found: str(int(found[0])), text) for text in texts]
             keys[side] = [(*key, part) for key, part in zip(keys[side], parts, strict=True)]
     return keys[0], keys[1]
-
-
-def _without_shared(texts: list[str]) -> list[str]:
-    """Cut the beginning and the end that all have, but within no number; drop leading zeros."""
-    for turn in (1, -1):
-        turned = [text[::turn] for text in texts]
-        low, high = min(turned), max(turned)  # what these two share, all share
-        ends = (k for k, (a, b) in enumerate(zip(low, high, strict=False)) if a != b)
-        shared = re.sub(r"\d+$", "", low[: next(ends, len(low))])
-        texts = [text[len(shared) :][::turn] for text in turned]
-    return [re.sub(r"\d+", lambda found: str(int(found[0])), text) for text in texts]
 
 
 SOURCE = "source.json"  # beside shards fetched when first read: {"url": ...}, where from

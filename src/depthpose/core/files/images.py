@@ -39,6 +39,8 @@ _UNREAD = re.compile(
     re.IGNORECASE,
 )
 """Suffixes of pictures that are not read: in a folder they are named."""
+_ARCHIVES = (".tar", ".tgz", ".gz", ".bz2", ".xz", ".zst", ".lz4", ".zip", ".7z", ".rar")
+"""Suffixes of archives, which are no pictures whatever they hold."""
 FAST_PNG = {"compress_level": 1}
 """Four times faster than zlib's usual 6 and a third larger at most: at 6, writing the pictures of
 an estimate took as long as the estimate."""
@@ -219,7 +221,7 @@ def list_images(path: AnyPath) -> list[Path]:
     """
     wanted = Path(path)
     try:
-        if wanted.is_file():
+        if wanted.is_file() and wanted.suffix.lower() not in _ARCHIVES:
             return [wanted]
         if wanted.is_dir():
             files = list(wanted.iterdir())
@@ -237,10 +239,10 @@ def list_images(path: AnyPath) -> list[Path]:
         said = f"{path}: {len(unread)} files are left out, {min(unread)} first: save them as PNG"
         warnings.warn(said, Notice, stacklevel=2)
     if not pictures:
-        raise InputError(
-            f"{path}: no {', '.join(LISTED_SUFFIXES)} file there; "
-            "give a picture, a folder of pictures or a pattern such as 'left/*.png'"
-        )
+        remedy = "give a picture, a folder of pictures or a pattern such as 'left/*.png'"
+        if any(p.suffix.lower() in _ARCHIVES for p in files):
+            remedy = "unpack the archive (with --engine ray, .tar and .tar.gz are read)"
+        raise InputError(f"{path}: no {', '.join(LISTED_SUFFIXES)} file there; {remedy}")
     return pictures
 
 
@@ -351,7 +353,29 @@ def read_map(path: AnyPath) -> Float32[Tensor, "h w"]:
     """
     suffix = Path(path).suffix.lower()
     if suffix == ".pfm":
-        return _read_pfm(path)
+        data = read_bytes(path)
+        header = _PFM_HEADER.match(data)
+        if header is None:
+            raise InputError(
+                f"{path}: no PFM header ('Pf', width, height, scale); is it a PFM file?"
+            )
+        if header[1] == b"F":
+            raise InputError(f"{path}: a colour PFM (PF), not a map; save one channel (Pf)")
+        width, height = int(header[2]), int(header[3])
+        body = memoryview(data)[header.end() :]
+        if width * height == 0 or width * height * 4 != len(body):
+            raise InputError(
+                f"{path}: declares {width}x{height} floats but {len(body)} bytes follow; it is "
+                "truncated or damaged, save it again"
+            )
+        with refused_as(path, "PFM scale", "it must be a number other than 0"):
+            scale = float(header[4])
+        if scale == 0 or not math.isfinite(scale):
+            raise InputError(f"{path}: PFM scale {scale}; its sign gives the byte order, so not 0")
+        rows = np.frombuffer(body, "<f4" if scale < 0 else ">f4").reshape(height, width)
+        array = to_float32(rows[::-1])
+        array[~np.isfinite(array)] = np.nan
+        return torch.from_numpy(array)
     if suffix != ".npy":
         raise refused_suffix(path, "map", MAP_SUFFIXES)
     array = read_npy(path)
@@ -430,30 +454,6 @@ def to_float32(array: np.ndarray) -> np.ndarray:
     """Copy to native contiguous float32; what float32 cannot hold becomes infinity."""
     with np.errstate(over="ignore", invalid="ignore"):
         return np.array(array, dtype=np.float32, order="C")
-
-
-def _read_pfm(path: AnyPath) -> Float32[Tensor, "h w"]:
-    data = read_bytes(path)
-    header = _PFM_HEADER.match(data)
-    if header is None:
-        raise InputError(f"{path}: no PFM header ('Pf', width, height, scale); is it a PFM file?")
-    if header[1] == b"F":
-        raise InputError(f"{path}: a colour PFM (PF), not a map; save one channel (Pf)")
-    width, height = int(header[2]), int(header[3])
-    body = memoryview(data)[header.end() :]
-    if width * height == 0 or width * height * 4 != len(body):
-        raise InputError(
-            f"{path}: declares {width}x{height} floats but {len(body)} bytes follow; it is "
-            "truncated or damaged, save it again"
-        )
-    with refused_as(path, "PFM scale", "it must be a number other than 0"):
-        scale = float(header[4])
-    if scale == 0 or not math.isfinite(scale):
-        raise InputError(f"{path}: PFM scale {scale}; its sign gives the byte order, so not 0")
-    rows = np.frombuffer(body, "<f4" if scale < 0 else ">f4").reshape(height, width)
-    array = to_float32(rows[::-1])
-    array[~np.isfinite(array)] = np.nan
-    return torch.from_numpy(array)
 
 
 KITTI_UNIT = 1 / 256  # KITTI stores metres and pixels of disparity times 256

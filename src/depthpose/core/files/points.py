@@ -159,7 +159,34 @@ def read_ply_elements(path: AnyPath, last: str | None = None) -> tuple[Columns, 
             more_lists, used = _binary_lists(path, body, element, order)
             body, lists = body[used:], lists | more_lists
         else:
-            lists |= _text_lists(path, rows, element)
+            sizes = {f.name: array("q") for f in element.fields if f.size_code}
+            values = {name: array("d") for name in sizes}
+            there = 0
+            for there, row in enumerate(islice(rows, element.count), 1):
+                words, at = row.split(), 0
+                try:
+                    for f in element.fields:
+                        if f.size_code:
+                            count = int(words[at])
+                            sizes[f.name].append(count)
+                            values[f.name].extend(map(float, words[at + 1 : at + 1 + count]))
+                            at += max(count, 0)
+                        at += 1
+                except (ValueError, IndexError, OverflowError):
+                    at = -1
+                if at != len(words):
+                    raise InputError(
+                        f"{path}: row {there} of {element.name}, {row.strip()[:60]!r}, is not what "
+                        "the header declares (the number of values, then as many); save it again"
+                    )
+            if there < element.count:
+                raise _truncated(path, f"{element.count} {element.name}", there)
+            lists |= {
+                f"{element.name} {name}": Ragged(
+                    np.array(sizes[name], np.int64), np.array(values[name])
+                )
+                for name in sizes
+            }
         if element.name == last:
             return columns, lists
     more = len(body) if rows is None else sum(1 for _ in rows)
@@ -219,35 +246,6 @@ def _binary_lists(
         for f in element.fields
         if f.size_code
     }, at
-
-
-def _text_lists(path: AnyPath, rows: Iterator[str], element: _Element) -> dict[str, Ragged]:
-    sizes = {f.name: array("q") for f in element.fields if f.size_code}
-    values = {name: array("d") for name in sizes}
-    there = 0
-    for there, row in enumerate(islice(rows, element.count), 1):
-        words, at = row.split(), 0
-        try:
-            for f in element.fields:
-                if f.size_code:
-                    count = int(words[at])
-                    sizes[f.name].append(count)
-                    values[f.name].extend(map(float, words[at + 1 : at + 1 + count]))
-                    at += max(count, 0)
-                at += 1
-        except (ValueError, IndexError, OverflowError):
-            at = -1
-        if at != len(words):
-            raise InputError(
-                f"{path}: row {there} of {element.name}, {row.strip()[:60]!r}, is not what the "
-                "header declares (the number of values, then as many); save it again"
-            )
-    if there < element.count:
-        raise _truncated(path, f"{element.count} {element.name}", there)
-    return {
-        f"{element.name} {name}": Ragged(np.array(sizes[name], np.int64), np.array(values[name]))
-        for name in sizes
-    }
 
 
 def encode_ply(points: np.ndarray, color: np.ndarray | None) -> bytes:
@@ -321,7 +319,20 @@ def read_pcd(path: AnyPath) -> Columns:
     lines = data[: end.start()].decode("latin-1").splitlines()
     rows = (line.split() for line in lines if not line.startswith("#"))
     header = {words[0]: words[1:] for words in rows if words}
-    fields = _parse_fields(path, header)
+    names = header.get("FIELDS", [])
+    counts = header.get("COUNT", ["1"] * len(names))
+    rows = list(zip(names, header.get("TYPE", []), header.get("SIZE", []), counts, strict=False))
+    is_known = all((kind, size) in _PCD_CODES for _, kind, size, _ in rows)
+    is_counted = all(re.fullmatch(r"[1-9][0-9]{0,3}", count) for count in counts)
+    real = [name for name in names if name != "_"]  # "_" is padding, any number of times
+    if not rows or len(rows) != len(names) or not (is_known and is_counted):
+        raise InputError(
+            f"{path}: PCD header of FIELDS {names}, TYPE {header.get('TYPE')}, SIZE "
+            f"{header.get('SIZE')}, COUNT {counts} is not understood; save it as version 0.7"
+        )
+    if len(set(real)) != len(real):
+        raise InputError(f"{path}: PCD fields {names} repeat a name; keep one of them")
+    fields = [Field(name=n, code=_PCD_CODES[k, s], count=int(c)) for n, k, s, c in rows]
     match header.get("POINTS"), header.get("WIDTH"), header.get("HEIGHT"):
         case [points], _, _ if _is_count(points):
             count = int(points)
@@ -333,7 +344,25 @@ def read_pcd(path: AnyPath) -> Columns:
     if end[1] == b"binary":
         return split_records(path, body, fields, count)
     if end[1] == b"binary_compressed":
-        return _split_compressed(path, body, fields, count)
+        need_bytes(path, len(body), 8, "the two compressed sizes")
+        packed_size, size = (int(n) for n in np.frombuffer(body, "<u4", 2))
+        need_bytes(path, len(body) - 8, packed_size, "compressed points")
+        declared = count * sum(f.count * np.dtype(f.code).itemsize for f in fields)
+        if size != declared or size > _MAX_UNPACKED or packed_size > _MAX_PACKED:
+            raise InputError(
+                f"{path}: {packed_size} bytes, {size} unpacked, where the header needs {declared} "
+                f"(and {_MAX_PACKED} and {_MAX_UNPACKED} are allowed); save it as DATA binary"
+            )
+        try:
+            unpacked = memoryview(decompress_lzf(body[8 : 8 + packed_size], size))
+        except ValueError as error:
+            raise InputError(f"{path}: damaged: {error}; save it as DATA binary") from error
+        columns: Columns = {}
+        for f in fields:  # one field after the other, each for all points
+            values = np.frombuffer(unpacked, f"<{f.code}", count * f.count)
+            columns[f.name] = values.reshape(count, f.count)[:, 0]
+            unpacked = unpacked[values.nbytes :]
+        return columns
     return split_rows(path, text_rows(path, body), fields, count)
 
 
@@ -352,15 +381,6 @@ def encode_pcd(points: np.ndarray, color: np.ndarray | None) -> bytes:
         f"VIEWPOINT 0 0 0 1 0 0 0\nPOINTS {len(points)}\nDATA binary\n"
     )
     return header.encode() + table.tobytes()
-
-
-def unpack_rgb(packed: np.ndarray) -> np.ndarray:
-    """Take PCL's packed colour apart: a 4-byte number, float or not, of bytes (-, r, g, b)."""
-    if packed.dtype.kind == "f":
-        bits = packed.astype(np.float32).view(np.uint32)
-    else:
-        bits = packed.astype(np.int64).astype(np.uint32)
-    return np.stack([(bits >> shift) & 255 for shift in (16, 8, 0)], -1).astype(np.uint8)
 
 
 def decompress_lzf(packed: memoryview, size: int) -> bytes:
@@ -391,45 +411,6 @@ def decompress_lzf(packed: memoryview, size: int) -> bytes:
     if len(out) != size or at > len(packed):
         raise ValueError(f"the compressed bytes do not unpack to {size}")
     return bytes(out)
-
-
-def _split_compressed(path: AnyPath, body: memoryview, fields: list[Field], count: int) -> Columns:
-    need_bytes(path, len(body), 8, "the two compressed sizes")
-    packed_size, size = (int(n) for n in np.frombuffer(body, "<u4", 2))
-    need_bytes(path, len(body) - 8, packed_size, "compressed points")
-    declared = count * sum(f.count * np.dtype(f.code).itemsize for f in fields)
-    if size != declared or size > _MAX_UNPACKED or packed_size > _MAX_PACKED:
-        raise InputError(
-            f"{path}: {packed_size} bytes, {size} unpacked, where the header needs {declared} (and "
-            f"{_MAX_PACKED} and {_MAX_UNPACKED} are allowed); save it as DATA binary"
-        )
-    try:
-        unpacked = memoryview(decompress_lzf(body[8 : 8 + packed_size], size))
-    except ValueError as error:
-        raise InputError(f"{path}: damaged: {error}; save it as DATA binary") from error
-    columns: Columns = {}
-    for f in fields:  # one field after the other, each for all points
-        values = np.frombuffer(unpacked, f"<{f.code}", count * f.count)
-        columns[f.name] = values.reshape(count, f.count)[:, 0]
-        unpacked = unpacked[values.nbytes :]
-    return columns
-
-
-def _parse_fields(path: AnyPath, header: dict[str, list[str]]) -> list[Field]:
-    names = header.get("FIELDS", [])
-    counts = header.get("COUNT", ["1"] * len(names))
-    rows = list(zip(names, header.get("TYPE", []), header.get("SIZE", []), counts, strict=False))
-    is_known = all((kind, size) in _PCD_CODES for _, kind, size, _ in rows)
-    is_counted = all(re.fullmatch(r"[1-9][0-9]{0,3}", count) for count in counts)
-    real = [name for name in names if name != "_"]  # "_" is padding, any number of times
-    if not rows or len(rows) != len(names) or not (is_known and is_counted):
-        raise InputError(
-            f"{path}: PCD header of FIELDS {names}, TYPE {header.get('TYPE')}, SIZE "
-            f"{header.get('SIZE')}, COUNT {counts} is not understood; save it as version 0.7"
-        )
-    if len(set(real)) != len(real):
-        raise InputError(f"{path}: PCD fields {names} repeat a name; keep one of them")
-    return [Field(name=n, code=_PCD_CODES[k, s], count=int(c)) for n, k, s, c in rows]
 
 
 def _is_count(text: str) -> bool:

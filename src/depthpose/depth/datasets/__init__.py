@@ -21,7 +21,6 @@ from depthpose.depth.datasets.frames import known_truths as known_truths
 from depthpose.depth.datasets.frames import lidar_truth as lidar_truth
 from depthpose.depth.datasets.frames import project_lidar as project_lidar
 from depthpose.depth.datasets.frames import read_disparity as read_disparity
-from depthpose.depth.datasets.layouts import RawFrame as RawFrame
 from depthpose.depth.datasets.layouts import has_calibration as has_calibration
 from depthpose.depth.datasets.layouts import has_raw_frame as has_raw_frame
 from depthpose.depth.datasets.layouts import pack_frames as pack_frames

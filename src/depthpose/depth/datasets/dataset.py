@@ -14,14 +14,15 @@ from torch import Tensor
 
 from depthpose.core.camera import StereoRig
 from depthpose.core.errors import InputError, nearest_name
-from depthpose.core.files import read_text
+from depthpose.core.files import image_size, read_image, read_text
 from depthpose.depth.datasets.frames import (
     Frame,
+    check_map_size,
     frame_camera,
-    frame_input,
-    frame_truth,
     has_lidar,
     lidar_truth,
+    read_depth,
+    read_disparity,
 )
 from depthpose.depth.datasets.layouts import find_frames, local_folder
 from depthpose.depth.disparity import depth_from_disparity
@@ -89,31 +90,26 @@ def read_split(name: str | Path) -> Split:
     known = _MONODEPTH_SHA256.get(hashlib.sha256(text.encode()).hexdigest())
     if known is not None:
         return _known(known)
-    lines = ((i, line.strip()) for i, line in enumerate(text.splitlines(), 1))
-    frames = {_parse_line(path, i, line) for i, line in lines if line} - {None}
+    frames: set[tuple[str, int]] = set()
+    for number, line in enumerate(map(str.strip, text.splitlines()), 1):
+        drives = set(re.findall(r"\d{4}_\d\d_\d\d_drive_\d{4}_sync", line, re.ASCII))
+        images = re.findall(r"image_0[23]/(?:data/)?(\d{1,10})\.\w", line, re.ASCII)
+        as_words = re.fullmatch(r"\S+\s+(\d{1,10})\s+([lr])", line, re.ASCII)
+        numbers = {int(n) for n in (images if as_words is None else as_words.groups()[:1])}
+        if line and (len(drives) != 1 or len(numbers) != 1):
+            raise InputError(
+                f"{path}: line {number} is {line[:60]!r}, but a frame is 'DATE/DRIVE FRAME l' "
+                "(monodepth2) or two image paths of one frame (monodepth)."
+            )
+        if line and (as_words is None or as_words[2] == "l"):
+            frames.add((drives.pop(), numbers.pop()))
     if not frames:
         raise InputError(
             f"{path}: names no frame. Each line is 'DATE/DRIVE FRAME l' or two images."
         )
-    listed = tuple(sorted(frame for frame in frames if frame is not None))
+    listed = tuple(sorted(frames))
     same = [key for key in SPLIT_NAMES if _known(key).frames == listed]
     return Split(name=same[0] if same else path.name, frames=listed)
-
-
-def _parse_line(path: Path, number: int, line: str) -> tuple[str, int] | None:
-    """Read one line; None for a frame of the right camera."""
-    drives = set(re.findall(r"\d{4}_\d\d_\d\d_drive_\d{4}_sync", line, re.ASCII))
-    images = {int(n) for n in re.findall(r"image_0[23]/(?:data/)?(\d{1,10})\.\w", line, re.ASCII)}
-    as_words = re.fullmatch(r"\S+\s+(\d{1,10})\s+([lr])", line, re.ASCII)
-    numbers = {int(as_words[1])} if as_words is not None else images
-    if len(drives) != 1 or len(numbers) != 1:
-        raise InputError(
-            f"{path}: line {number} is {line[:60]!r}, but a frame is 'DATE/DRIVE FRAME l' "
-            "(monodepth2) or two image paths of one frame (monodepth)."
-        )
-    if as_words is not None and as_words[2] == "r":
-        return None
-    return drives.pop(), numbers.pop()
 
 
 @cache
@@ -158,11 +154,24 @@ class Dataset:
 
     def read_input(self, index: int) -> StereoInput:
         """Read images and calibration alone."""
-        return frame_input(self.frames[index])
+        frame = self.frames[index]
+        left = read_image(frame.left)
+        right = None if frame.right is None else read_image(frame.right)
+        if frame.right is not None and right is not None:
+            check_map_size(frame.right, right, (left.shape[2], left.shape[1]))
+        return StereoInput(name=frame.name, left=left, right=right, camera=frame_camera(frame))
 
     def read_truth(self, index: int) -> StereoTruth:
-        """Read the truth alone."""
-        return frame_truth(self.frames[index])
+        """Read the truth that comes as maps; a LiDAR scan is for :func:`lidar_truth`."""
+        frame = self.frames[index]
+        depth_m = None if frame.depth is None else read_depth(frame.depth)
+        disparity_px = None if frame.disparity is None else read_disparity(frame.disparity)
+        is_sky = None if frame.sky is None else read_image(frame.sky)[0] > 0
+        parts = ((frame.depth, depth_m), (frame.disparity, disparity_px), (frame.sky, is_sky))
+        for path, values in parts:
+            if path is not None and values is not None:
+                check_map_size(path, values, image_size(frame.left))
+        return StereoTruth(disparity_px=disparity_px, depth_m=depth_m, is_sky=is_sky)
 
     def read_rig(self, index: int) -> StereoRig | None:
         """Read the calibration alone; None where the frame has none of a pair."""

@@ -34,7 +34,6 @@ from depthpose.core.errors import InputError
 from depthpose.core.files import (
     MAP_SUFFIXES,
     image_size,
-    read_image,
     read_key_values,
     read_map,
     read_points_bin,
@@ -43,7 +42,6 @@ from depthpose.core.files import (
 )
 from depthpose.core.files.images import KITTI_UNIT
 from depthpose.depth.config import TruthKind
-from depthpose.depth.types import StereoInput, StereoTruth
 
 _MAX_PAIRS_BYTES = 2**24
 """Of a text with a line for each pair of a folder."""
@@ -60,20 +58,6 @@ class KittiCalibration:
 
     rig: StereoRig
     pixels_from_velodyne: Float64[np.ndarray, "3 4"] | None
-
-
-def read_raw_calibration(folder: Path, width: int, height: int) -> KittiCalibration:
-    """Read a date's ``calib_cam_to_cam.txt`` and, where it is, ``calib_velo_to_cam.txt``."""
-    cameras, lidar = folder / "calib_cam_to_cam.txt", folder / "calib_velo_to_cam.txt"
-    keys = read_key_values(cameras)
-    rig, left = _projected_rig(cameras, keys, ("P_rect_02", "P_rect_03"), (width, height))
-    if not lidar.is_file():
-        return KittiCalibration(rig=rig, pixels_from_velodyne=None)
-    rectify = kitti_matrix(cameras, keys, "R_rect_00", (3, 3))
-    of_lidar = read_key_values(lidar)
-    R, t = kitti_matrix(lidar, of_lidar, "R", (3, 3)), kitti_matrix(lidar, of_lidar, "T", (3, 1))
-    composed = _composed(lidar, left, rectify, np.hstack([R, t]))
-    return KittiCalibration(rig=rig, pixels_from_velodyne=composed)
 
 
 def read_object_calibration(
@@ -276,27 +260,6 @@ class Frame:
         return files
 
 
-def frame_input(frame: Frame) -> StereoInput:
-    """Read images and calibration of a frame."""
-    left = read_image(frame.left)
-    right = None if frame.right is None else read_image(frame.right)
-    if frame.right is not None and right is not None:
-        _check_map_size(frame.right, right, (left.shape[2], left.shape[1]))
-    return StereoInput(name=frame.name, left=left, right=right, camera=frame_camera(frame))
-
-
-def frame_truth(frame: Frame) -> StereoTruth:
-    """Read the truth that the dataset ships as maps; a LiDAR scan is for :func:`lidar_truth`."""
-    depth_m = None if frame.depth is None else read_depth(frame.depth)
-    disparity_px = None if frame.disparity is None else read_disparity(frame.disparity)
-    is_sky = None if frame.sky is None else read_image(frame.sky)[0] > 0
-    parts = ((frame.depth, depth_m), (frame.disparity, disparity_px), (frame.sky, is_sky))
-    for path, values in parts:
-        if path is not None and values is not None:
-            _check_map_size(path, values, image_size(frame.left))
-    return StereoTruth(disparity_px=disparity_px, depth_m=depth_m, is_sky=is_sky)
-
-
 def frame_camera(frame: Frame) -> Camera | None:
     """Read the camera of a frame, or None where it has no calibration; of a pair, the rig."""
     if frame.calibration is None:
@@ -326,10 +289,19 @@ def kitti_calibration(frame: Frame) -> KittiCalibration:
             f"{frame.name}: no KITTI calibration, so its LiDAR scan cannot be projected. Put "
             "calib_cam_to_cam.txt and calib_velo_to_cam.txt into the folder of its date."
         )
-    width, height = image_size(frame.left)
-    if frame.style == "raw":
-        return read_raw_calibration(frame.calibration, width, height)
-    return read_object_calibration(frame.calibration, width, height, is_grey=frame.style == "grey")
+    home, size = frame.calibration, image_size(frame.left)
+    if frame.style != "raw":
+        return read_object_calibration(home, *size, is_grey=frame.style == "grey")
+    cameras, lidar = home / "calib_cam_to_cam.txt", home / "calib_velo_to_cam.txt"
+    keys = read_key_values(cameras)
+    rig, left = _projected_rig(cameras, keys, ("P_rect_02", "P_rect_03"), size)
+    if not lidar.is_file():
+        return KittiCalibration(rig=rig, pixels_from_velodyne=None)
+    rectify = kitti_matrix(cameras, keys, "R_rect_00", (3, 3))
+    of_lidar = read_key_values(lidar)
+    R, t = kitti_matrix(lidar, of_lidar, "R", (3, 3)), kitti_matrix(lidar, of_lidar, "T", (3, 1))
+    composed = _composed(lidar, left, rectify, np.hstack([R, t]))
+    return KittiCalibration(rig=rig, pixels_from_velodyne=composed)
 
 
 def known_truths(frame: Frame) -> tuple[TruthKind, ...]:
@@ -359,7 +331,7 @@ def lidar_truth(frame: Frame, depth: LidarDepth) -> Float[Tensor, "h w"]:
     drawn = _drawn_scan(frame)
     if frame.velodyne is None and drawn is not None and depth == "camera_z":
         depth_m = read_depth(drawn)
-        _check_map_size(drawn, depth_m, image_size(frame.left))
+        check_map_size(drawn, depth_m, image_size(frame.left))
         return depth_m
     if frame.velodyne is None:
         raise InputError(f"{frame.name}: has no LiDAR scan of the kind {depth}.")
@@ -383,7 +355,8 @@ def _is_plain(frame: Frame) -> bool:
     return frame.style in ("plain", "camera") and frame.scan is None
 
 
-def _check_map_size(path: Path, values: Shaped[Tensor, "*any h w"], size: tuple[int, int]) -> None:
+def check_map_size(path: Path, values: Shaped[Tensor, "*any h w"], size: tuple[int, int]) -> None:
+    """Refuse a map of another size than its left image, (width, height)."""
     height, width = values.shape[-2:]
     if (width, height) != size:
         raise InputError(

@@ -14,10 +14,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Float64
-from torch import Tensor
 
-from depthpose.core.camera import StereoRig
 from depthpose.core.errors import InputError
 from depthpose.core.files import (
     MAP_SUFFIXES,
@@ -34,6 +31,7 @@ from depthpose.core.files.disk import SOURCE, find_partners, write_bytes
 from depthpose.core.files.images import LISTED_SUFFIXES
 from depthpose.core.run import is_whole, note_result
 from depthpose.depth.datasets.frames import Frame
+from depthpose.depth.types import RawFrame
 
 INDEX = "index.json"
 """What a packed data set holds; written last."""
@@ -363,31 +361,6 @@ def _listed(folder: Path, suffixes: tuple[str, ...]) -> list[Path]:
 _CALIBRATION_FILES = ("calib_cam_to_cam.txt", "calib_velo_to_cam.txt")
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class RawFrame:
-    """What is written of one frame.
-
-    Attributes:
-        left: left image (camera 2).
-        right: right image (camera 3).
-        rig: the cameras.
-        disparity_px: of the left image; NaN where unknown.
-        occluded: left pixels that the right view does not show.
-        is_sky: left pixels that show the sky.
-        points: one LiDAR scan, x forward, y left, z up [m] and reflectance; or None.
-        camera_from_velodyne: from the LiDAR to the left camera.
-    """
-
-    left: Float[Tensor, "3 h w"]
-    right: Float[Tensor, "3 h w"]
-    rig: StereoRig
-    disparity_px: Float[Tensor, "h w"]
-    occluded: Bool[Tensor, "h w"]
-    is_sky: Bool[Tensor, "h w"]
-    points: Float[Tensor, "n 4"] | None
-    camera_from_velodyne: Float64[np.ndarray, "4 4"]
-
-
 def has_raw_frame(folder: Path, drive: str, number: int) -> bool:
     """Whether a frame is there, and every file of it as it was written."""
     last = f"{drive[:10]}/{drive}/disp_occ/{number:010d}.png"
@@ -426,8 +399,8 @@ def write_raw_frame(folder: Path, drive: str, number: int, frame: RawFrame) -> N
 
     write_image(new("image_02/data"), frame.left)
     write_image(new("image_03/data"), frame.right)
-    if frame.points is not None:
-        scan = frame.points.float().contiguous().numpy().astype("<f4")
+    if frame.lidar_points is not None:
+        scan = frame.lidar_points.float().contiguous().numpy().astype("<f4")
         write_bytes(new("velodyne_points/data", ".bin"), scan.tobytes())
     write_image(new("sky"), frame.is_sky.float().expand(3, -1, -1))
     seen_by_both = torch.where(frame.occluded, torch.nan, frame.disparity_px)

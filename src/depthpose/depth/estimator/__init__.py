@@ -4,6 +4,6 @@ from depthpose.depth.estimator.inputs import Picture as Picture
 from depthpose.depth.estimator.inputs import refuse_unrectified as refuse_unrectified
 from depthpose.depth.estimator.inputs import usable_right as usable_right
 from depthpose.depth.estimator.net import DEFAULT as DEFAULT
-from depthpose.depth.estimator.net import DepthPipeline as DepthPipeline
 from depthpose.depth.estimator.net import FakestereoNet as FakestereoNet
-from depthpose.depth.estimator.net import pipeline as pipeline
+from depthpose.depth.estimator.pictures import DepthPipeline as DepthPipeline
+from depthpose.depth.estimator.pictures import pipeline as pipeline

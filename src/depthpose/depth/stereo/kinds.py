@@ -111,14 +111,16 @@ def folded_weight(layer: nn.Module) -> tuple[Tensor, Tensor]:
 
 def fold_features(features: ModuleT, like: Tensor) -> ModuleT:
     """Fold every batch norm after a 2D convolution, in place, and bring all to ``like``'s type."""
-    for layer in list(features.modules()):
-        if not isinstance(getattr(layer, "norm", None), nn.BatchNorm2d):
-            continue
-        weight, bias = folded_weight(layer)
-        conv = cast("nn.Conv2d", layer.conv)
-        conv.weight.data = weight
-        conv.bias = nn.Parameter(bias)
-        layer.norm = nn.Identity()
+    for parent in list(features.modules()):
+        for name, layer in list(parent.named_children()):
+            if isinstance(getattr(layer, "norm", None), nn.BatchNorm2d):
+                weight, bias = folded_weight(layer)
+                conv = cast("nn.Conv2d", layer.conv)
+                conv.weight.data = weight
+                conv.bias = nn.Parameter(bias)
+                layer.norm = nn.Identity()
+                if isinstance(layer, ConvNorm):  # which then is its convolution
+                    setattr(parent, name, conv)
     for parameter in features.parameters():
         values = parameter.data.to(like)
         order = torch.channels_last if values.ndim == 4 else torch.contiguous_format
@@ -132,14 +134,13 @@ def fold_volumes(module: ModuleT, like: Tensor) -> ModuleT:
 
     So it is in 3D convolutions without a norm.
     """
-    for layer in list(module.modules()):
-        if isinstance(layer, ConvNorm) and isinstance(layer.norm, nn.BatchNorm3d):
-            layer.conv = VolumeConv(layer.conv, *folded_weight(layer), like)
-            layer.norm = nn.Identity()
-        for name, conv in list(layer.named_children()):
-            if isinstance(conv, nn.Conv3d):
-                bias = torch.zeros(conv.out_channels) if conv.bias is None else conv.bias
-                setattr(layer, name, VolumeConv(conv, conv.weight, bias, like))
+    for parent in list(module.modules()):
+        for name, layer in list(parent.named_children()):
+            if isinstance(layer, ConvNorm) and isinstance(layer.norm, nn.BatchNorm3d):
+                setattr(parent, name, VolumeConv(layer.conv, *folded_weight(layer), like))
+            elif isinstance(layer, nn.Conv3d) and not isinstance(parent, ConvNorm):
+                bias = torch.zeros(layer.out_channels) if layer.bias is None else layer.bias
+                setattr(parent, name, VolumeConv(layer, layer.weight, bias, like))
     return module
 
 
@@ -314,11 +315,6 @@ MATCHERS = {
     "light": MatcherKind(config=LightConfig, network=LightStereo, matcher=LightMatcher),
 }
 """Kinds of matchers with weights: a new one is a file with its three parts and one entry here."""
-
-
-def make_network(config: Any) -> StereoNetwork:  # noqa: ANN401
-    """Make the network of a config of any kind, with random weights."""
-    return next(k.network(config) for k in MATCHERS.values() if isinstance(config, k.config))
 
 
 def make_matcher(network: StereoNetwork, config: MatcherConfig) -> Matcher:

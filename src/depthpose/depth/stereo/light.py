@@ -56,7 +56,7 @@ class ViewFeatures(NamedTuple):
 
 
 class ConvexUpsampling(nn.Module):
-    """Weights of the nine neighbours at 1/4 size, for each pixel of the image.
+    """Maps at 1/4 size to full size: each pixel is a mean of nine neighbours, by learnt weights.
 
     With agreement, the weights also depend on how alike both views are under the disparity of each
     neighbour: where two surfaces meet, this says which one a pixel belongs to. That part is
@@ -73,19 +73,25 @@ class ConvexUpsampling(nn.Module):
             nn.init.zeros_(self.agreement.weight)
 
     def forward(
-        self, left: ViewFeatures, right_half: Features | None, quarter_px: Quarter
-    ) -> Float[Tensor, "b 9 4 h2 w2"]:
-        """Answer weights that sum to one, for the four pixels of each one at half size."""
-        wide = F.interpolate(left.levels[0], scale_factor=2.0, mode="nearest")
-        x = self.hidden(torch.cat([left.half, wide], 1))
+        self,
+        quarters: Float[Tensor, "b k h4 w4"],
+        left_half: Features,
+        left_quarter: Features,
+        right_half: Features | None,
+    ) -> Float[Tensor, "b k h w"]:
+        """Bring maps, the first the disparity [px], to full size by features of both views."""
+        wide = F.interpolate(left_quarter, scale_factor=2.0, mode="nearest")
+        x = self.hidden(torch.cat([left_half, wide], 1))
         if self.compared is not None and self.agreement is not None:
             assert right_half is not None
-            both = self.compared(left.half), self.compared(right_half)
-            alike = agreement_of_neighbours(*both, quarter_px.detach())
+            both = self.compared(left_half), self.compared(right_half)
+            alike = agreement_of_neighbours(*both, quarters[:, 0].detach())
             x = x + self.agreement(alike.to(x))
         x = F.relu(x)
         b, _, h, w = x.shape
-        return self.weights(x).float().reshape(b, 9, 4, h, w).softmax(1)
+        # They sum to one, for the four pixels of each one at half size.
+        weights = self.weights(x).float().reshape(b, 9, 4, h, w).softmax(1)
+        return torch.stack([enlarge(one, weights) for one in quarters.unbind(1)], 1)
 
 
 def agreement_of_neighbours(
@@ -452,12 +458,15 @@ class LightStereo(StereoNetwork):
         quarters = [quarter_px]
         if with_confidence or self.sky_head is not None:
             with torch.no_grad():
-                quarters.append(self._confidence(scores, quarter_px))
+                # By rows: probabilities between the scores are the largest volume.
+                parts = (scores, quarter_px)
+                quarters.append(by_rows(confidence_near, parts, halo=0, rows=self.rows))
         if self.sky_head is not None:
             quarters.append(self.sky_head(near.levels, *quarters))
         coarse_px = mean_of_all(scores)[:, None] if self.training else None
         del scores
-        found_px, *rest = self.enlarge(torch.stack(quarters, 1), near, right_half).unbind(1)
+        parts = (torch.stack(quarters, 1), near.half, near.levels[0], right_half)
+        found_px, *rest = by_rows(self.enlargement, parts, halo=2, rows=self.rows).unbind(1)
         heads = (found_px,)
         if self.refinement is not None:
             parts = (found_px, near.half, right_half)
@@ -476,24 +485,6 @@ class LightStereo(StereoNetwork):
         if confidence is not None:
             confidence = torch.where(sky > 0.5, sky, sure * (1 - sky))
         return Reading(heads, confidence, sky)
-
-    def _confidence(self, scores: Scores, quarter_px: Quarter) -> Quarter:
-        """By rows: probabilities between the scores are the largest volume."""
-        return by_rows(confidence_near, (scores, quarter_px), halo=0, rows=self.rows)
-
-    def enlarge(
-        self, quarters: Float[Tensor, "b k h4 w4"], left: ViewFeatures, right_half: Features | None
-    ) -> Float[Tensor, "b k h w"]:
-        """Bring maps to the images' size by weights that follow the first, the disparity [px]."""
-
-        def enlarged(
-            quarters: Tensor, half: Tensor, quarter: Tensor, right: Tensor | None
-        ) -> Tensor:
-            weights = self.enlargement(ViewFeatures(half, (quarter,)), right, quarters[:, 0])
-            return torch.stack([enlarge(one, weights) for one in quarters.unbind(1)], 1)
-
-        parts = (quarters, left.half, left.levels[0], right_half)
-        return by_rows(enlarged, parts, halo=2, rows=self.rows)
 
     def scores(
         self, left: Float[Tensor, "b 3 h w"], right: Float[Tensor, "b 3 h w"], max_disparity_px: int

@@ -122,20 +122,16 @@ class CallableMatcher:
                 f"the wrapped matcher answered shape {tuple(disparity_px.shape)} for images of "
                 f"{size}; let it answer one disparity a pixel"
             )
-        if bool(disparity_px.isinf().any()):
-            raise InputError(
-                "the wrapped matcher answered infinite disparity; use NaN for no answer"
-            )
-        if bool(disparity_px.isnan().all()):
-            raise InputError(
-                "the wrapped matcher answered NaN for every pixel; is the pair rectified?"
-            )
-        if bool((disparity_px < 0).any()):
-            raise InputError(
-                f"the wrapped matcher answered negative disparity (least "
-                f"{float(disparity_px.nan_to_num(0).min()):.4g} px); is the pair swapped? NaN says "
-                f"no answer"
-            )
+        least_px = float(disparity_px.nan_to_num(0).min())
+        faults = {
+            "infinite disparity; use NaN for no answer": disparity_px.isinf().any(),
+            "NaN for every pixel; is the pair rectified?": disparity_px.isnan().all(),
+            f"negative disparity (least {least_px:.4g} px); is the pair swapped? NaN says no "
+            "answer": least_px < 0,
+        }
+        for fault, is_there in faults.items():
+            if is_there:
+                raise InputError(f"the wrapped matcher answered {fault}")
         return Match(disparity_px=disparity_px)
 
 
@@ -294,6 +290,7 @@ class NetworkMatcher(ABC):
         config = config or MatcherConfig()
         self.device = usable_device(config.device)
         self.config = with_usable_precision(config)
+        self.dtype = DTYPES[self.config.precision]
         self.network_config = network
 
     @abstractmethod
@@ -310,11 +307,6 @@ class NetworkMatcher(ABC):
     @abstractmethod
     def activation_bytes(self, network: Any, height: int, width: int) -> int:  # noqa: ANN401
         """Peak memory of activations of one pair of suitable sides [bytes]."""
-
-    @property
-    def dtype(self) -> torch.dtype:
-        """What the network computes in."""
-        return DTYPES[self.config.precision]
 
     @torch.no_grad()
     def match(self, left: Tensor, right: Tensor) -> Match:
@@ -356,9 +348,10 @@ class NetworkMatcher(ABC):
                 normalise(torch.stack(side).to(self.device, torch.float32))
                 for side in zip(*group, strict=True)
             )
-            found = self._match_one_way(left, right, network)
+            match = self._match_padded if self.config.tile_px is None else self._match_in_tiles
+            found = match(left, right, network)
             if self.config.with_left_right_check:
-                mirrored = self._match_one_way(right.flip(-1), left.flip(-1), network)
+                mirrored = match(right.flip(-1), left.flip(-1), network)
                 other_px = [match.disparity_px.flip(-1) for match in mirrored]
                 found = list(map(lower_where_disagreeing, found, other_px))
             matches += found
@@ -384,19 +377,21 @@ class NetworkMatcher(ABC):
         share = math.sqrt(self.fine_pixels / (camera.height * camera.width))
         return max(trained_px, float(camera.K[0, 0]) * min(share, self.most_enlarged))
 
-    def _match_one_way(self, left: Views, right: Views, network: NetworkConfig) -> list[Match]:
-        """Match normalised pairs of any size: in tiles, or padded and cropped back."""
-        if self.config.tile_px is None:
-            return self._match_padded(left, right, network)
+    def _match_in_tiles(self, left: Views, right: Views, network: NetworkConfig) -> list[Match]:
+        assert self.config.tile_px is not None
         overlap_px, most_px = self.config.tile_overlap_px, network.max_disparity_px
         tiling = Tiling(*self.config.tile_px, overlap_px, most_px)
-
-        def match_tile(one: Tensor, other: Tensor) -> Match:
-            return self._match_padded(one[None], other[None], network)[0]
-
-        return [match_tiles(match_tile, *pair, tiling) for pair in zip(left, right, strict=True)]
+        return [
+            match_tiles(
+                lambda one, other: self._match_padded(one[None], other[None], network)[0],
+                *pair,
+                tiling,
+            )
+            for pair in zip(left, right, strict=True)
+        ]
 
     def _match_padded(self, left: Views, right: Views, network: NetworkConfig) -> list[Match]:
+        """Match normalised pairs of any size: padded, and cropped back."""
         h, w = left.shape[-2:]
         left, right = (pad_top_right(views, network) for views in (left, right))
         height, width = left.shape[-2:]

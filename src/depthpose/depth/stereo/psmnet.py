@@ -234,14 +234,12 @@ class FeatureExtractor(nn.Module):
             x = F.relu(layer(x))
         raw = self.stages[1](self.stages[0](x))
         last = self.stages[3](self.stages[2](raw))
-        levels = [self._pool(last, i) for i in reversed(range(len(self.pools)))]
+        levels = []
+        for layer, pool in zip(reversed(self.pyramid), reversed(self.pools), strict=True):
+            pooled = F.relu(layer(F.avg_pool2d(last, pool)))
+            size, align = last.shape[-2:], self.align_corners
+            levels.append(F.interpolate(pooled, size, mode="bilinear", align_corners=align))
         return self.project(F.relu(self.fuse(torch.cat([raw, last, *levels], 1))))
-
-    def _pool(self, x: Float[Tensor, "b c h w"], level: int) -> Float[Tensor, "b k h w"]:
-        pooled = F.relu(self.pyramid[level](F.avg_pool2d(x, self.pools[level])))
-        return F.interpolate(
-            pooled, size=x.shape[-2:], mode="bilinear", align_corners=self.align_corners
-        )
 
 
 Features = Float[Tensor, "b _ _ _"]
@@ -394,23 +392,21 @@ class PSMNet(StereoNetwork):
         bins = (max_disparity_px or self.config.max_disparity_px) // 4
 
         def begin(left: Features, right: Features) -> Volume:
-            return self._aggregate(concatenation_volume(left, right, bins))
+            return self.aggregate(concatenation_volume(left, right, bins))
 
         views = self.features(left), self.features(right)
         # Four convolutions follow each other.
-        return self._costs_from(by_rows(begin, views, halo=4, rows=self.rows))
+        return self.refine(by_rows(begin, views, halo=4, rows=self.rows))
 
-    def costs_of(self, volume: Volume) -> tuple[Volume, Volume, Volume]:
-        """Answer the costs of a concatenation volume, however it was made."""
-        return self._costs_from(self._aggregate(volume))
-
-    def _aggregate(self, volume: Volume) -> Volume:
+    def aggregate(self, volume: Volume) -> Volume:
+        """Give the volume that the hourglasses refine, of a concatenation volume."""
         x = self.dres0[0](volume).relu_()
         del volume
         x = self.dres0[1](x).relu_()
         return self.dres1[1](self.dres1[0](x).relu_()).add_(x)
 
-    def _costs_from(self, cost0: Volume) -> tuple[Volume, Volume, Volume]:
+    def refine(self, cost0: Volume) -> tuple[Volume, Volume, Volume]:
+        """Give the cost after each hourglass."""
         x, first, up, costs = cost0, None, None, []
         for module, head in zip(self.hourglasses, self.heads, strict=True):
             hourglass = cast("Hourglass", module)
@@ -458,16 +454,6 @@ _PUBLISHED_NAMES = {
 """Patterns of the authors' names, of the feature extractor and of the rest, and ours."""
 
 
-def _our_name(published: str) -> str:
-    """Translate one published name; an unknown one comes back as it is and is refused later."""
-    name = published.removeprefix("module.")
-    prefix = next(prefix for prefix in _PUBLISHED_NAMES if name.startswith(prefix))
-    name = name.removeprefix(prefix)
-    for pattern, ours in _PUBLISHED_NAMES[prefix]:
-        name = re.sub(pattern, ours, name)
-    return f"features.{name}" if prefix else name
-
-
 def psmnet_from_published(state: Mapping[str, Tensor], *, align_corners: bool) -> PSMNet:
     """Make a PSMNet of default size, in eval mode, from the authors' state dict.
 
@@ -481,7 +467,14 @@ def psmnet_from_published(state: Mapping[str, Tensor], *, align_corners: bool) -
     """
     network = PSMNet(PSMNetConfig(align_corners=align_corners))
     wanted = network.state_dict()
-    given = {_our_name(name): (name, value) for name, value in state.items()}
+    given: dict[str, tuple[str, Tensor]] = {}
+    for published, value in state.items():  # an unknown name stays as it is, and is refused
+        name = published.removeprefix("module.")
+        prefix = next(prefix for prefix in _PUBLISHED_NAMES if name.startswith(prefix))
+        name = name.removeprefix(prefix)
+        for pattern, ours in _PUBLISHED_NAMES[prefix]:
+            name = re.sub(pattern, ours, name)
+        given[f"features.{name}" if prefix else name] = published, value
     # The count of batches steers nothing at inference; files older than 2018 do not hold it.
     needed = {name for name in wanted if not name.endswith("num_batches_tracked")}
     shapes = [

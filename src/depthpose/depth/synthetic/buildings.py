@@ -47,27 +47,23 @@ class Plot(NamedTuple):
         return self.ground_m - self.height_m
 
 
-def draw_style(rng: np.random.Generator, *, with_details: bool) -> Style:
-    """Draw what a house looks like."""
-    kind = str(rng.choice(["brick", "plaster", "stone"], p=[0.24, 0.6, 0.16]))
+def add_house(b: MeshBuilder, plot: Plot, *, with_details: bool) -> None:
+    """Add one house: its walls, of which the back and one end have no windows, and a roof."""
+    kind = str(b.rng.choice(["brick", "plaster", "stone"], p=[0.24, 0.6, 0.16]))
     base = {"brick": (0.3, 0.12, 0.08), "stone": (0.3, 0.26, 0.22)}.get(
-        kind, _PLASTERS[rng.integers(len(_PLASTERS))]
+        kind, _PLASTERS[b.rng.integers(len(_PLASTERS))]
     )
-    r, g, b = np.array(base) * rng.uniform(0.4, 1.0) * (1 + 0.08 * rng.normal(size=3))
-    tile_m = {"brick": 1.8, "stone": 2.6, "plaster": 3.4}[kind] * rng.uniform(0.85, 1.2)
-    return Style(
-        wall=Surface(kind, (r, g, b), tile_m, int(rng.integers(8))),
-        storey_m=rng.uniform(2.7, 3.5),
-        window_m=(rng.uniform(0.8, 1.7), rng.uniform(1.1, 1.9)),
-        gap_m=rng.uniform(0.6, 1.9),
-        recess_m=rng.uniform(0.06, 0.25),
-        frame=_FRAMES[rng.choice(3, p=[0.6, 0.2, 0.2])],
+    red, green, blue = np.array(base) * b.rng.uniform(0.4, 1.0) * (1 + 0.08 * b.rng.normal(size=3))
+    tile_m = {"brick": 1.8, "stone": 2.6, "plaster": 3.4}[kind] * b.rng.uniform(0.85, 1.2)
+    style = Style(
+        wall=Surface(kind, (red, green, blue), tile_m, int(b.rng.integers(8))),
+        storey_m=b.rng.uniform(2.7, 3.5),
+        window_m=(b.rng.uniform(0.8, 1.7), b.rng.uniform(1.1, 1.9)),
+        gap_m=b.rng.uniform(0.6, 1.9),
+        recess_m=b.rng.uniform(0.06, 0.25),
+        frame=_FRAMES[b.rng.choice(3, p=[0.6, 0.2, 0.2])],
         with_details=with_details,
     )
-
-
-def add_house(b: MeshBuilder, plot: Plot, style: Style) -> None:
-    """Add one house: its walls, of which the back and one end have no windows, and a roof."""
     b.begin_thing()
     away, length = np.array([float(plot.side), 0, 0]), plot.stop_m - plot.start_m
     back_m = plot.x_m + plot.side * plot.depth_m
@@ -137,18 +133,8 @@ def _add_windows(b: MeshBuilder, wall: _Wall, style: Style, length: Number, heig
     after = [1, 2, 3, 0]
     reveal = np.stack([outer, outer[:, after], inner[:, after], inner], 2).reshape(-1, 4, 3)
     b.quads(reveal, _SQUARE * [0.5, 0.1], Surface("plaster", style.wall.tint))
-    if style.with_details:
-        _add_frames(b, wall, style, windows)
-
-
-def _rectangles(x0: np.ndarray, x1: np.ndarray, y0: np.ndarray, y1: np.ndarray) -> np.ndarray:
-    """Corners (..., 4, 2) of rectangles, in turn."""
-    return np.stack([np.stack(c, -1) for c in ((x0, y0), (x1, y0), (x1, y1), (x0, y1))], -2)
-
-
-def _add_frames(
-    b: MeshBuilder, wall: _Wall, style: Style, windows: Float[np.ndarray, "n 4 2"]
-) -> None:
+    if not style.with_details:
+        return
     (left, low), (right, high) = windows[:, 0].T, windows[:, 2].T
     middle, bar = (left + right) / 2, 0.07
     frames = np.concatenate(
@@ -166,6 +152,11 @@ def _add_frames(
     b.quads(front, sill, stone)
     top = np.stack([front[:, 3], front[:, 2], wall.at(sill)[:, 2], wall.at(sill)[:, 3]], 1)
     b.quads(top, _SQUARE * [1, 0.12], stone)
+
+
+def _rectangles(x0: np.ndarray, x1: np.ndarray, y0: np.ndarray, y1: np.ndarray) -> np.ndarray:
+    """Corners (..., 4, 2) of rectangles, in turn."""
+    return np.stack([np.stack(c, -1) for c in ((x0, y0), (x1, y0), (x1, y1), (x0, y1))], -2)
 
 
 def _add_gable_roof(b: MeshBuilder, plot: Plot, style: Style) -> None:

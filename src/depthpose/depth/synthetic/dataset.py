@@ -22,7 +22,7 @@ from depthpose.depth.disparity import disparity_from_depth
 from depthpose.depth.synthetic.scene import StreetScene, make_clutter, make_scene, street_rig
 from depthpose.depth.synthetic.shading import Hits, Stage, prepare, shade, sky_light
 from depthpose.depth.synthetic.textures import NUMBER
-from depthpose.depth.types import StereoInput, StereoSample, StereoTruth
+from depthpose.depth.types import RawFrame, StereoInput, StereoSample, StereoTruth
 
 NEAR_M = 0.3
 
@@ -113,10 +113,24 @@ _OFFSETS = ((-0.375, -0.125), (0.125, -0.375), (0.375, 0.125), (-0.125, 0.375))
 
 def draw_light(stage: Stage, sight: Sight, *, with_antialiasing: bool) -> Float[Tensor, "h w 3"]:
     """Give linear RGB, before any sensor."""
-    height, width = sight.raster.primitive.shape
-    is_edge = torch.zeros(height * width, dtype=torch.bool)
-    if with_antialiasing:
-        is_edge = _edge_pixels(stage, sight.raster).flatten()
+    raster = sight.raster
+    height, width = raster.primitive.shape
+    is_edge = torch.zeros(height, width, dtype=torch.bool)
+    if with_antialiasing:  # beside which something else is seen, or the same bent sharply
+        shown = raster.primitive.clamp(min=0)
+        kind = torch.where(raster.primitive >= 0, stage.kind[shown], -1)
+        normal = (
+            stage.attributes[:, 18:21].index_select(0, shown.flatten()).unflatten(0, shown.shape)
+        )
+        every, after, before = slice(None), slice(1, None), slice(None, -1)
+        for one, other in (((every, after), (every, before)), ((after, every), (before, every))):
+            is_other = raster.primitive[one] != raster.primitive[other]
+            x, y, z = (normal[one] * normal[other]).unbind(-1)
+            is_bent = (x + y + z).abs() < 0.9
+            differs = is_other & ((kind[one] != kind[other]) | is_bent)
+            is_edge[one] |= differs
+            is_edge[other] |= differs
+    is_edge = is_edge.flatten()
     light = torch.zeros(height * width, 3)
     whole, mixed = (~is_edge).nonzero()[:, 0], is_edge.nonzero()[:, 0]
     light[whole] = _light(stage, sight, _centres(whole, width), _seen_at(sight, whole))
@@ -148,23 +162,6 @@ def _seen_at(sight: Sight, index: Int[Tensor, " n"]) -> Nearest:
     assert raster.barycentric is not None
     parts = raster.primitive, raster.barycentric, raster.depth_m
     return Nearest(*(values.flatten(0, 1).index_select(0, index) for values in parts))
-
-
-def _edge_pixels(stage: Stage, raster: Raster) -> Bool[Tensor, "h w"]:
-    """Pixels beside which something else is seen, or the same thing bent sharply."""
-    seen = raster.primitive.clamp(min=0)
-    kind = torch.where(raster.primitive >= 0, stage.kind[seen], -1)
-    normal = stage.attributes[:, 18:21].index_select(0, seen.flatten()).unflatten(0, seen.shape)
-    edge = torch.zeros_like(kind, dtype=torch.bool)
-    every, after, before = slice(None), slice(1, None), slice(None, -1)
-    for one, other in (((every, after), (every, before)), ((after, every), (before, every))):
-        is_other = raster.primitive[one] != raster.primitive[other]
-        x, y, z = (normal[one] * normal[other]).unbind(-1)
-        is_bent = (x + y + z).abs() < 0.9
-        differs = is_other & ((kind[one] != kind[other]) | is_bent)
-        edge[one] |= differs
-        edge[other] |= differs
-    return edge
 
 
 def _light(
@@ -320,32 +317,18 @@ _OCCLUSION_SHARE = 1e-4
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class StreetFrame:
-    """A synthetic pair and everything that is known about it.
+class StreetFrame(RawFrame):
+    """A synthetic pair and everything that is known about it, exactly.
 
     Attributes:
-        left: left image.
-        right: right image.
-        disparity_px: of the left image, exact; NaN in the sky.
-        right_disparity_px: of the right image.
+        right_disparity_px: of the right image; NaN in the sky, as that of the left one.
         depth_m: of the left image, camera z; NaN in the sky.
-        occluded: left pixels whose point the right camera does not see: hidden, or outside.
-        is_sky: left pixels that see the sky.
         is_road: left pixels that see the carriageway.
-        lidar_points: x forward, y left, z up [m], reflectance; None where not asked for.
-        rig: the cameras.
     """
 
-    left: Float[Tensor, "3 h w"]
-    right: Float[Tensor, "3 h w"]
-    disparity_px: Float[Tensor, "h w"]
     right_disparity_px: Float[Tensor, "h w"]
     depth_m: Float[Tensor, "h w"]
-    occluded: Bool[Tensor, "h w"]
-    is_sky: Bool[Tensor, "h w"]
     is_road: Bool[Tensor, "h w"]
-    lidar_points: Float[Tensor, "n 4"] | None
-    rig: StereoRig
 
 
 def draw_street(config: StreetsConfig, index: int) -> StreetFrame:
@@ -405,6 +388,7 @@ def draw_scene(
         is_sky=primitive < 0,
         is_road=(primitive >= 0) & (stage.material[primitive.clamp(min=0)] == NUMBER["road"]),
         lidar_points=points,
+        camera_from_velodyne=camera_from_velodyne(),
         rig=rig,
     )
 

@@ -11,7 +11,7 @@ from typing import Literal
 import numpy as np
 from jaxtyping import Float, Float64
 
-from depthpose.depth.synthetic.buildings import Plot, add_house, draw_style
+from depthpose.depth.synthetic.buildings import Plot, add_house
 from depthpose.depth.synthetic.mesh import Mesh, MeshBuilder, place
 from depthpose.depth.synthetic.models import (
     BUSHES,
@@ -109,6 +109,28 @@ def draw_road(rng: np.random.Generator) -> Road:
         sides = ((1,), (-1,), (-1, 1))[rng.choice(3, p=[0.3, 0.3, 0.4])]
         streets.append(SideStreet(s_m=s, half_m=rng.uniform(2.8, 6), sides=sides))
         s += rng.uniform(25, 60)
+    # The centre by its curvature and slope; at the car the road is level and leads ahead.
+    along = np.arange(-BEHIND_M - 2, AHEAD_M + 2, 1.0)
+    curvature, slope = np.zeros_like(along), np.zeros_like(along)
+    if rng.random() < {"city": 0.35, "avenue": 0.45}.get(place, 0.65):
+        start = rng.uniform(-5, 45)
+        for _ in range(3):
+            radius = rng.uniform(45, 400) * rng.choice([-1, 1])
+            length = min(rng.uniform(15, 70), 0.9 * abs(radius))
+            ramp = np.clip((along - start) / 12, 0, 1) * np.clip(
+                (start + length - along) / 12, 0, 1
+            )
+            curvature += ramp / radius
+            start += length + rng.uniform(0, 60)
+    if rng.random() < 0.55:
+        for _ in range(3):
+            where, width = rng.uniform(10, 160), rng.uniform(15, 50)
+            slope += rng.normal(0, 0.022) * (1 + np.tanh((along - where) / width)) / 2
+        slope -= np.interp(0.0, along, slope)
+    heading = np.cumsum(curvature)
+    heading -= np.interp(0.0, along, heading)
+    line = np.cumsum(np.sin(heading)), -np.cumsum(slope), np.cumsum(np.cos(heading))
+    x, y, z = (values - np.interp(0.0, along, values) for values in line)
     return Road(
         place=place,
         left_m=float(right_m - width_m),
@@ -119,32 +141,8 @@ def draw_road(rng: np.random.Generator) -> Road:
         curb_m=curb_m,
         verge_m=verge_m,
         side_streets=tuple(streets),
-        centre=_draw_centre(rng, place),
+        centre=np.stack([along, x, y, z, heading], 1),
     )
-
-
-def _draw_centre(rng: np.random.Generator, place: Place) -> Float64[np.ndarray, "n 5"]:
-    """Integrate curvature and slope; at the car the road is level and leads ahead."""
-    s = np.arange(-BEHIND_M - 2, AHEAD_M + 2, 1.0)
-    curvature, slope = np.zeros_like(s), np.zeros_like(s)
-    if rng.random() < {"city": 0.35, "avenue": 0.45}.get(place, 0.65):
-        start = rng.uniform(-5, 45)
-        for _ in range(3):
-            radius = rng.uniform(45, 400) * rng.choice([-1, 1])
-            length = min(rng.uniform(15, 70), 0.9 * abs(radius))
-            ramp = np.clip((s - start) / 12, 0, 1) * np.clip((start + length - s) / 12, 0, 1)
-            curvature += ramp / radius
-            start += length + rng.uniform(0, 60)
-    if rng.random() < 0.55:
-        for _ in range(3):
-            where, width = rng.uniform(10, 160), rng.uniform(15, 50)
-            slope += rng.normal(0, 0.022) * (1 + np.tanh((s - where) / width)) / 2
-        slope -= np.interp(0.0, s, slope)
-    heading = np.cumsum(curvature)
-    heading -= np.interp(0.0, s, heading)
-    line = np.cumsum(np.sin(heading)), -np.cumsum(slope), np.cumsum(np.cos(heading))
-    x, y, z = (values - np.interp(0.0, s, values) for values in line)
-    return np.stack([s, x, y, z, heading], 1)
 
 
 def bend(mesh: Mesh, road: Road) -> Mesh:
@@ -278,7 +276,10 @@ def add_roadside(b: MeshBuilder, road: Road) -> None:
     """Fill both sides of the road, and close the view at its end."""
     rng, sides = b.rng, {side: _Roadside(b, road, side) for side in (-1, 1)}
     for beside in sides.values():
-        beside.add_plots()
+        plots = {
+            "city": beside.add_houses, "suburb": beside.add_gardens, "avenue": beside.add_avenue
+        }  # fmt: skip
+        plots.get(road.place, beside.add_country)()
         beside.add_kerb()
         beside.add_woods()
     if rng.random() < 0.85:  # trees across the end of the road's straight part
@@ -307,18 +308,6 @@ class _Roadside:
     def is_free(self, s: Number, length: float) -> bool:
         """Whether no side street lies in a stretch."""
         return not self.road.is_side_street(s + length / 2, self.side, length / 2 + 1)
-
-    def add_plots(self) -> None:
-        """What a place has behind the pavement."""
-        match self.road.place:
-            case "city":
-                self.add_houses()
-            case "suburb":
-                self.add_gardens()
-            case "avenue":
-                self.add_avenue()
-            case _:
-                self.add_country()
 
     def add_houses(self) -> None:
         """Houses at the pavement, wall to wall."""
@@ -436,48 +425,40 @@ class _Roadside:
         is_town = road.place not in ("rural", "forest")
         while s < 70:
             if not road.is_side_street(s, side, 0.5):
-                self.add_kerb_thing(x + side * rng.uniform(0, 0.4), s, is_town=is_town)
+                where = (x + side * rng.uniform(0, 0.4), y, s)
+                kind = rng.random()
+                if kind < 0.4:
+                    model = sign(int(rng.integers(20)))
+                    yaw = rng.normal(0, 0.12) + np.pi * (rng.random() < 0.2)
+                    self.b.add(place(model, where, yaw))
+                elif kind < 0.8 or not is_town:
+                    number = int(rng.choice([0, 1, 2, 3, 4, 5])) if is_town else 3
+                    self.b.add(place(small_thing(number), where, rng.normal(0, 0.1)))
+                else:
+                    self.add_tree(where[0] + side * 0.4, s, rng.uniform(3.5, 7))
             s += rng.uniform(3, 14) * (1 if is_town else 1.8)
         for street in road.side_streets:
             if side in street.sides and rng.random() < 0.4:
                 light = traffic_light(int(rng.integers(4)))
                 where = (x, y, street.s_m - street.half_m - 1)
                 self.b.add(place(light, where, 0, (-side, 1, 1)))
-        if rng.random() < 0.25:
-            self.add_wires(x + side * rng.uniform(0.5, 3))
-
-    def add_kerb_thing(self, x: Number, s: Number, *, is_town: bool) -> None:
-        """A sign, a small thing or a tree."""
-        rng, where = self.rng, (x, -self.road.curb_m, s)
-        kind = rng.random()
-        if kind < 0.4:
-            model = sign(int(rng.integers(20)))
-            yaw = rng.normal(0, 0.12) + np.pi * (rng.random() < 0.2)
-            self.b.add(place(model, where, yaw))
-        elif kind < 0.8 or not is_town:
-            number = int(rng.choice([0, 1, 2, 3, 4, 5])) if is_town else 3
-            self.b.add(place(small_thing(number), where, rng.normal(0, 0.1)))
-        else:
-            self.add_tree(x + self.side * 0.4, s, rng.uniform(3.5, 7))
-
-    def add_wires(self, x: Number) -> None:
-        """Wooden poles with cables between them, which hang."""
-        b, rng = self.b, self.rng
-        height, step = rng.uniform(6, 8), rng.uniform(22, 38)
-        places = np.arange(rng.uniform(-15, 10), 120, step)
-        b.begin_thing()
-        for s in places:
-            b.tube((x, 0.2, s), (x, -height, s), (0.12, 0.09), _WOOD, 8)
-            b.box((x, -height + 0.3, s), (1.4, 0.1, 0.1), _WOOD)
-        share = np.linspace(0, 1, 7)[:, None]
-        for ends in pairwise(places):
-            for shift in (-0.6, 0.6):
-                start, stop = (np.array([x + shift, -height + 0.22, s]) for s in ends)
-                points = start * (1 - share) + stop * share
-                sag = (4 * share * (1 - share))[:, 0] * 0.02
-                points[:, 1] += sag * np.linalg.norm(stop - start)
-                for one, other in pairwise(points):
-                    b.tube(one, other, 0.018, _DARK, 3)
+        if rng.random() < 0.25:  # wooden poles with cables between them, which hang
+            at = x + side * rng.uniform(0.5, 3)
+            height, gap = rng.uniform(6, 8), rng.uniform(22, 38)
+            places = np.arange(rng.uniform(-15, 10), 120, gap)
+            self.b.begin_thing()
+            for s in places:
+                self.b.tube((at, 0.2, s), (at, -height, s), (0.12, 0.09), _WOOD, 8)
+                self.b.box((at, -height + 0.3, s), (1.4, 0.1, 0.1), _WOOD)
+            share = np.linspace(0, 1, 7)[:, None]
+            for ends in pairwise(places):
+                for shift in (-0.6, 0.6):
+                    start, stop = (np.array([at + shift, -height + 0.22, s]) for s in ends)
+                    points = start * (1 - share) + stop * share
+                    sag = (4 * share * (1 - share))[:, 0] * 0.02
+                    points[:, 1] += sag * np.linalg.norm(stop - start)
+                    for one, other in pairwise(points):
+                        self.b.tube(one, other, 0.018, _DARK, 3)
 
     def add_house(self, s: Number, length: Number, back: Number, height: float) -> None:
         """A house so far behind the pavement."""
@@ -490,7 +471,7 @@ class _Roadside:
             height_m=height,
             ground_m=-self.road.curb_m + 0.2,
         )
-        add_house(self.b, plot, draw_style(self.rng, with_details=s < _DETAIL_M))
+        add_house(self.b, plot, with_details=s < _DETAIL_M)
 
     def add_border(self, start: Number, stop: Number, kind: int) -> None:
         """A line of hedge or fence pieces at the back of the pavement; kind 0 is none."""

@@ -112,7 +112,16 @@ def make_scene(seed: tuple[int, ...], mount_height_m: float = 1.65) -> StreetSce
     add_roadside(builder, road)
     add_traffic(builder, road)
     street = bend(builder.finish(), road)
-    _add_hills(far)
+    # A ring of far hills or woods, 900 m away.
+    angle = np.linspace(-1.35, 1.35, 120)
+    wave = np.zeros_like(angle)
+    for often in (3, 7, 17, 43):
+        wave += np.sin(angle * often + rng.uniform(0, 6.28)) / often**0.7
+    high = rng.uniform(8, 40) * np.clip(0.55 + 0.45 * wave, 0.1, None)
+    x, z, along = 900 * np.sin(angle), 900 * np.cos(angle), np.arange(len(angle)) * 12.0
+    faces = between(np.stack([x, 0 * x + 90, z], 1), np.stack([x, -high, z], 1))
+    uv = between(np.stack([along, 0 * along - 90], 1), np.stack([along, high], 1))
+    far.quads(faces, uv, Surface("hills", (0.045, 0.065, 0.03), 150.0, int(rng.integers(2))))
     hills = far.finish()
     hills = replace(hills, thing=hills.thing + street.thing.max() + 1)
     # The camera's attitude: near level, now and then turned off the road's direction.
@@ -135,19 +144,6 @@ def make_scene(seed: tuple[int, ...], mount_height_m: float = 1.65) -> StreetSce
         camera_from_world=rotation,
         place=road.place,
     )
-
-
-def _add_hills(b: MeshBuilder) -> None:
-    """A ring of far hills or woods, 900 m away."""
-    rng, angle = b.rng, np.linspace(-1.35, 1.35, 120)
-    wave = np.zeros_like(angle)
-    for often in (3, 7, 17, 43):
-        wave += np.sin(angle * often + rng.uniform(0, 6.28)) / often**0.7
-    height = rng.uniform(8, 40) * np.clip(0.55 + 0.45 * wave, 0.1, None)
-    x, z, along = 900 * np.sin(angle), 900 * np.cos(angle), np.arange(len(angle)) * 12.0
-    faces = between(np.stack([x, 0 * x + 90, z], 1), np.stack([x, -height, z], 1))
-    uv = between(np.stack([along, 0 * along - 90], 1), np.stack([along, height], 1))
-    b.quads(faces, uv, Surface("hills", (0.045, 0.065, 0.03), 150.0, int(rng.integers(2))))
 
 
 def _draw_markings(rng: np.random.Generator, road: Road) -> Markings:
@@ -193,11 +189,6 @@ _KITTI_SHARES = (0.6, 0.1, 0.1, 0.1, 0.1)
 """Nearly all benchmarks are of the first day."""
 
 
-def street_rig(config: StreetsConfig, index: int) -> tuple[StereoRig, float]:
-    """Give the rig of a frame and the height of its mount [m], without drawing the frame."""
-    return draw_rig(np.random.default_rng([72, config.seed, index]), config)
-
-
 def rig_number(config: StreetsConfig, index: int) -> int:
     """Say which of KITTI's rigs a frame has, where ``config.rigs`` knows no others.
 
@@ -215,8 +206,9 @@ def kitti_rig(number: int = 0) -> StereoRig:
     return StereoRig(width=width, height=height, K=K, baseline_m=baseline_m)
 
 
-def draw_rig(rng: np.random.Generator, config: StreetsConfig) -> tuple[StereoRig, float]:
-    """Draw the rig of a frame, scaled and cropped as asked, and the height of its mount [m]."""
+def street_rig(config: StreetsConfig, index: int) -> tuple[StereoRig, float]:
+    """Give the rig of a frame, scaled and cropped as asked, and the height of its mount [m]."""
+    rng = np.random.default_rng([72, config.seed, index])
     if config.rigs == "kitti" or rng.random() < 0.5:
         rig, mount_m = kitti_rig(int(rng.choice(len(KITTI_RIGS), p=_KITTI_SHARES))), 1.65
     else:

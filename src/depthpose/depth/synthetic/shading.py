@@ -12,7 +12,7 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from depthpose.core.render import rasterize_orthographic
-from depthpose.depth.synthetic.scene import Markings, StreetScene
+from depthpose.depth.synthetic.scene import StreetScene
 from depthpose.depth.synthetic.textures import MATERIALS, NUMBER, SIDE_PX, sample_texture, textures
 
 _SUN_MAPS = ((18.0, (-3.0, 36.0), 1024), (60.0, (-5.0, 115.0), 768))
@@ -311,7 +311,18 @@ def _paint_road(
     has this width and length. It is darker where wheels roll, where it was mended, and on covers.
     """
     x, s = place_m.unbind(1)
-    cover = _cover(scene.markings, x, s, width_m, length_m)
+    cover = torch.zeros_like(x)
+    for at, half, period, dash in scene.markings.lines.tolist():
+        line = _inside(x - at, half, width_m)
+        if dash < period:
+            line = line * _inside(s % period - period / 2, dash / 2, length_m)
+        cover = torch.maximum(cover, line)
+    for at, half, first, last, is_striped in scene.markings.bars.tolist():
+        bar = _inside(s - at, half, length_m)
+        bar = bar * _inside(x - (first + last) / 2, (last - first) / 2, width_m)
+        if is_striped:
+            bar = bar * _inside(x % 1.0 - 0.5, 0.25, width_m)
+        cover = torch.maximum(cover, bar)
     wear = torch.sigmoid(3 * (_looked_up(textures().stains, x * 0.13, s * 0.13) + 1.4))
     paint = (cover * scene.markings.brightness * (0.3 + 0.7 * wear))[:, None]
     first, lane_m = scene.markings.wheel_tracks
@@ -331,25 +342,6 @@ def _paint_road(
     seam = torch.exp(-(((within - 0.02 - 0.015 * torch.sin(s * 0.7)) / 0.012) ** 2))
     worn = albedo * (factor * (1 - 0.35 * seam * (scene.weather.shift[1] > 0.5)))[:, None]
     return torch.lerp(worn, worn.new_tensor([0.8, 0.8, 0.77]).expand_as(worn), paint)
-
-
-def _cover(
-    markings: Markings, x: Tensor, s: Tensor, width_m: Tensor, length_m: Tensor
-) -> Float[Tensor, " n"]:
-    """How much of each pixel is painted."""
-    cover = torch.zeros_like(x)
-    for at, half, period, dash in markings.lines.tolist():
-        line = _inside(x - at, half, width_m)
-        if dash < period:
-            line = line * _inside(s % period - period / 2, dash / 2, length_m)
-        cover = torch.maximum(cover, line)
-    for at, half, first, last, is_striped in markings.bars.tolist():
-        bar = _inside(s - at, half, length_m)
-        bar = bar * _inside(x - (first + last) / 2, (last - first) / 2, width_m)
-        if is_striped:
-            bar = bar * _inside(x % 1.0 - 0.5, 0.25, width_m)
-        cover = torch.maximum(cover, bar)
-    return cover
 
 
 def _inside(off: Tensor, half: float, foot: Tensor) -> Tensor:

@@ -201,17 +201,6 @@ def fine_focal_px(config: AdaptTraining, network: StereoNetwork) -> float:
     return min(matcher.work_focal_px(camera), largest_px)
 
 
-def adapted_text(before: AdaptMetrics, after: AdaptMetrics) -> str:
-    """Show for a card what changed, as Markdown."""
-    rows = [
-        f"| {name} | {old:.4g} | {asdict(after)[name]:.4g} |"
-        for name, old in vars(before).items()
-        if old is not None
-    ]
-    head = ["Held-out pairs, and synthetic streets:", "", "| | before | after |"]
-    return "\n".join([*head, "| --- | --- | --- |", *rows])
-
-
 def label_folders(config: AdaptTraining, home: Path) -> tuple[PairsConfig, list[StereoInput]]:
     """Label pairs by the start, once, below ``home``; give what to train on, and the rest."""
     folders: list[str] = []

@@ -1,9 +1,8 @@
 """Settings of the stages; the defaults of the thesis's three are its schedules (2.4.2, 2.5.3)."""
 
 from dataclasses import dataclass, field
-from typing import Literal
+from typing import Annotated, Literal
 
-from depthpose.core.config import check_settings
 from depthpose.core.errors import InputError, refuse_unknown
 from depthpose.core.loop import AdamConfig, LoopConfig
 from depthpose.depth.config import (
@@ -14,12 +13,13 @@ from depthpose.depth.config import (
     PairsConfig,
     PSMNetConfig,
     SelectionConfig,
+    Settings,
 )
 from depthpose.depth.losses import ADVERSARIAL_LOSSES, DISPARITY_LOSSES
 
 
 @dataclass(frozen=True, kw_only=True)
-class ViewTraining:
+class ViewTraining(Settings):
     """Stage 1: the generator learns to draw right views (thesis, 2.4.2)."""
 
     generator: GeneratorConfig = field(default_factory=GeneratorConfig)
@@ -28,13 +28,13 @@ class ViewTraining:
     discriminator: Literal["patch", "pixel", "none"] = "patch"
     """Scores patches or single pixels; none: L1 alone."""
 
-    discriminator_width: int = 64
+    discriminator_width: Annotated[int, "[1, inf)"] = 64
     """Channels of the discriminator's first layer."""
 
     gan_mode: str = "vanilla"
     """vanilla: cross entropy on logits; lsgan: least squares; see ``losses.ADVERSARIAL_LOSSES``."""
 
-    l1_weight: float = 100.0
+    l1_weight: Annotated[float, "[0, inf)"] = 100.0
     """Weight of L1 against the adversarial loss."""
 
     start: str | None = None
@@ -61,11 +61,11 @@ class ViewTraining:
 
     def __post_init__(self) -> None:
         refuse_unknown("gan_mode", self.gan_mode, ADVERSARIAL_LOSSES)
-        check_settings(self, discriminator_width="[1, inf)", l1_weight="[0, inf)")
+        super().__post_init__()
 
 
 @dataclass(frozen=True, kw_only=True)
-class SelectTraining:
+class SelectTraining(Settings):
     """Stage 1 of the generator that selects, in place of :class:`ViewTraining`."""
 
     generator: SelectionConfig = field(default_factory=SelectionConfig)
@@ -81,20 +81,20 @@ class SelectTraining:
     """Keep the encoder's first layers and its batch norm statistics: right for ImageNet's weights,
     wrong for an encoder that begins at random."""
 
-    encoder_rate: float = 0.3
+    encoder_rate: Annotated[float, "[0, 1]"] = 0.3
     """Learning rate of the encoder as a share of the decoder's."""
 
     disparity_loss: str = "log"
     """log: error of disparity's logarithm; pixel: of disparity as a share of the largest; see
     ``losses.DISPARITY_LOSSES``."""
 
-    plane_weight: float = 0.2
+    plane_weight: Annotated[float, "[0, inf)"] = 0.2
     """Weight of the cross entropy over sky and disparities."""
 
-    right_share: float = 0.5
+    right_share: Annotated[float, "[0, inf)"] = 0.5
     """Weight of the right view's disparity against the left one's."""
 
-    view_weight: float = 1.0
+    view_weight: Annotated[float, "[0, inf)"] = 1.0
     """Weight of the drawn right view, where there is a real one."""
 
     adam: AdamConfig = field(
@@ -110,7 +110,7 @@ class SelectTraining:
     more: PairsConfig | None = None
     """Other pairs to mix in, e.g. real ones beside synthetic ones."""
 
-    more_share: float = 0.5
+    more_share: Annotated[float, "[0, 1]"] = 0.5
     """Share of the samples that come from ``more``."""
 
     degrade: DegradeConfig = field(default_factory=DegradeConfig)
@@ -126,21 +126,14 @@ class SelectTraining:
 
     def __post_init__(self) -> None:
         refuse_unknown("disparity_loss", self.disparity_loss, DISPARITY_LOSSES)
-        check_settings(
-            self,
-            more_share="[0, 1]",
-            encoder_rate="[0, 1]",
-            plane_weight="[0, inf)",
-            right_share="[0, inf)",
-            view_weight="[0, inf)",
-        )
+        super().__post_init__()
         _refuse_views_changed_apart(self.pairs)
         if self.more is not None:
             _refuse_views_changed_apart(self.more)
 
 
 @dataclass(frozen=True, kw_only=True)
-class StereoTraining:
+class StereoTraining(Settings):
     """Stage 2: the matcher learns disparity from pairs with truth (thesis, 2.4.2)."""
 
     matcher: PSMNetConfig = field(default_factory=PSMNetConfig)
@@ -160,10 +153,10 @@ class StereoTraining:
     """light: keep the encoder's first layers and its batch norm statistics: right for ImageNet's
     weights, wrong for an encoder that begins at random."""
 
-    encoder_rate: float = 0.3
+    encoder_rate: Annotated[float, "[0, 1]"] = 0.3
     """light: learning rate of the encoder as a share of the rest's."""
 
-    sky_weight: float = 0.0
+    sky_weight: Annotated[float, "[0, 1]"] = 0.0
     """Weight of the sky; 0 leaves it out. It is taught a disparity of 0, each pixel with so much
     weight where another one with truth has 1; networks with a class of the sky (``with_sky``) are
     taught that class instead, and this is the weight of its cross entropy."""
@@ -190,7 +183,7 @@ class StereoTraining:
                 "matcher and light are both given, and one network is trained; leave matcher out "
                 "for the light network, or light for PSMNet"
             )
-        check_settings(self, encoder_rate="[0, 1]", sky_weight="[0, 1]")
+        super().__post_init__()
         if self.light is None and (self.encoder_rate != 0.3 or not self.with_frozen_stem):
             raise InputError(
                 "encoder_rate and with_frozen_stem are for the encoder of the light network, which "
@@ -215,26 +208,26 @@ class StereoTraining:
 
 
 @dataclass(frozen=True, kw_only=True)
-class AdaptTraining:
+class AdaptTraining(Settings):
     """Self-supervised adaptation of a matcher to the pairs of one rig (see ``train.adapt``)."""
 
     start: str = "default"
     """Weights of the matcher that is adapted (or a whole set)."""
 
-    photometric_weight: float = 1.0
+    photometric_weight: Annotated[float, "[0, inf)"] = 1.0
     """Weight of the difference between a view and the other one looked up by its disparity."""
 
-    smooth_weight: float = 0.02
+    smooth_weight: Annotated[float, "[0, inf)"] = 0.02
     """Weight of changes of disparity where the image does not change."""
 
-    label_weight: float = 0.1
+    label_weight: Annotated[float, "[0, inf)"] = 0.1
     """Weight of the error to what the start itself found, where both views agreed."""
 
-    validation_share: float = 0.2
+    validation_share: Annotated[float, "(0, 1)"] = 0.2
     """Share of the pairs, the last of each folder by name, that are not trained on: by these the
     result is accepted or refused. The last ones, because neighbours in a recording look alike."""
 
-    streets: int = 8
+    streets: Annotated[int, "[0, inf)"] = 8
     """Synthetic streets by which forgetting is measured; 0: it is not."""
 
     adam: AdamConfig = field(
@@ -256,14 +249,7 @@ class AdaptTraining:
     """How long."""
 
     def __post_init__(self) -> None:
-        check_settings(
-            self,
-            photometric_weight="[0, inf)",
-            smooth_weight="[0, inf)",
-            label_weight="[0, inf)",
-            validation_share="(0, 1)",
-            streets="[0, inf)",
-        )
+        super().__post_init__()
         if not (self.photometric_weight or self.smooth_weight or self.label_weight):
             raise InputError(
                 "photometric_weight, smooth_weight and label_weight are all 0, so nothing would be "
@@ -273,7 +259,7 @@ class AdaptTraining:
 
 
 @dataclass(frozen=True, kw_only=True)
-class FinetuneTraining:
+class FinetuneTraining(Settings):
     """Stage 3: the generator learns depth through the frozen matcher (thesis, 2.5.3)."""
 
     generator: str = ""
@@ -282,7 +268,7 @@ class FinetuneTraining:
     matcher: str = ""
     """Weights of the matcher, which stays as it is (or a whole set)."""
 
-    l1_weight: float = 0.0
+    l1_weight: Annotated[float, "[0, inf)"] = 0.0
     """Weight of L1 to the real right view beside the depth loss; the thesis has none."""
 
     adam: AdamConfig = field(default_factory=lambda: AdamConfig(beta1=0.5))
@@ -296,9 +282,6 @@ class FinetuneTraining:
 
     loop: LoopConfig = field(default_factory=lambda: LoopConfig(epochs=60.0))
     """How long."""
-
-    def __post_init__(self) -> None:
-        check_settings(self, l1_weight="[0, inf)")
 
 
 def _refuse_views_changed_apart(pairs: PairsConfig) -> None:

@@ -1,8 +1,7 @@
 """Pairs, on disk or rendered, as training samples by index."""
 
 from collections import Counter
-from collections.abc import Iterable, Sequence
-from hashlib import sha256
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import torch
@@ -26,15 +25,6 @@ class _Place(NamedTuple):
     source: Dataset | Streets
     number: int
     truth: TruthKind | None
-
-
-def name_frames(frames: Iterable[Frame]) -> str:
-    """Give a hash of the names of frames and the sizes of their left images."""
-    digest = sha256()
-    for frame in frames:
-        size = frame.left.stat().st_size if frame.left.is_file() else 0  # 0: in a shard
-        digest.update(f"{frame.name} {size}\n".encode())
-    return digest.hexdigest()
 
 
 class TrainingPairs:
@@ -73,9 +63,31 @@ class TrainingPairs:
             for source, _, truth in self._places
         )
         self.truths = tuple(dict.fromkeys(f"{name}: {truth}" for name, truth in names if truth))
-        if baseline_m is not None:
-            self._check_baselines(baseline_m)
         self._cache: dict[int, TrainingPair] = {}
+        if baseline_m is None:
+            return
+        # Every rig before any work: another baseline would change the metric scale.
+        rigs: dict[str, StereoRig | None] = {}
+        for number, (source, place, _) in enumerate(self._places):
+            if isinstance(source, Dataset):
+                rigs[self._frame_name(number)] = source.read_rig(place)
+            elif source.config.rigs != "kitti":
+                rigs[self._frame_name(number)] = street_rig(source.config, place)[0]
+        made = self.config.streets
+        if made is not None and made.rigs == "kitti":  # five rigs, and perhaps millions of streets
+            rigs |= {f"street with KITTI's rig {n}": kitti_rig(n) for n in range(5)}
+        for name, rig in rigs.items():
+            if rig is None:
+                raise InputError(
+                    f"{name}: has no calibration, and the generator imitates one rig; add one, or "
+                    "exclude the frame"
+                )
+            if abs(rig.baseline_m / baseline_m - 1) > BASELINE_TOLERANCE:
+                raise InputError(
+                    f"{name}: its baseline is {rig.baseline_m:.4f} m, but the generator imitates "
+                    f"one rig of {baseline_m} m. Train it on pairs of one rig, and set "
+                    "virtual_baseline_m to that rig's."
+                )
 
     def __len__(self) -> int:
         return len(self._places)
@@ -104,82 +116,57 @@ class TrainingPairs:
         return kept._replace(left=kept.left.float() / 255, right=kept.right.float() / 255)
 
     def _read(self, index: int) -> TrainingPair:
-        pair = _read_pair(self._places[index])
+        """Read a pair and its truth where one is asked for; 0 in the sky, where known."""
+        source, number, kind = self._places[index]
+        left_px = right_px = None
+        if isinstance(source, Dataset):
+            given, name = source.read_input(number), source.frames[number].name
+            rig = given.camera if isinstance(given.camera, StereoRig) else None
+            if kind == "disparity":
+                truth = source.read_truth(number)
+                assert truth.disparity_px is not None, "frames without truth were left out"
+                left_px = truth.disparity_px
+                if truth.is_sky is not None:
+                    left_px = torch.where(truth.is_sky, 0.0, left_px)
+            elif kind is not None and rig is None:
+                raise InputError(
+                    f"{name}: has depth as its truth but no calibration of the pair, so it cannot "
+                    "become disparity; add the calibration, or exclude the frame"
+                )
+            elif kind is not None and rig is not None:
+                depth_m = source.read_truth(number).depth_m
+                if kind == "scan":
+                    depth_m = lidar_truth(source.frames[number], "camera_z")
+                assert depth_m is not None, "frames without truth were left out"
+                left_px = disparity_from_depth(depth_m, rig)
+        else:
+            made = source[number]
+            given, rig = made.input, made.input.camera
+            if kind is not None:
+                exact = (made.truth.disparity_px, made.truth.right_disparity_px)
+                left_px, right_px = (px if px is None else px.nan_to_num(0.0) for px in exact)
+        if left_px is None:
+            left_px = torch.full_like(given.left[0], torch.nan)
+        focal_px = torch.tensor(torch.nan if rig is None else float(rig.K[0, 0]))
+        if given.right is None:
+            right_px = left_px
+        elif right_px is None:
+            right_px = right_disparity_from_left(left_px)
+        right = given.left if given.right is None else given.right
+        pair = TrainingPair(given.left, right, left_px, right_px, focal_px)
         wanted_px = self.config.focal_px
         if wanted_px is None:
             return pair
-        if bool(pair.focal_px.isnan()):
+        if rig is None:
             raise InputError(
                 f"{self._frame_name(index)}: has no calibration, so it cannot be brought to a "
                 f"focal length of {wanted_px} px; add one, exclude it, or leave focal_px out"
             )
-        return scale_pair(pair, wanted_px / float(pair.focal_px))
+        return scale_pair(pair, wanted_px / float(focal_px))
 
     def _frame_name(self, index: int) -> str:
         source, place, _ = self._places[index]
         return source.frames[place].name if isinstance(source, Dataset) else f"street {place}"
-
-    def _check_baselines(self, wanted_m: float) -> None:
-        """Check every rig before any work: another baseline would change the metric scale."""
-        rigs: dict[str, StereoRig | None] = {}
-        for number, (source, place, _) in enumerate(self._places):
-            if isinstance(source, Dataset):
-                rigs[self._frame_name(number)] = source.read_rig(place)
-            elif source.config.rigs != "kitti":
-                rigs[self._frame_name(number)] = street_rig(source.config, place)[0]
-        made = self.config.streets
-        if made is not None and made.rigs == "kitti":  # five rigs, and perhaps millions of streets
-            rigs |= {f"street with KITTI's rig {n}": kitti_rig(n) for n in range(5)}
-        for name, rig in rigs.items():
-            if rig is None:
-                raise InputError(
-                    f"{name}: has no calibration, and the generator imitates one rig; add one, or "
-                    "exclude the frame"
-                )
-            if abs(rig.baseline_m / wanted_m - 1) > BASELINE_TOLERANCE:
-                raise InputError(
-                    f"{name}: its baseline is {rig.baseline_m:.4f} m, but the generator imitates "
-                    f"one rig of {wanted_m} m. Train it on pairs of one rig, and set "
-                    "virtual_baseline_m to that rig's."
-                )
-
-
-def _read_pair(place: _Place) -> TrainingPair:
-    """Read a pair as it is, and its truth where one is asked for; 0 in the sky, where known."""
-    source, index, kind = place
-    left_px = right_px = None
-    if isinstance(source, Dataset):
-        given, name = source.read_input(index), source.frames[index].name
-        rig = given.camera if isinstance(given.camera, StereoRig) else None
-        if kind == "disparity":
-            truth = source.read_truth(index)
-            assert truth.disparity_px is not None, "frames without truth were left out"
-            left_px = truth.disparity_px
-            left_px = left_px if truth.is_sky is None else torch.where(truth.is_sky, 0.0, left_px)
-        elif kind is not None and rig is None:
-            raise InputError(
-                f"{name}: has depth as its truth but no calibration of the pair, so it cannot "
-                "become disparity; add the calibration, or exclude the frame"
-            )
-        elif kind is not None and rig is not None:
-            depth_m = source.read_truth(index).depth_m
-            if kind == "scan":
-                depth_m = lidar_truth(source.frames[index], "camera_z")
-            assert depth_m is not None, "frames without truth were left out"
-            left_px = disparity_from_depth(depth_m, rig)
-    else:
-        made = source[index]
-        given, rig = made.input, made.input.camera
-        if kind is not None:
-            exact = (made.truth.disparity_px, made.truth.right_disparity_px)
-            left_px, right_px = (px if px is None else px.nan_to_num(0.0) for px in exact)
-    if left_px is None:
-        left_px = torch.full_like(given.left[0], torch.nan)
-    focal_px = torch.tensor(torch.nan if rig is None else float(rig.K[0, 0]))
-    if given.right is None:
-        return TrainingPair(given.left, given.left, left_px, left_px, focal_px)
-    right_px = right_disparity_from_left(left_px) if right_px is None else right_px
-    return TrainingPair(given.left, given.right, left_px, right_px, focal_px)
 
 
 def _find_places(config: PairsConfig, *, needs_truth: bool, is_mixed: bool) -> list[_Place]:

@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import asdict, replace
+from hashlib import sha256
 from pathlib import Path
 from typing import Any, TypeVar, cast
 
@@ -17,13 +18,11 @@ from depthpose.core.run import find_rank
 from depthpose.depth.config import GeneratorConfig, MatcherConfig, PairsConfig, SelectionConfig
 from depthpose.depth.datasets import refuse_common
 from depthpose.depth.encoder import load_encoder
-from depthpose.depth.stereo import StereoNetwork
-from depthpose.depth.stereo.kinds import make_network
+from depthpose.depth.stereo import MATCHERS, StereoNetwork
 from depthpose.depth.synthesis import Generator, SelectionGenerator, UNetGenerator
 from depthpose.depth.train.adapt import (
     AdaptationCheck,
     AdaptTask,
-    adapted_text,
     fine_focal_px,
     label_folders,
     refuse_worse,
@@ -35,7 +34,7 @@ from depthpose.depth.train.config import (
     StereoTraining,
     ViewTraining,
 )
-from depthpose.depth.train.pairs import TrainingPairs, name_frames
+from depthpose.depth.train.pairs import TrainingPairs
 from depthpose.depth.train.stages import (
     FinetuneTask,
     SelectionSamples,
@@ -86,7 +85,8 @@ def start_from(network: Generator | StereoNetwork, found: nn.Module, source: str
 
 def make_matcher_network(config: StereoTraining) -> StereoNetwork:
     """Make the network that a config trains, with the weights that it begins with."""
-    matcher = make_network(config.network)
+    kind = next(k for k in MATCHERS.values() if isinstance(config.network, k.config))
+    matcher = kind.network(config.network)
     if config.encoder is not None:
         if matcher.encoder is None:
             raise InputError(
@@ -207,7 +207,15 @@ def train_adapt(config: AdaptTraining, run: Run) -> Path:
     write_json(run.folder / "adapt.json", [asdict(metrics) for metrics in found])
     refuse_worse(*found)
     write_depth_weights(path, matcher=matcher, facts=facts)
-    write_card(path, "depth train adapt", seconds, facts, adapted_text(*found))
+    text = [
+        "Held-out pairs, and synthetic streets:",
+        "",
+        "| | before | after |",
+        "| --- | --- | --- |",
+    ]
+    both = zip(asdict(found[0]).items(), asdict(found[1]).values(), strict=True)
+    text += [f"| {name} | {old:.4g} | {new:.4g} |" for (name, old), new in both if old is not None]
+    write_card(path, "depth train adapt", seconds, facts, "\n".join(text))
     return path
 
 
@@ -264,7 +272,11 @@ def _run_stage(
     sources = samples.sources if isinstance(samples, SelectionSamples) else [samples]
     frames = [frame for source in sources for frame in source.frames]
     if frames:
-        more["frames_sha256"] = name_frames(frames)
+        digest = sha256()  # of their names and the sizes of their left images
+        for frame in frames:
+            size = frame.left.stat().st_size if frame.left.is_file() else 0  # 0: in a shard
+            digest.update(f"{frame.name} {size}\n".encode())
+        more["frames_sha256"] = digest.hexdigest()
     held_out: TrainingPairs | None = getattr(task, "held_out", None)
     if held_out is not None:
         remedy = "give --held-out other pairs, or exclude these in the config"

@@ -8,8 +8,7 @@ each function compiles it; what was compiled is kept on disk until a source chan
 import inspect
 import os
 import warnings
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from functools import cache
 from hashlib import sha256
 from importlib import import_module
@@ -80,24 +79,15 @@ def compiled(function: Callable[..., Any]) -> Any:  # noqa: ANN401  numba's disp
 
     # Tests check annotations by wrapping every function: numba wants what is inside.
     inner = inspect.unwrap(function)
-    try:
-        with _cached_by_source():
-            return njit(cache=True, nogil=True, error_model="numpy")(inner)
-    except RuntimeError:  # no folder that may be written to
-        return njit(nogil=True, error_model="numpy")(inner)
-
-
-@contextmanager
-def _cached_by_source() -> Iterator[None]:
-    """Keep what is compiled in a folder for all sources as they are.
-
-    numba itself looks at the file of a function alone, and functions call those of other files.
-    """
+    # One folder for all sources as they are: numba itself looks at the file of a function alone,
+    # and functions call those of other files.
     config: Any = import_module("numba").config
     before = config.CACHE_DIR
     config.CACHE_DIR = str(Path(__file__).parent / "__pycache__" / f"numba-{_digest()}")
     try:
-        yield
+        return njit(cache=True, nogil=True, error_model="numpy")(inner)
+    except RuntimeError:  # no folder that may be written to
+        return njit(nogil=True, error_model="numpy")(inner)
     finally:
         config.CACHE_DIR = before
 

@@ -4,17 +4,14 @@ import numpy as np
 from torch import Tensor
 
 from depthpose.pose.compiled import compiled
-from depthpose.pose.compiled.points import Array
-
-
-def rows_of(keys: Array, standing: Array, moves: list[int]) -> Array:
-    """Give the row of each key ``standing + move``; one past the last where there is none."""
-    return _find_rows(keys, standing, np.array(moves, np.int64))
 
 
 @compiled
-def _find_rows(keys, standing, moves):
-    """Walk along both ascending lists at once."""
+def rows_of(keys, standing, moves):
+    """Give the row of each key ``standing + move``, one past the last where there is none.
+
+    Both lists ascend: it walks along them at once.
+    """
     rows = np.empty((len(moves), len(standing)), np.int32)
     for k in range(len(moves)):
         row = 0
@@ -52,8 +49,8 @@ def convolved(
     assert x.shape == (read, weight.shape[1]), "a row for each voxel, a channel for each weight"
     assert len(weight) == len(table), "a weight for each offset"
     out = x.new_zeros(written, weight.shape[2])
-    given = (a.detach().contiguous().numpy() for a in (x, weight, table))
-    _convolve(*given, is_transposed, out.numpy())
+    x, weight, table = x.detach().contiguous(), weight.detach().contiguous(), table.contiguous()
+    _convolve(x.numpy(), weight.numpy(), table.numpy(), is_transposed, out.numpy())
     return out
 
 

@@ -24,7 +24,6 @@ from depthpose.pose.compiled.points import (
     neighbours,
     rotation,
     solve,
-    tree_of,
 )
 
 
@@ -54,25 +53,6 @@ class Target(NamedTuple):
     ball: Array
 
 
-def target_of(
-    points: Array,
-    normals: Array,
-    boxes: tuple[Array, float, Array, Array],
-    outward: Array,
-    across: Array,
-    ball: Array,
-) -> Target:
-    """Prepare a surface once."""
-    low, side, counts, nearest = boxes
-    tree = tree_of(points)
-    place = np.full(len(points) + 1, -1)
-    place[tree.order] = np.arange(len(points))
-    table = place[nearest].astype(np.int32)  # half of the memory: it is read at random
-    normals, outward = (np.ascontiguousarray(a[tree.order]) for a in (normals, outward))
-    far = place[across[tree.order]].astype(np.int32)
-    return Target(tree, normals, low, side, counts, table, outward, far, ball)
-
-
 @compiled
 def match(cloud, R, t, limit, target, how, local, eye, places):
     """Find for each point of a cloud the place of a surface point that the camera may see."""
@@ -83,16 +63,11 @@ def match(cloud, R, t, limit, target, how, local, eye, places):
         for c in range(3):
             local[i, c] = R[0, c] * x + R[1, c] * y + R[2, c] * z
     sought = _meet_planes(local, eye, target, places) if how == ON_RAY else local
-    least = _least(eye, target.ball)
-    find_places(sought, limit, target, how != LOOKED_UP, places, eye, least)
-
-
-@compiled
-def _least(eye, ball):
-    """What :func:`faces` must give; anything where the camera is within the ball."""
-    x, y, z = eye[0] - ball[0], eye[1] - ball[1], eye[2] - ball[2]
+    x, y, z = eye[0] - target.ball[0], eye[1] - target.ball[1], eye[2] - target.ball[2]
     distance = np.sqrt(x * x + y * y + z * z)
-    return -SLACK * distance if distance > ball[3] else -np.inf
+    # A camera within the ball sees no side.
+    least = -SLACK * distance if distance > target.ball[3] else -np.inf
+    find_places(sought, limit, target, how != LOOKED_UP, places, eye, least)
 
 
 @compiled
@@ -266,29 +241,6 @@ def grown(
 
 
 @compiled
-def _linearise(points, places, times, middle, limit, surface, normals, rows):
-    """Write each point's derivatives by turn, shift and growth, residual and weight: (n, 9)."""
-    for i in range(len(points)):
-        row, place = rows[i], places[i]
-        row[8] = 0.0
-        if place < 0:
-            continue
-        ax = times * (surface[place, 0] - middle[0])
-        ay = times * (surface[place, 1] - middle[1])
-        az = times * (surface[place, 2] - middle[2])
-        gx = points[i, 0] - middle[0] - ax
-        gy = points[i, 1] - middle[1] - ay
-        gz = points[i, 2] - middle[2] - az
-        share = 1 - (gx * gx + gy * gy + gz * gz) / (limit * limit)
-        if share <= 0:
-            continue
-        nx, ny, nz = normals[place, 0], normals[place, 1], normals[place, 2]
-        row[0], row[1], row[2] = ay * nz - az * ny, az * nx - ax * nz, ax * ny - ay * nx
-        row[3], row[4], row[5], row[6] = nx, ny, nz, nx * ax + ny * ay + nz * az
-        row[7], row[8] = nx * gx + ny * gy + nz * gz, share * share
-
-
-@compiled
 def _step(rows, motion):
     """Solve for turn, shift and growth; give the variance of the growth."""
     H, b, total = np.zeros((7, 7)), np.zeros(7), 0.0
@@ -331,7 +283,24 @@ def _grow(local, times, middle, limits, target, is_exact, converged, variance):
             s, points = times[p], local[p]
             own[:] = (points - middle) / s + middle  # beside the surface of its own size
             find_places(own, limit / s, target, is_exact, places[p])
-            _linearise(points, places[p], s, middle, limit, surface, normals, rows)
+            for i in range(count):  # derivatives by turn, shift and growth, residual, weight
+                row, place = rows[i], places[p, i]
+                row[8] = 0.0
+                if place < 0:
+                    continue
+                ax = s * (surface[place, 0] - middle[0])
+                ay = s * (surface[place, 1] - middle[1])
+                az = s * (surface[place, 2] - middle[2])
+                gx = points[i, 0] - middle[0] - ax
+                gy = points[i, 1] - middle[1] - ay
+                gz = points[i, 2] - middle[2] - az
+                share = 1 - (gx * gx + gy * gy + gz * gz) / (limit * limit)
+                if share <= 0:
+                    continue
+                nx, ny, nz = normals[place, 0], normals[place, 1], normals[place, 2]
+                row[0], row[1], row[2] = ay * nz - az * ny, az * nx - ax * nz, ax * ny - ay * nx
+                row[3], row[4], row[5], row[6] = nx, ny, nz, nx * ax + ny * ay + nz * az
+                row[7], row[8] = nx * gx + ny * gy + nz * gz, share * share
             variance[p] = _step(rows, motion)
             times[p] = min(max(s * (1 + min(max(motion[6], -0.1), 0.1)), 0.5), 2.0)
             rotation(motion[0], motion[1], motion[2], turn)

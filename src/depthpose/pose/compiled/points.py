@@ -3,10 +3,7 @@
 from typing import NamedTuple
 
 import numpy as np
-import torch
-from torch import Tensor
 
-from depthpose.core.rigid import Rigid
 from depthpose.pose.compiled import compiled, finite_array
 
 
@@ -253,19 +250,12 @@ def _nearest_many(queries, tree):
     return index, distance
 
 
-def planes_of(every: Array, some: Array, count: int) -> tuple[Array, Array]:
+@compiled
+def planes_of(every, some, count):
     """Lay a plane through the ``count`` points of ``every`` nearest to each of ``some``.
 
     Gives normals (m, 3) toward the origin, and how bent the cloud is there (m,), 0 to 1.
     """
-    assert count > 0, "a plane goes through points"
-    return _lay_planes(
-        *(finite_array(a.astype(np.float64, copy=False)) for a in (every, some)), count
-    )
-
-
-@compiled
-def _lay_planes(every, some, count):
     normals, bend = np.empty((len(some), 3)), np.empty(len(some))
     points, _, axes, values = planted(every)
     stack, bounds = np.empty((64, 3), np.int64), np.empty((64, 4))
@@ -299,23 +289,6 @@ def _lay_planes(every, some, count):
     return normals, bend
 
 
-def compare_rays(
-    cloud: Tensor,
-    poses: Rigid,
-    points: Tensor,
-    scale: float,
-    column: float,
-    row: float,
-    reach: int,
-    limit: float,
-) -> tuple[Tensor, Tensor]:
-    """Compare a cloud with each pose of a surface."""
-    assert len(poses.R) == len(poses.t_m), "a translation for each rotation"
-    given = (finite_array(a) for a in (cloud, poses.R, poses.t_m, points))
-    front, unseen = _look(*given, scale, column, row, reach, limit)
-    return torch.from_numpy(front), torch.from_numpy(unseen)
-
-
 @compiled
 def _cell(x, y, z, scale, column, row, half):
     """Number the cell of a ray, those far off at the border."""
@@ -325,7 +298,8 @@ def _cell(x, y, z, scale, column, row, half):
 
 
 @compiled
-def _look(cloud, Rs, ts, points, scale, column, row, half, limit):
+def compare_rays(cloud, Rs, ts, points, scale, column, row, half, limit):
+    """Compare a cloud with each pose of a surface, as :func:`look_along_rays` says."""
     front, unseen = np.empty(len(ts)), np.empty(len(ts))
     cells = (2 * half + 1) ** 2
     is_seen = np.zeros(cells, np.bool_)

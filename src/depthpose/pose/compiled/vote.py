@@ -130,27 +130,6 @@ def _mirror(A):
 
 
 @compiled
-def _start(local, n, w, A, p, memory):
-    """Find the point nearest to all lines, and its matrix over the sum of weights."""
-    b = np.zeros(3)
-    A[:] = 0.0
-    total = 0.0
-    for i in range(len(w)):
-        x, y, z = local[0, i], local[1, i], local[2, i]
-        along = n[0, i] * x + n[1, i] * y + n[2, i] * z
-        _add_outer(A, w[i], n[0, i], n[1, i], n[2, i])
-        b[0] += w[i] * (x - n[0, i] * along)
-        b[1] += w[i] * (y - n[1, i] * along)
-        b[2] += w[i] * (z - n[2, i] * along)
-        total += w[i]
-    A /= total
-    b /= total
-    _mirror(A)
-    _damped(A, memory)
-    solve(memory, b, p)
-
-
-@compiled
 def _gradients(local, n, w, p, nearest, A, gradient):
     """Write the information matrix and the gradient of each line, over the sum of weights."""
     total, mean = 0.0, 0.0
@@ -175,19 +154,6 @@ def _gradients(local, n, w, p, nearest, A, gradient):
 
 
 @compiled
-def _nearest_gradients(local, n, w, p, gradient):
-    total = 0.0
-    for i in range(len(w)):
-        total += w[i]
-    for i in range(len(w)):
-        x, y, z = p[0] - local[0, i], p[1] - local[1, i], p[2] - local[2, i]
-        along = n[0, i] * x + n[1, i] * y + n[2, i] * z
-        gradient[0, i] = (x - n[0, i] * along) * w[i] / total
-        gradient[1, i] = (y - n[1, i] * along) * w[i] / total
-        gradient[2, i] = (z - n[2, i] * along) * w[i] / total
-
-
-@compiled
 def _meet(local, n, w, refinements, nearest, points, covariances, conditions):
     local = local[0]
     count = local.shape[1]
@@ -198,7 +164,24 @@ def _meet(local, n, w, refinements, nearest, points, covariances, conditions):
         spread += (local[0, i] ** 2 + local[1, i] ** 2 + local[2, i] ** 2) / count
     for k in range(len(points)):
         p = points[k]
-        _start(local, n[k], w[k], A, p, M)
+        # The point nearest to all lines, and its matrix over the sum of weights.
+        A[:] = 0.0
+        pull[:] = 0.0
+        total = 0.0
+        for i in range(count):
+            x, y, z = local[0, i], local[1, i], local[2, i]
+            nx, ny, nz = n[k, 0, i], n[k, 1, i], n[k, 2, i]
+            along = nx * x + ny * y + nz * z
+            _add_outer(A, w[k, i], nx, ny, nz)
+            pull[0] += w[k, i] * (x - nx * along)
+            pull[1] += w[k, i] * (y - ny * along)
+            pull[2] += w[k, i] * (z - nz * along)
+            total += w[k, i]
+        A /= total
+        pull /= total
+        _mirror(A)
+        _damped(A, M)
+        solve(M, pull, p)
         M[:] = A
         jacobi(M, V)
         low, high = min(M[0, 0], M[1, 1], M[2, 2]), max(M[0, 0], M[1, 1], M[2, 2])
@@ -214,7 +197,12 @@ def _meet(local, n, w, refinements, nearest, points, covariances, conditions):
             for c in range(3):
                 p[c] += step[c] * min(limit / size, 1.0)
         if refinements == 0:
-            _nearest_gradients(local, n[k], w[k], p, gradient)
+            for i in range(count):
+                x, y, z = p[0] - local[0, i], p[1] - local[1, i], p[2] - local[2, i]
+                along = n[k, 0, i] * x + n[k, 1, i] * y + n[k, 2, i] * z
+                gradient[0, i] = (x - n[k, 0, i] * along) * w[k, i] / total
+                gradient[1, i] = (y - n[k, 1, i] * along) * w[k, i] / total
+                gradient[2, i] = (z - n[k, 2, i] * along) * w[k, i] / total
         for c in range(3):
             unit[:] = 0.0
             unit[c] = 1.0

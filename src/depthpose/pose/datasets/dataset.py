@@ -372,24 +372,17 @@ def _check_content(instance: Instance, model: ObjectModel) -> Iterator[Problem]:
             "depth_scale and cam_t_m2c both for millimetres?"
         )
         yield Problem(path=instance.depth, kind="mismatch", message=message)
-    elif _share_in_mask(instance, model, mask) < _FEW_IN_MASK and not (
-        instance.visible_fraction is not None and instance.visible_fraction < _FEW_IN_MASK
-    ):
-        message = f"{instance.name}: the posed model does not lie on its mask; is it another's?"
-        yield Problem(path=instance.mask, kind="mismatch", message=message)
-
-
-def _share_in_mask(instance: Instance, model: ObjectModel, mask: Bool[Tensor, "h w"]) -> float:
-    """Share of the model's points whose pixel is in the mask, grown by a pixel or two."""
-    surface, _ = sample_surface(model, 500)
-    points = instance.camera_from_model.apply(surface.double())
-    pixels = project(points, instance.K).nan_to_num(-9).round().long()
-    height, width = mask.shape
-    grown = torch.nn.functional.max_pool2d(mask[None].float(), 5, 1, 2)[0] > 0
-    u, v = pixels[:, 0], pixels[:, 1]
-    is_inside = (u >= 0) & (v >= 0) & (u < width) & (v < height)
-    hit = grown[v.clamp(0, height - 1), u.clamp(0, width - 1)] & is_inside
-    return float(hit.double().mean())
+    elif instance.visible_fraction is None or instance.visible_fraction >= _FEW_IN_MASK:
+        # The share of the model's points whose pixel is in the mask, grown by a pixel or two.
+        points = instance.camera_from_model.apply(sample_surface(model, 500)[0].double())
+        u, v = project(points, instance.K).nan_to_num(-9).round().long().unbind(1)
+        height, width = mask.shape
+        grown = torch.nn.functional.max_pool2d(mask[None].float(), 5, 1, 2)[0] > 0
+        is_inside = (u >= 0) & (v >= 0) & (u < width) & (v < height)
+        hit = grown[v.clamp(0, height - 1), u.clamp(0, width - 1)] & is_inside
+        if float(hit.double().mean()) < _FEW_IN_MASK:
+            message = f"{instance.name}: the posed model does not lie on its mask; is it another's?"
+            yield Problem(path=instance.mask, kind="mismatch", message=message)
 
 
 _DEPTH_UNIT_M = 0.0001

@@ -265,11 +265,6 @@ SYMMETRIC = (10, 11)
 """Eggbox and glue: measured by ADD-S ever since Hinterstoisser et al. (2012)."""
 
 
-def linemod_splits(folder: Path) -> tuple[str, ...]:
-    """Name the splits of a folder; none where it is not laid out as Linemod_preprocessed."""
-    return ("train", "test") if any(folder.glob("data/[0-9][0-9]/gt.yml")) else ()
-
-
 def linemod_symmetries(number: int) -> Symmetries:
     """Give what ``models_info.yml`` does not say: eggbox and glue, turned half about z, look alike.
 
@@ -360,7 +355,9 @@ class Layout:
 
 LAYOUTS: dict[str, Layout] = {
     "Linemod_preprocessed": Layout(
-        splits=linemod_splits,
+        splits=lambda folder: (
+            ("train", "test") if any(folder.glob("data/[0-9][0-9]/gt.yml")) else ()
+        ),
         instances=linemod_instances,
         symmetries=linemod_symmetries,
         predicted_mask=segnet_mask,

@@ -162,7 +162,18 @@ def read_runs(entry: object, source: str) -> Runs:
         raise InputError(f"{what}: its size is {size!r}, where [height, width] belongs")
     height, width = size
     text = counts.decode("latin-1") if isinstance(counts, bytes) else counts
-    runs = _decompress(text, what) if isinstance(text, str) else text
+    runs, value, shift = text, 0, 0
+    if isinstance(text, str):  # five bits a character, runs as differences from the last but one
+        runs = list[int]()
+        for bits in (ord(character) - 48 for character in text):
+            value |= (bits & 0x1F) << shift
+            shift += 5
+            if shift > _MOST_BITS:
+                raise InputError(f"{what}: its text has a number of more than {_MOST_BITS} bits")
+            if not bits & 0x20:
+                value -= (1 << shift) if bits & 0x10 else 0
+                runs.append(value + (runs[-2] if len(runs) > 2 else 0))
+                value = shift = 0
     if not _is_list_of_counts(runs) or sum(runs) != height * width or height * width > MAX_PIXELS:
         raise InputError(f"{what} of {height}x{width} pixels: they do not add up to it")
     return tuple(runs), height, width
@@ -170,25 +181,6 @@ def read_runs(entry: object, source: str) -> Runs:
 
 def _is_list_of_counts(value: object) -> TypeGuard[list[int]]:
     return isinstance(value, list) and all(type(v) is int and v >= 0 for v in value)
-
-
-def _decompress(text: str, what: str) -> list[int]:
-    """Undo COCO's text form: five bits a character, runs as differences from the last but one."""
-    runs: list[int] = []
-    value = shift = 0
-    for character in text:
-        bits = ord(character) - 48
-        value |= (bits & 0x1F) << shift
-        shift += 5
-        if shift > _MOST_BITS:
-            raise InputError(f"{what}: its text has a number of more than {_MOST_BITS} bits")
-        if bits & 0x20:
-            continue
-        if bits & 0x10:
-            value -= 1 << shift
-        runs.append(value + (runs[-2] if len(runs) > 2 else 0))
-        value = shift = 0
-    return runs
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

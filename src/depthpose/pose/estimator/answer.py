@@ -5,10 +5,6 @@ import time
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
-from jaxtyping import Float
-from torch import Tensor
-
-from depthpose.core.rigid import Rigid
 from depthpose.pose.config import EstimateConfig, RefusalConfig
 from depthpose.pose.estimator.candidates import (
     Candidate,
@@ -66,7 +62,16 @@ def answer_of(
     pose, covariance, residual_m = candidates[number]
     free = free_motions(model.symmetries.continuous, pose)
     reason, identity = misfit_of(fit, refusal), None
-    reason = reason or _not_observable(cloud.cloud_m, pose, surface, free, refusal)
+    if reason is None:
+        observable, motion = observability(cloud.cloud_m, pose, surface, free)
+        if observable < refusal.min_hold:
+            what = "turn" if float(motion[:3].norm()) > math.sqrt(0.5) else "shift"
+            reason = Refusal(
+                status="not observable",
+                reason=f"the seen part of the object leaves one {what} undetermined: it moves the "
+                f"surface along its normals by {observable:.1%} of the motion only; no declared "
+                "symmetry allows it. Declare the symmetry, or look from a side that shows more",
+            )
     if reason is None and config.with_icp and refusal.max_size_error < 1:
         identity = identity_of(cloud, pose, model, surface, fit, seen, refusal.max_size_error)
         if identity.status == "contradicted":
@@ -131,25 +136,6 @@ def misfit_of(fit: Fit, limits: RefusalConfig) -> Refusal | None:
     else:
         return None
     return Refusal(status="doubtful", reason=reason)
-
-
-def _not_observable(
-    cloud_m: Float[Tensor, "n 3"],
-    pose: Rigid,
-    surface: Surface,
-    free: Float[Tensor, "m 6"],
-    config: RefusalConfig,
-) -> Refusal | None:
-    observable, motion = observability(cloud_m, pose, surface, free)
-    if observable >= config.min_hold:
-        return None
-    what = "turn" if float(motion[:3].norm()) > math.sqrt(0.5) else "shift"
-    return Refusal(
-        status="not observable",
-        reason=f"the seen part of the object leaves one {what} undetermined: it moves the surface "
-        f"along its normals by {observable:.1%} of the motion only; no declared symmetry allows "
-        "it. Declare the symmetry, or look from a side that shows more",
-    )
 
 
 def withheld(

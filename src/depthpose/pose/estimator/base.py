@@ -47,27 +47,21 @@ class PoseEstimator(ABC):
     Args:
         models: the objects.
         config: ICP, limits, device.
+        refusal: when an answer is withheld.
     """
 
     _holder = "the weights"
     """What knows the objects, in errors."""
 
-    def __init__(self, models: Sequence[ObjectModel], config: EstimateConfig | None) -> None:
+    def __init__(
+        self, models: Sequence[ObjectModel], config: EstimateConfig | None, refusal: RefusalConfig
+    ) -> None:
         self.config = EstimateConfig() if config is None else config
+        self.models, self.refusal = tuple(models), refusal
         self._numbers = {model.name: k for k, model in enumerate(models)}
         self._surfaces: dict[int, Surface] = {}
         self._copies: dict[int, PoseAmbiguities] = {}
         self._shapes: dict[int, tuple[PairTable, Views]] = {}
-
-    @property
-    @abstractmethod
-    def models(self) -> Sequence[ObjectModel]:
-        """The objects."""
-
-    @property
-    @abstractmethod
-    def refusal(self) -> RefusalConfig:
-        """When an answer is withheld."""
 
     @property
     def objects(self) -> tuple[str, ...]:
@@ -96,13 +90,22 @@ class PoseEstimator(ABC):
         Raises:
             InputError: fewer than one thread, or inputs that are neither.
         """
+        if isinstance(inputs, AnyInput):
+            raise InputError("estimate_many takes several inputs; give one as [input]")
+
+        def typed() -> Iterator[AnyInput]:
+            for given in inputs:
+                if not isinstance(given, AnyInput):
+                    raise InputError(
+                        "estimate_many takes CloudInput and ViewInput of depthpose.pose.types, not "
+                        f"a {type(given).__name__}; files and arrays go to estimate(), one at a "
+                        "time"
+                    )
+                yield given
+
         total = len(inputs) if isinstance(inputs, Sized) else None
-        with tqdm(total=total, unit=" poses", disable=not with_progress) as bar:
-            found: list[PoseEstimate] = []
-            for one in self._each(_typed(inputs), threads):
-                found.append(one)
-                bar.update()
-        return found
+        each = self._each(typed(), threads)
+        return list(tqdm(each, total=total, unit=" poses", disable=not with_progress))
 
     @abstractmethod
     def _each(
@@ -378,18 +381,6 @@ def answered(found: PoseEstimate) -> PoseEstimate:
     if found.status == "unreadable":
         raise InputError(found.reason)
     return found
-
-
-def _typed(inputs: Iterable[object]) -> Iterator[AnyInput]:
-    if isinstance(inputs, AnyInput):
-        raise InputError("estimate_many takes several inputs; give one as [input]")
-    for given in inputs:
-        if not isinstance(given, AnyInput):
-            raise InputError(
-                f"estimate_many takes CloudInput and ViewInput of depthpose.pose.types, not a "
-                f"{type(given).__name__}; files and arrays go to estimate(), one at a time"
-            )
-        yield given
 
 
 def refused(given: AnyInput, refusal: Refusal, seconds: dict[str, float]) -> PoseEstimate:

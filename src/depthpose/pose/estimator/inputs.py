@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Int64, Shaped
+from jaxtyping import Bool, Float, Int64
 from torch import Tensor
 
 from depthpose.core.arrays import take_evenly
@@ -85,7 +85,23 @@ def view_input(
     is_said = isinstance(camera, str | Path | Mapping | float | int)
     known = camera_of(camera, (width, height)) if is_said else camera
     said_m = known.depth_unit_m if isinstance(known, Camera) else None
-    depth_m = _metres(values, said_m, unit, str(depth) if isinstance(depth, str | Path) else name)
+    file = str(depth) if isinstance(depth, str | Path) else name
+    given_m = None if unit is None else metres_of(unit)
+    if not values.is_floating_point():
+        if given_m is not None and said_m is not None and given_m != said_m:
+            raise InputError(
+                f"{file}: unit {unit} is {given_m:g} m, but its camera says depth_unit_m "
+                f"{said_m:g}; omit one of the two (the unit of a CAD file is --cad-unit)"
+            )
+        given_m = said_m if given_m is None else given_m
+        if given_m is None:
+            raise InputError(
+                f"{file}: its depth is in whole numbers, and nothing says of what; give a camera "
+                'with "depth_unit_m" (0.001 where they are millimetres, 0.0002 of TUM RGB-D, '
+                "0.00390625 of KITTI), unit mm, or metres as floats"
+            )
+        values = values.double()
+    depth_m = torch.where(values > 0, values * (given_m or 1.0), torch.nan).float()
     pixels = torch.ones(height, width).bool()
     if mask is not None:
         said = str(mask) if isinstance(mask, str | Path) else name
@@ -165,27 +181,6 @@ def labels_input(mask: AnyMask, name: str) -> Int64[Tensor, "_ _"]:
         values = values > 0.5
     whole = values.long()
     return number_objects(whole.numpy()) if whole.ndim == 2 else whole
-
-
-def _metres(
-    values: Shaped[Tensor, "h w"], said_m: float | None, unit: Unit | None, name: str
-) -> Float[Tensor, "h w"]:
-    given_m = None if unit is None else metres_of(unit)
-    if values.is_floating_point():
-        return torch.where(values > 0, values * (given_m or 1.0), torch.nan).float()
-    if given_m is not None and said_m is not None and given_m != said_m:
-        raise InputError(
-            f"{name}: unit {unit} is {given_m:g} m, but its camera says depth_unit_m {said_m:g}; "
-            "omit one of the two (the unit of a CAD file is --cad-unit)"
-        )
-    unit_m = said_m if given_m is None else given_m
-    if unit_m is None:
-        raise InputError(
-            f"{name}: its depth is in whole numbers, and nothing says of what; give a camera with "
-            '"depth_unit_m" (0.001 where they are millimetres, 0.0002 of TUM RGB-D, 0.00390625 of '
-            "KITTI), unit mm, or metres as floats"
-        )
-    return torch.where(values > 0, values.double() * unit_m, torch.nan).float()
 
 
 def _tensor(values: Any) -> Tensor:  # noqa: ANN401  whatever a caller has
@@ -302,7 +297,17 @@ def _refusal_of(
         )
     # Some background in the mask is not of another size.
     elif not unusable and advice and not (sized_m is kept_m and "larger than the model" in advice):
-        hint = _view_hint(given) if isinstance(given, ViewInput) else ""
+        hint = ""
+        if isinstance(given, ViewInput):  # what else changes the size of a cloud
+            mask = given.mask.float()
+            edge = torch.cat([mask[0], mask[-1], mask[:, 0], mask[:, -1]])
+            hint = (
+                "; a mask of more than it, or a K of another image size, changes the size of its "
+                "cloud too, and so does another depth unit: 0.001 m of most sensors, 0.0002 m of "
+                "TUM RGB-D, 1/256 m of KITTI"
+            )
+            if (share := float(mask.mean())) > _MOST and float(edge.mean()) > _MOST:
+                hint = f"; the mask covers {share:.0%} of the image and its border: is it inverted?"
         unusable = f"{advice} (the object is {model.diameter_m:.3g} m long{hint})"
     if unusable is not None:
         return Refusal(status="unusable input", reason=unusable)
@@ -320,17 +325,4 @@ def _refusal_of(
         reason=f"the points lie {shape}, so that motions along it change nothing that is seen; "
         "look from a side that shows more of the object"
         f"{', or give the mask of this image: this one may lie on the background' * beside}",
-    )
-
-
-def _view_hint(view: ViewInput) -> str:
-    """Say what else than the object changes the size of a cloud from a depth image."""
-    edge = torch.cat([view.mask[0], view.mask[-1], view.mask[:, 0], view.mask[:, -1]])
-    share = float(view.mask.float().mean())
-    if share > _MOST and float(edge.float().mean()) > _MOST:
-        return f"; the mask covers {share:.0%} of the image and its border: is it inverted?"
-    return (
-        "; a mask of more than it, or a K of another image size, changes the size of its cloud "
-        "too, and so does another depth unit: 0.001 m of most sensors, 0.0002 m of TUM RGB-D, "
-        "1/256 m of KITTI"
     )

@@ -20,21 +20,10 @@ from depthpose.core.errors import InputError
 from depthpose.core.rigid import Rigid
 from depthpose.pose.baselines import DepthCrop, DepthImageNet, cut_depth, poses_of
 from depthpose.pose.cloud import cloud_from_depth, refusal_of
-from depthpose.pose.config import EstimateConfig, RefusalConfig, VotingConfig
-from depthpose.pose.estimator.answer import (
-    Clock,
-    answer_of,
-    candidate_of,
-    misfit_of,
-    withheld,
-)
+from depthpose.pose.config import EstimateConfig
+from depthpose.pose.estimator.answer import Clock, answer_of, candidate_of, misfit_of, withheld
 from depthpose.pose.estimator.base import PoseEstimator, answered, or_unreadable, refused
-from depthpose.pose.estimator.candidates import (
-    Candidate,
-    PoseAmbiguities,
-    evidence_of,
-    find_candidates,
-)
+from depthpose.pose.estimator.candidates import Candidate, evidence_of, find_candidates
 from depthpose.pose.estimator.fit import fit_of, seen_about
 from depthpose.pose.estimator.inputs import AnyInput, ObjectCloud, Refusal, prepare_cloud
 from depthpose.pose.estimator.inputs import CloudDirections as CloudDirections
@@ -58,57 +47,6 @@ _LEAST = 4
 """Keypoints that must agree: three fix a pose with nothing left to contradict it."""
 _DOUBTED: tuple[Status, ...] = ("votes do not meet", "keypoints do not fit", "doubtful")
 """What the network could not answer, and another method may; the rest is due to the input."""
-
-
-def pose_from_directions(
-    voted: CloudDirections,
-    model: ObjectModel,
-    surface: Surface,
-    copies: PoseAmbiguities,
-    refusal: RefusalConfig,
-    config: EstimateConfig,
-    *,
-    is_likely: bool = True,
-) -> PoseEstimate:
-    """Vote for the keypoints, fit the pose, refine and check it."""
-    clock = Clock()
-    vote = cast_votes(voted, config.voting)
-    clock.note("voting")
-    fits = _fits(vote, model, config)
-    if isinstance(fits, Refusal):
-        return withheld(model.name, fits, clock)
-    clock.note("svd")
-    cloud_m = voted.cloud.cloud_m
-    pose, icp = fits.camera_from_model, None
-    first = Candidate(pose[0].double(), fits.covariance[0], float(fits.residual_m[0]))
-    others = pose[[]].double()
-    if config.with_icp:
-        best = refine_best(cloud_m.double(), pose, surface, config.icp)
-        if float(best.refined.inlier_share) > 0:
-            first, others, icp = candidate_of(best.refined), best.others, config.icp
-    if not is_likely:
-        seen = seen_about(cloud_m, voted.cloud.view, surface.diameter_m)
-        misfit = misfit_of(fit_of(seen, first.pose, surface), refusal)
-        if misfit is not None:
-            clock.note("icp")
-            return withheld(model.name, misfit, clock)
-    candidates = find_candidates(cloud_m, first, others, copies, surface, icp)
-    poses = Rigid.stack([one.pose for one in candidates])
-    evidence = evidence_of(voted, poses, model, copies, surface)
-    if config.with_icp:
-        clock.note("icp")
-    return answer_of(
-        voted.cloud, model, surface, copies, candidates, evidence, refusal, config, clock, vote
-    )
-
-
-def cast_votes(voted: CloudDirections, config: VotingConfig) -> Vote:
-    """Let the directions vote, by RANSAC or least squares, in float64."""
-    points = voted.cloud.points_m.double()
-    directions = voted.directions.double()
-    if config.method == "ransac":
-        return vote_ransac(points, directions, config=config)
-    return meet_lines(points, directions, refinements=config.refinements)
 
 
 def _fits(vote: Vote, model: ObjectModel, config: EstimateConfig) -> PoseFit | Refusal:
@@ -179,7 +117,7 @@ class GeoPoseNet(PoseEstimator):
     """What the weights were called; nothing where they came from memory."""
 
     def __init__(self, weights: PoseWeights, config: EstimateConfig | None = None) -> None:
-        super().__init__(weights.models, config)
+        super().__init__(weights.models, config, weights.refusal)
         self.weights = weights
         if isinstance(weights.network, DepthImageNet):
             raise InputError(
@@ -222,16 +160,6 @@ class GeoPoseNet(PoseEstimator):
     def terms(self) -> str:
         """Terms of the weights, where they bind whoever uses them; else nothing."""
         return self.weights.facts.get("terms", "")
-
-    @property
-    def models(self) -> Sequence[ObjectModel]:
-        """The objects that the weights know."""
-        return self.weights.models
-
-    @property
-    def refusal(self) -> RefusalConfig:
-        """When an answer is withheld."""
-        return self.weights.refusal
 
     def _each(
         self, inputs: Iterable[AnyInput], threads: int, *, is_likely: bool = True
@@ -288,33 +216,29 @@ class GeoPoseNet(PoseEstimator):
         prepared = each_in_threads(self._prepare, inputs, threads)
         work = partial(self._pose, is_likely=is_likely)
         for some in batches(prepared, self.config.batch_voxels):
-            yield from each_in_threads(work, self._ask(some), threads)
+            ready = [(one, one.prepared) for one in some if isinstance(one.prepared, ObjectCloud)]
+            numbers = [self._number(one.given.object) for one, _ in ready]
+            clouds = [cloud for _, cloud in ready]
+            outputs, spent_s = self._directions(clouds, numbers) if ready else ([], 0.0)
+            total, left = sum(map(len, outputs)), iter(outputs)
+            for one in some:  # each has a share of the time
+                if isinstance(one.prepared, ObjectCloud):
+                    one.outputs = next(left)
+                    one.seconds["network"] = spent_s * len(one.outputs) / total
+            yield from each_in_threads(work, some, threads)
 
     def _prepare(self, given: AnyInput) -> "_Cloud":
-        def prepare(given: AnyInput) -> ObjectCloud | Refusal:
-            model = self.weights.models[self._number(given.object)]
-            return prepare_cloud(given, model, self.weights.cloud, self.config)
-
         start = time.perf_counter()
-        prepared = or_unreadable(prepare, given)
+        prepared = or_unreadable(
+            lambda given: prepare_cloud(
+                given, self.models[self._number(given.object)], self.weights.cloud, self.config
+            ),
+            given,
+        )
         seconds = {"cloud": time.perf_counter() - start}
         if isinstance(prepared, Refusal):
             prepared = refused(given, prepared, seconds)
         return _Cloud(given=given, prepared=prepared, seconds=seconds)
-
-    def _ask(self, group: list["_Cloud"]) -> Iterator["_Cloud"]:
-        """Ask the network for the directions of clouds together; each has a share of the time."""
-        ready = [(one, one.prepared) for one in group if isinstance(one.prepared, ObjectCloud)]
-        numbers = [self._number(one.given.object) for one, _ in ready]
-        outputs, spent_s = self._directions([p for _, p in ready], numbers) if ready else ([], 0.0)
-        total, left = sum(map(len, outputs)), iter(outputs)
-        for one in group:
-            if isinstance(one.prepared, ObjectCloud):
-                own = next(left)
-                seconds = {**one.seconds, "network": spent_s * len(own) / total}
-                yield replace(one, outputs=own, seconds=seconds)
-            else:
-                yield one
 
     def _directions(
         self, clouds: list[ObjectCloud], numbers: list[int]
@@ -343,24 +267,61 @@ class GeoPoseNet(PoseEstimator):
         assert one.outputs is not None, "asked before"
         voted = CloudDirections(one.prepared, one.outputs)
 
-        def pose(given: AnyInput) -> PoseEstimate:
-            number = self._number(given.object)
-            return pose_from_directions(
-                voted,
-                self.models[number],
-                self._surface(number),
-                self._copies_of(number),
-                self.refusal,
-                self.config,
-                is_likely=is_likely,
-            )
-
-        found = or_unreadable(pose, one.given)
+        found = or_unreadable(
+            lambda given: self._vote(voted, self._number(given.object), is_likely=is_likely),
+            one.given,
+        )
         seconds = {**one.seconds, **found.seconds}
         return one.given, replace(found, name=one.given.name, seconds=seconds), voted
 
+    def _vote(self, voted: CloudDirections, number: int, *, is_likely: bool) -> PoseEstimate:
+        """Vote for the keypoints, fit the pose, refine and check it."""
+        model, surface, copies = self.models[number], self._surface(number), self._copies_of(number)
+        config, clock = self.config, Clock()
+        points, directions = voted.cloud.points_m.double(), voted.directions.double()
+        if config.voting.method == "ransac":
+            vote = vote_ransac(points, directions, config=config.voting)
+        else:
+            vote = meet_lines(points, directions, refinements=config.voting.refinements)
+        clock.note("voting")
+        fits = _fits(vote, model, config)
+        if isinstance(fits, Refusal):
+            return withheld(model.name, fits, clock)
+        clock.note("svd")
+        cloud_m = voted.cloud.cloud_m
+        pose, icp = fits.camera_from_model, None
+        first = Candidate(pose[0].double(), fits.covariance[0], float(fits.residual_m[0]))
+        others = pose[[]].double()
+        if config.with_icp:
+            best = refine_best(cloud_m.double(), pose, surface, config.icp)
+            if float(best.refined.inlier_share) > 0:
+                first, others, icp = candidate_of(best.refined), best.others, config.icp
+        if not is_likely:
+            seen = seen_about(cloud_m, voted.cloud.view, surface.diameter_m)
+            misfit = misfit_of(fit_of(seen, first.pose, surface), self.refusal)
+            if misfit is not None:
+                clock.note("icp")
+                return withheld(model.name, misfit, clock)
+        candidates = find_candidates(cloud_m, first, others, copies, surface, icp)
+        poses = Rigid.stack([one.pose for one in candidates])
+        evidence = evidence_of(voted, poses, model, copies, surface)
+        if config.with_icp:
+            clock.note("icp")
+        return answer_of(
+            voted.cloud,
+            model,
+            surface,
+            copies,
+            candidates,
+            evidence,
+            self.refusal,
+            config,
+            clock,
+            vote,
+        )
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+
+@dataclass(kw_only=True, eq=False)
 class _Cloud:
     """An input on its way: a cloud, what the network says of it, the seconds; or a refusal."""
 

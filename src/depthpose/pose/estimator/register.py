@@ -7,8 +7,6 @@ from functools import partial
 from pathlib import Path
 
 import torch
-from jaxtyping import Float
-from torch import Tensor
 
 from depthpose.core.arrays import take_evenly
 from depthpose.core.devices import each_in_threads, own_arithmetic
@@ -20,7 +18,6 @@ from depthpose.pose.config import CloudConfig, EstimateConfig, RefusalConfig
 from depthpose.pose.estimator.answer import Clock, answer_of, candidate_of, withheld
 from depthpose.pose.estimator.base import PoseEstimator, or_unreadable, refused
 from depthpose.pose.estimator.candidates import (
-    CloudNormals,
     cloud_normals,
     find_candidates,
     surface_signals,
@@ -29,7 +26,6 @@ from depthpose.pose.estimator.candidates import (
 from depthpose.pose.estimator.inputs import AnyInput, Refusal, prepare_cloud
 from depthpose.pose.mesh import read_model, refuse_one_name, with_found_symmetries
 from depthpose.pose.refine import refine_best
-from depthpose.pose.surface import Surface
 from depthpose.pose.types import CloudInput, ObjectModel, PoseEstimate
 from depthpose.pose.voting.point_pairs import propose_poses, thin
 
@@ -75,7 +71,18 @@ class Registration(PoseEstimator):
         config: EstimateConfig | None = None,
         refusal: RefusalConfig | None = None,
     ) -> None:
-        _refuse_no_surface(models)
+        if not models:
+            raise InputError(
+                "registration looks for CAD files and none is given; name one: STL, PLY, OBJ or GLB"
+            )
+        refuse_one_name(models)
+        for model in models:
+            points = len(model.vertices_m)
+            if len(model.faces) == 0 and points < _LEAST:
+                raise InputError(
+                    f"{model.name}: {points} points without faces are no surface; export the part "
+                    f"as a mesh with triangles, such as STL, or give {_LEAST} points"
+                )
         if config is not None and not config.with_icp:
             raise InputError("registration refines by ICP; omit --no-icp (with_icp=False)")
         if config is not None and config.register_refused:
@@ -83,8 +90,7 @@ class Registration(PoseEstimator):
                 "registration has no network whose refusals it could register; omit "
                 "--register-refused (register_refused=True)"
             )
-        super().__init__(models, config)
-        self._models, self._refusal = tuple(models), refusal or REFUSAL
+        super().__init__(models, config, refusal or REFUSAL)
 
     @classmethod
     @own_arithmetic()
@@ -109,16 +115,6 @@ class Registration(PoseEstimator):
     def __repr__(self) -> str:
         """Say it in one line: the objects; a registration has no weights and no device."""
         return f"Registration(of {self._objects_in_short()})"
-
-    @property
-    def models(self) -> Sequence[ObjectModel]:
-        """The objects."""
-        return self._models
-
-    @property
-    def refusal(self) -> RefusalConfig:
-        """When an answer is withheld."""
-        return self._refusal
 
     def prepare(self) -> None:
         """Prepare every model now, about a second each; else it is done when first asked for."""
@@ -150,7 +146,15 @@ class Registration(PoseEstimator):
         if isinstance(prepared, Refusal):
             return refused(given, prepared, seconds)
         began = time.perf_counter()
-        proposals = self._proposals(prepared.cloud_m, number) if poses is None else poses
+        proposals = poses
+        if proposals is None:
+            generator = torch.Generator().manual_seed(self.config.voting.seed)
+            dense_m = take_evenly(prepared.cloud_m.double(), _SMOOTHED)
+            step_m = _VOXEL * surface.diameter_m
+            some_m = dense_m[thin(dense_m, torch.zeros_like(dense_m), step_m)]
+            normals, _ = local_planes(dense_m, some_m)
+            table = self._shape(number)[0]
+            proposals = propose_poses(some_m, normals, table, surface, _PROPOSALS, generator)
         seconds["voting"] = time.perf_counter() - began
         clock, icp = Clock(seconds), replace(self.config.icp, starts=1)
         best = refine_best(prepared.cloud_m.double(), proposals, surface, icp)
@@ -161,46 +165,17 @@ class Registration(PoseEstimator):
         first = candidate_of(best.refined)
         candidates = find_candidates(prepared.cloud_m, first, best.others, copies, surface, icp)
         normals = cloud_normals(prepared.cloud_m)
-        evidence = [_evidence_of(prepared.cloud_m, normals, c.pose, surface) for c in candidates]
+        evidence: list[dict[str, float]] = []
+        for pose in [one.pose for one in candidates]:
+            (signals,) = surface_signals(prepared.cloud_m, pose[None], surface, normals)
+            # The plane through neighbours is tilted where a part has edges and thin features too,
+            # whatever the pose: so it is on the cloud moved onto the posed surface.
+            local_m = pose.inverse().apply(prepared.cloud_m.double())
+            ideal_m = pose.apply(surface.points_m[surface.nearest(local_m)])
+            own = float(tilt_of(cloud_normals(ideal_m), pose[None], surface))
+            evidence.append({**signals, "tilt": max(0.0, signals["tilt"] - own)})
         clock.note("icp")
         found = answer_of(
             prepared, model, surface, copies, candidates, evidence, self.refusal, self.config, clock
         )
         return replace(found, name=given.name)
-
-    def _proposals(self, cloud_m: Float[Tensor, "n 3"], number: int) -> Rigid:
-        surface, table = self._surface(number), self._shape(number)[0]
-        generator = torch.Generator().manual_seed(self.config.voting.seed)
-        dense_m = take_evenly(cloud_m.double(), _SMOOTHED)
-        some_m = dense_m[thin(dense_m, torch.zeros_like(dense_m), _VOXEL * surface.diameter_m)]
-        normals, _ = local_planes(dense_m, some_m)
-        return propose_poses(some_m, normals, table, surface, _PROPOSALS, generator)
-
-
-def _evidence_of(
-    cloud_m: Float[Tensor, "n 3"], normals: CloudNormals, pose: Rigid, surface: Surface
-) -> dict[str, float]:
-    """Give the signals of a pose; of the tilt what its own surface does not cause.
-
-    The plane through neighbours is tilted where a part has edges and thin features too, whatever
-    the pose: so it is on the cloud moved onto the posed surface, which is subtracted.
-    """
-    (signals,) = surface_signals(cloud_m, pose[None], surface, normals)
-    local_m = pose.inverse().apply(cloud_m.double())
-    ideal_m = pose.apply(surface.points_m[surface.nearest(local_m)])
-    own = float(tilt_of(cloud_normals(ideal_m), pose[None], surface))
-    return {**signals, "tilt": max(0.0, signals["tilt"] - own)}
-
-
-def _refuse_no_surface(models: Sequence[ObjectModel]) -> None:
-    if not models:
-        raise InputError(
-            "registration looks for CAD files and none is given; name one: STL, PLY, OBJ or GLB"
-        )
-    refuse_one_name(models)
-    for model in models:
-        if len(model.faces) == 0 and len(model.vertices_m) < _LEAST:
-            raise InputError(
-                f"{model.name}: {len(model.vertices_m)} points without faces are no surface; "
-                f"export the part as a mesh with triangles, such as STL, or give {_LEAST} points"
-            )

@@ -127,28 +127,23 @@ def nearest_copy(
     one = Rigid(estimated.R.double().expand_as(R), estimated.t_m.double().expand_as(t_m))
     nearest = int(rotation_error_rad(one, copies).argmin())
     copy = copies[nearest]
-    return copy if declared is None else _turned_to(copy, estimated.R.double(), declared)
-
-
-def _turned_to(pose: Rigid, R: Float[Tensor, "3 3"], symmetries: Symmetries) -> Rigid:
-    """Turn a pose about the axes of revolution of its object until it is nearest to ``R``."""
-    if not symmetries.continuous:
-        return pose
-    relative = pose.R.mT @ R
-    centre_m = symmetries.ball_centre_m
+    if declared is None or not declared.continuous:
+        return copy
+    # Turned about the axes of revolution until it is nearest.
+    wanted, centre_m = estimated.R.double(), declared.ball_centre_m
+    relative = copy.R.mT @ wanted
     if centre_m is not None:
-        turn = Rigid(relative, centre_m.to(R) - relative @ centre_m.to(R))
-        return pose @ turn
+        centre_m = centre_m.to(wanted)
+        return copy @ Rigid(relative, centre_m - relative @ centre_m)
     turns = []
-    for axis in symmetries.continuous:
-        a = axis.direction.to(R) / axis.direction.norm()
+    for axis in declared.continuous:
+        a = axis.direction.to(wanted) / axis.direction.norm()
         # The trace of relative^T turn(angle) is largest there.
         skew = relative - relative.mT
         across = torch.stack([skew[2, 1], skew[0, 2], skew[1, 0]])
         angle = torch.atan2(a @ across, relative.trace() - a @ relative @ a)
-        turns.append(pose @ turn_about(a, axis.point_m.to(R), angle))
-    errors = [float(rotation_error_rad(Rigid(R, pose.t_m), one)) for one in turns]
-    return turns[errors.index(min(errors))]
+        turns.append(copy @ turn_about(a, axis.point_m.to(wanted), angle))
+    return min(turns, key=lambda one: float(rotation_error_rad(Rigid(wanted, copy.t_m), one)))
 
 
 def _vsd(estimated: Rigid, instance: Instance, context: ErrorContext) -> Float[Tensor, "10"]:
@@ -270,36 +265,27 @@ def match(
             assert prediction.place is not None
             offered[prediction.place].append(prediction.estimate)
     for place, estimates in offered.items():
-        found |= _assign(waiting[place], estimates, models[place.object_id])
+        left, model = waiting[place], models[place.object_id]
+        ranked = sorted((e for e in estimates if e.is_posed), key=score_of, reverse=True)
+        answers = ranked[: len(left)]
+        points_m = model.vertices_m[:: max(1, len(model.vertices_m) // _POINTS)]
+        costs = np.zeros((len(left), len(answers)))
+        for row, column in np.ndindex(costs.shape if len(left) > 1 else (0, 0)):
+            pose, true = answers[column].camera_from_model, left[row].camera_from_model
+            assert pose is not None
+            error_m = float(adds_m(pose, true, points_m))
+            costs[row, column] = min(error_m, _NEAR_DIAMETERS * model.diameter_m)
+        for row, column in zip(*linear_sum_assignment(costs), strict=True):
+            found[left[row].name] = answers[column]
+        refusals = [estimate for estimate in estimates if not estimate.is_posed]
+        left = [instance for instance in left if instance.name not in found]
+        found |= {i.name: e for i, e in zip(left, refusals, strict=False)}
     return found
 
 
 def _is_own(prediction: Prediction, places: Mapping[str, Place]) -> bool:
     place = places.get(prediction.estimate.name)
     return place is not None and prediction.place in (None, place)
-
-
-def _assign(
-    instances: list[Instance], estimates: list[PoseEstimate], model: ObjectModel
-) -> dict[str, PoseEstimate]:
-    ranked = sorted((e for e in estimates if e.is_posed), key=score_of, reverse=True)
-    answers = ranked[: len(instances)]
-    chosen: dict[str, PoseEstimate] = {}
-    if len(instances) == 1 and answers:
-        chosen[instances[0].name] = answers[0]
-    elif answers:
-        points_m = model.vertices_m[:: max(1, len(model.vertices_m) // _POINTS)]
-        costs = np.zeros((len(instances), len(answers)))
-        for (row, column), _ in np.ndenumerate(costs):
-            pose, true = answers[column].camera_from_model, instances[row].camera_from_model
-            assert pose is not None
-            error_m = float(adds_m(pose, true, points_m))
-            costs[row, column] = min(error_m, _NEAR_DIAMETERS * model.diameter_m)
-        for row, column in zip(*linear_sum_assignment(costs), strict=True):
-            chosen[instances[row].name] = answers[column]
-    refusals = [estimate for estimate in estimates if not estimate.is_posed]
-    left = [instance for instance in instances if instance.name not in chosen]
-    return chosen | {i.name: e for i, e in zip(left, refusals, strict=False)}
 
 
 _TRIED = 40

@@ -11,6 +11,7 @@ from codecs import BOM_UTF8
 from collections.abc import Callable, Iterator
 from contextlib import suppress
 from io import BytesIO
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -78,24 +79,12 @@ def read_geometry(path: AnyPath) -> tuple[np.ndarray, np.ndarray]:
         )
     if isinstance(faces, np.ndarray):
         faces = Ragged(np.full(len(faces), faces.shape[1]), faces.reshape(-1))
-    triangles = cut_polygons(path, vertices, faces.sizes, faces.values.astype(np.int64))
-    return vertices, _sound_faces(path, vertices, triangles)
-
-
-def mesh_suffixes() -> tuple[str, ...]:
-    """Name the suffixes of model files that may have faces, in lower case."""
-    return tuple(MESH_READERS)
-
-
-def _sound_faces(path: AnyPath, vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    """Drop faces without area, and all but the first of those on the same three points.
-
-    A face and its reverse would cancel in the normals. Holes are no flaw.
-    """
+    faces = cut_polygons(path, vertices, faces.sizes, faces.values.astype(np.int64))
     if len(faces) == 0:
-        return faces
-    corners = vertices[faces]
-    sides = corners[:, 1:] - corners[:, :1]
+        return vertices, faces
+    # Dropped are faces without area, and all but the first of those on the same three points: a
+    # face and its reverse would cancel in the normals. Holes are no flaw.
+    sides = vertices[faces[:, 1:]] - vertices[faces[:, :1]]
     area = np.linalg.norm(np.cross(sides[:, 0], sides[:, 1]), axis=-1) / 2
     square = float(np.ptp(vertices, axis=0).max()) ** 2
     if area.sum() <= _LEAST_AREA * square:
@@ -106,9 +95,13 @@ def _sound_faces(path: AnyPath, vertices: np.ndarray, faces: np.ndarray) -> np.n
     # By place, not by number: STL repeats the points of every face.
     _, place = np.unique(vertices, axis=0, return_inverse=True)
     _, first = np.unique(np.sort(place.reshape(-1)[faces], axis=-1), axis=0, return_index=True)
-    is_first = np.zeros(len(faces), bool)
-    is_first[first] = True
-    return faces[is_first & (area > _NO_AREA * square)]
+    is_first = np.isin(np.arange(len(faces)), first)
+    return vertices, faces[is_first & (area > _NO_AREA * square)]
+
+
+def mesh_suffixes() -> tuple[str, ...]:
+    """Name the suffixes of model files that may have faces, in lower case."""
+    return tuple(MESH_READERS)
 
 
 def _read_ply(path: AnyPath) -> tuple[np.ndarray, Ragged]:
@@ -168,7 +161,20 @@ def _read_stl(path: AnyPath) -> tuple[np.ndarray, Ragged]:
     head = data[: 2**16].removeprefix(BOM_UTF8).lstrip().lower()
     is_text = head.startswith(b"solid") and b"facet" in head and b"\0" not in head
     if is_text and (there, more) != (count, 0):
-        return _read_text_stl(path, data)
+        # Facets of one or more solids; a loop of four corners and more is a polygon.
+        places, ends, last = array("d"), array("q", [0]), b""
+        for number, words in _rows_of(path, data):
+            last = words[0]
+            if last == b"vertex":
+                places.extend(_place(path, number, words))
+            elif last == b"endloop":
+                ends.append(len(places) // 3)
+        if last != b"endsolid" or ends[-1] != len(places) // 3:
+            raise InputError(
+                f"{path}: STL in text that ends by {last.decode('latin-1')[:20]!r}, not by "
+                "'endsolid'; it is truncated. Export it again."
+            )
+        return np.array(places).reshape(-1, 3), Ragged(np.diff(ends), np.arange(ends[-1]))
     # Writers that stream leave the count at 0; a byte or two behind the last one do no harm.
     if there < 1 or (there != count and (count or more)):
         raise InputError(
@@ -178,23 +184,6 @@ def _read_stl(path: AnyPath) -> tuple[np.ndarray, Ragged]:
     record = np.dtype([("normal", "<f4", 3), ("corners", "<f4", 9), ("attribute", "<u2")])
     corners = np.frombuffer(data, record, there, 84)["corners"].reshape(-1, 3)
     return corners.astype(np.float64), Ragged(np.full(there, 3), np.arange(3 * there))
-
-
-def _read_text_stl(path: AnyPath, data: bytes) -> tuple[np.ndarray, Ragged]:
-    """Read facets of one or more solids; a loop of four corners and more is a polygon."""
-    places, ends, last = array("d"), array("q", [0]), b""
-    for number, words in _rows_of(path, data):
-        last = words[0]
-        if last == b"vertex":
-            places.extend(_place(path, number, words))
-        elif last == b"endloop":
-            ends.append(len(places) // 3)
-    if last != b"endsolid" or ends[-1] != len(places) // 3:
-        raise InputError(
-            f"{path}: STL in text that ends by {last.decode('latin-1')[:20]!r}, not by 'endsolid'; "
-            "it is truncated. Export it again."
-        )
-    return np.array(places).reshape(-1, 3), Ragged(np.diff(ends), np.arange(ends[-1]))
 
 
 def _read_obj(path: AnyPath) -> tuple[np.ndarray, Ragged]:
@@ -389,8 +378,14 @@ def _clip_ears(points: np.ndarray) -> list[tuple[int, int, int]]:
         at %= len(left)
         a, b, c = left[at - 1], left[at], left[(at + 1) % len(left)]
         turn = _turn(places, a, b, c)
-        ear = [places[a], places[b], places[c]]
-        is_ear = abs(turn) <= least or (turn > 0 and not _holds(points, is_back, ear))
+        is_ear = abs(turn) <= least
+        if not is_ear and turn > 0:  # and no corner that turns back lies in it or on its sides
+            x, y = points[is_back].T
+            is_inside = np.ones(len(x), bool)
+            for (ax, ay), (bx, by) in pairwise([places[k] for k in (a, b, c, a)]):
+                is_inside &= (bx - ax) * (y - ay) >= (by - ay) * (x - ax)
+                is_inside &= (x != ax) | (y != ay)
+            is_ear = not is_inside.any()
         if not is_ear and tried < len(left):
             at, tried = at + 1, tried + 1
             continue
@@ -410,13 +405,3 @@ def _turn(places: list[list[float]], a: int, b: int, c: int) -> float:
     """Twice the area of a triangle, positive where it turns left."""
     (ax, ay), (bx, by), (cx, cy) = places[a], places[b], places[c]
     return (bx - ax) * (cy - by) - (by - ay) * (cx - bx)
-
-
-def _holds(points: np.ndarray, is_back: np.ndarray, ear: list[list[float]]) -> bool:
-    """Whether a corner that turns back lies in or on a triangle, and not at one of its own."""
-    x, y = points[is_back].T
-    is_inside = np.ones(len(x), bool)
-    for (ax, ay), (bx, by) in zip(ear, [*ear[1:], ear[0]], strict=True):
-        is_inside &= (bx - ax) * (y - ay) >= (by - ay) * (x - ax)
-        is_inside &= (x != ax) | (y != ay)
-    return bool(is_inside.any())

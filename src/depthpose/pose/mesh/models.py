@@ -80,14 +80,44 @@ def symmetries_from_bop(info: Mapping[str, Any], *, source: str) -> Symmetries:
     turns, lines = (info.get(f"symmetries_{kind}", []) for kind in ("discrete", "continuous"))
     if not isinstance(turns, list) or not isinstance(lines, list):
         raise InputError(f"{source}: its symmetries are no lists; write [...] of them")
-    matrices = [_rigid_from_bop(row, source) for row in turns]
-    axes = tuple(_axis_from_bop(entry, source) for entry in lines)
-    is_found = info.get("symmetries_found", False) is True
-    discrete = None
-    if matrices:
-        stacked = torch.stack(matrices)
-        discrete = Rigid(stacked[:, :3, :3], stacked[:, :3, 3])
-    return Symmetries(discrete=discrete, continuous=axes, is_found=is_found)
+    motions: list[Rigid] = []
+    for row in turns:
+        try:
+            matrix = torch.tensor(row, dtype=torch.float64).reshape(4, 4)
+        except (TypeError, ValueError, RuntimeError, OverflowError) as error:
+            raise InputError(
+                f"{source}: the symmetry {repr(row)[:80]} is not 16 numbers; write a 4x4 matrix "
+                "row by row"
+            ) from error
+        R = matrix[:3, :3]
+        is_rigid = torch.allclose(R @ R.T, torch.eye(3).double(), atol=1e-3) and torch.det(R) > 0
+        if not is_rigid or matrix[3].tolist() != [0, 0, 0, 1]:
+            raise InputError(
+                f"{source}: the symmetry {repr(row)[:200]} is no rigid motion; its upper left 3x3 "
+                "is a rotation, its last row 0 0 0 1"
+            )
+        motions.append(Rigid(R, 0.001 * matrix[:3, 3]))
+    axes: list[Axis] = []
+    for entry in lines:
+        try:
+            assert isinstance(entry, Mapping)
+            direction = torch.tensor(entry["axis"], dtype=torch.float64).reshape(3)
+            offset_mm = torch.tensor(entry.get("offset", [0, 0, 0]), dtype=torch.float64).reshape(3)
+            length = float(direction.norm())
+            assert 0 < length < math.inf
+        except (
+            AssertionError, KeyError, TypeError, ValueError, RuntimeError, OverflowError
+        ) as error:  # fmt: skip
+            raise InputError(
+                f'{source}: the continuous symmetry {repr(entry)[:80]} is not {{"axis": [x, y, z], '
+                '"offset": [x, y, z]} with an axis of some length'
+            ) from error
+        axes.append(Axis(direction=direction / length, point_m=0.001 * offset_mm))
+    return Symmetries(
+        discrete=Rigid.stack(motions) if motions else None,
+        continuous=tuple(axes),
+        is_found=info.get("symmetries_found", False) is True,
+    )
 
 
 def symmetries_to_bop(symmetries: Symmetries) -> dict[str, Any]:
@@ -105,40 +135,6 @@ def symmetries_to_bop(symmetries: Symmetries) -> dict[str, Any]:
     if symmetries.is_found and info:
         info["symmetries_found"] = True
     return info
-
-
-def _rigid_from_bop(row: object, source: str) -> Float[Tensor, "4 4"]:
-    try:
-        matrix = torch.tensor(row, dtype=torch.float64).reshape(4, 4)
-    except (TypeError, ValueError, RuntimeError, OverflowError) as error:
-        raise InputError(
-            f"{source}: the symmetry {repr(row)[:80]} is not 16 numbers; write a 4x4 matrix row by "
-            "row"
-        ) from error
-    R = matrix[:3, :3]
-    is_rigid = torch.allclose(R @ R.T, torch.eye(3).double(), atol=1e-3) and torch.det(R) > 0
-    if not is_rigid or matrix[3].tolist() != [0, 0, 0, 1]:
-        raise InputError(
-            f"{source}: the symmetry {repr(row)[:200]} is no rigid motion; its upper left 3x3 is a "
-            "rotation, its last row 0 0 0 1"
-        )
-    matrix[:3, 3] *= 0.001
-    return matrix
-
-
-def _axis_from_bop(entry: object, source: str) -> Axis:
-    try:
-        assert isinstance(entry, Mapping)
-        direction = torch.tensor(entry["axis"], dtype=torch.float64).reshape(3)
-        offset_mm = torch.tensor(entry.get("offset", [0, 0, 0]), dtype=torch.float64).reshape(3)
-        length = float(direction.norm())
-        assert 0 < length < math.inf
-    except (AssertionError, KeyError, TypeError, ValueError, RuntimeError, OverflowError) as error:
-        raise InputError(
-            f'{source}: the continuous symmetry {repr(entry)[:80]} is not {{"axis": [x, y, z], '
-            '"offset": [x, y, z]} with an axis of some length'
-        ) from error
-    return Axis(direction=direction / length, point_m=0.001 * offset_mm)
 
 
 _NORMAL_NEIGHBOURS = 16
@@ -241,7 +237,7 @@ def fibonacci_directions(count: int) -> Float[Tensor, "count 3"]:
 
 
 _SIDE_DIRECTIONS = 32
-_CELL = 2.0
+CELL = 2.0
 """Side of a ray's cell in mean distances of samples: four samples in each on average."""
 _SAME = 0.5
 """Up to so many mean distances from another's plane a sample is of the same sheet."""
@@ -251,12 +247,6 @@ _SEEN = 0.1
 """Least share of directions from which an outer side is seen."""
 _CLEARER = 0.4
 """The inner side is seen in at most so many times the directions of the outer."""
-
-
-def cell_of(points: np.ndarray, tree: KDTree) -> float:
-    """Give the side of a cell in which a ray finds about four samples of a surface."""
-    near = tree.query(points[:: max(1, len(points) // 500)], k=min(5, len(points)))[0][:, -1]
-    return _CELL * float(np.median(near)) * np.sqrt(np.pi) / 2
 
 
 def outward_normals(points: np.ndarray, normals: np.ndarray, cell: float) -> np.ndarray:
@@ -278,7 +268,7 @@ def outward_normals(points: np.ndarray, normals: np.ndarray, cell: float) -> np.
             first[place[order[::way]]] = order[::way]
             front = first[place]
             off = ((points - points[front]) * normals[front]).sum(1)
-            is_seen = np.abs(off) < _SAME / _CELL * cell
+            is_seen = np.abs(off) < _SAME / CELL * cell
             for side in (0, 1):
                 facing = way * (1 - 2 * side) * slant > _SLANT
                 seen[side] += facing & is_seen

@@ -213,9 +213,16 @@ def symmetries_from_proposals(proposals: list[SymmetryProposal]) -> Symmetries:
             kept.append(turn)
     if not kept:
         return Symmetries(continuous=axes)
-    kept = kept if axes else _completed(kept)
-    discrete = Rigid.stack(kept)
-    return Symmetries(discrete=discrete, continuous=axes)
+    every = list(kept)
+    for first in every if not axes else ():  # grows under way: products until there is no new one
+        for second in kept:
+            product = first @ second
+            if _is_apart(product.R, [_EYE, *(turn.R for turn in every)], _SAME_RAD):
+                every.append(product)
+        if len(every) > 60:  # what passes 60 was no group (an icosahedron's)
+            every = kept
+            break
+    return Symmetries(discrete=Rigid.stack(every), continuous=axes)
 
 
 def with_found_symmetries(
@@ -253,19 +260,6 @@ def with_found_symmetries(
             )
         )
     return replace(model, symmetries=found) if is_taken else model
-
-
-def _completed(turns: list[Rigid]) -> list[Rigid]:
-    """Add products until there is no new one; what passes 60 was no group (an icosahedron's)."""
-    every = list(turns)
-    for first in every:  # grows under way
-        for second in turns:
-            product = first @ second
-            if _is_apart(product.R, [_EYE, *(turn.R for turn in every)], _SAME_RAD):
-                every.append(product)
-        if len(every) > 60:
-            return turns
-    return every
 
 
 def _is_apart(R: Tensor, others: Iterable[Tensor], limit_rad: float) -> bool:
@@ -378,7 +372,18 @@ def mirror_deviation(model: ObjectModel) -> float:
 
     def compute(model: ObjectModel) -> float:
         surface = SurfaceDeviation(model)
-        turns = [refine_turn(surface, R @ _FLIP, _FLIP) for R in _mirror_starts(surface)]
+        # Reflections, or reflections with a quarter turn or a half, that fit roughly: by 0, 90, 180
+        # and 270 degrees about the normal n: cos (1 - nn') + sin [n] - nn'.
+        normals = torch.cat([surface.axes, fibonacci_directions(_MIRROR_PLANES)])
+        along = normals[:, :, None] * normals[:, None]
+        across, crossed = _EYE - along, torch.linalg.cross(normals[:, None], _EYE[None])
+        ways = ((1, 0), (0, 1), (-1, 0), (0, -1))
+        every = torch.cat([c * across + s * crossed - along for c, s in ways])
+        starts: list[Float64[Tensor, "3 3"]] = []
+        for k in surface.rough_distance(every).argsort().tolist():
+            if len(starts) < _MIRROR_STARTS and _is_apart(every[k], starts, _APART_RAD):
+                starts.append(every[k])
+        turns = [refine_turn(surface, R @ _FLIP, _FLIP) for R in starts]
         R, shift = torch.stack([t.R for t in turns]) @ _FLIP, torch.stack([t.t_m for t in turns])
         return float(surface.deviation(R, shift).min())
 
@@ -403,24 +408,6 @@ def refine_turn(
         near = torch.from_numpy(distance <= np.quantile(distance, _NEAREST)).double()
         turn = fit_rigid(points, surface.points[torch.from_numpy(index)], near)
     return turn
-
-
-def _mirror_starts(surface: SurfaceDeviation) -> list[Float64[Tensor, "3 3"]]:
-    """Choose reflections, or reflections with a quarter turn or a half, that fit roughly."""
-    normals = torch.cat([surface.axes, fibonacci_directions(_MIRROR_PLANES)])
-    along = normals[:, :, None] * normals[:, None]
-    across = _EYE - along
-    crossed = torch.linalg.cross(normals[:, None], _EYE[None])
-    # By 0, 90, 180 and 270 degrees about the normal: cos (1 - nn') + sin [n] - nn'.
-    turns = [c * across + s * crossed - along for c, s in ((1, 0), (0, 1), (-1, 0), (0, -1))]
-    every = torch.cat(turns)
-    chosen: list[Float64[Tensor, "3 3"]] = []
-    for k in surface.rough_distance(every).argsort().tolist():
-        if len(chosen) == _MIRROR_STARTS:
-            break
-        if _is_apart(every[k], chosen, _APART_RAD):
-            chosen.append(every[k])
-    return chosen
 
 
 ALIKE = 0.01
@@ -474,7 +461,7 @@ def true_symmetries(model: ObjectModel) -> Symmetries:
     """
     if not model.symmetries.is_found:
         return model.symmetries
-    return _true(model.symmetries, kept(model, "near_symmetries", _search, _decoded)[1])
+    return _marked(model.symmetries, kept(model, "near_symmetries", _search, _decoded)[1])
 
 
 def _decoded(
@@ -499,46 +486,33 @@ def _search(model: ObjectModel) -> dict[str, Any]:
     if given.discrete is not None:
         discrete = (surface.deviation(given.discrete.R.double()) <= ALIKE).tolist()
     alike = (discrete, axes)
-    same = symmetry_transforms(_true(model.symmetries, alike), _FINE_STEP).R.double()
-    near: list[tuple[Rigid, float]] = []
-    for off, turn in sorted(_measured(model, surface), key=lambda pair: pair[0]):
-        if len(near) == _MOST_NEAR or off > 2 * _TOLERANCE:
-            break
-        # New is what is far from the others and from all copies of them that look alike.
-        others = torch.cat([R @ same for R in (_EYE, *(one.R for one, _ in near))])
-        apart_rad = float(geodesic_rad(turn.R.expand_as(others), others).min())
-        if apart_rad > _NEAR_SUPPRESSION_RAD:
-            near.append((turn, off))
-    return {"near": [(turn.matrix().tolist(), off) for turn, off in near], "alike": alike}
-
-
-def _measured(model: ObjectModel, surface: SurfaceDeviation) -> list[tuple[float, Rigid]]:
-    """Measure symmetries that were found, and turns refined to where they fit best.
-
-    A scan whose points lie denser on one side has its centre where no symmetry has it.
-    """
-    found = symmetry_transforms(model.symmetries, _STEP).R.double()[1:]
-    exact = found if model.symmetries.is_found else found[:0]
-    tried = [Rigid(R, torch.zeros(3).double()) for R in exact]
+    same = symmetry_transforms(_marked(given, alike) if given.is_found else given, _FINE_STEP).R
+    # Symmetries that were found, and turns refined to where they fit best: a scan whose points lie
+    # denser on one side has its centre where no symmetry has it.
+    copies = symmetry_transforms(given, _STEP).R.double()[1:]
+    tried = [Rigid(R, torch.zeros(3).double()) for R in (copies if given.is_found else copies[:0])]
     # From quarter turns about the principal axes, and the best of thousands of other turns.
     quarters = torch.arange(1, 4).double() * (math.pi / 2)
     starts = [R for axis in surface.axes for R in _turns(axis, quarters)]
     for R in promising_turns(surface):
-        if len(starts) == _NEAR_STARTS:
-            break
-        if _is_apart(R, [_EYE, *starts], _NEAR_SUPPRESSION_RAD):
+        if len(starts) < _NEAR_STARTS and _is_apart(R, [_EYE, *starts], _NEAR_SUPPRESSION_RAD):
             starts.append(R)
     tried += [refine_turn(surface, R) for R in starts]
     measured = _deviations(tried, surface)
     good = [turn for off, turn in sorted(measured, key=lambda pair: pair[0]) if off <= _TOLERANCE]
     # Two turns one after the other are one: of a can, upside down and then about its axis.
     measured += _deviations([a @ b for a in good[:_NEAR_STARTS] for b in good[:3]], surface)
-    # About the centre of the surface, in diameters, to the model's frame.
-    centre_m = surface.centre_m
-    return [
-        (off, Rigid(turn.R, centre_m - turn.R @ centre_m + turn.t_m * model.diameter_m))
-        for off, turn in measured
-    ]
+    near: list[tuple[Rigid, float]] = []
+    for off, turn in sorted(measured, key=lambda pair: pair[0]):
+        if len(near) == _MOST_NEAR or off > 2 * _TOLERANCE:
+            break
+        # New is what is far from the others and from all copies of them that look alike.
+        others = torch.cat([R @ same.double() for R in (_EYE, *(one.R for one, _ in near))])
+        apart_rad = float(geodesic_rad(turn.R.expand_as(others), others).min())
+        if apart_rad > _NEAR_SUPPRESSION_RAD:  # from the surface's centre and unit to the model's
+            shift_m = surface.centre_m - turn.R @ surface.centre_m + turn.t_m * model.diameter_m
+            near.append((Rigid(turn.R, shift_m), off))
+    return {"near": [(turn.matrix().tolist(), off) for turn, off in near], "alike": alike}
 
 
 def _deviations(turns: list[Rigid], surface: SurfaceDeviation) -> list[tuple[float, Rigid]]:
@@ -548,10 +522,8 @@ def _deviations(turns: list[Rigid], surface: SurfaceDeviation) -> list[tuple[flo
     return list(zip(surface.deviation(R, shift).tolist(), turns, strict=True))
 
 
-def _true(given: Symmetries, alike: tuple[list[bool], list[bool]]) -> Symmetries:
-    """Give the symmetries that were marked; declared ones are all true."""
-    if not given.is_found:
-        return given
+def _marked(given: Symmetries, alike: tuple[list[bool], list[bool]]) -> Symmetries:
+    """Give the symmetries whose copies lie on the surface."""
     discrete = given.discrete
     if discrete is not None:
         discrete = discrete[torch.tensor(alike[0])] if any(alike[0]) else None

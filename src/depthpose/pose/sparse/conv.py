@@ -81,7 +81,20 @@ class _Convolution(torch.autograd.Function):
         wants_x, wants_weight, _ = ctx.needs_input_grad
         # The first layer's input is no parameter's child: its gradient is seldom wanted.
         for_x = _convolve(gradient, weight.mT, m.transposed) if wants_x else None
-        return for_x, _weight_gradient(gradient, x, weight, m) if wants_weight else None, None
+        if not wants_weight:
+            return for_x, None, None
+        if _is_narrow(x, m):
+            return for_x, (_table(x, m) @ gradient).view(weight.shape), None
+        if _is_gridded(x, weight, m):
+            found = torch.bmm(_read(x, m).mT, _read(gradient, m.transposed))
+        else:
+            found = torch.zeros_like(weight)
+            for offset, read, write in m.by_offset():
+                pulls = gradient.index_select(0, write)
+                torch.mm(x.index_select(0, read).T, pulls, out=found[offset])
+        if m.centre is not None:
+            torch.mm(x.T, gradient, out=found[m.centre])
+        return for_x, found, None
 
 
 def _convolve(x: Tensor, weight: Tensor, m: KernelMap) -> Tensor:
@@ -94,21 +107,6 @@ def _convolve(x: Tensor, weight: Tensor, m: KernelMap) -> Tensor:
         for offset, read, write in m.by_offset():
             out.index_add_(0, write, x.index_select(0, read) @ kernels[offset])
     return out if m.centre is None else out.addmm_(x, weight[m.centre])
-
-
-def _weight_gradient(gradient: Tensor, x: Tensor, weight: Tensor, m: KernelMap) -> Tensor:
-    if _is_narrow(x, m):
-        return (_table(x, m) @ gradient).view(weight.shape)
-    if _is_gridded(x, weight, m):
-        found = torch.bmm(_read(x, m).mT, _read(gradient, m.transposed))
-    else:
-        found = torch.zeros_like(weight)
-        for offset, read, write in m.by_offset():
-            pulls = gradient.index_select(0, write)
-            torch.mm(x.index_select(0, read).T, pulls, out=found[offset])
-    if m.centre is not None:
-        torch.mm(x.T, gradient, out=found[m.centre])
-    return found
 
 
 def _read(x: Tensor, m: KernelMap) -> Tensor:
@@ -233,19 +231,11 @@ class SparseConv(nn.Module):
         self.kernel, self.stride = kernel, stride
         self.weight = nn.Parameter(torch.empty(kernel**3, inputs, outputs))
         self.bias = nn.Parameter(torch.zeros(outputs)) if has_bias else None
-        nn.init.normal_(self.weight, std=(2 / self.fan_in) ** 0.5)
-
-    @property
-    def fan_in(self) -> float:
-        """Numbers that one output is summed from, on a surface.
-
-        Voxels of a surface fill about 1.5 k^2 of a kernel's k^3 cells (counted: 13 to 14 of 27).
-        Where it is transposed, each coarse voxel feeds about 4 fine ones.
-        """
-        taps = 1.5 * self.kernel**2 if self.kernel > 1 else 1.0
-        if self.is_transposed:
-            taps = max(1.0, taps / self.stride**2)
-        return taps * self.weight.shape[1]
+        # Voxels of a surface fill about 1.5 k^2 of a kernel's k^3 cells (counted: 13 to 14 of 27).
+        # Where it is transposed, each coarse voxel feeds about 4 fine ones.
+        taps = 1.5 * kernel**2 if kernel > 1 else 1.0
+        taps = max(1.0, taps / stride**2) if self.is_transposed else taps
+        nn.init.normal_(self.weight, std=(2 / (taps * inputs)) ** 0.5)
 
     def forward(self, voxels: Voxels) -> Voxels:
         """Convolve."""

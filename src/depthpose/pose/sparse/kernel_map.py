@@ -13,6 +13,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
+import numpy as np
 import torch
 from jaxtyping import Int, Int32, Int64
 from torch import Tensor
@@ -66,16 +67,6 @@ def packed_move(x: int, y: int, z: int) -> int:
     return (x << 2 * FIELD_BITS) + (y << FIELD_BITS) + z
 
 
-def coarsen(keys: Keys, stride: int) -> Keys:
-    """Give the sorted keys of ``floor(c / stride) * stride``, each once; stride a power of two.
-
-    A field holds c + HALF, which is not negative: clearing its low bits is a floor division for
-    negative coordinates too.
-    """
-    field = packed_move(stride - 1, stride - 1, stride - 1)
-    return torch.unique(keys & ~field)
-
-
 def batch_coordinates(clouds: Sequence[Int[Tensor, "_ 3"]]) -> Int[Tensor, "n 4"]:
     """Put the voxel coordinates of several clouds under each other, each with its number."""
     if not clouds:
@@ -87,21 +78,12 @@ def batch_coordinates(clouds: Sequence[Int[Tensor, "_ 3"]]) -> Int[Tensor, "n 4"
 Moves = tuple[tuple[int, int, int], ...]
 
 MARGIN = 4
-"""Cells about the box: as far as a kernel may look beyond it (:func:`cells_beyond`). With fewer a
-look past one row's end would find the next row."""
+"""Cells about the box: as far as a kernel may look beyond it. With fewer a look past one row's end
+would find the next row."""
 
 MAX_CELLS = 1 << 24
 CELLS_PER_VOXEL = 512
 """A box with more cells than these is mostly air: binary search is then the cheaper."""
-
-
-def cells_beyond(kernel: int, stride: int) -> int:
-    """Cells that a kernel looks beyond the box of the finer level's voxels.
-
-    A coarser voxel lies up to ``stride - 1`` cells below the lowest finer one in it. An odd kernel
-    looks both ways from it, an even one forward alone.
-    """
-    return kernel // 2 + stride - 1 if kernel % 2 else max(kernel, stride) - 1
 
 
 class VoxelIndex:
@@ -131,7 +113,8 @@ class VoxelIndex:
         if self._is_compiled:
             from depthpose.pose.compiled.convolve import rows_of
 
-            return torch.from_numpy(rows_of(self._keys.numpy(), standing.numpy(), packed))
+            moved = np.array(packed, np.int64)
+            return torch.from_numpy(rows_of(self._keys.numpy(), standing.numpy(), moved))
         if self._table is None:
             wanted = standing + torch.tensor(packed, device=standing.device)[:, None]
             rows = torch.searchsorted(self._keys, wanted).clamp_(max=len(self._keys) - 1)
@@ -336,7 +319,10 @@ class CoordinateCache:
     def keys(self, level: int) -> Keys:
         """Give the sorted keys of a level."""
         if level not in self._keys:
-            self._keys[level] = coarsen(self.keys(level - 1), 2**level)
+            # A field holds c + HALF, which is not negative: clearing its low bits is a floor
+            # division for negative coordinates too.
+            low_bits = packed_move(2**level - 1, 2**level - 1, 2**level - 1)
+            self._keys[level] = torch.unique(self.keys(level - 1) & ~low_bits)
         return self._keys[level]
 
     def coordinates(self, level: int) -> Tensor:
@@ -356,7 +342,9 @@ class CoordinateCache:
         """
         assert stride & (stride - 1) == 0, f"stride must be a power of two, got {stride}"
         assert kernel % 2 or stride > 1, "an even kernel has no centre: it needs a stride"
-        beyond = cells_beyond(kernel, stride)
+        # A coarser voxel lies up to stride - 1 cells below the lowest finer one; an odd kernel
+        # looks both ways from it, an even one forward alone.
+        beyond = kernel // 2 + stride - 1 if kernel % 2 else max(kernel, stride) - 1
         assert beyond <= MARGIN, f"kernel {kernel} with stride {stride} looks {beyond} cells beyond"
         levels = stride.bit_length() - 1
         fine = level - levels if is_transposed else level

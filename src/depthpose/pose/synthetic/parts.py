@@ -11,7 +11,6 @@ import numpy as np
 import torch
 
 from depthpose.core.errors import InputError, nearest_name
-from depthpose.core.rigid import Rigid
 from depthpose.core.units import metres_of
 from depthpose.pose.config import MeshConfig
 from depthpose.pose.mesh import make_model, turn_about
@@ -34,12 +33,19 @@ def make_part(name: str, number: int = 0, config: MeshConfig | None = None) -> O
     if name not in PARTS:
         raise InputError(f"no part is called {name!r}; {nearest_name(name, PARTS)}")
     vertices, faces = PARTS[name]()
+    up, origin = torch.tensor([0.0, 0.0, 1.0]).double(), torch.zeros(3).double()
+    symmetries = Symmetries()
+    if name == "flange":
+        angle = torch.arange(1, _TEETH).double() * (2 * math.pi / _TEETH)
+        symmetries = Symmetries(discrete=turn_about(up, origin, angle))
+    elif name == "spool":
+        symmetries = Symmetries(continuous=(Axis(direction=up, point_m=origin),))
     return make_model(
         torch.from_numpy(vertices) * metres_of("mm"),
         torch.from_numpy(faces),
         name=name,
         number=number,
-        symmetries=_symmetries(name),
+        symmetries=symmetries,
         config=config,
     )
 
@@ -104,17 +110,6 @@ PARTS: dict[str, Callable[[], Mesh]] = {
     "spool": _spool,
 }
 """Parts by name."""
-
-
-def _symmetries(name: str) -> Symmetries:
-    up, origin = torch.tensor([0.0, 0.0, 1.0]).double(), torch.zeros(3).double()
-    if name == "flange":
-        angle = torch.arange(1, _TEETH).double() * (2 * math.pi / _TEETH)
-        turns = turn_about(up, origin, angle)
-        return Symmetries(discrete=Rigid(turns.R, turns.t_m))
-    if name == "spool":
-        return Symmetries(continuous=(Axis(direction=up, point_m=origin),))
-    return Symmetries()
 
 
 def _circle(radius: float) -> np.ndarray:

@@ -172,27 +172,22 @@ def turn_view(
     (a, b, c), (d, e, f), (g, h, i) = (view.K @ ray_from_pixel).tolist()
     u, v = torch.arange(width)[None], torch.arange(height)[:, None]
     w = g * u + h * v + i
-    inverse_m = _interpolated(1 / view.depth_m, (a * u + b * v + c) / w, (d * u + e * v + f) / w)
-    return CleanView(depth_m=1 / (inverse_m * w), K=moved, camera_from_model=pose)
-
-
-def _interpolated(
-    values: Float[Tensor, "h w"], u: Float[Tensor, "h2 w2"], v: Float[Tensor, "h2 w2"]
-) -> Float[Tensor, "h2 w2"]:
-    """Look up between pixels; at edges and beside the object the nearest pixel; NaN outside."""
-    height, width = values.shape
-    left, top = u.floor().clamp_(0, width - 2), v.floor().clamp_(0, height - 2)
+    u, v, values = (a * u + b * v + c) / w, (d * u + e * v + f) / w, 1 / view.depth_m
+    # Between pixels; at edges and beside the object the nearest pixel; NaN outside.
+    rows, columns = values.shape
+    left, top = u.floor().clamp_(0, columns - 2), v.floor().clamp_(0, rows - 2)
     x, y = u - left, v - top
-    index, flat = (top * width + left).long(), values.reshape(-1)
-    a, b, c, d = (flat[index + beyond] for beyond in (0, 1, width, width + 1))
-    smooth = torch.lerp(torch.lerp(a, b, x), torch.lerp(c, d, x), y)
-    nearest = torch.where(y < 0.5, torch.where(x < 0.5, a, b), torch.where(x < 0.5, c, d))
+    index, flat = (top * columns + left).long(), values.reshape(-1)
+    nw, ne, sw, se = (flat[index + beyond] for beyond in (0, 1, columns, columns + 1))
+    smooth = torch.lerp(torch.lerp(nw, ne, x), torch.lerp(sw, se, x), y)
+    nearest = torch.where(y < 0.5, torch.where(x < 0.5, nw, ne), torch.where(x < 0.5, sw, se))
     # A comparison with NaN is false: where a corner sees nothing, the nearest decides.
-    highest = torch.maximum(torch.maximum(a, b), torch.maximum(c, d))
-    lowest = torch.minimum(torch.minimum(a, b), torch.minimum(c, d))
+    highest = torch.maximum(torch.maximum(nw, ne), torch.maximum(sw, se))
+    lowest = torch.minimum(torch.minimum(nw, ne), torch.minimum(sw, se))
     found = torch.where(highest - lowest < _JUMP * smooth, smooth, nearest)
     is_inside = (x - 0.5).abs().maximum((y - 0.5).abs()) <= 1
-    return torch.where(is_inside, found, torch.nan)
+    inverse_m = torch.where(is_inside, found, torch.nan)
+    return CleanView(depth_m=1 / (inverse_m * w), K=moved, camera_from_model=pose)
 
 
 _BANK_SEED = 0x0B7EC7
@@ -281,11 +276,21 @@ class Objects:
         """Make the window of depth and the mask that a sample is lifted from."""
         number = index % len(self.models)
         generator = sample_generator(index, self.config.seed)
-        clean = self._clean_view(number, generator)
+        shape, views = self._shape(number), self.config.views
+        if views is None:  # drawn anew
+            R, distance_m, K = self._pose(generator)
+            turn = self._gaze(number, distance_m, K, generator)
+            clean = draw_view(shape, pose_of_middle(shape, turn @ R, turn[:, 2] * distance_m), K)
+        else:  # the camera of a stored view is turned
+            stored = self._stored((number, whole(generator, views)))
+            K = self.intrinsics(float(stored.K[0, 0]) / self.config.focal_px[0])
+            turn = self._gaze(number, stored.distance_m, K, generator)
+            depth_m = stored.depth_m.float() + stored.distance_m
+            clean = turn_view(replace(stored, depth_m=depth_m, distance_m=0.0), turn, shape, K)
         silhouette = clean.depth_m.isfinite()
         depth_m, visible = clean.depth_m, silhouette
         if self.config.with_background:
-            depth_m = self._before_background(clean, self._shape(number), generator)
+            depth_m = self._before_background(clean, shape, generator)
         if uniform(generator, 0.0, 1.0) < self.config.occluded_share:
             share = uniform(generator, *self.config.occlusion)
             depth_m, visible = occlude(depth_m, silhouette, share, generator)
@@ -312,20 +317,6 @@ class Objects:
             visible_fraction=int(visible.sum()) / max(int(silhouette.sum()), 1),
         )
         return ViewSample(input=view, truth=truth)
-
-    def _clean_view(self, number: int, generator: torch.Generator) -> CleanView:
-        """Draw the object anew, or turn the camera of a stored view."""
-        shape, views = self._shape(number), self.config.views
-        if views is None:
-            R, distance_m, K = self._pose(generator)
-            turn = self._gaze(number, distance_m, K, generator)
-            middle = turn[:, 2] * distance_m
-            return draw_view(shape, pose_of_middle(shape, turn @ R, middle), K)
-        stored = self._stored((number, whole(generator, views)))
-        K = self.intrinsics(float(stored.K[0, 0]) / self.config.focal_px[0])
-        turn = self._gaze(number, stored.distance_m, K, generator)
-        depth_m = stored.depth_m.float() + stored.distance_m
-        return turn_view(replace(stored, depth_m=depth_m, distance_m=0.0), turn, shape, K)
 
     def _stored(self, key: tuple[int, int]) -> CleanView:
         """Give a view by the number of its object and its own, drawn when it is first needed."""

@@ -90,7 +90,19 @@ class CloudBatch(NamedTuple):
 
 
 class TrainingViews:
-    """What is learnt from by sample index: synthetic views, real frames, or both."""
+    """What is learnt from by sample index: synthetic views, real frames, or both.
+
+    Args:
+        models: the objects; class k is ``models[k]``.
+        synthetic: how synthetic views look.
+        frames: real frames, and their share.
+        cloud: points and voxels.
+        seed: of the order of frames and of the choice of points.
+        first_alone: so many synthetic views at the start show the first object.
+
+    Raises:
+        InputError: frames of other objects.
+    """
 
     def __init__(
         self,
@@ -99,8 +111,10 @@ class TrainingViews:
         frames: FramesConfig | None,
         cloud: CloudConfig,
         seed: int,
+        first_alone: int = 0,
     ) -> None:
         self.models, self.cloud, self.seed = models, cloud, seed
+        self._first_alone = first_alone
         self.synthetic = Objects(models, synthetic, cloud)
         self._class_of = {model.name: k for k, model in enumerate(models)}
         self._frames, self._real = frames, None
@@ -131,31 +145,7 @@ class TrainingViews:
 
 
 class TrainingClouds(TrainingViews):
-    """A cloud by sample index, synthetic or of a frame.
-
-    Args:
-        models: the objects; class k is ``models[k]``.
-        synthetic: how synthetic views look.
-        frames: real frames, and their share.
-        cloud: points and voxels.
-        seed: of the order of frames and of the choice of points.
-        first_alone: so many synthetic views at the start show the first object.
-
-    Raises:
-        InputError: frames of other objects.
-    """
-
-    def __init__(
-        self,
-        models: Sequence[ObjectModel],
-        synthetic: ObjectsConfig,
-        frames: FramesConfig | None,
-        cloud: CloudConfig,
-        seed: int,
-        first_alone: int = 0,
-    ) -> None:
-        super().__init__(models, synthetic, frames, cloud, seed)
-        self._first_alone = first_alone
+    """A cloud by sample index, synthetic or of a frame."""
 
     def __getitem__(self, index: int) -> Cloud:
         """Make the sample of an index; one with too few points is replaced by another.
@@ -166,7 +156,16 @@ class TrainingClouds(TrainingViews):
         generator = sample_generator(index, self.seed)
         for attempt in range(TRIES):
             # Far beyond any training, and the same object.
-            sample = self._sample(index + attempt * len(self.models) * 2**32, generator)
+            place = index + attempt * len(self.models) * 2**32
+            # Sample i shows object i modulo their number.
+            place *= len(self.models) if place < self._first_alone else 1
+            frame = self._place(place, generator)
+            if self._real is None or self._frames is None or frame is None:
+                sample = self.synthetic.sample(place)
+            else:
+                sample = self._real[frame]
+                angle_rad = 2 * math.pi * float(torch.rand((), generator=generator))
+                sample = _rolled(sample, angle_rad) if self._frames.with_roll else sample
             if refusal_of(sample.input.points_m, self.cloud) is None:
                 number = self._class_of[sample.input.object]
                 return voxelised_cloud(sample, number, self.cloud, generator)
@@ -191,26 +190,18 @@ class TrainingClouds(TrainingViews):
             t_m=torch.stack([c.t_m for c in clouds]),
         )
 
-    def _sample(self, index: int, generator: torch.Generator) -> CloudSample:
-        # Sample i shows object i modulo their number.
-        index = index * len(self.models) if index < self._first_alone else index
-        place = self._place(index, generator)
-        if self._real is None or self._frames is None or place is None:
-            return self.synthetic.sample(index)
-        sample = self._real[place]
-        angle_rad = 2 * math.pi * float(torch.rand((), generator=generator))
-        if not self._frames.with_roll:
-            return sample
-        # The camera is turned about its optical axis: cloud and pose turn with it.
-        cosine, sine = math.cos(angle_rad), math.sin(angle_rad)
-        turn = torch.tensor([[cosine, -sine, 0.0], [sine, cosine, 0.0], [0.0, 0.0, 1.0]])
-        pose = sample.truth.camera_from_model
-        turned = Rigid(turn @ pose.R.float(), turn @ pose.t_m.float())
-        points_m = sample.input.points_m.float() @ turn.mT
-        return CloudSample(
-            input=dataclasses.replace(sample.input, points_m=points_m),
-            truth=dataclasses.replace(sample.truth, camera_from_model=turned),
-        )
+
+def _rolled(sample: CloudSample, angle_rad: float) -> CloudSample:
+    """Turn the camera about its optical axis: cloud and pose turn with it."""
+    cosine, sine = math.cos(angle_rad), math.sin(angle_rad)
+    turn = torch.tensor([[cosine, -sine, 0.0], [sine, cosine, 0.0], [0.0, 0.0, 1.0]])
+    pose = sample.truth.camera_from_model
+    turned = Rigid(turn @ pose.R.float(), turn @ pose.t_m.float())
+    points_m = sample.input.points_m.float() @ turn.mT
+    return CloudSample(
+        input=dataclasses.replace(sample.input, points_m=points_m),
+        truth=dataclasses.replace(sample.truth, camera_from_model=turned),
+    )
 
 
 def voxelised_cloud(
@@ -326,7 +317,18 @@ class HeldOut:
         if self.config.with_ransac:
             methods["ransac"] = vote_ransac
         errors: dict[str, list[float]] = {method: [] for method in methods}
-        clouds = self._of(occlusion)
+        if occlusion not in self._clouds:
+            own = self._clouds[occlusion] = []
+            objects = held_out_objects(
+                self.models, self._synthetic, self._cloud, self.config, occlusion
+            )
+            for index in range(len(objects)):
+                sample = objects[index]
+                if refusal_of(sample.input.points_m, self._cloud) is None:
+                    generator = sample_generator(index, HELD_OUT_SEED)
+                    number = index % len(self.models)
+                    own.append(voxelised_cloud(sample, number, self._cloud, generator))
+        clouds = self._clouds[occlusion]
         device = next(network.parameters()).device
         for start in range(0, len(clouds), _TOGETHER):
             part = clouds[start : start + _TOGETHER]
@@ -343,20 +345,6 @@ class HeldOut:
                     errors[method].append(_share(fit.camera_from_model, truth, model, surface_m))
         missing = [math.inf] * (self.config.number * len(self.models) - len(clouds))
         return {method: torch.tensor(some + missing) for method, some in errors.items()}
-
-    def _of(self, occlusion: float) -> list[Cloud]:
-        if occlusion not in self._clouds:
-            own = self._clouds[occlusion] = []
-            objects = held_out_objects(
-                self.models, self._synthetic, self._cloud, self.config, occlusion
-            )
-            for index in range(len(objects)):
-                sample = objects[index]
-                if refusal_of(sample.input.points_m, self._cloud) is None:
-                    generator = sample_generator(index, HELD_OUT_SEED)
-                    number = index % len(self.models)
-                    own.append(voxelised_cloud(sample, number, self._cloud, generator))
-        return self._clouds[occlusion]
 
 
 def held_out_numbers(

@@ -40,7 +40,7 @@ class ModelsConfig:
     objects: tuple[int, ...] = ()
     """Numbers of the data set's objects; none: all."""
 
-    mesh: MeshConfig = field(default_factory=MeshConfig)
+    mesh: MeshConfig = MeshConfig()
     """Keypoints of each."""
 
     with_found_symmetries: bool = False
@@ -105,22 +105,22 @@ class HeldOutConfig:
 class ViewsTraining:
     """What the trainings on views of known objects have in common."""
 
-    models: ModelsConfig = field(default_factory=ModelsConfig)
+    models: ModelsConfig = ModelsConfig()
     """What is learnt."""
 
-    objects: ObjectsConfig = field(default_factory=ObjectsConfig)
+    objects: ObjectsConfig = ObjectsConfig()
     """Synthetic views to learn from."""
 
     frames: FramesConfig | None = None
     """Real frames to learn from, beside them."""
 
-    cloud: CloudConfig = field(default_factory=CloudConfig)
+    cloud: CloudConfig = CloudConfig()
     """How a view is lifted to a cloud."""
 
     start: str | None = None
     """Weights to begin with; of directions, those of other objects give all but the last layer."""
 
-    held_out: HeldOutConfig = field(default_factory=HeldOutConfig)
+    held_out: HeldOutConfig = HeldOutConfig()
     """Views of the validation."""
 
     with_half: bool = False
@@ -138,30 +138,22 @@ class PoseTraining(ViewsTraining):
     """Synthetic views at the start that all show the first object. Several objects together take
     long to get beyond votes for the middle of the cloud; one alone does not, the others follow."""
 
-    cloud: CloudConfig = field(
-        default_factory=lambda: CloudConfig(max_points=1000, with_shape=True)
-    )
+    cloud: CloudConfig = CloudConfig(max_points=1000, with_shape=True)
     """Voxel size, points of a cloud, and what the network gets of each voxel."""
 
-    network: ResUNetConfig = field(
-        default_factory=lambda: ResUNetConfig(
-            first_kernel=5, encoder=(16, 32, 64, 128), decoder=(32, 32, 32, 64)
-        )
+    network: ResUNetConfig = ResUNetConfig(
+        first_kernel=5, encoder=(16, 32, 64, 128), decoder=(32, 32, 32, 64)
     )
     """The network; its classes and keypoints follow from the models."""
 
     loss: str = "mse"
     """Of the directions: mse, cosine, l1, or another of ``pose.losses.POINT_LOSSES``."""
 
-    adam: AdamConfig = field(
-        default_factory=lambda: AdamConfig(learning_rate=3e-3, schedule="cosine", warmup_steps=50)
-    )
+    adam: AdamConfig = AdamConfig(learning_rate=3e-3, schedule="cosine", warmup_steps=50)
     """The optimiser."""
 
-    loop: LoopConfig = field(
-        default_factory=lambda: LoopConfig(
-            steps=10000, batch_size=8, clip_norm=1.0, ema_decay=0.999, save_every_steps=500
-        )
+    loop: LoopConfig = LoopConfig(
+        steps=10000, batch_size=8, clip_norm=1.0, ema_decay=0.999, save_every_steps=500
     )
     """How long."""
 
@@ -201,21 +193,17 @@ class PointNetTraining(PoseTraining):
 class DepthImageTraining(ViewsTraining):
     """A network learns to regress the pose from the masked depth image."""
 
-    network: DepthImageConfig = field(default_factory=DepthImageConfig)
+    network: DepthImageConfig = DepthImageConfig()
     """The network; its classes follow from the models."""
 
     surface_points: int = 500
     """Points of the model whose distances are the loss."""
 
-    adam: AdamConfig = field(
-        default_factory=lambda: AdamConfig(learning_rate=1e-3, schedule="cosine", warmup_steps=50)
-    )
+    adam: AdamConfig = AdamConfig(learning_rate=1e-3, schedule="cosine", warmup_steps=50)
     """The optimiser."""
 
-    loop: LoopConfig = field(
-        default_factory=lambda: LoopConfig(
-            steps=10000, batch_size=16, clip_norm=1.0, ema_decay=0.999, save_every_steps=500
-        )
+    loop: LoopConfig = LoopConfig(
+        steps=10000, batch_size=16, clip_norm=1.0, ema_decay=0.999, save_every_steps=500
     )
     """How long."""
 
@@ -275,34 +263,28 @@ class ImageAugmentConfig:
 class SegmentationTraining:
     """FCN learns the masks of known objects."""
 
-    images: ImagesConfig = field(default_factory=ImagesConfig)
+    images: ImagesConfig = ImagesConfig()
     """What is learnt from; pixels that no mask covers are background."""
 
     held_out: ImagesConfig | None = None
     """Images of the validation."""
 
-    network: SegmentationConfig = field(default_factory=SegmentationConfig)
+    network: SegmentationConfig = SegmentationConfig()
     """The network."""
 
     start: str | None = None
     """An encoder to begin with, as ``weights import resnet18`` leaves it; None: random numbers."""
 
-    augment: ImageAugmentConfig = field(default_factory=ImageAugmentConfig)
+    augment: ImageAugmentConfig = ImageAugmentConfig()
     """Random changes."""
 
     object_weight: float = 3.0
     """A pixel of an object counts so many times a pixel of the background."""
 
-    adam: AdamConfig = field(
-        default_factory=lambda: AdamConfig(learning_rate=1e-3, schedule="cosine", warmup_steps=20)
-    )
+    adam: AdamConfig = AdamConfig(learning_rate=1e-3, schedule="cosine", warmup_steps=20)
     """The optimiser."""
 
-    loop: LoopConfig = field(
-        default_factory=lambda: LoopConfig(
-            steps=2000, batch_size=4, clip_norm=1.0, save_every_steps=200
-        )
-    )
+    loop: LoopConfig = LoopConfig(steps=2000, batch_size=4, clip_norm=1.0, save_every_steps=200)
     """How long."""
 
     with_half: bool = False

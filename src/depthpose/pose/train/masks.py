@@ -79,7 +79,18 @@ class AnnotatedImages:
                 images.setdefault((instance.scene_id, instance.image_id), []).append(instance)
         if not images:
             raise InputError(f"{config.folder}: split {config.split!r} has no picture (rgb)")
-        self.objects = _known(config, images) if objects is None else objects
+        if objects is None:
+            there = sorted({i.object_id for shown in images.values() for i in shown})
+            wanted = [n for n in there if not config.objects or n in config.objects]
+            if not wanted:
+                raise InputError(
+                    f"{config.folder}: shows none of the objects {list(config.objects)}; it has "
+                    f"{there}"
+                )
+            infos = read_models_info(models_folder(Path(config.folder)))
+            names = tuple(object_name(number, infos.get(number, {})) for number in wanted)
+            objects = KnownObjects(names=names, numbers=tuple(wanted))
+        self.objects = objects
         self._class_of = {number: k for k, number in enumerate(self.objects.numbers, 1)}
         every = list(images.values())
         count = len(every) if config.limit is None else min(config.limit, len(every))
@@ -166,7 +177,17 @@ def cut_window(
     bottom, right = max(0, size[0] - rows), max(0, size[1] - columns)
     image = F.pad(image[None], (0, right, 0, bottom), mode="replicate")[0]
     labels = F.pad(labels, (0, right, 0, bottom))
-    top, left = _corner(labels, size, generator)
+    slack = [side - part for side, part in zip(labels.shape, size, strict=True)]
+    shown = labels.unique()[1:] if uniform(generator, 0.0, 1.0) < 0.5 else labels[:0, 0]
+    if len(shown):
+        chosen = labels == shown[whole(generator, len(shown))]
+        middle = chosen.nonzero().float().mean(0).tolist()
+        top, left = (
+            min(max(round(at - part / 2), 0), most)
+            for at, part, most in zip(middle, size, slack, strict=True)
+        )
+    else:
+        top, left = (whole(generator, most + 1) for most in slack)
     window = (slice(top, top + size[0]), slice(left, left + size[1]))
     return LabelledImage(image[:, *window], labels[window])
 
@@ -182,34 +203,6 @@ def jitter_colors(
     bright = (bright - bright.mean()) * contrast + bright.mean()
     grey = grey_of(bright)
     return (grey + (bright - grey) * saturation).clamp(0, 1)
-
-
-def _corner(
-    labels: Int[Tensor, "h w"], size: tuple[int, int], generator: torch.Generator
-) -> tuple[int, int]:
-    slack = [side - part for side, part in zip(labels.shape, size, strict=True)]
-    shown = labels.unique()[1:] if uniform(generator, 0.0, 1.0) < 0.5 else labels[:0, 0]
-    if not len(shown):
-        return whole(generator, slack[0] + 1), whole(generator, slack[1] + 1)
-    chosen = labels == shown[whole(generator, len(shown))]
-    middle = chosen.nonzero().float().mean(0).tolist()
-    corner = [
-        min(max(round(at - part / 2), 0), most)
-        for at, part, most in zip(middle, size, slack, strict=True)
-    ]
-    return corner[0], corner[1]
-
-
-def _known(config: ImagesConfig, images: dict[tuple[int, int], list[Instance]]) -> KnownObjects:
-    numbers = sorted({i.object_id for shown in images.values() for i in shown})
-    wanted = [n for n in numbers if not config.objects or n in config.objects]
-    if not wanted:
-        raise InputError(
-            f"{config.folder}: shows none of the objects {list(config.objects)}; it has {numbers}"
-        )
-    infos = read_models_info(models_folder(Path(config.folder)))
-    names = tuple(object_name(number, infos.get(number, {})) for number in wanted)
-    return KnownObjects(names=names, numbers=tuple(wanted))
 
 
 class SegmentationTask:
@@ -244,8 +237,14 @@ class SegmentationTask:
             found = class_probabilities(self.network, image).argmax(0)
             overlap.add(found, labels)
             if index == 0:
-                pictures["found_truth"] = torch.cat(
-                    [_painted(image, part, self.network.classes) for part in (found, labels)], -1
+                # The background darkened, and each object tinted with a colour of its own.
+                classes, both = self.network.classes, torch.cat([found, labels], -1)
+                angle = 2 * torch.pi * torch.arange(classes) / max(classes - 1, 1)
+                phase = torch.tensor([0.0, 2.0, 4.0]) * torch.pi / 3
+                tint = (0.5 + 0.5 * (angle[:, None] + phase).cos())[both].movedim(-1, 0)
+                twice = torch.cat([image, image], -1)
+                pictures["found_truth"] = torch.where(
+                    both > 0, 0.5 * twice + 0.5 * tint, 0.3 * twice
                 )
         self.network.train()
         iou = overlap.iou()
@@ -288,12 +287,3 @@ def train_segmentation(config: SegmentationTraining, run: Run) -> Path:
     known = {"objects": ", ".join(weights.objects), **weights.facts}
     write_card(path, "pose train --what segmentation", seconds, known, measured)
     return path
-
-
-def _painted(image: torch.Tensor, labels: torch.Tensor, classes: int) -> torch.Tensor:
-    """Darken the background, and tint each object with a colour of its own."""
-    angle = 2 * torch.pi * torch.arange(classes) / max(classes - 1, 1)
-    phase = torch.tensor([0.0, 2.0, 4.0]) * torch.pi / 3
-    colors = 0.5 + 0.5 * (angle[:, None] + phase).cos()
-    tint = colors[labels].movedim(-1, 0)
-    return torch.where(labels > 0, 0.5 * image + 0.5 * tint, 0.3 * image)

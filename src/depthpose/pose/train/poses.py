@@ -34,7 +34,7 @@ from depthpose.pose.baselines import (
     cut_depth,
     poses_of,
 )
-from depthpose.pose.config import CloudConfig, EstimateConfig, RefusalConfig
+from depthpose.pose.config import EstimateConfig, RefusalConfig
 from depthpose.pose.estimator import DepthImageRegressor
 from depthpose.pose.estimator.candidates import near_symmetry_lines
 from depthpose.pose.losses import direction_loss, model_point_loss
@@ -158,37 +158,12 @@ def packed(
     )
 
 
-def card_facts(weights: PoseWeights) -> dict[str, str]:
-    """Put before the facts of weights their objects, sizes, and turns that look nearly alike."""
-    known = ", ".join(f"{m.name} ({1000 * m.diameter_m:.0f} mm)" for m in weights.models)
-    lines = {model.name: near_symmetry_lines(model) for model in weights.models}
-    near = "; ".join(
-        f"{name}: {', '.join(some[:_TURNS_ON_CARD])}" for name, some in lines.items() if some
-    )
-    return {"objects": known} | ({"nearly_alike": near} if near else {}) | dict(weights.facts)
-
-
 def with_origin(facts: Mapping[str, str], config: Any) -> dict[str, str]:  # noqa: ANN401
     """Add to a card the stage, and the weights that it began with: their terms bind it too."""
     origin = {**facts, "stage": type(config).__name__}
     if config.start is None:
         return origin
     return bound_facts({**origin, "began_with": Path(config.start).stem}, [config.start])
-
-
-def with_classes(
-    network: Any,  # noqa: ANN401
-    models: Sequence[ObjectModel],
-    cloud: CloudConfig,
-) -> Any:  # noqa: ANN401
-    """Give a network's config the classes and keypoints of the objects, the inputs of the cloud."""
-    sizes = {
-        "classes": len(models),
-        "keypoints": len(models[0].keypoints_m),
-        "inputs": cloud.features,
-    }
-    known = {field.name for field in dataclasses.fields(network)}
-    return dataclasses.replace(network, **{k: v for k, v in sizes.items() if k in known})
 
 
 _IMAGE_SYMMETRY_STEP = 0.2
@@ -313,7 +288,11 @@ def train_pose(config: PoseTraining | DepthImageTraining, run: Run) -> Path:
     """
     torch.manual_seed(config.loop.seed)
     models = read_models(config.models, run.on_message)
-    config = dataclasses.replace(config, network=with_classes(config.network, models, config.cloud))
+    # The classes and keypoints are those of the objects, the inputs those of the cloud.
+    sizes = {"classes": len(models), "keypoints": len(models[0].keypoints_m)}
+    sizes["inputs"] = config.cloud.features
+    sizes = {name: size for name, size in sizes.items() if hasattr(config.network, name)}
+    config = dataclasses.replace(config, network=dataclasses.replace(config.network, **sizes))
     if isinstance(config, DepthImageTraining):
         word, samples = "depth-image", TrainingCrops(models, config, config.loop.seed)
         network = DepthImageNet(config.network)
@@ -356,7 +335,11 @@ def train_pose(config: PoseTraining | DepthImageTraining, run: Run) -> Path:
     cad = [word for file in config.models.cad for word in ("--cad", file)]
     unit = ["--unit", config.models.unit] if cad and config.models.unit else []
     command = shlex.join(["pose", "train", "--what", word, *cad, *unit])
-    write_card(path, command, seconds, card_facts(weights), measured)
+    known = ", ".join(f"{m.name} ({1000 * m.diameter_m:.0f} mm)" for m in weights.models)
+    alike = {model.name: near_symmetry_lines(model)[:_TURNS_ON_CARD] for model in weights.models}
+    near = "; ".join(f"{name}: {', '.join(some)}" for name, some in alike.items() if some)
+    facts = {"objects": known} | ({"nearly_alike": near} if near else {}) | dict(weights.facts)
+    write_card(path, command, seconds, facts, measured)
     return path
 
 

@@ -172,9 +172,19 @@ def vote_ransac(
     """
     config = VotingConfig() if config is None else config
     lines, centre_m = prepare_lines(points_m, directions, weight)
-    tried, is_crossing = cross_lines(
-        lines, *draw_pairs(lines.weights, config.hypotheses, config.seed)
-    )
+    # Pairs of two different votes of positive weight for each keypoint, on any device alike.
+    w = lines.weights
+    counts = (w > 0).sum(-1, keepdim=True)
+    generator = torch.Generator().manual_seed(config.seed)
+    shape = (2, *counts.shape[:-1], config.hypotheses)
+    draws = torch.rand(shape, generator=generator, dtype=torch.float64).to(w.device)
+    first = (draws[0] * counts).long()
+    # A step of 1 .. count - 1 further round never comes back to the first.
+    second = (first + 1 + (draws[1] * (counts - 1)).long()) % counts
+    if int(counts.min()) < w.shape[-1]:
+        voters = (w > 0).to(torch.uint8).argsort(dim=-1, descending=True, stable=True)
+        first, second = voters.gather(-1, first), voters.gather(-1, second)
+    tried, is_crossing = _cross_lines(lines, first, second)
     inlier_test = InlierTest(lines, config)
     # Parallel pairs propose nothing, yet score 0 so that one always wins.
     best = torch.where(is_crossing, inlier_test.score(tried), 0).argmax(-1)[..., None, None]
@@ -189,35 +199,16 @@ def vote_ransac(
     return replace(vote, inlier_share=share)
 
 
-def draw_pairs(
-    w: Float[Tensor, "*batch k n"], hypotheses: int, seed: int
-) -> tuple[Int64[Tensor, "*batch k h"], Int64[Tensor, "*batch k h"]]:
-    """Draw pairs of two different votes of positive weight for each keypoint, on any device alike.
-
-    Each row of ``w`` has two such votes at least.
-    """
-    counts = (w > 0).sum(-1, keepdim=True)
-    generator = torch.Generator().manual_seed(seed)
-    shape = (2, *counts.shape[:-1], hypotheses)
-    draws = torch.rand(shape, generator=generator, dtype=torch.float64).to(w.device)
-    first = (draws[0] * counts).long()
-    # A step of 1 .. count - 1 further round never comes back to the first.
-    second = (first + 1 + (draws[1] * (counts - 1)).long()) % counts
-    if int(counts.min()) == w.shape[-1]:
-        return first, second
-    voters = (w > 0).to(torch.uint8).argsort(dim=-1, descending=True, stable=True)
-    return voters.gather(-1, first), voters.gather(-1, second)
-
-
-def cross_lines(
+def _cross_lines(
     lines: Lines, first: Int64[Tensor, "*batch k h"], second: Int64[Tensor, "*batch k h"]
 ) -> tuple[Float[Tensor, "*batch k h 3"], Bool[Tensor, "*batch k h"]]:
-    """Give the point nearest to both lines of each pair, and whether they are not parallel.
-
-    The middle of the common perpendicular.
-    """
-    x1, n1 = _pick(lines, first)
-    x2, n2 = _pick(lines, second)
+    """Give the middle of the common perpendicular of each pair, and whether they cross."""
+    wide = (*first.shape[:-1], 3, first.shape[-1])
+    x1, x2, n1, n2 = (
+        values.expand_as(lines.directions).gather(-1, index[..., None, :].expand(wide))
+        for values in (lines.points, lines.directions)
+        for index in (first, second)
+    )
     gap = x1 - x2
     cosine = (n1 * n2).sum(-2, keepdim=True)
     d, e = (n1 * gap).sum(-2, keepdim=True), (n2 * gap).sum(-2, keepdim=True)
@@ -293,12 +284,6 @@ def _polynomials(tried: Float[Tensor, "*batch k h 3"]) -> list[Tensor]:
         [flat, flat.square().sum(-1, keepdim=True), torch.ones_like(flat[..., :1])], -1
     )
     return [whole[..., [0, 1, 2, 4]], whole]
-
-
-def _pick(lines: Lines, index: Int64[Tensor, "*batch k h"]) -> tuple[Tensor, Tensor]:
-    local, n, _ = lines
-    wide = index[..., None, :].expand(*index.shape[:-1], 3, index.shape[-1])
-    return local.expand_as(n).gather(-1, wide), n.gather(-1, wide)
 
 
 def _inliers(
@@ -408,7 +393,11 @@ def distance_errors(
     keypoints_m: Float[Tensor, "*batch k 3"], model_keypoints_m: Float[Tensor, "k 3"]
 ) -> Float[Tensor, "*batch k k"]:
     """Found minus known distance of each pair of keypoints [m]: 28 pairs of 8, each twice."""
-    return _distances(keypoints_m) - _distances(model_keypoints_m.to(keypoints_m))
+    found, known = (
+        (points_m[..., :, None, :] - points_m[..., None, :, :]).norm(dim=-1)
+        for points_m in (keypoints_m, model_keypoints_m.to(keypoints_m))
+    )
+    return found - known
 
 
 def consistent_keypoints(
@@ -445,7 +434,3 @@ def consistent_keypoints(
         worst = torch.nn.functional.one_hot(blame.argmax(-1), count).bool()
         stays = stays & ~(worst & broken.any((-1, -2))[..., None])
     return stays
-
-
-def _distances(points_m: Float[Tensor, "*batch k 3"]) -> Float[Tensor, "*batch k k"]:
-    return (points_m[..., :, None, :] - points_m[..., None, :, :]).norm(dim=-1)
