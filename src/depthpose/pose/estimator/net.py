@@ -27,7 +27,7 @@ from depthpose.pose.estimator.candidates import Candidate, evidence_of, find_can
 from depthpose.pose.estimator.fit import fit_of, seen_about
 from depthpose.pose.estimator.inputs import AnyInput, ObjectCloud, Refusal, prepare_cloud
 from depthpose.pose.estimator.inputs import CloudDirections as CloudDirections
-from depthpose.pose.estimator.register import CANDIDATE_SLOPES, Registration
+from depthpose.pose.estimator.register import Registration
 from depthpose.pose.refine import refine_best
 from depthpose.pose.surface import Surface, prepare_surface
 from depthpose.pose.types import (
@@ -183,8 +183,7 @@ class GeoPoseNet(PoseEstimator):
         """Give the registration of the same objects, which shares what was prepared of them."""
         if self._registration is None:
             config = replace(self.config, register_refused=False, with_icp=True)
-            limits = replace(self.refusal, candidate_slopes=CANDIDATE_SLOPES)
-            self._registration = Registration(self.models, config, limits)
+            self._registration = Registration(self.models, config)
             self._registration._surfaces, self._registration._copies = self._surfaces, self._copies
         return self._registration
 
