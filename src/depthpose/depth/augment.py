@@ -17,11 +17,10 @@ from torch import Tensor
 from depthpose.core.arrays import grey_of
 from depthpose.core.errors import InputError
 from depthpose.depth.config import AugmentConfig, DegradeConfig
+from depthpose.depth.types import View
 
-Picture = Float[Tensor, "3 h w"]
 
-
-def degrade(image: Picture, config: DegradeConfig, generator: torch.Generator) -> Picture:
+def degrade(image: View, config: DegradeConfig, generator: torch.Generator) -> View:
     """Change colours and sharpness of an image at random; where things are stays as it is.
 
     Args:
@@ -68,7 +67,7 @@ def degrade(image: Picture, config: DegradeConfig, generator: torch.Generator) -
     return image
 
 
-def through_jpeg(image: Picture, quality: int) -> Picture:
+def through_jpeg(image: View, quality: int) -> View:
     """Give what is left of an image after JPEG of ``quality`` (1 to 95), 4:4:4."""
     pixels = (image.permute(1, 2, 0) * 255).round().byte().numpy()
     file = BytesIO()
@@ -238,9 +237,7 @@ def set_apart(
     return pair
 
 
-def shift_rows(
-    image: Float[Tensor, "3 h w"], left_px: float, right_px: float
-) -> Float[Tensor, "3 h w"]:
+def shift_rows(image: View, left_px: float, right_px: float) -> View:
     """Look each pixel up so many rows further down, in proportion between the two borders.
 
     Columns stay, and so does disparity.
@@ -253,6 +250,6 @@ def shift_rows(
     return F.grid_sample(image[None], grid[None], padding_mode="border", align_corners=False)[0]
 
 
-def _saturate(image: Float[Tensor, "3 h w"], factor: float) -> Float[Tensor, "3 h w"]:
+def _saturate(image: View, factor: float) -> View:
     grey = grey_of(image)
     return grey + (image - grey) * factor

@@ -17,7 +17,7 @@ from depthpose.core.errors import InputError
 from depthpose.core.files import read_image
 from depthpose.depth.datasets import Dataset, known_truths, read_known_depth, shrink
 from depthpose.depth.disparity import disparity_from_depth
-from depthpose.depth.types import DepthEstimate, StereoInput
+from depthpose.depth.types import DepthEstimate, Map, StereoInput, View
 
 _CANONICAL_FOCAL_PX = 721.5377
 """Rows are counted in a camera of this focal length (KITTI's), centred at its principal point."""
@@ -138,7 +138,7 @@ class NearestImageBaseline:
         return DepthEstimate(depth_m=depth_m, disparity_px=disparity_from_depth(depth_m, rig))
 
 
-def fill_by_pyramid(values: Float[Tensor, "h w"]) -> Float[Tensor, "h w"]:
+def fill_by_pyramid(values: Map) -> Map:
     """Fill NaN with the mean of the smallest cell (2, 4, 8, ... pixels) around it that has values.
 
     All stays NaN where there is no value at all.
@@ -159,7 +159,7 @@ def _canonical_row(v: np.ndarray, camera: Camera) -> Float64[np.ndarray, " rows"
     return slope * _CANONICAL_FOCAL_PX + _ROWS // 2
 
 
-def _thumbnail(image: Float[Tensor, "3 h w"]) -> Float[Tensor, " d"]:
+def _thumbnail(image: View) -> Float[Tensor, " d"]:
     cells = shrink(image, 8, 24).flatten()
     centred = cells - cells.mean()
     return centred / centred.norm().clamp(min=1e-9)

@@ -11,7 +11,7 @@ from torch.nn import functional as F
 
 from depthpose.core.camera import Camera, StereoRig
 from depthpose.core.errors import InputError, Notice
-from depthpose.depth.types import Match
+from depthpose.depth.types import Map, Match
 
 _MISTAKES = {
     1000.0: "is its depth in millimetres (divide by 1000), or its disparity in shares of the width "
@@ -35,9 +35,7 @@ MOST_ENLARGED_PIXELS = 8_000_000
 """An image is not enlarged beyond this to reach the focal length of a network."""
 
 
-def disparity_advice(
-    predicted_px: Float[Tensor, "h w"], true_px: Float[Tensor, "h w"]
-) -> str | None:
+def disparity_advice(predicted_px: Map, true_px: Map) -> str | None:
     """Say that a prediction is of another unit or sign than pixels; None where it seems not.
 
     What a poor estimate could be too is a notice, and None.
@@ -93,9 +91,7 @@ def disparity_from_depth(
     return torch.where(depth_m > 0, disparity_px, torch.nan)
 
 
-def resize_disparity(
-    disparity_px: Float[Tensor, "h w"], height: int, width: int
-) -> Float[Tensor, "height width"]:
+def resize_disparity(disparity_px: Map, height: int, width: int) -> Float[Tensor, "height width"]:
     """Resize bilinearly (pixel centres at halves) and scale the values by the ratio of the widths.
 
     Disparity is what is interpolated, never depth: depth is not linear between two pixels.
@@ -105,9 +101,7 @@ def resize_disparity(
     return resized_map(disparity_px, height, width) * (width / disparity_px.shape[1])
 
 
-def warp_right_to_left(
-    right: Float[Tensor, "c h w"], disparity_px: Float[Tensor, "h w"]
-) -> Float[Tensor, "c h w"]:
+def warp_right_to_left(right: Float[Tensor, "c h w"], disparity_px: Map) -> Float[Tensor, "c h w"]:
     """Look up, for each left pixel x, the right view at ``x - disparity`` (bilinear).
 
     NaN where the disparity is NaN or the pixel looked up lies outside the right view.
@@ -124,7 +118,7 @@ def warp_right_to_left(
     return torch.where(is_inside, looked_up[0], torch.nan)
 
 
-def right_disparity_from_left(left_px: Float[Tensor, "h w"]) -> Float[Tensor, "h w"]:
+def right_disparity_from_left(left_px: Map) -> Map:
     """Carry the disparity of the left view over to the right one: pixel x goes to ``x - d``.
 
     The nearest point wins where several fall on one pixel. NaN where none does: what the left view
@@ -141,9 +135,7 @@ def right_disparity_from_left(left_px: Float[Tensor, "h w"]) -> Float[Tensor, "h
     return torch.where(carried.isinf(), torch.nan, carried).reshape(height, width)
 
 
-def left_right_difference_px(
-    left_px: Float[Tensor, "h w"], right_px: Float[Tensor, "h w"]
-) -> Float[Tensor, "h w"]:
+def left_right_difference_px(left_px: Map, right_px: Map) -> Map:
     """Compare the disparity of the left view with that of the right view at the same point.
 
     Small where both views agree, large at occlusions; NaN where the point leaves the right view.

@@ -15,6 +15,7 @@ from depthpose.core.checkpoint import (
     save_imported,
 )
 from depthpose.core.errors import InputError
+from depthpose.depth.types import Views
 
 KIND = "efficientnet-lite0"
 _STEM = 32
@@ -65,7 +66,7 @@ class LiteEncoder(nn.Module):
                 self._frozen = len(blocks)
         self.blocks = nn.ModuleList(blocks)
 
-    def forward(self, image: Float[Tensor, "b 3 h w"]) -> list[Float[Tensor, "b c rows columns"]]:
+    def forward(self, image: Views) -> list[Float[Tensor, "b c rows columns"]]:
         """Answer features from stride 2 to stride 32; sides are multiples of the last."""
         x = F.relu6(self.stem((image * 255 - 127) / 128))
         features = []

@@ -48,7 +48,7 @@ from depthpose.depth.predictions import (
     read_drawn_view,
     read_sky,
 )
-from depthpose.depth.types import DepthEstimate
+from depthpose.depth.types import DepthEstimate, Map
 
 NO_PREDICTION = "no right view to match, and no prediction"
 Cell = str | int | float
@@ -349,8 +349,8 @@ class FrameResult:
     """
 
     estimate: DepthEstimate
-    error: Float[Tensor, "h w"]
-    true_depth_m: Float[Tensor, "h w"] | None
+    error: Map
+    true_depth_m: Map | None
 
 
 def frame_result(
@@ -393,9 +393,7 @@ def frame_result(
     return FrameResult(estimate=estimate, error=error, true_depth_m=true_m)
 
 
-def clamped_depth(
-    disparity_px: Float[Tensor, "h w"], rig: StereoRig, cap_m: float
-) -> Float[Tensor, "h w"]:
+def clamped_depth(disparity_px: Map, rig: StereoRig, cap_m: float) -> Map:
     """Turn disparity into depth as the published script does: infinity to 0, then the clamp.
 
     NaN (no prediction) stays NaN; zero and negative disparity become the smallest depth, as there.
@@ -410,10 +408,10 @@ class _Prepared:
     """A frame's truth and prediction, brought to the size of the image."""
 
     frame: Frame
-    truth: Float[Tensor, "h w"]
-    disparity_px: Float[Tensor, "h w"]
-    depth_m: Float[Tensor, "h w"] | None  # of what was predicted as depth alone, which is compared
-    confidence: Float[Tensor, "h w"] | None
+    truth: Map
+    disparity_px: Map
+    depth_m: Map | None  # of what was predicted as depth alone, which is compared
+    confidence: Map | None
     rig: StereoRig | None
     view: dict[str, float]  # errors of the drawn right view
 
@@ -474,9 +472,7 @@ def _prepare(dataset: Dataset, index: int, predictions: Path, rule: Protocol) ->
     )
 
 
-def _compared(
-    prepared: _Prepared, rule: Protocol, cap_m: float | None
-) -> tuple[Float[Tensor, "h w"], Float[Tensor, "h w"]]:
+def _compared(prepared: _Prepared, rule: Protocol, cap_m: float | None) -> tuple[Map, Map]:
     """Prepare prediction and truth as the protocol says; NaN where there is none or none counts."""
     truth, predicted_m = prepared.truth, prepared.depth_m
     if cap_m is None:

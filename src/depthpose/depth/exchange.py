@@ -9,13 +9,12 @@ from typing import Any, Literal
 
 import numpy as np
 import torch
-from jaxtyping import Float
-from torch import Tensor
 
 from depthpose.core.errors import InputError
 from depthpose.core.files import read_json, read_map, write_depth_png, write_json, write_map
 from depthpose.core.files.disk import AnyPath, write_bytes
 from depthpose.core.run import read_sources
+from depthpose.depth.types import Map
 
 Kind = Literal["png", "npy"]
 """Files of nerfstudio's depth: 16-bit PNG, or float32."""
@@ -121,12 +120,12 @@ def write_transforms(out: Path, content: Mapping[str, Any]) -> None:
     write_json(out / TRANSFORMS_DEPTH, content)
 
 
-def _depth_m(results: Path, name: str) -> Float[Tensor, "h w"]:
+def _depth_m(results: Path, name: str) -> Map:
     depth_m = read_map(results / f"{name}{_DEPTH}")
     return torch.where(depth_m > 0, depth_m, torch.nan)
 
 
-def write_colmap_map(path: AnyPath, depth: Float[Tensor, "h w"]) -> None:
+def write_colmap_map(path: AnyPath, depth: Map) -> None:
     """Write a depth map; 0 where it is NaN.
 
     ``WIDTH&HEIGHT&CHANNELS&`` in text, then little-endian float32, columns fastest, as

@@ -28,7 +28,7 @@ from depthpose.depth.synthesis import (
     make_synthesiser,
     read_logits,
 )
-from depthpose.depth.types import DepthEstimate, StereoInput
+from depthpose.depth.types import DepthEstimate, StereoInput, Views
 from depthpose.depth.weights import DepthWeights
 
 _0, _1, _2, _HALF = np.float32(0), np.float32(1), np.float32(2), np.float32(0.5)
@@ -96,7 +96,7 @@ class DynamicPSMNet(nn.Module):
         self.register_buffer("matrix", interpolation_matrix(taps, self.bins)[..., None, None])
 
     def forward(
-        self, left: Float[Tensor, "b 3 h w"], right: Float[Tensor, "b 3 h w"]
+        self, left: Views, right: Views
     ) -> tuple[Float[Tensor, "b h w"], Float[Tensor, "b h w"]]:
         """Give disparity [px] and confidence of normalised images."""
         near, far = self.network.features(left), self.network.features(right)
@@ -118,9 +118,7 @@ class DynamicLightStereo(nn.Module):
         super().__init__()
         self.network = network
 
-    def forward(
-        self, left: Float[Tensor, "b 3 h w"], right: Float[Tensor, "b 3 h w"]
-    ) -> tuple[Maps, ...]:
+    def forward(self, left: Views, right: Views) -> tuple[Maps, ...]:
         """Give disparity [px], confidence and, with that class, the sky of normalised images."""
         max_disparity_px = self.network.config.max_disparity_px
         read = self.network.read(left, right, max_disparity_px, with_confidence=True)
@@ -143,7 +141,7 @@ class DynamicSelection(nn.Module):
         super().__init__()
         self.generator = generator
 
-    def forward(self, image: Float[Tensor, "b 3 h w"]) -> tuple[Tensor, ...]:
+    def forward(self, image: Views) -> tuple[Tensor, ...]:
         """Give log of disparity, sky and confidence of the left view; the first two of the right.
 
         Disparity is counted in pixels of the image's width. Where the weights know streets, how

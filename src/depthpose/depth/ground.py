@@ -9,7 +9,7 @@ from torch import Tensor
 
 from depthpose.core.camera import Camera
 from depthpose.core.errors import InputError
-from depthpose.depth.types import DepthEstimate, Ground, StereoInput
+from depthpose.depth.types import DepthEstimate, Ground, Map, StereoInput
 
 _INLIER = 0.06
 """Inverse depths within this share of the plane's belong to it."""
@@ -28,7 +28,7 @@ _WINDOW_PX = 5
 """Side of the square around a pixel whose distance is known."""
 
 
-def fit_ground(depth_m: Float[Tensor, "h w"], camera: Camera) -> Ground | None:
+def fit_ground(depth_m: Map, camera: Camera) -> Ground | None:
     """Fit a plane to the lower part of a depth map: RANSAC on inverse depth, then least squares.
 
     None where a quarter of the lower part does not lie on one that could be ground.
@@ -66,7 +66,7 @@ def fit_ground(depth_m: Float[Tensor, "h w"], camera: Camera) -> Ground | None:
 
 
 def _lower_points(
-    depth_m: Float[Tensor, "h w"], camera: Camera
+    depth_m: Map, camera: Camera
 ) -> tuple[Float[Tensor, "n 3"], Float[Tensor, " n"], Int[Tensor, " n"]]:
     """Rays (z = 1), inverse depths and column strips of points below and not at the sides."""
     height, width = depth_m.shape
@@ -146,7 +146,7 @@ def _plane(ground: Ground) -> Float[Tensor, "3"]:
 
 
 def rescale(
-    found: DepthEstimate, factor: float | Float[Tensor, "h w"], *, fit: Ground | None = None
+    found: DepthEstimate, factor: float | Map, *, fit: Ground | None = None
 ) -> DepthEstimate:
     """Multiply the depth of an estimate by ``factor``, and divide its disparity; not the sky's."""
     assert found.depth_m is not None

@@ -7,8 +7,6 @@ from pathlib import Path
 from typing import Annotated
 
 import torch
-from jaxtyping import Bool, Float
-from torch import Tensor
 
 from depthpose.core.camera import StereoRig
 from depthpose.core.errors import InputError
@@ -19,7 +17,7 @@ from depthpose.depth.config import Settings
 from depthpose.depth.datasets import Dataset
 from depthpose.depth.disparity import left_right_difference_px
 from depthpose.depth.estimator import FakestereoNet, refuse_unrectified
-from depthpose.depth.types import DepthEstimate, StereoInput
+from depthpose.depth.types import DepthEstimate, Map, Mask, StereoInput
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -115,7 +113,7 @@ def _is_labelled(folder: Path, name: str) -> bool:
     return is_whole(folder, name, [f"disp_occ/{name}.png"])
 
 
-def label_pair(net: FakestereoNet, pair: StereoInput, config: LabelConfig) -> Float[Tensor, "h w"]:
+def label_pair(net: FakestereoNet, pair: StereoInput, config: LabelConfig) -> Map:
     """Match a pair both ways [px]; NaN where they disagree, in the sky, or where it is not sure."""
     one, right_px = match_both_ways(net, pair)
     is_known = is_consistent(one.disparity_px, right_px, config)
@@ -126,9 +124,7 @@ def label_pair(net: FakestereoNet, pair: StereoInput, config: LabelConfig) -> Fl
     return torch.where(is_known, one.disparity_px, torch.nan)
 
 
-def match_both_ways(
-    net: FakestereoNet, pair: StereoInput
-) -> tuple[DepthEstimate, Float[Tensor, "h w"]]:
+def match_both_ways(net: FakestereoNet, pair: StereoInput) -> tuple[DepthEstimate, Map]:
     """Match a pair from the left view, and give the disparity of the right view [px] too."""
     assert pair.right is not None
     mirrored = replace(pair, left=pair.right.flip(-1), right=pair.left.flip(-1))
@@ -137,9 +133,7 @@ def match_both_ways(
 
 
 @torch.no_grad()
-def is_consistent(
-    left_px: Float[Tensor, "h w"], right_px: Float[Tensor, "h w"], config: LabelConfig
-) -> Bool[Tensor, "h w"]:
+def is_consistent(left_px: Map, right_px: Map, config: LabelConfig) -> Mask:
     """Mark left pixels where the disparities of both views agree; not where a point leaves one."""
     limit_px = (config.largest_share * left_px).clamp(min=config.largest_difference_px)
     return left_right_difference_px(left_px, right_px) <= limit_px

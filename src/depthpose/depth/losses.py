@@ -7,6 +7,8 @@ import torch.nn.functional as F
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from depthpose.depth.types import Maps, Views
+
 HEAD_WEIGHTS = (0.5, 0.7, 1.0)
 """Weights of the three heads of PSMNet (Chang and Chen 2018)."""
 
@@ -36,24 +38,18 @@ def discriminator_loss(
     return (real_loss + adversarial_loss(fake, mode, is_real=False)) / 2
 
 
-def l1_loss(
-    generated: Float[Tensor, "b 3 h w"], real: Float[Tensor, "b 3 h w"]
-) -> Float[Tensor, ""]:
+def l1_loss(generated: Views, real: Views) -> Float[Tensor, ""]:
     """Mean absolute difference (eq. 2.5 of the thesis)."""
     return (generated - real).abs().mean()
 
 
-def valid_disparity(truth_px: Float[Tensor, "b h w"], max_px: int) -> Bool[Tensor, "b h w"]:
+def valid_disparity(truth_px: Maps, max_px: int) -> Bool[Tensor, "b h w"]:
     """Where the truth is known, positive (0 is the sky) and in the matcher's range."""
     return (truth_px > 0) & (truth_px < max_px)
 
 
 def disparity_loss(
-    found_px: Float[Tensor, "b h w"],
-    truth_px: Float[Tensor, "b h w"],
-    max_px: int,
-    *,
-    sky_weight: float = 0.0,
+    found_px: Maps, truth_px: Maps, max_px: int, *, sky_weight: float = 0.0
 ) -> Float[Tensor, ""]:
     """Smooth L1 over the pixels with truth (eq. 2.6 of the thesis); 0 where there are none.
 
@@ -67,11 +63,7 @@ def disparity_loss(
 
 
 def heads_loss(
-    heads_px: Sequence[Float[Tensor, "b h w"]],
-    truth_px: Float[Tensor, "b h w"],
-    max_px: int,
-    *,
-    sky_weight: float = 0.0,
+    heads_px: Sequence[Maps], truth_px: Maps, max_px: int, *, sky_weight: float = 0.0
 ) -> Float[Tensor, ""]:
     """Sum the loss of up to three heads, the later the heavier; the last has the weight 1."""
     losses = [disparity_loss(head, truth_px, max_px, sky_weight=sky_weight) for head in heads_px]
@@ -79,9 +71,7 @@ def heads_loss(
     return torch.stack([w * x for w, x in zip(weights, losses, strict=True)]).sum()
 
 
-def sky_loss(
-    probability: Float[Tensor, "b h w"], truth_px: Float[Tensor, "b h w"]
-) -> Float[Tensor, ""]:
+def sky_loss(probability: Maps, truth_px: Maps) -> Float[Tensor, ""]:
     """Mean cross entropy of the class of the sky, where it is known whether it is (truth 0)."""
     is_known, is_sky = truth_px >= 0, truth_px == 0
     of_truth = torch.where(is_sky, probability, 1 - probability)
@@ -91,9 +81,7 @@ def sky_loss(
 
 
 def log_disparity_loss(
-    found_log_px: Float[Tensor, "b h w"],
-    truth_px: Float[Tensor, "b h w"],
-    range_px: tuple[float, float],
+    found_log_px: Maps, truth_px: Maps, range_px: tuple[float, float]
 ) -> Float[Tensor, ""]:
     """Mean absolute difference of the logarithm of disparity: a relative error of depth.
 
@@ -112,9 +100,7 @@ def _mean_of_images(error: Tensor, is_known: Tensor) -> Tensor:
 
 
 def pixel_disparity_loss(
-    found_log_px: Float[Tensor, "b h w"],
-    truth_px: Float[Tensor, "b h w"],
-    range_px: tuple[float, float],
+    found_log_px: Maps, truth_px: Maps, range_px: tuple[float, float]
 ) -> Float[Tensor, ""]:
     """Mean absolute error of disparity over the pixels with truth, as a share of the largest."""
     is_known = truth_px > 0
@@ -157,9 +143,7 @@ def plane_loss(
     return _mean_of_images(-(near * (1 - share) + far * share), truth_px >= 0)
 
 
-def photometric_error(
-    one: Float[Tensor, "b 3 h w"], other: Float[Tensor, "b 3 h w"]
-) -> Float[Tensor, "b h w"]:
+def photometric_error(one: Views, other: Views) -> Maps:
     """Dissimilarity of each pixel's neighbourhood, 0 to 1: 0.85 (1 - SSIM) / 2 + 0.15 L1.
 
     SSIM over 3x3 pixels, as Godard et al. (CVPR 2017) use it for views of one scene.
@@ -182,9 +166,7 @@ _SSIM = (0.01**2, 0.03**2)
 """Constants of SSIM for values in [0, 1] (Wang et al. 2004)."""
 
 
-def smoothness_loss(
-    disparity_px: Float[Tensor, "b h w"], image: Float[Tensor, "b 3 h w"]
-) -> Float[Tensor, ""]:
+def smoothness_loss(disparity_px: Maps, image: Views) -> Float[Tensor, ""]:
     """Mean change of disparity between neighbours [px], less where the image changes as well."""
     total = disparity_px.new_zeros(())
     for axis in (1, 2):
@@ -194,9 +176,7 @@ def smoothness_loss(
     return total
 
 
-def view_loss(
-    drawn: Float[Tensor, "b 3 h w"], real: Float[Tensor, "b 3 h w"]
-) -> Float[Tensor, " b"]:
+def view_loss(drawn: Views, real: Views) -> Float[Tensor, " b"]:
     """L1 of a drawn view and of its horizontal gradient, for each image."""
     colour = (drawn - real).abs().mean((1, 2, 3))
     gradient = ((drawn[..., 1:] - drawn[..., :-1]) - (real[..., 1:] - real[..., :-1])).abs()

@@ -13,6 +13,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from depthpose.core.errors import InputError
+from depthpose.depth.types import View
 
 SMALLEST_DEPTH_M = 1e-3
 """Predicted depth of zero or below becomes this, as in the published script of the Eigen split."""
@@ -232,7 +233,7 @@ def _shared_error(error: Float[Tensor, " n"], key: Float[Tensor, " n"]) -> Float
     return mean[group]
 
 
-def view_errors(drawn: Float[Tensor, "3 h w"], real: Float[Tensor, "3 h w"]) -> dict[str, float]:
+def view_errors(drawn: View, real: View) -> dict[str, float]:
     """Compare a drawn right view with the real one, both RGB in [0, 1].
 
     Returns:

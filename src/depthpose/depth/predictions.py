@@ -6,9 +6,6 @@ from functools import partial
 from pathlib import Path
 from typing import Any, Protocol, runtime_checkable
 
-from jaxtyping import Bool, Float
-from torch import Tensor
-
 from depthpose.core.camera import Camera, StereoRig
 from depthpose.core.config import config_from_dict
 from depthpose.core.draw import draw_depth, draw_disparity
@@ -30,7 +27,7 @@ from depthpose.core.files.text import read_text
 from depthpose.core.run import claim_folder, claim_names, is_whole, note_result
 from depthpose.depth.disparity import depth_from_disparity, disparity_from_depth
 from depthpose.depth.metrics import SMALLEST_DEPTH_M
-from depthpose.depth.types import DepthEstimate, Ground, StereoInput
+from depthpose.depth.types import DepthEstimate, Ground, Map, Mask, StereoInput, View
 
 
 @runtime_checkable
@@ -125,7 +122,7 @@ def has_prediction(folder: Path, name: str) -> bool:
 
 def read_disparity(
     folder: Path, name: str, camera: Camera | None, *, with_disparity_png: bool = False
-) -> Float[Tensor, "h w"]:
+) -> Map:
     """Read one predicted disparity [px at its own width], ours or anybody's.
 
     ``NAME.disparity_px.npy`` (or ``.pfm``) is taken first; what :func:`read_depth` finds is turned
@@ -162,7 +159,7 @@ def read_disparity(
     return disparity_from_depth(least_m, camera) * (depth_m.shape[1] / camera.width)
 
 
-def read_depth(folder: Path, name: str) -> Float[Tensor, "h w"] | None:
+def read_depth(folder: Path, name: str) -> Map | None:
     """Read one predicted depth [m at its own size]; None where there is no file of depth.
 
     ``NAME.depth_m.npy`` or ``.pfm`` comes before ``NAME.depth.png`` and ``NAME.png``.
@@ -184,19 +181,19 @@ def _first(base: Path, endings: tuple[str, ...]) -> Path | None:
     return next((path for path in both if path.is_file()), None)
 
 
-def read_confidence(folder: Path, name: str) -> Float[Tensor, "h w"] | None:
+def read_confidence(folder: Path, name: str) -> Map | None:
     """Read the confidence beside a prediction, or None where there is none."""
     path = _first(folder / name, ("confidence.npy",))
     return None if path is None else read_map(path)
 
 
-def read_drawn_view(folder: Path, name: str) -> Float[Tensor, "3 h w"] | None:
+def read_drawn_view(folder: Path, name: str) -> View | None:
     """Read the right view that a prediction was made through, or None where none was drawn."""
     path = _first(folder / name, ("right.png",))
     return None if path is None else read_image(path)
 
 
-def read_sky(folder: Path, name: str) -> Bool[Tensor, "h w"] | None:
+def read_sky(folder: Path, name: str) -> Mask | None:
     """Read where a prediction says sky, or None where its weights do not know it."""
     path = _first(folder / name, ("sky.png",))
     return None if path is None else read_image(path)[0] > 0

@@ -23,8 +23,7 @@ from depthpose.core.errors import InputError
 from depthpose.depth.config import GeneratorConfig, SelectionConfig, Speed
 from depthpose.depth.disparity import resize_image
 from depthpose.depth.encoder import LiteEncoder
-
-Images = Float[Tensor, "b 3 h w"]
+from depthpose.depth.types import Maps, Views
 
 
 class UNetGenerator(nn.Module):
@@ -56,7 +55,7 @@ class UNetGenerator(nn.Module):
             self.up.append(_Level(conv, with_norm=level > 0, dropout=dropout))
         self.apply(_initialise)
 
-    def forward(self, left: Images) -> Images:
+    def forward(self, left: Views) -> Views:
         """Draw the right view of each image.
 
         Raises:
@@ -116,7 +115,7 @@ class _Discriminator(nn.Module):
         self.layers = nn.Sequential(*layers)
         self.apply(_initialise)
 
-    def forward(self, left: Images, right: Images) -> Scores:
+    def forward(self, left: Views, right: Views) -> Scores:
         """Answer one logit a patch or pixel; images are RGB in [-1, 1]."""
         return self.layers(torch.cat([left, right], 1))
 
@@ -192,7 +191,7 @@ class SelectionGenerator(nn.Module):
         self.street = nn.Linear(3 * deepest, 1) if self.config.with_street else None
         self.register_buffer("planes", make_planes(self.config), persistent=False)
 
-    def forward(self, image: Images) -> tuple[Logits, Logits]:
+    def forward(self, image: Views) -> tuple[Logits, Logits]:
         """Answer the logits of the left and of the right view.
 
         Raises:
@@ -250,18 +249,18 @@ class Selected:
         street: probability that the image shows a street; None where the weights do not say.
     """
 
-    disparity_px: Float[Tensor, "b h w"]
-    sky: Float[Tensor, "b h w"]
-    sure: Float[Tensor, "b h w"]
+    disparity_px: Maps
+    sky: Maps
+    sure: Maps
     street: Float[Tensor, " b"] | None = None
 
     @property
-    def confidence(self) -> Float[Tensor, "b h w"]:
+    def confidence(self) -> Maps:
         """Probability of what lies within 15 % of the disparity, or of the sky where that is it."""
         return torch.where(self.is_sky, self.sky, self.sure * (1 - self.sky))
 
     @property
-    def shift_px(self) -> Float[Tensor, "b h w"]:
+    def shift_px(self) -> Maps:
         """Disparity, and 0 in the sky [px]."""
         return torch.where(self.is_sky, 0.0, self.disparity_px)
 
@@ -322,7 +321,7 @@ def log_expectation(logits: Logits, planes: Planes) -> Float[Tensor, "b rows col
     return torch.einsum("bkhw,k->bhw", logits[:, 1:].float().softmax(1), planes.log())
 
 
-def shift_left(left: Images, right_px: Float[Tensor, "b h w"]) -> Images:
+def shift_left(left: Views, right_px: Maps) -> Views:
     """Draw the right view by one shift a pixel: ``left`` looked up at ``x + disparity``.
 
     Beyond the border the border repeats. A mixture of shifts has the lower L1, but ghosts, which
@@ -335,7 +334,7 @@ def shift_left(left: Images, right_px: Float[Tensor, "b h w"]) -> Images:
     return F.grid_sample(left, grid.to(left.dtype), padding_mode="border", align_corners=False)
 
 
-def mix_shifts(left: Images, logits: Logits, planes: Planes) -> Images:
+def mix_shifts(left: Views, logits: Logits, planes: Planes) -> Views:
     """Draw the right view as a mixture: the left image under each shift, weighed by its share.
 
     Logits are of the size of ``left``, and ``planes`` in its pixels. What a training draws, since
@@ -377,9 +376,9 @@ class SynthesisedViews:
         street: probability that the left view shows a street; None where the generator cannot say.
     """
 
-    right: Float[Tensor, "b 3 h w"]
-    disparity_px: Float[Tensor, "b h w"] | None = None
-    confidence: Float[Tensor, "b h w"] | None = None
+    right: Views
+    disparity_px: Maps | None = None
+    confidence: Maps | None = None
     is_sky: Bool[Tensor, "b h w"] | None = None
     street: Float[Tensor, " b"] | None = None
 
@@ -398,9 +397,7 @@ class Synthesiser(Protocol):
         """Sizes at which it looks at an image, as shares of the first, which is the rig's."""
         ...
 
-    def draw(
-        self, left: Float[Tensor, "b 3 h w"], *larger: Float[Tensor, "b 3 _ _"]
-    ) -> SynthesisedViews:
+    def draw(self, left: Views, *larger: Float[Tensor, "b 3 _ _"]) -> SynthesisedViews:
         """Draw right views; images are RGB in [0, 1], and perhaps the same at other sizes."""
         ...
 
@@ -432,9 +429,7 @@ class SelectionSynthesiser:
         self.scales = self.config.scales if speed == "fine" else self.config.scales[:1]
 
     @torch.no_grad()
-    def draw(
-        self, left: Float[Tensor, "b 3 h w"], *larger: Float[Tensor, "b 3 _ _"]
-    ) -> SynthesisedViews:
+    def draw(self, left: Views, *larger: Float[Tensor, "b 3 _ _"]) -> SynthesisedViews:
         """Draw right views; images are RGB in [0, 1].
 
         Args:
@@ -487,9 +482,7 @@ class UNetSynthesiser:
                     part.train()
 
     @torch.no_grad()
-    def draw(
-        self, left: Float[Tensor, "b 3 h w"], *larger: Float[Tensor, "b 3 _ _"]
-    ) -> SynthesisedViews:
+    def draw(self, left: Views, *larger: Float[Tensor, "b 3 _ _"]) -> SynthesisedViews:
         """Draw right views; images are RGB in [0, 1], at one size.
 
         Raises:
@@ -506,9 +499,7 @@ class UNetSynthesiser:
 
 
 def select_views(
-    generator: SelectionGenerator,
-    left: Float[Tensor, "b 3 h w"],
-    size: tuple[int, int] | None = None,
+    generator: SelectionGenerator, left: Views, size: tuple[int, int] | None = None
 ) -> tuple[Selected, Selected]:
     """Answer disparity, sky and confidence of the left and of the right view, with gradients."""
     height, width = left.shape[-2:]
@@ -525,7 +516,7 @@ def select_views(
     return replace(first, street=generator.find_street(features[-1])), second
 
 
-def draw_right(generator: Generator, left: Float[Tensor, "b 3 h w"]) -> Float[Tensor, "b 3 h w"]:
+def draw_right(generator: Generator, left: Views) -> Views:
     """Draw right views of any size, RGB in [0, 1], with gradients.
 
     Sides close to a multiple of what the network takes are resized to it, others padded by

@@ -12,6 +12,14 @@ from depthpose.core.camera import Camera, StereoRig, back_project
 from depthpose.core.errors import InputError
 from depthpose.core.files import Cloud
 
+View = Float[Tensor, "3 h w"]
+"""An image, RGB in [0, 1]."""
+Views = Float[Tensor, "b 3 h w"]
+Map = Float[Tensor, "h w"]
+"""A number a pixel, NaN where it is not known."""
+Maps = Float[Tensor, "b h w"]
+Mask = Bool[Tensor, "h w"]
+
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class StereoInput:
@@ -26,7 +34,7 @@ class StereoInput:
     """
 
     name: str
-    left: Float[Tensor, "3 h w"]
+    left: View
     right: Float[Tensor, "3 right_h right_w"] | None
     camera: Camera | None
 
@@ -43,11 +51,11 @@ class StereoTruth:
         is_sky: left pixels that show the sky.
     """
 
-    disparity_px: Float[Tensor, "h w"] | None = None
-    depth_m: Float[Tensor, "h w"] | None = None
-    occluded: Bool[Tensor, "h w"] | None = None
-    right_disparity_px: Float[Tensor, "h w"] | None = None
-    is_sky: Bool[Tensor, "h w"] | None = None
+    disparity_px: Map | None = None
+    depth_m: Map | None = None
+    occluded: Mask | None = None
+    right_disparity_px: Map | None = None
+    is_sky: Mask | None = None
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -73,12 +81,12 @@ class RawFrame:
         camera_from_velodyne: from the LiDAR to the left camera.
     """
 
-    left: Float[Tensor, "3 h w"]
-    right: Float[Tensor, "3 h w"]
+    left: View
+    right: View
     rig: StereoRig
-    disparity_px: Float[Tensor, "h w"]
-    occluded: Bool[Tensor, "h w"]
-    is_sky: Bool[Tensor, "h w"]
+    disparity_px: Map
+    occluded: Mask
+    is_sky: Mask
     lidar_points: Float[Tensor, "n 4"] | None
     camera_from_velodyne: Float64[np.ndarray, "4 4"]
 
@@ -95,9 +103,9 @@ class Match:
             does not know the sky.
     """
 
-    disparity_px: Float[Tensor, "h w"]
-    confidence: Float[Tensor, "h w"] | None = None
-    is_sky: Bool[Tensor, "h w"] | None = None
+    disparity_px: Map
+    confidence: Map | None = None
+    is_sky: Mask | None = None
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -151,11 +159,11 @@ class DepthEstimate:
             estimate alone.
     """
 
-    depth_m: Float[Tensor, "h w"] | None
-    disparity_px: Float[Tensor, "h w"]
-    confidence: Float[Tensor, "h w"] | None = None
-    right: Float[Tensor, "3 h w"] | None = None
-    is_sky: Bool[Tensor, "h w"] | None = None
+    depth_m: Map | None
+    disparity_px: Map
+    confidence: Map | None = None
+    right: View | None = None
+    is_sky: Mask | None = None
     image_confidence: float | None = None
     ground: Ground | None = None
     warning: str = ""
@@ -202,7 +210,7 @@ class DepthEstimate:
         return f"DepthEstimate({', '.join(said)})"
 
 
-def _spread(values: Float[Tensor, "h w"], unit: str) -> str:
+def _spread(values: Map, unit: str) -> str:
     known = values[values.isfinite()]
     if not len(known):
         return "nowhere known"

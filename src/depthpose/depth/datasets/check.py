@@ -17,14 +17,10 @@ from depthpose.core.files import MAP_SUFFIXES, image_size, read_image, read_poin
 from depthpose.core.files.images import LISTED_SUFFIXES
 from depthpose.core.findings import CheckReport, Problem, make_report, unreadable
 from depthpose.depth.datasets.dataset import Dataset, read_split
-from depthpose.depth.datasets.frames import (
-    Frame,
-    frame_camera,
-    kitti_calibration,
-    read_depth,
-)
+from depthpose.depth.datasets.frames import Frame, frame_camera, kitti_calibration, read_depth
 from depthpose.depth.datasets.layouts import find_frames
 from depthpose.depth.disparity import disparity_from_depth
+from depthpose.depth.types import Map
 
 _MAX_DEPTH_M = 200
 """KITTI's LiDAR sees 120 m."""
@@ -224,9 +220,7 @@ def _check_truth(
     yield _problem(path, "mismatch", message)
 
 
-def _agreement(
-    disparity_px: Float[Tensor, "h w"], report: RectificationReport
-) -> tuple[float, int] | None:
+def _agreement(disparity_px: Map, report: RectificationReport) -> tuple[float, int] | None:
     """Share and number of matches that a map agrees with; None where it says too little.
 
     Corners lie at edges, so a value within a window may be the one that a match saw.

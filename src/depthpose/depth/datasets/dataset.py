@@ -9,9 +9,6 @@ from importlib import resources
 from itertools import pairwise
 from pathlib import Path
 
-from jaxtyping import Float
-from torch import Tensor
-
 from depthpose.core.camera import StereoRig
 from depthpose.core.errors import InputError, nearest_name
 from depthpose.core.files import image_size, read_image, read_text
@@ -26,7 +23,7 @@ from depthpose.depth.datasets.frames import (
 )
 from depthpose.depth.datasets.layouts import find_frames, local_folder
 from depthpose.depth.disparity import depth_from_disparity
-from depthpose.depth.types import StereoInput, StereoSample, StereoTruth
+from depthpose.depth.types import Map, StereoInput, StereoSample, StereoTruth
 
 # Frames, and the sha256 of our own file: drives in order, each with its frame numbers as ranges.
 _SHIPPED = {
@@ -255,7 +252,7 @@ def refuse_common(
         )
 
 
-def read_known_depth(dataset: Dataset, index: int) -> Float[Tensor, "h w"] | None:
+def read_known_depth(dataset: Dataset, index: int) -> Map | None:
     """Read what is known of the left image's depth [m]: LiDAR, depth map or disparity, in order.
 
     None where the frame has no truth at all.

@@ -42,6 +42,7 @@ from depthpose.core.files import (
 )
 from depthpose.core.files.images import KITTI_UNIT
 from depthpose.depth.config import TruthKind
+from depthpose.depth.types import Map
 
 _MAX_PAIRS_BYTES = 2**24
 """Of a text with a line for each pair of a folder."""
@@ -172,7 +173,7 @@ def project_lidar(
     pixels_from_velodyne: Float64[np.ndarray, "3 4"],
     size: tuple[int, int],
     depth: LidarDepth,
-) -> Float[Tensor, "h w"]:
+) -> Map:
     """Draw a scan into camera 2; NaN where no point falls. No interpolation.
 
     Points behind the scanner are dropped, pixels are rounded half to even and then moved by -1
@@ -319,7 +320,7 @@ def has_lidar(frame: Frame, depth: LidarDepth) -> bool:
     return frame.velodyne is not None or (depth == "camera_z" and _drawn_scan(frame) is not None)
 
 
-def lidar_truth(frame: Frame, depth: LidarDepth) -> Float[Tensor, "h w"]:
+def lidar_truth(frame: Frame, depth: LidarDepth) -> Map:
     """Draw the LiDAR scan of a frame into its left image; NaN where no point falls.
 
     Where there is no scan but a drawn one (``lidar_depth/`` of a plain folder, ``velodyne_raw`` of
@@ -365,7 +366,7 @@ def check_map_size(path: Path, values: Shaped[Tensor, "*any h w"], size: tuple[i
         )
 
 
-def read_disparity(path: Path) -> Float[Tensor, "h w"]:
+def read_disparity(path: Path) -> Map:
     """Read true disparity from a 16-bit PNG or TIFF, a TIFF of floats, PFM or NPY.
 
     NaN where it is unknown, 0 or below, or so large that no pixel of the right image is meant.
@@ -374,7 +375,7 @@ def read_disparity(path: Path) -> Float[Tensor, "h w"]:
     return torch.where(values < values.shape[1], values, torch.nan)
 
 
-def read_depth(path: Path) -> Float[Tensor, "h w"]:
+def read_depth(path: Path) -> Map:
     """Read true depth [m] as :func:`read_disparity`, of 16 bits x 256; NaN where it is unknown."""
     values = read_map(path) if path.suffix.lower() in MAP_SUFFIXES else read_stored_depth(path)
     if not values.is_floating_point():

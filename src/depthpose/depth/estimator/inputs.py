@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from jaxtyping import Float, Shaped
+from jaxtyping import Shaped
 from PIL.Image import Image
 from torch import Tensor
 
@@ -19,7 +19,7 @@ from depthpose.core.camera import (
 )
 from depthpose.core.errors import InputError, Notice
 from depthpose.core.files import picture_tensor, read_exif_focal, read_image
-from depthpose.depth.types import StereoInput
+from depthpose.depth.types import StereoInput, View
 
 Picture = str | Path | Image | Shaped[Tensor, "..."] | Shaped[np.ndarray, "..."]
 """A file, a picture of Pillow's, an array or a tensor: RGB, RGBA (alpha is dropped) or grey, whole
@@ -32,7 +32,7 @@ _VALUES = (
 )
 
 
-def as_tensor(image: object, name: str = "the image") -> Float[Tensor, "3 h w"]:
+def as_tensor(image: object, name: str = "the image") -> View:
     """Read a :data:`Picture`, or bring it to RGB in [0, 1]; a batch of one is its image."""
     match image:
         case str() | Path():
@@ -53,7 +53,7 @@ def as_tensor(image: object, name: str = "the image") -> Float[Tensor, "3 h w"]:
             return check_image(image, name)
 
 
-def _rgb(values: Tensor, sides: tuple[int, int], what: str) -> Float[Tensor, "3 h w"]:
+def _rgb(values: Tensor, sides: tuple[int, int], what: str) -> View:
     """Bring three channels in [0, 1] to the front."""
     shape = tuple(values.shape)
     if values.ndim == 4 and shape[0] != 1:
@@ -118,7 +118,7 @@ def refuse_unrectified(pair: StereoInput) -> str:
     return report.message if report.is_rectified is None else ""
 
 
-def usable_right(pair: StereoInput) -> Float[Tensor, "3 h w"]:
+def usable_right(pair: StereoInput) -> View:
     """Give the right view of a pair that can be matched.
 
     Raises:

@@ -55,7 +55,7 @@ from depthpose.depth.ground import scale_by_distance, scale_by_mount
 from depthpose.depth.stereo import CameraMatcher, Matcher, SGBMMatcher, make_matcher
 from depthpose.depth.stereo.light import LEAST_PX
 from depthpose.depth.synthesis import SelectionGenerator, Synthesiser, make_synthesiser
-from depthpose.depth.types import DepthEstimate, Match, StereoInput
+from depthpose.depth.types import DepthEstimate, Mask, Match, StereoInput
 from depthpose.depth.weights import Use, read_depth_weights
 
 DEFAULT = "default"
@@ -508,7 +508,7 @@ def from_pair(pair: StereoInput, match: Match, warning: str = "") -> DepthEstima
     )
 
 
-def _without_specks(is_sky: Bool[Tensor, "h w"] | None) -> Bool[Tensor, "h w"] | None:
+def _without_specks(is_sky: Mask | None) -> Mask | None:
     """Take a few pixels of sky in an image for none: a lamp or a window, at the match's depth."""
     return None if is_sky is None else is_sky & (is_sky.float().mean() >= _LEAST_SKY)
 

@@ -17,9 +17,9 @@ from torch import Tensor, nn
 from depthpose.core.errors import InputError
 from depthpose.depth.config import LightConfig, MatcherConfig, PSMNetConfig
 from depthpose.depth.stereo.light import LightStereo
-from depthpose.depth.stereo.matcher import Matcher, NetworkMatcher, StereoNetwork, Views
+from depthpose.depth.stereo.matcher import Matcher, NetworkMatcher, StereoNetwork
 from depthpose.depth.stereo.psmnet import CHUNK_BYTES, ConvNorm, PSMNet, Size, expected_disparity
-from depthpose.depth.types import Match
+from depthpose.depth.types import Match, Views
 
 MARGIN = 1.1
 """Allocators keep gaps: measured peaks stay below the sum of the tensors times this ..."""

@@ -23,7 +23,7 @@ from torch import Tensor, nn
 from depthpose.core.errors import InputError
 from depthpose.depth.config import LightConfig
 from depthpose.depth.encoder import LiteEncoder
-from depthpose.depth.stereo.matcher import IMAGENET_MEAN, IMAGENET_STD, Maps, StereoNetwork
+from depthpose.depth.stereo.matcher import IMAGENET_MEAN, IMAGENET_STD, StereoNetwork
 from depthpose.depth.stereo.psmnet import (
     Shape,
     by_rows,
@@ -33,6 +33,7 @@ from depthpose.depth.stereo.psmnet import (
     interpolation_matrix,
     linear_taps,
 )
+from depthpose.depth.types import Maps, Views
 
 Features = Float[Tensor, "b _ _ _"]
 Quarter = Float[Tensor, "b h4 w4"]
@@ -172,7 +173,7 @@ def _neighbours(quarter: Quarter) -> Float[Tensor, "b 9 h2 w2"]:
     return F.interpolate(torch.cat(near, 1), scale_factor=2.0, mode="nearest")
 
 
-def enlarge(quarter: Quarter, weights: Float[Tensor, "b 9 4 h2 w2"]) -> Float[Tensor, "b h w"]:
+def enlarge(quarter: Quarter, weights: Float[Tensor, "b 9 4 h2 w2"]) -> Maps:
     """Bring a map to full size: each pixel is a mean of nine neighbours, weighed."""
     return F.pixel_shuffle((weights * _neighbours(quarter)[:, :, None]).sum(1), 2)[:, 0]
 
@@ -302,7 +303,7 @@ class LightFeatures(nn.Module):
     mean: Tensor
     deviation: Tensor
 
-    def forward(self, image: Float[Tensor, "b 3 h w"]) -> ViewFeatures:
+    def forward(self, image: Views) -> ViewFeatures:
         """Give features of each pixel with local and global context."""
         image = image.contiguous(memory_format=torch.channels_last)
         half = F.relu(self.stem(image))
@@ -427,26 +428,17 @@ class LightStereo(StereoNetwork):
         """The class of the sky."""
         return self.sky_head
 
-    def forward(
-        self, left: Float[Tensor, "b 3 h w"], right: Float[Tensor, "b 3 h w"]
-    ) -> tuple[Maps, ...]:
+    def forward(self, left: Views, right: Views) -> tuple[Maps, ...]:
         """Give the disparity maps of :meth:`read`."""
         return self.read(left, right, self.config.max_disparity_px).heads
 
-    def forward_with_sky(
-        self, left: Float[Tensor, "b 3 h w"], right: Float[Tensor, "b 3 h w"]
-    ) -> tuple[tuple[Maps, ...], Maps | None]:
+    def forward_with_sky(self, left: Views, right: Views) -> tuple[tuple[Maps, ...], Maps | None]:
         """Give the disparity maps of :meth:`read`, and the probability of the sky."""
         read = self.read(left, right, self.config.max_disparity_px)
         return read.heads, read.sky
 
     def read(
-        self,
-        left: Float[Tensor, "b 3 h w"],
-        right: Float[Tensor, "b 3 h w"],
-        max_disparity_px: int,
-        *,
-        with_confidence: bool = False,
+        self, left: Views, right: Views, max_disparity_px: int, *, with_confidence: bool = False
     ) -> Reading:
         """Match the pair, and read disparity, confidence and sky off the scores.
 
@@ -487,7 +479,7 @@ class LightStereo(StereoNetwork):
         return Reading(heads, confidence, sky)
 
     def scores(
-        self, left: Float[Tensor, "b 3 h w"], right: Float[Tensor, "b 3 h w"], max_disparity_px: int
+        self, left: Views, right: Views, max_disparity_px: int
     ) -> tuple[Scores, ViewFeatures, Features | None]:
         """Answer a score for each disparity at 1/4 size, and what the enlargement sees.
 

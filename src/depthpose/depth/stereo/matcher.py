@@ -29,7 +29,7 @@ from depthpose.depth.disparity import (
     resized_match,
 )
 from depthpose.depth.encoder import LiteEncoder
-from depthpose.depth.types import Match
+from depthpose.depth.types import Map, Maps, Match, View, Views
 
 
 @runtime_checkable
@@ -236,9 +236,6 @@ IMAGENET_MEAN = (0.485, 0.456, 0.406)
 IMAGENET_STD = (0.229, 0.224, 0.225)
 DTYPES = {"fp32": torch.float32, "bf16": torch.bfloat16}
 
-Views = Float[Tensor, "b 3 h w"]
-Maps = Float[Tensor, "b h w"]
-
 NetworkConfig = PSMNetConfig | LightConfig
 
 AGREEMENT_PX = 3.0
@@ -431,7 +428,7 @@ def pad_top_right(
     return F.pad(image, (0, w - image.shape[-1], h - image.shape[-2], 0))
 
 
-def lower_where_disagreeing(found: Match, right_px: Float[Tensor, "h w"]) -> Match:
+def lower_where_disagreeing(found: Match, right_px: Map) -> Match:
     """Lower the confidence where the right view's own disparity is another.
 
     Halved at least where the matching point lies outside the right view: nothing there can
@@ -467,9 +464,6 @@ def tile_change_px(
     return float((tiled.disparity_px - untiled.disparity_px).abs().mean())
 
 
-Image = Float[Tensor, "3 h w"]
-
-
 class Tiling(NamedTuple):
     """Size of a tile's own part, what neighbours share, and what lies to the left besides [px].
 
@@ -493,7 +487,7 @@ class Span(NamedTuple):
 
 
 def match_tiles(
-    match: Callable[[Image, Image], Match], left: Image, right: Image, tiling: Tiling
+    match: Callable[[View, View], Match], left: View, right: View, tiling: Tiling
 ) -> Match:
     """Match tile by tile and blend the answers linearly where tiles overlap."""
     h, w = left.shape[-2:]

@@ -18,7 +18,8 @@ from depthpose.core.checkpoint import Checkpoint, file_sha256, read_published, s
 from depthpose.core.config import config_to_dict
 from depthpose.core.errors import InputError
 from depthpose.depth.config import PSMNetConfig
-from depthpose.depth.stereo.matcher import Maps, StereoNetwork
+from depthpose.depth.stereo.matcher import StereoNetwork
+from depthpose.depth.types import Map, Maps, Views
 
 CHUNK_BYTES = 6 << 20
 """Size of one piece of the soft arg-min; it fits the caches."""
@@ -114,7 +115,7 @@ def expected_disparity(
     align_corners: bool,
     chunk_bytes: int = CHUNK_BYTES,
     with_confidence: bool,
-) -> tuple[Float[Tensor, "h w"], Float[Tensor, "h w"] | None]:
+) -> tuple[Map, Map | None]:
     """Enlarge the cost to ``size`` and take the expected disparity [px], some rows at a time.
 
     Equals :func:`depthpose.depth.stereo.psmnet.soft_argmin`.
@@ -227,7 +228,7 @@ class FeatureExtractor(nn.Module):
         self.fuse = conv_norm_2d((6 + len(config.pools)) * c, 4 * c)
         self.project = nn.Conv2d(4 * c, c, 1, bias=False)
 
-    def forward(self, image: Float[Tensor, "b 3 h w"]) -> Float[Tensor, "b c h4 w4"]:
+    def forward(self, image: Views) -> Float[Tensor, "b c h4 w4"]:
         """Give features of each pixel with local and global context."""
         x = image
         for layer in self.stem:
@@ -352,9 +353,7 @@ class PSMNet(StereoNetwork):
         self.heads = nn.ModuleList([Head(c) for _ in range(3)])
         self.apply(_initialise)
 
-    def forward(
-        self, left: Float[Tensor, "b 3 h w"], right: Float[Tensor, "b 3 h w"]
-    ) -> tuple[Maps, ...]:
+    def forward(self, left: Views, right: Views) -> tuple[Maps, ...]:
         """Match the pair.
 
         Returns:
@@ -379,10 +378,7 @@ class PSMNet(StereoNetwork):
         )
 
     def costs(
-        self,
-        left: Float[Tensor, "b 3 h w"],
-        right: Float[Tensor, "b 3 h w"],
-        max_disparity_px: int | None = None,
+        self, left: Views, right: Views, max_disparity_px: int | None = None
     ) -> tuple[Volume, Volume, Volume]:
         """Answer the quarter-size cost after each hourglass; each adds to the one before.
 

@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Float64, Int
+from jaxtyping import Float, Float64, Int
 from torch import Tensor
 from torch.nn import functional as F
 
@@ -22,7 +22,7 @@ from depthpose.depth.disparity import disparity_from_depth
 from depthpose.depth.synthetic.scene import StreetScene, make_clutter, make_scene, street_rig
 from depthpose.depth.synthetic.shading import Hits, Stage, prepare, shade, sky_light
 from depthpose.depth.synthetic.textures import NUMBER
-from depthpose.depth.types import RawFrame, StereoInput, StereoSample, StereoTruth
+from depthpose.depth.types import Map, Mask, RawFrame, StereoInput, StereoSample, StereoTruth, View
 
 NEAR_M = 0.3
 
@@ -228,7 +228,7 @@ def draw_sensors(
     return left, right
 
 
-def expose(light: Float[Tensor, "h w 3"], sensor: Sensor) -> Float[Tensor, "3 h w"]:
+def expose(light: Float[Tensor, "h w 3"], sensor: Sensor) -> View:
     """Take a picture: RGB in [0, 1], in steps of 1/255."""
     signal = light.permute(2, 0, 1) * torch.tensor(sensor.exposure)[:, None, None]
     height, width = signal.shape[1:]
@@ -326,9 +326,9 @@ class StreetFrame(RawFrame):
         is_road: left pixels that see the carriageway.
     """
 
-    right_disparity_px: Float[Tensor, "h w"]
-    depth_m: Float[Tensor, "h w"]
-    is_road: Bool[Tensor, "h w"]
+    right_disparity_px: Map
+    depth_m: Map
+    is_road: Mask
 
 
 def draw_street(config: StreetsConfig, index: int) -> StreetFrame:
@@ -393,7 +393,7 @@ def draw_scene(
     )
 
 
-def _occluded(left: Sight, right: Sight, rig: StereoRig) -> Bool[Tensor, "h w"]:
+def _occluded(left: Sight, right: Sight, rig: StereoRig) -> Mask:
     """Ask for each left point what the right camera sees where it should be."""
     height, width = left.raster.primitive.shape
     primitive, depth_m = left.raster.primitive.flatten(), left.raster.depth_m.flatten()

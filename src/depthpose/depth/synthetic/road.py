@@ -1,4 +1,4 @@
-"""The road, the ground beside it, and what stands there: houses, gardens, trees, lamps and signs.
+"""The road, the ground beside it, what stands there, and its traffic.
 
 Everything is laid out along a straight street first, at (x to the right, y down, s ahead) with the
 camera's car at x = s = 0, and then bent as a whole.
@@ -11,24 +11,9 @@ from typing import Literal
 import numpy as np
 from jaxtyping import Float, Float64
 
+from depthpose.depth.synthetic import models
 from depthpose.depth.synthetic.buildings import Plot, add_house
 from depthpose.depth.synthetic.mesh import Mesh, MeshBuilder, place
-from depthpose.depth.synthetic.models import (
-    BUSHES,
-    FENCE_M,
-    HEDGES,
-    TREES,
-    add_wood_edge,
-    bush,
-    fence,
-    hedge,
-    lamp,
-    leaf_color,
-    sign,
-    small_thing,
-    traffic_light,
-    tree,
-)
 from depthpose.depth.synthetic.textures import Number, Surface
 
 Place = Literal["city", "suburb", "avenue", "rural", "forest"]
@@ -290,7 +275,7 @@ def add_roadside(b: MeshBuilder, road: Road) -> None:
     if rng.random() < 0.6:
         s, half = rng.uniform(170, 300), rng.uniform(60, 160)
         stop = (half, s + rng.uniform(-40, 40))
-        add_wood_edge(b, (-half, s), stop, rng.uniform(7, 14))
+        models.add_wood_edge(b, (-half, s), stop, rng.uniform(7, 14))
 
 
 class _Roadside:
@@ -397,7 +382,7 @@ class _Roadside:
         near, height = (rng.uniform(8, 13), 13.0) if is_forest else (rng.uniform(14, 55), 9.0)
         s, x = rng.uniform(-10, 0 if is_forest else 60), self.x_m(near)
         stop, other = s + rng.uniform(60, 200), x + self.side * rng.uniform(-2, 15)
-        add_wood_edge(self.b, (x, s), (other, stop), height * rng.uniform(0.7, 1.3))
+        models.add_wood_edge(self.b, (x, s), (other, stop), height * rng.uniform(0.7, 1.3))
 
     def add_copse(self, s: Number, length: Number, depth: Number) -> None:
         """Some trees and bushes."""
@@ -420,7 +405,7 @@ class _Roadside:
             number, step = int(rng.integers(6)), rng.uniform(16, 34)
             for s in np.arange(rng.uniform(2, 25), 110, step):
                 if not road.is_side_street(s, side):
-                    self.b.add(place(lamp(number), (x, y, s), 0.0 if side < 0 else np.pi))
+                    self.b.add(place(models.lamp(number), (x, y, s), 0.0 if side < 0 else np.pi))
         s = rng.uniform(3, 12)
         is_town = road.place not in ("rural", "forest")
         while s < 70:
@@ -428,18 +413,18 @@ class _Roadside:
                 where = (x + side * rng.uniform(0, 0.4), y, s)
                 kind = rng.random()
                 if kind < 0.4:
-                    model = sign(int(rng.integers(20)))
+                    model = models.sign(int(rng.integers(20)))
                     yaw = rng.normal(0, 0.12) + np.pi * (rng.random() < 0.2)
                     self.b.add(place(model, where, yaw))
                 elif kind < 0.8 or not is_town:
                     number = int(rng.choice([0, 1, 2, 3, 4, 5])) if is_town else 3
-                    self.b.add(place(small_thing(number), where, rng.normal(0, 0.1)))
+                    self.b.add(place(models.small_thing(number), where, rng.normal(0, 0.1)))
                 else:
                     self.add_tree(where[0] + side * 0.4, s, rng.uniform(3.5, 7))
             s += rng.uniform(3, 14) * (1 if is_town else 1.8)
         for street in road.side_streets:
             if side in street.sides and rng.random() < 0.4:
-                light = traffic_light(int(rng.integers(4)))
+                light = models.traffic_light(int(rng.integers(4)))
                 where = (x, y, street.s_m - street.half_m - 1)
                 self.b.add(place(light, where, 0, (-side, 1, 1)))
         if rng.random() < 0.25:  # wooden poles with cables between them, which hang
@@ -479,16 +464,16 @@ class _Roadside:
             return
         rng = self.rng
         number, height = int(rng.integers(20)), rng.uniform(0.7, 1.9)
-        color = leaf_color(rng)
-        for s in np.arange(start + 2, min(stop, 95), FENCE_M):
+        color = models.leaf_color(rng)
+        for s in np.arange(start + 2, min(stop, 95), models.FENCE_M):
             if self.road.is_side_street(s, self.side, 2.2):
                 continue
             where = (self.x_m(0.45), -self.road.curb_m, s)
             if kind == 1:
-                model = hedge(int(rng.integers(HEDGES)))
+                model = models.hedge(int(rng.integers(models.HEDGES)))
                 self.b.add(place(model, where, 0, (1, height, 1), {"leaf": color}))
             else:
-                self.b.add(place(fence(number), where))
+                self.b.add(place(models.fence(number), where))
 
     def add_tree_row(self, x: Number) -> None:
         """Trees along the road, at even distances."""
@@ -502,17 +487,116 @@ class _Roadside:
     def add_tree(self, x: Number, s: Number, height: Number | None) -> None:
         """A tree of some kind, coarser where it is far away."""
         tall = self.rng.uniform(5, 12) if height is None else height
-        number = int(self.rng.integers(TREES))
+        number = int(self.rng.integers(models.TREES))
         wide = tall * self.rng.uniform(0.85, 1.15)
-        model = tree(number, int(s > 24) + int(s > 48 or abs(x) > 25))
+        model = models.tree(number, int(s > 24) + int(s > 48 or abs(x) > 25))
         self.add_plant(model, x, s, np.array([wide, tall, wide]) / 10)
 
     def add_bush(self, x: Number, s: Number, size: Number) -> None:
         """A bush of some kind, coarser where it is far away."""
-        model = bush(int(self.rng.integers(BUSHES)), int(s > 20))
+        model = models.bush(int(self.rng.integers(models.BUSHES)), int(s > 20))
         self.add_plant(model, x, s, size * self.rng.uniform(0.7, 1.3, 3))
 
     def add_plant(self, model: Mesh, x: Number, s: Number, scale: np.ndarray) -> None:
         """A model turned at random, with leaves of some colour."""
-        tints = {"leaf": leaf_color(self.rng)}
+        tints = {"leaf": models.leaf_color(self.rng)}
         self.b.add(place(model, (x, 0, s), self.rng.uniform(0, 6.28), scale, tints))
+
+
+class Traffic:
+    """Vehicles and people on a road, none where another one is; every method adds to the mesh."""
+
+    def __init__(self, b: MeshBuilder, road: Road) -> None:
+        self.b, self.rng, self.road = b, b.rng, road
+        # x, s, half width and half length of the camera's own car, and of sight before it [m].
+        self._taken = [(0.0, 0.5, 1.5, 4.5)]
+
+    def claim(self, x: Number, s: float, half_x: Number, half_s: float) -> bool:
+        """Take a place [m], if it is free."""
+        for other in self._taken:
+            if abs(x - other[0]) < half_x + other[2] and abs(s - other[1]) < half_s + other[3]:
+                return False
+        self._taken.append((x, s, half_x, half_s))
+        return True
+
+    def add_parked(self) -> None:
+        """Cars in the strips for them, or at the edge of streets without one."""
+        rng, road = self.rng, self.road
+        for side in (-1, 1):
+            width = road.parking_m[(side + 1) // 2]
+            on_edge = not width and road.place in ("city", "suburb") and rng.random() < 0.25
+            if not width and not on_edge:
+                continue
+            fill, s = rng.uniform(0.3, 0.95), rng.uniform(-4, 9)
+            while s < 85:
+                x = road.edge_m(side) - side * rng.uniform(0.92, 1.15)
+                if rng.random() < fill and not road.is_side_street(s, side, 3):
+                    ahead = 0.0 if (side > 0) == (rng.random() < 0.93) else np.pi
+                    self.add_vehicle(x, s, ahead + rng.normal(0, 0.02))
+                s += rng.uniform(5.0, 6.5)
+
+    def add_driving(self) -> None:
+        """Vehicles in the lanes."""
+        rng, road = self.rng, self.road
+        usual = {"avenue": 1.3, "forest": 0.6, "rural": 0.6}.get(road.place, 0.9)
+        density = rng.uniform(0.15, 1) * usual
+        for lane in range(road.lanes):
+            x = road.left_m + road.parking_m[0] + (lane + 0.5) * road.lane_m
+            is_oncoming = lane < road.lanes // 2
+            s = rng.uniform(7, 30)
+            while s < 110:
+                if rng.random() < density * 0.6:
+                    yaw = rng.normal(0, 0.02) + (np.pi if is_oncoming else 0)
+                    self.add_vehicle(x + rng.normal(0, 0.25), s, yaw)
+                s += rng.uniform(7, 32)
+
+    def add_crossing(self) -> None:
+        """Vehicles in the side streets, waiting or turning."""
+        rng, road = self.rng, self.road
+        for street in road.side_streets:
+            for side in street.sides:
+                if rng.random() < 0.5 and street.s_m > 8:
+                    x = road.edge_m(side) + side * rng.uniform(2.5, 16)
+                    s = street.s_m + rng.choice([-0.45, 0.45]) * street.half_m
+                    self.add_vehicle(x, s, rng.choice([-1, 1]) * np.pi / 2 + rng.normal(0, 0.1))
+
+    def add_vehicle(self, x: Number, s: Number, yaw: Number) -> None:
+        """A vehicle of some kind and colour, if its place is free."""
+        rng, shares = self.rng, np.array([body.share for body in models.BODIES.values()])
+        kind = list(models.BODIES)[rng.choice(len(shares), p=shares / shares.sum())]
+        length, width, _ = models.BODIES[kind].size_m
+        c, t = abs(np.cos(yaw)), abs(np.sin(yaw))
+        half_x, half_s = (width * c + length * t) / 2 + 0.1, (length * c + width * t) / 2 + 0.3
+        if not self.claim(x, s, half_x, half_s):
+            return
+        shares = np.array([share for _, share in models.PAINTS])
+        color, _ = models.PAINTS[rng.choice(len(models.PAINTS), p=shares / shares.sum())]
+        color = tuple(np.array(color) * rng.uniform(0.8, 1.15))
+        model = models.vehicle(kind, int(rng.integers(models.MODELS)))
+        tints = {"paint": color, "side": color}
+        self.b.add(place(model, (x, 0, s), yaw, rng.uniform(0.96, 1.04, 3), tints))
+
+    def add_people(self) -> None:
+        """People on foot, on the pavement and now and then the road, and on bicycles."""
+        rng, road = self.rng, self.road
+        mean = {"city": 5.0, "suburb": 1.5, "avenue": 2.0}.get(road.place, 0.4)
+        for _ in range(int(rng.poisson(mean))):
+            side = int(rng.choice([-1, 1]))
+            s, strip = rng.uniform(5, 50), road.verge_m + road.walk_m
+            x = road.edge_m(side) + side * rng.uniform(0.3, max(0.6, strip - 0.2))
+            if rng.random() < 0.12:
+                x = rng.uniform(road.left_m, road.right_m)
+            if not self.claim(x, s, 0.3, 0.3):
+                continue
+            on_road = road.left_m < x < road.right_m
+            turns = rng.choice([0, np.pi, np.pi / 2, -np.pi / 2], p=[0.35, 0.35, 0.15, 0.15])
+            yaw = float(turns) + rng.normal(0, 0.2) + (np.pi / 2 if on_road else 0)
+            y = 0.0 if on_road else -road.curb_m
+            self.b.add(place(models.walker(int(rng.integers(models.WALKERS))), (x, y, s), yaw))
+        for _ in range(int(rng.poisson(mean * 0.3))):
+            side = int(rng.choice([-1, 1]))
+            x = road.edge_m(side) - side * (road.parking_m[(side + 1) // 2] + rng.uniform(0.3, 0.9))
+            s = rng.uniform(6, 45)
+            if self.claim(x, s, 0.4, 1.0):
+                yaw = rng.normal(0, 0.08) + (0 if side > 0 else np.pi)
+                self.b.add(place(models.rider(int(rng.integers(models.RIDERS))), (x, 0, s), yaw))

@@ -16,11 +16,10 @@ from jaxtyping import Float64
 
 from depthpose.core.camera import StereoRig, crop_camera, resize_camera
 from depthpose.depth.config import StreetsConfig
+from depthpose.depth.synthetic import road as roads
 from depthpose.depth.synthetic.mesh import Mesh, MeshBuilder, Rotation, between, join
 from depthpose.depth.synthetic.models import add_ball, add_leaves
-from depthpose.depth.synthetic.road import Place, Road, add_ground, add_roadside, bend, draw_road
 from depthpose.depth.synthetic.textures import Surface, Values
-from depthpose.depth.synthetic.traffic import add_traffic
 
 Vector = Float64[np.ndarray, "3"]
 
@@ -95,7 +94,7 @@ class StreetScene:
     markings: Markings
     weather: Weather
     camera_from_world: Float64[np.ndarray, "3 3"]
-    place: Place | Literal["clutter"]
+    place: roads.Place | Literal["clutter"]
 
 
 def make_scene(seed: tuple[int, ...], mount_height_m: float = 1.65) -> StreetScene:
@@ -106,12 +105,16 @@ def make_scene(seed: tuple[int, ...], mount_height_m: float = 1.65) -> StreetSce
         mount_height_m: height of the cameras above the road, some centimetres more or less.
     """
     rng = np.random.default_rng([71, *seed])
-    road = draw_road(rng)
+    road = roads.draw_road(rng)
     builder, far = MeshBuilder(rng), MeshBuilder(rng)
-    add_ground(builder, road)
-    add_roadside(builder, road)
-    add_traffic(builder, road)
-    street = bend(builder.finish(), road)
+    roads.add_ground(builder, road)
+    roads.add_roadside(builder, road)
+    traffic = roads.Traffic(builder, road)
+    traffic.add_parked()
+    traffic.add_driving()
+    traffic.add_crossing()
+    traffic.add_people()
+    street = roads.bend(builder.finish(), road)
     # A ring of far hills or woods, 900 m away.
     angle = np.linspace(-1.35, 1.35, 120)
     wave = np.zeros_like(angle)
@@ -146,7 +149,7 @@ def make_scene(seed: tuple[int, ...], mount_height_m: float = 1.65) -> StreetSce
     )
 
 
-def _draw_markings(rng: np.random.Generator, road: Road) -> Markings:
+def _draw_markings(rng: np.random.Generator, road: roads.Road) -> Markings:
     """Lines; stop lines and zebra crossings before side streets, dashes across their mouths."""
     is_marked = road.place in ("avenue", "rural", "forest") or rng.random() < 0.5
     dash, half = rng.uniform(2, 6), rng.uniform(0.05, 0.08)
@@ -245,14 +248,33 @@ _PLAIN_SHARE = 0.3
 
 
 def make_clutter(seed: tuple[int, ...]) -> StreetScene:
-    """Make the clutter that belongs to ``seed``.
-
-    Args:
-        seed: any whole numbers.
-    """
+    """Make the clutter that belongs to ``seed``, any whole numbers."""
     rng = np.random.default_rng([74, *seed])
     b = MeshBuilder(rng)
-    _add_backdrop(b)
+
+    def sheet(corner: Values, along: Values, up: Values) -> None:
+        b.begin_thing()
+        b.rectangle(corner, along, up, _surface(rng, rng.uniform(0.5, 4)))
+
+    # A ground, somewhat aslant; a wall across the view and a ground; or the inside of a box.
+    kind = int(rng.integers(3))
+    if kind == 2:
+        half, depth = rng.uniform(3, 14), rng.uniform(8, 45)
+        floor, top = rng.uniform(1, 3), rng.uniform(-6, -2)
+        up = [0, -(floor - top), 0]
+        sheet([-half, floor, 0], [2 * half, 0, 0], [0, 0, depth])
+        sheet([-half, floor, depth], [2 * half, 0, 0], up)
+        for x in (-half, half):
+            sheet([x, floor, 0], [0, 0, depth], up)
+        if rng.random() < 0.6:
+            sheet([-half, top, 0], [2 * half, 0, 0], [0, 0, depth])
+    elif kind == 1:
+        turn, z = rng.uniform(-0.9, 0.9), rng.uniform(18, 60)
+        along = np.array([np.cos(turn), rng.normal(0, 0.1), np.sin(turn)]) * 300
+        sheet(np.array([0, 20, z]) - along / 2, along, [0, -40, rng.normal(0, 10)])
+    if kind != 2:
+        y, slope = rng.uniform(1.0, 3.0), rng.normal(0, 0.02)
+        sheet([-150, y, 0], [300, rng.normal(0, 8), 0], [0, slope * 300, 300])
     for _ in range(int(rng.integers(12, 60))):
         b.begin_thing()
         z = _log_uniform(rng, *_DEPTHS_M)
@@ -273,34 +295,6 @@ def make_clutter(seed: tuple[int, ...]) -> StreetScene:
         camera_from_world=np.eye(3),
         place="clutter",
     )
-
-
-def _add_backdrop(b: MeshBuilder) -> None:
-    """A ground, somewhat aslant; a wall across the view and a ground; or the inside of a box."""
-    rng = b.rng
-
-    def sheet(corner: Values, along: Values, up: Values) -> None:
-        b.begin_thing()
-        b.rectangle(corner, along, up, _surface(rng, rng.uniform(0.5, 4)))
-
-    kind = int(rng.integers(3))
-    if kind == 2:
-        half, depth = rng.uniform(3, 14), rng.uniform(8, 45)
-        floor, top = rng.uniform(1, 3), rng.uniform(-6, -2)
-        up = [0, -(floor - top), 0]
-        sheet([-half, floor, 0], [2 * half, 0, 0], [0, 0, depth])
-        sheet([-half, floor, depth], [2 * half, 0, 0], up)
-        for x in (-half, half):
-            sheet([x, floor, 0], [0, 0, depth], up)
-        if rng.random() < 0.6:
-            sheet([-half, top, 0], [2 * half, 0, 0], [0, 0, depth])
-        return
-    if kind == 1:
-        turn, z = rng.uniform(-0.9, 0.9), rng.uniform(18, 60)
-        along = np.array([np.cos(turn), rng.normal(0, 0.1), np.sin(turn)]) * 300
-        sheet(np.array([0, 20, z]) - along / 2, along, [0, -40, rng.normal(0, 10)])
-    y, slope = rng.uniform(1.0, 3.0), rng.normal(0, 0.02)
-    sheet([-150, y, 0], [300, rng.normal(0, 8), 0], [0, slope * 300, 300])
 
 
 def _surface(rng: np.random.Generator, size_m: float) -> Surface:

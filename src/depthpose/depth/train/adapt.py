@@ -10,8 +10,7 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 import torch
-from jaxtyping import Bool
-from torch import Tensor, nn
+from torch import nn
 
 from depthpose.core.checkpoint import file_sha256, find_weights
 from depthpose.core.errors import InputError
@@ -27,7 +26,7 @@ from depthpose.depth.metrics import disparity_errors
 from depthpose.depth.stereo import NetworkMatcher, StereoNetwork, make_matcher, normalise
 from depthpose.depth.synthetic import Streets
 from depthpose.depth.train.config import AdaptTraining
-from depthpose.depth.types import StereoInput
+from depthpose.depth.types import Mask, StereoInput
 
 _LIMITS = LabelConfig()
 """When the disparities of both views agree."""
@@ -107,8 +106,8 @@ class AdaptationCheck:
         self.pairs, self.config = pairs, config
         made = Streets(StreetsConfig(seed=_STREETS_SEED, scale=0.5, frames=max(streets, 1)))
         self.streets = [made[index] for index in range(streets)]
-        self._seen: list[Bool[Tensor, "h w"]] = []
-        self._sky: list[Bool[Tensor, "h w"] | None] = []
+        self._seen: list[Mask] = []
+        self._sky: list[Mask | None] = []
 
     @torch.no_grad()
     def measure(self, matcher: StereoNetwork) -> AdaptMetrics:

@@ -49,6 +49,7 @@ from depthpose.depth.train.config import (
     ViewTraining,
 )
 from depthpose.depth.train.pairs import TrainingPairs
+from depthpose.depth.types import Maps
 
 
 def _groups(network: nn.Module, encoder: LiteEncoder, rate: float) -> list[dict[str, object]]:
@@ -157,9 +158,7 @@ def validate_pairs(
 
 
 @torch.no_grad()
-def mean_error_px(
-    found_px: Float[Tensor, "b h w"], truth_px: Float[Tensor, "b h w"], max_px: int
-) -> Float[Tensor, ""]:
+def mean_error_px(found_px: Maps, truth_px: Maps, max_px: int) -> Float[Tensor, ""]:
     """Mean absolute disparity error over the pixels with truth [px]."""
     is_valid = valid_disparity(truth_px, max_px)
     error = torch.where(is_valid, (found_px - truth_px.nan_to_num(0.0)).abs(), 0.0)
@@ -359,7 +358,7 @@ class SelectTask:
         yield Update("generator", loss, facts)
 
     def _truth_loss(
-        self, logits: Float[Tensor, "b k rows columns"], truth_px: Float[Tensor, "b h w"]
+        self, logits: Float[Tensor, "b k rows columns"], truth_px: Maps
     ) -> Float[Tensor, ""]:
         """Losses of the disparity of one view."""
         planes, range_px = self.generator.planes, self.generator.config.disparity_px
