@@ -18,6 +18,7 @@ from depthpose.depth.types import View
 SMALLEST_DEPTH_M = 1e-3
 """Predicted depth of zero or below becomes this, as in the published script of the Eigen split."""
 
+Numbers = Float[Tensor, " n"]
 Quantity = Literal["depth", "disparity", "disparity_noc"]
 """Depth [m]; disparity [px] of all pixels with truth, or of those that both views see."""
 
@@ -77,9 +78,7 @@ class DisparityErrors:
     d1_all: float
 
 
-def measure(
-    of: Quantity, predicted: Float[Tensor, " n"], true: Float[Tensor, " n"]
-) -> dict[str, float]:
+def measure(of: Quantity, predicted: Numbers, true: Numbers) -> dict[str, float]:
     """Give every metric of a kind, in the order of ``METRICS``.
 
     Args:
@@ -103,15 +102,13 @@ def measure(
     return {one.name: one.function(p, t) for one in METRICS.values() if one.of == of}
 
 
-def depth_errors(predicted_m: Float[Tensor, " n"], true_m: Float[Tensor, " n"]) -> DepthErrors:
+def depth_errors(predicted_m: Numbers, true_m: Numbers) -> DepthErrors:
     """Measure depth by the seven numbers of Eigen et al.; refuses what :func:`measure` does."""
     found = measure("depth", predicted_m, true_m)
     return DepthErrors(**{name: found[name] for name in DepthErrors.__dataclass_fields__})
 
 
-def disparity_errors(
-    predicted_px: Float[Tensor, " n"], true_px: Float[Tensor, " n"]
-) -> DisparityErrors:
+def disparity_errors(predicted_px: Numbers, true_px: Numbers) -> DisparityErrors:
     """Measure disparity, D1 by the KITTI 2015 devkit (both strict); no pixel is refused."""
     found = measure("disparity", predicted_px, true_px)
     return DisparityErrors(epe_px=found["epe_px"], d1_all=found["d1_all"])
@@ -165,9 +162,7 @@ def garg_crop(height: int, width: int) -> Bool[Tensor, "height width"]:
     return mask
 
 
-def sparsification_area(
-    error: Float[Tensor, " n"], confidence: Float[Tensor, " n"], steps: int = 50
-) -> float:
+def sparsification_area(error: Numbers, confidence: Numbers, steps: int = 50) -> float:
     """AUSE: how far removing the least confident pixels is from removing the worst ones.
 
     Both orders remove 0 %, 2 %, ... of the pixels; the area between the two curves of the mean
@@ -186,9 +181,7 @@ def sparsification_area(
     return float(((by_confidence - by_oracle) / error.double().mean()).mean())
 
 
-def score_confidence(
-    error: Float[Tensor, " n"], confidence: Float[Tensor, " n"]
-) -> dict[str, float]:
+def score_confidence(error: Numbers, confidence: Numbers) -> dict[str, float]:
     """Compare a confidence with an oracle and with chance; see :func:`sparsification_area`.
 
     Returns:
@@ -202,9 +195,7 @@ def score_confidence(
     return {"ause": ause, "ause_random": ause_random, "ause_share": share}
 
 
-def error_by_decile(
-    error: Float[Tensor, " n"], confidence: Float[Tensor, " n"]
-) -> Float[Tensor, "10"]:
+def error_by_decile(error: Numbers, confidence: Numbers) -> Float[Tensor, "10"]:
     """Mean error of the least sure tenth of the pixels, of the next, ..., of the surest.
 
     Pixels of equal confidence share their mean error. NaN for a tenth without a pixel.
@@ -214,9 +205,7 @@ def error_by_decile(
     return torch.stack([tenth.mean() for tenth in tenths])
 
 
-def _remaining_error(
-    error: Float[Tensor, " n"], keep_first: Float[Tensor, " n"], steps: int
-) -> Float[Tensor, " steps"]:
+def _remaining_error(error: Numbers, keep_first: Numbers, steps: int) -> Float[Tensor, " steps"]:
     """Mean error of what is left, the pixels of low ``keep_first`` removed first."""
     descending = torch.argsort(keep_first, descending=True)
     counts = torch.arange(1, len(error) + 1)
@@ -225,7 +214,7 @@ def _remaining_error(
     return running[kept.ceil().long().clamp(min=1) - 1]
 
 
-def _shared_error(error: Float[Tensor, " n"], key: Float[Tensor, " n"]) -> Float[Tensor, " n"]:
+def _shared_error(error: Numbers, key: Numbers) -> Numbers:
     """Give pixels of an equal key their mean error: no answer may depend on the order of ties."""
     values, group = key.unique(return_inverse=True)
     count = torch.zeros(len(values), dtype=error.dtype).index_add_(0, group, torch.ones_like(error))

@@ -21,7 +21,7 @@ from depthpose.depth.config import StreetsConfig
 from depthpose.depth.disparity import disparity_from_depth
 from depthpose.depth.synthetic.scene import StreetScene, make_clutter, make_scene, street_rig
 from depthpose.depth.synthetic.shading import Hits, Stage, prepare, shade, sky_light
-from depthpose.depth.synthetic.textures import NUMBER
+from depthpose.depth.synthetic.textures import NUMBER, Indices, Numbers, Vectors
 from depthpose.depth.types import Map, Mask, RawFrame, StereoInput, StereoSample, StereoTruth, View
 
 NEAR_M = 0.3
@@ -30,9 +30,9 @@ NEAR_M = 0.3
 class Nearest(NamedTuple):
     """The nearest triangles on some rays: -1 where there is none, barycentric shares, depth."""
 
-    primitive: Int[Tensor, " n"]
-    shares: Float[Tensor, "n 3"]
-    depth_m: Float[Tensor, " n"]
+    primitive: Indices
+    shares: Vectors
+    depth_m: Numbers
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -45,7 +45,7 @@ class Sight:
     edges: Float64[Tensor, "n 3 3"]  # edge functions of all triangles; see ``core.render``
     volume: Float64[Tensor, " n"]  # what they are divided by
 
-    def rays(self, pixels: Float64[Tensor, "n 2"]) -> Float[Tensor, "n 3"]:
+    def rays(self, pixels: Float64[Tensor, "n 2"]) -> Vectors:
         """Directions of pixels, with z = 1."""
         (a, b, c), (_, d, e), _ = self.K.inverse().tolist()
         u, v = pixels.unbind(1)
@@ -95,7 +95,7 @@ def nearest_at(
     return found
 
 
-def neighbours(primitive: Int[Tensor, "h w"], index: Int[Tensor, " n"]) -> Int[Tensor, "n 5"]:
+def neighbours(primitive: Int[Tensor, "h w"], index: Indices) -> Int[Tensor, "n 5"]:
     """Triangles seen at some pixels and at the four beside each."""
     height, width = primitive.shape
     column, row = index % width, index // width
@@ -153,20 +153,18 @@ def draw_light(stage: Stage, sight: Sight, *, with_antialiasing: bool) -> Float[
     return light.reshape(height, width, 3)
 
 
-def _centres(index: Int[Tensor, " n"], width: int) -> Float64[Tensor, "n 2"]:
+def _centres(index: Indices, width: int) -> Float64[Tensor, "n 2"]:
     return torch.stack([index % width, index // width], 1).double()
 
 
-def _seen_at(sight: Sight, index: Int[Tensor, " n"]) -> Nearest:
+def _seen_at(sight: Sight, index: Indices) -> Nearest:
     raster = sight.raster
     assert raster.barycentric is not None
     parts = raster.primitive, raster.barycentric, raster.depth_m
     return Nearest(*(values.flatten(0, 1).index_select(0, index) for values in parts))
 
 
-def _light(
-    stage: Stage, sight: Sight, pixels: Float64[Tensor, "n 2"], nearest: Nearest
-) -> Float[Tensor, "n 3"]:
+def _light(stage: Stage, sight: Sight, pixels: Float64[Tensor, "n 2"], nearest: Nearest) -> Vectors:
     primitive, shares, depth = nearest
     rays = sight.rays(pixels)
     length = rays.norm(dim=1)

@@ -7,13 +7,14 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Float
 from torch import Tensor
 from torch.nn import functional as F
 
 from depthpose.core.render import rasterize_orthographic
+from depthpose.depth.synthetic import textures as tx
 from depthpose.depth.synthetic.scene import StreetScene
-from depthpose.depth.synthetic.textures import MATERIALS, NUMBER, SIDE_PX, sample_texture, textures
+from depthpose.depth.synthetic.textures import MATERIALS, NUMBER, SIDE_PX, Indices, Numbers, Vectors
 
 _SUN_MAPS = ((18.0, (-3.0, 36.0), 1024), (60.0, (-5.0, 115.0), 768))
 _SKY_MAP = (28.0, (-3.0, 64.0), 512)
@@ -33,7 +34,7 @@ class LightMap:
     pixels_per_m: Float[Tensor, "2"]  # scale of its columns and rows
     texel_m: float  # the larger of its two pixel sizes
 
-    def place(self, points: Float[Tensor, "n 3"]) -> tuple[Tensor, Tensor, Tensor]:
+    def place(self, points: Vectors) -> tuple[Tensor, Tensor, Tensor]:
         """Column and row [px], and depth along the light [m]."""
         turned = points @ self.rotation.T
         column, row = ((turned[:, :2] - self.low) * self.pixels_per_m).unbind(1)
@@ -48,9 +49,9 @@ class Stage:
     corners: Float[Tensor, "n 3 3"]  # triangles in the left camera's frame [m]
     # A row a triangle: uv (6), normals (9), tint (3), plane normal (3) and texels a metre (1).
     attributes: Float[Tensor, "n 22"]
-    material: Int[Tensor, " n"]  # number of the material
-    layer: Int[Tensor, " n"]  # number of the texture
-    kind: Int[Tensor, " n"]  # equal where no edge shows: same thing, same material
+    material: Indices  # number of the material
+    layer: Indices  # number of the texture
+    kind: Indices  # equal where no edge shows: same thing, same material
     to_sun: Float[Tensor, "3"]
     up: Float[Tensor, "3"]  # towards the sky
     sun_maps: list[LightMap]  # near and far shadows; none under clouds
@@ -120,9 +121,7 @@ def _light_map(
     )
 
 
-def _sunlit_share(
-    stage: Stage, points: Float[Tensor, "n 3"], normals: Float[Tensor, "n 3"]
-) -> Float[Tensor, " n"]:
+def _sunlit_share(stage: Stage, points: Vectors, normals: Vectors) -> Numbers:
     """How much of the sun reaches each point: 0 in shadow, 1 lit, soft over a texel."""
     lit = torch.ones(len(points))
     # From the far map to the near one, which is finer and has the last word.
@@ -143,7 +142,7 @@ def _sunlit_share(
     return lit
 
 
-def _open_share(light: LightMap, points: Float[Tensor, "n 3"]) -> Float[Tensor, " n"]:
+def _open_share(light: LightMap, points: Vectors) -> Numbers:
     """How open each point is to the sky above, from a few places around it."""
     column, row, depth_m = light.place(points)
     side = len(light.depth_m)
@@ -168,14 +167,14 @@ _CHUNK = 1 << 17
 class Hits:
     """Where rays hit triangles."""
 
-    primitive: Int[Tensor, " n"]  # number of the triangle
-    barycentric: Float[Tensor, "n 3"]  # shares of its corners
-    points: Float[Tensor, "n 3"]  # in the left camera's frame [m]
-    towards: Float[Tensor, "n 3"]  # unit vectors along the rays
-    distance_m: Float[Tensor, " n"]  # from the camera
+    primitive: Indices  # number of the triangle
+    barycentric: Vectors  # shares of its corners
+    points: Vectors  # in the left camera's frame [m]
+    towards: Vectors  # unit vectors along the rays
+    distance_m: Numbers  # from the camera
 
 
-def shade(stage: Stage, hits: Hits, focal_px: float) -> Float[Tensor, "n 3"]:
+def shade(stage: Stage, hits: Hits, focal_px: float) -> Vectors:
     """Give the light from each hit towards the camera."""
     parts = {name: values.split(_CHUNK) for name, values in vars(hits).items()}
     chunks = (
@@ -184,7 +183,7 @@ def shade(stage: Stage, hits: Hits, focal_px: float) -> Float[Tensor, "n 3"]:
     return torch.cat([_shade(stage, some, focal_px) for some in chunks])
 
 
-def _shade(stage: Stage, hits: Hits, focal_px: float) -> Float[Tensor, "n 3"]:
+def _shade(stage: Stage, hits: Hits, focal_px: float) -> Vectors:
     rows = stage.attributes.index_select(0, hits.primitive)
     material, layer = (n.index_select(0, hits.primitive) for n in (stage.material, stage.layer))
     # The triangle's own normal, and a smooth one; both look to the camera.
@@ -197,11 +196,11 @@ def _shade(stage: Stage, hits: Hits, focal_px: float) -> Float[Tensor, "n 3"]:
     uv, footprint_m = _mix(rows[:, :6], hits.barycentric), hits.distance_m / focal_px
     # A compromise between the footprint's width and its length, which grows when seen aslant.
     level = torch.log2(footprint_m * rows[:, 21] * facing.abs().clamp(min=0.03) ** -0.6 + 1e-9)
-    albedo = sample_texture(textures(), layer, uv, level) * rows[:, 15:18]
+    albedo = tx.sample_texture(tx.textures(), layer, uv, level) * rows[:, 15:18]
     # Unevenness over metres hides that textures repeat.
     weather, points = stage.scene.weather, hits.points
     u = points[:, 0] * 0.021 + points[:, 1] * 0.013 + weather.shift[0]
-    stains = _looked_up(textures().stains, u, points[:, 2] * 0.021 + weather.shift[1])
+    stains = _looked_up(tx.textures().stains, u, points[:, 2] * 0.021 + weather.shift[1])
     albedo *= (1 + 0.07 * stains)[:, None]
     is_road = (material == NUMBER["road"]).nonzero()[:, 0]
     if len(is_road):
@@ -230,24 +229,19 @@ def _shade(stage: Stage, hits: Hits, focal_px: float) -> Float[Tensor, "n 3"]:
     return torch.lerp(color, haze.expand_as(color), thick[:, None])
 
 
-def _mix(values: Float[Tensor, "n triple"], shares: Float[Tensor, "n 3"]) -> Float[Tensor, "n m"]:
+def _mix(values: Float[Tensor, "n triple"], shares: Vectors) -> Float[Tensor, "n m"]:
     """Interpolate between the values of three corners."""
     a, b, c = values.chunk(3, 1)
     return a * shares[:, :1] + b * shares[:, 1:2] + c * shares[:, 2:]
 
 
-def _dot(one: Float[Tensor, "n 3"], other: Float[Tensor, "n 3"]) -> Float[Tensor, " n"]:
+def _dot(one: Vectors, other: Vectors) -> Numbers:
     """Written out: a sum over so short an axis would take ten times as long."""
     return one[:, 0] * other[:, 0] + one[:, 1] * other[:, 1] + one[:, 2] * other[:, 2]
 
 
 def _add_mirrored(
-    stage: Stage,
-    towards: Float[Tensor, "n 3"],
-    normal: Float[Tensor, "n 3"],
-    mirror: Float[Tensor, " n"],
-    lit: Float[Tensor, " n"],
-    color: Float[Tensor, "n 3"],
+    stage: Stage, towards: Vectors, normal: Vectors, mirror: Numbers, lit: Numbers, color: Vectors
 ) -> None:
     """Mix in what glass, paint and metal mirror: the sky, a made-up skyline, the sun."""
     some = (mirror > 0).nonzero()[:, 0]
@@ -269,9 +263,7 @@ def _add_mirrored(
     color[some] = own + share[:, None] * light + glint[:, None] * sun_color
 
 
-def sky_light(
-    stage: Stage, towards: Float[Tensor, "n 3"], *, with_sun: bool = True
-) -> Float[Tensor, "n 3"]:
+def sky_light(stage: Stage, towards: Vectors, *, with_sun: bool = True) -> Vectors:
     """Give the light of the sky (and of the ground, below) from each direction."""
     weather, height = stage.scene.weather, towards @ stage.up
     zenith, horizon, sun_color = (
@@ -282,7 +274,7 @@ def sky_light(
     color = torch.lerp(horizon.expand(len(height), 3), zenith.expand(len(height), 3), share)
     far = towards / height.clamp(min=0.03)[:, None]
     u, v = far[:, 0] * 0.05 + weather.shift[0], far[:, 2] * 0.05 + weather.shift[1]
-    density = _looked_up(textures().clouds, u, v)
+    density = _looked_up(tx.textures().clouds, u, v)
     cover = torch.sigmoid(3 * (density - 1.4 + 2.2 * weather.cloud)) * (height * 6).clamp(0, 1)
     lit = (horizon * 0.9 + sun_color * 0.12).expand_as(color)
     color = torch.lerp(color, lit, (0.8 * cover)[:, None])
@@ -300,11 +292,11 @@ _PATCH_M = 9.0
 
 def _paint_road(
     scene: StreetScene,
-    albedo: Float[Tensor, "n 3"],
+    albedo: Vectors,
     place_m: Float[Tensor, "n 2"],
-    width_m: Float[Tensor, " n"],
-    length_m: Float[Tensor, " n"],
-) -> Float[Tensor, "n 3"]:
+    width_m: Numbers,
+    length_m: Numbers,
+) -> Vectors:
     """Give the colour of the asphalt with what is painted on it, at places (x, s) of the road.
 
     Lines are narrower than a pixel far away, so they cover it by the share of its footprint, which
@@ -323,7 +315,7 @@ def _paint_road(
         if is_striped:
             bar = bar * _inside(x % 1.0 - 0.5, 0.25, width_m)
         cover = torch.maximum(cover, bar)
-    wear = torch.sigmoid(3 * (_looked_up(textures().stains, x * 0.13, s * 0.13) + 1.4))
+    wear = torch.sigmoid(3 * (_looked_up(tx.textures().stains, x * 0.13, s * 0.13) + 1.4))
     paint = (cover * scene.markings.brightness * (0.3 + 0.7 * wear))[:, None]
     first, lane_m = scene.markings.wheel_tracks
     within = ((x - first) / lane_m) % 1

@@ -20,6 +20,10 @@ Number = float | int
 Values = Sequence | np.ndarray | float | int
 """What NumPy makes an array of."""
 
+Numbers = Float[Tensor, " n"]
+Vectors = Float[Tensor, "n 3"]
+Indices = Int[Tensor, " n"]
+
 Color = tuple[Number, Number, Number]
 """Linear RGB, 0 black to 1 white."""
 
@@ -118,11 +122,8 @@ def textures() -> Textures:
 
 
 def sample_texture(
-    textures: Textures,
-    layer: Int[Tensor, " n"],
-    uv: Float[Tensor, "n 2"],
-    level: Float[Tensor, " n"],
-) -> Float[Tensor, "n 3"]:
+    textures: Textures, layer: Indices, uv: Float[Tensor, "n 2"], level: Numbers
+) -> Vectors:
     """Look textures up, bilinearly in the nearest level; 0 is the largest picture, 1 half of it."""
     whole = level.round().clamp(0, LEVELS - 1).long()
     side = SIDE_PX >> whole
