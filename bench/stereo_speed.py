@@ -27,7 +27,7 @@ from depthpose.depth.stereo import (
     psmnet_from_published,
 )
 from depthpose.depth.stereo.matcher import pad_top_right
-from depthpose.depth.stereo.psmnet import Size, expected_disparity
+from depthpose.depth.stereo.psmnet import expected_disparity
 from depthpose.depth.weights import read_matcher
 
 Pair = tuple[Tensor, Tensor]
@@ -128,7 +128,7 @@ def exact_match(network: PSMNet, pair: Pair) -> Tensor:
     double.rows = 32
     h, w = pair[0].shape[-2:]
     left, right = (pad_top_right(normalise(i.double()), network.config)[None] for i in pair)
-    size = Size(network.config.max_disparity_px, *left.shape[-2:])
+    size = (network.config.max_disparity_px, *left.shape[-2:])
     align = network.config.align_corners
     with torch.no_grad():
         cost = double.costs(left, right)[-1][0, 0].permute(1, 2, 0)

@@ -20,7 +20,13 @@ from depthpose.depth.evaluate import clamped_depth
 from depthpose.depth.metrics import depth_errors, disparity_errors
 from depthpose.depth.predictions import CLOUD_M, write_estimate
 from depthpose.depth.synthetic import Streets
-from depthpose.depth.types import DepthEstimate, StereoInput, StereoSample, StereoTruth
+from depthpose.depth.types import (
+    DepthError,
+    DepthEstimate,
+    StereoInput,
+    StereoSample,
+    StereoTruth,
+)
 from depthpose.pose.config import ObjectsConfig
 from depthpose.pose.datasets import open_bop, write_bop_models, write_bop_scene
 from depthpose.pose.datasets.dataset import write_mask
@@ -29,7 +35,7 @@ from depthpose.pose.evaluate import evaluate
 from depthpose.pose.predictions import CLOUD, Prediction, place_of, write_predictions
 from depthpose.pose.synthetic import make_frames
 from depthpose.report import page as pages
-from depthpose.report.depth import DepthError, DepthShown, depth_section
+from depthpose.report.depth import DepthShown, depth_section
 from depthpose.report.page import Layer, Picture, Scene, Section
 from depthpose.report.pose import draw_pose, grey_depth, pose_layers, posed_cloud
 

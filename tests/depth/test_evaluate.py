@@ -1,6 +1,6 @@
 import json
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 
 import pytest
@@ -75,7 +75,7 @@ def test_the_sky_of_a_prediction_is_shown_as_sky(pairs: Dataset, tmp_path: Path)
     again = read_estimate(tmp_path / "p", "a", rig())
     assert again.is_sky is not None
     assert torch.equal(again.is_sky, is_sky)
-    shown = frame_result(pairs, 0, tmp_path / "p", "kitti-2015", None).estimate.depth_m
+    shown = frame_result(pairs, 0, tmp_path / "p", "kitti-2015", None)[0].depth_m
     assert shown is not None
     assert torch.equal(shown.isnan(), is_sky)
 
@@ -115,8 +115,8 @@ def test_depth_of_one_camera_needs_no_baseline(alone: Dataset, tmp_path: Path, e
     for row in evaluate(alone, tmp_path / "p", "eigen-raw-camera").rows:
         assert row.metrics["abs_rel"] == 0
         assert row.coverage == 1
-    shown = frame_result(alone, 0, tmp_path / "p", "eigen-raw-camera", 80.0)
-    assert float(shown.error.nanmean()) == 0
+    _, wrong = frame_result(alone, 0, tmp_path / "p", "eigen-raw-camera", 80.0)
+    assert float(wrong.error.nanmean()) == 0
 
 
 def test_a_prediction_that_is_missing_is_not_called_a_truth(alone: Dataset, tmp_path: Path) -> None:
@@ -425,8 +425,8 @@ def test_a_measured_frame_survives_json(pairs: Dataset, tmp_path: Path) -> None:
     for protocol in ("eigen-improved", "kitti-2015"):
         found = measure_frame(pairs, 0, folder, protocol, (80.0,))
         assert not isinstance(found, str)
-        again = Measured.from_values(json.loads(json.dumps(found[0].to_values())))
-        assert again.to_values() == found[0].to_values()
+        again = Measured(**json.loads(json.dumps(asdict(found[0]))))
+        assert again == found[0]
         assert (again.frame, again.cap_m) == ("a", None if protocol == "kitti-2015" else 80.0)
 
 

@@ -30,7 +30,6 @@ from depthpose.depth.stereo.matcher import (
     pad_top_right,
 )
 from depthpose.depth.stereo.psmnet import (
-    Size,
     concatenation_volume,
     expected_disparity,
     soft_argmin,
@@ -183,7 +182,7 @@ def test_chunked_expectation_equals_the_whole_one(align_corners: bool, chunk_byt
     cost = 3 * torch.randn(6, 7, 8, dtype=torch.float64)
     found, confidence = expected_disparity(
         cost,
-        Size(32, 24, 28),
+        (32, 24, 28),
         align_corners=align_corners,
         chunk_bytes=chunk_bytes,
         with_confidence=True,
@@ -203,7 +202,7 @@ def test_confidence_is_one_where_one_disparity_wins_and_small_where_two_do() -> 
     cost[..., 3] = 100
     cost[2:, :, 12] = 100
     _, confidence = expected_disparity(
-        cost, Size(64, 4, 4), align_corners=True, chunk_bytes=1 << 20, with_confidence=True
+        cost, (64, 4, 4), align_corners=True, chunk_bytes=1 << 20, with_confidence=True
     )
     assert confidence is not None
     assert float(confidence[:2].min()) > 0.9

@@ -9,8 +9,8 @@ from tests.synthetic_street import make_street
 
 from depthpose.core.draw import draw_depth, draw_share
 from depthpose.core.files import Cloud
-from depthpose.depth.types import DepthEstimate
-from depthpose.report.depth import DepthError, DepthShown, depth_section
+from depthpose.depth.types import DepthError, DepthEstimate
+from depthpose.report.depth import DepthShown, depth_section
 
 SAMPLE = make_street(0.1)
 PAIR = replace(SAMPLE.input, right=None)

@@ -4,7 +4,7 @@ import json
 import sys
 import tempfile
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -37,7 +37,7 @@ from depthpose.depth.metrics import METRICS
 from depthpose.depth.predictions import is_finished, predict
 from depthpose.depth.types import DepthEstimate, StereoInput
 from depthpose.report import page
-from depthpose.report.depth import DepthError, DepthShown, depth_section
+from depthpose.report.depth import DepthShown, depth_section
 from depthpose.report.page import Section
 
 _SAID_ABOVE = ("method", "input", "speed", "weights", "protocol", "dataset")
@@ -172,14 +172,9 @@ def measure(
             frames = f"{len(of_cap)} frame{'' if len(of_cap) == 1 else 's'}"
             text = f"The {role} of {frames} by {metric.name}: {value:.4f}{cap}."
             index = places[row.frame or ""]
-            result = frame_result(dataset, index, folder, protocol, row.cap_m)
-            error = DepthError(
-                error=result.error,
-                is_disparity=PROTOCOLS[protocol].truth == "disparity",
-                true_depth_m=result.true_depth_m,
-            )
+            estimate, error = frame_result(dataset, index, folder, protocol, row.cap_m)
             pair = dataset.read_input(index)
-            shown = DepthShown(pair=pair, estimate=result.estimate, error=error)
+            shown = DepthShown(pair=pair, estimate=estimate, error=error)
             own = {name: v for name, v in row.columns().items() if name not in _SAID_ABOVE}
             title = f"{folder.name}: {row.frame}, {role}"
             sections.append(replace(depth_section(title, shown, text), rows=[own]))
@@ -307,7 +302,7 @@ class ShardTruth:
                         path.write_bytes(data)
                     rows = self.measure_frame(dataset, places[name], Path(folder))
                 is_said = isinstance(rows, str)
-                measured[name] = rows if is_said else [row.to_values() for row in rows]
+                measured[name] = rows if is_said else [asdict(row) for row in rows]
         except InputError as error:
             return str(error)
         (out / f"{sample.name}.{ENDING}").write_text(json.dumps(measured))
@@ -341,7 +336,7 @@ def measure_shards(
             of_frames = json.loads(files[ENDING]) if item in names else {}
             for frame, some in of_frames.items():
                 is_said = isinstance(some, str)
-                rows[frame] = some if is_said else [Measured.from_values(one) for one in some]
+                rows[frame] = some if is_said else [Measured(**one) for one in some]
     with tempfile.TemporaryDirectory() as nothing:
         for index, frame in enumerate(dataset.frames):
             if frame.name not in rows:  # it has no truth, or its absence is an error

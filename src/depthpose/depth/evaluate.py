@@ -11,8 +11,6 @@ from pathlib import Path
 from typing import Any, Literal
 
 import torch
-from jaxtyping import Float
-from torch import Tensor
 
 from depthpose.core.camera import StereoRig
 from depthpose.core.errors import InputError, nearest_name
@@ -48,7 +46,7 @@ from depthpose.depth.predictions import (
     read_drawn_view,
     read_sky,
 )
-from depthpose.depth.types import DepthEstimate, Map
+from depthpose.depth.types import DepthError, DepthEstimate, Map
 
 NO_PREDICTION = "no right view to match, and no prediction"
 Cell = str | int | float
@@ -197,7 +195,7 @@ class Evaluation:
         return data_frame(row.columns() for row in self.per_frame)
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@dataclass(frozen=True, kw_only=True)
 class Measured:
     """One frame's numbers by one cap (None for disparity), and its error by decile."""
 
@@ -206,29 +204,7 @@ class Measured:
     pixels: int
     coverage: float
     metrics: Mapping[str, float]
-    deciles: Float[Tensor, "10"] | None = None
-
-    def to_values(self) -> dict[str, Any]:
-        """Give it as JSON values, exactly."""
-        cap = {} if self.cap_m is None else {"cap_m": self.cap_m}
-        counts = {"pixels": self.pixels, "coverage": self.coverage}
-        return {
-            "row": {"frame": self.frame, **cap, **counts, **self.metrics},
-            "deciles": None if self.deciles is None else self.deciles.tolist(),
-        }
-
-    @classmethod
-    def from_values(cls, values: Mapping[str, Any]) -> "Measured":
-        """Read what :meth:`to_values` gave."""
-        row, deciles = dict(values["row"]), values["deciles"]
-        return cls(
-            frame=row.pop("frame"),
-            cap_m=row.pop("cap_m", None),
-            pixels=row.pop("pixels"),
-            coverage=row.pop("coverage"),
-            metrics=row,
-            deciles=None if deciles is None else torch.tensor(deciles, dtype=torch.float64),
-        )
+    deciles: list[float] | None = None
 
 
 def evaluate(
@@ -322,7 +298,7 @@ def summarise(
             )
         )
         deciles = [one.deciles for one in of_cap if one.deciles is not None]
-        errors = torch.stack(deciles).nanmean(0).tolist() if deciles else []
+        errors = torch.tensor(deciles, dtype=torch.float64).nanmean(0).tolist() if deciles else []
         ranked_by = ranking_metric(cap_m).name
         for n, error in enumerate(errors, 1):
             metrics = {ranked_by: error}
@@ -337,26 +313,10 @@ def ranking_metric(cap_m: float | None) -> Metric:
     return METRICS[RANKING["disparity" if cap_m is None else "depth"]]
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class FrameResult:
-    """The maps of a frame that show where its error is.
-
-    Attributes:
-        estimate: at the size of the image.
-        error: absolute disparity error [px], or absolute depth error as a share of the truth; NaN
-            where nothing is compared.
-        true_depth_m: the truth that counts as depth; None where it is a disparity without a rig.
-    """
-
-    estimate: DepthEstimate
-    error: Map
-    true_depth_m: Map | None
-
-
 def frame_result(
     dataset: Dataset, index: int, predictions: Path, protocol: str, cap_m: float | None
-) -> FrameResult:
-    """Read one frame again as :func:`evaluate` measured it.
+) -> tuple[DepthEstimate, DepthError]:
+    """Read one frame again as :func:`evaluate` measured it: at the image's size, and its error.
 
     Args:
         dataset: as it was measured.
@@ -390,7 +350,7 @@ def frame_result(
         right=read_drawn_view(predictions, name),
         is_sky=is_sky,
     )
-    return FrameResult(estimate=estimate, error=error, true_depth_m=true_m)
+    return estimate, DepthError(error=error, is_disparity=cap_m is None, true_depth_m=true_m)
 
 
 def clamped_depth(disparity_px: Map, rig: StereoRig, cap_m: float) -> Map:
@@ -508,7 +468,7 @@ def _measure(prepared: _Prepared, rule: Protocol, cap_m: float | None) -> Measur
         metrics |= prepared.view
         if prepared.confidence is not None:
             metrics |= score_confidence(error, prepared.confidence[mask])
-            deciles = error_by_decile(error, prepared.confidence[mask])
+            deciles = error_by_decile(error, prepared.confidence[mask]).tolist()
     return Measured(
         frame=prepared.frame.name,
         cap_m=cap_m,

@@ -210,6 +210,22 @@ class DepthEstimate:
         return f"DepthEstimate({', '.join(said)})"
 
 
+@dataclass(frozen=True, kw_only=True, eq=False)
+class DepthError:
+    """How far an estimate is from the truth, at the size of the image.
+
+    Attributes:
+        error: absolute error of disparity [px], or that of depth as a share of the truth; NaN where
+            nothing is compared.
+        is_disparity: which of the two.
+        true_depth_m: the truth as depth, where it is known.
+    """
+
+    error: Map
+    is_disparity: bool
+    true_depth_m: Map | None = None
+
+
 def _spread(values: Map, unit: str) -> str:
     known = values[values.isfinite()]
     if not len(known):

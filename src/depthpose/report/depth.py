@@ -3,8 +3,6 @@
 from dataclasses import dataclass, replace
 
 import numpy as np
-from jaxtyping import Float
-from torch import Tensor
 
 from depthpose.core.arrays import take_evenly
 from depthpose.core.camera import Camera, StereoRig, back_project
@@ -18,7 +16,7 @@ from depthpose.core.draw import (
     rising_scale,
 )
 from depthpose.depth.predictions import COLOR_RANGE_M
-from depthpose.depth.types import DepthEstimate, StereoInput
+from depthpose.depth.types import DepthError, DepthEstimate, StereoInput
 from depthpose.report.page import Drawing, Layer, Scene, Section, colored_points
 
 WORST_PX = 4.0
@@ -31,18 +29,6 @@ _SPARSE = 0.25
 _RADIUS_PX = 2
 _TRUE = (0.1, 0.8, 0.2)
 _TRUE_POINTS = 20_000
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class DepthError:
-    """How far an estimate is from the truth: pixels of disparity, or depth as a share of the truth.
-
-    NaN where nothing is compared. ``true_depth_m`` is shown too, where it is given.
-    """
-
-    error: Float[Tensor, "h w"]
-    is_disparity: bool
-    true_depth_m: Float[Tensor, "h w"] | None = None
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

@@ -3,7 +3,6 @@
 Batch norm is folded into the convolution before it: the same function, one pass less.
 """
 
-import copy
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cache
@@ -18,7 +17,7 @@ from depthpose.core.errors import InputError
 from depthpose.depth.config import LightConfig, MatcherConfig, PSMNetConfig
 from depthpose.depth.stereo.light import LightStereo
 from depthpose.depth.stereo.matcher import Matcher, NetworkMatcher, StereoNetwork
-from depthpose.depth.stereo.psmnet import CHUNK_BYTES, ConvNorm, PSMNet, Size, expected_disparity
+from depthpose.depth.stereo.psmnet import CHUNK_BYTES, ConvNorm, PSMNet, expected_disparity
 from depthpose.depth.types import Match, Views
 
 MARGIN = 1.1
@@ -204,31 +203,21 @@ def has_onednn_operators() -> bool:
 
 
 class PSMNetMatcher(NetworkMatcher):
-    """PSMNet with pre- and post-processing: normalisation, padding, device, memory.
-
-    The weights are copied: training ``network`` further does not change this matcher. Where the
-    processor has no bf16, ``config`` says fp32 in its place.
-
-    Raises:
-        InputError: the device does not exist on this machine.
-    """
+    """PSMNet with pre- and post-processing, as :class:`NetworkMatcher` says."""
 
     fine_pixels = 280_000
     """Pixels of a fine match at most: an image of KITTI at three quarters of its resolution."""
 
-    def __init__(self, network: PSMNet, config: MatcherConfig | None = None) -> None:
-        super().__init__(network.config, config)
-        like = torch.empty(0, dtype=self.dtype, device=self.device)
-        self._network = copy.deepcopy(network).eval().to(self.device)
-        for head in self._network.heads:
+    def fold(self, network: PSMNet, like: Tensor) -> PSMNet:
+        """Fold batch norm, and compute some rows at a time."""
+        for head in network.heads:
             # In float32 at least: 8 bits would round the expectation to whole pixels.
             cost, wide = cast("nn.Conv3d", head.cost), torch.empty(0, device=self.device)
             head.cost = VolumeConv(cost, cost.weight, torch.zeros(1), wide)
-        fold_volumes(self._network, like)
-        fold_features(self._network.features, like)
-        self._network.rows = PSMNET_ROWS
-        if self.config.with_compile:
-            self._network.features.compile()
+        fold_volumes(network, like)
+        fold_features(network.features, like)
+        network.rows = PSMNET_ROWS
+        return network
 
     def activation_bytes(self, network: PSMNetConfig, height: int, width: int) -> int:
         """Peak memory of activations of one pair of suitable sides [bytes]."""
@@ -241,7 +230,7 @@ class PSMNetMatcher(NetworkMatcher):
         found = [
             expected_disparity(
                 cost.permute(1, 2, 0).contiguous(),
-                Size(network.max_disparity_px, *left.shape[-2:]),
+                (network.max_disparity_px, *left.shape[-2:]),
                 align_corners=network.align_corners,
                 with_confidence=self.config.with_confidence,
             )
@@ -251,29 +240,18 @@ class PSMNetMatcher(NetworkMatcher):
 
 
 class LightMatcher(NetworkMatcher):
-    """The light network with pre- and post-processing: normalisation, padding, device.
-
-    The weights are copied: training ``network`` further does not change this matcher. Where the
-    processor has no bf16, ``config`` says fp32 in its place.
-
-    Raises:
-        InputError: the device does not exist on this machine.
-    """
+    """The light network with pre- and post-processing, as :class:`NetworkMatcher` says."""
 
     fine_pixels = 650_000
     """Pixels of a fine match at most: an image of KITTI, enlarged 1.18 times."""
     most_enlarged = 1.5
     most_disparities = 1.75
 
-    def __init__(self, network: LightStereo, config: MatcherConfig | None = None) -> None:
-        super().__init__(network.config, config)
-        like = torch.empty(0, dtype=self.dtype, device=self.device)
-        folded = fold_volumes(copy.deepcopy(network).eval().to(self.device), like)
-        self._network = fold_features(folded, like)
+    def fold(self, network: LightStereo, like: Tensor) -> LightStereo:
+        """Fold batch norm, and compute some rows at a time."""
         # A GPU has the memory, and is busy with whole volumes alone.
-        self._network.rows = LIGHT_ROWS if self.device.type == "cpu" else None
-        if self.config.with_compile:
-            self._network.features.compile()
+        network.rows = LIGHT_ROWS if self.device.type == "cpu" else None
+        return fold_features(fold_volumes(network, like), like)
 
     def activation_bytes(self, network: LightConfig, height: int, width: int) -> int:
         """Peak memory of activations of one pair of suitable sides [bytes]."""

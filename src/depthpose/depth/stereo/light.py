@@ -25,7 +25,6 @@ from depthpose.depth.config import LightConfig
 from depthpose.depth.encoder import LiteEncoder
 from depthpose.depth.stereo.matcher import IMAGENET_MEAN, IMAGENET_STD, StereoNetwork
 from depthpose.depth.stereo.psmnet import (
-    Shape,
     by_rows,
     conv_norm_2d,
     conv_norm_3d,
@@ -144,7 +143,7 @@ class Refinement(nn.Module):
         seen = groups * len(_OFFSETS) + STEM + 4
         widths, dilations = (seen, _REFINED, _REFINED), (1, 2, 1)
         self.layers = nn.ModuleList(
-            conv_norm_2d(width, _REFINED, Shape(dilation=dilation))
+            conv_norm_2d(width, _REFINED, dilation=dilation)
             for width, dilation in zip(widths, dilations, strict=True)
         )
         self.correction = nn.Conv2d(_REFINED, 4, 1)
@@ -285,10 +284,10 @@ class LightFeatures(nn.Module):
     def __init__(self, config: LightConfig) -> None:
         super().__init__()
         w = config.width
-        self.stem = conv_norm_2d(3, STEM, Shape(3, 2))
-        self.quarter = nn.ModuleList([conv_norm_2d(STEM, w, Shape(3, 2)), conv_norm_2d(w, w)])
+        self.stem = conv_norm_2d(3, STEM, stride=2)
+        self.quarter = nn.ModuleList([conv_norm_2d(STEM, w, stride=2), conv_norm_2d(w, w)])
         self.encoder = LiteEncoder(config.encoder_width, levels=4)
-        self.top = conv_norm_2d(self.encoder.channels[3], _DEEP, Shape(1))
+        self.top = conv_norm_2d(self.encoder.channels[3], _DEEP, 1)
         quarter, eighth, sixteenth, _ = self.encoder.channels
         skips = (sixteenth, eighth, quarter + w)
         self.widths = (w, _DEEP // 2, _DEEP // 2, _DEEP)

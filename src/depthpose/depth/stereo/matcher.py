@@ -6,7 +6,7 @@ What networks share: normalisation, padding, the working focal length, tiles, th
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
-from copy import copy
+from copy import copy, deepcopy
 from dataclasses import replace
 from typing import Any, ClassVar, NamedTuple, Protocol, runtime_checkable
 
@@ -267,10 +267,11 @@ class StereoNetwork(nn.Module):
 
 
 class NetworkMatcher(ABC):
-    """A network with pre- and post-processing: normalisation, padding, device, tiles.
+    """A network with pre- and post-processing: normalisation, padding, device, memory, tiles.
 
-    A kind of network adds :meth:`run`. Where the processor has no bf16, ``config`` says fp32 in its
-    place.
+    A kind of network adds :meth:`fold` and :meth:`run`. The weights are copied: training
+    ``network`` further does not change this matcher. Where the processor has no bf16, ``config``
+    says fp32 in its place.
 
     Raises:
         InputError: the device does not exist on this machine.
@@ -283,12 +284,20 @@ class NetworkMatcher(ABC):
     most_disparities: ClassVar[float] = 1.5
     """Times the disparities of training that a fine match looks through at most."""
 
-    def __init__(self, network: NetworkConfig, config: MatcherConfig | None = None) -> None:
+    def __init__(self, network: StereoNetwork, config: MatcherConfig | None = None) -> None:
         config = config or MatcherConfig()
         self.device = usable_device(config.device)
         self.config = with_usable_precision(config)
         self.dtype = DTYPES[self.config.precision]
-        self.network_config = network
+        self.network_config: NetworkConfig = network.config
+        like = torch.empty(0, dtype=self.dtype, device=self.device)
+        self._network = self.fold(deepcopy(network).eval().to(self.device), like)
+        if config.with_compile:
+            self._network.features.compile()
+
+    @abstractmethod
+    def fold(self, network: Any, like: Tensor) -> Any:  # noqa: ANN401
+        """Fold batch norm into the convolutions; weights get the type of ``like``."""
 
     @abstractmethod
     def run(self, left: Views, right: Views, network: Any) -> list[Match]:  # noqa: ANN401

@@ -72,14 +72,6 @@ WINDOW_PX = 2.0
 """Half width of the window whose probability is the confidence; ranks errors best (AUSE)."""
 
 
-class Size(NamedTuple):
-    """Disparities, rows and columns of the full-size volume."""
-
-    bins: int
-    rows: int
-    columns: int
-
-
 class Taps(NamedTuple):
     """Linear interpolation along one axis: ``(1 - share) x[low] + share x[high]``."""
 
@@ -110,7 +102,7 @@ def interpolation_matrix(taps: Taps, small: int) -> Float[Tensor, "large small"]
 
 def expected_disparity(
     cost: Float[Tensor, "h4 w4 d4"],
-    size: Size,
+    size: tuple[int, int, int],
     *,
     align_corners: bool,
     chunk_bytes: int = CHUNK_BYTES,
@@ -122,24 +114,25 @@ def expected_disparity(
 
     Args:
         cost: quarter-size cost, larger where a match is likelier, in float32 or wider.
-        size: of the answer.
+        size: disparities, rows and columns at full size.
         align_corners: as in ``F.interpolate``.
         chunk_bytes: largest size of one full-size piece; about four are alive at a time.
         with_confidence: answer also the probability within ``WINDOW_PX`` of the expectation.
     """
+    count, rows, columns = size
     down, across, deep = (
         linear_taps(small, large, cost, align_corners=align_corners)
-        for small, large in zip(cost.shape, (size.rows, size.columns, size.bins), strict=True)
+        for small, large in zip(cost.shape, (rows, columns, count), strict=True)
     )
     matrix = interpolation_matrix(deep, cost.shape[2]).T.contiguous()
-    bins = torch.arange(size.bins, device=cost.device).to(cost)
-    disparity_px = cost.new_empty(size.rows, size.columns)
+    bins = torch.arange(count, device=cost.device).to(cost)
+    disparity_px = cost.new_empty(rows, columns)
     confidence = torch.empty_like(disparity_px) if with_confidence else None
-    step = max(1, chunk_bytes // (size.columns * size.bins * cost.element_size()))
-    for first in range(0, size.rows, step):
+    step = max(1, chunk_bytes // (columns * count * cost.element_size()))
+    for first in range(0, rows, step):
         y = slice(first, first + step)
-        rows = torch.lerp(cost[down.low[y]], cost[down.high[y]], down.share[y, None, None])
-        low, high = (rows.index_select(1, taps) for taps in (across.low, across.high))
+        wide = torch.lerp(cost[down.low[y]], cost[down.high[y]], down.share[y, None, None])
+        low, high = (wide.index_select(1, taps) for taps in (across.low, across.high))
         probability = (torch.lerp(low, high, across.share[:, None]) @ matrix).softmax(-1)
         torch.matmul(probability, bins, out=disparity_px[y])
         if confidence is not None:
@@ -162,23 +155,12 @@ class ConvNorm(nn.Module):
         return self.norm(self.conv(x))
 
 
-class Shape(NamedTuple):
-    """Window, stride and dilation of a convolution."""
-
-    kernel: int = 3
-    stride: int = 1
-    dilation: int = 1
-
-
-PLAIN = Shape()
-
-
-def conv_norm_2d(inputs: int, outputs: int, shape: Shape = PLAIN) -> ConvNorm:
+def conv_norm_2d(
+    inputs: int, outputs: int, kernel: int = 3, stride: int = 1, dilation: int = 1
+) -> ConvNorm:
     """Make a 2D convolution that keeps the size (but for its stride), with batch norm."""
-    padding = shape.dilation * (shape.kernel // 2)
-    conv = nn.Conv2d(
-        inputs, outputs, shape.kernel, shape.stride, padding, shape.dilation, bias=False
-    )
+    padding = dilation * (kernel // 2)
+    conv = nn.Conv2d(inputs, outputs, kernel, stride, padding, dilation, bias=False)
     return ConvNorm(conv, nn.BatchNorm2d(outputs))
 
 
@@ -187,22 +169,15 @@ class Block(nn.Module):
 
     def __init__(self, inputs: int, outputs: int, stride: int, dilation: int) -> None:
         super().__init__()
-        self.first = conv_norm_2d(inputs, outputs, Shape(3, stride, dilation))
-        self.second = conv_norm_2d(outputs, outputs, Shape(3, 1, dilation))
+        self.first = conv_norm_2d(inputs, outputs, 3, stride, dilation)
+        self.second = conv_norm_2d(outputs, outputs, 3, 1, dilation)
         keeps_size = stride == 1 and inputs == outputs
-        self.shortcut = None if keeps_size else conv_norm_2d(inputs, outputs, Shape(1, stride))
+        self.shortcut = None if keeps_size else conv_norm_2d(inputs, outputs, 1, stride)
 
     def forward(self, x: Float[Tensor, "b c h w"]) -> Float[Tensor, "b k h2 w2"]:
         """Add what two convolutions see to the input."""
         shortcut = x if self.shortcut is None else self.shortcut(x)
         return self.second(F.relu(self.first(x))) + shortcut
-
-
-def make_stage(inputs: int, outputs: int, count: int, shape: Shape) -> nn.Sequential:
-    """Make ``count`` blocks of which the first changes the channels and the size."""
-    first = Block(inputs, outputs, shape.stride, shape.dilation)
-    rest = (Block(outputs, outputs, 1, shape.dilation) for _ in range(count - 1))
-    return nn.Sequential(first, *rest)
 
 
 class FeatureExtractor(nn.Module):
@@ -213,18 +188,15 @@ class FeatureExtractor(nn.Module):
         c = config.width
         self.align_corners = config.align_corners
         self.pools = config.pools
-        stem = conv_norm_2d(3, c, Shape(3, 2)), conv_norm_2d(c, c), conv_norm_2d(c, c)
+        stem = conv_norm_2d(3, c, stride=2), conv_norm_2d(c, c), conv_norm_2d(c, c)
         self.stem = nn.ModuleList(stem)
-        counts = config.blocks
-        self.stages = nn.ModuleList(
-            [
-                make_stage(c, c, counts[0], PLAIN),
-                make_stage(c, 2 * c, counts[1], Shape(3, 2)),
-                make_stage(2 * c, 4 * c, counts[2], PLAIN),
-                make_stage(4 * c, 4 * c, counts[3], Shape(3, 1, 2)),
-            ]
-        )
-        self.pyramid = nn.ModuleList([conv_norm_2d(4 * c, c, Shape(1)) for _ in config.pools])
+        # The first block of each stage changes the channels and the size.
+        kinds = ((c, c, 1, 1), (c, 2 * c, 2, 1), (2 * c, 4 * c, 1, 1), (4 * c, 4 * c, 1, 2))
+        self.stages = nn.ModuleList()
+        for (inputs, outputs, stride, dilation), count in zip(kinds, config.blocks, strict=True):
+            rest = (Block(outputs, outputs, 1, dilation) for _ in range(count - 1))
+            self.stages.append(nn.Sequential(Block(inputs, outputs, stride, dilation), *rest))
+        self.pyramid = nn.ModuleList([conv_norm_2d(4 * c, c, 1) for _ in config.pools])
         self.fuse = conv_norm_2d((6 + len(config.pools)) * c, 4 * c)
         self.project = nn.Conv2d(4 * c, c, 1, bias=False)
 
