@@ -16,15 +16,9 @@ from depthpose.core.camera import StereoRig
 from depthpose.core.errors import InputError, nearest_name
 from depthpose.core.files import read_image
 from depthpose.core.frame import data_frame
+from depthpose.depth import disparity
 from depthpose.depth.datasets import Dataset, Frame, has_lidar, lidar_truth
 from depthpose.depth.datasets import read_disparity as read_truth_disparity
-from depthpose.depth.disparity import (
-    depth_from_disparity,
-    disparity_advice,
-    disparity_from_depth,
-    resize_disparity,
-    resized_map,
-)
 from depthpose.depth.metrics import (
     METRICS,
     RANKING,
@@ -333,14 +327,14 @@ def frame_result(
     if isinstance(prepared, str):
         raise InputError(f"{name}: {prepared}; choose a frame that counts")
     rig = prepared.rig
-    depth_m = None if rig is None else depth_from_disparity(prepared.disparity_px, rig)
+    depth_m = None if rig is None else disparity.depth_from_disparity(prepared.disparity_px, rig)
     is_sky = read_sky(predictions, name)
     if is_sky is not None and depth_m is not None and is_sky.shape == depth_m.shape:
         depth_m = torch.where(is_sky, torch.nan, depth_m)
     predicted, truth = _compared(prepared, rule, cap_m)
     error, true_m = (predicted - truth).abs(), truth
     if cap_m is None:
-        true_m = None if rig is None else depth_from_disparity(truth, rig)
+        true_m = None if rig is None else disparity.depth_from_disparity(truth, rig)
     else:
         error = error / truth
     estimate = DepthEstimate(
@@ -358,7 +352,7 @@ def clamped_depth(disparity_px: Map, rig: StereoRig, cap_m: float) -> Map:
 
     NaN (no prediction) stays NaN; zero and negative disparity become the smallest depth, as there.
     """
-    depth_m = depth_from_disparity(disparity_px, rig).nan_to_num(0.0)
+    depth_m = disparity.depth_from_disparity(disparity_px, rig).nan_to_num(0.0)
     clamped_m = depth_m.clamp(SMALLEST_DEPTH_M, cap_m)
     return torch.where(torch.isnan(disparity_px), torch.nan, clamped_m)
 
@@ -402,15 +396,17 @@ def _prepare(dataset: Dataset, index: int, predictions: Path, rule: Protocol) ->
         K = torch.tensor([[width, 0, 0], [0, width, 0], [0, 0, 1]], dtype=torch.float64)
         rig = StereoRig(width=width, height=height, K=K, baseline_m=1.0)  # depth takes any
     found_px = read_disparity(predictions, frame.name, rig, with_disparity_png=is_stereo)
-    predicted_px = resize_disparity(found_px, height, width)
-    true_px = truth if is_stereo or rig is None else disparity_from_depth(truth, rig)
+    predicted_px = disparity.resize_disparity(found_px, height, width)
+    true_px = truth if is_stereo or rig is None else disparity.disparity_from_depth(truth, rig)
     # With principal points apart, the disparity of far points is negative.
     apart_px = 0.0 if rig is None else rig.cx_right_minus_left_px
-    if (advice := disparity_advice(predicted_px + apart_px, true_px + apart_px)) is not None:
+    if (
+        advice := disparity.disparity_advice(predicted_px + apart_px, true_px + apart_px)
+    ) is not None:
         raise InputError(f"{predictions / frame.name}: {advice}")
     confidence = read_confidence(predictions, frame.name)
     if confidence is not None and confidence.shape != truth.shape:
-        confidence = resized_map(confidence, height, width)
+        confidence = disparity.resized_map(confidence, height, width)
     drawn, view = read_drawn_view(predictions, frame.name), {}
     if drawn is not None and frame.right is not None:
         real = read_image(frame.right)

@@ -6,22 +6,11 @@ from functools import partial
 from pathlib import Path
 from typing import Any, Protocol, runtime_checkable
 
+from depthpose.core import files
 from depthpose.core.camera import Camera, StereoRig
 from depthpose.core.config import config_from_dict
 from depthpose.core.draw import draw_depth, draw_disparity
 from depthpose.core.errors import InputError
-from depthpose.core.files import (
-    read_depth_png,
-    read_disparity_png,
-    read_image,
-    read_json,
-    read_map,
-    write_cloud,
-    write_depth_png,
-    write_image,
-    write_json,
-    write_map,
-)
 from depthpose.core.files.disk import write_bytes
 from depthpose.core.files.text import read_text
 from depthpose.core.run import claim_folder, claim_names, is_whole, note_result
@@ -85,27 +74,27 @@ def write_estimate(
         return written[-1]
 
     if cloud_m is not None:
-        write_cloud(new(CLOUD), replace(estimate, seen=pair).cloud(cloud_m))
+        files.write_cloud(new(CLOUD), replace(estimate, seen=pair).cloud(cloud_m))
     if estimate.warning:
         write_bytes(new("warning.txt"), f"{estimate.warning}\n".encode())
     if estimate.ground is not None:
-        write_json(new("ground.json"), asdict(estimate.ground))
+        files.write_json(new("ground.json"), asdict(estimate.ground))
     if estimate.depth_m is not None:
-        write_map(new("depth_m.npy"), estimate.depth_m)
-        write_depth_png(new("depth.png"), estimate.depth_m)
+        files.write_map(new("depth_m.npy"), estimate.depth_m)
+        files.write_depth_png(new("depth.png"), estimate.depth_m)
     if estimate.confidence is not None:
-        write_map(new("confidence.npy"), estimate.confidence)
+        files.write_map(new("confidence.npy"), estimate.confidence)
     if estimate.right is not None:
-        write_image(new("right.png"), estimate.right)
+        files.write_image(new("right.png"), estimate.right)
     if estimate.is_sky is not None:
-        write_image(new("sky.png"), estimate.is_sky.float().expand(3, -1, -1))
+        files.write_image(new("sky.png"), estimate.is_sky.float().expand(3, -1, -1))
     picture = (
         draw_disparity(estimate.disparity_px, is_sky=estimate.is_sky)
         if estimate.depth_m is None
         else draw_depth(estimate.depth_m, *range_m)
     )
-    write_image(new("color.png"), picture)
-    write_map(new("disparity_px.npy"), estimate.disparity_px)
+    files.write_image(new("color.png"), picture)
+    files.write_map(new("disparity_px.npy"), estimate.disparity_px)
     return written
 
 
@@ -140,14 +129,14 @@ def read_disparity(
     """
     base = folder / name
     if (path := _first(base, _DISPARITY)) is not None:
-        return read_map(path)
+        return files.read_map(path)
     path = _first(base, (*_DEPTH, _KITTI))
     if path is None:
         raise InputError(
             f"{folder}: no prediction for frame {name!r}. Expected {EXPECTED.replace('NAME', name)}"
         )
     if with_disparity_png and path == _first(base, (_KITTI,)):
-        return read_disparity_png(path)
+        return files.read_disparity_png(path)
     depth_m = read_depth(folder, name)
     assert depth_m is not None
     if not isinstance(camera, StereoRig):
@@ -167,7 +156,7 @@ def read_depth(folder: Path, name: str) -> Map | None:
     path = _first(folder / name, (*_DEPTH, _KITTI))
     if path is None:
         return None
-    return read_depth_png(path) if path.suffix.lower() == ".png" else read_map(path)
+    return files.read_depth_png(path) if path.suffix.lower() == ".png" else files.read_map(path)
 
 
 def has_disparity(folder: Path, name: str) -> bool:
@@ -176,27 +165,27 @@ def has_disparity(folder: Path, name: str) -> bool:
 
 
 def _first(base: Path, endings: tuple[str, ...]) -> Path | None:
-    files = (_file(base, end) for end in endings)
-    both = (path for file in files for path in (file, file.with_suffix(file.suffix.upper())))
+    named = (_file(base, end) for end in endings)
+    both = (path for file in named for path in (file, file.with_suffix(file.suffix.upper())))
     return next((path for path in both if path.is_file()), None)
 
 
 def read_confidence(folder: Path, name: str) -> Map | None:
     """Read the confidence beside a prediction, or None where there is none."""
     path = _first(folder / name, ("confidence.npy",))
-    return None if path is None else read_map(path)
+    return None if path is None else files.read_map(path)
 
 
 def read_drawn_view(folder: Path, name: str) -> View | None:
     """Read the right view that a prediction was made through, or None where none was drawn."""
     path = _first(folder / name, ("right.png",))
-    return None if path is None else read_image(path)
+    return None if path is None else files.read_image(path)
 
 
 def read_sky(folder: Path, name: str) -> Mask | None:
     """Read where a prediction says sky, or None where its weights do not know it."""
     path = _first(folder / name, ("sky.png",))
-    return None if path is None else read_image(path)[0] > 0
+    return None if path is None else files.read_image(path)[0] > 0
 
 
 def read_estimate(folder: Path, name: str, camera: Camera | None) -> DepthEstimate:
@@ -209,12 +198,12 @@ def read_estimate(folder: Path, name: str, camera: Camera | None) -> DepthEstima
     depth_m, warning, ground = (
         _first(folder / name, (ending,)) for ending in ("depth_m.npy", "warning.txt", "ground.json")
     )
-    metres = None if depth_m is None else read_map(depth_m)
+    metres = None if depth_m is None else files.read_map(depth_m)
     if metres is None and isinstance(camera, StereoRig):
         metres = depth_from_disparity(disparity_px, camera)
     plane = None
     if ground is not None:
-        content = read_json(ground)
+        content = files.read_json(ground)
         if not isinstance(content, dict):
             kind = type(content).__name__
             raise InputError(f"{ground}: holds no ground, but {kind}; predict again")

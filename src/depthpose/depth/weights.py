@@ -6,13 +6,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any, Literal
 
-from depthpose.core.checkpoint import (
-    Checkpoint,
-    build_network,
-    half_state,
-    read_checkpoint,
-    save_checkpoint,
-)
+from depthpose.core import checkpoint as checkpoints
 from depthpose.core.config import config_from_dict, config_to_dict
 from depthpose.core.errors import InputError
 from depthpose.depth.config import Answer, GeneratorConfig, SelectionConfig
@@ -62,7 +56,7 @@ def read_depth_weights(
     Raises:
         InputError: not such weights, or weights that do not fit their own config.
     """
-    checkpoint = read_checkpoint(path)
+    checkpoint = checkpoints.read_checkpoint(path)
     if checkpoint.kind not in (*_networks(), BOTH):
         raise InputError(
             f"{path}: holds weights of kind {checkpoint.kind!r}; depth takes "
@@ -78,7 +72,7 @@ def read_depth_weights(
             raise InputError(f"{path}: its config has no {kind!r}; the file is damaged.")
         given = checkpoint.state.items()
         state = {key.removeprefix(prefix): t for key, t in given if key.startswith(prefix)}
-        parts[kind] = Checkpoint(kind=kind, config=config, state=state)
+        parts[kind] = checkpoints.Checkpoint(kind=kind, config=config, state=state)
     if is_both and not (set(parts) & set(_GENERATORS) and set(parts) & set(MATCHERS)):
         raise InputError(
             f"{path}: its config names {sorted(checkpoint.config)}, but it should hold a "
@@ -90,7 +84,7 @@ def read_depth_weights(
             continue
         kind_of_config, make = _networks()[kind]
         config = config_from_dict(part.config, kind_of_config, source=str(path))
-        built[kind] = build_network(partial(make, config), part, str(path)).eval()
+        built[kind] = checkpoints.build_network(partial(make, config), part, str(path)).eval()
         if use == "images" and kind in _GENERATORS and (answer or config.answer) == "own":
             break  # it takes no matcher
     return DepthWeights(
@@ -147,7 +141,10 @@ def write_depth_weights(
             if isinstance(part, network):
                 parts[kind] = part
     assert parts, "a weights file holds a network at least"
-    states = {k: half_state(part) if with_half else part.state_dict() for k, part in parts.items()}
+    states = {
+        k: checkpoints.half_state(part) if with_half else part.state_dict()
+        for k, part in parts.items()
+    }
     configs = {kind: config_to_dict(part.config) for kind, part in parts.items()}
     if len(parts) == 1:
         kind = next(iter(parts))
@@ -155,4 +152,6 @@ def write_depth_weights(
     else:
         kind, config = BOTH, configs
         state = {f"{name}.{key}": t for name, s in states.items() for key, t in s.items()}
-    save_checkpoint(path, Checkpoint(kind=kind, config=config, state=state, facts=facts))
+    checkpoints.save_checkpoint(
+        path, checkpoints.Checkpoint(kind=kind, config=config, state=state, facts=facts)
+    )

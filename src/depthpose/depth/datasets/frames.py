@@ -16,6 +16,7 @@ import torch
 from jaxtyping import Float, Float64, Shaped
 from torch import Tensor
 
+from depthpose.core import files
 from depthpose.core.camera import (
     Camera,
     StereoRig,
@@ -31,15 +32,6 @@ from depthpose.core.camera.pinhole import (
     facts_from_projections,
 )
 from depthpose.core.errors import InputError
-from depthpose.core.files import (
-    MAP_SUFFIXES,
-    image_size,
-    read_key_values,
-    read_map,
-    read_points_bin,
-    read_stored_depth,
-    read_text,
-)
 from depthpose.core.files.images import KITTI_UNIT
 from depthpose.depth.config import TruthKind
 from depthpose.depth.types import Map
@@ -69,7 +61,7 @@ def read_object_calibration(
     Texts of the KITTI 2012 and 2015 sets (``P2`` or ``P_rect_02``) are read too, and those of
     odometry, whose ``Tr`` goes to the rectified camera 0; of the grey pair, P0 and P1.
     """
-    keys = read_key_values(path)
+    keys = files.read_key_values(path)
     names = ("P2", "P3") if "P2" in keys else ("P_rect_02", "P_rect_03")
     names = ("P0", "P1") if is_grey else names
     rig, left = _projected_rig(path, keys, names, (width, height))
@@ -88,9 +80,9 @@ def read_plain_calibration(path: Path, name: str, width: int, height: int) -> St
     a pair: ``name width height focal_px cx cy baseline_m``, which may go on with ``focal_y_px
     cx_right_minus_left_px``.
     """
-    text = read_text(path, _MAX_PAIRS_BYTES)
+    text = files.read_text(path, _MAX_PAIRS_BYTES)
     if re.search(r"^[ \t]*focal_px[ \t]*:", text, re.MULTILINE):
-        keys = read_key_values(path)
+        keys = files.read_key_values(path)
         return _rig(path, plain_facts(path, keys), (width, height))
     lines = re.findall(rf"^[ \t]*{re.escape(name)}[ \t]+(.+)$", text, re.MULTILINE)
     own: list[list[float]] = []
@@ -251,21 +243,21 @@ class Frame:
 
     def seen_files(self, *, with_right: bool = True) -> list[Path]:
         """List what an estimate depends on: left image, right image, files of the calibration."""
-        files = [self.left]
+        seen = [self.left]
         if with_right and self.right is not None:
-            files.append(self.right)
+            seen.append(self.right)
         if self.calibration is not None and self.calibration.is_dir():
-            files += sorted(self.calibration.glob("calib_*.txt"))
+            seen += sorted(self.calibration.glob("calib_*.txt"))
         elif self.calibration is not None:
-            files.append(self.calibration)
-        return files
+            seen.append(self.calibration)
+        return seen
 
 
 def frame_camera(frame: Frame) -> Camera | None:
     """Read the camera of a frame, or None where it has no calibration; of a pair, the rig."""
     if frame.calibration is None:
         return None
-    path, size = frame.calibration, image_size(frame.left)
+    path, size = frame.calibration, files.image_size(frame.left)
     match frame.style:
         case "raw" | "object" | "grey":
             camera = kitti_calibration(frame).rig
@@ -290,16 +282,16 @@ def kitti_calibration(frame: Frame) -> KittiCalibration:
             f"{frame.name}: no KITTI calibration, so its LiDAR scan cannot be projected. Put "
             "calib_cam_to_cam.txt and calib_velo_to_cam.txt into the folder of its date."
         )
-    home, size = frame.calibration, image_size(frame.left)
+    home, size = frame.calibration, files.image_size(frame.left)
     if frame.style != "raw":
         return read_object_calibration(home, *size, is_grey=frame.style == "grey")
     cameras, lidar = home / "calib_cam_to_cam.txt", home / "calib_velo_to_cam.txt"
-    keys = read_key_values(cameras)
+    keys = files.read_key_values(cameras)
     rig, left = _projected_rig(cameras, keys, ("P_rect_02", "P_rect_03"), size)
     if not lidar.is_file():
         return KittiCalibration(rig=rig, pixels_from_velodyne=None)
     rectify = kitti_matrix(cameras, keys, "R_rect_00", (3, 3))
-    of_lidar = read_key_values(lidar)
+    of_lidar = files.read_key_values(lidar)
     R, t = kitti_matrix(lidar, of_lidar, "R", (3, 3)), kitti_matrix(lidar, of_lidar, "T", (3, 1))
     composed = _composed(lidar, left, rectify, np.hstack([R, t]))
     return KittiCalibration(rig=rig, pixels_from_velodyne=composed)
@@ -332,7 +324,7 @@ def lidar_truth(frame: Frame, depth: LidarDepth) -> Map:
     drawn = _drawn_scan(frame)
     if frame.velodyne is None and drawn is not None and depth == "camera_z":
         depth_m = read_depth(drawn)
-        check_map_size(drawn, depth_m, image_size(frame.left))
+        check_map_size(drawn, depth_m, files.image_size(frame.left))
         return depth_m
     if frame.velodyne is None:
         raise InputError(f"{frame.name}: has no LiDAR scan of the kind {depth}.")
@@ -342,8 +334,8 @@ def lidar_truth(frame: Frame, depth: LidarDepth) -> Map:
             f"{frame.name}: its calibration says nothing of the LiDAR; calib_velo_to_cam.txt (or "
             "Tr_velo_to_cam in an object text) is missing."
         )
-    width, height = image_size(frame.left)
-    points = read_points_bin(frame.velodyne)
+    width, height = files.image_size(frame.left)
+    points = files.read_points_bin(frame.velodyne)
     return project_lidar(points, pixels_from_velodyne, (height, width), depth)
 
 
@@ -377,7 +369,11 @@ def read_disparity(path: Path) -> Map:
 
 def read_depth(path: Path) -> Map:
     """Read true depth [m] as :func:`read_disparity`, of 16 bits x 256; NaN where it is unknown."""
-    values = read_map(path) if path.suffix.lower() in MAP_SUFFIXES else read_stored_depth(path)
+    values = (
+        files.read_map(path)
+        if path.suffix.lower() in files.MAP_SUFFIXES
+        else files.read_stored_depth(path)
+    )
     if not values.is_floating_point():
         values = values * KITTI_UNIT
     return torch.where((values > 0) & (values < torch.inf), values, torch.nan)

@@ -15,18 +15,8 @@ from typing import Any
 import numpy as np
 import torch
 
+from depthpose.core import files
 from depthpose.core.errors import InputError
-from depthpose.core.files import (
-    MAP_SUFFIXES,
-    atomic_write,
-    cache_folder,
-    read_bytes,
-    read_json,
-    read_text,
-    write_disparity_png,
-    write_image,
-    write_json,
-)
 from depthpose.core.files.disk import SOURCE, find_partners, write_bytes
 from depthpose.core.files.images import LISTED_SUFFIXES
 from depthpose.core.run import is_whole, note_result
@@ -64,7 +54,7 @@ def pack_frames(
     remaining, shards = list(frames), 0
     while remaining:
         name, size = f"{shards:06d}.tar", 0
-        with atomic_write(out / name) as part, tarfile.open(part, "w") as tar:
+        with files.atomic_write(out / name) as part, tarfile.open(part, "w") as tar:
             while remaining:
                 frame, key = remaining.pop(0), f"{len(rows):08d}"
                 row = {"name": frame.name, "style": frame.style}
@@ -72,7 +62,7 @@ def pack_frames(
                     path = getattr(frame, what)
                     if path is None:
                         continue
-                    data = read_bytes(path)
+                    data = files.read_bytes(path)
                     member = tarfile.TarInfo(f"{key}.{what}{path.suffix.lower()}")
                     member.size = len(data)
                     tar.addfile(member, io.BytesIO(data))
@@ -85,7 +75,7 @@ def pack_frames(
                 if size >= shard_bytes:
                     break
         shards += 1
-    write_json(out / INDEX, {"frames": rows})
+    files.write_json(out / INDEX, {"frames": rows})
     return shards
 
 
@@ -95,7 +85,7 @@ def packed_frames(folder: Path) -> Iterator[Frame]:
     if not index.is_file():
         return
     known = {field.name for field in fields(Frame)}
-    found = read_json(index)
+    found = files.read_json(index)
     rows = found.get("frames") if isinstance(found, dict) else None
     if not isinstance(rows, list):
         return  # an index of somebody else
@@ -118,7 +108,7 @@ def local_folder(folder: Path | str) -> Path:
     if _URL.match(text) is None:
         return Path(folder)
     url = _URL.sub(r"\1://", text, count=1).rstrip("/")  # a Path has made one slash of two
-    here = cache_folder() / "shards" / hashlib.sha256(url.encode()).hexdigest()[:16]
+    here = files.cache_folder() / "shards" / hashlib.sha256(url.encode()).hexdigest()[:16]
     from depthpose.core.files.disk import exists, fetch, join, list_tree  # fsspec takes time
 
     if not exists(join(url, INDEX)):
@@ -127,7 +117,7 @@ def local_folder(folder: Path | str) -> Path:
         if ".." not in Path(name).parts:
             fetch(of_file, here / _CALIBRATION / name)
     fetch(join(url, INDEX), here / INDEX)
-    write_json(here / SOURCE, {"url": url})
+    files.write_json(here / SOURCE, {"url": url})
     return here
 
 
@@ -137,10 +127,10 @@ def _keep(calibration: Path, out: Path, kept: dict[Path, str]) -> str:
         kept[calibration] = place = f"{_CALIBRATION}/{len(kept):06d}"
         if calibration.is_file():
             kept[calibration] = place = f"{place}{calibration.suffix}"
-            write_bytes(out / place, read_bytes(calibration))
+            write_bytes(out / place, files.read_bytes(calibration))
         else:  # KITTI raw: the folder of a date
             for file in sorted(calibration.glob("calib_*.txt")):
-                write_bytes(out / place / file.name, read_bytes(file))
+                write_bytes(out / place / file.name, files.read_bytes(file))
     return kept[calibration]
 
 
@@ -204,7 +194,7 @@ def _raw(folder: Path) -> Iterable[Frame]:
                 left=left,
                 calibration=date if (date / "calib_cam_to_cam.txt").exists() else None,
                 style="raw",
-                **{part: files.get(left.stem) for part, files in parts.items()},
+                **{part: found.get(left.stem) for part, found in parts.items()},
             )
 
 
@@ -277,7 +267,7 @@ def _benchmark(folder: Path, one: str, other: str, ending: str) -> Iterable[Fram
             left=left,
             calibration=texts.get(left.stem) or texts.get(left.stem.removesuffix("_10")),
             style="object",
-            **{part: files.get(left.stem) for part, files in parts.items()},
+            **{part: found.get(left.stem) for part, found in parts.items()},
         )
 
 
@@ -314,7 +304,7 @@ def _pairs(folder: Path) -> Iterable[Frame]:
             left=left,
             calibration=camera or (text if text.is_file() else None),
             style="camera" if camera else "plain",
-            **{part: files.get(left.stem) for part, files in parts.items()},
+            **{part: found.get(left.stem) for part, found in parts.items()},
         )
 
 
@@ -344,11 +334,11 @@ def _images(folder: Path) -> list[Path]:
 
 
 def _by_stem(
-    folder: Path, suffixes: tuple[str, ...] = (*LISTED_SUFFIXES, *MAP_SUFFIXES)
+    folder: Path, suffixes: tuple[str, ...] = (*LISTED_SUFFIXES, *files.MAP_SUFFIXES)
 ) -> dict[str, Path]:
     """List files by their names; of two suffixes the first one counts, in capitals or not."""
-    files = sorted(_listed(folder, suffixes), key=lambda path: suffixes.index(path.suffix.lower()))
-    return {path.stem: path for path in reversed(files)}
+    found = sorted(_listed(folder, suffixes), key=lambda path: suffixes.index(path.suffix.lower()))
+    return {path.stem: path for path in reversed(found)}
 
 
 def _listed(folder: Path, suffixes: tuple[str, ...]) -> list[Path]:
@@ -397,15 +387,15 @@ def write_raw_frame(folder: Path, drive: str, number: int, frame: RawFrame) -> N
         written.append(home / place / f"{name}{suffix}")
         return written[-1]
 
-    write_image(new("image_02/data"), frame.left)
-    write_image(new("image_03/data"), frame.right)
+    files.write_image(new("image_02/data"), frame.left)
+    files.write_image(new("image_03/data"), frame.right)
     if frame.lidar_points is not None:
         scan = frame.lidar_points.float().contiguous().numpy().astype("<f4")
         write_bytes(new("velodyne_points/data", ".bin"), scan.tobytes())
-    write_image(new("sky"), frame.is_sky.float().expand(3, -1, -1))
+    files.write_image(new("sky"), frame.is_sky.float().expand(3, -1, -1))
     seen_by_both = torch.where(frame.occluded, torch.nan, frame.disparity_px)
-    write_disparity_png(new("disp_noc"), seen_by_both)
-    write_disparity_png(new("disp_occ"), frame.disparity_px)
+    files.write_disparity_png(new("disp_noc"), seen_by_both)
+    files.write_disparity_png(new("disp_occ"), frame.disparity_px)
     note_result(folder, f"{drive}/{name}", written)
 
 
@@ -423,8 +413,8 @@ def _write_calibration(folder: Path, date: str, frame: RawFrame) -> None:
     transform = frame.camera_from_velodyne
     poses = {"R": transform[:3, :3], "T": transform[:3, 3]}
     is_there = has_calibration(folder, date)
-    files = [folder / date / name for name in _CALIBRATION_FILES]
-    for path, matrices in zip(files, (cameras, poses), strict=True):
+    paths = [folder / date / name for name in _CALIBRATION_FILES]
+    for path, matrices in zip(paths, (cameras, poses), strict=True):
         lines = [
             f"{name}: " + " ".join(f"{value:.12e}" for value in matrix.ravel())
             for name, matrix in matrices.items()
@@ -432,9 +422,9 @@ def _write_calibration(folder: Path, date: str, frame: RawFrame) -> None:
         text = "\n".join(lines) + "\n"
         if not is_there:
             write_bytes(path, text.encode())
-        elif read_text(path) != text:
+        elif files.read_text(path) != text:
             raise InputError(
                 f"{path}: belongs to frames of another rig or scale; write these to another folder"
             )
     if not is_there:
-        note_result(folder, date, files)
+        note_result(folder, date, paths)

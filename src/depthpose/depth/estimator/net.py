@@ -29,20 +29,13 @@ from depthpose.core.camera import (
 from depthpose.core.checkpoint import find_weights, join_terms, warn_of_terms
 from depthpose.core.devices import each_in_threads, own_arithmetic
 from depthpose.core.errors import InputError, refused_memory
+from depthpose.depth import disparity
 from depthpose.depth.config import (
     Answer,
     GeneratorConfig,
     MatcherConfig,
     SelectionConfig,
     SGBMConfig,
-)
-from depthpose.depth.disparity import (
-    changed_match,
-    depth_from_disparity,
-    disparity_from_depth,
-    focal_size,
-    resize_image,
-    resized_match,
 )
 from depthpose.depth.estimator.inputs import (
     Picture,
@@ -378,7 +371,7 @@ class FakestereoNet:
         rig_px = self.synthesiser.config.virtual_focal_px
         own_px = float(image.camera.K.diagonal()[:2].min())
         used = [s for s in self.synthesiser.scales if s == 1 or s * rig_px <= own_px]
-        return [focal_size(image.camera, scale * rig_px) for scale in used]
+        return [disparity.focal_size(image.camera, scale * rig_px) for scale in used]
 
     @torch.no_grad()
     def _estimate_alone(
@@ -389,7 +382,7 @@ class FakestereoNet:
         rig = self.synthesiser.config
         with refused_memory(images[0].name):
             left, *larger = (
-                torch.stack([resize_image(image.left.float(), *size) for image in images])
+                torch.stack([disparity.resize_image(image.left.float(), *size) for image in images])
                 for size in sizes
             )
             views = self.synthesiser.draw(left, *larger)
@@ -466,7 +459,7 @@ class FakestereoNet:
             found = [self.matcher.match(*pair) for pair in pairs]
         if columns == 0:
             return found
-        cut = [changed_match(wide, lambda values: values[:, added:]) for wide in found]
+        cut = [disparity.changed_match(wide, lambda values: values[:, added:]) for wide in found]
         # The right view shows none of the first columns, even at infinity.
         is_outside = torch.arange(width, device=cut[0].disparity_px.device) < -columns
         sure = (None if m.confidence is None else m.confidence.where(~is_outside, 0.0) for m in cut)
@@ -493,10 +486,10 @@ def from_pair(pair: StereoInput, match: Match, warning: str = "") -> DepthEstima
     if is_sky is not None:
         far_px = torch.full_like(px, LEAST_PX)
         if rig is not None:
-            far_px = disparity_from_depth(torch.full_like(px, SKY_M), rig)
+            far_px = disparity.disparity_from_depth(torch.full_like(px, SKY_M), rig)
         px = torch.where(is_sky, far_px, px)
     if rig is not None:
-        depth_m = depth_from_disparity(px, rig)
+        depth_m = disparity.depth_from_disparity(px, rig)
         depth_m = depth_m if is_sky is None else torch.where(is_sky, torch.nan, depth_m)
     return DepthEstimate(
         depth_m=depth_m,
@@ -524,18 +517,20 @@ def from_virtual(
     camera = image.camera
     assert camera is not None
     height, width = image.left.shape[1:]
-    seen = resized_match(replace(match, is_sky=is_sky), height, width)
+    seen = disparity.resized_match(replace(match, is_sky=is_sky), height, width)
     imitated = StereoRig(width=width, height=height, K=camera.K, baseline_m=rig.virtual_baseline_m)
     px, is_sky = seen.disparity_px, _without_specks(seen.is_sky)
-    depth_m = depth_from_disparity(px, imitated)
+    depth_m = disparity.depth_from_disparity(px, imitated)
     if is_sky is not None:
         depth_m = torch.where(is_sky, SKY_M, depth_m)
         px = torch.where(is_sky, float(camera.K[0, 0]) * rig.virtual_baseline_m / SKY_M, px)
     return DepthEstimate(
         depth_m=depth_m if is_sky is None else torch.where(is_sky, torch.nan, depth_m),
-        disparity_px=disparity_from_depth(depth_m, camera) if isinstance(camera, StereoRig) else px,
+        disparity_px=disparity.disparity_from_depth(depth_m, camera)
+        if isinstance(camera, StereoRig)
+        else px,
         confidence=seen.confidence,
-        right=resize_image(right, height, width),
+        right=disparity.resize_image(right, height, width),
         is_sky=is_sky,
         seen=image,
     )

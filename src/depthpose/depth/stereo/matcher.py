@@ -20,14 +20,8 @@ from depthpose.core.arrays import check_image
 from depthpose.core.camera import Camera
 from depthpose.core.devices import usable_device, usable_precision
 from depthpose.core.errors import InputError, import_opencv
+from depthpose.depth import disparity
 from depthpose.depth.config import LightConfig, MatcherConfig, PSMNetConfig, SGBMConfig
-from depthpose.depth.disparity import (
-    changed_match,
-    focal_size,
-    left_right_difference_px,
-    resize_image,
-    resized_match,
-)
 from depthpose.depth.encoder import LiteEncoder
 from depthpose.depth.types import Map, Maps, Match, View, Views
 
@@ -345,7 +339,7 @@ class NetworkMatcher(ABC):
             larger = min(self.work_focal_px(camera) / trained.work_focal_px, self.most_disparities)
             steps = math.ceil(round(trained.max_disparity_px * larger, 3) / trained.step_px)
             network = replace(trained, max_disparity_px=steps * trained.step_px)
-            views = [tuple(resize_image(view, *size) for view in pair) for pair in pairs]
+            views = [tuple(disparity.resize_image(view, *size) for view in pair) for pair in pairs]
         is_bounded = self.config.tile_px is not None or self.config.max_memory_bytes is not None
         together = not is_bounded and len({left.shape for left, _ in views}) == 1
         matches: list[Match] = []
@@ -363,7 +357,9 @@ class NetworkMatcher(ABC):
             matches += found
         home = pairs[0][0].device
         return [
-            resized_match(changed_match(match, lambda values: values.to(home)), *left.shape[1:])
+            disparity.resized_match(
+                disparity.changed_match(match, lambda values: values.to(home)), *left.shape[1:]
+            )
             for match, (left, _) in zip(matches, pairs, strict=True)
         ]
 
@@ -371,7 +367,7 @@ class NetworkMatcher(ABC):
         """Rows and columns at which images of a camera are matched [px]."""
         if self.network_config.work_focal_px is None:
             return camera.height, camera.width
-        return focal_size(camera, self.work_focal_px(camera))
+        return disparity.focal_size(camera, self.work_focal_px(camera))
 
     def work_focal_px(self, camera: Camera) -> float:
         """Focal length at which images of a camera are matched [px]."""
@@ -410,7 +406,7 @@ class NetworkMatcher(ABC):
                 "tiles (tile_px)"
             )
         matches = self.run(left, right, network)
-        return [changed_match(match, lambda values: values[-h:, :w]) for match in matches]
+        return [disparity.changed_match(match, lambda values: values[-h:, :w]) for match in matches]
 
 
 def with_usable_precision(config: MatcherConfig) -> MatcherConfig:
@@ -443,7 +439,7 @@ def lower_where_disagreeing(found: Match, right_px: Map) -> Match:
     Halved at least where the matching point lies outside the right view: nothing there can
     agree, and nothing contradicts. That of the sky is kept.
     """
-    difference_px = left_right_difference_px(found.disparity_px, right_px)
+    difference_px = disparity.left_right_difference_px(found.disparity_px, right_px)
     agreement = torch.exp(-difference_px / AGREEMENT_PX).nan_to_num(0.0)
     confidence = agreement if found.confidence is None else found.confidence * (1 + agreement) / 2
     if found.confidence is not None and found.is_sky is not None:

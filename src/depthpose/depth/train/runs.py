@@ -20,13 +20,7 @@ from depthpose.depth.datasets import refuse_common
 from depthpose.depth.encoder import load_encoder
 from depthpose.depth.stereo import MATCHERS, StereoNetwork
 from depthpose.depth.synthesis import Generator, SelectionGenerator, UNetGenerator
-from depthpose.depth.train.adapt import (
-    AdaptationCheck,
-    AdaptTask,
-    fine_focal_px,
-    label_folders,
-    refuse_worse,
-)
+from depthpose.depth.train import adapt, stages
 from depthpose.depth.train.config import (
     AdaptTraining,
     FinetuneTraining,
@@ -35,13 +29,6 @@ from depthpose.depth.train.config import (
     ViewTraining,
 )
 from depthpose.depth.train.pairs import TrainingPairs
-from depthpose.depth.train.stages import (
-    FinetuneTask,
-    SelectionSamples,
-    SelectTask,
-    StereoTask,
-    ViewTask,
-)
 from depthpose.depth.weights import read_generator, read_matcher, write_depth_weights
 
 _FREE_OF_WEIGHTS = ("max_disparity_px", "with_street", "least_confidence")
@@ -129,7 +116,7 @@ def train_view(config: ViewTraining, run: Run) -> Path:
     generator = UNetGenerator(config.generator)
     if config.start is not None:
         start_from(generator, read_generator(find_weights(config.start)), config.start)
-    facts, seconds = _run_stage(ViewTask(generator, config, held_out), pairs, config, run)
+    facts, seconds = _run_stage(stages.ViewTask(generator, config, held_out), pairs, config, run)
     return _write_weights(run, "view", facts, seconds, generator=generator)
 
 
@@ -147,13 +134,13 @@ def train_select(config: SelectTraining, run: Run) -> Path:
         for pairs in (config.pairs, config.more)
         if pairs is not None
     ]
-    samples = SelectionSamples(sources, config.more_share, config.degrade, seed)
+    samples = stages.SelectionSamples(sources, config.more_share, config.degrade, seed)
     generator = SelectionGenerator(rig)
     if config.encoder is not None:
         load_encoder(generator.encoder, find_weights(config.encoder))
     if config.start is not None:
         start_from(generator, read_generator(find_weights(config.start)), config.start)
-    task = SelectTask(generator, config, _held_out(config.held_out))
+    task = stages.SelectTask(generator, config, _held_out(config.held_out))
     facts, seconds = _run_stage(task, samples, config, run)
     return _write_weights(run, "select", facts, seconds, generator=generator)
 
@@ -175,7 +162,7 @@ def train_stereo(config: StereoTraining, run: Run) -> Path:
     pairs = TrainingPairs(config.pairs, config.loop.seed, needs_truth=True)
     held_out = _held_out(config.held_out)
     matcher = make_matcher_network(config)
-    facts, seconds = _run_stage(StereoTask(matcher, config, held_out), pairs, config, run)
+    facts, seconds = _run_stage(stages.StereoTask(matcher, config, held_out), pairs, config, run)
     return _write_weights(run, "stereo", facts, seconds, matcher=matcher)
 
 
@@ -191,21 +178,21 @@ def train_adapt(config: AdaptTraining, run: Run) -> Path:
         raise InputError("there is nothing to adapt to: name a folder of the rig's pairs (--data).")
     matcher = read_matcher(find_weights(config.start))
     if config.pairs.focal_px is None:
-        pairs = replace(config.pairs, focal_px=fine_focal_px(config, matcher))
+        pairs = replace(config.pairs, focal_px=adapt.fine_focal_px(config, matcher))
         config = replace(config, pairs=pairs)
-    labelled, kept = label_folders(config, run.folder / "labels")
+    labelled, kept = adapt.label_folders(config, run.folder / "labels")
     pairs = TrainingPairs(labelled, config.loop.seed, needs_truth=True)
-    facts, seconds = _run_stage(AdaptTask(matcher, config), pairs, config, run)
+    facts, seconds = _run_stage(adapt.AdaptTask(matcher, config), pairs, config, run)
     facts = facts | {"truth": "none; pseudo-labels of the initial weights regularise it"}
     path = run.folder / "matcher.safetensors"
     if find_rank().rank:
         return path
     device = str(next(matcher.parameters()).device)
-    check = AdaptationCheck(kept, config.streets, MatcherConfig(device=device))
+    check = adapt.AdaptationCheck(kept, config.streets, MatcherConfig(device=device))
     before = read_matcher(find_weights(config.start))
     found = [check.measure(network) for network in (before, matcher.eval())]
     write_json(run.folder / "adapt.json", [asdict(metrics) for metrics in found])
-    refuse_worse(*found)
+    adapt.refuse_worse(*found)
     write_depth_weights(path, matcher=matcher, facts=facts)
     text = [
         "Held-out pairs, and synthetic streets:",
@@ -237,7 +224,7 @@ def train_finetune(config: FinetuneTraining, run: Run) -> Path:
     config = _at_virtual_focal(config, generator.config)
     baseline_m = generator.config.virtual_baseline_m
     pairs = TrainingPairs(config.pairs, config.loop.seed, needs_truth=True, baseline_m=baseline_m)
-    task = FinetuneTask(generator, matcher, config, _held_out(config.held_out))
+    task = stages.FinetuneTask(generator, matcher, config, _held_out(config.held_out))
     facts, seconds = _run_stage(task, pairs, config, run)
     return _write_weights(run, "finetune", facts, seconds, generator=generator, matcher=matcher)
 
@@ -254,7 +241,7 @@ STAGES = {
 
 def _run_stage(
     task: Task,
-    samples: TrainingPairs | SelectionSamples,
+    samples: TrainingPairs | stages.SelectionSamples,
     config: Any,  # noqa: ANN401
     run: Run,
 ) -> tuple[dict[str, str], float]:
@@ -269,7 +256,7 @@ def _run_stage(
     more: dict[str, Any] = {f"{k}_sha256": file_sha256(find_weights(v)) for k, v in named.items()}
     if samples.truths:
         more["truth"] = list(samples.truths)
-    sources = samples.sources if isinstance(samples, SelectionSamples) else [samples]
+    sources = samples.sources if isinstance(samples, stages.SelectionSamples) else [samples]
     frames = [frame for source in sources for frame in source.frames]
     if frames:
         digest = sha256()  # of their names and the sizes of their left images

@@ -14,34 +14,13 @@ from torch import Tensor, nn
 
 from depthpose.core.draw import draw_disparity
 from depthpose.core.loop import Update, ValidationResult, make_adam, sample_generator
+from depthpose.depth import losses, synthesis
 from depthpose.depth.augment import TrainingPair, degrade
 from depthpose.depth.config import DegradeConfig
 from depthpose.depth.disparity import right_disparity_from_left
 from depthpose.depth.encoder import LiteEncoder
-from depthpose.depth.losses import (
-    DISPARITY_LOSSES,
-    adversarial_loss,
-    discriminator_loss,
-    disparity_loss,
-    heads_loss,
-    l1_loss,
-    plane_loss,
-    sky_loss,
-    valid_disparity,
-    view_loss,
-)
 from depthpose.depth.stereo import StereoNetwork, normalise
 from depthpose.depth.stereo.matcher import pad_top_right
-from depthpose.depth.synthesis import (
-    Generator,
-    SelectionGenerator,
-    SelectionSynthesiser,
-    UNetGenerator,
-    draw_right,
-    log_expectation,
-    make_discriminator,
-    mix_shifts,
-)
 from depthpose.depth.train.config import (
     FinetuneTraining,
     SelectTraining,
@@ -97,10 +76,10 @@ class StereoTask:
         heads = tuple(head.float() for head in heads)
         facts = {"epe": mean_error_px(heads[-1], batch.left_px, max_disparity_px)}
         if sky is None:
-            loss = heads_loss(heads, batch.left_px, max_disparity_px, sky_weight=sky_weight)
+            loss = losses.heads_loss(heads, batch.left_px, max_disparity_px, sky_weight=sky_weight)
         else:
-            error = sky_loss(sky.float(), batch.left_px)
-            loss = heads_loss(heads, batch.left_px, max_disparity_px) + sky_weight * error
+            error = losses.sky_loss(sky.float(), batch.left_px)
+            loss = losses.heads_loss(heads, batch.left_px, max_disparity_px) + sky_weight * error
             facts["sky"] = error.detach()
         yield Update("matcher", loss, facts)
 
@@ -134,7 +113,7 @@ def validate_pairs(
         height, width = pair.left.shape[-2:]
         found = heads[-1][0, -height:, :width].float().cpu()
         is_sky = None if sky is None else sky[0, -height:, :width].cpu() > 0.5
-        is_known = valid_disparity(pair.left_px[None], matcher.config.max_disparity_px)[0]
+        is_known = losses.valid_disparity(pair.left_px[None], matcher.config.max_disparity_px)[0]
         is_true_sky = pair.left_px == 0
         if is_sky is not None:
             found = torch.where(is_sky, 0.0, found)
@@ -160,7 +139,7 @@ def validate_pairs(
 @torch.no_grad()
 def mean_error_px(found_px: Maps, truth_px: Maps, max_px: int) -> Float[Tensor, ""]:
     """Mean absolute disparity error over the pixels with truth [px]."""
-    is_valid = valid_disparity(truth_px, max_px)
+    is_valid = losses.valid_disparity(truth_px, max_px)
     error = torch.where(is_valid, (found_px - truth_px.nan_to_num(0.0)).abs(), 0.0)
     return error.sum() / is_valid.sum().clamp(min=1)
 
@@ -169,7 +148,10 @@ class ViewTask:
     """cGAN + lambda L1 (eq. 2.3): the discriminator's update, then the generator's."""
 
     def __init__(
-        self, generator: UNetGenerator, config: ViewTraining, held_out: TrainingPairs | None
+        self,
+        generator: synthesis.UNetGenerator,
+        config: ViewTraining,
+        held_out: TrainingPairs | None,
     ) -> None:
         self.config, self.held_out = config, held_out
         self.generator = generator.train()
@@ -177,7 +159,9 @@ class ViewTask:
         adam = config.generator_adam
         self.optimizers = {"generator": (make_adam(generator.parameters(), adam), adam)}
         if config.discriminator != "none":
-            discriminator = make_discriminator(config.discriminator, config.discriminator_width)
+            discriminator = synthesis.make_discriminator(
+                config.discriminator, config.discriminator_width
+            )
             self.modules["discriminator"] = discriminator.train()
             adam = config.discriminator_adam
             self.optimizers["discriminator"] = (make_adam(discriminator.parameters(), adam), adam)
@@ -186,16 +170,16 @@ class ViewTask:
         """Draw once; the discriminator learns from it, then scores it anew."""
         left, right = 2 * batch.left - 1, 2 * batch.right - 1
         drawn = self.generator(left)
-        l1 = l1_loss(drawn, right)
+        l1 = losses.l1_loss(drawn, right)
         if self.config.discriminator == "none":
             yield Update("generator", self.config.l1_weight * l1, {"l1": l1.detach()})
             return
         discriminator, mode = self.modules["discriminator"], self.config.gan_mode
-        d_loss = discriminator_loss(
+        d_loss = losses.discriminator_loss(
             discriminator(left, right), discriminator(left, drawn.detach()), mode
         )
         yield Update("discriminator", d_loss, {})
-        adversarial = adversarial_loss(discriminator(left, drawn), mode, is_real=True)
+        adversarial = losses.adversarial_loss(discriminator(left, drawn), mode, is_real=True)
         loss = adversarial + self.config.l1_weight * l1
         yield Update("generator", loss, {"l1": l1.detach(), "adversarial": adversarial.detach()})
 
@@ -209,7 +193,7 @@ class ViewTask:
         for index in range(len(self.held_out)):
             pair = self.held_out.read(index)
             device = next(self.generator.parameters()).device
-            drawn = draw_right(self.generator, pair.left[None].to(device))[0].cpu()
+            drawn = synthesis.draw_right(self.generator, pair.left[None].to(device))[0].cpu()
             errors.append(float((drawn - pair.right).abs().mean()))
             squares.append(float((drawn - pair.right).square().mean()))
             if index == 0:
@@ -230,7 +214,7 @@ class FinetuneTask:
 
     def __init__(
         self,
-        generator: Generator,
+        generator: synthesis.Generator,
         matcher: StereoNetwork,
         config: FinetuneTraining,
         held_out: TrainingPairs | None,
@@ -245,12 +229,12 @@ class FinetuneTask:
 
     def step(self, batch: TrainingPair) -> Iterator[Update]:
         """One update: draw, match, compare with the truth."""
-        drawn = draw_right(self.generator, batch.left)
+        drawn = synthesis.draw_right(self.generator, batch.left)
         (found_px,) = self.matcher(normalise(batch.left), normalise(drawn))
         max_disparity_px = self.matcher.config.max_disparity_px
         found_px = found_px.float()
-        loss = disparity_loss(found_px, batch.left_px, max_disparity_px)
-        l1 = l1_loss(2 * drawn, 2 * batch.right)
+        loss = losses.disparity_loss(found_px, batch.left_px, max_disparity_px)
+        l1 = losses.l1_loss(2 * drawn, 2 * batch.right)
         facts = {"epe": mean_error_px(found_px, batch.left_px, max_disparity_px), "l1": l1.detach()}
         yield Update("generator", loss + self.config.l1_weight * l1, facts)
 
@@ -263,7 +247,7 @@ class FinetuneTask:
         device = next(self.generator.parameters()).device
 
         def draw(left: Tensor) -> Tensor:
-            return draw_right(self.generator, left[None].to(device))[0].cpu()
+            return synthesis.draw_right(self.generator, left[None].to(device))[0].cpu()
 
         result = validate_pairs(self.matcher, self.held_out, draw)
         self.generator.train()
@@ -325,7 +309,10 @@ class SelectTask:
     """Relative error and cross entropy of both views' disparity, L1 of the drawn right view."""
 
     def __init__(
-        self, generator: SelectionGenerator, config: SelectTraining, held_out: TrainingPairs | None
+        self,
+        generator: synthesis.SelectionGenerator,
+        config: SelectTraining,
+        held_out: TrainingPairs | None,
     ) -> None:
         self.config, self.held_out = config, held_out
         self.generator = generator
@@ -345,13 +332,14 @@ class SelectTask:
         """One update: predict disparity, warp the right view, compare."""
         planes = self.generator.planes
         left, right = self.generator(batch.seen)
-        losses = [self._truth_loss(left, batch.left_px), self._truth_loss(right, batch.right_px)]
-        loss = losses[0] + self.config.right_share * losses[1]
-        facts = {"left": losses[0].detach(), "right": losses[1].detach()}
+        of_left = self._truth_loss(left, batch.left_px)
+        of_right = self._truth_loss(right, batch.right_px)
+        loss = of_left + self.config.right_share * of_right
+        facts = {"left": of_left.detach(), "right": of_right.detach()}
         if self.config.view_weight:
             small = [F.avg_pool2d(view, 2) for view in (batch.left, batch.right)]
-            drawn = mix_shifts(small[0], right.float(), planes / 2)
-            views = view_loss(drawn, small[1])
+            drawn = synthesis.mix_shifts(small[0], right.float(), planes / 2)
+            views = losses.view_loss(drawn, small[1])
             view = (views * batch.has_right).sum() / batch.has_right.sum().clamp(min=1)
             loss = loss + self.config.view_weight * view
             facts["view"] = view.detach()
@@ -362,15 +350,15 @@ class SelectTask:
     ) -> Float[Tensor, ""]:
         """Losses of the disparity of one view."""
         planes, range_px = self.generator.planes, self.generator.config.disparity_px
-        log_px = log_expectation(logits, planes)[:, None]
+        log_px = synthesis.log_expectation(logits, planes)[:, None]
         log_px = F.interpolate(log_px, truth_px.shape[1:], mode="bilinear", align_corners=False)
-        loss = DISPARITY_LOSSES[self.config.disparity_loss](log_px[:, 0], truth_px, range_px)
+        loss = losses.DISPARITY_LOSSES[self.config.disparity_loss](log_px[:, 0], truth_px, range_px)
         if not self.config.plane_weight:
             return loss
         # The nearest point of the four pixels that a logit stands for; unknown is -1.
         coarse = F.max_pool2d(truth_px.nan_to_num(-1.0)[:, None], 2)[:, 0]
         coarse = torch.where(coarse < 0, torch.nan, coarse)
-        return loss + self.config.plane_weight * plane_loss(logits, coarse, planes)
+        return loss + self.config.plane_weight * losses.plane_loss(logits, coarse, planes)
 
     @torch.no_grad()
     def validate(self) -> ValidationResult:
@@ -379,7 +367,7 @@ class SelectTask:
             return ValidationResult()
         self.generator.eval()
         device, rig = next(self.generator.parameters()).device, self.generator.config
-        synthesiser = SelectionSynthesiser(self.generator, device)
+        synthesiser = synthesis.SelectionSynthesiser(self.generator, device)
         far_px = rig.virtual_focal_px * rig.virtual_baseline_m / _CAP_M
         errors, within, missed, pictures = [], [], [], {}
         for index in range(len(self.held_out)):
