@@ -20,7 +20,7 @@ from depthpose.depth.estimator.net import from_pair, join_matches
 from depthpose.depth.export import depth_export
 from depthpose.depth.labels import LabelConfig, label_pair
 from depthpose.depth.losses import sky_loss
-from depthpose.depth.predictions import read_sky, write_estimate
+from depthpose.depth.predictions import read_estimate, write_estimate
 from depthpose.depth.stereo import LightMatcher, LightStereo, StereoNetwork, light, normalise
 from depthpose.depth.train import StereoTask
 from depthpose.depth.train.adapt import AdaptationCheck
@@ -291,7 +291,7 @@ def test_the_sky_is_written_beside_the_depth(tmp_path: Path) -> None:
     found = estimated()
     assert found.seen is not None
     write_estimate(tmp_path, found.seen, found)
-    written = read_sky(tmp_path, found.seen.name)
+    written = read_estimate(tmp_path, found.seen.name, None).is_sky
     assert written is not None
     assert found.is_sky is not None
     assert torch.equal(written, found.is_sky)

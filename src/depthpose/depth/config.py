@@ -332,21 +332,6 @@ class SGBMConfig(Settings):
     p2: int = 32 * 3 * 9
     """Penalty of a larger step; more than p1."""
 
-    disp12_max_diff: int = 1
-    """Largest difference allowed in the left-right check [px]."""
-
-    pre_filter_cap: int = 63
-    """Bound of the horizontal gradient that is matched."""
-
-    uniqueness_ratio: int = 10
-    """Percent by which the best cost must beat the second."""
-
-    speckle_window_size: int = 100
-    """Islands of at most so many pixels are dropped."""
-
-    speckle_range: int = 2
-    """Disparity step inside an island [px]."""
-
     mode: Literal["sgbm", "hh", "sgbm_3way", "hh4"] = "sgbm_3way"
     """Directions of aggregation: 5, 8, 3 or 4."""
 

@@ -182,9 +182,9 @@ def changed_match(match: Match, change: Callable[[Tensor], Tensor]) -> Match:
 
 def resized_match(match: Match, height: int, width: int) -> Match:
     """Bring a match to another size of its image."""
-    sure, sky = match.confidence, match.is_sky
+    px, sure, sky = match.disparity_px, match.confidence, match.is_sky
     return Match(
-        disparity_px=resize_disparity(match.disparity_px, height, width),
+        disparity_px=resized_map(px, height, width) * (width / px.shape[1]),
         confidence=None if sure is None else resized_map(sure, height, width),
         is_sky=None if sky is None else resized_map(sky.float(), height, width) > 0.5,
     )

@@ -17,8 +17,8 @@ from depthpose.core.errors import InputError, nearest_name
 from depthpose.core.files import read_image
 from depthpose.core.frame import data_frame
 from depthpose.depth import disparity
-from depthpose.depth.datasets import Dataset, Frame, has_lidar, lidar_truth
-from depthpose.depth.datasets import read_disparity as read_truth_disparity
+from depthpose.depth import predictions as files
+from depthpose.depth.datasets import Dataset, Frame, has_lidar, lidar_truth, read_disparity
 from depthpose.depth.metrics import (
     METRICS,
     RANKING,
@@ -29,16 +29,6 @@ from depthpose.depth.metrics import (
     measure,
     score_confidence,
     view_errors,
-)
-from depthpose.depth.predictions import (
-    EXPECTED,
-    has_disparity,
-    has_prediction,
-    read_confidence,
-    read_depth,
-    read_disparity,
-    read_drawn_view,
-    read_sky,
 )
 from depthpose.depth.types import DepthError, DepthEstimate, Map
 
@@ -265,7 +255,7 @@ def summarise(
         name = next(name for name, why in skipped.items() if why == NO_PREDICTION)
         raise InputError(
             f"{dataset.name}: no frame has both truth and a prediction; {name!r} has the truth and "
-            f"{NO_PREDICTION}. Predictions are called {EXPECTED}"
+            f"{NO_PREDICTION}. Predictions are called {files.EXPECTED}"
         )
     if not measured:
         raise InputError(
@@ -328,7 +318,8 @@ def frame_result(
         raise InputError(f"{name}: {prepared}; choose a frame that counts")
     rig = prepared.rig
     depth_m = None if rig is None else disparity.depth_from_disparity(prepared.disparity_px, rig)
-    is_sky = read_sky(predictions, name)
+    sky = files.read_part(predictions, name, "sky.png")
+    is_sky = None if sky is None else sky[0] > 0
     if is_sky is not None and depth_m is not None and is_sky.shape == depth_m.shape:
         depth_m = torch.where(is_sky, torch.nan, depth_m)
     predicted, truth = _compared(prepared, rule, cap_m)
@@ -341,7 +332,7 @@ def frame_result(
         depth_m=depth_m,
         disparity_px=prepared.disparity_px,
         confidence=prepared.confidence,
-        right=read_drawn_view(predictions, name),
+        right=files.read_part(predictions, name, "right.png"),
         is_sky=is_sky,
     )
     return estimate, DepthError(error=error, is_disparity=cap_m is None, true_depth_m=true_m)
@@ -375,7 +366,7 @@ def _prepare(dataset: Dataset, index: int, predictions: Path, rule: Protocol) ->
     frame, is_stereo = dataset.frames[index], rule.truth == "disparity"
     if not has_truth(frame, rule):
         return f"no truth of the kind {rule.truth}"
-    if frame.right is None and not has_prediction(predictions, frame.name):
+    if frame.right is None and not files.has_prediction(predictions, frame.name):
         return NO_PREDICTION
     if rule.truth in ("velodyne_x", "camera_z"):
         truth = lidar_truth(frame, rule.truth)
@@ -385,8 +376,9 @@ def _prepare(dataset: Dataset, index: int, predictions: Path, rule: Protocol) ->
     assert truth is not None, "has_truth said so"
     height, width = truth.shape
     rig, depth_m = dataset.read_rig(index), None
-    if not is_stereo and (rig is None or not has_disparity(predictions, frame.name)):
-        depth_m = read_depth(predictions, frame.name)
+    has_disparity = files.has_prediction(predictions, frame.name, of_disparity=True)
+    if not is_stereo and (rig is None or not has_disparity):
+        depth_m = files.read_depth(predictions, frame.name)
     if not is_stereo and rig is None:
         if depth_m is None:
             raise InputError(
@@ -395,7 +387,7 @@ def _prepare(dataset: Dataset, index: int, predictions: Path, rule: Protocol) ->
             )
         K = torch.tensor([[width, 0, 0], [0, width, 0], [0, 0, 1]], dtype=torch.float64)
         rig = StereoRig(width=width, height=height, K=K, baseline_m=1.0)  # depth takes any
-    found_px = read_disparity(predictions, frame.name, rig, with_disparity_png=is_stereo)
+    found_px = files.read_disparity(predictions, frame.name, rig, with_disparity_png=is_stereo)
     predicted_px = disparity.resize_disparity(found_px, height, width)
     true_px = truth if is_stereo or rig is None else disparity.disparity_from_depth(truth, rig)
     # With principal points apart, the disparity of far points is negative.
@@ -404,10 +396,10 @@ def _prepare(dataset: Dataset, index: int, predictions: Path, rule: Protocol) ->
         advice := disparity.disparity_advice(predicted_px + apart_px, true_px + apart_px)
     ) is not None:
         raise InputError(f"{predictions / frame.name}: {advice}")
-    confidence = read_confidence(predictions, frame.name)
+    confidence = files.read_part(predictions, frame.name, "confidence.npy")
     if confidence is not None and confidence.shape != truth.shape:
         confidence = disparity.resized_map(confidence, height, width)
-    drawn, view = read_drawn_view(predictions, frame.name), {}
+    drawn, view = files.read_part(predictions, frame.name, "right.png"), {}
     if drawn is not None and frame.right is not None:
         real = read_image(frame.right)
         if real.shape != drawn.shape:
@@ -457,7 +449,7 @@ def _measure(prepared: _Prepared, rule: Protocol, cap_m: float | None) -> Measur
         if cap_m is not None:
             error = error / truth
         elif prepared.frame.disparity_noc is not None:
-            seen_px = read_truth_disparity(prepared.frame.disparity_noc)
+            seen_px = read_disparity(prepared.frame.disparity_noc)
             seen = torch.isfinite(seen_px) & torch.isfinite(prepared.disparity_px)
             if bool(seen.any()):
                 metrics |= measure("disparity_noc", prepared.disparity_px[seen], seen_px[seen])

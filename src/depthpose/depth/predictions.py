@@ -6,6 +6,9 @@ from functools import partial
 from pathlib import Path
 from typing import Any, Protocol, runtime_checkable
 
+from jaxtyping import Float
+from torch import Tensor
+
 from depthpose.core import files
 from depthpose.core.camera import Camera, StereoRig
 from depthpose.core.config import config_from_dict
@@ -16,7 +19,7 @@ from depthpose.core.files.text import read_text
 from depthpose.core.run import claim_folder, claim_names, is_whole, note_result
 from depthpose.depth.disparity import depth_from_disparity, disparity_from_depth
 from depthpose.depth.metrics import SMALLEST_DEPTH_M
-from depthpose.depth.types import DepthEstimate, Ground, Map, Mask, StereoInput, View
+from depthpose.depth.types import DepthEstimate, Ground, Map, StereoInput
 
 
 @runtime_checkable
@@ -70,7 +73,7 @@ def write_estimate(
     written: list[Path] = []
 
     def new(ending: str) -> Path:
-        written.append(_file(folder / pair.name, ending))
+        written.append(folder / f"{pair.name}.{ending}")
         return written[-1]
 
     if cloud_m is not None:
@@ -104,9 +107,10 @@ def is_finished(folder: Path, name: str, *, with_cloud: bool = False) -> bool:
     return is_whole(folder, name, [f"{name}.{ending}" for ending in endings])
 
 
-def has_prediction(folder: Path, name: str) -> bool:
-    """Whether the folder holds a prediction of this frame, ours or anybody's."""
-    return _first(folder / name, (*_DISPARITY, *_DEPTH, _KITTI)) is not None
+def has_prediction(folder: Path, name: str, *, of_disparity: bool = False) -> bool:
+    """Whether the folder holds a prediction of this frame, or one of disparity by its name."""
+    endings = _DISPARITY if of_disparity else (*_DISPARITY, *_DEPTH, _KITTI)
+    return _first(folder / name, endings) is not None
 
 
 def read_disparity(
@@ -159,33 +163,18 @@ def read_depth(folder: Path, name: str) -> Map | None:
     return files.read_depth_png(path) if path.suffix.lower() == ".png" else files.read_map(path)
 
 
-def has_disparity(folder: Path, name: str) -> bool:
-    """Whether a prediction is one of disparity."""
-    return _first(folder / name, _DISPARITY) is not None
-
-
 def _first(base: Path, endings: tuple[str, ...]) -> Path | None:
-    named = (_file(base, end) for end in endings)
+    named = (base.with_name(f"{base.name}.{end}") for end in endings)
     both = (path for file in named for path in (file, file.with_suffix(file.suffix.upper())))
     return next((path for path in both if path.is_file()), None)
 
 
-def read_confidence(folder: Path, name: str) -> Map | None:
-    """Read the confidence beside a prediction, or None where there is none."""
-    path = _first(folder / name, ("confidence.npy",))
-    return None if path is None else files.read_map(path)
-
-
-def read_drawn_view(folder: Path, name: str) -> View | None:
-    """Read the right view that a prediction was made through, or None where none was drawn."""
-    path = _first(folder / name, ("right.png",))
-    return None if path is None else files.read_image(path)
-
-
-def read_sky(folder: Path, name: str) -> Mask | None:
-    """Read where a prediction says sky, or None where its weights do not know it."""
-    path = _first(folder / name, ("sky.png",))
-    return None if path is None else files.read_image(path)[0] > 0
+def read_part(folder: Path, name: str, ending: str) -> Float[Tensor, "*c h w"] | None:
+    """Read a map or a picture of :data:`ENDINGS`; None where the prediction has none."""
+    path = _first(folder / name, (ending,))
+    if path is None:
+        return None
+    return files.read_image(path) if path.suffix.lower() == ".png" else files.read_map(path)
 
 
 def read_estimate(folder: Path, name: str, camera: Camera | None) -> DepthEstimate:
@@ -195,10 +184,8 @@ def read_estimate(folder: Path, name: str, camera: Camera | None) -> DepthEstima
         InputError: there is no prediction of that name, or a file of it is damaged.
     """
     disparity_px = read_disparity(folder, name, camera)
-    depth_m, warning, ground = (
-        _first(folder / name, (ending,)) for ending in ("depth_m.npy", "warning.txt", "ground.json")
-    )
-    metres = None if depth_m is None else files.read_map(depth_m)
+    warning, ground = (_first(folder / name, (end,)) for end in ("warning.txt", "ground.json"))
+    metres, sky = (read_part(folder, name, end) for end in ("depth_m.npy", "sky.png"))
     if metres is None and isinstance(camera, StereoRig):
         metres = depth_from_disparity(disparity_px, camera)
     plane = None
@@ -211,9 +198,9 @@ def read_estimate(folder: Path, name: str, camera: Camera | None) -> DepthEstima
     return DepthEstimate(
         depth_m=metres,
         disparity_px=disparity_px,
-        confidence=read_confidence(folder, name),
-        right=read_drawn_view(folder, name),
-        is_sky=read_sky(folder, name),
+        confidence=read_part(folder, name, "confidence.npy"),
+        right=read_part(folder, name, "right.png"),
+        is_sky=None if sky is None else sky[0] > 0,
         ground=plane,
         warning="" if warning is None else read_text(warning).strip(),
     )
@@ -243,7 +230,3 @@ def predict(
             pair = read_input()
             note_result(folder, name, write_estimate(folder, pair, net.estimate_pair(pair)))
         yield name
-
-
-def _file(base: Path, ending: str) -> Path:
-    return base.with_name(f"{base.name}.{ending}")

@@ -5,7 +5,7 @@ import io
 import os
 import re
 import tarfile
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, fields
 from functools import partial
@@ -20,7 +20,7 @@ from depthpose.core.errors import InputError
 from depthpose.core.files.disk import SOURCE, find_partners, write_bytes
 from depthpose.core.files.images import LISTED_SUFFIXES
 from depthpose.core.run import is_whole, note_result
-from depthpose.depth.datasets.frames import Frame
+from depthpose.depth.datasets.frames import CalibrationStyle, Frame
 from depthpose.depth.types import RawFrame
 
 INDEX = "index.json"
@@ -174,28 +174,34 @@ def _recognise(folder: Path) -> tuple[str, list[Frame]] | None:
     return None
 
 
+def _frames(
+    lefts: list[Path], style: CalibrationStyle, prefix: str = "", **parts: Mapping[str, Path]
+) -> Iterator[Frame]:
+    """Frames of left images, with the parts of the same stem."""
+    for left in lefts:
+        others = {part: found.get(left.stem) for part, found in parts.items()}
+        yield Frame(name=prefix + left.stem, left=left, style=style, **others)
+
+
 def _raw(folder: Path) -> Iterable[Frame]:
     """KITTI raw: a root of dates, a date or a drive; its depth-prediction set inside or beside."""
     itself = [folder] if folder.name.endswith("_sync") else []
     for drive in sorted([*itself, *folder.glob("*_sync"), *folder.glob("*/*_sync")]):
-        date = drive.parent
-        parts = {
-            "right": _by_stem(drive / "image_03/data"),
-            "velodyne": _by_stem(drive / "velodyne_points/data", (".bin",)),
-            "scan": _by_stem(_depth_folder(drive, "velodyne_raw", "data_depth_velodyne")),
-            "depth": _by_stem(_depth_folder(drive, "groundtruth", "data_depth_annotated")),
-            "disparity": _by_stem(drive / "disp_occ"),
-            "disparity_noc": _by_stem(drive / "disp_noc"),
-            "sky": _by_stem(drive / "sky"),
-        }
-        for left in _images(drive / "image_02/data"):
-            yield Frame(
-                name=f"{drive.name}_{left.stem}",
-                left=left,
-                calibration=date if (date / "calib_cam_to_cam.txt").exists() else None,
-                style="raw",
-                **{part: found.get(left.stem) for part, found in parts.items()},
-            )
+        date, lefts = drive.parent, _images(drive / "image_02/data")
+        is_calibrated = (date / "calib_cam_to_cam.txt").exists()
+        yield from _frames(
+            lefts,
+            "raw",
+            f"{drive.name}_",
+            calibration={left.stem: date for left in lefts if is_calibrated},
+            right=_by_stem(drive / "image_03/data"),
+            velodyne=_by_stem(drive / "velodyne_points/data", (".bin",)),
+            scan=_by_stem(_depth_folder(drive, "velodyne_raw", "data_depth_velodyne")),
+            depth=_by_stem(_depth_folder(drive, "groundtruth", "data_depth_annotated")),
+            disparity=_by_stem(drive / "disp_occ"),
+            disparity_noc=_by_stem(drive / "disp_noc"),
+            sky=_by_stem(drive / "sky"),
+        )
 
 
 def _depth_folder(drive: Path, kind: str, archive: str) -> Path:
@@ -233,42 +239,35 @@ def _odometry(folder: Path) -> Iterable[Frame]:
         if not (home / "calib.txt").is_file():
             continue
         is_grey = not (home / "image_2").is_dir()
-        right = _by_stem(home / ("image_1" if is_grey else "image_3"))
-        points = _by_stem(home / "velodyne", (".bin",))
-        for left in _images(home / ("image_0" if is_grey else "image_2")):
-            yield Frame(
-                name=left.stem if home == folder else f"{home.name}_{left.stem}",
-                left=left,
-                right=right.get(left.stem),
-                calibration=home / "calib.txt",
-                style="grey" if is_grey else "object",
-                velodyne=points.get(left.stem),
-            )
+        lefts = _images(home / ("image_0" if is_grey else "image_2"))
+        yield from _frames(
+            lefts,
+            "grey" if is_grey else "object",
+            "" if home == folder else f"{home.name}_",
+            calibration={left.stem: home / "calib.txt" for left in lefts},
+            right=_by_stem(home / ("image_1" if is_grey else "image_3")),
+            velodyne=_by_stem(home / "velodyne", (".bin",)),
+        )
 
 
 def _benchmark(folder: Path, one: str, other: str, ending: str) -> Iterable[Frame]:
     """KITTI object, 2012 or 2015: of the stereo sets the frames that have truth, NNNNNN_10."""
     home = folder / "training" if (folder / "training" / one).is_dir() else folder
     lefts = _images(home / one)
-    is_stereo = any(left.stem.endswith("_10") for left in lefts)  # its testing folder too
-    parts = {
-        "right": _by_stem(home / other),
-        "velodyne": _by_stem(home / "velodyne", (".bin",)),
-        "depth": _by_stem(home / "gt_depth_map"),
-        "disparity": _by_stem(home / f"disp_occ{ending}"),
-        "disparity_noc": _by_stem(home / f"disp_noc{ending}"),
-    }
+    # Of the stereo sets the testing folder too.
+    lefts = [left for left in lefts if left.stem.endswith("_10")] or lefts
     texts = _by_stem(home / "calib_cam_to_cam", (".txt",)) | _by_stem(home / "calib", (".txt",))
-    for left in lefts:
-        if is_stereo and not left.stem.endswith("_10"):
-            continue
-        yield Frame(
-            name=left.stem,
-            left=left,
-            calibration=texts.get(left.stem) or texts.get(left.stem.removesuffix("_10")),
-            style="object",
-            **{part: found.get(left.stem) for part, found in parts.items()},
-        )
+    texts = {f"{stem}_10": path for stem, path in texts.items()} | texts
+    return _frames(
+        lefts,
+        "object",
+        calibration=texts,
+        right=_by_stem(home / other),
+        velodyne=_by_stem(home / "velodyne", (".bin",)),
+        depth=_by_stem(home / "gt_depth_map"),
+        disparity=_by_stem(home / f"disp_occ{ending}"),
+        disparity_noc=_by_stem(home / f"disp_noc{ending}"),
+    )
 
 
 def _middlebury(folder: Path) -> Iterable[Frame]:
@@ -298,14 +297,9 @@ def _pairs(folder: Path) -> Iterable[Frame]:
             order = find_partners([left.stem for left in lefts], list(right), str(folder))
             views = list(right.values())
             parts["right"] = {left.stem: views[k] for left, k in zip(lefts, order, strict=True)}
-    for left in lefts:
-        yield Frame(
-            name=left.stem,
-            left=left,
-            calibration=camera or (text if text.is_file() else None),
-            style="camera" if camera else "plain",
-            **{part: found.get(left.stem) for part, found in parts.items()},
-        )
+    calibration = camera or (text if text.is_file() else None)
+    of_all = {left.stem: calibration for left in lefts if calibration}
+    return _frames(lefts, "camera" if camera else "plain", calibration=of_all, **parts)
 
 
 LAYOUTS = {

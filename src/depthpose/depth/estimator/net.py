@@ -48,7 +48,7 @@ from depthpose.depth.ground import scale_by_distance, scale_by_mount
 from depthpose.depth.stereo import CameraMatcher, Matcher, SGBMMatcher, make_matcher
 from depthpose.depth.stereo.light import LEAST_PX
 from depthpose.depth.synthesis import SelectionGenerator, Synthesiser, make_synthesiser
-from depthpose.depth.types import DepthEstimate, Mask, Match, StereoInput
+from depthpose.depth.types import DepthEstimate, Match, StereoInput
 from depthpose.depth.weights import Use, read_depth_weights
 
 DEFAULT = "default"
@@ -56,7 +56,8 @@ DEFAULT = "default"
 SKY_M = 10_000.0
 """What the disparity of the sky says: protocols take a disparity of zero for none, or for near."""
 _LEAST_SKY = 0.002
-"""Of the image: 43 pixels in a garage were 0.87 m of RMSE, and 0.25 m without them."""
+"""Of the image; fewer pixels are a lamp or a window, at the match's depth: 43 in a garage were
+0.87 m of RMSE, and 0.25 m without them."""
 
 
 class FakestereoNet:
@@ -481,9 +482,10 @@ def square_camera(size: tuple[int, int], focal_px: float) -> Camera:
 
 def from_pair(pair: StereoInput, match: Match, warning: str = "") -> DepthEstimate:
     """Give what was found in a rectified pair: metres where its camera has a baseline."""
-    px, depth_m, is_sky = match.disparity_px, None, _without_specks(match.is_sky)
+    px, depth_m, is_sky = match.disparity_px, None, match.is_sky
     rig = pair.camera if isinstance(pair.camera, StereoRig) else None
     if is_sky is not None:
+        is_sky = is_sky & (is_sky.float().mean() >= _LEAST_SKY)
         far_px = torch.full_like(px, LEAST_PX)
         if rig is not None:
             far_px = disparity.disparity_from_depth(torch.full_like(px, SKY_M), rig)
@@ -501,11 +503,6 @@ def from_pair(pair: StereoInput, match: Match, warning: str = "") -> DepthEstima
     )
 
 
-def _without_specks(is_sky: Mask | None) -> Mask | None:
-    """Take a few pixels of sky in an image for none: a lamp or a window, at the match's depth."""
-    return None if is_sky is None else is_sky & (is_sky.float().mean() >= _LEAST_SKY)
-
-
 def from_virtual(
     image: StereoInput,
     rig: GeneratorConfig | SelectionConfig,
@@ -519,9 +516,10 @@ def from_virtual(
     height, width = image.left.shape[1:]
     seen = disparity.resized_match(replace(match, is_sky=is_sky), height, width)
     imitated = StereoRig(width=width, height=height, K=camera.K, baseline_m=rig.virtual_baseline_m)
-    px, is_sky = seen.disparity_px, _without_specks(seen.is_sky)
+    px, is_sky = seen.disparity_px, seen.is_sky
     depth_m = disparity.depth_from_disparity(px, imitated)
     if is_sky is not None:
+        is_sky = is_sky & (is_sky.float().mean() >= _LEAST_SKY)
         depth_m = torch.where(is_sky, SKY_M, depth_m)
         px = torch.where(is_sky, float(camera.K[0, 0]) * rig.virtual_baseline_m / SKY_M, px)
     return DepthEstimate(

@@ -177,11 +177,11 @@ class SGBMMatcher:
             blockSize=config.block_size,
             P1=config.p1,
             P2=config.p2,
-            disp12MaxDiff=config.disp12_max_diff,
-            preFilterCap=config.pre_filter_cap,
-            uniquenessRatio=config.uniqueness_ratio,
-            speckleWindowSize=config.speckle_window_size,
-            speckleRange=config.speckle_range,
+            disp12MaxDiff=1,  # of the left-right check [px]
+            preFilterCap=63,  # of the horizontal gradient
+            uniquenessRatio=10,  # by which the best cost must beat the second [%]
+            speckleWindowSize=100,  # islands of at most so many pixels are dropped ...
+            speckleRange=2,  # ... where they step by more than this [px]
             mode=getattr(self._cv2, f"STEREO_SGBM_MODE_{config.mode.upper()}"),
         )
         # The 8-bit BGR that OpenCV reads from a file.
