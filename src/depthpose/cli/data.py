@@ -376,6 +376,7 @@ def export_depth(
         images: of colmap: folder that image names are relative to; by default that of each image.
         scale: units of the reconstruction per metre.
     """
+    from depthpose.core.files import write_json
     from depthpose.core.run import claim_folder
     from depthpose.depth import exchange
 
@@ -383,21 +384,23 @@ def export_depth(
         raise InputError(f"--scale {scale:g}: units per metre must be positive; 1 for metres")
     settings = {"command": "data export-depth", "results": str(results.resolve())}
     settings |= {"scale": scale, "format": format}
+    readers = exchange.read_predicted(results)
     if format == "colmap":
-        named = exchange.colmap_files(results, images)
+        named = exchange.colmap_files(results, readers, images)
         claim_folder(out, settings, named.values())
-        written = exchange.write_colmap(results, out, named, scale)
-        list(_shown(written, len(named), "frames"))
+        for name in _shown(readers, len(readers), "frames"):
+            exchange.write_colmap_map(out / named[name], readers[name]() * scale)
         print(f"{out}: depth of {len(named)} images in stereo/depth_maps")
         return 0
-    named = exchange.nerfstudio_files(results, files)
+    named = {name: f"depths/{name}.{files}" for name in readers}
     frames = exchange.nerfstudio_frames(out, named)
     claim_folder(out, settings | {"files": files}, [*named.values(), exchange.TRANSFORMS_DEPTH])
-    written = exchange.write_nerfstudio(results, out, named, scale)
-    lost = sum(_shown(written, len(named), "frames"))
+    lost = 0
+    for name in _shown(readers, len(readers), "frames"):
+        lost += exchange.write_nerfstudio_map(out / named[name], readers[name]() * scale)
     beside = "there is no transforms.json"
     if frames is not None:
-        exchange.write_transforms(out, frames)
+        write_json(out / exchange.TRANSFORMS_DEPTH, frames)
         beside = "transforms_depth.json names them"
     print(f"{out}: depth of {len(named)} frames in depths; {beside}")
     if lost:

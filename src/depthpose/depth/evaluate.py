@@ -229,9 +229,41 @@ def measure_frame(
     prepared = _prepare(dataset, index, predictions, rule)
     if isinstance(prepared, str):
         return prepared
-    caps = [None] if rule.truth == "disparity" else caps_m
-    measured = [_measure(prepared, rule, cap_m) for cap_m in caps]
-    return [one for one in measured if one is not None] or "no truth within the caps and the crop"
+    measured: list[Measured] = []
+    for cap_m in [None] if rule.truth == "disparity" else caps_m:
+        predicted, truth = _compared(prepared, rule, cap_m)
+        counts = torch.isfinite(truth)
+        mask = counts & torch.isfinite(predicted)
+        if not bool(counts.any()):
+            continue
+        metrics, deciles, pixels = {}, None, int(mask.sum())
+        if pixels:
+            predicted, truth = predicted[mask], truth[mask]
+            error = (predicted - truth).abs()
+            metrics = measure("disparity" if cap_m is None else "depth", predicted, truth)
+            if cap_m is not None:
+                error = error / truth
+            elif prepared.frame.disparity_noc is not None:
+                seen_px = read_disparity(prepared.frame.disparity_noc)
+                seen = torch.isfinite(seen_px) & torch.isfinite(prepared.disparity_px)
+                if bool(seen.any()):
+                    metrics |= measure("disparity_noc", prepared.disparity_px[seen], seen_px[seen])
+            metrics |= prepared.view
+            if prepared.confidence is not None:
+                metrics |= score_confidence(error, prepared.confidence[mask])
+                deciles = error_by_decile(error, prepared.confidence[mask]).tolist()
+        coverage = float(mask.sum() / counts.sum())
+        measured.append(
+            Measured(
+                frame=prepared.frame.name,
+                cap_m=cap_m,
+                pixels=pixels,
+                coverage=coverage,
+                metrics=metrics,
+                deciles=deciles,
+            )
+        )
+    return measured or "no truth within the caps and the crop"
 
 
 def summarise(
@@ -432,36 +464,3 @@ def _compared(prepared: _Prepared, rule: Protocol, cap_m: float | None) -> tuple
         assert prepared.rig is not None
         predicted_m = clamped_depth(prepared.disparity_px, prepared.rig, cap_m)
     return predicted_m.clamp(SMALLEST_DEPTH_M, cap_m), torch.where(counts, truth, torch.nan)
-
-
-def _measure(prepared: _Prepared, rule: Protocol, cap_m: float | None) -> Measured | None:
-    """Measure one frame up to a cap; None where no truth counts."""
-    predicted, truth = _compared(prepared, rule, cap_m)
-    counts = torch.isfinite(truth)
-    mask = counts & torch.isfinite(predicted)
-    if not bool(counts.any()):
-        return None
-    metrics, deciles, pixels = {}, None, int(mask.sum())
-    if pixels:
-        predicted, truth = predicted[mask], truth[mask]
-        error = (predicted - truth).abs()
-        metrics = measure("disparity" if cap_m is None else "depth", predicted, truth)
-        if cap_m is not None:
-            error = error / truth
-        elif prepared.frame.disparity_noc is not None:
-            seen_px = read_disparity(prepared.frame.disparity_noc)
-            seen = torch.isfinite(seen_px) & torch.isfinite(prepared.disparity_px)
-            if bool(seen.any()):
-                metrics |= measure("disparity_noc", prepared.disparity_px[seen], seen_px[seen])
-        metrics |= prepared.view
-        if prepared.confidence is not None:
-            metrics |= score_confidence(error, prepared.confidence[mask])
-            deciles = error_by_decile(error, prepared.confidence[mask]).tolist()
-    return Measured(
-        frame=prepared.frame.name,
-        cap_m=cap_m,
-        pixels=pixels,
-        coverage=float(mask.sum() / counts.sum()),
-        metrics=metrics,
-        deciles=deciles,
-    )

@@ -3,21 +3,19 @@
 COLMAP's maps are those of its dense reconstruction (``stereo/depth_maps``).
 """
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterable, Mapping
+from functools import partial
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 import torch
 
 from depthpose.core.errors import InputError
-from depthpose.core.files import read_json, read_map, write_depth_png, write_json, write_map
+from depthpose.core.files import read_json, read_map, write_depth_png, write_map
 from depthpose.core.files.disk import AnyPath, write_bytes
 from depthpose.core.run import read_sources
 from depthpose.depth.types import Map
-
-Kind = Literal["png", "npy"]
-"""Files of nerfstudio's depth: 16-bit PNG, or float32."""
 
 NERFSTUDIO_UNIT = 0.001
 """What nerfstudio multiplies depth files of either kind by, by default."""
@@ -25,25 +23,30 @@ TRANSFORMS, TRANSFORMS_DEPTH = "transforms.json", "transforms_depth.json"
 _DEPTH = ".depth_m.npy"
 
 
-def predicted_names(results: Path) -> list[str]:
-    """List the frames of a folder of ``depth predict`` or ``depth match`` that have metres."""
+def read_predicted(results: Path) -> dict[str, Callable[[], Map]]:
+    """Give readers of depth [m], NaN where unknown, of the frames of a folder of predictions."""
     names = sorted(path.name.removesuffix(_DEPTH) for path in results.glob(f"*{_DEPTH}"))
     if not names:
         raise InputError(
             f"{results}: no NAME{_DEPTH} in it; give a folder that 'depth predict' or 'depth "
             "match' wrote, with a camera"
         )
-    return names
+
+    def read(name: str) -> Map:
+        depth_m = read_map(results / f"{name}{_DEPTH}")
+        return torch.where(depth_m > 0, depth_m, torch.nan)
+
+    return {name: partial(read, name) for name in names}
 
 
-def colmap_files(results: Path, images: Path | None = None) -> dict[str, str]:
+def colmap_files(results: Path, names: Iterable[str], images: Path | None = None) -> dict[str, str]:
     """Say where in COLMAP's workspace the depth of each frame belongs.
 
     COLMAP calls a map by its image, suffix and all: ``stereo/depth_maps/a.jpg.geometric.bin``.
     """
     sources = read_sources(results)
     files = {}
-    for name in predicted_names(results):
+    for name in names:
         image = sources.get(name, Path(f"{name}.png"))
         if images is None:
             inside = Path(image.name)
@@ -53,18 +56,6 @@ def colmap_files(results: Path, images: Path | None = None) -> dict[str, str]:
             raise InputError(f"{image}: does not lie in --images {images}; name their folder")
         files[name] = f"stereo/depth_maps/{inside.as_posix()}.geometric.bin"
     return files
-
-
-def write_colmap(results: Path, out: Path, files: Mapping[str, str], scale: float) -> Iterator[str]:
-    """Write the depth of each frame for COLMAP, and yield its name."""
-    for name, file in files.items():
-        write_colmap_map(out / file, _depth_m(results, name) * scale)
-        yield name
-
-
-def nerfstudio_files(results: Path, kind: Kind) -> dict[str, str]:
-    """Say what the depth of each frame is called in nerfstudio's data set; none is refused."""
-    return {name: f"depths/{name}.{kind}" for name in predicted_names(results)}
 
 
 def nerfstudio_frames(out: Path, files: Mapping[str, str]) -> dict[str, Any] | None:
@@ -94,35 +85,13 @@ def nerfstudio_frames(out: Path, files: Mapping[str, str]) -> dict[str, Any] | N
     return {**content, "frames": given, "depth_unit_scale_factor": NERFSTUDIO_UNIT}
 
 
-def write_nerfstudio(
-    results: Path, out: Path, files: Mapping[str, str], scale: float
-) -> Iterator[int]:
-    """Write the depth of each frame in thousandths, and yield how many pixels did not fit.
-
-    Args:
-        results: folder of predictions.
-        out: the data set's folder.
-        files: of :func:`nerfstudio_files`; a PNG holds 65.535 units at most.
-        scale: units of the camera poses a metre.
-    """
-    for name, file in files.items():
-        depth = _depth_m(results, name) * scale
-        if file.endswith(".png"):
-            write_depth_png(out / file, depth, NERFSTUDIO_UNIT)
-            yield int((depth > 65535 * NERFSTUDIO_UNIT).sum())
-        else:
-            write_map(out / file, depth.nan_to_num(0.0) / NERFSTUDIO_UNIT)
-            yield 0
-
-
-def write_transforms(out: Path, content: Mapping[str, Any]) -> None:
-    """Write what :func:`nerfstudio_frames` gave beside the file that it came from."""
-    write_json(out / TRANSFORMS_DEPTH, content)
-
-
-def _depth_m(results: Path, name: str) -> Map:
-    depth_m = read_map(results / f"{name}{_DEPTH}")
-    return torch.where(depth_m > 0, depth_m, torch.nan)
+def write_nerfstudio_map(path: Path, depth: Map) -> int:
+    """Write depth in thousandths, and give how many pixels a PNG, up to 65.535 units, lost."""
+    if path.suffix == ".png":
+        write_depth_png(path, depth, NERFSTUDIO_UNIT)
+        return int((depth > 65535 * NERFSTUDIO_UNIT).sum())
+    write_map(path, depth.nan_to_num(0.0) / NERFSTUDIO_UNIT)
+    return 0
 
 
 def write_colmap_map(path: AnyPath, depth: Map) -> None:

@@ -273,8 +273,18 @@ def image_graph(weights: DepthWeights) -> Graph:
     if rig.answer != "own":  # matched or joined
         assert weights.matcher is not None, "checked before"
         found = _matched(left, right, np.array([rig.virtual_focal_px] * 2), weights.matcher)
-        if own is not None:
-            found = found._replace(sky=own.sky) if rig.answer == "matched" else _joined(own, found)
+        if own is not None and rig.answer == "matched":
+            found = found._replace(sky=own.sky)
+        elif own is not None:  # as ``join_matches``: the mean of the logarithms, by confidence
+            weight = found.disparity_px.op("Greater", _0).op("Where", found.confidence, _0)
+            if found.sky is not None:
+                weight = weight * (found.sky * np.float32(-1) + _1)
+            share = weight / (weight + own.confidence).op("Max", np.float32(1e-6))
+            one, other = (
+                maps.disparity_px.op("Max", np.float32(1e-3)).op("Log") for maps in (own, found)
+            )
+            confidence = own.confidence + (weight - own.confidence) * share
+            found = _Maps((one + (other - one) * share).op("Exp"), confidence, own.sky)
     assert found is not None
     disparity_px = _resized_map(found.disparity_px, full) * _ratio(full, small)
     # Depth is that over disparity.
@@ -321,20 +331,6 @@ def pair_graph(weights: DepthWeights) -> Graph:
     graph.output("disparity_px", disparity_px, np.float32, _MAPS)
     graph.output("confidence", confidence, np.float32, _MAPS)
     return graph
-
-
-def _joined(one: _Maps, other: _Maps) -> _Maps:
-    """What ``join_matches`` does: the mean of the logarithms, weighed by confidence."""
-    is_known = other.disparity_px.op("Greater", _0)
-    weight = is_known.op("Where", other.confidence, _0)
-    if other.sky is not None:
-        weight = weight * (other.sky * np.float32(-1) + _1)
-    share = weight / (weight + one.confidence).op("Max", np.float32(1e-6))
-    own, matched = (
-        maps.disparity_px.op("Max", np.float32(1e-3)).op("Log") for maps in (one, other)
-    )
-    confidence = one.confidence + (weight - one.confidence) * share
-    return _Maps((own + (matched - own) * share).op("Exp"), confidence, one.sky)
 
 
 def _dynamic_shape_network(matcher: StereoNetwork) -> nn.Module:
@@ -423,21 +419,72 @@ def depth_export(weights: DepthWeights, what: str | None, facts: dict[str, Any])
 
 
 def _pair_export(weights: DepthWeights, facts: dict[str, Any]) -> Export:
+    def cases() -> Iterator[Case]:
+        assert weights.matcher is not None
+        net = FakestereoNet(make_matcher(weights.matcher, _QUICK))
+        sky = ("is_sky",) if _sees_sky(weights.matcher) else ()
+        work_px = cast("NetworkConfig", weights.matcher.config).work_focal_px
+        for size in _SIZES:
+            left, right = _scenes(*size)
+            if sky:
+                left, right = _under_sky(left), _under_sky(right)
+            inputs = {"left": left.numpy(), "right": right.numpy()}
+            rig = None
+            if work_px is not None:
+                camera = _camera(size, work_px)
+                rig = StereoRig(
+                    width=camera.width, height=camera.height, K=camera.K, baseline_m=0.5
+                )
+                inputs["K"] = camera.K.numpy()
+            found = [
+                net.estimate_pair(
+                    StereoInput(name="proof", left=one, right=other, camera=rig), with_check=False
+                )
+                for one, other in zip(left, right, strict=True)
+            ]
+            yield _case(inputs, found, ("disparity_px", "confidence", *sky))
+
     return Export(
         graph=lambda: pair_graph(weights),
-        cases=lambda: _pair_cases(weights),
+        cases=cases,
         limits=_FLIPPING_LIMITS if isinstance(weights.matcher, _FLIPPING) else _LIMITS,
         facts={**facts, "what": "rectified pair, RGB in [0, 1] -> disparity [px], ..."},
     )
 
 
 def _image_export(weights: DepthWeights, facts: dict[str, Any]) -> Export:
+    def cases() -> Iterator[Case]:
+        assert weights.generator is not None
+        matcher = None if weights.matcher is None else make_matcher(weights.matcher, _QUICK)
+        # The scenes of the proof need not be like the images that the weights were trained on.
+        synthesiser = make_synthesiser(weights.generator, speed=_QUICK.speed)
+        net = FakestereoNet(matcher, synthesiser, allow_ood=True)
+        selects = isinstance(weights.generator, SelectionGenerator)
+        sky = ("is_sky",) if selects or _sees_sky(weights.matcher) else ()
+        street = ("image_confidence",) if getattr(weights.generator, "street", None) else ()
+        for size in _SIZES:
+            scenes, _ = _scenes(*size)
+            images = _under_sky(scenes) if sky else scenes
+            camera = _camera(size, weights.generator.config.virtual_focal_px)
+            given = [
+                StereoInput(name="proof", left=one, right=None, camera=camera) for one in images
+            ]
+            inputs = {"image": images.numpy(), "K": camera.K.numpy()}
+            # A depth beyond all bounds, or none, hangs on the last bit of a disparity near zero.
+            found = [net.estimate_pair(one) for one in given]
+            case = _case(
+                inputs, found, ("depth_m", "disparity_px", "confidence", "right", *sky, *street)
+            )
+            is_near = case.expected["disparity_px"] >= _LEAST_PX
+            where = {"depth_m": is_near | case.expected["is_sky"] if sky else is_near}
+            yield replace(case, where=where)
+
     generator, names = weights.generator, ("virtual_focal_px", "virtual_baseline_m", "answer")
     rig = {} if generator is None else {name: getattr(generator.config, name) for name in names}
     chooses = isinstance(generator, SelectionGenerator) or isinstance(weights.matcher, _FLIPPING)
     return Export(
         graph=lambda: image_graph(weights),
-        cases=lambda: _image_cases(weights),
+        cases=cases,
         limits=_FLIPPING_LIMITS if chooses else _LIMITS,
         facts={**facts, **rig, "what": "image, RGB in [0, 1], and K [px] -> depth [m], ..."},
     )
@@ -448,55 +495,6 @@ TARGETS = {
     "pair": Target(fits=lambda weights: weights.matcher is not None, export=_pair_export),
 }
 """One image to depth, a rectified pair to disparity: a new target is a function and one entry."""
-
-
-def _image_cases(weights: DepthWeights) -> Iterator[Case]:
-    assert weights.generator is not None
-    matcher = None if weights.matcher is None else make_matcher(weights.matcher, _QUICK)
-    # The scenes of the proof need not be like the images that the weights were trained on.
-    synthesiser = make_synthesiser(weights.generator, speed=_QUICK.speed)
-    net = FakestereoNet(matcher, synthesiser, allow_ood=True)
-    selects = isinstance(weights.generator, SelectionGenerator)
-    sky = ("is_sky",) if selects or _sees_sky(weights.matcher) else ()
-    street = ("image_confidence",) if getattr(weights.generator, "street", None) else ()
-    for size in _SIZES:
-        scenes, _ = _scenes(*size)
-        images = _under_sky(scenes) if sky else scenes
-        camera = _camera(size, weights.generator.config.virtual_focal_px)
-        given = [StereoInput(name="proof", left=one, right=None, camera=camera) for one in images]
-        inputs = {"image": images.numpy(), "K": camera.K.numpy()}
-        # A depth beyond all bounds, or none, is a matter of the last bit of a disparity near zero.
-        found = [net.estimate_pair(one) for one in given]
-        case = _case(
-            inputs, found, ("depth_m", "disparity_px", "confidence", "right", *sky, *street)
-        )
-        is_near = case.expected["disparity_px"] >= _LEAST_PX
-        where = {"depth_m": is_near | case.expected["is_sky"] if sky else is_near}
-        yield replace(case, where=where)
-
-
-def _pair_cases(weights: DepthWeights) -> Iterator[Case]:
-    assert weights.matcher is not None
-    net = FakestereoNet(make_matcher(weights.matcher, _QUICK))
-    sky = ("is_sky",) if _sees_sky(weights.matcher) else ()
-    work_px = cast("NetworkConfig", weights.matcher.config).work_focal_px
-    for size in _SIZES:
-        left, right = _scenes(*size)
-        if sky:
-            left, right = _under_sky(left), _under_sky(right)
-        inputs = {"left": left.numpy(), "right": right.numpy()}
-        rig = None
-        if work_px is not None:
-            camera = _camera(size, work_px)
-            rig = StereoRig(width=camera.width, height=camera.height, K=camera.K, baseline_m=0.5)
-            inputs["K"] = camera.K.numpy()
-        found = [
-            net.estimate_pair(
-                StereoInput(name="proof", left=one, right=other, camera=rig), with_check=False
-            )
-            for one, other in zip(left, right, strict=True)
-        ]
-        yield _case(inputs, found, ("disparity_px", "confidence", *sky))
 
 
 def _sees_sky(matcher: StereoNetwork | None) -> bool:

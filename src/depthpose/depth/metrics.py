@@ -118,10 +118,6 @@ def _rmse(p: Tensor, t: Tensor) -> float:
     return float(((p - t) ** 2).mean().sqrt())
 
 
-def _share_within(p: Tensor, t: Tensor, factor: float) -> float:
-    return float((torch.maximum(p / t, t / p) < factor).double().mean())
-
-
 def _end_point_error(p: Tensor, t: Tensor) -> float:
     return float((p - t).abs().mean())
 
@@ -129,6 +125,10 @@ def _end_point_error(p: Tensor, t: Tensor) -> float:
 def _share_bad(p: Tensor, t: Tensor) -> float:
     error = (p - t).abs()
     return float(((error > 3) & (error > 0.05 * t)).double().mean())
+
+
+def _share_within(p: Tensor, t: Tensor, factor: float) -> float:
+    return float((torch.maximum(p / t, t / p) < factor).double().mean())
 
 
 _within_1, _within_2, _within_3 = (partial(_share_within, factor=1.25**k) for k in (1, 2, 3))
