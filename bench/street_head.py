@@ -30,9 +30,9 @@ from depthpose.core.checkpoint import find_weights
 from depthpose.depth.disparity import resize_image
 from depthpose.depth.synthesis import SelectionGenerator, pad_to_multiple
 from depthpose.depth.synthetic.dataset import draw_light, draw_sensors, expose, view_from
+from depthpose.depth.synthetic.mesh import NUMBER
 from depthpose.depth.synthetic.scene import make_scene
 from depthpose.depth.synthetic.shading import prepare
-from depthpose.depth.synthetic.textures import NUMBER
 from depthpose.depth.types import StereoInput
 from depthpose.depth.weights import read_depth_weights, write_depth_weights
 from depthpose.report.page import markdown_table

@@ -22,16 +22,16 @@ from depthpose.depth.labels import LabelConfig, is_consistent
 from depthpose.depth.losses import photometric_error, smoothness_loss
 from depthpose.depth.stereo import CallableMatcher, PSMNet, PSMNetMatcher, StereoNetwork
 from depthpose.depth.train import train_adapt
-from depthpose.depth.train.adapt import (
+from depthpose.depth.train.config import AdaptTraining
+from depthpose.depth.train.runs import (
     AdaptationCheck,
     AdaptMetrics,
-    AdaptTask,
     fine_focal_px,
     label_folders,
     refuse_worse,
     split_pairs,
 )
-from depthpose.depth.train.config import AdaptTraining
+from depthpose.depth.train.stages import AdaptTask
 from depthpose.depth.weights import read_matcher, write_depth_weights
 
 TRUE_PX = 6.0
@@ -178,7 +178,7 @@ def test_the_guard_tells_a_worse_matcher(monkeypatch: pytest.MonkeyPatch) -> Non
     def matcher_of(network: Fixed, _: MatcherConfig) -> object:
         return CallableMatcher(lambda *_: truth_px + network.off_px)
 
-    monkeypatch.setattr("depthpose.depth.train.adapt.make_matcher", matcher_of)
+    monkeypatch.setattr("depthpose.depth.train.runs.make_matcher", matcher_of)
     guard = AdaptationCheck([street.input], 0, MatcherConfig())
     good, bad = guard.measure(Fixed(0.0)), guard.measure(Fixed(5.0))
     assert good.photometric < bad.photometric

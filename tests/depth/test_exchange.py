@@ -15,7 +15,7 @@ from depthpose.core.camera import StereoRig
 from depthpose.core.errors import InputError, MissingExtraError
 from depthpose.core.files import write_json, write_map
 from depthpose.depth.estimator import FakestereoNet
-from depthpose.depth.exchange import write_colmap_map
+from depthpose.depth.predictions import write_colmap_map
 from depthpose.depth.types import DepthEstimate, Match, StereoInput
 
 H, W, F = 4, 6, 8.0

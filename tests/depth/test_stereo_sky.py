@@ -23,9 +23,9 @@ from depthpose.depth.losses import sky_loss
 from depthpose.depth.predictions import read_estimate, write_estimate
 from depthpose.depth.stereo import LightMatcher, LightStereo, StereoNetwork, light, normalise
 from depthpose.depth.train import StereoTask
-from depthpose.depth.train.adapt import AdaptationCheck
 from depthpose.depth.train.config import StereoTraining
 from depthpose.depth.train.pairs import TrainingPairs
+from depthpose.depth.train.runs import AdaptationCheck
 from depthpose.depth.train.stages import validate_pairs
 from depthpose.depth.types import DepthEstimate, Match, StereoInput
 from depthpose.depth.weights import DepthWeights
@@ -265,7 +265,7 @@ def test_what_becomes_sky_does_not_count_as_agreement(monkeypatch: pytest.Monkey
             is_sky = torch.arange(left.shape[1])[:, None].expand(left.shape[1:]) < self.rows
             return Match(disparity_px=torch.full(left.shape[1:], 4.0), is_sky=is_sky)
 
-    monkeypatch.setattr("depthpose.depth.train.adapt.make_matcher", matcher_of)
+    monkeypatch.setattr("depthpose.depth.train.runs.make_matcher", matcher_of)
     check = AdaptationCheck([street], 0, MatcherConfig())
     before, same, more = (check.measure(Finds(rows)).disagreeing for rows in (10, 10, 20))
     assert same == before

@@ -378,29 +378,29 @@ def export_depth(
     """
     from depthpose.core.files import write_json
     from depthpose.core.run import claim_folder
-    from depthpose.depth import exchange
+    from depthpose.depth import predictions
 
     if not (math.isfinite(scale) and scale > 0):
         raise InputError(f"--scale {scale:g}: units per metre must be positive; 1 for metres")
     settings = {"command": "data export-depth", "results": str(results.resolve())}
     settings |= {"scale": scale, "format": format}
-    readers = exchange.read_predicted(results)
+    readers = predictions.read_predicted(results)
     if format == "colmap":
-        named = exchange.colmap_files(results, readers, images)
+        named = predictions.colmap_files(results, readers, images)
         claim_folder(out, settings, named.values())
         for name in _shown(readers, len(readers), "frames"):
-            exchange.write_colmap_map(out / named[name], readers[name]() * scale)
+            predictions.write_colmap_map(out / named[name], readers[name]() * scale)
         print(f"{out}: depth of {len(named)} images in stereo/depth_maps")
         return 0
     named = {name: f"depths/{name}.{files}" for name in readers}
-    frames = exchange.nerfstudio_frames(out, named)
-    claim_folder(out, settings | {"files": files}, [*named.values(), exchange.TRANSFORMS_DEPTH])
+    frames = predictions.nerfstudio_frames(out, named)
+    claim_folder(out, settings | {"files": files}, [*named.values(), predictions.TRANSFORMS_DEPTH])
     lost = 0
     for name in _shown(readers, len(readers), "frames"):
-        lost += exchange.write_nerfstudio_map(out / named[name], readers[name]() * scale)
+        lost += predictions.write_nerfstudio_map(out / named[name], readers[name]() * scale)
     beside = "there is no transforms.json"
     if frames is not None:
-        write_json(out / exchange.TRANSFORMS_DEPTH, frames)
+        write_json(out / predictions.TRANSFORMS_DEPTH, frames)
         beside = "transforms_depth.json names them"
     print(f"{out}: depth of {len(named)} frames in depths; {beside}")
     if lost:

@@ -6,13 +6,12 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
-from depthpose.core.camera import StereoRig, write_camera
+from depthpose.core.camera import StereoRig, camera_of, write_camera
 from depthpose.core.draw import depth_scale, draw_share, rising_scale
 from depthpose.core.errors import InputError
 from depthpose.core.files import read_exif_focal, read_image, write_image
 from depthpose.depth.config import StreetsConfig
 from depthpose.depth.estimator import FakestereoNet
-from depthpose.depth.estimator.net import square_camera
 from depthpose.depth.predictions import COLOR_RANGE_M, write_estimate
 from depthpose.depth.stereo import CameraMatcher
 from depthpose.depth.synthetic import Streets
@@ -62,7 +61,7 @@ def answer_depth(form: Form, net: FakestereoNet) -> Answer:
     sizes = []
     if rig is not None:
         sizes += net.virtual_sizes(pair)
-        camera = square_camera(sizes[0], rig.virtual_focal_px)
+        camera = camera_of(rig.virtual_focal_px, (sizes[0][1], sizes[0][0])) or camera
     if rig is None or rig.answer != "own":
         own = (camera.height, camera.width)
         matcher = net.matcher

@@ -23,6 +23,7 @@ from depthpose.core.camera import (
     AnyLens,
     Camera,
     StereoRig,
+    camera_of,
     check_image_matches_camera,
     choose_lens,
 )
@@ -389,7 +390,7 @@ class FakestereoNet:
             views = self.synthesiser.draw(left, *larger)
             matches: list[Match] = []
             if rig.answer != "own":  # matched or joined
-                camera = square_camera(sizes[0], rig.virtual_focal_px)
+                camera = camera_of(rig.virtual_focal_px, (left.shape[3], left.shape[2]))
                 matches = self._match(list(zip(left, views.right, strict=True)), camera)
             if rig.answer != "matched":  # own or joined
                 assert views.disparity_px is not None and views.confidence is not None  # noqa: PT018
@@ -468,16 +469,6 @@ class FakestereoNet:
             replace(match, disparity_px=match.disparity_px - columns, confidence=confidence)
             for match, confidence in zip(cut, sure, strict=True)
         ]
-
-
-def square_camera(size: tuple[int, int], focal_px: float) -> Camera:
-    """Make the camera of an image brought to ``focal_px``, its axis through the middle."""
-    rows, columns = size
-    K = torch.tensor(
-        [[focal_px, 0, (columns - 1) / 2], [0, focal_px, (rows - 1) / 2], [0, 0, 1]],
-        dtype=torch.float64,
-    )
-    return Camera(width=columns, height=rows, K=K)
 
 
 def from_pair(pair: StereoInput, match: Match, warning: str = "") -> DepthEstimate:

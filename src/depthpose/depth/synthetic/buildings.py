@@ -5,8 +5,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from depthpose.depth.synthetic.mesh import MeshBuilder
-from depthpose.depth.synthetic.textures import Color, Number, Surface
+from depthpose.depth.synthetic.mesh import Color, MeshBuilder, Number, Surface
 
 _PLASTERS: list[Color] = [
     (0.62, 0.57, 0.46), (0.58, 0.47, 0.26), (0.5, 0.5, 0.5), (0.55, 0.36, 0.28), (0.36, 0.4, 0.35),

@@ -19,9 +19,9 @@ from depthpose.core.render import Raster, barycentric_shares, edge_functions, ra
 from depthpose.depth.augment import through_jpeg
 from depthpose.depth.config import StreetsConfig
 from depthpose.depth.disparity import disparity_from_depth
+from depthpose.depth.synthetic.mesh import NUMBER, Indices, Numbers, Vectors
 from depthpose.depth.synthetic.scene import StreetScene, make_clutter, make_scene, street_rig
 from depthpose.depth.synthetic.shading import Hits, Stage, prepare, shade, sky_light
-from depthpose.depth.synthetic.textures import NUMBER, Indices, Numbers, Vectors
 from depthpose.depth.types import Map, Mask, RawFrame, StereoInput, StereoSample, StereoTruth, View
 
 NEAR_M = 0.3

@@ -1,16 +1,356 @@
-"""Triangles with what covers them, and the builder that collects them.
+"""Triangles and what covers them: materials, their seamless textures, and the builder of meshes.
 
-Metres; x right, y down, z forward, as in a camera's frame. A model stands at the origin on y = 0
-and looks along z.
+A texture modulates a surface's colour, so its mean is about 1. Textures are made from noise, once a
+process, and shared by every scene. Metres; x right, y down, z forward, as in a camera's frame. A
+model stands at the origin on y = 0 and looks along z.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
+from functools import cache
+from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float, Float32, Int
+import torch
+from jaxtyping import Bool, Float, Float16, Float32, Int
+from torch import Tensor
 
-from depthpose.depth.synthetic.textures import NUMBER, Color, Number, Surface, Values
+Number = float | int
+"""A length, an angle or a share, written as one likes."""
+
+Values = Sequence | np.ndarray | float | int
+"""What NumPy makes an array of."""
+
+Numbers = Float[Tensor, " n"]
+Vectors = Float[Tensor, "n 3"]
+Indices = Int[Tensor, " n"]
+
+Color = tuple[Number, Number, Number]
+"""Linear RGB, 0 black to 1 white."""
+
+
+class Material(NamedTuple):
+    """How a material takes light."""
+
+    variants: int  # how many different textures there are of it
+    specular: float = 0.0  # mirror reflection seen straight on, 0..1
+    translucency: float = 0.0  # share of the light that comes through from behind
+    glow: float = 0.0  # light of its own, as a share of its colour
+
+
+MATERIALS: dict[str, Material] = {
+    "road": Material(4), "pavement": Material(3), "grass": Material(3), "dirt": Material(2),
+    "curb": Material(1), "brick": Material(3), "plaster": Material(3), "stone": Material(3),
+    "concrete": Material(2), "roof": Material(3), "bark": Material(2),
+    "leaf": Material(3, translucency=0.35), "wood": Material(2),
+    "metal": Material(2, specular=0.05), "paint": Material(1, specular=0.05),
+    "side": Material(3, specular=0.05), "glass": Material(1, specular=0.07),
+    "pane": Material(3, specular=0.06), "tyre": Material(1), "wheel": Material(2, specular=0.05),
+    "plate": Material(2, specular=0.02), "lamp": Material(1, specular=0.05, glow=0.35),
+    "sign": Material(6, specular=0.02), "poster": Material(4), "cloth": Material(4),
+    "skin": Material(1), "hills": Material(2),
+}  # fmt: skip
+NUMBER = {name: number for number, name in enumerate(MATERIALS)}
+"""Numbers by which meshes name materials."""
+
+_counts = [material.variants for material in MATERIALS.values()]
+FIRST_LAYER = {name: sum(_counts[:number]) for name, number in NUMBER.items()}
+"""Where the textures of each material begin in the stack of all textures."""
+
+LAYERS = sum(_counts)
+"""Textures in all."""
+
+
+class Surface(NamedTuple):
+    """What a part of a mesh is covered with."""
+
+    material: str  # a name of ``MATERIALS``
+    tint: Color = (1.0, 1.0, 1.0)  # colour that the texture modulates
+    tile_m: Number = 1.0  # length that one tile of the texture covers
+    variant: int = 0  # which of the material's textures; any whole number
+
+    @property
+    def layer(self) -> int:
+        """Number of the texture in the stack of all textures."""
+        variants = MATERIALS[self.material].variants
+        return FIRST_LAYER[self.material] + int(self.variant) % variants
+
+
+SIDE_PX = 256
+LEVELS = 9
+"""From 256 pixels down to 1."""
+
+Plane = Float[np.ndarray, "256 256"]
+Picture = Float[np.ndarray, "256 256 3"]
+_y, _x = np.mgrid[:SIDE_PX, :SIDE_PX].astype(np.float32) / SIDE_PX
+"""Places in a texture, in tiles."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Textures:
+    """Every texture at every size."""
+
+    texels: Float16[Tensor, "n 3"]  # all in one list, a level after the other
+    starts: Int[Tensor, " levels"]  # where each level begins
+    clouds: Float[Tensor, "256 256"]  # a field of noise for clouds
+    stains: Float[Tensor, "256 256"]  # a field of noise for unevenness over metres
+
+
+@cache
+def textures() -> Textures:
+    """Make all textures: a second, once a process."""
+    rng = np.random.default_rng(5)
+    stack = np.ones((LAYERS, SIDE_PX, SIDE_PX, 3), np.float32)
+    for name, material in MATERIALS.items():
+        for variant in range(material.variants):
+            painted = _PAINTERS[name](_Noise(rng), variant)
+            stack[FIRST_LAYER[name] + variant] = (
+                painted if painted.ndim == 3 else painted[..., None]
+            )
+    level, levels = np.clip(stack, 0.02, 3), []
+    for _ in range(LEVELS):
+        levels.append(level.reshape(-1, 3))
+        half = level.shape[1] // 2
+        if half:
+            level = level.reshape(LAYERS, half, 2, half, 2, 3).mean((2, 4))
+    starts = np.cumsum([0, *(len(texels) for texels in levels[:-1])])
+    return Textures(
+        texels=torch.from_numpy(np.concatenate(levels).astype(np.float16)),
+        starts=torch.from_numpy(starts),
+        clouds=torch.from_numpy(_Noise(rng).smooth(2.6, (1, 100))),
+        stains=torch.from_numpy(_Noise(rng).smooth(2.0, (1, 64))),
+    )
+
+
+def sample_texture(
+    textures: Textures, layer: Indices, uv: Float[Tensor, "n 2"], level: Numbers
+) -> Vectors:
+    """Look textures up, bilinearly in the nearest level; 0 is the largest picture, 1 half of it."""
+    whole = level.round().clamp(0, LEVELS - 1).long()
+    side = SIDE_PX >> whole
+    place = uv * side[:, None] - 0.5
+    low = place.floor()
+    share = place - low
+    column, row = low.long().unbind(1)
+    mask = side - 1  # sides are powers of two
+    start = textures.starts.to(layer.device)[whole] + layer * side * side
+    left, right = column & mask, (column + 1) & mask
+    above, below = start + (row & mask) * side, start + ((row + 1) & mask) * side
+    texels = textures.texels
+    a, b, c, d = (
+        texels.index_select(0, index).float()
+        for index in (above + left, above + right, below + left, below + right)
+    )
+    across, down = share[:, :1], share[:, 1:]
+    top, bottom = torch.lerp(a, b, across), torch.lerp(c, d, across)
+    return torch.lerp(top, bottom, down)
+
+
+class _Noise:
+    """Seamless fields of noise with a mean of 0 and a deviation of 1."""
+
+    def __init__(self, rng: np.random.Generator) -> None:
+        self.rng = rng
+
+    def smooth(
+        self, fall: Number, band: tuple[Number, Number], stretch: tuple[Number, Number] = (1, 1)
+    ) -> Plane:
+        """Noise whose power falls with the frequency; ``stretch`` > 1 makes it finer in y, x."""
+        fy = np.fft.fftfreq(SIDE_PX)[:, None] * SIDE_PX / stretch[0]
+        fx = np.fft.rfftfreq(SIDE_PX)[None] * SIDE_PX / stretch[1]
+        often = np.hypot(fx, fy)
+        is_in = (often >= band[0]) & (often <= band[1])
+        strength = np.where(is_in, 1 / np.maximum(often, 1) ** (fall / 2 + 0.5), 0)
+        turn = np.exp(2j * np.pi * self.rng.random(strength.shape))
+        field = np.fft.irfft2(strength * turn, s=(SIDE_PX, SIDE_PX))
+        return (field / field.std()).astype(np.float32)
+
+    def rough(self) -> Plane:
+        """Coarse and fine together."""
+        return self.smooth(1.6, (1, 128))
+
+    def fine(self) -> Plane:
+        """Grains."""
+        return self.smooth(0.3, (24, 128))
+
+    def broad(self) -> Plane:
+        """Patches."""
+        return self.smooth(2.4, (1, 20))
+
+    def bricks(
+        self, rows: int, columns: int, joint: Number, spread: Number
+    ) -> tuple[Plane, Picture, Plane]:
+        """A bond: 1 on the bricks and 0 in the joints, a shade for each, the height in its row."""
+        row = np.floor(_y * rows).astype(int)
+        across = _x * columns + 0.5 * (row % 2)
+        column = np.floor(across).astype(int) % columns
+        in_row, in_column = (_y * rows) % 1, across % 1
+        edge = np.minimum(
+            np.minimum(in_column, 1 - in_column) * rows / columns, np.minimum(in_row, 1 - in_row)
+        )
+        is_brick = np.clip((edge - joint / 2) / (joint * 0.6), 0, 1)
+        shade = 1 + spread * self.rng.normal(size=(rows, columns, 1))
+        shade = shade + 0.3 * spread * self.rng.normal(size=(rows, columns, 3))
+        return is_brick, shade[row, column].astype(np.float32), in_row
+
+
+Painter = Callable[[_Noise, int], Plane | Picture]
+"""Paints one variant of a texture, grey or in colours."""
+
+
+def _mottled(**shares: float) -> Painter:
+    """Grey with noise of the named kinds, drawn in their order."""
+
+    def paint(noise: _Noise, _variant: int) -> Plane:
+        plane = np.ones((SIDE_PX, SIDE_PX), np.float32)
+        for kind, share in shares.items():
+            plane = plane + share * getattr(noise, kind)()
+        return plane
+
+    return paint
+
+
+def _road(noise: _Noise, variant: int) -> Plane:
+    cracks = np.clip(1 - np.abs(noise.smooth(1.8, (2, 60))) / 0.035, 0, 1)
+    cracks = cracks * np.clip(noise.broad() - 0.4 * variant % 1, 0, 1)
+    rough, fine, broad = noise.rough(), noise.fine(), noise.broad()
+    return 1 + (0.24 + 0.05 * variant) * fine + 0.14 * rough + 0.06 * broad - 0.6 * cracks
+
+
+def _pavement(noise: _Noise, variant: int) -> Picture:
+    rows, columns = ((4, 4), (12, 6), (8, 8))[variant]
+    is_slab, shade, _ = noise.bricks(rows, columns, 0.05, 0.07)
+    grains = 1 + 0.08 * noise.rough() + 0.14 * noise.fine()
+    return shade * (grains * (0.55 + 0.45 * is_slab))[..., None]
+
+
+def _grass(noise: _Noise, variant: int) -> Picture:
+    fine, rough, broad = noise.fine(), noise.rough(), noise.broad()
+    dry = 0.14 + 0.1 * variant
+    red = 1 + 0.34 * fine + 0.26 * rough + dry * broad
+    green = 1 + 0.32 * fine + 0.24 * rough + 0.4 * dry * broad
+    return np.stack([red, green, 1 + 0.3 * fine + 0.22 * rough], 2)
+
+
+def _brick(noise: _Noise, variant: int) -> Picture:
+    is_brick, shade, _ = noise.bricks(24, (8, 6, 10)[variant], 0.1, 0.16)
+    wall = shade * (1 + 0.1 * noise.fine() + 0.08 * noise.rough())[..., None]
+    joint = (1.3 + 0.08 * noise.fine())[..., None] * np.array([0.9, 1.3, 1.5])
+    return np.where(is_brick[..., None] > 0.5, wall, joint) * (1 + 0.1 * noise.broad())[..., None]
+
+
+def _plaster(noise: _Noise, variant: int) -> Plane:
+    streaks = np.clip(noise.smooth(2.2, (1, 60), (0.25, 1)) - 0.6, 0, 2)
+    fine, rough, broad = noise.fine(), noise.rough(), noise.broad()
+    return 1 + 0.05 * fine + 0.06 * rough + 0.07 * broad - (0.06 + 0.06 * variant) * streaks
+
+
+def _stone(noise: _Noise, variant: int) -> Picture:
+    rows, columns = ((8, 5), (6, 3), (12, 6))[variant]
+    is_stone, shade, _ = noise.bricks(rows, columns, 0.06, 0.14)
+    grains = 1 + 0.09 * noise.fine() + 0.12 * noise.rough()
+    return shade * (grains * (0.55 + 0.45 * is_stone))[..., None]
+
+
+def _roof(noise: _Noise, variant: int) -> Picture:
+    _, shade, in_row = noise.bricks((14, 20, 10)[variant], 12, 0.04, 0.13)
+    grains = 1 + 0.09 * noise.fine() + 0.1 * noise.broad()
+    return shade * ((0.55 + 0.65 * in_row) * grains)[..., None]
+
+
+def _leaf(noise: _Noise, _variant: int) -> Picture:
+    """Light and dark clumps: a ball covered with it looks like foliage, not like a ball."""
+    fine, rough = noise.fine(), noise.rough()
+    clumps = np.clip(1 + 0.55 * noise.smooth(0.8, (6, 60)) + 0.2 * fine, 0.1, 2.5)
+    return np.stack([clumps + 0.15 * rough, clumps + 0.1 * rough, clumps], 2)
+
+
+def _wood(noise: _Noise, variant: int) -> Picture:
+    is_board, shade, _ = noise.bricks(1, 6, 0.03 * variant + 1e-3, 0.08)
+    grain = 0.2 * noise.smooth(1.4, (2, 128), (0.15, 1)) + 0.05 * noise.fine()
+    return shade * ((1 + grain) * (0.5 + 0.5 * is_board))[..., None]
+
+
+def _side(noise: _Noise, variant: int) -> Plane:
+    """A car's flank from rear (u = 0) to front, sill (v = 0) to roof: doors, handles, a strip."""
+    picture = 1 + 0.04 * noise.broad() + 0.1 * np.clip((_y - 0.2) * 2, -0.5, 0.6)
+    is_door = (_y > 0.16) & (_y < 0.62)
+    for where in ((0.3, 0.5, 0.7), (0.34, 0.68), (0.28, 0.49, 0.72))[variant]:
+        picture -= 0.8 * np.clip(1 - np.abs(_x - where) / 0.006, 0, 1) * is_door
+        handle = (np.abs(_x - where - 0.04) < 0.018) & (np.abs(_y - 0.52) < 0.01)
+        picture[handle] = 0.35
+    picture[np.abs(_y - 0.34) < 0.012 * (variant > 0)] *= 0.55
+    picture[_y < 0.15] *= 0.3
+    dirt = np.clip((0.32 - _y) * 3, 0, 1) * (0.5 + 0.3 * noise.rough())
+    return picture * (1 - 0.35 * dirt)
+
+
+def _pane(noise: _Noise, variant: int) -> Plane:
+    """Curtains, blinds, or the dark of a room."""
+    curtain = np.clip(np.abs(_x - 0.5) * 2 - 0.55, 0, 1) * 2.5 * (1 + 0.3 * np.sin(_x * 90))
+    blind = 0.35 * np.sign(np.sin(_y * np.pi * 40)) * (_y > (0.2, 0.55, 2)[variant])
+    return 0.75 + 0.4 * _y + 0.15 * noise.broad() + curtain * (variant != 1) + blind
+
+
+def _wheel(_noise: _Noise, variant: int) -> Plane:
+    y, x = _y - 0.5, _x - 0.5
+    turn, out = np.arctan2(y, x), np.hypot(x, y)
+    spokes = np.cos(turn * (5, 7)[variant]) > -0.1
+    return np.where((spokes | (out > 0.42) | (out < 0.12)), 1.1, 0.15).astype(np.float32)
+
+
+def _plate(noise: _Noise, _variant: int) -> Picture:
+    picture = np.ones((SIDE_PX, SIDE_PX, 3), np.float32)
+    for x in range(22, 22 + 7 * 31, 31):
+        picture[10:50, x : x + int(noise.rng.integers(8, 22))] = 0.08
+    picture[:, :14] = (0.1, 0.2, 0.9)
+    return picture
+
+
+def _sign(noise: _Noise, variant: int) -> Picture:
+    """Dark figures on a light ground: bars, arrows, words."""
+    picture, rng = np.ones((SIDE_PX, SIDE_PX, 3), np.float32), noise.rng
+    colors = [(0.1, 0.1, 0.1), (0.05, 0.05, 0.05), (1.0, 0.08, 0.08), (0.1, 0.2, 0.9)]
+    color = np.array(colors[variant % 4])
+    for _ in range((3, 5, 8, 14, 24, 4)[variant]):
+        width, height = rng.integers(10, 110), rng.integers(8, 60)
+        x, y = rng.integers(30, 220 - width // 2), rng.integers(30, 220 - height // 2)
+        picture[y : y + height, x : x + width] = color * rng.uniform(0.5, 1.2)
+    return picture
+
+
+def _poster(noise: _Noise, _variant: int) -> Picture:
+    picture, rng = np.ones((SIDE_PX, SIDE_PX, 3), np.float32), noise.rng
+    for _ in range(50):
+        width, height = rng.integers(6, 90), rng.integers(4, 60)
+        x, y = rng.integers(0, SIDE_PX, 2)
+        picture[y : y + height, x : x + width] = rng.uniform(0.05, 1.4, 3)
+    return picture
+
+
+def _cloth(noise: _Noise, variant: int) -> Plane:
+    stripes = np.sign(np.sin(_x[:1] * 2 * np.pi * 6)) * (0, 0.18, 0, 0.3)[variant]
+    folds = noise.smooth(2.0, (2, 30), (0.4, 1))
+    return 1 + 0.16 * folds + 0.07 * noise.fine() + stripes
+
+
+_dirt = _mottled(rough=0.2, fine=0.18, broad=0.12)
+_PAINTERS: dict[str, Painter] = {
+    "road": _road, "pavement": _pavement, "grass": _grass, "dirt": _dirt, "curb": _dirt,
+    "brick": _brick, "plaster": _plaster, "stone": _stone, "roof": _roof,
+    "leaf": _leaf, "wood": _wood, "side": _side, "pane": _pane,
+    "wheel": _wheel, "plate": _plate, "sign": _sign, "poster": _poster, "cloth": _cloth,
+    "concrete": _mottled(fine=0.07, rough=0.09, broad=0.08),
+    "paint": _mottled(broad=0.03, fine=0.012),
+    "glass": _mottled(broad=0.15),
+    "tyre": _mottled(fine=0.2, rough=0.15),
+    "skin": _mottled(broad=0.06),
+    "bark": lambda n, _: 1 + 0.38 * n.smooth(1.2, (4, 128), (0.18, 1)) + 0.12 * n.fine(),
+    "metal": lambda n, variant: 1 + 0.06 * n.fine() + (0.08 + 0.1 * variant) * n.broad(),
+    "lamp": lambda n, _: 1 + 0.15 * np.sign(np.sin(_x * 40 * np.pi)) + 0 * n.broad(),
+    "hills": lambda n, _: 1 + 0.4 * n.smooth(1.0, (16, 128)) + 0.15 * n.broad(),
+}  # fmt: skip
+
 
 Rotation = Float[np.ndarray, "3 3"]
 

@@ -11,8 +11,15 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from depthpose.depth.synthetic.mesh import Mesh, MeshBuilder, between
-from depthpose.depth.synthetic.textures import Color, Number, Surface, Values
+from depthpose.depth.synthetic.mesh import (
+    Color,
+    Mesh,
+    MeshBuilder,
+    Number,
+    Surface,
+    Values,
+    between,
+)
 
 
 def add_ball(

@@ -13,8 +13,7 @@ from jaxtyping import Float, Float64
 
 from depthpose.depth.synthetic import models
 from depthpose.depth.synthetic.buildings import Plot, add_house
-from depthpose.depth.synthetic.mesh import Mesh, MeshBuilder, place
-from depthpose.depth.synthetic.textures import Number, Surface
+from depthpose.depth.synthetic.mesh import Mesh, MeshBuilder, Number, Surface, place
 
 Place = Literal["city", "suburb", "avenue", "rural", "forest"]
 PLACES: dict[Place, float] = {

@@ -17,9 +17,16 @@ from jaxtyping import Float64
 from depthpose.core.camera import StereoRig, crop_camera, resize_camera
 from depthpose.depth.config import StreetsConfig
 from depthpose.depth.synthetic import road as roads
-from depthpose.depth.synthetic.mesh import Mesh, MeshBuilder, Rotation, between, join
+from depthpose.depth.synthetic.mesh import (
+    Mesh,
+    MeshBuilder,
+    Rotation,
+    Surface,
+    Values,
+    between,
+    join,
+)
 from depthpose.depth.synthetic.models import add_ball, add_leaves
-from depthpose.depth.synthetic.textures import Surface, Values
 
 Vector = Float64[np.ndarray, "3"]
 

@@ -12,9 +12,9 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from depthpose.core.render import rasterize_orthographic
-from depthpose.depth.synthetic import textures as tx
+from depthpose.depth.synthetic import mesh as tx
+from depthpose.depth.synthetic.mesh import MATERIALS, NUMBER, SIDE_PX, Indices, Numbers, Vectors
 from depthpose.depth.synthetic.scene import StreetScene
-from depthpose.depth.synthetic.textures import MATERIALS, NUMBER, SIDE_PX, Indices, Numbers, Vectors
 
 _SUN_MAPS = ((18.0, (-3.0, 36.0), 1024), (60.0, (-5.0, 115.0), 768))
 _SKY_MAP = (28.0, (-3.0, 64.0), 512)

@@ -209,7 +209,7 @@ class StereoTraining(Settings):
 
 @dataclass(frozen=True, kw_only=True)
 class AdaptTraining(Settings):
-    """Self-supervised adaptation of a matcher to the pairs of one rig (see ``train.adapt``)."""
+    """Self-supervised adaptation of a matcher to the pairs of one rig (see ``train.runs``)."""
 
     start: str = "default"
     """Weights of the matcher that is adapted (or a whole set)."""
