@@ -26,9 +26,10 @@ from depthpose.core.checkpoint import find_weights
 from depthpose.depth.config import GeneratorConfig, MatcherConfig, Speed
 from depthpose.depth.disparity import focal_size, resize_image
 from depthpose.depth.estimator import FakestereoNet
-from depthpose.depth.stereo import MATCHERS, NetworkMatcher, PSMNet, PSMNetMatcher
+from depthpose.depth.stereo import NetworkMatcher, PSMNet, PSMNetMatcher
 from depthpose.depth.synthesis import UNetGenerator, make_synthesiser
 from depthpose.depth.types import StereoInput
+from depthpose.depth.weights import MATCHERS
 from depthpose.report.page import markdown_table
 
 HEIGHT, WIDTH, FOCAL_PX = 375, 1242, 721.5377

@@ -35,7 +35,6 @@ from depthpose.depth.config import (
 )
 from depthpose.depth.datasets import open_dataset
 from depthpose.depth.estimator import FakestereoNet
-from depthpose.depth.stereo import make_matcher
 from depthpose.depth.synthesis import (
     SelectionGenerator,
     SelectionSynthesiser,
@@ -44,7 +43,7 @@ from depthpose.depth.synthesis import (
 )
 from depthpose.depth.train import STAGES
 from depthpose.depth.train.config import SelectTraining, ViewTraining
-from depthpose.depth.weights import read_generator, read_matcher, write_depth_weights
+from depthpose.depth.weights import make_matcher, read_generator, read_matcher, write_depth_weights
 from depthpose.report.page import markdown_table, write_table
 
 FOCAL_PX = 186.0

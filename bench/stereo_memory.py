@@ -16,7 +16,7 @@ from stereo_speed import network_for, out_folder, plain_match, random_pair, size
 
 from depthpose.depth.config import MatcherConfig
 from depthpose.depth.stereo import PSMNetMatcher
-from depthpose.depth.stereo.kinds import psmnet_bytes
+from depthpose.depth.stereo.psmnet import psmnet_bytes
 
 PLAIN = 0
 """Marks the plain network, in place of a bound."""

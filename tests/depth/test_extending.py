@@ -29,13 +29,19 @@ from depthpose.depth.estimator import FakestereoNet
 from depthpose.depth.export import TARGETS, Target, depth_export
 from depthpose.depth.losses import ADVERSARIAL_LOSSES, DISPARITY_LOSSES, adversarial_loss
 from depthpose.depth.metrics import METRICS, Metric
-from depthpose.depth.stereo import MATCHERS, MatcherKind, StereoNetwork
+from depthpose.depth.stereo import StereoNetwork
 from depthpose.depth.synthesis import SelectionGenerator, UNetGenerator
 from depthpose.depth.train.config import FinetuneTraining, SelectTraining, StereoTraining
 from depthpose.depth.train.runs import train_finetune
 from depthpose.depth.train.stages import SelectionSample, SelectTask, StereoTask
 from depthpose.depth.types import Match
-from depthpose.depth.weights import DepthWeights, read_depth_weights, write_depth_weights
+from depthpose.depth.weights import (
+    MATCHERS,
+    DepthWeights,
+    MatcherKind,
+    read_depth_weights,
+    write_depth_weights,
+)
 
 W, H = 64, 32
 FACTS = {"licence": "MIT", "trained_on": "nothing"}

@@ -17,12 +17,11 @@ from depthpose.depth.config import MatcherConfig, PSMNetConfig
 from depthpose.depth.stereo import (
     PSMNet,
     PSMNetMatcher,
-    kinds,
+    layers,
     normalise,
     psmnet,
     tile_change_px,
 )
-from depthpose.depth.stereo.kinds import psmnet_bytes
 from depthpose.depth.stereo.matcher import (
     Tiling,
     lower_where_disagreeing,
@@ -32,6 +31,7 @@ from depthpose.depth.stereo.matcher import (
 from depthpose.depth.stereo.psmnet import (
     concatenation_volume,
     expected_disparity,
+    psmnet_bytes,
     soft_argmin,
 )
 from depthpose.depth.types import Match
@@ -90,13 +90,13 @@ def test_without_onednn_operators_the_answer_is_the_same(monkeypatch: pytest.Mon
         raise RuntimeError("no such operator")
 
     for operator in ("_onednn_convolved", "_onednn_transposed"):
-        monkeypatch.setattr(kinds, operator, refuse)
-    kinds.has_onednn_operators.cache_clear()
+        monkeypatch.setattr(layers, operator, refuse)
+    layers.has_onednn_operators.cache_clear()
     try:
         documented = PSMNetMatcher(network).match(left, right)
-        assert not kinds.has_onednn_operators()
+        assert not layers.has_onednn_operators()
     finally:
-        kinds.has_onednn_operators.cache_clear()
+        layers.has_onednn_operators.cache_clear()
     assert len(calls) == torch.backends.mkldnn.is_available()
     assert torch.allclose(by_name.disparity_px, documented.disparity_px, atol=1e-3)
     assert by_name.confidence is not None
@@ -110,20 +110,20 @@ def test_an_onednn_operator_that_answers_otherwise_is_not_used(
     def wrong(volume: torch.Tensor, *_: torch.Tensor) -> torch.Tensor:
         return torch.zeros_like(volume)
 
-    monkeypatch.setattr(kinds, "_onednn_transposed", wrong)
-    kinds.has_onednn_operators.cache_clear()
+    monkeypatch.setattr(layers, "_onednn_transposed", wrong)
+    layers.has_onednn_operators.cache_clear()
     try:
-        assert not kinds.has_onednn_operators()
+        assert not layers.has_onednn_operators()
     finally:
-        kinds.has_onednn_operators.cache_clear()
+        layers.has_onednn_operators.cache_clear()
 
 
 @pytest.mark.parametrize("rows", [1, 2, 3, 6, 10, 64])
 def test_any_number_of_rows_gives_one_answer_in_double_precision(rows: int) -> None:
     network = random_network(SMALL).double()
     left, right = torch.rand(2, 2, 3, 80, 96, dtype=torch.float64)
-    folded = kinds.fold_volumes(copy.deepcopy(network), left)
-    kinds.fold_features(folded.features, left)
+    folded = layers.fold_volumes(copy.deepcopy(network), left)
+    layers.fold_features(folded.features, left)
     folded.rows = rows
     with torch.no_grad():
         found_px, expected_px = (one(left, right)[-1] for one in (folded, network))
@@ -325,14 +325,14 @@ def test_unknown_device_is_refused() -> None:
 
 _PSMNET = """
 from depthpose.depth.stereo import PSMNet, PSMNetMatcher as Matcher
-from depthpose.depth.stereo.kinds import psmnet_bytes
+from depthpose.depth.stereo.psmnet import psmnet_bytes
 network = PSMNet().eval()
 least = psmnet_bytes(network.config, 256, 1024, torch.float32)
 """
 _LIGHT = """
 from depthpose.depth.config import LightConfig
 from depthpose.depth.stereo import LightMatcher as Matcher, LightStereo
-from depthpose.depth.stereo.kinds import light_bytes
+from depthpose.depth.stereo.light import light_bytes
 network = LightStereo(LightConfig(with_agreement=True, with_refinement=True)).eval()
 least = light_bytes(network.config, 256, 1024, torch.float32)
 """

@@ -23,8 +23,7 @@ from depthpose.depth.config import (
     StreetsConfig,
 )
 from depthpose.depth.encoder import LiteEncoder, load_encoder
-from depthpose.depth.stereo import LightMatcher, LightStereo, PSMNet, make_matcher, normalise
-from depthpose.depth.stereo.kinds import light_bytes
+from depthpose.depth.stereo import LightMatcher, LightStereo, PSMNet, normalise
 from depthpose.depth.stereo.light import (
     Refinement,
     agreement_around,
@@ -32,6 +31,7 @@ from depthpose.depth.stereo.light import (
     confidence_near,
     correlation_volume,
     enlarge,
+    light_bytes,
     mean_of_all,
     mean_of_best,
 )
@@ -39,7 +39,7 @@ from depthpose.depth.stereo.matcher import CameraMatcher, pad_top_right
 from depthpose.depth.train import StereoTask
 from depthpose.depth.train.config import StereoTraining
 from depthpose.depth.train.runs import make_matcher_network, train_stereo
-from depthpose.depth.weights import read_matcher, write_depth_weights
+from depthpose.depth.weights import make_matcher, read_matcher, write_depth_weights
 
 SMALL = LightConfig(
     max_disparity_px=32,

@@ -17,8 +17,8 @@ from depthpose.depth.config import Answer, BaselineName, MatcherConfig, SGBMConf
 from depthpose.depth.datasets import Dataset
 from depthpose.depth.estimator import FakestereoNet
 from depthpose.depth.predictions import Estimator
-from depthpose.depth.stereo import MATCHERS, SGBMMatcher, with_usable_precision
-from depthpose.depth.weights import Use
+from depthpose.depth.stereo import SGBMMatcher, with_usable_precision
+from depthpose.depth.weights import MATCHERS, Use
 
 
 class Method(NamedTuple):

@@ -16,10 +16,11 @@ from depthpose.core.export import Case, Export, Graph, Limit, Value, network_mod
 from depthpose.depth.config import MatcherConfig
 from depthpose.depth.estimator import FakestereoNet
 from depthpose.depth.estimator.net import SKY_M
-from depthpose.depth.stereo import LightStereo, PSMNet, StereoNetwork, make_matcher
+from depthpose.depth.stereo import LightStereo, PSMNet, StereoNetwork
+from depthpose.depth.stereo.layers import interpolation_matrix, linear_taps
 from depthpose.depth.stereo.light import LEAST_PX
 from depthpose.depth.stereo.matcher import IMAGENET_MEAN, IMAGENET_STD, NetworkConfig
-from depthpose.depth.stereo.psmnet import WINDOW_PX, interpolation_matrix, linear_taps
+from depthpose.depth.stereo.psmnet import WINDOW_PX
 from depthpose.depth.synthesis import (
     COLUMNS_SHARE,
     ROWS_SHARE,
@@ -29,7 +30,7 @@ from depthpose.depth.synthesis import (
     read_logits,
 )
 from depthpose.depth.types import DepthEstimate, StereoInput, Views
-from depthpose.depth.weights import DepthWeights
+from depthpose.depth.weights import DepthWeights, make_matcher
 
 _0, _1, _2, _HALF = np.float32(0), np.float32(1), np.float32(2), np.float32(0.5)
 

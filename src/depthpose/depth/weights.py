@@ -1,6 +1,6 @@
 """Weights of depth on disk: a generator, a matcher, or both in one file."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -9,9 +9,40 @@ from typing import Any, Literal
 from depthpose.core import checkpoint as checkpoints
 from depthpose.core.config import config_from_dict, config_to_dict
 from depthpose.core.errors import InputError
-from depthpose.depth.config import Answer, GeneratorConfig, SelectionConfig
-from depthpose.depth.stereo import MATCHERS, StereoNetwork
+from depthpose.depth import stereo
+from depthpose.depth.config import (
+    Answer,
+    GeneratorConfig,
+    LightConfig,
+    MatcherConfig,
+    PSMNetConfig,
+    SelectionConfig,
+)
 from depthpose.depth.synthesis import Generator, SelectionGenerator, UNetGenerator
+
+
+@dataclass(frozen=True, kw_only=True)
+class MatcherKind:
+    """What it takes to read, write and run one kind of matcher.
+
+    Attributes:
+        config: dataclass of the network's sizes and conventions, which its weights file holds.
+        network: makes the module of a config, and keeps it as the attribute ``config``.
+        matcher: makes a matcher of a module in eval mode.
+    """
+
+    config: type
+    network: type[stereo.StereoNetwork]
+    matcher: Callable[[Any, MatcherConfig], stereo.Matcher]
+
+
+MATCHERS = {
+    "psmnet": MatcherKind(config=PSMNetConfig, network=stereo.PSMNet, matcher=stereo.PSMNetMatcher),
+    "light": MatcherKind(
+        config=LightConfig, network=stereo.LightStereo, matcher=stereo.LightMatcher
+    ),
+}
+"""Kinds of matchers with weights: a new one is a file with its three parts and one entry here."""
 
 BOTH = "fakestereo"
 Use = Literal["images", "pairs"]
@@ -33,13 +64,13 @@ class DepthWeights:
 
     Attributes:
         generator: left view to right view, or None in a file of the matcher alone.
-        matcher: pair to disparity, of any kind of ``stereo.MATCHERS``, or None in a file of the
+        matcher: pair to disparity, of any kind of :data:`MATCHERS`, or None in a file of the
             generator alone.
         facts: the card in short.
     """
 
     generator: Generator | None
-    matcher: StereoNetwork | None
+    matcher: stereo.StereoNetwork | None
     facts: Mapping[str, str]
 
 
@@ -106,7 +137,7 @@ def read_generator(path: Path) -> Generator:
     return generator
 
 
-def read_matcher(path: Path) -> StereoNetwork:
+def read_matcher(path: Path) -> stereo.StereoNetwork:
     """Read the matcher of a weights file, of any kind.
 
     Raises:
@@ -122,7 +153,7 @@ def write_depth_weights(
     path: Path,
     *,
     generator: Generator | None = None,
-    matcher: StereoNetwork | None = None,
+    matcher: stereo.StereoNetwork | None = None,
     facts: Mapping[str, str],
     with_half: bool = False,
 ) -> None:
@@ -154,4 +185,18 @@ def write_depth_weights(
         state = {f"{name}.{key}": t for name, s in states.items() for key, t in s.items()}
     checkpoints.save_checkpoint(
         path, checkpoints.Checkpoint(kind=kind, config=config, state=state, facts=facts)
+    )
+
+
+def make_matcher(network: stereo.StereoNetwork, config: MatcherConfig) -> stereo.Matcher:
+    """Make the matcher of a network of any kind.
+
+    Raises:
+        InputError: no kind has such a network.
+    """
+    for kind in MATCHERS.values():
+        if isinstance(network, kind.network):
+            return kind.matcher(network, config)
+    raise InputError(
+        f"{type(network).__name__} is no network of a matcher; known are {', '.join(MATCHERS)}"
     )

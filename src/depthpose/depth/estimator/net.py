@@ -46,11 +46,11 @@ from depthpose.depth.estimator.inputs import (
     usable_right,
 )
 from depthpose.depth.ground import scale_by_distance, scale_by_mount
-from depthpose.depth.stereo import CameraMatcher, Matcher, SGBMMatcher, make_matcher
+from depthpose.depth.stereo import CameraMatcher, Matcher, SGBMMatcher
 from depthpose.depth.stereo.light import LEAST_PX
 from depthpose.depth.synthesis import SelectionGenerator, Synthesiser, make_synthesiser
 from depthpose.depth.types import DepthEstimate, Match, StereoInput
-from depthpose.depth.weights import Use, read_depth_weights
+from depthpose.depth.weights import Use, make_matcher, read_depth_weights
 
 DEFAULT = "default"
 """Name of the weights that are taken where none are named."""

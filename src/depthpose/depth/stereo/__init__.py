@@ -1,10 +1,6 @@
 """Stereo matching: a rectified pair to disparity, by one of several matchers."""
 
-from depthpose.depth.stereo.kinds import MATCHERS as MATCHERS
-from depthpose.depth.stereo.kinds import LightMatcher as LightMatcher
-from depthpose.depth.stereo.kinds import MatcherKind as MatcherKind
-from depthpose.depth.stereo.kinds import PSMNetMatcher as PSMNetMatcher
-from depthpose.depth.stereo.kinds import make_matcher as make_matcher
+from depthpose.depth.stereo.light import LightMatcher as LightMatcher
 from depthpose.depth.stereo.light import LightStereo as LightStereo
 from depthpose.depth.stereo.matcher import CallableMatcher as CallableMatcher
 from depthpose.depth.stereo.matcher import CameraMatcher as CameraMatcher
@@ -18,5 +14,6 @@ from depthpose.depth.stereo.matcher import normalise as normalise
 from depthpose.depth.stereo.matcher import tile_change_px as tile_change_px
 from depthpose.depth.stereo.matcher import with_usable_precision as with_usable_precision
 from depthpose.depth.stereo.psmnet import PSMNet as PSMNet
+from depthpose.depth.stereo.psmnet import PSMNetMatcher as PSMNetMatcher
 from depthpose.depth.stereo.psmnet import import_psmnet as import_psmnet
 from depthpose.depth.stereo.psmnet import psmnet_from_published as psmnet_from_published

@@ -23,18 +23,16 @@ from torch import Tensor, nn
 from depthpose.core.errors import InputError
 from depthpose.depth.config import LightConfig
 from depthpose.depth.encoder import LiteEncoder
-from depthpose.depth.stereo.matcher import IMAGENET_MEAN, IMAGENET_STD, StereoNetwork
-from depthpose.depth.stereo.psmnet import (
-    by_rows,
-    conv_norm_2d,
-    conv_norm_3d,
-    deconv_norm_3d,
-    interpolation_matrix,
-    linear_taps,
+from depthpose.depth.stereo import layers
+from depthpose.depth.stereo.layers import Features, Volume, by_rows, conv_norm_2d, conv_norm_3d
+from depthpose.depth.stereo.matcher import (
+    IMAGENET_MEAN,
+    IMAGENET_STD,
+    NetworkMatcher,
+    StereoNetwork,
 )
-from depthpose.depth.types import Maps, Views
+from depthpose.depth.types import Maps, Match, Views
 
-Features = Float[Tensor, "b _ _ _"]
 Quarter = Float[Tensor, "b h4 w4"]
 
 STEM = 16
@@ -215,7 +213,9 @@ def confidence_near(scores: Scores, disparity_px: Quarter) -> Quarter:
     """
     bins = scores.shape[1]
     count = STEP_PX * (bins - 1) + 1
-    matrix = interpolation_matrix(linear_taps(bins, count, scores, align_corners=True), bins)
+    matrix = layers.interpolation_matrix(
+        layers.linear_taps(bins, count, scores, align_corners=True), bins
+    )
     probability = F.conv2d(scores, matrix[..., None, None]).softmax(1)
     steps_px = torch.arange(count, dtype=scores.dtype, device=scores.device)[:, None, None]
     distance_px = (steps_px - disparity_px[:, None]).abs()
@@ -271,8 +271,6 @@ class Reading(NamedTuple):
     confidence: Maps | None  # 0..1, in the sky its probability; None where it was not asked for
     sky: Maps | None  # its probability; None where the network has no such class
 
-
-Volume = Float[Tensor, "b _ _ _ _"]
 
 _DEEP = 96
 """Channels of the decoder at 1/32, twice those at 1/16 and 1/8."""
@@ -344,7 +342,7 @@ class Aggregation(nn.Module):
         steps = list(pairwise(v))
         self.down = nn.ModuleList(conv_norm_3d(a, b, stride=2) for a, b in steps)
         self.same = nn.ModuleList(conv_norm_3d(b, b) for _, b in steps)
-        self.up = nn.ModuleList(deconv_norm_3d(b, a) for a, b in steps)
+        self.up = nn.ModuleList(layers.deconv_norm_3d(b, a) for a, b in steps)
         self.joined = nn.ModuleList(conv_norm_3d(a, a) for a in v[:-1])
         self.guides = nn.ModuleList(
             nn.Conv2d(g, c, 1) for g, c in zip(guide_widths, v, strict=True)
@@ -499,3 +497,66 @@ class LightStereo(StereoNetwork):
         scores = self.aggregation(*described, bins, near.levels, self.rows)
         wide = torch.promote_types(scores.dtype, torch.float32)
         return scores.to(wide), near, right_half
+
+
+ROWS = 16
+"""Rows at quarter size that a matcher computes at a time."""
+
+
+def light_bytes(
+    config: LightConfig, height: int, width: int, dtype: torch.dtype, rows: int = ROWS
+) -> int:
+    """Peak memory of activations of one padded pair [bytes], with margin for the allocator.
+
+    One volume of the largest size is held whole; ``rows`` at quarter size are computed at a time.
+    """
+    pixels = height * width // 16
+    slab_pixels = min((rows + 4) * width // 4, pixels)
+    halves = 2 if config.with_agreement or config.with_refinement else 1
+    kept = pixels * (halves * 4 * 16 + 3 * config.width) * dtype.itemsize
+    # Both views in float32: at this size, normalised, padded.
+    images = 6 * 3 * 4 * height * width
+    # A volume at quarter size, the smaller ones, and three of the rows at a time.
+    widest = max(config.groups, config.volume_widths[0])
+    voxel_bytes = widest * (config.max_disparity_px // 4) * dtype.itemsize
+    volumes = voxel_bytes * (7 * pixels // 4 + 3 * slab_pixels)
+    # Weights that enlarge maps, thrice, and what they are made of at half size; the refinement
+    # takes less.
+    joined = 4 * (16 + config.width + 32) * dtype.itemsize
+    compared = 4 * (4 * 16 + 9 + 3 * 9) * 4 if config.with_agreement else 0
+    weights = slab_pixels * (joined + compared + 3 * 4 * 36 * 4)
+    return int(layers.MARGIN * (images + kept + max(volumes, weights))) + layers.OVERHEAD_BYTES // 2
+
+
+class LightMatcher(NetworkMatcher):
+    """The light network with pre- and post-processing, as :class:`NetworkMatcher` says."""
+
+    fine_pixels = 650_000
+    """Pixels of a fine match at most: an image of KITTI, enlarged 1.18 times."""
+    most_enlarged = 1.5
+    most_disparities = 1.75
+
+    def fold(self, network: LightStereo, like: Tensor) -> LightStereo:
+        """Fold batch norm, and compute some rows at a time."""
+        # A GPU has the memory, and is busy with whole volumes alone.
+        network.rows = ROWS if self.device.type == "cpu" else None
+        return layers.fold_features(layers.fold_volumes(network, like), like)
+
+    def activation_bytes(self, network: LightConfig, height: int, width: int) -> int:
+        """Peak memory of activations of one pair of suitable sides [bytes]."""
+        rows = self._network.rows or height // 4
+        return light_bytes(network, height, width, self.dtype, rows)
+
+    def run(self, left: Views, right: Views, network: LightConfig) -> list[Match]:
+        """Match normalised pairs whose sides suit the network."""
+        read = self._network.read(
+            left.to(self.dtype),
+            right.to(self.dtype),
+            network.max_disparity_px,
+            with_confidence=self.config.with_confidence,
+        )
+        nothing = [None] * len(left)
+        sure = nothing if read.confidence is None else read.confidence
+        sky = nothing if read.sky is None else read.sky > 0.5
+        parts = zip(read.heads[-1], sure, sky, strict=True)
+        return [Match(disparity_px=d, confidence=c, is_sky=s) for d, c, s in parts]

@@ -1,13 +1,12 @@
 """PSMNet, stacked hourglass: a rectified pair to disparity (Chang and Chen, CVPR 2018).
 
-The features of one view come first: residual layers and a spatial pyramid, at 1/4 size. Volumes can
-be computed some rows at a time, and the disparity expected from one of costs some rows at a time.
+The features of one view come first: residual layers and a spatial pyramid, at 1/4 size.
 """
 
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
-from typing import NamedTuple, cast
+from typing import cast
 
 import torch
 import torch.nn.functional as F
@@ -18,86 +17,17 @@ from depthpose.core.checkpoint import Checkpoint, file_sha256, read_published, s
 from depthpose.core.config import config_to_dict
 from depthpose.core.errors import InputError
 from depthpose.depth.config import PSMNetConfig
-from depthpose.depth.stereo.matcher import StereoNetwork
-from depthpose.depth.types import Map, Maps, Views
+from depthpose.depth.stereo import layers
+from depthpose.depth.stereo.layers import Features, Volume, conv_norm_2d, conv_norm_3d
+from depthpose.depth.stereo.matcher import NetworkMatcher, StereoNetwork
+from depthpose.depth.types import Map, Maps, Match, Views
 
 CHUNK_BYTES = 6 << 20
 """Size of one piece of the soft arg-min; it fits the caches."""
 
 
-def by_rows(
-    function: Callable[..., Tensor],
-    inputs: Sequence[Tensor | None],
-    *,
-    halo: int,
-    rows: int | None,
-    into: Tensor | None = None,
-) -> Tensor:
-    """Compute some rows of an answer at a time: the same numbers, with less held in between.
-
-    Rows stand last but one. Inputs and answer may have whole multiples of the rows of the smallest
-    input, in which everything here is counted.
-
-    Args:
-        function: of the inputs; its answer depends on nearby rows alone.
-        inputs: tensors; None stays None.
-        halo: so many rows to each side an answer depends on.
-        rows: at a time; None: all.
-        into: where the answer is written, perhaps over an input of which no answer needs another
-            row than its own; None: a new tensor.
-    """
-    if rows is None:
-        return function(*inputs)
-    height, whole = min(x.shape[-2] for x in inputs if x is not None), into
-    for first in range(0, height, rows):
-        stop = min(first + rows, height)
-        before, after = max(first - halo, 0), min(stop + halo, height)
-        pieces = []
-        for x in inputs:
-            times = 1 if x is None else x.shape[-2] // height
-            pieces.append(None if x is None else x[..., times * before : times * after, :])
-        some = function(*pieces)
-        times = some.shape[-2] // (after - before)
-        if whole is None:  # in the order of memory that convolutions of volumes like
-            order = torch.channels_last_3d if some.ndim == 5 else torch.contiguous_format
-            size = (*some.shape[:-2], times * height, some.shape[-1])
-            whole = torch.empty(size, dtype=some.dtype, device=some.device, memory_format=order)
-        own = some[..., times * (first - before) : times * (stop - before), :]
-        whole[..., times * first : times * stop, :] = own
-    assert whole is not None, "there are rows"
-    return whole
-
-
 WINDOW_PX = 2.0
 """Half width of the window whose probability is the confidence; ranks errors best (AUSE)."""
-
-
-class Taps(NamedTuple):
-    """Linear interpolation along one axis: ``(1 - share) x[low] + share x[high]``."""
-
-    low: Tensor
-    high: Tensor
-    share: Tensor
-
-
-def linear_taps(small: int, large: int, like: Tensor, *, align_corners: bool) -> Taps:
-    """Find where each of ``large`` samples falls among ``small`` ones, as F.interpolate does."""
-    index = torch.arange(large, dtype=torch.float64, device=like.device)
-    if align_corners:
-        at = index * ((small - 1) / max(large - 1, 1))
-    else:
-        at = ((index + 0.5) * (small / large) - 0.5).clamp(min=0)
-    low = at.floor().long().clamp(max=small - 1)
-    return Taps(low, (low + 1).clamp(max=small - 1), (at - low).to(like))
-
-
-def interpolation_matrix(taps: Taps, small: int) -> Float[Tensor, "large small"]:
-    """Write linear interpolation as a matrix, to be one product over many pixels."""
-    matrix = taps.share.new_zeros(len(taps.low), small)
-    rows = torch.arange(len(taps.low), device=matrix.device)
-    matrix[rows, taps.low] += 1 - taps.share
-    matrix[rows, taps.high] += taps.share
-    return matrix
 
 
 def expected_disparity(
@@ -121,10 +51,10 @@ def expected_disparity(
     """
     count, rows, columns = size
     down, across, deep = (
-        linear_taps(small, large, cost, align_corners=align_corners)
+        layers.linear_taps(small, large, cost, align_corners=align_corners)
         for small, large in zip(cost.shape, (rows, columns, count), strict=True)
     )
-    matrix = interpolation_matrix(deep, cost.shape[2]).T.contiguous()
+    matrix = layers.interpolation_matrix(deep, cost.shape[2]).T.contiguous()
     bins = torch.arange(count, device=cost.device).to(cost)
     disparity_px = cost.new_empty(rows, columns)
     confidence = torch.empty_like(disparity_px) if with_confidence else None
@@ -140,28 +70,6 @@ def expected_disparity(
             torch.sum(probability.mul_(near), -1, out=confidence[y])
             confidence[y].clamp_(0, 1)
     return disparity_px, confidence
-
-
-class ConvNorm(nn.Module):
-    """A convolution without bias, then batch normalisation."""
-
-    def __init__(self, conv: nn.Module, norm: nn.Module) -> None:
-        super().__init__()
-        self.conv = conv
-        self.norm = norm
-
-    def forward(self, x: Float[Tensor, "b c *size"]) -> Float[Tensor, "b k *smaller"]:
-        """Convolve and normalise."""
-        return self.norm(self.conv(x))
-
-
-def conv_norm_2d(
-    inputs: int, outputs: int, kernel: int = 3, stride: int = 1, dilation: int = 1
-) -> ConvNorm:
-    """Make a 2D convolution that keeps the size (but for its stride), with batch norm."""
-    padding = dilation * (kernel // 2)
-    conv = nn.Conv2d(inputs, outputs, kernel, stride, padding, dilation, bias=False)
-    return ConvNorm(conv, nn.BatchNorm2d(outputs))
 
 
 class Block(nn.Module):
@@ -215,22 +123,6 @@ class FeatureExtractor(nn.Module):
         return self.project(F.relu(self.fuse(torch.cat([raw, last, *levels], 1))))
 
 
-Features = Float[Tensor, "b _ _ _"]
-Volume = Float[Tensor, "b _ _ _ _"]
-
-
-def conv_norm_3d(inputs: int, outputs: int, stride: int = 1) -> ConvNorm:
-    """Make a 3x3x3 convolution with batch norm."""
-    conv = nn.Conv3d(inputs, outputs, 3, stride, 1, bias=False)
-    return ConvNorm(conv, nn.BatchNorm3d(outputs))
-
-
-def deconv_norm_3d(inputs: int, outputs: int) -> ConvNorm:
-    """Make a transposed 3x3x3 convolution that doubles the size, with batch norm."""
-    conv = nn.ConvTranspose3d(inputs, outputs, 3, 2, 1, output_padding=1, bias=False)
-    return ConvNorm(conv, nn.BatchNorm3d(outputs))
-
-
 class Hourglass(nn.Module):
     """Down to a quarter of the volume and back, to let far evidence reach each voxel."""
 
@@ -240,8 +132,8 @@ class Hourglass(nn.Module):
         self.same1 = conv_norm_3d(2 * c, 2 * c)
         self.down2 = conv_norm_3d(2 * c, 2 * c, stride=2)
         self.same2 = conv_norm_3d(2 * c, 2 * c)
-        self.up2 = deconv_norm_3d(2 * c, 2 * c)
-        self.up1 = deconv_norm_3d(2 * c, c)
+        self.up2 = layers.deconv_norm_3d(2 * c, 2 * c)
+        self.up1 = layers.deconv_norm_3d(2 * c, c)
 
     def forward(
         self, x: Volume, first: Volume | None, before: Volume | None
@@ -364,7 +256,7 @@ class PSMNet(StereoNetwork):
 
         views = self.features(left), self.features(right)
         # Four convolutions follow each other.
-        return self.refine(by_rows(begin, views, halo=4, rows=self.rows))
+        return self.refine(layers.by_rows(begin, views, halo=4, rows=self.rows))
 
     def aggregate(self, volume: Volume) -> Volume:
         """Give the volume that the hourglasses refine, of a concatenation volume."""
@@ -384,7 +276,7 @@ class PSMNet(StereoNetwork):
             first = down if first is None else first
             del down
             x = hourglass.up1(up).add_(cost0)
-            cost = by_rows(head, (x,), halo=2, rows=self.rows)
+            cost = layers.by_rows(head, (x,), halo=2, rows=self.rows)
             costs.append(cost + costs[-1] if costs else cost)
         return cast("tuple[Volume, Volume, Volume]", tuple(costs))
 
@@ -394,6 +286,77 @@ def _initialise(module: nn.Module) -> None:
     if isinstance(module, nn.Conv2d | nn.Conv3d):
         taps = module.weight[0, 0].numel()
         nn.init.normal_(module.weight, 0, (2 / (taps * module.out_channels)) ** 0.5)
+
+
+ROWS = 32
+"""Rows at quarter size that a matcher computes at a time."""
+
+
+def psmnet_bytes(
+    config: PSMNetConfig, height: int, width: int, dtype: torch.dtype, rows: int = ROWS
+) -> int:
+    """Peak memory of activations of one padded pair [bytes], with margin for the allocator.
+
+    Two volumes of the largest size are held whole; ``rows`` at quarter size are computed at a time.
+    """
+    h, w = height // 4, width // 4
+    row_bytes = config.width * w * dtype.itemsize
+    map_bytes = row_bytes * h
+    bins = config.max_disparity_px // 4
+    volume_bytes = map_bytes * bins
+
+    slab2_bytes, slab4_bytes = (min(rows + 2 * halo, h) * row_bytes * bins for halo in (2, 4))
+    levels = 6 + len(config.pools)
+    cost_bytes = 4 * bins * h * w
+    # Costs are computed in float32.
+    head_slabs = 2 if dtype.itemsize >= 4 else 4
+    stages = (
+        # Five half-size maps in the first stage; joined levels, twice, in the last.
+        2 * map_bytes * max(5 * 4, 2 * levels + 12),
+        # ``cost0``; of some rows the concatenation, and what a convolution makes of it.
+        volume_bytes + 2 * map_bytes + 3 * slab4_bytes,
+        # ``cost0``, what is added to it, three half-size volumes; some rows in the head.
+        2 * volume_bytes + 3 * volume_bytes // 4 + head_slabs * slab2_bytes + 3 * cost_bytes,
+        4 * cost_bytes + 16 * height * width + 5 * CHUNK_BYTES,
+    )
+    return int(layers.MARGIN * max(stages)) + layers.OVERHEAD_BYTES
+
+
+class PSMNetMatcher(NetworkMatcher):
+    """PSMNet with pre- and post-processing, as :class:`NetworkMatcher` says."""
+
+    fine_pixels = 280_000
+    """Pixels of a fine match at most: an image of KITTI at three quarters of its resolution."""
+
+    def fold(self, network: PSMNet, like: Tensor) -> PSMNet:
+        """Fold batch norm, and compute some rows at a time."""
+        for head in network.heads:
+            # In float32 at least: 8 bits would round the expectation to whole pixels.
+            cost, wide = cast("nn.Conv3d", head.cost), torch.empty(0, device=self.device)
+            head.cost = layers.VolumeConv(cost, cost.weight, torch.zeros(1), wide)
+        layers.fold_volumes(network, like)
+        layers.fold_features(network.features, like)
+        network.rows = ROWS
+        return network
+
+    def activation_bytes(self, network: PSMNetConfig, height: int, width: int) -> int:
+        """Peak memory of activations of one pair of suitable sides [bytes]."""
+        return psmnet_bytes(network, height, width, self.dtype)
+
+    def run(self, left: Views, right: Views, network: PSMNetConfig) -> list[Match]:
+        """Match normalised pairs whose sides suit the network."""
+        near, far = (one.to(self.dtype, memory_format=torch.channels_last) for one in (left, right))
+        costs = self._network.costs(near, far, network.max_disparity_px)[-1][:, 0]
+        found = [
+            expected_disparity(
+                cost.permute(1, 2, 0).contiguous(),
+                (network.max_disparity_px, *left.shape[-2:]),
+                align_corners=network.align_corners,
+                with_confidence=self.config.with_confidence,
+            )
+            for cost in costs
+        ]
+        return [Match(disparity_px=d, confidence=c) for d, c in found]
 
 
 _PARTS = {"0": "conv", "1": "norm"}

@@ -29,7 +29,7 @@ from depthpose.depth.estimator import FakestereoNet
 from depthpose.depth.labels import is_consistent, label_pairs, match_both_ways
 from depthpose.depth.losses import photometric_error
 from depthpose.depth.metrics import disparity_errors
-from depthpose.depth.stereo import MATCHERS, NetworkMatcher, StereoNetwork, make_matcher
+from depthpose.depth.stereo import NetworkMatcher, StereoNetwork
 from depthpose.depth.synthesis import Generator, SelectionGenerator, UNetGenerator
 from depthpose.depth.synthetic import Streets
 from depthpose.depth.train import stages
@@ -42,7 +42,13 @@ from depthpose.depth.train.config import (
 )
 from depthpose.depth.train.pairs import TrainingPairs
 from depthpose.depth.types import Mask, StereoInput
-from depthpose.depth.weights import read_generator, read_matcher, write_depth_weights
+from depthpose.depth.weights import (
+    MATCHERS,
+    make_matcher,
+    read_generator,
+    read_matcher,
+    write_depth_weights,
+)
 
 _FORGOTTEN = 0.005
 """More bad disparities on synthetic streets than this share are too many."""

@@ -1,0 +1,244 @@
+"""Layers that the stereo networks share, and networks made ready to match.
+
+Volumes can be computed some rows at a time. Batch norm is folded into the convolution before it:
+the same function, one pass less.
+"""
+
+from collections.abc import Callable, Sequence
+from functools import cache
+from typing import NamedTuple, TypeVar, cast
+
+import torch
+import torch.nn.functional as F
+from jaxtyping import Float
+from torch import Tensor, nn
+
+MARGIN = 1.1
+"""Allocators keep gaps: measured peaks stay below the sum of the tensors times this ..."""
+
+OVERHEAD_BYTES = 128 << 20
+"""... plus this, which the first convolutions take for themselves whatever the size."""
+
+
+def by_rows(
+    function: Callable[..., Tensor],
+    inputs: Sequence[Tensor | None],
+    *,
+    halo: int,
+    rows: int | None,
+    into: Tensor | None = None,
+) -> Tensor:
+    """Compute some rows of an answer at a time: the same numbers, with less held in between.
+
+    Rows stand last but one. Inputs and answer may have whole multiples of the rows of the smallest
+    input, in which everything here is counted.
+
+    Args:
+        function: of the inputs; its answer depends on nearby rows alone.
+        inputs: tensors; None stays None.
+        halo: so many rows to each side an answer depends on.
+        rows: at a time; None: all.
+        into: where the answer is written, perhaps over an input of which no answer needs another
+            row than its own; None: a new tensor.
+    """
+    if rows is None:
+        return function(*inputs)
+    height, whole = min(x.shape[-2] for x in inputs if x is not None), into
+    for first in range(0, height, rows):
+        stop = min(first + rows, height)
+        before, after = max(first - halo, 0), min(stop + halo, height)
+        pieces = []
+        for x in inputs:
+            times = 1 if x is None else x.shape[-2] // height
+            pieces.append(None if x is None else x[..., times * before : times * after, :])
+        some = function(*pieces)
+        times = some.shape[-2] // (after - before)
+        if whole is None:  # in the order of memory that convolutions of volumes like
+            order = torch.channels_last_3d if some.ndim == 5 else torch.contiguous_format
+            size = (*some.shape[:-2], times * height, some.shape[-1])
+            whole = torch.empty(size, dtype=some.dtype, device=some.device, memory_format=order)
+        own = some[..., times * (first - before) : times * (stop - before), :]
+        whole[..., times * first : times * stop, :] = own
+    assert whole is not None, "there are rows"
+    return whole
+
+
+class Taps(NamedTuple):
+    """Linear interpolation along one axis: ``(1 - share) x[low] + share x[high]``."""
+
+    low: Tensor
+    high: Tensor
+    share: Tensor
+
+
+def linear_taps(small: int, large: int, like: Tensor, *, align_corners: bool) -> Taps:
+    """Find where each of ``large`` samples falls among ``small`` ones, as F.interpolate does."""
+    index = torch.arange(large, dtype=torch.float64, device=like.device)
+    if align_corners:
+        at = index * ((small - 1) / max(large - 1, 1))
+    else:
+        at = ((index + 0.5) * (small / large) - 0.5).clamp(min=0)
+    low = at.floor().long().clamp(max=small - 1)
+    return Taps(low, (low + 1).clamp(max=small - 1), (at - low).to(like))
+
+
+def interpolation_matrix(taps: Taps, small: int) -> Float[Tensor, "large small"]:
+    """Write linear interpolation as a matrix, to be one product over many pixels."""
+    matrix = taps.share.new_zeros(len(taps.low), small)
+    rows = torch.arange(len(taps.low), device=matrix.device)
+    matrix[rows, taps.low] += 1 - taps.share
+    matrix[rows, taps.high] += taps.share
+    return matrix
+
+
+class ConvNorm(nn.Module):
+    """A convolution without bias, then batch normalisation."""
+
+    def __init__(self, conv: nn.Module, norm: nn.Module) -> None:
+        super().__init__()
+        self.conv = conv
+        self.norm = norm
+
+    def forward(self, x: Float[Tensor, "b c *size"]) -> Float[Tensor, "b k *smaller"]:
+        """Convolve and normalise."""
+        return self.norm(self.conv(x))
+
+
+def conv_norm_2d(
+    inputs: int, outputs: int, kernel: int = 3, stride: int = 1, dilation: int = 1
+) -> ConvNorm:
+    """Make a 2D convolution that keeps the size (but for its stride), with batch norm."""
+    padding = dilation * (kernel // 2)
+    conv = nn.Conv2d(inputs, outputs, kernel, stride, padding, dilation, bias=False)
+    return ConvNorm(conv, nn.BatchNorm2d(outputs))
+
+
+Features = Float[Tensor, "b _ _ _"]
+Volume = Float[Tensor, "b _ _ _ _"]
+
+
+def conv_norm_3d(inputs: int, outputs: int, stride: int = 1) -> ConvNorm:
+    """Make a 3x3x3 convolution with batch norm."""
+    conv = nn.Conv3d(inputs, outputs, 3, stride, 1, bias=False)
+    return ConvNorm(conv, nn.BatchNorm3d(outputs))
+
+
+def deconv_norm_3d(inputs: int, outputs: int) -> ConvNorm:
+    """Make a transposed 3x3x3 convolution that doubles the size, with batch norm."""
+    conv = nn.ConvTranspose3d(inputs, outputs, 3, 2, 1, output_padding=1, bias=False)
+    return ConvNorm(conv, nn.BatchNorm3d(outputs))
+
+
+Conv = nn.Conv2d | nn.Conv3d | nn.ConvTranspose3d
+Norm = nn.BatchNorm2d | nn.BatchNorm3d
+ModuleT = TypeVar("ModuleT", bound=nn.Module)
+
+
+def folded_weight(layer: nn.Module) -> tuple[Tensor, Tensor]:
+    """Weight and bias of the one convolution that equals ``layer`` in eval mode, in float64.
+
+    ``norm(conv(x)) = gain * (conv(x) - mean) + bias`` with ``gain = weight / sqrt(var + eps)``.
+    """
+    conv, norm = cast("Conv", layer.conv), cast("Norm", layer.norm)
+    assert norm.running_mean is not None
+    assert norm.running_var is not None
+    gain = norm.weight.double() / (norm.running_var.double() + norm.eps).sqrt()
+    bias = norm.bias.double() - gain * norm.running_mean.double()
+    output_axis = 1 if isinstance(conv, nn.ConvTranspose3d) else 0
+    shape = [1] * conv.weight.ndim
+    shape[output_axis] = -1
+    return (conv.weight.double() * gain.view(shape)).detach(), bias.detach()
+
+
+def fold_features(features: ModuleT, like: Tensor) -> ModuleT:
+    """Fold every batch norm after a 2D convolution, in place, and bring all to ``like``'s type."""
+    for parent in list(features.modules()):
+        for name, layer in list(parent.named_children()):
+            if isinstance(getattr(layer, "norm", None), nn.BatchNorm2d):
+                weight, bias = folded_weight(layer)
+                conv = cast("nn.Conv2d", layer.conv)
+                conv.weight.data = weight
+                conv.bias = nn.Parameter(bias)
+                layer.norm = nn.Identity()
+                if isinstance(layer, ConvNorm):  # which then is its convolution
+                    setattr(parent, name, conv)
+    for parameter in features.parameters():
+        values = parameter.data.to(like)
+        order = torch.channels_last if values.ndim == 4 else torch.contiguous_format
+        parameter.data = values.contiguous(memory_format=order)
+        parameter.requires_grad_(False)
+    return features
+
+
+def fold_volumes(module: ModuleT, like: Tensor) -> ModuleT:
+    """Fold every batch norm after a 3D convolution, in place; oneDNN is called by name after it.
+
+    So it is in 3D convolutions without a norm.
+    """
+    for parent in list(module.modules()):
+        for name, layer in list(parent.named_children()):
+            if isinstance(layer, ConvNorm) and isinstance(layer.norm, nn.BatchNorm3d):
+                setattr(parent, name, VolumeConv(layer.conv, *folded_weight(layer), like))
+            elif isinstance(layer, nn.Conv3d) and not isinstance(parent, ConvNorm):
+                bias = torch.zeros(layer.out_channels) if layer.bias is None else layer.bias
+                setattr(parent, name, VolumeConv(layer, layer.weight, bias, like))
+    return module
+
+
+class VolumeConv(nn.Module):
+    """A folded 3x3x3 convolution of whole volumes."""
+
+    def __init__(self, conv: nn.Module, weight: Tensor, bias: Tensor, like: Tensor) -> None:
+        super().__init__()
+        self.is_transposed = isinstance(conv, nn.ConvTranspose3d)
+        self.stride = cast("Conv", conv).stride[0]
+        weight = weight.detach().to(like).contiguous(memory_format=torch.channels_last_3d)
+        self.weight = nn.Parameter(weight, requires_grad=False)
+        self.bias = nn.Parameter(bias.detach().to(like), requires_grad=False)
+
+    def forward(self, volume: Volume) -> Volume:
+        """Convolve a volume, in the type of the weights."""
+        volume = volume.to(self.weight.dtype)
+        is_usable = volume.device.type == "cpu" and volume.dtype in (torch.float32, torch.bfloat16)
+        # oneDNN is called by name: PyTorch's own choice takes a slow path for few rows.
+        by_name = is_usable and has_onednn_operators()
+        if self.is_transposed:
+            if by_name:
+                return _onednn_transposed(volume, self.weight, self.bias)
+            return F.conv_transpose3d(volume, self.weight, self.bias, 2, 1, 1)
+        if by_name:
+            return _onednn_convolved(volume, self.weight, self.bias, self.stride)
+        return F.conv3d(volume, self.weight, self.bias, self.stride, 1)
+
+
+def _onednn_convolved(volume: Tensor, weight: Tensor, bias: Tensor, stride: int) -> Tensor:
+    ones, strides = (1, 1, 1), (stride,) * 3
+    return torch.mkldnn_convolution(volume, weight, bias, ones, strides, ones, 1)
+
+
+def _onednn_transposed(volume: Tensor, weight: Tensor, bias: Tensor) -> Tensor:
+    ones, twos = (1, 1, 1), (2, 2, 2)
+    args = (volume, weight, bias, ones, ones, twos, ones, 1, "none", [], "")
+    return torch.ops.mkldnn._convolution_transpose_pointwise(*args)
+
+
+@cache
+def has_onednn_operators() -> bool:
+    """Whether this PyTorch has both oneDNN operators, which it does not document, as used here.
+
+    Without them, or where they answer otherwise than the documented ones, these are called.
+    """
+    if not torch.backends.mkldnn.is_available():
+        return False
+    volume, weight, bias = torch.ones(1, 2, 4, 4, 4), torch.ones(2, 2, 3, 3, 3), torch.ones(2)
+    try:
+        with torch.no_grad():
+            convolved = _onednn_convolved(volume, weight, bias, 1)
+            transposed = _onednn_transposed(volume, weight, bias)
+    except (AttributeError, RuntimeError, TypeError):
+        return False
+    both = (
+        (convolved, F.conv3d(volume, weight, bias, 1, 1)),
+        (transposed, F.conv_transpose3d(volume, weight, bias, 2, 1, 1)),
+    )
+    return all(one.shape == other.shape and torch.allclose(one, other) for one, other in both)
