@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Callable, Mapping
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +17,7 @@ from depthpose.depth.config import SGBMConfig, StreetsConfig
 from depthpose.depth.disparity import depth_from_disparity
 from depthpose.depth.estimator import FakestereoNet
 from depthpose.depth.evaluate import clamped_depth
-from depthpose.depth.metrics import depth_errors, disparity_errors
+from depthpose.depth.metrics import measure
 from depthpose.depth.predictions import CLOUD_M, write_estimate
 from depthpose.depth.synthetic import Streets
 from depthpose.depth.types import (
@@ -144,8 +144,8 @@ def _measure(sample: StereoSample, estimate: DepthEstimate) -> dict[str, Any]:
     counts = true_m < _CAP_M
     mask = counts & torch.isfinite(estimate.disparity_px)
     row = {"coverage": float(mask.sum() / counts.sum())}
-    row |= asdict(disparity_errors(estimate.disparity_px[mask], true_px[mask]))
-    return row | asdict(depth_errors(predicted_m[mask], true_m[mask]))
+    row |= measure("disparity", estimate.disparity_px[mask], true_px[mask])
+    return row | measure("depth", predicted_m[mask], true_m[mask])
 
 
 def read_motorcycle() -> StereoSample | None:

@@ -5,11 +5,9 @@ import torch
 
 from depthpose.core.errors import InputError
 from depthpose.depth.metrics import (
-    DepthErrors,
-    depth_errors,
-    disparity_errors,
     error_by_decile,
     garg_crop,
+    measure,
     score_confidence,
     sparsification_area,
     view_errors,
@@ -18,35 +16,37 @@ from depthpose.depth.metrics import (
 
 def test_the_truth_has_no_error() -> None:
     truth = torch.rand(100) * 80 + 1
-    assert depth_errors(truth, truth) == DepthErrors(0.0, 0.0, 0.0, 0.0, 1.0, 1.0, 1.0)
+    assert list(measure("depth", truth, truth).values()) == [0.0, 0.0, 0.0, 0.0, 1.0, 1.0, 1.0]
 
 
 def test_depth_errors_of_a_worked_example() -> None:
-    errors = depth_errors(torch.tensor([2.0, 10.0]), torch.tensor([1.0, 10.0]))
-    assert errors.abs_rel == 0.5
-    assert errors.sq_rel == 0.5
-    assert errors.rmse == pytest.approx(math.sqrt(0.5))
-    assert errors.rmse_log == pytest.approx(math.log(2) / math.sqrt(2))
-    assert (errors.d1, errors.d2, errors.d3) == (0.5, 0.5, 0.5)
+    errors = measure("depth", torch.tensor([2.0, 10.0]), torch.tensor([1.0, 10.0]))
+    assert errors["abs_rel"] == 0.5
+    assert errors["sq_rel"] == 0.5
+    assert errors["rmse"] == pytest.approx(math.sqrt(0.5))
+    assert errors["rmse_log"] == pytest.approx(math.log(2) / math.sqrt(2))
+    assert (errors["d1"], errors["d2"], errors["d3"]) == (0.5, 0.5, 0.5)
 
 
 def test_the_thresholds_are_strict() -> None:
-    errors = depth_errors(torch.tensor([1.25]), torch.tensor([1.0]))
-    assert (errors.d1, errors.d2) == (0.0, 1.0)
+    errors = measure("depth", torch.tensor([1.25]), torch.tensor([1.0]))
+    assert (errors["d1"], errors["d2"]) == (0.0, 1.0)
 
 
 def test_relative_errors_do_not_change_with_the_unit() -> None:
     predicted, truth = torch.rand(50) + 1, torch.rand(50) + 1
-    one, other = depth_errors(predicted, truth), depth_errors(8 * predicted, 8 * truth)
-    assert one.abs_rel == pytest.approx(other.abs_rel)
-    assert one.rmse_log == pytest.approx(other.rmse_log)
-    assert 8 * one.rmse == pytest.approx(other.rmse)
+    one, other = measure("depth", predicted, truth), measure("depth", 8 * predicted, 8 * truth)
+    assert one["abs_rel"] == pytest.approx(other["abs_rel"])
+    assert one["rmse_log"] == pytest.approx(other["rmse_log"])
+    assert 8 * one["rmse"] == pytest.approx(other["rmse"])
 
 
 def test_the_order_of_pixels_does_not_matter() -> None:
     predicted, truth = torch.rand(5000) + 1, torch.rand(5000) + 1
-    turned = depth_errors(predicted.flip(0), truth.flip(0))
-    assert turned.abs_rel == pytest.approx(depth_errors(predicted, truth).abs_rel, rel=1e-12)
+    turned = measure("depth", predicted.flip(0), truth.flip(0))
+    assert turned["abs_rel"] == pytest.approx(
+        measure("depth", predicted, truth)["abs_rel"], rel=1e-12
+    )
 
 
 @pytest.mark.parametrize(
@@ -62,19 +62,19 @@ def test_unusable_depth_is_refused(
     predicted: list[float], truth: list[float], message: str
 ) -> None:
     with pytest.raises(InputError, match=message):
-        depth_errors(torch.tensor(predicted), torch.tensor(truth))
+        measure("depth", torch.tensor(predicted), torch.tensor(truth))
 
 
 def test_a_pixel_is_bad_when_off_by_both_measures() -> None:
     truth = torch.tensor([10.0, 10.0, 100.0, 100.0])
-    errors = disparity_errors(truth + torch.tensor([3.0, 3.1, 4.9, 5.1]), truth)
-    assert errors.d1_all == 0.5
-    assert errors.epe_px == pytest.approx(4.025, rel=1e-6)
+    errors = measure("disparity", truth + torch.tensor([3.0, 3.1, 4.9, 5.1]), truth)
+    assert errors["d1_all"] == 0.5
+    assert errors["epe_px"] == pytest.approx(4.025, rel=1e-6)
 
 
 def test_disparity_without_pixels_is_refused() -> None:
     with pytest.raises(InputError, match="no pixel to compare"):
-        disparity_errors(torch.zeros(0), torch.zeros(0))
+        measure("disparity", torch.zeros(0), torch.zeros(0))
 
 
 @pytest.mark.parametrize(

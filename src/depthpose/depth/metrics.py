@@ -42,42 +42,6 @@ class Metric:
     is_printed: bool = True
 
 
-@dataclass(frozen=True)
-class DepthErrors:
-    """The seven numbers of Eigen et al. (2014), of one image.
-
-    Attributes:
-        abs_rel: mean of ``|p - t| / t``.
-        sq_rel: mean of (p - t)^2 / t [m].
-        rmse: root of the mean of (p - t)^2 [m].
-        rmse_log: the same of natural logarithms.
-        d1: share of pixels with max(p / t, t / p) < 1.25.
-        d2: the same below 1.25^2.
-        d3: the same below 1.25^3.
-    """
-
-    abs_rel: float
-    sq_rel: float
-    rmse: float
-    rmse_log: float
-    d1: float
-    d2: float
-    d3: float
-
-
-@dataclass(frozen=True)
-class DisparityErrors:
-    """KITTI's stereo measures over a set of pixels.
-
-    Attributes:
-        epe_px: mean end-point error, ``|p - t|``.
-        d1_all: share of pixels off by more than 3 px and by more than 5 % of the truth.
-    """
-
-    epe_px: float
-    d1_all: float
-
-
 def measure(of: Quantity, predicted: Numbers, true: Numbers) -> dict[str, float]:
     """Give every metric of a kind, in the order of ``METRICS``.
 
@@ -100,18 +64,6 @@ def measure(of: Quantity, predicted: Numbers, true: Numbers) -> dict[str, float]
                 )
     p, t = predicted.double(), true.double()
     return {one.name: one.function(p, t) for one in METRICS.values() if one.of == of}
-
-
-def depth_errors(predicted_m: Numbers, true_m: Numbers) -> DepthErrors:
-    """Measure depth by the seven numbers of Eigen et al.; refuses what :func:`measure` does."""
-    found = measure("depth", predicted_m, true_m)
-    return DepthErrors(**{name: found[name] for name in DepthErrors.__dataclass_fields__})
-
-
-def disparity_errors(predicted_px: Numbers, true_px: Numbers) -> DisparityErrors:
-    """Measure disparity, D1 by the KITTI 2015 devkit (both strict); no pixel is refused."""
-    found = measure("disparity", predicted_px, true_px)
-    return DisparityErrors(epe_px=found["epe_px"], d1_all=found["d1_all"])
 
 
 def _rmse(p: Tensor, t: Tensor) -> float:
@@ -148,7 +100,11 @@ METRICS = {
         Metric(name="d1_noc", of="disparity_noc", function=_share_bad, is_printed=False),
     )
 }
-"""Metrics by name, in the order of the columns: a new one is a function and one entry here."""
+"""Metrics by name, in the order of the columns: a new one is a function and one entry here.
+
+Of depth the seven of Eigen et al. (2014), where d1, d2 and d3 are the shares of pixels with
+max(p / t, t / p) below 1.25, 1.25^2 and 1.25^3; of disparity those of the KITTI 2015 devkit: the
+mean end-point error, and the share off by more than 3 px and by more than 5 % of the truth."""
 
 RANKING: dict[Quantity, str] = {"depth": "abs_rel", "disparity": "epe_px"}
 """The metric by which frames are ranked, and whose error is set beside the confidence."""

@@ -1,7 +1,7 @@
 """Chapter 2 of the thesis: its printed tables joined to our rows, and figures 2-1 and 2-5."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import dataclass, field, replace
 from typing import Literal
 
 import torch
@@ -12,11 +12,11 @@ from torch.nn import functional as F
 from depthpose.core.draw import depth_scale, draw_depth, draw_points
 from depthpose.core.errors import InputError, nearest_name
 from depthpose.depth.evaluate import Cell, EvaluationRow, Row
-from depthpose.depth.metrics import DepthErrors
+from depthpose.depth.metrics import METRICS
 from depthpose.depth.types import DepthEstimate, StereoInput
 from depthpose.report.page import Drawing
 
-_METRICS = tuple(DepthErrors.__dataclass_fields__)
+_METRICS = tuple(name for name, metric in METRICS.items() if metric.of == "depth")
 _FIRST = ("method", "weights", "cap_m", "protocol", *_METRICS)
 
 
@@ -35,9 +35,9 @@ class PublishedRow:
     note: str = ""
 
     @property
-    def errors(self) -> DepthErrors:
-        """The seven numbers."""
-        return DepthErrors(*map(float, self.printed.split()))
+    def errors(self) -> dict[str, float]:
+        """The seven numbers, by the names of our metrics."""
+        return dict(zip(_METRICS, map(float, self.printed.split()), strict=True))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -98,7 +98,7 @@ def join_published(
             source="published",
             method=row.method,
             cap_m=row.cap_m,
-            metrics=asdict(row.errors),
+            metrics=row.errors,
             protocol=row.protocol,
             others={"note": row.note},
         )

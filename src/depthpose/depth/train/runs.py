@@ -28,7 +28,7 @@ from depthpose.depth.encoder import load_encoder
 from depthpose.depth.estimator import FakestereoNet
 from depthpose.depth.labels import is_consistent, label_pairs, match_both_ways
 from depthpose.depth.losses import photometric_error
-from depthpose.depth.metrics import disparity_errors
+from depthpose.depth.metrics import measure
 from depthpose.depth.stereo import NetworkMatcher, StereoNetwork
 from depthpose.depth.synthesis import Generator, SelectionGenerator, UNetGenerator
 from depthpose.depth.synthetic import Streets
@@ -112,9 +112,9 @@ class AdaptationCheck:
             assert truth_px is not None
             found_px = net.estimate_pair(street.input, with_check=False).disparity_px
             counts = truth_px > 0
-            of_street = disparity_errors(found_px[counts], truth_px[counts])
-            bad.append(of_street.d1_all)
-            off_px.append(of_street.epe_px)
+            of_street = measure("disparity", found_px[counts], truth_px[counts])
+            bad.append(of_street["d1_all"])
+            off_px.append(of_street["epe_px"])
         return AdaptMetrics(
             photometric=float(torch.stack(errors).mean()),
             disagreeing=float(torch.stack(apart).mean()),
