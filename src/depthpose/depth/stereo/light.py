@@ -535,17 +535,13 @@ class LightMatcher(NetworkMatcher):
     """Pixels of a fine match at most: an image of KITTI, enlarged 1.18 times."""
     most_enlarged = 1.5
     most_disparities = 1.75
+    activation_bytes = staticmethod(light_bytes)
 
     def fold(self, network: LightStereo, like: Tensor) -> LightStereo:
         """Fold batch norm, and compute some rows at a time."""
         # A GPU has the memory, and is busy with whole volumes alone.
         network.rows = ROWS if self.device.type == "cpu" else None
         return layers.fold_features(layers.fold_volumes(network, like), like)
-
-    def activation_bytes(self, network: LightConfig, height: int, width: int) -> int:
-        """Peak memory of activations of one pair of suitable sides [bytes]."""
-        rows = self._network.rows or height // 4
-        return light_bytes(network, height, width, self.dtype, rows)
 
     def run(self, left: Views, right: Views, network: LightConfig) -> list[Match]:
         """Match normalised pairs whose sides suit the network."""

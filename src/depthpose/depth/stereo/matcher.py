@@ -277,6 +277,8 @@ class NetworkMatcher(ABC):
     """Times the size of the images at which a fine match may be."""
     most_disparities: ClassVar[float] = 1.5
     """Times the disparities of training that a fine match looks through at most."""
+    activation_bytes: ClassVar[Callable[..., int]]
+    """Peak memory of a padded pair [bytes], by the network's config, height, width, type, rows."""
 
     def __init__(self, network: StereoNetwork, config: MatcherConfig | None = None) -> None:
         config = config or MatcherConfig()
@@ -303,10 +305,6 @@ class NetworkMatcher(ABC):
             network: the network's config, perhaps with more disparities than it was trained with.
 
         """
-
-    @abstractmethod
-    def activation_bytes(self, network: Any, height: int, width: int) -> int:  # noqa: ANN401
-        """Peak memory of activations of one pair of suitable sides [bytes]."""
 
     @torch.no_grad()
     def match(self, left: Tensor, right: Tensor) -> Match:
@@ -397,7 +395,8 @@ class NetworkMatcher(ABC):
         h, w = left.shape[-2:]
         left, right = (pad_top_right(views, network) for views in (left, right))
         height, width = left.shape[-2:]
-        least, most = self.activation_bytes(network, height, width), self.config.max_memory_bytes
+        rows, most = self._network.rows or height // 4, self.config.max_memory_bytes
+        least = self.activation_bytes(network, height, width, self.dtype, rows)
         if most is not None and least > most:  # volumes are held whole, and cannot be traded
             quick = "" if network.work_focal_px is None else " or speed='quick'"
             raise InputError(

@@ -327,6 +327,7 @@ class PSMNetMatcher(NetworkMatcher):
 
     fine_pixels = 280_000
     """Pixels of a fine match at most: an image of KITTI at three quarters of its resolution."""
+    activation_bytes = staticmethod(psmnet_bytes)
 
     def fold(self, network: PSMNet, like: Tensor) -> PSMNet:
         """Fold batch norm, and compute some rows at a time."""
@@ -338,10 +339,6 @@ class PSMNetMatcher(NetworkMatcher):
         layers.fold_features(network.features, like)
         network.rows = ROWS
         return network
-
-    def activation_bytes(self, network: PSMNetConfig, height: int, width: int) -> int:
-        """Peak memory of activations of one pair of suitable sides [bytes]."""
-        return psmnet_bytes(network, height, width, self.dtype)
 
     def run(self, left: Views, right: Views, network: PSMNetConfig) -> list[Match]:
         """Match normalised pairs whose sides suit the network."""
