@@ -239,7 +239,7 @@ def predict(
 
 NERFSTUDIO_UNIT = 0.001
 """What nerfstudio multiplies depth files of either kind by, by default."""
-TRANSFORMS, TRANSFORMS_METRES = "transforms.json", "transforms_depth.json"
+TRANSFORMS, TRANSFORMS_DEPTH = "transforms.json", "transforms_depth.json"
 _METRES = ".depth_m.npy"
 
 
@@ -265,7 +265,7 @@ def colmap_files(results: Path, names: Iterable[str], images: Path | None = None
     COLMAP calls a map by its image, suffix and all: ``stereo/depth_maps/a.jpg.geometric.bin``.
     """
     sources = read_sources(results)
-    files = {}
+    places = {}
     for name in names:
         image = sources.get(name, Path(f"{name}.png"))
         if images is None:
@@ -274,11 +274,11 @@ def colmap_files(results: Path, names: Iterable[str], images: Path | None = None
             inside = image.relative_to(images.resolve())
         else:
             raise InputError(f"{image}: does not lie in --images {images}; name their folder")
-        files[name] = f"stereo/depth_maps/{inside.as_posix()}.geometric.bin"
-    return files
+        places[name] = f"stereo/depth_maps/{inside.as_posix()}.geometric.bin"
+    return places
 
 
-def nerfstudio_frames(out: Path, files: Mapping[str, str]) -> dict[str, Any] | None:
+def nerfstudio_frames(out: Path, named: Mapping[str, str]) -> dict[str, Any] | None:
     """Give ``transforms.json`` of a data set with the depth of each frame; None where it has none.
 
     Raises:
@@ -296,12 +296,12 @@ def nerfstudio_frames(out: Path, files: Mapping[str, str]) -> dict[str, Any] | N
     given = []
     for frame in frames or ():
         name = Path(str(frame.get("file_path", ""))).stem
-        if name not in files:
+        if name not in named:
             raise InputError(
                 f"{path}: frame {name!r} has no prediction, and nerfstudio takes depth for all "
-                f"frames or for none; predict it too. There are {', '.join(list(files)[:3])}, ..."
+                f"frames or for none; predict it too. There are {', '.join(list(named)[:3])}, ..."
             )
-        given.append({**frame, "depth_file_path": files[name]})
+        given.append({**frame, "depth_file_path": named[name]})
     return {**content, "frames": given, "depth_unit_scale_factor": NERFSTUDIO_UNIT}
 
 
