@@ -31,10 +31,9 @@ from depthpose.depth.config import (
     SGBMConfig,
     Speed,
 )
-from depthpose.depth.disparity import disparity_from_depth, resize_image
+from depthpose.depth.disparity import disparity_from_depth, join_matches, resize_image
 from depthpose.depth.estimator import DepthPipeline
-from depthpose.depth.estimator.inputs import as_tensor
-from depthpose.depth.estimator.net import join_matches
+from depthpose.depth.estimator.net import as_tensor
 from depthpose.depth.out_of_distribution import calibrate, measure_image_confidence, refuse_share
 from depthpose.depth.stereo import CallableMatcher, PSMNet, PSMNetMatcher
 from depthpose.depth.synthesis import SelectionGenerator, UNetGenerator, make_synthesiser

@@ -14,9 +14,8 @@ from depthpose.core.draw import draw_disparity
 from depthpose.core.errors import InputError
 from depthpose.depth.augment import TrainingPair
 from depthpose.depth.config import LightConfig, MatcherConfig
-from depthpose.depth.disparity import resized_match
+from depthpose.depth.disparity import from_pair, join_matches, resized_match
 from depthpose.depth.estimator import FakestereoNet
-from depthpose.depth.estimator.net import from_pair, join_matches
 from depthpose.depth.export import depth_export
 from depthpose.depth.labels import LabelConfig, label_pair
 from depthpose.depth.losses import sky_loss

@@ -14,11 +14,10 @@ from depthpose.core.camera import Camera, StereoRig
 from depthpose.core.errors import InputError, refuse_unknown
 from depthpose.core.export import Case, Export, Graph, Limit, Value, network_model
 from depthpose.depth.config import MatcherConfig
+from depthpose.depth.disparity import LEAST_PX, SKY_M
 from depthpose.depth.estimator import FakestereoNet
-from depthpose.depth.estimator.net import SKY_M
 from depthpose.depth.stereo import LightStereo, PSMNet, StereoNetwork
 from depthpose.depth.stereo.layers import interpolation_matrix, linear_taps
-from depthpose.depth.stereo.light import LEAST_PX
 from depthpose.depth.stereo.matcher import IMAGENET_MEAN, IMAGENET_STD, NetworkConfig
 from depthpose.depth.stereo.psmnet import WINDOW_PX
 from depthpose.depth.synthesis import (

@@ -1,6 +1,7 @@
-"""One image, or a rectified pair, to one depth estimate in metres."""
+"""One image, or a rectified pair, to one depth estimate in metres; and what may be given."""
 
 import math
+import warnings
 from collections.abc import Iterable, Sequence, Sized
 from dataclasses import replace
 from functools import partial
@@ -11,7 +12,7 @@ from typing import cast
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Shaped
 from PIL import Image
 from torch import Tensor
 from torch.nn import functional as F
@@ -25,40 +26,148 @@ from depthpose.core.camera import (
     StereoRig,
     camera_of,
     check_image_matches_camera,
+    check_rectified,
     choose_lens,
 )
 from depthpose.core.checkpoint import find_weights, join_terms, warn_of_terms
 from depthpose.core.devices import each_in_threads, own_arithmetic
-from depthpose.core.errors import InputError, refused_memory
+from depthpose.core.errors import InputError, Notice, refused_memory
+from depthpose.core.files import picture_tensor, read_exif_focal, read_image
 from depthpose.depth import disparity
-from depthpose.depth.config import (
-    Answer,
-    GeneratorConfig,
-    MatcherConfig,
-    SelectionConfig,
-    SGBMConfig,
-)
-from depthpose.depth.estimator.inputs import (
-    Picture,
-    as_input,
-    as_tensor,
-    refuse_unrectified,
-    usable_right,
-)
+from depthpose.depth.config import Answer, MatcherConfig, SelectionConfig, SGBMConfig
 from depthpose.depth.ground import scale_by_distance, scale_by_mount
 from depthpose.depth.stereo import CameraMatcher, Matcher, SGBMMatcher
-from depthpose.depth.stereo.light import LEAST_PX
 from depthpose.depth.synthesis import SelectionGenerator, Synthesiser, make_synthesiser
-from depthpose.depth.types import DepthEstimate, Match, StereoInput
+from depthpose.depth.types import DepthEstimate, Match, StereoInput, View
 from depthpose.depth.weights import Use, make_matcher, read_depth_weights
+
+Picture = str | Path | Image.Image | Shaped[Tensor, "..."] | Shaped[np.ndarray, "..."]
+"""A file, a picture of Pillow's, an array or a tensor: RGB, RGBA (alpha is dropped) or grey, whole
+numbers of 8 bits or floats in [0, 1], (H, W, C), (C, H, W) or (H, W). The order of the channels
+cannot be seen in the values: OpenCV reads BGR, which ``image[..., ::-1]`` turns into RGB."""
+_CHANNELS = (1, 3, 4)
+_VALUES = (
+    "give 8-bit numbers, or floats in [0, 1]: divide by the largest value that it can hold (65535 "
+    "of 16 bits)"
+)
+
+
+def as_tensor(image: object, name: str = "the image") -> View:
+    """Read a :data:`Picture`, or bring it to RGB in [0, 1]; a batch of one is its image."""
+    match image:
+        case str() | Path():
+            return read_image(Path(image))
+        case Image.Image():
+            return picture_tensor(image, name)
+        case np.ndarray() if image.dtype != np.uint8 and image.dtype.kind != "f":
+            raise InputError(f"{name} is an array of {image.dtype}; {_VALUES}")
+        case np.ndarray():
+            kind = np.uint8 if image.dtype == np.uint8 else np.float32
+            values = torch.from_numpy(np.require(image, kind, requirements=["C", "W"]))
+            return _rgb(values, (-1, 0), f"{name} is an array")
+        case Tensor() if image.dtype != torch.uint8 and not image.is_floating_point():
+            raise InputError(f"{name} is a tensor of {image.dtype}; {_VALUES}")
+        case Tensor():
+            return _rgb(image, (0, -1), f"{name} is a tensor")
+        case _:
+            return check_image(image, name)
+
+
+def _rgb(values: Tensor, sides: tuple[int, int], what: str) -> View:
+    """Bring three channels in [0, 1] to the front."""
+    shape = tuple(values.shape)
+    if values.ndim == 4 and shape[0] != 1:
+        raise InputError(
+            f"{what} of shape {shape}, a batch; give one image, or the batch to "
+            "estimate_many(batch, camera)"
+        )
+    one = values[0] if values.ndim == 4 else values
+    planes = one[None] if one.ndim == 2 else one
+    found = (k for k in sides if planes.ndim == 3 and planes.shape[k] in _CHANNELS)
+    side = 0 if one.ndim == 2 else next(found, None)
+    if side is None:
+        raise InputError(f"{what} of shape {shape}; give (H, W, 3), (3, H, W) or grey (H, W)")
+    planes = planes.movedim(side, 0)[:3]
+    scaled = planes.float() / 255 if planes.dtype == torch.uint8 else planes.float()
+    return check_image(scaled.expand(3, -1, -1), what.partition(" is ")[0])
+
+
+def as_input(
+    image: object, name: str, camera: AnyLens | None, *, with_exif: bool = True
+) -> StereoInput:
+    """Take a picture and what is known of its camera; without that, ask the picture's EXIF.
+
+    What is an input already stays it.
+    """
+    if isinstance(image, StereoInput):
+        return image
+    left = as_tensor(image)
+    if camera is None and with_exif:
+        camera = exif_focal_px(image, name)
+    camera = camera_of(camera, (left.shape[2], left.shape[1]))
+    return StereoInput(name=name, left=left, right=None, camera=camera)
+
+
+def exif_focal_px(image: object, name: str) -> float | None:
+    """Give the focal length of a photograph's EXIF [px], with a :class:`Notice` of it, or None."""
+    found = read_exif_focal(image) if isinstance(image, str | Path | Image.Image) else None
+    if found is None:
+        return None
+    said = f"{name}: a focal length of {found[0]:.0f} px, by its EXIF ({found[1]})"
+    warnings.warn(f"{said}; of a cropped picture it is another", Notice, stacklevel=4)
+    return found[0]
+
+
+def refuse_unrectified(pair: StereoInput) -> str:
+    """Raise where two images are no pair, are swapped, or their rows do not correspond.
+
+    Returns:
+        A warning where this cannot be told, else nothing.
+
+    Raises:
+        InputError: with what was measured and what to do.
+    """
+    right, camera = usable_right(pair), pair.camera
+    apart_px = camera.cx_right_minus_left_px if isinstance(camera, StereoRig) else 0.0
+    report = check_rectified(pair.left, right, apart_px)
+    if report.is_wrong:
+        raise InputError(
+            f"{pair.name}: {report.message} (--no-check, in Python with_check=False, matches them "
+            "all the same.)"
+        )
+    return report.message if report.is_rectified is None else ""
+
+
+def usable_right(pair: StereoInput) -> View:
+    """Give the right view of a pair that can be matched.
+
+    Raises:
+        InputError: there is none, its size is another, the camera has no baseline, or an image
+            does not lie in [0, 1].
+    """
+    if pair.right is None:
+        raise InputError(f"{pair.name}: there is no right image; give right=.")
+    check_image(pair.left, f"{pair.name}: the left image")
+    check_image(pair.right, f"{pair.name}: the right image")
+    if pair.right.shape != pair.left.shape:
+        left, right = pair.left.shape[1:], pair.right.shape[1:]
+        raise InputError(
+            f"{pair.name}: the left image is {left[1]}x{left[0]} and the right one "
+            f"{right[1]}x{right[0]}; a rectified pair has one size. Rectify the pair again."
+        )
+    if pair.camera is not None:
+        height, width = pair.left.shape[1:]
+        check_image_matches_camera(pair.camera, width, height, pair.name)
+        if not isinstance(pair.camera, StereoRig):
+            raise InputError(
+                f"{pair.name}: the camera has no baseline, so disparity cannot become metres. Add "
+                '"baseline_m" (the distance between the two cameras in metres) to its file.'
+            )
+    return pair.right
+
 
 DEFAULT = "default"
 """Name of the weights that are taken where none are named."""
-SKY_M = 10_000.0
-"""What the disparity of the sky says: protocols take a disparity of zero for none, or for near."""
-_LEAST_SKY = 0.002
-"""Of the image; fewer pixels are a lamp or a window, at the match's depth: 43 in a garage were
-0.87 m of RMSE, and 0.25 m without them."""
 
 
 class FakestereoNet:
@@ -267,7 +376,7 @@ class FakestereoNet:
         assert pair.right is not None, "checked before"
         with refused_memory(pair.name):
             (match,) = self._match([(pair.left, pair.right)], pair.camera)
-            return from_pair(pair, match, warning)
+            return disparity.from_pair(pair, match, warning)
 
     @own_arithmetic()
     def estimate_many(
@@ -396,11 +505,11 @@ class FakestereoNet:
                 assert views.disparity_px is not None and views.confidence is not None  # noqa: PT018
                 parts = zip(views.disparity_px, views.confidence, strict=True)
                 own = [Match(disparity_px=px, confidence=sure) for px, sure in parts]
-                matches = list(map(join_matches, own, matches)) if matches else own
+                matches = list(map(disparity.join_matches, own, matches)) if matches else own
             estimates = []
             for n, (image, match) in enumerate(zip(images, matches, strict=True)):
                 is_sky = match.is_sky if views.is_sky is None else views.is_sky[n]
-                estimate = from_virtual(image, rig, match, views.right[n], is_sky)
+                estimate = disparity.from_virtual(image, rig, match, views.right[n], is_sky)
                 estimate = scale_by_mount(estimate, image)
                 estimates.append(estimate)
                 if views.confidence is None:
@@ -469,73 +578,3 @@ class FakestereoNet:
             replace(match, disparity_px=match.disparity_px - columns, confidence=confidence)
             for match, confidence in zip(cut, sure, strict=True)
         ]
-
-
-def from_pair(pair: StereoInput, match: Match, warning: str = "") -> DepthEstimate:
-    """Give what was found in a rectified pair: metres where its camera has a baseline."""
-    px, depth_m, is_sky = match.disparity_px, None, match.is_sky
-    rig = pair.camera if isinstance(pair.camera, StereoRig) else None
-    if is_sky is not None:
-        is_sky = is_sky & (is_sky.float().mean() >= _LEAST_SKY)
-        far_px = torch.full_like(px, LEAST_PX)
-        if rig is not None:
-            far_px = disparity.disparity_from_depth(torch.full_like(px, SKY_M), rig)
-        px = torch.where(is_sky, far_px, px)
-    if rig is not None:
-        depth_m = disparity.depth_from_disparity(px, rig)
-        depth_m = depth_m if is_sky is None else torch.where(is_sky, torch.nan, depth_m)
-    return DepthEstimate(
-        depth_m=depth_m,
-        disparity_px=px,
-        confidence=match.confidence,
-        is_sky=is_sky,
-        warning=warning,
-        seen=pair,
-    )
-
-
-def from_virtual(
-    image: StereoInput,
-    rig: GeneratorConfig | SelectionConfig,
-    match: Match,
-    right: Float[Tensor, "3 _ _"],
-    is_sky: Bool[Tensor, "_ _"] | None,
-) -> DepthEstimate:
-    """Bring what was found at the virtual rig back to the image."""
-    camera = image.camera
-    assert camera is not None
-    height, width = image.left.shape[1:]
-    seen = disparity.resized_match(replace(match, is_sky=is_sky), height, width)
-    imitated = StereoRig(width=width, height=height, K=camera.K, baseline_m=rig.virtual_baseline_m)
-    px, is_sky = seen.disparity_px, seen.is_sky
-    depth_m = disparity.depth_from_disparity(px, imitated)
-    if is_sky is not None:
-        is_sky = is_sky & (is_sky.float().mean() >= _LEAST_SKY)
-        depth_m = torch.where(is_sky, SKY_M, depth_m)
-        px = torch.where(is_sky, float(camera.K[0, 0]) * rig.virtual_baseline_m / SKY_M, px)
-    return DepthEstimate(
-        depth_m=depth_m if is_sky is None else torch.where(is_sky, torch.nan, depth_m),
-        disparity_px=disparity.disparity_from_depth(depth_m, camera)
-        if isinstance(camera, StereoRig)
-        else px,
-        confidence=seen.confidence,
-        right=disparity.resize_image(right, height, width),
-        is_sky=is_sky,
-        seen=image,
-    )
-
-
-def join_matches(one: Match, other: Match) -> Match:
-    """Take the mean of two disparities in the logarithm, weighed by their confidence.
-
-    Where ``other`` has no answer, or no confidence, or sees the sky, ``one`` is taken.
-    """
-    assert one.confidence is not None
-    weight = torch.zeros_like(one.confidence) if other.confidence is None else other.confidence
-    weight = torch.where(other.disparity_px > 0, weight, 0.0)
-    if other.is_sky is not None:
-        weight = torch.where(other.is_sky, 0.0, weight)
-    share = weight / (weight + one.confidence).clamp(min=1e-6)
-    logs = [match.disparity_px.clamp(min=1e-3).log() for match in (one, other)]
-    log_px = torch.lerp(logs[0], logs[1].nan_to_num(0.0), share)
-    return Match(disparity_px=log_px.exp(), confidence=torch.lerp(one.confidence, weight, share))

@@ -18,8 +18,14 @@ from torch import Tensor
 from depthpose.core.camera import AnyCamera, AnyLens, choose_lens
 from depthpose.core.errors import InputError, Notice, refuse_unknown
 from depthpose.depth.config import MatcherConfig
-from depthpose.depth.estimator.inputs import Picture, as_input, as_tensor, exif_focal_px
-from depthpose.depth.estimator.net import DEFAULT, FakestereoNet
+from depthpose.depth.estimator.net import (
+    DEFAULT,
+    FakestereoNet,
+    Picture,
+    as_input,
+    as_tensor,
+    exif_focal_px,
+)
 from depthpose.depth.types import StereoInput
 
 _PHONE = 0.75

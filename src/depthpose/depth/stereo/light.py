@@ -22,6 +22,7 @@ from torch import Tensor, nn
 
 from depthpose.core.errors import InputError
 from depthpose.depth.config import LightConfig
+from depthpose.depth.disparity import LEAST_PX
 from depthpose.depth.encoder import LiteEncoder
 from depthpose.depth.stereo import layers
 from depthpose.depth.stereo.layers import Features, Volume, by_rows, conv_norm_2d, conv_norm_3d
@@ -39,9 +40,6 @@ STEM = 16
 """Channels at half size."""
 _OFFSETS = (-2, -1, 0, 1, 2)
 """Where the refinement compares the views: so many pixels at half size from the disparity."""
-LEAST_PX = 0.01
-"""Of a corrected disparity in use: depth stays finite. It is what a pair without a rig has in the
-sky."""
 _REFINED = 32
 """Channels of the refinement at half size."""
 
