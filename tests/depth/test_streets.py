@@ -22,8 +22,8 @@ from depthpose.depth.synthetic import (
     kitti_rig,
     make_clutter,
     make_scene,
+    models,
     road,
-    traffic,
 )
 from depthpose.depth.synthetic.dataset import draw_sensors
 from depthpose.depth.synthetic.road import draw_road
@@ -92,8 +92,8 @@ def test_streets_vary_in_what_stands_there_and_how(monkeypatch: pytest.MonkeyPat
         monkeypatch.setattr(module, name, note)
 
     for module, names in {
-        traffic: ("walker", "rider", "vehicle"),
-        road: ("tree", "bush", "hedge", "lamp", "sign", "fence", "add_house"),
+        models: ("walker", "rider", "vehicle", "tree", "bush", "hedge", "lamp", "sign", "fence"),
+        road: ("add_house",),
     }.items():
         for name in names:
             counted(module, name)
