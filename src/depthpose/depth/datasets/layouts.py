@@ -289,17 +289,21 @@ def _middlebury(folder: Path) -> Iterable[Frame]:
 def _pairs(folder: Path) -> Iterable[Frame]:
     cameras = _by_stem(folder, (".json", ".yaml", ".yml"))
     camera, text = cameras.get("camera"), folder / "calib.txt"
-    folders = {"right": "right", "depth": "lidar_depth", "disparity": "disp_occ"}
-    parts = {part: _by_stem(folder / name) for part, name in folders.items()}
-    lefts, right = _images(folder / "left"), parts["right"]
+    lefts, right = _images(folder / "left"), _by_stem(folder / "right")
     if right and not any(left.stem in right for left in lefts):
         with suppress(InputError):  # left_0004 and right_0004
             order = find_partners([left.stem for left in lefts], list(right), str(folder))
             views = list(right.values())
-            parts["right"] = {left.stem: views[k] for left, k in zip(lefts, order, strict=True)}
+            right = {left.stem: views[k] for left, k in zip(lefts, order, strict=True)}
     calibration = camera or (text if text.is_file() else None)
-    of_all = {left.stem: calibration for left in lefts if calibration}
-    return _frames(lefts, "camera" if camera else "plain", calibration=of_all, **parts)
+    return _frames(
+        lefts,
+        "camera" if camera else "plain",
+        calibration={left.stem: calibration for left in lefts if calibration},
+        right=right,
+        depth=_by_stem(folder / "lidar_depth"),
+        disparity=_by_stem(folder / "disp_occ"),
+    )
 
 
 LAYOUTS = {

@@ -344,10 +344,11 @@ class PSMNetMatcher(NetworkMatcher):
         """Match normalised pairs whose sides suit the network."""
         near, far = (one.to(self.dtype, memory_format=torch.channels_last) for one in (left, right))
         costs = self._network.costs(near, far, network.max_disparity_px)[-1][:, 0]
+        height, width = left.shape[-2:]
         found = [
             expected_disparity(
                 cost.permute(1, 2, 0).contiguous(),
-                (network.max_disparity_px, *left.shape[-2:]),
+                (network.max_disparity_px, height, width),
                 align_corners=network.align_corners,
                 with_confidence=self.config.with_confidence,
             )
