@@ -1,6 +1,7 @@
 """EfficientNet-Lite0 as an encoder (Tan and Le, ICML 2019), and import of its published weights."""
 
 import re
+from collections import OrderedDict
 from pathlib import Path
 
 import torch.nn.functional as F
@@ -88,22 +89,17 @@ class LiteEncoder(nn.Module):
                 part.eval()
 
 
-class _ConvNorm(nn.Module):
+class _ConvNorm(nn.Sequential):
     """Convolution with SAME padding, then batch norm."""
 
     def __init__(
         self, inputs: int, outputs: int, kernel: int, stride: int, groups: int = 1
     ) -> None:
-        super().__init__()
         total = kernel - stride
-        self._uneven = (0, total % 2, 0, total % 2)
-        self.conv = nn.Conv2d(
-            inputs, outputs, kernel, stride, total // 2, groups=groups, bias=False
-        )
-        self.norm = nn.BatchNorm2d(outputs, eps=1e-3, momentum=0.01)
-
-    def forward(self, x: Float[Tensor, "b c h w"]) -> Float[Tensor, "b c2 h2 w2"]:
-        return self.norm(self.conv(F.pad(x, self._uneven) if any(self._uneven) else x))
+        conv = nn.Conv2d(inputs, outputs, kernel, stride, total // 2, groups=groups, bias=False)
+        norm = nn.BatchNorm2d(outputs, eps=1e-3, momentum=0.01)
+        uneven = {"pad": nn.ZeroPad2d((0, 1, 0, 1))} if total % 2 else {}
+        super().__init__(OrderedDict(uneven | {"conv": conv, "norm": norm}))
 
 
 class _InvertedResidual(nn.Module):

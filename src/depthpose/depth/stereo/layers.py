@@ -4,6 +4,7 @@ Volumes can be computed some rows at a time. Batch norm is folded into the convo
 the same function, one pass less.
 """
 
+from collections import OrderedDict
 from collections.abc import Callable, Sequence
 from functools import cache
 from typing import NamedTuple, TypeVar, cast
@@ -91,17 +92,11 @@ def interpolation_matrix(taps: Taps, small: int) -> Float[Tensor, "large small"]
     return matrix
 
 
-class ConvNorm(nn.Module):
+class ConvNorm(nn.Sequential):
     """A convolution without bias, then batch normalisation."""
 
     def __init__(self, conv: nn.Module, norm: nn.Module) -> None:
-        super().__init__()
-        self.conv = conv
-        self.norm = norm
-
-    def forward(self, x: Float[Tensor, "b c *size"]) -> Float[Tensor, "b k *smaller"]:
-        """Convolve and normalise."""
-        return self.norm(self.conv(x))
+        super().__init__(OrderedDict(conv=conv, norm=norm))
 
 
 def conv_norm_2d(
