@@ -175,7 +175,7 @@ def _first(base: Path, endings: tuple[str, ...]) -> Path | None:
 
 
 def read_part(folder: Path, name: str, ending: str) -> Float[Tensor, "*c h w"] | None:
-    """Read a map or a picture of :data:`ENDINGS`; None where the prediction has none."""
+    """Read a map or a picture of ``ENDINGS``; None where the prediction has none."""
     path = _first(folder / name, (ending,))
     if path is None:
         return None

@@ -12,11 +12,9 @@ from depthpose.core.camera import Camera, StereoRig, back_project
 from depthpose.core.errors import InputError
 from depthpose.core.files import Cloud
 
-View = Float[Tensor, "3 h w"]
-"""An image, RGB in [0, 1]."""
+View = Float[Tensor, "3 h w"]  # an image, RGB in [0, 1]
 Views = Float[Tensor, "b 3 h w"]
-Map = Float[Tensor, "h w"]
-"""A number a pixel, NaN where it is not known."""
+Map = Float[Tensor, "h w"]  # a number a pixel, NaN where it is not known
 Maps = Float[Tensor, "b h w"]
 Mask = Bool[Tensor, "h w"]
 

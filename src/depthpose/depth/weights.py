@@ -64,7 +64,7 @@ class DepthWeights:
 
     Attributes:
         generator: left view to right view, or None in a file of the matcher alone.
-        matcher: pair to disparity, of any kind of :data:`MATCHERS`, or None in a file of the
+        matcher: pair to disparity, of any kind of ``MATCHERS``, or None in a file of the
             generator alone.
         facts: the card in short.
     """
