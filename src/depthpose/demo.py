@@ -35,7 +35,7 @@ from depthpose.pose.evaluate import evaluate
 from depthpose.pose.predictions import CLOUD, Prediction, place_of, write_predictions
 from depthpose.pose.synthetic import make_frames
 from depthpose.report import page as pages
-from depthpose.report.depth import DepthShown, depth_section
+from depthpose.report.depth import depth_section
 from depthpose.report.page import Layer, Picture, Scene, Section
 from depthpose.report.pose import draw_pose, grey_depth, pose_layers, posed_cloud
 
@@ -119,9 +119,10 @@ def _show_scene(
         write_estimate(homes[method], seen, estimate, range_m, CLOUD_M)
         error_px = (estimate.disparity_px - truth.disparity_px).abs()
         error = DepthError(error=error_px, is_disparity=True)
-        shown = DepthShown(pair=seen, estimate=estimate, range_m=range_m, error=error)
         title = f"{pair.name}: {method}, {views}"
-        sections.append(depth_section(title, shown, with_image=False))
+        sections.append(
+            depth_section(title, seen, estimate, range_m=range_m, error=error, with_image=False)
+        )
     best, scale = next(iter(nets)), depth_scale(*range_m)
     colors, true = homes[best] / f"{pair.name}.color.png", folder / "depth.color.png"
     pictures = [

@@ -37,7 +37,7 @@ from depthpose.depth.metrics import METRICS
 from depthpose.depth.predictions import is_finished, predict
 from depthpose.depth.types import DepthEstimate, StereoInput
 from depthpose.report import page
-from depthpose.report.depth import DepthShown, depth_section
+from depthpose.report.depth import depth_section
 from depthpose.report.page import Section
 
 _SAID_ABOVE = ("method", "input", "speed", "weights", "protocol", "dataset")
@@ -174,10 +174,11 @@ def measure(
             index = places[row.frame or ""]
             estimate, error = frame_result(dataset, index, folder, protocol, row.cap_m)
             pair = dataset.read_input(index)
-            shown = DepthShown(pair=pair, estimate=estimate, error=error)
             own = {name: v for name, v in row.columns().items() if name not in _SAID_ABOVE}
             title = f"{folder.name}: {row.frame}, {role}"
-            sections.append(replace(depth_section(title, shown, text), rows=[own]))
+            sections.append(
+                replace(depth_section(title, pair, estimate, text, error=error), rows=[own])
+            )
     sections = [
         Section(title="Mean over frames", text=about, rows=rows),
         *sections,

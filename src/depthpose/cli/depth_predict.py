@@ -42,7 +42,7 @@ from depthpose.depth.estimator import FakestereoNet
 from depthpose.depth.ground import scale_by_distance
 from depthpose.depth.predictions import CLOUD_M, ENDINGS, is_finished, read_estimate, write_estimate
 from depthpose.depth.types import StereoInput
-from depthpose.report.depth import DepthShown, depth_section
+from depthpose.report.depth import depth_section
 from depthpose.report.page import MOST_VIEWS, Film, Section, spread_evenly, write_page
 from depthpose.report.viewer import Viewer, open_viewer
 
@@ -306,8 +306,7 @@ def estimate_all(
         sections += [Section(title="Videos", films=films)] if films else []
         for one in shown:
             estimate = read_estimate(out, one.name, one.camera)
-            drawn = DepthShown(pair=one, estimate=estimate, range_m=(near_m, far_m))
-            sections.append(depth_section(one.name, drawn))
+            sections.append(depth_section(one.name, one, estimate, range_m=(near_m, far_m)))
         write_page(
             out / _PAGE, f"Depth of {_count(len(names), 'image')}", sections, run.environment()
         )

@@ -1,6 +1,6 @@
 """Depth on a page: picture, depth, confidence, right view, error, and the cloud in 3D."""
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
@@ -31,22 +31,22 @@ _TRUE = (0.1, 0.8, 0.2)
 _TRUE_POINTS = 20_000
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class DepthShown:
-    """An estimate as a page shows it, its colours from bright to dark over ``range_m``."""
-
-    pair: StereoInput
-    estimate: DepthEstimate
-    range_m: tuple[float, float] = COLOR_RANGE_M
-    error: DepthError | None = None
-
-
 def depth_section(
-    title: str, shown: DepthShown, text: str = "", *, with_image: bool = True
+    title: str,
+    pair: StereoInput,
+    estimate: DepthEstimate,
+    text: str = "",
+    *,
+    range_m: tuple[float, float] = COLOR_RANGE_M,
+    error: DepthError | None = None,
+    with_image: bool = True,
 ) -> Section:
-    """Show one estimate: the facts, pictures with the bars of their colours, the cloud in 3D."""
-    estimate, (near_m, far_m) = shown.estimate, shown.range_m
-    pictures = [Drawing(image=shown.pair.left, caption="image")] if with_image else []
+    """Show one estimate: the facts, pictures with the bars of their colours, the cloud in 3D.
+
+    The colours of depth go from bright to dark over ``range_m``.
+    """
+    near_m, far_m = range_m
+    pictures = [Drawing(image=pair.left, caption="image")] if with_image else []
     if estimate.depth_m is None:
         disparity = Drawing(
             image=draw_disparity(estimate.disparity_px, is_sky=estimate.is_sky),
@@ -56,17 +56,17 @@ def depth_section(
         pictures.append(disparity)
     else:
         depth = Drawing(
-            image=draw_depth(estimate.depth_m, *shown.range_m),
+            image=draw_depth(estimate.depth_m, *range_m),
             caption=f"estimated depth, near bright and far dark; {grey_caption(estimate)}",
-            scale=depth_scale(*shown.range_m),
+            scale=depth_scale(*range_m),
         )
         pictures.append(depth)
     true_m = None
-    if shown.error is not None:
-        error, left, true_m = shown.error.error, shown.pair.left, shown.error.true_depth_m
-        is_sparse = float(error.isfinite().double().mean()) < _SPARSE
+    if error is not None:
+        wrong, left, true_m = error.error, pair.left, error.true_depth_m
+        is_sparse = float(wrong.isfinite().double().mean()) < _SPARSE
         where = "over the dimmed image" if is_sparse else "grey: not compared"
-        if shown.error.is_disparity:
+        if error.is_disparity:
             top, what = WORST_PX, "disparity error"
             scale = rising_scale("disparity error [px]", top, has_more=True)
         else:
@@ -80,9 +80,9 @@ def depth_section(
             said, bar = f"true depth; {where}", depth_scale(near_m, far_m)
             pictures.append(Drawing(image=image, caption=said, scale=bar))
         if is_sparse:
-            image = draw_error_points(left, error, top, _RADIUS_PX)
+            image = draw_error_points(left, wrong, top, _RADIUS_PX)
         else:
-            image = draw_share(1 - error / top)
+            image = draw_share(1 - wrong / top)
         caption = f"{what}: dark is right, bright is wrong; {where}"
         pictures.append(Drawing(image=image, caption=caption, scale=scale))
     if estimate.confidence is not None:
@@ -95,8 +95,8 @@ def depth_section(
     if estimate.right is not None:
         pictures.append(Drawing(image=estimate.right, caption="right view as drawn"))
     scenes: list[Scene] = []
-    if estimate.depth_m is not None and (camera := shown.pair.camera) is not None:
-        scenes = [depth_scene(shown.pair, estimate, far_m, f"{title}: the cloud")]
+    if estimate.depth_m is not None and (camera := pair.camera) is not None:
+        scenes = [depth_scene(pair, estimate, far_m, f"{title}: the cloud")]
         if true_m is not None:
             points_m = back_project(true_m, camera.K).reshape(-1, 3).float()
             points_m = points_m[points_m.isfinite().all(-1) & (points_m[:, 2] <= far_m)]
@@ -104,7 +104,7 @@ def depth_section(
             layer = Layer(name="true points", shape=colored_points(points_m, _TRUE))
             said, layers = f"{scenes[0].caption}; the truth in green", [*scenes[0].layers, layer]
             scenes = [Scene(caption=said, layers=layers)]
-    facts = depth_facts(shown.pair, estimate)
+    facts = depth_facts(pair, estimate)
     return Section(title=title, text=text, facts=facts, pictures=pictures, scenes=scenes)
 
 
