@@ -325,7 +325,8 @@ def measure_shards(
     items, before = jobs.result_items(predictions), jobs.read_job_settings(predictions)
     name, names = jobs.stem(predictions.rstrip("/")), {item.name for item in items}
     about = {"data": truth.data, "split": truth.split, "protocol": truth.protocol}
-    settings = {"predictions": before, **about, "caps_m": list(truth.caps_m)}
+    # Of what a worker writes: a job that was begun by another version is refused.
+    settings = {"predictions": before, **about, "caps_m": list(truth.caps_m), "format": 2}
     home = str(out / "measured" / name)
     job = jobs.Job(work=truth, items=items, out=home, settings=settings, block=1)
     rows: dict[str, list[Measured] | str] = {}
