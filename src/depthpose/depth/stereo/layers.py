@@ -32,15 +32,9 @@ def by_rows(
     """Compute some rows of an answer at a time: the same numbers, with less held in between.
 
     Rows stand last but one. Inputs and answer may have whole multiples of the rows of the smallest
-    input, in which everything here is counted.
-
-    Args:
-        function: of the inputs; its answer depends on nearby rows alone.
-        inputs: tensors; None stays None.
-        halo: so many rows to each side an answer depends on.
-        rows: at a time; None: all.
-        into: where the answer is written, perhaps over an input of which no answer needs another
-            row than its own; None: a new tensor.
+    input, in which everything here is counted: the ``halo`` to each side that an answer depends on,
+    and the ``rows`` at a time (None: all). The answer is written ``into`` a tensor, perhaps an input
+    of which no answer needs another row than its own.
     """
     if rows is None:
         return function(*inputs)

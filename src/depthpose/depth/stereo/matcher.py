@@ -303,7 +303,6 @@ class NetworkMatcher(ABC):
             left: left views.
             right: right views, the same size.
             network: the network's config, perhaps with more disparities than it was trained with.
-
         """
 
     @torch.no_grad()

@@ -40,14 +40,9 @@ def expected_disparity(
 ) -> tuple[Map, Map | None]:
     """Enlarge the cost to ``size`` and take the expected disparity [px], some rows at a time.
 
-    Equals :func:`depthpose.depth.stereo.psmnet.soft_argmin`.
-
-    Args:
-        cost: quarter-size cost, larger where a match is likelier, in float32 or wider.
-        size: disparities, rows and columns at full size.
-        align_corners: as in ``F.interpolate``.
-        chunk_bytes: largest size of one full-size piece; about four are alive at a time.
-        with_confidence: answer also the probability within ``WINDOW_PX`` of the expectation.
+    Equals :func:`soft_argmin` of a cost in float32 or wider; ``size`` is disparities, rows and
+    columns. About four pieces of ``chunk_bytes`` are alive at a time. The confidence is the
+    probability within ``WINDOW_PX`` of the expectation.
     """
     count, rows, columns = size
     down, across, deep = (

@@ -70,13 +70,7 @@ class AdaptMetrics:
 
 
 class AdaptationCheck:
-    """Measures a matcher before and after, and refuses what became worse.
-
-    Args:
-        pairs: pairs of the rig that are not trained on.
-        streets: how many synthetic streets.
-        config: how matchers run.
-    """
+    """Measures a matcher before and after, on pairs held out and on so many synthetic streets."""
 
     def __init__(self, pairs: Sequence[StereoInput], streets: int, config: MatcherConfig) -> None:
         self.pairs, self.config = pairs, config
