@@ -33,8 +33,8 @@ def by_rows(
 
     Rows stand last but one. Inputs and answer may have whole multiples of the rows of the smallest
     input, in which everything here is counted: the ``halo`` to each side that an answer depends on,
-    and the ``rows`` at a time (None: all). The answer is written ``into`` a tensor, perhaps an input
-    of which no answer needs another row than its own.
+    and the ``rows`` at a time (None: all). The answer is written ``into`` a tensor, perhaps an
+    input of which no answer needs another row than its own.
     """
     if rows is None:
         return function(*inputs)
