@@ -34,11 +34,16 @@ from depthpose.depth.config import (
 from depthpose.depth.disparity import disparity_from_depth, join_matches, resize_image
 from depthpose.depth.estimator import DepthPipeline
 from depthpose.depth.estimator.net import as_tensor
-from depthpose.depth.out_of_distribution import calibrate, measure_image_confidence, refuse_share
+from depthpose.depth.evaluate import measure_image_confidence
 from depthpose.depth.stereo import CallableMatcher, PSMNet, PSMNetMatcher
 from depthpose.depth.synthesis import SelectionGenerator, UNetGenerator, make_synthesiser
 from depthpose.depth.types import DepthEstimate, Match, StereoInput
-from depthpose.depth.weights import read_generator, write_depth_weights
+from depthpose.depth.weights import (
+    calibrate_weights,
+    read_generator,
+    refuse_share,
+    write_depth_weights,
+)
 
 
 @pytest.fixture(scope="module")
@@ -678,7 +683,7 @@ def test_a_threshold_is_chosen_by_known_images(tmp_path: Path) -> None:
         for k in range(5)
     ]  # fmt: skip
     known = measure_image_confidence(FakestereoNet.load(given, allow_ood=True), images)
-    least = calibrate(given, [*known, 0.1, 0.9], 0.2, out)
+    least = calibrate_weights(given, [*known, 0.1, 0.9], 0.2, out)
     assert least == pytest.approx(0.7, abs=1e-4)
     found = read_generator(out)
     assert isinstance(found, SelectionGenerator)
@@ -688,7 +693,7 @@ def test_a_threshold_is_chosen_by_known_images(tmp_path: Path) -> None:
         with pytest.raises(InputError, match="must be above 0 and below 1"):
             refuse_share(100, share)
     with pytest.raises(InputError, match=r"7 images cannot say what refuses 0\.01 of them"):
-        calibrate(given, [*known, 0.1, 0.9], 0.01, out)
+        calibrate_weights(given, [*known, 0.1, 0.9], 0.01, out)
 
 
 def test_a_generator_without_confidence_cannot_be_calibrated(
@@ -697,7 +702,7 @@ def test_a_generator_without_confidence_cannot_be_calibrated(
     given = tmp_path / "w.safetensors"
     write_depth_weights(given, generator=generator, facts={})
     with pytest.raises(InputError, match="holds no generator that selects"):
-        calibrate(given, [0.5, 0.6], 0.5, tmp_path / "c.safetensors")
+        calibrate_weights(given, [0.5, 0.6], 0.5, tmp_path / "c.safetensors")
     net = FakestereoNet(CallableMatcher(by_brightness), make_synthesiser(generator))
     image = StereoInput(name="a", left=torch.rand(3, 40, 60), right=None,
                         camera=camera(60, 40, FOCAL_PX))  # fmt: skip

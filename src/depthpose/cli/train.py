@@ -254,9 +254,10 @@ def calibrate(
 
     from depthpose.core.checkpoint import find_weights
     from depthpose.core.run import refuse_to_replace
-    from depthpose.depth import out_of_distribution
     from depthpose.depth.datasets import join_datasets, open_dataset
     from depthpose.depth.estimator import FakestereoNet
+    from depthpose.depth.evaluate import measure_image_confidence
+    from depthpose.depth.weights import calibrate_weights, refuse_share
 
     refuse_to_replace(out)
     if out.suffix != ".safetensors":
@@ -264,11 +265,11 @@ def calibrate(
     path = find_weights(weights)
     parts = [open_dataset(folder, split if k == 0 else None) for k, folder in enumerate(data)]
     dataset = join_datasets(parts)
-    out_of_distribution.refuse_share(len(dataset), alarm_share)
+    refuse_share(len(dataset), alarm_share)
     net = FakestereoNet.load(path, config=MatcherConfig(device=device), allow_ood=True)
     shown = tqdm(range(len(dataset)), unit=" images", disable=None)
-    known = out_of_distribution.measure_image_confidence(net, map(dataset.read_input, shown))
-    least = out_of_distribution.calibrate(path, known, alarm_share, out)
+    known = measure_image_confidence(net, map(dataset.read_input, shown))
+    least = calibrate_weights(path, known, alarm_share, out)
     print(f"{len(known)} images: confidence {min(known):.3f} to {max(known):.3f}")
     print(f"refused below {least:.3f}; calibrated weights: {out}")
     return 0

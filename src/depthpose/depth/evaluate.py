@@ -5,7 +5,7 @@ two protocols do not compare; every row carries its protocol's name.
 """
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from functools import partial
 from pathlib import Path
 from typing import Any, Literal
@@ -19,6 +19,7 @@ from depthpose.core.frame import data_frame
 from depthpose.depth import disparity
 from depthpose.depth import predictions as files
 from depthpose.depth.datasets import Dataset, Frame, has_lidar, lidar_truth, read_disparity
+from depthpose.depth.estimator import FakestereoNet
 from depthpose.depth.metrics import (
     METRICS,
     RANKING,
@@ -30,7 +31,7 @@ from depthpose.depth.metrics import (
     score_confidence,
     view_errors,
 )
-from depthpose.depth.types import DepthError, DepthEstimate, Map
+from depthpose.depth.types import DepthError, DepthEstimate, Map, StereoInput
 
 NO_PREDICTION = "no right view to match, and no prediction"
 Cell = str | int | float
@@ -464,3 +465,17 @@ def _compared(prepared: _Prepared, rule: Protocol, cap_m: float | None) -> tuple
         assert prepared.rig is not None
         predicted_m = clamped_depth(prepared.disparity_px, prepared.rig, cap_m)
     return predicted_m.clamp(SMALLEST_DEPTH_M, cap_m), torch.where(counts, truth, torch.nan)
+
+
+def measure_image_confidence(net: FakestereoNet, images: Iterable[StereoInput]) -> list[float]:
+    """Give the confidence in each image as a whole, 0..1 (``DepthEstimate.image_confidence``)."""
+    found: list[float] = []
+    for image in images:
+        image_confidence = net.estimate_pair(replace(image, right=None)).image_confidence
+        if image_confidence is None:
+            raise InputError(
+                "these weights have no generator with a confidence of its own; take those of "
+                "'depthpose depth train select'"
+            )
+        found.append(image_confidence)
+    return found

@@ -1,10 +1,13 @@
 """Weights of depth on disk: a generator, a matcher, or both in one file."""
 
+import math
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any, Literal
+
+import numpy as np
 
 from depthpose.core import checkpoint as checkpoints
 from depthpose.core.config import config_from_dict, config_to_dict
@@ -44,12 +47,12 @@ MATCHERS = {
 }
 """Kinds of matchers with weights: a new one is a file with its three parts and one entry here."""
 
-BOTH = "fakestereo"
+BOTH, _SELECTION = "fakestereo", "selection"
 Use = Literal["images", "pairs"]
 """What networks are for: depth of single images, or of real pairs."""
 _GENERATORS: dict[str, tuple[type, type]] = {
     "generator": (GeneratorConfig, UNetGenerator),
-    "selection": (SelectionConfig, SelectionGenerator),
+    _SELECTION: (SelectionConfig, SelectionGenerator),
 }
 
 
@@ -200,3 +203,52 @@ def make_matcher(network: stereo.StereoNetwork, config: MatcherConfig) -> stereo
     raise InputError(
         f"{type(network).__name__} is no network of a matcher; known are {', '.join(MATCHERS)}"
     )
+
+
+def refuse_share(images: int, alarm_share: float) -> None:
+    """Refuse a share of images that so many of them cannot tell."""
+    if not 0 < alarm_share < 1:
+        raise InputError(f"alarm_share is {alarm_share:g}; it must be above 0 and below 1")
+    if images * alarm_share < 1:
+        raise InputError(
+            f"{images} images cannot say what refuses {alarm_share:g} of them; "
+            f"give {math.ceil(1 / alarm_share)} images or more, or a larger share"
+        )
+
+
+def calibrate_weights(
+    weights: Path, image_confidence: list[float], alarm_share: float, out: Path
+) -> float:
+    """Write weights that refuse all but ``1 - alarm_share`` of images like some that are known.
+
+    Args:
+        weights: with a generator that selects; its tensors stay as they are.
+        image_confidence: of images that the weights shall know.
+        alarm_share: share of these that may be refused, 0..1.
+        out: the file of the weights.
+
+    Returns:
+        The ``least_confidence`` that they bear.
+
+    Raises:
+        InputError: too few images for that share, or weights of another kind.
+    """
+    refuse_share(len(image_confidence), alarm_share)
+    least = min(round(float(np.quantile(image_confidence, alarm_share)), 4), 0.9999)
+    found = checkpoints.read_checkpoint(weights)
+    config = dict(found.config)
+    own = (
+        config.get(_SELECTION)
+        if found.kind == BOTH
+        else config
+        if found.kind == _SELECTION
+        else None
+    )
+    if not isinstance(own, dict):
+        raise InputError(
+            f"{weights}: holds no generator that selects; take weights of 'train select'"
+        )
+    changed = {**own, "least_confidence": least}
+    config = {**config, _SELECTION: changed} if found.kind == BOTH else changed
+    checkpoints.save_checkpoint(out, replace(found, config=config))
+    return least
