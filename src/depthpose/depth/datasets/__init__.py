@@ -1,6 +1,5 @@
 """KITTI, Middlebury and plain folders of pairs: disk to samples, splits, the check of a folder."""
 
-from depthpose.depth.datasets.check import DUPLICATE_SIMILARITY as DUPLICATE_SIMILARITY
 from depthpose.depth.datasets.check import Duplicate as Duplicate
 from depthpose.depth.datasets.check import check_dataset as check_dataset
 from depthpose.depth.datasets.check import find_duplicates as find_duplicates

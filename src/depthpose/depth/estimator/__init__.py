@@ -1,9 +1,7 @@
 """One image, or a rectified pair, to one depth estimate in metres."""
 
-from depthpose.depth.estimator.net import DEFAULT as DEFAULT
 from depthpose.depth.estimator.net import FakestereoNet as FakestereoNet
 from depthpose.depth.estimator.net import Picture as Picture
 from depthpose.depth.estimator.net import refuse_unrectified as refuse_unrectified
-from depthpose.depth.estimator.net import usable_right as usable_right
 from depthpose.depth.estimator.pictures import DepthPipeline as DepthPipeline
 from depthpose.depth.estimator.pictures import pipeline as pipeline
