@@ -12,7 +12,7 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from depthpose.core.render import rasterize_orthographic
-from depthpose.depth.synthetic import mesh as tx
+from depthpose.depth.synthetic import mesh as surfaces
 from depthpose.depth.synthetic.mesh import MATERIALS, NUMBER, SIDE_PX, Indices, Numbers, Vectors
 from depthpose.depth.synthetic.scene import StreetScene
 
@@ -196,11 +196,11 @@ def _shade(stage: Stage, hits: Hits, focal_px: float) -> Vectors:
     uv, footprint_m = _mix(rows[:, :6], hits.barycentric), hits.distance_m / focal_px
     # A compromise between the footprint's width and its length, which grows when seen aslant.
     level = torch.log2(footprint_m * rows[:, 21] * facing.abs().clamp(min=0.03) ** -0.6 + 1e-9)
-    albedo = tx.sample_texture(tx.textures(), layer, uv, level) * rows[:, 15:18]
+    albedo = surfaces.sample_texture(surfaces.textures(), layer, uv, level) * rows[:, 15:18]
     # Unevenness over metres hides that textures repeat.
     weather, points = stage.scene.weather, hits.points
     u = points[:, 0] * 0.021 + points[:, 1] * 0.013 + weather.shift[0]
-    stains = _looked_up(tx.textures().stains, u, points[:, 2] * 0.021 + weather.shift[1])
+    stains = _looked_up(surfaces.textures().stains, u, points[:, 2] * 0.021 + weather.shift[1])
     albedo *= (1 + 0.07 * stains)[:, None]
     is_road = (material == NUMBER["road"]).nonzero()[:, 0]
     if len(is_road):
@@ -274,7 +274,7 @@ def sky_light(stage: Stage, towards: Vectors, *, with_sun: bool = True) -> Vecto
     color = torch.lerp(horizon.expand(len(height), 3), zenith.expand(len(height), 3), share)
     far = towards / height.clamp(min=0.03)[:, None]
     u, v = far[:, 0] * 0.05 + weather.shift[0], far[:, 2] * 0.05 + weather.shift[1]
-    density = _looked_up(tx.textures().clouds, u, v)
+    density = _looked_up(surfaces.textures().clouds, u, v)
     cover = torch.sigmoid(3 * (density - 1.4 + 2.2 * weather.cloud)) * (height * 6).clamp(0, 1)
     lit = (horizon * 0.9 + sun_color * 0.12).expand_as(color)
     color = torch.lerp(color, lit, (0.8 * cover)[:, None])
@@ -315,7 +315,7 @@ def _paint_road(
         if is_striped:
             bar = bar * _inside(x % 1.0 - 0.5, 0.25, width_m)
         cover = torch.maximum(cover, bar)
-    wear = torch.sigmoid(3 * (_looked_up(tx.textures().stains, x * 0.13, s * 0.13) + 1.4))
+    wear = torch.sigmoid(3 * (_looked_up(surfaces.textures().stains, x * 0.13, s * 0.13) + 1.4))
     paint = (cover * scene.markings.brightness * (0.3 + 0.7 * wear))[:, None]
     first, lane_m = scene.markings.wheel_tracks
     within = ((x - first) / lane_m) % 1
