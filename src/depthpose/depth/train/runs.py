@@ -354,7 +354,7 @@ def train_adapt(config: AdaptTraining, run: Run) -> Path:
     check = AdaptationCheck(kept, config.streets, MatcherConfig(device=device))
     before = read_matcher(find_weights(config.start))
     found = [check.measure(network) for network in (before, matcher.eval())]
-    write_json(run.folder / "json", [asdict(metrics) for metrics in found])
+    write_json(run.folder / "adapt.json", [asdict(metrics) for metrics in found])
     refuse_worse(*found)
     write_depth_weights(path, matcher=matcher, facts=facts)
     text = [
