@@ -128,7 +128,7 @@ def exact_match(network: PSMNet, pair: Pair) -> Tensor:
     double.rows = 32
     h, w = pair[0].shape[-2:]
     left, right = (pad_top_right(normalise(i.double()), network.config)[None] for i in pair)
-    size = (network.config.max_disparity_px, *left.shape[-2:])
+    size = (network.config.max_disparity_px, left.shape[-2], left.shape[-1])
     align = network.config.align_corners
     with torch.no_grad():
         cost = double.costs(left, right)[-1][0, 0].permute(1, 2, 0)

@@ -167,7 +167,9 @@ def fold_volumes(module: ModuleT, like: Tensor) -> ModuleT:
     for parent in list(module.modules()):
         for name, layer in list(parent.named_children()):
             if isinstance(layer, ConvNorm) and isinstance(layer.norm, nn.BatchNorm3d):
-                setattr(parent, name, VolumeConv(layer.conv, *folded_weight(layer), like))
+                setattr(
+                    parent, name, VolumeConv(cast("Conv", layer.conv), *folded_weight(layer), like)
+                )
             elif isinstance(layer, nn.Conv3d) and not isinstance(parent, ConvNorm):
                 bias = torch.zeros(layer.out_channels) if layer.bias is None else layer.bias
                 setattr(parent, name, VolumeConv(layer, layer.weight, bias, like))
