@@ -93,8 +93,7 @@ _REMOVED_COMMANDS = {
     "pose calibrate": "no risk is calibrated any more; 'pose predict --min-certainty' says how "
     "sure an answer must be, for all weights",
 }
-_THESIS = ("reproduce", "figure")
-"""Groups of commands that reproduce the thesis."""
+_THESIS = ("reproduce", "figure")  # groups of commands that reproduce the thesis
 _EXIT_CODES = """exit codes:
   0    done
   1    done, but something in the input failed, or the output could not be written (it is named)

@@ -46,13 +46,10 @@ Source = Annotated[str, _Names.INPUT]
 """A file, folder, pattern or URL that is read; a ``Path`` is a file or folder that is read."""
 NewPath = Annotated[Path, _Names.NEW]
 """A file or folder that need not exist: it is written, or the command itself says it is missing."""
-NewPlace = Annotated[str, _Names.NEW]
-"""A folder or URL that is written."""
-WeightsName = Annotated[str, _Names.WEIGHTS]
-"""Weights, by name or file, or a word in their place."""
+NewPlace = Annotated[str, _Names.NEW]  # a folder or URL that is written
+WeightsName = Annotated[str, _Names.WEIGHTS]  # weights, by name or file, or a word in their place
 
-_WORDS = ("sgbm", "nothing", "open3d", "register")
-"""What may be said in place of weights."""
+_WORDS = ("sgbm", "nothing", "open3d", "register")  # what may be said in place of weights
 _PREFIXES = "^(both|sgbm|own|matched|joined|quick|fine):"
 """Before the name of weights: how they are used."""
 _POSITIONAL = get_args(tyro.conf.Positional[int])[1]

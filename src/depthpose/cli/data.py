@@ -415,8 +415,7 @@ def _shown(written: "Iterable[Any]", total: int | None, what: str) -> "Iterable[
     return tqdm(written, total=total, unit=f" {what}", leave=False, disable=None)
 
 
-_LOOKED_AT = 8
-"""Pairs that are checked before anything is written."""
+_LOOKED_AT = 8  # pairs that are checked before anything is written
 _WARN_PX = 0.5
 _SIDES = ("left", "right")
 _ASK = "were the cameras moved since, or are the images scaled or cropped? Calibrate anew"

@@ -43,6 +43,7 @@ def predict(
 
     if not images:
         raise InputError("name images, folders of them, patterns or videos to predict from")
+    options.refuse_unusable(scale, output)
     method = MethodSource(
         weights=networks.weights,
         config=matching.config,
@@ -52,10 +53,7 @@ def predict(
         answer=networks.answer,
         use="images",
     )
-    options.refuse_unusable(scale, output)
-    if engine.is_ray:
-        work.refuse_videos(images)
-        method = method.packed()
+    method = method.packed() if engine.is_ray else method
 
     def work_of(sources: Sequence[Path]) -> work.DepthWork:
         known = work.read_lens(lens, sources, scale)

@@ -25,7 +25,6 @@ from depthpose.depth.evaluate import (
     Evaluation,
     Measured,
     Protocol,
-    Row,
     evaluate,
     frame_result,
     has_truth,
@@ -42,11 +41,6 @@ from depthpose.report.page import Section
 
 _SAID_ABOVE = ("method", "input", "speed", "weights", "protocol", "dataset")
 """Columns that the title of a frame's part of the page says already."""
-
-
-def columns(rows: Sequence[Row]) -> list[dict[str, Any]]:
-    """Give rows as files and pages take them."""
-    return [row.columns() for row in rows]
 
 
 def open_frames(data: Path, split: str | None) -> Dataset:
@@ -143,7 +137,7 @@ def measure(
         return 0
     each = measure_each(dataset, folders, protocol, caps_m)
     measured = join([*each, *ready])
-    rows = columns(measured.rows)
+    rows = [row.columns() for row in measured.rows]
     page.write_table(out, rows)
     about = f"{protocol}: {PROTOCOLS[protocol].summary}."
     unknown = sum(frame.right is not None and not frame.calibration for frame in dataset.frames)
@@ -240,7 +234,9 @@ def join(each: Sequence[Evaluation]) -> Evaluation:
 
 def write_details(measured: Evaluation, out: Path) -> list[Section]:
     """Write each frame's numbers, and the error by confidence; give them as parts of a page."""
-    frames, deciles = columns(measured.per_frame), columns(measured.deciles)
+    frames, deciles = (
+        [row.columns() for row in rows] for rows in (measured.per_frame, measured.deciles)
+    )
     page.write_table(out, frames, name="frames")
     if deciles:
         page.write_table(out, deciles, name="confidence")

@@ -37,7 +37,6 @@ from depthpose.core.files import (
 from depthpose.core.files.disk import find_partners
 from depthpose.core.files.images import LISTED_SUFFIXES
 from depthpose.core.files.text import read_text
-from depthpose.core.run import note_result
 from depthpose.depth.estimator import FakestereoNet
 from depthpose.depth.ground import scale_by_distance
 from depthpose.depth.predictions import CLOUD_M, ENDINGS, is_finished, read_estimate, write_estimate
@@ -51,8 +50,7 @@ PAIRS = Files(roles=("left", "right"), suffixes=LISTED_SUFFIXES)
 _PAGE = "report.html"
 _VIDEO = ".color.mp4"
 _SAME_FOCAL = 0.01
-Named = Iterable[tuple[str, Callable[[], StereoInput]]]
-"""Names of inputs, and how each is read."""
+Named = Iterable[tuple[str, Callable[[], StereoInput]]]  # names of inputs, and how each is read
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -161,7 +159,7 @@ def find_sources(words: Sequence[str], out: Path) -> list[Path]:
     """List images and videos."""
     sources: list[Path] = []
     for word in words:
-        sources += [Path(word)] if _is_video(Path(word)) else list_images(word)
+        sources += [Path(word)] if _is_video(word) else list_images(word)
     stems = Counter(path.stem for path in sources)
     twice = next((stem for stem, times in stems.items() if times > 1), None)
     if twice is not None:
@@ -177,20 +175,13 @@ def find_sources(words: Sequence[str], out: Path) -> list[Path]:
     return sources
 
 
-def refuse_videos(words: Sequence[str]) -> None:
-    """Refuse videos, which workers take none of."""
-    video = next((word for word in words if _is_video(Path(word))), None)
-    if video is not None:
-        raise InputError(f"{video}: --engine ray takes no videos; omit --engine for them")
-
-
 def _frame_of(video: Path, name: str) -> bool:
     """Whether a frame of a video has this name."""
     return re.fullmatch(re.escape(video.stem) + r"_\d{6}", name) is not None
 
 
-def _is_video(path: Path) -> bool:
-    return path.suffix.lower() in VIDEO_SUFFIXES
+def _is_video(path: str | Path) -> bool:
+    return Path(path).suffix.lower() in VIDEO_SUFFIXES
 
 
 def list_pairs(left: str, right: str) -> list[tuple[Path, Path]]:
@@ -250,6 +241,8 @@ def estimate_by_engine(
     engine: EngineOptions,
 ) -> int:
     """Estimate images or pairs, manifests or tar shards, by the workers of an engine."""
+    if (video := next(filter(_is_video, words), None)) is not None:
+        raise InputError(f"{video}: --engine ray takes no videos; omit --engine for them")
     inputs = Inputs.find(words, files)
     with inputs.first() as first:
         work = work_of(first)
@@ -327,25 +320,20 @@ class Predictor:
 
     def predict_video(self, source: Path) -> int:
         """Predict a video's frames, and make a video of them; give how many are done."""
-        frames: list[str] = []
-
-        def named() -> Named:
-            for name, image in video:
-                frames.append(name)
-                yield name, partial(self.work.lens.input_of, name, image)
 
         def colors() -> Iterator[Tensor]:
             """Draw each frame's depth, in grey where there is none, so that none is missing."""
-            done, first = set(names), self.out / f"{min(names)}.depth_m.npy"
-            unknown = torch.full_like(read_map(first), torch.nan)
-            for name in frames:
-                depth_m = read_map(self.out / f"{name}.depth_m.npy") if name in done else unknown
-                yield draw_depth(depth_m, *self.work.output.color_range)
+            lost = {name for name in self.failures if _frame_of(source, name)}
+            unknown = torch.full_like(read_map(self.out / f"{names[0]}.depth_m.npy"), torch.nan)
+            for name in sorted([*names, *lost]):
+                known = unknown if name in lost else read_map(self.out / f"{name}.depth_m.npy")
+                yield draw_depth(known, *self.work.output.color_range)
 
         try:
             video = read_video(source)
-            names = self.predict(named(), video.frames or None, source.name)
-            drawn = colors() if names else iter(())
+            coming = self.work.lens.inputs_of([source])
+            names = self.predict(coming, video.frames or None, source.name)
+            drawn = colors() if names else ()
             write_video(self.out / f"{source.stem}{_VIDEO}", drawn, video.fps)
         except InputError as error:
             self.failures[source.name] = error
@@ -380,7 +368,7 @@ class Predictor:
                             estimate = scale_by_distance(estimate, one.name, scale.distance)  # noqa: PLW2901
                         cloud_m = CLOUD_M if output.cloud else None
                         files = write_estimate(self.out, one, estimate, output.color_range, cloud_m)
-                        note_result(self.out, one.name, files)
+                        run.note_result(self.out, one.name, files)
                     except InputError as error:
                         self.failures[one.name] = error
                         continue

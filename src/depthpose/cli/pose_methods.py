@@ -197,10 +197,8 @@ def distinct_names(files: Sequence[tuple[Path | None, str]]) -> list[str]:
     return names
 
 
-REGISTRATION = "open3d"
-"""The name of Open3D's features, RANSAC and ICP, where weights are named."""
-REGISTER = "register"
-"""The name of our own registration, which needs no training."""
+REGISTRATION = "open3d"  # the name of Open3D's features, RANSAC and ICP, where weights are named
+REGISTER = "register"  # the name of our own registration, which needs no training
 _SAME_DIAMETER = 0.05
 
 EstimateMany = Callable[[Sequence[ViewInput]], Sequence[PoseEstimate]]

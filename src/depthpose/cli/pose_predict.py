@@ -62,12 +62,9 @@ from depthpose.report.page import Section, choose_answers, plain_table, write_pa
 from depthpose.report.viewer import open_viewer
 
 _PAGE = "report.html"
-_MOST_SHOWN = 20
-"""Of the answers, on the terminal; poses.json holds all."""
-_SAID = 5
-"""Of so many inputs the alternatives are printed; of all they are in poses.json."""
-_MOST_ROWS = 1000
-"""Of the answers, in the table of the page."""
+_MOST_SHOWN = 20  # of the answers, on the terminal; poses.json holds all
+_SAID = 5  # of so many inputs the alternatives are printed; of all they are in poses.json
+_MOST_ROWS = 1000  # of the answers, in the table of the page
 _PRINTED = ("input", "object", "status", "x, y, z [m]", "qx, qy, qz, qw", "fit", "certainty",
             "identity", "tracking")  # fmt: skip
 """Columns on the terminal."""
@@ -422,8 +419,7 @@ def _write_page(
 
 VIEW_FILES = Files(roles=("depth", "mask"), suffixes=(*LISTED_SUFFIXES, ".json"))
 NO_FILES = Files(roles=(), suffixes=())
-ENDING = "pose.json"
-"""Of the one file of a result: an entry of ``poses.json``."""
+ENDING = "pose.json"  # of the one file of a result: an entry of poses.json
 
 
 def cloud_files() -> Files:

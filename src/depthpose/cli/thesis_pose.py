@@ -33,10 +33,8 @@ from depthpose.report.page import Drawing, Picture, Section
 from depthpose.report.pose import close_up, draw_boxes, grey_depth, picture_of
 from depthpose.thesis import pose_figures, pose_tables
 
-_SYNTHETIC_SEED = 3303
-"""Of synthetic views for tables and figures; no training uses it."""
-_MOST_POINTS = 4000
-"""Of a t-SNE: its time grows with the square."""
+_SYNTHETIC_SEED = 3303  # of synthetic views for tables and figures; no training uses it
+_MOST_POINTS = 4000  # of a t-SNE: its time grows with the square
 _SCAN_POINTS = 1500
 _TEXTS = {
     "3-2": "Alike features have alike colours (t-SNE to one number for all clouds, Spectral); the "
@@ -141,7 +139,7 @@ def reproduce_by_object(
         pose_evaluate.measure_each(dataset, [*folders, *csv], how.evaluation)
     )
     joined = pose_tables.join_by_object(measured.rows, numbers, with_published=is_printed)
-    rows, every = [row.columns() for row in joined], pose_evaluate.table_of(measured.rows)
+    rows, every = ([row.columns() for row in some] for some in (joined, measured.rows))
     page.write_table(out, rows)
     page.write_table(out, every, name="all")
     sections: list[Section] = []

@@ -153,8 +153,7 @@ class Lines:
         print(", ".join(said), flush=True)
 
 
-_LOOKED_AT = 20
-"""Held-out pairs of a folder, by default."""
+_LOOKED_AT = 20  # held-out pairs of a folder, by default
 
 
 def train_depth(
@@ -274,10 +273,8 @@ def calibrate(
     return 0
 
 
-_START = "parts"
-"""The weights that ship and may go with any licence."""
-_NOTHING = "nothing"
-"""The word for no weights."""
+_START = "parts"  # the weights that ship and may go with any licence
+_NOTHING = "nothing"  # the word for no weights
 
 
 def train_pose(

@@ -27,8 +27,7 @@ MOST_POINTS = 60_000
 """Most points of one cloud on a page: 0.7 MB of text."""
 MOST_LINES = 20_000
 
-_GREY = 0.55
-"""Grey of points without a colour: visible on white and on black."""
+_GREY = 0.55  # grey of points without a colour: visible on white and on black
 _RED_GREEN_BLUE = ((0.85, 0.2, 0.2), (0.15, 0.65, 0.25), (0.25, 0.45, 0.95))
 
 
@@ -167,8 +166,7 @@ def _base64(values: np.ndarray) -> str:
 
 
 MOST_VIEWS = 6
-_REFUSED = 2
-"""Refusals shown at least, where there are so many."""
+_REFUSED = 2  # refusals shown at least, where there are so many
 
 
 def spread_evenly(total: int, number: int) -> list[int]:
@@ -212,10 +210,8 @@ Row = Mapping[str, Any]
 _MOST_PIXELS = 480_000
 """Most pixels of a drawing on a page of many; a frame of KITTI keeps its size."""
 _QUALITY = 85
-_MOST_BYTES = 250_000
-"""Largest picture file that goes onto a page as it is."""
-_MOST_FILM_BYTES = 8_000_000
-"""Largest video file on a page; a larger one is shown from beside it."""
+_MOST_BYTES = 250_000  # largest picture file that goes onto a page as it is
+_MOST_FILM_BYTES = 8_000_000  # largest video file on a page; a larger one is shown from beside it
 
 
 @dataclass(frozen=True, kw_only=True)

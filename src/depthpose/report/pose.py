@@ -42,10 +42,8 @@ OTHER: Color = (0.6, 0.3, 0.85)
 """Colour of an alternative: violet."""
 _SURFACE = 5000
 _BEND = math.radians(30)
-_CROSS = 0.04
-"""Half of the mark of a keypoint, in diameters of the object."""
-_VOTES = 40
-"""Points whose votes are drawn."""
+_CROSS = 0.04  # half of the mark of a keypoint, in diameters of the object
+_VOTES = 40  # points whose votes are drawn
 _DASH_PX = 6.0
 
 
@@ -216,8 +214,7 @@ _SEEN = (0.55, 0.55, 0.55)
 _AROUND = (0.7, 0.66, 0.6)
 _MASKED = (1.0, 0.85, 0.1)
 _AROUND_POINTS = 20_000
-_MARGIN = 0.6
-"""About an object in a close-up, in its own width."""
+_MARGIN = 0.6  # about an object in a close-up, in its own width
 _CLOSE_UP_PX = 360
 
 
