@@ -3,9 +3,9 @@
 import re
 import sys
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, field
 from functools import partial
 from itertools import islice
 from pathlib import Path
@@ -15,6 +15,7 @@ import torch
 from torch import Tensor
 from tqdm import tqdm
 
+from depthpose.cli.arguments import changed
 from depthpose.cli.depth_methods import Method, MethodSource
 from depthpose.cli.depth_options import LensOptions, PredictOutput, ScaleOptions
 from depthpose.cli.engine import EngineOptions, say
@@ -22,7 +23,7 @@ from depthpose.core import run
 from depthpose.core.camera import Camera, FieldOfView, StereoRig, camera_of, read_camera
 from depthpose.core.camera.pinhole import camera_keys
 from depthpose.core.draw import draw_depth
-from depthpose.core.engine import Files, Function, Inputs, Sample
+from depthpose.core.engine import Files, Function, Inputs, Sample, Work
 from depthpose.core.errors import InputError
 from depthpose.core.files import (
     VIDEO_SUFFIXES,
@@ -50,63 +51,16 @@ PAIRS = Files(roles=("left", "right"), suffixes=LISTED_SUFFIXES)
 _PAGE = "report.html"
 _VIDEO = ".color.mp4"
 _SAME_FOCAL = 0.01
-Named = Iterable[tuple[str, Callable[[], StereoInput]]]  # names of inputs, and how each is read
+Named = Iterator[tuple[str, Callable[[], StereoInput]]]  # names of inputs, and how each is read
 
 
-@dataclass(frozen=True, kw_only=True)
-class Lens:
-    """What is known of the camera of images, or the rig of pairs, and what sets the scale."""
-
-    camera: Camera | FieldOfView | float
-    scale: ScaleOptions = field(default_factory=ScaleOptions)
-
-    def __post_init__(self) -> None:
-        mount_m = self.scale.camera_height or getattr(self.camera, "mount_height_m", None)
-        if self.scale.camera_tilt is not None and mount_m is None:
-            raise InputError(
-                "--camera-tilt says where the road is together with --camera-height, or the "
-                "camera file's mount_height_m; give the height, or omit the tilt"
-            )
-
-    def input_of(self, name: str, left: Tensor | Path, right: Path | None = None) -> StereoInput:
-        """Make the input of an image or a pair, read already or not."""
-        image = read_image(left) if isinstance(left, Path) else left
-        camera = camera_of(self.camera, (image.shape[2], image.shape[1]))
-        assert camera is not None
-        mount = {"mount_height_m": self.scale.camera_height, "tilt_deg": self.scale.camera_tilt}
-        camera = replace(camera, **{key: v for key, v in mount.items() if v is not None})
-        other = None if right is None else read_image(right)
-        return StereoInput(name=name, left=image, right=other, camera=camera)
-
-    def inputs_of(self, files: Sequence[Path]) -> Iterator[tuple[str, Callable[[], StereoInput]]]:
-        """Give the one input of an image or a pair, or every frame of a video."""
-        if not _is_video(files[0]):
-            yield files[0].stem, partial(self.input_of, files[0].stem, *files)
-            return
-        for name, frame in read_video(files[0]):
-            yield name, partial(self.input_of, name, frame)
-
-    def facts(self) -> dict[str, Any]:
-        """Give what decides depth, as JSON values, for the record of a run."""
-        known: dict[str, Any] = {"focal_px": self.camera}
-        if isinstance(self.camera, FieldOfView):
-            known = {"fov_deg": self.camera.degrees}
-        elif isinstance(self.camera, StereoRig):
-            known = {"K": self.camera.K.tolist(), "baseline_m": self.camera.baseline_m}
-            known["cx_right_minus_left_px"] = self.camera.cx_right_minus_left_px
-        elif isinstance(self.camera, Camera):
-            keys = camera_keys(self.camera)
-            known = {key: keys[key] for key in ("K", "mount_height_m", "tilt_deg") if key in keys}
-        return known | {key: v for key, v in asdict(self.scale).items() if v is not None}
-
-
-def read_lens(options: LensOptions, sources: Sequence[Path], scale: ScaleOptions) -> Lens:
+def read_lens(options: LensOptions, sources: Sequence[Path]) -> Camera | FieldOfView | float:
     """Read what the user knows of the camera; without any of it the EXIF of the images is asked."""
     focal_px, fov = options.focal_px, options.fov
     if focal_px is not None and not 1 < focal_px < 1e6:
         raise InputError(f"--focal-px {focal_px}: not a focal length in pixels; KITTI's is 721.5.")
     if fov is not None:
-        return Lens(camera=FieldOfView(fov), scale=scale)
+        return FieldOfView(fov)
     if options.camera is None and focal_px is None:  # what the EXIF of all images says
         known: dict[str, tuple[float, str]] = {}
         for source in sources:
@@ -137,7 +91,7 @@ def read_lens(options: LensOptions, sources: Sequence[Path], scale: ScaleOptions
               "picture it is another", file=sys.stderr)  # fmt: skip
     if options.camera is None:
         assert focal_px is not None
-        return Lens(camera=focal_px, scale=scale)
+        return focal_px
     size = None  # of the images, for a camera file that says none
     for source in sources:
         with suppress(InputError):  # an image that cannot be read fails by itself, later
@@ -151,8 +105,8 @@ def read_lens(options: LensOptions, sources: Sequence[Path], scale: ScaleOptions
     if isinstance(read, StereoRig):
         print("the camera's baseline is ignored: one image has none", file=sys.stderr)
         keys = {key: getattr(read, key) for key in ("mount_height_m", "tilt_deg")}
-        read = Camera(width=read.width, height=read.height, K=read.K, **keys)
-    return Lens(camera=read, scale=scale)
+        return Camera(width=read.width, height=read.height, K=read.K, **keys)
+    return read
 
 
 def find_sources(words: Sequence[str], out: Path) -> list[Path]:
@@ -198,24 +152,58 @@ def list_pairs(left: str, right: str) -> list[tuple[Path, Path]]:
 
 @dataclass(frozen=True, kw_only=True)
 class DepthWork:
-    """Images or pairs to the files of their depth, in this process or by workers of an engine."""
+    """Images or pairs to the files of their depth, in this process or by workers of an engine.
+
+    ``camera``: what is known of that of the images, or the rig of pairs.
+    """
 
     method: MethodSource
-    lens: Lens
+    camera: Camera | FieldOfView | float
     output: PredictOutput
+    scale: ScaleOptions = field(default_factory=ScaleOptions)
     with_check: bool = True
     files: Files = IMAGES
-    endings: Sequence[str] = ENDINGS
 
-    @property
-    def batch(self) -> int:
-        """Images that go through the networks together."""
-        return self.output.batch
+    def __post_init__(self) -> None:
+        mount_m = self.scale.camera_height or getattr(self.camera, "mount_height_m", None)
+        if self.scale.camera_tilt is not None and mount_m is None:
+            raise InputError(
+                "--camera-tilt says where the road is together with --camera-height, or the "
+                "camera file's mount_height_m; give the height, or omit the tilt"
+            )
+
+    def input_of(self, name: str, left: Tensor | Path, right: Path | None = None) -> StereoInput:
+        """Make the input of an image or a pair, read already or not."""
+        image = read_image(left) if isinstance(left, Path) else left
+        camera = camera_of(self.camera, (image.shape[2], image.shape[1]))
+        assert camera is not None
+        mount = {"mount_height_m": self.scale.camera_height, "tilt_deg": self.scale.camera_tilt}
+        camera = changed(camera, **mount)
+        other = None if right is None else read_image(right)
+        return StereoInput(name=name, left=image, right=other, camera=camera)
+
+    def inputs_of(self, files: Sequence[Path]) -> Named:
+        """Give the one input of an image or a pair, or every frame of a video."""
+        if not _is_video(files[0]):
+            yield files[0].stem, partial(self.input_of, files[0].stem, *files)
+            return
+        for name, frame in read_video(files[0]):
+            yield name, partial(self.input_of, name, frame)
 
     def settings(self, method: dict[str, Any]) -> dict[str, Any]:
         """Give what decides the results, as JSON values, for the record of a run."""
+        known: dict[str, Any] = {"focal_px": self.camera}
+        if isinstance(self.camera, FieldOfView):
+            known = {"fov_deg": self.camera.degrees}
+        elif isinstance(self.camera, StereoRig):
+            known = {"K": self.camera.K.tolist(), "baseline_m": self.camera.baseline_m}
+            known["cx_right_minus_left_px"] = self.camera.cx_right_minus_left_px
+        elif isinstance(self.camera, Camera):
+            keys = camera_keys(self.camera)
+            known = {key: keys[key] for key in ("K", "mount_height_m", "tilt_deg") if key in keys}
+        known |= {key: v for key, v in asdict(self.scale).items() if v is not None}
         own = {} if self.files == PAIRS else {"color_range_m": list(self.output.color_range)}
-        return {**method, "camera": self.lens.facts(), **own}
+        return {**method, "camera": known, **own}
 
     def start(self) -> Function:
         """Build the networks."""
@@ -223,10 +211,7 @@ class DepthWork:
 
         def estimate(samples: Sequence[Sample], out: Path) -> list[str]:
             predictor = Predictor(self, method, out)
-            named = [
-                (one.name, partial(self.lens.input_of, one.name, *map(Path, one.files)))
-                for one in samples
-            ]
+            named = ((one.name, partial(self.input_of, one.name, *one.files)) for one in samples)
             predictor.predict(named, len(samples), "images")
             return [str(predictor.failures.get(sample.name, "")) for sample in samples]
 
@@ -245,8 +230,9 @@ def estimate_by_engine(
         raise InputError(f"{video}: --engine ray takes no videos; omit --engine for them")
     inputs = Inputs.find(words, files)
     with inputs.first() as first:
-        work = work_of(first)
-    settings = work.settings(work.method.settings())
+        own = work_of(first)
+    settings = own.settings(own.method.settings())
+    work = Work(start=own.start, files=files, endings=ENDINGS, batch=own.output.batch)
     what = "pairs" if files == PAIRS else "depth maps"
     return say(engine.run(work, inputs, out, settings), out, what)
 
@@ -263,7 +249,7 @@ def estimate_all(
     with open_viewer(None if run.find_rank().rank else work.output.view) as viewer:
         predictor = Predictor(work, method, out, viewer)
         stills = [files for files in mine if not _is_video(files[0])]
-        named = (one for files in stills for one in work.lens.inputs_of(files))
+        named = (one for files in stills for one in work.inputs_of(files))
         done = len(predictor.predict(named, len(stills), "images"))
         done += sum(predictor.predict_video(video) for video, *_ in mine if _is_video(video))
     failures = list(predictor.failures.values())
@@ -281,7 +267,7 @@ def estimate_all(
         for files, own in finished.items():
             wanted = [name for name in own if name in chosen]
             with suppress(InputError):
-                for name, read in work.lens.inputs_of(files) if wanted else ():
+                for name, read in work.inputs_of(files) if wanted else ():
                     if name in wanted:
                         shown.append(read())
                     if name == wanted[-1]:
@@ -331,8 +317,8 @@ class Predictor:
 
         try:
             video = read_video(source)
-            coming = self.work.lens.inputs_of([source])
-            names = self.predict(coming, video.frames or None, source.name)
+            frames = self.work.inputs_of([source])
+            names = self.predict(frames, video.frames or None, source.name)
             drawn = colors() if names else ()
             write_video(self.out / f"{source.stem}{_VIDEO}", drawn, video.fps)
         except InputError as error:
@@ -346,11 +332,10 @@ class Predictor:
         What an earlier run finished is not even read.
         """
         names: list[str] = []
-        output, scale, net = self.work.output, self.work.lens.scale, self.method.net
+        output, scale, net = self.work.output, self.work.scale, self.method.net
         assert isinstance(net, FakestereoNet), "weights build no other"
-        coming = iter(named)
         with tqdm(total=total, desc=what, disable=None, unit=f" {what}") as bar:
-            while chunk := list(islice(coming, output.batch)):
+            while chunk := list(islice(named, output.batch)):
                 inputs: list[StereoInput] = []
                 for name, read in chunk:
                     try:

@@ -138,8 +138,8 @@ def reproduce_by_object(
     measured = pose_evaluate.join(
         pose_evaluate.measure_each(dataset, [*folders, *csv], how.evaluation)
     )
-    joined = pose_tables.join_by_object(measured.rows, numbers, with_published=is_printed)
-    rows, every = ([row.columns() for row in some] for some in (joined, measured.rows))
+    rows = pose_tables.join_by_object(measured.rows, numbers, with_published=is_printed)
+    every = [row.columns() for row in measured.rows]
     page.write_table(out, rows)
     page.write_table(out, every, name="all")
     sections: list[Section] = []
@@ -206,7 +206,7 @@ def reproduce_voting(
         cases = list(
             pose_tables.cases_of(net, tqdm(views.samples, f"{count} points", disable=None), count)
         )
-        rows += [row.columns() | facts for row in pose_tables.compare_voting(cases, count)]
+        rows += [row | facts for row in pose_tables.compare_voting(cases, count)]
     page.write_table(out, rows)
     text = (
         "Success: percent of instances whose ADD(-S) is below 10 % of the diameter, without ICP; "

@@ -79,25 +79,21 @@ def lock_folder(record: Path, *, is_shared: bool, timeout_s: float = 10.0) -> bo
     while True:
         try:
             fcntl.lockf(file, kind | fcntl.LOCK_NB)
-        except BlockingIOError as error:
-            if time.monotonic() > last:
-                _close(record, file)
-                raise InputError(
-                    f"{record.parent}: another command is writing there; wait until it has ended, "
-                    "or choose another folder"
-                ) from error
-            time.sleep(0.1)
-        except OSError:  # no locks on this file system
-            _close(record, file)
-            return False
-        else:
-            _locks[record.resolve()] = file
-            return held is None and not is_shared
-
-
-def _close(record: Path, file: int) -> None:
-    _locks.pop(record.resolve(), None)
-    os.close(file)
+        except OSError as error:
+            is_held = isinstance(error, BlockingIOError)
+            if is_held and time.monotonic() <= last:
+                time.sleep(0.1)
+                continue
+            _locks.pop(record.resolve(), None)
+            os.close(file)
+            if not is_held:  # no locks on this file system
+                return False
+            raise InputError(
+                f"{record.parent}: another command is writing there; wait until it has ended, or "
+                "choose another folder"
+            ) from error
+        _locks[record.resolve()] = file
+        return held is None and not is_shared
 
 
 def held_folders() -> frozenset[Path]:
@@ -233,41 +229,36 @@ def claim_folder(
     record = folder / RECORD
     if not record.exists():
         there = [name for name in (_SOURCES, *results) if os.path.lexists(folder / name)]
-        # Looked at again: another process may have begun the same run.
-        if there and not record.exists():
+        if not there:
+            write_once(record, run_record(settings))
+        elif not record.exists():  # again: another process may have begun the same run
             raise not_ours(folder / there[0])
-    if not record.exists():
-        write_once(record, run_record(settings))
-    is_alone = find_rank().world == 1
-    if is_alone and _is_empty(folder):  # a run that failed before its first result
-        earlier = _read_record(record)
-        there = earlier.get("settings") if isinstance(earlier, dict) else None
-        if isinstance(there, dict) and _flat(there) != _flat(settings):
-            lock_folder(record, is_shared=False)
-            if _is_empty(folder):
-                (folder / _SOURCES).unlink(missing_ok=True)
-                file, content = _locks.get(record.resolve()), run_record(settings)
-                if file is None:  # no locks here
-                    write_json(record, content)
-                    return
-                # Through the file that holds the lock, which closing another would let go.
-                data = f"{json.dumps(content, indent=2)}\n".encode()
-                os.pwrite(file, data, 0)
-                os.ftruncate(file, len(data))
-                return
-    refuse_other_settings(folder, _read_record(record), settings, remedy)
-    if lock_folder(record, is_shared=not is_alone):
-        remove_parts(folder)
-
-
-def _read_record(record: Path) -> object:
     try:
-        return read_json(record)
+        earlier = read_json(record)
     except InputError as error:
         raise InputError(
             f"{error}. What made the results is not known any more: choose another folder, or "
             "delete this one"
         ) from error
+    is_alone = find_rank().world == 1
+    before = earlier.get("settings") if isinstance(earlier, dict) else None
+    is_other = isinstance(before, dict) and _flat(before) != _flat(settings)
+    if is_alone and is_other and _is_empty(folder):  # a run that failed before its first result
+        lock_folder(record, is_shared=False)
+        if _is_empty(folder):
+            (folder / _SOURCES).unlink(missing_ok=True)
+            file, content = _locks.get(record.resolve()), run_record(settings)
+            if file is None:  # no locks here
+                write_json(record, content)
+                return
+            # Through the file that holds the lock, which closing another would let go.
+            data = f"{json.dumps(content, indent=2)}\n".encode()
+            os.pwrite(file, data, 0)
+            os.ftruncate(file, len(data))
+            return
+    refuse_other_settings(folder, earlier, settings, remedy)
+    if lock_folder(record, is_shared=not is_alone):
+        remove_parts(folder)
 
 
 def _is_empty(folder: Path) -> bool:

@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
 import pytest
-from tests.core.engine.doubles import InProcessEngine, ReverseWork, unpacked, write_texts
+from tests.core.engine.doubles import InProcessEngine, reverse_work, unpacked, write_texts
 
 from depthpose.core.engine import (
     Done,
@@ -24,7 +24,7 @@ from depthpose.core.errors import InputError
 
 
 def job_of(tmp_path: Path, words: list[str], **changed: object) -> Job:
-    work = ReverseWork(str(tmp_path / "log"))
+    work = reverse_work(str(tmp_path / "log"))
     given = {"out": str(tmp_path / "out"), "settings": {"way": "back"}, "block": 2} | changed
     items = find_items(words, work.files) if words else []
     return Job(work=work, items=items, **given)  # pyright: ignore[reportArgumentType]

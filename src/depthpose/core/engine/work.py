@@ -17,7 +17,7 @@ from dataclasses import asdict, dataclass
 from importlib import import_module
 from itertools import groupby, islice
 from pathlib import Path, PurePosixPath
-from typing import Any, Literal, Protocol, runtime_checkable
+from typing import Any, Literal
 
 from depthpose.core.errors import InputError, import_extra
 from depthpose.core.files import disk
@@ -417,28 +417,21 @@ Function = Callable[[Sequence[Sample], Path], Sequence[str]]
 """Writes ``NAME.ENDING`` for each sample into a folder; gives for each "" or why it failed."""
 
 
-@runtime_checkable
-class Work(Protocol):
-    """What a job does; it is sent to every worker, which starts it once."""
+@dataclass(frozen=True, kw_only=True)
+class Work:
+    """What a job does; it is sent to every worker, which starts it once.
 
-    @property
-    def files(self) -> Files:
-        """What an input is made of."""
-        ...
+    Attributes:
+        start: loads what all samples need, such as a network.
+        files: what an input is made of.
+        endings: of the files of a result.
+        batch: samples that are handed over at once.
+    """
 
-    @property
-    def endings(self) -> Sequence[str]:
-        """Endings of the files of a result."""
-        ...
-
-    @property
-    def batch(self) -> int:
-        """Samples that are handed over at once."""
-        ...
-
-    def start(self) -> Function:
-        """Load what all samples need, such as a network."""
-        ...
+    start: Callable[[], Function]
+    files: Files
+    endings: Sequence[str]
+    batch: int = 1
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -545,6 +538,4 @@ class Runner:
 
 def run_here(blocks: Sequence[Block], work: Work, out: str, form: ShardFormat) -> Iterator[Done]:
     """Do blocks in this process, one after the other: the engine that needs no cluster."""
-    runner = Runner(work, out, form)
-    for block in blocks:
-        yield runner.run(block)
+    yield from map(Runner(work, out, form).run, blocks)

@@ -219,7 +219,7 @@ class _Training:
         while self.step < self.steps:
             self._take_step([next(batches) for _ in range(self.config.accumulate)])
             self.step += 1
-            stop = self._any_process(request.to_stop())
+            stop = self._any_process(bool(request.asked))
             if stop and self._any_process(request.to_finish()):
                 self.steps = self.step
             numbers: dict[str, float] = {}
@@ -368,7 +368,7 @@ class StopRequest:
     """Lets SIGTERM and Ctrl-C end the training after the step, with its state saved."""
 
     def __enter__(self) -> "StopRequest":
-        self._asked: list[tuple[int, float]] = []
+        self.asked: list[tuple[int, float]] = []
         self._handlers = {}
         with suppress(ValueError):  # not the main thread: whoever runs us handles signals
             numbers = (signal.SIGTERM, signal.SIGINT)
@@ -380,24 +380,20 @@ class StopRequest:
             signal.signal(number, handler)
 
     def _remember(self, number: int, _: FrameType | None) -> None:
-        if not self._asked and number == signal.SIGINT:
+        if not self.asked and number == signal.SIGINT:
             message = (
                 "\ndepthpose: stopping after this step. Press Ctrl-C again within 3 s to finish "
                 "now: the weights of the steps so far are written.\n"
             )
             os.write(2, message.encode())  # print may be at work itself
-        self._asked.append((number, time.monotonic()))
-
-    def to_stop(self) -> bool:
-        """Whether to stop after the step, with the state saved."""
-        return bool(self._asked)
+        self.asked.append((number, time.monotonic()))
 
     def to_finish(self) -> bool:
         """Whether to take the steps so far for all: Ctrl-C twice. Waits for the second one."""
-        presses = [at for number, at in self._asked if number == signal.SIGINT]
+        presses = [at for number, at in self.asked if number == signal.SIGINT]
         while len(presses) == 1 and time.monotonic() - presses[0] < SECOND_CTRL_C_S:
             time.sleep(0.05)
-            presses = [at for number, at in self._asked if number == signal.SIGINT]
+            presses = [at for number, at in self.asked if number == signal.SIGINT]
         return len(presses) > 1
 
 
