@@ -174,7 +174,8 @@ def _finish(
             write_predictions(out, [*predictions, *others])
     pairs = zip(predictions, jobs, strict=True)
     explained = [explained_job(job, prediction.estimate, method) for prediction, job in pairs]
-    code = pose_predict.finish(predictions, explained, out, method, dataset)
+    pose_predict.write_files(predictions, explained, out, method, dataset)
+    code = pose_predict.say_result(predictions, out)
     kinds = Counter(p.estimate.tracking for p in predictions if p.estimate.tracking is not None)
     print(", ".join(f"{kinds[kind]} {kind}" for kind in ("tracked", "found", "lost")))
     return code

@@ -140,7 +140,10 @@ def predict_files(
         settings |= {} if inputs.unit is None else {"unit": inputs.unit}
     claim(out, settings, jobs, source)
     predictions = predict_all(method, jobs, out, settings, batch, view)
-    return 0 if predictions is None else finish(predictions, jobs, out, method)
+    if predictions is None:
+        return 0
+    write_files(predictions, jobs, out, method)
+    return say_result(predictions, out)
 
 
 def predict_dataset(
@@ -211,7 +214,10 @@ def predict_dataset(
         write_predictions(Path(out), predictions)
     else:
         predictions = predict_all(method, jobs, home, settings, batch, view)
-    return 0 if predictions is None else finish(predictions, jobs, home, method, dataset)
+    if predictions is None:
+        return 0
+    write_files(predictions, jobs, home, method, dataset)
+    return say_result(predictions, home)
 
 
 def predict_all(
@@ -272,18 +278,6 @@ def _known(out: Path) -> dict[str, Prediction]:
     every = [p for folder in folders for p in kept_predictions(folder)]
     # What was read at last counts, whatever another part said of an earlier try.
     return {p.estimate.name: p for p in sorted(every, key=is_finished)}
-
-
-def finish(
-    predictions: list[Prediction],
-    jobs: list[Job[Any]],
-    out: Path,
-    method: PoseMethod,
-    dataset: BopDataset | None = None,
-) -> int:
-    """Write clouds, pictures, BOP's csv and the page, and say what was found; the exit code."""
-    write_files(predictions, jobs, out, method, dataset)
-    return say_result(predictions, out)
 
 
 def write_files(

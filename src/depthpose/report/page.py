@@ -71,20 +71,42 @@ class Scene:
     caption: str
     layers: Sequence[Layer]
 
-    @property
-    def note(self) -> str:
-        """Which layers are shown thinned; empty where none is."""
-        said = [
-            f"{layer.name}: {_most(layer.shape)} of {_count(layer.shape)}, thinned evenly"
-            for layer in self.layers
-            if _count(layer.shape) > _most(layer.shape)
-        ]
-        return "; ".join(said)
-
     def encoded(self) -> dict[str, Any]:
-        """Give the JSON that ``viewer.js`` reads: base64 of 16-bit places and 8-bit colours."""
-        return {"caption": self.caption, "note": self.note,
-                "layers": [_encoded(layer) for layer in self.layers]}  # fmt: skip
+        """Give the JSON that ``viewer.js`` reads: base64 of 16-bit places and 8-bit colours.
+
+        Places are steps of 1/65535 of their extent: of a street of 80 m, 1.2 mm. ``note`` says
+        which layers are thinned.
+        """
+        layers: list[dict[str, Any]] = []
+        thinned: list[str] = []
+        for layer in self.layers:
+            shape = layer.shape
+            if isinstance(shape, Cloud):
+                kind, most, places, color = "points", MOST_POINTS, shape.points, shape.color
+                color = torch.full_like(places, _GREY) if color is None else color
+            else:
+                kind, most, places, color = "lines", MOST_LINES, shape.ends_m, shape.color
+            if len(places) > most:
+                thinned.append(f"{layer.name}: {most} of {len(places)}, thinned evenly")
+            kept = _spread(len(places), most)
+            places, color = places[kept], color[kept]
+            bytes_of_color = (color.detach().cpu().clamp(0, 1) * 255).round().byte().numpy()
+            flat_m = places.detach().cpu().numpy().astype(np.float64).reshape(-1, 3)
+            low = flat_m.min(0) if len(flat_m) else np.zeros(3)
+            step = (flat_m.max(0) - low) / 65535 if len(flat_m) else np.zeros(3)
+            steps = np.round((flat_m - low) / np.where(step > 0, step, 1))
+            encoded = {
+                "name": layer.name,
+                "kind": kind,
+                "shown": layer.is_shown,
+                "count": len(places),
+                "low": low.tolist(),
+                "step": step.tolist(),
+                "places": base64.b64encode(steps.astype("<u2").tobytes()).decode(),
+                "colors": base64.b64encode(bytes_of_color.tobytes()).decode(),
+            }
+            layers.append(encoded)
+        return {"caption": self.caption, "note": "; ".join(thinned), "layers": layers}
 
 
 def page_file(name: Literal["viewer.js", "page.css"]) -> str:
@@ -115,41 +137,6 @@ def frame_axes(origin_m: Float[Tensor, "3"], R: Float[Tensor, "3 3"], length_m: 
     return Lines(ends_m=ends_m.float(), color=torch.tensor(_RED_GREEN_BLUE))
 
 
-def _count(shape: Cloud | Lines) -> int:
-    return len(shape.points if isinstance(shape, Cloud) else shape.ends_m)
-
-
-def _most(shape: Cloud | Lines) -> int:
-    return MOST_POINTS if isinstance(shape, Cloud) else MOST_LINES
-
-
-def _encoded(layer: Layer) -> dict[str, Any]:
-    """Store places as steps of 1/65535 of their extent: of a street of 80 m, 1.2 mm."""
-    shape = layer.shape
-    if isinstance(shape, Cloud):
-        kind, places, color = "points", shape.points, shape.color
-        color = torch.full_like(places, _GREY) if color is None else color
-    else:
-        kind, places, color = "lines", shape.ends_m, shape.color
-    kept = _spread(len(places), _most(shape))
-    places, color = places[kept], color[kept]
-    bytes_of_color = (color.detach().cpu().clamp(0, 1) * 255).round().byte().numpy()
-    flat_m = places.detach().cpu().numpy().astype(np.float64).reshape(-1, 3)
-    low = flat_m.min(0) if len(flat_m) else np.zeros(3)
-    step = (flat_m.max(0) - low) / 65535 if len(flat_m) else np.zeros(3)
-    steps = np.round((flat_m - low) / np.where(step > 0, step, 1))
-    return {
-        "name": layer.name,
-        "kind": kind,
-        "shown": layer.is_shown,
-        "count": len(places),
-        "low": low.tolist(),
-        "step": step.tolist(),
-        "places": _base64(steps.astype("<u2")),
-        "colors": _base64(bytes_of_color),
-    }
-
-
 def _spread(count: int, most: int) -> Int64[Tensor, " m"]:
     """Choose one row of each of ``most`` equal runs, by chance, always the same ones.
 
@@ -159,10 +146,6 @@ def _spread(count: int, most: int) -> Int64[Tensor, " m"]:
         return torch.arange(count)
     chance = torch.rand(most, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
     return ((torch.arange(most) + chance) * (count / most)).long().clamp(max=count - 1)
-
-
-def _base64(values: np.ndarray) -> str:
-    return base64.b64encode(np.ascontiguousarray(values).tobytes()).decode()
 
 
 MOST_VIEWS = 6
@@ -178,13 +161,13 @@ def spread_evenly(total: int, number: int) -> list[int]:
     return [(2 * k + 1) * total // (2 * number) for k in range(number)]
 
 
-def choose_answers(is_ok: Sequence[bool], most: int = MOST_VIEWS) -> list[int]:
+def choose_answers(is_ok: Sequence[bool]) -> list[int]:
     """Choose answers and some refusals, each spread evenly; give their places in order."""
     answered = [k for k, ok in enumerate(is_ok) if ok]
     refused = [k for k, ok in enumerate(is_ok) if not ok]
-    few = min(len(refused), max(_REFUSED, most - len(answered)), most)
+    few = min(len(refused), max(_REFUSED, MOST_VIEWS - len(answered)))
     chosen = [refused[i] for i in spread_evenly(len(refused), few)]
-    chosen += [answered[i] for i in spread_evenly(len(answered), most - few)]
+    chosen += [answered[i] for i in spread_evenly(len(answered), MOST_VIEWS - few)]
     return sorted(chosen)
 
 
