@@ -483,10 +483,8 @@ def rectify(
 def _rectified(rectifier: "Rectifier", *pair: Path) -> tuple["Tensor", "Tensor"]:
     from depthpose.core.files import read_image
 
-    left, right = (read_image(path) for path in pair)
-    rectifier.refuse_other_size(left, str(pair[0]))
-    rectifier.refuse_other_size(right, str(pair[1]))
-    return rectifier.rectify(left, right)
+    left, right = map(read_image, pair)
+    return rectifier.rectify(left, right, [str(path) for path in pair])
 
 
 def _check_rows(
