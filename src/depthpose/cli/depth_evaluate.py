@@ -309,7 +309,7 @@ def measure_shards(
     Each frame is measured where its shard is read, by truth that every worker reads; the rows are
     collected here in the order of the data set, and summed as if one process had measured them.
     """
-    items, before = jobs.result_items(predictions), jobs.read_job_settings(predictions)
+    items, before = jobs.result_items(predictions), read_settings(predictions) or {}
     name, names = jobs.stem(predictions.rstrip("/")), {item.name for item in items}
     about = {"data": data, "split": split, "protocol": protocol, "caps_m": list(caps_m)}
     home = str(out / "measured" / name)

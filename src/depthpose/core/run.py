@@ -23,7 +23,7 @@ from typing import Any
 import torch
 
 from depthpose.core.errors import InputError
-from depthpose.core.files import read_json, remove_parts, write_json
+from depthpose.core.files import disk, read_json, remove_parts, write_json
 from depthpose.core.files.disk import refused_write
 
 try:
@@ -234,15 +234,13 @@ def claim_folder(
         elif not record.exists():  # again: another process may have begun the same run
             raise not_ours(folder / there[0])
     try:
-        earlier = read_json(record)
+        earlier = read_settings(folder) or {}
     except InputError as error:
         raise InputError(
             f"{error}. What made the results is not known any more: choose another folder, or "
             "delete this one"
         ) from error
-    is_alone = find_rank().world == 1
-    before = earlier.get("settings") if isinstance(earlier, dict) else None
-    is_other = isinstance(before, dict) and _flat(before) != _flat(settings)
+    is_alone, is_other = find_rank().world == 1, _flat(earlier) != _flat(settings)
     if is_alone and is_other and _is_empty(folder):  # a run that failed before its first result
         lock_folder(record, is_shared=False)
         if _is_empty(folder):
@@ -387,15 +385,23 @@ def refuse_among_inputs(out: Path, words: Iterable[str | Path], files: Iterable[
         )
 
 
-def read_settings(folder: Path) -> dict[str, Any] | None:
-    """Give the settings that made ``folder``, or None where no run claimed it."""
-    record = folder / RECORD
-    if not record.exists():
+def read_settings(folder: Path | str) -> dict[str, Any] | None:
+    """Give the settings that made a folder, by path or URL, or None where no run claimed it.
+
+    Raises:
+        InputError: its record is damaged.
+    """
+    record = disk.join(str(folder), RECORD)
+    if not disk.exists(record):
         return None
-    content = read_json(record)
+    with disk.refused_as(record, "record of a run", "choose another folder"):
+        path = disk.local_path(record)
+        content = json.loads(disk.read_from(record)) if path is None else read_json(path)
     settings = content.get("settings") if isinstance(content, dict) else None
     if not isinstance(settings, dict):
-        raise InputError(f"{record}: has no 'settings'. Delete the file, or choose another folder.")
+        raise InputError(
+            f"{record}: not a record of a run: it has no 'settings'; choose another folder"
+        )
     return settings
 
 
@@ -409,18 +415,15 @@ def not_ours(path: Path | str) -> InputError:
 
 def refuse_other_settings(
     folder: Path | str,
-    record: object,
+    earlier: Mapping[str, Any],
     settings: Mapping[str, Any],
     remedy: str = "choose another, or delete this one",
 ) -> None:
-    """Refuse a folder whose record has other settings.
+    """Refuse a folder that was made by other settings.
 
     Raises:
         InputError: the first difference is named.
     """
-    earlier = record.get("settings") if isinstance(record, dict) else None
-    if not isinstance(earlier, dict):
-        raise InputError(f"{folder}/{RECORD}: not a record of a run. Choose another folder.")
     before, now = _flat(earlier), _flat(settings)
     for name in sorted(before.keys() | now.keys()):
         # A later version may add settings: one that either does not know counts as off.

@@ -34,7 +34,14 @@ from depthpose.core.engine.work import (
 )
 from depthpose.core.errors import InputError, MissingExtraError, import_extra
 from depthpose.core.files import disk, remove_parts
-from depthpose.core.run import RECORD, is_unchanged, not_ours, refuse_other_settings, run_record
+from depthpose.core.run import (
+    RECORD,
+    is_unchanged,
+    not_ours,
+    read_settings,
+    refuse_other_settings,
+    run_record,
+)
 
 MANIFEST = "manifest.csv"
 
@@ -131,36 +138,19 @@ def run_job(job: Job, engine: Engine) -> list[Done]:
 
 def claim(out: str, settings: Mapping[str, Any]) -> None:
     """Claim a folder, local or in a store, for a run with these settings, or continue it."""
-    record = disk.join(out, RECORD)
-    if disk.exists(record):
-        try:
-            earlier = json.loads(disk.read_from(record))
-        except ValueError as error:
-            raise InputError(f"{record}: no JSON ({error}); choose another folder") from error
+    if (earlier := read_settings(out)) is not None:
         refuse_other_settings(out, earlier, settings)
         return
     for name in (MANIFEST, PLAN, SHARDS):
         if disk.exists(disk.join(out, name)):
             raise not_ours(disk.join(out, name))
-    disk.publish_bytes(f"{json.dumps(run_record(settings), indent=2)}\n".encode(), record)
+    record = f"{json.dumps(run_record(settings), indent=2)}\n"
+    disk.publish_bytes(record.encode(), disk.join(out, RECORD))
 
 
 def is_job(out: str) -> bool:
     """Whether a folder holds shards of a job."""
     return disk.exists(disk.join(disk.absolute(out), PLAN))
-
-
-def read_job_settings(out: str) -> dict[str, Any]:
-    """Give the settings that made the shards of a folder.
-
-    Raises:
-        InputError: there are none.
-    """
-    record = disk.join(disk.absolute(out), RECORD)
-    try:
-        return dict(json.loads(disk.read_from(record))["settings"])
-    except (ValueError, KeyError, TypeError) as error:
-        raise InputError(f"{record}: not a record of a run. Choose another folder.") from error
 
 
 def result_items(out: str) -> list[Item]:
