@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping
 from pathlib import Path
+from textwrap import shorten
 from typing import TYPE_CHECKING, Literal
 
 import tyro
@@ -33,19 +34,14 @@ def list_weights(folder: Path | None = None) -> int:
             "name": path.stem,
             "kind": (read := read_checkpoint(path)).kind,
             "MB": f"{path.stat().st_size / 1e6:.1f}",
-            "licence": _in_short(read.facts.get("licence", "")),
-            "trained on": _in_short(read.facts.get("trained_on", "")),
+            "licence": shorten(read.facts.get("licence", ""), 34, placeholder=" ..."),
+            "trained on": shorten(read.facts.get("trained_on", ""), 34, placeholder=" ..."),
         }
         for path in files
     ]
     print(plain_table(rows), end="")
     print("'depthpose weights show NAME' prints origin, terms and settings of one.")
     return 0
-
-
-def _in_short(text: str) -> str:
-    """Cut a sentence at a word."""
-    return text if len(text) <= 34 else text[:30].rpartition(" ")[0].rstrip(",;") + " ..."
 
 
 def show_weights(weights: tyro.conf.Positional[WeightsName]) -> int:

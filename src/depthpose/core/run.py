@@ -119,15 +119,10 @@ _PACKAGES = ("depthpose", "torch", "numpy", "opencv-python-headless")
 
 @dataclass(frozen=True, kw_only=True)
 class ProcessRank:
-    """Rank of this process among several that share the work through files.
+    """Rank of this process among several that share the work through files."""
 
-    Attributes:
-        rank: 0 .. world - 1.
-        world: how many processes there are.
-    """
-
-    rank: int = 0
-    world: int = 1
+    rank: int = 0  #: 0 .. world - 1
+    world: int = 1  #: how many processes there are
 
     def share(self, total: int) -> range:
         """Give the indices of 0 .. total - 1 that are this process's."""

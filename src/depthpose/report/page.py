@@ -33,43 +33,27 @@ _RED_GREEN_BLUE = ((0.85, 0.2, 0.2), (0.15, 0.65, 0.25), (0.25, 0.45, 0.95))
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Lines:
-    """Straight pieces of line.
+    """Straight pieces of line."""
 
-    Attributes:
-        ends_m: both ends of each.
-        color: RGB in [0, 1], one for each piece.
-    """
-
-    ends_m: Float[Tensor, "n 2 3"]
-    color: Float[Tensor, "n 3"]
+    ends_m: Float[Tensor, "n 2 3"]  #: both ends of each
+    color: Float[Tensor, "n 3"]  #: RGB in [0, 1], one for each piece
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Layer:
-    """A part of a scene that can be hidden.
+    """A part of a scene that can be hidden."""
 
-    Attributes:
-        name: what the viewer calls it; layers of one name are hidden together.
-        shape: coloured points (NaN left out), or lines; metres, camera frame.
-        is_shown: whether it is seen at first.
-    """
-
-    name: str
-    shape: Cloud | Lines
-    is_shown: bool = True
+    name: str  #: what the viewer calls it; layers of one name are hidden together
+    shape: Cloud | Lines  #: coloured points (NaN left out), or lines; metres, camera frame
+    is_shown: bool = True  #: whether it is seen at first
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Scene:
-    """What one 3D view shows.
+    """What one 3D view shows."""
 
-    Attributes:
-        caption: stands below it.
-        layers: drawn together.
-    """
-
-    caption: str
-    layers: Sequence[Layer]
+    caption: str  #: stands below it
+    layers: Sequence[Layer]  #: drawn together
 
     def encoded(self) -> dict[str, Any]:
         """Give the JSON that ``viewer.js`` reads: base64 of 16-bit places and 8-bit colours.

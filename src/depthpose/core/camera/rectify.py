@@ -84,19 +84,12 @@ class RawCamera:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class RawPair:
-    """The calibration of two cameras whose images are not rectified.
+    """The calibration of two cameras whose images are not rectified."""
 
-    Attributes:
-        left: the left camera.
-        right: the right one.
-        right_from_left: carries points from the left camera's frame to the right one's [m].
-        size: width and height of both images [px]; None where the file does not say it.
-    """
-
-    left: RawCamera
-    right: RawCamera
-    right_from_left: Rigid
-    size: Size | None
+    left: RawCamera  #: the left camera
+    right: RawCamera  #: the right one
+    right_from_left: Rigid  #: carries points from the left camera's frame to the right one's [m]
+    size: Size | None  #: width and height of both images [px]; None where the file does not say it
 
 
 def read_raw_pair(

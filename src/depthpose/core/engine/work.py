@@ -46,15 +46,10 @@ class Files:
 
 @dataclass(frozen=True, slots=True)
 class Item:
-    """One input.
+    """One input."""
 
-    Attributes:
-        name: that of its results: unique in a job, relative, without a suffix.
-        files: paths or URLs, in the order of the roles of the work.
-    """
-
-    name: str
-    files: tuple[str, ...]
+    name: str  #: that of its results: unique in a job, relative, without a suffix
+    files: tuple[str, ...]  #: paths or URLs, in the order of the roles of the work
 
 
 def find_items(words: Sequence[str], files: Files) -> list[Item]:
@@ -321,17 +316,11 @@ def read_tar(url: str) -> Iterator[tuple[str, bytes]]:
 
 @dataclass(frozen=True, slots=True)
 class Sample:
-    """One input, its files at hand.
+    """One input, its files at hand."""
 
-    Attributes:
-        name: that of its results.
-        files: local paths, in the order of the roles.
-        reason: why there are none; a ``Function`` is given no such sample.
-    """
-
-    name: str
-    files: tuple[Path, ...] = ()
-    reason: str = ""
+    name: str  #: that of its results
+    files: tuple[Path, ...] = ()  #: local paths, in the order of the roles
+    reason: str = ""  #: why there are none; a ``Function`` is given no such sample
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -419,19 +408,12 @@ Function = Callable[[Sequence[Sample], Path], Sequence[str]]
 
 @dataclass(frozen=True, kw_only=True)
 class Work:
-    """What a job does; it is sent to every worker, which starts it once.
+    """What a job does; it is sent to every worker, which starts it once."""
 
-    Attributes:
-        start: loads what all samples need, such as a network.
-        files: what an input is made of.
-        endings: of the files of a result.
-        batch: samples that are handed over at once.
-    """
-
-    start: Callable[[], Function]
-    files: Files
-    endings: Sequence[str]
-    batch: int = 1
+    start: Callable[[], Function]  #: loads what all samples need, such as a network
+    files: Files  #: what an input is made of
+    endings: Sequence[str]  #: of the files of a result
+    batch: int = 1  #: samples that are handed over at once
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -52,17 +52,11 @@ class Interrupted(KeyboardInterrupt):
 
 @dataclass(frozen=True, kw_only=True)
 class Progress:
-    """How far a training is.
+    """How far a training is."""
 
-    Attributes:
-        step: steps done.
-        steps: steps in all.
-        numbers: the latest metrics; empty between two log steps.
-    """
-
-    step: int
-    steps: int
-    numbers: dict[str, float]
+    step: int  #: steps done
+    steps: int  #: steps in all
+    numbers: dict[str, float]  #: the latest metrics; empty between two log steps
 
 
 @dataclass(frozen=True, kw_only=True)
