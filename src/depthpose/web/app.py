@@ -198,13 +198,10 @@ class Limits:
 
     upload_bytes: int = 64 * 10**6
     """All files of one request together."""
-
     waiting: int = 4
     """Requests that may wait for the one that is computed."""
-
     uploads: int = 32
     """Requests whose files may arrive at the same time."""
-
     hosts: tuple[str, ...] | None = LOOPBACK
     """Host names under which a browser may request the page; None: any. They keep other web pages
     in the same browser from reading answers by a name of their own (DNS rebinding)."""
