@@ -146,7 +146,8 @@ def _frame_job(instance: Instance, name: str) -> Job[Any]:
             name=instance.name, depth_m=depth_m, mask=everywhere, K=instance.K, object=name
         )
 
-    return pose_methods.input_job(instance.name, name, read, place_of(instance))
+    job = Job(name=instance.name, read=read, place=place_of(instance))
+    return pose_methods.safe_job(job, name)
 
 
 def _finish(

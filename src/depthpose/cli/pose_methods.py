@@ -35,6 +35,7 @@ from depthpose.pose.mesh import FIXED_UNITS, unit_of
 from depthpose.pose.segmentation import Segmenter
 from depthpose.pose.types import ObjectModel, PoseEstimate, ViewInput
 from depthpose.pose.weights import read_pose_weights
+from depthpose.report.viewer import Viewer
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -446,9 +447,10 @@ def cloud_jobs(cloud: Path, unit: Unit, object: str, out: Path) -> list[predicti
         raise InputError(f"{cloud}: no {', '.join(known)} file there; give a cloud, or a folder")
     _refuse_one_name(files)
     refuse_among_inputs(out, [cloud], files)
+    each = {path: partial(cloud_input, path, unit, object, path.stem) for path in files}
     return [
-        input_job(p.stem, object, partial(cloud_input, p, unit, object, p.stem), source=p)
-        for p in files
+        safe_job(predictions.Job(name=path.stem, read=read, source=path), object)
+        for path, read in each.items()
     ]
 
 
@@ -489,7 +491,8 @@ def view_jobs(
         for end, one in own.items():
             name = path.stem + end
             read = partial(view_input, path, one, camera, object, name, unit)
-            jobs.append(input_job(name, object, read, source=(path, masks[path.stem])))
+            job = predictions.Job(name=name, read=read, source=(path, masks[path.stem]))
+            jobs.append(safe_job(job, object))
     twice = [name for name, count in Counter(job.name for job in jobs).items() if count > 1]
     if twice:
         raise InputError(
@@ -506,11 +509,10 @@ def frame_jobs(
     depths = _list_depths(depth)
     refuse_among_inputs(out, [depth], depths)
     _refuse_one_name(depths)
+    each = {p: partial(view_input, p, None, camera, object, p.stem, unit) for p in depths}
     return [
-        input_job(
-            p.stem, object, partial(view_input, p, None, camera, object, p.stem, unit), source=p
-        )
-        for p in depths
+        safe_job(predictions.Job(name=path.stem, read=read, source=path), object)
+        for path, read in each.items()
     ]
 
 
@@ -565,22 +567,11 @@ def bop_jobs(
     """Take the instances of a data set by some masks."""
     names = match_names(dataset, method.models)
     jobs = masks.jobs(names)
-    return [_safe(job, names[job.place.object_id]) for job in jobs if job.place is not None]
+    return [safe_job(job, names[job.place.object_id]) for job in jobs if job.place is not None]
 
 
-def input_job(
-    name: str,
-    object: str,
-    read: Callable[[], AnyInput],
-    place: predictions.Place | None = None,
-    source: Path | tuple[Path, ...] | None = None,
-) -> predictions.Job[Any]:
-    """Take one input; one that cannot be read stops no other."""
-    return _safe(predictions.Job(name=name, read=read, place=place, source=source), object)
-
-
-def _safe(job: predictions.Job[Any], object: str) -> predictions.Job[Any]:
-    """Let the job of what cannot be read give the estimate that says so."""
+def safe_job(job: predictions.Job[Any], object: str) -> predictions.Job[Any]:
+    """Let the job of what cannot be read give the estimate that says so, and stop no other."""
 
     def read() -> AnyInput | PoseEstimate:
         try:
@@ -592,12 +583,16 @@ def _safe(job: predictions.Job[Any], object: str) -> predictions.Job[Any]:
     return replace(job, read=read)
 
 
-def safely(method: PoseMethod) -> EstimateMany:
-    """Let a method skip what could not be read."""
+def safely(method: PoseMethod, viewer: Viewer | None = None) -> EstimateMany:
+    """Let a method skip what could not be read, and show the others."""
 
     def estimate_many(inputs: Sequence[Any]) -> list[PoseEstimate]:
         readable = [one for one in inputs if not isinstance(one, PoseEstimate)]
-        estimates = iter(method.estimate_many(readable))
-        return [one if isinstance(one, PoseEstimate) else next(estimates) for one in inputs]
+        estimates = method.estimate_many(readable)
+        if viewer is not None:
+            for one, estimate in zip(readable, estimates, strict=True):
+                viewer.show_pose(one, estimate, method.models_by_name[one.object])
+        left = iter(estimates)
+        return [one if isinstance(one, PoseEstimate) else next(left) for one in inputs]
 
     return estimate_many

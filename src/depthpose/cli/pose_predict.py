@@ -238,16 +238,7 @@ def predict_all(
     left = [jobs[k] for k in process.share(len(jobs)) if jobs[k].name not in done]
     if left:
         with open_viewer(None if process.rank else view) as viewer:
-
-            def estimate_many(inputs: Sequence[Any]) -> list[PoseEstimate]:
-                estimates = list(method.estimate_many(inputs))
-                for one, estimate in zip(inputs, estimates, strict=True):
-                    if viewer is not None:
-                        viewer.show_pose(one, estimate, method.models_by_name[one.object])
-                return estimates
-
-            shown = replace(method, estimate_many=estimate_many)
-            names = predict(pose_methods.safely(shown), left, home, settings, batch)
+            names = predict(pose_methods.safely(method, viewer), left, home, settings, batch)
             for _ in tqdm(names, total=len(left), disable=None, unit=" poses"):
                 pass
     if process.rank:
@@ -443,7 +434,8 @@ def start_files(
         return view_input(depth, mask, camera, object, sample.name, unit)
 
     def predict(samples: Sequence[Sample], out: Path) -> list[str]:
-        jobs = [pose_methods.input_job(s.name, object, partial(read, s)) for s in samples]
+        named = [Job(name=sample.name, read=partial(read, sample)) for sample in samples]
+        jobs = [pose_methods.safe_job(job, object) for job in named]
         return _write_estimates(method, jobs, out)
 
     return predict

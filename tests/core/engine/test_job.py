@@ -191,7 +191,7 @@ def test_a_damaged_plan_is_made_again_and_a_damaged_record_of_settings_refused(
     run_job(job, InProcessEngine())
     assert unpacked(tmp_path / "out").keys() == {"a", "b", "c", "d"}, "blocks are others now"
     (tmp_path / "out" / "run.json").write_text("{")
-    with pytest.raises(InputError, match=r"run.json: no JSON"):
+    with pytest.raises(InputError, match=r"run.json: not a readable JSON file"):
         run_job(job, InProcessEngine())
 
 
