@@ -48,8 +48,8 @@ def find_all(method: PoseMethod, inputs: OneObjectOptions, out: Path) -> int:
         raise InputError("--depth without --mask: these weights need masked views; give --mask")
     if find_rank().world > 1:
         raise InputError("--depth without --mask is done by one process; give --mask, or start one")
-    depth, unit = Path(inputs.depth), inputs.unit
-    jobs = pose_methods.frame_jobs(depth, lens, objects[0], unit, out)
+    unit = inputs.unit
+    jobs = pose_methods.frame_jobs(Path(inputs.depth), lens, objects[0], unit, out)
     names = {job.name for job in jobs}
     for name in sorted(names):
         if (plain := re.sub(r"_\d+$", "", name)) != name and plain in names:
@@ -59,7 +59,7 @@ def find_all(method: PoseMethod, inputs: OneObjectOptions, out: Path) -> int:
             )
     facts = pose_methods.camera_facts(lens) | ({} if unit is None else {"unit": unit})
     settings = {**method.settings, "find": sorted(objects), **facts}
-    pose_predict.claim(out, settings, jobs, depth, pose_predict.is_result_of)
+    pose_predict.claim(out, settings, jobs, pose_predict.is_result_of)
     left = [p for p in kept_predictions(out) if is_finished(p)]
     results: list[tuple[Prediction, Job[Any]]] = []
     for job in tqdm(jobs, disable=None, unit=" images"):
@@ -73,7 +73,7 @@ def find_all(method: PoseMethod, inputs: OneObjectOptions, out: Path) -> int:
             own = [Prediction(estimate=one) for one in found]
         results += [(one, explained_job(job, one.estimate, method)) for one in own]
         write_predictions(out, [*(prediction for prediction, _ in results), *left])
-    pose_predict.claim(out, settings, [job for _, job in results], depth, pose_predict.is_result_of)
+    pose_predict.claim(out, settings, [job for _, job in results], pose_predict.is_result_of)
     answered = [pair for pair in results if pair[0].estimate.is_posed]
     pose_predict.write_files([p for p, _ in answered], [job for _, job in answered], out, method)
     return pose_predict.say_result([prediction for prediction, _ in results], out)
@@ -108,7 +108,7 @@ def track_folder(method: PoseMethod, frames: SequenceOptions, out: Path) -> int:
         settings |= pose_methods.camera_facts(frames.camera)
     if frames.first is not None:
         settings |= {"first": pose_methods.named_file(frames.first)}
-    pose_predict.claim(out, settings, jobs, frames.cloud or frames.depth or out)
+    pose_predict.claim(out, settings, jobs)
     return _finish(method, _followed(method, jobs, name, start), jobs, out)
 
 

@@ -86,13 +86,11 @@ def claim(
     out: Path,
     settings: dict[str, Any],
     jobs: list[Job[Any]],
-    source: Path,
     is_result: Callable[[str, str], bool] = operator.eq,
 ) -> None:
-    """Claim a folder for the poses of clouds or depth images.
+    """Claim a folder for the poses of clouds or depth images, whose jobs name their files.
 
-    ``source``: of jobs that name none; ``is_result``: whether a result of the first name is of the
-    input of the second.
+    ``is_result``: whether a result of the first name is of the input of the second.
     """
     run.claim_folder(out, settings, [POSES, _PAGE])
     if run.find_rank().world == 1 and not run.read_sources(out):  # lost: of what the poses are
@@ -100,7 +98,7 @@ def claim(
     done = _finished(out)
     run.claim_names(
         out,
-        {job.name: job.source or source for job in jobs},
+        {job.name: job.source for job in jobs if job.source is not None},
         [f".{end}" for end in (PICTURE, CLOUD)],
         is_finished=lambda name: any(is_result(n, name) for n in done),
     )
@@ -126,19 +124,19 @@ def predict_files(
     name, lens = pose_methods.object_named(inputs.object, method), inputs.lens
     settings = {**method.settings, "object": name}
     if inputs.cloud is not None:
-        unit, source = inputs.unit or "m", Path(inputs.cloud)
-        jobs = pose_methods.cloud_jobs(source, unit, name, out)
+        unit = inputs.unit or "m"
+        jobs = pose_methods.cloud_jobs(Path(inputs.cloud), unit, name, out)
         settings |= {"unit": unit}
     elif inputs.depth is None or inputs.mask is None or lens is None:
         raise InputError(
             "--depth needs --camera or --focal-px beside it, and --mask unless it is to be found"
         )
     else:
-        source, mask = Path(inputs.depth), Path(inputs.mask)
-        jobs = pose_methods.view_jobs(source, mask, lens, name, inputs.unit, out)
+        mask = Path(inputs.mask)
+        jobs = pose_methods.view_jobs(Path(inputs.depth), mask, lens, name, inputs.unit, out)
         settings |= pose_methods.camera_facts(lens) | {"mask": str(mask.resolve())}
         settings |= {} if inputs.unit is None else {"unit": inputs.unit}
-    claim(out, settings, jobs, source)
+    claim(out, settings, jobs)
     predictions = predict_all(method, jobs, out, settings, batch, view)
     if predictions is None:
         return 0
