@@ -51,25 +51,15 @@ Engine = Callable[[Sequence[Block], Work, str, ShardFormat], Iterable[Done]]
 
 @dataclass(frozen=True, kw_only=True)
 class Job:
-    """What is done, to which inputs, and where the results go.
+    """What is done, to which inputs, and where the results go."""
 
-    Attributes:
-        work: what is done.
-        items: listed inputs.
-        tars: tar shards of inputs.
-        out: folder of the results, by path or URL.
-        settings: JSON values that decide the results; other settings need another folder.
-        form: of the shards.
-        block: inputs of a shard.
-    """
-
-    work: Work
-    items: Sequence[Item] = ()
-    tars: Sequence[str] = ()
-    out: str
-    settings: Mapping[str, Any]
-    form: ShardFormat = "tar"
-    block: int = 64
+    work: Work  #: what is done
+    items: Sequence[Item] = ()  #: listed inputs
+    tars: Sequence[str] = ()  #: tar shards of inputs
+    out: str  #: folder of the results, by path or URL
+    settings: Mapping[str, Any]  #: JSON values that decide the results; others need another folder
+    form: ShardFormat = "tar"  #: of the shards
+    block: int = 64  #: inputs of a shard
 
 
 def run_job(job: Job, engine: Engine) -> list[Done]:
@@ -201,8 +191,7 @@ class RayEngine:
     """Does blocks by Ray Data.
 
     Attributes:
-        address: of a running cluster, ``auto`` for the one of this machine; None starts one here,
-            and ends it afterwards.
+        address: of a running cluster, or ``auto``; None starts one for this job.
         workers: at most; None: as many as fit into the cluster when the job begins.
         worker_cpus: cores that a worker asks for.
         worker_gpus: GPUs that it asks for; a part lets workers share one.

@@ -61,22 +61,13 @@ class Progress:
 
 @dataclass(frozen=True, kw_only=True)
 class Run:
-    """Folder of a training, and callbacks.
+    """Folder of a training, and callbacks."""
 
-    Attributes:
-        folder: the run folder; the weights lie in it, named after what was trained, and their card
-            beside them.
-        resume: go on from its last state.
-        finish: make weights of its last state, without another step.
-        on_step: called after each optimiser step.
-        on_message: called with each message for the user.
-    """
-
-    folder: Path
-    resume: bool = False
-    finish: bool = False
-    on_step: Callable[[Progress], None] | None = None
-    on_message: Callable[[str], None] | None = None
+    folder: Path  #: the run folder; weights, named after what was trained, and card lie in it
+    resume: bool = False  #: go on from its last state
+    finish: bool = False  #: make weights of its last state, without another step
+    on_step: Callable[[Progress], None] | None = None  #: called after each optimiser step
+    on_message: Callable[[str], None] | None = None  #: called with each message for the user
 
     def claim(
         self,
