@@ -179,11 +179,7 @@ def _segmented(
 def distinct_names(files: Sequence[tuple[Path | None, str]]) -> list[str]:
     """Give each its own name; of equal ones, with as many folders above it as distinguish them.
 
-    Args:
-        files: the folder that something lies in, None where it lies in none, and its name.
-
-    Raises:
-        InputError: two of one name lie in one folder, or one is given twice.
+    ``files``: the folder that something lies in, None where it lies in none, and its name.
     """
     parts = [(*(folder.resolve().parts[1:] if folder else ()), name) for folder, name in files]
     for some, count in Counter(parts).items():

@@ -77,7 +77,7 @@ def run_job(job: Job, engine: Engine) -> list[Done]:
     claim(out, {**job.settings, "shards": job.form})
     blocks = make_plan(out, job.items, job.tars, job.block)
     folder = disk.join(out, SHARDS)
-    sizes, records = disk.list_sizes(folder), _finished(out)
+    sizes, records = disk.list_sizes(folder), {one.name: one for one in read_results(out)}
     done: dict[str, Done] = {}
     for block in blocks:
         one, record = records.get(block.shard), disk.join(folder, f"{block.shard}.json")
@@ -160,8 +160,12 @@ def result_items(out: str) -> list[Item]:
 
 
 def read_results(out: str) -> list[Done]:
-    """Say what an earlier job left, shard by shard; nothing where there was none."""
-    return [one for _, one in sorted(_finished(disk.absolute(out)).items())]
+    """Say what an earlier job left, shard by shard; a record that is damaged is as none."""
+    found: list[Done] = []
+    for _, text in sorted(disk.read_all(disk.join(disk.absolute(out), SHARDS), ".json").items()):
+        with suppress(ValueError, KeyError, TypeError):
+            found.append(Done.from_json(text))
+    return found
 
 
 def shard_results(out: str, done: Done) -> Iterator[tuple[str, dict[str, bytes]]]:
@@ -172,15 +176,6 @@ def shard_results(out: str, done: Done) -> Iterator[tuple[str, dict[str, bytes]]
     """
     names = {name for name, reason in done.entries if not reason}
     return read_shard(disk.join(disk.absolute(out), SHARDS, done.shard), names, done.endings)
-
-
-def _finished(out: str) -> dict[str, Done]:
-    """Read the records of shards; one that is damaged is as none."""
-    records: dict[str, Done] = {}
-    for name, text in disk.read_all(disk.join(out, SHARDS), ".json").items():
-        with suppress(ValueError, KeyError, TypeError):
-            records[name.removesuffix(".json")] = Done.from_json(text)
-    return records
 
 
 _LEAST_VERSION = (2, 52)  # the first version of Ray that has passwords
