@@ -330,15 +330,13 @@ def figure_3_5(
 class Step(NamedTuple):
     """One command: its description, the arguments of ``depthpose``, and the file that it makes.
 
-    It is done again if a file of earlier steps, ``of``, is newer. ``is_replaced``: an older file
-    and its card are deleted first, because the command replaces none.
+    It is done again if a file of earlier steps, ``of``, is newer.
     """
 
     what: str
     words: Sequence[str]
     makes: Path
     of: Sequence[Path] = ()
-    is_replaced: bool = False
 
 
 _TRAIN = " --data {data} --device {device} --resume --config {configs}/"
@@ -460,7 +458,7 @@ def reproduce_all(
             what = f"training by {words[-1].partition('/')[2]}" if "--config" in words else what
             made_of = [home / name for name in of.split()]
             filled = [word.format(**values) for word in words]
-            steps.append(Step(what, filled, home / makes, made_of, words[0] == "weights"))
+            steps.append(Step(what, filled, home / makes, made_of))
     return walk(steps)
 
 
@@ -476,7 +474,7 @@ def walk(steps: Sequence[Step]) -> int:
             print(f"{head}: done, {step.makes}", flush=True)
             continue
         print(f"{head}: depthpose {shlex.join(step.words)}", flush=True)
-        if step.is_replaced:
+        if step.words[0] == "weights":  # which replace no file, nor their card
             for path in (step.makes, step.makes.with_suffix(".md")):
                 path.unlink(missing_ok=True)
         own = main(step.words)
