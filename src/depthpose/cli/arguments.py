@@ -52,7 +52,8 @@ _PREFIXES = "^(both|sgbm|own|matched|joined|quick|fine):"
 _POSITIONAL = get_args(tyro.conf.Positional[int])[1]
 _OF_TYPES = {Path: "PATH", str: "TEXT", int: "N", float: "NUMBER"}
 _NOTHING = ("", "None")
-Group, Config = TypeVar("Group"), TypeVar("Config", bound=Any)
+Group = TypeVar("Group")
+Config = TypeVar("Config", bound=Any)
 
 
 def shown_as(metavar: str | None, help: str | None = None) -> Any:  # noqa: ANN401  tyro's own object

@@ -158,10 +158,12 @@ class Task(Protocol):
     @property
     def modules(self) -> Mapping[str, nn.Module]:
         """Networks by name; all of them are saved and resumed."""
+        ...
 
     @property
     def optimizers(self) -> Mapping[str, tuple[torch.optim.Optimizer, AdamConfig]]:
         """Optimisers with their settings; each parameter is in at most one of them."""
+        ...
 
     def step(self, batch: Any) -> Iterator[Update]:  # noqa: ANN401 - the task's own batch
         """Yield one update after the other; each optimiser steps before the next is computed.
@@ -169,9 +171,11 @@ class Task(Protocol):
         An adversarial task yields the discriminator's update, then the generator's, whose loss then
         uses the updated discriminator.
         """
+        ...
 
     def validate(self) -> ValidationResult:
         """Evaluate held-out samples; the task sets and restores the networks' mode."""
+        ...
 
 
 @runtime_checkable
@@ -186,9 +190,11 @@ class Samples(Protocol):
 
     def __len__(self) -> int:
         """Samples of one epoch."""
+        ...
 
     def __getitem__(self, sample_index: int, /) -> Any:  # noqa: ANN401 - a tuple of tensors
         """Make a sample."""
+        ...
 
 
 def shuffled_index(sample_index: int, count: int, seed: int) -> int:
