@@ -9,8 +9,8 @@ from pathlib import Path
 import pytest
 
 from depthpose.cli import main
+from depthpose.cli.arguments import refuse_ignored_options
 from depthpose.cli.depth_options import parse_bytes
-from depthpose.cli.rules import refuse_ignored_options
 from depthpose.cli.streams import Output, lasting_streams
 from depthpose.core.errors import InputError
 

@@ -26,7 +26,7 @@ from tests.pose.synthetic_objects import (
 )
 
 from depthpose.cli import main, pose_methods
-from depthpose.cli.pose_inputs import chosen_objects
+from depthpose.cli.pose_methods import chosen_objects
 from depthpose.core.camera import Camera, write_camera
 from depthpose.core.files import (
     Cloud,

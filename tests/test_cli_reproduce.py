@@ -23,7 +23,7 @@ from depthpose.depth.datasets import open_dataset
 from depthpose.depth.disparity import disparity_from_depth
 from depthpose.depth.evaluate import Evaluation, EvaluationRow
 from depthpose.depth.types import DepthEstimate, StereoInput
-from depthpose.thesis.depth import find_table
+from depthpose.thesis.depth import TABLES
 
 CAMERA_Z = ("--protocol", "eigen-raw-camera")
 
@@ -80,9 +80,7 @@ def reproduce(table: str, street: Path, out: Path, *more: str) -> int:
 def write_table(number: str, street: Path, methods: list[tuple[str, Method]], out: Path) -> int:
     caps_m, pictures = (80.0, 50.0), 1
     data = open_dataset(street)
-    return reproduce_table(
-        find_table(number), data, methods, out, "eigen-raw-camera", caps_m, pictures
-    )
+    return reproduce_table(TABLES[number], data, methods, out, "eigen-raw-camera", caps_m, pictures)
 
 
 def mono(name: str, depth_m: float) -> Method:
@@ -186,7 +184,7 @@ def test_baselines_know_the_street_they_were_fitted_to(
 
 def test_table_2_3_sets_each_weights_beside_its_row(street: Path, tmp_path: Path) -> None:
     methods = (mono("apart", 20.0), mono("tuned", 10.0))
-    chosen = list(zip(find_table("2.3").own, methods, strict=True))
+    chosen = list(zip(TABLES["2.3"].own, methods, strict=True))
     assert write_table("2.3", street, chosen, tmp_path) == 0
     rows = [row for row in rows_of(tmp_path) if row["cap_m"] == 80]
     names = [(row["source"], row["method"], row["weights"]) for row in rows]

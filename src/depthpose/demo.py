@@ -39,8 +39,7 @@ from depthpose.report.depth import depth_section
 from depthpose.report.page import Layer, Picture, Scene, Section
 from depthpose.report.pose import draw_pose, grey_depth, pose_layers, posed_cloud
 
-_STREETS_SEED = 9
-"""No weights were trained on streets of this seed."""
+_STREETS_SEED = 9  # no weights were trained on streets of this seed
 _STREET = 1
 _CAP_M = 80.0
 _FROM_ONE, _FROM_PAIR = "one image", "both images"
@@ -175,11 +174,9 @@ def read_motorcycle() -> StereoSample | None:
     return StereoSample(input=pair, truth=truth)
 
 
-_FRAMES_SEED = 9
-"""No weights were trained on frames of this seed."""
+_FRAMES_SEED = 9  # no weights were trained on frames of this seed
 
-_FRAME = 1
-"""The first that shows every part whole."""
+_FRAME = 1  # the first that shows every part whole
 
 _SAMPLE = "flange"
 """The part whose depth image, mask and camera get a folder of their own, for a first command."""

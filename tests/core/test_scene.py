@@ -56,7 +56,7 @@ def test_many_points_are_thinned_evenly_and_the_page_says_so() -> None:
 
 def test_few_points_are_all_shown_and_nothing_is_said() -> None:
     cloud = Cloud(points=torch.zeros(scenes.MOST_POINTS, 3))
-    assert Scene(caption="", layers=[Layer(name="c", shape=cloud)]).note == ""
+    assert Scene(caption="", layers=[Layer(name="c", shape=cloud)]).encoded()["note"] == ""
 
 
 def test_axes_are_red_green_blue_columns() -> None:

@@ -39,21 +39,15 @@ COMMANDS = {
     "depth match": ("depth:match", "a real stereo pair, or many, to metric depth"),
     "depth predict": ("depth:predict", "one image, or many, or a video, to metric depth"),
     "depth train": (
-        "train:train_depth",
-        "stages view, select, stereo, adapt, finetune of generator and matcher",
-    ),
+        "train:train_depth", "stages view, select, stereo, adapt, finetune of generator, matcher"),
     "depth calibrate": ("train:calibrate", "set when an image is refused as out of distribution"),
     "depth evaluate": ("depth:evaluate", "measure predictions by a named protocol"),
     "data make streets": (
-        "data:make_streets",
-        "synthetic streets with exact disparity and LiDAR, in KITTI's raw layout",
-    ),
+        "data:make_streets", "synthetic streets with exact disparity and LiDAR, in KITTI's layout"),
     "data make objects": (
         "data:make_objects", "synthetic frames of your CAD files on a table, in BOP's layout"),
     "data rectify": (
-        "data:rectify",
-        "raw pairs and their calibration to rectified pairs that depth match takes",
-    ),
+        "data:rectify", "raw pairs and their calibration to rectified pairs for depth match"),
     "data check": ("data:check", "read a whole data set and list what is wrong"),
     "data label": (
         "data:label", "truth for pairs that have none, by a matcher, where both views agree"),
@@ -73,9 +67,7 @@ COMMANDS = {
     "export pose": ("weights:export_pose", "the network of directions as an ONNX file"),
     "reproduce": ("thesis:reproduce", "a table of chapter 2: published rows, ours, difference"),
     "reproduce all": (
-        "thesis:reproduce_all",
-        "all tables of a chapter, trainings included, from KITTI or LineMOD on disk",
-    ),
+        "thesis:reproduce_all", "all tables of a chapter, trainings too, from KITTI or LineMOD"),
     "reproduce 3.1": ("thesis:table_3_1", "the method beside its baselines, by object"),
     "reproduce 3.2": ("thesis:table_3_2", "LineMOD: published rows, ours, difference"),
     "reproduce 3.3": ("thesis:table_3_3", "RANSAC against least squares"),
@@ -93,8 +85,7 @@ _REMOVED_COMMANDS = {
     "pose calibrate": "no risk is calibrated any more; 'pose predict --min-certainty' says how "
     "sure an answer must be, for all weights",
 }
-_THESIS = ("reproduce", "figure")
-"""Groups of commands that reproduce the thesis."""
+_THESIS = ("reproduce", "figure")  # groups of commands that reproduce the thesis
 _EXIT_CODES = """exit codes:
   0    done
   1    done, but something in the input failed, or the output could not be written (it is named)
@@ -221,7 +212,7 @@ def _run(words: list[str]) -> int:
             raise InputError(f"'depthpose {name}' has no {option} any more: {remedy}")
     import tyro
 
-    from depthpose.cli import arguments, rules
+    from depthpose.cli import arguments
 
     home, _, function = COMMANDS[name][0].partition(":")
     command: Callable[..., int] = getattr(import_module(f"depthpose.cli.{home}"), function)
@@ -236,7 +227,7 @@ def _run(words: list[str]) -> int:
         )
     except SystemExit as stop:  # tyro has printed help (0) or the wrong arguments (2)
         return int(stop.code or 0)
-    rules.refuse_ignored_options(name, rest)
+    arguments.refuse_ignored_options(name, rest)
     arguments.refuse_missing(command, given.arguments)
     code = command(*given.args, **given.kwargs)
     sys.stdout.flush()

@@ -39,9 +39,9 @@ def make_streets(
 ) -> int:
     """Render synthetic street scenes with exact disparity, in KITTI's raw layout.
 
-    Existing frames are skipped, so an interrupted run can be resumed, and a later run with another
-    --first adds to it; runs at the same time need a folder each. Each rig of KITTI's five recording
-    days gets a date of its own, 2100_01_01 to 2100_01_05, which no real drive has.
+    Existing frames are skipped, and a later run with another --first adds to them; runs at the same
+    time need a folder each. Each rig of KITTI's five recording days gets a date that no real drive
+    has, 2100_01_01 to 2100_01_05.
 
     Args:
         out: folder to write to.
@@ -99,8 +99,7 @@ def make_objects(
 ) -> int:
     """Render frames of objects on a table, with image, depth, masks and poses, in BOP's layout.
 
-    A scene has 50 frames; existing scenes are skipped, so an interrupted run can be resumed.
-    'depthpose data check OUT' checks the result.
+    A scene has 50 frames; existing scenes are skipped. 'depthpose data check OUT' checks them.
 
         depthpose data make objects --cad part.stl clamp.stl --unit mm --out synthetic --number 500
 
@@ -183,13 +182,13 @@ def check(
 ) -> int:
     """Read a data set and list everything that is wrong: pairs, KITTI, Middlebury, BOP, LineMOD.
 
-    Prints a line for each file that is missing, truncated or of the wrong size, and a summary.
-    Exit code 0: nothing wrong. 1: something is. 2: the layout of the folder is unknown.
+    A line for each missing, truncated or wrong file, and a summary. Exit code 0: nothing wrong. 1:
+    something is. 2: the layout of the folder is unknown.
 
     Args:
         path: the dataset's folder.
-        split: only these frames: eigen-train, -val, -train-val, -test, -benchmark, or a file of
-            monodepth's or monodepth2's form; of a BOP dataset, one of its splits.
+        split: only these frames: eigen-train, -val, -train-val, -test, -benchmark, a file of
+            monodepth's or monodepth2's form, or a split of a BOP dataset.
         with_decoding: decode every image in full, which finds truncation, and pairs that are
             swapped, not rectified or no pair; off reads headers only.
     """
@@ -260,8 +259,7 @@ def duplicates(
 
     Training on frames of the evaluation's drives makes every number too good. Left images are
     compared by their fine structure over small shifts and zooms: 1 is the same image, two streets
-    stay below 0.3. Check the listed images by eye. The most similar pair is always printed. Exit
-    code 0: none listed. 1: some.
+    stay below 0.3. Check the list by eye. Exit code 0: none is listed. 1: some are.
 
         depthpose data duplicates my-pairs kitti-eval
 
@@ -357,13 +355,11 @@ def export_depth(
 ) -> int:
     """Write depth of 'depth predict' or 'depth match' as files of COLMAP or nerfstudio.
 
-    colmap: OUT/stereo/depth_maps/IMAGE.geometric.bin; OUT is a dense workspace. COLMAP's
-    stereo_fusion needs normal maps too, which are not written.
-    nerfstudio: OUT/depths/NAME.png or .npy in millimetres, 0 where nothing is known. Where OUT
-    holds transforms.json, transforms_depth.json is written beside it, with depth_file_path of
-    each frame: ns-train depth-nerfacto --data OUT/transforms_depth.json.
-    Depth is in metres; a reconstruction from images alone has another unit: --scale is the number
-    of its units in a metre.
+    colmap: OUT/stereo/depth_maps/IMAGE.geometric.bin of a dense workspace, OUT; stereo_fusion needs
+    normal maps too, which are not written. nerfstudio: OUT/depths/NAME.png or .npy in millimetres,
+    0 where nothing is known, and beside transforms.json of OUT transforms_depth.json, which names
+    them: ns-train depth-nerfacto --data OUT/transforms_depth.json. Depth is in metres; a
+    reconstruction from images alone has another unit: --scale is how many make a metre.
 
         depthpose data export-depth out --format colmap --out dense
         depthpose data export-depth out --format nerfstudio --files npy --out data
@@ -418,8 +414,7 @@ def _shown(written: "Iterable[Any]", total: int | None, what: str) -> "Iterable[
     return tqdm(written, total=total, unit=f" {what}", leave=False, disable=None)
 
 
-_LOOKED_AT = 8
-"""Pairs that are checked before anything is written."""
+_LOOKED_AT = 8  # pairs that are checked before anything is written
 _WARN_PX = 0.5
 _SIDES = ("left", "right")
 _ASK = "were the cameras moved since, or are the images scaled or cropped? Calibrate anew"
@@ -437,10 +432,9 @@ def rectify(
 ) -> int:
     """Rectify raw stereo pairs by the calibration of their two cameras, with OpenCV.
 
-    Writes left/NAME.png, right/NAME.png and camera.json, the camera of the rectified pairs: OUT is
-    input for 'depth match' and 'data check'. First, corners of up to 8 pairs are
-    matched and the differences of their rows printed: a warning above 0.5 px, an error where most
-    of these pairs are not rectified. Needs the extra 'opencv'.
+    Writes left/NAME.png, right/NAME.png and camera.json: OUT is input for 'depth match'. First,
+    corners of up to 8 pairs are matched and the differences of their rows printed: a warning above
+    0.5 px, an error where most of these pairs are not rectified. Needs the extra 'opencv'.
 
         depthpose data rectify left.png right.png --camera stereo.yaml --out rectified
         depthpose data rectify 'raw/cam0/*.png' 'raw/cam1/*.png' --camera camchain.yaml --out out
@@ -448,8 +442,7 @@ def rectify(
 
     Args:
         left: raw left image, a folder of them, or a quoted pattern such as 'left/*.png'.
-        right: raw right image, folder or pattern; images are paired by their names, or the numbers
-            in them.
+        right: raw right image, folder or pattern; paired by their names, or the numbers in them.
         camera: calibration of both cameras: a camchain of Kalibr, a file of OpenCV's K1, D1, K2,
             D2, R, T (YAML, XML, JSON), or a folder with its intrinsics.yml and extrinsics.yml or
             with left.yaml and right.yaml of ROS.
@@ -493,10 +486,8 @@ def rectify(
 def _rectified(rectifier: "Rectifier", *pair: Path) -> tuple["Tensor", "Tensor"]:
     from depthpose.core.files import read_image
 
-    left, right = (read_image(path) for path in pair)
-    rectifier.refuse_other_size(left, str(pair[0]))
-    rectifier.refuse_other_size(right, str(pair[1]))
-    return rectifier.rectify(left, right)
+    left, right = map(read_image, pair)
+    return rectifier.rectify(left, right, [str(path) for path in pair])
 
 
 def _check_rows(

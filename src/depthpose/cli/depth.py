@@ -27,9 +27,8 @@ def predict(
     For each NAME.png: NAME.depth_m.npy (metres, NaN where invalid and in the sky), NAME.depth.png
     (16 bit, metres x 256), NAME.disparity_px.npy, NAME.confidence.npy (0..1), NAME.right.png (the
     synthesised view), NAME.sky.png (255 in the sky, where the weights know it), NAME.color.png, and
-    NAME.cloud.ply with --cloud. A video gives the files of each frame and NAME.color.mp4.
-    report.html shows some of them, with the cloud in 3D. A rerun skips what is finished; other
-    settings need another --out. Only files of the same run are overwritten.
+    NAME.cloud.ply with --cloud; of a video those of each frame, and NAME.color.mp4. report.html
+    shows some. A rerun skips what is finished; other settings need another --out.
 
         depthpose depth predict street.png --camera cam.json --out out
         depthpose depth predict drive.mp4 --fov 90 --camera-height 1.4 --out out
@@ -43,6 +42,7 @@ def predict(
 
     if not images:
         raise InputError("name images, folders of them, patterns or videos to predict from")
+    options.refuse_unusable(scale, output)
     method = MethodSource(
         weights=networks.weights,
         config=matching.config,
@@ -52,16 +52,13 @@ def predict(
         answer=networks.answer,
         use="images",
     )
-    options.refuse_unusable(scale, output)
-    if engine.is_ray:
-        work.refuse_videos(images)
-        method = method.packed()
+    method = method.packed() if engine.engine == "ray" else method
 
     def work_of(sources: Sequence[Path]) -> work.DepthWork:
-        known = work.read_lens(lens, sources, scale)
-        return work.DepthWork(method=method, lens=known, output=output)
+        camera = work.read_lens(lens, sources)
+        return work.DepthWork(method=method, camera=camera, scale=scale, output=output)
 
-    if engine.is_ray:
+    if engine.engine == "ray":
         return work.estimate_by_engine(images, work.IMAGES, work_of, out, engine)
     sources = work.find_sources(images, Path(out))
     this, built = work_of(sources), method.build()
@@ -86,11 +83,9 @@ def match(
 ) -> int:
     """Match real stereo pairs to metric depth.
 
-    For each NAME.png on the left: NAME.depth_m.npy (metres, NaN where invalid and in the sky),
-    NAME.depth.png (16 bit, metres x 256), NAME.disparity_px.npy, NAME.confidence.npy (0..1),
-    NAME.sky.png by weights that predict the sky, NAME.color.png, and NAME.cloud.ply with --cloud.
-    report.html shows some of them, with the cloud in 3D. A rerun skips
-    what is finished; other settings need another --out. Only files of the same run are overwritten.
+    For each NAME.png on the left the files of 'depth predict', but for the right view: depth in
+    metres, disparity, confidence, sky, colours, and the cloud with --cloud. report.html shows some.
+    A rerun skips what is finished; other settings need another --out.
 
         depthpose depth match left.png right.png --camera cam.json --out out
         depthpose depth match left.png right.png --camera cam.json --matcher sgbm --out sgbm
@@ -98,8 +93,7 @@ def match(
     Args:
         left: left image, a folder of them, or a quoted pattern such as 'left/*.png'; with --engine
             ray also a manifest with columns left and right, or tar shards of both, without RIGHT.
-        right: right image, folder or pattern; images are paired by their names, or the numbers in
-            them.
+        right: right image, folder or pattern; paired by their names, or the numbers in them.
         camera: JSON file: {"width", "height", "K": 3x3, "baseline_m"}, or that of KITTI,
             Middlebury, ROS or OpenCV; for ROS and OpenCV also a folder with both cameras' files.
         out: folder for the results.
@@ -114,16 +108,16 @@ def match(
 
     used = None if pairs.matcher == "sgbm" else pairs.matcher or pairs.weights or "default"
     method = MethodSource(weights=used, config=matching.config, with_right=True, use="pairs")
-    method = method.packed() if engine.is_ray else method
+    method = method.packed() if engine.engine == "ray" else method
 
     def work_of(files: Sequence[Path]) -> work.DepthWork:
-        lens = work.Lens(camera=read_rig(camera, image_size(files[0])))
+        rig = read_rig(camera, image_size(files[0]))
         output = options.PredictOutput(cloud=pairs.cloud)
         return work.DepthWork(
-            method=method, lens=lens, output=output, with_check=pairs.check, files=work.PAIRS
+            method=method, camera=rig, output=output, with_check=pairs.check, files=work.PAIRS
         )
 
-    if engine.is_ray:
+    if engine.engine == "ray":
         sides = [left] if right is None else [left, right]
         return work.estimate_by_engine(sides, work.PAIRS, work_of, out, engine)
     if right is None:
@@ -133,7 +127,7 @@ def match(
     refuse_among_inputs(Path(out), (left, right), [path for pair in files for path in pair])
     built = method.build()
     if matching.tile is not None:
-        pair = this.lens.input_of(files[0][0].stem, *files[0])
+        pair = this.input_of(files[0][0].stem, *files[0])
         assert pair.right is not None
         assert isinstance(built.net, FakestereoNet)
         if not isinstance(built.net.matcher, NetworkMatcher):
@@ -154,10 +148,9 @@ def evaluate(
 ) -> int:
     """Measure depth on a dataset by a named protocol, and write rows, a table and a page.
 
-    Predictions are made once, as files in OUT/predictions/METHOD, and measured from there; a second
-    run measures without predicting anew. --predictions measures the files of any other method.
-    Several methods may be named at once: their rows share the table. Under torchrun or accelerate
-    launch the processes share the frames, and the first one measures.
+    Predictions are made once, as files in OUT/predictions/METHOD, and measured from there. Several
+    methods share the table; --predictions measures the files of any other. Under torchrun or
+    accelerate launch the processes share the frames, and the first one measures.
 
     Protocols: eigen-raw (one LiDAR scan, depth = LiDAR x, Garg crop: the published one),
     eigen-raw-camera (depth = camera z), eigen-improved (annotated maps, no crop),
@@ -166,11 +159,9 @@ def evaluate(
     Args:
         data: KITTI raw, object, 2012/2015, Middlebury, or a plain folder of pairs.
         out: folder for rows.json, rows.csv, table.md, report.html and the predictions.
-        split: eigen-test, eigen-val, eigen-train, eigen-train-val, eigen-benchmark, or a file of
-            frames.
+        split: eigen-test, -val, -train, -train-val, -benchmark, or a file of frames.
     """
     from depthpose.cli.depth_evaluate import (
-        ShardTruth,
         choose_methods,
         measure,
         measure_shards,
@@ -200,10 +191,10 @@ def evaluate(
     folders = [predict_all(dataset, method, rule, out / "predictions") for method in chosen]
     name, caps_m, predictions = comparison.protocol, comparison.cap, methods.predictions
     if predictions is not None and is_job(predictions):
-        truth = ShardTruth(data=str(data.resolve()), split=split, protocol=name, caps_m=caps_m)
-        ready = measure_shards(dataset, predictions, truth, out, engine)
+        home = str(data.resolve())
+        ready = measure_shards(dataset, predictions, home, split, name, caps_m, out, engine)
         return measure(dataset, folders, name, caps_m, out, [ready])
-    if engine.is_ray:
+    if engine.engine == "ray":
         raise InputError("--engine ray measures shards; give them by --predictions")
     folders += [] if predictions is None else [Path(predictions)]
     return measure(dataset, folders, name, caps_m, out)

@@ -3,7 +3,7 @@
 import json
 import sys
 import tempfile
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -25,7 +25,6 @@ from depthpose.depth.evaluate import (
     Evaluation,
     Measured,
     Protocol,
-    Row,
     evaluate,
     frame_result,
     has_truth,
@@ -42,11 +41,6 @@ from depthpose.report.page import Section
 
 _SAID_ABOVE = ("method", "input", "speed", "weights", "protocol", "dataset")
 """Columns that the title of a frame's part of the page says already."""
-
-
-def columns(rows: Sequence[Row]) -> list[dict[str, Any]]:
-    """Give rows as files and pages take them."""
-    return [row.columns() for row in rows]
 
 
 def open_frames(data: Path, split: str | None) -> Dataset:
@@ -143,7 +137,7 @@ def measure(
         return 0
     each = measure_each(dataset, folders, protocol, caps_m)
     measured = join([*each, *ready])
-    rows = columns(measured.rows)
+    rows = [row.columns() for row in measured.rows]
     page.write_table(out, rows)
     about = f"{protocol}: {PROTOCOLS[protocol].summary}."
     unknown = sum(frame.right is not None and not frame.calibration for frame in dataset.frames)
@@ -236,7 +230,9 @@ def join(each: Sequence[Evaluation]) -> Evaluation:
 
 def write_details(measured: Evaluation, out: Path) -> list[Section]:
     """Write each frame's numbers, and the error by confidence; give them as parts of a page."""
-    frames, deciles = columns(measured.per_frame), columns(measured.deciles)
+    frames, deciles = (
+        [row.columns() for row in rows] for rows in (measured.per_frame, measured.deciles)
+    )
     page.write_table(out, frames, name="frames")
     if deciles:
         page.write_table(out, deciles, name="confidence")
@@ -261,34 +257,16 @@ def say_skipped(measured: Evaluation) -> None:
 
 
 ENDING = "measured.json"
-RESULTS = jobs.Files(roles=("record", "shard"), suffixes=(".json", ".tar", ".parquet"))
 
 
-@dataclass(frozen=True, kw_only=True)
-class ShardTruth:
-    """Shards of predictions to the numbers of their frames; every worker reads the truth."""
+def start_measuring(
+    data: str, split: str | None, protocol: str, caps_m: Sequence[float]
+) -> jobs.Function:
+    """Open a data set, and give what turns shards of predictions into the numbers of its frames."""
+    dataset = open_dataset(Path(data), split)
+    places = {frame.name: index for index, frame in enumerate(dataset.frames)}
 
-    data: str
-    split: str | None
-    protocol: str
-    caps_m: tuple[float, ...]
-    files: jobs.Files = RESULTS
-    endings: Sequence[str] = (ENDING,)
-    batch: int = 1
-
-    def start(self) -> jobs.Function:
-        """Open the data set."""
-        dataset = open_dataset(Path(self.data), self.split)
-        places = {frame.name: index for index, frame in enumerate(dataset.frames)}
-
-        def measure(samples: Sequence[jobs.Sample], out: Path) -> list[str]:
-            return [self._measure_shard(dataset, places, sample, out) for sample in samples]
-
-        return measure
-
-    def _measure_shard(
-        self, dataset: Dataset, places: Mapping[str, int], sample: jobs.Sample, out: Path
-    ) -> str:
+    def measure_shard(sample: jobs.Sample, out: Path) -> str:
         """Measure each frame by the files of its prediction; give why not where that fails."""
         record, shard = sample.files
         measured: dict[str, Any] = {}
@@ -297,11 +275,11 @@ class ShardTruth:
             names = {name for name, reason in done.entries if not reason and name in places}
             for name, files in jobs.read_shard(str(shard), names, done.endings):
                 with tempfile.TemporaryDirectory(prefix="depthpose-") as folder:
-                    for ending, data in files.items():
+                    for ending, content in files.items():
                         path = Path(folder) / f"{name}.{ending}"
                         path.parent.mkdir(parents=True, exist_ok=True)
-                        path.write_bytes(data)
-                    rows = self.measure_frame(dataset, places[name], Path(folder))
+                        path.write_bytes(content)
+                    rows = measure_frame(dataset, places[name], Path(folder), protocol, caps_m)
                 is_said = isinstance(rows, str)
                 measured[name] = rows if is_said else [asdict(row) for row in rows]
         except InputError as error:
@@ -309,38 +287,46 @@ class ShardTruth:
         (out / f"{sample.name}.{ENDING}").write_text(json.dumps(measured))
         return ""
 
-    def measure_frame(self, dataset: Dataset, index: int, folder: Path) -> list[Measured] | str:
-        """Measure one frame; a word where it has no truth."""
-        return measure_frame(dataset, index, folder, self.protocol, self.caps_m)
+    return lambda samples, out: [measure_shard(sample, out) for sample in samples]
 
 
 def measure_shards(
-    dataset: Dataset, predictions: str, truth: ShardTruth, out: Path, engine: EngineOptions
+    dataset: Dataset,
+    predictions: str,
+    data: str,
+    split: str | None,
+    protocol: str,
+    caps_m: Sequence[float],
+    out: Path,
+    engine: EngineOptions,
 ) -> Evaluation:
     """Measure shards of predictions, here or on a cluster, and put the rows together.
 
-    Each frame is measured where its shard is read; the rows of all frames are collected here in the
-    order of the data set, and summed as if one process had measured them.
+    Each frame is measured where its shard is read, by truth that every worker reads; the rows are
+    collected here in the order of the data set, and summed as if one process had measured them.
     """
-    items, before = jobs.result_items(predictions), jobs.read_job_settings(predictions)
+    items, before = jobs.result_items(predictions), read_settings(predictions) or {}
     name, names = jobs.stem(predictions.rstrip("/")), {item.name for item in items}
-    about = {"data": truth.data, "split": truth.split, "protocol": truth.protocol}
-    # Of what a worker writes: a job that was begun by another version is refused.
-    settings = {"predictions": before, **about, "caps_m": list(truth.caps_m), "format": 2}
+    about = {"data": data, "split": split, "protocol": protocol, "caps_m": list(caps_m)}
     home = str(out / "measured" / name)
-    job = jobs.Job(work=truth, items=items, out=home, settings=settings, block=1)
+    files = jobs.Files(roles=("record", "shard"), suffixes=(".json", ".tar", ".parquet"))
+    start = partial(start_measuring, data, split, protocol, caps_m)
+    work = jobs.Work(start=start, files=files, endings=(ENDING,))
+    # Of what a worker writes: a job that was begun by another version is refused.
+    settings = {"predictions": before, **about, "format": 2}
+    job = jobs.Job(work=work, items=items, out=home, settings=settings, block=1)
     rows: dict[str, list[Measured] | str] = {}
-    for done in jobs.run_job(job, engine.build() if engine.is_ray else jobs.run_here):
+    for done in jobs.run_job(job, engine.build() if engine.engine == "ray" else jobs.run_here):
         for failed, reason in done.failures:
             if failed in names:
                 raise InputError(f"{home}: {reason}")
-        for item, files in jobs.shard_results(home, done):
-            of_frames = json.loads(files[ENDING]) if item in names else {}
+        for item, made in jobs.shard_results(home, done):
+            of_frames = json.loads(made[ENDING]) if item in names else {}
             for frame, some in of_frames.items():
                 is_said = isinstance(some, str)
                 rows[frame] = some if is_said else [Measured(**one) for one in some]
     with tempfile.TemporaryDirectory() as nothing:
         for index, frame in enumerate(dataset.frames):
             if frame.name not in rows:  # it has no truth, or its absence is an error
-                rows[frame.name] = truth.measure_frame(dataset, index, Path(nothing))
-    return signed(summarise(dataset, truth.protocol, rows), name, before)
+                rows[frame.name] = measure_frame(dataset, index, Path(nothing), protocol, caps_m)
+    return signed(summarise(dataset, protocol, rows), name, before)

@@ -23,12 +23,10 @@ class MatcherOptions:
     precision: Literal["fp32", "bf16"] = "fp32"
     """fp32, or bf16: faster, with errors of a few hundredths of a pixel."""
     max_memory: Annotated[str | None, shown_as("SIZE")] = None
-    """limit on the memory of a matcher's activations, such as 1GB or 800MB; the result stays
-    exact."""
+    """limit on a matcher's activations, such as 1GB or 800MB; the result stays exact."""
     speed: Speed = "fine"
-    """quick: at the size that the weights were trained at; fine: one image is looked at in a larger
-    size too, a pair matched at up to 280,000 pixels (PSMNet) or 650,000 (light), for KITTI in about
-    3 times the time."""
+    """quick: at the size that the weights were trained at; fine: one image in a larger size too, a
+    pair at up to 280,000 pixels (PSMNet) or 650,000 (light): for KITTI 3 times the time."""
 
     @property
     def config(self) -> MatcherConfig:
@@ -49,8 +47,7 @@ class LensOptions:
     """JSON file: {"width", "height", "K": 3x3}, or that of KITTI, Middlebury, TUM RGB-D, BOP, ROS
     or OpenCV. A baseline in it is ignored: one image has none."""
     focal_px: float | None = None
-    """focal length in pixels, in place of a camera; the principal point is then the centre of the
-    image."""
+    """focal length in pixels, in place of a camera; its axis meets the centre of the image."""
     fov: float | None = None
     """horizontal field of view in degrees, in place of both."""
 
@@ -61,14 +58,14 @@ class ScaleOptions:
 
     camera_height: float | None = None
     """height of the camera above the road in metres: with --camera-tilt the road gets the depth of
-    that plane; what stands on it, and all without a tilt, is scaled half of the way to it, since
-    its size says another scale ("mount_height_m" of a camera file)."""
+    that plane; what stands on it, and all without a tilt, is scaled half of the way to it
+    ("mount_height_m" of a camera file)."""
     camera_tilt: float | None = None
     """tilt of the camera in degrees, negative downwards, for --camera-height ("tilt_deg" of a
     camera file)."""
     known_distance: str | None = None
     """X,Y,METRES: column and row of a pixel and its measured depth along the optical axis, which
-    sets the scale of each image in place of the camera's height."""
+    sets the scale of each image."""
 
     @property
     def distance(self) -> tuple[float, float, float] | None:
@@ -89,8 +86,8 @@ class MatchOptions(MatcherOptions):
     """How the matcher of the weights runs; sgbm takes none of these."""
 
     tile: tuple[int, int] | None = None
-    """match tiles of so many rows and columns: less memory; the result is approximate. The first
-    pair is matched whole as well, and the change of its disparity is printed."""
+    """match tiles of so many rows and columns: less memory, an approximate result. The first pair
+    is matched whole as well, and the change is printed."""
     left_right_check: bool = False
     """match the mirrored pair too, which makes the confidence better."""
 
@@ -114,8 +111,7 @@ class PairNetworks:
     cloud: bool = False
     """write a coloured point cloud of what is nearer than 80 m, NAME.cloud.ply."""
     check: bool = True
-    """refuse pairs that are swapped, not rectified or no pair, and warn where this cannot be
-    told."""
+    """refuse pairs that are swapped, not rectified or no pair; warn where this cannot be told."""
 
 
 @group
@@ -131,8 +127,7 @@ class ImageNetworks:
     """own: the generator's own disparity; matched: the matcher on left and synthesised right view;
     joined: both. Default: what the weights say; with --matcher, matched."""
     allow_ood: bool = False
-    """also answer out-of-distribution images, with a warning (NAME.warning.txt), in
-    place of refusing them."""
+    """also answer out-of-distribution images, with a warning (NAME.warning.txt)."""
 
 
 @group
@@ -142,8 +137,7 @@ class PredictOutput:
     color_range: tuple[float, float] = (3.0, 80.0)
     """metres of the brightest and the darkest colour, the same for all pictures."""
     batch: int = 1
-    """images of one size that go through the networks together: for a GPU; a processor is busy
-    with one."""
+    """images of one size that go through the networks together: for a GPU."""
     cloud: bool = False
     """write a coloured point cloud of what is nearer than 80 m, NAME.cloud.ply."""
     view: View = None
@@ -178,11 +172,11 @@ class MethodOptions:
     matcher: Literal["sgbm"] | None = None
     """sgbm measures OpenCV's StereoSGBM on both views, and no weights."""
     holes: Literal["fill", "leave"] = "fill"
-    """sgbm's pixels without an answer: fill, as KITTI's devkit does, or leave them out (then the
-    column 'coverage' is the share that was measured)."""
+    """sgbm's pixels without an answer: fill, as KITTI's devkit does, or leave out ('coverage' is
+    then the share that was measured)."""
     predictions: Source | None = None
-    """measure these files: NAME.disparity_px.npy or NAME.depth_m.npy; or the shards that 'depth
-    predict|match --engine ray' left, path or URL."""
+    """measure these files: NAME.disparity_px.npy or NAME.depth_m.npy; or the shards, path or URL,
+    of 'depth predict|match --engine ray'."""
     baseline: Annotated[tuple[BaselineName, ...], tyro.conf.arg(aliases=("--floor",))] = ()
     """what every method must beat: rows (the best constant depth of each image row) or nearest (the
     depth of the training image that looks most alike), or both."""

@@ -3,9 +3,9 @@
 import re
 import sys
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, field
 from functools import partial
 from itertools import islice
 from pathlib import Path
@@ -15,6 +15,7 @@ import torch
 from torch import Tensor
 from tqdm import tqdm
 
+from depthpose.cli.arguments import changed
 from depthpose.cli.depth_methods import Method, MethodSource
 from depthpose.cli.depth_options import LensOptions, PredictOutput, ScaleOptions
 from depthpose.cli.engine import EngineOptions, say
@@ -22,7 +23,7 @@ from depthpose.core import run
 from depthpose.core.camera import Camera, FieldOfView, StereoRig, camera_of, read_camera
 from depthpose.core.camera.pinhole import camera_keys
 from depthpose.core.draw import draw_depth
-from depthpose.core.engine import Files, Function, Inputs, Sample
+from depthpose.core.engine import Files, Function, Inputs, Sample, Work
 from depthpose.core.errors import InputError
 from depthpose.core.files import (
     VIDEO_SUFFIXES,
@@ -37,7 +38,6 @@ from depthpose.core.files import (
 from depthpose.core.files.disk import find_partners
 from depthpose.core.files.images import LISTED_SUFFIXES
 from depthpose.core.files.text import read_text
-from depthpose.core.run import note_result
 from depthpose.depth.estimator import FakestereoNet
 from depthpose.depth.ground import scale_by_distance
 from depthpose.depth.predictions import CLOUD_M, ENDINGS, is_finished, read_estimate, write_estimate
@@ -51,64 +51,16 @@ PAIRS = Files(roles=("left", "right"), suffixes=LISTED_SUFFIXES)
 _PAGE = "report.html"
 _VIDEO = ".color.mp4"
 _SAME_FOCAL = 0.01
-Named = Iterable[tuple[str, Callable[[], StereoInput]]]
-"""Names of inputs, and how each is read."""
+Named = Iterator[tuple[str, Callable[[], StereoInput]]]  # names of inputs, and how each is read
 
 
-@dataclass(frozen=True, kw_only=True)
-class Lens:
-    """What is known of the camera of images, or the rig of pairs, and what sets the scale."""
-
-    camera: Camera | FieldOfView | float
-    scale: ScaleOptions = field(default_factory=ScaleOptions)
-
-    def __post_init__(self) -> None:
-        mount_m = self.scale.camera_height or getattr(self.camera, "mount_height_m", None)
-        if self.scale.camera_tilt is not None and mount_m is None:
-            raise InputError(
-                "--camera-tilt says where the road is together with --camera-height, or the "
-                "camera file's mount_height_m; give the height, or omit the tilt"
-            )
-
-    def input_of(self, name: str, left: Tensor | Path, right: Path | None = None) -> StereoInput:
-        """Make the input of an image or a pair, read already or not."""
-        image = read_image(left) if isinstance(left, Path) else left
-        camera = camera_of(self.camera, (image.shape[2], image.shape[1]))
-        assert camera is not None
-        mount = {"mount_height_m": self.scale.camera_height, "tilt_deg": self.scale.camera_tilt}
-        camera = replace(camera, **{key: v for key, v in mount.items() if v is not None})
-        other = None if right is None else read_image(right)
-        return StereoInput(name=name, left=image, right=other, camera=camera)
-
-    def inputs_of(self, files: Sequence[Path]) -> Iterator[tuple[str, Callable[[], StereoInput]]]:
-        """Give the one input of an image or a pair, or every frame of a video."""
-        if not _is_video(files[0]):
-            yield files[0].stem, partial(self.input_of, files[0].stem, *files)
-            return
-        for name, frame in read_video(files[0]):
-            yield name, partial(self.input_of, name, frame)
-
-    def facts(self) -> dict[str, Any]:
-        """Give what decides depth, as JSON values, for the record of a run."""
-        known: dict[str, Any] = {"focal_px": self.camera}
-        if isinstance(self.camera, FieldOfView):
-            known = {"fov_deg": self.camera.degrees}
-        elif isinstance(self.camera, StereoRig):
-            known = {"K": self.camera.K.tolist(), "baseline_m": self.camera.baseline_m}
-            known["cx_right_minus_left_px"] = self.camera.cx_right_minus_left_px
-        elif isinstance(self.camera, Camera):
-            keys = camera_keys(self.camera)
-            known = {key: keys[key] for key in ("K", "mount_height_m", "tilt_deg") if key in keys}
-        return known | {key: v for key, v in asdict(self.scale).items() if v is not None}
-
-
-def read_lens(options: LensOptions, sources: Sequence[Path], scale: ScaleOptions) -> Lens:
+def read_lens(options: LensOptions, sources: Sequence[Path]) -> Camera | FieldOfView | float:
     """Read what the user knows of the camera; without any of it the EXIF of the images is asked."""
     focal_px, fov = options.focal_px, options.fov
     if focal_px is not None and not 1 < focal_px < 1e6:
         raise InputError(f"--focal-px {focal_px}: not a focal length in pixels; KITTI's is 721.5.")
     if fov is not None:
-        return Lens(camera=FieldOfView(fov), scale=scale)
+        return FieldOfView(fov)
     if options.camera is None and focal_px is None:  # what the EXIF of all images says
         known: dict[str, tuple[float, str]] = {}
         for source in sources:
@@ -139,7 +91,7 @@ def read_lens(options: LensOptions, sources: Sequence[Path], scale: ScaleOptions
               "picture it is another", file=sys.stderr)  # fmt: skip
     if options.camera is None:
         assert focal_px is not None
-        return Lens(camera=focal_px, scale=scale)
+        return focal_px
     size = None  # of the images, for a camera file that says none
     for source in sources:
         with suppress(InputError):  # an image that cannot be read fails by itself, later
@@ -153,15 +105,15 @@ def read_lens(options: LensOptions, sources: Sequence[Path], scale: ScaleOptions
     if isinstance(read, StereoRig):
         print("the camera's baseline is ignored: one image has none", file=sys.stderr)
         keys = {key: getattr(read, key) for key in ("mount_height_m", "tilt_deg")}
-        read = Camera(width=read.width, height=read.height, K=read.K, **keys)
-    return Lens(camera=read, scale=scale)
+        return Camera(width=read.width, height=read.height, K=read.K, **keys)
+    return read
 
 
 def find_sources(words: Sequence[str], out: Path) -> list[Path]:
     """List images and videos."""
     sources: list[Path] = []
     for word in words:
-        sources += [Path(word)] if _is_video(Path(word)) else list_images(word)
+        sources += [Path(word)] if _is_video(word) else list_images(word)
     stems = Counter(path.stem for path in sources)
     twice = next((stem for stem, times in stems.items() if times > 1), None)
     if twice is not None:
@@ -177,20 +129,13 @@ def find_sources(words: Sequence[str], out: Path) -> list[Path]:
     return sources
 
 
-def refuse_videos(words: Sequence[str]) -> None:
-    """Refuse videos, which workers take none of."""
-    video = next((word for word in words if _is_video(Path(word))), None)
-    if video is not None:
-        raise InputError(f"{video}: --engine ray takes no videos; omit --engine for them")
-
-
 def _frame_of(video: Path, name: str) -> bool:
     """Whether a frame of a video has this name."""
     return re.fullmatch(re.escape(video.stem) + r"_\d{6}", name) is not None
 
 
-def _is_video(path: Path) -> bool:
-    return path.suffix.lower() in VIDEO_SUFFIXES
+def _is_video(path: str | Path) -> bool:
+    return Path(path).suffix.lower() in VIDEO_SUFFIXES
 
 
 def list_pairs(left: str, right: str) -> list[tuple[Path, Path]]:
@@ -207,24 +152,58 @@ def list_pairs(left: str, right: str) -> list[tuple[Path, Path]]:
 
 @dataclass(frozen=True, kw_only=True)
 class DepthWork:
-    """Images or pairs to the files of their depth, in this process or by workers of an engine."""
+    """Images or pairs to the files of their depth, in this process or by workers of an engine.
+
+    ``camera``: what is known of that of the images, or the rig of pairs.
+    """
 
     method: MethodSource
-    lens: Lens
+    camera: Camera | FieldOfView | float
     output: PredictOutput
+    scale: ScaleOptions = field(default_factory=ScaleOptions)
     with_check: bool = True
     files: Files = IMAGES
-    endings: Sequence[str] = ENDINGS
 
-    @property
-    def batch(self) -> int:
-        """Images that go through the networks together."""
-        return self.output.batch
+    def __post_init__(self) -> None:
+        mount_m = self.scale.camera_height or getattr(self.camera, "mount_height_m", None)
+        if self.scale.camera_tilt is not None and mount_m is None:
+            raise InputError(
+                "--camera-tilt says where the road is together with --camera-height, or the "
+                "camera file's mount_height_m; give the height, or omit the tilt"
+            )
+
+    def input_of(self, name: str, left: Tensor | Path, right: Path | None = None) -> StereoInput:
+        """Make the input of an image or a pair, read already or not."""
+        image = read_image(left) if isinstance(left, Path) else left
+        camera = camera_of(self.camera, (image.shape[2], image.shape[1]))
+        assert camera is not None
+        mount = {"mount_height_m": self.scale.camera_height, "tilt_deg": self.scale.camera_tilt}
+        camera = changed(camera, **mount)
+        other = None if right is None else read_image(right)
+        return StereoInput(name=name, left=image, right=other, camera=camera)
+
+    def inputs_of(self, files: Sequence[Path]) -> Named:
+        """Give the one input of an image or a pair, or every frame of a video."""
+        if not _is_video(files[0]):
+            yield files[0].stem, partial(self.input_of, files[0].stem, *files)
+            return
+        for name, frame in read_video(files[0]):
+            yield name, partial(self.input_of, name, frame)
 
     def settings(self, method: dict[str, Any]) -> dict[str, Any]:
         """Give what decides the results, as JSON values, for the record of a run."""
+        known: dict[str, Any] = {"focal_px": self.camera}
+        if isinstance(self.camera, FieldOfView):
+            known = {"fov_deg": self.camera.degrees}
+        elif isinstance(self.camera, StereoRig):
+            known = {"K": self.camera.K.tolist(), "baseline_m": self.camera.baseline_m}
+            known["cx_right_minus_left_px"] = self.camera.cx_right_minus_left_px
+        elif isinstance(self.camera, Camera):
+            keys = camera_keys(self.camera)
+            known = {key: keys[key] for key in ("K", "mount_height_m", "tilt_deg") if key in keys}
+        known |= {key: v for key, v in asdict(self.scale).items() if v is not None}
         own = {} if self.files == PAIRS else {"color_range_m": list(self.output.color_range)}
-        return {**method, "camera": self.lens.facts(), **own}
+        return {**method, "camera": known, **own}
 
     def start(self) -> Function:
         """Build the networks."""
@@ -232,10 +211,7 @@ class DepthWork:
 
         def estimate(samples: Sequence[Sample], out: Path) -> list[str]:
             predictor = Predictor(self, method, out)
-            named = [
-                (one.name, partial(self.lens.input_of, one.name, *map(Path, one.files)))
-                for one in samples
-            ]
+            named = ((one.name, partial(self.input_of, one.name, *one.files)) for one in samples)
             predictor.predict(named, len(samples), "images")
             return [str(predictor.failures.get(sample.name, "")) for sample in samples]
 
@@ -250,10 +226,13 @@ def estimate_by_engine(
     engine: EngineOptions,
 ) -> int:
     """Estimate images or pairs, manifests or tar shards, by the workers of an engine."""
+    if (video := next(filter(_is_video, words), None)) is not None:
+        raise InputError(f"{video}: --engine ray takes no videos; omit --engine for them")
     inputs = Inputs.find(words, files)
     with inputs.first() as first:
-        work = work_of(first)
-    settings = work.settings(work.method.settings())
+        own = work_of(first)
+    settings = own.settings(own.method.settings())
+    work = Work(start=own.start, files=files, endings=ENDINGS, batch=own.output.batch)
     what = "pairs" if files == PAIRS else "depth maps"
     return say(engine.run(work, inputs, out, settings), out, what)
 
@@ -270,7 +249,7 @@ def estimate_all(
     with open_viewer(None if run.find_rank().rank else work.output.view) as viewer:
         predictor = Predictor(work, method, out, viewer)
         stills = [files for files in mine if not _is_video(files[0])]
-        named = (one for files in stills for one in work.lens.inputs_of(files))
+        named = (one for files in stills for one in work.inputs_of(files))
         done = len(predictor.predict(named, len(stills), "images"))
         done += sum(predictor.predict_video(video) for video, *_ in mine if _is_video(video))
     failures = list(predictor.failures.values())
@@ -288,7 +267,7 @@ def estimate_all(
         for files, own in finished.items():
             wanted = [name for name in own if name in chosen]
             with suppress(InputError):
-                for name, read in work.lens.inputs_of(files) if wanted else ():
+                for name, read in work.inputs_of(files) if wanted else ():
                     if name in wanted:
                         shown.append(read())
                     if name == wanted[-1]:
@@ -326,25 +305,20 @@ class Predictor:
 
     def predict_video(self, source: Path) -> int:
         """Predict a video's frames, and make a video of them; give how many are done."""
-        frames: list[str] = []
-
-        def named() -> Named:
-            for name, image in video:
-                frames.append(name)
-                yield name, partial(self.work.lens.input_of, name, image)
 
         def colors() -> Iterator[Tensor]:
             """Draw each frame's depth, in grey where there is none, so that none is missing."""
-            done, first = set(names), self.out / f"{min(names)}.depth_m.npy"
-            unknown = torch.full_like(read_map(first), torch.nan)
-            for name in frames:
-                depth_m = read_map(self.out / f"{name}.depth_m.npy") if name in done else unknown
-                yield draw_depth(depth_m, *self.work.output.color_range)
+            lost = {name for name in self.failures if _frame_of(source, name)}
+            unknown = torch.full_like(read_map(self.out / f"{names[0]}.depth_m.npy"), torch.nan)
+            for name in sorted([*names, *lost]):
+                known = unknown if name in lost else read_map(self.out / f"{name}.depth_m.npy")
+                yield draw_depth(known, *self.work.output.color_range)
 
         try:
             video = read_video(source)
-            names = self.predict(named(), video.frames or None, source.name)
-            drawn = colors() if names else iter(())
+            frames = self.work.inputs_of([source])
+            names = self.predict(frames, video.frames or None, source.name)
+            drawn = colors() if names else ()
             write_video(self.out / f"{source.stem}{_VIDEO}", drawn, video.fps)
         except InputError as error:
             self.failures[source.name] = error
@@ -357,11 +331,10 @@ class Predictor:
         What an earlier run finished is not even read.
         """
         names: list[str] = []
-        output, scale, net = self.work.output, self.work.lens.scale, self.method.net
+        output, scale, net = self.work.output, self.work.scale, self.method.net
         assert isinstance(net, FakestereoNet), "weights build no other"
-        coming = iter(named)
         with tqdm(total=total, desc=what, disable=None, unit=f" {what}") as bar:
-            while chunk := list(islice(coming, output.batch)):
+            while chunk := list(islice(named, output.batch)):
                 inputs: list[StereoInput] = []
                 for name, read in chunk:
                     try:
@@ -379,7 +352,7 @@ class Predictor:
                             estimate = scale_by_distance(estimate, one.name, scale.distance)  # noqa: PLW2901
                         cloud_m = CLOUD_M if output.cloud else None
                         files = write_estimate(self.out, one, estimate, output.color_range, cloud_m)
-                        note_result(self.out, one.name, files)
+                        run.note_result(self.out, one.name, files)
                     except InputError as error:
                         self.failures[one.name] = error
                         continue

@@ -11,10 +11,8 @@ from depthpose.cli.arguments import NewPath
 from depthpose.core.errors import InputError, install_command
 
 _REQUIREMENT = re.compile(r"([\w.-]+)[^;]*(?:;.*extra == ['\"](\w+)['\"])?")
-_EXTRAS_OF_OURS = ("dev",)
-"""Extras for those who develop the package."""
-_SHIFT_PX = 12
-"""Disparity of the pair that depth is tested with."""
+_EXTRAS_OF_OURS = ("dev",)  # extras for those who develop the package
+_SHIFT_PX = 12  # disparity of the pair that depth is tested with
 
 
 def doctor(files: tyro.conf.Positional[tuple[NewPath, ...]] = ()) -> int:

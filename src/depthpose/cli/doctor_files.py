@@ -172,15 +172,13 @@ def _of_depth(path: Path, units: Tensor) -> FileFacts:
     height, width = units.shape
     known = units[units.isfinite()]
     seen = FileFacts(path=path, size=(width, height), depth_units=units)
+    seen.what = f"16-bit depth of {width}x{height}"
     if len(known) == 0:
-        seen.what, seen.odd = f"16-bit depth of {width}x{height}", ["every pixel is 0: no reading"]
+        seen.odd.append("every pixel is 0: no reading")
         return seen
-    median = float(known.median())
+    median, share = float(known.median()), len(known) / units.numel()
     maybe = ", ".join(f"{median * unit:.3g} m ({who})" for who, unit in _UNITS_M.items())
-    share = len(known) / units.numel()
-    seen.what = (
-        f"16-bit depth of {width}x{height}, {share:.0%} known, median {median:g} units: {maybe}"
-    )
+    seen.what += f", {share:.0%} known, median {median:g} units: {maybe}"
     if share == 1:
         seen.what += "; or, as no pixel is 0, a picture of 16 bits"
     if float(known.max()) <= _EIGHT_BIT:
@@ -194,16 +192,9 @@ def _of_map(path: Path) -> FileFacts:
         if stored.dtype.kind != "f" and stored.ndim == 2:
             units = torch.from_numpy(stored.astype("float32"))
             return _of_depth(path, torch.where(units > 0, units, torch.nan))
-        try:
-            values = files.read_map(path)
-        except InputError as error:
-            if "a map is (H, W)" not in str(error):
-                raise
+        if stored.ndim != 2 or stored.shape[1] in (3, 4):
             return _of_points(path, files.read_cloud(path).points.double())
-        if values.shape[1] in (3, 4):
-            return _of_points(path, files.read_cloud(path).points.double())
-    else:
-        values = files.read_map(path)
+    values = files.read_map(path)
     known = values[values.isfinite()]
     height, width = values.shape
     seen = FileFacts(path=path, what=f"map of {width}x{height}", size=(width, height))

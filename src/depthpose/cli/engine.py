@@ -12,8 +12,7 @@ from depthpose.cli.arguments import group, shown_as
 from depthpose.core.errors import InputError
 
 if TYPE_CHECKING:  # --help imports this module and must answer at once
-    from depthpose.core.engine import Done, Inputs, RayEngine
-    from depthpose.core.engine.work import Work
+    from depthpose.core.engine import Done, Inputs, RayEngine, Work
 
 
 @group
@@ -37,11 +36,6 @@ class EngineOptions:
     """inputs of a shard, which are done again when their worker dies."""
     shards: Literal["tar", "parquet"] = "tar"
     """format of the results."""
-
-    @property
-    def is_ray(self) -> bool:
-        """Whether a cluster does the work."""
-        return self.engine == "ray"
 
     def build(self) -> "RayEngine":
         """Make the engine of these options."""

@@ -55,7 +55,7 @@ def predict(
     source = source_of(weights, register, inputs.unit, dataset, estimates.config)
     if dataset.bop is not None:
         return predict_dataset(source, dataset, inputs.object, out, estimates.batch, view, engine)
-    if engine.is_ray:
+    if engine.engine == "ray":
         return predict_on_ray(inputs, source, estimates.batch, out, engine)
     method = source.build()
     if inputs.cloud is not None and not method.takes_clouds:

@@ -2,7 +2,7 @@
 
 import sys
 from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -20,9 +20,7 @@ from depthpose.pose.datasets import BopDataset, open_bop, read_targets
 from depthpose.pose.evaluate import (
     Evaluation,
     InstanceRow,
-    ObjectRow,
     Origin,
-    RiskRow,
     evaluate,
     match,
     nearest_copy,
@@ -121,18 +119,13 @@ def describe(predictions: Sequence[Path]) -> list[Origin]:
     return [replace(one, method=names[home, one.method]) for home, one in pairs]
 
 
-def table_of(rows: Iterable[ObjectRow | InstanceRow | RiskRow]) -> list[dict[str, Any]]:
-    """Give the columns of rows, as tables and files take them."""
-    return [row.columns() for row in rows]
-
-
 def measure(
     dataset: BopDataset, predictions: Sequence[Path], config: EvaluationConfig, out: Path
 ) -> int:
     """Measure, write rows.json, rows.csv, table.md, report.html and instances.csv, and print."""
     each = measure_each(dataset, predictions, config)
     measured = join(each)
-    rows = table_of(measured.rows)
+    rows = [row.columns() for row in measured.rows]
     said = HOW if measured.advice is None else f"{measured.advice}. {HOW}"
     page.write_table(out, rows)
     by_masks: dict[tuple[str, str], dict[str, Any]] = {}
@@ -184,11 +177,11 @@ def measure(
 
 def write_details(measured: Evaluation, out: Path) -> list[Section]:
     """Write each instance's numbers, and the risk by coverage; give them as parts of a page."""
-    risk = table_of(measured.risk)
-    page.write_table(out, table_of(measured.per_instance), name="instances")
+    risk = [row.columns() for row in measured.risk]
+    page.write_table(out, [row.columns() for row in measured.per_instance], name="instances")
     if risk:
         page.write_table(out, risk, name="risk")
-    failed = table_of(row for row in measured.per_instance if not row.is_success)
+    failed = [row.columns() for row in measured.per_instance if not row.is_success]
     text = "How many answers are wrong if only the surest are given."
     sections = [
         Section(title="Risk by coverage", text=text, rows=risk),

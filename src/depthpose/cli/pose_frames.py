@@ -10,9 +10,8 @@ from typing import Any
 import torch
 from tqdm import tqdm
 
-from depthpose.cli import pose_inputs, pose_predict
-from depthpose.cli.pose_inputs import camera_facts, object_named
-from depthpose.cli.pose_methods import PoseMethod, match_names, named_file, of_dataset
+from depthpose.cli import pose_methods, pose_predict
+from depthpose.cli.pose_methods import PoseMethod
 from depthpose.cli.pose_options import OneObjectOptions, SequenceOptions
 from depthpose.core.errors import InputError
 from depthpose.core.files import read_depth_png
@@ -44,13 +43,13 @@ def find_all(method: PoseMethod, inputs: OneObjectOptions, out: Path) -> int:
     assert lens is not None
     objects = tuple(method.models_by_name)
     if inputs.object is not None:
-        objects = (object_named(inputs.object, method),)
+        objects = (pose_methods.object_named(inputs.object, method),)
     if method.find is None:
         raise InputError("--depth without --mask: these weights need masked views; give --mask")
     if find_rank().world > 1:
         raise InputError("--depth without --mask is done by one process; give --mask, or start one")
-    depth, unit = Path(inputs.depth), inputs.unit
-    jobs = pose_inputs.frame_jobs(depth, lens, objects[0], unit, out)
+    unit = inputs.unit
+    jobs = pose_methods.frame_jobs(Path(inputs.depth), lens, objects[0], unit, out)
     names = {job.name for job in jobs}
     for name in sorted(names):
         if (plain := re.sub(r"_\d+$", "", name)) != name and plain in names:
@@ -58,9 +57,9 @@ def find_all(method: PoseMethod, inputs: OneObjectOptions, out: Path) -> int:
                 f"two depth images are called {plain!r} and {name!r}, and so would be what is "
                 "found in the first; rename one"
             )
-    facts = camera_facts(lens) | ({} if unit is None else {"unit": unit})
+    facts = pose_methods.camera_facts(lens) | ({} if unit is None else {"unit": unit})
     settings = {**method.settings, "find": sorted(objects), **facts}
-    pose_predict.claim(out, settings, jobs, depth, pose_predict.is_result_of)
+    pose_predict.claim(out, settings, jobs, pose_predict.is_result_of)
     left = [p for p in kept_predictions(out) if is_finished(p)]
     results: list[tuple[Prediction, Job[Any]]] = []
     for job in tqdm(jobs, disable=None, unit=" images"):
@@ -74,7 +73,7 @@ def find_all(method: PoseMethod, inputs: OneObjectOptions, out: Path) -> int:
             own = [Prediction(estimate=one) for one in found]
         results += [(one, explained_job(job, one.estimate, method)) for one in own]
         write_predictions(out, [*(prediction for prediction, _ in results), *left])
-    pose_predict.claim(out, settings, [job for _, job in results], depth, pose_predict.is_result_of)
+    pose_predict.claim(out, settings, [job for _, job in results], pose_predict.is_result_of)
     answered = [pair for pair in results if pair[0].estimate.is_posed]
     pose_predict.write_files([p for p, _ in answered], [job for _, job in answered], out, method)
     return pose_predict.say_result([prediction for prediction, _ in results], out)
@@ -97,19 +96,19 @@ def explained_job(job: Job[Any], estimate: PoseEstimate, method: PoseMethod) -> 
 def track_folder(method: PoseMethod, frames: SequenceOptions, out: Path) -> int:
     """Follow one object through depth images with a camera, or clouds; give the exit code."""
     unit = frames.unit
-    start = None if frames.first is None else pose_inputs.read_pose(frames.first)
-    name = object_named(frames.object, method)
+    start = None if frames.first is None else pose_methods.read_pose(frames.first)
+    name = pose_methods.object_named(frames.object, method)
     settings = {**method.settings, "track": name} | ({} if unit is None else {"unit": unit})
     if frames.cloud is not None:
-        jobs = pose_inputs.cloud_jobs(frames.cloud, unit or "m", name, out)
+        jobs = pose_methods.cloud_jobs(frames.cloud, unit or "m", name, out)
     else:
         assert frames.depth is not None
         assert frames.camera is not None
-        jobs = pose_inputs.frame_jobs(frames.depth, frames.camera, name, unit, out)
-        settings |= camera_facts(frames.camera)
+        jobs = pose_methods.frame_jobs(frames.depth, frames.camera, name, unit, out)
+        settings |= pose_methods.camera_facts(frames.camera)
     if frames.first is not None:
-        settings |= {"first": named_file(frames.first)}
-    pose_predict.claim(out, settings, jobs, frames.cloud or frames.depth or out)
+        settings |= {"first": pose_methods.named_file(frames.first)}
+    pose_predict.claim(out, settings, jobs)
     return _finish(method, _followed(method, jobs, name, start), jobs, out)
 
 
@@ -117,9 +116,13 @@ def track_bop(method: PoseMethod, frames: SequenceOptions, out: Path) -> int:
     """Follow each known object of each scene, or one; give the exit code."""
     assert frames.bop is not None
     dataset = open_bop(frames.bop, frames.split)
-    dataset = pose_inputs.chosen_objects(dataset, method, frames.object)
-    names = match_names(dataset, method.models)
-    settings = {**method.settings, **of_dataset(dataset), "track": sorted(names.values())}
+    dataset = pose_methods.chosen_objects(dataset, method, frames.object)
+    names = pose_methods.match_names(dataset, method.models)
+    settings = {
+        **method.settings,
+        **pose_methods.of_dataset(dataset),
+        "track": sorted(names.values()),
+    }
     pose_predict.claim_bop(out, settings, dataset)
     images: dict[tuple[int, int], dict[int, Instance]] = {}
     for one in sorted(dataset.instances, key=lambda i: (i.image_id, i.index)):
@@ -143,7 +146,8 @@ def _frame_job(instance: Instance, name: str) -> Job[Any]:
             name=instance.name, depth_m=depth_m, mask=everywhere, K=instance.K, object=name
         )
 
-    return pose_inputs.input_job(instance.name, name, read, place_of(instance))
+    job = Job(name=instance.name, read=read, place=place_of(instance))
+    return pose_methods.safe_job(job, name)
 
 
 def _finish(
@@ -171,7 +175,8 @@ def _finish(
             write_predictions(out, [*predictions, *others])
     pairs = zip(predictions, jobs, strict=True)
     explained = [explained_job(job, prediction.estimate, method) for prediction, job in pairs]
-    code = pose_predict.finish(predictions, explained, out, method, dataset)
+    pose_predict.write_files(predictions, explained, out, method, dataset)
+    code = pose_predict.say_result(predictions, out)
     kinds = Counter(p.estimate.tracking for p in predictions if p.estimate.tracking is not None)
     print(", ".join(f"{kinds[kind]} {kind}" for kind in ("tracked", "found", "lost")))
     return code

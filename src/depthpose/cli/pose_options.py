@@ -87,8 +87,7 @@ class OneObjectOptions:
     """16-bit PNG in the camera's depth_unit_m, or a folder of them."""
     mask: Source | None = None
     """picture, not black is the object, or .json with COCO's run lengths; or a folder of masks with
-    the names of the depth images. Without, the image is searched: its planes are removed, and each
-    region left is tried as every object, or as --object alone."""
+    the names of the depth images. Without, the image is searched for every object, or --object."""
     camera: Path | None = None
     """of the depth images; JSON file: {"width", "height", "K": 3x3, "depth_unit_m"}, or that of
     BOP, TUM RGB-D, ROS, OpenCV, KITTI or Middlebury."""
@@ -136,8 +135,8 @@ class EstimateOptions:
     up_to_symmetry: bool = False
     """copies of an object that look nearly alike are one answer, not alternatives."""
     register_refused: bool = False
-    """what a network doubts is registered by its model alone, some tenths of a second each. For
-    clouds and masked images."""
+    """what a network doubts is registered by its model alone, some tenths of a second each; not
+    where an image is searched."""
     batch: int = 16
     """inputs in one call of the network."""
     device: Device = "cpu"
@@ -166,8 +165,7 @@ class RegisterOptions:
     method: Literal["network", "register"] = "network"
     """network: trained weights. register: the CAD file alone, a second or two for each part."""
     cad: tuple[Source, ...] = ()
-    """of register: STL, PLY, OBJ or GLB files; an object has its file's name. A data set has its
-    own models."""
+    """of register: STL, PLY, OBJ or GLB files; an object has its file's name."""
     cad_unit: Unit | None = None
     """of the CAD files; as --unit by default, and of GLB metres."""
 
@@ -181,14 +179,14 @@ class SequenceOptions:
     camera: Path | None = None
     """of the depth images; a JSON file, as for 'pose predict'."""
     cloud: Path | None = None
-    """folder of clouds (PLY, PCD, NPY, text) in the camera frame, of the object alone or of what is
-    about it too, which needs --first: the object is found in clouds of it alone."""
+    """folder of clouds (PLY, PCD, NPY, text) in the camera frame, of the object alone; with --first
+    also of what is about it."""
     first: NewPath | None = None
-    """text file with the pose in the first frame, as far as it is known: the 4x4 matrix
-    camera_from_model, in metres; without it the object is looked for."""
+    """text file with the pose in the first frame, about: the 4x4 matrix camera_from_model, in
+    metres; without it the object is looked for."""
     bop: Path | None = None
-    """folder of a data set in BOP's layout; every object of each scene is followed that the weights
-    know (with --method register: that has a model there), or --object alone."""
+    """folder of a data set in BOP's layout; every known object of each scene is followed (with
+    --method register: that has a model there), or --object alone."""
     split: str = "test"
     """of the data set."""
     object: str | None = None

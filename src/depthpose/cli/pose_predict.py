@@ -7,7 +7,7 @@ import sys
 import time
 from collections import Counter, defaultdict
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -15,14 +15,24 @@ from typing import Any
 from scipy.spatial.transform import Rotation
 from tqdm import tqdm
 
-from depthpose.cli import pose_inputs
+from depthpose.cli import pose_methods
 from depthpose.cli.engine import EngineOptions, say
-from depthpose.cli.pose_methods import MethodSource, PoseMethod, find_masks, of_dataset
+from depthpose.cli.pose_methods import MethodSource, PoseMethod
 from depthpose.cli.pose_options import DataSetOptions, OneObjectOptions
 from depthpose.core import run
 from depthpose.core.camera import Camera, camera_of
 from depthpose.core.config import config_to_dict
-from depthpose.core.engine import Files, Function, Inputs, Item, Sample, is_url, shard_results, stem
+from depthpose.core.engine import (
+    Files,
+    Function,
+    Inputs,
+    Item,
+    Sample,
+    Work,
+    is_url,
+    shard_results,
+    stem,
+)
 from depthpose.core.errors import InputError
 from depthpose.core.files import (
     cloud_suffixes,
@@ -62,12 +72,9 @@ from depthpose.report.page import Section, choose_answers, plain_table, write_pa
 from depthpose.report.viewer import open_viewer
 
 _PAGE = "report.html"
-_MOST_SHOWN = 20
-"""Of the answers, on the terminal; poses.json holds all."""
-_SAID = 5
-"""Of so many inputs the alternatives are printed; of all they are in poses.json."""
-_MOST_ROWS = 1000
-"""Of the answers, in the table of the page."""
+_MOST_SHOWN = 20  # of the answers, on the terminal; poses.json holds all
+_SAID = 5  # of so many inputs the alternatives are printed; of all they are in poses.json
+_MOST_ROWS = 1000  # of the answers, in the table of the page
 _PRINTED = ("input", "object", "status", "x, y, z [m]", "qx, qy, qz, qw", "fit", "certainty",
             "identity", "tracking")  # fmt: skip
 """Columns on the terminal."""
@@ -79,13 +86,11 @@ def claim(
     out: Path,
     settings: dict[str, Any],
     jobs: list[Job[Any]],
-    source: Path,
     is_result: Callable[[str, str], bool] = operator.eq,
 ) -> None:
-    """Claim a folder for the poses of clouds or depth images.
+    """Claim a folder for the poses of clouds or depth images, whose jobs name their files.
 
-    ``source``: of jobs that name none; ``is_result``: whether a result of the first name is of the
-    input of the second.
+    ``is_result``: whether a result of the first name is of the input of the second.
     """
     run.claim_folder(out, settings, [POSES, _PAGE])
     if run.find_rank().world == 1 and not run.read_sources(out):  # lost: of what the poses are
@@ -93,7 +98,7 @@ def claim(
     done = _finished(out)
     run.claim_names(
         out,
-        {job.name: job.source or source for job in jobs},
+        {job.name: job.source for job in jobs if job.source is not None},
         [f".{end}" for end in (PICTURE, CLOUD)],
         is_finished=lambda name: any(is_result(n, name) for n in done),
     )
@@ -116,24 +121,27 @@ def predict_files(
     method: PoseMethod, inputs: OneObjectOptions, out: Path, batch: int, view: str | None
 ) -> int:
     """Pose clouds, or masked depth images, in this process; give the exit code."""
-    name, lens = pose_inputs.object_named(inputs.object, method), inputs.lens
+    name, lens = pose_methods.object_named(inputs.object, method), inputs.lens
     settings = {**method.settings, "object": name}
     if inputs.cloud is not None:
-        unit, source = inputs.unit or "m", Path(inputs.cloud)
-        jobs = pose_inputs.cloud_jobs(source, unit, name, out)
+        unit = inputs.unit or "m"
+        jobs = pose_methods.cloud_jobs(Path(inputs.cloud), unit, name, out)
         settings |= {"unit": unit}
     elif inputs.depth is None or inputs.mask is None or lens is None:
         raise InputError(
             "--depth needs --camera or --focal-px beside it, and --mask unless it is to be found"
         )
     else:
-        source, mask = Path(inputs.depth), Path(inputs.mask)
-        jobs = pose_inputs.view_jobs(source, mask, lens, name, inputs.unit, out)
-        settings |= pose_inputs.camera_facts(lens) | {"mask": str(mask.resolve())}
+        mask = Path(inputs.mask)
+        jobs = pose_methods.view_jobs(Path(inputs.depth), mask, lens, name, inputs.unit, out)
+        settings |= pose_methods.camera_facts(lens) | {"mask": str(mask.resolve())}
         settings |= {} if inputs.unit is None else {"unit": inputs.unit}
-    claim(out, settings, jobs, source)
+    claim(out, settings, jobs)
     predictions = predict_all(method, jobs, out, settings, batch, view)
-    return 0 if predictions is None else finish(predictions, jobs, out, method)
+    if predictions is None:
+        return 0
+    write_files(predictions, jobs, out, method)
+    return say_result(predictions, out)
 
 
 def predict_dataset(
@@ -147,7 +155,7 @@ def predict_dataset(
 ) -> int:
     """Pose the objects of a data set, or one, here or by an engine; give the exit code."""
     assert options.bop is not None
-    if engine.is_ray:
+    if engine.engine == "ray":
         if is_url(out):
             raise InputError(
                 f"--out {out}: poses of a data set come together in poses.json and BOP's csv, "
@@ -159,31 +167,32 @@ def predict_dataset(
                 "truth, predicted, or a file of BOP detections, such as 'pose evaluate --masks "
                 "WEIGHTS' leaves"
             )
-    method, home = source.build("cpu" if engine.is_ray else None), Path(out)
+    method, home = source.build("cpu" if engine.engine == "ray" else None), Path(out)
     dataset = open_bop(options.bop, options.split)
     if options.targets is not None:
         dataset = of_targets(dataset, read_targets(options.targets, options.bop))
-    dataset = pose_inputs.chosen_objects(dataset, method, object)
-    (masks,) = find_masks([options.masks], dataset, home, source.config.device)
-    jobs = pose_inputs.bop_jobs(dataset, masks, method)
+    dataset = pose_methods.chosen_objects(dataset, method, object)
+    masks = options.masks
+    (found,) = pose_methods.find_masks([masks], dataset, home, source.config.device)
+    jobs = pose_methods.bop_jobs(dataset, found, method)
     settings = {**method.settings, "estimate": config_to_dict(source.config)}
-    settings |= {**of_dataset(dataset), "masks": masks.name, **masks.settings}
+    settings |= {**pose_methods.of_dataset(dataset), "masks": found.name, **found.settings}
     if object is not None:
         settings["objects"] = sorted({i.object_id for i in dataset.instances})
-    if engine.is_ray:
+    if engine.engine == "ray":
         settings["shards"] = engine.shards
     claim_bop(home, settings, dataset)
-    if engine.is_ray:
-        masks_file = Path(options.masks)
-        work = BopWork(
+    if engine.engine == "ray":
+        start = partial(
+            start_bop,
             source=source.packed(),
             folder=str(dataset.folder.resolve()),
             split=options.split,
-            masks=str(masks_file.resolve()) if masks_file.suffix == ".json" else options.masks,
+            masks=str(Path(masks).resolve()) if masks.endswith(".json") else masks,
             objects=tuple(sorted({instance.object_id for instance in dataset.instances})),
-            batch=batch,
         )
-        inputs = Inputs(items=[Item(job.name, ()) for job in jobs], files=NO_FILES)
+        inputs = Inputs(items=[Item(job.name, ()) for job in jobs], files=Files((), ()))
+        work = Work(start=start, files=inputs.files, endings=(ENDING,), batch=batch)
         known: dict[str, Prediction] = {}
         failed: dict[str, str] = {}
         for done in engine.run(work, inputs, out, settings):
@@ -203,7 +212,10 @@ def predict_dataset(
         write_predictions(Path(out), predictions)
     else:
         predictions = predict_all(method, jobs, home, settings, batch, view)
-    return 0 if predictions is None else finish(predictions, jobs, home, method, dataset)
+    if predictions is None:
+        return 0
+    write_files(predictions, jobs, home, method, dataset)
+    return say_result(predictions, home)
 
 
 def predict_all(
@@ -224,16 +236,7 @@ def predict_all(
     left = [jobs[k] for k in process.share(len(jobs)) if jobs[k].name not in done]
     if left:
         with open_viewer(None if process.rank else view) as viewer:
-
-            def estimate_many(inputs: Sequence[Any]) -> list[PoseEstimate]:
-                estimates = list(method.estimate_many(inputs))
-                for one, estimate in zip(inputs, estimates, strict=True):
-                    if viewer is not None:
-                        viewer.show_pose(one, estimate, method.models_by_name[one.object])
-                return estimates
-
-            shown = replace(method, estimate_many=estimate_many)
-            names = predict(pose_inputs.safely(shown), left, home, settings, batch)
+            names = predict(pose_methods.safely(method, viewer), left, home, settings, batch)
             for _ in tqdm(names, total=len(left), disable=None, unit=" poses"):
                 pass
     if process.rank:
@@ -264,18 +267,6 @@ def _known(out: Path) -> dict[str, Prediction]:
     every = [p for folder in folders for p in kept_predictions(folder)]
     # What was read at last counts, whatever another part said of an earlier try.
     return {p.estimate.name: p for p in sorted(every, key=is_finished)}
-
-
-def finish(
-    predictions: list[Prediction],
-    jobs: list[Job[Any]],
-    out: Path,
-    method: PoseMethod,
-    dataset: BopDataset | None = None,
-) -> int:
-    """Write clouds, pictures, BOP's csv and the page, and say what was found; the exit code."""
-    write_files(predictions, jobs, out, method, dataset)
-    return say_result(predictions, out)
 
 
 def write_files(
@@ -420,10 +411,7 @@ def _write_page(
     print(f"the page: {out / _PAGE}")
 
 
-VIEW_FILES = Files(roles=("depth", "mask"), suffixes=(*LISTED_SUFFIXES, ".json"))
-NO_FILES = Files(roles=(), suffixes=())
-ENDING = "pose.json"
-"""Of the one file of a result: an entry of ``poses.json``."""
+ENDING = "pose.json"  # of the one file of a result: an entry of poses.json
 
 
 def cloud_files() -> Files:
@@ -431,72 +419,49 @@ def cloud_files() -> Files:
     return Files(roles=("cloud",), suffixes=cloud_suffixes())
 
 
-@dataclass(frozen=True, kw_only=True)
-class PoseWork:
-    """Clouds, or depth images and masks, to poses or the reasons for none."""
+def start_files(
+    source: MethodSource, object: str, unit: Unit | None, camera: Camera | None
+) -> Function:
+    """Build the estimator; clouds, or depth images and masks, to poses or the reasons for none."""
+    method = source.build()
 
-    source: MethodSource
-    object: str
-    unit: Unit | None
-    camera: Camera | None
-    files: Files
-    batch: int
-    endings: Sequence[str] = (ENDING,)
-
-    def start(self) -> Function:
-        """Build the estimator."""
-        method = self.source.build()
-
-        def predict(samples: Sequence[Sample], out: Path) -> list[str]:
-            jobs = [
-                pose_inputs.input_job(s.name, self.object, partial(self._read, s)) for s in samples
-            ]
-            return _write_estimates(method, jobs, out)
-
-        return predict
-
-    def _read(self, sample: Sample) -> AnyInput:
-        if self.camera is None:
-            return cloud_input(sample.files[0], self.unit or "m", self.object, sample.name)
+    def read(sample: Sample) -> AnyInput:
+        if camera is None:
+            return cloud_input(sample.files[0], unit or "m", object, sample.name)
         depth, mask = sample.files
-        return view_input(depth, mask, self.camera, self.object, sample.name, self.unit)
+        return view_input(depth, mask, camera, object, sample.name, unit)
+
+    def predict(samples: Sequence[Sample], out: Path) -> list[str]:
+        named = [Job(name=sample.name, read=partial(read, sample)) for sample in samples]
+        jobs = [pose_methods.safe_job(job, object) for job in named]
+        return _write_estimates(method, jobs, out)
+
+    return predict
 
 
-@dataclass(frozen=True, kw_only=True)
-class BopWork:
-    """Objects of a data set, by their names, to poses or the reasons for none.
+def start_bop(
+    source: MethodSource, folder: str, split: str, masks: str, objects: tuple[int, ...]
+) -> Function:
+    """Build the estimator, and open the data set; its objects, by name, to poses or the reasons.
 
-    All workers see the folder of the data set and a file of detections, if ``masks`` is one;
-    ``objects`` are the numbers that the estimator knows.
+    All workers see the folder and a file of detections, if ``masks`` is one.
     """
+    method = source.build()
+    dataset = open_bop(Path(folder), split).of_objects(*objects)
+    (found,) = pose_methods.find_masks([masks], dataset, Path())
+    jobs = {job.name: job for job in pose_methods.bop_jobs(dataset, found, method)}
 
-    source: MethodSource
-    folder: str
-    split: str
-    masks: str
-    objects: tuple[int, ...]
-    batch: int
-    files: Files = NO_FILES
-    endings: Sequence[str] = (ENDING,)
+    def predict(samples: Sequence[Sample], out: Path) -> list[str]:
+        return _write_estimates(method, [jobs[sample.name] for sample in samples], out)
 
-    def start(self) -> Function:
-        """Build the estimator and open the data set."""
-        method = self.source.build()
-        dataset = open_bop(Path(self.folder), self.split).of_objects(*self.objects)
-        (masks,) = find_masks([self.masks], dataset, Path())
-        jobs = {job.name: job for job in pose_inputs.bop_jobs(dataset, masks, method)}
-
-        def predict(samples: Sequence[Sample], out: Path) -> list[str]:
-            return _write_estimates(method, [jobs[sample.name] for sample in samples], out)
-
-        return predict
+    return predict
 
 
 def _write_estimates(method: PoseMethod, jobs: Sequence[Job[Any]], out: Path) -> list[str]:
     """Estimate some inputs and write an entry of each; give for each "" or why it failed."""
     reasons: list[str] = []
     for job, estimate in zip(
-        jobs, pose_inputs.safely(method)([job.read() for job in jobs]), strict=True
+        jobs, pose_methods.safely(method)([job.read() for job in jobs]), strict=True
     ):
         spent = {**job.seconds, **estimate.seconds}
         prediction = Prediction(estimate=replace(estimate, seconds=spent), place=job.place)
@@ -511,7 +476,8 @@ def predict_on_ray(
     """Pose clouds, depth images and masks, manifests or tar shards by the workers of an engine."""
     if options.depth is not None and options.lens is None:
         raise InputError("--depth needs --camera or --focal-px beside it")
-    files = cloud_files() if options.depth is None else VIEW_FILES
+    views = Files(roles=("depth", "mask"), suffixes=(*LISTED_SUFFIXES, ".json"))
+    files = cloud_files() if options.depth is None else views
     words = [word for word in (options.cloud, options.depth, options.mask) if word is not None]
     inputs = Inputs.find(words, files)
     for item in inputs.items if len(words) == 2 else ():  # one manifest pairs as it likes
@@ -522,13 +488,12 @@ def predict_on_ray(
             )
     source = source.packed()
     method = source.build("cpu")
-    object = pose_inputs.object_named(options.object or None, method)
+    object = pose_methods.object_named(options.object or None, method)
     with inputs.first() as first:
         lens = options.lens
         camera = None if lens is None else camera_of(lens, image_size(first[0]))
-    work = PoseWork(
-        source=source, object=object, unit=options.unit, camera=camera, files=files, batch=batch
-    )
+    start = partial(start_files, source, object, options.unit, camera)
+    work = Work(start=start, files=files, endings=(ENDING,), batch=batch)
     settings = {**method.settings, "estimate": config_to_dict(source.config), "object": object}
     settings |= {"unit": options.unit}
     if camera is not None:

@@ -11,9 +11,7 @@ from typing import Any
 class Output:
     """A standard stream that remembers why it could not be written, in place of raising it.
 
-    Args:
-        stream: what is written to.
-        is_lost: the process began without it, and ``stream`` only stands in its place.
+    ``is_lost``: the process began without it, and ``stream`` only stands in its place.
     """
 
     def __init__(self, stream: Any, *, is_lost: bool = False) -> None:  # noqa: ANN401

@@ -32,10 +32,9 @@ def reproduce(
 ) -> int:
     """Reproduce a table of the thesis, from data on disk to published rows, ours and difference.
 
-    2.1: depth from one image. 2.2: depth from the real stereo pair. 2.3: depth from one image
-    without and with fine-tuning: give two weights, in this order. Writes rows.json, rows.csv,
-    table.md, report.md and report.html (with the frames of figures 2-1 and 2-5), with protocol,
-    weights, settings and environment. A rerun uses existing predictions.
+    2.1: depth from one image. 2.2: from the real stereo pair. 2.3: from one image without and with
+    fine-tuning: give two weights, in this order. Writes rows.json, rows.csv, table.md, report.md
+    and report.html (with the frames of figures 2-1 and 2-5). A rerun uses existing predictions.
 
         depthpose reproduce 2.1 --kitti /data/kitti --weights apart.safetensors --out out/table-2.1
 
@@ -46,7 +45,7 @@ def reproduce(
         weights: weights files, a row each; 2.2 takes a stereo matcher's too.
         matcher: sgbm: OpenCV's StereoSGBM as a row of table 2.2.
         beside: tables 2.1 and 2.3: weights of other methods, a row each; by default those that
-            ship. '--beside' without a name: none.
+            ship, '--beside' without a name: none.
         train: training folders, for two baselines (best depth of each row, nearest image).
         train_without: names of training frames to leave out.
         split: eigen-test (697 frames), another split, a file of frames, or all.
@@ -56,9 +55,9 @@ def reproduce(
     from depthpose.cli.depth_methods import Method, MethodSource, baseline_method, sgbm_method
     from depthpose.cli.thesis_depth import reproduce_table
     from depthpose.depth.evaluate import find_protocol
-    from depthpose.thesis.depth import find_table
+    from depthpose.thesis.depth import TABLES
 
-    published = find_table(table)
+    published = TABLES[table]
     if find_protocol(comparison.protocol).truth == "disparity":
         raise InputError(
             f"--protocol {comparison.protocol}: measures disparity, and the tables hold depth."
@@ -138,10 +137,9 @@ def figure(
 ) -> int:
     """Draw a figure of the thesis from your frames and weights.
 
-    2-1, one frame: left, real right, synthesised right, depth from left and synthesised right,
-    depth from the real pair, LiDAR. 2-5, a column a frame: left, real right, predicted depth,
-    predicted right, LiDAR. Colours mean the same metres in every panel. Writes figure-2-1.png or
-    figure-2-5.png, and report.html with each panel and its caption.
+    2-1, one frame: left, real right, synthesised right, depth from left and synthesised right, from
+    the real pair, LiDAR. 2-5, a column a frame: left, real right, predicted depth, predicted right,
+    LiDAR. Colours mean the same metres in every panel. Writes figure-NUMBER.png and report.html.
 
         depthpose figure 2-5 --kitti /data/kitti --weights W.safetensors --out out/figure-2-5
 
@@ -175,16 +173,15 @@ def table_3_1(
 ) -> int:
     """Reproduce table 3.1: the method beside its baselines, by object, on the same data.
 
-    Give weights of the method first, then of the baselines (kinds pointnet and depth-image): each
-    is run by the estimator of its kind. Writes rows.json, rows.csv, table.md (percent by object),
-    all.json (every number), instances.csv, report.md and report.html. The thesis's own
-    numbers are not at hand: differences are those of the first weights to the others.
+    Each weights is run by the estimator of its kind. Writes rows.json, rows.csv, table.md (percent
+    by object), all.json, instances.csv, report.md and report.html. The thesis's own numbers are not
+    at hand: differences are those of the first weights to the others.
 
         depthpose reproduce 3.1 --bop lm --weights ours.safetensors pointnet.safetensors --out out
 
     Args:
-        weights: the method's, then those of each baseline; open3d is Open3D's registration
-            (an extra), which needs no weights.
+        weights: the method's, then those of each baseline (kinds pointnet and depth-image); open3d
+            is Open3D's registration (an extra), which needs no weights.
         out: folder to write to.
     """
     from depthpose.cli.thesis_pose import reproduce_by_object
@@ -205,8 +202,8 @@ def table_3_2(
 ) -> int:
     """Reproduce table 3.2: LineMOD's ADD(-S) by object, published rows, ours, and the difference.
 
-    Writes rows.json, rows.csv, table.md (percent by object), all.json (every number),
-    instances.csv, report.md and report.html. Masks truth and predicted are two rows of ours.
+    Writes rows.json, rows.csv, table.md (percent by object), all.json, instances.csv, report.md and
+    report.html. Masks truth and predicted are two rows of ours.
 
         depthpose reproduce 3.2 --linemod Linemod_preprocessed --weights W --out out/table-3.2
 
@@ -231,10 +228,9 @@ def table_3_3(
 ) -> int:
     """Reproduce table 3.3: RANSAC against least squares on the same directions of one network.
 
-    Compares a loop of 50 hypotheses one by one in NumPy (published practice), our RANSAC of 50,
-    128 and 1024 hypotheses by both tests for inliers, and least squares as published and as ours:
-    success by ADD(-S) without ICP, and milliseconds of the vote alone, all in one process. Without
-    a data set the clouds are synthetic views of the weights' objects.
+    A loop of 50 hypotheses one by one in NumPy (published practice), our RANSAC of 50, 128 and 1024
+    by both tests for inliers, and least squares as published and as ours: success by ADD(-S)
+    without ICP, and milliseconds of the vote alone. Without a data set, on synthetic views.
 
         depthpose reproduce 3.3 --weights W.safetensors --linemod Linemod_preprocessed --out out
 
@@ -266,9 +262,9 @@ def figure_3_2(
 ) -> int:
     """Draw figure 3-2: features of partial clouds as colours, each cloud posed on its model.
 
-    The features before the last layer (64 numbers a point) of all clouds are mapped to one number
-    by an exact t-SNE and shown in the Spectral scale; the model is black. Without a data set the
-    clouds are synthetic views of the weights' objects. Writes figure-3-2.png, panels, report.html.
+    The features before the last layer (64 numbers a point) are mapped to one number by an exact
+    t-SNE and shown in the Spectral scale; the model is black. Without a data set the clouds are
+    synthetic. Writes figure-3-2.png, panels and report.html.
 
         depthpose figure 3-2 --weights W.safetensors --out out/figure-3-2
 
@@ -293,9 +289,9 @@ def figure_3_4(
 ) -> int:
     """Draw figure 3-4: true and predicted directions to the keypoint with the largest error.
 
-    Looks at some views and shows the worst. In the plane of the camera's x and y: a yellow star is
-    the true keypoint, a red cross the voted one. Without a data set the views are synthetic, of the
-    weights' objects. Writes figure-3-4.png, panels and report.html.
+    Of some views the worst, in the plane of the camera's x and y: a yellow star is the true
+    keypoint, a red cross the voted one. Without a data set the views are synthetic. Writes
+    figure-3-4.png, panels and report.html.
 
         depthpose figure 3-4 --weights W.safetensors --out out/figure-3-4
 
@@ -316,8 +312,8 @@ def figure_3_5(
 ) -> int:
     """Draw figure 3-5: boxes of true (green, dashed) and estimated (blue, solid) poses.
 
-    Over the picture, or the depth where there is none. Without a data set the views are synthetic,
-    of the weights' objects. Writes figure-3-5.png, panels and report.html.
+    Over the picture, or the depth where there is none. Without a data set the views are synthetic.
+    Writes figure-3-5.png, panels and report.html.
 
         depthpose figure 3-5 --weights W.safetensors --linemod Linemod_preprocessed --out out
 
@@ -334,15 +330,13 @@ def figure_3_5(
 class Step(NamedTuple):
     """One command: its description, the arguments of ``depthpose``, and the file that it makes.
 
-    It is done again if a file of earlier steps, ``of``, is newer. ``is_replaced``: an older file
-    and its card are deleted first, because the command replaces none.
+    It is done again if a file of earlier steps, ``of``, is newer.
     """
 
     what: str
     words: Sequence[str]
     makes: Path
     of: Sequence[Path] = ()
-    is_replaced: bool = False
 
 
 _TRAIN = " --data {data} --device {device} --resume --config {configs}/"
@@ -404,8 +398,8 @@ def reproduce_all(
     From KITTI: the generator, the matcher and fine-tuning, then tables 2.1, 2.2 and 2.3. From
     Linemod_preprocessed: the network of directions, its two baselines and the segmentation, then
     tables 3.1, 3.2 and 3.3, with true and with found masks, poses by votes alone as published.
-    Each step is a command, which is printed. Run again, it skips finished steps and resumes an
-    interrupted training. The thesis's trainings take days on a GPU.
+    Each step is a command, which is printed. Run again, it skips finished steps and resumes. The
+    thesis's trainings take days on a GPU.
 
         depthpose reproduce all --kitti /data/kitti --out out/thesis
         depthpose reproduce all --linemod /data/Linemod_preprocessed --out out/thesis
@@ -464,7 +458,7 @@ def reproduce_all(
             what = f"training by {words[-1].partition('/')[2]}" if "--config" in words else what
             made_of = [home / name for name in of.split()]
             filled = [word.format(**values) for word in words]
-            steps.append(Step(what, filled, home / makes, made_of, words[0] == "weights"))
+            steps.append(Step(what, filled, home / makes, made_of))
     return walk(steps)
 
 
@@ -480,7 +474,7 @@ def walk(steps: Sequence[Step]) -> int:
             print(f"{head}: done, {step.makes}", flush=True)
             continue
         print(f"{head}: depthpose {shlex.join(step.words)}", flush=True)
-        if step.is_replaced:
+        if step.words[0] == "weights":  # which replace no file, nor their card
             for path in (step.makes, step.makes.with_suffix(".md")):
                 path.unlink(missing_ok=True)
         own = main(step.words)

@@ -60,8 +60,7 @@ def reproduce_table(
         return 0
     measured = evaluation.join(evaluation.measure_each(dataset, folders, protocol, caps_m))
     owns = [own for own, _ in methods for _ in caps_m]
-    joined = join_published(table, list(zip(owns, measured.rows, strict=True)))
-    rows = evaluation.columns(joined)
+    rows = join_published(table, list(zip(owns, measured.rows, strict=True)))
     page.write_table(out, rows)
     how = (
         f"Ours: {protocol}: {rule.summary}. The printed rows are of the 697 frames of "

@@ -33,10 +33,8 @@ from depthpose.report.page import Drawing, Picture, Section
 from depthpose.report.pose import close_up, draw_boxes, grey_depth, picture_of
 from depthpose.thesis import pose_figures, pose_tables
 
-_SYNTHETIC_SEED = 3303
-"""Of synthetic views for tables and figures; no training uses it."""
-_MOST_POINTS = 4000
-"""Of a t-SNE: its time grows with the square."""
+_SYNTHETIC_SEED = 3303  # of synthetic views for tables and figures; no training uses it
+_MOST_POINTS = 4000  # of a t-SNE: its time grows with the square
 _SCAN_POINTS = 1500
 _TEXTS = {
     "3-2": "Alike features have alike colours (t-SNE to one number for all clouds, Spectral); the "
@@ -140,8 +138,8 @@ def reproduce_by_object(
     measured = pose_evaluate.join(
         pose_evaluate.measure_each(dataset, [*folders, *csv], how.evaluation)
     )
-    joined = pose_tables.join_by_object(measured.rows, numbers, with_published=is_printed)
-    rows, every = [row.columns() for row in joined], pose_evaluate.table_of(measured.rows)
+    rows = pose_tables.join_by_object(measured.rows, numbers, with_published=is_printed)
+    every = [row.columns() for row in measured.rows]
     page.write_table(out, rows)
     page.write_table(out, every, name="all")
     sections: list[Section] = []
@@ -208,7 +206,7 @@ def reproduce_voting(
         cases = list(
             pose_tables.cases_of(net, tqdm(views.samples, f"{count} points", disable=None), count)
         )
-        rows += [row.columns() | facts for row in pose_tables.compare_voting(cases, count)]
+        rows += [row | facts for row in pose_tables.compare_voting(cases, count)]
     page.write_table(out, rows)
     text = (
         "Success: percent of instances whose ADD(-S) is below 10 % of the diameter, without ICP; "

@@ -153,8 +153,7 @@ class Lines:
         print(", ".join(said), flush=True)
 
 
-_LOOKED_AT = 20
-"""Held-out pairs of a folder, by default."""
+_LOOKED_AT = 20  # held-out pairs of a folder, by default
 
 
 def train_depth(
@@ -175,15 +174,13 @@ def train_depth(
         select    a generator that warps the left image to the right view, and estimates depth
                   itself; needs pairs with truth
         stereo    the matcher; needs pairs with truth
-        adapt     a trained matcher to your rig; needs its pairs with calibration, no truth. A fifth
-                  of them is held out, and weights are written only if these fit better and
-                  synthetic streets no worse
+        adapt     a trained matcher to your rig; needs its pairs with calibration, no truth. Weights
+                  are written if a held-out fifth fits better, and synthetic streets no worse
         finetune  either generator through the frozen matcher; needs weights of both
 
-    A config holds every setting; the options below change what they name. The run folder keeps
-    config, metrics, pictures, TensorBoard and the last state: --resume goes on from there, whatever
-    stopped the training, and ends with the weights of a run that nothing stopped. Several GPUs or
-    machines: 'accelerate launch -m depthpose depth train ...'.
+    A config holds every setting; the options change what they name. The run folder keeps config,
+    metrics, pictures, TensorBoard and the last state: --resume goes on from there, to the weights
+    of a run that nothing stopped. On many: 'accelerate launch -m depthpose depth train ...'.
 
         depthpose depth train view --config configs/depth/view.yaml --data kitti --out runs/view
 
@@ -192,11 +189,9 @@ def train_depth(
         out: the run folder.
         config: YAML with what differs from the thesis's settings.
         data: folders of pairs to learn from; they replace the config's.
-        held_out: folders of pairs for validation alone; 20 of each, evenly spaced, unless the
-            config says otherwise.
+        held_out: folders of pairs for validation alone; by default 20 of each, evenly spaced.
         generator: finetune: weights of the generator to begin with.
-        matcher: finetune: weights whose matcher matches the synthesised view, by name or file; they
-            are not changed.
+        matcher: finetune: weights whose matcher matches the synthesised view; it is not changed.
         start: view, select, stereo, adapt: weights to begin with; adapt takes 'default' by default.
         encoder: select, stereo with a light network: weights of the encoder to begin with, of
             'depthpose weights import efficientnet-lite0'.
@@ -237,9 +232,9 @@ def calibrate(
 ) -> int:
     """Set below which confidence an image is refused as out of distribution.
 
-    The confidence (of weights that know streets how probable one is, else the mean over the image)
-    is measured on images like those of the training. The threshold below which 'depth predict'
-    refuses is set so that a share of them is refused. Tensors stay as they are.
+    'depth predict' refuses below a threshold of the confidence (of weights that know streets how
+    probable one is, else the mean over the image). It is set so that a share of images like those
+    of the training is refused. Tensors stay as they are.
 
         depthpose depth calibrate mine.safetensors --data my_pairs --out mine-calibrated.safetensors
 
@@ -275,10 +270,8 @@ def calibrate(
     return 0
 
 
-_START = "parts"
-"""The weights that ship and may go with any licence."""
-_NOTHING = "nothing"
-"""The word for no weights."""
+_START = "parts"  # the weights that ship and may go with any licence
+_NOTHING = "nothing"  # the word for no weights
 
 
 def train_pose(
@@ -295,11 +288,9 @@ def train_pose(
 ) -> int:
     """Train a network on your CAD file, or by a config.
 
-    Views of the object are rendered while it trains: no photograph is needed. At the end the
-    whole is measured on held-out views; OUT holds the weights with the model in them, their card,
-    config, metrics and states. A training that stopped goes on with
-    --resume; --finish, or Ctrl-C twice, writes weights of the steps so far. Without a terminal a
-    line is printed each minute.
+    Views of the object are rendered while it trains: no photograph is needed. OUT holds the weights
+    with the model in them, their card with what held-out views measured, config, metrics and
+    states. --resume goes on; --finish, or Ctrl-C twice, writes weights of the steps so far.
 
         depthpose pose train --cad part.stl --unit mm --out my_part
         depthpose pose predict --cloud scan.ply --unit mm --weights my_part/pose.safetensors ...
@@ -312,8 +303,7 @@ def train_pose(
         symmetries: found: detect symmetries of the part and count equivalent poses as one; by
             default they are only printed.
         data: folder of a data set; it takes the place of the config's, for models and frames.
-        what: pose: the network of directions; segmentation: the masks for it; depth-image and
-            pointnet: baselines.
+        what: pose: the network of directions; segmentation: its masks; the others are baselines.
         start: weights to begin with, by name or file. A CAD file without a config begins with
             'parts'; 'nothing' begins anew and takes twice the steps.
         workers: processes that render views beside the one that trains.

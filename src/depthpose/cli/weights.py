@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping
 from pathlib import Path
+from textwrap import shorten
 from typing import TYPE_CHECKING, Literal
 
 import tyro
@@ -33,19 +34,14 @@ def list_weights(folder: Path | None = None) -> int:
             "name": path.stem,
             "kind": (read := read_checkpoint(path)).kind,
             "MB": f"{path.stat().st_size / 1e6:.1f}",
-            "licence": _in_short(read.facts.get("licence", "")),
-            "trained on": _in_short(read.facts.get("trained_on", "")),
+            "licence": shorten(read.facts.get("licence", ""), 34, placeholder=" ..."),
+            "trained on": shorten(read.facts.get("trained_on", ""), 34, placeholder=" ..."),
         }
         for path in files
     ]
     print(plain_table(rows), end="")
     print("'depthpose weights show NAME' prints origin, terms and settings of one.")
     return 0
-
-
-def _in_short(text: str) -> str:
-    """Cut a sentence at a word."""
-    return text if len(text) <= 34 else text[:30].rpartition(" ")[0].rstrip(",;") + " ..."
 
 
 def show_weights(weights: tyro.conf.Positional[WeightsName]) -> int:
@@ -83,18 +79,16 @@ def import_weights(
 ) -> int:
     """Turn a published checkpoint into a weights file of depthpose.
 
-    The checkpoint is read without running any code in it; one that holds pickled objects other
-    than tensors is refused.
+    The checkpoint is read without running any code in it; pickled objects but tensors are refused.
 
     Args:
-        kind: the network: psmnet, the stacked hourglass; resnet18, an encoder trained on
-            ImageNet, which segmentation can start from (.pth of tensors or .safetensors);
-            efficientnet-lite0, an encoder that 'depth train select' can start from.
+        kind: psmnet, the stacked hourglass; resnet18, an encoder trained on ImageNet, which
+            segmentation can start from (.pth of tensors or .safetensors); efficientnet-lite0, an
+            encoder that 'depth train select' can start from.
         file: the published checkpoint, e.g. pretrained_model_KITTI2015.tar (do not unpack it).
         out: the .safetensors file to write.
-        align_corners: psmnet: how the checkpoint was trained to upsample (not in the file):
-            true for the authors' first weights (2018, PyTorch 0.4), false for those of 2021
-            (PyTorch 1.8.1). A wrong choice costs about 1 px of disparity.
+        align_corners: psmnet: how it was trained to upsample: true for the authors' first weights
+            (2018, PyTorch 0.4), false for those of 2021 (1.8.1). A wrong choice costs about 1 px.
     """
     from depthpose.core.run import refuse_to_replace
 
@@ -143,8 +137,7 @@ def pack_weights(
         trained_on: the data, for the card.
         licence: under which terms the weights may be used.
         matcher: what matches the two views: weights with a matcher, by name or file.
-        terms: printed whenever the weights are loaded; for licences that restrict use. Terms of
-            the packed weights are kept too.
+        terms: of use, printed whenever the weights are loaded; those of the parts are kept too.
         half: store 16-bit floats: half the size.
     """
     from depthpose.core.checkpoint import bound_facts, find_weights, warn_of_terms
@@ -262,9 +255,9 @@ def export_depth(out: NewPath, weights: WeightsName = "default", what: str | Non
     """Write the depth networks as one ONNX file that runs without torch, and prove that it agrees.
 
     The graph does all that the estimator does at the quick speed, at any size: one image and its K
-    to metres, sky and the right view; or a pair to disparity and confidence. Its outputs are
-    compared with PyTorch's at several sizes and the differences written to NAME.proof.json; beyond
-    the limit nothing is written. Needs the extra export.
+    to metres, sky and the right view; or a pair to disparity and confidence. NAME.proof.json has
+    its differences to PyTorch at several sizes; beyond the limit nothing is written. Needs the
+    extra export.
 
         depthpose export depth --out depth.onnx
         depthpose export depth --weights psmnet.safetensors --out psmnet.onnx
@@ -289,10 +282,9 @@ def export_pose(out: NewPath, weights: WeightsName = "parts") -> int:
     """Write the network of directions as one ONNX file that runs without torch, and prove it.
 
     The graph takes voxels (cloud, x, y, z; each once) and their features, and gives the direction
-    from each to every keypoint of every object; coarser levels and kernel maps are made inside it.
-    It does neither voxelise nor vote, run ICP or refuse. Its outputs are compared with PyTorch's
-    on several clouds and the differences written to NAME.proof.json; beyond the limit nothing is
-    written. Needs the extra export.
+    from each to every keypoint of every object; it does neither voxelise nor vote, run ICP or
+    refuse. NAME.proof.json has its differences to PyTorch on several clouds; beyond the limit
+    nothing is written. Needs the extra export.
 
         depthpose export pose --out pose.onnx
 

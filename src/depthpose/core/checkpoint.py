@@ -33,19 +33,12 @@ class LicenceNotice(Notice):
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Checkpoint:
-    """What a weights file holds.
+    """What a weights file holds."""
 
-    Attributes:
-        kind: which network the weights belong to, e.g. ``psmnet``.
-        config: the settings of that network, as :func:`depthpose.core.config.config_to_dict` gives.
-        state: tensors by the names of the network's ``state_dict``.
-        facts: the card in short: ``trained_on``, ``licence`` and the like.
-    """
-
-    kind: str
-    config: Mapping[str, Any]
-    state: Mapping[str, Tensor]
-    facts: Mapping[str, str] = field(default_factory=dict)
+    kind: str  #: which network the weights belong to, e.g. ``psmnet``
+    config: Mapping[str, Any]  #: of that network, as ``config_to_dict`` gives it
+    state: Mapping[str, Tensor]  #: tensors by the names of the network's ``state_dict``
+    facts: Mapping[str, str] = field(default_factory=dict)  #: the card, such as ``licence``
 
 
 def save_checkpoint(path: Path, checkpoint: Checkpoint) -> None:

@@ -16,6 +16,7 @@ _NEAR_TO_FAR = (
     (0.57, 0.16, 0.47), (0.33, 0.12, 0.45), (0.14, 0.08, 0.30), (0.02, 0.02, 0.10),
 )  # fmt: skip
 _INVALID = (0.5, 0.5, 0.5)
+_LARGEST_PX = 96.0  # disparity of the brightest colour
 _DIMMED = 0.35  # brightness of a picture under points
 _LEAST_GAP = 0.08  # of two marks on a bar, as a share of its length: nearer ones would touch
 
@@ -70,12 +71,10 @@ def draw_depth(
 
 
 def draw_disparity(
-    disparity_px: Float[Tensor, "h w"],
-    largest_px: float = 96.0,
-    is_sky: Bool[Tensor, "h w"] | None = None,
+    disparity_px: Float[Tensor, "h w"], is_sky: Bool[Tensor, "h w"] | None = None
 ) -> Float[Tensor, "3 h w"]:
-    """Colour disparity, large (near) bright, on the fixed scale 0..``largest_px``; sky is grey."""
-    share = 1 - disparity_px / largest_px
+    """Colour disparity, large (near) bright, on the fixed scale 0..96 px; sky is grey."""
+    share = 1 - disparity_px / _LARGEST_PX
     return draw_share(share if is_sky is None else torch.where(is_sky, torch.nan, share))
 
 
@@ -171,13 +170,9 @@ def draw_lines(
 
 
 def draw_outline(
-    image: Float[Tensor, "3 h w"],
-    mask: Bool[Tensor, "h w"],
-    color: tuple[float, float, float],
-    width_px: int = 1,
+    image: Float[Tensor, "3 h w"], mask: Bool[Tensor, "h w"], color: tuple[float, float, float]
 ) -> Float[Tensor, "3 h w"]:
-    """Draw the border of a mask, inside it."""
-    outside = (~mask).float()[None]
-    grown = F.max_pool2d(outside, 2 * width_px + 1, 1, width_px)[0] > 0
+    """Draw the border of a mask, inside it, one pixel wide."""
+    grown = F.max_pool2d((~mask).float()[None], 3, 1, 1)[0] > 0
     ink = torch.tensor(color).to(image)[:, None, None]
     return torch.where(mask & grown, ink, image)

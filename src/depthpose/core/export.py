@@ -274,13 +274,10 @@ MOST = 1 << 10  # multiple of a side for the exporter; the graph itself has no b
 
 
 def network_model(module: nn.Module, images: Sequence[Tensor], multiple: int) -> Any:  # noqa: ANN401
-    """Turn a module of images into an ONNX model whose batch, rows and columns are free.
+    """Turn a module of images, in eval mode, into an ONNX model of free batch, rows and columns.
 
-    Args:
-        module: in eval mode; takes tensors (b, c, h, w) of one size.
-        images: an example of each; more than one image, sides of more than one ``multiple``, so
-            that no size of the example is taken for a law.
-        multiple: both sides are multiples of it.
+    ``images``, (b, c, h, w) each, are examples: more than one image, sides of more than one
+    ``multiple``, so that no size of theirs is taken for a law. All sides are such multiples.
     """
     onnx = import_export()
     batch = torch.export.Dim("batch", min=1, max=MOST)

@@ -11,34 +11,21 @@ _LFS_POINTER = b"version https://git-lfs"
 
 @dataclass(frozen=True, kw_only=True)
 class Problem:
-    """One thing that is wrong, or worth knowing.
+    """One thing that is wrong, or worth knowing."""
 
-    Attributes:
-        path: the file or folder.
-        kind: ``missing``, ``unreadable``, ``mismatch``, ``empty`` or ``note``.
-        message: what is wrong.
-    """
-
-    path: Path
-    kind: str
-    message: str
+    path: Path  #: the file or folder
+    kind: str  #: ``missing``, ``unreadable``, ``mismatch``, ``empty`` or ``note``
+    message: str  #: what is wrong
 
 
 @dataclass(frozen=True, kw_only=True)
 class CheckReport:
-    """What the check of a folder found.
+    """What the check of a folder found."""
 
-    Attributes:
-        layout: the layout that was recognised.
-        counts: how many frames, and how many of them have each part.
-        problems: what would stop or spoil work.
-        notices: what only limits it, such as frames without a right view.
-    """
-
-    layout: str
-    counts: dict[str, int]
-    problems: list[Problem]
-    notices: list[Problem]
+    layout: str  #: the layout that was recognised
+    counts: dict[str, int]  #: how many frames, and how many of them have each part
+    problems: list[Problem]  #: what would stop or spoil work
+    notices: list[Problem]  #: what only limits it, such as frames without a right view
 
     @property
     def is_ok(self) -> bool:

@@ -14,15 +14,10 @@ from depthpose.core.errors import InputError
 
 @dataclass(frozen=True, eq=False)
 class Rigid:
-    """``target_from_source``: carries source points to the target frame, ``R @ p + t``.
+    """``target_from_source``: carries source points to the target frame, ``R @ p + t``."""
 
-    Attributes:
-        R: rotation, orthonormal with determinant +1.
-        t_m: translation [m].
-    """
-
-    R: Float[Tensor, "*batch 3 3"]
-    t_m: Float[Tensor, "*batch 3"]
+    R: Float[Tensor, "*batch 3 3"]  #: rotation, orthonormal with determinant +1
+    t_m: Float[Tensor, "*batch 3"]  #: translation [m]
 
     def apply(self, points_m: Float[Tensor, "*points n 3"]) -> Float[Tensor, "*moved n 3"]:
         """Move points from the source frame to the target frame; batch axes are broadcast."""

@@ -23,7 +23,7 @@ from typing import Any
 import torch
 
 from depthpose.core.errors import InputError
-from depthpose.core.files import read_json, remove_parts, write_json
+from depthpose.core.files import disk, read_json, remove_parts, write_json
 from depthpose.core.files.disk import refused_write
 
 try:
@@ -79,25 +79,21 @@ def lock_folder(record: Path, *, is_shared: bool, timeout_s: float = 10.0) -> bo
     while True:
         try:
             fcntl.lockf(file, kind | fcntl.LOCK_NB)
-        except BlockingIOError as error:
-            if time.monotonic() > last:
-                _close(record, file)
-                raise InputError(
-                    f"{record.parent}: another command is writing there; wait until it has ended, "
-                    "or choose another folder"
-                ) from error
-            time.sleep(0.1)
-        except OSError:  # no locks on this file system
-            _close(record, file)
-            return False
-        else:
-            _locks[record.resolve()] = file
-            return held is None and not is_shared
-
-
-def _close(record: Path, file: int) -> None:
-    _locks.pop(record.resolve(), None)
-    os.close(file)
+        except OSError as error:
+            is_held = isinstance(error, BlockingIOError)
+            if is_held and time.monotonic() <= last:
+                time.sleep(0.1)
+                continue
+            _locks.pop(record.resolve(), None)
+            os.close(file)
+            if not is_held:  # no locks on this file system
+                return False
+            raise InputError(
+                f"{record.parent}: another command is writing there; wait until it has ended, or "
+                "choose another folder"
+            ) from error
+        _locks[record.resolve()] = file
+        return held is None and not is_shared
 
 
 def held_folders() -> frozenset[Path]:
@@ -123,15 +119,10 @@ _PACKAGES = ("depthpose", "torch", "numpy", "opencv-python-headless")
 
 @dataclass(frozen=True, kw_only=True)
 class ProcessRank:
-    """Rank of this process among several that share the work through files.
+    """Rank of this process among several that share the work through files."""
 
-    Attributes:
-        rank: 0 .. world - 1.
-        world: how many processes there are.
-    """
-
-    rank: int = 0
-    world: int = 1
+    rank: int = 0  #: 0 .. world - 1
+    world: int = 1  #: how many processes there are
 
     def share(self, total: int) -> range:
         """Give the indices of 0 .. total - 1 that are this process's."""
@@ -233,41 +224,34 @@ def claim_folder(
     record = folder / RECORD
     if not record.exists():
         there = [name for name in (_SOURCES, *results) if os.path.lexists(folder / name)]
-        # Looked at again: another process may have begun the same run.
-        if there and not record.exists():
+        if not there:
+            write_once(record, run_record(settings))
+        elif not record.exists():  # again: another process may have begun the same run
             raise not_ours(folder / there[0])
-    if not record.exists():
-        write_once(record, run_record(settings))
-    is_alone = find_rank().world == 1
-    if is_alone and _is_empty(folder):  # a run that failed before its first result
-        earlier = _read_record(record)
-        there = earlier.get("settings") if isinstance(earlier, dict) else None
-        if isinstance(there, dict) and _flat(there) != _flat(settings):
-            lock_folder(record, is_shared=False)
-            if _is_empty(folder):
-                (folder / _SOURCES).unlink(missing_ok=True)
-                file, content = _locks.get(record.resolve()), run_record(settings)
-                if file is None:  # no locks here
-                    write_json(record, content)
-                    return
-                # Through the file that holds the lock, which closing another would let go.
-                data = f"{json.dumps(content, indent=2)}\n".encode()
-                os.pwrite(file, data, 0)
-                os.ftruncate(file, len(data))
-                return
-    refuse_other_settings(folder, _read_record(record), settings, remedy)
-    if lock_folder(record, is_shared=not is_alone):
-        remove_parts(folder)
-
-
-def _read_record(record: Path) -> object:
     try:
-        return read_json(record)
+        earlier = read_settings(folder) or {}
     except InputError as error:
         raise InputError(
             f"{error}. What made the results is not known any more: choose another folder, or "
             "delete this one"
         ) from error
+    is_alone, is_other = find_rank().world == 1, _flat(earlier) != _flat(settings)
+    if is_alone and is_other and _is_empty(folder):  # a run that failed before its first result
+        lock_folder(record, is_shared=False)
+        if _is_empty(folder):
+            (folder / _SOURCES).unlink(missing_ok=True)
+            file, content = _locks.get(record.resolve()), run_record(settings)
+            if file is None:  # no locks here
+                write_json(record, content)
+                return
+            # Through the file that holds the lock, which closing another would let go.
+            data = f"{json.dumps(content, indent=2)}\n".encode()
+            os.pwrite(file, data, 0)
+            os.ftruncate(file, len(data))
+            return
+    refuse_other_settings(folder, earlier, settings, remedy)
+    if lock_folder(record, is_shared=not is_alone):
+        remove_parts(folder)
 
 
 def _is_empty(folder: Path) -> bool:
@@ -396,15 +380,23 @@ def refuse_among_inputs(out: Path, words: Iterable[str | Path], files: Iterable[
         )
 
 
-def read_settings(folder: Path) -> dict[str, Any] | None:
-    """Give the settings that made ``folder``, or None where no run claimed it."""
-    record = folder / RECORD
-    if not record.exists():
+def read_settings(folder: Path | str) -> dict[str, Any] | None:
+    """Give the settings that made a folder, by path or URL, or None where no run claimed it.
+
+    Raises:
+        InputError: its record is damaged.
+    """
+    record = disk.join(str(folder), RECORD)
+    if not disk.exists(record):
         return None
-    content = read_json(record)
+    with disk.refused_as(record, "record of a run", "choose another folder"):
+        path = disk.local_path(record)
+        content = json.loads(disk.read_from(record)) if path is None else read_json(path)
     settings = content.get("settings") if isinstance(content, dict) else None
     if not isinstance(settings, dict):
-        raise InputError(f"{record}: has no 'settings'. Delete the file, or choose another folder.")
+        raise InputError(
+            f"{record}: not a record of a run: it has no 'settings'; choose another folder"
+        )
     return settings
 
 
@@ -418,18 +410,15 @@ def not_ours(path: Path | str) -> InputError:
 
 def refuse_other_settings(
     folder: Path | str,
-    record: object,
+    earlier: Mapping[str, Any],
     settings: Mapping[str, Any],
     remedy: str = "choose another, or delete this one",
 ) -> None:
-    """Refuse a folder whose record has other settings.
+    """Refuse a folder that was made by other settings.
 
     Raises:
         InputError: the first difference is named.
     """
-    earlier = record.get("settings") if isinstance(record, dict) else None
-    if not isinstance(earlier, dict):
-        raise InputError(f"{folder}/{RECORD}: not a record of a run. Choose another folder.")
     before, now = _flat(earlier), _flat(settings)
     for name in sorted(before.keys() | now.keys()):
         # A later version may add settings: one that either does not know counts as off.

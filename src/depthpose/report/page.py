@@ -27,65 +27,70 @@ MOST_POINTS = 60_000
 """Most points of one cloud on a page: 0.7 MB of text."""
 MOST_LINES = 20_000
 
-_GREY = 0.55
-"""Grey of points without a colour: visible on white and on black."""
+_GREY = 0.55  # grey of points without a colour: visible on white and on black
 _RED_GREEN_BLUE = ((0.85, 0.2, 0.2), (0.15, 0.65, 0.25), (0.25, 0.45, 0.95))
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Lines:
-    """Straight pieces of line.
+    """Straight pieces of line."""
 
-    Attributes:
-        ends_m: both ends of each.
-        color: RGB in [0, 1], one for each piece.
-    """
-
-    ends_m: Float[Tensor, "n 2 3"]
-    color: Float[Tensor, "n 3"]
+    ends_m: Float[Tensor, "n 2 3"]  #: both ends of each
+    color: Float[Tensor, "n 3"]  #: RGB in [0, 1], one for each piece
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Layer:
-    """A part of a scene that can be hidden.
+    """A part of a scene that can be hidden."""
 
-    Attributes:
-        name: what the viewer calls it; layers of one name are hidden together.
-        shape: coloured points (NaN left out), or lines; metres, camera frame.
-        is_shown: whether it is seen at first.
-    """
-
-    name: str
-    shape: Cloud | Lines
-    is_shown: bool = True
+    name: str  #: what the viewer calls it; layers of one name are hidden together
+    shape: Cloud | Lines  #: coloured points (NaN left out), or lines; metres, camera frame
+    is_shown: bool = True  #: whether it is seen at first
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Scene:
-    """What one 3D view shows.
+    """What one 3D view shows."""
 
-    Attributes:
-        caption: stands below it.
-        layers: drawn together.
-    """
-
-    caption: str
-    layers: Sequence[Layer]
-
-    @property
-    def note(self) -> str:
-        """Which layers are shown thinned; empty where none is."""
-        said = [
-            f"{layer.name}: {_most(layer.shape)} of {_count(layer.shape)}, thinned evenly"
-            for layer in self.layers
-            if _count(layer.shape) > _most(layer.shape)
-        ]
-        return "; ".join(said)
+    caption: str  #: stands below it
+    layers: Sequence[Layer]  #: drawn together
 
     def encoded(self) -> dict[str, Any]:
-        """Give the JSON that ``viewer.js`` reads: base64 of 16-bit places and 8-bit colours."""
-        return {"caption": self.caption, "note": self.note,
-                "layers": [_encoded(layer) for layer in self.layers]}  # fmt: skip
+        """Give the JSON that ``viewer.js`` reads: base64 of 16-bit places and 8-bit colours.
+
+        Places are steps of 1/65535 of their extent: of a street of 80 m, 1.2 mm. ``note`` says
+        which layers are thinned.
+        """
+        layers: list[dict[str, Any]] = []
+        thinned: list[str] = []
+        for layer in self.layers:
+            shape = layer.shape
+            if isinstance(shape, Cloud):
+                kind, most, places, color = "points", MOST_POINTS, shape.points, shape.color
+                color = torch.full_like(places, _GREY) if color is None else color
+            else:
+                kind, most, places, color = "lines", MOST_LINES, shape.ends_m, shape.color
+            if len(places) > most:
+                thinned.append(f"{layer.name}: {most} of {len(places)}, thinned evenly")
+            kept = _spread(len(places), most)
+            places, color = places[kept], color[kept]
+            bytes_of_color = (color.detach().cpu().clamp(0, 1) * 255).round().byte().numpy()
+            flat_m = places.detach().cpu().numpy().astype(np.float64).reshape(-1, 3)
+            low = flat_m.min(0) if len(flat_m) else np.zeros(3)
+            step = (flat_m.max(0) - low) / 65535 if len(flat_m) else np.zeros(3)
+            steps = np.round((flat_m - low) / np.where(step > 0, step, 1))
+            encoded = {
+                "name": layer.name,
+                "kind": kind,
+                "shown": layer.is_shown,
+                "count": len(places),
+                "low": low.tolist(),
+                "step": step.tolist(),
+                "places": base64.b64encode(steps.astype("<u2").tobytes()).decode(),
+                "colors": base64.b64encode(bytes_of_color.tobytes()).decode(),
+            }
+            layers.append(encoded)
+        return {"caption": self.caption, "note": "; ".join(thinned), "layers": layers}
 
 
 def page_file(name: Literal["viewer.js", "page.css"]) -> str:
@@ -116,41 +121,6 @@ def frame_axes(origin_m: Float[Tensor, "3"], R: Float[Tensor, "3 3"], length_m: 
     return Lines(ends_m=ends_m.float(), color=torch.tensor(_RED_GREEN_BLUE))
 
 
-def _count(shape: Cloud | Lines) -> int:
-    return len(shape.points if isinstance(shape, Cloud) else shape.ends_m)
-
-
-def _most(shape: Cloud | Lines) -> int:
-    return MOST_POINTS if isinstance(shape, Cloud) else MOST_LINES
-
-
-def _encoded(layer: Layer) -> dict[str, Any]:
-    """Store places as steps of 1/65535 of their extent: of a street of 80 m, 1.2 mm."""
-    shape = layer.shape
-    if isinstance(shape, Cloud):
-        kind, places, color = "points", shape.points, shape.color
-        color = torch.full_like(places, _GREY) if color is None else color
-    else:
-        kind, places, color = "lines", shape.ends_m, shape.color
-    kept = _spread(len(places), _most(shape))
-    places, color = places[kept], color[kept]
-    bytes_of_color = (color.detach().cpu().clamp(0, 1) * 255).round().byte().numpy()
-    flat_m = places.detach().cpu().numpy().astype(np.float64).reshape(-1, 3)
-    low = flat_m.min(0) if len(flat_m) else np.zeros(3)
-    step = (flat_m.max(0) - low) / 65535 if len(flat_m) else np.zeros(3)
-    steps = np.round((flat_m - low) / np.where(step > 0, step, 1))
-    return {
-        "name": layer.name,
-        "kind": kind,
-        "shown": layer.is_shown,
-        "count": len(places),
-        "low": low.tolist(),
-        "step": step.tolist(),
-        "places": _base64(steps.astype("<u2")),
-        "colors": _base64(bytes_of_color),
-    }
-
-
 def _spread(count: int, most: int) -> Int64[Tensor, " m"]:
     """Choose one row of each of ``most`` equal runs, by chance, always the same ones.
 
@@ -162,13 +132,8 @@ def _spread(count: int, most: int) -> Int64[Tensor, " m"]:
     return ((torch.arange(most) + chance) * (count / most)).long().clamp(max=count - 1)
 
 
-def _base64(values: np.ndarray) -> str:
-    return base64.b64encode(np.ascontiguousarray(values).tobytes()).decode()
-
-
 MOST_VIEWS = 6
-_REFUSED = 2
-"""Refusals shown at least, where there are so many."""
+_REFUSED = 2  # refusals shown at least, where there are so many
 
 
 def spread_evenly(total: int, number: int) -> list[int]:
@@ -180,13 +145,13 @@ def spread_evenly(total: int, number: int) -> list[int]:
     return [(2 * k + 1) * total // (2 * number) for k in range(number)]
 
 
-def choose_answers(is_ok: Sequence[bool], most: int = MOST_VIEWS) -> list[int]:
+def choose_answers(is_ok: Sequence[bool]) -> list[int]:
     """Choose answers and some refusals, each spread evenly; give their places in order."""
     answered = [k for k, ok in enumerate(is_ok) if ok]
     refused = [k for k, ok in enumerate(is_ok) if not ok]
-    few = min(len(refused), max(_REFUSED, most - len(answered)), most)
+    few = min(len(refused), max(_REFUSED, MOST_VIEWS - len(answered)))
     chosen = [refused[i] for i in spread_evenly(len(refused), few)]
-    chosen += [answered[i] for i in spread_evenly(len(answered), most - few)]
+    chosen += [answered[i] for i in spread_evenly(len(answered), MOST_VIEWS - few)]
     return sorted(chosen)
 
 
@@ -212,10 +177,8 @@ Row = Mapping[str, Any]
 _MOST_PIXELS = 480_000
 """Most pixels of a drawing on a page of many; a frame of KITTI keeps its size."""
 _QUALITY = 85
-_MOST_BYTES = 250_000
-"""Largest picture file that goes onto a page as it is."""
-_MOST_FILM_BYTES = 8_000_000
-"""Largest video file on a page; a larger one is shown from beside it."""
+_MOST_BYTES = 250_000  # largest picture file that goes onto a page as it is
+_MOST_FILM_BYTES = 8_000_000  # largest video file on a page; a larger one is shown from beside it
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -42,10 +42,8 @@ OTHER: Color = (0.6, 0.3, 0.85)
 """Colour of an alternative: violet."""
 _SURFACE = 5000
 _BEND = math.radians(30)
-_CROSS = 0.04
-"""Half of the mark of a keypoint, in diameters of the object."""
-_VOTES = 40
-"""Points whose votes are drawn."""
+_CROSS = 0.04  # half of the mark of a keypoint, in diameters of the object
+_VOTES = 40  # points whose votes are drawn
 _DASH_PX = 6.0
 
 
@@ -75,14 +73,17 @@ def draw_pose(
             is blue.
     """
     pose = pose.double()
-    ends_m = pose.apply(box_edges(model).double().flatten(0, 1))
-    ends_px = project(ends_m, K).unflatten(0, (12, 2))
+    ends_px = project(_posed(pose, box_edges(model)), K)
     if is_true:
         return draw_lines(image, ends_px, TRUE, dash_px=_DASH_PX)
     triangles = drawn_triangles(model).double()
     moved = pose.apply(triangles.flatten(0, 1)).unflatten(0, (-1, 3))
     seen = rasterize(moved, K, image.shape[2], image.shape[1], with_barycentric=False)
     return draw_lines(draw_outline(image, seen.depth_m.isfinite(), FOUND), ends_px, FOUND)
+
+
+def _posed(pose: Rigid, ends_m: Float[Tensor, "n 2 3"]) -> Float[Tensor, "n 2 3"]:
+    return pose.double().apply(ends_m.double().flatten(0, 1)).unflatten(0, (-1, 2))
 
 
 def box_edges(model: ObjectModel) -> Float[Tensor, "12 2 3"]:
@@ -120,12 +121,8 @@ def pose_layers(
         with_box: whether an estimate's box is seen at first; that of a truth is.
     """
     pose = pose.double()
-
-    def posed(ends_m: Float[Tensor, "n 2 3"]) -> Float[Tensor, "n 2 3"]:
-        return pose.apply(ends_m.double().flatten(0, 1)).unflatten(0, (-1, 2)).float()
-
-    box_m = posed(box_edges(model))
-    edges_m = posed(crease_edges(model)) if len(model.faces) else None
+    box_m = _posed(pose, box_edges(model)).float()
+    edges_m = _posed(pose, crease_edges(model)).float() if len(model.faces) else None
     if is_true:
         layers = [Layer(name="true box", shape=colored_lines(box_m, TRUE))]
         if edges_m is not None:
@@ -216,8 +213,7 @@ _SEEN = (0.55, 0.55, 0.55)
 _AROUND = (0.7, 0.66, 0.6)
 _MASKED = (1.0, 0.85, 0.1)
 _AROUND_POINTS = 20_000
-_MARGIN = 0.6
-"""About an object in a close-up, in its own width."""
+_MARGIN = 0.6  # about an object in a close-up, in its own width
 _CLOSE_UP_PX = 360
 
 
@@ -360,9 +356,8 @@ def pose_scene(
         layers += pose_layers(pose, model, with_box=truth is not None)
         for other in estimate.alternatives:  # by axes and box, not shown at first
             placed = other.camera_from_model.double()
-            ends_m = placed.apply(box_edges(model).double().flatten(0, 1)).unflatten(0, (12, 2))
             said = f"{other.difference}, {other.probability:.0%}"
-            box = colored_lines(ends_m.float(), OTHER)
+            box = colored_lines(_posed(placed, box_edges(model)).float(), OTHER)
             layers.append(Layer(name=f"box if {said}", shape=box, is_shown=False))
             axes = frame_axes(placed.t_m, placed.R, model.diameter_m / 2)
             layers.append(Layer(name=f"axes if {said}", shape=axes, is_shown=False))

@@ -1,8 +1,8 @@
 """Chapter 2 of the thesis: its printed tables joined to our rows, and figures 2-1 and 2-5."""
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
-from typing import Literal
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
 
 import torch
 from jaxtyping import Float
@@ -10,14 +10,14 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from depthpose.core.draw import depth_scale, draw_depth, draw_points
-from depthpose.core.errors import InputError, nearest_name
-from depthpose.depth.evaluate import Cell, EvaluationRow, Row
+from depthpose.core.errors import InputError
+from depthpose.depth.evaluate import EvaluationRow
 from depthpose.depth.metrics import METRICS
 from depthpose.depth.types import DepthEstimate, StereoInput
 from depthpose.report.page import Drawing
 
 _METRICS = tuple(name for name, metric in METRICS.items() if metric.of == "depth")
-_FIRST = ("method", "weights", "cap_m", "protocol", *_METRICS)
+_FIRST = ("source", "method", "weights", "cap_m", *_METRICS, "protocol")
 
 
 @dataclass(frozen=True)
@@ -55,82 +55,44 @@ class PublishedTable:
     with_right: bool
 
 
-@dataclass(frozen=True, kw_only=True)
-class JoinedRow(Row):
-    """A printed row, one of ours, or the difference (ours minus the thesis's).
-
-    ``protocol`` of a difference across two protocols names both; ``others`` are further columns:
-    the note of a printed row, all others of ours.
-    """
-
-    source: Literal["published", "ours", "difference"]
-    method: str
-    weights: str = ""
-    cap_m: float
-    metrics: Mapping[str, float]
-    protocol: str
-    others: Mapping[str, Cell] = field(default_factory=dict)
-
-
-def find_table(number: str) -> PublishedTable:
-    """Give a table by its number in the thesis.
-
-    Raises:
-        InputError: there is none of that number.
-    """
-    if number not in TABLES:
-        raise InputError(f"table {number!r}: {nearest_name(number, TABLES)}")
-    return TABLES[number]
-
-
 def join_published(
     table: PublishedTable, ours: Sequence[tuple[str, EvaluationRow]]
-) -> list[JoinedRow]:
+) -> list[dict[str, Any]]:
     """Set our rows beside the printed ones, cap by cap: published, ours, difference.
+
+    A difference is ours less the thesis's; across two protocols its ``protocol`` names both.
 
     Args:
         table: the printed table.
         ours: for each of our rows the name of the thesis's own method that it stands for (one of
             ``table.own``, or empty where it stands for none, as a baseline), and the row.
+
+    Returns:
+        The columns of each row; ``source`` is ``published``, ``ours`` or ``difference``.
     """
-    rows = [
-        JoinedRow(
-            source="published",
-            method=row.method,
-            cap_m=row.cap_m,
-            metrics=row.errors,
-            protocol=row.protocol,
-            others={"note": row.note},
-        )
+    printed = [
+        {
+            **dict.fromkeys(_FIRST, ""),
+            **{"source": "published", "method": row.method, "cap_m": row.cap_m},
+            **row.errors,
+            **{"protocol": row.protocol, "note": row.note},
+        }
         for row in table.rows
     ]
-    printed_rows = tuple(rows)
+    rows: list[dict[str, Any]] = [*printed]
     for own, row in ours:
         assert row.cap_m is not None, "the tables are of depth, and reproduce takes no disparity"
-        columns = row.columns()
-        one = JoinedRow(
-            source="ours",
-            method=row.method or "",
-            weights=row.weights or "",
-            cap_m=row.cap_m,
-            metrics={name: row.metrics[name] for name in _METRICS},
-            protocol=row.protocol,
-            others={name: cell for name, cell in columns.items() if name not in _FIRST},
-        )
+        one = {**dict.fromkeys(_FIRST, ""), **row.columns(), "source": "ours"}
         rows.append(one)
-        for printed in printed_rows:
-            if (printed.method, printed.cap_m) == (own, one.cap_m):
-                same = one.protocol == printed.protocol
-                difference = replace(
-                    one,
-                    source="difference",
-                    method=f"{row.method} - {own}",
-                    metrics={n: one.metrics[n] - printed.metrics[n] for n in _METRICS},
-                    protocol=one.protocol if same else f"{one.protocol} against {printed.protocol}",
-                    others={},
-                )
+        for other in printed:
+            if (other["method"], other["cap_m"]) == (own, row.cap_m):
+                difference = {name: one[name] for name in _FIRST}
+                difference |= {"source": "difference", "method": f"{row.method} - {own}"}
+                difference |= {name: one[name] - other[name] for name in _METRICS}
+                if row.protocol != other["protocol"]:
+                    difference["protocol"] = f"{row.protocol} against {other['protocol']}"
                 rows.append(difference)
-    return sorted(rows, key=lambda row: -row.cap_m)
+    return sorted(rows, key=lambda row: -row["cap_m"])
 
 
 _Row = PublishedRow

@@ -6,9 +6,9 @@ Table 3.3: ways to find keypoints from the same directions, their success and ti
 import statistics
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import dataclass
 from functools import partial
-from typing import Any, Literal
+from typing import Any
 
 import torch
 from jaxtyping import Float
@@ -117,41 +117,6 @@ ROWS = (
 """Every figure as printed. Not like for like: see the notes, and the diameters."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class ComparedRow:
-    """A method, or the difference of two, in percent; None: there is no such number.
-
-    ``source``: a difference is ours minus the other; ``auc``: to 10 cm; ``diameters``: whose table
-    a success is a tenth of; ``others``: further columns, such as weights, frames and mean
-    milliseconds of each stage.
-    """
-
-    source: Literal["published", "ours", "difference"]
-    method: str
-    masks: str
-    input: str | None = None
-    by_object: Mapping[str, float]
-    mean: float | None
-    refused: float | None = None
-    wrong: float | None = None
-    auc: float | None = None
-    instances: int | None = None
-    diameters: str | None = None
-    note: str | None = None
-    printed_in: str | None = None
-    others: Mapping[str, Any] = field(default_factory=dict)
-
-    def columns(self) -> dict[str, Any]:
-        """Give the columns of a table, in its order."""
-        table: dict[str, Any] = {}
-        for name, value in vars(self).items():
-            if isinstance(value, Mapping):
-                table |= value
-            elif value is not None or name == "mean":
-                table[name.replace("_", " ")] = value
-        return table
-
-
 def linemod_number(model: ObjectModel) -> int:
     """Give BOP's number of the object of LineMOD that a model is, by its name and diameter.
 
@@ -175,7 +140,7 @@ def linemod_number(model: ObjectModel) -> int:
 
 def join_by_object(
     rows: Sequence[ObjectRow], numbers: Mapping[str, int], *, with_published: bool
-) -> list[ComparedRow]:
+) -> list[dict[str, Any]]:
     """Turn the rows of evaluations into a row a method and kind of masks, in percent.
 
     Args:
@@ -186,8 +151,9 @@ def join_by_object(
             ``PEERS`` after; else (table 3.1) the differences of the first method to the others.
 
     Returns:
-        The mean of ours is over the objects that were measured; a difference of means is given only
-        where both are over the same objects.
+        The columns of each row; ``source`` is ``published``, ``ours`` or ``difference`` (ours less
+        the other). The mean of ours is over the objects that were measured; a difference of means
+        is given only where both are over the same objects.
     """
     columns = {n: LINEMOD.get(k, n) if with_published else n for n, k in numbers.items()}
     groups: dict[tuple[str, str], list[ObjectRow]] = {}
@@ -195,68 +161,69 @@ def join_by_object(
         assert row.origin is not None, "rows of an evaluation say whose they are"
         groups.setdefault((row.origin.method, row.origin.masks), []).append(row)
     ours = [_own(group, columns) for group in groups.values()]
+    names = list(columns.values())
     if not with_published:
-        return [*ours, *(_difference(ours[0], other) for other in ours[1:])]
+        return [*ours, *(_difference(ours[0], other, names) for other in ours[1:])]
     printed = [
-        ComparedRow(
-            source="published",
-            method=row.method,
-            masks="",
-            input=row.input,
-            by_object={LINEMOD[number]: percent for number, percent in row.by_object.items()},
-            mean=row.mean,
-            diameters="pvnet" if row.method == "PVNet" else "bop",
-            note=row.note,
-            printed_in=row.source,
-        )
+        {
+            "source": "published",
+            "method": row.method,
+            "masks": "",
+            "input": row.input,
+            **{LINEMOD[number]: percent for number, percent in row.by_object.items()},
+            "mean": row.mean,
+            "diameters": "pvnet" if row.method == "PVNet" else "bop",
+            "note": row.note,
+            "printed in": row.source,
+        }
         for row in ROWS
     ]
-    peers = [row for row in printed if row.method in PEERS]
-    return [*printed, *ours, *(_difference(row, peer) for row in ours for peer in peers)]
+    peers = [row for row in printed if row["method"] in PEERS]
+    return [*printed, *ours, *(_difference(row, peer, names) for row in ours for peer in peers)]
 
 
-def _own(rows: Sequence[ObjectRow], columns: Mapping[str, str]) -> ComparedRow:
+def _own(rows: Sequence[ObjectRow], columns: Mapping[str, str]) -> dict[str, Any]:
     by_name = {row.object: row for row in rows}
     # Of one object there is no row of means: it is its own.
     mean = by_name.get("mean", rows[0])
     origin, conditions = mean.origin, mean.conditions
     assert origin is not None
     assert conditions is not None
-    return ComparedRow(
-        source="ours",
-        method=origin.method,
-        masks=origin.masks,
-        input="depth",
-        by_object={column: 100 * by_name[name].success for name, column in columns.items()},
-        mean=100 * mean.success,
-        refused=100 * mean.refused,
-        wrong=100 * mean.wrong,
-        auc=100 * (mean.scores["auc"] or 0.0),
-        instances=mean.instances,
-        diameters=conditions.diameters,
-        others={
-            "weights": origin.weights,
-            "weights_sha256": origin.weights_sha256,
-            "frames": conditions.frames,
-            "frames_sha256": conditions.frames_sha256,
-            **{f"ms_{stage}": value for stage, value in mean.ms.items()},
-        },
-    )
+    return {
+        "source": "ours",
+        "method": origin.method,
+        "masks": origin.masks,
+        "input": "depth",
+        **{column: 100 * by_name[name].success for name, column in columns.items()},
+        "mean": 100 * mean.success,
+        "refused": 100 * mean.refused,
+        "wrong": 100 * mean.wrong,
+        "auc": 100 * (mean.scores["auc"] or 0.0),
+        "instances": mean.instances,
+        "diameters": conditions.diameters,
+        "weights": origin.weights,
+        "weights_sha256": origin.weights_sha256,
+        "frames": conditions.frames,
+        "frames_sha256": conditions.frames_sha256,
+        **{f"ms_{stage}": value for stage, value in mean.ms.items()},
+    }
 
 
-def _difference(ours: ComparedRow, other: ComparedRow) -> ComparedRow:
-    shared = [name for name in ours.by_object if name in other.by_object]
-    is_same = other.source == "ours" or set(other.by_object) == set(ours.by_object)
-    is_comparable = is_same and ours.mean is not None and other.mean is not None
-    differ = ours.diameters != other.diameters
-    return ComparedRow(
-        source="difference",
-        method=f"{ours.method} - {other.method}",
-        masks=ours.masks,
-        by_object={name: ours.by_object[name] - other.by_object[name] for name in shared},
-        mean=(ours.mean or 0.0) - (other.mean or 0.0) if is_comparable else None,
-        diameters=f"{ours.diameters} against {other.diameters}" if differ else None,
-    )
+def _difference(
+    ours: Mapping[str, Any], other: Mapping[str, Any], names: Sequence[str]
+) -> dict[str, Any]:
+    """Subtract a row from one of ours, by the names of our objects."""
+    theirs = names if other["source"] == "ours" else [n for n in LINEMOD.values() if n in other]
+    difference = {
+        "source": "difference",
+        "method": f"{ours['method']} - {other['method']}",
+        "masks": ours["masks"],
+        **{name: ours[name] - other[name] for name in names if name in theirs},
+        "mean": ours["mean"] - other["mean"] if set(theirs) == set(names) else None,
+    }
+    if ours["diameters"] != other["diameters"]:
+        difference["diameters"] = f"{ours['diameters']} against {other['diameters']}"
+    return difference
 
 
 _ADD_POINTS = 1000
@@ -278,31 +245,6 @@ class VotingCase:
     model: ObjectModel
     truth: Rigid
     is_adds: bool
-
-
-@dataclass(frozen=True, kw_only=True)
-class VotingRow:
-    """A way of voting, measured.
-
-    ``points``: at most so many of each cloud; ``votes``: their mean; ``success``: percent of the
-    clouds whose pose is right; ``milliseconds``: of the vote alone, the median; ``times_faster``:
-    than the loop.
-    """
-
-    points: int
-    votes: float
-    method: str
-    hypotheses: int | None
-    inlier_test: str
-    instances: int
-    success: float
-    milliseconds: float
-    times_faster: float = 1.0
-
-    def columns(self) -> dict[str, Any]:
-        """Give the columns of a table, in its order."""
-        titles = {"inlier_test": "inliers by", "times_faster": "times faster"}
-        return {titles.get(name, name): value for name, value in asdict(self).items()}
 
 
 def cases_of(
@@ -344,18 +286,18 @@ def cases_of(
         )
 
 
-def compare_voting(cases: Sequence[VotingCase | None], points: int) -> list[VotingRow]:
-    """Let every way vote on every case, one after the other, and sum up.
+def compare_voting(cases: Sequence[VotingCase | None], points: int) -> list[dict[str, Any]]:
+    """Let every way vote on every case, one after the other; give the columns of a row for each.
 
     The pose follows by the same fit for all: without the covariances that only ours give. What has
     too few points is a failure of every way. The time is that of the vote alone, its median, on one
-    thread.
+    thread. ``points``: at most so many of each cloud; ``votes``: their mean.
     """
     usable = [case for case in cases if case is not None]
     if not usable:
         raise InputError(f"none of the {len(cases)} views has enough points to be posed")
     votes = sum(len(case.points_m) for case in usable) / len(usable)
-    rows: list[VotingRow] = []
+    rows: list[dict[str, Any]] = []
     threads = torch.get_num_threads()
     for method, hypotheses, test, vote in _ways():
         successes, seconds = 0, []
@@ -375,19 +317,19 @@ def compare_voting(cases: Sequence[VotingCase | None], points: int) -> list[Voti
                 successes += bool(is_within_diameter(torch.tensor(share)))
         finally:
             torch.set_num_threads(threads)
-        row = VotingRow(
-            points=points,
-            votes=votes,
-            method=method,
-            hypotheses=hypotheses,
-            inlier_test=test,
-            instances=len(cases),
-            success=100 * successes / len(cases),
-            milliseconds=1000 * statistics.median(seconds),
-        )
+        row = {
+            "points": points,
+            "votes": votes,
+            "method": method,
+            "hypotheses": hypotheses,
+            "inliers by": test,
+            "instances": len(cases),
+            "success": 100 * successes / len(cases),
+            "milliseconds": 1000 * statistics.median(seconds),
+        }
         rows.append(row)
-    slow = next(row.milliseconds for row in rows if row.method == _LOOP)
-    return [replace(row, times_faster=slow / row.milliseconds) for row in rows]
+    slow = next(row["milliseconds"] for row in rows if row["method"] == _LOOP)
+    return [row | {"times faster": slow / row["milliseconds"]} for row in rows]
 
 
 def _ways() -> Iterator[tuple[str, int | None, str, Callable[[VotingCase], Tensor]]]:

@@ -54,8 +54,7 @@ def read_files(folder: Path) -> dict[str, bytes]:
     return {path.name: path.read_bytes() for path in sorted(folder.iterdir())}
 
 
-MOST_PIXELS = 12_500_000
-"""Most pixels of a picture: those of a phone's."""
+MOST_PIXELS = 12_500_000  # most pixels of a picture: those of a phone's
 KINDS: dict[str, tuple[str, tuple[str, ...]]] = {
     "image": ("a picture", LISTED_SUFFIXES),
     "right": ("a picture", LISTED_SUFFIXES),
@@ -161,8 +160,7 @@ def keep_file(folder: Path, field: str, sent_name: str, data: bytes) -> Path:
     return kept
 
 
-EXAMPLE_SEED = 9
-"""No weights were trained on streets or views of this seed."""
+EXAMPLE_SEED = 9  # no weights were trained on streets or views of this seed
 
 
 def example_form(folder: Path, fields: dict[str, str]) -> dict[str, Any]:

@@ -187,8 +187,7 @@ def paced(receive: Receive) -> Receive:
 
 TICKET = "x-ticket"
 """Header of a request: a random name, by which the page asks for its place in the queue."""
-_RESULTS = 3
-"""Answers whose files are kept in memory for downloads."""
+_RESULTS = 3  # answers whose files are kept in memory for downloads
 _TYPES = {".png": "image/png", ".jpg": "image/jpeg", ".json": "application/json",
           ".zip": "application/zip"}  # fmt: skip
 
@@ -199,13 +198,10 @@ class Limits:
 
     upload_bytes: int = 64 * 10**6
     """All files of one request together."""
-
     waiting: int = 4
     """Requests that may wait for the one that is computed."""
-
     uploads: int = 32
     """Requests whose files may arrive at the same time."""
-
     hosts: tuple[str, ...] | None = LOOPBACK
     """Host names under which a browser may request the page; None: any. They keep other web pages
     in the same browser from reading answers by a name of their own (DNS rebinding)."""
@@ -391,8 +387,7 @@ def make_app(depth: FakestereoNet, pose: GeoPoseNet, limits: Limits | None = Non
 
 _CONNECTIONS = 400
 """Connections at once; more are answered with 503 before anything of them is read."""
-_LEAVE_S = 2
-"""Seconds that open connections have to finish after Ctrl+C."""
+_LEAVE_S = 2  # seconds that open connections have to finish after Ctrl+C
 
 
 def open_socket(host: str, port: int) -> socket.socket:

@@ -35,8 +35,7 @@ from depthpose.web.answer import (
     small_size,
 )
 
-OWN_CAD = "cad"
-"""The value of the field ``object`` that means the CAD file."""
+OWN_CAD = "cad"  # the value of the field object that means the CAD file
 _SAME = 0.02
 """Largest difference [diameters] of size and surface of a CAD file and the weights' own object."""
 

@@ -4,22 +4,23 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from depthpose.core.engine import Done, Files, Function, Sample, read_results, shard_results
-from depthpose.core.engine.work import Block, Runner, ShardFormat, Work
+from depthpose.core.engine import Done, Files, Function, Sample, Work, read_results, shard_results
+from depthpose.core.engine.work import Block, Runner, ShardFormat
 from depthpose.core.errors import InputError
 from depthpose.core.files import read_text
 
 TEXTS = Files(roles=("text",), suffixes=(".txt",))
 
 
-@dataclass(frozen=True)
-class ReverseWork:
-    """Turns the letters of text files round; a file with "bad" in it fails. Each call is logged."""
+def reverse_work(log: str) -> Work:
+    """Turn the letters of text files round; a file with "bad" in it fails. Each call is logged."""
+    start = Reverser(log).start
+    return Work(start=start, files=TEXTS, endings=("back.txt", "length"), batch=2)
 
+
+@dataclass(frozen=True)
+class Reverser:
     log: str
-    batch: int = 2
-    files: Files = TEXTS
-    endings: Sequence[str] = ("back.txt", "length")
 
     def start(self) -> Function:
         self._note("start")

@@ -7,28 +7,19 @@ import json
 import resource
 import sys
 from collections.abc import Sequence
-from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 
 from tests.core.engine.doubles import TEXTS
 
-from depthpose.core.engine import Files, Function, Job, RayEngine, Sample, find_items, run_job
+from depthpose.core.engine import Function, Job, RayEngine, Sample, Work, find_items, run_job
 
 
-@dataclass(frozen=True)
-class PeakWork:
-    """Gives for each input the peak memory of the process that took it, in kB."""
-
-    batch: int = 16
-    files: Files = TEXTS
-    endings: Sequence[str] = ("peak_kb",)
-
-    def start(self) -> Function:
-        return partial(_write_peaks)
+def _start() -> Function:
+    return _write_peaks
 
 
 def _write_peaks(samples: Sequence[Sample], out: Path) -> list[str]:
+    """Give for each input the peak memory of the process that took it, in kB."""
     for sample in samples:
         assert sample.files[0].read_text() == "small"
         (out / f"{sample.name}.peak_kb").write_text(str(_peak_kb()))
@@ -44,7 +35,7 @@ def main(total: int, home: Path) -> None:
     rows = [f"small.txt,{k:06d}" for k in range(total)]
     (home / "list.csv").write_text("\n".join(["text,name", *rows]))
     job = Job(
-        work=PeakWork(),
+        work=Work(start=_start, files=TEXTS, endings=("peak_kb",), batch=16),
         items=find_items([str(home / "list.csv")], TEXTS),
         out=str(home / "out"),
         settings={},

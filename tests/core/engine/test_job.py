@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
 import pytest
-from tests.core.engine.doubles import InProcessEngine, ReverseWork, unpacked, write_texts
+from tests.core.engine.doubles import InProcessEngine, reverse_work, unpacked, write_texts
 
 from depthpose.core.engine import (
     Done,
@@ -24,7 +24,7 @@ from depthpose.core.errors import InputError
 
 
 def job_of(tmp_path: Path, words: list[str], **changed: object) -> Job:
-    work = ReverseWork(str(tmp_path / "log"))
+    work = reverse_work(str(tmp_path / "log"))
     given = {"out": str(tmp_path / "out"), "settings": {"way": "back"}, "block": 2} | changed
     items = find_items(words, work.files) if words else []
     return Job(work=work, items=items, **given)  # pyright: ignore[reportArgumentType]
@@ -191,7 +191,7 @@ def test_a_damaged_plan_is_made_again_and_a_damaged_record_of_settings_refused(
     run_job(job, InProcessEngine())
     assert unpacked(tmp_path / "out").keys() == {"a", "b", "c", "d"}, "blocks are others now"
     (tmp_path / "out" / "run.json").write_text("{")
-    with pytest.raises(InputError, match=r"run.json: no JSON"):
+    with pytest.raises(InputError, match=r"run.json: not a readable JSON file"):
         run_job(job, InProcessEngine())
 
 

@@ -40,6 +40,7 @@ from depthpose.core.camera.stored_camera import (
     is_ros,
     lens_of,
     named,
+    numbers,
     read_storage,
     read_two_files,
     scalar,
@@ -77,12 +78,6 @@ _PLAIN_KEYS = ("width", "height", "focal_y_px", _DOFFS)
 def _middlebury_facts(path: AnyPath) -> CameraFacts:
     """Middlebury's ``calib.txt``: cam0, doffs, baseline in millimetres, size; cam1 is checked."""
     keys = read_key_values(path)
-    for name in ("cam0", "doffs", "baseline", "width", "height"):
-        if name not in keys:
-            raise InputError(
-                f"{path}: has no line {name}=...; a Middlebury calib.txt holds cam0, doffs, "
-                "baseline, width and height."
-            )
     K = kitti_matrix(path, keys, "cam0", (3, 3))
     right = kitti_matrix(path, keys, "cam1", (3, 3)) if "cam1" in keys else K
     baseline_mm, difference_px = (_number(path, keys, name) for name in ("baseline", "doffs"))
@@ -212,7 +207,7 @@ def _bare_facts(text: str) -> CameraFacts | None:
 
 def _number(path: AnyPath, keys: Mapping[str, list[float]], name: str) -> float:
     if len(keys.get(name, [])) != 1:
-        raise InputError(f"{path}: '{name}: NUMBER' is missing or holds several numbers.")
+        raise InputError(f"{path}: {name!r} is missing, or is not one number; copy the file anew")
     return keys[name][0]
 
 
@@ -310,14 +305,11 @@ def _json_number(keys: dict[str, Any], key: str) -> float:
 
 
 def _matrix(value: object) -> Float[Tensor, "3 3"]:
-    rows = value if isinstance(value, list) else []
-    if len(rows) == 9:
-        rows = [rows[k : k + 3] for k in (0, 3, 6)]
-    is_square = len(rows) == 3 and all(isinstance(row, list) and len(row) == 3 for row in rows)
-    if not is_square or not all(_is_number(x) for row in rows for x in row):
+    found = numbers(value)
+    if found is None or len(found) != 9:
         shown = repr(value)[:80]
         raise InputError(f"'K' is {shown}; write [[fx, skew, cx], [0, fy, cy], [0, 0, 1]]")
-    return torch.tensor([[float(x) for x in row] for row in rows], dtype=torch.float64)
+    return torch.tensor(found, dtype=torch.float64).reshape(3, 3)
 
 
 def _is_number(value: Any) -> bool:  # noqa: ANN401

@@ -1,7 +1,7 @@
 """Two cameras as they were calibrated (ROS, OpenCV, Kalibr), and their rectification by OpenCV."""
 
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -84,19 +84,12 @@ class RawCamera:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class RawPair:
-    """The calibration of two cameras whose images are not rectified.
+    """The calibration of two cameras whose images are not rectified."""
 
-    Attributes:
-        left: the left camera.
-        right: the right one.
-        right_from_left: carries points from the left camera's frame to the right one's [m].
-        size: width and height of both images [px]; None where the file does not say it.
-    """
-
-    left: RawCamera
-    right: RawCamera
-    right_from_left: Rigid
-    size: Size | None
+    left: RawCamera  #: the left camera
+    right: RawCamera  #: the right one
+    right_from_left: Rigid  #: carries points from the left camera's frame to the right one's [m]
+    size: Size | None  #: width and height of both images [px]; None where the file does not say it
 
 
 def read_raw_pair(
@@ -297,35 +290,30 @@ class Rectifier:
         return float(inside.mean())
 
     def rectify(
-        self, left: Float32[Tensor, "3 h w"], right: Float32[Tensor, "3 h w"]
+        self,
+        left: Float32[Tensor, "3 h w"],
+        right: Float32[Tensor, "3 h w"],
+        names: Sequence[str] = ("the left image", "the right image"),
     ) -> tuple[Float32[Tensor, "3 h w"], Float32[Tensor, "3 h w"]]:
         """Rectify the two images of a pair; what a raw image does not show is black.
 
         Raises:
-            InputError: an image is not of the calibration's size.
+            InputError: an image, which is called by its name, is not of the calibration's size.
         """
-        for image, name in ((left, "the left image"), (right, "the right image")):
-            self.refuse_other_size(image, name)
         cv2 = import_opencv("rectifying a pair")
+        size = (self.rig.width, self.rig.height)
         warped: list[Tensor] = []
-        for image, maps in ((left, self.left_maps), (right, self.right_maps)):
+        both = zip((left, right), names, (self.left_maps, self.right_maps), strict=True)
+        for image, name, maps in both:
+            if (image.shape[2], image.shape[1]) != size:
+                raise InputError(
+                    f"{name} is {image.shape[2]}x{image.shape[1]}, but the cameras were calibrated "
+                    f"at {size[0]}x{size[1]}; give the raw images in that size"
+                )
             pixels = np.ascontiguousarray(image.permute(1, 2, 0).numpy())
             cubic = torch.from_numpy(cv2.remap(pixels, *maps, cv2.INTER_CUBIC))
             warped.append(cubic.permute(2, 0, 1).clamp(0, 1).contiguous())
         return warped[0], warped[1]
-
-    def refuse_other_size(self, image: Float32[Tensor, "3 h w"], name: str) -> None:
-        """Refuse an image that is not of the calibration's size.
-
-        Raises:
-            InputError: that is so.
-        """
-        height, width = image.shape[1:]
-        if (width, height) != (self.rig.width, self.rig.height):
-            raise InputError(
-                f"{name} is {width}x{height}, but the cameras were calibrated at "
-                f"{self.rig.width}x{self.rig.height}; give the raw images in that size"
-            )
 
 
 def make_rectifier(pair: RawPair, size: Size, keep: float = 0.0) -> Rectifier:

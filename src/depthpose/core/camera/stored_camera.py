@@ -151,24 +151,18 @@ def facts_from_names(names: Names) -> CameraFacts | None:
         fx, fy, cx, cy = (
             scalar(names, f"{settings}{key}") or 0.0 for key in ("fx", "fy", "cx", "cy")
         )
-        width, height = (scalar(names, f"camera{key}") for key in ("width", "height"))
         baseline_m, product = scalar(names, "stereob"), scalar(names, "camerabf")
         factor = scalar(names, "depthmapfactor") or scalar(names, "rgbddepthmapfactor")
         is_rgbd = factor is not None
         if baseline_m is None and product is not None and not is_rgbd and fx > 0:
             baseline_m = product / fx  # of an RGB-D camera it is a made-up one
-        bent = [
-            value
-            for key in _DISTORTION_KEYS
-            if (value := scalar(names, f"{settings}{key}")) is not None
-        ]
         return CameraFacts(
             kind="settings of ORB-SLAM",
             K=intrinsics(fx, fy, cx, cy),
-            size=None if width is None or height is None else (int(width), int(height)),
+            size=size_of({key: names.get(f"camera{key}") for key in ("width", "height")}),
             baseline_m=None if is_rgbd else baseline_m,
             depth_unit_m=1 / factor if factor else None,
-            distortion=tuple(bent),
+            distortion=lens_of({key: names.get(f"{settings}{key}") for key in _DISTORTION_KEYS}),
         )
     left, right = published(names, _P, 12), matrix(names, ("p2",), 12)
     distortion, undistort = lens_of(names), _RECTIFY

@@ -6,7 +6,6 @@ The engine knows files and names; what a worker does with them is a function tha
 from depthpose.core.engine.job import Job as Job
 from depthpose.core.engine.job import RayEngine as RayEngine
 from depthpose.core.engine.job import is_job as is_job
-from depthpose.core.engine.job import read_job_settings as read_job_settings
 from depthpose.core.engine.job import read_results as read_results
 from depthpose.core.engine.job import result_items as result_items
 from depthpose.core.engine.job import run_job as run_job
@@ -18,6 +17,7 @@ from depthpose.core.engine.work import Inputs as Inputs
 from depthpose.core.engine.work import Item as Item
 from depthpose.core.engine.work import Sample as Sample
 from depthpose.core.engine.work import ShardFormat as ShardFormat
+from depthpose.core.engine.work import Work as Work
 from depthpose.core.engine.work import find_items as find_items
 from depthpose.core.engine.work import find_tars as find_tars
 from depthpose.core.engine.work import read_shard as read_shard

@@ -34,7 +34,14 @@ from depthpose.core.engine.work import (
 )
 from depthpose.core.errors import InputError, MissingExtraError, import_extra
 from depthpose.core.files import disk, remove_parts
-from depthpose.core.run import RECORD, is_unchanged, not_ours, refuse_other_settings, run_record
+from depthpose.core.run import (
+    RECORD,
+    is_unchanged,
+    not_ours,
+    read_settings,
+    refuse_other_settings,
+    run_record,
+)
 
 MANIFEST = "manifest.csv"
 
@@ -44,25 +51,15 @@ Engine = Callable[[Sequence[Block], Work, str, ShardFormat], Iterable[Done]]
 
 @dataclass(frozen=True, kw_only=True)
 class Job:
-    """What is done, to which inputs, and where the results go.
+    """What is done, to which inputs, and where the results go."""
 
-    Attributes:
-        work: what is done.
-        items: listed inputs.
-        tars: tar shards of inputs.
-        out: folder of the results, by path or URL.
-        settings: JSON values that decide the results; other settings need another folder.
-        form: of the shards.
-        block: inputs of a shard.
-    """
-
-    work: Work
-    items: Sequence[Item] = ()
-    tars: Sequence[str] = ()
-    out: str
-    settings: Mapping[str, Any]
-    form: ShardFormat = "tar"
-    block: int = 64
+    work: Work  #: what is done
+    items: Sequence[Item] = ()  #: listed inputs
+    tars: Sequence[str] = ()  #: tar shards of inputs
+    out: str  #: folder of the results, by path or URL
+    settings: Mapping[str, Any]  #: JSON values that decide the results; others need another folder
+    form: ShardFormat = "tar"  #: of the shards
+    block: int = 64  #: inputs of a shard
 
 
 def run_job(job: Job, engine: Engine) -> list[Done]:
@@ -80,7 +77,7 @@ def run_job(job: Job, engine: Engine) -> list[Done]:
     claim(out, {**job.settings, "shards": job.form})
     blocks = make_plan(out, job.items, job.tars, job.block)
     folder = disk.join(out, SHARDS)
-    sizes, records = disk.list_sizes(folder), _finished(out)
+    sizes, records = disk.list_sizes(folder), {one.name: one for one in read_results(out)}
     done: dict[str, Done] = {}
     for block in blocks:
         one, record = records.get(block.shard), disk.join(folder, f"{block.shard}.json")
@@ -131,36 +128,19 @@ def run_job(job: Job, engine: Engine) -> list[Done]:
 
 def claim(out: str, settings: Mapping[str, Any]) -> None:
     """Claim a folder, local or in a store, for a run with these settings, or continue it."""
-    record = disk.join(out, RECORD)
-    if disk.exists(record):
-        try:
-            earlier = json.loads(disk.read_from(record))
-        except ValueError as error:
-            raise InputError(f"{record}: no JSON ({error}); choose another folder") from error
+    if (earlier := read_settings(out)) is not None:
         refuse_other_settings(out, earlier, settings)
         return
     for name in (MANIFEST, PLAN, SHARDS):
         if disk.exists(disk.join(out, name)):
             raise not_ours(disk.join(out, name))
-    disk.publish_bytes(f"{json.dumps(run_record(settings), indent=2)}\n".encode(), record)
+    record = f"{json.dumps(run_record(settings), indent=2)}\n"
+    disk.publish_bytes(record.encode(), disk.join(out, RECORD))
 
 
 def is_job(out: str) -> bool:
     """Whether a folder holds shards of a job."""
     return disk.exists(disk.join(disk.absolute(out), PLAN))
-
-
-def read_job_settings(out: str) -> dict[str, Any]:
-    """Give the settings that made the shards of a folder.
-
-    Raises:
-        InputError: there are none.
-    """
-    record = disk.join(disk.absolute(out), RECORD)
-    try:
-        return dict(json.loads(disk.read_from(record))["settings"])
-    except (ValueError, KeyError, TypeError) as error:
-        raise InputError(f"{record}: not a record of a run. Choose another folder.") from error
 
 
 def result_items(out: str) -> list[Item]:
@@ -180,8 +160,12 @@ def result_items(out: str) -> list[Item]:
 
 
 def read_results(out: str) -> list[Done]:
-    """Say what an earlier job left, shard by shard; nothing where there was none."""
-    return [one for _, one in sorted(_finished(disk.absolute(out)).items())]
+    """Say what an earlier job left, shard by shard; a record that is damaged is as none."""
+    found: list[Done] = []
+    for _, text in sorted(disk.read_all(disk.join(disk.absolute(out), SHARDS), ".json").items()):
+        with suppress(ValueError, KeyError, TypeError):
+            found.append(Done.from_json(text))
+    return found
 
 
 def shard_results(out: str, done: Done) -> Iterator[tuple[str, dict[str, bytes]]]:
@@ -194,15 +178,6 @@ def shard_results(out: str, done: Done) -> Iterator[tuple[str, dict[str, bytes]]
     return read_shard(disk.join(disk.absolute(out), SHARDS, done.shard), names, done.endings)
 
 
-def _finished(out: str) -> dict[str, Done]:
-    """Read the records of shards; one that is damaged is as none."""
-    records: dict[str, Done] = {}
-    for name, text in disk.read_all(disk.join(out, SHARDS), ".json").items():
-        with suppress(ValueError, KeyError, TypeError):
-            records[name.removesuffix(".json")] = Done.from_json(text)
-    return records
-
-
 _LEAST_VERSION = (2, 52)  # the first version of Ray that has passwords
 
 
@@ -211,8 +186,7 @@ class RayEngine:
     """Does blocks by Ray Data.
 
     Attributes:
-        address: of a running cluster, ``auto`` for the one of this machine; None starts one here,
-            and ends it afterwards.
+        address: of a running cluster, or ``auto``; None starts one for this job.
         workers: at most; None: as many as fit into the cluster when the job begins.
         worker_cpus: cores that a worker asks for.
         worker_gpus: GPUs that it asks for; a part lets workers share one.

@@ -17,7 +17,7 @@ from dataclasses import asdict, dataclass
 from importlib import import_module
 from itertools import groupby, islice
 from pathlib import Path, PurePosixPath
-from typing import Any, Literal, Protocol, runtime_checkable
+from typing import Any, Literal
 
 from depthpose.core.errors import InputError, import_extra
 from depthpose.core.files import disk
@@ -46,15 +46,10 @@ class Files:
 
 @dataclass(frozen=True, slots=True)
 class Item:
-    """One input.
+    """One input."""
 
-    Attributes:
-        name: that of its results: unique in a job, relative, without a suffix.
-        files: paths or URLs, in the order of the roles of the work.
-    """
-
-    name: str
-    files: tuple[str, ...]
+    name: str  #: that of its results: unique in a job, relative, without a suffix
+    files: tuple[str, ...]  #: paths or URLs, in the order of the roles of the work
 
 
 def find_items(words: Sequence[str], files: Files) -> list[Item]:
@@ -321,17 +316,11 @@ def read_tar(url: str) -> Iterator[tuple[str, bytes]]:
 
 @dataclass(frozen=True, slots=True)
 class Sample:
-    """One input, its files at hand.
+    """One input, its files at hand."""
 
-    Attributes:
-        name: that of its results.
-        files: local paths, in the order of the roles.
-        reason: why there are none; a ``Function`` is given no such sample.
-    """
-
-    name: str
-    files: tuple[Path, ...] = ()
-    reason: str = ""
+    name: str  #: that of its results
+    files: tuple[Path, ...] = ()  #: local paths, in the order of the roles
+    reason: str = ""  #: why there are none; a ``Function`` is given no such sample
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -417,28 +406,14 @@ Function = Callable[[Sequence[Sample], Path], Sequence[str]]
 """Writes ``NAME.ENDING`` for each sample into a folder; gives for each "" or why it failed."""
 
 
-@runtime_checkable
-class Work(Protocol):
+@dataclass(frozen=True, kw_only=True)
+class Work:
     """What a job does; it is sent to every worker, which starts it once."""
 
-    @property
-    def files(self) -> Files:
-        """What an input is made of."""
-        ...
-
-    @property
-    def endings(self) -> Sequence[str]:
-        """Endings of the files of a result."""
-        ...
-
-    @property
-    def batch(self) -> int:
-        """Samples that are handed over at once."""
-        ...
-
-    def start(self) -> Function:
-        """Load what all samples need, such as a network."""
-        ...
+    start: Callable[[], Function]  #: loads what all samples need, such as a network
+    files: Files  #: what an input is made of
+    endings: Sequence[str]  #: of the files of a result
+    batch: int = 1  #: samples that are handed over at once
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -545,6 +520,4 @@ class Runner:
 
 def run_here(blocks: Sequence[Block], work: Work, out: str, form: ShardFormat) -> Iterator[Done]:
     """Do blocks in this process, one after the other: the engine that needs no cluster."""
-    runner = Runner(work, out, form)
-    for block in blocks:
-        yield runner.run(block)
+    yield from map(Runner(work, out, form).run, blocks)

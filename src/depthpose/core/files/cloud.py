@@ -37,15 +37,10 @@ _MAX_SCAN_BYTES = 2**26  # largest scan of a LiDAR that is read, thirty times KI
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Cloud:
-    """Points as a file holds them: its unit and frame are known to the caller alone.
+    """Points as a file holds them: its unit and frame are known to the caller alone."""
 
-    Attributes:
-        points: coordinates.
-        color: RGB in [0, 1], one a point, or None.
-    """
-
-    points: Float32[Tensor, "n 3"]
-    color: Float32[Tensor, "n 3"] | None = None
+    points: Float32[Tensor, "n 3"]  #: coordinates
+    color: Float32[Tensor, "n 3"] | None = None  #: RGB in [0, 1], one a point, or None
 
     def to_open3d(self) -> Any:  # noqa: ANN401  Open3D's classes carry no types
         """Give the same points, and colours where there are, as ``open3d.geometry.PointCloud``.

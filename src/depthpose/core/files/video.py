@@ -23,17 +23,11 @@ _CODECS = {".mp4": "vp09", ".avi": "MJPG"}  # VP9: OpenCV's own wheels have no H
 
 @dataclass(frozen=True, kw_only=True)
 class Video:
-    """A video on disk. Iterating decodes it anew from its first frame, one frame at a time.
+    """A video on disk. Iterating decodes it anew from its first frame, one frame at a time."""
 
-    Attributes:
-        path: the file.
-        fps: frames a second.
-        frames: the number in the file's header; 0 where it has none.
-    """
-
-    path: Path
-    fps: float
-    frames: int
+    path: Path  #: the file
+    fps: float  #: frames a second
+    frames: int  #: the number in the file's header; 0 where it has none
 
     def __iter__(self) -> Iterator[tuple[str, Float[Tensor, "3 h w"]]]:
         """Yield the name (``STEM_000000``, ``STEM_000001``, ...) and RGB in [0, 1] of each frame.

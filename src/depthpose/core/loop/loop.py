@@ -52,37 +52,22 @@ class Interrupted(KeyboardInterrupt):
 
 @dataclass(frozen=True, kw_only=True)
 class Progress:
-    """How far a training is.
+    """How far a training is."""
 
-    Attributes:
-        step: steps done.
-        steps: steps in all.
-        numbers: the latest metrics; empty between two log steps.
-    """
-
-    step: int
-    steps: int
-    numbers: dict[str, float]
+    step: int  #: steps done
+    steps: int  #: steps in all
+    numbers: dict[str, float]  #: the latest metrics; empty between two log steps
 
 
 @dataclass(frozen=True, kw_only=True)
 class Run:
-    """Folder of a training, and callbacks.
+    """Folder of a training, and callbacks."""
 
-    Attributes:
-        folder: the run folder; the weights lie in it, named after what was trained, and their card
-            beside them.
-        resume: go on from its last state.
-        finish: make weights of its last state, without another step.
-        on_step: called after each optimiser step.
-        on_message: called with each message for the user.
-    """
-
-    folder: Path
-    resume: bool = False
-    finish: bool = False
-    on_step: Callable[[Progress], None] | None = None
-    on_message: Callable[[str], None] | None = None
+    folder: Path  #: the run folder; weights, named after what was trained, and card lie in it
+    resume: bool = False  #: go on from its last state
+    finish: bool = False  #: make weights of its last state, without another step
+    on_step: Callable[[Progress], None] | None = None  #: called after each optimiser step
+    on_message: Callable[[str], None] | None = None  #: called with each message for the user
 
     def claim(
         self,
@@ -219,7 +204,7 @@ class _Training:
         while self.step < self.steps:
             self._take_step([next(batches) for _ in range(self.config.accumulate)])
             self.step += 1
-            stop = self._any_process(request.to_stop())
+            stop = self._any_process(bool(request.asked))
             if stop and self._any_process(request.to_finish()):
                 self.steps = self.step
             numbers: dict[str, float] = {}
@@ -368,7 +353,7 @@ class StopRequest:
     """Lets SIGTERM and Ctrl-C end the training after the step, with its state saved."""
 
     def __enter__(self) -> "StopRequest":
-        self._asked: list[tuple[int, float]] = []
+        self.asked: list[tuple[int, float]] = []
         self._handlers = {}
         with suppress(ValueError):  # not the main thread: whoever runs us handles signals
             numbers = (signal.SIGTERM, signal.SIGINT)
@@ -380,24 +365,20 @@ class StopRequest:
             signal.signal(number, handler)
 
     def _remember(self, number: int, _: FrameType | None) -> None:
-        if not self._asked and number == signal.SIGINT:
+        if not self.asked and number == signal.SIGINT:
             message = (
                 "\ndepthpose: stopping after this step. Press Ctrl-C again within 3 s to finish "
                 "now: the weights of the steps so far are written.\n"
             )
             os.write(2, message.encode())  # print may be at work itself
-        self._asked.append((number, time.monotonic()))
-
-    def to_stop(self) -> bool:
-        """Whether to stop after the step, with the state saved."""
-        return bool(self._asked)
+        self.asked.append((number, time.monotonic()))
 
     def to_finish(self) -> bool:
         """Whether to take the steps so far for all: Ctrl-C twice. Waits for the second one."""
-        presses = [at for number, at in self._asked if number == signal.SIGINT]
+        presses = [at for number, at in self.asked if number == signal.SIGINT]
         while len(presses) == 1 and time.monotonic() - presses[0] < SECOND_CTRL_C_S:
             time.sleep(0.05)
-            presses = [at for number, at in self._asked if number == signal.SIGINT]
+            presses = [at for number, at in self.asked if number == signal.SIGINT]
         return len(presses) > 1
 
 

@@ -19,22 +19,16 @@ class AdamConfig:
 
     learning_rate: float = 1e-4
     """Step size at the start."""
-
     beta1: float = 0.9
     """Decay of the mean of the gradient; 0.5 for adversarial training."""
-
     beta2: float = 0.999
     """Decay of the mean of its square."""
-
     schedule: Literal["constant", "constant-linear", "halving", "cosine"] = "constant"
     """constant; constant-linear (second half falls to zero); halving; cosine (falls to zero)."""
-
     halvings: int = 4
     """Equal parts of a training; ``halving`` halves after each but the last."""
-
     warmup_steps: int = 0
     """Steps over which the rate rises linearly from zero."""
-
     weight_decay: float = 0.0
     """Share of the weights taken off at a rate of 1, apart from the gradient (AdamW)."""
 
@@ -63,45 +57,32 @@ class LoopConfig:
 
     INSTEAD: ClassVar[dict[str, str]] = {"steps": "epochs", "epochs": "steps"}
     """A config file that gives one of these removes the other's default."""
-
     steps: int | None = None
     """Optimiser steps; or give ``epochs``."""
-
     epochs: float | None = None
     """Passes over the data; or give ``steps``."""
-
     batch_size: int = 4
     """Samples of a micro-batch, in each process."""
-
     accumulate: int = 1
     """Micro-batches whose gradients are averaged before a step. The view stage holds the graphs of
     all of them until the discriminator has been updated."""
-
     precision: Literal["fp32", "bf16", "fp16"] = "fp32"
     """Precision of the forward pass; fp16 needs a GPU. A processor without bf16 takes fp32."""
-
     clip_norm: float | None = None
     """Largest norm of an optimiser's gradient; None: as it is."""
-
     seed: int = 0
     """Decides order, augmentation and dropout; the initial weights are the task's."""
-
     save_every_steps: int = 200
     """Steps between two saved states."""
-
     validate_every_steps: int = 1000
     """Steps between two validations; there is always one after the last step."""
-
     log_every_steps: int = 10
     """Steps averaged into one line of metrics."""
-
     workers: int = 0
     """Processes that make samples; 0: the training process itself."""
-
     ema_decay: float | None = None
     """Decay of the moving average of the weights, which is then what is exported; None: off. The
     first steps decay faster, so that the initial weights are soon forgotten."""
-
     device: Literal["auto", "cpu"] = "auto"
     """auto: the accelerator that ``accelerate`` finds; cpu: none."""
 
