@@ -20,7 +20,7 @@ from depthpose.core.arrays import check_image
 from depthpose.core.camera import Camera
 from depthpose.core.devices import usable_device, usable_precision
 from depthpose.core.errors import InputError, import_opencv
-from depthpose.depth.config import LightConfig, MatcherConfig, PSMNetConfig, SGBMConfig
+from depthpose.depth.config import MatcherConfig, NetworkConfig, SGBMConfig
 from depthpose.depth.disparity import (
     changed_match,
     focal_size,
@@ -239,8 +239,6 @@ DTYPES = {"fp32": torch.float32, "bf16": torch.bfloat16}
 Views = Float[Tensor, "b 3 h w"]
 Maps = Float[Tensor, "b h w"]
 
-NetworkConfig = PSMNetConfig | LightConfig
-
 AGREEMENT_PX = 3.0
 """Difference of left and right disparity at which their agreement is down to 1/e."""
 
@@ -249,7 +247,7 @@ class StereoNetwork(nn.Module):
     """A stereo network: a normalised pair to disparity maps for the losses; the last is the output.
 
     Attributes:
-        config: its sizes and conventions; it has ``max_disparity_px``.
+        config: its sizes and conventions, a :class:`~depthpose.depth.config.NetworkConfig`.
     """
 
     config: Any
