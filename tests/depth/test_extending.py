@@ -10,6 +10,7 @@ from torch import Tensor, nn
 
 from depthpose.cli import main
 from depthpose.core.camera import StereoRig, write_camera
+from depthpose.core.config import config_from_dict
 from depthpose.core.errors import InputError
 from depthpose.core.export import Case, Export, Graph, Limit
 from depthpose.core.files import read_map, write_disparity_png, write_image, write_map
@@ -19,6 +20,7 @@ from depthpose.depth.config import (
     AugmentConfig,
     GeneratorConfig,
     MatcherConfig,
+    NetworkConfig,
     PairsConfig,
     SelectionConfig,
 )
@@ -32,7 +34,7 @@ from depthpose.depth.metrics import METRICS, Metric
 from depthpose.depth.stereo import StereoNetwork
 from depthpose.depth.synthesis import SelectionGenerator, UNetGenerator
 from depthpose.depth.train.config import FinetuneTraining, SelectTraining, StereoTraining
-from depthpose.depth.train.runs import train_finetune
+from depthpose.depth.train.runs import train_finetune, train_stereo
 from depthpose.depth.train.stages import SelectionSample, SelectTask, StereoTask
 from depthpose.depth.types import Match
 from depthpose.depth.weights import (
@@ -61,11 +63,10 @@ def pairs(tmp_path: Path) -> Path:
 
 
 @dataclass(frozen=True, kw_only=True)
-class FlatConfig:
+class FlatConfig(NetworkConfig):
     """Settings of the example's network."""
 
     most_px: float = 10.0
-    max_disparity_px: int = 192
 
 
 class FlatNetwork(StereoNetwork):
@@ -131,6 +132,14 @@ def test_extending_matchers_with_training(
     assert network.share.grad is not None
     assert float(network.share.grad) < 0, "4 px found, 5 px true"
     assert float(turn.facts["epe"]) == pytest.approx(1.0)
+
+    # A training by its config, as the command reads it from YAML.
+    words = {"other": {"flat": {"most_px": 12.0}}, "loop": {"steps": 1, "batch_size": 1}}
+    words["pairs"] = {"folders": [str(pairs)], "augment": {"crop_px": [16, 16]}}
+    training = config_from_dict(words, StereoTraining, source="flat.yaml")
+    trained = read_depth_weights(train_stereo(training, Run(folder=tmp_path / "stereo"))).matcher
+    assert isinstance(trained, FlatNetwork)
+    assert trained.config.most_px == 12.0
 
     # Fine-tuning a generator takes its matcher from any weights.
     weights, generator = tmp_path / "flat.safetensors", tmp_path / "generator.safetensors"

@@ -403,7 +403,7 @@ def test_one_network_is_given(tmp_path: Path) -> None:
     write_config(path, light)
     assert read_config(path, StereoTraining) == light, "as a resumed run reads it"
     path.write_text("light: {width: 8}\nmatcher: {width: 16}\n")
-    with pytest.raises(InputError, match="matcher and light are both given, and one network"):
+    with pytest.raises(InputError, match="matcher and light are given, and one network"):
         read_config(path, StereoTraining)
     path.write_text("with_frozen_stem: false\n")
     with pytest.raises(InputError, match="encoder of the light network, which PSMNet does not"):

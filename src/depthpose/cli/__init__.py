@@ -11,7 +11,6 @@ import warnings
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from importlib import import_module
-from importlib.metadata import version
 from inspect import cleandoc
 from typing import Any
 
@@ -172,6 +171,8 @@ def _notices_in_a_line() -> Iterator[None]:
 def _run(words: list[str]) -> int:
     """Read the words after ``depthpose`` as a command and its options, and call it."""
     if words in (["--version"], ["-V"]):
+        from importlib.metadata import version  # not for --help, which it would double
+
         from depthpose.cli.doctor import device_names
 
         versions = f"torch {version('torch')}, Python {platform.python_version()}"

@@ -182,7 +182,26 @@ Speed = Literal["quick", "fine"]
 
 
 @dataclass(frozen=True, kw_only=True)
-class PSMNetConfig(Settings):
+class NetworkConfig(Settings):
+    """What every stereo network says of itself."""
+
+    max_disparity_px: int = 192
+    """Disparities below this are considered; a multiple of ``step_px``."""
+
+    work_focal_px: Annotated[float | None, "(0, inf)"] = None
+    """Pairs are brought to this focal length before matching [px]; None: matched as they are."""
+
+    step_px: ClassVar[int] = 16
+    """Sides of images and ``max_disparity_px`` are multiples of this [px]."""
+
+    @property
+    def min_side_px(self) -> int:
+        """Smallest image side that the network takes [px]."""
+        return self.step_px
+
+
+@dataclass(frozen=True, kw_only=True)
+class PSMNetConfig(NetworkConfig):
     """Size and conventions of the stereo network (Chang and Chen 2018, stacked hourglass)."""
 
     max_disparity_px: Annotated[int, "[16, 16384]", 16] = 192
@@ -201,16 +220,10 @@ class PSMNetConfig(Settings):
     align_corners: bool = True
     """How the weights expect maps to be enlarged: True for the published KITTI 2015 weights."""
 
-    work_focal_px: Annotated[float | None, "(0, inf)"] = None
-    """Pairs are brought to this focal length before matching [px]; None: matched as they are."""
-
     def __post_init__(self) -> None:
         super().__post_init__()
         if not 1 <= len(self.pools) <= 16:
             raise InputError(f"pools must hold 1 to 16 windows, got {self.pools}")
-
-    step_px: ClassVar[int] = 16
-    """Sides of images and ``max_disparity_px`` are multiples of this [px]."""
 
     @property
     def min_side_px(self) -> int:
@@ -219,7 +232,7 @@ class PSMNetConfig(Settings):
 
 
 @dataclass(frozen=True, kw_only=True)
-class LightConfig(Settings):
+class LightConfig(NetworkConfig):
     """Size and conventions of the light stereo network."""
 
     max_disparity_px: Annotated[int, "[32, 16384]", 32] = 192
@@ -252,9 +265,6 @@ class LightConfig(Settings):
     """Whether the sky is a class of its own, beside the disparities; weights without it can be
     trained on with it."""
 
-    work_focal_px: Annotated[float | None, "(0, inf)"] = None
-    """Pairs are brought to this focal length before matching [px]; None: matched as they are."""
-
     def __post_init__(self) -> None:
         super().__post_init__()
         check_settings(self, candidates=f"[1, {self.max_disparity_px // 4}]")
@@ -265,10 +275,6 @@ class LightConfig(Settings):
             )
 
     step_px: ClassVar[int] = 32
-    """Sides of images and ``max_disparity_px`` are multiples of this [px]."""
-
-    min_side_px: ClassVar[int] = 32
-    """Smallest image side that the network takes [px]."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
-from typing import Any, NamedTuple, cast
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -18,7 +18,7 @@ from depthpose.depth.disparity import LEAST_PX, SKY_M
 from depthpose.depth.estimator import FakestereoNet
 from depthpose.depth.stereo import LightStereo, PSMNet, StereoNetwork
 from depthpose.depth.stereo.layers import interpolation_matrix, linear_taps
-from depthpose.depth.stereo.matcher import IMAGENET_MEAN, IMAGENET_STD, NetworkConfig
+from depthpose.depth.stereo.matcher import IMAGENET_MEAN, IMAGENET_STD
 from depthpose.depth.stereo.psmnet import WINDOW_PX
 from depthpose.depth.synthesis import (
     COLUMNS_SHARE,
@@ -320,7 +320,7 @@ def pair_graph(weights: DepthWeights) -> Graph:
     left = graph.input("left", np.float32, _IMAGES)
     right = graph.input("right", np.float32, _IMAGES)
     focal_px = None
-    if cast("NetworkConfig", weights.matcher.config).work_focal_px is not None:
+    if weights.matcher.config.work_focal_px is not None:
         K = graph.input("K", np.float64, (3, 3))
         focal_px = K.op("Reshape", [-1]).op("Gather", [4, 0])
     disparity_px, confidence, sky = _matched(left, right, focal_px, weights.matcher)
@@ -348,7 +348,7 @@ def _matched(
 ) -> _Maps:
     """Match at the focal length that the weights want, and come back to the images' size."""
     network = _dynamic_shape_network(matcher)
-    config, graph = cast("NetworkConfig", matcher.config), left.graph
+    config, graph = matcher.config, left.graph
     size = work = _size_of(left)
     if config.work_focal_px is not None:
         work = _focal_size(size, focal_px, config.work_focal_px)
@@ -423,7 +423,7 @@ def _pair_export(weights: DepthWeights, facts: dict[str, Any]) -> Export:
         assert weights.matcher is not None
         net = FakestereoNet(make_matcher(weights.matcher, _QUICK))
         sky = ("is_sky",) if _sees_sky(weights.matcher) else ()
-        work_px = cast("NetworkConfig", weights.matcher.config).work_focal_px
+        work_px = weights.matcher.config.work_focal_px
         for size in _SIZES:
             left, right = _scenes(*size)
             if sky:

@@ -21,7 +21,7 @@ from depthpose.core.camera import Camera
 from depthpose.core.devices import usable_device, usable_precision
 from depthpose.core.errors import InputError, import_opencv
 from depthpose.depth import disparity
-from depthpose.depth.config import LightConfig, MatcherConfig, PSMNetConfig, SGBMConfig
+from depthpose.depth.config import MatcherConfig, NetworkConfig, SGBMConfig
 from depthpose.depth.encoder import LiteEncoder
 from depthpose.depth.types import Map, Maps, Match, View, Views
 
@@ -230,7 +230,6 @@ IMAGENET_MEAN = (0.485, 0.456, 0.406)
 IMAGENET_STD = (0.229, 0.224, 0.225)
 DTYPES = {"fp32": torch.float32, "bf16": torch.bfloat16}
 
-NetworkConfig = PSMNetConfig | LightConfig
 
 AGREEMENT_PX = 3.0
 """Difference of left and right disparity at which their agreement is down to 1/e."""
@@ -240,7 +239,7 @@ class StereoNetwork(nn.Module):
     """A stereo network: a normalised pair to disparity maps for the losses; the last is the output.
 
     Attributes:
-        config: its sizes and conventions; it has ``max_disparity_px``.
+        config: its sizes and conventions, a :class:`~depthpose.depth.config.NetworkConfig`.
     """
 
     config: Any

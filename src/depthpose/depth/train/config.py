@@ -3,6 +3,7 @@
 from dataclasses import dataclass, field
 from typing import Annotated, Literal
 
+from depthpose.core.config import config_from_dict
 from depthpose.core.errors import InputError, refuse_unknown
 from depthpose.core.loop import AdamConfig, LoopConfig
 from depthpose.depth.config import (
@@ -10,12 +11,14 @@ from depthpose.depth.config import (
     DegradeConfig,
     GeneratorConfig,
     LightConfig,
+    NetworkConfig,
     PairsConfig,
     PSMNetConfig,
     SelectionConfig,
     Settings,
 )
 from depthpose.depth.losses import ADVERSARIAL_LOSSES, DISPARITY_LOSSES
+from depthpose.depth.weights import MATCHERS
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -142,6 +145,10 @@ class StereoTraining(Settings):
     light: LightConfig | None = None
     """Train this light network in place of ``matcher``."""
 
+    other: dict[str, dict[str, object]] = field(default_factory=dict)
+    """Train a network of another kind in its place: the name of the kind in ``stereo.MATCHERS``,
+    and its config."""
+
     start: str | None = None
     """Weights of the whole network to begin with (or a whole set)."""
 
@@ -177,14 +184,18 @@ class StereoTraining(Settings):
     """How long."""
 
     def __post_init__(self) -> None:
-        # A config that a run has written holds the defaults of ``matcher`` beside ``light``.
-        if self.light is not None and self.matcher != PSMNetConfig():
+        # A config that a run has written holds the defaults of ``matcher`` beside the others.
+        given = ["matcher"] if self.matcher != PSMNetConfig() else []
+        given += [*(["light"] if self.light is not None else []), *self.other]
+        if len(given) > 1:
             raise InputError(
-                "matcher and light are both given, and one network is trained; leave matcher out "
-                "for the light network, or light for PSMNet"
+                f"{' and '.join(given)} are given, and one network is trained; keep one"
             )
+        for kind in self.other:
+            refuse_unknown("other", kind, MATCHERS)
         super().__post_init__()
-        if self.light is None and (self.encoder_rate != 0.3 or not self.with_frozen_stem):
+        is_psmnet = self.light is None and not self.other
+        if is_psmnet and (self.encoder_rate != 0.3 or not self.with_frozen_stem):
             raise InputError(
                 "encoder_rate and with_frozen_stem are for the encoder of the light network, which "
                 "PSMNet does not have; leave them out, or give light"
@@ -202,8 +213,10 @@ class StereoTraining(Settings):
             )
 
     @property
-    def network(self) -> PSMNetConfig | LightConfig:
+    def network(self) -> NetworkConfig:
         """Config of the network that is trained."""
+        for kind, settings in self.other.items():
+            return config_from_dict(settings, MATCHERS[kind].config, source=f"other.{kind}")
         return self.light or self.matcher
 
 
