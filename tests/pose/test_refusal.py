@@ -23,12 +23,15 @@ from depthpose.core.errors import InputError
 from depthpose.core.rigid import Rigid
 from depthpose.pose.augment import grow_mask, shift_mask
 from depthpose.pose.config import CloudConfig, EstimateConfig, IcpConfig, RefusalConfig
-from depthpose.pose.estimator.answer import Clock, answer_of, misfit_of, with_status
 from depthpose.pose.estimator.candidates import (
     Candidate,
+    Clock,
+    answer_of,
     find_copies,
+    misfit_of,
     observability,
     surface_signals,
+    with_status,
 )
 from depthpose.pose.estimator.fit import fit_of, seen_about
 from depthpose.pose.estimator.inputs import ObjectCloud, prepare_cloud

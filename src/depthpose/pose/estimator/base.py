@@ -16,8 +16,7 @@ from depthpose.core.errors import InputError, nearest_name, refused_memory
 from depthpose.core.rigid import Rigid
 from depthpose.core.units import Unit
 from depthpose.pose.config import EstimateConfig, RefusalConfig
-from depthpose.pose.estimator.answer import with_status
-from depthpose.pose.estimator.candidates import PoseAmbiguities, find_copies
+from depthpose.pose.estimator.candidates import PoseAmbiguities, find_copies, with_status
 from depthpose.pose.estimator.find import SearchTargets, find_objects, nothing_found, which_object
 from depthpose.pose.estimator.hypotheses import Views, prepare_views
 from depthpose.pose.estimator.inputs import (
