@@ -21,7 +21,8 @@ from depthpose.core.checkpoint import SHIPPED, read_checkpoint
 from depthpose.core.config import config_from_dict
 from depthpose.core.errors import InputError
 from depthpose.core.rigid import Rigid
-from depthpose.pose.augment import grow_mask, shift_mask
+from depthpose.pose.augment import shift_mask
+from depthpose.pose.cloud import grow_mask
 from depthpose.pose.config import CloudConfig, EstimateConfig, IcpConfig, RefusalConfig
 from depthpose.pose.estimator.candidates import (
     Candidate,

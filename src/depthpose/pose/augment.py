@@ -97,18 +97,6 @@ def occlude(
     return torch.where(is_hidden, occluder_m, depth_m), silhouette & ~is_hidden
 
 
-def grow_mask(mask: Mask, grow_px: int) -> Mask:
-    """Grow a mask by so many pixels, or shrink it by as many where the number is negative."""
-    if grow_px == 0:
-        return mask
-    source = (mask if grow_px > 0 else ~mask).float()[None, None]
-    size = 2 * abs(grow_px) + 1
-    # A square, one axis after the other.
-    wide = F.max_pool2d(source, (1, size), 1, (0, size // 2))
-    grown = F.max_pool2d(wide, (size, 1), 1, (size // 2, 0))[0, 0] > 0
-    return grown if grow_px > 0 else ~grown
-
-
 def shift_mask(mask: Mask, rows: int, columns: int) -> Mask:
     """Shift a mask by so many pixels down and right; what comes in is not of it."""
     shifted = mask.roll((rows, columns), (0, 1))
@@ -227,10 +215,7 @@ def _gaps(depth_m: Depth, share: float, generator: torch.Generator) -> Mask:
 
 
 def _displaced(depth_m: Depth, scale: float, generator: torch.Generator) -> Depth:
-    """Read each pixel some pixels away, by the same way as its neighbours: edges wander.
-
-    ``scale`` is pixels of the window for one of the sensor's full image.
-    """
+    """Read each pixel ``scale`` times some pixels away, alike its neighbours: edges wander."""
     height, width = depth_m.shape
     ways = [1.2 * smooth_noise((height, width), 3.0 * scale, generator) for _ in range(2)]
     farthest = _STEREO_WINDOW * scale

@@ -3,6 +3,7 @@
 from dataclasses import dataclass
 
 import torch
+import torch.nn.functional as F
 from jaxtyping import Bool, Float, Float64, Int64
 from scipy.spatial import KDTree
 from torch import Tensor
@@ -95,6 +96,18 @@ def refuse_other_size(mask: Bool[Tensor, "mask_h mask_w"], depth_m: Float[Tensor
             f"the mask is {mask.shape[1]}x{mask.shape[0]}, but the depth image is "
             f"{depth_m.shape[1]}x{depth_m.shape[0]}; give the mask of this very image"
         )
+
+
+def grow_mask(mask: Bool[Tensor, "h w"], grow_px: int) -> Bool[Tensor, "h w"]:
+    """Grow a mask by so many pixels, or shrink it by as many where the number is negative."""
+    if grow_px == 0:
+        return mask
+    source = (mask if grow_px > 0 else ~mask).float()[None, None]
+    size = 2 * abs(grow_px) + 1
+    # A square, one axis after the other.
+    wide = F.max_pool2d(source, (1, size), 1, (0, size // 2))
+    grown = F.max_pool2d(wide, (size, 1), 1, (size // 2, 0))[0, 0] > 0
+    return grown if grow_px > 0 else ~grown
 
 
 def is_flying(points_m: Float[Tensor, "n 3"], limit_m: float) -> Bool[Tensor, " n"]:

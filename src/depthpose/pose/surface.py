@@ -113,8 +113,8 @@ class Surface:
     @cached_property
     def target(self) -> Any:  # noqa: ANN401  a tuple of numba's
         """Points, normals and table as compiled functions take them."""
-        from depthpose.pose.compiled.icp import Target
         from depthpose.pose.compiled.points import tree_of
+        from depthpose.pose.compiled.poses import Target
 
         tree, boxes = tree_of(self.points_m.numpy()), self.boxes
         place = np.full(len(self.points_m) + 1, -1)

@@ -56,11 +56,8 @@ def disagreement(
 ) -> Float64[Tensor, " b"]:
     """Mean angle between the network's directions and those to the keypoints of each pose [rad].
 
-    Args:
-        cloud: what the network saw.
-        outputs: its directions.
-        copies_m: for each pose the keypoints of the copies that the network could not distinguish
-            from it; the copy counts at which the directions point best, by their mean cosine.
+    ``copies_m``: for each pose the keypoints of the copies that the network could not distinguish
+    from it; the copy counts at which the directions point best, by their mean cosine.
     """
     directions = normalize(outputs.double(), dim=-1)
     points_m = cloud.points_m.double()
@@ -90,11 +87,7 @@ class CloudNormals(NamedTuple):
 
 
 def cloud_normals(cloud_m: Float[Tensor, "n 3"]) -> CloudNormals:
-    """Lay planes through some points of a cloud, once for all poses that are compared with it.
-
-    Args:
-        cloud_m: of the object, in the camera frame.
-    """
+    """Lay planes through some points of a cloud, once for all poses that are compared with it."""
     thinned_m = take_evenly(cloud_m.double(), _THINNED)
     some_m = take_evenly(thinned_m, _TILTED)
     return CloudNormals(some_m, local_planes(thinned_m, some_m)[0])
@@ -110,12 +103,6 @@ def surface_signals(
 
     A point seen through the posed surface contradicts the pose; surface that nobody saw may merely
     be occluded by something else.
-
-    Args:
-        cloud_m: of the object, in the camera frame.
-        poses: of the object, a batch.
-        surface: of its model.
-        normals: of the cloud; None: they are computed.
     """
     normals = cloud_normals(cloud_m) if normals is None else normals
     limit_m = NEAR * surface.diameter_m
@@ -144,18 +131,9 @@ def observability(
     A motion ``y = (d/2 w, v)`` about the middle of the cloud moves a surface point at ``a`` with
     normal ``n`` across itself by ``n . v + (a x n) . w``. The observability is the root mean square
     of that over the points near the surface, for the unit motion that moves it least (Gelfand et
-    al., Geometrically Stable Sampling for the ICP Algorithm, 2003).
-
-    Args:
-        cloud_m: of the object, in the camera frame.
-        pose: of the object.
-        surface: of its model.
-        free: declared symmetries, as :func:`~depthpose.pose.voting.free_motions` gives them; they
-            are left out.
-
-    Returns:
-        The observability, and the weakest motion: (rotation, translation at the middle of the
-        cloud), unit length after scaling.
+    al., Geometrically Stable Sampling for the ICP Algorithm, 2003). Motions of declared symmetries
+    (``free``) are left out. The weakest motion is given too: (rotation, translation at the middle
+    of the cloud), of unit length after scaling.
     """
     points = take_evenly(cloud_m.double(), _SAMPLED)
     distance_m, index = _nearest(points, pose, surface)
@@ -248,12 +226,7 @@ class Candidate(NamedTuple):
 
 
 def find_copies(model: ObjectModel, *, up_to_symmetry: bool) -> PoseAmbiguities:
-    """Search a model for its near-symmetries, or count them as one answer with the true ones.
-
-    Args:
-        model: the object.
-        up_to_symmetry: copies that look nearly alike are one answer.
-    """
+    """Search a model for its near-symmetries, or count them as one answer with the true ones."""
     points_m = sample_surface(model, 2000)[0].double()
     near = [one.model_from_model for one in near_symmetries(model)]
     none = Rigid(torch.zeros(0, 3, 3).double(), torch.zeros(0, 3).double())
@@ -303,18 +276,10 @@ def find_candidates(
     surface: Surface,
     config: IcpConfig | None,
 ) -> list[Candidate]:
-    """Refine the poses at which ICP ended elsewhere and the nearly symmetric copies of the best.
+    """Refine ``others``, at which ICP ended elsewhere, and the nearly symmetric copies of the best.
 
-    Args:
-        cloud_m: of the object, in the camera frame.
-        best: the pose that was found.
-        others: at which other starts of ICP ended.
-        copies: of the model.
-        surface: of the model.
-        config: of ICP; None: the copies stay where they are.
-
-    Returns:
-        The best first, then those that are other poses than it and than each other.
+    The best comes first, then those that are other poses than it and than each other. Without a
+    config of ICP the copies stay where they are.
     """
     starts = Rigid.cat([others, best.pose @ copies.near])
     kept = [best]

@@ -14,7 +14,7 @@ from torch.nn.functional import max_pool2d
 from depthpose.core.arrays import take_evenly
 from depthpose.core.camera import back_project
 from depthpose.core.rigid import Rigid, rotation_by
-from depthpose.pose.augment import grow_mask
+from depthpose.pose.cloud import grow_mask
 from depthpose.pose.compiled import serves
 from depthpose.pose.config import IcpConfig
 from depthpose.pose.estimator.inputs import ObjectCloud
@@ -66,7 +66,15 @@ class Seen:
 def seen_about(cloud_m: Float[Tensor, "n 3"], view: ViewInput | None, diameter_m: float) -> Seen:
     """Cut the window of an object out of its view; a cloud alone is drawn as its camera saw it."""
     cloud_m = cloud_m.double()
-    K = _camera_of(cloud_m) if view is None else view.K.double()
+    if view is None:  # a camera to which the points of the cloud are a pixel apart
+        rays = cloud_m[:, :2] / cloud_m[:, 2:]
+        apart = torch.cdist(take_evenly(rays, 200), take_evenly(rays, 5000))
+        apart = apart.masked_fill(apart < 1e-9, torch.inf).amin(-1)
+        focal = 1 / (1.5 * float(apart.median()))
+        focal *= (min(len(rays), 5000) / len(rays)) ** -0.5
+        K = torch.diag(torch.tensor([focal, focal, 1.0], dtype=torch.float64))
+    else:
+        K = view.K.double()
     u, v = (cloud_m @ K.T)[:, :2].div(cloud_m[:, 2:]).round().long().unbind(-1)
     reach = int(_WIDE * diameter_m / float(cloud_m[:, 2].median()) * float(K[0, 0])) + 4
     low = torch.stack([u.amin(), v.amin()]) - reach
@@ -89,7 +97,15 @@ def seen_about(cloud_m: Float[Tensor, "n 3"], view: ViewInput | None, diameter_m
     depth_m = torch.where(depth_m.isfinite() & (depth_m > 0), depth_m, torch.nan)
     moved = K.clone()
     moved[:2, 2] -= torch.tensor([left, top], dtype=torch.float64)
-    return Seen(depth_m=depth_m, is_own=own, K=moved, noise_m=_noise_m(depth_m, own))
+    # Noise by second differences, which a slope does not change.
+    own_m, found = torch.where(grow_mask(own, -1), depth_m, torch.nan), []
+    for along_m in (own_m, own_m.T):
+        ends_m = along_m[:, : -2 * _LAG_PX] + along_m[:, 2 * _LAG_PX :]
+        bent_m = (ends_m - 2 * along_m[:, _LAG_PX:-_LAG_PX]).flatten()
+        found.append(bent_m[bent_m.isfinite()])
+    bent_m = torch.cat(found).abs()
+    noise_m = 1.4826 * float(bent_m.median()) / 6**0.5 if len(bent_m) > 0 else 0.0
+    return Seen(depth_m=depth_m, is_own=own, K=moved, noise_m=noise_m)
 
 
 def fit_of(seen: Seen, pose: Rigid, surface: Surface) -> Fit:
@@ -163,28 +179,6 @@ def fit_of(seen: Seen, pose: Rigid, surface: Surface) -> Fit:
         explained=float((apart_m < limit_m).double().mean()) if len(apart_m) else 0.0,
         noise_m=seen.noise_m,
     )
-
-
-def _noise_m(depth_m: Float64[Tensor, "h w"], is_own: Bool[Tensor, "h w"]) -> float:
-    """Give the noise of the readings by their second differences, which a slope does not change."""
-    own_m, found = torch.where(grow_mask(is_own, -1), depth_m, torch.nan), []
-    for along_m in (own_m, own_m.T):
-        ends_m = along_m[:, : -2 * _LAG_PX] + along_m[:, 2 * _LAG_PX :]
-        bent_m = (ends_m - 2 * along_m[:, _LAG_PX:-_LAG_PX]).flatten()
-        found.append(bent_m[bent_m.isfinite()])
-    bent_m = torch.cat(found).abs()
-    return 1.4826 * float(bent_m.median()) / 6**0.5 if len(bent_m) > 0 else 0.0
-
-
-def _camera_of(cloud_m: Float64[Tensor, "n 3"]) -> Float64[Tensor, "3 3"]:
-    """Give the intrinsic matrix of a camera to which the points of a cloud are a pixel apart."""
-    rays = cloud_m[:, :2] / cloud_m[:, 2:]
-    some = take_evenly(rays, 200)
-    apart = torch.cdist(some, take_evenly(rays, 5000))
-    apart = apart.masked_fill(apart < 1e-9, torch.inf).amin(-1)
-    focal = 1 / (1.5 * float(apart.median()))
-    focal *= (min(len(rays), 5000) / len(rays)) ** -0.5
-    return torch.diag(torch.tensor([focal, focal, 1.0], dtype=torch.float64))
 
 
 POINTS = 400
@@ -277,7 +271,7 @@ def _grow(
     widths = (1 + (_WIDE_STEP - 1) * max(0.0, 1 - 2 * step / _STEPS) for step in range(_STEPS))
     limits_m = [NEAR * surface.diameter_m * width for width in widths]
     if serves(local_m, times):
-        from depthpose.pose.compiled.icp import grown
+        from depthpose.pose.compiled.poses import grown
 
         times, local_m, variance = grown(
             local_m, times, middle_m, surface.target, limits_m, _CONVERGED, is_exact

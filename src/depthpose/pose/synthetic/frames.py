@@ -17,8 +17,7 @@ from depthpose.core.rigid import Rigid
 from depthpose.pose.augment import measure, random_rotation, uniform, whole
 from depthpose.pose.config import ObjectsConfig
 from depthpose.pose.datasets import BopFrame, BopObject
-from depthpose.pose.mesh import sample_surface
-from depthpose.pose.synthetic.views import surfel_triangles
+from depthpose.pose.mesh import sample_surface, surfel_triangles
 from depthpose.pose.types import ObjectModel
 
 _WAVES = 6
@@ -132,16 +131,6 @@ class Light:
     ambient: Float[Tensor, "3"]
 
 
-def random_light(up: Float[Tensor, "3"], generator: torch.Generator) -> Light:
-    """Draw a lamp above the table, warm or cold, strong or weak."""
-    towards = F.normalize(1.2 * up + 0.8 * torch.randn(3, generator=generator), dim=0)
-    strength, warmth = uniform(generator, 0.3, 0.9), uniform(generator, -0.15, 0.15)
-    colour = torch.tensor([1 + warmth, 1.0, 1 - warmth])
-    return Light(
-        towards=towards, lamp=strength * colour, ambient=uniform(generator, 0.2, 0.6) * (2 - colour)
-    )
-
-
 def shade(
     placed: Sequence[Placed], raster: Raster, K: Float[Tensor, "3 3"], light: Light
 ) -> Float[Tensor, "n 3"]:
@@ -233,10 +222,8 @@ def _make_frame(
         world = _piled(models, solids, config, generator)
     else:
         world = _arranged(solids, config, generator)
-    camera_from_world = _viewpoint(config, generator)
-    placed = [
-        Placed(solid=solid, camera_from_model=camera_from_world @ pose) for solid, pose in world
-    ]
+    view = _viewpoint(config, generator)
+    placed = [Placed(solid=solid, camera_from_model=view @ pose) for solid, pose in world]
     (fx, fy), (cx, cy) = config.focal_px, config.principal_point_px
     K = torch.tensor([[fx, 0, cx], [0, fy, cy], [0, 0, 1]], dtype=torch.float64)
     width, height = config.image_px
@@ -245,7 +232,13 @@ def _make_frame(
     owner = torch.cat([torch.full((len(c),), i) for i, c in enumerate(corners)])
     seen = torch.where(raster.primitive >= 0, owner[raster.primitive.clamp(min=0)], -1)
     image = backdrop(height, width, generator)
-    light = random_light(placed[-1].camera_from_model.R[:, 2], generator)  # above the table
+    # A lamp above the table, warm or cold, strong or weak.
+    up = placed[-1].camera_from_model.R[:, 2]
+    towards = F.normalize(1.2 * up + 0.8 * torch.randn(3, generator=generator), dim=0)
+    strength, warmth = uniform(generator, 0.3, 0.9), uniform(generator, -0.15, 0.15)
+    colour = torch.tensor([1 + warmth, 1.0, 1 - warmth])
+    ambient = uniform(generator, 0.2, 0.6) * (2 - colour)
+    light = Light(towards=towards, lamp=strength * colour, ambient=ambient)
     image[:, raster.primitive >= 0] = shade(placed, raster, K, light).mT
     rgb = _exposed(image, generator)
     focal_px = (config.focal_px[0], config.focal_px[0])
@@ -307,11 +300,7 @@ def _piled(
     config: ObjectsConfig,
     generator: torch.Generator,
 ) -> list[tuple[Solid, Rigid]]:
-    """Drop copies of one thing straight down until they touch, in the table's frame (z up).
-
-    Of several random rotations and places the one whose middle comes to lie lowest is taken.
-    Nothing slides or tips over afterwards.
-    """
+    """Drop copies of one thing straight down until they touch, in the table's frame (z up)."""
     which = whole(generator, len(solids))
     points = sample_surface(models[which], 20000)[0]
     middle = (points.amin(0) + points.amax(0)) / 2
@@ -321,7 +310,7 @@ def _piled(
     cells = math.ceil((reach_m + radius_m) / _CELL_M)
     height_m = torch.zeros((2 * cells + 1) ** 2)
     placed: list[tuple[Solid, Rigid]] = []
-    for _ in range(config.frame_pile):
+    for _ in range(config.frame_pile):  # each where its middle comes to lie lowest
         drops: list[tuple[float, Rigid, Tensor, Tensor]] = []
         for _ in range(_DROPS):
             R = random_rotation(generator).float()

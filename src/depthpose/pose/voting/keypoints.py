@@ -86,7 +86,7 @@ def meet_prepared(lines: Lines, centre_m: Float[Tensor, "*batch 1 3"], refinemen
     local, n, w = lines
     all_count = torch.ones_like(w[..., 0])
     if n.ndim == 3 and n.dtype == torch.float64 and serves(*lines):
-        from depthpose.pose.compiled.vote import met
+        from depthpose.pose.compiled.poses import met
 
         p, covariance, condition = met(local, n, w, refinements, _NEAREST)
         return Vote(keypoints_m=p + centre_m, covariance_m2=covariance, condition=condition,
@@ -336,7 +336,7 @@ def fit_pose(
     most = 100 * trace.median(-1, keepdim=True).values.clamp(min=1e-300)
     pose = fit_rigid(model, found, trace.clamp(max=most))
     if serves(pose.R, model, found, information):
-        from depthpose.pose.compiled.vote import fitted
+        from depthpose.pose.compiled.poses import fitted
 
         pose, H = fitted(pose, model, found, information, _STEPS)
     else:
