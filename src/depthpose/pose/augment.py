@@ -125,7 +125,16 @@ def measure(
     if kind == "none":
         return depth_m
     steepest = _STEEPEST if kind != "laser" else 2 * _STEEPEST
-    is_lost = _is_steep(depth_m, focal_px[0], steepest) | _gaps(depth_m, missing, generator)
+    is_lost = _is_steep(depth_m, focal_px[0], steepest)
+    # Half of the missing readings singly, half in patches.
+    height, width = depth_m.shape
+    is_lost |= torch.rand(height, width, generator=generator) < 0.5 * missing
+    coarse = torch.rand(1, 1, 2 + height // 12, 2 + width // 12, generator=generator)
+    patches = F.interpolate(coarse, (height, width), mode="bilinear", align_corners=False)[0, 0]
+    # Their level is met on every fourth row and column: the share is a matter of chance anyway.
+    some = patches[::4, ::4].flatten()
+    if count := round(0.5 * missing * len(some)):
+        is_lost |= patches <= some.kthvalue(count).values
     correlation_px = config.noise_correlation_px
     if kind == "active stereo":
         correlation_px = correlation_px or _STEREO_CORRELATION_PX
@@ -136,7 +145,6 @@ def measure(
         is_lost |= _is_shadowed(depth_m, focal_px[0])
         # Each pixel reads one that is a pixel or none away: edges are blurred. At the ends of a row
         # it reads beyond; windows have a margin there.
-        height, width = depth_m.shape
         steps, index = torch.tensor([-1, 0, 0, 1]), torch.arange(height * width)
         moves = (steps[:, None] * width + steps).flatten()
         index += moves[torch.randint(16, (height * width,), generator=generator)]
@@ -201,17 +209,6 @@ def _is_shadowed(depth_m: Depth, focal_px: float, baseline_m: float = _KINECT_BA
     lit = column + (focal_px * baseline_m / depth_m).nan_to_num(-torch.inf)
     # The projector's columns ascend along a row, but for what lies behind an edge.
     return lit < lit.cummax(1).values - 1.5
-
-
-def _gaps(depth_m: Depth, share: float, generator: torch.Generator) -> Mask:
-    height, width = depth_m.shape
-    single = torch.rand(height, width, generator=generator) < 0.5 * share
-    coarse = torch.rand(1, 1, 2 + height // 12, 2 + width // 12, generator=generator)
-    patches = F.interpolate(coarse, (height, width), mode="bilinear", align_corners=False)[0, 0]
-    # Their level is met on every fourth row and column: the share is a matter of chance anyway.
-    some = patches[::4, ::4].flatten()
-    count = round(0.5 * share * len(some))
-    return single | (patches <= some.kthvalue(count).values) if count else single
 
 
 def _displaced(depth_m: Depth, scale: float, generator: torch.Generator) -> Depth:

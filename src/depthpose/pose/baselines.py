@@ -15,7 +15,7 @@ from torch import Tensor, nn
 from depthpose.core.config import Settings
 from depthpose.core.errors import import_open3d
 from depthpose.core.rigid import Rigid, turn_axis_to
-from depthpose.pose.cloud import cloud_from_depth
+from depthpose.pose.cloud import object_points
 from depthpose.pose.mesh import sample_surface
 from depthpose.pose.segmentation import ResNet18
 from depthpose.pose.sparse import RowNorm
@@ -307,8 +307,8 @@ class FpfhEstimator:
         estimates = []
         for given in inputs:
             peer = self._peers[given.object]
-            points_m = cloud_from_depth(given.depth_m, given.mask, given.K, peer.model.diameter_m)
-            cloud = CloudInput(name=given.name, points_m=points_m.float(), object=given.object)
+            points_m = object_points(given, peer.model.diameter_m)
+            cloud = CloudInput(name=given.name, points_m=points_m, object=given.object)
             estimates.append(peer.estimate(cloud))
         return estimates
 

@@ -12,7 +12,7 @@ from depthpose.core.errors import InputError
 from depthpose.core.rigid import turn_axis_to
 from depthpose.pose.compiled import finite_array, serves
 from depthpose.pose.config import CloudConfig
-from depthpose.pose.types import CloudInput, ViewInput
+from depthpose.pose.types import CloudInput, CloudSample, ViewInput, ViewSample
 
 _LARGEST_CELL = 2**20
 _NEIGHBOURS = 20
@@ -83,6 +83,14 @@ def object_points(given: CloudInput | ViewInput, diameter_m: float) -> Float[Ten
     if isinstance(given, ViewInput):
         return cloud_from_depth(given.depth_m, given.mask, given.K, diameter_m).float()
     return given.points_m[is_reading(given.points_m)].float()
+
+
+def lift_sample(view: ViewSample, diameter_m: float, config: CloudConfig) -> CloudSample:
+    """Lift a view of an object to its cloud, without flying pixels."""
+    given = view.input
+    points_m = cloud_from_depth(given.depth_m, given.mask, given.K, diameter_m, config)
+    cloud = CloudInput(name=given.name, points_m=points_m, object=given.object)
+    return CloudSample(input=cloud, truth=view.truth)
 
 
 def refuse_other_size(mask: Bool[Tensor, "mask_h mask_w"], depth_m: Float[Tensor, "h w"]) -> None:

@@ -107,8 +107,22 @@ class VoxelIndex:
         self._low = self._strides = keys.new_zeros(4)
         self._table: Tensor | None = None
         self._is_compiled = serves(keys)
-        if len(keys) and not self._is_compiled:
-            self._lay_out()
+        if not len(keys) or self._is_compiled:
+            return
+        coordinates = self._cell_coordinates(keys)
+        low, high = coordinates.amin(0), coordinates.amax(0)
+        sides = (high - low + 1).tolist()
+        sides[1:] = [side + 2 * MARGIN for side in sides[1:]]
+        cells = sides[0] * sides[1] * sides[2] * sides[3]
+        if cells > min(MAX_CELLS, CELLS_PER_VOXEL * len(coordinates) + MAX_CELLS // 256):
+            return
+        low[1:] -= MARGIN
+        strides = [sides[1] * sides[2] * sides[3], sides[2] * sides[3], sides[3], 1]
+        device = low.device
+        self._low, self._strides = low, torch.tensor(strides, device=device)
+        self._table = torch.full((cells,), len(coordinates), dtype=torch.int32, device=device)
+        rows = torch.arange(len(coordinates), dtype=torch.int32, device=device)
+        self._table[self._cells(keys)] = rows
 
     def find(self, standing: Keys, moves: Moves) -> Int32[Tensor, "moves standing"]:
         """Give the row of each voxel ``standing + move * step``.
@@ -131,22 +145,6 @@ class VoxelIndex:
         offsets = (torch.tensor(moves, device=cells.device) * self._strides[1:]).sum(-1)
         wanted = offsets[:, None] + cells
         return self._table.index_select(0, wanted.flatten()).view(wanted.shape)
-
-    def _lay_out(self) -> None:
-        coordinates = self._cell_coordinates(self._keys)
-        low, high = coordinates.amin(0), coordinates.amax(0)
-        sides = (high - low + 1).tolist()
-        sides[1:] = [side + 2 * MARGIN for side in sides[1:]]
-        cells = sides[0] * sides[1] * sides[2] * sides[3]
-        if cells > min(MAX_CELLS, CELLS_PER_VOXEL * len(coordinates) + MAX_CELLS // 256):
-            return
-        low[1:] -= MARGIN
-        strides = [sides[1] * sides[2] * sides[3], sides[2] * sides[3], sides[3], 1]
-        device = low.device
-        self._low, self._strides = low, torch.tensor(strides, device=device)
-        self._table = torch.full((cells,), len(coordinates), dtype=torch.int32, device=device)
-        rows = torch.arange(len(coordinates), dtype=torch.int32, device=device)
-        self._table[self._cells(self._keys)] = rows
 
     def _cell_coordinates(self, keys: Keys) -> Int64[Tensor, "n 4"]:
         coordinates = unpack(keys)

@@ -164,18 +164,6 @@ def shade(
     return colour
 
 
-def backdrop(
-    height: int, width: int, generator: torch.Generator
-) -> Float[Tensor, "3 {height} {width}"]:
-    """Draw what is behind the table: blots of several sizes over a colour, out of focus."""
-    image = torch.rand(3, 1, 1, generator=generator) * torch.ones(1, height, width)
-    for cells in (3, 8, 24):
-        blots = torch.randn(1, 3, cells, cells, generator=generator)
-        smooth = F.interpolate(blots, (height, width), mode="bilinear", align_corners=False)
-        image = image + uniform(generator, 0.0, 0.25) * smooth[0]
-    return image.clamp(0, 1)
-
-
 _TRIES = 30
 _FRAMES_SEED = 0xF4A3E5
 
@@ -231,7 +219,13 @@ def _make_frame(
     raster = rasterize(torch.cat(corners), K, width, height)
     owner = torch.cat([torch.full((len(c),), i) for i, c in enumerate(corners)])
     seen = torch.where(raster.primitive >= 0, owner[raster.primitive.clamp(min=0)], -1)
-    image = backdrop(height, width, generator)
+    # Behind the table blots of several sizes over a colour, out of focus.
+    image = torch.rand(3, 1, 1, generator=generator) * torch.ones(1, height, width)
+    for cells in (3, 8, 24):
+        blots = torch.randn(1, 3, cells, cells, generator=generator)
+        smooth = F.interpolate(blots, (height, width), mode="bilinear", align_corners=False)
+        image = image + uniform(generator, 0.0, 0.25) * smooth[0]
+    image = image.clamp(0, 1)
     # A lamp above the table, warm or cold, strong or weak.
     up = placed[-1].camera_from_model.R[:, 2]
     towards = F.normalize(1.2 * up + 0.8 * torch.randn(3, generator=generator), dim=0)

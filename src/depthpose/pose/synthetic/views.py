@@ -30,11 +30,10 @@ from depthpose.pose.augment import (
     uniform,
     whole,
 )
-from depthpose.pose.cloud import cloud_from_depth, grow_mask
+from depthpose.pose.cloud import grow_mask, lift_sample
 from depthpose.pose.config import CloudConfig, ObjectsConfig
 from depthpose.pose.mesh import drawn_triangles
 from depthpose.pose.types import (
-    CloudInput,
     CloudSample,
     ObjectModel,
     PoseTruth,
@@ -228,15 +227,8 @@ class Objects:
 
     def sample(self, index: int) -> CloudSample:
         """Make the partial cloud of any index, also beyond the number of samples."""
-        view = self.view(index)
-        given, model = view.input, self.models[index % len(self.models)]
-        points_m = cloud_from_depth(
-            given.depth_m, given.mask, given.K, model.diameter_m, self.cloud
-        )
-        return CloudSample(
-            input=CloudInput(name=given.name, points_m=points_m, object=given.object),
-            truth=view.truth,
-        )
+        model = self.models[index % len(self.models)]
+        return lift_sample(self.view(index), model.diameter_m, self.cloud)
 
     def view(self, index: int) -> ViewSample:
         """Make the window of depth and the mask that a sample is lifted from."""
