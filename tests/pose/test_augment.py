@@ -9,7 +9,8 @@ import torch
 
 from depthpose.core.config import config_to_dict, read_config, write_config
 from depthpose.core.errors import InputError
-from depthpose.pose.augment import (
+from depthpose.pose.config import ObjectsConfig, SensorConfig
+from depthpose.pose.synthetic.views import (
     grow_mask,
     measure,
     occlude,
@@ -17,7 +18,6 @@ from depthpose.pose.augment import (
     random_rotation,
     whole,
 )
-from depthpose.pose.config import ObjectsConfig, SensorConfig
 from depthpose.pose.train import PoseTraining
 
 

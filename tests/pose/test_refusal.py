@@ -21,7 +21,6 @@ from depthpose.core.checkpoint import SHIPPED, read_checkpoint
 from depthpose.core.config import config_from_dict
 from depthpose.core.errors import InputError
 from depthpose.core.rigid import Rigid
-from depthpose.pose.augment import shift_mask
 from depthpose.pose.cloud import grow_mask
 from depthpose.pose.config import CloudConfig, EstimateConfig, IcpConfig, RefusalConfig
 from depthpose.pose.estimator.candidates import (
@@ -38,6 +37,7 @@ from depthpose.pose.estimator.fit import fit_of, seen_about
 from depthpose.pose.estimator.inputs import ObjectCloud, prepare_cloud
 from depthpose.pose.metrics import risk_coverage
 from depthpose.pose.surface import prepare_surface
+from depthpose.pose.synthetic.views import shift_mask
 from depthpose.pose.types import Fit, ObjectModel, PoseEstimate, ViewInput
 
 TRUTH = pose_at()

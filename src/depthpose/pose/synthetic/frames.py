@@ -14,10 +14,10 @@ from depthpose.core.errors import InputError
 from depthpose.core.loop import sample_generator
 from depthpose.core.render import Raster, rasterize
 from depthpose.core.rigid import Rigid
-from depthpose.pose.augment import measure, random_rotation, uniform, whole
 from depthpose.pose.config import ObjectsConfig
 from depthpose.pose.datasets import BopFrame, BopObject
 from depthpose.pose.mesh import sample_surface, surfel_triangles
+from depthpose.pose.synthetic.views import measure, random_rotation, uniform, whole
 from depthpose.pose.types import ObjectModel
 
 _WAVES = 6
