@@ -92,12 +92,6 @@ class Surface:
             return torch.from_numpy(nearest_of(points_m.numpy(), self.target.tree)[0])
         return torch.from_numpy(self.tree.query(points_m.numpy(), workers=1)[1])
 
-    def find(
-        self, points_m: Float64[Tensor, "*batch n 3"], *, is_exact: bool
-    ) -> Int64[Tensor, "*batch n"]:
-        """Give the number of the surface point near each point: searched, or looked up."""
-        return self.nearest(points_m) if is_exact else self.boxes.look_up(points_m)
-
     @cached_property
     def spacing_m(self) -> float:
         """Distance from a point to the third nearest, in the median."""

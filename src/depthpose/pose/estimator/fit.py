@@ -241,20 +241,15 @@ def scale_of(cloud_m: Float[Tensor, "n 3"], pose: Rigid, surface: Surface) -> Sc
     which moves its point ``p`` across the surface by ``n . (p - c) s``.
     """
     local_m = pose.inverse().apply(take_evenly(cloud_m.double(), POINTS))
-    middle_m = (surface.points_m.amin(0) + surface.points_m.amax(0)) / 2
-
-    def distance(moved_m: Tensor, times: Tensor, *, is_exact: bool) -> Float64[Tensor, " b"]:
-        own_m = (moved_m - middle_m) / times[:, None, None] + middle_m
-        return distance_to(own_m, surface, times, is_exact=is_exact)
-
+    middle_m = surface.ball_m[:3]
     starts = torch.tensor(_STARTS, dtype=torch.float64)
     few_m = take_evenly(local_m, _ROUGH_POINTS).expand(len(starts), -1, -1)
     times, turned_m, _ = _grow(few_m, starts, middle_m, surface, is_exact=False)
-    costs = distance(turned_m, times, is_exact=False).square()
+    costs = distance_to(turned_m, surface, times, is_exact=False).square()
     costs[0] -= _TRUST
     start = starts[costs.argmin()][None]
     times, turned_m, sigma = _grow(local_m[None], start, middle_m, surface, is_exact=True)
-    reached = distance(turned_m, times, is_exact=True)
+    reached = distance_to(turned_m, surface, times, is_exact=True)
     gain = distance_to(local_m, surface, is_exact=True) - reached[0]
     return Scale(float(times), float(sigma), float(gain))
 
@@ -280,7 +275,7 @@ def _grow(
     sigma = torch.ones_like(times)
     for limit_m in limits_m:
         own_m = (local_m - middle_m) / times[:, None, None] + middle_m
-        index = surface.find(own_m, is_exact=is_exact)
+        index = surface.nearest(own_m) if is_exact else surface.boxes.look_up(own_m)
         normal = surface.normals[index]
         arm_m = times[:, None, None] * (surface.points_m[index] - middle_m)
         gap_m = local_m - middle_m - arm_m
@@ -311,8 +306,14 @@ def distance_to(
     *,
     is_exact: bool,
 ) -> Float64[Tensor, "*batch"]:
-    """Root mean square distance of points to a surface, in limits of nearness, cut off at 1."""
-    gap_m = (local_m - surface.points_m[surface.find(local_m, is_exact=is_exact)]).norm(dim=-1)
+    """Root mean square distance of points to a surface, in limits of nearness, cut off at 1.
+
+    With ``times`` the surface is so many times as large, grown about its middle.
+    """
+    if times is not None:
+        local_m = (local_m - surface.ball_m[:3]) / times[:, None, None] + surface.ball_m[:3]
+    index = surface.nearest(local_m) if is_exact else surface.boxes.look_up(local_m)
+    gap_m = (local_m - surface.points_m[index]).norm(dim=-1)
     if times is not None:
         gap_m = times[..., None] * gap_m
     return (gap_m / (NEAR * surface.diameter_m)).clamp(max=1).square().mean(-1).sqrt()
@@ -324,7 +325,7 @@ def mirror_gain(cloud_m: Float[Tensor, "n 3"], pose: Rigid, surface: Surface) ->
     The cloud is mirrored in place of the model, so that ICP finds a pose.
     """
     local_m = pose.inverse().apply(take_evenly(cloud_m.double(), POINTS))
-    middle_m = (surface.points_m.amin(0) + surface.points_m.amax(0)) / 2
+    middle_m = surface.ball_m[:3]
     mirrored_m = (local_m - middle_m) * _FLIP + middle_m
     config = IcpConfig()
     normals = fibonacci_directions(_PLANES)  # of planes that mirror the cloud back
