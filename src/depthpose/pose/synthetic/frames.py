@@ -16,7 +16,7 @@ from depthpose.core.render import Raster, rasterize
 from depthpose.core.rigid import Rigid
 from depthpose.pose.config import ObjectsConfig
 from depthpose.pose.datasets import BopFrame, BopObject
-from depthpose.pose.mesh import sample_surface, surfel_triangles
+from depthpose.pose.mesh import drawn_triangles, sample_surface
 from depthpose.pose.synthetic.views import measure, random_rotation, uniform, whole
 from depthpose.pose.types import ObjectModel
 
@@ -75,19 +75,6 @@ def random_pattern(
         phases=2 * math.pi * torch.rand(_WAVES, generator=generator),
         gloss=uniform(generator, 0.0, 0.4),
     )
-
-
-def solid_of(model: ObjectModel) -> Solid:
-    """Prepare a known object: it looks alike in every frame of every data set."""
-    generator = sample_generator(model.number, _COLOUR_SEED)
-    pattern = random_pattern(generator, model.diameter_m, (0.7, 1.0))
-    if len(model.faces):
-        corners, normals = model.triangles_m, model.normals[model.faces]
-    else:
-        corners = surfel_triangles(model)
-        each = len(corners) // len(model.vertices_m)
-        normals = model.normals.repeat_interleave(each, 0)[:, None].expand(-1, 3, 3)
-    return Solid(triangles_m=corners, normals=normals, pattern=pattern, number=model.number)
 
 
 def random_clutter(generator: torch.Generator) -> Solid:
@@ -197,7 +184,17 @@ def make_frames(
             f"distance_m begins at {config.distance_m[0]:g} m, but the largest object is "
             f"{widest_m:.3g} m wide and would fill the image; begin at {3 * widest_m:.2g}"
         )
-    solids = [solid_of(model) for model in models]
+    solids = list[Solid]()
+    for model in models:  # an object looks alike in every frame of every data set
+        chance = sample_generator(model.number, _COLOUR_SEED)
+        pattern = random_pattern(chance, model.diameter_m, (0.7, 1.0))
+        corners, normals = drawn_triangles(model), model.normals[model.faces]
+        if not len(model.faces):  # each point is a disc of several triangles
+            each = len(corners) // len(model.vertices_m)
+            normals = model.normals.repeat_interleave(each, 0)[:, None].expand(-1, 3, 3)
+        solids.append(
+            Solid(triangles_m=corners, normals=normals, pattern=pattern, number=model.number)
+        )
     for index in range(first, first + number):
         yield _make_frame(models, solids, config, index)
 

@@ -92,16 +92,8 @@ class CloudBatch(NamedTuple):
 class TrainingViews:
     """What is learnt from by sample index: synthetic views, real frames, or both.
 
-    Args:
-        models: the objects; class k is ``models[k]``.
-        synthetic: how synthetic views look.
-        frames: real frames, and their share.
-        cloud: points and voxels.
-        seed: of the order of frames and of the choice of points.
-        first_alone: so many synthetic views at the start show the first object.
-
-    Raises:
-        InputError: frames of other objects.
+    ``seed`` is that of the order of frames and of the choice of points; ``first_alone`` synthetic
+    views at the start show the first object.
     """
 
     def __init__(
@@ -278,12 +270,6 @@ class HeldOut:
 
     Each is a rendering of its own at the full resolution; so many of each object are at each
     occlusion. One that shows too few points to be posed counts as a failure.
-
-    Args:
-        models: the objects; class k is ``models[k]``.
-        synthetic: how the views of the training look.
-        cloud: points and voxels.
-        config: how many.
     """
 
     def __init__(
