@@ -274,16 +274,13 @@ class GeoPoseNet(PoseEstimator):
             return one.given, one.prepared, None
         assert one.outputs is not None, "asked before"
         voted = CloudDirections(one.prepared, one.outputs)
-
-        found = or_unreadable(
-            lambda given: self._vote(voted, self._number(given.object), is_likely=is_likely),
-            one.given,
-        )
+        found = or_unreadable(partial(self._vote, voted=voted, is_likely=is_likely), one.given)
         seconds = {**one.seconds, **found.seconds}
         return one.given, replace(found, name=one.given.name, seconds=seconds), voted
 
-    def _vote(self, voted: CloudDirections, number: int, *, is_likely: bool) -> PoseEstimate:
+    def _vote(self, given: AnyInput, *, voted: CloudDirections, is_likely: bool) -> PoseEstimate:
         """Vote for the keypoints, fit the pose, refine and check it."""
+        number = self._number(given.object)
         model, surface, copies = self.models[number], self._surface(number), self._copies_of(number)
         config, clock = self.config, Clock()
         points, directions = voted.cloud.points_m.double(), voted.directions.double()
