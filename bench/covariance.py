@@ -24,11 +24,11 @@ from depthpose.core.checkpoint import find_weights
 from depthpose.core.loop import sample_generator
 from depthpose.core.render import rasterize
 from depthpose.core.rigid import Rigid, cross_matrix
-from depthpose.pose.augment import measure, random_rotation
 from depthpose.pose.cloud import cloud_from_depth
 from depthpose.pose.config import IcpConfig, SensorConfig, SensorKind
 from depthpose.pose.refine import refine_pose
 from depthpose.pose.surface import prepare_surface
+from depthpose.pose.synthetic.views import measure, random_rotation
 from depthpose.report.page import markdown_table
 
 KINDS: tuple[SensorKind, ...] = ("structured light", "active stereo", "time of flight", "laser")

@@ -10,7 +10,6 @@ import torch
 
 from depthpose.core.rigid import Rigid
 from depthpose.core.units import metres_of
-from depthpose.pose.augment import random_rotation, uniform, whole
 from depthpose.pose.mesh import is_mirror_alike, make_model
 from depthpose.pose.synthetic.parts import (
     PARTS,
@@ -23,6 +22,7 @@ from depthpose.pose.synthetic.parts import (
     tube,
     turned,
 )
+from depthpose.pose.synthetic.views import random_rotation, uniform, whole
 from depthpose.pose.types import ObjectModel
 
 NegativeKind = Literal[

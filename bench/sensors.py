@@ -20,8 +20,8 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from depthpose.core.files import read_depth_png, read_image
-from depthpose.pose.augment import measure
 from depthpose.pose.config import SensorConfig, SensorKind
+from depthpose.pose.synthetic.views import measure
 from depthpose.report.page import markdown_table
 
 _BASELINE_M = 0.075

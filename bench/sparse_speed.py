@@ -110,7 +110,7 @@ def engines(network: ResUNet, coordinates: Tensor) -> dict[str, Run]:
         return network(Voxels.from_points(coordinates))
 
     def plain() -> Tensor:
-        with patch.object(import_module("depthpose.pose.sparse.conv"), "conv", plain_conv):
+        with patch.object(import_module("depthpose.pose.sparse"), "conv", plain_conv):
             return network(Voxels.from_points(coordinates))
 
     runs: dict[str, Run] = {"ours": ours, "plain autograd": plain}

@@ -31,12 +31,11 @@ from depthpose.core.checkpoint import find_weights
 from depthpose.core.loop import sample_generator
 from depthpose.core.render import rasterize
 from depthpose.core.rigid import Rigid, rotation_by
-from depthpose.pose.augment import measure, random_rotation
 from depthpose.pose.config import SensorConfig
 from depthpose.pose.estimator import GeoPoseNet
-from depthpose.pose.mesh import sample_surface
+from depthpose.pose.mesh import drawn_triangles, sample_surface
 from depthpose.pose.metrics import add_share
-from depthpose.pose.synthetic import drawn_triangles
+from depthpose.pose.synthetic.views import measure, random_rotation
 from depthpose.pose.types import ObjectModel, PoseEstimate, ViewInput
 from depthpose.report.page import markdown_table
 

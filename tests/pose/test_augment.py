@@ -9,7 +9,8 @@ import torch
 
 from depthpose.core.config import config_to_dict, read_config, write_config
 from depthpose.core.errors import InputError
-from depthpose.pose.augment import (
+from depthpose.pose.config import ObjectsConfig, SensorConfig
+from depthpose.pose.synthetic.views import (
     grow_mask,
     measure,
     occlude,
@@ -17,7 +18,6 @@ from depthpose.pose.augment import (
     random_rotation,
     whole,
 )
-from depthpose.pose.config import ObjectsConfig, SensorConfig
 from depthpose.pose.train import PoseTraining
 
 
@@ -191,10 +191,10 @@ def test_whole_numbers_stay_below_their_count() -> None:
     ("values", "text"),
     [
         ({"number": 0}, "number must be in [1, inf), got 0; the default is 1000"),
-        ({"seed": -1}, "seed is -1; take 0 or more"),
+        ({"seed": -1}, "seed must be in [0, 9223372036854775808), got -1"),
         (
             {"seed": 2**64},
-            "seed is 18446744073709551616; take 0 or more, up to 9223372036854775807",
+            "seed must be in [0, 9223372036854775808), got 18446744073709551616",
         ),
         (
             {"centre_px": (-5000.0, 9000.0)},

@@ -9,12 +9,18 @@ import trimesh
 
 from depthpose.core.errors import InputError
 from depthpose.core.render import rasterize
-from depthpose.pose.augment import random_rotation
 from depthpose.pose.config import ObjectsConfig, SensorConfig
 from depthpose.pose.datasets import check_bop, open_bop, write_bop_models, write_bop_scene
-from depthpose.pose.mesh import make_model
-from depthpose.pose.synthetic import Objects, make_frames, surfel_triangles
-from depthpose.pose.synthetic.views import draw_view, gaze, make_shape, pose_of_middle, turn_view
+from depthpose.pose.mesh import make_model, surfel_triangles
+from depthpose.pose.synthetic import Objects, make_frames
+from depthpose.pose.synthetic.views import (
+    draw_view,
+    gaze,
+    make_shape,
+    pose_of_middle,
+    random_rotation,
+    turn_view,
+)
 from depthpose.pose.types import ObjectModel, ViewSample
 
 _K = torch.tensor([[572.4, 0, 325.3], [0, 573.6, 242.0], [0, 0, 1]], dtype=torch.float64)

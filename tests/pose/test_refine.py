@@ -11,7 +11,6 @@ from depthpose.core.config import config_from_dict
 from depthpose.core.errors import InputError
 from depthpose.core.render import rasterize
 from depthpose.core.rigid import Rigid, cross_matrix, geodesic_rad, perturb
-from depthpose.pose.augment import measure
 from depthpose.pose.cloud import cloud_from_depth
 from depthpose.pose.config import IcpConfig, SensorConfig, SensorKind
 from depthpose.pose.datasets import open_bop
@@ -20,6 +19,7 @@ from depthpose.pose.mesh.models import turn_about
 from depthpose.pose.metrics import add_m
 from depthpose.pose.refine import _covariance, refine_best, refine_pose
 from depthpose.pose.surface import Surface, prepare_surface
+from depthpose.pose.synthetic.views import measure
 from depthpose.pose.types import ObjectModel, Symmetries
 
 ORIGIN = torch.zeros(3).double()

@@ -21,19 +21,23 @@ from depthpose.core.checkpoint import SHIPPED, read_checkpoint
 from depthpose.core.config import config_from_dict
 from depthpose.core.errors import InputError
 from depthpose.core.rigid import Rigid
-from depthpose.pose.augment import grow_mask, shift_mask
+from depthpose.pose.cloud import grow_mask
 from depthpose.pose.config import CloudConfig, EstimateConfig, IcpConfig, RefusalConfig
-from depthpose.pose.estimator.answer import Clock, answer_of, misfit_of, with_status
 from depthpose.pose.estimator.candidates import (
     Candidate,
+    Clock,
+    answer_of,
     find_copies,
+    misfit_of,
     observability,
     surface_signals,
+    with_status,
 )
 from depthpose.pose.estimator.fit import fit_of, seen_about
 from depthpose.pose.estimator.inputs import ObjectCloud, prepare_cloud
 from depthpose.pose.metrics import risk_coverage
 from depthpose.pose.surface import prepare_surface
+from depthpose.pose.synthetic.views import shift_mask
 from depthpose.pose.types import Fit, ObjectModel, PoseEstimate, ViewInput
 
 TRUTH = pose_at()

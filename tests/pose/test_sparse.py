@@ -11,6 +11,7 @@ from torch import Tensor
 
 from depthpose.core.errors import InputError
 from depthpose.pose.sparse import (
+    CLOUD_LIMIT,
     COORDINATE_LIMIT,
     CoordinateCache,
     SparseConv,
@@ -19,10 +20,11 @@ from depthpose.pose.sparse import (
     batch_coordinates,
     conv,
     kernel_offsets,
+    pack,
+    unpack,
 )
-from depthpose.pose.sparse.kernel_map import CLOUD_LIMIT, pack, unpack
 
-CONV = import_module("depthpose.pose.sparse.conv")
+CONV = import_module("depthpose.pose.sparse")
 SIDE = 8
 """Dense grids run from -SIDE to SIDE - 1."""
 
@@ -156,7 +158,7 @@ def test_pairs_of_a_small_case_by_hand() -> None:
 def test_a_table_and_a_binary_search_find_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
     cloud_keys = Voxels.from_points(cloud()).cache
     by_table = [cloud_keys.kernel_map(*a).neighbours.table for a in ((0, 5), (0, 3, 2), (1, 3))]
-    monkeypatch.setattr("depthpose.pose.sparse.kernel_map.MAX_CELLS", 0)
+    monkeypatch.setattr("depthpose.pose.sparse.MAX_CELLS", 0)
     cloud_keys = CoordinateCache(cloud_keys.keys(0))
     by_search = [cloud_keys.kernel_map(*a).neighbours.table for a in ((0, 5), (0, 3, 2), (1, 3))]
     assert all(map(torch.equal, by_table, by_search))
@@ -171,7 +173,7 @@ def test_no_look_leaves_the_table(
     xyz = torch.cartesian_prod(*[torch.arange(5) - shift] * 3)
     keys = pack(F.pad(xyz, (1, 0)))
     found = CoordinateCache(keys.sort().values).kernel_map(0, kernel, stride).neighbours.table
-    monkeypatch.setattr("depthpose.pose.sparse.kernel_map.MAX_CELLS", 0)
+    monkeypatch.setattr("depthpose.pose.sparse.MAX_CELLS", 0)
     wanted = CoordinateCache(keys.sort().values).kernel_map(0, kernel, stride).neighbours.table
     assert torch.equal(found, wanted)
 

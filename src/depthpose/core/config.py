@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from contextlib import suppress
 from functools import cache
 from pathlib import Path
-from typing import Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
+from typing import Annotated, Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
 
 import yaml
 
@@ -16,6 +16,45 @@ from depthpose.core.errors import InputError, nearest_name, refuse_unknown
 ConfigT = TypeVar("ConfigT")
 _LONGEST = 500  # letters of a value that an error shows
 _MAX_BYTES = 2**17  # largest config file: a hundred times the largest of ours
+
+
+Seed = Annotated[int, "[0, 9223372036854775808)"]
+"""What random numbers begin with: 63 bits."""
+ASCENDING = "ascending"
+"""Of a setting of two numbers: they are a range."""
+
+
+class Settings:
+    """Base of settings whose types say ranges: ``Annotated[int, "[16, inf)", 16]``.
+
+    A number behind the range is one that the setting is a multiple of; ``ASCENDING`` there says
+    that the lower end of a range comes first.
+
+    Raises:
+        InputError: a number that breaks these rules, or a word that the type does not know.
+    """
+
+    def __post_init__(self) -> None:
+        rules = _rules_of(type(self))
+        check_settings(self, **{name: rule[0] for name, rule in rules.items()})
+        for name, (_, *more) in rules.items():
+            value = getattr(self, name)
+            if ASCENDING in more and value is not None and value[0] > value[1]:
+                raise InputError(
+                    f"{name} must be a range, the lower end first, got {value}; turn it"
+                )
+            steps = [step for step in more if step != ASCENDING]
+            if any(value % step for step in steps):
+                raise InputError(
+                    f"{name} must be a multiple of {steps[0]}, got {value}; take "
+                    f"{getattr(type(self), name)}"
+                )
+
+
+@cache
+def _rules_of(kind: type) -> dict[str, tuple[Any, ...]]:
+    hints = get_type_hints(kind, include_extras=True)
+    return {n: hint.__metadata__ for n, hint in hints.items() if get_origin(hint) is Annotated}
 
 
 def check_settings(config: Any, **ranges: str) -> None:  # noqa: ANN401  any dataclass

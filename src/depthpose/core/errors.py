@@ -104,16 +104,6 @@ def import_open3d(purpose: str) -> Any:  # noqa: ANN401  Open3D's classes carry 
     return import_extra("open3d", "open3d", "open3d", purpose)
 
 
-def refuse_seed(seed: int) -> None:
-    """Refuse a seed that random numbers cannot begin with.
-
-    Raises:
-        InputError: it is below 0, or takes more than 63 bits.
-    """
-    if not 0 <= seed < 2**63:
-        raise InputError(f"seed is {seed}; take 0 or more, up to {2**63 - 1} (63 bits)")
-
-
 def refuse_unknown(what: str, name: object, known: Iterable[str]) -> None:
     """Refuse a word that is none of the known ones.
 

@@ -1,9 +1,9 @@
 """Settings of depth: frozen dataclasses that refuse unusable values."""
 
 from dataclasses import dataclass, field
-from typing import Annotated, ClassVar, Literal, get_origin, get_type_hints
+from typing import Annotated, ClassVar, Literal
 
-from depthpose.core.config import check_settings
+from depthpose.core.config import Settings, check_settings
 from depthpose.core.errors import InputError
 
 TruthKind = Literal["scan", "annotated", "disparity"]
@@ -12,28 +12,6 @@ TruthKind = Literal["scan", "annotated", "disparity"]
 
 _MOST_FOCAL_PX = 20_000
 """Of pairs: several times that of the largest images; beyond it they would fill the memory."""
-
-
-class Settings:
-    """Base of settings whose types say ranges: ``Annotated[int, "[16, inf)", 16]``.
-
-    A number behind the range is one that the setting is a multiple of.
-
-    Raises:
-        InputError: a number that breaks these rules, or a word that the type does not know.
-    """
-
-    def __post_init__(self) -> None:
-        hints = get_type_hints(type(self), include_extras=True)
-        rules = {n: h.__metadata__ for n, h in hints.items() if get_origin(h) is Annotated}
-        check_settings(self, **{name: rule[0] for name, rule in rules.items()})
-        for name, (_, *steps) in rules.items():
-            value = getattr(self, name)
-            if any(value % step for step in steps):
-                raise InputError(
-                    f"{name} must be a multiple of {steps[0]}, got {value}; take "
-                    f"{getattr(type(self), name)}"
-                )
 
 
 @dataclass(frozen=True, kw_only=True)

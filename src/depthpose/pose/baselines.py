@@ -4,7 +4,7 @@ import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import Any, ClassVar, NamedTuple
+from typing import Annotated, Any, ClassVar, NamedTuple
 
 import numpy as np
 import torch
@@ -12,10 +12,10 @@ import torch.nn.functional as F
 from jaxtyping import Float, Float64, Int
 from torch import Tensor, nn
 
-from depthpose.core.config import check_settings
+from depthpose.core.config import Settings
 from depthpose.core.errors import import_open3d
 from depthpose.core.rigid import Rigid, turn_axis_to
-from depthpose.pose.cloud import cloud_from_depth
+from depthpose.pose.cloud import object_points
 from depthpose.pose.mesh import sample_surface
 from depthpose.pose.segmentation import ResNet18
 from depthpose.pose.sparse import RowNorm
@@ -23,63 +23,55 @@ from depthpose.pose.types import CloudInput, ObjectModel, PoseEstimate, SeenPoin
 
 
 @dataclass(frozen=True, kw_only=True)
-class DepthImageConfig:
+class DepthImageConfig(Settings):
     """A masked crop of the depth image, regressed to a pose."""
 
-    classes: int = 1
+    classes: Annotated[int, "[1, inf)"] = 1
     """Objects that one network knows."""
 
-    crop_px: int = 128
+    crop_px: Annotated[int, "[32, inf)"] = 128
     """Side of the crop that the network sees."""
 
-    margin: float = 1.1
+    margin: Annotated[float, "[1, inf)"] = 1.1
     """The crop is so many times as wide as the object's box."""
 
-    contrast: float = 0.1
+    contrast: Annotated[float, "(0, inf)"] = 0.1
     """The crop is divided by its mean depth; this much more or less than the mean is 1 or -1."""
 
-    widths: tuple[int, int, int, int] = (64, 128, 256, 512)
+    widths: Annotated[tuple[int, int, int, int], "[1, inf)"] = (64, 128, 256, 512)
     """Channels of the encoder's stages: those of ResNet-18."""
 
-    min_points: int = 16
+    min_points: Annotated[int, "[1, inf)"] = 16
     """Fewer masked pixels with a depth are refused, not posed."""
-
-    def __post_init__(self) -> None:
-        counts = dict.fromkeys(("classes", "widths", "min_points"), "[1, inf)")
-        check_settings(self, **counts, crop_px="[32, inf)", margin="[1, inf)", contrast="(0, inf)")
 
 
 @dataclass(frozen=True, kw_only=True)
-class PointNetConfig:
+class PointNetConfig(Settings):
     """Size of a PointNet for segmentation (Qi et al. 2017) whose outputs are directions."""
 
     RETIRED: ClassVar[frozenset[str]] = frozenset({"with_confidence"})
     """Settings of before, in older weights: no confidence is learnt any more."""
 
-    classes: int = 13
+    classes: Annotated[int, "[1, inf)"] = 13
     """Objects that one network knows."""
 
-    keypoints: int = 8
+    keypoints: Annotated[int, "[1, inf)"] = 8
     """Keypoints of each object."""
 
     with_transforms: bool = True
     """The two T-Nets, which turn points (3x3) and features (64x64) before they go on."""
 
-    unit_m: float = 0.1
+    unit_m: Annotated[float, "(0, inf)"] = 0.1
     """Points are given to the network in units of so many metres: of order one for an object."""
 
-    local: tuple[int, int] = (64, 64)
+    local: Annotated[tuple[int, int], "[1, inf)"] = (64, 64)
     """Channels of a point by itself."""
 
-    pooled: tuple[int, int, int] = (64, 128, 1024)
+    pooled: Annotated[tuple[int, int, int], "[1, inf)"] = (64, 128, 1024)
     """Channels on the way to the maximum over all points."""
 
-    head: tuple[int, int, int] = (512, 256, 128)
+    head: Annotated[tuple[int, int, int], "[1, inf)"] = (512, 256, 128)
     """Channels of a point beside that maximum."""
-
-    def __post_init__(self) -> None:
-        counts = ("classes", "keypoints", "local", "pooled", "head")
-        check_settings(self, **dict.fromkeys(counts, "[1, inf)"), unit_m="(0, inf)")
 
     @property
     def outputs(self) -> int:
@@ -88,20 +80,17 @@ class PointNetConfig:
 
 
 @dataclass(frozen=True, kw_only=True)
-class FpfhConfig:
+class FpfhConfig(Settings):
     """FPFH features, RANSAC and ICP of Open3D."""
 
-    voxel_diameters: float = 0.03
+    voxel_diameters: Annotated[float, "(0, inf)"] = 0.03
     """Side of a voxel in diameters of the object."""
 
-    iterations: int = 100_000
+    iterations: Annotated[int, "[1, inf)"] = 100_000
     """Of RANSAC, at most."""
 
     seed: int = 0
     """Of RANSAC."""
-
-    def __post_init__(self) -> None:
-        check_settings(self, voxel_diameters="(0, inf)", iterations="[1, inf)")
 
 
 EMPTY = -2.0
@@ -318,8 +307,8 @@ class FpfhEstimator:
         estimates = []
         for given in inputs:
             peer = self._peers[given.object]
-            points_m = cloud_from_depth(given.depth_m, given.mask, given.K, peer.model.diameter_m)
-            cloud = CloudInput(name=given.name, points_m=points_m.float(), object=given.object)
+            points_m = object_points(given, peer.model.diameter_m)
+            cloud = CloudInput(name=given.name, points_m=points_m, object=given.object)
             estimates.append(peer.estimate(cloud))
         return estimates
 

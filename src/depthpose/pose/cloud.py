@@ -3,6 +3,7 @@
 from dataclasses import dataclass
 
 import torch
+import torch.nn.functional as F
 from jaxtyping import Bool, Float, Float64, Int64
 from scipy.spatial import KDTree
 from torch import Tensor
@@ -11,7 +12,7 @@ from depthpose.core.errors import InputError
 from depthpose.core.rigid import turn_axis_to
 from depthpose.pose.compiled import finite_array, serves
 from depthpose.pose.config import CloudConfig
-from depthpose.pose.types import CloudInput, ViewInput
+from depthpose.pose.types import CloudInput, CloudSample, ViewInput, ViewSample
 
 _LARGEST_CELL = 2**20
 _NEIGHBOURS = 20
@@ -84,6 +85,14 @@ def object_points(given: CloudInput | ViewInput, diameter_m: float) -> Float[Ten
     return given.points_m[is_reading(given.points_m)].float()
 
 
+def lift_sample(view: ViewSample, diameter_m: float, config: CloudConfig) -> CloudSample:
+    """Lift a view of an object to its cloud, without flying pixels."""
+    given = view.input
+    points_m = cloud_from_depth(given.depth_m, given.mask, given.K, diameter_m, config)
+    cloud = CloudInput(name=given.name, points_m=points_m, object=given.object)
+    return CloudSample(input=cloud, truth=view.truth)
+
+
 def refuse_other_size(mask: Bool[Tensor, "mask_h mask_w"], depth_m: Float[Tensor, "h w"]) -> None:
     """Refuse a mask that is not of this depth image.
 
@@ -95,6 +104,18 @@ def refuse_other_size(mask: Bool[Tensor, "mask_h mask_w"], depth_m: Float[Tensor
             f"the mask is {mask.shape[1]}x{mask.shape[0]}, but the depth image is "
             f"{depth_m.shape[1]}x{depth_m.shape[0]}; give the mask of this very image"
         )
+
+
+def grow_mask(mask: Bool[Tensor, "h w"], grow_px: int) -> Bool[Tensor, "h w"]:
+    """Grow a mask by so many pixels, or shrink it by as many where the number is negative."""
+    if grow_px == 0:
+        return mask
+    source = (mask if grow_px > 0 else ~mask).float()[None, None]
+    size = 2 * abs(grow_px) + 1
+    # A square, one axis after the other.
+    wide = F.max_pool2d(source, (1, size), 1, (0, size // 2))
+    grown = F.max_pool2d(wide, (size, 1), 1, (size // 2, 0))[0, 0] > 0
+    return grown if grow_px > 0 else ~grown
 
 
 def is_flying(points_m: Float[Tensor, "n 3"], limit_m: float) -> Bool[Tensor, " n"]:

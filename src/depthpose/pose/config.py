@@ -1,31 +1,28 @@
 """Settings of pose estimation: clouds, meshes, refusal, estimates, synthetic objects."""
 
 from dataclasses import dataclass, field
-from typing import ClassVar, Literal, get_args
+from typing import Annotated, ClassVar, Literal, get_args
 
-from depthpose.core.config import check_settings
-from depthpose.core.errors import InputError, refuse_seed
+from depthpose.core.config import ASCENDING, Seed, Settings
+from depthpose.core.errors import InputError
 
 VotingMethod = Literal["least squares", "ransac"]
 InlierTest = Literal["angle", "distance"]
 
 
 @dataclass(frozen=True, kw_only=True)
-class MeshConfig:
+class MeshConfig(Settings):
     """What is taken from a model file."""
 
-    keypoints: int = 8
+    keypoints: Annotated[int, "[4, inf)"] = 8
     """Farthest points of the surface that the network's directions point at (4 to 20 usual)."""
-
-    def __post_init__(self) -> None:
-        check_settings(self, keypoints="[4, inf)")
 
 
 @dataclass(frozen=True, kw_only=True)
-class CloudConfig:
+class CloudConfig(Settings):
     """How a mask and a depth map become the cloud that the network sees."""
 
-    voxel_m: float = 0.008
+    voxel_m: Annotated[float, "(0, 1)"] = 0.008
     """Side of a voxel; one point is kept in each. The published method takes 0.001."""
 
     with_sight_axis: bool = True
@@ -37,23 +34,17 @@ class CloudConfig:
     """Give the network for each voxel where in it the points lie on average, how many they are, and
     the normal and curvature there; the published method gives a constant 1."""
 
-    max_points: int | None = 1500
+    max_points: Annotated[int | None, "[3, inf)"] = 1500
     """At most so many points, chosen at random before voxelising; None: all."""
 
-    min_points: int = 16
+    min_points: Annotated[int, "[3, inf)"] = 16
     """Fewer points are refused, not posed."""
 
-    max_offset_diameters: float = 1.0
+    max_offset_diameters: Annotated[float, "(0, inf)"] = 1.0
     """Points farther from the median of the masked points are flying pixels, and dropped."""
 
     def __post_init__(self) -> None:
-        check_settings(
-            self,
-            voxel_m="(0, 1)",
-            min_points="[3, inf)",
-            max_points="[3, inf)",
-            max_offset_diameters="(0, inf)",
-        )
+        super().__post_init__()
         if self.max_points is not None and self.max_points < self.min_points:
             raise InputError(
                 f"max_points is {self.max_points}, below min_points {self.min_points}: every cloud "
@@ -67,57 +58,45 @@ class CloudConfig:
 
 
 @dataclass(frozen=True, kw_only=True)
-class VotingConfig:
+class VotingConfig(Settings):
     """How directions become keypoints, and keypoints a pose."""
 
     method: VotingMethod = "ransac"
     """``least squares`` trusts every direction; ``ransac`` only those that agree."""
 
-    hypotheses: int = 128
+    hypotheses: Annotated[int, "[1, inf)"] = 128
     """Pairs of points tried for each keypoint (published practice 50; PVNet 128 a round)."""
 
     inlier_test: InlierTest = "angle"
     """``angle``: a direction misses the keypoint by a small angle, and points toward it.
     ``distance``: its line passes near."""
 
-    min_cosine: float = 0.99
+    min_cosine: Annotated[float, "(0, 1)"] = 0.99
     """Inliers by angle: cosine between the direction and the way to the keypoint (8.1 degrees)."""
 
-    max_distance_m: float = 0.0005
+    max_distance_m: Annotated[float, "(0, 1)"] = 0.0005
     """Inliers by distance: how far from its line the keypoint may lie."""
 
-    refinements: int = 3
+    refinements: Annotated[int, "[0, inf)"] = 3
     """Steps from the point nearest to the lines to the most likely one under errors of angle.
     Noisy lines draw the nearest point toward the cloud: a direction that errs by an angle misses a
     far keypoint by more than a near one. 0: the published, biased answer."""
 
-    max_condition: float = 1000.0
+    max_condition: Annotated[float, "(1, inf)"] = 1000.0
     """A keypoint whose normal matrix is worse conditioned does not count as found."""
 
-    rigidity_diameters: float = 0.1
+    rigidity_diameters: Annotated[float, "(0, inf)"] = 0.1
     """Distances between keypoints may differ from the model's by this share of its diameter."""
 
-    seed: int = 0
+    seed: Seed = 0
     """Of the pairs: the same input gives the same answer."""
-
-    def __post_init__(self) -> None:
-        check_settings(
-            self,
-            hypotheses="[1, inf)",
-            min_cosine="(0, 1)",
-            max_distance_m="(0, 1)",
-            refinements="[0, inf)",
-            max_condition="(1, inf)",
-            rigidity_diameters="(0, inf)",
-        )
-        refuse_seed(self.seed)
 
 
 @dataclass(frozen=True, kw_only=True)
-class IcpConfig:
+class IcpConfig(Settings):
     """How a pose is brought onto the cloud."""
 
-    iterations: int = 30
+    iterations: Annotated[int, "[1, inf)"] = 30
     """At most so many exact steps from one start; half of them after the best of several."""
 
     start_distance_diameters: float = 0.1
@@ -127,30 +106,23 @@ class IcpConfig:
     """The same in the last: the limit shrinks from step to step. Below the sensor's noise the
     answer grows worse (0.02 on a Kinect's cat: 2.7 % of the diameter, 0.05: 1.7 %)."""
 
-    cloud_points: int = 500
+    cloud_points: Annotated[int, "[100, inf)"] = 500
     """At most so many points of the cloud, evenly taken: more are slower and no more exact."""
 
-    surface_points: int = 10000
+    surface_points: Annotated[int, "[100, inf)"] = 10000
     """Points sampled on the model's surface."""
 
-    sensor_offset_m: float = 0.004
+    sensor_offset_m: Annotated[float, "[0, 1]"] = 0.004
     """Standard deviation of an offset of all readings along the ray, which no residual shows: it is
     added to the covariance of a pose. Depth cameras are off by 3 to 6 mm as a whole
     (``bench/sensors.py``); 0 where yours is calibrated at the distance of the object."""
 
-    starts: int = 7
+    starts: Annotated[int, "[1, 7]"] = 7
     """From each fit of the keypoints so many: 1, it alone; up to 7, also turned by 15 degrees one
     way and the other about each axis of the camera (``bench/refine_starts.py``)."""
 
     def __post_init__(self) -> None:
-        check_settings(
-            self,
-            starts="[1, 7]",
-            iterations="[1, inf)",
-            surface_points="[100, inf)",
-            cloud_points="[100, inf)",
-            sensor_offset_m="[0, 1]",
-        )
+        super().__post_init__()
         if not 0 < self.end_distance_diameters <= self.start_distance_diameters:
             raise InputError(
                 f"the distances go from {self.start_distance_diameters} to "
@@ -172,7 +144,7 @@ _CANDIDATE_SLOPES = {
 
 
 @dataclass(frozen=True, kw_only=True)
-class RefusalConfig:
+class RefusalConfig(Settings):
     """When an estimate is withheld. The limits are shares of what was seen, on any sensor."""
 
     RETIRED: ClassVar[frozenset[str]] = frozenset(
@@ -180,42 +152,32 @@ class RefusalConfig:
     )
     """Settings of a calibrated risk, in weights written before 2026-11-26; they are left out."""
 
-    min_agreement: float = 0.8
+    min_agreement: Annotated[float, "[0, 1]"] = 0.8
     """Of the posed surface that the camera saw, so much must lie where it saw something: an edge
     of a real sensor takes a tenth, other objects leave a fifth and more."""
 
-    max_beyond: float = 0.03
+    max_beyond: Annotated[float, "[0, 1]"] = 0.03
     """Of the object's readings so many may lie beside the posed silhouette, its border apart."""
 
-    min_explained: float = 0.75
+    min_explained: Annotated[float, "[0, 1]"] = 0.75
     """Of the object's readings so many must lie near the posed surface; the rest may be of what a
     loose mask takes in."""
 
-    max_size_error: float = 0.03
+    max_size_error: Annotated[float, "(0, 1]"] = 0.03
     """The size of the model that fits best may differ from 1 by so much beyond what the sensor
     explains; 1: neither size nor mirror image is tested. Without ICP they are not."""
 
     candidate_slopes: dict[str, float] = field(default_factory=lambda: dict(_CANDIDATE_SLOPES))
     """Weight of each signal's logarithm as evidence against a pose among several that fit."""
 
-    min_hold: float = 0.02
+    min_hold: Annotated[float, "[0, 1)"] = 0.02
     """A motion that no symmetry allows must move the seen surface along its normals by this
     share of what it moves the object's points; one that moves it within itself (of a plane or
     ball) is not observable."""
 
-    def __post_init__(self) -> None:
-        check_settings(
-            self,
-            min_agreement="[0, 1]",
-            max_beyond="[0, 1]",
-            min_explained="[0, 1]",
-            max_size_error="(0, 1]",
-            min_hold="[0, 1)",
-        )
-
 
 @dataclass(frozen=True, kw_only=True)
-class EstimateConfig:
+class EstimateConfig(Settings):
     """How a cloud becomes a pose."""
 
     voting: VotingConfig = VotingConfig()
@@ -227,7 +189,7 @@ class EstimateConfig:
     with_icp: bool = True
     """Whether it does; without, the voted pose is the answer."""
 
-    min_certainty: float = 0.9
+    min_certainty: Annotated[float, "[0, 1]"] = 0.9
     """Below this certainty the status is ``ambiguous``, not ``ok``; pose and alternatives are given
     all the same. 0: the likeliest pose is always the answer."""
 
@@ -246,19 +208,17 @@ class EstimateConfig:
     ones, and what does not fit then is refused. Where fewer than four keypoints agree all are
     fitted, and ICP begins at both fits."""
 
-    max_cloud_points: int = 100_000
+    max_cloud_points: Annotated[int, "[100, inf)"] = 100_000
     """Of a larger cloud so many points are taken, evenly in their order, before anything else."""
 
-    batch_voxels: int = 20_000
+    batch_voxels: Annotated[int, "[1, inf)"] = 20_000
     """Voxels in one call of the network: many clouds at once, in bounded memory."""
 
     device: str = "cpu"
     """Where the network runs: cpu, cuda, cuda:1, ..."""
 
     def __post_init__(self) -> None:
-        check_settings(
-            self, min_certainty="[0, 1]", max_cloud_points="[100, inf)", batch_voxels="[1, inf)"
-        )
+        super().__post_init__()
         if self.rough_rigidity_diameters < self.voting.rigidity_diameters:
             raise InputError(
                 f"rough_rigidity_diameters is {self.rough_rigidity_diameters}, but the strict one, "
@@ -276,7 +236,7 @@ SymmetryRule = Literal["declared", "all"]
 
 
 @dataclass(frozen=True, kw_only=True)
-class EvaluationConfig:
+class EvaluationConfig(Settings):
     """How estimates are measured against the truth."""
 
     diameters: DiameterTable = "bop"
@@ -290,11 +250,8 @@ class EvaluationConfig:
     with_vsd: bool = True
     """Draw both poses for VSD, and so for BOP's average recall: the slowest of the errors."""
 
-    vsd_delta_m: float = 0.015
+    vsd_delta_m: Annotated[float, "(0, 1)"] = 0.015
     """How far a surface may lie behind the measured one and count as visible (ITODD: 0.005)."""
-
-    def __post_init__(self) -> None:
-        check_settings(self, vsd_delta_m="(0, 1)")
 
 
 SensorKind = Literal["structured light", "active stereo", "time of flight", "laser", "none"]
@@ -305,20 +262,8 @@ OCCLUSIONS = "[0, 0.95]"
 """Share of a silhouette that something may occlude."""
 
 
-def refuse_reversed(config: object, *names: str) -> None:
-    """Refuse ranges whose upper end comes first.
-
-    Raises:
-        InputError: that is so.
-    """
-    for name in names:
-        ends = getattr(config, name)
-        if ends is not None and ends[0] > ends[1]:
-            raise InputError(f"{name} must be a range, the lower end first, got {ends}; turn it")
-
-
 @dataclass(frozen=True, kw_only=True)
-class SensorConfig:
+class SensorConfig(Settings):
     """The errors of a depth sensor. Ranges are of what each sample draws."""
 
     kinds: tuple[SensorKind, ...] = ("structured light",)
@@ -328,117 +273,91 @@ class SensorConfig:
     side. ``time of flight``: mixed readings where depth jumps. ``laser``: little noise. ``none``:
     no error."""
 
-    noise: tuple[float, float] = (0.5, 1.5)
+    noise: Annotated[tuple[float, float], "[0, 20]", ASCENDING] = (0.5, 1.5)
     """Times the noise of the kind."""
 
-    noise_correlation_px: tuple[float, float] | None = None
+    noise_correlation_px: Annotated[tuple[float, float] | None, "[0, 30]", ASCENDING] = None
     """Correlation length of the noise (deviation of the Gaussian that smooths it), in pixels of the
     full image; None: 3 to 6 for ``active stereo``, else every pixel has its own. Measured on planes
     by ``bench/sensors.py``: a Kinect 3, a RealSense 5."""
 
-    missing: tuple[float, float] = (0.0, 0.1)
+    missing: Annotated[tuple[float, float], "[0, 0.9]", ASCENDING] = (0.0, 0.1)
     """Share of readings lost beside those of shadows and grazing surfaces; half in patches."""
 
-    offset_m: tuple[float, float] = (-0.005, 0.005)
+    offset_m: Annotated[tuple[float, float], "[-0.1, 0.1]", ASCENDING] = (-0.005, 0.005)
     """Added to all readings of a view alike: real sensors are off by 3 to 6 mm as a whole. Not of
     ``none``."""
 
     def __post_init__(self) -> None:
         if not self.kinds:
             raise InputError(f"kinds is (); name one or more of {', '.join(get_args(SensorKind))}")
-        check_settings(
-            self,
-            noise="[0, 20]",
-            noise_correlation_px="[0, 30]",
-            missing="[0, 0.9]",
-            offset_m="[-0.1, 0.1]",
-        )
-        refuse_reversed(self, "noise", "noise_correlation_px", "missing", "offset_m")
+        super().__post_init__()
 
 
 @dataclass(frozen=True, kw_only=True)
-class ObjectsConfig:
+class ObjectsConfig(Settings):
     """Synthetic views of known objects. Ranges are of what each sample draws."""
 
     INSTEAD: ClassVar[dict[str, str]] = {"image_px": "centre_px"}
     """A config file that gives another image has that one's middle, not the default's."""
 
-    number: int = 1000
+    number: Annotated[int, "[1, inf)"] = 1000
     """Samples; sample i shows object i modulo their number."""
 
-    seed: int = 0
+    seed: Seed = 0
     """Another seed, other samples."""
 
-    views: int | None = 2000
+    views: Annotated[int | None, "[1, inf)"] = 2000
     """Renderings of each object, rendered at first use and then kept; a sample turns the camera of
     one of them at random, which shows the same surface. None: each sample is a rendering of its
     own, for evaluation."""
 
-    distance_m: tuple[float, float] = (0.6, 1.1)
+    distance_m: Annotated[tuple[float, float], "[0.05, 20]", ASCENDING] = (0.6, 1.1)
     """From the camera to the middle of the object."""
 
-    image_px: tuple[int, int] = (640, 480)
+    image_px: Annotated[tuple[int, int], "(0, inf)"] = (640, 480)
     """Width and height of the sensor's image; the object lies somewhere in it."""
 
-    focal_px: tuple[float, float] = (572.4114, 573.57043)
+    focal_px: Annotated[tuple[float, float], "(0, inf)"] = (572.4114, 573.57043)
     """fx and fy; LineMOD's Kinect."""
 
     centre_px: tuple[float, float] | None = None
     """Principal point, within the image; None: the middle of the image, or that of LineMOD's Kinect
     in an image of 640x480. It is always known once the settings are made."""
 
-    resolution: tuple[float, float] = (0.4, 0.8)
+    resolution: Annotated[tuple[float, float], "[0.05, 4]", ASCENDING] = (0.4, 0.8)
     """The image is so many times as large: coarser pictures are faster."""
 
-    occluded_share: float = 0.7
+    occluded_share: Annotated[float, "[0, 1]"] = 0.7
     """Share of samples in which something occludes the object."""
 
-    occlusion: tuple[float, float] = (0.0, 0.5)
+    occlusion: Annotated[tuple[float, float], OCCLUSIONS, ASCENDING] = (0.0, 0.5)
     """Share of the silhouette that it occludes."""
 
     with_background: bool = True
     """Whether there is something behind and beside the object, which wrong masks take in."""
 
-    mask_error_px: int = 3
+    mask_error_px: Annotated[int, "[0, 20]"] = 3
     """The mask is grown or shrunk by up to so many pixels of the full image."""
 
-    mask_shift_px: int = 2
+    mask_shift_px: Annotated[int, "[0, 20]"] = 2
     """And shifted by up to so many of them along each axis, as a predicted mask is."""
 
     sensor: SensorConfig = SensorConfig()
     """What measures the depth."""
 
-    frame_objects: tuple[int, int] = (2, 6)
+    frame_objects: Annotated[tuple[int, int], "[1, inf)", ASCENDING] = (2, 6)
     """Objects of a whole frame, no more than there are models."""
 
-    frame_clutter: tuple[int, int] = (0, 4)
+    frame_clutter: Annotated[tuple[int, int], "[0, inf)", ASCENDING] = (0, 4)
     """Boxes, balls and cans of no model among them."""
 
-    frame_pile: int = 0
+    frame_pile: Annotated[int, "[0, 200]"] = 0
     """A frame shows so many copies of one model, dropped onto each other, in place of
     ``frame_objects`` and ``frame_clutter``; 0: no pile."""
 
     def __post_init__(self) -> None:
-        check_settings(
-            self,
-            number="[1, inf)",
-            views="[1, inf)",
-            image_px="(0, inf)",
-            focal_px="(0, inf)",
-            distance_m="[0.05, 20]",
-            resolution="[0.05, 4]",
-            occluded_share="[0, 1]",
-            occlusion=OCCLUSIONS,
-            mask_error_px="[0, 20]",
-            mask_shift_px="[0, 20]",
-            frame_objects="[1, inf)",
-            frame_clutter="[0, inf)",
-            frame_pile="[0, 200]",
-        )
-        refuse_seed(self.seed)
-        refuse_reversed(
-            self, "distance_m", "resolution", "occlusion", "frame_objects", "frame_clutter"
-        )
+        super().__post_init__()
         width, height = self.image_px
         middle = ((width - 1) / 2, (height - 1) / 2)
         if self.centre_px is None:

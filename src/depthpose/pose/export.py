@@ -45,10 +45,7 @@ class KernelMaps:
         self._maps: dict[tuple[int, int, int], Value] = {}
 
     def neighbour_rows(self, kernel: int, level_in: int, level_out: int) -> Value:
-        """Give the row of ``level_in`` beside each voxel of ``level_out`` at each offset.
-
-        (voxels, kernel^3); one past the last row where there is none.
-        """
+        """Give rows of ``level_in`` at offsets (voxels, kernel^3); one past the last: none."""
         key = (kernel, level_in, level_out)
         if key not in self._maps:
             step = 1 << min(level_in, level_out)

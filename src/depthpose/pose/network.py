@@ -2,14 +2,14 @@
 
 import dataclasses
 from dataclasses import dataclass
-from typing import ClassVar, Literal
+from typing import Annotated, ClassVar, Literal
 
 import torch
 import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from depthpose.core.config import check_settings
+from depthpose.core.config import Settings
 from depthpose.core.errors import InputError
 from depthpose.pose.sparse import RowNorm, SparseConv, SparseConvTranspose, Voxels
 from depthpose.pose.types import SeenPoints
@@ -18,16 +18,16 @@ Widths = tuple[int, int, int, int]
 
 
 @dataclass(frozen=True, kw_only=True)
-class ResUNetConfig:
+class ResUNetConfig(Settings):
     """Size of the network (FCGF's ResUNetBN2C, Choy et al. ICCV 2019, figure 3-3 of the thesis)."""
 
     RETIRED: ClassVar[frozenset[str]] = frozenset({"with_confidence", "descriptor"})
     """Settings of before, in older weights: no confidence is learnt and no descriptor given."""
 
-    classes: int = 13
+    classes: Annotated[int, "[1, inf)"] = 13
     """Objects that one network knows; the segmentation says which of them a cloud is."""
 
-    keypoints: int = 8
+    keypoints: Annotated[int, "[1, inf)"] = 8
     """Keypoints of each object."""
 
     norm: Literal["batch", "none"] = "batch"
@@ -41,18 +41,17 @@ class ResUNetConfig:
     first_kernel: int = 7
     """Size of the first convolution's kernel, in voxels: 1, 3, 5 or 7."""
 
-    encoder: Widths = (32, 64, 128, 256)
+    encoder: Annotated[Widths, "[1, inf)"] = (32, 64, 128, 256)
     """Channels of the levels going down, finest first."""
 
-    decoder: Widths = (64, 64, 64, 128)
+    decoder: Annotated[Widths, "[1, inf)"] = (64, 64, 64, 128)
     """Channels of the levels coming up, finest first; the first are the features of a point."""
 
-    inputs: int = 1
+    inputs: Annotated[int, "[1, inf)"] = 1
     """Features of a voxel that are given: the number 1 alone, or its shape too (9)."""
 
     def __post_init__(self) -> None:
-        sizes = ("classes", "keypoints", "inputs", "encoder", "decoder")
-        check_settings(self, **dict.fromkeys(sizes, "[1, inf)"))
+        super().__post_init__()
         if self.first_kernel not in (1, 3, 5, 7):
             raise InputError(
                 f"first_kernel must be 1, 3, 5 or 7 (an odd kernel has a centre), got "

@@ -228,12 +228,9 @@ def _iterated(
     *,
     is_exact: bool,
 ) -> tuple[Rigid, Int64[Tensor, "*batch n"]]:
-    """Step by step to where the cloud lies on the surface, each until it moves no more.
-
-    The last limit moves nothing. Gives the poses and the number of each point's sample, or -1.
-    """
+    """Step to where the cloud lies on the surface; give each point's sample too, or -1."""
     if serves(cloud, pose.R, pose.t_m):
-        from depthpose.pose.compiled.icp import refined
+        from depthpose.pose.compiled.poses import refined
 
         scale_m = surface.diameter_m
         return refined(
@@ -264,10 +261,7 @@ def _iterated(
 def _worth(
     points_m: Float[Tensor, "n 3"], poses: Rigid, surface: Surface, limit_m: float
 ) -> Float64[Tensor, " b"]:
-    """Score each pose: share of points near the surface, less distance and contradictions.
-
-    The first pose is trusted by ``_TRUST`` more.
-    """
+    """Score each pose: share of points near the surface, less distance and contradictions."""
     cloud = take_evenly(points_m.double(), _OCCLUDING_POINTS)
     few = take_evenly(cloud, _ROUGH_POINTS)
     index = match(few, poses, surface, limit_m, LOOKED_UP)
@@ -276,7 +270,7 @@ def _worth(
     front, unseen = look_along_rays(cloud, poses, surface, every=4)
     # Of equals, the nearer one.
     worth = near - _spread_m(residual_m, weight) / surface.diameter_m - front - _UNSEEN * unseen
-    worth[0] += _TRUST
+    worth[0] += _TRUST  # the first pose is trusted more
     return worth
 
 

@@ -4,7 +4,7 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Literal
+from typing import Annotated, Literal
 
 import numpy as np
 import torch
@@ -26,7 +26,7 @@ from depthpose.core.checkpoint import (
     save_imported,
     warn_of_terms,
 )
-from depthpose.core.config import check_settings, config_from_dict, config_to_dict
+from depthpose.core.config import Settings, config_from_dict, config_to_dict
 from depthpose.core.devices import usable_device
 from depthpose.core.errors import InputError
 
@@ -151,16 +151,16 @@ KIND = "segmentation"
 
 
 @dataclass(frozen=True, kw_only=True)
-class SegmentationConfig:
+class SegmentationConfig(Settings):
     """The network, how an image is brought to it, and what becomes of its answer."""
 
     stride: Literal[8, 16, 32] = 8
     """FCN-8s, 16s or 32s: stride in pixels of the finest features that are used."""
 
-    widths: tuple[int, int, int, int] = (64, 128, 256, 512)
+    widths: Annotated[tuple[int, int, int, int], "[1, inf)"] = (64, 128, 256, 512)
     """Channels of the encoder's stages; published weights have these."""
 
-    long_side_px: int = 640
+    long_side_px: Annotated[int, "[32, inf)"] = 640
     """Images are brought to this long side before the network, up or down, and the answer is
     brought back."""
 
@@ -168,11 +168,8 @@ class SegmentationConfig:
     """An image shows each object once: the largest connected part is kept, the others are errors.
     Else each connected part is an instance."""
 
-    min_share: float = 0.0005
+    min_share: Annotated[float, "[0, 1)"] = 0.0005
     """Parts below this share of the image's pixels are no object (150 pixels of 640x480)."""
-
-    def __post_init__(self) -> None:
-        check_settings(self, widths="[1, inf)", long_side_px="[32, inf)", min_share="[0, 1)")
 
 
 class FCN(nn.Module):

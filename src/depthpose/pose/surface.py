@@ -14,7 +14,7 @@ from torch.nn.functional import max_pool2d
 from depthpose.core.rigid import Rigid
 from depthpose.pose.compiled import GRAZING, LOOKED_UP, ON_RAY, SLACK, finite_array, serves
 from depthpose.pose.mesh import sample_surface, symmetry_transforms
-from depthpose.pose.mesh.models import CELL, across_walls, fibonacci_directions, outward_normals
+from depthpose.pose.mesh.models import CELL, across_walls, outward_normals
 from depthpose.pose.types import ObjectModel
 
 NEAR = 0.05
@@ -32,7 +32,6 @@ _BOXES = 48
 """Boxes along the longest side of a model, for looking up what is near without searching."""
 _MARGIN = 0.15
 """Of the diameter: so far the boxes reach beyond the model."""
-_VIEWS = 32
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -93,12 +92,6 @@ class Surface:
             return torch.from_numpy(nearest_of(points_m.numpy(), self.target.tree)[0])
         return torch.from_numpy(self.tree.query(points_m.numpy(), workers=1)[1])
 
-    def find(
-        self, points_m: Float64[Tensor, "*batch n 3"], *, is_exact: bool
-    ) -> Int64[Tensor, "*batch n"]:
-        """Give the number of the surface point near each point: searched, or looked up."""
-        return self.nearest(points_m) if is_exact else self.boxes.look_up(points_m)
-
     @cached_property
     def spacing_m(self) -> float:
         """Distance from a point to the third nearest, in the median."""
@@ -112,27 +105,10 @@ class Surface:
         return torch.cat([middle_m, (self.points_m - middle_m).norm(dim=-1).amax()[None]])
 
     @cached_property
-    def least_silhouette_m2(self) -> float:
-        """Area of the smallest silhouette among 32 directions, without its border.
-
-        Counted in cells of 1/24 diameter; a part that is thinner than three of them adds nothing.
-        """
-        side_m, reach = _CELL * self.diameter_m, round(1 / _CELL) + 3
-        # The last two rows of each frame are two axes across the direction.
-        _, _, frames = torch.linalg.svd(fibonacci_directions(_VIEWS)[:, None])
-        flat_m = (self.points_m - self.points_m.mean(0)) @ frames[:, 1:].mT
-        column, row = ((flat_m / side_m).floor().long() + reach).unbind(-1)
-        filled = torch.zeros(_VIEWS, (2 * reach) ** 2)
-        filled.scatter_(1, column * 2 * reach + row, 1.0)
-        closed = max_pool2d(filled.reshape(_VIEWS, 1, 2 * reach, 2 * reach), 3, 1, 1)
-        inner = -max_pool2d(-closed, 5, 1, 2)
-        return float(inner.sum((1, 2, 3)).min()) * side_m**2
-
-    @cached_property
     def target(self) -> Any:  # noqa: ANN401  a tuple of numba's
         """Points, normals and table as compiled functions take them."""
-        from depthpose.pose.compiled.icp import Target
         from depthpose.pose.compiled.points import tree_of
+        from depthpose.pose.compiled.poses import Target
 
         tree, boxes = tree_of(self.points_m.numpy()), self.boxes
         place = np.full(len(self.points_m) + 1, -1)

@@ -17,8 +17,7 @@ from depthpose.core.rigid import Rigid
 from depthpose.pose.cloud import object_points
 from depthpose.pose.datasets import Instance
 from depthpose.pose.estimator.inputs import AnyInput
-from depthpose.pose.mesh import sample_surface
-from depthpose.pose.synthetic import drawn_triangles
+from depthpose.pose.mesh import drawn_triangles, sample_surface
 from depthpose.pose.types import ObjectModel, PoseEstimate, ViewInput
 from depthpose.report.page import (
     Drawing,

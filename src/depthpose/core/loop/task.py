@@ -3,40 +3,40 @@
 import math
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
-from typing import Any, ClassVar, Literal, NamedTuple, Protocol, runtime_checkable
+from typing import Annotated, Any, ClassVar, Literal, NamedTuple, Protocol, runtime_checkable
 
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from depthpose.core.config import check_settings
-from depthpose.core.errors import InputError, refuse_seed
+from depthpose.core.config import Seed, Settings
+from depthpose.core.errors import InputError
 
 
 @dataclass(frozen=True, kw_only=True)
-class AdamConfig:
+class AdamConfig(Settings):
     """Adam (Kingma and Ba 2015), and its learning rate over the training."""
 
-    learning_rate: float = 1e-4
+    learning_rate: Annotated[float, "(0, 1)"] = 1e-4
     """Step size at the start."""
-    beta1: float = 0.9
+
+    beta1: Annotated[float, "[0, 1)"] = 0.9
     """Decay of the mean of the gradient; 0.5 for adversarial training."""
-    beta2: float = 0.999
+
+    beta2: Annotated[float, "[0, 1)"] = 0.999
     """Decay of the mean of its square."""
+
     schedule: Literal["constant", "constant-linear", "halving", "cosine"] = "constant"
     """constant; constant-linear (second half falls to zero); halving; cosine (falls to zero)."""
-    halvings: int = 4
-    """Equal parts of a training; ``halving`` halves after each but the last."""
-    warmup_steps: int = 0
-    """Steps over which the rate rises linearly from zero."""
-    weight_decay: float = 0.0
-    """Share of the weights taken off at a rate of 1, apart from the gradient (AdamW)."""
 
-    def __post_init__(self) -> None:
-        """Refuse values that cannot train."""
-        shares = dict.fromkeys(("beta1", "beta2"), "[0, 1)")
-        positive = dict.fromkeys(("warmup_steps", "weight_decay"), "[0, inf)")
-        check_settings(self, learning_rate="(0, 1)", **shares, halvings="[1, inf)", **positive)
+    halvings: Annotated[int, "[1, inf)"] = 4
+    """Equal parts of a training; ``halving`` halves after each but the last."""
+
+    warmup_steps: Annotated[int, "[0, inf)"] = 0
+    """Steps over which the rate rises linearly from zero."""
+
+    weight_decay: Annotated[float, "[0, inf)"] = 0.0
+    """Share of the weights taken off at a rate of 1, apart from the gradient (AdamW)."""
 
     def rate_at(self, step: int, steps: int) -> float:
         """Learning rate of ``step`` (0, 1, ...) in a training of ``steps``."""
@@ -52,52 +52,60 @@ class AdamConfig:
 
 
 @dataclass(frozen=True, kw_only=True)
-class LoopConfig:
+class LoopConfig(Settings):
     """How a task is trained, and for how long."""
 
     INSTEAD: ClassVar[dict[str, str]] = {"steps": "epochs", "epochs": "steps"}
     """A config file that gives one of these removes the other's default."""
-    steps: int | None = None
+
+    steps: Annotated[int | None, "(0, inf)"] = None
     """Optimiser steps; or give ``epochs``."""
-    epochs: float | None = None
+
+    epochs: Annotated[float | None, "(0, inf)"] = None
     """Passes over the data; or give ``steps``."""
-    batch_size: int = 4
+
+    batch_size: Annotated[int, "(0, inf)"] = 4
     """Samples of a micro-batch, in each process."""
-    accumulate: int = 1
+
+    accumulate: Annotated[int, "(0, inf)"] = 1
     """Micro-batches whose gradients are averaged before a step. The view stage holds the graphs of
     all of them until the discriminator has been updated."""
+
     precision: Literal["fp32", "bf16", "fp16"] = "fp32"
     """Precision of the forward pass; fp16 needs a GPU. A processor without bf16 takes fp32."""
-    clip_norm: float | None = None
+
+    clip_norm: Annotated[float | None, "(0, inf)"] = None
     """Largest norm of an optimiser's gradient; None: as it is."""
-    seed: int = 0
+
+    seed: Seed = 0
     """Decides order, augmentation and dropout; the initial weights are the task's."""
-    save_every_steps: int = 200
+
+    save_every_steps: Annotated[int, "(0, inf)"] = 200
     """Steps between two saved states."""
-    validate_every_steps: int = 1000
+
+    validate_every_steps: Annotated[int, "(0, inf)"] = 1000
     """Steps between two validations; there is always one after the last step."""
-    log_every_steps: int = 10
+
+    log_every_steps: Annotated[int, "(0, inf)"] = 10
     """Steps averaged into one line of metrics."""
-    workers: int = 0
+
+    workers: Annotated[int, "[0, inf)"] = 0
     """Processes that make samples; 0: the training process itself."""
-    ema_decay: float | None = None
+
+    ema_decay: Annotated[float | None, "(0, 1)"] = None
     """Decay of the moving average of the weights, which is then what is exported; None: off. The
     first steps decay faster, so that the initial weights are soon forgotten."""
+
     device: Literal["auto", "cpu"] = "auto"
     """auto: the accelerator that ``accelerate`` finds; cpu: none."""
 
     def __post_init__(self) -> None:
-        """Refuse a loop that cannot run."""
+        super().__post_init__()
         if (self.steps is None) == (self.epochs is None):
             raise InputError(
                 f"a training is as long as steps or epochs say: give one of the two, got "
                 f"steps={self.steps}, epochs={self.epochs}"
             )
-        counts = ("steps", "epochs", "batch_size", "accumulate", "save_every_steps",
-                  "validate_every_steps", "log_every_steps", "clip_norm")  # fmt: skip
-        positive = dict.fromkeys(counts, "(0, inf)")
-        check_settings(self, **positive, workers="[0, inf)", ema_decay="(0, 1)")
-        refuse_seed(self.seed)
 
     def total_steps(self, samples: int, processes: int) -> int:
         """Number of optimiser steps for a dataset of ``samples`` on ``processes``."""

@@ -27,7 +27,7 @@ from depthpose.core.files import (
 from depthpose.core.files.disk import write_bytes
 from depthpose.core.findings import CheckReport, Problem, make_report, unreadable
 from depthpose.core.rigid import Rigid
-from depthpose.pose.cloud import cloud_from_depth, refusal_of, refuse_other_size
+from depthpose.pose.cloud import cloud_from_depth, lift_sample, refusal_of, refuse_other_size
 from depthpose.pose.config import CloudConfig, MeshConfig
 from depthpose.pose.datasets.layouts import (
     Instance,
@@ -49,7 +49,6 @@ from depthpose.pose.mesh import (
     unit_advice,
 )
 from depthpose.pose.types import (
-    CloudInput,
     CloudSample,
     ObjectModel,
     PoseTruth,
@@ -110,15 +109,8 @@ class BopDataset:
         Raises:
             InputError: a file is missing or damaged, or the mask does not fit the depth.
         """
-        model, view = self.objects[instance.object_id], self.view(instance, mask)
-        given = view.input
-        points_m = cloud_from_depth(
-            given.depth_m, given.mask, given.K, model.diameter_m, self.cloud_config
-        )
-        return CloudSample(
-            input=CloudInput(name=instance.name, points_m=points_m, object=model.name),
-            truth=view.truth,
-        )
+        model = self.objects[instance.object_id]
+        return lift_sample(self.view(instance, mask), model.diameter_m, self.cloud_config)
 
     def view(
         self, instance: Instance, mask: Bool[Tensor, "mask_h mask_w"] | None = None

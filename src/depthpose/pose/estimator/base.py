@@ -16,8 +16,7 @@ from depthpose.core.errors import InputError, nearest_name, refused_memory
 from depthpose.core.rigid import Rigid
 from depthpose.core.units import Unit
 from depthpose.pose.config import EstimateConfig, RefusalConfig
-from depthpose.pose.estimator.answer import with_status
-from depthpose.pose.estimator.candidates import PoseAmbiguities, find_copies
+from depthpose.pose.estimator.candidates import PoseAmbiguities, find_copies, with_status
 from depthpose.pose.estimator.find import SearchTargets, find_objects, nothing_found, which_object
 from depthpose.pose.estimator.hypotheses import Views, prepare_views
 from depthpose.pose.estimator.inputs import (
@@ -111,13 +110,7 @@ class PoseEstimator(ABC):
     def _each(
         self, inputs: Iterable[AnyInput], threads: int, *, is_likely: bool = True
     ) -> Iterator[PoseEstimate]:
-        """Give each input's estimate, as :meth:`estimate_many`, in their order.
-
-        Args:
-            inputs: clouds and views.
-            threads: so many are worked at at a time.
-            is_likely: whether most of them show their object.
-        """
+        """Give each input's estimate in order; ``is_likely``: most of them show their object."""
 
     @torch.no_grad()
     @own_arithmetic()
@@ -309,25 +302,23 @@ class PoseEstimator(ABC):
         self, frames: Iterable[AnyInput], object: str, first: Rigid | None = None
     ) -> Iterator[PoseEstimate]:
         """Do as :meth:`track` does for views and clouds; a view's mask limits where is looked."""
+
+        def look(given: AnyInput) -> PoseEstimate:
+            if isinstance(given, CloudInput):
+                return self._try_many([given])[0]
+            began = time.perf_counter()
+            found = self.find_in(given, [object])
+            return found[0] if found else nothing_found(given, object, time.perf_counter() - began)
+
         number = self._number(object)
         followed = TrackedObject(
             model=self.models[number],
             surface=self._surface(number),
             refusal=self.refusal,
             icp=self.config.icp,
-            look=lambda given: self._look(given, object),
+            look=look,
         )
         return each_in_own_arithmetic(track(frames, followed, first))
-
-    def _look(self, given: AnyInput, object: str) -> PoseEstimate:
-        """Find the object in a frame of which nothing else is known."""
-        if isinstance(given, CloudInput):
-            return self._try_many([given])[0]
-        began = time.perf_counter()
-        found = self.find_in(given, [object])
-        if found:
-            return found[0]
-        return nothing_found(given, object, time.perf_counter() - began)
 
     def _object(self, name: str | None) -> str:
         if name is None and len(self._numbers) == 1:

@@ -1,8 +1,12 @@
-"""Poses that fit: the evidence against each, how likely each is, and how they differ in words."""
+"""Poses that fit: the evidence against each, how likely each is, how they differ in words.
+
+The best of them is the answer, or the reason why it is withheld.
+"""
 
 import math
+import time
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
 import torch
@@ -13,13 +17,15 @@ from torch.nn.functional import normalize
 from depthpose.core.arrays import take_evenly
 from depthpose.core.rigid import Rigid, cross_matrix, geodesic_rad
 from depthpose.pose.cloud import local_planes
-from depthpose.pose.config import IcpConfig
-from depthpose.pose.estimator.inputs import CloudDirections, ObjectCloud
+from depthpose.pose.config import EstimateConfig, IcpConfig, RefusalConfig
+from depthpose.pose.estimator.fit import SHOWN, fit_of, identity_of, seen_about
+from depthpose.pose.estimator.inputs import ObjectCloud, Refusal
 from depthpose.pose.mesh import near_symmetries, sample_surface, symmetry_transforms
 from depthpose.pose.mesh import true_symmetries as find_true
-from depthpose.pose.refine import refine_pose
+from depthpose.pose.refine import RefinedPose, refine_pose
 from depthpose.pose.surface import NEAR, Surface, look_along_rays
-from depthpose.pose.types import Alternative, ObjectModel
+from depthpose.pose.types import Alternative, Fit, ObjectModel, PoseEstimate, PoseFit, Vote
+from depthpose.pose.voting import free_motions
 
 _SAMPLED = 1000
 """At most so many points of the cloud are used, evenly taken."""
@@ -50,11 +56,8 @@ def disagreement(
 ) -> Float64[Tensor, " b"]:
     """Mean angle between the network's directions and those to the keypoints of each pose [rad].
 
-    Args:
-        cloud: what the network saw.
-        outputs: its directions.
-        copies_m: for each pose the keypoints of the copies that the network could not distinguish
-            from it; the copy counts at which the directions point best, by their mean cosine.
+    ``copies_m``: for each pose the keypoints of the copies that the network could not distinguish
+    from it; the copy counts at which the directions point best, by their mean cosine.
     """
     directions = normalize(outputs.double(), dim=-1)
     points_m = cloud.points_m.double()
@@ -84,11 +87,7 @@ class CloudNormals(NamedTuple):
 
 
 def cloud_normals(cloud_m: Float[Tensor, "n 3"]) -> CloudNormals:
-    """Lay planes through some points of a cloud, once for all poses that are compared with it.
-
-    Args:
-        cloud_m: of the object, in the camera frame.
-    """
+    """Lay planes through some points of a cloud, once for all poses that are compared with it."""
     thinned_m = take_evenly(cloud_m.double(), _THINNED)
     some_m = take_evenly(thinned_m, _TILTED)
     return CloudNormals(some_m, local_planes(thinned_m, some_m)[0])
@@ -104,12 +103,6 @@ def surface_signals(
 
     A point seen through the posed surface contradicts the pose; surface that nobody saw may merely
     be occluded by something else.
-
-    Args:
-        cloud_m: of the object, in the camera frame.
-        poses: of the object, a batch.
-        surface: of its model.
-        normals: of the cloud; None: they are computed.
     """
     normals = cloud_normals(cloud_m) if normals is None else normals
     limit_m = NEAR * surface.diameter_m
@@ -138,18 +131,9 @@ def observability(
     A motion ``y = (d/2 w, v)`` about the middle of the cloud moves a surface point at ``a`` with
     normal ``n`` across itself by ``n . v + (a x n) . w``. The observability is the root mean square
     of that over the points near the surface, for the unit motion that moves it least (Gelfand et
-    al., Geometrically Stable Sampling for the ICP Algorithm, 2003).
-
-    Args:
-        cloud_m: of the object, in the camera frame.
-        pose: of the object.
-        surface: of its model.
-        free: declared symmetries, as :func:`~depthpose.pose.voting.free_motions` gives them; they
-            are left out.
-
-    Returns:
-        The observability, and the weakest motion: (rotation, translation at the middle of the
-        cloud), unit length after scaling.
+    al., Geometrically Stable Sampling for the ICP Algorithm, 2003). Motions of declared symmetries
+    (``free``) are left out. The weakest motion is given too: (rotation, translation at the middle
+    of the cloud), of unit length after scaling.
     """
     points = take_evenly(cloud_m.double(), _SAMPLED)
     distance_m, index = _nearest(points, pose, surface)
@@ -161,7 +145,10 @@ def observability(
     middle, radius_m = points.mean(0), surface.diameter_m / 2
     arm = points[near] - middle
     J = torch.cat([torch.linalg.cross(arm, normal) / radius_m, normal], -1)
-    basis = _complement(_scaled(free.double(), middle, radius_m))
+    # Declared symmetries as motions about the middle, turns in metres at the radius.
+    turn, shift = free[:, :3].double(), free[:, 3:].double()
+    own = torch.cat([turn * radius_m, shift + turn @ cross_matrix(middle)], -1)
+    basis = _complement(own)
     values, vectors = torch.linalg.eigh(basis.T @ (J.T @ J / len(J)) @ basis)
     return float(values[0].clamp(min=0).sqrt()), basis @ vectors[:, 0]
 
@@ -194,14 +181,6 @@ def _nearest(
     local_m = pose.inverse().apply(points_m)
     index = surface.nearest(local_m)
     return (local_m - surface.points_m[index]).norm(dim=-1), index
-
-
-def _scaled(
-    motions: Float64[Tensor, "m 6"], middle: Float64[Tensor, "3"], radius_m: float
-) -> Float64[Tensor, "m 6"]:
-    """Write motions about the origin as motions about ``middle``, turns in metres at the radius."""
-    turn, shift = motions[:, :3], motions[:, 3:]
-    return torch.cat([turn * radius_m, shift + turn @ cross_matrix(middle)], -1)
 
 
 def _complement(motions: Float64[Tensor, "m 6"]) -> Float64[Tensor, "6 r"]:
@@ -247,12 +226,7 @@ class Candidate(NamedTuple):
 
 
 def find_copies(model: ObjectModel, *, up_to_symmetry: bool) -> PoseAmbiguities:
-    """Search a model for its near-symmetries, or count them as one answer with the true ones.
-
-    Args:
-        model: the object.
-        up_to_symmetry: copies that look nearly alike are one answer.
-    """
+    """Search a model for its near-symmetries, or count them as one answer with the true ones."""
     points_m = sample_surface(model, 2000)[0].double()
     near = [one.model_from_model for one in near_symmetries(model)]
     none = Rigid(torch.zeros(0, 3, 3).double(), torch.zeros(0, 3).double())
@@ -302,77 +276,36 @@ def find_candidates(
     surface: Surface,
     config: IcpConfig | None,
 ) -> list[Candidate]:
-    """Refine the poses at which ICP ended elsewhere and the nearly symmetric copies of the best.
+    """Refine ``others``, at which ICP ended elsewhere, and the nearly symmetric copies of the best.
 
-    Args:
-        cloud_m: of the object, in the camera frame.
-        best: the pose that was found.
-        others: at which other starts of ICP ended.
-        copies: of the model.
-        surface: of the model.
-        config: of ICP; None: the copies stay where they are.
-
-    Returns:
-        The best first, then those that are other poses than it and than each other.
+    The best comes first, then those that are other poses than it and than each other. Without a
+    config of ICP the copies stay where they are.
     """
     starts = Rigid.cat([others, best.pose @ copies.near])
     kept = [best]
     if len(starts.R) == 0:
         return kept
-    for one in _refined(cloud_m, starts, best, surface, config):
-        if not _is_any_same(one.pose, Rigid.stack([other.pose for other in kept]), copies):
+    if config is None:
+        poses = [starts[k] for k in range(len(starts.R))]
+        tried = [best._replace(pose=pose) for pose in poses]
+    else:
+        short = replace(
+            config,
+            iterations=(config.iterations + 1) // 2,
+            cloud_points=min(_ICP_POINTS, config.cloud_points),
+        )
+        found = refine_pose(cloud_m.double(), starts, surface, short)
+        tried = [
+            Candidate(found.camera_from_model[k], found.covariance[k], float(found.residual_m[k]))
+            for k in range(len(starts.R))
+            if float(found.inlier_share[k]) > 0  # else it is near no surface
+        ]
+    for one in tried:
+        every = Rigid.stack([other.pose for other in kept])[:, None] @ copies.same
+        gap_m = one.pose.apply(copies.points_m) - every.apply(copies.points_m)
+        if float(gap_m.norm(dim=-1).mean(-1).min()) >= _SAME * copies.diameter_m:
             kept.append(one)
     return kept
-
-
-def _refined(
-    cloud_m: Float[Tensor, "n 3"],
-    starts: Rigid,
-    best: Candidate,
-    surface: Surface,
-    config: IcpConfig | None,
-) -> list[Candidate]:
-    """Refine starts, all at once; those near no surface are left out."""
-    if config is None:
-        return [best._replace(pose=Rigid(R, t_m))
-                for R, t_m in zip(starts.R, starts.t_m, strict=True)]  # fmt: skip
-    short = replace(
-        config,
-        iterations=(config.iterations + 1) // 2,
-        cloud_points=min(_ICP_POINTS, config.cloud_points),
-    )
-    found = refine_pose(cloud_m.double(), starts, surface, short)
-    pose = found.camera_from_model
-    return [
-        Candidate(pose[k], found.covariance[k], float(found.residual_m[k]))
-        for k in range(len(starts.R))
-        if float(found.inlier_share[k]) > 0
-    ]
-
-
-def _is_any_same(pose: Rigid, others: Rigid, copies: PoseAmbiguities) -> bool:
-    """Whether one of others, or a copy that counts as it, carries the model where a pose does."""
-    every = others[:, None] @ copies.same
-    gap_m = pose.apply(copies.points_m) - every.apply(copies.points_m)
-    return float(gap_m.norm(dim=-1).mean(-1).min()) < _SAME * copies.diameter_m
-
-
-def evidence_of(
-    voted: CloudDirections,
-    poses: Rigid,
-    model: ObjectModel,
-    copies: PoseAmbiguities,
-    surface: Surface,
-) -> list[dict[str, float]]:
-    """Give the signals by which candidates are compared, for each pose of a batch.
-
-    The directions are compared with those to one of the copies that the network could not learn to
-    distinguish from the pose. Which of them it points at is chance, so the best one counts.
-    """
-    every_m = (poses[:, None] @ copies.trained).apply(model.keypoints_m.double())
-    disagree = disagreement(voted.cloud, voted.directions, every_m).tolist()
-    signals = surface_signals(voted.cloud.cloud_m, poses, surface)
-    return [{**one, "disagree": angle} for one, angle in zip(signals, disagree, strict=True)]
 
 
 def share_out(
@@ -414,31 +347,149 @@ def difference_of(pose: Rigid, from_pose: Rigid, copies: PoseAmbiguities) -> str
     angle = math.degrees(float(geodesic_rad(turn, torch.eye(3, dtype=torch.float64))))
     middle_m = copies.middle_m[None]
     shift_m = float((pose.apply(middle_m) - from_pose.apply(middle_m)).norm())
-    words = f"turned by {angle:.0f} degrees about {_axis_words(turn, copies)}"
-    if shift_m > _SAME / 2 * copies.diameter_m:
-        words += f" and shifted by {1000 * shift_m:.0f} mm"
-    return words
-
-
-def _axis_words(turn: Float64[Tensor, "3 3"], copies: PoseAmbiguities) -> str:
-    axis = _axis_of(turn)
-    lengths = copies.lengths_m
-    names = {}
+    # The direction that the turn leaves alone, of the sign of a turn by up to 180 degrees.
+    axis = torch.linalg.svd(turn - torch.eye(3, dtype=turn.dtype)).Vh[-1]
+    skew = torch.stack([turn[2, 1] - turn[1, 2], turn[0, 2] - turn[2, 0], turn[1, 0] - turn[0, 1]])
+    axis = axis if float(axis @ skew) >= 0 else -axis
+    lengths, names = copies.lengths_m, {}
     if lengths[0] > _LONGER * lengths[1]:
         names[0] = "the long axis"
     if lengths[1] > _LONGER * lengths[2]:
         names[2] = "the short axis"
     if len(names) == 2:  # then the one between is known too
         names[1] = "the middle axis"
-    for k, name in names.items():
-        if abs(float(copies.axes[k] @ axis)) > _ALONG:
-            return name
     x, y, z = (round(value, 2) + 0.0 for value in axis.tolist())  # no -0.00
-    return f"the model's axis ({x:.2f}, {y:.2f}, {z:.2f})"
+    along = [name for k, name in names.items() if abs(float(copies.axes[k] @ axis)) > _ALONG]
+    about = along[0] if along else f"the model's axis ({x:.2f}, {y:.2f}, {z:.2f})"
+    words = f"turned by {angle:.0f} degrees about {about}"
+    if shift_m > _SAME / 2 * copies.diameter_m:
+        words += f" and shifted by {1000 * shift_m:.0f} mm"
+    return words
 
 
-def _axis_of(R: Float64[Tensor, "3 3"]) -> Float64[Tensor, "3"]:
-    """The direction that a rotation leaves alone, of the sign of a turn by up to 180 degrees."""
-    axis = torch.linalg.svd(R - torch.eye(3, dtype=R.dtype)).Vh[-1]
-    skew = torch.stack([R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]])
-    return axis if float(axis @ skew) >= 0 else -axis
+@dataclass
+class Clock:
+    """Seconds of each stage."""
+
+    seconds: dict[str, float] = field(default_factory=dict)
+    last: float = field(default_factory=time.perf_counter)
+
+    def note(self, stage: str) -> None:
+        """Give a stage the time since the one before."""
+        now = time.perf_counter()
+        self.seconds[stage] = now - self.last
+        self.last = now
+
+
+def candidate_of(source: PoseFit | RefinedPose) -> Candidate:
+    """Take a fitted or a refined pose as one that may be right."""
+    return Candidate(source.camera_from_model.double(), source.covariance, float(source.residual_m))
+
+
+def answer_of(
+    cloud: ObjectCloud,
+    model: ObjectModel,
+    surface: Surface,
+    copies: PoseAmbiguities,
+    candidates: Sequence[Candidate],
+    evidence: Sequence[dict[str, float]],
+    refusal: RefusalConfig,
+    config: EstimateConfig,
+    clock: Clock,
+    vote: Vote | None = None,
+) -> PoseEstimate:
+    """Choose among poses by the evidence against each; ask whether it fits and is that object."""
+    seen = seen_about(cloud.cloud_m, cloud.view, surface.diameter_m)
+    shares = share_out(evidence, refusal.candidate_slopes)
+    number = int(shares.argsort(descending=True, stable=True)[0])
+    fit = fit_of(seen, candidates[number].pose, surface)
+    shares = shares * min(1.0, fit.agrees / SHOWN)  # the rest is that of a pose that was not found
+    pose, covariance, residual_m = candidates[number]
+    free = free_motions(model.symmetries.continuous, pose)
+    reason, identity = misfit_of(fit, refusal), None
+    if reason is None:
+        observable, motion = observability(cloud.cloud_m, pose, surface, free)
+        if observable < refusal.min_hold:
+            what = "turn" if float(motion[:3].norm()) > math.sqrt(0.5) else "shift"
+            reason = Refusal(
+                status="not observable",
+                reason=f"the seen part of the object leaves one {what} undetermined: it moves the "
+                f"surface along its normals by {observable:.1%} of the motion only; no declared "
+                "symmetry allows it. Declare the symmetry, or look from a side that shows more",
+            )
+    if reason is None and config.with_icp and refusal.max_size_error < 1:
+        identity = identity_of(cloud, pose, model, surface, fit, seen, refusal.max_size_error)
+        if identity.status == "contradicted":
+            reason = Refusal(status="doubtful", reason=identity.reason)
+    clock.note("check")
+    # Worked out in float64, given as points and models come: in float32.
+    answer = PoseEstimate(
+        name="",
+        object=model.name,
+        status="ok",
+        camera_from_model=pose.float(),
+        keypoints_m=None if vote is None else vote.keypoints_m.float(),
+        covariance=without_motions(covariance, free).float(),
+        free_motions=free.float(),
+        inlier_share=None if vote is None else float(vote.inlier_share.mean()),
+        residual_m=residual_m,
+        signals=evidence[number],
+        fit=fit,
+        identity=identity,
+        certainty=float(shares[number]),
+        alternatives=alternatives_among(candidates, evidence, shares, copies),
+        seconds=clock.seconds,
+    )
+    if reason is not None:
+        return withheld(answer.object, reason, clock, answer)
+    return with_status(answer, config.min_certainty)
+
+
+def with_status(answer: PoseEstimate, min_certainty: float) -> PoseEstimate:
+    """Say that a pose is ambiguous where its certainty is below the limit, and else ok."""
+    if answer.camera_from_model is None:
+        return answer
+    if answer.certainty is None or answer.certainty >= min_certainty:
+        return replace(answer, status="ok", reason="")
+    others = (
+        f"{len(answer.alternatives)} others fit too" if answer.alternatives else "others may fit"
+    )
+    reason = (
+        f"this pose has a certainty of {answer.certainty:.0%}, below min_certainty "
+        f"{min_certainty:.0%}: {others}"
+    )
+    return replace(answer, status="ambiguous", reason=reason)
+
+
+def misfit_of(fit: Fit, limits: RefusalConfig) -> Refusal | None:
+    """Say why a pose does not fit what the camera saw; None where it does."""
+    if fit.agrees < limits.min_agreement:
+        reason = (
+            f"of the posed surface that was seen {1 - fit.agrees:.0%} lies where the camera saw "
+            f"something else, and {1 - limits.min_agreement:.0%} may: another object or pose"
+        )
+    elif fit.beyond > limits.max_beyond:
+        reason = (
+            f"{fit.beyond:.1%} of the object's readings lie beside the posed silhouette, and "
+            f"{limits.max_beyond:.0%} may: another object, a larger one, or a mask of more than it"
+        )
+    elif fit.explained < limits.min_explained:
+        reason = (
+            f"{1 - fit.explained:.0%} of the object's readings are nowhere near the posed surface, "
+            f"and {1 - limits.min_explained:.0%} may be: another object, or a mask of more than it"
+        )
+    else:
+        return None
+    return Refusal(status="doubtful", reason=reason)
+
+
+def withheld(
+    object: str, refusal: Refusal, clock: Clock, answer: PoseEstimate | None = None
+) -> PoseEstimate:
+    """Keep what was found out but the pose: a refusal cannot be taken for an answer."""
+    known = PoseEstimate(name="", object=object, status=refusal.status, reason=refusal.reason,
+                         seconds=clock.seconds)  # fmt: skip
+    if answer is None:
+        return known
+    kept = ("keypoints_m", "inlier_share", "residual_m", "fit", "identity", "signals")
+    return replace(known, **{name: getattr(answer, name) for name in kept})

@@ -12,8 +12,7 @@ from torch import Tensor
 
 from depthpose.core.camera import back_project
 from depthpose.core.rigid import Rigid
-from depthpose.pose.augment import grow_mask
-from depthpose.pose.cloud import cloud_from_depth
+from depthpose.pose.cloud import cloud_from_depth, grow_mask
 from depthpose.pose.config import RefusalConfig
 from depthpose.pose.estimator.candidates import share_out
 from depthpose.pose.estimator.fit import BORDER_PX, SURE, sensor_size_error

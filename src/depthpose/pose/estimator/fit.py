@@ -14,7 +14,7 @@ from torch.nn.functional import max_pool2d
 from depthpose.core.arrays import take_evenly
 from depthpose.core.camera import back_project
 from depthpose.core.rigid import Rigid, rotation_by
-from depthpose.pose.augment import grow_mask
+from depthpose.pose.cloud import grow_mask
 from depthpose.pose.compiled import serves
 from depthpose.pose.config import IcpConfig
 from depthpose.pose.estimator.inputs import ObjectCloud
@@ -66,7 +66,15 @@ class Seen:
 def seen_about(cloud_m: Float[Tensor, "n 3"], view: ViewInput | None, diameter_m: float) -> Seen:
     """Cut the window of an object out of its view; a cloud alone is drawn as its camera saw it."""
     cloud_m = cloud_m.double()
-    K = _camera_of(cloud_m) if view is None else view.K.double()
+    if view is None:  # a camera to which the points of the cloud are a pixel apart
+        rays = cloud_m[:, :2] / cloud_m[:, 2:]
+        apart = torch.cdist(take_evenly(rays, 200), take_evenly(rays, 5000))
+        apart = apart.masked_fill(apart < 1e-9, torch.inf).amin(-1)
+        focal = 1 / (1.5 * float(apart.median()))
+        focal *= (min(len(rays), 5000) / len(rays)) ** -0.5
+        K = torch.diag(torch.tensor([focal, focal, 1.0], dtype=torch.float64))
+    else:
+        K = view.K.double()
     u, v = (cloud_m @ K.T)[:, :2].div(cloud_m[:, 2:]).round().long().unbind(-1)
     reach = int(_WIDE * diameter_m / float(cloud_m[:, 2].median()) * float(K[0, 0])) + 4
     low = torch.stack([u.amin(), v.amin()]) - reach
@@ -89,7 +97,15 @@ def seen_about(cloud_m: Float[Tensor, "n 3"], view: ViewInput | None, diameter_m
     depth_m = torch.where(depth_m.isfinite() & (depth_m > 0), depth_m, torch.nan)
     moved = K.clone()
     moved[:2, 2] -= torch.tensor([left, top], dtype=torch.float64)
-    return Seen(depth_m=depth_m, is_own=own, K=moved, noise_m=_noise_m(depth_m, own))
+    # Noise by second differences, which a slope does not change.
+    own_m, found = torch.where(grow_mask(own, -1), depth_m, torch.nan), []
+    for along_m in (own_m, own_m.T):
+        ends_m = along_m[:, : -2 * _LAG_PX] + along_m[:, 2 * _LAG_PX :]
+        bent_m = (ends_m - 2 * along_m[:, _LAG_PX:-_LAG_PX]).flatten()
+        found.append(bent_m[bent_m.isfinite()])
+    bent_m = torch.cat(found).abs()
+    noise_m = 1.4826 * float(bent_m.median()) / 6**0.5 if len(bent_m) > 0 else 0.0
+    return Seen(depth_m=depth_m, is_own=own, K=moved, noise_m=noise_m)
 
 
 def fit_of(seen: Seen, pose: Rigid, surface: Surface) -> Fit:
@@ -165,28 +181,6 @@ def fit_of(seen: Seen, pose: Rigid, surface: Surface) -> Fit:
     )
 
 
-def _noise_m(depth_m: Float64[Tensor, "h w"], is_own: Bool[Tensor, "h w"]) -> float:
-    """Give the noise of the readings by their second differences, which a slope does not change."""
-    own_m, found = torch.where(grow_mask(is_own, -1), depth_m, torch.nan), []
-    for along_m in (own_m, own_m.T):
-        ends_m = along_m[:, : -2 * _LAG_PX] + along_m[:, 2 * _LAG_PX :]
-        bent_m = (ends_m - 2 * along_m[:, _LAG_PX:-_LAG_PX]).flatten()
-        found.append(bent_m[bent_m.isfinite()])
-    bent_m = torch.cat(found).abs()
-    return 1.4826 * float(bent_m.median()) / 6**0.5 if len(bent_m) > 0 else 0.0
-
-
-def _camera_of(cloud_m: Float64[Tensor, "n 3"]) -> Float64[Tensor, "3 3"]:
-    """Give the intrinsic matrix of a camera to which the points of a cloud are a pixel apart."""
-    rays = cloud_m[:, :2] / cloud_m[:, 2:]
-    some = take_evenly(rays, 200)
-    apart = torch.cdist(some, take_evenly(rays, 5000))
-    apart = apart.masked_fill(apart < 1e-9, torch.inf).amin(-1)
-    focal = 1 / (1.5 * float(apart.median()))
-    focal *= (min(len(rays), 5000) / len(rays)) ** -0.5
-    return torch.diag(torch.tensor([focal, focal, 1.0], dtype=torch.float64))
-
-
 POINTS = 400
 """Of the cloud, evenly taken."""
 _STEPS = 12
@@ -247,20 +241,15 @@ def scale_of(cloud_m: Float[Tensor, "n 3"], pose: Rigid, surface: Surface) -> Sc
     which moves its point ``p`` across the surface by ``n . (p - c) s``.
     """
     local_m = pose.inverse().apply(take_evenly(cloud_m.double(), POINTS))
-    middle_m = (surface.points_m.amin(0) + surface.points_m.amax(0)) / 2
-
-    def distance(moved_m: Tensor, times: Tensor, *, is_exact: bool) -> Float64[Tensor, " b"]:
-        own_m = (moved_m - middle_m) / times[:, None, None] + middle_m
-        return distance_to(own_m, surface, times, is_exact=is_exact)
-
+    middle_m = surface.ball_m[:3]
     starts = torch.tensor(_STARTS, dtype=torch.float64)
     few_m = take_evenly(local_m, _ROUGH_POINTS).expand(len(starts), -1, -1)
     times, turned_m, _ = _grow(few_m, starts, middle_m, surface, is_exact=False)
-    costs = distance(turned_m, times, is_exact=False).square()
+    costs = distance_to(turned_m, surface, times, is_exact=False).square()
     costs[0] -= _TRUST
     start = starts[costs.argmin()][None]
     times, turned_m, sigma = _grow(local_m[None], start, middle_m, surface, is_exact=True)
-    reached = distance(turned_m, times, is_exact=True)
+    reached = distance_to(turned_m, surface, times, is_exact=True)
     gain = distance_to(local_m, surface, is_exact=True) - reached[0]
     return Scale(float(times), float(sigma), float(gain))
 
@@ -277,7 +266,7 @@ def _grow(
     widths = (1 + (_WIDE_STEP - 1) * max(0.0, 1 - 2 * step / _STEPS) for step in range(_STEPS))
     limits_m = [NEAR * surface.diameter_m * width for width in widths]
     if serves(local_m, times):
-        from depthpose.pose.compiled.icp import grown
+        from depthpose.pose.compiled.poses import grown
 
         times, local_m, variance = grown(
             local_m, times, middle_m, surface.target, limits_m, _CONVERGED, is_exact
@@ -286,7 +275,7 @@ def _grow(
     sigma = torch.ones_like(times)
     for limit_m in limits_m:
         own_m = (local_m - middle_m) / times[:, None, None] + middle_m
-        index = surface.find(own_m, is_exact=is_exact)
+        index = surface.nearest(own_m) if is_exact else surface.boxes.look_up(own_m)
         normal = surface.normals[index]
         arm_m = times[:, None, None] * (surface.points_m[index] - middle_m)
         gap_m = local_m - middle_m - arm_m
@@ -317,8 +306,14 @@ def distance_to(
     *,
     is_exact: bool,
 ) -> Float64[Tensor, "*batch"]:
-    """Root mean square distance of points to a surface, in limits of nearness, cut off at 1."""
-    gap_m = (local_m - surface.points_m[surface.find(local_m, is_exact=is_exact)]).norm(dim=-1)
+    """Root mean square distance of points to a surface, in limits of nearness, cut off at 1.
+
+    With ``times`` the surface is so many times as large, grown about its middle.
+    """
+    if times is not None:
+        local_m = (local_m - surface.ball_m[:3]) / times[:, None, None] + surface.ball_m[:3]
+    index = surface.nearest(local_m) if is_exact else surface.boxes.look_up(local_m)
+    gap_m = (local_m - surface.points_m[index]).norm(dim=-1)
     if times is not None:
         gap_m = times[..., None] * gap_m
     return (gap_m / (NEAR * surface.diameter_m)).clamp(max=1).square().mean(-1).sqrt()
@@ -330,7 +325,7 @@ def mirror_gain(cloud_m: Float[Tensor, "n 3"], pose: Rigid, surface: Surface) ->
     The cloud is mirrored in place of the model, so that ICP finds a pose.
     """
     local_m = pose.inverse().apply(take_evenly(cloud_m.double(), POINTS))
-    middle_m = (surface.points_m.amin(0) + surface.points_m.amax(0)) / 2
+    middle_m = surface.ball_m[:3]
     mirrored_m = (local_m - middle_m) * _FLIP + middle_m
     config = IcpConfig()
     normals = fibonacci_directions(_PLANES)  # of planes that mirror the cloud back

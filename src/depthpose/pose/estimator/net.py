@@ -21,9 +21,18 @@ from depthpose.core.rigid import Rigid
 from depthpose.pose.baselines import DepthCrop, DepthImageNet, cut_depth, poses_of
 from depthpose.pose.cloud import cloud_from_depth, refusal_of
 from depthpose.pose.config import EstimateConfig
-from depthpose.pose.estimator.answer import Clock, answer_of, candidate_of, misfit_of, withheld
 from depthpose.pose.estimator.base import PoseEstimator, answered, or_unreadable, refused
-from depthpose.pose.estimator.candidates import Candidate, evidence_of, find_candidates
+from depthpose.pose.estimator.candidates import (
+    Candidate,
+    Clock,
+    answer_of,
+    candidate_of,
+    disagreement,
+    find_candidates,
+    misfit_of,
+    surface_signals,
+    withheld,
+)
 from depthpose.pose.estimator.fit import fit_of, seen_about
 from depthpose.pose.estimator.inputs import AnyInput, ObjectCloud, Refusal, prepare_cloud
 from depthpose.pose.estimator.inputs import CloudDirections as CloudDirections
@@ -265,16 +274,13 @@ class GeoPoseNet(PoseEstimator):
             return one.given, one.prepared, None
         assert one.outputs is not None, "asked before"
         voted = CloudDirections(one.prepared, one.outputs)
-
-        found = or_unreadable(
-            lambda given: self._vote(voted, self._number(given.object), is_likely=is_likely),
-            one.given,
-        )
+        found = or_unreadable(partial(self._vote, voted=voted, is_likely=is_likely), one.given)
         seconds = {**one.seconds, **found.seconds}
         return one.given, replace(found, name=one.given.name, seconds=seconds), voted
 
-    def _vote(self, voted: CloudDirections, number: int, *, is_likely: bool) -> PoseEstimate:
+    def _vote(self, given: AnyInput, *, voted: CloudDirections, is_likely: bool) -> PoseEstimate:
         """Vote for the keypoints, fit the pose, refine and check it."""
+        number = self._number(given.object)
         model, surface, copies = self.models[number], self._surface(number), self._copies_of(number)
         config, clock = self.config, Clock()
         points, directions = voted.cloud.points_m.double(), voted.directions.double()
@@ -303,7 +309,11 @@ class GeoPoseNet(PoseEstimator):
                 return withheld(model.name, misfit, clock)
         candidates = find_candidates(cloud_m, first, others, copies, surface, icp)
         poses = Rigid.stack([one.pose for one in candidates])
-        evidence = evidence_of(voted, poses, model, copies, surface)
+        # Of the copies that the network could not learn to distinguish, the best counts.
+        every_m = (poses[:, None] @ copies.trained).apply(model.keypoints_m.double())
+        angles = disagreement(voted.cloud, voted.directions, every_m).tolist()
+        signals = surface_signals(cloud_m, poses, surface)
+        evidence = [{**one, "disagree": a} for one, a in zip(signals, angles, strict=True)]
         if config.with_icp:
             clock.note("icp")
         return answer_of(

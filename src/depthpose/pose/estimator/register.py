@@ -15,13 +15,16 @@ from depthpose.core.rigid import Rigid
 from depthpose.core.units import Unit
 from depthpose.pose.cloud import local_planes
 from depthpose.pose.config import CloudConfig, EstimateConfig, RefusalConfig
-from depthpose.pose.estimator.answer import Clock, answer_of, candidate_of, withheld
 from depthpose.pose.estimator.base import PoseEstimator, or_unreadable, refused
 from depthpose.pose.estimator.candidates import (
+    Clock,
+    answer_of,
+    candidate_of,
     cloud_normals,
     find_candidates,
     surface_signals,
     tilt_of,
+    withheld,
 )
 from depthpose.pose.estimator.inputs import AnyInput, Refusal, prepare_cloud
 from depthpose.pose.mesh import read_model, refuse_one_name, with_found_symmetries

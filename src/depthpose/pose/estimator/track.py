@@ -163,10 +163,7 @@ def _contradiction(
 
 
 def _follow(given: AnyInput, last: _Last, known: TrackedObject) -> PoseEstimate | Refusal:
-    """Refine the last pose and the predicted one; take the better if the scene agrees with it.
-
-    What else the object may be stays what it was where it was found.
-    """
+    """Refine the last pose and the predicted one; take the better if the scene agrees with it."""
     surface, starts = known.surface, [last.pose]
     if last.moved is not None:  # the pose that goes on as it moved last
         moved = Rigid(last.moved.R @ last.pose.R, last.pose.t_m + last.moved.t_m)
@@ -222,10 +219,7 @@ def _follow(given: AnyInput, last: _Last, known: TrackedObject) -> PoseEstimate 
 def _is_support(
     scene_m: Float64[Tensor, "n 3"], near: Bool[Tensor, " n"], posed_m: Float64[Tensor, "m 3"]
 ) -> Bool[Tensor, " n"]:
-    """Whether points are of a table or wall that goes on beside the object.
-
-    ICP would pull the surface onto them: they lie within its limit all around what rests there.
-    """
+    """Whether points are of a table or wall beside the object, onto which ICP would pull it."""
     is_support, is_flat = torch.zeros_like(near), torch.zeros(len(posed_m), dtype=torch.bool)
     generator = torch.Generator().manual_seed(0)
     for _ in range(_SUPPORTS):

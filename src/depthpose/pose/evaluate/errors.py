@@ -17,7 +17,7 @@ from depthpose.core.files import image_size, read_depth_png
 from depthpose.core.render import rasterize
 from depthpose.core.rigid import Rigid
 from depthpose.pose.datasets import BopDataset, Instance
-from depthpose.pose.mesh import symmetry_transforms, turn_about
+from depthpose.pose.mesh import drawn_triangles, symmetry_transforms, turn_about
 from depthpose.pose.metrics import (
     BOP_PIXELS,
     BOP_SHARES,
@@ -33,7 +33,6 @@ from depthpose.pose.metrics import (
     vsd,
 )
 from depthpose.pose.predictions import Place, Prediction, place_of, score_of
-from depthpose.pose.synthetic import drawn_triangles
 from depthpose.pose.types import ObjectModel, PoseEstimate, Symmetries
 
 BOP_WIDTH_PX = 640

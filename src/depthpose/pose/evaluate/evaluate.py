@@ -23,7 +23,6 @@ from depthpose.pose.evaluate.errors import (
     match,
     measure,
 )
-from depthpose.pose.metrics import risk_coverage
 from depthpose.pose.predictions import (
     STAGES,
     Place,
@@ -243,19 +242,14 @@ def risk_rows(rows: Sequence[InstanceRow]) -> list[RiskRow]:
     """
     answered = [row for row in rows if row.status in POSED and row.score is not None]
     answered.sort(key=lambda row: -(row.score or 0.0))
-    ranks = torch.full((len(rows),), math.inf, dtype=torch.float64)
-    ranks[: len(answered)] = torch.arange(len(answered), dtype=torch.float64)
-    is_right = torch.zeros(len(rows), dtype=torch.bool)
-    is_right[: len(answered)] = torch.tensor([row.is_success for row in answered], dtype=torch.bool)
-    coverage, risk = risk_coverage(ranks, is_right)
     tenths = (round(k * len(rows) / _DECILES) for k in range(1, _DECILES + 1))
     counts = dict.fromkeys(min(count, len(answered)) for count in tenths)
     return [
         RiskRow(
-            coverage=float(coverage[count - 1]),
+            coverage=count / len(rows),
             answers=count,
             least_score=answered[count - 1].score,
-            risk=float(risk[count - 1]),
+            risk=sum(not row.is_success for row in answered[:count]) / count,
         )
         for count in counts
         if count

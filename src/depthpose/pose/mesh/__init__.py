@@ -4,6 +4,7 @@ from depthpose.pose.mesh.files import FIXED_UNITS as FIXED_UNITS
 from depthpose.pose.mesh.files import mesh_suffixes as mesh_suffixes
 from depthpose.pose.mesh.files import read_geometry as read_geometry
 from depthpose.pose.mesh.files import unit_of as unit_of
+from depthpose.pose.mesh.models import drawn_triangles as drawn_triangles
 from depthpose.pose.mesh.models import estimate_normals as estimate_normals
 from depthpose.pose.mesh.models import exact_diameter as exact_diameter
 from depthpose.pose.mesh.models import farthest_points as farthest_points
@@ -12,6 +13,7 @@ from depthpose.pose.mesh.models import make_model as make_model
 from depthpose.pose.mesh.models import read_model as read_model
 from depthpose.pose.mesh.models import refuse_one_name as refuse_one_name
 from depthpose.pose.mesh.models import sample_surface as sample_surface
+from depthpose.pose.mesh.models import surfel_triangles as surfel_triangles
 from depthpose.pose.mesh.models import symmetries_from_bop as symmetries_from_bop
 from depthpose.pose.mesh.models import symmetries_to_bop as symmetries_to_bop
 from depthpose.pose.mesh.models import symmetry_transforms as symmetry_transforms

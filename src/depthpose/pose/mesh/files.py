@@ -366,10 +366,7 @@ def _cut(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _clip_ears(points: np.ndarray) -> list[tuple[int, int, int]]:
-    """Cut off a corner whose triangle holds no other, again and again; points (n, 2), in order.
-
-    Where there is none (the polygon crosses itself), the next corner is taken.
-    """
+    """Cut off a corner whose triangle holds no other, again and again; points (n, 2), in order."""
     left, ears, places = list(range(len(points))), [], points.tolist()
     least = _FLAT * float(np.ptp(points, axis=0).max()) ** 2
     is_back = np.array([_turn(places, k - 1, k, (k + 1) % len(left)) < 0 for k in left])
@@ -386,7 +383,7 @@ def _clip_ears(points: np.ndarray) -> list[tuple[int, int, int]]:
                 is_inside &= (bx - ax) * (y - ay) >= (by - ay) * (x - ax)
                 is_inside &= (x != ax) | (y != ay)
             is_ear = not is_inside.any()
-        if not is_ear and tried < len(left):
+        if not is_ear and tried < len(left):  # none at all: the polygon crosses itself
             at, tried = at + 1, tried + 1
             continue
         ears.append((a, b, c))

@@ -200,6 +200,40 @@ def sample_surface(
     return points.to(model.vertices_m), normals.to(model.vertices_m)
 
 
+_CORNERS = 6
+"""Of a disc: three quarters of its area, in four triangles."""
+_DISC = 1.6
+"""Radius of a disc, in spacings of its points: neighbours then overlap, and nothing shows through
+where the points are twice as far apart as usual."""
+
+
+def drawn_triangles(model: ObjectModel) -> Float[Tensor, "n 3 3"]:
+    """Give the faces of a model, or a disc at each point of one that has no faces."""
+    return model.triangles_m if len(model.faces) else surfel_triangles(model)
+
+
+def surfel_triangles(model: ObjectModel) -> Float[Tensor, "n 3 3"]:
+    """Lay a flat six-cornered disc on each point, across its normal (Pfister et al. 2000).
+
+    Each is as large as its own neighbourhood is sparse: the distance to the third nearest point,
+    but no more than twice the usual one, so that a stray point makes no plate.
+    """
+    points = model.vertices_m.double()
+    distance, _ = KDTree(points.numpy()).query(points.numpy(), k=min(4, len(points)))
+    spacing = torch.from_numpy(distance[:, -1])
+    radius = _DISC * spacing.clamp(max=2 * float(spacing.median())) / 2**0.5
+    normal = model.normals.double()
+    # Any axis that is not along the normal.
+    helper = torch.eye(3, dtype=torch.float64)[normal.abs().argmin(1)]
+    first = torch.nn.functional.normalize(torch.linalg.cross(normal, helper), dim=-1)
+    second = torch.linalg.cross(normal, first)
+    angle = 2 * math.pi * torch.arange(_CORNERS, dtype=torch.float64) / _CORNERS
+    spokes = first[:, None] * angle.cos()[:, None] + second[:, None] * angle.sin()[:, None]
+    corners = points[:, None] + radius[:, None, None] * spokes
+    fan = torch.tensor([[0, i, i + 1] for i in range(1, _CORNERS - 1)])
+    return corners[:, fan].flatten(0, 1).to(model.vertices_m)
+
+
 def gap_to_surface_m(points_m: Float[Tensor, "n 3"], model: ObjectModel) -> float:
     """Say how far off a model's surface the farthest of some points lies [m].
 

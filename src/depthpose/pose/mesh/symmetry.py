@@ -299,10 +299,7 @@ def _is_known(direction: Tensor, tried: list[Tensor], revolved: list[Tensor]) ->
 def _measure(
     surface: SurfaceDeviation, direction: Tensor, limit: float, tolerance: float
 ) -> list[SymmetryProposal]:
-    """Measure the full circle about an axis and, unless that is sure, turns of order 2 to 12.
-
-    A rough square block is nearly round, and surely square.
-    """
+    """Measure the full circle about an axis and, unless that is sure, turns of order 2 to 12."""
     axis = Axis(direction=direction, point_m=surface.centre_m)
     circle = _turns(direction, torch.arange(1, _TURNS) * (2 * math.pi / _TURNS))
     found: list[SymmetryProposal] = []

@@ -14,11 +14,10 @@ from depthpose.core.errors import InputError
 from depthpose.core.loop import sample_generator
 from depthpose.core.render import Raster, rasterize
 from depthpose.core.rigid import Rigid
-from depthpose.pose.augment import measure, random_rotation, uniform, whole
 from depthpose.pose.config import ObjectsConfig
 from depthpose.pose.datasets import BopFrame, BopObject
-from depthpose.pose.mesh import sample_surface
-from depthpose.pose.synthetic.views import surfel_triangles
+from depthpose.pose.mesh import drawn_triangles, sample_surface
+from depthpose.pose.synthetic.views import measure, random_rotation, uniform, whole
 from depthpose.pose.types import ObjectModel
 
 _WAVES = 6
@@ -78,19 +77,6 @@ def random_pattern(
     )
 
 
-def solid_of(model: ObjectModel) -> Solid:
-    """Prepare a known object: it looks alike in every frame of every data set."""
-    generator = sample_generator(model.number, _COLOUR_SEED)
-    pattern = random_pattern(generator, model.diameter_m, (0.7, 1.0))
-    if len(model.faces):
-        corners, normals = model.triangles_m, model.normals[model.faces]
-    else:
-        corners = surfel_triangles(model)
-        each = len(corners) // len(model.vertices_m)
-        normals = model.normals.repeat_interleave(each, 0)[:, None].expand(-1, 3, 3)
-    return Solid(triangles_m=corners, normals=normals, pattern=pattern, number=model.number)
-
-
 def random_clutter(generator: torch.Generator) -> Solid:
     """Draw a box, a ball or a can of no known object."""
     import trimesh
@@ -132,16 +118,6 @@ class Light:
     ambient: Float[Tensor, "3"]
 
 
-def random_light(up: Float[Tensor, "3"], generator: torch.Generator) -> Light:
-    """Draw a lamp above the table, warm or cold, strong or weak."""
-    towards = F.normalize(1.2 * up + 0.8 * torch.randn(3, generator=generator), dim=0)
-    strength, warmth = uniform(generator, 0.3, 0.9), uniform(generator, -0.15, 0.15)
-    colour = torch.tensor([1 + warmth, 1.0, 1 - warmth])
-    return Light(
-        towards=towards, lamp=strength * colour, ambient=uniform(generator, 0.2, 0.6) * (2 - colour)
-    )
-
-
 def shade(
     placed: Sequence[Placed], raster: Raster, K: Float[Tensor, "3 3"], light: Light
 ) -> Float[Tensor, "n 3"]:
@@ -173,18 +149,6 @@ def shade(
         colour[own] = pattern.at(local) * base + pattern.gloss * shine * light.lamp
         start = stop
     return colour
-
-
-def backdrop(
-    height: int, width: int, generator: torch.Generator
-) -> Float[Tensor, "3 {height} {width}"]:
-    """Draw what is behind the table: blots of several sizes over a colour, out of focus."""
-    image = torch.rand(3, 1, 1, generator=generator) * torch.ones(1, height, width)
-    for cells in (3, 8, 24):
-        blots = torch.randn(1, 3, cells, cells, generator=generator)
-        smooth = F.interpolate(blots, (height, width), mode="bilinear", align_corners=False)
-        image = image + uniform(generator, 0.0, 0.25) * smooth[0]
-    return image.clamp(0, 1)
 
 
 _TRIES = 30
@@ -220,7 +184,17 @@ def make_frames(
             f"distance_m begins at {config.distance_m[0]:g} m, but the largest object is "
             f"{widest_m:.3g} m wide and would fill the image; begin at {3 * widest_m:.2g}"
         )
-    solids = [solid_of(model) for model in models]
+    solids = list[Solid]()
+    for model in models:  # an object looks alike in every frame of every data set
+        chance = sample_generator(model.number, _COLOUR_SEED)
+        pattern = random_pattern(chance, model.diameter_m, (0.7, 1.0))
+        corners, normals = drawn_triangles(model), model.normals[model.faces]
+        if not len(model.faces):  # each point is a disc of several triangles
+            each = len(corners) // len(model.vertices_m)
+            normals = model.normals.repeat_interleave(each, 0)[:, None].expand(-1, 3, 3)
+        solids.append(
+            Solid(triangles_m=corners, normals=normals, pattern=pattern, number=model.number)
+        )
     for index in range(first, first + number):
         yield _make_frame(models, solids, config, index)
 
@@ -233,10 +207,8 @@ def _make_frame(
         world = _piled(models, solids, config, generator)
     else:
         world = _arranged(solids, config, generator)
-    camera_from_world = _viewpoint(config, generator)
-    placed = [
-        Placed(solid=solid, camera_from_model=camera_from_world @ pose) for solid, pose in world
-    ]
+    view = _viewpoint(config, generator)
+    placed = [Placed(solid=solid, camera_from_model=view @ pose) for solid, pose in world]
     (fx, fy), (cx, cy) = config.focal_px, config.principal_point_px
     K = torch.tensor([[fx, 0, cx], [0, fy, cy], [0, 0, 1]], dtype=torch.float64)
     width, height = config.image_px
@@ -244,8 +216,20 @@ def _make_frame(
     raster = rasterize(torch.cat(corners), K, width, height)
     owner = torch.cat([torch.full((len(c),), i) for i, c in enumerate(corners)])
     seen = torch.where(raster.primitive >= 0, owner[raster.primitive.clamp(min=0)], -1)
-    image = backdrop(height, width, generator)
-    light = random_light(placed[-1].camera_from_model.R[:, 2], generator)  # above the table
+    # Behind the table blots of several sizes over a colour, out of focus.
+    image = torch.rand(3, 1, 1, generator=generator) * torch.ones(1, height, width)
+    for cells in (3, 8, 24):
+        blots = torch.randn(1, 3, cells, cells, generator=generator)
+        smooth = F.interpolate(blots, (height, width), mode="bilinear", align_corners=False)
+        image = image + uniform(generator, 0.0, 0.25) * smooth[0]
+    image = image.clamp(0, 1)
+    # A lamp above the table, warm or cold, strong or weak.
+    up = placed[-1].camera_from_model.R[:, 2]
+    towards = F.normalize(1.2 * up + 0.8 * torch.randn(3, generator=generator), dim=0)
+    strength, warmth = uniform(generator, 0.3, 0.9), uniform(generator, -0.15, 0.15)
+    colour = torch.tensor([1 + warmth, 1.0, 1 - warmth])
+    ambient = uniform(generator, 0.2, 0.6) * (2 - colour)
+    light = Light(towards=towards, lamp=strength * colour, ambient=ambient)
     image[:, raster.primitive >= 0] = shade(placed, raster, K, light).mT
     rgb = _exposed(image, generator)
     focal_px = (config.focal_px[0], config.focal_px[0])
@@ -307,11 +291,7 @@ def _piled(
     config: ObjectsConfig,
     generator: torch.Generator,
 ) -> list[tuple[Solid, Rigid]]:
-    """Drop copies of one thing straight down until they touch, in the table's frame (z up).
-
-    Of several random rotations and places the one whose middle comes to lie lowest is taken.
-    Nothing slides or tips over afterwards.
-    """
+    """Drop copies of one thing straight down until they touch, in the table's frame (z up)."""
     which = whole(generator, len(solids))
     points = sample_surface(models[which], 20000)[0]
     middle = (points.amin(0) + points.amax(0)) / 2
@@ -321,7 +301,7 @@ def _piled(
     cells = math.ceil((reach_m + radius_m) / _CELL_M)
     height_m = torch.zeros((2 * cells + 1) ** 2)
     placed: list[tuple[Solid, Rigid]] = []
-    for _ in range(config.frame_pile):
+    for _ in range(config.frame_pile):  # each where its middle comes to lie lowest
         drops: list[tuple[float, Rigid, Tensor, Tensor]] = []
         for _ in range(_DROPS):
             R = random_rotation(generator).float()

@@ -1,8 +1,12 @@
-"""Synthetic views of known objects, drawn at a pose or turned out of a view that was drawn before.
+"""Synthetic views of known objects, and random changes that keep a pose true.
 
-A camera that turns about its own centre sees the same surface points, along other rays. A stored
-view is therefore a view from every direction of gaze, and only its pixels are interpolated: inverse
-depth, which is linear in the picture of a plane, so that flat parts stay exact.
+A view is drawn at a pose, or turned out of a view that was drawn before. A camera that turns about
+its own centre sees the same surface points, along other rays. A stored view is therefore a view
+from every direction of gaze, and only its pixels are interpolated: inverse depth, which is linear
+in the picture of a plane, so that flat parts stay exact.
+
+Changes (occluders, wrong masks, a sensor's errors) take their chance from a generator alone. Depth
+is NaN where nothing is seen.
 """
 
 import copy
@@ -12,8 +16,9 @@ from contextlib import suppress
 from dataclasses import dataclass, replace
 
 import torch
-from jaxtyping import Float
-from scipy.spatial import ConvexHull, KDTree, QhullError
+import torch.nn.functional as F
+from jaxtyping import Bool, Float
+from scipy.spatial import ConvexHull, QhullError
 from torch import Tensor
 from torch.utils.data import DataLoader
 
@@ -21,20 +26,10 @@ from depthpose.core.errors import InputError
 from depthpose.core.loop import sample_generator
 from depthpose.core.render import rasterize
 from depthpose.core.rigid import Rigid, turn_axis_to
-from depthpose.pose.augment import (
-    grow_mask,
-    measure,
-    occlude,
-    random_levels,
-    random_rotation,
-    shift_mask,
-    uniform,
-    whole,
-)
-from depthpose.pose.cloud import cloud_from_depth
-from depthpose.pose.config import CloudConfig, ObjectsConfig
+from depthpose.pose.cloud import grow_mask, lift_sample
+from depthpose.pose.config import CloudConfig, ObjectsConfig, SensorConfig, SensorKind
+from depthpose.pose.mesh import drawn_triangles
 from depthpose.pose.types import (
-    CloudInput,
     CloudSample,
     ObjectModel,
     PoseTruth,
@@ -42,44 +37,219 @@ from depthpose.pose.types import (
     ViewSample,
 )
 
-_CORNERS = 6
-"""Of a disc: three quarters of its area, in four triangles."""
-_REACH = 1.6
-"""Radius of a disc, in spacings of its points: neighbours then overlap, and nothing shows through
-where the points are twice as far apart as usual."""
+Depth = Float[Tensor, "h w"]
+Mask = Bool[Tensor, "h w"]
+
+_KINECT_BASELINE_M = 0.075
+_STEPS_A_PIXEL = 8
+_STEREO_BASELINE_M = 0.05
+_STEREO_STEPS_A_PIXEL = 32
+_STEREO_CORRELATION_PX = (3.0, 6.0)
+_STEREO_WINDOW = 2
+"""Pixels by which active stereo displaces an edge at most."""
+_STEEPEST = math.tan(math.radians(80))
+"""No sensor reads a surface that is turned farther away than 80 degrees."""
+_JUMP = 0.02
+"""Neighbours whose depths differ by more than this share lie on different surfaces, and are not
+interpolated between."""
 
 
-def drawn_triangles(model: ObjectModel) -> Float[Tensor, "n 3 3"]:
-    """Give the faces of a model, or a disc at each point of one that has no faces."""
-    return model.triangles_m if len(model.faces) else surfel_triangles(model)
+def uniform(generator: torch.Generator, low: float, high: float) -> float:
+    """Draw a number of a range."""
+    return low + (high - low) * float(torch.rand((), generator=generator))
 
 
-def surfel_triangles(model: ObjectModel) -> Float[Tensor, "n 3 3"]:
-    """Lay a flat six-cornered disc on each point, across its normal (Pfister et al. 2000).
+def whole(generator: torch.Generator, count: int) -> int:
+    """Draw one of 0 .. count - 1."""
+    return int(torch.randint(count, (), generator=generator))
 
-    Each is as large as its own neighbourhood is sparse: the distance to the third nearest point,
-    but no more than twice the usual one, so that a stray point makes no plate.
+
+def random_rotation(generator: torch.Generator) -> Float[Tensor, "3 3"]:
+    """Draw a rotation, all equally likely: a quaternion of four normal numbers, in float64."""
+    q = torch.randn(4, generator=generator, dtype=torch.float64)
+    w, x, y, z = (q / q.norm()).tolist()
+    rows = [
+        [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
+        [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
+        [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
+    ]
+    return torch.tensor(rows, dtype=torch.float64)
+
+
+def random_levels(height: int, width: int, generator: torch.Generator) -> Depth:
+    """Draw a function whose lower parts are half-planes, ellipses, boxes or convex polygons.
+
+    Cut at a quantile, it occludes exactly the wanted share of anything.
     """
-    points = model.vertices_m.double()
-    distance, _ = KDTree(points.numpy()).query(points.numpy(), k=min(4, len(points)))
-    spacing = torch.from_numpy(distance[:, -1])
-    radius = _REACH * spacing.clamp(max=2 * float(spacing.median())) / 2**0.5
-    normal = model.normals.double()
-    # Any axis that is not along the normal.
-    helper = torch.eye(3, dtype=torch.float64)[normal.abs().argmin(1)]
-    first = torch.nn.functional.normalize(torch.linalg.cross(normal, helper), dim=-1)
-    second = torch.linalg.cross(normal, first)
-    angle = 2 * math.pi * torch.arange(_CORNERS, dtype=torch.float64) / _CORNERS
-    spokes = first[:, None] * angle.cos()[:, None] + second[:, None] * angle.sin()[:, None]
-    corners = points[:, None] + radius[:, None, None] * spokes
-    fan = torch.tensor([[0, i, i + 1] for i in range(1, _CORNERS - 1)])
-    return corners[:, fan].flatten(0, 1).to(model.vertices_m)
+    size = max(height, width)
+    angle, stretch = uniform(generator, 0.0, 2 * math.pi), uniform(generator, 0.3, 1.0)
+    row, column = uniform(generator, 0.0, float(height)), uniform(generator, 0.0, float(width))
+    v = (torch.arange(height)[:, None] - row) / size
+    u = (torch.arange(width)[None] - column) / size
+    along = math.cos(angle) * u + math.sin(angle) * v
+    across = (math.cos(angle) * v - math.sin(angle) * u) * stretch
+    match whole(generator, 4):
+        case 0:
+            return along
+        case 1:
+            return along.square() + across.square()
+        case 2:
+            return torch.maximum(along.abs(), across.abs())
+        case _:  # a convex polygon
+            sides = 3 + whole(generator, 4)
+            turns = torch.rand(sides, generator=generator).cumsum(0)
+            angles = 2 * math.pi * turns / (turns[-1] + uniform(generator, 0.2, 0.8))
+            far = 0.5 + torch.rand(sides, generator=generator)
+            level = torch.full_like(along, -torch.inf)
+            for turn, extent in zip(angles.tolist(), far.tolist(), strict=True):
+                side = (math.cos(turn) * along + math.sin(turn) * across) / extent
+                level = torch.maximum(level, side)
+            return level
+
+
+def occlude(
+    depth_m: Depth, silhouette: Mask, share: float, generator: torch.Generator
+) -> tuple[Depth, Mask]:
+    """Occlude exactly a share of a silhouette by something before it; give what is left of both."""
+    count = round(share * int(silhouette.sum()))
+    levels = random_levels(depth_m.shape[0], depth_m.shape[1], generator)
+    gap_m = uniform(generator, 0.005, 0.15)
+    if count == 0:
+        return depth_m, silhouette
+    is_hidden = levels <= levels[silhouette].kthvalue(count).values
+    # Nearer than all that it occludes.
+    nearest_m = depth_m.masked_fill(~(silhouette & is_hidden), torch.inf).min()
+    occluder_m = (nearest_m - gap_m).clamp(min=0.1 * nearest_m)
+    return torch.where(is_hidden, occluder_m, depth_m), silhouette & ~is_hidden
+
+
+def shift_mask(mask: Mask, rows: int, columns: int) -> Mask:
+    """Shift a mask by so many pixels down and right; what comes in is not of it."""
+    shifted = mask.roll((rows, columns), (0, 1))
+    for axis, steps in enumerate((rows, columns)):
+        if steps:
+            size = mask.shape[axis]
+            start = 0 if steps > 0 else max(0, size + steps)
+            shifted.narrow(axis, start, min(abs(steps), size)).fill_(False)
+    return shifted
+
+
+def measure(
+    depth_m: Depth, focal_px: tuple[float, float], config: SensorConfig, generator: torch.Generator
+) -> Depth:
+    """Measure a clean depth window as a sensor would.
+
+    Args:
+        depth_m: of every pixel of the window; NaN where there is nothing.
+        focal_px: of this window, and of the sensor's full image (which says how fine its disparity
+            is).
+        config: kinds of sensor, and how bad they are.
+        generator: of the chance.
+    """
+    kind: SensorKind = config.kinds[whole(generator, len(config.kinds))]
+    noise, missing = uniform(generator, *config.noise), uniform(generator, *config.missing)
+    if kind == "none":
+        return depth_m
+    steepest = _STEEPEST if kind != "laser" else 2 * _STEEPEST
+    is_lost = _is_steep(depth_m, focal_px[0], steepest)
+    # Half of the missing readings singly, half in patches.
+    height, width = depth_m.shape
+    is_lost |= torch.rand(height, width, generator=generator) < 0.5 * missing
+    coarse = torch.rand(1, 1, 2 + height // 12, 2 + width // 12, generator=generator)
+    patches = F.interpolate(coarse, (height, width), mode="bilinear", align_corners=False)[0, 0]
+    # Their level is met on every fourth row and column: the share is a matter of chance anyway.
+    some = patches[::4, ::4].flatten()
+    if count := round(0.5 * missing * len(some)):
+        is_lost |= patches <= some.kthvalue(count).values
+    correlation_px = config.noise_correlation_px
+    if kind == "active stereo":
+        correlation_px = correlation_px or _STEREO_CORRELATION_PX
+    of_full = focal_px[0] / focal_px[1]
+    width_px = of_full * uniform(generator, *correlation_px) if correlation_px else 0.0
+    white = noise * smooth_noise((depth_m.shape[0], depth_m.shape[1]), width_px, generator)
+    if kind == "structured light":
+        is_lost |= _is_shadowed(depth_m, focal_px[0])
+        # Each pixel reads one that is a pixel or none away: edges are blurred. At the ends of a row
+        # it reads beyond; windows have a margin there.
+        steps, index = torch.tensor([-1, 0, 0, 1]), torch.arange(height * width)
+        moves = (steps[:, None] * width + steps).flatten()
+        index += moves[torch.randint(16, (height * width,), generator=generator)]
+        index = index.clamp_(0, height * width - 1)
+        read_m = depth_m.reshape(-1)[index].view(height, width)
+        # Nguyen, Izadi and Lovell 2012: sigma_z = 0.0012 + 0.0019 (z - 0.4)^2 [m].
+        read_m = read_m + white * (0.0012 + 0.0019 * (read_m - 0.4).square())
+        scale = _STEPS_A_PIXEL * focal_px[1] * _KINECT_BASELINE_M
+        read_m = scale / (scale / read_m).round()
+    elif kind == "active stereo":
+        is_lost |= _is_shadowed(depth_m.flip(1), focal_px[0], _STEREO_BASELINE_M).flip(1)
+        one, other = (_displaced(depth_m, of_full, generator) for _ in range(2))
+        read_m = torch.lerp(one, other, torch.rand(depth_m.shape, generator=generator))
+        read_m = read_m + white * 0.003 * read_m.square()
+        scale = _STEREO_STEPS_A_PIXEL * focal_px[1] * _STEREO_BASELINE_M
+        read_m = scale / (scale / read_m).round()
+    elif kind == "time of flight":
+        # A pixel is mixed with its right or lower neighbour where depth jumps.
+        share = torch.rand(depth_m.shape, generator=generator)
+        right, lower = depth_m.roll(-1, 1), depth_m.roll(-1, 0)
+        right[:, -1], lower[-1] = depth_m[:, -1], depth_m[-1]
+        read_m = depth_m
+        for other in (right, lower):
+            is_jump = (other - read_m).abs() > _JUMP * read_m
+            read_m = torch.where(is_jump, torch.lerp(read_m, other, share), read_m)
+        read_m = read_m + white * (0.001 + 0.002 * read_m.square())
+    else:
+        read_m = depth_m + 0.0005 * white
+    read_m = read_m + uniform(generator, *config.offset_m)
+    return torch.where(is_lost, torch.nan, read_m)
+
+
+def smooth_noise(size: tuple[int, int], width_px: float, generator: torch.Generator) -> Depth:
+    """Draw normal noise of deviation 1 that neighbours share: white noise under a Gaussian.
+
+    ``size`` is rows and columns; a Gaussian of deviation ``width_px`` 0 leaves the noise white.
+    """
+    radius = math.ceil(3 * width_px)
+    white = torch.randn(size[0] + 2 * radius, size[1] + 2 * radius, generator=generator)
+    if radius == 0:
+        return white
+    weights = (-0.5 * (torch.arange(-radius, radius + 1) / width_px).square()).exp()
+    weights = weights / weights.norm()
+    along = F.conv2d(white[None, None], weights.view(1, 1, 1, -1))
+    return F.conv2d(along, weights.view(1, 1, -1, 1))[0, 0]
+
+
+def _is_steep(depth_m: Depth, focal_px: float, steepest: float) -> Mask:
+    """Mark surfaces seen at a grazing angle: one pixel on, the depth changes by far too much."""
+    limit_m = depth_m * (steepest / focal_px)
+    is_steep = torch.zeros_like(depth_m, dtype=torch.bool)
+    across, down = depth_m.diff(dim=1).abs_(), depth_m.diff(dim=0).abs_()
+    # A jump to another surface is steep on one side alone: the flatter side decides.
+    is_steep[:, 1:-1] = torch.fmin(across[:, 1:], across[:, :-1]) > limit_m[:, 1:-1]
+    is_steep[1:-1] |= torch.fmin(down[1:], down[:-1]) > limit_m[1:-1]
+    return is_steep
+
+
+def _is_shadowed(depth_m: Depth, focal_px: float, baseline_m: float = _KINECT_BASELINE_M) -> Mask:
+    """Mark what the projector, beside the camera, cannot light: something nearer is in its way."""
+    column = torch.arange(depth_m.shape[1])
+    lit = column + (focal_px * baseline_m / depth_m).nan_to_num(-torch.inf)
+    # The projector's columns ascend along a row, but for what lies behind an edge.
+    return lit < lit.cummax(1).values - 1.5
+
+
+def _displaced(depth_m: Depth, scale: float, generator: torch.Generator) -> Depth:
+    """Read each pixel ``scale`` times some pixels away, alike its neighbours: edges wander."""
+    height, width = depth_m.shape
+    ways = [1.2 * smooth_noise((height, width), 3.0 * scale, generator) for _ in range(2)]
+    farthest = _STEREO_WINDOW * scale
+    dy, dx = ((scale * way).clamp(-farthest, farthest).round().long() for way in ways)
+    rows = (torch.arange(height)[:, None] + dy).clamp(0, height - 1)
+    columns = (torch.arange(width) + dx).clamp(0, width - 1)
+    return depth_m[rows, columns]
 
 
 MARGIN_PX = 8
 """Around the object: what lies behind it must be seen where a mask is too large."""
-_JUMP = 0.02
-"""Corners of a pixel whose depths differ by more than this share are not interpolated between."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -262,15 +432,8 @@ class Objects:
 
     def sample(self, index: int) -> CloudSample:
         """Make the partial cloud of any index, also beyond the number of samples."""
-        view = self.view(index)
-        given, model = view.input, self.models[index % len(self.models)]
-        points_m = cloud_from_depth(
-            given.depth_m, given.mask, given.K, model.diameter_m, self.cloud
-        )
-        return CloudSample(
-            input=CloudInput(name=given.name, points_m=points_m, object=given.object),
-            truth=view.truth,
-        )
+        model = self.models[index % len(self.models)]
+        return lift_sample(self.view(index), model.diameter_m, self.cloud)
 
     def view(self, index: int) -> ViewSample:
         """Make the window of depth and the mask that a sample is lifted from."""

@@ -92,16 +92,8 @@ class CloudBatch(NamedTuple):
 class TrainingViews:
     """What is learnt from by sample index: synthetic views, real frames, or both.
 
-    Args:
-        models: the objects; class k is ``models[k]``.
-        synthetic: how synthetic views look.
-        frames: real frames, and their share.
-        cloud: points and voxels.
-        seed: of the order of frames and of the choice of points.
-        first_alone: so many synthetic views at the start show the first object.
-
-    Raises:
-        InputError: frames of other objects.
+    ``seed`` is that of the order of frames and of the choice of points; ``first_alone`` synthetic
+    views at the start show the first object.
     """
 
     def __init__(
@@ -165,7 +157,16 @@ class TrainingClouds(TrainingViews):
             else:
                 sample = self._real[frame]
                 angle_rad = 2 * math.pi * float(torch.rand((), generator=generator))
-                sample = _rolled(sample, angle_rad) if self._frames.with_roll else sample
+                if self._frames.with_roll:  # the camera turns: cloud and pose turn with it
+                    c, s = math.cos(angle_rad), math.sin(angle_rad)
+                    turn = torch.tensor([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+                    pose = sample.truth.camera_from_model
+                    turned = Rigid(turn @ pose.R.float(), turn @ pose.t_m.float())
+                    points_m = sample.input.points_m.float() @ turn.mT
+                    sample = CloudSample(
+                        input=dataclasses.replace(sample.input, points_m=points_m),
+                        truth=dataclasses.replace(sample.truth, camera_from_model=turned),
+                    )
             if refusal_of(sample.input.points_m, self.cloud) is None:
                 number = self._class_of[sample.input.object]
                 return voxelised_cloud(sample, number, self.cloud, generator)
@@ -189,19 +190,6 @@ class TrainingClouds(TrainingViews):
             R=torch.stack([c.R for c in clouds]),
             t_m=torch.stack([c.t_m for c in clouds]),
         )
-
-
-def _rolled(sample: CloudSample, angle_rad: float) -> CloudSample:
-    """Turn the camera about its optical axis: cloud and pose turn with it."""
-    cosine, sine = math.cos(angle_rad), math.sin(angle_rad)
-    turn = torch.tensor([[cosine, -sine, 0.0], [sine, cosine, 0.0], [0.0, 0.0, 1.0]])
-    pose = sample.truth.camera_from_model
-    turned = Rigid(turn @ pose.R.float(), turn @ pose.t_m.float())
-    points_m = sample.input.points_m.float() @ turn.mT
-    return CloudSample(
-        input=dataclasses.replace(sample.input, points_m=points_m),
-        truth=dataclasses.replace(sample.truth, camera_from_model=turned),
-    )
 
 
 def voxelised_cloud(
@@ -282,12 +270,6 @@ class HeldOut:
 
     Each is a rendering of its own at the full resolution; so many of each object are at each
     occlusion. One that shows too few points to be posed counts as a failure.
-
-    Args:
-        models: the objects; class k is ``models[k]``.
-        synthetic: how the views of the training look.
-        cloud: points and voxels.
-        config: how many.
     """
 
     def __init__(

@@ -2,9 +2,9 @@
 
 import dataclasses
 from dataclasses import dataclass, field
-from typing import ClassVar
+from typing import Annotated, ClassVar
 
-from depthpose.core.config import check_settings
+from depthpose.core.config import ASCENDING, Settings
 from depthpose.core.errors import InputError, refuse_unknown
 from depthpose.core.loop import AdamConfig, LoopConfig
 from depthpose.core.units import Unit
@@ -14,7 +14,6 @@ from depthpose.pose.config import (
     CloudConfig,
     MeshConfig,
     ObjectsConfig,
-    refuse_reversed,
 )
 from depthpose.pose.losses import POINT_LOSSES
 from depthpose.pose.network import ResUNetConfig
@@ -22,7 +21,7 @@ from depthpose.pose.segmentation import SegmentationConfig
 
 
 @dataclass(frozen=True, kw_only=True)
-class ModelsConfig:
+class ModelsConfig(Settings):
     """The objects that are learnt: CAD files, or models of a data set, or parts of our own."""
 
     cad: tuple[str, ...] = ()
@@ -46,7 +45,7 @@ class ModelsConfig:
     with_found_symmetries: bool = False
     """Look for symmetries of models that declare none, and count the copies as right."""
 
-    symmetry_tolerance: float = 0.02
+    symmetry_tolerance: Annotated[float, "(0, 1)"] = 0.02
     """How far, in diameters, a turned copy may lie off. Scans, rough and dented, take more."""
 
     licence: str = "not stated; that of the models binds"
@@ -55,12 +54,9 @@ class ModelsConfig:
     terms: str = ""
     """Said whenever the weights are loaded; for licences that bind the user."""
 
-    def __post_init__(self) -> None:
-        check_settings(self, symmetry_tolerance="(0, 1)")
-
 
 @dataclass(frozen=True, kw_only=True)
-class FramesConfig:
+class FramesConfig(Settings):
     """Annotated real frames among the synthetic views."""
 
     folder: str = ""
@@ -69,7 +65,7 @@ class FramesConfig:
     split: str = "train"
     """Which part of it."""
 
-    share: float = 1.0
+    share: Annotated[float, "(0, 1]"] = 1.0
     """Of the samples; the others are synthetic."""
 
     with_roll: bool = True
@@ -79,30 +75,30 @@ class FramesConfig:
     def __post_init__(self) -> None:
         if not self.folder:
             raise InputError("frames has no folder; name a data set, or leave frames out")
-        check_settings(self, share="(0, 1]")
+        super().__post_init__()
 
 
 @dataclass(frozen=True, kw_only=True)
-class HeldOutConfig:
+class HeldOutConfig(Settings):
     """Synthetic views of the validation; no training uses one."""
 
-    number: int = 25
+    number: Annotated[int, "[1, inf)"] = 25
     """Of each object at each occlusion."""
 
-    occlusions: tuple[float, ...] = (0.0, 0.3)
+    occlusions: Annotated[tuple[float, ...], OCCLUSIONS] = (0.0, 0.3)
     """Occluded shares of the silhouette."""
 
     with_ransac: bool = True
     """Vote by RANSAC too."""
 
     def __post_init__(self) -> None:
-        check_settings(self, number="[1, inf)", occlusions=OCCLUSIONS)
+        super().__post_init__()
         if not self.occlusions:
             raise InputError("held_out.occlusions is (); nothing would be measured; take (0, 0.3)")
 
 
 @dataclass(frozen=True, kw_only=True)
-class ViewsTraining:
+class ViewsTraining(Settings):
     """What the trainings on views of known objects have in common."""
 
     models: ModelsConfig = ModelsConfig()
@@ -134,7 +130,7 @@ class PoseTraining(ViewsTraining):
     RETIRED: ClassVar[frozenset[str]] = frozenset({"calibration", "confidence_weight"})
     """Settings of before: no risk is calibrated any more, and no confidence learnt."""
 
-    first_alone: int = 0
+    first_alone: Annotated[int, "[0, inf)"] = 0
     """Synthetic views at the start that all show the first object. Several objects together take
     long to get beyond votes for the middle of the cloud; one alone does not, the others follow."""
 
@@ -159,7 +155,7 @@ class PoseTraining(ViewsTraining):
 
     def __post_init__(self) -> None:
         refuse_unknown("loss", self.loss, POINT_LOSSES)
-        check_settings(self, first_alone="[0, inf)")
+        super().__post_init__()
 
 
 def own_part(start: str) -> PoseTraining:
@@ -196,7 +192,7 @@ class DepthImageTraining(ViewsTraining):
     network: DepthImageConfig = DepthImageConfig()
     """The network; its classes follow from the models."""
 
-    surface_points: int = 500
+    surface_points: Annotated[int, "[3, inf)"] = 500
     """Points of the model whose distances are the loss."""
 
     adam: AdamConfig = AdamConfig(learning_rate=1e-3, schedule="cosine", warmup_steps=50)
@@ -206,9 +202,6 @@ class DepthImageTraining(ViewsTraining):
         steps=10000, batch_size=16, clip_norm=1.0, ema_decay=0.999, save_every_steps=500
     )
     """How long."""
-
-    def __post_init__(self) -> None:
-        check_settings(self, surface_points="[3, inf)")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -232,35 +225,34 @@ class ImagesConfig:
 
 
 @dataclass(frozen=True, kw_only=True)
-class ImageAugmentConfig:
+class ImageAugmentConfig(Settings):
     """Random changes of an image and its masks."""
 
     crop_px: tuple[int, int] = (384, 512)
     """Rows and columns that are seen of an image at the network's size; multiples of 32."""
 
-    scale: tuple[float, float] = (0.75, 1.5)
+    scale: Annotated[tuple[float, float], "(0, 10]", ASCENDING] = (0.75, 1.5)
     """Times the network's own size."""
 
-    flip_share: float = 0.0
+    flip_share: Annotated[float, "[0, 1]"] = 0.0
     """Share of mirrored images. A mirrored object is another object, unless it is mirror-symmetric;
     for segmentation alone it is one more appearance."""
 
-    jitter: float = 0.3
+    jitter: Annotated[float, "[0, 1)"] = 0.3
     """Brightness, contrast and saturation change by up to this share, each color by a third of
     it."""
 
     def __post_init__(self) -> None:
-        check_settings(self, scale="(0, 10]", flip_share="[0, 1]", jitter="[0, 1)")
+        super().__post_init__()
         if any(side < 32 or side % 32 for side in self.crop_px):
             raise InputError(
                 f"crop_px is {self.crop_px}, but the coarsest feature is 32 pixels wide; take "
                 "multiples of 32"
             )
-        refuse_reversed(self, "scale")
 
 
 @dataclass(frozen=True, kw_only=True)
-class SegmentationTraining:
+class SegmentationTraining(Settings):
     """FCN learns the masks of known objects."""
 
     images: ImagesConfig = ImagesConfig()
@@ -278,7 +270,7 @@ class SegmentationTraining:
     augment: ImageAugmentConfig = ImageAugmentConfig()
     """Random changes."""
 
-    object_weight: float = 3.0
+    object_weight: Annotated[float, "(0, inf)"] = 3.0
     """A pixel of an object counts so many times a pixel of the background."""
 
     adam: AdamConfig = AdamConfig(learning_rate=1e-3, schedule="cosine", warmup_steps=20)
@@ -289,6 +281,3 @@ class SegmentationTraining:
 
     with_half: bool = False
     """Write the weights in 16 bits."""
-
-    def __post_init__(self) -> None:
-        check_settings(self, object_weight="(0, inf)")

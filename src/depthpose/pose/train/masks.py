@@ -26,7 +26,6 @@ from depthpose.core.loop import (
     write_card,
 )
 from depthpose.core.run import find_rank
-from depthpose.pose.augment import uniform, whole
 from depthpose.pose.datasets import Instance, open_bop
 from depthpose.pose.datasets.dataset import read_instance_mask
 from depthpose.pose.datasets.layouts import models_folder, object_name, read_models_info
@@ -42,6 +41,7 @@ from depthpose.pose.segmentation import (
     read_encoder_state,
     write_segmentation,
 )
+from depthpose.pose.synthetic.views import uniform, whole
 from depthpose.pose.train.config import ImageAugmentConfig, ImagesConfig, SegmentationTraining
 from depthpose.pose.train.poses import claim_run, with_origin
 

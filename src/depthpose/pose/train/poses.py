@@ -344,11 +344,7 @@ def train_pose(config: PoseTraining | DepthImageTraining, run: Run) -> Path:
 
 
 def _start_from(network: AnyNetwork, start: str, samples: TrainingViews) -> None:
-    """Copy weights; of other objects, all but the last layer, except of a depth image's.
-
-    Written weights are folded: they have no norms, but biases. Batch norm takes both up. New
-    input features of a voxel get weights of zero.
-    """
+    """Copy weights; of other objects, all but the last layer, except of a depth image's."""
     found = read_pose_network(find_weights(start))
     if isinstance(network, DepthImageNet):
         if found.config != network.config:
@@ -360,7 +356,7 @@ def _start_from(network: AnyNetwork, start: str, samples: TrainingViews) -> None
         return
     if isinstance(found, ResUNet) and isinstance(network, ResUNet):
         more = network.config.inputs - found.config.inputs
-        if more > 0:
+        if more > 0:  # new features of a voxel get weights of zero
             state, first = found.state_dict(), "down.0.conv.weight"
             silent = state[first].new_zeros(len(state[first]), more, state[first].shape[2])
             found = ResUNet(dataclasses.replace(found.config, inputs=network.config.inputs))
@@ -375,6 +371,7 @@ def _start_from(network: AnyNetwork, start: str, samples: TrainingViews) -> None
                 f"{start}: was trained with {name} = {given.get(name)!r}, but the config says "
                 f"{value!r}. Give the config the weights' own."
             )
+    # Written weights are folded: they have no norms, but biases; batch norm takes both up.
     if has_norms and isinstance(network, ResUNet) and isinstance(found, ResUNet):
         assert isinstance(samples, TrainingClouds)
         batch = samples.collate([samples[index] for index in range(_STATISTICS_CLOUDS)])

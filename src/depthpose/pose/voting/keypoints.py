@@ -4,7 +4,7 @@ from dataclasses import replace
 from typing import NamedTuple
 
 import torch
-from jaxtyping import Bool, Float, Float64, Int64
+from jaxtyping import Bool, Float, Float64
 from torch import Tensor
 
 from depthpose.core.errors import InputError
@@ -86,7 +86,7 @@ def meet_prepared(lines: Lines, centre_m: Float[Tensor, "*batch 1 3"], refinemen
     local, n, w = lines
     all_count = torch.ones_like(w[..., 0])
     if n.ndim == 3 and n.dtype == torch.float64 and serves(*lines):
-        from depthpose.pose.compiled.vote import met
+        from depthpose.pose.compiled.poses import met
 
         p, covariance, condition = met(local, n, w, refinements, _NEAREST)
         return Vote(keypoints_m=p + centre_m, covariance_m2=covariance, condition=condition,
@@ -184,25 +184,7 @@ def vote_ransac(
     if int(counts.min()) < w.shape[-1]:
         voters = (w > 0).to(torch.uint8).argsort(dim=-1, descending=True, stable=True)
         first, second = voters.gather(-1, first), voters.gather(-1, second)
-    tried, is_crossing = _cross_lines(lines, first, second)
-    inlier_test = InlierTest(lines, config)
-    # Parallel pairs propose nothing, yet score 0 so that one always wins.
-    best = torch.where(is_crossing, inlier_test.score(tried), 0).argmax(-1)[..., None, None]
-    keypoint = tried.gather(-2, best.expand(*best.shape[:-1], 3))
-    # Once toward what the best hypothesis gathered, then with those that agree on that.
-    used, _ = _inliers(lines, inlier_test, keypoint)
-    again = meet_prepared(
-        lines._replace(weights=used), torch.zeros_like(centre_m), min(config.refinements, 1)
-    )
-    used, share = _inliers(lines, inlier_test, again.keypoints_m[..., None, :])
-    vote = meet_prepared(lines._replace(weights=used), centre_m, config.refinements)
-    return replace(vote, inlier_share=share)
-
-
-def _cross_lines(
-    lines: Lines, first: Int64[Tensor, "*batch k h"], second: Int64[Tensor, "*batch k h"]
-) -> tuple[Float[Tensor, "*batch k h 3"], Bool[Tensor, "*batch k h"]]:
-    """Give the middle of the common perpendicular of each pair, and whether they cross."""
+    # The middle of the common perpendicular of each pair, where they cross.
     wide = (*first.shape[:-1], 3, first.shape[-1])
     x1, x2, n1, n2 = (
         values.expand_as(lines.directions).gather(-1, index[..., None, :].expand(wide))
@@ -215,9 +197,22 @@ def _cross_lines(
     sine_squared = 1 - cosine * cosine
     is_crossing = sine_squared > _PARALLEL
     scale = torch.where(is_crossing, sine_squared, 1)
+    is_crossing = is_crossing.squeeze(-2)
     on_first = x1 + n1 * ((cosine * e - d) / scale)
     on_second = x2 + n2 * ((e - cosine * d) / scale)
-    return ((on_first + on_second) / 2).mT, is_crossing.squeeze(-2)
+    tried = ((on_first + on_second) / 2).mT
+    inlier_test = InlierTest(lines, config)
+    # Parallel pairs propose nothing, yet score 0 so that one always wins.
+    best = torch.where(is_crossing, inlier_test.score(tried), 0).argmax(-1)[..., None, None]
+    keypoint = tried.gather(-2, best.expand(*best.shape[:-1], 3))
+    # Once toward what the best hypothesis gathered, then with those that agree on that.
+    used, _ = _inliers(lines, inlier_test, keypoint)
+    again = meet_prepared(
+        lines._replace(weights=used), torch.zeros_like(centre_m), min(config.refinements, 1)
+    )
+    used, share = _inliers(lines, inlier_test, again.keypoints_m[..., None, :])
+    vote = meet_prepared(lines._replace(weights=used), centre_m, config.refinements)
+    return replace(vote, inlier_share=share)
 
 
 class InlierTest:
@@ -336,7 +331,7 @@ def fit_pose(
     most = 100 * trace.median(-1, keepdim=True).values.clamp(min=1e-300)
     pose = fit_rigid(model, found, trace.clamp(max=most))
     if serves(pose.R, model, found, information):
-        from depthpose.pose.compiled.vote import fitted
+        from depthpose.pose.compiled.poses import fitted
 
         pose, H = fitted(pose, model, found, information, _STEPS)
     else:
