@@ -9,7 +9,10 @@ export DEPTHPOSE_DATA ?= $(wildcard $(CURDIR)/../shared/data)
 
 # Tests side by side, one thread each: threads of torch in every worker would fight for cores. Who
 # has none left takes some of another's; the slow ones share what a file sets up, and stay together.
-PYTEST := OMP_NUM_THREADS=1 $(BIN)/python -m pytest --numprocesses auto --maxprocesses 8
+# Bytecode is kept even where containers say otherwise: a worker rewrites 300 files of tests for 12 s
+# of a core, and every program that a test starts would compile the package again.
+PYTEST := PYTHONDONTWRITEBYTECODE= OMP_NUM_THREADS=1 $(BIN)/python -m pytest \
+	--numprocesses auto --maxprocesses 8
 # Shapes and types of every call, checked while tests run: slower, so only with TYPES=1, as .ci/run
 # has it for the quick tests. Most slow ones start commands, and in those processes nothing is checked.
 TYPES ?=

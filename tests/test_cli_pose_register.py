@@ -2,6 +2,7 @@
 
 import csv
 import json
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -15,8 +16,27 @@ from depthpose.core.files import Cloud, read_cloud, write_cloud, write_depth_png
 from depthpose.pose.config import ObjectsConfig
 from depthpose.pose.datasets import write_bop_models, write_bop_scene
 from depthpose.pose.estimator.inputs import rigid_input
+from depthpose.pose.mesh import SymmetryProposal, symmetry
 from depthpose.pose.metrics import add_m
 from depthpose.pose.synthetic import Objects, make_part
+from depthpose.pose.types import ObjectModel
+
+
+@pytest.fixture(scope="module", autouse=True)
+def searched_once() -> Iterator[None]:
+    """Search each shape here for symmetries once: that takes most of the time of a command."""
+    found: dict[tuple[bytes, bytes, float], list[SymmetryProposal]] = {}
+    search = symmetry.propose_symmetries
+
+    def once(model: ObjectModel, tolerance: float = 0.02) -> list[SymmetryProposal]:
+        key = (model.vertices_m.numpy().tobytes(), model.faces.numpy().tobytes(), tolerance)
+        if key not in found:
+            found[key] = search(model, tolerance)
+        return found[key]
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(symmetry, "propose_symmetries", once)
+        yield
 
 
 @pytest.fixture

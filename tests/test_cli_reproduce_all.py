@@ -70,6 +70,7 @@ def methods(table: Path) -> list[str]:
     return [row["method"] for row in rows_of(table) if row.get("source", "ours") == "ours"]
 
 
+@pytest.mark.slow
 def test_kitti_to_tables_of_chapter_2(
     configs: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

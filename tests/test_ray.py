@@ -215,10 +215,10 @@ def test_an_address_where_nothing_answers_is_refused(home: Path, tmp_path: Path)
     assert "--address 127.0.0.1:1: no Ray cluster answers there" in made.stderr
 
 
-def test_memory_stays_bounded_with_a_hundred_thousand_inputs(tmp_path: Path) -> None:
+def test_memory_stays_bounded_with_many_thousand_inputs(tmp_path: Path) -> None:
     pytest.importorskip("resource", reason="a system that says no peak of memory")
     peaks: dict[int, tuple[int, int]] = {}
-    for total in (1_000, 100_000):
+    for total in (1_000, 31_000):
         home = tmp_path / str(total)
         home.mkdir()
         words = [sys.executable, "-m", "tests.core.engine.many", str(total), str(home)]
@@ -229,5 +229,5 @@ def test_memory_stays_bounded_with_a_hundred_thousand_inputs(tmp_path: Path) -> 
         workers_kb = max(int(files["peak_kb"]) for files in found.values())
         peaks[total] = (said["command_kb"], workers_kb)
     (few, worker_few), (many, worker_many) = peaks.values()
-    assert many - few < 200_000, "2 kB an input in the command at most"
+    assert many - few < 60_000, "2 kB an input in the command at most"
     assert worker_many - worker_few < 100_000, "a worker holds its block alone"

@@ -63,7 +63,7 @@ def test_a_flip_without_a_swap_would_break_the_pair() -> None:
 
 
 def test_flip_and_swap_of_a_street_keeps_left_and_right_consistent() -> None:
-    street = make_street(0.4)
+    street = make_street(0.2)
     assert street.input.right is not None
     assert street.truth.disparity_px is not None
     unknown = torch.full_like(street.truth.disparity_px, torch.nan)

@@ -3,6 +3,8 @@ import json
 import re
 import subprocess
 import sys
+from collections.abc import Iterator
+from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
 
@@ -10,6 +12,7 @@ import numpy as np
 import pytest
 import torch
 from tests.depth.constant_selection import CONFIG, of_all_kinds
+from tests.depth.short_encoder import short_encoder
 from tests.depth.test_stereo_light import SMALL
 
 from depthpose.cli import main
@@ -74,9 +77,17 @@ def of_streets() -> SelectionGenerator:
     return generator
 
 
+@pytest.fixture(scope="module", params=["short", pytest.param("whole", marks=pytest.mark.slow)])
+def encoder(request: pytest.FixtureRequest) -> Iterator[str]:
+    """Which encoder the networks have: a short one, for the quick tests, or the whole one."""
+    with short_encoder() if request.param == "short" else nullcontext():
+        yield request.param
+
+
 @pytest.fixture(scope="module")
-def selection_network() -> Any:  # noqa: ANN401 - an ONNX model
+def selection_network(encoder: str) -> Any:  # noqa: ANN401 - an ONNX model
     """The network of :func:`of_streets`, exported once: that is what takes the time."""
+    assert encoder
     module, multiple = DynamicSelection(of_streets()).eval(), CONFIG.side_multiple_px
     return network_model(module, [torch.rand(2, 3, 2 * multiple, 3 * multiple)], multiple)
 
@@ -126,7 +137,8 @@ def test_the_gathered_volume_is_the_concatenation_volume(width: int) -> None:
 @pytest.mark.slow
 def test_the_graph_of_the_light_network_takes_any_size() -> None:
     torch.manual_seed(0)
-    light = LightStereo(dataclasses.replace(SMALL, encoder_width=0.1)).eval()
+    with short_encoder():
+        light = LightStereo(dataclasses.replace(SMALL, encoder_width=0.1)).eval()
     assert light.enlargement.agreement is not None
     torch.nn.init.normal_(light.enlargement.agreement.weight)
     assert light.refinement is not None
@@ -219,6 +231,7 @@ def test_an_answer_of_its_own_is_exported_without_a_matcher(selection: Path) -> 
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("encoder", ["short"], indirect=True)
 def test_the_matcher_is_asked_where_the_weights_say_so(selection: Path) -> None:
     """Joined: the matcher looks at the drawn view, and both depths become one."""
     matcher = calm_matcher()

@@ -99,8 +99,9 @@ def test_a_pair_that_cannot_be_read_stops_no_other(keep: int, tmp_path: Path) ->
 
 
 def test_the_command_says_what_it_did_and_what_failed(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    monkeypatch.setattr(FakestereoNet, "load", lambda *_, **__: brightness_matcher())
     folder, out = write_pairs(tmp_path / "pairs", (0.15, 0.15)), tmp_path / "out"
     damaged = folder / "left/00.png"
     whole = damaged.read_bytes()

@@ -187,7 +187,8 @@ def test_matcher_config_refuses_nonsense(settings: dict, text: str) -> None:
 
 
 @pytest.mark.data
-@pytest.mark.parametrize("with_matcher", [True, pytest.param(False, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("with_matcher", [True, False])
 def test_published_weights_give_the_published_disparity(real: Path, with_matcher: bool) -> None:
     weights = real / "reference/psmnet/published_kitti2015.tar"
     with np.load(real / "reference/psmnet/kitti2015_000046_10.npz") as reference:

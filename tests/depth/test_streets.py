@@ -63,8 +63,8 @@ def test_a_frame_is_a_function_of_seed_and_index() -> None:
 def test_clutter_takes_its_share_and_leaves_the_streets_as_they_are() -> None:
     config = StreetsConfig(scale=0.05)
     half = replace(config, clutter_share=0.5)
-    streets = [bool(draw_street(half, i).is_road.any()) for i in range(10)]
-    assert 2 <= sum(streets) <= 8
+    streets = [bool(draw_street(half, i).is_road.any()) for i in range(6)]
+    assert 1 <= sum(streets) <= 5
     first = streets.index(True)
     assert torch.equal(draw_street(half, first).left, draw_street(config, first).left)
 
@@ -97,7 +97,7 @@ def test_streets_vary_in_what_stands_there_and_how(monkeypatch: pytest.MonkeyPat
     }.items():
         for name in names:
             counted(module, name)
-    scenes = [make_scene((0, index)) for index in range(24)]
+    scenes = [make_scene((0, index)) for index in range(10)]
     assert len({scene.place for scene in scenes}) >= 3
     assert sum(kind.startswith("vehicle") for kind in drawn) >= 3
     for what in ("walker", "rider", "tree", "bush", "hedge", "add_house", "lamp", "sign", "fence"):
