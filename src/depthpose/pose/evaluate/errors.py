@@ -338,20 +338,17 @@ def convention_advice(
         changed: list[Prediction] = []
         for one in moved:
             pose = one.estimate.camera_from_model
-            if pose is None or not (one.place in places or one.estimate.name in names):
-                continue
-            pose = _TURNS[turn](Rigid(pose.R.double(), pose.t_m.double()))
-            pose = Rigid(pose.R, pose.t_m * scale)
-            estimate = replace(one.estimate, camera_from_model=pose)
-            changed.append(replace(one, estimate=estimate))
-        found = match(some, changed, dataset.objects)
-        right = 0
-        for instance in some:
-            pose = found[instance.name].camera_from_model if instance.name in found else None
-            if pose is not None:
-                context = contexts[instance.object_id]
-                error_m = METRICS["error_m"].measure(pose, instance, context)
-                right += float(error_m) < limit * context.diameter_m
+            if pose is not None and (one.place in places or one.estimate.name in names):
+                pose = _TURNS[turn](Rigid(pose.R.double(), pose.t_m.double()))
+                pose = Rigid(pose.R, pose.t_m * scale)
+                estimate = replace(one.estimate, camera_from_model=pose)
+                changed.append(replace(one, estimate=estimate))
+        found, right = match(some, changed, dataset.objects), 0
+        for instance in (one for one in some if one.name in found):
+            pose, context = found[instance.name].camera_from_model, contexts[instance.object_id]
+            assert pose is not None
+            error_m = METRICS["error_m"].measure(pose, instance, context)
+            right += float(error_m) < limit * context.diameter_m
         return right, len(some)
 
     now, tried = count_right()
