@@ -294,7 +294,7 @@ def test_a_side_with_more_images_is_refused(
     assert "no partner of the same name or number is there for 'b'" in capsys.readouterr().err
 
 
-@pytest.mark.parametrize("size", ["1 parsec", "-1GB", "GB", ""])
+@pytest.mark.parametrize("size", ["1 parsec", "-1GB", "GB", "", "0", "0.0GB"])
 def test_a_size_that_is_none_is_refused(
     size: str, pair_folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
