@@ -291,7 +291,7 @@ def test_a_side_with_more_images_is_refused(
     assert "no partner of the same name or number is there for 'b'" in capsys.readouterr().err
 
 
-@pytest.mark.parametrize("size", ["1 parsec", "-1GB", "GB", ""])
+@pytest.mark.parametrize("size", ["1 parsec", "-1GB", "GB", "", "0", "0.0GB"])
 def test_a_size_that_is_none_is_refused(
     size: str, pair_folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -325,6 +325,27 @@ def test_a_path_that_leads_nowhere_is_refused_before_torch_is_loaded(
     done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
     assert done.returncode == 2, done.stderr
     assert said in done.stderr
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="there is no limit of address space")
+@pytest.mark.parametrize("kib", [100_000, 450_000, 740_000])
+def test_a_limit_below_what_the_libraries_take_is_refused_before_they_end_the_process(
+    kib: int, tmp_path: Path
+) -> None:
+    """At 450,000 glibc aborts, at 500,000 OpenBLAS ends the process: neither names a remedy."""
+    limit = f"resource.setrlimit(resource.RLIMIT_AS, ({kib * 1024},) * 2)"
+    code = f"import resource, sys; from depthpose.cli import main; {limit}; sys.exit(main())"
+    words = ["depth", "match", "l.png", "r.png", "--camera", "c.json", "--out", "out"]
+    for name in words[2:4]:
+        write_image(tmp_path / name, torch.zeros(3, 8, 8))
+    (tmp_path / "c.json").write_text("{}")
+    command = [sys.executable, "-c", code, *words]
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert done.returncode == 2
+    assert done.stderr == (
+        f"depthpose: error: the limit of {kib} KiB (ulimit -v) is below the 750000 that the "
+        "libraries alone take; raise it\n"
+    )
 
 
 @pytest.mark.parametrize(

@@ -89,6 +89,28 @@ def test_a_mesh_in_millimetres_beside_a_cloud_in_metres(
     assert "is it in mm?" in out
 
 
+@pytest.mark.parametrize(
+    ("scale", "mesh", "cloud"),
+    [
+        (1.0, "metres (--unit m)", "metres"),
+        (100.0, "metres, cm or mm; measure it", "centimetres"),
+        (1000.0, "millimetres (--unit mm)", "millimetres"),
+    ],
+)
+def test_centimetres_are_a_unit_too(
+    scale: float, mesh: str, cloud: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A tetrahedron 0.14 m across, 0.7 m away."""
+    corners = scale * np.array([[0, 0, 0.7], [0.1, 0, 0.7], [0, 0.1, 0.7], [0, 0, 0.75]])
+    rows = [" ".join(map(str, row)) for row in corners]
+    faces = "f 1 3 2\nf 1 2 4\nf 2 3 4\nf 1 4 3\n"
+    (tmp_path / "part.obj").write_text("".join(f"v {row}\n" for row in rows) + faces)
+    (tmp_path / "cloud.xyz").write_text("\n".join(rows))
+    _, out = said(capsys, tmp_path / "part.obj", tmp_path / "cloud.xyz")
+    assert f"across: {mesh}\n" in out
+    assert f"from the origin: {cloud}\n" in out
+
+
 def test_each_oddity_is_said_with_its_file(
     things: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

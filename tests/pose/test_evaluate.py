@@ -316,8 +316,31 @@ def test_poses_by_another_convention_are_named(
         return
     assert found.rows[-1].success == 0
     assert found.advice is not None
-    assert found.advice.startswith("0 of 6 answers that were tried are right, but 6 were if")
+    assert found.advice.startswith("0 of 6 answers that were tried are right, but 6 of 6 were if")
     assert said in found.advice
+
+
+@pytest.mark.parametrize(
+    ("step", "said"),
+    [
+        ((0, 1, 0), "image numbers were one smaller (are yours counted from 1?)"),
+        ((0, -1, 0), "image numbers were one larger (from 0?)"),
+    ],
+)
+def test_poses_numbered_from_another_first_are_named(
+    synthetic: BopDataset, step: tuple[int, int, int], said: str
+) -> None:
+    poses = [
+        replace(
+            one,
+            estimate=replace(one.estimate, name=f"row {k}"),
+            place=Place(*(a + b for a, b in zip(one.place or (), step, strict=True))),
+        )
+        for k, one in enumerate(predictions_of(synthetic, lambda i: i.camera_from_model))
+    ]
+    found = evaluate(synthetic, poses, EvaluationConfig(with_vsd=False))
+    assert found.advice is not None
+    assert found.advice.endswith(f"right, but 6 of 6 were if {said}")
 
 
 def test_a_csv_of_a_header_alone_is_refused(tmp_path: Path) -> None:

@@ -92,6 +92,8 @@ _EXIT_CODES = """exit codes:
   130  interrupted"""
 
 
+_LEAST_KIB = 750_000
+"""Of address space; where torch and SciPy find less, they end the process without a reason."""
 _OF_THE_DISK = (errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EFBIG)
 """Errors of a disk where a library or a temporary file writes; our own writers catch them."""
 _OF_A_PATH = (errno.EACCES, errno.EPERM, errno.ENAMETOOLONG, errno.ELOOP, errno.EISDIR,
@@ -230,6 +232,12 @@ def _run(words: list[str]) -> int:
         return int(stop.code or 0)
     arguments.refuse_ignored_options(name, rest)
     arguments.refuse_missing(command, given.arguments)
+    if sys.platform != "win32":
+        import resource
+
+        if 0 <= (limit := resource.getrlimit(resource.RLIMIT_AS)[0]) < _LEAST_KIB * 1024:
+            raise InputError(f"the limit of {limit // 1024} KiB (ulimit -v) is below the "
+                             f"{_LEAST_KIB} that the libraries alone take; raise it")  # fmt: skip
     code = command(*given.args, **given.kwargs)
     sys.stdout.flush()
     return code

@@ -211,6 +211,6 @@ def parse_bytes(text: str | None) -> int | None:
     if text is None:
         return None
     size = re.fullmatch(r"\s*(\d+(?:\.\d+)?)\s*([KMGT]?)(i?)B?\s*", text, re.IGNORECASE)
-    if size is None or (size[3] and not size[2]):
+    if size is None or (size[3] and not size[2]) or not float(size[1]):
         raise InputError(f"--max-memory {text!r}: not a size. Write, say, 1GB, 800MB or 1.5GiB.")
     return int(float(size[1]) * (1024 if size[3] else 1000) ** _POWERS[size[2].upper()])

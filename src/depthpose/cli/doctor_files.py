@@ -21,8 +21,9 @@ Size = tuple[int, int]
 
 _UNITS_M = {"most sensors": 0.001, "TUM RGB-D": 0.0002, "KITTI": 1 / 256}
 _NEAR_M, _FAR_M = 0.05, 100.0
-_ONLY_MM, _ONLY_M = 20.0, 2.0
-"""A part is no longer than 20 m, a scan no farther; and no part is shorter than 2 mm."""
+_ONLY_MM, _ONLY_M, _LEAST_MM = 20.0, 2.0, 150.0
+"""A part is no longer than 20 m, a scan no farther; no part is shorter than 2 mm, and no depth
+camera sees what is nearer than 15 cm."""
 _EIGHT_BIT = 255
 _FEW_UNKNOWN, _ROUGH = 0.02, 0.012
 """Of depth, pixels without a reading (sensors: 6 % and more) and the mean step between neighbours
@@ -94,7 +95,7 @@ def _read(path: Path, size: Size | None) -> FileFacts:
         if not len(faces):
             return _of_points(path, points)
         diameter = exact_diameter(points)
-        unit = "metres (--unit m)" if diameter < _ONLY_M else "metres or millimetres; measure it"
+        unit = "metres (--unit m)" if diameter < _ONLY_M else "metres, cm or mm; measure it"
         unit = "millimetres (--unit mm)" if diameter > _ONLY_MM else unit
         what = f"mesh of {len(points)} points and {len(faces)} faces, {diameter:.4g} across: {unit}"
         return FileFacts(path=path, what=what, model=points)
@@ -214,7 +215,7 @@ def _of_map(path: Path) -> FileFacts:
 
 def _of_points(path: Path, points: Tensor) -> FileFacts:
     away = float(points.median(0).values.norm())
-    unit = "metres" if away < _ONLY_M else "millimetres" if away > _ONLY_MM else "metres or mm"
+    unit = "metres" if away < _ONLY_MM else "centimetres" if away < _LEAST_MM else "millimetres"
     what = f"{len(points)} points, {away:.4g} from the origin: {unit}"
     odd = [said] if (said := frame_advice(points)) is not None else []
     if away < float((points - points.median(0).values).norm(dim=-1).median()):

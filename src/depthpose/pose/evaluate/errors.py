@@ -289,8 +289,8 @@ def _is_own(prediction: Prediction, places: Mapping[str, Place]) -> bool:
 
 _TRIED = 40
 """Instances that each change is tried on."""
-_MANY, _TIMES = 0.2, 3
-"""A change is said where so many are right by it, and so many times more than without."""
+_MORE = 0.2
+"""A change is said where so large a share more is right by it."""
 _SCALES = {
     1.0: "",
     1000.0: "t were 1000 times larger (is it in metres? BOP's csv has millimetres)",
@@ -307,6 +307,12 @@ _TURNS = {
 }
 _FLIP = torch.diag(torch.tensor([1.0, -1.0, -1.0]))
 
+_STEPS = {
+    f"{what} numbers were one {words}": tuple(step * (k == place) for k in range(3))
+    for words, step in (("smaller (are yours counted from 1?)", -1), ("larger (from 0?)", 1))
+    for place, what in enumerate(("image", "object"), 1)
+}
+
 
 def convention_advice(
     dataset: BopDataset,
@@ -316,39 +322,44 @@ def convention_advice(
 ) -> str | None:
     """Say by which change of all predictions many more were right; None where by none."""
     answers = [p for p in predictions if p.estimate.is_posed]
-    there = match(dataset.instances, answers, dataset.objects)
-    seen = [instance for instance in dataset.instances if instance.name in there]
-    some = seen[:: max(1, len(seen) // _TRIED)][:_TRIED]
-    places, names = {place_of(one) for one in some}, {one.name for one in some}
-    answers = [p for p in answers if p.place in places or p.estimate.name in names]
 
-    def count_right(scale: float, turn: str) -> int:
+    def count_right(
+        scale: float = 1.0, turn: str = "", step: Sequence[int] = (0, 0, 0)
+    ) -> tuple[int, int]:
+        moved = [
+            one if one.place is None else replace(one, place=Place(*np.add(one.place, step)))
+            for one in answers
+        ]
+        there = match(dataset.instances, moved, dataset.objects)
+        seen = [instance for instance in dataset.instances if instance.name in there]
+        some = seen[:: max(1, len(seen) // _TRIED)][:_TRIED]
+        places, names = {place_of(one) for one in some}, {one.name for one in some}
         changed: list[Prediction] = []
-        for one in answers:
+        for one in moved:
             pose = one.estimate.camera_from_model
+            if pose is not None and (one.place in places or one.estimate.name in names):
+                pose = _TURNS[turn](Rigid(pose.R.double(), pose.t_m.double()))
+                pose = Rigid(pose.R, pose.t_m * scale)
+                estimate = replace(one.estimate, camera_from_model=pose)
+                changed.append(replace(one, estimate=estimate))
+        found, right = match(some, changed, dataset.objects), 0
+        for instance in (one for one in some if one.name in found):
+            pose, context = found[instance.name].camera_from_model, contexts[instance.object_id]
             assert pose is not None
-            pose = _TURNS[turn](Rigid(pose.R.double(), pose.t_m.double()))
-            pose = Rigid(pose.R, pose.t_m * scale)
-            estimate = replace(one.estimate, camera_from_model=pose)
-            changed.append(replace(one, estimate=estimate))
-        found = match(some, changed, dataset.objects)
-        right = 0
-        for instance in some:
-            pose = found[instance.name].camera_from_model if instance.name in found else None
-            if pose is not None:
-                context = contexts[instance.object_id]
-                error_m = METRICS["error_m"].measure(pose, instance, context)
-                right += float(error_m) < limit * context.diameter_m
-        return right
+            error_m = METRICS["error_m"].measure(pose, instance, context)
+            right += float(error_m) < limit * context.diameter_m
+        return right, len(some)
 
-    now = count_right(1.0, "")
-    enough = max(min(3, len(some)), _MANY * len(some), _TIMES * now)
-    best, said = 0, ""
-    for turn in _TURNS if some and now < len(some) / _TIMES else ():
-        for scale, words in _SCALES.items():
-            right = count_right(scale, turn)
-            if right > best:
-                best, said = right, " and ".join(filter(None, (words, turn)))
-    if not said or best < enough:
+    now, tried = count_right()
+    if now > (1 - _MORE) * tried > 0:
         return None
-    return f"{now} of {len(some)} answers that were tried are right, but {best} were if {said}"
+    changes = [(*count_right(step=step), words) for words, step in _STEPS.items()]
+    changes += [
+        (*count_right(scale, turn), " and ".join(filter(None, (words, turn))))
+        for turn in _TURNS
+        for scale, words in _SCALES.items()
+    ]
+    best, of, said = max(changes, key=lambda change: change[0])
+    if best < now + max(1, min(3, of), _MORE * of):
+        return None
+    return f"{now} of {tried} answers that were tried are right, but {best} of {of} were if {said}"
