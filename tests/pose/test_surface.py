@@ -108,15 +108,3 @@ def test_points_at_and_behind_the_camera_are_no_part_of_what_it_saw(
 def test_a_surface_knows_the_poses_that_look_alike(surface: Surface) -> None:
     assert len(prepare_surface(bottle()).copies.R) > 30
     assert len(surface.copies.R) == 1
-
-
-@pytest.mark.parametrize(
-    ("size_m", "least_m2"), [((0.1, 0.1, 0.1), 0.01), ((0.2, 0.06, 0.04), 0.06 * 0.04)]
-)
-def test_the_least_silhouette_is_that_of_the_smallest_side_without_its_border(
-    size_m: tuple[float, float, float], least_m2: float
-) -> None:
-    mesh = trimesh.creation.box(size_m)
-    model = make_model(torch.tensor(mesh.vertices).float(), torch.tensor(mesh.faces), name="box")
-    found = prepare_surface(model).least_silhouette_m2
-    assert 0.4 * least_m2 < found < 1.2 * least_m2

@@ -8,39 +8,24 @@ import math
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Bool, Float32, Float64, Int32, Int64
+from jaxtyping import Float32, Float64, Int32, Int64
 from torch import Tensor
 from torch.nn.functional import normalize
 
 from depthpose.core.rigid import Rigid
-from depthpose.pose.compiled import serves
-from depthpose.pose.mesh.models import fibonacci_directions
+from depthpose.pose.compiled import ANGLES, DISTANCES, MOST_ALIKE, TURNS, serves
 from depthpose.pose.surface import Surface, look_along_rays
 
 STEP = 0.07
 """Of the diameter: distance of the points of the model, and a bin of the distances of a pair."""
-_ANGLES = 15
-"""Bins of an angle from 0 to 180 degrees."""
-_DISTANCES = 15
-_REACH = 1.05
-"""Of the diameter: the longest pair."""
-_TURNS = 30
-"""Bins of the turn about the normal of a reference point."""
-_MOST_ALIKE = 150
-"""Pairs of the model with the same feature, of which so many vote: those of a plane are all alike
-and say little."""
 _MODEL, _COARSER = 800, 1.1
 """At most so many points of the model; where there are more, their distance grows by this."""
 _SCENE, _REFERENCES = 400, 50
 """At most so many points of the cloud, and those of them that vote with each of the others."""
 _PEAKS = 6
 """Poses that each reference point proposes."""
-_VIEWS = 30
-"""Directions from which the model is looked at, to find which side of its surface is seen."""
 _FACING = 0.2
 """Cosine from which a surface is seen."""
-_CELLS = 40
-"""Cells along the diameter in which points hide those behind them."""
 _CHECKED = 100
 """Points of the cloud that compare the proposed poses."""
 _FAR = 0.1
@@ -78,7 +63,11 @@ def prepare_pairs(surface: Surface) -> PairTable:
     Args:
         surface: of the model; normals may point to either side.
     """
-    points_m, normals = _seen_from_outside(surface)
+    views = surface.views  # of a thin sheet they show both sides
+    cosine = (views.normals * views.toward[:, None]).sum(-1)
+    is_seen = cosine.abs() > _FACING
+    points_m = views.points_m[is_seen]
+    normals = (views.normals * cosine.sign()[..., None])[is_seen]
     step_m = STEP * surface.diameter_m
     while len(kept := thin(points_m, normals, step_m)) > _MODEL:
         step_m *= _COARSER
@@ -91,7 +80,7 @@ def prepare_pairs(surface: Surface) -> PairTable:
     feature = _key(feature.floor().long())[chance]
     feature, order = feature.sort(stable=True)
     order = chance[order]
-    sizes = torch.bincount(feature, minlength=(_DISTANCES + 1) * _ANGLES**3)
+    sizes = torch.bincount(feature, minlength=(DISTANCES + 1) * ANGLES**3)
     bounds = torch.cat([sizes.new_zeros(1), sizes.cumsum(0)])
     return PairTable(
         points_m=points_m,
@@ -141,31 +130,6 @@ def thin(
     return first.scatter_reduce_(0, place, torch.arange(len(points_m)), "amin").sort().values
 
 
-def _seen_from_outside(
-    surface: Surface,
-) -> tuple[Float64[Tensor, "n 3"], Float64[Tensor, "n 3"]]:
-    """Give the points that a camera can see, with normals toward it; thin sheets have both."""
-    half = fibonacci_directions(_VIEWS // 2).double()
-    directions = torch.cat([half, -half])
-    seen = torch.stack([_is_seen(surface, toward) for toward in directions])
-    cosine = directions @ surface.normals.T
-    front, back = ((seen & (sign * cosine > _FACING)).any(0) for sign in (1, -1))
-    points_m = torch.cat([surface.points_m[front], surface.points_m[back]])
-    return points_m, torch.cat([surface.normals[front], -surface.normals[back]])
-
-
-def _is_seen(surface: Surface, toward: Float64[Tensor, "3"]) -> Bool[Tensor, " m"]:
-    """Mark the points that nothing hides from a camera far off in a direction."""
-    across = torch.linalg.svd(toward[None]).Vh[1:]
-    cells = ((surface.points_m @ across.T) / surface.diameter_m * _CELLS).floor().long()
-    column, row = (cells - cells.amin(0) + 1).unbind(-1)
-    width = int(row.max()) + 2
-    place, depth_m = column * width + row, surface.points_m @ toward
-    nearest_m = torch.full(((int(column.max()) + 2) * width,), -torch.inf, dtype=torch.float64)
-    nearest_m.scatter_reduce_(0, place, depth_m, "amax")
-    return depth_m > nearest_m[place] - surface.diameter_m / _CELLS
-
-
 def _frames(normals: Float64[Tensor, "n 3"]) -> Float64[Tensor, "n 3 3"]:
     """Give each normal and two tangents, as columns."""
     least = torch.eye(3, dtype=torch.float64)[normals.abs().argmin(-1)]
@@ -189,7 +153,7 @@ def _features(
     cosines = torch.stack(
         [local_m[:, 0] / safe_m, (m * way_m).sum(-1) / safe_m, (n * m).sum(-1)], -1
     )
-    angles = cosines.clamp(-1, 1).arccos() * (_ANGLES / math.pi)
+    angles = cosines.clamp(-1, 1).arccos() * (ANGLES / math.pi)
     bins = torch.cat([(distance_m / (STEP * diameter_m))[:, None], angles], 1)
     return bins, torch.atan2(local_m[:, 2], local_m[:, 1])
 
@@ -197,8 +161,8 @@ def _features(
 def _key(bins: Int64[Tensor, "*b 4"]) -> Int64[Tensor, "*b"]:
     """Number a feature; what lies beyond the bins is in the last one."""
     d, a, b, c = bins.clamp(min=0).unbind(-1)
-    a, b, c = (angle.clamp(max=_ANGLES - 1) for angle in (a, b, c))
-    return ((d.clamp(max=_DISTANCES) * _ANGLES + a) * _ANGLES + b) * _ANGLES + c
+    a, b, c = (angle.clamp(max=ANGLES - 1) for angle in (a, b, c))
+    return ((d.clamp(max=DISTANCES) * ANGLES + a) * ANGLES + b) * ANGLES + c
 
 
 def _neighbours(feature: Float64[Tensor, "p 4"]) -> Int64[Tensor, "p 5"]:
@@ -239,19 +203,17 @@ def vote_poses(
     if serves(points_m):
         from depthpose.pose.compiled.pairs import pair_peaks
 
-        pairs = (table.bounds.numpy(), table.first.numpy(), table.turn_rad.numpy())
-        step_m = STEP * table.diameter_m
-        reach = (step_m, step_m, _REACH * table.diameter_m)
         found = pair_peaks(
-            (points_m.numpy(), frames.numpy()), partners, references.numpy(), pairs,
-            (len(table.points_m), peaks, _MOST_ALIKE), reach, (_DISTANCES, _ANGLES, _TURNS),
+            points_m.numpy(), frames.numpy(), partners, references.numpy(), table.bounds.numpy(),
+            table.first.numpy(), table.turn_rad.numpy(), len(table.points_m), peaks,
+            STEP * table.diameter_m,
         )  # fmt: skip
         number, bin_, votes = (torch.from_numpy(a).flatten() for a in found)
     else:
         chunks = [_peaks(points_m, frames, partners, some, table, peaks)
                   for some in references.split(20)]  # fmt: skip
         number, bin_, votes = (torch.cat(parts) for parts in zip(*chunks, strict=True))
-    angle = (bin_ + 0.5) * (2 * math.pi / _TURNS)
+    angle = (bin_ + 0.5) * (2 * math.pi / TURNS)
     reference = references.repeat_interleave(peaks)
     return _poses(points_m, frames, table, reference, number, angle.double()), votes
 
@@ -267,32 +229,32 @@ def _peaks(
     """Vote without numba: numbers of model points, bins of turns and votes."""
     count, models = len(references), len(table.points_m)
     far_m = (points_m[references, None] - points_m[:partners]).norm(dim=-1)
-    used = (far_m > STEP * table.diameter_m) & (far_m < _REACH * table.diameter_m)
+    used = (far_m > STEP * table.diameter_m) & (far_m < DISTANCES * STEP * table.diameter_m)
     row, second = used.nonzero(as_tuple=True)
     feature, turn_rad = _features(points_m, frames, references[row], second, table.diameter_m)
     keys = _neighbours(feature)
     size = (table.bounds[keys + 1] - table.bounds[keys]).long()
     same = (keys[:, 1:] == keys[:, :1]).nonzero(as_tuple=True)
     size[:, 1:][same] = 0
-    turn_bin = ((turn_rad + math.pi) / (2 * math.pi) * _TURNS).long().clamp(max=_TURNS - 1)
-    said = (row[:, None] * len(table.bounds) + keys) * _TURNS + turn_bin[:, None]
+    turn_bin = ((turn_rad + math.pi) / (2 * math.pi) * TURNS).long().clamp(max=TURNS - 1)
+    said = (row[:, None] * len(table.bounds) + keys) * TURNS + turn_bin[:, None]
     said = torch.where(size > 0, said, -1).flatten()
     _, place = said.unique(return_inverse=True)
     first = torch.full((int(place.max()) + 1 if len(place) else 0,), len(said))
     first = first.scatter_reduce_(0, place, torch.arange(len(said)), "amin")
     first = first[said[first] >= 0].sort().values
     size = size.flatten()[first]
-    few = size.clamp(max=_MOST_ALIKE)
+    few = size.clamp(max=MOST_ALIKE)
     asked = torch.repeat_interleave(torch.arange(len(few)), few)
     offset = torch.arange(len(asked)) - (few.cumsum(0) - few)[asked]
     pair = table.bounds[keys.flatten()[first][asked]] + offset
     scene = first[asked] // keys.shape[1]
     turn = (turn_rad[scene] - table.turn_rad[pair]) / (2 * math.pi) % 1
-    bin_ = (turn * _TURNS).long().clamp(max=_TURNS - 1)
-    cell = (row[scene] * models + table.first[pair]) * _TURNS + bin_
+    bin_ = (turn * TURNS).long().clamp(max=TURNS - 1)
+    cell = (row[scene] * models + table.first[pair]) * TURNS + bin_
     weight = 1 / size[asked].double().sqrt()
-    votes = torch.bincount(cell, weight, minlength=count * models * _TURNS)
-    votes = votes.reshape(count, models, _TURNS)
+    votes = torch.bincount(cell, weight, minlength=count * models * TURNS)
+    votes = votes.reshape(count, models, TURNS)
     votes = 2 * votes + votes.roll(1, -1) + votes.roll(-1, -1)
     most, bins = votes.max(-1)
     best = most.topk(min(peaks, models))
