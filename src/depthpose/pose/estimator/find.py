@@ -28,19 +28,20 @@ from depthpose.pose.surface import NEAR, Surface
 from depthpose.pose.types import CloudInput, PoseEstimate, ViewInput
 from depthpose.pose.voting.point_pairs import PairTable
 
-_HOPELESS = 4.0
-"""Log odds that the image alone adds, from which nothing else makes a pose right."""
-_WORSE = 2.0
-"""An answer whose log odds are by so much worse than those of the best of its object is none."""
+_MOST_LOG_ODDS = 4.0
+"""Proposed poses with larger log odds of being wrong are not refined and judged."""
+_BEHIND_BEST = 2.0
+"""Of each object answers are kept up to so much above the log odds of its best one."""
 _DISAGREES = 6.7
-"""Log odds, for the share of the seen surface that disagrees."""
+"""Weight of the share of the seen surface that disagrees, in log odds of being wrong."""
 _BENT, _MOST_DEVIATIONS = 2.0, 4.0
-"""Times the deviation of a fitted size, and deviations beyond which more say no more."""
+"""A sensor bends what it sees: a fitted size deviates by so many times what its noise explains. A
+size that is off by more deviations than the second counts as one that is off by these."""
 _MOST_JUDGED, _LEAST_JUDGED = 40, 4
 """Poses that are judged in an image, and of each object at least."""
-_MOST_TOGETHER, _NEARLY = 8, 0.2
-"""Poses of one object at one place at most, and by how much the image may agree less with those
-that say too which points are its own."""
+_MOST_TOGETHER, _NEARLY = 8, 4.0
+"""Poses of one object at one place at most; the readings that one of them explains are the
+object's, if its log odds are at most so much above those of the best there."""
 _LEAST_PIXELS = 100
 """Of the whole image: fewer show no shape."""
 _SHARED = 0.3
@@ -54,8 +55,8 @@ _CONTINUED = 0.4
 _RIM = 0.05
 """Width of what is looked at beside it, in diameters."""
 _NAMED = 0.02
-"""Other objects of a larger share are named."""
-_ONE = 0.8
+"""Other objects of a larger share of the probability are named."""
+_LEAST_SHARE = 0.8
 """Where no object among several has so large a share of the probability, none is answered."""
 
 
@@ -124,7 +125,7 @@ def _candidates(frame: Frame, known: SearchTargets) -> list[_Candidate]:
     def propose(name: str) -> list[tuple[float, Rigid, str, bool]]:
         surface, pairs = known.surface_of(name), known.pairs_of(name)
         poses, log_odds = propose_in_frame(frame, surface, pairs, len(known.names))
-        likely = int((log_odds < _HOPELESS).sum())
+        likely = int((log_odds < _MOST_LOG_ODDS).sum())
         return [(float(log_odds[k]), poses[k], name, k < _LEAST_JUDGED) for k in range(likely)]
 
     each = each_in_threads(propose, known.names, torch.get_num_threads())
@@ -167,7 +168,7 @@ def _judged(
             one = _Candidate(object=estimate.object, pose=pose, log_odds=log_odds, explained=own)
             answers.append((one, estimate))
     least = {one.object: one.log_odds for one, _ in sorted(answers, key=lambda a: -a[0].log_odds)}
-    return [both for both in answers if both[0].log_odds < least[both[0].object] + _WORSE]
+    return [both for both in answers if both[0].log_odds < least[both[0].object] + _BEHIND_BEST]
 
 
 def size_deviations(
@@ -207,7 +208,7 @@ def _without_rivals(answers: Sequence[tuple[_Candidate, PoseEstimate]]) -> list[
                 rivals.setdefault(other.object, (other.log_odds, its))
         log_odds = torch.tensor([log_odds for log_odds, _ in rivals.values()], dtype=torch.float64)
         best, share = _given_others([its for _, its in rivals.values()], (-log_odds).softmax(0))
-        if share >= _ONE:  # else it may be another object
+        if share >= _LEAST_SHARE:  # else it may be another object
             kept.append(best)
     return kept
 
@@ -307,7 +308,7 @@ def which_object(estimates: Sequence[PoseEstimate], refusal: RefusalConfig) -> P
         return replace(least, reason=reason, seconds=dict(spent))
     shares = share_out([one.signals for one in some], refusal.candidate_slopes)
     best, share = _given_others(some, shares)
-    if share < _ONE:
+    if share < _LEAST_SHARE:
         said = ", ".join(
             f"{one.object} ({float(s):.0%})" for one, s in zip(some, shares, strict=True)
         )
