@@ -87,7 +87,8 @@ class OneObjectOptions:
     """16-bit PNG in the camera's depth_unit_m, or a folder of them."""
     mask: Source | None = None
     """picture, not black is the object, or .json with COCO's run lengths; or a folder of masks with
-    the names of the depth images. Without, the image is searched for every object, or --object."""
+    the names of the depth images. Without, the whole image is searched for every object, or for
+    --object alone."""
     camera: Path | None = None
     """of the depth images; JSON file: {"width", "height", "K": 3x3, "depth_unit_m"}, or that of
     BOP, TUM RGB-D, ROS, OpenCV, KITTI or Middlebury."""

@@ -9,12 +9,12 @@ import torch
 from jaxtyping import Bool, Float64, Int64
 from scipy.spatial import KDTree
 from torch import Tensor
-from torch.nn.functional import max_pool2d
+from torch.nn.functional import avg_pool2d, max_pool2d, pad
 
 from depthpose.core.rigid import Rigid
 from depthpose.pose.compiled import GRAZING, LOOKED_UP, ON_RAY, SLACK, finite_array, serves
 from depthpose.pose.mesh import sample_surface, symmetry_transforms
-from depthpose.pose.mesh.models import CELL, across_walls, outward_normals
+from depthpose.pose.mesh.models import CELL, across_walls, fibonacci_directions, outward_normals
 from depthpose.pose.types import ObjectModel
 
 NEAR = 0.05
@@ -32,6 +32,13 @@ _BOXES = 48
 """Boxes along the longest side of a model, for looking up what is near without searching."""
 _MARGIN = 0.15
 """Of the diameter: so far the boxes reach beyond the model."""
+_VIEWS = 128
+"""Directions from which a model is looked at."""
+_POINTS, _RING = 160, 64
+"""Cells of a picture at most, and those beside its silhouette."""
+BESIDE = 0.08
+"""Of the diameter: where what is beside a silhouette is no farther than so much from its border in
+depth, the same surface goes on."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -58,6 +65,23 @@ class Boxes:
         box = ((points_m - self.low_m) / self.side_m).long()
         x, y, z = torch.minimum(box.clamp_(min=0), self.counts - 1).unbind(-1)
         return self.nearest[(x * self.counts[1] + y) * self.counts[2] + z]
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Views:
+    """What a camera far off sees of a model, from many sides, in the model's frame.
+
+    Attributes:
+        toward: unit vectors to the camera.
+        points_m: what is seen, spread evenly over the picture; NaN where there are fewer.
+        normals: theirs.
+        beside_m: places beside the silhouette, as far off as its border; NaN where there are fewer.
+    """
+
+    toward: Float64[Tensor, "v 3"]
+    points_m: Float64[Tensor, "v n 3"]
+    normals: Float64[Tensor, "v n 3"]
+    beside_m: Float64[Tensor, "v m 3"]
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -99,10 +123,25 @@ class Surface:
         return float(np.median(self.tree.query(some_m.numpy(), k=4, workers=1)[0][:, -1]))
 
     @cached_property
+    def middle_m(self) -> Float64[Tensor, "3"]:
+        """Middle of the box about the surface, along the axes of the model."""
+        return (self.points_m.amin(0) + self.points_m.amax(0)) / 2
+
+    @cached_property
     def ball_m(self) -> Float64[Tensor, "4"]:
         """Middle and radius of a ball about the surface."""
-        middle_m = (self.points_m.amin(0) + self.points_m.amax(0)) / 2
-        return torch.cat([middle_m, (self.points_m - middle_m).norm(dim=-1).amax()[None]])
+        radius_m = (self.points_m - self.middle_m).norm(dim=-1).amax()
+        return torch.cat([self.middle_m, radius_m[None]])
+
+    @cached_property
+    def views(self) -> Views:
+        """What a camera sees of the surface: looked at once for many images."""
+        toward = fibonacci_directions(_VIEWS).double()
+        _, _, axes = torch.linalg.svd(toward[:, None])
+        # The last two rows of each frame are two axes across the direction.
+        views = [_view_of(self, way, across[1:]) for way, across in zip(toward, axes, strict=True)]
+        points_m, normals, beside_m = (torch.stack(parts) for parts in zip(*views, strict=True))
+        return Views(toward=toward, points_m=points_m, normals=normals, beside_m=beside_m)
 
     @cached_property
     def target(self) -> Any:  # noqa: ANN401  a tuple of numba's
@@ -124,6 +163,42 @@ class Surface:
             place[self.across.numpy()[tree.order]].astype(np.int32),
             self.ball_m.numpy(),
         )
+
+
+def _view_of(surface: Surface, toward: Tensor, across: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Gather a surface in cells of a picture; give the nearest points, and places beside them."""
+    cell_m, side = _CELL * surface.diameter_m, 2 * round(0.5 / _CELL) + 10
+    about_m = surface.points_m - surface.middle_m
+    column, row = (about_m @ across.T / cell_m).floor().long().add(side // 2).unbind(-1)
+    place, near_m = row * side + column, about_m @ toward
+    most_m = near_m.new_full((side**2,), -torch.inf).scatter_reduce_(0, place, near_m, "amax")
+    first = torch.full((side**2,), len(place))
+    first[place[near_m == most_m[place]]] = torch.arange(len(place))[near_m == most_m[place]]
+    # Between sparse points the far side shows: it is none that a camera would see.
+    picture_m = most_m.reshape(1, side, side)
+    is_seen = most_m > max_pool2d(picture_m, 3, 1, 1).flatten() - BESIDE * surface.diameter_m
+    is_seen &= most_m.isfinite()
+    shown = _spread(first[is_seen], _POINTS)
+    filled = is_seen.double().reshape(1, side, side)
+    wide, narrow = (max_pool2d(filled, size, 1, size // 2) for size in (5, 3))
+    shown_m = torch.where(filled > 0, picture_m, 0.0)
+    border_m = avg_pool2d(shown_m, 5, 1, 2) / avg_pool2d(filled, 5, 1, 2)
+    ring = _spread(((wide > 0) & (narrow == 0)).flatten().nonzero()[:, 0], _RING)
+    at = torch.stack([ring % side, ring.div(side, rounding_mode="floor")], -1).double()
+    at += 0.5 - side // 2
+    beside_m = at * cell_m @ across + border_m.flatten()[ring, None] * toward + surface.middle_m
+    parts = (surface.points_m[shown], surface.normals[shown], beside_m)
+    points_m, normals, beside_m = (
+        pad(part, (0, 0, 0, most - len(part)), value=torch.nan)
+        for part, most in zip(parts, (_POINTS, _POINTS, _RING), strict=True)
+    )
+    return points_m, normals, beside_m
+
+
+def _spread(index: Int64[Tensor, " n"], most: int) -> Int64[Tensor, " m"]:
+    """Take so many at most, in an order of chance: the first ones are a sample of all."""
+    chance = torch.randperm(len(index), generator=torch.Generator().manual_seed(0))
+    return index[chance[:most]]
 
 
 def prepare_surface(model: ObjectModel, count: int = 10_000) -> Surface:

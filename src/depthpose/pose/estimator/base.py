@@ -18,7 +18,6 @@ from depthpose.core.units import Unit
 from depthpose.pose.config import EstimateConfig, RefusalConfig
 from depthpose.pose.estimator.candidates import PoseAmbiguities, find_copies, with_status
 from depthpose.pose.estimator.find import SearchTargets, find_objects, nothing_found, which_object
-from depthpose.pose.estimator.hypotheses import Views, prepare_views
 from depthpose.pose.estimator.inputs import (
     AnyArray,
     AnyInput,
@@ -60,7 +59,7 @@ class PoseEstimator(ABC):
         self._numbers = {model.name: k for k, model in enumerate(models)}
         self._surfaces: dict[int, Surface] = {}
         self._copies: dict[int, PoseAmbiguities] = {}
-        self._shapes: dict[int, tuple[PairTable, Views]] = {}
+        self._prepared_pairs: dict[int, PairTable] = {}
 
     @property
     def objects(self) -> tuple[str, ...]:
@@ -244,7 +243,7 @@ class PoseEstimator(ABC):
         known = SearchTargets(
             names=objects,
             surface_of=lambda name: self._surface(self._number(name)),
-            shape_of=lambda name: self._shape(self._number(name)),
+            pairs_of=lambda name: self._pairs(self._number(name)),
             pose_near=self._pose_near,
             max_size_error=self.refusal.max_size_error,
         )
@@ -342,11 +341,10 @@ class PoseEstimator(ABC):
             self._copies[number] = find_copies(self.models[number], up_to_symmetry=up_to_symmetry)
         return self._copies[number]
 
-    def _shape(self, number: int) -> tuple[PairTable, Views]:
-        if number not in self._shapes:
-            surface = self._surface(number)
-            self._shapes[number] = (prepare_pairs(surface), prepare_views(surface))
-        return self._shapes[number]
+    def _pairs(self, number: int) -> PairTable:
+        if number not in self._prepared_pairs:
+            self._prepared_pairs[number] = prepare_pairs(self._surface(number))
+        return self._prepared_pairs[number]
 
     def _number(self, name: str) -> int:
         if not isinstance(name, str):

@@ -3,7 +3,6 @@
 import math
 from collections import Counter
 from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 
 import torch
@@ -11,15 +10,15 @@ from jaxtyping import Bool, Float64
 from torch import Tensor
 
 from depthpose.core.camera import back_project
+from depthpose.core.devices import each_in_threads
 from depthpose.core.rigid import Rigid
 from depthpose.pose.cloud import cloud_from_depth, grow_mask
 from depthpose.pose.config import RefusalConfig
 from depthpose.pose.estimator.candidates import share_out
-from depthpose.pose.estimator.fit import BORDER_PX, SURE, sensor_size_error
+from depthpose.pose.estimator.fit import BORDER_PX, sensor_size_error
 from depthpose.pose.estimator.hypotheses import (
-    Views,
-    doubts_of,
     is_no_side,
+    log_odds_wrong,
     propose_in_frame,
 )
 from depthpose.pose.estimator.inputs import nothing_seen
@@ -28,17 +27,20 @@ from depthpose.pose.surface import NEAR, Surface
 from depthpose.pose.types import CloudInput, PoseEstimate, ViewInput
 from depthpose.pose.voting.point_pairs import PairTable
 
-_HOPELESS = 4.0
-"""Log odds that the image alone adds, from which nothing else makes a pose right."""
-_WORSE = 3.0
-"""An answer whose log odds are by so much worse than those of the best of its object is none."""
-_LEAST_WORTH = 0.25
-"""Poses with which the image agrees less are not judged."""
+_MOST_LOG_ODDS = 4.0
+"""Proposed poses with larger log odds of being wrong are not refined and judged."""
+_BEHIND_BEST = 2.0
+"""Of each object answers are kept up to so much above the log odds of its best one."""
+_DISAGREES = 6.7
+"""Weight of the share of the seen surface that disagrees, in log odds of being wrong."""
+_BENT, _MOST_DEVIATIONS = 2.0, 4.0
+"""A sensor bends what it sees: a fitted size deviates by so many times what its noise explains. A
+size that is off by more deviations than the second counts as one that is off by these."""
 _MOST_JUDGED, _LEAST_JUDGED = 40, 4
 """Poses that are judged in an image, and of each object at least."""
 _MOST_TOGETHER, _NEARLY = 8, 0.2
-"""Poses of one object at one place at most, and by how much the image may agree less with those
-that say too which points are its own."""
+"""Poses of one object at one place at most; the readings that one of them explains are the
+object's, if its log odds are at most so much above those of the best there."""
 _LEAST_PIXELS = 100
 """Of the whole image: fewer show no shape."""
 _SHARED = 0.3
@@ -52,8 +54,8 @@ _CONTINUED = 0.4
 _RIM = 0.05
 """Width of what is looked at beside it, in diameters."""
 _NAMED = 0.02
-"""Other objects of a larger share are named."""
-_ONE = 0.8
+"""Other objects of a larger share of the probability are named."""
+_LEAST_SHARE = 0.8
 """Where no object among several has so large a share of the probability, none is answered."""
 
 
@@ -64,14 +66,14 @@ class SearchTargets:
     Attributes:
         names: of the objects.
         surface_of: gives the surface of an object by its name.
-        shape_of: gives its point pairs and what a camera sees of it.
+        pairs_of: gives its point pairs.
         pose_near: clouds and the poses that were proposed for them to estimates.
         max_size_error: of :class:`RefusalConfig`.
     """
 
     names: Sequence[str]
     surface_of: Callable[[str], Surface]
-    shape_of: Callable[[str], tuple[PairTable, Views]]
+    pairs_of: Callable[[str], PairTable]
     pose_near: Callable[[Sequence[CloudInput], Sequence[Rigid]], list[PoseEstimate]]
     max_size_error: float
 
@@ -82,7 +84,7 @@ class _Candidate:
 
     object: str
     pose: Rigid
-    doubt: float
+    log_odds: float
     explained: Bool[Tensor, "h w"]
 
     def shared_with(self, other: "_Candidate") -> float:
@@ -117,24 +119,24 @@ def find_objects(view: ViewInput, known: SearchTargets) -> list[PoseEstimate]:
 
 
 def _candidates(frame: Frame, known: SearchTargets) -> list[_Candidate]:
-    """Propose poses of every object, the best of all first."""
-    most = max(_LEAST_JUDGED, _MOST_JUDGED // len(known.names))
+    """Propose poses of every object, and take the likeliest of all, and of each object some."""
 
-    def propose(name: str) -> list[_Candidate]:
-        surface, (table, views) = known.surface_of(name), known.shape_of(name)
-        poses, seen = propose_in_frame(frame, surface, table, views, len(known.names))
-        doubts, found = seen.rough_doubt, list[_Candidate]()
-        likely = (seen.worth >= _LEAST_WORTH) & (doubts < _HOPELESS)
-        for k in likely.nonzero()[:most, 0].tolist():
-            own = _explained(frame, poses[k], surface)
+    def propose(name: str) -> list[tuple[float, Rigid, str, bool]]:
+        surface, pairs = known.surface_of(name), known.pairs_of(name)
+        poses, log_odds = propose_in_frame(frame, surface, pairs, len(known.names))
+        likely = (log_odds < _MOST_LOG_ODDS).nonzero()[:_MOST_JUDGED, 0].tolist()
+        return [(float(log_odds[k]), poses[k], name, n < _LEAST_JUDGED)
+                for n, k in enumerate(likely)]  # fmt: skip
+
+    each = each_in_threads(propose, known.names, torch.get_num_threads())
+    every = sorted((one for some in each for one in some), key=lambda one: one[0])
+    found = list[_Candidate]()
+    for k, (log_odds, pose, name, is_first) in enumerate(every):
+        if k < _MOST_JUDGED or is_first:
+            own = _explained(frame, pose, known.surface_of(name))
             if int(own.sum()) * frame.step**2 >= _LEAST_PIXELS:
-                doubt = float(doubts[k])
-                found.append(_Candidate(object=name, pose=poses[k], doubt=doubt, explained=own))
-        return found
-
-    with ThreadPoolExecutor(torch.get_num_threads()) as pool:
-        every = [one for some in pool.map(propose, known.names) for one in some]
-    return sorted(every, key=lambda one: one.doubt)
+                found.append(_Candidate(object=name, pose=pose, log_odds=log_odds, explained=own))
+    return found
 
 
 def _judged(
@@ -144,7 +146,7 @@ def _judged(
     inputs: list[CloudInput] = []
     height, width = view.depth_m.shape
     for k, some in enumerate(groups):
-        likely = [one for one in some if one.doubt < some[0].doubt + _NEARLY]
+        likely = [one for one in some if one.log_odds < some[0].log_odds + _NEARLY]
         mask = torch.stack([one.explained for one in likely]).any(0)
         mask = mask.repeat_interleave(frame.step, 0).repeat_interleave(frame.step, 1)
         cloud_m = cloud_from_depth(view.depth_m, mask[:height, :width] & view.mask, view.K)
@@ -155,53 +157,58 @@ def _judged(
     for estimate in known.pose_near(inputs, poses) if inputs else []:
         if estimate.camera_from_model is None:
             continue
-        surface, views = known.surface_of(estimate.object), known.shape_of(estimate.object)[1]
+        surface = known.surface_of(estimate.object)
         pose, fit = estimate.camera_from_model.double(), estimate.fit
         assert fit is not None
-        doubt = float(doubts_of(frame, pose[None], surface, views)) + 3.47 * (1 - fit.agrees)
-        is_other = is_other_size(estimate, view, surface, known.max_size_error)
-        if doubt < 0 and not is_other and not is_cut_out(view, pose, surface):
+        log_odds = float(log_odds_wrong(frame, pose[None], surface)) + _DISAGREES * (1 - fit.agrees)
+        off = size_deviations(estimate, view, surface, known.max_size_error)
+        log_odds += 0.5 * min(off, _MOST_DEVIATIONS) ** 2  # of a normal distribution
+        if log_odds < 0 and not is_cut_out(view, pose, surface):
             own = _explained(frame, pose, surface)
-            one = _Candidate(object=estimate.object, pose=pose, doubt=doubt, explained=own)
+            one = _Candidate(object=estimate.object, pose=pose, log_odds=log_odds, explained=own)
             answers.append((one, estimate))
-    least = {one.object: one.doubt for one, _ in sorted(answers, key=lambda a: -a[0].doubt)}
-    return [both for both in answers if both[0].doubt < least[both[0].object] + _WORSE]
+    least = {one.object: one.log_odds for one, _ in sorted(answers, key=lambda a: -a[0].log_odds)}
+    return [both for both in answers if both[0].log_odds < least[both[0].object] + _BEHIND_BEST]
 
 
-def is_other_size(estimate: PoseEstimate, view: ViewInput, surface: Surface, most: float) -> bool:
-    """Whether the size that fits best is none that the sensor explains, however little it gains.
+def size_deviations(
+    estimate: PoseEstimate, view: ViewInput, surface: Surface, max_size_error: float
+) -> float:
+    """Give by how many standard deviations the size that fits best differs from the model's.
 
-    With a mask it must gain too, as what is asked for is likely there.
+    The deviation of the fit knows the noise of the readings alone: it is taken twice, for a sensor
+    bends what it sees. Added to it is half of what the model and the sensor may be off by.
 
     Args:
         estimate: with a pose.
         view: in which it was found.
         surface: of the model.
-        most: by so much a thing may differ in size from its model.
+        max_size_error: by so much a thing may differ in size from its model.
     """
     identity, pose = estimate.identity, estimate.camera_from_model
     if identity is None or identity.size is None or identity.size_deviation is None:
-        return False
+        return 0.0
     assert pose is not None
     distance_m = float(pose.apply(surface.points_m.mean(0, keepdim=True).float())[0, 2])
-    most += sensor_size_error(distance_m, float(view.K[0, 0]), surface.diameter_m)
-    return abs(identity.size - 1) > most + SURE * identity.size_deviation
+    sensor = sensor_size_error(distance_m, float(view.K[0, 0]), surface.diameter_m)
+    expected = math.hypot(0.5 * (max_size_error + sensor), _BENT * identity.size_deviation)
+    return abs(identity.size - 1) / expected
 
 
 def _without_rivals(answers: Sequence[tuple[_Candidate, PoseEstimate]]) -> list[PoseEstimate]:
     """Keep answers from the surest down that explain what none before does, if they are likely."""
     kept, taken = list[PoseEstimate](), list[_Candidate]()
-    for one, estimate in sorted(answers, key=lambda answer: answer[0].doubt):
+    for one, estimate in sorted(answers, key=lambda answer: answer[0].log_odds):
         if any(one.shared_with(other) > _SHARED for other in taken):
             continue
         taken.append(one)
-        rivals = {one.object: (one.doubt, estimate)}
+        rivals = {one.object: (one.log_odds, estimate)}
         for other, its in answers:
             if one.shared_with(other) > _RIVAL:
-                rivals.setdefault(other.object, (other.doubt, its))
-        doubts = torch.tensor([doubt for doubt, _ in rivals.values()], dtype=torch.float64)
-        best, share = _given_others([its for _, its in rivals.values()], (-doubts).softmax(0))
-        if share >= _ONE:  # else it may be another object
+                rivals.setdefault(other.object, (other.log_odds, its))
+        log_odds = torch.tensor([log_odds for log_odds, _ in rivals.values()], dtype=torch.float64)
+        best, share = _given_others([its for _, its in rivals.values()], (-log_odds).softmax(0))
+        if share >= _LEAST_SHARE:  # else it may be another object
             kept.append(best)
     return kept
 
@@ -301,7 +308,7 @@ def which_object(estimates: Sequence[PoseEstimate], refusal: RefusalConfig) -> P
         return replace(least, reason=reason, seconds=dict(spent))
     shares = share_out([one.signals for one in some], refusal.candidate_slopes)
     best, share = _given_others(some, shares)
-    if share < _ONE:
+    if share < _LEAST_SHARE:
         said = ", ".join(
             f"{one.object} ({float(s):.0%})" for one, s in zip(some, shares, strict=True)
         )

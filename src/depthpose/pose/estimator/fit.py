@@ -202,7 +202,7 @@ steps do not bring it nearer: in 123 views the gain was then -0.035 at most."""
 _FLIP = torch.tensor([-1.0, 1.0, 1.0], dtype=torch.float64)
 _OFFSET_M = 0.006
 """Sensors are off along the ray as a whole by 3 to 6 mm: so much nearer, a thing looks larger."""
-SURE = 2.0
+_SURE = 2.0
 """Standard deviations."""
 _SIZE_GAIN = 0.05
 """Where another size gains less (0.25 % of the diameter), what is seen of the surface fits at many,
@@ -241,7 +241,7 @@ def scale_of(cloud_m: Float[Tensor, "n 3"], pose: Rigid, surface: Surface) -> Sc
     which moves its point ``p`` across the surface by ``n . (p - c) s``.
     """
     local_m = pose.inverse().apply(take_evenly(cloud_m.double(), POINTS))
-    middle_m = surface.ball_m[:3]
+    middle_m = surface.middle_m
     starts = torch.tensor(_STARTS, dtype=torch.float64)
     few_m = take_evenly(local_m, _ROUGH_POINTS).expand(len(starts), -1, -1)
     times, turned_m, _ = _grow(few_m, starts, middle_m, surface, is_exact=False)
@@ -325,7 +325,7 @@ def mirror_gain(cloud_m: Float[Tensor, "n 3"], pose: Rigid, surface: Surface) ->
     The cloud is mirrored in place of the model, so that ICP finds a pose.
     """
     local_m = pose.inverse().apply(take_evenly(cloud_m.double(), POINTS))
-    middle_m = surface.ball_m[:3]
+    middle_m = surface.middle_m
     mirrored_m = (local_m - middle_m) * _FLIP + middle_m
     config = IcpConfig()
     normals = fibonacci_directions(_PLANES)  # of planes that mirror the cloud back
@@ -366,7 +366,7 @@ def identity_of(
     distance_m = float(cloud.cloud_m[:, 2].double().median())
     sensor = sensor_size_error(distance_m, float(seen.K[0, 0]), surface.diameter_m)
     off = abs(scale.times - 1)
-    is_other_size = off > max_size_error + sensor + SURE * scale.sigma and scale.gain > _SIZE_GAIN
+    is_other_size = off > max_size_error + sensor + _SURE * scale.sigma and scale.gain > _SIZE_GAIN
     words = (
         f"{scale.times:.2f} times the model's size fits best (standard deviation {scale.sigma:.2f})"
     )
@@ -384,13 +384,13 @@ def identity_of(
             f"{words}, and the sensor explains {max_size_error + sensor:.0%}: a copy "
             "of another size, another object, or a wrong unit or camera"
         )
-    elif off + SURE * scale.sigma > _OTHER_SIZES + sensor:
+    elif off + _SURE * scale.sigma > _OTHER_SIZES + sensor:
         reason = f"what was seen does not fix the size: {words}"
     elif mirror is not None and mirror > -_MIRROR_GAIN:
         reason = f"the mirror image of {model.name} fits what was seen as well"
     elif scale.gain > _SIZE_GAIN:
         reason = f"{words}, which a sensor's errors may explain"
-    elif off > max(_NEAR_SIZE, SURE * scale.sigma) + _OFFSET_M / distance_m:
+    elif off > max(_NEAR_SIZE, _SURE * scale.sigma) + _OFFSET_M / distance_m:
         reason = f"{words}, and not that of the model"
     elif fit.beyond > _BESIDE:
         reason = f"{fit.beyond:.1%} of the object's readings lie beside the posed silhouette"

@@ -123,7 +123,7 @@ class Registration(PoseEstimator):
         """Prepare every model now, about a second each; else it is done when first asked for."""
         for number in range(len(self.models)):
             self._copies_of(number)
-            self._shape(number)
+            self._pairs(number)
 
     def _each(
         self, inputs: Iterable[AnyInput], threads: int, *, is_likely: bool = True
@@ -136,7 +136,8 @@ class Registration(PoseEstimator):
         self, inputs: Sequence[CloudInput], poses: Sequence[Rigid]
     ) -> list[PoseEstimate]:
         """Refine the poses that were proposed, without votes of the clouds alone."""
-        return [self._estimate(*both) for both in zip(inputs, poses, strict=True)]
+        both, threads = zip(inputs, poses, strict=True), torch.get_num_threads()
+        return list(each_in_threads(lambda one: self._estimate(*one), both, threads))
 
     def _estimate(self, given: AnyInput, poses: Rigid | None = None) -> PoseEstimate:
         """Estimate a pose, from those that were proposed if there are any."""
@@ -156,7 +157,7 @@ class Registration(PoseEstimator):
             step_m = _VOXEL * surface.diameter_m
             some_m = dense_m[thin(dense_m, torch.zeros_like(dense_m), step_m)]
             normals, _ = local_planes(dense_m, some_m)
-            table = self._shape(number)[0]
+            table = self._pairs(number)
             proposals = propose_poses(some_m, normals, table, surface, _PROPOSALS, generator)
         seconds["voting"] = time.perf_counter() - began
         clock, icp = Clock(seconds), replace(self.config.icp, starts=1)

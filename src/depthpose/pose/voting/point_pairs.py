@@ -13,22 +13,12 @@ from torch import Tensor
 from torch.nn.functional import normalize
 
 from depthpose.core.rigid import Rigid
-from depthpose.pose.compiled import serves
+from depthpose.pose.compiled import ANGLES, DISTANCES, MOST_ALIKE, TURNS, serves
 from depthpose.pose.mesh.models import fibonacci_directions
 from depthpose.pose.surface import Surface, look_along_rays
 
 STEP = 0.07
 """Of the diameter: distance of the points of the model, and a bin of the distances of a pair."""
-_ANGLES = 15
-"""Bins of an angle from 0 to 180 degrees."""
-_DISTANCES = 15
-_REACH = 1.05
-"""Of the diameter: the longest pair."""
-_TURNS = 30
-"""Bins of the turn about the normal of a reference point."""
-_MOST_ALIKE = 150
-"""Pairs of the model with the same feature, of which so many vote: those of a plane are all alike
-and say little."""
 _MODEL, _COARSER = 800, 1.1
 """At most so many points of the model; where there are more, their distance grows by this."""
 _SCENE, _REFERENCES = 400, 50
@@ -91,7 +81,7 @@ def prepare_pairs(surface: Surface) -> PairTable:
     feature = _key(feature.floor().long())[chance]
     feature, order = feature.sort(stable=True)
     order = chance[order]
-    sizes = torch.bincount(feature, minlength=(_DISTANCES + 1) * _ANGLES**3)
+    sizes = torch.bincount(feature, minlength=(DISTANCES + 1) * ANGLES**3)
     bounds = torch.cat([sizes.new_zeros(1), sizes.cumsum(0)])
     return PairTable(
         points_m=points_m,
@@ -189,7 +179,7 @@ def _features(
     cosines = torch.stack(
         [local_m[:, 0] / safe_m, (m * way_m).sum(-1) / safe_m, (n * m).sum(-1)], -1
     )
-    angles = cosines.clamp(-1, 1).arccos() * (_ANGLES / math.pi)
+    angles = cosines.clamp(-1, 1).arccos() * (ANGLES / math.pi)
     bins = torch.cat([(distance_m / (STEP * diameter_m))[:, None], angles], 1)
     return bins, torch.atan2(local_m[:, 2], local_m[:, 1])
 
@@ -197,8 +187,8 @@ def _features(
 def _key(bins: Int64[Tensor, "*b 4"]) -> Int64[Tensor, "*b"]:
     """Number a feature; what lies beyond the bins is in the last one."""
     d, a, b, c = bins.clamp(min=0).unbind(-1)
-    a, b, c = (angle.clamp(max=_ANGLES - 1) for angle in (a, b, c))
-    return ((d.clamp(max=_DISTANCES) * _ANGLES + a) * _ANGLES + b) * _ANGLES + c
+    a, b, c = (angle.clamp(max=ANGLES - 1) for angle in (a, b, c))
+    return ((d.clamp(max=DISTANCES) * ANGLES + a) * ANGLES + b) * ANGLES + c
 
 
 def _neighbours(feature: Float64[Tensor, "p 4"]) -> Int64[Tensor, "p 5"]:
@@ -239,19 +229,17 @@ def vote_poses(
     if serves(points_m):
         from depthpose.pose.compiled.pairs import pair_peaks
 
-        pairs = (table.bounds.numpy(), table.first.numpy(), table.turn_rad.numpy())
-        step_m = STEP * table.diameter_m
-        reach = (step_m, step_m, _REACH * table.diameter_m)
         found = pair_peaks(
-            (points_m.numpy(), frames.numpy()), partners, references.numpy(), pairs,
-            (len(table.points_m), peaks, _MOST_ALIKE), reach, (_DISTANCES, _ANGLES, _TURNS),
+            points_m.numpy(), frames.numpy(), partners, references.numpy(), table.bounds.numpy(),
+            table.first.numpy(), table.turn_rad.numpy(), len(table.points_m), peaks,
+            STEP * table.diameter_m,
         )  # fmt: skip
         number, bin_, votes = (torch.from_numpy(a).flatten() for a in found)
     else:
         chunks = [_peaks(points_m, frames, partners, some, table, peaks)
                   for some in references.split(20)]  # fmt: skip
         number, bin_, votes = (torch.cat(parts) for parts in zip(*chunks, strict=True))
-    angle = (bin_ + 0.5) * (2 * math.pi / _TURNS)
+    angle = (bin_ + 0.5) * (2 * math.pi / TURNS)
     reference = references.repeat_interleave(peaks)
     return _poses(points_m, frames, table, reference, number, angle.double()), votes
 
@@ -267,32 +255,32 @@ def _peaks(
     """Vote without numba: numbers of model points, bins of turns and votes."""
     count, models = len(references), len(table.points_m)
     far_m = (points_m[references, None] - points_m[:partners]).norm(dim=-1)
-    used = (far_m > STEP * table.diameter_m) & (far_m < _REACH * table.diameter_m)
+    used = (far_m > STEP * table.diameter_m) & (far_m < DISTANCES * STEP * table.diameter_m)
     row, second = used.nonzero(as_tuple=True)
     feature, turn_rad = _features(points_m, frames, references[row], second, table.diameter_m)
     keys = _neighbours(feature)
     size = (table.bounds[keys + 1] - table.bounds[keys]).long()
     same = (keys[:, 1:] == keys[:, :1]).nonzero(as_tuple=True)
     size[:, 1:][same] = 0
-    turn_bin = ((turn_rad + math.pi) / (2 * math.pi) * _TURNS).long().clamp(max=_TURNS - 1)
-    said = (row[:, None] * len(table.bounds) + keys) * _TURNS + turn_bin[:, None]
+    turn_bin = ((turn_rad + math.pi) / (2 * math.pi) * TURNS).long().clamp(max=TURNS - 1)
+    said = (row[:, None] * len(table.bounds) + keys) * TURNS + turn_bin[:, None]
     said = torch.where(size > 0, said, -1).flatten()
     _, place = said.unique(return_inverse=True)
     first = torch.full((int(place.max()) + 1 if len(place) else 0,), len(said))
     first = first.scatter_reduce_(0, place, torch.arange(len(said)), "amin")
     first = first[said[first] >= 0].sort().values
     size = size.flatten()[first]
-    few = size.clamp(max=_MOST_ALIKE)
+    few = size.clamp(max=MOST_ALIKE)
     asked = torch.repeat_interleave(torch.arange(len(few)), few)
     offset = torch.arange(len(asked)) - (few.cumsum(0) - few)[asked]
     pair = table.bounds[keys.flatten()[first][asked]] + offset
     scene = first[asked] // keys.shape[1]
     turn = (turn_rad[scene] - table.turn_rad[pair]) / (2 * math.pi) % 1
-    bin_ = (turn * _TURNS).long().clamp(max=_TURNS - 1)
-    cell = (row[scene] * models + table.first[pair]) * _TURNS + bin_
+    bin_ = (turn * TURNS).long().clamp(max=TURNS - 1)
+    cell = (row[scene] * models + table.first[pair]) * TURNS + bin_
     weight = 1 / size[asked].double().sqrt()
-    votes = torch.bincount(cell, weight, minlength=count * models * _TURNS)
-    votes = votes.reshape(count, models, _TURNS)
+    votes = torch.bincount(cell, weight, minlength=count * models * TURNS)
+    votes = votes.reshape(count, models, TURNS)
     votes = 2 * votes + votes.roll(1, -1) + votes.roll(-1, -1)
     most, bins = votes.max(-1)
     best = most.topk(min(peaks, models))
