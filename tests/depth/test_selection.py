@@ -64,11 +64,13 @@ def test_features_and_logits_have_their_strides() -> None:
 def test_convolutions_of_stride_two_pad_below_and_to_the_right() -> None:
     """TensorFlow's SAME: of 4 pixels, a 3x3 kernel of stride 2 sees 0..2 and 2..4."""
     first = LiteEncoder(1 / 32).stem
-    torch.nn.init.ones_(first.conv.weight)
+    conv, norm = first.get_submodule("conv"), first.get_submodule("norm")
+    assert isinstance(conv, torch.nn.Conv2d)
+    torch.nn.init.ones_(conv.weight)
     image = torch.zeros(1, 3, 4, 4)
     image[..., 0, 0] = 1.0
-    found = first.conv(F.pad(image, (0, 1, 0, 1)))
-    torch.testing.assert_close(first(image), first.norm(found))
+    found = conv(F.pad(image, (0, 1, 0, 1)))
+    torch.testing.assert_close(first(image), norm(found))
     assert found[0, 0].tolist() == [[3.0, 0.0], [0.0, 0.0]]
 
 
