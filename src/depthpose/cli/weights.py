@@ -34,8 +34,8 @@ def list_weights(folder: Path | None = None) -> int:
             "name": path.stem,
             "kind": (read := read_checkpoint(path)).kind,
             "MB": f"{path.stat().st_size / 1e6:.1f}",
-            "licence": shorten(read.facts.get("licence", ""), 34, placeholder=" ..."),
-            "trained on": shorten(read.facts.get("trained_on", ""), 34, placeholder=" ..."),
+            "licence": shorten(read.facts.get("licence", ""), 31, placeholder=" ..."),
+            "trained on": shorten(read.facts.get("trained_on", ""), 33, placeholder=" ..."),
         }
         for path in files
     ]
