@@ -667,7 +667,7 @@ def _wait_for_progress(folder: Path, process: BaseProcess) -> None:
     """Let the process load and begin, so that the kill meets training, not importing."""
     state = folder / "state.pt"
     before = state.stat().st_mtime_ns if state.exists() else 0
-    deadline = time.monotonic() + 60
+    deadline = time.monotonic() + 240  # of a busy machine
     while time.monotonic() < deadline and process.is_alive():
         if state.exists() and state.stat().st_mtime_ns != before:
             return
