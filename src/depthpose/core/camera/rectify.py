@@ -291,8 +291,8 @@ class Rectifier:
 
     def rectify(
         self,
-        left: Float32[Tensor, "3 h w"],
-        right: Float32[Tensor, "3 h w"],
+        left: Float32[Tensor, "3 _ _"],
+        right: Float32[Tensor, "3 _ _"],
         names: Sequence[str] = ("the left image", "the right image"),
     ) -> tuple[Float32[Tensor, "3 h w"], Float32[Tensor, "3 h w"]]:
         """Rectify the two images of a pair; what a raw image does not show is black.
