@@ -11,6 +11,7 @@ from tests.pose.synthetic_objects import write_part
 from tests.written import ROOT, read_blocks, run
 from tests.written import commands as commands_of
 
+from depthpose.cli import COMMANDS
 from depthpose.core.files import read_depth_png
 
 README = (ROOT / "README.md").read_text()
@@ -91,6 +92,14 @@ def test_published_weights_are_imported_and_match(demo_folder: Path, real: Path)
 @pytest.mark.parametrize("target", sorted(set(re.findall(r"^make (\w+)", README, re.MULTILINE))))
 def test_the_make_targets_exist(target: str) -> None:
     assert re.search(rf"^{target}:", (ROOT / "Makefile").read_text(), re.MULTILINE)
+
+
+@pytest.mark.parametrize("page", [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))])
+def test_commands_in_the_text_exist(page: Path) -> None:
+    groups = "|".join(sorted({name.split()[0] for name in COMMANDS if " " in name}))
+    named = re.findall(rf"`(?:depthpose )?((?:{groups}) [a-z][a-z-]*)", page.read_text())
+    known = {" ".join(name.split()[:2]) for name in COMMANDS}
+    assert not set(named) - known
 
 
 def test_the_links_lead_somewhere() -> None:

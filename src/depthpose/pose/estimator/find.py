@@ -79,12 +79,19 @@ class SearchTargets:
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class _Candidate:
-    """A pose of an object, log odds of its being wrong, and the pixels of a frame on it."""
+class _Proposal:
+    """A pose of an object, and log odds of its being wrong; ``rank``: among those of its object."""
 
     object: str
     pose: Rigid
     log_odds: float
+    rank: int = 0
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _Candidate(_Proposal):
+    """One that is judged, with the pixels of a frame on it."""
+
     explained: Bool[Tensor, "h w"]
 
     def shared_with(self, other: "_Candidate") -> float:
@@ -121,21 +128,23 @@ def find_objects(view: ViewInput, known: SearchTargets) -> list[PoseEstimate]:
 def _candidates(frame: Frame, known: SearchTargets) -> list[_Candidate]:
     """Propose poses of every object, and take the likeliest of all, and of each object some."""
 
-    def propose(name: str) -> list[tuple[float, Rigid, str, bool]]:
+    def propose(name: str) -> list[_Proposal]:
         surface, pairs = known.surface_of(name), known.pairs_of(name)
         poses, log_odds = propose_in_frame(frame, surface, pairs, len(known.names))
         likely = (log_odds < _MOST_LOG_ODDS).nonzero()[:_MOST_JUDGED, 0].tolist()
-        return [(float(log_odds[k]), poses[k], name, n < _LEAST_JUDGED)
-                for n, k in enumerate(likely)]  # fmt: skip
+        return [
+            _Proposal(object=name, pose=poses[k], log_odds=float(log_odds[k]), rank=rank)
+            for rank, k in enumerate(likely)
+        ]
 
     each = each_in_threads(propose, known.names, torch.get_num_threads())
-    every = sorted((one for some in each for one in some), key=lambda one: one[0])
+    every = sorted((one for some in each for one in some), key=lambda one: one.log_odds)
     found = list[_Candidate]()
-    for k, (log_odds, pose, name, is_first) in enumerate(every):
-        if k < _MOST_JUDGED or is_first:
-            own = _explained(frame, pose, known.surface_of(name))
+    for k, one in enumerate(every):
+        if k < _MOST_JUDGED or one.rank < _LEAST_JUDGED:
+            own = _explained(frame, one.pose, known.surface_of(one.object))
             if int(own.sum()) * frame.step**2 >= _LEAST_PIXELS:
-                found.append(_Candidate(object=name, pose=pose, log_odds=log_odds, explained=own))
+                found.append(_Candidate(**vars(one), explained=own))
     return found
 
 
@@ -167,8 +176,10 @@ def _judged(
             own = _explained(frame, pose, surface)
             one = _Candidate(object=estimate.object, pose=pose, log_odds=log_odds, explained=own)
             answers.append((one, estimate))
-    least = {one.object: one.log_odds for one, _ in sorted(answers, key=lambda a: -a[0].log_odds)}
-    return [both for both in answers if both[0].log_odds < least[both[0].object] + _BEHIND_BEST]
+    best: dict[str, float] = {}
+    for one, _ in answers:
+        best[one.object] = min(one.log_odds, best.get(one.object, math.inf))
+    return [both for both in answers if both[0].log_odds < best[both[0].object] + _BEHIND_BEST]
 
 
 def size_deviations(

@@ -72,7 +72,8 @@ def propose_in_frame(
         models: so many are searched in the image.
 
     Returns:
-        Poses, roughly refined, the best first, and what speaks against each before refinement.
+        Poses, roughly refined, those with which the image agrees best first, and the rough log
+        odds of each being wrong.
     """
     points_m, normals = _scene_points(frame, surface)
     generator = torch.Generator().manual_seed(0)
@@ -180,7 +181,7 @@ class ImageEvidence(NamedTuple):
 
     @property
     def rough_log_odds(self) -> Float64[Tensor, " b"]:
-        """What this says against poses that are not refined yet, however well they agree."""
+        """Log odds of being wrong of poses that are not refined yet, however well they agree."""
         return 2.9 * self.contradicted + 20.0 * self.continued + 3.2 * (1 - self.parted)
 
 
