@@ -25,7 +25,6 @@ from depthpose.depth.stereo import LightMatcher, LightStereo, StereoNetwork, lig
 from depthpose.depth.train import StereoTask
 from depthpose.depth.train.config import StereoTraining
 from depthpose.depth.train.pairs import TrainingPairs
-from depthpose.depth.train.runs import AdaptationCheck
 from depthpose.depth.train.stages import validate_pairs
 from depthpose.depth.types import DepthEstimate, Match, StereoInput
 from depthpose.depth.weights import DepthWeights
@@ -248,28 +247,6 @@ def test_held_out_pairs_measure_the_sky() -> None:
 def test_a_class_that_would_not_be_learnt_is_refused() -> None:
     with pytest.raises(InputError, match="the sky would not be learnt; set sky_weight"):
         StereoTraining(light=SMALL)
-
-
-def test_what_becomes_sky_does_not_count_as_agreement(monkeypatch: pytest.MonkeyPatch) -> None:
-    street = make_street(0.2).input
-
-    def matcher_of(network: StereoNetwork, _: MatcherConfig) -> object:
-        return network
-
-    class Finds(StereoNetwork):
-        def __init__(self, rows: int) -> None:
-            super().__init__()
-            self.rows = rows
-
-        def match(self, left: torch.Tensor, right: torch.Tensor) -> Match:  # noqa: ARG002
-            is_sky = torch.arange(left.shape[1])[:, None].expand(left.shape[1:]) < self.rows
-            return Match(disparity_px=torch.full(left.shape[1:], 4.0), is_sky=is_sky)
-
-    monkeypatch.setattr("depthpose.depth.train.runs.make_matcher", matcher_of)
-    check = AdaptationCheck([street], 0, MatcherConfig())
-    before, same, more = (check.measure(Finds(rows)).disagreeing for rows in (10, 10, 20))
-    assert same == before
-    assert more > before
 
 
 def test_a_disparity_is_drawn_grey_in_the_sky() -> None:

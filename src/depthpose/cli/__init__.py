@@ -38,7 +38,7 @@ COMMANDS = {
     "depth match": ("depth:match", "a real stereo pair, or many, to metric depth"),
     "depth predict": ("depth:predict", "one image, or many, or a video, to metric depth"),
     "depth train": (
-        "train:train_depth", "stages view, select, stereo, adapt, finetune of generator, matcher"),
+        "train:train_depth", "stages view, select, stereo, finetune of generator, matcher"),
     "depth calibrate": ("train:calibrate", "set when an image is refused as out of distribution"),
     "depth evaluate": ("depth:evaluate", "measure predictions by a named protocol"),
     "data make streets": (

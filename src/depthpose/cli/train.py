@@ -157,7 +157,7 @@ _LOOKED_AT = 20  # held-out pairs of a folder, by default
 
 
 def train_depth(
-    stage: tyro.conf.Positional[Literal["view", "select", "stereo", "adapt", "finetune"]],
+    stage: tyro.conf.Positional[Literal["view", "select", "stereo", "finetune"]],
     out: NewPath,
     config: Path | None = None,
     data: tuple[Source, ...] = (),
@@ -174,8 +174,6 @@ def train_depth(
         select    a generator that warps the left image to the right view, and estimates depth
                   itself; needs pairs with truth
         stereo    the matcher; needs pairs with truth
-        adapt     a trained matcher to your rig; needs its pairs with calibration, no truth. Weights
-                  are written if a held-out fifth fits better, and synthetic streets no worse
         finetune  either generator through the frozen matcher; needs weights of both
 
     A config holds every setting; the options change what they name. The run folder keeps config,
@@ -185,14 +183,14 @@ def train_depth(
         depthpose depth train view --config configs/depth/view.yaml --data kitti --out runs/view
 
     Args:
-        stage: what is trained: view, select, stereo, adapt or finetune.
+        stage: what is trained: view, select, stereo or finetune.
         out: the run folder.
         config: YAML with what differs from the thesis's settings.
         data: folders of pairs to learn from; they replace the config's.
         held_out: folders of pairs for validation alone; by default 20 of each, evenly spaced.
         generator: finetune: weights of the generator to begin with.
         matcher: finetune: weights whose matcher matches the synthesised view; it is not changed.
-        start: view, select, stereo, adapt: weights to begin with; adapt takes 'default' by default.
+        start: view, select, stereo: weights to begin with.
         encoder: select, stereo with a light network: weights of the encoder to begin with, of
             'depthpose weights import efficientnet-lite0'.
     """
@@ -202,11 +200,6 @@ def train_depth(
     kind, run_stage = STAGES[stage]
     settings = training.read(config, kind)
     settings = replace(settings, pairs=changed(settings.pairs, folders=data or None))
-    if held_out and stage == "adapt":
-        raise InputError(
-            "--held-out has no meaning for 'adapt', which holds out a share of the pairs itself "
-            "(validation_share in the config); leave it out."
-        )
     if held_out:
         # A generator is measured at the focal length of its own rig, whatever it is trained on.
         focal_px = settings.pairs.focal_px if stage == "stereo" else None

@@ -1,6 +1,6 @@
 """Truth for pairs that have none: what a matcher finds in both views, kept where they agree."""
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -17,7 +17,7 @@ from depthpose.depth.config import Settings
 from depthpose.depth.datasets import Dataset
 from depthpose.depth.disparity import left_right_difference_px
 from depthpose.depth.estimator import FakestereoNet, refuse_unrectified
-from depthpose.depth.types import DepthEstimate, Map, Mask, StereoInput
+from depthpose.depth.types import Map, StereoInput
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -38,7 +38,6 @@ def label_pairs(
     config: LabelConfig,
     folder: Path,
     settings: dict[str, object],
-    numbers: Sequence[int] | None = None,
     *,
     failures: list[InputError] | None = None,
 ) -> Iterator[tuple[str, float]]:
@@ -54,7 +53,6 @@ def label_pairs(
         config: what counts as known.
         folder: where to write; refused if other settings made what it holds.
         settings: what decides the result.
-        numbers: of the frames that are labelled; None: all.
         failures: takes what is wrong with each pair that cannot be read or matched, and the others
             are labelled; None: the first such pair is an error.
 
@@ -62,9 +60,8 @@ def label_pairs(
         InputError: no frame has both, the folder holds a label of another image of that name, no
             calibration can be read, or a pair that cannot be matched.
     """
-    chosen = range(len(dataset)) if numbers is None else numbers
-    frames = {n: dataset.frames[n] for n in chosen}
-    usable = [n for n, frame in frames.items() if frame.right and frame.calibration]
+    frames = dataset.frames
+    usable = [n for n, frame in enumerate(frames) if frame.right and frame.calibration]
     if not usable:
         raise InputError(f"{dataset.name}: no frame has a right view and a calibration to match by")
     claim_folder(folder, settings, ("left", "right", "disp_occ", "calib.txt"))
@@ -115,28 +112,17 @@ def _is_labelled(folder: Path, name: str) -> bool:
 
 def label_pair(net: FakestereoNet, pair: StereoInput, config: LabelConfig) -> Map:
     """Match a pair both ways [px]; NaN where they disagree, in the sky, or where it is not sure."""
-    one, right_px = match_both_ways(net, pair)
-    is_known = is_consistent(one.disparity_px, right_px, config)
+    assert pair.right is not None
+    mirrored = replace(pair, left=pair.right.flip(-1), right=pair.left.flip(-1))
+    one, other = (net.estimate_pair(views, with_check=False) for views in (pair, mirrored))
+    left_px, right_px = one.disparity_px, other.disparity_px.flip(-1)
+    limit_px = (config.largest_share * left_px).clamp(min=config.largest_difference_px)
+    is_known = left_right_difference_px(left_px, right_px) <= limit_px
     if one.confidence is not None:
         is_known &= one.confidence >= config.least_confidence
     if one.is_sky is not None:
         is_known &= ~one.is_sky
-    return torch.where(is_known, one.disparity_px, torch.nan)
-
-
-def match_both_ways(net: FakestereoNet, pair: StereoInput) -> tuple[DepthEstimate, Map]:
-    """Match a pair from the left view, and give the disparity of the right view [px] too."""
-    assert pair.right is not None
-    mirrored = replace(pair, left=pair.right.flip(-1), right=pair.left.flip(-1))
-    one, other = (net.estimate_pair(views, with_check=False) for views in (pair, mirrored))
-    return one, other.disparity_px.flip(-1)
-
-
-@torch.no_grad()
-def is_consistent(left_px: Map, right_px: Map, config: LabelConfig) -> Mask:
-    """Mark left pixels where the disparities of both views agree; not where a point leaves one."""
-    limit_px = (config.largest_share * left_px).clamp(min=config.largest_difference_px)
-    return left_right_difference_px(left_px, right_px) <= limit_px
+    return torch.where(is_known, left_px, torch.nan)
 
 
 def _refuse_bytes(name: str) -> None:

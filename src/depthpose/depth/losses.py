@@ -143,39 +143,6 @@ def plane_loss(
     return _mean_of_images(-(near * (1 - share) + far * share), truth_px >= 0)
 
 
-def photometric_error(one: Views, other: Views) -> Maps:
-    """Dissimilarity of each pixel's neighbourhood, 0 to 1: 0.85 (1 - SSIM) / 2 + 0.15 L1.
-
-    SSIM over 3x3 pixels, as Godard et al. (CVPR 2017) use it for views of one scene.
-    """
-
-    def mean(values: Tensor) -> Tensor:
-        return F.avg_pool2d(F.pad(values, (1, 1, 1, 1), mode="reflect"), 3, 1)
-
-    x, y = mean(one), mean(other)
-    squares = (mean(one * one), mean(other * other), mean(one * other))
-    xx, yy, xy = x**2, y**2, x * y
-    variance_x, variance_y, covariance = (m - p for m, p in zip(squares, (xx, yy, xy), strict=True))
-    first = (2 * xy + _SSIM[0]) * (2 * covariance + _SSIM[1])
-    second = (xx + yy + _SSIM[0]) * (variance_x + variance_y + _SSIM[1])
-    unlike = ((1 - first / second) / 2).clamp(0, 1).mean(1)
-    return 0.85 * unlike + 0.15 * (one - other).abs().mean(1)
-
-
-_SSIM = (0.01**2, 0.03**2)
-"""Constants of SSIM for values in [0, 1] (Wang et al. 2004)."""
-
-
-def smoothness_loss(disparity_px: Maps, image: Views) -> Float[Tensor, ""]:
-    """Mean change of disparity between neighbours [px], less where the image changes as well."""
-    total = disparity_px.new_zeros(())
-    for axis in (1, 2):
-        change = disparity_px.diff(dim=axis).abs()
-        edge = image.diff(dim=axis + 1).abs().mean(1)
-        total = total + (change * torch.exp(-10 * edge)).mean()
-    return total
-
-
 def view_loss(drawn: Views, real: Views) -> Float[Tensor, " b"]:
     """L1 of a drawn view and of its horizontal gradient, for each image."""
     colour = (drawn - real).abs().mean((1, 2, 3))

@@ -2,7 +2,6 @@
 
 from depthpose.depth.train.pairs import TrainingPairs as TrainingPairs
 from depthpose.depth.train.runs import STAGES as STAGES
-from depthpose.depth.train.runs import train_adapt as train_adapt
 from depthpose.depth.train.runs import train_finetune as train_finetune
 from depthpose.depth.train.runs import train_select as train_select
 from depthpose.depth.train.runs import train_stereo as train_stereo

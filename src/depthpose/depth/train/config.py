@@ -7,7 +7,6 @@ from depthpose.core.config import config_from_dict
 from depthpose.core.errors import InputError, refuse_unknown
 from depthpose.core.loop import AdamConfig, LoopConfig
 from depthpose.depth.config import (
-    AugmentConfig,
     DegradeConfig,
     GeneratorConfig,
     LightConfig,
@@ -218,57 +217,6 @@ class StereoTraining(Settings):
         for kind, settings in self.other.items():
             return config_from_dict(settings, MATCHERS[kind].config, source=f"other.{kind}")
         return self.light or self.matcher
-
-
-@dataclass(frozen=True, kw_only=True)
-class AdaptTraining(Settings):
-    """Self-supervised adaptation of a matcher to the pairs of one rig (see ``train.runs``)."""
-
-    start: str = "default"
-    """Weights of the matcher that is adapted (or a whole set)."""
-
-    photometric_weight: Annotated[float, "[0, inf)"] = 1.0
-    """Weight of the difference between a view and the other one looked up by its disparity."""
-
-    smooth_weight: Annotated[float, "[0, inf)"] = 0.02
-    """Weight of changes of disparity where the image does not change."""
-
-    label_weight: Annotated[float, "[0, inf)"] = 0.1
-    """Weight of the error to what the start itself found, where both views agreed."""
-
-    validation_share: Annotated[float, "(0, 1)"] = 0.2
-    """Share of the pairs, the last of each folder by name, that are not trained on: by these the
-    result is accepted or refused. The last ones, because neighbours in a recording look alike."""
-
-    streets: Annotated[int, "[0, inf)"] = 8
-    """Synthetic streets by which forgetting is measured; 0: it is not."""
-
-    adam: AdamConfig = field(
-        default_factory=lambda: AdamConfig(learning_rate=1e-4, schedule="cosine", warmup_steps=20)
-    )
-    """The optimiser."""
-
-    pairs: PairsConfig = field(
-        default_factory=lambda: PairsConfig(
-            with_cache=True, augment=AugmentConfig(crop_px=(192, 384), jitter=0.0)
-        )
-    )
-    """Pairs of the rig, with calibration; their truth is not used. Views must not be changed
-    each on its own."""
-
-    loop: LoopConfig = field(
-        default_factory=lambda: LoopConfig(steps=200, batch_size=1, save_every_steps=50)
-    )
-    """How long."""
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if not (self.photometric_weight or self.smooth_weight or self.label_weight):
-            raise InputError(
-                "photometric_weight, smooth_weight and label_weight are all 0, so nothing would be "
-                "learnt; give one above 0"
-            )
-        _refuse_views_changed_apart(self.pairs)
 
 
 @dataclass(frozen=True, kw_only=True)

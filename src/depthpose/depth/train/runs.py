@@ -1,7 +1,7 @@
 """A config to a trained weights file: how networks begin, and the stages as commands run them."""
 
-from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from collections.abc import Mapping
+from dataclasses import replace
 from hashlib import sha256
 from pathlib import Path
 from typing import Any, TypeVar, cast
@@ -12,187 +12,31 @@ from torch import nn
 from depthpose.core.checkpoint import bound_facts, file_sha256, find_weights, warn_of_terms
 from depthpose.core.config import config_to_dict
 from depthpose.core.errors import InputError
-from depthpose.core.files import write_json
 from depthpose.core.loop import Run, Task, held_out_text, releases_folder, write_card
 from depthpose.core.run import find_rank
 from depthpose.depth.config import (
     GeneratorConfig,
-    MatcherConfig,
     PairsConfig,
     SelectionConfig,
-    StreetsConfig,
 )
-from depthpose.depth.datasets import Dataset, open_dataset, refuse_common
-from depthpose.depth.disparity import warp_right_to_left
+from depthpose.depth.datasets import refuse_common
 from depthpose.depth.encoder import load_encoder
-from depthpose.depth.estimator import FakestereoNet
-from depthpose.depth.labels import is_consistent, label_pairs, match_both_ways
-from depthpose.depth.losses import photometric_error
-from depthpose.depth.metrics import measure
-from depthpose.depth.stereo import NetworkMatcher, StereoNetwork
+from depthpose.depth.stereo import StereoNetwork
 from depthpose.depth.synthesis import Generator, SelectionGenerator, UNetGenerator
-from depthpose.depth.synthetic import Streets
 from depthpose.depth.train import stages
 from depthpose.depth.train.config import (
-    AdaptTraining,
     FinetuneTraining,
     SelectTraining,
     StereoTraining,
     ViewTraining,
 )
 from depthpose.depth.train.pairs import TrainingPairs
-from depthpose.depth.types import Mask, StereoInput
 from depthpose.depth.weights import (
     MATCHERS,
-    make_matcher,
     read_generator,
     read_matcher,
     write_depth_weights,
 )
-
-_FORGOTTEN = 0.005
-"""More bad disparities on synthetic streets than this share are too many."""
-_NOTHING = 0.002
-"""A change by this share is none."""
-_STREETS_SEED = 977
-
-
-@dataclass(frozen=True, kw_only=True)
-class AdaptMetrics:
-    """What a matcher does on held-out pairs, and on synthetic streets (None without any)."""
-
-    # Difference of left views and right ones looked up, where the start's two disparities agreed.
-    photometric: float
-    # Share of pixels whose disparities of both views do not agree, or that are newly taken for sky.
-    disagreeing: float
-    street_d1: float | None  # share of bad disparities
-    street_epe_px: float | None  # mean error [px]
-
-
-class AdaptationCheck:
-    """Measures a matcher before and after, on pairs held out and on so many synthetic streets."""
-
-    def __init__(self, pairs: Sequence[StereoInput], streets: int, config: MatcherConfig) -> None:
-        self.pairs, self.config = pairs, config
-        made = Streets(StreetsConfig(seed=_STREETS_SEED, scale=0.5, frames=max(streets, 1)))
-        self.streets = [made[index] for index in range(streets)]
-        self._seen: list[Mask] = []
-        self._sky: list[Mask | None] = []
-
-    @torch.no_grad()
-    def measure(self, matcher: StereoNetwork) -> AdaptMetrics:
-        """Measure a network in eval mode; the first one decides which pixels count."""
-        net = FakestereoNet(make_matcher(matcher, self.config))
-        errors, apart = [], []
-        for number, pair in enumerate(self.pairs):
-            found, right_px = match_both_ways(net, pair)
-            left_px = found.disparity_px
-            agrees = is_consistent(left_px, right_px, stages.AGREEMENT)
-            if len(self._seen) == number:
-                self._seen.append(agrees)
-                self._sky.append(found.is_sky)
-            before = self._sky[number]
-            if found.is_sky is not None and before is not None:
-                agrees &= before | ~found.is_sky  # nothing disagrees where all is sky
-            assert pair.right is not None
-            looked_up = warp_right_to_left(pair.right, left_px)
-            counts = self._seen[number] & looked_up[0].isfinite()
-            error = photometric_error(pair.left[None], looked_up.nan_to_num(0.0)[None])[0]
-            errors.append(error[counts].mean())
-            apart.append((~agrees).float().mean())
-        bad, off_px = [], []
-        for street in self.streets:
-            truth_px = street.truth.disparity_px
-            assert truth_px is not None
-            found_px = net.estimate_pair(street.input, with_check=False).disparity_px
-            counts = truth_px > 0
-            of_street = measure("disparity", found_px[counts], truth_px[counts])
-            bad.append(of_street["d1_all"])
-            off_px.append(of_street["epe_px"])
-        return AdaptMetrics(
-            photometric=float(torch.stack(errors).mean()),
-            disagreeing=float(torch.stack(apart).mean()),
-            street_d1=sum(bad) / len(bad) if bad else None,
-            street_epe_px=sum(off_px) / len(off_px) if bad else None,
-        )
-
-
-def refuse_worse(before: AdaptMetrics, after: AdaptMetrics) -> None:
-    """Refuse a matcher that lost more than it gained."""
-    said = f"before {asdict(before)}, after {asdict(after)}"
-    advice = "no weights are written; take fewer steps, a lower learning_rate, or more pairs"
-    changes = [
-        getattr(after, name) / max(getattr(before, name), 1e-9) - 1
-        for name in ("photometric", "disagreeing")
-    ]
-    # NaN, where no pixel could be compared, is no gain either.
-    if not (all(c <= _NOTHING for c in changes) and any(c <= -_NOTHING for c in changes)):
-        raise InputError(f"the held-out pairs fit no better: {said}; {advice}.")
-    if (after.street_d1 or 0.0) > (before.street_d1 or 0.0) + _FORGOTTEN:
-        raise InputError(
-            f"synthetic streets are matched worse by more than {_FORGOTTEN:.1%} bad disparities: "
-            f"{said}; {advice}."
-        )
-
-
-def split_pairs(
-    folder: str, split: str | None, share: float, exclude: Sequence[str] = ()
-) -> tuple[Dataset, list[int], list[int]]:
-    """Open a folder of pairs; give the numbers of those to train on, and of the last, held out.
-
-    Frames that ``exclude`` names are neither.
-    """
-    dataset = open_dataset(folder, split)
-    usable = [
-        n
-        for n, frame in enumerate(dataset.frames)
-        if frame.right and frame.calibration and frame.name not in exclude
-    ]
-    usable.sort(key=lambda n: dataset.frames[n].name)
-    if len(usable) < 2:
-        raise InputError(
-            f"{dataset.name}: {len(usable)} of {len(dataset.frames)} frames have a right view and "
-            "a calibration; two at least are needed, one to train on and one to measure by"
-        )
-    number = min(max(1, round(share * len(usable))), len(usable) - 1)
-    return dataset, usable[:-number], usable[-number:]
-
-
-def fine_focal_px(config: AdaptTraining, network: StereoNetwork) -> float:
-    """Give the focal length of a fine match of the first held-out pair, not enlarged [px]."""
-    folder, split = config.pairs.folders[0], config.pairs.split
-    dataset, _, back = split_pairs(folder, split, config.validation_share, config.pairs.exclude)
-    camera = dataset.read_input(back[0]).camera
-    assert camera is not None, "pairs with a calibration"
-    matcher = make_matcher(network, MatcherConfig())
-    assert isinstance(matcher, NetworkMatcher)
-    largest_px = max(float(camera.K[0, 0]), matcher.network_config.work_focal_px or 0.0)
-    return min(matcher.work_focal_px(camera), largest_px)
-
-
-def label_folders(config: AdaptTraining, home: Path) -> tuple[PairsConfig, list[StereoInput]]:
-    """Label pairs by the start, once, below ``home``; give what to train on, and the rest."""
-    folders: list[str] = []
-    kept: list[StereoInput] = []
-    path = find_weights(config.start)
-    device = "cuda" if config.loop.device == "auto" and torch.cuda.is_available() else "cpu"
-    net = FakestereoNet.load(path, matcher=path, config=MatcherConfig(device=device))
-    for number, folder in enumerate(config.pairs.folders):
-        split = config.pairs.split if number == 0 else None
-        dataset, shown, back = split_pairs(
-            folder, split, config.validation_share, config.pairs.exclude
-        )
-        kept += [dataset.read_input(n) for n in back]
-        held_out = [dataset.frames[n].name for n in back]
-        settings = {"dataset": dataset.name, "held_out": held_out} | asdict(stages.AGREEMENT)
-        settings["weights_sha256"] = file_sha256(path)
-        place = home / f"{number}-{Path(folder).name}"
-        for _ in label_pairs(net, dataset, stages.AGREEMENT, place, settings, shown):
-            pass
-        folders.append(str(place))
-    pairs = replace(config.pairs, folders=tuple(folders), exclude=(), truth="disparity", split=None)
-    return pairs, kept
-
 
 _FREE_OF_WEIGHTS = ("max_disparity_px", "with_street", "least_confidence")
 """Settings that the weights of a training do not depend on: a matcher searches any disparities in
@@ -330,46 +174,6 @@ def train_stereo(config: StereoTraining, run: Run) -> Path:
 
 
 @releases_folder
-def train_adapt(config: AdaptTraining, run: Run) -> Path:
-    """Adapt a matcher to a rig by its pairs alone; give its weights file.
-
-    Raises:
-        InputError: no folder of pairs, or the matcher became worse.
-    """
-    torch.manual_seed(config.loop.seed)
-    if not config.pairs.folders:
-        raise InputError("there is nothing to adapt to: name a folder of the rig's pairs (--data).")
-    matcher = read_matcher(find_weights(config.start))
-    if config.pairs.focal_px is None:
-        pairs = replace(config.pairs, focal_px=fine_focal_px(config, matcher))
-        config = replace(config, pairs=pairs)
-    labelled, kept = label_folders(config, run.folder / "labels")
-    pairs = TrainingPairs(labelled, config.loop.seed, needs_truth=True)
-    facts, seconds = _run_stage(stages.AdaptTask(matcher, config), pairs, config, run)
-    facts = facts | {"truth": "none; pseudo-labels of the initial weights regularise it"}
-    path = run.folder / "matcher.safetensors"
-    if find_rank().rank:
-        return path
-    device = str(next(matcher.parameters()).device)
-    check = AdaptationCheck(kept, config.streets, MatcherConfig(device=device))
-    before = read_matcher(find_weights(config.start))
-    found = [check.measure(network) for network in (before, matcher.eval())]
-    write_json(run.folder / "adapt.json", [asdict(metrics) for metrics in found])
-    refuse_worse(*found)
-    write_depth_weights(path, matcher=matcher, facts=facts)
-    text = [
-        "Held-out pairs, and synthetic streets:",
-        "",
-        "| | before | after |",
-        "| --- | --- | --- |",
-    ]
-    both = zip(asdict(found[0]).items(), asdict(found[1]).values(), strict=True)
-    text += [f"| {name} | {old:.4g} | {new:.4g} |" for (name, old), new in both if old is not None]
-    write_card(path, "depth train adapt", seconds, facts, "\n".join(text))
-    return path
-
-
-@releases_folder
 def train_finetune(config: FinetuneTraining, run: Run) -> Path:
     """Fine-tune the generator through the frozen matcher; give the weights file of both."""
     torch.manual_seed(config.loop.seed)
@@ -396,7 +200,6 @@ STAGES = {
     "view": (ViewTraining, train_view),
     "select": (SelectTraining, train_select),
     "stereo": (StereoTraining, train_stereo),
-    "adapt": (AdaptTraining, train_adapt),
     "finetune": (FinetuneTraining, train_finetune),
 }
 """Config and function of each stage, by its name on the command line."""

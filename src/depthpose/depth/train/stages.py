@@ -17,13 +17,11 @@ from depthpose.core.loop import Update, ValidationResult, make_adam, sample_gene
 from depthpose.depth import losses, synthesis
 from depthpose.depth.augment import TrainingPair, degrade
 from depthpose.depth.config import DegradeConfig
-from depthpose.depth.disparity import right_disparity_from_left, warp_right_to_left
+from depthpose.depth.disparity import right_disparity_from_left
 from depthpose.depth.encoder import LiteEncoder
-from depthpose.depth.labels import LabelConfig, is_consistent
 from depthpose.depth.stereo import StereoNetwork, normalise
 from depthpose.depth.stereo.matcher import pad_top_right
 from depthpose.depth.train.config import (
-    AdaptTraining,
     FinetuneTraining,
     SelectTraining,
     StereoTraining,
@@ -392,51 +390,3 @@ class SelectTask:
         numbers = {"abs_rel": errors, "d1": within, "sky_missed": missed}
         means = {f"held_out/{k}": sum(v) / len(v) for k, v in numbers.items() if v}
         return ValidationResult(numbers=means, pictures=pictures)
-
-
-AGREEMENT = LabelConfig()
-"""When the disparities of both views agree."""
-
-
-class AdaptTask:
-    """Adapt a matcher to one rig's pairs, without truth.
-
-    The loss warps the other view by the disparity of each view and compares (Godard et al., CVPR
-    2017), where the disparities of both views agree: elsewhere one of the two does not see the
-    point. Labels of the initial matcher, where both views agreed at full size, regularise it.
-    """
-
-    def __init__(self, matcher: StereoNetwork, config: AdaptTraining) -> None:
-        self.config, self.matcher = config, matcher.train()
-        for part in matcher.modules():
-            # Statistics stay those of the training before: one or two pairs have none.
-            if isinstance(part, nn.BatchNorm2d | nn.BatchNorm3d):
-                part.eval()
-        self.modules: dict[str, nn.Module] = {"matcher": matcher}
-        parameters = [p for p in matcher.parameters() if p.requires_grad]
-        self.optimizers = {"matcher": (make_adam(parameters, config.adam), config.adam)}
-
-    def step(self, batch: TrainingPair) -> Iterator[Update]:
-        """One update: match both ways, warp each view to the other."""
-        views = torch.cat([batch.left, batch.right.flip(-1)])
-        others = torch.cat([batch.right, batch.left.flip(-1)])
-        heads = [head.float() for head in self.matcher(normalise(views), normalise(others))]
-        found_px, count = heads[-1], len(batch.left)
-        # The mean difference where both ways agree; the first ``count`` are left views.
-        looked_up = torch.stack(list(map(warp_right_to_left, others, found_px)))
-        both = zip(found_px, found_px.roll(count, 0).flip(-1), strict=True)
-        is_seen = torch.stack([is_consistent(one, back, AGREEMENT) for one, back in both])
-        error = losses.photometric_error(views, looked_up.nan_to_num(0.0))
-        error = torch.where(is_seen, error, 0.0).sum() / is_seen.sum().clamp(min=1)
-        smooth = losses.smoothness_loss(found_px, views)
-        max_disparity_px = self.matcher.config.max_disparity_px
-        label = losses.heads_loss([head[:count] for head in heads], batch.left_px, max_disparity_px)
-        config = self.config
-        loss = config.photometric_weight * error + config.smooth_weight * smooth
-        loss = loss + config.label_weight * label
-        facts = {"photometric": error.detach(), "smooth": smooth.detach(), "label": label.detach()}
-        yield Update("matcher", loss, facts)
-
-    def validate(self) -> ValidationResult:
-        """Nothing: the held-out pairs are looked at once, at the end."""
-        return ValidationResult()
