@@ -244,7 +244,7 @@ def test_without_bf16_one_line_is_said_and_the_record_says_fp32(
 def test_options_of_psmnet_are_refused_with_sgbm(
     pair_folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert match(pair_folder, tmp_path / "o", "--matcher", "sgbm", "--tile", "64", "64") == 2
+    assert match(pair_folder, tmp_path / "o", "--matcher", "sgbm", "--left-right-check") == 2
     assert "has no effect here; sgbm has no weights" in capsys.readouterr().err
     assert not (tmp_path / "o").exists()
 

@@ -157,17 +157,13 @@ def test_extending_matchers_with_training(
     assert isinstance(read_depth_weights(out).matcher, FlatNetwork)
 
 
-def test_a_matcher_without_tiles_refuses_them(
-    pairs: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+def test_a_matcher_without_a_graph_is_not_exported(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     kind = MatcherKind(config=FlatConfig, network=FlatNetwork, matcher=FlatMatcher)
     monkeypatch.setitem(MATCHERS, "flat", kind)
     weights = tmp_path / "flat.safetensors"
     write_depth_weights(weights, matcher=FlatNetwork(FlatConfig()), facts=FACTS)
-    sides = [str(pairs / "left"), str(pairs / "right"), "--camera", str(pairs / "camera.json")]
-    how = ["--no-check", "--weights", str(weights), "--tile", "32", "32"]
-    assert main(["depth", "match", *sides, *how, "--out", str(tmp_path / "out")]) != 0
-    assert "--tile: flat matches no tiles" in capsys.readouterr().err
     with pytest.raises(InputError, match="the matcher is FlatNetwork, and no file is made of it"):
         depth_export(read_depth_weights(weights), "pair", {}).graph()
 

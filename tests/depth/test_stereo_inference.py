@@ -10,7 +10,6 @@ import torch
 import torch.nn.functional as F
 from tests.depth.random_norms import with_random_norms
 
-from depthpose.core.camera import StereoRig
 from depthpose.core.devices import PrecisionNotice, computes_bf16
 from depthpose.core.errors import InputError
 from depthpose.depth.config import MatcherConfig, PSMNetConfig
@@ -20,12 +19,9 @@ from depthpose.depth.stereo import (
     layers,
     normalise,
     psmnet,
-    tile_change_px,
 )
 from depthpose.depth.stereo.matcher import (
-    Tiling,
     lower_where_disagreeing,
-    match_tiles,
     pad_top_right,
 )
 from depthpose.depth.stereo.psmnet import (
@@ -217,7 +213,7 @@ def test_a_bound_is_met_or_refused_with_the_least_that_works(size: tuple[int, in
         PSMNetMatcher(network, MatcherConfig(max_memory_bytes=1000)).match(left, right)
     assert "max_memory_bytes=1000 is too small for images of" in str(caught.value)
     assert "precision='bf16'" in str(caught.value)
-    assert "tiles (tile_px)" in str(caught.value)
+    assert "at a smaller size" in str(caught.value)
     least = int(str(caught.value).split("this matcher takes ")[1].split(";")[0])
     free = PSMNetMatcher(network).match(left, right)
     bound = PSMNetMatcher(network, MatcherConfig(max_memory_bytes=least)).match(left, right)
@@ -232,58 +228,6 @@ def test_the_published_size_takes_less_than_1_gb_of_a_pair_of_kitti() -> None:
     assert whole < 1_000_000_000
     assert psmnet_bytes(network, *size, torch.bfloat16) < whole
     assert psmnet_bytes(network, *size, torch.float32, rows=8) < whole
-
-
-@pytest.mark.parametrize("overlap", [0, 8])
-def test_tiles_of_a_pointwise_matcher_change_nothing(overlap: int) -> None:
-    left, right = torch.rand(2, 3, 50, 90)
-    answer = match_tiles(
-        lambda a, b: Match(disparity_px=a[0], confidence=b[1]),
-        left,
-        right,
-        Tiling(20, 30, overlap, 16),
-    )
-    assert torch.allclose(answer.disparity_px, left[0], atol=1e-6)
-    assert answer.confidence is not None
-    assert torch.allclose(answer.confidence, right[1], atol=1e-6)
-
-
-def test_each_tile_sees_its_disparity_range_to_the_left() -> None:
-    seen = []
-
-    def match(left: torch.Tensor, right: torch.Tensor) -> Match:
-        seen.append(tuple(left.shape[-2:]))
-        return Match(disparity_px=torch.zeros(left.shape[-2:]))
-
-    left, right = torch.rand(2, 3, 20, 100)
-    assert match_tiles(match, left, right, Tiling(20, 50, 4, 16)).confidence is None
-    assert seen == [(20, 54), (20, 70)]
-
-
-def test_tile_change_is_zero_for_one_tile_and_needs_tiles() -> None:
-    network = random_network(SMALL)
-    left, right = torch.rand(2, 3, 64, 96)
-    matcher = PSMNetMatcher(network, MatcherConfig(tile_px=(64, 96)))
-    assert tile_change_px(matcher, left, right) < 1e-5
-    matcher = PSMNetMatcher(network, MatcherConfig(tile_px=(32, 48), tile_overlap_px=8))
-    assert 0 < tile_change_px(matcher, left, right) < 32
-    assert matcher.config.tile_px == (32, 48), "its config stays"
-    with pytest.raises(InputError, match="set tile_px in its config"):
-        tile_change_px(PSMNetMatcher(network), left, right)
-
-
-def test_tile_change_is_measured_at_the_size_of_the_match() -> None:
-    """At twice the focal length the network's own, the pair is matched at half its size."""
-    network = random_network(replace(SMALL, work_focal_px=50.0))
-    left, right = torch.rand(2, 3, 64, 96)
-    K = torch.tensor([[100.0, 0, 48], [0, 100, 32], [0, 0, 1]], dtype=torch.float64)
-    rig = StereoRig(width=96, height=64, K=K, baseline_m=0.1)
-    matcher = PSMNetMatcher(
-        network, MatcherConfig(tile_px=(32, 48), tile_overlap_px=8, speed="quick")
-    )
-    assert matcher.work_size(rig) == (32, 48)
-    assert tile_change_px(matcher, left, right, rig) < 1e-5, "one tile"
-    assert tile_change_px(matcher, left, right) > 1e-3
 
 
 def test_left_right_check_lowers_confidence_where_views_disagree() -> None:

@@ -207,13 +207,13 @@ def test_training_further_does_not_change_a_matcher() -> None:
     assert torch.equal(matcher.match(left, right).disparity_px, before)
 
 
-def test_it_is_a_matcher_of_cameras_and_tiles() -> None:
+def test_it_is_a_matcher_of_cameras() -> None:
     network = random_network(dataclasses.replace(SMALL, work_focal_px=80.0))
     left, right = shifted_pair(64, 128, 5)
     K = torch.tensor([[160.0, 0, 64], [0, 160, 32], [0, 0, 1]], dtype=torch.float64)
     camera = Camera(width=128, height=64, K=K)
     quick = make_matcher(network, MatcherConfig(speed="quick"))
-    fine = make_matcher(network, MatcherConfig(tile_px=(32, 64), tile_overlap_px=8))
+    fine = make_matcher(network, MatcherConfig())
     assert isinstance(quick, LightMatcher)
     assert isinstance(fine, CameraMatcher)
     assert quick.work_size(camera) == (32, 64)

@@ -177,8 +177,6 @@ def test_network_config_refuses_nonsense(settings: dict, text: str) -> None:
     ("settings", "text"),
     [
         ({"max_memory_bytes": 0}, "max_memory_bytes must be in"),
-        ({"tile_px": (0, 5)}, "tile_px must be in"),
-        ({"tile_overlap_px": -1}, "tile_overlap_px must be in"),
     ],
 )
 def test_matcher_config_refuses_nonsense(settings: dict, text: str) -> None:

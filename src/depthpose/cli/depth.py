@@ -103,8 +103,6 @@ def match(
     from depthpose.core.camera import read_rig
     from depthpose.core.files import image_size
     from depthpose.core.run import refuse_among_inputs
-    from depthpose.depth.estimator import FakestereoNet
-    from depthpose.depth.stereo import NetworkMatcher, tile_change_px
 
     used = None if pairs.matcher == "sgbm" else pairs.matcher or pairs.weights or "default"
     method = MethodSource(weights=used, config=matching.config, with_right=True, use="pairs")
@@ -126,14 +124,6 @@ def match(
     this = work_of(files[0])
     refuse_among_inputs(Path(out), (left, right), [path for pair in files for path in pair])
     built = method.build()
-    if matching.tile is not None:
-        pair = this.input_of(files[0][0].stem, *files[0])
-        assert pair.right is not None
-        assert isinstance(built.net, FakestereoNet)
-        if not isinstance(built.net.matcher, NetworkMatcher):
-            raise InputError(f"--tile: {built.name} matches no tiles; omit --tile")
-        change_px = tile_change_px(built.net.matcher, pair.left, pair.right, pair.camera)
-        print(f"tiles change the disparity of {pair.name} by {change_px:.4f} px on average")
     return work.estimate_all(files, this, built, Path(out))
 
 

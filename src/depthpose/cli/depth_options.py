@@ -85,18 +85,13 @@ class ScaleOptions:
 class MatchOptions(MatcherOptions):
     """How the matcher of the weights runs; sgbm takes none of these."""
 
-    tile: tuple[int, int] | None = None
-    """match tiles of so many rows and columns: less memory, an approximate result. The first pair
-    is matched whole as well, and the change is printed."""
     left_right_check: bool = False
     """match the mirrored pair too, which makes the confidence better."""
 
     @property
     def config(self) -> MatcherConfig:
         """Settings of the matcher."""
-        return replace(
-            super().config, tile_px=self.tile, with_left_right_check=self.left_right_check
-        )
+        return replace(super().config, with_left_right_check=self.left_right_check)
 
 
 @group

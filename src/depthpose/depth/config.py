@@ -275,13 +275,7 @@ class MatcherConfig(Settings):
     speed."""
 
     max_memory_bytes: Annotated[int | None, "[1, inf)"] = None
-    """Bound on the memory of activations, exact (no tiles); None: no bound."""
-
-    tile_px: Annotated[tuple[int, int] | None, "[1, inf)"] = None
-    """Rows and columns of tiles that are matched one by one and blended: approximate."""
-
-    tile_overlap_px: Annotated[int, "[0, inf)"] = 64
-    """Overlap of neighbouring tiles, beyond the disparity range to the left of each."""
+    """Bound on the memory of activations; None: no bound."""
 
     with_confidence: bool = True
     """Say for each pixel how sure the match is."""

@@ -1,14 +1,14 @@
 """Matchers: a function of the user's, OpenCV's StereoSGBM, and a network with weights.
 
-What networks share: normalisation, padding, the working focal length, tiles, the left-right check.
+What networks share: normalisation, padding, the working focal length, the left-right check.
 """
 
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
-from copy import copy, deepcopy
+from copy import deepcopy
 from dataclasses import replace
-from typing import Any, ClassVar, NamedTuple, Protocol, runtime_checkable
+from typing import Any, ClassVar, Protocol, runtime_checkable
 
 import numpy as np
 import torch
@@ -23,7 +23,7 @@ from depthpose.core.errors import InputError, import_opencv
 from depthpose.depth import disparity
 from depthpose.depth.config import MatcherConfig, NetworkConfig, SGBMConfig
 from depthpose.depth.encoder import LiteEncoder
-from depthpose.depth.types import Map, Maps, Match, View, Views
+from depthpose.depth.types import Map, Maps, Match, Views
 
 
 @runtime_checkable
@@ -260,7 +260,7 @@ class StereoNetwork(nn.Module):
 
 
 class NetworkMatcher(ABC):
-    """A network with pre- and post-processing: normalisation, padding, device, memory, tiles.
+    """A network with pre- and post-processing: normalisation, padding, device, memory.
 
     A kind of network adds :meth:`fold` and :meth:`run`. The weights are copied: training
     ``network`` further does not change this matcher. Where the processor has no bf16, ``config``
@@ -317,7 +317,7 @@ class NetworkMatcher(ABC):
     def match_many(
         self, pairs: Sequence[tuple[Tensor, Tensor]], camera: Camera | None = None
     ) -> list[Match]:
-        """Match pairs; those of one size together, unless memory is bounded or there are tiles.
+        """Match pairs; those of one size together, unless memory is bounded.
 
         Pairs of a known camera are matched at the size of :meth:`work_size`. A processor is busy
         with one pair; it is a GPU that gains from several.
@@ -336,7 +336,7 @@ class NetworkMatcher(ABC):
             steps = math.ceil(round(trained.max_disparity_px * larger, 3) / trained.step_px)
             network = replace(trained, max_disparity_px=steps * trained.step_px)
             views = [tuple(disparity.resize_image(view, *size) for view in pair) for pair in pairs]
-        is_bounded = self.config.tile_px is not None or self.config.max_memory_bytes is not None
+        is_bounded = self.config.max_memory_bytes is not None
         together = not is_bounded and len({left.shape for left, _ in views}) == 1
         matches: list[Match] = []
         for group in [views] if together else [[pair] for pair in views]:
@@ -344,10 +344,9 @@ class NetworkMatcher(ABC):
                 normalise(torch.stack(side).to(self.device, torch.float32))
                 for side in zip(*group, strict=True)
             )
-            match = self._match_padded if self.config.tile_px is None else self._match_in_tiles
-            found = match(left, right, network)
+            found = self._match_padded(left, right, network)
             if self.config.with_left_right_check:
-                mirrored = match(right.flip(-1), left.flip(-1), network)
+                mirrored = self._match_padded(right.flip(-1), left.flip(-1), network)
                 other_px = [match.disparity_px.flip(-1) for match in mirrored]
                 found = list(map(lower_where_disagreeing, found, other_px))
             matches += found
@@ -375,19 +374,6 @@ class NetworkMatcher(ABC):
         share = math.sqrt(self.fine_pixels / (camera.height * camera.width))
         return max(trained_px, float(camera.K[0, 0]) * min(share, self.most_enlarged))
 
-    def _match_in_tiles(self, left: Views, right: Views, network: NetworkConfig) -> list[Match]:
-        assert self.config.tile_px is not None
-        overlap_px, most_px = self.config.tile_overlap_px, network.max_disparity_px
-        tiling = Tiling(*self.config.tile_px, overlap_px, most_px)
-        return [
-            match_tiles(
-                lambda one, other: self._match_padded(one[None], other[None], network)[0],
-                *pair,
-                tiling,
-            )
-            for pair in zip(left, right, strict=True)
-        ]
-
     def _match_padded(self, left: Views, right: Views, network: NetworkConfig) -> list[Match]:
         """Match normalised pairs of any size: padded, and cropped back."""
         h, w = left.shape[-2:]
@@ -399,8 +385,8 @@ class NetworkMatcher(ABC):
             quick = "" if network.work_focal_px is None else " or speed='quick'"
             raise InputError(
                 f"max_memory_bytes={most} is too small for images of {height}x{width} (padded): "
-                f"this matcher takes {least}; allow that, take precision='bf16'{quick}, or match "
-                "tiles (tile_px)"
+                f"this matcher takes {least}; allow that, take precision='bf16'{quick}, or "
+                "match the pair at a smaller size"
             )
         matches = self.run(left, right, network)
         return [disparity.changed_match(match, lambda values: values[-h:, :w]) for match in matches]
@@ -442,90 +428,3 @@ def lower_where_disagreeing(found: Match, right_px: Map) -> Match:
     if found.confidence is not None and found.is_sky is not None:
         confidence = torch.where(found.is_sky, found.confidence, confidence)
     return replace(found, confidence=confidence)
-
-
-def tile_change_px(
-    matcher: NetworkMatcher, left: Tensor, right: Tensor, camera: Camera | None = None
-) -> float:
-    """Mean difference that tiles make to the disparity of a pair [px].
-
-    Args:
-        matcher: with tiles.
-        left: left image, ``(3, H, W)`` RGB in [0, 1].
-        right: right image, the same size.
-        camera: of the left image, which decides the size at which the pair is matched.
-
-    Raises:
-        InputError: the matcher uses no tiles, or the pair is unusable.
-    """
-    if matcher.config.tile_px is None:
-        raise InputError("tile_change_px needs a matcher with tiles; set tile_px in its config")
-    whole = copy(matcher)
-    whole.config = replace(matcher.config, tile_px=None)
-    tiled, untiled = (one.match_many([(left, right)], camera)[0] for one in (matcher, whole))
-    return float((tiled.disparity_px - untiled.disparity_px).abs().mean())
-
-
-class Tiling(NamedTuple):
-    """Size of a tile's own part, what neighbours share, and what lies to the left besides [px].
-
-    A left pixel at x matches a right one at x - disparity, so each tile sees
-    ``max_disparity_px`` more columns on its left than it answers for.
-    """
-
-    rows: int
-    columns: int
-    overlap: int
-    max_disparity_px: int
-
-
-class Span(NamedTuple):
-    """One tile along one axis: what it sees, from where it counts, and its weights there."""
-
-    seen: slice
-    counted: slice
-    inside: slice  # what counts, in what is seen
-    weight: Float[Tensor, " n"]
-
-
-def match_tiles(
-    match: Callable[[View, View], Match], left: View, right: View, tiling: Tiling
-) -> Match:
-    """Match tile by tile and blend the answers linearly where tiles overlap."""
-    h, w = left.shape[-2:]
-    total = left.new_zeros(4, h, w)
-    with_confidence = with_sky = True
-    for y in _spans(h, tiling.rows, tiling.overlap, 0):
-        for x in _spans(w, tiling.columns, tiling.overlap, tiling.max_disparity_px):
-            tile = match(left[:, y.seen, x.seen], right[:, y.seen, x.seen])
-            inner = (y.inside, x.inside)
-            weight = (y.weight[:, None] * x.weight).to(left)
-            total[0, y.counted, x.counted] += weight
-            total[1, y.counted, x.counted] += weight * tile.disparity_px[inner]
-            with_confidence, with_sky = tile.confidence is not None, tile.is_sky is not None
-            if tile.confidence is not None:
-                total[2, y.counted, x.counted] += weight * tile.confidence[inner]
-            if tile.is_sky is not None:
-                total[3, y.counted, x.counted] += weight * tile.is_sky[inner]
-    disparity_px, confidence, sky = total[1:] / total[0]
-    return Match(
-        disparity_px=disparity_px,
-        confidence=confidence if with_confidence else None,
-        is_sky=sky > 0.5 if with_sky else None,
-    )
-
-
-def _spans(length: int, step: int, overlap: int, max_disparity_px: int) -> list[Span]:
-    spans = []
-    for own_first in range(0, length, step):
-        own_stop = min(own_first + step, length)
-        first, stop = max(own_first - overlap, 0), min(own_stop + overlap, length)
-        at = torch.arange(first, stop) + 0.5
-        ramp = max(2 * overlap, 1)
-        rising = (at - own_first + overlap) / ramp if own_first else torch.ones_like(at)
-        falling = (own_stop + overlap - at) / ramp if own_stop < length else torch.ones_like(at)
-        weight = rising.clamp(0, 1) * falling.clamp(0, 1)
-        seen = slice(max(first - max_disparity_px, 0), stop)
-        inside = slice(first - seen.start, stop - seen.start)
-        spans.append(Span(seen, slice(first, stop), inside, weight))
-    return spans
