@@ -41,7 +41,6 @@ IGNORED = [
     ("depth evaluate", "--weights quick:a fine:b --speed fine", "--speed"),
     ("depth evaluate", "--weights own:a --precision bf16", "--precision"),
     ("depth evaluate", "--protocol kitti-2015 --cap 50", "--cap"),
-    ("data export-depth", "r --format colmap --files npy", "--files"),
     ("weights complete", "w --models . --unit m", "--unit"),
     ("reproduce all", "--linemod l --split all", "--split"),
 ]

@@ -51,8 +51,6 @@ COMMANDS = {
     "data label": (
         "data:label", "truth for pairs that have none, by a matcher, where both views agree"),
     "data pack": ("data:pack", "a data set as tar shards: few large files, from a disk or a store"),
-    "data export-depth": (
-        "data:export_depth", "predicted depth as COLMAP's and nerfstudio's files"),
     "data duplicates": ("data:duplicates", "find evaluation images that are in a training set"),
     "weights list": ("weights:list_weights", "list the weights"),
     "weights show": ("weights:show_weights", "print what a weights file holds"),

@@ -345,69 +345,6 @@ def label(
     return 1 if failures else 0
 
 
-def export_depth(
-    results: tyro.conf.Positional[Path],
-    format: Literal["colmap", "nerfstudio"],
-    out: NewPath,
-    files: Literal["png", "npy"] = "png",
-    images: Path | None = None,
-    scale: float = 1.0,
-) -> int:
-    """Write depth of 'depth predict' or 'depth match' as files of COLMAP or nerfstudio.
-
-    colmap: OUT/stereo/depth_maps/IMAGE.geometric.bin of a dense workspace, OUT; stereo_fusion needs
-    normal maps too, which are not written. nerfstudio: OUT/depths/NAME.png or .npy in millimetres,
-    0 where nothing is known, and beside transforms.json of OUT transforms_depth.json, which names
-    them: ns-train depth-nerfacto --data OUT/transforms_depth.json. Depth is in metres; a
-    reconstruction from images alone has another unit: --scale is how many make a metre.
-
-        depthpose data export-depth out --format colmap --out dense
-        depthpose data export-depth out --format nerfstudio --files npy --out data
-
-    Args:
-        results: folder of predictions.
-        format: program whose format is written.
-        out: folder to write to: COLMAP's dense workspace, or nerfstudio's data set.
-        files: of nerfstudio: png holds at most 65.535 m, farther pixels are unknown; npy holds all.
-        images: of colmap: folder that image names are relative to; by default that of each image.
-        scale: units of the reconstruction per metre.
-    """
-    from depthpose.core.files import write_json
-    from depthpose.core.run import claim_folder
-    from depthpose.depth import predictions
-
-    if not (math.isfinite(scale) and scale > 0):
-        raise InputError(f"--scale {scale:g}: units per metre must be positive; 1 for metres")
-    settings = {"command": "data export-depth", "results": str(results.resolve())}
-    settings |= {"scale": scale, "format": format}
-    readers = predictions.read_predicted(results)
-    if format == "colmap":
-        named = predictions.colmap_files(results, readers, images)
-        claim_folder(out, settings, named.values())
-        for name in _shown(readers, len(readers), "frames"):
-            predictions.write_colmap_map(out / named[name], readers[name]() * scale)
-        print(f"{out}: depth of {len(named)} images in stereo/depth_maps")
-        return 0
-    named = {name: f"depths/{name}.{files}" for name in readers}
-    frames = predictions.nerfstudio_frames(out, named)
-    claim_folder(out, settings | {"files": files}, [*named.values(), predictions.TRANSFORMS_DEPTH])
-    lost = 0
-    for name in _shown(readers, len(readers), "frames"):
-        lost += predictions.write_nerfstudio_map(out / named[name], readers[name]() * scale)
-    beside = "there is no transforms.json"
-    if frames is not None:
-        write_json(out / predictions.TRANSFORMS_DEPTH, frames)
-        beside = "transforms_depth.json names them"
-    print(f"{out}: depth of {len(named)} frames in depths; {beside}")
-    if lost:
-        print(
-            f"depthpose: {lost} pixels are beyond 65.535 m, which a PNG cannot hold, and are "
-            "unknown there; --files npy keeps them",
-            file=sys.stderr,
-        )
-    return 0
-
-
 def _shown(written: "Iterable[Any]", total: int | None, what: str) -> "Iterable[Any]":
     from tqdm import tqdm
 

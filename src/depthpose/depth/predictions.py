@@ -1,7 +1,4 @@
-"""Estimates as files: writing them all or nothing, reading them back, and as other tools keep them.
-
-These are COLMAP's dense workspace (``stereo/depth_maps``) and nerfstudio's data sets.
-"""
+"""Estimates as files: writing them all or nothing, and reading them back."""
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import asdict, replace
@@ -9,8 +6,6 @@ from functools import partial
 from pathlib import Path
 from typing import Any, Protocol, runtime_checkable
 
-import numpy as np
-import torch
 from jaxtyping import Float
 from torch import Tensor
 
@@ -19,9 +14,9 @@ from depthpose.core.camera import Camera, StereoRig
 from depthpose.core.config import config_from_dict
 from depthpose.core.draw import draw_depth, draw_disparity
 from depthpose.core.errors import InputError
-from depthpose.core.files.disk import AnyPath, write_bytes
+from depthpose.core.files.disk import write_bytes
 from depthpose.core.files.text import read_text
-from depthpose.core.run import claim_folder, claim_names, is_whole, note_result, read_sources
+from depthpose.core.run import claim_folder, claim_names, is_whole, note_result
 from depthpose.depth.disparity import depth_from_disparity, disparity_from_depth
 from depthpose.depth.metrics import SMALLEST_DEPTH_M
 from depthpose.depth.types import DepthEstimate, Ground, Map, StereoInput
@@ -235,100 +230,3 @@ def predict(
             pair = read_input()
             note_result(folder, name, write_estimate(folder, pair, net.estimate_pair(pair)))
         yield name
-
-
-NERFSTUDIO_UNIT = 0.001
-"""What nerfstudio multiplies depth files of either kind by, by default."""
-TRANSFORMS, TRANSFORMS_DEPTH = "transforms.json", "transforms_depth.json"
-_METRES = ".depth_m.npy"
-
-
-def read_predicted(results: Path) -> dict[str, Callable[[], Map]]:
-    """Give readers of depth [m], NaN where unknown, of the frames of a folder of predictions."""
-    names = sorted(path.name.removesuffix(_METRES) for path in results.glob(f"*{_METRES}"))
-    if not names:
-        raise InputError(
-            f"{results}: no NAME{_METRES} in it; give a folder that 'depth predict' or 'depth "
-            "match' wrote, with a camera"
-        )
-
-    def read(name: str) -> Map:
-        depth_m = files.read_map(results / f"{name}{_METRES}")
-        return torch.where(depth_m > 0, depth_m, torch.nan)
-
-    return {name: partial(read, name) for name in names}
-
-
-def colmap_files(results: Path, names: Iterable[str], images: Path | None = None) -> dict[str, str]:
-    """Say where in COLMAP's workspace the depth of each frame belongs.
-
-    COLMAP calls a map by its image, suffix and all: ``stereo/depth_maps/a.jpg.geometric.bin``.
-    """
-    sources = read_sources(results)
-    places = {}
-    for name in names:
-        image = sources.get(name, Path(f"{name}.png"))
-        if images is None:
-            inside = Path(image.name)
-        elif image.is_relative_to(images.resolve()):
-            inside = image.relative_to(images.resolve())
-        else:
-            raise InputError(f"{image}: does not lie in --images {images}; name their folder")
-        places[name] = f"stereo/depth_maps/{inside.as_posix()}.geometric.bin"
-    return places
-
-
-def nerfstudio_frames(out: Path, named: Mapping[str, str]) -> dict[str, Any] | None:
-    """Give ``transforms.json`` of a data set with the depth of each frame; None where it has none.
-
-    Raises:
-        InputError: it lists no frames, or one without a prediction: nerfstudio takes depth for
-            all frames or for none.
-    """
-    path = out / TRANSFORMS
-    if not path.exists():
-        return None
-    content = files.read_json(path)
-    frames = content.get("frames") if isinstance(content, dict) else None
-    is_list = isinstance(frames, list) and all(isinstance(f, dict) for f in frames)
-    if not isinstance(content, dict) or not is_list:
-        raise InputError(f"{path}: has no list of 'frames'; give one that ns-process-data wrote")
-    given = []
-    for frame in frames or ():
-        name = Path(str(frame.get("file_path", ""))).stem
-        if name not in named:
-            raise InputError(
-                f"{path}: frame {name!r} has no prediction, and nerfstudio takes depth for all "
-                f"frames or for none; predict it too. There are {', '.join(list(named)[:3])}, ..."
-            )
-        given.append({**frame, "depth_file_path": named[name]})
-    return {**content, "frames": given, "depth_unit_scale_factor": NERFSTUDIO_UNIT}
-
-
-def write_nerfstudio_map(path: Path, depth: Map) -> int:
-    """Write depth in thousandths, and give how many pixels a PNG, up to 65.535 units, lost."""
-    if path.suffix == ".png":
-        files.write_depth_png(path, depth, NERFSTUDIO_UNIT)
-        return int((depth > 65535 * NERFSTUDIO_UNIT).sum())
-    files.write_map(path, depth.nan_to_num(0.0) / NERFSTUDIO_UNIT)
-    return 0
-
-
-def write_colmap_map(path: AnyPath, depth: Map) -> None:
-    """Write a depth map; 0 where it is NaN.
-
-    ``WIDTH&HEIGHT&CHANNELS&`` in text, then little-endian float32, columns fastest, as
-    ``scripts/python/read_dense.py`` of COLMAP reads it.
-
-    Args:
-        path: ``stereo/depth_maps/IMAGE.geometric.bin``, IMAGE with its own suffix.
-        depth: in the unit of the reconstruction, NaN where nothing is known.
-
-    Raises:
-        InputError: the map is empty or holds infinity, or the disk refuses.
-    """
-    rows = depth.detach().cpu().float().nan_to_num(0.0, torch.inf, -torch.inf).numpy()
-    if rows.size == 0 or np.isinf(rows).any():
-        raise InputError(f"{path}: the map is empty or holds infinity; mark invalid pixels by NaN")
-    height, width = rows.shape
-    write_bytes(path, f"{width}&{height}&1&".encode() + rows.astype("<f4").tobytes())
