@@ -84,19 +84,14 @@ class TrainingPair(NamedTuple):
 
     Whatever is done to it, ``focal_px * baseline_m / left_px`` stays the depth of each pixel
     (where the rig has two principal points, their difference is scaled as the focal length is).
-
-    Attributes:
-        left: RGB in [0, 1].
-        right: RGB in [0, 1], rectified, of the same size.
-        left_px: disparity of the left view [px], NaN for unknown.
-        right_px: disparity of the right view, counted positive as well: what is truth after a flip.
-        focal_px: focal length along the rows (fx) at this size; NaN for unknown.
     """
 
-    left: Float[Tensor, "*b 3 h w"]
-    right: Float[Tensor, "*b 3 h w"]
-    left_px: Float[Tensor, "*b h w"]
+    left: Float[Tensor, "*b 3 h w"]  #: RGB in [0, 1]
+    right: Float[Tensor, "*b 3 h w"]  #: RGB in [0, 1], rectified, of the same size
+    left_px: Float[Tensor, "*b h w"]  #: disparity of the left view [px], NaN for unknown
+    #: disparity of the right view, counted positive as well: what is truth after a flip
     right_px: Float[Tensor, "*b h w"]
+    #: focal length along the rows (fx) at this size; NaN for unknown
     focal_px: Float[Tensor, "*b"] = _UNKNOWN
 
 

@@ -44,17 +44,13 @@ class Protocol:
 
     In all protocols of depth truth counts between 0.001 m and the cap, and predictions are clamped
     to that range.
-
-    Attributes:
-        summary: one line for people.
-        truth: ``velodyne_x`` and ``camera_z`` project one LiDAR scan; ``depth`` and ``disparity``
-            read the truth that the dataset ships.
-        with_crop: only truth inside the crop of Garg et al. counts.
     """
 
-    summary: str
+    summary: str  #: one line for people
+    #: ``velodyne_x`` and ``camera_z`` project one LiDAR scan; ``depth`` and ``disparity`` read the
+    #: truth that the dataset ships
     truth: Literal["velodyne_x", "camera_z", "depth", "disparity"]
-    with_crop: bool = False
+    with_crop: bool = False  #: only truth inside the crop of Garg et al. counts
 
 
 PROTOCOLS = {
@@ -117,59 +113,38 @@ class Row:
 
 @dataclass(frozen=True, kw_only=True)
 class EvaluationRow(Row):
-    """Numbers of one frame, their mean over frames (each counts the same), or one decile of it.
+    """Numbers of one frame, their mean over frames (each counts the same), or one decile of it."""
 
-    Attributes:
-        method: whose predictions were measured; None, as the next four: not known.
-        input: which images it was given.
-        speed: at which networks ran.
-        weights: name of the file.
-        weights_sha256: the first 12 digits.
-        protocol: by which the frames were measured.
-        dataset: its name.
-        frame: of one frame, its name.
-        cap_m: truth beyond it does not count; None for disparity.
-        frames: how many a mean is over.
-        pixels: that were compared, in all frames.
-        coverage: share of the pixels with truth that have a prediction.
-        confidence_decile: n, where the numbers are of the n-th tenth of the pixels, from the least
-            sure (1) to the surest (10).
-        metrics: what all frames with a predicted pixel have, in the order of
-            ``depth.metrics.METRICS``, then those of the drawn view and of the confidence.
-    """
-
-    method: str | None = None
-    input: str | None = None
-    speed: str | None = None
-    weights: str | None = None
-    weights_sha256: str | None = None
-    protocol: str
-    dataset: str
-    frame: str | None = None
-    cap_m: float | None
-    frames: int | None = None
-    pixels: int | None = None
-    coverage: float | None = None
+    method: str | None = None  #: whose predictions were measured; None, as the next four: not known
+    input: str | None = None  #: which images it was given
+    speed: str | None = None  #: at which networks ran
+    weights: str | None = None  #: name of the file
+    weights_sha256: str | None = None  #: the first 12 digits
+    protocol: str  #: by which the frames were measured
+    dataset: str  #: its name
+    frame: str | None = None  #: of one frame, its name
+    cap_m: float | None  #: truth beyond it does not count; None for disparity
+    frames: int | None = None  #: how many a mean is over
+    pixels: int | None = None  #: that were compared, in all frames
+    coverage: float | None = None  #: share of the pixels with truth that have a prediction
+    #: n, where the numbers are of the n-th tenth of the pixels, from the least sure (1) to the
+    #: surest (10)
     confidence_decile: int | None = None
+    #: what all frames with a predicted pixel have, in the order of ``depth.metrics.METRICS``, then
+    #: those of the drawn view and of the confidence
     metrics: Mapping[str, float]
 
 
 @dataclass(frozen=True, kw_only=True)
 class Evaluation:
-    """What evaluating one set of predictions gave.
+    """What evaluating one set of predictions gave."""
 
-    Attributes:
-        rows: means over frames, one row for each cap.
-        per_frame: one row for each frame and cap.
-        deciles: mean error of the least sure tenth of each frame's pixels (1) to the surest (10),
-            for predictions with a confidence.
-        skipped: frames that do not count, each with the reason.
-    """
-
-    rows: list[EvaluationRow]
-    per_frame: list[EvaluationRow]
+    rows: list[EvaluationRow]  #: means over frames, one row for each cap
+    per_frame: list[EvaluationRow]  #: one row for each frame and cap
+    #: mean error of the least sure tenth of each frame's pixels (1) to the surest (10), for
+    #: predictions with a confidence
     deciles: list[EvaluationRow]
-    skipped: dict[str, str]
+    skipped: dict[str, str]  #: frames that do not count, each with the reason
 
     def to_frame(self) -> Any:  # noqa: ANN401  pandas is no dependency
         """Give ``per_frame`` as a ``pandas.DataFrame``; the columns are those of its table.

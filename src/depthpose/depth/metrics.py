@@ -25,21 +25,14 @@ Quantity = Literal["depth", "disparity", "disparity_noc"]
 
 @dataclass(frozen=True, kw_only=True)
 class Metric:
-    """One number over the pixels of a frame that have truth: a column of every table.
+    """One number over the pixels of a frame that have truth: a column of every table."""
 
-    Attributes:
-        name: of the column.
-        of: the values that are compared.
-        function: from the predicted and the true values, each ``(n,)`` float64.
-        better: which values are the better ones.
-        is_printed: whether the printed table has it; files have all.
-    """
-
-    name: str
-    of: Quantity
+    name: str  #: of the column
+    of: Quantity  #: the values that are compared
+    #: from the predicted and the true values, each ``(n,)`` float64
     function: Callable[[Tensor, Tensor], float]
-    better: Literal["lower", "higher"] = "lower"
-    is_printed: bool = True
+    better: Literal["lower", "higher"] = "lower"  #: which values are the better ones
+    is_printed: bool = True  #: whether the printed table has it; files have all
 
 
 def measure(of: Quantity, predicted: Numbers, true: Numbers) -> dict[str, float]:

@@ -240,18 +240,12 @@ def make_planes(config: SelectionConfig) -> Planes:
 
 @dataclass(frozen=True, eq=False)
 class Selected:
-    """What the distributions say of one view, at the size of the image.
+    """What the distributions say of one view, at the size of the image."""
 
-    Attributes:
-        disparity_px: the expectation in the logarithm, sky left out.
-        sky: probability of the sky.
-        sure: probability of what lies within 15 % of the disparity, sky left out.
-        street: probability that the image shows a street; None where the weights do not say.
-    """
-
-    disparity_px: Maps
-    sky: Maps
-    sure: Maps
+    disparity_px: Maps  #: the expectation in the logarithm, sky left out
+    sky: Maps  #: probability of the sky
+    sure: Maps  #: probability of what lies within 15 % of the disparity, sky left out
+    #: probability that the image shows a street; None where the weights do not say
     street: Float[Tensor, " b"] | None = None
 
     @property
@@ -365,21 +359,14 @@ COLUMNS_SHARE = 0.01
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class SynthesisedViews:
-    """What a generator answers for left images.
+    """What a generator answers for left images."""
 
-    Attributes:
-        right: the right views, RGB in [0, 1].
-        disparity_px: the generator's own disparity of the left view, finite in the sky too; None
-            where it has none.
-        confidence: 0 (guess) to 1 (sure) of that.
-        is_sky: where the left view shows the sky.
-        street: probability that the left view shows a street; None where the generator cannot say.
-    """
-
-    right: Views
+    right: Views  #: the right views, RGB in [0, 1]
+    #: the generator's own disparity of the left view, finite in the sky too; None where it has none
     disparity_px: Maps | None = None
-    confidence: Maps | None = None
-    is_sky: Bool[Tensor, "b h w"] | None = None
+    confidence: Maps | None = None  #: 0 (guess) to 1 (sure) of that
+    is_sky: Bool[Tensor, "b h w"] | None = None  #: where the left view shows the sky
+    #: probability that the left view shows a street; None where the generator cannot say
     street: Float[Tensor, " b"] | None = None
 
 

@@ -21,39 +21,28 @@ Mask = Bool[Tensor, "h w"]
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class StereoInput:
-    """What a depth estimate may use. There is no truth here, so none can leak.
+    """What a depth estimate may use. There is no truth here, so none can leak."""
 
-    Attributes:
-        name: what the files made from this input are called.
-        left: left (reference) image, RGB in [0, 1].
-        right: right image of the rectified pair, or None for one image alone. That its size is
-            the left one's is checked by the estimator.
-        camera: intrinsics of the left image; its baseline makes disparity metric.
-    """
-
-    name: str
-    left: View
+    name: str  #: what the files made from this input are called
+    left: View  #: left (reference) image, RGB in [0, 1]
+    #: right image of the rectified pair, or None for one image alone. That its size is the left
+    #: one's is checked by the estimator.
     right: Float[Tensor, "3 right_h right_w"] | None
-    camera: Camera | None
+    camera: Camera | None  #: intrinsics of the left image; its baseline makes disparity metric
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class StereoTruth:
-    """What is known about the left image of a sample; NaN where nothing is known.
+    """What is known about the left image of a sample; NaN where nothing is known."""
 
-    Attributes:
-        disparity_px: disparity of the left image.
-        depth_m: depth of the left image (camera z unless the dataset's protocol says otherwise).
-        occluded: left pixels whose point the right view does not show: hidden there, or outside.
-        right_disparity_px: disparity of the right image, positive like the left one's.
-        is_sky: left pixels that show the sky.
-    """
-
-    disparity_px: Map | None = None
+    disparity_px: Map | None = None  #: disparity of the left image
+    #: depth of the left image (camera z unless the dataset's protocol says otherwise)
     depth_m: Map | None = None
+    #: left pixels whose point the right view does not show: hidden there, or outside
     occluded: Mask | None = None
+    #: disparity of the right image, positive like the left one's
     right_disparity_px: Map | None = None
-    is_sky: Mask | None = None
+    is_sky: Mask | None = None  #: left pixels that show the sky
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -66,66 +55,44 @@ class StereoSample:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class RawFrame:
-    """A pair with its truth, as it is written to a folder of KITTI's raw layout.
+    """A pair with its truth, as it is written to a folder of KITTI's raw layout."""
 
-    Attributes:
-        left: left image (camera 2).
-        right: right image (camera 3).
-        rig: the cameras.
-        disparity_px: of the left image; NaN where unknown.
-        occluded: left pixels that the right view does not show.
-        is_sky: left pixels that show the sky.
-        lidar_points: one LiDAR scan, x forward, y left, z up [m] and reflectance; or None.
-        camera_from_velodyne: from the LiDAR to the left camera.
-    """
-
-    left: View
-    right: View
-    rig: StereoRig
-    disparity_px: Map
-    occluded: Mask
-    is_sky: Mask
+    left: View  #: left image (camera 2)
+    right: View  #: right image (camera 3)
+    rig: StereoRig  #: the cameras
+    disparity_px: Map  #: of the left image; NaN where unknown
+    occluded: Mask  #: left pixels that the right view does not show
+    is_sky: Mask  #: left pixels that show the sky
+    #: one LiDAR scan, x forward, y left, z up [m] and reflectance; or None
     lidar_points: Float[Tensor, "n 4"] | None
-    camera_from_velodyne: Float64[np.ndarray, "4 4"]
+    camera_from_velodyne: Float64[np.ndarray, "4 4"]  #: from the LiDAR to the left camera
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Match:
-    """What a stereo matcher answers for one pair.
+    """What a stereo matcher answers for one pair."""
 
-    Attributes:
-        disparity_px: disparity of the left image, dense or NaN where the matcher has no answer.
-        confidence: 0 (guess) to 1 (sure), from the matching distribution; None where the matcher
-            has no distribution.
-        is_sky: left pixels that show the sky, whose disparity means nothing; None where the matcher
-            does not know the sky.
-    """
-
-    disparity_px: Map
+    disparity_px: Map  #: disparity of the left image, dense or NaN where the matcher has no answer
+    #: 0 (guess) to 1 (sure), from the matching distribution; None where the matcher has no
+    #: distribution
     confidence: Map | None = None
+    #: left pixels that show the sky, whose disparity means nothing; None where the matcher does not
+    #: know the sky
     is_sky: Mask | None = None
 
 
 @dataclass(frozen=True, kw_only=True)
 class Ground:
-    """The plane of the road in a depth map, in the map's own metres.
+    """The plane of the road in a depth map, in the map's own metres."""
 
-    Attributes:
-        height_m: of the camera above it.
-        tilt_deg: of the optical axis against it; positive looks up.
-        roll_deg: positive where the horizon falls to the right.
-        share: of the lower part of the image that lies on it, 0..1.
-        height_std_m: how far the height moves by the choice of columns (a jackknife's standard
-            deviation); the scale of the depth itself is not in it.
-        tilt_std_deg: the same of the tilt.
-    """
-
-    height_m: float
-    tilt_deg: float
-    roll_deg: float
-    share: float
+    height_m: float  #: of the camera above it
+    tilt_deg: float  #: of the optical axis against it; positive looks up
+    roll_deg: float  #: positive where the horizon falls to the right
+    share: float  #: of the lower part of the image that lies on it, 0..1
+    #: how far the height moves by the choice of columns (a jackknife's standard deviation); the
+    #: scale of the depth itself is not in it
     height_std_m: float
-    tilt_std_deg: float
+    tilt_std_deg: float  #: the same of the tilt
 
     def __str__(self) -> str:
         """Say it in one line."""
@@ -137,34 +104,28 @@ class Ground:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class DepthEstimate:
-    """Depth of one left image.
+    """Depth of one left image."""
 
-    Attributes:
-        depth_m: metres along the optical axis; NaN where disparity is invalid, and in the sky.
-            None without a rig.
-        disparity_px: disparity that the depth was made from, at the size of the input; in the sky
-            that of a point 10 km away, or 0.01 of a pair without a rig.
-        confidence: 0..1, or None.
-        right: the synthesised right view, or None where a real one was given.
-        is_sky: where the image shows the sky, or None where the weights do not know it.
-        image_confidence: how probable it is that the image shows a street, or by weights that do
-            not say that the mean confidence of the generator, 0..1: low for images out of
-            distribution. None for pairs, and where the generator has no confidence.
-        ground: the road, of one image alone; None where none was found.
-        warning: why the whole estimate is doubtful, such as an image unlike those that the
-            weights know, or a pair of which it cannot be told whether it is rectified; else empty.
-        seen: what it was estimated from, for its colours and camera; None where files hold the
-            estimate alone.
-    """
-
+    #: metres along the optical axis; NaN where disparity is invalid, and in the sky. None without a
+    #: rig.
     depth_m: Map | None
+    #: disparity that the depth was made from, at the size of the input; in the sky that of a point
+    #: 10 km away, or 0.01 of a pair without a rig
     disparity_px: Map
-    confidence: Map | None = None
-    right: View | None = None
+    confidence: Map | None = None  #: 0..1, or None
+    right: View | None = None  #: the synthesised right view, or None where a real one was given
+    #: where the image shows the sky, or None where the weights do not know it
     is_sky: Mask | None = None
+    #: how probable it is that the image shows a street, or by weights that do not say that the mean
+    #: confidence of the generator, 0..1: low for images out of distribution. None for pairs, and
+    #: where the generator has no confidence.
     image_confidence: float | None = None
-    ground: Ground | None = None
+    ground: Ground | None = None  #: the road, of one image alone; None where none was found
+    #: why the whole estimate is doubtful, such as an image unlike those that the weights know, or a
+    #: pair of which it cannot be told whether it is rectified; else empty
     warning: str = ""
+    #: what it was estimated from, for its colours and camera; None where files hold the estimate
+    #: alone
     seen: StereoInput | None = None
 
     def cloud(self, far_m: float = 80.0) -> Cloud:
@@ -210,18 +171,13 @@ class DepthEstimate:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class DepthError:
-    """How far an estimate is from the truth, at the size of the image.
+    """How far an estimate is from the truth, at the size of the image."""
 
-    Attributes:
-        error: absolute error of disparity [px], or that of depth as a share of the truth; NaN where
-            nothing is compared.
-        is_disparity: which of the two.
-        true_depth_m: the truth as depth, where it is known.
-    """
-
+    #: absolute error of disparity [px], or that of depth as a share of the truth; NaN where nothing
+    #: is compared
     error: Map
-    is_disparity: bool
-    true_depth_m: Map | None = None
+    is_disparity: bool  #: which of the two
+    true_depth_m: Map | None = None  #: the truth as depth, where it is known
 
 
 def _spread(values: Map, unit: str) -> str:

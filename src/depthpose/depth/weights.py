@@ -26,16 +26,12 @@ from depthpose.depth.synthesis import Generator, SelectionGenerator, UNetGenerat
 
 @dataclass(frozen=True, kw_only=True)
 class MatcherKind:
-    """What it takes to read, write and run one kind of matcher.
+    """What it takes to read, write and run one kind of matcher."""
 
-    Attributes:
-        config: dataclass of the network's sizes and conventions, which its weights file holds.
-        network: makes the module of a config, and keeps it as the attribute ``config``.
-        matcher: makes a matcher of a module in eval mode.
-    """
-
-    config: type
+    config: type  #: dataclass of the network's sizes and conventions, which its weights file holds
+    #: makes the module of a config, and keeps it as the attribute ``config``
     network: type[stereo.StereoNetwork]
+    #: makes a matcher of a module in eval mode
     matcher: Callable[[Any, MatcherConfig], stereo.Matcher]
 
 
@@ -63,18 +59,12 @@ def _networks() -> dict[str, tuple[type, type]]:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class DepthWeights:
-    """Networks of one weights file, in eval mode.
+    """Networks of one weights file, in eval mode."""
 
-    Attributes:
-        generator: left view to right view, or None in a file of the matcher alone.
-        matcher: pair to disparity, of any kind of ``MATCHERS``, or None in a file of the
-            generator alone.
-        facts: the card in short.
-    """
-
-    generator: Generator | None
+    generator: Generator | None  #: left view to right view, or None in a file of the matcher alone
+    #: pair to disparity, of any kind of ``MATCHERS``, or None in a file of the generator alone
     matcher: stereo.StereoNetwork | None
-    facts: Mapping[str, str]
+    facts: Mapping[str, str]  #: the card in short
 
 
 def read_depth_weights(

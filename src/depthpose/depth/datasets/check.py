@@ -252,17 +252,11 @@ Progress = Callable[[Sequence[int]], Iterable[int]]
 
 @dataclass(frozen=True, kw_only=True)
 class Duplicate:
-    """Two images that show nearly the same.
+    """Two images that show nearly the same."""
 
-    Attributes:
-        first: name of the frame in the first set.
-        second: name of the frame in the second set.
-        similarity: 1 for the same picture, about 0 for two streets.
-    """
-
-    first: str
-    second: str
-    similarity: float
+    first: str  #: name of the frame in the first set
+    second: str  #: name of the frame in the second set
+    similarity: float  #: 1 for the same picture, about 0 for two streets
 
 
 def shrink(image: Float[Tensor, "c h w"], rows: int, columns: int) -> Float[Tensor, "c rows cols"]:

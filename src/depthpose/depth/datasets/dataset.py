@@ -48,14 +48,10 @@ _MAX_BYTES = 2**24
 
 @dataclass(frozen=True, kw_only=True)
 class Split:
-    """A list of frames of KITTI raw.
+    """A list of frames of KITTI raw."""
 
-    Attributes:
-        name: ``eigen-test`` and the like, or the file's name where it is no known list.
-        frames: (drive, frame number), e.g. ``("2011_09_26_drive_0002_sync", 69)``, sorted.
-    """
-
-    name: str
+    name: str  #: ``eigen-test`` and the like, or the file's name where it is no known list
+    #: (drive, frame number), e.g. ``("2011_09_26_drive_0002_sync", 69)``, sorted
     frames: tuple[tuple[str, int], ...]
 
     @property
@@ -130,17 +126,11 @@ def _known(name: str) -> Split:
 
 @dataclass(frozen=True, kw_only=True)
 class Dataset:
-    """Frames of one folder; nothing is read before it is asked for.
+    """Frames of one folder; nothing is read before it is asked for."""
 
-    Attributes:
-        name: the folder's name, and the split's.
-        layout: which layout was recognised.
-        frames: where each frame's parts lie.
-    """
-
-    name: str
-    layout: str
-    frames: list[Frame]
+    name: str  #: the folder's name, and the split's
+    layout: str  #: which layout was recognised
+    frames: list[Frame]  #: where each frame's parts lie
 
     def __len__(self) -> int:
         return len(self.frames)

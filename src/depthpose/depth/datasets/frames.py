@@ -42,14 +42,10 @@ _MAX_PAIRS_BYTES = 2**24
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class KittiCalibration:
-    """What a KITTI calibration says of the colour pair (cameras 2 and 3) and the LiDAR.
+    """What a KITTI calibration says of the colour pair (cameras 2 and 3) and the LiDAR."""
 
-    Attributes:
-        rig: intrinsics, baseline and difference of the principal points.
-        pixels_from_velodyne: homogeneous LiDAR points to homogeneous pixels of camera 2.
-    """
-
-    rig: StereoRig
+    rig: StereoRig  #: intrinsics, baseline and difference of the principal points
+    #: homogeneous LiDAR points to homogeneous pixels of camera 2
     pixels_from_velodyne: Float64[np.ndarray, "3 4"] | None
 
 
@@ -212,34 +208,23 @@ CalibrationStyle = Literal["raw", "object", "grey", "middlebury", "plain", "came
 
 @dataclass(frozen=True, kw_only=True)
 class Frame:
-    """Paths of one frame; None where the dataset has no such file.
+    """Paths of one frame; None where the dataset has no such file."""
 
-    Attributes:
-        name: unique in its dataset and usable as a file name.
-        left: left image (camera 2 of KITTI).
-        right: right image (camera 3).
-        calibration: file, or for ``raw`` the folder of the date.
-        style: how the calibration is written.
-        velodyne: one LiDAR scan, float32 x, y, z, reflectance.
-        scan: a LiDAR scan that was drawn into the left image already, 16-bit camera z, metres x
-            256 (``velodyne_raw`` of KITTI's depth-prediction set).
-        depth: depth of the left image, 16-bit PNG (metres x 256), or PFM or NPY in metres.
-        disparity: disparity of the left image, 16-bit PNG (x 256), PFM or NPY, hidden pixels too.
-        disparity_noc: that of the pixels alone that both views see.
-        sky: 8-bit PNG of the left image, not 0 where it shows the sky.
-    """
-
-    name: str
-    left: Path
-    right: Path | None = None
-    calibration: Path | None = None
-    style: CalibrationStyle = "plain"
-    velodyne: Path | None = None
+    name: str  #: unique in its dataset and usable as a file name
+    left: Path  #: left image (camera 2 of KITTI)
+    right: Path | None = None  #: right image (camera 3)
+    calibration: Path | None = None  #: file, or for ``raw`` the folder of the date
+    style: CalibrationStyle = "plain"  #: how the calibration is written
+    velodyne: Path | None = None  #: one LiDAR scan, float32 x, y, z, reflectance
+    #: a LiDAR scan that was drawn into the left image already, 16-bit camera z, metres x 256
+    #: (``velodyne_raw`` of KITTI's depth-prediction set)
     scan: Path | None = None
+    #: depth of the left image, 16-bit PNG (metres x 256), or PFM or NPY in metres
     depth: Path | None = None
+    #: disparity of the left image, 16-bit PNG (x 256), PFM or NPY, hidden pixels too
     disparity: Path | None = None
-    disparity_noc: Path | None = None
-    sky: Path | None = None
+    disparity_noc: Path | None = None  #: that of the pixels alone that both views see
+    sky: Path | None = None  #: 8-bit PNG of the left image, not 0 where it shows the sky
 
     def seen_files(self, *, with_right: bool = True) -> list[Path]:
         """List what an estimate depends on: left image, right image, files of the calibration."""

@@ -393,12 +393,10 @@ class LightStereo(StereoNetwork):
     """Rectified pair to disparity at a fraction of PSMNet's operations.
 
     Images are RGB normalised by ImageNet's mean and deviation; both sides are multiples of 32.
-
-    Attributes:
-        rows: at 1/4 size, an even number, that are computed at a time where something large would
-            be held, with no gradient; None, as in training and in exported graphs: all.
     """
 
+    #: at 1/4 size, an even number, that are computed at a time where something large would be held,
+    #: with no gradient; None, as in training and in exported graphs: all
     rows: int | None = None
 
     def __init__(self, config: LightConfig | None = None) -> None:

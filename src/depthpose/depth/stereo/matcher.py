@@ -236,13 +236,9 @@ AGREEMENT_PX = 3.0
 
 
 class StereoNetwork(nn.Module):
-    """A stereo network: a normalised pair to disparity maps for the losses; the last is the output.
+    """A normalised pair to disparity maps for the losses; the last is the output."""
 
-    Attributes:
-        config: its sizes and conventions, a :class:`~depthpose.depth.config.NetworkConfig`.
-    """
-
-    config: Any
+    config: Any  #: its sizes and conventions, a :class:`~depthpose.depth.config.NetworkConfig`
 
     def forward_with_sky(self, left: Views, right: Views) -> tuple[tuple[Maps, ...], Maps | None]:
         """Give the disparity maps [px], and P(sky) where the network has that class."""

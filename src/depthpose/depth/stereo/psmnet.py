@@ -193,12 +193,10 @@ class PSMNet(StereoNetwork):
 
     Images are RGB normalised by ImageNet's mean and deviation; both sides are multiples of 16 and
     at least ``config.min_side_px``. The default size has 5,224,768 parameters.
-
-    Attributes:
-        rows: at 1/4 size, that are computed at a time where something large would be held, with no
-            gradient; None, as in training and in exported graphs: all.
     """
 
+    #: at 1/4 size, that are computed at a time where something large would be held, with no
+    #: gradient; None, as in training and in exported graphs: all
     rows: int | None = None
 
     def __init__(self, config: PSMNetConfig | None = None) -> None:

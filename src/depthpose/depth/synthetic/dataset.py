@@ -316,17 +316,11 @@ _OCCLUSION_SHARE = 1e-4
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class StreetFrame(RawFrame):
-    """A synthetic pair and everything that is known about it, exactly.
+    """A synthetic pair and everything that is known about it, exactly."""
 
-    Attributes:
-        right_disparity_px: of the right image; NaN in the sky, as that of the left one.
-        depth_m: of the left image, camera z; NaN in the sky.
-        is_road: left pixels that see the carriageway.
-    """
-
-    right_disparity_px: Map
-    depth_m: Map
-    is_road: Mask
+    right_disparity_px: Map  #: of the right image; NaN in the sky, as that of the left one
+    depth_m: Map  #: of the left image, camera z; NaN in the sky
+    is_road: Mask  #: left pixels that see the carriageway
 
 
 def draw_street(config: StreetsConfig, index: int) -> StreetFrame:
@@ -415,13 +409,9 @@ def _occluded(left: Sight, right: Sight, rig: StereoRig) -> Mask:
 
 @dataclass(frozen=True)
 class Streets:
-    """Synthetic pairs, each a function of the seed and its index alone.
+    """Synthetic pairs, each a function of the seed and its index alone."""
 
-    Attributes:
-        config: what the frames are like.
-    """
-
-    config: StreetsConfig
+    config: StreetsConfig  #: what the frames are like
 
     def __len__(self) -> int:
         """How many there are."""

@@ -87,21 +87,13 @@ class Markings:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class StreetScene:
-    """A synthetic street, in the frame of its left camera (x right, y down, z forward) [m].
+    """A synthetic street, in the frame of its left camera (x right, y down, z forward) [m]."""
 
-    Attributes:
-        mesh: everything that is seen, but the sky.
-        markings: paint on the road.
-        weather: the light, in the world's frame.
-        camera_from_world: rotation of the camera.
-        place: what kind of place it is.
-    """
-
-    mesh: Mesh
-    markings: Markings
-    weather: Weather
-    camera_from_world: Float64[np.ndarray, "3 3"]
-    place: roads.Place | Literal["clutter"]
+    mesh: Mesh  #: everything that is seen, but the sky
+    markings: Markings  #: paint on the road
+    weather: Weather  #: the light, in the world's frame
+    camera_from_world: Float64[np.ndarray, "3 3"]  #: rotation of the camera
+    place: roads.Place | Literal["clutter"]  #: what kind of place it is
 
 
 def make_scene(seed: tuple[int, ...], mount_height_m: float = 1.65) -> StreetScene:
