@@ -162,13 +162,12 @@ def test_where_depth_comes_from_is_one_word(
     write_depth_weights(Path(weights), generator=sure_of(1), matcher=matcher, facts={})
     words = [str(home / "images/0.png"), "--camera", str(home / "cam.json"), "--weights", weights]
     found = {}
-    for answer in ("own", "matched", "joined"):
+    for answer in ("own", "matched"):
         out = tmp_path / answer
         assert main(["depth", "predict", *words, "--answer", answer, "--out", str(out)]) == 0
         found[answer] = read_map(out / "0.disparity_px.npy")
         assert json.loads((out / "run.json").read_text())["settings"]["answer"] == answer
     assert not torch.equal(found["own"], found["matched"])
-    assert not torch.equal(found["own"], found["joined"])
     capsys.readouterr()
     other = ["--answer", "own", "--matcher", "sgbm", "--out", str(tmp_path / "x")]
     assert main(["depth", "predict", *words, *other]) == 2

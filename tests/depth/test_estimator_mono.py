@@ -31,13 +31,13 @@ from depthpose.depth.config import (
     SGBMConfig,
     Speed,
 )
-from depthpose.depth.disparity import disparity_from_depth, join_matches, resize_image
+from depthpose.depth.disparity import disparity_from_depth, resize_image
 from depthpose.depth.estimator import DepthPipeline
 from depthpose.depth.estimator.net import as_tensor
 from depthpose.depth.evaluate import measure_image_confidence
 from depthpose.depth.stereo import CallableMatcher, PSMNet, PSMNetMatcher
 from depthpose.depth.synthesis import SelectionGenerator, UNetGenerator, make_synthesiser
-from depthpose.depth.types import DepthEstimate, Match, StereoInput
+from depthpose.depth.types import DepthEstimate, StereoInput
 from depthpose.depth.weights import (
     calibrate_weights,
     read_generator,
@@ -532,23 +532,16 @@ def test_the_sky_has_no_depth_and_a_disparity_next_to_nothing(baseline_m: float 
     assert float(found.confidence.min()) > 0.99
 
 
-def test_the_matcher_and_both_are_one_word_away() -> None:
-    """A matcher without confidence adds nothing to the join; one that is as sure, the mean log."""
+def test_the_matcher_is_one_word_away() -> None:
     image, seen = torch.rand(3, 64, 96), camera(96, 64, FOCAL_PX)
     found = {
         answer: FakestereoNet(constant_matcher(2.0), make_synthesiser(sure_of(3, answer)))
         .estimate(image, seen)
         .disparity_px.mean()
         .item()
-        for answer in ("own", "matched", "joined")
+        for answer in ("own", "matched")
     }
-    assert found == pytest.approx({"own": 4.0, "matched": 2.0, "joined": 4.0}, rel=1e-3)
-    own = Match(disparity_px=torch.full((1, 2), 4.0), confidence=torch.ones(1, 2))
-    other = Match(
-        disparity_px=torch.tensor([[1.0, torch.nan]]), confidence=torch.tensor([[1.0, 1.0]])
-    )
-    joined = join_matches(own, other)
-    assert joined.disparity_px.tolist()[0] == pytest.approx([2.0, 4.0], rel=1e-4)
+    assert found == pytest.approx({"own": 4.0, "matched": 2.0}, rel=1e-3)
 
 
 def selection_file(folder: Path, answer: Answer = "own") -> Path:
@@ -571,13 +564,12 @@ def test_a_generator_with_an_answer_of_its_own_needs_no_matcher(tmp_path: Path) 
             estimate(pair)
 
 
-@pytest.mark.parametrize("answer", ["matched", "joined"])
-def test_an_answer_of_the_matcher_needs_one(tmp_path: Path, answer: Answer) -> None:
-    path = selection_file(tmp_path, answer)
+def test_an_answer_of_the_matcher_needs_one(tmp_path: Path) -> None:
+    path = selection_file(tmp_path, "matched")
     with pytest.raises(InputError, match="there is no matcher in that"):
         FakestereoNet.load(path)
     with pytest.raises(InputError, match="matcher is None"):
-        FakestereoNet(None, make_synthesiser(sure_of(3, answer)))
+        FakestereoNet(None, make_synthesiser(sure_of(3, "matched")))
     assert FakestereoNet.load(path, matcher=constant_matcher(2.0)).matcher is not None
     with pytest.raises(InputError, match="there is no matcher in that"):
         FakestereoNet.load(path, matcher=path)
@@ -599,8 +591,8 @@ def test_the_answer_may_be_another_than_the_weights_say(
     FakestereoNet.load(painting, matcher=given, answer="matched")
     with pytest.raises(InputError, match="answer is 'own'"):
         FakestereoNet.load(painting, matcher=given, answer="own")
-    with pytest.raises(InputError, match="answer is 'joined'"):
-        FakestereoNet.load(matcher=given, answer="joined")
+    with pytest.raises(InputError, match="answer is 'matched'"):
+        FakestereoNet.load(matcher=given, answer="matched")
 
 
 def unsure(least: float) -> SelectionGenerator:

@@ -233,9 +233,8 @@ def test_an_answer_of_its_own_is_exported_without_a_matcher(selection: Path) -> 
 @pytest.mark.slow
 @pytest.mark.parametrize("encoder", ["short"], indirect=True)
 def test_the_matcher_is_asked_where_the_weights_say_so(selection: Path) -> None:
-    """Joined: the matcher looks at the drawn view, and both depths become one."""
     matcher = calm_matcher()
-    generator = of_all_kinds("joined")
+    generator = of_all_kinds("matched")
     write_depth_weights(
         selection / "w.safetensors", generator=generator, matcher=matcher, facts=TERMS
     )

@@ -15,7 +15,7 @@ from depthpose.core.draw import draw_disparity
 from depthpose.core.errors import InputError
 from depthpose.depth.augment import TrainingPair
 from depthpose.depth.config import LightConfig, MatcherConfig
-from depthpose.depth.disparity import from_pair, join_matches, resized_match
+from depthpose.depth.disparity import from_pair, resized_match
 from depthpose.depth.estimator import FakestereoNet
 from depthpose.depth.export import depth_export
 from depthpose.depth.labels import LabelConfig, label_pair
@@ -194,14 +194,6 @@ def test_without_a_rig_the_disparity_of_the_sky_is_next_to_nothing() -> None:
     found = FakestereoNet(UpperHalf()).estimate(image, right=image, with_check=False)
     assert found.is_sky is not None
     assert float(found.disparity_px[found.is_sky].max()) == pytest.approx(0.01)
-
-
-def test_the_generator_is_believed_where_the_matcher_sees_the_sky() -> None:
-    left = torch.rand(3, 2, 3)
-    own = Match(disparity_px=torch.full((2, 3), 16.0), confidence=torch.ones(2, 3))
-    joined = join_matches(own, UpperHalf().match(left, left))
-    torch.testing.assert_close(joined.disparity_px[0], torch.full((3,), 16.0))
-    torch.testing.assert_close(joined.disparity_px[1], torch.full((3,), 8.0))
 
 
 def test_held_out_pairs_measure_the_sky() -> None:

@@ -47,7 +47,7 @@ NewPlace = Annotated[str, _Names.NEW]  # a folder or URL that is written
 WeightsName = Annotated[str, _Names.WEIGHTS]  # weights, by name or file, or a word in their place
 
 _WORDS = ("sgbm", "nothing", "open3d", "register")  # what may be said in place of weights
-_PREFIXES = "^(both|sgbm|own|matched|joined|quick|fine):"
+_PREFIXES = "^(both|sgbm|own|matched|quick|fine):"
 """Before the name of weights: how they are used."""
 _POSITIONAL = get_args(tyro.conf.Positional[int])[1]
 _OF_TYPES = {Path: "PATH", str: "TEXT", int: "N", float: "NUMBER"}

@@ -119,8 +119,8 @@ class ImageNetworks:
     """what matches the synthesised view: sgbm (OpenCV's), or other weights with a matcher, by name
     or file. Left out: that of the weights."""
     answer: Answer | None = None
-    """own: the generator's own disparity; matched: the matcher on left and synthesised right view;
-    joined: both. Default: what the weights say; with --matcher, matched."""
+    """own: the generator's own disparity; matched: the matcher on left and synthesised right view.
+    Default: what the weights say; with --matcher, matched."""
     allow_ood: bool = False
     """also answer out-of-distribution images, with a warning (NAME.warning.txt)."""
 
@@ -161,9 +161,9 @@ class MethodOptions:
     weights: tuple[WeightsName, ...] = ()
     """files or names. Weights with a generator are given the left view alone; 'both:NAME' gives
     their matcher the real right view too, 'sgbm:NAME' lets OpenCV match the synthesised one,
-    'own:NAME', 'matched:NAME', 'joined:NAME' take the depth of one image from the generator, from
-    the matcher on the synthesised view, or from both; 'quick:NAME' and 'fine:NAME' are 'both:NAME'
-    at that speed (for one image, give --speed)."""
+    'own:NAME' and 'matched:NAME' take the depth of one image from the generator, or from the
+    matcher on the synthesised view; 'quick:NAME' and 'fine:NAME' are 'both:NAME' at that speed (for
+    one image, give --speed)."""
     matcher: Literal["sgbm"] | None = None
     """sgbm measures OpenCV's StereoSGBM on both views, and no weights."""
     holes: Literal["fill", "leave"] = "fill"

@@ -324,10 +324,10 @@ class SGBMConfig(Settings):
             raise InputError(f"p1 and p2 must be 0 < p1 < p2, got p1={self.p1}, p2={self.p2}")
 
 
-Answer = Literal["own", "matched", "joined"]
+Answer = Literal["own", "matched"]
 """Where the disparity of one image comes from. own: the generator, which estimates disparity beside
 the right view (no matcher runs). matched: the matcher, on the image and the right view that the
-generator drew. joined: the mean of both, weighed by their confidence."""
+generator drew."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -258,19 +258,3 @@ def from_virtual(
         is_sky=is_sky,
         seen=image,
     )
-
-
-def join_matches(one: Match, other: Match) -> Match:
-    """Take the mean of two disparities in the logarithm, weighed by their confidence.
-
-    Where ``other`` has no answer, or no confidence, or sees the sky, ``one`` is taken.
-    """
-    assert one.confidence is not None
-    weight = torch.zeros_like(one.confidence) if other.confidence is None else other.confidence
-    weight = torch.where(other.disparity_px > 0, weight, 0.0)
-    if other.is_sky is not None:
-        weight = torch.where(other.is_sky, 0.0, weight)
-    share = weight / (weight + one.confidence).clamp(min=1e-6)
-    logs = [match.disparity_px.clamp(min=1e-3).log() for match in (one, other)]
-    log_px = torch.lerp(logs[0], logs[1].nan_to_num(0.0), share)
-    return Match(disparity_px=log_px.exp(), confidence=torch.lerp(one.confidence, weight, share))

@@ -270,21 +270,11 @@ def image_graph(weights: DepthWeights) -> Graph:
     left = _resized_image(image, small)
     right, own, street = _drawn(left, generator)
     found = own
-    if rig.answer != "own":  # matched or joined
+    if rig.answer == "matched":
         assert weights.matcher is not None, "checked before"
         found = _matched(left, right, np.array([rig.virtual_focal_px] * 2), weights.matcher)
-        if own is not None and rig.answer == "matched":
+        if own is not None:
             found = found._replace(sky=own.sky)
-        elif own is not None:  # as ``join_matches``: the mean of the logarithms, by confidence
-            weight = found.disparity_px.op("Greater", _0).op("Where", found.confidence, _0)
-            if found.sky is not None:
-                weight = weight * (found.sky * np.float32(-1) + _1)
-            share = weight / (weight + own.confidence).op("Max", np.float32(1e-6))
-            one, other = (
-                maps.disparity_px.op("Max", np.float32(1e-3)).op("Log") for maps in (own, found)
-            )
-            confidence = own.confidence + (weight - own.confidence) * share
-            found = _Maps((one + (other - one) * share).op("Exp"), confidence, own.sky)
     assert found is not None
     disparity_px = _resized_map(found.disparity_px, full) * _ratio(full, small)
     # Depth is that over disparity.

@@ -10,7 +10,7 @@ Synthesisers are generators with pre- and post-processing: any size, [0, 1], tes
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Literal, Protocol, runtime_checkable
+from typing import Protocol, runtime_checkable
 
 import torch
 import torch.nn.functional as F
@@ -143,17 +143,6 @@ class PixelDiscriminator(_Discriminator):
             nn.LeakyReLU(0.2),
             nn.Conv2d(2 * width, 1, 1, bias=False),
         )
-
-
-def make_discriminator(kind: Literal["patch", "pixel"], width: int) -> nn.Module:
-    """Make a discriminator by name.
-
-    Raises:
-        InputError: there is none of that name.
-    """
-    if kind not in ("patch", "pixel"):
-        raise InputError(f"discriminator must be 'patch' or 'pixel', got {kind!r}")
-    return PatchDiscriminator(width) if kind == "patch" else PixelDiscriminator(width)
 
 
 Logits = Float[Tensor, "b classes rows columns"]

@@ -497,15 +497,13 @@ class FakestereoNet:
                 for size in sizes
             )
             views = self.synthesiser.draw(left, *larger)
-            matches: list[Match] = []
-            if rig.answer != "own":  # matched or joined
+            if rig.answer == "matched":
                 camera = camera_of(rig.virtual_focal_px, (left.shape[3], left.shape[2]))
                 matches = self._match(list(zip(left, views.right, strict=True)), camera)
-            if rig.answer != "matched":  # own or joined
+            else:
                 assert views.disparity_px is not None and views.confidence is not None  # noqa: PT018
                 parts = zip(views.disparity_px, views.confidence, strict=True)
-                own = [Match(disparity_px=px, confidence=sure) for px, sure in parts]
-                matches = list(map(disparity.join_matches, own, matches)) if matches else own
+                matches = [Match(disparity_px=px, confidence=sure) for px, sure in parts]
             estimates = []
             for n, (image, match) in enumerate(zip(images, matches, strict=True)):
                 is_sky = match.is_sky if views.is_sky is None else views.is_sky[n]

@@ -159,9 +159,10 @@ class ViewTask:
         adam = config.generator_adam
         self.optimizers = {"generator": (make_adam(generator.parameters(), adam), adam)}
         if config.discriminator != "none":
-            discriminator = synthesis.make_discriminator(
-                config.discriminator, config.discriminator_width
-            )
+            kinds = {
+                "patch": synthesis.PatchDiscriminator, "pixel": synthesis.PixelDiscriminator
+            }  # fmt: skip
+            discriminator = kinds[config.discriminator](config.discriminator_width)
             self.modules["discriminator"] = discriminator.train()
             adam = config.discriminator_adam
             self.optimizers["discriminator"] = (make_adam(discriminator.parameters(), adam), adam)
