@@ -145,8 +145,6 @@ def bench(network: PSMNet, size: str, pair: Pair, args: argparse.Namespace) -> l
         "ours fp32 + confidence": MatcherConfig(),
         "ours bf16": MatcherConfig(with_confidence=False, precision="bf16"),
     }
-    if args.compile:
-        variants["ours fp32, compiled"] = MatcherConfig(with_confidence=False, with_compile=True)
     flops = plain_flops(network, pair)
     rows: list[dict] = []
     for name, config in variants.items():
@@ -197,7 +195,6 @@ def main() -> None:
     parser.add_argument("--weights", type=Path)
     parser.add_argument("--pair", nargs=2, type=Path)
     parser.add_argument("--repeats", type=int, default=2)
-    parser.add_argument("--compile", action="store_true")
     parser.add_argument("--exact", action="store_true", help="compare with float64: a minute more")
     args = parser.parse_args()
     network = network_for(args.weights)

@@ -283,9 +283,6 @@ class MatcherConfig(Settings):
     with_left_right_check: bool = False
     """Match the mirrored pair too and lower the confidence where both disagree: twice the time."""
 
-    with_compile: bool = False
-    """Compile the feature extractor: pays after many images of one size."""
-
 
 @dataclass(frozen=True, kw_only=True)
 class SGBMConfig(Settings):

@@ -283,8 +283,6 @@ class NetworkMatcher(ABC):
         self.network_config: NetworkConfig = network.config
         like = torch.empty(0, dtype=self.dtype, device=self.device)
         self._network = self.fold(deepcopy(network).eval().to(self.device), like)
-        if config.with_compile:
-            self._network.features.compile()
 
     @abstractmethod
     def fold(self, network: Any, like: Tensor) -> Any:  # noqa: ANN401
@@ -375,15 +373,17 @@ class NetworkMatcher(ABC):
         h, w = left.shape[-2:]
         left, right = (pad_top_right(views, network) for views in (left, right))
         height, width = left.shape[-2:]
-        rows, most = self._network.rows or height // 4, self.config.max_memory_bytes
-        least = self.activation_bytes(network, height, width, self.dtype, rows)
-        if most is not None and least > most:  # volumes are held whole, and cannot be traded
-            quick = "" if network.work_focal_px is None else " or speed='quick'"
-            raise InputError(
-                f"max_memory_bytes={most} is too small for images of {height}x{width} (padded): "
-                f"this matcher takes {least}; allow that, take precision='bf16'{quick}, or "
-                "match the pair at a smaller size"
-            )
+        most = self.config.max_memory_bytes
+        if most is not None:  # volumes are held whole, and cannot be traded
+            rows = self._network.rows or height // 4
+            least = self.activation_bytes(network, height, width, self.dtype, rows)
+            if least > most:
+                quick = "" if network.work_focal_px is None else " or speed='quick'"
+                raise InputError(
+                    f"max_memory_bytes={most} is too small for images of {height}x{width} "
+                    f"(padded): this matcher takes {least}; allow that, take precision='bf16'"
+                    f"{quick}, or match the pair at a smaller size"
+                )
         matches = self.run(left, right, network)
         return [disparity.changed_match(match, lambda values: values[-h:, :w]) for match in matches]
 
