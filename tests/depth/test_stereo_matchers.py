@@ -120,14 +120,6 @@ def test_nothing_to_fill_from_is_an_error() -> None:
         fill_holes(torch.full((2, 2), NAN))
 
 
-@pytest.mark.parametrize(
-    ("settings", "text"),
-    [
-        ({"num_disparities": 100}, "multiple of 16, got 100"),
-        ({"block_size": 4}, "block_size must be odd, got 4"),
-        ({"p1": 9, "p2": 3}, "0 < p1 < p2, got p1=9, p2=3"),
-    ],
-)
-def test_sgbm_config_refuses_nonsense(settings: dict, text: str) -> None:
-    with pytest.raises(InputError, match=text):
-        SGBMConfig(**settings)
+def test_sgbm_config_refuses_nonsense() -> None:
+    with pytest.raises(InputError, match="multiple of 16, got 100"):
+        SGBMConfig(num_disparities=100)

@@ -286,10 +286,7 @@ class MatcherConfig(Settings):
 
 @dataclass(frozen=True, kw_only=True)
 class SGBMConfig(Settings):
-    """Semi-global block matching of OpenCV (Hirschmueller 2008), with the settings of our tables.
-
-    The names follow OpenCV's documentation of ``StereoSGBM``.
-    """
+    """OpenCV's semi-global block matching (Hirschmueller 2008), with the settings of our tables."""
 
     num_disparities: Annotated[int, "[16, inf)", 16] = 192
     """Disparities 0 .. num_disparities - 1 are considered; a multiple of 16.
@@ -298,27 +295,8 @@ class SGBMConfig(Settings):
     moved by this difference, so disparities grow by d: for a range given of the images as they are
     (Middlebury's ``ndisp``), take d more."""
 
-    block_size: Annotated[int, "[1, inf)"] = 3
-    """Side of the matched window [px], odd."""
-
-    p1: int = 8 * 3 * 9
-    """Penalty of a disparity step of 1 between neighbours."""
-
-    p2: int = 32 * 3 * 9
-    """Penalty of a larger step; more than p1."""
-
-    mode: Literal["sgbm", "hh", "sgbm_3way", "hh4"] = "sgbm_3way"
-    """Directions of aggregation: 5, 8, 3 or 4."""
-
     with_filled_holes: bool = False
     """Fill pixels without an answer as the KITTI devkit does: the smaller neighbour of the row."""
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if self.block_size % 2 == 0:
-            raise InputError(f"block_size must be odd, got {self.block_size}")
-        if not 0 < self.p1 < self.p2:
-            raise InputError(f"p1 and p2 must be 0 < p1 < p2, got p1={self.p1}, p2={self.p2}")
 
 
 Answer = Literal["own", "matched"]

@@ -20,13 +20,13 @@ _MISTAKES = {
     256.0: "is its depth metres x 256, as KITTI's PNG holds it (divide by 256)?",
     1 / 256: "is its disparity pixels x 256, as KITTI's PNG holds it (divide by 256)?",
 }
+"""What was likely meant, by how many times farther than the truth a prediction lies."""
 _DOUBTS = {
     1000 / 256: "is it a PNG of millimetres, read as metres x 256?",
     256 / 1000: "is its truth a PNG of millimetres, read as metres x 256?",
     1 / 16: "is its disparity pixels x 16, as OpenCV's matchers give it?",
 }
 """What may have been meant by a scale that a poor estimate could have too."""
-"""What was likely meant, by how many times farther than the truth a prediction lies."""
 _ABOUT = 1.4
 """No estimate is wrong by 250 or 1000 in the median, and a slip is met to within this factor."""
 _said: set[str] = set()

@@ -40,8 +40,8 @@ STEM = 16
 """Channels at half size."""
 _OFFSETS = (-2, -1, 0, 1, 2)
 """Where the refinement compares the views: so many pixels at half size from the disparity."""
-_REFINED = 32
-"""Channels of the refinement at half size."""
+_GROUPS, _REFINED = 4, 32
+"""Groups of features that the refinement compares, and its channels at half size."""
 
 
 class ViewFeatures(NamedTuple):
@@ -132,11 +132,10 @@ class Refinement(nn.Module):
     Its output is initialised to zero.
     """
 
-    def __init__(self, groups: int = 4) -> None:
+    def __init__(self) -> None:
         super().__init__()
-        self.groups = groups
         self.compared = conv_norm_2d(STEM, STEM)
-        seen = groups * len(_OFFSETS) + STEM + 4
+        seen = _GROUPS * len(_OFFSETS) + STEM + 4
         widths, dilations = (seen, _REFINED, _REFINED), (1, 2, 1)
         self.layers = nn.ModuleList(
             conv_norm_2d(width, _REFINED, dilation=dilation)
@@ -151,7 +150,7 @@ class Refinement(nn.Module):
         four = F.pixel_unshuffle(enlarged_px.detach()[:, None], 2) / 2
         middle = four.mean(1)
         left, right = self.compared(left_half), self.compared(right_half)
-        alike = agreement_around(left.float(), right.float(), middle, self.groups)
+        alike = agreement_around(left.float(), right.float(), middle, _GROUPS)
         x = torch.cat([alike, left_half.float(), four - middle[:, None]], 1).to(left)
         for layer in self.layers:
             x = F.relu(layer(x))

@@ -170,19 +170,18 @@ class SGBMMatcher:
                 f"images are {left.shape[-1]} px wide and num_disparities is "
                 f"{self.config.num_disparities}; take a smaller multiple of 16"
             )
-        config = self.config
         matcher = self._cv2.StereoSGBM_create(
             minDisparity=0,
-            numDisparities=config.num_disparities,
-            blockSize=config.block_size,
-            P1=config.p1,
-            P2=config.p2,
+            numDisparities=self.config.num_disparities,
+            blockSize=3,  # side of the matched window [px]
+            P1=8 * 3 * 9,  # penalty of a disparity step of 1 between neighbours
+            P2=32 * 3 * 9,  # and of a larger step
             disp12MaxDiff=1,  # of the left-right check [px]
             preFilterCap=63,  # of the horizontal gradient
             uniquenessRatio=10,  # by which the best cost must beat the second [%]
             speckleWindowSize=100,  # islands of at most so many pixels are dropped ...
             speckleRange=2,  # ... where they step by more than this [px]
-            mode=getattr(self._cv2, f"STEREO_SGBM_MODE_{config.mode.upper()}"),
+            mode=self._cv2.STEREO_SGBM_MODE_SGBM_3WAY,
         )
         # The 8-bit BGR that OpenCV reads from a file.
         images = ((view.detach().cpu().clamp(0, 1) * 255).round().byte() for view in (left, right))

@@ -14,11 +14,7 @@ from depthpose.core.config import config_to_dict
 from depthpose.core.errors import InputError
 from depthpose.core.loop import Run, Task, held_out_text, releases_folder, write_card
 from depthpose.core.run import find_rank
-from depthpose.depth.config import (
-    GeneratorConfig,
-    PairsConfig,
-    SelectionConfig,
-)
+from depthpose.depth.config import GeneratorConfig, PairsConfig, SelectionConfig
 from depthpose.depth.datasets import refuse_common
 from depthpose.depth.encoder import load_encoder
 from depthpose.depth.stereo import StereoNetwork
@@ -31,12 +27,7 @@ from depthpose.depth.train.config import (
     ViewTraining,
 )
 from depthpose.depth.train.pairs import TrainingPairs
-from depthpose.depth.weights import (
-    MATCHERS,
-    read_generator,
-    read_matcher,
-    write_depth_weights,
-)
+from depthpose.depth.weights import MATCHERS, read_generator, read_matcher, write_depth_weights
 
 _FREE_OF_WEIGHTS = ("max_disparity_px", "with_street", "least_confidence")
 """Settings that the weights of a training do not depend on: a matcher searches any disparities in
