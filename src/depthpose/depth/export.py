@@ -415,9 +415,7 @@ def _pair_export(weights: DepthWeights, facts: dict[str, Any]) -> Export:
         sky = ("is_sky",) if _sees_sky(weights.matcher) else ()
         work_px = weights.matcher.config.work_focal_px
         for size in _SIZES:
-            left, right = _scenes(*size)
-            if sky:
-                left, right = _under_sky(left), _under_sky(right)
+            left, right = _scenes(size, with_sky=bool(sky))
             inputs = {"left": left.numpy(), "right": right.numpy()}
             rig = None
             if work_px is not None:
@@ -426,12 +424,11 @@ def _pair_export(weights: DepthWeights, facts: dict[str, Any]) -> Export:
                     width=camera.width, height=camera.height, K=camera.K, baseline_m=0.5
                 )
                 inputs["K"] = camera.K.numpy()
-            found = [
-                net.estimate_pair(
-                    StereoInput(name="proof", left=one, right=other, camera=rig), with_check=False
-                )
+            given = (
+                StereoInput(name="proof", left=one, right=other, camera=rig)
                 for one, other in zip(left, right, strict=True)
-            ]
+            )
+            found = [net.estimate_pair(pair, with_check=False) for pair in given]
             yield _case(inputs, found, ("disparity_px", "confidence", *sky))
 
     return Export(
@@ -453,14 +450,13 @@ def _image_export(weights: DepthWeights, facts: dict[str, Any]) -> Export:
         sky = ("is_sky",) if selects or _sees_sky(weights.matcher) else ()
         street = ("image_confidence",) if getattr(weights.generator, "street", None) else ()
         for size in _SIZES:
-            scenes, _ = _scenes(*size)
-            images = _under_sky(scenes) if sky else scenes
+            images, _ = _scenes(size, with_sky=bool(sky))
             camera = _camera(size, weights.generator.config.virtual_focal_px)
-            given = [
-                StereoInput(name="proof", left=one, right=None, camera=camera) for one in images
-            ]
             inputs = {"image": images.numpy(), "K": camera.K.numpy()}
             # A depth beyond all bounds, or none, hangs on the last bit of a disparity near zero.
+            given = (
+                StereoInput(name="proof", left=one, right=None, camera=camera) for one in images
+            )
             found = [net.estimate_pair(one) for one in given]
             case = _case(
                 inputs, found, ("depth_m", "disparity_px", "confidence", "right", *sky, *street)
@@ -509,19 +505,14 @@ def _camera(size: tuple[int, int, float, int], focal_px: float) -> Camera:
     return Camera(width=columns, height=rows, K=K)
 
 
-def _under_sky(images: Tensor) -> Tensor:
-    """Lay a bright, smooth sky over the upper two fifths, for weights that know the sky."""
-    rows = images.shape[2] * 2 // 5
-    sky = torch.tensor(_SKY)[:, None, None] * torch.linspace(0.9, 1.0, rows)[:, None]
-    hazy = torch.lerp(images[:, :, :rows], sky, 0.97)
-    return torch.cat([hazy, images[:, :, rows:]], 2)
-
-
-def _scenes(rows: int, columns: int, share: float, count: int) -> tuple[Tensor, Tensor]:
+def _scenes(size: tuple[int, int, float, int], *, with_sky: bool) -> tuple[Tensor, Tensor]:
     """Make images of smooth noise, and the same moved to the left: pairs that match everywhere."""
-    shift = round(_SHIFT_PX * share)
-    noise = torch.rand(
-        count, 3, rows // 6, columns // 6, generator=torch.Generator().manual_seed(0)
-    )
+    rows, columns, share, count = size
+    shift, chance = round(_SHIFT_PX * share), torch.Generator().manual_seed(0)
+    noise = torch.rand(count, 3, rows // 6, columns // 6, generator=chance)
     scene = F.interpolate(noise, (rows, columns + shift), mode="bicubic").clamp(0, 1)
+    if with_sky:  # bright and smooth, over the upper two fifths
+        top = rows * 2 // 5
+        sky = torch.tensor(_SKY)[:, None, None] * torch.linspace(0.9, 1.0, top)[:, None]
+        scene[:, :, :top] = torch.lerp(scene[:, :, :top], sky, 0.97)
     return scene[..., :columns].contiguous(), scene[..., shift:].contiguous()
