@@ -7,7 +7,7 @@ model stands at the origin on y = 0 and looks along z.
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
-from functools import cache
+from functools import cache, partialmethod
 from typing import NamedTuple
 
 import numpy as np
@@ -165,17 +165,9 @@ class _Noise:
         field = np.fft.irfft2(strength * turn, s=(SIDE_PX, SIDE_PX))
         return (field / field.std()).astype(np.float32)
 
-    def rough(self) -> Plane:
-        """Coarse and fine together."""
-        return self.smooth(1.6, (1, 128))
-
-    def fine(self) -> Plane:
-        """Grains."""
-        return self.smooth(0.3, (24, 128))
-
-    def broad(self) -> Plane:
-        """Patches."""
-        return self.smooth(2.4, (1, 20))
+    rough = partialmethod(smooth, 1.6, (1, 128))  # coarse and fine together
+    fine = partialmethod(smooth, 0.3, (24, 128))  # grains
+    broad = partialmethod(smooth, 2.4, (1, 20))  # patches
 
     def bricks(
         self, rows: int, columns: int, joint: Number, spread: Number
@@ -210,18 +202,24 @@ def _mottled(**shares: float) -> Painter:
     return paint
 
 
+def _paved(
+    sizes: Sequence[tuple[int, int]], joint: Number, spread: Number, **shares: float
+) -> Painter:
+    """Slabs or stones, so many rows and columns of each variant, with noise as in mottled grey."""
+    grey = _mottled(**shares)
+
+    def paint(noise: _Noise, variant: int) -> Picture:
+        is_slab, shade, _ = noise.bricks(*sizes[variant], joint, spread)
+        return shade * (grey(noise, variant) * (0.55 + 0.45 * is_slab))[..., None]
+
+    return paint
+
+
 def _road(noise: _Noise, variant: int) -> Plane:
     cracks = np.clip(1 - np.abs(noise.smooth(1.8, (2, 60))) / 0.035, 0, 1)
     cracks = cracks * np.clip(noise.broad() - 0.4 * variant % 1, 0, 1)
     rough, fine, broad = noise.rough(), noise.fine(), noise.broad()
     return 1 + (0.24 + 0.05 * variant) * fine + 0.14 * rough + 0.06 * broad - 0.6 * cracks
-
-
-def _pavement(noise: _Noise, variant: int) -> Picture:
-    rows, columns = ((4, 4), (12, 6), (8, 8))[variant]
-    is_slab, shade, _ = noise.bricks(rows, columns, 0.05, 0.07)
-    grains = 1 + 0.08 * noise.rough() + 0.14 * noise.fine()
-    return shade * (grains * (0.55 + 0.45 * is_slab))[..., None]
 
 
 def _grass(noise: _Noise, variant: int) -> Picture:
@@ -243,13 +241,6 @@ def _plaster(noise: _Noise, variant: int) -> Plane:
     streaks = np.clip(noise.smooth(2.2, (1, 60), (0.25, 1)) - 0.6, 0, 2)
     fine, rough, broad = noise.fine(), noise.rough(), noise.broad()
     return 1 + 0.05 * fine + 0.06 * rough + 0.07 * broad - (0.06 + 0.06 * variant) * streaks
-
-
-def _stone(noise: _Noise, variant: int) -> Picture:
-    rows, columns = ((8, 5), (6, 3), (12, 6))[variant]
-    is_stone, shade, _ = noise.bricks(rows, columns, 0.06, 0.14)
-    grains = 1 + 0.09 * noise.fine() + 0.12 * noise.rough()
-    return shade * (grains * (0.55 + 0.45 * is_stone))[..., None]
 
 
 def _roof(noise: _Noise, variant: int) -> Picture:
@@ -336,8 +327,10 @@ def _cloth(noise: _Noise, variant: int) -> Plane:
 
 _dirt = _mottled(rough=0.2, fine=0.18, broad=0.12)
 _PAINTERS: dict[str, Painter] = {
-    "road": _road, "pavement": _pavement, "grass": _grass, "dirt": _dirt, "curb": _dirt,
-    "brick": _brick, "plaster": _plaster, "stone": _stone, "roof": _roof,
+    "road": _road, "grass": _grass, "dirt": _dirt, "curb": _dirt,
+    "pavement": _paved(((4, 4), (12, 6), (8, 8)), 0.05, 0.07, rough=0.08, fine=0.14),
+    "stone": _paved(((8, 5), (6, 3), (12, 6)), 0.06, 0.14, fine=0.09, rough=0.12),
+    "brick": _brick, "plaster": _plaster, "roof": _roof,
     "leaf": _leaf, "wood": _wood, "side": _side, "pane": _pane,
     "wheel": _wheel, "plate": _plate, "sign": _sign, "poster": _poster, "cloth": _cloth,
     "concrete": _mottled(fine=0.07, rough=0.09, broad=0.08),
