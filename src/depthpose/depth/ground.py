@@ -164,16 +164,9 @@ def rescale(
 def scale_by_distance(
     found: DepthEstimate, name: str, known: tuple[float, float, float]
 ) -> DepthEstimate:
-    """Make the depth around one pixel what was measured there.
+    """Make the depth around a pixel what was measured there: its column, its row, camera z [m].
 
-    Args:
-        found: an estimate with metres.
-        name: of the image, for errors.
-        known: column and row [px] and camera z [m] of a measured point; the median of 5x5 pixels
-            counts.
-
-    Raises:
-        InputError: a pixel outside the image, no depth around it (the sky), or no distance.
+    The median of 5x5 pixels counts; ``name`` is the image's, for errors.
     """
     column, row, metres = known
     assert found.depth_m is not None

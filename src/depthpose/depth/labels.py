@@ -44,21 +44,10 @@ def label_pairs(
     """Write a plain folder of pairs with pseudo-truth, and yield each name and what share is known.
 
     ``left/`` and ``right/`` repeat the images, ``disp_occ/`` holds the disparity, ``calib.txt``
-    the rigs. A rerun goes on where it was. Pairs of another folder may be added, if their names
-    are others.
-
-    Args:
-        net: the matcher; a network that has seen evaluation frames must not be used.
-        dataset: the pairs; frames without right view or calibration are left out.
-        config: what counts as known.
-        folder: where to write; refused if other settings made what it holds.
-        settings: what decides the result.
-        failures: takes what is wrong with each pair that cannot be read or matched, and the others
-            are labelled; None: the first such pair is an error.
-
-    Raises:
-        InputError: no frame has both, the folder holds a label of another image of that name, no
-            calibration can be read, or a pair that cannot be matched.
+    the rigs. A rerun goes on where it was; pairs of another folder may be added, if their names are
+    others. Frames without right view or calibration are left out. What is wrong with a pair goes to
+    ``failures``, or without these is raised. A network that has seen evaluation frames must not be
+    used.
     """
     frames = dataset.frames
     usable = [n for n, frame in enumerate(frames) if frame.right and frame.calibration]

@@ -227,13 +227,7 @@ def calibrate_weights(
     least = min(round(float(np.quantile(image_confidence, alarm_share)), 4), 0.9999)
     found = checkpoints.read_checkpoint(weights)
     config = dict(found.config)
-    own = (
-        config.get(_SELECTION)
-        if found.kind == BOTH
-        else config
-        if found.kind == _SELECTION
-        else None
-    )
+    own = {BOTH: config.get(_SELECTION), _SELECTION: config}.get(found.kind)
     if not isinstance(own, dict):
         raise InputError(
             f"{weights}: holds no generator that selects; take weights of 'train select'"

@@ -139,12 +139,7 @@ def refuse_unrectified(pair: StereoInput) -> str:
 
 
 def usable_right(pair: StereoInput) -> View:
-    """Give the right view of a pair that can be matched.
-
-    Raises:
-        InputError: there is none, its size is another, the camera has no baseline, or an image
-            does not lie in [0, 1].
-    """
+    """Give the right view of a pair, and refuse what cannot be matched."""
     if pair.right is None:
         raise InputError(f"{pair.name}: there is no right image; give right=.")
     check_image(pair.left, f"{pair.name}: the left image")
