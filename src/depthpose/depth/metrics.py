@@ -76,7 +76,7 @@ def _share_within(p: Tensor, t: Tensor, factor: float) -> float:
     return float((torch.maximum(p / t, t / p) < factor).double().mean())
 
 
-_within_1, _within_2, _within_3 = (partial(_share_within, factor=1.25**k) for k in (1, 2, 3))
+_within = [partial(_share_within, factor=1.25**k) for k in (1, 2, 3)]
 METRICS = {
     metric.name: metric
     for metric in (
@@ -84,9 +84,9 @@ METRICS = {
         Metric(name="sq_rel", of="depth", function=lambda p, t: float(((p - t) ** 2 / t).mean())),
         Metric(name="rmse", of="depth", function=_rmse),
         Metric(name="rmse_log", of="depth", function=lambda p, t: _rmse(p.log(), t.log())),
-        Metric(name="d1", of="depth", function=_within_1, better="higher"),
-        Metric(name="d2", of="depth", function=_within_2, better="higher", is_printed=False),
-        Metric(name="d3", of="depth", function=_within_3, better="higher", is_printed=False),
+        Metric(name="d1", of="depth", function=_within[0], better="higher"),
+        Metric(name="d2", of="depth", function=_within[1], better="higher", is_printed=False),
+        Metric(name="d3", of="depth", function=_within[2], better="higher", is_printed=False),
         Metric(name="epe_px", of="disparity", function=_end_point_error),
         Metric(name="d1_all", of="disparity", function=_share_bad),
         Metric(name="epe_noc_px", of="disparity_noc", function=_end_point_error, is_printed=False),

@@ -19,6 +19,7 @@ from depthpose.depth.augment import TrainingPair, degrade
 from depthpose.depth.config import DegradeConfig
 from depthpose.depth.disparity import right_disparity_from_left
 from depthpose.depth.encoder import LiteEncoder
+from depthpose.depth.metrics import measure
 from depthpose.depth.stereo import StereoNetwork, normalise
 from depthpose.depth.stereo.matcher import pad_top_right
 from depthpose.depth.train.config import (
@@ -126,10 +127,9 @@ def validate_pairs(
             pictures["left_right_disparity"] = torch.cat(views, 1)
         if not bool(is_known.any()):
             continue
-        error = (found - pair.left_px)[is_known].abs()
-        errors.append(float(error.mean()))
-        is_bad = (error > 3) & (error > 0.05 * pair.left_px[is_known])
-        bad.append(float(is_bad.float().mean()))
+        metrics = measure("disparity", found[is_known], pair.left_px[is_known])
+        errors.append(metrics["epe_px"])
+        bad.append(metrics["d1_all"])
     named = {"epe_px": errors, "d1": bad}
     named |= {name: v for name, v in (("sky_missed", missed), ("sky_false", false)) if v}
     numbers = {f"held_out/{name}": sum(v) / max(len(v), 1) for name, v in named.items()}
@@ -382,9 +382,10 @@ class SelectTask:
                 pictures["left_right_drawn_disparity"] = torch.cat(views, 1)
             is_known, is_true_sky = pair.left_px >= far_px, pair.left_px == 0
             if bool(is_known.any()):
-                ratio = pair.left_px[is_known] / found_px[is_known]
-                errors.append(float((ratio - 1).abs().mean()))
-                within.append(float((torch.maximum(ratio, 1 / ratio) < 1.25).float().mean()))
+                # Of depth without its unit, which these do not depend on.
+                metrics = measure("depth", 1 / found_px[is_known], 1 / pair.left_px[is_known])
+                errors.append(metrics["abs_rel"])
+                within.append(metrics["d1"])
             if bool(is_true_sky.any()):
                 missed.append(float((~is_sky[is_true_sky]).float().mean()))
         self._train()
