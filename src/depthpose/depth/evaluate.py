@@ -34,8 +34,6 @@ from depthpose.depth.metrics import (
 from depthpose.depth.types import DepthError, DepthEstimate, Map, StereoInput
 
 NO_PREDICTION = "no right view to match, and no prediction"
-Cell = str | int | float
-"""What a table holds."""
 
 
 @dataclass(frozen=True)
@@ -93,27 +91,11 @@ def has_truth(frame: Frame, rule: Protocol) -> bool:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Row:
-    """A row whose columns are its fields, in order.
+class EvaluationRow:
+    """Numbers of one frame, their mean over frames (each counts the same), or one decile of it.
 
-    A field that is None is no column; a mapping is a column for each of its entries.
+    Its columns are its fields, in order.
     """
-
-    def columns(self) -> dict[str, Cell]:
-        """Give the columns by name, as files and printed tables hold them."""
-        found: dict[str, Cell] = {}
-        for field in fields(self):
-            value = getattr(self, field.name)
-            if isinstance(value, Mapping):
-                found |= value
-            elif value is not None:
-                found[field.name] = value
-        return found
-
-
-@dataclass(frozen=True, kw_only=True)
-class EvaluationRow(Row):
-    """Numbers of one frame, their mean over frames (each counts the same), or one decile of it."""
 
     method: str | None = None  #: whose predictions were measured; None, as the next four: not known
     input: str | None = None  #: which images it was given
@@ -133,6 +115,15 @@ class EvaluationRow(Row):
     #: what all frames with a predicted pixel have, in the order of ``depth.metrics.METRICS``, then
     #: those of the drawn view and of the confidence
     metrics: Mapping[str, float]
+
+    def columns(self) -> dict[str, str | int | float]:
+        """Give the columns by name, one for each metric, as files and printed tables hold them.
+
+        A field that is None is no column.
+        """
+        found = {field.name: getattr(self, field.name) for field in fields(self)}
+        metrics = found.pop("metrics")
+        return {**{name: value for name, value in found.items() if value is not None}, **metrics}
 
 
 @dataclass(frozen=True, kw_only=True)
