@@ -22,7 +22,7 @@ from matchers import make_nets, measure, samples
 from depthpose.core.config import config_to_dict, read_config
 from depthpose.core.files import write_json
 from depthpose.core.loop import Run
-from depthpose.depth.config import AugmentConfig, PairsConfig, StreetsConfig
+from depthpose.depth.config import AugmentConfig, PairsConfig
 from depthpose.depth.train import STAGES
 from depthpose.depth.train.config import StereoTraining
 from depthpose.report.page import markdown_table, write_table
@@ -41,7 +41,6 @@ class Arm:
         light: changes of the network.
         change: changes of the rest of the config.
         data: which synthetic scenes.
-        streets: others that are rendered while training.
         seed: of the training.
     """
 
@@ -50,12 +49,9 @@ class Arm:
     light: dict[str, Any] = field(default_factory=dict)
     change: dict[str, Any] = field(default_factory=dict)
     data: tuple[str, ...] = ("streets", "clutter")
-    streets: StreetsConfig | None = None
     seed: int = 0
 
 
-OTHER_RIGS = StreetsConfig(frames=700, seed=33, scale=0.5, rigs="varied", with_lidar=False)
-"""Half of them by rigs of 0.12 to 0.8 m and other fields of view."""
 NO_SKY = {"with_sky": False}
 SCRATCH = {"encoder": None, "with_frozen_stem": False, "encoder_rate": 1.0}
 ARMS = (
@@ -66,7 +62,6 @@ ARMS = (
     Arm(name="one focal length (558 px)", augment={"scale": (1.5, 1.5)}),
     Arm(name="no clutter", data=("streets",)),
     Arm(name="no streets", data=("clutter",)),
-    Arm(name="half of the rigs others than KITTI's", data=("clutter",), streets=OTHER_RIGS),
     Arm(name="the sky is a disparity of 0", light=NO_SKY, change={"sky_weight": 1.0}),
     Arm(name="the sky has no truth", light=NO_SKY, change={"sky_weight": 0.0}),
     Arm(name="the sky counts a tenth", light=NO_SKY, change={"sky_weight": 0.1}),
@@ -88,7 +83,7 @@ def config_of(arm: Arm, options: argparse.Namespace) -> StereoTraining:
         base,
         encoder=str(options.encoder),
         adam=replace(base.adam, warmup_steps=30),
-        pairs=replace(base.pairs, folders=folders, streets=arm.streets, augment=augment),
+        pairs=replace(base.pairs, folders=folders, augment=augment),
         held_out=PairsConfig(folders=(str(options.held_out),), limit=24, focal_px=FOCAL_PX),
         loop=loop,
     )

@@ -81,7 +81,7 @@ class AugmentConfig(Settings):
 
 @dataclass(frozen=True, kw_only=True)
 class StreetsConfig(Settings):
-    """What synthetic street scenes are like."""
+    """What synthetic street scenes are like, seen by the five rigs of KITTI's recording days."""
 
     seed: Annotated[int, "[0, inf)"] = 0
     """Another seed, other streets."""
@@ -89,14 +89,8 @@ class StreetsConfig(Settings):
     frames: Annotated[int, "[0, inf)"] = 100_000
     """How many there are; each is rendered on demand."""
 
-    rigs: Literal["kitti", "varied"] = "kitti"
-    """kitti: the five rigs of KITTI's recording days; varied: half of the frames with others."""
-
     scale: Annotated[float, "[0.02, 4]"] = 1.0
     """Size of the pictures as a share of the rig's: 0.5 draws half as many rows and columns."""
-
-    crop: Annotated[tuple[int, int] | None, "[1, inf)"] = None
-    """Rows and columns of a window that alone is drawn, somewhere in each frame; None: all."""
 
     clutter_share: Annotated[float, "[0, 1]"] = 0.0
     """Share of the scenes that are clutter in place of a street: shapes of all kinds and surfaces,

@@ -10,4 +10,3 @@ from depthpose.depth.synthetic.scene import kitti_rig as kitti_rig
 from depthpose.depth.synthetic.scene import make_clutter as make_clutter
 from depthpose.depth.synthetic.scene import make_scene as make_scene
 from depthpose.depth.synthetic.scene import rig_number as rig_number
-from depthpose.depth.synthetic.scene import street_rig as street_rig

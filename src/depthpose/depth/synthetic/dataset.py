@@ -13,14 +13,20 @@ from jaxtyping import Float, Float64, Int
 from torch import Tensor
 from torch.nn import functional as F
 
-from depthpose.core.camera import StereoRig
+from depthpose.core.camera import StereoRig, resize_camera
 from depthpose.core.errors import InputError
 from depthpose.core.render import Raster, barycentric_shares, edge_functions, rasterize
 from depthpose.depth.augment import through_jpeg
 from depthpose.depth.config import StreetsConfig
 from depthpose.depth.disparity import disparity_from_depth
 from depthpose.depth.synthetic.mesh import NUMBER, Indices, Numbers, Vectors
-from depthpose.depth.synthetic.scene import StreetScene, make_clutter, make_scene, street_rig
+from depthpose.depth.synthetic.scene import (
+    StreetScene,
+    kitti_rig,
+    make_clutter,
+    make_scene,
+    rig_number,
+)
 from depthpose.depth.synthetic.shading import Hits, Stage, prepare, shade, sky_light
 from depthpose.depth.types import Map, Mask, RawFrame, StereoInput, StereoSample, StereoTruth, View
 
@@ -335,11 +341,12 @@ def draw_street(config: StreetsConfig, index: int) -> StreetFrame:
     """
     if index < 0:
         raise InputError(f"index is {index}, but frames are counted from 0; take another")
-    rig, mount_height_m = street_rig(config, index)
     seed = (config.seed, index)
     is_clutter = np.random.default_rng([75, *seed]).random() < config.clutter_share
-    scene = make_clutter(seed) if is_clutter else make_scene(seed, mount_height_m)
-    return draw_scene(scene, rig, config, seed)
+    scene = make_clutter(seed) if is_clutter else make_scene(seed)
+    rig = kitti_rig(rig_number(config, index))
+    width, height = (max(1, round(side * config.scale)) for side in (rig.width, rig.height))
+    return draw_scene(scene, resize_camera(rig, width, height), config, seed)
 
 
 def draw_scene(
@@ -349,8 +356,7 @@ def draw_scene(
 
     Args:
         scene: one that :func:`make_scene` made.
-        rig: the cameras; the size of the pictures is theirs. Scale and crop of ``config`` are not
-            applied.
+        rig: the cameras; the size of the pictures is theirs, whatever the scale of ``config``.
         config: how to draw.
         seed: of the sensors' noise, their small misalignment and the LiDAR's.
     """

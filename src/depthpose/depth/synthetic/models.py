@@ -402,7 +402,7 @@ _BLACK = Surface("tyre", (0.02, 0.02, 0.022))
 @cache
 def vehicle(kind: str, number: int) -> Mesh:
     """Give model ``number`` of a kind, white, looking along z."""
-    b = MeshBuilder(np.random.default_rng([21, list(BODIES).index(kind), number]))
+    b = _builder(21, list(BODIES).index(kind), number)
     body = BODIES[kind]
     size = np.array(body.size_m) * b.rng.uniform(0.95, 1.05, 3)
     shift = np.zeros((len(body.stations), 3))
@@ -499,7 +499,7 @@ _RUBBER = Surface("tyre", (0.025, 0.025, 0.028))
 @cache
 def walker(number: int) -> Mesh:
     """Give a person on foot, looking along z, caught at some moment of a step."""
-    b = MeshBuilder(np.random.default_rng([31, number]))
+    b = _builder(31, number)
     height, step = b.rng.uniform(1.55, 1.9), b.rng.uniform(-0.28, 0.28)
     coat, trousers = _cloth(b, 0.45), _cloth(b, 0.22)
     for side in (-1, 1):
@@ -518,7 +518,7 @@ def walker(number: int) -> Mesh:
 @cache
 def rider(number: int) -> Mesh:
     """Give a person on a bicycle, riding along z."""
-    b = MeshBuilder(np.random.default_rng([32, number]))
+    b = _builder(32, number)
     frame = Surface("metal", tuple(b.rng.uniform(0.03, 0.4, 3)))
     for z in (-0.52, 0.52):
         angle = np.linspace(0, 2 * np.pi, 19)

@@ -1,6 +1,6 @@
 """A scene to be drawn, a street or clutter: its mesh, its weather; and the rig that sees it.
 
-Rigs are those of KITTI's recording days, and others. Streets alone teach a matcher what streets
+Rigs are those of KITTI's recording days. Streets alone teach a matcher what streets
 look like: upright walls beside a plane. Clutter has thin, slanted, round, leafy, textureless,
 repetitive and mirroring things at every distance.
 """
@@ -14,7 +14,7 @@ import numpy as np
 import torch
 from jaxtyping import Float64
 
-from depthpose.core.camera import StereoRig, crop_camera, resize_camera
+from depthpose.core.camera import StereoRig
 from depthpose.depth.config import StreetsConfig
 from depthpose.depth.synthetic import road as roads
 from depthpose.depth.synthetic.mesh import (
@@ -192,13 +192,9 @@ _KITTI_SHARES = (0.6, 0.1, 0.1, 0.1, 0.1)
 
 
 def rig_number(config: StreetsConfig, index: int) -> int:
-    """Say which of KITTI's rigs a frame has, where ``config.rigs`` knows no others.
-
-    Rigs cannot be distinguished by their size: small pictures of two of them are of one.
-    """
-    full = replace(config, scale=1.0, crop=None)
-    width = street_rig(full, index)[0].width
-    return next(n for n, rig in enumerate(KITTI_RIGS) if rig[0] == width)
+    """Say which of KITTI's rigs a frame has."""
+    rng = np.random.default_rng([72, config.seed, index])
+    return int(rng.choice(len(KITTI_RIGS), p=_KITTI_SHARES))
 
 
 def kitti_rig(number: int = 0) -> StereoRig:
@@ -206,31 +202,6 @@ def kitti_rig(number: int = 0) -> StereoRig:
     width, height, focal_px, cx, cy, baseline_m = KITTI_RIGS[number]
     K = torch.tensor([[focal_px, 0, cx], [0, focal_px, cy], [0, 0, 1]], dtype=torch.float64)
     return StereoRig(width=width, height=height, K=K, baseline_m=baseline_m)
-
-
-def street_rig(config: StreetsConfig, index: int) -> tuple[StereoRig, float]:
-    """Give the rig of a frame, scaled and cropped as asked, and the height of its mount [m]."""
-    rng = np.random.default_rng([72, config.seed, index])
-    if config.rigs == "kitti" or rng.random() < 0.5:
-        rig, mount_m = kitti_rig(int(rng.choice(len(KITTI_RIGS), p=_KITTI_SHARES))), 1.65
-    else:
-        width = int(rng.integers(900, 1600))
-        height = int(width / rng.uniform(1.6, 3.3))
-        fx = width * rng.uniform(0.45, 1.1)
-        fy = fx * (1 + rng.normal(0, 0.004))
-        cx, cy = width * (0.5 + rng.normal(0, 0.015)), height * (0.5 + rng.normal(0, 0.03))
-        K = torch.tensor([[fx, 0, cx], [0, fy, cy], [0, 0, 1]], dtype=torch.float64)
-        baseline_m = _log_uniform(rng, 0.12, 0.8)
-        rig = StereoRig(width=width, height=height, K=K, baseline_m=baseline_m)
-        mount_m = rng.uniform(1.1, 2.2)
-    width, height = (max(1, round(side * config.scale)) for side in (rig.width, rig.height))
-    rig = resize_camera(rig, width, height)
-    if config.crop is None:
-        return rig, mount_m
-    rows, columns = min(config.crop[0], height), min(config.crop[1], width)
-    left = int(rng.integers(width - columns + 1))
-    top = int(rng.integers(height - rows + 1))
-    return crop_camera(rig, left, top, columns, rows), mount_m
 
 
 def _log_uniform(rng: np.random.Generator, low: float, high: float) -> float:

@@ -13,7 +13,7 @@ from depthpose.depth.augment import TrainingPair, augment, scale_pair
 from depthpose.depth.config import PairsConfig, TruthKind
 from depthpose.depth.datasets import Dataset, Frame, known_truths, lidar_truth, open_dataset
 from depthpose.depth.disparity import disparity_from_depth, right_disparity_from_left
-from depthpose.depth.synthetic import Streets, kitti_rig, street_rig
+from depthpose.depth.synthetic import Streets, kitti_rig
 
 BASELINE_TOLERANCE = 0.02
 """Relative difference of baselines that one virtual rig may stand for: KITTI's differ by 1.4 %."""
@@ -67,14 +67,12 @@ class TrainingPairs:
         if baseline_m is None:
             return
         # Every rig before any work: another baseline would change the metric scale.
-        rigs: dict[str, StereoRig | None] = {}
-        for number, (source, place, _) in enumerate(self._places):
-            if isinstance(source, Dataset):
-                rigs[self._frame_name(number)] = source.read_rig(place)
-            elif source.config.rigs != "kitti":
-                rigs[self._frame_name(number)] = street_rig(source.config, place)[0]
-        made = self.config.streets
-        if made is not None and made.rigs == "kitti":  # five rigs, and perhaps millions of streets
+        rigs = {
+            self._frame_name(number): source.read_rig(place)
+            for number, (source, place, _) in enumerate(self._places)
+            if isinstance(source, Dataset)
+        }
+        if self.config.streets is not None:  # five rigs, and perhaps millions of streets
             rigs |= {f"street with KITTI's rig {n}": kitti_rig(n) for n in range(5)}
         for name, rig in rigs.items():
             if rig is None:
