@@ -13,7 +13,7 @@ from torch.nn import functional as F
 
 from depthpose.core.camera import Camera, RectificationReport, StereoRig, check_rectified
 from depthpose.core.errors import InputError
-from depthpose.core.files import MAP_SUFFIXES, read_image, read_points_bin
+from depthpose.core.files import MAP_SUFFIXES, image_size, read_image, read_points_bin
 from depthpose.core.files.images import LISTED_SUFFIXES
 from depthpose.core.findings import CheckReport, Problem, make_report, unreadable
 from depthpose.depth.datasets.dataset import Dataset, read_split
@@ -39,6 +39,7 @@ def check_dataset(
     folder: Path,
     split: str | Path | None = None,
     *,
+    with_decoding: bool = True,
     progress: Callable[[int, int], None] | None = None,
 ) -> CheckReport:
     """Check every file of a dataset.
@@ -46,6 +47,7 @@ def check_dataset(
     Args:
         folder: the dataset's folder, in any layout that ``open_dataset`` knows.
         split: look only at these frames, and name those that are missing.
+        with_decoding: decode every image in full; else only headers and sizes are read.
         progress: called with the number of frames done and of all frames.
 
     Raises:
@@ -62,7 +64,7 @@ def check_dataset(
         frames = [here[name] for name in chosen.names if name in here]
     found += _check_folder(folder, frames)
     for done, frame in enumerate(frames, 1):
-        found += _check_images(frame)
+        found += _check_images(frame, with_decoding=with_decoding)
         if progress is not None:
             progress(done, len(frames))
     parts = {"right views": ("right",), "calibrations": ("calibration",),
@@ -113,7 +115,7 @@ def _check_folder(folder: Path, frames: list[Frame]) -> Iterator[Problem]:
             yield _problem(folder / name, "missing", message)
 
 
-def _check_images(frame: Frame) -> Iterator[Problem]:
+def _check_images(frame: Frame, *, with_decoding: bool) -> Iterator[Problem]:
     size = None
     images: list[Tensor] = []
     for path in (frame.left, frame.right):
@@ -121,11 +123,14 @@ def _check_images(frame: Frame) -> Iterator[Problem]:
             yield _problem(frame.left, "note", "has no right view")
             continue
         try:
-            images.append(read_image(path))
+            if with_decoding:
+                images.append(read_image(path))
+                found = (images[-1].shape[2], images[-1].shape[1])
+            else:
+                found = image_size(path)
         except InputError as error:
             yield unreadable(path, error)
             continue
-        found = (images[-1].shape[2], images[-1].shape[1])
         if size is not None and found != size:
             message = f"is {found[0]}x{found[1]}, but its left image is {size[0]}x{size[1]}"
             yield _problem(path, "mismatch", message)
