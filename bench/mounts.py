@@ -58,7 +58,7 @@ def draw(street: int, height_m: float, tilt_deg: int, fov_deg: int) -> dict[str,
     seen = dataclasses.replace(scene, mesh=mesh, camera_from_world=R)
     stage = prepare(seen, WIDTH * HEIGHT)
     sight = view_from(stage, camera(fov_deg).K, (HEIGHT, WIDTH), torch.zeros(3))
-    light = draw_light(stage, sight, with_antialiasing=True)
+    light = draw_light(stage, sight)
     seed = [street, int(height_m * 100), 9 - tilt_deg, fov_deg]
     sensor, _ = draw_sensors(np.random.default_rng(seed), light, 0.3)
     picture = (expose(light, sensor) * 255).round().byte().numpy()

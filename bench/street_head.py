@@ -81,7 +81,7 @@ def view(seed: int, index: int) -> StereoInput | None:
     sight = view_from(stage, K, (ROWS, COLUMNS), torch.zeros(3))
     if float((sight.raster.depth_m < 2).float().mean()) > 0.15:
         return None
-    light = draw_light(stage, sight, with_antialiasing=True)
+    light = draw_light(stage, sight)
     return images.given(f"{index}", expose(light, draw_sensors(rng, light, 0.3)[0]), f)
 
 

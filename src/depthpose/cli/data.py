@@ -33,7 +33,6 @@ def make_streets(
     first: int = 0,
     seed: int = 0,
     scale: float = 1.0,
-    with_antialiasing: bool = True,
     with_lidar: bool = True,
     clutter_share: float = 0.0,
 ) -> int:
@@ -49,7 +48,6 @@ def make_streets(
         first: number of the first one.
         seed: of the random streets, and number of the drives.
         scale: size of the images: 0.5 gives half as many rows and columns.
-        with_antialiasing: smooth edges.
         with_lidar: scan each scene with a LiDAR of 64 beams.
         clutter_share: share of scenes that show random shapes before a ground, a wall or in a box
             instead of a street; for training matchers.
@@ -68,7 +66,6 @@ def make_streets(
         seed=seed,
         scale=scale,
         clutter_share=clutter_share,
-        with_antialiasing=with_antialiasing,
         with_lidar=with_lidar,
     )
     # Seeds have drives of their own, so they may share a folder.

@@ -96,9 +96,6 @@ class StreetsConfig(Settings):
     """Share of the scenes that are clutter in place of a street: shapes of all kinds and surfaces,
     floating before a ground, a wall or in a box."""
 
-    with_antialiasing: bool = True
-    """Four samples in pixels where edges show."""
-
     with_lidar: bool = False
     """Scan each scene with a LiDAR too."""
 

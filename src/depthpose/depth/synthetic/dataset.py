@@ -117,25 +117,23 @@ _OFFSETS = ((-0.375, -0.125), (0.125, -0.375), (0.375, 0.125), (-0.125, 0.375))
 """Where in an edge pixel light is sampled: a turned square, which treats no direction badly."""
 
 
-def draw_light(stage: Stage, sight: Sight, *, with_antialiasing: bool) -> Float[Tensor, "h w 3"]:
-    """Give linear RGB, before any sensor."""
+def draw_light(stage: Stage, sight: Sight) -> Float[Tensor, "h w 3"]:
+    """Give linear RGB, before any sensor; the mean of four samples where edges show."""
     raster = sight.raster
     height, width = raster.primitive.shape
+    # Beside which something else is seen, or the same bent sharply.
     is_edge = torch.zeros(height, width, dtype=torch.bool)
-    if with_antialiasing:  # beside which something else is seen, or the same bent sharply
-        shown = raster.primitive.clamp(min=0)
-        kind = torch.where(raster.primitive >= 0, stage.kind[shown], -1)
-        normal = (
-            stage.attributes[:, 18:21].index_select(0, shown.flatten()).unflatten(0, shown.shape)
-        )
-        every, after, before = slice(None), slice(1, None), slice(None, -1)
-        for one, other in (((every, after), (every, before)), ((after, every), (before, every))):
-            is_other = raster.primitive[one] != raster.primitive[other]
-            x, y, z = (normal[one] * normal[other]).unbind(-1)
-            is_bent = (x + y + z).abs() < 0.9
-            differs = is_other & ((kind[one] != kind[other]) | is_bent)
-            is_edge[one] |= differs
-            is_edge[other] |= differs
+    shown = raster.primitive.clamp(min=0)
+    kind = torch.where(raster.primitive >= 0, stage.kind[shown], -1)
+    normal = stage.attributes[:, 18:21].index_select(0, shown.flatten()).unflatten(0, shown.shape)
+    every, after, before = slice(None), slice(1, None), slice(None, -1)
+    for one, other in (((every, after), (every, before)), ((after, every), (before, every))):
+        is_other = raster.primitive[one] != raster.primitive[other]
+        x, y, z = (normal[one] * normal[other]).unbind(-1)
+        is_bent = (x + y + z).abs() < 0.9
+        differs = is_other & ((kind[one] != kind[other]) | is_bent)
+        is_edge[one] |= differs
+        is_edge[other] |= differs
     is_edge = is_edge.flatten()
     light = torch.zeros(height * width, 3)
     whole, mixed = (~is_edge).nonzero()[:, 0], is_edge.nonzero()[:, 0]
@@ -368,10 +366,7 @@ def draw_scene(
     K[0, 2] += rig.cx_right_minus_left_px
     K[1, 2] += rng.normal(0, 1) * config.rectification_error_px
     right = view_from(stage, K, (rig.height, rig.width), torch.tensor([rig.baseline_m, 0.0, 0.0]))
-    light, other_light = (
-        draw_light(stage, sight, with_antialiasing=config.with_antialiasing)
-        for sight in (left, right)
-    )
+    light, other_light = draw_light(stage, left), draw_light(stage, right)
     sensors = draw_sensors(rng, light, config.jpeg_share)
     points = scan(stage, rng) if config.with_lidar else None
     primitive, depth_m = left.raster.primitive, left.raster.depth_m
