@@ -123,11 +123,10 @@ def test_a_sure_mixture_is_one_shift(scale: float) -> None:
 def test_any_size_is_answered_at_its_own_size(size: tuple[int, int]) -> None:
     drawn = make_synthesiser(tiny()).draw(torch.rand(2, 3, *size))
     assert drawn.right.shape == (2, 3, *size)
-    for part in (drawn.disparity_px, drawn.confidence, drawn.is_sky):
-        assert part is not None
+    assert drawn.seen is not None
+    for part in (drawn.seen.disparity_px, drawn.seen.confidence, drawn.seen.is_sky):
         assert part.shape == (2, *size)
-    assert drawn.disparity_px is not None
-    assert bool((drawn.disparity_px > 0).all())
+    assert bool((drawn.seen.disparity_px > 0).all())
 
 
 def test_neighbours_in_a_batch_change_nothing() -> None:

@@ -2,10 +2,10 @@
 
 import warnings
 from collections.abc import Callable
-from dataclasses import fields, replace
+from dataclasses import fields
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from torch import Tensor
 from torch.nn import functional as F
 
@@ -236,13 +236,12 @@ def from_virtual(
     rig: GeneratorConfig | SelectionConfig,
     match: Match,
     right: Float[Tensor, "3 _ _"],
-    is_sky: Bool[Tensor, "_ _"] | None,
 ) -> DepthEstimate:
     """Bring what was found at the virtual rig back to the image."""
     camera = image.camera
     assert camera is not None
     height, width = image.left.shape[1:]
-    seen = resized_match(replace(match, is_sky=is_sky), height, width)
+    seen = resized_match(match, height, width)
     imitated = StereoRig(width=width, height=height, K=camera.K, baseline_m=rig.virtual_baseline_m)
     px, is_sky = seen.disparity_px, seen.is_sky
     depth_m = depth_from_disparity(px, imitated)

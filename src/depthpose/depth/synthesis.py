@@ -351,12 +351,7 @@ class SynthesisedViews:
     """What a generator answers for left images."""
 
     right: Views  #: the right views, RGB in [0, 1]
-    #: the generator's own disparity of the left view, finite in the sky too; None where it has none
-    disparity_px: Maps | None = None
-    confidence: Maps | None = None  #: 0 (guess) to 1 (sure) of that
-    is_sky: Bool[Tensor, "b h w"] | None = None  #: where the left view shows the sky
-    #: probability that the left view shows a street; None where the generator cannot say
-    street: Float[Tensor, " b"] | None = None
+    seen: Selected | None = None  #: what it says of the left views; None where it draws alone
 
 
 @runtime_checkable
@@ -423,14 +418,10 @@ class SelectionSynthesiser:
         limits_px = [most_px * size[1] / images.shape[-1] for images in sizes]
         views = [select_views(self.generator, images, size) for images in sizes]
         lefts, rights = zip(*views, strict=True)
-        seen = average(lefts, limits_px)
-        home = left.device
+        seen, home = average(lefts, limits_px), left.device
         return SynthesisedViews(
             right=shift_left(sizes[0], average(rights, limits_px).shift_px).to(home),
-            disparity_px=seen.disparity_px.to(home),
-            confidence=seen.confidence.to(home),
-            is_sky=seen.is_sky.to(home),
-            street=None if seen.street is None else seen.street.to(home),
+            seen=Selected(*(v if v is None else v.to(home) for v in vars(seen).values())),
         )
 
 

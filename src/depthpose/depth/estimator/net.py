@@ -492,22 +492,23 @@ class FakestereoNet:
                 for size in sizes
             )
             views = self.synthesiser.draw(left, *larger)
+            seen = views.seen
             if rig.answer == "matched":
                 camera = camera_of(rig.virtual_focal_px, (left.shape[3], left.shape[2]))
                 matches = self._match(list(zip(left, views.right, strict=True)), camera)
             else:
-                assert views.disparity_px is not None and views.confidence is not None  # noqa: PT018
-                parts = zip(views.disparity_px, views.confidence, strict=True)
+                assert seen is not None, "it has an answer of its own"
+                parts = zip(seen.disparity_px, seen.confidence, strict=True)
                 matches = [Match(disparity_px=px, confidence=sure) for px, sure in parts]
             estimates = []
-            for n, (image, match) in enumerate(zip(images, matches, strict=True)):
-                is_sky = match.is_sky if views.is_sky is None else views.is_sky[n]
-                estimate = disparity.from_virtual(image, rig, match, views.right[n], is_sky)
+            for n, (image, found) in enumerate(zip(images, matches, strict=True)):
+                match = found if seen is None else replace(found, is_sky=seen.is_sky[n])
+                estimate = disparity.from_virtual(image, rig, match, views.right[n])
                 estimate = scale_by_mount(estimate, image)
                 estimates.append(estimate)
-                if views.confidence is None:
+                if seen is None:
                     continue
-                mean = views.confidence[n].mean() if views.street is None else views.street[n]
+                mean = seen.confidence[n].mean() if seen.street is None else seen.street[n]
                 sure, said = float(mean), ""
                 if isinstance(rig, SelectionConfig) and sure < rig.least_confidence:
                     what = "probability of a street" if rig.with_street else "mean confidence"

@@ -374,9 +374,9 @@ class SelectTask:
         for index in range(len(self.held_out)):
             pair = self.held_out.read(index)
             drawn = synthesiser.draw(pair.left[None])
-            assert drawn.disparity_px is not None and drawn.is_sky is not None  # noqa: PT018
-            is_sky = drawn.is_sky[0]
-            found_px = torch.where(is_sky, 0.0, drawn.disparity_px[0]).clamp(min=far_px)
+            assert drawn.seen is not None, "it selects"
+            is_sky = drawn.seen.is_sky[0]
+            found_px = drawn.seen.shift_px[0].clamp(min=far_px)
             if index == 0:
                 views = [pair.left, pair.right, drawn.right[0], draw_disparity(found_px)]
                 pictures["left_right_drawn_disparity"] = torch.cat(views, 1)
