@@ -419,10 +419,9 @@ class SelectionSynthesiser:
         views = [select_views(self.generator, images, size) for images in sizes]
         lefts, rights = zip(*views, strict=True)
         seen, home = average(lefts, limits_px), left.device
-        return SynthesisedViews(
-            right=shift_left(sizes[0], average(rights, limits_px).shift_px).to(home),
-            seen=Selected(*(v if v is None else v.to(home) for v in vars(seen).values())),
-        )
+        parts = {name: value.to(home) for name, value in vars(seen).items() if value is not None}
+        right = shift_left(sizes[0], average(rights, limits_px).shift_px)
+        return SynthesisedViews(right=right.to(home), seen=Selected(**parts))
 
 
 class UNetSynthesiser:
