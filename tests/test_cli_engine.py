@@ -89,16 +89,13 @@ def match(home: Path, out: Path, *words: str) -> int:
     return main(["depth", "match", *words, *fixed, "--out", str(out), "--no-check"])
 
 
-@pytest.mark.parametrize("form", ["tar", "parquet"])
 def test_shards_hold_the_files_of_the_plain_command(
-    home: Path, tmp_path: Path, double: InProcessEngine, form: str
+    home: Path, tmp_path: Path, double: InProcessEngine
 ) -> None:
-    if form == "parquet":
-        pytest.importorskip("pyarrow", reason="Parquet needs pyarrow (the extra ray)")
     assert predict(home, tmp_path / "plain", str(home / "left")) == 0
-    words = [str(home / "left"), *RAY, "--block", "2", "--shards", form]
+    words = [str(home / "left"), *RAY, "--block", "2"]
     assert predict(home, tmp_path / "big", *words) == 0
-    assert len(list((tmp_path / "big" / "shards").glob(f"*.{form}"))) == 3
+    assert len(list((tmp_path / "big" / "shards").glob("*.tar"))) == 3
     wanted = files_of(tmp_path / "plain")
     assert len(wanted) == 5
     assert len(wanted["0"]) == 7

@@ -43,7 +43,6 @@ IGNORED = [
     ("depth evaluate", "--protocol kitti-2015 --cap 50", "--cap"),
     ("data export-depth", "r --format colmap --files npy", "--files"),
     ("weights complete", "w --models . --unit m", "--unit"),
-    ("reproduce all", "--linemod l --split all", "--split"),
 ]
 USED = [
     ("pose predict", "--voting ransac --hypotheses 64"),
@@ -54,7 +53,6 @@ USED = [
     ("pose predict", "--depth d.csv --camera c --engine ray --batch 4"),
     ("depth evaluate", "--matcher sgbm --holes leave --baseline rows --train t"),
     ("depth evaluate", "--weights quick:a b --speed fine --protocol eigen-raw --cap 50"),
-    ("reproduce all", "--kitti k --split all"),
 ]
 
 

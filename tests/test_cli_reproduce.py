@@ -14,7 +14,7 @@ from tests.synthetic_street import make_street
 
 from depthpose.cli import main
 from depthpose.cli.depth_evaluate import signed
-from depthpose.cli.depth_methods import Method
+from depthpose.cli.depth_predict import Method
 from depthpose.cli.thesis_depth import reproduce_table, write_figure
 from depthpose.core.camera import StereoRig, write_camera
 from depthpose.core.errors import InputError

@@ -38,12 +38,11 @@ def predict(
         out: folder for the results.
     """
     from depthpose.cli import depth_predict as work
-    from depthpose.cli.depth_methods import MethodSource
 
     if not images:
         raise InputError("name images, folders of them, patterns or videos to predict from")
     options.refuse_unusable(scale, output)
-    method = MethodSource(
+    method = work.MethodSource(
         weights=networks.weights,
         config=matching.config,
         with_right=False,
@@ -99,7 +98,6 @@ def match(
         out: folder for the results.
     """
     from depthpose.cli import depth_predict as work
-    from depthpose.cli.depth_methods import MethodSource
     from depthpose.core.camera import read_rig
     from depthpose.core.files import image_size
     from depthpose.core.run import refuse_among_inputs
@@ -107,7 +105,7 @@ def match(
     from depthpose.depth.stereo import NetworkMatcher, tile_change_px
 
     used = None if pairs.matcher == "sgbm" else pairs.matcher or pairs.weights or "default"
-    method = MethodSource(weights=used, config=matching.config, with_right=True, use="pairs")
+    method = work.MethodSource(weights=used, config=matching.config, with_right=True, use="pairs")
     method = method.packed() if engine.engine == "ray" else method
 
     def work_of(files: Sequence[Path]) -> work.DepthWork:

@@ -1,23 +1,25 @@
 """The work behind ``depthpose depth evaluate``."""
 
+import hashlib
 import json
 import sys
 import tempfile
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, cast, get_args
 
 from tqdm import tqdm
 
-from depthpose.cli.depth_methods import Method, baseline_method, named_method, sgbm_method
 from depthpose.cli.depth_options import MethodOptions
+from depthpose.cli.depth_predict import Method, MethodSource, sgbm_method
 from depthpose.cli.engine import EngineOptions
 from depthpose.core import engine as jobs
 from depthpose.core.errors import InputError
 from depthpose.core.run import environment, find_rank, read_settings, wait_for
-from depthpose.depth.config import MatcherConfig
+from depthpose.depth.baselines import NearestImageBaseline, RowDepthBaseline
+from depthpose.depth.config import Answer, BaselineName, MatcherConfig, Speed
 from depthpose.depth.datasets import Dataset, join_datasets, open_dataset, refuse_common
 from depthpose.depth.estimator import FakestereoNet
 from depthpose.depth.evaluate import (
@@ -110,6 +112,40 @@ def choose_methods(options: MethodOptions, config: MatcherConfig, dataset: Datas
         training = open_training(options.train, options.train_without, dataset)
         chosen += [baseline_method(name, training) for name in dict.fromkeys(options.baseline)]
     return chosen
+
+
+def named_method(word: str, config: MatcherConfig) -> Method:
+    """Build the method of a name: weights by file or name, perhaps with ``both:`` and the like."""
+    how, _, name = word.rpartition(":")
+    source = MethodSource(weights=name, config=config, with_right=how not in get_args(Answer))
+    if how in get_args(Answer):  # what depth of one image comes from
+        return replace(source, answer=cast("Answer", how)).build()
+    if how == "both":
+        return source.build()
+    if how in get_args(Speed):  # how much time the match of a real pair may take
+        method = replace(source, config=replace(config, speed=how)).build()
+        return method._replace(name=f"{method.name}-{how}")
+    if how == "sgbm":
+        return replace(source, with_right=False, matcher="sgbm").build()
+    return MethodSource(weights=word, config=config).build()
+
+
+def baseline_method(name: BaselineName, training: Dataset) -> Method:
+    """Fit a baseline to the truth of training frames."""
+    kinds = {"rows": RowDepthBaseline, "nearest": NearestImageBaseline}
+    names = "\n".join(frame.name for frame in training.frames)
+    settings = {
+        "matcher": f"baseline: {name}",
+        "input": "left view" if name == "nearest" else "no image",
+        "train": training.name,
+        "train_frames": len(training),
+        "train_sha256": hashlib.sha256(names.encode()).hexdigest(),
+    }
+
+    def show(frames: Sequence[int]) -> Iterable[int]:
+        return tqdm(frames, f"fit {name}", unit=" frames", disable=None)
+
+    return Method(f"baseline-{name}", kinds[name].fit(training, show), settings, with_right=False)
 
 
 def open_training(folders: Sequence[Path], without: Sequence[str], measured: Dataset) -> Dataset:
@@ -309,7 +345,7 @@ def measure_shards(
     name, names = jobs.stem(predictions.rstrip("/")), {item.name for item in items}
     about = {"data": data, "split": split, "protocol": protocol, "caps_m": list(caps_m)}
     home = str(out / "measured" / name)
-    files = jobs.Files(roles=("record", "shard"), suffixes=(".json", ".tar", ".parquet"))
+    files = jobs.Files(roles=("record", "shard"), suffixes=(".json", ".tar"))
     start = partial(start_measuring, data, split, protocol, caps_m)
     work = jobs.Work(start=start, files=files, endings=(ENDING,))
     # Of what a worker writes: a job that was begun by another version is refused.

@@ -208,16 +208,13 @@ EstimateMany = Callable[[Sequence[ViewInput]], Sequence[PoseEstimate]]
 class PoseMethod:
     """An estimator, what to call it, the objects it knows, and what decides its results.
 
-    Attributes:
-        takes_clouds: whether it can do without a depth image.
-        find: gives the poses of named objects in a view without a mask; None: it cannot.
-        track: follows a named object through frames; None: it cannot.
-        holder: what knows the objects, in messages.
+    ``find`` gives the poses of named objects in a view without a mask, ``track`` follows one
+    through frames; None: it cannot. ``holder``: what knows the objects, in messages.
     """
 
     name: str
     estimate_many: EstimateMany
-    takes_clouds: bool
+    takes_clouds: bool  # whether it can do without a depth image
     models: Sequence[ObjectModel]
     settings: Mapping[str, Any]
     find: Callable[[ViewInput, Sequence[str]], list[PoseEstimate]] | None = None

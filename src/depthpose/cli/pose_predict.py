@@ -180,7 +180,7 @@ def predict_dataset(
     if object is not None:
         settings["objects"] = sorted({i.object_id for i in dataset.instances})
     if engine.engine == "ray":
-        settings["shards"] = engine.shards
+        settings["shards"] = "tar"
     claim_bop(home, settings, dataset)
     if engine.engine == "ray":
         start = partial(

@@ -23,17 +23,11 @@ _LEAST_GAP = 0.08  # of two marks on a bar, as a share of its length: nearer one
 
 @dataclass(frozen=True, kw_only=True)
 class Scale:
-    """What the colours of a picture mean, for a colour bar.
+    """What the colours of a picture mean, for a colour bar."""
 
-    Attributes:
-        title: of what, with its unit.
-        colors: RGB in [0, 1] at even steps from the left end of the bar to the right.
-        marks: places on the bar, 0 (left) to 1, and what is written there.
-    """
-
-    title: str
-    colors: Sequence[tuple[float, float, float]]
-    marks: Sequence[tuple[float, str]]
+    title: str  #: of what, with its unit
+    colors: Sequence[tuple[float, float, float]]  #: RGB in [0, 1] at even steps from left to right
+    marks: Sequence[tuple[float, str]]  #: places, 0 (left) to 1, and what is written there
 
 
 def depth_scale(near_m: float = 3.0, far_m: float = 80.0) -> Scale:

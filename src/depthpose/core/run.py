@@ -386,12 +386,17 @@ def read_settings(folder: Path | str) -> dict[str, Any] | None:
     Raises:
         InputError: its record is damaged.
     """
-    record = disk.join(str(folder), RECORD)
-    if not disk.exists(record):
-        return None
+    record, content = f"{folder}/{RECORD}", None
     with disk.refused_as(record, "record of a run", "choose another folder"):
-        path = disk.local_path(record)
-        content = json.loads(disk.read_from(record)) if path is None else read_json(path)
+        if not disk.is_url(record):
+            path = Path(record)
+            if not path.exists():
+                return None
+            content = read_json(path)
+        elif not disk.exists(record):
+            return None
+        else:
+            content = json.loads(disk.read_from(record))
     settings = content.get("settings") if isinstance(content, dict) else None
     if not isinstance(settings, dict):
         raise InputError(

@@ -218,21 +218,13 @@ _CLOSE_UP_PX = 360
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class PoseShown:
-    """An estimate or a refusal as a page shows it.
+    """An estimate or a refusal as a page shows it."""
 
-    Attributes:
-        input: what was seen.
-        estimate: its result.
-        model: the object.
-        image: what the pose is drawn over, of the view's camera; None: its depth in grey.
-        truth: ``camera_from_model``, where it is known.
-    """
-
-    input: AnyInput
-    estimate: PoseEstimate
-    model: ObjectModel
-    image: Float[Tensor, "3 h w"] | None = None
-    truth: Rigid | None = None
+    input: AnyInput  #: what was seen
+    estimate: PoseEstimate  #: its result
+    model: ObjectModel  #: the object
+    image: Float[Tensor, "3 h w"] | None = None  #: to draw the pose over; None: the depth in grey
+    truth: Rigid | None = None  #: ``camera_from_model``, where it is known
 
 
 def pose_section(title: str, shown: PoseShown, text: str = "", rows: Sequence[Row] = ()) -> Section:

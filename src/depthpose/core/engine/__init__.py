@@ -16,7 +16,6 @@ from depthpose.core.engine.work import Function as Function
 from depthpose.core.engine.work import Inputs as Inputs
 from depthpose.core.engine.work import Item as Item
 from depthpose.core.engine.work import Sample as Sample
-from depthpose.core.engine.work import ShardFormat as ShardFormat
 from depthpose.core.engine.work import Work as Work
 from depthpose.core.engine.work import find_items as find_items
 from depthpose.core.engine.work import find_tars as find_tars
