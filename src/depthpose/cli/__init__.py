@@ -59,8 +59,6 @@ COMMANDS = {
     "weights pack": ("weights:pack_weights", "one file of a generator and a matcher, with a card"),
     "weights complete": (
         "weights:complete_weights", "add meshes to pose weights that came without"),
-    "weights push": (
-        "weights:push_weights", "upload weights and their card to the Hugging Face hub"),
     "weights import": ("weights:import_weights", "import a published checkpoint, safely"),
     "export depth": ("weights:export_depth", "depth as an ONNX file, proven to agree"),
     "export pose": ("weights:export_pose", "the network of directions as an ONNX file"),
