@@ -66,7 +66,6 @@ def shown_as(metavar: str | None, help: str | None = None) -> Any:  # noqa: ANN4
 
 
 Device = Annotated[str, shown_as("DEVICE", help="cpu, cuda, cuda:1, ...")]
-View = Annotated[str | None, shown_as("live|FILE.rrd")]
 
 
 @dataclass_transform(frozen_default=True, kw_only_default=True)
@@ -224,8 +223,8 @@ _RULES: tuple[tuple[str, _Case, str, str], ...] = (
     ("pose predict", lambda o: "least-squares" in o["voting"], "hypotheses",
      "--voting least-squares draws no hypotheses"),
     ("pose predict", lambda o: "depth" in o and "mask" not in o and "ray" not in o["engine"],
-     "batch view register-refused",
-     "an image without --mask is searched alone, not shown, and registers nothing; give --mask"),
+     "batch register-refused",
+     "an image without --mask is searched alone, and registers nothing; give --mask"),
     ("pose track", lambda o: "bop" not in o, "split", "it is of a data set; give --bop"),
     ("pose track", lambda o: "bop" in o, "first",
      "a data set has many sequences and one pose is given; give the frames of one by --depth"),
@@ -236,8 +235,6 @@ _RULES: tuple[tuple[str, _Case, str, str], ...] = (
     ("pose predict, depth predict, depth match, depth evaluate",
      lambda o: "ray" not in o["engine"], "address workers worker-cpus worker-gpus block",
      "--engine ray takes it, and is not given; add it"),
-    ("pose predict, depth predict", lambda o: "ray" in o["engine"], "view",
-     "the workers of --engine ray show nothing"),
     ("pose predict, depth predict, depth match",
      lambda o: o["device"][:1] in ([], ["cpu"]) and o["worker-gpus"][:1] not in (["0"], ["0.0"]),
      "worker-gpus", "the workers compute on the processor without --device cuda"),

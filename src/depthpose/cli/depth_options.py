@@ -8,7 +8,7 @@ from typing import Annotated, Literal
 
 import tyro
 
-from depthpose.cli.arguments import Device, Source, View, WeightsName, group, shown_as
+from depthpose.cli.arguments import Device, Source, WeightsName, group, shown_as
 from depthpose.core.errors import InputError
 from depthpose.depth.config import Answer, BaselineName, MatcherConfig, Speed
 
@@ -140,8 +140,6 @@ class PredictOutput:
     """images of one size that go through the networks together: for a GPU."""
     cloud: bool = False
     """write a coloured point cloud of what is nearer than 80 m, NAME.cloud.ply."""
-    view: View = None
-    """live shows each result in Rerun's viewer (an extra) as it comes; FILE.rrd records it."""
 
 
 def refuse_unusable(scale: ScaleOptions, output: PredictOutput) -> None:

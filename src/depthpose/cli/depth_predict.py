@@ -55,7 +55,6 @@ from depthpose.depth.types import StereoInput
 from depthpose.depth.weights import MATCHERS, Use
 from depthpose.report.depth import depth_section
 from depthpose.report.page import MOST_VIEWS, Film, Section, spread_evenly, write_page
-from depthpose.report.viewer import Viewer, open_viewer
 
 IMAGES = Files(roles=("image",), suffixes=LISTED_SUFFIXES)
 PAIRS = Files(roles=("left", "right"), suffixes=LISTED_SUFFIXES)
@@ -356,12 +355,11 @@ def estimate_all(
     endings = [f".{end}" for end in ENDINGS] + [_VIDEO]
     run.claim_names(out, {files[0].stem: files for files in sources}, endings, videos)
     mine = [sources[k] for k in run.find_rank().share(len(sources))]
-    with open_viewer(None if run.find_rank().rank else work.output.view) as viewer:
-        predictor = Predictor(work, method, out, viewer)
-        stills = [files for files in mine if not _is_video(files[0])]
-        named = (one for files in stills for one in work.inputs_of(files))
-        done = len(predictor.predict(named, len(stills), "images"))
-        done += sum(predictor.predict_video(video) for video, *_ in mine if _is_video(video))
+    predictor = Predictor(work, method, out)
+    stills = [files for files in mine if not _is_video(files[0])]
+    named = (one for files in stills for one in work.inputs_of(files))
+    done = len(predictor.predict(named, len(stills), "images"))
+    done += sum(predictor.predict_video(video) for video, *_ in mine if _is_video(video))
     failures = list(predictor.failures.values())
     if failures and not done and len(sources) == 1:
         raise failures[0]
@@ -410,7 +408,6 @@ class Predictor:
     work: DepthWork
     method: Method
     out: Path
-    viewer: Viewer | None = None
     failures: dict[str, InputError] = field(default_factory=dict)
 
     def predict_video(self, source: Path) -> int:
@@ -471,8 +468,6 @@ class Predictor:
                         tqdm.write(said, sys.stderr)
                     if estimate.ground is not None:
                         tqdm.write(f"{one.name}: {estimate.ground}")
-                    if self.viewer is not None:
-                        self.viewer.show_depth(one, estimate)
                 names += [name for name, _ in chunk if name not in self.failures]
                 bar.update(len(chunk))
         return names

@@ -35,7 +35,6 @@ from depthpose.pose.mesh import FIXED_UNITS, unit_of
 from depthpose.pose.segmentation import Segmenter
 from depthpose.pose.types import ObjectModel, PoseEstimate, ViewInput
 from depthpose.pose.weights import read_pose_weights
-from depthpose.report.viewer import Viewer
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -576,16 +575,11 @@ def safe_job(job: predictions.Job[Any], object: str) -> predictions.Job[Any]:
     return replace(job, read=read)
 
 
-def safely(method: PoseMethod, viewer: Viewer | None = None) -> EstimateMany:
-    """Let a method skip what could not be read, and show the others."""
+def safely(method: PoseMethod) -> EstimateMany:
+    """Let a method skip what could not be read."""
 
     def estimate_many(inputs: Sequence[Any]) -> list[PoseEstimate]:
-        readable = [one for one in inputs if not isinstance(one, PoseEstimate)]
-        estimates = method.estimate_many(readable)
-        if viewer is not None:
-            for one, estimate in zip(readable, estimates, strict=True):
-                viewer.show_pose(one, estimate, method.models_by_name[one.object])
-        left = iter(estimates)
+        left = iter(method.estimate_many([o for o in inputs if not isinstance(o, PoseEstimate)]))
         return [one if isinstance(one, PoseEstimate) else next(left) for one in inputs]
 
     return estimate_many

@@ -69,7 +69,6 @@ from depthpose.pose.predictions import (
 from depthpose.pose.types import PoseEstimate, ViewInput
 from depthpose.report import pose as drawn
 from depthpose.report.page import Section, choose_answers, plain_table, write_page
-from depthpose.report.viewer import open_viewer
 
 _PAGE = "report.html"
 _MOST_SHOWN = 20  # of the answers, on the terminal; poses.json holds all
@@ -117,9 +116,7 @@ def claim_bop(out: Path, settings: dict[str, Any], dataset: BopDataset) -> None:
     run.claim_folder(out, settings, [POSES, _PAGE, *tables, *pictures])
 
 
-def predict_files(
-    method: PoseMethod, inputs: OneObjectOptions, out: Path, batch: int, view: str | None
-) -> int:
+def predict_files(method: PoseMethod, inputs: OneObjectOptions, out: Path, batch: int) -> int:
     """Pose clouds, or masked depth images, in this process; give the exit code."""
     name, lens = pose_methods.object_named(inputs.object, method), inputs.lens
     settings = {**method.settings, "object": name}
@@ -137,7 +134,7 @@ def predict_files(
         settings |= pose_methods.camera_facts(lens) | {"mask": str(mask.resolve())}
         settings |= {} if inputs.unit is None else {"unit": inputs.unit}
     claim(out, settings, jobs)
-    predictions = predict_all(method, jobs, out, settings, batch, view)
+    predictions = predict_all(method, jobs, out, settings, batch)
     if predictions is None:
         return 0
     write_files(predictions, jobs, out, method)
@@ -150,7 +147,6 @@ def predict_dataset(
     object: str | None,
     out: str,
     batch: int,
-    view: str | None,
     engine: EngineOptions,
 ) -> int:
     """Pose the objects of a data set, or one, here or by an engine; give the exit code."""
@@ -211,7 +207,7 @@ def predict_dataset(
         predictions = [known[job.name] for job in jobs]
         write_predictions(Path(out), predictions)
     else:
-        predictions = predict_all(method, jobs, home, settings, batch, view)
+        predictions = predict_all(method, jobs, home, settings, batch)
     if predictions is None:
         return 0
     write_files(predictions, jobs, home, method, dataset)
@@ -224,7 +220,6 @@ def predict_all(
     out: Path,
     settings: dict[str, Any],
     batch: int,
-    view: str | None,
 ) -> list[Prediction] | None:
     """Estimate what is not finished; several processes share the work through the files.
 
@@ -235,10 +230,9 @@ def predict_all(
     done = _finished(out)
     left = [jobs[k] for k in process.share(len(jobs)) if jobs[k].name not in done]
     if left:
-        with open_viewer(None if process.rank else view) as viewer:
-            names = predict(pose_methods.safely(method, viewer), left, home, settings, batch)
-            for _ in tqdm(names, total=len(left), disable=None, unit=" poses"):
-                pass
+        names = predict(pose_methods.safely(method), left, home, settings, batch)
+        for _ in tqdm(names, total=len(left), disable=None, unit=" poses"):
+            pass
     if process.rank:
         return None
     if process.world > 1:
