@@ -133,7 +133,7 @@ def test_the_old_name_of_the_option_baseline_still_works(
     street: Path, trained: Path, tmp_path: Path
 ) -> None:
     words = ["depth", "evaluate", "--data", str(street), "--out", str(tmp_path), *CAMERA_Z]
-    assert main([*words, "--floor", "rows", "--train", str(trained)]) == 0
+    assert main([*words, "--baseline", "rows", "--train", str(trained)]) == 0
     assert {row["method"] for row in rows_of(tmp_path)} == {"baseline: rows"}
 
 

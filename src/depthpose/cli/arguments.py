@@ -248,7 +248,7 @@ _RULES: tuple[tuple[str, _Case, str, str], ...] = (
     ("depth match", lambda o: "sgbm" in o["matcher"],
      f"device speed {_NETWORK} tile left-right-check",
      "sgbm has no weights"),
-    ("depth evaluate", lambda o: "baseline" not in o and "floor" not in o, "train train-without",
+    ("depth evaluate", lambda o: "baseline" not in o, "train train-without",
      "--baseline takes it, and is not given; add it"),
     ("depth evaluate, reproduce", lambda o: "train" not in o, "train-without",
      "it leaves frames out of --train, and none is given"),

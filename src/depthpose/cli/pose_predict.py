@@ -384,13 +384,10 @@ def _write_page(
         if isinstance(shown_input, PoseEstimate):  # unreadable by now
             continue
         rgb = None if place is None else image_of[place[:2]]
-        shown = drawn.PoseShown(
-            input=shown_input,
-            estimate=estimate,
-            model=method.models_by_name[estimate.object],
-            image=None if rgb is None else read_image(rgb),
-        )
-        sections.append(drawn.pose_section(estimate.name, shown))
+        model = method.models_by_name[estimate.object]
+        image = None if rgb is None else read_image(rgb)
+        section = drawn.pose_section(estimate.name, shown_input, estimate, model, image=image)
+        sections.append(section)
     number = len(predictions)
     estimates = [prediction.estimate for prediction in predictions]
     text = f"{number} inputs: {_statuses(estimates)}. Shown below: {len(sections)}"
