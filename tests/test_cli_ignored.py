@@ -24,6 +24,7 @@ IGNORED = [
     ("pose predict", "--depth d.png --camera c.json --batch 4", "--batch"),
     ("pose predict", "--cad p.stl --cloud c.ply", "--cad"),
     ("pose predict", "--bop b --masks truth --mask m", "--mask"),
+    ("pose predict", "--bop b --engine ray", "--engine"),
     ("pose predict", "--depth d --mask m --camera c --masks truth", "--masks"),
     ("pose track", "--depth d --camera c --split test", "--split"),
     ("pose evaluate", "--bop b --csv a.csv --no-icp --masks truth", "--masks and --no-icp"),

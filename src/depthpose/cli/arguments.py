@@ -213,6 +213,8 @@ _RULES: tuple[tuple[str, _Case, str, str], ...] = (
     ("pose predict, pose track", lambda o: "bop" in o, "cad", "the models of --bop are taken"),
     ("pose predict, pose track", lambda o: "bop" in o, "mask camera focal-px unit",
      "a data set says its cameras and units itself, and its masks are chosen by --masks"),
+    ("pose predict", lambda o: "bop" in o and "ray" in o["engine"], "engine",
+     "a data set is posed by this process, or shared by those of torchrun"),
     ("pose predict", lambda o: "bop" not in o, "split masks targets",
      "--bop names no data set; the mask of a depth image is given by --mask"),
     ("pose predict, pose track", lambda o: "cloud" in o, "mask camera focal-px",

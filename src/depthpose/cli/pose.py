@@ -51,19 +51,19 @@ def predict(
             "with --mask and --camera, or a data set"
         )
     source = source_of(weights, register, inputs.unit, dataset, estimates.config)
-    if dataset.bop is not None:
-        return predict_dataset(source, dataset, inputs.object, out, estimates.batch, engine)
     if engine.engine == "ray":
         return predict_on_ray(inputs, source, estimates.batch, out, engine)
-    method = source.build()
+    method, home, batch = source.build(), Path(out), estimates.batch
+    if dataset.bop is not None:
+        return predict_dataset(method, dataset, inputs.object, source.config, home, batch)
     if inputs.cloud is not None and not method.takes_clouds:
         raise InputError(
             f"--cloud {inputs.cloud}: the weights {weights} need depth images; give --depth, "
             "--mask and --camera, or weights that vote"
         )
     if inputs.depth is not None and inputs.mask is None and inputs.lens is not None:
-        return find_all(method, inputs, Path(out))
-    return predict_files(method, inputs, Path(out), estimates.batch)
+        return find_all(method, inputs, home)
+    return predict_files(method, inputs, home, batch)
 
 
 def evaluate(

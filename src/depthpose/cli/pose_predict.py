@@ -1,6 +1,5 @@
 """The work behind ``depthpose pose predict``, here or by an engine."""
 
-import json
 import operator
 import re
 import sys
@@ -26,11 +25,8 @@ from depthpose.core.engine import (
     Files,
     Function,
     Inputs,
-    Item,
     Sample,
     Work,
-    is_url,
-    shard_results,
     stem,
 )
 from depthpose.core.errors import InputError
@@ -47,6 +43,7 @@ from depthpose.core.rigid import numbers_text
 from depthpose.core.run import is_whole, note_result
 from depthpose.core.units import Unit
 from depthpose.pose.cloud import object_points
+from depthpose.pose.config import EstimateConfig
 from depthpose.pose.datasets import BopDataset, open_bop, read_targets
 from depthpose.pose.estimator.inputs import AnyInput, cloud_input, view_input
 from depthpose.pose.evaluate import of_targets
@@ -59,7 +56,6 @@ from depthpose.pose.predictions import (
     alternatives_name,
     is_finished,
     kept_predictions,
-    parse_prediction,
     predict,
     prediction_row,
     results_name,
@@ -142,76 +138,31 @@ def predict_files(method: PoseMethod, inputs: OneObjectOptions, out: Path, batch
 
 
 def predict_dataset(
-    source: MethodSource,
+    method: PoseMethod,
     options: DataSetOptions,
     object: str | None,
-    out: str,
+    config: EstimateConfig,
+    out: Path,
     batch: int,
-    engine: EngineOptions,
 ) -> int:
-    """Pose the objects of a data set, or one, here or by an engine; give the exit code."""
+    """Pose the objects of a data set, or one; give the exit code."""
     assert options.bop is not None
-    if engine.engine == "ray":
-        if is_url(out):
-            raise InputError(
-                f"--out {out}: poses of a data set come together in poses.json and BOP's csv, "
-                "which need a disk; give a folder, and copy it"
-            )
-        if options.masks not in ("truth", "predicted") and not options.masks.endswith(".json"):
-            raise InputError(
-                f"--masks {options.masks}: workers take masks that are there already; give "
-                "truth, predicted, or a file of BOP detections, such as 'pose evaluate --masks "
-                "WEIGHTS' leaves"
-            )
-    method, home = source.build("cpu" if engine.engine == "ray" else None), Path(out)
     dataset = open_bop(options.bop, options.split)
     if options.targets is not None:
         dataset = of_targets(dataset, read_targets(options.targets, options.bop))
     dataset = pose_methods.chosen_objects(dataset, method, object)
-    masks = options.masks
-    (found,) = pose_methods.find_masks([masks], dataset, home, source.config.device)
+    (found,) = pose_methods.find_masks([options.masks], dataset, out, config.device)
     jobs = pose_methods.bop_jobs(dataset, found, method)
-    settings = {**method.settings, "estimate": config_to_dict(source.config)}
+    settings = {**method.settings, "estimate": config_to_dict(config)}
     settings |= {**pose_methods.of_dataset(dataset), "masks": found.name, **found.settings}
     if object is not None:
         settings["objects"] = sorted({i.object_id for i in dataset.instances})
-    if engine.engine == "ray":
-        settings["shards"] = "tar"
-    claim_bop(home, settings, dataset)
-    if engine.engine == "ray":
-        start = partial(
-            start_bop,
-            source=source.packed(),
-            folder=str(dataset.folder.resolve()),
-            split=options.split,
-            masks=str(Path(masks).resolve()) if masks.endswith(".json") else masks,
-            objects=tuple(sorted({instance.object_id for instance in dataset.instances})),
-        )
-        inputs = Inputs(items=[Item(job.name, ()) for job in jobs], files=Files((), ()))
-        work = Work(start=start, files=inputs.files, endings=(ENDING,), batch=batch)
-        known: dict[str, Prediction] = {}
-        failed: dict[str, str] = {}
-        for done in engine.run(work, inputs, out, settings):
-            failed |= dict(done.failures)
-            for name, files in shard_results(out, done):
-                known[name] = parse_prediction(json.loads(files[ENDING]), f"{done.shard}: {name}")
-        for job in jobs:
-            if job.name not in known:
-                lost = PoseEstimate(
-                    name=job.name,
-                    object=job.read().object,
-                    status="unreadable",
-                    reason=failed[job.name],
-                )
-                known[job.name] = Prediction(estimate=lost, place=job.place)
-        predictions = [known[job.name] for job in jobs]
-        write_predictions(Path(out), predictions)
-    else:
-        predictions = predict_all(method, jobs, home, settings, batch)
+    claim_bop(out, settings, dataset)
+    predictions = predict_all(method, jobs, out, settings, batch)
     if predictions is None:
         return 0
-    write_files(predictions, jobs, home, method, dataset)
-    return say_result(predictions, home)
+    write_files(predictions, jobs, out, method, dataset)
+    return say_result(predictions, out)
 
 
 def predict_all(
@@ -425,40 +376,16 @@ def start_files(
     def predict(samples: Sequence[Sample], out: Path) -> list[str]:
         named = [Job(name=sample.name, read=partial(read, sample)) for sample in samples]
         jobs = [pose_methods.safe_job(job, object) for job in named]
-        return _write_estimates(method, jobs, out)
+        estimates = pose_methods.safely(method)([job.read() for job in jobs])
+        reasons: list[str] = []
+        for job, estimate in zip(jobs, estimates, strict=True):
+            spent = {**job.seconds, **estimate.seconds}
+            prediction = Prediction(estimate=replace(estimate, seconds=spent))
+            write_json(out / f"{job.name}.{ENDING}", prediction_row(prediction))
+            reasons.append("" if is_finished(prediction) else estimate.reason)
+        return reasons
 
     return predict
-
-
-def start_bop(
-    source: MethodSource, folder: str, split: str, masks: str, objects: tuple[int, ...]
-) -> Function:
-    """Build the estimator, and open the data set; its objects, by name, to poses or the reasons.
-
-    All workers see the folder and a file of detections, if ``masks`` is one.
-    """
-    method = source.build()
-    dataset = open_bop(Path(folder), split).of_objects(*objects)
-    (found,) = pose_methods.find_masks([masks], dataset, Path())
-    jobs = {job.name: job for job in pose_methods.bop_jobs(dataset, found, method)}
-
-    def predict(samples: Sequence[Sample], out: Path) -> list[str]:
-        return _write_estimates(method, [jobs[sample.name] for sample in samples], out)
-
-    return predict
-
-
-def _write_estimates(method: PoseMethod, jobs: Sequence[Job[Any]], out: Path) -> list[str]:
-    """Estimate some inputs and write an entry of each; give for each "" or why it failed."""
-    reasons: list[str] = []
-    for job, estimate in zip(
-        jobs, pose_methods.safely(method)([job.read() for job in jobs]), strict=True
-    ):
-        spent = {**job.seconds, **estimate.seconds}
-        prediction = Prediction(estimate=replace(estimate, seconds=spent), place=job.place)
-        write_json(out / f"{job.name}.{ENDING}", prediction_row(prediction))
-        reasons.append("" if is_finished(prediction) else estimate.reason)
-    return reasons
 
 
 def predict_on_ray(
