@@ -6,6 +6,7 @@ import sys
 import time
 from collections import Counter, defaultdict
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -16,10 +17,11 @@ from tqdm import tqdm
 
 from depthpose.cli import pose_methods
 from depthpose.cli.engine import EngineOptions, say
-from depthpose.cli.pose_methods import MethodSource, PoseMethod
+from depthpose.cli.pose_methods import EstimateMany, MethodSource, PoseMethod
 from depthpose.cli.pose_options import DataSetOptions, OneObjectOptions
 from depthpose.core import run
 from depthpose.core.camera import Camera, camera_of
+from depthpose.core.checkpoint import file_sha256
 from depthpose.core.config import config_to_dict
 from depthpose.core.engine import (
     Files,
@@ -29,23 +31,32 @@ from depthpose.core.engine import (
     Work,
     stem,
 )
-from depthpose.core.errors import InputError
+from depthpose.core.errors import InputError, nearest_name
 from depthpose.core.files import (
+    MAP_SUFFIXES,
     cloud_suffixes,
     image_size,
+    list_images,
     read_image,
     write_cloud,
     write_image,
     write_json,
 )
+from depthpose.core.files.disk import natural_order
 from depthpose.core.files.images import LISTED_SUFFIXES
 from depthpose.core.rigid import numbers_text
 from depthpose.core.run import is_whole, note_result
 from depthpose.core.units import Unit
 from depthpose.pose.cloud import object_points
 from depthpose.pose.config import EstimateConfig
-from depthpose.pose.datasets import BopDataset, open_bop, read_targets
-from depthpose.pose.estimator.inputs import AnyInput, cloud_input, view_input
+from depthpose.pose.datasets import (
+    BopDataset,
+    encode_rle,
+    open_bop,
+    read_labels,
+    read_targets,
+)
+from depthpose.pose.estimator.inputs import AnyInput, AnyMask, cloud_input, view_input
 from depthpose.pose.evaluate import of_targets
 from depthpose.pose.predictions import (
     CLOUD,
@@ -112,13 +123,166 @@ def claim_bop(out: Path, settings: dict[str, Any], dataset: BopDataset) -> None:
     run.claim_folder(out, settings, [POSES, _PAGE, *tables, *pictures])
 
 
+def object_named(name: str | None, method: PoseMethod) -> str:
+    """Give the object that is meant."""
+    known = list(method.models_by_name)
+    if name is None and len(known) > 1:
+        raise InputError(f"the {method.holder} know {', '.join(known)}; say which by --object")
+    if name is not None and name not in known:
+        raise InputError(
+            f"--object {name}: the {method.holder} do not know it; {nearest_name(name, known)}"
+        )
+    return known[0] if name is None else name
+
+
+def camera_facts(camera: Path | float) -> dict[str, Any]:
+    """Give what of a camera file, or a focal length, decides the poses, for the record of a run."""
+    if not isinstance(camera, Path):
+        return {"focal_px": camera}
+    return {"camera": str(camera.resolve()), "camera_sha256": file_sha256(camera)}
+
+
+def cloud_jobs(cloud: Path, unit: Unit, object: str, out: Path) -> list[Job[Any]]:
+    """Take a cloud, or every one of a folder."""
+    known = cloud_suffixes()
+    files = [cloud]
+    if cloud.is_dir():
+        named = [path for path in cloud.iterdir() if not path.name.startswith(".")]
+        files = [path for path in named if path.suffix.lower() in known]
+    files.sort(key=natural_order)
+    if not files:
+        raise InputError(f"{cloud}: no {', '.join(known)} file there; give a cloud, or a folder")
+    _refuse_one_name(files)
+    run.refuse_among_inputs(out, [cloud], files)
+    jobs = [
+        Job(name=p.stem, read=partial(cloud_input, p, unit, object, p.stem), source=p)
+        for p in files
+    ]
+    return [safe_job(job, object) for job in jobs]
+
+
+def view_jobs(
+    depth: Path,
+    mask: Path,
+    camera: Path | float,
+    object: str,
+    unit: Unit | None,
+    out: Path,
+) -> list[Job[Any]]:
+    """Take a depth image, its mask and its camera, or images and masks of one name in two folders.
+
+    Of a mask that numbers several objects each is an input: NAME_1, NAME_2, ...
+    """
+    runs = sorted(mask.glob("*.json")) if mask.is_dir() else []  # of run lengths
+    depths, pictures = _list_depths(depth), runs or list_images(mask)
+    run.refuse_among_inputs(out, [depth, mask], [*depths, *pictures])
+    _refuse_one_name(depths)
+    _refuse_one_name(pictures)
+    masks = {path.stem: path for path in pictures}
+    if len(depths) == len(masks) == 1 and not depth.is_dir():
+        masks = {depths[0].stem: next(iter(masks.values()))}
+    lost = [path.stem for path in depths if path.stem not in masks]
+    if lost:
+        raise InputError(
+            f"{mask}: no mask called {lost[0]!r}; a mask has the name of its depth image"
+        )
+    jobs: list[Job[Any]] = []
+    for path in depths:
+        own: dict[str, AnyMask] = {"": masks[path.stem]}
+        with suppress(InputError):  # it will be said where the mask is read
+            labels = read_labels(masks[path.stem])
+            numbers = labels[labels != 0].unique().tolist()
+            runs = {k: encode_rle(labels == k)[0] for k in numbers if len(numbers) > 1}
+            size = list(labels.shape)
+            own = {f"_{k}": {"size": size, "counts": list(r)} for k, r in runs.items()} or own
+        for end, one in own.items():
+            name = path.stem + end
+            read = partial(view_input, path, one, camera, object, name, unit)
+            job = Job(name=name, read=read, source=(path, masks[path.stem]))
+            jobs.append(safe_job(job, object))
+    twice = [name for name, count in Counter(job.name for job in jobs).items() if count > 1]
+    if twice:
+        raise InputError(
+            f"{depth}: two results would be called {twice[0]!r}, the name of a depth image and a "
+            "number of its mask; rename the other"
+        )
+    return jobs
+
+
+def frame_jobs(
+    depth: Path, camera: Path | float, object: str, unit: Unit | None, out: Path
+) -> list[Job[Any]]:
+    """Take whole depth images, without masks."""
+    depths = _list_depths(depth)
+    run.refuse_among_inputs(out, [depth], depths)
+    _refuse_one_name(depths)
+    jobs = [
+        Job(name=p.stem, read=partial(view_input, p, None, camera, object, p.stem, unit), source=p)
+        for p in depths
+    ]
+    return [safe_job(job, object) for job in jobs]
+
+
+def _list_depths(depth: Path) -> list[Path]:
+    """List depth images: pictures, or the maps of a folder without such."""
+    try:
+        return list_images(depth)
+    except InputError:
+        maps = [p for p in depth.glob("*") if p.suffix.lower() in MAP_SUFFIXES]
+        if not maps:
+            raise
+        return sorted(maps, key=natural_order)
+
+
+def _refuse_one_name(files: Sequence[Path]) -> None:
+    """Results bear the names of their inputs, without the suffix."""
+    first: dict[str, Path] = {}
+    for path in files:
+        other = first.setdefault(path.stem, path)
+        if other != path:
+            raise InputError(
+                f"{path.parent}: {other.name} and {path.name} would both be {path.stem!r} in the "
+                "results; rename one, or move it to another folder"
+            )
+
+
+def bop_jobs(dataset: BopDataset, masks: pose_methods.Masks, method: PoseMethod) -> list[Job[Any]]:
+    """Take the instances of a data set by some masks."""
+    names = pose_methods.match_names(dataset, method.models)
+    jobs = masks.jobs(names)
+    return [safe_job(job, names[job.place.object_id]) for job in jobs if job.place is not None]
+
+
+def safe_job(job: Job[Any], object: str) -> Job[Any]:
+    """Let the job of what cannot be read give the estimate that says so, and stop no other."""
+
+    def read() -> AnyInput | PoseEstimate:
+        try:
+            return job.read()
+        except InputError as error:
+            said = f"cannot be read: {error}"
+            return PoseEstimate(name=job.name, object=object, status="unreadable", reason=said)
+
+    return replace(job, read=read)
+
+
+def safely(method: PoseMethod) -> EstimateMany:
+    """Let a method skip what could not be read."""
+
+    def estimate_many(inputs: Sequence[Any]) -> list[PoseEstimate]:
+        left = iter(method.estimate_many([o for o in inputs if not isinstance(o, PoseEstimate)]))
+        return [one if isinstance(one, PoseEstimate) else next(left) for one in inputs]
+
+    return estimate_many
+
+
 def predict_files(method: PoseMethod, inputs: OneObjectOptions, out: Path, batch: int) -> int:
     """Pose clouds, or masked depth images, in this process; give the exit code."""
-    name, lens = pose_methods.object_named(inputs.object, method), inputs.lens
+    name, lens = object_named(inputs.object, method), inputs.lens
     settings = {**method.settings, "object": name}
     if inputs.cloud is not None:
         unit = inputs.unit or "m"
-        jobs = pose_methods.cloud_jobs(Path(inputs.cloud), unit, name, out)
+        jobs = cloud_jobs(Path(inputs.cloud), unit, name, out)
         settings |= {"unit": unit}
     elif inputs.depth is None or inputs.mask is None or lens is None:
         raise InputError(
@@ -126,8 +290,8 @@ def predict_files(method: PoseMethod, inputs: OneObjectOptions, out: Path, batch
         )
     else:
         mask = Path(inputs.mask)
-        jobs = pose_methods.view_jobs(Path(inputs.depth), mask, lens, name, inputs.unit, out)
-        settings |= pose_methods.camera_facts(lens) | {"mask": str(mask.resolve())}
+        jobs = view_jobs(Path(inputs.depth), mask, lens, name, inputs.unit, out)
+        settings |= camera_facts(lens) | {"mask": str(mask.resolve())}
         settings |= {} if inputs.unit is None else {"unit": inputs.unit}
     claim(out, settings, jobs)
     predictions = predict_all(method, jobs, out, settings, batch)
@@ -152,7 +316,7 @@ def predict_dataset(
         dataset = of_targets(dataset, read_targets(options.targets, options.bop))
     dataset = pose_methods.chosen_objects(dataset, method, object)
     (found,) = pose_methods.find_masks([options.masks], dataset, out, config.device)
-    jobs = pose_methods.bop_jobs(dataset, found, method)
+    jobs = bop_jobs(dataset, found, method)
     settings = {**method.settings, "estimate": config_to_dict(config)}
     settings |= {**pose_methods.of_dataset(dataset), "masks": found.name, **found.settings}
     if object is not None:
@@ -181,7 +345,7 @@ def predict_all(
     done = _finished(out)
     left = [jobs[k] for k in process.share(len(jobs)) if jobs[k].name not in done]
     if left:
-        names = predict(pose_methods.safely(method), left, home, settings, batch)
+        names = predict(safely(method), left, home, settings, batch)
         for _ in tqdm(names, total=len(left), disable=None, unit=" poses"):
             pass
     if process.rank:
@@ -375,8 +539,8 @@ def start_files(
 
     def predict(samples: Sequence[Sample], out: Path) -> list[str]:
         named = [Job(name=sample.name, read=partial(read, sample)) for sample in samples]
-        jobs = [pose_methods.safe_job(job, object) for job in named]
-        estimates = pose_methods.safely(method)([job.read() for job in jobs])
+        jobs = [safe_job(job, object) for job in named]
+        estimates = safely(method)([job.read() for job in jobs])
         reasons: list[str] = []
         for job, estimate in zip(jobs, estimates, strict=True):
             spent = {**job.seconds, **estimate.seconds}
@@ -406,7 +570,7 @@ def predict_on_ray(
             )
     source = source.packed()
     method = source.build("cpu")
-    object = pose_methods.object_named(options.object or None, method)
+    object = object_named(options.object or None, method)
     with inputs.first() as first:
         lens = options.lens
         camera = None if lens is None else camera_of(lens, image_size(first[0]))
