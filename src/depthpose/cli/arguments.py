@@ -234,7 +234,7 @@ _RULES: tuple[tuple[str, _Case, str, str], ...] = (
      "nothing is estimated: --csv and --predictions are measured as they are"),
     ("pose evaluate", lambda o: o.all_begin("weights", "register", "open3d"), "voting device",
      "register and open3d do not vote, and compute on the processor"),
-    ("pose predict, depth predict, depth match, depth evaluate",
+    ("pose predict, depth predict, depth match",
      lambda o: "ray" not in o["engine"], "address workers worker-cpus worker-gpus block",
      "--engine ray takes it, and is not given; add it"),
     ("pose predict, depth predict, depth match",

@@ -142,7 +142,6 @@ def evaluate(
     methods: options.MethodOptions = options.MethodOptions(),
     comparison: options.ProtocolOptions = options.ProtocolOptions(),
     matching: options.MatcherOptions = options.MatcherOptions(),
-    engine: EngineOptions = EngineOptions(),
 ) -> int:
     """Measure depth on a dataset by a named protocol, and write rows, a table and a page.
 
@@ -189,10 +188,7 @@ def evaluate(
     folders = [predict_all(dataset, method, rule, out / "predictions") for method in chosen]
     name, caps_m, predictions = comparison.protocol, comparison.cap, methods.predictions
     if predictions is not None and is_job(predictions):
-        home = str(data.resolve())
-        ready = measure_shards(dataset, predictions, home, split, name, caps_m, out, engine)
+        ready = measure_shards(dataset, predictions, name, caps_m)
         return measure(dataset, folders, name, caps_m, out, [ready])
-    if engine.engine == "ray":
-        raise InputError("--engine ray measures shards; give them by --predictions")
     folders += [] if predictions is None else [Path(predictions)]
     return measure(dataset, folders, name, caps_m, out)

@@ -16,7 +16,6 @@ from depthpose.core.engine import (
     Job,
     find_items,
     read_results,
-    result_items,
     run_job,
 )
 from depthpose.core.engine.work import Block, Work, read_shard
@@ -257,13 +256,11 @@ def test_a_job_that_was_copied_is_not_done_again(tmp_path: Path) -> None:
     folder = write_texts(tmp_path / "in", {"a": "one", "b": "two", "c": "three"})
     job = job_of(tmp_path, [str(folder)])
     run_job(job, InProcessEngine())
-    names = [item.name for item in result_items(str(tmp_path / "out"))]
     for shard in (tmp_path / "out" / "shards").glob("*.tar"):
         os.utime(shard, ns=(1, 1))
     before = len(calls(tmp_path))
     run_job(job, InProcessEngine())
     assert calls(tmp_path)[before:] == []
-    assert [item.name for item in result_items(str(tmp_path / "out"))] == names
 
 
 def test_links_and_names_that_are_there_twice_are_said(tmp_path: Path) -> None:

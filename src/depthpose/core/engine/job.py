@@ -6,7 +6,6 @@ of text, so that neither queues nor results fill the memory.
 """
 
 import csv
-import hashlib
 import io
 import json
 import os
@@ -139,22 +138,6 @@ def claim(out: str, settings: Mapping[str, Any]) -> None:
 def is_job(out: str) -> bool:
     """Whether a folder holds shards of a job."""
     return disk.exists(disk.join(disk.absolute(out), PLAN))
-
-
-def result_items(out: str) -> list[Item]:
-    """Take the shards of an earlier job as inputs of another: a record and a shard each.
-
-    The name changes with the record, so that a shard that was made anew is a new input.
-    """
-    folder = disk.join(disk.absolute(out), SHARDS)
-    items = []
-    for done in read_results(out):
-        # A copy changes the time of a shard, and nothing else.
-        untimed = replace(done, stamp=(done.stamp[0], done.stamp[2])).to_json()
-        mark = hashlib.sha256(untimed.encode()).hexdigest()[:12]
-        files = (disk.join(folder, f"{done.name}.json"), disk.join(folder, done.shard))
-        items.append(Item(f"{done.name}-{mark}", files))
-    return items
 
 
 def read_results(out: str) -> list[Done]:

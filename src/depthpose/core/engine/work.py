@@ -435,8 +435,3 @@ class Runner:
                     for path in one.files:
                         if scratch in path.parents:  # a copy, alone in its folder
                             shutil.rmtree(path.parent, ignore_errors=True)
-
-
-def run_here(blocks: Sequence[Block], work: Work, out: str) -> Iterator[Done]:
-    """Do blocks in this process, one after the other: the engine that needs no cluster."""
-    yield from map(Runner(work, out).run, blocks)
