@@ -368,7 +368,14 @@ def estimate_all(
     count = f"{done} of {len(mine)} pairs" if work.files == PAIRS else f"{done} depth maps"
     print(f"{count} are in {out}")
     if run.find_rank().rank == 0:
-        finished = {files: _finished_names(files[0], out) for files in sources}
+        ending = ".disparity_px.npy"
+        frames = sorted(path.name.removesuffix(ending) for path in out.glob(f"*_??????{ending}"))
+        finished: dict[tuple[Path, ...], list[str]] = {}
+        for files in sources:
+            stem = files[0].stem
+            finished[files] = [stem] if is_finished(out, stem) else []
+            if _is_video(files[0]):
+                finished[files] = [name for name in frames if _frame_of(files[0], name)]
         names = [name for some in finished.values() for name in some]
         chosen = [names[k] for k in spread_evenly(len(names), MOST_VIEWS)]
         shown: list[StereoInput] = []
@@ -471,15 +478,6 @@ class Predictor:
                 names += [name for name, _ in chunk if name not in self.failures]
                 bar.update(len(chunk))
         return names
-
-
-def _finished_names(source: Path, out: Path) -> list[str]:
-    """List what is finished of an image or a pair, or of a video's frames."""
-    if not _is_video(source):
-        return [source.stem] if is_finished(out, source.stem) else []
-    ending = ".disparity_px.npy"
-    names = sorted(path.name.removesuffix(ending) for path in out.glob(f"*{ending}"))
-    return [name for name in names if _frame_of(source, name)]
 
 
 def _count(number: int, what: str) -> str:

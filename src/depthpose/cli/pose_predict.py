@@ -246,13 +246,6 @@ def _refuse_one_name(files: Sequence[Path]) -> None:
             )
 
 
-def bop_jobs(dataset: BopDataset, masks: pose_methods.Masks, method: PoseMethod) -> list[Job[Any]]:
-    """Take the instances of a data set by some masks."""
-    names = pose_methods.match_names(dataset, method.models)
-    jobs = masks.jobs(names)
-    return [safe_job(job, names[job.place.object_id]) for job in jobs if job.place is not None]
-
-
 def safe_job(job: Job[Any], object: str) -> Job[Any]:
     """Let the job of what cannot be read give the estimate that says so, and stop no other."""
 
@@ -316,7 +309,8 @@ def predict_dataset(
         dataset = of_targets(dataset, read_targets(options.targets, options.bop))
     dataset = pose_methods.chosen_objects(dataset, method, object)
     (found,) = pose_methods.find_masks([options.masks], dataset, out, config.device)
-    jobs = bop_jobs(dataset, found, method)
+    names = pose_methods.match_names(dataset, method.models)
+    jobs = [safe_job(j, names[j.place.object_id]) for j in found.jobs(names) if j.place is not None]
     settings = {**method.settings, "estimate": config_to_dict(config)}
     settings |= {**pose_methods.of_dataset(dataset), "masks": found.name, **found.settings}
     if object is not None:
