@@ -386,17 +386,12 @@ def read_settings(folder: Path | str) -> dict[str, Any] | None:
     Raises:
         InputError: its record is damaged.
     """
-    record, content = f"{folder}/{RECORD}", None
+    record = disk.join(str(folder), RECORD)
+    is_url = disk.is_url(record)
+    if not (disk.exists(record) if is_url else Path(record).is_file()):
+        return None
     with disk.refused_as(record, "record of a run", "choose another folder"):
-        if not disk.is_url(record):
-            path = Path(record)
-            if not path.exists():
-                return None
-            content = read_json(path)
-        elif not disk.exists(record):
-            return None
-        else:
-            content = json.loads(disk.read_from(record))
+        content = json.loads(disk.read_from(record)) if is_url else read_json(record)
     settings = content.get("settings") if isinstance(content, dict) else None
     if not isinstance(settings, dict):
         raise InputError(
