@@ -537,8 +537,7 @@ def start_files(
         estimates = safely(method)([job.read() for job in jobs])
         reasons: list[str] = []
         for job, estimate in zip(jobs, estimates, strict=True):
-            spent = {**job.seconds, **estimate.seconds}
-            prediction = Prediction(estimate=replace(estimate, seconds=spent))
+            prediction = Prediction(estimate=estimate)
             write_json(out / f"{job.name}.{ENDING}", prediction_row(prediction))
             reasons.append("" if is_finished(prediction) else estimate.reason)
         return reasons
