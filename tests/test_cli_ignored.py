@@ -22,14 +22,13 @@ IGNORED = [
     ("pose predict", "--voting least-squares --hypotheses 64", "--hypotheses"),
     ("pose predict", "--hypotheses=64 --voting=least-squares", "--hypotheses"),
     ("pose predict", "--depth d.png --camera c.json --batch 4", "--batch"),
-    ("pose predict", "--cloud c.ply --engine ray --view live", "--view"),
     ("pose predict", "--cad p.stl --cloud c.ply", "--cad"),
     ("pose predict", "--bop b --masks truth --mask m", "--mask"),
+    ("pose predict", "--bop b --engine ray", "--engine"),
     ("pose predict", "--depth d --mask m --camera c --masks truth", "--masks"),
     ("pose track", "--depth d --camera c --split test", "--split"),
     ("pose evaluate", "--bop b --csv a.csv --no-icp --masks truth", "--masks and --no-icp"),
     ("pose evaluate", "--bop b --weights register open3d --voting ransac", "--voting"),
-    ("depth predict", "a.png --engine ray --view a.rrd", "--view"),
     ("depth predict", "a.png --answer own --max_memory 1GB", "--max_memory"),
     ("depth predict", "a.png --camera c --focal-px 7 --fov 9", "--focal-px and --fov"),
     ("depth predict", "a.png --block 8 --workers 2", "--workers and --block"),
@@ -42,18 +41,15 @@ IGNORED = [
     ("depth evaluate", "--weights own:a --precision bf16", "--precision"),
     ("depth evaluate", "--protocol kitti-2015 --cap 50", "--cap"),
     ("weights complete", "w --models . --unit m", "--unit"),
-    ("reproduce all", "--linemod l --split all", "--split"),
 ]
 USED = [
     ("pose predict", "--voting ransac --hypotheses 64"),
     ("pose predict", "--depth d.png --mask m.png --camera c.json --batch 4"),
     ("pose evaluate", "--bop b --weights register parts --voting ransac --no-icp"),
     ("depth predict", "a.png --engine ray --worker-gpus 0.5 --device cuda:1"),
-    ("depth predict", "a.png --view live"),
     ("pose predict", "--depth d.csv --camera c --engine ray --batch 4"),
     ("depth evaluate", "--matcher sgbm --holes leave --baseline rows --train t"),
     ("depth evaluate", "--weights quick:a b --speed fine --protocol eigen-raw --cap 50"),
-    ("reproduce all", "--kitti k --split all"),
 ]
 
 

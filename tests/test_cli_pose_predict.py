@@ -157,7 +157,7 @@ def test_a_depth_image_alone_is_searched(
 
 
 def _search_again(words: list[str], out: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """What was found stays, what could not be read is read again, and no view is shown."""
+    """What was found stays, and what could not be read is read again."""
     depth = out.parent / "depth"
     whole = (depth / "wall.png").read_bytes()
     (depth / "torn.png").write_bytes(whole[:100])
@@ -177,8 +177,8 @@ def _search_again(words: list[str], out: Path, capsys: pytest.CaptureFixture[str
     assert main([*words, str(out)]) == 2
     assert "two depth images are called 'wall' and 'wall_1'" in capsys.readouterr().err
     (depth / "wall_1.png").unlink()
-    assert main([*words, str(out), "--view", "x.rrd"]) == 2
-    assert "--view: has no effect here; an image without --mask" in capsys.readouterr().err
+    assert main([*words, str(out), "--batch", "2"]) == 2
+    assert "--batch: has no effect here; an image without --mask" in capsys.readouterr().err
 
 
 def test_results_never_take_the_place_of_inputs(

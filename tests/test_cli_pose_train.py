@@ -51,13 +51,6 @@ def test_a_cad_file_becomes_weights_with_a_card(
     assert "seed" in capsys.readouterr().err
 
 
-def test_a_command_of_before_says_what_to_do_instead(capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["pose", "calibrate", "mine.safetensors", "--max-wrong-share", "0.05"]) == 2
-    said = capsys.readouterr().err
-    assert said.startswith("depthpose pose: error: no command 'calibrate'; no risk is calibrated")
-    assert "--min-certainty" in said
-
-
 @pytest.mark.parametrize(
     ("words", "said"),
     [

@@ -14,7 +14,7 @@ from tests.synthetic_street import make_street
 
 from depthpose.cli import main
 from depthpose.cli.depth_evaluate import signed
-from depthpose.cli.depth_methods import Method
+from depthpose.cli.depth_predict import Method
 from depthpose.cli.thesis_depth import reproduce_table, write_figure
 from depthpose.core.camera import StereoRig, write_camera
 from depthpose.core.errors import InputError
@@ -133,7 +133,7 @@ def test_the_old_name_of_the_option_baseline_still_works(
     street: Path, trained: Path, tmp_path: Path
 ) -> None:
     words = ["depth", "evaluate", "--data", str(street), "--out", str(tmp_path), *CAMERA_Z]
-    assert main([*words, "--floor", "rows", "--train", str(trained)]) == 0
+    assert main([*words, "--baseline", "rows", "--train", str(trained)]) == 0
     assert {row["method"] for row in rows_of(tmp_path)} == {"baseline: rows"}
 
 

@@ -145,7 +145,7 @@ def repeated(home: Path, times: int) -> Path:
 
 def test_two_nodes_give_what_one_process_gives(home: Path, tmp_path: Path, nodes: Nodes) -> None:
     assert predict(home, tmp_path / "plain", str(home / "left")) == 0
-    words = [str(home / "left"), "--address", nodes.address, "--block", "1", "--shards", "parquet"]
+    words = [str(home / "left"), "--address", nodes.address, "--block", "1"]
     said = run(command(home, str(tmp_path / "big"), *words))
     assert "5 of 5 depth maps are in 5 shards" in said
     assert unpacked(tmp_path / "big") == files_of(tmp_path / "plain")

@@ -54,16 +54,16 @@ def test_points_grow_to_the_size_that_is_asked_for() -> None:
 def test_lines_are_where_they_should_be() -> None:
     black = torch.zeros(3, 20, 30)
     ends = torch.tensor([[[2.0, 5], [12, 5]], [[float("nan"), 1], [3, 3]], [[25, 15], [99, 15]]])
-    drawn = draw_lines(black, ends, (1.0, 0.0, 0.5), width_px=1)
+    drawn = draw_lines(black, ends, (1.0, 0.0, 0.5))
     ink = (drawn[0] > 0).nonzero().tolist()
     assert [5, 2] in ink
     assert [5, 7] in ink
-    assert {v for v, _ in ink} == {5, 15}
+    assert {v for v, _ in ink} == {5, 6, 15, 16}
     assert max(u for _, u in ink) == 29
     assert float(drawn[2].max()) == 0.5
     assert float(black.max()) == 0
-    dashed = draw_lines(black, ends[:1], (1.0, 0.0, 0.0), width_px=1, dash_px=3.0)
-    assert 4 < int((dashed[0] > 0).sum()) < int((drawn[0, 5] > 0).sum())
+    dashed = draw_lines(black, ends[:1], (1.0, 0.0, 0.0), dash_px=3.0)
+    assert 4 < int((dashed[0, 5] > 0).sum()) < int((drawn[0, 5] > 0).sum())
 
 
 def test_the_outline_lies_inside_the_mask() -> None:

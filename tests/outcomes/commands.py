@@ -11,9 +11,7 @@ from tests.pose.synthetic_objects import bracket, cloud_of, pose_at, tiny_weight
 from tests.raw_pairs import make_raw, write_kalibr
 from tests.synthetic_street import make_street, write_pairs
 from tests.test_cli_engine import make_home
-from tests.test_cli_reproduce_all import write_configs
 
-from depthpose.cli import main
 from depthpose.core.camera import write_camera
 from depthpose.core.files import Cloud, write_cloud, write_depth_png, write_image
 from depthpose.depth.types import StereoSample
@@ -108,10 +106,6 @@ COMMANDS: Sequence[Command] = (
         "--protocol eigen-raw-camera"
     ),
     Command("reproduce 3.3 --weights {home}/p.safetensors --points 60 --synthetic 1"),
-    Command(
-        "reproduce all --kitti {home}/kitti --configs {home}/configs --split all --device cpu "
-        "--protocol eigen-raw-camera"
-    ),
     Command("figure 3-4 --weights {home}/p.safetensors --number 1"),
     Command("demo --weights {home}/w.safetensors"),
 )
@@ -141,9 +135,6 @@ def make_inputs(home: Path) -> Path:
     write_image(home / "raw/left.png", raw.left)
     write_image(home / "raw/right.png", raw.right)
     write_kalibr(home / "camchain.yaml", raw.pair)
-    write_configs(home / "configs")
-    street_words = ["data", "make", "streets", "--number", "2", "--scale", "0.25"]
-    assert main([*street_words, "--out", str(home / "kitti")]) == 0
     return home
 
 

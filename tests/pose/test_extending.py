@@ -12,8 +12,7 @@ from tests.pose.synthetic_objects import bracket
 from torch.nn.functional import huber_loss
 
 from depthpose.cli import main
-from depthpose.cli.pose_methods import cloud_jobs
-from depthpose.cli.pose_predict import cloud_files
+from depthpose.cli.pose_predict import cloud_files, cloud_jobs
 from depthpose.core.config import config_from_dict
 from depthpose.core.errors import InputError
 from depthpose.core.files import Cloud, cloud_suffixes, read_cloud

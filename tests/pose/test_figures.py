@@ -1,7 +1,9 @@
 import math
 
+import numpy as np
 import pytest
 import torch
+from PIL import Image, ImageDraw
 from tests.pose.synthetic_objects import bracket
 
 from depthpose.core.errors import InputError
@@ -66,9 +68,10 @@ def test_colours_go_from_red_over_yellow_to_blue() -> None:
 def test_near_points_cover_far_ones() -> None:
     places = torch.tensor([[5.0, 5.0, 1.0], [5.0, 5.0, 2.0], [-9.0, 5.0, 0.0]])
     colors = torch.eye(3)
-    image = draw_discs(torch.ones(3, 11, 11), places, colors, 2.0)
-    assert image[:, 5, 5].tolist() == [1.0, 0.0, 0.0]
-    assert int((image.sum(0) < 3).sum()) == 13
+    image = Image.new("RGB", (11, 11), "white")
+    draw_discs(ImageDraw.Draw(image), places, colors, 2.0)
+    assert image.getpixel((5, 5)) == (255, 0, 0)
+    assert 13 <= int((np.asarray(image) < 255).any(-1).sum()) <= 21
 
 
 def test_a_cloud_is_drawn_over_its_model_from_where_it_was_seen() -> None:
@@ -87,7 +90,7 @@ def test_the_field_shows_where_directions_meet() -> None:
     ways = torch.nn.functional.normalize(true - points, dim=-1)
     alone = draw_field(points, ways, true, None, 200)
     both = draw_field(points, ways, true, voted, 200)
-    assert alone[:, 100, 100].tolist() == pytest.approx([0.95, 0.75, 0.0])
+    assert alone[:, 100, 100].tolist() == pytest.approx([0.95, 0.75, 0.0], abs=0.01)
     is_red = (both[0] > 0.8) & (both[1] < 0.1)
     rows, columns = is_red.nonzero(as_tuple=True)
     scale = (200 - 66) / 0.2

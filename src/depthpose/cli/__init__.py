@@ -57,14 +57,10 @@ COMMANDS = {
     "weights pack": ("weights:pack_weights", "one file of a generator and a matcher, with a card"),
     "weights complete": (
         "weights:complete_weights", "add meshes to pose weights that came without"),
-    "weights push": (
-        "weights:push_weights", "upload weights and their card to the Hugging Face hub"),
     "weights import": ("weights:import_weights", "import a published checkpoint, safely"),
     "export depth": ("weights:export_depth", "depth as an ONNX file, proven to agree"),
     "export pose": ("weights:export_pose", "the network of directions as an ONNX file"),
     "reproduce": ("thesis:reproduce", "a table of chapter 2: published rows, ours, difference"),
-    "reproduce all": (
-        "thesis:reproduce_all", "all tables of a chapter, trainings too, from KITTI or LineMOD"),
     "reproduce 3.1": ("thesis:table_3_1", "the method beside its baselines, by object"),
     "reproduce 3.2": ("thesis:table_3_2", "LineMOD: published rows, ours, difference"),
     "reproduce 3.3": ("thesis:table_3_3", "RANSAC against least squares"),
@@ -73,15 +69,6 @@ COMMANDS = {
     "figure 3-4": ("thesis:figure_3_4", "true and predicted directions to a keypoint"),
     "figure 3-5": ("thesis:figure_3_5", "boxes of true and estimated poses"),
 }  # fmt: skip
-_REMOVED_OPTIONS = {
-    ("export", "--format"): "ONNX is the one format; omit --format",
-    ("reproduce", "--made"): "synthetic views are asked for by --synthetic",
-}
-"""Options of before, by the first word of their command, and what to do instead."""
-_REMOVED_COMMANDS = {
-    "pose calibrate": "no risk is calibrated any more; 'pose predict --min-certainty' says how "
-    "sure an answer must be, for all weights",
-}
 _THESIS = ("reproduce", "figure")  # groups of commands that reproduce the thesis
 _EXIT_CODES = """exit codes:
   0    done
@@ -189,9 +176,8 @@ def _run(words: list[str]) -> int:
         inside = {name: what for name, (_, what) in COMMANDS.items() if name.startswith(group)}
         verb = next((word for word in words[1:] if not word.startswith("-")), "")
         if group and verb:
-            verbs = [name.partition(" ")[2] for name in inside]
-            instead = _REMOVED_COMMANDS.get(f"{group} {verb}", nearest_name(verb, verbs))
-            print(f"depthpose {group}: error: no command {verb!r}; {instead}", file=sys.stderr)
+            near = nearest_name(verb, [name.partition(" ")[2] for name in inside])
+            print(f"depthpose {group}: error: no command {verb!r}; {near}", file=sys.stderr)
             return 2
         width = max(map(len, inside)) + 2
         lines = [f"usage: depthpose {group or 'COMMAND'} ... [--help]", ""]
@@ -207,10 +193,6 @@ def _run(words: list[str]) -> int:
         print("\n".join([*lines, "", _EXIT_CODES]), file=stream)
         return 0 if asked_help else 2
     rest = words[len(name.split()) :]
-    for word in rest:
-        option = word.partition("=")[0]
-        if remedy := _REMOVED_OPTIONS.get((words[0], option)):
-            raise InputError(f"'depthpose {name}' has no {option} any more: {remedy}")
     import tyro
 
     from depthpose.cli import arguments

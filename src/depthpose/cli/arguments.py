@@ -66,7 +66,6 @@ def shown_as(metavar: str | None, help: str | None = None) -> Any:  # noqa: ANN4
 
 
 Device = Annotated[str, shown_as("DEVICE", help="cpu, cuda, cuda:1, ...")]
-View = Annotated[str | None, shown_as("live|FILE.rrd")]
 
 
 @dataclass_transform(frozen_default=True, kw_only_default=True)
@@ -214,6 +213,8 @@ _RULES: tuple[tuple[str, _Case, str, str], ...] = (
     ("pose predict, pose track", lambda o: "bop" in o, "cad", "the models of --bop are taken"),
     ("pose predict, pose track", lambda o: "bop" in o, "mask camera focal-px unit",
      "a data set says its cameras and units itself, and its masks are chosen by --masks"),
+    ("pose predict", lambda o: "bop" in o and "ray" in o["engine"], "engine",
+     "a data set is posed by this process, or shared by those of torchrun"),
     ("pose predict", lambda o: "bop" not in o, "split masks targets",
      "--bop names no data set; the mask of a depth image is given by --mask"),
     ("pose predict, pose track", lambda o: "cloud" in o, "mask camera focal-px",
@@ -224,8 +225,8 @@ _RULES: tuple[tuple[str, _Case, str, str], ...] = (
     ("pose predict", lambda o: "least-squares" in o["voting"], "hypotheses",
      "--voting least-squares draws no hypotheses"),
     ("pose predict", lambda o: "depth" in o and "mask" not in o and "ray" not in o["engine"],
-     "batch view register-refused",
-     "an image without --mask is searched alone, not shown, and registers nothing; give --mask"),
+     "batch register-refused",
+     "an image without --mask is searched alone, and registers nothing; give --mask"),
     ("pose track", lambda o: "bop" not in o, "split", "it is of a data set; give --bop"),
     ("pose track", lambda o: "bop" in o, "first",
      "a data set has many sequences and one pose is given; give the frames of one by --depth"),
@@ -233,11 +234,9 @@ _RULES: tuple[tuple[str, _Case, str, str], ...] = (
      "nothing is estimated: --csv and --predictions are measured as they are"),
     ("pose evaluate", lambda o: o.all_begin("weights", "register", "open3d"), "voting device",
      "register and open3d do not vote, and compute on the processor"),
-    ("pose predict, depth predict, depth match, depth evaluate",
-     lambda o: "ray" not in o["engine"], "address workers worker-cpus worker-gpus block shards",
+    ("pose predict, depth predict, depth match",
+     lambda o: "ray" not in o["engine"], "address workers worker-cpus worker-gpus block",
      "--engine ray takes it, and is not given; add it"),
-    ("pose predict, depth predict", lambda o: "ray" in o["engine"], "view",
-     "the workers of --engine ray show nothing"),
     ("pose predict, depth predict, depth match",
      lambda o: o["device"][:1] in ([], ["cpu"]) and o["worker-gpus"][:1] not in (["0"], ["0.0"]),
      "worker-gpus", "the workers compute on the processor without --device cuda"),
@@ -251,7 +250,7 @@ _RULES: tuple[tuple[str, _Case, str, str], ...] = (
     ("depth match", lambda o: "sgbm" in o["matcher"],
      f"device speed {_NETWORK} left-right-check",
      "sgbm has no weights"),
-    ("depth evaluate", lambda o: "baseline" not in o and "floor" not in o, "train train-without",
+    ("depth evaluate", lambda o: "baseline" not in o, "train train-without",
      "--baseline takes it, and is not given; add it"),
     ("depth evaluate, reproduce", lambda o: "train" not in o, "train-without",
      "it leaves frames out of --train, and none is given"),
@@ -266,8 +265,6 @@ _RULES: tuple[tuple[str, _Case, str, str], ...] = (
      "no network is measured"),
     ("weights complete", lambda o: all(Path(word).is_dir() for word in o["models"]), "unit",
      "the models of a data set are in mm; --unit is for a model file"),
-    ("reproduce all", lambda o: "kitti" not in o, "split protocol",
-     "--kitti takes it, and is not given; add it"),
     ("reproduce 3.1, reproduce 3.2, reproduce 3.3, figure 3-2, figure 3-4, figure 3-5",
      lambda o: "linemod" not in o and "bop" not in o, "objects split", _OF_FOLDER),
     ("reproduce 3.1, reproduce 3.2, reproduce 3.3, figure 3-2, figure 3-4, figure 3-5",

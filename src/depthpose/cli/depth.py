@@ -38,12 +38,11 @@ def predict(
         out: folder for the results.
     """
     from depthpose.cli import depth_predict as work
-    from depthpose.cli.depth_methods import MethodSource
 
     if not images:
         raise InputError("name images, folders of them, patterns or videos to predict from")
     options.refuse_unusable(scale, output)
-    method = MethodSource(
+    method = work.MethodSource(
         weights=networks.weights,
         config=matching.config,
         with_right=False,
@@ -99,13 +98,12 @@ def match(
         out: folder for the results.
     """
     from depthpose.cli import depth_predict as work
-    from depthpose.cli.depth_methods import MethodSource
     from depthpose.core.camera import read_rig
     from depthpose.core.files import image_size
     from depthpose.core.run import refuse_among_inputs
 
     used = None if pairs.matcher == "sgbm" else pairs.matcher or pairs.weights or "default"
-    method = MethodSource(weights=used, config=matching.config, with_right=True, use="pairs")
+    method = work.MethodSource(weights=used, config=matching.config, with_right=True, use="pairs")
     method = method.packed() if engine.engine == "ray" else method
 
     def work_of(files: Sequence[Path]) -> work.DepthWork:
@@ -134,7 +132,6 @@ def evaluate(
     methods: options.MethodOptions = options.MethodOptions(),
     comparison: options.ProtocolOptions = options.ProtocolOptions(),
     matching: options.MatcherOptions = options.MatcherOptions(),
-    engine: EngineOptions = EngineOptions(),
 ) -> int:
     """Measure depth on a dataset by a named protocol, and write rows, a table and a page.
 
@@ -181,10 +178,7 @@ def evaluate(
     folders = [predict_all(dataset, method, rule, out / "predictions") for method in chosen]
     name, caps_m, predictions = comparison.protocol, comparison.cap, methods.predictions
     if predictions is not None and is_job(predictions):
-        home = str(data.resolve())
-        ready = measure_shards(dataset, predictions, home, split, name, caps_m, out, engine)
+        ready = measure_shards(dataset, predictions, name, caps_m)
         return measure(dataset, folders, name, caps_m, out, [ready])
-    if engine.engine == "ray":
-        raise InputError("--engine ray measures shards; give them by --predictions")
     folders += [] if predictions is None else [Path(predictions)]
     return measure(dataset, folders, name, caps_m, out)

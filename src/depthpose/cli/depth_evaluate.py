@@ -1,23 +1,23 @@
 """The work behind ``depthpose depth evaluate``."""
 
-import json
+import hashlib
 import sys
 import tempfile
-from collections.abc import Sequence
-from dataclasses import asdict, dataclass, replace
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, cast, get_args
 
 from tqdm import tqdm
 
-from depthpose.cli.depth_methods import Method, baseline_method, named_method, sgbm_method
 from depthpose.cli.depth_options import MethodOptions
-from depthpose.cli.engine import EngineOptions
+from depthpose.cli.depth_predict import Method, MethodSource, sgbm_method
 from depthpose.core import engine as jobs
 from depthpose.core.errors import InputError
 from depthpose.core.run import environment, find_rank, read_settings, wait_for
-from depthpose.depth.config import MatcherConfig
+from depthpose.depth.baselines import NearestImageBaseline, RowDepthBaseline
+from depthpose.depth.config import Answer, BaselineName, MatcherConfig, Speed
 from depthpose.depth.datasets import Dataset, join_datasets, open_dataset, refuse_common
 from depthpose.depth.estimator import FakestereoNet
 from depthpose.depth.evaluate import (
@@ -110,6 +110,40 @@ def choose_methods(options: MethodOptions, config: MatcherConfig, dataset: Datas
         training = open_training(options.train, options.train_without, dataset)
         chosen += [baseline_method(name, training) for name in dict.fromkeys(options.baseline)]
     return chosen
+
+
+def named_method(word: str, config: MatcherConfig) -> Method:
+    """Build the method of a name: weights by file or name, perhaps with ``both:`` and the like."""
+    how, _, name = word.rpartition(":")
+    source = MethodSource(weights=name, config=config, with_right=how not in get_args(Answer))
+    if how in get_args(Answer):  # what depth of one image comes from
+        return replace(source, answer=cast("Answer", how)).build()
+    if how == "both":
+        return source.build()
+    if how in get_args(Speed):  # how much time the match of a real pair may take
+        method = replace(source, config=replace(config, speed=how)).build()
+        return method._replace(name=f"{method.name}-{how}")
+    if how == "sgbm":
+        return replace(source, with_right=False, matcher="sgbm").build()
+    return MethodSource(weights=word, config=config).build()
+
+
+def baseline_method(name: BaselineName, training: Dataset) -> Method:
+    """Fit a baseline to the truth of training frames."""
+    kinds = {"rows": RowDepthBaseline, "nearest": NearestImageBaseline}
+    names = "\n".join(frame.name for frame in training.frames)
+    settings = {
+        "matcher": f"baseline: {name}",
+        "input": "left view" if name == "nearest" else "no image",
+        "train": training.name,
+        "train_frames": len(training),
+        "train_sha256": hashlib.sha256(names.encode()).hexdigest(),
+    }
+
+    def show(frames: Sequence[int]) -> Iterable[int]:
+        return tqdm(frames, f"fit {name}", unit=" frames", disable=None)
+
+    return Method(f"baseline-{name}", kinds[name].fit(training, show), settings, with_right=False)
 
 
 def open_training(folders: Sequence[Path], without: Sequence[str], measured: Dataset) -> Dataset:
@@ -256,77 +290,25 @@ def say_skipped(measured: Evaluation) -> None:
     print(f"{len(measured.skipped)} frames skipped")
 
 
-ENDING = "measured.json"
-
-
-def start_measuring(
-    data: str, split: str | None, protocol: str, caps_m: Sequence[float]
-) -> jobs.Function:
-    """Open a data set, and give what turns shards of predictions into the numbers of its frames."""
-    dataset = open_dataset(Path(data), split)
-    places = {frame.name: index for index, frame in enumerate(dataset.frames)}
-
-    def measure_shard(sample: jobs.Sample, out: Path) -> str:
-        """Measure each frame by the files of its prediction; give why not where that fails."""
-        record, shard = sample.files
-        measured: dict[str, Any] = {}
-        try:
-            done = jobs.Done.from_json(record.read_bytes())
-            names = {name for name, reason in done.entries if not reason and name in places}
-            for name, files in jobs.read_shard(str(shard), names, done.endings):
-                with tempfile.TemporaryDirectory(prefix="depthpose-") as folder:
-                    for ending, content in files.items():
-                        path = Path(folder) / f"{name}.{ending}"
-                        path.parent.mkdir(parents=True, exist_ok=True)
-                        path.write_bytes(content)
-                    rows = measure_frame(dataset, places[name], Path(folder), protocol, caps_m)
-                is_said = isinstance(rows, str)
-                measured[name] = rows if is_said else [asdict(row) for row in rows]
-        except InputError as error:
-            return str(error)
-        (out / f"{sample.name}.{ENDING}").write_text(json.dumps(measured))
-        return ""
-
-    return lambda samples, out: [measure_shard(sample, out) for sample in samples]
-
-
 def measure_shards(
-    dataset: Dataset,
-    predictions: str,
-    data: str,
-    split: str | None,
-    protocol: str,
-    caps_m: Sequence[float],
-    out: Path,
-    engine: EngineOptions,
+    dataset: Dataset, predictions: str, protocol: str, caps_m: Sequence[float]
 ) -> Evaluation:
-    """Measure shards of predictions, here or on a cluster, and put the rows together.
-
-    Each frame is measured where its shard is read, by truth that every worker reads; the rows are
-    collected here in the order of the data set, and summed as if one process had measured them.
-    """
-    items, before = jobs.result_items(predictions), read_settings(predictions) or {}
-    name, names = jobs.stem(predictions.rstrip("/")), {item.name for item in items}
-    about = {"data": data, "split": split, "protocol": protocol, "caps_m": list(caps_m)}
-    home = str(out / "measured" / name)
-    files = jobs.Files(roles=("record", "shard"), suffixes=(".json", ".tar", ".parquet"))
-    start = partial(start_measuring, data, split, protocol, caps_m)
-    work = jobs.Work(start=start, files=files, endings=(ENDING,))
-    # Of what a worker writes: a job that was begun by another version is refused.
-    settings = {"predictions": before, **about, "format": 2}
-    job = jobs.Job(work=work, items=items, out=home, settings=settings, block=1)
+    """Measure shards of predictions, one after the other; the rows say whose they are."""
+    name, settings = jobs.stem(predictions.rstrip("/")), read_settings(predictions)
+    places = {frame.name: index for index, frame in enumerate(dataset.frames)}
     rows: dict[str, list[Measured] | str] = {}
-    for done in jobs.run_job(job, engine.build() if engine.engine == "ray" else jobs.run_here):
-        for failed, reason in done.failures:
-            if failed in names:
-                raise InputError(f"{home}: {reason}")
-        for item, made in jobs.shard_results(home, done):
-            of_frames = json.loads(made[ENDING]) if item in names else {}
-            for frame, some in of_frames.items():
-                is_said = isinstance(some, str)
-                rows[frame] = some if is_said else [Measured(**one) for one in some]
+    for done in tqdm(jobs.read_results(predictions), name, disable=None, unit=" shards"):
+        for frame, files in jobs.shard_results(predictions, done):
+            if frame not in places:
+                continue
+            with tempfile.TemporaryDirectory(prefix="depthpose-") as folder:
+                for ending, content in files.items():
+                    path = Path(folder) / f"{frame}.{ending}"
+                    path.parent.mkdir(parents=True, exist_ok=True)
+                    path.write_bytes(content)
+                rows[frame] = measure_frame(dataset, places[frame], Path(folder), protocol, caps_m)
     with tempfile.TemporaryDirectory() as nothing:
-        for index, frame in enumerate(dataset.frames):
-            if frame.name not in rows:  # it has no truth, or its absence is an error
-                rows[frame.name] = measure_frame(dataset, index, Path(nothing), protocol, caps_m)
-    return signed(summarise(dataset, protocol, rows), name, before)
+        for frame, index in places.items():
+            if frame not in rows:  # it has no truth, or its absence is an error
+                rows[frame] = measure_frame(dataset, index, Path(nothing), protocol, caps_m)
+    return signed(summarise(dataset, protocol, rows), name, settings)

@@ -6,9 +6,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Literal
 
-import tyro
-
-from depthpose.cli.arguments import Device, Source, View, WeightsName, group, shown_as
+from depthpose.cli.arguments import Device, Source, WeightsName, group, shown_as
 from depthpose.core.errors import InputError
 from depthpose.depth.config import Answer, BaselineName, MatcherConfig, Speed
 
@@ -135,8 +133,6 @@ class PredictOutput:
     """images of one size that go through the networks together: for a GPU."""
     cloud: bool = False
     """write a coloured point cloud of what is nearer than 80 m, NAME.cloud.ply."""
-    view: View = None
-    """live shows each result in Rerun's viewer (an extra) as it comes; FILE.rrd records it."""
 
 
 def refuse_unusable(scale: ScaleOptions, output: PredictOutput) -> None:
@@ -172,7 +168,7 @@ class MethodOptions:
     predictions: Source | None = None
     """measure these files: NAME.disparity_px.npy or NAME.depth_m.npy; or the shards, path or URL,
     of 'depth predict|match --engine ray'."""
-    baseline: Annotated[tuple[BaselineName, ...], tyro.conf.arg(aliases=("--floor",))] = ()
+    baseline: tuple[BaselineName, ...] = ()
     """what every method must beat: rows (the best constant depth of each image row) or nearest (the
     depth of the training image that looks most alike), or both."""
     train: tuple[Path, ...] = ()

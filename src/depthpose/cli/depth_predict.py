@@ -5,23 +5,24 @@ import sys
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from functools import partial
 from itertools import islice
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
 from tqdm import tqdm
 
 from depthpose.cli.arguments import changed
-from depthpose.cli.depth_methods import Method, MethodSource
 from depthpose.cli.depth_options import LensOptions, PredictOutput, ScaleOptions
-from depthpose.cli.engine import EngineOptions, say
+from depthpose.cli.engine import EngineOptions, Weights, say
 from depthpose.core import run
 from depthpose.core.camera import Camera, FieldOfView, StereoRig, camera_of, read_camera
 from depthpose.core.camera.pinhole import camera_keys
+from depthpose.core.checkpoint import file_sha256, find_weights, read_checkpoint
+from depthpose.core.config import config_to_dict
 from depthpose.core.draw import draw_depth
 from depthpose.core.engine import Files, Function, Inputs, Sample, Work
 from depthpose.core.errors import InputError
@@ -38,13 +39,22 @@ from depthpose.core.files import (
 from depthpose.core.files.disk import find_partners
 from depthpose.core.files.images import LISTED_SUFFIXES
 from depthpose.core.files.text import read_text
+from depthpose.depth.config import Answer, MatcherConfig, SGBMConfig
 from depthpose.depth.estimator import FakestereoNet
 from depthpose.depth.ground import scale_by_distance
-from depthpose.depth.predictions import CLOUD_M, ENDINGS, is_finished, read_estimate, write_estimate
+from depthpose.depth.predictions import (
+    CLOUD_M,
+    ENDINGS,
+    Estimator,
+    is_finished,
+    read_estimate,
+    write_estimate,
+)
+from depthpose.depth.stereo import SGBMMatcher, with_usable_precision
 from depthpose.depth.types import StereoInput
+from depthpose.depth.weights import MATCHERS, Use
 from depthpose.report.depth import depth_section
 from depthpose.report.page import MOST_VIEWS, Film, Section, spread_evenly, write_page
-from depthpose.report.viewer import Viewer, open_viewer
 
 IMAGES = Files(roles=("image",), suffixes=LISTED_SUFFIXES)
 PAIRS = Files(roles=("left", "right"), suffixes=LISTED_SUFFIXES)
@@ -52,6 +62,105 @@ _PAGE = "report.html"
 _VIDEO = ".color.mp4"
 _SAME_FOCAL = 0.01
 Named = Iterator[tuple[str, Callable[[], StereoInput]]]  # names of inputs, and how each is read
+
+
+class Method(NamedTuple):
+    """An estimator, what to call it, and the JSON values that decide its results.
+
+    ``with_right`` says whether it is given the real right view.
+    """
+
+    name: str
+    net: Estimator
+    settings: dict[str, Any]
+    with_right: bool = True
+
+
+@dataclass(frozen=True, kw_only=True)
+class MethodSource:
+    """What a method is built from, in this process or by the workers of an engine."""
+
+    weights: str | Weights | None  #: by name or file, or packed to travel; None: OpenCV's matcher
+    config: MatcherConfig  #: how the networks run
+    with_right: bool | None = None  #: give them the real right view; None: a matcher alone needs it
+    matcher: str | None = None  #: for the synthesised view: other weights, or sgbm; None: their own
+    allow_ood: bool = True  #: answer out-of-distribution images too, as a measurement must
+    answer: Answer | None = None  #: where depth of one image comes from; None: as the weights say
+    use: Use | None = None  #: build what these take alone; None: all networks
+
+    def build(self) -> Method:
+        """Build the networks on the device of the config."""
+        if self.weights is None:
+            return sgbm_method(with_filled_holes=False)
+        if isinstance(self.weights, Weights):
+            with self.weights.unpacked() as file:
+                return replace(self, weights=file).build()
+        config = with_usable_precision(self.config)  # what is computed in is what is recorded
+        config = replace(config, device=run.own_device(config.device))
+        path = find_weights(self.weights)
+        kind = read_checkpoint(path).kind
+        is_matcher = kind in MATCHERS
+        with_right = is_matcher if self.with_right is None else self.with_right
+        if is_matcher and not with_right:
+            raise InputError(
+                f"{path}: matches pairs, but depth from one image is asked for. Give weights that "
+                "synthesise the right view."
+            )
+        facts: dict[str, Any] = {"matcher": kind, "weights": path.stem}
+        facts["weights_sha256"] = file_sha256(path)
+        if not is_matcher:
+            facts["input"] = "both views" if with_right else "left view"
+        own, matcher, answer = config_to_dict(config), None, self.answer
+        if self.matcher is None:
+            name = path.stem + ("-both" if with_right and not is_matcher else "")
+            name += "" if answer is None else f"-{answer}"
+        else:  # OpenCV, or other weights, match the view of the generator
+            other, answer = self.matcher, "matched"
+            if self.matcher == "sgbm":
+                sgbm = SGBMConfig(with_filled_holes=True)
+                matcher, own = SGBMMatcher(sgbm), {**own, **config_to_dict(sgbm)}
+            else:
+                matcher = find_weights(self.matcher)
+                other, facts["matcher_sha256"] = matcher.stem, file_sha256(matcher)
+            name, facts["matcher"] = f"{path.stem}-{other}", f"{kind} with {other}"
+        net = FakestereoNet.load(
+            path, matcher=matcher, config=config, answer=answer, allow_ood=self.allow_ood,
+            use=self.use,
+        )  # fmt: skip
+        if with_right and net.matcher is None:
+            raise InputError(
+                f"{path}: answers depth of one image, and holds no matcher, which a pair needs. "
+                "Give weights with one, or sgbm."
+            )
+        if not with_right and net.synthesiser is not None:
+            facts["answer"] = net.synthesiser.config.answer
+            facts["scales"] = list(net.synthesiser.scales)
+        return Method(name, net, {**facts, **own}, with_right)
+
+    def packed(self) -> "MethodSource":
+        """Give the same with the weights in memory."""
+        if self.matcher not in (None, "sgbm"):
+            raise InputError(
+                f"--matcher {self.matcher}: --engine ray takes sgbm or the weights' own; make one "
+                "file of both by 'depthpose weights pack G --matcher S --trained-on DATA --licence "
+                "L --out W'"
+            )
+        if not isinstance(self.weights, str):
+            return self
+        return replace(self, weights=Weights.read(self.weights))
+
+    def settings(self) -> dict[str, Any]:
+        """Say what decides the results; this machine need not have the workers' device."""
+        settings = replace(self, config=replace(self.config, device="cpu")).build().settings
+        return settings | ({"device": self.config.device} if "device" in settings else {})
+
+
+def sgbm_method(*, with_filled_holes: bool) -> Method:
+    """OpenCV's StereoSGBM with the settings of our tables."""
+    config = SGBMConfig(with_filled_holes=with_filled_holes)
+    net = FakestereoNet.load(matcher="sgbm", config=config)
+    name = "sgbm-filled" if with_filled_holes else "sgbm"
+    return Method(name, net, {"matcher": "sgbm", **config_to_dict(config)})
 
 
 def read_lens(options: LensOptions, sources: Sequence[Path]) -> Camera | FieldOfView | float:
@@ -246,12 +355,11 @@ def estimate_all(
     endings = [f".{end}" for end in ENDINGS] + [_VIDEO]
     run.claim_names(out, {files[0].stem: files for files in sources}, endings, videos)
     mine = [sources[k] for k in run.find_rank().share(len(sources))]
-    with open_viewer(None if run.find_rank().rank else work.output.view) as viewer:
-        predictor = Predictor(work, method, out, viewer)
-        stills = [files for files in mine if not _is_video(files[0])]
-        named = (one for files in stills for one in work.inputs_of(files))
-        done = len(predictor.predict(named, len(stills), "images"))
-        done += sum(predictor.predict_video(video) for video, *_ in mine if _is_video(video))
+    predictor = Predictor(work, method, out)
+    stills = [files for files in mine if not _is_video(files[0])]
+    named = (one for files in stills for one in work.inputs_of(files))
+    done = len(predictor.predict(named, len(stills), "images"))
+    done += sum(predictor.predict_video(video) for video, *_ in mine if _is_video(video))
     failures = list(predictor.failures.values())
     if failures and not done and len(sources) == 1:
         raise failures[0]
@@ -260,7 +368,14 @@ def estimate_all(
     count = f"{done} of {len(mine)} pairs" if work.files == PAIRS else f"{done} depth maps"
     print(f"{count} are in {out}")
     if run.find_rank().rank == 0:
-        finished = {files: _finished_names(files[0], out) for files in sources}
+        ending = ".disparity_px.npy"
+        frames = sorted(path.name.removesuffix(ending) for path in out.glob(f"*_??????{ending}"))
+        finished: dict[tuple[Path, ...], list[str]] = {}
+        for files in sources:
+            stem = files[0].stem
+            finished[files] = [stem] if is_finished(out, stem) else []
+            if _is_video(files[0]):
+                finished[files] = [name for name in frames if _frame_of(files[0], name)]
         names = [name for some in finished.values() for name in some]
         chosen = [names[k] for k in spread_evenly(len(names), MOST_VIEWS)]
         shown: list[StereoInput] = []
@@ -300,7 +415,6 @@ class Predictor:
     work: DepthWork
     method: Method
     out: Path
-    viewer: Viewer | None = None
     failures: dict[str, InputError] = field(default_factory=dict)
 
     def predict_video(self, source: Path) -> int:
@@ -361,20 +475,9 @@ class Predictor:
                         tqdm.write(said, sys.stderr)
                     if estimate.ground is not None:
                         tqdm.write(f"{one.name}: {estimate.ground}")
-                    if self.viewer is not None:
-                        self.viewer.show_depth(one, estimate)
                 names += [name for name, _ in chunk if name not in self.failures]
                 bar.update(len(chunk))
         return names
-
-
-def _finished_names(source: Path, out: Path) -> list[str]:
-    """List what is finished of an image or a pair, or of a video's frames."""
-    if not _is_video(source):
-        return [source.stem] if is_finished(out, source.stem) else []
-    ending = ".disparity_px.npy"
-    names = sorted(path.name.removesuffix(ending) for path in out.glob(f"*{ending}"))
-    return [name for name in names if _frame_of(source, name)]
 
 
 def _count(number: int, what: str) -> str:

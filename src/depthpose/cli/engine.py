@@ -21,9 +21,8 @@ class EngineOptions:
 
     engine: Literal["here", "ray"] = "here"
     """here: in this process, a file for each result. ray: by workers of a Ray cluster (an extra),
-    many results to a shard, OUT/shards/*.tar or *.parquet, listed in OUT/manifest.csv; inputs and
-    OUT may be URLs (s3://, gs://, file://), inputs also WebDataset shards (*.tar) or a manifest
-    (*.parquet, *.csv)."""
+    many results to a shard, OUT/shards/*.tar, listed in OUT/manifest.csv; inputs and OUT may be
+    URLs (s3://, gs://, file://), inputs also WebDataset shards (*.tar) or a manifest (*.csv)."""
     address: Annotated[str | None, shown_as("HOST:PORT")] = None
     """of a running Ray cluster: auto, or HOST:PORT; without it one is started on this machine."""
     workers: int | None = None
@@ -34,8 +33,6 @@ class EngineOptions:
     """GPUs of each worker (with --device cuda); with 0.5 two share one."""
     block: int = 64
     """inputs of a shard, which are done again when their worker dies."""
-    shards: Literal["tar", "parquet"] = "tar"
-    """format of the results."""
 
     def build(self) -> "RayEngine":
         """Make the engine of these options."""
@@ -65,7 +62,6 @@ class EngineOptions:
             tars=inputs.tars,
             out=out,
             settings=settings,
-            form=self.shards,
             block=self.block,
         )
         return run_job(job, self.build())

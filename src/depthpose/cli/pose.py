@@ -4,7 +4,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from depthpose.cli import pose_options as options
-from depthpose.cli.arguments import NewPath, NewPlace, View, WeightsName
+from depthpose.cli.arguments import NewPath, NewPlace, WeightsName
 from depthpose.cli.engine import EngineOptions
 from depthpose.core.errors import InputError
 from depthpose.pose.config import EstimateConfig, SymmetryRule
@@ -17,7 +17,6 @@ def predict(
     dataset: options.DataSetOptions = options.DataSetOptions(),
     estimates: options.EstimateOptions = options.EstimateOptions(),
     register: options.RegisterOptions = options.RegisterOptions(),
-    view: View = None,
     engine: EngineOptions = EngineOptions(),
 ) -> int:
     """The pose of known objects from clouds, depth images or a data set; or the reason for none.
@@ -40,7 +39,6 @@ def predict(
     Args:
         out: folder for the results.
         weights: of a pose network, by name or file ('depthpose weights list').
-        view: live shows each result in Rerun's viewer (an extra) as it comes; FILE.rrd records it.
     """
     from depthpose.cli.pose_frames import find_all
     from depthpose.cli.pose_methods import source_of
@@ -53,19 +51,19 @@ def predict(
             "with --mask and --camera, or a data set"
         )
     source = source_of(weights, register, inputs.unit, dataset, estimates.config)
-    if dataset.bop is not None:
-        return predict_dataset(source, dataset, inputs.object, out, estimates.batch, view, engine)
     if engine.engine == "ray":
         return predict_on_ray(inputs, source, estimates.batch, out, engine)
-    method = source.build()
+    method, home, batch = source.build(), Path(out), estimates.batch
+    if dataset.bop is not None:
+        return predict_dataset(method, dataset, inputs.object, source.config, home, batch)
     if inputs.cloud is not None and not method.takes_clouds:
         raise InputError(
             f"--cloud {inputs.cloud}: the weights {weights} need depth images; give --depth, "
             "--mask and --camera, or weights that vote"
         )
     if inputs.depth is not None and inputs.mask is None and inputs.lens is not None:
-        return find_all(method, inputs, Path(out))
-    return predict_files(method, inputs, Path(out), estimates.batch, view)
+        return find_all(method, inputs, home)
+    return predict_files(method, inputs, home, batch)
 
 
 def evaluate(

@@ -30,7 +30,7 @@ from depthpose.pose.evaluate import (
 from depthpose.pose.mesh import symmetry_transforms
 from depthpose.report import page
 from depthpose.report.page import Section
-from depthpose.report.pose import PoseShown, pose_section
+from depthpose.report.pose import pose_section
 
 HOW = (
     "Refused and wrong answers stay in every number. The row 'mean' counts each object the same, "
@@ -151,17 +151,20 @@ def measure(
                 truth = nearest_copy(
                     pose, truth, symmetry_transforms(model.symmetries), model.symmetries
                 )
-            shown = PoseShown(
-                input=dataset.view(instance).input,
-                estimate=estimate,
-                model=model,
-                image=None if instance.rgb is None else read_image(instance.rgb),
-                truth=truth,
-            )
             title = f"{path.stem}: {row.object} in {row.instance}, {role}"
             columns = row.columns()
             own = {name: columns[name] for name in _MEASURED}
-            sections.append(pose_section(title, shown, _OF_TRUTH, rows=[own]))
+            section = pose_section(
+                title,
+                dataset.view(instance).input,
+                estimate,
+                model,
+                _OF_TRUTH,
+                image=None if instance.rgb is None else read_image(instance.rgb),
+                truth=truth,
+                rows=[own],
+            )
+            sections.append(section)
     sections = [
         Section(title="Success by masks", text=said, rows=list(by_masks.values())),
         Section(title="All numbers", rows=rows),

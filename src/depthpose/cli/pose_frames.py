@@ -43,13 +43,13 @@ def find_all(method: PoseMethod, inputs: OneObjectOptions, out: Path) -> int:
     assert lens is not None
     objects = tuple(method.models_by_name)
     if inputs.object is not None:
-        objects = (pose_methods.object_named(inputs.object, method),)
+        objects = (pose_predict.object_named(inputs.object, method),)
     if method.find is None:
         raise InputError("--depth without --mask: these weights need masked views; give --mask")
     if find_rank().world > 1:
         raise InputError("--depth without --mask is done by one process; give --mask, or start one")
     unit = inputs.unit
-    jobs = pose_methods.frame_jobs(Path(inputs.depth), lens, objects[0], unit, out)
+    jobs = pose_predict.frame_jobs(Path(inputs.depth), lens, objects[0], unit, out)
     names = {job.name for job in jobs}
     for name in sorted(names):
         if (plain := re.sub(r"_\d+$", "", name)) != name and plain in names:
@@ -57,7 +57,7 @@ def find_all(method: PoseMethod, inputs: OneObjectOptions, out: Path) -> int:
                 f"two depth images are called {plain!r} and {name!r}, and so would be what is "
                 "found in the first; rename one"
             )
-    facts = pose_methods.camera_facts(lens) | ({} if unit is None else {"unit": unit})
+    facts = pose_predict.camera_facts(lens) | ({} if unit is None else {"unit": unit})
     settings = {**method.settings, "find": sorted(objects), **facts}
     pose_predict.claim(out, settings, jobs, pose_predict.is_result_of)
     left = [p for p in kept_predictions(out) if is_finished(p)]
@@ -97,15 +97,15 @@ def track_folder(method: PoseMethod, frames: SequenceOptions, out: Path) -> int:
     """Follow one object through depth images with a camera, or clouds; give the exit code."""
     unit = frames.unit
     start = None if frames.first is None else pose_methods.read_pose(frames.first)
-    name = pose_methods.object_named(frames.object, method)
+    name = pose_predict.object_named(frames.object, method)
     settings = {**method.settings, "track": name} | ({} if unit is None else {"unit": unit})
     if frames.cloud is not None:
-        jobs = pose_methods.cloud_jobs(frames.cloud, unit or "m", name, out)
+        jobs = pose_predict.cloud_jobs(frames.cloud, unit or "m", name, out)
     else:
         assert frames.depth is not None
         assert frames.camera is not None
-        jobs = pose_methods.frame_jobs(frames.depth, frames.camera, name, unit, out)
-        settings |= pose_methods.camera_facts(frames.camera)
+        jobs = pose_predict.frame_jobs(frames.depth, frames.camera, name, unit, out)
+        settings |= pose_predict.camera_facts(frames.camera)
     if frames.first is not None:
         settings |= {"first": pose_methods.named_file(frames.first)}
     pose_predict.claim(out, settings, jobs)
@@ -147,7 +147,7 @@ def _frame_job(instance: Instance, name: str) -> Job[Any]:
         )
 
     job = Job(name=instance.name, read=read, place=place_of(instance))
-    return pose_methods.safe_job(job, name)
+    return pose_predict.safe_job(job, name)
 
 
 def _finish(

@@ -1,4 +1,4 @@
-"""What pose commands are given: methods and masks by their names, clouds and images as jobs."""
+"""Methods and masks of pose commands, by their names."""
 
 import re
 import sys
@@ -19,23 +19,21 @@ from depthpose.cli.engine import Weights
 from depthpose.cli.pose_options import DataSetOptions, RegisterOptions, SequenceOptions
 from depthpose.core.checkpoint import file_sha256, find_weights, read_checkpoint, warn_of_terms
 from depthpose.core.config import config_to_dict
-from depthpose.core.errors import InputError, nearest_name
-from depthpose.core.files import MAP_SUFFIXES, cloud_suffixes, list_images, read_image, write_json
-from depthpose.core.files.disk import natural_order
+from depthpose.core.errors import InputError
+from depthpose.core.files import read_image, write_json
 from depthpose.core.rigid import Rigid
-from depthpose.core.run import claim_folder, refuse_among_inputs
+from depthpose.core.run import claim_folder
 from depthpose.core.units import Unit
 from depthpose.pose import datasets, predictions
 from depthpose.pose.baselines import DepthImageNet, FpfhConfig, FpfhEstimator
 from depthpose.pose.config import EstimateConfig
 from depthpose.pose.datasets.layouts import integer, read_rows
 from depthpose.pose.estimator import DepthImageRegressor, GeoPoseNet, Registration
-from depthpose.pose.estimator.inputs import AnyInput, AnyMask, cloud_input, rigid_input, view_input
+from depthpose.pose.estimator.inputs import AnyInput, rigid_input
 from depthpose.pose.mesh import FIXED_UNITS, unit_of
 from depthpose.pose.segmentation import Segmenter
 from depthpose.pose.types import ObjectModel, PoseEstimate, ViewInput
 from depthpose.pose.weights import read_pose_weights
-from depthpose.report.viewer import Viewer
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -208,16 +206,13 @@ EstimateMany = Callable[[Sequence[ViewInput]], Sequence[PoseEstimate]]
 class PoseMethod:
     """An estimator, what to call it, the objects it knows, and what decides its results.
 
-    Attributes:
-        takes_clouds: whether it can do without a depth image.
-        find: gives the poses of named objects in a view without a mask; None: it cannot.
-        track: follows a named object through frames; None: it cannot.
-        holder: what knows the objects, in messages.
+    ``find`` gives the poses of named objects in a view without a mask, ``track`` follows one
+    through frames; None: it cannot. ``holder``: what knows the objects, in messages.
     """
 
     name: str
     estimate_many: EstimateMany
-    takes_clouds: bool
+    takes_clouds: bool  # whether it can do without a depth image
     models: Sequence[ObjectModel]
     settings: Mapping[str, Any]
     find: Callable[[ViewInput, Sequence[str]], list[PoseEstimate]] | None = None
@@ -394,18 +389,6 @@ def match_names(dataset: datasets.BopDataset, models: Sequence[ObjectModel]) -> 
     return names
 
 
-def object_named(name: str | None, method: PoseMethod) -> str:
-    """Give the object that is meant."""
-    known = list(method.models_by_name)
-    if name is None and len(known) > 1:
-        raise InputError(f"the {method.holder} know {', '.join(known)}; say which by --object")
-    if name is not None and name not in known:
-        raise InputError(
-            f"--object {name}: the {method.holder} do not know it; {nearest_name(name, known)}"
-        )
-    return known[0] if name is None else name
-
-
 def read_pose(path: Path) -> Rigid:
     """Read the 4x4 matrix of a pose from a text file; brackets and commas do no harm."""
     try:
@@ -422,117 +405,6 @@ def read_pose(path: Path) -> Rigid:
         return rigid_input(values.reshape(4, 4))
     except InputError as error:
         raise InputError(f"--first {path}: {error}") from error
-
-
-def camera_facts(camera: Path | float) -> dict[str, Any]:
-    """Give what of a camera file, or a focal length, decides the poses, for the record of a run."""
-    if not isinstance(camera, Path):
-        return {"focal_px": camera}
-    return {"camera": str(camera.resolve()), "camera_sha256": file_sha256(camera)}
-
-
-def cloud_jobs(cloud: Path, unit: Unit, object: str, out: Path) -> list[predictions.Job[Any]]:
-    """Take a cloud, or every one of a folder."""
-    known = cloud_suffixes()
-    files = [cloud]
-    if cloud.is_dir():
-        named = [path for path in cloud.iterdir() if not path.name.startswith(".")]
-        files = [path for path in named if path.suffix.lower() in known]
-    files.sort(key=natural_order)
-    if not files:
-        raise InputError(f"{cloud}: no {', '.join(known)} file there; give a cloud, or a folder")
-    _refuse_one_name(files)
-    refuse_among_inputs(out, [cloud], files)
-    each = {path: partial(cloud_input, path, unit, object, path.stem) for path in files}
-    return [
-        safe_job(predictions.Job(name=path.stem, read=read, source=path), object)
-        for path, read in each.items()
-    ]
-
-
-def view_jobs(
-    depth: Path,
-    mask: Path,
-    camera: Path | float,
-    object: str,
-    unit: Unit | None,
-    out: Path,
-) -> list[predictions.Job[Any]]:
-    """Take a depth image, its mask and its camera, or images and masks of one name in two folders.
-
-    Of a mask that numbers several objects each is an input: NAME_1, NAME_2, ...
-    """
-    runs = sorted(mask.glob("*.json")) if mask.is_dir() else []  # of run lengths
-    depths, pictures = _list_depths(depth), runs or list_images(mask)
-    refuse_among_inputs(out, [depth, mask], [*depths, *pictures])
-    _refuse_one_name(depths)
-    _refuse_one_name(pictures)
-    masks = {path.stem: path for path in pictures}
-    if len(depths) == len(masks) == 1 and not depth.is_dir():
-        masks = {depths[0].stem: next(iter(masks.values()))}
-    lost = [path.stem for path in depths if path.stem not in masks]
-    if lost:
-        raise InputError(
-            f"{mask}: no mask called {lost[0]!r}; a mask has the name of its depth image"
-        )
-    jobs: list[predictions.Job[Any]] = []
-    for path in depths:
-        own: dict[str, AnyMask] = {"": masks[path.stem]}
-        with suppress(InputError):  # it will be said where the mask is read
-            labels = datasets.read_labels(masks[path.stem])
-            numbers = labels[labels != 0].unique().tolist()
-            runs = {k: datasets.encode_rle(labels == k)[0] for k in numbers if len(numbers) > 1}
-            size = list(labels.shape)
-            own = {f"_{k}": {"size": size, "counts": list(r)} for k, r in runs.items()} or own
-        for end, one in own.items():
-            name = path.stem + end
-            read = partial(view_input, path, one, camera, object, name, unit)
-            job = predictions.Job(name=name, read=read, source=(path, masks[path.stem]))
-            jobs.append(safe_job(job, object))
-    twice = [name for name, count in Counter(job.name for job in jobs).items() if count > 1]
-    if twice:
-        raise InputError(
-            f"{depth}: two results would be called {twice[0]!r}, the name of a depth image and a "
-            "number of its mask; rename the other"
-        )
-    return jobs
-
-
-def frame_jobs(
-    depth: Path, camera: Path | float, object: str, unit: Unit | None, out: Path
-) -> list[predictions.Job[Any]]:
-    """Take whole depth images, without masks."""
-    depths = _list_depths(depth)
-    refuse_among_inputs(out, [depth], depths)
-    _refuse_one_name(depths)
-    each = {p: partial(view_input, p, None, camera, object, p.stem, unit) for p in depths}
-    return [
-        safe_job(predictions.Job(name=path.stem, read=read, source=path), object)
-        for path, read in each.items()
-    ]
-
-
-def _list_depths(depth: Path) -> list[Path]:
-    """List depth images: pictures, or the maps of a folder without such."""
-    try:
-        return list_images(depth)
-    except InputError:
-        maps = [p for p in depth.glob("*") if p.suffix.lower() in MAP_SUFFIXES]
-        if not maps:
-            raise
-        return sorted(maps, key=natural_order)
-
-
-def _refuse_one_name(files: Sequence[Path]) -> None:
-    """Results bear the names of their inputs, without the suffix."""
-    first: dict[str, Path] = {}
-    for path in files:
-        other = first.setdefault(path.stem, path)
-        if other != path:
-            raise InputError(
-                f"{path.parent}: {other.name} and {path.name} would both be {path.stem!r} in the "
-                "results; rename one, or move it to another folder"
-            )
 
 
 def chosen_objects(
@@ -555,40 +427,3 @@ def chosen_objects(
         said = f"left out, as the {method.holder} do not know them: objects {left_out}"
         print(said, file=sys.stderr)
     return dataset.of_objects(*known)
-
-
-def bop_jobs(
-    dataset: datasets.BopDataset, masks: Masks, method: PoseMethod
-) -> list[predictions.Job[Any]]:
-    """Take the instances of a data set by some masks."""
-    names = match_names(dataset, method.models)
-    jobs = masks.jobs(names)
-    return [safe_job(job, names[job.place.object_id]) for job in jobs if job.place is not None]
-
-
-def safe_job(job: predictions.Job[Any], object: str) -> predictions.Job[Any]:
-    """Let the job of what cannot be read give the estimate that says so, and stop no other."""
-
-    def read() -> AnyInput | PoseEstimate:
-        try:
-            return job.read()
-        except InputError as error:
-            said = f"cannot be read: {error}"
-            return PoseEstimate(name=job.name, object=object, status="unreadable", reason=said)
-
-    return replace(job, read=read)
-
-
-def safely(method: PoseMethod, viewer: Viewer | None = None) -> EstimateMany:
-    """Let a method skip what could not be read, and show the others."""
-
-    def estimate_many(inputs: Sequence[Any]) -> list[PoseEstimate]:
-        readable = [one for one in inputs if not isinstance(one, PoseEstimate)]
-        estimates = method.estimate_many(readable)
-        if viewer is not None:
-            for one, estimate in zip(readable, estimates, strict=True):
-                viewer.show_pose(one, estimate, method.models_by_name[one.object])
-        left = iter(estimates)
-        return [one if isinstance(one, PoseEstimate) else next(left) for one in inputs]
-
-    return estimate_many

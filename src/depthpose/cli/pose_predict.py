@@ -1,12 +1,12 @@
 """The work behind ``depthpose pose predict``, here or by an engine."""
 
-import json
 import operator
 import re
 import sys
 import time
 from collections import Counter, defaultdict
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -17,38 +17,46 @@ from tqdm import tqdm
 
 from depthpose.cli import pose_methods
 from depthpose.cli.engine import EngineOptions, say
-from depthpose.cli.pose_methods import MethodSource, PoseMethod
+from depthpose.cli.pose_methods import EstimateMany, MethodSource, PoseMethod
 from depthpose.cli.pose_options import DataSetOptions, OneObjectOptions
 from depthpose.core import run
 from depthpose.core.camera import Camera, camera_of
+from depthpose.core.checkpoint import file_sha256
 from depthpose.core.config import config_to_dict
 from depthpose.core.engine import (
     Files,
     Function,
     Inputs,
-    Item,
     Sample,
     Work,
-    is_url,
-    shard_results,
     stem,
 )
-from depthpose.core.errors import InputError
+from depthpose.core.errors import InputError, nearest_name
 from depthpose.core.files import (
+    MAP_SUFFIXES,
     cloud_suffixes,
     image_size,
+    list_images,
     read_image,
     write_cloud,
     write_image,
     write_json,
 )
+from depthpose.core.files.disk import natural_order
 from depthpose.core.files.images import LISTED_SUFFIXES
 from depthpose.core.rigid import numbers_text
 from depthpose.core.run import is_whole, note_result
 from depthpose.core.units import Unit
 from depthpose.pose.cloud import object_points
-from depthpose.pose.datasets import BopDataset, open_bop, read_targets
-from depthpose.pose.estimator.inputs import AnyInput, cloud_input, view_input
+from depthpose.pose.config import EstimateConfig
+from depthpose.pose.datasets import (
+    BopDataset,
+    encode_rle,
+    open_bop,
+    read_labels,
+    read_targets,
+)
+from depthpose.pose.estimator.inputs import AnyInput, AnyMask, cloud_input, view_input
 from depthpose.pose.evaluate import of_targets
 from depthpose.pose.predictions import (
     CLOUD,
@@ -59,7 +67,6 @@ from depthpose.pose.predictions import (
     alternatives_name,
     is_finished,
     kept_predictions,
-    parse_prediction,
     predict,
     prediction_row,
     results_name,
@@ -69,7 +76,6 @@ from depthpose.pose.predictions import (
 from depthpose.pose.types import PoseEstimate, ViewInput
 from depthpose.report import pose as drawn
 from depthpose.report.page import Section, choose_answers, plain_table, write_page
-from depthpose.report.viewer import open_viewer
 
 _PAGE = "report.html"
 _MOST_SHOWN = 20  # of the answers, on the terminal; poses.json holds all
@@ -117,15 +123,159 @@ def claim_bop(out: Path, settings: dict[str, Any], dataset: BopDataset) -> None:
     run.claim_folder(out, settings, [POSES, _PAGE, *tables, *pictures])
 
 
-def predict_files(
-    method: PoseMethod, inputs: OneObjectOptions, out: Path, batch: int, view: str | None
-) -> int:
+def object_named(name: str | None, method: PoseMethod) -> str:
+    """Give the object that is meant."""
+    known = list(method.models_by_name)
+    if name is None and len(known) > 1:
+        raise InputError(f"the {method.holder} know {', '.join(known)}; say which by --object")
+    if name is not None and name not in known:
+        raise InputError(
+            f"--object {name}: the {method.holder} do not know it; {nearest_name(name, known)}"
+        )
+    return known[0] if name is None else name
+
+
+def camera_facts(camera: Path | float) -> dict[str, Any]:
+    """Give what of a camera file, or a focal length, decides the poses, for the record of a run."""
+    if not isinstance(camera, Path):
+        return {"focal_px": camera}
+    return {"camera": str(camera.resolve()), "camera_sha256": file_sha256(camera)}
+
+
+def cloud_jobs(cloud: Path, unit: Unit, object: str, out: Path) -> list[Job[Any]]:
+    """Take a cloud, or every one of a folder."""
+    known = cloud_suffixes()
+    files = [cloud]
+    if cloud.is_dir():
+        named = [path for path in cloud.iterdir() if not path.name.startswith(".")]
+        files = [path for path in named if path.suffix.lower() in known]
+    files.sort(key=natural_order)
+    if not files:
+        raise InputError(f"{cloud}: no {', '.join(known)} file there; give a cloud, or a folder")
+    _refuse_one_name(files)
+    run.refuse_among_inputs(out, [cloud], files)
+    jobs = [
+        Job(name=p.stem, read=partial(cloud_input, p, unit, object, p.stem), source=p)
+        for p in files
+    ]
+    return [safe_job(job, object) for job in jobs]
+
+
+def view_jobs(
+    depth: Path,
+    mask: Path,
+    camera: Path | float,
+    object: str,
+    unit: Unit | None,
+    out: Path,
+) -> list[Job[Any]]:
+    """Take a depth image, its mask and its camera, or images and masks of one name in two folders.
+
+    Of a mask that numbers several objects each is an input: NAME_1, NAME_2, ...
+    """
+    runs = sorted(mask.glob("*.json")) if mask.is_dir() else []  # of run lengths
+    depths, pictures = _list_depths(depth), runs or list_images(mask)
+    run.refuse_among_inputs(out, [depth, mask], [*depths, *pictures])
+    _refuse_one_name(depths)
+    _refuse_one_name(pictures)
+    masks = {path.stem: path for path in pictures}
+    if len(depths) == len(masks) == 1 and not depth.is_dir():
+        masks = {depths[0].stem: next(iter(masks.values()))}
+    lost = [path.stem for path in depths if path.stem not in masks]
+    if lost:
+        raise InputError(
+            f"{mask}: no mask called {lost[0]!r}; a mask has the name of its depth image"
+        )
+    jobs: list[Job[Any]] = []
+    for path in depths:
+        own: dict[str, AnyMask] = {"": masks[path.stem]}
+        with suppress(InputError):  # it will be said where the mask is read
+            labels = read_labels(masks[path.stem])
+            numbers = labels[labels != 0].unique().tolist()
+            runs = {k: encode_rle(labels == k)[0] for k in numbers if len(numbers) > 1}
+            size = list(labels.shape)
+            own = {f"_{k}": {"size": size, "counts": list(r)} for k, r in runs.items()} or own
+        for end, one in own.items():
+            name = path.stem + end
+            read = partial(view_input, path, one, camera, object, name, unit)
+            job = Job(name=name, read=read, source=(path, masks[path.stem]))
+            jobs.append(safe_job(job, object))
+    twice = [name for name, count in Counter(job.name for job in jobs).items() if count > 1]
+    if twice:
+        raise InputError(
+            f"{depth}: two results would be called {twice[0]!r}, the name of a depth image and a "
+            "number of its mask; rename the other"
+        )
+    return jobs
+
+
+def frame_jobs(
+    depth: Path, camera: Path | float, object: str, unit: Unit | None, out: Path
+) -> list[Job[Any]]:
+    """Take whole depth images, without masks."""
+    depths = _list_depths(depth)
+    run.refuse_among_inputs(out, [depth], depths)
+    _refuse_one_name(depths)
+    jobs = [
+        Job(name=p.stem, read=partial(view_input, p, None, camera, object, p.stem, unit), source=p)
+        for p in depths
+    ]
+    return [safe_job(job, object) for job in jobs]
+
+
+def _list_depths(depth: Path) -> list[Path]:
+    """List depth images: pictures, or the maps of a folder without such."""
+    try:
+        return list_images(depth)
+    except InputError:
+        maps = [p for p in depth.glob("*") if p.suffix.lower() in MAP_SUFFIXES]
+        if not maps:
+            raise
+        return sorted(maps, key=natural_order)
+
+
+def _refuse_one_name(files: Sequence[Path]) -> None:
+    """Results bear the names of their inputs, without the suffix."""
+    first: dict[str, Path] = {}
+    for path in files:
+        other = first.setdefault(path.stem, path)
+        if other != path:
+            raise InputError(
+                f"{path.parent}: {other.name} and {path.name} would both be {path.stem!r} in the "
+                "results; rename one, or move it to another folder"
+            )
+
+
+def safe_job(job: Job[Any], object: str) -> Job[Any]:
+    """Let the job of what cannot be read give the estimate that says so, and stop no other."""
+
+    def read() -> AnyInput | PoseEstimate:
+        try:
+            return job.read()
+        except InputError as error:
+            said = f"cannot be read: {error}"
+            return PoseEstimate(name=job.name, object=object, status="unreadable", reason=said)
+
+    return replace(job, read=read)
+
+
+def safely(method: PoseMethod) -> EstimateMany:
+    """Let a method skip what could not be read."""
+
+    def estimate_many(inputs: Sequence[Any]) -> list[PoseEstimate]:
+        left = iter(method.estimate_many([o for o in inputs if not isinstance(o, PoseEstimate)]))
+        return [one if isinstance(one, PoseEstimate) else next(left) for one in inputs]
+
+    return estimate_many
+
+
+def predict_files(method: PoseMethod, inputs: OneObjectOptions, out: Path, batch: int) -> int:
     """Pose clouds, or masked depth images, in this process; give the exit code."""
-    name, lens = pose_methods.object_named(inputs.object, method), inputs.lens
+    name, lens = object_named(inputs.object, method), inputs.lens
     settings = {**method.settings, "object": name}
     if inputs.cloud is not None:
         unit = inputs.unit or "m"
-        jobs = pose_methods.cloud_jobs(Path(inputs.cloud), unit, name, out)
+        jobs = cloud_jobs(Path(inputs.cloud), unit, name, out)
         settings |= {"unit": unit}
     elif inputs.depth is None or inputs.mask is None or lens is None:
         raise InputError(
@@ -133,11 +283,11 @@ def predict_files(
         )
     else:
         mask = Path(inputs.mask)
-        jobs = pose_methods.view_jobs(Path(inputs.depth), mask, lens, name, inputs.unit, out)
-        settings |= pose_methods.camera_facts(lens) | {"mask": str(mask.resolve())}
+        jobs = view_jobs(Path(inputs.depth), mask, lens, name, inputs.unit, out)
+        settings |= camera_facts(lens) | {"mask": str(mask.resolve())}
         settings |= {} if inputs.unit is None else {"unit": inputs.unit}
     claim(out, settings, jobs)
-    predictions = predict_all(method, jobs, out, settings, batch, view)
+    predictions = predict_all(method, jobs, out, settings, batch)
     if predictions is None:
         return 0
     write_files(predictions, jobs, out, method)
@@ -145,77 +295,32 @@ def predict_files(
 
 
 def predict_dataset(
-    source: MethodSource,
+    method: PoseMethod,
     options: DataSetOptions,
     object: str | None,
-    out: str,
+    config: EstimateConfig,
+    out: Path,
     batch: int,
-    view: str | None,
-    engine: EngineOptions,
 ) -> int:
-    """Pose the objects of a data set, or one, here or by an engine; give the exit code."""
+    """Pose the objects of a data set, or one; give the exit code."""
     assert options.bop is not None
-    if engine.engine == "ray":
-        if is_url(out):
-            raise InputError(
-                f"--out {out}: poses of a data set come together in poses.json and BOP's csv, "
-                "which need a disk; give a folder, and copy it"
-            )
-        if options.masks not in ("truth", "predicted") and not options.masks.endswith(".json"):
-            raise InputError(
-                f"--masks {options.masks}: workers take masks that are there already; give "
-                "truth, predicted, or a file of BOP detections, such as 'pose evaluate --masks "
-                "WEIGHTS' leaves"
-            )
-    method, home = source.build("cpu" if engine.engine == "ray" else None), Path(out)
     dataset = open_bop(options.bop, options.split)
     if options.targets is not None:
         dataset = of_targets(dataset, read_targets(options.targets, options.bop))
     dataset = pose_methods.chosen_objects(dataset, method, object)
-    masks = options.masks
-    (found,) = pose_methods.find_masks([masks], dataset, home, source.config.device)
-    jobs = pose_methods.bop_jobs(dataset, found, method)
-    settings = {**method.settings, "estimate": config_to_dict(source.config)}
+    (found,) = pose_methods.find_masks([options.masks], dataset, out, config.device)
+    names = pose_methods.match_names(dataset, method.models)
+    jobs = [safe_job(j, names[j.place.object_id]) for j in found.jobs(names) if j.place is not None]
+    settings = {**method.settings, "estimate": config_to_dict(config)}
     settings |= {**pose_methods.of_dataset(dataset), "masks": found.name, **found.settings}
     if object is not None:
         settings["objects"] = sorted({i.object_id for i in dataset.instances})
-    if engine.engine == "ray":
-        settings["shards"] = engine.shards
-    claim_bop(home, settings, dataset)
-    if engine.engine == "ray":
-        start = partial(
-            start_bop,
-            source=source.packed(),
-            folder=str(dataset.folder.resolve()),
-            split=options.split,
-            masks=str(Path(masks).resolve()) if masks.endswith(".json") else masks,
-            objects=tuple(sorted({instance.object_id for instance in dataset.instances})),
-        )
-        inputs = Inputs(items=[Item(job.name, ()) for job in jobs], files=Files((), ()))
-        work = Work(start=start, files=inputs.files, endings=(ENDING,), batch=batch)
-        known: dict[str, Prediction] = {}
-        failed: dict[str, str] = {}
-        for done in engine.run(work, inputs, out, settings):
-            failed |= dict(done.failures)
-            for name, files in shard_results(out, done):
-                known[name] = parse_prediction(json.loads(files[ENDING]), f"{done.shard}: {name}")
-        for job in jobs:
-            if job.name not in known:
-                lost = PoseEstimate(
-                    name=job.name,
-                    object=job.read().object,
-                    status="unreadable",
-                    reason=failed[job.name],
-                )
-                known[job.name] = Prediction(estimate=lost, place=job.place)
-        predictions = [known[job.name] for job in jobs]
-        write_predictions(Path(out), predictions)
-    else:
-        predictions = predict_all(method, jobs, home, settings, batch, view)
+    claim_bop(out, settings, dataset)
+    predictions = predict_all(method, jobs, out, settings, batch)
     if predictions is None:
         return 0
-    write_files(predictions, jobs, home, method, dataset)
-    return say_result(predictions, home)
+    write_files(predictions, jobs, out, method, dataset)
+    return say_result(predictions, out)
 
 
 def predict_all(
@@ -224,7 +329,6 @@ def predict_all(
     out: Path,
     settings: dict[str, Any],
     batch: int,
-    view: str | None,
 ) -> list[Prediction] | None:
     """Estimate what is not finished; several processes share the work through the files.
 
@@ -235,10 +339,9 @@ def predict_all(
     done = _finished(out)
     left = [jobs[k] for k in process.share(len(jobs)) if jobs[k].name not in done]
     if left:
-        with open_viewer(None if process.rank else view) as viewer:
-            names = predict(pose_methods.safely(method, viewer), left, home, settings, batch)
-            for _ in tqdm(names, total=len(left), disable=None, unit=" poses"):
-                pass
+        names = predict(safely(method), left, home, settings, batch)
+        for _ in tqdm(names, total=len(left), disable=None, unit=" poses"):
+            pass
     if process.rank:
         return None
     if process.world > 1:
@@ -390,13 +493,10 @@ def _write_page(
         if isinstance(shown_input, PoseEstimate):  # unreadable by now
             continue
         rgb = None if place is None else image_of[place[:2]]
-        shown = drawn.PoseShown(
-            input=shown_input,
-            estimate=estimate,
-            model=method.models_by_name[estimate.object],
-            image=None if rgb is None else read_image(rgb),
-        )
-        sections.append(drawn.pose_section(estimate.name, shown))
+        model = method.models_by_name[estimate.object]
+        image = None if rgb is None else read_image(rgb)
+        section = drawn.pose_section(estimate.name, shown_input, estimate, model, image=image)
+        sections.append(section)
     number = len(predictions)
     estimates = [prediction.estimate for prediction in predictions]
     text = f"{number} inputs: {_statuses(estimates)}. Shown below: {len(sections)}"
@@ -433,41 +533,16 @@ def start_files(
 
     def predict(samples: Sequence[Sample], out: Path) -> list[str]:
         named = [Job(name=sample.name, read=partial(read, sample)) for sample in samples]
-        jobs = [pose_methods.safe_job(job, object) for job in named]
-        return _write_estimates(method, jobs, out)
+        jobs = [safe_job(job, object) for job in named]
+        estimates = safely(method)([job.read() for job in jobs])
+        reasons: list[str] = []
+        for job, estimate in zip(jobs, estimates, strict=True):
+            prediction = Prediction(estimate=estimate)
+            write_json(out / f"{job.name}.{ENDING}", prediction_row(prediction))
+            reasons.append("" if is_finished(prediction) else estimate.reason)
+        return reasons
 
     return predict
-
-
-def start_bop(
-    source: MethodSource, folder: str, split: str, masks: str, objects: tuple[int, ...]
-) -> Function:
-    """Build the estimator, and open the data set; its objects, by name, to poses or the reasons.
-
-    All workers see the folder and a file of detections, if ``masks`` is one.
-    """
-    method = source.build()
-    dataset = open_bop(Path(folder), split).of_objects(*objects)
-    (found,) = pose_methods.find_masks([masks], dataset, Path())
-    jobs = {job.name: job for job in pose_methods.bop_jobs(dataset, found, method)}
-
-    def predict(samples: Sequence[Sample], out: Path) -> list[str]:
-        return _write_estimates(method, [jobs[sample.name] for sample in samples], out)
-
-    return predict
-
-
-def _write_estimates(method: PoseMethod, jobs: Sequence[Job[Any]], out: Path) -> list[str]:
-    """Estimate some inputs and write an entry of each; give for each "" or why it failed."""
-    reasons: list[str] = []
-    for job, estimate in zip(
-        jobs, pose_methods.safely(method)([job.read() for job in jobs]), strict=True
-    ):
-        spent = {**job.seconds, **estimate.seconds}
-        prediction = Prediction(estimate=replace(estimate, seconds=spent), place=job.place)
-        write_json(out / f"{job.name}.{ENDING}", prediction_row(prediction))
-        reasons.append("" if is_finished(prediction) else estimate.reason)
-    return reasons
 
 
 def predict_on_ray(
@@ -488,7 +563,7 @@ def predict_on_ray(
             )
     source = source.packed()
     method = source.build("cpu")
-    object = pose_methods.object_named(options.object or None, method)
+    object = object_named(options.object or None, method)
     with inputs.first() as first:
         lens = options.lens
         camera = None if lens is None else camera_of(lens, image_size(first[0]))

@@ -1,9 +1,8 @@
 """``depthpose reproduce ...`` and ``depthpose figure ...``."""
 
-import shlex
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal, NamedTuple
+from typing import TYPE_CHECKING, Literal
 
 import tyro
 
@@ -51,8 +50,8 @@ def reproduce(
         split: eigen-test (697 frames), another split, a file of frames, or all.
         pictures: how many frames the page shows.
     """
-    from depthpose.cli.depth_evaluate import open_frames, open_training
-    from depthpose.cli.depth_methods import Method, MethodSource, baseline_method, sgbm_method
+    from depthpose.cli.depth_evaluate import baseline_method, open_frames, open_training
+    from depthpose.cli.depth_predict import Method, MethodSource, sgbm_method
     from depthpose.cli.thesis_depth import reproduce_table
     from depthpose.depth.evaluate import find_protocol
     from depthpose.thesis.depth import TABLES
@@ -153,7 +152,7 @@ def figure(
         split: choose among the frames of a split, such as eigen-test.
     """
     from depthpose.cli.depth_evaluate import open_frames
-    from depthpose.cli.depth_methods import MethodSource
+    from depthpose.cli.depth_predict import MethodSource
     from depthpose.cli.thesis_depth import choose_frames, write_figure
 
     dataset = open_frames(kitti, split)
@@ -325,160 +324,3 @@ def figure_3_5(
     from depthpose.cli.thesis_pose import box_panels, write_figure
 
     return write_figure("3-5", weights, data, number, out, box_panels, columns=3)
-
-
-class Step(NamedTuple):
-    """One command: its description, the arguments of ``depthpose``, and the file that it makes.
-
-    It is done again if a file of earlier steps, ``of``, is newer.
-    """
-
-    what: str
-    words: Sequence[str]
-    makes: Path
-    of: Sequence[Path] = ()
-
-
-_TRAIN = " --data {data} --device {device} --resume --config {configs}/"
-_TABLE_2 = (
-    " --kitti {data} --split {split} --protocol {protocol} --device {gpu} --out {home}/table-"
-)
-_TABLE_3 = " --linemod {data} --no-icp --masks truth {home}/segmentation/segmentation.safetensors"
-_TABLE_3 += " --device {gpu} --out {home}/table-"
-_GENERATOR, _MATCHER = "view/generator.safetensors", "stereo/matcher.safetensors"
-_POSE, _MASKS = "pose/pose.safetensors", "segmentation/segmentation.safetensors"
-_BASELINES = "pointnet/pointnet.safetensors", "depth-image/depth-image.safetensors"
-_STEPS = {
-    "depth": (
-        (_GENERATOR, "", "depth train view --out {home}/view" + _TRAIN + "depth/view.yaml"),
-        (_MATCHER, "", "depth train stereo --out {home}/stereo" + _TRAIN + "depth/stereo.yaml"),
-        ("apart.safetensors", f"{_GENERATOR} {_MATCHER}",
-         f"weights pack {{home}}/{_GENERATOR} --matcher {{home}}/{_MATCHER} "
-         "--out {home}/apart.safetensors --trained-on {trained_on} --licence {licence}"),
-        ("table-2.1/report.html", "apart.safetensors",
-         "reproduce 2.1 --weights {home}/apart.safetensors" + _TABLE_2 + "2.1"),
-        ("table-2.2/report.html", _MATCHER,
-         f"reproduce 2.2 --weights {{home}}/{_MATCHER}{_TABLE_2}2.2"),
-        ("finetune/fakestereo.safetensors", f"{_GENERATOR} {_MATCHER}",
-         f"depth train finetune --generator {{home}}/{_GENERATOR} --matcher {{home}}/{_MATCHER} "
-         "--out {home}/finetune" + _TRAIN + "depth/finetune.yaml"),
-        ("table-2.3/report.html", "apart.safetensors finetune/fakestereo.safetensors",
-         "reproduce 2.3 --weights {home}/apart.safetensors {home}/finetune/fakestereo.safetensors"
-         + _TABLE_2 + "2.3"),
-    ),
-    "pose": (
-        *((f"{what}/{what}.safetensors", "",
-           f"pose train --what {what} --out {{home}}/{what}{_TRAIN}pose/{config}.yaml")
-          for what, config in (
-              ("pose", "thesis"), ("pointnet", "thesis-pointnet"),
-              ("depth-image", "thesis-depth-image"), ("segmentation", "thesis-masks"))),
-        ("table-3.1/report.html", " ".join([_POSE, *_BASELINES, _MASKS]),
-         f"reproduce 3.1 --weights {{home}}/{_POSE} {{home}}/{_BASELINES[0]} "
-         f"{{home}}/{_BASELINES[1]}{_TABLE_3}3.1"),
-        ("table-3.2/report.html", f"{_POSE} {_MASKS}",
-         f"reproduce 3.2 --weights {{home}}/{_POSE}{_TABLE_3}3.2"),
-        ("table-3.3/report.html", _POSE,
-         f"reproduce 3.3 --weights {{home}}/{_POSE} --linemod {{data}} --out {{home}}/table-3.3"),
-    ),
-}  # fmt: skip
-"""By chapter: the file that each step makes, those that it is made of, and its command."""
-
-
-def reproduce_all(
-    out: NewPath,
-    kitti: Path | None = None,
-    linemod: Path | None = None,
-    configs: NewPath = Path("configs"),
-    split: str = "eigen-test",
-    protocol: str = "eigen-raw",
-    device: Literal["auto", "cpu"] = "auto",
-) -> int:
-    """Reproduce all tables of the thesis from data on disk: trainings first, then tables.
-
-    From KITTI: the generator, the matcher and fine-tuning, then tables 2.1, 2.2 and 2.3. From
-    Linemod_preprocessed: the network of directions, its two baselines and the segmentation, then
-    tables 3.1, 3.2 and 3.3, with true and with found masks, poses by votes alone as published.
-    Each step is a command, which is printed. Run again, it skips finished steps and resumes. The
-    thesis's trainings take days on a GPU.
-
-        depthpose reproduce all --kitti /data/kitti --out out/thesis
-        depthpose reproduce all --linemod /data/Linemod_preprocessed --out out/thesis
-
-    Args:
-        out: folder of trainings and tables.
-        kitti: KITTI raw with LiDAR: drives of training and test.
-        linemod: Linemod_preprocessed.
-        configs: folder of depth/view.yaml, stereo.yaml, finetune.yaml, and of pose/thesis.yaml,
-            thesis-pointnet.yaml, thesis-depth-image.yaml, thesis-masks.yaml (see the repository).
-        split: KITTI frames of the tables: eigen-test, a file of frames, or all.
-        protocol: how depth is compared; eigen-raw is the thesis's.
-        device: auto: a GPU where there is one; cpu: none.
-    """
-    import torch
-
-    from depthpose.cli.depth_evaluate import open_frames
-    from depthpose.core.checkpoint import file_sha256
-    from depthpose.core.run import claim_folder, find_rank
-    from depthpose.pose.datasets import open_bop
-
-    if kitti is None and linemod is None:
-        raise InputError("there is nothing to reproduce from: give --kitti or --linemod FOLDER.")
-    if find_rank().world > 1:
-        raise InputError(
-            "'reproduce all' runs its steps one after the other in one process; launch the "
-            "trainings that it prints one by one, then run it again"
-        )
-    if kitti is not None:  # read now, not only after days of training
-        open_frames(kitti, None if split == "all" else split)
-    if linemod is not None:
-        print(f"{linemod}: {len(open_bop(linemod, 'test').instances)} instances to test on")
-    is_gpu = device == "auto" and torch.cuda.is_available()
-    steps: list[Step] = []
-    for chapter, data in (("depth", kitti), ("pose", linemod)):
-        if data is None:
-            continue
-        home, commands = out / chapter, [words.split() for _, _, words in _STEPS[chapter]]
-        named = [words[-1] for words in commands if words[-2] == "--config"]
-        files = [name.removeprefix("{configs}/") for name in named]
-        if missing := [name for name in files if not (configs / name).is_file()]:
-            raise InputError(
-                f"{configs}: there is no {missing[0]}; give the folder of the thesis's configs, "
-                "which is in the repository, by --configs"
-            )
-        sums = {name: file_sha256(configs / name) for name in files}
-        how = {"split": split, "protocol": protocol} if chapter == "depth" else {}
-        claim_folder(home, {"data": str(data.resolve()), "configs": sums, **how})
-        values = {
-            "data": data, "home": home, "configs": configs, "device": device,
-            "gpu": "cuda" if is_gpu else "cpu", "split": split, "protocol": protocol,
-            "trained_on": "KITTI raw", "licence": "not stated; that of KITTI binds",
-        }  # fmt: skip
-        for (makes, of, _), words in zip(_STEPS[chapter], commands, strict=True):
-            what = "both in one file" if words[0] == "weights" else f"table {words[1]}"
-            what = f"training by {words[-1].partition('/')[2]}" if "--config" in words else what
-            made_of = [home / name for name in of.split()]
-            filled = [word.format(**values) for word in words]
-            steps.append(Step(what, filled, home / makes, made_of))
-    return walk(steps)
-
-
-def walk(steps: Sequence[Step]) -> int:
-    """Run what is not done, to the first that fails; give its exit code, or the largest."""
-    from depthpose.cli import main
-
-    code = 0
-    for number, step in enumerate(steps, 1):
-        head = f"[{number}/{len(steps)}] {step.what}"
-        made = step.makes.stat().st_mtime if step.makes.is_file() else -1
-        if made >= 0 and all(p.is_file() and p.stat().st_mtime <= made for p in step.of):
-            print(f"{head}: done, {step.makes}", flush=True)
-            continue
-        print(f"{head}: depthpose {shlex.join(step.words)}", flush=True)
-        if step.words[0] == "weights":  # which replace no file, nor their card
-            for path in (step.makes, step.makes.with_suffix(".md")):
-                path.unlink(missing_ok=True)
-        own = main(step.words)
-        if own > 1:
-            return own
-        code = max(code, own)
-    return code

@@ -11,7 +11,7 @@ from torch import Tensor
 from tqdm import tqdm
 
 from depthpose.cli import depth_evaluate as evaluation
-from depthpose.cli.depth_methods import Method
+from depthpose.cli.depth_predict import Method
 from depthpose.core.errors import InputError, nearest_name
 from depthpose.core.files import write_image
 from depthpose.core.run import claim_folder, environment, find_rank

@@ -2,8 +2,7 @@
 
 import sys
 import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from dataclasses import fields, replace
 from functools import partial
 from pathlib import Path
@@ -15,7 +14,6 @@ from depthpose.cli.arguments import (
     Device,
     NewPath,
     Source,
-    View,
     WeightsName,
     changed,
     group,
@@ -45,8 +43,6 @@ class TrainingOptions:
     finish: bool = False
     """write weights and card of the state that OUT holds, without another step; Ctrl-C twice does
     the same while it trains."""
-    view: View = None
-    """live draws the losses in Rerun's viewer (an extra); FILE.rrd records them."""
 
     def read(
         self, path: Path | None, kind: type, default: object = None, workers: int | None = None
@@ -74,16 +70,31 @@ class TrainingOptions:
         with_messages: bool = False,
     ) -> int:
         """Train, show how far it is, and print where the weights and their card are."""
+        from tqdm import tqdm
+
         from depthpose.core.loop import Run
         from depthpose.core.run import find_rank
 
-        is_first = find_rank().rank == 0
-        with progress_bar(self.view) as on_step:
+        is_first = find_rank().rank == 0  # other processes never show a step
+        is_logged = is_first and not (sys.stdout.isatty() and sys.stderr.isatty())
+        lines = Lines() if is_logged else None
+        with tqdm(unit=" steps", disable=None if is_first else True) as bar:
+
+            def show(progress: "Progress") -> None:
+                if bar.total is None:
+                    bar.reset(progress.steps)
+                    bar.initial = bar.n = progress.step - 1
+                bar.update(progress.step - bar.n)
+                if progress.numbers:
+                    bar.set_postfix({k: f"{v:.4g}" for k, v in progress.numbers.items()})
+                if lines is not None:
+                    lines.show(progress)
+
             run = Run(
                 folder=out,
                 resume=self.resume,
                 finish=self.finish,
-                on_step=on_step,
+                on_step=show,
                 on_message=partial(print, flush=True) if with_messages and is_first else None,
             )
             path = run_stage(config, run)
@@ -92,38 +103,6 @@ class TrainingOptions:
             card = path.with_suffix(".md")
             print(card.read_text() if card.is_file() else "", end="")
         return 0
-
-
-@contextmanager
-def progress_bar(view: str | None = None) -> "Iterator[Callable[[Progress], None]]":
-    """A bar with time left and the latest numbers; with ``view``, curves of them in Rerun too."""
-    from tqdm import tqdm
-
-    from depthpose.core.run import find_rank
-    from depthpose.report.viewer import open_viewer
-
-    # Opened before the length is known; other processes than the first never show a step.
-    is_first = find_rank().rank == 0
-    is_logged = is_first and not (sys.stdout.isatty() and sys.stderr.isatty())
-    lines = Lines() if is_logged else None
-    with (
-        tqdm(unit=" steps", disable=None if is_first else True) as bar,
-        open_viewer(view if is_first else None) as viewer,
-    ):
-
-        def show(progress: "Progress") -> None:
-            if bar.total is None:
-                bar.reset(progress.steps)
-                bar.initial = bar.n = progress.step - 1
-            bar.update(progress.step - bar.n)
-            if progress.numbers:
-                bar.set_postfix({k: f"{v:.4g}" for k, v in progress.numbers.items()})
-            if viewer is not None:
-                viewer.show_step(progress)
-            if lines is not None:
-                lines.show(progress)
-
-        yield show
 
 
 class Lines:

@@ -142,6 +142,7 @@ def pack_weights(
     """
     from depthpose.core.checkpoint import bound_facts, find_weights, warn_of_terms
     from depthpose.core.files import atomic_write
+    from depthpose.core.loop import card_text
     from depthpose.core.run import refuse_to_replace
     from depthpose.depth.weights import read_depth_weights, read_matcher, write_depth_weights
 
@@ -161,7 +162,7 @@ def pack_weights(
         with_half=half,
     )
     with atomic_write(card) as part:
-        part.write_text(_card(out, facts))
+        part.write_text(card_text(out.stem, dict(sorted(facts.items()))))
     print(f"card: {card}")
     return show_weights(str(out))
 
@@ -202,53 +203,6 @@ def complete_weights(
         )
     complete(path, meshes, out)
     return show_weights(str(out))
-
-
-def push_weights(
-    weights: tyro.conf.Positional[WeightsName],
-    repository: tyro.conf.Positional[str],
-    public: bool = False,
-    accept_terms: bool = False,
-) -> int:
-    """Upload weights to the Hugging Face hub, with their card as README.md.
-
-    Others then load them by hf://OWNER/NAME. Log in first ('hf auth login'); needs the extra hub.
-
-        depthpose weights push my_part.safetensors me/my-part
-
-    Args:
-        weights: a .safetensors file, its folder, or the name of weights that came with depthpose.
-        repository: OWNER/NAME; created if missing.
-        public: make a new repository public; by default it is private.
-        accept_terms: you have read the terms of the weights, and may pass them on.
-    """
-    from depthpose.core import hub
-    from depthpose.core.checkpoint import find_weights, read_checkpoint
-
-    path = find_weights(weights)
-    facts = read_checkpoint(path).facts
-    terms = facts.get("terms", "")
-    if terms:
-        print(f"{weights}: {terms}")
-    if terms and not accept_terms:
-        raise InputError(
-            f"{weights}: has terms for passing it on, printed above. If you may, add "
-            "--accept-terms."
-        )
-    readme = hub.readme_of(_card(path, facts), facts)
-    url = hub.push_weights(path, readme, repository, is_private=not public)
-    size = f"{path.stat().st_size / 1e6:.1f} MB"
-    print(f"{url}: {path.name} ({size}) and its card; load them by hf://{repository}")
-    return 0
-
-
-def _card(path: Path, facts: Mapping[str, str]) -> str:
-    """Read the card beside a weights file, or write one of its facts."""
-    from depthpose.core.files import read_text
-    from depthpose.core.loop import card_text
-
-    card = path.with_suffix(".md")
-    return read_text(card) if card.is_file() else card_text(path.stem, dict(sorted(facts.items())))
 
 
 def export_depth(out: NewPath, weights: WeightsName = "default", what: str | None = None) -> int:

@@ -23,17 +23,11 @@ _LEAST_GAP = 0.08  # of two marks on a bar, as a share of its length: nearer one
 
 @dataclass(frozen=True, kw_only=True)
 class Scale:
-    """What the colours of a picture mean, for a colour bar.
+    """What the colours of a picture mean, for a colour bar."""
 
-    Attributes:
-        title: of what, with its unit.
-        colors: RGB in [0, 1] at even steps from the left end of the bar to the right.
-        marks: places on the bar, 0 (left) to 1, and what is written there.
-    """
-
-    title: str
-    colors: Sequence[tuple[float, float, float]]
-    marks: Sequence[tuple[float, str]]
+    title: str  #: of what, with its unit
+    colors: Sequence[tuple[float, float, float]]  #: RGB in [0, 1] at even steps from left to right
+    marks: Sequence[tuple[float, str]]  #: places, 0 (left) to 1, and what is written there
 
 
 def depth_scale(near_m: float = 3.0, far_m: float = 80.0) -> Scale:
@@ -137,21 +131,20 @@ def draw_lines(
     image: Float[Tensor, "3 h w"],
     ends_px: Float[Tensor, "n 2 2"],
     color: tuple[float, float, float],
-    width_px: int = 2,
     dash_px: float | None = None,
 ) -> Float[Tensor, "3 h w"]:
-    """Draw straight lines; what lies outside the image is cut, a line with a NaN end left out.
+    """Draw lines two pixels wide; what lies outside is cut, a line with a NaN end left out.
 
     Args:
         image: what they are drawn on; it is not changed.
         ends_px: (u, v) of both ends of each.
         color: RGB in [0, 1].
-        width_px: side of the square brush.
         dash_px: length of the dashes, and of the gaps between them; None: no gap.
     """
     height, width = image.shape[1:]
     drawn = image.clone()
     ink = torch.tensor(color).to(image)[:, None]
+    brush = torch.cartesian_prod(torch.arange(2), torch.arange(2))
     for start, end in ends_px.double().tolist():
         length = math.dist(start, end)
         if not 0 < length < 1e5:  # NaN, a point, or beyond any picture
@@ -161,8 +154,7 @@ def draw_lines(
             way = way[(way / dash_px).floor() % 2 == 0]
         share = (way / length)[:, None]
         line = torch.tensor(start) * (1 - share) + torch.tensor(end) * share
-        brush = torch.arange(width_px) - (width_px - 1) // 2
-        cells = (line.round().long()[:, None] + torch.cartesian_prod(brush, brush)).flatten(0, 1)
+        cells = (line.round().long()[:, None] + brush).flatten(0, 1)
         inside = ((cells >= 0) & (cells < torch.tensor([width, height]))).all(-1)
         u, v = cells[inside].unbind(-1)
         drawn[:, v, u] = ink

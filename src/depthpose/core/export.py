@@ -150,18 +150,14 @@ class Case:
 class Limit:
     """How far an output may be off.
 
-    Attributes:
-        value: the limit, in the output's unit.
-        of: the largest difference, or the mean one where the output is discontinuous.
-        is_relative: differences are shares of what PyTorch answers.
-        flips: share of the numbers that may be off by more, or be NaN in one answer alone, and are
-            left out of the differences: where a decision is at its limit.
+    ``flips`` may be off by more, or be NaN in one answer alone, where a decision is at its limit;
+    they are left out of the differences.
     """
 
-    value: float
-    of: Literal["largest", "mean"] = "largest"
-    is_relative: bool = False
-    flips: float = 0.0
+    value: float  #: the limit, in the output's unit
+    of: Literal["largest", "mean"] = "largest"  #: mean where the output is discontinuous
+    is_relative: bool = False  #: differences are shares of what PyTorch answers
+    flips: float = 0.0  #: as a share of the numbers
 
 
 def _row(case: str, output: str, answer: np.ndarray, expected: np.ndarray, limit: Limit) -> Row:

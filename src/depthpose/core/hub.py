@@ -9,8 +9,6 @@ HF_HUB_OFFLINE, the token of ``hf auth login``.
 """
 
 import re
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
 from functools import cache
 from importlib import import_module
 from pathlib import Path
@@ -23,8 +21,6 @@ WEIGHTS_FILE = "model.safetensors"
 _NAME = r"[\w-][\w.-]*/[\w-][\w.-]*"
 # One slash is left of the two where the name was made a path.
 _REFERENCE = re.compile(rf"hf://?(?P<repository>{_NAME})(@(?P<revision>[^/@]+))?(/(?P<file>.+))?")
-_LICENCES = ("mit", "apache-2.0", "cc-by-4.0", "cc-by-nc-4.0", "cc-by-nc-sa-3.0", "cc-by-nc-sa-4.0")
-"""Licences as the hub spells them; all others are ``other``."""
 
 
 def is_on_hub(name: str | Path) -> bool:
@@ -52,53 +48,6 @@ def fetch_weights(name: str) -> Path:
     if not file.endswith(".safetensors"):
         raise InputError(f"{name!r}: only .safetensors are fetched: they cannot run code.")
     hub = import_extra("huggingface_hub", "huggingface_hub", "hub", "weights on the hub")
-    with _explained(name):
-        path = hub.hf_hub_download(reference["repository"], file, revision=reference["revision"])
-    return Path(path)
-
-
-def push_weights(path: Path, readme: str, repository: str, *, is_private: bool) -> str:
-    """Upload weights and their card as one commit; the repository is made where it is missing.
-
-    Args:
-        path: the ``.safetensors`` file, which becomes ``model.safetensors``.
-        readme: text of ``README.md``.
-        repository: ``OWNER/NAME``.
-        is_private: of a repository that is made; one that is there stays as it is.
-
-    Returns:
-        The address of the repository.
-
-    Raises:
-        InputError: no such name, no access, no connection.
-        MissingExtraError: the extra ``hub`` is not installed.
-    """
-    if not re.fullmatch(_NAME, repository):
-        raise InputError(f"{repository!r}: a repository on the hub is OWNER/NAME.")
-    hub = import_extra("huggingface_hub", "huggingface_hub", "hub", "weights on the hub")
-    files = {WEIGHTS_FILE: path, "README.md": readme.encode()}
-    operations = [
-        hub.CommitOperationAdd(path_in_repo=name, path_or_fileobj=content)
-        for name, content in files.items()
-    ]
-    api = hub.HfApi()
-    with _explained(repository):
-        url = api.create_repo(repository, private=is_private, exist_ok=True)
-        api.create_commit(repository, operations, commit_message=f"Weights {path.stem}")
-    return str(url)
-
-
-def readme_of(card: str, facts: Mapping[str, str]) -> str:
-    """Put before a card what the hub reads of it: library, licence."""
-    slug = facts.get("licence", "").lower().replace(" ", "-")
-    lines = ["---", "library_name: depthpose"]
-    lines.append(f"license: {slug if slug in _LICENCES else 'other'}")
-    return "\n".join([*lines, "---", "", card])
-
-
-@contextmanager
-def _explained(name: str) -> Iterator[None]:
-    """Turn what the library raises into one error with a remedy."""
     errors = import_module("huggingface_hub.errors")
     remedies = {
         errors.HFValidationError: "no name that the hub allows: {said}",
@@ -115,17 +64,18 @@ def _explained(name: str) -> Iterator[None]:
         # Of the connection, of access, of a full disk. Base classes of the library's errors: of
         # requests, of httpx or its successor.
         (OSError, *(k for k in errors.HfHubHTTPError.__mro__[1:] if k.__module__ != "builtins")): (
-            "the hub refused: {said}. To upload, 'hf auth login' first."
+            "the hub refused: {said}; try again, or copy the file here and give its path."
         ),
     }
     try:
-        yield
+        path = hub.hf_hub_download(reference["repository"], file, revision=reference["revision"])
     except Exception as error:
         said = " ".join(str(error).split())[:200] or type(error).__name__
         for kinds, remedy in remedies.items():
             if isinstance(error, kinds):
                 raise InputError(f"{name}: {remedy.replace('{said}', said)}") from error
         raise
+    return Path(path)
 
 
 SHIPPED = Path(__file__).parents[1] / "weights"

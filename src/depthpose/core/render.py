@@ -25,18 +25,11 @@ _MAX_PIXELS = 1 << 18  # how much is expanded at a time: some 200 MB at most, wh
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Raster:
-    """What each pixel sees.
+    """What each pixel sees."""
 
-    Attributes:
-        depth_m: distance along the viewing axis; NaN where nothing is seen.
-        primitive: number of the triangle; -1 where nothing is seen.
-        barycentric: shares of its three corners at the seen point; 0 where nothing is seen. None
-            where it was not asked for.
-    """
-
-    depth_m: Float[Tensor, "h w"]
-    primitive: Int64[Tensor, "h w"]
-    barycentric: Float[Tensor, "h w 3"] | None
+    depth_m: Float[Tensor, "h w"]  #: distance along the viewing axis; NaN where nothing is seen
+    primitive: Int64[Tensor, "h w"]  #: number of the triangle; -1 where nothing is seen
+    barycentric: Float[Tensor, "h w 3"] | None  #: shares of its corners there, 0 at nothing
 
 
 def rasterize(

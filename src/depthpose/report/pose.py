@@ -2,7 +2,6 @@
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import torch
 from jaxtyping import Bool, Float, Float64
@@ -216,38 +215,58 @@ _MARGIN = 0.6  # about an object in a close-up, in its own width
 _CLOSE_UP_PX = 360
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class PoseShown:
-    """An estimate or a refusal as a page shows it.
+def pose_section(
+    title: str,
+    pose_input: AnyInput,
+    estimate: PoseEstimate,
+    model: ObjectModel,
+    text: str = "",
+    *,
+    image: Float[Tensor, "3 h w"] | None = None,
+    truth: Rigid | None = None,
+    rows: Sequence[Row] = (),
+) -> Section:
+    """Show one estimate: sentence and numbers, the picture, the cloud with the model in 3D.
 
-    Attributes:
-        input: what was seen.
+    Pictures are of the whole view and of the object from near by, with the mask where there is no
+    pose.
+
+    Args:
+        title: of the section.
+        pose_input: what was seen.
         estimate: its result.
         model: the object.
+        text: before the sentence.
         image: what the pose is drawn over, of the view's camera; None: its depth in grey.
         truth: ``camera_from_model``, where it is known.
+        rows: of a table.
     """
-
-    input: AnyInput
-    estimate: PoseEstimate
-    model: ObjectModel
-    image: Float[Tensor, "3 h w"] | None = None
-    truth: Rigid | None = None
-
-
-def pose_section(title: str, shown: PoseShown, text: str = "", rows: Sequence[Row] = ()) -> Section:
-    """Show one estimate: sentence and numbers, the picture, the cloud with the model in 3D."""
-    estimate, model = shown.estimate, shown.model
-    points_m = object_points(shown.input, model.diameter_m)
-    scene = pose_scene(shown.input, points_m, estimate, model, shown.truth)
+    drawings: list[Drawing] = []
+    if isinstance(pose_input, ViewInput):
+        pose, mask, K = estimate.camera_from_model, pose_input.mask, pose_input.K
+        what = "depth image, near bright" if image is None else "picture"
+        image = grey_depth(pose_input.depth_m) if image is None else image
+        said = f"{what}; the estimated pose blue"
+        if pose is None:
+            image = draw_outline(image, mask, _MASKED)
+            said = f"{what}; the border of the mask yellow"
+        said += ", the box of the truth green and dashed" if truth is not None else ""
+        whole = draw_boxes(image, truth, pose, model, K)
+        drawings.append(Drawing(image=whole, caption=said))
+        if bool(mask.any()):
+            near, K = close_up(image, mask, K)
+            near = draw_boxes(near, truth, pose, model, K)
+            said = f"the object from near by; {said.partition('; ')[2]}"
+            drawings.append(Drawing(image=near, caption=said))
+    points_m = object_points(pose_input, model.diameter_m)
     return Section(
         title=title,
         text=f"{text} {pose_sentence(estimate)}".strip(),
         facts=pose_facts(estimate, model),
         rows=rows,
         tables=pose_tables(estimate),
-        pictures=_drawings(shown),
-        scenes=[scene],
+        pictures=drawings,
+        scenes=[pose_scene(pose_input, points_m, estimate, model, truth)],
     )
 
 
@@ -418,24 +437,3 @@ def close_up(
     moved[:2] *= scale
     moved[:2, 2] -= 0.5
     return grown, moved
-
-
-def _drawings(shown: PoseShown) -> list[Drawing]:
-    """Draw the whole picture and the object from near by; the mask where there is no pose."""
-    view = shown.input
-    if not isinstance(view, ViewInput):
-        return []
-    image = grey_depth(view.depth_m) if shown.image is None else shown.image
-    truth, pose = shown.truth, shown.estimate.camera_from_model
-    what = "depth image, near bright" if shown.image is None else "picture"
-    if pose is None:
-        image = draw_outline(image, view.mask, _MASKED)
-    said = "the estimated pose blue" if pose is not None else "the border of the mask yellow"
-    said += ", the box of the truth green and dashed" if truth is not None else ""
-    whole = draw_boxes(image, truth, pose, shown.model, view.K)
-    drawings = [Drawing(image=whole, caption=f"{what}; {said}")]
-    if bool(view.mask.any()):
-        near, K = close_up(image, view.mask, view.K)
-        near = draw_boxes(near, truth, pose, shown.model, K)
-        drawings.append(Drawing(image=near, caption=f"the object from near by; {said}"))
-    return drawings

@@ -8,11 +8,12 @@ from collections.abc import Sequence
 
 import torch
 from jaxtyping import Float, Float64
+from PIL import Image, ImageDraw
 from torch import Tensor
 
 from depthpose.core.arrays import take_evenly
-from depthpose.core.draw import draw_lines
 from depthpose.core.errors import InputError
+from depthpose.core.files.images import picture_tensor
 from depthpose.pose.estimator import GeoPoseNet
 from depthpose.pose.estimator.inputs import AnyInput, Refusal, prepare_cloud
 from depthpose.pose.mesh import sample_surface
@@ -59,31 +60,20 @@ def arrange_grid(
 
 
 def draw_discs(
-    image: Float[Tensor, "3 h w"],
+    pen: ImageDraw.ImageDraw,
     places: Float[Tensor, "n 3"],
     colors: Float[Tensor, "n 3"],
     radius_px: float,
-) -> Float[Tensor, "3 h w"]:
-    """Draw points as discs on a copy of a picture, colours as RGB in [0, 1].
+) -> None:
+    """Draw points as discs of colours in [0, 1].
 
     ``places`` are (u, v) in pixels and the distance: near ones cover far ones.
     """
-    height, width = image.shape[1:]
-    reach = int(radius_px) + 1
-    steps = torch.cartesian_prod(*[torch.arange(-reach, reach + 1)] * 2)
-    steps = steps[steps.double().norm(dim=1) <= radius_px]
     order = places[:, 2].argsort(descending=True, stable=True)
-    cells = places[order, None, :2].round().long() + steps
-    u, v = cells.unbind(-1)
-    inside = (u >= 0) & (u < width) & (v >= 0) & (v < height)
-    # Of the discs that cover a pixel the last in this order, the nearest, is seen.
-    rank = torch.arange(len(order))[:, None].expand_as(u)
-    seen = torch.full((height * width,), -1)
-    seen.scatter_reduce_(0, (v * width + u)[inside], rank[inside], "amax")
-    drawn = image.flatten(1).clone()
-    is_drawn = seen >= 0
-    drawn[:, is_drawn] = colors[order][seen[is_drawn]].to(image).T
-    return drawn.view_as(image)
+    inks = (255 * colors[order]).round().int().tolist()
+    for (u, v, _), ink in zip(places[order].tolist(), inks, strict=True):
+        box = (u - radius_px, v - radius_px, u + radius_px, v + radius_px)
+        pen.ellipse(box, fill=tuple(ink))
 
 
 _SURFACE = 4000
@@ -141,15 +131,17 @@ def draw_features(
     def places(of_m: Float[Tensor, "m 3"]) -> Float[Tensor, "m 3"]:
         return (of_m - middle_m) @ view_from_model.T * scale + centre_px
 
-    image, black = torch.ones(3, size_px, size_px), torch.zeros(len(surface_m), 3)
-    image = draw_discs(image, places(surface_m), black, 1.0)
-    return draw_discs(image, places(points_m.double()), spectral(share), max(2.0, size_px / 110))
+    canvas = Image.new("RGB", (size_px, size_px), "white")
+    pen = ImageDraw.Draw(canvas)
+    draw_discs(pen, places(surface_m), torch.zeros(len(surface_m), 3), 1.0)
+    draw_discs(pen, places(points_m.double()), spectral(share), max(2.0, size_px / 110))
+    return picture_tensor(canvas, "figure 3-2")
 
 
 _ARROWS = 220
 _ARROW_PX = 22.0
 _HEAD = 0.35
-_YELLOW, _RED, _INK = (0.95, 0.75, 0.0), (0.85, 0.05, 0.05), (0.15, 0.25, 0.55)
+_YELLOW, _RED, _INK, _WHITE = (242, 191, 0), (217, 13, 13), (38, 64, 140), (255, 255, 255)
 
 
 def draw_field(
@@ -175,32 +167,24 @@ def draw_field(
     def place(xy: Float[Tensor, "m 2"]) -> Float[Tensor, "m 2"]:
         return (xy - middle) * scale + size_px / 2
 
-    chosen = take_evenly(torch.arange(len(plane)), _ARROWS)
-    starts = place(plane[chosen])
-    shafts = _ARROW_PX * directions.double()[chosen, :2]
-    tips, across = starts + shafts, torch.stack([-shafts[:, 1], shafts[:, 0]], 1)
-    lines = [torch.stack([starts, tips], 1)]
-    for side in (-1.0, 1.0):
-        barbs = tips - _HEAD * shafts + 0.5 * _HEAD * side * across
-        lines.append(torch.stack([tips, barbs], 1))
-    image = draw_lines(torch.ones(3, size_px, size_px), torch.cat(lines), _INK, width_px=1)
-    angle = torch.arange(10, dtype=torch.float64) * torch.pi / 5 - torch.pi / 2
-    reach = torch.where(torch.arange(10) % 2 == 0, 12.0, 5.0).double()
-    tips = place(marks[:1]) + torch.stack([angle.cos(), angle.sin()], 1) * reach[:, None]
-    # Filled by spokes: a star is small.
-    steps = torch.linspace(0, 1, 40, dtype=torch.float64)[:, None, None]
-    rim = (tips[None] * (1 - steps) + tips.roll(-1, 0)[None] * steps).flatten(0, 1)
-    spokes = torch.stack([place(marks[:1]).expand_as(rim), rim], 1)
-    image = draw_lines(image, spokes, _YELLOW, width_px=2)
-    edges = torch.stack([tips, tips.roll(-1, 0)], 1)
-    image = draw_lines(image, edges, (0.0, 0.0, 0.0), width_px=1)
-    if voted_m is None:
-        return image
-    at = place(marks[1:])
-    arms = torch.tensor([[[-9.0, -9], [9, 9]], [[-9, 9], [9, -9]]], dtype=torch.float64)
-    image = draw_lines(image, at + arms * 1.2, (1.0, 1.0, 1.0), width_px=6)
-    image = draw_lines(image, at + arms, _RED, width_px=4)
-    return draw_discs(image, torch.cat([at, torch.zeros(1, 1)], 1), torch.tensor([_RED]), 2.0)
+    canvas = Image.new("RGB", (size_px, size_px), "white")
+    pen = ImageDraw.Draw(canvas)
+    starts, shafts = take_evenly(plane, _ARROWS), take_evenly(directions.double(), _ARROWS)
+    shafts = _ARROW_PX * shafts[:, :2]
+    for (x, y), (dx, dy) in zip(place(starts).tolist(), shafts.tolist(), strict=True):
+        tip = (x + dx, y + dy)
+        pen.line([(x, y), tip], _INK)
+        for side in (-0.5, 0.5):
+            barb = tip[0] - _HEAD * (dx + side * dy), tip[1] - _HEAD * (dy - side * dx)
+            pen.line([tip, barb], _INK)
+    (x, y), (u, v) = place(marks).tolist()
+    rim = [(math.radians(36 * k - 90), 5 if k % 2 else 12) for k in range(10)]
+    star = [(x + reach * math.cos(way), y + reach * math.sin(way)) for way, reach in rim]
+    pen.polygon(star, fill=_YELLOW, outline=(0, 0, 0))
+    for ink, width, reach in ((_WHITE, 6, 11), (_RED, 4, 9)) if voted_m is not None else ():
+        pen.line([(u - reach, v - reach), (u + reach, v + reach)], ink, width)
+        pen.line([(u - reach, v + reach), (u + reach, v - reach)], ink, width)
+    return picture_tensor(canvas, "figure 3-4")
 
 
 _STEPS = 300

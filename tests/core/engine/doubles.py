@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from depthpose.core.engine import Done, Files, Function, Sample, Work, read_results, shard_results
-from depthpose.core.engine.work import Block, Runner, ShardFormat
+from depthpose.core.engine.work import Block, Runner
 from depthpose.core.errors import InputError
 from depthpose.core.files import read_text
 
@@ -54,10 +54,8 @@ class InProcessEngine:
     def __init__(self, dies_at: int | None = None) -> None:
         self.dies_at = dies_at
 
-    def __call__(
-        self, blocks: Sequence[Block], work: Work, out: str, form: ShardFormat
-    ) -> Iterator[Done]:
-        runner = Runner(work, out, form)
+    def __call__(self, blocks: Sequence[Block], work: Work, out: str) -> Iterator[Done]:
+        runner = Runner(work, out)
         for number, block in enumerate(blocks):
             if number == self.dies_at:
                 raise InputError("the double died, as it was asked to")

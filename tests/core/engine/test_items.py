@@ -4,9 +4,9 @@ import fsspec
 import pytest
 from tests.core.engine.doubles import write_texts
 
-from depthpose.core.engine import Files, find_items, find_tars, local_copy
+from depthpose.core.engine import Files, find_items, find_tars
 from depthpose.core.errors import InputError
-from depthpose.core.files.disk import list_files, publish_bytes, read_all
+from depthpose.core.files.disk import list_files, local_copy, publish_bytes, read_all
 
 ONE = Files(roles=("text",), suffixes=(".txt",))
 TWO = Files(roles=("left", "right"), suffixes=(".txt",))
@@ -47,19 +47,6 @@ def test_a_manifest_names_inputs_and_is_read_from_where_it_lies(
         assert first.name == "drive/1"
         assert first.files == (f"{tmp_path}/l/1.txt", "/r/1.txt")
         assert (second.name, second.files[1]) == ("2", "s3://b/2.txt")
-
-
-def test_a_parquet_manifest_is_the_csv_one(tmp_path: Path) -> None:
-    arrow = pytest.importorskip("pyarrow", reason="Parquet needs pyarrow (the extra ray)")
-    parquet = pytest.importorskip("pyarrow.parquet")
-    rows = {"text": ["a.txt", "b.txt"], "name": ["x", None]}
-    parquet.write_table(arrow.table(rows), tmp_path / "list.parquet")
-    (tmp_path / "list.csv").write_text("text,name\na.txt,x\nb.txt,\n")
-    found = [find_items([str(tmp_path / f"list.{end}")], ONE) for end in ("parquet", "csv")]
-    assert found[0] == found[1]
-    (tmp_path / "bad.parquet").write_bytes(b"PAR1 and nothing else")
-    with pytest.raises(InputError, match="not a Parquet file"):
-        find_items([str(tmp_path / "bad.parquet")], ONE)
 
 
 @pytest.mark.parametrize(

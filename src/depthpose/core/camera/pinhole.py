@@ -26,24 +26,16 @@ MIN_BASELINE_M = 1e-4  # no two lenses stand so near: such a number was divided 
 class Camera:
     """A pinhole camera without lens distortion. The centre of the first pixel is (0, 0).
 
-    Attributes:
-        width: image width [px].
-        height: image height [px].
-        K: intrinsic matrix ``[[fx, skew, cx], [0, fy, cy], [0, 0, 1]]`` [px], float64.
-        depth_unit_m: metres a unit of this camera's depth images, where it has any.
-        mount_height_m: height above the road, where known.
-        tilt_deg: of the optical axis against the road, where known; positive looks up.
-
     Raises:
         InputError: a value is out of its range.
     """
 
-    width: int
-    height: int
-    K: Float[Tensor, "3 3"]
-    depth_unit_m: float | None = None
-    mount_height_m: float | None = None
-    tilt_deg: float | None = None
+    width: int  #: of the image [px]
+    height: int  #: of the image [px]
+    K: Float[Tensor, "3 3"]  #: ``[[fx, skew, cx], [0, fy, cy], [0, 0, 1]]`` [px], float64
+    depth_unit_m: float | None = None  #: metres a unit of its depth images, where it has any
+    mount_height_m: float | None = None  #: height above the road, where known
+    tilt_deg: float | None = None  #: of the axis against the road; positive looks up
 
     def __post_init__(self) -> None:
         for name, (least, most, rule) in _RULES.items():
@@ -75,17 +67,14 @@ _RULES = {
 class StereoRig(Camera):
     """The left camera of a rectified pair, and where the right one stands.
 
-    Attributes:
-        baseline_m: the right camera's x in the left camera's frame [m], positive.
-        cx_right_minus_left_px: difference of the two principal points (Middlebury's ``doffs``).
-            depth = fx * baseline_m / (disparity + cx_right_minus_left_px).
+    depth = fx * baseline_m / (disparity + cx_right_minus_left_px).
 
     Raises:
         InputError: a value is out of its range.
     """
 
-    baseline_m: float
-    cx_right_minus_left_px: float = 0.0
+    baseline_m: float  #: the right camera's x in the left camera's frame [m], positive
+    cx_right_minus_left_px: float = 0.0  #: of the two principal points (Middlebury's ``doffs``)
 
     def __post_init__(self) -> None:
         super().__post_init__()

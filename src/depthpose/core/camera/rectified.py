@@ -54,34 +54,24 @@ Flags = Bool[Tensor, "_"]
 class RectificationReport:
     """What the matches between two images say about the pair.
 
-    Attributes:
-        vertical_offset_px: median of the right row less the left row; NaN without matches.
-        vertical_spread_px: median absolute deviation of it, scaled to a standard deviation.
-        positive_share: share of positive disparities among those beyond a pixel; NaN where there
-            are none.
-        corners: corners of the left image that were sought in the right one.
-        matches: matches that all this rests on.
-        is_pair: False where one image shows nothing, both show the same view, or they do not
-            belong together; None with too few matches.
-        is_rectified: whether rows agree; None with too few matches.
-        is_swapped: whether the left image is the right one; None with too few matches.
-        message: the finding, and the remedy where there is one.
-        places_px: column and row in the left image of each match [px].
-        disparities_px: column of each match in the left image less that in the right one [px].
+    NaN stands where there are no matches, None where there are too few. They are no pair where one
+    image shows nothing, both show the same view, or they do not belong together.
     """
 
-    vertical_offset_px: float = math.nan
-    vertical_spread_px: float = math.nan
-    positive_share: float = math.nan
-    corners: int = 0
-    matches: int = 0
-    is_pair: bool | None = None
-    is_rectified: bool | None = None
-    is_swapped: bool | None = None
-    message: str
+    vertical_offset_px: float = math.nan  #: median of the right row less the left row
+    vertical_spread_px: float = math.nan  #: its median absolute deviation, as a standard deviation
+    positive_share: float = math.nan  #: of positive disparities among those beyond a pixel
+    corners: int = 0  #: corners of the left image that were sought in the right one
+    matches: int = 0  #: matches that all this rests on
+    is_pair: bool | None = None  #: whether the images belong together
+    is_rectified: bool | None = None  #: whether rows agree
+    is_swapped: bool | None = None  #: whether the left image is the right one
+    message: str  #: the finding, and the remedy where there is one
+    #: column and row in the left image of each match [px]
     places_px: Float[Tensor, "n 2"] = field(
         default_factory=lambda: torch.zeros(0, 2), repr=False, compare=False
     )
+    #: column of each match in the left image less that in the right one [px]
     disparities_px: Float[Tensor, " n"] = field(
         default_factory=lambda: torch.zeros(0), repr=False, compare=False
     )

@@ -68,18 +68,15 @@ _KNOWN = (
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class RawCamera:
-    """A camera with its lens distortion.
+    """A camera with its lens distortion, in OpenCV's order of coefficients.
 
-    Attributes:
-        K: intrinsic matrix [px].
-        distortion: coefficients in OpenCV's order: k1, k2, p1, p2, k3, ... of a pinhole; k1 to k4
-            of a fisheye lens.
-        is_fisheye: whether the angle from the axis is what is distorted (Kannala and Brandt 2006).
+    k1, k2, p1, p2, k3, ... of a pinhole; k1 to k4 of a fisheye lens, which distorts the angle from
+    the axis (Kannala and Brandt 2006).
     """
 
-    K: Float64[Tensor, "3 3"]
-    distortion: tuple[float, ...]
-    is_fisheye: bool = False
+    K: Float64[Tensor, "3 3"]  #: intrinsic matrix [px]
+    distortion: tuple[float, ...]  #: coefficients
+    is_fisheye: bool = False  #: whether the lens is a fisheye
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -268,19 +265,14 @@ Maps = tuple[np.ndarray, np.ndarray]
 class Rectifier:
     """What takes a calibrated pair to a rectified one.
 
-    Attributes:
-        rig: the camera of the rectified pair.
-        rectified_from_raw: carries points from the raw left camera's frame to the rectified one's
-            (a rotation alone): what is known of the raw camera, such as where a LiDAR stands, is
-            carried along by it.
-        left_maps: column and row of the raw left image for each pixel of the rectified one.
-        right_maps: the same of the right image.
+    What is known of the raw left camera, such as where a LiDAR stands, is carried along by
+    ``rectified_from_raw``, a rotation alone.
     """
 
-    rig: StereoRig
-    rectified_from_raw: Rigid
-    left_maps: Maps
-    right_maps: Maps
+    rig: StereoRig  #: the camera of the rectified pair
+    rectified_from_raw: Rigid  #: carries points from the raw left camera's frame
+    left_maps: Maps  #: column and row of the raw left image for each pixel of the rectified one
+    right_maps: Maps  #: the same of the right image
 
     @cached_property
     def seen_share(self) -> float:

@@ -7,7 +7,6 @@ from depthpose.core.engine.job import Job as Job
 from depthpose.core.engine.job import RayEngine as RayEngine
 from depthpose.core.engine.job import is_job as is_job
 from depthpose.core.engine.job import read_results as read_results
-from depthpose.core.engine.job import result_items as result_items
 from depthpose.core.engine.job import run_job as run_job
 from depthpose.core.engine.job import shard_results as shard_results
 from depthpose.core.engine.work import Done as Done
@@ -16,13 +15,8 @@ from depthpose.core.engine.work import Function as Function
 from depthpose.core.engine.work import Inputs as Inputs
 from depthpose.core.engine.work import Item as Item
 from depthpose.core.engine.work import Sample as Sample
-from depthpose.core.engine.work import ShardFormat as ShardFormat
 from depthpose.core.engine.work import Work as Work
 from depthpose.core.engine.work import find_items as find_items
 from depthpose.core.engine.work import find_tars as find_tars
 from depthpose.core.engine.work import read_shard as read_shard
-from depthpose.core.engine.work import run_here as run_here
 from depthpose.core.engine.work import stem as stem
-from depthpose.core.files.disk import absolute as absolute
-from depthpose.core.files.disk import is_url as is_url
-from depthpose.core.files.disk import local_copy as local_copy

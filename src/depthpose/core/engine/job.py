@@ -6,7 +6,6 @@ of text, so that neither queues nor results fill the memory.
 """
 
 import csv
-import hashlib
 import io
 import json
 import os
@@ -27,7 +26,6 @@ from depthpose.core.engine.work import (
     Done,
     Item,
     Runner,
-    ShardFormat,
     Work,
     make_plan,
     read_shard,
@@ -45,7 +43,7 @@ from depthpose.core.run import (
 
 MANIFEST = "manifest.csv"
 
-Engine = Callable[[Sequence[Block], Work, str, ShardFormat], Iterable[Done]]
+Engine = Callable[[Sequence[Block], Work, str], Iterable[Done]]
 """Processes blocks, on any machine, and yields the outcome of each, in any order."""
 
 
@@ -58,7 +56,6 @@ class Job:
     tars: Sequence[str] = ()  #: tar shards of inputs
     out: str  #: folder of the results, by path or URL
     settings: Mapping[str, Any]  #: JSON values that decide the results; others need another folder
-    form: ShardFormat = "tar"  #: of the shards
     block: int = 64  #: inputs of a shard
 
 
@@ -74,7 +71,7 @@ def run_job(job: Job, engine: Engine) -> list[Done]:
     """
     out = disk.absolute(job.out)
     disk.refuse_unsafe(out)
-    claim(out, {**job.settings, "shards": job.form})
+    claim(out, {**job.settings, "shards": "tar"})
     blocks = make_plan(out, job.items, job.tars, job.block)
     folder = disk.join(out, SHARDS)
     sizes, records = disk.list_sizes(folder), {one.name: one for one in read_results(out)}
@@ -98,7 +95,7 @@ def run_job(job: Job, engine: Engine) -> list[Done]:
             disk.remove(record)
     left = [block for block in blocks if block.shard not in done]
     if left:
-        done |= {one.name: one for one in engine(left, job.work, out, job.form)}
+        done |= {one.name: one for one in engine(left, job.work, out)}
     lost = [block.shard for block in blocks if block.shard not in done]
     if lost:
         raise InputError(
@@ -143,22 +140,6 @@ def is_job(out: str) -> bool:
     return disk.exists(disk.join(disk.absolute(out), PLAN))
 
 
-def result_items(out: str) -> list[Item]:
-    """Take the shards of an earlier job as inputs of another: a record and a shard each.
-
-    The name changes with the record, so that a shard that was made anew is a new input.
-    """
-    folder = disk.join(disk.absolute(out), SHARDS)
-    items = []
-    for done in read_results(out):
-        # A copy changes the time of a shard, and nothing else.
-        untimed = replace(done, stamp=(done.stamp[0], done.stamp[2])).to_json()
-        mark = hashlib.sha256(untimed.encode()).hexdigest()[:12]
-        files = (disk.join(folder, f"{done.name}.json"), disk.join(folder, done.shard))
-        items.append(Item(f"{done.name}-{mark}", files))
-    return items
-
-
 def read_results(out: str) -> list[Done]:
     """Say what an earlier job left, shard by shard; a record that is damaged is as none."""
     found: list[Done] = []
@@ -183,23 +164,14 @@ _LEAST_VERSION = (2, 52)  # the first version of Ray that has passwords
 
 @dataclass(frozen=True, kw_only=True)
 class RayEngine:
-    """Does blocks by Ray Data.
+    """Does blocks by Ray Data."""
 
-    Attributes:
-        address: of a running cluster, or ``auto``; None starts one for this job.
-        workers: at most; None: as many as fit into the cluster when the job begins.
-        worker_cpus: cores that a worker asks for.
-        worker_gpus: GPUs that it asks for; a part lets workers share one.
-    """
+    address: str | None = None  #: of a running cluster, or ``auto``; None starts one for this job
+    workers: int | None = None  #: at most; None: as many as fit when the job begins
+    worker_cpus: float = 1.0  #: cores that a worker asks for
+    worker_gpus: float = 0.0  #: GPUs that it asks for; a part lets workers share one
 
-    address: str | None = None
-    workers: int | None = None
-    worker_cpus: float = 1.0
-    worker_gpus: float = 0.0
-
-    def __call__(
-        self, blocks: Sequence[Block], work: Work, out: str, form: ShardFormat
-    ) -> Iterator[Done]:
+    def __call__(self, blocks: Sequence[Block], work: Work, out: str) -> Iterator[Done]:
         """Do blocks, and give what became of each as it is done.
 
         Raises:
@@ -228,7 +200,7 @@ class RayEngine:
                 .map_batches(
                     _Worker,
                     batch_size=1,
-                    fn_constructor_args=(shipped, out, form),
+                    fn_constructor_args=(shipped, out),
                     compute=ray.data.ActorPoolStrategy(
                         min_size=1,
                         max_size=min(self.workers or self._capacity(ray), len(lines)),
@@ -288,8 +260,8 @@ class RayEngine:
 class _Worker:
     """What Ray runs: a runner that lives as long as its process."""
 
-    def __init__(self, shipped: list[Any], out: str, form: ShardFormat) -> None:
-        self._runner = Runner(_import_ray().get(shipped[0]), out, form)
+    def __init__(self, shipped: list[Any], out: str) -> None:
+        self._runner = Runner(_import_ray().get(shipped[0]), out)
 
     def __call__(self, batch: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
         lines = [self._runner.run(Block.from_json(str(line))).to_json() for line in batch["block"]]

@@ -1,7 +1,7 @@
 """The inputs of a job, their blocks, and one block to one shard of results, whole or not at all.
 
 Inputs are found in folders, patterns, manifests and tar shards; blocks are fixed by the first run.
-Shards are tar files in WebDataset's layout, or Parquet.
+Shards are tar files in WebDataset's layout.
 """
 
 import csv
@@ -11,37 +11,30 @@ import shutil
 import tarfile
 import tempfile
 import zlib
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass
-from importlib import import_module
 from itertools import groupby, islice
 from pathlib import Path, PurePosixPath
-from typing import Any, Literal
 
-from depthpose.core.errors import InputError, import_extra
+from depthpose.core.errors import InputError
 from depthpose.core.files import disk
 from depthpose.core.files.disk import find_partners, refused_write
 from depthpose.core.run import file_stamp
 
 PLAN, SHARDS = "plan.jsonl", "shards"
-ShardFormat = Literal["tar", "parquet"]
-_GROUP_BYTES = 64 * 2**20  # from which on the rows so far are one row group of Parquet
 
 
 @dataclass(frozen=True, slots=True)
 class Files:
     """What an input is made of.
 
-    Attributes:
-        roles: a word for each of its files, such as ``("left", "right")``. They are the columns of
-            a manifest; a member of a tar shard is ``KEY.ROLE.SUFFIX``, of a single role
-            ``KEY.SUFFIX`` does.
-        suffixes: that the files may have, in lower case, with the dot.
+    Its roles are the columns of a manifest; a member of a tar shard is ``KEY.ROLE.SUFFIX``, of a
+    single role ``KEY.SUFFIX`` does.
     """
 
-    roles: tuple[str, ...]
-    suffixes: tuple[str, ...]
+    roles: tuple[str, ...]  #: a word for each of its files, such as ``("left", "right")``
+    suffixes: tuple[str, ...]  #: that the files may have, in lower case, with the dot
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,7 +56,7 @@ def find_items(words: Sequence[str], files: Files) -> list[Item]:
     Raises:
         InputError: nothing is there, sides that cannot be paired, or two inputs of one name.
     """
-    manifests = [word for word in words if word.lower().endswith((".parquet", ".csv"))]
+    manifests = [word for word in words if word.lower().endswith(".csv")]
     others = [word for word in words if word not in manifests]
     items = [item for word in manifests for item in _read_manifest(word, files.roles)]
     if others and len(others) != len(files.roles) > 1:
@@ -94,14 +87,11 @@ def find_items(words: Sequence[str], files: Files) -> list[Item]:
 
 
 def _read_manifest(url: str, roles: Sequence[str]) -> Iterator[Item]:
-    if url.lower().endswith(".parquet"):
-        rows: Iterable[Mapping[str, Any]] = _parquet_rows(url, "a Parquet manifest")
-    else:
-        try:
-            text = io.StringIO(disk.read_from(url).decode("utf-8-sig"), newline="")
-            rows = list(csv.DictReader(text, strict=True))
-        except (UnicodeDecodeError, csv.Error) as error:
-            raise InputError(f"{url}: not a CSV table in UTF-8 ({error}); save it so") from error
+    try:
+        text = io.StringIO(disk.read_from(url).decode("utf-8-sig"), newline="")
+        rows = list(csv.DictReader(text, strict=True))
+    except (UnicodeDecodeError, csv.Error) as error:
+        raise InputError(f"{url}: not a CSV table in UTF-8 ({error}); save it so") from error
     folder = url.rpartition("/")[0] or "."
     for number, row in enumerate(rows, 1):
         missing = [role for role in roles if not isinstance(row.get(role), str) or not row[role]]
@@ -144,22 +134,6 @@ def _refuse_name(name: str, source: str) -> None:
         raise InputError(
             f"{source}: the name {name!r} is no name of a result; write letters, digits and '/'"
         )
-
-
-def _import_pyarrow(purpose: str) -> Any:  # noqa: ANN401  pyarrow carries no types
-    import_extra("pyarrow.parquet", "pyarrow", "ray", purpose)
-    return import_module("pyarrow")
-
-
-def _parquet_rows(url: str, purpose: str) -> Iterator[dict[str, Any]]:
-    """Read the rows of a Parquet file one by one, few at a time."""
-    arrow = _import_pyarrow(purpose)
-    try:
-        file = arrow.parquet.ParquetFile(io.BytesIO(disk.read_from(url)))
-        for batch in file.iter_batches(batch_size=8):
-            yield from batch.to_pylist()
-    except (arrow.ArrowException, OSError) as error:
-        raise InputError(f"{url}: not a Parquet file ({error}); write it anew") from error
 
 
 @dataclass(frozen=True, slots=True)
@@ -218,46 +192,6 @@ def make_plan(out: str, items: Sequence[Item], tars: Sequence[str], size: int) -
     return blocks
 
 
-AddResult = Callable[[str, Mapping[str, bytes], str], None]
-"""Adds a result to a shard: its name, contents by their endings, or why there are none."""
-
-
-@contextmanager
-def shard_writer(path: Path, form: ShardFormat, endings: Sequence[str]) -> Iterator[AddResult]:
-    """Write a tar of ``NAME.ENDING``, or Parquet of a row a name; equal results, equal bytes."""
-    if form == "tar":
-        with tarfile.open(path, "w", format=tarfile.PAX_FORMAT) as tar:
-
-            def add_members(name: str, files: Mapping[str, bytes], _: str) -> None:
-                for ending, data in sorted(files.items()):
-                    member = tarfile.TarInfo(f"{name}.{ending}")
-                    member.size = len(data)
-                    tar.addfile(member, io.BytesIO(data))
-
-            yield add_members
-        return
-    arrow = _import_pyarrow("results in Parquet")
-    fields = [("name", arrow.string()), ("reason", arrow.string())]
-    schema = arrow.schema([*fields, *((ending, arrow.binary()) for ending in endings)])
-    rows: list[dict[str, Any]] = []
-    held_bytes = 0
-    # Maps hardly shrink, and pictures are compressed already.
-    with arrow.parquet.ParquetWriter(path, schema, compression="zstd") as writer:
-
-        def add_row(name: str, files: Mapping[str, bytes], reason: str) -> None:
-            nonlocal held_bytes
-            rows.append({"name": name, "reason": reason, **files})
-            held_bytes += sum(map(len, files.values()))
-            if held_bytes > _GROUP_BYTES:
-                writer.write_table(arrow.Table.from_pylist(rows, schema))
-                rows.clear()
-                held_bytes = 0
-
-        yield add_row
-        if rows:
-            writer.write_table(arrow.Table.from_pylist(rows, schema))
-
-
 def read_shard(
     url: str, names: Collection[str], endings: Collection[str]
 ) -> Iterator[tuple[str, dict[str, bytes]]]:
@@ -271,14 +205,6 @@ def read_shard(
     Raises:
         InputError: the shard is not there, or is damaged.
     """
-    if url.endswith(".parquet"):
-        for row in _parquet_rows(url, "results in Parquet"):
-            if "name" not in row:
-                raise InputError(f"{url}: not a Parquet shard (no 'name'); make it anew")
-            contents = {end: row[end] for end in endings if row.get(end) is not None}
-            if contents:
-                yield row["name"], contents
-        return
 
     def split(member: str) -> tuple[str, str]:
         for k in (k for k, letter in enumerate(member) if letter == "."):
@@ -418,21 +344,13 @@ class Work:
 
 @dataclass(frozen=True, kw_only=True)
 class Done:
-    """What became of a block.
+    """What became of a block."""
 
-    Attributes:
-        shard: name of the shard, with its suffix.
-        entries: name and "" or the reason of its failure, for each input.
-        endings: that the files of a result may have.
-        stamp: size, time and checksum of the shard (``file_stamp`` of core.run).
-        block: checksum of the inputs.
-    """
-
-    shard: str
-    entries: tuple[tuple[str, str], ...]
-    endings: tuple[str, ...]
-    stamp: tuple[int, ...]
-    block: int
+    shard: str  #: name of the shard, with its suffix
+    entries: tuple[tuple[str, str], ...]  #: name and "" or the reason of its failure, of each input
+    endings: tuple[str, ...]  #: that the files of a result may have
+    stamp: tuple[int, ...]  #: size, time and checksum of the shard (``file_stamp`` of core.run)
+    block: int  #: checksum of the inputs
 
     @property
     def name(self) -> str:
@@ -459,9 +377,8 @@ class Done:
 class Runner:
     """Does blocks one after the other; what the work needs is loaded at the first."""
 
-    def __init__(self, work: Work, out: str, form: ShardFormat) -> None:
+    def __init__(self, work: Work, out: str) -> None:
         self._work, self._out = work, out
-        self._form: ShardFormat = form
         self._function: Function | None = None
 
     def run(self, block: Block) -> Done:
@@ -476,7 +393,7 @@ class Runner:
                 return done
         temporary = tempfile.TemporaryDirectory(prefix="depthpose-")
         with refused_write(temporary.name), temporary as scratch:
-            file = Path(scratch) / f"{block.shard}.{self._form}"
+            file = Path(scratch) / f"{block.shard}.tar"
             entries = tuple(self._write(block, file, Path(scratch)))
             url = disk.join(self._out, SHARDS, file.name)
             disk.publish(file, url)
@@ -497,7 +414,7 @@ class Runner:
         samples = _samples(block, self._work.files, scratch)
         results = scratch / "results"
         results.mkdir()
-        with shard_writer(file, self._form, self._work.endings) as add:
+        with tarfile.open(file, "w", format=tarfile.PAX_FORMAT) as tar:
             while chunk := list(islice(samples, self._work.batch)):
                 reasons = iter(self._function([one for one in chunk if not one.reason], results))
                 for one in chunk:
@@ -505,19 +422,16 @@ class Runner:
                     for path in one.files:
                         if scratch in path.parents:  # of a copy the name alone says something
                             reason = reason.replace(str(path), path.name)
-                    files: dict[str, bytes] = {}
-                    for ending in self._work.endings:
+                    for ending in sorted(self._work.endings):
                         path = results / f"{one.name}.{ending}"
                         if path.is_file():
-                            files[ending] = path.read_bytes()
+                            if not reason:
+                                data = path.read_bytes()
+                                member = tarfile.TarInfo(f"{one.name}.{ending}")
+                                member.size = len(data)  # neither time nor owner: equal bytes
+                                tar.addfile(member, io.BytesIO(data))
                             path.unlink()
-                    add(one.name, {} if reason else files, reason)
                     yield one.name, reason
                     for path in one.files:
                         if scratch in path.parents:  # a copy, alone in its folder
                             shutil.rmtree(path.parent, ignore_errors=True)
-
-
-def run_here(blocks: Sequence[Block], work: Work, out: str, form: ShardFormat) -> Iterator[Done]:
-    """Do blocks in this process, one after the other: the engine that needs no cluster."""
-    yield from map(Runner(work, out, form).run, blocks)

@@ -26,13 +26,9 @@ from depthpose.core.run import environment
 STATE, BEFORE = "state.pt", "state.before.pt"  # the last, and the one before, if that is damaged
 _NEEDED = ("step", "modules", "optimizers", "scaler", "average")
 _METRICS, _PICTURES = "metrics.jsonl", "pictures"
+RUN_FILES = ("config.yaml", _METRICS, _PICTURES, "tensorboard", STATE, BEFORE)
+"""What a training leaves in its folder beside weights."""
 _HELD_OUT = "held_out/"  # begins the names of numbers that validation found
-
-
-def run_files(weights: str) -> list[str]:
-    """Name what a training leaves in its folder, with weights of this name."""
-    own = ["config.yaml", _METRICS, _PICTURES, "tensorboard", STATE, BEFORE]
-    return [*own, *(f"{weights}.{ending}" for ending in ("safetensors", "md", "json"))]
 
 
 class RunLogger:

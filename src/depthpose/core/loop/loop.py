@@ -27,11 +27,11 @@ from depthpose.core.config import config_to_dict, write_config
 from depthpose.core.devices import usable_precision
 from depthpose.core.errors import InputError, import_extra
 from depthpose.core.loop.folder import (
+    RUN_FILES,
     STATE,
     Parts,
     RunLogger,
     restore_last,
-    run_files,
     saved_states,
 )
 from depthpose.core.loop.task import LoopConfig, Samples, Task, mixed_seed
@@ -91,7 +91,8 @@ class Run:
         decisive = {k: v for k, v in settings["loop"].items() if k not in _FREE}
         settings["loop"] = decisive | {"processes": find_rank().world}
         kept = {k: v for k, v in settings.items() if k not in without}
-        files = [file for name in weights for file in run_files(name)]
+        ends = ("safetensors", "md", "json")
+        files = [*RUN_FILES, *(f"{name}.{end}" for name in weights for end in ends)]
         remedy = "choose another, or delete this one"
         for path in (self.folder / f"{name}.safetensors" for name in weights):
             if path.is_file():
