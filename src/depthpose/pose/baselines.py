@@ -98,21 +98,16 @@ EMPTY = -2.0
 
 
 class DepthCrop(NamedTuple):
-    """A crop, and where it lies; batched with leading axes.
+    """A crop, and where it lies; batched with leading axes."""
 
-    Attributes:
-        image: depth over its mean, less one, over the contrast; ``EMPTY`` beside the object.
-        R: ``camera_from_crop``: turns the optical axis onto the ray through the crop's middle. An
-            object looks alike in the crop wherever in the image it is, if its rotation is said in
-            this frame.
-        middle_m: the point of that ray at the mean depth, in the camera frame.
-        side_m: width of the crop at the mean depth.
-    """
-
+    #: depth over its mean, less one, over the contrast; ``EMPTY`` beside the object.
     image: Float[Tensor, "*b 1 size size"]
+    #: ``camera_from_crop``: turns the optical axis onto the ray through the crop's middle. An
+    #: object looks alike in the crop wherever in the image it is, if its rotation is said in this
+    #: frame.
     R: Float[Tensor, "*b 3 3"]
-    middle_m: Float[Tensor, "*b 3"]
-    side_m: Float[Tensor, "*b"]
+    middle_m: Float[Tensor, "*b 3"]  #: the point of that ray at the mean depth, in the camera frame
+    side_m: Float[Tensor, "*b"]  #: width of the crop at the mean depth
 
 
 def cut_depth(

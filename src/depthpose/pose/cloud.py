@@ -25,23 +25,16 @@ _FARTHEST_M = 1e6
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class VoxelGrid:
-    """Which cells of a grid a cloud fills, and the point that was kept in each.
+    """Which cells of a grid a cloud fills, and the point that was kept in each."""
 
-    Attributes:
-        coordinates: of the filled cells, ``floor((x - mean) / voxel)`` of the turned cloud; no two
-            are equal.
-        kept: index of the point of each cell, ascending: the first of its cell.
-        row_of_point: which of the cells each point of the cloud lies in.
-        grid_from_camera: how the cloud was turned before.
-        features: of each cell, in the axes of the grid: the number 1 or, with shape, also the place
-            of its mean in the cell (-1 to 1), log2 of its number of points, the normal toward the
-            camera, and the curvature (0 in a plane, 1 in a ball).
-    """
-
+    #: of the filled cells, ``floor((x - mean) / voxel)`` of the turned cloud; no two are equal.
     coordinates: Int64[Tensor, "m 3"]
-    kept: Int64[Tensor, " m"]
-    row_of_point: Int64[Tensor, " n"]
-    grid_from_camera: Float[Tensor, "3 3"]
+    kept: Int64[Tensor, " m"]  #: index of the point of each cell, ascending: the first of its cell
+    row_of_point: Int64[Tensor, " n"]  #: which of the cells each point of the cloud lies in
+    grid_from_camera: Float[Tensor, "3 3"]  #: how the cloud was turned before
+    #: of each cell, in the axes of the grid: the number 1 or, with shape, also the place of its
+    #: mean in the cell (-1 to 1), log2 of its number of points, the normal toward the camera, and
+    #: the curvature (0 in a plane, 1 in a ball).
     features: Float[Tensor, "m c"]
 
 

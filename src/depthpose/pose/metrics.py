@@ -30,17 +30,12 @@ RenderDepth = Callable[[Rigid], Float[Tensor, "h w"]]
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class View:
-    """What VSD compares poses in.
+    """What VSD compares poses in."""
 
-    Attributes:
-        depth_m: measured; NaN or 0 where there is no reading.
-        K: intrinsic matrix of that image.
-        render: depth of the object at a pose, in this camera; with ``core.render``
-            ``lambda pose: rasterize(pose.apply(corners), K, width, height).depth_m``.
-    """
-
-    depth_m: Float[Tensor, "h w"]
-    K: Float[Tensor, "3 3"]
+    depth_m: Float[Tensor, "h w"]  #: measured; NaN or 0 where there is no reading
+    K: Float[Tensor, "3 3"]  #: intrinsic matrix of that image
+    #: depth of the object at a pose, in this camera; with ``core.render`` ``lambda pose:
+    #: rasterize(pose.apply(corners), K, width, height).depth_m``.
     render: RenderDepth
 
 

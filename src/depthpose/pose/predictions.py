@@ -58,15 +58,11 @@ class Place(NamedTuple):
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Prediction:
-    """An estimate as a file keeps it.
+    """An estimate as a file keeps it."""
 
-    Attributes:
-        estimate: or refusal; from the annotated mask of an instance it bears the instance's name.
-        place: scene, image and object; None for a cloud of no data set.
-    """
-
+    #: or refusal; from the annotated mask of an instance it bears the instance's name.
     estimate: PoseEstimate
-    place: Place | None = None
+    place: Place | None = None  #: scene, image and object; None for a cloud of no data set
 
 
 class Predictions(list[Prediction]):
@@ -313,21 +309,14 @@ Input = TypeVar("Input")
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Job(Generic[Input]):
-    """One thing to estimate: what it is called, where it belongs, and how its input is read.
+    """One thing to estimate: what it is called, where it belongs, and how its input is read."""
 
-    Attributes:
-        name: that of the input: unique in a run.
-        read: gives the input; called only where the estimate is not there yet.
-        place: as :class:`Prediction` has it.
-        seconds: what was spent before, on its mask.
-        source: file or files that the input is read from.
-    """
-
-    name: str
-    read: Callable[[], Input]
-    place: Place | None = None
+    name: str  #: that of the input: unique in a run
+    read: Callable[[], Input]  #: gives the input; called only where the estimate is not there yet
+    place: Place | None = None  #: as :class:`Prediction` has it
+    #: what was spent before, on its mask.
     seconds: Mapping[str, float] = field(default_factory=dict)
-    source: Path | tuple[Path, ...] | None = None
+    source: Path | tuple[Path, ...] | None = None  #: file or files that the input is read from
 
 
 def predict(

@@ -47,37 +47,26 @@ _LEAST_SLOPE = 0.25
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class RefinedPose:
-    """A refined pose, with leading batch axes of the poses that it began from.
+    """A refined pose, with leading batch axes of the poses that it began from."""
 
-    Attributes:
-        camera_from_model: the pose.
-        covariance: of (rotation, translation) as :class:`~depthpose.pose.types.PoseFit` says, from
-            the residuals, of which neighbours may be alike, and an offset of all readings along the
-            ray (``IcpConfig.sensor_offset_m``); what the surface does not fix (a turn of a ball) is
-            far too uncertain to be missed. Local: of this minimum alone, whether it is the right
-            one or not.
-        residual_m: root mean square distance to the surface, of the points that count.
-        inlier_share: share of the points within the last limit of the surface.
-    """
-
-    camera_from_model: Rigid
+    camera_from_model: Rigid  #: the pose
+    #: of (rotation, translation) as :class:`~depthpose.pose.types.PoseFit` says, from the
+    #: residuals, of which neighbours may be alike, and an offset of all readings along the ray
+    #: (``IcpConfig.sensor_offset_m``); what the surface does not fix (a turn of a ball) is far too
+    #: uncertain to be missed. Local: of this minimum alone, whether it is the right one or not.
     covariance: Float[Tensor, "*batch 6 6"]
+    #: root mean square distance to the surface, of the points that count.
     residual_m: Float[Tensor, "*batch"]
+    #: share of the points within the last limit of the surface.
     inlier_share: Float[Tensor, "*batch"]
 
 
 class BestStart(NamedTuple):
-    """The best of several refined poses.
+    """The best of several refined poses."""
 
-    Attributes:
-        refined: it.
-        start: number of the given pose that it began from.
-        others: the best poses beside it, three at most, roughly refined.
-    """
-
-    refined: RefinedPose
-    start: int
-    others: Rigid
+    refined: RefinedPose  #: it
+    start: int  #: number of the given pose that it began from
+    others: Rigid  #: the best poses beside it, three at most, roughly refined
 
 
 def refine_pose(

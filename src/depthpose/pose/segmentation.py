@@ -218,18 +218,12 @@ class FCN(nn.Module):
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class SegmentationWeights:
-    """What a weights file of this kind holds.
+    """What a weights file of this kind holds."""
 
-    Attributes:
-        network: in eval mode; class 0 is the background, class ``1 + i`` is ``objects[i]``.
-        objects: names, in the order of the classes.
-        numbers: BOP's ``obj_id`` of each.
-        facts: the card in short: ``trained_on``, ``licence`` and the like.
-    """
-
-    network: FCN
-    objects: tuple[str, ...]
-    numbers: tuple[int, ...]
+    network: FCN  #: in eval mode; class 0 is the background, class ``1 + i`` is ``objects[i]``
+    objects: tuple[str, ...]  #: names, in the order of the classes
+    numbers: tuple[int, ...]  #: BOP's ``obj_id`` of each
+    #: the card in short: ``trained_on``, ``licence`` and the like.
     facts: Mapping[str, str] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
@@ -280,15 +274,12 @@ def read_segmentation(path: Path) -> SegmentationWeights:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Segmentation:
-    """What one image shows.
+    """What one image shows."""
 
-    Attributes:
-        masks: of the instances of each object that was found, the surest first; an object that was
-            not found has no entry.
-        scores: mean probability of the object over each of those masks, 0..1.
-    """
-
+    #: of the instances of each object that was found, the surest first; an object that was not
+    #: found has no entry.
     masks: Mapping[str, Bool[Tensor, "n h w"]]
+    #: mean probability of the object over each of those masks, 0..1.
     scores: Mapping[str, Float[Tensor, " n"]]
 
     def best(self, object: str) -> Bool[Tensor, "h w"] | None:

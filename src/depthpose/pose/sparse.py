@@ -157,39 +157,26 @@ class VoxelIndex:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class PairList:
-    """Neighbours of two levels, offset by offset.
+    """Neighbours of two levels, offset by offset."""
 
-    Attributes:
-        fine: row of each pair in the finer level: where the kernel reads.
-        coarse: row of each pair in the coarser level: where the kernel is centred.
-        slot: place of each pair in a grid of (volume, most).
-        filled: offsets that have pairs; the others are skipped.
-        counts: how many pairs each of them has.
-        most: the largest of these counts.
-    """
-
-    fine: Int64[Tensor, " pairs"]
+    fine: Int64[Tensor, " pairs"]  #: row of each pair in the finer level: where the kernel reads
+    #: row of each pair in the coarser level: where the kernel is centred.
     coarse: Int64[Tensor, " pairs"]
-    slot: Int64[Tensor, " pairs"]
-    filled: tuple[int, ...]
-    counts: tuple[int, ...]
-    most: int
+    slot: Int64[Tensor, " pairs"]  #: place of each pair in a grid of (volume, most)
+    filled: tuple[int, ...]  #: offsets that have pairs; the others are skipped
+    counts: tuple[int, ...]  #: how many pairs each of them has
+    most: int  #: the largest of these counts
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class NeighbourTable:
-    """Neighbours between a fine and a coarse level, or of a level with itself.
+    """Neighbours between a fine and a coarse level, or of a level with itself."""
 
-    Attributes:
-        table: row of the fine voxel that each coarse one has at each offset; one past the last
-            where there is none.
-        fine_rows: number of voxels of the finer level.
-        centre: offset at which each voxel is its own neighbour; None across levels.
-    """
-
+    #: row of the fine voxel that each coarse one has at each offset; one past the last where there
+    #: is none.
     table: Int32[Tensor, "volume coarse_rows"]
-    fine_rows: int
-    centre: int | None
+    fine_rows: int  #: number of voxels of the finer level
+    centre: int | None  #: offset at which each voxel is its own neighbour; None across levels
 
     @cached_property
     def pairs(self) -> PairList:
@@ -244,14 +231,10 @@ class NeighbourTable:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class KernelMap:
-    """Neighbours with a direction: what a convolution reads and where it writes.
+    """Neighbours with a direction: what a convolution reads and where it writes."""
 
-    Attributes:
-        neighbours: of the two levels, or of the one.
-        is_transposed: False: fine to coarse (or the level to itself); True: coarse to fine.
-    """
-
-    neighbours: NeighbourTable
+    neighbours: NeighbourTable  #: of the two levels, or of the one
+    #: False: fine to coarse (or the level to itself); True: coarse to fine.
     is_transposed: bool = False
 
     @property
@@ -494,18 +477,12 @@ class Voxels:
 
     Rows are in the order of the level's sorted keys, so the order in which points were given
     changes no bit of any result; :meth:`at_points` answers in the order given.
-
-    Attributes:
-        features: one row a voxel.
-        cache: coordinates of all levels, and the kernel maps among them.
-        level: coordinates here are multiples of ``2**level``.
-        row_of_point: row at level 0 of each point given.
     """
 
-    features: Float[Tensor, "n c"]
-    cache: CoordinateCache
-    level: int = 0
-    row_of_point: Int64[Tensor, " points"]
+    features: Float[Tensor, "n c"]  #: one row a voxel
+    cache: CoordinateCache  #: coordinates of all levels, and the kernel maps among them
+    level: int = 0  #: coordinates here are multiples of ``2**level``
+    row_of_point: Int64[Tensor, " points"]  #: row at level 0 of each point given
 
     @classmethod
     def from_points(

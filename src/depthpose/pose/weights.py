@@ -53,20 +53,14 @@ _TENSORS = (*_SURFACE, "keypoints_m")
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class PoseWeights:
-    """What a file of pose weights contains: enough to pose an object without its CAD file.
+    """What a file of pose weights contains: enough to pose an object without its CAD file."""
 
-    Attributes:
-        network: partial cloud to directions, in eval mode where it was read; or a baseline.
-        models: the objects; class k of the network is ``models[k]``.
-        cloud: how the clouds were made that the network was trained on.
-        refusal: when its estimates are withheld.
-        facts: the card in short: ``trained_on``, ``licence``, ``terms`` and the like.
-    """
-
+    #: partial cloud to directions, in eval mode where it was read; or a baseline.
     network: AnyNetwork
-    models: tuple[ObjectModel, ...]
-    cloud: CloudConfig
-    refusal: RefusalConfig
+    models: tuple[ObjectModel, ...]  #: the objects; class k of the network is ``models[k]``
+    cloud: CloudConfig  #: how the clouds were made that the network was trained on
+    refusal: RefusalConfig  #: when its estimates are withheld
+    #: the card in short: ``trained_on``, ``licence``, ``terms`` and the like.
     facts: Mapping[str, str]
 
     def __post_init__(self) -> None:

@@ -108,19 +108,12 @@ _LEAF = 8
 
 
 class Tree(NamedTuple):
-    """Points in the order of a balanced k-d tree, whose ranges are halved down to few points.
+    """Points in the order of a balanced k-d tree, whose ranges are halved down to few points."""
 
-    Attributes:
-        points: (m, 3), float64.
-        order: number that each had before, (m,).
-        axes: across which axis each inner node is parted, (nodes,).
-        values: where, (nodes,).
-    """
-
-    points: Array
-    order: Array
-    axes: Array
-    values: Array
+    points: Array  #: (m, 3), float64
+    order: Array  #: number that each had before, (m,)
+    axes: Array  #: across which axis each inner node is parted, (nodes,)
+    values: Array  #: where, (nodes,)
 
 
 def tree_of(points: Array) -> Tree:

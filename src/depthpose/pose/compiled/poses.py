@@ -32,29 +32,17 @@ from depthpose.pose.compiled.points import (
 
 
 class Target(NamedTuple):
-    """A surface, and the table by which what is near is looked up without searching.
+    """A surface, and the table by which what is near is looked up without searching."""
 
-    Attributes:
-        tree: of the surface points.
-        normals: of these, in the tree's order, (m, 3).
-        low: corner of the table, (3,).
-        side: of its boxes.
-        counts: boxes along each axis, (3,).
-        table: place in the tree of the point nearest to the middle of each box.
-        outward: normals on the outer side, 0 where none is known, (m, 3).
-        across: place of the point on the other side of a wall, or -1, (m,).
-        ball: middle and radius; a camera within it sees no side, (4,).
-    """
-
-    tree: Tree
-    normals: Array
-    low: Array
-    side: float
-    counts: Array
-    table: Array
-    outward: Array
-    across: Array
-    ball: Array
+    tree: Tree  #: of the surface points
+    normals: Array  #: of these, in the tree's order, (m, 3)
+    low: Array  #: corner of the table, (3,)
+    side: float  #: of its boxes
+    counts: Array  #: boxes along each axis, (3,)
+    table: Array  #: place in the tree of the point nearest to the middle of each box
+    outward: Array  #: normals on the outer side, 0 where none is known, (m, 3)
+    across: Array  #: place of the point on the other side of a wall, or -1, (m,)
+    ball: Array  #: middle and radius; a camera within it sees no side, (4,)
 
 
 @compiled

@@ -59,25 +59,15 @@ from depthpose.pose.types import (
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class BopDataset:
-    """Instances of one split, each a sample when it is asked for.
+    """Instances of one split, each a sample when it is asked for."""
 
-    Attributes:
-        folder: of the data set.
-        split: its name.
-        layout: a key of ``LAYOUTS``.
-        instances: what is annotated, in the order of scene, image and place.
-        mesh_config: for its models.
-        cloud_config: for its clouds.
-        sha256: of all annotations of the split: tells data sets of one name apart.
-    """
-
-    folder: Path
-    split: str
-    layout: str
-    instances: Sequence[Instance]
-    mesh_config: MeshConfig
-    cloud_config: CloudConfig
-    sha256: str
+    folder: Path  #: of the data set
+    split: str  #: its name
+    layout: str  #: a key of ``LAYOUTS``
+    instances: Sequence[Instance]  #: what is annotated, in the order of scene, image and place
+    mesh_config: MeshConfig  #: for its models
+    cloud_config: CloudConfig  #: for its clouds
+    sha256: str  #: of all annotations of the split: tells data sets of one name apart
 
     def __len__(self) -> int:
         """How many instances."""
@@ -383,38 +373,23 @@ _DEPTH_UNIT_M = 0.0001
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class BopObject:
-    """One object of a frame.
+    """One object of a frame."""
 
-    Attributes:
-        number: its ``obj_id``.
-        camera_from_model: its pose.
-        visible: its pixels that nothing occludes.
-        silhouette: all its pixels in the image, occluded ones too.
-    """
-
-    number: int
-    camera_from_model: Rigid
-    visible: Bool[Tensor, "h w"]
-    silhouette: Bool[Tensor, "h w"]
+    number: int  #: its ``obj_id``
+    camera_from_model: Rigid  #: its pose
+    visible: Bool[Tensor, "h w"]  #: its pixels that nothing occludes
+    silhouette: Bool[Tensor, "h w"]  #: all its pixels in the image, occluded ones too
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class BopFrame:
-    """One image of a scene.
+    """One image of a scene."""
 
-    Attributes:
-        number: its ``im_id``.
-        K: intrinsic matrix.
-        depth_m: NaN where there is no reading.
-        objects: what is annotated.
-        rgb: the picture, if there is one.
-    """
-
-    number: int
-    K: Float[Tensor, "3 3"]
-    depth_m: Float[Tensor, "h w"]
-    objects: Sequence[BopObject]
-    rgb: Float[Tensor, "3 h w"] | None = None
+    number: int  #: its ``im_id``
+    K: Float[Tensor, "3 3"]  #: intrinsic matrix
+    depth_m: Float[Tensor, "h w"]  #: NaN where there is no reading
+    objects: Sequence[BopObject]  #: what is annotated
+    rgb: Float[Tensor, "3 h w"] | None = None  #: the picture, if there is one
 
 
 def write_bop_scene(

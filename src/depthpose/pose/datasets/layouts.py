@@ -125,35 +125,21 @@ _IMAGE_FOLDERS = ("rgb", "gray")
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Instance:
-    """One annotated object in one image.
+    """One annotated object in one image."""
 
-    Attributes:
-        scene_id: number of the scene.
-        image_id: number of the image in it.
-        index: place among the annotations of the image: names the mask.
-        object_id: BOP's ``obj_id``.
-        K: intrinsic matrix.
-        depth: the depth image.
-        depth_unit_m: metres a unit of it.
-        mask: of the visible part; None where there is no such file.
-        rgb: the picture, where there is one.
-        camera_from_model: the annotated pose.
-        visible_fraction: share of the silhouette that is seen, where it is given.
-        is_measured: whether the pose was annotated, not itself fitted to the same depth.
-    """
-
-    scene_id: int
-    image_id: int
-    index: int
-    object_id: int
-    K: Float[Tensor, "3 3"]
-    depth: Path
-    depth_unit_m: float
-    mask: Path | None
-    rgb: Path | None
-    camera_from_model: Rigid
+    scene_id: int  #: number of the scene
+    image_id: int  #: number of the image in it
+    index: int  #: place among the annotations of the image: names the mask
+    object_id: int  #: BOP's ``obj_id``
+    K: Float[Tensor, "3 3"]  #: intrinsic matrix
+    depth: Path  #: the depth image
+    depth_unit_m: float  #: metres a unit of it
+    mask: Path | None  #: of the visible part; None where there is no such file
+    rgb: Path | None  #: the picture, where there is one
+    camera_from_model: Rigid  #: the annotated pose
+    #: share of the silhouette that is seen, where it is given.
     visible_fraction: float | None = None
-    is_measured: bool = True
+    is_measured: bool = True  #: whether the pose was annotated, not itself fitted to the same depth
 
     @property
     def name(self) -> str:
@@ -337,19 +323,15 @@ def segnet_mask(folder: Path, instance: Instance) -> Path:
 
 @dataclass(frozen=True, kw_only=True)
 class Layout:
-    """How one kind of data set is read; its models are ``models/obj_NNNNNN.ply`` in millimetres.
+    """How one kind of data set is read; its models are ``models/obj_NNNNNN.ply`` in millimetres."""
 
-    Attributes:
-        splits: names of the splits of a folder; none where the folder is of another layout.
-        instances: of one split of a folder.
-        symmetries: of an object, by number, whose models declare none.
-        predicted_mask: file of the mask that came with the data, for a folder and an instance;
-            None: the data set has none.
-    """
-
+    #: names of the splits of a folder; none where the folder is of another layout.
     splits: Callable[[Path], Sequence[str]]
-    instances: Callable[[Path, str], Iterable[Instance]]
+    instances: Callable[[Path, str], Iterable[Instance]]  #: of one split of a folder
+    #: of an object, by number, whose models declare none.
     symmetries: Callable[[int], Symmetries] = lambda _: Symmetries()
+    #: file of the mask that came with the data, for a folder and an instance; None: the data set
+    #: has none.
     predicted_mask: Callable[[Path, Instance], Path] | None = None
 
 

@@ -185,23 +185,14 @@ def _is_list_of_counts(value: object) -> TypeGuard[list[int]]:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Detection:
-    """One predicted object.
+    """One predicted object."""
 
-    Attributes:
-        scene_id: number of the scene.
-        image_id: number of the image.
-        object_id: which object (``category_id``).
-        score: how sure.
-        segmentation: run lengths as in the file, checked.
-        seconds: what the image took, where it is said.
-    """
-
-    scene_id: int
-    image_id: int
-    object_id: int
-    score: float
-    segmentation: Runs
-    seconds: float | None = None
+    scene_id: int  #: number of the scene
+    image_id: int  #: number of the image
+    object_id: int  #: which object (``category_id``)
+    score: float  #: how sure
+    segmentation: Runs  #: run lengths as in the file, checked
+    seconds: float | None = None  #: what the image took, where it is said
 
     @property
     def mask(self) -> Bool[Tensor, "h w"]:

@@ -48,19 +48,12 @@ _WIDE = 0.6
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Seen:
-    """What a camera saw about an object, in a window of its image.
+    """What a camera saw about an object, in a window of its image."""
 
-    Attributes:
-        depth_m: NaN where there is no reading.
-        is_own: the pixels that are said to be the object's.
-        K: of the window.
-        noise_m: standard deviation of a reading, of what neighbours do not share.
-    """
-
-    depth_m: Float64[Tensor, "h w"]
-    is_own: Bool[Tensor, "h w"]
-    K: Float64[Tensor, "3 3"]
-    noise_m: float
+    depth_m: Float64[Tensor, "h w"]  #: NaN where there is no reading
+    is_own: Bool[Tensor, "h w"]  #: the pixels that are said to be the object's
+    K: Float64[Tensor, "3 3"]  #: of the window
+    noise_m: float  #: standard deviation of a reading, of what neighbours do not share
 
 
 def seen_about(cloud_m: Float[Tensor, "n 3"], view: ViewInput | None, diameter_m: float) -> Seen:
@@ -220,17 +213,12 @@ _BESIDE = 0.005
 
 @dataclass(frozen=True)
 class Scale:
-    """How many times as large as the model the seen object is, and how sure that is.
+    """How many times as large as the model the seen object is, and how sure that is."""
 
-    Attributes:
-        times: 1 for the model itself.
-        sigma: standard deviation of it.
-        gain: by how much it lowers the root mean square distance of the points to the surface, in
-            units of the distance up to which a point is near.
-    """
-
-    times: float
-    sigma: float
+    times: float  #: 1 for the model itself
+    sigma: float  #: standard deviation of it
+    #: by how much it lowers the root mean square distance of the points to the surface, in units of
+    #: the distance up to which a point is near.
     gain: float
 
 

@@ -206,18 +206,12 @@ def _tensor(values: Any) -> Tensor:  # noqa: ANN401  whatever a caller has
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class ObjectCloud:
-    """A cloud that can be posed.
+    """A cloud that can be posed."""
 
-    Attributes:
-        cloud_m: all usable points, without flying pixels.
-        points_m: those that the network sees and that vote, one a voxel.
-        voxels: of the network's grid.
-        view: the depth image that shows the cloud; None where the cloud alone is known.
-    """
-
-    cloud_m: Float[Tensor, "n 3"]
-    points_m: Float[Tensor, "m 3"]
-    voxels: VoxelGrid
+    cloud_m: Float[Tensor, "n 3"]  #: all usable points, without flying pixels
+    points_m: Float[Tensor, "m 3"]  #: those that the network sees and that vote, one a voxel
+    voxels: VoxelGrid  #: of the network's grid
+    #: the depth image that shows the cloud; None where the cloud alone is known.
     view: ViewInput | None
 
 

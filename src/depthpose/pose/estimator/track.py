@@ -72,20 +72,13 @@ def scene_about(given: AnyInput, poses: Rigid, surface: Surface) -> Float64[Tens
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class TrackedObject:
-    """What is followed, and how it is looked for.
+    """What is followed, and how it is looked for."""
 
-    Attributes:
-        model: the object.
-        surface: of the model.
-        refusal: when a pose is refused.
-        icp: of the first steps.
-        look: an estimate of the object in a frame about which nothing is known.
-    """
-
-    model: ObjectModel
-    surface: Surface
-    refusal: RefusalConfig
-    icp: IcpConfig
+    model: ObjectModel  #: the object
+    surface: Surface  #: of the model
+    refusal: RefusalConfig  #: when a pose is refused
+    icp: IcpConfig  #: of the first steps
+    #: an estimate of the object in a frame about which nothing is known.
     look: Callable[[AnyInput], PoseEstimate]
 
 

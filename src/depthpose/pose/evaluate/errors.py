@@ -41,19 +41,12 @@ _MARGIN_PX = 2
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class ErrorContext:
-    """What the errors of an object depend on.
+    """What the errors of an object depend on."""
 
-    Attributes:
-        model: the object.
-        diameter_m: of the table that was asked for.
-        is_adds: whether ADD-S decides a success.
-        vsd_delta_m: see ``EvaluationConfig``; None: VSD is not measured.
-    """
-
-    model: ObjectModel
-    diameter_m: float
-    is_adds: bool
-    vsd_delta_m: float | None
+    model: ObjectModel  #: the object
+    diameter_m: float  #: of the table that was asked for
+    is_adds: bool  #: whether ADD-S decides a success
+    vsd_delta_m: float | None  #: see ``EvaluationConfig``; None: VSD is not measured
 
     @cached_property
     def symmetries(self) -> Rigid:
@@ -72,21 +65,16 @@ Errors = Float[Tensor, " n"]
 
 @dataclass(frozen=True, kw_only=True)
 class Metric:
-    """An error of a pose, and what the rows of objects say of it.
+    """An error of a pose, and what the rows of objects say of it."""
 
-    Attributes:
-        measure: ``(estimated, instance, context)``, the first ``camera_from_model``, to the error.
-        missing: the error of an instance without an answer.
-        is_wanted: whether it is measured at all.
-        summaries: columns of the rows of objects: name to a function of the errors (n, t) of all
-            instances and their diameters [m] (n).
-        has_median: whether rows of objects hold the median of the answers, as ``NAME_median``.
-    """
-
+    #: ``(estimated, instance, context)``, the first ``camera_from_model``, to the error.
     measure: Callable[[Rigid, Instance, ErrorContext], Errors | Tensor | float]
-    missing: tuple[float, ...] = (math.inf,)
-    is_wanted: Callable[[ErrorContext], bool] = lambda _: True
+    missing: tuple[float, ...] = (math.inf,)  #: the error of an instance without an answer
+    is_wanted: Callable[[ErrorContext], bool] = lambda _: True  #: whether it is measured at all
+    #: columns of the rows of objects: name to a function of the errors (n, t) of all instances and
+    #: their diameters [m] (n).
     summaries: Mapping[str, Callable[[Tensor, Tensor], float]] = field(default_factory=dict)
+    #: whether rows of objects hold the median of the answers, as ``NAME_median``.
     has_median: bool = False
 
 

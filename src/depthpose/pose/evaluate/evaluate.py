@@ -39,40 +39,27 @@ Number = float | None
 
 @dataclass(frozen=True, kw_only=True)
 class Origin:
-    """Whose predictions a row measures; the first columns of its row.
+    """Whose predictions a row measures; the first columns of its row."""
 
-    Attributes:
-        method: its name.
-        masks: kind of masks that it was given.
-        weights: file or name, where it has any.
-        weights_sha256: its first digits; of a file of predictions by others the file's own.
-    """
-
-    method: str
-    masks: str = ""
-    weights: str = ""
-    weights_sha256: str = ""
+    method: str  #: its name
+    masks: str = ""  #: kind of masks that it was given
+    weights: str = ""  #: file or name, where it has any
+    weights_sha256: str = ""  #: its first digits; of a file of predictions by others the file's own
 
 
 @dataclass(frozen=True, kw_only=True)
 class Conditions:
-    """What a number cannot be compared without; the last columns of its row.
+    """What a number cannot be compared without; the last columns of its row."""
 
-    Attributes:
-        diameters: whose table of diameters.
-        frames: data set and split.
-        frames_sha256: first digits of :func:`frames_hash`.
-    """
-
-    diameters: str
-    frames: str
-    frames_sha256: str
+    diameters: str  #: whose table of diameters
+    frames: str  #: data set and split
+    frames_sha256: str  #: first digits of :func:`frames_hash`
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class _Row:
-    conditions: Conditions | None = None
-    origin: Origin | None = None
+    conditions: Conditions | None = None  #: of the evaluation
+    origin: Origin | None = None  #: whose predictions it measures
 
     def columns(self) -> dict[str, Any]:
         """Give the columns of a table, in its order."""
@@ -97,36 +84,21 @@ _LAST = ("conditions", "origin")
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class InstanceRow(_Row):
-    """One instance and the errors of its estimate.
+    """One instance and the errors of its estimate."""
 
-    Attributes:
-        instance: its name.
-        object: name of its model.
-        status: of the estimate; ``missing`` where there is none.
-        is_success: whether ADD (ADD-S of a symmetric object) is below a tenth of the diameter.
-        score: of the answer, larger is surer.
-        visible_fraction: share of the silhouette that is seen, where it is given.
-        truth: ``annotated``, or ``fitted`` to the same depth.
-        diameter_m: of the table that was asked for.
-        metric: ``ADD`` or ``ADD-S``.
-        errors: by the names of ``METRICS``; what is not measured is left out.
-        ms: milliseconds of each stage and in ``total``; None where it has not run.
-        reason: of a refusal.
-        origin: whose estimate it is.
-    """
-
-    instance: str
-    object: str
-    status: str
-    is_success: bool
-    score: Number
-    visible_fraction: Number
-    truth: str
-    diameter_m: float
-    metric: str
-    errors: Mapping[str, Errors]
+    instance: str  #: its name
+    object: str  #: name of its model
+    status: str  #: of the estimate; ``missing`` where there is none
+    is_success: bool  #: whether ADD (ADD-S of a symmetric object) is below a tenth of the diameter
+    score: Number  #: of the answer, larger is surer
+    visible_fraction: Number  #: share of the silhouette that is seen, where it is given
+    truth: str  #: ``annotated``, or ``fitted`` to the same depth
+    diameter_m: float  #: of the table that was asked for
+    metric: str  #: ``ADD`` or ``ADD-S``
+    errors: Mapping[str, Errors]  #: by the names of ``METRICS``; what is not measured is left out
+    #: milliseconds of each stage and in ``total``; None where it has not run.
     ms: Mapping[str, Number]
-    reason: str
+    reason: str  #: of a refusal
 
     def error(self, name: str) -> Number:
         """Give an error by its name, or None where it is not measured or infinite."""
@@ -138,54 +110,30 @@ class InstanceRow(_Row):
 
 @dataclass(frozen=True, kw_only=True)
 class ObjectRow(_Row):
-    """The instances of an object, the ``mean`` of objects, or ``all`` instances.
+    """The instances of an object, the ``mean`` of objects, or ``all`` instances."""
 
-    Attributes:
-        object: what the row is called.
-        instances: how many.
-        annotated: how many of them have a pose that was annotated, not fitted.
-        success: share of instances.
-        refused: share of instances without an answer.
-        wrong: share of instances with an answer that is no success.
-        coverage: share of instances with an answer.
-        scores: the summaries of ``METRICS``, ``ar`` and medians; None where not measured.
-        ms: mean milliseconds of each stage and in ``total``.
-        metric: ``ADD`` or ``ADD-S``, where it is of one object.
-        diameter_m: the same.
-        conditions: of the evaluation.
-        origin: whose estimates they are.
-    """
-
-    object: str
-    instances: int
-    annotated: int
-    success: float
-    refused: float
-    wrong: float
-    coverage: float
+    object: str  #: what the row is called
+    instances: int  #: how many
+    annotated: int  #: how many of them have a pose that was annotated, not fitted
+    success: float  #: share of instances
+    refused: float  #: share of instances without an answer
+    wrong: float  #: share of instances with an answer that is no success
+    coverage: float  #: share of instances with an answer
+    #: the summaries of ``METRICS``, ``ar`` and medians; None where not measured.
     scores: Mapping[str, Number]
-    ms: Mapping[str, Number]
-    metric: str | None = None
-    diameter_m: float | None = None
+    ms: Mapping[str, Number]  #: mean milliseconds of each stage and in ``total``
+    metric: str | None = None  #: ``ADD`` or ``ADD-S``, where it is of one object
+    diameter_m: float | None = None  #: the same
 
 
 @dataclass(frozen=True, kw_only=True)
 class RiskRow(_Row):
-    """How many answers are wrong if only the surest are given.
+    """How many answers are wrong if only the surest are given."""
 
-    Attributes:
-        coverage: share of all instances that is answered.
-        answers: their number.
-        least_score: of the least sure of them.
-        risk: share of wrong ones among them.
-        conditions: of the evaluation.
-        origin: whose estimates they are.
-    """
-
-    coverage: float
-    answers: int
-    least_score: Number
-    risk: float
+    coverage: float  #: share of all instances that is answered
+    answers: int  #: their number
+    least_score: Number  #: of the least sure of them
+    risk: float  #: share of wrong ones among them
 
 
 _RECALLS = ("ar_vsd", "ar_mssd", "ar_mspd")
@@ -346,20 +294,15 @@ SUCCESS_SHARE = 0.1
 
 @dataclass(frozen=True, kw_only=True)
 class Evaluation:
-    """What evaluating one set of predictions gave.
+    """What evaluating one set of predictions gave."""
 
-    Attributes:
-        rows: one an object; where there are several the ``mean`` over objects, in which each
-            counts the same, and ``all`` over instances, as BOP pools them.
-        per_instance: one an instance.
-        risk: how many answers are wrong if only the surest are given.
-        advice: by which change of all predictions many more were right: another unit or convention
-            of poses; None where by none.
-    """
-
+    #: one an object; where there are several the ``mean`` over objects, in which each counts the
+    #: same, and ``all`` over instances, as BOP pools them.
     rows: list[ObjectRow]
-    per_instance: list[InstanceRow]
-    risk: list[RiskRow]
+    per_instance: list[InstanceRow]  #: one an instance
+    risk: list[RiskRow]  #: how many answers are wrong if only the surest are given
+    #: by which change of all predictions many more were right: another unit or convention of poses;
+    #: None where by none.
     advice: str | None = None
 
     def to_frame(self) -> Any:  # noqa: ANN401  pandas is no dependency

@@ -93,22 +93,15 @@ _MOST_AXES = 40
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class SymmetryProposal:
-    """One way in which an object may look alike.
+    """One way in which an object may look alike."""
 
-    Attributes:
-        kind: ``discrete`` or ``continuous``.
-        axis: what to turn about.
-        angle_rad: by how much; nothing for a continuous symmetry.
-        deviation: distance of the turned surface from the surface, in diameters: the largest but
-            for 2 % of the points, and for ``continuous`` over all turns.
-        certainty: 1 for an exact copy, 1/2 at the tolerance, toward 0 beyond.
-    """
-
-    kind: str
-    axis: Axis
-    angle_rad: float | None
+    kind: str  #: ``discrete`` or ``continuous``
+    axis: Axis  #: what to turn about
+    angle_rad: float | None  #: by how much; nothing for a continuous symmetry
+    #: distance of the turned surface from the surface, in diameters: the largest but for 2 % of the
+    #: points, and for ``continuous`` over all turns.
     deviation: float
-    certainty: float
+    certainty: float  #: 1 for an exact copy, 1/2 at the tolerance, toward 0 beyond
 
 
 class SurfaceDeviation:
@@ -426,15 +419,11 @@ _NEAR_STARTS = 24
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class NearSymmetry:
-    """A turn after which the object looks nearly as before.
+    """A turn after which the object looks nearly as before."""
 
-    Attributes:
-        model_from_model: the turn.
-        deviation: distance of the turned surface from the surface, in diameters: the largest but
-            for 2 % of the points.
-    """
-
-    model_from_model: Rigid
+    model_from_model: Rigid  #: the turn
+    #: distance of the turned surface from the surface, in diameters: the largest but for 2 % of the
+    #: points.
     deviation: float
 
 

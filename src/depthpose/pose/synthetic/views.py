@@ -263,18 +263,12 @@ class Shape:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class CleanView:
-    """An object alone, without any error, in a window of the image.
+    """An object alone, without any error, in a window of the image."""
 
-    Attributes:
-        depth_m: less ``distance_m``; NaN beside the object.
-        K: intrinsic matrix of the window.
-        camera_from_model: the pose.
-        distance_m: taken off the depths of stored views, whose float16 is then exact to 0.1 mm.
-    """
-
-    depth_m: Float[Tensor, "h w"]
-    K: Float[Tensor, "3 3"]
-    camera_from_model: Rigid
+    depth_m: Float[Tensor, "h w"]  #: less ``distance_m``; NaN beside the object
+    K: Float[Tensor, "3 3"]  #: intrinsic matrix of the window
+    camera_from_model: Rigid  #: the pose
+    #: taken off the depths of stored views, whose float16 is then exact to 0.1 mm.
     distance_m: float = 0.0
 
 

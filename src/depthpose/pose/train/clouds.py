@@ -55,23 +55,15 @@ class Cloud(NamedTuple):
 
 
 class CloudBatch(NamedTuple):
-    """Several clouds, one after the other.
+    """Several clouds, one after the other."""
 
-    Attributes:
-        points_m: of all clouds, each in the axes of its grid about its camera.
-        coordinates: (cloud, x, y, z) of each point's voxel.
-        features: of each voxel.
-        class_of: class of each cloud.
-        R: rotation of each cloud's pose.
-        t_m: translation.
-    """
-
+    #: of all clouds, each in the axes of its grid about its camera.
     points_m: Float[Tensor, "points 3"]
-    coordinates: Int[Tensor, "points 4"]
-    features: Float[Tensor, "points c"]
-    class_of: Int[Tensor, " clouds"]
-    R: Float[Tensor, "clouds 3 3"]
-    t_m: Float[Tensor, "clouds 3"]
+    coordinates: Int[Tensor, "points 4"]  #: (cloud, x, y, z) of each point's voxel
+    features: Float[Tensor, "points c"]  #: of each voxel
+    class_of: Int[Tensor, " clouds"]  #: class of each cloud
+    R: Float[Tensor, "clouds 3 3"]  #: rotation of each cloud's pose
+    t_m: Float[Tensor, "clouds 3"]  #: translation
 
     @property
     def instance(self) -> Int[Tensor, " points"]:

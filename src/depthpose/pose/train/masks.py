@@ -47,15 +47,10 @@ from depthpose.pose.train.poses import claim_run, with_origin
 
 
 class LabelledImage(NamedTuple):
-    """An image with the class of each pixel, or a batch of them.
+    """An image with the class of each pixel, or a batch of them."""
 
-    Attributes:
-        image: RGB in [0, 1].
-        labels: 0 is the background, ``1 + i`` object i.
-    """
-
-    image: Float[Tensor, "*b 3 h w"]
-    labels: Int[Tensor, "*b h w"]
+    image: Float[Tensor, "*b 3 h w"]  #: RGB in [0, 1]
+    labels: Int[Tensor, "*b h w"]  #: 0 is the background, ``1 + i`` object i
 
 
 @dataclass(frozen=True, kw_only=True)
