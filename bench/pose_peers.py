@@ -23,7 +23,7 @@ from real_poses import RealCase, real_cases
 
 from depthpose.core.checkpoint import find_weights
 from depthpose.core.rigid import Rigid
-from depthpose.pose.baselines import FpfhConfig, FpfhRegistration
+from depthpose.pose.baselines import FpfhConfig, FpfhEstimator
 from depthpose.pose.config import EstimateConfig, VotingConfig
 from depthpose.pose.estimator import GeoPoseNet, Registration
 from depthpose.pose.evaluate import nearest_copy
@@ -75,9 +75,9 @@ def declared_add(case: RealCase, pose: Rigid, points_m: torch.Tensor) -> float:
 def open3d_method(case: RealCase, seed: int, words: argparse.Namespace) -> Method:
     """Open3D's registration for one model."""
     config = FpfhConfig(seed=seed, voxel_diameters=words.voxel)
-    peer = FpfhRegistration(case.model, config)
+    peer = FpfhEstimator([case.model], config)
     cloud = CloudInput(name=case.name, points_m=case.points_m, object=case.model.name)
-    return lambda _: peer.estimate(cloud)
+    return lambda _: peer.estimate_many([cloud])[0]
 
 
 def zero_shot_method(case: RealCase, seed: int) -> Method:

@@ -9,7 +9,7 @@ from typing import Annotated, Any, ClassVar, NamedTuple
 import numpy as np
 import torch
 import torch.nn.functional as F
-from jaxtyping import Float, Float64, Int
+from jaxtyping import Float, Int
 from torch import Tensor, nn
 
 from depthpose.core.config import Settings
@@ -205,38 +205,45 @@ _LEAST = 3
 """Points that a pose takes; Open3D answers fewer with a crash or with the identity."""
 
 
-class FpfhRegistration:
-    """Poses of one object: its model is prepared once.
+class FpfhEstimator:
+    """Registration of several objects, each model prepared once; called as the networks are.
 
     Raises:
         MissingExtraError: Open3D is not installed.
     """
 
-    def __init__(self, model: ObjectModel, config: FpfhConfig | None = None) -> None:
-        self.model, self.config = model, config or FpfhConfig()
-        self._voxel_m = self.config.voxel_diameters * model.diameter_m
+    def __init__(self, models: Sequence[ObjectModel], config: FpfhConfig | None = None) -> None:
+        self.config = config or FpfhConfig()
         self._open3d = import_open3d("registration by FPFH")
-        points_m, normals = sample_surface(model, _MODEL_POINTS)
-        cloud = self._cloud(points_m)
-        cloud.normals = self._open3d.utility.Vector3dVector(normals.double().numpy())
-        self._target, self._target_features = self._prepare(cloud)
+        self._models = {model.name: model for model in models}
+        self._targets: dict[str, tuple[Any, Any]] = {}
+        for model in models:
+            points_m, normals = sample_surface(model, _MODEL_POINTS)
+            cloud = self._cloud(points_m)
+            cloud.normals = self._open3d.utility.Vector3dVector(normals.double().numpy())
+            self._targets[model.name] = self._prepare(cloud, self._voxel_m(model))
 
-    def estimate(self, given: CloudInput) -> PoseEstimate:
-        """Pose a cloud; RANSAC that finds nothing is a refusal."""
-        began = time.perf_counter()
-        if len(given.points_m) < _LEAST:
-            reason = f"the cloud has {len(given.points_m)} points, and a pose takes {_LEAST}"
+    def estimate_many(self, inputs: Sequence[CloudInput | ViewInput]) -> list[PoseEstimate]:
+        """Pose one after the other; RANSAC that finds nothing is a refusal."""
+        return [self._estimate(given) for given in inputs]
+
+    def _estimate(self, given: CloudInput | ViewInput) -> PoseEstimate:
+        began, model = time.perf_counter(), self._models[given.object]
+        points_m = object_points(given, model.diameter_m)
+        if len(points_m) < _LEAST:
+            reason = f"the cloud has {len(points_m)} points, and a pose takes {_LEAST}"
             return PoseEstimate(
                 name=given.name, object=given.object, status="too few points", reason=reason
             )
-        o3d = self._open3d
-        source, features = self._prepare(self._cloud(given.points_m))
+        o3d, voxel_m = self._open3d, self._voxel_m(model)
+        target, its_features = self._targets[model.name]
+        source, features = self._prepare(self._cloud(points_m), voxel_m)
         o3d.utility.random.seed(self.config.seed)
         # It prints a line for each cloud of which few features are mutually nearest.
-        r, limit_m = o3d.pipelines.registration, _CORRESPONDENCE * self._voxel_m
+        r, limit_m = o3d.pipelines.registration, _CORRESPONDENCE * voxel_m
         with o3d.utility.VerbosityContextManager(o3d.utility.VerbosityLevel.Error):
             found = r.registration_ransac_based_on_feature_matching(
-                source, self._target, features, self._target_features, True, limit_m,
+                source, target, features, its_features, True, limit_m,
                 r.TransformationEstimationPointToPoint(False), 3,
                 [
                     r.CorrespondenceCheckerBasedOnEdgeLength(0.9),
@@ -246,7 +253,7 @@ class FpfhRegistration:
             )  # fmt: skip
         if len(found.correspondence_set):
             found = r.registration_icp(
-                source, self._target, _ICP * self._voxel_m, found.transformation,
+                source, target, _ICP * voxel_m, found.transformation,
                 r.TransformationEstimationPointToPlane(),
             )  # fmt: skip
         seconds = {"registration": time.perf_counter() - began}
@@ -262,20 +269,23 @@ class FpfhRegistration:
             name=given.name,
             object=given.object,
             status="ok",
-            camera_from_model=Rigid(pose.R.to(given.points_m), pose.t_m.to(given.points_m)),
+            camera_from_model=Rigid(pose.R.to(points_m), pose.t_m.to(points_m)),
             inlier_share=float(found.fitness),
             residual_m=float(found.inlier_rmse),
             seconds=seconds,
         )
+
+    def _voxel_m(self, model: ObjectModel) -> float:
+        return self.config.voxel_diameters * model.diameter_m
 
     def _cloud(self, points_m: Float[Tensor, "n 3"]) -> Any:  # noqa: ANN401 - Open3D has no types
         cloud = self._open3d.geometry.PointCloud()
         cloud.points = self._open3d.utility.Vector3dVector(points_m.double().cpu().numpy())
         return cloud
 
-    def _prepare(self, cloud: Any) -> tuple[Any, Any]:  # noqa: ANN401
+    def _prepare(self, cloud: Any, voxel_m: float) -> tuple[Any, Any]:  # noqa: ANN401
         """Thin a cloud to voxels; normals of a measured one point to the camera."""
-        o3d, voxel_m = self._open3d, self._voxel_m
+        o3d = self._open3d
         cloud = cloud.voxel_down_sample(voxel_m)
         near = o3d.geometry.KDTreeSearchParamHybrid
         if not cloud.has_normals():
@@ -285,76 +295,6 @@ class FpfhRegistration:
             cloud, near(radius=_FEATURE * voxel_m, max_nn=100)
         )
         return cloud, features
-
-
-class FpfhEstimator:
-    """Registration of several objects from their masked depth, called as the networks are.
-
-    Raises:
-        MissingExtraError: Open3D is not installed.
-    """
-
-    def __init__(self, models: Sequence[ObjectModel], config: FpfhConfig | None = None) -> None:
-        self._peers = {model.name: FpfhRegistration(model, config) for model in models}
-
-    def estimate_many(self, inputs: Sequence[ViewInput]) -> list[PoseEstimate]:
-        """Pose one after the other."""
-        estimates = []
-        for given in inputs:
-            peer = self._peers[given.object]
-            points_m = object_points(given, peer.model.diameter_m)
-            cloud = CloudInput(name=given.name, points_m=points_m, object=given.object)
-            estimates.append(peer.estimate(cloud))
-        return estimates
-
-
-def ransac_one_by_one(
-    points_m: Float64[np.ndarray, "n 3"],
-    directions: Float64[np.ndarray, "n k 3"],
-    hypotheses: int = 50,
-    min_cosine: float = 0.99,
-    seed: int = 0,
-) -> Float64[np.ndarray, "k 3"]:
-    """Find every keypoint with a loop over keypoints and hypotheses.
-
-    A hypothesis is the point nearest to the lines of two random points; its inliers are the points
-    whose unit direction comes within an angle of it; the best is refitted on its inliers.
-
-    Args:
-        points_m: where the votes start.
-        directions: of unit length.
-        hypotheses: tried for each keypoint; published practice is 50.
-        min_cosine: of the angle of an inlier.
-        seed: of the pairs.
-    """
-    random = np.random.default_rng(seed)
-    found = []
-    for k in range(directions.shape[1]):
-        n = directions[:, k]
-        best, chosen = -1, np.ones(len(n), bool)
-        for _ in range(hypotheses):
-            pair = random.choice(len(points_m), 2, replace=False)
-            try:
-                tried = np.linalg.solve(*_normal_equations(points_m[pair], n[pair]))
-            except np.linalg.LinAlgError:
-                continue
-            way = tried - points_m
-            inliers = (way * n).sum(1) / np.sqrt((way * way).sum(1)).clip(1e-300) > min_cosine
-            count = np.count_nonzero(inliers)
-            if count > best:
-                best, chosen = count, inliers
-        try:
-            refitted = np.linalg.solve(*_normal_equations(points_m[chosen], n[chosen]))
-        except np.linalg.LinAlgError:  # no inlier but parallel ones, or none: all votes count
-            refitted = np.linalg.lstsq(*_normal_equations(points_m, n), rcond=None)[0]
-        found.append(refitted)
-    return np.stack(found)
-
-
-def _normal_equations(points_m: np.ndarray, n: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Of the point nearest to the lines through ``points_m`` along ``n``; singular if parallel."""
-    A = len(points_m) * np.eye(3) - n.T @ n
-    return A, points_m.sum(0) - n.T @ (n * points_m).sum(1)
 
 
 _TRANSFORM_POOLED, _TRANSFORM_HEAD = (64, 128, 1024), (512, 256)
@@ -387,9 +327,16 @@ class PointNet(nn.Module):
             points_m: about the mean of their cloud.
             cloud: which cloud each belongs to, 0, 1, ..., ascending.
         """
-        c = self.config
-        outputs = self.final(self.features(points_m, cloud))
-        return outputs.view(len(outputs), c.classes, c.keypoints, 3)
+        x = points_m / self.config.unit_m
+        count = int(cloud.max()) + 1
+        if self.turn_points is not None:
+            x = _turned(x, self.turn_points(x, cloud, count), cloud)
+        x = self.local(x)
+        if self.turn_features is not None:
+            x = _turned(x, self.turn_features(x, cloud, count), cloud)
+        whole = _largest(self.pooled(x), cloud, count)
+        outputs = self.final(self.head(torch.cat([x, whole[cloud]], 1)))
+        return outputs.view(len(outputs), self.config.classes, self.config.keypoints, 3)
 
     def directions(self, seen: SeenPoints) -> Float[Tensor, "points keypoints 3"]:
         """Answer for each point's own class: what every network that votes offers."""
@@ -399,20 +346,6 @@ class PointNet(nn.Module):
         local_m = points_m - (sums_m / sizes[:, None])[cloud]
         rows = torch.arange(len(points_m), device=points_m.device)
         return self(local_m, cloud)[rows, seen.class_of_point]
-
-    def features(
-        self, points_m: Float[Tensor, "points 3"], cloud: Int[Tensor, " points"]
-    ) -> Float[Tensor, "points width"]:
-        """Give what the last layer sees of each point."""
-        x = points_m / self.config.unit_m
-        count = int(cloud.max()) + 1
-        if self.turn_points is not None:
-            x = _turned(x, self.turn_points(x, cloud, count), cloud)
-        x = self.local(x)
-        if self.turn_features is not None:
-            x = _turned(x, self.turn_features(x, cloud, count), cloud)
-        whole = _largest(self.pooled(x), cloud, count)
-        return self.head(torch.cat([x, whole[cloud]], 1))
 
 
 class _Transform(nn.Module):

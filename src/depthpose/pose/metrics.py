@@ -55,20 +55,14 @@ def add_m(estimated: Rigid, true: Rigid, points_m: Float[Tensor, "n 3"]) -> Floa
 
 
 def adds_m(
-    estimated: Rigid, true: Rigid, points_m: Float[Tensor, "n 3"], *, from_estimate: bool = False
+    estimated: Rigid, true: Rigid, points_m: Float[Tensor, "n 3"]
 ) -> Float[Tensor, "*batch"]:
-    """ADD-S [m]: mean distance of each point to the nearest at the other pose.
+    """ADD-S [m]: mean distance of each true point to the nearest estimated one.
 
-    Args:
-        estimated: ``camera_from_model``.
-        true: the same, annotated.
-        points_m: of the model.
-        from_estimate: BOP and Hinterstoisser go from each true point to the nearest estimated one;
-            True goes the other way, as DenseFusion and the method's published code do.
+    So BOP and Hinterstoisser; DenseFusion and the method's published code go the other way, from
+    each estimated point to the nearest true one.
     """
     first, second = _moved(true, points_m), _moved(estimated, points_m)
-    if from_estimate:
-        first, second = second, first
     rows = zip(first.reshape(-1, *first.shape[-2:]), second.reshape(-1, *second.shape[-2:]),
                strict=True)  # fmt: skip
     means = [float(KDTree(b.numpy()).query(a.numpy())[0].mean()) for a, b in rows]
@@ -240,26 +234,3 @@ def _symmetric_copies(true: Rigid, symmetries: Rigid, points: int) -> list[Rigid
 
 def _is_visible(model: Tensor, measured: Tensor, delta_m: float) -> Bool[Tensor, "h w"]:
     return (model > 0) & ((model - measured <= delta_m) | (measured == 0))
-
-
-def risk_coverage(
-    risks: Float[Tensor, " n"], is_right: Bool[Tensor, " n"]
-) -> tuple[Float[Tensor, " m"], Float[Tensor, " m"]]:
-    """Trade answers against mistakes: refuse beyond each risk in turn (El-Yaniv and Wiener 2010).
-
-    Args:
-        risks: of all inputs; infinite where there is no answer at any risk.
-        is_right: whether the answer is.
-
-    Returns:
-        Coverage, the share of all inputs that is answered, and the share of those answers that is
-        wrong; one point for each different finite risk, from the least to the greatest.
-    """
-    order = risks.argsort(stable=True)
-    ordered, wrong = risks[order], (~is_right[order]).double().cumsum(0)
-    answered = torch.arange(1, len(risks) + 1, dtype=torch.float64)
-    # Equal risks are refused together: the last of them counts for all.
-    is_last = torch.ones_like(ordered, dtype=torch.bool)
-    is_last[:-1] = ordered[1:] > ordered[:-1]
-    kept = is_last & ordered.isfinite()
-    return (answered / max(len(risks), 1))[kept], (wrong / answered)[kept]

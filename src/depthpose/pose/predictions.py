@@ -84,11 +84,6 @@ def place_of(instance: Instance) -> Place:
     return Place(instance.scene_id, instance.image_id, instance.object_id)
 
 
-def is_started(folder: Path) -> bool:
-    """Whether a folder holds predictions."""
-    return (folder / POSES).is_file()
-
-
 def is_finished(prediction: Prediction) -> bool:
     """Whether a rerun need not estimate it: an input that was unreadable may be repaired."""
     return prediction.estimate.status != "unreadable"
@@ -124,7 +119,7 @@ def read_predictions(folder: Path) -> Predictions:
 def kept_predictions(folder: Path) -> list[Prediction]:
     """Read what earlier runs of this folder left; a damaged file is as none, and a notice."""
     try:
-        return read_predictions(folder) if is_started(folder) else []
+        return read_predictions(folder) if (folder / POSES).is_file() else []
     except InputError as error:
         warnings.warn(f"{error} - it is damaged, and made again", Notice, stacklevel=2)
         return []
@@ -362,7 +357,7 @@ def predict(
                 write_predictions(folder, done.values())
                 unsaved = 0
     finally:
-        if unsaved or not is_started(folder):
+        if unsaved or not (folder / POSES).is_file():
             write_predictions(folder, done.values())
 
 

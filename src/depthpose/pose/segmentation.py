@@ -138,15 +138,6 @@ def import_resnet18(file: Path, out: Path) -> None:
     save_imported(out, ENCODER_KIND, network, file, said)
 
 
-def read_encoder_state(path: Path) -> Mapping[str, Tensor]:
-    """Read the tensors that :func:`import_resnet18` wrote, for a network to start from.
-
-    Raises:
-        InputError: no such weights.
-    """
-    return read_checkpoint(path, ENCODER_KIND).state
-
-
 KIND = "segmentation"
 
 
@@ -348,20 +339,15 @@ def class_probabilities(network: FCN, image: Image) -> Float[Tensor, "classes h 
     device = next(network.parameters()).device
     height, width = image.shape[-2:]
     scale = network.config.long_side_px / max(height, width)
-    size = tuple(max(1, math.floor(side * scale + 0.5)) for side in (height, width))
-    small = resize_image(image.to(device), (size[0], size[1]))
+    size = (max(1, math.floor(height * scale + 0.5)), max(1, math.floor(width * scale + 0.5)))
+    small = image.to(device)
+    if size != (height, width):
+        small = F.interpolate(small[None], size, mode="bilinear", antialias=True)[0].clamp(0, 1)
     bottom, right = (-side % 32 for side in size)
     padded = F.pad(normalise_colors(small)[None], (0, right, 0, bottom), mode="replicate")
     logits = network(padded)[..., : size[0], : size[1]]
     logits = F.interpolate(logits, (height, width), mode="bilinear", align_corners=False)
     return logits[0].float().softmax(0).cpu()
-
-
-def resize_image(image: Image, size: tuple[int, int]) -> Float[Tensor, "3 rows columns"]:
-    """Resize an image to (rows, columns), averaging where it shrinks."""
-    if tuple(image.shape[-2:]) == size:
-        return image
-    return F.interpolate(image[None], size, mode="bilinear", antialias=True)[0].clamp(0, 1)
 
 
 def connected_parts(mask: Bool[Tensor, "h w"], config: SegmentationConfig) -> Bool[Tensor, "n h w"]:

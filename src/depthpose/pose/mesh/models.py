@@ -208,16 +208,14 @@ where the points are twice as far apart as usual."""
 
 
 def drawn_triangles(model: ObjectModel) -> Float[Tensor, "n 3 3"]:
-    """Give the faces of a model, or a disc at each point of one that has no faces."""
-    return model.triangles_m if len(model.faces) else surfel_triangles(model)
+    """Give the faces of a model, or a disc at each point of one that has no faces.
 
-
-def surfel_triangles(model: ObjectModel) -> Float[Tensor, "n 3 3"]:
-    """Lay a flat six-cornered disc on each point, across its normal (Pfister et al. 2000).
-
-    Each is as large as its own neighbourhood is sparse: the distance to the third nearest point,
-    but no more than twice the usual one, so that a stray point makes no plate.
+    A disc is flat and six-cornered, across its normal (Pfister et al. 2000), and as large as its
+    own neighbourhood is sparse: the distance to the third nearest point, but no more than twice the
+    usual one, so that a stray point makes no plate.
     """
+    if len(model.faces):
+        return model.triangles_m
     points = model.vertices_m.double()
     distance, _ = KDTree(points.numpy()).query(points.numpy(), k=min(4, len(points)))
     spacing = torch.from_numpy(distance[:, -1])

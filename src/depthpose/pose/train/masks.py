@@ -11,7 +11,7 @@ from jaxtyping import Float, Int, UInt8
 from torch import Tensor, nn
 
 from depthpose.core.arrays import grey_of
-from depthpose.core.checkpoint import Checkpoint, find_weights, load_weights
+from depthpose.core.checkpoint import Checkpoint, find_weights, load_weights, read_checkpoint
 from depthpose.core.errors import InputError
 from depthpose.core.files import read_image
 from depthpose.core.loop import (
@@ -31,6 +31,7 @@ from depthpose.pose.datasets.dataset import read_instance_mask
 from depthpose.pose.datasets.layouts import models_folder, object_name, read_models_info
 from depthpose.pose.losses import mask_loss
 from depthpose.pose.segmentation import (
+    ENCODER_KIND,
     FCN,
     KIND,
     Overlap,
@@ -38,7 +39,6 @@ from depthpose.pose.segmentation import (
     SegmentationWeights,
     class_probabilities,
     normalise_colors,
-    read_encoder_state,
     write_segmentation,
 )
 from depthpose.pose.synthetic.views import uniform, whole
@@ -260,7 +260,7 @@ def train_segmentation(config: SegmentationTraining, run: Run) -> Path:
     network = FCN(len(images.objects.names), config.network)
     if config.start is not None:
         path = find_weights(config.start)
-        held = Checkpoint(kind=KIND, config={}, state=read_encoder_state(path))
+        held = Checkpoint(kind=KIND, config={}, state=read_checkpoint(path, ENCODER_KIND).state)
         load_weights(network.encoder, held, str(path))
     claim_run(config, run)
     task = SegmentationTask(network, config, images.objects)
