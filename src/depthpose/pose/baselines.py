@@ -93,8 +93,7 @@ class FpfhConfig(Settings):
     """Of RANSAC."""
 
 
-EMPTY = -2.0
-"""Of a pixel without the object: below all that a depth can be, -1 to 1."""
+EMPTY = -2.0  #: of a pixel without the object: below all that a depth can be, -1 to 1
 
 
 class DepthCrop(NamedTuple):
@@ -201,8 +200,7 @@ _MODEL_POINTS = 20_000
 _NORMAL, _FEATURE, _CORRESPONDENCE, _ICP = 2.0, 5.0, 1.5, 0.4
 """Radius for normals and for features (Rusu et al. 2009), reach of RANSAC's correspondences and of
 the point-to-plane ICP that follows, in voxels, as Open3D's tutorial has them."""
-_LEAST = 3
-"""Points that a pose takes; Open3D answers fewer with a crash or with the identity."""
+_LEAST = 3  # points that a pose takes; Open3D answers fewer with a crash or with the identity
 
 
 class FpfhEstimator:

@@ -17,10 +17,8 @@ from depthpose.pose.types import CloudInput, CloudSample, ViewInput, ViewSample
 _LARGEST_CELL = 2**20
 _NEIGHBOURS = 20
 _MOST = 0.5
-_STEEP = 1.73
-"""Tangent of 60 degrees."""
-_FARTHEST_M = 1e6
-"""A coordinate beyond this marks a missing reading."""
+_STEEP = 1.73  # tangent of 60 degrees
+_FARTHEST_M = 1e6  # a coordinate beyond this marks a missing reading
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

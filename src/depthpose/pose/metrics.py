@@ -15,8 +15,7 @@ from torch import Tensor
 from depthpose.core.camera import pixel_grid, project
 from depthpose.core.rigid import Rigid, geodesic_rad
 
-VSD_DELTA_M = 0.015
-"""Tolerance of visibility [m]; BOP takes 15 mm for all sets but ITODD (5 mm)."""
+VSD_DELTA_M = 0.015  #: tolerance of visibility [m]; BOP takes 15 mm for all sets but ITODD (5 mm)
 BOP_SHARES = tuple(round(0.05 * i, 2) for i in range(1, 11))
 """BOP's taus of VSD and thresholds of VSD and MSSD: 0.05 to 0.5 (of the diameter)."""
 BOP_PIXELS = tuple(5.0 * i for i in range(1, 11))

@@ -37,8 +37,7 @@ from depthpose.pose.types import (
 
 AnswerT = TypeVar("AnswerT", Fit, Identity)
 POSES = "poses.json"
-VERSION = 1
-"""Of an entry of ``poses.json``; ``docs/poses.schema.json`` describes it."""
+VERSION = 1  #: of an entry of ``poses.json``; ``docs/poses.schema.json`` describes it
 PICTURE, CLOUD = "pose.png", "pose.ply"
 """What follows ``NAME.`` in the names of the files that show a pose."""
 STAGES = ("segmentation", "cloud", "network", "voting", "svd", "icp", "check", "registration")
@@ -434,8 +433,7 @@ def detection_jobs(
 
 
 _HEADER = ["scene_id", "im_id", "obj_id", "score", "R", "t", "time"]
-_SAME_TIME_S = 0.001
-"""BOP's toolkit refuses rows of an image whose times differ by more."""
+_SAME_TIME_S = 0.001  # BOP's toolkit refuses rows of an image whose times differ by more
 
 
 def results_name(dataset: BopDataset) -> str:

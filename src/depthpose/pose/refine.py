@@ -17,32 +17,25 @@ from depthpose.pose.surface import Surface, look_along_rays, match
 
 _CONVERGED = 3e-4
 """Stop when a step turns by less than this [rad] and shifts by less than this in diameters."""
-_TURN_RAD = math.radians(15)
-"""By how much further starts are turned."""
+_TURN_RAD = math.radians(15)  # by how much further starts are turned
 _ROUGH_LIMITS = (3.0, 2.4, 2.0, 1.6, 1.4, 1.2, 1.0, 1.0, 1.0, 1.0)
 """Of the starts, step by step, over the last limit of all: they begin farther off."""
-_ROUGH_POINTS = 100
-"""Points of the cloud that refine and compare starts."""
-_OCCLUDING_POINTS = 1000
-"""Points of the cloud that show what a pose would occlude."""
+_ROUGH_POINTS = 100  # points of the cloud that refine and compare starts
+_OCCLUDING_POINTS = 1000  # points of the cloud that show what a pose would occlude
 _UNSEEN = 0.3
 """What a surface that should be seen and is not counts against a pose: something may occlude it."""
-_OTHER = 0.1
-"""Mean distance between the points of two poses, in diameters, from which they are two."""
-_MOST_OTHERS = 3
-"""Poses beside the best at which starts ended, that are kept."""
+_OTHER = 0.1  # mean distance between the points of two poses, in diameters, from which they are two
+_MOST_OTHERS = 3  # poses beside the best at which starts ended, that are kept
 _TRUST = 0.02
 """Another start must bring so large a share of the points nearer to the surface than the given one
 to be believed: a plane fits many places, and noise would choose among them. Where a start ended
 roughly must explain the cloud better by as much than where it ended exactly to be preferred."""
 
-_BLOCKS = (0.15, 0.2, 0.3, 0.4)
-"""Sides of blocks of points whose errors may be alike, in diameters."""
+_BLOCKS = (0.15, 0.2, 0.3, 0.4)  # sides of blocks of points whose errors may be alike, in diameters
 _REST = 0.03
 """Of what holds a pose so much is always taken to be left where a block is left out: else a block
 that alone holds a direction would make it infinitely uncertain."""
-_LEAST_SLOPE = 0.25
-"""Least information of the weighted residuals, over that of constant weights."""
+_LEAST_SLOPE = 0.25  # least information of the weighted residuals, over that of constant weights
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

@@ -31,8 +31,7 @@ from depthpose.core.devices import usable_device
 from depthpose.core.errors import InputError
 
 ENCODER_KIND = "resnet18"
-WIDTHS = (64, 128, 256, 512)
-"""Channels of the four stages in the published network."""
+WIDTHS = (64, 128, 256, 512)  #: channels of the four stages in the published network
 
 Widths = tuple[int, int, int, int]
 MEAN, STD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)

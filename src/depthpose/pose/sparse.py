@@ -31,14 +31,11 @@ from depthpose.pose.compiled import serves
 
 FIELD_BITS = 17
 HALF = 1 << (FIELD_BITS - 1)
-REACH = 1 << 12
-"""Farthest that a kernel may look, in voxels of the finest level."""
+REACH = 1 << 12  #: farthest that a kernel may look, in voxels of the finest level
 
-COORDINATE_LIMIT = HALF - REACH
-"""Coordinates lie in [-COORDINATE_LIMIT, COORDINATE_LIMIT)."""
+COORDINATE_LIMIT = HALF - REACH  #: coordinates lie in [-COORDINATE_LIMIT, COORDINATE_LIMIT)
 
-CLOUD_LIMIT = 1 << (63 - 3 * FIELD_BITS)
-"""Clouds that one batch can hold."""
+CLOUD_LIMIT = 1 << (63 - 3 * FIELD_BITS)  #: clouds that one batch can hold
 
 Keys = Int64[Tensor, " _"]
 
@@ -363,8 +360,7 @@ clouds takes 101 ms with it, one of only 64 clouds offset by offset 169 ms (H200
 NARROW = 4
 """Inputs of up to this many channels are laid out as a table: their products are too thin."""
 
-TABLE_ELEMENTS = 1 << 25
-"""Largest such table."""
+TABLE_ELEMENTS = 1 << 25  #: largest such table
 
 
 COMPILED_ELEMENTS = 1 << 17

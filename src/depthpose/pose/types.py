@@ -25,8 +25,7 @@ Status = Literal[
 them. Unreadable: no input came; it is tried again by the next run. Doubtful: the pose does not fit
 what the camera saw, or another size or the mirror image fits better than the sensor explains."""
 
-POSED: tuple[Status, ...] = ("ok", "ambiguous")
-"""With a pose."""
+POSED: tuple[Status, ...] = ("ok", "ambiguous")  #: with a pose
 
 Tracking = Literal["tracked", "found", "lost"]
 """How an estimate of a sequence came about: followed from the frame before, looked for anew, or
@@ -40,7 +39,7 @@ class CloudInput:
     name: str  #: what the files of its results are called
     #: the visible part of one object, in the camera frame (x right, y down, z forward).
     points_m: Float[Tensor, "n 3"]
-    object: str  #: name of the object, as its :class:`ObjectModel` carries it
+    object: str  # as its ObjectModel is called; after "#:" the docs would take the builtin for it
     #: the depth image that the points are of, where there is one: what the camera saw through a
     #: pose is evidence against it.
     view: "ViewInput | None" = None
@@ -90,7 +89,7 @@ class ViewInput:
     mask: Bool[Tensor, "h w"]
     #: intrinsic matrix of this very image (a window's principal point is shifted).
     K: Float[Tensor, "3 3"]
-    object: str  #: name of the object
+    object: str  # name of the object
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -109,8 +108,7 @@ class Axis:
     point_m: Float[Tensor, "3"]  #: a point that the axis goes through
 
 
-_OTHER_AXIS = 0.1
-"""Sine of the angle from which two axes of revolution are two."""
+_OTHER_AXIS = 0.1  # sine of the angle from which two axes of revolution are two
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -255,7 +253,7 @@ class PoseEstimate:
     """The pose of one object, or the reason why there is none."""
 
     name: str  #: that of the input
-    object: str  #: name of the object
+    object: str  # name of the object
     status: Status  #: ``ok``, ``ambiguous``, or the kind of refusal
     reason: str = ""  #: one sentence for people; empty where the status is ``ok``
     #: the pose; None where it is refused. Where it is ambiguous, the likeliest.

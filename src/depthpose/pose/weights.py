@@ -33,8 +33,7 @@ from depthpose.pose.mesh import (
 from depthpose.pose.network import ResUNet, ResUNetConfig
 from depthpose.pose.types import ObjectModel
 
-DirectionNet = ResUNet | PointNet
-"""Networks whose points vote."""
+DirectionNet = ResUNet | PointNet  #: networks whose points vote
 AnyNetwork = DirectionNet | DepthImageNet
 KIND = "geoposenet"
 _NETWORKS: dict[str, tuple[type[AnyNetwork], type]] = {
@@ -43,8 +42,7 @@ _NETWORKS: dict[str, tuple[type[AnyNetwork], type]] = {
     "depth-image": (DepthImageNet, DepthImageConfig),
 }
 """Network and config of each kind of file: the method's, and those of its baselines."""
-_OFF = 0.02
-"""Keypoints lie on the surface; so many diameters off the mesh, it is another one."""
+_OFF = 0.02  # keypoints lie on the surface; so many diameters off the mesh, it is another one
 _OTHER_SIZE = 0.05
 """So much longer or shorter, a mesh is another one; declared diameters are off by less."""
 _SURFACE = ("vertices_m", "faces", "normals")

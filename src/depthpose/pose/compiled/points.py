@@ -103,8 +103,7 @@ def jacobi(A, V):
 
 
 Array = np.ndarray
-_LEAF = 8
-"""Points of a range that is not parted any more."""
+_LEAF = 8  # points of a range that is not parted any more
 
 
 class Tree(NamedTuple):

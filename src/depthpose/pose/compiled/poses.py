@@ -307,8 +307,7 @@ def _grow(local, times, middle, limits, target, is_exact, converged, variance):
             break
 
 
-_FARTHEST = 1e9
-"""A step beyond this is none."""
+_FARTHEST = 1e9  # a step beyond this is none
 
 
 def fitted(

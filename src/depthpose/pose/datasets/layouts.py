@@ -24,8 +24,7 @@ _ROTATION_SLACK = 1e-2
 """Published annotations are rounded; LineMOD's rotations are off by up to a few thousandths."""
 
 
-MOST = 10**9
-"""Of scenes, images and objects: their numbers name files."""
+MOST = 10**9  #: of scenes, images and objects: their numbers name files
 
 
 def entry_number(key: object) -> int | None:
@@ -244,11 +243,9 @@ def read_targets(path: str | Path, folder: str | Path = ".") -> list[BopTarget]:
 _OF_YAML = {b"[": 750, b"{": 750, b",": 450, b":": 500, b"\n": 500, b"- ": 500}
 """Bytes that a value takes while it is read, measured with PyYAML 6."""
 
-_MAX_BYTES = 2**22
-"""Of a list of images."""
+_MAX_BYTES = 2**22  # of a list of images
 
-SYMMETRIC = (10, 11)
-"""Eggbox and glue: measured by ADD-S ever since Hinterstoisser et al. (2012)."""
+SYMMETRIC = (10, 11)  #: Eggbox and glue: measured by ADD-S ever since Hinterstoisser et al. (2012).
 
 
 def linemod_symmetries(number: int) -> Symmetries:

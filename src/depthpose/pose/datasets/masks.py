@@ -15,11 +15,9 @@ from depthpose.core.files import read_json, write_json
 from depthpose.core.files.images import MAX_PIXELS, opened_image
 from depthpose.pose.datasets.layouts import integer, number, read_rows
 
-Runs = tuple[tuple[int, ...], int, int]
-"""Run lengths, height and width."""
+Runs = tuple[tuple[int, ...], int, int]  #: run lengths, height and width
 _MOST_LABELS, _HALF, _SOFT = 64, 127, 32
-_MOST_BITS = 40
-"""Of a run length in text: no image has as many pixels."""
+_MOST_BITS = 40  # of a run length in text: no image has as many pixels
 
 
 def read_mask(path: Path) -> Bool[Tensor, "mask_h mask_w"]:

@@ -35,8 +35,7 @@ from depthpose.pose.types import CloudInput, ObjectModel, PoseEstimate, ViewInpu
 from depthpose.pose.voting.point_pairs import PairTable, prepare_pairs
 
 Made = TypeVar("Made")
-_NAME = "input"
-"""What an input is called that came without a name."""
+_NAME = "input"  # what an input is called that came without a name
 
 
 class PoseEstimator(ABC):

@@ -41,10 +41,8 @@ from depthpose.pose.mesh import unit_advice
 from depthpose.pose.segmentation import label_parts
 from depthpose.pose.types import CloudInput, ObjectModel, Status, ViewInput
 
-AnyArray = str | Path | np.ndarray | Tensor
-"""A file, an array or a tensor."""
-AnyMask = AnyArray | Mapping[str, Any]
-"""A mask, its file, or COCO's run lengths."""
+AnyArray = str | Path | np.ndarray | Tensor  #: a file, an array or a tensor
+AnyMask = AnyArray | Mapping[str, Any]  #: a mask, its file, or COCO's run lengths
 _SMALLEST_INSTANCE = 0.2
 """Pieces of a mask below this share of the largest are fragments of a segmentation, not objects."""
 AnyInput = CloudInput | ViewInput
@@ -52,8 +50,7 @@ _MOST = 0.5
 """Where most points lie farther from their median than the object is long, they are not its."""
 _BEFORE = 0.05
 """Nearly all points of a cloud that was seen lie so many diameters before the camera, and more."""
-_THIN = 0.002
-"""Below this root mean square, in diameters, a cloud has no extent."""
+_THIN = 0.002  # below this root mean square, in diameters, a cloud has no extent
 
 
 def cloud_input(cloud: AnyArray, unit: Unit, object: str, name: str) -> CloudInput:

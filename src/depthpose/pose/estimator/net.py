@@ -52,8 +52,7 @@ from depthpose.pose.types import (
 from depthpose.pose.voting import consistent_keypoints, fit_pose, meet_lines, vote_ransac
 from depthpose.pose.weights import PoseWeights, read_pose_weights
 
-_LEAST = 4
-"""Keypoints that must agree: three fix a pose with nothing left to contradict it."""
+_LEAST = 4  # keypoints that must agree: three fix a pose with nothing left to contradict it
 _DOUBTED: tuple[Status, ...] = ("votes do not meet", "keypoints do not fit", "doubtful")
 """What the network could not answer, and another method may; the rest is due to the input."""
 _NEEDS_MASK = "a regressed depth image takes a depth image with a mask; give both, or other weights"

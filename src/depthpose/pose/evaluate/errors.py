@@ -164,8 +164,7 @@ def _apply(pose: Rigid, triangles_m: Float[Tensor, "f 3 3"]) -> Float[Tensor, "f
     return triangles_m @ pose.R.double().mT + pose.t_m.double()
 
 
-_read_depth = lru_cache(maxsize=4)(read_depth_png)
-"""Instances of one image follow each other."""
+_read_depth = lru_cache(maxsize=4)(read_depth_png)  # instances of one image follow each other
 
 METRICS = {
     "error_m": Metric(  # ADD, or ADD-S where that decides a success
@@ -275,10 +274,8 @@ def _is_own(prediction: Prediction, places: Mapping[str, Place]) -> bool:
     return place is not None and prediction.place in (None, place)
 
 
-_TRIED = 40
-"""Instances that each change is tried on."""
-_MORE = 0.2
-"""A change is said where so large a share more is right by it."""
+_TRIED = 40  # instances that each change is tried on
+_MORE = 0.2  # a change is said where so large a share more is right by it
 _SCALES = {
     1.0: "",
     1000.0: "t were 1000 times larger (is it in metres? BOP's csv has millimetres)",

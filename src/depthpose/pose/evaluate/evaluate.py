@@ -87,7 +87,7 @@ class InstanceRow(_Row):
     """One instance and the errors of its estimate."""
 
     instance: str  #: its name
-    object: str  #: name of its model
+    object: str  # name of its model
     status: str  #: of the estimate; ``missing`` where there is none
     is_success: bool  #: whether ADD (ADD-S of a symmetric object) is below a tenth of the diameter
     score: Number  #: of the answer, larger is surer
@@ -112,7 +112,7 @@ class InstanceRow(_Row):
 class ObjectRow(_Row):
     """The instances of an object, the ``mean`` of objects, or ``all`` instances."""
 
-    object: str  #: what the row is called
+    object: str  # what the row is called
     instances: int  #: how many
     annotated: int  #: how many of them have a pose that was annotated, not fitted
     success: float  #: share of instances

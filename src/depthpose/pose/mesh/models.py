@@ -200,8 +200,7 @@ def sample_surface(
     return points.to(model.vertices_m), normals.to(model.vertices_m)
 
 
-_CORNERS = 6
-"""Of a disc: three quarters of its area, in four triangles."""
+_CORNERS = 6  # of a disc: three quarters of its area, in four triangles
 _DISC = 1.6
 """Radius of a disc, in spacings of its points: neighbours then overlap, and nothing shows through
 where the points are twice as far apart as usual."""
@@ -269,16 +268,11 @@ def fibonacci_directions(count: int) -> Float[Tensor, "count 3"]:
 
 
 _SIDE_DIRECTIONS = 32
-CELL = 2.0
-"""Side of a ray's cell in mean distances of samples: four samples in each on average."""
-_SAME = 0.5
-"""Up to so many mean distances from another's plane a sample is of the same sheet."""
-_SLANT = 0.3
-"""Least cosine at which a sample is looked at."""
-_SEEN = 0.1
-"""Least share of directions from which an outer side is seen."""
-_CLEARER = 0.4
-"""The inner side is seen in at most so many times the directions of the outer."""
+CELL = 2.0  #: side of a ray's cell in mean distances of samples: four samples in each on average
+_SAME = 0.5  # up to so many mean distances from another's plane a sample is of the same sheet
+_SLANT = 0.3  # least cosine at which a sample is looked at
+_SEEN = 0.1  # least share of directions from which an outer side is seen
+_CLEARER = 0.4  # the inner side is seen in at most so many times the directions of the outer
 
 
 def outward_normals(points: np.ndarray, normals: np.ndarray, cell: float) -> np.ndarray:
@@ -497,8 +491,7 @@ def refuse_one_name(models: Sequence[ObjectModel]) -> None:
         )
 
 
-_HULL = 8000
-"""Corners of a hull of which all pairs are compared; more take seconds."""
+_HULL = 8000  # corners of a hull of which all pairs are compared; more take seconds
 _HULL_DIRECTIONS = 4096
 """No direction is farther than 0.03 rad from one of these, whose cosine is 0.9995."""
 

@@ -30,8 +30,7 @@ from depthpose.pose.types import Axis, ObjectModel, Symmetries
 
 ValueT = TypeVar("ValueT")
 
-_MOST_IN_MEMORY = 128
-"""Values in memory."""
+_MOST_IN_MEMORY = 128  # values in memory
 _memory: OrderedDict[str, Any] = OrderedDict()
 
 
@@ -85,10 +84,8 @@ _COARSE = 0.04
 that is off by 4 degrees moves the surface by about as much."""
 _SAME_RAD = 0.15
 _SUPPRESSION_RAD = 0.25
-SURE = 0.5
-"""Certainty from which a proposal is taken: that of a copy that is off by the tolerance."""
-_MOST_AXES = 40
-"""A cube has 13 axes, an icosahedron 31."""
+SURE = 0.5  #: certainty from which a proposal is taken: that of a copy that is off by the tolerance
+_MOST_AXES = 40  # a cube has 13 axes, an icosahedron 31
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -344,8 +341,7 @@ _MIRROR_PLANES = 400
 _MIRROR_STARTS = 8
 _APART_RAD = math.radians(25)
 _STEPS = 20
-_NEAREST = 0.9
-"""Points that count in each step of ICP."""
+_NEAREST = 0.9  # points that count in each step of ICP
 _FLIP = torch.diag(torch.tensor([-1.0, 1.0, 1.0], dtype=torch.float64))
 
 
@@ -409,12 +405,10 @@ points of LineMOD and YCB lie 1.4 to 2.6 % of the diameter off the posed surface
 tried."""
 _NEAR_SUPPRESSION_RAD = math.radians(35)
 """Turns nearer to each other are one: ICP goes from one to the other."""
-_STEP = math.pi / 8
-"""An axis that nearly is one of revolution counts as eight turns."""
+_STEP = math.pi / 8  # an axis that nearly is one of revolution counts as eight turns
 _FINE_STEP = math.pi / 36
 _MOST_NEAR = 24
-_NEAR_STARTS = 24
-"""Turns that ICP refines."""
+_NEAR_STARTS = 24  # turns that ICP refines
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

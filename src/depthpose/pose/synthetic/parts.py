@@ -19,8 +19,7 @@ from depthpose.pose.types import Axis, ObjectModel, Symmetries
 Mesh = tuple[np.ndarray, np.ndarray]
 """Corners (n, 3) [mm] and faces (m, 3), counter-clockwise seen from outside."""
 
-_ROUND = 96
-"""Corners of a circle."""
+_ROUND = 96  # corners of a circle
 _TEETH = 6
 
 

@@ -45,8 +45,7 @@ _STEPS_A_PIXEL = 8
 _STEREO_BASELINE_M = 0.05
 _STEREO_STEPS_A_PIXEL = 32
 _STEREO_CORRELATION_PX = (3.0, 6.0)
-_STEREO_WINDOW = 2
-"""Pixels by which active stereo displaces an edge at most."""
+_STEREO_WINDOW = 2  # pixels by which active stereo displaces an edge at most
 _STEEPEST = math.tan(math.radians(80))
 """No sensor reads a surface that is turned farther away than 80 degrees."""
 _JUMP = 0.02
@@ -248,8 +247,7 @@ def _displaced(depth_m: Depth, scale: float, generator: torch.Generator) -> Dept
     return depth_m[rows, columns]
 
 
-MARGIN_PX = 8
-"""Around the object: what lies behind it must be seen where a mask is too large."""
+MARGIN_PX = 8  #: around the object: what lies behind it must be seen where a mask is too large
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -355,8 +353,7 @@ def turn_view(
 
 
 _BANK_SEED = 0x0B7EC7
-_TILT_RAD = math.radians(75)
-"""A table is seen from no flatter an angle."""
+_TILT_RAD = math.radians(75)  # a table is seen from no flatter an angle
 
 
 class Objects:

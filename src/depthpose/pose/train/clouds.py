@@ -39,8 +39,7 @@ from depthpose.pose.types import (
 from depthpose.pose.voting import fit_pose, meet_lines, vote_ransac
 from depthpose.pose.weights import DirectionNet, PoseWeights
 
-TRIES = 20
-"""Samples in a row that may show too little."""
+TRIES = 20  #: samples in a row that may show too little
 
 
 class Cloud(NamedTuple):
@@ -251,8 +250,7 @@ def read_models(
     )
 
 
-HELD_OUT_SEED = 0x4E1D
-"""Added to the seed of the views that are trained on."""
+HELD_OUT_SEED = 0x4E1D  #: added to the seed of the views that are trained on
 _TOGETHER = 8
 _SURFACE = 1000
 

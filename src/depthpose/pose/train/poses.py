@@ -126,8 +126,7 @@ def symmetric_copies(models: Sequence[ObjectModel], step_rad: float) -> Rigid:
     return Rigid(R, t_m)
 
 
-_TURNS_ON_CARD = 3
-"""Turns of an object that look nearly alike, on a card."""
+_TURNS_ON_CARD = 3  # turns of an object that look nearly alike, on a card
 
 
 def claim_run(config: Any, run: Run, files: Sequence[str] = ()) -> None:  # noqa: ANN401
