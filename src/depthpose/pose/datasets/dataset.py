@@ -48,13 +48,7 @@ from depthpose.pose.mesh import (
     symmetries_to_bop,
     unit_advice,
 )
-from depthpose.pose.types import (
-    CloudSample,
-    ObjectModel,
-    PoseTruth,
-    ViewInput,
-    ViewSample,
-)
+from depthpose.pose.types import CloudSample, ObjectModel, PoseTruth, ViewInput, ViewSample
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

@@ -29,13 +29,7 @@ from depthpose.core.rigid import Rigid, turn_axis_to
 from depthpose.pose.cloud import grow_mask, lift_sample
 from depthpose.pose.config import CloudConfig, ObjectsConfig, SensorConfig, SensorKind
 from depthpose.pose.mesh import drawn_triangles
-from depthpose.pose.types import (
-    CloudSample,
-    ObjectModel,
-    PoseTruth,
-    ViewInput,
-    ViewSample,
-)
+from depthpose.pose.types import CloudSample, ObjectModel, PoseTruth, ViewInput, ViewSample
 
 Depth = Float[Tensor, "h w"]
 Mask = Bool[Tensor, "h w"]

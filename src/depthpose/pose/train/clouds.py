@@ -28,14 +28,7 @@ from depthpose.pose.mesh import (
 from depthpose.pose.metrics import add_of_nearest_m, is_within_diameter
 from depthpose.pose.synthetic import Objects, make_part
 from depthpose.pose.train.config import FramesConfig, HeldOutConfig, ModelsConfig
-from depthpose.pose.types import (
-    CloudSample,
-    ObjectModel,
-    PoseEstimate,
-    PoseTruth,
-    SeenPoints,
-    Vote,
-)
+from depthpose.pose.types import CloudSample, ObjectModel, PoseEstimate, PoseTruth, SeenPoints, Vote
 from depthpose.pose.voting import fit_pose, meet_lines, vote_ransac
 from depthpose.pose.weights import DirectionNet, PoseWeights
 
