@@ -21,7 +21,6 @@ from depthpose.pose.metrics import (
     adds_m,
     auc,
     average_recall,
-    is_within_diameter,
     mspd_px,
     mssd_m,
     rotation_error_rad,
@@ -138,8 +137,6 @@ def test_add_takes_batches() -> None:
 def test_missing_estimates_stay_in_the_denominator() -> None:
     errors = torch.tensor([0.0, 0.05, math.inf, math.nan])
     assert auc(errors) == pytest.approx((1 + 0.5) / 4)
-    assert is_within_diameter(errors, 0.6).tolist() == [True, True, False, False]
-    assert is_within_diameter(errors / 0.6).tolist() == [True, True, False, False]
     assert average_recall(errors[:, None], BOP_SHARES) == pytest.approx((10 + 9) / 40)
     assert len(BOP_PIXELS) == 10
 

@@ -21,6 +21,8 @@ BOP_SHARES = tuple(round(0.05 * i, 2) for i in range(1, 11))
 BOP_PIXELS = tuple(5.0 * i for i in range(1, 11))
 """BOP's thresholds of MSPD [px], for an image 640 wide."""
 
+SUCCESS_SHARE = 0.1  #: of the diameter: a pose is right whose ADD or ADD-S is below
+
 _CHUNK = 2**22
 
 RenderDepth = Callable[[Rigid], Float[Tensor, "h w"]]
@@ -171,16 +173,6 @@ def vsd(
     alone = count - int(both.sum())
     bad = torch.stack([(gap_m >= tau).sum() for tau in taus_m])
     return (bad.double() + alone) / count
-
-
-def is_within_diameter(
-    error_m: Float[Tensor, "*batch"], diameter_m: float = 1.0, share: float = 0.1
-) -> Bool[Tensor, "*batch"]:
-    """Whether an ADD or ADD-S is below a share of the diameter; NaN (no estimate) is not.
-
-    Errors in diameters, as :func:`add_share` gives them, have a diameter of 1.
-    """
-    return error_m < share * diameter_m
 
 
 def auc(error_m: Float[Tensor, " n"], limit_m: float = 0.1) -> float:

@@ -28,7 +28,7 @@ from depthpose.core.files.disk import write_bytes
 from depthpose.core.findings import CheckReport, Problem, make_report, unreadable
 from depthpose.core.rigid import Rigid
 from depthpose.pose.cloud import cloud_from_depth, lift_sample, refusal_of, refuse_other_size
-from depthpose.pose.config import CloudConfig, MeshConfig
+from depthpose.pose.config import CloudConfig
 from depthpose.pose.datasets.layouts import (
     Instance,
     find_layout,
@@ -59,7 +59,6 @@ class BopDataset:
     split: str  #: its name
     layout: str  #: a key of ``LAYOUTS``
     instances: Sequence[Instance]  #: what is annotated, in the order of scene, image and place
-    mesh_config: MeshConfig  #: for its models
     cloud_config: CloudConfig  #: for its clouds
     sha256: str  #: of all annotations of the split: tells data sets of one name apart
 
@@ -79,7 +78,7 @@ class BopDataset:
             InputError: a mesh is missing or damaged.
         """
         numbers = {instance.object_id for instance in self.instances}
-        return read_bop_models(self.folder, numbers, self.mesh_config)
+        return read_bop_models(self.folder, numbers)
 
     def sample(
         self, instance: Instance, mask: Bool[Tensor, "mask_h mask_w"] | None = None
@@ -151,7 +150,6 @@ def open_bop(
     folder: str | Path,
     split: str = "test",
     *,
-    mesh: MeshConfig | None = None,
     cloud: CloudConfig | None = None,
 ) -> BopDataset:
     """Open a split of a data set in BOP's layout, or in another of ``LAYOUTS``.
@@ -159,7 +157,6 @@ def open_bop(
     Args:
         folder: of the data set, with ``models`` and the splits in it.
         split: ``test``, ``train_pbr``, ...; ``train`` or ``test`` of Linemod_preprocessed.
-        mesh: how many keypoints its models get.
         cloud: how its clouds are cut.
 
     Raises:
@@ -178,7 +175,6 @@ def open_bop(
         split=split,
         layout=name,
         instances=instances,
-        mesh_config=MeshConfig() if mesh is None else mesh,
         cloud_config=CloudConfig() if cloud is None else cloud,
         sha256=said.hexdigest(),
     )

@@ -21,6 +21,7 @@ from depthpose.pose.mesh import drawn_triangles, symmetry_transforms, turn_about
 from depthpose.pose.metrics import (
     BOP_PIXELS,
     BOP_SHARES,
+    SUCCESS_SHARE,
     View,
     add_m,
     adds_m,
@@ -303,7 +304,6 @@ def convention_advice(
     dataset: BopDataset,
     predictions: Sequence[Prediction],
     contexts: Mapping[int, ErrorContext],
-    limit: float,
 ) -> str | None:
     """Say by which change of all predictions many more were right; None where by none."""
     answers = [p for p in predictions if p.estimate.is_posed]
@@ -332,7 +332,7 @@ def convention_advice(
             pose, context = found[instance.name].camera_from_model, contexts[instance.object_id]
             assert pose is not None
             error_m = METRICS["error_m"].measure(pose, instance, context)
-            right += float(error_m) < limit * context.diameter_m
+            right += float(error_m) < SUCCESS_SHARE * context.diameter_m
         return right, len(some)
 
     now, tried = count_right()

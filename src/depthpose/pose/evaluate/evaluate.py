@@ -23,6 +23,7 @@ from depthpose.pose.evaluate.errors import (
     match,
     measure,
 )
+from depthpose.pose.metrics import SUCCESS_SHARE
 from depthpose.pose.predictions import (
     STAGES,
     Place,
@@ -289,9 +290,6 @@ def is_adds(model: ObjectModel, config: EvaluationConfig) -> bool:
     return config.adds == "all" or not model.symmetries.is_none
 
 
-SUCCESS_SHARE = 0.1
-
-
 @dataclass(frozen=True, kw_only=True)
 class Evaluation:
     """What evaluating one set of predictions gave."""
@@ -401,7 +399,7 @@ def evaluate(
         rows=[replace(row, conditions=conditions) for row in summed],
         per_instance=rows,
         risk=[replace(row, conditions=conditions) for row in risk_rows(rows)],
-        advice=convention_advice(dataset, predictions, contexts, SUCCESS_SHARE),
+        advice=convention_advice(dataset, predictions, contexts),
     )
 
 

@@ -25,7 +25,7 @@ from depthpose.pose.mesh import (
     symmetry_transforms,
     with_found_symmetries,
 )
-from depthpose.pose.metrics import add_of_nearest_m, is_within_diameter
+from depthpose.pose.metrics import SUCCESS_SHARE, add_of_nearest_m
 from depthpose.pose.synthetic import Objects, make_part
 from depthpose.pose.train.config import FramesConfig, HeldOutConfig, ModelsConfig
 from depthpose.pose.types import CloudSample, ObjectModel, PoseEstimate, PoseTruth, SeenPoints, Vote
@@ -318,7 +318,7 @@ def held_out_numbers(
     """Name the share of right ones among errors in diameters, and their median."""
     place = f"held_out/occluded_{round(100 * occlusion)}/{method}"
     return {
-        f"{place}_add_10": float(is_within_diameter(errors).float().mean()),
+        f"{place}_add_10": float((errors < SUCCESS_SHARE).float().mean()),
         f"{place}_median": float(errors.median()),
     }
 
@@ -374,7 +374,7 @@ def score_held_out(weights: PoseWeights, synthetic: ObjectsConfig, config: HeldO
         estimates, errors = _posed(weights, objects)
         answered = [e for e, estimate in zip(errors, estimates, strict=True) if estimate.is_ok]
         posed = sorted(e for e in errors if e < math.inf)
-        right = int(is_within_diameter(torch.tensor(answered)).sum())
+        right = sum(e < SUCCESS_SHARE for e in answered)
         table[f"{round(100 * occlusion)}"] = {
             "right": right / len(errors),
             "ambiguous": (len(posed) - len(answered)) / len(errors),
