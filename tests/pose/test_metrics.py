@@ -15,7 +15,6 @@ from depthpose.pose.metrics import (
     BOP_PIXELS,
     BOP_SHARES,
     VSD_DELTA_M,
-    View,
     add_m,
     add_of_nearest_m,
     adds_m,
@@ -153,9 +152,9 @@ def test_vsd_counts_what_is_seen_in_one_render_alone() -> None:
     first = Rigid(torch.eye(3).double(), torch.tensor([0.0, 0, 0]).double())
     second = Rigid(torch.eye(3).double(), torch.tensor([1.0, 0, 0]).double())
     # Truth covers columns 0-1, the estimate 1-3: one of four columns is common and right.
-    assert vsd(second, first, View(depth_m=flat, K=K, render=render), [0.01]).tolist() == [0.75]
+    assert vsd(second, first, flat, K, render, [0.01]).tolist() == [0.75]
     nothing = torch.full((4, 4), 0.5).double()
-    assert vsd(second, first, View(depth_m=nothing, K=K, render=render), [0.01, 0.1]).tolist() == [
+    assert vsd(second, first, nothing, K, render, [0.01, 0.1]).tolist() == [
         1,
         1,
     ]

@@ -207,7 +207,7 @@ def colored(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def test_labels_are_the_classes_of_the_masks(colored: Path) -> None:
     images = AnnotatedImages(ImagesConfig(folder=str(colored)))
-    assert (images.objects.names, images.objects.numbers) == (("bottle", "bracket"), (3, 7))
+    assert images.objects == {3: "bottle", 7: "bracket"}
     for _ in range(2):  # read, then out of memory
         image, labels = images[2]
         red, green = (o.visible for o in colored_frame(2).objects)
@@ -215,7 +215,7 @@ def test_labels_are_the_classes_of_the_masks(colored: Path) -> None:
         assert torch.equal(labels == 2, red & ~green)
         assert float(image[0][labels == 2].mean()) > 0.5
     only = AnnotatedImages(ImagesConfig(folder=str(colored), objects=(7,), limit=3))
-    assert (len(only), only.objects.names, only[0].labels.unique().tolist()) == (
+    assert (len(only), tuple(only.objects.values()), only[0].labels.unique().tolist()) == (
         3, ("bracket",), [0, 1],
     )  # fmt: skip
 

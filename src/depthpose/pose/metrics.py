@@ -5,7 +5,6 @@ Computed in float64.
 """
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
 
 import torch
 from jaxtyping import Bool, Float
@@ -27,17 +26,6 @@ _CHUNK = 2**22
 
 RenderDepth = Callable[[Rigid], Float[Tensor, "h w"]]
 """Renders the depth [m] of an object at a pose; NaN, 0 or infinity where it is not."""
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class View:
-    """What VSD compares poses in."""
-
-    depth_m: Float[Tensor, "h w"]  #: measured; NaN or 0 where there is no reading
-    K: Float[Tensor, "3 3"]  #: intrinsic matrix of that image
-    #: depth of the object at a pose, in this camera; with ``core.render`` ``lambda pose:
-    #: rasterize(pose.apply(corners), K, width, height).depth_m``.
-    render: RenderDepth
 
 
 def rotation_error_rad(estimated: Rigid, true: Rigid) -> Float[Tensor, "*batch"]:
@@ -137,7 +125,13 @@ def mspd_px(
 
 
 def vsd(
-    estimated: Rigid, true: Rigid, view: View, taus_m: Sequence[float], delta_m: float = VSD_DELTA_M
+    estimated: Rigid,
+    true: Rigid,
+    depth_m: Float[Tensor, "h w"],
+    K: Float[Tensor, "3 3"],
+    render: RenderDepth,
+    taus_m: Sequence[float],
+    delta_m: float = VSD_DELTA_M,
 ) -> Float[Tensor, " t"]:
     """VSD: share of the visible surface whose distance is off by ``tau`` or more, for each tau.
 
@@ -149,19 +143,22 @@ def vsd(
     Args:
         estimated: ``camera_from_model``.
         true: the same, annotated.
-        view: the measured image, and how the object is drawn into it.
+        depth_m: measured; NaN or 0 where there is no reading.
+        K: intrinsic matrix of that image.
+        render: depth of the object at a pose, in this camera; with ``core.render``
+            ``lambda pose: rasterize(pose.apply(corners), K, width, height).depth_m``.
         taus_m: tolerances; BOP's are ``BOP_SHARES`` times the diameter.
         delta_m: tolerance of visibility.
     """
     # Distance from the centre of a point at depth 1, by pixel.
-    (height, width), K = view.depth_m.shape, view.K
+    height, width = depth_m.shape
     pixels = pixel_grid(height, width, torch.float64)
     y = (pixels[..., 1] - K[1, 2]) / K[1, 1]
     x = (pixels[..., 0] - K[0, 2] - K[0, 1] * y) / K[0, 0]
     rays = (x * x + y * y + 1).sqrt()
     measured, found, known = (
-        depth_m.double().nan_to_num(nan=0.0, posinf=0.0) * rays
-        for depth_m in (view.depth_m, view.render(estimated), view.render(true))
+        image_m.double().nan_to_num(nan=0.0, posinf=0.0) * rays
+        for image_m in (depth_m, render(estimated), render(true))
     )
     is_known = _is_visible(known, measured, delta_m)
     is_found = _is_visible(found, measured, delta_m) | (is_known & (found > 0))

@@ -195,11 +195,6 @@ class PoseFit:
     covariance: Float[Tensor, "*batch 6 6"]
     #: root mean square distance of the keypoints that were used.
     residual_m: Float[Tensor, "*batch"]
-    #: squared distances in units of their covariance, over the degrees of freedom: about 1 where
-    #: the covariances of the keypoints are right, far above 1 where the keypoints do not fit the
-    #: rigid model.
-    misfit: Float[Tensor, "*batch"]
-    is_used: Bool[Tensor, "*batch k"]  #: the keypoints that agree with the shape of the model
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

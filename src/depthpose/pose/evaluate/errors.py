@@ -22,7 +22,6 @@ from depthpose.pose.metrics import (
     BOP_PIXELS,
     BOP_SHARES,
     SUCCESS_SHARE,
-    View,
     add_m,
     adds_m,
     auc,
@@ -156,9 +155,8 @@ def _vsd(estimated: Rigid, instance: Instance, context: ErrorContext) -> Float[T
         triangles_m = _apply(pose, context.triangles_m)
         return rasterize(triangles_m, K, width, height, with_barycentric=False).depth_m
 
-    view = View(depth_m=window, K=K, render=render)
     taus_m = [share * context.diameter_m for share in BOP_SHARES]
-    return vsd(*poses, view, taus_m, context.vsd_delta_m)
+    return vsd(*poses, window, K, render, taus_m, context.vsd_delta_m)
 
 
 def _apply(pose: Rigid, triangles_m: Float[Tensor, "f 3 3"]) -> Float[Tensor, "f 3 3"]:

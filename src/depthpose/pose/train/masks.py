@@ -1,7 +1,6 @@
 """Training of segmentation: annotated images, random changes of them, and the task."""
 
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -53,18 +52,10 @@ class LabelledImage(NamedTuple):
     labels: Int[Tensor, "*b h w"]  #: 0 is the background, ``1 + i`` object i
 
 
-@dataclass(frozen=True, kw_only=True)
-class KnownObjects:
-    """The objects that a data set shows, in the order of the classes."""
-
-    names: tuple[str, ...]
-    numbers: tuple[int, ...]
-
-
 class AnnotatedImages:
     """Images of a data set with their labels."""
 
-    def __init__(self, config: ImagesConfig, objects: KnownObjects | None = None) -> None:
+    def __init__(self, config: ImagesConfig, objects: Mapping[int, str] | None = None) -> None:
         if not config.folder:
             raise InputError("there is no image to learn from; name a folder in BOP's layout")
         dataset = open_bop(config.folder, config.split)
@@ -83,10 +74,9 @@ class AnnotatedImages:
                     f"{there}"
                 )
             infos = read_models_info(models_folder(Path(config.folder)))
-            names = tuple(object_name(number, infos.get(number, {})) for number in wanted)
-            objects = KnownObjects(names=names, numbers=tuple(wanted))
-        self.objects = objects
-        self._class_of = {number: k for k, number in enumerate(self.objects.numbers, 1)}
+            objects = {number: object_name(number, infos.get(number, {})) for number in wanted}
+        self.objects = objects  # names by number, in the order of the classes
+        self._class_of = {number: k for k, number in enumerate(objects, 1)}
         every = list(images.values())
         count = len(every) if config.limit is None else min(config.limit, len(every))
         self._images = [every[k * len(every) // count] for k in range(count)]
@@ -203,7 +193,9 @@ def jitter_colors(
 class SegmentationTask:
     """Cross entropy of each pixel, objects weighing more."""
 
-    def __init__(self, network: FCN, config: SegmentationTraining, objects: KnownObjects) -> None:
+    def __init__(
+        self, network: FCN, config: SegmentationTraining, objects: Mapping[int, str]
+    ) -> None:
         self.config, self.objects = config, objects
         self.network = network.train()
         self.modules: dict[str, nn.Module] = {"network": network}
@@ -245,7 +237,7 @@ class SegmentationTask:
         iou = overlap.iou()
         numbers = {
             f"held_out/iou_{name}": float(value)
-            for name, value in zip(("background", *self.objects.names), iou, strict=True)
+            for name, value in zip(("background", *self.objects.values()), iou, strict=True)
             if bool(value.isfinite())
         }
         numbers["held_out/iou_objects"] = float(iou[1:].nanmean())
@@ -257,7 +249,7 @@ def train_segmentation(config: SegmentationTraining, run: Run) -> Path:
     """Train FCN; give its weights file."""
     torch.manual_seed(config.loop.seed)
     images = AnnotatedImages(config.images)
-    network = FCN(len(images.objects.names), config.network)
+    network = FCN(len(images.objects), config.network)
     if config.start is not None:
         path = find_weights(config.start)
         held = Checkpoint(kind=KIND, config={}, state=read_checkpoint(path, ENCODER_KIND).state)
@@ -273,8 +265,8 @@ def train_segmentation(config: SegmentationTraining, run: Run) -> Path:
     facts = {"trained_on": Path(config.images.folder).name, "licence": licence}
     weights = SegmentationWeights(
         network=network.cpu().eval(),
-        objects=images.objects.names,
-        numbers=images.objects.numbers,
+        objects=tuple(images.objects.values()),
+        numbers=tuple(images.objects),
         facts=with_origin(facts, config),
     )
     write_segmentation(path, weights, with_half=config.with_half)

@@ -340,15 +340,11 @@ def fit_pose(
             pose = perturb(pose, torch.linalg.solve(H, step))
         H, _ = _normal_equations(pose, model, found, information)
     error_m = pose.apply(model) - found
-    count = used.sum(-1)
-    misfit = (error_m[..., None, :] @ information @ error_m[..., None]).sum((-1, -2, -3))
-    square = (error_m.square().sum(-1) * used).sum(-1) / count
+    square = (error_m.square().sum(-1) * used).sum(-1) / used.sum(-1)
     return PoseFit(
         camera_from_model=Rigid(pose.R.to(keypoints_m), pose.t_m.to(keypoints_m)),
         covariance=torch.linalg.inv(H).to(keypoints_m),
         residual_m=square.sqrt().to(keypoints_m),
-        misfit=(misfit / (3 * count - 6).clamp(min=1)).to(keypoints_m),
-        is_used=used,
     )
 
 
