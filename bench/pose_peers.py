@@ -23,7 +23,6 @@ from real_poses import RealCase, real_cases
 
 from depthpose.core.checkpoint import find_weights
 from depthpose.core.rigid import Rigid
-from depthpose.pose.baselines import FpfhConfig, FpfhEstimator
 from depthpose.pose.config import EstimateConfig, VotingConfig
 from depthpose.pose.estimator import GeoPoseNet, Registration
 from depthpose.pose.evaluate import nearest_copy
@@ -32,6 +31,7 @@ from depthpose.pose.metrics import add_m, adds_m, auc
 from depthpose.pose.types import CloudInput, PoseEstimate, ViewInput
 from depthpose.pose.weights import PoseWeights, read_pose_weights
 from depthpose.report.page import markdown_table, write_table
+from depthpose.thesis.fpfh import FpfhConfig, FpfhEstimator
 
 POINTS = 2000
 AnyInput = CloudInput | ViewInput

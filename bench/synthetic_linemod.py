@@ -28,7 +28,6 @@ import torch
 from curves import draw_curves
 
 from depthpose.core.checkpoint import find_weights
-from depthpose.pose.baselines import FpfhEstimator
 from depthpose.pose.config import EstimateConfig, ObjectsConfig, SensorConfig, SensorKind
 from depthpose.pose.datasets.layouts import models_folder, read_bop_models, read_models_info
 from depthpose.pose.estimator import DepthImageRegressor, GeoPoseNet, Registration
@@ -38,6 +37,7 @@ from depthpose.pose.synthetic import PARTS, Objects, make_part
 from depthpose.pose.types import ObjectModel, PoseEstimate, ViewInput, ViewSample
 from depthpose.pose.weights import read_pose_weights
 from depthpose.report.page import markdown_table, write_table
+from depthpose.thesis.fpfh import FpfhEstimator
 
 SEED = 0x7E57ED
 POINTS = 1000

@@ -20,8 +20,6 @@ from depthpose.pose.baselines import (
     DepthCrop,
     DepthImageConfig,
     DepthImageNet,
-    FpfhConfig,
-    FpfhEstimator,
     PointNet,
     PointNetConfig,
     cut_depth,
@@ -31,6 +29,7 @@ from depthpose.pose.baselines import (
 from depthpose.pose.losses import model_point_loss
 from depthpose.pose.mesh import sample_surface
 from depthpose.pose.types import CloudInput, SeenPoints, ViewInput
+from depthpose.thesis.fpfh import FpfhConfig, FpfhEstimator
 
 K = torch.tensor([[500.0, 0, 160], [0, 510.0, 120], [0, 0, 1]], dtype=torch.float64)
 SMALL = DepthImageConfig(classes=3, crop_px=32, widths=(4, 4, 8, 8))
