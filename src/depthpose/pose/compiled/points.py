@@ -71,37 +71,6 @@ def rotation(x, y, z, R):
     R[1, 2], R[2, 1] = c * y * z - s * x, c * y * z + s * x
 
 
-@compiled
-def _rotate(A, V, p, q):
-    """Make one entry of a symmetric matrix zero (Jacobi), and turn its axes along."""
-    if A[p, q] == 0.0:
-        return
-    theta = (A[q, q] - A[p, p]) / (2 * A[p, q])
-    t = (1.0 if theta >= 0 else -1.0) / (abs(theta) + np.sqrt(theta * theta + 1))
-    c = 1 / np.sqrt(t * t + 1)
-    s = t * c
-    for k in range(3):
-        a, b = A[k, p], A[k, q]
-        A[k, p], A[k, q] = c * a - s * b, s * a + c * b
-    for k in range(3):
-        a, b = A[p, k], A[q, k]
-        A[p, k], A[q, k] = c * a - s * b, s * a + c * b
-    for k in range(3):
-        a, b = V[k, p], V[k, q]
-        V[k, p], V[k, q] = c * a - s * b, s * a + c * b
-
-
-@compiled
-def jacobi(A, V):
-    """Turn a symmetric 3x3 matrix into its eigenvalues, on the diagonal, and the vectors in V."""
-    V[:] = 0.0
-    V[0, 0] = V[1, 1] = V[2, 2] = 1.0
-    for _ in range(8):
-        _rotate(A, V, 0, 1)
-        _rotate(A, V, 0, 2)
-        _rotate(A, V, 1, 2)
-
-
 Array = np.ndarray
 _LEAF = 8  # points of a range that is not parted any more
 
@@ -256,8 +225,7 @@ def planes_of(every, some, count):
     points, _, axes, values = planted(every)
     stack, bounds = np.empty((64, 3), np.int64), np.empty((64, 4))
     places, squares = np.zeros(count, np.int64), np.empty(count)
-    A, V = np.empty((3, 3)), np.empty((3, 3))
-    mean = np.empty(3)
+    A, mean = np.empty((3, 3)), np.empty(3)
     for i in range(len(some)):
         x, y, z = some[i, 0], some[i, 1], some[i, 2]
         squares[:] = np.inf
@@ -271,17 +239,11 @@ def planes_of(every, some, count):
             for k in range(3):
                 for m in range(3):
                     A[k, m] += (points[p, k] - mean[k]) * (points[p, m] - mean[m])
-        jacobi(A, V)
-        least = 0
-        for k in range(1, 3):
-            if A[k, k] < A[least, least]:
-                least = k
-        along = V[0, least] * some[i, 0] + V[1, least] * some[i, 1] + V[2, least] * some[i, 2]
-        sign = -1.0 if along > 0 else 1.0
-        for k in range(3):
-            normals[i, k] = sign * V[k, least]
-        total = max(A[0, 0] + A[1, 1] + A[2, 2], 1e-30)
-        bend[i] = 3 * max(A[least, least], 0.0) / total
+        values, axes_here = np.linalg.eigh(A)
+        normal = axes_here[:, 0]  # of the least spread
+        along = normal[0] * x + normal[1] * y + normal[2] * z
+        normals[i] = -normal if along > 0 else normal
+        bend[i] = 3 * max(values[0], 0.0) / max(values.sum(), 1e-30)
     return normals, bend
 
 

@@ -24,7 +24,6 @@ from depthpose.pose.compiled.points import (
     Tree,
     damp,
     faces,
-    jacobi,
     neighbours,
     rotation,
     solve,
@@ -233,32 +232,16 @@ def grown(
 
 
 @compiled
-def _step(rows, motion):
-    """Solve for turn, shift and growth; give the variance of the growth."""
-    H, b, total = np.zeros((7, 7)), np.zeros(7), 0.0
-    for i in range(len(rows)):
-        weight = rows[i, 8]
-        if weight == 0:
-            continue
-        total += weight
-        for k in range(7):
-            scaled = weight * rows[i, k]
-            b[k] += scaled * rows[i, 7]
-            for m in range(k + 1):
-                H[k, m] += scaled * rows[i, m]
+def _step(J, residual, weight):
+    """Solve for turn, shift and growth; give the variance of the growth too."""
+    weighted = J * weight.reshape(-1, 1)
+    H = weighted.T @ J
     damp(H, 1e-9)
-    factor, unit, column = H.copy(), np.zeros(7), np.empty(7)
-    solve(factor, b, motion)
-    unit[6] = 1.0
-    solve(H, unit, column)
-    square = 0.0
-    for i in range(len(rows)):
-        if rows[i, 8] > 0:
-            left = rows[i, 7]
-            for k in range(7):
-                left -= rows[i, k] * motion[k]
-            square += rows[i, 8] * left * left
-    return max(square / max(total - 7, 1.0) * column[6], 0.0)
+    inverse = np.linalg.inv(H)
+    motion = inverse @ (weighted.T @ residual)
+    left = residual - J @ motion
+    square = (weight * left * left).sum()
+    return motion, max(square / max(weight.sum() - 7, 1.0) * inverse[6, 6], 0.0)
 
 
 @compiled
@@ -267,17 +250,17 @@ def _grow(local, times, middle, limits, target, is_exact, converged, variance):
     count = local.shape[1]
     places = np.full((len(times), count), -1)
     surface, normals = target.tree.points, target.normals
-    own, rows = np.empty((count, 3)), np.empty((count, 9))
-    motion, turn = np.empty(7), np.empty((3, 3))
+    own, turn = np.empty((count, 3)), np.empty((3, 3))
+    J, residual, weight = np.zeros((count, 7)), np.zeros(count), np.empty(count)
     for limit in limits:
         most = 0.0
         for p in range(len(times)):
             s, points = times[p], local[p]
             own[:] = (points - middle) / s + middle  # beside the surface of its own size
             find_places(own, limit / s, target, is_exact, places[p])
-            for i in range(count):  # derivatives by turn, shift and growth, residual, weight
-                row, place = rows[i], places[p, i]
-                row[8] = 0.0
+            for i in range(count):  # derivatives by turn, shift and growth
+                row, place = J[i], places[p, i]
+                weight[i] = 0.0
                 if place < 0:
                     continue
                 ax = s * (surface[place, 0] - middle[0])
@@ -292,8 +275,8 @@ def _grow(local, times, middle, limits, target, is_exact, converged, variance):
                 nx, ny, nz = normals[place, 0], normals[place, 1], normals[place, 2]
                 row[0], row[1], row[2] = ay * nz - az * ny, az * nx - ax * nz, ax * ny - ay * nx
                 row[3], row[4], row[5], row[6] = nx, ny, nz, nx * ax + ny * ay + nz * az
-                row[7], row[8] = nx * gx + ny * gy + nz * gz, share * share
-            variance[p] = _step(rows, motion)
+                residual[i], weight[i] = nx * gx + ny * gy + nz * gz, share * share
+            motion, variance[p] = _step(J, residual, weight)
             times[p] = min(max(s * (1 + min(max(motion[6], -0.1), 0.1)), 0.5), 2.0)
             rotation(motion[0], motion[1], motion[2], turn)
             for i in range(count):  # by the inverse of the surface's motion
@@ -339,24 +322,15 @@ def _add_keypoints(R, t, model, found, information, H, b):
     """Add up the normal equations, ``J = [-[R m + t]_x, I]``."""
     H[:] = 0.0
     b[:] = 0.0
-    J, WJ, moved = np.zeros((3, 6)), np.empty((3, 6)), np.empty(3)
+    J = np.zeros((3, 6))
     J[0, 3] = J[1, 4] = J[2, 5] = 1.0
     for i in range(len(model)):
-        W = information[i]
-        for c in range(3):
-            moved[c] = t[c]
-            for m in range(3):
-                moved[c] += R[c, m] * model[i, m]
+        moved = R @ model[i] + t
         x, y, z = moved
         J[0, 1], J[0, 2], J[1, 0], J[1, 2], J[2, 0], J[2, 1] = z, -y, -z, x, y, -x
-        for c in range(3):
-            for k in range(6):
-                WJ[c, k] = W[c, 0] * J[0, k] + W[c, 1] * J[1, k] + W[c, 2] * J[2, k]
-        for k in range(6):
-            for c in range(3):
-                b[k] += WJ[c, k] * (found[i, c] - moved[c])
-                for m in range(6):
-                    H[k, m] += J[c, k] * WJ[c, m]
+        weighted = information[i] @ J
+        H += J.T @ weighted
+        b += weighted.T @ (found[i] - moved)
 
 
 @compiled
@@ -455,7 +429,7 @@ def _gradients(local, n, w, p, nearest, A, gradient):
 def _meet(local, n, w, refinements, nearest, points, covariances, conditions):
     local = local[0]
     count = local.shape[1]
-    A, V, M = np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3))
+    A, M = np.empty((3, 3)), np.empty((3, 3))
     gradient, pull, step, unit = np.empty((3, count)), np.empty(3), np.empty(3), np.empty(3)
     inverse, spread = np.empty((3, 3)), 0.0
     for i in range(count):
@@ -480,10 +454,8 @@ def _meet(local, n, w, refinements, nearest, points, covariances, conditions):
         _mirror(A)
         _damped(A, M)
         solve(M, pull, p)
-        M[:] = A
-        jacobi(M, V)
-        low, high = min(M[0, 0], M[1, 1], M[2, 2]), max(M[0, 0], M[1, 1], M[2, 2])
-        conditions[k] = high / low if low > 1e-7 else np.inf
+        values = np.linalg.eigvalsh(A)
+        conditions[k] = values[2] / values[0] if values[0] > 1e-7 else np.inf
         for _ in range(refinements):
             _gradients(local, n[k], w[k], p, nearest, A, gradient)
             for c in range(3):

@@ -311,15 +311,6 @@ class Evaluation:
         """
         return data_frame(row.columns() for row in self.per_instance)
 
-    def of(self, origin: Origin) -> "Evaluation":
-        """Say in each row whose predictions it measures."""
-        return replace(
-            self,
-            rows=[replace(row, origin=origin) for row in self.rows],
-            per_instance=[replace(row, origin=origin) for row in self.per_instance],
-            risk=[replace(row, origin=origin) for row in self.risk],
-        )
-
 
 def read_any(path: Path) -> list[Prediction]:
     """Read predictions: a folder with ``poses.json``, or anybody's BOP csv.
@@ -338,6 +329,7 @@ def evaluate(
     predictions: Sequence[Prediction],
     config: EvaluationConfig | None = None,
     progress: Callable[[Sequence[Instance]], Iterable[Instance]] = iter,
+    origin: Origin | None = None,
 ) -> Evaluation:
     """Measure predictions; an instance without an answer is a failure and stays in every number.
 
@@ -349,6 +341,7 @@ def evaluate(
         predictions: of :func:`read_any`.
         config: diameters, which objects by ADD-S, whether VSD.
         progress: wraps the sequence of instances, to show how far it is.
+        origin: whose predictions they are, for the columns of the rows.
 
     Raises:
         InputError: there is no instance, no prediction is of this data set, or a file of it is
@@ -396,9 +389,9 @@ def evaluate(
     if len(summed) > 1:
         summed += [mean_row(summed), object_row("all", rows)]
     return Evaluation(
-        rows=[replace(row, conditions=conditions) for row in summed],
-        per_instance=rows,
-        risk=[replace(row, conditions=conditions) for row in risk_rows(rows)],
+        rows=[replace(row, conditions=conditions, origin=origin) for row in summed],
+        per_instance=[replace(row, origin=origin) for row in rows],
+        risk=[replace(r, conditions=conditions, origin=origin) for r in risk_rows(rows)],
         advice=convention_advice(dataset, predictions, contexts),
     )
 

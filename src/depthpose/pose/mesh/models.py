@@ -16,7 +16,7 @@ from torch import Tensor
 from depthpose.core.arrays import take_evenly
 from depthpose.core.errors import InputError
 from depthpose.core.files import AnyPath
-from depthpose.core.rigid import Rigid
+from depthpose.core.rigid import Rigid, rotation_by
 from depthpose.core.units import Unit, metres_of
 from depthpose.pose.config import MeshConfig
 from depthpose.pose.mesh.files import read_geometry, unit_of
@@ -29,12 +29,8 @@ BOP_STEP = 0.01
 def turn_about(
     direction: Float[Tensor, "3"], point_m: Float[Tensor, "3"], angle_rad: Float[Tensor, "*batch"]
 ) -> Rigid:
-    """Turn about the line through ``point_m``, by the right-hand rule (Rodrigues)."""
-    x, y, z = (direction / direction.norm()).unbind()
-    zero = torch.zeros_like(x)
-    K = torch.stack([zero, -z, y, z, zero, -x, -y, x, zero]).reshape(3, 3)
-    angle = angle_rad[..., None, None].to(K)
-    R = torch.eye(3).to(K) + angle.sin() * K + (1 - angle.cos()) * (K @ K)
+    """Turn about the line through ``point_m``, by the right-hand rule."""
+    R = rotation_by(angle_rad[..., None].to(direction) * direction / direction.norm())
     return Rigid(R, point_m - (R @ point_m[..., None]).squeeze(-1))
 
 
