@@ -10,7 +10,6 @@ from torch import Tensor
 
 from depthpose.core.errors import InputError
 from depthpose.core.rigid import turn_axis_to
-from depthpose.pose.compiled import finite_array, serves
 from depthpose.pose.config import CloudConfig
 from depthpose.pose.types import CloudInput, CloudSample, ViewInput, ViewSample
 
@@ -231,12 +230,6 @@ def local_planes(
         The normal of each toward the camera; how bent the cloud is there, 0 (flat) to 1 (a ball).
     """
     count = min(_NEIGHBOURS, len(every_m))
-    if serves(every_m, some_m):
-        from depthpose.pose.compiled.points import planes_of
-
-        assert count > 0, "a plane goes through points"
-        normals, bend = planes_of(finite_array(every_m), finite_array(some_m), count)
-        return torch.from_numpy(normals), torch.from_numpy(bend)[:, None]
     index = KDTree(every_m.numpy()).query(some_m.numpy(), k=count, workers=1)[1]
     near_m = every_m[torch.as_tensor(index).reshape(len(some_m), count)]
     near_m = near_m - near_m.mean(1, keepdim=True)

@@ -19,7 +19,6 @@ from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
 
-import numpy as np
 import torch
 import torch.nn.functional as F
 from jaxtyping import Float, Int, Int32, Int64
@@ -92,10 +91,10 @@ CELLS_PER_VOXEL = 512
 
 
 class VoxelIndex:
-    """Finds rows of one level's voxels, the same in each of three ways.
+    """Finds rows of one level's voxels, the same in each of two ways.
 
-    A compiled walk along the sorted keys where it serves; a table of the cells of the clouds'
-    common box where that is small enough, some five times faster than binary search; or that.
+    A table of the cells of the clouds' common box where that is small enough, some five times
+    faster than binary search; or that.
     """
 
     def __init__(self, keys: Keys, step: int) -> None:
@@ -103,8 +102,7 @@ class VoxelIndex:
         self._keys, self._step = keys, step
         self._low = self._strides = keys.new_zeros(4)
         self._table: Tensor | None = None
-        self._is_compiled = serves(keys)
-        if not len(keys) or self._is_compiled:
+        if not len(keys):
             return
         coordinates = self._cell_coordinates(keys)
         low, high = coordinates.amin(0), coordinates.amax(0)
@@ -129,11 +127,6 @@ class VoxelIndex:
         if not len(self._keys):
             return standing.new_zeros(len(moves), len(standing), dtype=torch.int32)
         packed = [packed_move(*move) * self._step for move in moves]
-        if self._is_compiled:
-            from depthpose.pose.compiled.points import rows_of
-
-            moved = np.array(packed, np.int64)
-            return torch.from_numpy(rows_of(self._keys.numpy(), standing.numpy(), moved))
         if self._table is None:
             wanted = standing + torch.tensor(packed, device=standing.device)[:, None]
             rows = torch.searchsorted(self._keys, wanted).clamp_(max=len(self._keys) - 1)

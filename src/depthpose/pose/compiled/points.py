@@ -1,4 +1,4 @@
-"""Points in space: small matrices, nearest neighbours, planes through them, what a camera sees.
+"""Points in space: small matrices, nearest neighbours, what a camera sees.
 
 And sparse convolution of small clouds: no call for each offset, nothing gathered.
 """
@@ -216,38 +216,6 @@ def _nearest_many(queries, tree):
 
 
 @compiled
-def planes_of(every, some, count):
-    """Lay a plane through the ``count`` points of ``every`` nearest to each of ``some``.
-
-    Gives normals (m, 3) toward the origin, and how bent the cloud is there (m,), 0 to 1.
-    """
-    normals, bend = np.empty((len(some), 3)), np.empty(len(some))
-    points, _, axes, values = planted(every)
-    stack, bounds = np.empty((64, 3), np.int64), np.empty((64, 4))
-    places, squares = np.zeros(count, np.int64), np.empty(count)
-    A, mean = np.empty((3, 3)), np.empty(3)
-    for i in range(len(some)):
-        x, y, z = some[i, 0], some[i, 1], some[i, 2]
-        squares[:] = np.inf
-        neighbours(x, y, z, points, axes, values, places, squares, stack, bounds)
-        mean[:] = 0.0
-        for p in places:
-            mean += points[p]
-        mean /= count
-        A[:] = 0.0
-        for p in places:
-            for k in range(3):
-                for m in range(3):
-                    A[k, m] += (points[p, k] - mean[k]) * (points[p, m] - mean[m])
-        values, axes_here = np.linalg.eigh(A)
-        normal = axes_here[:, 0]  # of the least spread
-        along = normal[0] * x + normal[1] * y + normal[2] * z
-        normals[i] = -normal if along > 0 else normal
-        bend[i] = 3 * max(values[0], 0.0) / max(values.sum(), 1e-30)
-    return normals, bend
-
-
-@compiled
 def _cell(x, y, z, scale, column, row, half):
     """Number the cell of a ray, those far off at the border."""
     u = min(max(np.floor(x / z * scale - column), -half), half) + half
@@ -289,24 +257,6 @@ def compare_rays(cloud, Rs, ts, points, scale, column, row, half, limit):
         front[b] = occluded / len(cloud) if total else 1.0
         unseen[b] = missed / total if total else 1.0
     return front, unseen
-
-
-@compiled
-def rows_of(keys, standing, moves):
-    """Give the row of each key ``standing + move``, one past the last where there is none.
-
-    Both lists ascend: it walks along them at once.
-    """
-    rows = np.empty((len(moves), len(standing)), np.int32)
-    for k in range(len(moves)):
-        row = 0
-        for j in range(len(standing)):
-            wanted = standing[j] + moves[k]
-            while row < len(keys) and keys[row] < wanted:
-                row += 1
-            is_there = row < len(keys) and keys[row] == wanted
-            rows[k, j] = row if is_there else len(keys)
-    return rows
 
 
 @compiled
