@@ -12,37 +12,6 @@ from depthpose.pose.compiled import compiled, finite_array
 
 
 @compiled
-def solve(H, b, x):
-    """Solve a symmetric system, of which the lower half is read; ``H`` is used up.
-
-    By elimination with pivots, as rounding may make a positive matrix indefinite.
-    """
-    n = len(b)
-    for i in range(n):
-        x[i] = b[i]
-        for j in range(i):
-            H[j, i] = H[i, j]
-    for k in range(n):
-        pivot = k
-        for i in range(k + 1, n):
-            if abs(H[i, k]) > abs(H[pivot, k]):
-                pivot = i
-        if pivot != k:
-            x[k], x[pivot] = x[pivot], x[k]
-            for j in range(k, n):
-                H[k, j], H[pivot, j] = H[pivot, j], H[k, j]
-        for i in range(k + 1, n):
-            share = H[i, k] / H[k, k]
-            x[i] -= share * x[k]
-            for j in range(k + 1, n):
-                H[i, j] -= share * H[k, j]
-    for i in range(n - 1, -1, -1):
-        for j in range(i + 1, n):
-            x[i] -= H[i, j] * x[j]
-        x[i] /= H[i, i]
-
-
-@compiled
 def damp(H, least):
     """Keep unknowns that nothing determines where they are."""
     size = least

@@ -16,7 +16,7 @@ from depthpose.pose.compiled import (
     compiled,
     finite_array,
 )
-from depthpose.pose.compiled.points import Array, Tree, damp, faces, neighbours, rotation, solve
+from depthpose.pose.compiled.points import Array, Tree, damp, faces, neighbours, rotation
 
 
 class Target(NamedTuple):
@@ -157,7 +157,7 @@ def _add_equations(local, places, R, arm, limit, points, normals, eye, how, H, b
         for k in range(6):
             scaled = share * share * J[k]
             b[k] += scaled * residual
-            for m in range(k + 1):
+            for m in range(6):
                 H[k, m] += scaled * J[m]
 
 
@@ -181,7 +181,7 @@ def _refine(cloud, Rs, ts, limits, scale, converged, target, is_exact, every):
     middle /= len(cloud)
     points, normals = target.tree.points, target.normals
     local, eye, turn = np.empty_like(cloud), np.empty(3), np.empty((3, 3))
-    H, b, motion = np.empty((6, 6)), np.empty(6), np.empty(6)
+    H, b = np.empty((6, 6)), np.empty(6)
     for p in range(len(ts)):
         R, t, places = Rs[p], ts[p], every[p]
         for k in range(len(limits)):
@@ -193,7 +193,7 @@ def _refine(cloud, Rs, ts, limits, scale, converged, target, is_exact, every):
                 break
             _add_equations(local, places, R, t - middle, limit, points, normals, eye, how, H, b)
             damp(H, 1e-6)
-            solve(H, b, motion)
+            motion = np.linalg.solve(H, b)
             rotation(motion[0], motion[1], motion[2], turn)
             _move(turn, motion, middle, R, t)
             most = 0.0
