@@ -308,8 +308,7 @@ class Job(Generic[Input]):
     name: str  #: that of the input: unique in a run
     read: Callable[[], Input]  #: gives the input; called only where the estimate is not there yet
     place: Place | None = None  #: as :class:`Prediction` has it
-    #: what was spent before, on its mask.
-    seconds: Mapping[str, float] = field(default_factory=dict)
+    seconds: Mapping[str, float] = field(default_factory=dict)  #: what was spent before, on a mask
     source: Path | tuple[Path, ...] | None = None  #: file or files that the input is read from
 
 

@@ -48,10 +48,8 @@ class RefinedPose:
     #: (``IcpConfig.sensor_offset_m``); what the surface does not fix (a turn of a ball) is far too
     #: uncertain to be missed. Local: of this minimum alone, whether it is the right one or not.
     covariance: Float[Tensor, "*batch 6 6"]
-    #: root mean square distance to the surface, of the points that count.
-    residual_m: Float[Tensor, "*batch"]
-    #: share of the points within the last limit of the surface.
-    inlier_share: Float[Tensor, "*batch"]
+    residual_m: Float[Tensor, "*batch"]  #: root mean square distance to the surface, of what counts
+    inlier_share: Float[Tensor, "*batch"]  #: share of the points within the last limit
 
 
 class BestStart(NamedTuple):

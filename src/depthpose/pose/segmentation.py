@@ -269,8 +269,7 @@ class Segmentation:
     #: of the instances of each object that was found, the surest first; an object that was not
     #: found has no entry.
     masks: Mapping[str, Bool[Tensor, "n h w"]]
-    #: mean probability of the object over each of those masks, 0..1.
-    scores: Mapping[str, Float[Tensor, " n"]]
+    scores: Mapping[str, Float[Tensor, " n"]]  #: mean probability of the object on each mask, 0..1
 
     def best(self, object: str) -> Bool[Tensor, "h w"] | None:
         """Give the surest mask of an object; None where it was not found."""

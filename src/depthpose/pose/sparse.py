@@ -150,8 +150,7 @@ class PairList:
     """Neighbours of two levels, offset by offset."""
 
     fine: Int64[Tensor, " pairs"]  #: row of each pair in the finer level: where the kernel reads
-    #: row of each pair in the coarser level: where the kernel is centred.
-    coarse: Int64[Tensor, " pairs"]
+    coarse: Int64[Tensor, " pairs"]  #: row of each pair in the coarser level: the kernel's centre
     slot: Int64[Tensor, " pairs"]  #: place of each pair in a grid of (volume, most)
     filled: tuple[int, ...]  #: offsets that have pairs; the others are skipped
     counts: tuple[int, ...]  #: how many pairs each of them has
@@ -224,8 +223,7 @@ class KernelMap:
     """Neighbours with a direction: what a convolution reads and where it writes."""
 
     neighbours: NeighbourTable  #: of the two levels, or of the one
-    #: False: fine to coarse (or the level to itself); True: coarse to fine.
-    is_transposed: bool = False
+    is_transposed: bool = False  #: False: fine to coarse (or the level to itself); True: back
 
     @property
     def transposed(self) -> "KernelMap":

@@ -59,8 +59,7 @@ class Views:
     """What a camera far off sees of a model, from many sides, in the model's frame."""
 
     toward: Float64[Tensor, "v 3"]  #: unit vectors to the camera
-    #: what is seen, spread evenly over the picture; NaN where there are fewer.
-    points_m: Float64[Tensor, "v n 3"]
+    points_m: Float64[Tensor, "v n 3"]  #: what is seen, evenly spread; NaN where there are fewer
     normals: Float64[Tensor, "v n 3"]  #: theirs
     #: places beside the silhouette, as far off as its border; NaN where there are fewer.
     beside_m: Float64[Tensor, "v m 3"]

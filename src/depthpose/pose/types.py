@@ -49,8 +49,7 @@ class CloudInput:
 class SeenPoints:
     """Input of a network whose points vote: one or several clouds, one after the other."""
 
-    #: one of each voxel, in the axes of its cloud's grid about its camera.
-    points_m: Float[Tensor, "points 3"]
+    points_m: Float[Tensor, "points 3"]  #: one a voxel, in the axes of its grid about its camera
     coordinates: Int[Tensor, "points 4"]  #: (cloud, x, y, z) of its voxel
     features: Float[Tensor, "points c"]  #: of its voxel
     class_of_point: Int[Tensor, " points"]  #: which object each belongs to
@@ -65,8 +64,7 @@ class PoseTruth:
     """What is known about the object of a sample."""
 
     camera_from_model: Rigid  #: its pose
-    #: share of its silhouette that is not occluded, 0..1; None where unknown.
-    visible_fraction: float | None = None
+    visible_fraction: float | None = None  #: share of its silhouette that is seen; None: unknown
     is_measured: bool = True  #: whether the pose was annotated, not itself fitted to the same depth
 
 
@@ -85,10 +83,8 @@ class ViewInput:
     name: str  #: what the files of its results are called
     #: along the optical axis; NaN where there is no reading. May be a window of a larger image.
     depth_m: Float[Tensor, "h w"]
-    #: the object's pixels, as a segmentation gives them: not free of errors.
-    mask: Bool[Tensor, "h w"]
-    #: intrinsic matrix of this very image (a window's principal point is shifted).
-    K: Float[Tensor, "3 3"]
+    mask: Bool[Tensor, "h w"]  #: the object's pixels, as a segmentation gives them, with errors
+    K: Float[Tensor, "3 3"]  #: intrinsic matrix of this image (a window shifts the principal point)
     object: str  # name of the object
 
 
@@ -118,8 +114,7 @@ class Symmetries:
     #: ``model_from_model``, the identity not among them; None where there is none.
     discrete: Rigid | None = None
     continuous: tuple[Axis, ...] = ()  #: axes of revolution
-    #: whether they were found in the geometry, within a tolerance, and not declared.
-    is_found: bool = False
+    is_found: bool = False  #: whether they were found in the geometry, and not declared
 
     @property
     def is_none(self) -> bool:
@@ -147,11 +142,9 @@ class ObjectModel:
 
     name: str  #: what samples call it
     number: int  #: BOP's ``obj_id``
-    #: points of the surface; all that there is where ``faces`` is empty.
-    vertices_m: Float[Tensor, "v 3"]
+    vertices_m: Float[Tensor, "v 3"]  #: points of the surface; all there is without ``faces``
     faces: Int64[Tensor, "f 3"]  #: three vertices each, counter-clockwise seen from outside
-    #: outward unit normal of each vertex; of an unknown side for a model of points.
-    normals: Float[Tensor, "v 3"]
+    normals: Float[Tensor, "v 3"]  #: outward unit normal of each vertex; of points, of unknown side
     diameter_m: float  #: largest distance of two points
     keypoints_m: Float[Tensor, "k 3"]  #: what the network's directions point at
     symmetries: Symmetries = field(default_factory=Symmetries)  #: as declared or found
@@ -174,13 +167,11 @@ class Vote:
     """Where the directions of many points meet, with leading batch axes."""
 
     keypoints_m: Float[Tensor, "*batch k 3"]  #: the meeting points, in the frame of the points
-    #: their covariance, from how well the directions meet.
-    covariance_m2: Float[Tensor, "*batch k 3 3"]
+    covariance_m2: Float[Tensor, "*batch k 3 3"]  #: their covariance, from how well directions meet
     #: largest over smallest eigenvalue of the normal matrix; infinite where all lines are parallel.
     #: Above about 1000 the depth of the keypoint is a guess (figure 3-4).
     condition: Float[Tensor, "*batch k"]
-    #: share of the voting weight that agrees with the keypoint, 0..1.
-    inlier_share: Float[Tensor, "*batch k"]
+    inlier_share: Float[Tensor, "*batch k"]  #: share of the weight that agrees with the point, 0..1
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -193,8 +184,7 @@ class PoseFit:
     #: how well the data fix the pose about this answer, and nothing of other answers, such as a
     #: half-turn away, that explain the data as well.
     covariance: Float[Tensor, "*batch 6 6"]
-    #: root mean square distance of the keypoints that were used.
-    residual_m: Float[Tensor, "*batch"]
+    residual_m: Float[Tensor, "*batch"]  #: root mean square distance of the used keypoints
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -203,8 +193,7 @@ class Alternative:
 
     camera_from_model: Rigid  #: the pose
     probability: float  #: that it is the right one, 0..1
-    #: from the estimate's own pose, in words: "turned by 180 degrees about the long axis".
-    difference: str
+    difference: str  #: from the estimate's own pose: "turned by 180 degrees about the long axis"
     #: evidence against it, by name; not kept in files.
     signals: dict[str, float] = field(default_factory=dict)
 
@@ -232,14 +221,12 @@ class Identity:
     """Whether what was posed is the object, and not a copy of it or another thing."""
 
     status: IdentityStatus  #: confirmed, not excluded or contradicted
-    #: of what was seen in sizes of the model, as it fits best; None where not measured.
-    size: float | None = None
+    size: float | None = None  #: of what was seen in sizes of the model; None where not measured
     size_deviation: float | None = None  #: standard deviation of it
     #: by how much nearer, in diameters, the points lie to the mirror image of the model; negative
     #: where the model is nearer, None where both are one or none was measured.
     mirror_gain: float | None = None
-    #: another known object that it may be, the likeliest; None where there is none.
-    other: str | None = None
+    other: str | None = None  #: another known object that it may be, the likeliest; or None
     reason: str = ""  #: one sentence; empty where it is confirmed
 
 
@@ -251,8 +238,7 @@ class PoseEstimate:
     object: str  # name of the object
     status: Status  #: ``ok``, ``ambiguous``, or the kind of refusal
     reason: str = ""  #: one sentence for people; empty where the status is ``ok``
-    #: the pose; None where it is refused. Where it is ambiguous, the likeliest.
-    camera_from_model: Rigid | None = None
+    camera_from_model: Rigid | None = None  #: the pose, or the likeliest; None where it is refused
     keypoints_m: Float[Tensor, "k 3"] | None = None  #: the found keypoints in the camera frame
     #: 6x6, order and frame as :class:`PoseFit` says. Local: a pose that is a half-turn off may have
     #: one of 0.2 degrees; such errors are covered by ``certainty``. Finite: it leaves out the
@@ -265,8 +251,7 @@ class PoseEstimate:
     inlier_share: float | None = None  #: share of the votes that agree, 0..1
     #: root mean square distance: of keypoints, or of points to the surface after ICP.
     residual_m: float | None = None
-    #: whether the pose fits what the camera saw; None where it was not compared.
-    fit: Fit | None = None
+    fit: Fit | None = None  #: whether the pose fits what the camera saw; None: not compared
     #: chance that this very pose is right, and none of the alternatives nor, where some of what was
     #: seen does not agree, one that was not found; None: not compared.
     certainty: float | None = None

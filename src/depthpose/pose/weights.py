@@ -53,13 +53,11 @@ _TENSORS = (*_SURFACE, "keypoints_m")
 class PoseWeights:
     """What a file of pose weights contains: enough to pose an object without its CAD file."""
 
-    #: partial cloud to directions, in eval mode where it was read; or a baseline.
-    network: AnyNetwork
+    network: AnyNetwork  #: partial cloud to directions, in eval mode where read; or a baseline
     models: tuple[ObjectModel, ...]  #: the objects; class k of the network is ``models[k]``
     cloud: CloudConfig  #: how the clouds were made that the network was trained on
     refusal: RefusalConfig  #: when its estimates are withheld
-    #: the card in short: ``trained_on``, ``licence``, ``terms`` and the like.
-    facts: Mapping[str, str]
+    facts: Mapping[str, str]  #: the card in short: ``trained_on``, ``licence``, ``terms`` and more
 
     def __post_init__(self) -> None:
         config = self.network.config

@@ -136,8 +136,7 @@ class Instance:
     mask: Path | None  #: of the visible part; None where there is no such file
     rgb: Path | None  #: the picture, where there is one
     camera_from_model: Rigid  #: the annotated pose
-    #: share of the silhouette that is seen, where it is given.
-    visible_fraction: float | None = None
+    visible_fraction: float | None = None  #: share of the silhouette that is seen, where given
     is_measured: bool = True  #: whether the pose was annotated, not itself fitted to the same depth
 
     @property
@@ -322,8 +321,7 @@ def segnet_mask(folder: Path, instance: Instance) -> Path:
 class Layout:
     """How one kind of data set is read; its models are ``models/obj_NNNNNN.ply`` in millimetres."""
 
-    #: names of the splits of a folder; none where the folder is of another layout.
-    splits: Callable[[Path], Sequence[str]]
+    splits: Callable[[Path], Sequence[str]]  #: names of a folder's splits; none in another layout
     instances: Callable[[Path, str], Iterable[Instance]]  #: of one split of a folder
     #: of an object, by number, whose models declare none.
     symmetries: Callable[[int], Symmetries] = lambda _: Symmetries()

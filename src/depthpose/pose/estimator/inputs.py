@@ -208,8 +208,7 @@ class ObjectCloud:
     cloud_m: Float[Tensor, "n 3"]  #: all usable points, without flying pixels
     points_m: Float[Tensor, "m 3"]  #: those that the network sees and that vote, one a voxel
     voxels: VoxelGrid  #: of the network's grid
-    #: the depth image that shows the cloud; None where the cloud alone is known.
-    view: ViewInput | None
+    view: ViewInput | None  #: the depth image that shows the cloud; None of a cloud alone
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -72,8 +72,7 @@ class TrackedObject:
     surface: Surface  #: of the model
     refusal: RefusalConfig  #: when a pose is refused
     icp: IcpConfig  #: of the first steps
-    #: an estimate of the object in a frame about which nothing is known.
-    look: Callable[[AnyInput], PoseEstimate]
+    look: Callable[[AnyInput], PoseEstimate]  #: estimates the object in a frame not yet known
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

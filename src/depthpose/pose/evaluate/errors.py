@@ -74,8 +74,7 @@ class Metric:
     #: columns of the rows of objects: name to a function of the errors (n, t) of all instances and
     #: their diameters [m] (n).
     summaries: Mapping[str, Callable[[Tensor, Tensor], float]] = field(default_factory=dict)
-    #: whether rows of objects hold the median of the answers, as ``NAME_median``.
-    has_median: bool = False
+    has_median: bool = False  #: whether rows of objects hold the median of answers, ``NAME_median``
 
 
 def measure(

@@ -260,8 +260,7 @@ class CleanView:
     depth_m: Float[Tensor, "h w"]  #: less ``distance_m``; NaN beside the object
     K: Float[Tensor, "3 3"]  #: intrinsic matrix of the window
     camera_from_model: Rigid  #: the pose
-    #: taken off the depths of stored views, whose float16 is then exact to 0.1 mm.
-    distance_m: float = 0.0
+    distance_m: float = 0.0  #: taken off depths of stored views: float16 is then exact to 0.1 mm
 
 
 def make_shape(model: ObjectModel) -> Shape:

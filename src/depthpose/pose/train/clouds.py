@@ -49,8 +49,7 @@ class Cloud(NamedTuple):
 class CloudBatch(NamedTuple):
     """Several clouds, one after the other."""
 
-    #: of all clouds, each in the axes of its grid about its camera.
-    points_m: Float[Tensor, "points 3"]
+    points_m: Float[Tensor, "points 3"]  #: each cloud in the axes of its grid about its camera
     coordinates: Int[Tensor, "points 4"]  #: (cloud, x, y, z) of each point's voxel
     features: Float[Tensor, "points c"]  #: of each voxel
     class_of: Int[Tensor, " clouds"]  #: class of each cloud
