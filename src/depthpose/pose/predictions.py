@@ -38,8 +38,7 @@ from depthpose.pose.types import (
 AnswerT = TypeVar("AnswerT", Fit, Identity)
 POSES = "poses.json"
 VERSION = 1  #: of an entry of ``poses.json``; ``docs/poses.schema.json`` describes it
-PICTURE, CLOUD = "pose.png", "pose.ply"
-"""What follows ``NAME.`` in the names of the files that show a pose."""
+PICTURE, CLOUD = "pose.png", "pose.ply"  #: what follows ``NAME.`` in files that show a pose
 STAGES = ("segmentation", "cloud", "network", "voting", "svd", "icp", "check", "registration")
 """What an estimate's ``seconds`` are of, in order; a stage that was not run is missing."""
 

@@ -15,15 +15,13 @@ from depthpose.pose.compiled import LOOKED_UP, ON_RAY, SEARCHED, serves
 from depthpose.pose.config import IcpConfig
 from depthpose.pose.surface import Surface, look_along_rays, match
 
-_CONVERGED = 3e-4
-"""Stop when a step turns by less than this [rad] and shifts by less than this in diameters."""
+_CONVERGED = 3e-4  # stop when a step turns [rad] and shifts [diameters] by less than this
 _TURN_RAD = math.radians(15)  # by how much further starts are turned
 _ROUGH_LIMITS = (3.0, 2.4, 2.0, 1.6, 1.4, 1.2, 1.0, 1.0, 1.0, 1.0)
 """Of the starts, step by step, over the last limit of all: they begin farther off."""
 _ROUGH_POINTS = 100  # points of the cloud that refine and compare starts
 _OCCLUDING_POINTS = 1000  # points of the cloud that show what a pose would occlude
-_UNSEEN = 0.3
-"""What a surface that should be seen and is not counts against a pose: something may occlude it."""
+_UNSEEN = 0.3  # a surface that should be seen and is not: something may occlude it
 _OTHER = 0.1  # mean distance between the points of two poses, in diameters, from which they are two
 _MOST_OTHERS = 3  # poses beside the best at which starts ended, that are kept
 _TRUST = 0.02

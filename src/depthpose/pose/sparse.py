@@ -86,8 +86,7 @@ MARGIN = 4
 would find the next row."""
 
 MAX_CELLS = 1 << 24
-CELLS_PER_VOXEL = 512
-"""A box with more cells than these is mostly air: binary search is then the cheaper."""
+CELLS_PER_VOXEL = 512  #: a box with more cells is mostly air: binary search is then the cheaper
 
 
 class VoxelIndex:
@@ -348,8 +347,7 @@ GRID_ELEMENTS = 1 << 29
 """Largest padded table on a GPU, where the calls cost more than the padding: a training step of 128
 clouds takes 101 ms with it, one of only 64 clouds offset by offset 169 ms (H200)."""
 
-NARROW = 4
-"""Inputs of up to this many channels are laid out as a table: their products are too thin."""
+NARROW = 4  #: inputs of up to so many channels are laid out as a table: products are too thin
 
 TABLE_ELEMENTS = 1 << 25  #: largest such table
 

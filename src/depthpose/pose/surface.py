@@ -19,14 +19,12 @@ from depthpose.pose.types import ObjectModel
 
 NEAR = 0.05  #: of the diameter: a point of the cloud within this distance lies on the posed surface
 _TURN_STEP = 0.1  # half of the step between the turns about a continuous axis [rad]
-_CELL = 1 / 24
-"""Side of a ray's cell at the object, in diameters: several samples of the surface in each."""
+_CELL = 1 / 24  # side of a ray's cell at the object, in diameters: several samples in each
 _REACH = 72
 """Cells to each side of the middle of the cloud that are distinguished, three diameters; what lies
 farther off counts as if it lay there."""
 _FRONT = 0.1  # points nearer to the camera than this share of the median are no part of what it saw
-_BOXES = 48
-"""Boxes along the longest side of a model, for looking up what is near without searching."""
+_BOXES = 48  # boxes along the longest side of a model, to look up what is near without a search
 _MARGIN = 0.15  # of the diameter: so far the boxes reach beyond the model
 _VIEWS = 128  # directions from which a model is looked at
 _POINTS, _RING = 160, 64  # cells of a picture at most, and those beside its silhouette

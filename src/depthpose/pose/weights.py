@@ -43,8 +43,7 @@ _NETWORKS: dict[str, tuple[type[AnyNetwork], type]] = {
 }
 """Network and config of each kind of file: the method's, and those of its baselines."""
 _OFF = 0.02  # keypoints lie on the surface; so many diameters off the mesh, it is another one
-_OTHER_SIZE = 0.05
-"""So much longer or shorter, a mesh is another one; declared diameters are off by less."""
+_OTHER_SIZE = 0.05  # so much longer or shorter is another mesh; declared diameters are off by less
 _SURFACE = ("vertices_m", "faces", "normals")
 _TENSORS = (*_SURFACE, "keypoints_m")
 

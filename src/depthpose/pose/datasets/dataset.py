@@ -357,8 +357,7 @@ def _check_content(instance: Instance, model: ObjectModel) -> Iterator[Problem]:
             yield Problem(path=instance.mask, kind="mismatch", message=message)
 
 
-_DEPTH_UNIT_M = 0.0001
-"""Tenths of a millimetre reach 6.5 m and are finer than any sensor that is imitated."""
+_DEPTH_UNIT_M = 0.0001  # tenths of a millimetre reach 6.5 m, and no imitated sensor is finer
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

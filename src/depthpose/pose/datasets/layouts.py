@@ -20,8 +20,7 @@ from depthpose.pose.config import MeshConfig
 from depthpose.pose.mesh import read_model, symmetries_from_bop, turn_about
 from depthpose.pose.types import ObjectModel, Symmetries
 
-_ROTATION_SLACK = 1e-2
-"""Published annotations are rounded; LineMOD's rotations are off by up to a few thousandths."""
+_ROTATION_SLACK = 1e-2  # published ones are rounded; LineMOD's are off by a few thousandths
 
 
 MOST = 10**9  #: of scenes, images and objects: their numbers name files

@@ -27,15 +27,13 @@ from depthpose.pose.types import Fit, Identity, ObjectModel, ViewInput
 BORDER_PX = 2
 """Readings so near an edge may be of either side: stereo and structured light match windows, and
 a mask ends so far from the silhouette."""
-SHOWN = 0.95
-"""Of what was seen of the surface so much agrees at a right pose that a sensor reads well."""
+SHOWN = 0.95  #: so much of the seen surface agrees at a right pose that a sensor reads well
 _NOISES = 3.0
 _WIDEST = 2.0  # times the usual limit, whatever the noise: beyond, what was read is no surface
 _COMPARED = 1000  # readings of the object, evenly taken, that are laid on the surface
 _LAG_PX = 3  # noise is compared so far apart: neighbouring pixels of a real sensor err alike
 _FINEST = 0.01  # of the diameter: models are no more exact
-_CELLS = 40
-"""Of the z-buffer along a diameter, at most; no finer than the pixels and the surface's points."""
+_CELLS = 40  # of the z-buffer along a diameter, at most; no finer than pixels and samples
 _GRAZING = 0.2  # cosine below which a surface is not compared: no sensor reads it well
 _WIDE = 0.6  # half of the window about the object, in diameters
 
@@ -171,21 +169,18 @@ def fit_of(seen: Seen, pose: Rigid, surface: Surface) -> Fit:
 POINTS = 400  #: of the cloud, evenly taken
 _STEPS = 12
 _WIDE_STEP = 2.0  # times the usual limit of a distance in the first step
-_INDEPENDENT = 10.0
-"""So many neighbouring readings err alike: the variance is as many times as large."""
+_INDEPENDENT = 10.0  # so many neighbouring readings err alike: the variance is so many times larger
 _STARTS = (1.0, 0.87, 1.15)
 """Scales at which the search begins: from one alone it stays there where the copy is smaller."""
 _ROUGH_POINTS = 150
-_TRUST = 0.03
-"""A scale beside 1 must lower the mean squared distance, in squared limits, by so much."""
+_TRUST = 0.03  # a scale beside 1 must lower the mean squared distance, in squared limits, so much
 _CONVERGED = 3e-4
 _PLANES = 24  # planes across which the posed model is mirrored for a start
 _CLEAR = 0.05
 """Where the mirror image, roughly fitted, is so much farther from the points than the model, exact
 steps do not bring it nearer: in 123 views the gain was then -0.035 at most."""
 _FLIP = torch.tensor([-1.0, 1.0, 1.0], dtype=torch.float64)
-_OFFSET_M = 0.006
-"""Sensors are off along the ray as a whole by 3 to 6 mm: so much nearer, a thing looks larger."""
+_OFFSET_M = 0.006  # sensors are off along the ray by 3 to 6 mm: so much nearer, things look larger
 _SURE = 2.0  # standard deviations
 _SIZE_GAIN = 0.05
 """Where another size gains less (0.25 % of the diameter), what is seen of the surface fits at many,
@@ -194,10 +189,8 @@ _MIRROR_GAIN = 0.02
 """Gain from which a cloud is that of a mirrored copy, 0.1 % of the diameter: of right answers for
 synthetic views it was at most 0.004, where the mirror image is not nearly the model."""
 _OTHER_SIZES = 0.1  # sizes so far from 1 must be excluded for an identity to be confirmed
-_NEAR_SIZE = 0.05
-"""And the size that fits is as near to 1, beside its deviation and an offset of the sensor."""
-_BESIDE = 0.005
-"""And no more of the readings may lie beside the silhouette, as those of a larger copy do."""
+_NEAR_SIZE = 0.05  # and the size that fits is as near to 1, beside its deviation and an offset
+_BESIDE = 0.005  # and no more readings may lie beside the silhouette, as a larger copy's do
 
 
 @dataclass(frozen=True)

@@ -46,10 +46,8 @@ AnyMask = AnyArray | Mapping[str, Any]  #: a mask, its file, or COCO's run lengt
 _SMALLEST_INSTANCE = 0.2
 """Pieces of a mask below this share of the largest are fragments of a segmentation, not objects."""
 AnyInput = CloudInput | ViewInput
-_MOST = 0.5
-"""Where most points lie farther from their median than the object is long, they are not its."""
-_BEFORE = 0.05
-"""Nearly all points of a cloud that was seen lie so many diameters before the camera, and more."""
+_MOST = 0.5  # where most points are farther from their median than the object is long, refuse
+_BEFORE = 0.05  # nearly all points of a seen cloud are so many diameters before the camera
 _THIN = 0.002  # below this root mean square, in diameters, a cloud has no extent
 
 

@@ -59,8 +59,7 @@ class ErrorContext:
         return drawn_triangles(self.model).double()
 
 
-Errors = Float[Tensor, " n"]
-"""One number, or several of which a row shows the mean (VSD: one a tau); float64."""
+Errors = Float[Tensor, " n"]  #: one number, or several whose mean a row shows (VSD: one a tau)
 
 
 @dataclass(frozen=True, kw_only=True)

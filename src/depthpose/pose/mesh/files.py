@@ -31,10 +31,8 @@ _WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT2": 4, "MAT3": 9, "
 _KNOWN = ("KHR_materials", "KHR_texture", "KHR_lights", "KHR_xmp", "EXT_texture", "KHR_mesh_quant")
 """How extensions of glTF begin that change no surface, or that trimesh reads."""
 _NO_AREA = 1e-12  # of the square of the extent: a face of no more is a line or a point
-_LEAST_AREA = 1e-6
-"""Of the square of the extent: all faces of less are no surface. A wire has 0.003."""
-_FARTHEST = 1e9
-"""A coordinate beyond belongs to no model, in whatever unit, and overflows in float32."""
+_LEAST_AREA = 1e-6  # of the squared extent: all faces of less are no surface; a wire has 0.003
+_FARTHEST = 1e9  # a coordinate beyond is no model's, in whatever unit, and overflows in float32
 
 
 FIXED_UNITS: dict[str, Unit] = {".glb": "m"}  #: of formats that fix theirs

@@ -319,12 +319,9 @@ def across_walls(points: np.ndarray, outward: np.ndarray, limit: float) -> np.nd
 
 _PER_METRE = {"mm": 1000.0, "cm": 100.0, "inches": 39.37}
 _MM = {"cm": 10.0, "inches": 25.4}
-_LARGEST_SHARE = 1.5
-"""A cloud is part of its object; noise and a grown mask may make it somewhat larger."""
-_SMALLEST_SHARE = 0.1
-"""What is occluded to less than a tenth of the diameter cannot be posed anyway."""
-_LIKELY_SHARE = 0.3
-"""A cloud that is too large is taken for one of another unit if that makes it as long as this."""
+_LARGEST_SHARE = 1.5  # a cloud is part of its object; noise and grown masks make it somewhat larger
+_SMALLEST_SHARE = 0.1  # what shows less than a tenth of the diameter cannot be posed anyway
+_LIKELY_SHARE = 0.3  # a cloud too large is of another unit if that makes it as long as this
 _USUAL_SHARE, _AS_LIKELY = 0.7, 0.3
 """What is seen of an object is about so long; of units that give it within 35 % all are named."""
 
@@ -372,8 +369,7 @@ def unit_advice(model_diameter_m: float, points_m: Float[Tensor, "n 3"]) -> str 
     )
 
 
-_COARSE_MESH = 1000
-"""A mesh of fewer points (a CAD box has eight) also takes keypoints from inside its faces."""
+_COARSE_MESH = 1000  # a mesh of fewer points (a box: eight) also takes keypoints inside its faces
 _LARGEST_M, _SMALLEST_M = 20.0, 0.002
 
 
@@ -488,8 +484,7 @@ def refuse_one_name(models: Sequence[ObjectModel]) -> None:
 
 
 _HULL = 8000  # corners of a hull of which all pairs are compared; more take seconds
-_HULL_DIRECTIONS = 4096
-"""No direction is farther than 0.03 rad from one of these, whose cosine is 0.9995."""
+_HULL_DIRECTIONS = 4096  # no direction is farther than 0.03 rad from one of these: cosine 0.9995
 
 
 def exact_diameter(points_m: Float[Tensor, "n 3"]) -> float:

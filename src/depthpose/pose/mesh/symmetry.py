@@ -403,8 +403,7 @@ _TOLERANCE = 0.05
 """Deviation in diameters at which a sensor's noise begins to mask the difference of two poses: real
 points of LineMOD and YCB lie 1.4 to 2.6 % of the diameter off the posed surface. Twice as much is
 tried."""
-_NEAR_SUPPRESSION_RAD = math.radians(35)
-"""Turns nearer to each other are one: ICP goes from one to the other."""
+_NEAR_SUPPRESSION_RAD = math.radians(35)  # turns nearer to each other are one to ICP
 _STEP = math.pi / 8  # an axis that nearly is one of revolution counts as eight turns
 _FINE_STEP = math.pi / 36
 _MOST_NEAR = 24

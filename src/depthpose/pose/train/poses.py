@@ -65,8 +65,7 @@ from depthpose.pose.weights import (
     write_pose_weights,
 )
 
-_SYMMETRY_STEP = 0.05
-"""Turns about a continuous axis are tried every 5.7 degrees; the vote's own error is larger."""
+_SYMMETRY_STEP = 0.05  # about an axis of revolution, [rad]; the vote's own error is larger
 
 
 class PoseTask:
@@ -270,8 +269,7 @@ def surface_points(models: Sequence[ObjectModel], count: int) -> Float[Tensor, "
     return torch.stack([points[torch.arange(count) % len(points)] for points in every])
 
 
-_STATISTICS_CLOUDS = 64
-"""Clouds from which batch norm statistics, lost by folding, are computed again."""
+_STATISTICS_CLOUDS = 64  # from which statistics of batch norm, lost by folding, are computed anew
 
 
 @releases_folder

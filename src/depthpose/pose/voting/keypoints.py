@@ -286,8 +286,7 @@ def _inliers(
     return torch.where(is_enough, kept, w), share
 
 
-_STEPS = 4
-"""Gauss-Newton from Kabsch converges quadratically; the fourth step is below float64's noise."""
+_STEPS = 4  # Gauss-Newton from Kabsch: the fourth step is below float64's noise
 
 
 def fit_pose(
