@@ -434,15 +434,10 @@ _HEADER = ["scene_id", "im_id", "obj_id", "score", "R", "t", "time"]
 _SAME_TIME_S = 0.001  # BOP's toolkit refuses rows of an image whose times differ by more
 
 
-def results_name(dataset: BopDataset) -> str:
-    """Name the BOP csv of a data set: ``depthpose_DATASET-SPLIT.csv``."""
+def results_name(dataset: BopDataset, method: str = "depthpose") -> str:
+    """Name the BOP csv of a data set: ``METHOD_DATASET-SPLIT.csv``."""
     split = dataset.split.replace("_", "-")  # as test_primesense; BOP's toolkit parts names at _
-    return f"depthpose_{dataset.folder.resolve().name}-{split}.csv"
-
-
-def alternatives_name(dataset: BopDataset) -> str:
-    """Name the csv that holds alternatives too: ``depthpose-alternatives_DATASET-SPLIT.csv``."""
-    return results_name(dataset).replace("depthpose_", "depthpose-alternatives_", 1)
+    return f"{method}_{dataset.folder.resolve().name}-{split}.csv"
 
 
 def read_bop_results(path: str | Path) -> list[Prediction]:
