@@ -163,48 +163,36 @@ def _apply(pose: Rigid, triangles_m: Float[Tensor, "f 3 3"]) -> Float[Tensor, "f
 
 _read_depth = lru_cache(maxsize=4)(read_depth_png)  # instances of one image follow each other
 
-METRICS = {
+METRICS = {  # i: the instance, c: its context
     "error_m": Metric(  # ADD, or ADD-S where that decides a success
-        measure=lambda pose, instance, context: (adds_m if context.is_adds else add_m)(
-            pose, instance.camera_from_model, context.model.vertices_m
+        measure=lambda pose, i, c: (adds_m if c.is_adds else add_m)(
+            pose, i.camera_from_model, c.model.vertices_m
         ),
         summaries={"auc": lambda errors, _: auc(errors[:, 0])},
     ),
     "adds_m": Metric(
-        measure=lambda pose, instance, context: adds_m(
-            pose, instance.camera_from_model, context.model.vertices_m
-        ),
+        measure=lambda pose, i, c: adds_m(pose, i.camera_from_model, c.model.vertices_m),
         summaries={"auc_adds": lambda errors, _: auc(errors[:, 0])},
     ),
     "mssd_m": Metric(
-        measure=lambda pose, instance, context: mssd_m(
-            pose, instance.camera_from_model, context.model.vertices_m, context.symmetries
+        measure=lambda pose, i, c: mssd_m(
+            pose, i.camera_from_model, c.model.vertices_m, c.symmetries
         ),
         summaries={"ar_mssd": lambda errors, d: average_recall(errors / d[:, None], BOP_SHARES)},
     ),
     "mspd_px": Metric(  # scaled to an image 640 wide
-        measure=lambda pose, instance, context: (
-            (BOP_WIDTH_PX / image_size(instance.depth)[0])
-            * mspd_px(
-                pose,
-                instance.camera_from_model,
-                context.model.vertices_m,
-                context.symmetries,
-                instance.K,
-            )
+        measure=lambda pose, i, c: (
+            (BOP_WIDTH_PX / image_size(i.depth)[0])
+            * mspd_px(pose, i.camera_from_model, c.model.vertices_m, c.symmetries, i.K)
         ),
         summaries={"ar_mspd": lambda errors, _: average_recall(errors, BOP_PIXELS)},
     ),
     "rotation_deg": Metric(
-        measure=lambda pose, instance, context: rotation_error_rad(
-            pose, _nearest(pose, instance, context)
-        ).rad2deg(),
+        measure=lambda pose, i, c: rotation_error_rad(pose, _nearest(pose, i, c)).rad2deg(),
         has_median=True,
     ),
     "translation_m": Metric(
-        measure=lambda pose, instance, context: translation_error_m(
-            pose, _nearest(pose, instance, context)
-        ),
+        measure=lambda pose, i, c: translation_error_m(pose, _nearest(pose, i, c)),
         has_median=True,
     ),
     "vsd": Metric(
