@@ -314,7 +314,6 @@ class PoseEstimate:
         return std.masked_fill(is_free, torch.inf)
 
     def __repr__(self) -> str:
-        """Say it in one line."""
         said = f"{self.object}: {self.status}"
         if self.camera_from_model is not None:
             said += f", t_m=[{numbers_text(self.camera_from_model.t_m.tolist())}]"

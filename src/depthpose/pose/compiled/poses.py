@@ -36,15 +36,10 @@ class Target(NamedTuple):
 @compiled
 def match(cloud, R, t, limit, target, how, local, eye, places):
     """Find for each point of a cloud the place of a surface point that the camera may see."""
-    for c in range(3):
-        eye[c] = -(R[0, c] * t[0] + R[1, c] * t[1] + R[2, c] * t[2])
-    for i in range(len(cloud)):
-        x, y, z = cloud[i, 0] - t[0], cloud[i, 1] - t[1], cloud[i, 2] - t[2]
-        for c in range(3):
-            local[i, c] = R[0, c] * x + R[1, c] * y + R[2, c] * z
+    eye[:] = -(t @ R)
+    local[:] = (cloud - t) @ R
     sought = _meet_planes(local, eye, target, places) if how == ON_RAY else local
-    x, y, z = eye[0] - target.ball[0], eye[1] - target.ball[1], eye[2] - target.ball[2]
-    distance = np.sqrt(x * x + y * y + z * z)
+    distance = np.linalg.norm(eye - target.ball[:3])
     # A camera within the ball sees no side.
     least = -SLACK * distance if distance > target.ball[3] else -np.inf
     find_places(sought, limit, target, how != LOOKED_UP, places, eye, least)
@@ -162,23 +157,9 @@ def _add_equations(local, places, R, arm, limit, points, normals, eye, how, H, b
 
 
 @compiled
-def _move(turn, motion, middle, R, t):
-    """Turn a pose about a point and shift it."""
-    x, y, z = t[0] - middle[0], t[1] - middle[1], t[2] - middle[2]
-    for c in range(3):
-        t[c] = turn[c, 0] * x + turn[c, 1] * y + turn[c, 2] * z + middle[c] + motion[3 + c]
-        x_c, y_c, z_c = R[0, c], R[1, c], R[2, c]
-        for k in range(3):
-            R[k, c] = turn[k, 0] * x_c + turn[k, 1] * y_c + turn[k, 2] * z_c
-
-
-@compiled
 def _refine(cloud, Rs, ts, limits, scale, converged, target, is_exact, every):
     """Move poses in place, step by step, each until it moves no more."""
-    middle = np.zeros(3)
-    for i in range(len(cloud)):
-        middle += cloud[i]
-    middle /= len(cloud)
+    middle = cloud.sum(0) / len(cloud)
     points, normals = target.tree.points, target.normals
     local, eye, turn = np.empty_like(cloud), np.empty(3), np.empty((3, 3))
     H, b = np.empty((6, 6)), np.empty(6)
@@ -195,10 +176,9 @@ def _refine(cloud, Rs, ts, limits, scale, converged, target, is_exact, every):
             damp(H, 1e-6)
             motion = np.linalg.solve(H, b)
             rotation(motion[0], motion[1], motion[2], turn)
-            _move(turn, motion, middle, R, t)
-            most = 0.0
-            for c in range(6):
-                most = max(most, abs(motion[c]) / (1.0 if c < 3 else scale))
+            t[:] = turn @ (t - middle) + middle + motion[3:]
+            R[:] = turn @ R
+            most = max(np.abs(motion[:3]).max(), np.abs(motion[3:]).max() / scale)
             if most < converged and how != SEARCHED and limit <= limits[-1]:
                 break
 
@@ -268,12 +248,8 @@ def _grow(local, times, middle, limits, target, is_exact, converged, variance):
             motion, variance[p] = _step(J, residual, weight)
             times[p] = min(max(s * (1 + min(max(motion[6], -0.1), 0.1)), 0.5), 2.0)
             rotation(motion[0], motion[1], motion[2], turn)
-            for i in range(count):  # by the inverse of the surface's motion
-                x = points[i, 0] - middle[0] - motion[3]
-                y = points[i, 1] - middle[1] - motion[4]
-                z = points[i, 2] - middle[2] - motion[5]
-                for c in range(3):
-                    points[i, c] = x * turn[0, c] + y * turn[1, c] + z * turn[2, c] + middle[c]
+            # By the inverse of the surface's motion.
+            points[:] = (points - middle - motion[3:6]) @ turn + middle
             most = max(most, abs(motion[0]), abs(motion[1]), abs(motion[2]), abs(motion[6]))
         if most < converged:
             break

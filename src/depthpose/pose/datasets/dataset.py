@@ -63,7 +63,6 @@ class BopDataset:
     sha256: str  #: of all annotations of the split: tells data sets of one name apart
 
     def __len__(self) -> int:
-        """How many instances."""
         return len(self.instances)
 
     def __getitem__(self, index: int) -> CloudSample:

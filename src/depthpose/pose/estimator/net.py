@@ -160,7 +160,6 @@ class GeoPoseNet(PoseEstimator):
     """The same as :meth:`load`."""
 
     def __repr__(self) -> str:
-        """Say it in one line: the network, its objects, weights, device."""
         said = f"{type(self._network).__name__} of {self._objects_in_short()}"
         named = f", weights {self.name!r}" if self.name else ""
         return f"GeoPoseNet({said}{named}, {self.config.device})"

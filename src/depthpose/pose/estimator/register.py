@@ -113,7 +113,6 @@ class Registration(PoseEstimator):
         return cls([with_found_symmetries(m, None, is_taken=True) for m in models], config)
 
     def __repr__(self) -> str:
-        """Say it in one line: the objects; a registration has no weights and no device."""
         return f"Registration(of {self._objects_in_short()})"
 
     def prepare(self) -> None:

@@ -384,7 +384,6 @@ class Objects:
         self._views: dict[tuple[int, int], CleanView] = {}
 
     def __len__(self) -> int:
-        """How many samples there are."""
         return self.config.number
 
     def __getitem__(self, index: int) -> CloudSample:

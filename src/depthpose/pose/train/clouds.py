@@ -105,7 +105,6 @@ class TrainingViews:
                     )
 
     def __len__(self) -> int:
-        """Samples of an epoch: each frame once, or as many as there are synthetic views."""
         if self._frames is None or self._real is None:
             return len(self.synthetic)
         return max(1, round(len(self._real) / self._frames.share))

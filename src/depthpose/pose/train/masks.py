@@ -84,7 +84,6 @@ class AnnotatedImages:
         self._with_cache = config.with_cache
 
     def __len__(self) -> int:
-        """How many images."""
         return len(self._images)
 
     def __getitem__(self, index: int) -> LabelledImage:
@@ -130,7 +129,6 @@ class TrainingImages:
         self._long_side_px = network.long_side_px
 
     def __len__(self) -> int:
-        """Images of an epoch."""
         return len(self.images)
 
     def __getitem__(self, index: int) -> LabelledImage:
