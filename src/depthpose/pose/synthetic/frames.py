@@ -196,6 +196,8 @@ def _make_frame(
         world = _piled(models, solids, config, generator)
     else:
         world = _arranged(solids, config, generator)
+    table = table_of(uniform(generator, 0.8, 3.0), generator)
+    world.append((table, Rigid(torch.eye(3), torch.zeros(3))))
     view = _viewpoint(config, generator)
     placed = [(solid, view @ pose) for solid, pose in world]
     (fx, fy), (cx, cy) = config.focal_px, config.principal_point_px
@@ -250,7 +252,6 @@ def _arranged(
     chosen = [solids[i] for i in order[: low + whole(generator, high - low + 1)].tolist()]
     low, high = config.frame_clutter
     chosen += [random_clutter(generator) for _ in range(low + whole(generator, high - low + 1))]
-    floor = Rigid(torch.eye(3), torch.zeros(3))
     placed: list[tuple[Solid, Rigid]] = []
     circles: list[tuple[float, float, float]] = []
     for solid in chosen:
@@ -267,7 +268,7 @@ def _arranged(
                 placed.append((solid, Rigid(R, shift)))
                 circles.append((x, y, radius_m))
                 break
-    return [*placed, (table_of(uniform(generator, 0.8, 3.0), generator), floor)]
+    return placed
 
 
 _CELL_M = 0.004
@@ -306,8 +307,7 @@ def _piled(
         _, pose, cell, top = min(drops, key=lambda drop: drop[0])
         height_m = height_m.scatter_reduce(0, cell, top, "amax")
         placed.append((solids[which], pose))
-    floor = Rigid(torch.eye(3), torch.zeros(3))
-    return [*placed, (table_of(uniform(generator, 0.8, 3.0), generator), floor)]
+    return placed
 
 
 def _viewpoint(config: ObjectsConfig, generator: torch.Generator) -> Rigid:
