@@ -21,7 +21,7 @@ import trimesh
 from depthpose.core.config import read_config
 from depthpose.pose.config import EstimateConfig
 from depthpose.pose.estimator import GeoPoseNet, Registration
-from depthpose.pose.metrics import is_within_diameter
+from depthpose.pose.metrics import SUCCESS_SHARE
 from depthpose.pose.train.clouds import held_out_objects, pose_error
 from depthpose.pose.train.config import PoseTraining
 from depthpose.pose.weights import PoseWeights, read_pose_weights
@@ -77,7 +77,7 @@ def measure(weights: PoseWeights, number: int) -> list[dict[str, Any]]:
                 for one, sample in zip(found, samples, strict=True)
                 if one.is_posed
             ]
-            right = int(is_within_diameter(torch.tensor(errors)).sum())
+            right = sum(e < SUCCESS_SHARE for e in errors)
             rows.append({
                 "occluded": share, "method": name, "views": len(views),
                 "right": right / len(views), "wrong": (len(errors) - right) / len(views),

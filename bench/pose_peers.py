@@ -23,7 +23,6 @@ from real_poses import RealCase, real_cases
 
 from depthpose.core.checkpoint import find_weights
 from depthpose.core.rigid import Rigid
-from depthpose.pose.baselines import FpfhConfig, FpfhRegistration
 from depthpose.pose.config import EstimateConfig, VotingConfig
 from depthpose.pose.estimator import GeoPoseNet, Registration
 from depthpose.pose.evaluate import nearest_copy
@@ -32,6 +31,7 @@ from depthpose.pose.metrics import add_m, adds_m, auc
 from depthpose.pose.types import CloudInput, PoseEstimate, ViewInput
 from depthpose.pose.weights import PoseWeights, read_pose_weights
 from depthpose.report.page import markdown_table, write_table
+from depthpose.thesis.fpfh import FpfhConfig, FpfhEstimator
 
 POINTS = 2000
 AnyInput = CloudInput | ViewInput
@@ -75,9 +75,9 @@ def declared_add(case: RealCase, pose: Rigid, points_m: torch.Tensor) -> float:
 def open3d_method(case: RealCase, seed: int, words: argparse.Namespace) -> Method:
     """Open3D's registration for one model."""
     config = FpfhConfig(seed=seed, voxel_diameters=words.voxel)
-    peer = FpfhRegistration(case.model, config)
+    peer = FpfhEstimator([case.model], config)
     cloud = CloudInput(name=case.name, points_m=case.points_m, object=case.model.name)
-    return lambda _: peer.estimate(cloud)
+    return lambda _: peer.estimate_many([cloud])[0]
 
 
 def zero_shot_method(case: RealCase, seed: int) -> Method:

@@ -28,16 +28,16 @@ import torch
 from curves import draw_curves
 
 from depthpose.core.checkpoint import find_weights
-from depthpose.pose.baselines import FpfhEstimator
 from depthpose.pose.config import EstimateConfig, ObjectsConfig, SensorConfig, SensorKind
 from depthpose.pose.datasets.layouts import models_folder, read_bop_models, read_models_info
 from depthpose.pose.estimator import DepthImageRegressor, GeoPoseNet, Registration
 from depthpose.pose.mesh import sample_surface
-from depthpose.pose.metrics import add_m, adds_m, risk_coverage
+from depthpose.pose.metrics import add_m, adds_m
 from depthpose.pose.synthetic import PARTS, Objects, make_part
 from depthpose.pose.types import ObjectModel, PoseEstimate, ViewInput, ViewSample
 from depthpose.pose.weights import read_pose_weights
 from depthpose.report.page import markdown_table, write_table
+from depthpose.thesis.fpfh import FpfhEstimator
 
 SEED = 0x7E57ED
 POINTS = 1000
@@ -83,7 +83,8 @@ def loaded(
 ) -> Iterator[Method]:
     """Give a method of trained weights, with and without ICP."""
     for with_icp in (False, True):
-        nets = [kind.load(file, EstimateConfig(with_icp=with_icp)) for file in files]
+        found = (read_pose_weights(find_weights(file)) for file in files)
+        nets = [kind(weights, EstimateConfig(with_icp=with_icp)) for weights in found]
         yield from _of(f"{name} + ICP" if with_icp else name, nets, number)
 
 
@@ -253,8 +254,13 @@ def draw_risks(views: Sequence[Row], out: Path) -> None:
             v for v in views if v["method"] == OPEN and all(v.get(k, at[k]) == at[k] for k in at)
         ]
         if own:
-            found = risk_coverage(finite(own, "risk"), finite(own, "error") < 0.1)
-            points = list(zip(*(x.tolist() for x in found), strict=True))
+            risk, order = finite(own, "risk").sort(stable=True)
+            wrong = (finite(own, "error")[order] >= 0.1).double().cumsum(0)
+            answered = torch.arange(1, len(own) + 1).double()
+            # Views of one risk are refused together: the last of them counts for all.
+            kept = risk.isfinite() & torch.cat([risk.diff() > 0, torch.ones(1).bool()])
+            both = (answered / len(own))[kept], (wrong / answered)[kept]
+            points = list(zip(*(share.tolist() for share in both), strict=True))
             curves[f"{occlusion:.0%} hidden"] = points[:: max(1, len(points) // 40)]
     if curves:
         draw_curves(out / "risks.png", {"share of views answered": curves}, "wrong among answers")

@@ -18,9 +18,9 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from depthpose.pose.baselines import ransac_one_by_one
 from depthpose.pose.config import VotingConfig
 from depthpose.pose.voting import meet_lines, vote_ransac
+from depthpose.thesis.pose_tables import ransac_one_by_one
 
 KEYPOINTS = 8
 WRONG_SHARE = 0.2

@@ -5,7 +5,12 @@ from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).parent / "ext"))
 
+from sphinx.ext.napoleon.docstring import GoogleDocstring
+
 from depthpose import __version__
+
+# Else what stands before the first colon of a field's meaning would be shown as its type.
+GoogleDocstring._parse_attribute_docstring = GoogleDocstring._consume_to_end
 
 project = "depthpose"
 author = "The depthpose authors"

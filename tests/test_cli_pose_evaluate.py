@@ -2,6 +2,8 @@ import csv
 import json
 import shutil
 import sys
+from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 from typing import ClassVar
 
@@ -11,13 +13,13 @@ from tests.pages.read_page import read_page
 from tests.pose.synthetic_frames import frame_models, make_dataset, moved, predictions_of
 from tests.pose.synthetic_objects import tiny_weights
 
-from depthpose.cli import main
+from depthpose.cli import main, pose_methods
 from depthpose.core.checkpoint import file_sha256
-from depthpose.pose import baselines
+from depthpose.pose.cloud import object_points
 from depthpose.pose.datasets import BopDataset, Detection, encode_rle, read_mask, write_detections
 from depthpose.pose.evaluate import frames_hash
 from depthpose.pose.predictions import read_predictions, write_bop_results, write_predictions
-from depthpose.pose.types import CloudInput, ObjectModel, PoseEstimate
+from depthpose.pose.types import ObjectModel, PoseEstimate, ViewInput
 from depthpose.pose.weights import write_pose_weights
 
 
@@ -139,33 +141,33 @@ def test_weights_predict_once_with_true_and_predicted_masks(
 class KnowsNoPose:
     """What registration is asked for, without Open3D."""
 
-    clouds: ClassVar[list[CloudInput]] = []
+    views: ClassVar[list[ViewInput]] = []
 
-    def __init__(self, model: ObjectModel, _: object) -> None:
-        self.model = model
+    def __init__(self, models: Sequence[ObjectModel]) -> None:
+        self.names = {model.name for model in models}
 
-    def estimate(self, given: CloudInput) -> PoseEstimate:
-        assert given.object == self.model.name
-        self.clouds.append(given)
-        return PoseEstimate(
-            name=given.name, object=given.object, status="votes do not meet", reason="none"
-        )
+    def estimate_many(self, inputs: Sequence[ViewInput]) -> list[PoseEstimate]:
+        assert {given.object for given in inputs} <= self.names
+        self.views.extend(inputs)
+        none = partial(PoseEstimate, status="votes do not meet", reason="none")
+        return [none(name=given.name, object=given.object) for given in inputs]
 
 
 def test_registration_is_a_row_beside_weights(
     synthetic: BopDataset, weights: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(baselines, "FpfhRegistration", KnowsNoPose)
+    monkeypatch.setattr(pose_methods, "FpfhEstimator", KnowsNoPose)
     words = ["--bop", str(synthetic.folder), "--weights", str(weights), "open3d", "--no-vsd"]
     assert main(["pose", "evaluate", *words, "--out", str(tmp_path / "out")]) == 0
     own = [row for row in rows_of(tmp_path / "out") if row["method"] == "open3d"]
     assert [row["object"] for row in own] == ["bracket", "bottle", "mean", "all"]
     assert all(row["refused"] == 1 and not row["weights"] for row in own)
-    for cloud, instance in zip(KnowsNoPose.clouds, synthetic.instances, strict=True):
+    for view, instance in zip(KnowsNoPose.views, synthetic.instances, strict=True):
         truth = synthetic.view(instance).truth.camera_from_model
         diameter_m = synthetic.objects[instance.object_id].diameter_m
-        assert len(cloud.points_m) > 100
-        assert float((cloud.points_m - truth.t_m).norm(dim=1).max()) < diameter_m
+        points_m = object_points(view, diameter_m)
+        assert len(points_m) > 100
+        assert float((points_m - truth.t_m).norm(dim=1).max()) < diameter_m
 
 
 def test_registration_without_training_is_a_word_in_place_of_weights(

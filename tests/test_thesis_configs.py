@@ -280,7 +280,7 @@ def test_the_segmentation_knows_the_same_objects(
     monkeypatch: pytest.MonkeyPatch, linemod: Path, tmp_path: Path
 ) -> None:
     found = pose_training("thesis-masks", monkeypatch, linemod, tmp_path)
-    assert found.task.objects.numbers == OBJECTS
+    assert tuple(found.task.objects) == OBJECTS
     assert found.task.network.classes == 14
     assert found.config.network.stride == 8
     assert len(found.samples) == 13

@@ -20,8 +20,6 @@ from depthpose.pose.baselines import (
     DepthCrop,
     DepthImageConfig,
     DepthImageNet,
-    FpfhConfig,
-    FpfhRegistration,
     PointNet,
     PointNetConfig,
     cut_depth,
@@ -31,6 +29,7 @@ from depthpose.pose.baselines import (
 from depthpose.pose.losses import model_point_loss
 from depthpose.pose.mesh import sample_surface
 from depthpose.pose.types import CloudInput, SeenPoints, ViewInput
+from depthpose.thesis.fpfh import FpfhConfig, FpfhEstimator
 
 K = torch.tensor([[500.0, 0, 160], [0, 510.0, 120], [0, 0, 1]], dtype=torch.float64)
 SMALL = DepthImageConfig(classes=3, crop_px=32, widths=(4, 4, 8, 8))
@@ -266,18 +265,18 @@ def test_a_training_step_takes_a_cloud_of_one_point() -> None:
 def test_without_open3d_the_extra_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "open3d", None)
     with pytest.raises(MissingExtraError, match=r"pip install -e '.\[open3d\]'"):
-        FpfhRegistration(bracket())
+        FpfhEstimator([bracket()])
 
 
 @pytest.mark.skipif(importlib.util.find_spec("open3d") is None, reason="open3d is not installed")
 def test_registration_finds_a_seen_pose_and_refuses_two_points() -> None:
     pose = Rigid(turned(2), torch.tensor([0.05, 0.0, 0.7]))
     points_m = pose.apply(sample_surface(bracket(), 4000)[0])
-    register = FpfhRegistration(bracket(), FpfhConfig(iterations=50_000))
-    found = register.estimate(CloudInput(name="c", points_m=points_m, object="bracket"))
+    peer = FpfhEstimator([bracket()], FpfhConfig(iterations=50_000))
+    clouds = [CloudInput(name="c", points_m=p, object="bracket") for p in (points_m, points_m[:2])]
+    found, few = peer.estimate_many(clouds)
     assert found.camera_from_model is not None
     assert float((found.camera_from_model.t_m - pose.t_m).norm()) < 0.01
-    few = register.estimate(CloudInput(name="c", points_m=points_m[:2], object="bracket"))
     assert (few.status, few.camera_from_model) == ("too few points", None)
 
 

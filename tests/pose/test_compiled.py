@@ -17,14 +17,13 @@ from depthpose.core.errors import Notice
 from depthpose.core.rigid import Rigid, rotation_by
 from depthpose.pose import compiled
 from depthpose.pose.cloud import local_planes
-from depthpose.pose.config import IcpConfig, VotingConfig
+from depthpose.pose.config import IcpConfig
 from depthpose.pose.estimator.fit import scale_of
 from depthpose.pose.network import ResUNet, ResUNetConfig
 from depthpose.pose.refine import RefinedPose, refine_best, refine_pose, refine_roughly
 from depthpose.pose.sparse import Voxels, conv
 from depthpose.pose.surface import Surface, look_along_rays, prepare_surface
 from depthpose.pose.synthetic.parts import make_part
-from depthpose.pose.voting import fit_pose, meet_lines, vote_ransac
 from depthpose.pose.voting.point_pairs import prepare_pairs, vote_poses
 
 pytest.importorskip("numba")
@@ -155,20 +154,6 @@ def test_scales(times: float, surface: Surface, monkeypatch: pytest.MonkeyPatch)
     assert abs(a.gain - b.gain) < 1e-6
 
 
-def test_planes(surface: Surface, monkeypatch: pytest.MonkeyPatch) -> None:
-    cloud_m = seen(surface, poses(surface, 1)[0])
-    (a, bend), (b, other) = both(lambda: local_planes(cloud_m, cloud_m[::3]), monkeypatch)
-    assert is_near(bend, other, 1e-10)
-    assert is_near((a * b).sum(-1), torch.ones(len(a)).double(), 1e-10)
-
-
-def test_planes_of_fewer_points_than_neighbours(monkeypatch: pytest.MonkeyPatch) -> None:
-    cloud_m = torch.randn(7, 3, generator=torch.Generator().manual_seed(2)).double()
-    (a, bend), (b, other) = both(lambda: local_planes(cloud_m, cloud_m), monkeypatch)
-    assert is_near(a, b, 1e-10)
-    assert is_near(bend, other, 1e-10)
-
-
 def test_rays(surface: Surface, monkeypatch: pytest.MonkeyPatch) -> None:
     every = poses(surface, 5, spread=1.0)
     every = Rigid(every.R, torch.cat([every.t_m[:4], -every.t_m[4:]]))  # the last behind the camera
@@ -177,45 +162,6 @@ def test_rays(surface: Surface, monkeypatch: pytest.MonkeyPatch) -> None:
     for first, second in zip(a, b, strict=True):
         assert is_near(first, second, 1e-12)
     assert float(a[0][-1]) == float(a[1][-1]) == 1
-
-
-@pytest.mark.parametrize("is_weighted", [True, False])
-@pytest.mark.parametrize("refinements", [0, 3])
-def test_votes(refinements: int, is_weighted: bool, monkeypatch: pytest.MonkeyPatch) -> None:
-    generator = torch.Generator().manual_seed(4)
-    points_m = 0.05 * torch.randn(60, 3, generator=generator).double()
-    keypoints_m = 0.05 * torch.randn(8, 3, generator=generator).double()
-    directions = torch.nn.functional.normalize(keypoints_m - points_m[:, None], dim=-1)
-    directions += 0.05 * torch.randn(60, 8, 3, generator=generator).double()
-    weight = torch.rand(60, 8, generator=generator).double() if is_weighted else None
-    config = VotingConfig(refinements=refinements)
-    ways = (
-        lambda: meet_lines(points_m, directions, weight, refinements),
-        lambda: vote_ransac(points_m, directions, weight, config),
-    )
-    for way in ways:
-        a, b = both(way, monkeypatch)
-        assert is_near(a.keypoints_m, b.keypoints_m, 1e-12)
-        assert is_near(a.covariance_m2, b.covariance_m2, 1e-12)
-        assert is_near(a.condition, b.condition, 1e-9)
-        assert torch.equal(a.inlier_share, b.inlier_share)
-
-
-def test_fits(monkeypatch: pytest.MonkeyPatch) -> None:
-    generator = torch.Generator().manual_seed(6)
-    model_m = 0.1 * torch.randn(8, 3, generator=generator).double()
-    found_m = model_m @ rotation_by(torch.tensor([0.3, -0.2, 2.0]).double()).T + 0.5
-    found_m = found_m + 0.002 * torch.randn(2, 8, 3, generator=generator).double()
-    root = 0.002 * torch.randn(2, 8, 3, 3, generator=generator).double()
-    covariance_m2 = root @ root.mT + 1e-8 * torch.eye(3).double()
-    used = torch.ones(2, 8, dtype=torch.bool)
-    used[1, 2] = False
-    for part in (slice(None), 0):
-        given = (found_m[part], covariance_m2[part], model_m, used[part])
-        a, b = both(lambda given=given: fit_pose(*given), monkeypatch)
-        assert is_near(a.camera_from_model.R, b.camera_from_model.R, 1e-9)
-        assert is_near(a.covariance, b.covariance, 1e-9)
-        assert is_near(a.misfit, b.misfit, 1e-6)
 
 
 def test_networks(monkeypatch: pytest.MonkeyPatch) -> None:

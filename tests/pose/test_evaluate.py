@@ -247,8 +247,9 @@ _SCORES = ["auc", "auc_adds", "ar_mssd", "ar_mspd", "ar_vsd", "ar", "rotation_de
 
 
 def test_columns_come_in_the_declared_order(synthetic: BopDataset) -> None:
-    result = evaluate(synthetic, predictions_of(synthetic, lambda i: i.camera_from_model))
-    found = result.of(Origin(method="ours", masks="truth", weights="w", weights_sha256="ab"))
+    origin = Origin(method="ours", masks="truth", weights="w", weights_sha256="ab")
+    exact = predictions_of(synthetic, lambda i: i.camera_from_model)
+    found = evaluate(synthetic, exact, origin=origin)
     who, times = ["method", "masks"], ["ms_network", "ms_voting", "ms_total"]
     stamp = ["diameters", "frames", "frames_sha256"]
     assert list(found.per_instance[0].columns()) == [

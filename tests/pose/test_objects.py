@@ -11,7 +11,7 @@ from depthpose.core.errors import InputError
 from depthpose.core.render import rasterize
 from depthpose.pose.config import ObjectsConfig, SensorConfig
 from depthpose.pose.datasets import check_bop, open_bop, write_bop_models, write_bop_scene
-from depthpose.pose.mesh import make_model, surfel_triangles
+from depthpose.pose.mesh import drawn_triangles, make_model
 from depthpose.pose.synthetic import Objects, make_frames
 from depthpose.pose.synthetic.views import (
     draw_view,
@@ -191,7 +191,7 @@ def test_discs_stand_for_the_surface_that_points_were_taken_from() -> None:
     pose = pose_of_middle(make_shape(mesh), R, torch.tensor([0, 0, 0.5]).double())
     drawn = [
         rasterize((triangles.double() @ pose.R.mT + pose.t_m).float(), _K, 640, 480).depth_m
-        for triangles in (mesh.triangles_m, surfel_triangles(points))
+        for triangles in (mesh.triangles_m, drawn_triangles(points))
     ]
     shapes = [depth.isfinite() for depth in drawn]
     union, both = (shapes[0] | shapes[1]).sum(), (shapes[0] & shapes[1]).sum()

@@ -35,7 +35,6 @@ from depthpose.pose.estimator.candidates import (
 )
 from depthpose.pose.estimator.fit import fit_of, seen_about
 from depthpose.pose.estimator.inputs import ObjectCloud, prepare_cloud
-from depthpose.pose.metrics import risk_coverage
 from depthpose.pose.surface import prepare_surface
 from depthpose.pose.synthetic.views import shift_mask
 from depthpose.pose.types import Fit, ObjectModel, PoseEstimate, ViewInput
@@ -237,11 +236,3 @@ def test_a_plane_is_unobservable_and_a_corner_is_not() -> None:
     assert whole > 0.15
     away, _ = observability(torch.ones(100, 3), pose, surface, none)
     assert away == 0
-
-
-def test_risk_and_coverage_of_a_toy() -> None:
-    risks = torch.tensor([0.3, 0.1, 0.1, torch.inf, 0.9])
-    is_right = torch.tensor([True, True, False, False, False])
-    coverage, wrong = risk_coverage(risks, is_right)
-    assert coverage.tolist() == pytest.approx([0.4, 0.6, 0.8])
-    assert wrong.tolist() == pytest.approx([1 / 2, 1 / 3, 2 / 4])

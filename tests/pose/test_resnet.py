@@ -9,12 +9,13 @@ from safetensors.torch import save_file
 from torch import Tensor
 
 from depthpose.cli import main
+from depthpose.core.checkpoint import read_checkpoint
 from depthpose.core.errors import InputError
 from depthpose.pose.segmentation import (
+    ENCODER_KIND,
     ResNet18,
     import_resnet18,
     normalise_colors,
-    read_encoder_state,
     resnet18_from_published,
 )
 
@@ -106,7 +107,7 @@ def test_both_kinds_of_published_file_come_back_by_the_command(tmp_path: Path) -
         out = tmp_path / f"ours_{name[0]}.safetensors"
         words = ["weights", "import", "resnet18", str(tmp_path / name), "--out", str(out)]
         assert main(words) == 0
-        read = read_encoder_state(out)
+        read = read_checkpoint(out, ENCODER_KIND).state
         assert torch.equal(read["layer3.0.downsample.0.weight"],
                            state["layer3.0.downsample.0.weight"])  # fmt: skip
         assert not any(key.startswith("fc") for key in read)

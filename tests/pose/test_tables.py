@@ -8,7 +8,6 @@ from tests.pose.synthetic_objects import bracket, tiny_weights
 
 from depthpose.core.errors import InputError
 from depthpose.core.rigid import Rigid
-from depthpose.pose.baselines import ransac_one_by_one
 from depthpose.pose.config import CloudConfig
 from depthpose.pose.estimator import GeoPoseNet
 from depthpose.pose.estimator.inputs import ObjectCloud, prepare_cloud
@@ -23,6 +22,7 @@ from depthpose.thesis.pose_tables import (
     compare_voting,
     join_by_object,
     linemod_number,
+    ransac_one_by_one,
 )
 
 

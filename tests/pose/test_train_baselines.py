@@ -10,7 +10,13 @@ import torch.nn.functional as F
 from tests.pose.stopping import StoppedError, stop_after
 from tests.pose.synthetic_objects import bottle, bracket
 
-from depthpose.core.checkpoint import Checkpoint, LicenceNotice, read_checkpoint, save_checkpoint
+from depthpose.core.checkpoint import (
+    Checkpoint,
+    LicenceNotice,
+    read_checkpoint,
+    save_checkpoint,
+    warn_of_terms,
+)
 from depthpose.core.errors import InputError
 from depthpose.core.files import write_image
 from depthpose.core.loop import AdamConfig, LoopConfig, Run, read_metrics
@@ -38,6 +44,8 @@ from depthpose.pose.train.masks import (
     jitter_colors,
 )
 from depthpose.pose.train.poses import TrainingCrops, surface_points, symmetric_copies
+from depthpose.pose.types import CloudInput
+from depthpose.pose.weights import read_pose_weights
 
 LOOP = LoopConfig(steps=2, batch_size=2, device="cpu", log_every_steps=1)
 VIEWS = ObjectsConfig(number=8, views=2, resolution=(0.25, 0.25), distance_m=(0.6, 0.7))
@@ -100,8 +108,10 @@ def test_the_depth_image_trains_and_its_file_is_a_regressors(
         "| occluded_0/regressed_median | ",
     ):
         assert said in card
+    weights = read_pose_weights(path)
     with pytest.warns(LicenceNotice, match="For research alone"):
-        regressor = DepthImageRegressor.load(path)
+        warn_of_terms(weights.facts)
+    regressor = DepthImageRegressor(weights)
     view = Objects([bracket()], VIEWS).view(0).input
     found, refused = regressor.estimate_many(
         [view, dataclasses.replace(view, mask=view.mask & False)]
@@ -109,8 +119,13 @@ def test_the_depth_image_trains_and_its_file_is_a_regressors(
     assert found.is_ok
     assert set(found.seconds) == {"network", "icp"}
     assert (refused.status, refused.is_ok) == ("too few points", False)
-    with pytest.raises(InputError, match=r"'cup'.*they know bracket"):
-        regressor.estimate_many([dataclasses.replace(view, object="cup")])
+    cloud = CloudInput(name="c", points_m=torch.rand(50, 3), object="bracket")
+    found = regressor.estimate_many([dataclasses.replace(view, object="cup"), cloud])
+    assert [one.status for one in found] == ["unreadable"] * 2
+    assert "'cup': the weights do not know it" in found[0].reason
+    assert "takes a depth image with a mask" in found[1].reason
+    with pytest.raises(InputError, match="takes a depth image with a mask"):
+        regressor.estimate(cloud=cloud.points_m, object="bracket")
 
 
 def test_weights_of_the_other_kind_are_refused_with_the_class_to_take(
@@ -121,7 +136,7 @@ def test_weights_of_the_other_kind_are_refused_with_the_class_to_take(
     with pytest.raises(InputError, match="load them as DepthImageRegressor"):
         GeoPoseNet.load(depth)
     with pytest.raises(InputError, match="load them as GeoPoseNet"):
-        DepthImageRegressor.load(votes)
+        DepthImageRegressor(read_pose_weights(votes))
     other = dataclasses.replace(depth_image_config(models_folder), start=str(votes))
     with pytest.raises(InputError, match="Give the config the weights' own"):
         STAGES["depth-image"][1](other, Run(folder=tmp_path / "o"))
@@ -192,7 +207,7 @@ def colored(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def test_labels_are_the_classes_of_the_masks(colored: Path) -> None:
     images = AnnotatedImages(ImagesConfig(folder=str(colored)))
-    assert (images.objects.names, images.objects.numbers) == (("bottle", "bracket"), (3, 7))
+    assert images.objects == {3: "bottle", 7: "bracket"}
     for _ in range(2):  # read, then out of memory
         image, labels = images[2]
         red, green = (o.visible for o in colored_frame(2).objects)
@@ -200,7 +215,7 @@ def test_labels_are_the_classes_of_the_masks(colored: Path) -> None:
         assert torch.equal(labels == 2, red & ~green)
         assert float(image[0][labels == 2].mean()) > 0.5
     only = AnnotatedImages(ImagesConfig(folder=str(colored), objects=(7,), limit=3))
-    assert (len(only), only.objects.names, only[0].labels.unique().tolist()) == (
+    assert (len(only), tuple(only.objects.values()), only[0].labels.unique().tolist()) == (
         3, ("bracket",), [0, 1],
     )  # fmt: skip
 

@@ -70,7 +70,7 @@ def measure_each(
                     f"{path}: predictions of the {what} {theirs!r}, but {own!r} is measured; give "
                     f"those of this very {what}, or measure that one"
                 )
-        evaluations.append(evaluate(dataset, read_any(path), config, show).of(origin))
+        evaluations.append(evaluate(dataset, read_any(path), config, show, origin))
         if (advice := evaluations[-1].advice) is not None:
             print(f"{path}: {advice}", file=sys.stderr)
     return evaluations

@@ -25,7 +25,7 @@ from depthpose.core.rigid import Rigid
 from depthpose.core.run import claim_folder
 from depthpose.core.units import Unit
 from depthpose.pose import datasets, predictions
-from depthpose.pose.baselines import DepthImageNet, FpfhConfig, FpfhEstimator
+from depthpose.pose.baselines import DepthImageNet
 from depthpose.pose.config import EstimateConfig
 from depthpose.pose.datasets.layouts import integer, read_rows
 from depthpose.pose.estimator import DepthImageRegressor, GeoPoseNet, Registration
@@ -34,6 +34,7 @@ from depthpose.pose.mesh import FIXED_UNITS, unit_of
 from depthpose.pose.segmentation import Segmenter
 from depthpose.pose.types import ObjectModel, PoseEstimate, ViewInput
 from depthpose.pose.weights import read_pose_weights
+from depthpose.thesis.fpfh import FpfhConfig, FpfhEstimator
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

@@ -64,7 +64,6 @@ from depthpose.pose.predictions import (
     POSES,
     Job,
     Prediction,
-    alternatives_name,
     is_finished,
     kept_predictions,
     predict,
@@ -78,6 +77,7 @@ from depthpose.report import pose as drawn
 from depthpose.report.page import Section, choose_answers, plain_table, write_page
 
 _PAGE = "report.html"
+_WITH_ALTERNATIVES = "depthpose-alternatives"  # the method of a csv that has them too
 _MOST_SHOWN = 20  # of the answers, on the terminal; poses.json holds all
 _SAID = 5  # of so many inputs the alternatives are printed; of all they are in poses.json
 _MOST_ROWS = 1000  # of the answers, in the table of the page
@@ -119,7 +119,7 @@ def claim_bop(out: Path, settings: dict[str, Any], dataset: BopDataset) -> None:
     """Claim a folder for the poses of a data set."""
     images = sorted({(i.scene_id, i.image_id) for i in dataset.instances})
     pictures = [_picture_name(*image) for image in images]
-    tables = [results_name(dataset), alternatives_name(dataset)]
+    tables = [results_name(dataset), results_name(dataset, _WITH_ALTERNATIVES)]
     run.claim_folder(out, settings, [POSES, _PAGE, *tables, *pictures])
 
 
@@ -383,7 +383,8 @@ def write_files(
     if dataset is not None:
         write_bop_results(out / results_name(dataset), predictions)
         if any(p.estimate.alternatives for p in predictions):
-            write_bop_results(out / alternatives_name(dataset), predictions, with_alternatives=True)
+            more = out / results_name(dataset, _WITH_ALTERNATIVES)
+            write_bop_results(more, predictions, with_alternatives=True)
         image_of = {(i.scene_id, i.image_id): i for i in dataset.instances}
         posed: dict[tuple[int, int], list[PoseEstimate]] = defaultdict(list)
         for prediction in predictions:

@@ -1,25 +1,20 @@
-"""Baselines: FPFH, PointNet, a regressed depth image."""
+"""Baselines: PointNet, a regressed depth image."""
 
-import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import Annotated, Any, ClassVar, NamedTuple
+from typing import Annotated, ClassVar, NamedTuple
 
-import numpy as np
 import torch
 import torch.nn.functional as F
-from jaxtyping import Float, Float64, Int
+from jaxtyping import Float, Int
 from torch import Tensor, nn
 
 from depthpose.core.config import Settings
-from depthpose.core.errors import import_open3d
 from depthpose.core.rigid import Rigid, turn_axis_to
-from depthpose.pose.cloud import object_points
-from depthpose.pose.mesh import sample_surface
 from depthpose.pose.segmentation import ResNet18
 from depthpose.pose.sparse import RowNorm
-from depthpose.pose.types import CloudInput, ObjectModel, PoseEstimate, SeenPoints, ViewInput
+from depthpose.pose.types import SeenPoints, ViewInput
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -79,40 +74,20 @@ class PointNetConfig(Settings):
         return self.classes * self.keypoints * 3
 
 
-@dataclass(frozen=True, kw_only=True)
-class FpfhConfig(Settings):
-    """FPFH features, RANSAC and ICP of Open3D."""
-
-    voxel_diameters: Annotated[float, "(0, inf)"] = 0.03
-    """Side of a voxel in diameters of the object."""
-
-    iterations: Annotated[int, "[1, inf)"] = 100_000
-    """Of RANSAC, at most."""
-
-    seed: int = 0
-    """Of RANSAC."""
-
-
-EMPTY = -2.0
-"""Of a pixel without the object: below all that a depth can be, -1 to 1."""
+EMPTY = -2.0  #: of a pixel without the object: below all that a depth can be, -1 to 1
 
 
 class DepthCrop(NamedTuple):
-    """A crop, and where it lies; batched with leading axes.
+    """A crop, and where it lies; batched with leading axes."""
 
-    Attributes:
-        image: depth over its mean, less one, over the contrast; ``EMPTY`` beside the object.
-        R: ``camera_from_crop``: turns the optical axis onto the ray through the crop's middle. An
-            object looks alike in the crop wherever in the image it is, if its rotation is said in
-            this frame.
-        middle_m: the point of that ray at the mean depth, in the camera frame.
-        side_m: width of the crop at the mean depth.
-    """
-
+    #: depth over its mean, less one, over the contrast; ``EMPTY`` beside the object.
     image: Float[Tensor, "*b 1 size size"]
+    #: ``camera_from_crop``: turns the optical axis onto the ray through the crop's middle. An
+    #: object looks alike in the crop wherever in the image it is, if its rotation is said in this
+    #: frame.
     R: Float[Tensor, "*b 3 3"]
-    middle_m: Float[Tensor, "*b 3"]
-    side_m: Float[Tensor, "*b"]
+    middle_m: Float[Tensor, "*b 3"]  #: the point of that ray at the mean depth, in the camera frame
+    side_m: Float[Tensor, "*b"]  #: width of the crop at the mean depth
 
 
 def cut_depth(
@@ -202,166 +177,6 @@ def rotation_from_6d(numbers: Float[Tensor, "*b 6"]) -> Float[Tensor, "*b 3 3"]:
     return torch.stack([first, second, torch.linalg.cross(first, second)], -1)
 
 
-_MODEL_POINTS = 20_000
-_NORMAL, _FEATURE, _CORRESPONDENCE, _ICP = 2.0, 5.0, 1.5, 0.4
-"""Radius for normals and for features (Rusu et al. 2009), reach of RANSAC's correspondences and of
-the point-to-plane ICP that follows, in voxels, as Open3D's tutorial has them."""
-_LEAST = 3
-"""Points that a pose takes; Open3D answers fewer with a crash or with the identity."""
-
-
-class FpfhRegistration:
-    """Poses of one object: its model is prepared once.
-
-    Raises:
-        MissingExtraError: Open3D is not installed.
-    """
-
-    def __init__(self, model: ObjectModel, config: FpfhConfig | None = None) -> None:
-        self.model, self.config = model, config or FpfhConfig()
-        self._voxel_m = self.config.voxel_diameters * model.diameter_m
-        self._open3d = import_open3d("registration by FPFH")
-        points_m, normals = sample_surface(model, _MODEL_POINTS)
-        cloud = self._cloud(points_m)
-        cloud.normals = self._open3d.utility.Vector3dVector(normals.double().numpy())
-        self._target, self._target_features = self._prepare(cloud)
-
-    def estimate(self, given: CloudInput) -> PoseEstimate:
-        """Pose a cloud; RANSAC that finds nothing is a refusal."""
-        began = time.perf_counter()
-        if len(given.points_m) < _LEAST:
-            reason = f"the cloud has {len(given.points_m)} points, and a pose takes {_LEAST}"
-            return PoseEstimate(
-                name=given.name, object=given.object, status="too few points", reason=reason
-            )
-        o3d = self._open3d
-        source, features = self._prepare(self._cloud(given.points_m))
-        o3d.utility.random.seed(self.config.seed)
-        # It prints a line for each cloud of which few features are mutually nearest.
-        r, limit_m = o3d.pipelines.registration, _CORRESPONDENCE * self._voxel_m
-        with o3d.utility.VerbosityContextManager(o3d.utility.VerbosityLevel.Error):
-            found = r.registration_ransac_based_on_feature_matching(
-                source, self._target, features, self._target_features, True, limit_m,
-                r.TransformationEstimationPointToPoint(False), 3,
-                [
-                    r.CorrespondenceCheckerBasedOnEdgeLength(0.9),
-                    r.CorrespondenceCheckerBasedOnDistance(limit_m),
-                ],
-                r.RANSACConvergenceCriteria(self.config.iterations, 0.999),
-            )  # fmt: skip
-        if len(found.correspondence_set):
-            found = r.registration_icp(
-                source, self._target, _ICP * self._voxel_m, found.transformation,
-                r.TransformationEstimationPointToPlane(),
-            )  # fmt: skip
-        seconds = {"registration": time.perf_counter() - began}
-        if not len(found.correspondence_set):
-            reason = "RANSAC found no pose that any correspondence of features agrees with"
-            return PoseEstimate(
-                name=given.name, object=given.object, status="votes do not meet",
-                reason=reason, seconds=seconds,
-            )  # fmt: skip
-        T = torch.from_numpy(np.array(found.transformation))
-        pose = Rigid(T[:3, :3], T[:3, 3]).inverse()
-        return PoseEstimate(
-            name=given.name,
-            object=given.object,
-            status="ok",
-            camera_from_model=Rigid(pose.R.to(given.points_m), pose.t_m.to(given.points_m)),
-            inlier_share=float(found.fitness),
-            residual_m=float(found.inlier_rmse),
-            seconds=seconds,
-        )
-
-    def _cloud(self, points_m: Float[Tensor, "n 3"]) -> Any:  # noqa: ANN401 - Open3D has no types
-        cloud = self._open3d.geometry.PointCloud()
-        cloud.points = self._open3d.utility.Vector3dVector(points_m.double().cpu().numpy())
-        return cloud
-
-    def _prepare(self, cloud: Any) -> tuple[Any, Any]:  # noqa: ANN401
-        """Thin a cloud to voxels; normals of a measured one point to the camera."""
-        o3d, voxel_m = self._open3d, self._voxel_m
-        cloud = cloud.voxel_down_sample(voxel_m)
-        near = o3d.geometry.KDTreeSearchParamHybrid
-        if not cloud.has_normals():
-            cloud.estimate_normals(near(radius=_NORMAL * voxel_m, max_nn=30))
-            cloud.orient_normals_towards_camera_location(np.zeros(3))
-        features = o3d.pipelines.registration.compute_fpfh_feature(
-            cloud, near(radius=_FEATURE * voxel_m, max_nn=100)
-        )
-        return cloud, features
-
-
-class FpfhEstimator:
-    """Registration of several objects from their masked depth, called as the networks are.
-
-    Raises:
-        MissingExtraError: Open3D is not installed.
-    """
-
-    def __init__(self, models: Sequence[ObjectModel], config: FpfhConfig | None = None) -> None:
-        self._peers = {model.name: FpfhRegistration(model, config) for model in models}
-
-    def estimate_many(self, inputs: Sequence[ViewInput]) -> list[PoseEstimate]:
-        """Pose one after the other."""
-        estimates = []
-        for given in inputs:
-            peer = self._peers[given.object]
-            points_m = object_points(given, peer.model.diameter_m)
-            cloud = CloudInput(name=given.name, points_m=points_m, object=given.object)
-            estimates.append(peer.estimate(cloud))
-        return estimates
-
-
-def ransac_one_by_one(
-    points_m: Float64[np.ndarray, "n 3"],
-    directions: Float64[np.ndarray, "n k 3"],
-    hypotheses: int = 50,
-    min_cosine: float = 0.99,
-    seed: int = 0,
-) -> Float64[np.ndarray, "k 3"]:
-    """Find every keypoint with a loop over keypoints and hypotheses.
-
-    A hypothesis is the point nearest to the lines of two random points; its inliers are the points
-    whose unit direction comes within an angle of it; the best is refitted on its inliers.
-
-    Args:
-        points_m: where the votes start.
-        directions: of unit length.
-        hypotheses: tried for each keypoint; published practice is 50.
-        min_cosine: of the angle of an inlier.
-        seed: of the pairs.
-    """
-    random = np.random.default_rng(seed)
-    found = []
-    for k in range(directions.shape[1]):
-        n = directions[:, k]
-        best, chosen = -1, np.ones(len(n), bool)
-        for _ in range(hypotheses):
-            pair = random.choice(len(points_m), 2, replace=False)
-            try:
-                tried = np.linalg.solve(*_normal_equations(points_m[pair], n[pair]))
-            except np.linalg.LinAlgError:
-                continue
-            way = tried - points_m
-            inliers = (way * n).sum(1) / np.sqrt((way * way).sum(1)).clip(1e-300) > min_cosine
-            count = np.count_nonzero(inliers)
-            if count > best:
-                best, chosen = count, inliers
-        try:
-            refitted = np.linalg.solve(*_normal_equations(points_m[chosen], n[chosen]))
-        except np.linalg.LinAlgError:  # no inlier but parallel ones, or none: all votes count
-            refitted = np.linalg.lstsq(*_normal_equations(points_m, n), rcond=None)[0]
-        found.append(refitted)
-    return np.stack(found)
-
-
-def _normal_equations(points_m: np.ndarray, n: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Of the point nearest to the lines through ``points_m`` along ``n``; singular if parallel."""
-    A = len(points_m) * np.eye(3) - n.T @ n
-    return A, points_m.sum(0) - n.T @ (n * points_m).sum(1)
-
-
 _TRANSFORM_POOLED, _TRANSFORM_HEAD = (64, 128, 1024), (512, 256)
 
 
@@ -392,9 +207,16 @@ class PointNet(nn.Module):
             points_m: about the mean of their cloud.
             cloud: which cloud each belongs to, 0, 1, ..., ascending.
         """
-        c = self.config
-        outputs = self.final(self.features(points_m, cloud))
-        return outputs.view(len(outputs), c.classes, c.keypoints, 3)
+        x = points_m / self.config.unit_m
+        count = int(cloud.max()) + 1
+        if self.turn_points is not None:
+            x = _turned(x, self.turn_points(x, cloud, count), cloud)
+        x = self.local(x)
+        if self.turn_features is not None:
+            x = _turned(x, self.turn_features(x, cloud, count), cloud)
+        whole = _largest(self.pooled(x), cloud, count)
+        outputs = self.final(self.head(torch.cat([x, whole[cloud]], 1)))
+        return outputs.view(len(outputs), self.config.classes, self.config.keypoints, 3)
 
     def directions(self, seen: SeenPoints) -> Float[Tensor, "points keypoints 3"]:
         """Answer for each point's own class: what every network that votes offers."""
@@ -404,20 +226,6 @@ class PointNet(nn.Module):
         local_m = points_m - (sums_m / sizes[:, None])[cloud]
         rows = torch.arange(len(points_m), device=points_m.device)
         return self(local_m, cloud)[rows, seen.class_of_point]
-
-    def features(
-        self, points_m: Float[Tensor, "points 3"], cloud: Int[Tensor, " points"]
-    ) -> Float[Tensor, "points width"]:
-        """Give what the last layer sees of each point."""
-        x = points_m / self.config.unit_m
-        count = int(cloud.max()) + 1
-        if self.turn_points is not None:
-            x = _turned(x, self.turn_points(x, cloud, count), cloud)
-        x = self.local(x)
-        if self.turn_features is not None:
-            x = _turned(x, self.turn_features(x, cloud, count), cloud)
-        whole = _largest(self.pooled(x), cloud, count)
-        return self.head(torch.cat([x, whole[cloud]], 1))
 
 
 class _Transform(nn.Module):

@@ -10,38 +10,28 @@ from torch import Tensor
 
 from depthpose.core.errors import InputError
 from depthpose.core.rigid import turn_axis_to
-from depthpose.pose.compiled import finite_array, serves
 from depthpose.pose.config import CloudConfig
 from depthpose.pose.types import CloudInput, CloudSample, ViewInput, ViewSample
 
 _LARGEST_CELL = 2**20
 _NEIGHBOURS = 20
 _MOST = 0.5
-_STEEP = 1.73
-"""Tangent of 60 degrees."""
-_FARTHEST_M = 1e6
-"""A coordinate beyond this marks a missing reading."""
+_STEEP = 1.73  # tangent of 60 degrees
+_FARTHEST_M = 1e6  # a coordinate beyond this marks a missing reading
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class VoxelGrid:
-    """Which cells of a grid a cloud fills, and the point that was kept in each.
+    """Which cells of a grid a cloud fills, and the point that was kept in each."""
 
-    Attributes:
-        coordinates: of the filled cells, ``floor((x - mean) / voxel)`` of the turned cloud; no two
-            are equal.
-        kept: index of the point of each cell, ascending: the first of its cell.
-        row_of_point: which of the cells each point of the cloud lies in.
-        grid_from_camera: how the cloud was turned before.
-        features: of each cell, in the axes of the grid: the number 1 or, with shape, also the place
-            of its mean in the cell (-1 to 1), log2 of its number of points, the normal toward the
-            camera, and the curvature (0 in a plane, 1 in a ball).
-    """
-
+    #: of the filled cells, ``floor((x - mean) / voxel)`` of the turned cloud; no two are equal.
     coordinates: Int64[Tensor, "m 3"]
-    kept: Int64[Tensor, " m"]
-    row_of_point: Int64[Tensor, " n"]
-    grid_from_camera: Float[Tensor, "3 3"]
+    kept: Int64[Tensor, " m"]  #: index of the point of each cell, ascending: the first of its cell
+    row_of_point: Int64[Tensor, " n"]  #: which of the cells each point of the cloud lies in
+    grid_from_camera: Float[Tensor, "3 3"]  #: how the cloud was turned before
+    #: of each cell, in the axes of the grid: the number 1 or, with shape, also the place of its
+    #: mean in the cell (-1 to 1), log2 of its number of points, the normal toward the camera, and
+    #: the curvature (0 in a plane, 1 in a ball).
     features: Float[Tensor, "m c"]
 
 
@@ -240,12 +230,6 @@ def local_planes(
         The normal of each toward the camera; how bent the cloud is there, 0 (flat) to 1 (a ball).
     """
     count = min(_NEIGHBOURS, len(every_m))
-    if serves(every_m, some_m):
-        from depthpose.pose.compiled.points import planes_of
-
-        assert count > 0, "a plane goes through points"
-        normals, bend = planes_of(finite_array(every_m), finite_array(some_m), count)
-        return torch.from_numpy(normals), torch.from_numpy(bend)[:, None]
     index = KDTree(every_m.numpy()).query(some_m.numpy(), k=count, workers=1)[1]
     near_m = every_m[torch.as_tensor(index).reshape(len(some_m), count)]
     near_m = near_m - near_m.mean(1, keepdim=True)

@@ -258,8 +258,7 @@ SensorKind = Literal["structured light", "active stereo", "time of flight", "las
 """What measures depth, and so what its errors look like."""
 _LINEMOD_PX = (640, 480)
 _LINEMOD_CENTRE_PX = (325.2611, 242.04899)
-OCCLUSIONS = "[0, 0.95]"
-"""Share of a silhouette that something may occlude."""
+OCCLUSIONS = "[0, 0.95]"  #: share of a silhouette that something may occlude
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -17,8 +17,7 @@ from depthpose.pose.sparse import SparseConv, Voxels, batch_coordinates, kernel_
 from depthpose.pose.weights import PoseWeights
 
 LEVELS = 4
-MARGIN = 1 << (LEVELS - 1)
-"""Cells about the box: as far as a kernel of 3 reads on the coarsest level (of 7: 3 cells)."""
+MARGIN = 1 << (LEVELS - 1)  #: cells about the box that a kernel of 3 reads on the coarsest level
 
 
 class KernelMaps:

@@ -5,7 +5,6 @@ Computed in float64.
 """
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
 
 import torch
 from jaxtyping import Bool, Float
@@ -15,33 +14,17 @@ from torch import Tensor
 from depthpose.core.camera import pixel_grid, project
 from depthpose.core.rigid import Rigid, geodesic_rad
 
-VSD_DELTA_M = 0.015
-"""Tolerance of visibility [m]; BOP takes 15 mm for all sets but ITODD (5 mm)."""
+VSD_DELTA_M = 0.015  #: tolerance of visibility [m]; BOP takes 15 mm for all sets but ITODD (5 mm)
 BOP_SHARES = tuple(round(0.05 * i, 2) for i in range(1, 11))
 """BOP's taus of VSD and thresholds of VSD and MSSD: 0.05 to 0.5 (of the diameter)."""
-BOP_PIXELS = tuple(5.0 * i for i in range(1, 11))
-"""BOP's thresholds of MSPD [px], for an image 640 wide."""
+BOP_PIXELS = tuple(5.0 * i for i in range(1, 11))  #: thresholds of MSPD [px], at 640 px width
+
+SUCCESS_SHARE = 0.1  #: of the diameter: a pose is right whose ADD or ADD-S is below
 
 _CHUNK = 2**22
 
 RenderDepth = Callable[[Rigid], Float[Tensor, "h w"]]
 """Renders the depth [m] of an object at a pose; NaN, 0 or infinity where it is not."""
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class View:
-    """What VSD compares poses in.
-
-    Attributes:
-        depth_m: measured; NaN or 0 where there is no reading.
-        K: intrinsic matrix of that image.
-        render: depth of the object at a pose, in this camera; with ``core.render``
-            ``lambda pose: rasterize(pose.apply(corners), K, width, height).depth_m``.
-    """
-
-    depth_m: Float[Tensor, "h w"]
-    K: Float[Tensor, "3 3"]
-    render: RenderDepth
 
 
 def rotation_error_rad(estimated: Rigid, true: Rigid) -> Float[Tensor, "*batch"]:
@@ -60,20 +43,14 @@ def add_m(estimated: Rigid, true: Rigid, points_m: Float[Tensor, "n 3"]) -> Floa
 
 
 def adds_m(
-    estimated: Rigid, true: Rigid, points_m: Float[Tensor, "n 3"], *, from_estimate: bool = False
+    estimated: Rigid, true: Rigid, points_m: Float[Tensor, "n 3"]
 ) -> Float[Tensor, "*batch"]:
-    """ADD-S [m]: mean distance of each point to the nearest at the other pose.
+    """ADD-S [m]: mean distance of each true point to the nearest estimated one.
 
-    Args:
-        estimated: ``camera_from_model``.
-        true: the same, annotated.
-        points_m: of the model.
-        from_estimate: BOP and Hinterstoisser go from each true point to the nearest estimated one;
-            True goes the other way, as DenseFusion and the method's published code do.
+    So BOP and Hinterstoisser; DenseFusion and the method's published code go the other way, from
+    each estimated point to the nearest true one.
     """
     first, second = _moved(true, points_m), _moved(estimated, points_m)
-    if from_estimate:
-        first, second = second, first
     rows = zip(first.reshape(-1, *first.shape[-2:]), second.reshape(-1, *second.shape[-2:]),
                strict=True)  # fmt: skip
     means = [float(KDTree(b.numpy()).query(a.numpy())[0].mean()) for a, b in rows]
@@ -147,7 +124,13 @@ def mspd_px(
 
 
 def vsd(
-    estimated: Rigid, true: Rigid, view: View, taus_m: Sequence[float], delta_m: float = VSD_DELTA_M
+    estimated: Rigid,
+    true: Rigid,
+    depth_m: Float[Tensor, "h w"],
+    K: Float[Tensor, "3 3"],
+    render: RenderDepth,
+    taus_m: Sequence[float],
+    delta_m: float = VSD_DELTA_M,
 ) -> Float[Tensor, " t"]:
     """VSD: share of the visible surface whose distance is off by ``tau`` or more, for each tau.
 
@@ -159,19 +142,22 @@ def vsd(
     Args:
         estimated: ``camera_from_model``.
         true: the same, annotated.
-        view: the measured image, and how the object is drawn into it.
+        depth_m: measured; NaN or 0 where there is no reading.
+        K: intrinsic matrix of that image.
+        render: depth of the object at a pose, in this camera; with ``core.render``
+            ``lambda pose: rasterize(pose.apply(corners), K, width, height).depth_m``.
         taus_m: tolerances; BOP's are ``BOP_SHARES`` times the diameter.
         delta_m: tolerance of visibility.
     """
     # Distance from the centre of a point at depth 1, by pixel.
-    (height, width), K = view.depth_m.shape, view.K
+    height, width = depth_m.shape
     pixels = pixel_grid(height, width, torch.float64)
     y = (pixels[..., 1] - K[1, 2]) / K[1, 1]
     x = (pixels[..., 0] - K[0, 2] - K[0, 1] * y) / K[0, 0]
     rays = (x * x + y * y + 1).sqrt()
     measured, found, known = (
-        depth_m.double().nan_to_num(nan=0.0, posinf=0.0) * rays
-        for depth_m in (view.depth_m, view.render(estimated), view.render(true))
+        image_m.double().nan_to_num(nan=0.0, posinf=0.0) * rays
+        for image_m in (depth_m, render(estimated), render(true))
     )
     is_known = _is_visible(known, measured, delta_m)
     is_found = _is_visible(found, measured, delta_m) | (is_known & (found > 0))
@@ -183,16 +169,6 @@ def vsd(
     alone = count - int(both.sum())
     bad = torch.stack([(gap_m >= tau).sum() for tau in taus_m])
     return (bad.double() + alone) / count
-
-
-def is_within_diameter(
-    error_m: Float[Tensor, "*batch"], diameter_m: float = 1.0, share: float = 0.1
-) -> Bool[Tensor, "*batch"]:
-    """Whether an ADD or ADD-S is below a share of the diameter; NaN (no estimate) is not.
-
-    Errors in diameters, as :func:`add_share` gives them, have a diameter of 1.
-    """
-    return error_m < share * diameter_m
 
 
 def auc(error_m: Float[Tensor, " n"], limit_m: float = 0.1) -> float:
@@ -245,26 +221,3 @@ def _symmetric_copies(true: Rigid, symmetries: Rigid, points: int) -> list[Rigid
 
 def _is_visible(model: Tensor, measured: Tensor, delta_m: float) -> Bool[Tensor, "h w"]:
     return (model > 0) & ((model - measured <= delta_m) | (measured == 0))
-
-
-def risk_coverage(
-    risks: Float[Tensor, " n"], is_right: Bool[Tensor, " n"]
-) -> tuple[Float[Tensor, " m"], Float[Tensor, " m"]]:
-    """Trade answers against mistakes: refuse beyond each risk in turn (El-Yaniv and Wiener 2010).
-
-    Args:
-        risks: of all inputs; infinite where there is no answer at any risk.
-        is_right: whether the answer is.
-
-    Returns:
-        Coverage, the share of all inputs that is answered, and the share of those answers that is
-        wrong; one point for each different finite risk, from the least to the greatest.
-    """
-    order = risks.argsort(stable=True)
-    ordered, wrong = risks[order], (~is_right[order]).double().cumsum(0)
-    answered = torch.arange(1, len(risks) + 1, dtype=torch.float64)
-    # Equal risks are refused together: the last of them counts for all.
-    is_last = torch.ones_like(ordered, dtype=torch.bool)
-    is_last[:-1] = ordered[1:] > ordered[:-1]
-    kept = is_last & ordered.isfinite()
-    return (answered / max(len(risks), 1))[kept], (wrong / answered)[kept]

@@ -37,10 +37,8 @@ from depthpose.pose.types import (
 
 AnswerT = TypeVar("AnswerT", Fit, Identity)
 POSES = "poses.json"
-VERSION = 1
-"""Of an entry of ``poses.json``; ``docs/poses.schema.json`` describes it."""
-PICTURE, CLOUD = "pose.png", "pose.ply"
-"""What follows ``NAME.`` in the names of the files that show a pose."""
+VERSION = 1  #: of an entry of ``poses.json``; ``docs/poses.schema.json`` describes it
+PICTURE, CLOUD = "pose.png", "pose.ply"  #: what follows ``NAME.`` in files that show a pose
 STAGES = ("segmentation", "cloud", "network", "voting", "svd", "icp", "check", "registration")
 """What an estimate's ``seconds`` are of, in order; a stage that was not run is missing."""
 
@@ -58,15 +56,11 @@ class Place(NamedTuple):
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Prediction:
-    """An estimate as a file keeps it.
+    """An estimate as a file keeps it."""
 
-    Attributes:
-        estimate: or refusal; from the annotated mask of an instance it bears the instance's name.
-        place: scene, image and object; None for a cloud of no data set.
-    """
-
+    #: or refusal; from the annotated mask of an instance it bears the instance's name.
     estimate: PoseEstimate
-    place: Place | None = None
+    place: Place | None = None  #: scene, image and object; None for a cloud of no data set
 
 
 class Predictions(list[Prediction]):
@@ -86,11 +80,6 @@ class Predictions(list[Prediction]):
 def place_of(instance: Instance) -> Place:
     """Say where an annotated object belongs."""
     return Place(instance.scene_id, instance.image_id, instance.object_id)
-
-
-def is_started(folder: Path) -> bool:
-    """Whether a folder holds predictions."""
-    return (folder / POSES).is_file()
 
 
 def is_finished(prediction: Prediction) -> bool:
@@ -128,7 +117,7 @@ def read_predictions(folder: Path) -> Predictions:
 def kept_predictions(folder: Path) -> list[Prediction]:
     """Read what earlier runs of this folder left; a damaged file is as none, and a notice."""
     try:
-        return read_predictions(folder) if is_started(folder) else []
+        return read_predictions(folder) if (folder / POSES).is_file() else []
     except InputError as error:
         warnings.warn(f"{error} - it is damaged, and made again", Notice, stacklevel=2)
         return []
@@ -313,21 +302,13 @@ Input = TypeVar("Input")
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Job(Generic[Input]):
-    """One thing to estimate: what it is called, where it belongs, and how its input is read.
+    """One thing to estimate: what it is called, where it belongs, and how its input is read."""
 
-    Attributes:
-        name: that of the input: unique in a run.
-        read: gives the input; called only where the estimate is not there yet.
-        place: as :class:`Prediction` has it.
-        seconds: what was spent before, on its mask.
-        source: file or files that the input is read from.
-    """
-
-    name: str
-    read: Callable[[], Input]
-    place: Place | None = None
-    seconds: Mapping[str, float] = field(default_factory=dict)
-    source: Path | tuple[Path, ...] | None = None
+    name: str  #: that of the input: unique in a run
+    read: Callable[[], Input]  #: gives the input; called only where the estimate is not there yet
+    place: Place | None = None  #: as :class:`Prediction` has it
+    seconds: Mapping[str, float] = field(default_factory=dict)  #: what was spent before, on a mask
+    source: Path | tuple[Path, ...] | None = None  #: file or files that the input is read from
 
 
 def predict(
@@ -373,7 +354,7 @@ def predict(
                 write_predictions(folder, done.values())
                 unsaved = 0
     finally:
-        if unsaved or not is_started(folder):
+        if unsaved or not (folder / POSES).is_file():
             write_predictions(folder, done.values())
 
 
@@ -450,19 +431,13 @@ def detection_jobs(
 
 
 _HEADER = ["scene_id", "im_id", "obj_id", "score", "R", "t", "time"]
-_SAME_TIME_S = 0.001
-"""BOP's toolkit refuses rows of an image whose times differ by more."""
+_SAME_TIME_S = 0.001  # BOP's toolkit refuses rows of an image whose times differ by more
 
 
-def results_name(dataset: BopDataset) -> str:
-    """Name the BOP csv of a data set: ``depthpose_DATASET-SPLIT.csv``."""
+def results_name(dataset: BopDataset, method: str = "depthpose") -> str:
+    """Name the BOP csv of a data set: ``METHOD_DATASET-SPLIT.csv``."""
     split = dataset.split.replace("_", "-")  # as test_primesense; BOP's toolkit parts names at _
-    return f"depthpose_{dataset.folder.resolve().name}-{split}.csv"
-
-
-def alternatives_name(dataset: BopDataset) -> str:
-    """Name the csv that holds alternatives too: ``depthpose-alternatives_DATASET-SPLIT.csv``."""
-    return results_name(dataset).replace("depthpose_", "depthpose-alternatives_", 1)
+    return f"{method}_{dataset.folder.resolve().name}-{split}.csv"
 
 
 def read_bop_results(path: str | Path) -> list[Prediction]:

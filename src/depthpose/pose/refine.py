@@ -15,69 +15,47 @@ from depthpose.pose.compiled import LOOKED_UP, ON_RAY, SEARCHED, serves
 from depthpose.pose.config import IcpConfig
 from depthpose.pose.surface import Surface, look_along_rays, match
 
-_CONVERGED = 3e-4
-"""Stop when a step turns by less than this [rad] and shifts by less than this in diameters."""
-_TURN_RAD = math.radians(15)
-"""By how much further starts are turned."""
+_CONVERGED = 3e-4  # stop when a step turns [rad] and shifts [diameters] by less than this
+_TURN_RAD = math.radians(15)  # by how much further starts are turned
 _ROUGH_LIMITS = (3.0, 2.4, 2.0, 1.6, 1.4, 1.2, 1.0, 1.0, 1.0, 1.0)
 """Of the starts, step by step, over the last limit of all: they begin farther off."""
-_ROUGH_POINTS = 100
-"""Points of the cloud that refine and compare starts."""
-_OCCLUDING_POINTS = 1000
-"""Points of the cloud that show what a pose would occlude."""
-_UNSEEN = 0.3
-"""What a surface that should be seen and is not counts against a pose: something may occlude it."""
-_OTHER = 0.1
-"""Mean distance between the points of two poses, in diameters, from which they are two."""
-_MOST_OTHERS = 3
-"""Poses beside the best at which starts ended, that are kept."""
+_ROUGH_POINTS = 100  # points of the cloud that refine and compare starts
+_OCCLUDING_POINTS = 1000  # points of the cloud that show what a pose would occlude
+_UNSEEN = 0.3  # a surface that should be seen and is not: something may occlude it
+_OTHER = 0.1  # mean distance between the points of two poses, in diameters, from which they are two
+_MOST_OTHERS = 3  # poses beside the best at which starts ended, that are kept
 _TRUST = 0.02
 """Another start must bring so large a share of the points nearer to the surface than the given one
 to be believed: a plane fits many places, and noise would choose among them. Where a start ended
 roughly must explain the cloud better by as much than where it ended exactly to be preferred."""
 
-_BLOCKS = (0.15, 0.2, 0.3, 0.4)
-"""Sides of blocks of points whose errors may be alike, in diameters."""
+_BLOCKS = (0.15, 0.2, 0.3, 0.4)  # sides of blocks of points whose errors may be alike, in diameters
 _REST = 0.03
 """Of what holds a pose so much is always taken to be left where a block is left out: else a block
 that alone holds a direction would make it infinitely uncertain."""
-_LEAST_SLOPE = 0.25
-"""Least information of the weighted residuals, over that of constant weights."""
+_LEAST_SLOPE = 0.25  # least information of the weighted residuals, over that of constant weights
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class RefinedPose:
-    """A refined pose, with leading batch axes of the poses that it began from.
+    """A refined pose, with leading batch axes of the poses that it began from."""
 
-    Attributes:
-        camera_from_model: the pose.
-        covariance: of (rotation, translation) as :class:`~depthpose.pose.types.PoseFit` says, from
-            the residuals, of which neighbours may be alike, and an offset of all readings along the
-            ray (``IcpConfig.sensor_offset_m``); what the surface does not fix (a turn of a ball) is
-            far too uncertain to be missed. Local: of this minimum alone, whether it is the right
-            one or not.
-        residual_m: root mean square distance to the surface, of the points that count.
-        inlier_share: share of the points within the last limit of the surface.
-    """
-
-    camera_from_model: Rigid
+    camera_from_model: Rigid  #: the pose
+    #: of (rotation, translation) as :class:`~depthpose.pose.types.PoseFit` says, from the
+    #: residuals, of which neighbours may be alike, and an offset of all readings along the ray
+    #: (``IcpConfig.sensor_offset_m``); what the surface does not fix (a turn of a ball) is far too
+    #: uncertain to be missed. Local: of this minimum alone, whether it is the right one or not.
     covariance: Float[Tensor, "*batch 6 6"]
-    residual_m: Float[Tensor, "*batch"]
-    inlier_share: Float[Tensor, "*batch"]
+    residual_m: Float[Tensor, "*batch"]  #: root mean square distance to the surface, of what counts
+    inlier_share: Float[Tensor, "*batch"]  #: share of the points within the last limit
 
 
 class BestStart(NamedTuple):
-    """The best of several refined poses.
+    """The best of several refined poses."""
 
-    Attributes:
-        refined: it.
-        start: number of the given pose that it began from.
-        others: the best poses beside it, three at most, roughly refined.
-    """
-
-    refined: RefinedPose
-    start: int
-    others: Rigid
+    refined: RefinedPose  #: it
+    start: int  #: number of the given pose that it began from
+    others: Rigid  #: the best poses beside it, three at most, roughly refined
 
 
 def refine_pose(

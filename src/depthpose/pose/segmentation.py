@@ -31,8 +31,7 @@ from depthpose.core.devices import usable_device
 from depthpose.core.errors import InputError
 
 ENCODER_KIND = "resnet18"
-WIDTHS = (64, 128, 256, 512)
-"""Channels of the four stages in the published network."""
+WIDTHS = (64, 128, 256, 512)  #: channels of the four stages in the published network
 
 Widths = tuple[int, int, int, int]
 MEAN, STD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
@@ -138,15 +137,6 @@ def import_resnet18(file: Path, out: Path) -> None:
     save_imported(out, ENCODER_KIND, network, file, said)
 
 
-def read_encoder_state(path: Path) -> Mapping[str, Tensor]:
-    """Read the tensors that :func:`import_resnet18` wrote, for a network to start from.
-
-    Raises:
-        InputError: no such weights.
-    """
-    return read_checkpoint(path, ENCODER_KIND).state
-
-
 KIND = "segmentation"
 
 
@@ -218,18 +208,12 @@ class FCN(nn.Module):
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class SegmentationWeights:
-    """What a weights file of this kind holds.
+    """What a weights file of this kind holds."""
 
-    Attributes:
-        network: in eval mode; class 0 is the background, class ``1 + i`` is ``objects[i]``.
-        objects: names, in the order of the classes.
-        numbers: BOP's ``obj_id`` of each.
-        facts: the card in short: ``trained_on``, ``licence`` and the like.
-    """
-
-    network: FCN
-    objects: tuple[str, ...]
-    numbers: tuple[int, ...]
+    network: FCN  #: in eval mode; class 0 is the background, class ``1 + i`` is ``objects[i]``
+    objects: tuple[str, ...]  #: names, in the order of the classes
+    numbers: tuple[int, ...]  #: BOP's ``obj_id`` of each
+    #: the card in short: ``trained_on``, ``licence`` and the like.
     facts: Mapping[str, str] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
@@ -280,16 +264,12 @@ def read_segmentation(path: Path) -> SegmentationWeights:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Segmentation:
-    """What one image shows.
+    """What one image shows."""
 
-    Attributes:
-        masks: of the instances of each object that was found, the surest first; an object that was
-            not found has no entry.
-        scores: mean probability of the object over each of those masks, 0..1.
-    """
-
+    #: of the instances of each object that was found, the surest first; an object that was not
+    #: found has no entry.
     masks: Mapping[str, Bool[Tensor, "n h w"]]
-    scores: Mapping[str, Float[Tensor, " n"]]
+    scores: Mapping[str, Float[Tensor, " n"]]  #: mean probability of the object on each mask, 0..1
 
     def best(self, object: str) -> Bool[Tensor, "h w"] | None:
         """Give the surest mask of an object; None where it was not found."""
@@ -357,20 +337,15 @@ def class_probabilities(network: FCN, image: Image) -> Float[Tensor, "classes h 
     device = next(network.parameters()).device
     height, width = image.shape[-2:]
     scale = network.config.long_side_px / max(height, width)
-    size = tuple(max(1, math.floor(side * scale + 0.5)) for side in (height, width))
-    small = resize_image(image.to(device), (size[0], size[1]))
+    size = (max(1, math.floor(height * scale + 0.5)), max(1, math.floor(width * scale + 0.5)))
+    small = image.to(device)
+    if size != (height, width):
+        small = F.interpolate(small[None], size, mode="bilinear", antialias=True)[0].clamp(0, 1)
     bottom, right = (-side % 32 for side in size)
     padded = F.pad(normalise_colors(small)[None], (0, right, 0, bottom), mode="replicate")
     logits = network(padded)[..., : size[0], : size[1]]
     logits = F.interpolate(logits, (height, width), mode="bilinear", align_corners=False)
     return logits[0].float().softmax(0).cpu()
-
-
-def resize_image(image: Image, size: tuple[int, int]) -> Float[Tensor, "3 rows columns"]:
-    """Resize an image to (rows, columns), averaging where it shrinks."""
-    if tuple(image.shape[-2:]) == size:
-        return image
-    return F.interpolate(image[None], size, mode="bilinear", antialias=True)[0].clamp(0, 1)
 
 
 def connected_parts(mask: Bool[Tensor, "h w"], config: SegmentationConfig) -> Bool[Tensor, "n h w"]:

@@ -19,7 +19,6 @@ from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
 
-import numpy as np
 import torch
 import torch.nn.functional as F
 from jaxtyping import Float, Int, Int32, Int64
@@ -31,14 +30,11 @@ from depthpose.pose.compiled import serves
 
 FIELD_BITS = 17
 HALF = 1 << (FIELD_BITS - 1)
-REACH = 1 << 12
-"""Farthest that a kernel may look, in voxels of the finest level."""
+REACH = 1 << 12  #: farthest that a kernel may look, in voxels of the finest level
 
-COORDINATE_LIMIT = HALF - REACH
-"""Coordinates lie in [-COORDINATE_LIMIT, COORDINATE_LIMIT)."""
+COORDINATE_LIMIT = HALF - REACH  #: coordinates lie in [-COORDINATE_LIMIT, COORDINATE_LIMIT)
 
-CLOUD_LIMIT = 1 << (63 - 3 * FIELD_BITS)
-"""Clouds that one batch can hold."""
+CLOUD_LIMIT = 1 << (63 - 3 * FIELD_BITS)  #: clouds that one batch can hold
 
 Keys = Int64[Tensor, " _"]
 
@@ -90,15 +86,14 @@ MARGIN = 4
 would find the next row."""
 
 MAX_CELLS = 1 << 24
-CELLS_PER_VOXEL = 512
-"""A box with more cells than these is mostly air: binary search is then the cheaper."""
+CELLS_PER_VOXEL = 512  #: a box with more cells is mostly air: binary search is then the cheaper
 
 
 class VoxelIndex:
-    """Finds rows of one level's voxels, the same in each of three ways.
+    """Finds rows of one level's voxels, the same in each of two ways.
 
-    A compiled walk along the sorted keys where it serves; a table of the cells of the clouds'
-    common box where that is small enough, some five times faster than binary search; or that.
+    A table of the cells of the clouds' common box where that is small enough, some five times
+    faster than binary search; or that.
     """
 
     def __init__(self, keys: Keys, step: int) -> None:
@@ -106,8 +101,7 @@ class VoxelIndex:
         self._keys, self._step = keys, step
         self._low = self._strides = keys.new_zeros(4)
         self._table: Tensor | None = None
-        self._is_compiled = serves(keys)
-        if not len(keys) or self._is_compiled:
+        if not len(keys):
             return
         coordinates = self._cell_coordinates(keys)
         low, high = coordinates.amin(0), coordinates.amax(0)
@@ -132,11 +126,6 @@ class VoxelIndex:
         if not len(self._keys):
             return standing.new_zeros(len(moves), len(standing), dtype=torch.int32)
         packed = [packed_move(*move) * self._step for move in moves]
-        if self._is_compiled:
-            from depthpose.pose.compiled.points import rows_of
-
-            moved = np.array(packed, np.int64)
-            return torch.from_numpy(rows_of(self._keys.numpy(), standing.numpy(), moved))
         if self._table is None:
             wanted = standing + torch.tensor(packed, device=standing.device)[:, None]
             rows = torch.searchsorted(self._keys, wanted).clamp_(max=len(self._keys) - 1)
@@ -157,39 +146,25 @@ class VoxelIndex:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class PairList:
-    """Neighbours of two levels, offset by offset.
+    """Neighbours of two levels, offset by offset."""
 
-    Attributes:
-        fine: row of each pair in the finer level: where the kernel reads.
-        coarse: row of each pair in the coarser level: where the kernel is centred.
-        slot: place of each pair in a grid of (volume, most).
-        filled: offsets that have pairs; the others are skipped.
-        counts: how many pairs each of them has.
-        most: the largest of these counts.
-    """
-
-    fine: Int64[Tensor, " pairs"]
-    coarse: Int64[Tensor, " pairs"]
-    slot: Int64[Tensor, " pairs"]
-    filled: tuple[int, ...]
-    counts: tuple[int, ...]
-    most: int
+    fine: Int64[Tensor, " pairs"]  #: row of each pair in the finer level: where the kernel reads
+    coarse: Int64[Tensor, " pairs"]  #: row of each pair in the coarser level: the kernel's centre
+    slot: Int64[Tensor, " pairs"]  #: place of each pair in a grid of (volume, most)
+    filled: tuple[int, ...]  #: offsets that have pairs; the others are skipped
+    counts: tuple[int, ...]  #: how many pairs each of them has
+    most: int  #: the largest of these counts
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class NeighbourTable:
-    """Neighbours between a fine and a coarse level, or of a level with itself.
+    """Neighbours between a fine and a coarse level, or of a level with itself."""
 
-    Attributes:
-        table: row of the fine voxel that each coarse one has at each offset; one past the last
-            where there is none.
-        fine_rows: number of voxels of the finer level.
-        centre: offset at which each voxel is its own neighbour; None across levels.
-    """
-
+    #: row of the fine voxel that each coarse one has at each offset; one past the last where there
+    #: is none.
     table: Int32[Tensor, "volume coarse_rows"]
-    fine_rows: int
-    centre: int | None
+    fine_rows: int  #: number of voxels of the finer level
+    centre: int | None  #: offset at which each voxel is its own neighbour; None across levels
 
     @cached_property
     def pairs(self) -> PairList:
@@ -244,15 +219,10 @@ class NeighbourTable:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class KernelMap:
-    """Neighbours with a direction: what a convolution reads and where it writes.
+    """Neighbours with a direction: what a convolution reads and where it writes."""
 
-    Attributes:
-        neighbours: of the two levels, or of the one.
-        is_transposed: False: fine to coarse (or the level to itself); True: coarse to fine.
-    """
-
-    neighbours: NeighbourTable
-    is_transposed: bool = False
+    neighbours: NeighbourTable  #: of the two levels, or of the one
+    is_transposed: bool = False  #: False: fine to coarse (or the level to itself); True: back
 
     @property
     def transposed(self) -> "KernelMap":
@@ -279,11 +249,6 @@ class KernelMap:
         """Number of voxels written."""
         return self.neighbours.fine_rows if self.is_transposed else self.neighbours.table.shape[1]
 
-    @property
-    def grid_in(self) -> Int64[Tensor, " slots"]:
-        """Row that each slot of (volume, most) reads; one past the last where it is empty."""
-        return self.neighbours.coarse_grid if self.is_transposed else self.neighbours.fine_grid
-
     def by_offset(self) -> Iterator[tuple[int, Tensor, Tensor]]:
         """Give each filled offset with the rows that its pairs read, and those they add to."""
         pairs = self.neighbours.pairs
@@ -291,15 +256,6 @@ class KernelMap:
         fine, coarse = pairs.fine.split(pairs.counts), pairs.coarse.split(pairs.counts)
         rows_in, rows_out = (coarse, fine) if self.is_transposed else (fine, coarse)
         return zip(pairs.filled, rows_in, rows_out, strict=True)
-
-    def sum_by_output(self, products: Tensor) -> Tensor:
-        """Add up the slots of each output voxel, always in the same order.
-
-        A gather, not a scatter: the same bits on every run, on CUDA too, and several times faster
-        on the CPU than ``index_add_``.
-        """
-        order, starts = self.neighbours.by_fine if self.is_transposed else self.neighbours.by_coarse
-        return F.embedding_bag(order, products, starts, mode="sum")
 
 
 def kernel_offsets(kernel: int) -> tuple[tuple[int, int, int], ...]:
@@ -377,11 +333,9 @@ GRID_ELEMENTS = 1 << 29
 """Largest padded table on a GPU, where the calls cost more than the padding: a training step of 128
 clouds takes 101 ms with it, one of only 64 clouds offset by offset 169 ms (H200)."""
 
-NARROW = 4
-"""Inputs of up to this many channels are laid out as a table: their products are too thin."""
+NARROW = 4  #: inputs of up to so many channels are laid out as a table: products are too thin
 
-TABLE_ELEMENTS = 1 << 25
-"""Largest such table."""
+TABLE_ELEMENTS = 1 << 25  #: largest such table
 
 
 COMPILED_ELEMENTS = 1 << 17
@@ -452,7 +406,11 @@ def _convolve(x: Tensor, weight: Tensor, m: KernelMap) -> Tensor:
     if _is_narrow(x, m):
         return _table(x, m).T @ weight.flatten(0, 1)
     if _is_gridded(x, weight, m):  # all offsets in one operation each, padded to the fullest
-        out = m.sum_by_output(torch.bmm(_read(x, m), weight).flatten(0, 1))
+        products = torch.bmm(_read(x, m), weight).flatten(0, 1)
+        # The slots of an output are gathered, not scattered: the same bits on every run, on CUDA
+        # too, and several times faster on the CPU than ``index_add_``.
+        order, starts = m.neighbours.by_fine if m.is_transposed else m.neighbours.by_coarse
+        out = F.embedding_bag(order, products, starts, mode="sum")
     else:  # an offset at a time: its pairs write each row once at most
         out, kernels = x.new_zeros(m.outputs, weight.shape[2]), weight.unbind()
         for offset, read, write in m.by_offset():
@@ -462,8 +420,8 @@ def _convolve(x: Tensor, weight: Tensor, m: KernelMap) -> Tensor:
 
 def _read(x: Tensor, m: KernelMap) -> Tensor:
     """Gather the slots of (volume, most); empty ones read a row of zeros."""
-    padded = F.pad(x, (0, 0, 0, 1))
-    return padded.index_select(0, m.grid_in).view(m.volume, m.most, x.shape[1])
+    grid = m.neighbours.coarse_grid if m.is_transposed else m.neighbours.fine_grid
+    return F.pad(x, (0, 0, 0, 1)).index_select(0, grid).view(m.volume, m.most, x.shape[1])
 
 
 def _table(x: Tensor, m: KernelMap) -> Tensor:
@@ -494,18 +452,12 @@ class Voxels:
 
     Rows are in the order of the level's sorted keys, so the order in which points were given
     changes no bit of any result; :meth:`at_points` answers in the order given.
-
-    Attributes:
-        features: one row a voxel.
-        cache: coordinates of all levels, and the kernel maps among them.
-        level: coordinates here are multiples of ``2**level``.
-        row_of_point: row at level 0 of each point given.
     """
 
-    features: Float[Tensor, "n c"]
-    cache: CoordinateCache
-    level: int = 0
-    row_of_point: Int64[Tensor, " points"]
+    features: Float[Tensor, "n c"]  #: one row a voxel
+    cache: CoordinateCache  #: coordinates of all levels, and the kernel maps among them
+    level: int = 0  #: coordinates here are multiples of ``2**level``
+    row_of_point: Int64[Tensor, " points"]  #: row at level 0 of each point given
 
     @classmethod
     def from_points(

@@ -17,25 +17,17 @@ from depthpose.pose.mesh import sample_surface, symmetry_transforms
 from depthpose.pose.mesh.models import CELL, across_walls, fibonacci_directions, outward_normals
 from depthpose.pose.types import ObjectModel
 
-NEAR = 0.05
-"""Of the diameter: a point of the cloud within this distance lies on the posed surface."""
-_TURN_STEP = 0.1
-"""Half of the step between the turns about a continuous axis [rad]."""
-_CELL = 1 / 24
-"""Side of a ray's cell at the object, in diameters: several samples of the surface in each."""
+NEAR = 0.05  #: of the diameter: a point of the cloud within this distance lies on the posed surface
+_TURN_STEP = 0.1  # half of the step between the turns about a continuous axis [rad]
+_CELL = 1 / 24  # side of a ray's cell at the object, in diameters: several samples in each
 _REACH = 72
 """Cells to each side of the middle of the cloud that are distinguished, three diameters; what lies
 farther off counts as if it lay there."""
-_FRONT = 0.1
-"""Points nearer to the camera than this share of the median are no part of what it saw."""
-_BOXES = 48
-"""Boxes along the longest side of a model, for looking up what is near without searching."""
-_MARGIN = 0.15
-"""Of the diameter: so far the boxes reach beyond the model."""
-_VIEWS = 128
-"""Directions from which a model is looked at."""
-_POINTS, _RING = 160, 64
-"""Cells of a picture at most, and those beside its silhouette."""
+_FRONT = 0.1  # points nearer to the camera than this share of the median are no part of what it saw
+_BOXES = 48  # boxes along the longest side of a model, to look up what is near without a search
+_MARGIN = 0.15  # of the diameter: so far the boxes reach beyond the model
+_VIEWS = 128  # directions from which a model is looked at
+_POINTS, _RING = 160, 64  # cells of a picture at most, and those beside its silhouette
 BESIDE = 0.08
 """Of the diameter: where what is beside a silhouette is no farther than so much from its border in
 depth, the same surface goes on."""
@@ -43,19 +35,12 @@ depth, the same surface goes on."""
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Boxes:
-    """For each box of a grid about a model, the surface point that is nearest to its middle.
+    """For each box of a grid about a model, the surface point that is nearest to its middle."""
 
-    Attributes:
-        low_m: corner of the grid, in the model frame.
-        side_m: of a box.
-        counts: boxes along each axis.
-        nearest: number of the surface point, axes one after the other.
-    """
-
-    low_m: Float64[Tensor, "3"]
-    side_m: float
-    counts: Int64[Tensor, "3"]
-    nearest: Int64[Tensor, " boxes"]
+    low_m: Float64[Tensor, "3"]  #: corner of the grid, in the model frame
+    side_m: float  #: of a box
+    counts: Int64[Tensor, "3"]  #: boxes along each axis
+    nearest: Int64[Tensor, " boxes"]  #: number of the surface point, axes one after the other
 
     def look_up(self, points_m: Float64[Tensor, "*batch n 3"]) -> Int64[Tensor, "*batch n"]:
         """Give the surface point nearest to the middle of each point's box.
@@ -69,44 +54,27 @@ class Boxes:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Views:
-    """What a camera far off sees of a model, from many sides, in the model's frame.
+    """What a camera far off sees of a model, from many sides, in the model's frame."""
 
-    Attributes:
-        toward: unit vectors to the camera.
-        points_m: what is seen, spread evenly over the picture; NaN where there are fewer.
-        normals: theirs.
-        beside_m: places beside the silhouette, as far off as its border; NaN where there are fewer.
-    """
-
-    toward: Float64[Tensor, "v 3"]
-    points_m: Float64[Tensor, "v n 3"]
-    normals: Float64[Tensor, "v n 3"]
+    toward: Float64[Tensor, "v 3"]  #: unit vectors to the camera
+    points_m: Float64[Tensor, "v n 3"]  #: what is seen, evenly spread; NaN where there are fewer
+    normals: Float64[Tensor, "v n 3"]  #: theirs
+    #: places beside the silhouette, as far off as its border; NaN where there are fewer.
     beside_m: Float64[Tensor, "v m 3"]
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Surface:
-    """Samples of a model's surface, computed once and used for every cloud.
+    """Samples of a model's surface, computed once and used for every cloud."""
 
-    Attributes:
-        points_m: of the surface, in the model frame.
-        normals: theirs; their side does not matter.
-        outward: normals on the outer side, 0 where none is known.
-        across: number of the sample on the other side of a wall, or -1.
-        diameter_m: of the object.
-        copies: what leaves the object as it is, ``model_from_model``, the identity first.
-        tree: finds the nearest of the points.
-        boxes: find it nearly, some thirty times as fast.
-    """
-
-    points_m: Float64[Tensor, "m 3"]
-    normals: Float64[Tensor, "m 3"]
-    outward: Float64[Tensor, "m 3"]
-    across: Int64[Tensor, " m"]
-    diameter_m: float
-    copies: Rigid
-    tree: KDTree
-    boxes: Boxes
+    points_m: Float64[Tensor, "m 3"]  #: of the surface, in the model frame
+    normals: Float64[Tensor, "m 3"]  #: theirs; their side does not matter
+    outward: Float64[Tensor, "m 3"]  #: normals on the outer side, 0 where none is known
+    across: Int64[Tensor, " m"]  #: number of the sample on the other side of a wall, or -1
+    diameter_m: float  #: of the object
+    copies: Rigid  #: what leaves the object as it is, ``model_from_model``, the identity first
+    tree: KDTree  #: finds the nearest of the points
+    boxes: Boxes  #: find it nearly, some thirty times as fast
 
     def nearest(self, points_m: Float64[Tensor, "*batch n 3"]) -> Int64[Tensor, "*batch n"]:
         """Give the number of the surface point nearest to each point of the model frame."""

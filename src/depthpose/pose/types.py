@@ -25,8 +25,7 @@ Status = Literal[
 them. Unreadable: no input came; it is tried again by the next run. Doubtful: the pose does not fit
 what the camera saw, or another size or the mirror image fits better than the sensor explains."""
 
-POSED: tuple[Status, ...] = ("ok", "ambiguous")
-"""With a pose."""
+POSED: tuple[Status, ...] = ("ok", "ambiguous")  #: with a pose
 
 Tracking = Literal["tracked", "found", "lost"]
 """How an estimate of a sequence came about: followed from the frame before, looked for anew, or
@@ -35,37 +34,25 @@ neither."""
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class CloudInput:
-    """Input of a pose estimate. There is no truth here, so none can leak.
+    """Input of a pose estimate. There is no truth here, so none can leak."""
 
-    Attributes:
-        name: what the files of its results are called.
-        points_m: the visible part of one object, in the camera frame (x right, y down, z forward).
-        object: name of the object, as its :class:`ObjectModel` carries it.
-        view: the depth image that the points are of, where there is one: what the camera saw
-            through a pose is evidence against it.
-    """
-
-    name: str
+    name: str  #: what the files of its results are called
+    #: the visible part of one object, in the camera frame (x right, y down, z forward).
     points_m: Float[Tensor, "n 3"]
-    object: str
+    object: str  # as its ObjectModel is called; after "#:" the docs would take the builtin for it
+    #: the depth image that the points are of, where there is one: what the camera saw through a
+    #: pose is evidence against it.
     view: "ViewInput | None" = None
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class SeenPoints:
-    """Input of a network whose points vote: one or several clouds, one after the other.
+    """Input of a network whose points vote: one or several clouds, one after the other."""
 
-    Attributes:
-        points_m: one of each voxel, in the axes of its cloud's grid about its camera.
-        coordinates: (cloud, x, y, z) of its voxel.
-        features: of its voxel.
-        class_of_point: which object each belongs to.
-    """
-
-    points_m: Float[Tensor, "points 3"]
-    coordinates: Int[Tensor, "points 4"]
-    features: Float[Tensor, "points c"]
-    class_of_point: Int[Tensor, " points"]
+    points_m: Float[Tensor, "points 3"]  #: one a voxel, in the axes of its grid about its camera
+    coordinates: Int[Tensor, "points 4"]  #: (cloud, x, y, z) of its voxel
+    features: Float[Tensor, "points c"]  #: of its voxel
+    class_of_point: Int[Tensor, " points"]  #: which object each belongs to
 
     def to(self, device: str | torch.device) -> "SeenPoints":
         """Give the same on a device."""
@@ -74,17 +61,11 @@ class SeenPoints:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class PoseTruth:
-    """What is known about the object of a sample.
+    """What is known about the object of a sample."""
 
-    Attributes:
-        camera_from_model: its pose.
-        visible_fraction: share of its silhouette that is not occluded, 0..1; None where unknown.
-        is_measured: whether the pose was annotated, not itself fitted to the same depth.
-    """
-
-    camera_from_model: Rigid
-    visible_fraction: float | None = None
-    is_measured: bool = True
+    camera_from_model: Rigid  #: its pose
+    visible_fraction: float | None = None  #: share of its silhouette that is seen; None: unknown
+    is_measured: bool = True  #: whether the pose was annotated, not itself fitted to the same depth
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -97,22 +78,14 @@ class CloudSample:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class ViewInput:
-    """A depth image with the mask of one object: what a :class:`CloudInput` is lifted from.
+    """A depth image with the mask of one object: what a :class:`CloudInput` is lifted from."""
 
-    Attributes:
-        name: what the files of its results are called.
-        depth_m: along the optical axis; NaN where there is no reading. May be a window of a larger
-            image.
-        mask: the object's pixels, as a segmentation gives them: not free of errors.
-        K: intrinsic matrix of this very image (a window's principal point is shifted).
-        object: name of the object.
-    """
-
-    name: str
+    name: str  #: what the files of its results are called
+    #: along the optical axis; NaN where there is no reading. May be a window of a larger image.
     depth_m: Float[Tensor, "h w"]
-    mask: Bool[Tensor, "h w"]
-    K: Float[Tensor, "3 3"]
-    object: str
+    mask: Bool[Tensor, "h w"]  #: the object's pixels, as a segmentation gives them, with errors
+    K: Float[Tensor, "3 3"]  #: intrinsic matrix of this image (a window shifts the principal point)
+    object: str  # name of the object
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -125,34 +98,23 @@ class ViewSample:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Axis:
-    """A continuous symmetry: every turn about this line leaves the object as it is.
+    """A continuous symmetry: every turn about this line leaves the object as it is."""
 
-    Attributes:
-        direction: unit vector in the model frame.
-        point_m: a point that the axis goes through.
-    """
-
-    direction: Float[Tensor, "3"]
-    point_m: Float[Tensor, "3"]
+    direction: Float[Tensor, "3"]  #: unit vector in the model frame
+    point_m: Float[Tensor, "3"]  #: a point that the axis goes through
 
 
-_OTHER_AXIS = 0.1
-"""Sine of the angle from which two axes of revolution are two."""
+_OTHER_AXIS = 0.1  # sine of the angle from which two axes of revolution are two
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Symmetries:
-    """Motions of the model frame that leave the object as it is, as BOP's models_info says them.
+    """Motions of the model frame that leave the object as it is, as BOP's models_info says them."""
 
-    Attributes:
-        discrete: ``model_from_model``, the identity not among them; None where there is none.
-        continuous: axes of revolution.
-        is_found: whether they were found in the geometry, within a tolerance, and not declared.
-    """
-
+    #: ``model_from_model``, the identity not among them; None where there is none.
     discrete: Rigid | None = None
-    continuous: tuple[Axis, ...] = ()
-    is_found: bool = False
+    continuous: tuple[Axis, ...] = ()  #: axes of revolution
+    is_found: bool = False  #: whether they were found in the geometry, and not declared
 
     @property
     def is_none(self) -> bool:
@@ -176,27 +138,16 @@ class Symmetries:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class ObjectModel:
-    """A known object: what its CAD file and the config say of it, in metres.
+    """A known object: what its CAD file and the config say of it, in metres."""
 
-    Attributes:
-        name: what samples call it.
-        number: BOP's ``obj_id``.
-        vertices_m: points of the surface; all that there is where ``faces`` is empty.
-        faces: three vertices each, counter-clockwise seen from outside.
-        normals: outward unit normal of each vertex; of an unknown side for a model of points.
-        diameter_m: largest distance of two points.
-        keypoints_m: what the network's directions point at.
-        symmetries: as declared or found.
-    """
-
-    name: str
-    number: int
-    vertices_m: Float[Tensor, "v 3"]
-    faces: Int64[Tensor, "f 3"]
-    normals: Float[Tensor, "v 3"]
-    diameter_m: float
-    keypoints_m: Float[Tensor, "k 3"]
-    symmetries: Symmetries = field(default_factory=Symmetries)
+    name: str  #: what samples call it
+    number: int  #: BOP's ``obj_id``
+    vertices_m: Float[Tensor, "v 3"]  #: points of the surface; all there is without ``faces``
+    faces: Int64[Tensor, "f 3"]  #: three vertices each, counter-clockwise seen from outside
+    normals: Float[Tensor, "v 3"]  #: outward unit normal of each vertex; of points, of unknown side
+    diameter_m: float  #: largest distance of two points
+    keypoints_m: Float[Tensor, "k 3"]  #: what the network's directions point at
+    symmetries: Symmetries = field(default_factory=Symmetries)  #: as declared or found
 
     def __post_init__(self) -> None:
         if not self.diameter_m > 0:
@@ -213,82 +164,51 @@ class ObjectModel:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Vote:
-    """Where the directions of many points meet, with leading batch axes.
+    """Where the directions of many points meet, with leading batch axes."""
 
-    Attributes:
-        keypoints_m: the meeting points, in the frame of the points.
-        covariance_m2: their covariance, from how well the directions meet.
-        condition: largest over smallest eigenvalue of the normal matrix; infinite where all lines
-            are parallel. Above about 1000 the depth of the keypoint is a guess (figure 3-4).
-        inlier_share: share of the voting weight that agrees with the keypoint, 0..1.
-    """
-
-    keypoints_m: Float[Tensor, "*batch k 3"]
-    covariance_m2: Float[Tensor, "*batch k 3 3"]
+    keypoints_m: Float[Tensor, "*batch k 3"]  #: the meeting points, in the frame of the points
+    covariance_m2: Float[Tensor, "*batch k 3 3"]  #: their covariance, from how well directions meet
+    #: largest over smallest eigenvalue of the normal matrix; infinite where all lines are parallel.
+    #: Above about 1000 the depth of the keypoint is a guess (figure 3-4).
     condition: Float[Tensor, "*batch k"]
-    inlier_share: Float[Tensor, "*batch k"]
+    inlier_share: Float[Tensor, "*batch k"]  #: share of the weight that agrees with the point, 0..1
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class PoseFit:
-    """The rigid transform that carries the model's keypoints onto found ones.
+    """The rigid transform that carries the model's keypoints onto found ones."""
 
-    Attributes:
-        camera_from_model: the pose.
-        covariance: of (rotation [rad], translation [m]), left perturbation in the camera frame:
-            the true pose is ``R = exp(rotation) R_found``, ``t = exp(rotation) t_found +
-            translation``. Local: it says how well the data fix the pose about this answer, and
-            nothing of other answers, such as a half-turn away, that explain the data as well.
-        residual_m: root mean square distance of the keypoints that were used.
-        misfit: squared distances in units of their covariance, over the degrees of freedom: about 1
-            where the covariances of the keypoints are right, far above 1 where the keypoints do
-            not fit the rigid model.
-        is_used: the keypoints that agree with the shape of the model.
-    """
-
-    camera_from_model: Rigid
+    camera_from_model: Rigid  #: the pose
+    #: of (rotation [rad], translation [m]), left perturbation in the camera frame: the true pose is
+    #: ``R = exp(rotation) R_found``, ``t = exp(rotation) t_found + translation``. Local: it says
+    #: how well the data fix the pose about this answer, and nothing of other answers, such as a
+    #: half-turn away, that explain the data as well.
     covariance: Float[Tensor, "*batch 6 6"]
-    residual_m: Float[Tensor, "*batch"]
-    misfit: Float[Tensor, "*batch"]
-    is_used: Bool[Tensor, "*batch k"]
+    residual_m: Float[Tensor, "*batch"]  #: root mean square distance of the used keypoints
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Alternative:
-    """Another pose that explains what was seen.
+    """Another pose that explains what was seen."""
 
-    Attributes:
-        camera_from_model: the pose.
-        probability: that it is the right one, 0..1.
-        difference: from the estimate's own pose, in words: "turned by 180 degrees about the long
-            axis".
-        signals: evidence against it, by name; not kept in files.
-    """
-
-    camera_from_model: Rigid
-    probability: float
-    difference: str
+    camera_from_model: Rigid  #: the pose
+    probability: float  #: that it is the right one, 0..1
+    difference: str  #: from the estimate's own pose: "turned by 180 degrees about the long axis"
+    #: evidence against it, by name; not kept in files.
     signals: dict[str, float] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, kw_only=True)
 class Fit:
-    """Whether a pose fits what the camera saw, at the sensor's own scale.
+    """Whether a pose fits what the camera saw, at the sensor's own scale."""
 
-    Attributes:
-        agrees: of the posed surface that was seen, the share that lies where the camera saw
-            something; the rest it saw through, or it lies behind the object's own readings.
-        seen: share of the visible posed surface that agrees; the rest may be occluded.
-        beyond: share of the object's readings beside the posed silhouette.
-        explained: share of these readings near the posed surface; a mask's border is not.
-        noise_m: standard deviation of the sensor's readings there, estimated from them.
-    """
-
+    #: of the posed surface that was seen, the share that lies where the camera saw something; the
+    #: rest it saw through, or it lies behind the object's own readings.
     agrees: float
-    seen: float
-    beyond: float
-    explained: float
-    noise_m: float
+    seen: float  #: share of the visible posed surface that agrees; the rest may be occluded
+    beyond: float  #: share of the object's readings beside the posed silhouette
+    explained: float  #: share of these readings near the posed surface; a mask's border is not
+    noise_m: float  #: standard deviation of the sensor's readings there, estimated from them
 
 
 IdentityStatus = Literal["confirmed", "not excluded", "contradicted"]
@@ -298,72 +218,49 @@ well, or it was not tested. Contradicted: one fits better by more than the senso
 
 @dataclass(frozen=True, kw_only=True)
 class Identity:
-    """Whether what was posed is the object, and not a copy of it or another thing.
+    """Whether what was posed is the object, and not a copy of it or another thing."""
 
-    Attributes:
-        status: confirmed, not excluded or contradicted.
-        size: of what was seen in sizes of the model, as it fits best; None where not measured.
-        size_deviation: standard deviation of it.
-        mirror_gain: by how much nearer, in diameters, the points lie to the mirror image of the
-            model; negative where the model is nearer, None where both are one or none was measured.
-        other: another known object that it may be, the likeliest; None where there is none.
-        reason: one sentence; empty where it is confirmed.
-    """
-
-    status: IdentityStatus
-    size: float | None = None
-    size_deviation: float | None = None
+    status: IdentityStatus  #: confirmed, not excluded or contradicted
+    size: float | None = None  #: of what was seen in sizes of the model; None where not measured
+    size_deviation: float | None = None  #: standard deviation of it
+    #: by how much nearer, in diameters, the points lie to the mirror image of the model; negative
+    #: where the model is nearer, None where both are one or none was measured.
     mirror_gain: float | None = None
-    other: str | None = None
-    reason: str = ""
+    other: str | None = None  #: another known object that it may be, the likeliest; or None
+    reason: str = ""  #: one sentence; empty where it is confirmed
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class PoseEstimate:
-    """The pose of one object, or the reason why there is none.
+    """The pose of one object, or the reason why there is none."""
 
-    Attributes:
-        name: that of the input.
-        object: name of the object.
-        status: ``ok``, ``ambiguous``, or the kind of refusal.
-        reason: one sentence for people; empty where the status is ``ok``.
-        camera_from_model: the pose; None where it is refused. Where it is ambiguous, the likeliest.
-        keypoints_m: the found keypoints in the camera frame.
-        covariance: 6x6, order and frame as :class:`PoseFit` says. Local: a pose that is a half-turn
-            off may have one of 0.2 degrees; such errors are covered by ``certainty``. Finite: it
-            leaves out the motions of ``free_motions``. Its translation is of the camera's origin:
-            ``origin_std_mm`` and ``rotation_std_deg`` say it of the model.
-        free_motions: unit vectors of (rotation, translation) along which a declared continuous
-            symmetry makes the variance infinite; no row where there is none.
-        inlier_share: share of the votes that agree, 0..1.
-        residual_m: root mean square distance: of keypoints, or of points to the surface after ICP.
-        fit: whether the pose fits what the camera saw; None where it was not compared.
-        certainty: chance that this very pose is right, and none of the alternatives nor, where
-            some of what was seen does not agree, one that was not found; None: not compared.
-        identity: whether it is this object; None where that was not asked.
-        alternatives: other poses that fit, the likeliest first.
-        signals: by what the poses that fit were compared, by name; kept for refusals too.
-        seconds: time of each stage.
-        tracking: how it came about, in a sequence; None elsewhere.
-    """
-
-    name: str
-    object: str
-    status: Status
-    reason: str = ""
-    camera_from_model: Rigid | None = None
-    keypoints_m: Float[Tensor, "k 3"] | None = None
+    name: str  #: that of the input
+    object: str  # name of the object
+    status: Status  #: ``ok``, ``ambiguous``, or the kind of refusal
+    reason: str = ""  #: one sentence for people; empty where the status is ``ok``
+    camera_from_model: Rigid | None = None  #: the pose, or the likeliest; None where it is refused
+    keypoints_m: Float[Tensor, "k 3"] | None = None  #: the found keypoints in the camera frame
+    #: 6x6, order and frame as :class:`PoseFit` says. Local: a pose that is a half-turn off may have
+    #: one of 0.2 degrees; such errors are covered by ``certainty``. Finite: it leaves out the
+    #: motions of ``free_motions``. Its translation is of the camera's origin: ``origin_std_mm`` and
+    #: ``rotation_std_deg`` say it of the model.
     covariance: Float[Tensor, "6 6"] | None = None
+    #: unit vectors of (rotation, translation) along which a declared continuous symmetry makes the
+    #: variance infinite; no row where there is none.
     free_motions: Float[Tensor, "m 6"] | None = None
-    inlier_share: float | None = None
+    inlier_share: float | None = None  #: share of the votes that agree, 0..1
+    #: root mean square distance: of keypoints, or of points to the surface after ICP.
     residual_m: float | None = None
-    fit: Fit | None = None
+    fit: Fit | None = None  #: whether the pose fits what the camera saw; None: not compared
+    #: chance that this very pose is right, and none of the alternatives nor, where some of what was
+    #: seen does not agree, one that was not found; None: not compared.
     certainty: float | None = None
-    identity: Identity | None = None
-    alternatives: tuple[Alternative, ...] = ()
+    identity: Identity | None = None  #: whether it is this object; None where that was not asked
+    alternatives: tuple[Alternative, ...] = ()  #: other poses that fit, the likeliest first
+    #: by what the poses that fit were compared, by name; kept for refusals too.
     signals: dict[str, float] = field(default_factory=dict)
-    seconds: dict[str, float] = field(default_factory=dict)
-    tracking: Tracking | None = None
+    seconds: dict[str, float] = field(default_factory=dict)  #: time of each stage
+    tracking: Tracking | None = None  #: how it came about, in a sequence; None elsewhere
 
     def __post_init__(self) -> None:
         # No default may look like success: an answer has a pose, all others have a reason.
@@ -417,7 +314,6 @@ class PoseEstimate:
         return std.masked_fill(is_free, torch.inf)
 
     def __repr__(self) -> str:
-        """Say it in one line."""
         said = f"{self.object}: {self.status}"
         if self.camera_from_model is not None:
             said += f", t_m=[{numbers_text(self.camera_from_model.t_m.tolist())}]"

@@ -33,8 +33,7 @@ from depthpose.pose.mesh import (
 from depthpose.pose.network import ResUNet, ResUNetConfig
 from depthpose.pose.types import ObjectModel
 
-DirectionNet = ResUNet | PointNet
-"""Networks whose points vote."""
+DirectionNet = ResUNet | PointNet  #: networks whose points vote
 AnyNetwork = DirectionNet | DepthImageNet
 KIND = "geoposenet"
 _NETWORKS: dict[str, tuple[type[AnyNetwork], type]] = {
@@ -43,31 +42,21 @@ _NETWORKS: dict[str, tuple[type[AnyNetwork], type]] = {
     "depth-image": (DepthImageNet, DepthImageConfig),
 }
 """Network and config of each kind of file: the method's, and those of its baselines."""
-_OFF = 0.02
-"""Keypoints lie on the surface; so many diameters off the mesh, it is another one."""
-_OTHER_SIZE = 0.05
-"""So much longer or shorter, a mesh is another one; declared diameters are off by less."""
+_OFF = 0.02  # keypoints lie on the surface; so many diameters off the mesh, it is another one
+_OTHER_SIZE = 0.05  # so much longer or shorter is another mesh; declared diameters are off by less
 _SURFACE = ("vertices_m", "faces", "normals")
 _TENSORS = (*_SURFACE, "keypoints_m")
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class PoseWeights:
-    """What a file of pose weights contains: enough to pose an object without its CAD file.
+    """What a file of pose weights contains: enough to pose an object without its CAD file."""
 
-    Attributes:
-        network: partial cloud to directions, in eval mode where it was read; or a baseline.
-        models: the objects; class k of the network is ``models[k]``.
-        cloud: how the clouds were made that the network was trained on.
-        refusal: when its estimates are withheld.
-        facts: the card in short: ``trained_on``, ``licence``, ``terms`` and the like.
-    """
-
-    network: AnyNetwork
-    models: tuple[ObjectModel, ...]
-    cloud: CloudConfig
-    refusal: RefusalConfig
-    facts: Mapping[str, str]
+    network: AnyNetwork  #: partial cloud to directions, in eval mode where read; or a baseline
+    models: tuple[ObjectModel, ...]  #: the objects; class k of the network is ``models[k]``
+    cloud: CloudConfig  #: how the clouds were made that the network was trained on
+    refusal: RefusalConfig  #: when its estimates are withheld
+    facts: Mapping[str, str]  #: the card in short: ``trained_on``, ``licence``, ``terms`` and more
 
     def __post_init__(self) -> None:
         config = self.network.config

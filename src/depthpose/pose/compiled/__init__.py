@@ -22,20 +22,16 @@ from torch import Tensor
 
 from depthpose.core.errors import Notice
 
-LOOKED_UP, SEARCHED, ON_RAY = 0, 1, 2
-"""How the sample of a surface that a point shows is found."""
-SLACK = 0.1
-"""Sine of the angle by which a surface may face away from the camera and still be seen."""
-GRAZING = 0.1
-"""Sine of the angle between a ray and a plane below which they meet nowhere near."""
+LOOKED_UP, SEARCHED, ON_RAY = 0, 1, 2  #: how the sample of a surface that a point shows is found
+SLACK = 0.1  #: sine of the angle by which a surface may face away from the camera and still be seen
+GRAZING = 0.1  #: sine of the angle between a ray and a plane below which they meet nowhere near
 DISTANCES, ANGLES, TURNS = 15, 15, 30
 """Bins of a point pair: of its length, as long as the longest pair together; of an angle from 0 to
 180 degrees; of the turn about the normal of its first point."""
 MOST_ALIKE = 150
 """Pairs of the model with the same feature, of which so many vote: those of a plane are all alike
 and say little."""
-_SWITCH = "DEPTHPOSE_COMPILED"
-"""Environment variable; 0 keeps to torch."""
+_SWITCH = "DEPTHPOSE_COMPILED"  # environment variable; 0 keeps to torch
 
 
 @cache

@@ -1,4 +1,4 @@
-"""Points in space: small matrices, nearest neighbours, planes through them, what a camera sees.
+"""Points in space: small matrices, nearest neighbours, what a camera sees.
 
 And sparse convolution of small clouds: no call for each offset, nothing gathered.
 """
@@ -9,37 +9,6 @@ import numpy as np
 from torch import Tensor
 
 from depthpose.pose.compiled import compiled, finite_array
-
-
-@compiled
-def solve(H, b, x):
-    """Solve a symmetric system, of which the lower half is read; ``H`` is used up.
-
-    By elimination with pivots, as rounding may make a positive matrix indefinite.
-    """
-    n = len(b)
-    for i in range(n):
-        x[i] = b[i]
-        for j in range(i):
-            H[j, i] = H[i, j]
-    for k in range(n):
-        pivot = k
-        for i in range(k + 1, n):
-            if abs(H[i, k]) > abs(H[pivot, k]):
-                pivot = i
-        if pivot != k:
-            x[k], x[pivot] = x[pivot], x[k]
-            for j in range(k, n):
-                H[k, j], H[pivot, j] = H[pivot, j], H[k, j]
-        for i in range(k + 1, n):
-            share = H[i, k] / H[k, k]
-            x[i] -= share * x[k]
-            for j in range(k + 1, n):
-                H[i, j] -= share * H[k, j]
-    for i in range(n - 1, -1, -1):
-        for j in range(i + 1, n):
-            x[i] -= H[i, j] * x[j]
-        x[i] /= H[i, i]
 
 
 @compiled
@@ -71,56 +40,17 @@ def rotation(x, y, z, R):
     R[1, 2], R[2, 1] = c * y * z - s * x, c * y * z + s * x
 
 
-@compiled
-def _rotate(A, V, p, q):
-    """Make one entry of a symmetric matrix zero (Jacobi), and turn its axes along."""
-    if A[p, q] == 0.0:
-        return
-    theta = (A[q, q] - A[p, p]) / (2 * A[p, q])
-    t = (1.0 if theta >= 0 else -1.0) / (abs(theta) + np.sqrt(theta * theta + 1))
-    c = 1 / np.sqrt(t * t + 1)
-    s = t * c
-    for k in range(3):
-        a, b = A[k, p], A[k, q]
-        A[k, p], A[k, q] = c * a - s * b, s * a + c * b
-    for k in range(3):
-        a, b = A[p, k], A[q, k]
-        A[p, k], A[q, k] = c * a - s * b, s * a + c * b
-    for k in range(3):
-        a, b = V[k, p], V[k, q]
-        V[k, p], V[k, q] = c * a - s * b, s * a + c * b
-
-
-@compiled
-def jacobi(A, V):
-    """Turn a symmetric 3x3 matrix into its eigenvalues, on the diagonal, and the vectors in V."""
-    V[:] = 0.0
-    V[0, 0] = V[1, 1] = V[2, 2] = 1.0
-    for _ in range(8):
-        _rotate(A, V, 0, 1)
-        _rotate(A, V, 0, 2)
-        _rotate(A, V, 1, 2)
-
-
 Array = np.ndarray
-_LEAF = 8
-"""Points of a range that is not parted any more."""
+_LEAF = 8  # points of a range that is not parted any more
 
 
 class Tree(NamedTuple):
-    """Points in the order of a balanced k-d tree, whose ranges are halved down to few points.
+    """Points in the order of a balanced k-d tree, whose ranges are halved down to few points."""
 
-    Attributes:
-        points: (m, 3), float64.
-        order: number that each had before, (m,).
-        axes: across which axis each inner node is parted, (nodes,).
-        values: where, (nodes,).
-    """
-
-    points: Array
-    order: Array
-    axes: Array
-    values: Array
+    points: Array  #: (m, 3), float64
+    order: Array  #: number that each had before, (m,)
+    axes: Array  #: across which axis each inner node is parted, (nodes,)
+    values: Array  #: where, (nodes,)
 
 
 def tree_of(points: Array) -> Tree:
@@ -255,45 +185,6 @@ def _nearest_many(queries, tree):
 
 
 @compiled
-def planes_of(every, some, count):
-    """Lay a plane through the ``count`` points of ``every`` nearest to each of ``some``.
-
-    Gives normals (m, 3) toward the origin, and how bent the cloud is there (m,), 0 to 1.
-    """
-    normals, bend = np.empty((len(some), 3)), np.empty(len(some))
-    points, _, axes, values = planted(every)
-    stack, bounds = np.empty((64, 3), np.int64), np.empty((64, 4))
-    places, squares = np.zeros(count, np.int64), np.empty(count)
-    A, V = np.empty((3, 3)), np.empty((3, 3))
-    mean = np.empty(3)
-    for i in range(len(some)):
-        x, y, z = some[i, 0], some[i, 1], some[i, 2]
-        squares[:] = np.inf
-        neighbours(x, y, z, points, axes, values, places, squares, stack, bounds)
-        mean[:] = 0.0
-        for p in places:
-            mean += points[p]
-        mean /= count
-        A[:] = 0.0
-        for p in places:
-            for k in range(3):
-                for m in range(3):
-                    A[k, m] += (points[p, k] - mean[k]) * (points[p, m] - mean[m])
-        jacobi(A, V)
-        least = 0
-        for k in range(1, 3):
-            if A[k, k] < A[least, least]:
-                least = k
-        along = V[0, least] * some[i, 0] + V[1, least] * some[i, 1] + V[2, least] * some[i, 2]
-        sign = -1.0 if along > 0 else 1.0
-        for k in range(3):
-            normals[i, k] = sign * V[k, least]
-        total = max(A[0, 0] + A[1, 1] + A[2, 2], 1e-30)
-        bend[i] = 3 * max(A[least, least], 0.0) / total
-    return normals, bend
-
-
-@compiled
 def _cell(x, y, z, scale, column, row, half):
     """Number the cell of a ray, those far off at the border."""
     u = min(max(np.floor(x / z * scale - column), -half), half) + half
@@ -335,24 +226,6 @@ def compare_rays(cloud, Rs, ts, points, scale, column, row, half, limit):
         front[b] = occluded / len(cloud) if total else 1.0
         unseen[b] = missed / total if total else 1.0
     return front, unseen
-
-
-@compiled
-def rows_of(keys, standing, moves):
-    """Give the row of each key ``standing + move``, one past the last where there is none.
-
-    Both lists ascend: it walks along them at once.
-    """
-    rows = np.empty((len(moves), len(standing)), np.int32)
-    for k in range(len(moves)):
-        row = 0
-        for j in range(len(standing)):
-            wanted = standing[j] + moves[k]
-            while row < len(keys) and keys[row] < wanted:
-                row += 1
-            is_there = row < len(keys) and keys[row] == wanted
-            rows[k, j] = row if is_there else len(keys)
-    return rows
 
 
 @compiled

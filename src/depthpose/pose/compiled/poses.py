@@ -1,7 +1,4 @@
-"""Poses: steps of point-to-plane ICP, of a scale beside, and from votes to keypoints to a pose.
-
-The formulas are those of pose.refine, pose.estimator.fit and pose.voting.
-"""
+"""Poses: steps of point-to-plane ICP, and of a scale beside; formulas of pose.refine and fit."""
 
 from typing import NamedTuple
 
@@ -19,56 +16,30 @@ from depthpose.pose.compiled import (
     compiled,
     finite_array,
 )
-from depthpose.pose.compiled.points import (
-    Array,
-    Tree,
-    damp,
-    faces,
-    jacobi,
-    neighbours,
-    rotation,
-    solve,
-)
+from depthpose.pose.compiled.points import Array, Tree, damp, faces, neighbours, rotation
 
 
 class Target(NamedTuple):
-    """A surface, and the table by which what is near is looked up without searching.
+    """A surface, and the table by which what is near is looked up without searching."""
 
-    Attributes:
-        tree: of the surface points.
-        normals: of these, in the tree's order, (m, 3).
-        low: corner of the table, (3,).
-        side: of its boxes.
-        counts: boxes along each axis, (3,).
-        table: place in the tree of the point nearest to the middle of each box.
-        outward: normals on the outer side, 0 where none is known, (m, 3).
-        across: place of the point on the other side of a wall, or -1, (m,).
-        ball: middle and radius; a camera within it sees no side, (4,).
-    """
-
-    tree: Tree
-    normals: Array
-    low: Array
-    side: float
-    counts: Array
-    table: Array
-    outward: Array
-    across: Array
-    ball: Array
+    tree: Tree  #: of the surface points
+    normals: Array  #: of these, in the tree's order, (m, 3)
+    low: Array  #: corner of the table, (3,)
+    side: float  #: of its boxes
+    counts: Array  #: boxes along each axis, (3,)
+    table: Array  #: place in the tree of the point nearest to the middle of each box
+    outward: Array  #: normals on the outer side, 0 where none is known, (m, 3)
+    across: Array  #: place of the point on the other side of a wall, or -1, (m,)
+    ball: Array  #: middle and radius; a camera within it sees no side, (4,)
 
 
 @compiled
 def match(cloud, R, t, limit, target, how, local, eye, places):
     """Find for each point of a cloud the place of a surface point that the camera may see."""
-    for c in range(3):
-        eye[c] = -(R[0, c] * t[0] + R[1, c] * t[1] + R[2, c] * t[2])
-    for i in range(len(cloud)):
-        x, y, z = cloud[i, 0] - t[0], cloud[i, 1] - t[1], cloud[i, 2] - t[2]
-        for c in range(3):
-            local[i, c] = R[0, c] * x + R[1, c] * y + R[2, c] * z
+    eye[:] = -(t @ R)
+    local[:] = (cloud - t) @ R
     sought = _meet_planes(local, eye, target, places) if how == ON_RAY else local
-    x, y, z = eye[0] - target.ball[0], eye[1] - target.ball[1], eye[2] - target.ball[2]
-    distance = np.sqrt(x * x + y * y + z * z)
+    distance = np.linalg.norm(eye - target.ball[:3])
     # A camera within the ball sees no side.
     least = -SLACK * distance if distance > target.ball[3] else -np.inf
     find_places(sought, limit, target, how != LOOKED_UP, places, eye, least)
@@ -181,31 +152,17 @@ def _add_equations(local, places, R, arm, limit, points, normals, eye, how, H, b
         for k in range(6):
             scaled = share * share * J[k]
             b[k] += scaled * residual
-            for m in range(k + 1):
+            for m in range(6):
                 H[k, m] += scaled * J[m]
-
-
-@compiled
-def _move(turn, motion, middle, R, t):
-    """Turn a pose about a point and shift it."""
-    x, y, z = t[0] - middle[0], t[1] - middle[1], t[2] - middle[2]
-    for c in range(3):
-        t[c] = turn[c, 0] * x + turn[c, 1] * y + turn[c, 2] * z + middle[c] + motion[3 + c]
-        x_c, y_c, z_c = R[0, c], R[1, c], R[2, c]
-        for k in range(3):
-            R[k, c] = turn[k, 0] * x_c + turn[k, 1] * y_c + turn[k, 2] * z_c
 
 
 @compiled
 def _refine(cloud, Rs, ts, limits, scale, converged, target, is_exact, every):
     """Move poses in place, step by step, each until it moves no more."""
-    middle = np.zeros(3)
-    for i in range(len(cloud)):
-        middle += cloud[i]
-    middle /= len(cloud)
+    middle = cloud.sum(0) / len(cloud)
     points, normals = target.tree.points, target.normals
     local, eye, turn = np.empty_like(cloud), np.empty(3), np.empty((3, 3))
-    H, b, motion = np.empty((6, 6)), np.empty(6), np.empty(6)
+    H, b = np.empty((6, 6)), np.empty(6)
     for p in range(len(ts)):
         R, t, places = Rs[p], ts[p], every[p]
         for k in range(len(limits)):
@@ -217,12 +174,11 @@ def _refine(cloud, Rs, ts, limits, scale, converged, target, is_exact, every):
                 break
             _add_equations(local, places, R, t - middle, limit, points, normals, eye, how, H, b)
             damp(H, 1e-6)
-            solve(H, b, motion)
+            motion = np.linalg.solve(H, b)
             rotation(motion[0], motion[1], motion[2], turn)
-            _move(turn, motion, middle, R, t)
-            most = 0.0
-            for c in range(6):
-                most = max(most, abs(motion[c]) / (1.0 if c < 3 else scale))
+            t[:] = turn @ (t - middle) + middle + motion[3:]
+            R[:] = turn @ R
+            most = max(np.abs(motion[:3]).max(), np.abs(motion[3:]).max() / scale)
             if most < converged and how != SEARCHED and limit <= limits[-1]:
                 break
 
@@ -245,32 +201,16 @@ def grown(
 
 
 @compiled
-def _step(rows, motion):
-    """Solve for turn, shift and growth; give the variance of the growth."""
-    H, b, total = np.zeros((7, 7)), np.zeros(7), 0.0
-    for i in range(len(rows)):
-        weight = rows[i, 8]
-        if weight == 0:
-            continue
-        total += weight
-        for k in range(7):
-            scaled = weight * rows[i, k]
-            b[k] += scaled * rows[i, 7]
-            for m in range(k + 1):
-                H[k, m] += scaled * rows[i, m]
+def _step(J, residual, weight):
+    """Solve for turn, shift and growth; give the variance of the growth too."""
+    weighted = J * weight.reshape(-1, 1)
+    H = weighted.T @ J
     damp(H, 1e-9)
-    factor, unit, column = H.copy(), np.zeros(7), np.empty(7)
-    solve(factor, b, motion)
-    unit[6] = 1.0
-    solve(H, unit, column)
-    square = 0.0
-    for i in range(len(rows)):
-        if rows[i, 8] > 0:
-            left = rows[i, 7]
-            for k in range(7):
-                left -= rows[i, k] * motion[k]
-            square += rows[i, 8] * left * left
-    return max(square / max(total - 7, 1.0) * column[6], 0.0)
+    inverse = np.linalg.inv(H)
+    motion = inverse @ (weighted.T @ residual)
+    left = residual - J @ motion
+    square = (weight * left * left).sum()
+    return motion, max(square / max(weight.sum() - 7, 1.0) * inverse[6, 6], 0.0)
 
 
 @compiled
@@ -279,17 +219,17 @@ def _grow(local, times, middle, limits, target, is_exact, converged, variance):
     count = local.shape[1]
     places = np.full((len(times), count), -1)
     surface, normals = target.tree.points, target.normals
-    own, rows = np.empty((count, 3)), np.empty((count, 9))
-    motion, turn = np.empty(7), np.empty((3, 3))
+    own, turn = np.empty((count, 3)), np.empty((3, 3))
+    J, residual, weight = np.zeros((count, 7)), np.zeros(count), np.empty(count)
     for limit in limits:
         most = 0.0
         for p in range(len(times)):
             s, points = times[p], local[p]
             own[:] = (points - middle) / s + middle  # beside the surface of its own size
             find_places(own, limit / s, target, is_exact, places[p])
-            for i in range(count):  # derivatives by turn, shift and growth, residual, weight
-                row, place = rows[i], places[p, i]
-                row[8] = 0.0
+            for i in range(count):  # derivatives by turn, shift and growth
+                row, place = J[i], places[p, i]
+                weight[i] = 0.0
                 if place < 0:
                     continue
                 ax = s * (surface[place, 0] - middle[0])
@@ -304,221 +244,12 @@ def _grow(local, times, middle, limits, target, is_exact, converged, variance):
                 nx, ny, nz = normals[place, 0], normals[place, 1], normals[place, 2]
                 row[0], row[1], row[2] = ay * nz - az * ny, az * nx - ax * nz, ax * ny - ay * nx
                 row[3], row[4], row[5], row[6] = nx, ny, nz, nx * ax + ny * ay + nz * az
-                row[7], row[8] = nx * gx + ny * gy + nz * gz, share * share
-            variance[p] = _step(rows, motion)
+                residual[i], weight[i] = nx * gx + ny * gy + nz * gz, share * share
+            motion, variance[p] = _step(J, residual, weight)
             times[p] = min(max(s * (1 + min(max(motion[6], -0.1), 0.1)), 0.5), 2.0)
             rotation(motion[0], motion[1], motion[2], turn)
-            for i in range(count):  # by the inverse of the surface's motion
-                x = points[i, 0] - middle[0] - motion[3]
-                y = points[i, 1] - middle[1] - motion[4]
-                z = points[i, 2] - middle[2] - motion[5]
-                for c in range(3):
-                    points[i, c] = x * turn[0, c] + y * turn[1, c] + z * turn[2, c] + middle[c]
+            # By the inverse of the surface's motion.
+            points[:] = (points - middle - motion[3:6]) @ turn + middle
             most = max(most, abs(motion[0]), abs(motion[1]), abs(motion[2]), abs(motion[6]))
         if most < converged:
             break
-
-
-_FARTHEST = 1e9
-"""A step beyond this is none."""
-
-
-def fitted(
-    pose: Rigid, model: Tensor, found: Tensor, information: Tensor, steps: int
-) -> tuple[Rigid, Tensor]:
-    """Move poses to the least ``sum e^T W e`` with ``e = R m + t - p``.
-
-    Args:
-        pose: one or a batch, to begin with, float64.
-        model: keypoints of the model, (..., k, 3).
-        found: those that were found, (..., k, 3).
-        information: inverse covariances W, (..., k, 3, 3), 0 where a keypoint does not count.
-        steps: so many.
-
-    Returns:
-        The poses, and their information matrices of (rotation, translation), (..., 6, 6).
-    """
-    R, t_m = pose.R.contiguous().clone(), pose.t_m.contiguous().clone()
-    H = R.new_empty(*R.shape[:-2], 6, 6)
-    keypoints = (a.contiguous().numpy().reshape(-1, *a.shape[-2:]) for a in (model, found))
-    W = information.contiguous().numpy().reshape(-1, *information.shape[-3:])
-    poses = (R.view(-1, 3, 3).numpy(), t_m.view(-1, 3).numpy())
-    _fit(*poses, *keypoints, W, steps, H.view(-1, 6, 6).numpy())
-    return Rigid(R, t_m), H
-
-
-@compiled
-def _add_keypoints(R, t, model, found, information, H, b):
-    """Add up the normal equations, ``J = [-[R m + t]_x, I]``."""
-    H[:] = 0.0
-    b[:] = 0.0
-    J, WJ, moved = np.zeros((3, 6)), np.empty((3, 6)), np.empty(3)
-    J[0, 3] = J[1, 4] = J[2, 5] = 1.0
-    for i in range(len(model)):
-        W = information[i]
-        for c in range(3):
-            moved[c] = t[c]
-            for m in range(3):
-                moved[c] += R[c, m] * model[i, m]
-        x, y, z = moved
-        J[0, 1], J[0, 2], J[1, 0], J[1, 2], J[2, 0], J[2, 1] = z, -y, -z, x, y, -x
-        for c in range(3):
-            for k in range(6):
-                WJ[c, k] = W[c, 0] * J[0, k] + W[c, 1] * J[1, k] + W[c, 2] * J[2, k]
-        for k in range(6):
-            for c in range(3):
-                b[k] += WJ[c, k] * (found[i, c] - moved[c])
-                for m in range(6):
-                    H[k, m] += J[c, k] * WJ[c, m]
-
-
-@compiled
-def _fit(Rs, ts, model, found, information, steps, Hs):
-    H, b, motion, turn = np.empty((6, 6)), np.empty(6), np.empty(6), np.empty((3, 3))
-    for p in range(len(ts)):
-        R, t = Rs[p], ts[p]
-        for _ in range(steps):
-            _add_keypoints(R, t, model[p], found[p], information[p], H, b)
-            solve(H, b, motion)
-            if not np.abs(motion).max() < _FARTHEST:  # keypoints that fix nothing
-                break
-            rotation(motion[0], motion[1], motion[2], turn)
-            R[:] = turn @ R
-            t[:] = turn @ t + motion[3:]
-        _add_keypoints(R, t, model[p], found[p], information[p], Hs[p], b)
-
-
-_SMALLEST = 1e-12
-
-
-def met(
-    points: Tensor, directions: Tensor, weights: Tensor, refinements: int, nearest: float
-) -> tuple[Tensor, Tensor, Tensor]:
-    """Find the point where the lines of each keypoint meet best.
-
-    Args:
-        points: about their mean, (1, 3, n), float64 as the others.
-        directions: of unit length, (k, 3, n).
-        weights: (k, n).
-        refinements: steps after the nearest point.
-        nearest: points nearer to a keypoint than this share of the mean distance weigh no more.
-
-    Returns:
-        Points (k, 3) about the points' mean, covariances (k, 3, 3), condition numbers (k,).
-
-    Raises:
-        ValueError: a value is not finite.
-    """
-    count = len(directions)
-    out = [torch.empty(count, *shape, dtype=torch.float64) for shape in ((3,), (3, 3), ())]
-    arrays = (finite_array(a) for a in (points, directions, weights))
-    _meet(*arrays, refinements, nearest, *(a.numpy() for a in out))
-    return out[0], out[1], out[2]
-
-
-@compiled
-def _damped(A, out):
-    size = max(A[0, 0] + A[1, 1] + A[2, 2], 1e-300)
-    out[:] = A
-    for c in range(3):
-        out[c, c] += 1e-12 * size
-
-
-@compiled
-def _add_outer(A, amount, x, y, z):
-    """Add ``amount (I - q q^T)``, of the lower half."""
-    A[0, 0] += amount * (1 - x * x)
-    A[1, 1] += amount * (1 - y * y)
-    A[2, 2] += amount * (1 - z * z)
-    A[1, 0] -= amount * x * y
-    A[2, 0] -= amount * x * z
-    A[2, 1] -= amount * y * z
-
-
-@compiled
-def _mirror(A):
-    A[0, 1], A[0, 2], A[1, 2] = A[1, 0], A[2, 0], A[2, 1]
-
-
-@compiled
-def _gradients(local, n, w, p, nearest, A, gradient):
-    """Write the information matrix and the gradient of each line, over the sum of weights."""
-    total, mean = 0.0, 0.0
-    for i in range(len(w)):
-        x, y, z = p[0] - local[0, i], p[1] - local[1, i], p[2] - local[2, i]
-        mean += np.sqrt(x * x + y * y + z * z) / len(w)
-        total += w[i]
-    least = nearest * max(mean, _SMALLEST)
-    A[:] = 0.0
-    for i in range(len(w)):
-        x, y, z = p[0] - local[0, i], p[1] - local[1, i], p[2] - local[2, i]
-        distance = max(np.sqrt(x * x + y * y + z * z), _SMALLEST)
-        x, y, z = x / distance, y / distance, z / distance
-        distance = max(distance, least)
-        cosine = n[0, i] * x + n[1, i] * y + n[2, i] * z
-        pull = w[i] / distance / total
-        gradient[0, i] = (n[0, i] - x * cosine) * pull
-        gradient[1, i] = (n[1, i] - y * cosine) * pull
-        gradient[2, i] = (n[2, i] - z * cosine) * pull
-        _add_outer(A, pull / distance * max(cosine, 0.5), x, y, z)
-    _mirror(A)
-
-
-@compiled
-def _meet(local, n, w, refinements, nearest, points, covariances, conditions):
-    local = local[0]
-    count = local.shape[1]
-    A, V, M = np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3))
-    gradient, pull, step, unit = np.empty((3, count)), np.empty(3), np.empty(3), np.empty(3)
-    inverse, spread = np.empty((3, 3)), 0.0
-    for i in range(count):
-        spread += (local[0, i] ** 2 + local[1, i] ** 2 + local[2, i] ** 2) / count
-    for k in range(len(points)):
-        p = points[k]
-        # The point nearest to all lines, and its matrix over the sum of weights.
-        A[:] = 0.0
-        pull[:] = 0.0
-        total = 0.0
-        for i in range(count):
-            x, y, z = local[0, i], local[1, i], local[2, i]
-            nx, ny, nz = n[k, 0, i], n[k, 1, i], n[k, 2, i]
-            along = nx * x + ny * y + nz * z
-            _add_outer(A, w[k, i], nx, ny, nz)
-            pull[0] += w[k, i] * (x - nx * along)
-            pull[1] += w[k, i] * (y - ny * along)
-            pull[2] += w[k, i] * (z - nz * along)
-            total += w[k, i]
-        A /= total
-        pull /= total
-        _mirror(A)
-        _damped(A, M)
-        solve(M, pull, p)
-        M[:] = A
-        jacobi(M, V)
-        low, high = min(M[0, 0], M[1, 1], M[2, 2]), max(M[0, 0], M[1, 1], M[2, 2])
-        conditions[k] = high / low if low > 1e-7 else np.inf
-        for _ in range(refinements):
-            _gradients(local, n[k], w[k], p, nearest, A, gradient)
-            for c in range(3):
-                pull[c] = gradient[c].sum()
-            _damped(A, M)
-            solve(M, pull, step)
-            limit = np.sqrt(p[0] ** 2 + p[1] ** 2 + p[2] ** 2 + spread)
-            size = max(np.sqrt(step[0] ** 2 + step[1] ** 2 + step[2] ** 2), _SMALLEST)
-            for c in range(3):
-                p[c] += step[c] * min(limit / size, 1.0)
-        if refinements == 0:
-            for i in range(count):
-                x, y, z = p[0] - local[0, i], p[1] - local[1, i], p[2] - local[2, i]
-                along = n[k, 0, i] * x + n[k, 1, i] * y + n[k, 2, i] * z
-                gradient[0, i] = (x - n[k, 0, i] * along) * w[k, i] / total
-                gradient[1, i] = (y - n[k, 1, i] * along) * w[k, i] / total
-                gradient[2, i] = (z - n[k, 2, i] * along) * w[k, i] / total
-        for c in range(3):
-            unit[:] = 0.0
-            unit[c] = 1.0
-            _damped(A, M)
-            solve(M, unit, inverse[c])
-        votes = (w[k] > 0).sum()
-        spare = 2 * votes / max(2 * votes - 3, 1)
-        covariances[k] = spare * (inverse @ (gradient @ gradient.T) @ inverse)

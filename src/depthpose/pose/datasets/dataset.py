@@ -28,7 +28,7 @@ from depthpose.core.files.disk import write_bytes
 from depthpose.core.findings import CheckReport, Problem, make_report, unreadable
 from depthpose.core.rigid import Rigid
 from depthpose.pose.cloud import cloud_from_depth, lift_sample, refusal_of, refuse_other_size
-from depthpose.pose.config import CloudConfig, MeshConfig
+from depthpose.pose.config import CloudConfig
 from depthpose.pose.datasets.layouts import (
     Instance,
     find_layout,
@@ -48,39 +48,21 @@ from depthpose.pose.mesh import (
     symmetries_to_bop,
     unit_advice,
 )
-from depthpose.pose.types import (
-    CloudSample,
-    ObjectModel,
-    PoseTruth,
-    ViewInput,
-    ViewSample,
-)
+from depthpose.pose.types import CloudSample, ObjectModel, PoseTruth, ViewInput, ViewSample
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class BopDataset:
-    """Instances of one split, each a sample when it is asked for.
+    """Instances of one split, each a sample when it is asked for."""
 
-    Attributes:
-        folder: of the data set.
-        split: its name.
-        layout: a key of ``LAYOUTS``.
-        instances: what is annotated, in the order of scene, image and place.
-        mesh_config: for its models.
-        cloud_config: for its clouds.
-        sha256: of all annotations of the split: tells data sets of one name apart.
-    """
-
-    folder: Path
-    split: str
-    layout: str
-    instances: Sequence[Instance]
-    mesh_config: MeshConfig
-    cloud_config: CloudConfig
-    sha256: str
+    folder: Path  #: of the data set
+    split: str  #: its name
+    layout: str  #: a key of ``LAYOUTS``
+    instances: Sequence[Instance]  #: what is annotated, in the order of scene, image and place
+    cloud_config: CloudConfig  #: for its clouds
+    sha256: str  #: of all annotations of the split: tells data sets of one name apart
 
     def __len__(self) -> int:
-        """How many instances."""
         return len(self.instances)
 
     def __getitem__(self, index: int) -> CloudSample:
@@ -95,7 +77,7 @@ class BopDataset:
             InputError: a mesh is missing or damaged.
         """
         numbers = {instance.object_id for instance in self.instances}
-        return read_bop_models(self.folder, numbers, self.mesh_config)
+        return read_bop_models(self.folder, numbers)
 
     def sample(
         self, instance: Instance, mask: Bool[Tensor, "mask_h mask_w"] | None = None
@@ -167,7 +149,6 @@ def open_bop(
     folder: str | Path,
     split: str = "test",
     *,
-    mesh: MeshConfig | None = None,
     cloud: CloudConfig | None = None,
 ) -> BopDataset:
     """Open a split of a data set in BOP's layout, or in another of ``LAYOUTS``.
@@ -175,7 +156,6 @@ def open_bop(
     Args:
         folder: of the data set, with ``models`` and the splits in it.
         split: ``test``, ``train_pbr``, ...; ``train`` or ``test`` of Linemod_preprocessed.
-        mesh: how many keypoints its models get.
         cloud: how its clouds are cut.
 
     Raises:
@@ -194,7 +174,6 @@ def open_bop(
         split=split,
         layout=name,
         instances=instances,
-        mesh_config=MeshConfig() if mesh is None else mesh,
         cloud_config=CloudConfig() if cloud is None else cloud,
         sha256=said.hexdigest(),
     )
@@ -377,44 +356,28 @@ def _check_content(instance: Instance, model: ObjectModel) -> Iterator[Problem]:
             yield Problem(path=instance.mask, kind="mismatch", message=message)
 
 
-_DEPTH_UNIT_M = 0.0001
-"""Tenths of a millimetre reach 6.5 m and are finer than any sensor that is imitated."""
+_DEPTH_UNIT_M = 0.0001  # tenths of a millimetre reach 6.5 m, and no imitated sensor is finer
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class BopObject:
-    """One object of a frame.
+    """One object of a frame."""
 
-    Attributes:
-        number: its ``obj_id``.
-        camera_from_model: its pose.
-        visible: its pixels that nothing occludes.
-        silhouette: all its pixels in the image, occluded ones too.
-    """
-
-    number: int
-    camera_from_model: Rigid
-    visible: Bool[Tensor, "h w"]
-    silhouette: Bool[Tensor, "h w"]
+    number: int  #: its ``obj_id``
+    camera_from_model: Rigid  #: its pose
+    visible: Bool[Tensor, "h w"]  #: its pixels that nothing occludes
+    silhouette: Bool[Tensor, "h w"]  #: all its pixels in the image, occluded ones too
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class BopFrame:
-    """One image of a scene.
+    """One image of a scene."""
 
-    Attributes:
-        number: its ``im_id``.
-        K: intrinsic matrix.
-        depth_m: NaN where there is no reading.
-        objects: what is annotated.
-        rgb: the picture, if there is one.
-    """
-
-    number: int
-    K: Float[Tensor, "3 3"]
-    depth_m: Float[Tensor, "h w"]
-    objects: Sequence[BopObject]
-    rgb: Float[Tensor, "3 h w"] | None = None
+    number: int  #: its ``im_id``
+    K: Float[Tensor, "3 3"]  #: intrinsic matrix
+    depth_m: Float[Tensor, "h w"]  #: NaN where there is no reading
+    objects: Sequence[BopObject]  #: what is annotated
+    rgb: Float[Tensor, "3 h w"] | None = None  #: the picture, if there is one
 
 
 def write_bop_scene(

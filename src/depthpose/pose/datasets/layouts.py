@@ -20,12 +20,10 @@ from depthpose.pose.config import MeshConfig
 from depthpose.pose.mesh import read_model, symmetries_from_bop, turn_about
 from depthpose.pose.types import ObjectModel, Symmetries
 
-_ROTATION_SLACK = 1e-2
-"""Published annotations are rounded; LineMOD's rotations are off by up to a few thousandths."""
+_ROTATION_SLACK = 1e-2  # published ones are rounded; LineMOD's are off by a few thousandths
 
 
-MOST = 10**9
-"""Of scenes, images and objects: their numbers name files."""
+MOST = 10**9  #: of scenes, images and objects: their numbers name files
 
 
 def entry_number(key: object) -> int | None:
@@ -125,35 +123,20 @@ _IMAGE_FOLDERS = ("rgb", "gray")
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Instance:
-    """One annotated object in one image.
+    """One annotated object in one image."""
 
-    Attributes:
-        scene_id: number of the scene.
-        image_id: number of the image in it.
-        index: place among the annotations of the image: names the mask.
-        object_id: BOP's ``obj_id``.
-        K: intrinsic matrix.
-        depth: the depth image.
-        depth_unit_m: metres a unit of it.
-        mask: of the visible part; None where there is no such file.
-        rgb: the picture, where there is one.
-        camera_from_model: the annotated pose.
-        visible_fraction: share of the silhouette that is seen, where it is given.
-        is_measured: whether the pose was annotated, not itself fitted to the same depth.
-    """
-
-    scene_id: int
-    image_id: int
-    index: int
-    object_id: int
-    K: Float[Tensor, "3 3"]
-    depth: Path
-    depth_unit_m: float
-    mask: Path | None
-    rgb: Path | None
-    camera_from_model: Rigid
-    visible_fraction: float | None = None
-    is_measured: bool = True
+    scene_id: int  #: number of the scene
+    image_id: int  #: number of the image in it
+    index: int  #: place among the annotations of the image: names the mask
+    object_id: int  #: BOP's ``obj_id``
+    K: Float[Tensor, "3 3"]  #: intrinsic matrix
+    depth: Path  #: the depth image
+    depth_unit_m: float  #: metres a unit of it
+    mask: Path | None  #: of the visible part; None where there is no such file
+    rgb: Path | None  #: the picture, where there is one
+    camera_from_model: Rigid  #: the annotated pose
+    visible_fraction: float | None = None  #: share of the silhouette that is seen, where given
+    is_measured: bool = True  #: whether the pose was annotated, not itself fitted to the same depth
 
     @property
     def name(self) -> str:
@@ -258,11 +241,9 @@ def read_targets(path: str | Path, folder: str | Path = ".") -> list[BopTarget]:
 _OF_YAML = {b"[": 750, b"{": 750, b",": 450, b":": 500, b"\n": 500, b"- ": 500}
 """Bytes that a value takes while it is read, measured with PyYAML 6."""
 
-_MAX_BYTES = 2**22
-"""Of a list of images."""
+_MAX_BYTES = 2**22  # of a list of images
 
-SYMMETRIC = (10, 11)
-"""Eggbox and glue: measured by ADD-S ever since Hinterstoisser et al. (2012)."""
+SYMMETRIC = (10, 11)  #: Eggbox and glue: measured by ADD-S ever since Hinterstoisser et al. (2012).
 
 
 def linemod_symmetries(number: int) -> Symmetries:
@@ -337,19 +318,14 @@ def segnet_mask(folder: Path, instance: Instance) -> Path:
 
 @dataclass(frozen=True, kw_only=True)
 class Layout:
-    """How one kind of data set is read; its models are ``models/obj_NNNNNN.ply`` in millimetres.
+    """How one kind of data set is read; its models are ``models/obj_NNNNNN.ply`` in millimetres."""
 
-    Attributes:
-        splits: names of the splits of a folder; none where the folder is of another layout.
-        instances: of one split of a folder.
-        symmetries: of an object, by number, whose models declare none.
-        predicted_mask: file of the mask that came with the data, for a folder and an instance;
-            None: the data set has none.
-    """
-
-    splits: Callable[[Path], Sequence[str]]
-    instances: Callable[[Path, str], Iterable[Instance]]
+    splits: Callable[[Path], Sequence[str]]  #: names of a folder's splits; none in another layout
+    instances: Callable[[Path, str], Iterable[Instance]]  #: of one split of a folder
+    #: of an object, by number, whose models declare none.
     symmetries: Callable[[int], Symmetries] = lambda _: Symmetries()
+    #: file of the mask that came with the data, for a folder and an instance; None: the data set
+    #: has none.
     predicted_mask: Callable[[Path, Instance], Path] | None = None
 
 

@@ -15,11 +15,9 @@ from depthpose.core.files import read_json, write_json
 from depthpose.core.files.images import MAX_PIXELS, opened_image
 from depthpose.pose.datasets.layouts import integer, number, read_rows
 
-Runs = tuple[tuple[int, ...], int, int]
-"""Run lengths, height and width."""
+Runs = tuple[tuple[int, ...], int, int]  #: run lengths, height and width
 _MOST_LABELS, _HALF, _SOFT = 64, 127, 32
-_MOST_BITS = 40
-"""Of a run length in text: no image has as many pixels."""
+_MOST_BITS = 40  # of a run length in text: no image has as many pixels
 
 
 def read_mask(path: Path) -> Bool[Tensor, "mask_h mask_w"]:
@@ -185,23 +183,14 @@ def _is_list_of_counts(value: object) -> TypeGuard[list[int]]:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Detection:
-    """One predicted object.
+    """One predicted object."""
 
-    Attributes:
-        scene_id: number of the scene.
-        image_id: number of the image.
-        object_id: which object (``category_id``).
-        score: how sure.
-        segmentation: run lengths as in the file, checked.
-        seconds: what the image took, where it is said.
-    """
-
-    scene_id: int
-    image_id: int
-    object_id: int
-    score: float
-    segmentation: Runs
-    seconds: float | None = None
+    scene_id: int  #: number of the scene
+    image_id: int  #: number of the image
+    object_id: int  #: which object (``category_id``)
+    score: float  #: how sure
+    segmentation: Runs  #: run lengths as in the file, checked
+    seconds: float | None = None  #: what the image took, where it is said
 
     @property
     def mask(self) -> Bool[Tensor, "h w"]:

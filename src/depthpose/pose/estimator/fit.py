@@ -27,40 +27,25 @@ from depthpose.pose.types import Fit, Identity, ObjectModel, ViewInput
 BORDER_PX = 2
 """Readings so near an edge may be of either side: stereo and structured light match windows, and
 a mask ends so far from the silhouette."""
-SHOWN = 0.95
-"""Of what was seen of the surface so much agrees at a right pose that a sensor reads well."""
+SHOWN = 0.95  #: so much of the seen surface agrees at a right pose that a sensor reads well
 _NOISES = 3.0
-_WIDEST = 2.0
-"""Times the usual limit, whatever the noise: beyond, what was read is no surface."""
-_COMPARED = 1000
-"""Readings of the object, evenly taken, that are laid on the surface."""
-_LAG_PX = 3
-"""Noise is compared so far apart: neighbouring pixels of a real sensor err alike."""
-_FINEST = 0.01
-"""Of the diameter: models are no more exact."""
-_CELLS = 40
-"""Of the z-buffer along a diameter, at most; no finer than the pixels and the surface's points."""
-_GRAZING = 0.2
-"""Cosine below which a surface is not compared: no sensor reads it well."""
-_WIDE = 0.6
-"""Half of the window about the object, in diameters."""
+_WIDEST = 2.0  # times the usual limit, whatever the noise: beyond, what was read is no surface
+_COMPARED = 1000  # readings of the object, evenly taken, that are laid on the surface
+_LAG_PX = 3  # noise is compared so far apart: neighbouring pixels of a real sensor err alike
+_FINEST = 0.01  # of the diameter: models are no more exact
+_CELLS = 40  # of the z-buffer along a diameter, at most; no finer than pixels and samples
+_GRAZING = 0.2  # cosine below which a surface is not compared: no sensor reads it well
+_WIDE = 0.6  # half of the window about the object, in diameters
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Seen:
-    """What a camera saw about an object, in a window of its image.
+    """What a camera saw about an object, in a window of its image."""
 
-    Attributes:
-        depth_m: NaN where there is no reading.
-        is_own: the pixels that are said to be the object's.
-        K: of the window.
-        noise_m: standard deviation of a reading, of what neighbours do not share.
-    """
-
-    depth_m: Float64[Tensor, "h w"]
-    is_own: Bool[Tensor, "h w"]
-    K: Float64[Tensor, "3 3"]
-    noise_m: float
+    depth_m: Float64[Tensor, "h w"]  #: NaN where there is no reading
+    is_own: Bool[Tensor, "h w"]  #: the pixels that are said to be the object's
+    K: Float64[Tensor, "3 3"]  #: of the window
+    noise_m: float  #: standard deviation of a reading, of what neighbours do not share
 
 
 def seen_about(cloud_m: Float[Tensor, "n 3"], view: ViewInput | None, diameter_m: float) -> Seen:
@@ -181,56 +166,41 @@ def fit_of(seen: Seen, pose: Rigid, surface: Surface) -> Fit:
     )
 
 
-POINTS = 400
-"""Of the cloud, evenly taken."""
+POINTS = 400  #: of the cloud, evenly taken
 _STEPS = 12
-_WIDE_STEP = 2.0
-"""Times the usual limit of a distance in the first step."""
-_INDEPENDENT = 10.0
-"""So many neighbouring readings err alike: the variance is as many times as large."""
+_WIDE_STEP = 2.0  # times the usual limit of a distance in the first step
+_INDEPENDENT = 10.0  # so many neighbouring readings err alike: the variance is so many times larger
 _STARTS = (1.0, 0.87, 1.15)
 """Scales at which the search begins: from one alone it stays there where the copy is smaller."""
 _ROUGH_POINTS = 150
-_TRUST = 0.03
-"""A scale beside 1 must lower the mean squared distance, in squared limits, by so much."""
+_TRUST = 0.03  # a scale beside 1 must lower the mean squared distance, in squared limits, so much
 _CONVERGED = 3e-4
-_PLANES = 24
-"""Planes across which the posed model is mirrored for a start."""
+_PLANES = 24  # planes across which the posed model is mirrored for a start
 _CLEAR = 0.05
 """Where the mirror image, roughly fitted, is so much farther from the points than the model, exact
 steps do not bring it nearer: in 123 views the gain was then -0.035 at most."""
 _FLIP = torch.tensor([-1.0, 1.0, 1.0], dtype=torch.float64)
-_OFFSET_M = 0.006
-"""Sensors are off along the ray as a whole by 3 to 6 mm: so much nearer, a thing looks larger."""
-_SURE = 2.0
-"""Standard deviations."""
+_OFFSET_M = 0.006  # sensors are off along the ray by 3 to 6 mm: so much nearer, things look larger
+_SURE = 2.0  # standard deviations
 _SIZE_GAIN = 0.05
 """Where another size gains less (0.25 % of the diameter), what is seen of the surface fits at many,
 or a sensor errs so: the right pose of a real bowl gains 0.032 at 1.07."""
 _MIRROR_GAIN = 0.02
 """Gain from which a cloud is that of a mirrored copy, 0.1 % of the diameter: of right answers for
 synthetic views it was at most 0.004, where the mirror image is not nearly the model."""
-_OTHER_SIZES = 0.1
-"""Sizes so far from 1 must be excluded for an identity to be confirmed."""
-_NEAR_SIZE = 0.05
-"""And the size that fits is as near to 1, beside its deviation and an offset of the sensor."""
-_BESIDE = 0.005
-"""And no more of the readings may lie beside the silhouette, as those of a larger copy do."""
+_OTHER_SIZES = 0.1  # sizes so far from 1 must be excluded for an identity to be confirmed
+_NEAR_SIZE = 0.05  # and the size that fits is as near to 1, beside its deviation and an offset
+_BESIDE = 0.005  # and no more readings may lie beside the silhouette, as a larger copy's do
 
 
 @dataclass(frozen=True)
 class Scale:
-    """How many times as large as the model the seen object is, and how sure that is.
+    """How many times as large as the model the seen object is, and how sure that is."""
 
-    Attributes:
-        times: 1 for the model itself.
-        sigma: standard deviation of it.
-        gain: by how much it lowers the root mean square distance of the points to the surface, in
-            units of the distance up to which a point is near.
-    """
-
-    times: float
-    sigma: float
+    times: float  #: 1 for the model itself
+    sigma: float  #: standard deviation of it
+    #: by how much it lowers the root mean square distance of the points to the surface, in units of
+    #: the distance up to which a point is near.
     gain: float
 
 

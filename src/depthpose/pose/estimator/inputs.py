@@ -41,19 +41,14 @@ from depthpose.pose.mesh import unit_advice
 from depthpose.pose.segmentation import label_parts
 from depthpose.pose.types import CloudInput, ObjectModel, Status, ViewInput
 
-AnyArray = str | Path | np.ndarray | Tensor
-"""A file, an array or a tensor."""
-AnyMask = AnyArray | Mapping[str, Any]
-"""A mask, its file, or COCO's run lengths."""
+AnyArray = str | Path | np.ndarray | Tensor  #: a file, an array or a tensor
+AnyMask = AnyArray | Mapping[str, Any]  #: a mask, its file, or COCO's run lengths
 _SMALLEST_INSTANCE = 0.2
 """Pieces of a mask below this share of the largest are fragments of a segmentation, not objects."""
 AnyInput = CloudInput | ViewInput
-_MOST = 0.5
-"""Where most points lie farther from their median than the object is long, they are not its."""
-_BEFORE = 0.05
-"""Nearly all points of a cloud that was seen lie so many diameters before the camera, and more."""
-_THIN = 0.002
-"""Below this root mean square, in diameters, a cloud has no extent."""
+_MOST = 0.5  # where most points are farther from their median than the object is long, refuse
+_BEFORE = 0.05  # nearly all points of a seen cloud are so many diameters before the camera
+_THIN = 0.002  # below this root mean square, in diameters, a cloud has no extent
 
 
 def cloud_input(cloud: AnyArray, unit: Unit, object: str, name: str) -> CloudInput:
@@ -206,19 +201,12 @@ def _tensor(values: Any) -> Tensor:  # noqa: ANN401  whatever a caller has
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class ObjectCloud:
-    """A cloud that can be posed.
+    """A cloud that can be posed."""
 
-    Attributes:
-        cloud_m: all usable points, without flying pixels.
-        points_m: those that the network sees and that vote, one a voxel.
-        voxels: of the network's grid.
-        view: the depth image that shows the cloud; None where the cloud alone is known.
-    """
-
-    cloud_m: Float[Tensor, "n 3"]
-    points_m: Float[Tensor, "m 3"]
-    voxels: VoxelGrid
-    view: ViewInput | None
+    cloud_m: Float[Tensor, "n 3"]  #: all usable points, without flying pixels
+    points_m: Float[Tensor, "m 3"]  #: those that the network sees and that vote, one a voxel
+    voxels: VoxelGrid  #: of the network's grid
+    view: ViewInput | None  #: the depth image that shows the cloud; None of a cloud alone
 
 
 @dataclass(frozen=True, kw_only=True)

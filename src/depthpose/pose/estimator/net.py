@@ -9,6 +9,7 @@ from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
+from typing import NoReturn
 
 import torch
 from jaxtyping import Float
@@ -38,7 +39,6 @@ from depthpose.pose.estimator.inputs import AnyInput, ObjectCloud, Refusal, prep
 from depthpose.pose.estimator.inputs import CloudDirections as CloudDirections
 from depthpose.pose.estimator.register import Registration
 from depthpose.pose.refine import refine_best
-from depthpose.pose.surface import Surface, prepare_surface
 from depthpose.pose.types import (
     CloudInput,
     ObjectModel,
@@ -52,10 +52,10 @@ from depthpose.pose.types import (
 from depthpose.pose.voting import consistent_keypoints, fit_pose, meet_lines, vote_ransac
 from depthpose.pose.weights import PoseWeights, read_pose_weights
 
-_LEAST = 4
-"""Keypoints that must agree: three fix a pose with nothing left to contradict it."""
+_LEAST = 4  # keypoints that must agree: three fix a pose with nothing left to contradict it
 _DOUBTED: tuple[Status, ...] = ("votes do not meet", "keypoints do not fit", "doubtful")
 """What the network could not answer, and another method may; the rest is due to the input."""
+_NEEDS_MASK = "a regressed depth image takes a depth image with a mask; give both, or other weights"
 
 
 def _fits(vote: Vote, model: ObjectModel, config: EstimateConfig) -> PoseFit | Refusal:
@@ -160,7 +160,6 @@ class GeoPoseNet(PoseEstimator):
     """The same as :meth:`load`."""
 
     def __repr__(self) -> str:
-        """Say it in one line: the network, its objects, weights, device."""
         said = f"{type(self._network).__name__} of {self._objects_in_short()}"
         named = f", weights {self.name!r}" if self.name else ""
         return f"GeoPoseNet({said}{named}, {self.config.device})"
@@ -192,8 +191,8 @@ class GeoPoseNet(PoseEstimator):
         """Give the registration of the same objects, which shares what was prepared of them."""
         if self._registration is None:
             config = replace(self.config, register_refused=False, with_icp=True)
-            self._registration = Registration(self.models, config)
-            self._registration._surfaces, self._registration._copies = self._surfaces, self._copies
+            both = self._registration = Registration(self.models, config)
+            both._surface, both._copies_of = self._surface, self._copies_of
         return self._registration
 
     def _pose_near(
@@ -340,7 +339,7 @@ class _Cloud:
     outputs: Float[Tensor, "n k 3"] | None = None
 
 
-class DepthImageRegressor:
+class DepthImageRegressor(PoseEstimator):
     """The baseline as an estimator. It refuses nothing but views with too little of the object.
 
     Args:
@@ -352,59 +351,35 @@ class DepthImageRegressor:
     """
 
     def __init__(self, weights: PoseWeights, config: EstimateConfig | None = None) -> None:
+        super().__init__(weights.models, config, weights.refusal)
         if not isinstance(weights.network, DepthImageNet):
             raise InputError(
                 "these weights cast votes and regress no depth image; load them as GeoPoseNet"
             )
-        self.config = EstimateConfig() if config is None else config
         if self.config.register_refused:
             raise InputError(
                 "a regressed depth image refuses nothing that could be registered; omit "
                 "--register-refused (register_refused=True)"
             )
-        self.weights = weights
         self._network = weights.network.to(usable_device(self.config.device)).eval()
-        self._numbers = {model.name: k for k, model in enumerate(weights.models)}
-        self._surfaces: dict[int, Surface] = {}
+        self._cloud = weights.cloud
 
-    @classmethod
-    @own_arithmetic()
-    def load(
-        cls, weights: str | Path, config: EstimateConfig | None = None
-    ) -> "DepthImageRegressor":
-        """Build an estimator from weights, by file or by name.
+    def _each(
+        self, inputs: Iterable[AnyInput], threads: int, *, is_likely: bool = True
+    ) -> Iterator[PoseEstimate]:
+        """Regress one by one, whatever is likely."""
+        del is_likely
+        return each_in_threads(partial(or_unreadable, self._estimate), inputs, threads)
 
-        Raises:
-            InputError: no such weights, or of another kind.
-        """
-        found = read_pose_weights(find_weights(weights))
-        warn_of_terms(found.facts)
-        return cls(found, config)
+    def _pose_near(self, inputs: Sequence[CloudInput], poses: Sequence[Rigid]) -> NoReturn:
+        del inputs, poses
+        raise InputError(_NEEDS_MASK)
 
-    @property
-    def objects(self) -> tuple[str, ...]:
-        """Names of the objects that the weights know."""
-        return tuple(self._numbers)
-
-    @torch.no_grad()
-    @own_arithmetic()
-    def estimate_many(self, inputs: Sequence[ViewInput]) -> list[PoseEstimate]:
-        """Estimate one after the other.
-
-        Raises:
-            InputError: an object that the weights do not know.
-        """
-        return [self._estimate(given) for given in inputs]
-
-    def _estimate(self, given: ViewInput) -> PoseEstimate:
-        if given.object not in self._numbers:
-            raise InputError(
-                f"object {given.object!r}: the weights do not know it; they know "
-                f"{', '.join(self.objects)}"
-            )
-        number = self._numbers[given.object]
-        model, clock = self.weights.models[number], Clock()
-        assert isinstance(self._network, DepthImageNet)
+    def _estimate(self, given: AnyInput) -> PoseEstimate:
+        number = self._number(given.object)
+        if not isinstance(given, ViewInput):
+            raise InputError(_NEEDS_MASK)
+        model, clock = self.models[number], Clock()
         config = self._network.config
         crop = cut_depth(given, config, model.diameter_m)
         if crop is None:
@@ -423,14 +398,12 @@ class DepthImageRegressor:
         clock.note("network")
         if not self.config.with_icp:
             return found
-        if number not in self._surfaces:
-            self._surfaces[number] = prepare_surface(model, self.config.icp.surface_points)
         points_m = cloud_from_depth(
-            given.depth_m, given.mask, given.K, model.diameter_m, self.weights.cloud
+            given.depth_m, given.mask, given.K, model.diameter_m, self._cloud
         ).float()
-        if (few := refusal_of(points_m, self.weights.cloud)) is not None:
+        if (few := refusal_of(points_m, self._cloud)) is not None:
             return replace(found, status="too few points", reason=few, camera_from_model=None)
-        pose, surface = found.camera_from_model, self._surfaces[number]
+        pose, surface = found.camera_from_model, self._surface(number)
         assert pose is not None
         refined = refine_best(points_m, pose, surface, self.config.icp).refined
         clock.note("icp")

@@ -37,13 +37,10 @@ CANDIDATE_SLOPES = {
 }
 """As of :class:`RefusalConfig`; no network disagrees."""
 REFUSAL = RefusalConfig(candidate_slopes=CANDIDATE_SLOPES)
-_VOXEL = 0.05
-"""Of the diameter."""
-_LEAST = 500
-"""Points of a model without faces."""
+_VOXEL = 0.05  # of the diameter
+_LEAST = 500  # points of a model without faces
 _PROPOSALS = 40
-_SMOOTHED = 1500
-"""Of so many points 20 neighbours lay the plane that gives a normal."""
+_SMOOTHED = 1500  # of so many points 20 neighbours lay the plane that gives a normal
 
 
 class Registration(PoseEstimator):
@@ -116,7 +113,6 @@ class Registration(PoseEstimator):
         return cls([with_found_symmetries(m, None, is_taken=True) for m in models], config)
 
     def __repr__(self) -> str:
-        """Say it in one line: the objects; a registration has no weights and no device."""
         return f"Registration(of {self._objects_in_short()})"
 
     def prepare(self) -> None:

@@ -26,21 +26,15 @@ from depthpose.pose.voting import free_motions
 MARGIN = 0.15
 """Of the diameter: points so far from the surface at the last or the predicted pose may be the
 object's; between two frames it moves by less."""
-_MOST_POINTS = 10_000
-"""Of what a camera saw about the object, evenly taken."""
+_MOST_POINTS = 10_000  # of what a camera saw about the object, evenly taken
 _LEAST_POINTS = 60
-_THROUGH = 0.1
-"""Where the camera saw through more of the posed surface, the object is not there."""
-_SEEN = 0.35
-"""Where less of the posed surface was seen, it may be anywhere."""
+_THROUGH = 0.1  # where the camera saw through more of the posed surface, the object is not there
+_SEEN = 0.35  # where less of the posed surface was seen, it may be anywhere
 _SEEN_BESIDE, _REST_SEEN = 0.2, 0.5
 """Of an object that is followed and occluded less is enough, if so much of the rest was seen."""
-_SUPPORTS = 2
-"""Planes beside the object that are looked for: a table and a wall."""
-_BESIDE = 1000
-"""Points beside the object that show them."""
-_ON = 3.0
-"""Standard deviations of a plane's points: nearer ones are of it."""
+_SUPPORTS = 2  # planes beside the object that are looked for: a table and a wall
+_BESIDE = 1000  # points beside the object that show them
+_ON = 3.0  # standard deviations of a plane's points: nearer ones are of it
 
 
 def scene_about(given: AnyInput, poses: Rigid, surface: Surface) -> Float64[Tensor, "n 3"]:
@@ -72,21 +66,13 @@ def scene_about(given: AnyInput, poses: Rigid, surface: Surface) -> Float64[Tens
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class TrackedObject:
-    """What is followed, and how it is looked for.
+    """What is followed, and how it is looked for."""
 
-    Attributes:
-        model: the object.
-        surface: of the model.
-        refusal: when a pose is refused.
-        icp: of the first steps.
-        look: an estimate of the object in a frame about which nothing is known.
-    """
-
-    model: ObjectModel
-    surface: Surface
-    refusal: RefusalConfig
-    icp: IcpConfig
-    look: Callable[[AnyInput], PoseEstimate]
+    model: ObjectModel  #: the object
+    surface: Surface  #: of the model
+    refusal: RefusalConfig  #: when a pose is refused
+    icp: IcpConfig  #: of the first steps
+    look: Callable[[AnyInput], PoseEstimate]  #: estimates the object in a frame not yet known
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

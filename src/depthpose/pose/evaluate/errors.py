@@ -21,7 +21,7 @@ from depthpose.pose.mesh import drawn_triangles, symmetry_transforms, turn_about
 from depthpose.pose.metrics import (
     BOP_PIXELS,
     BOP_SHARES,
-    View,
+    SUCCESS_SHARE,
     add_m,
     adds_m,
     auc,
@@ -41,19 +41,12 @@ _MARGIN_PX = 2
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class ErrorContext:
-    """What the errors of an object depend on.
+    """What the errors of an object depend on."""
 
-    Attributes:
-        model: the object.
-        diameter_m: of the table that was asked for.
-        is_adds: whether ADD-S decides a success.
-        vsd_delta_m: see ``EvaluationConfig``; None: VSD is not measured.
-    """
-
-    model: ObjectModel
-    diameter_m: float
-    is_adds: bool
-    vsd_delta_m: float | None
+    model: ObjectModel  #: the object
+    diameter_m: float  #: of the table that was asked for
+    is_adds: bool  #: whether ADD-S decides a success
+    vsd_delta_m: float | None  #: see ``EvaluationConfig``; None: VSD is not measured
 
     @cached_property
     def symmetries(self) -> Rigid:
@@ -66,28 +59,21 @@ class ErrorContext:
         return drawn_triangles(self.model).double()
 
 
-Errors = Float[Tensor, " n"]
-"""One number, or several of which a row shows the mean (VSD: one a tau); float64."""
+Errors = Float[Tensor, " n"]  #: one number, or several whose mean a row shows (VSD: one a tau)
 
 
 @dataclass(frozen=True, kw_only=True)
 class Metric:
-    """An error of a pose, and what the rows of objects say of it.
+    """An error of a pose, and what the rows of objects say of it."""
 
-    Attributes:
-        measure: ``(estimated, instance, context)``, the first ``camera_from_model``, to the error.
-        missing: the error of an instance without an answer.
-        is_wanted: whether it is measured at all.
-        summaries: columns of the rows of objects: name to a function of the errors (n, t) of all
-            instances and their diameters [m] (n).
-        has_median: whether rows of objects hold the median of the answers, as ``NAME_median``.
-    """
-
+    #: ``(estimated, instance, context)``, the first ``camera_from_model``, to the error.
     measure: Callable[[Rigid, Instance, ErrorContext], Errors | Tensor | float]
-    missing: tuple[float, ...] = (math.inf,)
-    is_wanted: Callable[[ErrorContext], bool] = lambda _: True
+    missing: tuple[float, ...] = (math.inf,)  #: the error of an instance without an answer
+    is_wanted: Callable[[ErrorContext], bool] = lambda _: True  #: whether it is measured at all
+    #: columns of the rows of objects: name to a function of the errors (n, t) of all instances and
+    #: their diameters [m] (n).
     summaries: Mapping[str, Callable[[Tensor, Tensor], float]] = field(default_factory=dict)
-    has_median: bool = False
+    has_median: bool = False  #: whether rows of objects hold the median of answers, ``NAME_median``
 
 
 def measure(
@@ -167,60 +153,46 @@ def _vsd(estimated: Rigid, instance: Instance, context: ErrorContext) -> Float[T
         triangles_m = _apply(pose, context.triangles_m)
         return rasterize(triangles_m, K, width, height, with_barycentric=False).depth_m
 
-    view = View(depth_m=window, K=K, render=render)
     taus_m = [share * context.diameter_m for share in BOP_SHARES]
-    return vsd(*poses, view, taus_m, context.vsd_delta_m)
+    return vsd(*poses, window, K, render, taus_m, context.vsd_delta_m)
 
 
 def _apply(pose: Rigid, triangles_m: Float[Tensor, "f 3 3"]) -> Float[Tensor, "f 3 3"]:
     return triangles_m @ pose.R.double().mT + pose.t_m.double()
 
 
-_read_depth = lru_cache(maxsize=4)(read_depth_png)
-"""Instances of one image follow each other."""
+_read_depth = lru_cache(maxsize=4)(read_depth_png)  # instances of one image follow each other
 
-METRICS = {
+METRICS = {  # i: the instance, c: its context
     "error_m": Metric(  # ADD, or ADD-S where that decides a success
-        measure=lambda pose, instance, context: (adds_m if context.is_adds else add_m)(
-            pose, instance.camera_from_model, context.model.vertices_m
+        measure=lambda pose, i, c: (adds_m if c.is_adds else add_m)(
+            pose, i.camera_from_model, c.model.vertices_m
         ),
         summaries={"auc": lambda errors, _: auc(errors[:, 0])},
     ),
     "adds_m": Metric(
-        measure=lambda pose, instance, context: adds_m(
-            pose, instance.camera_from_model, context.model.vertices_m
-        ),
+        measure=lambda pose, i, c: adds_m(pose, i.camera_from_model, c.model.vertices_m),
         summaries={"auc_adds": lambda errors, _: auc(errors[:, 0])},
     ),
     "mssd_m": Metric(
-        measure=lambda pose, instance, context: mssd_m(
-            pose, instance.camera_from_model, context.model.vertices_m, context.symmetries
+        measure=lambda pose, i, c: mssd_m(
+            pose, i.camera_from_model, c.model.vertices_m, c.symmetries
         ),
         summaries={"ar_mssd": lambda errors, d: average_recall(errors / d[:, None], BOP_SHARES)},
     ),
     "mspd_px": Metric(  # scaled to an image 640 wide
-        measure=lambda pose, instance, context: (
-            (BOP_WIDTH_PX / image_size(instance.depth)[0])
-            * mspd_px(
-                pose,
-                instance.camera_from_model,
-                context.model.vertices_m,
-                context.symmetries,
-                instance.K,
-            )
+        measure=lambda pose, i, c: (
+            (BOP_WIDTH_PX / image_size(i.depth)[0])
+            * mspd_px(pose, i.camera_from_model, c.model.vertices_m, c.symmetries, i.K)
         ),
         summaries={"ar_mspd": lambda errors, _: average_recall(errors, BOP_PIXELS)},
     ),
     "rotation_deg": Metric(
-        measure=lambda pose, instance, context: rotation_error_rad(
-            pose, _nearest(pose, instance, context)
-        ).rad2deg(),
+        measure=lambda pose, i, c: rotation_error_rad(pose, _nearest(pose, i, c)).rad2deg(),
         has_median=True,
     ),
     "translation_m": Metric(
-        measure=lambda pose, instance, context: translation_error_m(
-            pose, _nearest(pose, instance, context)
-        ),
+        measure=lambda pose, i, c: translation_error_m(pose, _nearest(pose, i, c)),
         has_median=True,
     ),
     "vsd": Metric(
@@ -287,10 +259,8 @@ def _is_own(prediction: Prediction, places: Mapping[str, Place]) -> bool:
     return place is not None and prediction.place in (None, place)
 
 
-_TRIED = 40
-"""Instances that each change is tried on."""
-_MORE = 0.2
-"""A change is said where so large a share more is right by it."""
+_TRIED = 40  # instances that each change is tried on
+_MORE = 0.2  # a change is said where so large a share more is right by it
 _SCALES = {
     1.0: "",
     1000.0: "t were 1000 times larger (is it in metres? BOP's csv has millimetres)",
@@ -318,7 +288,6 @@ def convention_advice(
     dataset: BopDataset,
     predictions: Sequence[Prediction],
     contexts: Mapping[int, ErrorContext],
-    limit: float,
 ) -> str | None:
     """Say by which change of all predictions many more were right; None where by none."""
     answers = [p for p in predictions if p.estimate.is_posed]
@@ -347,7 +316,7 @@ def convention_advice(
             pose, context = found[instance.name].camera_from_model, contexts[instance.object_id]
             assert pose is not None
             error_m = METRICS["error_m"].measure(pose, instance, context)
-            right += float(error_m) < limit * context.diameter_m
+            right += float(error_m) < SUCCESS_SHARE * context.diameter_m
         return right, len(some)
 
     now, tried = count_right()

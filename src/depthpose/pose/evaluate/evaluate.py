@@ -23,6 +23,7 @@ from depthpose.pose.evaluate.errors import (
     match,
     measure,
 )
+from depthpose.pose.metrics import SUCCESS_SHARE
 from depthpose.pose.predictions import (
     STAGES,
     Place,
@@ -39,40 +40,27 @@ Number = float | None
 
 @dataclass(frozen=True, kw_only=True)
 class Origin:
-    """Whose predictions a row measures; the first columns of its row.
+    """Whose predictions a row measures; the first columns of its row."""
 
-    Attributes:
-        method: its name.
-        masks: kind of masks that it was given.
-        weights: file or name, where it has any.
-        weights_sha256: its first digits; of a file of predictions by others the file's own.
-    """
-
-    method: str
-    masks: str = ""
-    weights: str = ""
-    weights_sha256: str = ""
+    method: str  #: its name
+    masks: str = ""  #: kind of masks that it was given
+    weights: str = ""  #: file or name, where it has any
+    weights_sha256: str = ""  #: its first digits; of a file of predictions by others the file's own
 
 
 @dataclass(frozen=True, kw_only=True)
 class Conditions:
-    """What a number cannot be compared without; the last columns of its row.
+    """What a number cannot be compared without; the last columns of its row."""
 
-    Attributes:
-        diameters: whose table of diameters.
-        frames: data set and split.
-        frames_sha256: first digits of :func:`frames_hash`.
-    """
-
-    diameters: str
-    frames: str
-    frames_sha256: str
+    diameters: str  #: whose table of diameters
+    frames: str  #: data set and split
+    frames_sha256: str  #: first digits of :func:`frames_hash`
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class _Row:
-    conditions: Conditions | None = None
-    origin: Origin | None = None
+    conditions: Conditions | None = None  #: of the evaluation
+    origin: Origin | None = None  #: whose predictions it measures
 
     def columns(self) -> dict[str, Any]:
         """Give the columns of a table, in its order."""
@@ -97,36 +85,21 @@ _LAST = ("conditions", "origin")
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class InstanceRow(_Row):
-    """One instance and the errors of its estimate.
+    """One instance and the errors of its estimate."""
 
-    Attributes:
-        instance: its name.
-        object: name of its model.
-        status: of the estimate; ``missing`` where there is none.
-        is_success: whether ADD (ADD-S of a symmetric object) is below a tenth of the diameter.
-        score: of the answer, larger is surer.
-        visible_fraction: share of the silhouette that is seen, where it is given.
-        truth: ``annotated``, or ``fitted`` to the same depth.
-        diameter_m: of the table that was asked for.
-        metric: ``ADD`` or ``ADD-S``.
-        errors: by the names of ``METRICS``; what is not measured is left out.
-        ms: milliseconds of each stage and in ``total``; None where it has not run.
-        reason: of a refusal.
-        origin: whose estimate it is.
-    """
-
-    instance: str
-    object: str
-    status: str
-    is_success: bool
-    score: Number
-    visible_fraction: Number
-    truth: str
-    diameter_m: float
-    metric: str
-    errors: Mapping[str, Errors]
+    instance: str  #: its name
+    object: str  # name of its model
+    status: str  #: of the estimate; ``missing`` where there is none
+    is_success: bool  #: whether ADD (ADD-S of a symmetric object) is below a tenth of the diameter
+    score: Number  #: of the answer, larger is surer
+    visible_fraction: Number  #: share of the silhouette that is seen, where it is given
+    truth: str  #: ``annotated``, or ``fitted`` to the same depth
+    diameter_m: float  #: of the table that was asked for
+    metric: str  #: ``ADD`` or ``ADD-S``
+    errors: Mapping[str, Errors]  #: by the names of ``METRICS``; what is not measured is left out
+    #: milliseconds of each stage and in ``total``; None where it has not run.
     ms: Mapping[str, Number]
-    reason: str
+    reason: str  #: of a refusal
 
     def error(self, name: str) -> Number:
         """Give an error by its name, or None where it is not measured or infinite."""
@@ -138,54 +111,30 @@ class InstanceRow(_Row):
 
 @dataclass(frozen=True, kw_only=True)
 class ObjectRow(_Row):
-    """The instances of an object, the ``mean`` of objects, or ``all`` instances.
+    """The instances of an object, the ``mean`` of objects, or ``all`` instances."""
 
-    Attributes:
-        object: what the row is called.
-        instances: how many.
-        annotated: how many of them have a pose that was annotated, not fitted.
-        success: share of instances.
-        refused: share of instances without an answer.
-        wrong: share of instances with an answer that is no success.
-        coverage: share of instances with an answer.
-        scores: the summaries of ``METRICS``, ``ar`` and medians; None where not measured.
-        ms: mean milliseconds of each stage and in ``total``.
-        metric: ``ADD`` or ``ADD-S``, where it is of one object.
-        diameter_m: the same.
-        conditions: of the evaluation.
-        origin: whose estimates they are.
-    """
-
-    object: str
-    instances: int
-    annotated: int
-    success: float
-    refused: float
-    wrong: float
-    coverage: float
+    object: str  # what the row is called
+    instances: int  #: how many
+    annotated: int  #: how many of them have a pose that was annotated, not fitted
+    success: float  #: share of instances
+    refused: float  #: share of instances without an answer
+    wrong: float  #: share of instances with an answer that is no success
+    coverage: float  #: share of instances with an answer
+    #: the summaries of ``METRICS``, ``ar`` and medians; None where not measured.
     scores: Mapping[str, Number]
-    ms: Mapping[str, Number]
-    metric: str | None = None
-    diameter_m: float | None = None
+    ms: Mapping[str, Number]  #: mean milliseconds of each stage and in ``total``
+    metric: str | None = None  #: ``ADD`` or ``ADD-S``, where it is of one object
+    diameter_m: float | None = None  #: the same
 
 
 @dataclass(frozen=True, kw_only=True)
 class RiskRow(_Row):
-    """How many answers are wrong if only the surest are given.
+    """How many answers are wrong if only the surest are given."""
 
-    Attributes:
-        coverage: share of all instances that is answered.
-        answers: their number.
-        least_score: of the least sure of them.
-        risk: share of wrong ones among them.
-        conditions: of the evaluation.
-        origin: whose estimates they are.
-    """
-
-    coverage: float
-    answers: int
-    least_score: Number
-    risk: float
+    coverage: float  #: share of all instances that is answered
+    answers: int  #: their number
+    least_score: Number  #: of the least sure of them
+    risk: float  #: share of wrong ones among them
 
 
 _RECALLS = ("ar_vsd", "ar_mssd", "ar_mspd")
@@ -341,25 +290,17 @@ def is_adds(model: ObjectModel, config: EvaluationConfig) -> bool:
     return config.adds == "all" or not model.symmetries.is_none
 
 
-SUCCESS_SHARE = 0.1
-
-
 @dataclass(frozen=True, kw_only=True)
 class Evaluation:
-    """What evaluating one set of predictions gave.
+    """What evaluating one set of predictions gave."""
 
-    Attributes:
-        rows: one an object; where there are several the ``mean`` over objects, in which each
-            counts the same, and ``all`` over instances, as BOP pools them.
-        per_instance: one an instance.
-        risk: how many answers are wrong if only the surest are given.
-        advice: by which change of all predictions many more were right: another unit or convention
-            of poses; None where by none.
-    """
-
+    #: one an object; where there are several the ``mean`` over objects, in which each counts the
+    #: same, and ``all`` over instances, as BOP pools them.
     rows: list[ObjectRow]
-    per_instance: list[InstanceRow]
-    risk: list[RiskRow]
+    per_instance: list[InstanceRow]  #: one an instance
+    risk: list[RiskRow]  #: how many answers are wrong if only the surest are given
+    #: by which change of all predictions many more were right: another unit or convention of poses;
+    #: None where by none.
     advice: str | None = None
 
     def to_frame(self) -> Any:  # noqa: ANN401  pandas is no dependency
@@ -369,15 +310,6 @@ class Evaluation:
             ImportError: pandas is not installed.
         """
         return data_frame(row.columns() for row in self.per_instance)
-
-    def of(self, origin: Origin) -> "Evaluation":
-        """Say in each row whose predictions it measures."""
-        return replace(
-            self,
-            rows=[replace(row, origin=origin) for row in self.rows],
-            per_instance=[replace(row, origin=origin) for row in self.per_instance],
-            risk=[replace(row, origin=origin) for row in self.risk],
-        )
 
 
 def read_any(path: Path) -> list[Prediction]:
@@ -397,6 +329,7 @@ def evaluate(
     predictions: Sequence[Prediction],
     config: EvaluationConfig | None = None,
     progress: Callable[[Sequence[Instance]], Iterable[Instance]] = iter,
+    origin: Origin | None = None,
 ) -> Evaluation:
     """Measure predictions; an instance without an answer is a failure and stays in every number.
 
@@ -408,6 +341,7 @@ def evaluate(
         predictions: of :func:`read_any`.
         config: diameters, which objects by ADD-S, whether VSD.
         progress: wraps the sequence of instances, to show how far it is.
+        origin: whose predictions they are, for the columns of the rows.
 
     Raises:
         InputError: there is no instance, no prediction is of this data set, or a file of it is
@@ -455,10 +389,10 @@ def evaluate(
     if len(summed) > 1:
         summed += [mean_row(summed), object_row("all", rows)]
     return Evaluation(
-        rows=[replace(row, conditions=conditions) for row in summed],
-        per_instance=rows,
-        risk=[replace(row, conditions=conditions) for row in risk_rows(rows)],
-        advice=convention_advice(dataset, predictions, contexts, SUCCESS_SHARE),
+        rows=[replace(row, conditions=conditions, origin=origin) for row in summed],
+        per_instance=[replace(row, origin=origin) for row in rows],
+        risk=[replace(r, conditions=conditions, origin=origin) for r in risk_rows(rows)],
+        advice=convention_advice(dataset, predictions, contexts),
     )
 
 

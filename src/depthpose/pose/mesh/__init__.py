@@ -13,7 +13,6 @@ from depthpose.pose.mesh.models import make_model as make_model
 from depthpose.pose.mesh.models import read_model as read_model
 from depthpose.pose.mesh.models import refuse_one_name as refuse_one_name
 from depthpose.pose.mesh.models import sample_surface as sample_surface
-from depthpose.pose.mesh.models import surfel_triangles as surfel_triangles
 from depthpose.pose.mesh.models import symmetries_from_bop as symmetries_from_bop
 from depthpose.pose.mesh.models import symmetries_to_bop as symmetries_to_bop
 from depthpose.pose.mesh.models import symmetry_transforms as symmetry_transforms

@@ -23,25 +23,19 @@ from depthpose.core.files.disk import refused_as, refused_suffix
 from depthpose.core.files.points import Ragged, read_ply_elements
 from depthpose.core.units import Unit
 
-_MOST_VALUES = 2 * 10**7
-"""That the accessors of a GLB may declare: six million points."""
-_MOST_TEXT = 2**25
-"""Bytes of an OBJ or STL in text, which are read in some seconds."""
+_MOST_VALUES = 2 * 10**7  # that the accessors of a GLB may declare: six million points
+_MOST_TEXT = 2**25  # bytes of an OBJ or STL in text, which are read in some seconds
 _NO_FACES = Ragged(np.empty(0, np.int64), np.empty(0, np.int64))
 _MOST_NODES, _MOST_SCENE_BYTES = 10_000, 2**22
 _WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT2": 4, "MAT3": 9, "MAT4": 16}
 _KNOWN = ("KHR_materials", "KHR_texture", "KHR_lights", "KHR_xmp", "EXT_texture", "KHR_mesh_quant")
 """How extensions of glTF begin that change no surface, or that trimesh reads."""
-_NO_AREA = 1e-12
-"""Of the square of the extent: a face of no more is a line or a point."""
-_LEAST_AREA = 1e-6
-"""Of the square of the extent: all faces of less are no surface. A wire has 0.003."""
-_FARTHEST = 1e9
-"""A coordinate beyond belongs to no model, in whatever unit, and overflows in float32."""
+_NO_AREA = 1e-12  # of the square of the extent: a face of no more is a line or a point
+_LEAST_AREA = 1e-6  # of the squared extent: all faces of less are no surface; a wire has 0.003
+_FARTHEST = 1e9  # a coordinate beyond is no model's, in whatever unit, and overflows in float32
 
 
-FIXED_UNITS: dict[str, Unit] = {".glb": "m"}
-"""Of formats that fix theirs."""
+FIXED_UNITS: dict[str, Unit] = {".glb": "m"}  #: of formats that fix theirs
 
 
 def unit_of(path: AnyPath, unit: Unit | None) -> Unit:
@@ -288,12 +282,9 @@ MESH_READERS: dict[str, Callable[[AnyPath], tuple[np.ndarray, np.ndarray | Ragge
 """Suffix to reader of points (n, 3; float64) in the file's unit, and faces (f, corners; int64)."""
 
 
-_MOST_CORNERS = 5_000
-"""Of one polygon: clipping takes time by the square of them, here a second."""
-_FLAT = 1e-9
-"""Of the square of a polygon's area: a corner that turns back by less is straight."""
-_OVERLAP = 1e-3
-"""Of all area: polygons that cross themselves may lay so much of it twice."""
+_MOST_CORNERS = 5_000  # of one polygon: clipping takes time by the square of them, here a second
+_FLAT = 1e-9  # of the square of a polygon's area: a corner that turns back by less is straight
+_OVERLAP = 1e-3  # of all area: polygons that cross themselves may lay so much of it twice
 
 
 def cut_polygons(

@@ -16,7 +16,7 @@ from torch import Tensor
 from depthpose.core.arrays import take_evenly
 from depthpose.core.errors import InputError
 from depthpose.core.files import AnyPath
-from depthpose.core.rigid import Rigid
+from depthpose.core.rigid import Rigid, rotation_by
 from depthpose.core.units import Unit, metres_of
 from depthpose.pose.config import MeshConfig
 from depthpose.pose.mesh.files import read_geometry, unit_of
@@ -29,12 +29,8 @@ BOP_STEP = 0.01
 def turn_about(
     direction: Float[Tensor, "3"], point_m: Float[Tensor, "3"], angle_rad: Float[Tensor, "*batch"]
 ) -> Rigid:
-    """Turn about the line through ``point_m``, by the right-hand rule (Rodrigues)."""
-    x, y, z = (direction / direction.norm()).unbind()
-    zero = torch.zeros_like(x)
-    K = torch.stack([zero, -z, y, z, zero, -x, -y, x, zero]).reshape(3, 3)
-    angle = angle_rad[..., None, None].to(K)
-    R = torch.eye(3).to(K) + angle.sin() * K + (1 - angle.cos()) * (K @ K)
+    """Turn about the line through ``point_m``, by the right-hand rule."""
+    R = rotation_by(angle_rad[..., None].to(direction) * direction / direction.norm())
     return Rigid(R, point_m - (R @ point_m[..., None]).squeeze(-1))
 
 
@@ -200,24 +196,21 @@ def sample_surface(
     return points.to(model.vertices_m), normals.to(model.vertices_m)
 
 
-_CORNERS = 6
-"""Of a disc: three quarters of its area, in four triangles."""
+_CORNERS = 6  # of a disc: three quarters of its area, in four triangles
 _DISC = 1.6
 """Radius of a disc, in spacings of its points: neighbours then overlap, and nothing shows through
 where the points are twice as far apart as usual."""
 
 
 def drawn_triangles(model: ObjectModel) -> Float[Tensor, "n 3 3"]:
-    """Give the faces of a model, or a disc at each point of one that has no faces."""
-    return model.triangles_m if len(model.faces) else surfel_triangles(model)
+    """Give the faces of a model, or a disc at each point of one that has no faces.
 
-
-def surfel_triangles(model: ObjectModel) -> Float[Tensor, "n 3 3"]:
-    """Lay a flat six-cornered disc on each point, across its normal (Pfister et al. 2000).
-
-    Each is as large as its own neighbourhood is sparse: the distance to the third nearest point,
-    but no more than twice the usual one, so that a stray point makes no plate.
+    A disc is flat and six-cornered, across its normal (Pfister et al. 2000), and as large as its
+    own neighbourhood is sparse: the distance to the third nearest point, but no more than twice the
+    usual one, so that a stray point makes no plate.
     """
+    if len(model.faces):
+        return model.triangles_m
     points = model.vertices_m.double()
     distance, _ = KDTree(points.numpy()).query(points.numpy(), k=min(4, len(points)))
     spacing = torch.from_numpy(distance[:, -1])
@@ -271,16 +264,11 @@ def fibonacci_directions(count: int) -> Float[Tensor, "count 3"]:
 
 
 _SIDE_DIRECTIONS = 32
-CELL = 2.0
-"""Side of a ray's cell in mean distances of samples: four samples in each on average."""
-_SAME = 0.5
-"""Up to so many mean distances from another's plane a sample is of the same sheet."""
-_SLANT = 0.3
-"""Least cosine at which a sample is looked at."""
-_SEEN = 0.1
-"""Least share of directions from which an outer side is seen."""
-_CLEARER = 0.4
-"""The inner side is seen in at most so many times the directions of the outer."""
+CELL = 2.0  #: side of a ray's cell in mean distances of samples: four samples in each on average
+_SAME = 0.5  # up to so many mean distances from another's plane a sample is of the same sheet
+_SLANT = 0.3  # least cosine at which a sample is looked at
+_SEEN = 0.1  # least share of directions from which an outer side is seen
+_CLEARER = 0.4  # the inner side is seen in at most so many times the directions of the outer
 
 
 def outward_normals(points: np.ndarray, normals: np.ndarray, cell: float) -> np.ndarray:
@@ -331,12 +319,9 @@ def across_walls(points: np.ndarray, outward: np.ndarray, limit: float) -> np.nd
 
 _PER_METRE = {"mm": 1000.0, "cm": 100.0, "inches": 39.37}
 _MM = {"cm": 10.0, "inches": 25.4}
-_LARGEST_SHARE = 1.5
-"""A cloud is part of its object; noise and a grown mask may make it somewhat larger."""
-_SMALLEST_SHARE = 0.1
-"""What is occluded to less than a tenth of the diameter cannot be posed anyway."""
-_LIKELY_SHARE = 0.3
-"""A cloud that is too large is taken for one of another unit if that makes it as long as this."""
+_LARGEST_SHARE = 1.5  # a cloud is part of its object; noise and grown masks make it somewhat larger
+_SMALLEST_SHARE = 0.1  # what shows less than a tenth of the diameter cannot be posed anyway
+_LIKELY_SHARE = 0.3  # a cloud too large is of another unit if that makes it as long as this
 _USUAL_SHARE, _AS_LIKELY = 0.7, 0.3
 """What is seen of an object is about so long; of units that give it within 35 % all are named."""
 
@@ -384,8 +369,7 @@ def unit_advice(model_diameter_m: float, points_m: Float[Tensor, "n 3"]) -> str 
     )
 
 
-_COARSE_MESH = 1000
-"""A mesh of fewer points (a CAD box has eight) also takes keypoints from inside its faces."""
+_COARSE_MESH = 1000  # a mesh of fewer points (a box: eight) also takes keypoints inside its faces
 _LARGEST_M, _SMALLEST_M = 20.0, 0.002
 
 
@@ -499,10 +483,8 @@ def refuse_one_name(models: Sequence[ObjectModel]) -> None:
         )
 
 
-_HULL = 8000
-"""Corners of a hull of which all pairs are compared; more take seconds."""
-_HULL_DIRECTIONS = 4096
-"""No direction is farther than 0.03 rad from one of these, whose cosine is 0.9995."""
+_HULL = 8000  # corners of a hull of which all pairs are compared; more take seconds
+_HULL_DIRECTIONS = 4096  # no direction is farther than 0.03 rad from one of these: cosine 0.9995
 
 
 def exact_diameter(points_m: Float[Tensor, "n 3"]) -> float:

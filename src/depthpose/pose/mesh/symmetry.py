@@ -30,8 +30,7 @@ from depthpose.pose.types import Axis, ObjectModel, Symmetries
 
 ValueT = TypeVar("ValueT")
 
-_MOST_IN_MEMORY = 128
-"""Values in memory."""
+_MOST_IN_MEMORY = 128  # values in memory
 _memory: OrderedDict[str, Any] = OrderedDict()
 
 
@@ -85,30 +84,21 @@ _COARSE = 0.04
 that is off by 4 degrees moves the surface by about as much."""
 _SAME_RAD = 0.15
 _SUPPRESSION_RAD = 0.25
-SURE = 0.5
-"""Certainty from which a proposal is taken: that of a copy that is off by the tolerance."""
-_MOST_AXES = 40
-"""A cube has 13 axes, an icosahedron 31."""
+SURE = 0.5  #: certainty from which a proposal is taken: that of a copy that is off by the tolerance
+_MOST_AXES = 40  # a cube has 13 axes, an icosahedron 31
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class SymmetryProposal:
-    """One way in which an object may look alike.
+    """One way in which an object may look alike."""
 
-    Attributes:
-        kind: ``discrete`` or ``continuous``.
-        axis: what to turn about.
-        angle_rad: by how much; nothing for a continuous symmetry.
-        deviation: distance of the turned surface from the surface, in diameters: the largest but
-            for 2 % of the points, and for ``continuous`` over all turns.
-        certainty: 1 for an exact copy, 1/2 at the tolerance, toward 0 beyond.
-    """
-
-    kind: str
-    axis: Axis
-    angle_rad: float | None
+    kind: str  #: ``discrete`` or ``continuous``
+    axis: Axis  #: what to turn about
+    angle_rad: float | None  #: by how much; nothing for a continuous symmetry
+    #: distance of the turned surface from the surface, in diameters: the largest but for 2 % of the
+    #: points, and for ``continuous`` over all turns.
     deviation: float
-    certainty: float
+    certainty: float  #: 1 for an exact copy, 1/2 at the tolerance, toward 0 beyond
 
 
 class SurfaceDeviation:
@@ -351,8 +341,7 @@ _MIRROR_PLANES = 400
 _MIRROR_STARTS = 8
 _APART_RAD = math.radians(25)
 _STEPS = 20
-_NEAREST = 0.9
-"""Points that count in each step of ICP."""
+_NEAREST = 0.9  # points that count in each step of ICP
 _FLIP = torch.diag(torch.tensor([-1.0, 1.0, 1.0], dtype=torch.float64))
 
 
@@ -414,27 +403,20 @@ _TOLERANCE = 0.05
 """Deviation in diameters at which a sensor's noise begins to mask the difference of two poses: real
 points of LineMOD and YCB lie 1.4 to 2.6 % of the diameter off the posed surface. Twice as much is
 tried."""
-_NEAR_SUPPRESSION_RAD = math.radians(35)
-"""Turns nearer to each other are one: ICP goes from one to the other."""
-_STEP = math.pi / 8
-"""An axis that nearly is one of revolution counts as eight turns."""
+_NEAR_SUPPRESSION_RAD = math.radians(35)  # turns nearer to each other are one to ICP
+_STEP = math.pi / 8  # an axis that nearly is one of revolution counts as eight turns
 _FINE_STEP = math.pi / 36
 _MOST_NEAR = 24
-_NEAR_STARTS = 24
-"""Turns that ICP refines."""
+_NEAR_STARTS = 24  # turns that ICP refines
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class NearSymmetry:
-    """A turn after which the object looks nearly as before.
+    """A turn after which the object looks nearly as before."""
 
-    Attributes:
-        model_from_model: the turn.
-        deviation: distance of the turned surface from the surface, in diameters: the largest but
-            for 2 % of the points.
-    """
-
-    model_from_model: Rigid
+    model_from_model: Rigid  #: the turn
+    #: distance of the turned surface from the surface, in diameters: the largest but for 2 % of the
+    #: points.
     deviation: float
 
 

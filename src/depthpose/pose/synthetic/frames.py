@@ -50,14 +50,6 @@ class Solid:
     number: int | None
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class Placed:
-    """A solid in the camera's frame."""
-
-    solid: Solid
-    camera_from_model: Rigid
-
-
 def random_pattern(
     generator: torch.Generator, size_m: float, colourful: tuple[float, float] = (0.0, 0.8)
 ) -> Pattern:
@@ -109,21 +101,18 @@ def table_of(side_m: float, generator: torch.Generator) -> Solid:
     )
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class Light:
-    """A lamp far away, toward a unit vector of the camera's frame, and light from everywhere."""
-
-    towards: Float[Tensor, "3"]
-    lamp: Float[Tensor, "3"]
-    ambient: Float[Tensor, "3"]
-
-
 def shade(
-    placed: Sequence[Placed], raster: Raster, K: Float[Tensor, "3 3"], light: Light
+    placed: Sequence[tuple[Solid, Rigid]],
+    raster: Raster,
+    K: Float[Tensor, "3 3"],
+    towards: Float[Tensor, "3"],
+    lamp: Float[Tensor, "3"],
+    ambient: Float[Tensor, "3"],
 ) -> Float[Tensor, "n 3"]:
     """Colour of each pixel that sees something, in the order of the image's rows.
 
-    Lambert's law and a mirrored lamp (Blinn 1977); no shadow is cast.
+    By Lambert's law and a mirrored lamp (Blinn 1977); no shadow is cast. The lamp is far away,
+    ``towards`` a unit vector of the camera's frame; ambient light comes from everywhere.
     """
     assert raster.barycentric is not None
     is_seen = raster.primitive >= 0
@@ -131,22 +120,22 @@ def shade(
     primitive = raster.primitive[is_seen]
     colour = torch.zeros_like(points)
     start = 0
-    for thing in placed:
-        stop = start + len(thing.solid.triangles_m)
+    for solid, pose in placed:
+        stop = start + len(solid.triangles_m)
         own = ((primitive >= start) & (primitive < stop)).nonzero()[:, 0]
-        corners = thing.solid.normals[primitive[own] - start]
-        normal = (corners * share[own, :, None]).sum(1) @ thing.camera_from_model.R.mT
-        local = thing.camera_from_model.inverse().apply(points[own])
+        corners = solid.normals[primitive[own] - start]
+        normal = (corners * share[own, :, None]).sum(1) @ pose.R.mT
+        local = pose.inverse().apply(points[own])
         normal, sight = F.normalize(normal, dim=-1), F.normalize(-points[own], dim=-1)
         # Both sides of a thin part are seen.
         normal = normal * torch.where((normal * sight).sum(-1, keepdim=True) < 0, -1.0, 1.0)
-        facing = (normal @ light.towards).clamp(min=0)[:, None]
-        half = F.normalize(sight + light.towards, dim=-1)
+        facing = (normal @ towards).clamp(min=0)[:, None]
+        half = F.normalize(sight + towards, dim=-1)
         shine = (normal * half).sum(-1, keepdim=True).clamp(min=0) ** (1 / math.radians(2))
         # From below comes half of what comes from above.
-        open_sky = 0.75 + 0.25 * (normal @ light.towards)[:, None]
-        pattern, base = thing.solid.pattern, light.ambient * open_sky + light.lamp * facing
-        colour[own] = pattern.at(local) * base + pattern.gloss * shine * light.lamp
+        open_sky = 0.75 + 0.25 * (normal @ towards)[:, None]
+        base = ambient * open_sky + lamp * facing
+        colour[own] = solid.pattern.at(local) * base + solid.pattern.gloss * shine * lamp
         start = stop
     return colour
 
@@ -207,12 +196,14 @@ def _make_frame(
         world = _piled(models, solids, config, generator)
     else:
         world = _arranged(solids, config, generator)
+    table = table_of(uniform(generator, 0.8, 3.0), generator)
+    world.append((table, Rigid(torch.eye(3), torch.zeros(3))))
     view = _viewpoint(config, generator)
-    placed = [Placed(solid=solid, camera_from_model=view @ pose) for solid, pose in world]
+    placed = [(solid, view @ pose) for solid, pose in world]
     (fx, fy), (cx, cy) = config.focal_px, config.principal_point_px
     K = torch.tensor([[fx, 0, cx], [0, fy, cy], [0, 0, 1]], dtype=torch.float64)
     width, height = config.image_px
-    corners = [thing.camera_from_model.apply(thing.solid.triangles_m) for thing in placed]
+    corners = [pose.apply(solid.triangles_m) for solid, pose in placed]
     raster = rasterize(torch.cat(corners), K, width, height)
     owner = torch.cat([torch.full((len(c),), i) for i, c in enumerate(corners)])
     seen = torch.where(raster.primitive >= 0, owner[raster.primitive.clamp(min=0)], -1)
@@ -224,27 +215,27 @@ def _make_frame(
         image = image + uniform(generator, 0.0, 0.25) * smooth[0]
     image = image.clamp(0, 1)
     # A lamp above the table, warm or cold, strong or weak.
-    up = placed[-1].camera_from_model.R[:, 2]
+    up = view.R[:, 2]
     towards = F.normalize(1.2 * up + 0.8 * torch.randn(3, generator=generator), dim=0)
     strength, warmth = uniform(generator, 0.3, 0.9), uniform(generator, -0.15, 0.15)
     colour = torch.tensor([1 + warmth, 1.0, 1 - warmth])
     ambient = uniform(generator, 0.2, 0.6) * (2 - colour)
-    light = Light(towards=towards, lamp=strength * colour, ambient=ambient)
-    image[:, raster.primitive >= 0] = shade(placed, raster, K, light).mT
+    lit = shade(placed, raster, K, towards, strength * colour, ambient)
+    image[:, raster.primitive >= 0] = lit.mT
     rgb = _exposed(image, generator)
     focal_px = (config.focal_px[0], config.focal_px[0])
     depth_m = measure(raster.depth_m, focal_px, config.sensor, generator)
     shown: list[BopObject] = []
-    for i, thing in enumerate(placed):
-        if thing.solid.number is None:
+    for i, (solid, pose) in enumerate(placed):
+        if solid.number is None:
             continue
         alone = rasterize(corners[i], K, width, height, with_barycentric=False)
         silhouette = alone.depth_m.isfinite()
         if bool(silhouette.any()):
             shown.append(
                 BopObject(
-                    number=thing.solid.number,
-                    camera_from_model=thing.camera_from_model,
+                    number=solid.number,
+                    camera_from_model=pose,
                     visible=seen == i,
                     silhouette=silhouette,
                 )
@@ -261,7 +252,6 @@ def _arranged(
     chosen = [solids[i] for i in order[: low + whole(generator, high - low + 1)].tolist()]
     low, high = config.frame_clutter
     chosen += [random_clutter(generator) for _ in range(low + whole(generator, high - low + 1))]
-    floor = Rigid(torch.eye(3), torch.zeros(3))
     placed: list[tuple[Solid, Rigid]] = []
     circles: list[tuple[float, float, float]] = []
     for solid in chosen:
@@ -278,7 +268,7 @@ def _arranged(
                 placed.append((solid, Rigid(R, shift)))
                 circles.append((x, y, radius_m))
                 break
-    return [*placed, (table_of(uniform(generator, 0.8, 3.0), generator), floor)]
+    return placed
 
 
 _CELL_M = 0.004
@@ -317,8 +307,7 @@ def _piled(
         _, pose, cell, top = min(drops, key=lambda drop: drop[0])
         height_m = height_m.scatter_reduce(0, cell, top, "amax")
         placed.append((solids[which], pose))
-    floor = Rigid(torch.eye(3), torch.zeros(3))
-    return [*placed, (table_of(uniform(generator, 0.8, 3.0), generator), floor)]
+    return placed
 
 
 def _viewpoint(config: ObjectsConfig, generator: torch.Generator) -> Rigid:

@@ -16,11 +16,9 @@ from depthpose.pose.config import MeshConfig
 from depthpose.pose.mesh import make_model, turn_about
 from depthpose.pose.types import Axis, ObjectModel, Symmetries
 
-Mesh = tuple[np.ndarray, np.ndarray]
-"""Corners (n, 3) [mm] and faces (m, 3), counter-clockwise seen from outside."""
+Mesh = tuple[np.ndarray, np.ndarray]  #: corners (n, 3) [mm]; outward faces (m, 3)
 
-_ROUND = 96
-"""Corners of a circle."""
+_ROUND = 96  # corners of a circle
 _TEETH = 6
 
 

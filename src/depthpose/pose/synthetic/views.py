@@ -29,13 +29,7 @@ from depthpose.core.rigid import Rigid, turn_axis_to
 from depthpose.pose.cloud import grow_mask, lift_sample
 from depthpose.pose.config import CloudConfig, ObjectsConfig, SensorConfig, SensorKind
 from depthpose.pose.mesh import drawn_triangles
-from depthpose.pose.types import (
-    CloudSample,
-    ObjectModel,
-    PoseTruth,
-    ViewInput,
-    ViewSample,
-)
+from depthpose.pose.types import CloudSample, ObjectModel, PoseTruth, ViewInput, ViewSample
 
 Depth = Float[Tensor, "h w"]
 Mask = Bool[Tensor, "h w"]
@@ -45,8 +39,7 @@ _STEPS_A_PIXEL = 8
 _STEREO_BASELINE_M = 0.05
 _STEREO_STEPS_A_PIXEL = 32
 _STEREO_CORRELATION_PX = (3.0, 6.0)
-_STEREO_WINDOW = 2
-"""Pixels by which active stereo displaces an edge at most."""
+_STEREO_WINDOW = 2  # pixels by which active stereo displaces an edge at most
 _STEEPEST = math.tan(math.radians(80))
 """No sensor reads a surface that is turned farther away than 80 degrees."""
 _JUMP = 0.02
@@ -248,8 +241,7 @@ def _displaced(depth_m: Depth, scale: float, generator: torch.Generator) -> Dept
     return depth_m[rows, columns]
 
 
-MARGIN_PX = 8
-"""Around the object: what lies behind it must be seen where a mask is too large."""
+MARGIN_PX = 8  #: around the object: what lies behind it must be seen where a mask is too large
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -263,19 +255,12 @@ class Shape:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class CleanView:
-    """An object alone, without any error, in a window of the image.
+    """An object alone, without any error, in a window of the image."""
 
-    Attributes:
-        depth_m: less ``distance_m``; NaN beside the object.
-        K: intrinsic matrix of the window.
-        camera_from_model: the pose.
-        distance_m: taken off the depths of stored views, whose float16 is then exact to 0.1 mm.
-    """
-
-    depth_m: Float[Tensor, "h w"]
-    K: Float[Tensor, "3 3"]
-    camera_from_model: Rigid
-    distance_m: float = 0.0
+    depth_m: Float[Tensor, "h w"]  #: less ``distance_m``; NaN beside the object
+    K: Float[Tensor, "3 3"]  #: intrinsic matrix of the window
+    camera_from_model: Rigid  #: the pose
+    distance_m: float = 0.0  #: taken off depths of stored views: float16 is then exact to 0.1 mm
 
 
 def make_shape(model: ObjectModel) -> Shape:
@@ -361,8 +346,7 @@ def turn_view(
 
 
 _BANK_SEED = 0x0B7EC7
-_TILT_RAD = math.radians(75)
-"""A table is seen from no flatter an angle."""
+_TILT_RAD = math.radians(75)  # a table is seen from no flatter an angle
 
 
 class Objects:
@@ -400,7 +384,6 @@ class Objects:
         self._views: dict[tuple[int, int], CleanView] = {}
 
     def __len__(self) -> int:
-        """How many samples there are."""
         return self.config.number
 
     def __getitem__(self, index: int) -> CloudSample:

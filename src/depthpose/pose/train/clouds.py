@@ -25,22 +25,14 @@ from depthpose.pose.mesh import (
     symmetry_transforms,
     with_found_symmetries,
 )
-from depthpose.pose.metrics import add_of_nearest_m, is_within_diameter
+from depthpose.pose.metrics import SUCCESS_SHARE, add_of_nearest_m
 from depthpose.pose.synthetic import Objects, make_part
 from depthpose.pose.train.config import FramesConfig, HeldOutConfig, ModelsConfig
-from depthpose.pose.types import (
-    CloudSample,
-    ObjectModel,
-    PoseEstimate,
-    PoseTruth,
-    SeenPoints,
-    Vote,
-)
+from depthpose.pose.types import CloudSample, ObjectModel, PoseEstimate, PoseTruth, SeenPoints, Vote
 from depthpose.pose.voting import fit_pose, meet_lines, vote_ransac
 from depthpose.pose.weights import DirectionNet, PoseWeights
 
-TRIES = 20
-"""Samples in a row that may show too little."""
+TRIES = 20  #: samples in a row that may show too little
 
 
 class Cloud(NamedTuple):
@@ -55,23 +47,14 @@ class Cloud(NamedTuple):
 
 
 class CloudBatch(NamedTuple):
-    """Several clouds, one after the other.
+    """Several clouds, one after the other."""
 
-    Attributes:
-        points_m: of all clouds, each in the axes of its grid about its camera.
-        coordinates: (cloud, x, y, z) of each point's voxel.
-        features: of each voxel.
-        class_of: class of each cloud.
-        R: rotation of each cloud's pose.
-        t_m: translation.
-    """
-
-    points_m: Float[Tensor, "points 3"]
-    coordinates: Int[Tensor, "points 4"]
-    features: Float[Tensor, "points c"]
-    class_of: Int[Tensor, " clouds"]
-    R: Float[Tensor, "clouds 3 3"]
-    t_m: Float[Tensor, "clouds 3"]
+    points_m: Float[Tensor, "points 3"]  #: each cloud in the axes of its grid about its camera
+    coordinates: Int[Tensor, "points 4"]  #: (cloud, x, y, z) of each point's voxel
+    features: Float[Tensor, "points c"]  #: of each voxel
+    class_of: Int[Tensor, " clouds"]  #: class of each cloud
+    R: Float[Tensor, "clouds 3 3"]  #: rotation of each cloud's pose
+    t_m: Float[Tensor, "clouds 3"]  #: translation
 
     @property
     def instance(self) -> Int[Tensor, " points"]:
@@ -122,7 +105,6 @@ class TrainingViews:
                     )
 
     def __len__(self) -> int:
-        """Samples of an epoch: each frame once, or as many as there are synthetic views."""
         if self._frames is None or self._real is None:
             return len(self.synthetic)
         return max(1, round(len(self._real) / self._frames.share))
@@ -259,8 +241,7 @@ def read_models(
     )
 
 
-HELD_OUT_SEED = 0x4E1D
-"""Added to the seed of the views that are trained on."""
+HELD_OUT_SEED = 0x4E1D  #: added to the seed of the views that are trained on
 _TOGETHER = 8
 _SURFACE = 1000
 
@@ -335,7 +316,7 @@ def held_out_numbers(
     """Name the share of right ones among errors in diameters, and their median."""
     place = f"held_out/occluded_{round(100 * occlusion)}/{method}"
     return {
-        f"{place}_add_10": float(is_within_diameter(errors).float().mean()),
+        f"{place}_add_10": float((errors < SUCCESS_SHARE).float().mean()),
         f"{place}_median": float(errors.median()),
     }
 
@@ -391,7 +372,7 @@ def score_held_out(weights: PoseWeights, synthetic: ObjectsConfig, config: HeldO
         estimates, errors = _posed(weights, objects)
         answered = [e for e, estimate in zip(errors, estimates, strict=True) if estimate.is_ok]
         posed = sorted(e for e in errors if e < math.inf)
-        right = int(is_within_diameter(torch.tensor(answered)).sum())
+        right = sum(e < SUCCESS_SHARE for e in answered)
         table[f"{round(100 * occlusion)}"] = {
             "right": right / len(errors),
             "ambiguous": (len(posed) - len(answered)) / len(errors),

@@ -1,7 +1,6 @@
 """Training of segmentation: annotated images, random changes of them, and the task."""
 
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -11,7 +10,7 @@ from jaxtyping import Float, Int, UInt8
 from torch import Tensor, nn
 
 from depthpose.core.arrays import grey_of
-from depthpose.core.checkpoint import Checkpoint, find_weights, load_weights
+from depthpose.core.checkpoint import Checkpoint, find_weights, load_weights, read_checkpoint
 from depthpose.core.errors import InputError
 from depthpose.core.files import read_image
 from depthpose.core.loop import (
@@ -31,6 +30,7 @@ from depthpose.pose.datasets.dataset import read_instance_mask
 from depthpose.pose.datasets.layouts import models_folder, object_name, read_models_info
 from depthpose.pose.losses import mask_loss
 from depthpose.pose.segmentation import (
+    ENCODER_KIND,
     FCN,
     KIND,
     Overlap,
@@ -38,7 +38,6 @@ from depthpose.pose.segmentation import (
     SegmentationWeights,
     class_probabilities,
     normalise_colors,
-    read_encoder_state,
     write_segmentation,
 )
 from depthpose.pose.synthetic.views import uniform, whole
@@ -47,29 +46,16 @@ from depthpose.pose.train.poses import claim_run, with_origin
 
 
 class LabelledImage(NamedTuple):
-    """An image with the class of each pixel, or a batch of them.
+    """An image with the class of each pixel, or a batch of them."""
 
-    Attributes:
-        image: RGB in [0, 1].
-        labels: 0 is the background, ``1 + i`` object i.
-    """
-
-    image: Float[Tensor, "*b 3 h w"]
-    labels: Int[Tensor, "*b h w"]
-
-
-@dataclass(frozen=True, kw_only=True)
-class KnownObjects:
-    """The objects that a data set shows, in the order of the classes."""
-
-    names: tuple[str, ...]
-    numbers: tuple[int, ...]
+    image: Float[Tensor, "*b 3 h w"]  #: RGB in [0, 1]
+    labels: Int[Tensor, "*b h w"]  #: 0 is the background, ``1 + i`` object i
 
 
 class AnnotatedImages:
     """Images of a data set with their labels."""
 
-    def __init__(self, config: ImagesConfig, objects: KnownObjects | None = None) -> None:
+    def __init__(self, config: ImagesConfig, objects: Mapping[int, str] | None = None) -> None:
         if not config.folder:
             raise InputError("there is no image to learn from; name a folder in BOP's layout")
         dataset = open_bop(config.folder, config.split)
@@ -88,10 +74,9 @@ class AnnotatedImages:
                     f"{there}"
                 )
             infos = read_models_info(models_folder(Path(config.folder)))
-            names = tuple(object_name(number, infos.get(number, {})) for number in wanted)
-            objects = KnownObjects(names=names, numbers=tuple(wanted))
-        self.objects = objects
-        self._class_of = {number: k for k, number in enumerate(self.objects.numbers, 1)}
+            objects = {number: object_name(number, infos.get(number, {})) for number in wanted}
+        self.objects = objects  # names by number, in the order of the classes
+        self._class_of = {number: k for k, number in enumerate(objects, 1)}
         every = list(images.values())
         count = len(every) if config.limit is None else min(config.limit, len(every))
         self._images = [every[k * len(every) // count] for k in range(count)]
@@ -99,7 +84,6 @@ class AnnotatedImages:
         self._with_cache = config.with_cache
 
     def __len__(self) -> int:
-        """How many images."""
         return len(self._images)
 
     def __getitem__(self, index: int) -> LabelledImage:
@@ -145,7 +129,6 @@ class TrainingImages:
         self._long_side_px = network.long_side_px
 
     def __len__(self) -> int:
-        """Images of an epoch."""
         return len(self.images)
 
     def __getitem__(self, index: int) -> LabelledImage:
@@ -208,7 +191,9 @@ def jitter_colors(
 class SegmentationTask:
     """Cross entropy of each pixel, objects weighing more."""
 
-    def __init__(self, network: FCN, config: SegmentationTraining, objects: KnownObjects) -> None:
+    def __init__(
+        self, network: FCN, config: SegmentationTraining, objects: Mapping[int, str]
+    ) -> None:
         self.config, self.objects = config, objects
         self.network = network.train()
         self.modules: dict[str, nn.Module] = {"network": network}
@@ -250,7 +235,7 @@ class SegmentationTask:
         iou = overlap.iou()
         numbers = {
             f"held_out/iou_{name}": float(value)
-            for name, value in zip(("background", *self.objects.names), iou, strict=True)
+            for name, value in zip(("background", *self.objects.values()), iou, strict=True)
             if bool(value.isfinite())
         }
         numbers["held_out/iou_objects"] = float(iou[1:].nanmean())
@@ -262,10 +247,10 @@ def train_segmentation(config: SegmentationTraining, run: Run) -> Path:
     """Train FCN; give its weights file."""
     torch.manual_seed(config.loop.seed)
     images = AnnotatedImages(config.images)
-    network = FCN(len(images.objects.names), config.network)
+    network = FCN(len(images.objects), config.network)
     if config.start is not None:
         path = find_weights(config.start)
-        held = Checkpoint(kind=KIND, config={}, state=read_encoder_state(path))
+        held = Checkpoint(kind=KIND, config={}, state=read_checkpoint(path, ENCODER_KIND).state)
         load_weights(network.encoder, held, str(path))
     claim_run(config, run)
     task = SegmentationTask(network, config, images.objects)
@@ -278,8 +263,8 @@ def train_segmentation(config: SegmentationTraining, run: Run) -> Path:
     facts = {"trained_on": Path(config.images.folder).name, "licence": licence}
     weights = SegmentationWeights(
         network=network.cpu().eval(),
-        objects=images.objects.names,
-        numbers=images.objects.numbers,
+        objects=tuple(images.objects.values()),
+        numbers=tuple(images.objects),
         facts=with_origin(facts, config),
     )
     write_segmentation(path, weights, with_half=config.with_half)

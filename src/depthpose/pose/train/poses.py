@@ -65,8 +65,7 @@ from depthpose.pose.weights import (
     write_pose_weights,
 )
 
-_SYMMETRY_STEP = 0.05
-"""Turns about a continuous axis are tried every 5.7 degrees; the vote's own error is larger."""
+_SYMMETRY_STEP = 0.05  # about an axis of revolution, [rad]; the vote's own error is larger
 
 
 class PoseTask:
@@ -126,8 +125,7 @@ def symmetric_copies(models: Sequence[ObjectModel], step_rad: float) -> Rigid:
     return Rigid(R, t_m)
 
 
-_TURNS_ON_CARD = 3
-"""Turns of an object that look nearly alike, on a card."""
+_TURNS_ON_CARD = 3  # turns of an object that look nearly alike, on a card
 
 
 def claim_run(config: Any, run: Run, files: Sequence[str] = ()) -> None:  # noqa: ANN401
@@ -271,8 +269,7 @@ def surface_points(models: Sequence[ObjectModel], count: int) -> Float[Tensor, "
     return torch.stack([points[torch.arange(count) % len(points)] for points in every])
 
 
-_STATISTICS_CLOUDS = 64
-"""Clouds from which batch norm statistics, lost by folding, are computed again."""
+_STATISTICS_CLOUDS = 64  # from which statistics of batch norm, lost by folding, are computed anew
 
 
 @releases_folder

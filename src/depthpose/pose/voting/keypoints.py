@@ -9,7 +9,6 @@ from torch import Tensor
 
 from depthpose.core.errors import InputError
 from depthpose.core.rigid import Rigid, cross_matrix, fit_rigid, perturb
-from depthpose.pose.compiled import serves
 from depthpose.pose.config import VotingConfig
 from depthpose.pose.types import Axis, PoseFit, Symmetries, Vote
 
@@ -85,12 +84,6 @@ def meet_prepared(lines: Lines, centre_m: Float[Tensor, "*batch 1 3"], refinemen
     """Do as :func:`meet_lines` does, for what :func:`prepare_lines` gave."""
     local, n, w = lines
     all_count = torch.ones_like(w[..., 0])
-    if n.ndim == 3 and n.dtype == torch.float64 and serves(*lines):
-        from depthpose.pose.compiled.poses import met
-
-        p, covariance, condition = met(local, n, w, refinements, _NEAREST)
-        return Vote(keypoints_m=p + centre_m, covariance_m2=covariance, condition=condition,
-                    inlier_share=all_count)  # fmt: skip
     along, total = (n * local).sum(-2, keepdim=True), w.sum(-1).double()[..., None, None]
     wn, eye = n * w[..., None, :], torch.eye(3, dtype=torch.float64, device=n.device)
     # Over the sum of weights, the damping is a pure number.
@@ -293,8 +286,7 @@ def _inliers(
     return torch.where(is_enough, kept, w), share
 
 
-_STEPS = 4
-"""Gauss-Newton from Kabsch converges quadratically; the fourth step is below float64's noise."""
+_STEPS = 4  # Gauss-Newton from Kabsch: the fourth step is below float64's noise
 
 
 def fit_pose(
@@ -330,25 +322,16 @@ def fit_pose(
     # One keypoint that looks exact must not decide alone; a rotation takes three.
     most = 100 * trace.median(-1, keepdim=True).values.clamp(min=1e-300)
     pose = fit_rigid(model, found, trace.clamp(max=most))
-    if serves(pose.R, model, found, information):
-        from depthpose.pose.compiled.poses import fitted
-
-        pose, H = fitted(pose, model, found, information, _STEPS)
-    else:
-        for _ in range(_STEPS):
-            H, step = _normal_equations(pose, model, found, information)
-            pose = perturb(pose, torch.linalg.solve(H, step))
-        H, _ = _normal_equations(pose, model, found, information)
+    for _ in range(_STEPS):
+        H, step = _normal_equations(pose, model, found, information)
+        pose = perturb(pose, torch.linalg.solve(H, step))
+    H, _ = _normal_equations(pose, model, found, information)
     error_m = pose.apply(model) - found
-    count = used.sum(-1)
-    misfit = (error_m[..., None, :] @ information @ error_m[..., None]).sum((-1, -2, -3))
-    square = (error_m.square().sum(-1) * used).sum(-1) / count
+    square = (error_m.square().sum(-1) * used).sum(-1) / used.sum(-1)
     return PoseFit(
         camera_from_model=Rigid(pose.R.to(keypoints_m), pose.t_m.to(keypoints_m)),
         covariance=torch.linalg.inv(H).to(keypoints_m),
         residual_m=square.sqrt().to(keypoints_m),
-        misfit=(misfit / (3 * count - 6).clamp(min=1)).to(keypoints_m),
-        is_used=used,
     )
 
 
