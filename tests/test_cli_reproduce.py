@@ -47,9 +47,9 @@ class FlatMono:
 
 @pytest.fixture(scope="module")
 def street(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Four pairs of the synthetic street with depth, 621 x 188."""
+    """Four pairs of the synthetic street with depth, 497 x 150."""
     folder = tmp_path_factory.mktemp("street")
-    sample = make_street(0.5)
+    sample = make_street(0.4)
     assert sample.input.right is not None
     assert sample.input.camera is not None
     assert sample.truth.depth_m is not None
@@ -275,7 +275,7 @@ def test_figures_are_drawn_and_explained(
     assert write_figure("2-5", data, [0, 2], method, tmp_path / "five") == 0
     assert "predicted depth; predicted right image; LiDAR" in capsys.readouterr().out
     picture = read_image(tmp_path / "five/figure-2-5.png")
-    assert picture.shape == (3, 5 * 188 + 5 * 8 + 18, 2 * 621 + 8)
+    assert picture.shape == (3, 5 * 150 + 5 * 8 + 18, 2 * 497 + 8)
     assert write_figure("2-1", data, [1], method, tmp_path / "one") == 0
     page = (tmp_path / "one/report.html").read_text()
     assert page.count("<figure>") == 6
@@ -317,7 +317,7 @@ def test_an_unknown_frame_has_no_figure(
 def test_near_duplicates_are_listed(
     street: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    write_image(tmp_path / "other/left/x.png", torch.rand(3, 188, 621))
+    write_image(tmp_path / "other/left/x.png", torch.rand(3, 150, 497))
     assert main(["data", "duplicates", str(street), str(tmp_path / "other")]) == 0
     assert (
         "4 x 1 images: 0 pairs of similarity 0.3 or more; the most similar:"

@@ -152,17 +152,18 @@ def test_what_was_found_is_kept_for_the_next_process(
     monkeypatch.setenv("DEPTHPOSE_CACHE", str(tmp_path))
     monkeypatch.setattr(symmetry, "_memory", OrderedDict())
     model = replace(bar(), symmetries=Symmetries(is_found=True))
-    found = near_symmetries(model)
-    (path,) = tmp_path.glob("near_symmetries/*.json")
-    assert found
+    true = symmetry._search(model)
     searches: list[ObjectModel] = []
-    search = symmetry._search
 
     def counted(model: ObjectModel) -> Any:  # noqa: ANN401
         searches.append(model)
-        return search(model)
+        return true
 
     monkeypatch.setattr(symmetry, "_search", counted)
+    found = near_symmetries(model)
+    assert found
+    (path,) = tmp_path.glob("near_symmetries/*.json")
+    searches.clear()
 
     def again() -> tuple[NearSymmetry, ...]:
         monkeypatch.setattr(symmetry, "_memory", OrderedDict())

@@ -51,7 +51,7 @@ def both(compute: Callable[[], T], monkeypatch: pytest.MonkeyPatch) -> tuple[T, 
     return found[0], found[1]
 
 
-@pytest.fixture(params=PARTS)
+@pytest.fixture(params=PARTS, scope="module")
 def surface(request: pytest.FixtureRequest) -> Surface:
     return prepare_surface(make_part(request.param), 4000)
 

@@ -97,9 +97,9 @@ def jacobi(A, V):
     V[:] = 0.0
     V[0, 0] = V[1, 1] = V[2, 2] = 1.0
     for _ in range(8):
-        _rotate(A, V, 0, 1)
-        _rotate(A, V, 0, 2)
-        _rotate(A, V, 1, 2)
+        for p in range(2):
+            for q in range(p + 1, 3):
+                _rotate(A, V, p, q)
 
 
 Array = np.ndarray

@@ -93,7 +93,7 @@ def _meet_planes(local, eye, target, places):
             meet[i, 1] += share * y
             meet[i, 2] += share * z
         else:
-            meet[i] = point
+            meet[i, 0], meet[i, 1], meet[i, 2] = point[0], point[1], point[2]
     return meet
 
 
@@ -279,13 +279,12 @@ def _grow(local, times, middle, limits, target, is_exact, converged, variance):
     count = local.shape[1]
     places = np.full((len(times), count), -1)
     surface, normals = target.tree.points, target.normals
-    own, rows = np.empty((count, 3)), np.empty((count, 9))
-    motion, turn = np.empty(7), np.empty((3, 3))
+    rows, motion, turn = np.empty((count, 9)), np.empty(7), np.empty((3, 3))
     for limit in limits:
         most = 0.0
         for p in range(len(times)):
             s, points = times[p], local[p]
-            own[:] = (points - middle) / s + middle  # beside the surface of its own size
+            own = (points - middle) / s + middle  # beside the surface of its own size
             find_places(own, limit / s, target, is_exact, places[p])
             for i in range(count):  # derivatives by turn, shift and growth, residual, weight
                 row, place = rows[i], places[p, i]
@@ -375,6 +374,7 @@ def _add_keypoints(R, t, model, found, information, H, b):
 @compiled
 def _fit(Rs, ts, model, found, information, steps, Hs):
     H, b, motion, turn = np.empty((6, 6)), np.empty(6), np.empty(6), np.empty((3, 3))
+    origin = np.zeros(3)
     for p in range(len(ts)):
         R, t = Rs[p], ts[p]
         for _ in range(steps):
@@ -383,8 +383,7 @@ def _fit(Rs, ts, model, found, information, steps, Hs):
             if not np.abs(motion).max() < _FARTHEST:  # keypoints that fix nothing
                 break
             rotation(motion[0], motion[1], motion[2], turn)
-            R[:] = turn @ R
-            t[:] = turn @ t + motion[3:]
+            _move(turn, motion, origin, R, t)
         _add_keypoints(R, t, model[p], found[p], information[p], Hs[p], b)
 
 
@@ -419,8 +418,9 @@ def met(
 @compiled
 def _damped(A, out):
     size = max(A[0, 0] + A[1, 1] + A[2, 2], 1e-300)
-    out[:] = A
     for c in range(3):
+        for k in range(3):
+            out[c, k] = A[c, k]
         out[c, c] += 1e-12 * size
 
 
@@ -493,7 +493,7 @@ def _meet(local, n, w, refinements, nearest, points, covariances, conditions):
         _mirror(A)
         _damped(A, M)
         solve(M, pull, p)
-        M[:] = A
+        M = A.copy()
         jacobi(M, V)
         low, high = min(M[0, 0], M[1, 1], M[2, 2]), max(M[0, 0], M[1, 1], M[2, 2])
         conditions[k] = high / low if low > 1e-7 else np.inf
@@ -521,4 +521,7 @@ def _meet(local, n, w, refinements, nearest, points, covariances, conditions):
             solve(M, unit, inverse[c])
         votes = (w[k] > 0).sum()
         spare = 2 * votes / max(2 * votes - 3, 1)
-        covariances[k] = spare * (inverse @ (gradient @ gradient.T) @ inverse)
+        covariance = spare * (inverse @ (gradient @ gradient.T) @ inverse)
+        for c in range(3):
+            for m in range(3):
+                covariances[k, c, m] = covariance[c, m]
