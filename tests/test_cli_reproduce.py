@@ -341,9 +341,25 @@ def test_near_duplicates_are_listed(
     assert "a similarity is -1 .. 1" in capsys.readouterr().err
 
 
-def test_two_processes_share_the_frames_and_the_first_measures(
-    street: Path, tmp_path: Path
+def test_two_ranks_share_the_frames_and_the_first_measures(
+    street: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
+    words = ["depth", "evaluate", "--data", str(street), "--matcher", "sgbm", *CAMERA_Z]
+    assert main([*words, "--out", str(tmp_path / "alone")]) == 0
+    capsys.readouterr()
+    monkeypatch.setenv("WORLD_SIZE", "2")
+    for rank in "10":
+        monkeypatch.setenv("RANK", rank)
+        assert main([*words, "--out", str(tmp_path / "both")]) == 0
+        assert ("the page:" in capsys.readouterr().out) == (rank == "0")
+    assert rows_of(tmp_path / "both") == rows_of(tmp_path / "alone")
+
+
+@pytest.mark.slow
+def test_two_processes_at_once_give_what_one_gives(street: Path, tmp_path: Path) -> None:
     words = ["depth", "evaluate", "--data", str(street), "--matcher", "sgbm", *CAMERA_Z]
     assert main([*words, "--out", str(tmp_path / "alone")]) == 0
     command = [sys.executable, "-m", "depthpose", *words, "--out", str(tmp_path / "both")]
