@@ -343,7 +343,7 @@ def test_votes_of_point_pairs(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_the_rest_of_the_tests_with_torch_alone() -> None:
     """Edge cases are tested once, by what is installed: here without numba."""
     names = ("refine", "surface", "voting", "scale", "mirror", "sparse", "cloud",
-             "refusal", "keypoint_pose", "network", "estimator", "alternatives")  # fmt: skip
+             "refusal", "keypoint_pose", "network", "estimator")  # fmt: skip
     files = [f"tests/pose/test_{name}.py" for name in names]
     environment = {**os.environ, "DEPTHPOSE_COMPILED": "0"}
     command = [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", *files]
