@@ -275,7 +275,7 @@ def test_figures_are_drawn_and_explained(
     assert write_figure("2-5", data, [0, 2], method, tmp_path / "five") == 0
     assert "predicted depth; predicted right image; LiDAR" in capsys.readouterr().out
     picture = read_image(tmp_path / "five/figure-2-5.png")
-    assert picture.shape == (3, 5 * 150 + 5 * 8 + 18, 2 * 497 + 8)
+    assert picture.shape == (3, 5 * 187 + 5 * 8 + 18, 2 * 621 + 8)
     assert write_figure("2-1", data, [1], method, tmp_path / "one") == 0
     page = (tmp_path / "one/report.html").read_text()
     assert page.count("<figure>") == 6
