@@ -21,9 +21,9 @@ NAMES = [name.split() for name in COMMANDS]
 
 @pytest.fixture(scope="module")
 def pair_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Two pairs of the synthetic street, 621 x 188, with their rig."""
+    """Two pairs of the synthetic street, 497 x 150, with their rig."""
     folder = tmp_path_factory.mktemp("pairs")
-    pair = make_street(0.5).input
+    pair = make_street(0.4).input
     assert pair.right is not None
     for name in ("a", "b"):
         write_image(folder / "left" / f"{name}.png", pair.left)

@@ -655,9 +655,11 @@ def test_two_processes_select_as_one_that_accumulates(pairs: Path, tmp_path: Pat
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("stage", "config"), [("view", VIEW), ("select", SELECT)])
+@pytest.mark.parametrize(
+    ("stage", "config", "early", "late"), [("view", VIEW, 2, 3), ("select", SELECT, 1, 2)]
+)
 def test_kills_at_any_moment_change_no_weight_of_a_stage(
-    pairs: Path, tmp_path: Path, stage: str, config: str
+    pairs: Path, tmp_path: Path, stage: str, config: str, early: int, late: int
 ) -> None:
     """Before the first step too, while samples are read, and while weights are written."""
     text = config.replace("steps: 4", "steps: 200, save_every_steps: 7, validate_every_steps: 50")
@@ -668,8 +670,8 @@ def test_kills_at_any_moment_change_no_weight_of_a_stage(
     subprocess.run([*words, str(tmp_path / "whole")], check=True, capture_output=True)
     moments, killed = random.Random(1), tmp_path / "killed"
     state = killed / "state.pt"
-    # The first two meet a run that has saved nothing, the others one that went on.
-    for sign in (killed / "run.json", killed / "run.json", state, state, state):
+    # The early ones meet a run that has saved nothing, the others one that went on.
+    for sign in early * [killed / "run.json"] + late * [state]:
         before = sign.stat().st_mtime_ns if sign is state and sign.exists() else 0
         process = subprocess.Popen([*words, str(killed)], stderr=subprocess.DEVNULL)
         deadline = time.monotonic() + 120

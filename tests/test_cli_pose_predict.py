@@ -41,7 +41,7 @@ from depthpose.pose.baselines import DepthImageConfig, DepthImageNet
 from depthpose.pose.datasets import BopDataset
 from depthpose.pose.metrics import add_m
 from depthpose.pose.predictions import read_bop_results, read_predictions
-from depthpose.pose.types import ObjectModel
+from depthpose.pose.types import ObjectModel, ViewInput
 from depthpose.pose.weights import write_pose_weights
 
 TRUTH = pose_at(seed=1)
@@ -247,24 +247,38 @@ def frames(folder: Path) -> list[str]:
 
 @pytest.mark.parametrize("with_mask", [True, False])
 def test_a_focal_length_is_enough_of_a_camera(
-    weights: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], *, with_mask: bool
+    weights: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    *,
+    with_mask: bool,
 ) -> None:
-    """The answer is that of a camera file with this focal length and a centred axis."""
+    """What is posed or searched is that of a camera file of this focal length, centred."""
     words = frames(tmp_path)
     centred = torch.tensor([[500.0, 0, 159.5], [0, 500, 119.5], [0, 0, 1]], dtype=torch.float64)
     camera = Camera(width=320, height=240, K=centred, depth_unit_m=0.001)
     write_camera(tmp_path / "camera.json", camera)
+    searched: list[ViewInput] = []
     if not with_mask:
-        words = [words[0], f"{words[1]}/seen.png", *words[4:]]  # searched, which takes seconds
+        words = [words[0], f"{words[1]}/seen.png", *words[4:]]
+        # A search takes seconds: what it is given is looked at.
+        monkeypatch.setattr(Oracle, "find_in", lambda _, view, __: searched.append(view))
     at = words.index("--camera")
     bare = [*words[:at], "--focal-px", "500", "--unit", "mm", *words[at + 2 :]]
     given = ["pose", "predict", "--weights", str(weights), "--out"]
     assert main([*given, str(tmp_path / "file"), *words]) == 0
     assert main([*given, str(tmp_path / "bare"), *bare]) == 0
     expected, found = poses_of(tmp_path / "file"), poses_of(tmp_path / "bare")
-    assert any(row["status"] == "ok" for row in found.values())
-    for name, row in found.items():
-        assert row["camera_from_model"] == expected[name]["camera_from_model"]
+    assert found.keys() == expected.keys()
+    if with_mask:
+        assert any(row["status"] == "ok" for row in found.values())
+        for name, row in found.items():
+            assert row["camera_from_model"] == expected[name]["camera_from_model"]
+    else:
+        of_file, of_bare = searched
+        assert torch.equal(of_file.K, of_bare.K)
+        assert torch.equal(of_file.depth_m.nan_to_num(), of_bare.depth_m.nan_to_num())
     without_unit = [word for word in bare if word not in ("--unit", "mm")]
     assert main([*given, str(tmp_path / "no unit"), *without_unit]) == 1
     assert "its depth is in whole numbers, and nothing says of what" in capsys.readouterr().err

@@ -2,7 +2,7 @@
 
 import csv
 import json
-from collections.abc import Iterator
+import shutil
 from pathlib import Path
 
 import pytest
@@ -16,36 +16,25 @@ from depthpose.core.files import Cloud, read_cloud, write_cloud, write_depth_png
 from depthpose.pose.config import ObjectsConfig
 from depthpose.pose.datasets import write_bop_models, write_bop_scene
 from depthpose.pose.estimator.inputs import rigid_input
-from depthpose.pose.mesh import SymmetryProposal, symmetry
 from depthpose.pose.metrics import add_m
 from depthpose.pose.synthetic import Objects, make_part
-from depthpose.pose.types import ObjectModel
-
-
-@pytest.fixture(scope="module", autouse=True)
-def searched_once() -> Iterator[None]:
-    """Search each shape here for symmetries once: that takes most of the time of a command."""
-    found: dict[tuple[bytes, bytes, float], list[SymmetryProposal]] = {}
-    search = symmetry.propose_symmetries
-
-    def once(model: ObjectModel, tolerance: float = 0.02) -> list[SymmetryProposal]:
-        key = (model.vertices_m.numpy().tobytes(), model.faces.numpy().tobytes(), tolerance)
-        if key not in found:
-            found[key] = search(model, tolerance)
-        return found[key]
-
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(symmetry, "propose_symmetries", once)
-        yield
 
 
 @pytest.fixture
-def cad(tmp_path: Path) -> Path:
+def cad(drawn: Path, tmp_path: Path) -> Path:
+    """The folder of :func:`drawn` for a test of its own; its CAD file."""
+    shutil.copytree(drawn, tmp_path, dirs_exist_ok=True)
+    return tmp_path / "connector.stl"
+
+
+@pytest.fixture(scope="module")
+def drawn(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A part, a cloud of it in millimetres, and a depth image with its mask and camera."""
-    write_part("connector", tmp_path)
+    folder = tmp_path_factory.mktemp("part")
+    write_part("connector", folder)
     config = ObjectsConfig(views=None, resolution=(1.0, 1.0), occluded_share=0.0, seed=5)
     views = Objects([make_part("connector")], config)
-    write_cloud(tmp_path / "scan.ply", Cloud(points=1000 * views[0].input.points_m))
+    write_cloud(folder / "scan.ply", Cloud(points=1000 * views[0].input.points_m))
     window = views.view(0).input
     centre_px = torch.tensor(config.principal_point_px)
     left, top = (centre_px - window.K[:2, 2]).round().long().tolist()
@@ -56,10 +45,10 @@ def cad(tmp_path: Path) -> Path:
     depth_m[place], mask[:, *place] = window.depth_m.float(), window.mask.float()
     K = window.K.double() + torch.tensor([[0, 0, left], [0, 0, top], [0, 0, 0]])
     camera = Camera(width=width, height=height, K=K, depth_unit_m=0.0001)
-    write_camera(tmp_path / "camera.json", camera)
-    write_depth_png(tmp_path / "depth.png", depth_m, 0.0001)
-    write_image(tmp_path / "mask.png", mask)
-    return tmp_path / "connector.stl"
+    write_camera(folder / "camera.json", camera)
+    write_depth_png(folder / "depth.png", depth_m, 0.0001)
+    write_image(folder / "mask.png", mask)
+    return folder
 
 
 def predict(*words: str | Path) -> int:

@@ -160,20 +160,20 @@ def test_results_of_views_are_not_replaced_by_others(
     table = ["reproduce", "3.3", "--points", "60", "--out", str(tmp_path / "table")]
     figure = ["figure", "3-5", "--out", str(tmp_path / "figure")]
     own = ["--weights", str(weights)]
-    assert main([*table, *own, "--synthetic", "2"]) == 0
-    assert main([*figure, *own, "--number", "2"]) == 0
+    assert main([*table, *own, "--synthetic", "1"]) == 0
+    assert main([*figure, *own, "--number", "1"]) == 0
     before = (tmp_path / "table/rows.json").read_bytes()
     for words, setting in (
-        ([*table, *own, "--synthetic", "1"], "synthetic = 2, but now it is 1"),
-        ([*table, *own, "--synthetic", "2", "--points", "50"], "points = [60], but now it is [50]"),
-        ([*table, "--weights", str(other), "--synthetic", "2"], "weights_sha256 = "),
-        ([*figure, *own, "--number", "1"], "synthetic = 2, but now it is 1"),
-        ([*figure, "--weights", str(other), "--number", "2"], "weights_sha256 = "),
+        ([*table, *own, "--synthetic", "2"], "synthetic = 1, but now it is 2"),
+        ([*table, *own, "--synthetic", "1", "--points", "50"], "points = [60], but now it is [50]"),
+        ([*table, "--weights", str(other), "--synthetic", "1"], "weights_sha256 = "),
+        ([*figure, *own, "--number", "2"], "synthetic = 1, but now it is 2"),
+        ([*figure, "--weights", str(other), "--number", "1"], "weights_sha256 = "),
     ):
         assert main(words) == 2
         assert f"holds results made with {setting}" in capsys.readouterr().err
     assert (tmp_path / "table/rows.json").read_bytes() == before
-    assert main([*figure, *own, "--number", "2"]) == 0
+    assert main([*figure, *own, "--number", "1"]) == 0
     assert main(["figure", "3-5", *own, "--number", "0", "--out", str(tmp_path / "no")]) == 2
     assert "--number 0: give 1 or more" in capsys.readouterr().err
 

@@ -70,7 +70,9 @@ def test_an_interrupted_sequence_keeps_its_poses_in_the_order_of_the_numbers(
         write_depth_png(tmp_path / f"depth/{k}.png", seen.float().nan_to_num(1.2), 0.001)
     (tmp_path / "depth/9.png").write_bytes(b"no picture")
     write_camera(tmp_path / "c.json", Camera(width=320, height=240, K=K, depth_unit_m=0.001))
+    (tmp_path / "first.txt").write_text(str(POSES[0].matrix().tolist()))  # no search, of seconds
     words = ["--depth", str(tmp_path / "depth"), "--camera", str(tmp_path / "c.json")]
+    words += ["--first", str(tmp_path / "first.txt")]
     words += ["--object", "bracket", "--weights", str(weights), "--out", str(tmp_path / "out")]
 
     def names() -> list[str]:

@@ -47,9 +47,9 @@ class FlatMono:
 
 @pytest.fixture(scope="module")
 def street(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Four pairs of the synthetic street with depth, 621 x 188."""
+    """Four pairs of the synthetic street with depth, 497 x 150."""
     folder = tmp_path_factory.mktemp("street")
-    sample = make_street(0.5)
+    sample = make_street(0.4)
     assert sample.input.right is not None
     assert sample.input.camera is not None
     assert sample.truth.depth_m is not None
@@ -275,7 +275,7 @@ def test_figures_are_drawn_and_explained(
     assert write_figure("2-5", data, [0, 2], method, tmp_path / "five") == 0
     assert "predicted depth; predicted right image; LiDAR" in capsys.readouterr().out
     picture = read_image(tmp_path / "five/figure-2-5.png")
-    assert picture.shape == (3, 5 * 188 + 5 * 8 + 18, 2 * 621 + 8)
+    assert picture.shape == (3, 5 * 187 + 5 * 8 + 18, 2 * 621 + 8)
     assert write_figure("2-1", data, [1], method, tmp_path / "one") == 0
     page = (tmp_path / "one/report.html").read_text()
     assert page.count("<figure>") == 6
@@ -317,7 +317,7 @@ def test_an_unknown_frame_has_no_figure(
 def test_near_duplicates_are_listed(
     street: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    write_image(tmp_path / "other/left/x.png", torch.rand(3, 188, 621))
+    write_image(tmp_path / "other/left/x.png", torch.rand(3, 150, 497))
     assert main(["data", "duplicates", str(street), str(tmp_path / "other")]) == 0
     assert (
         "4 x 1 images: 0 pairs of similarity 0.3 or more; the most similar:"
@@ -341,9 +341,25 @@ def test_near_duplicates_are_listed(
     assert "a similarity is -1 .. 1" in capsys.readouterr().err
 
 
-def test_two_processes_share_the_frames_and_the_first_measures(
-    street: Path, tmp_path: Path
+def test_two_ranks_share_the_frames_and_the_first_measures(
+    street: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
+    words = ["depth", "evaluate", "--data", str(street), "--matcher", "sgbm", *CAMERA_Z]
+    assert main([*words, "--out", str(tmp_path / "alone")]) == 0
+    capsys.readouterr()
+    monkeypatch.setenv("WORLD_SIZE", "2")
+    for rank in "10":
+        monkeypatch.setenv("RANK", rank)
+        assert main([*words, "--out", str(tmp_path / "both")]) == 0
+        assert ("the page:" in capsys.readouterr().out) == (rank == "0")
+    assert rows_of(tmp_path / "both") == rows_of(tmp_path / "alone")
+
+
+@pytest.mark.slow
+def test_two_processes_at_once_give_what_one_gives(street: Path, tmp_path: Path) -> None:
     words = ["depth", "evaluate", "--data", str(street), "--matcher", "sgbm", *CAMERA_Z]
     assert main([*words, "--out", str(tmp_path / "alone")]) == 0
     command = [sys.executable, "-m", "depthpose", *words, "--out", str(tmp_path / "both")]

@@ -8,52 +8,57 @@ import depthpose
 from depthpose import core
 
 
-def modules_after(statement: str) -> set[str]:
-    code = f"{statement}; import sys; print(*sys.modules)"
+def modules_after(*statements: str) -> list[set[str]]:
+    """What is loaded after each statement, of one process that runs them in turn."""
+    code = "import sys\n" + "".join(f"{one}\nprint(*sys.modules)\n" for one in statements)
     answer = subprocess.run(
         [sys.executable, "-c", code], capture_output=True, text=True, check=True
     )
-    return set(answer.stdout.split())
+    return [set(line.split()) for line in answer.stdout.splitlines()]
 
 
-def test_core_imports_neither_depth_nor_pose() -> None:
+def of(loaded: set[str], package: str) -> set[str]:
+    return {name for name in loaded if name.startswith(f"depthpose.{package}")}
+
+
+def test_core_imports_neither_depth_nor_pose_and_a_depth_command_no_pose() -> None:
     names = [
         path.stem
         for path in Path(str(core.__file__)).parent.iterdir()
         if path.suffix in ("", ".py")
     ]
     names = [name for name in names if name[0] != "_"]
-    loaded = modules_after("; ".join(f"import depthpose.core.{name}" for name in names))
-    assert not {name for name in loaded if name.startswith(("depthpose.depth", "depthpose.pose"))}
+    loaded, then = modules_after(
+        "; ".join(f"import depthpose.core.{name}" for name in names),
+        "import depthpose.cli.depth, depthpose.cli.depth_predict",
+    )
+    assert not of(loaded, "depth")
+    assert not of(loaded, "pose")
     assert "cv2" not in loaded
+    assert "depthpose.depth.estimator" in then
+    assert not of(then, "pose")
 
 
 def test_importing_the_package_loads_nothing_heavy() -> None:
-    assert not {"torch", "numpy", "tyro", "PIL", "ray"} & modules_after("import depthpose")
+    (loaded,) = modules_after("import depthpose")
+    assert not {"torch", "numpy", "tyro", "PIL", "ray"} & loaded
 
 
 def test_the_command_line_loads_nothing_heavy() -> None:
-    assert not {"torch", "numpy", "PIL", "cv2", "ray", "fsspec"} & modules_after(
-        "import depthpose.cli.depth, depthpose.cli.pose, depthpose.cli.train"
-    )
+    (loaded,) = modules_after("import depthpose.cli.depth, depthpose.cli.pose, depthpose.cli.train")
+    assert not {"torch", "numpy", "PIL", "cv2", "ray", "fsspec"} & loaded
 
 
-def test_a_command_loads_its_own_networks_alone() -> None:
-    loaded = modules_after("import depthpose.cli.depth, depthpose.cli.depth_predict")
-    assert "depthpose.depth.estimator" in loaded
-    assert not {name for name in loaded if name.startswith("depthpose.pose")}
-    loaded = modules_after("import depthpose.cli.pose, depthpose.cli.pose_frames")
-    assert "depthpose.pose.estimator" in loaded
-    assert not {name for name in loaded if name.startswith("depthpose.depth")}
-
-
-def test_loading_weights_imports_no_compiler() -> None:
-    loaded = modules_after(
+def test_a_pose_command_loads_no_depth_and_loading_weights_no_compiler() -> None:
+    loaded, then = modules_after(
+        "import depthpose.cli.pose, depthpose.cli.pose_frames",
         "from depthpose import FakestereoNet, GeoPoseNet; FakestereoNet.load('default'); "
-        "FakestereoNet.load('psmnet-compact'); GeoPoseNet.load('parts')"
+        "FakestereoNet.load('psmnet-compact'); GeoPoseNet.load('parts')",
     )
-    assert "depthpose.pose.network" in loaded
-    assert not {"torch._dynamo", "torch._inductor", "sympy", "numba"} & loaded
+    assert "depthpose.pose.estimator" in loaded
+    assert not of(loaded, "depth")
+    assert "depthpose.pose.network" in then
+    assert not {"torch._dynamo", "torch._inductor", "sympy", "numba"} & then
 
 
 def test_an_estimator_is_imported_when_asked_for() -> None:
@@ -67,4 +72,4 @@ def test_an_unknown_name_is_refused() -> None:
 
 def test_the_public_names_are_listed() -> None:
     assert {"FakestereoNet", "GeoPoseNet", "pipeline"} <= set(dir(depthpose))
-    assert "torch" not in modules_after("import depthpose; dir(depthpose)")
+    assert "torch" not in modules_after("import depthpose; dir(depthpose)")[0]

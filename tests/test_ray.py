@@ -10,6 +10,7 @@ import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import suppress
 from importlib import import_module
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -17,8 +18,13 @@ import pytest
 from tests.test_cli_engine import files_of, make_home, predict, unpacked
 from tests.written import ROOT
 
-pytestmark = pytest.mark.slow
-pytest.importorskip("ray", reason="Ray is not installed: pip install -e '.[ray]'")
+pytestmark = [
+    pytest.mark.slow,
+    # Looked for and not imported: every worker collects this file, and Ray takes two seconds.
+    pytest.mark.skipif(
+        find_spec("ray") is None, reason="Ray is not installed: pip install -e '.[ray]'"
+    ),
+]
 
 # Ray's workers are polite (nice 15): on a machine that others keep busy they would get no core.
 os.environ.setdefault("RAY_worker_niceness", "0")

@@ -49,6 +49,7 @@ def test_the_python_lines_run_and_end_in_metres(demo_folder: Path, page: str) ->
     assert demo_folder.is_dir()
 
 
+@pytest.mark.slow
 def test_the_service_of_the_page_answers(demo_folder: Path) -> None:
     """The page's own lines: many inputs with an error among them, and a service for a part."""
     testclient = pytest.importorskip("starlette.testclient")

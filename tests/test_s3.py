@@ -11,6 +11,7 @@ import time
 from collections.abc import Iterator
 from contextlib import suppress
 from importlib import import_module
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -20,9 +21,16 @@ from tests.test_cli_engine import RAY, double, files_of, home, match, predict, t
 
 from depthpose.cli import main
 
-pytestmark = pytest.mark.slow
-pytest.importorskip("nanio", reason="no S3 server here: pip install nanio")
-pytest.importorskip("s3fs", reason="no S3 file system here: pip install s3fs")
+pytestmark = [
+    pytest.mark.slow,
+    # Looked for and not imported: every worker collects this file, and s3fs takes a second.
+    *(
+        pytest.mark.skipif(
+            find_spec(name) is None, reason=f"{name} is not installed: pip install it"
+        )
+        for name in ("nanio", "s3fs")
+    ),
+]
 
 __all__ = ["double", "home", "truth"]  # fixtures
 KEYS = {"AWS_ACCESS_KEY_ID": "tester", "AWS_SECRET_ACCESS_KEY": "a-secret-of-the-tests"}

@@ -12,7 +12,8 @@ import pytest
 from tests.written import ROOT, Block, read_blocks, run, run_block
 
 TUTORIALS = sorted(set((ROOT / "docs/tutorials").glob("*.md")) - {ROOT / "docs/tutorials/index.md"})
-QUICK = {"bop", "camera", "replace"}
+QUICK = {"replace"}
+"""Walked by the quick tests too; slow tests walk them all, whole."""
 MARKS = {"", "slow", "long", "data", "manual", "slurm", "exit 2"}
 
 

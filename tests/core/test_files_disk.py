@@ -1,14 +1,35 @@
 import errno
 import os
-import re
 import subprocess
 import sys
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import pytest
+import torch
 
+from depthpose.core.checkpoint import Checkpoint, save_checkpoint
+from depthpose.core.config import write_config
 from depthpose.core.errors import InputError
-from depthpose.core.files import atomic_write, read_bytes, write_json
+from depthpose.core.export import Export, Graph, freeze
+from depthpose.core.files import (
+    Cloud,
+    atomic_write,
+    read_bytes,
+    write_cloud,
+    write_depth_png,
+    write_image,
+    write_json,
+    write_map,
+    write_video,
+)
+from depthpose.core.loop import RunLogger
+from depthpose.core.loop.folder import write_state
+from depthpose.core.run import claim_folder
+from depthpose.report.page import Section, write_page, write_table
 
 
 def test_a_finished_write_is_whole_and_makes_its_folders(tmp_path: Path) -> None:
@@ -125,78 +146,72 @@ def test_a_killed_writer_never_leaves_half_a_file(tmp_path: Path, delay_s: float
     assert len(set(content)) == 1
 
 
-FULL_DISK = """
-import resource, signal, sys
-from dataclasses import dataclass
-from pathlib import Path
-import torch
-from onnx import helper, numpy_helper
-from depthpose.core.checkpoint import Checkpoint, save_checkpoint
-from depthpose.core.config import write_config
-from depthpose.core.errors import InputError
-from depthpose.core.export import Export, freeze
-from depthpose.core.files import (
-    Cloud, write_cloud, write_depth_png, write_image, write_map, write_video
-)
-from depthpose.core.loop import RunLogger
-from depthpose.core.loop.folder import write_state
-from depthpose.report.page import Section, write_page, write_table
-from depthpose.core.run import claim_folder
-
 @dataclass(frozen=True)
 class Knobs:
     text: str = 200_000 * "x"
 
-class Heavy:
-    def model(self, facts):
-        held = numpy_helper.from_array(noise["a"].numpy(), "a")
+
+NOISE = {"a": torch.randn(100_000)}
+
+
+class Heavy(Graph):
+    """A graph of one large tensor."""
+
+    def model(self, facts: Mapping[str, Any]) -> Any:  # noqa: ANN401, ARG002
+        from onnx import helper, numpy_helper
+
+        held = numpy_helper.from_array(NOISE["a"].numpy(), "a")
         return helper.make_model(helper.make_graph([], "g", [], [], [held]))
 
-def log_for_ever(folder):
+
+def log_for_ever(folder: Path) -> None:
     folder.mkdir(parents=True)
     logger = RunLogger(folder, is_writer=True)
     logger.open(0)
     while True:
         logger.log(1, {2_000 * "x": 1.0})
 
-root, noise, long = Path(sys.argv[1]), {"a": torch.randn(100_000)}, "x" * 200_000
-images = [torch.rand(3, 300, 300) for _ in range(9)]
-weights = Checkpoint(kind="k", config={}, state=noise)
-graph = Export(graph=Heavy, cases=list, limits={}, facts={})
-writers = {
-    "weights": lambda p: save_checkpoint(p / "w.safetensors", weights),
-    "state": lambda p: write_state(p, noise, keeps_last=True),
-    "run record": lambda p: claim_folder(p, {"a": long}),
-    "config": lambda p: write_config(p / "c.yaml", Knobs()),
-    "page": lambda p: write_page(p / "page.html", "t", [Section(title="t", text=long)], {}),
-    "table": lambda p: write_table(p, [{"a": long}]),
-    "cloud": lambda p: write_cloud(p / "c.ply", Cloud(points=torch.rand(50_000, 3))),
-    "map": lambda p: write_map(p / "m.npy", images[0][0].repeat(2, 2)),
-    "picture": lambda p: write_image(p / "p.png", images[0]),
-    "depth": lambda p: write_depth_png(p / "d.png", 200 * images[0][0]),
-    "avi": lambda p: write_video(p / "v.avi", images, 10.0),
-    "mp4": lambda p: write_video(p / "v.mp4", images, 10.0),
-    "graph": lambda p: freeze(p / "g.onnx", graph),
-    "logger": log_for_ever,
-}
-signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
-resource.setrlimit(resource.RLIMIT_FSIZE, (100_000, 100_000))  # what a full disk does, sooner
-for name, write in writers.items():
+
+@contextmanager
+def small_disk() -> Iterator[None]:
+    """Let no file of this process be larger than 100 kB: what a full disk does, sooner."""
+    resource = pytest.importorskip("resource", reason="a system without limits of file size")
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (100_000, before[1]))
     try:
-        write(root / name)
-        print(f"{name}: wrote it")
-    except InputError as error:
-        left = [path.name for path in root.rglob("*") if path.is_file()]
-        print(f"{name}: {error}; left: {left}")
-"""
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
 
 
 def test_every_writer_names_a_full_disk_and_leaves_nothing(tmp_path: Path) -> None:
-    pytest.importorskip("resource", reason="a system without limits of file size")
-    command = [sys.executable, "-c", FULL_DISK, str(tmp_path)]
-    done = subprocess.run(command, capture_output=True, text=True, check=True)
-    *lines, of_journal = done.stdout.splitlines()
-    assert len(lines) == 13
-    for line in lines:
-        assert re.search(r"(cannot be written: File too large|disk is full).*left: \[\]$", line)
-    assert "metrics.jsonl: cannot be written: File too large" in of_journal
+    long, images = "x" * 200_000, [torch.rand(3, 300, 300) for _ in range(9)]
+    weights = Checkpoint(kind="k", config={}, state=NOISE)
+    graph = Export(graph=Heavy, cases=list, limits={}, facts={})
+    writers: dict[str, Callable[[Path], object]] = {
+        "weights": lambda p: save_checkpoint(p / "w.safetensors", weights),
+        "state": lambda p: write_state(p, NOISE, keeps_last=True),
+        "run record": lambda p: claim_folder(p, {"a": long}),
+        "config": lambda p: write_config(p / "c.yaml", Knobs()),
+        "page": lambda p: write_page(p / "page.html", "t", [Section(title="t", text=long)], {}),
+        "table": lambda p: write_table(p, [{"a": long}]),
+        "cloud": lambda p: write_cloud(p / "c.ply", Cloud(points=torch.rand(50_000, 3))),
+        "map": lambda p: write_map(p / "m.npy", images[0][0].repeat(2, 2)),
+        "picture": lambda p: write_image(p / "p.png", images[0]),
+        "depth": lambda p: write_depth_png(p / "d.png", 200 * images[0][0]),
+        "avi": lambda p: write_video(p / "v.avi", images, 10.0),
+        "mp4": lambda p: write_video(p / "v.mp4", images, 10.0),
+        "graph": lambda p: freeze(p / "g.onnx", graph),
+    }
+    for name, write in writers.items():
+        with (
+            small_disk(),
+            pytest.raises(InputError, match=r"cannot be written: File too large|disk is full"),
+        ):
+            write(tmp_path / name)
+        assert not [path for path in tmp_path.rglob("*") if path.is_file()], name
+    with (
+        small_disk(),
+        pytest.raises(InputError, match=r"metrics\.jsonl: cannot be written: File too large"),
+    ):
+        log_for_ever(tmp_path / "logger")

@@ -241,7 +241,7 @@ def test_a_split_name_too_long_for_the_disk_is_refused() -> None:
 def test_truth_that_the_pair_contradicts_is_named(
     tmp_path: Path, change: Callable[[torch.Tensor], torch.Tensor], said: str
 ) -> None:
-    street = make_street(0.5)
+    street = make_street(0.4)
     assert street.input.right is not None
     assert street.truth.disparity_px is not None
     write_image(tmp_path / "left/a.png", street.input.left)

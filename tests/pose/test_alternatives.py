@@ -23,14 +23,17 @@ from depthpose.pose.config import EstimateConfig
 from depthpose.pose.estimator.candidates import difference_of, find_copies, share_out
 from depthpose.pose.mesh import (
     NearSymmetry,
+    SymmetryProposal,
     make_model,
     near_symmetries,
+    symmetries_from_proposals,
     symmetry,
     true_symmetries,
     turn_about,
+    with_found_symmetries,
 )
 from depthpose.pose.metrics import add_m
-from depthpose.pose.types import ObjectModel, Symmetries
+from depthpose.pose.types import Axis, ObjectModel, Symmetries
 
 EYE = torch.eye(3, dtype=torch.float64)
 
@@ -146,23 +149,54 @@ def test_words_tell_the_axis_and_the_shift() -> None:
     assert said == "turned by 90 degrees about the model's axis (0.71, 0.71, 0.00)"
 
 
+def test_proposals_of_a_shape_are_kept_to_the_bit(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("DEPTHPOSE_CACHE", str(tmp_path))
+    axis = Axis(direction=(EYE[0] + EYE[2] / 3) / math.hypot(1, 1 / 3), point_m=EYE.mean(0) / 7)
+    about: dict[str, Any] = {"axis": axis, "deviation": 0.1 / 3, "certainty": 2 / 3}
+    given = [
+        SymmetryProposal(kind="continuous", angle_rad=None, **about),
+        SymmetryProposal(kind="discrete", angle_rad=math.pi, **about),
+    ]
+    searches: list[float] = []
+
+    def search(_: ObjectModel, tolerance: float) -> list[SymmetryProposal]:
+        searches.append(tolerance)
+        return given
+
+    monkeypatch.setattr(symmetry, "propose_symmetries", search)
+    wanted = symmetries_from_proposals(given)
+    for tolerance in (0.02, 0.02, 0.03):
+        monkeypatch.setattr(symmetry, "_memory", OrderedDict())
+        model = with_found_symmetries(bar(), None, is_taken=True, tolerance=tolerance)
+        found, (own,) = model.symmetries, wanted.continuous
+        assert found.discrete is not None
+        assert wanted.discrete is not None
+        assert torch.equal(found.discrete.matrix(), wanted.discrete.matrix())
+        assert torch.equal(found.continuous[0].direction, own.direction)
+        assert torch.equal(found.continuous[0].point_m, own.point_m)
+    assert searches == [0.02, 0.03], "another tolerance is another search"
+
+
 def test_what_was_found_is_kept_for_the_next_process(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("DEPTHPOSE_CACHE", str(tmp_path))
     monkeypatch.setattr(symmetry, "_memory", OrderedDict())
     model = replace(bar(), symmetries=Symmetries(is_found=True))
-    found = near_symmetries(model)
-    (path,) = tmp_path.glob("near_symmetries/*.json")
-    assert found
+    true = symmetry._search(model)
     searches: list[ObjectModel] = []
-    search = symmetry._search
 
     def counted(model: ObjectModel) -> Any:  # noqa: ANN401
         searches.append(model)
-        return search(model)
+        return true
 
     monkeypatch.setattr(symmetry, "_search", counted)
+    found = near_symmetries(model)
+    assert found
+    (path,) = tmp_path.glob("near_symmetries/*.json")
+    searches.clear()
 
     def again() -> tuple[NearSymmetry, ...]:
         monkeypatch.setattr(symmetry, "_memory", OrderedDict())

@@ -39,13 +39,13 @@ def view(model: ObjectModel, index: int, seed: int = 5) -> CloudSample:
 
 
 def test_poses_of_a_part_that_no_training_saw_are_right_or_refused() -> None:
-    samples = [view(part(), index) for index in range(6)]
+    samples = [view(part(), index) for index in range(4)]
     found = registration().estimate_many([sample.input for sample in samples])
     points_m = sample_surface(part(), 500)[0]
     poses = [(one.camera_from_model, sample.truth.camera_from_model)
              for one, sample in zip(found, samples, strict=True)]  # fmt: skip
     errors_m = [float(add_m(pose, truth, points_m)) for pose, truth in poses if pose is not None]
-    assert len(errors_m) >= 4
+    assert len(errors_m) >= 3
     assert max(errors_m) < 0.05 * part().diameter_m
     for one in found:
         assert one.fit is not None

@@ -52,8 +52,9 @@ def test_a_copy_of_another_size_is_contradicted_with_its_size() -> None:
         assert found.is_ok
         assert found.identity is not None
         assert found.identity.status == "confirmed", found.identity
-    assert estimated(0.85, max_size_error=1.0).is_ok
-    assert estimated(0.85, max_size_error=1.0).identity is None
+    unmeasured = estimated(0.85, max_size_error=1.0)
+    assert unmeasured.is_ok
+    assert unmeasured.identity is None
 
 
 @pytest.mark.parametrize(("times", "status"), [(1.04, "confirmed"), (1.07, "not excluded")])

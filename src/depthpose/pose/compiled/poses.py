@@ -64,7 +64,7 @@ def _meet_planes(local, eye, target, places):
             meet[i, 1] += share * y
             meet[i, 2] += share * z
         else:
-            meet[i] = point
+            meet[i, 0], meet[i, 1], meet[i, 2] = point[0], point[1], point[2]
     return meet
 
 
@@ -219,13 +219,13 @@ def _grow(local, times, middle, limits, target, is_exact, converged, variance):
     count = local.shape[1]
     places = np.full((len(times), count), -1)
     surface, normals = target.tree.points, target.normals
-    own, turn = np.empty((count, 3)), np.empty((3, 3))
+    turn = np.empty((3, 3))
     J, residual, weight = np.zeros((count, 7)), np.zeros(count), np.empty(count)
     for limit in limits:
         most = 0.0
         for p in range(len(times)):
             s, points = times[p], local[p]
-            own[:] = (points - middle) / s + middle  # beside the surface of its own size
+            own = (points - middle) / s + middle  # beside the surface of its own size
             find_places(own, limit / s, target, is_exact, places[p])
             for i in range(count):  # derivatives by turn, shift and growth
                 row, place = J[i], places[p, i]

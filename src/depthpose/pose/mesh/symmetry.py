@@ -224,6 +224,8 @@ def with_found_symmetries(
 ) -> ObjectModel:
     """Look for the symmetries of a model that declares none, and count them if that is wanted.
 
+    They are searched once for each shape, and kept in ``$DEPTHPOSE_CACHE``.
+
     Args:
         model: a mesh, or points with normals.
         on_message: called with what was found, taken or not; None: symmetries that are not taken
@@ -233,7 +235,15 @@ def with_found_symmetries(
     """
     if not (is_taken or on_message) or not model.symmetries.is_none:
         return model
-    proposals = propose_symmetries(model, tolerance)
+
+    def search(model: ObjectModel) -> list[Any]:
+        return [
+            (p.kind, p.axis.direction.tolist(), p.axis.point_m.tolist(), p.angle_rad, p.deviation,
+             p.certainty)
+            for p in propose_symmetries(model, tolerance)
+        ]  # fmt: skip
+
+    proposals = kept(model, f"symmetries_{tolerance}", search, _proposals_of)
     found = replace(symmetries_from_proposals(proposals), is_found=True)
     if found.is_none:
         return model
@@ -250,6 +260,22 @@ def with_found_symmetries(
             )
         )
     return replace(model, symmetries=found) if is_taken else model
+
+
+def _proposals_of(rows: list[Any]) -> list[SymmetryProposal]:
+    return [
+        SymmetryProposal(
+            kind=kind,
+            axis=Axis(
+                direction=torch.tensor(direction, dtype=torch.float64),
+                point_m=torch.tensor(point_m, dtype=torch.float64),
+            ),
+            angle_rad=angle_rad,
+            deviation=deviation,
+            certainty=certainty,
+        )
+        for kind, direction, point_m, angle_rad, deviation, certainty in rows
+    ]
 
 
 def _is_apart(R: Tensor, others: Iterable[Tensor], limit_rad: float) -> bool:
