@@ -66,7 +66,7 @@ def readme_commands() -> list[str]:
     pages = ("README.md", "docs/quickstart.md", "docs/weights.md")
     text = "\n".join((PROJECT / page).read_text() for page in pages)
     blocks = re.findall(r"^```bash\n(.*?)^```", text, re.MULTILINE | re.DOTALL)
-    lines = [line for block in blocks for line in block.splitlines()]
+    lines = re.sub(r"\\\n *", " ", "\n".join(blocks)).splitlines()
     for long, short in SHORTER.items():
         lines = [line.replace(long, short) for line in lines]
     return [line for line in lines if line.startswith("depthpose ")]

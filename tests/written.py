@@ -47,8 +47,9 @@ def read_blocks(page: Path) -> list[Block]:
 
 
 def commands(blocks: list[Block]) -> list[str]:
-    """Every line that calls depthpose."""
-    lines = "\n".join(block.code for block in blocks if block.language == "bash").splitlines()
+    """Every line that calls depthpose, with what a backslash at its end joins to it."""
+    typed = "\n".join(block.code for block in blocks if block.language == "bash")
+    lines = re.sub(r"\\\n *", " ", typed).splitlines()
     return [line for line in lines if line.startswith("depthpose ")]
 
 

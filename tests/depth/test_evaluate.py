@@ -293,7 +293,12 @@ def test_the_clamp_follows_the_published_script() -> None:
     ("protocol", "message"),
     [
         ("eigen-rw", "did you mean 'eigen-raw'"),
-        ("eigen-raw", "none of its 3 frames has the truth"),
+        (
+            "eigen-raw",
+            r"none of its 3 frames has the truth that protocol 'eigen-raw' needs \(velodyne_x\)\. "
+            r"--protocol eigen-raw-camera or eigen-improved or eigen-improved-garg or kitti-2015 "
+            r"fits\.$",
+        ),
     ],
 )
 def test_an_unusable_protocol_is_refused(
@@ -301,6 +306,11 @@ def test_an_unusable_protocol_is_refused(
 ) -> None:
     with pytest.raises(InputError, match=message):
         evaluate(pairs, tmp_path, protocol)
+
+
+def test_a_folder_without_any_truth_is_refused(pairs: Dataset, tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"none of its 1 frames.*Choose another folder\.$"):
+        evaluate(replace(pairs, frames=pairs.frames[2:]), tmp_path, "eigen-raw")
 
 
 def test_a_missing_prediction_is_named(pairs: Dataset, tmp_path: Path) -> None:

@@ -22,7 +22,7 @@ from tests.pose.synthetic_objects import CAMERA, pose_at, view_of
 from tests.web.samples import PART, write_street, write_view
 
 from depthpose.core.camera import write_camera
-from depthpose.core.files import write_depth_png, write_map
+from depthpose.core.files import write_depth_png, write_image, write_map
 from depthpose.core.rigid import Rigid
 from depthpose.depth.estimator import FakestereoNet
 from depthpose.depth.stereo import CallableMatcher, LightMatcher
@@ -109,6 +109,19 @@ def test_one_image_becomes_the_depth_that_python_gives(
     whole = zipfile.ZipFile(io.BytesIO(page.get("/" + found["folder"] + "all.zip").content))
     assert whole.namelist() == names
     assert whole.read("left.depth_m.npy") == data
+
+
+def test_a_guess_is_not_coloured_as_a_good_answer(
+    nets: tuple[FakestereoNet, GeoPoseNet], tmp_path: Path
+) -> None:
+    """A portrait had the warning twice, beside a green bar."""
+    write_image(tmp_path / "noise.png", torch.rand(3, 94, 310, generator=torch.manual_seed(0)))
+    guessing = FakestereoNet.load("default", allow_ood=True)
+    with TestClient(make_app(guessing, nets[1]), base_url=URL) as client:
+        found = ask(client, "depth", tmp_path, {"image": "noise.png"}, focal_px="180").json()
+    assert not found["ok"]
+    assert found["said"].startswith("Careful: out of distribution")
+    assert "warning" not in dict(found["facts"])
 
 
 def test_fields_do_what_a_camera_file_does(page: TestClient, samples: Path) -> None:

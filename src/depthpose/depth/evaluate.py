@@ -257,9 +257,12 @@ def summarise(
             f"{NO_PREDICTION}. Predictions are called {files.EXPECTED}"
         )
     if not measured:
+        others = {n: r for n, r in PROTOCOLS.items() if r.truth != rule.truth}
+        fitting = [n for n, r in others.items() if any(has_truth(f, r) for f in dataset.frames)]
         raise InputError(
             f"{dataset.name}: none of its {len(dataset)} frames has the truth that protocol "
-            f"{protocol!r} needs ({rule.truth}). Choose another protocol or folder."
+            f"{protocol!r} needs ({rule.truth}). "
+            + (f"--protocol {' or '.join(fitting)} fits." if fitting else "Choose another folder.")
         )
     row = partial(EvaluationRow, protocol=protocol, dataset=dataset.name)
     names = ("frame", "cap_m", "pixels", "coverage", "metrics")
@@ -391,9 +394,8 @@ def _prepare(dataset: Dataset, index: int, predictions: Path, rule: Protocol) ->
     true_px = truth if is_stereo or rig is None else disparity.disparity_from_depth(truth, rig)
     # With principal points apart, the disparity of far points is negative.
     apart_px = 0.0 if rig is None else rig.cx_right_minus_left_px
-    if (
-        advice := disparity.disparity_advice(predicted_px + apart_px, true_px + apart_px)
-    ) is not None:
+    advice = disparity.disparity_advice(predicted_px + apart_px, true_px + apart_px)
+    if advice is not None:
         raise InputError(f"{predictions / frame.name}: {advice}")
     confidence = files.read_part(predictions, frame.name, "confidence.npy")
     if confidence is not None and confidence.shape != truth.shape:

@@ -88,10 +88,11 @@ def answer_depth(form: Form, net: FakestereoNet) -> Answer:
     pictures = _pictures(pair, estimate, (near_m, far_m))
     if estimate.confidence is not None:
         write_image(folder / f"{pair.name}.confidence.png", draw_share(1 - estimate.confidence))
+    facts = [fact for fact in depth_facts(pair, estimate, focal) if fact[0] != "warning"]
     return Answer(
-        is_ok=True,
+        is_ok=not estimate.warning,
         said=_sentence(pair, estimate),
-        facts=[*depth_facts(pair, estimate, focal), ("computed in", f"{seconds:.2f} s")],
+        facts=[*facts, ("computed in", f"{seconds:.2f} s")],
         pictures=pictures,
         scene=depth_scene(pair, estimate, far_m),
         terms=net.terms,
@@ -182,13 +183,9 @@ def _sentence(pair: StereoInput, estimate: DepthEstimate) -> str:
     )
 
 
-_SCALE = 0.5
-"""Size of the example's street, as a share of KITTI's."""
-
-
 def depth_example() -> dict[str, Any]:
-    """Render a street: left and right image, and their rig."""
-    pair = Streets(StreetsConfig(seed=EXAMPLE_SEED, scale=_SCALE))[1].input
+    """Render a street of half KITTI's size: left and right image, and their rig."""
+    pair = Streets(StreetsConfig(seed=EXAMPLE_SEED, scale=0.5))[1].input
     assert pair.right is not None
     assert pair.camera is not None
     with TemporaryDirectory(prefix="depthpose-") as name:

@@ -152,7 +152,7 @@ def _target(form: Form, net: GeoPoseNet) -> _Target:
         if "cad" in form.files:
             raise InputError(
                 f"object {name!r} and the CAD file {form.files['cad'].name} are both given; choose "
-                "'the CAD file below' as the object, or take the file out"
+                "'the CAD file above' as the object, or take the file out"
             )
         known = [model for model in models if model.name == name]
         if not known:

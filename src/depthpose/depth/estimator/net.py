@@ -519,8 +519,8 @@ class FakestereoNet:
                 if said and not self.allow_ood:
                     raise InputError(
                         f"{image.name}: {said}. Check that it is upright and that the focal length "
-                        "is its own; --allow-ood (in Python, allow_ood=True) answers it all the "
-                        "same."
+                        "is its own; --allow-ood (in Python, load(..., allow_ood=True)) answers "
+                        "it all the same."
                     )
                 estimates[n] = replace(estimate, image_confidence=sure, warning=said)
         return estimates

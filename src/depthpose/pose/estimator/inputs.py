@@ -93,7 +93,7 @@ def view_input(
             raise InputError(
                 f"{file}: its depth is in whole numbers, and nothing says of what; give a camera "
                 'with "depth_unit_m" (0.001 where they are millimetres, 0.0002 of TUM RGB-D, '
-                "0.00390625 of KITTI), unit mm, or metres as floats"
+                "0.00390625 of KITTI), --unit mm (in Python unit='mm'), or metres as floats"
             )
         values = values.double()
     depth_m = torch.where(values > 0, values * (given_m or 1.0), torch.nan).float()

@@ -404,7 +404,7 @@ def read_model(
     if extent_m > _LARGEST_M and unit == "m":
         raise InputError(
             f"{path}: the model is {extent_m:g} m long, and no sensor sees it whole; is it in mm? "
-            "Then say unit mm (or cm)."
+            "Then say unit mm (or cm); beside depth or a cloud that is --cad-unit."
         )
     if 0 < extent_m < _SMALLEST_M and unit == "mm":
         raise InputError(
