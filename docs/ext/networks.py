@@ -22,7 +22,7 @@ from depthpose.core.config import read_config
 from depthpose.core.rigid import fit_rigid
 from depthpose.depth.losses import disparity_loss
 from depthpose.depth.stereo import PSMNet
-from depthpose.depth.synthesis import UNetGenerator, make_discriminator
+from depthpose.depth.synthesis import PatchDiscriminator, UNetGenerator
 from depthpose.depth.train.config import StereoTraining, ViewTraining
 from depthpose.pose.cloud import voxelise
 from depthpose.pose.network import ResUNet
@@ -39,7 +39,7 @@ class DepthNetworks(NamedTuple):
     """The networks of chapter 2, and the crop that they are trained on."""
 
     generator: UNetGenerator
-    discriminator: nn.Module
+    discriminator: PatchDiscriminator
     matcher: PSMNet
     crop: tuple[int, int]
 
@@ -58,11 +58,11 @@ def depth_networks() -> DepthNetworks:
     """Build the networks of configs/depth/view.yaml and stereo.yaml, without memory for weights."""
     view = read_config(CONFIGS / "depth/view.yaml", ViewTraining)
     stereo = read_config(CONFIGS / "depth/stereo.yaml", StereoTraining)
-    assert view.discriminator != "none"
+    assert view.discriminator == "patch"
     with torch.device("meta"):
         return DepthNetworks(
             UNetGenerator(view.generator),
-            make_discriminator(view.discriminator, view.discriminator_width),
+            PatchDiscriminator(view.discriminator_width),
             PSMNet(stereo.matcher).eval(),
             view.pairs.augment.crop_px,
         )
