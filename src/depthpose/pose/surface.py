@@ -32,7 +32,7 @@ _BOXES = 48
 """Boxes along the longest side of a model, for looking up what is near without searching."""
 _MARGIN = 0.15
 """Of the diameter: so far the boxes reach beyond the model."""
-_VIEWS = 128
+_VIEWS = 256
 """Directions from which a model is looked at."""
 _POINTS, _RING = 160, 64
 """Cells of a picture at most, and those beside its silhouette."""
@@ -136,7 +136,8 @@ class Surface:
     @cached_property
     def views(self) -> Views:
         """What a camera sees of the surface: looked at once for many images."""
-        toward = fibonacci_directions(_VIEWS).double()
+        half = fibonacci_directions(_VIEWS // 2).double()
+        toward = torch.cat([half, -half])
         _, _, axes = torch.linalg.svd(toward[:, None])
         # The last two rows of each frame are two axes across the direction.
         views = [_view_of(self, way, across[1:]) for way, across in zip(toward, axes, strict=True)]
