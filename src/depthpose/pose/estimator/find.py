@@ -31,7 +31,7 @@ _MOST_LOG_ODDS = 4.0
 """Proposed poses with larger log odds of being wrong are not refined and judged."""
 _ANSWERED = -0.5
 """A pose is answered where its log odds of being wrong, once refined, are below."""
-_DISAGREES, _GAP = 25.4, 255.0
+_DISAGREES, _GAP = 19.0, 244.0
 """Weights of the share of the seen surface that disagrees, and of the distance of the object's
 points to the surface, in diameters, in log odds of being wrong."""
 _BENT, _MOST_DEVIATIONS = 2.0, 4.0

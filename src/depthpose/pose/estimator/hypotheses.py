@@ -224,8 +224,8 @@ def log_odds_wrong(frame: Frame, poses: Rigid, surface: Surface) -> Float64[Tens
     """Give the log odds of poses' being wrong, by the image alone.
 
     What counts is by how much better the image agrees with a pose than with those beside it, what
-    contradicts it, and whether its silhouette is one: logistic regression on 8,395 poses of 1,873
-    searches of synthetic frames, to which :mod:`depthpose.pose.estimator.find` adds what is known
+    contradicts it, and whether its silhouette is one: logistic regression on 3,400 judged poses
+    of synthetic frames, to which :mod:`depthpose.pose.estimator.find` adds what is known
     after refinement.
 
     Args:
@@ -238,8 +238,8 @@ def log_odds_wrong(frame: Frame, poses: Rigid, surface: Surface) -> Float64[Tens
     t_m = poses.t_m[:, None] + torch.cat([aside_m, -aside_m])
     moved = Rigid(poses.R.repeat_interleave(4, 0), t_m.flatten(0, 1))
     beside = compare_with_image(frame, moved, surface).agreement.reshape(-1, 4).amax(1)
-    alike = 2.5 * (beside - seen.agreement)
-    return alike + 15.6 * seen.continued - 2.9 * seen.parted + 16.4 * seen.contradicted - 2.6
+    alike = 2.6 * (beside - seen.agreement)
+    return alike + 12.0 * seen.continued - 2.7 * seen.parted + 19.6 * seen.contradicted - 2.2
 
 
 def _posed(
