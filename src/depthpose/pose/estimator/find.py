@@ -224,21 +224,20 @@ def _without_rivals(answers: Sequence[tuple[_Candidate, PoseEstimate]]) -> list[
     return kept
 
 
-def _is_near(points_m: Tensor, pose: Rigid, surface: Surface) -> Tensor:
-    local_m = pose.double().inverse().apply(points_m.double())
-    distance_m = (local_m - surface.points_m[surface.nearest(local_m)]).norm(dim=-1)
-    return distance_m < NEAR * surface.diameter_m
-
-
 def _on_surface(
     points_m: Float64[Tensor, "h w 3"], is_read: Bool[Tensor, "h w"], pose: Rigid, surface: Surface
 ) -> Bool[Tensor, "h w"]:
     """Mark the pixels whose points lie on a posed surface."""
-    middle_m = pose.double().apply(surface.points_m.mean(0, keepdim=True))
-    found = is_read.clone()
+    pose, found = pose.double(), is_read.clone()
+    middle_m = pose.apply(surface.points_m.mean(0, keepdim=True))
     found[is_read] = (points_m[is_read] - middle_m).norm(dim=-1) < surface.diameter_m
-    if bool(found.any()):
-        found[found.clone()] = _is_near(points_m[found], pose, surface)
+    local_m, limit_m = pose.inverse().apply(points_m[found]), NEAR * surface.diameter_m
+    gap_m = (local_m - surface.points_m[surface.boxes.look_up(local_m)]).norm(dim=-1)
+    # The nearest sample is nearer than the one of the box by its diagonal at most.
+    is_open = (gap_m >= limit_m) & (gap_m < limit_m + math.sqrt(3) * surface.boxes.side_m)
+    some_m = local_m[is_open]
+    gap_m[is_open] = (some_m - surface.points_m[surface.nearest(some_m)]).norm(dim=-1)
+    found[found.clone()] = gap_m < limit_m
     return found
 
 
@@ -261,8 +260,8 @@ def is_cut_out(view: ViewInput, pose: Rigid, surface: Surface) -> bool:
         pose: of the object.
         surface: of its model.
     """
-    own = explained_mask(view, pose, surface)
     points_m = back_project(view.depth_m.double(), view.K.double())
+    own = _on_surface(points_m, points_m.isfinite().all(-1) & view.mask, pose, surface)
     plane = largest_plane(points_m[own], torch.Generator().manual_seed(0))
     if plane is None or float(is_on_plane(points_m[own], plane).double().mean()) < _FLAT:
         return False

@@ -6,7 +6,7 @@ from typing import NamedTuple
 import torch
 from jaxtyping import Bool, Float64, Int64
 from torch import Tensor
-from torch.nn.functional import max_pool2d, normalize
+from torch.nn.functional import normalize
 
 from depthpose.core.camera import project
 from depthpose.core.rigid import Rigid, perturb, rotation_by
@@ -90,7 +90,9 @@ def propose_in_frame(
     seen = compare_with_image(frame, poses, surface)
     best = _distinct(poses, seen.agreement, surface, _STAGES[-1].kept)
     best = best[seen.agreement[best] >= _LEAST_AGREEMENT]
-    return poses[best], seen.rough_log_odds[best]
+    # Of poses that are not refined yet, however well they agree.
+    log_odds = 2.9 * seen.contradicted + 20.0 * seen.continued + 3.2 * (1 - seen.parted)
+    return poses[best], log_odds[best]
 
 
 def is_no_side(frame: Frame, surface: Surface) -> Bool[Tensor, "h w"]:
@@ -179,11 +181,6 @@ class ImageEvidence(NamedTuple):
     parted: Float64[Tensor, " b"]
     contradicted: Float64[Tensor, " b"]
 
-    @property
-    def rough_log_odds(self) -> Float64[Tensor, " b"]:
-        """Log odds of being wrong of poses that are not refined yet, however well they agree."""
-        return 2.9 * self.contradicted + 20.0 * self.continued + 3.2 * (1 - self.parted)
-
 
 def compare_with_image(
     frame: Frame, poses: Rigid, surface: Surface, stage: _Stage = _STAGES[-1]
@@ -202,9 +199,7 @@ def compare_with_image(
     agrees = fits & is_side & ((cosine > _TURNED) | ~frame.is_smooth.flatten()[at.pixel])
     before = at.is_read & (gap_m < -limit_m)
     # A sensor cuts rims and edges: the camera saw through where it saw nothing near beside either.
-    least_m = torch.where(frame.depth_m > 0, frame.depth_m, torch.inf)
-    least_m = -max_pool2d(-least_m[None], 3, 1, 1).flatten()
-    through = at.is_read & (least_m[at.pixel] > posed_m[..., 2] + limit_m)
+    through = at.is_read & (frame.nearest_m.flatten()[at.pixel] > posed_m[..., 2] + limit_m)
     contradicted = through | (before & ~is_side)
     partly = (fits & ~agrees).double() + 0.4 * (before & is_side).double()
     number = posed_m[..., 2].isfinite().sum(1).clamp(min=1)
