@@ -44,13 +44,15 @@ Row = dict[str, Any]
 class Shown(NamedTuple):
     """An instance of a frame: its object, its pose, and whether it must be found.
 
-    ``is_adds``: it is measured by ADD-S, though no symmetry is declared.
+    ``is_adds``: it is measured by ADD-S, though no symmetry is declared. ``visible``: the share of
+    its silhouette that is seen.
     """
 
     model: ObjectModel
     pose: Rigid
     counts: bool
     is_adds: bool = False
+    visible: float = 1.0
 
 
 class Frame(NamedTuple):
@@ -63,17 +65,24 @@ class Frame(NamedTuple):
     known: list[ObjectModel] | None = None
 
 
-def synthetic_frames(models: Sequence[ObjectModel], number: int, pile: int) -> Iterator[Frame]:
+def synthetic_frames(
+    models: Sequence[ObjectModel], number: int, pile: int, clutter: tuple[int, int] = (0, 4),
+    first: int = 0,
+) -> Iterator[Frame]:  # fmt: skip
     """Generate tables, or piles of so many, of another seed than any training."""
-    config = ObjectsConfig(seed=SEED, distance_m=(0.6, 1.0), frame_pile=pile)
+    config = ObjectsConfig(
+        seed=SEED, distance_m=(0.6, 1.0), frame_pile=pile, frame_clutter=clutter
+    )  # fmt: skip
     least = 0.7 if pile else 0.5
     by_number = {model.number: model for model in models}
-    for frame in make_frames(models, config, number):
+    for frame in make_frames(models, config, number, first):
         shown = []
         for thing in frame.objects:
             pixels = int(thing.visible.sum())
-            counts = pixels >= 200 and pixels >= least * int(thing.silhouette.sum())
-            shown.append(Shown(by_number[thing.number], thing.camera_from_model, counts))
+            share = pixels / int(thing.silhouette.sum())
+            counts = pixels >= 200 and share >= least
+            model = by_number[thing.number]
+            shown.append(Shown(model, thing.camera_from_model, counts, visible=share))
         known = None if pile else list(models)
         yield Frame(f"frame {frame.number}", frame.depth_m, frame.K, shown, known)
 

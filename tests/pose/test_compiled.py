@@ -276,9 +276,7 @@ def test_votes_of_point_pairs(monkeypatch: pytest.MonkeyPatch) -> None:
     pose = poses(part, 1)[0]
     points_m, normals = pose.apply(part.points_m[chosen]), part.normals[chosen] @ pose.R.mT
     table, references = prepare_pairs(part), torch.arange(10)
-    first, second = both(
-        lambda: vote_poses(points_m, normals, references, table, 3, partners=120), monkeypatch
-    )
+    first, second = both(lambda: vote_poses(points_m, normals, references, table, 3), monkeypatch)
     assert len(first[1]) == 30
     assert is_near(first[1], second[1], 1e-4 * float(first[1].max()))
     is_same = (first[0].t_m - second[0].t_m).norm(dim=-1) < 1e-9

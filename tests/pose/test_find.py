@@ -20,10 +20,10 @@ from depthpose.core.camera import back_project
 from depthpose.core.errors import InputError
 from depthpose.core.rigid import Rigid
 from depthpose.pose.config import RefusalConfig
-from depthpose.pose.estimator.find import is_cut_out, nothing_found
+from depthpose.pose.estimator.find import explained_mask, is_cut_out, nothing_found
 from depthpose.pose.mesh import make_model
 from depthpose.pose.metrics import add_m
-from depthpose.pose.surface import prepare_surface
+from depthpose.pose.surface import NEAR, prepare_surface
 from depthpose.pose.types import CloudInput, ObjectModel, ViewInput
 
 TRUTHS = [pose_at(-0.13, 0.7, seed=1), pose_at(0.12, 0.9, seed=2)]
@@ -92,6 +92,20 @@ def test_a_piece_of_a_larger_plane_is_no_flat_part(
     depth_m += 0.001 * torch.randn(240, 320, generator=torch.Generator().manual_seed(0))
     view = ViewInput(name="", depth_m=depth_m, mask=mask, K=K.float(), object=model.name)
     assert is_cut_out(view, pose, prepare_surface(model)) == is_cut
+
+
+def test_readings_on_a_posed_surface_are_all_that_are_near_it() -> None:
+    """A noisy sensor, so that many are about as far off as what counts as near."""
+    model, pose = bracket(), TRUTHS[0].double()
+    surface, noise = prepare_surface(model), torch.Generator().manual_seed(0)
+    depth_m = (table() + 0.01 * torch.randn(240, 320, generator=noise)).double()
+    local_m = pose.inverse().apply(back_project(depth_m, K.double()))
+    distance_m = torch.from_numpy(surface.tree.query(local_m.numpy())[0])
+    view = ViewInput(name="", depth_m=depth_m.float(), mask=depth_m > 0, K=K.float(),
+                     object=model.name)  # fmt: skip
+    found, near = explained_mask(view, pose, surface), distance_m < NEAR * surface.diameter_m
+    assert int(near.sum()) > 500
+    assert int((found != near).sum()) < 3, "but for rounding"
 
 
 def test_what_the_camera_saw_through_a_found_pose_counts() -> None:

@@ -108,3 +108,16 @@ def test_points_at_and_behind_the_camera_are_no_part_of_what_it_saw(
 def test_a_surface_knows_the_poses_that_look_alike(surface: Surface) -> None:
     assert len(prepare_surface(bottle()).copies.R) > 30
     assert len(surface.copies.R) == 1
+
+
+def test_a_camera_on_any_side_has_a_view_from_nearby(surface: Surface) -> None:
+    """Below the model too: a view of another side shows points that the camera does not see."""
+    ways = torch.randn(500, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    ways = torch.nn.functional.normalize(ways, dim=-1)
+    cosine, side = (ways @ surface.views.toward.T).max(-1)
+    assert float(cosine.min()) > np.cos(np.radians(12))
+    for way, points_m in zip(ways[:20], surface.views.points_m[side[:20]], strict=True):
+        top_m = points_m[points_m.isfinite().all(-1)] @ way
+        assert (
+            float(top_m.max()) > float((surface.points_m @ way).max()) - 0.05 * surface.diameter_m
+        )

@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 import torch
@@ -9,7 +10,7 @@ from jaxtyping import Bool, Float, Float64, Int64
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 from torch import Tensor
-from torch.nn.functional import normalize, pad
+from torch.nn.functional import max_pool2d, normalize, pad
 
 from depthpose.core.arrays import take_evenly
 from depthpose.core.camera import back_project
@@ -67,6 +68,12 @@ class Frame:
     normals: Float64[Tensor, "h w 3"]
     is_smooth: Bool[Tensor, "h w"]
     plane_m: Float64[Tensor, "h w"]
+
+    @cached_property
+    def nearest_m(self) -> Float64[Tensor, "h w"]:
+        """Least depth that a pixel or one beside it has; infinite where there is no reading."""
+        depth_m = torch.where(self.depth_m > 0, self.depth_m, torch.inf)
+        return -max_pool2d(-depth_m[None], 3, 1, 1)[0]
 
 
 def prepare_frame(depth_m: Float[Tensor, "h w"], K: Float[Tensor, "3 3"]) -> Frame:

@@ -26,7 +26,7 @@ farther off counts as if it lay there."""
 _FRONT = 0.1  # points nearer to the camera than this share of the median are no part of what it saw
 _BOXES = 48  # boxes along the longest side of a model, to look up what is near without a search
 _MARGIN = 0.15  # of the diameter: so far the boxes reach beyond the model
-_VIEWS = 128  # directions from which a model is looked at
+_VIEWS = 256  # directions from which a model is looked at
 _POINTS, _RING = 160, 64  # cells of a picture at most, and those beside its silhouette
 BESIDE = 0.08
 """Of the diameter: where what is beside a silhouette is no farther than so much from its border in
@@ -104,7 +104,8 @@ class Surface:
     @cached_property
     def views(self) -> Views:
         """What a camera sees of the surface: looked at once for many images."""
-        toward = fibonacci_directions(_VIEWS).double()
+        half = fibonacci_directions(_VIEWS // 2).double()
+        toward = torch.cat([half, -half])
         _, _, axes = torch.linalg.svd(toward[:, None])
         # The last two rows of each frame are two axes across the direction.
         views = [_view_of(self, way, across[1:]) for way, across in zip(toward, axes, strict=True)]

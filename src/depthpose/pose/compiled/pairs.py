@@ -10,7 +10,6 @@ Array = np.ndarray
 def pair_peaks(
     points_m: Array,
     frames: Array,
-    partners: int,
     references: Array,
     bounds: Array,
     first: Array,
@@ -24,7 +23,6 @@ def pair_peaks(
     Args:
         points_m: of the scene, (n, 3).
         frames: normal and two tangents of each as columns, (n, 3, 3).
-        partners: the first so many of the points are second ones.
         references: numbers of the points that vote, (r,).
         bounds: of the pairs of each feature.
         first: points of the model that are first in a pair.
@@ -42,8 +40,8 @@ def pair_peaks(
     shape = (len(references), min(peaks, models))
     point, turn, votes = np.zeros(shape, np.int64), np.zeros(shape, np.int64), np.zeros(shape)
     _vote(
-        finite_array(points_m), finite_array(frames), partners, references, bounds, first, turn_rad,
-        models, step_m, point, turn, votes,
+        finite_array(points_m), finite_array(frames), references, bounds, first, turn_rad,
+        models, step_m, MOST_ALIKE, point, turn, votes,
     )  # fmt: skip
     return point, turn, votes
 
@@ -68,7 +66,7 @@ def _feature(points, frames, i, j, far, step, value):
 
 @compiled
 def _vote(
-    points, frames, partners, references, bounds, first, turns, models, step, out_point, out_turn,
+    points, frames, references, bounds, first, turns, models, step, alike, out_point, out_turn,
     out_votes,
 ):  # fmt: skip
     counts = np.zeros((models, TURNS), np.float32)
@@ -79,7 +77,7 @@ def _vote(
         i = references[r]
         counts[:] = 0
         seen[:] = 0
-        for j in range(partners):
+        for j in range(len(points)):
             square = 0.0
             for c in range(3):
                 square += (points[j, c] - points[i, c]) ** 2
@@ -102,7 +100,7 @@ def _vote(
                     continue
                 seen[key] |= bit
                 weight = np.float32(1 / np.sqrt(high - low))
-                for p in range(low, min(high, low + MOST_ALIKE)):
+                for p in range(low, min(high, low + alike)):
                     t = (turn - turns[p]) * (TURNS / (2 * np.pi))
                     b = int(t + TURNS if t < 0 else t)
                     b = b - TURNS if b >= TURNS else b

@@ -248,7 +248,8 @@ class PoseEstimator(ABC):
             pose_near=self._pose_near,
             max_size_error=self.refusal.max_size_error,
         )
-        return find_objects(view, known)
+        found = find_objects(view, known)
+        return [with_status(estimate, self.config.min_certainty) for estimate in found]
 
     def track(
         self,

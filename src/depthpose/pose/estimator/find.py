@@ -29,15 +29,18 @@ from depthpose.pose.voting.point_pairs import PairTable
 
 _MOST_LOG_ODDS = 4.0
 """Proposed poses with larger log odds of being wrong are not refined and judged."""
-_BEHIND_BEST = 2.0
-"""Of each object answers are kept up to so much above the log odds of its best one."""
-_DISAGREES = 6.7
-"""Weight of the share of the seen surface that disagrees, in log odds of being wrong."""
+_ANSWERED = -0.5
+"""A pose is answered where its log odds of being wrong, once refined, are below."""
+_DISAGREES, _GAP = 19.0, 244.0
+"""Weights of the share of the seen surface that disagrees, and of the distance of the object's
+points to the surface, in diameters, in log odds of being wrong."""
 _BENT, _MOST_DEVIATIONS = 2.0, 4.0
 """A sensor bends what it sees: a fitted size deviates by so many times what its noise explains. A
 size that is off by more deviations than the second counts as one that is off by these."""
 _MOST_JUDGED, _LEAST_JUDGED = 40, 4
 """Poses that are judged in an image, and of each object at least."""
+_ROUNDS = 3
+"""So often an image is searched for an object that is there more than once, at most."""
 _MOST_TOGETHER, _NEARLY = 8, 0.2
 """Poses of one object at one place at most; the readings that one of them explains are the
 object's, if its log odds are at most so much above those of the best there."""
@@ -106,31 +109,46 @@ def find_objects(view: ViewInput, known: SearchTargets) -> list[PoseEstimate]:
     Point pairs of the whole image vote for poses of each object. Those with which the image agrees
     are gathered by the points that they explain, from which the object is estimated. Where poses of
     several objects explain the same, they share the probability of one by the evidence against
-    each, and where none has most of it none is answered.
+    each, and where none has most of it none is answered. Where an object is there more than once,
+    the rest of the image is searched for more of it.
 
     Args:
         view: depth and camera; its mask limits where is looked.
         known: what for.
     """
     frame = prepare_frame(torch.where(view.mask, view.depth_m, torch.nan), view.K)
-    groups: list[list[_Candidate]] = []
-    for one in _candidates(frame, known):
-        same = (some for some in groups if some[0].object == one.object)
-        own = next((some for some in same if one.shared_with(some[0]) > _RIVAL), None)
-        if own is None:
-            groups.append([one])
-        elif len(own) < _MOST_TOGETHER:
-            own.append(one)
-    found = _without_rivals(_judged(groups, frame, view, known))
-    return [replace(one, name=f"{view.name}_{k}") for k, one in enumerate(found)]
+    found = list[tuple[_Candidate, PoseEstimate]]()
+    names, is_left = known.names, torch.ones_like(frame.depth_m, dtype=torch.bool)
+    for _ in range(_ROUNDS):
+        groups: list[list[_Candidate]] = []
+        for one in _candidates(frame, is_left, replace(known, names=names)):
+            if any(one.shared_with(other) > _SHARED for other, _ in found):
+                continue
+            same = (some for some in groups if some[0].object == one.object)
+            own = next((some for some in same if one.shared_with(some[0]) > _RIVAL), None)
+            if own is None:
+                groups.append([one])
+            elif len(own) < _MOST_TOGETHER:
+                own.append(one)
+        more = _without_rivals(_judged(groups, frame, view, known), [one for one, _ in found])
+        found += more
+        for one, _ in more:
+            is_left &= ~one.explained
+        count = Counter(one.object for one, _ in found)
+        names = sorted({one.object for one, _ in more if count[one.object] > 1})
+        if not names:
+            break
+    return [replace(estimate, name=f"{view.name}_{k}") for k, (_, estimate) in enumerate(found)]
 
 
-def _candidates(frame: Frame, known: SearchTargets) -> list[_Candidate]:
+def _candidates(
+    frame: Frame, is_left: Bool[Tensor, "h w"], known: SearchTargets
+) -> list[_Candidate]:
     """Propose poses of every object, and take the likeliest of all, and of each object some."""
 
     def propose(name: str) -> list[_Proposal]:
         surface, pairs = known.surface_of(name), known.pairs_of(name)
-        poses, log_odds = propose_in_frame(frame, surface, pairs, len(known.names))
+        poses, log_odds = propose_in_frame(frame, is_left, surface, pairs, len(known.names))
         likely = (log_odds < _MOST_LOG_ODDS).nonzero()[:_MOST_JUDGED, 0].tolist()
         return [
             _Proposal(object=name, pose=poses[k], log_odds=float(log_odds[k]), rank=rank)
@@ -169,17 +187,15 @@ def _judged(
         surface = known.surface_of(estimate.object)
         pose, fit = estimate.camera_from_model.double(), estimate.fit
         assert fit is not None
-        log_odds = float(log_odds_wrong(frame, pose[None], surface)) + _DISAGREES * (1 - fit.agrees)
+        log_odds = float(log_odds_wrong(frame, pose[None], surface))
+        log_odds += _DISAGREES * (1 - fit.agrees) + _GAP * estimate.signals["gap"]
         off = size_deviations(estimate, view, surface, known.max_size_error)
         log_odds += 0.5 * min(off, _MOST_DEVIATIONS) ** 2  # of a normal distribution
-        if log_odds < 0 and not is_cut_out(view, pose, surface):
+        if log_odds < _ANSWERED and not is_cut_out(view, pose, surface):
             own = _explained(frame, pose, surface)
             one = _Candidate(object=estimate.object, pose=pose, log_odds=log_odds, explained=own)
             answers.append((one, estimate))
-    best: dict[str, float] = {}
-    for one, _ in answers:
-        best[one.object] = min(one.log_odds, best.get(one.object, math.inf))
-    return [both for both in answers if both[0].log_odds < best[both[0].object] + _BEHIND_BEST]
+    return answers
 
 
 def size_deviations(
@@ -206,9 +222,11 @@ def size_deviations(
     return abs(identity.size - 1) / expected
 
 
-def _without_rivals(answers: Sequence[tuple[_Candidate, PoseEstimate]]) -> list[PoseEstimate]:
+def _without_rivals(
+    answers: Sequence[tuple[_Candidate, PoseEstimate]], before: Sequence[_Candidate]
+) -> list[tuple[_Candidate, PoseEstimate]]:
     """Keep answers from the surest down that explain what none before does, if they are likely."""
-    kept, taken = list[PoseEstimate](), list[_Candidate]()
+    kept, taken = list[tuple[_Candidate, PoseEstimate]](), list(before)
     for one, estimate in sorted(answers, key=lambda answer: answer[0].log_odds):
         if any(one.shared_with(other) > _SHARED for other in taken):
             continue
@@ -220,25 +238,24 @@ def _without_rivals(answers: Sequence[tuple[_Candidate, PoseEstimate]]) -> list[
         log_odds = torch.tensor([log_odds for log_odds, _ in rivals.values()], dtype=torch.float64)
         best, share = _given_others([its for _, its in rivals.values()], (-log_odds).softmax(0))
         if share >= _LEAST_SHARE:  # else it may be another object
-            kept.append(best)
+            kept.append((one, _less_sure(best, 1 / (1 + math.exp(one.log_odds)))))
     return kept
-
-
-def _is_near(points_m: Tensor, pose: Rigid, surface: Surface) -> Tensor:
-    local_m = pose.double().inverse().apply(points_m.double())
-    distance_m = (local_m - surface.points_m[surface.nearest(local_m)]).norm(dim=-1)
-    return distance_m < NEAR * surface.diameter_m
 
 
 def _on_surface(
     points_m: Float64[Tensor, "h w 3"], is_read: Bool[Tensor, "h w"], pose: Rigid, surface: Surface
 ) -> Bool[Tensor, "h w"]:
     """Mark the pixels whose points lie on a posed surface."""
-    middle_m = pose.double().apply(surface.points_m.mean(0, keepdim=True))
-    found = is_read.clone()
+    pose, found = pose.double(), is_read.clone()
+    middle_m = pose.apply(surface.points_m.mean(0, keepdim=True))
     found[is_read] = (points_m[is_read] - middle_m).norm(dim=-1) < surface.diameter_m
-    if bool(found.any()):
-        found[found.clone()] = _is_near(points_m[found], pose, surface)
+    local_m, limit_m = pose.inverse().apply(points_m[found]), NEAR * surface.diameter_m
+    gap_m = (local_m - surface.points_m[surface.boxes.look_up(local_m)]).norm(dim=-1)
+    # The nearest sample is nearer than the one of the box by its diagonal at most.
+    is_open = (gap_m >= limit_m) & (gap_m < limit_m + math.sqrt(3) * surface.boxes.side_m)
+    some_m = local_m[is_open]
+    gap_m[is_open] = (some_m - surface.points_m[surface.nearest(some_m)]).norm(dim=-1)
+    found[found.clone()] = gap_m < limit_m
     return found
 
 
@@ -261,8 +278,8 @@ def is_cut_out(view: ViewInput, pose: Rigid, surface: Surface) -> bool:
         pose: of the object.
         surface: of its model.
     """
-    own = explained_mask(view, pose, surface)
     points_m = back_project(view.depth_m.double(), view.K.double())
+    own = _on_surface(points_m, points_m.isfinite().all(-1) & view.mask, pose, surface)
     plane = largest_plane(points_m[own], torch.Generator().manual_seed(0))
     if plane is None or float(is_on_plane(points_m[own], plane).double().mean()) < _FLAT:
         return False
@@ -334,12 +351,17 @@ def _given_others(some: Sequence[PoseEstimate], shares: Tensor) -> tuple[PoseEst
     """Take the likeliest; the others lower its certainty."""
     number = int(shares.argmax())
     share, estimate = float(shares[number]), some[number]
-    certainty = None if estimate.certainty is None else share * estimate.certainty
-    others = tuple(replace(a, probability=share * a.probability) for a in estimate.alternatives)
-    found = replace(estimate, certainty=certainty, alternatives=others)
+    found = _less_sure(estimate, share)
     if len(some) > 1 and estimate.identity is not None and share < 1 - _NAMED:
         second = some[int(shares.topk(2).indices[1])].object
         reason = f"it may be {second} ({1 - share:.0%} for all other objects)"
         identity = replace(estimate.identity, status="not excluded", other=second, reason=reason)
         found = replace(found, identity=identity)
     return found, share
+
+
+def _less_sure(estimate: PoseEstimate, share: float) -> PoseEstimate:
+    """Give a pose and its alternatives together so much of their probability."""
+    certainty = None if estimate.certainty is None else share * estimate.certainty
+    others = tuple(replace(a, probability=share * a.probability) for a in estimate.alternatives)
+    return replace(estimate, certainty=certainty, alternatives=others)

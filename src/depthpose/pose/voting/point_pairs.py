@@ -205,7 +205,6 @@ def vote_poses(
     references: Int64[Tensor, " r"],
     table: PairTable,
     peaks: int,
-    partners: int | None = None,
 ) -> tuple[Rigid, Float64[Tensor, " b"]]:
     """Let every pair of a reference point vote for a model point and a turn about its normal.
 
@@ -219,42 +218,44 @@ def vote_poses(
         references: numbers of the points that vote with each of the others.
         table: pairs of the model.
         peaks: poses that each reference proposes.
-        partners: the first so many of the points are those others; None: all are.
 
     Returns:
         Poses and their votes, reference after reference.
     """
     frames = _frames(normals)
-    partners = len(points_m) if partners is None else min(partners, len(points_m))
     if serves(points_m):
         from depthpose.pose.compiled.pairs import pair_peaks
 
         found = pair_peaks(
-            points_m.numpy(), frames.numpy(), partners, references.numpy(), table.bounds.numpy(),
+            points_m.numpy(), frames.numpy(), references.numpy(), table.bounds.numpy(),
             table.first.numpy(), table.turn_rad.numpy(), len(table.points_m), peaks,
             STEP * table.diameter_m,
         )  # fmt: skip
         number, bin_, votes = (torch.from_numpy(a).flatten() for a in found)
     else:
-        chunks = [_peaks(points_m, frames, partners, some, table, peaks)
+        chunks = [_peaks(points_m, frames, some, table, peaks)
                   for some in references.split(20)]  # fmt: skip
         number, bin_, votes = (torch.cat(parts) for parts in zip(*chunks, strict=True))
-    angle = (bin_ + 0.5) * (2 * math.pi / TURNS)
+    # Model points and their normals on reference points, turned about the normals.
+    angle = ((bin_ + 0.5) * (2 * math.pi / TURNS)).double()
     reference = references.repeat_interleave(peaks)
-    return _poses(points_m, frames, table, reference, number, angle.double()), votes
+    one, zero, c, s = torch.ones_like(angle), torch.zeros_like(angle), angle.cos(), angle.sin()
+    turn = torch.stack([one, zero, zero, zero, c, -s, zero, s, c], -1).reshape(-1, 3, 3)
+    R = frames[reference] @ turn @ table.frames[number].mT
+    t_m = points_m[reference] - (R @ table.points_m[number][..., None]).squeeze(-1)
+    return Rigid(R, t_m), votes
 
 
 def _peaks(
     points_m: Float64[Tensor, "n 3"],
     frames: Float64[Tensor, "n 3 3"],
-    partners: int,
     references: Int64[Tensor, " r"],
     table: PairTable,
     peaks: int,
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Vote without numba: numbers of model points, bins of turns and votes."""
     count, models = len(references), len(table.points_m)
-    far_m = (points_m[references, None] - points_m[:partners]).norm(dim=-1)
+    far_m = (points_m[references, None] - points_m).norm(dim=-1)
     used = (far_m > STEP * table.diameter_m) & (far_m < DISTANCES * STEP * table.diameter_m)
     row, second = used.nonzero(as_tuple=True)
     feature, turn_rad = _features(points_m, frames, references[row], second, table.diameter_m)
@@ -285,21 +286,6 @@ def _peaks(
     most, bins = votes.max(-1)
     best = most.topk(min(peaks, models))
     return best.indices.flatten(), bins.gather(1, best.indices).flatten(), best.values.flatten()
-
-
-def _poses(
-    points_m: Float64[Tensor, "n 3"],
-    frames: Float64[Tensor, "n 3 3"],
-    table: PairTable,
-    reference: Int64[Tensor, " b"],
-    number: Int64[Tensor, " b"],
-    angle: Float64[Tensor, " b"],
-) -> Rigid:
-    """Lay model points and their normals on reference points, and turn about the normals."""
-    one, zero, c, s = torch.ones_like(angle), torch.zeros_like(angle), angle.cos(), angle.sin()
-    turn = torch.stack([one, zero, zero, zero, c, -s, zero, s, c], -1).reshape(-1, 3, 3)
-    R = frames[reference] @ turn @ table.frames[number].mT
-    return Rigid(R, points_m[reference] - (R @ table.points_m[number][..., None]).squeeze(-1))
 
 
 def _scores(
