@@ -1,6 +1,9 @@
 """Objects by their models alone in whole depth images: planes, votes, and what is answered."""
 
+import resource
 import time
+from collections.abc import Sequence
+from dataclasses import replace
 
 import pytest
 import torch
@@ -9,7 +12,7 @@ from tests.pose.synthetic_objects import CAMERA, K, bracket, pose_at, view_of
 from depthpose.core.camera import Camera
 from depthpose.core.rigid import Rigid
 from depthpose.pose.estimator import Registration
-from depthpose.pose.estimator.find import size_deviations
+from depthpose.pose.estimator.find import SearchTargets, find_objects, size_deviations
 from depthpose.pose.estimator.hypotheses import (
     compare_with_image,
     log_odds_wrong,
@@ -17,9 +20,10 @@ from depthpose.pose.estimator.hypotheses import (
 )
 from depthpose.pose.estimator.inputs import view_input
 from depthpose.pose.frame import prepare_frame
+from depthpose.pose.mesh import make_model
 from depthpose.pose.metrics import add_m
 from depthpose.pose.surface import prepare_surface
-from depthpose.pose.types import Identity, PoseEstimate
+from depthpose.pose.types import CloudInput, Identity, ObjectModel, PoseEstimate
 from depthpose.pose.voting.point_pairs import prepare_pairs
 
 TRUTHS = [pose_at(-0.13, 0.7, seed=1), pose_at(0.12, 0.9, seed=2)]
@@ -99,19 +103,37 @@ def test_the_image_agrees_with_the_true_pose_and_with_none_beside_it() -> None:
     assert float(seen.parted[0]) > 0.8
     log_odds = log_odds_wrong(frame, Rigid.stack([truth, *aside]), surface)
     assert float(log_odds[0]) < -2
-    assert float(log_odds[1:].min()) > 0
+    assert float(log_odds[1:].min()) > float(log_odds[0]) + 1.5, "before what a refined pose adds"
+
+
+def nearest_m(poses: Rigid, truth: Rigid, model: ObjectModel) -> float:
+    each = (poses[k].float() for k in range(len(poses.t_m)))
+    return min(float(add_m(pose, truth, model.vertices_m)) for pose in each)
 
 
 def test_point_pairs_propose_every_instance() -> None:
     model = bracket()
     surface = prepare_surface(model)
     frame = prepare_frame(table(), K)
-    poses, log_odds = propose_in_frame(frame, surface, prepare_pairs(surface))
-    assert bool((log_odds.diff() >= 0).all())
+    everywhere = torch.ones(frame.depth_m.shape, dtype=torch.bool)
+    poses, log_odds = propose_in_frame(frame, everywhere, surface, prepare_pairs(surface))
+    agreement = compare_with_image(frame, poses, surface).agreement
+    assert bool((agreement.diff() <= 1e-9).all()), "what the image agrees with best comes first"
+    assert len(log_odds) == len(agreement)
     for truth in TRUTHS:
-        errors = [float(add_m(pose.float(), truth, model.vertices_m)) for pose in
-                  (poses[k] for k in range(len(log_odds)))]  # fmt: skip
-        assert min(errors) < 0.03 * model.diameter_m
+        assert nearest_m(poses, truth, model) < 0.03 * model.diameter_m
+
+
+def test_what_is_no_longer_left_votes_for_nothing() -> None:
+    """Without the pixels of one of two instances, the other is proposed alone."""
+    model = bracket()
+    surface = prepare_surface(model)
+    frame = prepare_frame(table(), K)
+    middle_m = TRUTHS[0].apply(model.vertices_m.mean(0, keepdim=True)).double()[0]
+    is_left = ~((frame.points_m - middle_m).norm(dim=-1) < model.diameter_m)
+    poses, _ = propose_in_frame(frame, is_left, surface, prepare_pairs(surface))
+    assert nearest_m(poses, TRUTHS[0], model) > 0.3 * model.diameter_m
+    assert nearest_m(poses, TRUTHS[1], model) < 0.03 * model.diameter_m
 
 
 @pytest.mark.parametrize(
@@ -130,6 +152,43 @@ def test_where_nothing_is_nothing_is_found_soon(depth_m: torch.Tensor, net: Regi
     began = time.process_time()
     assert net.find(depth_m, Camera(width=width, height=height, K=small)) == []
     assert time.process_time() - began < 10
+
+
+def test_a_model_larger_than_the_view_has_an_answer_soon() -> None:
+    """Of a part ten times as large a corner fills the image: an answer or none, in bounded time."""
+    small = bracket()
+    large = make_model(10 * small.vertices_m, small.faces, name="large")
+    began = time.process_time()
+    found = Registration([large]).find(table(), CAMERA)
+    assert all(estimate.object == "large" for estimate in found)
+    assert not any(estimate.is_ok for estimate in found), "two small parts before a wall are none"
+    assert time.process_time() - began < 20
+
+
+@pytest.mark.slow
+def test_a_hundred_models_take_bounded_time_and_memory(net: Registration) -> None:
+    """A hundred of one shape: what is there may be any of them, so none is answered."""
+    view = view_input(table(), None, CAMERA, "bracket", "input", None)
+    judged = list[int]()
+
+    def pose_near(inputs: Sequence[CloudInput], poses: Sequence[Rigid]) -> list[PoseEstimate]:
+        judged.append(len(inputs))
+        given = [replace(one, object="bracket") for one in inputs]
+        found = net._pose_near(given, poses)
+        return [replace(e, object=one.object) for e, one in zip(found, inputs, strict=True)]
+
+    known = SearchTargets(
+        names=[f"part {k}" for k in range(100)],
+        surface_of=lambda _: net._surface(0),
+        pairs_of=lambda _: net._pairs(0),
+        pose_near=pose_near,
+        max_size_error=net.refusal.max_size_error,
+    )
+    began, before = time.process_time(), resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    assert find_objects(view, known) == []
+    assert judged[0] <= 400
+    assert time.process_time() - began < 120
+    assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 1_000_000, "1 GB, in kB"
 
 
 def test_every_instance_is_found_once_and_nothing_else(net: Registration) -> None:
