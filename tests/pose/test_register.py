@@ -1,5 +1,6 @@
 """Poses without training: point pairs of a CAD file and of a cloud, ICP, refusal."""
 
+import pickle
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
@@ -54,6 +55,12 @@ def test_poses_of_a_part_that_no_training_saw_are_right_or_refused() -> None:
 
 def test_what_it_registers_is_said() -> None:
     assert repr(registration()) == "Registration(of connector)"
+
+
+def test_another_process_can_be_given_it() -> None:
+    registration().estimate_many([view(part(), 0).input])  # what it keeps of its model goes along
+    other = pickle.loads(pickle.dumps(registration()))  # noqa: S301 - our own bytes
+    assert other.objects == registration().objects
 
 
 def test_two_threads_give_what_one_gives_and_an_error_costs_nothing() -> None:

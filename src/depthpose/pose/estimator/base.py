@@ -4,7 +4,6 @@ import time
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Iterator, Sequence, Sized
 from dataclasses import replace
-from functools import cache
 from pathlib import Path
 from typing import TypeVar
 
@@ -57,10 +56,10 @@ class PoseEstimator(ABC):
         self.config = EstimateConfig() if config is None else config
         self.models, self.refusal = tuple(models), refusal
         self._numbers = {model.name: k for k, model in enumerate(models)}
-        # What is made of a model, by its number, is made when it is first asked for.
-        self._surface = cache(self._make_surface)
-        self._copies_of = cache(self._make_copies)
-        self._pairs: Callable[[int], PairTable] = cache(lambda k: prepare_pairs(self._surface(k)))
+        # What is made of a model, by its number, when it is first asked for.
+        self._surfaces: dict[int, Surface] = {}
+        self._copies: dict[int, PoseAmbiguities] = {}
+        self._prepared_pairs: dict[int, PairTable] = {}
 
     @property
     def objects(self) -> tuple[str, ...]:
@@ -331,11 +330,22 @@ class PoseEstimator(ABC):
         self._number(name)
         return name
 
-    def _make_surface(self, number: int) -> Surface:
-        return prepare_surface(self.models[number], self.config.icp.surface_points)
+    def _surface(self, number: int) -> Surface:
+        if number not in self._surfaces:
+            model = self.models[number]
+            self._surfaces[number] = prepare_surface(model, self.config.icp.surface_points)
+        return self._surfaces[number]
 
-    def _make_copies(self, number: int) -> PoseAmbiguities:
-        return find_copies(self.models[number], up_to_symmetry=self.config.up_to_symmetry)
+    def _copies_of(self, number: int) -> PoseAmbiguities:
+        if number not in self._copies:
+            up_to_symmetry = self.config.up_to_symmetry
+            self._copies[number] = find_copies(self.models[number], up_to_symmetry=up_to_symmetry)
+        return self._copies[number]
+
+    def _pairs(self, number: int) -> PairTable:
+        if number not in self._prepared_pairs:
+            self._prepared_pairs[number] = prepare_pairs(self._surface(number))
+        return self._prepared_pairs[number]
 
     def _number(self, name: str) -> int:
         if not isinstance(name, str):
