@@ -59,7 +59,7 @@ def test_what_it_registers_is_said() -> None:
 
 def test_another_process_can_be_given_it() -> None:
     registration().estimate_many([view(part(), 0).input])  # what it keeps of its model goes along
-    other = pickle.loads(pickle.dumps(registration()))  # noqa: S301 - our own bytes
+    other = pickle.loads(pickle.dumps(registration()))
     assert other.objects == registration().objects
 
 
