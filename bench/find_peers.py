@@ -43,7 +43,6 @@ from find_tables import Frame, measure, registration, synthetic_frames
 from depthpose.core.camera import Camera
 from depthpose.core.files import write_depth_png
 from depthpose.core.rigid import Rigid
-from depthpose.pose.baselines import FpfhRegistration
 from depthpose.pose.config import EvaluationConfig
 from depthpose.pose.datasets import Instance
 from depthpose.pose.estimator.hypotheses import is_no_side
@@ -58,6 +57,7 @@ from depthpose.pose.synthetic.parts import PARTS, make_part
 from depthpose.pose.types import CloudInput, ObjectModel, PoseEstimate
 from depthpose.pose.voting.point_pairs import thin
 from depthpose.report.page import markdown_table
+from depthpose.thesis.fpfh import FpfhEstimator
 
 KINDS = {"piles": (20, (0, 4)), "tables": (0, (0, 4)), "clutter": (0, (8, 16))}
 """By kind how many copies lie on a pile, and how many other things on a table."""
@@ -135,11 +135,11 @@ def open3d(frame: Frame, counts: dict[str, int]) -> list[PoseEstimate]:
         peer, surface = prepared("open3d", model_of(frame, name))
         used = seen.is_smooth & ~is_no_side(seen, surface)
         label = label_regions(seen.depth_m, used)
-        posed = list[PoseEstimate]()
-        for k in torch.bincount(label[used]).ge(LEAST_PIXELS).nonzero()[:, 0]:
-            points_m = seen.points_m[used & (label == k)]
-            posed.append(peer.estimate(CloudInput(name="", points_m=points_m, object=name)))
-        posed = [one for one in posed if one.is_posed]
+        clouds = [
+            CloudInput(name="", points_m=seen.points_m[used & (label == k)], object=name)
+            for k in torch.bincount(label[used]).ge(LEAST_PIXELS).nonzero()[:, 0]
+        ]
+        posed = [one for one in peer.estimate_many(clouds) if one.is_posed]
         posed.sort(key=lambda one: -(one.inlier_share or 0.0))
         matrices = list[torch.Tensor]()
         for pose in (one.camera_from_model for one in posed):
@@ -164,7 +164,7 @@ def prepared(method: str, model: ObjectModel) -> Any:  # noqa: ANN401  neither p
     if (method, model.name) not in _PREPARED:
         surface = prepare_surface(model)
         if method == "open3d":
-            _PREPARED[method, model.name] = FpfhRegistration(model), surface
+            _PREPARED[method, model.name] = FpfhEstimator([model]), surface
         else:
             import cv2
 
