@@ -191,8 +191,8 @@ class GeoPoseNet(PoseEstimator):
         """Give the registration of the same objects, which shares what was prepared of them."""
         if self._registration is None:
             config = replace(self.config, register_refused=False, with_icp=True)
-            both = self._registration = Registration(self.models, config)
-            both._surface, both._copies_of = self._surface, self._copies_of
+            self._registration = Registration(self.models, config)
+            self._registration._surfaces, self._registration._copies = self._surfaces, self._copies
         return self._registration
 
     def _pose_near(
