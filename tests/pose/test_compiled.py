@@ -16,7 +16,6 @@ from torch import Tensor
 from depthpose.core.errors import Notice
 from depthpose.core.rigid import Rigid, rotation_by
 from depthpose.pose import compiled
-from depthpose.pose.cloud import local_planes
 from depthpose.pose.config import IcpConfig
 from depthpose.pose.estimator.fit import scale_of
 from depthpose.pose.network import ResUNet, ResUNetConfig
@@ -200,7 +199,6 @@ def test_what_is_not_finite_is_refused(surface: Surface) -> None:
     strange = Rigid(pose.R, pose.t_m * torch.nan)
     calls = (
         lambda: surface.nearest(cloud_m),
-        lambda: local_planes(cloud_m, cloud_m),
         lambda: look_along_rays(cloud_m, pose, surface),
         lambda: look_along_rays(cloud_m[5:], strange, surface),
         lambda: refine_roughly(cloud_m[5:], strange, surface, IcpConfig()),
@@ -285,7 +283,10 @@ def test_votes_of_point_pairs(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.mark.slow
 def test_the_rest_of_the_tests_with_torch_alone() -> None:
-    """Edge cases are tested once, by what is installed: here without numba."""
+    """Edge cases are tested once, by what is installed: here without numba.
+
+    Searches for alternatives have one form, and their refinement is that of ``refine``.
+    """
     names = ("refine", "surface", "voting", "scale", "mirror", "sparse", "cloud",
              "refusal", "keypoint_pose", "network", "estimator")  # fmt: skip
     files = [f"tests/pose/test_{name}.py" for name in names]

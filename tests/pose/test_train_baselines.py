@@ -133,7 +133,7 @@ def test_weights_of_the_other_kind_are_refused_with_the_class_to_take(
 ) -> None:
     votes = STAGES["pointnet"][1](pointnet_config(models_folder), Run(folder=tmp_path / "p"))
     depth = STAGES["depth-image"][1](depth_image_config(models_folder), Run(folder=tmp_path / "d"))
-    with pytest.raises(InputError, match="load them as DepthImageRegressor"):
+    with pytest.raises(InputError, match="to DepthImageRegressor"):
         GeoPoseNet.load(depth)
     with pytest.raises(InputError, match="load them as GeoPoseNet"):
         DepthImageRegressor(read_pose_weights(votes))

@@ -17,7 +17,7 @@ from depthpose.core.rigid import Rigid, geodesic_rad
 VSD_DELTA_M = 0.015  #: tolerance of visibility [m]; BOP takes 15 mm for all sets but ITODD (5 mm)
 BOP_SHARES = tuple(round(0.05 * i, 2) for i in range(1, 11))
 """BOP's taus of VSD and thresholds of VSD and MSSD: 0.05 to 0.5 (of the diameter)."""
-BOP_PIXELS = tuple(5.0 * i for i in range(1, 11))  #: thresholds of MSPD [px], at 640 px width
+BOP_PIXELS = tuple(5.0 * i for i in range(1, 11))  #: BOP's, of MSPD [px], at 640 px width
 
 SUCCESS_SHARE = 0.1  #: of the diameter: a pose is right whose ADD or ADD-S is below
 

@@ -64,7 +64,7 @@ class PoseTruth:
     """What is known about the object of a sample."""
 
     camera_from_model: Rigid  #: its pose
-    visible_fraction: float | None = None  #: share of its silhouette that is seen; None: unknown
+    visible_fraction: float | None = None  #: not occluded share of its silhouette, 0..1
     is_measured: bool = True  #: whether the pose was annotated, not itself fitted to the same depth
 
 
@@ -114,7 +114,7 @@ class Symmetries:
     #: ``model_from_model``, the identity not among them; None where there is none.
     discrete: Rigid | None = None
     continuous: tuple[Axis, ...] = ()  #: axes of revolution
-    is_found: bool = False  #: whether they were found in the geometry, and not declared
+    is_found: bool = False  #: found in the geometry, within a tolerance, and not declared
 
     @property
     def is_none(self) -> bool:
@@ -221,7 +221,7 @@ class Identity:
     """Whether what was posed is the object, and not a copy of it or another thing."""
 
     status: IdentityStatus  #: confirmed, not excluded or contradicted
-    size: float | None = None  #: of what was seen in sizes of the model; None where not measured
+    size: float | None = None  #: that fits best, in sizes of the model; None: not measured
     size_deviation: float | None = None  #: standard deviation of it
     #: by how much nearer, in diameters, the points lie to the mirror image of the model; negative
     #: where the model is nearer, None where both are one or none was measured.
@@ -238,7 +238,7 @@ class PoseEstimate:
     object: str  # name of the object
     status: Status  #: ``ok``, ``ambiguous``, or the kind of refusal
     reason: str = ""  #: one sentence for people; empty where the status is ``ok``
-    camera_from_model: Rigid | None = None  #: the pose, or the likeliest; None where it is refused
+    camera_from_model: Rigid | None = None  #: if ambiguous the likeliest pose; None if refused
     keypoints_m: Float[Tensor, "k 3"] | None = None  #: the found keypoints in the camera frame
     #: 6x6, order and frame as :class:`PoseFit` says. Local: a pose that is a half-turn off may have
     #: one of 0.2 degrees; such errors are covered by ``certainty``. Finite: it leaves out the

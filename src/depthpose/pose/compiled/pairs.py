@@ -41,7 +41,7 @@ def pair_peaks(
     point, turn, votes = np.zeros(shape, np.int64), np.zeros(shape, np.int64), np.zeros(shape)
     _vote(
         finite_array(points_m), finite_array(frames), references, bounds, first, turn_rad,
-        models, step_m, MOST_ALIKE, point, turn, votes,
+        models, step_m, point, turn, votes,
     )  # fmt: skip
     return point, turn, votes
 
@@ -66,8 +66,7 @@ def _feature(points, frames, i, j, far, step, value):
 
 @compiled
 def _vote(
-    points, frames, references, bounds, first, turns, models, step, alike, out_point, out_turn,
-    out_votes,
+    points, frames, references, bounds, first, turns, models, step, out_point, out_turn, out_votes
 ):  # fmt: skip
     counts = np.zeros((models, TURNS), np.float32)
     value, own, aside = np.empty(4), np.empty(4, np.int64), np.empty(4, np.int64)
@@ -100,7 +99,7 @@ def _vote(
                     continue
                 seen[key] |= bit
                 weight = np.float32(1 / np.sqrt(high - low))
-                for p in range(low, min(high, low + alike)):
+                for p in range(low, min(high, low + MOST_ALIKE)):
                     t = (turn - turns[p]) * (TURNS / (2 * np.pi))
                     b = int(t + TURNS if t < 0 else t)
                     b = b - TURNS if b >= TURNS else b

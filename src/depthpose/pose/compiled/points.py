@@ -1,4 +1,4 @@
-"""Points in space: small matrices, nearest neighbours, what a camera sees.
+"""Points in space: rotations, nearest neighbours, what a camera sees.
 
 And sparse convolution of small clouds: no call for each offset, nothing gathered.
 """

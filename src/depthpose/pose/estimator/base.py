@@ -17,7 +17,13 @@ from depthpose.core.rigid import Rigid
 from depthpose.core.units import Unit
 from depthpose.pose.config import EstimateConfig, RefusalConfig
 from depthpose.pose.estimator.candidates import PoseAmbiguities, find_copies, with_status
-from depthpose.pose.estimator.find import SearchTargets, find_objects, nothing_found, which_object
+from depthpose.pose.estimator.find import (
+    ROUNDS,
+    SearchTargets,
+    find_objects,
+    nothing_found,
+    which_object,
+)
 from depthpose.pose.estimator.inputs import (
     AnyArray,
     AnyInput,
@@ -238,14 +244,23 @@ class PoseEstimator(ABC):
 
     @torch.no_grad()
     @own_arithmetic()
-    def find_in(self, view: ViewInput, objects: Sequence[str]) -> list[PoseEstimate]:
-        """Do as :meth:`find` does for a view; its mask limits where is looked."""
+    def find_in(
+        self, view: ViewInput, objects: Sequence[str], rounds: int = ROUNDS
+    ) -> list[PoseEstimate]:
+        """Do as :meth:`find` does for a view; its mask limits where is looked.
+
+        Args:
+            view: depth and camera.
+            objects: which may be there.
+            rounds: so often, at most, for what is there more than once.
+        """
         known = SearchTargets(
             names=objects,
             surface_of=lambda name: self._surface(self._number(name)),
             pairs_of=lambda name: self._pairs(self._number(name)),
             pose_near=self._pose_near,
             max_size_error=self.refusal.max_size_error,
+            rounds=rounds,
         )
         found = find_objects(view, known)
         return [with_status(estimate, self.config.min_certainty) for estimate in found]
@@ -307,7 +322,7 @@ class PoseEstimator(ABC):
             if isinstance(given, CloudInput):
                 return self._try_many([given])[0]
             began = time.perf_counter()
-            found = self.find_in(given, [object])
+            found = self.find_in(given, [object], rounds=1)
             return found[0] if found else nothing_found(given, object, time.perf_counter() - began)
 
         number = self._number(object)

@@ -39,8 +39,7 @@ _BENT, _MOST_DEVIATIONS = 2.0, 4.0
 size that is off by more deviations than the second counts as one that is off by these."""
 _MOST_JUDGED, _LEAST_JUDGED = 40, 4
 """Poses that are judged in an image, and of each object at least."""
-_ROUNDS = 3
-"""So often an image is searched for an object that is there more than once, at most."""
+ROUNDS = 3  #: so often an image is searched for an object that is there more than once, at most
 _MOST_TOGETHER, _NEARLY = 8, 0.2
 """Poses of one object at one place at most; the readings that one of them explains are the
 object's, if its log odds are at most so much above those of the best there."""
@@ -72,6 +71,7 @@ class SearchTargets:
         pairs_of: gives its point pairs.
         pose_near: clouds and the poses that were proposed for them to estimates.
         max_size_error: of :class:`RefusalConfig`.
+        rounds: so often, at most, for what is there more than once.
     """
 
     names: Sequence[str]
@@ -79,6 +79,7 @@ class SearchTargets:
     pairs_of: Callable[[str], PairTable]
     pose_near: Callable[[Sequence[CloudInput], Sequence[Rigid]], list[PoseEstimate]]
     max_size_error: float
+    rounds: int = ROUNDS
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -117,12 +118,12 @@ def find_objects(view: ViewInput, known: SearchTargets) -> list[PoseEstimate]:
         known: what for.
     """
     frame = prepare_frame(torch.where(view.mask, view.depth_m, torch.nan), view.K)
-    found = list[tuple[_Candidate, PoseEstimate]]()
+    found, taken = list[tuple[_Candidate, PoseEstimate]](), list[_Candidate]()
     names, is_left = known.names, torch.ones_like(frame.depth_m, dtype=torch.bool)
-    for _ in range(_ROUNDS):
+    for _ in range(known.rounds):
         groups: list[list[_Candidate]] = []
         for one in _candidates(frame, is_left, replace(known, names=names)):
-            if any(one.shared_with(other) > _SHARED for other, _ in found):
+            if any(one.shared_with(other) > _SHARED for other in taken):
                 continue
             same = (some for some in groups if some[0].object == one.object)
             own = next((some for some in same if one.shared_with(some[0]) > _RIVAL), None)
@@ -130,7 +131,7 @@ def find_objects(view: ViewInput, known: SearchTargets) -> list[PoseEstimate]:
                 groups.append([one])
             elif len(own) < _MOST_TOGETHER:
                 own.append(one)
-        more = _without_rivals(_judged(groups, frame, view, known), [one for one, _ in found])
+        more, taken = _without_rivals(_judged(groups, frame, view, known), taken)
         found += more
         for one, _ in more:
             is_left &= ~one.explained
@@ -138,6 +139,7 @@ def find_objects(view: ViewInput, known: SearchTargets) -> list[PoseEstimate]:
         names = sorted({one.object for one, _ in more if count[one.object] > 1})
         if not names:
             break
+    found.sort(key=lambda answer: answer[0].log_odds)
     return [replace(estimate, name=f"{view.name}_{k}") for k, (_, estimate) in enumerate(found)]
 
 
@@ -224,22 +226,26 @@ def size_deviations(
 
 def _without_rivals(
     answers: Sequence[tuple[_Candidate, PoseEstimate]], before: Sequence[_Candidate]
-) -> list[tuple[_Candidate, PoseEstimate]]:
-    """Keep answers from the surest down that explain what none before does, if they are likely."""
+) -> tuple[list[tuple[_Candidate, PoseEstimate]], list[_Candidate]]:
+    """Keep answers from the surest down that explain what none before does, if they are likely.
+
+    Gives them, and all whose place is taken: where it may be another object, by none.
+    """
     kept, taken = list[tuple[_Candidate, PoseEstimate]](), list(before)
-    for one, estimate in sorted(answers, key=lambda answer: answer[0].log_odds):
+    ranked = sorted(answers, key=lambda answer: answer[0].log_odds)
+    for k, (one, estimate) in enumerate(ranked):
         if any(one.shared_with(other) > _SHARED for other in taken):
             continue
         taken.append(one)
         rivals = {one.object: (one.log_odds, estimate)}
-        for other, its in answers:
+        for other, its in ranked[k + 1 :]:
             if one.shared_with(other) > _RIVAL:
                 rivals.setdefault(other.object, (other.log_odds, its))
         log_odds = torch.tensor([log_odds for log_odds, _ in rivals.values()], dtype=torch.float64)
         best, share = _given_others([its for _, its in rivals.values()], (-log_odds).softmax(0))
         if share >= _LEAST_SHARE:  # else it may be another object
             kept.append((one, _less_sure(best, 1 / (1 + math.exp(one.log_odds)))))
-    return kept
+    return kept, taken
 
 
 def _on_surface(
@@ -279,7 +285,7 @@ def is_cut_out(view: ViewInput, pose: Rigid, surface: Surface) -> bool:
         surface: of its model.
     """
     points_m = back_project(view.depth_m.double(), view.K.double())
-    own = _on_surface(points_m, points_m.isfinite().all(-1) & view.mask, pose, surface)
+    own = explained_mask(view, pose, surface)
     plane = largest_plane(points_m[own], torch.Generator().manual_seed(0))
     if plane is None or float(is_on_plane(points_m[own], plane).double().mean()) < _FLAT:
         return False

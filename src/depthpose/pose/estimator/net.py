@@ -130,8 +130,8 @@ class GeoPoseNet(PoseEstimator):
         self.weights = weights
         if isinstance(weights.network, DepthImageNet):
             raise InputError(
-                "these weights regress a depth image and cast no votes; load them as "
-                "DepthImageRegressor"
+                "these weights regress a depth image and cast no votes; give "
+                "read_pose_weights(FILE) to DepthImageRegressor"
             )
         self._network = weights.network.to(usable_device(self.config.device)).eval()
         self._registration: Registration | None = None
@@ -370,6 +370,16 @@ class DepthImageRegressor(PoseEstimator):
         """Regress one by one, whatever is likely."""
         del is_likely
         return each_in_threads(partial(or_unreadable, self._estimate), inputs, threads)
+
+    def _which(self, given: AnyInput, names: Sequence[str]) -> PoseEstimate:
+        if len(names) > 1:
+            raise InputError(f"object: say which of {', '.join(names)}; a regressor refuses none")
+        return super()._which(given, names)
+
+    def find_in(self, view: ViewInput, objects: Sequence[str], rounds: int = 1) -> NoReturn:
+        """Refuse: nothing tells whether an object is there."""
+        del view, objects, rounds
+        raise InputError(_NEEDS_MASK)
 
     def _pose_near(self, inputs: Sequence[CloudInput], poses: Sequence[Rigid]) -> NoReturn:
         del inputs, poses

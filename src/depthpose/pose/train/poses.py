@@ -65,7 +65,7 @@ from depthpose.pose.weights import (
     write_pose_weights,
 )
 
-_SYMMETRY_STEP = 0.05  # about an axis of revolution, [rad]; the vote's own error is larger
+_SYMMETRY_STEP = 0.05  # half the step about an axis of revolution [rad]; votes err by more
 
 
 class PoseTask:
