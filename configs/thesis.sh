@@ -10,6 +10,7 @@ set -euo pipefail
 chapter=$1 data=$2 out=$3
 configs=${CONFIGS:-$(dirname "$0")} device=${DEVICE:-cpu}
 
+[ -d "$configs" ] || { echo "$configs: no folder of configs" >&2; exit 2; }
 say() { echo "depthpose $*" >&2; depthpose "$@"; }
 train() { [ -f "$1" ] || say "${@:2}" --data "$data" --resume; }
 

@@ -129,9 +129,7 @@ def test_rows_of_confidence_name_the_speed() -> None:
     assert [row.columns()["speed"] for row in found] == ["quick", "fine"]
 
 
-def test_the_old_name_of_the_option_baseline_still_works(
-    street: Path, trained: Path, tmp_path: Path
-) -> None:
+def test_a_baseline_is_a_row_of_its_own(street: Path, trained: Path, tmp_path: Path) -> None:
     words = ["depth", "evaluate", "--data", str(street), "--out", str(tmp_path), *CAMERA_Z]
     assert main([*words, "--baseline", "rows", "--train", str(trained)]) == 0
     assert {row["method"] for row in rows_of(tmp_path)} == {"baseline: rows"}

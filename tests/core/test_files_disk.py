@@ -18,6 +18,7 @@ from depthpose.core.export import Export, Graph, freeze
 from depthpose.core.files import (
     Cloud,
     atomic_write,
+    disk,
     read_bytes,
     write_cloud,
     write_depth_png,
@@ -164,14 +165,6 @@ class Heavy(Graph):
         return helper.make_model(helper.make_graph([], "g", [], [], [held]))
 
 
-def log_for_ever(folder: Path) -> None:
-    folder.mkdir(parents=True)
-    logger = RunLogger(folder, is_writer=True)
-    logger.open(0)
-    while True:
-        logger.log(1, {2_000 * "x": 1.0})
-
-
 @contextmanager
 def small_disk() -> Iterator[None]:
     """Let no file of this process be larger than 100 kB: what a full disk does, sooner."""
@@ -210,8 +203,22 @@ def test_every_writer_names_a_full_disk_and_leaves_nothing(tmp_path: Path) -> No
         ):
             write(tmp_path / name)
         assert not [path for path in tmp_path.rglob("*") if path.is_file()], name
+    # TensorBoard writes in a thread of its own, so the metrics are full first.
+    logger = RunLogger(tmp_path, is_writer=True)
+    logger.open(0)
+    (tmp_path / "metrics.jsonl").write_text(99_000 * " ")
     with (
         small_disk(),
         pytest.raises(InputError, match=r"metrics\.jsonl: cannot be written: File too large"),
     ):
-        log_for_ever(tmp_path / "logger")
+        logger.log(1, {2_000 * "x": 1.0})
+    logger.close()
+
+
+def test_a_folder_may_be_called_as_a_pattern_is_written(tmp_path: Path) -> None:
+    folder = tmp_path / "run[1]"
+    folder.mkdir()
+    (folder / "0.json").write_bytes(b"{}")
+    assert disk.read_all(str(folder), ".json") == {"0.json": b"{}"}
+    assert disk.read_all(f"file://{folder}", ".json") == {"0.json": b"{}"}
+    assert disk.exists(str(folder / "0.json"))

@@ -52,7 +52,7 @@ def full_memory(error: BaseException) -> str:
     said = " ".join(str(error).split())[:200] or "no more is given"
     return (
         f"the memory is full ({said}); end other programs, raise the limit (ulimit -v), take "
-        "smaller images, or of a stereo matcher --max-memory or --tile"
+        "smaller images, or give a stereo matcher --max-memory"
     )
 
 

@@ -157,7 +157,7 @@ class Limit:
     value: float  #: the limit, in the output's unit
     of: Literal["largest", "mean"] = "largest"  #: mean where the output is discontinuous
     is_relative: bool = False  #: differences are shares of what PyTorch answers
-    flips: float = 0.0  #: as a share of the numbers
+    flips: float = 0.0  #: share of the numbers that may be off by more
 
 
 def _row(case: str, output: str, answer: np.ndarray, expected: np.ndarray, limit: Limit) -> Row:

@@ -29,7 +29,7 @@ class Raster:
 
     depth_m: Float[Tensor, "h w"]  #: distance along the viewing axis; NaN where nothing is seen
     primitive: Int64[Tensor, "h w"]  #: number of the triangle; -1 where nothing is seen
-    barycentric: Float[Tensor, "h w 3"] | None  #: shares of its corners there, 0 at nothing
+    barycentric: Float[Tensor, "h w 3"] | None  #: shares of its corners; None: unasked
 
 
 def rasterize(

@@ -387,11 +387,11 @@ def read_settings(folder: Path | str) -> dict[str, Any] | None:
         InputError: its record is damaged.
     """
     record = disk.join(str(folder), RECORD)
-    is_url = disk.is_url(record)
-    if not (disk.exists(record) if is_url else Path(record).is_file()):
+    if not disk.exists(record):
         return None
     with disk.refused_as(record, "record of a run", "choose another folder"):
-        content = json.loads(disk.read_from(record)) if is_url else read_json(record)
+        path = disk.local_path(record)
+        content = json.loads(disk.read_from(record)) if path is None else read_json(path)
     settings = content.get("settings") if isinstance(content, dict) else None
     if not isinstance(settings, dict):
         raise InputError(

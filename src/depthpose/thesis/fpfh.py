@@ -10,7 +10,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from depthpose.core.config import Settings
+from depthpose.core.config import Seed, Settings
 from depthpose.core.errors import import_open3d
 from depthpose.core.rigid import Rigid
 from depthpose.pose.cloud import object_points
@@ -28,7 +28,7 @@ class FpfhConfig(Settings):
     iterations: Annotated[int, "[1, inf)"] = 100_000
     """Of RANSAC, at most."""
 
-    seed: int = 0
+    seed: Seed = 0
     """Of RANSAC."""
 
 

@@ -35,7 +35,7 @@ class Camera:
     K: Float[Tensor, "3 3"]  #: ``[[fx, skew, cx], [0, fy, cy], [0, 0, 1]]`` [px], float64
     depth_unit_m: float | None = None  #: metres a unit of its depth images, where it has any
     mount_height_m: float | None = None  #: height above the road, where known
-    tilt_deg: float | None = None  #: of the axis against the road; positive looks up
+    tilt_deg: float | None = None  #: of the optical axis against the road; up is > 0
 
     def __post_init__(self) -> None:
         for name, (least, most, rule) in _RULES.items():

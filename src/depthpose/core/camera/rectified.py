@@ -60,7 +60,7 @@ class RectificationReport:
 
     vertical_offset_px: float = math.nan  #: median of the right row less the left row
     vertical_spread_px: float = math.nan  #: its median absolute deviation, as a standard deviation
-    positive_share: float = math.nan  #: of positive disparities among those beyond a pixel
+    positive_share: float = math.nan  #: of disparities beyond 1 px; NaN: none is
     corners: int = 0  #: corners of the left image that were sought in the right one
     matches: int = 0  #: matches that all this rests on
     is_pair: bool | None = None  #: whether the images belong together

@@ -270,7 +270,7 @@ class Rectifier:
     """
 
     rig: StereoRig  #: the camera of the rectified pair
-    rectified_from_raw: Rigid  #: carries points from the raw left camera's frame
+    rectified_from_raw: Rigid  #: carries points from the raw left camera's frame to its
     left_maps: Maps  #: column and row of the raw left image for each pixel of the rectified one
     right_maps: Maps  #: the same of the right image
 

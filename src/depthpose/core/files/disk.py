@@ -322,17 +322,21 @@ def read_from(url: str) -> bytes:
 
 def exists(url: str) -> bool:
     """Whether there is a file."""
+    path = local_path(url)
+    if path is not None:
+        return path.is_file()
     with _file_system(url, "looked for") as (fs, inner):
         return bool(fs.isfile(inner))
 
 
 def read_all(folder: str, suffix: str) -> dict[str, bytes]:
     """Read the files of a folder, not below it, by suffix; none where there is no folder."""
+    path = local_path(folder)
+    if path is not None:
+        return {p.name: read_bytes(p) for p in sorted(path.glob(f"*{suffix}")) if _shown(p.name)}
     with _file_system(folder, "listed") as (fs, inner):
-        there = [entry["name"] for entry in _details(fs, inner)]
-        names = [name for name in there if name.endswith(suffix) and _shown(name)]
-        contents = fs.cat(names) if names else {}
-        return {PurePosixPath(p).name: contents[p] for p in sorted(contents)}
+        names = sorted(e["name"] for e in _details(fs, inner) if e["name"].endswith(suffix))
+        return {PurePosixPath(name).name: fs.cat_file(name) for name in names}
 
 
 def publish(file: Path, url: str) -> None:
