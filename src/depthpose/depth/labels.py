@@ -47,7 +47,11 @@ def label_pairs(
     the rigs. A rerun goes on where it was; pairs of another folder may be added, if their names are
     others. Frames without right view or calibration are left out. What is wrong with a pair goes to
     ``failures``, or without these is raised. A network that has seen evaluation frames must not be
-    used.
+    used. ``config`` says what counts as known, ``settings`` all that decides the result.
+
+    Raises:
+        InputError: no frame has both, the folder holds a label of another image of that name or was
+            made by other settings, no calibration can be read, or a pair that cannot be matched.
     """
     frames = dataset.frames
     usable = [n for n, frame in enumerate(frames) if frame.right and frame.calibration]

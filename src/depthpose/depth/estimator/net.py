@@ -139,7 +139,12 @@ def refuse_unrectified(pair: StereoInput) -> str:
 
 
 def usable_right(pair: StereoInput) -> View:
-    """Give the right view of a pair, and refuse what cannot be matched."""
+    """Give the right view of a pair, and refuse what cannot be matched.
+
+    Raises:
+        InputError: there is none, its size is another, the camera has no baseline, or an image
+            does not lie in [0, 1].
+    """
     if pair.right is None:
         raise InputError(f"{pair.name}: there is no right image; give right=.")
     check_image(pair.left, f"{pair.name}: the left image")
@@ -493,22 +498,23 @@ class FakestereoNet:
             )
             views = self.synthesiser.draw(left, *larger)
             seen = views.seen
+            sky, confidence = (None, None) if seen is None else (seen.is_sky, seen.confidence)
             if rig.answer == "matched":
                 camera = camera_of(rig.virtual_focal_px, (left.shape[3], left.shape[2]))
                 matches = self._match(list(zip(left, views.right, strict=True)), camera)
             else:
-                assert seen is not None, "it has an answer of its own"
-                parts = zip(seen.disparity_px, seen.confidence, strict=True)
+                assert seen is not None and confidence is not None, "it has an answer of its own"
+                parts = zip(seen.disparity_px, confidence, strict=True)
                 matches = [Match(disparity_px=px, confidence=sure) for px, sure in parts]
             estimates = []
             for n, (image, found) in enumerate(zip(images, matches, strict=True)):
-                match = found if seen is None else replace(found, is_sky=seen.is_sky[n])
+                match = found if sky is None else replace(found, is_sky=sky[n])
                 estimate = disparity.from_virtual(image, rig, match, views.right[n])
                 estimate = scale_by_mount(estimate, image)
                 estimates.append(estimate)
-                if seen is None:
+                if seen is None or confidence is None:
                     continue
-                mean = seen.confidence[n].mean() if seen.street is None else seen.street[n]
+                mean = confidence[n].mean() if seen.street is None else seen.street[n]
                 sure, said = float(mean), ""
                 if isinstance(rig, SelectionConfig) and sure < rig.least_confidence:
                     what = "probability of a street" if rig.with_street else "mean confidence"

@@ -381,7 +381,7 @@ class SelectTask:
                 views = [pair.left, pair.right, drawn.right[0], draw_disparity(found_px)]
                 pictures["left_right_drawn_disparity"] = torch.cat(views, 1)
             is_known, is_true_sky = pair.left_px >= far_px, pair.left_px == 0
-            if bool(is_known.any()):
+            if bool(is_known.any()) and bool(found_px.isfinite().all()):
                 # Of depth without its unit, which these do not depend on.
                 metrics = measure("depth", 1 / found_px[is_known], 1 / pair.left_px[is_known])
                 errors.append(metrics["abs_rel"])
