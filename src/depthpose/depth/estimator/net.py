@@ -503,7 +503,8 @@ class FakestereoNet:
                 camera = camera_of(rig.virtual_focal_px, (left.shape[3], left.shape[2]))
                 matches = self._match(list(zip(left, views.right, strict=True)), camera)
             else:
-                assert seen is not None and confidence is not None, "it has an answer of its own"
+                assert seen is not None, "it has an answer of its own"
+                assert confidence is not None
                 parts = zip(seen.disparity_px, confidence, strict=True)
                 matches = [Match(disparity_px=px, confidence=sure) for px, sure in parts]
             estimates = []

@@ -4,6 +4,7 @@ Those of the thesis are a generator against a discriminator, the matcher, and on
 The generator that selects learns from pairs and single images, synthetic and real, mixed.
 """
 
+import math
 from collections.abc import Callable, Iterator, Sequence
 from typing import NamedTuple
 
@@ -381,9 +382,11 @@ class SelectTask:
                 views = [pair.left, pair.right, drawn.right[0], draw_disparity(found_px)]
                 pictures["left_right_drawn_disparity"] = torch.cat(views, 1)
             is_known, is_true_sky = pair.left_px >= far_px, pair.left_px == 0
-            if bool(is_known.any()) and bool(found_px.isfinite().all()):
-                # Of depth without its unit, which these do not depend on.
-                metrics = measure("depth", 1 / found_px[is_known], 1 / pair.left_px[is_known])
+            if bool(is_known.any()):
+                metrics = {"abs_rel": math.nan, "d1": math.nan}  # of a network that diverged
+                if bool(found_px.isfinite().all()):
+                    # Of depth without its unit, which these do not depend on.
+                    metrics = measure("depth", 1 / found_px[is_known], 1 / pair.left_px[is_known])
                 errors.append(metrics["abs_rel"])
                 within.append(metrics["d1"])
             if bool(is_true_sky.any()):
