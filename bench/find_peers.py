@@ -39,6 +39,7 @@ from typing import Any
 import numpy as np
 import torch
 from find_tables import Frame, measure, registration, synthetic_frames
+from fpfh import FpfhEstimator
 
 from depthpose.core.camera import Camera
 from depthpose.core.files import write_depth_png
@@ -57,7 +58,6 @@ from depthpose.pose.synthetic.parts import PARTS, make_part
 from depthpose.pose.types import CloudInput, ObjectModel, PoseEstimate
 from depthpose.pose.voting.point_pairs import thin
 from depthpose.report.page import markdown_table
-from depthpose.thesis.fpfh import FpfhEstimator
 
 KINDS = {"piles": (20, (0, 4)), "tables": (0, (0, 4)), "clutter": (0, (8, 16))}
 """By kind how many copies lie on a pile, and how many other things on a table."""

@@ -19,6 +19,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from fpfh import VOXEL_DIAMETERS, FpfhEstimator
 from real_poses import RealCase, real_cases
 
 from depthpose.core.checkpoint import find_weights
@@ -31,7 +32,6 @@ from depthpose.pose.metrics import add_m, adds_m, auc
 from depthpose.pose.types import CloudInput, PoseEstimate, ViewInput
 from depthpose.pose.weights import PoseWeights, read_pose_weights
 from depthpose.report.page import markdown_table, write_table
-from depthpose.thesis.fpfh import FpfhConfig, FpfhEstimator
 
 POINTS = 2000
 AnyInput = CloudInput | ViewInput
@@ -74,8 +74,7 @@ def declared_add(case: RealCase, pose: Rigid, points_m: torch.Tensor) -> float:
 
 def open3d_method(case: RealCase, seed: int, words: argparse.Namespace) -> Method:
     """Open3D's registration for one model."""
-    config = FpfhConfig(seed=seed, voxel_diameters=words.voxel)
-    peer = FpfhEstimator([case.model], config)
+    peer = FpfhEstimator([case.model], words.voxel, seed)
     cloud = CloudInput(name=case.name, points_m=case.points_m, object=case.model.name)
     return lambda _: peer.estimate_many([cloud])[0]
 
@@ -181,7 +180,7 @@ def main() -> None:
     parser.add_argument("samples", type=Path, nargs="?", default=default)
     parser.add_argument("--seeds", type=int, default=5)
     parser.add_argument("--only", default="", help="instances whose name contains this")
-    parser.add_argument("--voxel", type=float, default=FpfhConfig.voxel_diameters)
+    parser.add_argument("--voxel", type=float, default=VOXEL_DIAMETERS)
     parser.add_argument("--weights", nargs="*", default=[], help="of ours")
     parser.add_argument("--no-peer", action="store_true", help="ours alone")
     parser.add_argument("--register", action="store_true", help="ours without training too")

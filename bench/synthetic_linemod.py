@@ -26,6 +26,7 @@ from typing import Any, NamedTuple, get_args
 
 import torch
 from curves import draw_curves
+from fpfh import FpfhEstimator
 
 from depthpose.core.checkpoint import find_weights
 from depthpose.pose.config import EstimateConfig, ObjectsConfig, SensorConfig, SensorKind
@@ -37,7 +38,6 @@ from depthpose.pose.synthetic import PARTS, Objects, make_part
 from depthpose.pose.types import ObjectModel, PoseEstimate, ViewInput, ViewSample
 from depthpose.pose.weights import read_pose_weights
 from depthpose.report.page import markdown_table, write_table
-from depthpose.thesis.fpfh import FpfhEstimator
 
 SEED = 0x7E57ED
 POINTS = 1000

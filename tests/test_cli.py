@@ -371,7 +371,7 @@ def test_patterns_and_addresses_are_left_to_those_who_read_them() -> None:
 
     values = {"images": ("left/*.png", "s3://bucket/left"), "bop": None, "start": "hf://me/mine"}
     refuse_missing(command, values)
-    for word in ("sgbm:default", "open3d", "nothing"):
+    for word in ("sgbm:default", "register", "nothing"):
         refuse_missing(command, {"start": word})
     with pytest.raises(InputError, match="there is no such file or folder"):
         refuse_missing(command, {"bop": Path("nowhere")})

@@ -28,7 +28,7 @@ IGNORED = [
     ("pose predict", "--depth d --mask m --camera c --masks truth", "--masks"),
     ("pose track", "--depth d --camera c --split test", "--split"),
     ("pose evaluate", "--bop b --csv a.csv --no-icp --masks truth", "--masks and --no-icp"),
-    ("pose evaluate", "--bop b --weights register open3d --voting ransac", "--voting"),
+    ("pose evaluate", "--bop b --weights register --voting ransac", "--voting"),
     ("depth predict", "a.png --answer own --max_memory 1GB", "--max_memory"),
     ("depth predict", "a.png --camera c --focal-px 7 --fov 9", "--focal-px and --fov"),
     ("depth predict", "a.png --block 8 --workers 2", "--workers and --block"),

@@ -1,11 +1,7 @@
 import csv
 import json
 import shutil
-import sys
-from collections.abc import Sequence
-from functools import partial
 from pathlib import Path
-from typing import ClassVar
 
 import pytest
 import torch
@@ -13,13 +9,11 @@ from tests.pages.read_page import read_page
 from tests.pose.synthetic_frames import frame_models, make_dataset, moved, predictions_of
 from tests.pose.synthetic_objects import tiny_weights
 
-from depthpose.cli import main, pose_methods
+from depthpose.cli import main
 from depthpose.core.checkpoint import file_sha256
-from depthpose.pose.cloud import object_points
 from depthpose.pose.datasets import BopDataset, Detection, encode_rle, read_mask, write_detections
 from depthpose.pose.evaluate import frames_hash
 from depthpose.pose.predictions import read_predictions, write_bop_results, write_predictions
-from depthpose.pose.types import ObjectModel, PoseEstimate, ViewInput
 from depthpose.pose.weights import write_pose_weights
 
 
@@ -138,58 +132,12 @@ def test_weights_predict_once_with_true_and_predicted_masks(
     assert before == [(home / "poses.json").stat().st_mtime_ns for home in homes]
 
 
-class KnowsNoPose:
-    """What registration is asked for, without Open3D."""
-
-    views: ClassVar[list[ViewInput]] = []
-
-    def __init__(self, models: Sequence[ObjectModel]) -> None:
-        self.names = {model.name for model in models}
-
-    def estimate_many(self, inputs: Sequence[ViewInput]) -> list[PoseEstimate]:
-        assert {given.object for given in inputs} <= self.names
-        self.views.extend(inputs)
-        none = partial(PoseEstimate, status="votes do not meet", reason="none")
-        return [none(name=given.name, object=given.object) for given in inputs]
-
-
-def test_registration_is_a_row_beside_weights(
-    synthetic: BopDataset, weights: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(pose_methods, "FpfhEstimator", KnowsNoPose)
-    words = ["--bop", str(synthetic.folder), "--weights", str(weights), "open3d", "--no-vsd"]
-    assert main(["pose", "evaluate", *words, "--out", str(tmp_path / "out")]) == 0
-    own = [row for row in rows_of(tmp_path / "out") if row["method"] == "open3d"]
-    assert [row["object"] for row in own] == ["bracket", "bottle", "mean", "all"]
-    assert all(row["refused"] == 1 and not row["weights"] for row in own)
-    for view, instance in zip(KnowsNoPose.views, synthetic.instances, strict=True):
-        truth = synthetic.view(instance).truth.camera_from_model
-        diameter_m = synthetic.objects[instance.object_id].diameter_m
-        points_m = object_points(view, diameter_m)
-        assert len(points_m) > 100
-        assert float((points_m - truth.t_m).norm(dim=1).max()) < diameter_m
-
-
 def test_registration_without_training_is_a_word_in_place_of_weights(
     synthetic: BopDataset, tmp_path: Path
 ) -> None:
     words = ["--bop", str(synthetic.folder), "--weights", "register", "--objects", "7", "--no-vsd"]
     assert main(["pose", "evaluate", *words, "--out", str(tmp_path / "out")]) == 0
     assert {row["method"] for row in rows_of(tmp_path / "out")} == {"register"}
-
-
-def test_registration_wants_a_data_set_and_open3d(
-    synthetic: BopDataset,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-) -> None:
-    monkeypatch.setitem(sys.modules, "open3d", None)
-    words = ["--bop", str(synthetic.folder), "--weights", "open3d", "--out", str(tmp_path / "out")]
-    assert main(["pose", "evaluate", *words]) == 2
-    assert "pip install -e '.[open3d]'" in capsys.readouterr().err
-    assert main(["pose", "predict", *words]) == 2
-    assert "open3d: it looks for the models of a data set" in capsys.readouterr().err
 
 
 def test_what_cannot_be_measured_is_refused(

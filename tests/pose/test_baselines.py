@@ -1,7 +1,5 @@
 """Laws of the baselines: crops, rotations, points in any order, heads of each class."""
 
-import importlib.util
-import sys
 from dataclasses import replace
 from itertools import permutations
 from typing import Any
@@ -12,7 +10,7 @@ from tests.pose.synthetic_objects import bracket
 from torch import Tensor
 
 from depthpose.core.camera import project
-from depthpose.core.errors import InputError, MissingExtraError
+from depthpose.core.errors import InputError
 from depthpose.core.render import rasterize
 from depthpose.core.rigid import Rigid, perturb, turn_axis_to
 from depthpose.pose.baselines import (
@@ -28,8 +26,7 @@ from depthpose.pose.baselines import (
 )
 from depthpose.pose.losses import model_point_loss
 from depthpose.pose.mesh import sample_surface
-from depthpose.pose.types import CloudInput, SeenPoints, ViewInput
-from depthpose.thesis.fpfh import FpfhConfig, FpfhEstimator
+from depthpose.pose.types import SeenPoints, ViewInput
 
 K = torch.tensor([[500.0, 0, 160], [0, 510.0, 120], [0, 0, 1]], dtype=torch.float64)
 SMALL = DepthImageConfig(classes=3, crop_px=32, widths=(4, 4, 8, 8))
@@ -259,27 +256,6 @@ def test_a_training_step_takes_a_cloud_of_one_point() -> None:
     assert network(torch.zeros(1, 3), torch.zeros(1, dtype=torch.long)).isfinite().all()
 
 
-# registration
-
-
-def test_without_open3d_the_extra_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(sys.modules, "open3d", None)
-    with pytest.raises(MissingExtraError, match=r"pip install -e '.\[open3d\]'"):
-        FpfhEstimator([bracket()])
-
-
-@pytest.mark.skipif(importlib.util.find_spec("open3d") is None, reason="open3d is not installed")
-def test_registration_finds_a_seen_pose_and_refuses_two_points() -> None:
-    pose = Rigid(turned(2), torch.tensor([0.05, 0.0, 0.7]))
-    points_m = pose.apply(sample_surface(bracket(), 4000)[0])
-    peer = FpfhEstimator([bracket()], FpfhConfig(iterations=50_000))
-    clouds = [CloudInput(name="c", points_m=p, object="bracket") for p in (points_m, points_m[:2])]
-    found, few = peer.estimate_many(clouds)
-    assert found.camera_from_model is not None
-    assert float((found.camera_from_model.t_m - pose.t_m).norm()) < 0.01
-    assert (few.status, few.camera_from_model) == ("too few points", None)
-
-
 # configs
 
 
@@ -291,8 +267,6 @@ def test_registration_finds_a_seen_pose_and_refuses_two_points() -> None:
         (lambda: DepthImageConfig(margin=0.5), "margin must be in"),
         (lambda: PointNetConfig(keypoints=0), "keypoints must be in"),
         (lambda: PointNetConfig(unit_m=0.0), "unit_m must be in"),
-        (lambda: FpfhConfig(voxel_diameters=0.0), "voxel_diameters must be in"),
-        (lambda: FpfhConfig(iterations=0), "iterations must be in"),
     ],
 )
 def test_sizes_that_cannot_be_are_refused(config: Any, said: str) -> None:  # noqa: ANN401

@@ -46,7 +46,7 @@ NewPath = Annotated[Path, _Names.NEW]
 NewPlace = Annotated[str, _Names.NEW]  # a folder or URL that is written
 WeightsName = Annotated[str, _Names.WEIGHTS]  # weights, by name or file, or a word in their place
 
-_WORDS = ("sgbm", "nothing", "open3d", "register")  # what may be said in place of weights
+_WORDS = ("sgbm", "nothing", "register")  # what may be said in place of weights
 _PREFIXES = "^(both|sgbm|own|matched|quick|fine):"
 """Before the name of weights: how they are used."""
 _POSITIONAL = get_args(tyro.conf.Positional[int])[1]
@@ -232,8 +232,8 @@ _RULES: tuple[tuple[str, _Case, str, str], ...] = (
      "a data set has many sequences and one pose is given; give the frames of one by --depth"),
     ("pose evaluate", lambda o: "weights" not in o, "masks voting icp device",
      "nothing is estimated: --csv and --predictions are measured as they are"),
-    ("pose evaluate", lambda o: o.all_begin("weights", "register", "open3d"), "voting device",
-     "register and open3d do not vote, and compute on the processor"),
+    ("pose evaluate", lambda o: o.all_begin("weights", "register"), "voting device",
+     "register does not vote, and computes on the processor"),
     ("pose predict, depth predict, depth match",
      lambda o: "ray" not in o["engine"], "address workers worker-cpus worker-gpus block",
      "--engine ray takes it, and is not given; add it"),

@@ -91,7 +91,7 @@ def evaluate(
         out: folder for rows.json, rows.csv, table.md, report.html, instances.csv and predictions.
         split: train, test, ...
         weights: files or names, of the method or of a baseline; also register (registration
-            without training) and open3d (Open3D's, an extra), which need no weights.
+            without training), which needs no weights.
         csv: BOP results of any method.
         predictions: folders with poses.json.
         objects: keep these alone, by name or number.

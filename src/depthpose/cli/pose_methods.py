@@ -34,7 +34,6 @@ from depthpose.pose.mesh import FIXED_UNITS, unit_of
 from depthpose.pose.segmentation import Segmenter
 from depthpose.pose.types import ObjectModel, PoseEstimate, ViewInput
 from depthpose.pose.weights import read_pose_weights
-from depthpose.thesis.fpfh import FpfhConfig, FpfhEstimator
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -196,7 +195,6 @@ def distinct_names(files: Sequence[tuple[Path | None, str]]) -> list[str]:
     return names
 
 
-REGISTRATION = "open3d"  # the name of Open3D's features, RANSAC and ICP, where weights are named
 REGISTER = "register"  # the name of our own registration, which needs no training
 _SAME_DIAMETER = 0.05
 
@@ -233,27 +231,12 @@ def pose_methods(
 
     Files of one name are distinguished by their folders.
     """
-    takers = {REGISTRATION: _open3d, REGISTER: _register}
-    paths = [None if name in takers else find_weights(name) for name in names]
+    paths = [None if name == REGISTER else find_weights(name) for name in names]
     labels = _names_of(names, paths)
     return [
-        _network(path, label, config) if path else takers[name](label, models, config)
-        for path, name, label in zip(paths, names, labels, strict=True)
+        _network(path, label, config) if path else _register(label, models, config)
+        for path, label in zip(paths, labels, strict=True)
     ]
-
-
-def _open3d(name: str, models: Sequence[ObjectModel], _: EstimateConfig) -> PoseMethod:
-    if not models:
-        raise InputError(
-            f"{REGISTRATION}: it looks for the models of a data set; give --bop to 'pose evaluate'"
-        )
-    return PoseMethod(
-        name=name,
-        estimate_many=FpfhEstimator(models).estimate_many,
-        takes_clouds=False,
-        models=models,
-        settings={"kind": "registration", "fpfh": config_to_dict(FpfhConfig())},
-    )
 
 
 def _register(name: str, models: Sequence[ObjectModel], config: EstimateConfig) -> PoseMethod:

@@ -179,8 +179,7 @@ def table_3_1(
         depthpose reproduce 3.1 --bop lm --weights ours.safetensors pointnet.safetensors --out out
 
     Args:
-        weights: the method's, then those of each baseline (kinds pointnet and depth-image); open3d
-            is Open3D's registration (an extra), which needs no weights.
+        weights: the method's, then those of each baseline (kinds pointnet and depth-image).
         out: folder to write to.
     """
     from depthpose.cli.thesis_pose import reproduce_by_object

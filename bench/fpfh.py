@@ -1,37 +1,22 @@
-"""Open3D beside ours: FPFH features, RANSAC and ICP register a model on a cloud."""
+"""Open3D's registration, the peer of other benches: FPFH features, RANSAC and ICP."""
 
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import Annotated, Any
+from typing import Any
 
 import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from depthpose.core.config import Seed, Settings
 from depthpose.core.errors import import_open3d
 from depthpose.core.rigid import Rigid
 from depthpose.pose.cloud import object_points
 from depthpose.pose.mesh import sample_surface
 from depthpose.pose.types import CloudInput, ObjectModel, PoseEstimate, ViewInput
 
-
-@dataclass(frozen=True, kw_only=True)
-class FpfhConfig(Settings):
-    """FPFH features, RANSAC and ICP of Open3D."""
-
-    voxel_diameters: Annotated[float, "(0, inf)"] = 0.03
-    """Side of a voxel in diameters of the object."""
-
-    iterations: Annotated[int, "[1, inf)"] = 100_000
-    """Of RANSAC, at most."""
-
-    seed: Seed = 0
-    """Of RANSAC."""
-
-
+VOXEL_DIAMETERS = 0.03  # side of a voxel in diameters of the object
+_ITERATIONS = 100_000  # of RANSAC, at most
 _MODEL_POINTS = 20_000
 _NORMAL, _FEATURE, _CORRESPONDENCE, _ICP = 2.0, 5.0, 1.5, 0.4
 """Radius for normals and for features (Rusu et al. 2009), reach of RANSAC's correspondences and of
@@ -42,12 +27,19 @@ _LEAST = 3  # points that a pose takes; Open3D answers fewer with a crash or wit
 class FpfhEstimator:
     """Registration of several objects, each model prepared once; called as the networks are.
 
+    ``voxel_diameters`` is the side of a voxel, ``seed`` that of RANSAC.
+
     Raises:
         MissingExtraError: Open3D is not installed.
     """
 
-    def __init__(self, models: Sequence[ObjectModel], config: FpfhConfig | None = None) -> None:
-        self.config = config or FpfhConfig()
+    def __init__(
+        self,
+        models: Sequence[ObjectModel],
+        voxel_diameters: float = VOXEL_DIAMETERS,
+        seed: int = 0,
+    ) -> None:
+        self._voxel_diameters, self._seed = voxel_diameters, seed
         self._open3d = import_open3d("registration by FPFH")
         self._models = {model.name: model for model in models}
         self._targets: dict[str, tuple[Any, Any]] = {}
@@ -72,7 +64,7 @@ class FpfhEstimator:
         o3d, voxel_m = self._open3d, self._voxel_m(model)
         target, its_features = self._targets[model.name]
         source, features = self._prepare(self._cloud(points_m), voxel_m)
-        o3d.utility.random.seed(self.config.seed)
+        o3d.utility.random.seed(self._seed)
         # It prints a line for each cloud of which few features are mutually nearest.
         r, limit_m = o3d.pipelines.registration, _CORRESPONDENCE * voxel_m
         with o3d.utility.VerbosityContextManager(o3d.utility.VerbosityLevel.Error):
@@ -83,7 +75,7 @@ class FpfhEstimator:
                     r.CorrespondenceCheckerBasedOnEdgeLength(0.9),
                     r.CorrespondenceCheckerBasedOnDistance(limit_m),
                 ],
-                r.RANSACConvergenceCriteria(self.config.iterations, 0.999),
+                r.RANSACConvergenceCriteria(_ITERATIONS, 0.999),
             )  # fmt: skip
         if len(found.correspondence_set):
             found = r.registration_icp(
@@ -110,7 +102,7 @@ class FpfhEstimator:
         )
 
     def _voxel_m(self, model: ObjectModel) -> float:
-        return self.config.voxel_diameters * model.diameter_m
+        return self._voxel_diameters * model.diameter_m
 
     def _cloud(self, points_m: Float[Tensor, "n 3"]) -> Any:  # noqa: ANN401 - Open3D has no types
         cloud = self._open3d.geometry.PointCloud()
