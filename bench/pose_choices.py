@@ -72,10 +72,7 @@ def run_arm(arm: str, cad: Path, steps: int, seed: int, out: Path) -> dict[str, 
     last = next(line for line in reversed(list(lines)) if any("held_out" in name for name in line))
     row = {"arm": arm, "seed": seed, "steps": steps, "seconds": round(spent_s)}
     for hidden in (0, 30):
-        for method in ("lines", "ransac"):
-            row[f"{hidden} % hidden, {method}"] = last[
-                f"held_out/occluded_{hidden}/{method}_add_10"
-            ]
+        row[f"{hidden} % hidden"] = last[f"held_out/occluded_{hidden}/ransac_add_10"]
     write_json(home / "row.json", row)
     return row
 

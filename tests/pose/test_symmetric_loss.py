@@ -50,7 +50,7 @@ def test_each_declared_symmetry_leaves_the_loss_as_it_is(part: str, copies: int,
     points_m = pose.apply(model.vertices_m[chosen].double())
     network = _Stubborn(_SMALL)
     config = PoseTraining(loss=mode)
-    task = PoseTask(network, [model], config, None)
+    task = PoseTask(network, [model], config)
     # Near one truth, but right for none: the choice of the copy has a say.
     towards = pose.apply(keypoint_copies([model])[0, -1].double()) - points_m[:, None]
     noise = 0.3 * torch.randn(towards.shape, generator=generator)

@@ -36,7 +36,7 @@ from depthpose.pose.train import (
 )
 from depthpose.pose.train.clouds import (
     HELD_OUT_SEED,
-    HeldOut,
+    TrainingViews,
     held_out_objects,
     score_held_out,
     table_text,
@@ -130,7 +130,7 @@ def test_true_directions_cost_nothing_whichever_copy_they_point_at(copy: int) ->
     clouds = TrainingClouds(models, _VIEWS, None, _CLOUD, 0)
     batch = TrainingClouds.collate([clouds[0], clouds[1]])
     network = _Oracle(_SMALL)
-    task = PoseTask(network, models, _training(), None)
+    task = PoseTask(network, models, _training())
     network.truth = _truth_of(batch, models, copy)
     # The bracket has one copy alone, which is repeated.
     (turn,) = list(task.step(batch))
@@ -155,7 +155,7 @@ def test_the_loss_falls() -> None:
     clouds = TrainingClouds(models, _VIEWS, None, _CLOUD, 0)
     batch = TrainingClouds.collate([clouds[i] for i in range(4)])
     config = _training(adam=AdamConfig(learning_rate=0.01))
-    task = PoseTask(ResUNet(_SMALL), models, config, None)
+    task = PoseTask(ResUNet(_SMALL), models, config)
     optimizer, _ = task.optimizers["network"]
     losses = []
     for _ in range(40):
@@ -219,39 +219,32 @@ def test_views_too_far_for_their_voxels_are_refused_with_a_reason() -> None:
 
 
 def test_held_out_views_are_not_those_that_are_trained_on() -> None:
-    models = _models()
-    held_out = HeldOut(models, _VIEWS, _CLOUD, HeldOutConfig(number=2))
-    trained = TrainingClouds(models, _VIEWS, None, _CLOUD, 0)
-    known = [trained[i].R for i in range(8)]
-    numbers = held_out.look(ResUNet(_SMALL).eval()).numbers
-    assert len(held_out._clouds[0.3]) > 0
-    for cloud in held_out._clouds[0.3]:
-        assert not any(torch.allclose(cloud.R, R) for R in known)
+    models, held_out = _models(), HeldOutConfig(number=2)
+    task = PoseTask(ResUNet(_SMALL), models, _training(held_out=held_out))
+    trained = TrainingViews(models, _VIEWS, None, _CLOUD, 0).synthetic
+    known = [trained.view(i).truth.camera_from_model.R for i in range(8)]
+    numbers = task.validate().numbers
+    assert task.network.training
+    assert len(task._held_out[0.3]) == 4
+    for view in task._held_out[0.3]:
+        assert not any(torch.allclose(view.truth.camera_from_model.R, R) for R in known)
     assert set(numbers) == {
-        f"held_out/occluded_{o}/{m}_{k}"
-        for o in (0, 30)
-        for m in ("lines", "ransac")
-        for k in ("add_10", "median")
+        f"held_out/occluded_{o}/ransac_{k}" for o in (0, 30) for k in ("add_10", "median")
     }
     assert HELD_OUT_SEED > 0
 
 
 def test_a_held_out_view_of_too_few_points_is_a_failure() -> None:
-    config = HeldOutConfig(number=3, occlusions=(0.0,), with_ransac=False)
+    held_out = HeldOutConfig(number=3, occlusions=(0.0,))
     network = ResUNet(_SMALL).eval()
-    none = HeldOut(
-        _models(), _VIEWS, dataclasses.replace(_CLOUD, max_points=None, min_points=10**6), config
-    )
-    numbers = none.look(network).numbers
-    assert numbers["held_out/occluded_0/lines_add_10"] == 0
-    assert numbers["held_out/occluded_0/lines_median"] == math.inf
-    made = held_out_objects(_models(), _VIEWS, _CLOUD, config, 0.0)
-    seen = sorted(len(made[i].input.points_m) for i in range(6))
-    some = dataclasses.replace(_CLOUD, max_points=None, min_points=seen[4])
+    made = held_out_objects(_models(), _VIEWS, _CLOUD, held_out, 0.0)
+    seen = [len(made[i].input.points_m) for i in range(6)]
+    cloud = dataclasses.replace(_CLOUD, max_points=None, min_points=sorted(seen)[4])
+    task = PoseTask(network, _models(), _training(held_out=held_out, cloud=cloud))
     with torch.no_grad():
-        errors = HeldOut(_models(), _VIEWS, some, config)._errors(network, 0.0)["lines"]
-    assert len(errors) == 6
-    assert int(errors.isfinite().sum()) == sum(count >= seen[4] for count in seen) < 6
+        errors = [task.held_out_error(made.view(i), i) for i in range(6)]
+    assert [math.isfinite(error) for error in errors] == [n >= cloud.min_points for n in seen]
+    assert task.validate().numbers["held_out/occluded_0/ransac_median"] == math.inf
 
 
 def test_a_training_leaves_weights_a_card_and_its_config(tmp_path: Path) -> None:

@@ -49,7 +49,7 @@ from depthpose.pose.weights import read_pose_weights
 
 LOOP = LoopConfig(steps=2, batch_size=2, device="cpu", log_every_steps=1)
 VIEWS = ObjectsConfig(number=8, views=2, resolution=(0.25, 0.25), distance_m=(0.6, 0.7))
-HELD_OUT = HeldOutConfig(number=1, occlusions=(0.0,), with_ransac=False)
+HELD_OUT = HeldOutConfig(number=1, occlusions=(0.0,))
 
 
 @pytest.fixture(scope="module")
@@ -81,7 +81,7 @@ def test_the_pointnet_trains_and_its_file_is_an_estimators(
     path = STAGES["pointnet"][1](config, Run(folder=tmp_path))
     assert path == tmp_path / "pointnet.safetensors"
     rows = read_metrics(tmp_path)
-    assert "held_out/occluded_0/lines_add_10" in rows[-1]
+    assert "held_out/occluded_0/ransac_add_10" in rows[-1]
     net = GeoPoseNet.load(path)
     assert net.objects == ("bracket",)
     (found,) = net.estimate_many([Objects([bracket()], VIEWS)[0].input])

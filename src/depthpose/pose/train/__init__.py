@@ -2,7 +2,6 @@
 
 from depthpose.pose.train.clouds import Cloud as Cloud
 from depthpose.pose.train.clouds import CloudBatch as CloudBatch
-from depthpose.pose.train.clouds import HeldOut as HeldOut
 from depthpose.pose.train.clouds import TrainingClouds as TrainingClouds
 from depthpose.pose.train.clouds import read_models as read_models
 from depthpose.pose.train.config import DepthImageTraining as DepthImageTraining

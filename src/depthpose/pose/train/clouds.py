@@ -4,14 +4,14 @@ import dataclasses
 import math
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import ClassVar, NamedTuple
 
 import torch
 from jaxtyping import Float, Int
-from torch import Tensor
+from torch import Tensor, nn
 
 from depthpose.core.errors import InputError
-from depthpose.core.loop import ValidationResult, sample_generator, shuffled_index
+from depthpose.core.loop import ValidationResult, make_adam, sample_generator, shuffled_index
 from depthpose.core.rigid import Rigid
 from depthpose.pose.cloud import refusal_of, sample_points, voxelise
 from depthpose.pose.config import CloudConfig, EstimateConfig, ObjectsConfig
@@ -27,10 +27,16 @@ from depthpose.pose.mesh import (
 )
 from depthpose.pose.metrics import SUCCESS_SHARE, add_of_nearest_m
 from depthpose.pose.synthetic import Objects, make_part
-from depthpose.pose.train.config import FramesConfig, HeldOutConfig, ModelsConfig
-from depthpose.pose.types import CloudSample, ObjectModel, PoseEstimate, PoseTruth, SeenPoints, Vote
-from depthpose.pose.voting import fit_pose, meet_lines, vote_ransac
-from depthpose.pose.weights import DirectionNet, PoseWeights
+from depthpose.pose.train.config import FramesConfig, HeldOutConfig, ModelsConfig, ViewsTraining
+from depthpose.pose.types import (
+    CloudSample,
+    ObjectModel,
+    PoseEstimate,
+    PoseTruth,
+    SeenPoints,
+    ViewSample,
+)
+from depthpose.pose.weights import PoseWeights
 
 TRIES = 20  #: samples in a row that may show too little
 
@@ -242,83 +248,49 @@ def read_models(
 
 
 HELD_OUT_SEED = 0x4E1D  #: added to the seed of the views that are trained on
-_TOGETHER = 8
 _SURFACE = 1000
 
 
-class HeldOut:
-    """Clouds that are rendered once, and measured at each validation.
+class ViewsTask:
+    """What the trainings of networks that pose have in common: one network, and held-out views.
 
-    Each is a rendering of its own at the full resolution; so many of each object are at each
-    occlusion. One that shows too few points to be posed counts as a failure.
+    Each of the views is a rendering of its own at the full resolution; so many of each object are
+    at each occlusion. ``method`` says in the names of numbers how the network poses.
     """
 
+    method: ClassVar[str]
+
     def __init__(
-        self,
-        models: Sequence[ObjectModel],
-        synthetic: ObjectsConfig,
-        cloud: CloudConfig,
-        config: HeldOutConfig,
+        self, network: nn.Module, models: Sequence[ObjectModel], config: ViewsTraining
     ) -> None:
-        self.models, self.config = models, config
-        self._surfaces = [sample_surface(model, _SURFACE)[0] for model in models]
-        self._synthetic, self._cloud = synthetic, cloud
-        self._clouds: dict[float, list[Cloud]] = {}
+        self.models, self.training = tuple(models), config
+        self.modules: dict[str, nn.Module] = {"network": network.train()}
+        self.optimizers = {"network": (make_adam(network.parameters(), config.adam), config.adam)}
+        self._held_out: dict[float, list[ViewSample]] = {}
+
+    def held_out_error(self, view: ViewSample, index: int) -> float:
+        """ADD of a held-out view, posed without ICP and refusal: see :func:`add_error`."""
+        raise NotImplementedError
 
     @torch.no_grad()
-    def look(self, network: DirectionNet) -> ValidationResult:
-        """Share of ADD below a tenth of the diameter, and its median; to the nearest symmetry."""
+    def validate(self) -> ValidationResult:
+        """Share of ADD below a tenth of the diameter, and its median, by occlusion."""
         numbers: dict[str, float] = {}
-        for occlusion in self.config.occlusions:
-            for method, errors in self._errors(network, occlusion).items():
-                numbers |= held_out_numbers(occlusion, method, errors)
+        self.modules["network"].eval()
+        given = self.training
+        for occlusion in given.held_out.occlusions:
+            if occlusion not in self._held_out:
+                drawn = held_out_objects(
+                    self.models, given.objects, given.cloud, given.held_out, occlusion
+                )
+                self._held_out[occlusion] = [drawn.view(index) for index in range(len(drawn))]
+            views = self._held_out[occlusion]
+            errors = torch.tensor([self.held_out_error(view, k) for k, view in enumerate(views)])
+            place = f"held_out/occluded_{round(100 * occlusion)}/{self.method}"
+            numbers[f"{place}_add_10"] = float((errors < SUCCESS_SHARE).float().mean())
+            numbers[f"{place}_median"] = float(errors.median())
+        self.modules["network"].train()
         return ValidationResult(numbers=numbers)
-
-    def _errors(self, network: DirectionNet, occlusion: float) -> dict[str, Float[Tensor, " n"]]:
-        """ADD to the nearest symmetric pose, in diameters, by the method that votes."""
-        methods: dict[str, Callable[[Tensor, Tensor], Vote]] = {"lines": meet_lines}
-        if self.config.with_ransac:
-            methods["ransac"] = vote_ransac
-        errors: dict[str, list[float]] = {method: [] for method in methods}
-        if occlusion not in self._clouds:
-            own = self._clouds[occlusion] = []
-            objects = held_out_objects(
-                self.models, self._synthetic, self._cloud, self.config, occlusion
-            )
-            for index in range(len(objects)):
-                sample = objects[index]
-                if refusal_of(sample.input.points_m, self._cloud) is None:
-                    generator = sample_generator(index, HELD_OUT_SEED)
-                    number = index % len(self.models)
-                    own.append(voxelised_cloud(sample, number, self._cloud, generator))
-        clouds = self._clouds[occlusion]
-        device = next(network.parameters()).device
-        for start in range(0, len(clouds), _TOGETHER):
-            part = clouds[start : start + _TOGETHER]
-            seen = TrainingClouds.collate(part).seen.to(device)
-            outputs = network.directions(seen).float()[..., :3]
-            each = outputs.split([len(cloud.points_m) for cloud in part])
-            for cloud, directions in zip(part, each, strict=True):
-                model = self.models[cloud.class_number]
-                truth, surface_m = Rigid(cloud.R, cloud.t_m), self._surfaces[cloud.class_number]
-                for method, vote_of in methods.items():
-                    vote = vote_of(cloud.points_m.to(directions), directions)
-                    keypoints_m, covariance_m2 = vote.keypoints_m.cpu(), vote.covariance_m2.cpu()
-                    fit = fit_pose(keypoints_m, covariance_m2, model.keypoints_m)
-                    errors[method].append(_share(fit.camera_from_model, truth, model, surface_m))
-        missing = [math.inf] * (self.config.number * len(self.models) - len(clouds))
-        return {method: torch.tensor(some + missing) for method, some in errors.items()}
-
-
-def held_out_numbers(
-    occlusion: float, method: str, errors: Float[Tensor, " n"]
-) -> dict[str, float]:
-    """Name the share of right ones among errors in diameters, and their median."""
-    place = f"held_out/occluded_{round(100 * occlusion)}/{method}"
-    return {
-        f"{place}_add_10": float((errors < SUCCESS_SHARE).float().mean()),
-        f"{place}_median": float(errors.median()),
-    }
 
 
 def held_out_objects(
@@ -342,15 +314,14 @@ def held_out_objects(
 
 
 def pose_error(estimate: PoseEstimate, truth: PoseTruth, model: ObjectModel) -> float:
-    """ADD to the nearest symmetric pose, in diameters; infinite where there is no answer."""
+    """:func:`add_error` of an estimate; infinite where there is no answer."""
     found = estimate.camera_from_model
-    if found is None:
-        return math.inf
-    return _share(found, truth.camera_from_model, model, sample_surface(model, _SURFACE)[0])
+    return math.inf if found is None else add_error(found, truth.camera_from_model, model)
 
 
-def _share(found: Rigid, truth: Rigid, model: ObjectModel, points_m: Tensor) -> float:
-    copies = symmetry_transforms(model.symmetries)
+def add_error(found: Rigid, truth: Rigid, model: ObjectModel) -> float:
+    """ADD to the nearest symmetric pose, in diameters."""
+    points_m, copies = sample_surface(model, _SURFACE)[0], symmetry_transforms(model.symmetries)
     return float(add_of_nearest_m(found, truth, points_m, copies)) / model.diameter_m
 
 

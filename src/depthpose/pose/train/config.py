@@ -83,9 +83,6 @@ class HeldOutConfig(Settings):
     occlusions: Annotated[tuple[float, ...], OCCLUSIONS] = (0.0, 0.3)
     """Occluded shares of the silhouette."""
 
-    with_ransac: bool = True
-    """Vote by RANSAC too."""
-
     def __post_init__(self) -> None:
         super().__post_init__()
         if not self.occlusions:
@@ -116,6 +113,9 @@ class ViewsTraining(Settings):
 
     with_half: bool = False
     """Write the weights in 16 bits."""
+
+    adam: AdamConfig = AdamConfig(learning_rate=1e-3, schedule="cosine", warmup_steps=50)
+    """The optimiser."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -189,9 +189,6 @@ class DepthImageTraining(ViewsTraining):
 
     surface_points: Annotated[int, "[3, inf)"] = 500
     """Points of the model whose distances are the loss."""
-
-    adam: AdamConfig = AdamConfig(learning_rate=1e-3, schedule="cosine", warmup_steps=50)
-    """The optimiser."""
 
     loop: LoopConfig = LoopConfig(
         steps=10000, batch_size=16, clip_norm=1.0, ema_decay=0.999, save_every_steps=500

@@ -1,6 +1,7 @@
 """Training of networks that pose: of directions, and of the regressed depth image."""
 
 import dataclasses
+import math
 import shlex
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
@@ -8,7 +9,7 @@ from typing import Any, NamedTuple
 
 import torch
 from jaxtyping import Float, Int
-from torch import Tensor, nn
+from torch import Tensor
 
 from depthpose.core.checkpoint import bound_facts, file_sha256, find_weights, warn_of_terms
 from depthpose.core.config import config_to_dict
@@ -17,9 +18,7 @@ from depthpose.core.files import write_json
 from depthpose.core.loop import (
     Run,
     Update,
-    ValidationResult,
     held_out_text,
-    make_adam,
     releases_folder,
     sample_generator,
     write_card,
@@ -34,28 +33,29 @@ from depthpose.pose.baselines import (
     cut_depth,
     poses_of,
 )
-from depthpose.pose.config import EstimateConfig, RefusalConfig
-from depthpose.pose.estimator import DepthImageRegressor
+from depthpose.pose.cloud import lift_sample, refusal_of
+from depthpose.pose.config import RefusalConfig
 from depthpose.pose.estimator.candidates import near_symmetry_lines
 from depthpose.pose.losses import direction_loss, model_point_loss
 from depthpose.pose.mesh import sample_surface, symmetry_transforms
 from depthpose.pose.network import ResUNet, fold_norms, unfold_norms
 from depthpose.pose.sparse import Voxels
 from depthpose.pose.train.clouds import (
+    HELD_OUT_SEED,
     TRIES,
     CloudBatch,
-    HeldOut,
     TrainingClouds,
     TrainingViews,
-    held_out_numbers,
-    held_out_objects,
-    pose_error,
+    ViewsTask,
+    add_error,
     read_models,
     score_held_out,
     table_text,
+    voxelised_cloud,
 )
 from depthpose.pose.train.config import DepthImageTraining, PoseTraining, ViewsTraining
 from depthpose.pose.types import ObjectModel, ViewSample
+from depthpose.pose.voting import fit_pose, vote_ransac
 from depthpose.pose.weights import (
     AnyNetwork,
     DirectionNet,
@@ -68,23 +68,19 @@ from depthpose.pose.weights import (
 _SYMMETRY_STEP = 0.05  # half the step about an axis of revolution [rad]; votes err by more
 
 
-class PoseTask:
+class PoseTask(ViewsTask):
     """Directions from each point to the keypoints of its object (thesis, 3.3).
 
     A symmetric object's copy of the truth is chosen once for each cloud.
     """
 
+    method = "ransac"
+
     def __init__(
-        self,
-        network: DirectionNet,
-        models: Sequence[ObjectModel],
-        config: PoseTraining,
-        held_out: HeldOut | None,
+        self, network: DirectionNet, models: Sequence[ObjectModel], config: PoseTraining
     ) -> None:
-        self.config, self.held_out = config, held_out
-        self.network = network.train()
-        self.modules: dict[str, nn.Module] = {"network": network}
-        self.optimizers = {"network": (make_adam(network.parameters(), config.adam), config.adam)}
+        super().__init__(network, models, config)
+        self.network, self.config = network, config
         self._copies_m = keypoint_copies(models)
 
     def step(self, batch: CloudBatch) -> Iterator[Update]:
@@ -97,14 +93,19 @@ class PoseTask:
         )
         yield Update("network", loss, {"directions": loss.detach()})
 
-    def validate(self) -> ValidationResult:
-        """Pose held-out views with the current network."""
-        if self.held_out is None:
-            return ValidationResult()
-        self.network.eval()
-        result = self.held_out.look(self.network)
-        self.network.train()
-        return result
+    def held_out_error(self, view: ViewSample, index: int) -> float:
+        """Let the cloud of a view vote; one that shows too few points is a failure."""
+        number, chance = index % len(self.models), sample_generator(index, HELD_OUT_SEED)
+        model, config = self.models[number], self.config.cloud
+        sample = lift_sample(view, model.diameter_m, config)
+        if refusal_of(sample.input.points_m, config) is not None:
+            return math.inf
+        cloud = voxelised_cloud(sample, number, config, chance)
+        device = next(self.network.parameters()).device
+        seen = TrainingClouds.collate([cloud]).seen.to(device)
+        vote = vote_ransac(seen.points_m, self.network.directions(seen).float())
+        fit = fit_pose(vote.keypoints_m.cpu(), vote.covariance_m2.cpu(), model.keypoints_m)
+        return add_error(fit.camera_from_model, Rigid(cloud.R, cloud.t_m), model)
 
 
 def keypoint_copies(models: Sequence[ObjectModel]) -> Float[Tensor, "classes copies k 3"]:
@@ -214,20 +215,19 @@ class TrainingCrops(TrainingViews):
         )
 
 
-class DepthImageTask:
+class DepthImageTask(ViewsTask):
     """ADD of the regressed pose against the nearest symmetric copy of the truth."""
+
+    method = "regressed"
 
     def __init__(
         self, network: DepthImageNet, models: tuple[ObjectModel, ...], config: DepthImageTraining
     ) -> None:
-        self.config, self.models = config, models
-        self.network = network.train()
-        self.modules: dict[str, nn.Module] = {"network": network}
-        self.optimizers = {"network": (make_adam(network.parameters(), config.adam), config.adam)}
+        super().__init__(network, models, config)
+        self.network = network
         self._points_m = surface_points(models, config.surface_points)
         self._copies = symmetric_copies(models, _IMAGE_SYMMETRY_STEP).float()
         self._diameter_m = torch.tensor([model.diameter_m for model in models])
-        self._views: dict[float, list[ViewSample]] = {}
 
     def step(self, batch: CropSample) -> Iterator[Update]:
         """One update: regress, move the model's points, compare; in diameters."""
@@ -239,28 +239,18 @@ class DepthImageTask:
         error_m = model_point_loss(poses_of(outputs, batch.crop), truth, points_m, copies)
         yield Update("network", (error_m / self._diameter_m.to(device)[which]).mean(), {})
 
-    @torch.no_grad()
-    def validate(self) -> ValidationResult:
-        """Pose held-out views with the current network, without ICP."""
-        cpu = DepthImageNet(self.network.config)
-        cpu.load_state_dict(self.network.state_dict())
-        weights = PoseWeights(network=cpu, models=self.models, cloud=self.config.cloud,
-                              refusal=RefusalConfig(), facts={})  # fmt: skip
-        regressor = DepthImageRegressor(weights, EstimateConfig(with_icp=False))
-        numbers: dict[str, float] = {}
-        for occlusion in self.config.held_out.occlusions:
-            if occlusion not in self._views:
-                c = self.config
-                drawn = held_out_objects(self.models, c.objects, c.cloud, c.held_out, occlusion)
-                self._views[occlusion] = [drawn.view(index) for index in range(len(drawn))]
-            views = self._views[occlusion]
-            found = regressor.estimate_many([view.input for view in views])
-            errors = torch.tensor([
-                pose_error(estimate, view.truth, self.models[index % len(self.models)])
-                for index, (estimate, view) in enumerate(zip(found, views, strict=True))
-            ])  # fmt: skip
-            numbers |= held_out_numbers(occlusion, "regressed", errors)
-        return ValidationResult(numbers=numbers)
+    def held_out_error(self, view: ViewSample, index: int) -> float:
+        """Regress the pose of a view; one that shows too few pixels is a failure."""
+        number = index % len(self.models)
+        model, device = self.models[number], next(self.network.parameters()).device
+        crop = cut_depth(view.input, self.network.config, model.diameter_m)
+        if crop is None:
+            return math.inf
+        batch = DepthCrop(*(part[None].to(device) for part in crop))
+        found = poses_of(self.network(batch.image, torch.tensor([number], device=device)), batch)
+        return add_error(
+            Rigid(found.R[0].cpu(), found.t_m[0].cpu()), view.truth.camera_from_model, model
+        )
 
 
 def surface_points(models: Sequence[ObjectModel], count: int) -> Float[Tensor, "classes n 3"]:
@@ -309,8 +299,7 @@ def train_pose(config: PoseTraining | DepthImageTraining, run: Run) -> Path:
             word, network = "pointnet", PointNet(config.network)
         else:
             word, network = "pose", ResUNet(config.network)
-        held_out = HeldOut(models, config.objects, config.cloud, config.held_out)
-        task = PoseTask(network, models, config, held_out)
+        task = PoseTask(network, models, config)
     if config.start is not None:
         _start_from(network, config.start, samples)
     claim_run(config, run, config.models.cad)
