@@ -4,9 +4,7 @@ from torch import Tensor
 
 from depthpose.pose.losses import (
     POINT_LOSSES,
-    choose_copies,
     direction_loss,
-    instance_means,
     point_losses,
     unit_directions,
 )
@@ -30,11 +28,6 @@ def test_each_mode_by_hand() -> None:
     assert float(point_losses(found, truth, "cosine")) == pytest.approx(1 / 2)
 
 
-def test_instances_count_alike_whatever_their_size() -> None:
-    means = instance_means(torch.tensor([1.0, 3.0, 5.0]), torch.tensor([0, 0, 2]), 3)
-    assert means.tolist() == [2, 0, 5]
-
-
 def test_the_loss_by_hand() -> None:
     """Instance 0: two points, right and opposite; 1: one point, right under its second copy."""
     points = torch.zeros(3, 3)
@@ -43,7 +36,6 @@ def test_the_loss_by_hand() -> None:
     found = torch.stack([ahead, behind, behind])
     loss = direction_loss(found, points, copies, torch.tensor([0, 0, 1]))
     assert float(loss) == pytest.approx(((0 + 4 / 3) / 2 + 0) / 2)
-    assert choose_copies(found, points, copies, torch.tensor([0, 0, 1])).tolist() == [0, 1]
 
 
 @pytest.mark.parametrize("mode", POINT_LOSSES)

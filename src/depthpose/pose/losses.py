@@ -38,35 +38,6 @@ def point_losses(
     return POINT_LOSSES[mode](found, truth)
 
 
-def instance_means(
-    values: Float[Tensor, " points"], instance: Int[Tensor, " points"], count: int
-) -> Float[Tensor, " instances"]:
-    """Average the points of each instance; 0 for an instance without points."""
-    sums = values.new_zeros(count).index_add(0, instance, values)
-    points = torch.bincount(instance, minlength=count)
-    return sums / points.clamp(min=1).to(values.dtype)
-
-
-@torch.no_grad()
-def choose_copies(
-    found: Directions,
-    points_m: Float[Tensor, "points 3"],
-    copies_m: Float[Tensor, "instances copies keypoints 3"],
-    instance: Int[Tensor, " points"],
-    mode: str = "mse",
-) -> Int[Tensor, " instances"]:
-    """Find for each instance the symmetric copy of its truth that its votes are nearest to.
-
-    Once for a whole instance: a choice point by point, or an average of copies, would teach votes
-    that meet at the axis of symmetry.
-    """
-    losses: list[Tensor] = []
-    for copy in copies_m.unbind(1):
-        of_points = point_losses(found, unit_directions(points_m, copy[instance]), mode)
-        losses.append(instance_means(of_points, instance, len(copies_m)))
-    return torch.stack(losses).argmin(0)
-
-
 def direction_loss(
     found: Directions,
     points_m: Float[Tensor, "points 3"],
@@ -76,7 +47,9 @@ def direction_loss(
 ) -> Float[Tensor, ""]:
     """Mean over instances of the least loss that any symmetric copy of the truth gives.
 
-    It is the same whichever of the symmetric truths comes first.
+    It is the same whichever of the symmetric truths comes first. The copy is chosen once for a
+    whole instance: a choice point by point, or an average of copies, would teach votes that meet at
+    the axis of symmetry.
 
     Args:
         found: raw outputs of each point's own class.
@@ -88,12 +61,17 @@ def direction_loss(
     """
     if not len(found):
         return found.sum()
-    copy = choose_copies(found, points_m, copies_m, instance, mode)
-    truth_m = copies_m[torch.arange(len(copies_m), device=copy.device), copy]
-    losses = point_losses(found, unit_directions(points_m, truth_m[instance]), mode)
-    means = instance_means(losses, instance, len(copies_m))
-    seen = torch.bincount(instance, minlength=len(copies_m)) > 0
-    return means.sum() / seen.sum()
+    points = torch.bincount(instance, minlength=len(copies_m))
+
+    def means_of(truth_m: Float[Tensor, "instances keypoints 3"]) -> Float[Tensor, " instances"]:
+        losses = point_losses(found, unit_directions(points_m, truth_m[instance]), mode)
+        sums = losses.new_zeros(len(points)).index_add(0, instance, losses)
+        return sums / points.clamp(min=1).to(losses.dtype)
+
+    with torch.no_grad():
+        copy = torch.stack([means_of(truth_m) for truth_m in copies_m.unbind(1)]).argmin(0)
+    means = means_of(copies_m[torch.arange(len(copies_m), device=copy.device), copy])
+    return means.sum() / (points > 0).sum()
 
 
 def mask_loss(

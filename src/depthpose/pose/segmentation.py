@@ -95,46 +95,34 @@ def normalise_colors(image: Float[Tensor, "*b 3 h w"]) -> Float[Tensor, "*b 3 h 
     return (image - mean) / std
 
 
-def resnet18_from_published(state: Mapping[str, Tensor]) -> ResNet18:
-    """Make the encoder, in eval mode, from torchvision's state dict of a classifier on ImageNet.
+def import_resnet18(file: Path, out: Path) -> None:
+    """Turn torchvision's weights of ImageNet into an encoder that trainings can start from.
 
     The classifier's own layer (``fc``) is left out, and so is ``module.``; all else must agree.
-
-    Raises:
-        InputError: a name is missing, unknown or holds another shape; nothing is half loaded.
-    """
-    given = {name.removeprefix("module."): value for name, value in state.items()}
-    for name in ("fc.weight", "fc.bias"):
-        given.pop(name, None)
-    network = ResNet18()
-    # The count of batches steers nothing at inference, and old files do not hold it.
-    spare = {k: t for k, t in network.state_dict().items() if k.endswith("num_batches_tracked")}
-    load_weights(
-        network, Checkpoint(kind=ENCODER_KIND, config={}, state={**spare, **given}), ENCODER_KIND
-    )
-    return network.eval()
-
-
-def import_resnet18(file: Path, out: Path) -> None:
-    """Turn published weights of ImageNet into an encoder that trainings can start from.
 
     Args:
         file: a ``.pth`` of tensors, read without running any code in it, or ``.safetensors``.
         out: the ``.safetensors`` file to write.
 
     Raises:
-        InputError: not the weights of such a network.
+        InputError: not the weights of such a network; nothing is written.
     """
     state = read_published(file, "ResNet-18")
+    given = {name.removeprefix("module."): value for name, value in state.items()}
+    given = {name: value for name, value in given.items() if not name.startswith("fc.")}
+    network = ResNet18()
+    # The count of batches steers nothing at inference, and old files do not hold it.
+    spare = {k: t for k, t in network.state_dict().items() if k.endswith("num_batches_tracked")}
+    held = Checkpoint(kind=ENCODER_KIND, config={}, state={**spare, **given})
     try:
-        network = resnet18_from_published(state)
+        load_weights(network, held, ENCODER_KIND)
     except InputError as error:
         raise InputError(f"{file}: not the published weights of a ResNet-18: {error}") from error
     said = {
         "trained_on": "ImageNet, as its publisher says",
         "licence": "as published by its authors",
     }
-    save_imported(out, ENCODER_KIND, network, file, said)
+    save_imported(out, ENCODER_KIND, network.eval(), file, said)
 
 
 KIND = "segmentation"

@@ -27,7 +27,13 @@ from depthpose.core.files import (
 from depthpose.core.files.disk import write_bytes
 from depthpose.core.findings import CheckReport, Problem, make_report, unreadable
 from depthpose.core.rigid import Rigid
-from depthpose.pose.cloud import cloud_from_depth, lift_sample, refusal_of, refuse_other_size
+from depthpose.pose.cloud import (
+    cloud_from_depth,
+    grow_mask,
+    lift_sample,
+    refusal_of,
+    refuse_other_size,
+)
 from depthpose.pose.config import CloudConfig
 from depthpose.pose.datasets.layouts import (
     Instance,
@@ -198,8 +204,6 @@ _DIAMETER_SLACK = 0.01
 _FAR_DIAMETERS = 1.0
 _FEW_IN_MASK = 0.5
 
-Models = dict[int, ObjectModel]
-
 
 def check_bop(
     folder: str | Path,
@@ -234,10 +238,15 @@ def check_bop(
             instances += open_bop(folder, one).instances
         except InputError as error:
             found.append(Problem(path=folder, kind="unreadable", message=str(error)))
-    models, more = _check_models(folder, {i.object_id for i in instances})
-    found += more
+    models = _check_models(folder, {i.object_id for i in instances}, found)
     for done, instance in enumerate(instances, 1):
-        found += _check_instance(instance, models, with_decoding=with_decoding)
+        model = models.get(instance.object_id) if with_decoding else None
+        try:
+            found += _check_instance(instance, model)
+        except InputError as error:
+            paths = (p for p in (instance.mask, instance.rgb) if p and str(p) in str(error))
+            problem = unreadable(next(paths, instance.depth), error)
+            found.append(problem if problem.path.is_file() else replace(problem, kind="missing"))
         if progress is not None:
             progress(done, len(instances))
     counts = {
@@ -250,14 +259,15 @@ def check_bop(
     return make_report(name, counts, found)
 
 
-def _check_models(folder: Path, numbers: set[int]) -> tuple[Models, list[Problem]]:
+def _check_models(folder: Path, numbers: set[int], found: list[Problem]) -> dict[int, ObjectModel]:
+    """Read the models that can be read; what is wrong with them goes to ``found``."""
+    models: dict[int, ObjectModel] = {}
     try:
         home = models_folder(folder)
         infos = read_models_info(home)
     except InputError as error:
-        return {}, [Problem(path=folder, kind="missing", message=str(error))]
-    models: Models = {}
-    found: list[Problem] = []
+        found.append(Problem(path=folder, kind="missing", message=str(error)))
+        return models
     for number in sorted(numbers):
         path = model_path(home, number)
         if path is None:
@@ -285,70 +295,48 @@ def _check_models(folder: Path, numbers: set[int]) -> tuple[Models, list[Problem
             own = " and ".join(str(n) for n in sorted(names) if names[n] == name)
             message = f"calls objects {own} {name!r}; rename all but one in models_info"
             found.append(Problem(path=home, kind="mismatch", message=message))
-    return models, found
+    return models
 
 
-def _check_instance(
-    instance: Instance, models: Models, *, with_decoding: bool
-) -> Iterator[Problem]:
+def _check_instance(instance: Instance, model: ObjectModel | None) -> Iterator[Problem]:
+    """Compare the sizes of an instance's files, and with a model what they show with its pose."""
     if instance.mask is None:
         message = f"has no mask_visib of annotation {instance.index}"
         yield Problem(path=instance.depth, kind="note", message=message)
     if not instance.is_measured:
         message = f"annotation {instance.index} is itself fitted to this depth; quote no accuracy"
         yield Problem(path=instance.depth, kind="note", message=message)
-    paths = [p for p in (instance.depth, instance.mask, instance.rgb) if p is not None]
-    try:
-        sizes = {path: image_size(path) for path in paths}
-    except InputError as error:
-        path = next((p for p in paths if str(p) in str(error)), instance.depth)
-        kind = "unreadable" if path.is_file() else "missing"
-        problem = unreadable(path, error)
-        yield Problem(path=path, kind=kind, message=problem.message)
-        return
-    width, height = sizes[instance.depth]
-    for path, size in sizes.items():
+    width, height = image_size(instance.depth)
+    for path in filter(None, (instance.mask, instance.rgb)):
+        size = image_size(path)
         if size != (width, height):
             message = f"is {size[0]}x{size[1]}, but its depth image is {width}x{height}"
             yield Problem(path=path, kind="mismatch", message=message)
             return
-    if with_decoding and instance.mask is not None and instance.object_id in models:
-        yield from _check_content(instance, models[instance.object_id])
-
-
-def _check_content(instance: Instance, model: ObjectModel) -> Iterator[Problem]:
-    try:
-        mask = read_instance_mask(instance)
-        depth_m = read_depth_png(instance.depth, instance.depth_unit_m)
-    except InputError as error:
-        path = instance.mask if str(instance.mask) in str(error) else instance.depth
-        assert path is not None
-        yield unreadable(path, error)
+    if instance.mask is None or model is None:
         return
-    assert instance.mask is not None
+    mask = read_instance_mask(instance)
+    depth_m = read_depth_png(instance.depth, instance.depth_unit_m)
     cloud = cloud_from_depth(depth_m, mask, instance.K)
     refusal = refusal_of(cloud)
     if refusal is not None:
         # Instances that are fully occluded are annotated too: no fault, but no test either.
         yield Problem(path=instance.mask, kind="note", message=refusal)
         return
-    advice = unit_advice(model.diameter_m, cloud[cloud[:, 2] < 3 * cloud[:, 2].median()])
     centre_m = instance.camera_from_model.apply(model.vertices_m.double()).mean(0)
     away_m = float((cloud.double().median(0).values - centre_m).norm())
-    if advice is not None and away_m > _FAR_DIAMETERS * model.diameter_m:
-        yield Problem(path=instance.depth, kind="mismatch", message=f"{instance.name}: {advice}")
-    elif away_m > _FAR_DIAMETERS * model.diameter_m:
-        message = (
-            f"{instance.name}: the cloud lies {away_m:.2f} m from the annotated pose; are "
-            "depth_scale and cam_t_m2c both for millimetres?"
+    if away_m > _FAR_DIAMETERS * model.diameter_m:
+        advice = unit_advice(model.diameter_m, cloud[cloud[:, 2] < 3 * cloud[:, 2].median()])
+        advice = advice or (
+            f"the cloud lies {away_m:.2f} m from the annotated pose; are depth_scale and "
+            "cam_t_m2c both for millimetres?"
         )
-        yield Problem(path=instance.depth, kind="mismatch", message=message)
+        yield Problem(path=instance.depth, kind="mismatch", message=f"{instance.name}: {advice}")
     elif instance.visible_fraction is None or instance.visible_fraction >= _FEW_IN_MASK:
         # The share of the model's points whose pixel is in the mask, grown by a pixel or two.
         points = instance.camera_from_model.apply(sample_surface(model, 500)[0].double())
         u, v = project(points, instance.K).nan_to_num(-9).round().long().unbind(1)
-        height, width = mask.shape
-        grown = torch.nn.functional.max_pool2d(mask[None].float(), 5, 1, 2)[0] > 0
+        grown = grow_mask(mask, 2)
         is_inside = (u >= 0) & (v >= 0) & (u < width) & (v < height)
         hit = grown[v.clamp(0, height - 1), u.clamp(0, width - 1)] & is_inside
         if float(hit.double().mean()) < _FEW_IN_MASK:

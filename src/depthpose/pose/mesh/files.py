@@ -11,7 +11,6 @@ from codecs import BOM_UTF8
 from collections.abc import Callable, Iterator
 from contextlib import suppress
 from io import BytesIO
-from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -282,7 +281,7 @@ MESH_READERS: dict[str, Callable[[AnyPath], tuple[np.ndarray, np.ndarray | Ragge
 """Suffix to reader of points (n, 3; float64) in the file's unit, and faces (f, corners; int64)."""
 
 
-_MOST_CORNERS = 5_000  # of one polygon: clipping takes time by the square of them, here a second
+_MOST_CORNERS = 5_000  # of one polygon: clipping takes time by the square of them, here 3 s
 _FLAT = 1e-9  # of the square of a polygon's area: a corner that turns back by less is straight
 _OVERLAP = 1e-3  # of all area: polygons that cross themselves may lay so much of it twice
 
@@ -343,53 +342,38 @@ def _cut(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     normals = np.cross(points, after).sum(1)
     turns = np.einsum("mnc,mc->mn", np.cross(points - before, after - points), normals)
     is_back = turns < -_FLAT * (normals**2).sum(-1, keepdims=True)
-    # Of four corners one turns back at most, and a fan from there is right.
-    first = np.where(is_back.any(1), turns.argmin(1), 0)
     steps = np.arange(count - 2)
     fan = np.stack([0 * steps, steps + 1, steps + 2], -1)
-    local = (first[:, None, None] + fan) % count
-    for k in np.flatnonzero(is_back.any(1)) if count > 4 else ():
+    local = np.repeat(fan[None], len(points), 0)
+    for k in np.flatnonzero(is_back.any(1)):
         # Projected along its normal, which then points at the viewer.
         across = np.cross(normals[k], np.eye(3)[np.abs(normals[k]).argmin()])
         basis = np.stack([across, np.cross(normals[k], across)], -1)
-        local[k] = _clip_ears(points[k] @ (basis / np.linalg.norm(basis, axis=0).clip(1e-300)))
+        flat = points[k] @ (basis / np.linalg.norm(basis, axis=0).clip(1e-300))
+        local[k] = _clip_ears(flat, is_back[k])
     return normals, local
 
 
-def _clip_ears(points: np.ndarray) -> list[tuple[int, int, int]]:
-    """Cut off a corner whose triangle holds no other, again and again; points (n, 2), in order."""
-    left, ears, places = list(range(len(points))), [], points.tolist()
+def _clip_ears(points: np.ndarray, is_back: np.ndarray) -> list[list[int]]:
+    """Cut off a corner whose triangle holds no other, again and again; points (n, 2), in order.
+
+    If a triangle holds any, then one of the corners that turn back.
+    """
+    left, ears, tried = list(range(len(points))), list[list[int]](), 0
     least = _FLAT * float(np.ptp(points, axis=0).max()) ** 2
-    is_back = np.array([_turn(places, k - 1, k, (k + 1) % len(left)) < 0 for k in left])
-    at = tried = 0
     while len(left) > 3:
-        at %= len(left)
-        a, b, c = left[at - 1], left[at], left[(at + 1) % len(left)]
-        turn = _turn(places, a, b, c)
-        is_ear = abs(turn) <= least
-        if not is_ear and turn > 0:  # and no corner that turns back lies in it or on its sides
-            x, y = points[is_back].T
-            is_inside = np.ones(len(x), bool)
-            for (ax, ay), (bx, by) in pairwise([places[k] for k in (a, b, c, a)]):
-                is_inside &= (bx - ax) * (y - ay) >= (by - ay) * (x - ax)
-                is_inside &= (x != ax) | (y != ay)
-            is_ear = not is_inside.any()
-        if not is_ear and tried < len(left):  # none at all: the polygon crosses itself
-            at, tried = at + 1, tried + 1
-            continue
-        ears.append((a, b, c))
-        del left[at]
-        is_back[b] = False
-        for k in (at - 1, at):
-            middle = k % len(left)
-            around = (left[middle - 1], left[middle], left[(middle + 1) % len(left)])
-            is_back[left[middle]] = _turn(places, *around) < 0
-        # The corner before is skipped: a fan of needles is cut where it can be avoided.
-        at, tried = at + 1, 0
-    return [*ears, (left[0], left[1], left[2])]
-
-
-def _turn(places: list[list[float]], a: int, b: int, c: int) -> float:
-    """Twice the area of a triangle, positive where it turns left."""
-    (ax, ay), (bx, by), (cx, cy) = places[a], places[b], places[c]
-    return (bx - ax) * (cy - by) - (by - ay) * (cx - bx)
+        ear = points[left[:3]]
+        sides = np.roll(ear, -1, 0) - ear
+        turn = sides[0, 0] * sides[1, 1] - sides[0, 1] * sides[1, 0]
+        gaps = points[is_back] - ear[:, None]  # from each corner of the ear to each of the others
+        is_within = (sides[:, :1] * gaps[..., 1] >= sides[:, 1:] * gaps[..., 0]).all(0)
+        is_within &= gaps.any(-1).all(0)  # what is at the same place does no harm
+        is_ear = abs(turn) <= least or (turn > 0 and not is_within.any())
+        if is_ear or tried > len(left):  # none at all: the polygon crosses itself
+            # The corner before is skipped: a fan of needles is cut where it can be avoided.
+            ears.append(left[:3])
+            is_back[left[1]] = False
+            left, tried = [*left[2:], left[0]], 0
+        else:
+            left, tried = [*left[1:], left[0]], tried + 1
+    return [*ears, left]
