@@ -5,7 +5,6 @@ import json
 import math
 import re
 from pathlib import Path
-from typing import Literal
 
 import pytest
 import torch
@@ -311,30 +310,13 @@ def test_terms_of_the_start_bind_what_comes_of_it(tmp_path: Path) -> None:
         assert expected in then.with_suffix(".md").read_text()
 
 
-@pytest.mark.parametrize("norm", ["batch", "none"])
-def test_a_start_with_fewer_voxel_features_ignores_the_new_ones(
-    tmp_path: Path, norm: Literal["batch", "none"]
-) -> None:
+def test_a_start_with_other_voxel_features_is_refused(tmp_path: Path) -> None:
     first = train_pose(_training(), Run(folder=tmp_path / "first"))
-    still = AdamConfig(learning_rate=1e-12)
     cloud = dataclasses.replace(_CLOUD, with_shape=True)
-    network = dataclasses.replace(_SMALL, norm=norm, with_bias=norm == "none")
-    loop = LoopConfig(steps=1, batch_size=16, device="cpu", log_every_steps=1)
-    config = _training(cloud=cloud, network=network, start=str(first), adam=still, loop=loop)
-    then = train_pose(config, Run(folder=tmp_path / "then"))
-    found = [read_pose_weights(path) for path in (first, then)]
-    networks = [n for n in (weights.network for weights in found) if isinstance(n, ResUNet)]
-    assert [network.config.inputs for network in networks] == [1, 9]
-    answers = []
-    for weights, network in zip(found, networks, strict=True):
-        view = TrainingClouds(_models()[:1], _VIEWS, None, weights.cloud, seed=1)[0]
-        answers.append(network.directions(TrainingClouds.collate([view]).seen).detach())
-    # A batch norm has other statistics after its first batch, and nothing else changed.
-    assert float((answers[1] - answers[0]).norm() / answers[0].norm()) < 0.1
-    with pytest.raises(InputError, match="inputs = 9, but the config says 1"):
-        train_pose(_training(start=str(then)), Run(folder=tmp_path / "less"))
-    with pytest.raises(InputError, match=r"takes 9 features of a voxel, .* clouds give 1\. Set"):
-        dataclasses.replace(found[1], cloud=_CLOUD)
+    with pytest.raises(InputError, match="inputs = 1, but the config says 9"):
+        train_pose(_training(cloud=cloud, start=str(first)), Run(folder=tmp_path / "more"))
+    with pytest.raises(InputError, match=r"takes 1 features of a voxel, .* clouds give 9\. Set"):
+        dataclasses.replace(read_pose_weights(first), cloud=cloud)
 
 
 def test_a_training_without_norms_begins_with_weights_that_have_its_biases(tmp_path: Path) -> None:
@@ -459,19 +441,8 @@ def test_a_config_is_read_and_opens_with_its_own_command(path: Path) -> None:
 @pytest.mark.parametrize(
     ("make", "said"),
     [
-        (lambda: _training(first_alone=-1), "first_alone must be in [0, inf), got -1"),
         (FramesConfig, "frames has no folder"),
-        (lambda: FramesConfig(folder="x", share=0.0), "share must be in (0, 1], got 0.0"),
-        (lambda: HeldOutConfig(number=0), "number must be in [1, inf), got 0"),
         (lambda: HeldOutConfig(occlusions=()), "nothing would be measured; take (0, 0.3)"),
-        (
-            lambda: HeldOutConfig(occlusions=(0.0, 1.0)),
-            "occlusions must be in [0, 0.95], got (0.0, 1.0)",
-        ),
-        (
-            lambda: ModelsConfig(symmetry_tolerance=-1.0),
-            "symmetry_tolerance must be in (0, 1), got -1.0",
-        ),
     ],
 )
 def test_settings_that_cannot_be_are_refused(make, said: str) -> None:  # noqa: ANN001

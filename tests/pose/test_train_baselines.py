@@ -60,7 +60,7 @@ def models_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def pointnet_config(folder: Path) -> PointNetTraining:
-    network = PointNetConfig(local=(4, 4), pooled=(4, 4, 8), head=(8, 8, 8), with_transforms=False)
+    network = PointNetConfig(local=(4, 4), pooled=(4, 4, 8), head=(8, 8, 8))
     return PointNetTraining(
         models=ModelsConfig(bop=str(folder)), objects=VIEWS, network=network, held_out=HELD_OUT,
         cloud=CloudConfig(max_points=50), loop=LOOP,
@@ -214,9 +214,9 @@ def test_labels_are_the_classes_of_the_masks(colored: Path) -> None:
         assert torch.equal(labels == 1, green)
         assert torch.equal(labels == 2, red & ~green)
         assert float(image[0][labels == 2].mean()) > 0.5
-    only = AnnotatedImages(ImagesConfig(folder=str(colored), objects=(7,), limit=3))
+    only = AnnotatedImages(ImagesConfig(folder=str(colored), objects=(7,)))
     assert (len(only), tuple(only.objects.values()), only[0].labels.unique().tolist()) == (
-        3, ("bracket",), [0, 1],
+        6, ("bracket",), [0, 1],
     )  # fmt: skip
 
 
@@ -352,17 +352,6 @@ def test_training_images_are_the_same_for_the_same_index(colored: Path) -> None:
     assert not torch.equal(samples[11].image, samples[12].image)
 
 
-@pytest.mark.parametrize(
-    ("make", "said"),
-    [
-        (lambda: ImageAugmentConfig(crop_px=(100, 64)), "multiples of 32"),
-        (lambda: ImageAugmentConfig(scale=(0.0, 1.0)), r"scale must be in \(0, 10\]"),
-        (lambda: ImageAugmentConfig(scale=(100.0, 100.0)), r"scale must be in \(0, 10\]"),
-        (lambda: ImageAugmentConfig(jitter=1.0), r"jitter must be in \[0, 1\)"),
-        (lambda: SegmentationTraining(object_weight=0.0), "object_weight must be in"),
-        (lambda: DepthImageTraining(surface_points=2), "surface_points must be in"),
-    ],
-)
-def test_settings_that_cannot_be_are_refused(make: object, said: str) -> None:
-    with pytest.raises(InputError, match=said):
-        make()  # pyright: ignore[reportCallIssue]
+def test_a_crop_that_the_network_cannot_halve_is_refused() -> None:
+    with pytest.raises(InputError, match="multiples of 32"):
+        ImageAugmentConfig(crop_px=(100, 64))

@@ -44,17 +44,14 @@ class DepthImageConfig(Settings):
 class PointNetConfig(Settings):
     """Size of a PointNet for segmentation (Qi et al. 2017) whose outputs are directions."""
 
-    RETIRED: ClassVar[frozenset[str]] = frozenset({"with_confidence"})
-    """Settings of before, in older weights: no confidence is learnt any more."""
+    RETIRED: ClassVar[frozenset[str]] = frozenset({"with_confidence", "with_transforms"})
+    """Settings of before, in older weights: no confidence is learnt, and T-Nets always turn."""
 
     classes: Annotated[int, "[1, inf)"] = 13
     """Objects that one network knows."""
 
     keypoints: Annotated[int, "[1, inf)"] = 8
     """Keypoints of each object."""
-
-    with_transforms: bool = True
-    """The two T-Nets, which turn points (3x3) and features (64x64) before they go on."""
 
     unit_m: Annotated[float, "(0, inf)"] = 0.1
     """Points are given to the network in units of so many metres: of order one for an object."""
@@ -191,9 +188,9 @@ class PointNet(nn.Module):
         super().__init__()
         self.config = config = config or PointNetConfig()
         c = config
-        self.turn_points = _Transform(3) if c.with_transforms else None
+        self.turn_points = _Transform(3)
         self.local = _layers((3, *c.local))
-        self.turn_features = _Transform(c.local[1]) if c.with_transforms else None
+        self.turn_features = _Transform(c.local[1])
         self.pooled = _layers((c.local[1], *c.pooled))
         self.head = _layers((c.local[1] + c.pooled[2], *c.head))
         self.final = nn.Linear(c.head[2], c.outputs)
@@ -209,11 +206,8 @@ class PointNet(nn.Module):
         """
         x = points_m / self.config.unit_m
         count = int(cloud.max()) + 1
-        if self.turn_points is not None:
-            x = _turned(x, self.turn_points(x, cloud, count), cloud)
-        x = self.local(x)
-        if self.turn_features is not None:
-            x = _turned(x, self.turn_features(x, cloud, count), cloud)
+        x = self.local(_turned(x, self.turn_points(x, cloud, count), cloud))
+        x = _turned(x, self.turn_features(x, cloud, count), cloud)
         whole = _largest(self.pooled(x), cloud, count)
         outputs = self.final(self.head(torch.cat([x, whole[cloud]], 1)))
         return outputs.view(len(outputs), self.config.classes, self.config.keypoints, 3)

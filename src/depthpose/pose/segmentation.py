@@ -259,11 +259,6 @@ class Segmentation:
     masks: Mapping[str, Bool[Tensor, "n h w"]]
     scores: Mapping[str, Float[Tensor, " n"]]  #: mean probability of the object on each mask, 0..1
 
-    def best(self, object: str) -> Bool[Tensor, "h w"] | None:
-        """Give the surest mask of an object; None where it was not found."""
-        found = self.masks.get(object)
-        return None if found is None else found[0]
-
 
 class Segmenter:
     """Finds known objects in an image: sizes, colours and connected parts are its concern.

@@ -223,18 +223,17 @@ def arrange(columns: Sequence[Sequence[Drawing]], width_px: int = 621) -> Float[
         raise InputError("a figure of no panel cannot be arranged; give a frame at least.")
     shrunk = [[shrink_to_width(panel.image, width_px) for panel in column] for column in columns]
     count = max(map(len, shrunk))
-    heights = [max(c[k].shape[1] for c in shrunk if k < len(c)) for k in range(count)]
-    total_width = len(shrunk) * (width_px + _GAP_PX) - _GAP_PX
-    bar_top = sum(heights) + count * _GAP_PX
-    canvas = torch.ones(3, bar_top + _BAR_PX, total_width)
-    for x, column in enumerate(shrunk):
-        left = x * (width_px + _GAP_PX)
-        for y, image in enumerate(column):
-            top = sum(heights[:y]) + y * _GAP_PX
-            canvas[:, top : top + image.shape[1], left : left + width_px] = image
-    ramp_m = torch.logspace(0, 1, total_width, base=_FAR_M / _NEAR_M) * _NEAR_M
-    canvas[:, bar_top:] = draw_depth(ramp_m[None], _NEAR_M, _FAR_M)
-    return canvas
+    heights = [max(c[k].shape[1] for c in shrunk if k < len(c)) + _GAP_PX for k in range(count)]
+    tall = []
+    for column in shrunk:
+        cells = [F.pad(p, (0, _GAP_PX, 0, h - p.shape[1]), value=1.0)
+                 for p, h in zip(column, heights, strict=False)]  # fmt: skip
+        whole = torch.cat(cells, 1)
+        tall.append(F.pad(whole, (0, 0, 0, sum(heights) - whole.shape[1]), value=1.0))
+    grid = torch.cat(tall, 2)[..., :-_GAP_PX]
+    ramp_m = torch.logspace(0, 1, grid.shape[2], base=_FAR_M / _NEAR_M) * _NEAR_M
+    bar = draw_depth(ramp_m[None], _NEAR_M, _FAR_M).expand(-1, _BAR_PX, -1)
+    return torch.cat([grid, bar], 1)
 
 
 def _depth(caption: str, pair: StereoInput, estimate: DepthEstimate) -> Drawing:

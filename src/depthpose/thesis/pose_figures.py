@@ -10,6 +10,7 @@ import torch
 from jaxtyping import Float, Float64
 from PIL import Image, ImageDraw
 from torch import Tensor
+from torch.nn import functional as F
 
 from depthpose.core.arrays import take_evenly
 from depthpose.core.errors import InputError
@@ -48,15 +49,13 @@ def arrange_grid(
     """
     if not pictures:
         raise InputError("a figure of no picture cannot be arranged; give one at least.")
-    height = max(picture.shape[1] for picture in pictures)
-    width = max(picture.shape[2] for picture in pictures)
-    columns = min(columns, len(pictures))
-    rows = -(-len(pictures) // columns)
-    grid = torch.ones(3, rows * (height + _GAP_PX) - _GAP_PX, columns * (width + _GAP_PX) - _GAP_PX)
-    for k, picture in enumerate(pictures):
-        top, left = (k // columns) * (height + _GAP_PX), (k % columns) * (width + _GAP_PX)
-        grid[:, top : top + picture.shape[1], left : left + picture.shape[2]] = picture
-    return grid
+    height = max(picture.shape[1] for picture in pictures) + _GAP_PX
+    width = max(picture.shape[2] for picture in pictures) + _GAP_PX
+    cells = [F.pad(p, (0, width - p.shape[2], 0, height - p.shape[1]), value=1.0) for p in pictures]
+    columns = min(columns, len(cells))
+    cells += [torch.ones(3, height, width)] * (-len(cells) % columns)
+    rows = [torch.cat(cells[k : k + columns], 2) for k in range(0, len(cells), columns)]
+    return torch.cat(rows, 1)[:, :-_GAP_PX, :-_GAP_PX]
 
 
 def draw_discs(
@@ -98,7 +97,7 @@ def seen_points(
     if isinstance(prepared, Refusal):
         return None
     grid = prepared.voxels
-    rows = torch.nn.functional.pad(grid.coordinates, (1, 0))
+    rows = F.pad(grid.coordinates, (1, 0))
     voxels = Voxels.from_points(rows, grid.features)
     return prepared.points_m, network.point_features(voxels).float()
 

@@ -7,7 +7,6 @@ import statistics
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from functools import partial
 from typing import Any
 
 import numpy as np
@@ -230,7 +229,6 @@ _ADD_POINTS = 1000
 LOOP_HYPOTHESES = 50
 """Hypotheses of the loop, as published ones take."""
 OUR_HYPOTHESES = (50, 128, 1024)
-_LOOP = "RANSAC, one by one (NumPy)"
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -296,10 +294,27 @@ def compare_voting(cases: Sequence[VotingCase | None], points: int) -> list[dict
     usable = [case for case in cases if case is not None]
     if not usable:
         raise InputError(f"none of the {len(cases)} views has enough points to be posed")
-    votes = sum(len(case.points_m) for case in usable) / len(usable)
+    # Name, number of hypotheses and test for inliers to the vote itself.
+    ways: dict[tuple[str, int | None, str], Callable[[VotingCase], Tensor]] = {
+        ("RANSAC, one by one (NumPy)", LOOP_HYPOTHESES, "angle"): lambda case: torch.from_numpy(
+            ransac_one_by_one(
+                case.points_m.double().numpy(), case.directions.double().numpy(), LOOP_HYPOTHESES
+            )
+        )
+    }
+    for hypotheses in OUR_HYPOTHESES:
+        for test in ("angle", "distance"):
+            config = VotingConfig(hypotheses=hypotheses, inlier_test=test)
+            ways["RANSAC, ours", hypotheses, test] = lambda case, config=config: (
+                vote_ransac(case.points_m, case.directions, None, config).keypoints_m
+            )
+    for name, steps in (("least squares, published", 0), ("least squares, ours", 3)):
+        ways[name, None, ""] = lambda case, steps=steps: (
+            meet_lines(case.points_m, case.directions, None, steps).keypoints_m
+        )
     rows: list[dict[str, Any]] = []
     threads = torch.get_num_threads()
-    for method, hypotheses, test, vote in _ways():
+    for (method, hypotheses, test), vote in ways.items():
         successes, seconds = 0, []
         torch.set_num_threads(1)
         try:
@@ -319,7 +334,7 @@ def compare_voting(cases: Sequence[VotingCase | None], points: int) -> list[dict
             torch.set_num_threads(threads)
         row = {
             "points": points,
-            "votes": votes,
+            "votes": sum(len(case.points_m) for case in usable) / len(usable),
             "method": method,
             "hypotheses": hypotheses,
             "inliers by": test,
@@ -328,30 +343,7 @@ def compare_voting(cases: Sequence[VotingCase | None], points: int) -> list[dict
             "milliseconds": 1000 * statistics.median(seconds),
         }
         rows.append(row)
-    slow = next(row["milliseconds"] for row in rows if row["method"] == _LOOP)
-    return [row | {"times faster": slow / row["milliseconds"]} for row in rows]
-
-
-def _ways() -> Iterator[tuple[str, int | None, str, Callable[[VotingCase], Tensor]]]:
-    """Give the name, the number of hypotheses, the test for inliers, and the vote itself."""
-
-    def one_by_one(case: VotingCase) -> Tensor:
-        points, directions = (part.double().numpy() for part in (case.points_m, case.directions))
-        return torch.from_numpy(ransac_one_by_one(points, directions, LOOP_HYPOTHESES))
-
-    def ransac(case: VotingCase, config: VotingConfig) -> Tensor:
-        return vote_ransac(case.points_m, case.directions, None, config).keypoints_m
-
-    def lines(case: VotingCase, refinements: int) -> Tensor:
-        return meet_lines(case.points_m, case.directions, None, refinements).keypoints_m
-
-    yield (_LOOP, LOOP_HYPOTHESES, "angle", one_by_one)
-    for hypotheses in OUR_HYPOTHESES:
-        for test in ("angle", "distance"):
-            config = VotingConfig(hypotheses=hypotheses, inlier_test=test)
-            yield ("RANSAC, ours", hypotheses, test, partial(ransac, config=config))
-    yield ("least squares, published", None, "", partial(lines, refinements=0))
-    yield ("least squares, ours", None, "", partial(lines, refinements=3))
+    return [row | {"times faster": rows[0]["milliseconds"] / row["milliseconds"]} for row in rows]
 
 
 def ransac_one_by_one(

@@ -89,18 +89,6 @@ def random_clutter(generator: torch.Generator) -> Solid:
     )
 
 
-def table_of(side_m: float, generator: torch.Generator) -> Solid:
-    """Draw a table's top about the origin, at height 0."""
-    h = 0.5 * side_m
-    corners = torch.tensor([[-h, -h, 0.0], [h, -h, 0.0], [h, h, 0.0], [-h, h, 0.0]])
-    return Solid(
-        triangles_m=corners[torch.tensor([[0, 1, 2], [0, 2, 3]])],
-        normals=torch.tensor([0.0, 0.0, 1.0]).expand(2, 3, 3),
-        pattern=random_pattern(generator, uniform(generator, 0.05, 0.5)),
-        number=None,
-    )
-
-
 def shade(
     placed: Sequence[tuple[Solid, Rigid]],
     raster: Raster,
@@ -196,7 +184,14 @@ def _make_frame(
         world = _piled(models, solids, config, generator)
     else:
         world = _arranged(solids, config, generator)
-    table = table_of(uniform(generator, 0.8, 3.0), generator)
+    h = 0.5 * uniform(generator, 0.8, 3.0)
+    table = Solid(  # its top, at height 0
+        triangles_m=torch.tensor([[[-h, -h, 0.0], [h, -h, 0.0], [h, h, 0.0]],
+                                  [[-h, -h, 0.0], [h, h, 0.0], [-h, h, 0.0]]]),
+        normals=torch.tensor([0.0, 0.0, 1.0]).expand(2, 3, 3),
+        pattern=random_pattern(generator, uniform(generator, 0.05, 0.5)),
+        number=None,
+    )  # fmt: skip
     world.append((table, Rigid(torch.eye(3), torch.zeros(3))))
     view = _viewpoint(config, generator)
     placed = [(solid, view @ pose) for solid, pose in world]

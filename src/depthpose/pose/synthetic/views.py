@@ -380,7 +380,7 @@ class Objects:
                     f"{model.diameter_m:.3g} m wide: the camera would stand in it. Begin at "
                     f"{1.5 * model.diameter_m:.2g} or farther, or correct the unit of the model."
                 )
-        self._shapes: dict[int, Shape] = {}
+        self._shapes = [make_shape(model) for model in self.models]
         self._views: dict[tuple[int, int], CleanView] = {}
 
     def __len__(self) -> int:
@@ -422,7 +422,7 @@ class Objects:
         """Make the window of depth and the mask that a sample is lifted from."""
         number = index % len(self.models)
         generator = sample_generator(index, self.config.seed)
-        shape, views = self._shape(number), self.config.views
+        shape, views = self._shapes[number], self.config.views
         if views is None:  # drawn anew
             R, distance_m, K = self._pose(generator)
             turn = self._gaze(number, distance_m, K, generator)
@@ -470,17 +470,12 @@ class Objects:
             number, place = key
             index = place * len(self.models) + number
             R, distance_m, K = self._pose(sample_generator(index, self.config.seed + _BANK_SEED))
-            shape = self._shape(number)
+            shape = self._shapes[number]
             middle = torch.tensor([0.0, 0.0, distance_m], dtype=torch.float64)
             view = draw_view(shape, pose_of_middle(shape, R, middle), K)
             depth_m = (view.depth_m - distance_m).half()
             self._views[key] = replace(view, depth_m=depth_m, distance_m=distance_m)
         return self._views[key]
-
-    def _shape(self, number: int) -> Shape:
-        if number not in self._shapes:
-            self._shapes[number] = make_shape(self.models[number])
-        return self._shapes[number]
 
     def _pose(self, generator: torch.Generator) -> tuple[Tensor, float, Tensor]:
         R = random_rotation(generator)

@@ -209,9 +209,6 @@ class ImagesConfig:
     objects: tuple[int, ...] = ()
     """Numbers of the objects to find; none: all that occur."""
 
-    limit: int | None = None
-    """At most so many images, evenly taken; None: all."""
-
     with_cache: bool = True
     """Keep images in memory after the first reading."""
 
@@ -225,10 +222,6 @@ class ImageAugmentConfig(Settings):
 
     scale: Annotated[tuple[float, float], "(0, 10]", ASCENDING] = (0.75, 1.5)
     """Times the network's own size."""
-
-    flip_share: Annotated[float, "[0, 1]"] = 0.0
-    """Share of mirrored images. A mirrored object is another object, unless it is mirror-symmetric;
-    for segmentation alone it is one more appearance."""
 
     jitter: Annotated[float, "[0, 1)"] = 0.3
     """Brightness, contrast and saturation change by up to this share, each color by a third of

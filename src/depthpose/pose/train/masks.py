@@ -77,9 +77,7 @@ class AnnotatedImages:
             objects = {number: object_name(number, infos.get(number, {})) for number in wanted}
         self.objects = objects  # names by number, in the order of the classes
         self._class_of = {number: k for k, number in enumerate(objects, 1)}
-        every = list(images.values())
-        count = len(every) if config.limit is None else min(config.limit, len(every))
-        self._images = [every[k * len(every) // count] for k in range(count)]
+        self._images = list(images.values())
         self._cache: dict[int, tuple[UInt8[Tensor, "3 h w"], UInt8[Tensor, "h w"]]] = {}
         self._with_cache = config.with_cache
 
@@ -138,8 +136,6 @@ class TrainingImages:
         scale = self._long_side_px / max(given.image.shape[-2:])
         scale *= uniform(generator, *self.config.scale)
         changed = cut_window(given, scale, self.config.crop_px, generator)
-        if uniform(generator, 0.0, 1.0) < self.config.flip_share:
-            changed = LabelledImage(*(part.flip(-1) for part in changed))
         image = jitter_colors(changed.image, self.config.jitter, generator)
         return LabelledImage(image, changed.labels)
 

@@ -224,7 +224,7 @@ class DepthImageTask(ViewsTask):
         self, network: DepthImageNet, models: tuple[ObjectModel, ...], config: DepthImageTraining
     ) -> None:
         super().__init__(network, models, config)
-        self.network = network
+        self.network, self.config = network, config
         self._points_m = surface_points(models, config.surface_points)
         self._copies = symmetric_copies(models, _IMAGE_SYMMETRY_STEP).float()
         self._diameter_m = torch.tensor([model.diameter_m for model in models])
@@ -340,14 +340,6 @@ def _start_from(network: AnyNetwork, start: str, samples: TrainingViews) -> None
             )
         network.load_state_dict(found.state_dict())
         return
-    if isinstance(found, ResUNet) and isinstance(network, ResUNet):
-        more = network.config.inputs - found.config.inputs
-        if more > 0:  # new features of a voxel get weights of zero
-            state, first = found.state_dict(), "down.0.conv.weight"
-            silent = state[first].new_zeros(len(state[first]), more, state[first].shape[2])
-            found = ResUNet(dataclasses.replace(found.config, inputs=network.config.inputs))
-            found.load_state_dict({**state, first: torch.cat([state[first], silent], 1)})
-            found.eval()
     wanted, given = config_to_dict(network.config), config_to_dict(found.config)
     has_norms = isinstance(network, ResUNet) and network.config.norm == "batch"
     free = ("classes", "norm", "with_bias") if has_norms else ("classes",)
