@@ -41,7 +41,7 @@ from depthpose.depth.datasets.frames import read_plain_calibration
 from depthpose.depth.train import STAGES
 from depthpose.depth.weights import read_depth_weights
 from depthpose.pose.datasets import read_mask
-from depthpose.pose.datasets.layouts import read_yaml
+from depthpose.pose.datasets.layouts import read_mapping
 from depthpose.pose.datasets.masks import read_detections
 from depthpose.pose.mesh import read_model
 from depthpose.pose.predictions import read_bop_results
@@ -184,8 +184,8 @@ BOMBS: dict[str, Bomb] = {
     "YAML of laughs": ("x.yaml", laughs, camera),
     "config, deep lists": ("x.yaml", lambda: 2**17 * b"[", config),
     "config of laughs": ("x.yaml", laughs, config),
-    "LineMOD's YAML, deep": ("gt.yml", lambda: 2**20 * b"[", read_yaml),
-    "LineMOD's YAML of lists": ("gt.yml", lambda: b"[" + 2**22 * b"[]," + b"]", read_yaml),
+    "LineMOD's YAML, deep": ("gt.yml", lambda: 2**20 * b"[", read_mapping),
+    "LineMOD's YAML of lists": ("gt.yml", lambda: b"[" + 2**22 * b"[]," + b"]", read_mapping),
     "XML, deep": ("x.xml", lambda: 2**16 * b"<a>", camera),
     "run lengths of a huge mask": ("x.json", lambda: b'{"size": [100000, 100000], "counts": '
                                    b"[10000000000]}", look),

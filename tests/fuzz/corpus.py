@@ -47,7 +47,7 @@ from depthpose.depth.train import STAGES as DEPTH_STAGES
 from depthpose.depth.types import RawFrame
 from depthpose.depth.weights import read_depth_weights, write_depth_weights
 from depthpose.pose.datasets import open_bop, read_mask
-from depthpose.pose.datasets.layouts import read_yaml
+from depthpose.pose.datasets.layouts import read_mapping
 from depthpose.pose.datasets.masks import read_detections
 from depthpose.pose.mesh import read_model
 from depthpose.pose.predictions import read_bop_results, read_predictions
@@ -396,7 +396,7 @@ def open_bop_results(home: Path) -> dict[str, Kind]:
         "poses": Kind(file="poses.json", good=(home / "poses.json").read_bytes(),
                       damage=damage.hurt_json, readers=(read_predictions,), is_folder=True),
         "LineMOD YAML": Kind(file="gt.yml", good=(home / "gt.json").read_bytes(),
-                             damage=damage.hurt_yaml, readers=(read_yaml,)),
+                             damage=damage.hurt_yaml, readers=(read_mapping,)),
     }  # fmt: skip
 
 

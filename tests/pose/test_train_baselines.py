@@ -105,7 +105,7 @@ def test_the_depth_image_trains_and_its_file_is_a_regressors(
         "- **Terms**: For research alone.\n",
         "`depthpose pose train --what depth-image --config config.yaml --out ",
         "- **Time**: 2 steps in ",
-        "| occluded_0/regressed_median | ",
+        "| occluded % | right % | ",
     ):
         assert said in card
     weights = read_pose_weights(path)

@@ -4,7 +4,7 @@ Definitions of Hinterstoisser et al. (2012) and of the BOP toolkit (Hodan et al.
 Computed in float64.
 """
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 
 import torch
 from jaxtyping import Bool, Float
@@ -84,8 +84,8 @@ def add_of_nearest_m(
         points_m: of the model.
         symmetries: a batch with the identity, of ``mesh.symmetry_transforms``.
     """
-    gaps_m = _gaps_to_copies(estimated, true, points_m, symmetries)
-    return torch.cat([gap_m.mean(-1) for gap_m in gaps_m]).min()
+    found, copies = _moved(estimated, points_m), _symmetric_copies(true, symmetries, len(points_m))
+    return torch.cat([(_moved(c, points_m) - found).norm(dim=-1).mean(-1) for c in copies]).min()
 
 
 def mssd_m(
@@ -99,8 +99,8 @@ def mssd_m(
         points_m: of the model.
         symmetries: a batch with the identity, of ``mesh.symmetry_transforms``.
     """
-    gaps_m = _gaps_to_copies(estimated, true, points_m, symmetries)
-    return torch.cat([gap_m.amax(-1) for gap_m in gaps_m]).min()
+    found, copies = _moved(estimated, points_m), _symmetric_copies(true, symmetries, len(points_m))
+    return torch.cat([(_moved(c, points_m) - found).norm(dim=-1).amax(-1) for c in copies]).min()
 
 
 def mspd_px(
@@ -197,15 +197,6 @@ def average_recall(errors: Float[Tensor, "n t"], thresholds: Sequence[float]) ->
 def _moved(pose: Rigid, points_m: Float[Tensor, "n 3"]) -> Float[Tensor, "*batch n 3"]:
     points = points_m.double()
     return points @ pose.R.double().mT + pose.t_m.double()[..., None, :]
-
-
-def _gaps_to_copies(
-    estimated: Rigid, true: Rigid, points_m: Float[Tensor, "n 3"], symmetries: Rigid
-) -> Iterator[Float[Tensor, "copies n"]]:
-    """Distance of each point from where each symmetric truth has it, in groups of copies."""
-    found = _moved(estimated, points_m)
-    for copies in _symmetric_copies(true, symmetries, len(points_m)):
-        yield (_moved(copies, points_m) - found).norm(dim=-1)
 
 
 def _symmetric_copies(true: Rigid, symmetries: Rigid, points: int) -> list[Rigid]:

@@ -23,6 +23,9 @@ from depthpose.pose.types import ObjectModel, Symmetries
 _ROTATION_SLACK = 1e-2  # published ones are rounded; LineMOD's are off by a few thousandths
 
 
+_OF_YAML = {b"[": 750, b"{": 750, b",": 450, b":": 500, b"\n": 500, b"- ": 500}
+"""Bytes that a value takes while it is read, measured with PyYAML 6."""
+
 MOST = 10**9  #: of scenes, images and objects: their numbers name files
 
 
@@ -32,9 +35,14 @@ def entry_number(key: object) -> int | None:
     return int(text) if len(text) <= 9 and text.isascii() and text.isdecimal() else None
 
 
-def read_mapping(path: Path) -> dict[str, Any]:
-    """Read a JSON file that holds an object."""
-    content = read_json(path)
+def read_mapping(path: Path) -> dict[Any, Any]:
+    """Read a JSON or YAML file that holds names and their values."""
+    if path.suffix == ".json":
+        content = read_json(path)
+    else:
+        text = read_text(path)
+        refuse_heavy(path, text.encode(), _OF_YAML)
+        content = parse_yaml(path, text)
     if not isinstance(content, dict):
         raise InputError(f"{path}: holds a {type(content).__name__}, where names to values belong")
     return content
@@ -238,9 +246,6 @@ def read_targets(path: str | Path, folder: str | Path = ".") -> list[BopTarget]:
     return targets
 
 
-_OF_YAML = {b"[": 750, b"{": 750, b",": 450, b":": 500, b"\n": 500, b"- ": 500}
-"""Bytes that a value takes while it is read, measured with PyYAML 6."""
-
 _MAX_BYTES = 2**22  # of a list of images
 
 SYMMETRIC = (10, 11)  #: Eggbox and glue: measured by ADD-S ever since Hinterstoisser et al. (2012).
@@ -257,16 +262,6 @@ def linemod_symmetries(number: int) -> Symmetries:
     return Symmetries(discrete=turn_about(up, origin, torch.tensor([math.pi]).double()))
 
 
-def read_yaml(path: Path) -> dict[Any, Any]:
-    """Read a YAML file of the data set."""
-    text = read_text(path)
-    refuse_heavy(path, text.encode(), _OF_YAML)
-    content = parse_yaml(path, text)
-    if not isinstance(content, dict):
-        raise InputError(f"{path}: holds a {type(content).__name__}, where names to values belong")
-    return content
-
-
 def linemod_instances(folder: Path, split: str) -> Iterator[Instance]:
     """Read the annotations of a split: ``train`` or ``test``, by the lists beside the data.
 
@@ -277,7 +272,7 @@ def linemod_instances(folder: Path, split: str) -> Iterator[Instance]:
         listed = scene / f"{split}.txt"
         if not listed.is_file():
             raise InputError(f"{listed}: no such list; the splits are train and test")
-        truths, infos = read_yaml(scene / "gt.yml"), read_yaml(scene / "info.yml")
+        truths, infos = read_mapping(scene / "gt.yml"), read_mapping(scene / "info.yml")
         for line in read_text(listed, _MAX_BYTES).split():
             if entry_number(line) is None:
                 raise InputError(f"{listed}: {line[:40]!r} is no number of an image")
@@ -373,13 +368,8 @@ def models_folder(folder: Path) -> Path:
 
 def read_models_info(home: Path) -> dict[int, dict[str, Any]]:
     """Read ``models_info.json`` or ``.yml`` by number of object; nothing where there is neither."""
-    as_json, as_yaml = home / "models_info.json", home / "models_info.yml"
-    if as_json.is_file():
-        content: dict[Any, Any] = read_mapping(as_json)
-    elif as_yaml.is_file():
-        content = read_yaml(as_yaml)
-    else:
-        return {}
+    files = (home / "models_info.json", home / "models_info.yml")
+    content = next((read_mapping(path) for path in files if path.is_file()), {})
     wrong = [k for k, v in content.items() if entry_number(k) is None or not isinstance(v, dict)]
     if wrong:
         raise InputError(

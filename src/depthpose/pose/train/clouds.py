@@ -13,11 +13,12 @@ from torch import Tensor, nn
 from depthpose.core.errors import InputError
 from depthpose.core.loop import ValidationResult, make_adam, sample_generator, shuffled_index
 from depthpose.core.rigid import Rigid
+from depthpose.pose.baselines import DepthImageNet
 from depthpose.pose.cloud import refusal_of, sample_points, voxelise
-from depthpose.pose.config import CloudConfig, EstimateConfig, ObjectsConfig
+from depthpose.pose.config import CloudConfig, ObjectsConfig
 from depthpose.pose.datasets import open_bop
 from depthpose.pose.datasets.layouts import models_folder, read_bop_models, read_models_info
-from depthpose.pose.estimator import GeoPoseNet
+from depthpose.pose.estimator import DepthImageRegressor, GeoPoseNet
 from depthpose.pose.mesh import (
     read_model,
     refuse_one_name,
@@ -357,7 +358,7 @@ def score_held_out(weights: PoseWeights, synthetic: ObjectsConfig, config: HeldO
 def table_text(table: Table) -> str:
     """Show what was counted, for people."""
     lines = [
-        "Synthetic views that no training saw, posed with voting, ICP and refusal; right is an "
+        "Synthetic views that no training saw, posed with ICP and refusal; right is an "
         "ADD, to the nearest symmetric pose, below a tenth of the diameter.",
         "",
         "| occluded % | right % | ambiguous % | wrong % | refused % | median error, % of size |",
@@ -371,7 +372,8 @@ def table_text(table: Table) -> str:
 
 
 def _posed(weights: PoseWeights, objects: Objects) -> tuple[list[PoseEstimate], list[float]]:
-    net = GeoPoseNet(weights, EstimateConfig())
+    is_regressed = isinstance(weights.network, DepthImageNet)
+    net = DepthImageRegressor(weights) if is_regressed else GeoPoseNet(weights)
     estimates, errors = [], []
     for start in range(0, len(objects), _CLOUDS_AT_ONCE):
         places = range(start, min(start + _CLOUDS_AT_ONCE, len(objects)))

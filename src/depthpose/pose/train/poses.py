@@ -18,7 +18,6 @@ from depthpose.core.files import write_json
 from depthpose.core.loop import (
     Run,
     Update,
-    held_out_text,
     releases_folder,
     sample_generator,
     write_card,
@@ -168,12 +167,6 @@ def with_origin(facts: Mapping[str, str], config: Any) -> dict[str, str]:  # noq
 _IMAGE_SYMMETRY_STEP = 0.2
 """Turns about a continuous axis are tried every 23 degrees: half of that is far below the error
 that this network is left with."""
-_MEASURED = (
-    "Synthetic views that no training saw, by occluded %, posed without ICP: the share with an "
-    "ADD, to the nearest symmetric pose, below a tenth of the diameter (add_10), and its median in "
-    "diameters."
-)
-"""What the numbers of validation are."""
 
 
 class CropSample(NamedTuple):
@@ -305,19 +298,15 @@ def train_pose(config: PoseTraining | DepthImageTraining, run: Run) -> Path:
     claim_run(config, run, config.models.cad)
     seconds = run.train(task, samples, config.loop)
     path = run.folder / f"{word}.safetensors"
-    if run.on_message is not None and isinstance(config, PoseTraining):
+    if run.on_message is not None:
         run.on_message("trained; now it is measured on synthetic views: a minute or more")
     if find_rank().rank:
         return path  # statistics of batch norm are rank 0's, and so is the file
     learnt = fold_norms(network) if isinstance(network, ResUNet) else network
     write_pose_weights(path, packed(learnt, models, config), with_half=config.with_half)
     weights = read_pose_weights(path)  # as the file holds them: 16 bits round them
-    if isinstance(config, DepthImageTraining):
-        measured = held_out_text(run.folder, _MEASURED)
-    else:
-        table = score_held_out(weights, config.objects, config.held_out)
-        write_json(path.with_suffix(".json"), {"held_out": table})
-        measured = table_text(table)
+    table = score_held_out(weights, config.objects, config.held_out)
+    write_json(path.with_suffix(".json"), {"held_out": table})
     cad = [word for file in config.models.cad for word in ("--cad", file)]
     unit = ["--unit", config.models.unit] if cad and config.models.unit else []
     command = shlex.join(["pose", "train", "--what", word, *cad, *unit])
@@ -325,24 +314,17 @@ def train_pose(config: PoseTraining | DepthImageTraining, run: Run) -> Path:
     alike = {model.name: near_symmetry_lines(model)[:_TURNS_ON_CARD] for model in weights.models}
     near = "; ".join(f"{name}: {', '.join(some)}" for name, some in alike.items() if some)
     facts = {"objects": known} | ({"nearly_alike": near} if near else {}) | dict(weights.facts)
-    write_card(path, command, seconds, facts, measured)
+    write_card(path, command, seconds, facts, table_text(table))
     return path
 
 
 def _start_from(network: AnyNetwork, start: str, samples: TrainingViews) -> None:
     """Copy weights; of other objects, all but the last layer, except of a depth image's."""
     found = read_pose_network(find_weights(start))
-    if isinstance(network, DepthImageNet):
-        if found.config != network.config:
-            raise InputError(
-                f"{start}: holds {found.config}, but the config says {network.config}. Give "
-                "the config the weights' own."
-            )
-        network.load_state_dict(found.state_dict())
-        return
     wanted, given = config_to_dict(network.config), config_to_dict(found.config)
     has_norms = isinstance(network, ResUNet) and network.config.norm == "batch"
     free = ("classes", "norm", "with_bias") if has_norms else ("classes",)
+    free = () if isinstance(network, DepthImageNet) else free
     for name, value in wanted.items():
         if name not in free and given.get(name) != value:
             raise InputError(
