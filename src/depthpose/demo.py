@@ -27,6 +27,7 @@ from depthpose.depth.types import (
     StereoSample,
     StereoTruth,
 )
+from depthpose.pose.cloud import object_points
 from depthpose.pose.config import ObjectsConfig
 from depthpose.pose.datasets import open_bop, write_bop_models, write_bop_scene
 from depthpose.pose.datasets.dataset import write_mask
@@ -204,7 +205,7 @@ def show_poses(out: Path, weights: str | Path) -> tuple[list[dict[str, Any]], li
     assert frame.rgb is not None
     write_bop_models(out / "parts", net.weights.models)
     write_bop_scene(out / "parts", "test", 0, [frame])
-    dataset = open_bop(out / "parts", cloud=net.weights.cloud)
+    dataset = open_bop(out / "parts")
     views = [dataset.view(instance).input for instance in dataset.instances]
     sample = next(view for view in views if view.object == _SAMPLE)
     height, width = sample.mask.shape
@@ -230,7 +231,7 @@ def show_poses(out: Path, weights: str | Path) -> tuple[list[dict[str, Any]], li
         model, K = models[instance.object_id], instance.K.double()
         if (pose := estimate.camera_from_model) is not None:
             picture = draw_pose(picture, pose, model, K)
-            cloud = posed_cloud(dataset.sample(instance).input.points_m, pose, model)
+            cloud = posed_cloud(object_points(view, model.diameter_m), pose, model)
             write_cloud(folder / f"{view.object}.{CLOUD}", cloud)
             layers += pose_layers(pose, model)
         picture = draw_pose(picture, instance.camera_from_model, model, K, is_true=True)

@@ -121,7 +121,7 @@ def test_a_sample_depends_on_seed_and_index_alone() -> None:
     assert torch.equal(alone[7].input.points_m, ahead.sample(7).input.points_m)
 
 
-def test_views_drawn_by_other_processes_are_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_views_drawn_ahead_are_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
     models = [_model("first"), _model("second", 0.03)]
     ahead, alone = (Objects(models, ObjectsConfig(views=3, number=20)) for _ in range(2))
     ahead.draw_stored(workers=2)

@@ -11,7 +11,7 @@ from depthpose.core.config import config_from_dict
 from depthpose.core.errors import InputError
 from depthpose.core.render import rasterize
 from depthpose.core.rigid import Rigid, cross_matrix, geodesic_rad, perturb
-from depthpose.pose.cloud import cloud_from_depth
+from depthpose.pose.cloud import cloud_from_depth, object_points
 from depthpose.pose.config import IcpConfig, SensorConfig, SensorKind
 from depthpose.pose.datasets import open_bop
 from depthpose.pose.mesh import make_model, sample_surface
@@ -333,7 +333,8 @@ def test_the_real_cat_and_ape(real: Path) -> None:
         starts = [pose_near(true, seed, math.radians(8), 0.04 * model.diameter_m)
                   for seed in range(5)]  # fmt: skip
         batch = Rigid(torch.stack([s.R for s in starts]), torch.stack([s.t_m for s in starts]))
-        refined = refine_pose(sample.input.points_m, batch, prepare_surface(model))
+        points_m = object_points(sample.input, model.diameter_m)
+        refined = refine_pose(points_m, batch, prepare_surface(model))
         known = Rigid(true.R.expand(5, 3, 3), true.t_m.expand(5, 3))
         error_m = add_m(refined.camera_from_model, known, model.vertices_m[::7])
         assert float(error_m.max()) < 0.025 * model.diameter_m

@@ -30,11 +30,9 @@ from depthpose.core.rigid import Rigid
 from depthpose.pose.cloud import (
     cloud_from_depth,
     grow_mask,
-    lift_sample,
     refusal_of,
     refuse_other_size,
 )
-from depthpose.pose.config import CloudConfig
 from depthpose.pose.datasets.layouts import (
     Instance,
     find_layout,
@@ -54,7 +52,7 @@ from depthpose.pose.mesh import (
     symmetries_to_bop,
     unit_advice,
 )
-from depthpose.pose.types import CloudSample, ObjectModel, PoseTruth, ViewInput, ViewSample
+from depthpose.pose.types import ObjectModel, PoseTruth, ViewInput, ViewSample
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -65,15 +63,14 @@ class BopDataset:
     split: str  #: its name
     layout: str  #: a key of ``LAYOUTS``
     instances: Sequence[Instance]  #: what is annotated, in the order of scene, image and place
-    cloud_config: CloudConfig  #: for its clouds
     sha256: str  #: of all annotations of the split: tells data sets of one name apart
 
     def __len__(self) -> int:
         return len(self.instances)
 
-    def __getitem__(self, index: int) -> CloudSample:
-        """Give a sample with the annotated mask; see :meth:`sample`."""
-        return self.sample(self.instances[index])
+    def __getitem__(self, index: int) -> ViewSample:
+        """Give a view with the annotated mask; see :meth:`view`."""
+        return self.view(self.instances[index])
 
     @cached_property
     def objects(self) -> dict[int, ObjectModel]:
@@ -84,21 +81,6 @@ class BopDataset:
         """
         numbers = {instance.object_id for instance in self.instances}
         return read_bop_models(self.folder, numbers)
-
-    def sample(
-        self, instance: Instance, mask: Bool[Tensor, "mask_h mask_w"] | None = None
-    ) -> CloudSample:
-        """Cut an instance out of its depth image.
-
-        Args:
-            instance: one of ``instances``.
-            mask: predicted; None: the annotated one.
-
-        Raises:
-            InputError: a file is missing or damaged, or the mask does not fit the depth.
-        """
-        model = self.objects[instance.object_id]
-        return lift_sample(self.view(instance, mask), model.diameter_m, self.cloud_config)
 
     def view(
         self, instance: Instance, mask: Bool[Tensor, "mask_h mask_w"] | None = None
@@ -151,18 +133,12 @@ class BopDataset:
         return replace(self, instances=kept)
 
 
-def open_bop(
-    folder: str | Path,
-    split: str = "test",
-    *,
-    cloud: CloudConfig | None = None,
-) -> BopDataset:
+def open_bop(folder: str | Path, split: str = "test") -> BopDataset:
     """Open a split of a data set in BOP's layout, or in another of ``LAYOUTS``.
 
     Args:
         folder: of the data set, with ``models`` and the splits in it.
         split: ``test``, ``train_pbr``, ...; ``train`` or ``test`` of Linemod_preprocessed.
-        cloud: how its clouds are cut.
 
     Raises:
         InputError: no such folder or split, or an annotation is damaged.
@@ -180,7 +156,6 @@ def open_bop(
         split=split,
         layout=name,
         instances=instances,
-        cloud_config=CloudConfig() if cloud is None else cloud,
         sha256=said.hexdigest(),
     )
 

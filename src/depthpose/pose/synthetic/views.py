@@ -9,9 +9,9 @@ Changes (occluders, wrong masks, a sensor's errors) take their chance from a gen
 is NaN where nothing is seen.
 """
 
-import copy
 import math
 from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import dataclass, replace
 
@@ -20,7 +20,6 @@ import torch.nn.functional as F
 from jaxtyping import Bool, Float
 from scipy.spatial import ConvexHull, QhullError
 from torch import Tensor
-from torch.utils.data import DataLoader
 
 from depthpose.core.errors import InputError
 from depthpose.core.loop import sample_generator
@@ -397,21 +396,11 @@ class Objects:
         return self.sample(index)
 
     def draw_stored(self, workers: int) -> None:
-        """Draw all stored views now, in so many processes.
-
-        Processes that are forked later share them. Without this each process draws a view when a
-        sample first needs it, and keeps it for itself.
-        """
+        """Draw all stored views now, in so many threads: processes forked later share them."""
         wanted = [(n, k) for k in range(self.config.views or 0) for n in range(len(self.models))]
-        views = DataLoader(
-            wanted,  # pyright: ignore[reportArgumentType]
-            batch_size=None,
-            num_workers=workers,
-            collate_fn=self._stored,  # pyright: ignore[reportArgumentType]
-        )
-        for place, view in zip(wanted, views, strict=True):
-            # Tensors that a worker process sends hold file descriptors; copies do not.
-            self._views[place] = copy.deepcopy(view)
+        with ThreadPoolExecutor(workers) as pool:
+            for _ in pool.map(self._stored, wanted):
+                pass
 
     def sample(self, index: int) -> CloudSample:
         """Make the partial cloud of any index, also beyond the number of samples."""

@@ -14,7 +14,7 @@ from depthpose.core.errors import InputError
 from depthpose.core.loop import ValidationResult, make_adam, sample_generator, shuffled_index
 from depthpose.core.rigid import Rigid
 from depthpose.pose.baselines import DepthImageNet
-from depthpose.pose.cloud import refusal_of, sample_points, voxelise
+from depthpose.pose.cloud import lift_sample, refusal_of, sample_points, voxelise
 from depthpose.pose.config import CloudConfig, ObjectsConfig
 from depthpose.pose.datasets import open_bop
 from depthpose.pose.datasets.layouts import models_folder, read_bop_models, read_models_info
@@ -101,7 +101,7 @@ class TrainingViews:
         self._class_of = {model.name: k for k, model in enumerate(models)}
         self._frames, self._real = frames, None
         if frames is not None:
-            dataset = open_bop(frames.folder, frames.split, cloud=cloud)
+            dataset = open_bop(frames.folder, frames.split)
             self._real = dataset.of_objects(*(model.number for model in models))
             known = {model.number: model.name for model in models}
             for number, found in self._real.objects.items():
@@ -116,13 +116,12 @@ class TrainingViews:
             return len(self.synthetic)
         return max(1, round(len(self._real) / self._frames.share))
 
-    def _place(self, index: int, generator: torch.Generator) -> int | None:
-        """Choose which instance of the frames a sample shows; None: it is a synthetic view."""
-        if self._frames is None or self._real is None:
-            return None
-        if float(torch.rand((), generator=generator)) >= self._frames.share:
-            return None
-        return shuffled_index(index, len(self._real), self.seed)
+    def _view(self, place: int, generator: torch.Generator) -> tuple[ViewSample, bool]:
+        """Give a frame, as often as their share says, or a synthetic view; and whether a frame."""
+        share = 0.0 if self._frames is None else self._frames.share
+        if self._real is not None and float(torch.rand((), generator=generator)) < share:
+            return self._real[shuffled_index(place, len(self._real), self.seed)], True
+        return self.synthetic.view(place), False
 
 
 class TrainingClouds(TrainingViews):
@@ -140,11 +139,10 @@ class TrainingClouds(TrainingViews):
             place = index + attempt * len(self.models) * 2**32
             # Sample i shows object i modulo their number.
             place *= len(self.models) if place < self._first_alone else 1
-            frame = self._place(place, generator)
-            if self._real is None or self._frames is None or frame is None:
-                sample = self.synthetic.sample(place)
-            else:
-                sample = self._real[frame]
+            view, is_frame = self._view(place, generator)
+            number = self._class_of[view.input.object]
+            sample = lift_sample(view, self.models[number].diameter_m, self.cloud)
+            if self._frames is not None and is_frame:
                 angle_rad = 2 * math.pi * float(torch.rand((), generator=generator))
                 if self._frames.with_roll:  # the camera turns: cloud and pose turn with it
                     c, s = math.cos(angle_rad), math.sin(angle_rad)
@@ -157,7 +155,6 @@ class TrainingClouds(TrainingViews):
                         truth=dataclasses.replace(sample.truth, camera_from_model=turned),
                     )
             if refusal_of(sample.input.points_m, self.cloud) is None:
-                number = self._class_of[sample.input.object]
                 return voxelised_cloud(sample, number, self.cloud, generator)
         raise InputError(
             f"sample {index}: {TRIES} samples in a row have fewer than "

@@ -192,15 +192,11 @@ class TrainingCrops(TrainingViews):
         for attempt in range(TRIES):
             # Far beyond any training, and the same object.
             place = index + attempt * len(self.models) * 2**32
-            frame = self._place(place, sample_generator(place, self.seed))
-            if self._real is None or frame is None:
-                sample = self.synthetic.view(place)
-            else:
-                sample = self._real.view(self._real.instances[frame])
-            number = self._class_of[sample.input.object]
-            crop = cut_depth(sample.input, self.config, self.models[number].diameter_m)
+            view, _ = self._view(place, sample_generator(place, self.seed))
+            number = self._class_of[view.input.object]
+            crop = cut_depth(view.input, self.config, self.models[number].diameter_m)
             if crop is not None:
-                pose = sample.truth.camera_from_model
+                pose = view.truth.camera_from_model
                 return CropSample(crop, torch.tensor(number), pose.R.float(), pose.t_m.float())
         raise InputError(
             f"{TRIES} views in a row have fewer than {self.config.min_points} masked "
