@@ -267,7 +267,7 @@ class ViewsTask:
         self._held_out: dict[float, list[ViewSample]] = {}
 
     def held_out_error(self, view: ViewSample, index: int) -> float:
-        """ADD of a held-out view, posed without ICP and refusal: see :func:`add_error`."""
+        """ADD of a held-out view, posed without ICP and refusal: see ``add_error``."""
         raise NotImplementedError
 
     @torch.no_grad()
@@ -312,7 +312,7 @@ def held_out_objects(
 
 
 def pose_error(estimate: PoseEstimate, truth: PoseTruth, model: ObjectModel) -> float:
-    """:func:`add_error` of an estimate; infinite where there is no answer."""
+    """``add_error`` of an estimate; infinite where there is no answer."""
     found = estimate.camera_from_model
     return math.inf if found is None else add_error(found, truth.camera_from_model, model)
 
