@@ -11,6 +11,7 @@ from depthpose.core.rigid import Rigid, cross_matrix, perturb
 from depthpose.pose.cloud import voxelise
 from depthpose.pose.config import CloudConfig
 from depthpose.pose.datasets import open_bop
+from depthpose.pose.estimator.fit import free_motions
 from depthpose.pose.metrics import add_m
 from depthpose.pose.refine import refine_pose
 from depthpose.pose.surface import prepare_surface
@@ -19,7 +20,6 @@ from depthpose.pose.voting import (
     consistent_keypoints,
     distance_errors,
     fit_pose,
-    free_motions,
     vote_ransac,
 )
 

@@ -359,9 +359,15 @@ def conv(
     is_plain = features.dtype == weight.dtype == torch.float32
     near = kernel_map.neighbours
     if is_plain and serves(features, weight) and near.table.numel() <= COMPILED_ELEMENTS:
-        from depthpose.pose.compiled.points import convolved
+        from depthpose.pose.compiled.points import convolve
 
-        return convolved(features, weight, near.table, near.fine_rows, kernel_map.is_transposed)
+        read = near.table.shape[1] if kernel_map.is_transposed else near.fine_rows
+        assert features.shape == (read, weight.shape[1]), "a row for each voxel"
+        assert len(weight) == len(near.table), "a weight for each offset"
+        out = features.new_zeros(kernel_map.outputs, weight.shape[2])
+        given = (part.detach().contiguous().numpy() for part in (features, weight, near.table))
+        convolve(*given, kernel_map.is_transposed, out.numpy())
+        return out
     return _Convolution.apply(features, weight, kernel_map)
 
 

@@ -88,6 +88,9 @@ class ViewInput:
     object: str  # name of the object
 
 
+AnyInput = CloudInput | ViewInput
+
+
 @dataclass(frozen=True, kw_only=True, eq=False)
 class ViewSample:
     """A view and its truth."""

@@ -27,7 +27,13 @@ from depthpose.core.files import (
 from depthpose.core.files.disk import write_bytes
 from depthpose.core.findings import CheckReport, Problem, make_report, unreadable
 from depthpose.core.rigid import Rigid
-from depthpose.pose.cloud import cloud_from_depth, lift_sample, refusal_of, refuse_other_size
+from depthpose.pose.cloud import (
+    cloud_from_depth,
+    lift_sample,
+    refusal_of,
+    refuse_other_size,
+    unit_advice,
+)
 from depthpose.pose.config import CloudConfig
 from depthpose.pose.datasets.layouts import (
     Instance,
@@ -46,7 +52,6 @@ from depthpose.pose.mesh import (
     sample_surface,
     symmetries_from_bop,
     symmetries_to_bop,
-    unit_advice,
 )
 from depthpose.pose.types import CloudSample, ObjectModel, PoseTruth, ViewInput, ViewSample
 

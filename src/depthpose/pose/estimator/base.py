@@ -15,8 +15,9 @@ from depthpose.core.devices import each_in_own_arithmetic, own_arithmetic
 from depthpose.core.errors import InputError, nearest_name, refused_memory
 from depthpose.core.rigid import Rigid
 from depthpose.core.units import Unit
+from depthpose.pose.cloud import Refusal
 from depthpose.pose.config import EstimateConfig, RefusalConfig
-from depthpose.pose.estimator.candidates import PoseAmbiguities, find_copies, with_status
+from depthpose.pose.estimator.candidates import KnownObject
 from depthpose.pose.estimator.find import (
     ROUNDS,
     SearchTargets,
@@ -24,11 +25,11 @@ from depthpose.pose.estimator.find import (
     nothing_found,
     which_object,
 )
+from depthpose.pose.estimator.fit import refused, with_status
 from depthpose.pose.estimator.inputs import (
     AnyArray,
     AnyInput,
     AnyMask,
-    Refusal,
     cloud_input,
     labels_input,
     rigid_input,
@@ -36,7 +37,7 @@ from depthpose.pose.estimator.inputs import (
     view_input,
 )
 from depthpose.pose.estimator.track import TrackedObject, track
-from depthpose.pose.surface import Surface, prepare_surface
+from depthpose.pose.surface import prepare_surface
 from depthpose.pose.types import CloudInput, ObjectModel, PoseEstimate, ViewInput
 from depthpose.pose.voting.point_pairs import PairTable, prepare_pairs
 
@@ -61,16 +62,12 @@ class PoseEstimator(ABC):
     ) -> None:
         self.config = EstimateConfig() if config is None else config
         self.models, self.refusal = tuple(models), refusal
-        self._numbers = {model.name: k for k, model in enumerate(models)}
-        # What is made of a model, by its number, when it is first asked for.
-        self._surfaces: dict[int, Surface] = {}
-        self._copies: dict[int, PoseAmbiguities] = {}
-        self._prepared_pairs: dict[int, PairTable] = {}
+        self._objects: dict[str, KnownObject] = {}  # those that were asked for
 
     @property
     def objects(self) -> tuple[str, ...]:
         """Names of the objects."""
-        return tuple(self._numbers)
+        return tuple(model.name for model in self.models)
 
     def _objects_in_short(self) -> str:
         count = len(self.objects)
@@ -96,19 +93,8 @@ class PoseEstimator(ABC):
         """
         if isinstance(inputs, AnyInput):
             raise InputError("estimate_many takes several inputs; give one as [input]")
-
-        def typed() -> Iterator[AnyInput]:
-            for given in inputs:
-                if not isinstance(given, AnyInput):
-                    raise InputError(
-                        "estimate_many takes CloudInput and ViewInput of depthpose.pose.types, not "
-                        f"a {type(given).__name__}; files and arrays go to estimate(), one at a "
-                        "time"
-                    )
-                yield given
-
         total = len(inputs) if isinstance(inputs, Sized) else None
-        each = self._each(typed(), threads)
+        each = self._each(inputs, threads)
         return list(tqdm(each, total=total, unit=" poses", disable=not with_progress))
 
     @abstractmethod
@@ -256,8 +242,8 @@ class PoseEstimator(ABC):
         """
         known = SearchTargets(
             names=objects,
-            surface_of=lambda name: self._surface(self._number(name)),
-            pairs_of=lambda name: self._pairs(self._number(name)),
+            surface_of=lambda name: self._known(name).surface,
+            pairs_of=lambda name: self._pairs(self._known(name)),
             pose_near=self._pose_near,
             max_size_error=self.refusal.max_size_error,
             rounds=rounds,
@@ -325,10 +311,10 @@ class PoseEstimator(ABC):
             found = self.find_in(given, [object], rounds=1)
             return found[0] if found else nothing_found(given, object, time.perf_counter() - began)
 
-        number = self._number(object)
+        known = self._known(object)
         followed = TrackedObject(
-            model=self.models[number],
-            surface=self._surface(number),
+            model=known.model,
+            surface=known.surface,
             refusal=self.refusal,
             icp=self.config.icp,
             look=look,
@@ -336,44 +322,43 @@ class PoseEstimator(ABC):
         return each_in_own_arithmetic(track(frames, followed, first))
 
     def _object(self, name: str | None) -> str:
-        if name is None and len(self._numbers) == 1:
+        if name is None and len(self.models) == 1:
             return self.objects[0]
         if name is None:
             raise InputError(
                 f"estimate: {self._holder} know {', '.join(self.objects)}; say which by object="
             )
-        self._number(name)
-        return name
+        return self._known(name).model.name
 
-    def _surface(self, number: int) -> Surface:
-        if number not in self._surfaces:
-            model = self.models[number]
-            self._surfaces[number] = prepare_surface(model, self.config.icp.surface_points)
-        return self._surfaces[number]
-
-    def _copies_of(self, number: int) -> PoseAmbiguities:
-        if number not in self._copies:
-            up_to_symmetry = self.config.up_to_symmetry
-            self._copies[number] = find_copies(self.models[number], up_to_symmetry=up_to_symmetry)
-        return self._copies[number]
-
-    def _pairs(self, number: int) -> PairTable:
-        if number not in self._prepared_pairs:
-            self._prepared_pairs[number] = prepare_pairs(self._surface(number))
-        return self._prepared_pairs[number]
-
-    def _number(self, name: str) -> int:
+    def _known(self, name: str) -> KnownObject:
+        """Give an object by its name, with its surface."""
+        names = [model.name for model in self.models]
         if not isinstance(name, str):
-            known = ", ".join(map(repr, self.objects))
+            known = ", ".join(map(repr, names))
             raise InputError(f"object {name!r} is no text; give the name of one: {known}")
-        if name not in self._numbers:
-            nearest = nearest_name(name, self.objects)
+        if name not in names:
+            nearest = nearest_name(name, names)
             raise InputError(f"object {name!r}: {self._holder} do not know it; {nearest}")
-        return self._numbers[name]
+        if name not in self._objects:
+            number = names.index(name)
+            model = self.models[number]
+            surface = prepare_surface(model, self.config.icp.surface_points)
+            self._objects[name] = KnownObject(number=number, model=model, surface=surface)
+        return self._objects[name]
+
+    def _pairs(self, known: KnownObject) -> PairTable:
+        if known.pairs is None:
+            known.pairs = prepare_pairs(known.surface)
+        return known.pairs
 
 
 def or_unreadable(work: Callable[[AnyInput], Made], given: AnyInput) -> Made | PoseEstimate:
     """Do work for an input; where it raises :class:`InputError`, the estimate says so."""
+    if not isinstance(given, AnyInput):
+        raise InputError(
+            "estimate_many takes CloudInput and ViewInput of depthpose.pose.types, not a "
+            f"{type(given).__name__}; files and arrays go to estimate(), one at a time"
+        )
     try:
         with refused_memory(given.name):
             return work(given)
@@ -386,14 +371,3 @@ def answered(found: PoseEstimate) -> PoseEstimate:
     if found.status == "unreadable":
         raise InputError(found.reason)
     return found
-
-
-def refused(given: AnyInput, refusal: Refusal, seconds: dict[str, float]) -> PoseEstimate:
-    """Give the estimate of an input that cannot be posed."""
-    return PoseEstimate(
-        name=given.name,
-        object=given.object,
-        status=refusal.status,
-        reason=refusal.reason,
-        seconds=seconds,
-    )

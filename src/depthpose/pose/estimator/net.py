@@ -9,7 +9,7 @@ from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import NoReturn
+from typing import NamedTuple, NoReturn
 
 import torch
 from jaxtyping import Float
@@ -20,26 +20,26 @@ from depthpose.core.devices import each_in_threads, own_arithmetic, usable_devic
 from depthpose.core.errors import InputError
 from depthpose.core.rigid import Rigid
 from depthpose.pose.baselines import DepthCrop, DepthImageNet, cut_depth, poses_of
-from depthpose.pose.cloud import cloud_from_depth, refusal_of
+from depthpose.pose.cloud import (
+    ObjectCloud,
+    Refusal,
+    cloud_from_depth,
+    prepare_cloud,
+    refusal_of,
+)
 from depthpose.pose.config import EstimateConfig
-from depthpose.pose.estimator.base import PoseEstimator, answered, or_unreadable, refused
+from depthpose.pose.estimator.base import PoseEstimator, answered, or_unreadable
 from depthpose.pose.estimator.candidates import (
     Candidate,
-    Clock,
-    answer_of,
-    candidate_of,
     disagreement,
     find_candidates,
-    misfit_of,
     surface_signals,
-    withheld,
 )
-from depthpose.pose.estimator.fit import fit_of, seen_about
-from depthpose.pose.estimator.inputs import AnyInput, ObjectCloud, Refusal, prepare_cloud
-from depthpose.pose.estimator.inputs import CloudDirections as CloudDirections
+from depthpose.pose.estimator.fit import answer_of, fit_of, misfit_of, refused, seen_about
 from depthpose.pose.estimator.register import Registration
 from depthpose.pose.refine import refine_best
 from depthpose.pose.types import (
+    AnyInput,
     CloudInput,
     ObjectModel,
     PoseEstimate,
@@ -56,6 +56,13 @@ _LEAST = 4  # keypoints that must agree: three fix a pose with nothing left to c
 _DOUBTED: tuple[Status, ...] = ("votes do not meet", "keypoints do not fit", "doubtful")
 """What the network could not answer, and another method may; the rest is due to the input."""
 _NEEDS_MASK = "a regressed depth image takes a depth image with a mask; give both, or other weights"
+
+
+class CloudDirections(NamedTuple):
+    """A cloud and the network's directions at its points."""
+
+    cloud: ObjectCloud
+    directions: Float[Tensor, "n k 3"]
 
 
 def _fits(vote: Vote, model: ObjectModel, config: EstimateConfig) -> PoseFit | Refusal:
@@ -192,7 +199,7 @@ class GeoPoseNet(PoseEstimator):
         if self._registration is None:
             config = replace(self.config, register_refused=False, with_icp=True)
             self._registration = Registration(self.models, config)
-            self._registration._surfaces, self._registration._copies = self._surfaces, self._copies
+            self._registration._objects = self._objects
         return self._registration
 
     def _pose_near(
@@ -224,7 +231,7 @@ class GeoPoseNet(PoseEstimator):
         work = partial(self._pose, is_likely=is_likely)
         for some in batches(prepared, self.config.batch_voxels):
             ready = [(one, one.prepared) for one in some if isinstance(one.prepared, ObjectCloud)]
-            numbers = [self._number(one.given.object) for one, _ in ready]
+            numbers = [self._known(one.given.object).number for one, _ in ready]
             clouds = [cloud for _, cloud in ready]
             outputs, spent_s = self._directions(clouds, numbers) if ready else ([], 0.0)
             total, left = sum(map(len, outputs)), iter(outputs)
@@ -238,7 +245,7 @@ class GeoPoseNet(PoseEstimator):
         start = time.perf_counter()
         prepared = or_unreadable(
             lambda given: prepare_cloud(
-                given, self.models[self._number(given.object)], self.weights.cloud, self.config
+                given, self._known(given.object).model, self.weights.cloud, self.config
             ),
             given,
         )
@@ -273,59 +280,59 @@ class GeoPoseNet(PoseEstimator):
             return one.given, one.prepared, None
         assert one.outputs is not None, "asked before"
         voted = CloudDirections(one.prepared, one.outputs)
-        found = or_unreadable(partial(self._vote, voted=voted, is_likely=is_likely), one.given)
-        seconds = {**one.seconds, **found.seconds}
-        return one.given, replace(found, name=one.given.name, seconds=seconds), voted
+        vote = partial(self._vote, voted=voted, seconds=one.seconds, is_likely=is_likely)
+        return one.given, or_unreadable(vote, one.given), voted
 
-    def _vote(self, given: AnyInput, *, voted: CloudDirections, is_likely: bool) -> PoseEstimate:
+    def _vote(
+        self,
+        given: AnyInput,
+        *,
+        voted: CloudDirections,
+        seconds: dict[str, float],
+        is_likely: bool,
+    ) -> PoseEstimate:
         """Vote for the keypoints, fit the pose, refine and check it."""
-        number = self._number(given.object)
-        model, surface, copies = self.models[number], self._surface(number), self._copies_of(number)
-        config, clock = self.config, Clock()
+        known, config, began = self._known(given.object), self.config, time.perf_counter()
+        model, surface = known.model, known.surface
         points, directions = voted.cloud.points_m.double(), voted.directions.double()
         if config.voting.method == "ransac":
             vote = vote_ransac(points, directions, config=config.voting)
         else:
             vote = meet_lines(points, directions, refinements=config.voting.refinements)
-        clock.note("voting")
+        met = time.perf_counter()
+        seconds = {**seconds, "voting": met - began}
         fits = _fits(vote, model, config)
         if isinstance(fits, Refusal):
-            return withheld(model.name, fits, clock)
-        clock.note("svd")
-        cloud_m = voted.cloud.cloud_m
-        pose, icp = fits.camera_from_model, None
-        first = Candidate(pose[0].double(), fits.covariance[0], float(fits.residual_m[0]))
-        others = pose[[]].double()
+            return refused(given, fits, seconds)
+        fitted = time.perf_counter()
+        seconds["svd"] = fitted - met
+        cloud_m, pose = voted.cloud.cloud_m, fits.camera_from_model.double()
+        first = Candidate(pose[0], fits.covariance[0], float(fits.residual_m[0]))
+        others, is_refined = pose[[]], False
         if config.with_icp:
             best = refine_best(cloud_m.double(), pose, surface, config.icp)
-            if float(best.refined.inlier_share) > 0:
-                first, others, icp = candidate_of(best.refined), best.others, config.icp
+            icp, is_refined = best.refined, float(best.refined.inlier_share) > 0
+            if is_refined:
+                first = Candidate(icp.camera_from_model, icp.covariance, float(icp.residual_m))
+                others = best.others
         if not is_likely:
             seen = seen_about(cloud_m, voted.cloud.view, surface.diameter_m)
             misfit = misfit_of(fit_of(seen, first.pose, surface), self.refusal)
             if misfit is not None:
-                clock.note("icp")
-                return withheld(model.name, misfit, clock)
-        candidates = find_candidates(cloud_m, first, others, copies, surface, icp)
+                return refused(given, misfit, {**seconds, "icp": time.perf_counter() - fitted})
+        candidates = find_candidates(cloud_m, first, others, known, config, is_refined=is_refined)
         poses = Rigid.stack([one.pose for one in candidates])
+        evidence = surface_signals(cloud_m, poses, surface)
         # Of the copies that the network could not learn to distinguish, the best counts.
-        every_m = (poses[:, None] @ copies.trained).apply(model.keypoints_m.double())
+        assert known.copies is not None, "found with the candidates"
+        every_m = (poses[:, None] @ known.copies.trained).apply(model.keypoints_m.double())
         angles = disagreement(voted.cloud, voted.directions, every_m).tolist()
-        signals = surface_signals(cloud_m, poses, surface)
-        evidence = [{**one, "disagree": a} for one, a in zip(signals, angles, strict=True)]
+        for signals, angle in zip(evidence, angles, strict=True):
+            signals["disagree"] = angle
         if config.with_icp:
-            clock.note("icp")
+            seconds["icp"] = time.perf_counter() - fitted
         return answer_of(
-            voted.cloud,
-            model,
-            surface,
-            copies,
-            candidates,
-            evidence,
-            self.refusal,
-            config,
-            clock,
-            vote,
+            voted.cloud, known, candidates, evidence, self.refusal, config, seconds, vote
         )
 
 
@@ -386,26 +393,25 @@ class DepthImageRegressor(PoseEstimator):
         raise InputError(_NEEDS_MASK)
 
     def _estimate(self, given: AnyInput) -> PoseEstimate:
-        number = self._number(given.object)
+        known = self._known(given.object)
         if not isinstance(given, ViewInput):
             raise InputError(_NEEDS_MASK)
-        model, clock = self.models[number], Clock()
-        config = self._network.config
+        config, model, began = self._network.config, known.model, time.perf_counter()
         crop = cut_depth(given, config, model.diameter_m)
         if crop is None:
             reason = f"fewer than {config.min_points} masked pixels have a depth"
             return refused(given, Refusal(status="too few points", reason=reason), {})
         batch = DepthCrop(*(part[None].to(self.config.device) for part in crop))
-        numbers = torch.tensor([number], device=self.config.device)
+        numbers = torch.tensor([known.number], device=self.config.device)
         poses = poses_of(self._network(batch.image, numbers), batch)
+        regressed = time.perf_counter()
         found = PoseEstimate(
             name=given.name,
             object=given.object,
             status="ok",
             camera_from_model=Rigid(poses.R[0].cpu().float(), poses.t_m[0].cpu().float()),
-            seconds=clock.seconds,
+            seconds={"network": regressed - began},
         )
-        clock.note("network")
         if not self.config.with_icp:
             return found
         points_m = cloud_from_depth(
@@ -413,14 +419,15 @@ class DepthImageRegressor(PoseEstimator):
         ).float()
         if (few := refusal_of(points_m, self._cloud)) is not None:
             return replace(found, status="too few points", reason=few, camera_from_model=None)
-        pose, surface = found.camera_from_model, self._surface(number)
+        pose = found.camera_from_model
         assert pose is not None
-        refined = refine_best(points_m, pose, surface, self.config.icp).refined
-        clock.note("icp")
+        refined = refine_best(points_m, pose, known.surface, self.config.icp).refined
+        seconds = {**found.seconds, "icp": time.perf_counter() - regressed}
         if float(refined.inlier_share) == 0:  # nothing near the surface: ICP had no say
-            return found
+            return replace(found, seconds=seconds)
         return replace(
             found,
+            seconds=seconds,
             camera_from_model=refined.camera_from_model,
             covariance=refined.covariance,
             residual_m=float(refined.residual_m),

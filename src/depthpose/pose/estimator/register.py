@@ -13,23 +13,21 @@ from depthpose.core.devices import each_in_threads, own_arithmetic
 from depthpose.core.errors import InputError
 from depthpose.core.rigid import Rigid
 from depthpose.core.units import Unit
-from depthpose.pose.cloud import local_planes
+from depthpose.pose.cloud import Refusal, local_planes, prepare_cloud
 from depthpose.pose.config import CloudConfig, EstimateConfig, RefusalConfig
-from depthpose.pose.estimator.base import PoseEstimator, or_unreadable, refused
+from depthpose.pose.estimator.base import PoseEstimator, or_unreadable
 from depthpose.pose.estimator.candidates import (
-    Clock,
-    answer_of,
-    candidate_of,
-    cloud_normals,
+    Candidate,
     find_candidates,
+    find_copies,
+    nearest_posed,
     surface_signals,
     tilt_of,
-    withheld,
 )
-from depthpose.pose.estimator.inputs import AnyInput, Refusal, prepare_cloud
+from depthpose.pose.estimator.fit import answer_of, refused
 from depthpose.pose.mesh import read_model, refuse_one_name, with_found_symmetries
 from depthpose.pose.refine import refine_best
-from depthpose.pose.types import CloudInput, ObjectModel, PoseEstimate
+from depthpose.pose.types import AnyInput, CloudInput, ObjectModel, PoseEstimate
 from depthpose.pose.voting.point_pairs import propose_poses, thin
 
 CANDIDATE_SLOPES = {
@@ -117,9 +115,11 @@ class Registration(PoseEstimator):
 
     def prepare(self) -> None:
         """Prepare every model now, about a second each; else it is done when first asked for."""
-        for number in range(len(self.models)):
-            self._copies_of(number)
-            self._pairs(number)
+        for name in self.objects:
+            known, up_to_symmetry = self._known(name), self.config.up_to_symmetry
+            if known.copies is None:
+                known.copies = find_copies(known.model, up_to_symmetry=up_to_symmetry)
+            self._pairs(known)
 
     def _each(
         self, inputs: Iterable[AnyInput], threads: int, *, is_likely: bool = True
@@ -137,8 +137,8 @@ class Registration(PoseEstimator):
 
     def _estimate(self, given: AnyInput, poses: Rigid | None = None) -> PoseEstimate:
         """Estimate a pose, from those that were proposed if there are any."""
-        number = self._number(given.object)
-        model, surface, copies = self.models[number], self._surface(number), self._copies_of(number)
+        known = self._known(given.object)
+        model, surface = known.model, known.surface
         began = time.perf_counter()
         cloud = CloudConfig(voxel_m=min(0.9, _VOXEL * model.diameter_m), max_points=None)
         prepared = prepare_cloud(given, model, cloud, self.config)
@@ -146,36 +146,32 @@ class Registration(PoseEstimator):
         if isinstance(prepared, Refusal):
             return refused(given, prepared, seconds)
         began = time.perf_counter()
-        proposals = poses
+        proposals, cloud_m = poses, prepared.cloud_m.double()
         if proposals is None:
             generator = torch.Generator().manual_seed(self.config.voting.seed)
-            dense_m = take_evenly(prepared.cloud_m.double(), _SMOOTHED)
-            step_m = _VOXEL * surface.diameter_m
-            some_m = dense_m[thin(dense_m, torch.zeros_like(dense_m), step_m)]
+            dense_m = take_evenly(cloud_m, _SMOOTHED)
+            some_m = dense_m[thin(dense_m, torch.zeros_like(dense_m), _VOXEL * surface.diameter_m)]
             normals, _ = local_planes(dense_m, some_m)
-            table = self._pairs(number)
+            table = self._pairs(known)
             proposals = propose_poses(some_m, normals, table, surface, _PROPOSALS, generator)
-        seconds["voting"] = time.perf_counter() - began
-        clock, icp = Clock(seconds), replace(self.config.icp, starts=1)
-        best = refine_best(prepared.cloud_m.double(), proposals, surface, icp)
-        if float(best.refined.inlier_share) == 0:
+        voted = time.perf_counter()
+        seconds["voting"] = voted - began
+        best = refine_best(cloud_m, proposals, surface, replace(self.config.icp, starts=1))
+        icp = best.refined
+        if float(icp.inlier_share) == 0:
             reason = "no pose lays the model near the points: another object, or too little of it"
-            none = Refusal(status="votes do not meet", reason=reason)
-            return replace(withheld(model.name, none, clock), name=given.name)
-        first = candidate_of(best.refined)
-        candidates = find_candidates(prepared.cloud_m, first, best.others, copies, surface, icp)
-        normals = cloud_normals(prepared.cloud_m)
-        evidence: list[dict[str, float]] = []
-        for pose in [one.pose for one in candidates]:
-            (signals,) = surface_signals(prepared.cloud_m, pose[None], surface, normals)
+            return refused(given, Refusal(status="votes do not meet", reason=reason), seconds)
+        first = Candidate(icp.camera_from_model, icp.covariance, float(icp.residual_m))
+        candidates = find_candidates(
+            cloud_m, first, best.others, known, self.config, is_refined=True
+        )
+        found = Rigid.stack([one.pose for one in candidates])
+        evidence = surface_signals(cloud_m, found, surface)
+        for pose, signals in zip([one.pose for one in candidates], evidence, strict=True):
             # The plane through neighbours is tilted where a part has edges and thin features too,
             # whatever the pose: so it is on the cloud moved onto the posed surface.
-            local_m = pose.inverse().apply(prepared.cloud_m.double())
-            ideal_m = pose.apply(surface.points_m[surface.nearest(local_m)])
-            own = float(tilt_of(cloud_normals(ideal_m), pose[None], surface))
-            evidence.append({**signals, "tilt": max(0.0, signals["tilt"] - own)})
-        clock.note("icp")
-        found = answer_of(
-            prepared, model, surface, copies, candidates, evidence, self.refusal, self.config, clock
-        )
-        return replace(found, name=given.name)
+            _, index = nearest_posed(cloud_m, pose, surface)
+            own = tilt_of(pose.apply(surface.points_m[index]), pose[None], surface)
+            signals["tilt"] = max(0.0, signals["tilt"] - float(own))
+        seconds["icp"] = time.perf_counter() - voted
+        return answer_of(prepared, known, candidates, evidence, self.refusal, self.config, seconds)

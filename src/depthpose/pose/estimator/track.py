@@ -13,15 +13,14 @@ from torch import Tensor
 
 from depthpose.core.arrays import take_evenly
 from depthpose.core.rigid import Rigid
-from depthpose.pose.cloud import cloud_from_depth
+from depthpose.pose.cloud import Refusal, cloud_from_depth
 from depthpose.pose.config import IcpConfig, RefusalConfig
-from depthpose.pose.estimator.candidates import observability, surface_signals, without_motions
-from depthpose.pose.estimator.inputs import AnyInput, Refusal
+from depthpose.pose.estimator.candidates import surface_signals
+from depthpose.pose.estimator.fit import free_motions, observability, without_motions
 from depthpose.pose.frame import is_on_plane, largest_plane
 from depthpose.pose.refine import refine_best
 from depthpose.pose.surface import NEAR, Surface, compare_depths
-from depthpose.pose.types import CloudInput, ObjectModel, PoseEstimate, ViewInput
-from depthpose.pose.voting import free_motions
+from depthpose.pose.types import AnyInput, CloudInput, ObjectModel, PoseEstimate, ViewInput
 
 MARGIN = 0.15
 """Of the diameter: points so far from the surface at the last or the predicted pose may be the

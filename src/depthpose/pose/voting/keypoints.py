@@ -10,7 +10,7 @@ from torch import Tensor
 from depthpose.core.errors import InputError
 from depthpose.core.rigid import Rigid, cross_matrix, fit_rigid, perturb
 from depthpose.pose.config import VotingConfig
-from depthpose.pose.types import Axis, PoseFit, Symmetries, Vote
+from depthpose.pose.types import PoseFit, Vote
 
 _SMALLEST = 1e-12
 _NEAREST = 0.1
@@ -333,26 +333,6 @@ def fit_pose(
         covariance=torch.linalg.inv(H).to(keypoints_m),
         residual_m=square.sqrt().to(keypoints_m),
     )
-
-
-def free_motions(axes: tuple[Axis, ...], camera_from_model: Rigid) -> Float[Tensor, "m 6"]:
-    """Give the motions of the camera frame that turn the object about its axes of revolution.
-
-    Unit vectors of (rotation, translation): along them no observation says anything, the variance
-    is infinite, and the pose is valid all the same. Two axes make a ball, which is free to turn
-    about the third too.
-    """
-    rows = []
-    centre_m = Symmetries(continuous=axes).ball_centre_m
-    if centre_m is not None:  # turns about two axes of a ball make those about every axis
-        axes = tuple(Axis(direction=row, point_m=centre_m) for row in torch.eye(3).to(centre_m))
-    for axis in axes if centre_m is not None else axes[:1]:
-        direction = camera_from_model.R @ axis.direction.to(camera_from_model.R)
-        point_m = camera_from_model.apply(axis.point_m.to(camera_from_model.R)[None])[0]
-        # Turning by w about a line through c moves c nowhere: w x c + v = 0.
-        motion = torch.cat([direction, torch.linalg.cross(point_m, direction)])
-        rows.append(motion / motion.norm())
-    return torch.stack(rows) if rows else camera_from_model.R.new_zeros(0, 6)
 
 
 def _normal_equations(
