@@ -21,7 +21,8 @@ from depthpose.core.checkpoint import find_weights
 from depthpose.core.rigid import Rigid
 from depthpose.pose.config import ObjectsConfig, RefusalConfig
 from depthpose.pose.estimator import GeoPoseNet
-from depthpose.pose.estimator.candidates import FLOOR, PoseAmbiguities, find_copies, share_out
+from depthpose.pose.estimator.candidates import PoseAmbiguities, find_copies
+from depthpose.pose.estimator.fit import FLOOR, share_out
 from depthpose.pose.synthetic import Objects
 from depthpose.pose.types import PoseEstimate
 from depthpose.pose.weights import read_pose_weights

@@ -19,7 +19,8 @@ from tests.pose.synthetic_objects import (
 
 from depthpose.core.rigid import Rigid, geodesic_rad
 from depthpose.pose.config import EstimateConfig
-from depthpose.pose.estimator.candidates import difference_of, find_copies, share_out
+from depthpose.pose.estimator.candidates import difference_of, find_copies
+from depthpose.pose.estimator.fit import share_out
 from depthpose.pose.mesh import (
     NearSymmetry,
     SymmetryProposal,

@@ -182,7 +182,8 @@ def cloud_from_depth(
     Raises:
         InputError: mask and depth differ in size.
     """
-    refuse_other_size(mask, depth_m)
+    if depth_m.shape != mask.shape:
+        raise other_size(mask, depth_m)
     is_read = mask & torch.isfinite(depth_m) & (depth_m > 0)
     # As ``back_project`` does, for a fraction of the image.
     v, u = is_read.nonzero(as_tuple=True)
@@ -211,17 +212,12 @@ def lift_sample(view: ViewSample, diameter_m: float, config: CloudConfig) -> Clo
     return CloudSample(input=cloud, truth=view.truth)
 
 
-def refuse_other_size(mask: Bool[Tensor, "mask_h mask_w"], depth_m: Float[Tensor, "h w"]) -> None:
-    """Refuse a mask that is not of this depth image.
-
-    Raises:
-        InputError: mask and depth differ in size.
-    """
-    if depth_m.shape != mask.shape:
-        raise InputError(
-            f"the mask is {mask.shape[1]}x{mask.shape[0]}, but the depth image is "
-            f"{depth_m.shape[1]}x{depth_m.shape[0]}; give the mask of this very image"
-        )
+def other_size(mask: Bool[Tensor, "mask_h mask_w"], depth_m: Float[Tensor, "h w"]) -> InputError:
+    """Make the error of a mask that is not of this depth image."""
+    return InputError(
+        f"the mask is {mask.shape[1]}x{mask.shape[0]}, but the depth image is "
+        f"{depth_m.shape[1]}x{depth_m.shape[0]}; give the mask of this very image"
+    )
 
 
 def grow_mask(mask: Bool[Tensor, "h w"], grow_px: int) -> Bool[Tensor, "h w"]:

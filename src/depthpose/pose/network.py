@@ -167,7 +167,8 @@ class ResUNet(nn.Module):
     def directions(self, seen: SeenPoints) -> Float[Tensor, "points keypoints 3"]:
         """Answer for each point's own class: what every network that votes offers."""
         voxels = Voxels.from_points(seen.coordinates, seen.features)
-        features = self._features(voxels).at_points()
+        mixed = self._features(voxels)
+        features = mixed.features[mixed.row_of_point]
         answers = features.new_empty(len(features), self.config.keypoints, 3)
         for number in seen.class_of_point.unique().tolist():
             mine = seen.class_of_point == number

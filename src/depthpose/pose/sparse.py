@@ -353,10 +353,12 @@ def conv(
     if is_plain and serves(features, weight) and near.table.numel() <= COMPILED_ELEMENTS:
         from depthpose.pose.compiled.points import convolve
 
-        read = near.table.shape[1] if kernel_map.is_transposed else near.fine_rows
+        read, written = near.fine_rows, near.table.shape[1]
+        if kernel_map.is_transposed:
+            read, written = written, read
         assert features.shape == (read, weight.shape[1]), "a row for each voxel"
         assert len(weight) == len(near.table), "a weight for each offset"
-        out = features.new_zeros(kernel_map.outputs, weight.shape[2])
+        out = features.new_zeros(written, weight.shape[2])
         given = (part.detach().contiguous().numpy() for part in (features, weight, near.table))
         convolve(*given, kernel_map.is_transposed, out.numpy())
         return out

@@ -159,11 +159,6 @@ class ObjectModel:
                 "point. Give a model with an extent."
             )
 
-    @property
-    def triangles_m(self) -> Float[Tensor, "f 3 3"]:
-        """Corners of every face: what a renderer takes."""
-        return self.vertices_m[self.faces]
-
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Vote:

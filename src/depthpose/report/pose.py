@@ -68,14 +68,15 @@ def draw_pose(
         K: intrinsic matrix of the image.
         truth: ``camera_from_model``, whose box is drawn too, green and dashed; None: it is unknown.
     """
-    K, box_m = K.double(), box_edges(model).double()
+    K = K.double()
     if pose is not None:
+        ends_px = project(pose.double().apply(box_edges(model).double()), K)
         posed_m = pose.double().apply(drawn_triangles(model).double())
         seen = rasterize(posed_m, K, image.shape[2], image.shape[1], with_barycentric=False)
         image = draw_outline(image, seen.depth_m.isfinite(), FOUND)
-        image = draw_lines(image, project(pose.double().apply(box_m), K), FOUND)
+        image = draw_lines(image, ends_px, FOUND)
     if truth is not None:
-        ends_px = project(truth.double().apply(box_m), K)
+        ends_px = project(truth.double().apply(box_edges(model).double()), K)
         image = draw_lines(image, ends_px, TRUE, dash_px=_DASH_PX)
     return image
 
@@ -95,7 +96,7 @@ def crease_edges(model: ObjectModel) -> Float[Tensor, "n 2 3"]:
     corners = place[model.faces]
     side = torch.cat([corners[:, [0, 1]], corners[:, [1, 2]], corners[:, [2, 0]]]).sort(-1).values
     edges, which, count = torch.unique(side, dim=0, return_inverse=True, return_counts=True)
-    a, b, c = model.triangles_m.double().unbind(1)
+    a, b, c = model.vertices_m[model.faces].double().unbind(1)
     normal = torch.nn.functional.normalize(torch.linalg.cross(b - a, c - a), dim=-1)
     total = normal.new_zeros(len(edges), 3).index_add_(0, which, normal.repeat(3, 1))
     # Two unit normals at an angle have a mean as long as the cosine of half of it.
@@ -361,10 +362,11 @@ def pose_scene(
     truth: Rigid | None = None,
 ) -> Scene:
     """Show what was seen, the posed model, its keypoints, and the truth where it is known."""
-    layers = [Layer(name="the object, as seen", shape=colored_points(points_m, _SEEN))]
-    pose = estimate.camera_from_model
+    pose, posed = estimate.camera_from_model, list[Layer]()
     if pose is not None:
-        layers += pose_layers(pose, model, with_box=truth is not None)
+        posed = pose_layers(pose, model, with_box=truth is not None)
+    layers = [Layer(name="the object, as seen", shape=colored_points(points_m, _SEEN)), *posed]
+    if pose is not None:
         for other in estimate.alternatives:  # by axes and box, not shown at first
             placed = other.camera_from_model.double()
             said = f"{other.difference}, {other.probability:.0%}"

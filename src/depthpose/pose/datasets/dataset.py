@@ -30,8 +30,8 @@ from depthpose.core.rigid import Rigid
 from depthpose.pose.cloud import (
     cloud_from_depth,
     lift_sample,
+    other_size,
     refusal_of,
-    refuse_other_size,
     unit_advice,
 )
 from depthpose.pose.config import CloudConfig
@@ -113,7 +113,8 @@ class BopDataset:
         """
         mask = read_instance_mask(instance) if mask is None else mask
         depth_m = read_depth_png(instance.depth, instance.depth_unit_m)
-        refuse_other_size(mask, depth_m)
+        if mask.shape != depth_m.shape:
+            raise other_size(mask, depth_m)
         return ViewSample(
             input=ViewInput(
                 name=instance.name,

@@ -1,7 +1,6 @@
 """Poses that fit: the evidence against each, how likely each is, how they differ in words."""
 
 import math
-from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
@@ -14,11 +13,16 @@ from depthpose.core.arrays import take_evenly
 from depthpose.core.rigid import Rigid, geodesic_rad
 from depthpose.pose.cloud import ObjectCloud, local_planes
 from depthpose.pose.config import EstimateConfig
-from depthpose.pose.mesh import near_symmetries, sample_surface, symmetry_transforms
+from depthpose.pose.mesh import (
+    mirror_deviation,
+    near_symmetries,
+    sample_surface,
+    symmetry_transforms,
+)
 from depthpose.pose.mesh import true_symmetries as find_true
 from depthpose.pose.refine import refine_pose
 from depthpose.pose.surface import NEAR, Surface, look_along_rays
-from depthpose.pose.types import Alternative, ObjectModel
+from depthpose.pose.types import ObjectModel
 from depthpose.pose.voting.point_pairs import PairTable
 
 _SAMPLED = 1000
@@ -30,12 +34,8 @@ _TILTED = 250
 """At so many of them the normal is looked at."""
 _COMPARED = 100
 """At about so many points a copy is chosen."""
-FLOOR = 0.01
-"""Added to a signal before its logarithm is taken, which is finite where there is none."""
 _SAME = 0.1
 """Mean distance of the model's points at two poses, in diameters, up to which they are one."""
-_NAMED = 0.02
-"""Candidates of a smaller share are not named."""
 _STEP = math.pi / 16
 _ICP_POINTS = 250
 """Points of the cloud that refine candidates."""
@@ -71,7 +71,7 @@ def surface_signals(
     A point seen through the posed surface contradicts the pose; surface that nobody saw may merely
     be occluded by something else.
     """
-    limit_m = NEAR * surface.diameter_m
+    tilt, limit_m = tilt_of(cloud_m, poses, surface), NEAR * surface.diameter_m
     points_m = take_evenly(cloud_m.double(), _SAMPLED)
     distance_m, _ = nearest_posed(points_m, poses, surface)
     is_near = distance_m < limit_m
@@ -79,7 +79,7 @@ def surface_signals(
     near_m2 = torch.where(is_near, distance_m.square(), 0.0).sum(-1) / number.clamp(min=1)
     front, unseen = look_along_rays(cloud_m.double(), poses, surface)
     columns = {
-        "tilt": tilt_of(cloud_m, poses, surface),
+        "tilt": tilt,
         "gap": torch.where(number > 0, near_m2.sqrt(), limit_m) / surface.diameter_m,
         "far": 1 - number / len(points_m),
         "front": front,
@@ -116,6 +116,7 @@ class PoseAmbiguities:
     Attributes:
         same: ``model_from_model`` of the copies that are one answer, the identity first.
         near: of those that are another answer and look nearly alike.
+        mirror: how far the mirror image deviates from the model, in diameters.
         trained: of those that the network was trained to treat as one, the identity first.
         points_m: of the model, by which poses are compared.
         middle_m: of its box.
@@ -126,6 +127,7 @@ class PoseAmbiguities:
 
     same: Rigid
     near: Rigid
+    mirror: float
     trained: Rigid
     points_m: Float64[Tensor, "n 3"]
     middle_m: Float64[Tensor, "3"]
@@ -159,7 +161,7 @@ def find_copies(model: ObjectModel, *, up_to_symmetry: bool) -> PoseAmbiguities:
     near = [one.model_from_model for one in near_symmetries(model)]
     none = Rigid(torch.zeros(0, 3, 3).double(), torch.zeros(0, 3).double())
     turns = Rigid.stack(near) if near else none
-    true = find_true(model)
+    true, mirror = find_true(model), mirror_deviation(model)
     same = symmetry_transforms(true, _STEP).double()
     if up_to_symmetry:
         every = symmetry_transforms(model.symmetries, _STEP)
@@ -177,6 +179,7 @@ def find_copies(model: ObjectModel, *, up_to_symmetry: bool) -> PoseAmbiguities:
     return PoseAmbiguities(
         same=same,
         near=turns,
+        mirror=mirror,
         trained=trained.double(),
         points_m=compared_m,
         middle_m=(points_m.amin(0) + points_m.amax(0)) / 2,
@@ -238,42 +241,6 @@ def find_candidates(
         if float(gap_m.norm(dim=-1).mean(-1).min()) >= _SAME * copies.diameter_m:
             kept.append(one)
     return kept
-
-
-def share_out(
-    candidates: Sequence[Mapping[str, float]], slopes: Mapping[str, float]
-) -> Float64[Tensor, " b"]:
-    """Share the probability of one among candidates: ``exp(-sum slope log(0.01 + signal))``."""
-    odds = [
-        -sum(slope * math.log(FLOOR + one[name]) for name, slope in slopes.items())
-        for one in candidates
-    ]
-    return torch.tensor(odds, dtype=torch.float64).softmax(0)
-
-
-def alternatives_among(
-    candidates: Sequence[Candidate],
-    evidence: Sequence[dict[str, float]],
-    shares: Float64[Tensor, " b"],
-    copies: PoseAmbiguities,
-) -> tuple[Alternative, ...]:
-    """Name the candidates beside the best, the likeliest first; unlikely ones are left out.
-
-    Their probabilities are shares of one, in which the best has its own.
-    """
-    best, *order = shares.argsort(descending=True, stable=True).tolist()
-    pose = candidates[best].pose
-    return tuple(
-        Alternative(
-            camera_from_model=other.float(),
-            probability=float(shares[k]),
-            difference=difference_of(other, pose, copies),
-            signals=evidence[k],
-        )
-        for k in order
-        for other in [candidates[k].pose]
-        if float(shares[k]) >= _NAMED
-    )
 
 
 def difference_of(pose: Rigid, from_pose: Rigid, copies: PoseAmbiguities) -> str:

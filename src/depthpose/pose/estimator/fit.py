@@ -6,9 +6,10 @@ The posed surface is compared with the readings at the sensor's own scale.
 
 import math
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import product
+from typing import Any
 
 import numpy as np
 import torch
@@ -24,20 +25,22 @@ from depthpose.pose.config import EstimateConfig, IcpConfig, RefusalConfig
 from depthpose.pose.estimator.candidates import (
     Candidate,
     KnownObject,
-    alternatives_among,
+    PoseAmbiguities,
+    difference_of,
     nearest_posed,
-    share_out,
 )
-from depthpose.pose.mesh import MIRROR_ALIKE, mirror_deviation
+from depthpose.pose.mesh import MIRROR_ALIKE
 from depthpose.pose.mesh.models import fibonacci_directions
 from depthpose.pose.refine import refine_pose, refine_roughly
 from depthpose.pose.surface import NEAR, Surface
 from depthpose.pose.types import (
+    Alternative,
+    AnyInput,
     Axis,
-    CloudInput,
     Fit,
     Identity,
     PoseEstimate,
+    Status,
     Symmetries,
     ViewInput,
     Vote,
@@ -49,6 +52,9 @@ a mask ends so far from the silhouette."""
 SHOWN = 0.95  #: so much of the seen surface agrees at a right pose that a sensor reads well
 _NOISES = 3.0
 _WIDEST = 2.0  # times the usual limit, whatever the noise: beyond, what was read is no surface
+FLOOR = 0.01
+"""Added to a signal before its logarithm is taken, which is finite where there is none."""
+_NAMED = 0.02  # candidates of a smaller share are not named
 _SAMPLED = 1000  # points of the cloud that say how well it fixes a pose
 _COMPARED = 1000  # readings of the object, evenly taken, that are laid on the surface
 _LAG_PX = 3  # noise is compared so far apart: neighbouring pixels of a real sensor err alike
@@ -342,6 +348,7 @@ def identity_of(
     cloud: ObjectCloud,
     pose: Rigid,
     known: KnownObject,
+    copies: PoseAmbiguities,
     fit: Fit,
     seen: Seen,
     max_size_error: float,
@@ -350,7 +357,7 @@ def identity_of(
     model, surface = known.model, known.surface
     scale = scale_of(cloud.cloud_m, pose, surface)
     mirror = None
-    if mirror_deviation(model) > MIRROR_ALIKE:
+    if copies.mirror > MIRROR_ALIKE:
         mirror = mirror_gain(cloud.cloud_m, pose, surface)
     distance_m = float(cloud.cloud_m[:, 2].double().median())
     sensor = sensor_size_error(distance_m, float(seen.K[0, 0]), surface.diameter_m)
@@ -441,7 +448,7 @@ def observability(
     # Declared symmetries as motions about the middle, turns in metres at the radius.
     turn, shift = free[:, :3].double(), free[:, 3:].double()
     own = torch.cat([turn * radius_m, shift + turn @ cross_matrix(middle)], -1)
-    basis = _complement(own)
+    basis = torch.eye(6).double() if len(own) == 0 else _complement(own)
     values, vectors = torch.linalg.eigh(basis.T @ (J.T @ J / len(J)) @ basis)
     return float(values[0].clamp(min=0).sqrt()), basis @ vectors[:, 0]
 
@@ -461,8 +468,6 @@ def without_motions(
 
 def _complement(motions: Float64[Tensor, "m 6"]) -> Float64[Tensor, "6 r"]:
     """Give an orthonormal basis of what is orthogonal to all of the motions."""
-    if len(motions) == 0:
-        return torch.eye(6, dtype=torch.float64)
     _, values, rows = torch.linalg.svd(motions)
     rank = int((values > 1e-9 * values[0]).sum())
     return rows[rank:].T
@@ -501,47 +506,76 @@ def answer_of(
                 "symmetry allows it. Declare the symmetry, or look from a side that shows more",
             )
     if reason is None and config.with_icp and refusal.max_size_error < 1:
-        identity = identity_of(cloud, pose, known, fit, seen, refusal.max_size_error)
+        identity = identity_of(cloud, pose, known, copies, fit, seen, refusal.max_size_error)
         if identity.status == "contradicted":
             reason = Refusal(status="doubtful", reason=identity.reason)
-    seconds = {**seconds, "check": time.perf_counter() - began}
-    # Worked out in float64, given as points and models come: in float32.
-    answer = PoseEstimate(
-        name=cloud.name,
-        object=known.model.name,
-        status="ok",
-        camera_from_model=pose.float(),
-        keypoints_m=None if vote is None else vote.keypoints_m.float(),
-        covariance=without_motions(covariance, free).float(),
-        free_motions=free.float(),
-        inlier_share=None if vote is None else float(vote.inlier_share.mean()),
-        residual_m=residual_m,
-        signals=evidence[number],
-        fit=fit,
-        identity=identity,
-        certainty=float(shares[number]),
-        alternatives=alternatives_among(candidates, evidence, shares, copies),
-        seconds=seconds,
+    facts: dict[str, Any] = {
+        "name": cloud.name,
+        "object": known.model.name,
+        "keypoints_m": None if vote is None else vote.keypoints_m.float(),
+        "inlier_share": None if vote is None else float(vote.inlier_share.mean()),
+        "residual_m": residual_m,
+        "signals": evidence[number],
+        "fit": fit,
+        "identity": identity,
+        "seconds": {**seconds, "check": time.perf_counter() - began},
+    }
+    if reason is not None:  # all that was found out but the pose: nobody takes it for an answer
+        return PoseEstimate(status=reason.status, reason=reason.reason, **facts)
+    covariance = without_motions(covariance, free)
+    alternatives = tuple(
+        Alternative(
+            difference=difference_of(candidates[k].pose, pose, copies),
+            camera_from_model=candidates[k].pose.float(),
+            probability=float(shares[k]),
+            signals=evidence[k],
+        )
+        for k in shares.argsort(descending=True, stable=True).tolist()[1:]
+        if float(shares[k]) >= _NAMED
     )
-    if reason is not None:
-        return refused(answer, reason, seconds, kept=answer)
-    return with_status(answer, config.min_certainty)
+    certainty = float(shares[number])
+    status, words = status_of(certainty, len(alternatives), config.min_certainty)
+    # Worked out in float64, given as points and models come: in float32.
+    return PoseEstimate(
+        status=status,
+        reason=words,
+        camera_from_model=pose.float(),
+        covariance=covariance.float(),
+        free_motions=free.float(),
+        certainty=certainty,
+        alternatives=alternatives,
+        **facts,
+    )
+
+
+def share_out(
+    candidates: Sequence[Mapping[str, float]], slopes: Mapping[str, float]
+) -> Float64[Tensor, " b"]:
+    """Share the probability of one among candidates: ``exp(-sum slope log(0.01 + signal))``."""
+    odds = [
+        -sum(slope * math.log(FLOOR + one[name]) for name, slope in slopes.items())
+        for one in candidates
+    ]
+    return torch.tensor(odds, dtype=torch.float64).softmax(0)
+
+
+def status_of(certainty: float, others: int, min_certainty: float) -> tuple[Status, str]:
+    """Say that a pose is ambiguous where its certainty is below the limit, and else ok."""
+    if certainty >= min_certainty:
+        return "ok", ""
+    return "ambiguous", (
+        f"this pose has a certainty of {certainty:.0%}, below min_certainty {min_certainty:.0%}: "
+        + (f"{others} others fit too" if others else "others may fit")
+    )
 
 
 def with_status(answer: PoseEstimate, min_certainty: float) -> PoseEstimate:
-    """Say that a pose is ambiguous where its certainty is below the limit, and else ok."""
+    """Say anew, by another limit, whether a pose is ambiguous or ok."""
     if answer.camera_from_model is None:
         return answer
-    if answer.certainty is None or answer.certainty >= min_certainty:
-        return replace(answer, status="ok", reason="")
-    others = (
-        f"{len(answer.alternatives)} others fit too" if answer.alternatives else "others may fit"
-    )
-    reason = (
-        f"this pose has a certainty of {answer.certainty:.0%}, below min_certainty "
-        f"{min_certainty:.0%}: {others}"
-    )
-    return replace(answer, status="ambiguous", reason=reason)
+    certainty = 1.0 if answer.certainty is None else answer.certainty
+    status, reason = status_of(certainty, len(answer.alternatives), min_certainty)
+    return replace(answer, status=status, reason=reason)
 
 
 def misfit_of(fit: Fit, limits: RefusalConfig) -> Refusal | None:
@@ -566,23 +600,12 @@ def misfit_of(fit: Fit, limits: RefusalConfig) -> Refusal | None:
     return Refusal(status="doubtful", reason=reason)
 
 
-def refused(
-    given: CloudInput | ViewInput | PoseEstimate,
-    refusal: Refusal,
-    seconds: dict[str, float],
-    kept: PoseEstimate | None = None,
-) -> PoseEstimate:
-    """Give the estimate of an input without a pose.
-
-    What was found out but the pose is kept: a refusal cannot be taken for an answer.
-    """
-    names = ("keypoints_m", "inlier_share", "residual_m", "fit", "identity", "signals")
-    found = {} if kept is None else {name: getattr(kept, name) for name in names}
+def refused(given: AnyInput, refusal: Refusal, seconds: dict[str, float]) -> PoseEstimate:
+    """Give the estimate of an input without a pose."""
     return PoseEstimate(
         name=given.name,
         object=given.object,
         status=refusal.status,
         reason=refusal.reason,
         seconds=seconds,
-        **found,
     )

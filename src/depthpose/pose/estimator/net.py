@@ -41,18 +41,14 @@ from depthpose.pose.refine import refine_best
 from depthpose.pose.types import (
     AnyInput,
     CloudInput,
-    ObjectModel,
     PoseEstimate,
-    PoseFit,
     SeenPoints,
     Status,
     ViewInput,
-    Vote,
 )
-from depthpose.pose.voting import consistent_keypoints, fit_pose, meet_lines, vote_ransac
+from depthpose.pose.voting import fits_of, meet_lines, vote_ransac
 from depthpose.pose.weights import PoseWeights, read_pose_weights
 
-_LEAST = 4  # keypoints that must agree: three fix a pose with nothing left to contradict it
 _DOUBTED: tuple[Status, ...] = ("votes do not meet", "keypoints do not fit", "doubtful")
 """What the network could not answer, and another method may; the rest is due to the input."""
 _NEEDS_MASK = "a regressed depth image takes a depth image with a mask; give both, or other weights"
@@ -63,37 +59,6 @@ class CloudDirections(NamedTuple):
 
     cloud: ObjectCloud
     directions: Float[Tensor, "n k 3"]
-
-
-def _fits(vote: Vote, model: ObjectModel, config: EstimateConfig) -> PoseFit | Refusal:
-    """Fit the keypoints that agree; where ICP refines the fits, also all of them."""
-    found = (vote.condition <= config.voting.max_condition) & (vote.inlier_share > 0)
-    total = len(found)
-    if int(found.sum()) < _LEAST:
-        return Refusal(
-            status="votes do not meet",
-            reason=f"the directions meet at {int(found.sum())} of {total} keypoints, but {_LEAST} "
-            "are needed: too few points, or not the object that the mask promises",
-        )
-    strict, rough = config.voting.rigidity_diameters, config.rough_rigidity_diameters
-    limit_m = model.diameter_m * (rough if config.with_icp else strict)
-    used = consistent_keypoints(vote.keypoints_m, model.keypoints_m, limit_m, found)
-    choices = [used] if int(used.sum()) >= _LEAST else []
-    if config.with_icp and not torch.equal(used, found):
-        choices.append(found)
-    if not choices:
-        return Refusal(
-            status="keypoints do not fit",
-            reason=f"{int(used.sum())} of {total} keypoints have the model's distances within "
-            f"{limit_m:.2g} m, but {_LEAST} are needed: another object, or too much of it occluded",
-        )
-    count = len(choices)
-    return fit_pose(
-        vote.keypoints_m.expand(count, -1, -1),
-        vote.covariance_m2.expand(count, -1, -1, -1),
-        model.keypoints_m,
-        torch.stack(choices),
-    )
 
 
 def batches(clouds: Iterable["_Cloud"], most: int) -> Iterator[list["_Cloud"]]:
@@ -263,13 +228,15 @@ class GeoPoseNet(PoseEstimator):
         cloud_of_point = torch.repeat_interleave(torch.arange(len(clouds)), torch.tensor(counts))
         grids = [cloud.voxels for cloud in clouds]
         coordinates = torch.cat([grid.coordinates for grid in grids])
+        points_m = torch.cat([c.points_m @ c.voxels.grid_from_camera.mT for c in clouds])
+        device = self.config.device
         seen = SeenPoints(
-            points_m=torch.cat([c.points_m @ c.voxels.grid_from_camera.mT for c in clouds]),
-            coordinates=torch.cat([cloud_of_point[:, None], coordinates], 1),
-            features=torch.cat([grid.features for grid in grids]),
-            class_of_point=torch.tensor(numbers)[cloud_of_point],
+            points_m=points_m.to(device),
+            coordinates=torch.cat([cloud_of_point[:, None], coordinates], 1).to(device),
+            features=torch.cat([grid.features for grid in grids]).to(device),
+            class_of_point=torch.tensor(numbers)[cloud_of_point].to(device),
         )
-        outputs = self._network.directions(seen.to(self.config.device)).float().cpu().split(counts)
+        outputs = self._network.directions(seen).float().cpu().split(counts)
         found = [some @ grid.grid_from_camera for some, grid in zip(outputs, grids, strict=True)]
         return found, time.perf_counter() - start
 
@@ -301,7 +268,7 @@ class GeoPoseNet(PoseEstimator):
             vote = meet_lines(points, directions, refinements=config.voting.refinements)
         met = time.perf_counter()
         seconds = {**seconds, "voting": met - began}
-        fits = _fits(vote, model, config)
+        fits = fits_of(vote, model, config)
         if isinstance(fits, Refusal):
             return refused(given, fits, seconds)
         fitted = time.perf_counter()
@@ -322,11 +289,11 @@ class GeoPoseNet(PoseEstimator):
                 return refused(given, misfit, {**seconds, "icp": time.perf_counter() - fitted})
         candidates = find_candidates(cloud_m, first, others, known, config, is_refined=is_refined)
         poses = Rigid.stack([one.pose for one in candidates])
-        evidence = surface_signals(cloud_m, poses, surface)
         # Of the copies that the network could not learn to distinguish, the best counts.
         assert known.copies is not None, "found with the candidates"
         every_m = (poses[:, None] @ known.copies.trained).apply(model.keypoints_m.double())
         angles = disagreement(voted.cloud, voted.directions, every_m).tolist()
+        evidence = surface_signals(cloud_m, poses, surface)
         for signals, angle in zip(evidence, angles, strict=True):
             signals["disagree"] = angle
         if config.with_icp:

@@ -28,7 +28,7 @@ from depthpose.pose.estimator.fit import answer_of, refused
 from depthpose.pose.mesh import read_model, refuse_one_name, with_found_symmetries
 from depthpose.pose.refine import refine_best
 from depthpose.pose.types import AnyInput, CloudInput, ObjectModel, PoseEstimate
-from depthpose.pose.voting.point_pairs import propose_poses, thin
+from depthpose.pose.voting.point_pairs import prepare_pairs, propose_poses, thin
 
 CANDIDATE_SLOPES = {
     name: slope for name, slope in RefusalConfig().candidate_slopes.items() if name != "disagree"
@@ -152,8 +152,9 @@ class Registration(PoseEstimator):
             dense_m = take_evenly(cloud_m, _SMOOTHED)
             some_m = dense_m[thin(dense_m, torch.zeros_like(dense_m), _VOXEL * surface.diameter_m)]
             normals, _ = local_planes(dense_m, some_m)
-            table = self._pairs(known)
-            proposals = propose_poses(some_m, normals, table, surface, _PROPOSALS, generator)
+            if known.pairs is None:
+                known.pairs = prepare_pairs(surface)
+            proposals = propose_poses(some_m, normals, known.pairs, surface, _PROPOSALS, generator)
         voted = time.perf_counter()
         seconds["voting"] = voted - began
         best = refine_best(cloud_m, proposals, surface, replace(self.config.icp, starts=1))

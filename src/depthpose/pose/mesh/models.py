@@ -181,7 +181,7 @@ def sample_surface(
     if len(model.faces) == 0:
         # Farthest points would be evener, and quadratic; point models are even as they come.
         return take_evenly(model.vertices_m, count), take_evenly(model.normals, count)
-    corners = model.triangles_m.double()
+    corners = model.vertices_m[model.faces].double()
     doubled = torch.linalg.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     area = doubled.norm(dim=-1)
     bounds = area.cumsum(0)
@@ -210,7 +210,7 @@ def drawn_triangles(model: ObjectModel) -> Float[Tensor, "n 3 3"]:
     usual one, so that a stray point makes no plate.
     """
     if len(model.faces):
-        return model.triangles_m
+        return model.vertices_m[model.faces]
     points = model.vertices_m.double()
     distance, _ = KDTree(points.numpy()).query(points.numpy(), k=min(4, len(points)))
     spacing = torch.from_numpy(distance[:, -1])

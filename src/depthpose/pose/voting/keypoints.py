@@ -10,8 +10,9 @@ from torch import Tensor
 
 from depthpose.core.errors import InputError
 from depthpose.core.rigid import Rigid, cross_matrix, fit_rigid, perturb
-from depthpose.pose.config import VotingConfig
-from depthpose.pose.types import PoseFit, Vote
+from depthpose.pose.cloud import Refusal
+from depthpose.pose.config import EstimateConfig, VotingConfig
+from depthpose.pose.types import ObjectModel, PoseFit, Vote
 
 _SMALLEST = 1e-12
 _NEAREST = 0.1
@@ -269,7 +270,43 @@ class InlierTest:
         return agreed.view(*tried.shape[:-1], shape[-1])
 
 
+_LEAST = 4  # keypoints that must agree: three fix a pose with nothing left to contradict it
 _STEPS = 4  # Gauss-Newton from Kabsch: the fourth step is below float64's noise
+
+
+def fits_of(vote: Vote, model: ObjectModel, config: EstimateConfig) -> PoseFit | Refusal:
+    """Fit the keypoints that agree; where ICP refines the fits, also all of them.
+
+    Returns:
+        One fit or two as a batch; or why there is none.
+    """
+    found = (vote.condition <= config.voting.max_condition) & (vote.inlier_share > 0)
+    total = len(found)
+    if int(found.sum()) < _LEAST:
+        return Refusal(
+            status="votes do not meet",
+            reason=f"the directions meet at {int(found.sum())} of {total} keypoints, but {_LEAST} "
+            "are needed: too few points, or not the object that the mask promises",
+        )
+    strict, rough = config.voting.rigidity_diameters, config.rough_rigidity_diameters
+    limit_m = model.diameter_m * (rough if config.with_icp else strict)
+    used = consistent_keypoints(vote.keypoints_m, model.keypoints_m, limit_m, found)
+    choices = [used] if int(used.sum()) >= _LEAST else []
+    if config.with_icp and not torch.equal(used, found):
+        choices.append(found)
+    if not choices:
+        return Refusal(
+            status="keypoints do not fit",
+            reason=f"{int(used.sum())} of {total} keypoints have the model's distances within "
+            f"{limit_m:.2g} m, but {_LEAST} are needed: another object, or too much of it occluded",
+        )
+    count = len(choices)
+    return fit_pose(
+        vote.keypoints_m.expand(count, -1, -1),
+        vote.covariance_m2.expand(count, -1, -1, -1),
+        model.keypoints_m,
+        torch.stack(choices),
+    )
 
 
 def fit_pose(
