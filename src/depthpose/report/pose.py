@@ -362,23 +362,22 @@ def pose_scene(
     truth: Rigid | None = None,
 ) -> Scene:
     """Show what was seen, the posed model, its keypoints, and the truth where it is known."""
-    pose, posed = estimate.camera_from_model, list[Layer]()
+    pose, layers = estimate.camera_from_model, list[Layer]()
     if pose is not None:
-        posed = pose_layers(pose, model, with_box=truth is not None)
-    layers = [Layer(name="the object, as seen", shape=colored_points(points_m, _SEEN)), *posed]
-    if pose is not None:
-        for other in estimate.alternatives:  # by axes and box, not shown at first
-            placed = other.camera_from_model.double()
-            said = f"{other.difference}, {other.probability:.0%}"
-            box_m = placed.apply(box_edges(model).double()).float()
-            box = colored_lines(box_m, OTHER)
-            layers.append(Layer(name=f"box if {said}", shape=box, is_shown=False))
-            axes = frame_axes(placed.t_m, placed.R, model.diameter_m / 2)
-            layers.append(Layer(name=f"axes if {said}", shape=axes, is_shown=False))
+        layers += pose_layers(pose, model, with_box=truth is not None)
+    for other in estimate.alternatives:  # by axes and box, not shown at first
+        placed = other.camera_from_model.double()
+        said = f"{other.difference}, {other.probability:.0%}"
+        box_m = placed.apply(box_edges(model).double()).float()
+        box = colored_lines(box_m, OTHER)
+        layers.append(Layer(name=f"box if {said}", shape=box, is_shown=False))
+        axes = frame_axes(placed.t_m, placed.R, model.diameter_m / 2)
+        layers.append(Layer(name=f"axes if {said}", shape=axes, is_shown=False))
     if truth is not None:
         layers += pose_layers(truth, model, is_true=True)
     if estimate.keypoints_m is not None:
         layers += keypoint_layers(estimate.keypoints_m, pose, model)
+    layers.insert(0, Layer(name="the object, as seen", shape=colored_points(points_m, _SEEN)))
     if isinstance(pose_input, ViewInput):
         around_m = cloud_from_depth(pose_input.depth_m, ~pose_input.mask, pose_input.K).float()
         around = colored_points(take_evenly(around_m, _AROUND_POINTS), _AROUND)

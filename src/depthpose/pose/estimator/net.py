@@ -28,7 +28,7 @@ from depthpose.pose.cloud import (
     refusal_of,
 )
 from depthpose.pose.config import EstimateConfig
-from depthpose.pose.estimator.base import PoseEstimator, answered, or_unreadable
+from depthpose.pose.estimator.base import PoseEstimator, Registration, answered, or_unreadable
 from depthpose.pose.estimator.candidates import (
     Candidate,
     disagreement,
@@ -36,7 +36,6 @@ from depthpose.pose.estimator.candidates import (
     surface_signals,
 )
 from depthpose.pose.estimator.fit import answer_of, fit_of, misfit_of, refused, seen_about
-from depthpose.pose.estimator.register import Registration
 from depthpose.pose.refine import refine_best
 from depthpose.pose.types import (
     AnyInput,
