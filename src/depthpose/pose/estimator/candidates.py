@@ -111,29 +111,17 @@ def nearest_posed(
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class PoseAmbiguities:
-    """Pose ambiguities of a model.
+    """Pose ambiguities of a model."""
 
-    Attributes:
-        same: ``model_from_model`` of the copies that are one answer, the identity first.
-        near: of those that are another answer and look nearly alike.
-        mirror: how far the mirror image deviates from the model, in diameters.
-        trained: of those that the network was trained to treat as one, the identity first.
-        points_m: of the model, by which poses are compared.
-        middle_m: of its box.
-        axes: rows: its principal axes, from the longest.
-        lengths_m: its extent along each.
-        diameter_m: of the model.
-    """
-
-    same: Rigid
-    near: Rigid
-    mirror: float
-    trained: Rigid
-    points_m: Float64[Tensor, "n 3"]
-    middle_m: Float64[Tensor, "3"]
-    axes: Float64[Tensor, "3 3"]
-    lengths_m: Float64[Tensor, "3"]
-    diameter_m: float
+    same: Rigid  #: ``model_from_model`` of the copies that are one answer, the identity first
+    near: Rigid  #: of those that are another answer and look nearly alike
+    mirror: float  #: how far the mirror image deviates from the model, in diameters
+    trained: Rigid  #: of those that a network was trained to treat as one, the identity first
+    points_m: Float64[Tensor, "n 3"]  #: of the model, by which poses are compared
+    middle_m: Float64[Tensor, "3"]  #: of its box
+    axes: Float64[Tensor, "3 3"]  #: rows: its principal axes, from the longest
+    lengths_m: Float64[Tensor, "3"]  #: its extent along each
+    diameter_m: float  #: of the model
 
 
 @dataclass(kw_only=True, eq=False)

@@ -457,8 +457,6 @@ def without_motions(
     covariance: Float[Tensor, "6 6"], free: Float[Tensor, "m 6"]
 ) -> Float[Tensor, "6 6"]:
     """Give the covariance where the pose does not move along ``free``: finite, and 0 along them."""
-    if len(free) == 0:
-        return covariance
     basis = _complement(free.double())
     # Rotations and metres differ in size; the information of the rest is what counts.
     information = torch.linalg.inv(covariance.double())
@@ -522,7 +520,8 @@ def answer_of(
     }
     if reason is not None:  # all that was found out but the pose: nobody takes it for an answer
         return PoseEstimate(status=reason.status, reason=reason.reason, **facts)
-    covariance = without_motions(covariance, free)
+    if len(free):
+        covariance = without_motions(covariance, free)
     alternatives = tuple(
         Alternative(
             difference=difference_of(candidates[k].pose, pose, copies),

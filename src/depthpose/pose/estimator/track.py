@@ -177,13 +177,16 @@ def _follow(given: AnyInput, last: _Last, known: TrackedObject) -> PoseEstimate 
             reason="the seen part of the object does not fix its pose (observability "
             f"{observable:.1%})",
         )
+    covariance = refined.covariance
+    if len(free):
+        covariance = without_motions(covariance, free)
     (signals,) = surface_signals(own_m, pose[None], surface)
     answer = PoseEstimate(
         name="",
         object=known.model.name,
         status="ok",
         camera_from_model=refined.camera_from_model.float(),
-        covariance=without_motions(refined.covariance, free).float(),
+        covariance=covariance.float(),
         free_motions=free.float(),
         residual_m=float(refined.residual_m),
         signals=signals | {"through": shares[1], "before": shares[2]},
