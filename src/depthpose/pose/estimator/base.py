@@ -121,11 +121,16 @@ class PoseEstimator(ABC):
         each = self._each(inputs, threads)
         return list(tqdm(each, total=total, unit=" poses", disable=not with_progress))
 
-    @abstractmethod
     def _each(
         self, inputs: Iterable[AnyInput], threads: int, *, is_likely: bool = True
     ) -> Iterator[PoseEstimate]:
         """Give each input's estimate in order; ``is_likely``: most of them show their object."""
+        del is_likely
+        return each_in_threads(partial(or_unreadable, self._estimate), inputs, threads)
+
+    def _estimate(self, given: AnyInput) -> PoseEstimate:
+        """Estimate one input; an estimator of many at once has its own :meth:`_each`."""
+        raise NotImplementedError
 
     @torch.no_grad()
     @own_arithmetic()
@@ -476,13 +481,6 @@ class Registration(PoseEstimator):
             if known.copies is None:
                 known.copies = find_copies(known.model, up_to_symmetry=up_to_symmetry)
             self._pairs(known)
-
-    def _each(
-        self, inputs: Iterable[AnyInput], threads: int, *, is_likely: bool = True
-    ) -> Iterator[PoseEstimate]:
-        """Register one by one, whatever is likely; a model is prepared when first asked for."""
-        del is_likely
-        return each_in_threads(partial(or_unreadable, self._estimate), inputs, threads)
 
     def _pose_near(
         self, inputs: Sequence[CloudInput], poses: Sequence[Rigid]

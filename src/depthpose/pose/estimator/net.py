@@ -337,13 +337,6 @@ class DepthImageRegressor(PoseEstimator):
         self._network = weights.network.to(usable_device(self.config.device)).eval()
         self._cloud = weights.cloud
 
-    def _each(
-        self, inputs: Iterable[AnyInput], threads: int, *, is_likely: bool = True
-    ) -> Iterator[PoseEstimate]:
-        """Regress one by one, whatever is likely."""
-        del is_likely
-        return each_in_threads(partial(or_unreadable, self._estimate), inputs, threads)
-
     def _which(self, given: AnyInput, names: Sequence[str]) -> PoseEstimate:
         if len(names) > 1:
             raise InputError(f"object: say which of {', '.join(names)}; a regressor refuses none")
