@@ -430,6 +430,7 @@ class Registration(PoseEstimator):
         config: EstimateConfig | None = None,
         refusal: RefusalConfig | None = None,
     ) -> None:
+        super().__init__(models, config, refusal or REFUSAL)
         if not models:
             raise InputError(
                 "registration looks for CAD files and none is given; name one: STL, PLY, OBJ or GLB"
@@ -449,7 +450,6 @@ class Registration(PoseEstimator):
                 "registration has no network whose refusals it could register; omit "
                 "--register-refused (register_refused=True)"
             )
-        super().__init__(models, config, refusal or REFUSAL)
 
     @classmethod
     @own_arithmetic()
