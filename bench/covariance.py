@@ -26,6 +26,7 @@ from depthpose.core.render import rasterize
 from depthpose.core.rigid import Rigid, cross_matrix
 from depthpose.pose.cloud import cloud_from_depth
 from depthpose.pose.config import IcpConfig, SensorConfig, SensorKind
+from depthpose.pose.mesh import drawn_triangles
 from depthpose.pose.refine import refine_pose
 from depthpose.pose.surface import prepare_surface
 from depthpose.pose.synthetic.views import measure, random_rotation
@@ -54,7 +55,7 @@ def view_rows(
     true = Rigid(R, torch.tensor([0.02, -0.03, AWAY_M]).double() - R @ middle_m)
     at_m = true.apply(middle_m[None])[0]
     by = torch.cat([-cross_matrix(at_m), torch.eye(3).double()], 1)
-    clean_m = rasterize(true.apply(model.triangles_m.double()), K, WIDTH, HEIGHT).depth_m
+    clean_m = rasterize(true.apply(drawn_triangles(model).double()), K, WIDTH, HEIGHT).depth_m
     mask = clean_m.isfinite()
     clean_m = torch.where(mask, clean_m, BEHIND_M).float()
     offs, squares, spreads = [], [], []

@@ -10,7 +10,7 @@ import torch
 
 from depthpose.core.rigid import Rigid
 from depthpose.core.units import metres_of
-from depthpose.pose.mesh import is_mirror_alike, make_model
+from depthpose.pose.mesh import MIRROR_ALIKE, make_model, mirror_deviation
 from depthpose.pose.synthetic.parts import (
     PARTS,
     Mesh,
@@ -38,7 +38,7 @@ _SIZES = (0.5, 1.1)
 def negative_kinds(model: ObjectModel) -> tuple[NegativeKind, ...]:
     """List what is a negative of an object: its mirror image only where it differs from it."""
     kinds: tuple[NegativeKind, ...] = get_args(NegativeKind)
-    return tuple(k for k in kinds if k != "mirrored" or not is_mirror_alike(model))
+    return tuple(k for k in kinds if k != "mirrored" or mirror_deviation(model) > MIRROR_ALIKE)
 
 
 def negative_of(

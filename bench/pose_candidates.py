@@ -21,7 +21,8 @@ from depthpose.core.checkpoint import find_weights
 from depthpose.core.rigid import Rigid
 from depthpose.pose.config import ObjectsConfig, RefusalConfig
 from depthpose.pose.estimator import GeoPoseNet
-from depthpose.pose.estimator.candidates import PoseAmbiguities, find_copies, log_signal, share_out
+from depthpose.pose.estimator.candidates import PoseAmbiguities, find_copies
+from depthpose.pose.estimator.fit import FLOOR, share_out
 from depthpose.pose.synthetic import Objects
 from depthpose.pose.types import PoseEstimate
 from depthpose.pose.weights import read_pose_weights
@@ -89,7 +90,7 @@ def fit_candidate_slopes(
             real sensors err alike from pixel to pixel.
     """
     names = list(RefusalConfig().candidate_slopes)
-    x = [np.array([[log_signal(one[n]) for n in names] for one in some]) for some, _ in cases]
+    x = [np.array([[np.log(FLOOR + one[n]) for n in names] for one in some]) for some, _ in cases]
 
     def loss(slopes: np.ndarray) -> tuple[float, np.ndarray]:
         value, pull = 0.5 * ridge * float(slopes @ slopes), ridge * slopes

@@ -30,7 +30,7 @@ from depthpose.core.loop import sample_generator
 from depthpose.pose.config import EstimateConfig, ObjectsConfig
 from depthpose.pose.estimator import GeoPoseNet, Registration
 from depthpose.pose.estimator.base import PoseEstimator
-from depthpose.pose.mesh import is_mirror_alike
+from depthpose.pose.mesh import MIRROR_ALIKE, mirror_deviation
 from depthpose.pose.synthetic import Objects
 from depthpose.pose.train.clouds import pose_error
 from depthpose.pose.types import CloudSample, ObjectModel, ViewSample
@@ -92,7 +92,7 @@ def measure(
     for sample, which, found in zip(samples, asked, estimates, strict=True):
         error = pose_error(found, sample.truth, net.models[which])
         is_right = kind == ITSELF and error < 0.1
-        is_alike = kind == "mirrored" and is_mirror_alike(net.models[which])
+        is_alike = kind == "mirrored" and mirror_deviation(net.models[which]) <= MIRROR_ALIKE
         rows.append({
             "kind": ALIKE if is_alike else kind, "object": sample.input.object,
             "status": found.status,

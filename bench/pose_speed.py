@@ -22,9 +22,9 @@ from sparse_speed import child_memory, status_bytes, surface
 from torch import Tensor
 
 from depthpose.core.rigid import Rigid
+from depthpose.pose.cloud import ObjectCloud
 from depthpose.pose.config import CloudConfig, EstimateConfig, RefusalConfig, VotingConfig
 from depthpose.pose.estimator import GeoPoseNet
-from depthpose.pose.estimator.inputs import ObjectCloud
 from depthpose.pose.mesh import make_model
 from depthpose.pose.network import ResUNet, ResUNetConfig
 from depthpose.pose.types import CloudInput, ObjectModel

@@ -234,7 +234,7 @@ def show_poses(out: Path, weights: str | Path) -> tuple[list[dict[str, Any]], li
             cloud = posed_cloud(object_points(view, model.diameter_m), pose, model)
             write_cloud(folder / f"{view.object}.{CLOUD}", cloud)
             layers += pose_layers(pose, model)
-        picture = draw_pose(picture, instance.camera_from_model, model, K, is_true=True)
+        picture = draw_pose(picture, None, model, K, truth=instance.camera_from_model)
         layers += pose_layers(instance.camera_from_model, model, is_true=True)
     write_image(folder / "poses.png", picture)
     write_image(folder / "depth.grey.png", grey_depth(frame.depth_m))

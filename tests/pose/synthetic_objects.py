@@ -9,9 +9,9 @@ from torch import Tensor
 from depthpose.core.camera import Camera, back_project
 from depthpose.core.render import rasterize
 from depthpose.core.rigid import Rigid
+from depthpose.pose.cloud import ObjectCloud
 from depthpose.pose.config import CloudConfig, MeshConfig, RefusalConfig
 from depthpose.pose.estimator import GeoPoseNet
-from depthpose.pose.estimator.inputs import ObjectCloud
 from depthpose.pose.mesh import make_model
 from depthpose.pose.network import ResUNet, ResUNetConfig
 from depthpose.pose.synthetic import PARTS

@@ -1,7 +1,6 @@
 """Poses that fit as well as the best: found by the shape of the model, shared, named, counted."""
 
 import math
-from collections import OrderedDict
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -20,7 +19,8 @@ from tests.pose.synthetic_objects import (
 
 from depthpose.core.rigid import Rigid, geodesic_rad
 from depthpose.pose.config import EstimateConfig
-from depthpose.pose.estimator.candidates import difference_of, find_copies, share_out
+from depthpose.pose.estimator.candidates import difference_of, find_copies
+from depthpose.pose.estimator.fit import share_out
 from depthpose.pose.mesh import (
     NearSymmetry,
     SymmetryProposal,
@@ -168,7 +168,7 @@ def test_proposals_of_a_shape_are_kept_to_the_bit(
     monkeypatch.setattr(symmetry, "propose_symmetries", search)
     wanted = symmetries_from_proposals(given)
     for tolerance in (0.02, 0.02, 0.03):
-        monkeypatch.setattr(symmetry, "_memory", OrderedDict())
+        symmetry.kept.cache_clear()
         model = with_found_symmetries(bar(), None, is_taken=True, tolerance=tolerance)
         found, (own,) = model.symmetries, wanted.continuous
         assert found.discrete is not None
@@ -183,7 +183,7 @@ def test_what_was_found_is_kept_for_the_next_process(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("DEPTHPOSE_CACHE", str(tmp_path))
-    monkeypatch.setattr(symmetry, "_memory", OrderedDict())
+    symmetry.kept.cache_clear()
     model = replace(bar(), symmetries=Symmetries(is_found=True))
     true = symmetry._search(model)
     searches: list[ObjectModel] = []
@@ -199,7 +199,7 @@ def test_what_was_found_is_kept_for_the_next_process(
     searches.clear()
 
     def again() -> tuple[NearSymmetry, ...]:
-        monkeypatch.setattr(symmetry, "_memory", OrderedDict())
+        symmetry.kept.cache_clear()
         return near_symmetries(model)
 
     assert all(

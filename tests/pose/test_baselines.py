@@ -22,7 +22,7 @@ from depthpose.pose.baselines import (
     rotation_from_6d,
 )
 from depthpose.pose.losses import model_point_loss
-from depthpose.pose.mesh import sample_surface
+from depthpose.pose.mesh import drawn_triangles, sample_surface
 from depthpose.pose.types import SeenPoints, ViewInput
 
 K = torch.tensor([[500.0, 0, 160], [0, 510.0, 120], [0, 0, 1]], dtype=torch.float64)
@@ -36,7 +36,7 @@ def turned(seed: int) -> Tensor:
 
 
 def view_of(pose: Rigid, size: tuple[int, int] = (240, 320)) -> ViewInput:
-    triangles = pose.apply(bracket().triangles_m.reshape(-1, 3)).reshape(-1, 3, 3)
+    triangles = pose.apply(drawn_triangles(bracket()).reshape(-1, 3)).reshape(-1, 3, 3)
     depth_m = rasterize(triangles, K, size[1], size[0]).depth_m
     return ViewInput(name="v", depth_m=depth_m, mask=depth_m.isfinite(), K=K, object="bracket")
 

@@ -87,13 +87,13 @@ def test_nearest_surface_points(surface: Surface, monkeypatch: pytest.MonkeyPatc
 
 @pytest.mark.parametrize("count", [1, 7, 8, 9, 100])
 def test_trees_of_few_points(count: int) -> None:
-    from depthpose.pose.compiled.points import nearest_of, tree_of
+    from depthpose.pose.compiled.points import Tree, nearest_many, planted
 
     generator = torch.Generator().manual_seed(count)
     points = torch.randn(count, 3, generator=generator, dtype=torch.float64)
     points[count // 2] = points[0]  # two alike
     asked = torch.randn(50, 3, generator=generator, dtype=torch.float64)
-    _, found = nearest_of(asked.numpy(), tree_of(points.numpy()))
+    _, found = nearest_many(asked.numpy(), Tree(*planted(points.numpy())))
     true = torch.cdist(asked, points, compute_mode="donot_use_mm_for_euclid_dist").amin(1)
     assert is_near(torch.from_numpy(found), true, 1e-12)
 
@@ -245,14 +245,18 @@ def test_what_is_compiled_is_kept_by_all_sources(
 ) -> None:
     config: Any = import_module("numba").config
     before = config.CACHE_DIR
-    names = []
+    folders = []
+
+    def njit(**words: object) -> Callable[[T], T]:
+        folders.append(config.CACHE_DIR)
+        return lambda function: function
+
+    monkeypatch.setattr("numba.njit", njit)
+    monkeypatch.setattr(compiled, "__file__", str(tmp_path / "__init__.py"))
     for text in ("one", "another"):
         (tmp_path / "loop.py").write_text(text)
-        monkeypatch.setattr(compiled, "__file__", str(tmp_path / "__init__.py"))
-        compiled._digest.cache_clear()
-        names.append(compiled._digest())
-    compiled._digest.cache_clear()
-    assert names[0] != names[1]
+        compiled.compiled(test_networks)
+    assert folders[0] != folders[1]
     assert before == config.CACHE_DIR
 
 

@@ -26,9 +26,9 @@ from depthpose.core.checkpoint import LicenceNotice
 from depthpose.core.errors import InputError
 from depthpose.core.files import Cloud, write_cloud, write_depth_png, write_image
 from depthpose.core.rigid import Rigid, geodesic_rad, rotation_by
+from depthpose.pose.cloud import ObjectCloud, prepare_cloud
 from depthpose.pose.config import CloudConfig, EstimateConfig, VotingConfig
 from depthpose.pose.estimator import GeoPoseNet
-from depthpose.pose.estimator.inputs import ObjectCloud, prepare_cloud
 from depthpose.pose.mesh import (
     make_model,
     propose_symmetries,

@@ -17,9 +17,9 @@ from torch import Tensor
 from torch.utils._python_dispatch import TorchDispatchMode
 
 from depthpose.core.rigid import Rigid
+from depthpose.pose.cloud import ObjectCloud
 from depthpose.pose.config import CloudConfig, EstimateConfig, VotingConfig
 from depthpose.pose.estimator import Registration
-from depthpose.pose.estimator.inputs import ObjectCloud
 from depthpose.pose.mesh import make_model
 from depthpose.pose.types import PoseEstimate
 

@@ -11,6 +11,7 @@ import trimesh
 from depthpose.core.errors import InputError
 from depthpose.core.files import read_json
 from depthpose.core.rigid import Rigid, geodesic_rad, rotation_by
+from depthpose.pose.cloud import unit_advice
 from depthpose.pose.config import MeshConfig
 from depthpose.pose.mesh import (
     SymmetryProposal,
@@ -26,7 +27,6 @@ from depthpose.pose.mesh import (
     symmetries_to_bop,
     symmetry_transforms,
     turn_about,
-    unit_advice,
 )
 from depthpose.pose.types import Axis, ObjectModel, Symmetries
 

@@ -47,7 +47,7 @@ def _model(name: str = "part", shift_m: float = 0.0) -> ObjectModel:
 def _drawn_again(view: ViewSample, model: ObjectModel) -> torch.Tensor:
     pose, given = view.truth.camera_from_model, view.input
     height, width = given.depth_m.shape
-    return rasterize(pose.apply(model.triangles_m), given.K, width, height).depth_m
+    return rasterize(pose.apply(drawn_triangles(model)), given.K, width, height).depth_m
 
 
 @pytest.mark.parametrize("views", [None, 3])
@@ -191,7 +191,7 @@ def test_discs_stand_for_the_surface_that_points_were_taken_from() -> None:
     pose = pose_of_middle(make_shape(mesh), R, torch.tensor([0, 0, 0.5]).double())
     drawn = [
         rasterize((triangles.double() @ pose.R.mT + pose.t_m).float(), _K, 640, 480).depth_m
-        for triangles in (mesh.triangles_m, drawn_triangles(points))
+        for triangles in (drawn_triangles(mesh), drawn_triangles(points))
     ]
     shapes = [depth.isfinite() for depth in drawn]
     union, both = (shapes[0] | shapes[1]).sum(), (shapes[0] & shapes[1]).sum()
@@ -229,7 +229,7 @@ def test_a_frame_is_what_its_poses_look_like() -> None:
         assert 0 <= float(frame.rgb.min()) <= float(frame.rgb.max()) <= 1
         assert len(frame.objects) >= 2
         for shown in frame.objects:
-            corners = shown.camera_from_model.apply(models[shown.number - 1].triangles_m)
+            corners = shown.camera_from_model.apply(drawn_triangles(models[shown.number - 1]))
             alone_m = rasterize(corners, frame.K, 160, 120).depth_m
             assert torch.equal(shown.silhouette, alone_m.isfinite())
             assert not (shown.visible & ~shown.silhouette).any()

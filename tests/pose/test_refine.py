@@ -14,7 +14,7 @@ from depthpose.core.rigid import Rigid, cross_matrix, geodesic_rad, perturb
 from depthpose.pose.cloud import cloud_from_depth, object_points
 from depthpose.pose.config import IcpConfig, SensorConfig, SensorKind
 from depthpose.pose.datasets import open_bop
-from depthpose.pose.mesh import make_model, sample_surface
+from depthpose.pose.mesh import drawn_triangles, make_model, sample_surface
 from depthpose.pose.mesh.models import turn_about
 from depthpose.pose.metrics import add_m
 from depthpose.pose.refine import _covariance, refine_best, refine_pose
@@ -269,7 +269,7 @@ def test_its_covariance_covers_the_errors_of_sensors(kind: SensorKind) -> None:
         R = pose.R.double()
         at_m = torch.tensor([0.01, -0.02, 0.6]).double()
         true = Rigid(R, at_m - R @ part.points_m.mean(0))
-        clean_m = rasterize(true.apply(model.triangles_m.double()), K, 160, 120).depth_m
+        clean_m = rasterize(true.apply(drawn_triangles(model).double()), K, 160, 120).depth_m
         mask, generator = clean_m.isfinite(), torch.Generator().manual_seed(seed)
         sensor = SensorConfig(kinds=(kind,), noise=(1.0, 1.0), offset_m=(0.0, 0.0))
         by = torch.cat([-cross_matrix(at_m), torch.eye(3).double()], 1)

@@ -21,20 +21,22 @@ from depthpose.core.checkpoint import SHIPPED, read_checkpoint
 from depthpose.core.config import config_from_dict
 from depthpose.core.errors import InputError
 from depthpose.core.rigid import Rigid
-from depthpose.pose.cloud import grow_mask
+from depthpose.pose.cloud import ObjectCloud, grow_mask, prepare_cloud
 from depthpose.pose.config import CloudConfig, EstimateConfig, IcpConfig, RefusalConfig
 from depthpose.pose.estimator.candidates import (
     Candidate,
-    Clock,
-    answer_of,
+    KnownObject,
     find_copies,
+    surface_signals,
+)
+from depthpose.pose.estimator.fit import (
+    answer_of,
+    fit_of,
     misfit_of,
     observability,
-    surface_signals,
+    seen_about,
     with_status,
 )
-from depthpose.pose.estimator.fit import fit_of, seen_about
-from depthpose.pose.estimator.inputs import ObjectCloud, prepare_cloud
 from depthpose.pose.surface import prepare_surface
 from depthpose.pose.synthetic.views import shift_mask
 from depthpose.pose.types import Fit, ObjectModel, PoseEstimate, ViewInput
@@ -146,11 +148,10 @@ def test_a_pose_of_which_some_disagrees_is_not_certain_though_no_other_was_found
         assert isinstance(cloud, ObjectCloud)
         alone = [Candidate(TRUTH.double(), torch.eye(6), 0.001)]
         copies = find_copies(bracket(), up_to_symmetry=False)
+        known = KnownObject(number=0, model=bracket(), surface=SURFACE, copies=copies)
         evidence = [dict.fromkeys(RefusalConfig().candidate_slopes, 0.1)]
         refusal = RefusalConfig(max_beyond=1.0, max_size_error=1.0)
-        found.append(answer_of(
-            cloud, bracket(), SURFACE, copies, alone, evidence, refusal, EstimateConfig(), Clock()
-        ))  # fmt: skip
+        found.append(answer_of(cloud, known, alone, evidence, refusal, EstimateConfig(), {}))
     assert (found[0].status, found[0].certainty) == ("ok", 1.0)
     assert found[1].fit is not None
     assert 0.8 < found[1].fit.agrees < 0.85

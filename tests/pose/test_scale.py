@@ -92,7 +92,7 @@ def test_negatives_bear_the_name_and_are_something_else(kind: NegativeKind) -> N
 
 def test_a_mirrored_object_has_its_normals_outward() -> None:
     once = mirrored(bracket())
-    corners = once.triangles_m
+    corners = once.vertices_m[once.faces]
     across = torch.linalg.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     assert bool(((across * once.normals[once.faces].mean(1)).sum(-1) > 0).all())
     twice = mirrored(once)

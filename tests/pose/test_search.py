@@ -179,8 +179,8 @@ def test_a_hundred_models_take_bounded_time(net: Registration) -> None:
 
     known = SearchTargets(
         names=[f"part {k}" for k in range(100)],
-        surface_of=lambda _: net._surface(0),
-        pairs_of=lambda _: net._pairs(0),
+        surface_of=lambda _: net._known("bracket").surface,
+        pairs_of=lambda _: net._pairs(net._known("bracket")),
         pose_near=pose_near,
         max_size_error=net.refusal.max_size_error,
     )

@@ -13,9 +13,9 @@ from depthpose.core import camera as cameras
 from depthpose.core import files
 from depthpose.core.errors import InputError
 from depthpose.core.files.images import opened_image, read_numbers, value_range
-from depthpose.pose.cloud import frame_advice
+from depthpose.pose.cloud import frame_advice, unit_advice
 from depthpose.pose.datasets import mask_from_rle
-from depthpose.pose.mesh import exact_diameter, mesh_suffixes, read_geometry, unit_advice
+from depthpose.pose.mesh import exact_diameter, mesh_suffixes, read_geometry
 
 Size = tuple[int, int]
 

@@ -30,7 +30,7 @@ from depthpose.pose.types import ViewSample
 from depthpose.pose.voting import vote_ransac
 from depthpose.report import page
 from depthpose.report.page import Drawing, Picture, Section
-from depthpose.report.pose import close_up, draw_boxes, grey_depth, picture_of
+from depthpose.report.pose import close_up, draw_pose, grey_depth, picture_of
 from depthpose.thesis import pose_figures, pose_tables
 
 _SYNTHETIC_SEED = 3303  # of synthetic views for tables and figures; no training uses it
@@ -156,7 +156,7 @@ def reproduce_by_object(
             true, found = instance.camera_from_model, estimate.camera_from_model
             model = dataset.objects[instance.object_id]
             path = out / "figures" / folder.name / f"3-5_{instance.name}.jpg"
-            write_image(path, draw_boxes(picture, true, found, model, K))
+            write_image(path, draw_pose(picture, found, model, K, true))
             caption = instance.name if estimate.is_posed else f"{instance.name}: {estimate.reason}"
             pictures.append(Picture(path=path, caption=caption))
         if pictures:
@@ -311,7 +311,7 @@ def box_panels(net: GeoPoseNet, views: Views) -> list[Drawing]:
         picture, K = views.close_up(k)
         true, found = view.truth.camera_from_model, estimate.camera_from_model
         name = view.input.name
-        image = draw_boxes(picture, true, found, models[view.input.object], K)
+        image = draw_pose(picture, found, models[view.input.object], K, true)
         caption = name if estimate.is_posed else f"{name}: refused, {estimate.reason}"
         panels.append(Drawing(image=image, caption=caption))
     return panels

@@ -1,5 +1,6 @@
-"""Depth and mask to the partial cloud of one object: flying pixels, samples, voxels."""
+"""Depth and mask to the partial cloud of one object, or the reason why it cannot be posed."""
 
+import math
 from dataclasses import dataclass
 
 import torch
@@ -8,15 +9,25 @@ from jaxtyping import Bool, Float, Float64, Int64
 from scipy.spatial import KDTree
 from torch import Tensor
 
+from depthpose.core.arrays import take_evenly
 from depthpose.core.errors import InputError
 from depthpose.core.rigid import turn_axis_to
-from depthpose.pose.config import CloudConfig
-from depthpose.pose.types import CloudInput, CloudSample, ViewInput, ViewSample
+from depthpose.pose.config import CloudConfig, EstimateConfig
+from depthpose.pose.types import (
+    CloudInput,
+    CloudSample,
+    ObjectModel,
+    Status,
+    ViewInput,
+    ViewSample,
+)
 
 _LARGEST_CELL = 2**20
 _NEIGHBOURS = 20
 _MOST = 0.5
 _STEEP = 1.73  # tangent of 60 degrees
+_BEFORE = 0.05  # nearly all points of a seen cloud are so many diameters before the camera
+_THIN = 0.002  # below this root mean square, in diameters, a cloud has no extent
 _FARTHEST_M = 1e6  # a coordinate beyond this marks a missing reading
 
 
@@ -33,6 +44,123 @@ class VoxelGrid:
     #: mean in the cell (-1 to 1), log2 of its number of points, the normal toward the camera, and
     #: the curvature (0 in a plane, 1 in a ball).
     features: Float[Tensor, "m c"]
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class ObjectCloud:
+    """A cloud that can be posed."""
+
+    name: str  #: that of the input
+    cloud_m: Float[Tensor, "n 3"]  #: all usable points, without flying pixels
+    points_m: Float[Tensor, "m 3"]  #: those that the network sees and that vote, one a voxel
+    voxels: VoxelGrid  #: of the network's grid
+    view: ViewInput | None  #: the depth image that shows the cloud; None of a cloud alone
+
+
+@dataclass(frozen=True, kw_only=True)
+class Refusal:
+    """Why there is no pose."""
+
+    status: Status
+    reason: str
+
+
+def prepare_cloud(
+    given: CloudInput | ViewInput, model: ObjectModel, cloud: CloudConfig, config: EstimateConfig
+) -> ObjectCloud | Refusal:
+    """Lift, thin, drop flying pixels, check, sample and put on the grid of the network."""
+    if isinstance(given, ViewInput):
+        points_m = cloud_from_depth(given.depth_m, given.mask, given.K).float()
+        nothing = nothing_seen(given) if len(points_m) == 0 else ""
+    else:
+        points_m = given.points_m.float()
+        is_zero = bool((points_m == 0).all(-1).any())
+        nothing = "the cloud has no point with finite coordinates"
+        nothing = "the cloud is (0, 0, 0), no reading, in every point" if is_zero else nothing
+        nothing = "the cloud is empty" if len(points_m) == 0 else nothing
+    points_m = take_evenly(points_m[is_reading(points_m)], config.max_cloud_points)
+    if len(points_m) == 0:
+        return Refusal(status="too few points", reason=nothing)
+    kept_m = points_m[~is_flying(points_m, cloud.max_offset_diameters * model.diameter_m)]
+    if (refusal := _refusal_of(given, points_m, kept_m, model, cloud)) is not None:
+        return refusal
+    generator = torch.Generator().manual_seed(config.voting.seed)
+    sampled_m = sample_points(kept_m, cloud.max_points, generator)
+    voxels = voxelise(sampled_m, cloud)
+    view = given if isinstance(given, ViewInput) else given.view
+    return ObjectCloud(
+        name=given.name,
+        cloud_m=kept_m,
+        points_m=sampled_m[voxels.kept],
+        voxels=voxels,
+        view=view,
+    )
+
+
+def nothing_seen(view: ViewInput) -> str:
+    """Say why no masked pixel of a view has a depth."""
+    masked = int(view.mask.sum())
+    if masked == 0:
+        return "the mask is empty: no pixel of it is the object"
+    if not bool((view.depth_m > 0).any()):
+        return "the depth image has no reading at all: every pixel is 0 or NaN"
+    return f"none of the {masked} masked pixels has a depth reading"
+
+
+def _refusal_of(
+    given: CloudInput | ViewInput,
+    points_m: Float[Tensor, "n 3"],
+    kept_m: Float[Tensor, "m 3"],
+    model: ObjectModel,
+    cloud: CloudConfig,
+) -> Refusal | None:
+    """Refuse a cloud by its place, its size and its shape; ``kept_m`` has no flying pixels."""
+    if (few := refusal_of(points_m, cloud)) is not None:
+        return Refusal(status="too few points", reason=few)
+    # Of the object's size is what is left without flying pixels, if those are few.
+    sized_m = kept_m if len(kept_m) > _MOST * len(points_m) else points_m
+    advice = unit_advice(model.diameter_m, sized_m)
+    # What was seen is wholly before the camera; a cloud about the origin is in no other axes.
+    is_about_origin = float(points_m.median(0).values.norm()) < model.diameter_m / 2
+    least_m = float(take_evenly(points_m[:, 2], 10_000).quantile(0.05))
+    is_centred = is_about_origin and least_m < _BEFORE * model.diameter_m
+    unusable = frame_advice(points_m)
+    if isinstance(given, CloudInput) and is_centred and advice is None:
+        unusable = (
+            "the cloud lies about the origin, where the camera is: it was centred, or is in "
+            "the frame of the model; give it in the camera's frame, as it was seen"
+        )
+    # Some background in the mask is not of another size.
+    elif not unusable and advice and not (sized_m is kept_m and "larger than the model" in advice):
+        hint = ""
+        if isinstance(given, ViewInput):  # what else changes the size of a cloud
+            mask = given.mask.float()
+            edge = torch.cat([mask[0], mask[-1], mask[:, 0], mask[:, -1]])
+            hint = (
+                "; a mask of more than it, or a K of another image size, changes the size of its "
+                "cloud too, and so does another depth unit: 0.001 m of most sensors, 0.0002 m of "
+                "TUM RGB-D, 1/256 m of KITTI"
+            )
+            if (share := float(mask.mean())) > _MOST and float(edge.mean()) > _MOST:
+                hint = f"; the mask covers {share:.0%} of the image and its border: is it inverted?"
+        unusable = f"{advice} (the object is {model.diameter_m:.3g} m long{hint})"
+    if unusable is not None:
+        return Refusal(status="unusable input", reason=unusable)
+    if (few := refusal_of(kept_m, cloud)) is not None:
+        return Refusal(status="too few points", reason=few)
+    centred = kept_m.double() - kept_m.double().mean(0)
+    extent_m = torch.linalg.eigvalsh(centred.T @ centred / len(centred)).clamp(min=0).sqrt()
+    flat = int((extent_m < _THIN * model.diameter_m).sum())
+    if flat == 0:
+        return None
+    shape = {1: "in a plane", 2: "on a line", 3: "in one place"}[flat]
+    beside = isinstance(given, ViewInput) and flat == 1
+    return Refusal(
+        status="not observable",
+        reason=f"the points lie {shape}, so that motions along it change nothing that is seen; "
+        "look from a side that shows more of the object"
+        f"{', or give the mask of this image: this one may lie on the background' * beside}",
+    )
 
 
 def cloud_from_depth(
@@ -54,7 +182,8 @@ def cloud_from_depth(
     Raises:
         InputError: mask and depth differ in size.
     """
-    refuse_other_size(mask, depth_m)
+    if depth_m.shape != mask.shape:
+        raise other_size(mask, depth_m)
     is_read = mask & torch.isfinite(depth_m) & (depth_m > 0)
     # As ``back_project`` does, for a fraction of the image.
     v, u = is_read.nonzero(as_tuple=True)
@@ -83,17 +212,12 @@ def lift_sample(view: ViewSample, diameter_m: float, config: CloudConfig) -> Clo
     return CloudSample(input=cloud, truth=view.truth)
 
 
-def refuse_other_size(mask: Bool[Tensor, "mask_h mask_w"], depth_m: Float[Tensor, "h w"]) -> None:
-    """Refuse a mask that is not of this depth image.
-
-    Raises:
-        InputError: mask and depth differ in size.
-    """
-    if depth_m.shape != mask.shape:
-        raise InputError(
-            f"the mask is {mask.shape[1]}x{mask.shape[0]}, but the depth image is "
-            f"{depth_m.shape[1]}x{depth_m.shape[0]}; give the mask of this very image"
-        )
+def other_size(mask: Bool[Tensor, "mask_h mask_w"], depth_m: Float[Tensor, "h w"]) -> InputError:
+    """Make the error of a mask that is not of this depth image."""
+    return InputError(
+        f"the mask is {mask.shape[1]}x{mask.shape[0]}, but the depth image is "
+        f"{depth_m.shape[1]}x{depth_m.shape[0]}; give the mask of this very image"
+    )
 
 
 def grow_mask(mask: Bool[Tensor, "h w"], grow_px: int) -> Bool[Tensor, "h w"]:
@@ -129,6 +253,58 @@ def refusal_of(points_m: Float[Tensor, "n 3"], config: CloudConfig | None = None
     return (
         f"the cloud has {len(points_m)} points, fewer than the {config.min_points} that a pose "
         "takes: is the mask empty, or the depth missing there?"
+    )
+
+
+_PER_METRE = {"mm": 1000.0, "cm": 100.0, "inches": 39.37}
+_MM = {"cm": 10.0, "inches": 25.4}
+_LARGEST_SHARE = 1.5  # a cloud is part of its object; noise and grown masks make it somewhat larger
+_SMALLEST_SHARE = 0.1  # what shows less than a tenth of the diameter cannot be posed anyway
+_LIKELY_SHARE = 0.3  # a cloud too large is of another unit if that makes it as long as this
+_USUAL_SHARE, _AS_LIKELY = 0.7, 0.3
+"""What is seen of an object is about so long; of units that give it within 35 % all are named."""
+
+
+def unit_advice(model_diameter_m: float, points_m: Float[Tensor, "n 3"]) -> str | None:
+    """Say that the model and the cloud seem to be of different units; None where they agree.
+
+    The size of a cloud is twice the distance from its median that 95 % of the points stay within:
+    a few flying pixels do not change it.
+
+    Args:
+        model_diameter_m: of the model, in what was taken for metres.
+        points_m: of the object, in what was taken for metres.
+    """
+    if len(points_m) < 2:
+        return None
+    distance_m = (points_m - points_m.median(0).values).norm(dim=-1)
+    size_m = 2 * float(distance_m.kthvalue(1 + int(0.95 * (len(distance_m) - 1))).values)
+    if size_m <= 0:
+        return None
+    share = size_m / model_diameter_m
+    if _SMALLEST_SHARE <= share <= _LARGEST_SHARE:
+        return None
+    more, larger, smaller = max(share, 1 / share), "model", "cloud"
+    if share > 1:
+        larger, smaller = smaller, larger
+    # Five times too large is a mask of more than the object sooner than a sliver in inches.
+    least = _LIKELY_SHARE if share > 1 else _SMALLEST_SHARE
+    fits = {unit: share * factor if share < 1 else share / factor
+            for unit, factor in _PER_METRE.items()}  # fmt: skip
+    likely = {abs(math.log(fit / _USUAL_SHARE)): unit for unit, fit in fits.items()
+              if least <= fit <= _LARGEST_SHARE}  # fmt: skip
+    if likely:
+        best = min(likely)
+        units = " or ".join(unit for off, unit in likely.items() if off < best + _AS_LIKELY)
+        return f"your {larger} is {more:.0f} times larger than the {smaller}: is it in {units}?"
+    units = " or ".join(
+        unit for unit, mm in _MM.items()
+        if _LIKELY_SHARE <= (share * mm if share < 1 else share / mm) <= _LARGEST_SHARE
+    )  # fmt: skip
+    relation = "larger" if share > 1 else "smaller"
+    return (
+        f"the cloud is {more:.1f} times {relation} than the model: is this the right object, and "
+        f"does the mask fit it?{f' Or is the {smaller} in {units}?' if units else ''}"
     )
 
 

@@ -113,7 +113,8 @@ class Block(nn.Module):
 
     def forward(self, voxels: Voxels) -> Voxels:
         """Add to what comes in; the answer is not negative."""
-        branch = self.second(_relu(self.first(voxels)))
+        inner = self.first(voxels)
+        branch = self.second(inner.with_features(F.relu(inner.features)))
         return voxels.with_features(F.relu(branch.features + voxels.features))
 
 
@@ -166,7 +167,8 @@ class ResUNet(nn.Module):
     def directions(self, seen: SeenPoints) -> Float[Tensor, "points keypoints 3"]:
         """Answer for each point's own class: what every network that votes offers."""
         voxels = Voxels.from_points(seen.coordinates, seen.features)
-        features = self._features(voxels).at_points()
+        mixed = self._features(voxels)
+        features = mixed.features[mixed.row_of_point]
         answers = features.new_empty(len(features), self.config.keypoints, 3)
         for number in seen.class_of_point.unique().tolist():
             mine = seen.class_of_point == number
@@ -190,11 +192,8 @@ class ResUNet(nn.Module):
         for up, block in zip(self.up, self.up_blocks, strict=True):
             voxels = block(up(voxels))
             voxels = voxels.with_features(torch.cat([voxels.features, seen.pop().features], 1))
-        return _relu(self.mix(voxels))
-
-
-def _relu(voxels: Voxels) -> Voxels:
-    return voxels.with_features(F.relu(voxels.features))
+        mixed = self.mix(voxels)
+        return mixed.with_features(F.relu(mixed.features))
 
 
 @torch.no_grad()

@@ -35,7 +35,6 @@ from depthpose.pose.types import (
     ViewInput,
 )
 
-AnswerT = TypeVar("AnswerT", Fit, Identity)
 POSES = "poses.json"
 VERSION = 1  #: of an entry of ``poses.json``; ``docs/poses.schema.json`` describes it
 PICTURE, CLOUD = "pose.png", "pose.ply"  #: what follows ``NAME.`` in files that show a pose
@@ -140,22 +139,24 @@ def prediction_row(prediction: Prediction) -> dict[str, Any]:
     row: dict[str, Any] = {"version": VERSION, "name": estimate.name, "object": estimate.object}
     row |= dict(zip(_PLACE, place, strict=True)) if place is not None else {}
     row |= {"status": estimate.status, "reason": estimate.reason}
-    row["camera_from_model"] = None if pose is None else _matrix(pose)
+    row["camera_from_model"] = None if pose is None else pose.matrix().tolist()
     for name in ("covariance", "free_motions", "keypoints_m"):
         values: Tensor | None = getattr(estimate, name)
         row[name] = None if values is None else values.double().tolist()
+    # JSON has no infinity: a free axis has no deviation, nothing near the surface no distance.
     for name in ("origin_std_mm", "rotation_std_deg"):
         values = getattr(estimate, name)
-        row[name] = None if values is None else [_finite(v) for v in values.tolist()]
+        known = [] if values is None else values.tolist()
+        row[name] = [v if math.isfinite(v) else None for v in known] or None
     for name in ("inlier_share", "residual_m", "certainty"):
         value: float | None = getattr(estimate, name)
-        row[name] = None if value is None else _finite(value)
+        row[name] = value if value is not None and math.isfinite(value) else None
     for name in ("fit", "identity"):
         answer = getattr(estimate, name)
         row[name] = None if answer is None else asdict(answer)
     row["alternatives"] = [
         {
-            "camera_from_model": _matrix(other.camera_from_model),
+            "camera_from_model": other.camera_from_model.matrix().tolist(),
             "probability": other.probability,
             "difference": other.difference,
         }
@@ -164,16 +165,6 @@ def prediction_row(prediction: Prediction) -> dict[str, Any]:
     if estimate.tracking is not None:
         row["tracking"] = estimate.tracking
     return row | {"signals": dict(estimate.signals), "seconds": dict(estimate.seconds)}
-
-
-def _finite(value: float) -> float | None:
-    """JSON has no infinity: a free axis has no deviation, nothing near the surface no distance."""
-    return value if math.isfinite(value) else None
-
-
-def _matrix(pose: Rigid) -> list[list[float]]:
-    top = torch.cat([pose.R.double(), pose.t_m.double()[:, None]], 1).tolist()
-    return [*top, [0.0, 0.0, 0.0, 1.0]]
 
 
 def parse_prediction(row: dict[str, Any], source: str) -> Prediction:
@@ -220,24 +211,32 @@ def parse_prediction(row: dict[str, Any], source: str) -> Prediction:
         alternatives.append(
             Alternative(camera_from_model=other, probability=probability, difference=words)
         )
+    values: dict[str, Any] = {
+        "keypoints_m": _table(row, "keypoints_m", 3, source),
+        "covariance": _table(row, "covariance", 6, source, rows=6),
+        "free_motions": _table(row, "free_motions", 6, source),
+    }
+    for key in ("inlier_share", "residual_m", "certainty"):
+        values[key] = None if row.get(key) is None else number(row, key, None, source)
+    for key in ("signals", "seconds"):
+        found = row.get(key, {})
+        if not isinstance(found, dict):
+            raise InputError(f"{source}: {key} is {found!r}, where names to numbers belong")
+        values[key] = {str(k): number(found, k, None, source) for k in found}
+    for key, kind in (("fit", Fit), ("identity", Identity)):
+        found, where = row.get(key), f"{source}: {key}"
+        if found is not None and not isinstance(found, dict):
+            raise InputError(f"{where} is {found!r}, where names to values belong")
+        values[key] = None if found is None else config_from_dict(found, kind, source=where)
     estimate = PoseEstimate(
         name=name,
         object=what,
         status=cast("Status", status),
         reason=str(reason),
         camera_from_model=pose,
-        keypoints_m=_table(row, "keypoints_m", 3, source),
-        covariance=_table(row, "covariance", 6, source, rows=6),
-        free_motions=_table(row, "free_motions", 6, source),
-        inlier_share=_optional(row, "inlier_share", source),
-        residual_m=_optional(row, "residual_m", source),
-        fit=_fields_of(row, "fit", Fit, source),
-        certainty=_optional(row, "certainty", source),
-        identity=_fields_of(row, "identity", Identity, source),
         alternatives=tuple(alternatives),
-        signals=_named(row, "signals", source),
-        seconds=_named(row, "seconds", source),
         tracking=cast("Tracking | None", tracking),
+        **values,
     )
     has_place = any(row.get(key) is not None for key in _PLACE)
     place = Place(*(integer(row, key, source) for key in _PLACE)) if has_place else None
@@ -272,27 +271,6 @@ def _table(
         raise InputError(
             f"{source}: {key} is not {count}rows of {width} numbers; write them so"
         ) from error
-
-
-def _fields_of(row: dict[str, Any], key: str, kind: type[AnswerT], source: str) -> AnswerT | None:
-    """Read one of the three answers; numbers that it does not say are None."""
-    entry = row.get(key)
-    if entry is None:
-        return None
-    if not isinstance(entry, dict):
-        raise InputError(f"{source}: {key} is {entry!r}, where names to values belong")
-    return config_from_dict(entry, kind, source=f"{source}: {key}")
-
-
-def _optional(row: dict[str, Any], key: str, source: str) -> float | None:
-    return None if row.get(key) is None else number(row, key, None, source)
-
-
-def _named(row: dict[str, Any], key: str, source: str) -> dict[str, float]:
-    found = row.get(key, {})
-    if not isinstance(found, dict):
-        raise InputError(f"{source}: {key} is {found!r}, where names to numbers belong")
-    return {str(name): number(found, name, None, source) for name in found}
 
 
 _SAVE_EVERY = 200

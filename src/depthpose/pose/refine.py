@@ -4,6 +4,7 @@ import math
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
+import numpy as np
 import torch
 from jaxtyping import Bool, Float, Float64, Int64
 from torch import Tensor
@@ -11,9 +12,17 @@ from torch import Tensor
 from depthpose.core.arrays import take_evenly
 from depthpose.core.errors import InputError
 from depthpose.core.rigid import Rigid, cross_matrix, perturb, rotation_by
-from depthpose.pose.compiled import LOOKED_UP, ON_RAY, SEARCHED, serves
+from depthpose.pose.compiled import (
+    GRAZING,
+    LOOKED_UP,
+    ON_RAY,
+    SEARCHED,
+    SLACK,
+    finite_array,
+    serves,
+)
 from depthpose.pose.config import IcpConfig
-from depthpose.pose.surface import Surface, look_along_rays, match
+from depthpose.pose.surface import Surface, look_along_rays
 
 _CONVERGED = 3e-4  # stop when a step turns [rad] and shifts [diameters] by less than this
 _TURN_RAD = math.radians(15)  # by how much further starts are turned
@@ -87,15 +96,15 @@ def refine_pose(
         InputError: there is no point, or one is not finite.
     """
     config = IcpConfig() if config is None else config
-    _refuse_no_points(points_m)
-    cloud = take_evenly(points_m.double(), config.cloud_points)
     # The limit shrinks in even ratios over half of the steps; then it is kept, and checked by.
     start, end = config.start_distance_diameters, config.end_distance_diameters
     half = max(1, config.iterations // 2)
     shares = [start * (end / start) ** min(1.0, i / half) for i in range(config.iterations)]
     limits_m = [share * surface.diameter_m for share in (*shares, end)]
-    pose, index = _iterated(cloud, initial.double(), surface, limits_m, is_exact=True)
-    H, _, residual_m, weight, J = _normal_equations(
+    most, initial = config.cloud_points, initial.double()
+    pose, index = _iterated(points_m, most, initial, surface, limits_m, is_exact=True)
+    cloud = take_evenly(points_m.double(), most)
+    H, _, J, weight, residual_m, spread_m = _normal_equations(
         cloud, pose, surface, limits_m[-1], index, ON_RAY
     )
     local = _covariance(cloud, H, J, weight, residual_m, limits_m[-1], surface.diameter_m)
@@ -109,7 +118,7 @@ def refine_pose(
     return RefinedPose(
         camera_from_model=Rigid(pose.R.to(points_m), pose.t_m.to(points_m)),
         covariance=(shift @ local @ shift.mT).to(points_m),
-        residual_m=_spread_m(residual_m, weight).to(points_m),
+        residual_m=spread_m.to(points_m),
         inlier_share=(weight > 0).to(points_m).mean(-1),
     )
 
@@ -138,7 +147,6 @@ def refine_best(
         InputError: there is no point, or one is not finite.
     """
     config = IcpConfig() if config is None else config
-    _refuse_no_points(points_m)
     given = Rigid(initial.R.reshape(-1, 3, 3), initial.t_m.reshape(-1, 3))
     # The poses, then all of them turned once, twice ... about the middle of the object.
     poses, axes = given.double(), torch.eye(3, dtype=torch.float64)
@@ -184,36 +192,37 @@ def refine_roughly(
         surface: of the model.
         config: its last limit.
     """
-    few = take_evenly(points_m.double(), _ROUGH_POINTS)
     end_m = config.end_distance_diameters * surface.diameter_m
     limits_m = [share * end_m for share in _ROUGH_LIMITS]
-    return _iterated(few, starts, surface, limits_m, is_exact=False)[0]
-
-
-def _refuse_no_points(points_m: Float[Tensor, "n 3"]) -> None:
-    if len(points_m) == 0 or not bool(points_m.isfinite().all()):
-        raise InputError(
-            f"ICP of {len(points_m)} points, {int((~points_m.isfinite().all(-1)).sum())} of them "
-            "not finite: leave those out, and refuse a cloud of none."
-        )
+    return _iterated(points_m, _ROUGH_POINTS, starts, surface, limits_m, is_exact=False)[0]
 
 
 def _iterated(
-    cloud: Float[Tensor, "n 3"],
+    points_m: Float[Tensor, "m 3"],
+    most: int,
     pose: Rigid,
     surface: Surface,
     limits_m: list[float],
     *,
     is_exact: bool,
 ) -> tuple[Rigid, Int64[Tensor, "*batch n"]]:
-    """Step to where the cloud lies on the surface; give each point's sample too, or -1."""
-    if serves(cloud, pose.R, pose.t_m):
-        from depthpose.pose.compiled.poses import refined
-
-        scale_m = surface.diameter_m
-        return refined(
-            cloud, pose, surface.target, limits_m, _CONVERGED, scale_m, is_exact=is_exact
+    """Step to where a cloud of ``most`` points lies on the surface; give their samples, or -1."""
+    if len(points_m) == 0 or not bool(points_m.isfinite().all()):
+        raise InputError(
+            f"ICP of {len(points_m)} points, {int((~points_m.isfinite().all(-1)).sum())} of them "
+            "not finite: leave those out, and refuse a cloud of none."
         )
+    cloud = take_evenly(points_m.double(), most)
+    if serves(cloud, pose.R, pose.t_m):
+        from depthpose.pose.compiled.poses import refine
+
+        R, t_m = (torch.from_numpy(finite_array(part).copy()) for part in (pose.R, pose.t_m))
+        target, points = surface.target, finite_array(cloud)
+        arrays = (points, R.view(-1, 3, 3).numpy(), t_m.view(-1, 3).numpy(), np.array(limits_m))
+        places = np.full((len(arrays[2]), len(points)), -1)
+        refine(*arrays, surface.diameter_m, _CONVERGED, target, is_exact, places)
+        index = torch.from_numpy(np.append(target.tree.order, -1)[places])
+        return Rigid(R, t_m), index.view(*t_m.shape[:-1], -1)
     scale = torch.tensor([1.0] * 3 + [surface.diameter_m] * 3, dtype=torch.float64)
     moves = torch.ones_like(pose.t_m[..., :1])
     index, steps = torch.full((*pose.t_m.shape[:-1], len(cloud)), -1), len(limits_m) - 1
@@ -241,15 +250,79 @@ def _worth(
 ) -> Float64[Tensor, " b"]:
     """Score each pose: share of points near the surface, less distance and contradictions."""
     cloud = take_evenly(points_m.double(), _OCCLUDING_POINTS)
+    front, unseen = look_along_rays(cloud, poses, surface, every=4)
     few = take_evenly(cloud, _ROUGH_POINTS)
     index = match(few, poses, surface, limit_m, LOOKED_UP)
-    _, _, residual_m, weight, _ = _normal_equations(few, poses, surface, limit_m, index, LOOKED_UP)
+    *_, weight, _, spread_m = _normal_equations(few, poses, surface, limit_m, index, LOOKED_UP)
     near = (weight > 0).double().mean(-1)
-    front, unseen = look_along_rays(cloud, poses, surface, every=4)
     # Of equals, the nearer one.
-    worth = near - _spread_m(residual_m, weight) / surface.diameter_m - front - _UNSEEN * unseen
+    worth = near - spread_m / surface.diameter_m - front - _UNSEEN * unseen
     worth[0] += _TRUST  # the first pose is trusted more
     return worth
+
+
+def match(
+    cloud_m: Float64[Tensor, "n 3"],
+    pose: Rigid,
+    surface: Surface,
+    limit_m: float,
+    how: int,
+    before: Int64[Tensor, "*batch n"] | None = None,
+) -> Int64[Tensor, "*batch n"]:
+    """Give for each point the number of a sample of the surface that the camera may see, or -1.
+
+    A sample is seen where its outer side faces the camera, or nearly; one without a known side
+    always, and all where the camera is within a ball about the surface.
+
+    Args:
+        cloud_m: in the camera frame.
+        pose: ``camera_from_model``, one or a batch.
+        surface: of the model.
+        limit_m: beyond it nothing is searched.
+        how: ``LOOKED_UP``, by the table of boxes; ``SEARCHED``, the nearest; or ``ON_RAY``, the
+            nearest to where the point's ray meets the plane of its sample ``before``.
+        before: what was found a step earlier.
+    """
+    poses = Rigid(pose.R.reshape(-1, 3, 3), pose.t_m.reshape(-1, 3))
+    local_m, eyes_m = poses.inverse().apply(cloud_m), poses.inverse().t_m[:, None]
+    if how == LOOKED_UP:
+        index = surface.boxes.look_up(local_m)
+        index = torch.where(_is_seen(eyes_m, index, surface), index, surface.across[index])
+        is_good = (index >= 0) & _is_seen(eyes_m, index, surface)
+        return torch.where(is_good, index, -1).reshape(*pose.t_m.shape[:-1], -1)
+    if how == ON_RAY and before is not None:
+        own = before.reshape(local_m.shape[:2])
+        ray_m, normal, point_m = local_m - eyes_m, surface.normals[own], surface.points_m[own]
+        slope = (normal * ray_m).sum(-1, keepdim=True)
+        share = (normal * (point_m - local_m)).sum(-1, keepdim=True) / slope
+        is_met = slope.square() > GRAZING**2 * ray_m.square().sum(-1, keepdim=True)
+        meet_m = torch.where(is_met, local_m + share * ray_m, point_m)
+        local_m = torch.where(own[..., None] >= 0, meet_m, local_m)
+    # Ask for ever more of the nearest samples until one is seen.
+    count, total = 1, len(surface.points_m)
+    index = torch.full(local_m.shape[:2], -1)
+    which, place = (index < 0).nonzero(as_tuple=True)
+    while len(which):
+        asked = local_m[which, place].numpy()
+        _, found = surface.tree.query(asked, k=range(1, count + 1), distance_upper_bound=limit_m)
+        found = torch.from_numpy(found)
+        is_some = found < total  # the tree's word for none within the limit
+        found = found.clamp(max=total - 1)
+        is_good = is_some & _is_seen(eyes_m[which, 0, None], found, surface)
+        first, is_done = is_good.int().argmax(1), is_good.any(1)
+        index[which[is_done], place[is_done]] = found[is_done, first[is_done]]
+        is_left = ~is_done & is_some.all(1) & (count < total)
+        which, place = which[is_left], place[is_left]
+        count = min(8 * count, total)
+    return index.reshape(*pose.t_m.shape[:-1], -1)
+
+
+def _is_seen(
+    eyes_m: Float64[Tensor, "b k 3"], index: Int64[Tensor, "b n"], surface: Surface
+) -> Bool[Tensor, "b n"]:
+    distance_m = (eyes_m - surface.ball_m[:3]).norm(dim=-1)
+    toward_m = ((eyes_m - surface.points_m[index]) * surface.outward[index]).sum(-1)
+    return (toward_m >= -SLACK * distance_m) | (distance_m <= surface.ball_m[3])
 
 
 def _is_other(poses: Rigid, best: Rigid, surface: Surface) -> Bool[Tensor, " b"]:
@@ -267,8 +340,12 @@ def _normal_equations(
     limit_m: float,
     index: Int64[Tensor, "*batch n"],
     how: int,
-) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
-    """Linearise about the middle of the cloud, where turning and shifting hardly mix."""
+) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]:
+    """Linearise about the middle of the cloud, where turning and shifting hardly mix.
+
+    Gives the information, its right side, the derivatives, weights and residuals of the points, and
+    the root mean square distance of those that count, infinite where none does.
+    """
     # In the camera frame, where the covariance is wanted.
     normal = surface.normals[index] @ pose.R.mT
     target = surface.points_m[index] @ pose.R.mT + pose.t_m[..., None, :]
@@ -288,7 +365,10 @@ def _normal_equations(
     # A direction that no point constrains stays where it was.
     size = H.diagonal(dim1=-2, dim2=-1).amax(-1)[..., None, None].clamp(min=1e-6)
     H = H + 1e-9 * size * torch.eye(6, dtype=torch.float64)
-    return H, (weighted @ residual_m[..., None]).squeeze(-1), residual_m, weight, J
+    pull = (weighted @ residual_m[..., None]).squeeze(-1)
+    total = weight.sum(-1)
+    mean_square = (weight * residual_m.square()).sum(-1) / total.clamp(min=1e-12)
+    return H, pull, J, weight, residual_m, torch.where(total > 0, mean_square, torch.inf).sqrt()
 
 
 def _covariance(
@@ -343,12 +423,3 @@ def _covariance(
     least = most.mean(-1, keepdim=True).clamp(min=1)
     spread = own @ ways
     return (spread * torch.maximum(most, least)[..., None, :]) @ spread.mT
-
-
-def _spread_m(
-    residual_m: Float64[Tensor, "*batch n"], weight: Float64[Tensor, "*batch n"]
-) -> Float64[Tensor, "*batch"]:
-    """Root mean square distance of the points that count; infinite where none does."""
-    total = weight.sum(-1)
-    mean_square = (weight * residual_m.square()).sum(-1) / total.clamp(min=1e-12)
-    return torch.where(total > 0, mean_square, torch.inf).sqrt()

@@ -36,6 +36,8 @@ COORDINATE_LIMIT = HALF - REACH  #: coordinates lie in [-COORDINATE_LIMIT, COORD
 
 CLOUD_LIMIT = 1 << (63 - 3 * FIELD_BITS)  #: clouds that one batch can hold
 
+AXES = (1 << 2 * FIELD_BITS, 1 << FIELD_BITS, 1)  #: added to a key, moves it by one along x, y or z
+
 Keys = Int64[Tensor, " _"]
 
 
@@ -64,11 +66,6 @@ def unpack(keys: Keys) -> Int64[Tensor, "n 4"]:
     low = (1 << FIELD_BITS) - 1
     x, y, z = ((keys >> shift * FIELD_BITS & low) - HALF for shift in (2, 1, 0))
     return torch.stack([keys >> 3 * FIELD_BITS, x, y, z], 1)
-
-
-def packed_move(x: int, y: int, z: int) -> int:
-    """Pack an offset: adding it to a key moves the voxel."""
-    return (x << 2 * FIELD_BITS) + (y << FIELD_BITS) + z
 
 
 def batch_coordinates(clouds: Sequence[Int[Tensor, "_ 3"]]) -> Int[Tensor, "n 4"]:
@@ -103,7 +100,8 @@ class VoxelIndex:
         self._table: Tensor | None = None
         if not len(keys):
             return
-        coordinates = self._cell_coordinates(keys)
+        coordinates = unpack(keys)
+        coordinates[:, 1:] >>= step.bit_length() - 1
         low, high = coordinates.amin(0), coordinates.amax(0)
         sides = (high - low + 1).tolist()
         sides[1:] = [side + 2 * MARGIN for side in sides[1:]]
@@ -116,7 +114,7 @@ class VoxelIndex:
         self._low, self._strides = low, torch.tensor(strides, device=device)
         self._table = torch.full((cells,), len(coordinates), dtype=torch.int32, device=device)
         rows = torch.arange(len(coordinates), dtype=torch.int32, device=device)
-        self._table[self._cells(keys)] = rows
+        self._table[((coordinates - low) * self._strides).sum(1)] = rows
 
     def find(self, standing: Keys, moves: Moves) -> Int32[Tensor, "moves standing"]:
         """Give the row of each voxel ``standing + move * step``.
@@ -125,23 +123,17 @@ class VoxelIndex:
         """
         if not len(self._keys):
             return standing.new_zeros(len(moves), len(standing), dtype=torch.int32)
-        packed = [packed_move(*move) * self._step for move in moves]
+        offsets = torch.tensor(moves, device=standing.device)
         if self._table is None:
-            wanted = standing + torch.tensor(packed, device=standing.device)[:, None]
+            packed = (offsets * self._step * offsets.new_tensor(AXES)).sum(-1)
+            wanted = standing + packed[:, None]
             rows = torch.searchsorted(self._keys, wanted).clamp_(max=len(self._keys) - 1)
             return torch.where(self._keys[rows] == wanted, rows, len(self._keys)).int()
-        cells = self._cells(standing)
-        offsets = (torch.tensor(moves, device=cells.device) * self._strides[1:]).sum(-1)
-        wanted = offsets[:, None] + cells
-        return self._table.index_select(0, wanted.flatten()).view(wanted.shape)
-
-    def _cell_coordinates(self, keys: Keys) -> Int64[Tensor, "n 4"]:
-        coordinates = unpack(keys)
+        coordinates = unpack(standing)
         coordinates[:, 1:] >>= self._step.bit_length() - 1
-        return coordinates
-
-    def _cells(self, keys: Keys) -> Int64[Tensor, " _"]:
-        return ((self._cell_coordinates(keys) - self._low) * self._strides).sum(1)
+        cells = ((coordinates - self._low) * self._strides).sum(1)
+        wanted = (offsets * self._strides[1:]).sum(-1)[:, None] + cells
+        return self._table.index_select(0, wanted.flatten()).view(wanted.shape)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -283,7 +275,7 @@ class CoordinateCache:
         if level not in self._keys:
             # A field holds c + HALF, which is not negative: clearing its low bits is a floor
             # division for negative coordinates too.
-            low_bits = packed_move(2**level - 1, 2**level - 1, 2**level - 1)
+            low_bits = (2**level - 1) * sum(AXES)
             self._keys[level] = torch.unique(self.keys(level - 1) & ~low_bits)
         return self._keys[level]
 
@@ -359,9 +351,17 @@ def conv(
     is_plain = features.dtype == weight.dtype == torch.float32
     near = kernel_map.neighbours
     if is_plain and serves(features, weight) and near.table.numel() <= COMPILED_ELEMENTS:
-        from depthpose.pose.compiled.points import convolved
+        from depthpose.pose.compiled.points import convolve
 
-        return convolved(features, weight, near.table, near.fine_rows, kernel_map.is_transposed)
+        read, written = near.fine_rows, near.table.shape[1]
+        if kernel_map.is_transposed:
+            read, written = written, read
+        assert features.shape == (read, weight.shape[1]), "a row for each voxel"
+        assert len(weight) == len(near.table), "a weight for each offset"
+        out = features.new_zeros(written, weight.shape[2])
+        given = (part.detach().contiguous().numpy() for part in (features, weight, near.table))
+        convolve(*given, kernel_map.is_transposed, out.numpy())
+        return out
     return _Convolution.apply(features, weight, kernel_map)
 
 

@@ -6,15 +6,15 @@ from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float64, Int64
+from jaxtyping import Float64, Int64
 from scipy.spatial import KDTree
 from torch import Tensor
 from torch.nn.functional import avg_pool2d, max_pool2d, pad
 
 from depthpose.core.rigid import Rigid
-from depthpose.pose.compiled import GRAZING, LOOKED_UP, ON_RAY, SLACK, finite_array, serves
+from depthpose.pose.compiled import finite_array, serves
 from depthpose.pose.mesh import sample_surface, symmetry_transforms
-from depthpose.pose.mesh.models import CELL, across_walls, fibonacci_directions, outward_normals
+from depthpose.pose.mesh.models import fibonacci_directions
 from depthpose.pose.types import ObjectModel
 
 NEAR = 0.05  #: of the diameter: a point of the cloud within this distance lies on the posed surface
@@ -72,6 +72,9 @@ class Surface:
     outward: Float64[Tensor, "m 3"]  #: normals on the outer side, 0 where none is known
     across: Int64[Tensor, " m"]  #: number of the sample on the other side of a wall, or -1
     diameter_m: float  #: of the object
+    spacing_m: float  #: distance from a point to the third nearest, in the median
+    middle_m: Float64[Tensor, "3"]  #: of the box about the surface, along the axes of the model
+    ball_m: Float64[Tensor, "4"]  #: middle and radius of a ball about the surface
     copies: Rigid  #: what leaves the object as it is, ``model_from_model``, the identity first
     tree: KDTree  #: finds the nearest of the points
     boxes: Boxes  #: find it nearly, some thirty times as fast
@@ -79,27 +82,11 @@ class Surface:
     def nearest(self, points_m: Float64[Tensor, "*batch n 3"]) -> Int64[Tensor, "*batch n"]:
         """Give the number of the surface point nearest to each point of the model frame."""
         if serves(points_m):
-            from depthpose.pose.compiled.points import nearest_of
+            from depthpose.pose.compiled.points import nearest_many
 
-            return torch.from_numpy(nearest_of(points_m.numpy(), self.target.tree)[0])
+            index, _ = nearest_many(finite_array(points_m).reshape(-1, 3), self.target.tree)
+            return torch.from_numpy(index).reshape(points_m.shape[:-1])
         return torch.from_numpy(self.tree.query(points_m.numpy(), workers=1)[1])
-
-    @cached_property
-    def spacing_m(self) -> float:
-        """Distance from a point to the third nearest, in the median."""
-        some_m = self.points_m[:: max(1, len(self.points_m) // 1000)]
-        return float(np.median(self.tree.query(some_m.numpy(), k=4, workers=1)[0][:, -1]))
-
-    @cached_property
-    def middle_m(self) -> Float64[Tensor, "3"]:
-        """Middle of the box about the surface, along the axes of the model."""
-        return (self.points_m.amin(0) + self.points_m.amax(0)) / 2
-
-    @cached_property
-    def ball_m(self) -> Float64[Tensor, "4"]:
-        """Middle and radius of a ball about the surface."""
-        radius_m = (self.points_m - self.middle_m).norm(dim=-1).amax()
-        return torch.cat([self.middle_m, radius_m[None]])
 
     @cached_property
     def views(self) -> Views:
@@ -115,10 +102,10 @@ class Surface:
     @cached_property
     def target(self) -> Any:  # noqa: ANN401  a tuple of numba's
         """Points, normals and table as compiled functions take them."""
-        from depthpose.pose.compiled.points import tree_of
+        from depthpose.pose.compiled.points import Tree, planted
         from depthpose.pose.compiled.poses import Target
 
-        tree, boxes = tree_of(self.points_m.numpy()), self.boxes
+        tree, boxes = Tree(*planted(finite_array(self.points_m))), self.boxes
         place = np.full(len(self.points_m) + 1, -1)
         place[tree.order] = np.arange(len(self.points_m))
         return Target(
@@ -178,9 +165,9 @@ def prepare_surface(model: ObjectModel, count: int = 10_000) -> Surface:
     near_m = tree.query(points_m.numpy()[:: max(1, len(points_m) // 500)], k=min(5, len(points_m)))[
         0
     ]
-    cell_m = CELL * float(np.median(near_m[:, -1])) * np.sqrt(np.pi) / 2
-    outward = outward_normals(points_m.numpy(), normals.numpy(), cell_m)
-    across = across_walls(points_m.numpy(), outward, 3 * NEAR * model.diameter_m)
+    cell_m = _SAMPLES_CELL * float(np.median(near_m[:, -1])) * np.sqrt(np.pi) / 2
+    limit_m = 3 * NEAR * model.diameter_m
+    outward, across = outer_sides(points_m.numpy(), normals.numpy(), cell_m, limit_m)
     low_m = points_m.amin(0) - _MARGIN * model.diameter_m
     size_m = points_m.amax(0) + _MARGIN * model.diameter_m - low_m
     side_m = float(size_m.max()) / _BOXES
@@ -188,80 +175,75 @@ def prepare_surface(model: ObjectModel, count: int = 10_000) -> Surface:
     middles = [(torch.arange(int(count)) + 0.5) * side_m for count in counts]
     grid_m = torch.cartesian_prod(*middles).double() + low_m
     nearest = torch.from_numpy(tree.query(grid_m.numpy(), workers=1)[1])
+    some_m = points_m.numpy()[:: max(1, len(points_m) // 1000)]
+    middle_m = (points_m.amin(0) + points_m.amax(0)) / 2
+    radius_m = (points_m - middle_m).norm(dim=-1).amax()
     return Surface(
         points_m=points_m,
         normals=normals,
         outward=torch.from_numpy(outward),
         across=torch.from_numpy(across),
         diameter_m=model.diameter_m,
+        spacing_m=float(np.median(tree.query(some_m, k=4, workers=1)[0][:, -1])),
+        middle_m=middle_m,
+        ball_m=torch.cat([middle_m, radius_m[None]]),
         copies=symmetry_transforms(model.symmetries, _TURN_STEP).double(),
         tree=tree,
         boxes=Boxes(low_m=low_m, side_m=side_m, counts=counts, nearest=nearest),
     )
 
 
-def match(
-    cloud_m: Float64[Tensor, "n 3"],
-    pose: Rigid,
-    surface: Surface,
-    limit_m: float,
-    how: int,
-    before: Int64[Tensor, "*batch n"] | None = None,
-) -> Int64[Tensor, "*batch n"]:
-    """Give for each point the number of a sample of the surface that the camera may see, or -1.
+_SIDE_DIRECTIONS = 32
+_SAMPLES_CELL = 2.0  # side of a cell in mean distances of samples: four in each on average
+_SHEET = 0.5  # up to so many mean distances from another's plane a sample is of the same sheet
+_SLANT = 0.3  # least cosine at which a sample is looked at
+_SEEN_FROM = 0.1  # least share of directions from which an outer side is seen
+_CLEARER = 0.4  # the inner side is seen in at most so many times the directions of the outer
 
-    A sample is seen where its outer side faces the camera, or nearly; one without a known side
-    always, and all where the camera is within a ball about the surface.
 
-    Args:
-        cloud_m: in the camera frame.
-        pose: ``camera_from_model``, one or a batch.
-        surface: of the model.
-        limit_m: beyond it nothing is searched.
-        how: ``LOOKED_UP``, by the table of boxes; ``SEARCHED``, the nearest; or ``ON_RAY``, the
-            nearest to where the point's ray meets the plane of its sample ``before``.
-        before: what was found a step earlier.
+def outer_sides(
+    points: np.ndarray, normals: np.ndarray, cell: float, limit: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """Turn normals to the side from which the surface is seen from afar.
+
+    What is thinner than half the distance of the samples, open sheets and what is never seen have
+    no outer side: their normals become 0. Given beside them is, for each sample, the number of the
+    nearest one of an opposite side within the limit, or -1.
     """
-    poses = Rigid(pose.R.reshape(-1, 3, 3), pose.t_m.reshape(-1, 3))
-    local_m, eyes_m = poses.inverse().apply(cloud_m), poses.inverse().t_m[:, None]
-    if how == LOOKED_UP:
-        index = surface.boxes.look_up(local_m)
-        index = torch.where(_is_seen(eyes_m, index, surface), index, surface.across[index])
-        is_good = (index >= 0) & _is_seen(eyes_m, index, surface)
-        return torch.where(is_good, index, -1).reshape(*pose.t_m.shape[:-1], -1)
-    if how == ON_RAY and before is not None:
-        own = before.reshape(local_m.shape[:2])
-        ray_m, normal, point_m = local_m - eyes_m, surface.normals[own], surface.points_m[own]
-        slope = (normal * ray_m).sum(-1, keepdim=True)
-        share = (normal * (point_m - local_m)).sum(-1, keepdim=True) / slope
-        is_met = slope.square() > GRAZING**2 * ray_m.square().sum(-1, keepdim=True)
-        meet_m = torch.where(is_met, local_m + share * ray_m, point_m)
-        local_m = torch.where(own[..., None] >= 0, meet_m, local_m)
-    # Ask for ever more of the nearest samples until one is seen.
-    count, total = 1, len(surface.points_m)
-    index = torch.full(local_m.shape[:2], -1)
-    which, place = (index < 0).nonzero(as_tuple=True)
-    while len(which):
-        asked = local_m[which, place].numpy()
-        _, found = surface.tree.query(asked, k=range(1, count + 1), distance_upper_bound=limit_m)
-        found = torch.from_numpy(found)
-        is_some = found < total  # the tree's word for none within the limit
-        found = found.clamp(max=total - 1)
-        is_good = is_some & _is_seen(eyes_m[which, 0, None], found, surface)
-        first, is_done = is_good.int().argmax(1), is_good.any(1)
-        index[which[is_done], place[is_done]] = found[is_done, first[is_done]]
-        is_left = ~is_done & is_some.all(1) & (count < total)
-        which, place = which[is_left], place[is_left]
-        count = min(8 * count, total)
-    return index.reshape(*pose.t_m.shape[:-1], -1)
-
-
-def _is_seen(
-    eyes_m: Float64[Tensor, "b k 3"], index: Int64[Tensor, "b n"], surface: Surface
-) -> Bool[Tensor, "b n"]:
-    distance_m = (eyes_m - surface.ball_m[:3]).norm(dim=-1)
-    toward_m = ((eyes_m - surface.points_m[index]) * surface.outward[index]).sum(-1)
-    return (toward_m >= -SLACK * distance_m) | (distance_m <= surface.ball_m[3])
+    seen, looked = np.zeros((2, len(points))), np.full((2, len(points)), 1e-9)
+    for axis in fibonacci_directions(_SIDE_DIRECTIONS).numpy():
+        across = np.linalg.svd(axis[None])[2][1:]
+        flat = np.floor(points @ across.T / cell).astype(np.int64)
+        flat -= flat.min(0)
+        place = flat[:, 0] * (flat[:, 1].max() + 1) + flat[:, 1]
+        slant = normals @ axis
+        order = np.argsort(points @ axis)
+        first = np.empty(place.max() + 1, np.int64)
+        for way in (1, -1):  # toward a camera in this direction, and in the other
+            first[place[order[::way]]] = order[::way]
+            front = first[place]
+            off = ((points - points[front]) * normals[front]).sum(1)
+            is_seen = np.abs(off) < _SHEET / _SAMPLES_CELL * cell
+            for side in (0, 1):
+                facing = way * (1 - 2 * side) * slant > _SLANT
+                seen[side] += facing & is_seen
+                looked[side] += facing
+    share = seen / looked
+    outer = share.argmax(0)
+    is_clear = (share.max(0) > _SEEN_FROM) & (share.min(0) < _CLEARER * share.max(0))
+    outward = normals * ((1 - 2 * outer) * is_clear)[:, None]
+    across, nearest = np.full(len(points), -1), np.full(len(points), np.inf)
+    for column, sign in ((c, s) for c in range(3) for s in (1, -1)):
+        (own,) = np.nonzero(sign * outward[:, column] > 0.577)
+        if len(own) == 0:
+            continue
+        distance, found = KDTree(points[own]).query(points, distance_upper_bound=limit)
+        number = own[np.minimum(found, len(own) - 1)]
+        is_opposite = (outward[number] * outward).sum(1) < 0
+        is_better = is_opposite & (distance < nearest)
+        across = np.where(is_better, number, across)
+        nearest = np.where(is_better, distance, nearest)
+    return outward, across
 
 
 def look_along_rays(

@@ -88,6 +88,9 @@ class ViewInput:
     object: str  # name of the object
 
 
+AnyInput = CloudInput | ViewInput
+
+
 @dataclass(frozen=True, kw_only=True, eq=False)
 class ViewSample:
     """A view and its truth."""
@@ -155,11 +158,6 @@ class ObjectModel:
                 f"object {self.name!r} has a diameter of {self.diameter_m} m; it is a single "
                 "point. Give a model with an extent."
             )
-
-    @property
-    def triangles_m(self) -> Float[Tensor, "f 3 3"]:
-        """Corners of every face: what a renderer takes."""
-        return self.vertices_m[self.faces]
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

@@ -6,7 +6,6 @@ from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from shlex import quote
-from typing import Any
 
 import torch
 from torch import Tensor
@@ -186,14 +185,15 @@ def read_pose_weights(path: Path) -> PoseWeights:
             f"in once: depthpose weights complete {word} --models FOLDER --out "
             f"{quote(path.stem + '-complete.safetensors')}, with the data set's folder."
         )
-    parts = {name: _part(checkpoint, name, source) for name in ("cloud", "refusal")}
-    records = checkpoint.config.get("models")
+    parts = checkpoint.config
+    records = parts.get("models")
     if not isinstance(records, list) or not records:
         raise InputError(f"{path}: its config lists no 'models', so nothing could be posed.")
     with refused_as(path, "file of pose weights", "it is damaged, or of another version"):
         models: list[ObjectModel] = []
         for k, record in enumerate(records):
-            state = _under(checkpoint, f"models.{k}.")
+            prefix, stored = f"models.{k}.", checkpoint.state.items()
+            state = {n.removeprefix(prefix): t for n, t in stored if n.startswith(prefix)}
             lost = [name for name in _TENSORS if name not in state]
             lost += [name for name in ("name", "number", "diameter_m") if name not in record]
             if lost:
@@ -252,21 +252,16 @@ def _network_of(checkpoint: Checkpoint, source: str) -> AnyNetwork:
             f"{', '.join(map(repr, _NETWORKS))}."
         )
     made, kind = _NETWORKS[checkpoint.kind]
-    config = config_from_dict(_part(checkpoint, "network", source), kind, source=source)
-    held = dataclasses.replace(checkpoint, state=_under(checkpoint, "network."))
+    for name in ("network", "cloud", "refusal"):
+        if not isinstance(checkpoint.config.get(name), Mapping):
+            raise InputError(
+                f"{source}: its config has no {name!r}; the file is of another version."
+            )
+    config = config_from_dict(checkpoint.config["network"], kind, source=source)
+    learnt = {name: t for name, t in checkpoint.state.items() if name.startswith("network.")}
+    state = {name.removeprefix("network."): tensor for name, tensor in learnt.items()}
+    held = dataclasses.replace(checkpoint, state=state)
     return build_network(lambda: made(config), held, source).eval()
-
-
-def _part(checkpoint: Checkpoint, name: str, source: str) -> Mapping[str, Any]:
-    part = checkpoint.config.get(name)
-    if not isinstance(part, Mapping):
-        raise InputError(f"{source}: its config has no {name!r}; the file is of another version.")
-    return part
-
-
-def _under(checkpoint: Checkpoint, prefix: str) -> dict[str, Tensor]:
-    found = checkpoint.state.items()
-    return {name.removeprefix(prefix): t for name, t in found if name.startswith(prefix)}
 
 
 def _small(tensor: Tensor) -> Tensor:

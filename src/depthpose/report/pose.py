@@ -4,16 +4,16 @@ import math
 from collections.abc import Sequence
 
 import torch
-from jaxtyping import Bool, Float, Float64
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from depthpose.core.arrays import take_evenly
-from depthpose.core.camera import back_project, project
+from depthpose.core.camera import project
 from depthpose.core.draw import draw_lines, draw_outline
 from depthpose.core.files import Cloud, read_depth_png, read_image
 from depthpose.core.render import rasterize
 from depthpose.core.rigid import Rigid
-from depthpose.pose.cloud import object_points
+from depthpose.pose.cloud import cloud_from_depth, object_points
 from depthpose.pose.datasets import Instance
 from depthpose.pose.estimator.inputs import AnyInput
 from depthpose.pose.mesh import drawn_triangles, sample_surface
@@ -54,34 +54,31 @@ def picture_of(instance: Instance) -> Float[Tensor, "3 h w"]:
 
 def draw_pose(
     image: Float[Tensor, "3 h w"],
-    pose: Rigid,
+    pose: Rigid | None,
     model: ObjectModel,
-    K: Float64[Tensor, "3 3"],
-    *,
-    is_true: bool = False,
+    K: Float[Tensor, "3 3"],
+    truth: Rigid | None = None,
 ) -> Float[Tensor, "3 h w"]:
-    """Draw the projected box of a posed object, and the border of its silhouette.
+    """Draw the projected box of a posed object and the border of its silhouette, in blue.
 
     Args:
         image: of the camera; it is not changed.
-        pose: ``camera_from_model``.
+        pose: ``camera_from_model``; None: the truth alone is drawn.
         model: the object; one of points alone is drawn by small discs.
         K: intrinsic matrix of the image.
-        is_true: draw the box alone, green and dashed, as the truth beside an estimate; an estimate
-            is blue.
+        truth: ``camera_from_model``, whose box is drawn too, green and dashed; None: it is unknown.
     """
-    pose = pose.double()
-    ends_px = project(_posed(pose, box_edges(model)), K)
-    if is_true:
-        return draw_lines(image, ends_px, TRUE, dash_px=_DASH_PX)
-    triangles = drawn_triangles(model).double()
-    moved = pose.apply(triangles.flatten(0, 1)).unflatten(0, (-1, 3))
-    seen = rasterize(moved, K, image.shape[2], image.shape[1], with_barycentric=False)
-    return draw_lines(draw_outline(image, seen.depth_m.isfinite(), FOUND), ends_px, FOUND)
-
-
-def _posed(pose: Rigid, ends_m: Float[Tensor, "n 2 3"]) -> Float[Tensor, "n 2 3"]:
-    return pose.double().apply(ends_m.double().flatten(0, 1)).unflatten(0, (-1, 2))
+    K = K.double()
+    if pose is not None:
+        ends_px = project(pose.double().apply(box_edges(model).double()), K)
+        posed_m = pose.double().apply(drawn_triangles(model).double())
+        seen = rasterize(posed_m, K, image.shape[2], image.shape[1], with_barycentric=False)
+        image = draw_outline(image, seen.depth_m.isfinite(), FOUND)
+        image = draw_lines(image, ends_px, FOUND)
+    if truth is not None:
+        ends_px = project(truth.double().apply(box_edges(model).double()), K)
+        image = draw_lines(image, ends_px, TRUE, dash_px=_DASH_PX)
+    return image
 
 
 def box_edges(model: ObjectModel) -> Float[Tensor, "12 2 3"]:
@@ -99,7 +96,7 @@ def crease_edges(model: ObjectModel) -> Float[Tensor, "n 2 3"]:
     corners = place[model.faces]
     side = torch.cat([corners[:, [0, 1]], corners[:, [1, 2]], corners[:, [2, 0]]]).sort(-1).values
     edges, which, count = torch.unique(side, dim=0, return_inverse=True, return_counts=True)
-    a, b, c = model.triangles_m.double().unbind(1)
+    a, b, c = model.vertices_m[model.faces].double().unbind(1)
     normal = torch.nn.functional.normalize(torch.linalg.cross(b - a, c - a), dim=-1)
     total = normal.new_zeros(len(edges), 3).index_add_(0, which, normal.repeat(3, 1))
     # Two unit normals at an angle have a mean as long as the cosine of half of it.
@@ -119,8 +116,9 @@ def pose_layers(
         with_box: whether an estimate's box is seen at first; that of a truth is.
     """
     pose = pose.double()
-    box_m = _posed(pose, box_edges(model)).float()
-    edges_m = _posed(pose, crease_edges(model)).float() if len(model.faces) else None
+    box_m, edges_m = pose.apply(box_edges(model).double()).float(), None
+    if len(model.faces):
+        edges_m = pose.apply(crease_edges(model).double()).float()
     if is_true:
         layers = [Layer(name="true box", shape=colored_lines(box_m, TRUE))]
         if edges_m is not None:
@@ -144,13 +142,15 @@ def keypoint_layers(
         pose: ``camera_from_model``; None where it was refused.
         model: the object.
     """
-    half_m = _CROSS * model.diameter_m
-    marks = colored_lines(_crosses(voted_m, half_m), VOTED)
-    layers = [Layer(name="keypoints, voted", shape=marks)]
+    marks = [("keypoints, voted", voted_m, VOTED)]
     if pose is not None:
         own_m = pose.apply(model.keypoints_m.to(pose.R))
-        own = colored_lines(_crosses(own_m, half_m), FOUND)
-        layers.append(Layer(name="keypoints, of the posed model", shape=own))
+        marks.append(("keypoints, of the posed model", own_m, FOUND))
+    layers = []
+    for name, at_m, color in marks:
+        arms_m = _CROSS * model.diameter_m * torch.eye(3).to(at_m)
+        ends_m = torch.stack([at_m[:, None] - arms_m, at_m[:, None] + arms_m], 2).flatten(0, 1)
+        layers.append(Layer(name=name, shape=colored_lines(ends_m.float(), color)))
     return layers
 
 
@@ -172,12 +172,6 @@ def vote_layer(
     starts_m = from_m[:, None].expand_as(toward)
     ends_m = torch.stack([starts_m, starts_m + way_m * toward], -2).flatten(0, 1)
     return Layer(name="votes", shape=colored_lines(ends_m.float(), VOTED), is_shown=False)
-
-
-def _crosses(at_m: Float[Tensor, "k 3"], half_m: float) -> Float[Tensor, "n 2 3"]:
-    arms_m = half_m * torch.eye(3).to(at_m)
-    ends_m = torch.stack([at_m[:, None] - arms_m, at_m[:, None] + arms_m], 2)
-    return ends_m.flatten(0, 1).float()
 
 
 def posed_cloud(cloud_m: Float[Tensor, "n 3"], pose: Rigid | None, model: ObjectModel) -> Cloud:
@@ -251,11 +245,11 @@ def pose_section(
             image = draw_outline(image, mask, _MASKED)
             said = f"{what}; the border of the mask yellow"
         said += ", the box of the truth green and dashed" if truth is not None else ""
-        whole = draw_boxes(image, truth, pose, model, K)
+        whole = draw_pose(image, pose, model, K, truth)
         drawings.append(Drawing(image=whole, caption=said))
         if bool(mask.any()):
             near, K = close_up(image, mask, K)
-            near = draw_boxes(near, truth, pose, model, K)
+            near = draw_pose(near, pose, model, K, truth)
             said = f"the object from near by; {said.partition('; ')[2]}"
             drawings.append(Drawing(image=near, caption=said))
     points_m = object_points(pose_input, model.diameter_m)
@@ -368,51 +362,28 @@ def pose_scene(
     truth: Rigid | None = None,
 ) -> Scene:
     """Show what was seen, the posed model, its keypoints, and the truth where it is known."""
-    layers = [Layer(name="the object, as seen", shape=colored_points(points_m, _SEEN))]
-    pose = estimate.camera_from_model
+    pose, layers = estimate.camera_from_model, list[Layer]()
     if pose is not None:
         layers += pose_layers(pose, model, with_box=truth is not None)
-        for other in estimate.alternatives:  # by axes and box, not shown at first
-            placed = other.camera_from_model.double()
-            said = f"{other.difference}, {other.probability:.0%}"
-            box = colored_lines(_posed(placed, box_edges(model)).float(), OTHER)
-            layers.append(Layer(name=f"box if {said}", shape=box, is_shown=False))
-            axes = frame_axes(placed.t_m, placed.R, model.diameter_m / 2)
-            layers.append(Layer(name=f"axes if {said}", shape=axes, is_shown=False))
+    for other in estimate.alternatives:  # by axes and box, not shown at first
+        placed = other.camera_from_model.double()
+        said = f"{other.difference}, {other.probability:.0%}"
+        box_m = placed.apply(box_edges(model).double()).float()
+        box = colored_lines(box_m, OTHER)
+        layers.append(Layer(name=f"box if {said}", shape=box, is_shown=False))
+        axes = frame_axes(placed.t_m, placed.R, model.diameter_m / 2)
+        layers.append(Layer(name=f"axes if {said}", shape=axes, is_shown=False))
     if truth is not None:
         layers += pose_layers(truth, model, is_true=True)
     if estimate.keypoints_m is not None:
         layers += keypoint_layers(estimate.keypoints_m, pose, model)
+    layers.insert(0, Layer(name="the object, as seen", shape=colored_points(points_m, _SEEN)))
     if isinstance(pose_input, ViewInput):
-        around_m = back_project(pose_input.depth_m, pose_input.K)[~pose_input.mask]
-        around_m = around_m[around_m.isfinite().all(-1)].float()
+        around_m = cloud_from_depth(pose_input.depth_m, ~pose_input.mask, pose_input.K).float()
         around = colored_points(take_evenly(around_m, _AROUND_POINTS), _AROUND)
         layers.append(Layer(name="all else", shape=around, is_shown=False))
     caption = "The cloud and the posed model" if pose is not None else "The cloud; there is no pose"
     return Scene(caption=caption, layers=layers)
-
-
-def draw_boxes(
-    image: Float[Tensor, "3 h w"],
-    truth: Rigid | None,
-    estimated: Rigid | None,
-    model: ObjectModel,
-    K: Float[Tensor, "3 3"],
-) -> Float[Tensor, "3 h w"]:
-    """Draw the box of the truth, green and dashed, and of the estimate, blue and solid.
-
-    Args:
-        image: it is not changed.
-        truth: ``camera_from_model``, where it is known.
-        estimated: the estimate, where there is one.
-        model: the object.
-        K: intrinsic matrix of the image.
-    """
-    if estimated is not None:
-        image = draw_pose(image, estimated, model, K.double())
-    if truth is not None:
-        image = draw_pose(image, truth, model, K.double(), is_true=True)
-    return image
 
 
 def close_up(

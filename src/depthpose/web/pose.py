@@ -15,8 +15,8 @@ from depthpose.pose.config import EstimateConfig, ObjectsConfig
 from depthpose.pose.datasets.dataset import write_mask
 from depthpose.pose.estimator import GeoPoseNet, Registration
 from depthpose.pose.estimator.base import answered
-from depthpose.pose.estimator.candidates import with_status
 from depthpose.pose.estimator.find import explained_mask, nothing_found
+from depthpose.pose.estimator.fit import with_status
 from depthpose.pose.estimator.inputs import cloud_input, view_input
 from depthpose.pose.predictions import CLOUD, PICTURE, Prediction, write_predictions
 from depthpose.pose.surface import prepare_surface

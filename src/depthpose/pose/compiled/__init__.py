@@ -85,18 +85,13 @@ def compiled(function: Callable[..., Any]) -> Any:  # noqa: ANN401  numba's disp
     # and functions call those of other files.
     config: Any = import_module("numba").config
     before = config.CACHE_DIR
-    config.CACHE_DIR = str(Path(__file__).parent / "__pycache__" / f"numba-{_digest()}")
+    folder, digest = Path(__file__).parent, sha256()
+    for path in sorted(folder.glob("*.py")):
+        digest.update(path.read_bytes())
+    config.CACHE_DIR = str(folder / "__pycache__" / f"numba-{digest.hexdigest()[:16]}")
     try:
         return njit(cache=True, nogil=True, error_model="numpy")(inner)
     except RuntimeError:  # no folder that may be written to
         return njit(nogil=True, error_model="numpy")(inner)
     finally:
         config.CACHE_DIR = before
-
-
-@cache
-def _digest() -> str:
-    digest = sha256()
-    for path in sorted(Path(__file__).parent.glob("*.py")):
-        digest.update(path.read_bytes())
-    return digest.hexdigest()[:16]

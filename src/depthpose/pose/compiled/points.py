@@ -6,9 +6,8 @@ And sparse convolution of small clouds: no call for each offset, nothing gathere
 from typing import NamedTuple
 
 import numpy as np
-from torch import Tensor
 
-from depthpose.pose.compiled import compiled, finite_array
+from depthpose.pose.compiled import compiled
 
 
 @compiled
@@ -53,20 +52,9 @@ class Tree(NamedTuple):
     values: Array  #: where, (nodes,)
 
 
-def tree_of(points: Array) -> Tree:
-    """Sort points (m, 3) into a tree; one at least, float64."""
-    return Tree(*planted(finite_array(points)))
-
-
-def nearest_of(points: Array, tree: Tree) -> tuple[Array, Array]:
-    """Give the number of the point nearest to each of (..., 3), float64, and its distance."""
-    index, distance = _nearest_many(finite_array(points).reshape(-1, 3), tree)
-    return index.reshape(points.shape[:-1]), distance.reshape(points.shape[:-1])
-
-
 @compiled
 def planted(points):
-    """Give the fields of a :class:`Tree`."""
+    """Sort points (m, 3) into the fields of a :class:`Tree`; one at least, float64."""
     count = len(points)
     order = np.arange(count)
     depth = 0
@@ -170,7 +158,8 @@ def faces(place, points, outward, eye, least):
 
 
 @compiled
-def _nearest_many(queries, tree):
+def nearest_many(queries, tree):
+    """Give the number of the point nearest to each of (n, 3), float64, and its distance."""
     index, distance = np.empty(len(queries), np.int64), np.empty(len(queries))
     stack, bounds = np.empty((64, 3), np.int64), np.empty((64, 4))
     points, order, axes, values = tree
@@ -244,22 +233,9 @@ def _add_row(out, row, weight):
             out[k] += a * wa[k]
 
 
-def convolved(
-    x: Tensor, weight: Tensor, table: Tensor, fine_rows: int, is_transposed: bool
-) -> Tensor:
-    """Convolve: ``out[o] = sum over neighbours (i, k) of o of x[i] @ weight[k]``."""
-    coarse_rows = table.shape[1]
-    read, written = (coarse_rows, fine_rows) if is_transposed else (fine_rows, coarse_rows)
-    assert x.shape == (read, weight.shape[1]), "a row for each voxel, a channel for each weight"
-    assert len(weight) == len(table), "a weight for each offset"
-    out = x.new_zeros(written, weight.shape[2])
-    x, weight, table = x.detach().contiguous(), weight.detach().contiguous(), table.contiguous()
-    _convolve(x.numpy(), weight.numpy(), table.numpy(), is_transposed, out.numpy())
-    return out
-
-
 @compiled
-def _convolve(x, weight, table, is_transposed, out):
+def convolve(x, weight, table, is_transposed, out):
+    """Add up: ``out[o] = sum over neighbours (i, k) of o of x[i] @ weight[k]``."""
     fine = len(out) if is_transposed else len(x)
     for k in range(len(table)):
         kernel = weight[k]

@@ -3,19 +3,8 @@
 from typing import NamedTuple
 
 import numpy as np
-import torch
-from torch import Tensor
 
-from depthpose.core.rigid import Rigid
-from depthpose.pose.compiled import (
-    GRAZING,
-    LOOKED_UP,
-    ON_RAY,
-    SEARCHED,
-    SLACK,
-    compiled,
-    finite_array,
-)
+from depthpose.pose.compiled import GRAZING, LOOKED_UP, ON_RAY, SEARCHED, SLACK, compiled
 from depthpose.pose.compiled.points import Array, Tree, damp, faces, neighbours, rotation
 
 
@@ -100,26 +89,6 @@ def find_places(local, limit, target, is_exact, places, eye=None, least=0.0):
         places[i] = place
 
 
-def refined(
-    cloud: Tensor,
-    pose: Rigid,
-    target: Target,
-    limits: list[float],
-    converged: float,
-    scale: float,
-    *,
-    is_exact: bool,
-) -> tuple[Rigid, Tensor]:
-    """Refine a pose or a batch of poses; give them and the number of each point's sample, or -1."""
-    assert pose.R.shape[:-2] == pose.t_m.shape[:-1], "a translation for each rotation"
-    R, t_m = (torch.from_numpy(finite_array(a).copy()) for a in (pose.R, pose.t_m))
-    given = (finite_array(cloud), R.view(-1, 3, 3).numpy(), t_m.view(-1, 3).numpy())
-    places = np.full((len(given[2]), len(given[0])), -1)
-    _refine(*given, np.array(limits), scale, converged, target, is_exact, places)
-    index = torch.from_numpy(np.append(target.tree.order, -1)[places])
-    return Rigid(R, t_m), index.view(*t_m.shape[:-1], -1)
-
-
 @compiled
 def _add_equations(local, places, R, arm, limit, points, normals, eye, how, H, b):
     """Add up the normal equations of one pose about a point, from which ``arm`` is its origin."""
@@ -157,8 +126,8 @@ def _add_equations(local, places, R, arm, limit, points, normals, eye, how, H, b
 
 
 @compiled
-def _refine(cloud, Rs, ts, limits, scale, converged, target, is_exact, every):
-    """Move poses in place, step by step, each until it moves no more."""
+def refine(cloud, Rs, ts, limits, scale, converged, target, is_exact, every):
+    """Move poses in place, step by step, each until it moves no more; ``every`` is of places."""
     middle = cloud.sum(0) / len(cloud)
     points, normals = target.tree.points, target.normals
     local, eye, turn = np.empty_like(cloud), np.empty(3), np.empty((3, 3))
@@ -183,23 +152,6 @@ def _refine(cloud, Rs, ts, limits, scale, converged, target, is_exact, every):
                 break
 
 
-def grown(
-    local: Tensor,
-    times: Tensor,
-    middle: Tensor,
-    target: Target,
-    limits: list[float],
-    converged: float,
-    is_exact: bool,
-) -> tuple[Tensor, Tensor, Tensor]:
-    """Find the scale of a surface that fits points, from each of several scales."""
-    local, times = torch.from_numpy(finite_array(local).copy()), times.clone()
-    variance = torch.ones_like(times)
-    arrays = (local.numpy(), times.numpy(), middle.numpy(), np.array(limits))
-    _grow(*arrays, target, is_exact, converged, variance.numpy())
-    return times, local, variance
-
-
 @compiled
 def _step(J, residual, weight):
     """Solve for turn, shift and growth; give the variance of the growth too."""
@@ -214,7 +166,7 @@ def _step(J, residual, weight):
 
 
 @compiled
-def _grow(local, times, middle, limits, target, is_exact, converged, variance):
+def grow(local, times, middle, limits, target, is_exact, converged, variance):
     """Move points and grow a surface about its middle, step by step, in place."""
     count = local.shape[1]
     places = np.full((len(times), count), -1)

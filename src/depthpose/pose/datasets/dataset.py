@@ -30,8 +30,9 @@ from depthpose.core.rigid import Rigid
 from depthpose.pose.cloud import (
     cloud_from_depth,
     grow_mask,
+    other_size,
     refusal_of,
-    refuse_other_size,
+    unit_advice,
 )
 from depthpose.pose.datasets.layouts import (
     Instance,
@@ -50,7 +51,6 @@ from depthpose.pose.mesh import (
     sample_surface,
     symmetries_from_bop,
     symmetries_to_bop,
-    unit_advice,
 )
 from depthpose.pose.types import ObjectModel, PoseTruth, ViewInput, ViewSample
 
@@ -96,7 +96,8 @@ class BopDataset:
         """
         mask = read_instance_mask(instance) if mask is None else mask
         depth_m = read_depth_png(instance.depth, instance.depth_unit_m)
-        refuse_other_size(mask, depth_m)
+        if mask.shape != depth_m.shape:
+            raise other_size(mask, depth_m)
         return ViewSample(
             input=ViewInput(
                 name=instance.name,

@@ -1,22 +1,36 @@
-"""What every estimator of poses offers: one object, several, whole depth images, sequences."""
+"""What every estimator of poses offers: one object, several, whole depth images, sequences.
+
+The one that needs no training follows it.
+"""
 
 import time
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Iterator, Sequence, Sized
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import TypeVar
 
 import torch
 from tqdm import tqdm
 
+from depthpose.core.arrays import take_evenly
 from depthpose.core.camera import AnyCamera, choose_lens
-from depthpose.core.devices import each_in_own_arithmetic, own_arithmetic
+from depthpose.core.devices import each_in_own_arithmetic, each_in_threads, own_arithmetic
 from depthpose.core.errors import InputError, nearest_name, refused_memory
 from depthpose.core.rigid import Rigid
 from depthpose.core.units import Unit
-from depthpose.pose.config import EstimateConfig, RefusalConfig
-from depthpose.pose.estimator.candidates import PoseAmbiguities, find_copies, with_status
+from depthpose.pose.cloud import Refusal, local_planes, prepare_cloud
+from depthpose.pose.config import CloudConfig, EstimateConfig, RefusalConfig
+from depthpose.pose.estimator.candidates import (
+    Candidate,
+    KnownObject,
+    find_candidates,
+    find_copies,
+    nearest_posed,
+    surface_signals,
+    tilt_of,
+)
 from depthpose.pose.estimator.find import (
     ROUNDS,
     SearchTargets,
@@ -24,11 +38,11 @@ from depthpose.pose.estimator.find import (
     nothing_found,
     which_object,
 )
+from depthpose.pose.estimator.fit import answer_of, refused, with_status
 from depthpose.pose.estimator.inputs import (
     AnyArray,
     AnyInput,
     AnyMask,
-    Refusal,
     cloud_input,
     labels_input,
     rigid_input,
@@ -36,12 +50,23 @@ from depthpose.pose.estimator.inputs import (
     view_input,
 )
 from depthpose.pose.estimator.track import TrackedObject, track
-from depthpose.pose.surface import Surface, prepare_surface
+from depthpose.pose.mesh import read_model, refuse_one_name, with_found_symmetries
+from depthpose.pose.refine import refine_best
+from depthpose.pose.surface import prepare_surface
 from depthpose.pose.types import CloudInput, ObjectModel, PoseEstimate, ViewInput
-from depthpose.pose.voting.point_pairs import PairTable, prepare_pairs
+from depthpose.pose.voting.point_pairs import PairTable, prepare_pairs, propose_poses, thin
 
 Made = TypeVar("Made")
 _NAME = "input"  # what an input is called that came without a name
+CANDIDATE_SLOPES = {
+    name: slope for name, slope in RefusalConfig().candidate_slopes.items() if name != "disagree"
+}
+"""As of :class:`RefusalConfig`; no network disagrees."""
+REFUSAL = RefusalConfig(candidate_slopes=CANDIDATE_SLOPES)
+_VOXEL = 0.05  # of the diameter
+_LEAST = 500  # points of a model without faces
+_PROPOSALS = 40
+_SMOOTHED = 1500  # of so many points 20 neighbours lay the plane that gives a normal
 
 
 class PoseEstimator(ABC):
@@ -61,16 +86,12 @@ class PoseEstimator(ABC):
     ) -> None:
         self.config = EstimateConfig() if config is None else config
         self.models, self.refusal = tuple(models), refusal
-        self._numbers = {model.name: k for k, model in enumerate(models)}
-        # What is made of a model, by its number, when it is first asked for.
-        self._surfaces: dict[int, Surface] = {}
-        self._copies: dict[int, PoseAmbiguities] = {}
-        self._prepared_pairs: dict[int, PairTable] = {}
+        self._objects: dict[str, KnownObject] = {}  # those that were asked for
 
     @property
     def objects(self) -> tuple[str, ...]:
         """Names of the objects."""
-        return tuple(self._numbers)
+        return tuple(model.name for model in self.models)
 
     def _objects_in_short(self) -> str:
         count = len(self.objects)
@@ -96,26 +117,20 @@ class PoseEstimator(ABC):
         """
         if isinstance(inputs, AnyInput):
             raise InputError("estimate_many takes several inputs; give one as [input]")
-
-        def typed() -> Iterator[AnyInput]:
-            for given in inputs:
-                if not isinstance(given, AnyInput):
-                    raise InputError(
-                        "estimate_many takes CloudInput and ViewInput of depthpose.pose.types, not "
-                        f"a {type(given).__name__}; files and arrays go to estimate(), one at a "
-                        "time"
-                    )
-                yield given
-
         total = len(inputs) if isinstance(inputs, Sized) else None
-        each = self._each(typed(), threads)
+        each = self._each(inputs, threads)
         return list(tqdm(each, total=total, unit=" poses", disable=not with_progress))
 
-    @abstractmethod
     def _each(
         self, inputs: Iterable[AnyInput], threads: int, *, is_likely: bool = True
     ) -> Iterator[PoseEstimate]:
         """Give each input's estimate in order; ``is_likely``: most of them show their object."""
+        del is_likely
+        return each_in_threads(partial(or_unreadable, self._estimate), inputs, threads)
+
+    def _estimate(self, given: AnyInput) -> PoseEstimate:
+        """Estimate one input; an estimator of many at once has its own :meth:`_each`."""
+        raise NotImplementedError
 
     @torch.no_grad()
     @own_arithmetic()
@@ -256,8 +271,8 @@ class PoseEstimator(ABC):
         """
         known = SearchTargets(
             names=objects,
-            surface_of=lambda name: self._surface(self._number(name)),
-            pairs_of=lambda name: self._pairs(self._number(name)),
+            surface_of=lambda name: self._known(name).surface,
+            pairs_of=lambda name: self._pairs(self._known(name)),
             pose_near=self._pose_near,
             max_size_error=self.refusal.max_size_error,
             rounds=rounds,
@@ -325,10 +340,10 @@ class PoseEstimator(ABC):
             found = self.find_in(given, [object], rounds=1)
             return found[0] if found else nothing_found(given, object, time.perf_counter() - began)
 
-        number = self._number(object)
+        known = self._known(object)
         followed = TrackedObject(
-            model=self.models[number],
-            surface=self._surface(number),
+            model=known.model,
+            surface=known.surface,
             refusal=self.refusal,
             icp=self.config.icp,
             look=look,
@@ -336,44 +351,43 @@ class PoseEstimator(ABC):
         return each_in_own_arithmetic(track(frames, followed, first))
 
     def _object(self, name: str | None) -> str:
-        if name is None and len(self._numbers) == 1:
+        if name is None and len(self.models) == 1:
             return self.objects[0]
         if name is None:
             raise InputError(
                 f"estimate: {self._holder} know {', '.join(self.objects)}; say which by object="
             )
-        self._number(name)
-        return name
+        return self._known(name).model.name
 
-    def _surface(self, number: int) -> Surface:
-        if number not in self._surfaces:
-            model = self.models[number]
-            self._surfaces[number] = prepare_surface(model, self.config.icp.surface_points)
-        return self._surfaces[number]
-
-    def _copies_of(self, number: int) -> PoseAmbiguities:
-        if number not in self._copies:
-            up_to_symmetry = self.config.up_to_symmetry
-            self._copies[number] = find_copies(self.models[number], up_to_symmetry=up_to_symmetry)
-        return self._copies[number]
-
-    def _pairs(self, number: int) -> PairTable:
-        if number not in self._prepared_pairs:
-            self._prepared_pairs[number] = prepare_pairs(self._surface(number))
-        return self._prepared_pairs[number]
-
-    def _number(self, name: str) -> int:
+    def _known(self, name: str) -> KnownObject:
+        """Give an object by its name, with its surface."""
+        names = [model.name for model in self.models]
         if not isinstance(name, str):
-            known = ", ".join(map(repr, self.objects))
+            known = ", ".join(map(repr, names))
             raise InputError(f"object {name!r} is no text; give the name of one: {known}")
-        if name not in self._numbers:
-            nearest = nearest_name(name, self.objects)
+        if name not in names:
+            nearest = nearest_name(name, names)
             raise InputError(f"object {name!r}: {self._holder} do not know it; {nearest}")
-        return self._numbers[name]
+        if name not in self._objects:
+            number = names.index(name)
+            model = self.models[number]
+            surface = prepare_surface(model, self.config.icp.surface_points)
+            self._objects[name] = KnownObject(number=number, model=model, surface=surface)
+        return self._objects[name]
+
+    def _pairs(self, known: KnownObject) -> PairTable:
+        if known.pairs is None:
+            known.pairs = prepare_pairs(known.surface)
+        return known.pairs
 
 
 def or_unreadable(work: Callable[[AnyInput], Made], given: AnyInput) -> Made | PoseEstimate:
     """Do work for an input; where it raises :class:`InputError`, the estimate says so."""
+    if not isinstance(given, AnyInput):
+        raise InputError(
+            "estimate_many takes CloudInput and ViewInput of depthpose.pose.types, not a "
+            f"{type(given).__name__}; files and arrays go to estimate(), one at a time"
+        )
     try:
         with refused_memory(given.name):
             return work(given)
@@ -388,12 +402,131 @@ def answered(found: PoseEstimate) -> PoseEstimate:
     return found
 
 
-def refused(given: AnyInput, refusal: Refusal, seconds: dict[str, float]) -> PoseEstimate:
-    """Give the estimate of an input that cannot be posed."""
-    return PoseEstimate(
-        name=given.name,
-        object=given.object,
-        status=refusal.status,
-        reason=refusal.reason,
-        seconds=seconds,
-    )
+class Registration(PoseEstimator):
+    """Poses of objects whose models are seen for the first time.
+
+    Pairs of points of the cloud propose poses, ICP refines them, and the evidence against the best
+    decides whether it is the answer, as it does for :class:`~depthpose.GeoPoseNet`.
+
+    Example::
+
+        parts = Registration.load("part.stl", unit="mm")
+        found = parts.estimate(cloud="scan.ply", unit="mm")
+
+    Args:
+        models: the objects.
+        config: ICP, limits; the seed is that of voting.
+        refusal: when an answer is withheld; None: by the usual limits.
+
+    Raises:
+        InputError: no model, two of one name, or one of few points without faces.
+    """
+
+    _holder = "the models"
+
+    def __init__(
+        self,
+        models: Sequence[ObjectModel],
+        config: EstimateConfig | None = None,
+        refusal: RefusalConfig | None = None,
+    ) -> None:
+        super().__init__(models, config, refusal or REFUSAL)
+        if not models:
+            raise InputError(
+                "registration looks for CAD files and none is given; name one: STL, PLY, OBJ or GLB"
+            )
+        refuse_one_name(models)
+        for model in models:
+            points = len(model.vertices_m)
+            if len(model.faces) == 0 and points < _LEAST:
+                raise InputError(
+                    f"{model.name}: {points} points without faces are no surface; export the part "
+                    f"as a mesh with triangles, such as STL, or give {_LEAST} points"
+                )
+        if config is not None and not config.with_icp:
+            raise InputError("registration refines by ICP; omit --no-icp (with_icp=False)")
+        if config is not None and config.register_refused:
+            raise InputError(
+                "registration has no network whose refusals it could register; omit "
+                "--register-refused (register_refused=True)"
+            )
+
+    @classmethod
+    @own_arithmetic()
+    def load(
+        cls, *cad: str | Path, unit: Unit | None = None, config: EstimateConfig | None = None
+    ) -> "Registration":
+        """Read CAD files; symmetries that are found in a part make its copies one answer.
+
+        Args:
+            cad: PLY, STL, OBJ, GLB; an object is called as its file.
+            unit: of the numbers in the files; None where all are GLB, which has metres.
+            config: as above.
+
+        Raises:
+            InputError: no file, two of one name, one that is not read, without a surface or unit.
+        """
+        if not all(isinstance(path, str | Path) for path in cad):
+            raise InputError("Registration.load takes paths one by one: load(*files, unit=...)")
+        models = [read_model(path, unit, number=k) for k, path in enumerate(cad, start=1)]
+        return cls([with_found_symmetries(m, None, is_taken=True) for m in models], config)
+
+    def __repr__(self) -> str:
+        return f"Registration(of {self._objects_in_short()})"
+
+    def prepare(self) -> None:
+        """Prepare every model now, about a second each; else it is done when first asked for."""
+        for name in self.objects:
+            known, up_to_symmetry = self._known(name), self.config.up_to_symmetry
+            if known.copies is None:
+                known.copies = find_copies(known.model, up_to_symmetry=up_to_symmetry)
+            self._pairs(known)
+
+    def _pose_near(
+        self, inputs: Sequence[CloudInput], poses: Sequence[Rigid]
+    ) -> list[PoseEstimate]:
+        """Refine the poses that were proposed, without votes of the clouds alone."""
+        both, threads = zip(inputs, poses, strict=True), torch.get_num_threads()
+        return list(each_in_threads(lambda one: self._estimate(*one), both, threads))
+
+    def _estimate(self, given: AnyInput, poses: Rigid | None = None) -> PoseEstimate:
+        """Estimate a pose, from those that were proposed if there are any."""
+        known = self._known(given.object)
+        model, surface = known.model, known.surface
+        began = time.perf_counter()
+        cloud = CloudConfig(voxel_m=min(0.9, _VOXEL * model.diameter_m), max_points=None)
+        prepared = prepare_cloud(given, model, cloud, self.config)
+        seconds = {"cloud": time.perf_counter() - began}
+        if isinstance(prepared, Refusal):
+            return refused(given, prepared, seconds)
+        began = time.perf_counter()
+        proposals, cloud_m = poses, prepared.cloud_m.double()
+        if proposals is None:
+            generator = torch.Generator().manual_seed(self.config.voting.seed)
+            dense_m = take_evenly(cloud_m, _SMOOTHED)
+            some_m = dense_m[thin(dense_m, torch.zeros_like(dense_m), _VOXEL * surface.diameter_m)]
+            normals, _ = local_planes(dense_m, some_m)
+            if known.pairs is None:
+                known.pairs = prepare_pairs(surface)
+            proposals = propose_poses(some_m, normals, known.pairs, surface, _PROPOSALS, generator)
+        voted = time.perf_counter()
+        seconds["voting"] = voted - began
+        best = refine_best(cloud_m, proposals, surface, replace(self.config.icp, starts=1))
+        icp = best.refined
+        if float(icp.inlier_share) == 0:
+            reason = "no pose lays the model near the points: another object, or too little of it"
+            return refused(given, Refusal(status="votes do not meet", reason=reason), seconds)
+        first = Candidate(icp.camera_from_model, icp.covariance, float(icp.residual_m))
+        candidates = find_candidates(
+            cloud_m, first, best.others, known, self.config, is_refined=True
+        )
+        found = Rigid.stack([one.pose for one in candidates])
+        evidence = surface_signals(cloud_m, found, surface)
+        for pose, signals in zip([one.pose for one in candidates], evidence, strict=True):
+            # The plane through neighbours is tilted where a part has edges and thin features too,
+            # whatever the pose: so it is on the cloud moved onto the posed surface.
+            _, index = nearest_posed(cloud_m, pose, surface)
+            own = tilt_of(pose.apply(surface.points_m[index]), pose[None], surface)
+            signals["tilt"] = max(0.0, signals["tilt"] - float(own))
+        seconds["icp"] = time.perf_counter() - voted
+        return answer_of(prepared, known, candidates, evidence, self.refusal, self.config, seconds)

@@ -1,12 +1,7 @@
-"""Poses that fit: the evidence against each, how likely each is, how they differ in words.
-
-The best of them is the answer, or the reason why it is withheld.
-"""
+"""Poses that fit: the evidence against each, how likely each is, how they differ in words."""
 
 import math
-import time
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import torch
@@ -15,17 +10,20 @@ from torch import Tensor
 from torch.nn.functional import normalize
 
 from depthpose.core.arrays import take_evenly
-from depthpose.core.rigid import Rigid, cross_matrix, geodesic_rad
-from depthpose.pose.cloud import local_planes
-from depthpose.pose.config import EstimateConfig, IcpConfig, RefusalConfig
-from depthpose.pose.estimator.fit import SHOWN, fit_of, identity_of, seen_about
-from depthpose.pose.estimator.inputs import ObjectCloud, Refusal
-from depthpose.pose.mesh import near_symmetries, sample_surface, symmetry_transforms
+from depthpose.core.rigid import Rigid, geodesic_rad
+from depthpose.pose.cloud import ObjectCloud, local_planes
+from depthpose.pose.config import EstimateConfig
+from depthpose.pose.mesh import (
+    mirror_deviation,
+    near_symmetries,
+    sample_surface,
+    symmetry_transforms,
+)
 from depthpose.pose.mesh import true_symmetries as find_true
-from depthpose.pose.refine import RefinedPose, refine_pose
+from depthpose.pose.refine import refine_pose
 from depthpose.pose.surface import NEAR, Surface, look_along_rays
-from depthpose.pose.types import Alternative, Fit, ObjectModel, PoseEstimate, PoseFit, Vote
-from depthpose.pose.voting import free_motions
+from depthpose.pose.types import ObjectModel
+from depthpose.pose.voting.point_pairs import PairTable
 
 _SAMPLED = 1000
 """At most so many points of the cloud are used, evenly taken."""
@@ -36,12 +34,8 @@ _TILTED = 250
 """At so many of them the normal is looked at."""
 _COMPARED = 100
 """At about so many points a copy is chosen."""
-_FLOOR = 0.01
-"""Added to a signal before its logarithm is taken."""
 _SAME = 0.1
 """Mean distance of the model's points at two poses, in diameters, up to which they are one."""
-_NAMED = 0.02
-"""Candidates of a smaller share are not named."""
 _STEP = math.pi / 16
 _ICP_POINTS = 250
 """Points of the cloud that refine candidates."""
@@ -61,59 +55,31 @@ def disagreement(
     """
     directions = normalize(outputs.double(), dim=-1)
     points_m = cloud.points_m.double()
-
-    def cosines(some_m: Tensor, few: int) -> Float64[Tensor, "*batch m k"]:
-        way = normalize(some_m[..., None, :, :] - points_m[::few, None], dim=-1)
-        return (directions[::few] * way).sum(-1)
-
-    best = torch.zeros(len(copies_m), dtype=torch.long)
-    if copies_m.shape[1] > 1:
-        few = max(1, len(points_m) // _COMPARED)
-        best = cosines(copies_m, few).mean((-2, -1)).argmax(-1)
+    few = max(1, len(points_m) // _COMPARED)
+    way = normalize(copies_m[..., None, :, :] - points_m[::few, None], dim=-1)
+    best = (directions[::few] * way).sum(-1).mean((-2, -1)).argmax(-1)
     chosen_m = copies_m[torch.arange(len(copies_m)), best]
-    return cosines(chosen_m, 1).clamp(-1, 1).arccos().mean((-2, -1))
-
-
-def log_signal(signal: float) -> float:
-    """Take the logarithm in which signals are weighed: finite where there is none."""
-    return math.log(_FLOOR + signal)
-
-
-class CloudNormals(NamedTuple):
-    """Some points of a cloud in float64, and their normals."""
-
-    points_m: Float64[Tensor, "n 3"]
-    normals: Float64[Tensor, "n 3"]
-
-
-def cloud_normals(cloud_m: Float[Tensor, "n 3"]) -> CloudNormals:
-    """Lay planes through some points of a cloud, once for all poses that are compared with it."""
-    thinned_m = take_evenly(cloud_m.double(), _THINNED)
-    some_m = take_evenly(thinned_m, _TILTED)
-    return CloudNormals(some_m, local_planes(thinned_m, some_m)[0])
+    way = normalize(chosen_m[:, None] - points_m[:, None], dim=-1)
+    return (directions * way).sum(-1).clamp(-1, 1).arccos().mean((-2, -1))
 
 
 def surface_signals(
-    cloud_m: Float[Tensor, "n 3"],
-    poses: Rigid,
-    surface: Surface,
-    normals: CloudNormals | None = None,
+    cloud_m: Float[Tensor, "n 3"], poses: Rigid, surface: Surface
 ) -> list[dict[str, float]]:
     """Say for each pose how well its surface explains the cloud, and the cloud the surface.
 
     A point seen through the posed surface contradicts the pose; surface that nobody saw may merely
     be occluded by something else.
     """
-    normals = cloud_normals(cloud_m) if normals is None else normals
-    limit_m = NEAR * surface.diameter_m
+    tilt, limit_m = tilt_of(cloud_m, poses, surface), NEAR * surface.diameter_m
     points_m = take_evenly(cloud_m.double(), _SAMPLED)
-    distance_m, _ = _nearest(points_m, poses, surface)
+    distance_m, _ = nearest_posed(points_m, poses, surface)
     is_near = distance_m < limit_m
     number = is_near.sum(-1)
     near_m2 = torch.where(is_near, distance_m.square(), 0.0).sum(-1) / number.clamp(min=1)
     front, unseen = look_along_rays(cloud_m.double(), poses, surface)
     columns = {
-        "tilt": tilt_of(normals, poses, surface),
+        "tilt": tilt,
         "gap": torch.where(number > 0, near_m2.sqrt(), limit_m) / surface.diameter_m,
         "far": 1 - number / len(points_m),
         "front": front,
@@ -123,58 +89,18 @@ def surface_signals(
     return [dict(zip(columns, row, strict=True)) for row in rows]
 
 
-def observability(
-    cloud_m: Float[Tensor, "n 3"], pose: Rigid, surface: Surface, free: Float[Tensor, "m 6"]
-) -> tuple[float, Float64[Tensor, "6"]]:
-    """Measure how well the seen surface determines the pose: 0 where a motion is unobservable.
-
-    A motion ``y = (d/2 w, v)`` about the middle of the cloud moves a surface point at ``a`` with
-    normal ``n`` across itself by ``n . v + (a x n) . w``. The observability is the root mean square
-    of that over the points near the surface, for the unit motion that moves it least (Gelfand et
-    al., Geometrically Stable Sampling for the ICP Algorithm, 2003). Motions of declared symmetries
-    (``free``) are left out. The weakest motion is given too: (rotation, translation at the middle
-    of the cloud), of unit length after scaling.
-    """
-    points = take_evenly(cloud_m.double(), _SAMPLED)
-    distance_m, index = _nearest(points, pose, surface)
-    near = distance_m < NEAR * surface.diameter_m
-    weakest = torch.zeros(6, dtype=torch.float64)
-    if int(near.sum()) < 6:
-        return 0.0, weakest
-    normal = (surface.normals[index] @ pose.R.mT)[near]
-    middle, radius_m = points.mean(0), surface.diameter_m / 2
-    arm = points[near] - middle
-    J = torch.cat([torch.linalg.cross(arm, normal) / radius_m, normal], -1)
-    # Declared symmetries as motions about the middle, turns in metres at the radius.
-    turn, shift = free[:, :3].double(), free[:, 3:].double()
-    own = torch.cat([turn * radius_m, shift + turn @ cross_matrix(middle)], -1)
-    basis = _complement(own)
-    values, vectors = torch.linalg.eigh(basis.T @ (J.T @ J / len(J)) @ basis)
-    return float(values[0].clamp(min=0).sqrt()), basis @ vectors[:, 0]
-
-
-def without_motions(
-    covariance: Float[Tensor, "6 6"], free: Float[Tensor, "m 6"]
-) -> Float[Tensor, "6 6"]:
-    """Give the covariance where the pose does not move along ``free``: finite, and 0 along them."""
-    if len(free) == 0:
-        return covariance
-    basis = _complement(free.double())
-    # Rotations and metres differ in size; the information of the rest is what counts.
-    information = torch.linalg.inv(covariance.double())
-    inner = torch.linalg.inv(basis.T @ information @ basis)
-    return (basis @ inner @ basis.T).to(covariance)
-
-
-def tilt_of(cloud: CloudNormals, poses: Rigid, surface: Surface) -> Float64[Tensor, " b"]:
-    """Mean of 1 - |cosine| between normals of the cloud and of each posed surface near it."""
-    distance_m, index = _nearest(cloud.points_m, poses, surface)
+def tilt_of(cloud_m: Float[Tensor, "n 3"], poses: Rigid, surface: Surface) -> Float64[Tensor, " b"]:
+    """Mean of 1 - |cosine| between planes laid through a cloud and each posed surface near it."""
+    thinned_m = take_evenly(cloud_m.double(), _THINNED)
+    some_m = take_evenly(thinned_m, _TILTED)
+    normals, _ = local_planes(thinned_m, some_m)
+    distance_m, index = nearest_posed(some_m, poses, surface)
     is_near = distance_m < NEAR * surface.diameter_m
-    cosine = (cloud.normals * (surface.normals[index] @ poses.R.mT)).sum(-1).abs()
+    cosine = (normals * (surface.normals[index] @ poses.R.mT)).sum(-1).abs()
     return 1 - torch.where(is_near, cosine, 0.0).sum(-1) / is_near.sum(-1).clamp(min=1)
 
 
-def _nearest(
+def nearest_posed(
     points_m: Float64[Tensor, "n 3"], pose: Rigid, surface: Surface
 ) -> tuple[Float64[Tensor, "*batch n"], Int64[Tensor, "*batch n"]]:
     """Distance of each point to a posed surface, and the number of the point of it there."""
@@ -183,38 +109,30 @@ def _nearest(
     return (local_m - surface.points_m[index]).norm(dim=-1), index
 
 
-def _complement(motions: Float64[Tensor, "m 6"]) -> Float64[Tensor, "6 r"]:
-    """Give an orthonormal basis of what is orthogonal to all of the motions."""
-    if len(motions) == 0:
-        return torch.eye(6, dtype=torch.float64)
-    _, values, rows = torch.linalg.svd(motions)
-    rank = int((values > 1e-9 * values[0]).sum())
-    return rows[rank:].T
-
-
 @dataclass(frozen=True, kw_only=True, eq=False)
 class PoseAmbiguities:
-    """Pose ambiguities of a model.
+    """Pose ambiguities of a model."""
 
-    Attributes:
-        same: ``model_from_model`` of the copies that are one answer, the identity first.
-        near: of those that are another answer and look nearly alike.
-        trained: of those that the network was trained to treat as one, the identity first.
-        points_m: of the model, by which poses are compared.
-        middle_m: of its box.
-        axes: rows: its principal axes, from the longest.
-        lengths_m: its extent along each.
-        diameter_m: of the model.
-    """
+    same: Rigid  #: ``model_from_model`` of the copies that are one answer, the identity first
+    near: Rigid  #: of those that are another answer and look nearly alike
+    mirror: float  #: how far the mirror image deviates from the model, in diameters
+    trained: Rigid  #: of those that a network was trained to treat as one, the identity first
+    points_m: Float64[Tensor, "n 3"]  #: of the model, by which poses are compared
+    middle_m: Float64[Tensor, "3"]  #: of its box
+    axes: Float64[Tensor, "3 3"]  #: rows: its principal axes, from the longest
+    lengths_m: Float64[Tensor, "3"]  #: its extent along each
+    diameter_m: float  #: of the model
 
-    same: Rigid
-    near: Rigid
-    trained: Rigid
-    points_m: Float64[Tensor, "n 3"]
-    middle_m: Float64[Tensor, "3"]
-    axes: Float64[Tensor, "3 3"]
-    lengths_m: Float64[Tensor, "3"]
-    diameter_m: float
+
+@dataclass(kw_only=True, eq=False)
+class KnownObject:
+    """An object, and what is made of its model once for all clouds, when it is first wanted."""
+
+    number: int  #: among the models of an estimator
+    model: ObjectModel
+    surface: Surface
+    copies: PoseAmbiguities | None = None
+    pairs: PairTable | None = None
 
 
 class Candidate(NamedTuple):
@@ -231,7 +149,7 @@ def find_copies(model: ObjectModel, *, up_to_symmetry: bool) -> PoseAmbiguities:
     near = [one.model_from_model for one in near_symmetries(model)]
     none = Rigid(torch.zeros(0, 3, 3).double(), torch.zeros(0, 3).double())
     turns = Rigid.stack(near) if near else none
-    true = find_true(model)
+    true, mirror = find_true(model), mirror_deviation(model)
     same = symmetry_transforms(true, _STEP).double()
     if up_to_symmetry:
         every = symmetry_transforms(model.symmetries, _STEP)
@@ -249,6 +167,7 @@ def find_copies(model: ObjectModel, *, up_to_symmetry: bool) -> PoseAmbiguities:
     return PoseAmbiguities(
         same=same,
         near=turns,
+        mirror=mirror,
         trained=trained.double(),
         points_m=compared_m,
         middle_m=(points_m.amin(0) + points_m.amax(0)) / 2,
@@ -272,29 +191,33 @@ def find_candidates(
     cloud_m: Float[Tensor, "n 3"],
     best: Candidate,
     others: Rigid,
-    copies: PoseAmbiguities,
-    surface: Surface,
-    config: IcpConfig | None,
+    known: KnownObject,
+    config: EstimateConfig,
+    *,
+    is_refined: bool,
 ) -> list[Candidate]:
     """Refine ``others``, at which ICP ended elsewhere, and the nearly symmetric copies of the best.
 
-    The best comes first, then those that are other poses than it and than each other. Without a
-    config of ICP the copies stay where they are.
+    The best comes first, then those that are other poses than it and than each other. Where the
+    best was not refined the copies stay where they are.
     """
+    if known.copies is None:
+        known.copies = find_copies(known.model, up_to_symmetry=config.up_to_symmetry)
+    copies = known.copies
     starts = Rigid.cat([others, best.pose @ copies.near])
     kept = [best]
     if len(starts.R) == 0:
         return kept
-    if config is None:
+    if not is_refined:
         poses = [starts[k] for k in range(len(starts.R))]
         tried = [best._replace(pose=pose) for pose in poses]
     else:
         short = replace(
-            config,
-            iterations=(config.iterations + 1) // 2,
-            cloud_points=min(_ICP_POINTS, config.cloud_points),
+            config.icp,
+            iterations=(config.icp.iterations + 1) // 2,
+            cloud_points=min(_ICP_POINTS, config.icp.cloud_points),
         )
-        found = refine_pose(cloud_m.double(), starts, surface, short)
+        found = refine_pose(cloud_m.double(), starts, known.surface, short)
         tried = [
             Candidate(found.camera_from_model[k], found.covariance[k], float(found.residual_m[k]))
             for k in range(len(starts.R))
@@ -306,39 +229,6 @@ def find_candidates(
         if float(gap_m.norm(dim=-1).mean(-1).min()) >= _SAME * copies.diameter_m:
             kept.append(one)
     return kept
-
-
-def share_out(
-    candidates: Sequence[Mapping[str, float]], slopes: Mapping[str, float]
-) -> Float64[Tensor, " b"]:
-    """Share the probability of one among candidates: ``exp(-sum slope log(0.01 + signal))``."""
-    odds = [-sum(k * log_signal(one[name]) for name, k in slopes.items()) for one in candidates]
-    return torch.tensor(odds, dtype=torch.float64).softmax(0)
-
-
-def alternatives_among(
-    candidates: Sequence[Candidate],
-    evidence: Sequence[dict[str, float]],
-    shares: Float64[Tensor, " b"],
-    copies: PoseAmbiguities,
-) -> tuple[Alternative, ...]:
-    """Name the candidates beside the best, the likeliest first; unlikely ones are left out.
-
-    Their probabilities are shares of one, in which the best has its own.
-    """
-    best, *order = shares.argsort(descending=True, stable=True).tolist()
-    pose = candidates[best].pose
-    return tuple(
-        Alternative(
-            camera_from_model=other.float(),
-            probability=float(shares[k]),
-            difference=difference_of(other, pose, copies),
-            signals=evidence[k],
-        )
-        for k in order
-        for other in [candidates[k].pose]
-        if float(shares[k]) >= _NAMED
-    )
 
 
 def difference_of(pose: Rigid, from_pose: Rigid, copies: PoseAmbiguities) -> str:
@@ -365,131 +255,3 @@ def difference_of(pose: Rigid, from_pose: Rigid, copies: PoseAmbiguities) -> str
     if shift_m > _SAME / 2 * copies.diameter_m:
         words += f" and shifted by {1000 * shift_m:.0f} mm"
     return words
-
-
-@dataclass
-class Clock:
-    """Seconds of each stage."""
-
-    seconds: dict[str, float] = field(default_factory=dict)
-    last: float = field(default_factory=time.perf_counter)
-
-    def note(self, stage: str) -> None:
-        """Give a stage the time since the one before."""
-        now = time.perf_counter()
-        self.seconds[stage] = now - self.last
-        self.last = now
-
-
-def candidate_of(source: PoseFit | RefinedPose) -> Candidate:
-    """Take a fitted or a refined pose as one that may be right."""
-    return Candidate(source.camera_from_model.double(), source.covariance, float(source.residual_m))
-
-
-def answer_of(
-    cloud: ObjectCloud,
-    model: ObjectModel,
-    surface: Surface,
-    copies: PoseAmbiguities,
-    candidates: Sequence[Candidate],
-    evidence: Sequence[dict[str, float]],
-    refusal: RefusalConfig,
-    config: EstimateConfig,
-    clock: Clock,
-    vote: Vote | None = None,
-) -> PoseEstimate:
-    """Choose among poses by the evidence against each; ask whether it fits and is that object."""
-    seen = seen_about(cloud.cloud_m, cloud.view, surface.diameter_m)
-    shares = share_out(evidence, refusal.candidate_slopes)
-    number = int(shares.argsort(descending=True, stable=True)[0])
-    fit = fit_of(seen, candidates[number].pose, surface)
-    shares = shares * min(1.0, fit.agrees / SHOWN)  # the rest is that of a pose that was not found
-    pose, covariance, residual_m = candidates[number]
-    free = free_motions(model.symmetries.continuous, pose)
-    reason, identity = misfit_of(fit, refusal), None
-    if reason is None:
-        observable, motion = observability(cloud.cloud_m, pose, surface, free)
-        if observable < refusal.min_hold:
-            what = "turn" if float(motion[:3].norm()) > math.sqrt(0.5) else "shift"
-            reason = Refusal(
-                status="not observable",
-                reason=f"the seen part of the object leaves one {what} undetermined: it moves the "
-                f"surface along its normals by {observable:.1%} of the motion only; no declared "
-                "symmetry allows it. Declare the symmetry, or look from a side that shows more",
-            )
-    if reason is None and config.with_icp and refusal.max_size_error < 1:
-        identity = identity_of(cloud, pose, model, surface, fit, seen, refusal.max_size_error)
-        if identity.status == "contradicted":
-            reason = Refusal(status="doubtful", reason=identity.reason)
-    clock.note("check")
-    # Worked out in float64, given as points and models come: in float32.
-    answer = PoseEstimate(
-        name="",
-        object=model.name,
-        status="ok",
-        camera_from_model=pose.float(),
-        keypoints_m=None if vote is None else vote.keypoints_m.float(),
-        covariance=without_motions(covariance, free).float(),
-        free_motions=free.float(),
-        inlier_share=None if vote is None else float(vote.inlier_share.mean()),
-        residual_m=residual_m,
-        signals=evidence[number],
-        fit=fit,
-        identity=identity,
-        certainty=float(shares[number]),
-        alternatives=alternatives_among(candidates, evidence, shares, copies),
-        seconds=clock.seconds,
-    )
-    if reason is not None:
-        return withheld(answer.object, reason, clock, answer)
-    return with_status(answer, config.min_certainty)
-
-
-def with_status(answer: PoseEstimate, min_certainty: float) -> PoseEstimate:
-    """Say that a pose is ambiguous where its certainty is below the limit, and else ok."""
-    if answer.camera_from_model is None:
-        return answer
-    if answer.certainty is None or answer.certainty >= min_certainty:
-        return replace(answer, status="ok", reason="")
-    others = (
-        f"{len(answer.alternatives)} others fit too" if answer.alternatives else "others may fit"
-    )
-    reason = (
-        f"this pose has a certainty of {answer.certainty:.0%}, below min_certainty "
-        f"{min_certainty:.0%}: {others}"
-    )
-    return replace(answer, status="ambiguous", reason=reason)
-
-
-def misfit_of(fit: Fit, limits: RefusalConfig) -> Refusal | None:
-    """Say why a pose does not fit what the camera saw; None where it does."""
-    if fit.agrees < limits.min_agreement:
-        reason = (
-            f"of the posed surface that was seen {1 - fit.agrees:.0%} lies where the camera saw "
-            f"something else, and {1 - limits.min_agreement:.0%} may: another object or pose"
-        )
-    elif fit.beyond > limits.max_beyond:
-        reason = (
-            f"{fit.beyond:.1%} of the object's readings lie beside the posed silhouette, and "
-            f"{limits.max_beyond:.0%} may: another object, a larger one, or a mask of more than it"
-        )
-    elif fit.explained < limits.min_explained:
-        reason = (
-            f"{1 - fit.explained:.0%} of the object's readings are nowhere near the posed surface, "
-            f"and {1 - limits.min_explained:.0%} may be: another object, or a mask of more than it"
-        )
-    else:
-        return None
-    return Refusal(status="doubtful", reason=reason)
-
-
-def withheld(
-    object: str, refusal: Refusal, clock: Clock, answer: PoseEstimate | None = None
-) -> PoseEstimate:
-    """Keep what was found out but the pose: a refusal cannot be taken for an answer."""
-    known = PoseEstimate(name="", object=object, status=refusal.status, reason=refusal.reason,
-                         seconds=clock.seconds)  # fmt: skip
-    if answer is None:
-        return known
-    kept = ("keypoints_m", "inlier_share", "residual_m", "fit", "identity", "signals")
-    return replace(known, **{name: getattr(answer, name) for name in kept})

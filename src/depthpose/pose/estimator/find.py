@@ -14,8 +14,7 @@ from depthpose.core.devices import each_in_threads
 from depthpose.core.rigid import Rigid
 from depthpose.pose.cloud import cloud_from_depth, grow_mask
 from depthpose.pose.config import RefusalConfig
-from depthpose.pose.estimator.candidates import share_out
-from depthpose.pose.estimator.fit import BORDER_PX, sensor_size_error
+from depthpose.pose.estimator.fit import BORDER_PX, sensor_size_error, share_out
 from depthpose.pose.estimator.hypotheses import (
     is_no_side,
     log_odds_wrong,

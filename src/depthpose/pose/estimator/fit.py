@@ -1,28 +1,50 @@
-"""Whether a pose fits what the camera saw, and whether it is that object: its size, its handedness.
+"""The answer: the likeliest pose, or why it is withheld.
 
+It must fit what the camera saw, be fixed by it, and be of that object: its size, its handedness.
 The posed surface is compared with the readings at the sensor's own scale.
 """
 
+import math
+import time
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import product
+from typing import Any
 
+import numpy as np
 import torch
 from jaxtyping import Bool, Float, Float64
 from torch import Tensor
 from torch.nn.functional import max_pool2d
 
 from depthpose.core.arrays import take_evenly
-from depthpose.core.camera import back_project
-from depthpose.core.rigid import Rigid, rotation_by
-from depthpose.pose.cloud import grow_mask
-from depthpose.pose.compiled import serves
-from depthpose.pose.config import IcpConfig
-from depthpose.pose.estimator.inputs import ObjectCloud
-from depthpose.pose.mesh import is_mirror_alike
+from depthpose.core.rigid import Rigid, cross_matrix, rotation_by
+from depthpose.pose.cloud import ObjectCloud, Refusal, cloud_from_depth, grow_mask
+from depthpose.pose.compiled import finite_array, serves
+from depthpose.pose.config import EstimateConfig, IcpConfig, RefusalConfig
+from depthpose.pose.estimator.candidates import (
+    Candidate,
+    KnownObject,
+    PoseAmbiguities,
+    difference_of,
+    nearest_posed,
+)
+from depthpose.pose.mesh import MIRROR_ALIKE
 from depthpose.pose.mesh.models import fibonacci_directions
 from depthpose.pose.refine import refine_pose, refine_roughly
 from depthpose.pose.surface import NEAR, Surface
-from depthpose.pose.types import Fit, Identity, ObjectModel, ViewInput
+from depthpose.pose.types import (
+    Alternative,
+    AnyInput,
+    Axis,
+    Fit,
+    Identity,
+    PoseEstimate,
+    Status,
+    Symmetries,
+    ViewInput,
+    Vote,
+)
 
 BORDER_PX = 2
 """Readings so near an edge may be of either side: stereo and structured light match windows, and
@@ -30,6 +52,10 @@ a mask ends so far from the silhouette."""
 SHOWN = 0.95  #: so much of the seen surface agrees at a right pose that a sensor reads well
 _NOISES = 3.0
 _WIDEST = 2.0  # times the usual limit, whatever the noise: beyond, what was read is no surface
+FLOOR = 0.01
+"""Added to a signal before its logarithm is taken, which is finite where there is none."""
+_NAMED = 0.02  # candidates of a smaller share are not named
+_SAMPLED = 1000  # points of the cloud that say how well it fixes a pose
 _COMPARED = 1000  # readings of the object, evenly taken, that are laid on the surface
 _LAG_PX = 3  # noise is compared so far apart: neighbouring pixels of a real sensor err alike
 _FINEST = 0.01  # of the diameter: models are no more exact
@@ -151,9 +177,7 @@ def fit_of(seen: Seen, pose: Rigid, surface: Surface) -> Fit:
     inside = (column >= 0) & (column < columns) & (row >= 0) & (row < rows)
     inside &= is_covered[row.clamp(0, rows - 1), column.clamp(0, columns - 1)]
     beyond = float((~inside).double().mean()) if len(read) else 0.0
-    read_m = take_evenly(
-        back_project(seen.depth_m, seen.K)[own & seen.depth_m.isfinite()], _COMPARED
-    )
+    read_m = take_evenly(cloud_from_depth(seen.depth_m, own, seen.K), _COMPARED)
     local_m = pose.inverse().apply(read_m)
     apart_m = (local_m - surface.points_m[surface.nearest(local_m)]).norm(dim=-1)
     compared = agrees + through + bulges
@@ -236,11 +260,12 @@ def _grow(
     widths = (1 + (_WIDE_STEP - 1) * max(0.0, 1 - 2 * step / _STEPS) for step in range(_STEPS))
     limits_m = [NEAR * surface.diameter_m * width for width in widths]
     if serves(local_m, times):
-        from depthpose.pose.compiled.poses import grown
+        from depthpose.pose.compiled.poses import grow
 
-        times, local_m, variance = grown(
-            local_m, times, middle_m, surface.target, limits_m, _CONVERGED, is_exact
-        )
+        local_m, times = torch.from_numpy(finite_array(local_m).copy()), times.clone()
+        variance = torch.ones_like(times)
+        arrays = (local_m.numpy(), times.numpy(), middle_m.numpy(), np.array(limits_m))
+        grow(*arrays, surface.target, is_exact, _CONVERGED, variance.numpy())
         return times, local_m, (_INDEPENDENT * variance).sqrt()
     sigma = torch.ones_like(times)
     for limit_m in limits_m:
@@ -322,16 +347,17 @@ def sensor_size_error(distance_m: float, focal_px: float, diameter_m: float) -> 
 def identity_of(
     cloud: ObjectCloud,
     pose: Rigid,
-    model: ObjectModel,
-    surface: Surface,
+    known: KnownObject,
+    copies: PoseAmbiguities,
     fit: Fit,
     seen: Seen,
     max_size_error: float,
 ) -> Identity:
     """Fit another size and the mirror image, and say whether one of them is what was seen."""
+    model, surface = known.model, known.surface
     scale = scale_of(cloud.cloud_m, pose, surface)
     mirror = None
-    if not is_mirror_alike(model):
+    if copies.mirror > MIRROR_ALIKE:
         mirror = mirror_gain(cloud.cloud_m, pose, surface)
     distance_m = float(cloud.cloud_m[:, 2].double().median())
     sensor = sensor_size_error(distance_m, float(seen.K[0, 0]), surface.diameter_m)
@@ -374,4 +400,211 @@ def identity_of(
         size_deviation=scale.sigma,
         mirror_gain=None if mirror is None else NEAR * mirror,
         reason=reason,
+    )
+
+
+def free_motions(axes: tuple[Axis, ...], camera_from_model: Rigid) -> Float[Tensor, "m 6"]:
+    """Give the motions of the camera frame that turn the object about its axes of revolution.
+
+    Unit vectors of (rotation, translation): along them no observation says anything, the variance
+    is infinite, and the pose is valid all the same. Two axes make a ball, which is free to turn
+    about the third too.
+    """
+    rows = []
+    centre_m = Symmetries(continuous=axes).ball_centre_m
+    if centre_m is not None:  # turns about two axes of a ball make those about every axis
+        axes = tuple(Axis(direction=row, point_m=centre_m) for row in torch.eye(3).to(centre_m))
+    for axis in axes if centre_m is not None else axes[:1]:
+        direction = camera_from_model.R @ axis.direction.to(camera_from_model.R)
+        point_m = camera_from_model.apply(axis.point_m.to(camera_from_model.R)[None])[0]
+        # Turning by w about a line through c moves c nowhere: w x c + v = 0.
+        motion = torch.cat([direction, torch.linalg.cross(point_m, direction)])
+        rows.append(motion / motion.norm())
+    return torch.stack(rows) if rows else camera_from_model.R.new_zeros(0, 6)
+
+
+def observability(
+    cloud_m: Float[Tensor, "n 3"], pose: Rigid, surface: Surface, free: Float[Tensor, "m 6"]
+) -> tuple[float, Float64[Tensor, "6"]]:
+    """Measure how well the seen surface determines the pose: 0 where a motion is unobservable.
+
+    A motion ``y = (d/2 w, v)`` about the middle of the cloud moves a surface point at ``a`` with
+    normal ``n`` across itself by ``n . v + (a x n) . w``. The observability is the root mean square
+    of that over the points near the surface, for the unit motion that moves it least (Gelfand et
+    al., Geometrically Stable Sampling for the ICP Algorithm, 2003). Motions of declared symmetries
+    (``free``) are left out. The weakest motion is given too: (rotation, translation at the middle
+    of the cloud), of unit length after scaling.
+    """
+    points = take_evenly(cloud_m.double(), _SAMPLED)
+    distance_m, index = nearest_posed(points, pose, surface)
+    near = distance_m < NEAR * surface.diameter_m
+    weakest = torch.zeros(6, dtype=torch.float64)
+    if int(near.sum()) < 6:
+        return 0.0, weakest
+    normal = (surface.normals[index] @ pose.R.mT)[near]
+    middle, radius_m = points.mean(0), surface.diameter_m / 2
+    arm = points[near] - middle
+    J = torch.cat([torch.linalg.cross(arm, normal) / radius_m, normal], -1)
+    # Declared symmetries as motions about the middle, turns in metres at the radius.
+    turn, shift = free[:, :3].double(), free[:, 3:].double()
+    own = torch.cat([turn * radius_m, shift + turn @ cross_matrix(middle)], -1)
+    basis = torch.eye(6).double() if len(own) == 0 else _complement(own)
+    values, vectors = torch.linalg.eigh(basis.T @ (J.T @ J / len(J)) @ basis)
+    return float(values[0].clamp(min=0).sqrt()), basis @ vectors[:, 0]
+
+
+def without_motions(
+    covariance: Float[Tensor, "6 6"], free: Float[Tensor, "m 6"]
+) -> Float[Tensor, "6 6"]:
+    """Give the covariance where the pose does not move along ``free``: finite, and 0 along them."""
+    basis = _complement(free.double())
+    # Rotations and metres differ in size; the information of the rest is what counts.
+    information = torch.linalg.inv(covariance.double())
+    inner = torch.linalg.inv(basis.T @ information @ basis)
+    return (basis @ inner @ basis.T).to(covariance)
+
+
+def _complement(motions: Float64[Tensor, "m 6"]) -> Float64[Tensor, "6 r"]:
+    """Give an orthonormal basis of what is orthogonal to all of the motions."""
+    _, values, rows = torch.linalg.svd(motions)
+    rank = int((values > 1e-9 * values[0]).sum())
+    return rows[rank:].T
+
+
+def answer_of(
+    cloud: ObjectCloud,
+    known: KnownObject,
+    candidates: Sequence[Candidate],
+    evidence: Sequence[dict[str, float]],
+    refusal: RefusalConfig,
+    config: EstimateConfig,
+    seconds: dict[str, float],
+    vote: Vote | None = None,
+) -> PoseEstimate:
+    """Choose among poses by the evidence against each; ask whether it fits and is that object."""
+    began = time.perf_counter()
+    surface, copies = known.surface, known.copies
+    assert copies is not None, "found with the candidates"
+    shares = share_out(evidence, refusal.candidate_slopes)
+    seen = seen_about(cloud.cloud_m, cloud.view, surface.diameter_m)
+    number = int(shares.argsort(descending=True, stable=True)[0])
+    fit = fit_of(seen, candidates[number].pose, surface)
+    shares = shares * min(1.0, fit.agrees / SHOWN)  # the rest is that of a pose that was not found
+    pose, covariance, residual_m = candidates[number]
+    free = free_motions(known.model.symmetries.continuous, pose)
+    reason, identity = misfit_of(fit, refusal), None
+    if reason is None:
+        observable, motion = observability(cloud.cloud_m, pose, surface, free)
+        if observable < refusal.min_hold:
+            what = "turn" if float(motion[:3].norm()) > math.sqrt(0.5) else "shift"
+            reason = Refusal(
+                status="not observable",
+                reason=f"the seen part of the object leaves one {what} undetermined: it moves the "
+                f"surface along its normals by {observable:.1%} of the motion only; no declared "
+                "symmetry allows it. Declare the symmetry, or look from a side that shows more",
+            )
+    if reason is None and config.with_icp and refusal.max_size_error < 1:
+        identity = identity_of(cloud, pose, known, copies, fit, seen, refusal.max_size_error)
+        if identity.status == "contradicted":
+            reason = Refusal(status="doubtful", reason=identity.reason)
+    facts: dict[str, Any] = {
+        "name": cloud.name,
+        "object": known.model.name,
+        "keypoints_m": None if vote is None else vote.keypoints_m.float(),
+        "inlier_share": None if vote is None else float(vote.inlier_share.mean()),
+        "residual_m": residual_m,
+        "signals": evidence[number],
+        "fit": fit,
+        "identity": identity,
+        "seconds": {**seconds, "check": time.perf_counter() - began},
+    }
+    if reason is not None:  # all that was found out but the pose: nobody takes it for an answer
+        return PoseEstimate(status=reason.status, reason=reason.reason, **facts)
+    if len(free):
+        covariance = without_motions(covariance, free)
+    alternatives = tuple(
+        Alternative(
+            difference=difference_of(candidates[k].pose, pose, copies),
+            camera_from_model=candidates[k].pose.float(),
+            probability=float(shares[k]),
+            signals=evidence[k],
+        )
+        for k in shares.argsort(descending=True, stable=True).tolist()[1:]
+        if float(shares[k]) >= _NAMED
+    )
+    certainty = float(shares[number])
+    status, words = status_of(certainty, len(alternatives), config.min_certainty)
+    # Worked out in float64, given as points and models come: in float32.
+    return PoseEstimate(
+        status=status,
+        reason=words,
+        camera_from_model=pose.float(),
+        covariance=covariance.float(),
+        free_motions=free.float(),
+        certainty=certainty,
+        alternatives=alternatives,
+        **facts,
+    )
+
+
+def share_out(
+    candidates: Sequence[Mapping[str, float]], slopes: Mapping[str, float]
+) -> Float64[Tensor, " b"]:
+    """Share the probability of one among candidates: ``exp(-sum slope log(0.01 + signal))``."""
+    odds = [
+        -sum(slope * math.log(FLOOR + one[name]) for name, slope in slopes.items())
+        for one in candidates
+    ]
+    return torch.tensor(odds, dtype=torch.float64).softmax(0)
+
+
+def status_of(certainty: float, others: int, min_certainty: float) -> tuple[Status, str]:
+    """Say that a pose is ambiguous where its certainty is below the limit, and else ok."""
+    if certainty >= min_certainty:
+        return "ok", ""
+    return "ambiguous", (
+        f"this pose has a certainty of {certainty:.0%}, below min_certainty {min_certainty:.0%}: "
+        + (f"{others} others fit too" if others else "others may fit")
+    )
+
+
+def with_status(answer: PoseEstimate, min_certainty: float) -> PoseEstimate:
+    """Say anew, by another limit, whether a pose is ambiguous or ok."""
+    if answer.camera_from_model is None:
+        return answer
+    certainty = 1.0 if answer.certainty is None else answer.certainty
+    status, reason = status_of(certainty, len(answer.alternatives), min_certainty)
+    return replace(answer, status=status, reason=reason)
+
+
+def misfit_of(fit: Fit, limits: RefusalConfig) -> Refusal | None:
+    """Say why a pose does not fit what the camera saw; None where it does."""
+    if fit.agrees < limits.min_agreement:
+        reason = (
+            f"of the posed surface that was seen {1 - fit.agrees:.0%} lies where the camera saw "
+            f"something else, and {1 - limits.min_agreement:.0%} may: another object or pose"
+        )
+    elif fit.beyond > limits.max_beyond:
+        reason = (
+            f"{fit.beyond:.1%} of the object's readings lie beside the posed silhouette, and "
+            f"{limits.max_beyond:.0%} may: another object, a larger one, or a mask of more than it"
+        )
+    elif fit.explained < limits.min_explained:
+        reason = (
+            f"{1 - fit.explained:.0%} of the object's readings are nowhere near the posed surface, "
+            f"and {1 - limits.min_explained:.0%} may be: another object, or a mask of more than it"
+        )
+    else:
+        return None
+    return Refusal(status="doubtful", reason=reason)
+
+
+def refused(given: AnyInput, refusal: Refusal, seconds: dict[str, float]) -> PoseEstimate:
+    """Give the estimate of an input without a pose."""
+    return PoseEstimate(
+        name=given.name,
+        object=given.object,
+        status=refusal.status,
+        reason=refusal.reason,
+        seconds=seconds,
     )

@@ -1,17 +1,15 @@
-"""Files, arrays or tensors to clouds that can be posed, or the reason why they cannot."""
+"""Files, arrays or tensors to the inputs of a pose estimate."""
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Int64
+from jaxtyping import Bool, Int64
 from torch import Tensor
 
-from depthpose.core.arrays import take_evenly
 from depthpose.core.camera import (
     AnyLens,
     Camera,
@@ -25,30 +23,16 @@ from depthpose.core.errors import InputError
 from depthpose.core.files import read_cloud, read_stored_depth
 from depthpose.core.rigid import Rigid
 from depthpose.core.units import Unit, metres_of
-from depthpose.pose.cloud import (
-    VoxelGrid,
-    cloud_from_depth,
-    frame_advice,
-    is_flying,
-    is_reading,
-    refusal_of,
-    sample_points,
-    voxelise,
-)
-from depthpose.pose.config import CloudConfig, EstimateConfig
+from depthpose.pose.cloud import nothing_seen as nothing_seen
 from depthpose.pose.datasets import mask_from_rle, number_objects, one_mask, read_labels
-from depthpose.pose.mesh import unit_advice
 from depthpose.pose.segmentation import label_parts
-from depthpose.pose.types import CloudInput, ObjectModel, Status, ViewInput
+from depthpose.pose.types import AnyInput as AnyInput
+from depthpose.pose.types import CloudInput, ViewInput
 
 AnyArray = str | Path | np.ndarray | Tensor  #: a file, an array or a tensor
 AnyMask = AnyArray | Mapping[str, Any]  #: a mask, its file, or COCO's run lengths
 _SMALLEST_INSTANCE = 0.2
 """Pieces of a mask below this share of the largest are fragments of a segmentation, not objects."""
-AnyInput = CloudInput | ViewInput
-_MOST = 0.5  # where most points are farther from their median than the object is long, refuse
-_BEFORE = 0.05  # nearly all points of a seen cloud are so many diameters before the camera
-_THIN = 0.002  # below this root mean square, in diameters, a cloud has no extent
 
 
 def cloud_input(cloud: AnyArray, unit: Unit, object: str, name: str) -> CloudInput:
@@ -197,120 +181,3 @@ def _tensor(values: Any) -> Tensor:  # noqa: ANN401  whatever a caller has
         array = array.astype(np.float64)
     array = array.astype(array.dtype.newbyteorder("="), copy=False)
     return torch.from_numpy(np.require(array, requirements=["C", "W"]))  # Pillow lends read-only
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class ObjectCloud:
-    """A cloud that can be posed."""
-
-    cloud_m: Float[Tensor, "n 3"]  #: all usable points, without flying pixels
-    points_m: Float[Tensor, "m 3"]  #: those that the network sees and that vote, one a voxel
-    voxels: VoxelGrid  #: of the network's grid
-    view: ViewInput | None  #: the depth image that shows the cloud; None of a cloud alone
-
-
-@dataclass(frozen=True, kw_only=True)
-class Refusal:
-    """Why there is no pose."""
-
-    status: Status
-    reason: str
-
-
-class CloudDirections(NamedTuple):
-    """A cloud and the network's directions at its points."""
-
-    cloud: ObjectCloud
-    directions: Float[Tensor, "n k 3"]
-
-
-def prepare_cloud(
-    given: AnyInput, model: ObjectModel, cloud: CloudConfig, config: EstimateConfig
-) -> ObjectCloud | Refusal:
-    """Lift, thin, drop flying pixels, check, sample and put on the grid of the network."""
-    if isinstance(given, ViewInput):
-        points_m = cloud_from_depth(given.depth_m, given.mask, given.K).float()
-        nothing = nothing_seen(given) if len(points_m) == 0 else ""
-    else:
-        points_m = given.points_m.float()
-        is_zero = bool((points_m == 0).all(-1).any())
-        nothing = "the cloud has no point with finite coordinates"
-        nothing = "the cloud is (0, 0, 0), no reading, in every point" if is_zero else nothing
-        nothing = "the cloud is empty" if len(points_m) == 0 else nothing
-    points_m = take_evenly(points_m[is_reading(points_m)], config.max_cloud_points)
-    if len(points_m) == 0:
-        return Refusal(status="too few points", reason=nothing)
-    kept_m = points_m[~is_flying(points_m, cloud.max_offset_diameters * model.diameter_m)]
-    if (refusal := _refusal_of(given, points_m, kept_m, model, cloud)) is not None:
-        return refusal
-    generator = torch.Generator().manual_seed(config.voting.seed)
-    sampled_m = sample_points(kept_m, cloud.max_points, generator)
-    voxels = voxelise(sampled_m, cloud)
-    view = given if isinstance(given, ViewInput) else given.view
-    return ObjectCloud(cloud_m=kept_m, points_m=sampled_m[voxels.kept], voxels=voxels, view=view)
-
-
-def nothing_seen(view: ViewInput) -> str:
-    """Say why no masked pixel of a view has a depth."""
-    masked = int(view.mask.sum())
-    if masked == 0:
-        return "the mask is empty: no pixel of it is the object"
-    if not bool((view.depth_m > 0).any()):
-        return "the depth image has no reading at all: every pixel is 0 or NaN"
-    return f"none of the {masked} masked pixels has a depth reading"
-
-
-def _refusal_of(
-    given: AnyInput,
-    points_m: Float[Tensor, "n 3"],
-    kept_m: Float[Tensor, "m 3"],
-    model: ObjectModel,
-    cloud: CloudConfig,
-) -> Refusal | None:
-    """Refuse a cloud by its place, its size and its shape; ``kept_m`` has no flying pixels."""
-    if (few := refusal_of(points_m, cloud)) is not None:
-        return Refusal(status="too few points", reason=few)
-    # Of the object's size is what is left without flying pixels, if those are few.
-    sized_m = kept_m if len(kept_m) > _MOST * len(points_m) else points_m
-    advice = unit_advice(model.diameter_m, sized_m)
-    # What was seen is wholly before the camera; a cloud about the origin is in no other axes.
-    is_about_origin = float(points_m.median(0).values.norm()) < model.diameter_m / 2
-    least_m = float(take_evenly(points_m[:, 2], 10_000).quantile(0.05))
-    is_centred = is_about_origin and least_m < _BEFORE * model.diameter_m
-    unusable = frame_advice(points_m)
-    if isinstance(given, CloudInput) and is_centred and advice is None:
-        unusable = (
-            "the cloud lies about the origin, where the camera is: it was centred, or is in "
-            "the frame of the model; give it in the camera's frame, as it was seen"
-        )
-    # Some background in the mask is not of another size.
-    elif not unusable and advice and not (sized_m is kept_m and "larger than the model" in advice):
-        hint = ""
-        if isinstance(given, ViewInput):  # what else changes the size of a cloud
-            mask = given.mask.float()
-            edge = torch.cat([mask[0], mask[-1], mask[:, 0], mask[:, -1]])
-            hint = (
-                "; a mask of more than it, or a K of another image size, changes the size of its "
-                "cloud too, and so does another depth unit: 0.001 m of most sensors, 0.0002 m of "
-                "TUM RGB-D, 1/256 m of KITTI"
-            )
-            if (share := float(mask.mean())) > _MOST and float(edge.mean()) > _MOST:
-                hint = f"; the mask covers {share:.0%} of the image and its border: is it inverted?"
-        unusable = f"{advice} (the object is {model.diameter_m:.3g} m long{hint})"
-    if unusable is not None:
-        return Refusal(status="unusable input", reason=unusable)
-    if (few := refusal_of(kept_m, cloud)) is not None:
-        return Refusal(status="too few points", reason=few)
-    centred = kept_m.double() - kept_m.double().mean(0)
-    extent_m = torch.linalg.eigvalsh(centred.T @ centred / len(centred)).clamp(min=0).sqrt()
-    flat = int((extent_m < _THIN * model.diameter_m).sum())
-    if flat == 0:
-        return None
-    shape = {1: "in a plane", 2: "on a line", 3: "in one place"}[flat]
-    beside = isinstance(given, ViewInput) and flat == 1
-    return Refusal(
-        status="not observable",
-        reason=f"the points lie {shape}, so that motions along it change nothing that is seen; "
-        "look from a side that shows more of the object"
-        f"{', or give the mask of this image: this one may lie on the background' * beside}",
-    )

@@ -9,7 +9,7 @@ from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import NoReturn
+from typing import NamedTuple, NoReturn
 
 import torch
 from jaxtyping import Float
@@ -20,73 +20,44 @@ from depthpose.core.devices import each_in_threads, own_arithmetic, usable_devic
 from depthpose.core.errors import InputError
 from depthpose.core.rigid import Rigid
 from depthpose.pose.baselines import DepthCrop, DepthImageNet, cut_depth, poses_of
-from depthpose.pose.cloud import cloud_from_depth, refusal_of
+from depthpose.pose.cloud import (
+    ObjectCloud,
+    Refusal,
+    cloud_from_depth,
+    prepare_cloud,
+    refusal_of,
+)
 from depthpose.pose.config import EstimateConfig
-from depthpose.pose.estimator.base import PoseEstimator, answered, or_unreadable, refused
+from depthpose.pose.estimator.base import PoseEstimator, Registration, answered, or_unreadable
 from depthpose.pose.estimator.candidates import (
     Candidate,
-    Clock,
-    answer_of,
-    candidate_of,
     disagreement,
     find_candidates,
-    misfit_of,
     surface_signals,
-    withheld,
 )
-from depthpose.pose.estimator.fit import fit_of, seen_about
-from depthpose.pose.estimator.inputs import AnyInput, ObjectCloud, Refusal, prepare_cloud
-from depthpose.pose.estimator.inputs import CloudDirections as CloudDirections
-from depthpose.pose.estimator.register import Registration
+from depthpose.pose.estimator.fit import answer_of, fit_of, misfit_of, refused, seen_about
 from depthpose.pose.refine import refine_best
 from depthpose.pose.types import (
+    AnyInput,
     CloudInput,
-    ObjectModel,
     PoseEstimate,
-    PoseFit,
     SeenPoints,
     Status,
     ViewInput,
-    Vote,
 )
-from depthpose.pose.voting import consistent_keypoints, fit_pose, meet_lines, vote_ransac
+from depthpose.pose.voting import fits_of, meet_lines, vote_ransac
 from depthpose.pose.weights import PoseWeights, read_pose_weights
 
-_LEAST = 4  # keypoints that must agree: three fix a pose with nothing left to contradict it
 _DOUBTED: tuple[Status, ...] = ("votes do not meet", "keypoints do not fit", "doubtful")
 """What the network could not answer, and another method may; the rest is due to the input."""
 _NEEDS_MASK = "a regressed depth image takes a depth image with a mask; give both, or other weights"
 
 
-def _fits(vote: Vote, model: ObjectModel, config: EstimateConfig) -> PoseFit | Refusal:
-    """Fit the keypoints that agree; where ICP refines the fits, also all of them."""
-    found = (vote.condition <= config.voting.max_condition) & (vote.inlier_share > 0)
-    total = len(found)
-    if int(found.sum()) < _LEAST:
-        return Refusal(
-            status="votes do not meet",
-            reason=f"the directions meet at {int(found.sum())} of {total} keypoints, but {_LEAST} "
-            "are needed: too few points, or not the object that the mask promises",
-        )
-    strict, rough = config.voting.rigidity_diameters, config.rough_rigidity_diameters
-    limit_m = model.diameter_m * (rough if config.with_icp else strict)
-    used = consistent_keypoints(vote.keypoints_m, model.keypoints_m, limit_m, found)
-    choices = [used] if int(used.sum()) >= _LEAST else []
-    if config.with_icp and not torch.equal(used, found):
-        choices.append(found)
-    if not choices:
-        return Refusal(
-            status="keypoints do not fit",
-            reason=f"{int(used.sum())} of {total} keypoints have the model's distances within "
-            f"{limit_m:.2g} m, but {_LEAST} are needed: another object, or too much of it occluded",
-        )
-    count = len(choices)
-    return fit_pose(
-        vote.keypoints_m.expand(count, -1, -1),
-        vote.covariance_m2.expand(count, -1, -1, -1),
-        model.keypoints_m,
-        torch.stack(choices),
-    )
+class CloudDirections(NamedTuple):
+    """A cloud and the network's directions at its points."""
+
+    cloud: ObjectCloud
+    directions: Float[Tensor, "n k 3"]
 
 
 def batches(clouds: Iterable["_Cloud"], most: int) -> Iterator[list["_Cloud"]]:
@@ -192,7 +163,7 @@ class GeoPoseNet(PoseEstimator):
         if self._registration is None:
             config = replace(self.config, register_refused=False, with_icp=True)
             self._registration = Registration(self.models, config)
-            self._registration._surfaces, self._registration._copies = self._surfaces, self._copies
+            self._registration._objects = self._objects
         return self._registration
 
     def _pose_near(
@@ -224,7 +195,7 @@ class GeoPoseNet(PoseEstimator):
         work = partial(self._pose, is_likely=is_likely)
         for some in batches(prepared, self.config.batch_voxels):
             ready = [(one, one.prepared) for one in some if isinstance(one.prepared, ObjectCloud)]
-            numbers = [self._number(one.given.object) for one, _ in ready]
+            numbers = [self._known(one.given.object).number for one, _ in ready]
             clouds = [cloud for _, cloud in ready]
             outputs, spent_s = self._directions(clouds, numbers) if ready else ([], 0.0)
             total, left = sum(map(len, outputs)), iter(outputs)
@@ -238,7 +209,7 @@ class GeoPoseNet(PoseEstimator):
         start = time.perf_counter()
         prepared = or_unreadable(
             lambda given: prepare_cloud(
-                given, self.models[self._number(given.object)], self.weights.cloud, self.config
+                given, self._known(given.object).model, self.weights.cloud, self.config
             ),
             given,
         )
@@ -256,13 +227,15 @@ class GeoPoseNet(PoseEstimator):
         cloud_of_point = torch.repeat_interleave(torch.arange(len(clouds)), torch.tensor(counts))
         grids = [cloud.voxels for cloud in clouds]
         coordinates = torch.cat([grid.coordinates for grid in grids])
+        points_m = torch.cat([c.points_m @ c.voxels.grid_from_camera.mT for c in clouds])
+        device = self.config.device
         seen = SeenPoints(
-            points_m=torch.cat([c.points_m @ c.voxels.grid_from_camera.mT for c in clouds]),
-            coordinates=torch.cat([cloud_of_point[:, None], coordinates], 1),
-            features=torch.cat([grid.features for grid in grids]),
-            class_of_point=torch.tensor(numbers)[cloud_of_point],
+            points_m=points_m.to(device),
+            coordinates=torch.cat([cloud_of_point[:, None], coordinates], 1).to(device),
+            features=torch.cat([grid.features for grid in grids]).to(device),
+            class_of_point=torch.tensor(numbers)[cloud_of_point].to(device),
         )
-        outputs = self._network.directions(seen.to(self.config.device)).float().cpu().split(counts)
+        outputs = self._network.directions(seen).float().cpu().split(counts)
         found = [some @ grid.grid_from_camera for some, grid in zip(outputs, grids, strict=True)]
         return found, time.perf_counter() - start
 
@@ -273,59 +246,59 @@ class GeoPoseNet(PoseEstimator):
             return one.given, one.prepared, None
         assert one.outputs is not None, "asked before"
         voted = CloudDirections(one.prepared, one.outputs)
-        found = or_unreadable(partial(self._vote, voted=voted, is_likely=is_likely), one.given)
-        seconds = {**one.seconds, **found.seconds}
-        return one.given, replace(found, name=one.given.name, seconds=seconds), voted
+        vote = partial(self._vote, voted=voted, seconds=one.seconds, is_likely=is_likely)
+        return one.given, or_unreadable(vote, one.given), voted
 
-    def _vote(self, given: AnyInput, *, voted: CloudDirections, is_likely: bool) -> PoseEstimate:
+    def _vote(
+        self,
+        given: AnyInput,
+        *,
+        voted: CloudDirections,
+        seconds: dict[str, float],
+        is_likely: bool,
+    ) -> PoseEstimate:
         """Vote for the keypoints, fit the pose, refine and check it."""
-        number = self._number(given.object)
-        model, surface, copies = self.models[number], self._surface(number), self._copies_of(number)
-        config, clock = self.config, Clock()
+        known, config, began = self._known(given.object), self.config, time.perf_counter()
+        model, surface = known.model, known.surface
         points, directions = voted.cloud.points_m.double(), voted.directions.double()
         if config.voting.method == "ransac":
             vote = vote_ransac(points, directions, config=config.voting)
         else:
             vote = meet_lines(points, directions, refinements=config.voting.refinements)
-        clock.note("voting")
-        fits = _fits(vote, model, config)
+        met = time.perf_counter()
+        seconds = {**seconds, "voting": met - began}
+        fits = fits_of(vote, model, config)
         if isinstance(fits, Refusal):
-            return withheld(model.name, fits, clock)
-        clock.note("svd")
-        cloud_m = voted.cloud.cloud_m
-        pose, icp = fits.camera_from_model, None
-        first = Candidate(pose[0].double(), fits.covariance[0], float(fits.residual_m[0]))
-        others = pose[[]].double()
+            return refused(given, fits, seconds)
+        fitted = time.perf_counter()
+        seconds["svd"] = fitted - met
+        cloud_m, pose = voted.cloud.cloud_m, fits.camera_from_model.double()
+        first = Candidate(pose[0], fits.covariance[0], float(fits.residual_m[0]))
+        others, is_refined = pose[[]], False
         if config.with_icp:
             best = refine_best(cloud_m.double(), pose, surface, config.icp)
-            if float(best.refined.inlier_share) > 0:
-                first, others, icp = candidate_of(best.refined), best.others, config.icp
+            icp, is_refined = best.refined, float(best.refined.inlier_share) > 0
+            if is_refined:
+                first = Candidate(icp.camera_from_model, icp.covariance, float(icp.residual_m))
+                others = best.others
         if not is_likely:
             seen = seen_about(cloud_m, voted.cloud.view, surface.diameter_m)
             misfit = misfit_of(fit_of(seen, first.pose, surface), self.refusal)
             if misfit is not None:
-                clock.note("icp")
-                return withheld(model.name, misfit, clock)
-        candidates = find_candidates(cloud_m, first, others, copies, surface, icp)
+                return refused(given, misfit, {**seconds, "icp": time.perf_counter() - fitted})
+        candidates = find_candidates(cloud_m, first, others, known, config, is_refined=is_refined)
         poses = Rigid.stack([one.pose for one in candidates])
         # Of the copies that the network could not learn to distinguish, the best counts.
-        every_m = (poses[:, None] @ copies.trained).apply(model.keypoints_m.double())
+        assert known.copies is not None, "found with the candidates"
+        every_m = (poses[:, None] @ known.copies.trained).apply(model.keypoints_m.double())
         angles = disagreement(voted.cloud, voted.directions, every_m).tolist()
-        signals = surface_signals(cloud_m, poses, surface)
-        evidence = [{**one, "disagree": a} for one, a in zip(signals, angles, strict=True)]
+        evidence = surface_signals(cloud_m, poses, surface)
+        for signals, angle in zip(evidence, angles, strict=True):
+            signals["disagree"] = angle
         if config.with_icp:
-            clock.note("icp")
+            seconds["icp"] = time.perf_counter() - fitted
         return answer_of(
-            voted.cloud,
-            model,
-            surface,
-            copies,
-            candidates,
-            evidence,
-            self.refusal,
-            config,
-            clock,
-            vote,
+            voted.cloud, known, candidates, evidence, self.refusal, config, seconds, vote
         )
 
 
@@ -364,13 +337,6 @@ class DepthImageRegressor(PoseEstimator):
         self._network = weights.network.to(usable_device(self.config.device)).eval()
         self._cloud = weights.cloud
 
-    def _each(
-        self, inputs: Iterable[AnyInput], threads: int, *, is_likely: bool = True
-    ) -> Iterator[PoseEstimate]:
-        """Regress one by one, whatever is likely."""
-        del is_likely
-        return each_in_threads(partial(or_unreadable, self._estimate), inputs, threads)
-
     def _which(self, given: AnyInput, names: Sequence[str]) -> PoseEstimate:
         if len(names) > 1:
             raise InputError(f"object: say which of {', '.join(names)}; a regressor refuses none")
@@ -386,26 +352,25 @@ class DepthImageRegressor(PoseEstimator):
         raise InputError(_NEEDS_MASK)
 
     def _estimate(self, given: AnyInput) -> PoseEstimate:
-        number = self._number(given.object)
+        known = self._known(given.object)
         if not isinstance(given, ViewInput):
             raise InputError(_NEEDS_MASK)
-        model, clock = self.models[number], Clock()
-        config = self._network.config
+        config, model, began = self._network.config, known.model, time.perf_counter()
         crop = cut_depth(given, config, model.diameter_m)
         if crop is None:
             reason = f"fewer than {config.min_points} masked pixels have a depth"
             return refused(given, Refusal(status="too few points", reason=reason), {})
         batch = DepthCrop(*(part[None].to(self.config.device) for part in crop))
-        numbers = torch.tensor([number], device=self.config.device)
+        numbers = torch.tensor([known.number], device=self.config.device)
         poses = poses_of(self._network(batch.image, numbers), batch)
+        regressed = time.perf_counter()
         found = PoseEstimate(
             name=given.name,
             object=given.object,
             status="ok",
             camera_from_model=Rigid(poses.R[0].cpu().float(), poses.t_m[0].cpu().float()),
-            seconds=clock.seconds,
+            seconds={"network": regressed - began},
         )
-        clock.note("network")
         if not self.config.with_icp:
             return found
         points_m = cloud_from_depth(
@@ -413,14 +378,15 @@ class DepthImageRegressor(PoseEstimator):
         ).float()
         if (few := refusal_of(points_m, self._cloud)) is not None:
             return replace(found, status="too few points", reason=few, camera_from_model=None)
-        pose, surface = found.camera_from_model, self._surface(number)
+        pose = found.camera_from_model
         assert pose is not None
-        refined = refine_best(points_m, pose, surface, self.config.icp).refined
-        clock.note("icp")
+        refined = refine_best(points_m, pose, known.surface, self.config.icp).refined
+        seconds = {**found.seconds, "icp": time.perf_counter() - regressed}
         if float(refined.inlier_share) == 0:  # nothing near the surface: ICP had no say
-            return found
+            return replace(found, seconds=seconds)
         return replace(
             found,
+            seconds=seconds,
             camera_from_model=refined.camera_from_model,
             covariance=refined.covariance,
             residual_m=float(refined.residual_m),

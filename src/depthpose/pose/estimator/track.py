@@ -13,15 +13,14 @@ from torch import Tensor
 
 from depthpose.core.arrays import take_evenly
 from depthpose.core.rigid import Rigid
-from depthpose.pose.cloud import cloud_from_depth
+from depthpose.pose.cloud import Refusal, cloud_from_depth
 from depthpose.pose.config import IcpConfig, RefusalConfig
-from depthpose.pose.estimator.candidates import observability, surface_signals, without_motions
-from depthpose.pose.estimator.inputs import AnyInput, Refusal
+from depthpose.pose.estimator.candidates import surface_signals
+from depthpose.pose.estimator.fit import free_motions, observability, without_motions
 from depthpose.pose.frame import is_on_plane, largest_plane
 from depthpose.pose.refine import refine_best
 from depthpose.pose.surface import NEAR, Surface, compare_depths
-from depthpose.pose.types import CloudInput, ObjectModel, PoseEstimate, ViewInput
-from depthpose.pose.voting import free_motions
+from depthpose.pose.types import AnyInput, CloudInput, ObjectModel, PoseEstimate, ViewInput
 
 MARGIN = 0.15
 """Of the diameter: points so far from the surface at the last or the predicted pose may be the
@@ -178,13 +177,16 @@ def _follow(given: AnyInput, last: _Last, known: TrackedObject) -> PoseEstimate 
             reason="the seen part of the object does not fix its pose (observability "
             f"{observable:.1%})",
         )
+    covariance = refined.covariance
+    if len(free):
+        covariance = without_motions(covariance, free)
     (signals,) = surface_signals(own_m, pose[None], surface)
     answer = PoseEstimate(
         name="",
         object=known.model.name,
         status="ok",
         camera_from_model=refined.camera_from_model.float(),
-        covariance=without_motions(refined.covariance, free).float(),
+        covariance=covariance.float(),
         free_motions=free.float(),
         residual_m=float(refined.residual_m),
         signals=signals | {"through": shares[1], "before": shares[2]},

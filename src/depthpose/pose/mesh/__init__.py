@@ -17,11 +17,9 @@ from depthpose.pose.mesh.models import symmetries_from_bop as symmetries_from_bo
 from depthpose.pose.mesh.models import symmetries_to_bop as symmetries_to_bop
 from depthpose.pose.mesh.models import symmetry_transforms as symmetry_transforms
 from depthpose.pose.mesh.models import turn_about as turn_about
-from depthpose.pose.mesh.models import unit_advice as unit_advice
-from depthpose.pose.mesh.symmetry import SURE as SURE
+from depthpose.pose.mesh.symmetry import MIRROR_ALIKE as MIRROR_ALIKE
 from depthpose.pose.mesh.symmetry import NearSymmetry as NearSymmetry
 from depthpose.pose.mesh.symmetry import SymmetryProposal as SymmetryProposal
-from depthpose.pose.mesh.symmetry import is_mirror_alike as is_mirror_alike
 from depthpose.pose.mesh.symmetry import mirror_deviation as mirror_deviation
 from depthpose.pose.mesh.symmetry import near_symmetries as near_symmetries
 from depthpose.pose.mesh.symmetry import propose_symmetries as propose_symmetries

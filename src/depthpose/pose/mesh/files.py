@@ -72,7 +72,11 @@ def read_geometry(path: AnyPath) -> tuple[np.ndarray, np.ndarray]:
         )
     if isinstance(faces, np.ndarray):
         faces = Ragged(np.full(len(faces), faces.shape[1]), faces.reshape(-1))
-    faces = cut_polygons(path, vertices, faces.sizes, faces.values.astype(np.int64))
+    sizes, corners = faces.sizes, faces.values.astype(np.int64)
+    if (sizes == 3).all() and ((corners >= 0) & (corners < len(vertices))).all():
+        faces = corners.reshape(-1, 3)
+    else:
+        faces = cut_polygons(path, vertices, sizes, corners)
     if len(faces) == 0:
         return vertices, faces
     # Dropped are faces without area, and all but the first of those on the same three points: a

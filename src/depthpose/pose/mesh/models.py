@@ -181,7 +181,7 @@ def sample_surface(
     if len(model.faces) == 0:
         # Farthest points would be evener, and quadratic; point models are even as they come.
         return take_evenly(model.vertices_m, count), take_evenly(model.normals, count)
-    corners = model.triangles_m.double()
+    corners = model.vertices_m[model.faces].double()
     doubled = torch.linalg.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     area = doubled.norm(dim=-1)
     bounds = area.cumsum(0)
@@ -210,7 +210,7 @@ def drawn_triangles(model: ObjectModel) -> Float[Tensor, "n 3 3"]:
     usual one, so that a stray point makes no plate.
     """
     if len(model.faces):
-        return model.triangles_m
+        return model.vertices_m[model.faces]
     points = model.vertices_m.double()
     distance, _ = KDTree(points.numpy()).query(points.numpy(), k=min(4, len(points)))
     spacing = torch.from_numpy(distance[:, -1])
@@ -261,112 +261,6 @@ def fibonacci_directions(count: int) -> Float[Tensor, "count 3"]:
     angle = math.pi * (1 + 5**0.5) * i
     radius = (1 - z * z).sqrt()
     return torch.stack([radius * angle.cos(), radius * angle.sin(), z], -1)
-
-
-_SIDE_DIRECTIONS = 32
-CELL = 2.0  #: side of a ray's cell in mean distances of samples: four samples in each on average
-_SAME = 0.5  # up to so many mean distances from another's plane a sample is of the same sheet
-_SLANT = 0.3  # least cosine at which a sample is looked at
-_SEEN = 0.1  # least share of directions from which an outer side is seen
-_CLEARER = 0.4  # the inner side is seen in at most so many times the directions of the outer
-
-
-def outward_normals(points: np.ndarray, normals: np.ndarray, cell: float) -> np.ndarray:
-    """Turn normals to the side from which the surface is seen from afar.
-
-    What is thinner than half the distance of the samples, open sheets and what is never seen have
-    no outer side: their normals become 0.
-    """
-    seen, looked = np.zeros((2, len(points))), np.full((2, len(points)), 1e-9)
-    for axis in fibonacci_directions(_SIDE_DIRECTIONS).numpy():
-        across = np.linalg.svd(axis[None])[2][1:]
-        flat = np.floor(points @ across.T / cell).astype(np.int64)
-        flat -= flat.min(0)
-        place = flat[:, 0] * (flat[:, 1].max() + 1) + flat[:, 1]
-        slant = normals @ axis
-        order = np.argsort(points @ axis)
-        first = np.empty(place.max() + 1, np.int64)
-        for way in (1, -1):  # toward a camera in this direction, and in the other
-            first[place[order[::way]]] = order[::way]
-            front = first[place]
-            off = ((points - points[front]) * normals[front]).sum(1)
-            is_seen = np.abs(off) < _SAME / CELL * cell
-            for side in (0, 1):
-                facing = way * (1 - 2 * side) * slant > _SLANT
-                seen[side] += facing & is_seen
-                looked[side] += facing
-    share = seen / looked
-    outer = share.argmax(0)
-    is_clear = (share.max(0) > _SEEN) & (share.min(0) < _CLEARER * share.max(0))
-    return normals * ((1 - 2 * outer) * is_clear)[:, None]
-
-
-def across_walls(points: np.ndarray, outward: np.ndarray, limit: float) -> np.ndarray:
-    """Give for each sample the number of the nearest one of an opposite side, or -1, (m,)."""
-    across, nearest = np.full(len(points), -1), np.full(len(points), np.inf)
-    for column, sign in ((c, s) for c in range(3) for s in (1, -1)):
-        (own,) = np.nonzero(sign * outward[:, column] > 0.577)
-        if len(own) == 0:
-            continue
-        distance, found = KDTree(points[own]).query(points, distance_upper_bound=limit)
-        number = own[np.minimum(found, len(own) - 1)]
-        is_opposite = (outward[number] * outward).sum(1) < 0
-        is_better = is_opposite & (distance < nearest)
-        across = np.where(is_better, number, across)
-        nearest = np.where(is_better, distance, nearest)
-    return across
-
-
-_PER_METRE = {"mm": 1000.0, "cm": 100.0, "inches": 39.37}
-_MM = {"cm": 10.0, "inches": 25.4}
-_LARGEST_SHARE = 1.5  # a cloud is part of its object; noise and grown masks make it somewhat larger
-_SMALLEST_SHARE = 0.1  # what shows less than a tenth of the diameter cannot be posed anyway
-_LIKELY_SHARE = 0.3  # a cloud too large is of another unit if that makes it as long as this
-_USUAL_SHARE, _AS_LIKELY = 0.7, 0.3
-"""What is seen of an object is about so long; of units that give it within 35 % all are named."""
-
-
-def unit_advice(model_diameter_m: float, points_m: Float[Tensor, "n 3"]) -> str | None:
-    """Say that the model and the cloud seem to be of different units; None where they agree.
-
-    The size of a cloud is twice the distance from its median that 95 % of the points stay within:
-    a few flying pixels do not change it.
-
-    Args:
-        model_diameter_m: of the model, in what was taken for metres.
-        points_m: of the object, in what was taken for metres.
-    """
-    if len(points_m) < 2:
-        return None
-    distance_m = (points_m - points_m.median(0).values).norm(dim=-1)
-    size_m = 2 * float(distance_m.kthvalue(1 + int(0.95 * (len(distance_m) - 1))).values)
-    if size_m <= 0:
-        return None
-    share = size_m / model_diameter_m
-    if _SMALLEST_SHARE <= share <= _LARGEST_SHARE:
-        return None
-    more, larger, smaller = max(share, 1 / share), "model", "cloud"
-    if share > 1:
-        larger, smaller = smaller, larger
-    # Five times too large is a mask of more than the object sooner than a sliver in inches.
-    least = _LIKELY_SHARE if share > 1 else _SMALLEST_SHARE
-    fits = {unit: share * factor if share < 1 else share / factor
-            for unit, factor in _PER_METRE.items()}  # fmt: skip
-    likely = {abs(math.log(fit / _USUAL_SHARE)): unit for unit, fit in fits.items()
-              if least <= fit <= _LARGEST_SHARE}  # fmt: skip
-    if likely:
-        best = min(likely)
-        units = " or ".join(unit for off, unit in likely.items() if off < best + _AS_LIKELY)
-        return f"your {larger} is {more:.0f} times larger than the {smaller}: is it in {units}?"
-    units = " or ".join(
-        unit for unit, mm in _MM.items()
-        if _LIKELY_SHARE <= (share * mm if share < 1 else share / mm) <= _LARGEST_SHARE
-    )  # fmt: skip
-    relation = "larger" if share > 1 else "smaller"
-    return (
-        f"the cloud is {more:.1f} times {relation} than the model: is this the right object, and "
-        f"does the mask fit it?{f' Or is the {smaller} in {units}?' if units else ''}"
-    )
 
 
 _COARSE_MESH = 1000  # a mesh of fewer points (a box: eight) also takes keypoints inside its faces

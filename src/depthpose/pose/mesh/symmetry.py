@@ -1,14 +1,13 @@
 """Symmetries found in a shape, near-symmetries, and how far it is from its mirror image."""
 
 import math
-from collections import OrderedDict
 from collections.abc import Callable, Iterable
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from hashlib import sha256
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 import numpy as np
 import torch
@@ -28,40 +27,14 @@ from depthpose.pose.mesh.models import (
 )
 from depthpose.pose.types import Axis, ObjectModel, Symmetries
 
-ValueT = TypeVar("ValueT")
-
-_MOST_IN_MEMORY = 128  # values in memory
-_memory: OrderedDict[str, Any] = OrderedDict()
-
-
-def kept(
-    model: ObjectModel,
-    name: str,
-    compute: Callable[[ObjectModel], Any],
-    decode: Callable[[Any], ValueT],
-) -> ValueT:
-    """Give a value of a model that takes long to compute.
-
-    It is kept in ``$DEPTHPOSE_CACHE``, where that can be written to.
-    """
-    place = f"{name}/{_key_of(model)}.json"
-    if place not in _memory:
-        path = cache_folder() / place
-        try:
-            _memory[place] = decode(read_json(path))
-        except (InputError, OSError, KeyError, TypeError, ValueError, RuntimeError):
-            value = compute(model)
-            with suppress(InputError, OSError):
-                write_json(path, value)
-            _memory[place] = decode(value)
-        while len(_memory) > _MOST_IN_MEMORY:
-            _memory.popitem(last=False)
-    return _memory[place]
-
 
 @lru_cache(maxsize=64)
-def _key_of(model: ObjectModel) -> str:
-    """Name a shape and its symmetries by their bytes, and by the code that computes."""
+def kept(model: ObjectModel, compute: Callable[..., Any], name: str, *settings: float) -> Any:  # noqa: ANN401
+    """Give JSON values of a model that take long to compute.
+
+    They are kept in ``$DEPTHPOSE_CACHE``, where that can be written to, by the bytes of the shape
+    and its symmetries, and by the code that computes.
+    """
     symmetries = model.symmetries
     tensors = [model.vertices_m, model.faces]
     if symmetries.discrete is not None:
@@ -72,7 +45,15 @@ def _key_of(model: ObjectModel) -> str:
         digest.update(path.read_bytes())
     for tensor in tensors:
         digest.update(tensor.contiguous().numpy().tobytes())
-    return digest.hexdigest()
+    folder = "_".join(map(str, (name, *settings)))
+    path = cache_folder() / folder / f"{digest.hexdigest()}.json"
+    try:
+        return read_json(path)
+    except (InputError, OSError):
+        value = compute(model, *settings)
+        with suppress(InputError, OSError):
+            write_json(path, value)
+        return value
 
 
 _EYE = torch.eye(3, dtype=torch.float64)
@@ -207,7 +188,8 @@ def symmetries_from_proposals(proposals: list[SymmetryProposal]) -> Symmetries:
     for first in every if not axes else ():  # grows under way: products until there is no new one
         for second in kept:
             product = first @ second
-            if _is_apart(product.R, [_EYE, *(turn.R for turn in every)], _SAME_RAD):
+            known = [_EYE, *(turn.R for turn in every)]
+            if all(float(geodesic_rad(product.R, R)) > _SAME_RAD for R in known):
                 every.append(product)
         if len(every) > 60:  # what passes 60 was no group (an icosahedron's)
             every = kept
@@ -233,19 +215,26 @@ def with_found_symmetries(
         is_taken: give the model these symmetries.
         tolerance: as for :func:`propose_symmetries`.
     """
-    if not (is_taken or on_message) or not model.symmetries.is_none:
+    declared = model.symmetries
+    if not (is_taken or on_message) or declared.discrete is not None or declared.continuous:
         return model
-
-    def search(model: ObjectModel) -> list[Any]:
-        return [
-            (p.kind, p.axis.direction.tolist(), p.axis.point_m.tolist(), p.angle_rad, p.deviation,
-             p.certainty)
-            for p in propose_symmetries(model, tolerance)
-        ]  # fmt: skip
-
-    proposals = kept(model, f"symmetries_{tolerance}", search, _proposals_of)
+    proposals = [
+        SymmetryProposal(
+            kind=kind,
+            axis=Axis(
+                direction=torch.tensor(direction, dtype=torch.float64),
+                point_m=torch.tensor(point_m, dtype=torch.float64),
+            ),
+            angle_rad=angle_rad,
+            deviation=deviation,
+            certainty=certainty,
+        )
+        for kind, direction, point_m, angle_rad, deviation, certainty in kept(
+            model, _proposal_rows, "symmetries", tolerance
+        )
+    ]
     found = replace(symmetries_from_proposals(proposals), is_found=True)
-    if found.is_none:
+    if found.discrete is None and not found.continuous:
         return model
     turns = 0 if found.discrete is None else len(found.discrete.R)
     certainty = min(p.certainty for p in proposals if p.certainty >= SURE)
@@ -262,20 +251,12 @@ def with_found_symmetries(
     return replace(model, symmetries=found) if is_taken else model
 
 
-def _proposals_of(rows: list[Any]) -> list[SymmetryProposal]:
+def _proposal_rows(model: ObjectModel, tolerance: float) -> list[Any]:
     return [
-        SymmetryProposal(
-            kind=kind,
-            axis=Axis(
-                direction=torch.tensor(direction, dtype=torch.float64),
-                point_m=torch.tensor(point_m, dtype=torch.float64),
-            ),
-            angle_rad=angle_rad,
-            deviation=deviation,
-            certainty=certainty,
-        )
-        for kind, direction, point_m, angle_rad, deviation, certainty in rows
-    ]
+        (p.kind, p.axis.direction.tolist(), p.axis.point_m.tolist(), p.angle_rad, p.deviation,
+         p.certainty)
+        for p in propose_symmetries(model, tolerance)
+    ]  # fmt: skip
 
 
 def _is_apart(R: Tensor, others: Iterable[Tensor], limit_rad: float) -> bool:
@@ -381,30 +362,25 @@ def mirror_deviation(model: ObjectModel) -> float:
     Args:
         model: the object, a mesh or points with normals.
     """
-
-    def compute(model: ObjectModel) -> float:
-        surface = SurfaceDeviation(model)
-        # Reflections, or reflections with a quarter turn or a half, that fit roughly: by 0, 90, 180
-        # and 270 degrees about the normal n: cos (1 - nn') + sin [n] - nn'.
-        normals = torch.cat([surface.axes, fibonacci_directions(_MIRROR_PLANES)])
-        along = normals[:, :, None] * normals[:, None]
-        across, crossed = _EYE - along, torch.linalg.cross(normals[:, None], _EYE[None])
-        ways = ((1, 0), (0, 1), (-1, 0), (0, -1))
-        every = torch.cat([c * across + s * crossed - along for c, s in ways])
-        starts: list[Float64[Tensor, "3 3"]] = []
-        for k in surface.rough_distance(every).argsort().tolist():
-            if len(starts) < _MIRROR_STARTS and _is_apart(every[k], starts, _APART_RAD):
-                starts.append(every[k])
-        turns = [refine_turn(surface, R @ _FLIP, _FLIP) for R in starts]
-        R, shift = torch.stack([t.R for t in turns]) @ _FLIP, torch.stack([t.t_m for t in turns])
-        return float(surface.deviation(R, shift).min())
-
-    return kept(model, "mirror_deviation", compute, float)
+    return float(kept(model, _mirror_search, "mirror_deviation"))
 
 
-def is_mirror_alike(model: ObjectModel) -> bool:
-    """Whether the mirror image of a model is the model itself as far as a depth sensor can tell."""
-    return mirror_deviation(model) <= MIRROR_ALIKE
+def _mirror_search(model: ObjectModel) -> float:
+    surface = SurfaceDeviation(model)
+    # Reflections, or reflections with a quarter turn or a half, that fit roughly: by 0, 90, 180
+    # and 270 degrees about the normal n: cos (1 - nn') + sin [n] - nn'.
+    normals = torch.cat([surface.axes, fibonacci_directions(_MIRROR_PLANES)])
+    along = normals[:, :, None] * normals[:, None]
+    across, crossed = _EYE - along, torch.linalg.cross(normals[:, None], _EYE[None])
+    ways = ((1, 0), (0, 1), (-1, 0), (0, -1))
+    every = torch.cat([c * across + s * crossed - along for c, s in ways])
+    starts: list[Float64[Tensor, "3 3"]] = []
+    for k in surface.rough_distance(every).argsort().tolist():
+        if len(starts) < _MIRROR_STARTS and _is_apart(every[k], starts, _APART_RAD):
+            starts.append(every[k])
+    turns = [refine_turn(surface, R @ _FLIP, _FLIP) for R in starts]
+    R, shift = torch.stack([t.R for t in turns]) @ _FLIP, torch.stack([t.t_m for t in turns])
+    return float(surface.deviation(R, shift).min())
 
 
 def refine_turn(
@@ -455,31 +431,35 @@ def near_symmetries(model: ObjectModel) -> tuple[NearSymmetry, ...]:
     Args:
         model: the object, a mesh or points with normals.
     """
-    return kept(model, "near_symmetries", _search, _decoded)[0]
+    near = kept(model, _search, "near_symmetries")["near"]
+    turns = [(torch.tensor(matrix, dtype=torch.float64), deviation) for matrix, deviation in near]
+    return tuple(
+        NearSymmetry(model_from_model=Rigid(M[:3, :3], M[:3, 3]), deviation=deviation)
+        for M, deviation in turns
+    )
 
 
-def true_symmetries(model: ObjectModel) -> Symmetries:
+def true_symmetries(
+    model: ObjectModel, alike: tuple[list[bool], list[bool]] | None = None
+) -> Symmetries:
     """Give the symmetries whose copies are one pose.
 
     Declared ones are all. Of those that were found in the geometry, copies that lie 1 % of the
     diameter and more off the surface are left out: near-symmetries.
+
+    Args:
+        model: the object.
+        alike: which discrete symmetries and which axes look alike; None: as a search finds them.
     """
-    if not model.symmetries.is_found:
-        return model.symmetries
-    return _marked(model.symmetries, kept(model, "near_symmetries", _search, _decoded)[1])
-
-
-def _decoded(
-    found: Any,  # noqa: ANN401
-) -> tuple[tuple[NearSymmetry, ...], tuple[list[bool], list[bool]]]:
-    """Give the turns that nearly look alike; which found symmetries and axes look alike."""
-    turns = torch.tensor([matrix for matrix, _ in found["near"]], dtype=torch.float64)
-    near = [
-        NearSymmetry(model_from_model=Rigid(M[:3, :3], M[:3, 3]), deviation=deviation)
-        for M, (_, deviation) in zip(turns.reshape(-1, 4, 4), found["near"], strict=True)
-    ]
-    discrete, axes = found["alike"]
-    return tuple(near), (discrete, axes)
+    given = model.symmetries
+    if not given.is_found:
+        return given
+    turns, axes = kept(model, _search, "near_symmetries")["alike"] if alike is None else alike
+    discrete = given.discrete
+    if discrete is not None:
+        discrete = discrete[torch.tensor(turns)] if any(turns) else None
+    continuous = tuple(a for a, is_alike in zip(given.continuous, axes, strict=True) if is_alike)
+    return Symmetries(discrete=discrete, continuous=continuous, is_found=True)
 
 
 def _search(model: ObjectModel) -> dict[str, Any]:
@@ -491,7 +471,7 @@ def _search(model: ObjectModel) -> dict[str, Any]:
     if given.discrete is not None:
         discrete = (surface.deviation(given.discrete.R.double()) <= ALIKE).tolist()
     alike = (discrete, axes)
-    same = symmetry_transforms(_marked(given, alike) if given.is_found else given, _FINE_STEP).R
+    same = symmetry_transforms(true_symmetries(model, alike), _FINE_STEP).R
     # Symmetries that were found, and turns refined to where they fit best: a scan whose points lie
     # denser on one side has its centre where no symmetry has it.
     copies = symmetry_transforms(given, _STEP).R.double()[1:]
@@ -525,13 +505,3 @@ def _deviations(turns: list[Rigid], surface: SurfaceDeviation) -> list[tuple[flo
         return []
     R, shift = torch.stack([t.R for t in turns]), torch.stack([t.t_m for t in turns])
     return list(zip(surface.deviation(R, shift).tolist(), turns, strict=True))
-
-
-def _marked(given: Symmetries, alike: tuple[list[bool], list[bool]]) -> Symmetries:
-    """Give the symmetries whose copies lie on the surface."""
-    discrete = given.discrete
-    if discrete is not None:
-        discrete = discrete[torch.tensor(alike[0])] if any(alike[0]) else None
-    marked = zip(given.continuous, alike[1], strict=True)
-    axes = tuple(axis for axis, is_alike in marked if is_alike)
-    return Symmetries(discrete=discrete, continuous=axes, is_found=True)

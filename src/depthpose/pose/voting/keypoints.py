@@ -1,5 +1,6 @@
 """Directions to keypoints to a pose: least squares, RANSAC, rigidity, Kabsch, covariances."""
 
+import math
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -9,8 +10,9 @@ from torch import Tensor
 
 from depthpose.core.errors import InputError
 from depthpose.core.rigid import Rigid, cross_matrix, fit_rigid, perturb
-from depthpose.pose.config import VotingConfig
-from depthpose.pose.types import Axis, PoseFit, Symmetries, Vote
+from depthpose.pose.cloud import Refusal
+from depthpose.pose.config import EstimateConfig, VotingConfig
+from depthpose.pose.types import ObjectModel, PoseFit, Vote
 
 _SMALLEST = 1e-12
 _NEAREST = 0.1
@@ -199,13 +201,15 @@ def vote_ransac(
     best = torch.where(is_crossing, inlier_test.score(tried), 0).argmax(-1)[..., None, None]
     keypoint = tried.gather(-2, best.expand(*best.shape[:-1], 3))
     # Once toward what the best hypothesis gathered, then with those that agree on that.
-    used, _ = _inliers(lines, inlier_test, keypoint)
-    again = meet_prepared(
-        lines._replace(weights=used), torch.zeros_like(centre_m), min(config.refinements, 1)
-    )
-    used, share = _inliers(lines, inlier_test, again.keypoints_m[..., None, :])
-    vote = meet_prepared(lines._replace(weights=used), centre_m, config.refinements)
-    return replace(vote, inlier_share=share)
+    for steps in (min(config.refinements, 1), config.refinements):
+        agreeing = inlier_test.agree(keypoint).squeeze(-2) * w
+        is_enough = (agreeing > 0).sum(-1, keepdim=True) >= 3
+        # Where fewer agree than fix a point with its covariance all votes are used, the share is 0.
+        share = torch.where(is_enough, agreeing, 0).sum(-1) / w.sum(-1)
+        used = lines._replace(weights=torch.where(is_enough, agreeing, w))
+        vote = meet_prepared(used, torch.zeros_like(centre_m), steps)
+        keypoint = vote.keypoints_m[..., None, :]
+    return replace(vote, keypoints_m=vote.keypoints_m + centre_m, inlier_share=share)
 
 
 class InlierTest:
@@ -234,59 +238,75 @@ class InlierTest:
     @torch.no_grad()
     def score(self, tried: Float[Tensor, "*batch k h 3"]) -> Float[Tensor, "*batch k h"]:
         """Add up the weight of the lines that agree with each hypothesis."""
-        each, n = _polynomials(tried), self._w.shape[-1]
-        lines, rows = each[0].shape[:2]
+        flat, n = tried.flatten(0, -3), self._w.shape[-1]
+        lines, rows = flat.shape[:2]
         if tried.device.type == "cpu":
             rows = max(1, min(rows, _BLOCK // (lines * n)))
         memory = tried.new_empty(2, lines * rows * n)
-        scores = tried.new_empty(tried.shape[:-1])
-        flat = scores.view(lines, -1)
-        for part in range(0, flat.shape[-1], rows):
-            agreed = self._agree([e[:, part : part + rows] for e in each], memory)
+        scores = tried.new_empty(flat.shape[:-1])
+        for part in range(0, flat.shape[1], rows):
+            agreed = self.agree(flat[:, part : part + rows], memory)
             agreed = agreed.mul_(self._w) if self._is_weighted else agreed
-            flat[:, part : part + rows] = agreed.sum(-1)
-        return scores
+            scores[:, part : part + rows] = agreed.sum(-1)
+        return scores.view(tried.shape[:-1])
 
     @torch.no_grad()
-    def agree(self, tried: Float[Tensor, "*batch k h 3"]) -> Float[Tensor, "*batch k h n"]:
-        """Give 1 where a line agrees with a hypothesis, else 0."""
-        n = self._w.shape[-1]
-        memory = tried.new_empty(2, tried[..., 0].numel() * n)
-        return self._agree(_polynomials(tried), memory).view(*tried.shape[:-1], n)
-
-    def _agree(self, tried: list[Tensor], memory: Tensor) -> Float[Tensor, "b h n"]:
-        shape = (*tried[0].shape[:2], self._w.shape[-1])
-        size = shape[0] * shape[1] * shape[2]
-        along = torch.bmm(tried[0], self._along, out=memory[0, :size].view(shape))
-        far = torch.bmm(tried[1], self._far, out=memory[1, :size].view(shape))
+    def agree(
+        self, tried: Float[Tensor, "*batch k h 3"], memory: Tensor | None = None
+    ) -> Float[Tensor, "*batch k h n"]:
+        """Give 1 where a line agrees with a hypothesis, else 0; the answer lies in ``memory``."""
+        flat = tried.detach().flatten(0, -3)
+        square, one = flat.square().sum(-1, keepdim=True), torch.ones_like(flat[..., :1])
+        shape = (*flat.shape[:2], self._w.shape[-1])
+        size = math.prod(shape)
+        memory = tried.new_empty(2, size) if memory is None else memory
+        along, far = (part[:size].view(shape) for part in memory)
+        torch.bmm(torch.cat([flat, one], -1), self._along, out=along)
+        torch.bmm(torch.cat([flat, square, one], -1), self._far, out=far)
         if self._limit is not None:
-            return far.addcmul_(along, along, value=-1).lt_(self._limit)
-        # What points away reaches nothing, and no square is below its own share.
-        return far.addcmul_(along.clamp_(min=0), along, value=-1).lt_(0)
+            agreed = far.addcmul_(along, along, value=-1).lt_(self._limit)
+        else:  # what points away reaches nothing, and no square is below its own share
+            agreed = far.addcmul_(along.clamp_(min=0), along, value=-1).lt_(0)
+        return agreed.view(*tried.shape[:-1], shape[-1])
 
 
-def _polynomials(tried: Float[Tensor, "*batch k h 3"]) -> list[Tensor]:
-    """Give ``(h, 1)`` and ``(h, |h|^2, 1)``, keypoints and objects on one axis."""
-    flat = tried.detach().flatten(0, -3)
-    whole = torch.cat(
-        [flat, flat.square().sum(-1, keepdim=True), torch.ones_like(flat[..., :1])], -1
-    )
-    return [whole[..., [0, 1, 2, 4]], whole]
-
-
-def _inliers(
-    lines: Lines, inlier_test: InlierTest, keypoint: Float[Tensor, "*batch k 1 3"]
-) -> tuple[Float[Tensor, "*batch k n"], Float[Tensor, "*batch k"]]:
-    """Give the weights of the lines that agree with a keypoint, and their share."""
-    w = lines.weights
-    kept = inlier_test.agree(keypoint).squeeze(-2) * w
-    is_enough = (kept > 0).sum(-1, keepdim=True) >= 3
-    # Where fewer agree than fix a point with its covariance all votes are used; the share is 0.
-    share = torch.where(is_enough, kept, 0).sum(-1) / w.sum(-1)
-    return torch.where(is_enough, kept, w), share
-
-
+_LEAST = 4  # keypoints that must agree: three fix a pose with nothing left to contradict it
 _STEPS = 4  # Gauss-Newton from Kabsch: the fourth step is below float64's noise
+
+
+def fits_of(vote: Vote, model: ObjectModel, config: EstimateConfig) -> PoseFit | Refusal:
+    """Fit the keypoints that agree; where ICP refines the fits, also all of them.
+
+    Returns:
+        One fit or two as a batch; or why there is none.
+    """
+    found = (vote.condition <= config.voting.max_condition) & (vote.inlier_share > 0)
+    total = len(found)
+    if int(found.sum()) < _LEAST:
+        return Refusal(
+            status="votes do not meet",
+            reason=f"the directions meet at {int(found.sum())} of {total} keypoints, but {_LEAST} "
+            "are needed: too few points, or not the object that the mask promises",
+        )
+    strict, rough = config.voting.rigidity_diameters, config.rough_rigidity_diameters
+    limit_m = model.diameter_m * (rough if config.with_icp else strict)
+    used = consistent_keypoints(vote.keypoints_m, model.keypoints_m, limit_m, found)
+    choices = [used] if int(used.sum()) >= _LEAST else []
+    if config.with_icp and not torch.equal(used, found):
+        choices.append(found)
+    if not choices:
+        return Refusal(
+            status="keypoints do not fit",
+            reason=f"{int(used.sum())} of {total} keypoints have the model's distances within "
+            f"{limit_m:.2g} m, but {_LEAST} are needed: another object, or too much of it occluded",
+        )
+    count = len(choices)
+    return fit_pose(
+        vote.keypoints_m.expand(count, -1, -1),
+        vote.covariance_m2.expand(count, -1, -1, -1),
+        model.keypoints_m,
+        torch.stack(choices),
+    )
 
 
 def fit_pose(
@@ -322,60 +342,26 @@ def fit_pose(
     # One keypoint that looks exact must not decide alone; a rotation takes three.
     most = 100 * trace.median(-1, keepdim=True).values.clamp(min=1e-300)
     pose = fit_rigid(model, found, trace.clamp(max=most))
-    for _ in range(_STEPS):
-        H, step = _normal_equations(pose, model, found, information)
-        pose = perturb(pose, torch.linalg.solve(H, step))
-    H, _ = _normal_equations(pose, model, found, information)
-    error_m = pose.apply(model) - found
+    moved_m, eye = pose.apply(model), torch.eye(3).to(model).expand(*model.shape, 3)
+    steps = 0
+    while True:
+        # The information matrix of (rotation, translation), and the right side.
+        J = torch.cat([-cross_matrix(moved_m), eye], -1)
+        weighted = J.mT @ information
+        H = (weighted @ J).sum(-3)
+        if steps == _STEPS:
+            break
+        pull = (weighted @ (found - moved_m)[..., None]).sum(-3).squeeze(-1)
+        pose = perturb(pose, torch.linalg.solve(H, pull))
+        moved_m = pose.apply(model)
+        steps += 1
+    error_m = moved_m - found
     square = (error_m.square().sum(-1) * used).sum(-1) / used.sum(-1)
     return PoseFit(
         camera_from_model=Rigid(pose.R.to(keypoints_m), pose.t_m.to(keypoints_m)),
         covariance=torch.linalg.inv(H).to(keypoints_m),
         residual_m=square.sqrt().to(keypoints_m),
     )
-
-
-def free_motions(axes: tuple[Axis, ...], camera_from_model: Rigid) -> Float[Tensor, "m 6"]:
-    """Give the motions of the camera frame that turn the object about its axes of revolution.
-
-    Unit vectors of (rotation, translation): along them no observation says anything, the variance
-    is infinite, and the pose is valid all the same. Two axes make a ball, which is free to turn
-    about the third too.
-    """
-    rows = []
-    centre_m = Symmetries(continuous=axes).ball_centre_m
-    if centre_m is not None:  # turns about two axes of a ball make those about every axis
-        axes = tuple(Axis(direction=row, point_m=centre_m) for row in torch.eye(3).to(centre_m))
-    for axis in axes if centre_m is not None else axes[:1]:
-        direction = camera_from_model.R @ axis.direction.to(camera_from_model.R)
-        point_m = camera_from_model.apply(axis.point_m.to(camera_from_model.R)[None])[0]
-        # Turning by w about a line through c moves c nowhere: w x c + v = 0.
-        motion = torch.cat([direction, torch.linalg.cross(point_m, direction)])
-        rows.append(motion / motion.norm())
-    return torch.stack(rows) if rows else camera_from_model.R.new_zeros(0, 6)
-
-
-def _normal_equations(
-    pose: Rigid, model: Tensor, found: Tensor, information: Tensor
-) -> tuple[Float64[Tensor, "*batch 6 6"], Float64[Tensor, "*batch 6"]]:
-    """Give the information matrix of (rotation, translation), and the right side."""
-    moved_m = pose.apply(model)
-    eye = torch.eye(3, dtype=moved_m.dtype, device=moved_m.device).expand(*moved_m.shape, 3)
-    J = torch.cat([-cross_matrix(moved_m), eye], -1)
-    weighted = J.mT @ information
-    step = (weighted @ (found - moved_m)[..., None]).sum(-3).squeeze(-1)
-    return (weighted @ J).sum(-3), step
-
-
-def distance_errors(
-    keypoints_m: Float[Tensor, "*batch k 3"], model_keypoints_m: Float[Tensor, "k 3"]
-) -> Float[Tensor, "*batch k k"]:
-    """Found minus known distance of each pair of keypoints [m]: 28 pairs of 8, each twice."""
-    found, known = (
-        (points_m[..., :, None, :] - points_m[..., None, :, :]).norm(dim=-1)
-        for points_m in (keypoints_m, model_keypoints_m.to(keypoints_m))
-    )
-    return found - known
 
 
 def consistent_keypoints(
@@ -399,7 +385,11 @@ def consistent_keypoints(
     Returns:
         Those that stay; three or more of them fix a pose.
     """
-    errors_m = distance_errors(keypoints_m, model_keypoints_m).abs()
+    found, known = (
+        (points_m[..., :, None, :] - points_m[..., None, :, :]).norm(dim=-1)
+        for points_m in (keypoints_m, model_keypoints_m.to(keypoints_m))
+    )
+    errors_m = (found - known).abs()
     count = keypoints_m.shape[-2]
     stays = torch.ones(keypoints_m.shape[:-1], dtype=torch.bool, device=keypoints_m.device)
     stays = stays if is_found is None else is_found.clone()
