@@ -2,25 +2,25 @@
 
 import math
 import re
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Literal
 
-from depthpose.cli.arguments import Device, Source, WeightsName, group, shown_as
+from depthpose.cli.arguments import Device, Source, WeightsName, shown_as
 from depthpose.core.errors import InputError
 from depthpose.depth.config import Answer, BaselineName, MatcherConfig, Speed
 
 _POWERS = {"": 0, "K": 1, "M": 2, "G": 3, "T": 4}
 
 
-@group
+@dataclass(frozen=True, kw_only=True)
 class MatcherOptions:
     """How the weights run."""
 
     device: Device = "cpu"
     precision: Literal["fp32", "bf16"] = "fp32"
     """fp32, or bf16: faster, with errors of a few hundredths of a pixel."""
-    max_memory: Annotated[str | None, shown_as("SIZE")] = None
+    max_memory: Annotated[str | None, shown_as(metavar="SIZE")] = None
     """limit on a matcher's activations, such as 1GB or 800MB; the result stays exact."""
     speed: Speed = "fine"
     """quick: at the size that the weights were trained at; fine: one image in a larger size too, a
@@ -37,7 +37,7 @@ class MatcherOptions:
         )
 
 
-@group
+@dataclass(frozen=True, kw_only=True)
 class LensOptions:
     """What is known of the camera of single images; without any of it their EXIF is read."""
 
@@ -50,7 +50,7 @@ class LensOptions:
     """horizontal field of view in degrees, in place of both."""
 
 
-@group
+@dataclass(frozen=True, kw_only=True)
 class ScaleOptions:
     """What sets the metres of single images."""
 
@@ -79,7 +79,7 @@ class ScaleOptions:
         return column, row, metres
 
 
-@group
+@dataclass(frozen=True, kw_only=True)
 class MatchOptions(MatcherOptions):
     """How the matcher of the weights runs; sgbm takes none of these."""
 
@@ -92,7 +92,7 @@ class MatchOptions(MatcherOptions):
         return replace(super().config, with_left_right_check=self.left_right_check)
 
 
-@group
+@dataclass(frozen=True, kw_only=True)
 class PairNetworks:
     """What matches real pairs, whether they are checked, and what is written."""
 
@@ -107,7 +107,7 @@ class PairNetworks:
     """refuse pairs that are swapped, not rectified or no pair; warn where this cannot be told."""
 
 
-@group
+@dataclass(frozen=True, kw_only=True)
 class ImageNetworks:
     """Which networks answer depth of one image."""
 
@@ -123,7 +123,7 @@ class ImageNetworks:
     """also answer out-of-distribution images, with a warning (NAME.warning.txt)."""
 
 
-@group
+@dataclass(frozen=True, kw_only=True)
 class PredictOutput:
     """What is written, and how many images go together."""
 
@@ -150,7 +150,7 @@ def refuse_unusable(scale: ScaleOptions, output: PredictOutput) -> None:
         raise InputError(f"--camera-tilt {scale.camera_tilt:g}: give -45 to 45 degrees")
 
 
-@group
+@dataclass(frozen=True, kw_only=True)
 class MethodOptions:
     """What is measured; several at once share the table."""
 
@@ -177,7 +177,7 @@ class MethodOptions:
     """names of frames to leave out of them."""
 
 
-@group
+@dataclass(frozen=True, kw_only=True)
 class ProtocolOptions:
     """How prediction and truth are compared."""
 

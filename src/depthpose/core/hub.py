@@ -23,9 +23,8 @@ _NAME = r"[\w-][\w.-]*/[\w-][\w.-]*"
 _REFERENCE = re.compile(rf"hf://?(?P<repository>{_NAME})(@(?P<revision>[^/@]+))?(/(?P<file>.+))?")
 
 
-def is_on_hub(name: str | Path) -> bool:
-    """Say whether a name is one of the hub."""
-    return str(name).startswith("hf:/")
+ON_HUB = "hf:/"
+"""Begins a name of the hub."""
 
 
 @cache
@@ -110,7 +109,7 @@ def find_weights(name: str | Path) -> Path:
             f"{path}: a folder of weights holds one .safetensors file, or one called "
             f"{WEIGHTS_FILE}; here: {which}. Name the file."
         )
-    if is_on_hub(name):
+    if str(name).startswith(ON_HUB):
         return fetch_weights(str(name))
     if str(name) in _IN_REPOSITORY:
         raise InputError(
