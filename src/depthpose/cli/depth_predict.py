@@ -23,6 +23,7 @@ from depthpose.core.camera import Camera, FieldOfView, StereoRig, camera_of, rea
 from depthpose.core.camera.pinhole import camera_keys
 from depthpose.core.checkpoint import file_sha256, find_weights, read_checkpoint
 from depthpose.core.config import config_to_dict
+from depthpose.core.devices import own_device
 from depthpose.core.draw import draw_depth
 from depthpose.core.engine import Files, Function, Inputs, Sample, Work
 from depthpose.core.errors import InputError
@@ -96,7 +97,7 @@ class MethodSource:
             with self.weights.unpacked() as file:
                 return replace(self, weights=file).build()
         config = with_usable_precision(self.config)  # what is computed in is what is recorded
-        config = replace(config, device=run.own_device(config.device))
+        config = replace(config, device=own_device(config.device))
         path = find_weights(self.weights)
         kind = read_checkpoint(path).kind
         is_matcher = kind in MATCHERS
@@ -354,7 +355,8 @@ def estimate_all(
     videos = [files[0].stem for files in sources if _is_video(files[0])]
     endings = [f".{end}" for end in ENDINGS] + [_VIDEO]
     run.claim_names(out, {files[0].stem: files for files in sources}, endings, videos)
-    mine = [sources[k] for k in run.find_rank().share(len(sources))]
+    process = run.find_rank()
+    mine = sources[process.rank :: process.world]
     predictor = Predictor(work, method, out)
     stills = [files for files in mine if not _is_video(files[0])]
     named = (one for files in stills for one in work.inputs_of(files))
@@ -367,7 +369,7 @@ def estimate_all(
         print(f"depthpose: failed: {failure}", file=sys.stderr)
     count = f"{done} of {len(mine)} pairs" if work.files == PAIRS else f"{done} depth maps"
     print(f"{count} are in {out}")
-    if run.find_rank().rank == 0:
+    if process.rank == 0:
         ending = ".disparity_px.npy"
         frames = sorted(path.name.removesuffix(ending) for path in out.glob(f"*_??????{ending}"))
         finished: dict[tuple[Path, ...], list[str]] = {}

@@ -146,7 +146,7 @@ class EstimateOptions:
     @property
     def config(self) -> EstimateConfig:
         """Settings of the estimator, on the device of this process."""
-        from depthpose.core.run import own_device  # --help must not load torch
+        from depthpose.core.devices import own_device  # --help must not load torch
 
         if self.batch < 1:
             raise InputError(f"--batch {self.batch}: at least 1 input in one call of the network")

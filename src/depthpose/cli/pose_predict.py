@@ -337,7 +337,7 @@ def predict_all(
     process = run.find_rank()
     home = out if process.world == 1 else out / f"part-{process.rank}"
     done = _finished(out)
-    left = [jobs[k] for k in process.share(len(jobs)) if jobs[k].name not in done]
+    left = [job for job in jobs[process.rank :: process.world] if job.name not in done]
     if left:
         names = predict(safely(method), left, home, settings, batch)
         for _ in tqdm(names, total=len(left), disable=None, unit=" poses"):

@@ -122,6 +122,12 @@ def _named_device(name: str | torch.device) -> torch.device:
         ) from error
 
 
+def own_device(device: str) -> str:
+    """Give each process of a machine a GPU of its own: ``cuda`` is ``cuda:LOCAL_RANK``."""
+    local_rank = os.environ.get("LOCAL_RANK", "")
+    return f"cuda:{local_rank}" if device == "cuda" and local_rank.isdecimal() else device
+
+
 def computes_bf16(device: str | torch.device) -> bool:
     """Whether bfloat16 is computed in itself there.
 

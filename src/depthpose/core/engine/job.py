@@ -27,6 +27,7 @@ from depthpose.core.engine.work import (
     Item,
     Runner,
     Work,
+    is_unchanged,
     make_plan,
     read_shard,
 )
@@ -34,11 +35,10 @@ from depthpose.core.errors import InputError, MissingExtraError, import_extra
 from depthpose.core.files import disk, remove_parts
 from depthpose.core.run import (
     RECORD,
-    is_unchanged,
+    environment,
     not_ours,
     read_settings,
     refuse_other_settings,
-    run_record,
 )
 
 MANIFEST = "manifest.csv"
@@ -131,7 +131,8 @@ def claim(out: str, settings: Mapping[str, Any]) -> None:
     for name in (MANIFEST, PLAN, SHARDS):
         if disk.exists(disk.join(out, name)):
             raise not_ours(disk.join(out, name))
-    record = f"{json.dumps(run_record(settings), indent=2)}\n"
+    content = {"settings": dict(settings), "environment": environment()}
+    record = f"{json.dumps(content, indent=2)}\n"
     disk.publish_bytes(record.encode(), disk.join(out, RECORD))
 
 

@@ -20,7 +20,6 @@ from pathlib import Path, PurePosixPath
 from depthpose.core.errors import InputError
 from depthpose.core.files import disk
 from depthpose.core.files.disk import find_partners, refused_write
-from depthpose.core.run import file_stamp
 
 PLAN, SHARDS = "plan.jsonl", "shards"
 
@@ -349,7 +348,7 @@ class Done:
     shard: str  #: name of the shard, with its suffix
     entries: tuple[tuple[str, str], ...]  #: name and "" or the reason of its failure, of each input
     endings: tuple[str, ...]  #: that the files of a result may have
-    stamp: tuple[int, ...]  #: size, time and checksum of the shard (``file_stamp`` of core.run)
+    stamp: tuple[int, ...]  #: size, time and checksum of the shard (:func:`file_stamp`)
     block: int  #: checksum of the inputs
 
     @property
@@ -372,6 +371,26 @@ class Done:
         row = json.loads(text)
         row["entries"] = tuple((name, reason) for name, reason in row["entries"])
         return cls(**row | {key: tuple(row[key]) for key in ("endings", "stamp")})
+
+
+def file_stamp(path: Path) -> tuple[int, int, int]:
+    """Give size [bytes], time of the last change [ns] and CRC-32 of a file."""
+    status, checksum = path.stat(), 0
+    with path.open("rb") as file:
+        while chunk := file.read(2**22):
+            checksum = zlib.crc32(chunk, checksum)
+    return status.st_size, status.st_mtime_ns, checksum
+
+
+def is_unchanged(path: Path, stamp: Sequence[int]) -> bool:
+    """Whether a file is as it was when it had this stamp; it is read if its time is another one."""
+    try:
+        status = path.stat()
+        if not path.is_file() or status.st_size != stamp[0]:
+            return False
+        return status.st_mtime_ns == stamp[1] or file_stamp(path)[2] == stamp[2]
+    except (OSError, IndexError):
+        return False
 
 
 class Runner:
@@ -397,7 +416,7 @@ class Runner:
             entries = tuple(self._write(block, file, Path(scratch)))
             url = disk.join(self._out, SHARDS, file.name)
             disk.publish(file, url)
-            stamp = tuple(file_stamp(disk.local_path(url) or file))
+            stamp = file_stamp(disk.local_path(url) or file)
         done = Done(
             shard=file.name,
             entries=entries,
