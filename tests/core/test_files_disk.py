@@ -18,8 +18,8 @@ from depthpose.core.export import Export, Graph, freeze
 from depthpose.core.files import (
     Cloud,
     atomic_write,
-    disk,
     read_bytes,
+    stores,
     write_cloud,
     write_depth_png,
     write_image,
@@ -219,6 +219,6 @@ def test_a_folder_may_be_called_as_a_pattern_is_written(tmp_path: Path) -> None:
     folder = tmp_path / "run[1]"
     folder.mkdir()
     (folder / "0.json").write_bytes(b"{}")
-    assert disk.read_all(str(folder), ".json") == {"0.json": b"{}"}
-    assert disk.read_all(f"file://{folder}", ".json") == {"0.json": b"{}"}
-    assert disk.exists(str(folder / "0.json"))
+    assert stores.read_all(str(folder), ".json") == {"0.json": b"{}"}
+    assert stores.read_all(f"file://{folder}", ".json") == {"0.json": b"{}"}
+    assert stores.exists(str(folder / "0.json"))

@@ -37,9 +37,8 @@ from depthpose.core.files import (
     read_video,
     write_video,
 )
-from depthpose.core.files.disk import find_partners
+from depthpose.core.files.disk import find_partners, read_text
 from depthpose.core.files.images import LISTED_SUFFIXES
-from depthpose.core.files.text import read_text
 from depthpose.depth.config import Answer, MatcherConfig, SGBMConfig
 from depthpose.depth.estimator import FakestereoNet
 from depthpose.depth.ground import scale_by_distance

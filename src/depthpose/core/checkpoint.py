@@ -17,8 +17,7 @@ from torch import Tensor, nn
 from torch.overrides import TorchFunctionMode
 
 from depthpose.core.errors import InputError, Notice
-from depthpose.core.files.disk import refused_as, write_bytes
-from depthpose.core.files.text import refuse_number
+from depthpose.core.files.disk import refuse_number, refused_as, write_bytes
 from depthpose.core.hub import SHIPPED as SHIPPED
 from depthpose.core.hub import find_weights as find_weights
 

@@ -85,7 +85,7 @@ def read_config(path: Path, kind: type[ConfigT]) -> ConfigT:
         InputError: not YAML, an unknown key (its nearest name is said), or a value refused.
     """
     from depthpose.core.files import read_text  # here: options load without torch
-    from depthpose.core.files.text import parse_yaml
+    from depthpose.core.files.disk import parse_yaml
 
     content = parse_yaml(path, read_text(path, _MAX_BYTES))
     content = {} if content is None else content

@@ -20,7 +20,7 @@ from typing import Any
 import torch
 
 from depthpose.core.errors import InputError
-from depthpose.core.files import disk, read_json, remove_parts, write_json
+from depthpose.core.files import read_json, refused_as, remove_parts, stores, write_json
 from depthpose.core.files.disk import refused_write
 
 try:
@@ -343,10 +343,10 @@ def read_settings(folder: Path | str) -> dict[str, Any] | None:
     Raises:
         InputError: its record is damaged.
     """
-    if isinstance(folder, str) and disk.is_url(folder):
-        record = disk.join(folder, RECORD)
-        with disk.refused_as(record, "record of a run", "choose another folder"):
-            content = json.loads(disk.read_from(record)) if disk.exists(record) else None
+    if isinstance(folder, str) and stores.is_url(folder):
+        record = stores.join(folder, RECORD)
+        with refused_as(record, "record of a run", "choose another folder"):
+            content = json.loads(stores.read_from(record)) if stores.exists(record) else None
     else:
         record = Path(folder) / RECORD
         content = read_json(record) if record.is_file() else None

@@ -17,8 +17,7 @@ from torch import Tensor
 from depthpose.core.config import config_from_dict
 from depthpose.core.errors import InputError, Notice, nearest_name
 from depthpose.core.files import write_json
-from depthpose.core.files.disk import read_bytes, refused_as, write_bytes
-from depthpose.core.files.text import refuse_heavy
+from depthpose.core.files.disk import read_bytes, refuse_heavy, refused_as, write_bytes
 from depthpose.core.frame import data_frame
 from depthpose.core.rigid import Rigid
 from depthpose.core.run import claim_folder

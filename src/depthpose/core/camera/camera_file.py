@@ -47,8 +47,7 @@ from depthpose.core.camera.stored_camera import (
 )
 from depthpose.core.errors import InputError, nearest_name
 from depthpose.core.files import AnyPath, read_json, read_key_values, read_text, write_json
-from depthpose.core.files.disk import naming
-from depthpose.core.files.text import MAX_LIST_BYTES
+from depthpose.core.files.disk import MAX_LIST_BYTES, naming
 
 Matrix = Float64[np.ndarray, "rows columns"]
 
