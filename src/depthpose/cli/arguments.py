@@ -262,7 +262,7 @@ def refuse_words(command: str, options: Sequence[Option], words: Sequence[str]) 
         else:
             here.append(word)
     for name in (option.name.replace("_", "-") for option in options if option.names is not None):
-        if typed[name][:1] == [""]:
+        if typed.get(name, [])[:1] == [""]:
             raise InputError(
                 f"{spelled[name]} is empty; name a file or folder (the current folder is '.'), or "
                 "check the variable that should hold it"

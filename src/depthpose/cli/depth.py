@@ -41,7 +41,16 @@ def predict(
 
     if not images:
         raise InputError("name images, folders of them, patterns or videos to predict from")
-    options.refuse_unusable(scale, output)
+    near, far = output.color_range
+    height_m, tilt_deg = scale.camera_height, scale.camera_tilt
+    if not 0 < near < far:
+        raise InputError(f"--color-range {near, far}: give near and far metres, near first.")
+    if output.batch < 1:
+        raise InputError(f"--batch {output.batch}: give 1 or more images.")
+    if height_m is not None and not 0.1 <= height_m <= 20:
+        raise InputError(f"--camera-height {height_m:g}: give 0.1 to 20 metres")
+    if tilt_deg is not None and not -45 <= tilt_deg <= 45:
+        raise InputError(f"--camera-tilt {tilt_deg:g}: give -45 to 45 degrees")
     method = work.MethodSource(
         weights=networks.weights,
         config=matching.config,
@@ -55,6 +64,12 @@ def predict(
 
     def work_of(sources: Sequence[Path]) -> work.DepthWork:
         camera = work.read_lens(lens, sources)
+        mount_m = height_m or getattr(camera, "mount_height_m", None)
+        if tilt_deg is not None and mount_m is None:
+            raise InputError(
+                "--camera-tilt says where the road is together with --camera-height, or the "
+                "camera file's mount_height_m; give the height, or omit the tilt"
+            )
         return work.DepthWork(method=method, camera=camera, scale=scale, output=output)
 
     if engine.engine == "ray":

@@ -32,7 +32,7 @@ class MatcherOptions:
         return MatcherConfig(
             device=self.device,
             precision=self.precision,
-            max_memory_bytes=parse_bytes(self.max_memory),
+            max_memory_bytes=None if self.max_memory is None else parse_bytes(self.max_memory),
             speed=self.speed,
         )
 
@@ -66,10 +66,9 @@ class ScaleOptions:
     sets the scale of each image."""
 
     @property
-    def distance(self) -> tuple[float, float, float] | None:
+    def distance(self) -> tuple[float, float, float]:
         """The known distance: column, row [px], metres."""
-        if self.known_distance is None:
-            return None
+        assert self.known_distance is not None
         try:
             column, row, metres = (float(word) for word in self.known_distance.split(","))
         except ValueError as error:
@@ -135,21 +134,6 @@ class PredictOutput:
     """write a coloured point cloud of what is nearer than 80 m, NAME.cloud.ply."""
 
 
-def refuse_unusable(scale: ScaleOptions, output: PredictOutput) -> None:
-    """Refuse values out of their range."""
-    near, far = output.color_range
-    if not 0 < near < far:
-        raise InputError(
-            f"--color-range {output.color_range}: give near and far metres, near first."
-        )
-    if output.batch < 1:
-        raise InputError(f"--batch {output.batch}: give 1 or more images.")
-    if scale.camera_height is not None and not 0.1 <= scale.camera_height <= 20:
-        raise InputError(f"--camera-height {scale.camera_height:g}: give 0.1 to 20 metres")
-    if scale.camera_tilt is not None and not -45 <= scale.camera_tilt <= 45:
-        raise InputError(f"--camera-tilt {scale.camera_tilt:g}: give -45 to 45 degrees")
-
-
 @dataclass(frozen=True, kw_only=True)
 class MethodOptions:
     """What is measured; several at once share the table."""
@@ -197,10 +181,8 @@ class ProtocolOptions:
                 raise InputError(f"--cap {cap_m:g} is given twice; each cap is a row: give it once")
 
 
-def parse_bytes(text: str | None) -> int | None:
+def parse_bytes(text: str) -> int:
     """Read a size such as ``1GB``, ``800M`` or ``1500000`` (bytes); ``1GiB`` is 1024**3."""
-    if text is None:
-        return None
     size = re.fullmatch(r"\s*(\d+(?:\.\d+)?)\s*([KMGT]?)(i?)B?\s*", text, re.IGNORECASE)
     if size is None or (size[3] and not size[2]) or not float(size[1]):
         raise InputError(f"--max-memory {text!r}: not a size. Write, say, 1GB, 800MB or 1.5GiB.")

@@ -15,7 +15,6 @@ import torch
 from torch import Tensor
 from tqdm import tqdm
 
-from depthpose.cli.arguments import changed
 from depthpose.cli.depth_options import LensOptions, PredictOutput, ScaleOptions
 from depthpose.cli.engine import EngineOptions, Weights, say
 from depthpose.core import run
@@ -273,21 +272,13 @@ class DepthWork:
     with_check: bool = True
     files: Files = IMAGES
 
-    def __post_init__(self) -> None:
-        mount_m = self.scale.camera_height or getattr(self.camera, "mount_height_m", None)
-        if self.scale.camera_tilt is not None and mount_m is None:
-            raise InputError(
-                "--camera-tilt says where the road is together with --camera-height, or the "
-                "camera file's mount_height_m; give the height, or omit the tilt"
-            )
-
     def input_of(self, name: str, left: Tensor | Path, right: Path | None = None) -> StereoInput:
         """Make the input of an image or a pair, read already or not."""
         image = read_image(left) if isinstance(left, Path) else left
         camera = camera_of(self.camera, (image.shape[2], image.shape[1]))
         assert camera is not None
         mount = {"mount_height_m": self.scale.camera_height, "tilt_deg": self.scale.camera_tilt}
-        camera = changed(camera, **mount)
+        camera = replace(camera, **{key: v for key, v in mount.items() if v is not None})
         other = None if right is None else read_image(right)
         return StereoInput(name=name, left=image, right=other, camera=camera)
 
@@ -463,7 +454,7 @@ class Predictor:
                     try:
                         if isinstance(estimate, InputError):
                             raise estimate
-                        if scale.distance is not None:
+                        if scale.known_distance is not None:
                             estimate = scale_by_distance(estimate, one.name, scale.distance)  # noqa: PLW2901
                         cloud_m = CLOUD_M if output.cloud else None
                         files = write_estimate(self.out, one, estimate, output.color_range, cloud_m)

@@ -4,8 +4,7 @@ import hashlib
 import json
 import pickle
 import warnings
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, TypeVar
@@ -24,6 +23,10 @@ from depthpose.core.hub import find_weights as find_weights
 NetworkT = TypeVar("NetworkT", bound=nn.Module)
 _DRAWS = (nn.init.normal_, nn.init.uniform_, nn.init.kaiming_normal_, nn.init.kaiming_uniform_)
 """Functions that draw random weights, and may be skipped as a whole."""
+_SAFETENSORS = (
+    "safetensors file", "a published checkpoint is imported by 'depthpose weights import'"
+)  # fmt: skip
+"""What a file should be, and what to do where it is not."""
 
 
 class LicenceNotice(Notice):
@@ -72,25 +75,26 @@ def read_checkpoint(path: Path, kind: str | None = None) -> Checkpoint:
             with numbers that are not finite.
     """
     path = Path(path)
-    with _opened_safetensors(path) as (metadata, tensors):
-        if "kind" not in metadata or "config" not in metadata:
-            raise InputError(
-                f"{path}: no 'kind' and 'config' in its metadata, so no depthpose weights. A "
-                "published checkpoint is imported by 'depthpose weights import'."
-            )
-        held = metadata.pop("kind")
-        if kind is not None and held != kind:
-            raise InputError(
-                f"{path}: holds weights of kind {held!r}, but {kind!r} is needed here."
-            )
-        try:
-            config = json.loads(metadata.pop("config"), parse_constant=refuse_number)
-        except (ValueError, RecursionError) as error:
-            raise InputError(f"{path}: its 'config' is not JSON ({error}).") from error
-        if not isinstance(config, dict):
-            raise InputError(f"{path}: its 'config' is not a mapping.")
-        state = _finite(path, dict(tensors))
-        return Checkpoint(kind=held, config=config, state=state, facts=metadata)
+    if not path.is_file():
+        raise InputError(f"{path}: there is no such weights file.")
+    with refused_as(path, *_SAFETENSORS), safe_open(path, framework="pt") as file:
+        metadata = dict(file.metadata() or {})
+        state = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
+    if "kind" not in metadata or "config" not in metadata:
+        raise InputError(
+            f"{path}: no 'kind' and 'config' in its metadata, so no depthpose weights. A "
+            "published checkpoint is imported by 'depthpose weights import'."
+        )
+    held = metadata.pop("kind")
+    if kind is not None and held != kind:
+        raise InputError(f"{path}: holds weights of kind {held!r}, but {kind!r} is needed here.")
+    try:
+        config = json.loads(metadata.pop("config"), parse_constant=refuse_number)
+    except (ValueError, RecursionError) as error:
+        raise InputError(f"{path}: its 'config' is not JSON ({error}).") from error
+    if not isinstance(config, dict):
+        raise InputError(f"{path}: its 'config' is not a mapping.")
+    return Checkpoint(kind=held, config=config, state=_finite(path, state), facts=metadata)
 
 
 def load_weights(network: nn.Module, checkpoint: Checkpoint, source: str) -> None:
@@ -206,8 +210,8 @@ def read_published(path: Path, network: str) -> Mapping[str, Tensor]:
     """
     path = Path(path)
     if path.suffix == ".safetensors":
-        with _opened_safetensors(path) as (_, tensors):
-            return _finite(path, dict(tensors))
+        with refused_as(path, *_SAFETENSORS), safe_open(path, framework="pt") as file:
+            return _finite(path, {name: file.get_tensor(name) for name in file.keys()})  # noqa: SIM118
     content = read_torch_file(path)
     state = content.get("state_dict", content)
     if not isinstance(state, Mapping) or not all(isinstance(v, Tensor) for v in state.values()):
@@ -277,19 +281,6 @@ def file_sha256(path: Path) -> str:
     """Compute a file's sha256, recorded beside every number that was made with it."""
     with Path(path).open("rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
-
-
-@contextmanager
-def _opened_safetensors(
-    path: Path,
-) -> Iterator[tuple[dict[str, str], Iterator[tuple[str, Tensor]]]]:
-    """Give metadata and tensors of a file; whatever its bytes raise is an input error."""
-    if not path.is_file():
-        raise InputError(f"{path}: there is no such weights file.")
-    remedy = "a published checkpoint is imported by 'depthpose weights import'"
-    with refused_as(path, "safetensors file", remedy), safe_open(path, framework="pt") as file:
-        tensors = ((name, file.get_tensor(name)) for name in file.keys())  # noqa: SIM118
-        yield dict(file.metadata() or {}), tensors
 
 
 def _finite(path: Path, state: Mapping[str, Tensor]) -> Mapping[str, Tensor]:

@@ -113,9 +113,19 @@ def _decoded(name: AnyPath, image: Image.Image) -> np.ndarray:
             values = np.frombuffer(opened.fp.read(6 * image.width * image.height), ">u2")
             whole = values.reshape(image.height, image.width, 3).astype(np.float64)
             return (whole * (65535 / most)).round().clip(0, 65535).astype(np.uint16)
-    pixels, *low = (
-        _rgb_or_grey(name, one if turn is None else one.transpose(turn)) for one in parts
-    )
+    read: list[np.ndarray] = []
+    for part in parts:
+        one = part if turn is None else part.transpose(turn)
+        # Pillow scales 16-bit PGM to 65535.
+        if one.mode in _GREY_16 or (one.mode == "I" and image.format == "PPM"):
+            read.append(np.asarray(one).astype(np.uint16))
+            continue
+        if one.mode in ("I", "F"):
+            raise InputError(f"{name}: 32 bits a pixel; save it with 8 or 16 bits a channel")
+        if one.mode == "P" and "transparency" in one.info:
+            one = one.convert("RGBA")
+        read.append(np.asarray(one.convert("RGB")))
+    pixels, *low = read
     return pixels.astype(np.uint16) * 256 + low[0] if low else pixels
 
 
@@ -268,17 +278,6 @@ def _orientation(image: Image.Image) -> int:
     is_turned = image.format == "TIFF"
     is_hidden = image.format == "PNG" and "exif" not in image.info
     return 1 if is_turned or is_hidden else image.getexif().get(_EXIF_ORIENTATION, 1)
-
-
-def _rgb_or_grey(path: AnyPath, image: Image.Image) -> np.ndarray:
-    # Pillow scales 16-bit PGM to 65535.
-    if image.mode in _GREY_16 or (image.mode == "I" and image.format == "PPM"):
-        return np.asarray(image).astype(np.uint16)
-    if image.mode in ("I", "F"):
-        raise InputError(f"{path}: 32 bits a pixel; save it with 8 or 16 bits a channel")
-    if image.mode == "P" and "transparency" in image.info:
-        image = image.convert("RGBA")
-    return np.asarray(image.convert("RGB"))
 
 
 _EXIF_IFD = 0x8769
@@ -457,6 +456,7 @@ def to_float32(array: np.ndarray) -> np.ndarray:
 
 
 KITTI_UNIT = 1 / 256  # KITTI stores metres and pixels of disparity times 256
+_NO_UNIT = "a unit of {} is not positive; KITTI's is 1/256, BOP's 0.001"
 
 
 def read_depth_png(path: AnyPath, unit_m: float = KITTI_UNIT) -> Float32[Tensor, "h w"]:
@@ -469,7 +469,8 @@ def read_depth_png(path: AnyPath, unit_m: float = KITTI_UNIT) -> Float32[Tensor,
     Raises:
         InputError: the file is missing, damaged, 8-bit or coloured, or the unit makes no sense.
     """
-    _check_unit(path, unit_m)
+    if not 0 < unit_m < math.inf:
+        raise InputError(f"{path}: {_NO_UNIT.format(unit_m)}")
     with opened_image(path) as image:
         if image.format not in ("PNG", "TIFF") or image.mode not in ("I;16", "I;16B"):
             raise InputError(
@@ -512,7 +513,8 @@ def write_depth_png(
     Raises:
         InputError: the map is empty, the unit makes no sense, or the disk refuses.
     """
-    _check_unit(path, unit_m)
+    if not 0 < unit_m < math.inf:
+        raise InputError(f"{path}: {_NO_UNIT.format(unit_m)}")
     if depth_m.numel() == 0:
         raise InputError(f"{path}: an empty map {tuple(depth_m.shape)} makes no PNG; give pixels")
     units = (depth_m.detach().cpu().double() / unit_m).round()
@@ -539,8 +541,3 @@ def write_disparity_png(path: AnyPath, disparity_px: Float[Tensor, "h w"]) -> No
         InputError: the map is empty, or the disk refuses.
     """
     write_depth_png(path, disparity_px)
-
-
-def _check_unit(path: AnyPath, unit: float) -> None:
-    if not (math.isfinite(unit) and unit > 0):
-        raise InputError(f"{path}: a unit of {unit} is not positive; KITTI's is 1/256, BOP's 0.001")
