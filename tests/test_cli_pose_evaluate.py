@@ -189,7 +189,7 @@ def test_registration_wants_a_data_set_and_open3d(
     assert main(["pose", "evaluate", *words]) == 2
     assert "pip install -e '.[open3d]'" in capsys.readouterr().err
     assert main(["pose", "predict", *words]) == 2
-    assert "open3d: it looks for the models of a data set" in capsys.readouterr().err
+    assert "weights 'open3d': neither a file nor the name" in capsys.readouterr().err
 
 
 def test_what_cannot_be_measured_is_refused(

@@ -28,7 +28,6 @@ from typing import (
 import tyro
 
 from depthpose.core.errors import InputError
-from depthpose.core.hub import ON_HUB, find_weights
 
 
 class _Names(Enum):
@@ -133,7 +132,9 @@ def refuse_missing(options: Sequence[Option], values: Mapping[str, Any]) -> None
         for one in value if isinstance(value, list | tuple) else [value]:
             if names is _Names.WEIGHTS and one is not None:
                 bare = re.sub(_PREFIXES, "", one)
-                if bare not in _WORDS and not bare.startswith(ON_HUB):
+                if bare not in _WORDS and not bare.startswith("hf:/"):  # of the hub
+                    from depthpose.core.checkpoint import find_weights  # loads torch
+
                     find_weights(bare)
             elif one is not None and not any(mark in str(one) for mark in ("://", *"*?[{")):
                 wanted = Path(one)

@@ -1,7 +1,7 @@
 """``depthpose depth ...``."""
 
 import re
-from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 
 import tyro
@@ -62,16 +62,7 @@ def predict(
     )
     method = method.packed() if engine.engine == "ray" else method
 
-    def work_of(sources: Sequence[Path]) -> work.DepthWork:
-        camera = work.read_lens(lens, sources)
-        mount_m = height_m or getattr(camera, "mount_height_m", None)
-        if tilt_deg is not None and mount_m is None:
-            raise InputError(
-                "--camera-tilt says where the road is together with --camera-height, or the "
-                "camera file's mount_height_m; give the height, or omit the tilt"
-            )
-        return work.DepthWork(method=method, camera=camera, scale=scale, output=output)
-
+    work_of = partial(work.image_work, lens, scale, output, method)
     if engine.engine == "ray":
         return work.estimate_by_engine(images, work.IMAGES, work_of, out, engine)
     sources = work.find_sources(images, Path(out))
@@ -113,21 +104,13 @@ def match(
         out: folder for the results.
     """
     from depthpose.cli import depth_predict as work
-    from depthpose.core.camera import read_rig
-    from depthpose.core.files import image_size
     from depthpose.core.run import refuse_among_inputs
 
     used = None if pairs.matcher == "sgbm" else pairs.matcher or pairs.weights or "default"
     method = work.MethodSource(weights=used, config=matching.config, with_right=True, use="pairs")
     method = method.packed() if engine.engine == "ray" else method
 
-    def work_of(files: Sequence[Path]) -> work.DepthWork:
-        rig = read_rig(camera, image_size(files[0]))
-        output = options.PredictOutput(cloud=pairs.cloud)
-        return work.DepthWork(
-            method=method, camera=rig, output=output, with_check=pairs.check, files=work.PAIRS
-        )
-
+    work_of = partial(work.pair_work, camera, pairs, method)
     if engine.engine == "ray":
         sides = [left] if right is None else [left, right]
         return work.estimate_by_engine(sides, work.PAIRS, work_of, out, engine)

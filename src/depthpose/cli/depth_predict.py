@@ -15,14 +15,14 @@ import torch
 from torch import Tensor
 from tqdm import tqdm
 
-from depthpose.cli.depth_options import LensOptions, PredictOutput, ScaleOptions
+from depthpose.cli.depth_options import LensOptions, PairNetworks, PredictOutput, ScaleOptions
 from depthpose.cli.engine import EngineOptions, Weights, say
 from depthpose.core import run
-from depthpose.core.camera import Camera, FieldOfView, StereoRig, camera_of, read_camera
+from depthpose.core.camera import Camera, FieldOfView, StereoRig, camera_of, read_camera, read_rig
 from depthpose.core.camera.pinhole import camera_keys
 from depthpose.core.checkpoint import file_sha256, find_weights, read_checkpoint
 from depthpose.core.config import config_to_dict
-from depthpose.core.devices import own_device
+from depthpose.core.devices import own_device, usable_precision
 from depthpose.core.draw import draw_depth
 from depthpose.core.engine import Files, Function, Inputs, Sample, Work
 from depthpose.core.errors import InputError
@@ -49,7 +49,7 @@ from depthpose.depth.predictions import (
     read_estimate,
     write_estimate,
 )
-from depthpose.depth.stereo import SGBMMatcher, with_usable_precision
+from depthpose.depth.stereo import SGBMMatcher
 from depthpose.depth.types import StereoInput
 from depthpose.depth.weights import MATCHERS, Use
 from depthpose.report.depth import depth_section
@@ -94,8 +94,10 @@ class MethodSource:
         if isinstance(self.weights, Weights):
             with self.weights.unpacked() as file:
                 return replace(self, weights=file).build()
-        config = with_usable_precision(self.config)  # what is computed in is what is recorded
-        config = replace(config, device=own_device(config.device))
+        device = self.config.device
+        is_bf16 = usable_precision(self.config.precision, device) == "bf16"
+        precision = "bf16" if is_bf16 else "fp32"  # what is computed in is what is recorded
+        config = replace(self.config, precision=precision, device=own_device(device))
         path = find_weights(self.weights)
         kind = read_checkpoint(path).kind
         is_matcher = kind in MATCHERS
@@ -215,6 +217,33 @@ def read_lens(options: LensOptions, sources: Sequence[Path]) -> Camera | FieldOf
         keys = {key: getattr(read, key) for key in ("mount_height_m", "tilt_deg")}
         return Camera(width=read.width, height=read.height, K=read.K, **keys)
     return read
+
+
+def image_work(
+    lens: LensOptions,
+    scale: ScaleOptions,
+    output: PredictOutput,
+    method: MethodSource,
+    sources: Sequence[Path],
+) -> "DepthWork":
+    """Say what is done with single images, whose camera may be known by them alone."""
+    camera = read_lens(lens, sources)
+    mount_m = scale.camera_height or getattr(camera, "mount_height_m", None)
+    if scale.camera_tilt is not None and mount_m is None:
+        raise InputError(
+            "--camera-tilt says where the road is together with --camera-height, or the "
+            "camera file's mount_height_m; give the height, or omit the tilt"
+        )
+    return DepthWork(method=method, camera=camera, scale=scale, output=output)
+
+
+def pair_work(
+    camera: Path, pairs: PairNetworks, method: MethodSource, files: Sequence[Path]
+) -> "DepthWork":
+    """Say what is done with pairs, of which the first may say the size for the camera's file."""
+    rig = read_rig(camera, image_size(files[0]))
+    output = PredictOutput(cloud=pairs.cloud)
+    return DepthWork(method=method, camera=rig, output=output, with_check=pairs.check, files=PAIRS)
 
 
 def find_sources(words: Sequence[str], out: Path) -> list[Path]:

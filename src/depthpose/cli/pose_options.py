@@ -4,7 +4,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
-from depthpose.cli.arguments import Device, NewPath, Source, changed
+from depthpose.cli.arguments import Device, NewPath, Source
 from depthpose.core.errors import InputError
 from depthpose.core.units import Unit
 from depthpose.pose.config import DiameterTable, EstimateConfig, EvaluationConfig, VotingConfig
@@ -12,10 +12,10 @@ from depthpose.pose.config import DiameterTable, EstimateConfig, EvaluationConfi
 Voting = Literal["ransac", "least-squares"]
 
 
-def voting_config(voting: Voting, hypotheses: int | None = None) -> VotingConfig:
+def voting_config(voting: Voting, hypotheses: int = VotingConfig.hypotheses) -> VotingConfig:
     """Give the config of a way to vote."""
     method = "ransac" if voting == "ransac" else "least squares"
-    return changed(VotingConfig(method=method), hypotheses=hypotheses)
+    return VotingConfig(method=method, hypotheses=hypotheses)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -10,7 +10,7 @@ from typing import TypeVar, cast
 
 import torch
 
-from depthpose.core.errors import InputError, Notice
+from depthpose.core.errors import InputError, Notice, full_memory, is_of_memory
 
 _PROCESS = os.getpid()  # that loaded torch: one that is forked from it has another number
 Item = TypeVar("Item")
@@ -89,6 +89,17 @@ def each_in_threads(
             for future in waiting:
                 future.cancel()
             torch.set_num_threads(cores)
+
+
+@contextmanager
+def refused_memory(name: str) -> Iterator[None]:
+    """Turn a full memory into an :class:`InputError`: smaller inputs of a folder may fit."""
+    try:
+        yield
+    except (MemoryError, RuntimeError) as error:
+        if not is_of_memory(error):
+            raise
+        raise InputError(f"{name}: {full_memory(error)}") from error
 
 
 def usable_device(name: str | torch.device) -> torch.device:

@@ -304,7 +304,8 @@ class Job(Generic[Input]):
     """One thing to estimate: what it is called, where it belongs, and how its input is read."""
 
     name: str  #: that of the input: unique in a run
-    read: Callable[[], Input]  #: gives the input; called only where the estimate is not there yet
+    #: gives the input, or the estimate that says why there is none; called where none is there yet
+    read: Callable[[], Input | PoseEstimate]
     place: Place | None = None  #: as :class:`Prediction` has it
     seconds: Mapping[str, float] = field(default_factory=dict)  #: what was spent before, on a mask
     source: Path | tuple[Path, ...] | None = None  #: file or files that the input is read from
@@ -340,7 +341,9 @@ def predict(
     try:
         for start in range(0, len(left), batch):
             some = left[start : start + batch]
-            estimates = estimate_many([job.read() for job in some])
+            inputs = [job.read() for job in some]
+            answers = iter(estimate_many([i for i in inputs if not isinstance(i, PoseEstimate)]))
+            estimates = [i if isinstance(i, PoseEstimate) else next(answers) for i in inputs]
             for job, estimate in zip(some, estimates, strict=True):
                 assert estimate.name == job.name, f"{estimate.name!r} is not {job.name!r}"
                 spent = {**job.seconds, **estimate.seconds}

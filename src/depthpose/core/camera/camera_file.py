@@ -40,7 +40,6 @@ from depthpose.core.camera.stored_camera import (
     is_ros,
     lens_of,
     named,
-    numbers,
     read_storage,
     read_two_files,
     scalar,
@@ -321,11 +320,13 @@ def _json_number(keys: dict[str, Any], key: str, what: str = "a number") -> floa
 
 
 def _matrix(value: object) -> Float[Tensor, "3 3"]:
-    found = numbers(value)
-    if found is None or len(found) != 9:
+    try:
+        return torch.from_numpy(np.array(value, dtype=np.float64).reshape(3, 3))
+    except (TypeError, ValueError, OverflowError) as error:
         shown = repr(value)[:80]
-        raise InputError(f"'K' is {shown}; write [[fx, skew, cx], [0, fy, cy], [0, 0, 1]]")
-    return torch.tensor(found, dtype=torch.float64).reshape(3, 3)
+        raise InputError(
+            f"'K' is {shown}; write [[fx, skew, cx], [0, fy, cy], [0, 0, 1]]"
+        ) from error
 
 
 def read_camera(path: AnyPath, size: Size | None = None) -> Camera | StereoRig:

@@ -4,6 +4,7 @@ Reading is guarded, writing atomic. A path through a tar shard, ``000000.tar/a.l
 as through a folder.
 """
 
+import hashlib
 import json
 import math
 import os
@@ -265,6 +266,12 @@ class YamlLoader(_PLAIN):
                 raise ValueError(f"line {line}: key {key.value!r} is given twice")
             seen.add((key.tag, key.value))
         return super().construct_mapping(node, deep)
+
+
+def file_sha256(path: Path) -> str:
+    """Compute a file's sha256, recorded beside every number that was made with it."""
+    with Path(path).open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
 
 
 def read_text(path: AnyPath, most: int = MAX_TEXT_BYTES) -> str:

@@ -11,8 +11,8 @@ import torch
 from tqdm import tqdm
 
 from depthpose.core.camera import AnyCamera, choose_lens
-from depthpose.core.devices import each_in_own_arithmetic, own_arithmetic
-from depthpose.core.errors import InputError, nearest_name, refused_memory
+from depthpose.core.devices import each_in_own_arithmetic, own_arithmetic, refused_memory
+from depthpose.core.errors import InputError, nearest_name
 from depthpose.core.rigid import Rigid
 from depthpose.core.units import Unit
 from depthpose.pose.config import EstimateConfig, RefusalConfig
