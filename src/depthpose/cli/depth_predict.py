@@ -410,7 +410,8 @@ def estimate_all(
                         break
         near_m, far_m = work.output.color_range
         which = "all" if len(shown) == len(names) else "spread evenly"
-        text = f"Shown: {len(shown)} of {_count(len(names), 'depth map')} in this folder ({which})."
+        number = f"{len(names)} depth map{'s' * (len(names) != 1)}"
+        text = f"Shown: {len(shown)} of {number} in this folder ({which})."
         rows = [{"not estimated, because": str(reason)} for reason in failures]
         doubts = {name: out / f"{name}.warning.txt" for name in names}
         rows += [{"warning": f"{name}: {read_text(path).strip()}"}
@@ -422,9 +423,8 @@ def estimate_all(
         for one in shown:
             estimate = read_estimate(out, one.name, one.camera)
             sections.append(depth_section(one.name, one, estimate, range_m=(near_m, far_m)))
-        write_page(
-            out / _PAGE, f"Depth of {_count(len(names), 'image')}", sections, run.environment()
-        )
+        title = f"Depth of {len(names)} image{'s' * (len(names) != 1)}"
+        write_page(out / _PAGE, title, sections, run.environment())
         print(f"the page: {out / _PAGE}")
     return 1 if failures else 0
 
@@ -499,7 +499,3 @@ class Predictor:
                 names += [name for name, _ in chunk if name not in self.failures]
                 bar.update(len(chunk))
         return names
-
-
-def _count(number: int, what: str) -> str:
-    return f"{number} {what}{'' if number == 1 else 's'}"

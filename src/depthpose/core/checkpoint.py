@@ -215,7 +215,12 @@ def load_weights(network: nn.Module, checkpoint: Checkpoint, source: str) -> Non
     Raises:
         InputError: the first names that are missing, unexpected or of another shape.
     """
-    _refuse_misfits(network, checkpoint, source)
+    problems = misfits(network.state_dict(), checkpoint.state)
+    if problems:
+        raise InputError(
+            f"{source}: {len(problems)} tensors do not fit the network of its config: "
+            f"{'; '.join(problems[:3])}. File and config belong to different versions."
+        )
     network.load_state_dict(dict(checkpoint.state))
 
 
@@ -237,7 +242,7 @@ def build_network(make: Callable[[], NetworkT], checkpoint: Checkpoint, source: 
         _WithoutDrawing(),
     ):
         with torch.device("meta"):
-            _refuse_misfits(make(), checkpoint, source)
+            load_weights(make(), checkpoint, source)  # compares shapes, and copies nothing
         network = make()
     network.load_state_dict(dict(checkpoint.state))
     return network
@@ -257,15 +262,6 @@ class _WithoutDrawing(TorchFunctionMode):
         if func in _DRAWS:
             return args[0] if args else options["tensor"]
         return func(*args, **options)
-
-
-def _refuse_misfits(network: nn.Module, checkpoint: Checkpoint, source: str) -> None:
-    problems = misfits(network.state_dict(), checkpoint.state)
-    if problems:
-        raise InputError(
-            f"{source}: {len(problems)} tensors do not fit the network of its config: "
-            f"{'; '.join(problems[:3])}. File and config belong to different versions."
-        )
 
 
 def misfits(wanted: Mapping[str, Tensor], tensors: Mapping[str, Tensor]) -> list[str]:

@@ -49,7 +49,7 @@ class Settings:
                     if not (is_above and is_below):
                         remedy = "" if default is None else f"; the default is {default}"
                         raise InputError(
-                            f"{name} must be in {interval}, got {_shown(value)}{remedy}"
+                            f"{name} must be in {interval}, got {value!r:.{_LONGEST}}{remedy}"
                         )
             if ASCENDING in more and value is not None and value[0] > value[1]:
                 raise InputError(
@@ -137,7 +137,7 @@ def config_from_dict(
             continue
         if key not in defaults:
             raise InputError(
-                f"{source}: unknown key {_shown(prefix + str(key))}; "
+                f"{source}: unknown key {prefix + str(key)!r:.{_LONGEST}}; "
                 f"{nearest_name(str(key)[:_LONGEST], defaults)}"
             )
         # A default may be infinite, where no other number may.
@@ -161,7 +161,7 @@ def _value_of(value: Any, hint: Any, source: str, name: str) -> Any:  # noqa: AN
             with suppress(InputError):
                 return _value_of(value, other, source, name)
         return _value_of(value, last, source, name)
-    said = f"{source}: {name} is {_shown(value)}"
+    said = f"{source}: {name} is {value!r:.{_LONGEST}}"
     if origin in (tuple, list):
         is_free = origin is list or parts[-1] is Ellipsis
         times = 1 if is_free else len(parts)
@@ -201,11 +201,6 @@ def _value_of(value: Any, hint: Any, source: str, name: str) -> Any:  # noqa: AN
     if isinstance(hint, type) and isinstance(value, hint):
         return value
     raise InputError(f"{said}, which is not of type {hint}. Give a value of that type.")
-
-
-def _shown(value: object) -> str:
-    text = repr(value)
-    return text if len(text) <= _LONGEST else f"{text[:_LONGEST]}..."
 
 
 def config_to_dict(config: object) -> dict[str, Any]:
