@@ -6,6 +6,7 @@ import pytest
 
 from depthpose.core.devices import computes_bf16, own_device, usable_device
 from depthpose.core.errors import InputError
+from depthpose.core.files.images import refuse_among_inputs
 from depthpose.core.loop import LoopConfig, Run
 from depthpose.core.run import (
     ProcessRank,
@@ -17,7 +18,6 @@ from depthpose.core.run import (
     note_result,
     read_settings,
     read_sources,
-    refuse_among_inputs,
     refuse_to_replace,
     wait_for,
 )

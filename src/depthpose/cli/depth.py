@@ -104,7 +104,7 @@ def match(
         out: folder for the results.
     """
     from depthpose.cli import depth_predict as work
-    from depthpose.core.run import refuse_among_inputs
+    from depthpose.core.files.images import refuse_among_inputs
 
     used = None if pairs.matcher == "sgbm" else pairs.matcher or pairs.weights or "default"
     method = work.MethodSource(weights=used, config=matching.config, with_right=True, use="pairs")

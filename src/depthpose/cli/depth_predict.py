@@ -37,7 +37,7 @@ from depthpose.core.files import (
     write_video,
 )
 from depthpose.core.files.disk import find_partners, read_text
-from depthpose.core.files.images import LISTED_SUFFIXES
+from depthpose.core.files.images import LISTED_SUFFIXES, refuse_among_inputs
 from depthpose.depth.config import Answer, MatcherConfig, SGBMConfig
 from depthpose.depth.estimator import FakestereoNet
 from depthpose.depth.ground import scale_by_distance
@@ -262,7 +262,7 @@ def find_sources(words: Sequence[str], out: Path) -> list[Path]:
                 f"an input is called {frame!r}, as a frame of a video would be, and so would their "
                 "results; rename one of the two"
             )
-    run.refuse_among_inputs(out, words, sources)
+    refuse_among_inputs(out, words, sources)
     return sources
 
 

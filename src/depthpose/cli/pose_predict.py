@@ -43,7 +43,7 @@ from depthpose.core.files import (
     write_json,
 )
 from depthpose.core.files.disk import natural_order
-from depthpose.core.files.images import LISTED_SUFFIXES
+from depthpose.core.files.images import LISTED_SUFFIXES, refuse_among_inputs
 from depthpose.core.rigid import numbers_text
 from depthpose.core.run import is_whole, note_result
 from depthpose.core.units import Unit
@@ -153,7 +153,7 @@ def cloud_jobs(cloud: Path, unit: Unit, object: str, out: Path) -> list[Job[Any]
     if not files:
         raise InputError(f"{cloud}: no {', '.join(known)} file there; give a cloud, or a folder")
     _refuse_one_name(files)
-    run.refuse_among_inputs(out, [cloud], files)
+    refuse_among_inputs(out, [cloud], files)
     jobs = [
         Job(name=p.stem, read=partial(cloud_input, p, unit, object, p.stem), source=p)
         for p in files
@@ -175,7 +175,7 @@ def view_jobs(
     """
     runs = sorted(mask.glob("*.json")) if mask.is_dir() else []  # of run lengths
     depths, pictures = _list_depths(depth), runs or list_images(mask)
-    run.refuse_among_inputs(out, [depth, mask], [*depths, *pictures])
+    refuse_among_inputs(out, [depth, mask], [*depths, *pictures])
     _refuse_one_name(depths)
     _refuse_one_name(pictures)
     masks = {path.stem: path for path in pictures}
@@ -214,7 +214,7 @@ def frame_jobs(
 ) -> list[Job[Any]]:
     """Take whole depth images, without masks."""
     depths = _list_depths(depth)
-    run.refuse_among_inputs(out, [depth], depths)
+    refuse_among_inputs(out, [depth], depths)
     _refuse_one_name(depths)
     jobs = [
         Job(name=p.stem, read=partial(view_input, p, None, camera, object, p.stem, unit), source=p)

@@ -318,25 +318,6 @@ def refuse_to_replace(path: Path) -> None:
         raise InputError(f"{path}: is there already; delete it, or give another name")
 
 
-def refuse_among_inputs(out: Path, words: Iterable[str | Path], files: Iterable[Path]) -> None:
-    """Refuse results in a folder whose files are inputs: the next run would take them for such.
-
-    Args:
-        out: where the results go.
-        words: as given: files, folders or patterns.
-        files: that they name.
-
-    Raises:
-        InputError: ``out`` holds such files, and they were not named one by one.
-    """
-    named = {Path(word) for word in words}
-    if any(path not in named and path.parent.resolve() == out.resolve() for path in files):
-        raise InputError(
-            f"--out {out}: the inputs lie there, and a second run would take the results for "
-            "inputs too; choose a folder of their own"
-        )
-
-
 def read_settings(folder: Path | str) -> dict[str, Any] | None:
     """Give the settings that made a folder, by path or URL, or None where no run claimed it.
 

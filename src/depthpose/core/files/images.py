@@ -4,7 +4,7 @@ import math
 import re
 import sys
 import warnings
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from io import BytesIO
 from pathlib import Path
@@ -280,6 +280,25 @@ def list_images(path: AnyPath) -> list[Path]:
             remedy = "unpack the archive (with --engine ray, .tar and .tar.gz are read)"
         raise InputError(f"{path}: no {', '.join(LISTED_SUFFIXES)} file there; {remedy}")
     return pictures
+
+
+def refuse_among_inputs(out: Path, words: Iterable[str | Path], files: Iterable[Path]) -> None:
+    """Refuse results in a folder whose files are inputs: the next run would take them for such.
+
+    Args:
+        out: where the results go.
+        words: as given: files, folders or patterns.
+        files: that they name.
+
+    Raises:
+        InputError: ``out`` holds such files, and they were not named one by one.
+    """
+    named = {Path(word) for word in words}
+    if any(path not in named and path.parent.resolve() == out.resolve() for path in files):
+        raise InputError(
+            f"--out {out}: the inputs lie there, and a second run would take the results for "
+            "inputs too; choose a folder of their own"
+        )
 
 
 @contextmanager
