@@ -11,7 +11,7 @@ import torch
 from tests.synthetic_street import make_street
 
 from depthpose.cli import COMMANDS, main
-from depthpose.cli.arguments import Source, WeightsName, refuse_missing
+from depthpose.cli.arguments import Source, WeightsName, parser_of, refuse_missing
 from depthpose.core.errors import InputError
 from depthpose.core.files import read_depth_png, read_map, write_image, write_json
 from depthpose.depth.types import StereoInput
@@ -369,14 +369,15 @@ def test_patterns_and_addresses_are_left_to_those_who_read_them() -> None:
     def command(images: tuple[Source, ...], bop: Path | None, start: WeightsName) -> int:
         return len(images)
 
+    _, options = parser_of(command)
     values = {"images": ("left/*.png", "s3://bucket/left"), "bop": None, "start": "hf://me/mine"}
-    refuse_missing(command, values)
+    refuse_missing(options, values)
     for word in ("sgbm:default", "register", "nothing"):
-        refuse_missing(command, {"start": word})
+        refuse_missing(options, {"start": word})
     with pytest.raises(InputError, match="there is no such file or folder"):
-        refuse_missing(command, {"bop": Path("nowhere")})
+        refuse_missing(options, {"bop": Path("nowhere")})
     with pytest.raises(InputError, match="default"):
-        refuse_missing(command, {"start": "defalt"})
+        refuse_missing(options, {"start": "defalt"})
 
 
 @pytest.mark.parametrize(

@@ -8,10 +8,9 @@ from pathlib import Path
 
 import pytest
 
-from depthpose.cli import main
-from depthpose.cli.arguments import refuse_ignored_options
+from depthpose.cli import lasting_streams, main
+from depthpose.cli.arguments import refuse_words
 from depthpose.cli.depth_options import parse_bytes
-from depthpose.cli.streams import Output, lasting_streams
 from depthpose.core.errors import InputError
 
 IGNORED = [
@@ -56,12 +55,12 @@ USED = [
 @pytest.mark.parametrize(("command", "words", "named"), IGNORED)
 def test_an_option_without_effect_is_refused(command: str, words: str, named: str) -> None:
     with pytest.raises(InputError, match=rf"^{named}: has no effect here; .* Leave {named} out$"):
-        refuse_ignored_options(command, words.split())
+        refuse_words(command, [], words.split())
 
 
 @pytest.mark.parametrize(("command", "words"), USED)
 def test_an_option_with_effect_is_not(command: str, words: str) -> None:
-    refuse_ignored_options(command, words.split())
+    refuse_words(command, [], words.split())
 
 
 def test_the_command_refuses_it_in_a_line(capsys: pytest.CaptureFixture[str]) -> None:
@@ -133,8 +132,9 @@ def test_messages_that_nobody_can_read_stop_nothing(monkeypatch: pytest.MonkeyPa
         assert output.failure is None
 
 
-def test_a_name_that_is_not_utf8_is_printed() -> None:
+def test_a_name_that_is_not_utf8_is_printed(monkeypatch: pytest.MonkeyPatch) -> None:
     written = io.TextIOWrapper(io.BytesIO(), encoding="utf-8")
-    Output(written).write("n\udcfe.png")
-    written.flush()
+    monkeypatch.setattr(sys, "stdout", written)
+    with lasting_streams():
+        sys.stdout.write("n\udcfe.png")
     assert written.buffer.getvalue() == rb"n\udcfe.png"

@@ -13,7 +13,6 @@ from PIL import Image
 from tests.core.test_camera_rectified import pair
 from tests.pose.synthetic_objects import K, bracket, cloud_of, pose_at, view_of
 
-from depthpose.core.arrays import check_image
 from depthpose.core.camera import (
     Camera,
     StereoRig,
@@ -23,6 +22,7 @@ from depthpose.core.camera import (
 )
 from depthpose.core.errors import InputError
 from depthpose.core.files import write_depth_png
+from depthpose.core.files.images import check_image
 from depthpose.core.units import Unit
 from depthpose.depth.disparity import disparity_advice, disparity_from_depth
 from depthpose.depth.estimator import refuse_unrectified

@@ -191,7 +191,7 @@ def test_an_unknown_name_says_where_weights_come_from() -> None:
 def test_weights_that_stay_out_of_the_wheel_say_where_they_are(
     name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("depthpose.core.hub.SHIPPED", tmp_path)
+    monkeypatch.setattr("depthpose.core.checkpoint.SHIPPED", tmp_path)
     with pytest.raises(InputError, match=f"not in the wheel.*weights/{name}.safetensors from the"):
         find_weights(name)
 

@@ -3,6 +3,7 @@ from pathlib import Path
 
 import pytest
 
+from depthpose.core.devices import refused_memory
 from depthpose.core.errors import (
     InputError,
     MissingExtraError,
@@ -10,7 +11,6 @@ from depthpose.core.errors import (
     import_open3d,
     is_of_memory,
     nearest_name,
-    refused_memory,
 )
 
 

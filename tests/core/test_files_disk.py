@@ -18,8 +18,8 @@ from depthpose.core.export import Export, Graph, freeze
 from depthpose.core.files import (
     Cloud,
     atomic_write,
-    disk,
     read_bytes,
+    stores,
     write_cloud,
     write_depth_png,
     write_image,
@@ -202,7 +202,8 @@ def test_every_writer_names_a_full_disk_and_leaves_nothing(tmp_path: Path) -> No
             pytest.raises(InputError, match=r"cannot be written: File too large|disk is full"),
         ):
             write(tmp_path / name)
-        assert not [path for path in tmp_path.rglob("*") if path.is_file()], name
+        left = [path.name for path in tmp_path.rglob("*") if path.is_file()]
+        assert set(left) <= {".lock"}, name
     # TensorBoard writes in a thread of its own, so the metrics are full first.
     logger = RunLogger(tmp_path, is_writer=True)
     logger.open(0)
@@ -219,6 +220,6 @@ def test_a_folder_may_be_called_as_a_pattern_is_written(tmp_path: Path) -> None:
     folder = tmp_path / "run[1]"
     folder.mkdir()
     (folder / "0.json").write_bytes(b"{}")
-    assert disk.read_all(str(folder), ".json") == {"0.json": b"{}"}
-    assert disk.read_all(f"file://{folder}", ".json") == {"0.json": b"{}"}
-    assert disk.exists(str(folder / "0.json"))
+    assert stores.read_all(str(folder), ".json") == {"0.json": b"{}"}
+    assert stores.read_all(f"file://{folder}", ".json") == {"0.json": b"{}"}
+    assert stores.exists(str(folder / "0.json"))

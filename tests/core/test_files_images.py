@@ -22,7 +22,8 @@ from depthpose.core.files import (
     write_disparity_png,
     write_image,
 )
-from depthpose.core.files.disk import find_partners, list_files
+from depthpose.core.files.disk import find_partners
+from depthpose.core.files.stores import list_files
 
 
 def bytes_image(height: int = 5, width: int = 7) -> np.ndarray:

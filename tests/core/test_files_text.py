@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from depthpose.core.errors import InputError
 from depthpose.core.files import read_json, read_key_values, read_text, write_json
-from depthpose.core.files.text import parse_yaml
+from depthpose.core.files.disk import parse_yaml
 
 JSON = st.recursive(
     st.none()

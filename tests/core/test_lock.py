@@ -15,13 +15,11 @@ from tests.core.loop_task import ToySamples, ToyTask
 from depthpose.core.errors import InputError
 from depthpose.core.loop import LoopConfig, Run, releases_folder
 from depthpose.core.run import (
-    RECORD,
     claim_folder,
     held_folders,
     lock_folder,
     read_settings,
     release_folders,
-    write_once,
 )
 
 
@@ -48,7 +46,7 @@ def holder(
 def test_a_second_command_is_refused_until_the_first_is_gone(tmp_path: Path) -> None:
     refused = pytest.raises(InputError, match="another command is writing there")
     with holder(tmp_path, 600), refused:
-        lock_folder(tmp_path / RECORD, is_shared=False, timeout_s=0.3)
+        lock_folder(tmp_path, is_shared=False, timeout_s=0.3)
     claim_folder(tmp_path, {"a": 1})
     release_folders()
 
@@ -56,7 +54,7 @@ def test_a_second_command_is_refused_until_the_first_is_gone(tmp_path: Path) -> 
 def test_a_second_command_waits_for_one_that_ends(tmp_path: Path) -> None:
     with holder(tmp_path, 1) as process:
         began = time.monotonic()
-        lock_folder(tmp_path / RECORD, is_shared=False, timeout_s=60.0)
+        lock_folder(tmp_path, is_shared=False, timeout_s=60.0)
         process.join()
         assert process.exitcode == 0
         assert time.monotonic() - began < 60
@@ -71,7 +69,7 @@ def test_processes_of_one_launch_share_a_folder(
         claim_folder(tmp_path, {"a": 1})
         release_folders()
         with pytest.raises(InputError, match="another command is writing there"):
-            lock_folder(tmp_path / RECORD, is_shared=False, timeout_s=0.2)
+            lock_folder(tmp_path, is_shared=False, timeout_s=0.2)
 
 
 def test_a_folder_that_is_let_go_is_free(tmp_path: Path) -> None:
@@ -91,7 +89,7 @@ def test_a_training_lets_its_folder_go(tmp_path: Path) -> None:
     def stage(config: LoopConfig, run: Run) -> Path:
         claim_folder(run.folder, {"a": 1})
         run.train(ToyTask(), ToySamples(), config)
-        assert held_folders() == {run.folder / RECORD}
+        assert held_folders() == {run.folder}
         return run.folder
 
     stage(config, Run(folder=tmp_path.resolve()))
@@ -103,10 +101,9 @@ def test_a_training_lets_its_folder_go(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("settings", ["11", "01", "011", "010"])
 def test_a_folder_that_is_claimed_again_stays_locked(tmp_path: Path, settings: str) -> None:
-    """Reading the record lets a POSIX lock go; the claim takes it again."""
     refused = pytest.raises(InputError, match="another command is writing there")
     with holder(tmp_path, 600, settings), refused:
-        lock_folder(tmp_path / RECORD, is_shared=False, timeout_s=0.3)
+        lock_folder(tmp_path, is_shared=False, timeout_s=0.3)
     assert read_settings(tmp_path) == {"a": int(settings[-1])}
 
 
@@ -119,25 +116,26 @@ def test_a_command_within_another_releases_its_own_folders_alone(tmp_path: Path)
     assert len(before) == 1
 
 
-def test_the_first_record_stays(tmp_path: Path) -> None:
-    write_once(tmp_path / "run.json", {"settings": {"a": 1}})
-    write_once(tmp_path / "run.json", {"settings": {"a": 2}})
-    assert '"a": 1' in (tmp_path / "run.json").read_text()
-    assert [path.name for path in tmp_path.iterdir()] == ["run.json"]
+def test_a_claim_that_is_refused_holds_nothing(tmp_path: Path) -> None:
+    claim_folder(tmp_path, {"a": 1})
+    (tmp_path / "result.npy").touch()
+    release_folders()
+    with pytest.raises(InputError, match="made with a = 1, but now it is 2"):
+        claim_folder(tmp_path, {"a": 2})
+    assert not held_folders()
 
 
-def test_a_record_that_cannot_be_opened_is_refused(
+def test_a_lock_that_cannot_be_opened_is_refused(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """As in a folder that has become read-only, whose record is there from before."""
+    """As in a folder that has become read-only."""
 
     def refuse(*_: object) -> int:
         raise OSError(errno.EROFS, os.strerror(errno.EROFS))
 
-    (tmp_path / RECORD).write_text("{}")
     monkeypatch.setattr("depthpose.core.run.os.open", refuse)
     with pytest.raises(InputError, match="cannot be written: Read-only file system"):
-        lock_folder(tmp_path / RECORD, is_shared=False)
+        lock_folder(tmp_path, is_shared=False)
 
 
 def test_half_files_go_when_the_folder_is_ours_alone(tmp_path: Path) -> None:

@@ -4,8 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from depthpose.core import run
-from depthpose.core.run import RESULTS, is_whole, note_result, noted_files
+from depthpose.core.run import RESULTS, is_whole, note_result, read_results
 
 
 def make(folder: Path, name: str = "a") -> list[Path]:
@@ -65,19 +64,10 @@ def test_what_was_not_noted_is_not_finished_with_it(tmp_path: Path) -> None:
     assert not is_whole(tmp_path, "a", ["a.npy", "a.ply"])
 
 
-def test_files_are_read_again_once_after_a_copy(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_file_with_another_time_is_made_again(tmp_path: Path) -> None:
     files = make(tmp_path)
-    read: list[Path] = []
-    checksum = run._checksum
-    monkeypatch.setattr(run, "_checksum", lambda path: (read.append(path), checksum(path))[1])
-    assert is_whole(tmp_path, "a", ["a.npy"])
-    assert read == [], "sizes and times are enough"
     os.utime(files[0], ns=(5, 5))
-    assert is_whole(tmp_path, "a", ["a.npy"])
-    assert is_whole(tmp_path, "a", ["a.npy"])
-    assert read == files[:1]
+    assert not is_whole(tmp_path, "a", ["a.npy"])
 
 
 def test_what_a_killed_process_left_of_its_line_harms_no_other(tmp_path: Path) -> None:
@@ -85,10 +75,11 @@ def test_what_a_killed_process_left_of_its_line_harms_no_other(tmp_path: Path) -
     with (tmp_path / RESULTS).open("ab") as file:
         file.write(b'{"name": "half", "fil')
     files = make(tmp_path, "next")
-    assert noted_files(tmp_path, "half") == []
-    assert noted_files(tmp_path, "next") == files
+    noted = read_results(tmp_path)
+    assert "half" not in noted
+    assert [tmp_path / file for file in noted["next"]] == files
     (tmp_path / RESULTS).write_bytes(b"\xff\x00 [1]\n3\n")
-    assert noted_files(tmp_path, "next") == []
+    assert not read_results(tmp_path)
 
 
 def test_a_result_can_be_marked_as_to_be_made_again(tmp_path: Path) -> None:

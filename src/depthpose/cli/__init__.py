@@ -5,17 +5,18 @@ when it runs, so that every ``--help`` is quick.
 """
 
 import errno
+import os
 import platform
 import sys
 import warnings
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager, suppress
+from dataclasses import dataclass
 from importlib import import_module
 from inspect import cleandoc
 from typing import Any
 
 from depthpose import __version__
-from depthpose.cli.streams import lasting_streams
 from depthpose.core.errors import (
     InputError,
     MissingExtraError,
@@ -94,10 +95,17 @@ def main(words: Sequence[str] | None = None) -> int:
     """
     lock = sys.modules.get("depthpose.core.run")  # not imported for --help
     before = lock.held_folders() if lock is not None else ()
+    as_usual = warnings.formatwarning
+
+    def in_a_line(message: Warning | str, kind: type[Warning], *place: Any, **line: Any) -> str:  # noqa: ANN401
+        """Show our notices without the file and line of the code that gives them."""
+        is_ours = issubclass(kind, Notice)
+        return f"depthpose: {message}\n" if is_ours else as_usual(message, kind, *place, **line)
+
     with lasting_streams() as output:
+        warnings.formatwarning = in_a_line
         try:
-            with _notices_in_a_line():
-                code = _run(list(sys.argv[1:] if words is None else words))
+            code = _run(list(sys.argv[1:] if words is None else words))
         except (InputError, MissingExtraError) as error:
             code = _fail(f"error: {error}")
         except KeyboardInterrupt as stop:
@@ -107,6 +115,7 @@ def main(words: Sequence[str] | None = None) -> int:
                 raise
             code = _fail(f"error: {said}")
         finally:
+            warnings.formatwarning = as_usual
             if (lock := sys.modules.get("depthpose.core.run")) is not None:
                 lock.release_folders(but=before)
     if output.failure is None:
@@ -138,21 +147,57 @@ def _explained(error: Exception) -> str | None:
     )
 
 
+@dataclass(eq=False)
+class Output:
+    """A standard stream that remembers why it could not be written, in place of raising it."""
+
+    stream: Any  #: what is written to
+    is_lost: bool = False  #: the process began without it, and ``stream`` stands in its place
+    failure: OSError | None = None
+
+    def write(self, text: str) -> int:
+        """Write text at once, unless an earlier write has failed."""
+        if self.failure is None:
+            try:
+                if self.is_lost:
+                    raise OSError(errno.EBADF, "it is closed")  # noqa: TRY301
+                self.stream.write(text)
+                self.stream.flush()
+            except OSError as error:
+                self.failure = error
+                with suppress(OSError), open(os.devnull, "wb") as nothing:  # noqa: PTH123
+                    os.dup2(nothing.fileno(), self.stream.fileno())  # for what is buffered
+        return len(text)
+
+    def __getattr__(self, name: str) -> Any:  # noqa: ANN401  whatever a stream has
+        """Give what the stream has."""
+        return getattr(self.stream, name)
+
+
 @contextmanager
-def _notices_in_a_line() -> Iterator[None]:
-    """Show our notices without the file and line of the code that gives them."""
-    before = warnings.formatwarning
+def lasting_streams() -> Iterator[Output]:
+    """Let a command print though its streams are closed or full; gives standard output.
 
-    def shown(message: Warning | str, category: type[Warning], *place: Any, **line: Any) -> str:  # noqa: ANN401
-        if issubclass(category, Notice):
-            return f"depthpose: {message}\n"
-        return before(message, category, *place, **line)
-
-    warnings.formatwarning = shown
-    try:
-        yield
-    finally:
-        warnings.formatwarning = before
+    The numbers of closed streams are taken, so that no file gets them and is written into.
+    """
+    for number in range(3):
+        try:
+            os.fstat(number)
+        except OSError:
+            os.open(os.devnull, os.O_RDWR)  # takes the lowest free number
+    before = sys.stdin, sys.stdout, sys.stderr
+    with ExitStack() as opened:
+        names = zip(before, "rww", strict=True)
+        real = [s or opened.enter_context(open(os.devnull, mode)) for s, mode in names]  # noqa: PTH123
+        for stream in real[1:]:
+            if (reconfigure := getattr(stream, "reconfigure", None)) is not None:
+                reconfigure(errors="backslashreplace")  # names of files need not be UTF-8
+        output, errors = (Output(real[k], is_lost=before[k] is None) for k in (1, 2))
+        sys.stdin, sys.stdout, sys.stderr = real[0], output, errors
+        try:
+            yield output
+        finally:
+            sys.stdin, sys.stdout, sys.stderr = before
 
 
 def _run(words: list[str]) -> int:
@@ -199,10 +244,10 @@ def _run(words: list[str]) -> int:
 
     home, _, function = COMMANDS[name][0].partition(":")
     command: Callable[..., int] = getattr(import_module(f"depthpose.cli.{home}"), function)
-    arguments.refuse_empty(command, rest)
+    parse, options = arguments.parser_of(command)
     try:
         given = tyro.cli(
-            arguments.parser_of(command),
+            parse,
             prog=f"depthpose {name}",
             description=cleandoc(command.__doc__ or "").partition("\nArgs:")[0],
             args=rest,
@@ -210,14 +255,12 @@ def _run(words: list[str]) -> int:
         )
     except SystemExit as stop:  # tyro has printed help (0) or the wrong arguments (2)
         return int(stop.code or 0)
-    arguments.refuse_ignored_options(name, rest)
-    arguments.refuse_missing(command, given.arguments)
+    arguments.refuse_words(name, options, rest)
+    arguments.refuse_missing(options, given.arguments)
     if sys.platform != "win32":
         import resource
 
         if 0 <= (limit := resource.getrlimit(resource.RLIMIT_AS)[0]) < _LEAST_KIB * 1024:
             raise InputError(f"the limit of {limit // 1024} KiB (ulimit -v) is below the "
                              f"{_LEAST_KIB} that the libraries alone take; raise it")  # fmt: skip
-    code = command(*given.args, **given.kwargs)
-    sys.stdout.flush()
-    return code
+    return command(*given.args, **given.kwargs)

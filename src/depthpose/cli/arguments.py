@@ -5,21 +5,21 @@ weights that do not exist are refused before anything is loaded, and so is what 
 """
 
 import re
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, is_dataclass, replace
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import is_dataclass, replace
 from difflib import get_close_matches
 from enum import Enum
+from functools import partial
 from inspect import BoundArguments, signature, unwrap
-from itertools import pairwise
 from pathlib import Path
 from types import NoneType, UnionType
 from typing import (
     Annotated,
     Any,
     Literal,
+    NamedTuple,
     TypeVar,
     Union,
-    dataclass_transform,
     get_args,
     get_origin,
     get_type_hints,
@@ -28,7 +28,6 @@ from typing import (
 import tyro
 
 from depthpose.core.errors import InputError
-from depthpose.core.hub import find_weights, is_on_hub
 
 
 class _Names(Enum):
@@ -52,39 +51,46 @@ _PREFIXES = "^(both|sgbm|own|matched|quick|fine):"
 _POSITIONAL = get_args(tyro.conf.Positional[int])[1]
 _OF_TYPES = {Path: "PATH", str: "TEXT", int: "N", float: "NUMBER"}
 _NOTHING = ("", "None")
-Group = TypeVar("Group")
 Config = TypeVar("Config", bound=Any)
 
 
-def shown_as(metavar: str | None, help: str | None = None) -> Any:  # noqa: ANN401  tyro's own object
-    """Show an option with this in the place of its value; None: as tyro does."""
-    return tyro.conf.arg(
-        metavar=metavar,
-        help=help,
-        help_behavior_hint=lambda default: "" if default in _NOTHING else f"(default: {default})",
-    )
+shown_as = partial(
+    tyro.conf.arg,
+    help_behavior_hint=lambda default: "" if default in _NOTHING else f"(default: {default})",
+)
+"""Show an option with this ``metavar`` in the place of its value; None: as tyro does."""
+
+Device = Annotated[str, shown_as(metavar="DEVICE", help="cpu, cuda, cuda:1, ...")]
 
 
-Device = Annotated[str, shown_as("DEVICE", help="cpu, cuda, cuda:1, ...")]
+class Option(NamedTuple):
+    """An option of a command, and what its value names, if anything."""
+
+    parameter: str  #: of the command; an option of a group is a field of it
+    name: str
+    names: _Names | None
 
 
-@dataclass_transform(frozen_default=True, kw_only_default=True)
-def group(options: type[Group]) -> type[Group]:
-    """Make a class a frozen dataclass of options, all of which a command gets by a parameter."""
-    options = dataclass(frozen=True, kw_only=True)(options)
-    for name, hint in get_type_hints(options, include_extras=True).items():
-        if name in options.__annotations__:
-            options.__annotations__[name] = _worded(hint)
-    return options
-
-
-def parser_of(command: Callable[..., int]) -> Callable[..., BoundArguments]:
-    """Give tyro what parses a command's arguments: its signature, with option types in words."""
+def parser_of(
+    command: Callable[..., int],
+) -> tuple[Callable[..., BoundArguments], list[Option]]:
+    """Give tyro what parses a command's arguments, with option types in words, and its options."""
     hints = get_type_hints(command, include_extras=True)
     shape = signature(command)
-    for name, parameter in shape.parameters.items():
-        if not is_dataclass(parameter.default):
-            hints[name] = _worded(hints[name])
+    options: list[Option] = []
+    for parameter in shape.parameters.values():
+        group = type(parameter.default) if is_dataclass(parameter.default) else None
+        own = {parameter.name: hints[parameter.name]}
+        own = own if group is None else get_type_hints(group, include_extras=True)
+        for name, hint in own.items():
+            metavar, names = _described(hint)
+            options.append(Option(parameter.name, name, names))
+            if not any(hasattr(mark, "metavar") for mark in getattr(hint, "__metadata__", ())):
+                own[name] = Annotated[hint, shown_as(metavar=metavar)]
+        if group is None:
+            hints |= own
+        else:
+            group.__annotations__ = own
     worded = [p.replace(annotation=hints[n]) for n, p in shape.parameters.items()]
 
     def parse(*words: object, **options: object) -> BoundArguments:
@@ -94,75 +100,41 @@ def parser_of(command: Callable[..., int]) -> Callable[..., BoundArguments]:
     function.__doc__, function.__module__ = command.__doc__, command.__module__
     function.__annotations__ = hints
     vars(function)["__signature__"] = shape.replace(parameters=worded)
-    return function
+    return function, options
 
 
-def _worded(hint: Any) -> Any:  # noqa: ANN401  any type
-    if any(getattr(mark, "metavar", None) for mark in getattr(hint, "__metadata__", ())):
-        return hint  # it says itself how it is shown
-    return Annotated[hint, shown_as(_metavar(hint))]
-
-
-def _metavar(hint: Any) -> str | None:  # noqa: ANN401
-    """Name a value; None where tyro's own name will do: of positional arguments and flags."""
+def _described(hint: Any) -> tuple[str | None, _Names | None]:  # noqa: ANN401  any type
+    """Name a value, None where tyro's own name will do, and say what it names."""
     origin, parts = get_origin(hint), get_args(hint)
     if origin is Annotated:
-        if _POSITIONAL in parts or not any(isinstance(mark, _Names) for mark in parts):
-            return None
-        return "NAME|FILE" if _Names.WEIGHTS in parts else "PATH"
+        own = next((mark for mark in parts if isinstance(mark, _Names)), None)
+        if own is None:
+            return None, _described(parts[0])[1]
+        word = "NAME|FILE" if own is _Names.WEIGHTS else "PATH"
+        return None if _POSITIONAL in parts else word, own
     if origin in (Union, UnionType):
-        return _metavar(next(part for part in parts if part is not NoneType))
+        return _described(next(part for part in parts if part is not NoneType))
     if origin is Literal:
-        return f"{{{','.join(map(str, parts))}}}"
+        return f"{{{','.join(map(str, parts))}}}", None
     if origin in (tuple, list):
-        one = _metavar(parts[0])
-        return one and (f"{one} ..." if parts[1:] in ((), (...,)) else " ".join([one] * len(parts)))
-    return _OF_TYPES.get(hint)
+        one, names = _described(parts[0])
+        many = f"{one} ..." if parts[1:] in ((), (...,)) else " ".join([str(one)] * len(parts))
+        return one and many, names
+    return _OF_TYPES.get(hint), _Names.INPUT if hint is Path else None
 
 
-def _names(hint: Any) -> _Names | None:  # noqa: ANN401
-    """Say what values of a type name, alone or in a tuple or a list."""
-    if hint is Path:
-        return _Names.INPUT
-    parts = get_args(hint)
-    own = next((part for part in parts if isinstance(part, _Names)), None)
-    return own or next((found for part in parts if (found := _names(part)) is not None), None)
-
-
-def _options_of(command: Callable[..., int]) -> Iterator[tuple[str, str, _Names | None]]:
-    """Give the parameter, option and kind of each option; of groups too."""
-    hints = get_type_hints(command, include_extras=True)
-    for name, parameter in signature(command).parameters.items():
-        if is_dataclass(parameter.default):
-            fields = get_type_hints(type(parameter.default), include_extras=True)
-            yield from ((name, field, _names(hint)) for field, hint in fields.items())
-        elif name in hints:
-            yield name, name, _names(hints[name])
-
-
-def refuse_empty(command: Callable[..., int], words: Sequence[str]) -> None:
-    """Refuse a file or folder without a name, as of a script whose variable is unset."""
-    paths = {option for _, option, kind in _options_of(command) if kind is not None}
-    for word, after in pairwise([*words, "end"]):
-        option, sign, value = word.partition("=")
-        is_path = option.startswith("--") and option[2:].replace("-", "_") in paths
-        if is_path and (value if sign else after) == "":
-            raise InputError(
-                f"{option} is empty; name a file or folder (the current folder is '.'), or check "
-                "the variable that should hold it"
-            )
-
-
-def refuse_missing(command: Callable[..., int], values: Mapping[str, Any]) -> None:
+def refuse_missing(options: Sequence[Option], values: Mapping[str, Any]) -> None:
     """Refuse paths and weights that do not exist."""
-    for name, option, kind in _options_of(command):
-        if name not in values or kind in (None, _Names.NEW):
+    for parameter, name, names in options:
+        if parameter not in values or names in (None, _Names.NEW):
             continue
-        value = values[name] if name == option else getattr(values[name], option)
+        value = values[parameter] if parameter == name else getattr(values[parameter], name)
         for one in value if isinstance(value, list | tuple) else [value]:
-            if kind is _Names.WEIGHTS and one is not None:
+            if names is _Names.WEIGHTS and one is not None:
                 bare = re.sub(_PREFIXES, "", one)
-                if bare not in _WORDS and not is_on_hub(bare):
+                if bare not in _WORDS and not bare.startswith("hf:/"):  # of the hub
+                    from depthpose.core.checkpoint import find_weights  # loads torch
+
                     find_weights(bare)
             elif one is not None and not any(mark in str(one) for mark in ("://", *"*?[{")):
                 wanted = Path(one)
@@ -275,8 +247,11 @@ _RULES: tuple[tuple[str, _Case, str, str], ...] = (
 """Commands, in which case they ignore options, which, and why."""
 
 
-def refuse_ignored_options(command: str, words: Sequence[str]) -> None:
-    """Refuse what the command would ignore."""
+def refuse_words(command: str, options: Sequence[Option], words: Sequence[str]) -> None:
+    """Refuse what the command would ignore, and a file or folder without a name.
+
+    Such a name is that of a script whose variable is unset.
+    """
     typed, spelled = Typed(), dict[str, str]()
     here: list[str] = []
     for word in words:
@@ -287,8 +262,14 @@ def refuse_ignored_options(command: str, words: Sequence[str]) -> None:
             here += [value] if sign else []
         else:
             here.append(word)
-    for commands, case, options, why in _RULES:
-        ignored = [spelled[name] for name in options.split() if name in typed]
+    for name in (option.name.replace("_", "-") for option in options if option.names is not None):
+        if typed.get(name, [])[:1] == [""]:
+            raise InputError(
+                f"{spelled[name]} is empty; name a file or folder (the current folder is '.'), or "
+                "check the variable that should hold it"
+            )
+    for commands, case, ignored_names, why in _RULES:
+        ignored = [spelled[name] for name in ignored_names.split() if name in typed]
         if ignored and command in commands.split(", ") and case(typed):
             named = " and ".join(ignored)
             raise InputError(f"{named}: has no effect here; {why}. Leave {named} out")

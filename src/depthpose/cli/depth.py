@@ -1,7 +1,7 @@
 """``depthpose depth ...``."""
 
 import re
-from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 
 import tyro
@@ -41,7 +41,16 @@ def predict(
 
     if not images:
         raise InputError("name images, folders of them, patterns or videos to predict from")
-    options.refuse_unusable(scale, output)
+    near, far = output.color_range
+    height_m, tilt_deg = scale.camera_height, scale.camera_tilt
+    if not 0 < near < far:
+        raise InputError(f"--color-range {near, far}: give near and far metres, near first.")
+    if output.batch < 1:
+        raise InputError(f"--batch {output.batch}: give 1 or more images.")
+    if height_m is not None and not 0.1 <= height_m <= 20:
+        raise InputError(f"--camera-height {height_m:g}: give 0.1 to 20 metres")
+    if tilt_deg is not None and not -45 <= tilt_deg <= 45:
+        raise InputError(f"--camera-tilt {tilt_deg:g}: give -45 to 45 degrees")
     method = work.MethodSource(
         weights=networks.weights,
         config=matching.config,
@@ -53,10 +62,7 @@ def predict(
     )
     method = method.packed() if engine.engine == "ray" else method
 
-    def work_of(sources: Sequence[Path]) -> work.DepthWork:
-        camera = work.read_lens(lens, sources)
-        return work.DepthWork(method=method, camera=camera, scale=scale, output=output)
-
+    work_of = partial(work.image_work, lens, scale, output, method)
     if engine.engine == "ray":
         return work.estimate_by_engine(images, work.IMAGES, work_of, out, engine)
     sources = work.find_sources(images, Path(out))
@@ -98,21 +104,13 @@ def match(
         out: folder for the results.
     """
     from depthpose.cli import depth_predict as work
-    from depthpose.core.camera import read_rig
-    from depthpose.core.files import image_size
-    from depthpose.core.run import refuse_among_inputs
+    from depthpose.core.files.images import refuse_among_inputs
 
     used = None if pairs.matcher == "sgbm" else pairs.matcher or pairs.weights or "default"
     method = work.MethodSource(weights=used, config=matching.config, with_right=True, use="pairs")
     method = method.packed() if engine.engine == "ray" else method
 
-    def work_of(files: Sequence[Path]) -> work.DepthWork:
-        rig = read_rig(camera, image_size(files[0]))
-        output = options.PredictOutput(cloud=pairs.cloud)
-        return work.DepthWork(
-            method=method, camera=rig, output=output, with_check=pairs.check, files=work.PAIRS
-        )
-
+    work_of = partial(work.pair_work, camera, pairs, method)
     if engine.engine == "ray":
         sides = [left] if right is None else [left, right]
         return work.estimate_by_engine(sides, work.PAIRS, work_of, out, engine)

@@ -66,7 +66,7 @@ def predict_all(dataset: Dataset, method: Method, rule: Protocol, folder: Path) 
         pair = dataset.read_input(index)
         return pair if method.with_right else replace(pair, right=None)  # what it must not see
 
-    mine = [usable[k] for k in process.share(len(usable))]
+    mine = usable[process.rank :: process.world]
     readers = {frame.name: partial(read, i) for i, frame in mine}
     sources = {f.name: f.seen_files(with_right=method.with_right) for _, f in usable}
     net = _Unchecked(method.net) if isinstance(method.net, FakestereoNet) else method.net

@@ -2,25 +2,25 @@
 
 import math
 import re
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Literal
 
-from depthpose.cli.arguments import Device, Source, WeightsName, group, shown_as
+from depthpose.cli.arguments import Device, Source, WeightsName, shown_as
 from depthpose.core.errors import InputError
 from depthpose.depth.config import Answer, BaselineName, MatcherConfig, Speed
 
 _POWERS = {"": 0, "K": 1, "M": 2, "G": 3, "T": 4}
 
 
-@group
+@dataclass(frozen=True, kw_only=True)
 class MatcherOptions:
     """How the weights run."""
 
     device: Device = "cpu"
     precision: Literal["fp32", "bf16"] = "fp32"
     """fp32, or bf16: faster, with errors of a few hundredths of a pixel."""
-    max_memory: Annotated[str | None, shown_as("SIZE")] = None
+    max_memory: Annotated[str | None, shown_as(metavar="SIZE")] = None
     """limit on a matcher's activations, such as 1GB or 800MB; the result stays exact."""
     speed: Speed = "fine"
     """quick: at the size that the weights were trained at; fine: one image in a larger size too, a
@@ -32,12 +32,12 @@ class MatcherOptions:
         return MatcherConfig(
             device=self.device,
             precision=self.precision,
-            max_memory_bytes=parse_bytes(self.max_memory),
+            max_memory_bytes=None if self.max_memory is None else parse_bytes(self.max_memory),
             speed=self.speed,
         )
 
 
-@group
+@dataclass(frozen=True, kw_only=True)
 class LensOptions:
     """What is known of the camera of single images; without any of it their EXIF is read."""
 
@@ -50,7 +50,7 @@ class LensOptions:
     """horizontal field of view in degrees, in place of both."""
 
 
-@group
+@dataclass(frozen=True, kw_only=True)
 class ScaleOptions:
     """What sets the metres of single images."""
 
@@ -66,10 +66,9 @@ class ScaleOptions:
     sets the scale of each image."""
 
     @property
-    def distance(self) -> tuple[float, float, float] | None:
+    def distance(self) -> tuple[float, float, float]:
         """The known distance: column, row [px], metres."""
-        if self.known_distance is None:
-            return None
+        assert self.known_distance is not None
         try:
             column, row, metres = (float(word) for word in self.known_distance.split(","))
         except ValueError as error:
@@ -79,7 +78,7 @@ class ScaleOptions:
         return column, row, metres
 
 
-@group
+@dataclass(frozen=True, kw_only=True)
 class MatchOptions(MatcherOptions):
     """How the matcher of the weights runs; sgbm takes none of these."""
 
@@ -92,7 +91,7 @@ class MatchOptions(MatcherOptions):
         return replace(super().config, with_left_right_check=self.left_right_check)
 
 
-@group
+@dataclass(frozen=True, kw_only=True)
 class PairNetworks:
     """What matches real pairs, whether they are checked, and what is written."""
 
@@ -107,7 +106,7 @@ class PairNetworks:
     """refuse pairs that are swapped, not rectified or no pair; warn where this cannot be told."""
 
 
-@group
+@dataclass(frozen=True, kw_only=True)
 class ImageNetworks:
     """Which networks answer depth of one image."""
 
@@ -123,7 +122,7 @@ class ImageNetworks:
     """also answer out-of-distribution images, with a warning (NAME.warning.txt)."""
 
 
-@group
+@dataclass(frozen=True, kw_only=True)
 class PredictOutput:
     """What is written, and how many images go together."""
 
@@ -135,22 +134,7 @@ class PredictOutput:
     """write a coloured point cloud of what is nearer than 80 m, NAME.cloud.ply."""
 
 
-def refuse_unusable(scale: ScaleOptions, output: PredictOutput) -> None:
-    """Refuse values out of their range."""
-    near, far = output.color_range
-    if not 0 < near < far:
-        raise InputError(
-            f"--color-range {output.color_range}: give near and far metres, near first."
-        )
-    if output.batch < 1:
-        raise InputError(f"--batch {output.batch}: give 1 or more images.")
-    if scale.camera_height is not None and not 0.1 <= scale.camera_height <= 20:
-        raise InputError(f"--camera-height {scale.camera_height:g}: give 0.1 to 20 metres")
-    if scale.camera_tilt is not None and not -45 <= scale.camera_tilt <= 45:
-        raise InputError(f"--camera-tilt {scale.camera_tilt:g}: give -45 to 45 degrees")
-
-
-@group
+@dataclass(frozen=True, kw_only=True)
 class MethodOptions:
     """What is measured; several at once share the table."""
 
@@ -177,7 +161,7 @@ class MethodOptions:
     """names of frames to leave out of them."""
 
 
-@group
+@dataclass(frozen=True, kw_only=True)
 class ProtocolOptions:
     """How prediction and truth are compared."""
 
@@ -197,10 +181,8 @@ class ProtocolOptions:
                 raise InputError(f"--cap {cap_m:g} is given twice; each cap is a row: give it once")
 
 
-def parse_bytes(text: str | None) -> int | None:
+def parse_bytes(text: str) -> int:
     """Read a size such as ``1GB``, ``800M`` or ``1500000`` (bytes); ``1GiB`` is 1024**3."""
-    if text is None:
-        return None
     size = re.fullmatch(r"\s*(\d+(?:\.\d+)?)\s*([KMGT]?)(i?)B?\s*", text, re.IGNORECASE)
     if size is None or (size[3] and not size[2]) or not float(size[1]):
         raise InputError(f"--max-memory {text!r}: not a size. Write, say, 1GB, 800MB or 1.5GiB.")

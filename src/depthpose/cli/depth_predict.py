@@ -15,14 +15,14 @@ import torch
 from torch import Tensor
 from tqdm import tqdm
 
-from depthpose.cli.arguments import changed
-from depthpose.cli.depth_options import LensOptions, PredictOutput, ScaleOptions
+from depthpose.cli.depth_options import LensOptions, PairNetworks, PredictOutput, ScaleOptions
 from depthpose.cli.engine import EngineOptions, Weights, say
 from depthpose.core import run
-from depthpose.core.camera import Camera, FieldOfView, StereoRig, camera_of, read_camera
+from depthpose.core.camera import Camera, FieldOfView, StereoRig, camera_of, read_camera, read_rig
 from depthpose.core.camera.pinhole import camera_keys
 from depthpose.core.checkpoint import file_sha256, find_weights, read_checkpoint
 from depthpose.core.config import config_to_dict
+from depthpose.core.devices import own_device, usable_precision
 from depthpose.core.draw import draw_depth
 from depthpose.core.engine import Files, Function, Inputs, Sample, Work
 from depthpose.core.errors import InputError
@@ -36,9 +36,8 @@ from depthpose.core.files import (
     read_video,
     write_video,
 )
-from depthpose.core.files.disk import find_partners
-from depthpose.core.files.images import LISTED_SUFFIXES
-from depthpose.core.files.text import read_text
+from depthpose.core.files.disk import find_partners, read_text
+from depthpose.core.files.images import LISTED_SUFFIXES, refuse_among_inputs
 from depthpose.depth.config import Answer, MatcherConfig, SGBMConfig
 from depthpose.depth.estimator import FakestereoNet
 from depthpose.depth.ground import scale_by_distance
@@ -50,7 +49,7 @@ from depthpose.depth.predictions import (
     read_estimate,
     write_estimate,
 )
-from depthpose.depth.stereo import SGBMMatcher, with_usable_precision
+from depthpose.depth.stereo import SGBMMatcher
 from depthpose.depth.types import StereoInput
 from depthpose.depth.weights import MATCHERS, Use
 from depthpose.report.depth import depth_section
@@ -95,8 +94,10 @@ class MethodSource:
         if isinstance(self.weights, Weights):
             with self.weights.unpacked() as file:
                 return replace(self, weights=file).build()
-        config = with_usable_precision(self.config)  # what is computed in is what is recorded
-        config = replace(config, device=run.own_device(config.device))
+        device = self.config.device
+        is_bf16 = usable_precision(self.config.precision, device) == "bf16"
+        precision = "bf16" if is_bf16 else "fp32"  # what is computed in is what is recorded
+        config = replace(self.config, precision=precision, device=own_device(device))
         path = find_weights(self.weights)
         kind = read_checkpoint(path).kind
         is_matcher = kind in MATCHERS
@@ -218,6 +219,33 @@ def read_lens(options: LensOptions, sources: Sequence[Path]) -> Camera | FieldOf
     return read
 
 
+def image_work(
+    lens: LensOptions,
+    scale: ScaleOptions,
+    output: PredictOutput,
+    method: MethodSource,
+    sources: Sequence[Path],
+) -> "DepthWork":
+    """Say what is done with single images, whose camera may be known by them alone."""
+    camera = read_lens(lens, sources)
+    mount_m = scale.camera_height or getattr(camera, "mount_height_m", None)
+    if scale.camera_tilt is not None and mount_m is None:
+        raise InputError(
+            "--camera-tilt says where the road is together with --camera-height, or the "
+            "camera file's mount_height_m; give the height, or omit the tilt"
+        )
+    return DepthWork(method=method, camera=camera, scale=scale, output=output)
+
+
+def pair_work(
+    camera: Path, pairs: PairNetworks, method: MethodSource, files: Sequence[Path]
+) -> "DepthWork":
+    """Say what is done with pairs, of which the first may say the size for the camera's file."""
+    rig = read_rig(camera, image_size(files[0]))
+    output = PredictOutput(cloud=pairs.cloud)
+    return DepthWork(method=method, camera=rig, output=output, with_check=pairs.check, files=PAIRS)
+
+
 def find_sources(words: Sequence[str], out: Path) -> list[Path]:
     """List images and videos."""
     sources: list[Path] = []
@@ -234,7 +262,7 @@ def find_sources(words: Sequence[str], out: Path) -> list[Path]:
                 f"an input is called {frame!r}, as a frame of a video would be, and so would their "
                 "results; rename one of the two"
             )
-    run.refuse_among_inputs(out, words, sources)
+    refuse_among_inputs(out, words, sources)
     return sources
 
 
@@ -273,21 +301,13 @@ class DepthWork:
     with_check: bool = True
     files: Files = IMAGES
 
-    def __post_init__(self) -> None:
-        mount_m = self.scale.camera_height or getattr(self.camera, "mount_height_m", None)
-        if self.scale.camera_tilt is not None and mount_m is None:
-            raise InputError(
-                "--camera-tilt says where the road is together with --camera-height, or the "
-                "camera file's mount_height_m; give the height, or omit the tilt"
-            )
-
     def input_of(self, name: str, left: Tensor | Path, right: Path | None = None) -> StereoInput:
         """Make the input of an image or a pair, read already or not."""
         image = read_image(left) if isinstance(left, Path) else left
         camera = camera_of(self.camera, (image.shape[2], image.shape[1]))
         assert camera is not None
         mount = {"mount_height_m": self.scale.camera_height, "tilt_deg": self.scale.camera_tilt}
-        camera = changed(camera, **mount)
+        camera = replace(camera, **{key: v for key, v in mount.items() if v is not None})
         other = None if right is None else read_image(right)
         return StereoInput(name=name, left=image, right=other, camera=camera)
 
@@ -354,7 +374,8 @@ def estimate_all(
     videos = [files[0].stem for files in sources if _is_video(files[0])]
     endings = [f".{end}" for end in ENDINGS] + [_VIDEO]
     run.claim_names(out, {files[0].stem: files for files in sources}, endings, videos)
-    mine = [sources[k] for k in run.find_rank().share(len(sources))]
+    process = run.find_rank()
+    mine = sources[process.rank :: process.world]
     predictor = Predictor(work, method, out)
     stills = [files for files in mine if not _is_video(files[0])]
     named = (one for files in stills for one in work.inputs_of(files))
@@ -367,7 +388,7 @@ def estimate_all(
         print(f"depthpose: failed: {failure}", file=sys.stderr)
     count = f"{done} of {len(mine)} pairs" if work.files == PAIRS else f"{done} depth maps"
     print(f"{count} are in {out}")
-    if run.find_rank().rank == 0:
+    if process.rank == 0:
         ending = ".disparity_px.npy"
         frames = sorted(path.name.removesuffix(ending) for path in out.glob(f"*_??????{ending}"))
         finished: dict[tuple[Path, ...], list[str]] = {}
@@ -389,7 +410,8 @@ def estimate_all(
                         break
         near_m, far_m = work.output.color_range
         which = "all" if len(shown) == len(names) else "spread evenly"
-        text = f"Shown: {len(shown)} of {_count(len(names), 'depth map')} in this folder ({which})."
+        number = f"{len(names)} depth map{'s' * (len(names) != 1)}"
+        text = f"Shown: {len(shown)} of {number} in this folder ({which})."
         rows = [{"not estimated, because": str(reason)} for reason in failures]
         doubts = {name: out / f"{name}.warning.txt" for name in names}
         rows += [{"warning": f"{name}: {read_text(path).strip()}"}
@@ -401,9 +423,8 @@ def estimate_all(
         for one in shown:
             estimate = read_estimate(out, one.name, one.camera)
             sections.append(depth_section(one.name, one, estimate, range_m=(near_m, far_m)))
-        write_page(
-            out / _PAGE, f"Depth of {_count(len(names), 'image')}", sections, run.environment()
-        )
+        title = f"Depth of {len(names)} image{'s' * (len(names) != 1)}"
+        write_page(out / _PAGE, title, sections, run.environment())
         print(f"the page: {out / _PAGE}")
     return 1 if failures else 0
 
@@ -462,7 +483,7 @@ class Predictor:
                     try:
                         if isinstance(estimate, InputError):
                             raise estimate
-                        if scale.distance is not None:
+                        if scale.known_distance is not None:
                             estimate = scale_by_distance(estimate, one.name, scale.distance)  # noqa: PLW2901
                         cloud_m = CLOUD_M if output.cloud else None
                         files = write_estimate(self.out, one, estimate, output.color_range, cloud_m)
@@ -478,7 +499,3 @@ class Predictor:
                 names += [name for name, _ in chunk if name not in self.failures]
                 bar.update(len(chunk))
         return names
-
-
-def _count(number: int, what: str) -> str:
-    return f"{number} {what}{'' if number == 1 else 's'}"

@@ -8,14 +8,14 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
-from depthpose.cli.arguments import group, shown_as
+from depthpose.cli.arguments import shown_as
 from depthpose.core.errors import InputError
 
 if TYPE_CHECKING:  # --help imports this module and must answer at once
     from depthpose.core.engine import Done, Inputs, RayEngine, Work
 
 
-@group
+@dataclass(frozen=True, kw_only=True)
 class EngineOptions:
     """Where the work is done: in this process, or by Ray."""
 
@@ -23,7 +23,7 @@ class EngineOptions:
     """here: in this process, a file for each result. ray: by workers of a Ray cluster (an extra),
     many results to a shard, OUT/shards/*.tar, listed in OUT/manifest.csv; inputs and OUT may be
     URLs (s3://, gs://, file://), inputs also WebDataset shards (*.tar) or a manifest (*.csv)."""
-    address: Annotated[str | None, shown_as("HOST:PORT")] = None
+    address: Annotated[str | None, shown_as(metavar="HOST:PORT")] = None
     """of a running Ray cluster: auto, or HOST:PORT; without it one is started on this machine."""
     workers: int | None = None
     """at most; by default as many as fit into the cluster."""

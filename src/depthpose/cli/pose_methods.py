@@ -298,12 +298,13 @@ class MethodSource:
     def build(self, device: str | None = None) -> PoseMethod:
         """Build the estimator, on a device or on that of the config."""
         config = self.config if device is None else replace(self.config, device=device)
-        if self.weights is None:
+        if self.weights is None or self.weights == REGISTER:
             return _register(REGISTER, self.models, config)
         if isinstance(self.weights, str):
-            return pose_methods([self.weights], config)[0]
-        with self.weights.unpacked() as path:
-            return pose_methods([path], config)[0]
+            path = find_weights(self.weights)
+            return _network(path, path.stem, config)
+        with self.weights.unpacked() as name:
+            return _network(Path(name), Path(name).stem, config)
 
     def packed(self) -> "MethodSource":
         """Give the same with the weights in memory."""

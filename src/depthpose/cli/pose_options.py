@@ -1,9 +1,10 @@
 """Options that several pose commands take: each is declared, and described, once."""
 
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
-from depthpose.cli.arguments import Device, NewPath, Source, changed, group
+from depthpose.cli.arguments import Device, NewPath, Source
 from depthpose.core.errors import InputError
 from depthpose.core.units import Unit
 from depthpose.pose.config import DiameterTable, EstimateConfig, EvaluationConfig, VotingConfig
@@ -11,13 +12,13 @@ from depthpose.pose.config import DiameterTable, EstimateConfig, EvaluationConfi
 Voting = Literal["ransac", "least-squares"]
 
 
-def voting_config(voting: Voting, hypotheses: int | None = None) -> VotingConfig:
+def voting_config(voting: Voting, hypotheses: int = VotingConfig.hypotheses) -> VotingConfig:
     """Give the config of a way to vote."""
     method = "ransac" if voting == "ransac" else "least squares"
-    return changed(VotingConfig(method=method), hypotheses=hypotheses)
+    return VotingConfig(method=method, hypotheses=hypotheses)
 
 
-@group
+@dataclass(frozen=True, kw_only=True)
 class PoseDataOptions:
     """The data set of a table or figure of poses."""
 
@@ -36,7 +37,7 @@ class PoseDataOptions:
         return self.linemod or self.bop
 
 
-@group
+@dataclass(frozen=True, kw_only=True)
 class PoseMeasureOptions:
     """How poses of a data set are estimated and measured."""
 
@@ -68,7 +69,7 @@ class PoseMeasureOptions:
         return EvaluationConfig(diameters=self.diameters, with_vsd=self.vsd)
 
 
-@group
+@dataclass(frozen=True, kw_only=True)
 class PoseTableOptions(PoseMeasureOptions):
     """How the poses of a table are estimated, measured and shown."""
 
@@ -76,7 +77,7 @@ class PoseTableOptions(PoseMeasureOptions):
     """instances that the page shows."""
 
 
-@group
+@dataclass(frozen=True, kw_only=True)
 class OneObjectOptions:
     """A cloud or a depth image of known objects, and what is known of it."""
 
@@ -105,7 +106,7 @@ class OneObjectOptions:
         return self.focal_px if self.camera is None else self.camera
 
 
-@group
+@dataclass(frozen=True, kw_only=True)
 class DataSetOptions:
     """A data set, in place of --cloud and --depth."""
 
@@ -121,7 +122,7 @@ class DataSetOptions:
     the data set; by default all instances."""
 
 
-@group
+@dataclass(frozen=True, kw_only=True)
 class EstimateOptions:
     """How poses are estimated."""
 
@@ -145,7 +146,7 @@ class EstimateOptions:
     @property
     def config(self) -> EstimateConfig:
         """Settings of the estimator, on the device of this process."""
-        from depthpose.core.run import own_device  # --help must not load torch
+        from depthpose.core.devices import own_device  # --help must not load torch
 
         if self.batch < 1:
             raise InputError(f"--batch {self.batch}: at least 1 input in one call of the network")
@@ -159,7 +160,7 @@ class EstimateOptions:
         )
 
 
-@group
+@dataclass(frozen=True, kw_only=True)
 class RegisterOptions:
     """Poses by a CAD file alone, without training."""
 
@@ -171,7 +172,7 @@ class RegisterOptions:
     """of the CAD files; as --unit by default, and of GLB metres."""
 
 
-@group
+@dataclass(frozen=True, kw_only=True)
 class SequenceOptions:
     """The frames, and what is followed in them."""
 

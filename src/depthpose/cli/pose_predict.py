@@ -17,7 +17,7 @@ from tqdm import tqdm
 
 from depthpose.cli import pose_methods
 from depthpose.cli.engine import EngineOptions, say
-from depthpose.cli.pose_methods import EstimateMany, MethodSource, PoseMethod
+from depthpose.cli.pose_methods import MethodSource, PoseMethod
 from depthpose.cli.pose_options import DataSetOptions, OneObjectOptions
 from depthpose.core import run
 from depthpose.core.camera import Camera, camera_of
@@ -43,7 +43,7 @@ from depthpose.core.files import (
     write_json,
 )
 from depthpose.core.files.disk import natural_order
-from depthpose.core.files.images import LISTED_SUFFIXES
+from depthpose.core.files.images import LISTED_SUFFIXES, refuse_among_inputs
 from depthpose.core.rigid import numbers_text
 from depthpose.core.run import is_whole, note_result
 from depthpose.core.units import Unit
@@ -101,7 +101,7 @@ def claim(
     run.claim_folder(out, settings, [POSES, _PAGE])
     if run.find_rank().world == 1 and not run.read_sources(out):  # lost: of what the poses are
         (out / POSES).unlink(missing_ok=True)
-    done = _finished(out)
+    done = [name for name, prediction in _known(out).items() if is_finished(prediction)]
     run.claim_names(
         out,
         {job.name: job.source for job in jobs if job.source is not None},
@@ -153,7 +153,7 @@ def cloud_jobs(cloud: Path, unit: Unit, object: str, out: Path) -> list[Job[Any]
     if not files:
         raise InputError(f"{cloud}: no {', '.join(known)} file there; give a cloud, or a folder")
     _refuse_one_name(files)
-    run.refuse_among_inputs(out, [cloud], files)
+    refuse_among_inputs(out, [cloud], files)
     jobs = [
         Job(name=p.stem, read=partial(cloud_input, p, unit, object, p.stem), source=p)
         for p in files
@@ -175,7 +175,7 @@ def view_jobs(
     """
     runs = sorted(mask.glob("*.json")) if mask.is_dir() else []  # of run lengths
     depths, pictures = _list_depths(depth), runs or list_images(mask)
-    run.refuse_among_inputs(out, [depth, mask], [*depths, *pictures])
+    refuse_among_inputs(out, [depth, mask], [*depths, *pictures])
     _refuse_one_name(depths)
     _refuse_one_name(pictures)
     masks = {path.stem: path for path in pictures}
@@ -214,7 +214,7 @@ def frame_jobs(
 ) -> list[Job[Any]]:
     """Take whole depth images, without masks."""
     depths = _list_depths(depth)
-    run.refuse_among_inputs(out, [depth], depths)
+    refuse_among_inputs(out, [depth], depths)
     _refuse_one_name(depths)
     jobs = [
         Job(name=p.stem, read=partial(view_input, p, None, camera, object, p.stem, unit), source=p)
@@ -257,16 +257,6 @@ def safe_job(job: Job[Any], object: str) -> Job[Any]:
             return PoseEstimate(name=job.name, object=object, status="unreadable", reason=said)
 
     return replace(job, read=read)
-
-
-def safely(method: PoseMethod) -> EstimateMany:
-    """Let a method skip what could not be read."""
-
-    def estimate_many(inputs: Sequence[Any]) -> list[PoseEstimate]:
-        left = iter(method.estimate_many([o for o in inputs if not isinstance(o, PoseEstimate)]))
-        return [one if isinstance(one, PoseEstimate) else next(left) for one in inputs]
-
-    return estimate_many
 
 
 def predict_files(method: PoseMethod, inputs: OneObjectOptions, out: Path, batch: int) -> int:
@@ -336,10 +326,10 @@ def predict_all(
     """
     process = run.find_rank()
     home = out if process.world == 1 else out / f"part-{process.rank}"
-    done = _finished(out)
-    left = [jobs[k] for k in process.share(len(jobs)) if jobs[k].name not in done]
+    done = {name for name, prediction in _known(out).items() if is_finished(prediction)}
+    left = [job for job in jobs[process.rank :: process.world] if job.name not in done]
     if left:
-        names = predict(safely(method), left, home, settings, batch)
+        names = predict(method.estimate_many, left, home, settings, batch)
         for _ in tqdm(names, total=len(left), disable=None, unit=" poses"):
             pass
     if process.rank:
@@ -359,10 +349,6 @@ def predict_all(
     # Inputs of earlier runs stay in the file.
     write_predictions(out, [*known.values(), *predictions])
     return predictions
-
-
-def _finished(out: Path) -> set[str]:
-    return {name for name, prediction in _known(out).items() if is_finished(prediction)}
 
 
 def _known(out: Path) -> dict[str, Prediction]:
@@ -406,6 +392,8 @@ def write_files(
         if pose is None:
             continue
         view, model = job.read(), method.models_by_name[prediction.estimate.object]
+        if isinstance(view, PoseEstimate):  # unreadable by now
+            continue
         points_m = object_points(view, model.diameter_m)
         files = [out / f"{job.name}.{CLOUD}"]
         write_cloud(files[0], drawn.posed_cloud(points_m, pose, model))
@@ -535,9 +523,11 @@ def start_files(
     def predict(samples: Sequence[Sample], out: Path) -> list[str]:
         named = [Job(name=sample.name, read=partial(read, sample)) for sample in samples]
         jobs = [safe_job(job, object) for job in named]
-        estimates = safely(method)([job.read() for job in jobs])
+        inputs = [job.read() for job in jobs]
+        answers = iter(method.estimate_many([i for i in inputs if not isinstance(i, PoseEstimate)]))
         reasons: list[str] = []
-        for job, estimate in zip(jobs, estimates, strict=True):
+        for job, one in zip(jobs, inputs, strict=True):
+            estimate = one if isinstance(one, PoseEstimate) else next(answers)
             prediction = Prediction(estimate=estimate)
             write_json(out / f"{job.name}.{ENDING}", prediction_row(prediction))
             reasons.append("" if is_finished(prediction) else estimate.reason)

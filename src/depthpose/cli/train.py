@@ -3,7 +3,7 @@
 import sys
 import time
 from collections.abc import Callable
-from dataclasses import fields, replace
+from dataclasses import dataclass, fields, replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
@@ -16,7 +16,6 @@ from depthpose.cli.arguments import (
     Source,
     WeightsName,
     changed,
-    group,
 )
 from depthpose.core.errors import InputError
 from depthpose.core.units import Unit
@@ -26,7 +25,7 @@ if TYPE_CHECKING:  # --help must not load torch
     from depthpose.core.loop import Progress
 
 
-@group
+@dataclass(frozen=True, kw_only=True)
 class TrainingOptions:
     """How long a training goes, on what, and from which state."""
 

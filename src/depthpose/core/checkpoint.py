@@ -1,12 +1,19 @@
-"""Weights with the config that made them: safetensors, loaded strictly; others' files, safely."""
+"""Weights with the config that made them: safetensors, loaded strictly; others' files, safely.
 
-import hashlib
+Weights are named by a file, a folder, a name in the package, or one on the Hugging Face hub:
+``hf://OWNER/NAME``, ``hf://OWNER/NAME@REVISION`` or ``hf://OWNER/NAME/FILE.safetensors``, as
+huggingface_hub's own file system writes it. Nothing else is fetched. Files lie in that library's
+cache, and its settings hold: HF_HOME, HF_ENDPOINT, HF_HUB_OFFLINE, the token of ``hf auth login``.
+"""
+
 import json
 import pickle
+import re
 import warnings
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import cache
+from importlib import import_module
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -16,15 +23,32 @@ from safetensors.torch import save
 from torch import Tensor, nn
 from torch.overrides import TorchFunctionMode
 
-from depthpose.core.errors import InputError, Notice
-from depthpose.core.files.disk import refused_as, write_bytes
-from depthpose.core.files.text import refuse_number
-from depthpose.core.hub import SHIPPED as SHIPPED
-from depthpose.core.hub import find_weights as find_weights
+from depthpose.core.errors import InputError, Notice, import_extra, nearest_name
+from depthpose.core.files.disk import file_sha256 as file_sha256
+from depthpose.core.files.disk import refuse_number, refused_as, write_bytes
 
 NetworkT = TypeVar("NetworkT", bound=nn.Module)
 _DRAWS = (nn.init.normal_, nn.init.uniform_, nn.init.kaiming_normal_, nn.init.kaiming_uniform_)
 """Functions that draw random weights, and may be skipped as a whole."""
+_SAFETENSORS = (
+    "safetensors file", "a published checkpoint is imported by 'depthpose weights import'"
+)  # fmt: skip
+"""What a file should be, and what to do where it is not."""
+
+WEIGHTS_FILE = "model.safetensors"
+"""Name of the weights in a repository, as others on the hub call theirs."""
+
+_NAME = r"[\w-][\w.-]*/[\w-][\w.-]*"
+# One slash is left of the two where the name was made a path.
+_REFERENCE = re.compile(rf"hf://?(?P<repository>{_NAME})(@(?P<revision>[^/@]+))?(/(?P<file>.+))?")
+
+
+ON_HUB = "hf:/"
+"""Begins a name of the hub."""
+SHIPPED = Path(__file__).parents[1] / "weights"
+"""Folder of the weights that come with the package."""
+
+_IN_REPOSITORY = ("kitti-nc", "linemod-nc", "bunny-nc", "ycb")  # weights that stay out of the wheel
 
 
 class LicenceNotice(Notice):
@@ -61,6 +85,96 @@ def save_checkpoint(path: Path, checkpoint: Checkpoint) -> None:
     write_bytes(path, b"".join([content[:8], header.ljust(size), rest]))
 
 
+def find_weights(name: str | Path) -> Path:
+    """Find a weights file: by its path, its folder, its name in the package, or on the hub.
+
+    Args:
+        name: a file; weights that came with the package, by name; a folder with one file of
+            weights, or with ``model.safetensors``; or ``hf://OWNER/NAME``.
+
+    Raises:
+        InputError: none of these; the nearest name is said.
+    """
+    path = Path(name)
+    shipped = {file.stem: file for file in SHIPPED.glob("*.safetensors")}
+    if path.is_file():
+        return path
+    if str(name) in shipped:
+        return shipped[str(name)]
+    if path.is_dir():
+        files = sorted(path.glob("*.safetensors"))
+        named = [file for file in files if file.name == WEIGHTS_FILE] or files
+        if len(named) == 1:
+            return named[0]
+        which = ", ".join(file.name for file in files) or "none"
+        raise InputError(
+            f"{path}: a folder of weights holds one .safetensors file, or one called "
+            f"{WEIGHTS_FILE}; here: {which}. Name the file."
+        )
+    if str(name).startswith(ON_HUB):
+        return fetch_weights(str(name))
+    if str(name) in _IN_REPOSITORY:
+        raise InputError(
+            f"weights {str(name)!r}: not in the wheel, for their terms or their size. Take "
+            f"src/depthpose/weights/{name}.safetensors from the repository and give its path."
+        )
+    raise InputError(
+        f"weights {str(name)!r}: neither a file nor the name of weights that came with depthpose; "
+        f"{nearest_name(str(name), shipped)} 'depthpose weights import' imports published ones, "
+        "hf://OWNER/NAME those on the hub."
+    )
+
+
+@cache
+def fetch_weights(name: str) -> Path:
+    """Give the local file of weights on the hub, downloaded if the cache has not got them.
+
+    Asked again, one process gets the same file: what is fingerprinted is what is loaded.
+
+    Raises:
+        InputError: no such name, repository, revision or file; no access; no connection.
+        MissingExtraError: the extra ``hub`` is not installed.
+    """
+    reference = _REFERENCE.fullmatch(name)
+    if reference is None:
+        raise InputError(
+            f"{name!r}: weights on the hub are hf://OWNER/NAME, hf://OWNER/NAME@REVISION or "
+            "hf://OWNER/NAME/FILE.safetensors."
+        )
+    file = reference["file"] or WEIGHTS_FILE
+    if not file.endswith(".safetensors"):
+        raise InputError(f"{name!r}: only .safetensors are fetched: they cannot run code.")
+    hub = import_extra("huggingface_hub", "huggingface_hub", "hub", "weights on the hub")
+    errors = import_module("huggingface_hub.errors")
+    remedies = {
+        errors.HFValidationError: "no name that the hub allows: {said}",
+        errors.GatedRepoError: "its owner asks for consent; give it on the repository's page, then "
+        "'hf auth login'.",
+        errors.RepositoryNotFoundError: "there is no such repository, or it is private: check the "
+        "name, or 'hf auth login' with an account that may read it.",
+        errors.RevisionNotFoundError: "the repository has no such revision.",
+        (errors.LocalEntryNotFoundError, errors.OfflineModeIsEnabled): "the hub cannot be reached, "
+        "and it is not in the cache. Connect once, unset HF_HUB_OFFLINE, or copy the repository's "
+        "folder here and give its path.",
+        errors.EntryNotFoundError: f"the repository has no such file ({WEIGHTS_FILE} by default); "
+        "name it: hf://OWNER/NAME/FILE.safetensors.",
+        # Of the connection, of access, of a full disk. Base classes of the library's errors: of
+        # requests, of httpx or its successor.
+        (OSError, *(k for k in errors.HfHubHTTPError.__mro__[1:] if k.__module__ != "builtins")): (
+            "the hub refused: {said}; try again, or copy the file here and give its path."
+        ),
+    }
+    try:
+        path = hub.hf_hub_download(reference["repository"], file, revision=reference["revision"])
+    except Exception as error:
+        said = " ".join(str(error).split())[:200] or type(error).__name__
+        for kinds, remedy in remedies.items():
+            if isinstance(error, kinds):
+                raise InputError(f"{name}: {remedy.replace('{said}', said)}") from error
+        raise
+    return Path(path)
+
+
 def read_checkpoint(path: Path, kind: str | None = None) -> Checkpoint:
     """Read a file that :func:`save_checkpoint` wrote.
 
@@ -73,25 +187,26 @@ def read_checkpoint(path: Path, kind: str | None = None) -> Checkpoint:
             with numbers that are not finite.
     """
     path = Path(path)
-    with _opened_safetensors(path) as (metadata, tensors):
-        if "kind" not in metadata or "config" not in metadata:
-            raise InputError(
-                f"{path}: no 'kind' and 'config' in its metadata, so no depthpose weights. A "
-                "published checkpoint is imported by 'depthpose weights import'."
-            )
-        held = metadata.pop("kind")
-        if kind is not None and held != kind:
-            raise InputError(
-                f"{path}: holds weights of kind {held!r}, but {kind!r} is needed here."
-            )
-        try:
-            config = json.loads(metadata.pop("config"), parse_constant=refuse_number)
-        except (ValueError, RecursionError) as error:
-            raise InputError(f"{path}: its 'config' is not JSON ({error}).") from error
-        if not isinstance(config, dict):
-            raise InputError(f"{path}: its 'config' is not a mapping.")
-        state = _finite(path, dict(tensors))
-        return Checkpoint(kind=held, config=config, state=state, facts=metadata)
+    if not path.is_file():
+        raise InputError(f"{path}: there is no such weights file.")
+    with refused_as(path, *_SAFETENSORS), safe_open(path, framework="pt") as file:
+        metadata = dict(file.metadata() or {})
+        state = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
+    if "kind" not in metadata or "config" not in metadata:
+        raise InputError(
+            f"{path}: no 'kind' and 'config' in its metadata, so no depthpose weights. A "
+            "published checkpoint is imported by 'depthpose weights import'."
+        )
+    held = metadata.pop("kind")
+    if kind is not None and held != kind:
+        raise InputError(f"{path}: holds weights of kind {held!r}, but {kind!r} is needed here.")
+    try:
+        config = json.loads(metadata.pop("config"), parse_constant=refuse_number)
+    except (ValueError, RecursionError) as error:
+        raise InputError(f"{path}: its 'config' is not JSON ({error}).") from error
+    if not isinstance(config, dict):
+        raise InputError(f"{path}: its 'config' is not a mapping.")
+    return Checkpoint(kind=held, config=config, state=_finite(path, state), facts=metadata)
 
 
 def load_weights(network: nn.Module, checkpoint: Checkpoint, source: str) -> None:
@@ -100,7 +215,12 @@ def load_weights(network: nn.Module, checkpoint: Checkpoint, source: str) -> Non
     Raises:
         InputError: the first names that are missing, unexpected or of another shape.
     """
-    _refuse_misfits(network, checkpoint, source)
+    problems = misfits(network.state_dict(), checkpoint.state)
+    if problems:
+        raise InputError(
+            f"{source}: {len(problems)} tensors do not fit the network of its config: "
+            f"{'; '.join(problems[:3])}. File and config belong to different versions."
+        )
     network.load_state_dict(dict(checkpoint.state))
 
 
@@ -122,7 +242,7 @@ def build_network(make: Callable[[], NetworkT], checkpoint: Checkpoint, source: 
         _WithoutDrawing(),
     ):
         with torch.device("meta"):
-            _refuse_misfits(make(), checkpoint, source)
+            load_weights(make(), checkpoint, source)  # compares shapes, and copies nothing
         network = make()
     network.load_state_dict(dict(checkpoint.state))
     return network
@@ -142,15 +262,6 @@ class _WithoutDrawing(TorchFunctionMode):
         if func in _DRAWS:
             return args[0] if args else options["tensor"]
         return func(*args, **options)
-
-
-def _refuse_misfits(network: nn.Module, checkpoint: Checkpoint, source: str) -> None:
-    problems = misfits(network.state_dict(), checkpoint.state)
-    if problems:
-        raise InputError(
-            f"{source}: {len(problems)} tensors do not fit the network of its config: "
-            f"{'; '.join(problems[:3])}. File and config belong to different versions."
-        )
 
 
 def misfits(wanted: Mapping[str, Tensor], tensors: Mapping[str, Tensor]) -> list[str]:
@@ -207,8 +318,8 @@ def read_published(path: Path, network: str) -> Mapping[str, Tensor]:
     """
     path = Path(path)
     if path.suffix == ".safetensors":
-        with _opened_safetensors(path) as (_, tensors):
-            return _finite(path, dict(tensors))
+        with refused_as(path, *_SAFETENSORS), safe_open(path, framework="pt") as file:
+            return _finite(path, {name: file.get_tensor(name) for name in file.keys()})  # noqa: SIM118
     content = read_torch_file(path)
     state = content.get("state_dict", content)
     if not isinstance(state, Mapping) or not all(isinstance(v, Tensor) for v in state.values()):
@@ -272,25 +383,6 @@ def bound_facts(facts: Mapping[str, str], made_of: Iterable[str | Path]) -> dict
     cards = [read_checkpoint(find_weights(name)).facts for name in made_of]
     terms = join_terms(facts, *cards)
     return {**facts, "terms": terms} if terms else dict(facts)
-
-
-def file_sha256(path: Path) -> str:
-    """Compute a file's sha256, recorded beside every number that was made with it."""
-    with Path(path).open("rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()
-
-
-@contextmanager
-def _opened_safetensors(
-    path: Path,
-) -> Iterator[tuple[dict[str, str], Iterator[tuple[str, Tensor]]]]:
-    """Give metadata and tensors of a file; whatever its bytes raise is an input error."""
-    if not path.is_file():
-        raise InputError(f"{path}: there is no such weights file.")
-    remedy = "a published checkpoint is imported by 'depthpose weights import'"
-    with refused_as(path, "safetensors file", remedy), safe_open(path, framework="pt") as file:
-        tensors = ((name, file.get_tensor(name)) for name in file.keys())  # noqa: SIM118
-        yield dict(file.metadata() or {}), tensors
 
 
 def _finite(path: Path, state: Mapping[str, Tensor]) -> Mapping[str, Tensor]:

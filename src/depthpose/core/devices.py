@@ -6,13 +6,13 @@ from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import ExitStack, contextmanager, nullcontext
-from functools import cache, partial
 from typing import TypeVar, cast
 
 import torch
 
-from depthpose.core.errors import InputError, Notice
+from depthpose.core.errors import InputError, Notice, full_memory, is_of_memory
 
+_PROCESS = os.getpid()  # that loaded torch: one that is forked from it has another number
 Item = TypeVar("Item")
 Made = TypeVar("Made")
 
@@ -26,10 +26,11 @@ def own_arithmetic() -> Iterator[None]:
     """Compute in float32 on the processor where nothing else is said, whatever the caller has set.
 
     Around a caller's autocast, default dtype or default device, weights and inputs would be of two
-    kinds. In a process that was forked from one that has computed, one thread computes: OpenMP's
+    kinds. In a process that was forked from one that has loaded this, one thread computes: OpenMP's
     others did not come along, and would be waited for without end.
     """
-    _threads_after_fork()
+    if os.getpid() != _PROCESS:
+        torch.set_num_threads(1)
     dtype = torch.get_default_dtype()
     device = torch.get_default_device()
     on_cpu = nullcontext() if device.type == "cpu" else torch.device("cpu")
@@ -90,10 +91,15 @@ def each_in_threads(
             torch.set_num_threads(cores)
 
 
-@cache
-def _threads_after_fork() -> None:
-    if hasattr(os, "register_at_fork"):  # not on Windows
-        os.register_at_fork(after_in_child=partial(torch.set_num_threads, 1))
+@contextmanager
+def refused_memory(name: str) -> Iterator[None]:
+    """Turn a full memory into an :class:`InputError`: smaller inputs of a folder may fit."""
+    try:
+        yield
+    except (MemoryError, RuntimeError) as error:
+        if not is_of_memory(error):
+            raise
+        raise InputError(f"{name}: {full_memory(error)}") from error
 
 
 def usable_device(name: str | torch.device) -> torch.device:
@@ -102,7 +108,12 @@ def usable_device(name: str | torch.device) -> torch.device:
     Raises:
         InputError: this machine has none of that name, or it computes no float64.
     """
-    device = _named_device(name)
+    try:
+        device = torch.device(name)
+    except (RuntimeError, TypeError) as error:  # torch lists its 20 kinds
+        raise InputError(
+            f"device {str(name)!r} cannot be used here (no such name); take cpu, cuda or cuda:1"
+        ) from error
     try:
         torch.ones(1, dtype=torch.float64, device=device).cpu()
     except (RuntimeError, AssertionError, TypeError, ImportError) as error:
@@ -113,13 +124,10 @@ def usable_device(name: str | torch.device) -> torch.device:
     return device
 
 
-def _named_device(name: str | torch.device) -> torch.device:
-    try:
-        return torch.device(name)
-    except (RuntimeError, TypeError) as error:  # torch lists its 20 kinds
-        raise InputError(
-            f"device {str(name)!r} cannot be used here (no such name); take cpu, cuda or cuda:1"
-        ) from error
+def own_device(device: str) -> str:
+    """Give each process of a machine a GPU of its own: ``cuda`` is ``cuda:LOCAL_RANK``."""
+    local_rank = os.environ.get("LOCAL_RANK", "")
+    return f"cuda:{local_rank}" if device == "cuda" and local_rank.isdecimal() else device
 
 
 def computes_bf16(device: str | torch.device) -> bool:
@@ -129,7 +137,7 @@ def computes_bf16(device: str | torch.device) -> bool:
     VL and DQ), AMX or AVX-NE-CONVERT, and ARM's with BF16. Elsewhere oneDNN refuses bfloat16, or
     PyTorch computes it 20 to 30 times slower than float32.
     """
-    if _named_device(device).type != "cpu":
+    if usable_device(device).type != "cpu":
         return True
     supports = getattr(torch.ops.mkldnn, "_is_mkldnn_bf16_supported", None)
     return supports is not None and bool(supports())

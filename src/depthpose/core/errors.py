@@ -1,8 +1,7 @@
 """The one error that bad input raises, the notice that stops nothing, and the nearest name."""
 
 import re
-from collections.abc import Iterable, Iterator
-from contextlib import contextmanager
+from collections.abc import Iterable
 from difflib import get_close_matches
 from importlib import import_module
 from typing import Any
@@ -54,17 +53,6 @@ def full_memory(error: BaseException) -> str:
         f"the memory is full ({said}); end other programs, raise the limit (ulimit -v), take "
         "smaller images, or give a stereo matcher --max-memory"
     )
-
-
-@contextmanager
-def refused_memory(name: str) -> Iterator[None]:
-    """Turn a full memory into an :class:`InputError`: smaller inputs of a folder may fit."""
-    try:
-        yield
-    except (MemoryError, RuntimeError) as error:
-        if not is_of_memory(error):
-            raise
-        raise InputError(f"{name}: {full_memory(error)}") from error
 
 
 def import_extra(module: str, package: str, extra: str, purpose: str) -> Any:  # noqa: ANN401

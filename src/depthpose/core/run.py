@@ -1,7 +1,6 @@
 """One folder per run: what made it (settings, versions, machine, commit), its lock, its results.
 
-A line of ``results.jsonl`` names a result, and size, time and checksum of its files. A rerun
-compares sizes and times; a file is read again only where its time is another one, as of a copy.
+A line of ``results.jsonl`` names a result, and size and time of its files, which a rerun compares.
 """
 
 import json
@@ -10,12 +9,10 @@ import platform
 import re
 import subprocess
 import time
-import zlib
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from datetime import UTC, datetime
-from functools import partial
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
@@ -23,7 +20,7 @@ from typing import Any
 import torch
 
 from depthpose.core.errors import InputError
-from depthpose.core.files import disk, read_json, remove_parts, write_json
+from depthpose.core.files import read_json, refused_as, remove_parts, stores, write_json
 from depthpose.core.files.disk import refused_write
 
 try:
@@ -32,72 +29,60 @@ except ImportError:  # not on Windows
     fcntl = None
 
 
-def write_once(record: Path, content: Mapping[str, Any]) -> None:
-    """Write the record of a run, unless another process has just done so."""
-    own = record.with_name(f".part-{os.getpid()}-{record.name}")
-    with refused_write(record):
-        record.parent.mkdir(parents=True, exist_ok=True)
-    write_json(own, content)
-    try:
-        with suppress(FileExistsError):
-            os.link(own, record)
-    except OSError:  # a file system without links
-        write_json(record, content)
-    finally:
-        own.unlink(missing_ok=True)
+RECORD = "run.json"
+RESULTS = "results.jsonl"
+_SOURCES = "sources.json"
+_LOCK = ".lock"
+_OF_RUNS = (RECORD, _SOURCES, _LOCK)  # what a folder holds before its first result
+_FRAME = re.compile(r"_\d{6}$")
+_PACKAGES = ("depthpose", "torch", "numpy", "opencv-python-headless")
+
+_locks: dict[Path, int] = {}  # folders that are locked, and the descriptors of their locks
 
 
-_locks: dict[Path, int] = {}  # records of the folders that are locked, and their descriptors
-
-
-def lock_folder(record: Path, *, is_shared: bool, timeout_s: float = 10.0) -> bool:
+def lock_folder(folder: Path, *, is_shared: bool, timeout_s: float = 10.0) -> bool:
     """Lock a folder against other commands until :func:`release_folders`, or the process ends.
 
-    A POSIX lock: it ends with the process, however that ends, and workers do not inherit it.
-    Where the file system or the machine has none, nothing is held.
+    Where the file system or the machine has no locks, nothing is held.
 
     Args:
-        record: a file in the folder that no command replaces.
+        folder: made where it is missing.
         is_shared: let other processes of the same launch in.
         timeout_s: how long another command may take to end.
 
     Returns:
-        Whether the folder is this process's alone from now on.
+        Whether the folder is this process's from now on, and was not before.
 
     Raises:
         InputError: another command holds the folder, and goes on holding it; or nothing can be
             written there.
     """
-    if fcntl is None:
+    if folder.resolve() in _locks:
         return False
-    # Reading the record has let the lock go: a POSIX lock ends as its file is closed anywhere.
-    held = _locks.get(record.resolve())
-    with refused_write(record):
-        file = os.open(record, os.O_RDWR) if held is None else held
-    kind = fcntl.LOCK_SH if is_shared else fcntl.LOCK_EX
+    with refused_write(folder / _LOCK):
+        folder.mkdir(parents=True, exist_ok=True)
+        file = os.open(folder / _LOCK, os.O_RDWR | os.O_CREAT, 0o666)
     last = time.monotonic() + timeout_s
-    while True:
+    while fcntl is not None:
         try:
-            fcntl.lockf(file, kind | fcntl.LOCK_NB)
-        except OSError as error:
-            is_held = isinstance(error, BlockingIOError)
-            if is_held and time.monotonic() <= last:
-                time.sleep(0.1)
-                continue
-            _locks.pop(record.resolve(), None)
-            os.close(file)
-            if not is_held:  # no locks on this file system
-                return False
-            raise InputError(
-                f"{record.parent}: another command is writing there; wait until it has ended, or "
-                "choose another folder"
-            ) from error
-        _locks[record.resolve()] = file
-        return held is None and not is_shared
+            fcntl.flock(file, (fcntl.LOCK_SH if is_shared else fcntl.LOCK_EX) | fcntl.LOCK_NB)
+            break
+        except BlockingIOError as error:
+            if time.monotonic() > last:
+                os.close(file)
+                raise InputError(
+                    f"{folder}: another command is writing there; wait until it has ended, or "
+                    "choose another folder"
+                ) from error
+            time.sleep(0.1)
+        except OSError:  # no locks on this file system
+            break
+    _locks[folder.resolve()] = file
+    return True
 
 
 def held_folders() -> frozenset[Path]:
-    """Give the records of the folders that this process holds."""
+    """Give the folders that this process holds."""
     return frozenset(_locks)
 
 
@@ -105,28 +90,25 @@ def release_folders(but: Collection[Path] = ()) -> None:
     """Let other commands into the folders that this process has claimed.
 
     Args:
-        but: records of folders that it goes on holding.
+        but: folders that it goes on holding.
     """
-    for record in [record for record in _locks if record not in but]:
-        os.close(_locks.pop(record))
-
-
-RECORD = "run.json"
-_SOURCES = "sources.json"
-_FRAME = re.compile(r"_\d{6}$")
-_PACKAGES = ("depthpose", "torch", "numpy", "opencv-python-headless")
+    for folder in _locks.keys() - set(but):
+        file = _locks.pop(folder)
+        with suppress(OSError):
+            if fcntl is not None:
+                fcntl.flock(file, fcntl.LOCK_UN)  # processes that were forked have the file too
+        os.close(file)
 
 
 @dataclass(frozen=True, kw_only=True)
 class ProcessRank:
-    """Rank of this process among several that share the work through files."""
+    """Rank of this process among several that share the work through files.
+
+    Of a list each takes ``[rank::world]``.
+    """
 
     rank: int = 0  #: 0 .. world - 1
     world: int = 1  #: how many processes there are
-
-    def share(self, total: int) -> range:
-        """Give the indices of 0 .. total - 1 that are this process's."""
-        return range(self.rank, total, self.world)
 
 
 def find_rank() -> ProcessRank:
@@ -142,12 +124,6 @@ def find_rank() -> ProcessRank:
             "let torchrun or accelerate launch set them, or unset both"
         )
     return ProcessRank(rank=int(said[0]), world=int(said[1]))
-
-
-def own_device(device: str) -> str:
-    """Give each process of a machine a GPU of its own: ``cuda`` is ``cuda:LOCAL_RANK``."""
-    local_rank = os.environ.get("LOCAL_RANK", "")
-    return f"cuda:{local_rank}" if device == "cuda" and local_rank.isdecimal() else device
 
 
 def wait_for(
@@ -222,46 +198,33 @@ def claim_folder(
             there.
     """
     record = folder / RECORD
-    if not record.exists():
-        there = [name for name in (_SOURCES, *results) if os.path.lexists(folder / name)]
-        if not there:
-            write_once(record, run_record(settings))
-        elif not record.exists():  # again: another process may have begun the same run
-            raise not_ours(folder / there[0])
+    # Listed before the record is looked for, which other processes of a launch write first.
+    there = [name for name in (_SOURCES, *results) if os.path.lexists(folder / name)]
+    if there and not record.exists():
+        raise not_ours(folder / there[0])
+    is_alone = find_rank().world == 1
+    is_new = lock_folder(folder, is_shared=not is_alone)
     try:
-        earlier = read_settings(folder) or {}
-    except InputError as error:
-        raise InputError(
-            f"{error}. What made the results is not known any more: choose another folder, or "
-            "delete this one"
-        ) from error
-    is_alone, is_other = find_rank().world == 1, _flat(earlier) != _flat(settings)
-    if is_alone and is_other and _is_empty(folder):  # a run that failed before its first result
-        lock_folder(record, is_shared=False)
-        if _is_empty(folder):
+        try:
+            earlier = read_settings(folder)
+        except InputError as error:
+            raise InputError(
+                f"{error}. What made the results is not known any more: choose another folder, or "
+                "delete this one"
+            ) from error
+        # A run that failed before its first result binds no other to its settings.
+        is_free = is_alone and all(path.name in _OF_RUNS for path in folder.iterdir())
+        if earlier is None or (is_free and earlier != settings):
             (folder / _SOURCES).unlink(missing_ok=True)
-            file, content = _locks.get(record.resolve()), run_record(settings)
-            if file is None:  # no locks here
-                write_json(record, content)
-                return
-            # Through the file that holds the lock, which closing another would let go.
-            data = f"{json.dumps(content, indent=2)}\n".encode()
-            os.pwrite(file, data, 0)
-            os.ftruncate(file, len(data))
-            return
-    refuse_other_settings(folder, earlier, settings, remedy)
-    if lock_folder(record, is_shared=not is_alone):
+            write_json(record, {"settings": dict(settings), "environment": environment()})
+        elif earlier != settings:
+            refuse_other_settings(folder, earlier, settings, remedy)
+    except InputError:
+        if is_new:
+            release_folders(but=held_folders() - {folder.resolve()})
+        raise
+    if is_new and is_alone:
         remove_parts(folder)
-
-
-def _is_empty(folder: Path) -> bool:
-    """Whether a folder holds the record of a run and nothing else."""
-    return all(path.name in (RECORD, _SOURCES) for path in folder.iterdir())
-
-
-def run_record(settings: Mapping[str, Any]) -> dict[str, Any]:
-    """Give what ``run.json`` holds: the settings, and what they were run with."""
-    return {"settings": dict(settings), "environment": environment()}
 
 
 def claim_names(
@@ -293,7 +256,7 @@ def claim_names(
         for ending in endings
         if file.name.endswith(ending)
     }
-    known = _known_sources(folder)
+    known = read_sources(folder)
     made = {*results, *(_FRAME.sub("", stem) for stem in results)}
     wanted: dict[str, list[str]] = {}
     for name, files in sources.items():
@@ -312,8 +275,7 @@ def claim_names(
                 f"{folder}: {name!r} is the result of {earlier}, not of {path}; two files of "
                 "one name need two folders: choose another"
             )
-        # Records of before have the stamp of the first file alone.
-        is_other = before and stamp and not f"{stamp}, ".startswith(f"{before}, ")
+        is_other = before and stamp and before != stamp
         if is_other and (name in made if is_finished is None else is_finished(name)):
             files = sources[name]
             said = path if isinstance(files, Path) else " or ".join(map(str, files))
@@ -321,34 +283,29 @@ def claim_names(
                 f"{said}: has changed since its result {name!r} in {folder} was "
                 "made; choose another folder, or delete this one"
             )
-    new = wanted.keys() - known.keys()
+    new, noted = wanted.keys() - known.keys(), read_results(folder)
     for stem, file in results.items():
         is_frame = _FRAME.sub("", stem) in new & set(videos)
         if stem not in known and (stem in new or is_frame):
-            if file not in noted_files(folder, stem):
+            if file.relative_to(folder).as_posix() not in noted.get(stem, {}):
                 raise not_ours(file)
             note_result(folder, stem, [])
-    for name in filter(partial(noted_files, folder), new):  # of which source is not known any more
+    for name in filter(noted.get, new):  # of which source is not known any more
         note_result(folder, name, [])
     if any(known.get(name) != entry for name, entry in wanted.items()):
         write_json(record, known | wanted)
 
 
-def read_sources(folder: Path) -> dict[str, Path]:
-    """Give the file that each result of ``folder`` was made from, by the name of the result."""
-    return {name: Path(path) for name, (path, _) in _known_sources(folder).items() if path}
-
-
-def _known_sources(folder: Path) -> dict[str, list[str]]:
-    """Read path and stamp of each name from the record of sources; empty where it is damaged."""
+def read_sources(folder: Path) -> dict[str, list[str]]:
+    """Give path and stamp of the file that each result is of, by name; none of a damaged record."""
     known = None
     with suppress(InputError):
         known = read_json(folder / _SOURCES) if (folder / _SOURCES).exists() else {}
-    sources: dict[str, list[str]] = {}
-    for name, entry in known.items() if isinstance(known, dict) else ():
-        both = [*(entry if isinstance(entry, list) else [entry]), "", ""][:2]
-        sources[name] = [word if isinstance(word, str) else "" for word in both]
-    return sources
+    return {
+        name: entry
+        for name, entry in (known.items() if isinstance(known, dict) else ())
+        if isinstance(entry, list) and list(map(type, entry)) == [str, str]
+    }
 
 
 def refuse_to_replace(path: Path) -> None:
@@ -361,37 +318,21 @@ def refuse_to_replace(path: Path) -> None:
         raise InputError(f"{path}: is there already; delete it, or give another name")
 
 
-def refuse_among_inputs(out: Path, words: Iterable[str | Path], files: Iterable[Path]) -> None:
-    """Refuse results in a folder whose files are inputs: the next run would take them for such.
-
-    Args:
-        out: where the results go.
-        words: as given: files, folders or patterns.
-        files: that they name.
-
-    Raises:
-        InputError: ``out`` holds such files, and they were not named one by one.
-    """
-    named = {Path(word) for word in words}
-    if any(path not in named and path.parent.resolve() == out.resolve() for path in files):
-        raise InputError(
-            f"--out {out}: the inputs lie there, and a second run would take the results for "
-            "inputs too; choose a folder of their own"
-        )
-
-
 def read_settings(folder: Path | str) -> dict[str, Any] | None:
     """Give the settings that made a folder, by path or URL, or None where no run claimed it.
 
     Raises:
         InputError: its record is damaged.
     """
-    record = disk.join(str(folder), RECORD)
-    if not disk.exists(record):
+    if isinstance(folder, str) and stores.is_url(folder):
+        record = stores.join(folder, RECORD)
+        with refused_as(record, "record of a run", "choose another folder"):
+            content = json.loads(stores.read_from(record)) if stores.exists(record) else None
+    else:
+        record = Path(folder) / RECORD
+        content = read_json(record) if record.is_file() else None
+    if content is None:
         return None
-    with disk.refused_as(record, "record of a run", "choose another folder"):
-        path = disk.local_path(record)
-        content = json.loads(disk.read_from(record)) if path is None else read_json(path)
     settings = content.get("settings") if isinstance(content, dict) else None
     if not isinstance(settings, dict):
         raise InputError(
@@ -439,38 +380,23 @@ def _flat(settings: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
     return flat
 
 
-RESULTS = "results.jsonl"
-_CHUNK_BYTES = 2**22
-
 _read: dict[Path, tuple[int, int, dict[str, dict[str, Any]]]] = {}
 """Cache by results file: its inode, up to which byte it was read, and the results in it."""
 
 
-def file_stamp(path: Path) -> list[int]:
-    """Give size [bytes], time of the last change [ns] and CRC-32 of a file."""
-    status = path.stat()
-    return [status.st_size, status.st_mtime_ns, _checksum(path)]
-
-
-def is_unchanged(path: Path, stamp: Sequence[int]) -> bool:
-    """Whether a file is as it was when it had this stamp."""
-    try:
-        status = path.stat()
-        size, time_ns, checksum = stamp
-        is_same_size = path.is_file() and status.st_size == size
-        return is_same_size and (status.st_mtime_ns == time_ns or _checksum(path) == checksum)
-    except (OSError, ValueError):
-        return False
-
-
 def note_result(folder: Path, name: str, files: Iterable[Path]) -> None:
     """Remember that a result is finished, and its files; none: that it is to be made again."""
-    with refused_write(folder / RESULTS):
-        _append(folder, name, {f.relative_to(folder).as_posix(): file_stamp(f) for f in files})
+    stats = {file.relative_to(folder).as_posix(): file.stat() for file in files}
+    stamps = {file: [status.st_size, status.st_mtime_ns] for file, status in stats.items()}
+    # In one piece, and apart from what a killed process may have left of its last line.
+    line = f"\n{json.dumps({'name': name, 'files': stamps})}\n".encode()
+    with refused_write(folder / RESULTS), (folder / RESULTS).open("ab", buffering=0) as file:
+        while line:  # a full disk takes a part of it, and refuses the rest
+            line = line[file.write(line) :]
 
 
 def is_whole(folder: Path, name: str, needed: Collection[str]) -> bool:
-    """Whether a result is there, and every file of it as it was written.
+    """Whether a result is there, and every file of it as it was written, by size and time.
 
     Args:
         folder: of the results.
@@ -478,36 +404,20 @@ def is_whole(folder: Path, name: str, needed: Collection[str]) -> bool:
         needed: files, relative to the folder, without which it is not finished. Of a result of
             which nothing is noted, as after a loss of the notes, no file is known to be whole.
     """
-    noted = _results(folder).get(name, {})
-    if not noted or not noted.keys() >= set(needed):
-        return False
-    if not all(is_unchanged(folder / file, stamp) for file, stamp in noted.items()):
-        return False
-    times = {file: (folder / file).stat().st_mtime_ns for file in noted}
-    if any(stamp[1] != times[file] for file, stamp in noted.items()):  # a copy: read once
-        with suppress(OSError):
-            _append(folder, name, {f: [s[0], times[f], s[2]] for f, s in noted.items()})
-    return True
-
-
-def noted_files(folder: Path, name: str) -> list[Path]:
-    """Give the files that a run has noted of a result."""
-    return [folder / file for file in _results(folder).get(name, {})]
-
-
-def _append(folder: Path, name: str, stamps: Mapping[str, Sequence[int]]) -> None:
-    # In one piece, and apart from what a killed process may have left of its last line.
-    line = f"\n{json.dumps({'name': name, 'files': stamps})}\n".encode()
-    file = os.open(folder / RESULTS, os.O_WRONLY | os.O_APPEND | os.O_CREAT, 0o666)
+    noted = read_results(folder).get(name, {})
     try:
-        while line:  # a full disk takes a part of it, and refuses the rest
-            line = line[os.write(file, line) :]
-    finally:
-        os.close(file)
+        stats = {file: (folder / file).stat() for file in {*noted, *needed}}
+    except OSError:
+        return False
+    stamps = {file: [status.st_size, status.st_mtime_ns] for file, status in stats.items()}
+    return bool(noted) and stamps == noted
 
 
-def _results(folder: Path) -> dict[str, dict[str, Any]]:
-    """Read what has been noted since it was read last."""
+def read_results(folder: Path) -> dict[str, dict[str, list[int]]]:
+    """Give the files of each result and their stamps: size [bytes], time of the last change [ns].
+
+    What has been noted since it was asked last is read.
+    """
     path = (folder / RESULTS).absolute()
     try:
         status = path.stat()
@@ -528,11 +438,3 @@ def _results(folder: Path) -> dict[str, dict[str, Any]]:
     except OSError:
         return {}
     return results
-
-
-def _checksum(path: Path) -> int:
-    checksum = 0
-    with path.open("rb") as file:
-        while chunk := file.read(_CHUNK_BYTES):
-            checksum = zlib.crc32(chunk, checksum)
-    return checksum

@@ -12,5 +12,6 @@ METRES: dict[str, float] = {"m": 1.0, "cm": 0.01, "mm": 0.001}  # metres a unit
 
 def metres_of(unit: str) -> float:
     """Give the metres of a unit."""
-    refuse_unknown("unit", unit, METRES)
+    if unit not in METRES:
+        refuse_unknown("unit", unit, METRES)
     return METRES[unit]

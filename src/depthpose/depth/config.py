@@ -3,7 +3,7 @@
 from dataclasses import dataclass, field
 from typing import Annotated, ClassVar, Literal
 
-from depthpose.core.config import Settings, check_settings
+from depthpose.core.config import Settings
 from depthpose.core.errors import InputError
 
 TruthKind = Literal["scan", "annotated", "disparity"]
@@ -236,7 +236,9 @@ class LightConfig(NetworkConfig):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        check_settings(self, candidates=f"[1, {self.max_disparity_px // 4}]")
+        most = self.max_disparity_px // 4
+        if not 1 <= self.candidates <= most:
+            raise InputError(f"candidates must be in [1, {most}], got {self.candidates}; take 2")
         if self.width % self.groups:
             raise InputError(
                 f"width must be a multiple of groups, got width={self.width} and "

@@ -11,7 +11,7 @@ import torch
 from depthpose.core.camera import StereoRig
 from depthpose.core.errors import InputError
 from depthpose.core.files import atomic_write, write_disparity_png, write_image
-from depthpose.core.files.text import read_text
+from depthpose.core.files.disk import read_text
 from depthpose.core.run import claim_folder, claim_names, is_whole, note_result
 from depthpose.depth.config import Settings
 from depthpose.depth.datasets import Dataset

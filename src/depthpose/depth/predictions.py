@@ -14,8 +14,7 @@ from depthpose.core.camera import Camera, StereoRig
 from depthpose.core.config import config_from_dict
 from depthpose.core.draw import draw_depth, draw_disparity
 from depthpose.core.errors import InputError
-from depthpose.core.files.disk import write_bytes
-from depthpose.core.files.text import read_text
+from depthpose.core.files.disk import read_text, write_bytes
 from depthpose.core.run import claim_folder, claim_names, is_whole, note_result
 from depthpose.depth.disparity import depth_from_disparity, disparity_from_depth
 from depthpose.depth.metrics import SMALLEST_DEPTH_M

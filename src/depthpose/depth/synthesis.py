@@ -17,9 +17,9 @@ import torch.nn.functional as F
 from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
-from depthpose.core.arrays import check_image
 from depthpose.core.devices import usable_device
 from depthpose.core.errors import InputError
+from depthpose.core.files.images import check_image
 from depthpose.depth.config import GeneratorConfig, SelectionConfig, Speed
 from depthpose.depth.disparity import resize_image
 from depthpose.depth.encoder import LiteEncoder

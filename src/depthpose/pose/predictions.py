@@ -17,8 +17,7 @@ from torch import Tensor
 from depthpose.core.config import config_from_dict
 from depthpose.core.errors import InputError, Notice, nearest_name
 from depthpose.core.files import write_json
-from depthpose.core.files.disk import read_bytes, refused_as, write_bytes
-from depthpose.core.files.text import refuse_heavy
+from depthpose.core.files.disk import read_bytes, refuse_heavy, refused_as, write_bytes
 from depthpose.core.frame import data_frame
 from depthpose.core.rigid import Rigid
 from depthpose.core.run import claim_folder
@@ -283,7 +282,8 @@ class Job(Generic[Input]):
     """One thing to estimate: what it is called, where it belongs, and how its input is read."""
 
     name: str  #: that of the input: unique in a run
-    read: Callable[[], Input]  #: gives the input; called only where the estimate is not there yet
+    #: gives the input, or the estimate that says why there is none; called where none is there yet
+    read: Callable[[], Input | PoseEstimate]
     place: Place | None = None  #: as :class:`Prediction` has it
     seconds: Mapping[str, float] = field(default_factory=dict)  #: what was spent before, on a mask
     source: Path | tuple[Path, ...] | None = None  #: file or files that the input is read from
@@ -319,7 +319,9 @@ def predict(
     try:
         for start in range(0, len(left), batch):
             some = left[start : start + batch]
-            estimates = estimate_many([job.read() for job in some])
+            inputs = [job.read() for job in some]
+            answers = iter(estimate_many([i for i in inputs if not isinstance(i, PoseEstimate)]))
+            estimates = [i if isinstance(i, PoseEstimate) else next(answers) for i in inputs]
             for job, estimate in zip(some, estimates, strict=True):
                 assert estimate.name == job.name, f"{estimate.name!r} is not {job.name!r}"
                 spent = {**job.seconds, **estimate.seconds}

@@ -13,7 +13,7 @@ from jaxtyping import Bool, Float, Int, Int64
 from scipy import ndimage
 from torch import Tensor, nn
 
-from depthpose.core.arrays import Image, check_image
+from depthpose.core.arrays import Image
 from depthpose.core.checkpoint import (
     Checkpoint,
     build_network,
@@ -29,6 +29,7 @@ from depthpose.core.checkpoint import (
 from depthpose.core.config import Settings, config_from_dict, config_to_dict
 from depthpose.core.devices import usable_device
 from depthpose.core.errors import InputError
+from depthpose.core.files.images import check_image
 
 ENCODER_KIND = "resnet18"
 WIDTHS = (64, 128, 256, 512)  #: channels of the four stages in the published network

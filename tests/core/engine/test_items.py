@@ -6,7 +6,7 @@ from tests.core.engine.doubles import write_texts
 
 from depthpose.core.engine import Files, find_items, find_tars
 from depthpose.core.errors import InputError
-from depthpose.core.files.disk import list_files, local_copy, publish_bytes, read_all
+from depthpose.core.files.stores import list_files, local_copy, publish_bytes, read_all
 
 ONE = Files(roles=("text",), suffixes=(".txt",))
 TWO = Files(roles=("left", "right"), suffixes=(".txt",))

@@ -40,15 +40,13 @@ from depthpose.core.camera.stored_camera import (
     is_ros,
     lens_of,
     named,
-    numbers,
     read_storage,
     read_two_files,
     scalar,
 )
 from depthpose.core.errors import InputError, nearest_name
 from depthpose.core.files import AnyPath, read_json, read_key_values, read_text, write_json
-from depthpose.core.files.disk import naming
-from depthpose.core.files.text import MAX_LIST_BYTES
+from depthpose.core.files.disk import MAX_LIST_BYTES, naming
 
 Matrix = Float64[np.ndarray, "rows columns"]
 
@@ -217,37 +215,12 @@ _BOP = ("fx", "fy", "cx", "cy")
 
 
 def facts_from_json(content: object) -> CameraFacts:
-    """Take the camera of a JSON file: ours, BOP's ``camera.json`` or its ``scene_camera.json``."""
-    if isinstance(content, list) and len(content) in (3, 9):
-        return CameraFacts(kind="a matrix", K=_matrix(content))
-    if not isinstance(content, dict):
-        raise InputError(
-            f"a camera is a JSON object with the keys {', '.join(_KEYS)}, "
-            f"not a {type(content).__name__}"
-        )
-    if "K" not in content:
-        if "cam_K" in content:
-            return _from_scene({"0": content})
-        inner = content.get("intrinsic", content)
-        if isinstance(inner, dict) and "intrinsic_matrix" in inner:
-            K = _matrix(inner["intrinsic_matrix"])
-            is_by_columns = isinstance(inner["intrinsic_matrix"][0], int | float)
-            size = _size(inner) if {"width", "height"} <= inner.keys() else None
-            return CameraFacts(
-                kind="a camera of Open3D", K=K.T.contiguous() if is_by_columns else K, size=size
-            )
-        if content.keys() >= set(_BOP):
-            fx, fy, cx, cy = (_json_number(content, key) for key in _BOP)
-            return CameraFacts(
-                kind="a camera of BOP",
-                K=intrinsics(fx, fy, cx, cy),
-                size=_size(content) if {"width", "height"} <= content.keys() else None,
-                baseline_m=baseline_of(named(content)),
-                depth_unit_m=_bop_unit_m(content),
-                distortion=lens_of(named(content)),
-            )
-        if content and all(isinstance(v, dict) and "cam_K" in v for v in content.values()):
-            return _from_scene(content)
+    """Take the camera of a JSON file: ours, or one of those that we know."""
+    if not isinstance(content, dict) or not content.keys() <= set(_KEYS):
+        facts = _foreign_facts(content)
+        if facts is not None:
+            return facts
+    assert isinstance(content, dict)
     if not content.keys() & set(_KEYS):
         keys = ", ".join(map(repr, content))
         raise InputError(f"no camera that is known; its keys are {keys:.80}. Known: {KNOWN_FILES}")
@@ -263,6 +236,46 @@ def facts_from_json(content: object) -> CameraFacts:
     said: dict[str, Any] = {key: _json_number(content, key) for key in known if key in content}
     size = _size(content)
     return CameraFacts(kind="a camera", K=_matrix(content["K"]), size=size, is_metric=True, **said)
+
+
+def _foreign_facts(content: object) -> CameraFacts | None:
+    """Take a bare matrix, the names of ROS and OpenCV, or the JSON of Open3D and BOP."""
+    if isinstance(content, list) and len(content) in (3, 9):
+        return CameraFacts(kind="a matrix", K=_matrix(content))
+    if not isinstance(content, dict):
+        raise InputError(
+            f"a camera is a JSON object with the keys {', '.join(_KEYS)}, "
+            f"not a {type(content).__name__}"
+        )
+    names, facts = named(content), None
+    # Matrices of OpenCV are objects with ``data``.
+    is_storage = any(isinstance(value, dict) and "data" in value for value in content.values())
+    if is_storage or is_ros(names) or {"ppx", "cameramatrix"} & names.keys():
+        facts = _with_own_keys(facts_from_names(names), names)
+    if facts is not None or "K" in content:
+        return facts
+    inner = content.get("intrinsic", content)
+    if "cam_K" in content:
+        facts = _from_scene({"0": content})
+    elif isinstance(inner, dict) and "intrinsic_matrix" in inner:
+        K = _matrix(inner["intrinsic_matrix"])
+        is_by_columns = isinstance(inner["intrinsic_matrix"][0], int | float)
+        size = _size(inner) if {"width", "height"} <= inner.keys() else None
+        K = K.T.contiguous() if is_by_columns else K
+        facts = CameraFacts(kind="a camera of Open3D", K=K, size=size)
+    elif content.keys() >= set(_BOP):
+        fx, fy, cx, cy = (_json_number(content, key) for key in _BOP)
+        facts = CameraFacts(
+            kind="a camera of BOP",
+            K=intrinsics(fx, fy, cx, cy),
+            size=_size(content) if {"width", "height"} <= content.keys() else None,
+            baseline_m=baseline_of(names),
+            depth_unit_m=_bop_unit_m(content),
+            distortion=lens_of(names),
+        )
+    elif content and all(isinstance(v, dict) and "cam_K" in v for v in content.values()):
+        facts = _from_scene(content)
+    return facts
 
 
 def _from_scene(images: dict[str, dict[str, Any]]) -> CameraFacts:
@@ -290,31 +303,30 @@ def _bop_unit_m(keys: dict[str, Any]) -> float | None:
 
 
 def _size(keys: dict[str, Any]) -> Size:
+    what = "a whole number of pixels"
     for key in ("width", "height"):
-        value = keys[key]
-        if not _is_number(value) or value != int(value) or abs(value) > MAX_SIDE_PX:
-            raise InputError(f"{key!r} is {repr(value)[:80]}; give a whole number of pixels")
+        value = _json_number(keys, key, what)
+        if value != int(value) or abs(value) > MAX_SIDE_PX:
+            raise InputError(f"{key!r} is {repr(keys[key])[:80]}; give {what}")
     return int(keys["width"]), int(keys["height"])
 
 
-def _json_number(keys: dict[str, Any], key: str) -> float:
+def _json_number(keys: dict[str, Any], key: str, what: str = "a number") -> float:
     value = keys[key]
-    if not _is_number(value):
-        raise InputError(f"{key!r} is {repr(value)[:80]}; give a number")
+    # A whole number beyond 1e300 has no float.
+    if type(value) not in (int, float) or not abs(value) < 1e300:
+        raise InputError(f"{key!r} is {repr(value)[:80]}; give {what}")
     return float(value)
 
 
 def _matrix(value: object) -> Float[Tensor, "3 3"]:
-    found = numbers(value)
-    if found is None or len(found) != 9:
+    try:
+        return torch.from_numpy(np.array(value, dtype=np.float64).reshape(3, 3))
+    except (TypeError, ValueError, OverflowError) as error:
         shown = repr(value)[:80]
-        raise InputError(f"'K' is {shown}; write [[fx, skew, cx], [0, fy, cy], [0, 0, 1]]")
-    return torch.tensor(found, dtype=torch.float64).reshape(3, 3)
-
-
-def _is_number(value: Any) -> bool:  # noqa: ANN401
-    # A whole number beyond 1e300 has no float.
-    return type(value) in (int, float) and abs(value) < 1e300
+        raise InputError(
+            f"'K' is {shown}; write [[fx, skew, cx], [0, fy, cy], [0, 0, 1]]"
+        ) from error
 
 
 def read_camera(path: AnyPath, size: Size | None = None) -> Camera | StereoRig:
@@ -397,7 +409,7 @@ def _read_facts(path: AnyPath) -> CameraFacts:
         raise InputError("of COLMAP cameras.txt is read: colmap model_converter --output_type TXT")
     text = read_text(path, MAX_LIST_BYTES)
     if re.match(r"\s*(\{|\[\s*[-+\[\d])", text):
-        return _json_facts(read_json(path))
+        return facts_from_json(read_json(path))
     for sign, read in (
         (_MIDDLEBURY, lambda: _middlebury_facts(path)),
         (_KITTI, lambda: _kitti_facts(path)),
@@ -433,18 +445,6 @@ def _with_own_keys(facts: CameraFacts | None, names: Names) -> CameraFacts | Non
             raise InputError(f"{key} is {value!r}; write a number")
         added[key] = number
     return replace(facts, **added, is_metric=facts.is_metric or "baseline_m" in added)
-
-
-def _json_facts(content: object) -> CameraFacts:
-    """Take the names of ROS, OpenCV (whose matrices are objects with ``data``) or others."""
-    if isinstance(content, dict):
-        names = named(content)
-        is_storage = any(isinstance(value, dict) and "data" in value for value in content.values())
-        if is_storage or is_ros(names) or {"ppx", "cameramatrix"} & names.keys():
-            facts = _with_own_keys(facts_from_names(names), names)
-            if facts is not None:
-                return facts
-    return facts_from_json(content)
 
 
 AnyCamera = (
@@ -497,7 +497,7 @@ def camera_of(camera: AnyLens | None, size: Size) -> Camera | None:
     if isinstance(camera, Mapping):
         keys = {key: np.asarray(value).tolist() for key, value in camera.items()}
         has_size = bool({"width", "height"} & keys.keys())
-        facts = _json_facts(keys if has_size else {"width": size[0], "height": size[1], **keys})
+        facts = facts_from_json(keys if has_size else {"width": size[0], "height": size[1], **keys})
         # Without a size of its own the matrix may be that of another resolution: that is checked.
         return camera_from_facts(facts if has_size else replace(facts, size=None), size)
     return camera_from_facts(CameraFacts(kind="a matrix K", K=intrinsics_of(camera)), size)

@@ -35,8 +35,7 @@ from depthpose.core.camera.stored_camera import (
 )
 from depthpose.core.errors import InputError, import_opencv
 from depthpose.core.files import AnyPath, read_json, read_text
-from depthpose.core.files.disk import naming
-from depthpose.core.files.text import MAX_LIST_BYTES
+from depthpose.core.files.disk import MAX_LIST_BYTES, naming
 from depthpose.core.rigid import Rigid
 
 _K = {

@@ -20,8 +20,7 @@ from depthpose.core.camera.pinhole import (
 )
 from depthpose.core.errors import InputError
 from depthpose.core.files import AnyPath, read_text
-from depthpose.core.files.disk import refused_as
-from depthpose.core.files.text import MAX_LIST_BYTES, YamlLoader, refuse_yaml_bomb
+from depthpose.core.files.disk import MAX_LIST_BYTES, YamlLoader, refuse_yaml_bomb, refused_as
 
 Names = dict[str, Any]  # values by name; names in small letters and digits alone
 

@@ -27,18 +27,18 @@ from depthpose.core.engine.work import (
     Item,
     Runner,
     Work,
+    is_unchanged,
     make_plan,
     read_shard,
 )
 from depthpose.core.errors import InputError, MissingExtraError, import_extra
-from depthpose.core.files import disk, remove_parts
+from depthpose.core.files import remove_parts, stores
 from depthpose.core.run import (
     RECORD,
-    is_unchanged,
+    environment,
     not_ours,
     read_settings,
     refuse_other_settings,
-    run_record,
 )
 
 MANIFEST = "manifest.csv"
@@ -69,16 +69,16 @@ def run_job(job: Job, engine: Engine) -> list[Done]:
         InputError: the folder holds results of other settings or inputs, or refuses; or two
             samples of tar shards have one name.
     """
-    out = disk.absolute(job.out)
-    disk.refuse_unsafe(out)
+    out = stores.absolute(job.out)
+    stores.refuse_unsafe(out)
     claim(out, {**job.settings, "shards": "tar"})
     blocks = make_plan(out, job.items, job.tars, job.block)
-    folder = disk.join(out, SHARDS)
-    sizes, records = disk.list_sizes(folder), {one.name: one for one in read_results(out)}
+    folder = stores.join(out, SHARDS)
+    sizes, records = stores.list_sizes(folder), {one.name: one for one in read_results(out)}
     done: dict[str, Done] = {}
     for block in blocks:
-        one, record = records.get(block.shard), disk.join(folder, f"{block.shard}.json")
-        path = None if one is None else disk.local_path(disk.join(folder, one.shard))
+        one, record = records.get(block.shard), stores.join(folder, f"{block.shard}.json")
+        path = None if one is None else stores.local_path(stores.join(folder, one.shard))
         if one is None or one.block != block.checksum:
             is_whole = False
         elif path is None:  # of a store sizes alone are compared
@@ -87,12 +87,12 @@ def run_job(job: Job, engine: Engine) -> list[Done]:
             is_whole = is_unchanged(path, one.stamp)
             if is_whole and (time_ns := path.stat().st_mtime_ns) != one.stamp[1]:  # a copy
                 one = replace(one, stamp=(one.stamp[0], time_ns, one.stamp[2]))
-                disk.publish_bytes(one.to_json().encode(), record)
+                stores.publish_bytes(one.to_json().encode(), record)
         if one is not None and is_whole:
             if not one.failures:
                 done[block.shard] = one
         elif f"{block.shard}.json" in sizes:
-            disk.remove(record)
+            stores.remove(record)
     left = [block for block in blocks if block.shard not in done]
     if left:
         done |= {one.name: one for one in engine(left, job.work, out)}
@@ -102,7 +102,7 @@ def run_job(job: Job, engine: Engine) -> list[Done]:
             f"{out}: {len(lost)} of {len(blocks)} shards are missing, first {lost[0]}; start "
             "again: what is finished is kept"
         )
-    if (folder := disk.local_path(disk.join(out, SHARDS))) is not None:
+    if (folder := stores.local_path(stores.join(out, SHARDS))) is not None:
         remove_parts(folder)  # of killed workers: all have ended
     text = io.StringIO()
     table = csv.writer(text, lineterminator="\n")
@@ -119,7 +119,7 @@ def run_job(job: Job, engine: Engine) -> list[Done]:
             seen[name] = one.shard
             table.writerow([name, one.shard, reason])
     manifest = text.getvalue().encode(errors="surrogateescape")
-    disk.publish_bytes(manifest, disk.join(out, MANIFEST))
+    stores.publish_bytes(manifest, stores.join(out, MANIFEST))
     return every
 
 
@@ -129,21 +129,24 @@ def claim(out: str, settings: Mapping[str, Any]) -> None:
         refuse_other_settings(out, earlier, settings)
         return
     for name in (MANIFEST, PLAN, SHARDS):
-        if disk.exists(disk.join(out, name)):
-            raise not_ours(disk.join(out, name))
-    record = f"{json.dumps(run_record(settings), indent=2)}\n"
-    disk.publish_bytes(record.encode(), disk.join(out, RECORD))
+        if stores.exists(stores.join(out, name)):
+            raise not_ours(stores.join(out, name))
+    content = {"settings": dict(settings), "environment": environment()}
+    record = f"{json.dumps(content, indent=2)}\n"
+    stores.publish_bytes(record.encode(), stores.join(out, RECORD))
 
 
 def is_job(out: str) -> bool:
     """Whether a folder holds shards of a job."""
-    return disk.exists(disk.join(disk.absolute(out), PLAN))
+    return stores.exists(stores.join(stores.absolute(out), PLAN))
 
 
 def read_results(out: str) -> list[Done]:
     """Say what an earlier job left, shard by shard; a record that is damaged is as none."""
     found: list[Done] = []
-    for _, text in sorted(disk.read_all(disk.join(disk.absolute(out), SHARDS), ".json").items()):
+    for _, text in sorted(
+        stores.read_all(stores.join(stores.absolute(out), SHARDS), ".json").items()
+    ):
         with suppress(ValueError, KeyError, TypeError):
             found.append(Done.from_json(text))
     return found
@@ -156,7 +159,7 @@ def shard_results(out: str, done: Done) -> Iterator[tuple[str, dict[str, bytes]]
         InputError: the shard is not there, or is damaged.
     """
     names = {name for name, reason in done.entries if not reason}
-    return read_shard(disk.join(disk.absolute(out), SHARDS, done.shard), names, done.endings)
+    return read_shard(stores.join(stores.absolute(out), SHARDS, done.shard), names, done.endings)
 
 
 _LEAST_VERSION = (2, 52)  # the first version of Ray that has passwords

@@ -18,9 +18,8 @@ from itertools import groupby, islice
 from pathlib import Path, PurePosixPath
 
 from depthpose.core.errors import InputError
-from depthpose.core.files import disk
+from depthpose.core.files import stores
 from depthpose.core.files.disk import find_partners, refused_write
-from depthpose.core.run import file_stamp
 
 PLAN, SHARDS = "plan.jsonl", "shards"
 
@@ -64,7 +63,7 @@ def find_items(words: Sequence[str], files: Files) -> list[Item]:
             f"{', '.join(others)}: an input has {' and '.join(files.roles)}; give a path for each "
             "of them, or one manifest"
         )
-    sides = [disk.list_files(word, files.suffixes) for word in others]
+    sides = [stores.list_files(word, files.suffixes) for word in others]
     if len(files.roles) == 1:
         items += [Item(stem(url), (url,)) for side in sides for url in side]
     else:
@@ -88,7 +87,7 @@ def find_items(words: Sequence[str], files: Files) -> list[Item]:
 
 def _read_manifest(url: str, roles: Sequence[str]) -> Iterator[Item]:
     try:
-        text = io.StringIO(disk.read_from(url).decode("utf-8-sig"), newline="")
+        text = io.StringIO(stores.read_from(url).decode("utf-8-sig"), newline="")
         rows = list(csv.DictReader(text, strict=True))
     except (UnicodeDecodeError, csv.Error) as error:
         raise InputError(f"{url}: not a CSV table in UTF-8 ({error}); save it so") from error
@@ -102,8 +101,8 @@ def _read_manifest(url: str, roles: Sequence[str]) -> Iterator[Item]:
             )
         files = tuple(
             path
-            if disk.is_url(path) or path.startswith("/")
-            else disk.absolute(disk.join(folder, path))
+            if stores.is_url(path) or path.startswith("/")
+            else stores.absolute(stores.join(folder, path))
             for path in (row[role] for role in roles)
         )
         name = str(row.get("name") or stem(files[0]))
@@ -113,7 +112,7 @@ def _read_manifest(url: str, roles: Sequence[str]) -> Iterator[Item]:
 
 def find_tars(words: Iterable[str]) -> list[str]:
     """List tar shards: files themselves, or those of a pattern."""
-    listed = (url for word in words for url in disk.list_files(word, (".tar", ".tgz", ".gz")))
+    listed = (url for word in words for url in stores.list_files(word, (".tar", ".tgz", ".gz")))
     return list(dict.fromkeys(filter(is_tar, listed)))
 
 
@@ -169,9 +168,9 @@ def make_plan(out: str, items: Sequence[Item], tars: Sequence[str], size: int) -
     has been added to a folder since.
     """
     blocks: list[Block] = []
-    plan = disk.join(out, PLAN)
+    plan = stores.join(out, PLAN)
     with suppress(ValueError, KeyError, TypeError, AttributeError):  # what is damaged, and follows
-        for line in disk.read_from(plan).splitlines() if disk.exists(plan) else ():
+        for line in stores.read_from(plan).splitlines() if stores.exists(plan) else ():
             blocks.append(Block.from_json(line.decode()))  # noqa: PERF401  those before the damage
     files = {item.name: item.files for block in blocks for item in block.items}
     for item in items:
@@ -188,7 +187,7 @@ def make_plan(out: str, items: Sequence[Item], tars: Sequence[str], size: int) -
         if tar not in there:
             blocks.append(Block(f"{len(blocks):06d}", tar=tar))
     if len(blocks) > known:
-        disk.publish_bytes("".join(f"{b.to_json()}\n" for b in blocks).encode(), plan)
+        stores.publish_bytes("".join(f"{b.to_json()}\n" for b in blocks).encode(), plan)
     return blocks
 
 
@@ -221,7 +220,7 @@ def read_tar(url: str) -> Iterator[tuple[str, bytes]]:
     """Read the files of a tar shard, plain or compressed, from its beginning to its end."""
     seen: set[str] = set()
     try:
-        with disk.opened(url) as file, tarfile.open(fileobj=file, mode="r|*") as tar:
+        with stores.opened(url) as file, tarfile.open(fileobj=file, mode="r|*") as tar:
             for member in tar:
                 if not (member.isfile() or member.isdir()):
                     raise InputError(
@@ -284,7 +283,7 @@ def _samples(block: Block, wanted: Files, scratch: Path) -> Iterator[Sample]:
     """Bring the inputs of a block here; the members of a tar shard's share a key, as neighbours."""
     for item in block.items:
         try:
-            sample = Sample(item.name, tuple(disk.local_copy(url, scratch) for url in item.files))
+            sample = Sample(item.name, tuple(stores.local_copy(url, scratch) for url in item.files))
         except InputError as error:
             sample = Sample(item.name, reason=str(error))
         yield sample
@@ -349,7 +348,7 @@ class Done:
     shard: str  #: name of the shard, with its suffix
     entries: tuple[tuple[str, str], ...]  #: name and "" or the reason of its failure, of each input
     endings: tuple[str, ...]  #: that the files of a result may have
-    stamp: tuple[int, ...]  #: size, time and checksum of the shard (``file_stamp`` of core.run)
+    stamp: tuple[int, ...]  #: size, time and checksum of the shard (:func:`file_stamp`)
     block: int  #: checksum of the inputs
 
     @property
@@ -374,6 +373,26 @@ class Done:
         return cls(**row | {key: tuple(row[key]) for key in ("endings", "stamp")})
 
 
+def file_stamp(path: Path) -> tuple[int, int, int]:
+    """Give size [bytes], time of the last change [ns] and CRC-32 of a file."""
+    status, checksum = path.stat(), 0
+    with path.open("rb") as file:
+        while chunk := file.read(2**22):
+            checksum = zlib.crc32(chunk, checksum)
+    return status.st_size, status.st_mtime_ns, checksum
+
+
+def is_unchanged(path: Path, stamp: Sequence[int]) -> bool:
+    """Whether a file is as it was when it had this stamp; it is read if its time is another one."""
+    try:
+        status = path.stat()
+        if not path.is_file() or status.st_size != stamp[0]:
+            return False
+        return status.st_mtime_ns == stamp[1] or file_stamp(path)[2] == stamp[2]
+    except (OSError, IndexError):
+        return False
+
+
 class Runner:
     """Does blocks one after the other; what the work needs is loaded at the first."""
 
@@ -386,18 +405,18 @@ class Runner:
 
         The record ``SHARD.json`` is written after the shard: where it is, the shard is whole.
         """
-        record = disk.join(self._out, SHARDS, f"{block.shard}.json")
-        if disk.exists(record):
-            done = Done.from_json(disk.read_from(record))
+        record = stores.join(self._out, SHARDS, f"{block.shard}.json")
+        if stores.exists(record):
+            done = Done.from_json(stores.read_from(record))
             if not done.failures:
                 return done
         temporary = tempfile.TemporaryDirectory(prefix="depthpose-")
         with refused_write(temporary.name), temporary as scratch:
             file = Path(scratch) / f"{block.shard}.tar"
             entries = tuple(self._write(block, file, Path(scratch)))
-            url = disk.join(self._out, SHARDS, file.name)
-            disk.publish(file, url)
-            stamp = tuple(file_stamp(disk.local_path(url) or file))
+            url = stores.join(self._out, SHARDS, file.name)
+            stores.publish(file, url)
+            stamp = file_stamp(stores.local_path(url) or file)
         done = Done(
             shard=file.name,
             entries=entries,
@@ -405,7 +424,7 @@ class Runner:
             stamp=stamp,
             block=block.checksum,
         )
-        disk.publish_bytes(done.to_json().encode(), record)
+        stores.publish_bytes(done.to_json().encode(), record)
         return done
 
     def _write(self, block: Block, file: Path, scratch: Path) -> Iterator[tuple[str, str]]:

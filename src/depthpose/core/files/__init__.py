@@ -13,8 +13,12 @@ from depthpose.core.files.disk import AnyPath as AnyPath
 from depthpose.core.files.disk import atomic_write as atomic_write
 from depthpose.core.files.disk import cache_folder as cache_folder
 from depthpose.core.files.disk import read_bytes as read_bytes
+from depthpose.core.files.disk import read_json as read_json
+from depthpose.core.files.disk import read_key_values as read_key_values
+from depthpose.core.files.disk import read_text as read_text
 from depthpose.core.files.disk import refused_as as refused_as
 from depthpose.core.files.disk import remove_parts as remove_parts
+from depthpose.core.files.disk import write_json as write_json
 from depthpose.core.files.images import DEPTH_SUFFIXES as DEPTH_SUFFIXES
 from depthpose.core.files.images import MAP_SUFFIXES as MAP_SUFFIXES
 from depthpose.core.files.images import encode_image as encode_image
@@ -31,10 +35,6 @@ from depthpose.core.files.images import write_depth_png as write_depth_png
 from depthpose.core.files.images import write_disparity_png as write_disparity_png
 from depthpose.core.files.images import write_image as write_image
 from depthpose.core.files.images import write_map as write_map
-from depthpose.core.files.text import read_json as read_json
-from depthpose.core.files.text import read_key_values as read_key_values
-from depthpose.core.files.text import read_text as read_text
-from depthpose.core.files.text import write_json as write_json
 from depthpose.core.files.video import VIDEO_SUFFIXES as VIDEO_SUFFIXES
 from depthpose.core.files.video import Video as Video
 from depthpose.core.files.video import read_video as read_video

@@ -14,7 +14,14 @@ from jaxtyping import Float32
 from torch import Tensor
 
 from depthpose.core.errors import InputError, import_open3d
-from depthpose.core.files.disk import AnyPath, read_bytes, refused_as, refused_suffix, write_bytes
+from depthpose.core.files.disk import (
+    MAX_TEXT_BYTES,
+    AnyPath,
+    read_bytes,
+    refused_as,
+    refused_suffix,
+    write_bytes,
+)
 from depthpose.core.files.images import read_npy, to_float32
 from depthpose.core.files.points import (
     Columns,
@@ -25,7 +32,6 @@ from depthpose.core.files.points import (
     read_pcd,
     read_ply_elements,
 )
-from depthpose.core.files.text import MAX_TEXT_BYTES
 
 _ENCODERS = {".ply": encode_ply, ".pcd": encode_pcd}
 _COLOR = ("red", "green", "blue")

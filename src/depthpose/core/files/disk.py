@@ -1,24 +1,26 @@
-"""Bytes from and to disks, tar shards and object stores; names, and which belong together.
+"""Bytes, text, JSON and YAML from and to disks; names of files, and which belong together.
 
 Reading is guarded, writing atomic. A path through a tar shard, ``000000.tar/a.left.png``, is read
-as through a folder; a URL is fsspec's.
+as through a folder.
 """
 
+import hashlib
 import json
+import math
 import os
 import re
 import secrets
-import shutil
 import stat
 import tarfile
-import tempfile
 import warnings
 from collections import Counter
-from collections.abc import Hashable, Iterator, Sequence
+from collections.abc import Hashable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from functools import lru_cache
-from pathlib import Path, PurePosixPath
-from typing import Any
+from pathlib import Path
+from typing import Any, NoReturn
+
+import yaml
 
 from depthpose.core.errors import InputError
 
@@ -26,21 +28,18 @@ AnyPath = str | os.PathLike[str]
 """A path as users give it."""
 
 MAX_FILE_BYTES = 2**28  # largest file that is read whole; a bigger one is a mistake or an attack
+MAX_TEXT_BYTES = 2**26  # a table of a million points, annotations of ten thousand images
+MAX_LIST_BYTES = 2**20  # largest text that lists a few numbers: a calibration, a camera, a config
+_MOST_MEMORY = 700_000_000  # [bytes] of JSON or YAML once it is read, by counting its signs
+_MOST_DEPTH = 50
+_MOST_VALUES = 2_000_000  # most values of YAML whose references are written out
+_PLAIN: type[Any] = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
+"""Ten times faster where PyYAML was built with libyaml, as its wheels are."""
+_MERGE = "tag:yaml.org,2002:merge"
+_OF_JSON = {b",": 60, b"[": 100, b"{": 100, b":": 200}
 
-
-@contextmanager
-def refused_read(path: AnyPath) -> Iterator[None]:
-    """Turn what a disk refuses to give into an :class:`InputError`."""
-    try:
-        yield
-    except FileNotFoundError as error:
-        raise InputError(f"{path}: no such file; check the path") from error
-    except (OSError, MemoryError) as error:
-        raise InputError(f"{path}: cannot be read: {error or 'no memory left'}") from error
-    except InputError:
-        raise
-    except ValueError as error:  # a NUL byte in the name
-        raise InputError(f"{os.fspath(path)!r}: not a file name: {error}") from error
+_KEY_VALUE = re.compile(r"([^\s:=]+)\s*[:=](.*)")
+_BRACKETS = str.maketrans("[];,", "    ")
 
 
 _ADDRESS = re.compile(r"<[^<>]* at 0x[0-9a-fA-F]+>")  # what Python shows of an object in memory
@@ -124,9 +123,9 @@ def atomic_write(path: AnyPath) -> Iterator[Path]:
                 )
             target.parent.mkdir(parents=True, exist_ok=True)
             yield part
-            _sync(part)
+            with part.open("rb+") as file:
+                os.fsync(file.fileno())
             part.replace(target)
-            _sync(target.parent)
     finally:
         with suppress(OSError):
             part.unlink(missing_ok=True)
@@ -145,20 +144,280 @@ def write_bytes(path: AnyPath, data: bytes) -> None:
         part.write_bytes(data)
 
 
-def _sync(path: Path) -> None:
-    if os.name == "nt":  # which syncs no folder, and no file that is open for reading
-        return
-    descriptor = os.open(path, os.O_RDONLY)
-    try:
-        os.fsync(descriptor)
-    finally:
-        os.close(descriptor)
-
-
 def refused_suffix(path: AnyPath, kind: str, known: tuple[str, ...]) -> InputError:
     """Make the error for a file name with an unknown suffix."""
     suffix = Path(path).suffix or "no suffix"
     return InputError(f"{path}: {suffix} is no {kind} format; use {', '.join(known)}")
+
+
+SOURCE = "source.json"  # beside shards fetched when first read: {"url": ...}, where from
+
+
+def read_bytes(path: AnyPath, most: int = MAX_FILE_BYTES) -> bytes:
+    """Read a regular file whole, or one in a shard; more than ``most`` bytes are refused unread.
+
+    A shard that is not here yet is fetched first, from where its folder's ``source.json`` says.
+
+    Raises:
+        InputError: there is no such file, or it is none that can be read; the shard is damaged, or
+            the store that it comes from does not answer.
+    """
+    inside = Path(path)
+    try:
+        if ".tar/" in inside.as_posix():
+            shards = (folder for folder in inside.parents if folder.suffix == ".tar")
+            if (shard := next((one for one in shards if not one.is_dir()), None)) is not None:
+                return _read_in_shard(shard, inside.relative_to(shard).as_posix(), most)
+        status, reason = inside.stat(), ""
+        if stat.S_ISDIR(status.st_mode):
+            reason = "a folder where a file is needed; name a file inside it"
+        elif not stat.S_ISREG(status.st_mode):
+            reason = "a device or pipe; save its content to a regular file first"
+        elif status.st_size > most:
+            reason = (
+                f"{status.st_size} bytes, more than the {most} that are read of such a file; thin "
+                "it out or split it"
+            )
+        if not reason:
+            return inside.read_bytes()
+    except FileNotFoundError as error:
+        raise InputError(f"{path}: no such file; check the path") from error
+    except (OSError, MemoryError) as error:
+        raise InputError(f"{path}: cannot be read: {error or 'no memory left'}") from error
+    except InputError:
+        raise
+    except ValueError as error:  # a NUL byte in the name
+        raise InputError(f"{os.fspath(path)!r}: not a file name: {error}") from error
+    raise InputError(f"{path}: {reason}")
+
+
+def _read_in_shard(shard: Path, name: str, most: int) -> bytes:
+    """Read a file of a tar shard, which is fetched if it is not here."""
+    if not shard.exists():
+        source = shard.parent / SOURCE
+        if not source.is_file():
+            raise InputError(f"{shard}: no such file; check the path")
+        folder = json.loads(source.read_text())["url"].rstrip("/")
+        fetch(f"{folder}/{shard.name}", shard)
+    status = shard.stat()
+    place = _places(shard, status.st_mtime_ns, status.st_size).get(name)
+    if place is None:
+        raise InputError(f"{shard}: holds no file {name!r}; pack the data set again")
+    offset, size = place
+    if size > most:
+        raise InputError(f"{shard}/{name}: {size} bytes, more than the {most} that are read of it")
+    with shard.open("rb") as file:
+        file.seek(offset)
+        data = file.read(size)
+    if len(data) < size:
+        raise InputError(f"{shard}: ends within {name!r}; pack or fetch it again")
+    return data
+
+
+@lru_cache(maxsize=4096)
+def _places(shard: Path, _changed_ns: int, _size: int) -> dict[str, tuple[int, int]]:
+    """Say where each file of a shard begins, and how many bytes it has."""
+    try:
+        with tarfile.open(shard, "r:") as tar:
+            return {m.name: (m.offset_data, m.size) for m in tar if m.isfile() and not m.sparse}
+    except (tarfile.TarError, OSError, EOFError) as error:
+        raise InputError(f"{shard}: not a readable tar shard ({error}); pack it again") from error
+
+
+def fetch(url: str, path: Path) -> None:
+    """Copy a file to the disk, whole or not at all."""
+    with atomic_write(path) as part, file_system(url, "read") as (fs, inner):
+        fs.get_file(inner, str(part))
+
+
+@contextmanager
+def file_system(url: str, done: str) -> Iterator[tuple[Any, str]]:
+    """Give the file system of a URL and the path there; its errors become :class:`InputError`."""
+    try:
+        from fsspec.core import url_to_fs  # takes time to load
+
+        fs, inner = url_to_fs(url)
+        fs.invalidate_cache()
+        yield fs, inner
+    except InputError:
+        raise
+    except FileNotFoundError as error:
+        raise InputError(f"{url}: no such file; check the path") from error
+    except ImportError as error:
+        raise InputError(f"{url}: its file system is not installed: {error}") from error
+    except Exception as error:  # each file system raises errors of its own
+        said = " ".join(f"{type(error).__name__}: {error}".split())[:200]
+        raise InputError(
+            f"{url}: cannot be {done} ({said}); check the address and the credentials"
+        ) from error
+
+
+class YamlLoader(_PLAIN):
+    """Plain values alone, and no key twice."""
+
+    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
+        """Give a mapping; of a key that stands twice the first value would be lost."""
+        seen: set[tuple[str, str]] = set()
+        for key, _ in node.value:
+            if not isinstance(key, yaml.ScalarNode) or key.tag == _MERGE:
+                continue
+            if (key.tag, key.value) in seen:
+                line = key.start_mark.line + 1
+                raise ValueError(f"line {line}: key {key.value!r} is given twice")
+            seen.add((key.tag, key.value))
+        return super().construct_mapping(node, deep)
+
+
+def file_sha256(path: Path) -> str:
+    """Compute a file's sha256, recorded beside every number that was made with it."""
+    with Path(path).open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+def read_text(path: AnyPath, most: int = MAX_TEXT_BYTES) -> str:
+    """Read UTF-8 text, with or without a byte order mark.
+
+    Args:
+        path: the file.
+        most: bytes beyond which it is refused unread.
+
+    Raises:
+        InputError: the file is missing, too large or not UTF-8 text.
+    """
+    try:
+        return read_bytes(path, most).decode("utf-8-sig")
+    except UnicodeDecodeError as error:
+        raise InputError(
+            f"{path}: not UTF-8 text (byte {error.start}: {error.reason}); save it as UTF-8"
+        ) from error
+
+
+def read_json(path: AnyPath) -> object:
+    """Read JSON strictly.
+
+    Raises:
+        InputError: the file is missing or no JSON, holds NaN, infinity or a number beyond float64,
+            gives a key twice, or would fill the memory.
+    """
+    text = read_text(path, MAX_FILE_BYTES)
+    refuse_heavy(path, text.encode(), _OF_JSON)
+
+    def once_each(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+        seen: dict[str, Any] = {}
+        for key, value in pairs:
+            if key in seen:
+                raise ValueError(f"key {key!r} is given twice")
+            seen[key] = value
+        return seen
+
+    def finite(word: str) -> float:
+        value = float(word)
+        return value if math.isfinite(value) else refuse_number(word)
+
+    with refused_as(path, "JSON file", "correct it there"):
+        return json.loads(
+            text, parse_constant=refuse_number, parse_float=finite, object_pairs_hook=once_each
+        )
+
+
+def refuse_heavy(path: AnyPath, data: bytes, memory_of: Mapping[bytes, int]) -> None:
+    """Refuse a tree in text that would fill the memory."""
+    a_letter = 2 if data.isascii() else 5
+    need = a_letter * len(data) + sum(size * data.count(sign) for sign, size in memory_of.items())
+    if need > _MOST_MEMORY:
+        raise InputError(
+            f"{path}: {len(data)} bytes that would take about {need / 1e6:.0f} MB of memory, more "
+            f"than the {_MOST_MEMORY / 1e6:.0f} MB allowed; split it"
+        )
+
+
+def parse_yaml(path: AnyPath, text: str) -> object:
+    """Parse YAML of plain values; references (``*name``) are followed within a bound."""
+    refuse_yaml_bomb(path, text)
+    with refused_as(path, "YAML file", "correct it there"):
+        return yaml.load(text, YamlLoader)  # noqa: S506  a safe loader
+
+
+def refuse_yaml_bomb(path: AnyPath, text: str) -> None:
+    """Refuse YAML that refers to itself, is too deep, or grows beyond all bounds by references."""
+    sizes: dict[str, int] = {}
+    unfinished: list[tuple[str | None, int]] = []
+    with suppress(yaml.YAMLError):  # what is no YAML the parser refuses
+        for event in yaml.parse(text, YamlLoader):
+            anchor, size = getattr(event, "anchor", None), 0
+            match event:
+                case yaml.CollectionStartEvent():
+                    unfinished.append((anchor, 1))
+                    if len(unfinished) > _MOST_DEPTH:
+                        raise InputError(f"{path}: lists of lists, {_MOST_DEPTH} deep; correct it")
+                    continue
+                case yaml.CollectionEndEvent():
+                    anchor, size = unfinished.pop()
+                case yaml.AliasEvent():
+                    if anchor not in sizes:
+                        raise InputError(f"{path}: refers to itself (*{anchor}); write it out")
+                    anchor, size = None, sizes[anchor]
+                case yaml.ScalarEvent():
+                    size = 1
+            if anchor is not None:
+                sizes[anchor] = size
+            if unfinished:
+                unfinished[-1] = (unfinished[-1][0], unfinished[-1][1] + size)
+            if size > _MOST_VALUES:
+                raise InputError(
+                    f"{path}: its references (*name) make more than {_MOST_VALUES} values of it; "
+                    "write them out"
+                )
+
+
+def write_json(path: AnyPath, obj: object) -> None:
+    """Write JSON with an indent of 2, keys in the order they were put in, ending in a newline.
+
+    Raises:
+        InputError: something in ``obj`` has no JSON form, NaN among them, or the disk refuses.
+    """
+    try:
+        text = json.dumps(obj, indent=2, allow_nan=False, ensure_ascii=False)
+        # A name that is not UTF-8 is kept as JSON's escapes of its bytes, which are read back.
+        data = f"{text}\n".encode(errors="backslashreplace")
+    except (ValueError, TypeError, RecursionError) as error:
+        raise InputError(f"{path}: cannot be written as JSON: {error}; use null for NaN") from error
+    write_bytes(path, data)
+
+
+def read_key_values(path: AnyPath) -> dict[str, list[float]]:
+    """Read ``KEY: numbers`` lines, as in KITTI's calibration files.
+
+    ``key=[a b; c d]``, as in Middlebury's, is read row by row. Values that are not all numbers
+    (dates) are left out, and so are blank lines and those that start with ``#``.
+
+    Raises:
+        InputError: the file is missing or not text, a line has no key or repeats one, or a number
+            is not finite.
+    """
+    values: dict[str, list[float]] = {}
+    for number, line in enumerate(read_text(path, MAX_LIST_BYTES).splitlines(), start=1):
+        text = line.strip()
+        if not text or text.startswith("#"):
+            continue
+        match = _KEY_VALUE.fullmatch(text)
+        if match is None:
+            raise InputError(f"{path}: line {number}, {text[:60]!r}, is not 'KEY: numbers'")
+        if match[1] in values:
+            raise InputError(f"{path}: line {number} gives {match[1]!r} again; keep one of them")
+        numbers: list[float] = []
+        with suppress(ValueError):  # a date, or other words
+            numbers = [float(word) for word in match[2].translate(_BRACKETS).split()]
+        if not all(map(math.isfinite, numbers)):
+            raise InputError(f"{path}: line {number}, {match[1]!r}, holds NaN or infinity")
+        if numbers:
+            values[match[1]] = numbers
+    return values
+
+
+def refuse_number(text: str) -> NoReturn:
+    """Refuse NaN and infinity, which Python's parser of JSON would take."""
+    raise ValueError(f"{text} is not a JSON number")
 
 
 _MOST_SHOWN = 6
@@ -219,257 +478,3 @@ def _own_parts(first: Sequence[str], second: Sequence[str]) -> tuple[list[Any], 
             parts = [re.sub(r"\d+", lambda found: str(int(found[0])), text) for text in texts]
             keys[side] = [(*key, part) for key, part in zip(keys[side], parts, strict=True)]
     return keys[0], keys[1]
-
-
-SOURCE = "source.json"  # beside shards fetched when first read: {"url": ...}, where from
-_STORES = ("s3", "s3a", "gs", "gcs", "az", "abfs", "abfss")
-"""Stores in which an upload appears whole or not at all."""
-
-
-def read_bytes(path: AnyPath, most: int = MAX_FILE_BYTES) -> bytes:
-    """Read a regular file whole, or one in a shard; more than ``most`` bytes are refused unread.
-
-    A shard that is not here yet is fetched first, from where its folder's ``source.json`` says.
-
-    Raises:
-        InputError: there is no such file, or it is none that can be read; the shard is damaged, or
-            the store that it comes from does not answer.
-    """
-    inside = Path(path)
-    with refused_read(path):
-        is_in_shard = ".tar/" in inside.as_posix()
-        shards = (p for p in inside.parents if is_in_shard and p.suffix == ".tar")
-        shard = next((p for p in shards if not p.is_dir()), None)
-        if shard is None:
-            status = inside.stat()
-            if stat.S_ISDIR(status.st_mode):
-                raise InputError(f"{path}: a folder where a file is needed; name a file inside it")
-            if not stat.S_ISREG(status.st_mode):
-                raise InputError(
-                    f"{path}: a device or pipe; save its content to a regular file first"
-                )
-            if status.st_size > most:
-                raise InputError(
-                    f"{path}: {status.st_size} bytes, more than the {most} that are read of such a "
-                    "file; thin it out or split it"
-                )
-            return inside.read_bytes()
-        name = inside.relative_to(shard).as_posix()
-        if not shard.exists():
-            source = shard.parent / SOURCE
-            if not source.is_file():
-                raise InputError(f"{shard}: no such file; check the path")
-            fetch(join(json.loads(source.read_text())["url"], shard.name), shard)
-        status = shard.stat()
-        place = _places(shard, status.st_mtime_ns, status.st_size).get(name)
-        if place is None:
-            raise InputError(f"{shard}: holds no file {name!r}; pack the data set again")
-        offset, size = place
-        if size > most:
-            raise InputError(
-                f"{shard}/{name}: {size} bytes, more than the {most} that are read of it"
-            )
-        with shard.open("rb") as file:
-            file.seek(offset)
-            data = file.read(size)
-        if len(data) < size:
-            raise InputError(f"{shard}: ends within {name!r}; pack or fetch it again")
-        return data
-
-
-@lru_cache(maxsize=4096)
-def _places(shard: Path, _changed_ns: int, _size: int) -> dict[str, tuple[int, int]]:
-    """Say where each file of a shard begins, and how many bytes it has."""
-    try:
-        with tarfile.open(shard, "r:") as tar:
-            return {m.name: (m.offset_data, m.size) for m in tar if m.isfile() and not m.sparse}
-    except (tarfile.TarError, OSError, EOFError) as error:
-        raise InputError(f"{shard}: not a readable tar shard ({error}); pack it again") from error
-
-
-def is_url(path: str) -> bool:
-    """Whether a path names its file system: ``s3://bucket/key``."""
-    return "://" in path
-
-
-def local_path(url: str) -> Path | None:
-    """Give the local path behind a path or ``file://`` URL; None in an object store."""
-    if not is_url(url):
-        return Path(url)
-    protocol, _, rest = url.partition("://")
-    return Path(rest) if protocol in ("file", "local") else None
-
-
-def join(folder: str, *names: str) -> str:
-    """Join names to a folder or its URL."""
-    return "/".join([folder.rstrip("/"), *names])
-
-
-def absolute(path: str) -> str:
-    """Give a path that means the same in every process; URLs do already."""
-    local = local_path(path)
-    return path if local is None else str(local.absolute())
-
-
-def read_from(url: str) -> bytes:
-    """Read a file whole."""
-    path = local_path(url)
-    if path is not None:
-        return read_bytes(path)
-    with _file_system(url, "read") as (fs, inner):
-        return fs.cat_file(inner)
-
-
-def exists(url: str) -> bool:
-    """Whether there is a file."""
-    path = local_path(url)
-    if path is not None:
-        return path.is_file()
-    with _file_system(url, "looked for") as (fs, inner):
-        return bool(fs.isfile(inner))
-
-
-def read_all(folder: str, suffix: str) -> dict[str, bytes]:
-    """Read the files of a folder, not below it, by suffix; none where there is no folder."""
-    path = local_path(folder)
-    if path is not None:
-        return {p.name: read_bytes(p) for p in sorted(path.glob(f"*{suffix}")) if _shown(p.name)}
-    with _file_system(folder, "listed") as (fs, inner):
-        names = sorted(e["name"] for e in _details(fs, inner) if e["name"].endswith(suffix))
-        return {PurePosixPath(name).name: fs.cat_file(name) for name in names}
-
-
-def publish(file: Path, url: str) -> None:
-    """Put a finished local file under its final name, whole or not at all."""
-    path = local_path(url)
-    if path is not None:
-        with atomic_write(path) as part:
-            shutil.copyfile(file, part)
-        return
-    refuse_unsafe(url)
-    with _file_system(url, "written") as (fs, inner):
-        fs.put_file(str(file), inner)
-
-
-def publish_bytes(data: bytes, url: str) -> None:
-    """Put bytes under a name, whole or not at all; see :func:`publish`."""
-    with tempfile.TemporaryDirectory(prefix="depthpose-") as scratch:
-        file = Path(scratch) / "part"
-        file.write_bytes(data)
-        publish(file, url)
-
-
-def refuse_unsafe(url: str) -> None:
-    """Refuse a place for results where a killed upload may leave half a file."""
-    protocol = url.partition("://")[0]
-    if local_path(url) is None and protocol not in _STORES:
-        raise InputError(
-            f"{url}: {protocol}:// may show half a file when an upload is cut off; write results "
-            f"to a local path, or to one of {', '.join(f'{name}://' for name in _STORES)}"
-        )
-
-
-def local_copy(url: str, scratch: Path) -> Path:
-    """Give a file as a local path: itself on a disk, else a copy in a new folder in ``scratch``.
-
-    Raises:
-        InputError: it is in a store and cannot be read there.
-    """
-    if (path := local_path(url)) is not None:
-        return path
-    copy = Path(tempfile.mkdtemp(dir=scratch)) / PurePosixPath(url).name
-    with _file_system(url, "read") as (fs, inner):
-        fs.get_file(inner, str(copy))
-    return copy
-
-
-def fetch(url: str, path: Path) -> None:
-    """Copy a file to the disk, whole or not at all."""
-    with atomic_write(path) as part, _file_system(url, "read") as (fs, inner):
-        fs.get_file(inner, str(part))
-
-
-@contextmanager
-def opened(url: str) -> Iterator[Any]:
-    """Open a file for reading from its beginning to its end."""
-    with _file_system(url, "read") as (fs, inner):
-        file = fs.open(inner, "rb")
-    with file:
-        yield file
-
-
-def list_files(path: str, suffixes: Sequence[str]) -> list[str]:
-    """List files, not hidden ones, by their suffixes: one, those of a folder or of a pattern."""
-    with _file_system(path, "listed") as (fs, inner):
-        if fs.isfile(inner):
-            files = [inner]
-        elif fs.isdir(inner) or not any(mark in inner for mark in "*?["):
-            files = [entry["name"] for entry in _details(fs, inner)]
-        else:
-            # Brackets in the name of a folder that is there stand for themselves.
-            home, _, rest = inner.rpartition("/")
-            while "[" in home and not fs.isdir(home):
-                home, _, last = home.rpartition("/")
-                rest = f"{last}/{rest}"
-            files = fs.glob(f"{home.replace('[', '[[]')}/{rest}" if "[" in home else inner)
-    kept = [p for p in files if PurePosixPath(p).suffix.lower() in suffixes and _shown(p)]
-    kept.sort(key=lambda p: natural_order(Path(p)))
-    if not kept:
-        raise InputError(
-            f"{path}: no {', '.join(suffixes)} file there; give a file, a folder or a pattern"
-        )
-    prefix = f"{path.partition('://')[0]}://" if is_url(path) else ""
-    return [f"{prefix}{p}" for p in kept]
-
-
-def list_sizes(folder: str) -> dict[str, int]:
-    """Give the sizes [bytes] of the files of a folder, by name; none where there is no folder."""
-    with _file_system(folder, "listed") as (fs, inner):
-        return {PurePosixPath(e["name"]).name: int(e["size"]) for e in _details(fs, inner)}
-
-
-def remove(url: str) -> None:
-    """Remove a file."""
-    with _file_system(url, "removed") as (fs, inner):
-        fs.rm_file(inner)
-
-
-def list_tree(url: str) -> dict[str, str]:
-    """List all files below a folder: their URLs by their names in it; none without a folder."""
-    with _file_system(url, "listed") as (fs, inner):
-        root = inner.rstrip("/")
-        names = [path.removeprefix(root).lstrip("/") for path in fs.find(inner)]
-    return {name: join(url, name) for name in sorted(names)}
-
-
-def _details(fs: Any, folder: str) -> list[dict[str, Any]]:  # noqa: ANN401  fsspec has no types
-    try:
-        return [entry for entry in fs.ls(folder, detail=True) if entry["type"] == "file"]
-    except FileNotFoundError:
-        return []
-
-
-def _shown(path: str) -> bool:
-    return not PurePosixPath(path).name.startswith(".")
-
-
-@contextmanager
-def _file_system(url: str, done: str) -> Iterator[tuple[Any, str]]:
-    """Give the file system of a URL and the path there; its errors become :class:`InputError`."""
-    try:
-        from fsspec.core import url_to_fs  # takes time to load
-
-        fs, inner = url_to_fs(url)
-        fs.invalidate_cache()
-        yield fs, inner
-    except InputError:
-        raise
-    except FileNotFoundError as error:
-        raise InputError(f"{url}: no such file; check the path") from error
-    except ImportError as error:
-        raise InputError(f"{url}: its file system is not installed: {error}") from error
-    except Exception as error:  # each file system raises errors of its own
-        said = " ".join(f"{type(error).__name__}: {error}".split())[:200]
-        raise InputError(
-            f"{url}: cannot be {done} ({said}); check the address and the credentials"
-        ) from error

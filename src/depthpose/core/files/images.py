@@ -4,7 +4,7 @@ import math
 import re
 import sys
 import warnings
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from io import BytesIO
 from pathlib import Path
@@ -16,7 +16,6 @@ from jaxtyping import Float, Float32, Shaped
 from PIL import Image
 from torch import Tensor
 
-from depthpose.core.arrays import check_image
 from depthpose.core.errors import InputError, Notice
 from depthpose.core.files.disk import (
     AnyPath,
@@ -113,9 +112,19 @@ def _decoded(name: AnyPath, image: Image.Image) -> np.ndarray:
             values = np.frombuffer(opened.fp.read(6 * image.width * image.height), ">u2")
             whole = values.reshape(image.height, image.width, 3).astype(np.float64)
             return (whole * (65535 / most)).round().clip(0, 65535).astype(np.uint16)
-    pixels, *low = (
-        _rgb_or_grey(name, one if turn is None else one.transpose(turn)) for one in parts
-    )
+    read: list[np.ndarray] = []
+    for part in parts:
+        one = part if turn is None else part.transpose(turn)
+        # Pillow scales 16-bit PGM to 65535.
+        if one.mode in _GREY_16 or (one.mode == "I" and image.format == "PPM"):
+            read.append(np.asarray(one).astype(np.uint16))
+            continue
+        if one.mode in ("I", "F"):
+            raise InputError(f"{name}: 32 bits a pixel; save it with 8 or 16 bits a channel")
+        if one.mode == "P" and "transparency" in one.info:
+            one = one.convert("RGBA")
+        read.append(np.asarray(one.convert("RGB")))
+    pixels, *low = read
     return pixels.astype(np.uint16) * 256 + low[0] if low else pixels
 
 
@@ -148,6 +157,33 @@ def from_16_bit(values: np.ndarray, name: AnyPath) -> np.ndarray:
         )
         warnings.warn(said, Notice, stacklevel=2)
     return ((values.astype(np.float32) - black) / (high - black)).clip(0, 1)
+
+
+def check_image(image: object, name: str, slack: float = 0.5) -> Float[Tensor, "3 h w"]:
+    """Give an RGB image back, or refuse what is none; values may leave [0, 1] by ``slack``."""
+    if not isinstance(image, Tensor):
+        raise InputError(
+            f"{name} must be a tensor, got {type(image).__name__}; read files with "
+            f"core.files.read_image, or use torch.from_numpy"
+        )
+    if image.ndim != 3 or image.shape[0] != 3:
+        raise InputError(
+            f"{name} must have shape (3, H, W), got {tuple(image.shape)}; move channels first, "
+            f"drop alpha, repeat grey three times, and give one image at a time"
+        )
+    if not image.is_floating_point():
+        raise InputError(f"{name} must be float in [0, 1], got {image.dtype}; divide by 255")
+    if not image.numel():
+        raise InputError(f"{name} is empty: shape {tuple(image.shape)}; give it pixels")
+    if not bool(torch.isfinite(image).all()):
+        raise InputError(f"{name} holds NaN or infinite values; replace or mask them first")
+    low, high = float(image.min()), float(image.max())
+    if low < -slack or high > 1 + slack:
+        raise InputError(
+            f"{name} must lie in [0, 1], got {low:.4g} .. {high:.4g}; divide 8-bit values by 255, "
+            f"and do not normalise: the network does"
+        )
+    return image
 
 
 def value_range(values: np.ndarray) -> tuple[int, int]:
@@ -246,6 +282,25 @@ def list_images(path: AnyPath) -> list[Path]:
     return pictures
 
 
+def refuse_among_inputs(out: Path, words: Iterable[str | Path], files: Iterable[Path]) -> None:
+    """Refuse results in a folder whose files are inputs: the next run would take them for such.
+
+    Args:
+        out: where the results go.
+        words: as given: files, folders or patterns.
+        files: that they name.
+
+    Raises:
+        InputError: ``out`` holds such files, and they were not named one by one.
+    """
+    named = {Path(word) for word in words}
+    if any(path not in named and path.parent.resolve() == out.resolve() for path in files):
+        raise InputError(
+            f"--out {out}: the inputs lie there, and a second run would take the results for "
+            "inputs too; choose a folder of their own"
+        )
+
+
 @contextmanager
 def opened_image(path: AnyPath) -> Iterator[Image.Image]:
     """Open a picture's header; whatever decoding raises inside the block is an input error."""
@@ -268,17 +323,6 @@ def _orientation(image: Image.Image) -> int:
     is_turned = image.format == "TIFF"
     is_hidden = image.format == "PNG" and "exif" not in image.info
     return 1 if is_turned or is_hidden else image.getexif().get(_EXIF_ORIENTATION, 1)
-
-
-def _rgb_or_grey(path: AnyPath, image: Image.Image) -> np.ndarray:
-    # Pillow scales 16-bit PGM to 65535.
-    if image.mode in _GREY_16 or (image.mode == "I" and image.format == "PPM"):
-        return np.asarray(image).astype(np.uint16)
-    if image.mode in ("I", "F"):
-        raise InputError(f"{path}: 32 bits a pixel; save it with 8 or 16 bits a channel")
-    if image.mode == "P" and "transparency" in image.info:
-        image = image.convert("RGBA")
-    return np.asarray(image.convert("RGB"))
 
 
 _EXIF_IFD = 0x8769
@@ -457,6 +501,7 @@ def to_float32(array: np.ndarray) -> np.ndarray:
 
 
 KITTI_UNIT = 1 / 256  # KITTI stores metres and pixels of disparity times 256
+_NO_UNIT = "a unit of {} is not positive; KITTI's is 1/256, BOP's 0.001"
 
 
 def read_depth_png(path: AnyPath, unit_m: float = KITTI_UNIT) -> Float32[Tensor, "h w"]:
@@ -469,7 +514,8 @@ def read_depth_png(path: AnyPath, unit_m: float = KITTI_UNIT) -> Float32[Tensor,
     Raises:
         InputError: the file is missing, damaged, 8-bit or coloured, or the unit makes no sense.
     """
-    _check_unit(path, unit_m)
+    if not 0 < unit_m < math.inf:
+        raise InputError(f"{path}: {_NO_UNIT.format(unit_m)}")
     with opened_image(path) as image:
         if image.format not in ("PNG", "TIFF") or image.mode not in ("I;16", "I;16B"):
             raise InputError(
@@ -512,7 +558,8 @@ def write_depth_png(
     Raises:
         InputError: the map is empty, the unit makes no sense, or the disk refuses.
     """
-    _check_unit(path, unit_m)
+    if not 0 < unit_m < math.inf:
+        raise InputError(f"{path}: {_NO_UNIT.format(unit_m)}")
     if depth_m.numel() == 0:
         raise InputError(f"{path}: an empty map {tuple(depth_m.shape)} makes no PNG; give pixels")
     units = (depth_m.detach().cpu().double() / unit_m).round()
@@ -539,8 +586,3 @@ def write_disparity_png(path: AnyPath, disparity_px: Float[Tensor, "h w"]) -> No
         InputError: the map is empty, or the disk refuses.
     """
     write_depth_png(path, disparity_px)
-
-
-def _check_unit(path: AnyPath, unit: float) -> None:
-    if not (math.isfinite(unit) and unit > 0):
-        raise InputError(f"{path}: a unit of {unit} is not positive; KITTI's is 1/256, BOP's 0.001")

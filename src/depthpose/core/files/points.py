@@ -14,8 +14,7 @@ from typing import Any
 import numpy as np
 
 from depthpose.core.errors import InputError
-from depthpose.core.files.disk import AnyPath, read_bytes, refused_as
-from depthpose.core.files.text import MAX_TEXT_BYTES
+from depthpose.core.files.disk import MAX_TEXT_BYTES, AnyPath, read_bytes, refused_as
 
 _WORDS = re.compile(r"[-+]?(?:nan\(\w*\)|1[.,]#(?:QNAN|SNAN|IND|INF)\w*)")
 Columns = dict[str, np.ndarray]  # one array a name, all equally long

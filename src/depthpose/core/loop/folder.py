@@ -18,8 +18,7 @@ from torch import Tensor, nn
 from depthpose.core.checkpoint import misfits, read_torch_file
 from depthpose.core.errors import InputError, Notice, import_extra
 from depthpose.core.files import atomic_write, read_text, remove_parts, write_image
-from depthpose.core.files.disk import naming, refused_as, refused_write
-from depthpose.core.files.text import refuse_heavy
+from depthpose.core.files.disk import naming, refuse_heavy, refused_as, refused_write
 from depthpose.core.loop.task import ValidationResult
 from depthpose.core.run import environment
 

@@ -109,7 +109,8 @@ def local_folder(folder: Path | str) -> Path:
         return Path(folder)
     url = _URL.sub(r"\1://", text, count=1).rstrip("/")  # a Path has made one slash of two
     here = files.cache_folder() / "shards" / hashlib.sha256(url.encode()).hexdigest()[:16]
-    from depthpose.core.files.disk import exists, fetch, join, list_tree  # fsspec takes time
+    from depthpose.core.files.disk import fetch  # fsspec takes time
+    from depthpose.core.files.stores import exists, join, list_tree
 
     if not exists(join(url, INDEX)):
         raise InputError(f"{url}: holds no {INDEX}; 'depthpose data pack' makes one")

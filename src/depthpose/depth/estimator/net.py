@@ -18,7 +18,6 @@ from torch import Tensor
 from torch.nn import functional as F
 from tqdm import tqdm
 
-from depthpose.core.arrays import check_image
 from depthpose.core.camera import (
     AnyCamera,
     AnyLens,
@@ -30,9 +29,10 @@ from depthpose.core.camera import (
     choose_lens,
 )
 from depthpose.core.checkpoint import find_weights, join_terms, warn_of_terms
-from depthpose.core.devices import each_in_threads, own_arithmetic
-from depthpose.core.errors import InputError, Notice, refused_memory
+from depthpose.core.devices import each_in_threads, own_arithmetic, refused_memory
+from depthpose.core.errors import InputError, Notice
 from depthpose.core.files import picture_tensor, read_exif_focal, read_image
+from depthpose.core.files.images import check_image
 from depthpose.depth import disparity
 from depthpose.depth.config import Answer, MatcherConfig, SelectionConfig, SGBMConfig
 from depthpose.depth.ground import scale_by_distance, scale_by_mount
@@ -242,7 +242,7 @@ class FakestereoNet:
         Args:
             weights: weights of both networks, of the generator alone (pairs then need a
                 ``matcher``), or of a matcher alone (real pairs only). None: ``default``, or
-                ``matcher`` alone. What names weights: :func:`depthpose.core.hub.find_weights`.
+                ``matcher`` alone. What names weights: ``core.checkpoint.find_weights``.
             matcher: ``sgbm`` (OpenCV's), weights with a matcher by file or name, or any matcher of
                 your own. None: that of ``weights``.
             config: how the matcher runs.

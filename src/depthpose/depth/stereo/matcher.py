@@ -16,10 +16,10 @@ import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from depthpose.core.arrays import check_image
 from depthpose.core.camera import Camera
 from depthpose.core.devices import usable_device, usable_precision
 from depthpose.core.errors import InputError, import_opencv
+from depthpose.core.files.images import check_image
 from depthpose.depth import disparity
 from depthpose.depth.config import MatcherConfig, NetworkConfig, SGBMConfig
 from depthpose.depth.encoder import LiteEncoder

@@ -13,8 +13,8 @@ from torch import Tensor
 from depthpose.core.camera.pinhole import check_intrinsics
 from depthpose.core.errors import InputError
 from depthpose.core.files import read_json, read_text
+from depthpose.core.files.disk import parse_yaml, refuse_heavy
 from depthpose.core.files.images import LISTED_SUFFIXES
-from depthpose.core.files.text import parse_yaml, refuse_heavy
 from depthpose.core.rigid import Rigid
 from depthpose.pose.config import MeshConfig
 from depthpose.pose.mesh import read_model, symmetries_from_bop, turn_about

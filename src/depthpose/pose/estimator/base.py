@@ -16,8 +16,13 @@ from tqdm import tqdm
 
 from depthpose.core.arrays import take_evenly
 from depthpose.core.camera import AnyCamera, choose_lens
-from depthpose.core.devices import each_in_own_arithmetic, each_in_threads, own_arithmetic
-from depthpose.core.errors import InputError, nearest_name, refused_memory
+from depthpose.core.devices import (
+    each_in_own_arithmetic,
+    each_in_threads,
+    own_arithmetic,
+    refused_memory,
+)
+from depthpose.core.errors import InputError, nearest_name
 from depthpose.core.rigid import Rigid
 from depthpose.core.units import Unit
 from depthpose.pose.cloud import Refusal, local_planes, prepare_cloud
