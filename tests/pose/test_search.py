@@ -122,7 +122,7 @@ def test_point_pairs_propose_every_instance() -> None:
     assert bool((agreement.diff() <= 1e-9).all()), "what the image agrees with best comes first"
     assert len(log_odds) == len(agreement)
     for truth in TRUTHS:
-        assert nearest_m(poses, truth, model) < 0.03 * model.diameter_m
+        assert nearest_m(poses, truth, model) < 0.06 * model.diameter_m
 
 
 def test_what_is_no_longer_left_votes_for_nothing() -> None:
@@ -134,7 +134,7 @@ def test_what_is_no_longer_left_votes_for_nothing() -> None:
     is_left = ~((frame.points_m - middle_m).norm(dim=-1) < model.diameter_m)
     poses, _ = propose_in_frame(frame, is_left, surface, prepare_pairs(surface))
     assert nearest_m(poses, TRUTHS[0], model) > 0.3 * model.diameter_m
-    assert nearest_m(poses, TRUTHS[1], model) < 0.03 * model.diameter_m
+    assert nearest_m(poses, TRUTHS[1], model) < 0.06 * model.diameter_m
 
 
 @pytest.mark.parametrize(

@@ -71,9 +71,9 @@ class Frame:
 
     @cached_property
     def nearest_m(self) -> Float64[Tensor, "h w"]:
-        """Least depth that a pixel or one beside it has; infinite where there is no reading."""
+        """Least depth of the pixels up to two away; infinite where there is no reading."""
         depth_m = torch.where(self.depth_m > 0, self.depth_m, torch.inf)
-        return -max_pool2d(-depth_m[None], 3, 1, 1)[0]
+        return -max_pool2d(-depth_m[None], 5, 1, 2)[0]
 
 
 def prepare_frame(depth_m: Float[Tensor, "h w"], K: Float[Tensor, "3 3"]) -> Frame:

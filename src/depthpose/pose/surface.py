@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Float64, Int64
+from jaxtyping import Bool, Float64, Int64
 from scipy.spatial import KDTree
 from torch import Tensor
 from torch.nn.functional import avg_pool2d, max_pool2d, pad
@@ -59,6 +59,8 @@ class Views:
     toward: Float64[Tensor, "v 3"]  #: unit vectors to the camera
     points_m: Float64[Tensor, "v n 3"]  #: what is seen, evenly spread; NaN where there are fewer
     normals: Float64[Tensor, "v n 3"]  #: theirs
+    #: whether the surface goes on around a point: no rim or edge, which sensors cut.
+    is_inner: Bool[Tensor, "v n"]
     #: places beside the silhouette, as far off as its border; NaN where there are fewer.
     beside_m: Float64[Tensor, "v m 3"]
 
@@ -96,8 +98,10 @@ class Surface:
         _, _, axes = torch.linalg.svd(toward[:, None])
         # The last two rows of each frame are two axes across the direction.
         views = [_view_of(self, way, across[1:]) for way, across in zip(toward, axes, strict=True)]
-        points_m, normals, beside_m = (torch.stack(parts) for parts in zip(*views, strict=True))
-        return Views(toward=toward, points_m=points_m, normals=normals, beside_m=beside_m)
+        points_m, normals, is_inner, beside_m = map(torch.stack, zip(*views, strict=True))
+        return Views(
+            toward=toward, points_m=points_m, normals=normals, is_inner=is_inner, beside_m=beside_m
+        )
 
     @cached_property
     def target(self) -> Any:  # noqa: ANN401  a tuple of numba's
@@ -121,7 +125,7 @@ class Surface:
         )
 
 
-def _view_of(surface: Surface, toward: Tensor, across: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+def _view_of(surface: Surface, toward: Tensor, across: Tensor) -> tuple[Tensor, ...]:
     """Gather a surface in cells of a picture; give the nearest points, and places beside them."""
     cell_m, side = _CELL * surface.diameter_m, 2 * round(0.5 / _CELL) + 10
     about_m = surface.points_m - surface.middle_m
@@ -134,9 +138,14 @@ def _view_of(surface: Surface, toward: Tensor, across: Tensor) -> tuple[Tensor, 
     picture_m = most_m.reshape(1, side, side)
     is_seen = most_m > max_pool2d(picture_m, 3, 1, 1).flatten() - BESIDE * surface.diameter_m
     is_seen &= most_m.isfinite()
-    shown = _spread(first[is_seen], _POINTS)
+    cells = _spread(is_seen.nonzero()[:, 0], _POINTS)
+    shown = first[cells]
     filled = is_seen.double().reshape(1, side, side)
     wide, narrow = (max_pool2d(filled, size, 1, size // 2) for size in (5, 3))
+    # Neither at the silhouette, single empty cells aside, nor beside something farther off.
+    whole = -max_pool2d(-max_pool2d(picture_m.isfinite().double(), 3, 1, 1), 5, 1, 2)
+    farther_m = max_pool2d(torch.where(picture_m.isfinite(), -picture_m, -torch.inf), 3, 1, 1)
+    is_inner = (whole > 0) & (-farther_m > picture_m - BESIDE * surface.diameter_m)
     shown_m = torch.where(filled > 0, picture_m, 0.0)
     border_m = avg_pool2d(shown_m, 5, 1, 2) / avg_pool2d(filled, 5, 1, 2)
     ring = _spread(((wide > 0) & (narrow == 0)).flatten().nonzero()[:, 0], _RING)
@@ -148,7 +157,8 @@ def _view_of(surface: Surface, toward: Tensor, across: Tensor) -> tuple[Tensor, 
         pad(part, (0, 0, 0, most - len(part)), value=torch.nan)
         for part, most in zip(parts, (_POINTS, _POINTS, _RING), strict=True)
     )
-    return points_m, normals, beside_m
+    inner = pad(is_inner.flatten()[cells], (0, _POINTS - len(cells)))
+    return points_m, normals, inner, beside_m
 
 
 def _spread(index: Int64[Tensor, " n"], most: int) -> Int64[Tensor, " m"]:

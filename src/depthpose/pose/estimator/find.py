@@ -9,12 +9,19 @@ import torch
 from jaxtyping import Bool, Float64
 from torch import Tensor
 
+from depthpose.core.arrays import take_evenly
 from depthpose.core.camera import back_project
 from depthpose.core.devices import each_in_threads
 from depthpose.core.rigid import Rigid
 from depthpose.pose.cloud import cloud_from_depth, grow_mask
 from depthpose.pose.config import RefusalConfig
-from depthpose.pose.estimator.fit import BORDER_PX, sensor_size_error, share_out
+from depthpose.pose.estimator.fit import (
+    BORDER_PX,
+    fit_of,
+    seen_about,
+    sensor_size_error,
+    share_out,
+)
 from depthpose.pose.estimator.hypotheses import (
     is_no_side,
     log_odds_wrong,
@@ -28,11 +35,14 @@ from depthpose.pose.voting.point_pairs import PairTable
 
 _MOST_LOG_ODDS = 4.0
 """Proposed poses with larger log odds of being wrong are not refined and judged."""
-_ANSWERED = -0.5
-"""A pose is answered where its log odds of being wrong, once refined, are below."""
-_DISAGREES, _GAP = 19.0, 244.0
-"""Weights of the share of the seen surface that disagrees, and of the distance of the object's
-points to the surface, in diameters, in log odds of being wrong."""
+_ANSWERED, _ANOTHER = 0.5, -0.5
+"""A pose is answered where its log odds of being wrong, once refined, are below; the second one of
+an object where they are below the second: most things are there once, the others often."""
+_DISAGREES, _UNSEEN, _GAP = 20.3, 4.6, 216.0
+"""Weights in log odds of being wrong: of the share of the surface that disagrees with the camera,
+of what it did not see, and of the distance of the object's points to the surface, in diameters."""
+_COMPARED = 500
+"""Points of an object that are laid on the surface."""
 _BENT, _MOST_DEVIATIONS = 2.0, 4.0
 """A sensor bends what it sees: a fitted size deviates by so many times what its noise explains. A
 size that is off by more deviations than the second counts as one that is off by these."""
@@ -182,21 +192,31 @@ def _judged(
         inputs.append(CloudInput(name=name, points_m=cloud_m, object=some[0].object, view=view))
     poses = [Rigid.stack([one.pose for one in some]) for some in groups]
     answers: list[tuple[_Candidate, PoseEstimate]] = []
-    for estimate in known.pose_near(inputs, poses) if inputs else []:
+    estimates = known.pose_near(inputs, poses) if inputs else []
+    for one, estimate in zip(inputs, estimates, strict=True):
         if estimate.camera_from_model is None:
             continue
         surface = known.surface_of(estimate.object)
-        pose, fit = estimate.camera_from_model.double(), estimate.fit
-        assert fit is not None
+        pose = estimate.camera_from_model.double()
+        fit = fit_of(seen_about(one.points_m, view, surface.diameter_m), pose, surface, rim=1)
         log_odds = float(log_odds_wrong(frame, pose[None], surface))
-        log_odds += _DISAGREES * (1 - fit.agrees) + _GAP * estimate.signals["gap"]
+        own = _explained(frame, pose, surface)
+        log_odds += _DISAGREES * (1 - fit.agrees) + _UNSEEN * (1 - fit.seen)
+        log_odds += _GAP * _gap(frame.points_m[own], pose, surface)
         off = size_deviations(estimate, view, surface, known.max_size_error)
         log_odds += 0.5 * min(off, _MOST_DEVIATIONS) ** 2  # of a normal distribution
         if log_odds < _ANSWERED and not is_cut_out(view, pose, surface):
-            own = _explained(frame, pose, surface)
-            one = _Candidate(object=estimate.object, pose=pose, log_odds=log_odds, explained=own)
-            answers.append((one, estimate))
+            found = _Candidate(object=estimate.object, pose=pose, log_odds=log_odds, explained=own)
+            answers.append((found, estimate))
     return answers
+
+
+def _gap(points_m: Float64[Tensor, "n 3"], pose: Rigid, surface: Surface) -> float:
+    """Median distance of points to the planes through the nearest samples, in diameters."""
+    local_m = pose.inverse().apply(take_evenly(points_m, _COMPARED))
+    index = surface.nearest(local_m)
+    along_m = ((local_m - surface.points_m[index]) * surface.normals[index]).sum(-1)
+    return float(along_m.abs().median()) / surface.diameter_m if len(along_m) else NEAR
 
 
 def size_deviations(
@@ -234,6 +254,8 @@ def _without_rivals(
     ranked = sorted(answers, key=lambda answer: answer[0].log_odds)
     for k, (one, estimate) in enumerate(ranked):
         if any(one.shared_with(other) > _SHARED for other in taken):
+            continue
+        if one.log_odds > _ANOTHER and sum(one.object == other.object for other in taken) == 1:
             continue
         taken.append(one)
         rivals = {one.object: (one.log_odds, estimate)}

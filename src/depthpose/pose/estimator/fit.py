@@ -32,7 +32,7 @@ from depthpose.pose.estimator.candidates import (
 from depthpose.pose.mesh import MIRROR_ALIKE
 from depthpose.pose.mesh.models import fibonacci_directions
 from depthpose.pose.refine import refine_pose, refine_roughly
-from depthpose.pose.surface import NEAR, Surface
+from depthpose.pose.surface import BESIDE, NEAR, Surface
 from depthpose.pose.types import (
     Alternative,
     AnyInput,
@@ -119,13 +119,20 @@ def seen_about(cloud_m: Float[Tensor, "n 3"], view: ViewInput | None, diameter_m
     return Seen(depth_m=depth_m, is_own=own, K=moved, noise_m=noise_m)
 
 
-def fit_of(seen: Seen, pose: Rigid, surface: Surface) -> Fit:
+def fit_of(seen: Seen, pose: Rigid, surface: Surface, rim: int = 0) -> Fit:
     """Compare a posed surface with what the camera saw.
 
     Each visible place of the surface is compared with the readings about its pixel, of which the
     nearest in depth counts: the sensor's edges are blurred. Beyond the noise they lie on the
     surface, behind it (the camera saw through the surface), or before it: as part of the object,
     which contradicts the pose, or of something that occludes it.
+
+    Args:
+        seen: about the object.
+        pose: of the surface.
+        surface: of the model.
+        rim: so many cells, of a fortieth of the diameter or more, beside the silhouette and before
+            what is farther off the camera may see through: stereo cuts edges.
     """
     pose = pose.double()
     points_m, normals = pose.apply(surface.points_m), surface.normals @ pose.R.mT
@@ -150,13 +157,16 @@ def fit_of(seen: Seen, pose: Rigid, surface: Surface) -> Fit:
     nearest_m = -max_pool2d(-drawn_m.view(1, rows, columns), 3, 1, 1).flatten()[number]
     filled = grow_mask(grow_mask(drawn_m.view(rows, columns).isfinite(), 1), -1)
     is_covered = grow_mask(filled, border)  # cells within the silhouette or its border
+    front_m = drawn_m.nan_to_num(posinf=-torch.inf).view(1, rows, columns)
+    is_step = max_pool2d(front_m, 2 * rim + 1, 1, rim) > front_m + BESIDE * surface.diameter_m
+    is_inner = (grow_mask(filled, -rim) & ~is_step[0]).flatten()[number]
     hidden_m = 2 * side_m * (1 - cosine.square()).sqrt() / cosine.clamp(min=_GRAZING)
     is_visible = points_m[:, 2] < nearest_m + _FINEST * surface.diameter_m + hidden_m
     height, width = seen.depth_m.shape
     u, v = pixel.round().long().unbind(-1)
     is_visible &= (cosine > _GRAZING) & (u >= 0) & (u < width) & (v >= 0) & (v < height)
     u, v = u[is_visible], v[is_visible]
-    area, depth_m = cosine[is_visible], points_m[is_visible, 2]
+    area, depth_m, is_inner = cosine[is_visible], points_m[is_visible, 2], is_inner[is_visible]
     if len(depth_m) == 0:
         return nothing
     # How far behind the surface the reading is that is nearest to it; NaN where there is none.
@@ -170,7 +180,7 @@ def fit_of(seen: Seen, pose: Rigid, surface: Surface) -> Fit:
     own = grow_mask(seen.is_own, -BORDER_PX)
     own = own if bool(own.any()) else seen.is_own  # thin things are all border
     agrees = float(area[off_m.abs() <= limit_m].sum())
-    through = float(area[off_m > limit_m].sum())
+    through = float(area[(off_m > limit_m) & is_inner].sum())
     bulges = float(area[(off_m < -limit_m) & own[v, u]].sum())
     read = (own & seen.depth_m.isfinite()).nonzero().flip(-1)
     column, row = ((read / side_px).floor().long() - low).unbind(-1)
