@@ -23,6 +23,7 @@ from depthpose.core.camera import Camera, FieldOfView, StereoRig, camera_of, rea
 from depthpose.core.camera.pinhole import camera_keys
 from depthpose.core.checkpoint import file_sha256, find_weights, read_checkpoint
 from depthpose.core.config import config_to_dict
+from depthpose.core.devices import usable_precision
 from depthpose.core.draw import draw_depth
 from depthpose.core.engine import Files, Function, Inputs, Sample, Work
 from depthpose.core.errors import InputError
@@ -50,7 +51,7 @@ from depthpose.depth.predictions import (
     read_estimate,
     write_estimate,
 )
-from depthpose.depth.stereo import SGBMMatcher, with_usable_precision
+from depthpose.depth.stereo import SGBMMatcher
 from depthpose.depth.types import StereoInput
 from depthpose.depth.weights import MATCHERS, Use
 from depthpose.report.depth import depth_section
@@ -95,8 +96,9 @@ class MethodSource:
         if isinstance(self.weights, Weights):
             with self.weights.unpacked() as file:
                 return replace(self, weights=file).build()
-        config = with_usable_precision(self.config)  # what is computed in is what is recorded
-        config = replace(config, device=run.own_device(config.device))
+        config = self.config  # what is computed in is what is recorded
+        precision = usable_precision(config.precision, config.device)
+        config = replace(config, precision=precision, device=run.own_device(config.device))
         path = find_weights(self.weights)
         kind = read_checkpoint(path).kind
         is_matcher = kind in MATCHERS

@@ -44,6 +44,8 @@ MATCHERS = {
 """Kinds of matchers with weights: a new one is a file with its three parts and one entry here."""
 
 BOTH, _SELECTION = "fakestereo", "selection"
+_FORMER = ("candidates", "encoder_kind", "scales", "test_mode", "with_agreement", "with_refinement")
+"""Settings of before, which weights files hold: networks have one value of each."""
 Use = Literal["images", "pairs"]
 """What networks are for: depth of single images, or of real pairs."""
 _GENERATORS: dict[str, tuple[type, type]] = {
@@ -107,7 +109,8 @@ def read_depth_weights(
         if use == "pairs" and is_both and kind in _GENERATORS:
             continue
         kind_of_config, make = _networks()[kind]
-        config = config_from_dict(part.config, kind_of_config, source=str(path))
+        settings = {name: v for name, v in part.config.items() if name not in _FORMER}
+        config = config_from_dict(settings, kind_of_config, source=str(path))
         built[kind] = checkpoints.build_network(partial(make, config), part, str(path)).eval()
         if use == "images" and kind in _GENERATORS and (answer or config.answer) == "own":
             break  # it takes no matcher

@@ -46,18 +46,19 @@ def depth_section(
     The colours of depth go from bright to dark over ``range_m``.
     """
     near_m, far_m = range_m
+    facts, grey = depth_facts(pair, estimate), grey_caption(estimate)
     pictures = [Drawing(image=pair.left, caption="image")] if with_image else []
     if estimate.depth_m is None:
         disparity = Drawing(
             image=draw_disparity(estimate.disparity_px, is_sky=estimate.is_sky),
-            caption=f"estimated disparity, large (near) bright; {grey_caption(estimate)}",
+            caption=f"estimated disparity, large (near) bright; {grey}",
             scale=rising_scale("disparity [px]", 96.0, has_more=True),
         )
         pictures.append(disparity)
     else:
         depth = Drawing(
             image=draw_depth(estimate.depth_m, *range_m),
-            caption=f"estimated depth, near bright and far dark; {grey_caption(estimate)}",
+            caption=f"estimated depth, near bright and far dark; {grey}",
             scale=depth_scale(*range_m),
         )
         pictures.append(depth)
@@ -104,7 +105,6 @@ def depth_section(
             layer = Layer(name="true points", shape=colored_points(points_m, _TRUE))
             said, layers = f"{scenes[0].caption}; the truth in green", [*scenes[0].layers, layer]
             scenes = [Scene(caption=said, layers=layers)]
-    facts = depth_facts(pair, estimate)
     return Section(title=title, text=text, facts=facts, pictures=pictures, scenes=scenes)
 
 
