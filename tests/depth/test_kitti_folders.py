@@ -97,18 +97,9 @@ def make_pairs(home: Path) -> None:
     write_depth_png(home / "lidar_depth/a.png", torch.full((H, W), 9.0))
 
 
-def make_odometry(home: Path) -> None:
-    for side in ("image_2", "image_3"):
-        picture(home / "sequences/02" / side / "000000.png")
-    scan(home / "sequences/02/velodyne/000000.bin")
-    text = f"P0: {P2}\nP1: {P2}\nP2: {P2}\nP3: {P3}\nTr: {LIDAR}\n"
-    write(home / "sequences/02/calib.txt", text)
-
-
 MAKERS: dict[str, tuple[Callable[[Path], None], int, float]] = {
     "KITTI raw": (make_raw, 2, 370 / 700),
     "KITTI object or 2015": (make_object, 2, 370 / 700),
-    "KITTI odometry": (make_odometry, 1, 370 / 700),
     "KITTI 2012": (make_2012, 1, 370 / 700),
     "Middlebury": (make_middlebury, 1, 0.193),
     "pairs": (make_pairs, 2, 0.5),
@@ -551,37 +542,6 @@ def test_maps_that_belong_to_no_frame_are_a_problem(tmp_path: Path) -> None:
     assert (
         "lidar_depth: holds no file of a frame's name" in str(problem.path) + ": " + problem.message
     )
-
-
-def test_a_grey_sequence_has_the_rig_and_scans_of_its_cameras(tmp_path: Path) -> None:
-    for side in ("image_0", "image_1"):
-        picture(tmp_path / side / "000000.png")
-    scan(tmp_path / "velodyne/000000.bin")
-    text = f"P0: {P2}\nP1: {P3.replace('-325', '-305')}\nP2: {P2}\nP3: {P3}\nTr: {LIDAR}\n"
-    write(tmp_path / "calib.txt", text)
-    dataset = open_dataset(tmp_path)
-    rig = dataset.read_rig(0)
-    assert dataset.frames[0].name == "000000"
-    assert rig is not None
-    assert rig.baseline_m == pytest.approx(350 / 700)
-    assert bool(lidar_truth(dataset.frames[0], "camera_z").isfinite().any())
-
-
-def test_the_selection_of_frames_has_one_camera_and_both_truths(tmp_path: Path) -> None:
-    home = tmp_path / "val_selection_cropped"
-    name = "2011_09_26_drive_0002_sync_{}0000000005_image_02"
-    picture(home / "image" / f"{name.format('image_')}.png")
-    write(home / "intrinsics" / f"{name.format('image_')}.txt", "700 0 10 0 700 6 0 0 1")
-    for k, kind in enumerate(("groundtruth_depth", "velodyne_raw")):
-        path = home / kind / f"{name.format(f'{kind}_')}.png"
-        write_depth_png(path, torch.full((H, W), 9.0 + k))
-    for folder in (tmp_path, home):
-        dataset = open_dataset(folder)
-        assert check_dataset(folder).is_ok
-        assert dataset.read_rig(0) is None
-        assert dataset.read_input(0).camera is not None
-        assert known_truths(dataset.frames[0]) == ("scan", "annotated")
-        assert float(lidar_truth(dataset.frames[0], "camera_z").mean()) == 10
 
 
 def test_drives_that_are_not_rectified_are_named(tmp_path: Path) -> None:

@@ -51,18 +51,18 @@ def fit_ground(depth_m: Map, camera: Camera) -> Ground | None:
     if not len(errors):
         return None
     is_on = errors[int((errors < _INLIER).sum(1).argmax())] < _INLIER
-    plane = _least_squares(rays[is_on], inverse[is_on])
+    plane, angles = _fit_plane(rays[is_on], inverse[is_on])
     for _ in range(3):
-        plane = _least_squares(rays[is_on], inverse[is_on])
+        plane, angles = _fit_plane(rays[is_on], inverse[is_on])
         is_on = (rays @ plane / inverse - 1).abs() < _INLIER
         if int(is_on.sum()) < 30:
             return None
-    share, (height_m, tilt_deg, roll_deg) = float(is_on.double().mean()), _angles(plane)
+    share, (height_m, tilt_deg, roll_deg) = float(is_on.double().mean()), angles
     is_upright = abs(tilt_deg) <= _MOST_ROAD_TILT_DEG and abs(roll_deg) < _MOST_ROLL_DEG
     if share < _LEAST_SHARE or not (is_upright and _LEAST_HEIGHT_M < height_m < _MOST_HEIGHT_M):
         return None
     kept = [k for k in (is_on & (strips != n) for n in range(_STRIPS)) if int(k.sum()) >= 30]
-    parts = torch.tensor([_angles(_least_squares(rays[k], inverse[k])) for k in kept])
+    parts = torch.tensor([_fit_plane(rays[k], inverse[k])[1] for k in kept])
     # The jackknife's deviation: how far the fit moves when a part of the columns is left out.
     spread = ((len(parts) - 1) / len(parts) * ((parts - parts.mean(0)) ** 2).sum(0)).sqrt()
     return Ground(
@@ -87,15 +87,15 @@ def _lower_points(
     return rays[known], inverse[known], (u * _STRIPS // width)[known]
 
 
-def _least_squares(rays: Float[Tensor, "n 3"], inverse: Float[Tensor, " n"]) -> Float[Tensor, "3"]:
+def _fit_plane(
+    rays: Float[Tensor, "n 3"], inverse: Float[Tensor, " n"]
+) -> tuple[Float[Tensor, "3"], tuple[float, float, float]]:
+    """Fit ``plane @ ray = 1 / depth``; its height [m], tilt and roll [degrees] too."""
     weighed = rays / inverse[:, None]
-    return torch.linalg.lstsq(weighed, torch.ones_like(inverse)[:, None]).solution[:, 0]
-
-
-def _angles(plane: Float[Tensor, "3"]) -> tuple[float, float, float]:
-    """Height [m], tilt and roll [degrees] of ``plane @ ray = 1 / depth``."""
-    x, y, z = (float(value) for value in plane)
-    return 1 / math.hypot(x, y, z), -math.degrees(math.atan2(z, y)), -math.degrees(math.atan2(x, y))
+    plane = torch.linalg.lstsq(weighed, torch.ones_like(inverse)[:, None]).solution[:, 0]
+    x, y, z = plane.tolist()
+    tilt_deg, roll_deg = (-math.degrees(math.atan2(across, y)) for across in (z, x))
+    return plane, (1 / math.hypot(x, y, z), tilt_deg, roll_deg)
 
 
 def scale_by_mount(found: DepthEstimate, image: StereoInput) -> DepthEstimate:

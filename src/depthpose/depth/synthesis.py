@@ -10,7 +10,6 @@ Synthesisers are generators with pre- and post-processing: any size, [0, 1], tes
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Protocol, runtime_checkable
 
 import torch
 import torch.nn.functional as F
@@ -321,34 +320,6 @@ class SynthesisedViews:
     street: Float[Tensor, " b"] | None = None
 
 
-@runtime_checkable
-class Synthesiser(Protocol):
-    """Draws the right view of images of any size, as one rig would have seen it."""
-
-    @property
-    def config(self) -> GeneratorConfig | SelectionConfig:
-        """The network's settings, and its rig."""
-        ...
-
-    @property
-    def scales(self) -> tuple[float, ...]:
-        """Sizes at which it looks at an image, as shares of the first, which is the rig's."""
-        ...
-
-    def draw(self, left: Views, *larger: Float[Tensor, "b 3 _ _"]) -> SynthesisedViews:
-        """Draw right views; images are RGB in [0, 1], and perhaps the same at other sizes."""
-        ...
-
-
-def make_synthesiser(
-    generator: Generator, device: torch.device | str = "cpu", speed: Speed = "fine"
-) -> Synthesiser:
-    """Put a generator of either kind to use; one that generates colours has one speed."""
-    if isinstance(generator, SelectionGenerator):
-        return SelectionSynthesiser(generator, device, speed)
-    return UNetSynthesiser(generator, device)
-
-
 class SelectionSynthesiser:
     """Looks the right view up in the left one, and answers the left view's disparity too.
 
@@ -423,6 +394,19 @@ class UNetSynthesiser:
             check_image(image, "the left image")
         drawn = draw_right(self.generator, left.to(self.device, torch.float32))
         return SynthesisedViews(right=drawn.to(left.device))
+
+
+Synthesiser = SelectionSynthesiser | UNetSynthesiser
+"""Draws the right view of images of any size, as one rig would have seen it."""
+
+
+def make_synthesiser(
+    generator: Generator, device: torch.device | str = "cpu", speed: Speed = "fine"
+) -> Synthesiser:
+    """Put a generator of either kind to use; one that generates colours has one speed."""
+    if isinstance(generator, SelectionGenerator):
+        return SelectionSynthesiser(generator, device, speed)
+    return UNetSynthesiser(generator, device)
 
 
 def select_views(

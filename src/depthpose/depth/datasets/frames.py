@@ -49,23 +49,18 @@ class KittiCalibration:
     pixels_from_velodyne: Float64[np.ndarray, "3 4"] | None
 
 
-def read_object_calibration(
-    path: Path, width: int, height: int, *, is_grey: bool = False
-) -> KittiCalibration:
+def read_object_calibration(path: Path, width: int, height: int) -> KittiCalibration:
     """Read a text of the object layout: P2, P3 and, for the LiDAR, R0_rect and Tr_velo_to_cam.
 
-    Texts of the KITTI 2012 and 2015 sets (``P2`` or ``P_rect_02``) are read too, and those of
-    odometry, whose ``Tr`` goes to the rectified camera 0; of the grey pair, P0 and P1.
+    Texts of the KITTI 2012 and 2015 sets (``P2`` or ``P_rect_02``) are read too.
     """
     keys = files.read_key_values(path)
     names = ("P2", "P3") if "P2" in keys else ("P_rect_02", "P_rect_03")
-    names = ("P0", "P1") if is_grey else names
     rig, left = _projected_rig(path, keys, names, (width, height))
-    moved = next((name for name in ("Tr_velo_to_cam", "Tr") if name in keys), None)
-    if moved is None:
+    if "Tr_velo_to_cam" not in keys:
         return KittiCalibration(rig=rig, pixels_from_velodyne=None)
-    rectify = np.eye(3) if moved == "Tr" else kitti_matrix(path, keys, "R0_rect", (3, 3))
-    composed = _composed(path, left, rectify, kitti_matrix(path, keys, moved, (3, 4)))
+    rectify = kitti_matrix(path, keys, "R0_rect", (3, 3))
+    composed = _composed(path, left, rectify, kitti_matrix(path, keys, "Tr_velo_to_cam", (3, 4)))
     return KittiCalibration(rig=rig, pixels_from_velodyne=composed)
 
 
@@ -203,7 +198,7 @@ def project_lidar(
     return torch.where(as_float32 > 0, as_float32, torch.nan)
 
 
-CalibrationStyle = Literal["raw", "object", "grey", "middlebury", "plain", "camera"]
+CalibrationStyle = Literal["raw", "object", "middlebury", "plain", "camera"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -244,7 +239,7 @@ def frame_camera(frame: Frame) -> Camera | None:
         return None
     path, size = frame.calibration, files.image_size(frame.left)
     match frame.style:
-        case "raw" | "object" | "grey":
+        case "raw" | "object":
             camera = kitti_calibration(frame).rig
         case "middlebury":
             camera = read_rig(path)
@@ -262,14 +257,14 @@ def kitti_calibration(frame: Frame) -> KittiCalibration:
     Raises:
         InputError: the frame has no such calibration.
     """
-    if frame.calibration is None or frame.style not in ("raw", "object", "grey"):
+    if frame.calibration is None or frame.style not in ("raw", "object"):
         raise InputError(
             f"{frame.name}: no KITTI calibration, so its LiDAR scan cannot be projected. Put "
             "calib_cam_to_cam.txt and calib_velo_to_cam.txt into the folder of its date."
         )
     home, size = frame.calibration, files.image_size(frame.left)
     if frame.style != "raw":
-        return read_object_calibration(home, *size, is_grey=frame.style == "grey")
+        return read_object_calibration(home, *size)
     cameras, lidar = home / "calib_cam_to_cam.txt", home / "calib_velo_to_cam.txt"
     keys = files.read_key_values(cameras)
     rig, left = _projected_rig(cameras, keys, ("P_rect_02", "P_rect_03"), size)

@@ -213,43 +213,6 @@ def _depth_folder(drive: Path, kind: str, archive: str) -> Path:
     return next((home / inside for home in homes if (home / inside).is_dir()), drive / inside)
 
 
-def _depth_selection(folder: Path) -> Iterable[Frame]:
-    """KITTI's frames for completion and prediction of depth: cropped, each with its camera."""
-    inner = folder / "val_selection_cropped"
-    home = inner if inner.is_dir() else folder
-    if not (home / "intrinsics").is_dir():
-        return
-    lenses = _by_stem(home / "intrinsics", (".txt",))
-    scans, depth = _by_stem(home / "velodyne_raw"), _by_stem(home / "groundtruth_depth")
-    for left in _images(home / "image"):
-        yield Frame(
-            name=left.stem,
-            left=left,
-            calibration=lenses.get(left.stem),
-            style="camera",
-            scan=scans.get(left.stem.replace("_image_", "_velodyne_raw_", 1)),
-            depth=depth.get(left.stem.replace("_image_", "_groundtruth_depth_", 1)),
-        )
-
-
-def _odometry(folder: Path) -> Iterable[Frame]:
-    """A sequence of KITTI odometry, or the folder of all: in colour, else in grey."""
-    homes = [folder, *sorted(folder.glob("*")), *sorted(folder.glob("*sequences/*"))]
-    for home in (*homes, *sorted(folder.glob("dataset/sequences/*"))):
-        if not (home / "calib.txt").is_file():
-            continue
-        is_grey = not (home / "image_2").is_dir()
-        lefts = _images(home / ("image_0" if is_grey else "image_2"))
-        yield from _frames(
-            lefts,
-            "grey" if is_grey else "object",
-            "" if home == folder else f"{home.name}_",
-            calibration={left.stem: home / "calib.txt" for left in lefts},
-            right=_by_stem(home / ("image_1" if is_grey else "image_3")),
-            velodyne=_by_stem(home / "velodyne", (".bin",)),
-        )
-
-
 def _benchmark(folder: Path, one: str, other: str, ending: str) -> Iterable[Frame]:
     """KITTI object, 2012 or 2015: of the stereo sets the frames that have truth, NNNNNN_10."""
     home = folder / "training" if (folder / "training" / one).is_dir() else folder
@@ -309,10 +272,6 @@ def _pairs(folder: Path) -> Iterable[Frame]:
 LAYOUTS = {
     "packed shards": Layout(find=packed_frames, parts="index.json of 'depthpose data pack'"),
     "KITTI raw": Layout(find=_raw, parts="DATE/DATE_drive_NNNN_sync/image_02/data"),
-    "KITTI depth selection": Layout(
-        find=_depth_selection, parts="val_selection_cropped: image, groundtruth_depth, intrinsics"
-    ),
-    "KITTI odometry": Layout(find=_odometry, parts="sequences/NN/image_2, image_3, calib.txt"),
     "KITTI object or 2015": Layout(
         find=partial(_benchmark, one="image_2", other="image_3", ending="_0"),
         parts="image_2, image_3, calib or disp_occ_0",
