@@ -158,10 +158,8 @@ class NetworkConfig(Settings):
     step_px: ClassVar[int] = 16
     """Sides of images and ``max_disparity_px`` are multiples of this [px]."""
 
-    @property
-    def min_side_px(self) -> int:
-        """Smallest image side that the network takes [px]."""
-        return self.step_px
+    min_side_px: ClassVar[int] = 16
+    """Smallest image side that the network takes [px]."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -190,7 +188,7 @@ class PSMNetConfig(NetworkConfig):
             raise InputError(f"pools must hold 1 to 16 windows, got {self.pools}")
 
     @property
-    def min_side_px(self) -> int:
+    def min_side_px(self) -> int:  # pyright: ignore[reportIncompatibleVariableOverride]
         """Smallest image side that the network takes [px]: its largest pool sees one window."""
         return max(16, -(-4 * max(self.pools) // 16) * 16)
 
@@ -219,6 +217,7 @@ class LightConfig(NetworkConfig):
     trained on with it."""
 
     step_px: ClassVar[int] = 32
+    min_side_px: ClassVar[int] = 32
 
 
 @dataclass(frozen=True, kw_only=True)
