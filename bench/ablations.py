@@ -3,9 +3,9 @@
     python bench/ablations.py --synthetic streets --real PAIRS/kitti2015_train_drives \
         --evaluate PAIRS/kitti2015_eval_drives --out out/ablations
 
-L1 alone against cGAN + L1, patch against pixel discriminator, batch norm's mode at test; and how
-accuracy grows with the number of synthetic and real pairs. Every arm is trained apart, measured,
-fine-tuned and measured again: on real pairs, and on synthetic streets of a seed of their own.
+L1 alone against cGAN + L1, patch against pixel discriminator; and how accuracy grows with the
+number of synthetic and real pairs. Every arm is trained apart, measured, fine-tuned and measured
+again: on real pairs, and on synthetic streets of a seed of their own.
 Results in ``--out`` are reused: a second call continues where the first was stopped.
 """
 
@@ -31,7 +31,6 @@ from depthpose.depth.config import (
     StreetsConfig,
 )
 from depthpose.depth.estimator import FakestereoNet
-from depthpose.depth.synthesis import UNetGenerator
 from depthpose.depth.synthetic import draw_street
 from depthpose.depth.train import STAGES
 from depthpose.depth.train.config import FinetuneTraining, StereoTraining, ViewTraining
@@ -168,24 +167,16 @@ class Bench:
         return facts | {"seed": arm.seed, "stage": stage} | found
 
     def rows_of(self, arm: Arm) -> list[dict[str, Any]]:
-        """Train and measure one arm: apart, with batch norm's other mode, fine-tuned."""
+        """Train and measure one arm: apart, and fine-tuned."""
         generator = self.apart(arm)
         home = self.out / arm.name
-        modes = (
-            ("running", "batch")
-            if arm.real is None and arm.synthetic == Arm.synthetic
-            else ("running",)
-        )
-        rows = []
-        for mode in modes:
-            network = read_generator(generator)
-            assert isinstance(network, UNetGenerator)
-            network.config = replace(network.config, test_mode=mode)
-            both = home / f"apart-{mode}.safetensors"
-            matcher = read_matcher(self.matcher())
-            facts = bound_facts({}, [generator, self.matcher()])
-            write_depth_weights(both, generator=network, matcher=matcher, facts=facts)
-            rows.append(self.measure(arm, f"apart, {mode}" if mode == "batch" else "apart", both))
+        both = home / "apart.safetensors"
+        facts = bound_facts({}, [generator, self.matcher()])
+        write_depth_weights(
+            both, generator=read_generator(generator), matcher=read_matcher(self.matcher()),
+            facts=facts,
+        )  # fmt: skip
+        rows = [self.measure(arm, "apart", both)]
         return [*rows, self.measure(arm, "fine-tuned", self.tuned(arm, generator))]
 
 

@@ -88,7 +88,6 @@ ARMS = (
         name="encoder from scratch",
         change={"encoder": None, "with_frozen_stem": False, "encoder_rate": 1.0},
     ),
-    Arm(name="pixel loss", change={"disparity_loss": "pixel"}),
     Arm(name="no cross entropy", change={"plane_weight": 0.0}),
     Arm(name="no view loss", change={"view_weight": 0.0}),
     Arm(name="pairs without truth teach by the view alone", unlabelled="unlabelled"),

@@ -297,12 +297,9 @@ def test_weights_that_cannot_are_refused(tmp_path: Path) -> None:
     whole = tiny_weights()
     no_matcher = dataclasses.replace(whole, matcher=None)
     no_generator = dataclasses.replace(whole, generator=None)
-    by_chance = tiny_weights(test_mode="batch")
     with pytest.raises(InputError, match=r"lack the matcher; 'depthpose weights pack'"):
         depth_export(no_matcher, "image", {}).graph()
     with pytest.raises(InputError, match=r"lack the generator; 'depthpose weights pack'"):
         depth_export(no_generator, "image", {}).graph()
     with pytest.raises(InputError, match="hold no matcher, only a generator"):
         depth_export(no_matcher, "pair", {}).graph()
-    with pytest.raises(InputError, match="test_mode is 'batch'"):
-        depth_export(by_chance, None, {}).graph()

@@ -232,7 +232,7 @@ def test_extending_losses(monkeypatch: pytest.MonkeyPatch) -> None:
     def ones(log_px: Tensor, truth_px: Tensor, range_px: tuple[float, float]) -> Tensor:
         return log_px.mean() * 0 + 7.0
 
-    with pytest.raises(InputError, match=r"disparity_loss is 'ones'; .*'log', 'pixel'"):
+    with pytest.raises(InputError, match=r"disparity_loss is 'ones'; .*'log'"):
         SelectTraining(disparity_loss="ones")
     monkeypatch.setitem(DISPARITY_LOSSES, "ones", ones)
     config = SelectTraining(

@@ -2,6 +2,7 @@
 
 import math
 import re
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -16,11 +17,9 @@ from depthpose.depth.encoder import LiteEncoder, import_encoder, read_encoder
 from depthpose.depth.synthesis import (
     SelectionGenerator,
     draw_right,
-    log_expectation,
-    make_planes,
     make_synthesiser,
     mix_shifts,
-    select,
+    read_logits,
     shift_left,
 )
 
@@ -75,31 +74,27 @@ def test_convolutions_of_stride_two_pad_below_and_to_the_right() -> None:
 
 
 def test_planes_are_even_in_the_logarithm() -> None:
-    planes = make_planes(SelectionConfig(planes=4, disparity_px=(1.0, 8.0)))
+    planes = SelectionGenerator(replace(TINY, planes=4, disparity_px=(1.0, 8.0))).planes
     torch.testing.assert_close(planes, PLANES)
 
 
 def test_the_expectation_is_that_of_the_logarithm_without_the_sky() -> None:
     shares = torch.tensor([0.5, 0.0, 0.25, 0.0, 0.25])  # sky, 1, 2, 4, 8 px
     logits = shares.clamp(min=1e-30).log().reshape(1, 5, 1, 1)
-    found = log_expectation(logits, PLANES)
+    found = read_logits(logits, PLANES)[0]
     assert float(found) == pytest.approx((math.log(2) + math.log(8)) / 2, rel=1e-5)
 
 
-def test_a_sure_answer_is_read_at_the_size_of_the_image() -> None:
-    classes = torch.tensor([[0, 3], [0, 3]])
-    found = select(one_hot(classes, 5), PLANES, (4, 8))
-    assert found.disparity_px.shape == (1, 4, 8)
-    torch.testing.assert_close(found.disparity_px[0, :, -1], torch.full((4,), 4.0))
-    assert bool(found.is_sky[0, :, 0].all())
-    assert not bool(found.is_sky[0, :, -1].any())
-    torch.testing.assert_close(found.confidence[0, :, -1], torch.ones(4))
-    assert float(found.shift_px[0, 0, 0]) == 0.0
+def test_a_sure_answer_is_read_off() -> None:
+    log_px, sky, sure = read_logits(one_hot(torch.tensor([[0, 3], [0, 3]]), 5), PLANES)
+    torch.testing.assert_close(log_px[0, :, 1], torch.full((2,), 4.0).log())
+    torch.testing.assert_close(sky[0], torch.tensor([[1.0, 0.0], [1.0, 0.0]]))
+    torch.testing.assert_close(sure[0, :, 1], torch.ones(2))
 
 
 def test_an_even_distribution_is_no_confidence() -> None:
-    found = select(torch.zeros(1, 5, 1, 1), PLANES, (2, 2))
-    assert float(found.confidence.max()) < 0.3
+    _, sky, sure = read_logits(torch.zeros(1, 5, 1, 1), PLANES)
+    assert float((sure * (1 - sky)).max()) < 0.3
 
 
 def test_one_shift_a_pixel_looks_to_the_right_and_repeats_the_border() -> None:
@@ -123,10 +118,11 @@ def test_a_sure_mixture_is_one_shift(scale: float) -> None:
 def test_any_size_is_answered_at_its_own_size(size: tuple[int, int]) -> None:
     drawn = make_synthesiser(tiny()).draw(torch.rand(2, 3, *size))
     assert drawn.right.shape == (2, 3, *size)
-    assert drawn.seen is not None
-    for part in (drawn.seen.disparity_px, drawn.seen.confidence, drawn.seen.is_sky):
+    for part in (drawn.disparity_px, drawn.confidence, drawn.is_sky):
+        assert part is not None
         assert part.shape == (2, *size)
-    assert bool((drawn.seen.disparity_px > 0).all())
+    assert drawn.disparity_px is not None
+    assert bool((drawn.disparity_px > 0).all())
 
 
 def test_neighbours_in_a_batch_change_nothing() -> None:
@@ -193,7 +189,7 @@ def test_another_checkpoint_is_no_encoder(tmp_path: Path, change, message: str) 
     [
         ({"encoder_width": 0.0}, r"encoder_width must be in \(0, 4\], got 0.0"),
         ({"planes": 1}, r"planes must be in \[2, inf\), got 1"),
-        ({"disparity_px": (4.0, 2.0)}, "disparity_px must be a range, the smaller end first"),
+        ({"disparity_px": (4.0, 2.0)}, "disparity_px must be a range, the lower end first"),
         ({"virtual_focal_px": 0.0}, r"virtual_focal_px must be in \(0, inf\), got 0.0"),
     ],
 )

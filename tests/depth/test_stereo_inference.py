@@ -85,8 +85,7 @@ def test_without_onednn_operators_the_answer_is_the_same(monkeypatch: pytest.Mon
         calls.append("called")
         raise RuntimeError("no such operator")
 
-    for operator in ("_onednn_convolved", "_onednn_transposed"):
-        monkeypatch.setattr(layers, operator, refuse)
+    monkeypatch.setattr(layers, "_by_onednn", refuse)
     layers.has_onednn_operators.cache_clear()
     try:
         documented = PSMNetMatcher(network).match(left, right)
@@ -106,7 +105,7 @@ def test_an_onednn_operator_that_answers_otherwise_is_not_used(
     def wrong(volume: torch.Tensor, *_: torch.Tensor) -> torch.Tensor:
         return torch.zeros_like(volume)
 
-    monkeypatch.setattr(layers, "_onednn_transposed", wrong)
+    monkeypatch.setattr(layers, "_by_onednn", wrong)
     layers.has_onednn_operators.cache_clear()
     try:
         assert not layers.has_onednn_operators()
@@ -277,7 +276,7 @@ _LIGHT = """
 from depthpose.depth.config import LightConfig
 from depthpose.depth.stereo import LightMatcher as Matcher, LightStereo
 from depthpose.depth.stereo.light import light_bytes
-network = LightStereo(LightConfig(with_agreement=True, with_refinement=True)).eval()
+network = LightStereo(LightConfig()).eval()
 least = light_bytes(network.config, 256, 1024, torch.float32)
 """
 

@@ -25,15 +25,12 @@ from depthpose.depth.config import (
 from depthpose.depth.encoder import LiteEncoder, load_encoder
 from depthpose.depth.stereo import LightMatcher, LightStereo, PSMNet, normalise
 from depthpose.depth.stereo.light import (
+    STEM,
+    ConvexUpsampling,
     Refinement,
-    agreement_around,
-    agreement_of_neighbours,
     confidence_near,
     correlation_volume,
-    enlarge,
     light_bytes,
-    mean_of_all,
-    mean_of_best,
 )
 from depthpose.depth.stereo.matcher import CameraMatcher, pad_top_right
 from depthpose.depth.train import StereoTask
@@ -47,8 +44,6 @@ SMALL = LightConfig(
     width=8,
     volume_widths=(4, 4, 4, 4),
     encoder_width=0.25,
-    with_agreement=True,
-    with_refinement=True,
     with_sky=True,
 )
 
@@ -84,12 +79,17 @@ def test_the_volume_holds_the_cosine_of_each_group(width: int) -> None:
             torch.testing.assert_close(found[:, :, d, :, x], expected, atol=2e-3, rtol=0)
 
 
-def test_disparity_is_the_mean_over_the_best() -> None:
-    scores = torch.full((1, 8, 1, 1), -50.0)
-    scores[0, 2], scores[0, 3], scores[0, 7] = 1.0, 1.0, 0.5
-    assert float(mean_of_best(scores, 2)) == pytest.approx(10.0)
-    assert float(mean_of_best(scores, 1)) in (8.0, 12.0)
-    assert float(mean_of_all(scores)) == pytest.approx(float(mean_of_best(scores, 8)))
+def test_disparity_is_the_mean_over_the_two_best() -> None:
+    network = random_network(replace(SMALL, with_sky=False))
+    scores = torch.full((1, 8, 8, 16), -50.0)
+    scores[:, 2], scores[:, 3], scores[:, 7] = 1.0, 1.0, 0.5
+    network.aggregation.forward = lambda *_: scores  # pyright: ignore[reportAttributeAccessIssue]
+    for parameter in network.refinement.correction.parameters():
+        torch.nn.init.zeros_(parameter)
+    pair = torch.randn(2, 1, 3, 32, 64).unbind()
+    torch.testing.assert_close(network(*pair)[0], torch.full((1, 32, 64), 10.0))
+    every = (torch.tensor([2, 3, 7.0]) * torch.tensor([1.0, 1, 0.5]).softmax(0)).sum() * 4
+    torch.testing.assert_close(network.train()(*pair)[0], every.expand(1, 32, 64))
 
 
 def test_confidence_is_the_probability_near_the_answer() -> None:
@@ -104,24 +104,36 @@ def test_confidence_is_the_probability_near_the_answer() -> None:
 
 
 def test_a_map_is_enlarged_by_its_nine_neighbours() -> None:
-    quarter = torch.arange(12.0).view(1, 3, 4)
-    weights = torch.zeros(1, 9, 4, 6, 8)
-    weights[:, 4] = 1.0  # the pixel itself
-    nearest = quarter.repeat_interleave(4, 1).repeat_interleave(4, 2)
-    assert torch.equal(enlarge(quarter, weights), nearest)
-    weights = torch.zeros(1, 9, 4, 6, 8)
-    weights[:, 5, 3] = 1.0  # of the lower right pixel in each 2x2: the neighbour to the right
-    found = enlarge(quarter, weights)
-    assert found[0, 1, 1] == quarter[0, 0, 1]
+    quarter, upsampling = torch.arange(12.0).view(1, 1, 3, 4), ConvexUpsampling(8)
+    half, features = torch.randn(1, STEM, 6, 8), torch.randn(1, 8, 3, 4)
+    torch.nn.init.zeros_(upsampling.weights.weight)
+    bias = upsampling.weights.bias
+    assert bias is not None
+    with torch.no_grad():
+        logits = torch.full((9, 4), -100.0)
+        logits[4] = 100.0  # the pixel itself
+        bias.copy_(logits.flatten())
+        nearest = quarter.repeat_interleave(4, 2).repeat_interleave(4, 3)
+        assert torch.equal(upsampling(quarter, half, features, half), nearest)
+        logits[5, 3] = 300.0  # of the lower right pixel in each 2x2: the neighbour to the right
+        bias.copy_(logits.flatten())
+        found = upsampling(quarter, half, features, half)[:, 0]
+    assert found[0, 1, 1] == quarter[0, 0, 0, 1]
     assert found[0, 0, 0] == 0
 
 
 def test_views_agree_under_the_disparity_that_is_right() -> None:
-    left, right = torch.randn(2, 1, 6, 8, 16, generator=torch.Generator().manual_seed(0)).unbind()
+    chance = torch.Generator().manual_seed(0)
+    left, right = torch.randn(2, 1, STEM, 8, 16, generator=chance).unbind()
     right[..., :-3] = left[..., 3:]
-    quarter_px = torch.full((1, 4, 8), 2.0)
-    quarter_px[:, :, 5:] = 6.0  # three pixels at half size
-    found = agreement_of_neighbours(left, right, quarter_px)
+    quarter_px = torch.full((1, 1, 4, 8), 2.0)
+    quarter_px[..., 5:] = 6.0  # three pixels at half size
+    upsampling = ConvexUpsampling(8)
+    upsampling.compared = torch.nn.Identity()  # pyright: ignore[reportAttributeAccessIssue]
+    seen: list[torch.Tensor] = []
+    upsampling.agreement.register_forward_pre_hook(lambda _, given: seen.append(given[0]))
+    upsampling(quarter_px, left, torch.randn(1, 8, 4, 8), right)
+    found = seen[0]
     assert found.shape == (1, 9, 8, 16)
     # Column 10 at half size lies in column 5 at a quarter: itself and its right neighbour fit.
     torch.testing.assert_close(found[0, [1, 2, 4, 5, 7, 8], :, 10], torch.ones(6, 8))
@@ -132,9 +144,8 @@ def test_views_agree_under_the_disparity_that_is_right() -> None:
     assert float(found[..., 0].abs().max()) < 1e-6  # beyond the right image
 
 
-@pytest.mark.parametrize("part", ["with_agreement", "with_refinement", "with_sky"])
-def test_weights_without_a_part_are_trained_on_with_it(part: str, tmp_path: Path) -> None:
-    plain = dataclasses.replace(SMALL, **{part: False})
+def test_weights_without_the_sky_are_trained_on_with_it(tmp_path: Path) -> None:
+    plain = dataclasses.replace(SMALL, with_sky=False)
     start = tmp_path / "plain.safetensors"
     network = random_network(plain)
     facts = {"licence": "MIT", "trained_on": "nothing"}
@@ -144,24 +155,29 @@ def test_weights_without_a_part_are_trained_on_with_it(part: str, tmp_path: Path
     assert isinstance(found, LightStereo)
     pair = torch.randn(2, 1, 3, 32, 64).unbind()
     with torch.no_grad():
-        assert torch.equal(found.eval()(*pair)[-1], network(*pair)[-1].clamp_min(0.01))
+        assert torch.equal(found.eval()(*pair)[-1], network(*pair)[-1])
     write_depth_weights(start, matcher=found, facts=facts)
-    with pytest.raises(InputError, match=f"{part} = True, but the config says False"):
+    with pytest.raises(InputError, match="with_sky = True, but the config says False"):
         make_matcher_network(dataclasses.replace(config, light=plain))
 
 
 def test_the_refinement_compares_the_views_around_a_disparity() -> None:
-    left = torch.randn(1, 6, 4, 16, generator=torch.Generator().manual_seed(0))
+    left = torch.randn(1, STEM, 4, 16, generator=torch.Generator().manual_seed(0))
     right = left.roll(-3, -1)  # right[x - 3] is left[x]
-    found = agreement_around(left, right, torch.full((1, 4, 16), 3.0), 2).unflatten(1, (5, 2))
+    refinement = Refinement()
+    refinement.compared = torch.nn.Identity()  # pyright: ignore[reportAttributeAccessIssue]
+    seen: list[torch.Tensor] = []
+    refinement.layers[0].register_forward_pre_hook(lambda _, given: seen.append(given[0]))
+    refinement(torch.full((1, 8, 32), 6.0), left, right)
+    found = seen[0][:, :20].unflatten(1, (5, 4))
     inside = slice(5, -2)
     for k, offset in enumerate((-2, -1, 0, 1, 2)):
-        groups = [view.unflatten(1, (2, 3)) for view in (left, right.roll(3 + offset, -1))]
+        groups = [view.unflatten(1, (4, 4)) for view in (left, right.roll(3 + offset, -1))]
         expected = torch.cosine_similarity(*groups, dim=2)
         torch.testing.assert_close(
             found[:, k, ..., inside], expected[..., inside], atol=1e-4, rtol=0
         )
-    torch.testing.assert_close(found[:, 2, ..., inside], torch.ones(1, 2, 4, 9), atol=1e-4, rtol=0)
+    torch.testing.assert_close(found[:, 2, ..., inside], torch.ones(1, 4, 4, 9), atol=1e-4, rtol=0)
 
 
 def test_what_the_refinement_corrects_learns_by_a_loss_of_its_own() -> None:
@@ -237,17 +253,17 @@ def test_batches_say_what_single_pairs_say() -> None:
         assert float((difference > 1e-2).float().mean()) < 0.01
 
 
-@pytest.mark.parametrize("compares", [False, True])
-def test_some_rows_at_a_time_give_the_same_numbers(compares: bool) -> None:
-    network = random_network(replace(SMALL, with_agreement=compares, with_refinement=compares))
+def test_some_rows_at_a_time_give_the_same_numbers() -> None:
+    network = random_network()
     left, right = torch.randn(2, 2, 3, 96, 64, generator=torch.Generator().manual_seed(0))
+    scores: list[torch.Tensor] = []
+    network.aggregation.register_forward_hook(lambda *given: scores.append(given[-1]))
     with torch.no_grad():
-        scores, *_ = network.scores(left, right, 32)
         found = network(left, right)[-1]
         for rows in (2, 6, 16, 24, 100):
             network.rows = rows
-            some, *_ = network.scores(left, right, 32)
-            torch.testing.assert_close(some, scores, atol=1e-4, rtol=1e-4)
+            network(left, right)
+            torch.testing.assert_close(scores[-1], scores[0], atol=1e-4, rtol=1e-4)
             difference = (network(left, right)[-1] - found).abs()  # equal scores may change places
             assert float((difference > 1e-2).float().mean()) < 0.01
 
@@ -277,7 +293,6 @@ def test_weights_come_back(tmp_path: Path) -> None:
     [
         ({"max_disparity_px": 48}, "multiple of 32"),
         ({"width": 10, "groups": 4}, "multiple of groups"),
-        ({"candidates": 0}, r"candidates must be in \[1, 48\]"),
         ({"volume_widths": (8, 0, 8, 8)}, "volume_widths must be in"),
         ({"encoder_width": 0.0}, "encoder_width"),
         ({"work_focal_px": -1.0}, "work_focal_px must be in"),
@@ -285,7 +300,7 @@ def test_weights_come_back(tmp_path: Path) -> None:
 )
 def test_sizes_that_no_network_has_are_refused(settings: dict[str, Any], said: str) -> None:
     with pytest.raises(InputError, match=said):
-        LightConfig(**settings)
+        LightStereo(LightConfig(**settings))
 
 
 def test_images_of_another_size_are_refused() -> None:

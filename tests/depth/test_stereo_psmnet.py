@@ -152,9 +152,9 @@ def test_import_names_what_is_missing_unknown_and_misshaped() -> None:
     with pytest.raises(InputError) as caught:
         psmnet_from_published(state, align_corners=True)
     text = str(caught.value)
-    assert "missing: dres0.0.conv.weight" in text
-    assert "unknown: module.stranger" in text
-    assert "module.classif1.2.weight is (1, 32, 1, 1, 1) and should be (1, 32, 3, 3, 3)" in text
+    assert "dres0.0.conv.weight is missing" in text
+    assert "stranger is unexpected" in text
+    assert "heads.0.cost.weight is (1, 32, 1, 1, 1), not (1, 32, 3, 3, 3)" in text
     assert "state_dict" in text
 
 

@@ -115,19 +115,6 @@ def test_running_mode_is_deterministic_and_does_not_depend_on_neighbours() -> No
     torch.testing.assert_close(both[:1], drawer.draw(one).right)
 
 
-def test_batch_mode_uses_the_image_itself_and_keeps_the_statistics() -> None:
-    network = _warmed(small(7, test_mode="batch"))
-    before = {name: tensor.clone() for name, tensor in network.state_dict().items()}
-    drawer = make_synthesiser(network)
-    image = torch.rand(1, 3, 128, 256)
-    assert not torch.equal(drawer.draw(image).right, drawer.draw(image).right), "dropout is on"
-    after = network.state_dict()
-    assert before.keys() == after.keys()
-    assert all(torch.equal(tensor, after[name]) for name, tensor in before.items())
-    running = make_synthesiser(_warmed(small(7)))
-    assert not torch.equal(drawer.draw(image).right, running.draw(image).right)
-
-
 def _warmed(network: UNetGenerator) -> UNetGenerator:
     """Give batch norm statistics of its own."""
     network.train()

@@ -7,8 +7,7 @@ import torch
 from tests.depth.constant_selection import BASELINE_M, FOCAL_PX, sure_of
 
 from depthpose.core.camera import Camera
-from depthpose.core.errors import InputError
-from depthpose.depth.config import SelectionConfig, Speed
+from depthpose.depth.config import Speed
 from depthpose.depth.estimator import FakestereoNet
 from depthpose.depth.synthesis import Selected, SelectionSynthesiser, average
 from depthpose.depth.types import StereoInput
@@ -50,18 +49,10 @@ def test_an_average_is_as_sure_as_the_first() -> None:
     found = average([seen(4.0, 0.9, 0.7), seen(9.0, 0.3, 0.2)], [80.0, 40.0])
     torch.testing.assert_close(found.disparity_px, torch.full((1, 2, 3), 6.0))
     torch.testing.assert_close(found.sky, torch.full((1, 2, 3), 0.6))
-    torch.testing.assert_close(found.confidence, torch.full((1, 2, 3), 0.6))  # of the sky
-    ground = average([seen(4.0, 0.9, 0.7), seen(9.0, 0.0, 0.2)], [80.0, 40.0])
-    torch.testing.assert_close(ground.confidence, torch.full((1, 2, 3), 0.7 * 0.55))
+    torch.testing.assert_close(found.sure, torch.full((1, 2, 3), 0.7))
     alone = average([seen(35.0, 0.9, 0.7), seen(9.0, 0.3, 0.2)], [80.0, 40.0])
     torch.testing.assert_close(alone.disparity_px, torch.full((1, 2, 3), 35.0))
     torch.testing.assert_close(alone.sky, torch.full((1, 2, 3), 0.9))
-
-
-@pytest.mark.parametrize("scales", [(), (1.4,), (1.0, 0.0), (1.0, 5.0)])
-def test_scales_begin_with_the_size_of_the_training(scales: tuple[float, ...]) -> None:
-    with pytest.raises(InputError, match=r"scales must (begin with 1|be in)"):
-        SelectionConfig(scales=scales)
 
 
 @pytest.mark.parametrize(

@@ -3,7 +3,7 @@
 from dataclasses import dataclass, field
 from typing import Annotated, ClassVar, Literal
 
-from depthpose.core.config import Settings
+from depthpose.core.config import ASCENDING, Settings
 from depthpose.core.errors import InputError
 
 TruthKind = Literal["scan", "annotated", "disparity"]
@@ -53,7 +53,7 @@ class AugmentConfig(Settings):
     crop_px: Annotated[tuple[int, int], "[1, inf)"] = (256, 512)
     """Rows and columns of the crop."""
 
-    scale: Annotated[tuple[float, float], "(0, 10]"] = (1.0, 1.0)
+    scale: Annotated[tuple[float, float], "(0, 10]", ASCENDING] = (1.0, 1.0)
     """Range of the size at which a pair is seen. A pair smaller than the crop is padded with black
     on the right and below, never enlarged: another size would be another focal length."""
 
@@ -72,11 +72,6 @@ class AugmentConfig(Settings):
     misaligned_px: Annotated[float, "[0, 10)"] = 0.0
     """Rows of the right view are off by up to this at either border, as after a worn calibration
     [px]."""
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if self.scale[0] > self.scale[1]:
-            raise InputError(f"scale must be a range, the lower end first, got {self.scale}")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -163,10 +158,8 @@ class NetworkConfig(Settings):
     step_px: ClassVar[int] = 16
     """Sides of images and ``max_disparity_px`` are multiples of this [px]."""
 
-    @property
-    def min_side_px(self) -> int:
-        """Smallest image side that the network takes [px]."""
-        return self.step_px
+    min_side_px: ClassVar[int] = 16
+    """Smallest image side that the network takes [px]."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -195,7 +188,7 @@ class PSMNetConfig(NetworkConfig):
             raise InputError(f"pools must hold 1 to 16 windows, got {self.pools}")
 
     @property
-    def min_side_px(self) -> int:
+    def min_side_px(self) -> int:  # pyright: ignore[reportIncompatibleVariableOverride]
         """Smallest image side that the network takes [px]: its largest pool sees one window."""
         return max(16, -(-4 * max(self.pools) // 16) * 16)
 
@@ -216,36 +209,15 @@ class LightConfig(NetworkConfig):
     volume_widths: Annotated[tuple[int, int, int, int], "[1, inf)"] = (8, 16, 32, 48)
     """Channels of the volume at 1/4, 1/8, 1/16 and 1/32 of the image's sides."""
 
-    candidates: int = 2
-    """Disparities of the highest scores whose mean is the answer."""
-
     encoder_width: Annotated[float, "(0, 4]"] = 1.0
     """Channels of the encoder as a share of EfficientNet-Lite0's; ImageNet's weights need 1."""
-
-    with_agreement: bool = False
-    """Whether the upsampling compares both views, at half size, under the disparities it chooses
-    from; weights without it can be trained on with it."""
-
-    with_refinement: bool = False
-    """Whether both views are compared once more, at half size, around the disparity found, which
-    is corrected; weights without it can be trained on with it."""
 
     with_sky: bool = False
     """Whether the sky is a class of its own, beside the disparities; weights without it can be
     trained on with it."""
 
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        most = self.max_disparity_px // 4
-        if not 1 <= self.candidates <= most:
-            raise InputError(f"candidates must be in [1, {most}], got {self.candidates}; take 2")
-        if self.width % self.groups:
-            raise InputError(
-                f"width must be a multiple of groups, got width={self.width} and "
-                f"groups={self.groups}; take 48 and 8"
-            )
-
     step_px: ClassVar[int] = 32
+    min_side_px: ClassVar[int] = 32
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -260,7 +232,7 @@ class MatcherConfig(Settings):
     processor without bf16 (AVX-512, AMX) takes fp32."""
 
     speed: Speed = "fine"
-    """Of one image: quick looks at it once, fine at all ``scales`` of a generator that selects.
+    """Of one image: quick looks at it once, fine in two sizes, if the generator selects.
     Of pairs of a known camera: quick matches at the focal length that the weights were trained at;
     fine, where that is more, at up to 280,000 pixels and never enlarged (PSMNet), or at up to
     650,000 and 1.5 times the images' sides (light), and through up to 1.5 (PSMNet) or 1.75 times
@@ -315,9 +287,6 @@ class GeneratorConfig(Settings):
     with_dropout: bool = True
     """Dropout of 0.5 in the inner decoder blocks while training."""
 
-    test_mode: Literal["running", "batch"] = "running"
-    """Norm at test: the statistics of training without dropout, or the image's own with it."""
-
     virtual_focal_px: Annotated[float, "(0, inf)"] = 493.0
     """Focal length of the imitated rig [px]; by default that at which KITTI's images have the 256
     rows of the thesis's crops: with fewer of the rows a network must guess the horizon."""
@@ -347,9 +316,6 @@ class SelectionConfig(Settings):
     :class:`GeneratorConfig`, an image is brought to ``virtual_focal_px`` before.
     """
 
-    encoder_kind: Literal["efficientnet-lite0"] = "efficientnet-lite0"
-    """The encoder."""
-
     encoder_width: Annotated[float, "(0, 4]"] = 1.0
     """Channels of the encoder as a share of Lite0's; ImageNet's weights are of 1."""
 
@@ -359,7 +325,7 @@ class SelectionConfig(Settings):
     planes: Annotated[int, "[2, inf)"] = 32
     """Disparities that are distinguished, evenly spaced in their logarithm."""
 
-    disparity_px: Annotated[tuple[float, float], "(0, inf)"] = (1.2, 88.0)
+    disparity_px: Annotated[tuple[float, float], "(0, inf)", ASCENDING] = (1.2, 88.0)
     """Least and largest disparity at the virtual rig [px]: 165 to 2.25 m at the default rig."""
 
     answer: Answer = "own"
@@ -377,19 +343,6 @@ class SelectionConfig(Settings):
 
     virtual_baseline_m: Annotated[float, "(0, inf)"] = 0.5327
     """Baseline of the imitated rig [m]."""
-
-    scales: Annotated[tuple[float, ...], "[1, 4]"] = (1.0, 1.4)
-    """Sizes at which the fine speed looks at an image, as shares of that at the virtual focal
-    length, 1 the first; it averages. The quick speed looks once."""
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if self.disparity_px[0] >= self.disparity_px[1]:
-            raise InputError(
-                f"disparity_px must be a range, the smaller end first, got {self.disparity_px}"
-            )
-        if self.scales[:1] != (1.0,):
-            raise InputError(f"scales must begin with 1; take (1.0, 1.4), got {self.scales}")
 
     side_multiple_px: ClassVar[int] = 32
     """Both sides of an image are multiples of this [px]."""

@@ -214,9 +214,9 @@ def from_pair(pair: StereoInput, match: Match, warning: str = "") -> DepthEstima
     rig = pair.camera if isinstance(pair.camera, StereoRig) else None
     if is_sky is not None:
         is_sky = is_sky & (is_sky.float().mean() >= _LEAST_SKY)
-        far_px = torch.full_like(px, LEAST_PX)
+        far_px = LEAST_PX
         if rig is not None:
-            far_px = disparity_from_depth(torch.full_like(px, SKY_M), rig)
+            far_px = float(rig.K[0, 0]) * rig.baseline_m / SKY_M - rig.cx_right_minus_left_px
         px = torch.where(is_sky, far_px, px)
     if rig is not None:
         depth_m = depth_from_disparity(px, rig)
@@ -242,13 +242,13 @@ def from_virtual(
     assert camera is not None
     height, width = image.left.shape[1:]
     seen = resized_match(match, height, width)
-    imitated = StereoRig(width=width, height=height, K=camera.K, baseline_m=rig.virtual_baseline_m)
     px, is_sky = seen.disparity_px, seen.is_sky
-    depth_m = depth_from_disparity(px, imitated)
+    focal_m_px = float(camera.K[0, 0]) * rig.virtual_baseline_m
+    depth_m = torch.where(px > 0, focal_m_px / px, torch.nan)
     if is_sky is not None:
         is_sky = is_sky & (is_sky.float().mean() >= _LEAST_SKY)
         depth_m = torch.where(is_sky, SKY_M, depth_m)
-        px = torch.where(is_sky, float(camera.K[0, 0]) * rig.virtual_baseline_m / SKY_M, px)
+        px = torch.where(is_sky, focal_m_px / SKY_M, px)
     return DepthEstimate(
         depth_m=depth_m if is_sky is None else torch.where(is_sky, torch.nan, depth_m),
         disparity_px=disparity_from_depth(depth_m, camera) if isinstance(camera, StereoRig) else px,

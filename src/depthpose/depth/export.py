@@ -187,11 +187,6 @@ def _drawn(left: Value, generator: Generator) -> _Drawn:
     near = _near_multiple(size, multiple)
     example = torch.rand(2, 3, 2 * multiple, 3 * multiple)
     if not isinstance(generator, SelectionGenerator):
-        if generator.config.test_mode != "running":
-            raise InputError(
-                "the generator's test_mode is 'batch': it draws with dropout, other views each "
-                "time, so no file can agree with it; export weights whose test_mode is 'running'."
-            )
         image = _resized_image(left, near) * _2 - _1
         network = network_model(generator, [example], multiple)
         (found,) = left.graph.call(network, _mirrored(image, near, multiple))

@@ -4,7 +4,7 @@ import math
 from dataclasses import replace
 
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from depthpose.core.camera import Camera
@@ -18,7 +18,9 @@ _DRAWS = 200
 _STRIPS = 8
 _LEAST_SHARE = 0.25
 """Of the points in the lower part of the image, on the plane; with less there is no ground."""
-_MOST_TILT, _MOST_ROLL = (math.tan(math.radians(angle)) for angle in (25, 10))
+_MOST_ROLL_DEG = 10.0
+_MOST_TILT, _MOST_ROLL = (math.tan(math.radians(angle)) for angle in (25, _MOST_ROLL_DEG))
+_LEAST_HEIGHT_M, _MOST_HEIGHT_M = 0.2, 20.0
 _MOST_ROAD_TILT_DEG, _MOST_TILT_APART_DEG = 15.0, 8.0
 """Steeper planes were no road in any of 59 views by cameras tilted up to 7 degrees, and roads were
 at most 5.5 degrees off the true tilt."""
@@ -39,24 +41,28 @@ def fit_ground(depth_m: Map, camera: Camera) -> Ground | None:
     chance = torch.Generator().manual_seed(0)
     drawn = torch.randint(len(inverse), (_DRAWS, 3), generator=chance)
     planes = torch.linalg.solve_ex(rays[drawn], inverse[drawn])[0]
-    is_usable = planes.isfinite().all(1) & _could_be_ground(planes)
+    # Below the camera, and tilted and rolled as cameras of vehicles and hands are.
+    size = planes.norm(dim=1).clamp(min=1e-9)
+    tilt, roll = (planes[:, k].abs() / planes[:, 1] for k in (2, 0))
+    is_upright = (planes[:, 1] > 0) & (tilt < _MOST_TILT) & (roll < _MOST_ROLL)
+    is_near = (size > 1 / _MOST_HEIGHT_M) & (size < 1 / _LEAST_HEIGHT_M)
+    is_usable = planes.isfinite().all(1) & is_upright & is_near
     errors = (planes[is_usable] @ rays.T / inverse - 1).abs()
     if not len(errors):
         return None
     is_on = errors[int((errors < _INLIER).sum(1).argmax())] < _INLIER
-    plane = _least_squares(rays[is_on], inverse[is_on])
+    plane, angles = _fit_plane(rays[is_on], inverse[is_on])
     for _ in range(3):
-        plane = _least_squares(rays[is_on], inverse[is_on])
+        plane, angles = _fit_plane(rays[is_on], inverse[is_on])
         is_on = (rays @ plane / inverse - 1).abs() < _INLIER
         if int(is_on.sum()) < 30:
             return None
-    share, (height_m, tilt_deg, roll_deg) = float(is_on.double().mean()), _angles(plane)
-    if share < _LEAST_SHARE or not bool(_could_be_ground(plane[None])[0]):
-        return None
-    if abs(tilt_deg) > _MOST_ROAD_TILT_DEG:
+    share, (height_m, tilt_deg, roll_deg) = float(is_on.double().mean()), angles
+    is_upright = abs(tilt_deg) <= _MOST_ROAD_TILT_DEG and abs(roll_deg) < _MOST_ROLL_DEG
+    if share < _LEAST_SHARE or not (is_upright and _LEAST_HEIGHT_M < height_m < _MOST_HEIGHT_M):
         return None
     kept = [k for k in (is_on & (strips != n) for n in range(_STRIPS)) if int(k.sum()) >= 30]
-    parts = torch.tensor([_angles(_least_squares(rays[k], inverse[k])) for k in kept])
+    parts = torch.tensor([_fit_plane(rays[k], inverse[k])[1] for k in kept])
     # The jackknife's deviation: how far the fit moves when a part of the columns is left out.
     spread = ((len(parts) - 1) / len(parts) * ((parts - parts.mean(0)) ** 2).sum(0)).sqrt()
     return Ground(
@@ -81,23 +87,15 @@ def _lower_points(
     return rays[known], inverse[known], (u * _STRIPS // width)[known]
 
 
-def _least_squares(rays: Float[Tensor, "n 3"], inverse: Float[Tensor, " n"]) -> Float[Tensor, "3"]:
+def _fit_plane(
+    rays: Float[Tensor, "n 3"], inverse: Float[Tensor, " n"]
+) -> tuple[Float[Tensor, "3"], tuple[float, float, float]]:
+    """Fit ``plane @ ray = 1 / depth``; its height [m], tilt and roll [degrees] too."""
     weighed = rays / inverse[:, None]
-    return torch.linalg.lstsq(weighed, torch.ones_like(inverse)[:, None]).solution[:, 0]
-
-
-def _could_be_ground(planes: Float[Tensor, "n 3"]) -> Bool[Tensor, " n"]:
-    """Below the camera, and tilted and rolled as cameras of vehicles and hands are."""
-    size = planes.norm(dim=1).clamp(min=1e-9)
-    tilt, roll = (planes[:, k].abs() / planes[:, 1] for k in (2, 0))
-    is_upright = (planes[:, 1] > 0) & (tilt < _MOST_TILT) & (roll < _MOST_ROLL)
-    return is_upright & (size > 1 / 20) & (size < 1 / 0.2)
-
-
-def _angles(plane: Float[Tensor, "3"]) -> tuple[float, float, float]:
-    """Height [m], tilt and roll [degrees] of ``plane @ ray = 1 / depth``."""
-    x, y, z = (float(value) for value in plane)
-    return 1 / math.hypot(x, y, z), -math.degrees(math.atan2(z, y)), -math.degrees(math.atan2(x, y))
+    plane = torch.linalg.lstsq(weighed, torch.ones_like(inverse)[:, None]).solution[:, 0]
+    x, y, z = plane.tolist()
+    tilt_deg, roll_deg = (-math.degrees(math.atan2(across, y)) for across in (z, x))
+    return plane, (1 / math.hypot(x, y, z), tilt_deg, roll_deg)
 
 
 def scale_by_mount(found: DepthEstimate, image: StereoInput) -> DepthEstimate:

@@ -99,18 +99,8 @@ def _mean_of_images(error: Tensor, is_known: Tensor) -> Tensor:
     return means.sum() / (counts > 0).sum().clamp(min=1)
 
 
-def pixel_disparity_loss(
-    found_log_px: Maps, truth_px: Maps, range_px: tuple[float, float]
-) -> Float[Tensor, ""]:
-    """Mean absolute error of disparity over the pixels with truth, as a share of the largest."""
-    is_known = truth_px > 0
-    error = torch.where(is_known, (found_log_px.exp() - truth_px.nan_to_num(0.0)).abs(), 0.0)
-    return error.sum() / is_known.sum().clamp(min=1) / range_px[1]
-
-
 DISPARITY_LOSSES: dict[str, Callable[[Tensor, Tensor, tuple[float, float]], Tensor]] = {
     "log": log_disparity_loss,
-    "pixel": pixel_disparity_loss,
 }
 """Losses of a generator that selects, by their names in configs: a new one is a function of the
 log of disparity, the true disparity (NaN: unknown, 0: sky) and its range, and one entry here."""

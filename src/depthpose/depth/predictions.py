@@ -69,34 +69,36 @@ def write_estimate(
     (``DepthEstimate.cloud``) of what is nearer than ``cloud_m``, if that is given. The disparity is
     that of the frame's own rig.
     """
-    written: list[Path] = []
-
-    def new(ending: str) -> Path:
-        written.append(folder / f"{pair.name}.{ending}")
-        return written[-1]
-
-    if cloud_m is not None:
-        files.write_cloud(new(CLOUD), replace(estimate, seen=pair).cloud(cloud_m))
-    if estimate.warning:
-        write_bytes(new("warning.txt"), f"{estimate.warning}\n".encode())
-    if estimate.ground is not None:
-        files.write_json(new("ground.json"), asdict(estimate.ground))
-    if estimate.depth_m is not None:
-        files.write_map(new("depth_m.npy"), estimate.depth_m)
-        files.write_depth_png(new("depth.png"), estimate.depth_m)
-    if estimate.confidence is not None:
-        files.write_map(new("confidence.npy"), estimate.confidence)
-    if estimate.right is not None:
-        files.write_image(new("right.png"), estimate.right)
-    if estimate.is_sky is not None:
-        files.write_image(new("sky.png"), estimate.is_sky.float().expand(3, -1, -1))
-    picture = (
-        draw_disparity(estimate.disparity_px, is_sky=estimate.is_sky)
-        if estimate.depth_m is None
-        else draw_depth(estimate.depth_m, *range_m)
+    depth_m, is_sky = estimate.depth_m, estimate.is_sky
+    color = (
+        draw_disparity(estimate.disparity_px, is_sky=is_sky)
+        if depth_m is None
+        else draw_depth(depth_m, *range_m)
     )
-    files.write_image(new("color.png"), picture)
-    files.write_map(new("disparity_px.npy"), estimate.disparity_px)
+    cloud = None if cloud_m is None else replace(estimate, seen=pair).cloud(cloud_m)
+    parts: dict[str, tuple[Callable[..., None], Any]] = {
+        CLOUD: (files.write_cloud, cloud),
+        "warning.txt": (
+            write_bytes,
+            f"{estimate.warning}\n".encode() if estimate.warning else None,
+        ),
+        "ground.json": (files.write_json, estimate.ground and asdict(estimate.ground)),
+        "depth_m.npy": (files.write_map, depth_m),
+        "depth.png": (files.write_depth_png, depth_m),
+        "confidence.npy": (files.write_map, estimate.confidence),
+        "right.png": (files.write_image, estimate.right),
+        "sky.png": (
+            files.write_image,
+            None if is_sky is None else is_sky.float().expand(3, -1, -1),
+        ),
+        "color.png": (files.write_image, color),
+        "disparity_px.npy": (files.write_map, estimate.disparity_px),
+    }
+    written: list[Path] = []
+    for ending, (write, content) in parts.items():
+        if content is not None:
+            written.append(folder / f"{pair.name}.{ending}")
+            write(written[-1], content)
     return written
 
 
@@ -182,7 +184,9 @@ def read_estimate(folder: Path, name: str, camera: Camera | None) -> DepthEstima
     Raises:
         InputError: there is no prediction of that name, or a file of it is damaged.
     """
-    disparity_px = read_disparity(folder, name, camera)
+    disparity_px = read_part(folder, name, "disparity_px.npy")
+    if disparity_px is None:
+        raise InputError(f"{folder}: no prediction for frame {name!r}; predict it again")
     warning, ground = (_first(folder / name, (end,)) for end in ("warning.txt", "ground.json"))
     metres, sky = (read_part(folder, name, end) for end in ("depth_m.npy", "sky.png"))
     if metres is None and isinstance(camera, StereoRig):

@@ -9,8 +9,7 @@ Synthesisers are generators with pre- and post-processing: any size, [0, 1], tes
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
-from typing import Protocol, runtime_checkable
+from dataclasses import dataclass
 
 import torch
 import torch.nn.functional as F
@@ -178,7 +177,12 @@ class SelectionGenerator(nn.Module):
         self.head = nn.Conv2d(widths[-1], 2 * (self.config.planes + 1), 1)
         deepest = self.encoder.channels[-1]
         self.street = nn.Linear(3 * deepest, 1) if self.config.with_street else None
-        self.register_buffer("planes", make_planes(self.config), persistent=False)
+        # Computed on the processor: for the meta device torch would import its compiler.
+        low, high = (math.log(end) for end in self.config.disparity_px)
+        planes = torch.linspace(low, high, self.config.planes, device="cpu").exp()
+        device = torch.get_default_device()
+        planes = planes if device.type == "meta" else planes.to(device)
+        self.register_buffer("planes", planes, persistent=False)
 
     def forward(self, image: Views) -> tuple[Logits, Logits]:
         """Answer the logits of the left and of the right view.
@@ -206,25 +210,13 @@ class SelectionGenerator(nn.Module):
         """Answer how probable a street is, by a logistic regression; None where that is lacking."""
         if self.street is None:
             return None
-        return self.street(self.street_features(deepest))[:, 0].sigmoid()
-
-    @staticmethod
-    def street_features(deepest: Float[Tensor, "b c _ _"]) -> Float[Tensor, "b c3"]:
-        """Answer three moments over the rows: a street has its sky above and its road below."""
+        # Three moments over the rows: a street has its sky above and its road below.
         rows = deepest.shape[2]
         y = (2 * torch.arange(rows, device=deepest.device) + 1) / rows - 1
         row = deepest.float().mean(3)
         weights = (torch.ones_like(y), y, 1.5 * y**2 - 0.5)
-        return torch.cat([(row * weight).mean(2) for weight in weights], 1)
-
-
-def make_planes(config: SelectionConfig) -> Planes:
-    """Give the disparities that are distinguished [px], evenly spaced in their logarithm."""
-    low, high = config.disparity_px
-    # Computed on the processor: for the meta device torch would import its compiler.
-    planes = torch.linspace(math.log(low), math.log(high), config.planes, device="cpu").exp()
-    device = torch.get_default_device()
-    return planes if device.type == "meta" else planes.to(device)
+        moments = torch.cat([(row * weight).mean(2) for weight in weights], 1)
+        return self.street(moments)[:, 0].sigmoid()
 
 
 @dataclass(frozen=True, eq=False)
@@ -236,30 +228,6 @@ class Selected:
     sure: Maps  #: probability of what lies within 15 % of the disparity, sky left out
     #: probability that the image shows a street; None where the weights do not say
     street: Float[Tensor, " b"] | None = None
-
-    @property
-    def confidence(self) -> Maps:
-        """Probability of what lies within 15 % of the disparity, or of the sky where that is it."""
-        return torch.where(self.is_sky, self.sky, self.sure * (1 - self.sky))
-
-    @property
-    def shift_px(self) -> Maps:
-        """Disparity, and 0 in the sky [px]."""
-        return torch.where(self.is_sky, 0.0, self.disparity_px)
-
-    @property
-    def is_sky(self) -> Bool[Tensor, "b h w"]:
-        """Where the sky is likelier than not."""
-        return self.sky > 0.5
-
-
-def select(logits: Logits, planes: Planes, size: tuple[int, int]) -> Selected:
-    """Read disparity, sky and confidence off logits, and bring them to ``size``."""
-    log_px, sky, sure = (
-        F.interpolate(part[:, None], size, mode="bilinear")[:, 0]
-        for part in read_logits(logits, planes)
-    )
-    return Selected(log_px.exp(), sky, sure)
 
 
 def average(views: Sequence[Selected], limits_px: Sequence[float]) -> Selected:
@@ -287,21 +255,14 @@ def average(views: Sequence[Selected], limits_px: Sequence[float]) -> Selected:
 def read_logits(logits: Logits, planes: Planes) -> tuple[Tensor, Tensor, Tensor]:
     """Give the log of disparity, the sky, and what lies near that disparity, sky left out.
 
-    Each (b, rows, columns), at the size of the logits.
+    Each (b, rows, columns), at the size of the logits. The mean of disparity itself would be drawn
+    to the near: one plane at 88 px outweighs many at 2 px.
     """
     logits = logits.float()
-    log_px = log_expectation(logits, planes)
+    shares = logits[:, 1:].softmax(1)
+    log_px = torch.einsum("bkhw,k->bhw", shares, planes.log())
     is_near = (planes.log()[:, None, None] - log_px[:, None]).abs() <= math.log(_SURE_RATIO)
-    sure = (logits[:, 1:].softmax(1) * is_near).sum(1)
-    return log_px, logits.softmax(1)[:, 0], sure
-
-
-def log_expectation(logits: Logits, planes: Planes) -> Float[Tensor, "b rows columns"]:
-    """Give the mean of the logarithm of disparity [log px], sky left out.
-
-    The mean of disparity itself is drawn to the near: one plane at 88 px outweighs many at 2 px.
-    """
-    return torch.einsum("bkhw,k->bhw", logits[:, 1:].float().softmax(1), planes.log())
+    return log_px, logits.softmax(1)[:, 0], (shares * is_near).sum(1)
 
 
 def shift_left(left: Views, right_px: Maps) -> Views:
@@ -348,44 +309,22 @@ COLUMNS_SHARE = 0.01
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class SynthesisedViews:
-    """What a generator answers for left images."""
+    """What a generator answers for left images; None where it draws alone."""
 
     right: Views  #: the right views, RGB in [0, 1]
-    seen: Selected | None = None  #: what it says of the left views; None where it draws alone
-
-
-@runtime_checkable
-class Synthesiser(Protocol):
-    """Draws the right view of images of any size, as one rig would have seen it."""
-
-    @property
-    def config(self) -> GeneratorConfig | SelectionConfig:
-        """The network's settings, and its rig."""
-        ...
-
-    @property
-    def scales(self) -> tuple[float, ...]:
-        """Sizes at which it looks at an image, as shares of the first, which is the rig's."""
-        ...
-
-    def draw(self, left: Views, *larger: Float[Tensor, "b 3 _ _"]) -> SynthesisedViews:
-        """Draw right views; images are RGB in [0, 1], and perhaps the same at other sizes."""
-        ...
-
-
-def make_synthesiser(
-    generator: Generator, device: torch.device | str = "cpu", speed: Speed = "fine"
-) -> Synthesiser:
-    """Put a generator of either kind to use; one that generates colours has one speed."""
-    if isinstance(generator, SelectionGenerator):
-        return SelectionSynthesiser(generator, device, speed)
-    return UNetSynthesiser(generator, device)
+    disparity_px: Maps | None = None  #: of the left views, sky left out
+    #: probability of what lies within 15 % of the disparity, or of the sky where that is it
+    confidence: Maps | None = None
+    is_sky: Bool[Tensor, "b h w"] | None = None  #: where the sky is likelier than not
+    #: probability that an image shows a street; None where the weights do not say
+    street: Float[Tensor, " b"] | None = None
 
 
 class SelectionSynthesiser:
     """Looks the right view up in the left one, and answers the left view's disparity too.
 
-    At the fine speed it looks at an image at all ``config.scales``, and averages.
+    At the fine speed it looks at an image at 1 and at 1.4 times its size at the virtual focal
+    length, and averages; at the quick speed once.
     """
 
     def __init__(
@@ -397,7 +336,7 @@ class SelectionSynthesiser:
         self.device = usable_device(device)
         self.generator = generator.to(self.device).eval()
         self.config = generator.config
-        self.scales = self.config.scales if speed == "fine" else self.config.scales[:1]
+        self.scales = (1.0, 1.4) if speed == "fine" else (1.0,)
 
     @torch.no_grad()
     def draw(self, left: Views, *larger: Float[Tensor, "b 3 _ _"]) -> SynthesisedViews:
@@ -418,18 +357,22 @@ class SelectionSynthesiser:
         limits_px = [most_px * size[1] / images.shape[-1] for images in sizes]
         views = [select_views(self.generator, images, size) for images in sizes]
         lefts, rights = zip(*views, strict=True)
-        seen, home = average(lefts, limits_px), left.device
-        parts = {name: value.to(home) for name, value in vars(seen).items() if value is not None}
-        right = shift_left(sizes[0], average(rights, limits_px).shift_px)
-        return SynthesisedViews(right=right.to(home), seen=Selected(**parts))
+        seen, other, home = average(lefts, limits_px), average(rights, limits_px), left.device
+        right = shift_left(sizes[0], torch.where(other.sky > 0.5, 0.0, other.disparity_px))
+        is_sky = seen.sky > 0.5
+        return SynthesisedViews(
+            right=right.to(home),
+            disparity_px=seen.disparity_px.to(home),
+            confidence=torch.where(is_sky, seen.sky, seen.sure * (1 - seen.sky)).to(home),
+            is_sky=is_sky.to(home),
+            street=None if seen.street is None else seen.street.to(home),
+        )
 
 
 class UNetSynthesiser:
     """Synthesises the right view of images of any size with pix2pix's U-Net.
 
-    Norm and dropout follow ``config.test_mode``, which the weights record: ``running`` uses the
-    statistics of training and no dropout; ``batch`` those of the image itself, as pix2pix tests,
-    with dropout on.
+    Batch norm uses the statistics of training, and there is no dropout.
     """
 
     scales = (1.0,)
@@ -438,14 +381,6 @@ class UNetSynthesiser:
         self.device = usable_device(device)
         self.generator = generator.to(self.device).eval()
         self.config = generator.config
-        if generator.config.test_mode == "batch":
-            # Statistics of the image itself, without touching the stored ones; dropout on.
-            for part in self.generator.modules():
-                if isinstance(part, nn.BatchNorm2d):
-                    part.train()
-                    part.track_running_stats = False
-                elif isinstance(part, nn.Dropout):
-                    part.train()
 
     @torch.no_grad()
     def draw(self, left: Views, *larger: Float[Tensor, "b 3 _ _"]) -> SynthesisedViews:
@@ -457,11 +392,21 @@ class UNetSynthesiser:
         assert not larger, "it has one scale"
         for image in left:
             check_image(image, "the left image")
-        images = left.to(self.device, torch.float32)
-        # The statistics of test mode 'batch' are those of one image: a batch would change them.
-        groups = images.split(1) if self.config.test_mode == "batch" else [images]
-        drawn = [draw_right(self.generator, part) for part in groups]
-        return SynthesisedViews(right=torch.cat(drawn).to(left.device))
+        drawn = draw_right(self.generator, left.to(self.device, torch.float32))
+        return SynthesisedViews(right=drawn.to(left.device))
+
+
+Synthesiser = SelectionSynthesiser | UNetSynthesiser
+"""Draws the right view of images of any size, as one rig would have seen it."""
+
+
+def make_synthesiser(
+    generator: Generator, device: torch.device | str = "cpu", speed: Speed = "fine"
+) -> Synthesiser:
+    """Put a generator of either kind to use; one that generates colours has one speed."""
+    if isinstance(generator, SelectionGenerator):
+        return SelectionSynthesiser(generator, device, speed)
+    return UNetSynthesiser(generator, device)
 
 
 def select_views(
@@ -478,8 +423,14 @@ def select_views(
     features = generator.encoder(padded)
     kept = (logits[..., : rows // 2, : columns // 2] for logits in generator.decode(features))
     planes = generator.planes * (size[1] / columns)
-    first, second = (select(logits, planes, size) for logits in kept)
-    return replace(first, street=generator.find_street(features[-1])), second
+    views = []
+    for logits, street in zip(kept, (generator.find_street(features[-1]), None), strict=True):
+        log_px, sky, sure = (
+            F.interpolate(part[:, None], size, mode="bilinear")[:, 0]
+            for part in read_logits(logits, planes)
+        )
+        views.append(Selected(log_px.exp(), sky, sure, street))
+    return views[0], views[1]
 
 
 def draw_right(generator: Generator, left: Views) -> Views:
@@ -490,7 +441,8 @@ def draw_right(generator: Generator, left: Views) -> Views:
     193 rows padded to 256, where 192 were trained, drew views of 15 % too little disparity.
     """
     if isinstance(generator, SelectionGenerator):
-        return shift_left(left, select_views(generator, left)[1].shift_px)
+        other = select_views(generator, left)[1]
+        return shift_left(left, torch.where(other.sky > 0.5, 0.0, other.disparity_px))
     height, width = left.shape[-2:]
     multiple = generator.config.side_multiple_px
     rows = _near_multiple(height, multiple, ROWS_SHARE)

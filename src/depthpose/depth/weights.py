@@ -25,11 +25,17 @@ from depthpose.depth.synthesis import Generator, SelectionGenerator, UNetGenerat
 
 
 @dataclass(frozen=True, kw_only=True)
-class MatcherKind:
-    """What it takes to read, write and run one kind of matcher."""
+class GeneratorKind:
+    """What it takes to read and write one kind of network."""
 
     config: type  #: dataclass of the network's sizes and conventions, which its weights file holds
-    #: makes the module of a config, and keeps it as the attribute ``config``
+    network: type  #: makes the module of a config, and keeps it as the attribute ``config``
+
+
+@dataclass(frozen=True, kw_only=True)
+class MatcherKind(GeneratorKind):
+    """What it takes to read, write and run one kind of matcher."""
+
     network: type[stereo.StereoNetwork]
     #: makes a matcher of a module in eval mode
     matcher: Callable[[Any, MatcherConfig], stereo.Matcher]
@@ -44,17 +50,14 @@ MATCHERS = {
 """Kinds of matchers with weights: a new one is a file with its three parts and one entry here."""
 
 BOTH, _SELECTION = "fakestereo", "selection"
+_FORMER = ("candidates", "encoder_kind", "scales", "test_mode", "with_agreement", "with_refinement")
+"""Settings of before, which weights files hold: networks have one value of each."""
 Use = Literal["images", "pairs"]
 """What networks are for: depth of single images, or of real pairs."""
-_GENERATORS: dict[str, tuple[type, type]] = {
-    "generator": (GeneratorConfig, UNetGenerator),
-    _SELECTION: (SelectionConfig, SelectionGenerator),
+_GENERATORS = {
+    "generator": GeneratorKind(config=GeneratorConfig, network=UNetGenerator),
+    _SELECTION: GeneratorKind(config=SelectionConfig, network=SelectionGenerator),
 }
-
-
-def _networks() -> dict[str, tuple[type, type]]:
-    """Config and network of each kind of weights."""
-    return _GENERATORS | {name: (kind.config, kind.network) for name, kind in MATCHERS.items()}
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -80,15 +83,15 @@ def read_depth_weights(
     Raises:
         InputError: not such weights, or weights that do not fit their own config.
     """
-    checkpoint = checkpoints.read_checkpoint(path)
-    if checkpoint.kind not in (*_networks(), BOTH):
+    checkpoint, kinds = checkpoints.read_checkpoint(path), {**_GENERATORS, **MATCHERS}
+    if checkpoint.kind not in (*kinds, BOTH):
         raise InputError(
             f"{path}: holds weights of kind {checkpoint.kind!r}; depth takes "
-            f"{', '.join(map(repr, _networks()))} or {BOTH!r}."
+            f"{', '.join(map(repr, kinds))} or {BOTH!r}."
         )
     is_both = checkpoint.kind == BOTH
     parts = {} if is_both else {checkpoint.kind: checkpoint}
-    for kind in _networks() if is_both else ():  # its config names the networks
+    for kind in kinds if is_both else ():  # its config names the networks
         if kind not in checkpoint.config:
             continue
         config, prefix = checkpoint.config[kind], f"{kind}."
@@ -106,9 +109,10 @@ def read_depth_weights(
     for kind, part in parts.items():  # a generator first
         if use == "pairs" and is_both and kind in _GENERATORS:
             continue
-        kind_of_config, make = _networks()[kind]
-        config = config_from_dict(part.config, kind_of_config, source=str(path))
-        built[kind] = checkpoints.build_network(partial(make, config), part, str(path)).eval()
+        settings = {name: v for name, v in part.config.items() if name not in _FORMER}
+        config = config_from_dict(settings, kinds[kind].config, source=str(path))
+        make = partial(kinds[kind].network, config)
+        built[kind] = checkpoints.build_network(make, part, str(path)).eval()
         if use == "images" and kind in _GENERATORS and (answer or config.answer) == "own":
             break  # it takes no matcher
     return DepthWeights(
@@ -160,10 +164,10 @@ def write_depth_weights(
         with_half: store 16-bit floats: half the size.
     """
     parts: dict[str, Any] = {}
-    for kind, (_, network) in _networks().items():
+    for name, kind in (*_GENERATORS.items(), *MATCHERS.items()):
         for part in (generator, matcher):
-            if isinstance(part, network):
-                parts[kind] = part
+            if isinstance(part, kind.network):
+                parts[name] = part
     assert parts, "a weights file holds a network at least"
     states = {
         k: checkpoints.half_state(part) if with_half else part.state_dict()

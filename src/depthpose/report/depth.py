@@ -46,24 +46,35 @@ def depth_section(
     The colours of depth go from bright to dark over ``range_m``.
     """
     near_m, far_m = range_m
+    facts, grey = depth_facts(pair, estimate), grey_caption(estimate)
+    true_m = None if error is None else error.true_depth_m
+    scenes: list[Scene] = []
+    if estimate.depth_m is not None and (camera := pair.camera) is not None:
+        scenes = [depth_scene(pair, estimate, far_m, f"{title}: the cloud")]
+        if true_m is not None:
+            points_m = back_project(true_m, camera.K).reshape(-1, 3).float()
+            points_m = points_m[points_m.isfinite().all(-1) & (points_m[:, 2] <= far_m)]
+            points_m = take_evenly(points_m, _TRUE_POINTS)
+            layer = Layer(name="true points", shape=colored_points(points_m, _TRUE))
+            said, layers = f"{scenes[0].caption}; the truth in green", [*scenes[0].layers, layer]
+            scenes = [Scene(caption=said, layers=layers)]
     pictures = [Drawing(image=pair.left, caption="image")] if with_image else []
     if estimate.depth_m is None:
         disparity = Drawing(
             image=draw_disparity(estimate.disparity_px, is_sky=estimate.is_sky),
-            caption=f"estimated disparity, large (near) bright; {grey_caption(estimate)}",
+            caption=f"estimated disparity, large (near) bright; {grey}",
             scale=rising_scale("disparity [px]", 96.0, has_more=True),
         )
         pictures.append(disparity)
     else:
         depth = Drawing(
             image=draw_depth(estimate.depth_m, *range_m),
-            caption=f"estimated depth, near bright and far dark; {grey_caption(estimate)}",
+            caption=f"estimated depth, near bright and far dark; {grey}",
             scale=depth_scale(*range_m),
         )
         pictures.append(depth)
-    true_m = None
     if error is not None:
-        wrong, left, true_m = error.error, pair.left, error.true_depth_m
+        wrong, left = error.error, pair.left
         is_sparse = float(wrong.isfinite().double().mean()) < _SPARSE
         where = "over the dimmed image" if is_sparse else "grey: not compared"
         if error.is_disparity:
@@ -94,17 +105,6 @@ def depth_section(
         pictures.append(confidence)
     if estimate.right is not None:
         pictures.append(Drawing(image=estimate.right, caption="right view as drawn"))
-    scenes: list[Scene] = []
-    if estimate.depth_m is not None and (camera := pair.camera) is not None:
-        scenes = [depth_scene(pair, estimate, far_m, f"{title}: the cloud")]
-        if true_m is not None:
-            points_m = back_project(true_m, camera.K).reshape(-1, 3).float()
-            points_m = points_m[points_m.isfinite().all(-1) & (points_m[:, 2] <= far_m)]
-            points_m = take_evenly(points_m, _TRUE_POINTS)
-            layer = Layer(name="true points", shape=colored_points(points_m, _TRUE))
-            said, layers = f"{scenes[0].caption}; the truth in green", [*scenes[0].layers, layer]
-            scenes = [Scene(caption=said, layers=layers)]
-    facts = depth_facts(pair, estimate)
     return Section(title=title, text=text, facts=facts, pictures=pictures, scenes=scenes)
 
 

@@ -15,7 +15,7 @@ from urllib.parse import quote
 
 import numpy as np
 import torch
-from jaxtyping import Float, Int64
+from jaxtyping import Float
 from jinja2 import Environment, PackageLoader, StrictUndefined
 from torch import Tensor
 
@@ -72,8 +72,13 @@ class Scene:
                 kind, most, places, color = "lines", MOST_LINES, shape.ends_m, shape.color
             if len(places) > most:
                 thinned.append(f"{layer.name}: {most} of {len(places)}, thinned evenly")
-            kept = _spread(len(places), most)
-            places, color = places[kept], color[kept]
+                # One of each of equal runs, by chance, always the same ones: equal steps through
+                # the rows of a depth image would leave lines of points.
+                fixed = torch.Generator().manual_seed(0)
+                chance = torch.rand(most, generator=fixed, dtype=torch.float64)
+                kept = ((torch.arange(most) + chance) * (len(places) / most)).long()
+                kept = kept.clamp(max=len(places) - 1)
+                places, color = places[kept], color[kept]
             bytes_of_color = (color.detach().cpu().clamp(0, 1) * 255).round().byte().numpy()
             flat_m = places.detach().cpu().numpy().astype(np.float64).reshape(-1, 3)
             low = flat_m.min(0) if len(flat_m) else np.zeros(3)
@@ -121,17 +126,6 @@ def frame_axes(origin_m: Float[Tensor, "3"], R: Float[Tensor, "3 3"], length_m: 
     return Lines(ends_m=ends_m.float(), color=torch.tensor(_RED_GREEN_BLUE))
 
 
-def _spread(count: int, most: int) -> Int64[Tensor, " m"]:
-    """Choose one row of each of ``most`` equal runs, by chance, always the same ones.
-
-    Equal steps through the rows of a depth image would leave lines of points.
-    """
-    if count <= most:
-        return torch.arange(count)
-    chance = torch.rand(most, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
-    return ((torch.arange(most) + chance) * (count / most)).long().clamp(max=count - 1)
-
-
 MOST_VIEWS = 6
 _REFUSED = 2  # refusals shown at least, where there are so many
 
@@ -177,6 +171,7 @@ Row = Mapping[str, Any]
 _MOST_PIXELS = 480_000
 """Most pixels of a drawing on a page of many; a frame of KITTI keeps its size."""
 _QUALITY = 85
+_ERRORS = "backslashreplace"  # of names of files whose bytes are no UTF-8
 _MOST_BYTES = 250_000  # largest picture file that goes onto a page as it is
 _MOST_FILM_BYTES = 8_000_000  # largest video file on a page; a larger one is shown from beside it
 
@@ -271,12 +266,8 @@ def write_table(folder: Path, rows: Sequence[Row], name: str = "rows") -> None:
     """Write ``NAME.json``, ``NAME.csv`` and ``table.md`` (``NAME.md`` for other names)."""
     as_json, as_csv, as_markdown = table_files(name)
     write_json(folder / as_json, [dict(row) for row in rows])
-    _write_text(folder / as_csv, csv_table(rows))
-    _write_text(folder / as_markdown, markdown_table(rows))
-
-
-def _write_text(path: Path, text: str) -> None:
-    write_bytes(path, text.encode("utf-8", "backslashreplace"))
+    write_bytes(folder / as_csv, csv_table(rows).encode(errors=_ERRORS))
+    write_bytes(folder / as_markdown, markdown_table(rows).encode(errors=_ERRORS))
 
 
 def markdown_table(rows: Sequence[Row]) -> str:
@@ -323,7 +314,7 @@ def write_markdown(
         parts += [f"## {section.title}\n"] + ([f"{section.text}\n"] if section.text else [])
         parts += [markdown_table(section.rows)] if section.rows else []
     parts.append(" · ".join(f"{name} {value}" for name, value in environment.items()) + "\n")
-    _write_text(path, "\n".join(parts))
+    write_bytes(path, "\n".join(parts).encode(errors=_ERRORS))
 
 
 def column_names(rows: Sequence[Row]) -> list[str]:
@@ -387,4 +378,4 @@ def write_page(
     html = pages.get_template("report.html").render(
         title=title, sections=sections, environment=environment
     )
-    _write_text(path, html)
+    write_bytes(path, html.encode(errors=_ERRORS))

@@ -95,12 +95,7 @@ def _rgb(values: Tensor, sides: tuple[int, int], what: str) -> View:
 def as_input(
     image: object, name: str, camera: AnyLens | None, *, with_exif: bool = True
 ) -> StereoInput:
-    """Take a picture and what is known of its camera; without that, ask the picture's EXIF.
-
-    What is an input already stays it.
-    """
-    if isinstance(image, StereoInput):
-        return image
+    """Take a picture and what is known of its camera; without that, ask the picture's EXIF."""
     left = as_tensor(image)
     if camera is None and with_exif:
         camera = exif_focal_px(image, name)
@@ -438,7 +433,10 @@ class FakestereoNet:
         """Estimate images together; where one of them is unusable, each alone."""
         found: list[DepthEstimate | InputError] = []
         try:
-            inputs = [as_input(image, name, lens) for name, image in named]
+            inputs = [
+                image if isinstance(image, StereoInput) else as_input(image, name, lens)
+                for name, image in named
+            ]
             sized = [
                 (one, None if one.right is not None else self.virtual_sizes(one)) for one in inputs
             ]
@@ -497,15 +495,14 @@ class FakestereoNet:
                 for size in sizes
             )
             views = self.synthesiser.draw(left, *larger)
-            seen = views.seen
-            sky, confidence = (None, None) if seen is None else (seen.is_sky, seen.confidence)
+            sky, confidence = views.is_sky, views.confidence
             if rig.answer == "matched":
                 camera = camera_of(rig.virtual_focal_px, (left.shape[3], left.shape[2]))
                 matches = self._match(list(zip(left, views.right, strict=True)), camera)
             else:
-                assert seen is not None, "it has an answer of its own"
+                assert views.disparity_px is not None, "it has an answer of its own"
                 assert confidence is not None
-                parts = zip(seen.disparity_px, confidence, strict=True)
+                parts = zip(views.disparity_px, confidence, strict=True)
                 matches = [Match(disparity_px=px, confidence=sure) for px, sure in parts]
             estimates = []
             for n, (image, found) in enumerate(zip(images, matches, strict=True)):
@@ -513,9 +510,9 @@ class FakestereoNet:
                 estimate = disparity.from_virtual(image, rig, match, views.right[n])
                 estimate = scale_by_mount(estimate, image)
                 estimates.append(estimate)
-                if seen is None or confidence is None:
+                if confidence is None:
                     continue
-                mean = confidence[n].mean() if seen.street is None else seen.street[n]
+                mean = confidence[n].mean() if views.street is None else views.street[n]
                 sure, said = float(mean), ""
                 if isinstance(rig, SelectionConfig) and sure < rig.least_confidence:
                     what = "probability of a street" if rig.with_street else "mean confidence"

@@ -11,7 +11,6 @@ from depthpose.depth.stereo.matcher import StereoNetwork as StereoNetwork
 from depthpose.depth.stereo.matcher import check_pair as check_pair
 from depthpose.depth.stereo.matcher import fill_holes as fill_holes
 from depthpose.depth.stereo.matcher import normalise as normalise
-from depthpose.depth.stereo.matcher import with_usable_precision as with_usable_precision
 from depthpose.depth.stereo.psmnet import PSMNet as PSMNet
 from depthpose.depth.stereo.psmnet import PSMNetMatcher as PSMNetMatcher
 from depthpose.depth.stereo.psmnet import import_psmnet as import_psmnet

@@ -192,24 +192,21 @@ class VolumeConv(nn.Module):
         volume = volume.to(self.weight.dtype)
         is_usable = volume.device.type == "cpu" and volume.dtype in (torch.float32, torch.bfloat16)
         # oneDNN is called by name: PyTorch's own choice takes a slow path for few rows.
-        by_name = is_usable and has_onednn_operators()
+        if is_usable and has_onednn_operators():
+            return _by_onednn(
+                volume, self.weight, self.bias, None if self.is_transposed else self.stride
+            )
         if self.is_transposed:
-            if by_name:
-                return _onednn_transposed(volume, self.weight, self.bias)
             return F.conv_transpose3d(volume, self.weight, self.bias, 2, 1, 1)
-        if by_name:
-            return _onednn_convolved(volume, self.weight, self.bias, self.stride)
         return F.conv3d(volume, self.weight, self.bias, self.stride, 1)
 
 
-def _onednn_convolved(volume: Tensor, weight: Tensor, bias: Tensor, stride: int) -> Tensor:
-    ones, strides = (1, 1, 1), (stride,) * 3
-    return torch.mkldnn_convolution(volume, weight, bias, ones, strides, ones, 1)
-
-
-def _onednn_transposed(volume: Tensor, weight: Tensor, bias: Tensor) -> Tensor:
-    ones, twos = (1, 1, 1), (2, 2, 2)
-    args = (volume, weight, bias, ones, ones, twos, ones, 1, "none", [], "")
+def _by_onednn(volume: Tensor, weight: Tensor, bias: Tensor, stride: int | None) -> Tensor:
+    """Convolve with a stride; transposed, which doubles the size, where it is None."""
+    ones, steps = (1, 1, 1), (stride or 2,) * 3
+    if stride is not None:
+        return torch.mkldnn_convolution(volume, weight, bias, ones, steps, ones, 1)
+    args = (volume, weight, bias, ones, ones, steps, ones, 1, "none", [], "")
     return torch.ops.mkldnn._convolution_transpose_pointwise(*args)
 
 
@@ -224,8 +221,8 @@ def has_onednn_operators() -> bool:
     volume, weight, bias = torch.ones(1, 2, 4, 4, 4), torch.ones(2, 2, 3, 3, 3), torch.ones(2)
     try:
         with torch.no_grad():
-            convolved = _onednn_convolved(volume, weight, bias, 1)
-            transposed = _onednn_transposed(volume, weight, bias)
+            convolved = _by_onednn(volume, weight, bias, 1)
+            transposed = _by_onednn(volume, weight, bias, None)
     except (AttributeError, RuntimeError, TypeError):
         return False
     both = (

@@ -54,64 +54,44 @@ class ViewFeatures(NamedTuple):
 class ConvexUpsampling(nn.Module):
     """Maps at 1/4 size to full size: each pixel is a mean of nine neighbours, by learnt weights.
 
-    With agreement, the weights also depend on how alike both views are under the disparity of each
-    neighbour: where two surfaces meet, this says which one a pixel belongs to. That part is
-    initialised to zero.
+    These also depend on how alike both views are under the disparity of each neighbour: where two
+    surfaces meet, this says which one a pixel belongs to. That part is initialised to zero.
     """
 
-    def __init__(self, width: int, *, with_agreement: bool) -> None:
+    def __init__(self, width: int) -> None:
         super().__init__()
         self.hidden = conv_norm_2d(STEM + width, 32)
         self.weights = nn.Conv2d(32, 4 * 9, 1)
-        self.compared = conv_norm_2d(STEM, STEM) if with_agreement else None
-        self.agreement = nn.Conv2d(9, 32, 3, 1, 1, bias=False) if with_agreement else None
-        if self.agreement is not None:
-            nn.init.zeros_(self.agreement.weight)
+        self.compared = conv_norm_2d(STEM, STEM)
+        self.agreement = nn.Conv2d(9, 32, 3, 1, 1, bias=False)
+        nn.init.zeros_(self.agreement.weight)
 
     def forward(
         self,
         quarters: Float[Tensor, "b k h4 w4"],
         left_half: Features,
         left_quarter: Features,
-        right_half: Features | None,
+        right_half: Features,
     ) -> Float[Tensor, "b k h w"]:
         """Bring maps, the first the disparity [px], to full size by features of both views."""
         wide = F.interpolate(left_quarter, scale_factor=2.0, mode="nearest")
         x = self.hidden(torch.cat([left_half, wide], 1))
-        if self.compared is not None and self.agreement is not None:
-            assert right_half is not None
-            both = self.compared(left_half), self.compared(right_half)
-            alike = agreement_of_neighbours(*both, quarters[:, 0].detach())
-            x = x + self.agreement(alike.to(x))
-        x = F.relu(x)
+        # The cosine of features at half size under the disparity of each of nine neighbours.
+        near, far = (
+            F.normalize(self.compared(half).float(), dim=1, eps=1e-3)
+            for half in (left_half, right_half)
+        )
+        shifts = (_neighbours(quarters[:, 0].detach()) / 2).unbind(1)
+        alike = torch.stack([(near * _moved(far, shift)).sum(1) for shift in shifts], 1)
+        x = F.relu(x + self.agreement(alike.to(x)))
         b, _, h, w = x.shape
         # They sum to one, for the four pixels of each one at half size.
         weights = self.weights(x).float().reshape(b, 9, 4, h, w).softmax(1)
-        return torch.stack([enlarge(one, weights) for one in quarters.unbind(1)], 1)
-
-
-def agreement_of_neighbours(
-    left: Float[Tensor, "b c h2 w2"], right: Float[Tensor, "b c h2 w2"], quarter_px: Quarter
-) -> Float[Tensor, "b 9 h2 w2"]:
-    """Give the cosine of features at half size under the disparity of each of nine neighbours."""
-    near, far = (F.normalize(x.float(), dim=1, eps=1e-3) for x in (left, right))
-    shifts = (_neighbours(quarter_px) / 2).unbind(1)
-    return torch.stack([(near * _moved(far, shift)).sum(1) for shift in shifts], 1)
-
-
-def agreement_around(
-    left: Float[Tensor, "b c h2 w2"],
-    right: Float[Tensor, "b c h2 w2"],
-    half_px: Float[Tensor, "b h2 w2"],
-    groups: int,
-) -> Float[Tensor, "b _ h2 w2"]:
-    """Give the cosine of each group of features at half size at five disparities about one [px]."""
-    near, far = unit_groups(left, groups), unit_groups(right, groups).flatten(1, 2)
-    cosines = []
-    for offset in _OFFSETS:
-        moved = _moved(far, half_px + offset).unflatten(1, near.shape[1:3])
-        cosines.append((near * moved).sum(2))
-    return torch.cat(cosines, 1)
+        enlarged = [
+            F.pixel_shuffle((weights * _neighbours(one)[:, :, None]).sum(1), 2)
+            for one in quarters.unbind(1)
+        ]
+        return torch.cat(enlarged, 1)
 
 
 def _moved(
@@ -150,8 +130,13 @@ class Refinement(nn.Module):
         four = F.pixel_unshuffle(enlarged_px.detach()[:, None], 2) / 2
         middle = four.mean(1)
         left, right = self.compared(left_half), self.compared(right_half)
-        alike = agreement_around(left.float(), right.float(), middle, _GROUPS)
-        x = torch.cat([alike, left_half.float(), four - middle[:, None]], 1).to(left)
+        # The cosine of each group of features at five disparities about that one.
+        near, far = (unit_groups(half.float(), _GROUPS) for half in (left, right))
+        cosines = [
+            (near * _moved(far.flatten(1, 2), middle + offset).unflatten(1, near.shape[1:3])).sum(2)
+            for offset in _OFFSETS
+        ]
+        x = torch.cat([*cosines, left_half.float(), four - middle[:, None]], 1).to(left)
         for layer in self.layers:
             x = F.relu(layer(x))
         correction_px = F.pixel_shuffle(self.correction(x).to(enlarged_px), 2)[:, 0]
@@ -167,11 +152,6 @@ def _neighbours(quarter: Quarter) -> Float[Tensor, "b 9 h2 w2"]:
     return F.interpolate(torch.cat(near, 1), scale_factor=2.0, mode="nearest")
 
 
-def enlarge(quarter: Quarter, weights: Float[Tensor, "b 9 4 h2 w2"]) -> Maps:
-    """Bring a map to full size: each pixel is a mean of nine neighbours, weighed."""
-    return F.pixel_shuffle((weights * _neighbours(quarter)[:, :, None]).sum(1), 2)[:, 0]
-
-
 def unit_groups(features: Float[Tensor, "b c h w"], groups: int) -> Float[Tensor, "b g k h w"]:
     """Bring each group of features to length 1."""
     b, c, h, w = features.shape
@@ -183,24 +163,14 @@ Scores = Float[Tensor, "b d h4 w4"]
 
 STEP_PX = 4
 """Distance of neighbouring disparities that have a score."""
+_CANDIDATES = 2
+"""Disparities of the highest scores whose mean is the answer."""
 _WINDOW = 0.15
 """Of a disparity: what lies so near to it counts for its confidence."""
 _USUAL_PX = 64
 """A disparity of this size is 1 to the class of the sky."""
 _SKY_WIDTH = 32
 """Channels of the class of the sky."""
-
-
-def mean_of_best(scores: Scores, candidates: int) -> Quarter:
-    """Give the expected disparity [px] over the disparities of the highest scores."""
-    best = scores.topk(candidates, 1)
-    return STEP_PX * (best.values.softmax(1) * best.indices).sum(1)
-
-
-def mean_of_all(scores: Scores) -> Quarter:
-    """Give the expected disparity [px] over all disparities."""
-    bins = torch.arange(scores.shape[1], dtype=scores.dtype, device=scores.device)
-    return STEP_PX * (scores.softmax(1) * bins[:, None, None]).sum(1)
 
 
 def confidence_near(scores: Scores, disparity_px: Quarter) -> Quarter:
@@ -360,11 +330,13 @@ class Aggregation(nn.Module):
         """
         both = zip(self.guides, levels, strict=True)
         guides = [torch.sigmoid(guide(level))[:, :, None] for guide, level in both]
+        # In place where no gradient needs the old values.
+        product = torch.Tensor.mul if torch.is_grad_enabled() else torch.Tensor.mul_
 
         def begin(left: Features, right: Features, guide: Volume) -> Volume:
             volume = correlation_volume(left, right, bins, self.config.groups)
             volume = volume.contiguous(memory_format=torch.channels_last_3d)
-            return _product(self.first(volume).relu_(), guide)
+            return product(self.first(volume).relu_(), guide)
 
         def raised(up: nn.Module, volume: Volume, larger: Volume) -> Volume:
             return up(volume).add_(larger).relu_()
@@ -374,18 +346,13 @@ class Aggregation(nn.Module):
 
         scales = [by_rows(begin, (left, right, guides[0]), halo=1, rows=rows)]
         for down, same, guide in zip(self.down, self.same, guides[1:], strict=True):
-            scales.append(_product(same(down(scales[-1]).relu_()).relu_(), guide))
+            scales.append(product(same(down(scales[-1]).relu_()).relu_(), guide))
         x = scales.pop()
         for up, joined in zip(self.up[:0:-1], self.joined[:0:-1], strict=True):
             x = joined(raised(up, x, scales.pop())).relu_()
         largest, half = scales.pop(), None if rows is None else rows // 2
         x = by_rows(partial(raised, self.up[0]), (x, largest), halo=1, rows=half, into=largest)
         return by_rows(end, (x,), halo=2, rows=rows)[:, 0]
-
-
-def _product(volume: Volume, guide: Volume) -> Volume:
-    """Multiply a volume by its guide, in place where no gradient needs the old values."""
-    return volume * guide if torch.is_grad_enabled() else volume.mul_(guide)
 
 
 class LightStereo(StereoNetwork):
@@ -401,13 +368,16 @@ class LightStereo(StereoNetwork):
     def __init__(self, config: LightConfig | None = None) -> None:
         super().__init__()
         self.config = config or LightConfig()
+        if self.config.width % self.config.groups:
+            raise InputError(
+                f"width must be a multiple of groups, got width={self.config.width} and "
+                f"groups={self.config.groups}; take 48 and 8"
+            )
         self.features = LightFeatures(self.config)
         self.describe = nn.Conv2d(self.config.width, self.config.width, 1, bias=False)
         self.aggregation = Aggregation(self.config, self.features.widths)
-        self.enlargement = ConvexUpsampling(
-            self.config.width, with_agreement=self.config.with_agreement
-        )
-        self.refinement = Refinement() if self.config.with_refinement else None
+        self.enlargement = ConvexUpsampling(self.config.width)
+        self.refinement = Refinement()
         self.sky_head = SkyHead(self.features.widths) if self.config.with_sky else None
 
     @property
@@ -437,8 +407,22 @@ class LightStereo(StereoNetwork):
         Raises:
             InputError: the images' size does not suit the network.
         """
-        scores, near, right_half = self.scores(left, right, max_disparity_px)
-        quarter_px = mean_of_best(scores, self.config.candidates)
+        h, w = left.shape[-2:]
+        if h % 32 or w % 32:
+            raise InputError(
+                f"the light matcher takes sides that are multiples of 32, got {h}x{w}; pad the "
+                "pair, as LightMatcher does"
+            )
+        near, far = self.features(left), self.features(right)
+        described = self.describe(near.levels[0]), self.describe(far.levels[0])
+        right_half = far.half
+        del far
+        bins = max_disparity_px // STEP_PX
+        scores = self.aggregation(*described, bins, near.levels, self.rows)
+        # In float32 at least: 8 bits would round the expectation to whole pixels.
+        scores = scores.to(torch.promote_types(scores.dtype, torch.float32))
+        best = scores.topk(_CANDIDATES, 1)
+        quarter_px = STEP_PX * (best.values.softmax(1) * best.indices).sum(1)
         quarters = [quarter_px]
         if with_confidence or self.sky_head is not None:
             with torch.no_grad():
@@ -447,19 +431,19 @@ class LightStereo(StereoNetwork):
                 quarters.append(by_rows(confidence_near, parts, halo=0, rows=self.rows))
         if self.sky_head is not None:
             quarters.append(self.sky_head(near.levels, *quarters))
-        coarse_px = mean_of_all(scores)[:, None] if self.training else None
+        coarse_px = None
+        if self.training:  # the mean over all disparities
+            steps = torch.arange(bins, dtype=scores.dtype, device=scores.device)[:, None, None]
+            coarse_px = STEP_PX * (scores.softmax(1) * steps).sum(1, keepdim=True)
         del scores
         parts = (torch.stack(quarters, 1), near.half, near.levels[0], right_half)
         found_px, *rest = by_rows(self.enlargement, parts, halo=2, rows=self.rows).unbind(1)
-        heads = (found_px,)
-        if self.refinement is not None:
-            parts = (found_px, near.half, right_half)
-            half_rows = None if self.rows is None else 2 * self.rows
-            heads = (found_px, by_rows(self.refinement, parts, halo=5, rows=half_rows))
-        heads = heads[-1:] if coarse_px is None else heads
+        parts = (found_px, near.half, right_half)
+        half_rows = None if self.rows is None else 2 * self.rows
+        heads = (by_rows(self.refinement, parts, halo=5, rows=half_rows),)
         if coarse_px is not None:
             wide_px = F.interpolate(coarse_px, scale_factor=4.0, mode="bilinear")[:, 0]
-            heads = (wide_px, *heads)
+            heads = (wide_px, found_px, *heads)
         confidence = rest[0] if with_confidence else None
         if self.sky_head is None:
             return Reading(heads, confidence, None)
@@ -469,29 +453,6 @@ class LightStereo(StereoNetwork):
         if confidence is not None:
             confidence = torch.where(sky > 0.5, sky, sure * (1 - sky))
         return Reading(heads, confidence, sky)
-
-    def scores(
-        self, left: Views, right: Views, max_disparity_px: int
-    ) -> tuple[Scores, ViewFeatures, Features | None]:
-        """Answer a score for each disparity at 1/4 size, and what the enlargement sees.
-
-        Scores are float32 at least: 8 bits would round the expectation to whole pixels.
-        """
-        h, w = left.shape[-2:]
-        if h % 32 or w % 32:
-            raise InputError(
-                f"the light matcher takes sides that are multiples of 32, got {h}x{w}; pad the "
-                "pair, as LightMatcher does"
-            )
-        near, far = self.features(left), self.features(right)
-        described = self.describe(near.levels[0]), self.describe(far.levels[0])
-        compares = self.config.with_agreement or self.config.with_refinement
-        right_half = far.half if compares else None
-        del far
-        bins = max_disparity_px // STEP_PX
-        scores = self.aggregation(*described, bins, near.levels, self.rows)
-        wide = torch.promote_types(scores.dtype, torch.float32)
-        return scores.to(wide), near, right_half
 
 
 ROWS = 16
@@ -507,8 +468,7 @@ def light_bytes(
     """
     pixels = height * width // 16
     slab_pixels = min((rows + 4) * width // 4, pixels)
-    halves = 2 if config.with_agreement or config.with_refinement else 1
-    kept = pixels * (halves * 4 * 16 + 3 * config.width) * dtype.itemsize
+    kept = pixels * (2 * 4 * 16 + 3 * config.width) * dtype.itemsize
     # Both views in float32: at this size, normalised, padded.
     images = 6 * 3 * 4 * height * width
     # A volume at quarter size, the smaller ones, and three of the rows at a time.
@@ -518,7 +478,7 @@ def light_bytes(
     # Weights that enlarge maps, thrice, and what they are made of at half size; the refinement
     # takes less.
     joined = 4 * (16 + config.width + 32) * dtype.itemsize
-    compared = 4 * (4 * 16 + 9 + 3 * 9) * 4 if config.with_agreement else 0
+    compared = 4 * (4 * 16 + 9 + 3 * 9) * 4
     weights = slab_pixels * (joined + compared + 3 * 4 * 36 * 4)
     return int(layers.MARGIN * (images + kept + max(volumes, weights))) + layers.OVERHEAD_BYTES // 2
 

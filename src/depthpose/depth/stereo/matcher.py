@@ -277,8 +277,9 @@ class NetworkMatcher(ABC):
     def __init__(self, network: StereoNetwork, config: MatcherConfig | None = None) -> None:
         config = config or MatcherConfig()
         self.device = usable_device(config.device)
-        self.config = with_usable_precision(config)
-        self.dtype = DTYPES[self.config.precision]
+        precision = usable_precision(config.precision, config.device)
+        self.config = replace(config, precision=precision)
+        self.dtype = DTYPES[precision]
         self.network_config: NetworkConfig = network.config
         like = torch.empty(0, dtype=self.dtype, device=self.device)
         self._network = self.fold(deepcopy(network).eval().to(self.device), like)
@@ -385,12 +386,6 @@ class NetworkMatcher(ABC):
                 )
         matches = self.run(left, right, network)
         return [disparity.changed_match(match, lambda values: values[-h:, :w]) for match in matches]
-
-
-def with_usable_precision(config: MatcherConfig) -> MatcherConfig:
-    """Give a config whose precision its device computes in; says so where it is another."""
-    is_bf16 = usable_precision(config.precision, config.device) == "bf16"
-    return replace(config, precision="bf16" if is_bf16 else "fp32")
 
 
 def normalise(image: Float[Tensor, "*batch 3 h w"]) -> Float[Tensor, "*batch 3 h w"]:

@@ -13,7 +13,13 @@ import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from depthpose.core.checkpoint import Checkpoint, file_sha256, read_published, save_checkpoint
+from depthpose.core.checkpoint import (
+    Checkpoint,
+    file_sha256,
+    load_weights,
+    read_published,
+    save_checkpoint,
+)
 from depthpose.core.config import config_to_dict
 from depthpose.core.errors import InputError
 from depthpose.depth.config import PSMNetConfig
@@ -388,38 +394,18 @@ def psmnet_from_published(state: Mapping[str, Tensor], *, align_corners: bool) -
         InputError: a name is missing, unknown or holds another shape; nothing is half loaded.
     """
     network = PSMNet(PSMNetConfig(align_corners=align_corners))
-    wanted = network.state_dict()
-    given: dict[str, tuple[str, Tensor]] = {}
+    renamed: dict[str, Tensor] = {}
     for published, value in state.items():  # an unknown name stays as it is, and is refused
         name = published.removeprefix("module.")
         prefix = next(prefix for prefix in _PUBLISHED_NAMES if name.startswith(prefix))
         name = name.removeprefix(prefix)
         for pattern, ours in _PUBLISHED_NAMES[prefix]:
             name = re.sub(pattern, ours, name)
-        given[f"features.{name}" if prefix else name] = published, value
+        renamed[f"features.{name}" if prefix else name] = value
     # The count of batches steers nothing at inference; files older than 2018 do not hold it.
-    needed = {name for name in wanted if not name.endswith("num_batches_tracked")}
-    shapes = [
-        f"{given[name][0]} is {tuple(given[name][1].shape)} and should be {tuple(value.shape)}"
-        for name, value in wanted.items()
-        if name in given and given[name][1].shape != value.shape
-    ]
-    unknown = sorted(given[name][0] for name in set(given) - set(wanted))
-    faults = [
-        f"{what}: {', '.join(names[:5])}{f' and {len(names) - 5} more' if names[5:] else ''}"
-        for what, names in (
-            ("missing", sorted(needed - set(given))),
-            ("unknown", unknown),
-            ("misshaped", shapes),
-        )
-        if names
-    ]
-    if faults:
-        raise InputError(
-            f"these are not the weights of the published stacked-hourglass PSMNet: "
-            f"{'; '.join(faults)}. Give the value that the file holds under 'state_dict'"
-        )
-    network.load_state_dict({**wanted, **{name: value for name, (_, value) in given.items()}})
+    uncounted = {n: v for n, v in network.state_dict().items() if n.endswith("batches_tracked")}
+    given = Checkpoint(kind="psmnet", config={}, state={**uncounted, **renamed})
+    load_weights(network, given, "the checkpoint of the stacked-hourglass PSMNet ('state_dict')")
     return network.eval()
 
 

@@ -87,8 +87,7 @@ class SelectTraining(Settings):
     """Learning rate of the encoder as a share of the decoder's."""
 
     disparity_loss: str = "log"
-    """log: error of disparity's logarithm; pixel: of disparity as a share of the largest; see
-    ``losses.DISPARITY_LOSSES``."""
+    """log: error of disparity's logarithm; see ``losses.DISPARITY_LOSSES``."""
 
     plane_weight: Annotated[float, "[0, inf)"] = 0.2
     """Weight of the cross entropy over sky and disparities."""

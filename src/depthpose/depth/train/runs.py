@@ -32,7 +32,7 @@ from depthpose.depth.weights import MATCHERS, read_generator, read_matcher, writ
 _FREE_OF_WEIGHTS = ("max_disparity_px", "with_street", "least_confidence")
 """Settings that the weights of a training do not depend on: a matcher searches any disparities in
 the same way, and which images are refused is found after a training."""
-_CAN_BE_ADDED = ("with_agreement", "with_refinement", "with_sky")
+_CAN_BE_ADDED = ("with_sky",)
 """Parts that begin with next to no effect, so weights without them can be trained on with them."""
 
 

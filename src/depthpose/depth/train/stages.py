@@ -352,7 +352,7 @@ class SelectTask:
     ) -> Float[Tensor, ""]:
         """Losses of the disparity of one view."""
         planes, range_px = self.generator.planes, self.generator.config.disparity_px
-        log_px = synthesis.log_expectation(logits, planes)[:, None]
+        log_px = synthesis.read_logits(logits, planes)[0][:, None]
         log_px = F.interpolate(log_px, truth_px.shape[1:], mode="bilinear", align_corners=False)
         loss = losses.DISPARITY_LOSSES[self.config.disparity_loss](log_px[:, 0], truth_px, range_px)
         if not self.config.plane_weight:
@@ -375,9 +375,10 @@ class SelectTask:
         for index in range(len(self.held_out)):
             pair = self.held_out.read(index)
             drawn = synthesiser.draw(pair.left[None])
-            assert drawn.seen is not None, "it selects"
-            is_sky = drawn.seen.is_sky[0]
-            found_px = drawn.seen.shift_px[0].clamp(min=far_px)
+            assert drawn.disparity_px is not None
+            assert drawn.is_sky is not None
+            is_sky = drawn.is_sky[0]
+            found_px = drawn.disparity_px[0].where(~is_sky, 0.0).clamp(min=far_px)
             if index == 0:
                 views = [pair.left, pair.right, drawn.right[0], draw_disparity(found_px)]
                 pictures["left_right_drawn_disparity"] = torch.cat(views, 1)
