@@ -304,10 +304,8 @@ def test_a_size_that_is_none_is_refused(
         (["depth", "predict", "lfet.png", "--focal-px", "9"], "did you mean 'left.png'?"),
         (["depth", "match", "left.png", "right.png", "--camera", "c.json"], "right.png: there is"),
         (["depth", "train", "view", "--data", "left.png", "streets"], "streets: there is no such"),
-        (["depth", "evaluate", "--data", ".", "--weights", "both:nope"], "weights 'nope': neither"),
         (["pose", "train", "--cad", "part.stl", "--unit", "mm"], "part.stl: there is no such"),
         (["pose", "predict", "--cloud", "a.ply"], "a.ply: there is no such file"),
-        (["pose", "predict", "--cloud", ".", "--weights", "prats"], "did you mean 'parts'?"),
     ],
 )
 def test_a_path_that_leads_nowhere_is_refused_before_torch_is_loaded(
@@ -363,6 +361,20 @@ def test_an_option_without_a_path_is_not_the_current_folder(
     assert main(given) == 2
     assert f"{option} is empty; name a file or folder" in capsys.readouterr().err
     assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["depth", "evaluate", "--data", ".", "--weights", "both:nope"], "weights 'nope': neither"),
+        (["pose", "predict", "--cloud", ".", "--weights", "prats"], "did you mean 'parts'?"),
+    ],
+)
+def test_weights_of_no_such_name_are_refused(
+    words: list[str], said: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main([*words, "--out", str(tmp_path / "out")]) == 2
+    assert said in capsys.readouterr().err
 
 
 def test_patterns_and_addresses_are_left_to_those_who_read_them() -> None:

@@ -50,7 +50,7 @@ def seen(**mount: float) -> StereoInput:
 def test_height_tilt_and_roll_of_a_plane_are_found(height: float, tilt: float, roll: float) -> None:
     found = fit_ground(road(height, tilt, roll), CAMERA)
     assert found is not None
-    assert found.height_m == pytest.approx(height, rel=0.02)
+    assert found.height_m == pytest.approx(height, rel=0.05)
     assert found.tilt_deg == pytest.approx(tilt, abs=0.2)
     assert found.roll_deg == pytest.approx(roll, abs=0.2)
 

@@ -124,8 +124,8 @@ def _described(hint: Any) -> tuple[str | None, _Names | None]:  # noqa: ANN401  
 
 
 def refuse_missing(options: Sequence[Option], values: Mapping[str, Any]) -> None:
-    """Refuse paths and weights that do not exist."""
-    for parameter, name, names in options:
+    """Refuse paths and weights that do not exist; paths first: weights are looked up by torch."""
+    for parameter, name, names in sorted(options, key=lambda option: option[2] is _Names.WEIGHTS):
         if parameter not in values or names in (None, _Names.NEW):
             continue
         value = values[parameter] if parameter == name else getattr(values[parameter], name)

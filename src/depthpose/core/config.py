@@ -74,7 +74,8 @@ def _rules_of(kind: type) -> dict[str, tuple[tuple[Any, ...], str, tuple[Any, ..
         words = get_args(next(choices, None))
         if not all(isinstance(word, str) for word in words):
             words = ()
-        rules[name] = words, interval, tuple(more)
+        if words or interval or more:
+            rules[name] = words, interval, tuple(more)
     return rules
 
 

@@ -140,7 +140,8 @@ class Refinement(nn.Module):
         for layer in self.layers:
             x = F.relu(layer(x))
         correction_px = F.pixel_shuffle(self.correction(x).to(enlarged_px), 2)[:, 0]
-        corrected = enlarged_px.detach() + correction_px
+        # Frozen, it passes gradients on to what drew the views.
+        corrected = (enlarged_px.detach() if self.training else enlarged_px) + correction_px
         return corrected if self.training else corrected.clamp_min(LEAST_PX)
 
 
