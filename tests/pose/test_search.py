@@ -12,8 +12,10 @@ from tests.pose.synthetic_objects import CAMERA, K, bracket, pose_at, view_of
 
 from depthpose.core.camera import Camera
 from depthpose.core.rigid import Rigid
+from depthpose.pose.cloud import cloud_from_depth, grow_mask
 from depthpose.pose.estimator import Registration, find
 from depthpose.pose.estimator.find import SearchTargets, find_objects, size_deviations
+from depthpose.pose.estimator.fit import fit_of, seen_about
 from depthpose.pose.estimator.hypotheses import (
     compare_with_image,
     log_odds_wrong,
@@ -105,6 +107,29 @@ def test_the_image_agrees_with_the_true_pose_and_with_none_beside_it() -> None:
     log_odds = log_odds_wrong(frame, Rigid.stack([truth, *aside]), surface)
     assert float(log_odds[0]) < -2
     assert float(log_odds[1:].min()) > float(log_odds[0]) + 1.5, "before what a refined pose adds"
+
+
+def test_edges_that_a_sensor_cuts_contradict_no_pose_and_a_missing_half_does() -> None:
+    """Stereo reads what is behind the object up to four pixels from its border."""
+    model, truth = bracket(), TRUTHS[0]
+    surface = prepare_surface(model)
+    seen, mask = view_of(model, truth)
+    cut, half = mask & ~grow_mask(mask, -4), mask.clone()
+    half[:, : int(mask.nonzero()[:, 1].median())] = False
+    pose = Rigid(truth.R.double(), truth.t_m.double())
+    share, agrees = {}, {}
+    for name, lost in (("cut", cut), ("half", half)):
+        depth_m = torch.where(mask & ~lost, seen.float(), 1.25)
+        frame = prepare_frame(depth_m, K.float())
+        share[name] = float(compare_with_image(frame, pose[None], surface).contradicted)
+        view = view_input(depth_m, mask & ~lost, CAMERA, model.name, "view", None)
+        own_m = cloud_from_depth(depth_m, mask & ~lost, K.float())
+        about = seen_about(own_m, view, surface.diameter_m)
+        agrees[name] = [fit_of(about, pose, surface, rim).agrees for rim in (0, 1)]
+    assert share["cut"] < 0.02
+    assert share["half"] > 0.1
+    assert agrees["cut"][0] < agrees["cut"][1] > 0.97
+    assert agrees["half"][1] < 0.9
 
 
 def nearest_m(poses: Rigid, truth: Rigid, model: ObjectModel) -> float:

@@ -121,3 +121,19 @@ def test_a_camera_on_any_side_has_a_view_from_nearby(surface: Surface) -> None:
         assert (
             float(top_m.max()) > float((surface.points_m @ way).max()) - 0.05 * surface.diameter_m
         )
+
+
+def test_rims_and_edges_are_not_inside() -> None:
+    """Of a tube seen along its axis all is rim; of a plate seen from the front the border is."""
+    tube = trimesh.creation.annulus(r_min=0.046, r_max=0.05, height=0.1)
+    plate = trimesh.creation.box((0.1, 0.1, 0.004))
+    for mesh, inner in ((tube, 0.0), (plate, 0.75)):
+        vertices_m = torch.tensor(mesh.vertices).float()
+        model = make_model(vertices_m, torch.tensor(mesh.faces), name="thing")
+        views = prepare_surface(model).views
+        side = int(views.toward[:, 2].argmax())
+        seen = views.points_m[side].isfinite().all(-1)
+        share = float(views.is_inner[side][seen].double().mean())
+        assert share == pytest.approx(inner, abs=0.15)
+    radius_m = views.points_m[side][views.is_inner[side], :2].abs().amax(-1)
+    assert float(radius_m.max()) < 0.049, "not at the border of the plate"
