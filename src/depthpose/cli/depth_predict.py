@@ -42,10 +42,11 @@ from depthpose.depth.config import Answer, MatcherConfig, SGBMConfig
 from depthpose.depth.estimator import FakestereoNet
 from depthpose.depth.ground import scale_by_distance
 from depthpose.depth.predictions import (
+    CLOUD,
     CLOUD_M,
     ENDINGS,
+    LAST,
     Estimator,
-    is_finished,
     read_estimate,
     write_estimate,
 )
@@ -275,7 +276,7 @@ def _is_video(path: str | Path) -> bool:
     return Path(path).suffix.lower() in VIDEO_SUFFIXES
 
 
-def list_pairs(left: str, right: str) -> list[tuple[Path, Path]]:
+def list_pairs(left: str, right: str, out: Path) -> list[tuple[Path, Path]]:
     """List the images of both sides, paired by their names or the numbers in them."""
     lefts, rights = list_images(left), list_images(right)
     stems, others = ([path.stem for path in side] for side in (lefts, rights))
@@ -284,6 +285,7 @@ def list_pairs(left: str, right: str) -> list[tuple[Path, Path]]:
         raise InputError(f"{left}: two images are called {twice!r}, so would their results.")
     if (lefts, rights) != ([Path(left)], [Path(right)]):
         rights = [rights[k] for k in find_partners(stems, others, f"{left} and {right}")]
+    refuse_among_inputs(out, (left, right), lefts + rights)
     return list(zip(lefts, rights, strict=True))
 
 
@@ -370,8 +372,8 @@ def estimate_all(
     sources: Sequence[tuple[Path, ...]], work: DepthWork, method: Method, out: Path
 ) -> int:
     """Estimate what is not finished; an input that fails is named and stops no other."""
-    run.claim_folder(out, work.settings(method.settings), [_PAGE])
     videos = [files[0].stem for files in sources if _is_video(files[0])]
+    run.claim_folder(out, work.settings(method.settings), [_PAGE])
     endings = [f".{end}" for end in ENDINGS] + [_VIDEO]
     run.claim_names(out, {files[0].stem: files for files in sources}, endings, videos)
     process = run.find_rank()
@@ -389,12 +391,12 @@ def estimate_all(
     count = f"{done} of {len(mine)} pairs" if work.files == PAIRS else f"{done} depth maps"
     print(f"{count} are in {out}")
     if process.rank == 0:
-        ending = ".disparity_px.npy"
+        ending = f".{LAST}"
         frames = sorted(path.name.removesuffix(ending) for path in out.glob(f"*_??????{ending}"))
         finished: dict[tuple[Path, ...], list[str]] = {}
         for files in sources:
             stem = files[0].stem
-            finished[files] = [stem] if is_finished(out, stem) else []
+            finished[files] = [stem] if run.is_whole(out, stem, [stem + ending]) else []
             if _is_video(files[0]):
                 finished[files] = [name for name in frames if _frame_of(files[0], name)]
         names = [name for some in finished.values() for name in some]
@@ -468,17 +470,20 @@ class Predictor:
         names: list[str] = []
         output, scale, net = self.work.output, self.work.scale, self.method.net
         assert isinstance(net, FakestereoNet), "weights build no other"
+        endings = (LAST, CLOUD) if output.cloud else (LAST,)
         with tqdm(total=total, desc=what, disable=None, unit=f" {what}") as bar:
             while chunk := list(islice(named, output.batch)):
                 inputs: list[StereoInput] = []
                 for name, read in chunk:
                     try:
-                        if not is_finished(self.out, name, with_cloud=output.cloud):
+                        if not run.is_whole(self.out, name, [f"{name}.{end}" for end in endings]):
                             inputs.append(read())
                     except InputError as error:
                         self.failures[name] = error
                 check = self.work.with_check
-                estimates = net.estimate_many(inputs, with_check=check, batch=output.batch)
+                estimates = net.estimate_together(
+                    [(one.name, one) for one in inputs], with_check=check
+                )
                 for one, estimate in zip(inputs, estimates, strict=True):
                     try:
                         if isinstance(estimate, InputError):
