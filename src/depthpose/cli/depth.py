@@ -104,6 +104,7 @@ def match(
         out: folder for the results.
     """
     from depthpose.cli import depth_predict as work
+    from depthpose.core.files.images import refuse_among_inputs
 
     used = None if pairs.matcher == "sgbm" else pairs.matcher or pairs.weights or "default"
     method = work.MethodSource(weights=used, config=matching.config, with_right=True, use="pairs")
@@ -115,7 +116,8 @@ def match(
         return work.estimate_by_engine(sides, work.PAIRS, work_of, out, engine)
     if right is None:
         raise InputError(f"{left}: there is no right image beside it; give it second")
-    files = work.list_pairs(left, right, Path(out))
+    files = work.list_pairs(left, right)
+    refuse_among_inputs(Path(out), (left, right), [path for pair in files for path in pair])
     this, built = work_of(files[0]), method.build()
     return work.estimate_all(files, this, built, Path(out))
 

@@ -21,8 +21,7 @@ from depthpose.core import run
 from depthpose.core.camera import Camera, FieldOfView, StereoRig, camera_of, read_camera, read_rig
 from depthpose.core.camera.pinhole import camera_keys
 from depthpose.core.checkpoint import file_sha256, find_weights, read_checkpoint
-from depthpose.core.config import config_to_dict
-from depthpose.core.devices import own_device, usable_precision
+from depthpose.core.devices import own_device, usable_device, usable_precision
 from depthpose.core.draw import draw_depth
 from depthpose.core.engine import Files, Function, Inputs, Sample, Work
 from depthpose.core.errors import InputError
@@ -95,10 +94,11 @@ class MethodSource:
         if isinstance(self.weights, Weights):
             with self.weights.unpacked() as file:
                 return replace(self, weights=file).build()
-        device = self.config.device
+        device = own_device(self.config.device)
+        usable_device(device)  # refused before anything is read
         is_bf16 = usable_precision(self.config.precision, device) == "bf16"
         precision = "bf16" if is_bf16 else "fp32"  # what is computed in is what is recorded
-        config = replace(self.config, precision=precision, device=own_device(device))
+        config = replace(self.config, precision=precision, device=device)
         path = find_weights(self.weights)
         kind = read_checkpoint(path).kind
         is_matcher = kind in MATCHERS
@@ -112,7 +112,7 @@ class MethodSource:
         facts["weights_sha256"] = file_sha256(path)
         if not is_matcher:
             facts["input"] = "both views" if with_right else "left view"
-        own, matcher, answer = config_to_dict(config), None, self.answer
+        own, matcher, answer = asdict(config), None, self.answer
         if self.matcher is None:
             name = path.stem + ("-both" if with_right and not is_matcher else "")
             name += "" if answer is None else f"-{answer}"
@@ -120,7 +120,7 @@ class MethodSource:
             other, answer = self.matcher, "matched"
             if self.matcher == "sgbm":
                 sgbm = SGBMConfig(with_filled_holes=True)
-                matcher, own = SGBMMatcher(sgbm), {**own, **config_to_dict(sgbm)}
+                matcher, own = SGBMMatcher(sgbm), {**own, **asdict(sgbm)}
             else:
                 matcher = find_weights(self.matcher)
                 other, facts["matcher_sha256"] = matcher.stem, file_sha256(matcher)
@@ -162,7 +162,7 @@ def sgbm_method(*, with_filled_holes: bool) -> Method:
     config = SGBMConfig(with_filled_holes=with_filled_holes)
     net = FakestereoNet.load(matcher="sgbm", config=config)
     name = "sgbm-filled" if with_filled_holes else "sgbm"
-    return Method(name, net, {"matcher": "sgbm", **config_to_dict(config)})
+    return Method(name, net, {"matcher": "sgbm", **asdict(config)})
 
 
 def read_lens(options: LensOptions, sources: Sequence[Path]) -> Camera | FieldOfView | float:
@@ -276,7 +276,7 @@ def _is_video(path: str | Path) -> bool:
     return Path(path).suffix.lower() in VIDEO_SUFFIXES
 
 
-def list_pairs(left: str, right: str, out: Path) -> list[tuple[Path, Path]]:
+def list_pairs(left: str, right: str) -> list[tuple[Path, Path]]:
     """List the images of both sides, paired by their names or the numbers in them."""
     lefts, rights = list_images(left), list_images(right)
     stems, others = ([path.stem for path in side] for side in (lefts, rights))
@@ -285,7 +285,6 @@ def list_pairs(left: str, right: str, out: Path) -> list[tuple[Path, Path]]:
         raise InputError(f"{left}: two images are called {twice!r}, so would their results.")
     if (lefts, rights) != ([Path(left)], [Path(right)]):
         rights = [rights[k] for k in find_partners(stems, others, f"{left} and {right}")]
-    refuse_among_inputs(out, (left, right), lefts + rights)
     return list(zip(lefts, rights, strict=True))
 
 
