@@ -10,7 +10,7 @@ import numpy as np
 import torch
 
 from depthpose.core.camera import Camera, StereoRig, back_project, write_camera
-from depthpose.core.draw import depth_scale, draw_depth
+from depthpose.core.draw import draw_depth
 from depthpose.core.files import Cloud, write_cloud, write_depth_png, write_image
 from depthpose.core.run import claim_folder, environment
 from depthpose.depth.config import SGBMConfig, StreetsConfig
@@ -37,7 +37,7 @@ from depthpose.pose.predictions import CLOUD, Prediction, place_of, write_predic
 from depthpose.pose.synthetic import make_frames
 from depthpose.report import page as pages
 from depthpose.report.depth import depth_section
-from depthpose.report.page import Layer, Picture, Scene, Section
+from depthpose.report.page import Layer, Picture, Scene, Section, depth_scale
 from depthpose.report.pose import draw_pose, grey_depth, pose_layers, posed_cloud
 
 _STREETS_SEED = 9  # no weights were trained on streets of this seed

@@ -4,7 +4,6 @@ import pytest
 import torch
 
 from depthpose.core.draw import (
-    depth_scale,
     draw_depth,
     draw_disparity,
     draw_error_points,
@@ -12,9 +11,8 @@ from depthpose.core.draw import (
     draw_outline,
     draw_points,
     draw_share,
-    rising_scale,
-    shrink_to_pixels,
 )
+from depthpose.report.page import depth_scale, rising_scale, shrink_to_pixels
 
 
 def test_near_is_brighter_than_far_all_along() -> None:

@@ -8,7 +8,6 @@ from pathlib import Path
 import torch
 from PIL import Image
 
-from depthpose.core.draw import rising_scale
 from depthpose.core.files import Cloud, write_image
 from depthpose.report.page import (
     Drawing,
@@ -19,6 +18,7 @@ from depthpose.report.page import (
     csv_table,
     markdown_table,
     plain_table,
+    rising_scale,
     write_markdown,
     write_page,
     write_table,

@@ -5,13 +5,15 @@ from contextlib import contextmanager
 
 import pytest
 
-from depthpose.depth import encoder
+from depthpose.depth import synthesis
 
 
 @contextmanager
 def short_encoder() -> Iterator[None]:
     """Build encoders of the same strides, kernels and channels, of one block a stage."""
     with pytest.MonkeyPatch.context() as patch:
-        stages = tuple((1, kernel, step, 1, width) for _, kernel, step, _, width in encoder._STAGES)
-        patch.setattr(encoder, "_STAGES", stages)
+        stages = tuple(
+            (1, kernel, step, 1, width) for _, kernel, step, _, width in synthesis._STAGES
+        )
+        patch.setattr(synthesis, "_STAGES", stages)
         yield

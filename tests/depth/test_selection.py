@@ -13,12 +13,14 @@ from torch import Tensor
 
 from depthpose.core.errors import InputError
 from depthpose.depth.config import SelectionConfig
-from depthpose.depth.encoder import LiteEncoder, import_encoder, read_encoder
 from depthpose.depth.synthesis import (
+    LiteEncoder,
     SelectionGenerator,
     draw_right,
+    import_encoder,
     make_synthesiser,
     mix_shifts,
+    read_encoder,
     read_logits,
     shift_left,
 )

@@ -22,7 +22,6 @@ from depthpose.depth.config import (
     PSMNetConfig,
     StreetsConfig,
 )
-from depthpose.depth.encoder import LiteEncoder, load_encoder
 from depthpose.depth.stereo import LightMatcher, LightStereo, PSMNet, normalise
 from depthpose.depth.stereo.light import (
     STEM,
@@ -33,6 +32,7 @@ from depthpose.depth.stereo.light import (
     light_bytes,
 )
 from depthpose.depth.stereo.matcher import CameraMatcher, pad_top_right
+from depthpose.depth.synthesis import LiteEncoder, load_encoder
 from depthpose.depth.train import StereoTask
 from depthpose.depth.train.config import StereoTraining
 from depthpose.depth.train.runs import make_matcher_network, train_stereo

@@ -20,9 +20,8 @@ from depthpose.depth.config import (
     StreetsConfig,
 )
 from depthpose.depth.disparity import warp_right_to_left
-from depthpose.depth.encoder import LiteEncoder
 from depthpose.depth.stereo import PSMNet
-from depthpose.depth.synthesis import SelectionGenerator
+from depthpose.depth.synthesis import LiteEncoder, SelectionGenerator
 from depthpose.depth.train import (
     FinetuneTask,
     SelectTask,

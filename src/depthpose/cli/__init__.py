@@ -189,10 +189,10 @@ def lasting_streams() -> Iterator[Output]:
     with ExitStack() as opened:
         names = zip(before, "rww", strict=True)
         real = [s or opened.enter_context(open(os.devnull, mode)) for s, mode in names]  # noqa: PTH123
-        for stream in real[1:]:
+        output, errors = (Output(real[k], is_lost=before[k] is None) for k in (1, 2))
+        for stream in (output, errors):
             if (reconfigure := getattr(stream, "reconfigure", None)) is not None:
                 reconfigure(errors="backslashreplace")  # names of files need not be UTF-8
-        output, errors = (Output(real[k], is_lost=before[k] is None) for k in (1, 2))
         sys.stdin, sys.stdout, sys.stderr = real[0], output, errors
         try:
             yield output

@@ -117,9 +117,8 @@ def match(
     if right is None:
         raise InputError(f"{left}: there is no right image beside it; give it second")
     files = work.list_pairs(left, right)
-    this = work_of(files[0])
     refuse_among_inputs(Path(out), (left, right), [path for pair in files for path in pair])
-    built = method.build()
+    this, built = work_of(files[0]), method.build()
     return work.estimate_all(files, this, built, Path(out))
 
 

@@ -21,8 +21,7 @@ from depthpose.core import run
 from depthpose.core.camera import Camera, FieldOfView, StereoRig, camera_of, read_camera, read_rig
 from depthpose.core.camera.pinhole import camera_keys
 from depthpose.core.checkpoint import file_sha256, find_weights, read_checkpoint
-from depthpose.core.config import config_to_dict
-from depthpose.core.devices import own_device, usable_precision
+from depthpose.core.devices import own_device, usable_device, usable_precision
 from depthpose.core.draw import draw_depth
 from depthpose.core.engine import Files, Function, Inputs, Sample, Work
 from depthpose.core.errors import InputError
@@ -42,10 +41,11 @@ from depthpose.depth.config import Answer, MatcherConfig, SGBMConfig
 from depthpose.depth.estimator import FakestereoNet
 from depthpose.depth.ground import scale_by_distance
 from depthpose.depth.predictions import (
+    CLOUD,
     CLOUD_M,
     ENDINGS,
+    LAST,
     Estimator,
-    is_finished,
     read_estimate,
     write_estimate,
 )
@@ -94,10 +94,11 @@ class MethodSource:
         if isinstance(self.weights, Weights):
             with self.weights.unpacked() as file:
                 return replace(self, weights=file).build()
-        device = self.config.device
+        device = own_device(self.config.device)
+        usable_device(device)  # refused before anything is read
         is_bf16 = usable_precision(self.config.precision, device) == "bf16"
         precision = "bf16" if is_bf16 else "fp32"  # what is computed in is what is recorded
-        config = replace(self.config, precision=precision, device=own_device(device))
+        config = replace(self.config, precision=precision, device=device)
         path = find_weights(self.weights)
         kind = read_checkpoint(path).kind
         is_matcher = kind in MATCHERS
@@ -111,7 +112,7 @@ class MethodSource:
         facts["weights_sha256"] = file_sha256(path)
         if not is_matcher:
             facts["input"] = "both views" if with_right else "left view"
-        own, matcher, answer = config_to_dict(config), None, self.answer
+        own, matcher, answer = asdict(config), None, self.answer
         if self.matcher is None:
             name = path.stem + ("-both" if with_right and not is_matcher else "")
             name += "" if answer is None else f"-{answer}"
@@ -119,7 +120,7 @@ class MethodSource:
             other, answer = self.matcher, "matched"
             if self.matcher == "sgbm":
                 sgbm = SGBMConfig(with_filled_holes=True)
-                matcher, own = SGBMMatcher(sgbm), {**own, **config_to_dict(sgbm)}
+                matcher, own = SGBMMatcher(sgbm), {**own, **asdict(sgbm)}
             else:
                 matcher = find_weights(self.matcher)
                 other, facts["matcher_sha256"] = matcher.stem, file_sha256(matcher)
@@ -161,7 +162,7 @@ def sgbm_method(*, with_filled_holes: bool) -> Method:
     config = SGBMConfig(with_filled_holes=with_filled_holes)
     net = FakestereoNet.load(matcher="sgbm", config=config)
     name = "sgbm-filled" if with_filled_holes else "sgbm"
-    return Method(name, net, {"matcher": "sgbm", **config_to_dict(config)})
+    return Method(name, net, {"matcher": "sgbm", **asdict(config)})
 
 
 def read_lens(options: LensOptions, sources: Sequence[Path]) -> Camera | FieldOfView | float:
@@ -370,8 +371,8 @@ def estimate_all(
     sources: Sequence[tuple[Path, ...]], work: DepthWork, method: Method, out: Path
 ) -> int:
     """Estimate what is not finished; an input that fails is named and stops no other."""
-    run.claim_folder(out, work.settings(method.settings), [_PAGE])
     videos = [files[0].stem for files in sources if _is_video(files[0])]
+    run.claim_folder(out, work.settings(method.settings), [_PAGE])
     endings = [f".{end}" for end in ENDINGS] + [_VIDEO]
     run.claim_names(out, {files[0].stem: files for files in sources}, endings, videos)
     process = run.find_rank()
@@ -389,12 +390,12 @@ def estimate_all(
     count = f"{done} of {len(mine)} pairs" if work.files == PAIRS else f"{done} depth maps"
     print(f"{count} are in {out}")
     if process.rank == 0:
-        ending = ".disparity_px.npy"
+        ending = f".{LAST}"
         frames = sorted(path.name.removesuffix(ending) for path in out.glob(f"*_??????{ending}"))
         finished: dict[tuple[Path, ...], list[str]] = {}
         for files in sources:
             stem = files[0].stem
-            finished[files] = [stem] if is_finished(out, stem) else []
+            finished[files] = [stem] if run.is_whole(out, stem, [stem + ending]) else []
             if _is_video(files[0]):
                 finished[files] = [name for name in frames if _frame_of(files[0], name)]
         names = [name for some in finished.values() for name in some]
@@ -468,17 +469,20 @@ class Predictor:
         names: list[str] = []
         output, scale, net = self.work.output, self.work.scale, self.method.net
         assert isinstance(net, FakestereoNet), "weights build no other"
+        endings = (LAST, CLOUD) if output.cloud else (LAST,)
         with tqdm(total=total, desc=what, disable=None, unit=f" {what}") as bar:
             while chunk := list(islice(named, output.batch)):
                 inputs: list[StereoInput] = []
                 for name, read in chunk:
                     try:
-                        if not is_finished(self.out, name, with_cloud=output.cloud):
+                        if not run.is_whole(self.out, name, [f"{name}.{end}" for end in endings]):
                             inputs.append(read())
                     except InputError as error:
                         self.failures[name] = error
                 check = self.work.with_check
-                estimates = net.estimate_many(inputs, with_check=check, batch=output.batch)
+                estimates = net.estimate_together(
+                    [(one.name, one) for one in inputs], with_check=check
+                )
                 for one, estimate in zip(inputs, estimates, strict=True):
                     try:
                         if isinstance(estimate, InputError):

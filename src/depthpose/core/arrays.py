@@ -11,16 +11,9 @@ from torch import Tensor
 Image = Float[Tensor, "3 h w"]
 """RGB in [0, 1], float32: red first. OpenCV's images are BGR, blue first."""
 
-_LUMA = (0.299, 0.587, 0.114)  # shares of red, green and blue in the brightness, ITU-R BT.601
-
 
 def take_evenly(rows: Shaped[Tensor, "n ..."], count: int) -> Shaped[Tensor, "m ..."]:
     """Take ``count`` rows at even steps, the first among them; all where there are no more."""
     if len(rows) <= count:
         return rows
     return rows[torch.arange(count, device=rows.device) * len(rows) // count]
-
-
-def grey_of(image: Float[Tensor, "3 h w"]) -> Float[Tensor, "h w"]:
-    """Give the brightness of an RGB image (luma of ITU-R BT.601)."""
-    return (image * image.new_tensor(_LUMA)[:, None, None]).sum(0)

@@ -6,6 +6,7 @@ huggingface_hub's own file system writes it. Nothing else is fetched. Files lie 
 cache, and its settings hold: HF_HOME, HF_ENDPOINT, HF_HUB_OFFLINE, the token of ``hf auth login``.
 """
 
+import hashlib
 import json
 import pickle
 import re
@@ -24,7 +25,6 @@ from torch import Tensor, nn
 from torch.overrides import TorchFunctionMode
 
 from depthpose.core.errors import InputError, Notice, import_extra, nearest_name
-from depthpose.core.files.disk import file_sha256 as file_sha256
 from depthpose.core.files.disk import refuse_number, refused_as, write_bytes
 
 NetworkT = TypeVar("NetworkT", bound=nn.Module)
@@ -207,6 +207,12 @@ def read_checkpoint(path: Path, kind: str | None = None) -> Checkpoint:
     if not isinstance(config, dict):
         raise InputError(f"{path}: its 'config' is not a mapping.")
     return Checkpoint(kind=held, config=config, state=_finite(path, state), facts=metadata)
+
+
+def file_sha256(path: Path) -> str:
+    """Compute a file's sha256, recorded beside every number that was made with it."""
+    with Path(path).open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
 
 
 def load_weights(network: nn.Module, checkpoint: Checkpoint, source: str) -> None:

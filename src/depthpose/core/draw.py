@@ -1,8 +1,6 @@
 """Maps as pictures. A picture is for eyes only: values are read from the NPY beside it."""
 
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass
 
 import torch
 from jaxtyping import Bool, Float
@@ -11,47 +9,13 @@ from torch.nn import functional as F
 
 # From near to far: a warm, bright end and a dark, cold one, of falling lightness, so that the order
 # survives a grey-scale print and colour blindness.
-_NEAR_TO_FAR = (
+NEAR_TO_FAR = (
     (1.00, 0.97, 0.70), (0.99, 0.76, 0.35), (0.94, 0.49, 0.28), (0.80, 0.26, 0.38),
     (0.57, 0.16, 0.47), (0.33, 0.12, 0.45), (0.14, 0.08, 0.30), (0.02, 0.02, 0.10),
 )  # fmt: skip
 _INVALID = (0.5, 0.5, 0.5)
 _LARGEST_PX = 96.0  # disparity of the brightest colour
 _DIMMED = 0.35  # brightness of a picture under points
-_LEAST_GAP = 0.08  # of two marks on a bar, as a share of its length: nearer ones would touch
-
-
-@dataclass(frozen=True, kw_only=True)
-class Scale:
-    """What the colours of a picture mean, for a colour bar."""
-
-    title: str  #: of what, with its unit
-    colors: Sequence[tuple[float, float, float]]  #: RGB in [0, 1] at even steps from left to right
-    marks: Sequence[tuple[float, str]]  #: places, 0 (left) to 1, and what is written there
-
-
-def depth_scale(near_m: float = 3.0, far_m: float = 80.0) -> Scale:
-    """Give the bar of :func:`draw_depth`, with round metres between its ends."""
-    whole = math.log(far_m / near_m)
-    ends = [(0.0, f"{near_m:g}"), (1.0, f"{far_m:g}")]
-    exponents = range(math.floor(math.log10(near_m)), math.ceil(math.log10(far_m)) + 1)
-    for round_m in (digit * 10.0**k for k in exponents for digit in (1, 2, 5)):
-        place = math.log(round_m / near_m) / whole
-        if all(abs(place - other) >= _LEAST_GAP for other, _ in ends) and 0 < place < 1:
-            ends.append((place, f"{round_m:g}"))
-    return Scale(title="depth [m]", colors=_NEAR_TO_FAR, marks=sorted(ends))
-
-
-def rising_scale(title: str, top: float, *, has_more: bool = False) -> Scale:
-    """Give the bar of what is dark at 0 and bright at ``top``.
-
-    Args:
-        title: of what, with its unit.
-        top: the brightest.
-        has_more: whether what is beyond it is as bright.
-    """
-    marks = [(0.0, "0"), (0.5, f"{top / 2:g}"), (1.0, f"{top:g}{'+' if has_more else ''}")]
-    return Scale(title=title, colors=_NEAR_TO_FAR[::-1], marks=marks)
 
 
 def draw_depth(
@@ -74,7 +38,7 @@ def draw_disparity(
 
 def draw_share(share: Float[Tensor, "h w"]) -> Float[Tensor, "3 h w"]:
     """Colour numbers in 0 (bright) to 1 (dark); NaN becomes grey."""
-    anchors = torch.tensor(_NEAR_TO_FAR, dtype=torch.float32)
+    anchors = torch.tensor(NEAR_TO_FAR, dtype=torch.float32)
     position = share.nan_to_num(0.0).clamp(0, 1) * (len(anchors) - 1)
     below = position.long().clamp(max=len(anchors) - 2)
     color = torch.lerp(anchors[below], anchors[below + 1], (position - below)[..., None].float())
@@ -108,16 +72,6 @@ def draw_error_points(
     """
     grown = _grow(error, radius_px)
     return torch.where(torch.isnan(grown), _DIMMED * image, draw_share(1 - grown / top))
-
-
-def shrink_to_pixels(image: Float[Tensor, "3 h w"], most: int) -> Float[Tensor, "3 _ _"]:
-    """Scale a picture down to about so many pixels at most, its proportions kept."""
-    height, width = image.shape[1:]
-    scale = math.sqrt(most / (height * width))
-    if scale >= 1:
-        return image
-    size = (max(1, int(height * scale)), max(1, int(width * scale)))
-    return F.interpolate(image[None], size, mode="area")[0]
 
 
 def _grow(values: Float[Tensor, "h w"], radius_px: int) -> Float[Tensor, "h w"]:

@@ -190,7 +190,7 @@ class PSMNetConfig(NetworkConfig):
     @property
     def min_side_px(self) -> int:  # pyright: ignore[reportIncompatibleVariableOverride]
         """Smallest image side that the network takes [px]: its largest pool sees one window."""
-        return max(16, -(-4 * max(self.pools) // 16) * 16)
+        return max(16, -(-4 * max(self.pools, default=0) // 16) * 16)
 
 
 @dataclass(frozen=True, kw_only=True)

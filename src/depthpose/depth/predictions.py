@@ -41,9 +41,11 @@ EXPECTED = (
 
 _NEARLY_ALL = 0.9
 CLOUD = "cloud.ply"
+LAST = "disparity_px.npy"
+"""Of the file that every estimate has, and that is written last."""
 ENDINGS = (
     "depth_m.npy", "depth.png", "confidence.npy", "right.png", "sky.png", "color.png",
-    "disparity_px.npy", "warning.txt", "ground.json", CLOUD,
+    LAST, "warning.txt", "ground.json", CLOUD,
 )  # fmt: skip
 """What follows ``NAME.`` in the names of the files of an estimate."""
 
@@ -92,7 +94,7 @@ def write_estimate(
             None if is_sky is None else is_sky.float().expand(3, -1, -1),
         ),
         "color.png": (files.write_image, color),
-        "disparity_px.npy": (files.write_map, estimate.disparity_px),
+        LAST: (files.write_map, estimate.disparity_px),
     }
     written: list[Path] = []
     for ending, (write, content) in parts.items():
@@ -102,10 +104,9 @@ def write_estimate(
     return written
 
 
-def is_finished(folder: Path, name: str, *, with_cloud: bool = False) -> bool:
-    """Whether an earlier run left the estimate of this frame whole, and its cloud if wanted."""
-    endings = ("disparity_px.npy", CLOUD) if with_cloud else ("disparity_px.npy",)
-    return is_whole(folder, name, [f"{name}.{ending}" for ending in endings])
+def is_finished(folder: Path, name: str) -> bool:
+    """Whether an earlier run left the estimate of this frame whole."""
+    return is_whole(folder, name, [f"{name}.{LAST}"])
 
 
 def has_prediction(folder: Path, name: str, *, of_disparity: bool = False) -> bool:
@@ -184,7 +185,7 @@ def read_estimate(folder: Path, name: str, camera: Camera | None) -> DepthEstima
     Raises:
         InputError: there is no prediction of that name, or a file of it is damaged.
     """
-    disparity_px = read_part(folder, name, "disparity_px.npy")
+    disparity_px = read_part(folder, name, LAST)
     if disparity_px is None:
         raise InputError(f"{folder}: no prediction for frame {name!r}; predict it again")
     warning, ground = (_first(folder / name, (end,)) for end in ("warning.txt", "ground.json"))

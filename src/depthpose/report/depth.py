@@ -7,17 +7,23 @@ import numpy as np
 from depthpose.core.arrays import take_evenly
 from depthpose.core.camera import Camera, StereoRig, back_project
 from depthpose.core.draw import (
-    depth_scale,
     draw_depth,
     draw_disparity,
     draw_error_points,
     draw_points,
     draw_share,
-    rising_scale,
 )
 from depthpose.depth.predictions import COLOR_RANGE_M
 from depthpose.depth.types import DepthError, DepthEstimate, StereoInput
-from depthpose.report.page import Drawing, Layer, Scene, Section, colored_points
+from depthpose.report.page import (
+    Drawing,
+    Layer,
+    Scene,
+    Section,
+    colored_points,
+    depth_scale,
+    rising_scale,
+)
 
 WORST_PX = 4.0
 """Error of disparity [px] that gets the brightest colour."""

@@ -6,6 +6,7 @@
 import base64
 import csv
 import io
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from importlib.resources import files
@@ -18,8 +19,9 @@ import torch
 from jaxtyping import Float
 from jinja2 import Environment, PackageLoader, StrictUndefined
 from torch import Tensor
+from torch.nn import functional as F
 
-from depthpose.core.draw import Scale, shrink_to_pixels
+from depthpose.core.draw import NEAR_TO_FAR
 from depthpose.core.files import Cloud, encode_image, image_size, read_image, write_json
 from depthpose.core.files.disk import write_bytes
 
@@ -168,12 +170,46 @@ def share_views(sets: int) -> list[int]:
 
 Row = Mapping[str, Any]
 
+_LEAST_GAP = 0.08  # of two marks on a bar, as a share of its length: nearer ones would touch
 _MOST_PIXELS = 480_000
 """Most pixels of a drawing on a page of many; a frame of KITTI keeps its size."""
 _QUALITY = 85
 _ERRORS = "backslashreplace"  # of names of files whose bytes are no UTF-8
 _MOST_BYTES = 250_000  # largest picture file that goes onto a page as it is
 _MOST_FILM_BYTES = 8_000_000  # largest video file on a page; a larger one is shown from beside it
+
+
+@dataclass(frozen=True, kw_only=True)
+class Scale:
+    """What the colours of a picture mean, for a colour bar."""
+
+    title: str  #: of what, with its unit
+    colors: Sequence[tuple[float, float, float]]  #: RGB in [0, 1] at even steps from left to right
+    marks: Sequence[tuple[float, str]]  #: places, 0 (left) to 1, and what is written there
+
+
+def depth_scale(near_m: float = 3.0, far_m: float = 80.0) -> Scale:
+    """Give the bar of ``core.draw.draw_depth``, with round metres between its ends."""
+    whole = math.log(far_m / near_m)
+    ends = [(0.0, f"{near_m:g}"), (1.0, f"{far_m:g}")]
+    exponents = range(math.floor(math.log10(near_m)), math.ceil(math.log10(far_m)) + 1)
+    for round_m in (digit * 10.0**k for k in exponents for digit in (1, 2, 5)):
+        place = math.log(round_m / near_m) / whole
+        if all(abs(place - other) >= _LEAST_GAP for other, _ in ends) and 0 < place < 1:
+            ends.append((place, f"{round_m:g}"))
+    return Scale(title="depth [m]", colors=NEAR_TO_FAR, marks=sorted(ends))
+
+
+def rising_scale(title: str, top: float, *, has_more: bool = False) -> Scale:
+    """Give the bar of what is dark at 0 and bright at ``top``.
+
+    Args:
+        title: of what, with its unit.
+        top: the brightest.
+        has_more: whether what is beyond it is as bright.
+    """
+    marks = [(0.0, "0"), (0.5, f"{top / 2:g}"), (1.0, f"{top:g}{'+' if has_more else ''}")]
+    return Scale(title=title, colors=NEAR_TO_FAR[::-1], marks=marks)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -219,6 +255,16 @@ class Drawing:
         """The picture as a ``data:`` address."""
         encoded = encode_image(shrink_to_pixels(self.image, _MOST_PIXELS), "drawing.jpg", _QUALITY)
         return "data:image/jpeg;base64," + base64.b64encode(encoded).decode()
+
+
+def shrink_to_pixels(image: Float[Tensor, "3 h w"], most: int) -> Float[Tensor, "3 _ _"]:
+    """Scale a picture down to about so many pixels at most, its proportions kept."""
+    height, width = image.shape[1:]
+    scale = math.sqrt(most / (height * width))
+    if scale >= 1:
+        return image
+    size = (max(1, int(height * scale)), max(1, int(width * scale)))
+    return F.interpolate(image[None], size, mode="area")[0]
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -9,12 +9,12 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.nn import functional as F
 
-from depthpose.core.draw import depth_scale, draw_depth, draw_points
+from depthpose.core.draw import draw_depth, draw_points
 from depthpose.core.errors import InputError
 from depthpose.depth.evaluate import EvaluationRow
 from depthpose.depth.metrics import METRICS
 from depthpose.depth.types import DepthEstimate, StereoInput
-from depthpose.report.page import Drawing
+from depthpose.report.page import Drawing, depth_scale
 
 _METRICS = tuple(name for name, metric in METRICS.items() if metric.of == "depth")
 _FIRST = ("source", "method", "weights", "cap_m", *_METRICS, "protocol")

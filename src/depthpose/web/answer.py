@@ -9,13 +9,12 @@ from pathlib import Path
 from typing import Any
 
 from depthpose.core.camera import CAMERA_SUFFIXES, Camera, read_camera
-from depthpose.core.draw import Scale
 from depthpose.core.errors import InputError
 from depthpose.core.files import DEPTH_SUFFIXES, cloud_suffixes, image_size, write_json
 from depthpose.core.files.disk import write_bytes
 from depthpose.core.files.images import LISTED_SUFFIXES
 from depthpose.pose.mesh import mesh_suffixes
-from depthpose.report.page import Scene
+from depthpose.report.page import Scale, Scene
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

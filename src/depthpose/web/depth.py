@@ -7,7 +7,7 @@ from tempfile import TemporaryDirectory
 from typing import Any
 
 from depthpose.core.camera import StereoRig, camera_of, write_camera
-from depthpose.core.draw import depth_scale, draw_share, rising_scale
+from depthpose.core.draw import draw_share
 from depthpose.core.errors import InputError
 from depthpose.core.files import read_exif_focal, read_image, write_image
 from depthpose.depth.config import StreetsConfig
@@ -17,6 +17,7 @@ from depthpose.depth.stereo import CameraMatcher
 from depthpose.depth.synthetic import Streets
 from depthpose.depth.types import DepthEstimate, StereoInput
 from depthpose.report.depth import depth_facts, depth_scene, grey_caption
+from depthpose.report.page import depth_scale, rising_scale
 from depthpose.web.answer import (
     EXAMPLE_SEED,
     Answer,

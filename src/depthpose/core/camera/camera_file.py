@@ -6,7 +6,8 @@ What a caller has in place of a file, a matrix, a mapping or a focal length, is 
 
 import math
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -46,7 +47,7 @@ from depthpose.core.camera.stored_camera import (
 )
 from depthpose.core.errors import InputError, nearest_name
 from depthpose.core.files import AnyPath, read_json, read_key_values, read_text, write_json
-from depthpose.core.files.disk import MAX_LIST_BYTES, naming
+from depthpose.core.files.disk import MAX_LIST_BYTES
 
 Matrix = Float64[np.ndarray, "rows columns"]
 
@@ -327,6 +328,17 @@ def _matrix(value: object) -> Float[Tensor, "3 3"]:
         raise InputError(
             f"'K' is {shown}; write [[fx, skew, cx], [0, fy, cy], [0, 0, 1]]"
         ) from error
+
+
+@contextmanager
+def naming(path: AnyPath) -> Iterator[None]:
+    """Begin the message of an :class:`InputError` with the file that it is of."""
+    try:
+        yield
+    except InputError as error:
+        if str(error).startswith(f"{path}"):
+            raise
+        raise InputError(f"{path}: {error}") from error
 
 
 def read_camera(path: AnyPath, size: Size | None = None) -> Camera | StereoRig:

@@ -13,7 +13,6 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 from torch.nn import functional
 
-from depthpose.core.arrays import grey_of
 from depthpose.core.errors import InputError
 
 _COARSE_PIXELS, _FINE_PIXELS = 36_000, 180_000
@@ -39,6 +38,7 @@ _MAX_SHARE_SWAPPED = 0.2
 _SAME_PX, _SAME_SHARE = 0.5, 0.9
 _MAD_TO_DEVIATION = 1.4826  # of a normal distribution
 _SOME_CORNERS, _MIN_SOME = 100, 20
+_LUMA = (0.299, 0.587, 0.114)  # shares of red, green and blue in the brightness, ITU-R BT.601
 _CHANGES = [
     *((sign * turn, 1.0) for turn in (90.0, 20.0, 40.0, 65.0) for sign in (1, -1)),
     (0.0, 1.5), (0.0, 0.67),
@@ -334,6 +334,11 @@ def _fit_rows(where: Tensor, lower_px: Tensor) -> tuple[float, float, float]:
         is_near = rest <= 2.5 * rest.median() + 1e-3
     left = _MAD_TO_DEVIATION * float(rest.median())
     return math.degrees(math.atan(float(fit[1]))), 1 + float(fit[2]), left
+
+
+def grey_of(image: Float[Tensor, "3 h w"]) -> Float[Tensor, "h w"]:
+    """Give the brightness of an RGB image (luma of ITU-R BT.601)."""
+    return (image * image.new_tensor(_LUMA)[:, None, None]).sum(0)
 
 
 def _grey(image: Float[Tensor, "3 h w"], pixels: int) -> Float[Tensor, "h2 w2"]:

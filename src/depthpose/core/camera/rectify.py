@@ -11,6 +11,7 @@ import torch
 from jaxtyping import Float32, Float64
 from torch import Tensor
 
+from depthpose.core.camera.camera_file import naming
 from depthpose.core.camera.pinhole import (
     WIDE_BASELINE_M,
     Size,
@@ -35,7 +36,7 @@ from depthpose.core.camera.stored_camera import (
 )
 from depthpose.core.errors import InputError, import_opencv
 from depthpose.core.files import AnyPath, read_json, read_text
-from depthpose.core.files.disk import MAX_LIST_BYTES, naming
+from depthpose.core.files.disk import MAX_LIST_BYTES
 from depthpose.core.rigid import Rigid
 
 _K = {

@@ -4,7 +4,6 @@ Reading is guarded, writing atomic. A path through a tar shard, ``000000.tar/a.l
 as through a folder.
 """
 
-import hashlib
 import json
 import math
 import os
@@ -62,17 +61,6 @@ def refused_as(path: AnyPath, kind: str, remedy: str) -> Iterator[None]:
         text = _ADDRESS.sub("", f"{type(error).__name__}: {error}")
         said = " ".join(text.split())[:200]
         raise InputError(f"{path}: not a readable {kind} ({said}); {remedy}") from error
-
-
-@contextmanager
-def naming(path: AnyPath) -> Iterator[None]:
-    """Begin the message of an :class:`InputError` with the file that it is of."""
-    try:
-        yield
-    except InputError as error:
-        if str(error).startswith(f"{path}"):
-            raise
-        raise InputError(f"{path}: {error}") from error
 
 
 @contextmanager
@@ -266,12 +254,6 @@ class YamlLoader(_PLAIN):
                 raise ValueError(f"line {line}: key {key.value!r} is given twice")
             seen.add((key.tag, key.value))
         return super().construct_mapping(node, deep)
-
-
-def file_sha256(path: Path) -> str:
-    """Compute a file's sha256, recorded beside every number that was made with it."""
-    with Path(path).open("rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()
 
 
 def read_text(path: AnyPath, most: int = MAX_TEXT_BYTES) -> str:

@@ -18,7 +18,7 @@ from torch import Tensor, nn
 from depthpose.core.checkpoint import misfits, read_torch_file
 from depthpose.core.errors import InputError, Notice, import_extra
 from depthpose.core.files import atomic_write, read_text, remove_parts, write_image
-from depthpose.core.files.disk import naming, refuse_heavy, refused_as, refused_write
+from depthpose.core.files.disk import refuse_heavy, refused_as, refused_write
 from depthpose.core.loop.task import ValidationResult
 from depthpose.core.run import environment
 
@@ -252,11 +252,12 @@ def restore_last(folder: Path, parts: Parts) -> tuple[Path, int, float]:
         try:
             state = _read_state(path)
             remedy = "it is damaged, or of another training"
-            with naming(path), refused_as(path, "state of this training", remedy):
+            with refused_as(path, "state of this training", remedy):
                 parts.restore(state)
                 step, seconds = state["step"], float(state.get("seconds", 0.0))
         except InputError as error:
-            damages.append(str(error))
+            said = str(error)
+            damages.append(said if said.startswith(str(path)) else f"{path}: {said}")
             continue
         if path.name != STATE:
             reason = "; ".join(damages) or f"{folder}: there is no {STATE}"

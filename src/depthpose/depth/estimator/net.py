@@ -421,16 +421,30 @@ class FakestereoNet:
         found: list[DepthEstimate | InputError] = []
         total = len(several) if isinstance(several, Sized) else None
         with tqdm(total=total, unit=" images", disable=not with_progress) as bar:
-            work = partial(self._estimate_some, lens=lens, with_check=with_check)
+            work = partial(self.estimate_together, lens=lens, with_check=with_check)
             for some in each_in_threads(work, batches, threads):
                 found += some
                 bar.update(len(some))
         return found
 
-    def _estimate_some(
-        self, named: Sequence[tuple[str, object]], lens: AnyLens | None, *, with_check: bool
+    @own_arithmetic()
+    def estimate_together(
+        self,
+        named: Sequence[tuple[str, object]],
+        lens: AnyLens | None = None,
+        *,
+        with_check: bool = True,
     ) -> list[DepthEstimate | InputError]:
-        """Estimate images together; where one of them is unusable, each alone."""
+        """Estimate one batch; where an image of it is unusable, each alone.
+
+        Args:
+            named: names and inputs, or pictures.
+            lens: camera of the pictures, as for :meth:`estimate_many`.
+            with_check: of pairs, as for :meth:`estimate`.
+
+        Returns:
+            As :meth:`estimate_many`.
+        """
         found: list[DepthEstimate | InputError] = []
         try:
             inputs = [
@@ -449,7 +463,7 @@ class FakestereoNet:
         except InputError as error:
             if len(named) == 1:
                 return [error]
-            alone = (self._estimate_some([one], lens, with_check=with_check) for one in named)
+            alone = (self.estimate_together([one], lens, with_check=with_check) for one in named)
             return [one for (one,) in alone]
         return found
 

@@ -7,7 +7,7 @@ the same function, one pass less.
 from collections import OrderedDict
 from collections.abc import Callable, Sequence
 from functools import cache
-from typing import NamedTuple, TypeVar, cast
+from typing import Any, NamedTuple, TypeVar, cast
 
 import torch
 import torch.nn.functional as F
@@ -86,41 +86,33 @@ def interpolation_matrix(taps: Taps, small: int) -> Float[Tensor, "large small"]
     return matrix
 
 
-class ConvNorm(nn.Sequential):
-    """A convolution without bias, then batch normalisation."""
-
-    def __init__(self, conv: nn.Module, norm: nn.Module) -> None:
-        super().__init__(OrderedDict(conv=conv, norm=norm))
-
-
-def conv_norm_2d(
-    inputs: int, outputs: int, kernel: int = 3, stride: int = 1, dilation: int = 1
-) -> ConvNorm:
-    """Make a 2D convolution that keeps the size (but for its stride), with batch norm."""
-    padding = dilation * (kernel // 2)
-    conv = nn.Conv2d(inputs, outputs, kernel, stride, padding, dilation, bias=False)
-    return ConvNorm(conv, nn.BatchNorm2d(outputs))
-
-
 Features = Float[Tensor, "b _ _ _"]
 Volume = Float[Tensor, "b _ _ _ _"]
-
-
-def conv_norm_3d(inputs: int, outputs: int, stride: int = 1) -> ConvNorm:
-    """Make a 3x3x3 convolution with batch norm."""
-    conv = nn.Conv3d(inputs, outputs, 3, stride, 1, bias=False)
-    return ConvNorm(conv, nn.BatchNorm3d(outputs))
-
-
-def deconv_norm_3d(inputs: int, outputs: int) -> ConvNorm:
-    """Make a transposed 3x3x3 convolution that doubles the size, with batch norm."""
-    conv = nn.ConvTranspose3d(inputs, outputs, 3, 2, 1, output_padding=1, bias=False)
-    return ConvNorm(conv, nn.BatchNorm3d(outputs))
-
-
 Conv = nn.Conv2d | nn.Conv3d | nn.ConvTranspose3d
 Norm = nn.BatchNorm2d | nn.BatchNorm3d
 ModuleT = TypeVar("ModuleT", bound=nn.Module)
+
+
+class ConvNorm(nn.Sequential):
+    """A convolution without bias that keeps the size but for its stride, then batch norm.
+
+    A transposed one enlarges by its stride.
+    """
+
+    def __init__(
+        self,
+        kind: type[Conv],
+        inputs: int,
+        outputs: int,
+        kernel: int = 3,
+        stride: int = 1,
+        dilation: int = 1,
+    ) -> None:
+        more: dict[str, Any] = {"output_padding": stride - 1} if kind is nn.ConvTranspose3d else {}
+        padding = dilation * (kernel // 2)
+        conv = kind(inputs, outputs, kernel, stride, padding, dilation=dilation, bias=False, **more)
+        norm = nn.BatchNorm2d if kind is nn.Conv2d else nn.BatchNorm3d
+        super().__init__(OrderedDict(conv=conv, norm=norm(outputs)))
 
 
 def folded_weight(layer: nn.Module) -> tuple[Tensor, Tensor]:

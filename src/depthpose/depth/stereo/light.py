@@ -23,15 +23,15 @@ from torch import Tensor, nn
 from depthpose.core.errors import InputError
 from depthpose.depth.config import LightConfig
 from depthpose.depth.disparity import LEAST_PX
-from depthpose.depth.encoder import LiteEncoder
 from depthpose.depth.stereo import layers
-from depthpose.depth.stereo.layers import Features, Volume, by_rows, conv_norm_2d, conv_norm_3d
+from depthpose.depth.stereo.layers import ConvNorm, Features, Volume, by_rows
 from depthpose.depth.stereo.matcher import (
     IMAGENET_MEAN,
     IMAGENET_STD,
     NetworkMatcher,
     StereoNetwork,
 )
+from depthpose.depth.synthesis import LiteEncoder
 from depthpose.depth.types import Maps, Match, Views
 
 Quarter = Float[Tensor, "b h4 w4"]
@@ -60,9 +60,9 @@ class ConvexUpsampling(nn.Module):
 
     def __init__(self, width: int) -> None:
         super().__init__()
-        self.hidden = conv_norm_2d(STEM + width, 32)
+        self.hidden = ConvNorm(nn.Conv2d, STEM + width, 32)
         self.weights = nn.Conv2d(32, 4 * 9, 1)
-        self.compared = conv_norm_2d(STEM, STEM)
+        self.compared = ConvNorm(nn.Conv2d, STEM, STEM)
         self.agreement = nn.Conv2d(9, 32, 3, 1, 1, bias=False)
         nn.init.zeros_(self.agreement.weight)
 
@@ -114,11 +114,11 @@ class Refinement(nn.Module):
 
     def __init__(self) -> None:
         super().__init__()
-        self.compared = conv_norm_2d(STEM, STEM)
+        self.compared = ConvNorm(nn.Conv2d, STEM, STEM)
         seen = _GROUPS * len(_OFFSETS) + STEM + 4
         widths, dilations = (seen, _REFINED, _REFINED), (1, 2, 1)
         self.layers = nn.ModuleList(
-            conv_norm_2d(width, _REFINED, dilation=dilation)
+            ConvNorm(nn.Conv2d, width, _REFINED, dilation=dilation)
             for width, dilation in zip(widths, dilations, strict=True)
         )
         self.correction = nn.Conv2d(_REFINED, 4, 1)
@@ -201,10 +201,10 @@ class SkyHead(nn.Module):
         quarter, *coarser = widths
         deepest = len(coarser) - 1
         self.coarse = nn.ModuleList(
-            conv_norm_2d(w if k == deepest else w + _SKY_WIDTH, _SKY_WIDTH)
+            ConvNorm(nn.Conv2d, w if k == deepest else w + _SKY_WIDTH, _SKY_WIDTH)
             for k, w in enumerate(coarser)
         )
-        self.hidden = conv_norm_2d(quarter + _SKY_WIDTH + 2, _SKY_WIDTH)
+        self.hidden = ConvNorm(nn.Conv2d, quarter + _SKY_WIDTH + 2, _SKY_WIDTH)
         self.logit = nn.Conv2d(_SKY_WIDTH, 1, 1)
         for parameter, value in zip(self.logit.parameters(), (0.0, -2.0), strict=True):
             nn.init.constant_(parameter, value)
@@ -250,16 +250,19 @@ class LightFeatures(nn.Module):
     def __init__(self, config: LightConfig) -> None:
         super().__init__()
         w = config.width
-        self.stem = conv_norm_2d(3, STEM, stride=2)
-        self.quarter = nn.ModuleList([conv_norm_2d(STEM, w, stride=2), conv_norm_2d(w, w)])
+        self.stem = ConvNorm(nn.Conv2d, 3, STEM, stride=2)
+        self.quarter = nn.ModuleList(
+            [ConvNorm(nn.Conv2d, STEM, w, stride=2), ConvNorm(nn.Conv2d, w, w)]
+        )
         self.encoder = LiteEncoder(config.encoder_width, levels=4)
-        self.top = conv_norm_2d(self.encoder.channels[3], _DEEP, 1)
+        self.top = ConvNorm(nn.Conv2d, self.encoder.channels[3], _DEEP, 1)
         quarter, eighth, sixteenth, _ = self.encoder.channels
         skips = (sixteenth, eighth, quarter + w)
         self.widths = (w, _DEEP // 2, _DEEP // 2, _DEEP)
         outputs, above = self.widths[-2::-1], self.widths[:0:-1]
         self.decoder = nn.ModuleList(
-            conv_norm_2d(a + skip, out) for a, skip, out in zip(above, skips, outputs, strict=True)
+            ConvNorm(nn.Conv2d, a + skip, out)
+            for a, skip, out in zip(above, skips, outputs, strict=True)
         )
         mean, deviation = (torch.tensor(v)[:, None, None] for v in (IMAGENET_MEAN, IMAGENET_STD))
         self.register_buffer("mean", mean, persistent=False)
@@ -306,12 +309,12 @@ class Aggregation(nn.Module):
     def __init__(self, config: LightConfig, guide_widths: tuple[int, ...]) -> None:
         super().__init__()
         self.config, v = config, config.volume_widths
-        self.first = conv_norm_3d(config.groups, v[0])
+        self.first = ConvNorm(nn.Conv3d, config.groups, v[0])
         steps = list(pairwise(v))
-        self.down = nn.ModuleList(conv_norm_3d(a, b, stride=2) for a, b in steps)
-        self.same = nn.ModuleList(conv_norm_3d(b, b) for _, b in steps)
-        self.up = nn.ModuleList(layers.deconv_norm_3d(b, a) for a, b in steps)
-        self.joined = nn.ModuleList(conv_norm_3d(a, a) for a in v[:-1])
+        self.down = nn.ModuleList(ConvNorm(nn.Conv3d, a, b, stride=2) for a, b in steps)
+        self.same = nn.ModuleList(ConvNorm(nn.Conv3d, b, b) for _, b in steps)
+        self.up = nn.ModuleList(ConvNorm(nn.ConvTranspose3d, b, a, stride=2) for a, b in steps)
+        self.joined = nn.ModuleList(ConvNorm(nn.Conv3d, a, a) for a in v[:-1])
         self.guides = nn.ModuleList(
             nn.Conv2d(g, c, 1) for g, c in zip(guide_widths, v, strict=True)
         )

@@ -22,7 +22,7 @@ from depthpose.core.errors import InputError, import_opencv
 from depthpose.core.files.images import check_image
 from depthpose.depth import disparity
 from depthpose.depth.config import MatcherConfig, NetworkConfig, SGBMConfig
-from depthpose.depth.encoder import LiteEncoder
+from depthpose.depth.synthesis import LiteEncoder
 from depthpose.depth.types import Map, Maps, Match, Views
 
 

@@ -24,7 +24,7 @@ from depthpose.core.config import config_to_dict
 from depthpose.core.errors import InputError
 from depthpose.depth.config import PSMNetConfig
 from depthpose.depth.stereo import layers
-from depthpose.depth.stereo.layers import Features, Volume, conv_norm_2d, conv_norm_3d
+from depthpose.depth.stereo.layers import ConvNorm, Features, Volume
 from depthpose.depth.stereo.matcher import NetworkMatcher, StereoNetwork
 from depthpose.depth.types import Map, Maps, Match, Views
 
@@ -78,10 +78,10 @@ class Block(nn.Module):
 
     def __init__(self, inputs: int, outputs: int, stride: int, dilation: int) -> None:
         super().__init__()
-        self.first = conv_norm_2d(inputs, outputs, 3, stride, dilation)
-        self.second = conv_norm_2d(outputs, outputs, 3, 1, dilation)
+        self.first = ConvNorm(nn.Conv2d, inputs, outputs, 3, stride, dilation)
+        self.second = ConvNorm(nn.Conv2d, outputs, outputs, 3, 1, dilation)
         keeps_size = stride == 1 and inputs == outputs
-        self.shortcut = None if keeps_size else conv_norm_2d(inputs, outputs, 1, stride)
+        self.shortcut = None if keeps_size else ConvNorm(nn.Conv2d, inputs, outputs, 1, stride)
 
     def forward(self, x: Float[Tensor, "b c h w"]) -> Float[Tensor, "b k h2 w2"]:
         """Add what two convolutions see to the input."""
@@ -97,7 +97,11 @@ class FeatureExtractor(nn.Module):
         c = config.width
         self.align_corners = config.align_corners
         self.pools = config.pools
-        stem = conv_norm_2d(3, c, stride=2), conv_norm_2d(c, c), conv_norm_2d(c, c)
+        stem = (
+            ConvNorm(nn.Conv2d, 3, c, stride=2),
+            ConvNorm(nn.Conv2d, c, c),
+            ConvNorm(nn.Conv2d, c, c),
+        )
         self.stem = nn.ModuleList(stem)
         # The first block of each stage changes the channels and the size.
         kinds = ((c, c, 1, 1), (c, 2 * c, 2, 1), (2 * c, 4 * c, 1, 1), (4 * c, 4 * c, 1, 2))
@@ -105,8 +109,8 @@ class FeatureExtractor(nn.Module):
         for (inputs, outputs, stride, dilation), count in zip(kinds, config.blocks, strict=True):
             rest = (Block(outputs, outputs, 1, dilation) for _ in range(count - 1))
             self.stages.append(nn.Sequential(Block(inputs, outputs, stride, dilation), *rest))
-        self.pyramid = nn.ModuleList([conv_norm_2d(4 * c, c, 1) for _ in config.pools])
-        self.fuse = conv_norm_2d((6 + len(config.pools)) * c, 4 * c)
+        self.pyramid = nn.ModuleList([ConvNorm(nn.Conv2d, 4 * c, c, 1) for _ in config.pools])
+        self.fuse = ConvNorm(nn.Conv2d, (6 + len(config.pools)) * c, 4 * c)
         self.project = nn.Conv2d(4 * c, c, 1, bias=False)
 
     def forward(self, image: Views) -> Float[Tensor, "b c h4 w4"]:
@@ -129,12 +133,12 @@ class Hourglass(nn.Module):
 
     def __init__(self, c: int) -> None:
         super().__init__()
-        self.down1 = conv_norm_3d(c, 2 * c, stride=2)
-        self.same1 = conv_norm_3d(2 * c, 2 * c)
-        self.down2 = conv_norm_3d(2 * c, 2 * c, stride=2)
-        self.same2 = conv_norm_3d(2 * c, 2 * c)
-        self.up2 = layers.deconv_norm_3d(2 * c, 2 * c)
-        self.up1 = layers.deconv_norm_3d(2 * c, c)
+        self.down1 = ConvNorm(nn.Conv3d, c, 2 * c, stride=2)
+        self.same1 = ConvNorm(nn.Conv3d, 2 * c, 2 * c)
+        self.down2 = ConvNorm(nn.Conv3d, 2 * c, 2 * c, stride=2)
+        self.same2 = ConvNorm(nn.Conv3d, 2 * c, 2 * c)
+        self.up2 = ConvNorm(nn.ConvTranspose3d, 2 * c, 2 * c, stride=2)
+        self.up1 = ConvNorm(nn.ConvTranspose3d, 2 * c, c, stride=2)
 
     def forward(
         self, x: Volume, first: Volume | None, before: Volume | None
@@ -157,7 +161,7 @@ class Head(nn.Module):
 
     def __init__(self, c: int) -> None:
         super().__init__()
-        self.hidden = conv_norm_3d(c, c)
+        self.hidden = ConvNorm(nn.Conv3d, c, c)
         self.cost = nn.Conv3d(c, 1, 3, 1, 1, bias=False)
 
     def forward(self, x: Volume) -> Volume:
@@ -210,8 +214,8 @@ class PSMNet(StereoNetwork):
         self.config = config or PSMNetConfig()
         c = self.config.width
         self.features = FeatureExtractor(self.config)
-        self.dres0 = nn.ModuleList([conv_norm_3d(2 * c, c), conv_norm_3d(c, c)])
-        self.dres1 = nn.ModuleList([conv_norm_3d(c, c), conv_norm_3d(c, c)])
+        self.dres0 = nn.ModuleList([ConvNorm(nn.Conv3d, 2 * c, c), ConvNorm(nn.Conv3d, c, c)])
+        self.dres1 = nn.ModuleList([ConvNorm(nn.Conv3d, c, c), ConvNorm(nn.Conv3d, c, c)])
         self.hourglasses = nn.ModuleList([Hourglass(c) for _ in range(3)])
         self.heads = nn.ModuleList([Head(c) for _ in range(3)])
         self.apply(_initialise)

@@ -19,10 +19,10 @@ from depthpose.depth import losses, synthesis
 from depthpose.depth.augment import TrainingPair, degrade
 from depthpose.depth.config import DegradeConfig
 from depthpose.depth.disparity import right_disparity_from_left
-from depthpose.depth.encoder import LiteEncoder
 from depthpose.depth.metrics import measure
 from depthpose.depth.stereo import StereoNetwork, normalise
 from depthpose.depth.stereo.matcher import pad_top_right
+from depthpose.depth.synthesis import LiteEncoder
 from depthpose.depth.train.config import (
     FinetuneTraining,
     SelectTraining,
