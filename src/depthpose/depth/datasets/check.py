@@ -218,10 +218,8 @@ def _check_truth(
 
 
 def _agreement(disparity_px: Map, report: RectificationReport) -> tuple[float, int] | None:
-    """Share and number of matches that a map agrees with; None where it says too little.
-
-    Corners lie at edges, so a value within a window may be the one that a match saw.
-    """
+    """Share and number of matches that a map agrees with; None where it says too little."""
+    # Corners lie at edges, so a value within a window may be the one that a match saw.
     side = 2 * _TRUTH_RADIUS + 1
     padded = F.pad(disparity_px.float(), (_TRUTH_RADIUS,) * 4, value=float("nan"))
     windows = padded.unfold(0, side, 1).unfold(1, side, 1)
@@ -270,7 +268,6 @@ def find_duplicates(
     """List the pairs of left images, one of either set, that look alike, the most similar first.
 
     The most similar pair is listed in any case: its similarity says how far the sets are apart.
-
     The others have a similarity of ``at_least`` or more; ``progress`` wraps the sequence of frames.
     """
     similarity = similarity_matrix(first, second, progress)
