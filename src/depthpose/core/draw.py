@@ -43,7 +43,13 @@ def depth_scale(near_m: float = 3.0, far_m: float = 80.0) -> Scale:
 
 
 def rising_scale(title: str, top: float, *, has_more: bool = False) -> Scale:
-    """Give the bar of what is dark at 0 and bright at ``top``, and beyond it if there is more."""
+    """Give the bar of what is dark at 0 and bright at ``top``.
+
+    Args:
+        title: of what, with its unit.
+        top: the brightest.
+        has_more: whether what is beyond it is as bright.
+    """
     marks = [(0.0, "0"), (0.5, f"{top / 2:g}"), (1.0, f"{top:g}{'+' if has_more else ''}")]
     return Scale(title=title, colors=_NEAR_TO_FAR[::-1], marks=marks)
 
