@@ -238,9 +238,7 @@ def label_regions(
 ) -> Int64[Tensor, "h w"]:
     """Number the pixels that hang together: neighbours, at corners too, without a jump in depth.
 
-    Args:
-        depth_m: of each pixel.
-        is_left: the pixels that count; what is beside them has the number of a region of its own.
+    Those that ``is_left`` marks count; what is beside them has the number of a region of its own.
     """
     height, width = depth_m.shape
     index = torch.arange(height * width).reshape(height, width)
