@@ -127,7 +127,7 @@ def wait_for(
 ) -> None:
     """Wait until other processes have finished all of these.
 
-    Nothing new may appear for ``timeout_s``: a process that died finishes nothing.
+    ``timeout_s`` is how long nothing new may appear: a process that died finishes nothing.
 
     Raises:
         InputError: the time is up; what is missing is named.
