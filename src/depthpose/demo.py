@@ -20,13 +20,7 @@ from depthpose.depth.evaluate import clamped_depth
 from depthpose.depth.metrics import measure
 from depthpose.depth.predictions import CLOUD_M, write_estimate
 from depthpose.depth.synthetic import Streets
-from depthpose.depth.types import (
-    DepthError,
-    DepthEstimate,
-    StereoInput,
-    StereoSample,
-    StereoTruth,
-)
+from depthpose.depth.types import DepthError, StereoInput, StereoSample, StereoTruth
 from depthpose.pose.cloud import object_points
 from depthpose.pose.config import ObjectsConfig
 from depthpose.pose.datasets import open_bop, write_bop_models, write_bop_scene
@@ -59,11 +53,9 @@ _MOTORCYCLE_TEXT = (
 )
 
 
-def show_depth(
-    out: Path, weights: str | Path, scale: float
-) -> tuple[list[dict[str, Any]], list[Section]]:
+def show_depth(out: Path, weights: str | Path) -> tuple[list[dict[str, Any]], list[Section]]:
     """Estimate depth of both scenes; give a row for each method, and the parts of the page."""
-    street = Streets(StreetsConfig(seed=_STREETS_SEED, scale=scale))[_STREET]
+    street = Streets(StreetsConfig(seed=_STREETS_SEED))[_STREET]
     street = replace(street, input=replace(street.input, name="street"))
     scenes = [
         (read_motorcycle(), _MOTORCYCLE_TEXT, (1.5, 8.0)),
@@ -102,20 +94,26 @@ def _show_scene(
     """Write the pair as files that commands take; estimate by each method; rows and sections."""
     pair, truth, folder = sample.input, sample.truth, out / sample.input.name
     assert pair.right is not None
-    assert pair.camera is not None
+    assert isinstance(pair.camera, StereoRig)
     assert truth.depth_m is not None
     assert truth.disparity_px is not None
     write_image(folder / "left.png", pair.left)
     write_image(folder / "right.png", pair.right)
     write_camera(folder / "camera.json", pair.camera)
     write_image(folder / "depth.color.png", draw_depth(truth.depth_m, *range_m))
-    rows, sections = [], []
+    rows: list[dict[str, Any]] = []
+    sections: list[Section] = []
     homes = {method: out / method.lower().replace(",", "").replace(" ", "-") for method in nets}
     for method, (views, net) in nets.items():
         seen = pair if views == _FROM_PAIR else replace(pair, right=None)
         estimate = net.estimate_pair(seen, with_check=False)
-        measured = _measure(sample, estimate)
-        rows.append({"scene": pair.name, "method": method, "input": views, **measured})
+        predicted_m = clamped_depth(estimate.disparity_px, pair.camera, _CAP_M)
+        counts = truth.depth_m < _CAP_M
+        mask = counts & torch.isfinite(estimate.disparity_px)
+        row: dict[str, Any] = {"scene": pair.name, "method": method, "input": views}
+        row["coverage"] = float(mask.sum() / counts.sum())
+        row |= measure("disparity", estimate.disparity_px[mask], truth.disparity_px[mask])
+        rows.append(row | measure("depth", predicted_m[mask], truth.depth_m[mask]))
         write_estimate(homes[method], seen, estimate, range_m, CLOUD_M)
         error_px = (estimate.disparity_px - truth.disparity_px).abs()
         error = DepthError(error=error_px, is_disparity=True)
@@ -133,20 +131,6 @@ def _show_scene(
     ]
     opening = Section(title=f"The {pair.name}", text=text, rows=rows, pictures=pictures)
     return rows, [opening, *sections]
-
-
-def _measure(sample: StereoSample, estimate: DepthEstimate) -> dict[str, Any]:
-    """Every measure over the pixels that have truth within the cap and a prediction."""
-    rig, true_px, true_m = sample.input.camera, sample.truth.disparity_px, sample.truth.depth_m
-    assert isinstance(rig, StereoRig)
-    assert true_px is not None
-    assert true_m is not None
-    predicted_m = clamped_depth(estimate.disparity_px, rig, _CAP_M)
-    counts = true_m < _CAP_M
-    mask = counts & torch.isfinite(estimate.disparity_px)
-    row = {"coverage": float(mask.sum() / counts.sum())}
-    row |= measure("disparity", estimate.disparity_px[mask], true_px[mask])
-    return row | measure("depth", predicted_m[mask], true_m[mask])
 
 
 def read_motorcycle() -> StereoSample | None:
@@ -280,13 +264,11 @@ def make_demo(
     out: Path,
     weights: str | Path = "default",
     parts: str | Path = "parts",
-    scale: float = 1.0,
     on_message: Callable[[str], None] | None = None,
 ) -> DemoResult:
     """Pose synthetic parts on a table; estimate depth of a real pair and a synthetic street.
 
-    ``scale``: size of the street's images as a share of KITTI's; ``on_message`` is called with what
-    is done next.
+    ``on_message`` is called with what is done next.
     """
     claim_folder(
         out, {"command": "demo"}, [*_FOLDERS, *pages.table_files("depths", "poses"), _PAGE]
@@ -295,7 +277,7 @@ def make_demo(
     on_message("synthetic parts on a table are posed from a depth image ...")
     poses, of_pose = show_poses(out, parts)
     on_message("depth of a real pair and of a synthetic street ...")
-    depths, of_depth = show_depth(out, weights, scale)
+    depths, of_depth = show_depth(out, weights)
     pages.write_table(out, depths, name="depths")
     pages.write_table(out, poses, name="poses")
     page = out / _PAGE

@@ -93,7 +93,11 @@ def test_l1_alone_has_no_discriminator(pairs: PairsConfig) -> None:
 
 def any_matcher(kind: str) -> PSMNet | LightStereo:
     torch.manual_seed(0)
-    return PSMNet(MATCHER) if kind == "psmnet" else LightStereo(LIGHT)
+    if kind == "psmnet":
+        return PSMNet(MATCHER)
+    light = LightStereo(LIGHT)
+    torch.nn.init.normal_(light.refinement.correction.weight)  # no gradient passes while it is 0
+    return light
 
 
 @pytest.mark.parametrize("kind", ["psmnet", "light"])

@@ -112,14 +112,11 @@ def _read_words(path: Path, size: Size | None) -> FileFacts:
         if isinstance(one, dict) and {"counts", "segmentation"} & one.keys():
             return _of_mask(path, mask_from_rle(one, str(path)))
     try:
-        return _of_camera(path, cameras.read_camera(path, size))
+        camera = cameras.read_camera(path, size)
     except InputError as error:
         if path.suffix.lower() != ".txt" or "no camera that is known" not in str(error):
             raise
-    return _of_points(path, files.read_cloud(path).points.double())
-
-
-def _of_camera(path: Path, camera: cameras.Camera) -> FileFacts:
+        return _of_points(path, files.read_cloud(path).points.double())
     fx, fy = float(camera.K[0, 0]), float(camera.K[1, 1])
     wide = math.degrees(2 * math.atan(camera.width / (2 * fx)))
     what = f"camera of {camera.width}x{camera.height}, fx {fx:.1f} px, {wide:.0f} degrees wide"

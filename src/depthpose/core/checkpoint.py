@@ -314,9 +314,7 @@ def read_torch_file(path: Path) -> Mapping[str, Any]:
 def read_published(path: Path, network: str) -> Mapping[str, Tensor]:
     """Read the tensors of a foreign checkpoint: safetensors by its suffix, or else a PyTorch file.
 
-    Args:
-        path: of the checkpoint.
-        network: what it should hold, for errors.
+    Errors say that it should hold ``network``.
 
     Raises:
         InputError: missing, damaged, holding pickled code, no tensors by name, or numbers that are
@@ -341,12 +339,7 @@ def save_imported(
 ) -> None:
     """Write the weights of an imported network, with the checksum of the file that they are from.
 
-    Args:
-        out: the ``.safetensors`` file to write.
-        kind: of the checkpoint.
-        network: with the weights.
-        source: the published file.
-        facts: what the card says of them: ``trained_on``, ``licence``.
+    The card's ``facts`` say ``trained_on`` and ``licence``.
     """
     origin = {"origin": f"imported from a file with sha256 {file_sha256(source)}"}
     state = network.state_dict()

@@ -122,10 +122,8 @@ def barycentric_shares(
 ) -> Float[Tensor, "h w 3"]:
     """Give the shares of a triangle's corners at each pixel centre; 0 where nothing is seen.
 
-    Args:
-        edges: of all triangles; see :func:`edge_functions`.
-        volume: what they are divided by.
-        primitive: which triangle each pixel sees.
+    ``edges`` (:func:`edge_functions`) are those of all triangles, divided by ``volume``;
+    ``primitive`` is the triangle that each pixel sees.
     """
     height, width = primitive.shape
     shares = torch.zeros(height * width, 3, device=edges.device)

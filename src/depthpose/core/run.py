@@ -87,11 +87,7 @@ def held_folders() -> frozenset[Path]:
 
 
 def release_folders(but: Collection[Path] = ()) -> None:
-    """Let other commands into the folders that this process has claimed.
-
-    Args:
-        but: folders that it goes on holding.
-    """
+    """Let other commands into the folders that this process has claimed, but for these."""
     for folder in _locks.keys() - set(but):
         file = _locks.pop(folder)
         with suppress(OSError):
@@ -131,10 +127,7 @@ def wait_for(
 ) -> None:
     """Wait until other processes have finished all of these.
 
-    Args:
-        names: what is waited for.
-        is_there: whether one is finished.
-        timeout_s: how long nothing new may appear: a process that died finishes nothing.
+    ``timeout_s`` is how long nothing new may appear: a process that died finishes nothing.
 
     Raises:
         InputError: the time is up; what is missing is named.

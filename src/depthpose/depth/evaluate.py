@@ -238,10 +238,7 @@ def summarise(
 ) -> Evaluation:
     """Make the rows of a table of its frames, the same ones wherever they were measured.
 
-    Args:
-        dataset: whose order of frames counts.
-        protocol: by which they were measured.
-        found: of each frame's name what :func:`measure_frame` gave.
+    ``found`` has for each frame's name what :func:`measure_frame` gave.
 
     Raises:
         InputError: no frame has truth.
@@ -304,12 +301,7 @@ def frame_result(
 ) -> tuple[DepthEstimate, DepthError]:
     """Read one frame again as :func:`evaluate` measured it: at the image's size, and its error.
 
-    Args:
-        dataset: as it was measured.
-        index: of the frame.
-        predictions: the folder.
-        protocol: a key of ``PROTOCOLS``.
-        cap_m: of the row; None for a protocol of disparity.
+    ``cap_m`` is that of the row, None for a protocol of disparity.
 
     Raises:
         InputError: the frame does not count, or a file is damaged.

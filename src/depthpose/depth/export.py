@@ -184,7 +184,12 @@ class _Drawn(NamedTuple):
 def _drawn(left: Value, generator: Generator) -> _Drawn:
     """What ``draw_right`` or ``select_views`` and ``shift_left`` do."""
     size, multiple = _size_of(left), generator.config.side_multiple_px
-    near = _near_multiple(size, multiple)
+    # The multiple that a side is close to, or the side itself.
+    sides = size.cast(np.float64)
+    nearest = (sides / float(multiple)).op("Round").op("Max", 1.0) * float(multiple)
+    limits = sides * np.array([ROWS_SHARE, COLUMNS_SHARE])
+    is_near = (nearest - sides).op("Abs").op("LessOrEqual", limits)
+    near = is_near.op("Where", nearest, sides).cast(np.int64)
     example = torch.rand(2, 3, 2 * multiple, 3 * multiple)
     if not isinstance(generator, SelectionGenerator):
         image = _resized_image(left, near) * _2 - _1
@@ -217,15 +222,6 @@ def _drawn(left: Value, generator: Generator) -> _Drawn:
     grid = graph.op("Concat", *parts, axis=-1)
     right = left.op("GridSample", grid, mode="bilinear", padding_mode="border", align_corners=0)
     return _Drawn(right, own, street)
-
-
-def _near_multiple(size: Value, multiple: int) -> Value:
-    """The multiple that a side is close to, or the side itself."""
-    sides = size.cast(np.float64)
-    nearest = (sides / float(multiple)).op("Round").op("Max", 1.0) * float(multiple)
-    off = (nearest - sides).op("Abs")
-    is_near = off.op("LessOrEqual", sides * np.array([ROWS_SHARE, COLUMNS_SHARE]))
-    return is_near.op("Where", nearest, sides).cast(np.int64)
 
 
 def _mirrored(image: Value, size: Value, multiple: int) -> Value:

@@ -115,10 +115,7 @@ def plane_loss(
 
     Each image with truth counts the same, however sparse its truth is.
 
-    Args:
-        logits: class 0 is the sky.
-        truth_px: disparity; 0 in the sky, NaN where unknown.
-        planes: disparities, evenly spaced in their logarithm [px].
+    The truth is 0 in the sky and NaN where unknown; planes are evenly spaced in their logarithm.
     """
     is_sky = truth_px == 0
     logs = planes.log()

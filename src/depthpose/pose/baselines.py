@@ -92,11 +92,7 @@ def cut_depth(
 ) -> DepthCrop | None:
     """Cut the object out of a view; None where fewer pixels than ``min_points`` have a depth.
 
-    Args:
-        view: depth and mask.
-        config: size, margin, contrast.
-        diameter_m: pixels farther than this from the median depth belong to something else; None
-            keeps all.
+    Pixels farther than the diameter from the median depth belong to something else; None keeps all.
     """
     depth_m = torch.where(view.mask, view.depth_m, torch.nan)
     is_seen = depth_m.isfinite() & (depth_m > 0)

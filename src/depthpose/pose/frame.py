@@ -199,12 +199,7 @@ def _no_side_m(points_m: Float64[Tensor, "n 3"]) -> float:
 
 
 def largest_plane(points_m: Float64[Tensor, "n 3"], generator: torch.Generator) -> Plane | None:
-    """Give the plane that most points lie on; None for fewer than 60 points.
-
-    Args:
-        points_m: in the camera frame.
-        generator: of the hypotheses of RANSAC.
-    """
+    """Give the plane that most points lie on, by RANSAC; None for fewer than 60 points."""
     some = take_evenly(points_m, _SAMPLE)
     if len(some) < _LEAST_POINTS:
         return None
@@ -233,12 +228,7 @@ def _tolerance_m(points_m: Float64[Tensor, "*batch 3"]) -> Float64[Tensor, "*bat
 
 
 def is_on_plane(points_m: Float64[Tensor, "*batch 3"], plane: Plane) -> Bool[Tensor, "*batch"]:
-    """Whether points lie on a plane, as far as a depth sensor measures it.
-
-    Args:
-        points_m: in the camera frame.
-        plane: as :func:`largest_plane` gives it.
-    """
+    """Whether points of the camera frame lie on a plane, as far as a depth sensor measures it."""
     normal, offset = plane
     return (points_m @ normal - offset).abs() < _tolerance_m(points_m)
 
@@ -248,9 +238,7 @@ def label_regions(
 ) -> Int64[Tensor, "h w"]:
     """Number the pixels that hang together: neighbours, at corners too, without a jump in depth.
 
-    Args:
-        depth_m: of each pixel.
-        is_left: the pixels that count; what is beside them has the number of a region of its own.
+    Those that ``is_left`` marks count; what is beside them has the number of a region of its own.
     """
     height, width = depth_m.shape
     index = torch.arange(height * width).reshape(height, width)

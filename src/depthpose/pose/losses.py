@@ -91,13 +91,8 @@ def model_point_loss(
 ) -> Float[Tensor, " b"]:
     """ADD [m] of each pose against the nearest symmetric copy of its truth.
 
-    The mean distance of model points, differentiable in the found pose.
-
-    Args:
-        found: ``camera_from_model``, a batch.
-        truth: the same, annotated.
-        points_m: of each one's model.
-        copies: ``model_from_model`` of each one's object (b, c), the identity among them.
+    The mean distance of points of each one's model, differentiable in the found pose. Poses are
+    ``camera_from_model``, copies ``model_from_model`` (b, c) with the identity among them.
     """
     moved = found.apply(points_m)
     # T_true S p for each symmetry S: (b, c, n, 3)

@@ -76,13 +76,8 @@ def add_of_nearest_m(
     """ADD [m] for the most lenient symmetric truth.
 
     ADD-S is lower: it forgives any pose that lays the surface near itself, such as a U turned by
-    90 degrees, and not only those that leave the object as it is.
-
-    Args:
-        estimated: ``camera_from_model``.
-        true: the same, annotated.
-        points_m: of the model.
-        symmetries: a batch with the identity, of ``mesh.symmetry_transforms``.
+    90 degrees, and not only those that leave the object as it is. Poses are ``camera_from_model``,
+    symmetries a batch with the identity, of ``mesh.symmetry_transforms``.
     """
     found, copies = _moved(estimated, points_m), _symmetric_copies(true, symmetries, len(points_m))
     return torch.cat([(_moved(c, points_m) - found).norm(dim=-1).mean(-1) for c in copies]).min()
@@ -93,11 +88,7 @@ def mssd_m(
 ) -> Float[Tensor, ""]:
     """MSSD [m]: largest distance of a surface point, for the most lenient symmetric truth.
 
-    Args:
-        estimated: ``camera_from_model``.
-        true: the same, annotated.
-        points_m: of the model.
-        symmetries: a batch with the identity, of ``mesh.symmetry_transforms``.
+    The arguments are those of :func:`add_of_nearest_m`.
     """
     found, copies = _moved(estimated, points_m), _symmetric_copies(true, symmetries, len(points_m))
     return torch.cat([(_moved(c, points_m) - found).norm(dim=-1).amax(-1) for c in copies]).min()

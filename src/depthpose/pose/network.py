@@ -230,12 +230,8 @@ def unfold_norms(folded: ResUNet, network: ResUNet, voxels: Voxels) -> None:
     """Give a network with batch norm the weights of one without, so that it can learn on.
 
     The statistics that folding took are lost; those of ``voxels`` replace them. On these the
-    network answers in training and in eval mode what ``folded`` does.
-
-    Args:
-        folded: without norms.
-        network: of the same widths, with batch norm; if it has other classes, its last layer stays.
-        voxels: clouds like those to come.
+    network answers in training and in eval mode what ``folded`` does. They are clouds like those to
+    come. If the network has other classes, its last layer stays.
     """
     outputs: dict[ConvNorm, Tensor] = {}
 

@@ -167,11 +167,7 @@ def prediction_row(prediction: Prediction) -> dict[str, Any]:
 
 
 def parse_prediction(row: dict[str, Any], source: str) -> Prediction:
-    """Read what :func:`prediction_row` gave.
-
-    Args:
-        row: the values.
-        source: where they stand, for errors.
+    """Read what :func:`prediction_row` gave; ``source`` says in errors where it stands.
 
     Raises:
         InputError: a value is missing or impossible.
@@ -341,12 +337,9 @@ def predict(
 def instance_jobs(
     dataset: BopDataset, names: Mapping[int, str], mask_of: Callable[[Instance], Path] | None = None
 ) -> list[Job[ViewInput]]:
-    """Take every annotated instance by its mask.
+    """Take every annotated instance by the predicted mask that ``mask_of`` names, or its own.
 
-    Args:
-        dataset: what there is to estimate.
-        names: what the estimator calls each object, by its number.
-        mask_of: names the predicted mask of an instance, an image; None: the annotated masks.
+    ``names`` are those of the estimator, by the objects' numbers.
     """
 
     def read(instance: Instance) -> ViewInput:
@@ -367,10 +360,8 @@ def detection_jobs(
     What is not detected has no job, and is missing in what is measured. The time of an image's
     detection is shared by all its jobs.
 
-    Args:
-        dataset: what there is to find.
-        names: what the estimator calls each object, by its number.
-        detections: masks of any images; those of images that ``dataset`` has not are left out.
+    ``names`` are those of the estimator, by the objects' numbers. Detections of images that the
+    data set has not are left out.
 
     Raises:
         InputError: no detection is of the data set.

@@ -101,9 +101,7 @@ def import_resnet18(file: Path, out: Path) -> None:
 
     The classifier's own layer (``fc``) is left out, and so is ``module.``; all else must agree.
 
-    Args:
-        file: a ``.pth`` of tensors, read without running any code in it, or ``.safetensors``.
-        out: the ``.safetensors`` file to write.
+    They are a ``.pth`` of tensors, read without running any code in it, or ``.safetensors``.
 
     Raises:
         InputError: not the weights of such a network; nothing is written.

@@ -84,12 +84,9 @@ def write_pose_weights(
 ) -> None:
     """Write a network and its objects to one ``.safetensors`` file.
 
-    Args:
-        path: the file.
-        weights: what to write.
-        with_half: store the network's numbers with 16 bits: half the size. Models stay exact.
-        with_meshes: keep the models' surfaces. Without, where a licence does not let them pass on,
-            the file cannot be used until :func:`complete_weights` has put them in again.
+    With half, the network's numbers have 16 bits: half the size; models stay exact. Without
+    meshes, which a licence may not let pass on, the file cannot be used until
+    :func:`complete_weights` has put the models' surfaces in again.
     """
     network = weights.network
     learnt = half_state(network) if with_half else network.state_dict()
@@ -119,12 +116,9 @@ def write_pose_weights(
 
 
 def complete_weights(path: Path, meshes: Mapping[int, ObjectModel], out: Path) -> None:
-    """Put surfaces into weights that were written without.
+    """Put surfaces into weights that were written without; ``meshes`` are by number.
 
-    Args:
-        path: the weights.
-        meshes: their objects by number; names, keypoints and symmetries stay those of the weights.
-        out: the whole file.
+    Names, keypoints and symmetries stay those of the weights.
 
     Raises:
         InputError: an object is missing, or is not the one that the weights were trained on.

@@ -116,13 +116,7 @@ def colored_lines(ends_m: Float[Tensor, "n 2 3"], color: tuple[float, float, flo
 
 
 def frame_axes(origin_m: Float[Tensor, "3"], R: Float[Tensor, "3 3"], length_m: float) -> Lines:
-    """Draw the axes of a frame: x red, y green, z blue.
-
-    Args:
-        origin_m: where it stands, in the camera frame.
-        R: its axes as columns.
-        length_m: of each.
-    """
+    """Draw the axes (columns of R) of a frame at a place of the camera: x red, y green, z blue."""
     tips_m = origin_m + length_m * R.mT
     ends_m = torch.stack([origin_m.expand(3, 3), tips_m], 1)
     return Lines(ends_m=ends_m.float(), color=torch.tensor(_RED_GREEN_BLUE))

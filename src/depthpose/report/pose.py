@@ -109,11 +109,7 @@ def pose_layers(
 ) -> list[Layer]:
     """Show a posed object in space: surface, edges, box and axes; the truth by edges and box.
 
-    Args:
-        pose: ``camera_from_model``.
-        model: the object.
-        is_true: draw it as the truth beside an estimate.
-        with_box: whether an estimate's box is seen at first; that of a truth is.
+    ``with_box``: whether an estimate's box is seen at first; that of a truth is.
     """
     pose = pose.double()
     box_m, edges_m = pose.apply(box_edges(model).double()).float(), None
@@ -135,13 +131,7 @@ def pose_layers(
 def keypoint_layers(
     voted_m: Float[Tensor, "k 3"], pose: Rigid | None, model: ObjectModel
 ) -> list[Layer]:
-    """Show the keypoints as voted, and as the posed model has them.
-
-    Args:
-        voted_m: in the camera frame.
-        pose: ``camera_from_model``; None where it was refused.
-        model: the object.
-    """
+    """Show the keypoints as voted, and as the model has them if it was posed (camera frame)."""
     marks = [("keypoints, voted", voted_m, VOTED)]
     if pose is not None:
         own_m = pose.apply(model.keypoints_m.to(pose.R))
@@ -159,13 +149,7 @@ def vote_layer(
     directions: Float[Tensor, "n k 3"],
     voted_m: Float[Tensor, "k 3"],
 ) -> Layer:
-    """Show votes: from some points, along the direction, to where it passes its keypoint.
-
-    Args:
-        points_m: that vote.
-        directions: to each keypoint, of any length.
-        voted_m: the voted keypoints.
-    """
+    """Show votes: from some points, along directions of any length, past the voted keypoints."""
     from_m, toward = take_evenly(points_m, _VOTES), take_evenly(directions, _VOTES)
     toward = torch.nn.functional.normalize(toward, dim=-1)
     way_m = ((voted_m - from_m[:, None]) * toward).sum(-1, keepdim=True).clamp(min=0)
@@ -223,17 +207,8 @@ def pose_section(
     """Show one estimate: sentence and numbers, the picture, the cloud with the model in 3D.
 
     Pictures are of the whole view and of the object from near by, with the mask where there is no
-    pose.
-
-    Args:
-        title: of the section.
-        pose_input: what was seen.
-        estimate: its result.
-        model: the object.
-        text: before the sentence.
-        image: what the pose is drawn over, of the view's camera; None: its depth in grey.
-        truth: ``camera_from_model``, where it is known.
-        rows: of a table.
+    pose. ``image`` is what the pose is drawn over, of the view's camera; None: its depth in grey.
+    ``text`` comes before the sentence, ``rows`` are those of a table.
     """
     drawings: list[Drawing] = []
     if isinstance(pose_input, ViewInput):
@@ -290,11 +265,7 @@ def pose_facts(
 ) -> list[tuple[str, str]]:
     """Say what is known of an estimate besides its pose.
 
-    Args:
-        estimate: the estimate.
-        model: the object.
-        how: by what it was found; empty: not said.
-        agreeing: what the estimate's ``inlier_share`` is of.
+    ``how``: by what it was found, if not empty; ``agreeing``: what its ``inlier_share`` is of.
     """
     facts = [("object", f"{estimate.object}, {model.diameter_m:.4f} m long")]
     if how:

@@ -191,11 +191,8 @@ def draw_figure_2_1(
 ) -> list[Drawing]:
     """Make the six panels of figure 2-1, in its order.
 
-    Args:
-        pair: the frame, with its real right view.
-        lidar_m: one scan drawn into the left image, NaN where no point falls.
-        mono: the estimate from the left view alone, with the right view that it synthesised.
-        stereo: the estimate from the real pair, by the same matcher.
+    The LiDAR is one scan drawn into the left image, NaN where no point falls. ``mono`` is of the
+    left view and the right one that it synthesised, ``stereo`` of the real pair by that matcher.
 
     Raises:
         InputError: the frame has no right view, or the estimate no synthesised one.

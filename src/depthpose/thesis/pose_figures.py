@@ -199,9 +199,7 @@ def embed_line(features: Float[Tensor, "n c"], perplexity: float = 40.0) -> Floa
     Begins along the principal component, and so always gives the same answer; gradient descent
     with momentum and gains. Time and memory grow with the square of ``n``: thousands, not more.
 
-    Args:
-        features: of any scale.
-        perplexity: how many neighbours a point has, about.
+    A point has about ``perplexity`` neighbours.
 
     Raises:
         InputError: there are fewer points than three neighbourhoods.

@@ -358,12 +358,7 @@ def ransac_one_by_one(
     A hypothesis is the point nearest to the lines of two random points; its inliers are the points
     whose unit direction comes within an angle of it; the best is refitted on its inliers.
 
-    Args:
-        points_m: where the votes start.
-        directions: of unit length.
-        hypotheses: tried for each keypoint; published practice is 50.
-        min_cosine: of the angle of an inlier.
-        seed: of the pairs.
+    Published practice is 50 hypotheses for each keypoint.
     """
     random = np.random.default_rng(seed)
     found = []

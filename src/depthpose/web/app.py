@@ -37,7 +37,7 @@ from depthpose.core.errors import InputError, MissingExtraError
 from depthpose.depth.estimator import FakestereoNet
 from depthpose.pose.estimator import GeoPoseNet
 from depthpose.report.page import page_file
-from depthpose.web.answer import KINDS, Answer, Form, Shown, keep_file, without_paths
+from depthpose.web.answer import KINDS, Answer, Form, keep_file, without_paths
 from depthpose.web.depth import answer_depth, depth_example
 from depthpose.web.pose import answer_pose, pose_example
 
@@ -340,13 +340,18 @@ class Pages:
         self._kept[key] = answer.files
         while len(self._kept) > _RESULTS:
             self._kept.popitem(last=False)
+        pictures = []
+        for one in answer.pictures:  # with their sizes, so that nothing moves when they come
+            with Image.open(io.BytesIO(answer.files[one.file])) as image:  # a file of our own
+                said = {"scale": one.scale and vars(one.scale), "size": list(image.size)}
+            pictures.append({**vars(one), **said})
         return {
             "ok": answer.is_ok,
             "said": answer.said,
             "terms": answer.terms,
             "facts": list(answer.facts),
             "tables": dict(answer.tables),
-            "pictures": [_picture(picture, answer.files) for picture in answer.pictures],
+            "pictures": pictures,
             "scene": answer.scene.encoded(),
             "files": [{"name": n, "bytes": len(data)} for n, data in answer.files.items()],
             "folder": f"results/{key}/",
@@ -357,13 +362,6 @@ def _of_kind(known: Mapping[str, Result], request: Request) -> Result:
     if (kind := request.path_params["kind"]) not in known:
         raise HTTPException(404, f"only {' and '.join(known)} are estimated here")
     return known[kind]
-
-
-def _picture(shown: Shown, files: Mapping[str, bytes]) -> dict[str, Any]:
-    """Give what the page needs of a picture: its size too, so that nothing moves when it comes."""
-    with Image.open(io.BytesIO(files[shown.file])) as image:  # a file of our own
-        width, height = image.size
-    return {**vars(shown), "scale": shown.scale and vars(shown.scale), "size": [width, height]}
 
 
 def make_app(depth: FakestereoNet, pose: GeoPoseNet, limits: Limits | None = None) -> Starlette:

@@ -63,7 +63,19 @@ def answer_pose(form: Form, net: GeoPoseNet) -> Answer:
     pose_input = _input(form, target.model)
     name, voted = pose_input.name, None
     if "depth" in form.files and "mask" not in form.files:
-        seen = _found_alone(pose_input, target)
+        assert isinstance(pose_input, ViewInput)
+        answers = target.net.find_in(pose_input, [target.model.name])
+        seen = []
+        for k, answer in enumerate(answers):  # each pose with the pixels that it explains
+            own = f"{name}_{k}" if len(answers) > 1 else name
+            found_pose = answer.camera_from_model
+            assert found_pose is not None
+            mask = explained_mask(pose_input, found_pose, prepare_surface(target.model))
+            shown = replace(pose_input, name=own, mask=mask)
+            seen.append(_Seen(input=shown, estimate=replace(answer, name=own)))
+        if not seen:
+            nothing = nothing_found(pose_input, target.model.name)
+            seen.append(_Seen(input=pose_input, estimate=nothing))
     elif isinstance(target.net, GeoPoseNet):
         estimate, voted = target.net.estimate_with_votes(pose_input)
         seen = [_Seen(input=pose_input, estimate=estimate)]
@@ -107,22 +119,6 @@ def answer_pose(form: Form, net: GeoPoseNet) -> Answer:
         terms=net.terms if target.net is net else "",
         files=read_files(folder),
     )
-
-
-def _found_alone(pose_input: CloudInput | ViewInput, target: _Target) -> list[_Seen]:
-    """Search a depth image without a mask; give each pose with the pixels that it explains."""
-    assert isinstance(pose_input, ViewInput)
-    answers = target.net.find_in(pose_input, [target.model.name])
-    if not answers:
-        return [_Seen(input=pose_input, estimate=nothing_found(pose_input, target.model.name))]
-    seen: list[_Seen] = []
-    for k, answer in enumerate(answers):
-        name = f"{pose_input.name}_{k}" if len(answers) > 1 else pose_input.name
-        assert answer.camera_from_model is not None
-        mask = explained_mask(pose_input, answer.camera_from_model, prepare_surface(target.model))
-        own = replace(pose_input, name=name, mask=mask)
-        seen.append(_Seen(input=own, estimate=replace(answer, name=name)))
-    return seen
 
 
 def _write(folder: Path, name: str, seen: list[_Seen], model: ObjectModel) -> list[Shown]:

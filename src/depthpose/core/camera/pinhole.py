@@ -173,12 +173,7 @@ def back_project(
 def crop_camera(camera: AnyCamera, left: int, top: int, width: int, height: int) -> AnyCamera:
     """Make the camera of a window of the image.
 
-    Args:
-        camera: the camera of the whole image.
-        left: first column kept [px].
-        top: first row kept [px].
-        width: columns kept [px].
-        height: rows kept [px].
+    ``left`` and ``top`` are the first column and row that are kept [px].
 
     Raises:
         InputError: the window does not lie inside the image.

@@ -311,10 +311,8 @@ class Rectifier:
 def make_rectifier(pair: RawPair, size: Size, keep: float = 0.0) -> Rectifier:
     """Choose the rectified cameras (Bouguet's method, as OpenCV's ``stereoRectify`` has it).
 
-    Args:
-        pair: the calibration.
-        size: width and height of the images [px], for calibrations that do not say it.
-        keep: 0: only what the raw images show; 1: all that they show, with black borders.
+    ``size`` is that of the images [px], for calibrations that do not say it. ``keep`` 0 keeps what
+    both raw images show alone, 1 all that they show, with black borders.
 
     Raises:
         InputError: ``keep`` is out of range, or the lens bends more than any can.

@@ -196,10 +196,7 @@ def read_shard(
 ) -> Iterator[tuple[str, dict[str, bytes]]]:
     """Read the results of a shard one by one.
 
-    Args:
-        url: of the shard.
-        names: of the results in it, which a tar does not separate from the endings.
-        endings: that their files may have.
+    A tar does not separate the names of the results from the endings that their files may have.
 
     Raises:
         InputError: the shard is not there, or is damaged.

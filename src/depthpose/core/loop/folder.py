@@ -130,12 +130,8 @@ def write_card(
 ) -> None:
     """Write ``W.md`` beside the weights: what they are, the command, its time, what was measured.
 
-    Args:
-        weights: the file, in the folder of its run.
-        words: of the command that trains such, as ``depth train view``.
-        seconds: what the training took.
-        facts: of the weights.
-        measured: Markdown; :func:`held_out_text` where validation measured.
+    ``words`` are those of the command, as ``depth train view``; ``measured`` is Markdown, as
+    :func:`held_out_text` where validation measured.
     """
     folder, here = weights.parent, environment()
     where = ", ".join(here[name] for name in ("machine", "gpu") if name in here)

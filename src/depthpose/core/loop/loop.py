@@ -167,7 +167,14 @@ class _Training:
                 f"device {config.device!r} cannot be used in this process, which has trained on "
                 f"another; start this training in a process of its own ({error})"
             ) from error
-        self.precision = Precision(config, self.accelerator.device)
+        device = self.accelerator.device
+        if config.precision == "fp16" and device.type == "cpu":
+            raise InputError(
+                "precision 'fp16' cannot be used here: it needs a GPU. Take bf16, which a CPU has "
+                "too."
+            )
+        self.precision = _TYPES[usable_precision(config.precision, device)]  # None: fp32
+        scaler = torch.amp.GradScaler(device.type, enabled=self.precision is torch.float16)
         self.world = self.accelerator.num_processes
         self.steps = config.total_steps(len(samples), self.world)
         self.logger = RunLogger(folder, is_writer=self.accelerator.is_main_process)
@@ -177,7 +184,7 @@ class _Training:
         if saved and not resume:
             raise InputError(f"{folder}: holds a training. Add --resume, or take another folder.")
         for module in task.modules.values():
-            module.to(self.accelerator.device)
+            module.to(device)
         if not saved and self.world > 1:  # every process begins with rank 0's weights
             from accelerate.utils import broadcast
 
@@ -188,7 +195,7 @@ class _Training:
         self.parts = Parts(
             modules=task.modules,
             optimizers={name: adam for name, (adam, _) in task.optimizers.items()},
-            scaler=self.precision.scaler,
+            scaler=scaler,
             average={name: _copied(m) for name, m in task.modules.items() if has_average},
         )
         if saved:
@@ -266,7 +273,8 @@ class _Training:
                 # Dropout follows the micro-batch, not the process that happens to hold it.
                 micro = place * self.world + self.accelerator.process_index
                 torch.manual_seed(mixed_seed(self.config.seed, self.step, micro, number))
-                with self.precision.autocast():
+                device, precision = self.accelerator.device.type, self.precision
+                with torch.autocast(device, precision, enabled=precision is not None):
                     update = next(iterator, None)
                 if update is None:
                     continue
@@ -332,22 +340,6 @@ class _Training:
             return is_asked
         flag = torch.tensor([float(is_asked)], device=self.accelerator.device)
         return bool(float(self.accelerator.reduce(flag, "sum")) > 0)
-
-
-class Precision:
-    """Autocast, and the scaling of the loss that fp16 needs; bf16 is fp32 where it is unknown."""
-
-    def __init__(self, config: LoopConfig, device: torch.device) -> None:
-        if config.precision == "fp16" and device.type == "cpu":
-            said = "precision 'fp16' cannot be used here: it needs a GPU."
-            raise InputError(f"{said} Take bf16, which a CPU has too.")
-        self._device = device.type
-        self._type = _TYPES[usable_precision(config.precision, device)]
-        self.scaler = torch.amp.GradScaler(self._device, enabled=self._type is torch.float16)
-
-    def autocast(self) -> torch.autocast:
-        """Give the context of a forward pass."""
-        return torch.autocast(self._device, self._type, enabled=self._type is not None)
 
 
 class StopRequest:

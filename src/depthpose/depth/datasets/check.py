@@ -42,13 +42,10 @@ def check_dataset(
     with_decoding: bool = True,
     progress: Callable[[int, int], None] | None = None,
 ) -> CheckReport:
-    """Check every file of a dataset.
+    """Check every file of a dataset in any layout that ``open_dataset`` knows, or of its split.
 
-    Args:
-        folder: the dataset's folder, in any layout that ``open_dataset`` knows.
-        split: look only at these frames, and name those that are missing.
-        with_decoding: decode every image in full; else only headers and sizes are read.
-        progress: called with the number of frames done and of all frames.
+    Without decoding only headers and sizes are read. ``progress`` is called with the number of
+    frames done and of all frames.
 
     Raises:
         InputError: no such folder, or no layout that is known.
@@ -221,10 +218,8 @@ def _check_truth(
 
 
 def _agreement(disparity_px: Map, report: RectificationReport) -> tuple[float, int] | None:
-    """Share and number of matches that a map agrees with; None where it says too little.
-
-    Corners lie at edges, so a value within a window may be the one that a match saw.
-    """
+    """Share and number of matches that a map agrees with; None where it says too little."""
+    # Corners lie at edges, so a value within a window may be the one that a match saw.
     side = 2 * _TRUTH_RADIUS + 1
     padded = F.pad(disparity_px.float(), (_TRUTH_RADIUS,) * 4, value=float("nan"))
     windows = padded.unfold(0, side, 1).unfold(1, side, 1)
@@ -273,12 +268,7 @@ def find_duplicates(
     """List the pairs of left images, one of either set, that look alike, the most similar first.
 
     The most similar pair is listed in any case: its similarity says how far the sets are apart.
-
-    Args:
-        first: usually the training set.
-        second: usually the evaluation set.
-        at_least: smallest similarity that is listed; a lower one lists more pairs to compare.
-        progress: wraps the sequence of frames, to show how far it is.
+    The others have a similarity of ``at_least`` or more; ``progress`` wraps the sequence of frames.
     """
     similarity = similarity_matrix(first, second, progress)
     pairs = (similarity >= min(at_least, float(similarity.max()))).nonzero().tolist()

@@ -205,11 +205,7 @@ def refuse_common(
 ) -> None:
     """Refuse to measure by what is trained on.
 
-    Args:
-        trained: frames of the training.
-        measured: frames that the result is measured on.
-        what: these are, for the error.
-        remedy: for the error.
+    The error says ``what`` the measured frames are, and the ``remedy``.
 
     Raises:
         InputError: a left image is in both.

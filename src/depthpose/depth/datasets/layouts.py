@@ -40,11 +40,7 @@ def pack_frames(
     ``calibration/``, and ``index.json`` says where each frame's parts are. A shard is written whole
     or not at all, the index last; a second call writes everything again.
 
-    Args:
-        frames: what is packed, in order.
-        out: a folder of its own.
-        shard_bytes: a shard is closed when it has this many.
-        show: called with the name of each frame.
+    A shard is closed when it has ``shard_bytes``; ``show`` is called with the name of each frame.
 
     Raises:
         InputError: a file is missing or damaged, or the disk refuses.
@@ -368,11 +364,7 @@ def write_raw_frame(folder: Path, drive: str, number: int, frame: RawFrame) -> N
     disparity, which KITTI raw has not, goes beside them into ``disp_occ`` (all pixels) and
     ``disp_noc`` (those that both views show), as 16-bit PNG x 256, and the sky into ``sky``.
 
-    Args:
-        folder: the dataset's root.
-        drive: ``DATE_drive_NNNN_sync``.
-        number: of the frame, in its drive.
-        frame: what to write.
+    ``drive`` is ``DATE_drive_NNNN_sync``, ``number`` that of the frame in it.
 
     Raises:
         InputError: the date already has another calibration, or the disk refuses.

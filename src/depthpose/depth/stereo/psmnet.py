@@ -416,10 +416,8 @@ def psmnet_from_published(state: Mapping[str, Tensor], *, align_corners: bool) -
 def import_psmnet(file: Path, out: Path, *, align_corners: bool) -> None:
     """Turn the authors' checkpoint into a weights file of ours.
 
-    Args:
-        file: their ``.tar`` (a PyTorch file, not an archive to unpack), read without its code.
-        out: the ``.safetensors`` file to write.
-        align_corners: see :func:`psmnet_from_published`; it is recorded in ``out``.
+    Their ``.tar`` is a PyTorch file, not an archive to unpack, and read without its code.
+    ``align_corners`` (:func:`psmnet_from_published`) is recorded in ``out``.
 
     Raises:
         InputError: not a checkpoint of the published network.

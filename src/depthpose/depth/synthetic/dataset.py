@@ -330,10 +330,6 @@ class StreetFrame(RawFrame):
 def draw_street(config: StreetsConfig, index: int) -> StreetFrame:
     """Make frame ``index``: a function of the configuration and the index alone.
 
-    Args:
-        config: what frames are like.
-        index: any whole number that is not negative.
-
     Raises:
         InputError: the index is negative.
     """
@@ -352,11 +348,8 @@ def draw_scene(
 ) -> StreetFrame:
     """Draw a scene with a rig.
 
-    Args:
-        scene: one that :func:`make_scene` made.
-        rig: the cameras; the size of the pictures is theirs, whatever the scale of ``config``.
-        config: how to draw.
-        seed: of the sensors' noise, their small misalignment and the LiDAR's.
+    The pictures have the rig's size, whatever the scale of ``config``. ``seed`` is that of the
+    sensors' noise, their small misalignment and the LiDAR's.
     """
     rng = np.random.default_rng([73, *seed])
     stage = prepare(scene, rig.width * rig.height)

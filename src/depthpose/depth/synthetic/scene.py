@@ -97,11 +97,9 @@ class StreetScene:
 
 
 def make_scene(seed: tuple[int, ...], mount_height_m: float = 1.65) -> StreetScene:
-    """Make the street that belongs to ``seed``.
+    """Make the street that belongs to ``seed``, any whole numbers.
 
-    Args:
-        seed: any whole numbers.
-        mount_height_m: height of the cameras above the road, some centimetres more or less.
+    The cameras are mounted at this height above the road, some centimetres more or less.
     """
     rng = np.random.default_rng([71, *seed])
     road = roads.draw_road(rng)

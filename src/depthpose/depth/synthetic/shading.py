@@ -297,12 +297,9 @@ def _paint_road(
     width_m: Numbers,
     length_m: Numbers,
 ) -> Vectors:
-    """Give the colour of the asphalt with what is painted on it, at places (x, s) of the road.
-
-    Lines are narrower than a pixel far away, so they cover it by the share of its footprint, which
-    has this width and length. It is darker where wheels roll, where it was mended, and on covers.
-    """
+    """Give the colour of the asphalt with what is painted on it, at places (x, s) of the road."""
     x, s = place_m.unbind(1)
+    # Far lines are narrower than a pixel: they cover it by the share of its footprint.
     cover = torch.zeros_like(x)
     for at, half, period, dash in scene.markings.lines.tolist():
         line = _inside(x - at, half, width_m)

@@ -57,7 +57,26 @@ class TrainingPairs:
         baseline_m: float | None = None,
     ) -> None:
         self.config, self.seed = config, seed
-        self._places = _find_places(config, needs_truth=needs_truth, is_mixed=is_mixed)
+        if not config.folders and config.streets is None:
+            raise InputError("there is nothing to train on: name a folder of pairs (--data PATH).")
+        self._places: list[_Place] = []
+        if config.streets is not None:
+            made = Streets(config.streets)
+            exact: TruthKind | None = "disparity" if needs_truth else None
+            self._places += _spread(
+                [_Place(made, k, exact) for k in range(len(made))], config.limit
+            )
+        excluded = set(config.exclude)
+        for number, folder in enumerate(config.folders):
+            dataset = open_dataset(folder, config.split if number == 0 else None)
+            excluded -= {frame.name for frame in dataset.frames}
+            usable = _usable(dataset, config, needs_truth=needs_truth, is_mixed=is_mixed)
+            self._places += _spread(usable, config.limit)
+        if excluded:
+            raise InputError(
+                f"exclude names {sorted(excluded)}, which no folder holds; a misspelt name would "
+                "train on what should be left out"
+            )
         names = (
             (source.name if isinstance(source, Dataset) else _STREETS, truth)
             for source, _, truth in self._places
@@ -165,28 +184,6 @@ class TrainingPairs:
     def _frame_name(self, index: int) -> str:
         source, place, _ = self._places[index]
         return source.frames[place].name if isinstance(source, Dataset) else f"street {place}"
-
-
-def _find_places(config: PairsConfig, *, needs_truth: bool, is_mixed: bool) -> list[_Place]:
-    if not config.folders and config.streets is None:
-        raise InputError("there is nothing to train on: name a folder of pairs (--data PATH).")
-    excluded = set(config.exclude)
-    found: list[_Place] = []
-    if config.streets is not None:
-        made = Streets(config.streets)
-        exact: TruthKind | None = "disparity" if needs_truth else None
-        found += _spread([_Place(made, index, exact) for index in range(len(made))], config.limit)
-    for number, folder in enumerate(config.folders):
-        dataset = open_dataset(folder, config.split if number == 0 else None)
-        excluded -= {frame.name for frame in dataset.frames}
-        usable = _usable(dataset, config, needs_truth=needs_truth, is_mixed=is_mixed)
-        found += _spread(usable, config.limit)
-    if excluded:
-        raise InputError(
-            f"exclude names {sorted(excluded)}, which no folder holds; a misspelt name would "
-            "train on what should be left out"
-        )
-    return found
 
 
 def _usable(

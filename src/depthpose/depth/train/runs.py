@@ -201,14 +201,8 @@ def _run_stage(
     config: Any,  # noqa: ANN401
     run: Run,
 ) -> tuple[dict[str, str], float]:
-    """Claim the folder for this config, then train; give the facts of the card, and the seconds.
-
-    The facts are made before anything is measured, with the terms of the weights of the start.
-    """
-    settings = (getattr(config, setting, None) for setting in _BEGINS_WITH)
-    named = {
-        k: name for k, name in zip(_BEGINS_WITH, settings, strict=True) if isinstance(name, str)
-    }
+    """Claim the folder for this config, then train; give the facts of the card, and the seconds."""
+    named = {k: name for k in _BEGINS_WITH if isinstance(name := getattr(config, k, None), str)}
     more: dict[str, Any] = {f"{k}_sha256": file_sha256(find_weights(v)) for k, v in named.items()}
     if samples.truths:
         more["truth"] = list(samples.truths)
@@ -266,18 +260,13 @@ def _write_weights(
 def _at_virtual_focal(
     config: _OfGenerator, generator: GeneratorConfig | SelectionConfig
 ) -> _OfGenerator:
-    """Bring all pairs, those held out too, to the rig that the generator imitates.
-
-    The generator that selects may be trained on other sizes too, by ``focal_px`` and
-    ``augment.scale``: it answers pixels of the image before it, and these grow with the image. A
-    U-Net works for its own rig only.
-    """
+    """Bring all pairs, those held out too, to the rig that the generator imitates."""
     focal_px = generator.virtual_focal_px
     sources = ("pairs", "more", "held_out")
     there = {name: found for name in sources if (found := getattr(config, name, None)) is not None}
     for name, pairs in there.items():
         if isinstance(generator, SelectionConfig) and name != "held_out":
-            continue
+            continue  # it answers pixels of any image, a U-Net those of its own rig alone
         if pairs.focal_px not in (None, focal_px):
             raise InputError(
                 f"{name}.focal_px is {pairs.focal_px}, but the generator imitates a rig of "

@@ -270,15 +270,8 @@ class SelectionSample(NamedTuple):
 class SelectionSamples:
     """Samples by index: a share of the indices draws from the second source, evenly spread.
 
-    Args:
-        sources: the pairs that set the length of an epoch; and perhaps others, e.g. real ones
-            beside synthetic ones.
-        more_share: share of the samples that draws from the others.
-        config: changes of the input alone.
-        seed: decides the changes.
-
-    Attributes:
-        truths: which kind of truth each source gives.
+    The first source sets the length of an epoch; ``config`` changes the input alone.
+    ``truths`` says which kind of truth each source gives.
     """
 
     def __init__(

@@ -85,11 +85,7 @@ class BopDataset:
     def view(
         self, instance: Instance, mask: Bool[Tensor, "mask_h mask_w"] | None = None
     ) -> ViewSample:
-        """Read the whole depth image of an instance, and its mask.
-
-        Args:
-            instance: one of ``instances``.
-            mask: predicted; None: the annotated one.
+        """Read the whole depth image of an instance, with a predicted mask or the annotated one.
 
         Raises:
             InputError: a file is missing or damaged, or the mask does not fit the depth.
@@ -191,13 +187,8 @@ def check_bop(
     """Check every file of a data set: are they there and whole, and do they agree?
 
     Units are checked too: a cloud a thousand times smaller than its model, or a metre away from
-    its annotated pose, is reported.
-
-    Args:
-        folder: of the data set.
-        split: check only this one; None: all.
-        with_decoding: decode depth and masks and compare them with poses; else only headers.
-        progress: called with the number of instances done and of all.
+    its annotated pose, is reported; without decoding only headers are read. ``split`` None: all.
+    ``progress`` is called with the number of instances done and of all.
 
     Raises:
         InputError: there is no such split.

@@ -100,12 +100,8 @@ def nearest_copy(
 ) -> Rigid:
     """Give the true pose that is turned least against an estimate, of those that look alike.
 
-    Args:
-        estimated: ``camera_from_model``.
-        true: the same.
-        symmetries: motions of the model that leave it as it is, the identity first.
-        declared: the symmetries that these are of: turns about their axes are then exact, not one
-            of the steps in ``symmetries``.
+    ``symmetries`` are motions of the model that leave it as it is, the identity first. With the
+    ``declared`` ones that they are of, turns about their axes are exact, not one of the steps.
     """
     R, t_m = symmetries.R.double(), symmetries.t_m.double()
     copies = Rigid(true.R.double() @ R, (true.R.double() @ t_m[..., None])[..., 0] + true.t_m)

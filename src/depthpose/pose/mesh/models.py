@@ -64,11 +64,8 @@ def symmetry_transforms(symmetries: Symmetries, max_step: float = BOP_STEP) -> R
 def symmetries_from_bop(info: Mapping[str, Any], *, source: str) -> Symmetries:
     """Read ``symmetries_discrete`` (4x4, row by row) and ``symmetries_continuous``; both in mm.
 
-    ``symmetries_found`` is ours: true where they were found in the geometry.
-
-    Args:
-        info: an object's entry of ``models_info.json``.
-        source: what to call it in errors.
+    ``symmetries_found`` is ours: true where they were found in the geometry. ``info`` is the entry
+    of an object in ``models_info.json``, in errors called ``source``.
 
     Raises:
         InputError: an entry is no rigid transform or no axis.

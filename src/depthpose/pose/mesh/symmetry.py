@@ -206,14 +206,8 @@ def with_found_symmetries(
 ) -> ObjectModel:
     """Look for the symmetries of a model that declares none, and count them if that is wanted.
 
-    They are searched once for each shape, and kept in ``$DEPTHPOSE_CACHE``.
-
-    Args:
-        model: a mesh, or points with normals.
-        on_message: called with what was found, taken or not; None: symmetries that are not taken
-            are not searched.
-        is_taken: give the model these symmetries.
-        tolerance: as for :func:`propose_symmetries`.
+    They are searched once for each shape, and kept in ``$DEPTHPOSE_CACHE``. ``on_message`` is told
+    what was found, taken or not; without it, symmetries that are not taken are not searched.
     """
     declared = model.symmetries
     if not (is_taken or on_message) or declared.discrete is not None or declared.continuous:
@@ -427,9 +421,6 @@ def near_symmetries(model: ObjectModel) -> tuple[NearSymmetry, ...]:
 
     Not among them are those of :func:`true_symmetries`, which are no other pose. They are searched
     once for each shape, which takes a second or a few, and kept in ``$DEPTHPOSE_CACHE``.
-
-    Args:
-        model: the object, a mesh or points with normals.
     """
     near = kept(model, _search, "near_symmetries")["near"]
     turns = [(torch.tensor(matrix, dtype=torch.float64), deviation) for matrix, deviation in near]
@@ -447,9 +438,7 @@ def true_symmetries(
     Declared ones are all. Of those that were found in the geometry, copies that lie 1 % of the
     diameter and more off the surface are left out: near-symmetries.
 
-    Args:
-        model: the object.
-        alike: which discrete symmetries and which axes look alike; None: as a search finds them.
+    ``alike``: which discrete symmetries and which axes look so; None: as a search finds them.
     """
     given = model.symmetries
     if not given.is_found:

@@ -138,13 +138,8 @@ def make_frames(
     """Make frames of several objects on a table, as BOP lays them out.
 
     Frame i is a function of the seed and i alone. A frame shows each object once at most, or a pile
-    of one of them (``frame_pile``); poses are exact, sensor errors lie over the depth alone.
-
-    Args:
-        models: the objects; their numbers become ``obj_id``.
-        config: camera, sensor, and how many objects and other things there are.
-        number: how many frames.
-        first: number of the first.
+    of one of them (``frame_pile``); poses are exact, sensor errors lie over the depth alone. The
+    numbers of the models become ``obj_id``; so many frames are made, from number ``first`` on.
 
     Raises:
         InputError: no model, two of one number, or a camera that would be inside an object.

@@ -203,9 +203,7 @@ def read_models(
 ) -> tuple[ObjectModel, ...]:
     """Read the models that a training names.
 
-    Args:
-        config: which.
-        on_message: called with symmetries that were found and are not declared, taken or not.
+    ``on_message`` is told of symmetries that were found and are not declared, taken or not.
 
     Raises:
         InputError: none is named, or of two kinds, CAD files without their unit, two have one name,

@@ -1,6 +1,6 @@
 """Training of segmentation: annotated images, random changes of them, and the task."""
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import NamedTuple
 
@@ -88,21 +88,14 @@ class AnnotatedImages:
         """Read one whole image."""
         held = self._cache.get(index)
         if held is None:
-            held = self._read(self._images[index])
-            if self._with_cache:
-                self._cache[index] = held
-        return LabelledImage(held[0].float() / 255, held[1].long())
-
-    def _read(
-        self, instances: Sequence[Instance]
-    ) -> tuple[UInt8[Tensor, "3 h w"], UInt8[Tensor, "h w"]]:
-        path = instances[0].rgb
-        assert path is not None
-        image = read_image(path)
-        labels = torch.zeros(image.shape[1:], dtype=torch.uint8)
-        for instance in instances:
-            number = self._class_of.get(instance.object_id)
-            if number is not None:
+            path = self._images[index][0].rgb
+            assert path is not None
+            image = read_image(path)
+            labels = torch.zeros(image.shape[1:], dtype=torch.uint8)
+            for instance in self._images[index]:
+                number = self._class_of.get(instance.object_id)
+                if number is None:
+                    continue
                 mask = read_instance_mask(instance)
                 if mask.shape != labels.shape:
                     raise InputError(
@@ -110,7 +103,10 @@ class AnnotatedImages:
                         f"picture {labels.shape[1]}x{labels.shape[0]}; one of them is another's"
                     )
                 labels[mask] = number
-        return (image * 255).round().to(torch.uint8), labels
+            held = (image * 255).round().to(torch.uint8), labels
+            if self._with_cache:
+                self._cache[index] = held
+        return LabelledImage(held[0].float() / 255, held[1].long())
 
 
 class TrainingImages:

@@ -253,11 +253,7 @@ _STATISTICS_CLOUDS = 64  # from which statistics of batch norm, lost by folding,
 
 @releases_folder
 def train_pose(config: PoseTraining | DepthImageTraining, run: Run) -> Path:
-    """Train a network that poses, ours or a baseline; give its weights file.
-
-    Args:
-        config: of the training; the class of its network decides which it is.
-        run: where.
+    """Train the network that a config has, ours or a baseline; give its weights file.
 
     Raises:
         InputError: settings, models or weights to begin with that do not fit.
