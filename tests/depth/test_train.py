@@ -93,11 +93,7 @@ def test_l1_alone_has_no_discriminator(pairs: PairsConfig) -> None:
 
 def any_matcher(kind: str) -> PSMNet | LightStereo:
     torch.manual_seed(0)
-    if kind == "psmnet":
-        return PSMNet(MATCHER)
-    light = LightStereo(LIGHT)
-    torch.nn.init.normal_(light.refinement.correction.weight)  # no gradient passes while it is 0
-    return light
+    return PSMNet(MATCHER) if kind == "psmnet" else LightStereo(LIGHT)
 
 
 @pytest.mark.parametrize("kind", ["psmnet", "light"])

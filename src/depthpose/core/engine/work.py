@@ -345,7 +345,7 @@ class Done:
     shard: str  #: name of the shard, with its suffix
     entries: tuple[tuple[str, str], ...]  #: name and "" or the reason of its failure, of each input
     endings: tuple[str, ...]  #: that the files of a result may have
-    stamp: tuple[int, ...]  #: size, time and checksum of the shard (:func:`file_stamp`)
+    stamp: tuple[int, ...]  #: size, time and checksum of the shard
     block: int  #: checksum of the inputs
 
     @property
