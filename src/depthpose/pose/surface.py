@@ -86,7 +86,8 @@ class Surface:
         if serves(points_m):
             from depthpose.pose.compiled.points import nearest_many
 
-            index, _ = nearest_many(finite_array(points_m).reshape(-1, 3), self.target.tree)
+            points = finite_array(points_m.detach().numpy()).reshape(-1, 3)
+            index, _ = nearest_many(points, self.target.tree)
             return torch.from_numpy(index).reshape(points_m.shape[:-1])
         return torch.from_numpy(self.tree.query(points_m.numpy(), workers=1)[1])
 
@@ -109,7 +110,7 @@ class Surface:
         from depthpose.pose.compiled.points import Tree, planted
         from depthpose.pose.compiled.poses import Target
 
-        tree, boxes = Tree(*planted(finite_array(self.points_m))), self.boxes
+        tree, boxes = Tree(*planted(finite_array(self.points_m.numpy()))), self.boxes
         place = np.full(len(self.points_m) + 1, -1)
         place[tree.order] = np.arange(len(self.points_m))
         return Target(
@@ -287,7 +288,7 @@ def look_along_rays(
         from depthpose.pose.compiled.points import compare_rays
 
         points_m = surface.points_m[::every]
-        given = (finite_array(a) for a in (cloud_m, poses.R, poses.t_m, points_m))
+        given = (finite_array(a.detach().numpy()) for a in (cloud_m, poses.R, poses.t_m, points_m))
         front, unseen = compare_rays(*given, scale, *middle.tolist(), _REACH, limit_m)
         return torch.from_numpy(front), torch.from_numpy(unseen)
     posed_m = poses.apply(surface.points_m[::every])

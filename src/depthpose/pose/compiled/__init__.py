@@ -63,13 +63,12 @@ def serves(*tensors: Tensor) -> bool:
     return not with_gradients and all(t.device.type == "cpu" for t in tensors) and is_compiled()
 
 
-def finite_array(values: Tensor | np.ndarray) -> np.ndarray:
+def finite_array(array: np.ndarray) -> np.ndarray:
     """Give what a compiled loop reads: contiguous, and finite, as cells and trees need it.
 
     Raises:
         ValueError: a value is not finite.
     """
-    array = values.detach().numpy() if isinstance(values, Tensor) else values
     if not np.isfinite(array).all():
         raise ValueError("values must be finite; leave out what is not")
     return np.ascontiguousarray(array)

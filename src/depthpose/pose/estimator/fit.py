@@ -272,7 +272,7 @@ def _grow(
     if serves(local_m, times):
         from depthpose.pose.compiled.poses import grow
 
-        local_m, times = torch.from_numpy(finite_array(local_m).copy()), times.clone()
+        local_m, times = torch.from_numpy(finite_array(local_m.numpy()).copy()), times.clone()
         variance = torch.ones_like(times)
         arrays = (local_m.numpy(), times.numpy(), middle_m.numpy(), np.array(limits_m))
         grow(*arrays, surface.target, is_exact, _CONVERGED, variance.numpy())
