@@ -12,14 +12,14 @@ from depthpose.pose.cloud import (
     cloud_from_depth,
     is_flying,
     is_reading,
-    object_points,
     refusal_of,
     sample_points,
     turn_axis_to,
     voxelise,
 )
-from depthpose.pose.config import CloudConfig
+from depthpose.pose.config import SHAPE_FEATURES, CloudConfig
 from depthpose.pose.types import CloudInput
+from depthpose.report.pose import object_points
 
 K = torch.tensor([[500.0, 0, 32], [0, 500, 24], [0, 0, 1]]).double()
 
@@ -175,7 +175,7 @@ def test_a_cloud_at_the_side_has_the_grid_of_one_straight_ahead() -> None:
 def shape_of(points: torch.Tensor, voxel_m: float = 0.01) -> torch.Tensor:
     config = CloudConfig(voxel_m=voxel_m, with_shape=True)
     features = voxelise(points, config).features
-    assert features.shape[1] == config.features
+    assert features.shape[1] == SHAPE_FEATURES
     return features
 
 

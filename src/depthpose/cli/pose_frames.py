@@ -38,7 +38,7 @@ def find_all(method: PoseMethod, inputs: OneObjectOptions, out: Path) -> int:
     What is found in NAME is called NAME_0, NAME_1, ...; an image where nothing is found has one
     entry, NAME, that says so. A rerun goes on where it was, and reads again what could not be read.
     """
-    lens = inputs.lens
+    lens = inputs.camera or inputs.focal_px
     assert inputs.depth is not None
     assert lens is not None
     objects = tuple(model.name for model in method.models)
@@ -60,7 +60,7 @@ def find_all(method: PoseMethod, inputs: OneObjectOptions, out: Path) -> int:
     facts = pose_predict.camera_facts(lens) | ({} if unit is None else {"unit": unit})
     settings = {**method.settings, "find": sorted(objects), **facts}
     pose_predict.claim(out, settings, jobs, pose_predict.is_result_of)
-    left = [p for p in kept_predictions(out) if p.is_finished]
+    left = [p for p in kept_predictions(out) if p.estimate.status != "unreadable"]
     results: list[tuple[Prediction, Job[Any]]] = []
     for job in tqdm(jobs, disable=None, unit=" images"):
         own = [p for p in left if pose_predict.is_result_of(p.estimate.name, job.name)]

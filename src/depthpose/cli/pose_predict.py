@@ -46,7 +46,6 @@ from depthpose.core.files.disk import natural_order
 from depthpose.core.files.images import LISTED_SUFFIXES, refuse_among_inputs
 from depthpose.core.run import is_whole, note_result
 from depthpose.core.units import Unit
-from depthpose.pose.cloud import object_points
 from depthpose.pose.config import EstimateConfig
 from depthpose.pose.datasets import (
     BopDataset,
@@ -100,12 +99,17 @@ def claim(
     run.claim_folder(out, settings, [POSES, _PAGE])
     if run.find_rank().world == 1 and not run.read_sources(out):  # lost: of what the poses are
         (out / POSES).unlink(missing_ok=True)
-    done = [name for name, prediction in known_predictions(out).items() if prediction.is_finished]
+
+    def is_finished(name: str) -> bool:
+        made = known_predictions(out).values()
+        done = [p.estimate.name for p in made if p.estimate.status != "unreadable"]
+        return any(is_result(one, name) for one in done)
+
     run.claim_names(
         out,
         {job.name: job.source for job in jobs if job.source is not None},
         [f".{end}" for end in (PICTURE, CLOUD)],
-        is_finished=lambda name: any(is_result(n, name) for n in done),
+        is_finished=is_finished,
     )
 
 
@@ -255,7 +259,7 @@ def _refuse_one_name(files: Sequence[Path]) -> None:
 
 def predict_files(method: PoseMethod, inputs: OneObjectOptions, out: Path, batch: int) -> int:
     """Pose clouds, or masked depth images, in this process; give the exit code."""
-    name, lens = object_named(inputs.object, method), inputs.lens
+    name, lens = object_named(inputs.object, method), inputs.camera or inputs.focal_px
     settings = {**method.settings, "object": name}
     if inputs.cloud is not None:
         unit = inputs.unit or "m"
@@ -325,7 +329,7 @@ def predict_all(
     process = run.find_rank()
     home = out if process.world == 1 else out / f"part-{process.rank}"
     known = known_predictions(out)
-    done = {name for name, prediction in known.items() if prediction.is_finished}
+    done = {name for name, made in known.items() if made.estimate.status != "unreadable"}
     left = [job for job in jobs[process.rank :: process.world] if job.name not in done]
     if left:
         made = predict(method.estimate_many, left, home, settings, batch)
@@ -389,7 +393,7 @@ def write_files(
             view = job.read()
         except InputError:  # unreadable by now
             continue
-        points_m = object_points(view, model.diameter_m)
+        points_m = drawn.object_points(view, model.diameter_m)
         files = [out / f"{job.name}.{CLOUD}"]
         write_cloud(files[0], drawn.posed_cloud(points_m, pose.double(), model))
         if isinstance(view, ViewInput):
@@ -407,8 +411,8 @@ def _picture_name(scene: int, image: int) -> str:
 
 def say_result(predictions: list[Prediction], out: Path) -> int:
     """Print how many were posed and why others were not; give the exit code."""
-    failed = [p.estimate for p in predictions if not p.is_finished]
-    shown = [p.estimate for p in predictions if p.is_finished]
+    failed = [p.estimate for p in predictions if p.estimate.status == "unreadable"]
+    shown = [p.estimate for p in predictions if p.estimate.status != "unreadable"]
     for estimate in failed:
         print(f"depthpose: failed: {estimate.name}: {estimate.reason}", file=sys.stderr)
     if shown:
@@ -429,8 +433,8 @@ def say_result(predictions: list[Prediction], out: Path) -> int:
         what = "refused" if shown[0].camera_from_model is None else shown[0].status
         print(f"{what}: {shown[0].reason}")
     for prediction in predictions[:_SAID]:
-        for line in drawn.alternative_lines(prediction.estimate):
-            print(f"{prediction.estimate.name}: {line}")
+        for other in prediction.estimate.alternatives:
+            print(f"{prediction.estimate.name}: {other}")
     inputs = "1 input" if len(predictions) == 1 else f"{len(predictions)} inputs"
     print(f"{inputs}: {_statuses(shown) or 'none readable'}; {out / 'poses.json'}")
     return 1 if failed else 0
@@ -449,7 +453,7 @@ def _row(estimate: PoseEstimate) -> dict[str, Any]:
         "fit": None if fit is None else fit.agrees,
         "identity": None if identity is None else identity.status,
         "certainty": estimate.certainty,
-        "alternatives": "; ".join(drawn.alternative_lines(estimate)),
+        "alternatives": "; ".join(map(str, estimate.alternatives)),
         "reason": estimate.reason,
     }
 
@@ -472,7 +476,7 @@ def _write_page(
     estimates = [prediction.estimate for prediction in predictions]
     counts = _statuses(estimates)
     rows = [_row(one) for one in sorted(estimates, key=lambda one: one.is_posed)[:_MOST_ROWS]]
-    readable = [k for k, prediction in enumerate(predictions) if prediction.is_finished]
+    readable = [k for k, one in enumerate(estimates) if one.status != "unreadable"]
     sections: list[Section] = []
     for k in choose_answers([predictions[k].estimate.is_posed for k in readable]):
         estimate, place = predictions[readable[k]].estimate, predictions[readable[k]].place
@@ -530,7 +534,7 @@ def start_files(
             estimate = one if isinstance(one, PoseEstimate) else next(answers)
             prediction = Prediction(estimate=estimate)
             write_json(out / f"{sample.name}.{ENDING}", prediction_row(prediction))
-            reasons.append("" if prediction.is_finished else estimate.reason)
+            reasons.append("" if prediction.estimate.status != "unreadable" else estimate.reason)
         return reasons
 
     return predict
@@ -540,7 +544,7 @@ def predict_on_ray(
     options: OneObjectOptions, source: MethodSource, batch: int, out: str, engine: EngineOptions
 ) -> int:
     """Pose clouds, depth images and masks, manifests or tar shards by the workers of an engine."""
-    if options.depth is not None and options.lens is None:
+    if options.depth is not None and (options.camera or options.focal_px) is None:
         raise InputError("--depth needs --camera or --focal-px beside it")
     views = Files(roles=("depth", "mask"), suffixes=(*LISTED_SUFFIXES, ".json"))
     files = cloud_files() if options.depth is None else views
@@ -556,7 +560,7 @@ def predict_on_ray(
     method = source.build("cpu")
     object = object_named(options.object or None, method)
     with inputs.first() as first:
-        lens = options.lens
+        lens = options.camera or options.focal_px
         camera = None if lens is None else camera_of(lens, image_size(first[0]))
     start = partial(start_files, source, object, options.unit, camera)
     work = Work(start=start, files=files, endings=(ENDING,), batch=batch)

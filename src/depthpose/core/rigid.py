@@ -124,9 +124,7 @@ def geodesic_rad(
 
 def perturb(pose: Rigid, motion: Float[Tensor, "*batch 6"]) -> Rigid:
     """Move a pose by (rotation vector [rad], translation [m]) in the camera frame."""
-    turn = rotation_by(motion[..., :3])
-    moved_m = (turn @ pose.t_m[..., None]).squeeze(-1) + motion[..., 3:]
-    return Rigid(turn @ pose.R, moved_m)
+    return Rigid(rotation_by(motion[..., :3]), motion[..., 3:]) @ pose
 
 
 def rotation_by(vector: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3 3"]:

@@ -196,13 +196,6 @@ def cloud_from_depth(
     return points_m[~is_flying(points_m, diameter_m * config.max_offset_diameters)]
 
 
-def object_points(given: CloudInput | ViewInput, diameter_m: float) -> Float[Tensor, "n 3"]:
-    """Give the points of an input that are readings, of a depth image without flying pixels."""
-    if isinstance(given, ViewInput):
-        return cloud_from_depth(given.depth_m, given.mask, given.K, diameter_m).float()
-    return given.points_m[is_reading(given.points_m)].float()
-
-
 def lift_sample(view: ViewSample, diameter_m: float, config: CloudConfig) -> CloudSample:
     """Lift a view of an object to its cloud, without flying pixels."""
     given = view.input

@@ -60,11 +60,6 @@ class Prediction:
     estimate: PoseEstimate
     place: Place | None = None  #: scene, image and object; None for a cloud of no data set
 
-    @property
-    def is_finished(self) -> bool:
-        """Whether a rerun need not estimate it: an input that was unreadable may be repaired."""
-        return self.estimate.status != "unreadable"
-
 
 class Predictions(list[Prediction]):
     """Estimates in their order, which pandas may tabulate."""
@@ -126,7 +121,7 @@ def known_predictions(folder: Path) -> dict[str, Prediction]:
     folders = [folder, *sorted(folder.glob("part-*"))]
     every = [prediction for one in folders for prediction in kept_predictions(one)]
     # What was read at last counts, whatever another part said of an earlier try.
-    every.sort(key=lambda prediction: prediction.is_finished)
+    every.sort(key=lambda prediction: prediction.estimate.status != "unreadable")
     return {prediction.estimate.name: prediction for prediction in every}
 
 
@@ -153,7 +148,7 @@ def prediction_row(prediction: Prediction) -> dict[str, Any]:
         row[name] = None if values is None else values.double().tolist()
     # JSON has no infinity: a free axis has no deviation, nothing near the surface no distance.
     for name in ("origin_std_mm", "rotation_std_deg"):
-        values = getattr(estimate, name)
+        values = None if pose is None else getattr(estimate, name)
         known = [] if values is None else values.tolist()
         row[name] = [v if math.isfinite(v) else None for v in known] or None
     for name in ("inlier_share", "residual_m", "certainty"):
@@ -315,7 +310,7 @@ def predict(
 ) -> Generator[Prediction, None, None]:
     """Yield the finished, and estimate and yield the others; ``poses.json`` grows as it goes.
 
-    What was unreadable is tried again.
+    What was unreadable is tried again: it may have been repaired.
 
     What was estimated is saved every 200 jobs, and when the work ends or is interrupted.
 
@@ -329,7 +324,7 @@ def predict(
     claim_folder(folder, settings, [POSES])
     wanted = list(jobs)
     done = {p.estimate.name: p for p in kept_predictions(folder)}
-    finished = {name for name, prediction in done.items() if prediction.is_finished}
+    finished = {name for name, made in done.items() if made.estimate.status != "unreadable"}
     yield from (done[job.name] for job in wanted if job.name in finished)
     left = [job for job in wanted if job.name not in finished]
     unsaved = 0

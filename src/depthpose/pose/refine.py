@@ -18,11 +18,10 @@ from depthpose.pose.compiled import (
     ON_RAY,
     SEARCHED,
     SLACK,
-    finite_array,
     serves,
 )
 from depthpose.pose.config import IcpConfig
-from depthpose.pose.surface import Surface, look_along_rays
+from depthpose.pose.surface import Surface, finite_array, look_along_rays
 
 _CONVERGED = 3e-4  # stop when a step turns [rad] and shifts [diameters] by less than this
 _TURN_RAD = math.radians(15)  # by how much further starts are turned

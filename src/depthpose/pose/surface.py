@@ -12,7 +12,7 @@ from torch import Tensor
 from torch.nn.functional import avg_pool2d, max_pool2d, pad
 
 from depthpose.core.rigid import Rigid
-from depthpose.pose.compiled import finite_array, serves
+from depthpose.pose.compiled import serves
 from depthpose.pose.mesh import sample_surface, symmetry_transforms
 from depthpose.pose.mesh.models import fibonacci_directions
 from depthpose.pose.types import ObjectModel
@@ -124,6 +124,17 @@ class Surface:
             place[self.across.numpy()[tree.order]].astype(np.int32),
             self.ball_m.numpy(),
         )
+
+
+def finite_array(array: np.ndarray) -> np.ndarray:
+    """Give what a compiled loop reads: contiguous, and finite, as cells and trees need it.
+
+    Raises:
+        ValueError: a value is not finite.
+    """
+    if not np.isfinite(array).all():
+        raise ValueError("values must be finite; leave out what is not")
+    return np.ascontiguousarray(array)
 
 
 def _view_of(surface: Surface, toward: Tensor, across: Tensor) -> tuple[Tensor, ...]:

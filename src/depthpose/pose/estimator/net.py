@@ -217,7 +217,12 @@ class GeoPoseNet(PoseEstimator):
         for some in _batches(prepared, self.config.batch_voxels):
             ready = [one for one in some if isinstance(one, _Cloud)]
             if ready:
-                self._ask(ready)
+                numbers = [one.known.number for one in ready]
+                outputs, spent_s = self._directions([one.cloud for one in ready], numbers)
+                total = sum(map(len, outputs))
+                for one, own in zip(ready, outputs, strict=True):  # each has a share of the time
+                    one.outputs = own
+                    one.seconds["network"] = spent_s * len(own) / total
             yield from each_in_threads(work, some, threads)
 
     def _prepare(self, given: AnyInput) -> "_Cloud | PoseEstimate":
@@ -229,11 +234,11 @@ class GeoPoseNet(PoseEstimator):
             return refused(given, prepared, seconds)
         return _Cloud(given=given, known=known, cloud=prepared, seconds=seconds)
 
-    def _ask(self, ready: list["_Cloud"]) -> None:
-        """Ask the network for directions in the camera frame; each has its share of the time."""
+    def _directions(
+        self, clouds: list[ObjectCloud], numbers: list[int]
+    ) -> tuple[list[Float[Tensor, "n k 3"]], float]:
+        """Ask for the directions to the keypoints in the camera frame; give the seconds too."""
         start = time.perf_counter()
-        clouds = [one.cloud for one in ready]
-        numbers = torch.tensor([one.known.number for one in ready])
         counts = [len(cloud.points_m) for cloud in clouds]
         cloud_of_point = torch.repeat_interleave(torch.arange(len(clouds)), torch.tensor(counts))
         grids = [cloud.voxels for cloud in clouds]
@@ -244,14 +249,11 @@ class GeoPoseNet(PoseEstimator):
             points_m=points_m.to(device),
             coordinates=torch.cat([cloud_of_point[:, None], coordinates], 1).to(device),
             features=torch.cat([grid.features for grid in grids]).to(device),
-            class_of_point=numbers[cloud_of_point].to(device),
+            class_of_point=torch.tensor(numbers)[cloud_of_point].to(device),
         )
         outputs = self._network.directions(seen).float().cpu().split(counts)
-        for one, some in zip(ready, outputs, strict=True):
-            one.outputs = some @ one.cloud.voxels.grid_from_camera
-        spent_s = time.perf_counter() - start
-        for one, count in zip(ready, counts, strict=True):
-            one.seconds["network"] = spent_s * count / sum(counts)
+        found = [some @ grid.grid_from_camera for some, grid in zip(outputs, grids, strict=True)]
+        return found, time.perf_counter() - start
 
     def _pose(
         self, one: "_Cloud | PoseEstimate", *, is_likely: bool

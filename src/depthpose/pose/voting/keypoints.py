@@ -353,9 +353,7 @@ def fit_pose(
             break
         pull = (weighted @ (found - moved_m)[..., None]).sum(-3).squeeze(-1)
         motion = torch.linalg.solve(H, pull)
-        turn = rotation_by(motion[..., :3])
-        turned_m = (turn @ pose.t_m[..., None]).squeeze(-1)
-        pose = Rigid(turn @ pose.R, turned_m + motion[..., 3:])
+        pose = Rigid(rotation_by(motion[..., :3]), motion[..., 3:]) @ pose
         moved_m = pose.apply(model)
         steps += 1
     error_m = moved_m - found

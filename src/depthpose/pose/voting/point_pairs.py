@@ -14,9 +14,9 @@ from torch.nn.functional import normalize
 
 from depthpose.core.rigid import Rigid
 from depthpose.pose.cloud import thin
-from depthpose.pose.compiled import ANGLES, DISTANCES, MOST_ALIKE, TURNS, finite_array, serves
+from depthpose.pose.compiled import ANGLES, DISTANCES, MOST_ALIKE, TURNS, serves
 from depthpose.pose.mesh.models import fibonacci_directions
-from depthpose.pose.surface import Surface, look_along_rays
+from depthpose.pose.surface import Surface, finite_array, look_along_rays
 
 STEP = 0.07
 """Of the diameter: distance of the points of the model, and a bin of the distances of a pair."""
