@@ -44,6 +44,7 @@ from fpfh import FpfhEstimator
 from depthpose.core.camera import Camera
 from depthpose.core.files import write_depth_png
 from depthpose.core.rigid import Rigid
+from depthpose.pose.cloud import thin
 from depthpose.pose.config import EvaluationConfig
 from depthpose.pose.datasets import Instance
 from depthpose.pose.estimator.hypotheses import is_no_side
@@ -56,7 +57,6 @@ from depthpose.pose.predictions import Place, Prediction
 from depthpose.pose.surface import Surface, prepare_surface
 from depthpose.pose.synthetic.parts import PARTS, make_part
 from depthpose.pose.types import CloudInput, ObjectModel, PoseEstimate
-from depthpose.pose.voting.point_pairs import thin
 from depthpose.report.page import markdown_table
 
 KINDS = {"piles": (20, (0, 4)), "tables": (0, (0, 4)), "clutter": (0, (8, 16))}

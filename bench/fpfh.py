@@ -11,9 +11,9 @@ from torch import Tensor
 
 from depthpose.core.errors import import_open3d
 from depthpose.core.rigid import Rigid
-from depthpose.pose.cloud import object_points
 from depthpose.pose.mesh import sample_surface
 from depthpose.pose.types import CloudInput, ObjectModel, PoseEstimate, ViewInput
+from depthpose.report.pose import object_points
 
 VOXEL_DIAMETERS = 0.03  # side of a voxel in diameters of the object
 _ITERATIONS = 100_000  # of RANSAC, at most

@@ -17,7 +17,6 @@ from scipy.spatial.transform import Rotation
 from depthpose.core.files import read_cloud, read_depth_png
 from depthpose.core.render import rasterize
 from depthpose.core.rigid import Rigid
-from depthpose.pose.cloud import object_points
 from depthpose.pose.datasets import open_bop
 from depthpose.pose.mesh import read_model, with_found_symmetries
 from depthpose.pose.types import (
@@ -28,6 +27,7 @@ from depthpose.pose.types import (
     ViewInput,
     ViewSample,
 )
+from depthpose.report.pose import object_points
 
 _MASKED_M = 0.03
 _SCANNER_M = 0.7

@@ -21,7 +21,6 @@ from depthpose.depth.metrics import measure
 from depthpose.depth.predictions import CLOUD_M, write_estimate
 from depthpose.depth.synthetic import Streets
 from depthpose.depth.types import DepthError, StereoInput, StereoSample, StereoTruth
-from depthpose.pose.cloud import object_points
 from depthpose.pose.config import ObjectsConfig
 from depthpose.pose.datasets import open_bop, write_bop_models, write_bop_scene
 from depthpose.pose.datasets.dataset import write_mask
@@ -32,7 +31,7 @@ from depthpose.pose.synthetic import make_frames
 from depthpose.report import page as pages
 from depthpose.report.depth import depth_section
 from depthpose.report.page import Layer, Picture, Scene, Section, depth_scale
-from depthpose.report.pose import draw_pose, grey_depth, pose_layers, posed_cloud
+from depthpose.report.pose import draw_pose, grey_depth, object_points, pose_layers, posed_cloud
 
 _STREETS_SEED = 9  # no weights were trained on streets of this seed
 _STREET = 1

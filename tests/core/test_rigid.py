@@ -3,7 +3,7 @@ import pytest
 import torch
 
 from depthpose.core.errors import InputError
-from depthpose.core.rigid import Rigid, fit_rigid, geodesic_rad, turn_axis_to
+from depthpose.core.rigid import Rigid, fit_rigid, geodesic_rad
 
 Batch = tuple[int, ...]
 
@@ -71,18 +71,6 @@ def test_geodesic_measures_the_angle_about_an_axis(angle: float) -> None:
     turn = torch.stack([c, -s, o, s, c, o, o, o, i]).reshape(3, 3)
     R = random_rigid(()).R
     torch.testing.assert_close(geodesic_rad(turn @ R, R), a, rtol=1e-6, atol=1e-12)
-
-
-@pytest.mark.parametrize("direction", [(0, 0, 1), (0, 0, -1), (0.3, -2, 0.1)])
-def test_the_axis_turns_to_a_direction_the_shortest_way(direction: tuple[float, ...]) -> None:
-    towards = torch.tensor(direction, dtype=torch.float64)
-    R = turn_axis_to(towards)
-    assert torch.allclose(R[:, 2], towards / towards.norm(), atol=1e-9)
-    assert torch.allclose(R @ R.mT, torch.eye(3).double(), atol=1e-9)
-    assert float(torch.linalg.det(R)) > 0
-    angle = torch.acos((towards / towards.norm())[2])
-    # The shortest: it turns by no more than the angle between the two.
-    assert torch.allclose((R.trace() - 1) / 2, angle.cos(), atol=1e-9)
 
 
 @pytest.mark.parametrize("batch", [(), (4,), (2, 3)])

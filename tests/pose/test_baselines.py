@@ -9,7 +9,7 @@ from torch import Tensor
 
 from depthpose.core.camera import project
 from depthpose.core.render import rasterize
-from depthpose.core.rigid import Rigid, perturb, turn_axis_to
+from depthpose.core.rigid import Rigid, perturb
 from depthpose.pose.baselines import (
     EMPTY,
     DepthCrop,
@@ -21,6 +21,7 @@ from depthpose.pose.baselines import (
     poses_of,
     rotation_from_6d,
 )
+from depthpose.pose.cloud import turn_axis_to
 from depthpose.pose.losses import model_point_loss
 from depthpose.pose.mesh import drawn_triangles, sample_surface
 from depthpose.pose.types import SeenPoints, ViewInput

@@ -16,7 +16,6 @@ from depthpose.cli import main
 from depthpose.core.errors import InputError
 from depthpose.core.files import read_json, write_depth_png
 from depthpose.core.rigid import Rigid
-from depthpose.pose.cloud import object_points
 from depthpose.pose.datasets import (
     BopFrame,
     BopObject,
@@ -30,6 +29,7 @@ from depthpose.pose.datasets.layouts import read_bop_models, segnet_mask
 from depthpose.pose.mesh import make_model, turn_about
 from depthpose.pose.train.poses import keypoint_copies
 from depthpose.pose.types import ObjectModel, Symmetries
+from depthpose.report.pose import object_points
 
 K = torch.tensor([[500.0, 0, 40], [0, 500, 30], [0, 0, 1]]).double()
 

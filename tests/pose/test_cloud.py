@@ -8,18 +8,18 @@ from depthpose.core.camera import project
 from depthpose.core.config import config_from_dict
 from depthpose.core.errors import InputError
 from depthpose.core.files import read_depth_png, read_image
-from depthpose.core.rigid import turn_axis_to
 from depthpose.pose.cloud import (
     cloud_from_depth,
     is_flying,
     is_reading,
-    object_points,
     refusal_of,
     sample_points,
+    turn_axis_to,
     voxelise,
 )
-from depthpose.pose.config import CloudConfig
+from depthpose.pose.config import SHAPE_FEATURES, CloudConfig
 from depthpose.pose.types import CloudInput
+from depthpose.report.pose import object_points
 
 K = torch.tensor([[500.0, 0, 32], [0, 500, 24], [0, 0, 1]]).double()
 
@@ -175,7 +175,7 @@ def test_a_cloud_at_the_side_has_the_grid_of_one_straight_ahead() -> None:
 def shape_of(points: torch.Tensor, voxel_m: float = 0.01) -> torch.Tensor:
     config = CloudConfig(voxel_m=voxel_m, with_shape=True)
     features = voxelise(points, config).features
-    assert features.shape[1] == config.features
+    assert features.shape[1] == SHAPE_FEATURES
     return features
 
 
@@ -227,3 +227,15 @@ def test_three_points_have_a_shape_too() -> None:
     assert bool(features.isfinite().all())
     torch.testing.assert_close(features[:, 8], torch.zeros(3))
     assert bool(shape_of(few[:1]).isfinite().all())
+
+
+@pytest.mark.parametrize("direction", [(0, 0, 1), (0, 0, -1), (0.3, -2, 0.1)])
+def test_the_axis_turns_to_a_direction_the_shortest_way(direction: tuple[float, ...]) -> None:
+    towards = torch.tensor(direction, dtype=torch.float64)
+    R = turn_axis_to(towards)
+    assert torch.allclose(R[:, 2], towards / towards.norm(), atol=1e-9)
+    assert torch.allclose(R @ R.mT, torch.eye(3).double(), atol=1e-9)
+    assert float(torch.linalg.det(R)) > 0
+    angle = torch.acos((towards / towards.norm())[2])
+    # The shortest: it turns by no more than the angle between the two.
+    assert torch.allclose((R.trace() - 1) / 2, angle.cos(), atol=1e-9)

@@ -8,7 +8,7 @@ from torch import Tensor
 
 from depthpose.core.errors import InputError
 from depthpose.core.rigid import Rigid, cross_matrix, perturb
-from depthpose.pose.cloud import object_points, voxelise
+from depthpose.pose.cloud import voxelise
 from depthpose.pose.config import CloudConfig
 from depthpose.pose.datasets import open_bop
 from depthpose.pose.estimator.fit import free_motions
@@ -21,6 +21,7 @@ from depthpose.pose.voting import (
     fit_pose,
     vote_ransac,
 )
+from depthpose.report.pose import object_points
 
 
 def misfit(pose: Rigid, model: Tensor, found: Tensor, covariance: Tensor) -> Tensor:

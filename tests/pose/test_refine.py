@@ -11,7 +11,7 @@ from depthpose.core.config import config_from_dict
 from depthpose.core.errors import InputError
 from depthpose.core.render import rasterize
 from depthpose.core.rigid import Rigid, cross_matrix, geodesic_rad, perturb
-from depthpose.pose.cloud import cloud_from_depth, object_points
+from depthpose.pose.cloud import cloud_from_depth
 from depthpose.pose.config import IcpConfig, SensorConfig, SensorKind
 from depthpose.pose.datasets import open_bop
 from depthpose.pose.mesh import drawn_triangles, make_model, sample_surface
@@ -21,6 +21,7 @@ from depthpose.pose.refine import _covariance, refine_best, refine_pose
 from depthpose.pose.surface import Surface, prepare_surface
 from depthpose.pose.synthetic.views import measure
 from depthpose.pose.types import ObjectModel, Symmetries
+from depthpose.report.pose import object_points
 
 ORIGIN = torch.zeros(3).double()
 

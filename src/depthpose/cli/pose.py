@@ -61,7 +61,8 @@ def predict(
             f"--cloud {inputs.cloud}: the weights {weights} need depth images; give --depth, "
             "--mask and --camera, or weights that vote"
         )
-    if inputs.depth is not None and inputs.mask is None and inputs.lens is not None:
+    lens = inputs.camera or inputs.focal_px
+    if inputs.depth is not None and inputs.mask is None and lens is not None:
         return find_all(method, inputs, home)
     return predict_files(method, inputs, home, batch)
 

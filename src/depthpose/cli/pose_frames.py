@@ -23,9 +23,9 @@ from depthpose.pose.estimator.inputs import AnyInput
 from depthpose.pose.predictions import (
     Job,
     Prediction,
-    is_finished,
     kept_predictions,
     place_of,
+    unreadable,
     write_predictions,
 )
 from depthpose.pose.surface import prepare_surface
@@ -38,10 +38,10 @@ def find_all(method: PoseMethod, inputs: OneObjectOptions, out: Path) -> int:
     What is found in NAME is called NAME_0, NAME_1, ...; an image where nothing is found has one
     entry, NAME, that says so. A rerun goes on where it was, and reads again what could not be read.
     """
-    lens = inputs.lens
+    lens = inputs.camera or inputs.focal_px
     assert inputs.depth is not None
     assert lens is not None
-    objects = tuple(method.models_by_name)
+    objects = tuple(model.name for model in method.models)
     if inputs.object is not None:
         objects = (pose_predict.object_named(inputs.object, method),)
     if method.find is None:
@@ -60,16 +60,18 @@ def find_all(method: PoseMethod, inputs: OneObjectOptions, out: Path) -> int:
     facts = pose_predict.camera_facts(lens) | ({} if unit is None else {"unit": unit})
     settings = {**method.settings, "find": sorted(objects), **facts}
     pose_predict.claim(out, settings, jobs, pose_predict.is_result_of)
-    left = [p for p in kept_predictions(out) if is_finished(p)]
+    left = [p for p in kept_predictions(out) if p.estimate.status != "unreadable"]
     results: list[tuple[Prediction, Job[Any]]] = []
     for job in tqdm(jobs, disable=None, unit=" images"):
         own = [p for p in left if pose_predict.is_result_of(p.estimate.name, job.name)]
         left = [p for p in left if p not in own]
-        view = None if own else job.read()
-        if isinstance(view, PoseEstimate):  # that says why it cannot be read
-            own = [Prediction(estimate=view)]
-        elif view is not None:
-            found = method.find(view, objects) or [nothing_found(view, ", ".join(objects))]
+        if not own:
+            try:
+                view = job.read()
+            except InputError as error:
+                found = [unreadable(job.name, objects[0], error)]
+            else:
+                found = method.find(view, objects) or [nothing_found(view, ", ".join(objects))]
             own = [Prediction(estimate=one) for one in found]
         results += [(one, explained_job(job, one.estimate, method)) for one in own]
         write_predictions(out, [*(prediction for prediction, _ in results), *left])
@@ -81,9 +83,9 @@ def find_all(method: PoseMethod, inputs: OneObjectOptions, out: Path) -> int:
 
 def explained_job(job: Job[Any], estimate: PoseEstimate, method: PoseMethod) -> Job[Any]:
     """Take what was found in a whole depth image as if a mask had given it."""
-    model = method.models_by_name.get(estimate.object)
+    model = next((one for one in method.models if one.name == estimate.object), None)
 
-    def read() -> AnyInput | PoseEstimate:
+    def read() -> AnyInput:
         view, pose = job.read(), estimate.camera_from_model
         if model is None or pose is None or not isinstance(view, ViewInput):
             return view
@@ -146,8 +148,7 @@ def _frame_job(instance: Instance, name: str) -> Job[Any]:
             name=instance.name, depth_m=depth_m, mask=everywhere, K=instance.K, object=name
         )
 
-    job = Job(name=instance.name, read=read, place=place_of(instance))
-    return pose_predict.safe_job(job, name)
+    return Job(name=instance.name, read=read, object=name, place=place_of(instance))
 
 
 def _finish(
@@ -191,9 +192,10 @@ def _followed(
 
     def readable() -> Iterator[Any]:
         for job in tqdm(jobs, disable=None, unit=" frames"):
-            frame = job.read()
-            if isinstance(frame, PoseEstimate):
-                skipped.append(frame)
+            try:
+                frame = job.read()
+            except InputError as error:
+                skipped.append(unreadable(job.name, name, error))
             else:
                 yield frame
 

@@ -218,11 +218,6 @@ class PoseMethod:
     track: Callable[[Iterable[AnyInput], str, Rigid | None], Iterator[PoseEstimate]] | None = None
     holder: str = "weights"
 
-    @property
-    def models_by_name(self) -> dict[str, ObjectModel]:
-        """The objects by their names."""
-        return {model.name: model for model in self.models}
-
 
 def pose_methods(
     names: Sequence[str], config: EstimateConfig, models: Sequence[ObjectModel] = ()

@@ -100,11 +100,6 @@ class OneObjectOptions:
     unit: Unit | None = None
     """unit of clouds (default m), and of depth images whose camera file gives none."""
 
-    @property
-    def lens(self) -> Path | float | None:
-        """The camera file, or the focal length; None where neither is given."""
-        return self.focal_px if self.camera is None else self.camera
-
 
 @dataclass(frozen=True, kw_only=True)
 class DataSetOptions:

@@ -44,10 +44,8 @@ from depthpose.core.files import (
 )
 from depthpose.core.files.disk import natural_order
 from depthpose.core.files.images import LISTED_SUFFIXES, refuse_among_inputs
-from depthpose.core.rigid import numbers_text
 from depthpose.core.run import is_whole, note_result
 from depthpose.core.units import Unit
-from depthpose.pose.cloud import object_points
 from depthpose.pose.config import EstimateConfig
 from depthpose.pose.datasets import (
     BopDataset,
@@ -64,15 +62,15 @@ from depthpose.pose.predictions import (
     POSES,
     Job,
     Prediction,
-    is_finished,
-    kept_predictions,
+    known_predictions,
     predict,
     prediction_row,
     results_name,
+    unreadable,
     write_bop_results,
     write_predictions,
 )
-from depthpose.pose.types import PoseEstimate, ViewInput
+from depthpose.pose.types import ObjectModel, PoseEstimate, ViewInput
 from depthpose.report import pose as drawn
 from depthpose.report.page import Section, choose_answers, plain_table, write_page
 
@@ -101,12 +99,17 @@ def claim(
     run.claim_folder(out, settings, [POSES, _PAGE])
     if run.find_rank().world == 1 and not run.read_sources(out):  # lost: of what the poses are
         (out / POSES).unlink(missing_ok=True)
-    done = [name for name, prediction in _known(out).items() if is_finished(prediction)]
+
+    def is_finished(name: str) -> bool:
+        made = known_predictions(out).values()
+        done = [p.estimate.name for p in made if p.estimate.status != "unreadable"]
+        return any(is_result(one, name) for one in done)
+
     run.claim_names(
         out,
         {job.name: job.source for job in jobs if job.source is not None},
         [f".{end}" for end in (PICTURE, CLOUD)],
-        is_finished=lambda name: any(is_result(n, name) for n in done),
+        is_finished=is_finished,
     )
 
 
@@ -125,7 +128,7 @@ def claim_bop(out: Path, settings: dict[str, Any], dataset: BopDataset) -> None:
 
 def object_named(name: str | None, method: PoseMethod) -> str:
     """Give the object that is meant."""
-    known = list(method.models_by_name)
+    known = [model.name for model in method.models]
     if name is None and len(known) > 1:
         raise InputError(f"the {method.holder} know {', '.join(known)}; say which by --object")
     if name is not None and name not in known:
@@ -154,11 +157,15 @@ def cloud_jobs(cloud: Path, unit: Unit, object: str, out: Path) -> list[Job[Any]
         raise InputError(f"{cloud}: no {', '.join(known)} file there; give a cloud, or a folder")
     _refuse_one_name(files)
     refuse_among_inputs(out, [cloud], files)
-    jobs = [
-        Job(name=p.stem, read=partial(cloud_input, p, unit, object, p.stem), source=p)
+    return [
+        Job(
+            name=p.stem,
+            read=partial(cloud_input, p, unit, object, p.stem),
+            object=object,
+            source=p,
+        )
         for p in files
     ]
-    return [safe_job(job, object) for job in jobs]
 
 
 def view_jobs(
@@ -198,8 +205,8 @@ def view_jobs(
         for end, one in own.items():
             name = path.stem + end
             read = partial(view_input, path, one, camera, object, name, unit)
-            job = Job(name=name, read=read, source=(path, masks[path.stem]))
-            jobs.append(safe_job(job, object))
+            files = (path, masks[path.stem])
+            jobs.append(Job(name=name, read=read, object=object, source=files))
     twice = [name for name, count in Counter(job.name for job in jobs).items() if count > 1]
     if twice:
         raise InputError(
@@ -216,11 +223,15 @@ def frame_jobs(
     depths = _list_depths(depth)
     refuse_among_inputs(out, [depth], depths)
     _refuse_one_name(depths)
-    jobs = [
-        Job(name=p.stem, read=partial(view_input, p, None, camera, object, p.stem, unit), source=p)
+    return [
+        Job(
+            name=p.stem,
+            read=partial(view_input, p, None, camera, object, p.stem, unit),
+            object=object,
+            source=p,
+        )
         for p in depths
     ]
-    return [safe_job(job, object) for job in jobs]
 
 
 def _list_depths(depth: Path) -> list[Path]:
@@ -246,22 +257,9 @@ def _refuse_one_name(files: Sequence[Path]) -> None:
             )
 
 
-def safe_job(job: Job[Any], object: str) -> Job[Any]:
-    """Let the job of what cannot be read give the estimate that says so, and stop no other."""
-
-    def read() -> AnyInput | PoseEstimate:
-        try:
-            return job.read()
-        except InputError as error:
-            said = f"cannot be read: {error}"
-            return PoseEstimate(name=job.name, object=object, status="unreadable", reason=said)
-
-    return replace(job, read=read)
-
-
 def predict_files(method: PoseMethod, inputs: OneObjectOptions, out: Path, batch: int) -> int:
     """Pose clouds, or masked depth images, in this process; give the exit code."""
-    name, lens = object_named(inputs.object, method), inputs.lens
+    name, lens = object_named(inputs.object, method), inputs.camera or inputs.focal_px
     settings = {**method.settings, "object": name}
     if inputs.cloud is not None:
         unit = inputs.unit or "m"
@@ -300,7 +298,11 @@ def predict_dataset(
     dataset = pose_methods.chosen_objects(dataset, method, object)
     (found,) = pose_methods.find_masks([options.masks], dataset, out, config.device)
     names = pose_methods.match_names(dataset, method.models)
-    jobs = [safe_job(j, names[j.place.object_id]) for j in found.jobs(names) if j.place is not None]
+    jobs: list[Job[Any]] = [
+        replace(job, object=names[job.place.object_id])
+        for job in found.jobs(names)
+        if job.place is not None
+    ]
     settings = {**method.settings, "estimate": config_to_dict(config)}
     settings |= {**pose_methods.of_dataset(dataset), "masks": found.name, **found.settings}
     if object is not None:
@@ -326,12 +328,13 @@ def predict_all(
     """
     process = run.find_rank()
     home = out if process.world == 1 else out / f"part-{process.rank}"
-    done = {name for name, prediction in _known(out).items() if is_finished(prediction)}
+    known = known_predictions(out)
+    done = {name for name, made in known.items() if made.estimate.status != "unreadable"}
     left = [job for job in jobs[process.rank :: process.world] if job.name not in done]
     if left:
-        names = predict(method.estimate_many, left, home, settings, batch)
-        for _ in tqdm(names, total=len(left), disable=None, unit=" poses"):
-            pass
+        made = predict(method.estimate_many, left, home, settings, batch)
+        for prediction in tqdm(made, total=len(left), disable=None, unit=" poses"):
+            known[prediction.estimate.name] = prediction
     if process.rank:
         return None
     if process.world > 1:
@@ -340,22 +343,15 @@ def predict_all(
         def is_there(name: str) -> bool:
             # Files of all parts are read for all names at once, every second.
             if name not in seen["names"] and time.monotonic() - seen["at"] > 1:
-                seen["names"], seen["at"] = set(_known(out)), time.monotonic()
+                seen["names"], seen["at"] = set(known_predictions(out)), time.monotonic()
             return name in seen["names"]
 
         run.wait_for([job.name for job in jobs], is_there)
-    known = _known(out)
+        known = known_predictions(out)
     predictions = [known.pop(job.name) for job in jobs]
     # Inputs of earlier runs stay in the file.
     write_predictions(out, [*known.values(), *predictions])
     return predictions
-
-
-def _known(out: Path) -> dict[str, Prediction]:
-    folders = [out, *sorted(out.glob("part-*"))]
-    every = [p for folder in folders for p in kept_predictions(folder)]
-    # What was read at last counts, whatever another part said of an earlier try.
-    return {p.estimate.name: p for p in sorted(every, key=is_finished)}
 
 
 def write_files(
@@ -366,6 +362,7 @@ def write_files(
     dataset: BopDataset | None = None,
 ) -> None:
     """Write the files of poses, or of a data set's, and the page."""
+    models = {model.name: model for model in method.models}
     if dataset is not None:
         write_bop_results(out / results_name(dataset), predictions)
         if any(p.estimate.alternatives for p in predictions):
@@ -382,7 +379,7 @@ def write_files(
                 picture = drawn.picture_of(image_of[image])
                 for estimate in estimates:
                     assert estimate.camera_from_model is not None
-                    model = method.models_by_name[estimate.object]
+                    model = models[estimate.object]
                     pose, K = estimate.camera_from_model, image_of[image].K
                     picture = drawn.draw_pose(picture, pose, model, K)
                 write_image(out / name, picture)
@@ -391,19 +388,21 @@ def write_files(
         pose = prediction.estimate.camera_from_model
         if pose is None:
             continue
-        view, model = job.read(), method.models_by_name[prediction.estimate.object]
-        if isinstance(view, PoseEstimate):  # unreadable by now
+        model = models[prediction.estimate.object]
+        try:
+            view = job.read()
+        except InputError:  # unreadable by now
             continue
-        points_m = object_points(view, model.diameter_m)
+        points_m = drawn.object_points(view, model.diameter_m)
         files = [out / f"{job.name}.{CLOUD}"]
-        write_cloud(files[0], drawn.posed_cloud(points_m, pose, model))
+        write_cloud(files[0], drawn.posed_cloud(points_m, pose.double(), model))
         if isinstance(view, ViewInput):
             files.append(out / f"{job.name}.{PICTURE}")
             write_image(
                 files[1], drawn.draw_pose(drawn.grey_depth(view.depth_m), pose, model, view.K)
             )
         note_result(out, job.name, files)
-    _write_page(out, predictions, jobs, method, dataset)
+    _write_page(out, predictions, jobs, models, dataset)
 
 
 def _picture_name(scene: int, image: int) -> str:
@@ -412,8 +411,8 @@ def _picture_name(scene: int, image: int) -> str:
 
 def say_result(predictions: list[Prediction], out: Path) -> int:
     """Print how many were posed and why others were not; give the exit code."""
-    failed = [p.estimate for p in predictions if not is_finished(p)]
-    shown = [p.estimate for p in predictions if is_finished(p)]
+    failed = [p.estimate for p in predictions if p.estimate.status == "unreadable"]
+    shown = [p.estimate for p in predictions if p.estimate.status != "unreadable"]
     for estimate in failed:
         print(f"depthpose: failed: {estimate.name}: {estimate.reason}", file=sys.stderr)
     if shown:
@@ -422,8 +421,8 @@ def say_result(predictions: list[Prediction], out: Path) -> int:
             row, pose = _row(estimate), estimate.camera_from_model
             if pose is not None:
                 quaternion = Rotation.from_matrix(pose.R.double()).as_quat()
-                row["x, y, z [m]"] = numbers_text(pose.t_m.tolist())
-                row["qx, qy, qz, qw"] = numbers_text(quaternion.tolist())
+                row["x, y, z [m]"] = ", ".join(f"{value:.4f}" for value in pose.t_m.tolist())
+                row["qx, qy, qz, qw"] = ", ".join(f"{value:.4f}" for value in quaternion.tolist())
             certain = {
                 key: value for key in ("fit", "certainty") if (value := row[key]) is not None
             }
@@ -434,8 +433,8 @@ def say_result(predictions: list[Prediction], out: Path) -> int:
         what = "refused" if shown[0].camera_from_model is None else shown[0].status
         print(f"{what}: {shown[0].reason}")
     for prediction in predictions[:_SAID]:
-        for line in drawn.alternative_lines(prediction.estimate):
-            print(f"{prediction.estimate.name}: {line}")
+        for other in prediction.estimate.alternatives:
+            print(f"{prediction.estimate.name}: {other}")
     inputs = "1 input" if len(predictions) == 1 else f"{len(predictions)} inputs"
     print(f"{inputs}: {_statuses(shown) or 'none readable'}; {out / 'poses.json'}")
     return 1 if failed else 0
@@ -454,7 +453,7 @@ def _row(estimate: PoseEstimate) -> dict[str, Any]:
         "fit": None if fit is None else fit.agrees,
         "identity": None if identity is None else identity.status,
         "certainty": estimate.certainty,
-        "alternatives": "; ".join(drawn.alternative_lines(estimate)),
+        "alternatives": "; ".join(map(str, estimate.alternatives)),
         "reason": estimate.reason,
     }
 
@@ -468,32 +467,34 @@ def _write_page(
     out: Path,
     predictions: Sequence[Prediction],
     jobs: Sequence[Job[Any]],
-    method: PoseMethod,
+    models: dict[str, ObjectModel],
     dataset: BopDataset | None,
 ) -> None:
     """Write a page of some of the predictions, and of the reason of each refusal."""
     instances = () if dataset is None else dataset.instances
     image_of = {(i.scene_id, i.image_id): i.rgb for i in instances}
-    readable = [k for k, prediction in enumerate(predictions) if is_finished(prediction)]
+    estimates = [prediction.estimate for prediction in predictions]
+    counts = _statuses(estimates)
+    rows = [_row(one) for one in sorted(estimates, key=lambda one: one.is_posed)[:_MOST_ROWS]]
+    readable = [k for k, one in enumerate(estimates) if one.status != "unreadable"]
     sections: list[Section] = []
     for k in choose_answers([predictions[k].estimate.is_posed for k in readable]):
         estimate, place = predictions[readable[k]].estimate, predictions[readable[k]].place
-        shown_input = jobs[readable[k]].read()
-        if isinstance(shown_input, PoseEstimate):  # unreadable by now
+        try:
+            shown_input = jobs[readable[k]].read()
+        except InputError:  # unreadable by now
             continue
         rgb = None if place is None else image_of[place[:2]]
-        model = method.models_by_name[estimate.object]
+        model = models[estimate.object]
         image = None if rgb is None else read_image(rgb)
         section = drawn.pose_section(estimate.name, shown_input, estimate, model, image=image)
         sections.append(section)
     number = len(predictions)
-    estimates = [prediction.estimate for prediction in predictions]
-    text = f"{number} inputs: {_statuses(estimates)}. Shown below: {len(sections)}"
+    text = f"{number} inputs: {counts}. Shown below: {len(sections)}"
     text += "." if len(sections) == number else ", answers and refusals spread evenly."
     if number > _MOST_ROWS:
         text += f" The table holds the first {_MOST_ROWS}, refusals before answers; all are in "
         text += "poses.json."
-    rows = [_row(one) for one in sorted(estimates, key=lambda one: one.is_posed)[:_MOST_ROWS]]
     results = Section(title="What was found", text=text, rows=rows)
     title = f"Poses of {number} input{'s' * (number != 1)}"
     write_page(out / _PAGE, title, [results, *sections], run.environment())
@@ -521,16 +522,19 @@ def start_files(
         return view_input(depth, mask, camera, object, sample.name, unit)
 
     def predict(samples: Sequence[Sample], out: Path) -> list[str]:
-        named = [Job(name=sample.name, read=partial(read, sample)) for sample in samples]
-        jobs = [safe_job(job, object) for job in named]
-        inputs = [job.read() for job in jobs]
+        inputs: list[Any] = []
+        for sample in samples:
+            try:
+                inputs.append(read(sample))
+            except InputError as error:
+                inputs.append(unreadable(sample.name, object, error))
         answers = iter(method.estimate_many([i for i in inputs if not isinstance(i, PoseEstimate)]))
         reasons: list[str] = []
-        for job, one in zip(jobs, inputs, strict=True):
+        for sample, one in zip(samples, inputs, strict=True):
             estimate = one if isinstance(one, PoseEstimate) else next(answers)
             prediction = Prediction(estimate=estimate)
-            write_json(out / f"{job.name}.{ENDING}", prediction_row(prediction))
-            reasons.append("" if is_finished(prediction) else estimate.reason)
+            write_json(out / f"{sample.name}.{ENDING}", prediction_row(prediction))
+            reasons.append("" if prediction.estimate.status != "unreadable" else estimate.reason)
         return reasons
 
     return predict
@@ -540,7 +544,7 @@ def predict_on_ray(
     options: OneObjectOptions, source: MethodSource, batch: int, out: str, engine: EngineOptions
 ) -> int:
     """Pose clouds, depth images and masks, manifests or tar shards by the workers of an engine."""
-    if options.depth is not None and options.lens is None:
+    if options.depth is not None and (options.camera or options.focal_px) is None:
         raise InputError("--depth needs --camera or --focal-px beside it")
     views = Files(roles=("depth", "mask"), suffixes=(*LISTED_SUFFIXES, ".json"))
     files = cloud_files() if options.depth is None else views
@@ -556,7 +560,7 @@ def predict_on_ray(
     method = source.build("cpu")
     object = object_named(options.object or None, method)
     with inputs.first() as first:
-        lens = options.lens
+        lens = options.camera or options.focal_px
         camera = None if lens is None else camera_of(lens, image_size(first[0]))
     start = partial(start_files, source, object, options.unit, camera)
     work = Work(start=start, files=files, endings=(ENDING,), batch=batch)

@@ -122,25 +122,9 @@ def geodesic_rad(
     return 2 * torch.asin(chord.clamp(max=1.0))
 
 
-def turn_axis_to(direction: Float[Tensor, "3"]) -> Float[Tensor, "3 3"]:
-    """Rotation that carries the z axis to a direction the shortest way, in float64.
-
-    Rodrigues' formula with ``1 / (1 + z)``. Opposite to the axis no way is the shortest: half a
-    turn about x is taken there.
-    """
-    x, y, z = (direction / direction.norm()).tolist()
-    if z < -1 + 1e-9:
-        return torch.diag(torch.tensor([1.0, -1.0, -1.0], dtype=torch.float64))
-    k = 1 / (1 + z)
-    rows = [[1 - k * x * x, -k * x * y, x], [-k * x * y, 1 - k * y * y, y], [-x, -y, z]]
-    return torch.tensor(rows, dtype=torch.float64)
-
-
 def perturb(pose: Rigid, motion: Float[Tensor, "*batch 6"]) -> Rigid:
     """Move a pose by (rotation vector [rad], translation [m]) in the camera frame."""
-    turn = rotation_by(motion[..., :3])
-    moved_m = (turn @ pose.t_m[..., None]).squeeze(-1) + motion[..., 3:]
-    return Rigid(turn @ pose.R, moved_m)
+    return Rigid(rotation_by(motion[..., :3]), motion[..., 3:]) @ pose
 
 
 def rotation_by(vector: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3 3"]:

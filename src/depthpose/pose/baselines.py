@@ -11,7 +11,8 @@ from jaxtyping import Float, Int
 from torch import Tensor, nn
 
 from depthpose.core.config import Settings
-from depthpose.core.rigid import Rigid, turn_axis_to
+from depthpose.core.rigid import Rigid
+from depthpose.pose.cloud import turn_axis_to
 from depthpose.pose.segmentation import ResNet18
 from depthpose.pose.sparse import RowNorm
 from depthpose.pose.types import SeenPoints, ViewInput

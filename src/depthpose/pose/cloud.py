@@ -11,7 +11,6 @@ from torch import Tensor
 
 from depthpose.core.arrays import take_evenly
 from depthpose.core.errors import InputError
-from depthpose.core.rigid import turn_axis_to
 from depthpose.pose.config import CloudConfig, EstimateConfig
 from depthpose.pose.types import (
     CloudInput,
@@ -195,13 +194,6 @@ def cloud_from_depth(
         return points_m
     config = CloudConfig() if config is None else config
     return points_m[~is_flying(points_m, diameter_m * config.max_offset_diameters)]
-
-
-def object_points(given: CloudInput | ViewInput, diameter_m: float) -> Float[Tensor, "n 3"]:
-    """Give the points of an input that are readings, of a depth image without flying pixels."""
-    if isinstance(given, ViewInput):
-        return cloud_from_depth(given.depth_m, given.mask, given.K, diameter_m).float()
-    return given.points_m[is_reading(given.points_m)].float()
 
 
 def lift_sample(view: ViewSample, diameter_m: float, config: CloudConfig) -> CloudSample:
@@ -395,6 +387,31 @@ def voxelise(points_m: Float[Tensor, "n 3"], config: CloudConfig) -> VoxelGrid:
         grid_from_camera=turn,
         features=features,
     )
+
+
+def turn_axis_to(direction: Float[Tensor, "3"]) -> Float[Tensor, "3 3"]:
+    """Rotation that carries the z axis to a direction the shortest way, in float64.
+
+    Rodrigues' formula with ``1 / (1 + z)``. Opposite to the axis no way is the shortest: half a
+    turn about x is taken there.
+    """
+    x, y, z = (direction / direction.norm()).tolist()
+    if z < -1 + 1e-9:
+        return torch.diag(torch.tensor([1.0, -1.0, -1.0], dtype=torch.float64))
+    k = 1 / (1 + z)
+    rows = [[1 - k * x * x, -k * x * y, x], [-k * x * y, 1 - k * y * y, y], [-x, -y, z]]
+    return torch.tensor(rows, dtype=torch.float64)
+
+
+def thin(
+    points_m: Float64[Tensor, "n 3"], normals: Float64[Tensor, "n 3"], step_m: float
+) -> Int64[Tensor, " m"]:
+    """Choose one point of each cell of a grid and of each octant of normals in it."""
+    cells = ((points_m - points_m.amin(0)) / step_m).long()
+    cells = torch.cat([cells, (normals > 0).long()], 1)
+    _, place = torch.unique(cells, dim=0, return_inverse=True)
+    first = torch.full((int(place.max()) + 1,), len(points_m))
+    return first.scatter_reduce_(0, place, torch.arange(len(points_m)), "amin").sort().values
 
 
 def local_planes(

@@ -18,6 +18,9 @@ class MeshConfig(Settings):
     """Farthest points of the surface that the network's directions point at (4 to 20 usual)."""
 
 
+SHAPE_FEATURES = 9  #: numbers that the network gets of each voxel with its shape; else it is one
+
+
 @dataclass(frozen=True, kw_only=True)
 class CloudConfig(Settings):
     """How a mask and a depth map become the cloud that the network sees."""
@@ -50,11 +53,6 @@ class CloudConfig(Settings):
                 f"max_points is {self.max_points}, below min_points {self.min_points}: every cloud "
                 "would be refused; raise it"
             )
-
-    @property
-    def features(self) -> int:
-        """Numbers that the network gets of each voxel."""
-        return 9 if self.with_shape else 1
 
 
 @dataclass(frozen=True, kw_only=True)

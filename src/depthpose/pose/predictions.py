@@ -80,11 +80,6 @@ def place_of(instance: Instance) -> Place:
     return Place(instance.scene_id, instance.image_id, instance.object_id)
 
 
-def is_finished(prediction: Prediction) -> bool:
-    """Whether a rerun need not estimate it: an input that was unreadable may be repaired."""
-    return prediction.estimate.status != "unreadable"
-
-
 def write_predictions(folder: Path, predictions: Iterable[Prediction]) -> None:
     """Write ``poses.json``: a list of estimates and refusals, in metres, radians and seconds.
 
@@ -121,6 +116,15 @@ def kept_predictions(folder: Path) -> list[Prediction]:
         return []
 
 
+def known_predictions(folder: Path) -> dict[str, Prediction]:
+    """Read what earlier runs left in a folder, and in those of the parts of several processes."""
+    folders = [folder, *sorted(folder.glob("part-*"))]
+    every = [prediction for one in folders for prediction in kept_predictions(one)]
+    # What was read at last counts, whatever another part said of an earlier try.
+    every.sort(key=lambda prediction: prediction.estimate.status != "unreadable")
+    return {prediction.estimate.name: prediction for prediction in every}
+
+
 def score_of(estimate: PoseEstimate) -> float:
     """Say how sure an estimate is, 0..1: the chance of being right, where it is known.
 
@@ -144,7 +148,7 @@ def prediction_row(prediction: Prediction) -> dict[str, Any]:
         row[name] = None if values is None else values.double().tolist()
     # JSON has no infinity: a free axis has no deviation, nothing near the surface no distance.
     for name in ("origin_std_mm", "rotation_std_deg"):
-        values = getattr(estimate, name)
+        values = None if pose is None else getattr(estimate, name)
         known = [] if values is None else values.tolist()
         row[name] = [v if math.isfinite(v) else None for v in known] or None
     for name in ("inlier_share", "residual_m", "certainty"):
@@ -278,11 +282,19 @@ class Job(Generic[Input]):
     """One thing to estimate: what it is called, where it belongs, and how its input is read."""
 
     name: str  #: that of the input: unique in a run
-    #: gives the input, or the estimate that says why there is none; called where none is there yet
-    read: Callable[[], Input | PoseEstimate]
+    read: Callable[[], Input]  #: gives the input; called where no estimate is there yet
+    #: what is posed, where an input that cannot be read gives an estimate that says so; else it is
+    #: an error
+    object: str | None = None
     place: Place | None = None  #: as :class:`Prediction` has it
     seconds: Mapping[str, float] = field(default_factory=dict)  #: what was spent before, on a mask
     source: Path | tuple[Path, ...] | None = None  #: file or files that the input is read from
+
+
+def unreadable(name: str, object: str, error: InputError) -> PoseEstimate:
+    """Make the estimate that says why an input cannot be read."""
+    reason = f"cannot be read: {error}"
+    return PoseEstimate(name=name, object=object, status="unreadable", reason=reason)
 
 
 def predict(
@@ -291,10 +303,10 @@ def predict(
     folder: Path,
     settings: dict[str, Any],
     batch: int = 1,
-) -> Generator[str, None, None]:
-    """Estimate what is not finished yet, and yield each name; ``poses.json`` grows as it goes.
+) -> Generator[Prediction, None, None]:
+    """Yield the finished, and estimate and yield the others; ``poses.json`` grows as it goes.
 
-    What was unreadable is tried again.
+    What was unreadable is tried again: it may have been repaired.
 
     What was estimated is saved every 200 jobs, and when the work ends or is interrupted.
 
@@ -308,14 +320,21 @@ def predict(
     claim_folder(folder, settings, [POSES])
     wanted = list(jobs)
     done = {p.estimate.name: p for p in kept_predictions(folder)}
-    finished = {name for name, prediction in done.items() if is_finished(prediction)}
-    yield from (job.name for job in wanted if job.name in finished)
+    finished = {name for name, made in done.items() if made.estimate.status != "unreadable"}
+    yield from (done[job.name] for job in wanted if job.name in finished)
     left = [job for job in wanted if job.name not in finished]
     unsaved = 0
     try:
         for start in range(0, len(left), batch):
             some = left[start : start + batch]
-            inputs = [job.read() for job in some]
+            inputs: list[Input | PoseEstimate] = []
+            for job in some:
+                try:
+                    inputs.append(job.read())
+                except InputError as error:
+                    if job.object is None:
+                        raise
+                    inputs.append(unreadable(job.name, job.object, error))
             answers = iter(estimate_many([i for i in inputs if not isinstance(i, PoseEstimate)]))
             estimates = [i if isinstance(i, PoseEstimate) else next(answers) for i in inputs]
             for job, estimate in zip(some, estimates, strict=True):
@@ -325,7 +344,7 @@ def predict(
                     estimate=replace(estimate, seconds=spent), place=job.place
                 )
                 unsaved += 1
-                yield job.name
+                yield done[job.name]
             if unsaved >= _SAVE_EVERY:
                 write_predictions(folder, done.values())
                 unsaved = 0

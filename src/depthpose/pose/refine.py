@@ -18,11 +18,10 @@ from depthpose.pose.compiled import (
     ON_RAY,
     SEARCHED,
     SLACK,
-    finite_array,
     serves,
 )
 from depthpose.pose.config import IcpConfig
-from depthpose.pose.surface import Surface, look_along_rays
+from depthpose.pose.surface import Surface, finite_array, look_along_rays
 
 _CONVERGED = 3e-4  # stop when a step turns [rad] and shifts [diameters] by less than this
 _TURN_RAD = math.radians(15)  # by how much further starts are turned
@@ -216,8 +215,9 @@ def _iterated(
     if serves(cloud, pose.R, pose.t_m):
         from depthpose.pose.compiled.poses import refine
 
-        R, t_m = (torch.from_numpy(finite_array(part).copy()) for part in (pose.R, pose.t_m))
-        target, points = surface.target, finite_array(cloud)
+        parts = [part.detach().numpy() for part in (pose.R, pose.t_m)]
+        R, t_m = (torch.from_numpy(finite_array(part).copy()) for part in parts)
+        target, points = surface.target, finite_array(cloud.detach().numpy())
         arrays = (points, R.view(-1, 3, 3).numpy(), t_m.view(-1, 3).numpy(), np.array(limits_m))
         places = np.full((len(arrays[2]), len(points)), -1)
         refine(*arrays, surface.diameter_m, _CONVERGED, target, is_exact, places)

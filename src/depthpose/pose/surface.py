@@ -12,7 +12,7 @@ from torch import Tensor
 from torch.nn.functional import avg_pool2d, max_pool2d, pad
 
 from depthpose.core.rigid import Rigid
-from depthpose.pose.compiled import finite_array, serves
+from depthpose.pose.compiled import serves
 from depthpose.pose.mesh import sample_surface, symmetry_transforms
 from depthpose.pose.mesh.models import fibonacci_directions
 from depthpose.pose.types import ObjectModel
@@ -86,7 +86,8 @@ class Surface:
         if serves(points_m):
             from depthpose.pose.compiled.points import nearest_many
 
-            index, _ = nearest_many(finite_array(points_m).reshape(-1, 3), self.target.tree)
+            points = finite_array(points_m.detach().numpy()).reshape(-1, 3)
+            index, _ = nearest_many(points, self.target.tree)
             return torch.from_numpy(index).reshape(points_m.shape[:-1])
         return torch.from_numpy(self.tree.query(points_m.numpy(), workers=1)[1])
 
@@ -109,7 +110,7 @@ class Surface:
         from depthpose.pose.compiled.points import Tree, planted
         from depthpose.pose.compiled.poses import Target
 
-        tree, boxes = Tree(*planted(finite_array(self.points_m))), self.boxes
+        tree, boxes = Tree(*planted(finite_array(self.points_m.numpy()))), self.boxes
         place = np.full(len(self.points_m) + 1, -1)
         place[tree.order] = np.arange(len(self.points_m))
         return Target(
@@ -123,6 +124,17 @@ class Surface:
             place[self.across.numpy()[tree.order]].astype(np.int32),
             self.ball_m.numpy(),
         )
+
+
+def finite_array(array: np.ndarray) -> np.ndarray:
+    """Give what a compiled loop reads: contiguous, and finite, as cells and trees need it.
+
+    Raises:
+        ValueError: a value is not finite.
+    """
+    if not np.isfinite(array).all():
+        raise ValueError("values must be finite; leave out what is not")
+    return np.ascontiguousarray(array)
 
 
 def _view_of(surface: Surface, toward: Tensor, across: Tensor) -> tuple[Tensor, ...]:
@@ -287,7 +299,7 @@ def look_along_rays(
         from depthpose.pose.compiled.points import compare_rays
 
         points_m = surface.points_m[::every]
-        given = (finite_array(a) for a in (cloud_m, poses.R, poses.t_m, points_m))
+        given = (finite_array(a.detach().numpy()) for a in (cloud_m, poses.R, poses.t_m, points_m))
         front, unseen = compare_rays(*given, scale, *middle.tolist(), _REACH, limit_m)
         return torch.from_numpy(front), torch.from_numpy(unseen)
     posed_m = poses.apply(surface.points_m[::every])

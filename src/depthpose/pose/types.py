@@ -195,6 +195,10 @@ class Alternative:
     #: evidence against it, by name; not kept in files.
     signals: dict[str, float] = field(default_factory=dict)
 
+    def __str__(self) -> str:
+        """Say how it differs from the pose, and how likely it is."""
+        return f"{self.difference}, {self.probability:.0%}"
+
 
 @dataclass(frozen=True, kw_only=True)
 class Fit:

@@ -22,7 +22,7 @@ from depthpose.core.config import config_from_dict, config_to_dict
 from depthpose.core.errors import InputError
 from depthpose.core.files.disk import refused_as
 from depthpose.pose.baselines import DepthImageConfig, DepthImageNet, PointNet, PointNetConfig
-from depthpose.pose.config import CloudConfig, RefusalConfig
+from depthpose.pose.config import SHAPE_FEATURES, CloudConfig, RefusalConfig
 from depthpose.pose.mesh import (
     gap_to_surface_m,
     refuse_one_name,
@@ -64,10 +64,11 @@ class PoseWeights:
                 f"the network knows {config.classes} classes, but {len(self.models)} models are "
                 "given; class k is models[k]. Give one model for each."
             )
-        if isinstance(config, ResUNetConfig) and config.inputs != self.cloud.features:
+        inputs = SHAPE_FEATURES if self.cloud.with_shape else 1
+        if isinstance(config, ResUNetConfig) and config.inputs != inputs:
             raise InputError(
                 f"the network takes {config.inputs} features of a voxel, but its clouds give "
-                f"{self.cloud.features}. Set with_shape of the cloud as it was in training."
+                f"{inputs}. Set with_shape of the cloud as it was in training."
             )
         wanted = None if isinstance(config, DepthImageConfig) else config.keypoints
         for model in self.models:

@@ -13,11 +13,11 @@ from depthpose.core.draw import draw_lines, draw_outline
 from depthpose.core.files import Cloud, read_depth_png, read_image
 from depthpose.core.render import rasterize
 from depthpose.core.rigid import Rigid
-from depthpose.pose.cloud import cloud_from_depth, object_points
+from depthpose.pose.cloud import cloud_from_depth, is_reading
 from depthpose.pose.datasets import Instance
 from depthpose.pose.estimator.inputs import AnyInput
 from depthpose.pose.mesh import drawn_triangles, sample_surface
-from depthpose.pose.types import ObjectModel, PoseEstimate, ViewInput
+from depthpose.pose.types import CloudInput, ObjectModel, PoseEstimate, ViewInput
 from depthpose.report.page import (
     Drawing,
     Layer,
@@ -170,6 +170,13 @@ def posed_cloud(cloud_m: Float[Tensor, "n 3"], pose: Rigid | None, model: Object
     return Cloud(points=torch.cat([cloud_m.float(), surface_m.float()]), color=torch.cat(colors))
 
 
+def object_points(given: CloudInput | ViewInput, diameter_m: float) -> Float[Tensor, "n 3"]:
+    """Give the points of an input that are readings, of a depth image without flying pixels."""
+    if isinstance(given, ViewInput):
+        return cloud_from_depth(given.depth_m, given.mask, given.K, diameter_m).float()
+    return given.points_m[is_reading(given.points_m)].float()
+
+
 def grey_depth(depth_m: Float[Tensor, "h w"]) -> Float[Tensor, "3 h w"]:
     """Show depth by its grey, near bright and far dark, black where nothing was read.
 
@@ -249,12 +256,7 @@ def pose_sentence(estimate: PoseEstimate) -> str:
         said += f" It is ambiguous: {estimate.reason}."
     if not estimate.alternatives:
         return said
-    return f"{said} Other poses fit as well: {'; '.join(alternative_lines(estimate))}."
-
-
-def alternative_lines(estimate: PoseEstimate) -> list[str]:
-    """Say of each alternative how it differs from the pose, and how likely it is."""
-    return [f"{one.difference}, {one.probability:.0%}" for one in estimate.alternatives]
+    return f"{said} Other poses fit as well: {'; '.join(map(str, estimate.alternatives))}."
 
 
 def pose_facts(
@@ -284,7 +286,7 @@ def pose_facts(
         facts.append(("identity", said))
     if estimate.certainty is not None:
         facts.append(("certainty of this pose", f"{estimate.certainty:.3f}"))
-    facts += [("another pose that fits", line) for line in alternative_lines(estimate)]
+    facts += [("another pose that fits", str(other)) for other in estimate.alternatives]
     if estimate.inlier_share is not None:
         facts.append((agreeing, f"{estimate.inlier_share:.0%}"))
     if estimate.residual_m is not None and math.isfinite(estimate.residual_m):
@@ -338,12 +340,11 @@ def pose_scene(
         layers += pose_layers(pose, model, with_box=truth is not None)
     for other in estimate.alternatives:  # by axes and box, not shown at first
         placed = other.camera_from_model.double()
-        said = f"{other.difference}, {other.probability:.0%}"
         box_m = placed.apply(box_edges(model).double()).float()
         box = colored_lines(box_m, OTHER)
-        layers.append(Layer(name=f"box if {said}", shape=box, is_shown=False))
+        layers.append(Layer(name=f"box if {other}", shape=box, is_shown=False))
         axes = frame_axes(placed.t_m, placed.R, model.diameter_m / 2)
-        layers.append(Layer(name=f"axes if {said}", shape=axes, is_shown=False))
+        layers.append(Layer(name=f"axes if {other}", shape=axes, is_shown=False))
     if truth is not None:
         layers += pose_layers(truth, model, is_true=True)
     if estimate.keypoints_m is not None:

@@ -10,7 +10,6 @@ from depthpose.core.camera import Camera, write_camera
 from depthpose.core.errors import InputError, refuse_unknown
 from depthpose.core.units import METRES, Unit
 from depthpose.pose import mesh
-from depthpose.pose.cloud import object_points
 from depthpose.pose.config import EstimateConfig, ObjectsConfig
 from depthpose.pose.datasets.dataset import write_mask
 from depthpose.pose.estimator import GeoPoseNet, Registration
@@ -24,6 +23,7 @@ from depthpose.pose.synthetic import make_frames
 from depthpose.pose.types import CloudInput, ObjectModel, PoseEstimate, ViewInput
 from depthpose.report import pose as report
 from depthpose.report.page import Layer
+from depthpose.report.pose import object_points
 from depthpose.web.answer import (
     EXAMPLE_SEED,
     Answer,

@@ -16,7 +16,6 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import torch
 from torch import Tensor
 
@@ -61,18 +60,6 @@ def serves(*tensors: Tensor) -> bool:
     """Whether compiled functions serve for these: on the processor, and without gradients."""
     with_gradients = torch.is_grad_enabled() and any(t.requires_grad for t in tensors)
     return not with_gradients and all(t.device.type == "cpu" for t in tensors) and is_compiled()
-
-
-def finite_array(values: Tensor | np.ndarray) -> np.ndarray:
-    """Give what a compiled loop reads: contiguous, and finite, as cells and trees need it.
-
-    Raises:
-        ValueError: a value is not finite.
-    """
-    array = values.detach().numpy() if isinstance(values, Tensor) else values
-    if not np.isfinite(array).all():
-        raise ValueError("values must be finite; leave out what is not")
-    return np.ascontiguousarray(array)
 
 
 def compiled(function: Callable[..., Any]) -> Any:  # noqa: ANN401  numba's dispatcher

@@ -2,48 +2,7 @@
 
 import numpy as np
 
-from depthpose.pose.compiled import ANGLES, DISTANCES, MOST_ALIKE, TURNS, compiled, finite_array
-
-Array = np.ndarray
-
-
-def pair_peaks(
-    points_m: Array,
-    frames: Array,
-    references: Array,
-    bounds: Array,
-    first: Array,
-    turn_rad: Array,
-    models: int,
-    peaks: int,
-    step_m: float,
-) -> tuple[Array, Array, Array]:
-    """Let every pair of a reference point vote, and give the peaks of each.
-
-    Args:
-        points_m: of the scene, (n, 3).
-        frames: normal and two tangents of each as columns, (n, 3, 3).
-        references: numbers of the points that vote, (r,).
-        bounds: of the pairs of each feature.
-        first: points of the model that are first in a pair.
-        turn_rad: of the pairs.
-        models: points of the model.
-        peaks: of each reference.
-        step_m: a bin of distance, and the least distance of a pair.
-
-    Returns:
-        Model points, bins of the turn and votes, each (r, peaks).
-
-    Raises:
-        ValueError: a value is not finite.
-    """
-    shape = (len(references), min(peaks, models))
-    point, turn, votes = np.zeros(shape, np.int64), np.zeros(shape, np.int64), np.zeros(shape)
-    _vote(
-        finite_array(points_m), finite_array(frames), references, bounds, first, turn_rad,
-        models, step_m, point, turn, votes,
-    )  # fmt: skip
-    return point, turn, votes
+from depthpose.pose.compiled import ANGLES, DISTANCES, MOST_ALIKE, TURNS, compiled
 
 
 @compiled
@@ -65,9 +24,10 @@ def _feature(points, frames, i, j, far, step, value):
 
 
 @compiled
-def _vote(
+def vote(
     points, frames, references, bounds, first, turns, models, step, out_point, out_turn, out_votes
 ):  # fmt: skip
+    """Let every pair of a reference point vote; write the points, turns and votes of its peaks."""
     counts = np.zeros((models, TURNS), np.float32)
     value, own, aside = np.empty(4), np.empty(4, np.int64), np.empty(4, np.int64)
     seen = np.zeros(len(bounds), np.uint32)

@@ -16,16 +16,11 @@ from tqdm import tqdm
 
 from depthpose.core.arrays import take_evenly
 from depthpose.core.camera import AnyCamera, choose_lens
-from depthpose.core.devices import (
-    each_in_own_arithmetic,
-    each_in_threads,
-    own_arithmetic,
-    refused_memory,
-)
-from depthpose.core.errors import InputError, nearest_name
+from depthpose.core.devices import each_in_own_arithmetic, each_in_threads, own_arithmetic
+from depthpose.core.errors import InputError, full_memory, is_of_memory, nearest_name
 from depthpose.core.rigid import Rigid
 from depthpose.core.units import Unit
-from depthpose.pose.cloud import Refusal, local_planes, prepare_cloud
+from depthpose.pose.cloud import Refusal, local_planes, prepare_cloud, thin
 from depthpose.pose.config import CloudConfig, EstimateConfig, RefusalConfig
 from depthpose.pose.estimator.candidates import (
     Candidate,
@@ -59,7 +54,7 @@ from depthpose.pose.mesh import read_model, refuse_one_name, with_found_symmetri
 from depthpose.pose.refine import refine_best
 from depthpose.pose.surface import prepare_surface
 from depthpose.pose.types import CloudInput, ObjectModel, PoseEstimate, ViewInput
-from depthpose.pose.voting.point_pairs import PairTable, prepare_pairs, propose_poses, thin
+from depthpose.pose.voting.point_pairs import PairTable, prepare_pairs, propose_poses
 
 Made = TypeVar("Made")
 _NAME = "input"  # what an input is called that came without a name
@@ -394,10 +389,14 @@ def or_unreadable(work: Callable[[AnyInput], Made], given: AnyInput) -> Made | P
             f"{type(given).__name__}; files and arrays go to estimate(), one at a time"
         )
     try:
-        with refused_memory(given.name):
-            return work(given)
+        return work(given)
     except InputError as error:
-        return refused(given, Refusal(status="unreadable", reason=str(error)), {})
+        reason = str(error)
+    except (MemoryError, RuntimeError) as error:
+        if not is_of_memory(error):
+            raise
+        reason = f"{given.name}: {full_memory(error)}"
+    return refused(given, Refusal(status="unreadable", reason=reason), {})
 
 
 def answered(found: PoseEstimate) -> PoseEstimate:

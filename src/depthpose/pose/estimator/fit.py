@@ -20,7 +20,7 @@ from torch.nn.functional import max_pool2d
 from depthpose.core.arrays import take_evenly
 from depthpose.core.rigid import Rigid, cross_matrix, rotation_by
 from depthpose.pose.cloud import ObjectCloud, Refusal, cloud_from_depth, grow_mask
-from depthpose.pose.compiled import finite_array, serves
+from depthpose.pose.compiled import serves
 from depthpose.pose.config import EstimateConfig, IcpConfig, RefusalConfig
 from depthpose.pose.estimator.candidates import (
     Candidate,
@@ -32,7 +32,7 @@ from depthpose.pose.estimator.candidates import (
 from depthpose.pose.mesh import MIRROR_ALIKE
 from depthpose.pose.mesh.models import fibonacci_directions
 from depthpose.pose.refine import refine_pose, refine_roughly
-from depthpose.pose.surface import BESIDE, NEAR, Surface
+from depthpose.pose.surface import BESIDE, NEAR, Surface, finite_array
 from depthpose.pose.types import (
     Alternative,
     AnyInput,
@@ -272,7 +272,7 @@ def _grow(
     if serves(local_m, times):
         from depthpose.pose.compiled.poses import grow
 
-        local_m, times = torch.from_numpy(finite_array(local_m).copy()), times.clone()
+        local_m, times = torch.from_numpy(finite_array(local_m.numpy()).copy()), times.clone()
         variance = torch.ones_like(times)
         arrays = (local_m.numpy(), times.numpy(), middle_m.numpy(), np.array(limits_m))
         grow(*arrays, surface.target, is_exact, _CONVERGED, variance.numpy())

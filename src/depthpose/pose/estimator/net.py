@@ -6,8 +6,9 @@ the pose is fitted, refined by ICP, and checked. A baseline regresses the pose f
 
 import time
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import partial
+from operator import itemgetter
 from pathlib import Path
 from typing import NamedTuple, NoReturn
 
@@ -31,6 +32,7 @@ from depthpose.pose.config import EstimateConfig
 from depthpose.pose.estimator.base import PoseEstimator, Registration, answered, or_unreadable
 from depthpose.pose.estimator.candidates import (
     Candidate,
+    KnownObject,
     disagreement,
     find_candidates,
     surface_signals,
@@ -60,12 +62,25 @@ class CloudDirections(NamedTuple):
     directions: Float[Tensor, "n k 3"]
 
 
-def batches(clouds: Iterable["_Cloud"], most: int) -> Iterator[list["_Cloud"]]:
+@dataclass(kw_only=True, eq=False)
+class _Cloud:
+    """An input on its way: its object, its cloud, the seconds, and what the network says of it."""
+
+    given: AnyInput
+    known: KnownObject
+    cloud: ObjectCloud
+    seconds: dict[str, float]
+    outputs: Float[Tensor, "n k 3"] = field(default_factory=lambda: torch.empty(0, 0, 3))
+
+
+def _batches(
+    clouds: Iterable["_Cloud | PoseEstimate"], most: int
+) -> Iterator[list["_Cloud | PoseEstimate"]]:
     """Group clouds so that each group has ``most`` voxels at most, or is one cloud."""
-    group: list[_Cloud] = []
+    group: list[_Cloud | PoseEstimate] = []
     total = 0
     for one in clouds:
-        count = len(one.prepared.points_m) if isinstance(one.prepared, ObjectCloud) else 0
+        count = len(one.cloud.points_m) if isinstance(one, _Cloud) else 0
         if group and total + count > most:
             yield group
             group, total = [], 0
@@ -148,15 +163,19 @@ class GeoPoseNet(PoseEstimator):
         The answer for an input does not depend on those beside it, but for the rounding of the
         network's sums. Only what is likely is registered, where the config wants it.
         """
-        for given, found, _ in self._with_votes(inputs, threads, is_likely=is_likely):
-            if not (self.config.register_refused and is_likely and found.status in _DOUBTED):
-                yield found
-                continue
-            start = time.perf_counter()
-            (registered,) = self._by_models().estimate_many([given])
-            spent_s = time.perf_counter() - start
-            best = registered if registered.is_posed else found
-            yield replace(best, seconds={**found.seconds, "registration": spent_s})
+        answers = self._with_votes(inputs, threads, is_likely=is_likely)
+        work = self._registered if self.config.register_refused and is_likely else itemgetter(0)
+        return map(work, answers)
+
+    def _registered(self, answer: tuple[PoseEstimate, "_Cloud | None"]) -> PoseEstimate:
+        found, one = answer
+        if one is None or found.status not in _DOUBTED:
+            return found
+        start = time.perf_counter()
+        (registered,) = self._by_models().estimate_many([one.given])
+        spent_s = time.perf_counter() - start
+        best = registered if registered.is_posed else found
+        return replace(best, seconds={**found.seconds, "registration": spent_s})
 
     def _by_models(self) -> Registration:
         """Give the registration of the same objects, which shares what was prepared of them."""
@@ -185,38 +204,35 @@ class GeoPoseNet(PoseEstimator):
         Raises:
             InputError: an unknown object, or a mask that does not fit its depth image.
         """
-        ((_, found, voted),) = self._with_votes([given], 1)
+        ((found, one),) = self._with_votes([given], 1)
+        voted = None if one is None else CloudDirections(one.cloud, one.outputs)
         return answered(found), voted
 
     def _with_votes(
         self, inputs: Iterable[AnyInput], threads: int, *, is_likely: bool = True
-    ) -> Iterator[tuple[AnyInput, PoseEstimate, CloudDirections | None]]:
-        prepared = each_in_threads(self._prepare, inputs, threads)
+    ) -> Iterator[tuple[PoseEstimate, "_Cloud | None"]]:
+        """Give each estimate, and the cloud with the network's outputs where it was run."""
+        prepared = each_in_threads(partial(or_unreadable, self._prepare), inputs, threads)
         work = partial(self._pose, is_likely=is_likely)
-        for some in batches(prepared, self.config.batch_voxels):
-            ready = [(one, one.prepared) for one in some if isinstance(one.prepared, ObjectCloud)]
-            numbers = [self._known(one.given.object).number for one, _ in ready]
-            clouds = [cloud for _, cloud in ready]
-            outputs, spent_s = self._directions(clouds, numbers) if ready else ([], 0.0)
-            total, left = sum(map(len, outputs)), iter(outputs)
-            for one in some:  # each has a share of the time
-                if isinstance(one.prepared, ObjectCloud):
-                    one.outputs = next(left)
-                    one.seconds["network"] = spent_s * len(one.outputs) / total
+        for some in _batches(prepared, self.config.batch_voxels):
+            ready = [one for one in some if isinstance(one, _Cloud)]
+            if ready:
+                numbers = [one.known.number for one in ready]
+                outputs, spent_s = self._directions([one.cloud for one in ready], numbers)
+                total = sum(map(len, outputs))
+                for one, own in zip(ready, outputs, strict=True):  # each has a share of the time
+                    one.outputs = own
+                    one.seconds["network"] = spent_s * len(own) / total
             yield from each_in_threads(work, some, threads)
 
-    def _prepare(self, given: AnyInput) -> "_Cloud":
+    def _prepare(self, given: AnyInput) -> "_Cloud | PoseEstimate":
         start = time.perf_counter()
-        prepared = or_unreadable(
-            lambda given: prepare_cloud(
-                given, self._known(given.object).model, self.weights.cloud, self.config
-            ),
-            given,
-        )
+        known = self._known(given.object)
+        prepared = prepare_cloud(given, known.model, self.weights.cloud, self.config)
         seconds = {"cloud": time.perf_counter() - start}
         if isinstance(prepared, Refusal):
-            prepared = refused(given, prepared, seconds)
-        return _Cloud(given=given, prepared=prepared, seconds=seconds)
+            return refused(given, prepared, seconds)
+        return _Cloud(given=given, known=known, cloud=prepared, seconds=seconds)
 
     def _directions(
         self, clouds: list[ObjectCloud], numbers: list[int]
@@ -240,39 +256,30 @@ class GeoPoseNet(PoseEstimator):
         return found, time.perf_counter() - start
 
     def _pose(
-        self, one: "_Cloud", *, is_likely: bool
-    ) -> tuple[AnyInput, PoseEstimate, CloudDirections | None]:
-        if isinstance(one.prepared, PoseEstimate):
-            return one.given, one.prepared, None
-        assert one.outputs is not None, "asked before"
-        voted = CloudDirections(one.prepared, one.outputs)
-        vote = partial(self._vote, voted=voted, seconds=one.seconds, is_likely=is_likely)
-        return one.given, or_unreadable(vote, one.given), voted
+        self, one: "_Cloud | PoseEstimate", *, is_likely: bool
+    ) -> tuple[PoseEstimate, "_Cloud | None"]:
+        if isinstance(one, PoseEstimate):
+            return one, None
+        vote = partial(self._vote, one=one, is_likely=is_likely)
+        return or_unreadable(vote, one.given), one
 
-    def _vote(
-        self,
-        given: AnyInput,
-        *,
-        voted: CloudDirections,
-        seconds: dict[str, float],
-        is_likely: bool,
-    ) -> PoseEstimate:
+    def _vote(self, given: AnyInput, *, one: "_Cloud", is_likely: bool) -> PoseEstimate:
         """Vote for the keypoints, fit the pose, refine and check it."""
-        known, config, began = self._known(given.object), self.config, time.perf_counter()
-        model, surface = known.model, known.surface
-        points, directions = voted.cloud.points_m.double(), voted.directions.double()
+        known, config, began = one.known, self.config, time.perf_counter()
+        model, surface, cloud = known.model, known.surface, one.cloud
+        points, directions = cloud.points_m.double(), one.outputs.double()
         if config.voting.method == "ransac":
             vote = vote_ransac(points, directions, config=config.voting)
         else:
             vote = meet_lines(points, directions, refinements=config.voting.refinements)
         met = time.perf_counter()
-        seconds = {**seconds, "voting": met - began}
+        seconds = {**one.seconds, "voting": met - began}
         fits = fits_of(vote, model, config)
         if isinstance(fits, Refusal):
             return refused(given, fits, seconds)
         fitted = time.perf_counter()
         seconds["svd"] = fitted - met
-        cloud_m, pose = voted.cloud.cloud_m, fits.camera_from_model.double()
+        cloud_m, pose = cloud.cloud_m, fits.camera_from_model.double()
         first = Candidate(pose[0], fits.covariance[0], float(fits.residual_m[0]))
         others, is_refined = pose[[]], False
         if config.with_icp:
@@ -282,34 +289,22 @@ class GeoPoseNet(PoseEstimator):
                 first = Candidate(icp.camera_from_model, icp.covariance, float(icp.residual_m))
                 others = best.others
         if not is_likely:
-            seen = seen_about(cloud_m, voted.cloud.view, surface.diameter_m)
+            seen = seen_about(cloud_m, cloud.view, surface.diameter_m)
             misfit = misfit_of(fit_of(seen, first.pose, surface), self.refusal)
             if misfit is not None:
                 return refused(given, misfit, {**seconds, "icp": time.perf_counter() - fitted})
         candidates = find_candidates(cloud_m, first, others, known, config, is_refined=is_refined)
-        poses = Rigid.stack([one.pose for one in candidates])
+        poses = Rigid.stack([candidate.pose for candidate in candidates])
         # Of the copies that the network could not learn to distinguish, the best counts.
         assert known.copies is not None, "found with the candidates"
         every_m = (poses[:, None] @ known.copies.trained).apply(model.keypoints_m.double())
-        angles = disagreement(voted.cloud, voted.directions, every_m).tolist()
+        angles = disagreement(cloud, one.outputs, every_m).tolist()
         evidence = surface_signals(cloud_m, poses, surface)
         for signals, angle in zip(evidence, angles, strict=True):
             signals["disagree"] = angle
         if config.with_icp:
             seconds["icp"] = time.perf_counter() - fitted
-        return answer_of(
-            voted.cloud, known, candidates, evidence, self.refusal, config, seconds, vote
-        )
-
-
-@dataclass(kw_only=True, eq=False)
-class _Cloud:
-    """An input on its way: a cloud, what the network says of it, the seconds; or a refusal."""
-
-    given: AnyInput
-    prepared: ObjectCloud | PoseEstimate
-    seconds: dict[str, float]
-    outputs: Float[Tensor, "n k 3"] | None = None
+        return answer_of(cloud, known, candidates, evidence, self.refusal, config, seconds, vote)
 
 
 class DepthImageRegressor(PoseEstimator):

@@ -24,8 +24,8 @@ from torch import Tensor
 from depthpose.core.errors import InputError
 from depthpose.core.loop import sample_generator
 from depthpose.core.render import rasterize
-from depthpose.core.rigid import Rigid, turn_axis_to
-from depthpose.pose.cloud import grow_mask, lift_sample
+from depthpose.core.rigid import Rigid
+from depthpose.pose.cloud import grow_mask, lift_sample, turn_axis_to
 from depthpose.pose.config import CloudConfig, ObjectsConfig, SensorConfig, SensorKind
 from depthpose.pose.mesh import drawn_triangles
 from depthpose.pose.types import CloudSample, ObjectModel, PoseTruth, ViewInput, ViewSample

@@ -33,7 +33,7 @@ from depthpose.pose.baselines import (
     poses_of,
 )
 from depthpose.pose.cloud import lift_sample, refusal_of
-from depthpose.pose.config import RefusalConfig
+from depthpose.pose.config import SHAPE_FEATURES, RefusalConfig
 from depthpose.pose.estimator.candidates import near_symmetry_lines
 from depthpose.pose.losses import direction_loss, model_point_loss
 from depthpose.pose.mesh import sample_surface, symmetry_transforms
@@ -262,7 +262,7 @@ def train_pose(config: PoseTraining | DepthImageTraining, run: Run) -> Path:
     models = read_models(config.models, run.on_message)
     # The classes and keypoints are those of the objects, the inputs those of the cloud.
     sizes = {"classes": len(models), "keypoints": len(models[0].keypoints_m)}
-    sizes["inputs"] = config.cloud.features
+    sizes["inputs"] = SHAPE_FEATURES if config.cloud.with_shape else 1
     sizes = {name: size for name, size in sizes.items() if hasattr(config.network, name)}
     config = dataclasses.replace(config, network=dataclasses.replace(config.network, **sizes))
     if isinstance(config, DepthImageTraining):

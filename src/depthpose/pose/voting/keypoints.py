@@ -9,7 +9,7 @@ from jaxtyping import Bool, Float, Float64
 from torch import Tensor
 
 from depthpose.core.errors import InputError
-from depthpose.core.rigid import Rigid, cross_matrix, fit_rigid, perturb
+from depthpose.core.rigid import Rigid, cross_matrix, fit_rigid, rotation_by
 from depthpose.pose.cloud import Refusal
 from depthpose.pose.config import EstimateConfig, VotingConfig
 from depthpose.pose.types import ObjectModel, PoseFit, Vote
@@ -352,7 +352,8 @@ def fit_pose(
         if steps == _STEPS:
             break
         pull = (weighted @ (found - moved_m)[..., None]).sum(-3).squeeze(-1)
-        pose = perturb(pose, torch.linalg.solve(H, pull))
+        motion = torch.linalg.solve(H, pull)
+        pose = Rigid(rotation_by(motion[..., :3]), motion[..., 3:]) @ pose
         moved_m = pose.apply(model)
         steps += 1
     error_m = moved_m - found

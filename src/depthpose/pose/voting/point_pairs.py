@@ -13,9 +13,10 @@ from torch import Tensor
 from torch.nn.functional import normalize
 
 from depthpose.core.rigid import Rigid
+from depthpose.pose.cloud import thin
 from depthpose.pose.compiled import ANGLES, DISTANCES, MOST_ALIKE, TURNS, serves
 from depthpose.pose.mesh.models import fibonacci_directions
-from depthpose.pose.surface import Surface, look_along_rays
+from depthpose.pose.surface import Surface, finite_array, look_along_rays
 
 STEP = 0.07
 """Of the diameter: distance of the points of the model, and a bin of the distances of a pair."""
@@ -120,17 +121,6 @@ def propose_poses(
     return poses[best]
 
 
-def thin(
-    points_m: Float64[Tensor, "n 3"], normals: Float64[Tensor, "n 3"], step_m: float
-) -> Int64[Tensor, " m"]:
-    """Choose one point of each cell of a grid and of each octant of normals in it."""
-    cells = ((points_m - points_m.amin(0)) / step_m).long()
-    cells = torch.cat([cells, (normals > 0).long()], 1)
-    _, place = torch.unique(cells, dim=0, return_inverse=True)
-    first = torch.full((int(place.max()) + 1,), len(points_m))
-    return first.scatter_reduce_(0, place, torch.arange(len(points_m)), "amin").sort().values
-
-
 def _seen_from_outside(
     surface: Surface,
 ) -> tuple[Float64[Tensor, "n 3"], Float64[Tensor, "n 3"]]:
@@ -224,14 +214,18 @@ def vote_poses(
     """
     frames = _frames(normals)
     if serves(points_m):
-        from depthpose.pose.compiled.pairs import pair_peaks
+        from depthpose.pose.compiled.pairs import vote
 
-        found = pair_peaks(
-            points_m.numpy(), frames.numpy(), references.numpy(), table.bounds.numpy(),
-            table.first.numpy(), table.turn_rad.numpy(), len(table.points_m), peaks,
-            STEP * table.diameter_m,
+        models = len(table.points_m)
+        shape = (len(references), min(peaks, models))
+        number, bin_ = torch.zeros(shape, dtype=torch.int64), torch.zeros(shape, dtype=torch.int64)
+        votes = torch.zeros(shape, dtype=torch.float64)
+        vote(
+            finite_array(points_m.numpy()), finite_array(frames.numpy()), references.numpy(),
+            table.bounds.numpy(), table.first.numpy(), table.turn_rad.numpy(), models,
+            STEP * table.diameter_m, number.numpy(), bin_.numpy(), votes.numpy(),
         )  # fmt: skip
-        number, bin_, votes = (torch.from_numpy(a).flatten() for a in found)
+        number, bin_, votes = number.flatten(), bin_.flatten(), votes.flatten()
     else:
         chunks = [_peaks(points_m, frames, some, table, peaks)
                   for some in references.split(20)]  # fmt: skip
