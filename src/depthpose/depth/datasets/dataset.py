@@ -70,16 +70,18 @@ def read_split(name: str | Path) -> Split:
     text = read_text(path, _MAX_BYTES)
     frames: set[tuple[str, int]] = set()
     for number, line in enumerate(map(str.strip, text.splitlines()), 1):
+        if not line:
+            continue
         drives = set(re.findall(r"\d{4}_\d\d_\d\d_drive_\d{4}_sync", line, re.ASCII))
         images = re.findall(r"image_0[23]/(?:data/)?(\d{1,10})\.\w", line, re.ASCII)
         as_words = re.fullmatch(r"\S+\s+(\d{1,10})\s+([lr])", line, re.ASCII)
         numbers = {int(n) for n in (images if as_words is None else as_words.groups()[:1])}
-        if line and (len(drives) != 1 or len(numbers) != 1):
+        if len(drives) != 1 or len(numbers) != 1:
             raise InputError(
                 f"{path}: line {number} is {line[:60]!r}, but a frame is 'DATE/DRIVE FRAME l' "
                 "(monodepth2) or two image paths of one frame (monodepth)."
             )
-        if line and (as_words is None or as_words[2] == "l"):
+        if as_words is None or as_words[2] == "l":
             frames.add((drives.pop(), numbers.pop()))
     if not frames:
         raise InputError(
