@@ -26,10 +26,10 @@ from depthpose.pose.estimator.candidates import (
     Candidate,
     KnownObject,
     find_candidates,
-    find_copies,
     nearest_posed,
     surface_signals,
     tilt_of,
+    with_copies,
 )
 from depthpose.pose.estimator.find import (
     ROUNDS,
@@ -481,10 +481,7 @@ class Registration(PoseEstimator):
     def prepare(self) -> None:
         """Prepare every model now, about a second each; else it is done when first asked for."""
         for name in self.objects:
-            known, up_to_symmetry = self._known(name), self.config.up_to_symmetry
-            if known.copies is None:
-                known.copies = find_copies(known.model, up_to_symmetry=up_to_symmetry)
-            self._pairs(known)
+            self._pairs(with_copies(self._known(name), up_to_symmetry=self.config.up_to_symmetry))
 
     def _pose_near(
         self, inputs: Sequence[CloudInput], poses: Sequence[Rigid]
@@ -496,6 +493,9 @@ class Registration(PoseEstimator):
     def _estimate(self, given: AnyInput, poses: Rigid | None = None) -> PoseEstimate:
         """Estimate a pose, from those that were proposed if there are any."""
         known = self._known(given.object)
+        # Once for all inputs, and in the seconds of none.
+        with_copies(known, up_to_symmetry=self.config.up_to_symmetry)
+        pairs = self._pairs(known) if poses is None else None
         model, surface = known.model, known.surface
         began = time.perf_counter()
         cloud = CloudConfig(voxel_m=min(0.9, _VOXEL * model.diameter_m), max_points=None)
@@ -510,9 +510,8 @@ class Registration(PoseEstimator):
             dense_m = take_evenly(cloud_m, _SMOOTHED)
             some_m = dense_m[thin(dense_m, torch.zeros_like(dense_m), _VOXEL * surface.diameter_m)]
             normals, _ = local_planes(dense_m, some_m)
-            if known.pairs is None:
-                known.pairs = prepare_pairs(surface)
-            proposals = propose_poses(some_m, normals, known.pairs, surface, _PROPOSALS, generator)
+            assert pairs is not None
+            proposals = propose_poses(some_m, normals, pairs, surface, _PROPOSALS, generator)
         voted = time.perf_counter()
         seconds["voting"] = voted - began
         best = refine_best(cloud_m, proposals, surface, replace(self.config.icp, starts=1))

