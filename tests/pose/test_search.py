@@ -300,3 +300,12 @@ def test_the_size_that_fits_is_off_by_so_many_deviations(
     found = PoseEstimate(name="a", object="bracket", status="ok", camera_from_model=TRUTHS[0],
                          identity=identity)  # fmt: skip
     assert low <= size_deviations(found, view, prepare_surface(bracket()), 0.03) <= high
+
+
+def test_what_is_followed_must_be_surer(net: Registration, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A track that begins at a wrong pose stays there."""
+    view = view_input(table(), None, CAMERA, "bracket", "view", None)
+    assert len(net.find_in(view, ["bracket"], is_sure=True)) == 2
+    monkeypatch.setattr(find, "_ANOTHER", -100.0)
+    assert len(net.find_in(view, ["bracket"])) >= 1
+    assert not net.find_in(view, ["bracket"], is_sure=True)

@@ -260,14 +260,14 @@ class PoseEstimator(ABC):
     @torch.no_grad()
     @own_arithmetic()
     def find_in(
-        self, view: ViewInput, objects: Sequence[str], rounds: int = ROUNDS
+        self, view: ViewInput, objects: Sequence[str], *, is_sure: bool = False
     ) -> list[PoseEstimate]:
         """Do as :meth:`find` does for a view; its mask limits where is looked.
 
         Args:
             view: depth and camera.
             objects: which may be there.
-            rounds: so often, at most, for what is there more than once.
+            is_sure: answer only what is likelier there than not, and one of each object.
         """
         known = SearchTargets(
             names=objects,
@@ -275,7 +275,8 @@ class PoseEstimator(ABC):
             pairs_of=lambda name: self._pairs(self._known(name)),
             pose_near=self._pose_near,
             max_size_error=self.refusal.max_size_error,
-            rounds=rounds,
+            rounds=1 if is_sure else ROUNDS,
+            is_sure=is_sure,
         )
         found = find_objects(view, known)
         return [with_status(estimate, self.config.min_certainty) for estimate in found]
@@ -337,7 +338,7 @@ class PoseEstimator(ABC):
             if isinstance(given, CloudInput):
                 return self._try_many([given])[0]
             began = time.perf_counter()
-            found = self.find_in(given, [object], rounds=1)
+            found = self.find_in(given, [object], is_sure=True)
             return found[0] if found else nothing_found(given, object, time.perf_counter() - began)
 
         known = self._known(object)

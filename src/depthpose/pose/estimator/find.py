@@ -81,6 +81,7 @@ class SearchTargets:
         pose_near: clouds and the poses that were proposed for them to estimates.
         max_size_error: of :class:`RefusalConfig`.
         rounds: so often, at most, for what is there more than once.
+        is_sure: answer only what is likelier there than not, as what follows an object needs it.
     """
 
     names: Sequence[str]
@@ -89,6 +90,7 @@ class SearchTargets:
     pose_near: Callable[[Sequence[CloudInput], Sequence[Rigid]], list[PoseEstimate]]
     max_size_error: float
     rounds: int = ROUNDS
+    is_sure: bool = False
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -205,7 +207,9 @@ def _judged(
         log_odds += _GAP * _gap(frame.points_m[own], pose, surface)
         off = size_deviations(estimate, view, surface, known.max_size_error)
         log_odds += 0.5 * min(off, _MOST_DEVIATIONS) ** 2  # of a normal distribution
-        if log_odds < _ANSWERED and not is_cut_out(view, pose, surface):
+        if log_odds < (_ANOTHER if known.is_sure else _ANSWERED) and not is_cut_out(
+            view, pose, surface
+        ):
             found = _Candidate(object=estimate.object, pose=pose, log_odds=log_odds, explained=own)
             answers.append((found, estimate))
     return answers

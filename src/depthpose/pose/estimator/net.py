@@ -339,9 +339,11 @@ class DepthImageRegressor(PoseEstimator):
             raise InputError(f"object: say which of {', '.join(names)}; a regressor refuses none")
         return super()._which(given, names)
 
-    def find_in(self, view: ViewInput, objects: Sequence[str], rounds: int = 1) -> NoReturn:
+    def find_in(
+        self, view: ViewInput, objects: Sequence[str], *, is_sure: bool = False
+    ) -> NoReturn:
         """Refuse: nothing tells whether an object is there."""
-        del view, objects, rounds
+        del view, objects, is_sure
         raise InputError(_NEEDS_MASK)
 
     def _pose_near(self, inputs: Sequence[CloudInput], poses: Sequence[Rigid]) -> NoReturn:
