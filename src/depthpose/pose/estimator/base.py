@@ -32,7 +32,6 @@ from depthpose.pose.estimator.candidates import (
     with_copies,
 )
 from depthpose.pose.estimator.find import (
-    ROUNDS,
     SearchTargets,
     find_objects,
     nothing_found,
@@ -275,7 +274,6 @@ class PoseEstimator(ABC):
             pairs_of=lambda name: self._pairs(self._known(name)),
             pose_near=self._pose_near,
             max_size_error=self.refusal.max_size_error,
-            rounds=1 if is_sure else ROUNDS,
             is_sure=is_sure,
         )
         found = find_objects(view, known)

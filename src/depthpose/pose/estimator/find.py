@@ -36,8 +36,9 @@ from depthpose.pose.voting.point_pairs import PairTable
 _MOST_LOG_ODDS = 4.0
 """Proposed poses with larger log odds of being wrong are not refined and judged."""
 _ANSWERED, _ANOTHER = 0.5, -0.5
-"""A pose is answered where its log odds of being wrong, once refined, are below; the second one of
-an object where they are below the second: most things are there once, the others often."""
+"""A pose is answered where its log odds of being wrong, once refined, are below the first; a second
+one of an object, and what tracking begins at, where they are below the second. Most things are
+there once; where two are, there are often many, and the first limit holds again."""
 _DISAGREES, _UNSEEN, _GAP = 20.3, 4.6, 216.0
 """Weights in log odds of being wrong: of the share of the surface that disagrees with the camera,
 of what it did not see, and of the distance of the object's points to the surface, in diameters."""
@@ -48,7 +49,8 @@ _BENT, _MOST_DEVIATIONS = 2.0, 4.0
 size that is off by more deviations than the second counts as one that is off by these."""
 _MOST_JUDGED, _LEAST_JUDGED = 40, 4
 """Poses that are judged in an image, and of each object at least."""
-ROUNDS = 3  #: so often an image is searched for an object that is there more than once, at most
+_ROUNDS = 3
+"""So often an image is searched for an object that is there more than once, at most."""
 _MOST_TOGETHER, _NEARLY = 8, 0.2
 """Poses of one object at one place at most; the readings that one of them explains are the
 object's, if its log odds are at most so much above those of the best there."""
@@ -80,8 +82,7 @@ class SearchTargets:
         pairs_of: gives its point pairs.
         pose_near: clouds and the poses that were proposed for them to estimates.
         max_size_error: of :class:`RefusalConfig`.
-        rounds: so often, at most, for what is there more than once.
-        is_sure: answer only what is likelier there than not, as what follows an object needs it.
+        is_sure: answer only what is likelier there than not, and search once, as tracking does.
     """
 
     names: Sequence[str]
@@ -89,7 +90,6 @@ class SearchTargets:
     pairs_of: Callable[[str], PairTable]
     pose_near: Callable[[Sequence[CloudInput], Sequence[Rigid]], list[PoseEstimate]]
     max_size_error: float
-    rounds: int = ROUNDS
     is_sure: bool = False
 
 
@@ -131,7 +131,7 @@ def find_objects(view: ViewInput, known: SearchTargets) -> list[PoseEstimate]:
     frame = prepare_frame(torch.where(view.mask, view.depth_m, torch.nan), view.K)
     found, taken = list[tuple[_Candidate, PoseEstimate]](), list[_Candidate]()
     names, is_left = known.names, torch.ones_like(frame.depth_m, dtype=torch.bool)
-    for _ in range(known.rounds):
+    for _ in range(1 if known.is_sure else _ROUNDS):
         groups: list[list[_Candidate]] = []
         for one in _candidates(frame, is_left, replace(known, names=names)):
             if any(one.shared_with(other) > _SHARED for other in taken):
@@ -194,6 +194,7 @@ def _judged(
         inputs.append(CloudInput(name=name, points_m=cloud_m, object=some[0].object, view=view))
     poses = [Rigid.stack([one.pose for one in some]) for some in groups]
     answers: list[tuple[_Candidate, PoseEstimate]] = []
+    most_log_odds = _ANOTHER if known.is_sure else _ANSWERED
     estimates = known.pose_near(inputs, poses) if inputs else []
     for one, estimate in zip(inputs, estimates, strict=True):
         if estimate.camera_from_model is None:
@@ -207,9 +208,7 @@ def _judged(
         log_odds += _GAP * _gap(frame.points_m[own], pose, surface)
         off = size_deviations(estimate, view, surface, known.max_size_error)
         log_odds += 0.5 * min(off, _MOST_DEVIATIONS) ** 2  # of a normal distribution
-        if log_odds < (_ANOTHER if known.is_sure else _ANSWERED) and not is_cut_out(
-            view, pose, surface
-        ):
+        if log_odds < most_log_odds and not is_cut_out(view, pose, surface):
             found = _Candidate(object=estimate.object, pose=pose, log_odds=log_odds, explained=own)
             answers.append((found, estimate))
     return answers
