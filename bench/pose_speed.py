@@ -22,12 +22,12 @@ from sparse_speed import child_memory, status_bytes, surface
 from torch import Tensor
 
 from depthpose.core.rigid import Rigid
-from depthpose.pose.cloud import ObjectCloud
 from depthpose.pose.config import CloudConfig, EstimateConfig, RefusalConfig, VotingConfig
 from depthpose.pose.estimator import GeoPoseNet
+from depthpose.pose.estimator.net import CloudToPose
 from depthpose.pose.mesh import make_model
 from depthpose.pose.network import ResUNet, ResUNetConfig
-from depthpose.pose.types import CloudInput, ObjectModel
+from depthpose.pose.types import CloudInput, ObjectModel, PoseEstimate
 from depthpose.pose.weights import PoseWeights
 
 VOXEL_M = 0.004
@@ -45,13 +45,13 @@ class NoisyTruth(GeoPoseNet):
 
     truth: Rigid
 
-    def _directions(
-        self, clouds: list[ObjectCloud], numbers: list[int]
-    ) -> tuple[list[Tensor], float]:
-        _, seconds = super()._directions(clouds, numbers)
-        return [
-            self._true(cloud.points_m, n) for cloud, n in zip(clouds, numbers, strict=True)
-        ], seconds
+    def _ask_network(
+        self, group: list[CloudToPose | PoseEstimate]
+    ) -> list[CloudToPose | PoseEstimate]:
+        for one in super()._ask_network(group):
+            if isinstance(one, CloudToPose):
+                one.outputs = self._true(one.cloud.points_m, one.known.number)
+        return group
 
     def _true(self, points_m: Tensor, number: int) -> Tensor:
         keypoints_m = self.truth.apply(self.weights.models[number].keypoints_m)

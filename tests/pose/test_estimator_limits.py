@@ -17,9 +17,9 @@ from torch import Tensor
 from torch.utils._python_dispatch import TorchDispatchMode
 
 from depthpose.core.rigid import Rigid
-from depthpose.pose.cloud import ObjectCloud
 from depthpose.pose.config import CloudConfig, EstimateConfig, VotingConfig
 from depthpose.pose.estimator import Registration
+from depthpose.pose.estimator.net import CloudToPose
 from depthpose.pose.mesh import make_model
 from depthpose.pose.types import PoseEstimate
 
@@ -59,12 +59,14 @@ class _Noisy(Oracle):
 
     generator = torch.Generator().manual_seed(0)
 
-    def _directions(
-        self, clouds: list[ObjectCloud], numbers: list[int]
-    ) -> tuple[list[Tensor], float]:
-        true, seconds = super()._directions(clouds, numbers)
-        noise = [torch.randn(d.shape, generator=self.generator) for d in true]
-        return [d + 0.03 * n for d, n in zip(true, noise, strict=True)], seconds
+    def _ask_network(
+        self, group: list[CloudToPose | PoseEstimate]
+    ) -> list[CloudToPose | PoseEstimate]:
+        for one in super()._ask_network(group):
+            assert isinstance(one, CloudToPose)
+            noise = torch.randn(one.outputs.shape, generator=self.generator)
+            one.outputs = one.outputs + 0.03 * noise
+        return group
 
 
 def _misfit(found: PoseEstimate, truth: Rigid) -> float:

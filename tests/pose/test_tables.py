@@ -8,7 +8,6 @@ from tests.pose.synthetic_objects import bracket, tiny_weights
 
 from depthpose.core.errors import InputError
 from depthpose.core.rigid import Rigid
-from depthpose.pose.cloud import ObjectCloud, prepare_cloud
 from depthpose.pose.config import CloudConfig
 from depthpose.pose.estimator import GeoPoseNet
 from depthpose.pose.evaluate import Conditions, ObjectRow, Origin
@@ -185,14 +184,13 @@ def test_votes_are_those_of_the_estimator() -> None:
     weights = replace(tiny_weights(model), cloud=CloudConfig(max_points=None))
     net = GeoPoseNet(weights)
     view = Objects([model]).view(1)
-    prepared = prepare_cloud(view.input, model, weights.cloud, net.config)
-    assert isinstance(prepared, ObjectCloud)
+    _, voted = net.estimate_with_votes(view.input)
+    assert voted is not None
     case = next(cases_of(net, [view], 100_000))
     assert case is not None
-    (outputs,), _ = net._directions([prepared], [0])
-    expected = torch.nn.functional.normalize(outputs[..., :3], dim=-1)
+    expected = torch.nn.functional.normalize(voted.directions, dim=-1)
     # A kept point of each voxel; the estimator drops flying pixels by the same rule.
-    gaps = (case.points_m[None] - prepared.points_m[:, None]).norm(dim=-1)
+    gaps = (case.points_m[None] - voted.cloud.points_m[:, None]).norm(dim=-1)
     place = gaps.argmin(1)
     assert float(gaps.amin(1).max()) == 0.0
     assert torch.allclose(case.directions[place], expected, atol=1e-4)

@@ -8,7 +8,7 @@ import time
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
-from operator import itemgetter
+from itertools import chain
 from pathlib import Path
 from typing import NamedTuple, NoReturn
 
@@ -17,7 +17,12 @@ from jaxtyping import Float
 from torch import Tensor
 
 from depthpose.core.checkpoint import find_weights, warn_of_terms
-from depthpose.core.devices import each_in_threads, own_arithmetic, usable_device
+from depthpose.core.devices import (
+    each_in_threads,
+    own_arithmetic,
+    refused_memory,
+    usable_device,
+)
 from depthpose.core.errors import InputError
 from depthpose.core.rigid import Rigid
 from depthpose.pose.baselines import DepthCrop, DepthImageNet, cut_depth, poses_of
@@ -29,7 +34,7 @@ from depthpose.pose.cloud import (
     refusal_of,
 )
 from depthpose.pose.config import EstimateConfig
-from depthpose.pose.estimator.base import PoseEstimator, Registration, answered, or_unreadable
+from depthpose.pose.estimator.base import PoseEstimator, Registration, or_unreadable
 from depthpose.pose.estimator.candidates import (
     Candidate,
     KnownObject,
@@ -64,7 +69,7 @@ class CloudDirections(NamedTuple):
 
 
 @dataclass(kw_only=True, eq=False)
-class _Cloud:
+class CloudToPose:
     """An input on its way: its object, its cloud, the seconds, and what the network says of it."""
 
     given: AnyInput
@@ -75,13 +80,13 @@ class _Cloud:
 
 
 def _batches(
-    clouds: Iterable["_Cloud | PoseEstimate"], most: int
-) -> Iterator[list["_Cloud | PoseEstimate"]]:
+    clouds: Iterable[CloudToPose | PoseEstimate], most: int
+) -> Iterator[list[CloudToPose | PoseEstimate]]:
     """Group clouds so that each group has ``most`` voxels at most, or is one cloud."""
-    group: list[_Cloud | PoseEstimate] = []
+    group: list[CloudToPose | PoseEstimate] = []
     total = 0
     for one in clouds:
-        count = len(one.cloud.points_m) if isinstance(one, _Cloud) else 0
+        count = len(one.cloud.points_m) if isinstance(one, CloudToPose) else 0
         if group and total + count > most:
             yield group
             group, total = [], 0
@@ -164,19 +169,10 @@ class GeoPoseNet(PoseEstimator):
         The answer for an input does not depend on those beside it, but for the rounding of the
         network's sums. Only what is likely is registered, where the config wants it.
         """
-        answers = self._with_votes(inputs, threads, is_likely=is_likely)
-        work = self._registered if self.config.register_refused and is_likely else itemgetter(0)
-        return map(work, answers)
-
-    def _registered(self, answer: tuple[PoseEstimate, "_Cloud | None"]) -> PoseEstimate:
-        found, one = answer
-        if one is None or found.status not in _DOUBTED:
-            return found
-        start = time.perf_counter()
-        (registered,) = self._by_models().estimate_many([one.given])
-        spent_s = time.perf_counter() - start
-        best = registered if registered.is_posed else found
-        return replace(best, seconds={**found.seconds, "registration": spent_s})
+        prepared = each_in_threads(partial(or_unreadable, self._prepare), inputs, threads)
+        groups = map(self._ask_network, _batches(prepared, self.config.batch_voxels))
+        pose = partial(self._pose, is_likely=is_likely)
+        return chain.from_iterable(map(partial(each_in_threads, pose, threads=threads), groups))
 
     def _by_models(self) -> Registration:
         """Give the registration of the same objects, which shares what was prepared of them."""
@@ -205,28 +201,15 @@ class GeoPoseNet(PoseEstimator):
         Raises:
             InputError: an unknown object, or a mask that does not fit its depth image.
         """
-        ((found, one),) = self._with_votes([given], 1)
-        voted = None if one is None else CloudDirections(one.cloud, one.outputs)
-        return answered(found), voted
+        with refused_memory(given.name):
+            one = self._prepare(given)
+            if isinstance(one, PoseEstimate):
+                return one, None
+            self._ask_network([one])
+            found = self._vote(given, one=one, is_likely=True)
+            return found, CloudDirections(one.cloud, one.outputs)
 
-    def _with_votes(
-        self, inputs: Iterable[AnyInput], threads: int, *, is_likely: bool = True
-    ) -> Iterator[tuple[PoseEstimate, "_Cloud | None"]]:
-        """Give each estimate, and the cloud with the network's outputs where it was run."""
-        prepared = each_in_threads(partial(or_unreadable, self._prepare), inputs, threads)
-        work = partial(self._pose, is_likely=is_likely)
-        for some in _batches(prepared, self.config.batch_voxels):
-            ready = [one for one in some if isinstance(one, _Cloud)]
-            if ready:
-                numbers = [one.known.number for one in ready]
-                outputs, spent_s = self._directions([one.cloud for one in ready], numbers)
-                total = sum(map(len, outputs))
-                for one, own in zip(ready, outputs, strict=True):  # each has a share of the time
-                    one.outputs = own
-                    one.seconds["network"] = spent_s * len(own) / total
-            yield from each_in_threads(work, some, threads)
-
-    def _prepare(self, given: AnyInput) -> "_Cloud | PoseEstimate":
+    def _prepare(self, given: AnyInput) -> CloudToPose | PoseEstimate:
         known = self._known(given.object)
         with_copies(known, up_to_symmetry=self.config.up_to_symmetry)  # in the seconds of no input
         start = time.perf_counter()
@@ -234,38 +217,51 @@ class GeoPoseNet(PoseEstimator):
         seconds = {"cloud": time.perf_counter() - start}
         if isinstance(prepared, Refusal):
             return refused(given, prepared, seconds)
-        return _Cloud(given=given, known=known, cloud=prepared, seconds=seconds)
+        return CloudToPose(given=given, known=known, cloud=prepared, seconds=seconds)
 
-    def _directions(
-        self, clouds: list[ObjectCloud], numbers: list[int]
-    ) -> tuple[list[Float[Tensor, "n k 3"]], float]:
-        """Ask for the directions to the keypoints in the camera frame; give the seconds too."""
+    def _ask_network(
+        self, group: list[CloudToPose | PoseEstimate]
+    ) -> list[CloudToPose | PoseEstimate]:
+        """Ask together for the directions of a group's clouds, in the camera frame."""
+        ready = [one for one in group if isinstance(one, CloudToPose)]
+        if not ready:
+            return group
         start = time.perf_counter()
-        counts = [len(cloud.points_m) for cloud in clouds]
-        cloud_of_point = torch.repeat_interleave(torch.arange(len(clouds)), torch.tensor(counts))
-        grids = [cloud.voxels for cloud in clouds]
+        counts = [len(one.cloud.points_m) for one in ready]
+        cloud_of_point = torch.repeat_interleave(torch.arange(len(ready)), torch.tensor(counts))
+        numbers = torch.tensor([one.known.number for one in ready])
+        grids = [one.cloud.voxels for one in ready]
         coordinates = torch.cat([grid.coordinates for grid in grids])
-        points_m = torch.cat([c.points_m @ c.voxels.grid_from_camera.mT for c in clouds])
+        points_m = [one.cloud.points_m @ one.cloud.voxels.grid_from_camera.mT for one in ready]
         device = self.config.device
         seen = SeenPoints(
-            points_m=points_m.to(device),
+            points_m=torch.cat(points_m).to(device),
             coordinates=torch.cat([cloud_of_point[:, None], coordinates], 1).to(device),
             features=torch.cat([grid.features for grid in grids]).to(device),
-            class_of_point=torch.tensor(numbers)[cloud_of_point].to(device),
+            class_of_point=numbers[cloud_of_point].to(device),
         )
         outputs = self._network.directions(seen).float().cpu().split(counts)
-        found = [some @ grid.grid_from_camera for some, grid in zip(outputs, grids, strict=True)]
-        return found, time.perf_counter() - start
+        for one, some in zip(ready, outputs, strict=True):
+            one.outputs = some @ one.cloud.voxels.grid_from_camera
+        spent_s = time.perf_counter() - start
+        for one, count in zip(ready, counts, strict=True):  # each has a share of the time
+            one.seconds["network"] = spent_s * count / sum(counts)
+        return group
 
-    def _pose(
-        self, one: "_Cloud | PoseEstimate", *, is_likely: bool
-    ) -> tuple[PoseEstimate, "_Cloud | None"]:
+    def _pose(self, one: CloudToPose | PoseEstimate, *, is_likely: bool) -> PoseEstimate:
+        """Pose a cloud by its votes, or by registration where these are doubted."""
         if isinstance(one, PoseEstimate):
-            return one, None
-        vote = partial(self._vote, one=one, is_likely=is_likely)
-        return or_unreadable(vote, one.given), one
+            return one
+        found = or_unreadable(partial(self._vote, one=one, is_likely=is_likely), one.given)
+        if not (self.config.register_refused and is_likely) or found.status not in _DOUBTED:
+            return found
+        start = time.perf_counter()
+        (registered,) = self._by_models().estimate_many([one.given])
+        spent_s = time.perf_counter() - start
+        best = registered if registered.is_posed else found
+        return replace(best, seconds={**found.seconds, "registration": spent_s})
 
-    def _vote(self, given: AnyInput, *, one: "_Cloud", is_likely: bool) -> PoseEstimate:
+    def _vote(self, given: AnyInput, *, one: CloudToPose, is_likely: bool) -> PoseEstimate:
         """Vote for the keypoints, fit the pose, refine and check it."""
         known, config, began = one.known, self.config, time.perf_counter()
         model, surface, cloud = known.model, known.surface, one.cloud
