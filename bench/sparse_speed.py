@@ -50,7 +50,7 @@ def plain_conv(features: Tensor, weight: Tensor, kernel_map: KernelMap) -> Tenso
     out = features.new_zeros(kernel_map.outputs, weight.shape[2])
     for offset, read, write in kernel_map.by_offset():
         out = out.index_add(0, write, features[read] @ weight[offset])
-    centre = kernel_map.centre
+    centre = kernel_map.neighbours.centre
     return out if centre is None else out + features @ weight[centre]
 
 

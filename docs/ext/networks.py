@@ -276,7 +276,7 @@ def _answers(found: PoseNetworks) -> tuple[torch.Size, torch.Size]:
     with torch.no_grad():
         voxels = Voxels.from_points(plane.int(), features)
         seen = found.network.point_features(voxels)
-        return seen.shape, found.network.forward_class(voxels, 0).shape
+        return seen.shape, found.network.forward_class(seen, 0).shape
 
 
 def _weights(module: nn.Module) -> str:

@@ -16,7 +16,7 @@ from depthpose.pose.network import (
     fold_norms,
     unfold_norms,
 )
-from depthpose.pose.sparse import Voxels
+from depthpose.pose.sparse import Voxels, unpack
 from depthpose.pose.types import SeenPoints
 
 TINY = ResUNetConfig(
@@ -145,8 +145,9 @@ def test_one_class_alone_answers_as_among_all() -> None:
     network, voxels = tiny(), Voxels.from_points(surface())
     outputs = network(voxels)
     assert outputs.shape[1:] == (3, 4, 3)
+    features = network.point_features(voxels)
     for number in range(3):
-        torch.testing.assert_close(network.forward_class(voxels, number), outputs[:, number])
+        torch.testing.assert_close(network.forward_class(features, number), outputs[:, number])
     rows = torch.arange(len(outputs))
     seen = SeenPoints(
         points_m=torch.zeros(len(rows), 3),
@@ -156,7 +157,7 @@ def test_one_class_alone_answers_as_among_all() -> None:
     )
     chosen = network.directions(seen)
     torch.testing.assert_close(chosen, outputs[rows, rows % 3])
-    assert network.point_features(voxels).shape[1] == TINY.decoder[0]
+    assert features.shape[1] == TINY.decoder[0]
 
 
 @pytest.mark.parametrize("norm", NORMS)
@@ -168,7 +169,7 @@ def test_both_kinds_begin_with_answers_of_a_sensible_size_and_learn(
                            decoder=(32, 32, 32, 64))  # fmt: skip
     network, voxels = ResUNet(config), Voxels.from_points(surface())
     assert 0.1 < float(network.point_features(voxels).detach().std()) < 3
-    truth = torch.nn.functional.normalize(-voxels.coordinates[:, 1:].float(), dim=1)
+    truth = torch.nn.functional.normalize(-unpack(voxels.cache.keys(0))[:, 1:].float(), dim=1)
     optimiser, losses = torch.optim.Adam(network.parameters(), 2e-3), []
     for _ in range(12):
         loss = (network(voxels) - truth[:, None, None]).square().mean()

@@ -108,13 +108,13 @@ def test_equals_the_dense_convolution(
     levels = stride.bit_length() - 1
     start, end = (levels, 0) if is_transposed else (0, levels)
     cache = points.cache
-    x = features_of(cache.coordinates(start), inputs).requires_grad_()
+    x = features_of(unpack(cache.keys(start)), inputs).requires_grad_()
     weight = weight_of(kernel, inputs, 5).requires_grad_()
     found = conv(x, weight, cache.kernel_map(start, kernel, stride, is_transposed=is_transposed))
 
-    grid = scatter(x, cache.coordinates(start), 2**start)
+    grid = scatter(x, unpack(cache.keys(start)), 2**start)
     answer = dense_conv(grid, weight, stride, is_transposed=is_transposed)
-    expected = gather(answer, cache.coordinates(end), 2**end)
+    expected = gather(answer, unpack(cache.keys(end)), 2**end)
     # torch's transposed convolution is the adjoint of its convolution, as ours is of ours.
     torch.testing.assert_close(found, expected, rtol=1e-12, atol=1e-12)
     pull = features_of(expected, 5, seed=3)
@@ -128,15 +128,15 @@ def test_two_levels_down_and_up_equal_the_dense_convolutions() -> None:
     voxels = Voxels.from_points(cloud(), features_of(cloud(), 2))
     convs = [SparseConv(2, 3, 3, 2), SparseConv(3, 4, 3, 2, has_bias=True)]
     ups = [SparseConvTranspose(4, 3, 3, 2), SparseConvTranspose(3, 2, 3, 2)]
-    found, grid = voxels, scatter(voxels.features, voxels.coordinates, 1)
+    found, grid = voxels, scatter(voxels.features, unpack(voxels.cache.keys(0)), 1)
     for layer in [*(c.double() for c in convs), *(u.double() for u in ups)]:
         found = layer(found)
         grid = dense_conv(grid, layer.weight, 2, is_transposed=layer.is_transposed)
         grid = grid if layer.bias is None else grid + layer.bias[:, None, None, None]
-        stride = 2**found.level
-        torch.testing.assert_close(found.features, gather(grid, found.coordinates, stride))
+        stride, cells = 2**found.level, unpack(found.cache.keys(found.level))
+        torch.testing.assert_close(found.features, gather(grid, cells, stride))
         # Between levels only stored voxels live on.
-        grid = scatter(found.features, found.coordinates, stride)
+        grid = scatter(found.features, cells, stride)
     assert found.level == 0
 
 
@@ -151,8 +151,8 @@ def test_pairs_of_a_small_case_by_hand() -> None:
     left, right = offsets.index((-1, 0, 0)), offsets.index((1, 0, 0))
     assert met == {(left, 0, 1), (left, 1, 2), (right, 1, 0), (right, 2, 1)}
     pairs = kernel_map.neighbours.pairs
-    assert (kernel_map.centre, pairs.filled, pairs.counts) == (13, (left, right), (2, 2))
-    assert cache.coordinates(1).tolist() == [[0, -2, 0, 0], [0, 0, 0, 0], [1, 0, 0, 0]]
+    assert (kernel_map.neighbours.centre, pairs.filled, pairs.counts) == (13, (left, right), (2, 2))
+    assert unpack(cache.keys(1)).tolist() == [[0, -2, 0, 0], [0, 0, 0, 0], [1, 0, 0, 0]]
 
 
 def test_a_table_and_a_binary_search_find_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -199,7 +199,7 @@ def test_offsets_run_with_x_fastest() -> None:
 
 def test_gradients_by_differences() -> None:
     cache = Voxels.from_points(cloud(12)).cache
-    x = features_of(cache.coordinates(0), 5).requires_grad_()
+    x = features_of(unpack(cache.keys(0)), 5).requires_grad_()
     weight = weight_of(3, 5, 2).requires_grad_()
     for kernel_map in (cache.kernel_map(0, 3), cache.kernel_map(0, 3, 2)):
         assert torch.autograd.gradcheck(lambda a, w, m=kernel_map: conv(a, w, m), (x, weight))

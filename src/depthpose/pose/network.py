@@ -58,11 +58,6 @@ class ResUNetConfig(Settings):
                 f"{self.first_kernel}; take 7"
             )
 
-    @property
-    def outputs(self) -> int:
-        """Channels of the last layer."""
-        return self.classes * self.keypoints * 3
-
 
 BRANCH_SCALE = 0.25
 """Without norms the second convolution of each block begins this much smaller: seven blocks in a
@@ -139,7 +134,7 @@ class ResUNet(nn.Module):
         self.up_blocks = nn.ModuleList(Block(d[i], config) for i in (3, 2, 1))
         # No norm and no neighbours: the skip of the finest level is mixed point by point.
         self.mix = SparseConv(e[0] + d[1], d[0], 1, has_bias=config.with_bias)
-        self.final = SparseConv(d[0], config.outputs, 1, has_bias=True)
+        self.final = SparseConv(d[0], config.classes * config.keypoints * 3, 1, has_bias=True)
         # The answers are parts of unit vectors: begin near nothing, not twice too long.
         with torch.no_grad():
             self.final.weight.mul_(0.5)
@@ -160,10 +155,6 @@ class ResUNet(nn.Module):
         """Give what the last layer sees of each point given: the features of figure 3-2."""
         return self._features(voxels).at_points()
 
-    def forward_class(self, voxels: Voxels, number: int) -> Float[Tensor, "points keypoints 3"]:
-        """Answer for one class alone, without computing the other classes' outputs."""
-        return self._answer(self.point_features(voxels), number)
-
     def directions(self, seen: SeenPoints) -> Float[Tensor, "points keypoints 3"]:
         """Answer for each point's own class: what every network that votes offers."""
         voxels = Voxels.from_points(seen.coordinates, seen.features)
@@ -172,10 +163,13 @@ class ResUNet(nn.Module):
         answers = features.new_empty(len(features), self.config.keypoints, 3)
         for number in seen.class_of_point.unique().tolist():
             mine = seen.class_of_point == number
-            answers[mine] = self._answer(features[mine], number).to(answers)
+            answers[mine] = self.forward_class(features[mine], number).to(answers)
         return answers
 
-    def _answer(self, features: Tensor, number: int) -> Float[Tensor, "n keypoints 3"]:
+    def forward_class(
+        self, features: Float[Tensor, "n width"], number: int
+    ) -> Float[Tensor, "n keypoints 3"]:
+        """Answer for one class alone from :meth:`point_features`, without the other classes."""
         assert self.final.bias is not None
         assert 0 <= number < self.config.classes, f"class {number} of {self.config.classes}"
         size = self.config.keypoints * 3
@@ -253,7 +247,8 @@ def unfold_norms(folded: ResUNet, network: ResUNet, voxels: Voxels) -> None:
         norm.running_var.copy_(variance)
         norm.weight.copy_((variance + norm.eps).sqrt())
         norm.bias.copy_(mean)
-    parts = ("mix.", "final.") if folded.config.outputs == network.config.outputs else ("mix.",)
+    is_alike = folded.final.weight.shape == network.final.weight.shape
+    parts = ("mix.", "final.") if is_alike else ("mix.",)
     known = network.state_dict()
     others = {k: v for k, v in folded.state_dict().items() if k.startswith(parts) and k in known}
     network.load_state_dict(others, strict=False)

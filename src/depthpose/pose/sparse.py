@@ -15,9 +15,9 @@ gathered at once. Without gradients small ones go through a compiled loop, where
 """
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Any
+from typing import Any, Literal, NamedTuple
 
 import torch
 import torch.nn.functional as F
@@ -148,6 +148,14 @@ class PairList:
     most: int  #: the largest of these counts
 
 
+class Slots(NamedTuple):
+    """Pairs in a grid of (volume, most), for one direction of a convolution."""
+
+    read: Int64[Tensor, " slots"]  #: row that each slot reads; one past the last where it is empty
+    order: Int64[Tensor, " pairs"]  #: filled slots, grouped by the row that they add to
+    starts: Int64[Tensor, " rows"]  #: where in that order each row written begins
+
+
 @dataclass(frozen=True, kw_only=True, eq=False)
 class NeighbourTable:
     """Neighbours between a fine and a coarse level, or of a level with itself."""
@@ -157,6 +165,7 @@ class NeighbourTable:
     table: Int32[Tensor, "volume coarse_rows"]
     fine_rows: int  #: number of voxels of the finer level
     centre: int | None  #: offset at which each voxel is its own neighbour; None across levels
+    _slots: dict[bool, Slots] = field(default_factory=dict)
 
     @cached_property
     def pairs(self) -> PairList:
@@ -179,34 +188,20 @@ class NeighbourTable:
             counts=tuple(numbers[offset] for offset in filled), most=most,
         )  # fmt: skip
 
-    @cached_property
-    def fine_grid(self) -> Int64[Tensor, " slots"]:
-        """Fine row of each slot; one past the last row where the slot is empty."""
-        return self._grid(self.pairs.fine, self.fine_rows)
-
-    @cached_property
-    def coarse_grid(self) -> Int64[Tensor, " slots"]:
-        """Coarse row of each slot; one past the last row where the slot is empty."""
-        return self._grid(self.pairs.coarse, self.table.shape[1])
-
-    @cached_property
-    def by_fine(self) -> tuple[Tensor, Tensor]:
-        """Slots grouped by fine row: their order, and where in it each row begins."""
-        return self._grouped(self.pairs.fine, self.fine_rows)
-
-    @cached_property
-    def by_coarse(self) -> tuple[Tensor, Tensor]:
-        """Slots grouped by coarse row."""
-        return self._grouped(self.pairs.coarse, self.table.shape[1])
-
-    def _grid(self, rows: Tensor, nobody: int) -> Tensor:
-        grid = rows.new_full((len(self.table) * self.pairs.most,), nobody)
-        grid[self.pairs.slot] = rows
-        return grid
-
-    def _grouped(self, rows: Tensor, count: int) -> tuple[Tensor, Tensor]:
-        counts = torch.bincount(rows, minlength=count)
-        return self.pairs.slot[torch.argsort(rows, stable=True)], counts.cumsum(0) - counts
+    def slots(self, *, is_transposed: bool) -> Slots:
+        """The pairs as a grid; ``is_transposed``: from the coarse rows to the fine ones."""
+        if is_transposed not in self._slots:
+            pairs = self.pairs
+            read, inputs = pairs.fine, self.fine_rows
+            written, outputs = pairs.coarse, self.table.shape[1]
+            if is_transposed:
+                read, inputs, written, outputs = written, outputs, read, inputs
+            grid = read.new_full((len(self.table) * pairs.most,), inputs)
+            grid[pairs.slot] = read
+            order = pairs.slot[torch.argsort(written, stable=True)]
+            counts = torch.bincount(written, minlength=outputs)
+            self._slots[is_transposed] = Slots(grid, order, counts.cumsum(0) - counts)
+        return self._slots[is_transposed]
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -215,26 +210,6 @@ class KernelMap:
 
     neighbours: NeighbourTable  #: of the two levels, or of the one
     is_transposed: bool = False  #: False: fine to coarse (or the level to itself); True: back
-
-    @property
-    def transposed(self) -> "KernelMap":
-        """The way back: the map of the transposed convolution and of the input's gradient."""
-        return KernelMap(neighbours=self.neighbours, is_transposed=not self.is_transposed)
-
-    @property
-    def volume(self) -> int:
-        """Number of offsets of the kernel."""
-        return len(self.neighbours.table)
-
-    @property
-    def centre(self) -> int | None:
-        """Offset at which each voxel is its own neighbour, which the pairs leave out."""
-        return self.neighbours.centre
-
-    @property
-    def most(self) -> int:
-        """Pairs of the fullest offset."""
-        return self.neighbours.pairs.most
 
     @property
     def outputs(self) -> int:
@@ -278,10 +253,6 @@ class CoordinateCache:
             low_bits = (2**level - 1) * sum(AXES)
             self._keys[level] = torch.unique(self.keys(level - 1) & ~low_bits)
         return self._keys[level]
-
-    def coordinates(self, level: int) -> Tensor:
-        """Give (cloud, x, y, z) of each voxel of a level, in voxels of level 0."""
-        return unpack(self.keys(level))
 
     def kernel_map(
         self, level: int, kernel: int, stride: int = 1, *, is_transposed: bool = False
@@ -385,43 +356,47 @@ class _Convolution(torch.autograd.Function):
         gradient = gradient.contiguous()
         wants_x, wants_weight, _ = ctx.needs_input_grad
         # The first layer's input is no parameter's child: its gradient is seldom wanted.
-        for_x = _convolve(gradient, weight.mT, m.transposed) if wants_x else None
+        back = KernelMap(neighbours=m.neighbours, is_transposed=not m.is_transposed)
+        for_x = _convolve(gradient, weight.mT, back) if wants_x else None
         if not wants_weight:
             return for_x, None, None
-        if _is_narrow(x, m):
+        way = _way(x, weight, m)
+        if way == "table":
             return for_x, (_table(x, m) @ gradient).view(weight.shape), None
-        if _is_gridded(x, weight, m):
-            found = torch.bmm(_read(x, m).mT, _read(gradient, m.transposed))
+        if way == "grid":
+            found = torch.bmm(_read(x, m).mT, _read(gradient, back))
         else:
             found = torch.zeros_like(weight)
             for offset, read, write in m.by_offset():
                 pulls = gradient.index_select(0, write)
                 torch.mm(x.index_select(0, read).T, pulls, out=found[offset])
-        if m.centre is not None:
-            torch.mm(x.T, gradient, out=found[m.centre])
+        if (centre := m.neighbours.centre) is not None:
+            torch.mm(x.T, gradient, out=found[centre])
         return for_x, found, None
 
 
 def _convolve(x: Tensor, weight: Tensor, m: KernelMap) -> Tensor:
-    if _is_narrow(x, m):
+    way, centre = _way(x, weight, m), m.neighbours.centre
+    if way == "table":
         return _table(x, m).T @ weight.flatten(0, 1)
-    if _is_gridded(x, weight, m):  # all offsets in one operation each, padded to the fullest
+    if way == "grid":  # all offsets in one operation each, padded to the fullest
         products = torch.bmm(_read(x, m), weight).flatten(0, 1)
         # The slots of an output are gathered, not scattered: the same bits on every run, on CUDA
         # too, and several times faster on the CPU than ``index_add_``.
-        order, starts = m.neighbours.by_fine if m.is_transposed else m.neighbours.by_coarse
-        out = F.embedding_bag(order, products, starts, mode="sum")
+        slots = m.neighbours.slots(is_transposed=m.is_transposed)
+        out = F.embedding_bag(slots.order, products, slots.starts, mode="sum")
     else:  # an offset at a time: its pairs write each row once at most
         out, kernels = x.new_zeros(m.outputs, weight.shape[2]), weight.unbind()
         for offset, read, write in m.by_offset():
             out.index_add_(0, write, x.index_select(0, read) @ kernels[offset])
-    return out if m.centre is None else out.addmm_(x, weight[m.centre])
+    return out if centre is None else out.addmm_(x, weight[centre])
 
 
 def _read(x: Tensor, m: KernelMap) -> Tensor:
     """Gather the slots of (volume, most); empty ones read a row of zeros."""
-    grid = m.neighbours.coarse_grid if m.is_transposed else m.neighbours.fine_grid
-    return F.pad(x, (0, 0, 0, 1)).index_select(0, grid).view(m.volume, m.most, x.shape[1])
+    near, padded = m.neighbours, F.pad(x, (0, 0, 0, 1))
+    read = padded.index_select(0, near.slots(is_transposed=m.is_transposed).read)
+    return read.view(len(near.table), near.pairs.most, x.shape[1])
 
 
 def _table(x: Tensor, m: KernelMap) -> Tensor:
@@ -429,21 +404,22 @@ def _table(x: Tensor, m: KernelMap) -> Tensor:
     padded = F.pad(x, (0, 0, 0, 1))
     rows = m.neighbours.table
     read = padded.index_select(0, rows.flatten()).view(*rows.shape, x.shape[1])
-    return read.transpose(1, 2).reshape(m.volume * x.shape[1], m.outputs)
+    return read.transpose(1, 2).reshape(len(rows) * x.shape[1], m.outputs)
 
 
-def _is_narrow(x: Tensor, m: KernelMap) -> bool:
-    channels = x.shape[1]
-    elements = m.outputs * m.volume * channels
-    return not m.is_transposed and channels <= NARROW and elements <= TABLE_ELEMENTS
-
-
-def _is_gridded(x: Tensor, weight: Tensor, m: KernelMap) -> bool:
+def _way(x: Tensor, weight: Tensor, m: KernelMap) -> Literal["table", "grid", "offset by offset"]:
+    """Choose what is gathered at once: all that is read, the padded pairs, or one offset's."""
+    volume, channels = len(m.neighbours.table), x.shape[1]
+    is_small = channels <= NARROW and m.outputs * volume * channels <= TABLE_ELEMENTS
+    if is_small and not m.is_transposed:
+        return "table"
+    most = m.neighbours.pairs.most
+    is_gridded = most * weight[0].numel() <= GRID_PRODUCTS
     if x.is_cuda:
         # CUDA adds up offset by offset in no fixed order, so only a grid is the same on each run.
         is_fixed = torch.are_deterministic_algorithms_enabled()
-        return is_fixed or m.volume * m.most * max(weight.shape[1:]) <= GRID_ELEMENTS
-    return m.most * weight[0].numel() <= GRID_PRODUCTS
+        is_gridded = is_fixed or volume * most * max(weight.shape[1:]) <= GRID_ELEMENTS
+    return "grid" if is_gridded else "offset by offset"
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -485,11 +461,6 @@ class Voxels:
             )
         features = features[torch.argsort(given)]
         return cls(features=features, cache=CoordinateCache(keys), row_of_point=row_of_point)
-
-    @property
-    def coordinates(self) -> Int64[Tensor, "n 4"]:
-        """(cloud, x, y, z) of each row, in voxels of level 0."""
-        return self.cache.coordinates(self.level)
 
     def with_features(self, features: Float[Tensor, "m c2"], level: int | None = None) -> "Voxels":
         """Give other features of the same level, or of another one of the same voxels."""

@@ -273,7 +273,8 @@ def cases_of(
         places = torch.nn.functional.pad(grid.coordinates, (1, 0))
         voxels = Voxels.from_points(places, grid.features)
         with torch.inference_mode():
-            outputs = network.forward_class(voxels, number) @ grid.grid_from_camera
+            outputs = network.forward_class(network.point_features(voxels), number)
+            outputs = outputs @ grid.grid_from_camera
             directions = torch.nn.functional.normalize(outputs, dim=-1)[grid.row_of_point]
         yield VotingCase(
             points_m=points_m,
