@@ -163,8 +163,14 @@ def _planes(
         if int(piece.sum()) >= least:
             whole = torch.bincount(label[bent], minlength=len(sizes))
             joined = (sizes > 0.5 * whole)[label] & bent
-            plane_m[joined] = _no_side_m(points_m[piece])
             is_left &= ~joined
+            # An object of up to this diameter has no side as wide or as long.
+            some = take_evenly(points_m[piece], _SAMPLE)
+            offset = some - some.mean(0)
+            _, axes = torch.linalg.eigh(offset.T @ offset)
+            along = offset @ axes[:, 1:]
+            width_m, length_m = (along.quantile(0.95, 0) - along.quantile(0.05, 0)).tolist()
+            plane_m[joined] = max(width_m / _WIDER, length_m / _LONGER)
     return plane_m
 
 
@@ -178,24 +184,15 @@ def _bent(
     off_m = points_m @ plane[0] - plane[1]
     x, y = (points_m[..., :2] / points_m[..., 2:].clamp(min=1e-6)).unbind(-1)
     terms = torch.stack([torch.ones_like(x), x, y, x * x, x * y, y * y], -1)
+    tolerance_m = _TOLERANCE_M + _TOLERANCE_PER_M * points_m[..., 2].square()
     found = near & is_along
     for _ in range(_BENDINGS):
         A, b = (take_evenly(grid[found], _SAMPLE) for grid in (terms, off_m))
         if len(b) < _LEAST_POINTS:
             break
         bend_m = terms @ torch.linalg.lstsq(A, b[:, None]).solution
-        found = is_along & ((off_m - bend_m[..., 0]).abs() < _tolerance_m(points_m))
+        found = is_along & ((off_m - bend_m[..., 0]).abs() < tolerance_m)
     return found
-
-
-def _no_side_m(points_m: Float64[Tensor, "n 3"]) -> float:
-    """Give the diameter up to which an object has no side as wide or as long as a plane."""
-    some = take_evenly(points_m, _SAMPLE)
-    offset = some - some.mean(0)
-    _, axes = torch.linalg.eigh(offset.T @ offset)
-    along = offset @ axes[:, 1:]
-    width_m, length_m = (along.quantile(0.95, 0) - along.quantile(0.05, 0)).tolist()
-    return max(width_m / _WIDER, length_m / _LONGER)
 
 
 def largest_plane(points_m: Float64[Tensor, "n 3"], generator: torch.Generator) -> Plane | None:
@@ -209,7 +206,8 @@ def largest_plane(points_m: Float64[Tensor, "n 3"], generator: torch.Generator) 
     length = normal.norm(dim=-1, keepdim=True)
     normal = normal / length.clamp(min=1e-12)
     offset = (normal * a).sum(-1)
-    on = (some @ normal.T - offset).abs() < _tolerance_m(some)[:, None]
+    tolerance_m = _TOLERANCE_M + _TOLERANCE_PER_M * some[:, 2].square()
+    on = (some @ normal.T - offset).abs() < tolerance_m[:, None]
     on &= length[:, 0] > 1e-8
     best = int(on.sum(0).argmax())
     plane = (normal[best], offset[best])
@@ -223,14 +221,11 @@ def largest_plane(points_m: Float64[Tensor, "n 3"], generator: torch.Generator) 
     return plane
 
 
-def _tolerance_m(points_m: Float64[Tensor, "*batch 3"]) -> Float64[Tensor, "*batch"]:
-    return _TOLERANCE_M + _TOLERANCE_PER_M * points_m[..., 2].square()
-
-
 def is_on_plane(points_m: Float64[Tensor, "*batch 3"], plane: Plane) -> Bool[Tensor, "*batch"]:
     """Whether points of the camera frame lie on a plane, as far as a depth sensor measures it."""
     normal, offset = plane
-    return (points_m @ normal - offset).abs() < _tolerance_m(points_m)
+    tolerance_m = _TOLERANCE_M + _TOLERANCE_PER_M * points_m[..., 2].square()
+    return (points_m @ normal - offset).abs() < tolerance_m
 
 
 def label_regions(
@@ -244,12 +239,14 @@ def label_regions(
     index = torch.arange(height * width).reshape(height, width)
     rows, columns = [], []
     for down, right in ((0, 1), (1, 0), (1, 1), (1, -1)):
-        a, b = _beside(index, down, right)
-        z_a, z_b = _beside(depth_m, down, right)
-        both = torch.logical_and(*_beside(is_left, down, right))
-        joined = both & ((z_a - z_b).abs() < _JUMP_M + _JUMP_PER_M * torch.minimum(z_a, z_b))
-        rows.append(a[joined])
-        columns.append(b[joined])
+        # Each pixel, and its neighbour so many rows down and columns to the right.
+        first = slice(height - down), slice(max(0, -right), width - max(0, right))
+        second = slice(down, None), slice(max(0, right), width - max(0, -right))
+        z_a, z_b = depth_m[first], depth_m[second]
+        joined = (z_a - z_b).abs() < _JUMP_M + _JUMP_PER_M * torch.minimum(z_a, z_b)
+        joined &= is_left[first] & is_left[second]
+        rows.append(index[first][joined])
+        columns.append(index[second][joined])
     a, b = torch.cat(rows).numpy(), torch.cat(columns).numpy()
     size = height * width
     graph = coo_matrix((np.ones(len(a), np.int8), (a, b)), shape=(size, size))
@@ -258,12 +255,3 @@ def label_regions(
         .long()
         .reshape(height, width)
     )
-
-
-def _beside(grid: Tensor, down: int, right: int) -> tuple[Tensor, Tensor]:
-    """Give each pixel and its neighbour so many rows down and columns to the right."""
-    height, width = grid.shape
-    left = max(0, -right)
-    first = grid[: height - down, left : width - max(0, right)]
-    second = grid[down:, left + right : width - max(0, right) + right]
-    return first, second
