@@ -175,7 +175,7 @@ def test_a_cloud_that_hardly_shows_its_object_is_refused_early() -> None:
     strict = RefusalConfig(min_agreement=1.0, max_beyond=0.0, min_explained=1.0)
     net = Oracle(tiny_weights(bracket(), refusal=strict), [pose_at()])
     given = CloudInput(name="blob", points_m=blob, object="bracket")
-    (early,), (whole,) = net._try_many([given]), net.estimate_many([given])
+    (early,), (whole,) = net._answers([given], is_likely=False), net.estimate_many([given])
     for refused in (early, whole):
         assert refused.status == "doubtful"
     assert "check" in whole.seconds

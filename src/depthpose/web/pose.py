@@ -13,7 +13,6 @@ from depthpose.pose import mesh
 from depthpose.pose.config import EstimateConfig, ObjectsConfig
 from depthpose.pose.datasets.dataset import write_mask
 from depthpose.pose.estimator import GeoPoseNet, Registration
-from depthpose.pose.estimator.base import answered
 from depthpose.pose.estimator.find import explained_mask, nothing_found
 from depthpose.pose.estimator.fit import with_status
 from depthpose.pose.estimator.inputs import cloud_input, view_input
@@ -80,9 +79,10 @@ def answer_pose(form: Form, net: GeoPoseNet) -> Answer:
         estimate, voted = target.net.estimate_with_votes(pose_input)
         seen = [_Seen(input=pose_input, estimate=estimate)]
     else:
-        seen = [
-            _Seen(input=pose_input, estimate=answered(target.net.estimate_many([pose_input])[0]))
-        ]
+        (estimate,) = target.net.estimate_many([pose_input])
+        if estimate.status == "unreadable":
+            raise InputError(estimate.reason)
+        seen = [_Seen(input=pose_input, estimate=estimate)]
     if (least := form.number("min_certainty")) is not None:
         limit = EstimateConfig(min_certainty=least).min_certainty
         seen = [replace(one, estimate=with_status(one.estimate, limit)) for one in seen]

@@ -4,7 +4,6 @@ The one that needs no training follows it.
 """
 
 import time
-from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Iterator, Sequence, Sized
 from dataclasses import replace
 from functools import partial
@@ -68,7 +67,7 @@ _PROPOSALS = 40
 _SMOOTHED = 1500  # of so many points 20 neighbours lay the plane that gives a normal
 
 
-class PoseEstimator(ABC):
+class PoseEstimator:
     """Known objects, what is kept of each, and every form of input.
 
     Args:
@@ -91,10 +90,6 @@ class PoseEstimator(ABC):
     def objects(self) -> tuple[str, ...]:
         """Names of the objects."""
         return tuple(model.name for model in self.models)
-
-    def _objects_in_short(self) -> str:
-        count = len(self.objects)
-        return ", ".join(self.objects) if count <= 5 else f"{count} objects"
 
     @torch.no_grad()
     @own_arithmetic()
@@ -133,15 +128,20 @@ class PoseEstimator(ABC):
 
     @torch.no_grad()
     @own_arithmetic()
-    def _try_many(self, inputs: Sequence[AnyInput]) -> list[PoseEstimate]:
-        """Estimate inputs of which most do not show their object."""
-        return [answered(one) for one in self._each(inputs, 1, is_likely=False)]
+    def _answers(self, inputs: Sequence[AnyInput], *, is_likely: bool) -> list[PoseEstimate]:
+        """Estimate inputs; raise the :class:`InputError` of one that could not be taken."""
+        answers: list[PoseEstimate] = []
+        for one in self._each(inputs, 1, is_likely=is_likely):
+            if one.status == "unreadable":
+                raise InputError(one.reason)
+            answers.append(one)
+        return answers
 
-    @abstractmethod
     def _pose_near(
         self, inputs: Sequence[CloudInput], poses: Sequence[Rigid]
     ) -> list[PoseEstimate]:
         """Estimate clouds by the poses that were proposed for each."""
+        raise NotImplementedError
 
     @own_arithmetic()
     def estimate(
@@ -172,20 +172,18 @@ class PoseEstimator(ABC):
             InputError: an unknown object, a file that cannot be read, shapes that do not fit. What
                 the data themselves lack is no error but a refusal.
         """
-        which = self.objects[0] if object is None else self._object(object)
-        names = self.objects if object is None else (which,)
+        which = self.objects[0] if object is None else self._known(object).model.name
         if cloud is not None and depth is None and mask is None:
-            return self._which(cloud_input(cloud, unit or "m", which, _NAME), names)
-        lens = choose_lens(camera, focal_px)
-        if cloud is not None or depth is None or mask is None or lens is None:
-            raise InputError("estimate: give cloud=, or depth=, mask= and camera= together")
-        return self._which(view_input(depth, mask, lens, which, _NAME, unit), names)
-
-    def _which(self, given: AnyInput, names: Sequence[str]) -> PoseEstimate:
-        """Estimate one input as each of several objects, and take the one that it shows."""
-        if len(names) == 1:
-            return answered(self.estimate_many([given])[0])
-        estimates = self._try_many([replace(given, object=name) for name in names])
+            given = cloud_input(cloud, unit or "m", which, _NAME)
+        else:
+            lens = choose_lens(camera, focal_px)
+            if cloud is not None or depth is None or mask is None or lens is None:
+                raise InputError("estimate: give cloud=, or depth=, mask= and camera= together")
+            given = view_input(depth, mask, lens, which, _NAME, unit)
+        if object is not None or len(self.models) == 1:
+            return self._answers([given], is_likely=True)[0]
+        tried = [replace(given, object=name) for name in self.objects]
+        estimates = self._answers(tried, is_likely=False)
         return with_status(which_object(estimates, self.refusal), self.config.min_certainty)
 
     @own_arithmetic()
@@ -219,7 +217,8 @@ class PoseEstimator(ABC):
         if lens is None:
             raise InputError("estimate_instances: give camera= or focal_px=")
         labels = labels_input(mask, _NAME)
-        view = view_input(depth, labels != 0, lens, self._object(object), _NAME, unit)
+        which = self._known(object).model.name
+        view = view_input(depth, labels != 0, lens, which, _NAME, unit)
         pieces = split_instances(labels) or [view.mask]
         views = [replace(view, mask=m, name=f"{_NAME}_{k}") for k, m in enumerate(pieces)]
         return self.estimate_many(views)
@@ -250,7 +249,7 @@ class PoseEstimator(ABC):
             InputError: as for :meth:`estimate`.
         """
         asked = [objects] if isinstance(objects, str) else objects
-        names = self.objects if asked is None else [self._object(name) for name in asked]
+        names = self.objects if asked is None else [self._known(name).model.name for name in asked]
         if not names:
             raise InputError("find: objects names none; give those that may be there, or omit it")
         view = view_input(depth, None, camera, names[0], _NAME, unit)
@@ -310,21 +309,17 @@ class PoseEstimator(ABC):
         Raises:
             InputError: as for :meth:`estimate`.
         """
-        which = self._object(object)
+        which = self._known(object).model.name
         if isinstance(frames, str | Path):
             raise InputError(
                 f"track: frames is {str(frames)!r}, one path; give a list of files or arrays in "
                 "their order, such as list_images of depthpose.core.files gives of a folder"
             )
         start = None if first is None else rigid_input(first)
-
-        def given(frame: AnyArray, number: int) -> AnyInput:
-            name = f"{_NAME}_{number}"
-            if camera is None:
-                return cloud_input(frame, unit or "m", which, name)
-            return view_input(frame, None, camera, which, name, unit)
-
-        inputs = (given(frame, number) for number, frame in enumerate(frames))
+        made = partial(cloud_input, unit=unit or "m", object=which)
+        if camera is not None:
+            made = partial(view_input, mask=None, camera=camera, object=which, unit=unit)
+        inputs = (made(frame, name=f"{_NAME}_{number}") for number, frame in enumerate(frames))
         return self.track_in(inputs, which, start)
 
     def track_in(
@@ -334,7 +329,7 @@ class PoseEstimator(ABC):
 
         def look(given: AnyInput) -> PoseEstimate:
             if isinstance(given, CloudInput):
-                return self._try_many([given])[0]
+                return self._answers([given], is_likely=False)[0]
             began = time.perf_counter()
             found = self.find_in(given, [object], is_sure=True)
             return found[0] if found else nothing_found(given, object, time.perf_counter() - began)
@@ -349,18 +344,15 @@ class PoseEstimator(ABC):
         )
         return each_in_own_arithmetic(track(frames, followed, first))
 
-    def _object(self, name: str | None) -> str:
-        if name is None and len(self.models) == 1:
-            return self.objects[0]
+    def _known(self, name: str | None) -> KnownObject:
+        """Give an object by its name, with its surface; None where one alone is known."""
+        names = self.objects
         if name is None:
-            raise InputError(
-                f"estimate: {self._holder} know {', '.join(self.objects)}; say which by object="
-            )
-        return self._known(name).model.name
-
-    def _known(self, name: str) -> KnownObject:
-        """Give an object by its name, with its surface."""
-        names = [model.name for model in self.models]
+            if len(names) > 1:
+                raise InputError(
+                    f"estimate: {self._holder} know {', '.join(names)}; say which by object="
+                )
+            name = self.models[0].name
         if not isinstance(name, str):
             known = ", ".join(map(repr, names))
             raise InputError(f"object {name!r} is no text; give the name of one: {known}")
@@ -396,13 +388,6 @@ def or_unreadable(work: Callable[[AnyInput], Made], given: AnyInput) -> Made | P
             raise
         reason = f"{given.name}: {full_memory(error)}"
     return refused(given, Refusal(status="unreadable", reason=reason), {})
-
-
-def answered(found: PoseEstimate) -> PoseEstimate:
-    """Give an estimate, or raise the :class:`InputError` of an input that could not be taken."""
-    if found.status == "unreadable":
-        raise InputError(found.reason)
-    return found
 
 
 class Registration(PoseEstimator):
@@ -475,7 +460,9 @@ class Registration(PoseEstimator):
         return cls([with_found_symmetries(m, None, is_taken=True) for m in models], config)
 
     def __repr__(self) -> str:
-        return f"Registration(of {self._objects_in_short()})"
+        names = self.objects
+        objects = ", ".join(names) if len(names) <= 5 else f"{len(names)} objects"
+        return f"Registration(of {objects})"
 
     def prepare(self) -> None:
         """Prepare every model now, about a second each; else it is done when first asked for."""

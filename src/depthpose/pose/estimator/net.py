@@ -152,9 +152,10 @@ class GeoPoseNet(PoseEstimator):
     """The same as :meth:`load`."""
 
     def __repr__(self) -> str:
-        said = f"{type(self._network).__name__} of {self._objects_in_short()}"
-        named = f", weights {self.name!r}" if self.name else ""
-        return f"GeoPoseNet({said}{named}, {self.config.device})"
+        names, named = self.objects, f", weights {self.name!r}" if self.name else ""
+        objects = ", ".join(names) if len(names) <= 5 else f"{len(names)} objects"
+        kind = type(self._network).__name__
+        return f"GeoPoseNet({kind} of {objects}{named}, {self.config.device})"
 
     @property
     def terms(self) -> str:
@@ -330,20 +331,17 @@ class DepthImageRegressor(PoseEstimator):
         self._network = weights.network.to(usable_device(self.config.device)).eval()
         self._cloud = weights.cloud
 
-    def _which(self, given: AnyInput, names: Sequence[str]) -> PoseEstimate:
-        if len(names) > 1:
-            raise InputError(f"object: say which of {', '.join(names)}; a regressor refuses none")
-        return super()._which(given, names)
+    def _answers(self, inputs: Sequence[AnyInput], *, is_likely: bool) -> list[PoseEstimate]:
+        if len(inputs) > 1:
+            names = ", ".join(one.object for one in inputs)
+            raise InputError(f"object: say which of {names}; a regressor refuses none")
+        return super()._answers(inputs, is_likely=is_likely)
 
     def find_in(
         self, view: ViewInput, objects: Sequence[str], *, is_sure: bool = False
     ) -> NoReturn:
         """Refuse: nothing tells whether an object is there."""
         del view, objects, is_sure
-        raise InputError(_NEEDS_MASK)
-
-    def _pose_near(self, inputs: Sequence[CloudInput], poses: Sequence[Rigid]) -> NoReturn:
-        del inputs, poses
         raise InputError(_NEEDS_MASK)
 
     def _estimate(self, given: AnyInput) -> PoseEstimate:
