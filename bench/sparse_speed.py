@@ -47,11 +47,12 @@ def surface(voxels: int) -> Tensor:
 
 def plain_conv(features: Tensor, weight: Tensor, kernel_map: KernelMap) -> Tensor:
     """Convolve offset by offset under torch's autograd, which keeps every gathered row."""
-    out = features.new_zeros(kernel_map.outputs, weight.shape[2])
+    near = kernel_map.neighbours
+    written = near.fine_rows if kernel_map.is_transposed else near.table.shape[1]
+    out = features.new_zeros(written, weight.shape[2])
     for offset, read, write in kernel_map.by_offset():
         out = out.index_add(0, write, features[read] @ weight[offset])
-    centre = kernel_map.neighbours.centre
-    return out if centre is None else out + features @ weight[centre]
+    return out if near.centre is None else out + features @ weight[near.centre]
 
 
 class MinkowskiVoxels:

@@ -275,7 +275,7 @@ def _answers(found: PoseNetworks) -> tuple[torch.Size, torch.Size]:
     features = torch.ones(len(plane), found.network.config.inputs)
     with torch.no_grad():
         voxels = Voxels.from_points(plane.int(), features)
-        seen = found.network.point_features(voxels)
+        seen = found.network.features(voxels).at_points()
         return seen.shape, found.network.forward_class(seen, 0).shape
 
 

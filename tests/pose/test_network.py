@@ -121,7 +121,9 @@ def test_a_network_of_other_classes_gives_all_but_the_last_layer() -> None:
     network = tiny(norm="batch", classes=1).double()
     last = network.final.weight.clone()
     unfold_norms(folded, network, voxels)
-    torch.testing.assert_close(network.point_features(voxels), folded.point_features(voxels))
+    torch.testing.assert_close(
+        network.features(voxels).at_points(), folded.features(voxels).at_points()
+    )
     assert torch.equal(network.final.weight, last)
 
 
@@ -145,7 +147,7 @@ def test_one_class_alone_answers_as_among_all() -> None:
     network, voxels = tiny(), Voxels.from_points(surface())
     outputs = network(voxels)
     assert outputs.shape[1:] == (3, 4, 3)
-    features = network.point_features(voxels)
+    features = network.features(voxels).at_points()
     for number in range(3):
         torch.testing.assert_close(network.forward_class(features, number), outputs[:, number])
     rows = torch.arange(len(outputs))
@@ -168,7 +170,7 @@ def test_both_kinds_begin_with_answers_of_a_sensible_size_and_learn(
     config = ResUNetConfig(classes=1, keypoints=2, norm=norm, encoder=(16, 32, 64, 64),
                            decoder=(32, 32, 32, 64))  # fmt: skip
     network, voxels = ResUNet(config), Voxels.from_points(surface())
-    assert 0.1 < float(network.point_features(voxels).detach().std()) < 3
+    assert 0.1 < float(network.features(voxels).at_points().detach().std()) < 3
     truth = torch.nn.functional.normalize(-unpack(voxels.cache.keys(0))[:, 1:].float(), dim=1)
     optimiser, losses = torch.optim.Adam(network.parameters(), 2e-3), []
     for _ in range(12):

@@ -283,7 +283,7 @@ def test_a_training_begins_with_what_other_objects_taught(
     networks = [read_pose_network(path) for path in (first, then)]
     cloud = TrainingClouds(_models(), _VIEWS, None, _CLOUD, seed=1)[0]
     voxels = Voxels.from_points(F.pad(cloud.coordinates, (1, 0)))
-    seen = [n.point_features(voxels).detach() for n in networks if isinstance(n, ResUNet)]
+    seen = [n.features(voxels).at_points().detach() for n in networks if isinstance(n, ResUNet)]
     assert float((seen[1] - seen[0]).norm() / seen[0].norm()) < 0.1
     other = dataclasses.replace(_SMALL, keypoints=4)
     with pytest.raises(InputError, match="trained with keypoints = 8"):

@@ -2,7 +2,6 @@
 
 import math
 from dataclasses import dataclass
-from functools import cached_property
 
 import numpy as np
 import torch
@@ -59,6 +58,7 @@ class Frame:
         is_smooth: where a normal is known.
         plane_m: of the plane that a pixel shows: objects up to this diameter have no such side; 0
             where it shows none.
+        nearest_m: least depth of the pixels up to two away; infinite where none has a reading.
     """
 
     step: int
@@ -68,12 +68,7 @@ class Frame:
     normals: Float64[Tensor, "h w 3"]
     is_smooth: Bool[Tensor, "h w"]
     plane_m: Float64[Tensor, "h w"]
-
-    @cached_property
-    def nearest_m(self) -> Float64[Tensor, "h w"]:
-        """Least depth of the pixels up to two away; infinite where there is no reading."""
-        depth_m = torch.where(self.depth_m > 0, self.depth_m, torch.inf)
-        return -max_pool2d(-depth_m[None], 5, 1, 2)[0]
+    nearest_m: Float64[Tensor, "h w"]
 
 
 def prepare_frame(depth_m: Float[Tensor, "h w"], K: Float[Tensor, "3 3"]) -> Frame:
@@ -92,9 +87,10 @@ def prepare_frame(depth_m: Float[Tensor, "h w"], K: Float[Tensor, "3 3"]) -> Fra
     points_m = back_project(depth_m, K)
     normals, is_smooth = _normals(depth_m, points_m, K)
     plane_m = _planes(depth_m, points_m, normals)
+    nearest_m = -max_pool2d(-torch.where(depth_m > 0, depth_m, torch.inf)[None], 5, 1, 2)[0]
     return Frame(
         step=step, depth_m=depth_m, K=K, points_m=points_m, normals=normals, is_smooth=is_smooth,
-        plane_m=plane_m,
+        plane_m=plane_m, nearest_m=nearest_m,
     )  # fmt: skip
 
 

@@ -147,18 +147,14 @@ class ResUNet(nn.Module):
 
         They are not normalised: the loss pulls them to unit length, and the vote normalises.
         """
-        outputs = self.final(self._features(voxels)).at_points()
+        outputs = self.final(self.features(voxels)).at_points()
         c = self.config
         return outputs.view(len(outputs), c.classes, c.keypoints, 3)
-
-    def point_features(self, voxels: Voxels) -> Float[Tensor, "points width"]:
-        """Give what the last layer sees of each point given: the features of figure 3-2."""
-        return self._features(voxels).at_points()
 
     def directions(self, seen: SeenPoints) -> Float[Tensor, "points keypoints 3"]:
         """Answer for each point's own class: what every network that votes offers."""
         voxels = Voxels.from_points(seen.coordinates, seen.features)
-        mixed = self._features(voxels)
+        mixed = self.features(voxels)
         features = mixed.features[mixed.row_of_point]
         answers = features.new_empty(len(features), self.config.keypoints, 3)
         for number in seen.class_of_point.unique().tolist():
@@ -169,7 +165,7 @@ class ResUNet(nn.Module):
     def forward_class(
         self, features: Float[Tensor, "n width"], number: int
     ) -> Float[Tensor, "n keypoints 3"]:
-        """Answer for one class alone from :meth:`point_features`, without the other classes."""
+        """Answer for one class alone from :meth:`features` of points, without the other classes."""
         assert self.final.bias is not None
         assert 0 <= number < self.config.classes, f"class {number} of {self.config.classes}"
         size = self.config.keypoints * 3
@@ -177,7 +173,8 @@ class ResUNet(nn.Module):
         outputs = features @ self.final.weight[0, :, part] + self.final.bias[part]
         return outputs.view(len(outputs), self.config.keypoints, 3)
 
-    def _features(self, voxels: Voxels) -> Voxels:
+    def features(self, voxels: Voxels) -> Voxels:
+        """Give what the last layer sees: the features of figure 3-2."""
         seen: list[Voxels] = []
         for down, block in zip(self.down, self.down_blocks, strict=True):
             voxels = block(down(voxels))
@@ -201,11 +198,14 @@ def fold_norms(network: ResUNet) -> ResUNet:
         return network
     config = dataclasses.replace(network.config, norm="none", with_bias=True)
     folded = ResUNet(config).to(next(network.parameters()))
-    theirs = _conv_norms(folded)
     others = {k: v for k, v in network.state_dict().items() if k.startswith(("final.", "mix."))}
     folded.load_state_dict(others, strict=False)
-    for name, source in _conv_norms(network).items():
-        norm, into = source.norm, theirs[name].conv
+    for name, source in network.named_modules():
+        if not isinstance(source, ConvNorm):
+            continue
+        target = folded.get_submodule(name)
+        assert isinstance(target, ConvNorm)
+        norm, into = source.norm, target.conv
         assert norm is not None and norm.running_var is not None and norm.running_mean is not None  # noqa: PT018
         assert into.bias is not None
         scale = norm.weight * (norm.running_var + norm.eps).rsqrt()
@@ -213,10 +213,6 @@ def fold_norms(network: ResUNet) -> ResUNet:
         into.weight.copy_(source.conv.weight * scale)
         into.bias.copy_(norm.bias + (bias - norm.running_mean) * scale)
     return folded.eval()
-
-
-def _conv_norms(network: ResUNet) -> dict[str, ConvNorm]:
-    return {name: m for name, m in network.named_modules() if isinstance(m, ConvNorm)}
 
 
 @torch.no_grad()
@@ -232,13 +228,15 @@ def unfold_norms(folded: ResUNet, network: ResUNet, voxels: Voxels) -> None:
     def remember(module: ConvNorm, _inputs: object, out: Voxels) -> None:
         outputs[module] = out.features
 
-    sources, targets = _conv_norms(folded), _conv_norms(network)
+    sources = {name: m for name, m in folded.named_modules() if isinstance(m, ConvNorm)}
     hooks = [source.register_forward_hook(remember) for source in sources.values()]
     folded.eval()(voxels)
     for hook in hooks:
         hook.remove()
     for name, source in sources.items():
-        conv, norm, bias = targets[name].conv, targets[name].norm, source.conv.bias
+        target = network.get_submodule(name)
+        assert isinstance(target, ConvNorm)
+        conv, norm, bias = target.conv, target.norm, source.conv.bias
         assert norm is not None and norm.running_var is not None and norm.running_mean is not None  # noqa: PT018
         assert bias is not None
         variance, mean = torch.var_mean(outputs[source], 0, correction=0)

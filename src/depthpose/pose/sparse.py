@@ -211,11 +211,6 @@ class KernelMap:
     neighbours: NeighbourTable  #: of the two levels, or of the one
     is_transposed: bool = False  #: False: fine to coarse (or the level to itself); True: back
 
-    @property
-    def outputs(self) -> int:
-        """Number of voxels written."""
-        return self.neighbours.fine_rows if self.is_transposed else self.neighbours.table.shape[1]
-
     def by_offset(self) -> Iterator[tuple[int, Tensor, Tensor]]:
         """Give each filled offset with the rows that its pairs read, and those they add to."""
         pairs = self.neighbours.pairs
@@ -376,20 +371,21 @@ class _Convolution(torch.autograd.Function):
 
 
 def _convolve(x: Tensor, weight: Tensor, m: KernelMap) -> Tensor:
-    way, centre = _way(x, weight, m), m.neighbours.centre
+    way, near = _way(x, weight, m), m.neighbours
     if way == "table":
         return _table(x, m).T @ weight.flatten(0, 1)
     if way == "grid":  # all offsets in one operation each, padded to the fullest
         products = torch.bmm(_read(x, m), weight).flatten(0, 1)
         # The slots of an output are gathered, not scattered: the same bits on every run, on CUDA
         # too, and several times faster on the CPU than ``index_add_``.
-        slots = m.neighbours.slots(is_transposed=m.is_transposed)
+        slots = near.slots(is_transposed=m.is_transposed)
         out = F.embedding_bag(slots.order, products, slots.starts, mode="sum")
     else:  # an offset at a time: its pairs write each row once at most
-        out, kernels = x.new_zeros(m.outputs, weight.shape[2]), weight.unbind()
+        written = near.fine_rows if m.is_transposed else near.table.shape[1]
+        out, kernels = x.new_zeros(written, weight.shape[2]), weight.unbind()
         for offset, read, write in m.by_offset():
             out.index_add_(0, write, x.index_select(0, read) @ kernels[offset])
-    return out if centre is None else out.addmm_(x, weight[centre])
+    return out if near.centre is None else out.addmm_(x, weight[near.centre])
 
 
 def _read(x: Tensor, m: KernelMap) -> Tensor:
@@ -404,13 +400,13 @@ def _table(x: Tensor, m: KernelMap) -> Tensor:
     padded = F.pad(x, (0, 0, 0, 1))
     rows = m.neighbours.table
     read = padded.index_select(0, rows.flatten()).view(*rows.shape, x.shape[1])
-    return read.transpose(1, 2).reshape(len(rows) * x.shape[1], m.outputs)
+    return read.transpose(1, 2).reshape(len(rows) * x.shape[1], rows.shape[1])
 
 
 def _way(x: Tensor, weight: Tensor, m: KernelMap) -> Literal["table", "grid", "offset by offset"]:
     """Choose what is gathered at once: all that is read, the padded pairs, or one offset's."""
-    volume, channels = len(m.neighbours.table), x.shape[1]
-    is_small = channels <= NARROW and m.outputs * volume * channels <= TABLE_ELEMENTS
+    table, channels = m.neighbours.table, x.shape[1]
+    is_small = channels <= NARROW and table.numel() * channels <= TABLE_ELEMENTS
     if is_small and not m.is_transposed:
         return "table"
     most = m.neighbours.pairs.most
@@ -418,7 +414,7 @@ def _way(x: Tensor, weight: Tensor, m: KernelMap) -> Literal["table", "grid", "o
     if x.is_cuda:
         # CUDA adds up offset by offset in no fixed order, so only a grid is the same on each run.
         is_fixed = torch.are_deterministic_algorithms_enabled()
-        is_gridded = is_fixed or volume * most * max(weight.shape[1:]) <= GRID_ELEMENTS
+        is_gridded = is_fixed or len(table) * most * max(weight.shape[1:]) <= GRID_ELEMENTS
     return "grid" if is_gridded else "offset by offset"
 
 

@@ -99,7 +99,7 @@ def seen_points(
     grid = prepared.voxels
     rows = F.pad(grid.coordinates, (1, 0))
     voxels = Voxels.from_points(rows, grid.features)
-    return prepared.points_m, network.point_features(voxels).float()
+    return prepared.points_m, network.features(voxels).at_points().float()
 
 
 def draw_features(

@@ -273,7 +273,7 @@ def cases_of(
         places = torch.nn.functional.pad(grid.coordinates, (1, 0))
         voxels = Voxels.from_points(places, grid.features)
         with torch.inference_mode():
-            outputs = network.forward_class(network.point_features(voxels), number)
+            outputs = network.forward_class(network.features(voxels).at_points(), number)
             outputs = outputs @ grid.grid_from_camera
             directions = torch.nn.functional.normalize(outputs, dim=-1)[grid.row_of_point]
         yield VotingCase(

@@ -84,12 +84,9 @@ class PoseEstimator:
     ) -> None:
         self.config = EstimateConfig() if config is None else config
         self.models, self.refusal = tuple(models), refusal
-        self._objects: dict[str, KnownObject] = {}  # those that were asked for
-
-    @property
-    def objects(self) -> tuple[str, ...]:
+        self.objects = tuple(model.name for model in models)
         """Names of the objects."""
-        return tuple(model.name for model in self.models)
+        self._objects: dict[str, KnownObject] = {}  # those that were asked for
 
     @torch.no_grad()
     @own_arithmetic()

@@ -120,6 +120,8 @@ class GeoPoseNet(PoseEstimator):
     def __init__(self, weights: PoseWeights, config: EstimateConfig | None = None) -> None:
         super().__init__(weights.models, config, weights.refusal)
         self.weights = weights
+        self.terms = weights.facts.get("terms", "")
+        """Terms of the weights, where they bind whoever uses them; else nothing."""
         if isinstance(weights.network, DepthImageNet):
             raise InputError(
                 "these weights regress a depth image and cast no votes; give "
@@ -156,11 +158,6 @@ class GeoPoseNet(PoseEstimator):
         objects = ", ".join(names) if len(names) <= 5 else f"{len(names)} objects"
         kind = type(self._network).__name__
         return f"GeoPoseNet({kind} of {objects}{named}, {self.config.device})"
-
-    @property
-    def terms(self) -> str:
-        """Terms of the weights, where they bind whoever uses them; else nothing."""
-        return self.weights.facts.get("terms", "")
 
     def _each(
         self, inputs: Iterable[AnyInput], threads: int, *, is_likely: bool = True
