@@ -227,6 +227,7 @@ def kernel_offsets(kernel: int) -> tuple[tuple[int, int, int], ...]:
     return tuple((x, y, z) for z in steps for y in steps for x in steps)
 
 
+@dataclass(eq=False)
 class CoordinateCache:
     """Sorted keys of every level, and the neighbours of every kernel that was used.
 
@@ -234,20 +235,21 @@ class CoordinateCache:
     the stored coordinates of the finer level, never on new ones.
     """
 
-    def __init__(self, keys: Keys) -> None:
-        """Begin with the sorted, distinct keys of level 0."""
-        self._keys = {0: keys}
-        self._indices: dict[int, VoxelIndex] = {}
-        self._neighbours: dict[tuple[int, int, int], NeighbourTable] = {}
+    finest: Keys  #: sorted, distinct keys of level 0
+    _coarser: dict[int, Keys] = field(default_factory=dict)
+    _indices: dict[int, VoxelIndex] = field(default_factory=dict)
+    _neighbours: dict[tuple[int, int, int], NeighbourTable] = field(default_factory=dict)
 
     def keys(self, level: int) -> Keys:
         """Give the sorted keys of a level."""
-        if level not in self._keys:
+        if level == 0:
+            return self.finest
+        if level not in self._coarser:
             # A field holds c + HALF, which is not negative: clearing its low bits is a floor
             # division for negative coordinates too.
             low_bits = (2**level - 1) * sum(AXES)
-            self._keys[level] = torch.unique(self.keys(level - 1) & ~low_bits)
-        return self._keys[level]
+            self._coarser[level] = torch.unique(self.keys(level - 1) & ~low_bits)
+        return self._coarser[level]
 
     def kernel_map(
         self, level: int, kernel: int, stride: int = 1, *, is_transposed: bool = False
