@@ -352,8 +352,8 @@ class _Convolution(torch.autograd.Function):
         m: KernelMap = ctx.kernel_map
         gradient = gradient.contiguous()
         wants_x, wants_weight, _ = ctx.needs_input_grad
-        # The first layer's input is no parameter's child: its gradient is seldom wanted.
         back = KernelMap(neighbours=m.neighbours, is_transposed=not m.is_transposed)
+        # The first layer's input is no parameter's child: its gradient is seldom wanted.
         for_x = _convolve(gradient, weight.mT, back) if wants_x else None
         if not wants_weight:
             return for_x, None, None
