@@ -213,8 +213,8 @@ def find_candidates(
     starts = Rigid.cat([others, best.pose @ copies.near])
     kept = [best]
     if len(starts.R) == 0:
-        return kept
-    if not is_refined:
+        tried = list[Candidate]()
+    elif not is_refined:
         poses = [starts[k] for k in range(len(starts.R))]
         tried = [best._replace(pose=pose) for pose in poses]
     else:
@@ -229,6 +229,9 @@ def find_candidates(
             for k in range(len(starts.R))
             if float(found.inlier_share[k]) > 0  # else it is near no surface
         ]
+    if known.pairs is not None:  # they lay most of the surface where it is refined
+        turned = best.pose @ known.pairs.turns
+        tried += [best._replace(pose=turned[k]) for k in range(len(turned.R))]
     for one in tried:
         every = Rigid.stack([other.pose for other in kept])[:, None] @ copies.same
         gap_m = one.pose.apply(copies.points_m) - every.apply(copies.points_m)

@@ -143,7 +143,9 @@ def find_objects(view: ViewInput, known: SearchTargets) -> list[PoseEstimate]:
             same = (some for some in groups if some[0].object == one.object)
             own = next((some for some in same if one.shared_with(some[0]) > _RIVAL), None)
             if own is None:
-                groups.append([one])
+                pose = _best_turned(frame, one.pose, known.pairs_of(one.object))
+                explained = _explained(frame, pose, known.surface_of(one.object))
+                groups.append([replace(one, pose=pose, explained=explained)])
             elif len(own) < _MOST_TOGETHER:
                 own.append(one)
         more, taken = _without_rivals(_judged(groups, frame, view, known), taken)
@@ -177,7 +179,6 @@ def _candidates(
     found = list[_Candidate]()
     for k, one in enumerate(every):
         if k < _MOST_JUDGED or one.rank < _LEAST_JUDGED:
-            one = replace(one, pose=_best_turned(frame, one.pose, known.pairs_of(one.object)))
             own = _explained(frame, one.pose, known.surface_of(one.object))
             if int(own.sum()) * frame.step**2 >= _LEAST_PIXELS:
                 found.append(_Candidate(**vars(one), explained=own))
@@ -189,9 +190,9 @@ def _best_turned(frame: Frame, pose: Rigid, pairs: PairTable) -> Rigid:
 
     Beside a mug its handle is something else, as any neighbour is: each of its turns fits.
     """
-    surface, every = pairs.surface, pose[None] @ pairs.turns
-    if len(every.R) == 1:
+    if len(pairs.turns.R) == 0:
         return pose
+    surface, every = pairs.surface, Rigid.cat([pose[None], pose[None] @ pairs.turns])
     is_read = (frame.depth_m > 0) & ~is_no_side(frame, surface)
     middle_m = pose.apply(surface.middle_m[None])[0]
     is_read &= (frame.points_m - middle_m).norm(dim=-1) < surface.diameter_m

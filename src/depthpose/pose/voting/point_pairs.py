@@ -75,7 +75,7 @@ class PairTable:
 
     @cached_property
     def turns(self) -> Rigid:
-        """Turns, ``model_from_model``, that lay most of the surface on itself; the identity first.
+        """Turns, ``model_from_model``, that lay most of the surface on itself.
 
         A mug has them about its axis: but for the handle it looks alike. Found by looking for the
         model in itself. Those that are symmetries are left out.
@@ -91,9 +91,7 @@ class PairTable:
         # One after the other they are turns too, which fill the gaps between those that were found.
         twice = found[:, None] @ found
         found = Rigid.cat([found, Rigid(twice.R.flatten(0, 1), twice.t_m.flatten(0, 1))])
-        found = found[_apart_alike(found, surface, _MOSTLY)]
-        identity = Rigid(torch.eye(3, dtype=torch.float64)[None], surface.middle_m.new_zeros(1, 3))
-        return Rigid.cat([identity, found])
+        return found[_apart_alike(found, surface, _MOSTLY)]
 
 
 def _apart_alike(turns: Rigid, surface: Surface, least: float) -> list[int]:
