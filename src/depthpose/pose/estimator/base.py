@@ -266,7 +266,7 @@ class PoseEstimator(ABC):
         Args:
             view: depth and camera.
             objects: which may be there.
-            is_sure: answer only what is likelier there than not, and one of each object.
+            is_sure: answer only what is likelier there than not, and search once.
         """
         known = SearchTargets(
             names=objects,
