@@ -8,7 +8,7 @@ from unittest.mock import MagicMock
 
 import pytest
 import torch
-from tests.pose.synthetic_objects import CAMERA, K, bracket, pose_at, view_of
+from tests.pose.synthetic_objects import CAMERA, K, box_faces, bracket, pose_at, view_of
 
 from depthpose.core.camera import Camera, back_project
 from depthpose.core.rigid import Rigid, geodesic_rad, rotation_by
@@ -172,6 +172,18 @@ def test_a_mug_turned_about_its_axis_looks_alike_but_for_its_handle() -> None:
     apart = ((every - torch.cat([angle, torch.zeros(1)]) + 180) % 360 - 180).abs().amin(1)
     assert float(apart.max()) <= 20, "by any angle"
     assert len(prepare_pairs(prepare_surface(bracket())).turns.R) == 0
+
+
+@pytest.mark.parametrize("is_compiled", ["1", "0"])
+def test_a_needle_of_few_points_can_be_looked_for_in_itself(
+    is_compiled: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("DEPTHPOSE_COMPILED", is_compiled)
+    corners, faces = box_faces()
+    needle = make_model(corners * torch.tensor([0.002, 0.002, 0.2]), faces, name="needle")
+    pairs = prepare_pairs(prepare_surface(needle))
+    assert len(pairs.points_m) < 48, "fewer than each of them would propose"
+    assert pairs.turns.R.shape[1:] == (3, 3)
 
 
 @pytest.mark.parametrize("handle", ["seen", "hidden"])

@@ -518,7 +518,7 @@ class Registration(PoseEstimator):
             reason = "no pose lays the model near the points: another object, or too little of it"
             return refused(given, Refusal(status="votes do not meet", reason=reason), seconds)
         first = Candidate(icp.camera_from_model, icp.covariance, float(icp.residual_m))
-        turns = None if poses is None else pairs.turns  # a mask has what decides between them
+        turns = None if poses is None else pairs.turns  # in a mask the readings decide
         candidates = find_candidates(
             cloud_m, first, best.others, known, self.config, is_refined=True, turns=turns
         )

@@ -188,7 +188,7 @@ def _candidates(
 def _best_turned(frame: Frame, pose: Rigid, pairs: PairTable) -> Rigid:
     """Choose among the turns that show most of an object alike the one that explains most readings.
 
-    Beside a mug its handle is something else, as any neighbour is: each of its turns fits.
+    A handle that a wrong turn of a mug leaves out does not contradict it: a neighbour may be there.
     """
     if len(pairs.turns.R) == 0:
         return pose

@@ -74,10 +74,10 @@ class PairTable:
 
     @cached_property
     def turns(self) -> Rigid:
-        """Turns, ``model_from_model``, that lay most of the surface on itself.
+        """Turns that lay most of the surface on itself, as ``model_from_model``; no symmetries.
 
-        A mug has them about its axis: but for the handle it looks alike. Found by looking for the
-        model in itself. Those that are symmetries are left out.
+        A mug has them about its axis: but for its handle it looks alike. They are found by looking
+        for the model in itself.
         """
         surface, references = self.surface, torch.arange(min(_OWN_REFERENCES, len(self.points_m)))
         found, _ = vote_poses(self.points_m, self.frames[..., 0], references, self, _OWN_PEAKS)
@@ -260,12 +260,12 @@ def vote_poses(
     Returns:
         Poses and their votes, reference after reference.
     """
-    frames = _frames(normals)
+    frames, models = _frames(normals), len(table.points_m)
+    peaks = min(peaks, models)
     if serves(points_m):
         from depthpose.pose.compiled.pairs import vote
 
-        models = len(table.points_m)
-        shape = (len(references), min(peaks, models))
+        shape = (len(references), peaks)
         number, bin_ = torch.zeros(shape, dtype=torch.int64), torch.zeros(shape, dtype=torch.int64)
         votes = torch.zeros(shape, dtype=torch.float64)
         vote(
@@ -327,7 +327,7 @@ def _peaks(
     votes = votes.reshape(count, models, TURNS)
     votes = 2 * votes + votes.roll(1, -1) + votes.roll(-1, -1)
     most, bins = votes.max(-1)
-    best = most.topk(min(peaks, models))
+    best = most.topk(peaks)
     return best.indices.flatten(), bins.gather(1, best.indices).flatten(), best.values.flatten()
 
 
