@@ -8,12 +8,13 @@ from unittest.mock import MagicMock
 
 import pytest
 import torch
-from tests.pose.synthetic_objects import CAMERA, K, bracket, pose_at, view_of
+from tests.pose.synthetic_objects import CAMERA, K, box_faces, bracket, pose_at, view_of
 
-from depthpose.core.camera import Camera
-from depthpose.core.rigid import Rigid
+from depthpose.core.camera import Camera, back_project
+from depthpose.core.rigid import Rigid, geodesic_rad, rotation_by
 from depthpose.pose.cloud import cloud_from_depth, grow_mask
 from depthpose.pose.estimator import Registration, find
+from depthpose.pose.estimator.base import REFUSAL
 from depthpose.pose.estimator.find import SearchTargets, find_objects, size_deviations
 from depthpose.pose.estimator.fit import fit_of, seen_about
 from depthpose.pose.estimator.hypotheses import (
@@ -26,6 +27,7 @@ from depthpose.pose.frame import prepare_frame
 from depthpose.pose.mesh import make_model
 from depthpose.pose.metrics import add_m
 from depthpose.pose.surface import prepare_surface
+from depthpose.pose.synthetic.parts import make_part
 from depthpose.pose.types import CloudInput, Identity, ObjectModel, PoseEstimate
 from depthpose.pose.voting.point_pairs import prepare_pairs
 
@@ -160,6 +162,66 @@ def test_what_is_no_longer_left_votes_for_nothing() -> None:
     poses, _ = propose_in_frame(frame, is_left, surface, prepare_pairs(surface))
     assert nearest_m(poses, TRUTHS[0], model) > 0.3 * model.diameter_m
     assert nearest_m(poses, TRUTHS[1], model) < 0.06 * model.diameter_m
+
+
+def test_a_mug_turned_about_its_axis_looks_alike_but_for_its_handle() -> None:
+    turns = prepare_pairs(prepare_surface(make_part("mug"))).turns
+    assert float((turns.R[:, 2, 2] - 1).abs().max()) < 0.01, "about its axis"
+    angle = torch.atan2(turns.R[:, 1, 0], turns.R[:, 0, 0]).rad2deg()
+    every = torch.arange(-180.0, 180.0, 5.0)[:, None]
+    apart = ((every - torch.cat([angle, torch.zeros(1)]) + 180) % 360 - 180).abs().amin(1)
+    assert float(apart.max()) <= 20, "by any angle"
+    assert len(prepare_pairs(prepare_surface(bracket())).turns.R) == 0
+
+
+@pytest.mark.parametrize("is_compiled", ["1", "0"])
+def test_a_needle_of_few_points_can_be_looked_for_in_itself(
+    is_compiled: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("DEPTHPOSE_COMPILED", is_compiled)
+    corners, faces = box_faces()
+    needle = make_model(corners * torch.tensor([0.002, 0.002, 0.2]), faces, name="needle")
+    pairs = prepare_pairs(prepare_surface(needle))
+    assert len(pairs.points_m) < 48, "fewer than each of them would propose"
+    assert pairs.turns.R.shape[1:] == (3, 3)
+
+
+@pytest.mark.parametrize("handle", ["seen", "hidden"])
+def test_the_handle_of_a_mug_decides_its_turn(handle: str) -> None:
+    """A mug on its side: its handle is toward the camera, or the mug hides it and fixes no turn."""
+    mug = make_part("mug")
+    toward = -1.0 if handle == "seen" else 1.0  # the camera looks along z, the handle is at x
+    R = torch.tensor([[0.0, -toward, 0], [0, 0, -1], [toward, 0, 0]])
+    truth = Rigid(R, torch.tensor([0.0, 0.05, 0.6]))
+    seen, mask = view_of(mug, truth)
+    depth_m = torch.where(mask, seen.float(), 1.2)
+    poses = [one.camera_from_model for one in Registration([mug]).find(depth_m, CAMERA)]
+    errors = [float(add_m(pose, truth, mug.vertices_m)) for pose in poses if pose is not None]
+    assert errors == ([pytest.approx(0, abs=0.05 * mug.diameter_m)] if handle == "seen" else [])
+    about = Rigid(rotation_by(torch.tensor([0.0, 0, 1.8])), torch.zeros(3))  # 103 degrees
+    turned, pairs = (truth @ about).double(), prepare_pairs(prepare_surface(mug))
+    best = find._best_turned(prepare_frame(depth_m, K), turned, pairs)
+    off = math.degrees(float(geodesic_rad(best.R, truth.R.double())))
+    assert off < (20 if handle == "seen" else 70), "hidden: anywhere behind the mug"
+
+
+def test_turns_that_fit_as_well_are_named() -> None:
+    """The handle of a mug is not among the readings: every turn fits, and the true one is named."""
+    mug = make_part("mug")
+    R = torch.tensor([[1.0, 0, 0], [0, 0.6, 0.8], [0, -0.8, 0.6]])
+    truth = Rigid(R, torch.tensor([0.0, 0.05, 0.6]))
+    seen, mask = view_of(mug, truth)
+    local_m = truth.inverse().apply(back_project(seen, K).float())
+    view = view_input(seen, mask & (local_m[..., 0] < 0.043), CAMERA, "mug", "view", None)
+    cloud = CloudInput(name="view", points_m=cloud_from_depth(seen, view.mask, K), object="mug",
+                       view=view)  # fmt: skip
+    net = Registration([mug], refusal=replace(REFUSAL, min_hold=0.0))
+    (found,) = net._pose_near([cloud], [truth[None]])
+    assert found.camera_from_model is not None
+    assert found.status == "ambiguous"
+    named = [found.camera_from_model, *(one.camera_from_model for one in found.alternatives)]
+    assert len(named) > 5
+    assert min(float(add_m(pose, truth, mug.vertices_m)) for pose in named) < 0.1 * mug.diameter_m
 
 
 @pytest.mark.parametrize(

@@ -262,7 +262,7 @@ class PoseEstimator:
         Args:
             view: depth and camera.
             objects: which may be there.
-            is_sure: answer only what is likelier there than not, and one of each object.
+            is_sure: answer only what is likelier there than not, and search once.
         """
         known = SearchTargets(
             names=objects,
@@ -478,7 +478,7 @@ class Registration(PoseEstimator):
         known = self._known(given.object)
         # Once for all inputs, and in the seconds of none.
         with_copies(known, up_to_symmetry=self.config.up_to_symmetry)
-        pairs = self._pairs(known) if poses is None else None
+        pairs = self._pairs(known)
         model, surface = known.model, known.surface
         began = time.perf_counter()
         cloud = CloudConfig(voxel_m=min(0.9, _VOXEL * model.diameter_m), max_points=None)
@@ -493,7 +493,6 @@ class Registration(PoseEstimator):
             dense_m = take_evenly(cloud_m, _SMOOTHED)
             some_m = dense_m[thin(dense_m, torch.zeros_like(dense_m), _VOXEL * surface.diameter_m)]
             normals, _ = local_planes(dense_m, some_m)
-            assert pairs is not None
             proposals = propose_poses(some_m, normals, pairs, surface, _PROPOSALS, generator)
         voted = time.perf_counter()
         seconds["voting"] = voted - began
@@ -503,8 +502,9 @@ class Registration(PoseEstimator):
             reason = "no pose lays the model near the points: another object, or too little of it"
             return refused(given, Refusal(status="votes do not meet", reason=reason), seconds)
         first = Candidate(icp.camera_from_model, icp.covariance, float(icp.residual_m))
+        turns = None if poses is None else pairs.turns  # in a mask the readings decide
         candidates = find_candidates(
-            cloud_m, first, best.others, known, self.config, is_refined=True
+            cloud_m, first, best.others, known, self.config, is_refined=True, turns=turns
         )
         found = Rigid.stack([one.pose for one in candidates])
         evidence = surface_signals(cloud_m, found, surface)

@@ -202,19 +202,19 @@ def find_candidates(
     config: EstimateConfig,
     *,
     is_refined: bool,
+    turns: Rigid | None = None,
 ) -> list[Candidate]:
     """Refine ``others``, at which ICP ended elsewhere, and the nearly symmetric copies of the best.
 
     The best comes first, then those that are other poses than it and than each other. Where the
-    best was not refined the copies stay where they are.
+    best was not refined the copies stay where they are. So do those by ``turns``, which lay most
+    of the surface where it is refined.
     """
     copies = known.copies
     assert copies is not None, "with_copies comes first"
     starts = Rigid.cat([others, best.pose @ copies.near])
     kept = [best]
-    if len(starts.R) == 0:
-        return kept
-    if not is_refined:
+    if not is_refined or len(starts.R) == 0:
         poses = [starts[k] for k in range(len(starts.R))]
         tried = [best._replace(pose=pose) for pose in poses]
     else:
@@ -229,6 +229,9 @@ def find_candidates(
             for k in range(len(starts.R))
             if float(found.inlier_share[k]) > 0  # else it is near no surface
         ]
+    if turns is not None:
+        turned = best.pose @ turns
+        tried += [best._replace(pose=turned[k]) for k in range(len(turned.R))]
     for one in tried:
         every = Rigid.stack([other.pose for other in kept])[:, None] @ copies.same
         gap_m = one.pose.apply(copies.points_m) - every.apply(copies.points_m)

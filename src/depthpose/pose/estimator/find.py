@@ -23,6 +23,7 @@ from depthpose.pose.estimator.fit import (
     share_out,
 )
 from depthpose.pose.estimator.hypotheses import (
+    compare_with_image,
     is_no_side,
     log_odds_wrong,
     propose_in_frame,
@@ -49,6 +50,9 @@ _BENT, _MOST_DEVIATIONS = 2.0, 4.0
 size that is off by more deviations than the second counts as one that is off by these."""
 _MOST_JUDGED, _LEAST_JUDGED = 40, 4
 """Poses that are judged in an image, and of each object at least."""
+_ALIGNED, _CLEARLY = 0.7, 0.01
+"""Cosine of the normals of readings and surface, and the share of the readings by which a turned
+pose must explain more."""
 _ROUNDS = 3
 """So often an image is searched for an object that is there more than once, at most."""
 _MOST_TOGETHER, _NEARLY = 8, 0.2
@@ -139,7 +143,9 @@ def find_objects(view: ViewInput, known: SearchTargets) -> list[PoseEstimate]:
             same = (some for some in groups if some[0].object == one.object)
             own = next((some for some in same if one.shared_with(some[0]) > _RIVAL), None)
             if own is None:
-                groups.append([one])
+                pose = _best_turned(frame, one.pose, known.pairs_of(one.object))
+                explained = _explained(frame, pose, known.surface_of(one.object))
+                groups.append([replace(one, pose=pose, explained=explained)])
             elif len(own) < _MOST_TOGETHER:
                 own.append(one)
         more, taken = _without_rivals(_judged(groups, frame, view, known), taken)
@@ -177,6 +183,28 @@ def _candidates(
             if int(own.sum()) * frame.step**2 >= _LEAST_PIXELS:
                 found.append(_Candidate(**vars(one), explained=own))
     return found
+
+
+def _best_turned(frame: Frame, pose: Rigid, pairs: PairTable) -> Rigid:
+    """Choose among the turns that show most of an object alike the one that explains most readings.
+
+    A handle that a wrong turn of a mug leaves out does not contradict it: a neighbour may be there.
+    """
+    if len(pairs.turns.R) == 0:
+        return pose
+    surface, every = pairs.surface, Rigid.cat([pose[None], pose[None] @ pairs.turns])
+    is_read = (frame.depth_m > 0) & ~is_no_side(frame, surface)
+    middle_m = pose.apply(surface.middle_m[None])[0]
+    is_read &= (frame.points_m - middle_m).norm(dim=-1) < surface.diameter_m
+    local_m = every.inverse().apply(frame.points_m[is_read])
+    index = surface.boxes.look_up(local_m)
+    is_near = (local_m - surface.points_m[index]).norm(dim=-1) < NEAR * surface.diameter_m
+    cosine = ((surface.normals[index] @ every.R.mT) * frame.normals[is_read]).sum(-1).abs()
+    number = (is_near & ((cosine > _ALIGNED) | ~frame.is_smooth[is_read])).sum(-1)
+    contradicted = compare_with_image(frame, every, surface).contradicted
+    score = number / number.max().clamp(min=1) - contradicted
+    best = int(score.argmax())
+    return every[best] if float(score[best] - score[0]) > _CLEARLY else pose
 
 
 def _judged(

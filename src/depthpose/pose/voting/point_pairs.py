@@ -6,17 +6,20 @@ bins and the check of every candidate follow Vidal et al., Sensors 2018.
 
 import math
 from dataclasses import dataclass
+from functools import cached_property
 
 import torch
 from jaxtyping import Bool, Float32, Float64, Int32, Int64
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from depthpose.core.rigid import Rigid
+from depthpose.core.rigid import Rigid, geodesic_rad
 from depthpose.pose.cloud import thin
 from depthpose.pose.compiled import ANGLES, DISTANCES, MOST_ALIKE, TURNS, serves
+from depthpose.pose.config import IcpConfig
 from depthpose.pose.mesh.models import fibonacci_directions
-from depthpose.pose.surface import Surface, finite_array, look_along_rays
+from depthpose.pose.refine import refine_roughly
+from depthpose.pose.surface import NEAR, Surface, finite_array, look_along_rays
 
 STEP = 0.07
 """Of the diameter: distance of the points of the model, and a bin of the distances of a pair."""
@@ -40,6 +43,13 @@ _EVERY = 16
 """One point of the surface of so many shows what a pose would occlude."""
 _UNSEEN = 0.3
 """Weight of the share of the surface that should be seen and is not."""
+_OWN_REFERENCES, _OWN_PEAKS, _OWN_POINTS = 40, 48, 250
+"""Points of a model that look for it in itself, poses that each proposes, and points compared."""
+_ROUGHLY, _MOSTLY = 0.5, 0.8
+"""A turn that lays so much of a surface on itself is refined; then it shows it alike, but for a
+feature, if it lays so much."""
+_TURNED, _TURNED_RAD, _MOST_TURNS = 0.7, math.radians(12), 36
+"""Cosine of the normals there, the least angle between two turns, and their number at most."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -52,7 +62,7 @@ class PairTable:
         bounds: pairs ``bounds[k]`` to ``bounds[k + 1]`` have feature ``k``.
         first: number of the first point of each pair.
         turn_rad: angle of the second point about the normal of the first, from its first tangent.
-        diameter_m: of the object.
+        surface: of the model.
     """
 
     points_m: Float64[Tensor, "m 3"]
@@ -60,7 +70,45 @@ class PairTable:
     bounds: Int32[Tensor, " bounds"]
     first: Int32[Tensor, " pairs"]
     turn_rad: Float32[Tensor, " pairs"]
-    diameter_m: float
+    surface: Surface
+
+    @cached_property
+    def turns(self) -> Rigid:
+        """Turns that lay most of the surface on itself, as ``model_from_model``; no symmetries.
+
+        A mug has them about its axis: but for its handle it looks alike. They are found by looking
+        for the model in itself.
+        """
+        surface, references = self.surface, torch.arange(min(_OWN_REFERENCES, len(self.points_m)))
+        found, _ = vote_poses(self.points_m, self.frames[..., 0], references, self, _OWN_PEAKS)
+        found = found[_apart_alike(found, surface, _ROUGHLY)]
+        # With the camera in the middle of the model, from where it sees all.
+        points_m, starts = surface.points_m - surface.middle_m, found.t_m - surface.middle_m
+        found = refine_roughly(points_m, Rigid(found.R, starts), surface, IcpConfig())
+        found = Rigid(found.R, found.t_m + surface.middle_m)
+        found = found[_apart_alike(found, surface, _MOSTLY)]
+        # One after the other they are turns too, which fill the gaps between those that were found.
+        twice = found[:, None] @ found
+        found = Rigid.cat([found, Rigid(twice.R.flatten(0, 1), twice.t_m.flatten(0, 1))])
+        return found[_apart_alike(found, surface, _MOSTLY)]
+
+
+def _apart_alike(turns: Rigid, surface: Surface, least: float) -> list[int]:
+    """Choose what lays so large a share of a surface on itself, none nearly as one before it."""
+    every = max(1, len(surface.points_m) // _OWN_POINTS)
+    local_m = turns.inverse().apply(surface.points_m[::every])
+    index = surface.boxes.look_up(local_m)
+    is_alike = (local_m - surface.points_m[index]).norm(dim=-1) < NEAR * surface.diameter_m
+    cosine = ((surface.normals[index] @ turns.R.mT) * surface.normals[::every]).sum(-1)
+    share = (is_alike & (cosine.abs() > _TURNED)).double().mean(-1)
+    chosen, known = list[int](), surface.copies.R
+    for k in share.argsort(descending=True).tolist():
+        if share[k] < least or len(chosen) == _MOST_TURNS:
+            break
+        if float(geodesic_rad(turns.R[k].expand_as(known), known).min()) > _TURNED_RAD:
+            chosen.append(k)
+            known = torch.cat([known, turns.R[k] @ surface.copies.R])
+    return chosen
 
 
 def prepare_pairs(surface: Surface) -> PairTable:
@@ -90,7 +138,7 @@ def prepare_pairs(surface: Surface) -> PairTable:
         bounds=bounds.int(),
         first=first[order].int(),
         turn_rad=turn_rad[order].float(),
-        diameter_m=surface.diameter_m,
+        surface=surface,
     )
 
 
@@ -212,18 +260,18 @@ def vote_poses(
     Returns:
         Poses and their votes, reference after reference.
     """
-    frames = _frames(normals)
+    frames, models = _frames(normals), len(table.points_m)
+    peaks = min(peaks, models)
     if serves(points_m):
         from depthpose.pose.compiled.pairs import vote
 
-        models = len(table.points_m)
-        shape = (len(references), min(peaks, models))
+        shape = (len(references), peaks)
         number, bin_ = torch.zeros(shape, dtype=torch.int64), torch.zeros(shape, dtype=torch.int64)
         votes = torch.zeros(shape, dtype=torch.float64)
         vote(
             finite_array(points_m.numpy()), finite_array(frames.numpy()), references.numpy(),
             table.bounds.numpy(), table.first.numpy(), table.turn_rad.numpy(), models,
-            STEP * table.diameter_m, number.numpy(), bin_.numpy(), votes.numpy(),
+            STEP * table.surface.diameter_m, number.numpy(), bin_.numpy(), votes.numpy(),
         )  # fmt: skip
         number, bin_, votes = number.flatten(), bin_.flatten(), votes.flatten()
     else:
@@ -248,11 +296,12 @@ def _peaks(
     peaks: int,
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Vote without numba: numbers of model points, bins of turns and votes."""
-    count, models = len(references), len(table.points_m)
+    count, models, diameter_m = len(references), len(table.points_m), table.surface.diameter_m
     far_m = (points_m[references, None] - points_m).norm(dim=-1)
-    used = (far_m > STEP * table.diameter_m) & (far_m < DISTANCES * STEP * table.diameter_m)
+    step_m = STEP * diameter_m
+    used = (far_m > step_m) & (far_m < DISTANCES * step_m)
     row, second = used.nonzero(as_tuple=True)
-    feature, turn_rad = _features(points_m, frames, references[row], second, table.diameter_m)
+    feature, turn_rad = _features(points_m, frames, references[row], second, diameter_m)
     keys = _neighbours(feature)
     size = (table.bounds[keys + 1] - table.bounds[keys]).long()
     same = (keys[:, 1:] == keys[:, :1]).nonzero(as_tuple=True)
@@ -278,7 +327,7 @@ def _peaks(
     votes = votes.reshape(count, models, TURNS)
     votes = 2 * votes + votes.roll(1, -1) + votes.roll(-1, -1)
     most, bins = votes.max(-1)
-    best = most.topk(min(peaks, models))
+    best = most.topk(peaks)
     return best.indices.flatten(), bins.gather(1, best.indices).flatten(), best.values.flatten()
 
 
