@@ -17,8 +17,6 @@ from depthpose.core.units import Unit, metres_of
 from depthpose.pose.config import SensorKind
 
 if TYPE_CHECKING:  # --help must not load torch
-    from torch import Tensor
-
     from depthpose.core.camera import Rectifier
 
 _FRAMES_A_SCENE = 50
@@ -116,7 +114,8 @@ def make_objects(
 
     from depthpose.core.checkpoint import file_sha256
     from depthpose.core.config import config_to_dict
-    from depthpose.core.run import claim_folder, note_result
+    from depthpose.core.files import read_json
+    from depthpose.core.run import claim_folder, is_whole, note_result
     from depthpose.pose.config import ObjectsConfig, SensorConfig
     from depthpose.pose.datasets import write_bop_models, write_bop_scene
     from depthpose.pose.mesh import read_model, refuse_one_name, with_found_symmetries
@@ -152,7 +151,12 @@ def make_objects(
         seed * _SCENES_A_SEED + k: range(first, min(first + _FRAMES_A_SCENE, number))
         for k, first in enumerate(range(0, number, _FRAMES_A_SCENE))
     }
-    wanted = {k: scene for k, scene in scenes.items() if not _is_made(out, split, k, scene)}
+    wanted: dict[int, range] = {}
+    for k, scene in scenes.items():
+        name, record = f"{split}/{k:06d}", f"{split}/{k:06d}/scene_camera.json"
+        there = read_json(out / record) if is_whole(out, name, [record]) else None
+        if not isinstance(there, dict) or not {str(n) for n in scene} <= set(there):
+            wanted[k] = scene
     for k, scene in wanted.items():
         made = make_frames(models, config, len(scene), scene.start)
         home = write_bop_scene(out, split, k, list(_shown(made, len(scene), "frames")))
@@ -160,18 +164,6 @@ def make_objects(
         note_result(out, home.relative_to(out).as_posix(), files)
     print(f"{out}: {len(wanted)} scenes made, {len(scenes) - len(wanted)} were there")
     return 0
-
-
-def _is_made(out: Path, split: str, scene: int, frames: range) -> bool:
-    """Whether a scene exists with all of its frames, every file as it was written."""
-    from depthpose.core.files import read_json
-    from depthpose.core.run import is_whole
-
-    home = f"{split}/{scene:06d}"
-    if not is_whole(out, home, [f"{home}/scene_camera.json"]):
-        return False
-    there = read_json(out / home / "scene_camera.json")
-    return isinstance(there, dict) and {str(n) for n in frames} <= set(there)
 
 
 def check(
@@ -388,7 +380,7 @@ def rectify(
     """
     from depthpose.cli.depth_predict import list_pairs
     from depthpose.core.camera import make_rectifier, read_raw_pair, write_camera
-    from depthpose.core.files import image_size, write_image
+    from depthpose.core.files import image_size, read_image, write_image
     from depthpose.core.run import claim_folder, claim_names
 
     unit_m = metres_of(unit) if unit else None
@@ -410,18 +402,13 @@ def rectify(
     claim_folder(out, settings, [*_SIDES, "camera.json"])
     claim_names(out, {pair[0].stem: pair for pair in pairs})
     for first, second in _shown(pairs, None, "pairs"):
-        for side, image in zip(_SIDES, _rectified(rectifier, first, second), strict=True):
+        images = map(read_image, (first, second))
+        rectified = rectifier.rectify(*images, [str(first), str(second)])
+        for side, image in zip(_SIDES, rectified, strict=True):
             write_image(out / side / f"{first.stem}.png", image)
     write_camera(out / "camera.json", rectifier.rig)
     print(f"{out}: {len(pairs)} pairs in left and right, their camera in camera.json")
     return 0
-
-
-def _rectified(rectifier: "Rectifier", *pair: Path) -> tuple["Tensor", "Tensor"]:
-    from depthpose.core.files import read_image
-
-    left, right = map(read_image, pair)
-    return rectifier.rectify(left, right, [str(path) for path in pair])
 
 
 def _check_rows(
@@ -431,17 +418,18 @@ def _check_rows(
     from statistics import median
 
     from depthpose.core.camera import check_rectified
+    from depthpose.core.files import read_image
 
-    rig = rectifier.rig
+    rig, (x, y) = rectifier.rig, rectifier.left_maps
+    is_seen = (x >= 0) & (x <= rig.width - 1) & (y >= 0) & (y <= rig.height - 1)
     print(
         f"rectified camera: {rig.width}x{rig.height}, fx {float(rig.K[0, 0]):.1f} px, baseline "
-        f"{rig.baseline_m:.4f} m; the raw images show {rectifier.seen_share:.1%} of the left view"
+        f"{rig.baseline_m:.4f} m; the raw images show {is_seen.mean():.1%} of the left view"
     )
     count = min(_LOOKED_AT, len(pairs))
     some = [pairs[k * len(pairs) // count] for k in range(count)]
-    reports = [
-        check_rectified(*_rectified(rectifier, *pair), rig.cx_right_minus_left_px) for pair in some
-    ]
+    rectified = [rectifier.rectify(*map(read_image, p), [str(side) for side in p]) for p in some]
+    reports = [check_rectified(*pair, rig.cx_right_minus_left_px) for pair in rectified]
     known = [report for report in reports if report.is_rectified is not None]
     if not known:
         said = f"depthpose: the rows cannot be checked: {reports[0].message}"

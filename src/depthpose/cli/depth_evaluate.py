@@ -3,7 +3,7 @@
 import hashlib
 import sys
 import tempfile
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -139,10 +139,7 @@ def baseline_method(name: BaselineName, training: Dataset) -> Method:
         "train_frames": len(training),
         "train_sha256": hashlib.sha256(names.encode()).hexdigest(),
     }
-
-    def show(frames: Sequence[int]) -> Iterable[int]:
-        return tqdm(frames, f"fit {name}", unit=" frames", disable=None)
-
+    show = partial(tqdm, desc=f"fit {name}", unit=" frames", disable=None)
     return Method(f"baseline-{name}", kinds[name].fit(training, show), settings, with_right=False)
 
 

@@ -151,11 +151,6 @@ class MethodSource:
             return self
         return replace(self, weights=Weights.read(self.weights))
 
-    def settings(self) -> dict[str, Any]:
-        """Say what decides the results; this machine need not have the workers' device."""
-        settings = replace(self, config=replace(self.config, device="cpu")).build().settings
-        return settings | ({"device": self.config.device} if "device" in settings else {})
-
 
 def sgbm_method(*, with_filled_holes: bool) -> Method:
     """OpenCV's StereoSGBM with the settings of our tables."""
@@ -361,7 +356,10 @@ def estimate_by_engine(
     inputs = Inputs.find(words, files)
     with inputs.first() as first:
         own = work_of(first)
-    settings = own.settings(own.method.settings())
+    here = replace(own.method, config=replace(own.method.config, device="cpu")).build().settings
+    if "device" in here:  # that of the workers, which this machine need not have
+        here["device"] = own.method.config.device
+    settings = own.settings(here)
     work = Work(start=own.start, files=files, endings=ENDINGS, batch=own.output.batch)
     what = "pairs" if files == PAIRS else "depth maps"
     return say(engine.run(work, inputs, out, settings), out, what)
@@ -468,7 +466,7 @@ class Predictor:
         return len(names)
 
     def predict(self, named: Named, total: int | None, what: str) -> list[str]:
-        """Estimate inputs, a batch together, and write their files; give the names that are done."""
+        """Estimate inputs, a batch together, and write their files; give the names of the done."""
         names: list[str] = []
         output, scale, net = self.work.output, self.work.scale, self.method.net
         assert isinstance(net, FakestereoNet), "weights build no other"

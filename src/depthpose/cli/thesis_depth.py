@@ -6,8 +6,6 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from jaxtyping import Float
-from torch import Tensor
 from tqdm import tqdm
 
 from depthpose.cli import depth_evaluate as evaluation
@@ -73,7 +71,8 @@ def reproduce_table(
         frames = [f for f in dataset.frames if has_prediction(folder, f.name)]
         shown = replace(dataset, frames=frames)
         for place, index in enumerate(choose_frames(shown, (), pictures)):
-            pair, lidar_m = shown.read_input(index), _lidar(frames[index])
+            pair, frame = shown.read_input(index), frames[index]
+            lidar_m = lidar_truth(frame, "camera_z") if has_lidar(frame, "camera_z") else None
             estimate = read_estimate(folder, pair.name, pair.camera)
             figures = {"2-5": draw_figure_2_5(pair, lidar_m, estimate)}
             if place == 0 and estimate.right is not None and pair.right is not None:
@@ -131,7 +130,8 @@ def write_figure(
     columns: list[list[Drawing]] = []
     sections: list[Section] = []
     for index, frame in zip(tqdm(indices, unit=" frames", disable=None), frames, strict=True):
-        pair, lidar_m = dataset.read_input(index), _lidar(frame)
+        pair = dataset.read_input(index)
+        lidar_m = lidar_truth(frame, "camera_z") if has_lidar(frame, "camera_z") else None
         seen = pair if method.with_right else replace(pair, right=None)
         estimate = method.net.estimate_pair(seen)
         if number == "2-5":
@@ -157,10 +157,6 @@ def _panel_section(title: str, panels: Sequence[Drawing], home: Path) -> Section
         write_image(path, shrink_to_width(panel.image, _PICTURE_WIDTH_PX))
         pictures.append(Picture(path=path, caption=panel.caption, scale=panel.scale))
     return Section(title=title, text=DEPTH_SCALE, pictures=pictures)
-
-
-def _lidar(frame: Frame) -> Float[Tensor, "h w"] | None:
-    return lidar_truth(frame, "camera_z") if has_lidar(frame, "camera_z") else None
 
 
 def _frames_hash(frames: Sequence[Frame]) -> str:

@@ -138,18 +138,6 @@ def kitti_size(keys: Mapping[str, list[float]], camera: str = "02") -> Size | No
     return (int(said[0]), int(said[1])) if len(said) == 2 else None
 
 
-def _kitti_facts(path: AnyPath) -> CameraFacts:
-    """Take the colour pair (cameras 2 and 3) of a KITTI text, or the grey one; or one camera."""
-    keys = read_key_values(path)
-    left, right = next((pair for pair in _KITTI_NAMES if pair[0] in keys), _KITTI_NAMES[0])
-    return facts_from_projections(
-        "a KITTI calibration",
-        kitti_matrix(path, keys, left, (3, 4)),
-        kitti_matrix(path, keys, right, (3, 4)) if right in keys else None,
-        kitti_size(keys, left[-2:]),
-    )
-
-
 def _colmap_facts(text: str) -> CameraFacts:
     """COLMAP's ``cameras.txt``: number, model, size, parameters; (0.5, 0.5) is the first pixel."""
     cameras = {match.groups() for match in _COLMAP.finditer(text)}
@@ -422,14 +410,19 @@ def _read_facts(path: AnyPath) -> CameraFacts:
     text = read_text(path, MAX_LIST_BYTES)
     if re.match(r"\s*(\{|\[\s*[-+\[\d])", text):
         return facts_from_json(read_json(path))
-    for sign, read in (
-        (_MIDDLEBURY, lambda: _middlebury_facts(path)),
-        (_KITTI, lambda: _kitti_facts(path)),
-        (_PLAIN, lambda: plain_facts(path, read_key_values(path))),
-        (_COLMAP, lambda: _colmap_facts(text)),
-    ):
-        if sign.search(text):
-            return read()
+    if _MIDDLEBURY.search(text):
+        return _middlebury_facts(path)
+    if _KITTI.search(text):  # the colour pair (cameras 2 and 3), or the grey one; or one camera
+        keys = read_key_values(path)
+        left, right = next((pair for pair in _KITTI_NAMES if pair[0] in keys), _KITTI_NAMES[0])
+        P = kitti_matrix(path, keys, left, (3, 4))
+        other = kitti_matrix(path, keys, right, (3, 4)) if right in keys else None
+        size = kitti_size(keys, left[-2:])
+        return facts_from_projections("a KITTI calibration", P, other, size)
+    if _PLAIN.search(text):
+        return plain_facts(path, read_key_values(path))
+    if _COLMAP.search(text):
+        return _colmap_facts(text)
     for sign, what in _FOREIGN.items():
         if re.search(sign, text, re.MULTILINE):
             raise InputError(f"{what}. {_WRITE}")
@@ -502,10 +495,14 @@ def camera_of(camera: AnyLens | None, size: Size) -> Camera | None:
         return read_camera(Path(camera), size)
     if isinstance(camera, FieldOfView):
         camera = size[0] / 2 / math.tan(math.radians(camera.degrees / 2))
-    if isinstance(camera, int | float):
-        return centred_camera(size, camera)
     if isinstance(camera, np.generic | np.ndarray | Tensor) and camera.ndim == 0:
-        return centred_camera(size, float(camera))
+        camera = float(camera)
+    if isinstance(camera, int | float):  # its axis meets the centre
+        if not 1 < camera < 1e6:
+            raise InputError(f"focal_px is {camera}: not a focal length in pixels; KITTI's is 721.5")
+        width, height = size
+        K = intrinsics(camera, camera, (width - 1) / 2, (height - 1) / 2)
+        return Camera(width=width, height=height, K=K)
     if isinstance(camera, Mapping):
         keys = {key: np.asarray(value).tolist() for key, value in camera.items()}
         has_size = bool({"width", "height"} & keys.keys())
@@ -530,15 +527,6 @@ def choose_lens(
         first, second = list(chosen)[:2]
         raise InputError(f"{first} and {second} are both given; omit one of the two")
     return next(iter(chosen.values()), None)
-
-
-def centred_camera(size: Size, focal_px: float) -> Camera:
-    """Make the camera of which the focal length alone is known; its axis meets the centre."""
-    if not 1 < focal_px < 1e6:
-        raise InputError(f"focal_px is {focal_px}: not a focal length in pixels; KITTI's is 721.5")
-    width, height = size
-    K = intrinsics(focal_px, focal_px, (width - 1) / 2, (height - 1) / 2)
-    return Camera(width=width, height=height, K=K)
 
 
 def intrinsics_of(K: object) -> Float[Tensor, "3 3"]:
