@@ -8,7 +8,7 @@ from depthpose.core.errors import (
     InputError,
     MissingExtraError,
     full_memory,
-    import_open3d,
+    import_extra,
     is_of_memory,
     nearest_name,
 )
@@ -38,7 +38,7 @@ def test_a_package_that_is_not_there_is_not_a_package_that_does_not_load(
 ) -> None:
     monkeypatch.setitem(sys.modules, "open3d", None)
     with pytest.raises(MissingExtraError, match=r"needs open3d, which is not installed: pip"):
-        import_open3d("registration")
+        import_extra("open3d", "open3d", "open3d", "registration")
 
     (tmp_path / "open3d.py").write_text(
         'raise ImportError("libusb-1.0.so.0: cannot open shared object file", name="open3d")\n'
@@ -46,12 +46,12 @@ def test_a_package_that_is_not_there_is_not_a_package_that_does_not_load(
     monkeypatch.delitem(sys.modules, "open3d")
     monkeypatch.syspath_prepend(tmp_path)
     with pytest.raises(InputError, match=r"is installed and does not load: libusb-1\.0\.so\.0: "):
-        import_open3d("registration")
+        import_extra("open3d", "open3d", "open3d", "registration")
 
     full = "libopenblas.so: failed to map segment from shared object"  # under ulimit -v
     (tmp_path / "open3d.py").write_text(f"raise ImportError({full!r}, name='open3d')\n")
     with pytest.raises(InputError, match=r"needs open3d: the memory is full \(libopenblas"):
-        import_open3d("registration")
+        import_extra("open3d", "open3d", "open3d", "registration")
 
 
 @pytest.mark.parametrize(

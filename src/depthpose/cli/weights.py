@@ -266,7 +266,7 @@ def _facts(weights: str, path: Path, facts: Mapping[str, str]) -> dict[str, str]
 
 def _freeze(out: Path, export: "Export") -> int:
     """Write the graph, and print how much it differs from PyTorch."""
-    from depthpose.core.export import freeze, proof_path
+    from depthpose.core.export import freeze
     from depthpose.report.page import markdown_table
 
     rows = [
@@ -275,5 +275,5 @@ def _freeze(out: Path, export: "Export") -> int:
     ]
     print(markdown_table(rows), end="")
     print(f"{out}: {out.stat().st_size / 1e6:.1f} MB; the differences are in "
-          f"{proof_path(out).name}")  # fmt: skip
+          f"{out.with_suffix('.proof.json').name}")  # fmt: skip
     return 0

@@ -87,11 +87,6 @@ def import_opencv(purpose: str) -> Any:  # noqa: ANN401  OpenCV's classes carry 
     return import_extra("cv2", "opencv-python-headless", "opencv", purpose)
 
 
-def import_open3d(purpose: str) -> Any:  # noqa: ANN401  Open3D's classes carry no types
-    """Import Open3D, as :func:`import_extra`."""
-    return import_extra("open3d", "open3d", "open3d", purpose)
-
-
 def refuse_unknown(what: str, name: object, known: Iterable[str]) -> None:
     """Refuse a word that is none of the known ones.
 

@@ -218,7 +218,8 @@ def freeze(path: Path, export: Export) -> list[Row]:
     """Write ``NAME.onnx``, once it agrees with PyTorch, and ``NAME.proof.json`` beside it."""
     if path.suffix != ".onnx":
         raise InputError(f"{path}: the graph is written as ONNX; end the name in .onnx.")
-    for file in (path, proof_path(path)):
+    proof = path.with_suffix(".proof.json")  # NAME.json may be a camera
+    for file in (path, proof):
         refuse_to_replace(file)
     onnx = import_export()
     with atomic_write(path) as part:
@@ -257,13 +258,8 @@ def freeze(path: Path, export: Export) -> list[Row]:
             "facts": facts,
             "differences": rows,
         }
-        write_json(proof_path(path), record)
+        write_json(proof, record)
     return rows
-
-
-def proof_path(path: Path) -> Path:
-    """Give the path of a graph's proof; NAME.json may be a camera."""
-    return path.with_suffix(".proof.json")
 
 
 MOST = 1 << 10  # multiple of a side for the exporter; the graph itself has no bound

@@ -317,7 +317,7 @@ def read_settings(folder: Path | str) -> dict[str, Any] | None:
     Raises:
         InputError: its record is damaged.
     """
-    if isinstance(folder, str) and stores.is_url(folder):
+    if isinstance(folder, str) and "://" in folder:
         record = stores.join(folder, RECORD)
         with refused_as(record, "record of a run", "choose another folder"):
             content = json.loads(stores.read_from(record)) if stores.exists(record) else None

@@ -92,13 +92,9 @@ def refuse_other_host(request: Request, hosts: tuple[str, ...] | None) -> Respon
 
 
 async def error_response(_: Request, error: Exception) -> Response:
-    """Answer a refusal with its message."""
-    assert isinstance(error, HTTPException)
-    return _sentence(error.status_code, error.detail, error.headers)
-
-
-async def crash_response(_: Request, error: Exception) -> Response:
-    """Answer an unexpected error; the trace is on the server's terminal."""
+    """Answer a refusal with its message; the trace of another error is on the server's terminal."""
+    if isinstance(error, HTTPException):
+        return _sentence(error.status_code, error.detail, error.headers)
     kind = type(error).__name__
     return _sentence(500, f"depthpose failed ({kind}: {error}); see the server's terminal")
 
@@ -121,16 +117,12 @@ class Queue:
     def __init__(self, most: int) -> None:
         self._most = most
         self._one = anyio.CapacityLimiter(1)
-        self._tickets: list[str] = []
+        self.tickets: list[str] = []
 
     def refuse_full(self) -> None:
         """Refuse one more."""
-        if len(self._tickets) > self._most:  # one of them is at work
+        if len(self.tickets) > self._most:  # one of them is at work
             raise HTTPException(503, _FULL)
-
-    def before(self, ticket: str) -> int | None:
-        """Count the computations that end before that of a ticket; None: it does not wait here."""
-        return self._tickets.index(ticket) if ticket in self._tickets else None
 
     async def compute(
         self, ticket: str, work: Callable[[], Result], is_gone: Callable[[], Awaitable[bool]]
@@ -140,14 +132,14 @@ class Queue:
         By the ticket the client asks for its place in the queue; 503 where too many wait.
         """
         self.refuse_full()
-        self._tickets.append(ticket)
+        self.tickets.append(ticket)
         try:
             async with self._one:
                 if await is_gone():
                     return None
                 return await anyio.to_thread.run_sync(work)
         finally:
-            self._tickets.remove(ticket)
+            self.tickets.remove(ticket)
 
 
 async def has_gone(receive: Receive) -> bool:
@@ -263,7 +255,8 @@ class Pages:
 
     async def place(self, request: Request) -> Response:
         """Give the number of computations before that of a ticket; null: it does not wait here."""
-        return JSONResponse({"before": self._queue.before(request.path_params["ticket"])})
+        ticket, waiting = request.path_params["ticket"], self._queue.tickets
+        return JSONResponse({"before": waiting.index(ticket) if ticket in waiting else None})
 
     async def estimate(self, request: Request) -> Response:
         """Answer a form."""
@@ -379,7 +372,7 @@ def make_app(depth: FakestereoNet, pose: GeoPoseNet, limits: Limits | None = Non
             Route("/results/{key}/{name}", pages.download),
         ],
         middleware=[Middleware(HostCheck, hosts=limits.hosts)],
-        exception_handlers={HTTPException: error_response, Exception: crash_response},
+        exception_handlers={HTTPException: error_response, Exception: error_response},
     )
 
 

@@ -24,7 +24,6 @@ from depthpose.web.answer import (
     Form,
     Shown,
     example_form,
-    read_files,
     small_size,
 )
 
@@ -83,7 +82,8 @@ def answer_depth(form: Form, net: FakestereoNet) -> Answer:
     estimate = net.estimate_pair(pair)
     seconds = time.perf_counter() - began
     assert estimate.depth_m is not None
-    folder = form.results()
+    folder = form.folder / "results"
+    folder.mkdir()
     write_estimate(folder, pair, estimate, (near_m, far_m), far_m)
     write_image(folder / f"{pair.name}.input.jpg", pair.left)
     pictures = _pictures(pair, estimate, (near_m, far_m))
@@ -97,7 +97,7 @@ def answer_depth(form: Form, net: FakestereoNet) -> Answer:
         pictures=pictures,
         scene=depth_scene(pair, estimate, far_m),
         terms=net.terms,
-        files=read_files(folder),
+        files={path.name: path.read_bytes() for path in sorted(folder.iterdir())},
     )
 
 

@@ -30,7 +30,6 @@ from depthpose.web.answer import (
     Form,
     Shown,
     example_form,
-    read_files,
     refuse_large,
     small_size,
 )
@@ -86,7 +85,8 @@ def answer_pose(form: Form, net: GeoPoseNet) -> Answer:
     if (least := form.number("min_certainty")) is not None:
         limit = EstimateConfig(min_certainty=least).min_certainty
         seen = [replace(one, estimate=with_status(one.estimate, limit)) for one in seen]
-    folder = form.results()
+    folder = form.folder / "results"
+    folder.mkdir()
     best = seen[0]
     agreeing = "votes that agree" if isinstance(target.net, GeoPoseNet) else "points near the model"
     found = [["", "status", "x [m]", "y [m]", "z [m]", "certainty"]]
@@ -117,7 +117,7 @@ def answer_pose(form: Form, net: GeoPoseNet) -> Answer:
         pictures=_write(folder, name, seen, target.model),
         scene=replace(scene, layers=layers),
         terms=net.terms if target.net is net else "",
-        files=read_files(folder),
+        files={path.name: path.read_bytes() for path in sorted(folder.iterdir())},
     )
 
 

@@ -410,26 +410,27 @@ def _read_facts(path: AnyPath) -> CameraFacts:
     text = read_text(path, MAX_LIST_BYTES)
     if re.match(r"\s*(\{|\[\s*[-+\[\d])", text):
         return facts_from_json(read_json(path))
+    facts: CameraFacts | None
     if _MIDDLEBURY.search(text):
-        return _middlebury_facts(path)
-    if _KITTI.search(text):  # the colour pair (cameras 2 and 3), or the grey one; or one camera
+        facts = _middlebury_facts(path)
+    elif _KITTI.search(text):  # the colour pair (cameras 2 and 3), or the grey one; or one camera
         keys = read_key_values(path)
         left, right = next((pair for pair in _KITTI_NAMES if pair[0] in keys), _KITTI_NAMES[0])
         P = kitti_matrix(path, keys, left, (3, 4))
         other = kitti_matrix(path, keys, right, (3, 4)) if right in keys else None
         size = kitti_size(keys, left[-2:])
-        return facts_from_projections("a KITTI calibration", P, other, size)
-    if _PLAIN.search(text):
-        return plain_facts(path, read_key_values(path))
-    if _COLMAP.search(text):
-        return _colmap_facts(text)
-    for sign, what in _FOREIGN.items():
-        if re.search(sign, text, re.MULTILINE):
-            raise InputError(f"{what}. {_WRITE}")
-    facts = _bare_facts(text)
-    if facts is None:
-        names = read_storage(path, text)
-        facts = None if names is None else _with_own_keys(facts_from_names(names), names)
+        facts = facts_from_projections("a KITTI calibration", P, other, size)
+    elif _PLAIN.search(text):
+        facts = plain_facts(path, read_key_values(path))
+    elif _COLMAP.search(text):
+        facts = _colmap_facts(text)
+    else:
+        for sign, what in _FOREIGN.items():
+            if re.search(sign, text, re.MULTILINE):
+                raise InputError(f"{what}. {_WRITE}")
+        facts = _bare_facts(text)
+        if facts is None and (names := read_storage(path, text)) is not None:
+            facts = _with_own_keys(facts_from_names(names), names)
     if facts is None:
         shown = " ".join(text[:200].split())[:40]
         raise InputError(f"no camera that is known; it begins with {shown!r}. Known: {KNOWN_FILES}")
@@ -499,7 +500,9 @@ def camera_of(camera: AnyLens | None, size: Size) -> Camera | None:
         camera = float(camera)
     if isinstance(camera, int | float):  # its axis meets the centre
         if not 1 < camera < 1e6:
-            raise InputError(f"focal_px is {camera}: not a focal length in pixels; KITTI's is 721.5")
+            raise InputError(
+                f"focal_px is {camera}: not a focal length in pixels; KITTI's is 721.5"
+            )
         width, height = size
         K = intrinsics(camera, camera, (width - 1) / 2, (height - 1) / 2)
         return Camera(width=width, height=height, K=K)

@@ -29,10 +29,11 @@ from depthpose.core.engine.work import (
     Work,
     is_unchanged,
     make_plan,
-    read_shard,
+    read_tar,
 )
 from depthpose.core.errors import InputError, MissingExtraError, import_extra
 from depthpose.core.files import remove_parts, stores
+from depthpose.core.files.disk import file_system
 from depthpose.core.run import (
     RECORD,
     environment,
@@ -92,7 +93,8 @@ def run_job(job: Job, engine: Engine) -> list[Done]:
             if not one.failures:
                 done[block.shard] = one
         elif f"{block.shard}.json" in sizes:
-            stores.remove(record)
+            with file_system(record, "removed") as (fs, inner):
+                fs.rm_file(inner)
     left = [block for block in blocks if block.shard not in done]
     if left:
         done |= {one.name: one for one in engine(left, job.work, out)}
@@ -158,8 +160,24 @@ def shard_results(out: str, done: Done) -> Iterator[tuple[str, dict[str, bytes]]
     Raises:
         InputError: the shard is not there, or is damaged.
     """
+    url = stores.join(stores.absolute(out), SHARDS, done.shard)
     names = {name for name, reason in done.entries if not reason}
-    return read_shard(stores.join(stores.absolute(out), SHARDS, done.shard), names, done.endings)
+    known, files = "", dict[str, bytes]()
+    for member, data in read_tar(url):
+        # A tar does not separate the names of the results from the endings of their files.
+        dots = (k for k, letter in enumerate(member) if letter == ".")
+        pairs = ((member[:k], member[k + 1 :]) for k in dots)
+        parts = next((pair for pair in pairs if pair[0] in names and pair[1] in done.endings), None)
+        if parts is None:
+            raise InputError(
+                f"{url}: holds {member!r}, which its record does not name; make it anew"
+            )
+        if files and parts[0] != known:
+            yield known, files
+            files = {}
+        known, files[parts[1]] = parts[0], data
+    if files:
+        yield known, files
 
 
 _LEAST_VERSION = (2, 52)  # the first version of Ray that has passwords

@@ -11,7 +11,7 @@ import shutil
 import tarfile
 import tempfile
 import zlib
-from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass
 from itertools import groupby, islice
@@ -19,7 +19,7 @@ from pathlib import Path, PurePosixPath
 
 from depthpose.core.errors import InputError
 from depthpose.core.files import stores
-from depthpose.core.files.disk import find_partners, refused_write
+from depthpose.core.files.disk import file_system, find_partners, refused_write
 
 PLAN, SHARDS = "plan.jsonl", "shards"
 
@@ -101,19 +101,13 @@ def _read_manifest(url: str, roles: Sequence[str]) -> Iterator[Item]:
             )
         files = tuple(
             path
-            if stores.is_url(path) or path.startswith("/")
+            if "://" in path or path.startswith("/")
             else stores.absolute(stores.join(folder, path))
             for path in (row[role] for role in roles)
         )
         name = str(row.get("name") or stem(files[0]))
         _refuse_name(name, f"{url}: row {number}")
         yield Item(name, files)
-
-
-def find_tars(words: Iterable[str]) -> list[str]:
-    """List tar shards: files themselves, or those of a pattern."""
-    listed = (url for word in words for url in stores.list_files(word, (".tar", ".tgz", ".gz")))
-    return list(dict.fromkeys(filter(is_tar, listed)))
 
 
 def is_tar(word: str) -> bool:
@@ -191,33 +185,13 @@ def make_plan(out: str, items: Sequence[Item], tars: Sequence[str], size: int) -
     return blocks
 
 
-def read_shard(
-    url: str, names: Collection[str], endings: Collection[str]
-) -> Iterator[tuple[str, dict[str, bytes]]]:
-    """Read the results of a shard one by one.
-
-    A tar does not separate the names of the results from the endings that their files may have.
-
-    Raises:
-        InputError: the shard is not there, or is damaged.
-    """
-
-    def split(member: str) -> tuple[str, str]:
-        for k in (k for k, letter in enumerate(member) if letter == "."):
-            if member[:k] in names and member[k + 1 :] in endings:
-                return member[:k], member[k + 1 :]
-        raise InputError(f"{url}: holds {member!r}, which its record does not name; make it anew")
-
-    members = ((*split(member), data) for member, data in read_tar(url))
-    for name, group in groupby(members, lambda member: member[0]):
-        yield name, {ending: data for _, ending, data in group}
-
-
 def read_tar(url: str) -> Iterator[tuple[str, bytes]]:
     """Read the files of a tar shard, plain or compressed, from its beginning to its end."""
     seen: set[str] = set()
     try:
-        with stores.opened(url) as file, tarfile.open(fileobj=file, mode="r|*") as tar:
+        with file_system(url, "read") as (fs, inner):
+            file = fs.open(inner, "rb")
+        with file, tarfile.open(fileobj=file, mode="r|*") as tar:
             for member in tar:
                 if not (member.isfile() or member.isdir()):
                     raise InputError(
@@ -255,11 +229,13 @@ class Inputs:
 
     @classmethod
     def find(cls, words: Sequence[str], files: Files) -> "Inputs":
-        """List files, manifests and tar shards."""
-        tars = [word for word in words if is_tar(word)]
+        """List files, manifests and tar shards, these by name or by a pattern."""
         others = [word for word in words if not is_tar(word)]
         items = find_items(others, files) if others else []
-        return cls(items=items, tars=find_tars(tars), files=files)
+        endings = (".tar", ".tgz", ".gz")
+        listed = (url for word in filter(is_tar, words) for url in stores.list_files(word, endings))
+        tars = list(dict.fromkeys(filter(is_tar, listed)))
+        return cls(items=items, tars=tars, files=files)
 
     @contextmanager
     def first(self) -> Iterator[Sequence[Path]]:

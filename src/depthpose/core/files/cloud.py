@@ -13,7 +13,7 @@ import torch
 from jaxtyping import Float32
 from torch import Tensor
 
-from depthpose.core.errors import InputError, import_open3d
+from depthpose.core.errors import InputError, import_extra
 from depthpose.core.files.disk import (
     MAX_TEXT_BYTES,
     AnyPath,
@@ -54,7 +54,7 @@ class Cloud:
         Raises:
             MissingExtraError: Open3D is not installed.
         """
-        open3d = import_open3d("a cloud of Open3D")
+        open3d = import_extra("open3d", "open3d", "open3d", "a cloud of Open3D")
         cloud = open3d.geometry.PointCloud()
         cloud.points = open3d.utility.Vector3dVector(self.points.double().cpu().numpy())
         if self.color is not None:

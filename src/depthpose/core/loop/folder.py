@@ -77,9 +77,21 @@ class RunLogger:
 
     def save(self, state: Mapping[str, Any]) -> None:
         """Write the last state, all or nothing; the one until now becomes the one before."""
-        if self._is_writer:
-            write_state(self.folder, state, keeps_last=self.has_good_last)
-            self.has_good_last = True
+        if not self._is_writer:
+            return
+        packed = BytesIO()  # on a full disk torch.save would say anything but that
+        torch.save(dict(state), packed)
+        last, before = self.folder / STATE, self.folder / BEFORE
+        with atomic_write(last) as part:
+            part.write_bytes(packed.getbuffer())
+            if self.has_good_last and last.is_file():
+                before.unlink(missing_ok=True)
+                try:
+                    os.link(last, before)  # a second name: there is a last state at any moment
+                except OSError:  # a disk without links
+                    with suppress(OSError):
+                        last.replace(before)
+        self.has_good_last = True
 
     def close(self) -> None:
         """Flush what TensorBoard holds back."""
@@ -223,22 +235,6 @@ class Parts:
 def saved_states(folder: Path) -> list[Path]:
     """List the states that a folder holds, the last one first."""
     return [path for name in (STATE, BEFORE) if (path := folder / name).is_file()]
-
-
-def write_state(folder: Path, state: Mapping[str, Any], *, keeps_last: bool) -> None:
-    """Write the last state, all or nothing; the one until now is kept as the one before."""
-    packed = BytesIO()  # on a full disk torch.save would say anything but that
-    torch.save(dict(state), packed)
-    last, before = folder / STATE, folder / BEFORE
-    with atomic_write(last) as part:
-        part.write_bytes(packed.getbuffer())
-        if keeps_last and last.is_file():
-            before.unlink(missing_ok=True)
-            try:
-                os.link(last, before)  # a second name: there is a last state at any moment
-            except OSError:  # a disk without links
-                with suppress(OSError):
-                    last.replace(before)
 
 
 def restore_last(folder: Path, parts: Parts) -> tuple[Path, int, float]:

@@ -287,7 +287,8 @@ class _Training:
                         "precision fp32; 'start' can take weights from before."
                     )
                 share = self.parts.scaler.scale(update.loss / len(iterators))
-                share.backward(inputs=_parameters(self.parts.optimizers[name]))
+                groups = self.parts.optimizers[name].param_groups
+                share.backward(inputs=[p for group in groups for p in group["params"]])
                 for fact, value in {"loss": loss, **update.facts}.items():
                     total, terms = self.sums.get(f"{name}/{fact}", (0.0, 0))
                     self.sums[f"{name}/{fact}"] = (total + float(value), terms + 1)
@@ -312,7 +313,7 @@ class _Training:
         optimizer, adam = self.task.optimizers[name]
         for group in optimizer.param_groups:
             group["lr"] = adam.rate_at(self.step, self.steps) * group.get("rate", 1.0)
-        parameters = _parameters(optimizer)
+        parameters = [p for group in optimizer.param_groups for p in group["params"]]
         if self.world > 1:
             grads = [torch.zeros_like(p) if p.grad is None else p.grad for p in parameters]
             flat = torch.cat([grad.flatten() for grad in grads])
@@ -378,10 +379,6 @@ class StopRequest:
 def _leave_process_group(_: int) -> None:
     """Take a worker out of the job's process group: a killed worker would end the loop unsaved."""
     os.setsid()
-
-
-def _parameters(optimizer: torch.optim.Optimizer) -> list[Tensor]:
-    return [p for group in optimizer.param_groups for p in group["params"]]
 
 
 def _copied(module: torch.nn.Module) -> dict[str, Tensor]:
