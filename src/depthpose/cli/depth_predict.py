@@ -86,11 +86,15 @@ class MethodSource:
     allow_ood: bool = True  #: answer out-of-distribution images too, as a measurement must
     answer: Answer | None = None  #: where depth of one image comes from; None: as the weights say
     use: Use | None = None  #: build what these take alone; None: all networks
+    with_filled_holes: bool = False  #: of OpenCV's matcher: give every pixel an answer
 
     def build(self) -> Method:
         """Build the networks on the device of the config."""
-        if self.weights is None:
-            return sgbm_method(with_filled_holes=False)
+        if self.weights is None:  # OpenCV's StereoSGBM with the settings of our tables
+            sgbm = SGBMConfig(with_filled_holes=self.with_filled_holes)
+            name = "sgbm-filled" if self.with_filled_holes else "sgbm"
+            net = FakestereoNet.load(matcher="sgbm", config=sgbm)
+            return Method(name, net, {"matcher": "sgbm", **asdict(sgbm)})
         if isinstance(self.weights, Weights):
             with self.weights.unpacked() as file:
                 return replace(self, weights=file).build()
@@ -149,15 +153,8 @@ class MethodSource:
             )
         if not isinstance(self.weights, str):
             return self
-        return replace(self, weights=Weights.read(self.weights))
-
-
-def sgbm_method(*, with_filled_holes: bool) -> Method:
-    """OpenCV's StereoSGBM with the settings of our tables."""
-    config = SGBMConfig(with_filled_holes=with_filled_holes)
-    net = FakestereoNet.load(matcher="sgbm", config=config)
-    name = "sgbm-filled" if with_filled_holes else "sgbm"
-    return Method(name, net, {"matcher": "sgbm", **asdict(config)})
+        path = find_weights(self.weights)
+        return replace(self, weights=Weights(name=path.name, data=path.read_bytes()))
 
 
 def read_lens(options: LensOptions, sources: Sequence[Path]) -> Camera | FieldOfView | float:

@@ -21,7 +21,7 @@ from depthpose.cli.pose_methods import MethodSource, PoseMethod
 from depthpose.cli.pose_options import DataSetOptions, OneObjectOptions
 from depthpose.core import run
 from depthpose.core.camera import Camera, camera_of
-from depthpose.core.checkpoint import file_sha256
+from depthpose.core.checkpoint import file_sha256, find_weights
 from depthpose.core.config import config_to_dict
 from depthpose.core.engine import (
     Files,
@@ -121,7 +121,7 @@ def is_result_of(name: str, image: str) -> bool:
 def claim_bop(out: Path, settings: dict[str, Any], dataset: BopDataset) -> None:
     """Claim a folder for the poses of a data set."""
     images = sorted({(i.scene_id, i.image_id) for i in dataset.instances})
-    pictures = [_picture_name(*image) for image in images]
+    pictures = [f"{scene:06d}_{image:06d}.{PICTURE}" for scene, image in images]
     tables = [results_name(dataset), results_name(dataset, _WITH_ALTERNATIVES)]
     run.claim_folder(out, settings, [POSES, _PAGE, *tables, *pictures])
 
@@ -374,7 +374,7 @@ def write_files(
             if prediction.place is not None and prediction.estimate.is_posed:
                 posed[prediction.place[:2]].append(prediction.estimate)
         for image, estimates in posed.items():
-            name = _picture_name(*image)
+            name = f"{image[0]:06d}_{image[1]:06d}.{PICTURE}"
             if not is_whole(out, name, [name]):
                 picture = drawn.picture_of(image_of[image])
                 for estimate in estimates:
@@ -403,10 +403,6 @@ def write_files(
             )
         note_result(out, job.name, files)
     _write_page(out, predictions, jobs, models, dataset)
-
-
-def _picture_name(scene: int, image: int) -> str:
-    return f"{scene:06d}_{image:06d}.{PICTURE}"
 
 
 def say_result(predictions: list[Prediction], out: Path) -> int:
@@ -518,7 +514,8 @@ def start_files(
                 if camera is None:
                     inputs.append(cloud_input(sample.files[0], unit or "m", object, name))
                 else:
-                    inputs.append(view_input(*sample.files, camera, object, name, unit))
+                    depth, mask = sample.files
+                    inputs.append(view_input(depth, mask, camera, object, name, unit))
             except InputError as error:
                 inputs.append(unreadable(name, object, error))
         answers = iter(method.estimate_many([i for i in inputs if not isinstance(i, PoseEstimate)]))
@@ -551,7 +548,8 @@ def predict_on_ray(
                 f"{words[1]}: no mask called {depth!r}; a mask has the name of its depth image"
             )
     if isinstance(source.weights, str):
-        source = replace(source, weights=Weights.read(source.weights))
+        path = find_weights(source.weights)
+        source = replace(source, weights=Weights(name=path.name, data=path.read_bytes()))
     method = source.build("cpu")
     object = object_named(options.object or None, method)
     with inputs.first() as first:

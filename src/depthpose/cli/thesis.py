@@ -52,7 +52,7 @@ def reproduce(
         pictures: how many frames the page shows.
     """
     from depthpose.cli.depth_evaluate import baseline_method, open_frames, open_training
-    from depthpose.cli.depth_predict import MethodSource, sgbm_method
+    from depthpose.cli.depth_predict import MethodSource
     from depthpose.cli.thesis_depth import reproduce_table
     from depthpose.depth.evaluate import find_protocol
     from depthpose.thesis.depth import TABLES
@@ -81,7 +81,7 @@ def reproduce(
             f"two weights are called {names[0]!r}, and so would their predictions be: rename one."
         )
     if matcher is not None:
-        methods.append((own[0], sgbm_method(with_filled_holes=True)))
+        methods.append((own[0], replace(source, with_filled_holes=True).build()))
     if not published.with_right:
         files = ("default",) if beside is None else beside
         others = [replace(source, weights=file).build() for file in files]

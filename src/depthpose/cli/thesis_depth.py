@@ -4,7 +4,6 @@ import hashlib
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 from tqdm import tqdm
 
@@ -85,7 +84,14 @@ def reproduce_table(
         Section(title="Published rows, ours, and difference", text=how, rows=rows),
         *sections,
         *evaluation.write_details(measured, out),
-        Section(title="Settings", rows=[row for _, m in methods for row in _setting_rows(m)]),
+        Section(
+            title="Settings",
+            rows=[
+                {"method": method.name, "setting": name, "value": str(value)}
+                for _, method in methods
+                for name, value in method.settings.items()
+            ],
+        ),
     ]
     write_report(f"{table.title}, on {dataset.name}", sections, out)
     evaluation.say_skipped(measured)
@@ -142,7 +148,11 @@ def write_figure(
         sections.append(_panel_section(frame.name, columns[-1], out / "panels" / frame.name))
     path = out / f"figure-{number}.png"
     write_image(path, arrange(columns))
-    sections.append(Section(title="Settings", rows=_setting_rows(method)))
+    rows = [
+        {"method": method.name, "setting": name, "value": str(value)}
+        for name, value in method.settings.items()
+    ]
+    sections.append(Section(title="Settings", rows=rows))
     page.write_page(out / "report.html", f"Figure {number}", sections, environment())
     captions = "; ".join(panel.caption for panel in columns[0])
     print(f"{path}: each column from top to bottom: {captions}. {DEPTH_SCALE}; see the bar below.")
@@ -163,10 +173,3 @@ def _frames_hash(frames: Sequence[Frame]) -> str:
     """Give the SHA-256 of the list of left images, a line each."""
     lines = "".join(f"{frame.left.resolve()}\n" for frame in frames)
     return hashlib.sha256(lines.encode()).hexdigest()
-
-
-def _setting_rows(method: Method) -> list[dict[str, Any]]:
-    return [
-        {"method": method.name, "setting": name, "value": str(value)}
-        for name, value in method.settings.items()
-    ]

@@ -303,10 +303,14 @@ def table_files(*names: str) -> list[str]:
 
 
 def write_table(folder: Path, rows: Sequence[Row], name: str = "rows") -> None:
-    """Write ``NAME.json``, ``NAME.csv`` and ``table.md`` (``NAME.md`` for other names)."""
+    """Write ``NAME.json``, ``NAME.csv`` (with every digit) and ``table.md``, else ``NAME.md``."""
     as_json, as_csv, as_markdown = table_files(name)
     write_json(folder / as_json, [dict(row) for row in rows])
-    write_bytes(folder / as_csv, csv_table(rows).encode(errors=_ERRORS))
+    text = io.StringIO()
+    writer = csv.DictWriter(text, column_names(rows), lineterminator="\n")
+    writer.writeheader()
+    writer.writerows(rows)
+    write_bytes(folder / as_csv, text.getvalue().encode(errors=_ERRORS))
     write_bytes(folder / as_markdown, markdown_table(rows).encode(errors=_ERRORS))
 
 
@@ -334,15 +338,6 @@ def plain_table(rows: Sequence[Row], names: Sequence[str] = ()) -> str:
         "  ".join(cell.ljust(w) for cell, w in zip(line, widths, strict=True)).rstrip() + "\n"
         for line in cells
     )
-
-
-def csv_table(rows: Sequence[Row]) -> str:
-    """Format rows as CSV with a header, every digit kept."""
-    text = io.StringIO()
-    writer = csv.DictWriter(text, column_names(rows), lineterminator="\n")
-    writer.writeheader()
-    writer.writerows(rows)
-    return text.getvalue()
 
 
 def write_markdown(

@@ -6,7 +6,7 @@ from tests.core.engine.doubles import write_texts
 
 from depthpose.core.engine import Files, Inputs, find_items
 from depthpose.core.errors import InputError
-from depthpose.core.files.stores import list_files, local_copy, publish_bytes, read_all
+from depthpose.core.files.stores import list_files, local_copy, publish, read_all
 
 ONE = Files(roles=("text",), suffixes=(".txt",))
 TWO = Files(roles=("left", "right"), suffixes=(".txt",))
@@ -90,6 +90,6 @@ def test_a_remote_file_is_copied_and_a_missing_one_refused(tmp_path: Path) -> No
 
 def test_stores_that_may_show_half_a_file_take_no_results() -> None:
     with pytest.raises(InputError, match="ftp:// may show half a file"):
-        publish_bytes(b"x", "ftp://host/file")
+        publish(b"x", "ftp://host/file")
     with pytest.raises(InputError, match="cannot be listed"):
         list_files("nonsense://x", (".txt",))

@@ -218,18 +218,15 @@ def _place_finely(
     is_good = (best > _MIN_SCORE) & (row > 0) & (row < last) & (column > 0) & (column < last)
     row, column = row.clamp(1, last - 1), column.clamp(1, last - 1)
     n = torch.arange(len(places))
-    x = column + _peak(*(scores[n, row, column + i] for i in (-1, 0, 1)))
-    y = row + _peak(*(scores[n, row + i, column] for i in (-1, 0, 1)))
-    shift = matched - places + torch.stack([x, y], -1) - _REACH
+    peak = torch.stack([column, row], -1).float()
+    for axis in (0, 1):  # the top of the parabola through three scores, half a pixel off at most
+        before, at, after = (scores[n, row + k * axis, column + k * (1 - axis)] for k in (-1, 0, 1))
+        curvature = (2 * at - before - after).clamp_min(1e-6)
+        peak[:, axis] += ((after - before) / (2 * curvature)).clamp(-0.5, 0.5)
+    shift = matched - places + peak - _REACH
     scale = one.shape[1] / left.shape[2]
     centre = torch.tensor([one.shape[1], one.shape[0]]) / 2
     return ((places - centre) / scale)[is_good], (shift / scale)[is_good]
-
-
-def _peak(before: Tensor, at: Tensor, after: Tensor) -> Tensor:
-    """Place the top of the parabola through three scores, within half a pixel of the middle."""
-    curvature = (2 * at - before - after).clamp_min(1e-6)
-    return ((after - before) / (2 * curvature)).clamp(-0.5, 0.5)
 
 
 def _what_was_done(one: Grey, other: Grey, corners: Places) -> str | None:

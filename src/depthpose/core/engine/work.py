@@ -181,7 +181,7 @@ def make_plan(out: str, items: Sequence[Item], tars: Sequence[str], size: int) -
         if tar not in there:
             blocks.append(Block(f"{len(blocks):06d}", tar=tar))
     if len(blocks) > known:
-        stores.publish_bytes("".join(f"{b.to_json()}\n" for b in blocks).encode(), plan)
+        stores.publish("".join(f"{b.to_json()}\n" for b in blocks).encode(), plan)
     return blocks
 
 
@@ -325,11 +325,6 @@ class Done:
     block: int  #: checksum of the inputs
 
     @property
-    def name(self) -> str:
-        """Name of the shard, without its suffix."""
-        return self.shard.rpartition(".")[0]
-
-    @property
     def failures(self) -> list[tuple[str, str]]:
         """Inputs without a result."""
         return [entry for entry in self.entries if entry[1]]
@@ -366,19 +361,20 @@ def is_unchanged(path: Path, stamp: Sequence[int]) -> bool:
         return False
 
 
+@dataclass(eq=False)
 class Runner:
     """Does blocks one after the other; what the work needs is loaded at the first."""
 
-    def __init__(self, work: Work, out: str) -> None:
-        self._work, self._out = work, out
-        self._function: Function | None = None
+    work: Work
+    out: str
+    function: Function | None = None  #: what the work has started
 
     def run(self, block: Block) -> Done:
         """Do a block, unless a shard of it without failures is there.
 
         The record ``SHARD.json`` is written after the shard: where it is, the shard is whole.
         """
-        record = stores.join(self._out, SHARDS, f"{block.shard}.json")
+        record = stores.join(self.out, SHARDS, f"{block.shard}.json")
         if stores.exists(record):
             done = Done.from_json(stores.read_from(record))
             if not done.failures:
@@ -387,34 +383,34 @@ class Runner:
         with refused_write(temporary.name), temporary as scratch:
             file = Path(scratch) / f"{block.shard}.tar"
             entries = tuple(self._write(block, file, Path(scratch)))
-            url = stores.join(self._out, SHARDS, file.name)
+            url = stores.join(self.out, SHARDS, file.name)
             stores.publish(file, url)
             stamp = file_stamp(stores.local_path(url) or file)
         done = Done(
             shard=file.name,
             entries=entries,
-            endings=tuple(self._work.endings),
+            endings=tuple(self.work.endings),
             stamp=stamp,
             block=block.checksum,
         )
-        stores.publish_bytes(done.to_json().encode(), record)
+        stores.publish(done.to_json().encode(), record)
         return done
 
     def _write(self, block: Block, file: Path, scratch: Path) -> Iterator[tuple[str, str]]:
         """Write the results of a block, and give each name with "" or the reason of a failure."""
-        self._function = self._function or self._work.start()
-        samples = _samples(block, self._work.files, scratch)
+        self.function = self.function or self.work.start()
+        samples = _samples(block, self.work.files, scratch)
         results = scratch / "results"
         results.mkdir()
         with tarfile.open(file, "w", format=tarfile.PAX_FORMAT) as tar:
-            while chunk := list(islice(samples, self._work.batch)):
-                reasons = iter(self._function([one for one in chunk if not one.reason], results))
+            while chunk := list(islice(samples, self.work.batch)):
+                reasons = iter(self.function([one for one in chunk if not one.reason], results))
                 for one in chunk:
                     reason = one.reason or next(reasons)
                     for path in one.files:
                         if scratch in path.parents:  # of a copy the name alone says something
                             reason = reason.replace(str(path), path.name)
-                    for ending in sorted(self._work.endings):
+                    for ending in sorted(self.work.endings):
                         path = results / f"{one.name}.{ending}"
                         if path.is_file():
                             if not reason:

@@ -186,8 +186,12 @@ def _read_text(path: AnyPath) -> Cloud:
     rows = _rows_of(text, noted)
     with refused_as(path, "text", "save it as UTF-8"):
         head = list(islice(rows, _LOOKED_AT))
+    names: list[str] = []
     first = _names_in(head[0]) if head else []
-    names = [] if all(map(_is_number, first)) else first
+    try:
+        list(map(float, filter(None, first)))
+    except ValueError:  # no row of numbers
+        names = first
     if names and not set("xyz") <= set(names):
         raise InputError(
             f"{path}: begins by {head[0][:60]!r}, neither numbers nor names of columns with x, y "
@@ -229,14 +233,6 @@ def _rows_of(text: Iterable[str], noted: list[str]) -> Iterator[str]:
 
 def _names_in(line: str) -> list[str]:
     return [word.strip("\"'").lower() for word in _PARTS.split(line.strip())]
-
-
-def _is_number(word: str) -> bool:
-    try:
-        float(word)
-    except ValueError:
-        return not word
-    return True
 
 
 def _blank_separated(path: AnyPath, head: list[str], names: list[str]) -> Callable[[str], str]:

@@ -61,24 +61,22 @@ def read_all(folder: str, suffix: str) -> dict[str, bytes]:
         return {PurePosixPath(name).name: fs.cat_file(name) for name in names}
 
 
-def publish(file: Path, url: str) -> None:
-    """Put a finished local file under its final name, whole or not at all."""
+def publish(content: bytes | Path, url: str) -> None:
+    """Put bytes, or a finished local file, under a final name, whole or not at all."""
     path = local_path(url)
     if path is not None:
         with atomic_write(path) as part:
-            shutil.copyfile(file, part)
+            if isinstance(content, bytes):
+                part.write_bytes(content)
+            else:
+                shutil.copyfile(content, part)
         return
     refuse_unsafe(url)
     with file_system(url, "written") as (fs, inner):
-        fs.put_file(str(file), inner)
-
-
-def publish_bytes(data: bytes, url: str) -> None:
-    """Put bytes under a name, whole or not at all; see :func:`publish`."""
-    with tempfile.TemporaryDirectory(prefix="depthpose-") as scratch:
-        file = Path(scratch) / "part"
-        file.write_bytes(data)
-        publish(file, url)
+        if isinstance(content, bytes):
+            fs.pipe_file(inner, content)
+        else:
+            fs.put_file(str(content), inner)
 
 
 def refuse_unsafe(url: str) -> None:
