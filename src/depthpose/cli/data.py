@@ -17,7 +17,7 @@ from depthpose.core.units import Unit, metres_of
 from depthpose.pose.config import SensorKind
 
 if TYPE_CHECKING:  # --help must not load torch
-    from depthpose.core.camera import Rectifier
+    from depthpose.core.camera import RectificationReport, Rectifier
 
 _FRAMES_A_SCENE = 50
 _SCENES_A_SEED = 1000
@@ -408,8 +408,8 @@ def rectify(
     claim_folder(out, settings, [*_SIDES, "camera.json"])
     claim_names(out, {pair[0].stem: pair for pair in pairs})
     for first, second in _shown(pairs, None, "pairs"):
-        images = map(read_image, (first, second))
-        rectified = rectifier.rectify(*images, [str(first), str(second)])
+        names = [str(first), str(second)]
+        rectified = rectifier.rectify(read_image(first), read_image(second), names)
         for side, image in zip(_SIDES, rectified, strict=True):
             write_image(out / side / f"{first.stem}.png", image)
     write_camera(out / "camera.json", rectifier.rig)
@@ -434,8 +434,11 @@ def _check_rows(
     )
     count = min(_LOOKED_AT, len(pairs))
     some = [pairs[k * len(pairs) // count] for k in range(count)]
-    rectified = [rectifier.rectify(*map(read_image, p), [str(side) for side in p]) for p in some]
-    reports = [check_rectified(*pair, rig.cx_right_minus_left_px) for pair in rectified]
+    reports: list[RectificationReport] = []
+    for first, second in some:
+        names = [str(first), str(second)]
+        left, right = rectifier.rectify(read_image(first), read_image(second), names)
+        reports.append(check_rectified(left, right, rig.cx_right_minus_left_px))
     known = [report for report in reports if report.is_rectified is not None]
     if not known:
         said = f"depthpose: the rows cannot be checked: {reports[0].message}"

@@ -260,7 +260,7 @@ def _freeze(
     weights: str,
     path: Path,
     facts: Mapping[str, str],
-    export_of: Callable[[Mapping[str, str]], "Export"],
+    export_of: Callable[[dict[str, str]], "Export"],
 ) -> int:
     """Print the terms of weights, write their graph, and print how it differs from PyTorch."""
     from depthpose.core.checkpoint import file_sha256, warn_of_terms

@@ -22,6 +22,7 @@ from depthpose.core.files import stores
 from depthpose.core.files.disk import file_system, find_partners, refused_write
 
 PLAN, SHARDS = "plan.jsonl", "shards"
+_TARS = (".tar", ".tar.gz", ".tgz")
 
 
 @dataclass(frozen=True, slots=True)
@@ -108,11 +109,6 @@ def _read_manifest(url: str, roles: Sequence[str]) -> Iterator[Item]:
         name = str(row.get("name") or stem(files[0]))
         _refuse_name(name, f"{url}: row {number}")
         yield Item(name, files)
-
-
-def is_tar(word: str) -> bool:
-    """Whether a word names tar shards."""
-    return word.lower().endswith((".tar", ".tar.gz", ".tgz"))
 
 
 def stem(url: str) -> str:
@@ -230,12 +226,12 @@ class Inputs:
     @classmethod
     def find(cls, words: Sequence[str], files: Files) -> "Inputs":
         """List files, manifests and tar shards, these by name or by a pattern."""
-        others = [word for word in words if not is_tar(word)]
+        tars = [word for word in words if word.lower().endswith(_TARS)]
+        others = [word for word in words if word not in tars]
         items = find_items(others, files) if others else []
-        endings = (".tar", ".tgz", ".gz")
-        listed = (url for word in filter(is_tar, words) for url in stores.list_files(word, endings))
-        tars = list(dict.fromkeys(filter(is_tar, listed)))
-        return cls(items=items, tars=tars, files=files)
+        listed = (url for word in tars for url in stores.list_files(word, (".tar", ".tgz", ".gz")))
+        shards = dict.fromkeys(url for url in listed if url.lower().endswith(_TARS))
+        return cls(items=items, tars=list(shards), files=files)
 
     @contextmanager
     def first(self) -> Iterator[Sequence[Path]]:
