@@ -52,10 +52,7 @@ class Value:
         """Give the same numbers in another type."""
         return self.op("Cast", to=self.graph.onnx.helper.np_dtype_to_tensor_dtype(np.dtype(dtype)))
 
-    def slice(self, starts: Any, ends: Any, axes: Sequence[int]) -> "Value":  # noqa: ANN401
-        """Cut out a part; numbers are lists, or values of int64."""
-        return self.op("Slice", starts, ends, list(axes))
-
+    slice = partialmethod(op, "Slice")  # starts, ends, axes: lists, or values of int64
     __add__ = partialmethod(op, "Add")
     __sub__ = partialmethod(op, "Sub")
     __mul__ = partialmethod(op, "Mul")

@@ -36,13 +36,12 @@ from depthpose.core.camera.pinhole import (
 from depthpose.core.camera.stored_camera import (
     Names,
     baseline_of,
+    facts_from_folder,
     facts_from_names,
-    facts_from_ros_pair,
     is_ros,
     lens_of,
     named,
     read_storage,
-    read_two_files,
     scalar,
 )
 from depthpose.core.errors import InputError, nearest_name
@@ -398,13 +397,7 @@ def check_image_matches_camera(camera: Camera, width: int, height: int, name: st
 
 def _read_facts(path: AnyPath) -> CameraFacts:
     if Path(path).is_dir():
-        first, second = read_two_files(Path(path))
-        if is_ros(first) and is_ros(second) and "p2" not in first | second:
-            return facts_from_ros_pair(first, second)
-        facts = facts_from_names(first | second)
-        if facts is None:
-            raise InputError("its two files together describe no camera")
-        return facts
+        return facts_from_folder(Path(path))
     if Path(path).name == "cameras.bin":
         raise InputError("of COLMAP cameras.txt is read: colmap model_converter --output_type TXT")
     text = read_text(path, MAX_LIST_BYTES)
