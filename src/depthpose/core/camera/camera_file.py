@@ -131,12 +131,6 @@ def kitti_matrix(
     return np.array(keys[name], dtype=np.float64).reshape(shape)
 
 
-def kitti_size(keys: Mapping[str, list[float]], camera: str = "02") -> Size | None:
-    """Size of the rectified images, where a calibration has it (``S_rect_02``)."""
-    said = keys.get(f"S_rect_{camera}", [])
-    return (int(said[0]), int(said[1])) if len(said) == 2 else None
-
-
 def _colmap_facts(text: str) -> CameraFacts:
     """COLMAP's ``cameras.txt``: number, model, size, parameters; (0.5, 0.5) is the first pixel."""
     cameras = {match.groups() for match in _COLMAP.finditer(text)}
@@ -411,7 +405,8 @@ def _read_facts(path: AnyPath) -> CameraFacts:
         left, right = next((pair for pair in _KITTI_NAMES if pair[0] in keys), _KITTI_NAMES[0])
         P = kitti_matrix(path, keys, left, (3, 4))
         other = kitti_matrix(path, keys, right, (3, 4)) if right in keys else None
-        size = kitti_size(keys, left[-2:])
+        said = keys.get(f"S_rect_{left[-2:]}", [])  # the size of the rectified images
+        size = (int(said[0]), int(said[1])) if len(said) == 2 else None
         facts = facts_from_projections("a KITTI calibration", P, other, size)
     elif _PLAIN.search(text):
         facts = plain_facts(path, read_key_values(path))
