@@ -51,7 +51,8 @@ class FileFacts:
 def look_at_all(paths: Sequence[Path]) -> int:
     """Print what each file is and what is odd; give the exit code."""
     # What has a size comes first: a camera file may need it.
-    ordered = sorted(paths, key=_is_camera_like)
+    words = cameras.CAMERA_SUFFIXES
+    ordered = sorted(paths, key=lambda path: path.is_dir() or path.suffix.lower() in words)
     seen: list[FileFacts] = []
     for path in ordered:
         size = next((other.size for other in seen if other.size is not None), None)
@@ -79,13 +80,9 @@ def look_at_all(paths: Sequence[Path]) -> int:
     return 1 if is_odd else 0
 
 
-def _is_camera_like(path: Path) -> bool:
-    return path.is_dir() or path.suffix.lower() in cameras.CAMERA_SUFFIXES
-
-
 def _read(path: Path, size: Size | None) -> FileFacts:
     suffix = path.suffix.lower()
-    if _is_camera_like(path):
+    if path.is_dir() or suffix in cameras.CAMERA_SUFFIXES:
         return _read_words(path, size)
     if suffix in files.MAP_SUFFIXES:
         return _of_map(path)

@@ -301,12 +301,6 @@ class MethodSource:
         with self.weights.unpacked() as name:
             return _network(Path(name), Path(name).stem, config)
 
-    def packed(self) -> "MethodSource":
-        """Give the same with the weights in memory."""
-        if not isinstance(self.weights, str):
-            return self
-        return replace(self, weights=Weights.read(self.weights))
-
 
 def source_of(
     weights: str,

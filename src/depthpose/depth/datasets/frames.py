@@ -24,7 +24,7 @@ from depthpose.core.camera import (
     read_camera,
     read_rig,
 )
-from depthpose.core.camera.camera_file import Matrix, kitti_matrix, kitti_size, plain_facts
+from depthpose.core.camera.camera_file import Matrix, kitti_matrix, plain_facts
 from depthpose.core.camera.pinhole import (
     CameraFacts,
     Size,
@@ -124,7 +124,8 @@ def _projected_rig(
 ) -> tuple[StereoRig, Matrix]:
     """The rig of two projections, and that of the left camera."""
     left, right = (kitti_matrix(path, keys, name, (3, 4)) for name in names)
-    said = kitti_size(keys) or size
+    sides = keys.get("S_rect_02", [])  # of the rectified images
+    said = (int(sides[0]), int(sides[1])) if len(sides) == 2 else size
     if said != size:
         raise InputError(
             f"{path}: S_rect_02 says {said[0]}x{said[1]}, but the image is {size[0]}x{size[1]}. It "

@@ -16,7 +16,7 @@ from tqdm import tqdm
 from depthpose.core.arrays import take_evenly
 from depthpose.core.camera import AnyCamera, choose_lens
 from depthpose.core.devices import each_in_own_arithmetic, each_in_threads, own_arithmetic
-from depthpose.core.errors import InputError, full_memory, is_of_memory, nearest_name
+from depthpose.core.errors import InputError, full_memory, nearest_name
 from depthpose.core.rigid import Rigid
 from depthpose.core.units import Unit
 from depthpose.pose.cloud import Refusal, local_planes, prepare_cloud, thin
@@ -381,9 +381,9 @@ def or_unreadable(work: Callable[[AnyInput], Made], given: AnyInput) -> Made | P
     except InputError as error:
         reason = str(error)
     except (MemoryError, RuntimeError) as error:
-        if not is_of_memory(error):
+        if (said := full_memory(error)) is None:
             raise
-        reason = f"{given.name}: {full_memory(error)}"
+        reason = f"{given.name}: {said}"
     return refused(given, Refusal(status="unreadable", reason=reason), {})
 
 
