@@ -338,10 +338,8 @@ class PSMNetMatcher(NetworkMatcher):
             # In float32 at least: 8 bits would round the expectation to whole pixels.
             cost, wide = cast("nn.Conv3d", head.cost), torch.empty(0, device=self.device)
             head.cost = layers.VolumeConv(cost, cost.weight, torch.zeros(1), wide)
-        layers.fold_volumes(network, like)
-        layers.fold_features(network.features, like)
         network.rows = ROWS
-        return network
+        return layers.fold(network, like)
 
     def run(self, left: Views, right: Views, network: PSMNetConfig) -> list[Match]:
         """Match normalised pairs whose sides suit the network."""
