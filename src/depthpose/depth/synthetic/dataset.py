@@ -51,12 +51,6 @@ class Sight:
     edges: Float64[Tensor, "n 3 3"]  # edge functions of all triangles; see ``core.render``
     volume: Float64[Tensor, " n"]  # what they are divided by
 
-    def rays(self, pixels: Float64[Tensor, "n 2"]) -> Vectors:
-        """Directions of pixels, with z = 1."""
-        (a, b, c), (_, d, e), _ = self.K.inverse().tolist()
-        u, v = pixels.unbind(1)
-        return torch.stack([a * u + b * v + c, d * v + e, torch.ones_like(u)], 1).float()
-
 
 def view_from(
     stage: Stage, K: Float64[Tensor, "3 3"], size: tuple[int, int], eye: Float[Tensor, "3"]
@@ -170,7 +164,9 @@ def _seen_at(sight: Sight, index: Indices) -> Nearest:
 
 def _light(stage: Stage, sight: Sight, pixels: Float64[Tensor, "n 2"], nearest: Nearest) -> Vectors:
     primitive, shares, depth = nearest
-    rays = sight.rays(pixels)
+    (a, b, c), (_, d, e), _ = sight.K.inverse().tolist()
+    u, v = pixels.unbind(1)
+    rays = torch.stack([a * u + b * v + c, d * v + e, torch.ones_like(u)], 1).float()
     length = rays.norm(dim=1)
     towards = rays / length[:, None]
     light = torch.empty_like(rays)

@@ -489,15 +489,14 @@ class _Roadside:
         number = int(self.rng.integers(models.TREES))
         wide = tall * self.rng.uniform(0.85, 1.15)
         model = models.tree(number, int(s > 24) + int(s > 48 or abs(x) > 25))
-        self.add_plant(model, x, s, np.array([wide, tall, wide]) / 10)
+        scale = np.array([wide, tall, wide]) / 10
+        tints = {"leaf": models.leaf_color(self.rng)}
+        self.b.add(place(model, (x, 0, s), self.rng.uniform(0, 6.28), scale, tints))
 
     def add_bush(self, x: Number, s: Number, size: Number) -> None:
         """A bush of some kind, coarser where it is far away."""
         model = models.bush(int(self.rng.integers(models.BUSHES)), int(s > 20))
-        self.add_plant(model, x, s, size * self.rng.uniform(0.7, 1.3, 3))
-
-    def add_plant(self, model: Mesh, x: Number, s: Number, scale: np.ndarray) -> None:
-        """A model turned at random, with leaves of some colour."""
+        scale = size * self.rng.uniform(0.7, 1.3, 3)
         tints = {"leaf": models.leaf_color(self.rng)}
         self.b.add(place(model, (x, 0, s), self.rng.uniform(0, 6.28), scale, tints))
 
@@ -535,7 +534,7 @@ class Traffic:
                 s += rng.uniform(5.0, 6.5)
 
     def add_driving(self) -> None:
-        """Vehicles in the lanes."""
+        """Vehicles in the lanes, and in the side streets, waiting or turning."""
         rng, road = self.rng, self.road
         usual = {"avenue": 1.3, "forest": 0.6, "rural": 0.6}.get(road.place, 0.9)
         density = rng.uniform(0.15, 1) * usual
@@ -548,10 +547,6 @@ class Traffic:
                     yaw = rng.normal(0, 0.02) + (np.pi if is_oncoming else 0)
                     self.add_vehicle(x + rng.normal(0, 0.25), s, yaw)
                 s += rng.uniform(7, 32)
-
-    def add_crossing(self) -> None:
-        """Vehicles in the side streets, waiting or turning."""
-        rng, road = self.rng, self.road
         for street in road.side_streets:
             for side in street.sides:
                 if rng.random() < 0.5 and street.s_m > 8:
