@@ -34,11 +34,6 @@ from depthpose.depth.weights import DepthWeights, make_matcher
 _0, _1, _2, _HALF = np.float32(0), np.float32(1), np.float32(2), np.float32(0.5)
 
 
-def _size_of(image: Value) -> Value:
-    """Rows and columns of images."""
-    return image.op("Shape", start=2, end=4)
-
-
 def _rows(size: Value) -> Value:
     """The first of two sides, as a list of one."""
     return size.slice([0], [1], [0])
@@ -183,7 +178,7 @@ class _Drawn(NamedTuple):
 
 def _drawn(left: Value, generator: Generator) -> _Drawn:
     """What ``draw_right`` or ``select_views`` and ``shift_left`` do."""
-    size, multiple = _size_of(left), generator.config.side_multiple_px
+    size, multiple = left.op("Shape", start=2, end=4), generator.config.side_multiple_px
     # The multiple that a side is close to, or the side itself.
     sides = size.cast(np.float64)
     nearest = (sides / float(multiple)).op("Round").op("Max", 1.0) * float(multiple)
@@ -256,7 +251,7 @@ def image_graph(weights: DepthWeights) -> Graph:
     graph = Graph()
     image = graph.input("image", np.float32, _IMAGES)
     K = graph.input("K", np.float64, (3, 3)).op("Reshape", [-1])
-    full = _size_of(image)
+    full = image.op("Shape", start=2, end=4)
     small = _focal_size(full, K.op("Gather", [4, 0]), rig.virtual_focal_px)
     left = _resized_image(image, small)
     right, own, street = _drawn(left, generator)
@@ -330,7 +325,7 @@ def _matched(
     """Match at the focal length that the weights want, and come back to the images' size."""
     network = _dynamic_shape_network(matcher)
     config, graph = matcher.config, left.graph
-    size = work = _size_of(left)
+    size = work = left.op("Shape", start=2, end=4)
     if config.work_focal_px is not None:
         work = _focal_size(size, focal_px, config.work_focal_px)
     least, step = config.min_side_px, config.step_px
@@ -403,7 +398,7 @@ def _pair_export(weights: DepthWeights, facts: dict[str, Any]) -> Export:
     def cases() -> Iterator[Case]:
         assert weights.matcher is not None
         net = FakestereoNet(make_matcher(weights.matcher, _QUICK))
-        sky = ("is_sky",) if _sees_sky(weights.matcher) else ()
+        sky = ("is_sky",) if getattr(weights.matcher.config, "with_sky", False) else ()
         work_px = weights.matcher.config.work_focal_px
         for size in _SIZES:
             left, right = _scenes(size, with_sky=bool(sky))
@@ -438,7 +433,8 @@ def _image_export(weights: DepthWeights, facts: dict[str, Any]) -> Export:
         synthesiser = make_synthesiser(weights.generator, speed=_QUICK.speed)
         net = FakestereoNet(matcher, synthesiser, allow_ood=True)
         selects = isinstance(weights.generator, SelectionGenerator)
-        sky = ("is_sky",) if selects or _sees_sky(weights.matcher) else ()
+        own = None if weights.matcher is None else weights.matcher.config
+        sky = ("is_sky",) if selects or getattr(own, "with_sky", False) else ()
         street = ("image_confidence",) if getattr(weights.generator, "street", None) else ()
         for size in _SIZES:
             images, _ = _scenes(size, with_sky=bool(sky))
@@ -472,10 +468,6 @@ TARGETS = {
     "pair": Target(fits=lambda weights: weights.matcher is not None, export=_pair_export),
 }
 """One image to depth, a rectified pair to disparity: a new target is a function and one entry."""
-
-
-def _sees_sky(matcher: StereoNetwork | None) -> bool:
-    return matcher is not None and getattr(matcher.config, "with_sky", False)
 
 
 def _case(

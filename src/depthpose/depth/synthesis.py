@@ -88,19 +88,15 @@ class UNetGenerator(nn.Module):
         return torch.tanh(x)
 
 
-class _Level(nn.Module):
+class _Level(nn.Sequential):
     """Convolution, norm and dropout of one level; activations stand before it."""
 
     def __init__(
         self, conv: nn.Conv2d | nn.ConvTranspose2d, *, with_norm: bool, dropout: float = 0.0
     ) -> None:
-        super().__init__()
-        self.conv = conv
-        self.norm = nn.BatchNorm2d(conv.out_channels) if with_norm else nn.Identity()
-        self.dropout = nn.Dropout(dropout) if dropout else nn.Identity()
-
-    def forward(self, x: Tensor) -> Tensor:
-        return self.dropout(self.norm(self.conv(x)))
+        norm = nn.BatchNorm2d(conv.out_channels) if with_norm else nn.Identity()
+        rest = nn.Dropout(dropout) if dropout else nn.Identity()
+        super().__init__(OrderedDict(conv=conv, norm=norm, dropout=rest))
 
 
 def _initialise(module: nn.Module) -> None:
@@ -613,19 +609,16 @@ def import_encoder(file: Path, out: Path) -> None:
 
 
 def load_encoder(encoder: LiteEncoder, path: Path) -> None:
-    """Give an encoder of full width the weights of a file, as far as it reaches."""
-    state = read_encoder(path).state_dict()
-    own = encoder.state_dict()
+    """Give an encoder of full width the weights of a file, as far as it reaches.
+
+    The file is one that :func:`import_encoder` wrote.
+    """
+    whole = LiteEncoder()
+    load_weights(whole, read_checkpoint(path, ENCODER_KIND), str(path))
+    state, own = whole.state_dict(), encoder.state_dict()
     if any(state[name].shape != tensor.shape for name, tensor in own.items()):
         raise InputError(
             f"{path}: holds {ENCODER_KIND} at its full width, and this encoder is narrower; "
             "set encoder_width to 1, or begin at random."
         )
     encoder.load_state_dict({name: state[name] for name in own})
-
-
-def read_encoder(path: Path) -> LiteEncoder:
-    """Read an encoder that :func:`import_encoder` wrote."""
-    encoder = LiteEncoder()
-    load_weights(encoder, read_checkpoint(path, ENCODER_KIND), str(path))
-    return encoder

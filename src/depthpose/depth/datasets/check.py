@@ -8,7 +8,7 @@ from typing import Literal
 
 import torch
 from jaxtyping import Float
-from torch import Tensor
+from torch import Tensor, nn
 from torch.nn import functional as F
 
 from depthpose.core.camera import Camera, RectificationReport, StereoRig, check_rectified
@@ -254,11 +254,6 @@ class Duplicate:
     similarity: float  #: 1 for the same picture, about 0 for two streets
 
 
-def shrink(image: Float[Tensor, "c h w"], rows: int, columns: int) -> Float[Tensor, "c rows cols"]:
-    """Average an image over a grid of cells."""
-    return F.interpolate(image[None], (rows, columns), mode="area")[0]
-
-
 def find_duplicates(
     first: Dataset,
     second: Dataset,
@@ -319,14 +314,10 @@ def _fine_structure(dataset: Dataset, index: int) -> Float[Tensor, "zooms rows c
     for zoom in _ZOOMS:
         top, left = (round(side * (1 - 1 / zoom) / 2) for side in (height, width))
         middle = image[:, top : height - top, left : width - left]
-        parts.append(shrink(middle, _ROWS, _COLUMNS))
-    grey = torch.stack(parts)
-    detail = grey - _blur(grey)
-    return (detail / (_blur(detail**2).sqrt() + 0.01))[:, 0]
-
-
-def _blur(image: Float[Tensor, "n c h w"]) -> Float[Tensor, "n c h w"]:
-    return F.avg_pool2d(image, _BLUR, 1, _BLUR // 2, count_include_pad=False)
+        parts.append(F.interpolate(middle[None], (_ROWS, _COLUMNS), mode="area"))
+    grey, blur = torch.cat(parts), nn.AvgPool2d(_BLUR, 1, _BLUR // 2, count_include_pad=False)
+    detail = grey - blur(grey)
+    return (detail / (blur(detail**2).sqrt() + 0.01))[:, 0]
 
 
 def _unit(windows: Float[Tensor, "n h w"]) -> Float[Tensor, "n hw"]:

@@ -218,7 +218,10 @@ class PSMNet(StereoNetwork):
         self.dres1 = nn.ModuleList([ConvNorm(nn.Conv3d, c, c), ConvNorm(nn.Conv3d, c, c)])
         self.hourglasses = nn.ModuleList([Hourglass(c) for _ in range(3)])
         self.heads = nn.ModuleList([Head(c) for _ in range(3)])
-        self.apply(_initialise)
+        for module in self.modules():  # as the authors did: deconvolutions keep PyTorch's default
+            if isinstance(module, nn.Conv2d | nn.Conv3d):
+                taps = module.weight[0, 0].numel()
+                nn.init.normal_(module.weight, 0, (2 / (taps * module.out_channels)) ** 0.5)
 
     def forward(self, left: Views, right: Views) -> tuple[Maps, ...]:
         """Match the pair.
@@ -282,13 +285,6 @@ class PSMNet(StereoNetwork):
             cost = layers.by_rows(head, (x,), halo=2, rows=self.rows)
             costs.append(cost + costs[-1] if costs else cost)
         return cast("tuple[Volume, Volume, Volume]", tuple(costs))
-
-
-def _initialise(module: nn.Module) -> None:
-    """Draw weights as the authors did: deconvolutions keep PyTorch's default."""
-    if isinstance(module, nn.Conv2d | nn.Conv3d):
-        taps = module.weight[0, 0].numel()
-        nn.init.normal_(module.weight, 0, (2 / (taps * module.out_channels)) ** 0.5)
 
 
 ROWS = 32

@@ -265,7 +265,13 @@ def add_roadside(b: MeshBuilder, road: Road) -> None:
         }  # fmt: skip
         plots.get(road.place, beside.add_country)()
         beside.add_kerb()
-        beside.add_woods()
+        # The front of a wood: right behind a forest's first trees, far behind elsewhere.
+        is_forest, often = road.place == "forest", {"forest": 0.9, "city": 0.1, "suburb": 0.35}
+        if rng.random() <= often.get(road.place, 0.55):
+            near, height = (rng.uniform(8, 13), 13.0) if is_forest else (rng.uniform(14, 55), 9.0)
+            s, x = rng.uniform(-10, 0 if is_forest else 60), beside.x_m(near)
+            stop, other = s + rng.uniform(60, 200), x + beside.side * rng.uniform(-2, 15)
+            models.add_wood_edge(b, (x, s), (other, stop), height * rng.uniform(0.7, 1.3))
     if rng.random() < 0.85:  # trees across the end of the road's straight part
         for _ in range(int(rng.integers(30, 90))):
             beside = sides[int(rng.choice([-1, 1]))]
@@ -372,16 +378,6 @@ class _Roadside:
                 s += rng.uniform(8, 18)
         if not is_forest and rng.random() < 0.45:
             self.add_border(-8, 90, int(rng.integers(4)))
-
-    def add_woods(self) -> None:
-        """The front of a wood: right behind a forest's first trees, far behind elsewhere."""
-        rng, is_forest = self.rng, self.road.place == "forest"
-        if rng.random() > {"forest": 0.9, "city": 0.1, "suburb": 0.35}.get(self.road.place, 0.55):
-            return
-        near, height = (rng.uniform(8, 13), 13.0) if is_forest else (rng.uniform(14, 55), 9.0)
-        s, x = rng.uniform(-10, 0 if is_forest else 60), self.x_m(near)
-        stop, other = s + rng.uniform(60, 200), x + self.side * rng.uniform(-2, 15)
-        models.add_wood_edge(self.b, (x, s), (other, stop), height * rng.uniform(0.7, 1.3))
 
     def add_copse(self, s: Number, length: Number, depth: Number) -> None:
         """Some trees and bushes."""
