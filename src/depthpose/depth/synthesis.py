@@ -14,6 +14,7 @@ from collections import OrderedDict
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Literal
 
 import torch
 import torch.nn.functional as F
@@ -114,40 +115,29 @@ def _initialise(module: nn.Module) -> None:
 Scores = Float[Tensor, "b 1 rows columns"]
 
 
-class _Discriminator(nn.Module):
-    def __init__(self, *layers: nn.Module) -> None:
+class Discriminator(nn.Module):
+    """Score each 70x70 patch, or each pixel alone.
+
+    Of patches C64-C128-C256-C512-1, 2,768,705 parameters at width 64; of pixels 1x1 convolutions
+    64-128-1, 9,024 parameters.
+    """
+
+    def __init__(self, kind: Literal["patch", "pixel"] = "patch", width: int = 64) -> None:
         super().__init__()
+        kernel, stride, padding = (4, 2, 1) if kind == "patch" else (1, 1, 0)
+        layers: list[nn.Module] = [nn.Conv2d(6, width, kernel, stride, padding), nn.LeakyReLU(0.2)]
+        steps = ((width, 2), (2 * width, 2), (4 * width, 1)) if kind == "patch" else ((width, 1),)
+        for inputs, stride in steps:
+            conv = nn.Conv2d(inputs, 2 * inputs, kernel, stride, padding, bias=False)
+            layers += [conv, nn.BatchNorm2d(2 * inputs), nn.LeakyReLU(0.2)]
+        last = 2 * steps[-1][0]
+        layers.append(nn.Conv2d(last, 1, kernel, 1, padding, bias=kind == "patch"))
         self.layers = nn.Sequential(*layers)
         self.apply(_initialise)
 
     def forward(self, left: Views, right: Views) -> Scores:
         """Answer one logit a patch or pixel; images are RGB in [-1, 1]."""
         return self.layers(torch.cat([left, right], 1))
-
-
-class PatchDiscriminator(_Discriminator):
-    """Score each 70x70 patch: C64-C128-C256-C512-1; 2,768,705 parameters at width 64."""
-
-    def __init__(self, width: int = 64) -> None:
-        layers: list[nn.Module] = [nn.Conv2d(6, width, 4, 2, 1), nn.LeakyReLU(0.2)]
-        for inputs, stride in ((width, 2), (2 * width, 2), (4 * width, 1)):
-            conv = nn.Conv2d(inputs, 2 * inputs, 4, stride, 1, bias=False)
-            layers += [conv, nn.BatchNorm2d(2 * inputs), nn.LeakyReLU(0.2)]
-        super().__init__(*layers, nn.Conv2d(8 * width, 1, 4, 1, 1))
-
-
-class PixelDiscriminator(_Discriminator):
-    """Score each pixel alone: 1x1 convolutions 64-128-1; 9,024 parameters at width 64."""
-
-    def __init__(self, width: int = 64) -> None:
-        super().__init__(
-            nn.Conv2d(6, width, 1),
-            nn.LeakyReLU(0.2),
-            nn.Conv2d(width, 2 * width, 1, bias=False),
-            nn.BatchNorm2d(2 * width),
-            nn.LeakyReLU(0.2),
-            nn.Conv2d(2 * width, 1, 1, bias=False),
-        )
 
 
 Logits = Float[Tensor, "b classes rows columns"]
@@ -265,7 +255,7 @@ class LiteEncoder(nn.Module):
         stem = max(round(_STEM * width), 1)
         self.stem = _ConvNorm(3, stem, 3, 2)
         blocks: list[nn.Module] = []
-        inputs, self._taps, self._frozen = stem, [], 0
+        inputs, self._taps, self._frozen, self._keeps_statistics = stem, [], 0, False
         self.channels: list[int] = []
         stages = _STAGES[: _LAST_AT_STRIDE[levels - 1] + 1]
         for number, (count, kernel, stride, expansion, channels) in enumerate(stages):
@@ -292,15 +282,22 @@ class LiteEncoder(nn.Module):
         return features
 
     def freeze_early(self) -> None:
-        """Freeze the first layers: their ImageNet features (edges, colours) need no training."""
+        """Freeze the first layers: their ImageNet features (edges, colours) need no training.
+
+        Batch norm uses its stored statistics from here on, whatever the mode: small batches spoil
+        them.
+        """
         for part in (self.stem, *self.blocks[: self._frozen]):
             part.requires_grad_(False)
+        self._keeps_statistics = True
 
-    def keep_statistics(self) -> None:
-        """Let batch norm use its stored statistics, whatever the mode: small batches spoil them."""
+    def train(self, mode: bool = True) -> "LiteEncoder":
+        """Set the mode, but for batch norm that keeps its statistics."""
+        super().train(mode)
         for part in self.modules():
-            if isinstance(part, nn.BatchNorm2d):
+            if self._keeps_statistics and isinstance(part, nn.BatchNorm2d):
                 part.eval()
+        return self
 
 
 class _ConvNorm(nn.Sequential):

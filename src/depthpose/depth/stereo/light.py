@@ -386,12 +386,12 @@ class LightStereo(StereoNetwork):
         self.sky_head = SkyHead(self.features.widths) if self.config.with_sky else None
 
     @property
-    def encoder(self) -> LiteEncoder:
+    def encoder(self) -> LiteEncoder:  # pyright: ignore[reportIncompatibleVariableOverride]
         """Of ImageNet, in the features."""
         return self.features.encoder
 
     @property
-    def sky(self) -> SkyHead | None:
+    def sky(self) -> SkyHead | None:  # pyright: ignore[reportIncompatibleVariableOverride]
         """The class of the sky."""
         return self.sky_head
 

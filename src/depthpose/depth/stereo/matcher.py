@@ -239,20 +239,13 @@ class StereoNetwork(nn.Module):
     """A normalised pair to disparity maps for the losses; the last is the output."""
 
     config: Any  #: its sizes and conventions, a :class:`~depthpose.depth.config.NetworkConfig`
+    #: the part that may begin with weights of ImageNet, which trains more slowly
+    encoder: LiteEncoder | None = None
+    sky: nn.Module | None = None  #: the class of the sky, which may be trained alone
 
     def forward_with_sky(self, left: Views, right: Views) -> tuple[tuple[Maps, ...], Maps | None]:
         """Give the disparity maps [px], and P(sky) where the network has that class."""
         return self(left, right), None
-
-    @property
-    def encoder(self) -> LiteEncoder | None:
-        """The part that may begin with weights of ImageNet, which trains more slowly."""
-        return None
-
-    @property
-    def sky(self) -> nn.Module | None:
-        """The class of the sky, which may be trained alone."""
-        return None
 
 
 class NetworkMatcher(ABC):

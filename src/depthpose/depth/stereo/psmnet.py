@@ -4,6 +4,7 @@ The features of one view come first: residual layers and a spatial pyramid, at 1
 """
 
 import re
+from collections import OrderedDict
 from collections.abc import Mapping
 from pathlib import Path
 from typing import cast
@@ -156,17 +157,14 @@ class Hourglass(nn.Module):
         return down, up.add_(down if first is None else first).relu_()
 
 
-class Head(nn.Module):
+class Head(nn.Sequential):
     """Volume of features to one cost a voxel; a larger cost means a likelier match."""
 
     def __init__(self, c: int) -> None:
-        super().__init__()
-        self.hidden = ConvNorm(nn.Conv3d, c, c)
-        self.cost = nn.Conv3d(c, 1, 3, 1, 1, bias=False)
-
-    def forward(self, x: Volume) -> Volume:
-        """Score each voxel."""
-        return self.cost(self.hidden(x).relu_())
+        parts: OrderedDict[str, nn.Module] = OrderedDict(hidden=ConvNorm(nn.Conv3d, c, c))
+        parts["relu"] = nn.ReLU(inplace=True)
+        parts["cost"] = nn.Conv3d(c, 1, 3, 1, 1, bias=False)
+        super().__init__(parts)
 
 
 def concatenation_volume(

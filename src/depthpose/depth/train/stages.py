@@ -48,9 +48,8 @@ class StereoTask:
     ) -> None:
         self.config, self.held_out = config, held_out
         self.matcher = matcher
-        self._fixed = matcher.encoder if config.with_frozen_stem else None
-        if self._fixed is not None:
-            self._fixed.freeze_early()
+        if config.with_frozen_stem and matcher.encoder is not None:
+            matcher.encoder.freeze_early()
         self._alone = matcher.sky if config.sky_alone else None
         if self._alone is not None:
             matcher.requires_grad_(False)
@@ -64,8 +63,6 @@ class StereoTask:
 
     def _train(self) -> None:
         self.matcher.train()
-        if self._fixed is not None:
-            self._fixed.keep_statistics()
         if self._alone is not None:
             for part in self.matcher.children():
                 part.train(part is self._alone)
@@ -160,10 +157,9 @@ class ViewTask:
         adam = config.generator_adam
         self.optimizers = {"generator": (make_adam(generator.parameters(), adam), adam)}
         if config.discriminator != "none":
-            kinds = {
-                "patch": synthesis.PatchDiscriminator, "pixel": synthesis.PixelDiscriminator
-            }  # fmt: skip
-            discriminator = kinds[config.discriminator](config.discriminator_width)
+            discriminator = synthesis.Discriminator(
+                config.discriminator, config.discriminator_width
+            )
             self.modules["discriminator"] = discriminator.train()
             adam = config.discriminator_adam
             self.optimizers["discriminator"] = (make_adam(discriminator.parameters(), adam), adam)
@@ -172,14 +168,15 @@ class ViewTask:
         """Draw once; the discriminator learns from it, then scores it anew."""
         left, right = 2 * batch.left - 1, 2 * batch.right - 1
         drawn = self.generator(left)
-        l1 = losses.l1_loss(drawn, right)
+        l1 = (drawn - right).abs().mean()  # eq. 2.5
         if self.config.discriminator == "none":
             yield Update("generator", self.config.l1_weight * l1, {"l1": l1.detach()})
             return
         discriminator, mode = self.modules["discriminator"], self.config.gan_mode
-        d_loss = losses.discriminator_loss(
-            discriminator(left, right), discriminator(left, drawn.detach()), mode
-        )
+        real = losses.adversarial_loss(discriminator(left, right), mode, is_real=True)
+        fake = discriminator(left, drawn.detach())
+        # Half the sum of both slows the discriminator (pix2pix).
+        d_loss = (real + losses.adversarial_loss(fake, mode, is_real=False)) / 2
         yield Update("discriminator", d_loss, {})
         adversarial = losses.adversarial_loss(discriminator(left, drawn), mode, is_real=True)
         loss = adversarial + self.config.l1_weight * l1
@@ -236,7 +233,7 @@ class FinetuneTask:
         max_disparity_px = self.matcher.config.max_disparity_px
         found_px = found_px.float()
         loss = losses.disparity_loss(found_px, batch.left_px, max_disparity_px)
-        l1 = losses.l1_loss(2 * drawn, 2 * batch.right)
+        l1 = (2 * drawn - 2 * batch.right).abs().mean()
         facts = {"epe": mean_error_px(found_px, batch.left_px, max_disparity_px), "l1": l1.detach()}
         yield Update("generator", loss + self.config.l1_weight * l1, facts)
 
@@ -313,15 +310,9 @@ class SelectTask:
         self.generator = generator
         if config.with_frozen_stem:
             generator.encoder.freeze_early()
-        self.modules: dict[str, nn.Module] = {"generator": generator}
-        self._train()
+        self.modules: dict[str, nn.Module] = {"generator": generator.train()}
         groups = _groups(generator, generator.encoder, config.encoder_rate)
         self.optimizers = {"generator": (make_adam(groups, config.adam), config.adam)}
-
-    def _train(self) -> None:
-        self.generator.train()
-        if self.config.with_frozen_stem:
-            self.generator.encoder.keep_statistics()
 
     def step(self, batch: SelectionSample) -> Iterator[Update]:
         """One update: predict disparity, warp the right view, compare."""
@@ -385,7 +376,7 @@ class SelectTask:
                 within.append(metrics["d1"])
             if bool(is_true_sky.any()):
                 missed.append(float((~is_sky[is_true_sky]).float().mean()))
-        self._train()
+        self.generator.train()
         numbers = {"abs_rel": errors, "d1": within, "sky_missed": missed}
         means = {f"held_out/{k}": sum(v) / len(v) for k, v in numbers.items() if v}
         return ValidationResult(numbers=means, pictures=pictures)
