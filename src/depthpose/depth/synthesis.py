@@ -255,7 +255,7 @@ class LiteEncoder(nn.Module):
         stem = max(round(_STEM * width), 1)
         self.stem = _ConvNorm(3, stem, 3, 2)
         blocks: list[nn.Module] = []
-        inputs, self._taps, self._frozen, self._keeps_statistics = stem, [], 0, False
+        inputs, self._taps, self._frozen = stem, [], 0
         self.channels: list[int] = []
         stages = _STAGES[: _LAST_AT_STRIDE[levels - 1] + 1]
         for number, (count, kernel, stride, expansion, channels) in enumerate(stages):
@@ -282,22 +282,15 @@ class LiteEncoder(nn.Module):
         return features
 
     def freeze_early(self) -> None:
-        """Freeze the first layers: their ImageNet features (edges, colours) need no training.
-
-        Batch norm uses its stored statistics from here on, whatever the mode: small batches spoil
-        them.
-        """
+        """Freeze the first layers: their ImageNet features (edges, colours) need no training."""
         for part in (self.stem, *self.blocks[: self._frozen]):
             part.requires_grad_(False)
-        self._keeps_statistics = True
 
-    def train(self, mode: bool = True) -> "LiteEncoder":
-        """Set the mode, but for batch norm that keeps its statistics."""
-        super().train(mode)
+    def keep_statistics(self) -> None:
+        """Let batch norm use its stored statistics, whatever the mode: small batches spoil them."""
         for part in self.modules():
-            if self._keeps_statistics and isinstance(part, nn.BatchNorm2d):
+            if isinstance(part, nn.BatchNorm2d):
                 part.eval()
-        return self
 
 
 class _ConvNorm(nn.Sequential):

@@ -48,8 +48,9 @@ class StereoTask:
     ) -> None:
         self.config, self.held_out = config, held_out
         self.matcher = matcher
-        if config.with_frozen_stem and matcher.encoder is not None:
-            matcher.encoder.freeze_early()
+        self._fixed = matcher.encoder if config.with_frozen_stem else None
+        if self._fixed is not None:
+            self._fixed.freeze_early()
         self._alone = matcher.sky if config.sky_alone else None
         if self._alone is not None:
             matcher.requires_grad_(False)
@@ -63,6 +64,8 @@ class StereoTask:
 
     def _train(self) -> None:
         self.matcher.train()
+        if self._fixed is not None:
+            self._fixed.keep_statistics()
         if self._alone is not None:
             for part in self.matcher.children():
                 part.train(part is self._alone)
@@ -310,9 +313,15 @@ class SelectTask:
         self.generator = generator
         if config.with_frozen_stem:
             generator.encoder.freeze_early()
-        self.modules: dict[str, nn.Module] = {"generator": generator.train()}
+        self.modules: dict[str, nn.Module] = {"generator": generator}
+        self._train()
         groups = _groups(generator, generator.encoder, config.encoder_rate)
         self.optimizers = {"generator": (make_adam(groups, config.adam), config.adam)}
+
+    def _train(self) -> None:
+        self.generator.train()
+        if self.config.with_frozen_stem:
+            self.generator.encoder.keep_statistics()
 
     def step(self, batch: SelectionSample) -> Iterator[Update]:
         """One update: predict disparity, warp the right view, compare."""
@@ -376,7 +385,7 @@ class SelectTask:
                 within.append(metrics["d1"])
             if bool(is_true_sky.any()):
                 missed.append(float((~is_sky[is_true_sky]).float().mean()))
-        self.generator.train()
+        self._train()
         numbers = {"abs_rel": errors, "d1": within, "sky_missed": missed}
         means = {f"held_out/{k}": sum(v) / len(v) for k, v in numbers.items() if v}
         return ValidationResult(numbers=means, pictures=pictures)
