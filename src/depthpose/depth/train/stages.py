@@ -5,7 +5,7 @@ The generator that selects learns from pairs and single images, synthetic and re
 """
 
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
 import torch
@@ -97,9 +97,9 @@ class StereoTask:
 
 @torch.no_grad()
 def validate_pairs(
-    matcher: StereoNetwork, held_out: TrainingPairs, draw: Callable[[Tensor], Tensor] | None = None
+    matcher: StereoNetwork, held_out: TrainingPairs, generator: synthesis.Generator | None = None
 ) -> ValidationResult:
-    """Disparity error of a matcher on held-out pairs, or on right views that ``draw`` draws.
+    """Disparity error of a matcher on held-out pairs, or on right views that a generator draws.
 
     What is taken for sky has a disparity of 0.
     """
@@ -107,7 +107,9 @@ def validate_pairs(
     device = next(matcher.parameters()).device
     for index in range(len(held_out)):
         pair = held_out.read(index)
-        right = pair.right if draw is None else draw(pair.left)
+        right = pair.right
+        if generator is not None:
+            right = synthesis.draw_right(generator, pair.left[None].to(device))[0].cpu()
         views = (normalise(view.to(device)) for view in (pair.left, right))
         heads, sky = matcher.forward_with_sky(
             *(pad_top_right(v, matcher.config)[None] for v in views)
@@ -246,12 +248,7 @@ class FinetuneTask:
         if self.held_out is None:
             return ValidationResult()
         self.generator.eval()
-        device = next(self.generator.parameters()).device
-
-        def draw(left: Tensor) -> Tensor:
-            return synthesis.draw_right(self.generator, left[None].to(device))[0].cpu()
-
-        result = validate_pairs(self.matcher, self.held_out, draw)
+        result = validate_pairs(self.matcher, self.held_out, self.generator)
         self.generator.train()
         return result
 
