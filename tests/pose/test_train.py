@@ -12,13 +12,13 @@ import torch.nn.functional as F
 from tests.pose.stopping import StoppedError, stop_after
 from tests.pose.synthetic_objects import bottle, bracket, tiny_weights, write_part
 
+from depthpose.core.checkpoint import read_checkpoint
 from depthpose.core.config import read_config
 from depthpose.core.errors import InputError
 from depthpose.core.loop import AdamConfig, LoopConfig, Run
 from depthpose.core.rigid import Rigid
 from depthpose.pose.config import CloudConfig, MeshConfig, ObjectsConfig, SensorConfig
 from depthpose.pose.datasets import write_bop_models, write_bop_scene
-from depthpose.pose.losses import unit_directions
 from depthpose.pose.network import ResUNet, ResUNetConfig, fold_norms
 from depthpose.pose.sparse import Voxels
 from depthpose.pose.synthetic import Objects, make_frames
@@ -44,7 +44,7 @@ from depthpose.pose.train.poses import keypoint_copies, packed
 from depthpose.pose.types import ObjectModel, PoseEstimate, SeenPoints, Symmetries
 from depthpose.pose.weights import (
     PoseWeights,
-    read_pose_network,
+    network_of,
     read_pose_weights,
     write_pose_weights,
 )
@@ -99,7 +99,7 @@ def test_a_batch_keeps_clouds_apart_and_points_in_their_voxels() -> None:
     batch = TrainingClouds.collate(parts)
     assert batch.class_of.tolist() == [0, 1, 0]
     for number, part in enumerate(parts):
-        own = batch.instance == number
+        own = batch.coordinates[:, 0] == number
         assert torch.equal(batch.points_m[own], part.points_m)
         # Points of one cloud have voxels of their own: none is kept twice.
         assert len(torch.unique(part.coordinates, dim=0)) == len(part.coordinates)
@@ -120,7 +120,8 @@ class _Oracle(ResUNet):
 def _truth_of(batch, models, copy: int) -> torch.Tensor:  # noqa: ANN001
     copies = keypoint_copies(models)[batch.class_of, copy]
     posed = copies @ batch.R.mT + batch.t_m[:, None]
-    return unit_directions(batch.points_m, posed[batch.instance])
+    way = posed[batch.coordinates[:, 0].long()] - batch.points_m[:, None]
+    return torch.nn.functional.normalize(way, dim=-1)
 
 
 @pytest.mark.parametrize("copy", [0, 7])
@@ -280,7 +281,7 @@ def test_a_training_begins_with_what_other_objects_taught(
     parts = ModelsConfig(parts=("bracket", "mug"))
     config = _training(models=parts, start=str(first), adam=still, loop=loop)
     then = train_pose(config, Run(folder=tmp_path / "then"))
-    networks = [read_pose_network(path) for path in (first, then)]
+    networks = [network_of(read_checkpoint(path), str(path)) for path in (first, then)]
     cloud = TrainingClouds(_models(), _VIEWS, None, _CLOUD, seed=1)[0]
     voxels = Voxels.from_points(F.pad(cloud.coordinates, (1, 0)))
     seen = [n.point_features(voxels).detach() for n in networks if isinstance(n, ResUNet)]

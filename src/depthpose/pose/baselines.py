@@ -66,11 +66,6 @@ class PointNetConfig(Settings):
     head: Annotated[tuple[int, int, int], "[1, inf)"] = (512, 256, 128)
     """Channels of a point beside that maximum."""
 
-    @property
-    def outputs(self) -> int:
-        """Channels of the last layer."""
-        return self.classes * self.keypoints * 3
-
 
 EMPTY = -2.0  #: of a pixel without the object: below all that a depth can be, -1 to 1
 
@@ -190,7 +185,7 @@ class PointNet(nn.Module):
         self.turn_features = _Transform(c.local[1])
         self.pooled = _layers((c.local[1], *c.pooled))
         self.head = _layers((c.local[1] + c.pooled[2], *c.head))
-        self.final = nn.Linear(c.head[2], c.outputs)
+        self.final = nn.Linear(c.head[2], c.classes * c.keypoints * 3)
 
     def forward(
         self, points_m: Float[Tensor, "points 3"], cloud: Int[Tensor, " points"]

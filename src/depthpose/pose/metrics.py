@@ -32,11 +32,6 @@ def rotation_error_rad(estimated: Rigid, true: Rigid) -> Float[Tensor, "*batch"]
     return geodesic_rad(estimated.R.double(), true.R.double())
 
 
-def translation_error_m(estimated: Rigid, true: Rigid) -> Float[Tensor, "*batch"]:
-    """Distance between two poses' translations [m]."""
-    return (estimated.t_m.double() - true.t_m.double()).norm(dim=-1)
-
-
 def add_m(estimated: Rigid, true: Rigid, points_m: Float[Tensor, "n 3"]) -> Float[Tensor, "*batch"]:
     """ADD [m]: mean distance of each model point at one pose to itself at the other."""
     return (_moved(estimated, points_m) - _moved(true, points_m)).norm(dim=-1).mean(-1)

@@ -354,15 +354,18 @@ def predict(
 
 
 def instance_jobs(
-    dataset: BopDataset, names: Mapping[int, str], mask_of: Callable[[Instance], Path] | None = None
+    dataset: BopDataset, names: Mapping[int, str], predicted_mask: str | None = None
 ) -> list[Job[ViewInput]]:
-    """Take every annotated instance by the predicted mask that ``mask_of`` names, or its own.
+    """Take every annotated instance by its own mask, or a predicted one: see ``Layout``.
 
     ``names`` are those of the estimator, by the objects' numbers.
     """
 
     def read(instance: Instance) -> ViewInput:
-        mask = None if mask_of is None else read_mask(mask_of(instance))
+        mask = None
+        if predicted_mask is not None:
+            file = predicted_mask.format(object=instance.object_id, image=instance.image_id)
+            mask = read_mask(dataset.folder / file)
         return replace(dataset.view(instance, mask).input, object=names[instance.object_id])
 
     return [

@@ -35,8 +35,8 @@ from depthpose.pose.cloud import (
     unit_advice,
 )
 from depthpose.pose.datasets.layouts import (
+    LAYOUTS,
     Instance,
-    find_layout,
     layout_of,
     model_path,
     models_folder,
@@ -159,7 +159,7 @@ def open_bop(folder: str | Path, split: str = "test") -> BopDataset:
 
 def is_bop(folder: str | Path) -> bool:
     """Whether a folder holds a data set that :func:`open_bop` knows."""
-    return find_layout(Path(folder)) is not None
+    return any(layout.splits(Path(folder)) for layout in LAYOUTS.values())
 
 
 def read_instance_mask(instance: Instance) -> Bool[Tensor, "mask_h mask_w"]:

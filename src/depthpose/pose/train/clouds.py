@@ -64,18 +64,13 @@ class CloudBatch(NamedTuple):
     t_m: Float[Tensor, "clouds 3"]  #: translation
 
     @property
-    def instance(self) -> Int[Tensor, " points"]:
-        """Which cloud each point belongs to."""
-        return self.coordinates[:, 0].long()
-
-    @property
     def seen(self) -> SeenPoints:
         """What the network is shown: everything but the truth."""
         return SeenPoints(
             points_m=self.points_m,
             coordinates=self.coordinates,
             features=self.features,
-            class_of_point=self.class_of[self.instance],
+            class_of_point=self.class_of[self.coordinates[:, 0].long()],
         )
 
 

@@ -11,7 +11,13 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from depthpose.core.checkpoint import bound_facts, file_sha256, find_weights, warn_of_terms
+from depthpose.core.checkpoint import (
+    bound_facts,
+    file_sha256,
+    find_weights,
+    read_checkpoint,
+    warn_of_terms,
+)
 from depthpose.core.config import config_to_dict
 from depthpose.core.errors import InputError
 from depthpose.core.files import write_json
@@ -59,7 +65,7 @@ from depthpose.pose.weights import (
     AnyNetwork,
     DirectionNet,
     PoseWeights,
-    read_pose_network,
+    network_of,
     read_pose_weights,
     write_pose_weights,
 )
@@ -87,9 +93,8 @@ class PoseTask(ViewsTask):
         directions = self.network.directions(batch.seen).float()
         copies = self._copies_m.to(batch.R)[batch.class_of]
         copies_m = copies @ batch.R.mT[:, None] + batch.t_m[:, None, None]
-        loss = direction_loss(
-            directions, batch.points_m, copies_m, batch.instance, self.config.loss
-        )
+        instance = batch.coordinates[:, 0].long()
+        loss = direction_loss(directions, batch.points_m, copies_m, instance, self.config.loss)
         yield Update("network", loss, {"directions": loss.detach()})
 
     def held_out_error(self, view: ViewSample, index: int) -> float:
@@ -312,7 +317,8 @@ def train_pose(config: PoseTraining | DepthImageTraining, run: Run) -> Path:
 
 def _start_from(network: AnyNetwork, start: str, samples: TrainingViews) -> None:
     """Copy weights; of other objects, all but the last layer, except of a depth image's."""
-    found = read_pose_network(find_weights(start))
+    path = find_weights(start)
+    found = network_of(read_checkpoint(path), str(path))
     wanted, given = config_to_dict(network.config), config_to_dict(found.config)
     has_norms = isinstance(network, ResUNet) and network.config.norm == "batch"
     free = ("classes", "norm", "with_bias") if has_norms else ("classes",)
