@@ -191,7 +191,7 @@ def test_frames_and_synthetic_views_mix_and_frames_stay_true(tmp_path: Path) -> 
     assert len(clouds) == 2 * len(real)
     made = Objects(models, _VIEWS, _CLOUD)
     is_made = [
-        torch.allclose(clouds[i].t_m.norm(), made.sample(i).truth.camera_from_model.t_m.norm())
+        torch.allclose(clouds[i].t_m.norm(), made.view(i).truth.camera_from_model.t_m.norm())
         for i in range(30)
     ]
     assert 5 < sum(is_made) < 25
