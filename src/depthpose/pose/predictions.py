@@ -107,22 +107,23 @@ def read_predictions(folder: Path) -> Predictions:
     return found
 
 
-def kept_predictions(folder: Path) -> list[Prediction]:
-    """Read what earlier runs of this folder left; a damaged file is as none, and a notice."""
-    try:
-        return read_predictions(folder) if (folder / POSES).is_file() else []
-    except InputError as error:
-        warnings.warn(f"{error} - it is damaged, and made again", Notice, stacklevel=2)
-        return []
+def kept_predictions(folder: Path) -> dict[str, Prediction]:
+    """Read what earlier runs left in a folder, and in those of the parts of several processes.
 
-
-def known_predictions(folder: Path) -> dict[str, Prediction]:
-    """Read what earlier runs left in a folder, and in those of the parts of several processes."""
-    folders = [folder, *sorted(folder.glob("part-*"))]
-    every = [prediction for one in folders for prediction in kept_predictions(one)]
-    # What was read at last counts, whatever another part said of an earlier try.
-    every.sort(key=lambda prediction: prediction.estimate.status != "unreadable")
-    return {prediction.estimate.name: prediction for prediction in every}
+    By the names of estimates. A damaged file is as none, and a notice.
+    """
+    found: dict[str, Prediction] = {}
+    for home in (folder, *sorted(folder.glob("part-*"))):
+        try:
+            every = read_predictions(home) if (home / POSES).is_file() else []
+        except InputError as error:
+            warnings.warn(f"{error} - it is damaged, and made again", Notice, stacklevel=2)
+            continue
+        for one in every:
+            # What was read at last counts, whatever another part said of an earlier try.
+            if one.estimate.status != "unreadable" or one.estimate.name not in found:
+                found[one.estimate.name] = one
+    return found
 
 
 def score_of(estimate: PoseEstimate) -> float:
@@ -319,7 +320,7 @@ def predict(
     """
     claim_folder(folder, settings, [POSES])
     wanted = list(jobs)
-    done = {p.estimate.name: p for p in kept_predictions(folder)}
+    done = kept_predictions(folder)
     finished = {name for name, made in done.items() if made.estimate.status != "unreadable"}
     yield from (done[job.name] for job in wanted if job.name in finished)
     left = [job for job in wanted if job.name not in finished]

@@ -39,7 +39,6 @@ from depthpose.pose.datasets.layouts import (
     Instance,
     layout_of,
     model_path,
-    models_folder,
     object_name,
     read_bop_models,
     read_models_info,
@@ -115,7 +114,7 @@ class BopDataset:
         Raises:
             InputError: none is left.
         """
-        infos = read_models_info(models_folder(self.folder))
+        _, infos = read_models_info(self.folder)
         there = sorted({instance.object_id for instance in self.instances})
         names = {number: object_name(number, infos.get(number, {})) for number in there}
         digits = (o for o in objects if isinstance(o, str) and o.isdecimal())
@@ -230,8 +229,7 @@ def _check_models(folder: Path, numbers: set[int], found: list[Problem]) -> dict
     """Read the models that can be read; what is wrong with them goes to ``found``."""
     models: dict[int, ObjectModel] = {}
     try:
-        home = models_folder(folder)
-        infos = read_models_info(home)
+        home, infos = read_models_info(folder)
     except InputError as error:
         found.append(Problem(path=folder, kind="missing", message=str(error)))
         return models

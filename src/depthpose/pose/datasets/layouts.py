@@ -334,16 +334,17 @@ def layout_of(folder: Path) -> tuple[str, Layout]:
 _MODEL_FOLDERS = ("models", "models_eval", "models_points")
 
 
-def models_folder(folder: Path) -> Path:
-    """Find the folder of models of a data set."""
-    found = next((folder / name for name in _MODEL_FOLDERS if (folder / name).is_dir()), None)
-    if found is None:
+def read_models_info(folder: Path) -> tuple[Path, dict[int, dict[str, Any]]]:
+    """Find a data set's folder of models, and read what it says of each object, by number.
+
+    Nothing is said where there is neither ``models_info.json`` nor ``.yml``.
+
+    Raises:
+        InputError: there is no such folder, or the file is damaged.
+    """
+    home = next((folder / name for name in _MODEL_FOLDERS if (folder / name).is_dir()), None)
+    if home is None:
         raise InputError(f"{folder}: no folder {' or '.join(_MODEL_FOLDERS)}; put the meshes there")
-    return found
-
-
-def read_models_info(home: Path) -> dict[int, dict[str, Any]]:
-    """Read ``models_info.json`` or ``.yml`` by number of object; nothing where there is neither."""
     files = (home / "models_info.json", home / "models_info.yml")
     content = next((read_mapping(path) for path in files if path.is_file()), {})
     wrong = [k for k, v in content.items() if entry_number(k) is None or not isinstance(v, dict)]
@@ -351,7 +352,7 @@ def read_models_info(home: Path) -> dict[int, dict[str, Any]]:
         raise InputError(
             f"{home}: models_info entry {str(wrong[0])[:80]!r} is no object's; correct it"
         )
-    return {int(key): entry for key, entry in content.items()}
+    return home, {int(key): entry for key, entry in content.items()}
 
 
 def model_path(home: Path, number: int) -> Path | None:
@@ -368,8 +369,8 @@ def read_bop_models(
     The diameter is the declared one, where there is one: published numbers are shares of it. The
     two symmetric objects of Linemod_preprocessed, which declares none, get theirs.
     """
-    home = models_folder(folder)
-    infos, (_, layout) = read_models_info(home), layout_of(folder)
+    home, infos = read_models_info(folder)
+    _, layout = layout_of(folder)
     models: dict[int, ObjectModel] = {}
     for wanted in sorted(set(numbers)):
         path = model_path(home, wanted)
@@ -400,7 +401,7 @@ def object_names(folder: Path) -> dict[int, str]:
     Raises:
         InputError: there is no folder of models, or the file is damaged.
     """
-    infos = read_models_info(models_folder(folder))
+    _, infos = read_models_info(folder)
     return {number: object_name(number, info) for number, info in infos.items()}
 
 

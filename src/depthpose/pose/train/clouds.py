@@ -17,7 +17,7 @@ from depthpose.pose.baselines import DepthImageNet
 from depthpose.pose.cloud import lift_sample, refusal_of, sample_points, voxelise
 from depthpose.pose.config import CloudConfig, ObjectsConfig
 from depthpose.pose.datasets import open_bop
-from depthpose.pose.datasets.layouts import models_folder, read_bop_models, read_models_info
+from depthpose.pose.datasets.layouts import read_bop_models, read_models_info
 from depthpose.pose.estimator import DepthImageRegressor, GeoPoseNet
 from depthpose.pose.mesh import (
     read_model,
@@ -214,9 +214,9 @@ def read_models(
     if config.bop:
         folder, numbers = Path(config.bop), config.objects
         if not numbers:
-            home = models_folder(folder)
+            home, infos = read_models_info(folder)
             files = [path.stem.removeprefix("obj_") for path in home.glob("obj_*.ply")]
-            there = {int(name) for name in files if name.isdigit()} | set(read_models_info(home))
+            there = {int(name) for name in files if name.isdigit()} | set(infos)
             numbers = tuple(sorted(there))
             if not numbers:
                 raise InputError(f"{home}: holds no obj_NNNNNN.ply; put the models there")

@@ -219,7 +219,10 @@ class DepthImageTask(ViewsTask):
     ) -> None:
         super().__init__(network, models, config)
         self.network, self.config = network, config
-        self._points_m = surface_points(models, config.surface_points)
+        # Points of each surface; those of a sparse model of points come again.
+        count = config.surface_points
+        every = [sample_surface(model, count)[0] for model in models]
+        self._points_m = torch.stack([some[torch.arange(count) % len(some)] for some in every])
         self._copies = symmetric_copies(models, _IMAGE_SYMMETRY_STEP).float()
         self._diameter_m = torch.tensor([model.diameter_m for model in models])
 
@@ -245,12 +248,6 @@ class DepthImageTask(ViewsTask):
         return add_error(
             Rigid(found.R[0].cpu(), found.t_m[0].cpu()), view.truth.camera_from_model, model
         )
-
-
-def surface_points(models: Sequence[ObjectModel], count: int) -> Float[Tensor, "classes n 3"]:
-    """Points of each object's surface; those of a sparse model of points come again."""
-    every = [sample_surface(model, count)[0] for model in models]
-    return torch.stack([points[torch.arange(count) % len(points)] for points in every])
 
 
 _STATISTICS_CLOUDS = 64  # from which statistics of batch norm, lost by folding, are computed anew
