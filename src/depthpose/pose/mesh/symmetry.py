@@ -1,13 +1,13 @@
 """Symmetries found in a shape, near-symmetries, and how far it is from its mirror image."""
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from hashlib import sha256
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -70,12 +70,12 @@ _FOLLOWED = 15  # steps of ICP
 _MOST_AXES = 40  # a cube has 13 axes, an icosahedron 31
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class SymmetryProposal:
-    """One way in which an object may look alike."""
+class SymmetryProposal(NamedTuple):
+    """One way in which an object may look alike, in numbers that JSON holds."""
 
     kind: str  #: ``discrete`` or ``continuous``
-    axis: Axis  #: what to turn about
+    direction: Sequence[float]  #: unit vector of the axis to turn about
+    point_m: Sequence[float]  #: a point that the axis goes through
     angle_rad: float | None  #: by how much; nothing for a continuous symmetry
     #: distance of the turned surface from the surface, in diameters: the largest but for 2 % of the
     #: points, and for ``continuous`` over all turns.
@@ -146,12 +146,13 @@ def propose_symmetries(model: ObjectModel, tolerance: float = 0.02) -> list[Symm
     surface = SurfaceDeviation(model)
     limit = 2 * tolerance
     found: list[SymmetryProposal] = []
-    tried: list[Tensor] = []
+    tried, revolved = list[Tensor](), list[Tensor]()  # axes, and those of revolution
     for start in promising_turns(surface):
-        revolved = [p.axis.direction for p in found if p.kind == "continuous"]
         if len(revolved) >= 2 or len(tried) >= _MOST_AXES:
             break
-        if _is_known(_axis_of(start), tried, revolved):
+        # The direction that a rotation leaves alone; well defined for half turns too.
+        direction = torch.linalg.svd(start - _EYE).Vh[-1]
+        if _is_known(direction, tried, revolved):
             continue
         R = start
         weight = torch.ones(2 * len(surface.many), dtype=torch.float64)
@@ -161,10 +162,12 @@ def propose_symmetries(model: ObjectModel, tolerance: float = 0.02) -> list[Symm
             # With each point its mirror image through the centre, the fit cannot shift.
             pairs = (torch.cat([surface.many, -surface.many]), torch.cat([target, -target]))
             R = fit_rigid(*pairs, weight).R
-        direction = _axis_of(R)
+        direction = torch.linalg.svd(R - _EYE).Vh[-1]
         if not _is_known(direction, tried, revolved):
             tried.append(direction)
-            found += _measure(surface, direction, limit, tolerance)
+            measured = _measure(surface, direction, limit, tolerance)
+            revolved += [direction for p in measured if p.kind == "continuous"]
+            found += measured
     return sorted(found, key=lambda p: (p.kind != "continuous", -p.certainty))
 
 
@@ -174,13 +177,20 @@ def symmetries_from_proposals(proposals: list[SymmetryProposal]) -> Symmetries:
     Without an axis the turns are completed to a group: two symmetries one after the other are one.
     """
     sure = [p for p in proposals if p.certainty >= SURE]
-    axes = tuple(p.axis for p in sure if p.kind == "continuous")
+    lines = [
+        Axis(
+            direction=torch.tensor(p.direction, dtype=torch.float64),
+            point_m=torch.tensor(p.point_m, dtype=torch.float64),
+        )
+        for p in sure
+    ]
+    axes = tuple(line for line, p in zip(lines, sure, strict=True) if p.kind == "continuous")
     kept: list[Rigid] = []
-    for proposal in sure:
+    for line, proposal in zip(lines, sure, strict=True):
         if proposal.angle_rad is None:
             continue
-        turn = turn_about(proposal.axis.direction, proposal.axis.point_m,
-                          torch.tensor(proposal.angle_rad, dtype=torch.float64))  # fmt: skip
+        angle_rad = torch.tensor(proposal.angle_rad, dtype=torch.float64)
+        turn = turn_about(line.direction, line.point_m, angle_rad)
         # A turn about an axis makes it one of those kept where both move the axis alike.
         is_known = any(
             float(geodesic_rad(turn.R, other.R)) < _SAME_RAD
@@ -222,21 +232,8 @@ def with_found_symmetries(
     declared = model.symmetries
     if not (is_taken or on_message) or declared.discrete is not None or declared.continuous:
         return model
-    proposals = [
-        SymmetryProposal(
-            kind=kind,
-            axis=Axis(
-                direction=torch.tensor(direction, dtype=torch.float64),
-                point_m=torch.tensor(point_m, dtype=torch.float64),
-            ),
-            angle_rad=angle_rad,
-            deviation=deviation,
-            certainty=certainty,
-        )
-        for kind, direction, point_m, angle_rad, deviation, certainty in kept(
-            model, _proposal_rows, "symmetries", tolerance
-        )
-    ]
+    rows = kept(model, propose_symmetries, "symmetries", tolerance)
+    proposals = [SymmetryProposal(*row) for row in rows]
     found = replace(symmetries_from_proposals(proposals), is_found=True)
     if found.discrete is None and not found.continuous:
         return model
@@ -253,14 +250,6 @@ def with_found_symmetries(
             )
         )
     return replace(model, symmetries=found) if is_taken else model
-
-
-def _proposal_rows(model: ObjectModel, tolerance: float) -> list[Any]:
-    return [
-        (p.kind, p.axis.direction.tolist(), p.axis.point_m.tolist(), p.angle_rad, p.deviation,
-         p.certainty)
-        for p in propose_symmetries(model, tolerance)
-    ]  # fmt: skip
 
 
 def _turns(direction: Float[Tensor, "3"], angles: Float[Tensor, " a"]) -> Float[Tensor, "a 3 3"]:
@@ -309,19 +298,14 @@ def _measure(
     return [
         SymmetryProposal(
             kind="continuous" if angle is None else "discrete",
-            axis=Axis(direction=direction, point_m=surface.centre_m),
+            direction=direction.tolist(),
+            point_m=surface.centre_m.tolist(),
             angle_rad=angle,
             deviation=value,
             certainty=1 / (1 + (value / tolerance) ** 2),
         )
         for angle, value in (*full, *turns)
     ]
-
-
-def _axis_of(R: Float[Tensor, "3 3"]) -> Float[Tensor, "3"]:
-    """The direction that a rotation leaves alone; well defined for half turns too."""
-    _, _, vh = torch.linalg.svd(R - torch.eye(3, dtype=R.dtype))
-    return vh[-1]
 
 
 MIRROR_ALIKE = 0.03

@@ -183,14 +183,8 @@ class CropSample(NamedTuple):
     t_m: Float[Tensor, "*b 3"]
 
 
-class TrainingCrops(TrainingViews):
+class TrainingCrops(TrainingViews[DepthImageTraining]):
     """A crop of a view, synthetic or of a frame, by sample index."""
-
-    def __init__(
-        self, models: Sequence[ObjectModel], config: DepthImageTraining, seed: int
-    ) -> None:
-        super().__init__(models, config.objects, config.frames, config.cloud, seed)
-        self.config = config.network
 
     def __getitem__(self, index: int) -> CropSample:
         """Make the sample of an index; one with too few pixels is replaced by another."""
@@ -199,12 +193,12 @@ class TrainingCrops(TrainingViews):
             place = index + attempt * len(self.models) * 2**32
             view, _ = self._view(place, sample_generator(place, self.seed))
             number = self._class_of[view.input.object]
-            crop = cut_depth(view.input, self.config, self.models[number].diameter_m)
+            crop = cut_depth(view.input, self.config.network, self.models[number].diameter_m)
             if crop is not None:
                 pose = view.truth.camera_from_model
                 return CropSample(crop, torch.tensor(number), pose.R.float(), pose.t_m.float())
         raise InputError(
-            f"{TRIES} views in a row have fewer than {self.config.min_points} masked "
+            f"{TRIES} views in a row have fewer than {self.config.network.min_points} masked "
             "pixels with a depth; bring the camera nearer (distance_m), or lower min_points"
         )
 
@@ -272,14 +266,7 @@ def train_pose(config: PoseTraining | DepthImageTraining, run: Run) -> Path:
         network = DepthImageNet(config.network)
         task = DepthImageTask(network, models, config)
     else:
-        samples = TrainingClouds(
-            models,
-            config.objects,
-            config.frames,
-            config.cloud,
-            config.loop.seed,
-            first_alone=config.first_alone,
-        )
+        samples = TrainingClouds(models, config, config.loop.seed)
         if config.loop.workers > 1 and (config.frames is None or config.frames.share < 1):
             samples.synthetic.draw_stored(config.loop.workers)
         if isinstance(config.network, PointNetConfig):
@@ -312,7 +299,7 @@ def train_pose(config: PoseTraining | DepthImageTraining, run: Run) -> Path:
     return path
 
 
-def _start_from(network: AnyNetwork, start: str, samples: TrainingViews) -> None:
+def _start_from(network: AnyNetwork, start: str, samples: TrainingViews[Any]) -> None:
     """Copy weights; of other objects, all but the last layer, except of a depth image's."""
     path = find_weights(start)
     found = network_of(read_checkpoint(path), str(path))
