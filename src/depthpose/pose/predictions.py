@@ -361,18 +361,25 @@ def instance_jobs(
 
     ``names`` are those of the estimator, by the objects' numbers.
     """
-
-    def read(instance: Instance) -> ViewInput:
-        mask = None
+    jobs: list[Job[ViewInput]] = []
+    for instance in dataset.instances:
+        mask, object = None, names[instance.object_id]
         if predicted_mask is not None:
             file = predicted_mask.format(object=instance.object_id, image=instance.image_id)
-            mask = read_mask(dataset.folder / file)
-        return replace(dataset.view(instance, mask).input, object=names[instance.object_id])
+            mask = dataset.folder / file
+        read = partial(_read_view, dataset, instance, instance.name, object, mask)
+        jobs.append(Job(name=instance.name, read=read, place=place_of(instance)))
+    return jobs
 
-    return [
-        Job(name=instance.name, read=partial(read, instance), place=place_of(instance))
-        for instance in dataset.instances
-    ]
+
+def _read_view(
+    dataset: BopDataset, instance: Instance, name: str, object: str, mask: Path | Detection | None
+) -> ViewInput:
+    """Read the view of an instance by the mask of a file or a detection; None: its own."""
+    pixels = mask.mask if isinstance(mask, Detection) else None
+    if isinstance(mask, Path):
+        pixels = read_mask(mask)
+    return replace(dataset.view(instance, pixels).input, name=name, object=object)
 
 
 def detection_jobs(
@@ -405,22 +412,13 @@ def detection_jobs(
         )
     sharing = Counter(place[:2] for place, _, _ in kept)
 
-    def read(instance: Instance, name: str, one: Detection) -> ViewInput:
-        view = dataset.view(instance, one.mask).input
-        return replace(view, name=name, object=names[instance.object_id])
-
     jobs: list[Job[ViewInput]] = []
     for place, k, one in sorted(kept, key=lambda item: item[:2]):
         name = f"{place.scene_id:06d}_{place.image_id:06d}_object{place.object_id}_{k}"
         seconds = {} if one.seconds is None else {"segmentation": one.seconds / sharing[place[:2]]}
-        jobs.append(
-            Job(
-                name=name,
-                read=partial(read, shown[place][0], name, one),
-                place=place,
-                seconds=seconds,
-            )
-        )
+        instance, object = shown[place][0], names[place.object_id]
+        read = partial(_read_view, dataset, instance, name, object, one)
+        jobs.append(Job(name=name, read=read, place=place, seconds=seconds))
     return jobs
 
 

@@ -40,6 +40,7 @@ from depthpose.pose.datasets.layouts import (
     layout_of,
     model_path,
     object_name,
+    object_names,
     read_bop_models,
     read_models_info,
 )
@@ -114,9 +115,8 @@ class BopDataset:
         Raises:
             InputError: none is left.
         """
-        _, infos = read_models_info(self.folder)
         there = sorted({instance.object_id for instance in self.instances})
-        names = {number: object_name(number, infos.get(number, {})) for number in there}
+        names = object_names(self.folder, there)
         digits = (o for o in objects if isinstance(o, str) and o.isdecimal())
         wanted = {*objects, *(int(o) for o in digits if o not in names.values())}
         kept = [i for i in self.instances if {i.object_id, names[i.object_id]} & wanted]

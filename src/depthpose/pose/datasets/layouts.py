@@ -395,14 +395,14 @@ def read_bop_models(
     return models
 
 
-def object_names(folder: Path) -> dict[int, str]:
-    """Say what samples call each object that ``models_info`` lists.
+def object_names(folder: Path, numbers: Iterable[int] | None = None) -> dict[int, str]:
+    """Say what samples call objects, by number; None: all that ``models_info`` lists.
 
     Raises:
         InputError: there is no folder of models, or the file is damaged.
     """
     _, infos = read_models_info(folder)
-    return {number: object_name(number, info) for number, info in infos.items()}
+    return {k: object_name(k, infos.get(k, {})) for k in (infos if numbers is None else numbers)}
 
 
 def object_name(number: int, info: dict[str, Any]) -> str:

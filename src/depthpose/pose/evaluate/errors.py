@@ -4,7 +4,7 @@ import math
 from collections import defaultdict
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cached_property, lru_cache
+from functools import lru_cache
 
 import numpy as np
 import torch
@@ -17,7 +17,7 @@ from depthpose.core.files import image_size, read_depth_png
 from depthpose.core.render import rasterize
 from depthpose.core.rigid import Rigid
 from depthpose.pose.datasets import BopDataset, Instance
-from depthpose.pose.mesh import drawn_triangles, symmetry_transforms, turn_about
+from depthpose.pose.mesh import turn_about
 from depthpose.pose.metrics import (
     BOP_PIXELS,
     BOP_SHARES,
@@ -46,16 +46,8 @@ class ErrorContext:
     diameter_m: float  #: of the table that was asked for
     is_adds: bool  #: whether ADD-S decides a success
     vsd_delta_m: float | None  #: see ``EvaluationConfig``; None: VSD is not measured
-
-    @cached_property
-    def symmetries(self) -> Rigid:
-        """Motions of the model that leave it as it is, the identity first."""
-        return symmetry_transforms(self.model.symmetries)
-
-    @cached_property
-    def triangles_m(self) -> Float[Tensor, "f 3 3"]:
-        """What of the model VSD draws; a model of points is drawn as discs."""
-        return drawn_triangles(self.model).double()
+    symmetries: Rigid  #: motions of the model that leave it as it is, the identity first
+    triangles_m: Float[Tensor, "f 3 3"]  #: what VSD draws; a model of points is drawn as discs
 
 
 Errors = Float[Tensor, " n"]  #: one number, or several whose mean a row shows (VSD: one a tau)

@@ -23,6 +23,7 @@ from depthpose.pose.evaluate.errors import (
     match,
     measure,
 )
+from depthpose.pose.mesh import drawn_triangles, symmetry_transforms
 from depthpose.pose.metrics import SUCCESS_SHARE
 from depthpose.pose.predictions import (
     STAGES,
@@ -287,6 +288,8 @@ def error_context(model: ObjectModel, config: EvaluationConfig) -> ErrorContext:
         diameter_m=diameter_m,
         is_adds=config.adds == "all" or not model.symmetries.is_none,
         vsd_delta_m=config.vsd_delta_m if config.with_vsd else None,
+        symmetries=symmetry_transforms(model.symmetries),
+        triangles_m=drawn_triangles(model).double(),
     )
 
 

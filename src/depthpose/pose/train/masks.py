@@ -26,9 +26,8 @@ from depthpose.core.loop import (
     write_card,
 )
 from depthpose.core.run import find_rank
-from depthpose.pose.datasets import Instance, open_bop
+from depthpose.pose.datasets import Instance, object_names, open_bop
 from depthpose.pose.datasets.dataset import read_instance_mask
-from depthpose.pose.datasets.layouts import object_name, read_models_info
 from depthpose.pose.losses import mask_loss
 from depthpose.pose.segmentation import (
     ENCODER_KIND,
@@ -74,8 +73,7 @@ class AnnotatedImages:
                     f"{config.folder}: shows none of the objects {list(config.objects)}; it has "
                     f"{there}"
                 )
-            _, infos = read_models_info(Path(config.folder))
-            objects = {number: object_name(number, infos.get(number, {})) for number in wanted}
+            objects = object_names(Path(config.folder), wanted)
         self.objects = objects  # names by number, in the order of the classes
         self._class_of = {number: k for k, number in enumerate(objects, 1)}
         self._images = list(images.values())
