@@ -175,7 +175,7 @@ METRICS = {  # i: the instance, c: its context
         measure=lambda pose, i, c: (
             nearest_copy(pose, i.camera_from_model, c.symmetries, c.model.symmetries).t_m.double()
             - pose.t_m.double()
-        ).norm(),
+        ).norm(dim=-1),
         has_median=True,
     ),
     "vsd": Metric(
