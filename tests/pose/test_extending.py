@@ -24,8 +24,7 @@ from depthpose.pose.datasets.layouts import bop_instances
 from depthpose.pose.evaluate import METRICS, Metric
 from depthpose.pose.evaluate.errors import ErrorContext
 from depthpose.pose.losses import POINT_LOSSES, direction_loss
-from depthpose.pose.mesh import mesh_suffixes, read_model
-from depthpose.pose.mesh.files import MESH_READERS
+from depthpose.pose.mesh import MESH_READERS, read_model
 from depthpose.pose.predictions import write_bop_results
 from depthpose.pose.train import PoseTraining
 from depthpose.web.answer import KINDS
@@ -67,7 +66,6 @@ def test_extending_meshes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> No
         read_model(path, "m")
     monkeypatch.setitem(MESH_READERS, ".corners", read_json_mesh)
     read = read_model(path, "m")
-    assert ".corners" in mesh_suffixes()
     assert read.diameter_m == pytest.approx(model.diameter_m)
     assert len(read.faces) == len(model.faces)
 
@@ -142,4 +140,4 @@ def test_extending_losses(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def test_the_page_takes_every_cloud_and_mesh() -> None:
     assert KINDS["cloud"][1] == cloud_suffixes()
-    assert KINDS["cad"][1] == mesh_suffixes()
+    assert KINDS["cad"][1] == tuple(MESH_READERS)

@@ -15,7 +15,7 @@ from depthpose.core.errors import InputError
 from depthpose.core.files.images import opened_image, read_numbers, value_range
 from depthpose.pose.cloud import frame_advice, unit_advice
 from depthpose.pose.datasets import mask_from_rle
-from depthpose.pose.mesh import exact_diameter, mesh_suffixes, read_geometry
+from depthpose.pose.mesh import MESH_READERS, exact_diameter, read_geometry
 
 Size = tuple[int, int]
 
@@ -86,7 +86,7 @@ def _read(path: Path, size: Size | None) -> FileFacts:
         return _read_words(path, size)
     if suffix in files.MAP_SUFFIXES:
         return _of_map(path)
-    if suffix in mesh_suffixes():
+    if suffix in MESH_READERS:
         vertices, faces = read_geometry(path)
         points = torch.from_numpy(vertices)
         if not len(faces):

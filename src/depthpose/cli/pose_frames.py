@@ -61,7 +61,7 @@ def find_all(method: PoseMethod, inputs: OneObjectOptions, out: Path) -> int:
     facts = pose_predict.camera_facts(lens) | ({} if unit is None else {"unit": unit})
     settings = {**method.settings, "find": sorted(objects), **facts}
     pose_predict.claim(out, settings, jobs, pose_predict.is_result_of)
-    left = [p for p in kept_predictions(out) if p.estimate.status != "unreadable"]
+    left = [p for p in kept_predictions(out).values() if p.estimate.status != "unreadable"]
     results: list[tuple[Prediction, Job[Any]]] = []
     for job in tqdm(jobs, disable=None, unit=" images"):
         own = [p for p in left if pose_predict.is_result_of(p.estimate.name, job.name)]
@@ -163,7 +163,7 @@ def _finish(
     They are written where the work is interrupted, too; what an earlier run found of frames that
     this one did not reach stays in the file.
     """
-    left = kept_predictions(out)
+    left = list(kept_predictions(out).values())
     predictions: list[Prediction] = []
     try:
         for one in coming:

@@ -62,7 +62,7 @@ from depthpose.pose.predictions import (
     POSES,
     Job,
     Prediction,
-    known_predictions,
+    kept_predictions,
     predict,
     prediction_row,
     results_name,
@@ -101,7 +101,7 @@ def claim(
         (out / POSES).unlink(missing_ok=True)
 
     def is_finished(name: str) -> bool:
-        made = known_predictions(out).values()
+        made = kept_predictions(out).values()
         done = [p.estimate.name for p in made if p.estimate.status != "unreadable"]
         return any(is_result(one, name) for one in done)
 
@@ -328,7 +328,7 @@ def predict_all(
     """
     process = run.find_rank()
     home = out if process.world == 1 else out / f"part-{process.rank}"
-    known = known_predictions(out)
+    known = kept_predictions(out)
     done = {name for name, made in known.items() if made.estimate.status != "unreadable"}
     left = [job for job in jobs[process.rank :: process.world] if job.name not in done]
     if left:
@@ -343,11 +343,11 @@ def predict_all(
         def is_there(name: str) -> bool:
             # Files of all parts are read for all names at once, every second.
             if name not in seen["names"] and time.monotonic() - seen["at"] > 1:
-                seen["names"], seen["at"] = set(known_predictions(out)), time.monotonic()
+                seen["names"], seen["at"] = set(kept_predictions(out)), time.monotonic()
             return name in seen["names"]
 
         run.wait_for([job.name for job in jobs], is_there)
-        known = known_predictions(out)
+        known = kept_predictions(out)
     predictions = [known.pop(job.name) for job in jobs]
     # Inputs of earlier runs stay in the file.
     write_predictions(out, [*known.values(), *predictions])

@@ -13,7 +13,7 @@ from depthpose.core.errors import InputError
 from depthpose.core.files import DEPTH_SUFFIXES, cloud_suffixes, image_size, write_json
 from depthpose.core.files.disk import write_bytes
 from depthpose.core.files.images import LISTED_SUFFIXES
-from depthpose.pose.mesh import mesh_suffixes
+from depthpose.pose.mesh import MESH_READERS
 from depthpose.report.page import Scale, Scene
 
 
@@ -56,7 +56,7 @@ KINDS: dict[str, tuple[str, tuple[str, ...]]] = {
     "mask": ("a mask", LISTED_SUFFIXES),
     "camera": ("a camera file", CAMERA_SUFFIXES),
     "cloud": ("a point cloud", cloud_suffixes()),
-    "cad": ("a model file", mesh_suffixes()),
+    "cad": ("a model file", tuple(MESH_READERS)),
 }
 """What each field of the forms takes."""
 
