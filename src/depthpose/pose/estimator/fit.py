@@ -40,7 +40,6 @@ from depthpose.pose.types import (
     Fit,
     Identity,
     PoseEstimate,
-    Status,
     Symmetries,
     ViewInput,
     Vote,
@@ -542,19 +541,17 @@ def answer_of(
         for k in shares.argsort(descending=True, stable=True).tolist()[1:]
         if float(shares[k]) >= _NAMED
     )
-    certainty = float(shares[number])
-    status, words = status_of(certainty, len(alternatives), config.min_certainty)
     # Worked out in float64, given as points and models come: in float32.
-    return PoseEstimate(
-        status=status,
-        reason=words,
+    answer = PoseEstimate(
+        status="ok",
         camera_from_model=pose.float(),
         covariance=covariance.float(),
         free_motions=free.float(),
-        certainty=certainty,
+        certainty=float(shares[number]),
         alternatives=alternatives,
         **facts,
     )
+    return with_status(answer, config.min_certainty)
 
 
 def share_out(
@@ -568,23 +565,19 @@ def share_out(
     return torch.tensor(odds, dtype=torch.float64).softmax(0)
 
 
-def status_of(certainty: float, others: int, min_certainty: float) -> tuple[Status, str]:
-    """Say that a pose is ambiguous where its certainty is below the limit, and else ok."""
-    if certainty >= min_certainty:
-        return "ok", ""
-    return "ambiguous", (
-        f"this pose has a certainty of {certainty:.0%}, below min_certainty {min_certainty:.0%}: "
-        + (f"{others} others fit too" if others else "others may fit")
-    )
-
-
 def with_status(answer: PoseEstimate, min_certainty: float) -> PoseEstimate:
-    """Say anew, by another limit, whether a pose is ambiguous or ok."""
+    """Say that a pose is ambiguous where its certainty is below the limit, and else ok."""
     if answer.camera_from_model is None:
         return answer
     certainty = 1.0 if answer.certainty is None else answer.certainty
-    status, reason = status_of(certainty, len(answer.alternatives), min_certainty)
-    return replace(answer, status=status, reason=reason)
+    if certainty >= min_certainty:
+        return replace(answer, status="ok", reason="")
+    others = len(answer.alternatives)
+    reason = (
+        f"this pose has a certainty of {certainty:.0%}, below min_certainty {min_certainty:.0%}: "
+        + (f"{others} others fit too" if others else "others may fit")
+    )
+    return replace(answer, status="ambiguous", reason=reason)
 
 
 def misfit_of(fit: Fit, limits: RefusalConfig) -> Refusal | None:

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import torch
-from jaxtyping import Bool, Float32, Float64, Int32, Int64
+from jaxtyping import Float32, Float64, Int32, Int64
 from torch import Tensor
 from torch.nn.functional import normalize
 
@@ -146,7 +146,6 @@ def propose_poses(
     points_m: Float64[Tensor, "n 3"],
     normals: Float64[Tensor, "n 3"],
     table: PairTable,
-    surface: Surface,
     count: int,
     generator: torch.Generator,
 ) -> Rigid:
@@ -156,7 +155,6 @@ def propose_poses(
         points_m: of the cloud, about 0.05 diameters apart, in the camera frame.
         normals: theirs, toward the camera.
         table: pairs of the model.
-        surface: of the same model.
         count: how many poses at most.
         generator: chooses the reference points.
     """
@@ -164,7 +162,7 @@ def propose_poses(
     points_m, normals = points_m[chosen[:_SCENE]], normals[chosen[:_SCENE]]
     references = torch.arange(min(_REFERENCES, len(points_m)))
     poses, _ = vote_poses(points_m, normals, references, table, _PEAKS)
-    scores = _scores(points_m, normals, poses, surface)
+    scores = _scores(points_m, normals, poses, table.surface)
     best = scores.argsort(descending=True, stable=True)[:count]
     return poses[best]
 
@@ -172,26 +170,23 @@ def propose_poses(
 def _seen_from_outside(
     surface: Surface,
 ) -> tuple[Float64[Tensor, "n 3"], Float64[Tensor, "n 3"]]:
-    """Give the points that a camera can see, with normals toward it; thin sheets have both."""
+    """Give the points that a camera far off sees, with normals toward it; thin sheets have both."""
     half = fibonacci_directions(_VIEWS // 2).double()
     directions = torch.cat([half, -half])
-    seen = torch.stack([_is_seen(surface, toward) for toward in directions])
-    cosine = directions @ surface.normals.T
+    every = []
+    for toward in directions:
+        across = torch.linalg.svd(toward[None]).Vh[1:]
+        cells = ((surface.points_m @ across.T) / surface.diameter_m * _CELLS).floor().long()
+        column, row = (cells - cells.amin(0)).unbind(-1)
+        width = int(row.max()) + 1
+        place, depth_m = column * width + row, surface.points_m @ toward
+        nearest_m = torch.full(((int(column.max()) + 1) * width,), -torch.inf, dtype=torch.float64)
+        nearest_m.scatter_reduce_(0, place, depth_m, "amax")
+        every.append(depth_m > nearest_m[place] - surface.diameter_m / _CELLS)
+    seen, cosine = torch.stack(every), directions @ surface.normals.T
     front, back = ((seen & (sign * cosine > _FACING)).any(0) for sign in (1, -1))
     points_m = torch.cat([surface.points_m[front], surface.points_m[back]])
     return points_m, torch.cat([surface.normals[front], -surface.normals[back]])
-
-
-def _is_seen(surface: Surface, toward: Float64[Tensor, "3"]) -> Bool[Tensor, " m"]:
-    """Mark the points that nothing hides from a camera far off in a direction."""
-    across = torch.linalg.svd(toward[None]).Vh[1:]
-    cells = ((surface.points_m @ across.T) / surface.diameter_m * _CELLS).floor().long()
-    column, row = (cells - cells.amin(0) + 1).unbind(-1)
-    width = int(row.max()) + 2
-    place, depth_m = column * width + row, surface.points_m @ toward
-    nearest_m = torch.full(((int(column.max()) + 2) * width,), -torch.inf, dtype=torch.float64)
-    nearest_m.scatter_reduce_(0, place, depth_m, "amax")
-    return depth_m > nearest_m[place] - surface.diameter_m / _CELLS
 
 
 def _frames(normals: Float64[Tensor, "n 3"]) -> Float64[Tensor, "n 3 3"]:
@@ -227,14 +222,6 @@ def _key(bins: Int64[Tensor, "*b 4"]) -> Int64[Tensor, "*b"]:
     d, a, b, c = bins.clamp(min=0).unbind(-1)
     a, b, c = (angle.clamp(max=ANGLES - 1) for angle in (a, b, c))
     return ((d.clamp(max=DISTANCES) * ANGLES + a) * ANGLES + b) * ANGLES + c
-
-
-def _neighbours(feature: Float64[Tensor, "p 4"]) -> Int64[Tensor, "p 5"]:
-    """Number the bin of each feature, and of each of its four values the next bin beside it."""
-    own = feature.floor().long()
-    aside = torch.where(feature - own < 0.5, -1, 1)
-    moved = own[:, None] + aside[:, None] * torch.eye(4, dtype=torch.int64)
-    return torch.cat([_key(own)[:, None], _key(moved)], 1)
 
 
 def vote_poses(
@@ -302,7 +289,11 @@ def _peaks(
     used = (far_m > step_m) & (far_m < DISTANCES * step_m)
     row, second = used.nonzero(as_tuple=True)
     feature, turn_rad = _features(points_m, frames, references[row], second, diameter_m)
-    keys = _neighbours(feature)
+    # The bin of each feature, and of each of its four values the next bin beside it.
+    own = feature.floor().long()
+    aside = torch.where(feature - own < 0.5, -1, 1)
+    moved = own[:, None] + aside[:, None] * torch.eye(4, dtype=torch.int64)
+    keys = torch.cat([_key(own)[:, None], _key(moved)], 1)
     size = (table.bounds[keys + 1] - table.bounds[keys]).long()
     same = (keys[:, 1:] == keys[:, :1]).nonzero(as_tuple=True)
     size[:, 1:][same] = 0
