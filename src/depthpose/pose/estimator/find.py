@@ -50,8 +50,8 @@ size that is off by more deviations than the second counts as one that is off by
 _MOST_JUDGED, _LEAST_JUDGED = 40, 4
 """Poses that are judged in an image, and of each object at least."""
 _ALIGNED, _CLEARLY = 0.7, 0.01
-"""Cosine of the normals of readings and surface, and the share of the readings by which a turned
-pose must explain more."""
+"""Cosine of the normals from which a reading and the surface are alike, and by how much more a
+turned pose must score to take the place of the one that was proposed."""
 _ROUNDS = 3
 """So often an image is searched for an object that is there more than once, at most."""
 _MOST_TOGETHER, _NEARLY = 8, 0.2
@@ -183,21 +183,23 @@ def _candidates(
 
 
 def _best_turned(frame: Frame, pose: Rigid, pairs: PairTable) -> Rigid:
-    """Choose among the turns that show most of an object alike the one that explains most readings.
+    """Give the pose or the one of its turns at which the object explains most readings about it.
 
     A handle that a wrong turn of a mug leaves out does not contradict it: a neighbour may be there.
+    So each is scored by the readings that it explains, over the most that one does, less the share
+    of its surface that the image contradicts.
     """
     if len(pairs.turns.R) == 0:
         return pose
     surface, every = pairs.surface, Rigid.cat([pose[None], pose[None] @ pairs.turns])
-    is_read = (frame.depth_m > 0) & (frame.plane_m < surface.diameter_m)
+    about = (frame.depth_m > 0) & (frame.plane_m < surface.diameter_m)
     middle_m = pose.apply(surface.middle_m[None])[0]
-    is_read &= (frame.points_m - middle_m).norm(dim=-1) < surface.diameter_m
-    local_m = every.inverse().apply(frame.points_m[is_read])
+    about &= (frame.points_m - middle_m).norm(dim=-1) < surface.diameter_m
+    local_m = every.inverse().apply(frame.points_m[about])
     index = surface.boxes.look_up(local_m)
     is_near = (local_m - surface.points_m[index]).norm(dim=-1) < NEAR * surface.diameter_m
-    cosine = ((surface.normals[index] @ every.R.mT) * frame.normals[is_read]).sum(-1).abs()
-    number = (is_near & ((cosine > _ALIGNED) | ~frame.is_smooth[is_read])).sum(-1)
+    cosine = ((surface.normals[index] @ every.R.mT) * frame.normals[about]).sum(-1).abs()
+    number = (is_near & ((cosine > _ALIGNED) | ~frame.is_smooth[about])).sum(-1)
     contradicted = compare_with_image(frame, every, surface).contradicted
     score = number / number.max().clamp(min=1) - contradicted
     best = int(score.argmax())
@@ -296,7 +298,7 @@ def _without_rivals(
 
 
 def explained_mask(seen: Frame | ViewInput, pose: Rigid, surface: Surface) -> Bool[Tensor, "h w"]:
-    """Mark the pixels whose points lie on a posed surface, none on planes too wide for it."""
+    """Mark the pixels whose points lie on a posed surface; in a frame, none of wider planes."""
     if isinstance(seen, Frame):
         points_m = seen.points_m
         found = (seen.depth_m > 0) & (seen.plane_m < surface.diameter_m)

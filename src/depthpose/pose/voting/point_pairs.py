@@ -13,6 +13,7 @@ from jaxtyping import Float32, Float64, Int32, Int64
 from torch import Tensor
 from torch.nn.functional import normalize
 
+from depthpose.core.arrays import take_evenly
 from depthpose.core.rigid import Rigid, geodesic_rad
 from depthpose.pose.cloud import thin
 from depthpose.pose.compiled import ANGLES, DISTANCES, MOST_ALIKE, TURNS, serves
@@ -46,8 +47,8 @@ _UNSEEN = 0.3
 _OWN_REFERENCES, _OWN_PEAKS, _OWN_POINTS = 40, 48, 250
 """Points of a model that look for it in itself, poses that each proposes, and points compared."""
 _ROUGHLY, _MOSTLY = 0.5, 0.8
-"""A turn that lays so much of a surface on itself is refined; then it shows it alike, but for a
-feature, if it lays so much."""
+"""A turn that lays the first share of a surface on itself is refined; one that then lays the
+second share there is kept."""
 _TURNED, _TURNED_RAD, _MOST_TURNS = 0.7, math.radians(12), 36
 """Cosine of the normals there, the least angle between two turns, and their number at most."""
 
@@ -57,7 +58,8 @@ class PairTable:
     """Pairs of points of a model, sorted by their features.
 
     Attributes:
-        points_m: of the surface as it is seen from outside, some 0.05 diameters apart.
+        points_m: of the surface as it is seen from outside, 0.07 diameters apart or more, in the
+            order of the model's faces.
         frames: of each point its normal, toward who sees it, and two tangents, as columns.
         bounds: pairs ``bounds[k]`` to ``bounds[k + 1]`` have feature ``k``.
         first: number of the first point of each pair.
@@ -74,40 +76,45 @@ class PairTable:
 
     @cached_property
     def turns(self) -> Rigid:
-        """Turns that lay most of the surface on itself, as ``model_from_model``; no symmetries.
+        """Motions that lay 80 % of the surface on itself, ``model_from_model``; no symmetries.
 
         A mug has them about its axis: but for its handle it looks alike. They are found by looking
-        for the model in itself.
+        for the model in itself, when they are first wanted.
         """
-        surface, references = self.surface, torch.arange(min(_OWN_REFERENCES, len(self.points_m)))
+        surface = self.surface
+        # Of all sides, not those of the first faces.
+        references = take_evenly(torch.arange(len(self.points_m)), _OWN_REFERENCES)
         found, _ = vote_poses(self.points_m, self.frames[..., 0], references, self, _OWN_PEAKS)
-        found = found[_apart_alike(found, surface, _ROUGHLY)]
+        found = found[_distinct_turns(found, surface, _ROUGHLY)]
         # With the camera in the middle of the model, from where it sees all.
         points_m, starts = surface.points_m - surface.middle_m, found.t_m - surface.middle_m
         found = refine_roughly(points_m, Rigid(found.R, starts), surface, IcpConfig())
         found = Rigid(found.R, found.t_m + surface.middle_m)
-        found = found[_apart_alike(found, surface, _MOSTLY)]
+        found = found[_distinct_turns(found, surface, _MOSTLY)]
         # One after the other they are turns too, which fill the gaps between those that were found.
         twice = found[:, None] @ found
         found = Rigid.cat([found, Rigid(twice.R.flatten(0, 1), twice.t_m.flatten(0, 1))])
-        return found[_apart_alike(found, surface, _MOSTLY)]
+        return found[_distinct_turns(found, surface, _MOSTLY)]
 
 
-def _apart_alike(turns: Rigid, surface: Surface, least: float) -> list[int]:
-    """Choose what lays so large a share of a surface on itself, none nearly as one before it."""
+def _distinct_turns(turns: Rigid, surface: Surface, least: float) -> list[int]:
+    """Choose turns that lay so large a share of a surface on itself, the best first.
+
+    None is within 12 degrees of one before it or of a symmetry, nor of the two together.
+    """
     every = max(1, len(surface.points_m) // _OWN_POINTS)
     local_m = turns.inverse().apply(surface.points_m[::every])
     index = surface.boxes.look_up(local_m)
     is_alike = (local_m - surface.points_m[index]).norm(dim=-1) < NEAR * surface.diameter_m
     cosine = ((surface.normals[index] @ turns.R.mT) * surface.normals[::every]).sum(-1)
     share = (is_alike & (cosine.abs() > _TURNED)).double().mean(-1)
-    chosen, known = list[int](), surface.copies.R
+    chosen, taken = list[int](), surface.copies.R
     for k in share.argsort(descending=True).tolist():
         if share[k] < least or len(chosen) == _MOST_TURNS:
             break
-        if float(geodesic_rad(turns.R[k].expand_as(known), known).min()) > _TURNED_RAD:
+        if float(geodesic_rad(turns.R[k].expand_as(taken), taken).min()) > _TURNED_RAD:
             chosen.append(k)
-            known = torch.cat([known, turns.R[k] @ surface.copies.R])
+            taken = torch.cat([taken, turns.R[k] @ surface.copies.R])
     return chosen
 
 
