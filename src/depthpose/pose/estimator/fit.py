@@ -40,6 +40,7 @@ from depthpose.pose.types import (
     Fit,
     Identity,
     PoseEstimate,
+    Status,
     Symmetries,
     ViewInput,
     Vote,
@@ -541,17 +542,19 @@ def answer_of(
         for k in shares.argsort(descending=True, stable=True).tolist()[1:]
         if float(shares[k]) >= _NAMED
     )
+    certainty = float(shares[number])
+    status, words = status_of(certainty, len(alternatives), config.min_certainty)
     # Worked out in float64, given as points and models come: in float32.
-    answer = PoseEstimate(
-        status="ok",
+    return PoseEstimate(
+        status=status,
+        reason=words,
         camera_from_model=pose.float(),
         covariance=covariance.float(),
         free_motions=free.float(),
-        certainty=float(shares[number]),
+        certainty=certainty,
         alternatives=alternatives,
         **facts,
     )
-    return with_status(answer, config.min_certainty)
 
 
 def share_out(
@@ -565,19 +568,23 @@ def share_out(
     return torch.tensor(odds, dtype=torch.float64).softmax(0)
 
 
-def with_status(answer: PoseEstimate, min_certainty: float) -> PoseEstimate:
+def status_of(certainty: float, others: int, min_certainty: float) -> tuple[Status, str]:
     """Say that a pose is ambiguous where its certainty is below the limit, and else ok."""
-    if answer.camera_from_model is None:
-        return answer
-    certainty = 1.0 if answer.certainty is None else answer.certainty
     if certainty >= min_certainty:
-        return replace(answer, status="ok", reason="")
-    others = len(answer.alternatives)
-    reason = (
+        return "ok", ""
+    return "ambiguous", (
         f"this pose has a certainty of {certainty:.0%}, below min_certainty {min_certainty:.0%}: "
         + (f"{others} others fit too" if others else "others may fit")
     )
-    return replace(answer, status="ambiguous", reason=reason)
+
+
+def with_status(answer: PoseEstimate, min_certainty: float) -> PoseEstimate:
+    """Say anew, by another limit, whether a pose is ambiguous or ok."""
+    if answer.camera_from_model is None:
+        return answer
+    certainty = 1.0 if answer.certainty is None else answer.certainty
+    status, reason = status_of(certainty, len(answer.alternatives), min_certainty)
+    return replace(answer, status=status, reason=reason)
 
 
 def misfit_of(fit: Fit, limits: RefusalConfig) -> Refusal | None:
