@@ -12,7 +12,7 @@ from tests.pose.synthetic_objects import bracket
 from torch.nn.functional import huber_loss
 
 from depthpose.cli import main
-from depthpose.cli.pose_predict import cloud_files, cloud_jobs
+from depthpose.cli.pose_predict import cloud_jobs
 from depthpose.core.config import config_from_dict
 from depthpose.core.errors import InputError
 from depthpose.core.files import Cloud, cloud_suffixes, read_cloud
@@ -46,7 +46,7 @@ def test_extending_clouds(
     assert torch.equal(read_cloud(path).points, points)
     (job,) = cloud_jobs(tmp_path, "m", "bracket", tmp_path.parent / "out")
     assert torch.equal(job.read().points_m, points)
-    assert ".points" in cloud_files().suffixes
+    assert ".points" in cloud_suffixes()
     assert main(["doctor", str(path)]) in (0, 1)
     assert f"{len(points)} points" in capsys.readouterr().out
     assert np.allclose(read_model(path, "m").vertices_m, points)

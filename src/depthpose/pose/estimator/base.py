@@ -266,7 +266,6 @@ class PoseEstimator:
         """
         known = SearchTargets(
             names=objects,
-            surface_of=lambda name: self._known(name).surface,
             pairs_of=lambda name: self._pairs(self._known(name)),
             pose_near=self._pose_near,
             max_size_error=self.refusal.max_size_error,
@@ -493,7 +492,7 @@ class Registration(PoseEstimator):
             dense_m = take_evenly(cloud_m, _SMOOTHED)
             some_m = dense_m[thin(dense_m, torch.zeros_like(dense_m), _VOXEL * surface.diameter_m)]
             normals, _ = local_planes(dense_m, some_m)
-            proposals = propose_poses(some_m, normals, pairs, surface, _PROPOSALS, generator)
+            proposals = propose_poses(some_m, normals, pairs, _PROPOSALS, generator)
         voted = time.perf_counter()
         seconds["voting"] = voted - began
         best = refine_best(cloud_m, proposals, surface, replace(self.config.icp, starts=1))
