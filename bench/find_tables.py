@@ -32,7 +32,7 @@ from depthpose.pose.config import ObjectsConfig
 from depthpose.pose.datasets import open_bop
 from depthpose.pose.estimator import GeoPoseNet, Registration
 from depthpose.pose.mesh import read_model, sample_surface, with_found_symmetries
-from depthpose.pose.metrics import add_share
+from depthpose.pose.metrics import add_m, adds_m
 from depthpose.pose.synthetic import make_frames
 from depthpose.pose.types import ObjectModel, PoseEstimate
 from depthpose.report.page import markdown_table
@@ -157,7 +157,8 @@ def error_of(pose: Rigid, thing: Shown) -> float:
     """ADD(-S) in diameters."""
     points_m = sample_surface(thing.model, 1000)[0]
     is_adds = thing.is_adds or not thing.model.symmetries.is_none
-    return add_share(pose, thing.pose, points_m, thing.model.diameter_m, is_adds=is_adds)
+    measure = adds_m if is_adds else add_m
+    return float(measure(pose, thing.pose, points_m)) / thing.model.diameter_m
 
 
 def searches(frame: Frame, alone: bool) -> Iterator[Frame]:

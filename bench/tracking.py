@@ -34,7 +34,7 @@ from depthpose.core.rigid import Rigid, rotation_by
 from depthpose.pose.config import SensorConfig
 from depthpose.pose.estimator import GeoPoseNet
 from depthpose.pose.mesh import drawn_triangles, sample_surface
-from depthpose.pose.metrics import add_share
+from depthpose.pose.metrics import add_m, adds_m
 from depthpose.pose.synthetic.views import measure, random_rotation
 from depthpose.pose.types import ObjectModel, PoseEstimate, ViewInput
 from depthpose.report.page import markdown_table
@@ -182,9 +182,8 @@ def verdict(
     if found.camera_from_model is None:
         return ("lost" if frame.is_seen else "none"), math.nan
     is_adds = not model.symmetries.is_none
-    error = add_share(
-        found.camera_from_model, frame.truth, points_m, model.diameter_m, is_adds=is_adds
-    )
+    measured = adds_m if is_adds else add_m
+    error = float(measured(found.camera_from_model, frame.truth, points_m)) / model.diameter_m
     return ("right" if frame.is_seen and error < 0.1 else "wrong"), error
 
 

@@ -12,7 +12,6 @@ from depthpose.cli.pose_predict import view_jobs
 from depthpose.core.errors import InputError
 from depthpose.core.files import write_depth_png
 from depthpose.pose.datasets import (
-    mask_from_rle,
     number_objects,
     read_labels,
     read_mask,
@@ -37,7 +36,7 @@ def test_run_lengths_are_a_mask_as_the_picture_is(tmp_path: Path, content: objec
 
 
 def test_pycocotools_hands_over_bytes() -> None:
-    assert torch.equal(mask_from_rle({"size": [2, 3], "counts": b"123"}, "mask"), MASK)
+    assert torch.equal(labels_input({"size": [2, 3], "counts": b"123"}, "mask"), MASK.long())
 
 
 @pytest.mark.parametrize(

@@ -14,7 +14,8 @@ from depthpose.core import files
 from depthpose.core.errors import InputError
 from depthpose.core.files.images import opened_image, read_numbers, value_range
 from depthpose.pose.cloud import frame_advice, unit_advice
-from depthpose.pose.datasets import mask_from_rle
+from depthpose.pose.datasets import decode_rle
+from depthpose.pose.datasets.masks import read_runs
 from depthpose.pose.mesh import MESH_READERS, exact_diameter, read_geometry
 
 Size = tuple[int, int]
@@ -107,7 +108,7 @@ def _read_words(path: Path, size: Size | None) -> FileFacts:
         content = files.read_json(path)
         one = content[0] if isinstance(content, list) and len(content) == 1 else content
         if isinstance(one, dict) and {"counts", "segmentation"} & one.keys():
-            return _of_mask(path, mask_from_rle(one, str(path)))
+            return _of_mask(path, decode_rle(*read_runs(one, str(path))))
     try:
         camera = cameras.read_camera(path, size)
     except InputError as error:

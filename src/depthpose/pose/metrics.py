@@ -12,7 +12,7 @@ from scipy.spatial import KDTree
 from torch import Tensor
 
 from depthpose.core.camera import pixel_grid, project
-from depthpose.core.rigid import Rigid, geodesic_rad
+from depthpose.core.rigid import Rigid
 
 VSD_DELTA_M = 0.015  #: tolerance of visibility [m]; BOP takes 15 mm for all sets but ITODD (5 mm)
 BOP_SHARES = tuple(round(0.05 * i, 2) for i in range(1, 11))
@@ -25,11 +25,6 @@ _CHUNK = 2**22
 
 RenderDepth = Callable[[Rigid], Float[Tensor, "h w"]]
 """Renders the depth [m] of an object at a pose; NaN, 0 or infinity where it is not."""
-
-
-def rotation_error_rad(estimated: Rigid, true: Rigid) -> Float[Tensor, "*batch"]:
-    """Angle between two poses' rotations [rad]."""
-    return geodesic_rad(estimated.R.double(), true.R.double())
 
 
 def add_m(estimated: Rigid, true: Rigid, points_m: Float[Tensor, "n 3"]) -> Float[Tensor, "*batch"]:
@@ -50,19 +45,6 @@ def adds_m(
                strict=True)  # fmt: skip
     means = [float(KDTree(b.numpy()).query(a.numpy())[0].mean()) for a, b in rows]
     return torch.tensor(means, dtype=torch.float64).reshape(first.shape[:-2])
-
-
-def add_share(
-    estimated: Rigid,
-    true: Rigid,
-    points_m: Float[Tensor, "n 3"],
-    diameter_m: float,
-    *,
-    is_adds: bool,
-) -> float:
-    """ADD, or ADD-S where that decides (a symmetric object), in diameters."""
-    error_m = adds_m if is_adds else add_m
-    return float(error_m(estimated, true, points_m)) / diameter_m
 
 
 def add_of_nearest_m(

@@ -8,7 +8,6 @@ from pathlib import Path
 from shlex import quote
 
 import torch
-from torch import Tensor
 
 from depthpose.core.checkpoint import (
     Checkpoint,
@@ -94,7 +93,11 @@ def write_pose_weights(
     state = {f"network.{name}": tensor for name, tensor in learnt.items()}
     for k, model in enumerate(weights.models):
         kept = _TENSORS if with_meshes else ("keypoints_m",)
-        state |= {f"models.{k}.{name}": _small(getattr(model, name)) for name in kept}
+        for name in kept:
+            tensor = getattr(model, name)
+            # A copy: two models may be made of one tensor, which safetensors refuses to write.
+            stored = tensor.dtype if tensor.is_floating_point() else torch.int32
+            state[f"models.{k}.{name}"] = tensor.to(stored, copy=True)
     config = {
         "network": config_to_dict(network.config),
         "cloud": config_to_dict(weights.cloud),
@@ -141,7 +144,10 @@ def complete_weights(path: Path, meshes: Mapping[int, ObjectModel], out: Path) -
                 f"lies {off_m:.3g} m off the model {model.name} ({model.diameter_m:.3g} m long): "
                 "another object, frame or unit. Give the models that it was trained on."
             )
-        state |= {f"models.{k}.{name}": _small(getattr(model, name)) for name in _SURFACE}
+        for name in _SURFACE:
+            tensor = getattr(model, name)
+            stored = tensor.dtype if tensor.is_floating_point() else torch.int32
+            state[f"models.{k}.{name}"] = tensor.to(stored, copy=True)
     save_checkpoint(out, dataclasses.replace(checkpoint, state=state))
 
 
@@ -253,8 +259,3 @@ def network_of(checkpoint: Checkpoint, source: str) -> AnyNetwork:
     state = {name.removeprefix("network."): tensor for name, tensor in learnt.items()}
     held = dataclasses.replace(checkpoint, state=state)
     return build_network(lambda: made(config), held, source).eval()
-
-
-def _small(tensor: Tensor) -> Tensor:
-    # A copy: two models may be made of the same tensor, which safetensors refuses to write.
-    return tensor.clone() if tensor.is_floating_point() else tensor.to(torch.int32, copy=True)

@@ -20,7 +20,7 @@ from depthpose.pose.cloud import cloud_from_depth, refusal_of, sample_points, vo
 from depthpose.pose.config import VotingConfig
 from depthpose.pose.estimator import GeoPoseNet
 from depthpose.pose.evaluate import ObjectRow
-from depthpose.pose.metrics import SUCCESS_SHARE, add_share
+from depthpose.pose.metrics import SUCCESS_SHARE, add_m, adds_m
 from depthpose.pose.network import ResUNet
 from depthpose.pose.sparse import Voxels
 from depthpose.pose.types import ObjectModel, ViewSample
@@ -329,8 +329,8 @@ def compare_voting(cases: Sequence[VotingCase | None], points: int) -> list[dict
                 fit = fit_pose(keypoints_m.double(), alike, case.model.keypoints_m)
                 some_m = case.model.vertices_m[:: max(1, len(case.model.vertices_m) // _ADD_POINTS)]
                 pose, diameter_m = fit.camera_from_model, case.model.diameter_m
-                share = add_share(pose, case.truth, some_m, diameter_m, is_adds=case.is_adds)
-                successes += share < SUCCESS_SHARE
+                error_m = (adds_m if case.is_adds else add_m)(pose, case.truth, some_m)
+                successes += float(error_m) / diameter_m < SUCCESS_SHARE
         finally:
             torch.set_num_threads(threads)
         row = {

@@ -17,7 +17,6 @@ from depthpose.pose.datasets.layouts import read_targets as read_targets
 from depthpose.pose.datasets.masks import Detection as Detection
 from depthpose.pose.datasets.masks import decode_rle as decode_rle
 from depthpose.pose.datasets.masks import encode_rle as encode_rle
-from depthpose.pose.datasets.masks import mask_from_rle as mask_from_rle
 from depthpose.pose.datasets.masks import number_objects as number_objects
 from depthpose.pose.datasets.masks import one_mask as one_mask
 from depthpose.pose.datasets.masks import read_detections as read_detections

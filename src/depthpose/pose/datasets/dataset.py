@@ -38,8 +38,6 @@ from depthpose.pose.datasets.layouts import (
     LAYOUTS,
     Instance,
     layout_of,
-    model_path,
-    object_name,
     object_names,
     read_bop_models,
     read_models_info,
@@ -234,7 +232,8 @@ def _check_models(folder: Path, numbers: set[int], found: list[Problem]) -> dict
         found.append(Problem(path=folder, kind="missing", message=str(error)))
         return models
     for number in sorted(numbers):
-        path = model_path(home, number)
+        named = (home / f"obj_{number:06d}.ply", home / f"obj_{number:02d}.ply")
+        path = next((path for path in named if path.is_file()), None)
         if path is None:
             message = f"has no mesh of object {number}, which is annotated"
             found.append(Problem(path=home, kind="missing", message=message))
@@ -254,7 +253,7 @@ def _check_models(folder: Path, numbers: set[int], found: list[Problem]) -> dict
             message = f"is {measured_mm:.1f} mm across, but models_info says {declared_mm:.1f} mm"
             found.append(Problem(path=path, kind="mismatch", message=message))
     # Estimators know objects by name, and refuse two of one.
-    names = {n: object_name(n, infos.get(n, {})) for n in numbers}
+    names = object_names(folder, numbers)
     for name, count in sorted(Counter(names.values()).items()):
         if count > 1:
             own = " and ".join(str(n) for n in sorted(names) if names[n] == name)

@@ -144,17 +144,11 @@ class Instance:
         return f"{self.scene_id:06d}_{self.image_id:06d}_{self.index:06d}"
 
 
-def bop_splits(folder: Path) -> list[str]:
-    """Name the folders that hold scenes."""
-    found = {path.parent.parent.name for path in folder.glob("*/*/scene_camera.json")}
-    return sorted(found)
-
-
 def bop_scenes(folder: Path, split: str) -> list[Path]:
     """List the scenes of a split."""
     scenes = sorted(path.parent for path in (folder / split).glob("*/scene_camera.json"))
     if not scenes:
-        known = ", ".join(bop_splits(folder)) or "none"
+        known = ", ".join(LAYOUTS["BOP"].splits(folder)) or "none"
         raise InputError(
             f"{folder}: no split {split!r} with a scene (SPLIT/000001/scene_camera.json). "
             f"Here: {known}."
@@ -315,7 +309,9 @@ LAYOUTS: dict[str, Layout] = {
         predicted_mask="segnet_results/{object:02d}_label/{image:04d}_label.png",
     ),
     "BOP": Layout(
-        splits=bop_splits,
+        splits=lambda folder: sorted(
+            {path.parent.parent.name for path in folder.glob("*/*/scene_camera.json")}
+        ),
         instances=lambda folder, split: (
             one for scene in bop_scenes(folder, split) for one in bop_instances(scene)
         ),
@@ -355,12 +351,6 @@ def read_models_info(folder: Path) -> tuple[Path, dict[int, dict[str, Any]]]:
     return home, {int(key): entry for key, entry in content.items()}
 
 
-def model_path(home: Path, number: int) -> Path | None:
-    """Find the mesh of an object, whichever layout names it."""
-    named = (home / f"obj_{number:06d}.ply", home / f"obj_{number:02d}.ply")
-    return next((path for path in named if path.is_file()), None)
-
-
 def read_bop_models(
     folder: Path, numbers: Iterable[int], config: MeshConfig | None = None
 ) -> dict[int, ObjectModel]:
@@ -373,7 +363,8 @@ def read_bop_models(
     _, layout = layout_of(folder)
     models: dict[int, ObjectModel] = {}
     for wanted in sorted(set(numbers)):
-        path = model_path(home, wanted)
+        named = (home / f"obj_{wanted:06d}.ply", home / f"obj_{wanted:02d}.ply")
+        path = next((path for path in named if path.is_file()), None)
         if path is None:
             raise InputError(f"{home}: no obj_{wanted:06d}.ply for object {wanted}; put it there")
         info, source = infos.get(wanted, {}), f"{home / 'models_info.json'}: object {wanted}"
@@ -385,7 +376,7 @@ def read_bop_models(
         model = read_model(
             path,
             "mm",
-            name=object_name(wanted, info),
+            name=str(info.get("name", f"obj_{wanted:06d}")),
             number=wanted,
             symmetries=symmetries,
             config=config,
@@ -402,9 +393,5 @@ def object_names(folder: Path, numbers: Iterable[int] | None = None) -> dict[int
         InputError: there is no folder of models, or the file is damaged.
     """
     _, infos = read_models_info(folder)
-    return {k: object_name(k, infos.get(k, {})) for k in (infos if numbers is None else numbers)}
-
-
-def object_name(number: int, info: dict[str, Any]) -> str:
-    """Say what samples call an object."""
-    return str(info.get("name", f"obj_{number:06d}"))
+    wanted = infos if numbers is None else numbers
+    return {k: str(infos.get(k, {}).get("name", f"obj_{k:06d}")) for k in wanted}

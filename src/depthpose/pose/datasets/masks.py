@@ -48,7 +48,7 @@ def read_labels(path: Path) -> Int64[Tensor, "mask_h mask_w"]:
                 f"{path}: holds {len(entries)} masks, where one is needed; leave one there, or "
                 "name a list of BOP detections by --masks, beside --bop"
             )
-        return mask_from_rle(entries[0], str(path)).long()
+        return decode_rle(*read_runs(entries[0], str(path))).long()
     with opened_image(path) as image:
         if image.mode in ("LA", "PA", "RGBA", "RGBa", "La") or "transparency" in image.info:
             pixels = np.asarray(image.convert("RGBA"))
@@ -118,17 +118,6 @@ def one_mask(labels: Int64[Tensor, "h w"], name: str) -> Bool[Tensor, "h w"]:
     return labels != 0
 
 
-def mask_from_rle(entry: object, source: str) -> Bool[Tensor, "h w"]:
-    """Decode COCO's run lengths, or what has them as ``segmentation``.
-
-    Raises:
-        InputError: there are none, or they do not add up to their size.
-    """
-    if isinstance(entry, Mapping) and "segmentation" in entry:
-        entry = entry["segmentation"]
-    return decode_rle(*read_runs(entry, source))
-
-
 def decode_rle(counts: tuple[int, ...], height: int, width: int) -> Bool[Tensor, "h w"]:
     """Turn run lengths, column by column and beginning with the background, into a mask."""
     values = np.arange(len(counts)) % 2 == 1
@@ -146,7 +135,15 @@ def encode_rle(mask: Bool[Tensor, "h w"]) -> Runs:
 
 
 def read_runs(entry: object, source: str) -> Runs:
-    """Take COCO's run lengths, compressed (text) or not, and their size; nothing is decoded."""
+    """Take COCO's run lengths, compressed (text) or not, and their size; nothing is decoded.
+
+    They may be the ``segmentation`` of an entry.
+
+    Raises:
+        InputError: there are none, or they do not add up to their size.
+    """
+    if isinstance(entry, Mapping) and "segmentation" in entry:
+        entry = entry["segmentation"]
     what = f"{source}: the segmentation is no run lengths"
     if isinstance(entry, list) and entry:
         raise InputError(

@@ -24,7 +24,8 @@ from depthpose.core.files import read_cloud, read_stored_depth
 from depthpose.core.rigid import Rigid
 from depthpose.core.units import Unit, metres_of
 from depthpose.pose.cloud import nothing_seen as nothing_seen
-from depthpose.pose.datasets import mask_from_rle, number_objects, one_mask, read_labels
+from depthpose.pose.datasets import decode_rle, number_objects, one_mask, read_labels
+from depthpose.pose.datasets.masks import read_runs
 from depthpose.pose.segmentation import label_parts
 from depthpose.pose.types import AnyInput as AnyInput
 from depthpose.pose.types import CloudInput, ViewInput
@@ -149,7 +150,7 @@ def labels_input(mask: AnyMask, name: str) -> Int64[Tensor, "_ _"]:
     if isinstance(mask, str | Path):
         return read_labels(Path(mask))
     if isinstance(mask, Mapping):
-        return mask_from_rle(mask, name).long()
+        return decode_rle(*read_runs(mask, name)).long()
     values = _tensor(mask)
     if values.is_floating_point() and not bool((values % 1 == 0).all()):
         if not bool(((values >= 0) & (values <= 1)).all()):

@@ -15,7 +15,7 @@ from torch import Tensor
 from depthpose.core.camera import project
 from depthpose.core.files import image_size, read_depth_png
 from depthpose.core.render import rasterize
-from depthpose.core.rigid import Rigid
+from depthpose.core.rigid import Rigid, geodesic_rad
 from depthpose.pose.datasets import BopDataset, Instance
 from depthpose.pose.mesh import turn_about
 from depthpose.pose.metrics import (
@@ -28,7 +28,6 @@ from depthpose.pose.metrics import (
     average_recall,
     mspd_px,
     mssd_m,
-    rotation_error_rad,
     vsd,
 )
 from depthpose.pose.predictions import Place, Prediction, place_of, score_of
@@ -91,8 +90,7 @@ def nearest_copy(
     """
     R, t_m = symmetries.R.double(), symmetries.t_m.double()
     copies = Rigid(true.R.double() @ R, (true.R.double() @ t_m[..., None])[..., 0] + true.t_m)
-    one = Rigid(estimated.R.double().expand_as(R), estimated.t_m.double().expand_as(t_m))
-    nearest = int(rotation_error_rad(one, copies).argmin())
+    nearest = int(geodesic_rad(estimated.R.double().expand_as(R), copies.R).argmin())
     copy = copies[nearest]
     if declared is None or not declared.continuous:
         return copy
@@ -110,7 +108,7 @@ def nearest_copy(
         across = torch.stack([skew[2, 1], skew[0, 2], skew[1, 0]])
         angle = torch.atan2(a @ across, relative.trace() - a @ relative @ a)
         turns.append(copy @ turn_about(a, axis.point_m.to(wanted), angle))
-    return min(turns, key=lambda one: float(rotation_error_rad(Rigid(wanted, copy.t_m), one)))
+    return min(turns, key=lambda one: float(geodesic_rad(wanted, one.R)))
 
 
 def _vsd(estimated: Rigid, instance: Instance, context: ErrorContext) -> Float[Tensor, "10"]:
@@ -166,8 +164,9 @@ METRICS = {  # i: the instance, c: its context
         summaries={"ar_mspd": lambda errors, _: average_recall(errors, BOP_PIXELS)},
     ),
     "rotation_deg": Metric(
-        measure=lambda pose, i, c: rotation_error_rad(
-            pose, nearest_copy(pose, i.camera_from_model, c.symmetries, c.model.symmetries)
+        measure=lambda pose, i, c: geodesic_rad(
+            pose.R.double(),
+            nearest_copy(pose, i.camera_from_model, c.symmetries, c.model.symmetries).R.double(),
         ).rad2deg(),
         has_median=True,
     ),

@@ -210,7 +210,14 @@ def _make_frame(
     ambient = uniform(generator, 0.2, 0.6) * (2 - colour)
     lit = shade(placed, raster, K, towards, strength * colour, ambient)
     image[:, raster.primitive >= 0] = lit.mT
-    rgb = _exposed(image, generator)
+    # Blurred a little, tinted, exposed, with noise, and brought from linear light to sRGB's curve.
+    blur = uniform(generator, 0.0, 0.3)
+    near = F.avg_pool2d(image[None], 3, 1, 1, count_include_pad=False)[0]
+    image = torch.lerp(image, near, blur)
+    tint = 1 + 0.15 * (2 * torch.rand(3, 1, 1, generator=generator) - 1)
+    gain = math.exp(uniform(generator, -0.8, 0.2))
+    noise = uniform(generator, 0.0, 0.02) * torch.randn(image.shape, generator=generator)
+    rgb = (gain * tint * image + noise).clamp(1e-6, 1) ** (1 / 2.2)
     focal_px = (config.focal_px[0], config.focal_px[0])
     depth_m = measure(raster.depth_m, focal_px, config.sensor, generator)
     shown: list[BopObject] = []
@@ -314,14 +321,3 @@ def _viewpoint(config: ObjectsConfig, generator: torch.Generator) -> Rigid:
     R = torch.tensor([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]]) @ R
     target = torch.tensor([uniform(generator, -0.05, 0.05), uniform(generator, -0.05, 0.05), 0.03])
     return Rigid(R, -R @ (target + distance_m * torch.tensor(eye)))
-
-
-def _exposed(image: Float[Tensor, "3 h w"], generator: torch.Generator) -> Float[Tensor, "3 h w"]:
-    """Blur a little, tint, expose, add noise, and bring linear light to sRGB's curve."""
-    blur = uniform(generator, 0.0, 0.3)
-    near = torch.nn.functional.avg_pool2d(image[None], 3, 1, 1, count_include_pad=False)[0]
-    image = torch.lerp(image, near, blur)
-    tint = 1 + 0.15 * (2 * torch.rand(3, 1, 1, generator=generator) - 1)
-    gain = math.exp(uniform(generator, -0.8, 0.2))
-    noise = uniform(generator, 0.0, 0.02) * torch.randn(image.shape, generator=generator)
-    return (gain * tint * image + noise).clamp(1e-6, 1) ** (1 / 2.2)

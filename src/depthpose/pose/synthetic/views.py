@@ -143,7 +143,13 @@ def measure(
     if kind == "none":
         return depth_m
     steepest = _STEEPEST if kind != "laser" else 2 * _STEEPEST
-    is_lost = _is_steep(depth_m, focal_px[0], steepest)
+    # Lost is what is seen at a grazing angle: one pixel on, the depth changes by far too much.
+    limit_m = depth_m * (steepest / focal_px[0])
+    is_lost = torch.zeros_like(depth_m, dtype=torch.bool)
+    across, down = depth_m.diff(dim=1).abs_(), depth_m.diff(dim=0).abs_()
+    # A jump to another surface is steep on one side alone: the flatter side decides.
+    is_lost[:, 1:-1] = torch.fmin(across[:, 1:], across[:, :-1]) > limit_m[:, 1:-1]
+    is_lost[1:-1] |= torch.fmin(down[1:], down[:-1]) > limit_m[1:-1]
     # Half of the missing readings singly, half in patches.
     height, width = depth_m.shape
     is_lost |= torch.rand(height, width, generator=generator) < 0.5 * missing
@@ -208,17 +214,6 @@ def smooth_noise(size: tuple[int, int], width_px: float, generator: torch.Genera
     weights = weights / weights.norm()
     along = F.conv2d(white[None, None], weights.view(1, 1, 1, -1))
     return F.conv2d(along, weights.view(1, 1, -1, 1))[0, 0]
-
-
-def _is_steep(depth_m: Depth, focal_px: float, steepest: float) -> Mask:
-    """Mark surfaces seen at a grazing angle: one pixel on, the depth changes by far too much."""
-    limit_m = depth_m * (steepest / focal_px)
-    is_steep = torch.zeros_like(depth_m, dtype=torch.bool)
-    across, down = depth_m.diff(dim=1).abs_(), depth_m.diff(dim=0).abs_()
-    # A jump to another surface is steep on one side alone: the flatter side decides.
-    is_steep[:, 1:-1] = torch.fmin(across[:, 1:], across[:, :-1]) > limit_m[:, 1:-1]
-    is_steep[1:-1] |= torch.fmin(down[1:], down[:-1]) > limit_m[1:-1]
-    return is_steep
 
 
 def _is_shadowed(depth_m: Depth, focal_px: float, baseline_m: float = _KINECT_BASELINE_M) -> Mask:
