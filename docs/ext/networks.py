@@ -29,6 +29,7 @@ from depthpose.pose.network import ResUNet
 from depthpose.pose.segmentation import FCN
 from depthpose.pose.sparse import Voxels
 from depthpose.pose.train import PoseTraining, SegmentationTraining
+from depthpose.pose.types import SeenPoints
 from depthpose.pose.voting import meet_lines, vote_ransac
 
 CONFIGS = Path(__file__).parents[2] / "configs"
@@ -275,8 +276,10 @@ def _answers(found: PoseNetworks) -> tuple[torch.Size, torch.Size]:
     features = torch.ones(len(plane), found.network.config.inputs)
     with torch.no_grad():
         voxels = Voxels.from_points(plane.int(), features)
-        seen = found.network.features(voxels).at_points()
-        return seen.shape, found.network.forward_class(seen, 0).shape
+        seen = SeenPoints(points_m=plane[:, 1:].float(), coordinates=plane.int(), features=features,
+                          class_of_point=torch.zeros(len(plane), dtype=torch.long))  # fmt: skip
+        answers = found.network.directions(seen)
+        return found.network.features(voxels).at_points().shape, answers.shape
 
 
 def _weights(module: nn.Module) -> str:

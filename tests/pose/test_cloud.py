@@ -10,7 +10,6 @@ from depthpose.core.errors import InputError
 from depthpose.core.files import read_depth_png, read_image
 from depthpose.pose.cloud import (
     cloud_from_depth,
-    is_flying,
     is_reading,
     refusal_of,
     sample_points,
@@ -43,8 +42,6 @@ def test_flying_pixels_are_dropped() -> None:
     mask[10:20, 20:36] = True
     assert len(cloud_from_depth(depth, mask, K)) == 160
     assert len(cloud_from_depth(depth, mask, K, diameter_m=0.1)) == 130
-    points = torch.tensor([[0.0, 0, 1], [0, 0, 1.01], [0, 0, 1.02], [0, 0, 1.5]])
-    assert is_flying(points, 0.1).tolist() == [False, False, False, True]
 
 
 def test_a_mask_of_another_size_is_refused() -> None:

@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+import torch.nn.functional as F
 from tests.pose.synthetic_objects import bottle, bracket, tiny_weights
 from torch import Tensor
 
@@ -14,7 +15,7 @@ from depthpose.core.errors import InputError
 from depthpose.pose.baselines import PointNet, PointNetConfig
 from depthpose.pose.export import direction_graph, pose_export
 from depthpose.pose.network import ResUNet, ResUNetConfig
-from depthpose.pose.sparse import Voxels, batch_coordinates
+from depthpose.pose.sparse import Voxels
 from depthpose.pose.weights import write_pose_weights
 
 onnxruntime = pytest.importorskip("onnxruntime")
@@ -27,7 +28,8 @@ def clouds(*counts: int, spread: int = 6, at: int = 0) -> Tensor:
         (torch.rand(count, 3) * 2 * spread - spread).floor().long().unique(dim=0) + at
         for count in counts
     ]
-    return batch_coordinates([one[torch.randperm(len(one))] for one in cells])
+    mixed = [one[torch.randperm(len(one))] for one in cells]
+    return torch.cat([F.pad(one, (1, 0), value=k) for k, one in enumerate(mixed)])
 
 
 @pytest.fixture(scope="module", params=["batch", "none"])

@@ -19,7 +19,7 @@ from depthpose.core.files import Cloud, cloud_suffixes, read_cloud
 from depthpose.core.files.cloud import CLOUD_READERS
 from depthpose.core.files.disk import AnyPath
 from depthpose.core.rigid import Rigid
-from depthpose.pose.datasets import LAYOUTS, Instance, Layout, is_bop, open_bop
+from depthpose.pose.datasets import LAYOUTS, Instance, Layout, open_bop
 from depthpose.pose.datasets.layouts import bop_instances
 from depthpose.pose.evaluate import METRICS, Metric
 from depthpose.pose.evaluate.errors import ErrorContext
@@ -86,13 +86,12 @@ def test_extending_layouts(
     (tmp_path / "own/test").rename(tmp_path / "scenes")
     (tmp_path / "own/test").mkdir()
     (tmp_path / "scenes").rename(tmp_path / "own/test/scenes")
-    assert not is_bop(tmp_path / "own")
+    assert not any(layout.splits(tmp_path / "own") for layout in LAYOUTS.values())
     monkeypatch.setitem(LAYOUTS, "own", Layout(splits=splits, instances=instances))
     dataset = open_bop(tmp_path / "own")
     assert (dataset.layout, len(dataset)) == ("own", len(known))
     assert torch.equal(dataset[0].truth.camera_from_model.R, known.instances[0].camera_from_model.R)
     # The commands take it: the check of a folder names it.
-    assert is_bop(tmp_path / "own")
     assert main(["data", "check", str(tmp_path / "own")]) == 0
     assert "own: 1 images, 2 instances" in capsys.readouterr().out
 

@@ -11,7 +11,7 @@ from depthpose.core.rigid import Rigid, geodesic_rad
 from depthpose.pose.config import EvaluationConfig
 from depthpose.pose.datasets import open_bop
 from depthpose.pose.evaluate import error_context
-from depthpose.pose.evaluate.errors import measure
+from depthpose.pose.evaluate.errors import METRICS
 from depthpose.pose.mesh import read_model, symmetries_from_bop, symmetry_transforms
 from depthpose.pose.metrics import (
     BOP_PIXELS,
@@ -79,7 +79,9 @@ def test_vsd_is_that_of_the_bop_toolkit(real: Path) -> None:
     true = replace(data.instances[0], camera_from_model=pose_of(first["R_est"], first["t_est"]))
     assert tuple(reference["taus"]) == BOP_SHARES
     for row in reference["rows"]:
-        ours = measure(pose_of(row["R_est"], row["t_est"]), true, context)["vsd"]
+        ours = torch.as_tensor(
+            METRICS["vsd"].measure(pose_of(row["R_est"], row["t_est"]), true, context)
+        )
         assert ours.tolist() == pytest.approx(row["vsd"], abs=0.01)
 
 

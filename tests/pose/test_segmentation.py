@@ -11,7 +11,6 @@ from torch import Tensor
 
 from depthpose.core.checkpoint import LicenceNotice, read_checkpoint, save_checkpoint
 from depthpose.core.errors import InputError
-from depthpose.pose.losses import mask_loss
 from depthpose.pose.segmentation import (
     FCN,
     SegmentationConfig,
@@ -22,9 +21,10 @@ from depthpose.pose.segmentation import (
     count_overlap,
     intersection_over_union,
     label_parts,
-    read_segmentation,
     write_segmentation,
 )
+from depthpose.pose.train.config import SegmentationTraining
+from depthpose.pose.train.masks import LabelledImage, SegmentationTask
 
 TINY = SegmentationConfig(widths=(4, 4, 8, 8), long_side_px=96)
 
@@ -55,27 +55,35 @@ def test_finer_levels_begin_without_a_say_and_the_enlargement_bilinear() -> None
     torch.testing.assert_close(found[..., 1:-1, 1:-1], twice[..., 1:-1, 1:-1])
 
 
+def loss_of(network: FCN, size: tuple[int, int], labels: Tensor, object_weight: float) -> Tensor:
+    config = replace(SegmentationTraining(), object_weight=object_weight)
+    batch = LabelledImage(torch.rand(len(labels), 3, *size), labels)
+    (update,) = SegmentationTask(network, config, {6: "cat", 5: "can"}).step(batch)
+    return update.loss
+
+
 def test_every_weight_learns() -> None:
     network = FCN(2, TINY)
-    loss = mask_loss(network(torch.rand(2, 3, 64, 64)), torch.randint(3, (2, 64, 64)), 2.0)
-    loss.backward()
+    loss_of(network, (64, 64), torch.randint(3, (2, 64, 64)), 2.0).backward()
     assert all(p.grad is not None and bool(p.grad.isfinite().all()) for p in network.parameters())
     finest = network.scores[2].get_parameter("weight").grad
     assert finest is not None
     assert float(finest.abs().sum()) > 0
 
 
-def test_the_loss_weighs_objects_as_a_sum_by_hand() -> None:
+def test_the_loss_weighs_objects_as_a_sum_by_hand(monkeypatch: pytest.MonkeyPatch) -> None:
     logits, labels = torch.randn(1, 3, 2, 2), torch.tensor([[[0, 1], [2, 0]]])
     each = -logits.log_softmax(1).gather(1, labels[:, None])[0, 0]
     weight = torch.tensor([[1.0, 5.0], [5.0, 1.0]])
-    assert torch.isclose(mask_loss(logits, labels, 5.0), (each * weight).sum() / 12)
+    network = FCN(2, TINY)
+    monkeypatch.setattr(network, "forward", lambda _: logits)
+    assert torch.isclose(loss_of(network, (2, 2), labels, 5.0), (each * weight).sum() / 12)
 
 
 def test_weights_come_back_with_their_objects(tmp_path: Path) -> None:
     weights = tiny_weights()
     write_segmentation(tmp_path / "w.safetensors", weights)
-    read = read_segmentation(tmp_path / "w.safetensors")
+    read = Segmenter.load(tmp_path / "w.safetensors").weights
     assert (read.objects, read.numbers, read.network.config) == (("cat", "can"), (6, 5), TINY)
     image = torch.rand(1, 3, 32, 32)
     assert torch.equal(read.network(image), weights.network(image))
@@ -87,7 +95,7 @@ def test_half_weights_are_half_as_large_and_near(tmp_path: Path) -> None:
     write_segmentation(tmp_path / "h.safetensors", weights, with_half=True)
     sizes = [(tmp_path / f"{n}.safetensors").stat().st_size for n in "wh"]
     assert sizes[1] < 0.75 * sizes[0]
-    read = read_segmentation(tmp_path / "h.safetensors")
+    read = Segmenter.load(tmp_path / "h.safetensors").weights
     image = torch.rand(1, 3, 32, 32)
     torch.testing.assert_close(read.network(image), weights.network(image), rtol=0.05, atol=0.05)
 
@@ -98,7 +106,7 @@ def test_weights_whose_objects_have_no_numbers_are_refused(tmp_path: Path) -> No
     held = read_checkpoint(path)
     save_checkpoint(path, replace(held, config={**held.config, "numbers": [1]}))
     with pytest.raises(InputError, match="names 2 objects and 1 numbers"):
-        read_segmentation(path)
+        Segmenter.load(path)
 
 
 def painted(shape: tuple[int, int], *boxes: tuple[int, int, int, int]) -> Tensor:

@@ -17,7 +17,6 @@ from depthpose.pose.sparse import (
     SparseConv,
     SparseConvTranspose,
     Voxels,
-    batch_coordinates,
     conv,
     kernel_offsets,
     pack,
@@ -246,8 +245,11 @@ def test_linear_in_features_and_in_weight(seed: int, a: float, b: float) -> None
 def test_clouds_of_a_batch_do_not_meet() -> None:
     one, two = cloud(30, 1, seed=5)[:, 1:], cloud(30, 1, seed=6)[:, 1:]
     layer = SparseConv(1, 4, 3, 2)
-    together = layer(Voxels.from_points(batch_coordinates([one, two])))
-    apart = [layer(Voxels.from_points(batch_coordinates([xyz]))) for xyz in (one, two)]
+    first, second, alone = (
+        F.pad(xyz, (1, 0), value=k) for xyz, k in ((one, 0), (two, 1), (two, 0))
+    )
+    together = layer(Voxels.from_points(torch.cat([first, second])))
+    apart = [layer(Voxels.from_points(xyz)) for xyz in (first, alone)]
     torch.testing.assert_close(together.features, torch.cat([v.features for v in apart]))
 
 
@@ -335,11 +337,6 @@ def test_points_in_one_voxel_are_refused() -> None:
     x = torch.tensor([[1.0], [10.0], [3.0]])
     with pytest.raises(InputError, match=r"1 points share .* \[1, 0, 0\] of cloud 0; keep one"):
         Voxels.from_points(coordinates, x)
-
-
-def test_a_batch_needs_a_cloud() -> None:
-    with pytest.raises(InputError, match="a cloud at least"):
-        batch_coordinates([])
 
 
 @pytest.mark.gpu

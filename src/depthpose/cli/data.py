@@ -190,9 +190,10 @@ def check(
     from tqdm import tqdm
 
     from depthpose.depth.datasets import check_dataset
-    from depthpose.pose.datasets import check_bop, is_bop
+    from depthpose.pose.datasets import LAYOUTS, check_bop
 
-    check_folder = check_bop if is_bop(path) else check_dataset
+    is_bop = any(layout.splits(path) for layout in LAYOUTS.values())
+    check_folder = check_bop if is_bop else check_dataset
     with tqdm(unit=" frames", leave=False, disable=None) as bar:
 
         def show(done: int, total: int) -> None:

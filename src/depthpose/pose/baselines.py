@@ -148,22 +148,18 @@ class DepthImageNet(nn.Module):
 
 
 def poses_of(outputs: Float[Tensor, "b 9"], crop: DepthCrop) -> Rigid:
-    """Turn what the network says of crops into poses ``camera_from_model``."""
-    shift = crop.side_m[:, None] * outputs[:, 6:]
-    t_m = crop.middle_m + (crop.R @ shift[..., None]).squeeze(-1)
-    return Rigid(crop.R @ rotation_from_6d(outputs[:, :6]), t_m)
+    """Turn what the network says of crops into poses ``camera_from_model``.
 
-
-def rotation_from_6d(numbers: Float[Tensor, "*b 6"]) -> Float[Tensor, "*b 3 3"]:
-    """Make a rotation of its first two columns, not yet of unit length nor orthogonal.
-
-    By Gram and Schmidt: continuous, as no form of three or four numbers is (Zhou et al., CVPR
+    Six numbers are the first two columns of a rotation, not yet of unit length nor orthogonal, made
+    one by Gram and Schmidt: continuous, as no form of three or four numbers is (Zhou et al., CVPR
     2019). Undefined where the columns are parallel or zero.
     """
-    first = F.normalize(numbers[..., :3], dim=-1)
-    second = numbers[..., 3:]
+    first, second = F.normalize(outputs[:, :3], dim=-1), outputs[:, 3:6]
     second = F.normalize(second - (first * second).sum(-1, keepdim=True) * first, dim=-1)
-    return torch.stack([first, second, torch.linalg.cross(first, second)], -1)
+    R = torch.stack([first, second, torch.linalg.cross(first, second)], -1)
+    shift = crop.side_m[:, None] * outputs[:, 6:]
+    t_m = crop.middle_m + (crop.R @ shift[..., None]).squeeze(-1)
+    return Rigid(crop.R @ R, t_m)
 
 
 _TRANSFORM_POOLED, _TRANSFORM_HEAD = (64, 128, 1024), (512, 256)

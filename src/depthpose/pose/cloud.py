@@ -80,7 +80,9 @@ def prepare_cloud(
     points_m = take_evenly(points_m[is_reading(points_m)], config.max_cloud_points)
     if len(points_m) == 0:
         return Refusal(status="too few points", reason=nothing)
-    kept_m = points_m[~is_flying(points_m, cloud.max_offset_diameters * model.diameter_m)]
+    # What is far from the median is background at the mask's border.
+    off_m = (points_m - points_m.median(0).values).norm(dim=-1)
+    kept_m = points_m[~(off_m > cloud.max_offset_diameters * model.diameter_m)]
     if (refusal := _refusal_of(given, points_m, kept_m, model, cloud)) is not None:
         return refusal
     generator = torch.Generator().manual_seed(config.voting.seed)
@@ -193,7 +195,8 @@ def cloud_from_depth(
     if diameter_m is None or len(points_m) == 0:
         return points_m
     config = CloudConfig() if config is None else config
-    return points_m[~is_flying(points_m, diameter_m * config.max_offset_diameters)]
+    off_m = (points_m - points_m.median(0).values).norm(dim=-1)
+    return points_m[~(off_m > diameter_m * config.max_offset_diameters)]
 
 
 def lift_sample(view: ViewSample, diameter_m: float, config: CloudConfig) -> CloudSample:
@@ -222,11 +225,6 @@ def grow_mask(mask: Bool[Tensor, "h w"], grow_px: int) -> Bool[Tensor, "h w"]:
     wide = F.max_pool2d(source, (1, size), 1, (0, size // 2))
     grown = F.max_pool2d(wide, (size, 1), 1, (size // 2, 0))[0, 0] > 0
     return grown if grow_px > 0 else ~grown
-
-
-def is_flying(points_m: Float[Tensor, "n 3"], limit_m: float) -> Bool[Tensor, " n"]:
-    """Mark points farther than ``limit_m`` from the median: background at the mask's border."""
-    return (points_m - points_m.median(0).values).norm(dim=-1) > limit_m
 
 
 def is_reading(points_m: Float[Tensor, "n 3"]) -> Bool[Tensor, " n"]:

@@ -6,6 +6,7 @@ from typing import Any, cast
 
 import numpy as np
 import torch
+import torch.nn.functional as F
 from torch import Tensor
 
 from depthpose.core.config import config_to_dict
@@ -13,7 +14,7 @@ from depthpose.core.errors import InputError
 from depthpose.core.export import Case, Export, Graph, Limit, Value
 from depthpose.pose.mesh.models import sample_surface
 from depthpose.pose.network import Block, ConvNorm, ResUNet, fold_norms
-from depthpose.pose.sparse import SparseConv, Voxels, batch_coordinates, kernel_offsets
+from depthpose.pose.sparse import SparseConv, Voxels, kernel_offsets
 from depthpose.pose.weights import PoseWeights
 
 LEVELS = 4
@@ -141,7 +142,7 @@ def _cases(weights: PoseWeights, network: ResUNet) -> Iterator[Case]:
             cells = torch.floor(points_m / weights.cloud.voxel_m).long().unique(dim=0)
             chance = torch.Generator().manual_seed(count)
             clouds.append(cells[torch.randperm(len(cells), generator=chance)])
-        coordinates = batch_coordinates(clouds)
+        coordinates = torch.cat([F.pad(xyz, (1, 0), value=i) for i, xyz in enumerate(clouds)])
         generator = torch.Generator().manual_seed(0)
         features = torch.ones(len(coordinates), network.config.inputs)
         if network.config.inputs > 1:

@@ -65,18 +65,6 @@ def direction_loss(
     return means.sum() / (points > 0).sum()
 
 
-def mask_loss(
-    logits: Float[Tensor, "b classes h w"], labels: Int[Tensor, "b h w"], object_weight: float
-) -> Float[Tensor, ""]:
-    """Cross entropy of each pixel; one of an object weighs ``object_weight`` times the background.
-
-    Class 0 is the background; it dominates at a weight of 1, for objects cover a few percent.
-    """
-    weight = logits.new_full((logits.shape[1],), object_weight)
-    weight[0] = 1.0
-    return F.cross_entropy(logits, labels, weight)
-
-
 def model_point_loss(
     found: Rigid, truth: Rigid, points_m: Float[Tensor, "b n 3"], copies: Rigid
 ) -> Float[Tensor, " b"]:

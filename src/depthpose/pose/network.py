@@ -157,21 +157,15 @@ class ResUNet(nn.Module):
         mixed = self.features(voxels)
         features = mixed.features[mixed.row_of_point]
         answers = features.new_empty(len(features), self.config.keypoints, 3)
-        for number in seen.class_of_point.unique().tolist():
-            mine = seen.class_of_point == number
-            answers[mine] = self.forward_class(features[mine], number).to(answers)
-        return answers
-
-    def forward_class(
-        self, features: Float[Tensor, "n width"], number: int
-    ) -> Float[Tensor, "n keypoints 3"]:
-        """Answer for one class alone from :meth:`features` of points, without the other classes."""
         assert self.final.bias is not None
-        assert 0 <= number < self.config.classes, f"class {number} of {self.config.classes}"
         size = self.config.keypoints * 3
-        part = slice(number * size, (number + 1) * size)
-        outputs = features @ self.final.weight[0, :, part] + self.final.bias[part]
-        return outputs.view(len(outputs), self.config.keypoints, 3)
+        for number in seen.class_of_point.unique().tolist():  # without the other classes
+            assert 0 <= number < self.config.classes, f"class {number} of {self.config.classes}"
+            mine = seen.class_of_point == number
+            part = slice(number * size, (number + 1) * size)
+            outputs = features[mine] @ self.final.weight[0, :, part] + self.final.bias[part]
+            answers[mine] = outputs.view(len(outputs), self.config.keypoints, 3).to(answers)
+        return answers
 
     def features(self, voxels: Voxels) -> Voxels:
         """Give what the last layer sees: the features of figure 3-2."""

@@ -21,7 +21,7 @@ from depthpose.core.files.disk import read_bytes, refuse_heavy, refused_as, writ
 from depthpose.core.frame import data_frame
 from depthpose.core.rigid import Rigid
 from depthpose.core.run import claim_folder
-from depthpose.pose.datasets import BopDataset, Detection, Instance, read_mask
+from depthpose.pose.datasets import BopDataset, Detection, Instance, decode_rle, read_mask
 from depthpose.pose.datasets.layouts import MOST, integer, make_pose, number, read_rows
 from depthpose.pose.types import (
     POSED,
@@ -376,7 +376,7 @@ def _read_view(
     dataset: BopDataset, instance: Instance, name: str, object: str, mask: Path | Detection | None
 ) -> ViewInput:
     """Read the view of an instance by the mask of a file or a detection; None: its own."""
-    pixels = mask.mask if isinstance(mask, Detection) else None
+    pixels = decode_rle(*mask.segmentation) if isinstance(mask, Detection) else None
     if isinstance(mask, Path):
         pixels = read_mask(mask)
     return replace(dataset.view(instance, pixels).input, name=name, object=object)

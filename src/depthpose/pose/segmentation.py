@@ -231,24 +231,6 @@ def write_segmentation(
     save_checkpoint(path, Checkpoint(kind=KIND, config=config, state=state, facts=weights.facts))
 
 
-def read_segmentation(path: Path) -> SegmentationWeights:
-    """Read what :func:`write_segmentation` wrote.
-
-    Raises:
-        InputError: no such weights, or weights that do not fit their own config.
-    """
-    checkpoint = read_checkpoint(path, KIND)
-    config = config_from_dict(checkpoint.config, _FileConfig, source=str(path))
-    if len(config.objects) != len(config.numbers) or not config.objects:
-        raise InputError(
-            f"{path}: its config names {len(config.objects)} objects and {len(config.numbers)} "
-            "numbers; each object has both. Export it again."
-        )
-    network = build_network(lambda: FCN(len(config.objects), config.network), checkpoint, str(path))
-    return SegmentationWeights(network=network.eval(), objects=config.objects,
-                               numbers=config.numbers, facts=checkpoint.facts)  # fmt: skip
-
-
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Segmentation:
     """What one image shows."""
@@ -277,9 +259,21 @@ class Segmenter:
         """Load weights by path, or by the name of weights that came with the package.
 
         Raises:
-            InputError: there is no such file, or it holds something else.
+            InputError: there is no such file, or it holds something else, or weights that do not
+                fit their own config.
         """
-        weights = read_segmentation(find_weights(name))
+        path = find_weights(name)
+        checkpoint = read_checkpoint(path, KIND)
+        config = config_from_dict(checkpoint.config, _FileConfig, source=str(path))
+        classes = len(config.objects)
+        if classes != len(config.numbers) or not classes:
+            raise InputError(
+                f"{path}: its config names {classes} objects and {len(config.numbers)} numbers; "
+                "each object has both. Export it again."
+            )
+        network = build_network(lambda: FCN(classes, config.network), checkpoint, str(path))
+        weights = SegmentationWeights(network=network.eval(), objects=config.objects,
+                                      numbers=config.numbers, facts=checkpoint.facts)  # fmt: skip
         warn_of_terms(weights.facts)
         return cls(weights, device)
 

@@ -14,7 +14,7 @@ Every way of computing a convolution is gather, multiply, add up; the ways diffe
 gathered at once. Without gradients small ones go through a compiled loop, where numba is installed.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any, Literal, NamedTuple
@@ -66,14 +66,6 @@ def unpack(keys: Keys) -> Int64[Tensor, "n 4"]:
     low = (1 << FIELD_BITS) - 1
     x, y, z = ((keys >> shift * FIELD_BITS & low) - HALF for shift in (2, 1, 0))
     return torch.stack([keys >> 3 * FIELD_BITS, x, y, z], 1)
-
-
-def batch_coordinates(clouds: Sequence[Int[Tensor, "_ 3"]]) -> Int[Tensor, "n 4"]:
-    """Put the voxel coordinates of several clouds under each other, each with its number."""
-    if not clouds:
-        raise InputError("a batch needs a cloud at least, got none; an empty cloud is one too")
-    numbered = [F.pad(xyz, (1, 0), value=i) for i, xyz in enumerate(clouds)]
-    return torch.cat(numbered)
 
 
 Moves = tuple[tuple[int, int, int], ...]

@@ -150,8 +150,6 @@ def _view_of(surface: Surface, toward: Tensor, across: Tensor) -> tuple[Tensor, 
     picture_m = most_m.reshape(1, side, side)
     is_seen = most_m > max_pool2d(picture_m, 3, 1, 1).flatten() - BESIDE * surface.diameter_m
     is_seen &= most_m.isfinite()
-    cells = _spread(is_seen.nonzero()[:, 0], _POINTS)
-    shown = first[cells]
     filled = is_seen.double().reshape(1, side, side)
     wide, narrow = (max_pool2d(filled, size, 1, size // 2) for size in (5, 3))
     # Neither at the silhouette, single empty cells aside, nor beside something farther off.
@@ -160,7 +158,13 @@ def _view_of(surface: Surface, toward: Tensor, across: Tensor) -> tuple[Tensor, 
     is_inner = (whole > 0) & (-farther_m > picture_m - BESIDE * surface.diameter_m)
     shown_m = torch.where(filled > 0, picture_m, 0.0)
     border_m = avg_pool2d(shown_m, 5, 1, 2) / avg_pool2d(filled, 5, 1, 2)
-    ring = _spread(((wide > 0) & (narrow == 0)).flatten().nonzero()[:, 0], _RING)
+    # So many at most, in an order of chance: the first ones are a sample of all.
+    found = is_seen.nonzero()[:, 0], ((wide > 0) & (narrow == 0)).flatten().nonzero()[:, 0]
+    cells, ring = (
+        index[torch.randperm(len(index), generator=torch.Generator().manual_seed(0))[:most]]
+        for index, most in zip(found, (_POINTS, _RING), strict=True)
+    )
+    shown = first[cells]
     at = torch.stack([ring % side, ring.div(side, rounding_mode="floor")], -1).double()
     at += 0.5 - side // 2
     beside_m = at * cell_m @ across + border_m.flatten()[ring, None] * toward + surface.middle_m
@@ -171,12 +175,6 @@ def _view_of(surface: Surface, toward: Tensor, across: Tensor) -> tuple[Tensor, 
     )
     inner = pad(is_inner.flatten()[cells], (0, _POINTS - len(cells)))
     return points_m, normals, inner, beside_m
-
-
-def _spread(index: Int64[Tensor, " n"], most: int) -> Int64[Tensor, " m"]:
-    """Take so many at most, in an order of chance: the first ones are a sample of all."""
-    chance = torch.randperm(len(index), generator=torch.Generator().manual_seed(0))
-    return index[chance[:most]]
 
 
 def prepare_surface(model: ObjectModel, count: int = 10_000) -> Surface:

@@ -22,8 +22,7 @@ from depthpose.pose.estimator import GeoPoseNet
 from depthpose.pose.evaluate import ObjectRow
 from depthpose.pose.metrics import SUCCESS_SHARE, add_m, adds_m
 from depthpose.pose.network import ResUNet
-from depthpose.pose.sparse import Voxels
-from depthpose.pose.types import ObjectModel, ViewSample
+from depthpose.pose.types import ObjectModel, SeenPoints, ViewSample
 from depthpose.pose.voting import fit_pose, meet_lines, vote_ransac
 
 TITLES = {
@@ -271,10 +270,14 @@ def cases_of(
             continue
         grid = voxelise(points_m, net.weights.cloud)
         places = torch.nn.functional.pad(grid.coordinates, (1, 0))
-        voxels = Voxels.from_points(places, grid.features)
+        given = SeenPoints(
+            points_m=points_m[grid.kept],
+            coordinates=places,
+            features=grid.features,
+            class_of_point=torch.full((len(places),), number),
+        )
         with torch.inference_mode():
-            outputs = network.forward_class(network.features(voxels).at_points(), number)
-            outputs = outputs @ grid.grid_from_camera
+            outputs = network.directions(given) @ grid.grid_from_camera
             directions = torch.nn.functional.normalize(outputs, dim=-1)[grid.row_of_point]
         yield VotingCase(
             points_m=points_m,

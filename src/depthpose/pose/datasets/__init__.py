@@ -4,7 +4,6 @@ from depthpose.pose.datasets.dataset import BopDataset as BopDataset
 from depthpose.pose.datasets.dataset import BopFrame as BopFrame
 from depthpose.pose.datasets.dataset import BopObject as BopObject
 from depthpose.pose.datasets.dataset import check_bop as check_bop
-from depthpose.pose.datasets.dataset import is_bop as is_bop
 from depthpose.pose.datasets.dataset import open_bop as open_bop
 from depthpose.pose.datasets.dataset import write_bop_models as write_bop_models
 from depthpose.pose.datasets.dataset import write_bop_scene as write_bop_scene

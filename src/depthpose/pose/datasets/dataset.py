@@ -35,7 +35,6 @@ from depthpose.pose.cloud import (
     unit_advice,
 )
 from depthpose.pose.datasets.layouts import (
-    LAYOUTS,
     Instance,
     layout_of,
     object_names,
@@ -152,11 +151,6 @@ def open_bop(folder: str | Path, split: str = "test") -> BopDataset:
         instances=instances,
         sha256=said.hexdigest(),
     )
-
-
-def is_bop(folder: str | Path) -> bool:
-    """Whether a folder holds a data set that :func:`open_bop` knows."""
-    return any(layout.splits(Path(folder)) for layout in LAYOUTS.values())
 
 
 def read_instance_mask(instance: Instance) -> Bool[Tensor, "mask_h mask_w"]:

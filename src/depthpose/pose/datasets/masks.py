@@ -191,11 +191,6 @@ class Detection:
     segmentation: Runs  #: run lengths as in the file, checked
     seconds: float | None = None  #: what the image took, where it is said
 
-    @property
-    def mask(self) -> Bool[Tensor, "h w"]:
-        """The object's pixels."""
-        return decode_rle(*self.segmentation)
-
 
 def read_detections(path: str | Path) -> list[Detection]:
     """Read a file of detections; run lengths compressed or not.
@@ -235,7 +230,7 @@ def write_detections(path: str | Path, detections: Sequence[Detection]) -> None:
             "image_id": one.image_id,
             "category_id": one.object_id,
         }
-        row |= {"score": one.score, "bbox": mask_box(one.mask)}
+        row |= {"score": one.score, "bbox": mask_box(decode_rle(*one.segmentation))}
         row["segmentation"] = {"size": [height, width], "counts": list(counts)}
         rows.append(row | {"time": -1.0 if one.seconds is None else one.seconds})
     write_json(Path(path), rows)

@@ -458,7 +458,10 @@ def observability(
     # Declared symmetries as motions about the middle, turns in metres at the radius.
     turn, shift = free[:, :3].double(), free[:, 3:].double()
     own = torch.cat([turn * radius_m, shift + turn @ cross_matrix(middle)], -1)
-    basis = torch.eye(6).double() if len(own) == 0 else _complement(own)
+    basis = torch.eye(6).double()
+    if len(own):  # an orthonormal basis of what is orthogonal to all of them
+        _, sizes, rows = torch.linalg.svd(own)
+        basis = rows[int((sizes > 1e-9 * sizes[0]).sum()) :].T
     values, vectors = torch.linalg.eigh(basis.T @ (J.T @ J / len(J)) @ basis)
     return float(values[0].clamp(min=0).sqrt()), basis @ vectors[:, 0]
 
@@ -467,18 +470,12 @@ def without_motions(
     covariance: Float[Tensor, "6 6"], free: Float[Tensor, "m 6"]
 ) -> Float[Tensor, "6 6"]:
     """Give the covariance where the pose does not move along ``free``: finite, and 0 along them."""
-    basis = _complement(free.double())
+    _, sizes, rows = torch.linalg.svd(free.double())
+    basis = rows[int((sizes > 1e-9 * sizes[0]).sum()) :].T
     # Rotations and metres differ in size; the information of the rest is what counts.
     information = torch.linalg.inv(covariance.double())
     inner = torch.linalg.inv(basis.T @ information @ basis)
     return (basis @ inner @ basis.T).to(covariance)
-
-
-def _complement(motions: Float64[Tensor, "m 6"]) -> Float64[Tensor, "6 r"]:
-    """Give an orthonormal basis of what is orthogonal to all of the motions."""
-    _, values, rows = torch.linalg.svd(motions)
-    rank = int((values > 1e-9 * values[0]).sum())
-    return rows[rank:].T
 
 
 def answer_of(

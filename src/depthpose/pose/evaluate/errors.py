@@ -66,20 +66,6 @@ class Metric:
     has_median: bool = False  #: whether rows of objects hold the median of answers, ``NAME_median``
 
 
-def measure(
-    estimated: Rigid | None, instance: Instance, context: ErrorContext
-) -> dict[str, Errors]:
-    """Measure one estimate by every metric of ``METRICS`` that is wanted."""
-    found: dict[str, Errors] = {}
-    for name, metric in METRICS.items():
-        if metric.is_wanted(context):
-            error = metric.missing
-            if estimated is not None:
-                error = metric.measure(estimated, instance, context)
-            found[name] = torch.as_tensor(error, dtype=torch.float64).reshape(-1)
-    return found
-
-
 def nearest_copy(
     estimated: Rigid, true: Rigid, symmetries: Rigid, declared: Symmetries | None = None
 ) -> Rigid:

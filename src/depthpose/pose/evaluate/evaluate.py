@@ -21,7 +21,6 @@ from depthpose.pose.evaluate.errors import (
     Errors,
     convention_advice,
     match,
-    measure,
 )
 from depthpose.pose.mesh import drawn_triangles, symmetry_transforms
 from depthpose.pose.metrics import SUCCESS_SHARE
@@ -395,7 +394,11 @@ def _instance_row(
     instance: Instance, estimate: PoseEstimate | None, context: ErrorContext, stages: list[str]
 ) -> InstanceRow:
     pose = None if estimate is None else estimate.camera_from_model
-    errors = measure(pose, instance, context)
+    errors: dict[str, Errors] = {}
+    for name, metric in METRICS.items():
+        if metric.is_wanted(context):
+            error = metric.missing if pose is None else metric.measure(pose, instance, context)
+            errors[name] = torch.as_tensor(error, dtype=torch.float64).reshape(-1)
     seconds = {} if estimate is None else estimate.seconds
     ms = {stage: 1000 * seconds[stage] if stage in seconds else None for stage in stages}
     return InstanceRow(

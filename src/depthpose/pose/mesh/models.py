@@ -234,23 +234,6 @@ def gap_to_surface_m(points_m: Float[Tensor, "n 3"], model: ObjectModel) -> floa
     return float(torch.cdist(points_m, surface_m).amin(1).max())
 
 
-def estimate_normals(points_m: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3"]:
-    """Estimate unit normals of bare points by the plane through the nearest 16, pointing outward.
-
-    Outward is away from the mean of the points: right for convex parts alone. What needs no side,
-    as point-to-plane distance, may use them everywhere.
-    """
-    points = points_m.double().cpu().numpy()
-    _, index = KDTree(points).query(points, k=min(_NORMAL_NEIGHBOURS, len(points)))
-    near = points[index.reshape(len(points), -1)]
-    near = near - near.mean(1, keepdims=True)
-    _, axes = np.linalg.eigh(near.transpose(0, 2, 1) @ near)
-    normals = axes[:, :, 0]
-    is_inward = ((points - points.mean(0)) * normals).sum(-1) < 0
-    normals[is_inward] *= -1
-    return torch.from_numpy(normals).to(points_m)
-
-
 def fibonacci_directions(count: int) -> Float[Tensor, "count 3"]:
     """Spread unit vectors evenly over half of the sphere (an axis needs no sign)."""
     i = torch.arange(count, dtype=torch.float64) + 0.5
@@ -341,7 +324,16 @@ def make_model(
             total.index_add_(0, faces[:, corner], doubled)
         normals = (total / total.norm(dim=-1, keepdim=True).clamp(min=1e-300)).to(vertices_m)
     else:
-        normals = estimate_normals(vertices_m)
+        # By the plane through the nearest 16, pointing away from the mean of the points: right for
+        # convex parts alone. What needs no side, as point-to-plane distance, may use them anywhere.
+        points = vertices_m.double().cpu().numpy()
+        _, index = KDTree(points).query(points, k=min(_NORMAL_NEIGHBOURS, len(points)))
+        near = points[index.reshape(len(points), -1)]
+        near = near - near.mean(1, keepdims=True)
+        _, axes = np.linalg.eigh(near.transpose(0, 2, 1) @ near)
+        outward = axes[:, :, 0]
+        outward[((points - points.mean(0)) * outward).sum(-1) < 0] *= -1
+        normals = torch.from_numpy(outward).to(vertices_m)
     model = ObjectModel(
         name=name,
         number=number,

@@ -28,7 +28,6 @@ from depthpose.core.loop import (
 from depthpose.core.run import find_rank
 from depthpose.pose.datasets import Instance, object_names, open_bop
 from depthpose.pose.datasets.dataset import read_instance_mask
-from depthpose.pose.losses import mask_loss
 from depthpose.pose.segmentation import (
     ENCODER_KIND,
     FCN,
@@ -176,7 +175,10 @@ def jitter_colors(
 
 
 class SegmentationTask:
-    """Cross entropy of each pixel, objects weighing more."""
+    """Cross entropy of each pixel, those of objects weighing more than the background.
+
+    At one weight the background dominates, for objects cover a few percent.
+    """
 
     def __init__(
         self, network: FCN, config: SegmentationTraining, objects: Mapping[int, str]
@@ -192,7 +194,9 @@ class SegmentationTask:
     def step(self, batch: LabelledImage) -> Iterator[Update]:
         """One update: label and compare."""
         logits = self.network(normalise_colors(batch.image)).float()
-        loss = mask_loss(logits, batch.labels, self.config.object_weight)
+        weight = logits.new_full((logits.shape[1],), self.config.object_weight)
+        weight[0] = 1.0
+        loss = F.cross_entropy(logits, batch.labels, weight)
         table = count_overlap(logits.argmax(1), batch.labels, self.network.classes)
         iou = intersection_over_union(table)[1:].nanmean().nan_to_num(0.0)
         yield Update("network", loss, {"iou": iou})
