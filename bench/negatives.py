@@ -15,11 +15,12 @@ from depthpose.pose.synthetic.parts import (
     PARTS,
     Mesh,
     box,
+    circle,
     joined,
     make_part,
     moved,
     revolved,
-    tube,
+    ring,
     turned,
 )
 from depthpose.pose.synthetic.views import random_rotation, uniform, whole
@@ -175,7 +176,7 @@ def random_simple_part(generator: torch.Generator, name: str = "part") -> Object
     left, middle, right = (moved(web, (x, depth / 2, 0.0)) for x in (-edge, 0.0, edge))
     solids = [
         box((width, depth, length)),
-        tube(width / 2, bore * width / 2, length),
+        ring(circle(width / 2), circle(bore * width / 2), length),
         _cup(width / 2, length, wall),
         joined(foot, left),
         joined(foot, middle),
@@ -198,5 +199,5 @@ def _random_solid(generator: torch.Generator) -> Mesh:
         return box((uniform(generator, 4.0, 80.0), uniform(generator, 4.0, 60.0), height))
     low, high = uniform(generator, 3.0, 35.0), uniform(generator, 3.0, 35.0)
     if kind == 1:
-        return tube(low, uniform(generator, 0.2, 0.8) * low, height)
+        return ring(circle(low), circle(uniform(generator, 0.2, 0.8) * low), height)
     return revolved([(0.0, 0.0), (low, 0.0), (high, height), (0.0, height)])

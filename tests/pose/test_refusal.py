@@ -38,7 +38,6 @@ from depthpose.pose.estimator.fit import (
     with_status,
 )
 from depthpose.pose.surface import prepare_surface
-from depthpose.pose.synthetic.views import shift_mask
 from depthpose.pose.types import Fit, ObjectModel, PoseEstimate, ViewInput
 
 TRUTH = pose_at()
@@ -84,7 +83,8 @@ def test_the_true_pose_fits_and_the_noise_is_that_of_the_sensor(as_cloud: bool) 
 def test_a_real_sensors_errors_are_no_misfit(grow_px: int, right_px: int, offset_m: float) -> None:
     """Masks are dilated, eroded or shifted; all readings are off along the ray alike."""
     view = seen_in(bracket(), 0.001)
-    mask = shift_mask(grow_mask(view.mask, grow_px), 0, right_px)
+    mask = grow_mask(view.mask, grow_px).roll(right_px, 1)
+    mask[:, :right_px] = False
     found = fit(replace(view, mask=mask, depth_m=view.depth_m + offset_m))
     assert misfit_of(found, RefusalConfig()) is None, found
 

@@ -10,7 +10,6 @@ from depthpose.pose.network import ResUNet, ResUNetConfig
 from depthpose.pose.synthetic import make_part
 from depthpose.pose.train import PoseTask, PoseTraining
 from depthpose.pose.train.clouds import CloudBatch
-from depthpose.pose.train.poses import keypoint_copies
 from depthpose.pose.types import SeenPoints
 
 _SMALL = ResUNetConfig(classes=1, first_kernel=3, encoder=(4, 4, 8, 8), decoder=(4, 4, 4, 8))
@@ -52,7 +51,7 @@ def test_each_declared_symmetry_leaves_the_loss_as_it_is(part: str, copies: int,
     config = PoseTraining(loss=mode)
     task = PoseTask(network, [model], config)
     # Near one truth, but right for none: the choice of the copy has a say.
-    towards = pose.apply(keypoint_copies([model])[0, -1].double()) - points_m[:, None]
+    towards = pose.apply(task._copies_m[0, -1].double()) - points_m[:, None]
     noise = 0.3 * torch.randn(towards.shape, generator=generator)
     network.answer = (torch.nn.functional.normalize(towards, dim=-1) + noise).float()
 

@@ -42,7 +42,7 @@ from depthpose.pose.train.clouds import (
     score_held_out,
     table_text,
 )
-from depthpose.pose.train.poses import keypoint_copies, packed
+from depthpose.pose.train.poses import packed
 from depthpose.pose.types import ObjectModel, PoseEstimate, SeenPoints, Symmetries
 from depthpose.pose.weights import (
     PoseWeights,
@@ -125,7 +125,7 @@ class _Oracle(ResUNet):
 
 
 def _truth_of(batch, models, copy: int) -> torch.Tensor:  # noqa: ANN001
-    copies = keypoint_copies(models)[batch.class_of, copy]
+    copies = PoseTask(_Oracle(_SMALL), models, _training())._copies_m[batch.class_of, copy]
     posed = copies @ batch.R.mT + batch.t_m[:, None]
     way = posed[batch.coordinates[:, 0].long()] - batch.points_m[:, None]
     return F.normalize(way, dim=-1)
@@ -148,7 +148,7 @@ def test_true_directions_cost_nothing_whichever_copy_they_point_at(copy: int) ->
 
 
 def test_copies_of_the_keypoints_lie_on_the_turned_object() -> None:
-    copies = keypoint_copies(_models())
+    copies = PoseTask(_Oracle(_SMALL), _models(), _training())._copies_m
     assert copies.shape == (2, 63, 8, 3)
     assert torch.equal(copies[0], copies[0, :1].expand(63, -1, -1))
     height, radius = copies[1, ..., 2], copies[1, ..., :2].norm(dim=-1)

@@ -19,7 +19,14 @@ from depthpose.core.checkpoint import (
 )
 from depthpose.core.errors import InputError
 from depthpose.core.files import write_image
-from depthpose.core.loop import AdamConfig, LoopConfig, Run, read_metrics
+from depthpose.core.loop import (
+    AdamConfig,
+    LoopConfig,
+    Run,
+    read_metrics,
+    sample_generator,
+    shuffled_index,
+)
 from depthpose.core.rigid import Rigid
 from depthpose.pose.baselines import DepthImageConfig, DepthImageNet, PointNetConfig
 from depthpose.pose.config import CloudConfig, ObjectsConfig
@@ -27,6 +34,7 @@ from depthpose.pose.datasets import BopFrame, BopObject, write_bop_models, write
 from depthpose.pose.estimator import DepthImageRegressor, GeoPoseNet
 from depthpose.pose.segmentation import ResNet18, SegmentationConfig, Segmenter
 from depthpose.pose.synthetic import Objects
+from depthpose.pose.synthetic.views import uniform
 from depthpose.pose.train import (
     STAGES,
     DepthImageTraining,
@@ -41,7 +49,6 @@ from depthpose.pose.train.masks import (
     LabelledImage,
     TrainingImages,
     cut_window,
-    jitter_colors,
 )
 from depthpose.pose.train.poses import DepthImageTask, TrainingCrops, symmetric_copies
 from depthpose.pose.types import CloudInput
@@ -261,15 +268,6 @@ def test_a_window_keeps_image_and_labels_together(scale: float) -> None:
         assert float(right.float().mean()) > 0.97
 
 
-def test_colors_change_within_their_bounds_and_by_the_generator_alone() -> None:
-    image = torch.rand(3, 8, 8)
-    draws = [jitter_colors(image, 0.3, torch.Generator().manual_seed(s)) for s in (0, 0, 1)]
-    assert torch.equal(draws[0], draws[1])
-    assert not torch.equal(draws[0], draws[2])
-    torch.testing.assert_close(jitter_colors(image, 0.0, torch.Generator()), image)
-    assert 0 <= float(draws[0].min()) <= float(draws[0].max()) <= 1
-
-
 def segmentation_config(folder: Path, steps: int) -> SegmentationTraining:
     return SegmentationTraining(
         images=ImagesConfig(folder=str(folder)),
@@ -355,6 +353,22 @@ def test_training_images_are_the_same_for_the_same_index(colored: Path) -> None:
     assert torch.equal(samples[11].image, again[11].image)
     assert torch.equal(samples[11].labels, again[11].labels)
     assert not torch.equal(samples[11].image, samples[12].image)
+
+
+def test_colors_change_within_their_bounds_and_nothing_else_does(colored: Path) -> None:
+    config = segmentation_config(colored, 1)
+    images, side_px = AnnotatedImages(config.images), config.network.long_side_px
+    plain, changed = (
+        TrainingImages(images, dataclasses.replace(config.augment, jitter=jitter), side_px, 3)[11]
+        for jitter in (0.0, 0.3)
+    )
+    given, generator = images[shuffled_index(11, len(images), 3)], sample_generator(11, 3)
+    scale = side_px / max(given.image.shape[-2:]) * uniform(generator, *config.augment.scale)
+    cut = cut_window(given, scale, config.augment.crop_px, generator)
+    torch.testing.assert_close(plain.image, cut.image)
+    assert torch.equal(plain.labels, changed.labels)
+    assert not torch.equal(plain.image, changed.image)
+    assert 0 <= float(changed.image.min()) <= float(changed.image.max()) <= 1
 
 
 def test_a_crop_that_the_network_cannot_halve_is_refused() -> None:

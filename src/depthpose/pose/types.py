@@ -1,6 +1,6 @@
 """Types of the pose package: input apart from truth, the object, and the estimate."""
 
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field
 from typing import Literal
 
 import torch
@@ -53,10 +53,6 @@ class SeenPoints:
     coordinates: Int[Tensor, "points 4"]  #: (cloud, x, y, z) of its voxel
     features: Float[Tensor, "points c"]  #: of its voxel
     class_of_point: Int[Tensor, " points"]  #: which object each belongs to
-
-    def to(self, device: str | torch.device) -> "SeenPoints":
-        """Give the same on a device."""
-        return SeenPoints(**{f.name: getattr(self, f.name).to(device) for f in fields(self)})
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

@@ -63,14 +63,14 @@ def part_mesh(name: str) -> Mesh:
                 base,
                 moved(wall, (-56.0, 0.0, 36.0)),
                 moved(box((45.0, 8.0, 40.0)), (-32.0, 24.0, 22.0)),
-                moved(tube(9.0, 4.0, 22.0), (38.0, -18.0, 12.0)),
+                moved(ring(circle(9.0), circle(4.0), 22.0), (38.0, -18.0, 12.0)),
             )
         case "flange":  # a disc with teeth and a hub on one side: alike after sixths of a turn
             angle = np.arange(_ROUND) * (2 * math.pi / _ROUND)
             radius = 50 + 9 * np.tanh(4 * np.cos(_TEETH * angle))
             outer = np.stack([radius * np.cos(angle), radius * np.sin(angle)], 1)
-            disc = _ring(outer, _circle(14.0), 14.0)
-            return joined(disc, moved(tube(26.0, 14.0, 30.0), (0.0, 0.0, 20.0)))
+            disc = ring(outer, circle(14.0), 14.0)
+            return joined(disc, moved(ring(circle(26.0), circle(14.0), 30.0), (0.0, 0.0, 20.0)))
         case "mug":  # a cup with a handle, wider above than below: no turn leaves it as it is
             radii = (0.0, 32.0, 36.0, 42.0, 38.0, 33.0, 0.0)
             heights = (0.0, 0.0, 6.0, 95.0, 95.0, 10.0, 6.0)
@@ -79,7 +79,7 @@ def part_mesh(name: str) -> Mesh:
             return joined(revolved(list(zip(radii, heights, strict=True))), _hose(path, 5.5))
         case "connector":  # a plug with a key, two pins and a bent cable: no symmetry
             pins = [
-                moved(turned(tube(3.5, 1.5, length), (0.0, 1.0, 0.0), 90.0),
+                moved(turned(ring(circle(3.5), circle(1.5), length), (0.0, 1.0, 0.0), 90.0),
                       (30.0 + length / 2.0, y, 4.0))
                 for y, length in ((-9.0, 24.0), (3.0, 14.0))
             ]  # fmt: skip
@@ -100,14 +100,15 @@ def part_mesh(name: str) -> Mesh:
             raise InputError(f"no part is called {name!r}; {nearest_name(name, PARTS)}")
 
 
-def _circle(radius: float) -> np.ndarray:
+def circle(radius: float) -> np.ndarray:
+    """Corners of a circle about the origin (n, 2)."""
     angle = np.arange(_ROUND) * (2 * math.pi / _ROUND)
     return radius * np.stack([np.cos(angle), np.sin(angle)], 1)
 
 
 def _plate(size: tuple[float, float, float], hole_at: tuple[float, float], hole: float) -> Mesh:
     """A plate with a round hole of a diameter; the outline is seen from the hole."""
-    unit, at = _circle(1.0), np.array(hole_at)
+    unit, at = circle(1.0), np.array(hole_at)
     low, high = -np.array(size[:2]) / 2 - at, np.array(size[:2]) / 2 - at
     with np.errstate(divide="ignore", invalid="ignore"):
         extent = np.where(unit > 0, high / unit, np.where(unit < 0, low / unit, np.inf)).min(1)
@@ -116,10 +117,10 @@ def _plate(size: tuple[float, float, float], hole_at: tuple[float, float], hole:
     # The ray nearest to each corner goes to the corner itself, or the plate would lack its corners.
     for corner in corners:
         outline[np.argmax(unit @ (corner / np.linalg.norm(corner)))] = corner
-    return moved(_ring(outline, _circle(hole / 2), size[2]), (*hole_at, 0.0))
+    return moved(ring(outline, circle(hole / 2), size[2]), (*hole_at, 0.0))
 
 
-def _ring(outer: np.ndarray, inner: np.ndarray, height: float) -> Mesh:
+def ring(outer: np.ndarray, inner: np.ndarray, height: float) -> Mesh:
     """What lies between two outlines of as many corners, from -height/2 to height/2."""
     low, high = (np.full((len(outer), 1), z) for z in (-height / 2, height / 2))
     loops = [
@@ -129,11 +130,6 @@ def _ring(outer: np.ndarray, inner: np.ndarray, height: float) -> Mesh:
         np.hstack([inner, low]),
     ]
     return _skin([*loops, loops[0]])
-
-
-def tube(radius: float, bore: float, height: float) -> Mesh:
-    """Make a round tube about z."""
-    return _ring(_circle(radius), _circle(bore), height)
 
 
 def box(size: tuple[float, float, float]) -> Mesh:
@@ -146,7 +142,7 @@ def box(size: tuple[float, float, float]) -> Mesh:
 
 def revolved(profile: list[tuple[float, float]]) -> Mesh:
     """Turn (radius, height) about z, from the lower end of the axis along the outside and back."""
-    loops = [np.hstack([_circle(r), np.full((_ROUND, 1), z)]) for r, z in profile]
+    loops = [np.hstack([circle(r), np.full((_ROUND, 1), z)]) for r, z in profile]
     return _skin(loops)
 
 
@@ -155,10 +151,10 @@ def _hose(path: np.ndarray, radius: float) -> Mesh:
     along = np.gradient(path, axis=0)
     along /= np.linalg.norm(along, axis=1, keepdims=True)
     side = np.array([0.0, 1.0, 0.0])
-    circle, loops = _circle(radius), []
+    outline, loops = circle(radius), []
     for point, direction in zip(path, along, strict=True):
         across = np.cross(side, direction)
-        loops.append(point + circle[:, :1] * across + circle[:, 1:] * side)
+        loops.append(point + outline[:, :1] * across + outline[:, 1:] * side)
     ends = [np.repeat(path[i][None], _ROUND, 0) for i in (0, -1)]
     return _skin([ends[0], *loops, ends[1]])
 

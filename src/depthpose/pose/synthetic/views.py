@@ -115,17 +115,6 @@ def occlude(
     return torch.where(is_hidden, occluder_m, depth_m), silhouette & ~is_hidden
 
 
-def shift_mask(mask: Mask, rows: int, columns: int) -> Mask:
-    """Shift a mask by so many pixels down and right; what comes in is not of it."""
-    shifted = mask.roll((rows, columns), (0, 1))
-    for axis, steps in enumerate((rows, columns)):
-        if steps:
-            size = mask.shape[axis]
-            start = 0 if steps > 0 else max(0, size + steps)
-            shifted.narrow(axis, start, min(abs(steps), size)).fill_(False)
-    return shifted
-
-
 def measure(
     depth_m: Depth, focal_px: tuple[float, float], config: SensorConfig, generator: torch.Generator
 ) -> Depth:
@@ -429,8 +418,13 @@ class Objects:
         focal_px = (float(clean.K[0, 0]), self.config.focal_px[0])
         measured_m = measure(depth_m, focal_px, self.config.sensor, generator)
         most = self.config.mask_shift_px
-        rows, columns = (whole(generator, 2 * most + 1) - most for _ in range(2))
-        mask = shift_mask(mask, round(rows * scale), round(columns * scale))
+        rows, columns = (round((whole(generator, 2 * most + 1) - most) * scale) for _ in range(2))
+        mask = mask.roll((rows, columns), (0, 1))
+        for axis, steps in enumerate((rows, columns)):  # what comes in is not of it
+            if steps:
+                size = mask.shape[axis]
+                start = 0 if steps > 0 else max(0, size + steps)
+                mask.narrow(axis, start, min(abs(steps), size)).fill_(False)
         model = self.models[number]
         view = ViewInput(
             name=f"{model.name}_{self.config.seed}_{index:06d}",

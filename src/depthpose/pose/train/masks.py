@@ -126,7 +126,14 @@ class TrainingImages:
         scale = self.long_side_px / max(given.image.shape[-2:])
         scale *= uniform(generator, *self.config.scale)
         changed = cut_window(given, scale, self.config.crop_px, generator)
-        image = jitter_colors(changed.image, self.config.jitter, generator)
+        # Brightness, contrast and saturation change by the jitter at most, each color by a third.
+        changes = 1 + self.config.jitter * (2 * torch.rand(6, generator=generator) - 1)
+        brightness, contrast, saturation = changes[:3].tolist()
+        balance = 1 + (changes[3:, None, None] - 1) / 3
+        bright = changed.image * brightness * balance
+        bright = (bright - bright.mean()) * contrast + bright.mean()
+        grey = grey_of(bright)
+        image = (grey + (bright - grey) * saturation).clamp(0, 1)
         return LabelledImage(image, changed.labels)
 
 
@@ -159,19 +166,6 @@ def cut_window(
         top, left = (whole(generator, most + 1) for most in slack)
     window = (slice(top, top + size[0]), slice(left, left + size[1]))
     return LabelledImage(image[:, *window], labels[window])
-
-
-def jitter_colors(
-    image: Float[Tensor, "3 h w"], strength: float, generator: torch.Generator
-) -> Float[Tensor, "3 h w"]:
-    """Change brightness, contrast, saturation by 1 +- ``strength``, each color by a third of it."""
-    changes = 1 + strength * (2 * torch.rand(6, generator=generator) - 1)
-    brightness, contrast, saturation = changes[:3].tolist()
-    balance = 1 + (changes[3:, None, None] - 1) / 3
-    bright = image * brightness * balance
-    bright = (bright - bright.mean()) * contrast + bright.mean()
-    grey = grey_of(bright)
-    return (grey + (bright - grey) * saturation).clamp(0, 1)
 
 
 class SegmentationTask:

@@ -86,7 +86,10 @@ class PoseTask(ViewsTask):
     ) -> None:
         super().__init__(network, models, config)
         self.network, self.config = network, config
-        self._copies_m = keypoint_copies(models)
+        # Keypoints of each object under each of its symmetries (classes, copies, k, 3).
+        turns = symmetric_copies(models, _SYMMETRY_STEP)
+        keypoints_m = torch.stack([model.keypoints_m.double() for model in models])
+        self._copies_m = (keypoints_m[:, None] @ turns.R.mT + turns.t_m[:, :, None]).float()
 
     def step(self, batch: CloudBatch) -> Iterator[Update]:
         """One update: all clouds at once."""
@@ -106,17 +109,11 @@ class PoseTask(ViewsTask):
             return math.inf
         cloud = voxelised_cloud(sample, number, config, chance)
         device = next(self.network.parameters()).device
-        seen = TrainingClouds.collate([cloud]).seen.to(device)
+        batch = TrainingClouds.collate([cloud])
+        seen = CloudBatch(*(part.to(device) for part in batch)).seen
         vote = vote_ransac(seen.points_m, self.network.directions(seen).float())
         fit = fit_pose(vote.keypoints_m.cpu(), vote.covariance_m2.cpu(), model.keypoints_m)
         return add_error(fit.camera_from_model, Rigid(cloud.R, cloud.t_m), model)
-
-
-def keypoint_copies(models: Sequence[ObjectModel]) -> Float[Tensor, "classes copies k 3"]:
-    """Keypoints of each object under each of its symmetries; the first is repeated to the most."""
-    turns = symmetric_copies(models, _SYMMETRY_STEP)
-    keypoints_m = torch.stack([model.keypoints_m.double() for model in models])
-    return (keypoints_m[:, None] @ turns.R.mT + turns.t_m[:, :, None]).float()
 
 
 def symmetric_copies(models: Sequence[ObjectModel], step_rad: float) -> Rigid:
