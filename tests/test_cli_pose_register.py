@@ -36,7 +36,7 @@ def drawn(tmp_path_factory: pytest.TempPathFactory) -> Path:
     views = Objects([make_part("connector")], config)
     write_cloud(folder / "scan.ply", Cloud(points=1000 * views[0].input.points_m))
     window = views.view(0).input
-    centre_px = torch.tensor(config.principal_point_px)
+    centre_px = torch.tensor(config.centre_px)
     left, top = (centre_px - window.K[:2, 2]).round().long().tolist()
     width, height = config.image_px
     height_px, width_px = window.mask.shape

@@ -221,10 +221,10 @@ def test_bad_settings_of_objects_are_refused(values: dict, text: str) -> None:
 
 
 def test_the_principal_point_is_that_of_the_image(tmp_path: Path) -> None:
-    assert ObjectsConfig().principal_point_px == (325.2611, 242.04899)
+    assert ObjectsConfig().centre_px == (325.2611, 242.04899)
     assert config_to_dict(ObjectsConfig())["centre_px"] == [325.2611, 242.04899]
-    assert ObjectsConfig(image_px=(320, 240)).principal_point_px == (159.5, 119.5)
-    assert ObjectsConfig(centre_px=(0.0, 479.0)).principal_point_px == (0.0, 479.0)
+    assert ObjectsConfig(image_px=(320, 240)).centre_px == (159.5, 119.5)
+    assert ObjectsConfig(centre_px=(0.0, 479.0)).centre_px == (0.0, 479.0)
     path = tmp_path / "c.yaml"
     for text, centre_px in (
         ("{image_px: [320, 240]}", (159.5, 119.5)),

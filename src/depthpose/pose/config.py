@@ -357,18 +357,11 @@ class ObjectsConfig(Settings):
         super().__post_init__()
         width, height = self.image_px
         middle = ((width - 1) / 2, (height - 1) / 2)
-        if self.centre_px is None:
-            usual = _LINEMOD_CENTRE_PX if self.image_px == _LINEMOD_PX else middle
-            object.__setattr__(self, "centre_px", usual)
-        x, y = self.principal_point_px
+        usual = _LINEMOD_CENTRE_PX if self.image_px == _LINEMOD_PX else middle
+        x, y = usual if self.centre_px is None else self.centre_px
+        object.__setattr__(self, "centre_px", (x, y))
         if not (-0.5 <= x <= width - 0.5 and -0.5 <= y <= height - 0.5):
             raise InputError(
                 f"centre_px is {(x, y)}, but the principal point lies within the image, and "
                 f"image_px is {self.image_px}; leave it out for the middle, {middle}"
             )
-
-    @property
-    def principal_point_px(self) -> tuple[float, float]:
-        """``centre_px``, or what it is where it was not given."""
-        assert self.centre_px is not None
-        return self.centre_px

@@ -188,7 +188,8 @@ def _make_frame(
     world.append((table, Rigid(torch.eye(3), torch.zeros(3))))
     view = _viewpoint(config, generator)
     placed = [(solid, view @ pose) for solid, pose in world]
-    (fx, fy), (cx, cy) = config.focal_px, config.principal_point_px
+    assert config.centre_px is not None, "the config gives what was left out"
+    (fx, fy), (cx, cy) = config.focal_px, config.centre_px
     K = torch.tensor([[fx, 0, cx], [0, fy, cy], [0, 0, 1]], dtype=torch.float64)
     width, height = config.image_px
     corners = [pose.apply(solid.triangles_m) for solid, pose in placed]

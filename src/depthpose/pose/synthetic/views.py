@@ -456,7 +456,8 @@ class Objects:
 
     def intrinsics(self, scale: float = 1.0) -> Float[Tensor, "3 3"]:
         """Intrinsic matrix of the sensor's image at so many times its size."""
-        (fx, fy), (cx, cy) = self.config.focal_px, self.config.principal_point_px
+        assert self.config.centre_px is not None, "the config gives what was left out"
+        (fx, fy), (cx, cy) = self.config.focal_px, self.config.centre_px
         rows = [
             [scale * fx, 0, scale * (cx + 0.5) - 0.5],
             [0, scale * fy, scale * (cy + 0.5) - 0.5],
