@@ -65,6 +65,9 @@ _VOXEL = 0.05  # of the diameter
 _LEAST = 500  # points of a model without faces
 _PROPOSALS = 40
 _SMOOTHED = 1500  # of so many points 20 neighbours lay the plane that gives a normal
+_TILT_NOISE = 0.01
+"""By so much the tilt of one pose differs from one drawing of points to the next: less says nothing
+of which of two poses that look alike is the right one."""
 
 
 class PoseEstimator:
@@ -513,6 +516,6 @@ class Registration(PoseEstimator):
             # whatever the pose: so it is on the cloud moved onto the posed surface.
             _, index = nearest_posed(cloud_m, pose, surface)
             own = tilt_of(pose.apply(surface.points_m[index]), pose[None], surface)
-            signals["tilt"] = max(0.0, signals["tilt"] - float(own))
+            signals["tilt"] = max(_TILT_NOISE, signals["tilt"] - float(own))
         seconds["icp"] = time.perf_counter() - voted
         return answer_of(prepared, known, candidates, evidence, self.refusal, self.config, seconds)
