@@ -47,8 +47,7 @@ from depthpose.core.rigid import Rigid
 from depthpose.pose.cloud import thin
 from depthpose.pose.config import EvaluationConfig
 from depthpose.pose.datasets import Instance
-from depthpose.pose.estimator.hypotheses import is_no_side
-from depthpose.pose.evaluate.errors import ErrorContext, match
+from depthpose.pose.evaluate import error_context, match
 from depthpose.pose.evaluate.errors import measure as bop_errors
 from depthpose.pose.frame import label_regions, prepare_frame
 from depthpose.pose.mesh import sample_surface
@@ -92,7 +91,7 @@ def opencv(frame: Frame, counts: dict[str, int]) -> list[PoseEstimate]:
     seen, found = prepare_frame(frame.depth_m, frame.K), list[PoseEstimate]()
     for name, count in counts.items():
         detector, surface = prepared("opencv", model_of(frame, name))
-        used = seen.is_smooth & ~is_no_side(seen, surface)
+        used = seen.is_smooth & (seen.plane_m < surface.diameter_m)
         if int(used.sum()) < LEAST_PIXELS:
             continue
         points_m, normals = seen.points_m[used], seen.normals[used]
@@ -133,7 +132,7 @@ def open3d(frame: Frame, counts: dict[str, int]) -> list[PoseEstimate]:
     seen, found = prepare_frame(frame.depth_m, frame.K), list[PoseEstimate]()
     for name, count in counts.items():
         peer, surface = prepared("open3d", model_of(frame, name))
-        used = seen.is_smooth & ~is_no_side(seen, surface)
+        used = seen.is_smooth & (seen.plane_m < surface.diameter_m)
         label = label_regions(seen.depth_m, used)
         clouds = [
             CloudInput(name="", points_m=seen.points_m[used & (label == k)], object=name)
@@ -251,12 +250,9 @@ def recall_errors(frame: Frame, found: Sequence[PoseEstimate]) -> list[Row]:
         given = [Prediction(estimate=one, place=Place(0, 0, numbers[one.object]))
                  for one in found if one.object in numbers]  # fmt: skip
         answers, rows = match(instances, given, models), list[Row]()
-        delta_m = EvaluationConfig().vsd_delta_m
         for instance in instances:
             model = models[instance.object_id]
-            context = ErrorContext(
-                model=model, diameter_m=model.diameter_m, is_adds=False, vsd_delta_m=delta_m
-            )
+            context = error_context(model, EvaluationConfig())
             answer = answers.get(instance.name)
             errors = bop_errors(None if answer is None else answer.camera_from_model,
                                 instance, context)  # fmt: skip

@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from depthpose.core.errors import import_open3d
+from depthpose.core.errors import import_extra
 from depthpose.core.rigid import Rigid
 from depthpose.pose.mesh import sample_surface
 from depthpose.pose.types import CloudInput, ObjectModel, PoseEstimate, ViewInput
@@ -40,7 +40,7 @@ class FpfhEstimator:
         seed: int = 0,
     ) -> None:
         self._voxel_diameters, self._seed = voxel_diameters, seed
-        self._open3d = import_open3d("registration by FPFH")
+        self._open3d = import_extra("open3d", "open3d", "open3d", "registration by FPFH")
         self._models = {model.name: model for model in models}
         self._targets: dict[str, tuple[Any, Any]] = {}
         for model in models:

@@ -22,7 +22,7 @@ from depthpose.core.config import read_config
 from depthpose.pose.config import EstimateConfig
 from depthpose.pose.estimator import GeoPoseNet, Registration
 from depthpose.pose.metrics import SUCCESS_SHARE
-from depthpose.pose.train.clouds import held_out_objects, pose_error
+from depthpose.pose.train.clouds import add_error, held_out_objects
 from depthpose.pose.train.config import PoseTraining
 from depthpose.pose.weights import PoseWeights, read_pose_weights
 from depthpose.report.page import markdown_table
@@ -73,7 +73,7 @@ def measure(weights: PoseWeights, number: int) -> list[dict[str, Any]]:
         for name, method in methods.items():
             found = method.estimate_many([sample.input for sample in samples])
             errors = [
-                pose_error(one, sample.truth, weights.models[0])
+                add_error(one.camera_from_model, sample.truth.camera_from_model, weights.models[0])
                 for one, sample in zip(found, samples, strict=True)
                 if one.is_posed
             ]

@@ -32,7 +32,7 @@ from depthpose.pose.estimator import GeoPoseNet, Registration
 from depthpose.pose.estimator.base import PoseEstimator
 from depthpose.pose.mesh import MIRROR_ALIKE, mirror_deviation
 from depthpose.pose.synthetic import Objects
-from depthpose.pose.train.clouds import pose_error
+from depthpose.pose.train.clouds import add_error
 from depthpose.pose.types import CloudSample, ObjectModel, ViewSample
 from depthpose.report.page import markdown_table
 
@@ -90,7 +90,9 @@ def measure(
     estimates = [estimate for part in parts for estimate in net.estimate_many(part)]
     rows = []
     for sample, which, found in zip(samples, asked, estimates, strict=True):
-        error = pose_error(found, sample.truth, net.models[which])
+        error = add_error(
+            found.camera_from_model, sample.truth.camera_from_model, net.models[which]
+        )
         is_right = kind == ITSELF and error < 0.1
         is_alike = kind == "mirrored" and mirror_deviation(net.models[which]) <= MIRROR_ALIKE
         rows.append({

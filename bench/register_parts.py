@@ -26,7 +26,7 @@ from depthpose.pose.config import ObjectsConfig
 from depthpose.pose.estimator import Registration
 from depthpose.pose.mesh import with_found_symmetries
 from depthpose.pose.synthetic import Objects
-from depthpose.pose.train.clouds import pose_error
+from depthpose.pose.train.clouds import add_error
 from depthpose.pose.types import ObjectModel
 from depthpose.report.page import markdown_table
 
@@ -65,9 +65,8 @@ def rows_of(number: int, *, is_simple: bool) -> Iterator[Row]:
         sample = views.view(k)
         found = registration.estimate_many([sample.input])[0]
         poses = [found.camera_from_model, *(a.camera_from_model for a in found.alternatives)]
-        answers = [dataclasses.replace(found, camera_from_model=pose) for pose in poses]
-        is_right = [kind == ITSELF and pose_error(answer, sample.truth, part) < 0.1
-                    for answer in answers]  # fmt: skip
+        truth = sample.truth.camera_from_model
+        is_right = [kind == ITSELF and add_error(pose, truth, part) < 0.1 for pose in poses]
         share = 1.0 if found.certainty is None else found.certainty
         yield {
             "part": number, "kind": kind, "status": found.status,

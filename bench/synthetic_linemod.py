@@ -30,7 +30,7 @@ from fpfh import FpfhEstimator
 
 from depthpose.core.checkpoint import find_weights
 from depthpose.pose.config import EstimateConfig, ObjectsConfig, SensorConfig, SensorKind
-from depthpose.pose.datasets.layouts import models_folder, read_bop_models, read_models_info
+from depthpose.pose.datasets.layouts import read_bop_models, read_models_info
 from depthpose.pose.estimator import DepthImageRegressor, GeoPoseNet, Registration
 from depthpose.pose.mesh import sample_surface
 from depthpose.pose.metrics import add_m, adds_m
@@ -293,7 +293,7 @@ def main() -> None:
     parser.add_argument("--out", type=Path, default=Path("out/synthetic_linemod"))
     words = parser.parse_args()
     torch.set_num_threads(1)
-    numbers = words.objects or sorted(read_models_info(models_folder(words.bop)))
+    numbers = words.objects or sorted(read_models_info(words.bop)[1])
     models = list(read_bop_models(words.bop, numbers).values())
     models += [make_part(name, 100 + k) for k, name in enumerate(words.parts)]
     methods = [

@@ -10,7 +10,7 @@ import pytest
 
 from depthpose.cli import lasting_streams, main
 from depthpose.cli.arguments import refuse_words
-from depthpose.cli.depth_options import parse_bytes
+from depthpose.cli.depth_options import MatcherOptions
 from depthpose.core.errors import InputError
 
 IGNORED = [
@@ -76,7 +76,7 @@ def test_the_command_refuses_it_in_a_line(capsys: pytest.CaptureFixture[str]) ->
      (" 7 ", 7), ("12 B", 12), ("1T", 10**12)],
 )  # fmt: skip
 def test_sizes_are_read_as_people_write_them(text: str, size: int) -> None:
-    assert parse_bytes(text) == size
+    assert MatcherOptions(max_memory=text).config.max_memory_bytes == size
 
 
 class Full(io.StringIO):

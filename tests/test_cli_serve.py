@@ -5,7 +5,7 @@ import sys
 import pytest
 
 from depthpose.cli import main
-from depthpose.web import Limits, known_names, taken_address
+from depthpose.web import Limits, known_names
 from depthpose.web.app import LOOPBACK
 
 
@@ -87,8 +87,7 @@ def test_what_counts_is_the_address_that_was_taken(bound: str, is_open: bool) ->
             return bound, 8000
 
     with Taken() as taken:
-        address = taken_address(taken)
-    names = known_names("My-Robot", address)
+        _, names = known_names("My-Robot", taken)
     assert names == (None if is_open else (*LOOPBACK, "my-robot", bound))
 
 

@@ -14,7 +14,7 @@ from tests.written import ROOT
 
 from depthpose.depth.config import GeneratorConfig, PSMNetConfig
 from depthpose.depth.stereo import PSMNet
-from depthpose.depth.synthesis import PixelDiscriminator, UNetGenerator
+from depthpose.depth.synthesis import Discriminator, UNetGenerator
 from depthpose.pose.network import ResUNet, ResUNetConfig
 from depthpose.pose.segmentation import FCN
 
@@ -85,7 +85,7 @@ def test_another_network_is_another_picture(networks: ModuleType) -> None:
     with torch.device("meta"):
         depth = networks.DepthNetworks(
             UNetGenerator(GeneratorConfig(width=8, levels=6)),
-            PixelDiscriminator(),
+            Discriminator("pixel"),
             PSMNet(PSMNetConfig(width=8, max_disparity_px=48)).eval(),
             (256, 320),
         )

@@ -22,7 +22,7 @@ from depthpose.core.config import read_config
 from depthpose.core.rigid import fit_rigid
 from depthpose.depth.losses import disparity_loss
 from depthpose.depth.stereo import PSMNet
-from depthpose.depth.synthesis import PatchDiscriminator, UNetGenerator
+from depthpose.depth.synthesis import Discriminator, UNetGenerator
 from depthpose.depth.train.config import StereoTraining, ViewTraining
 from depthpose.pose.cloud import voxelise
 from depthpose.pose.network import ResUNet
@@ -39,7 +39,7 @@ class DepthNetworks(NamedTuple):
     """The networks of chapter 2, and the crop that they are trained on."""
 
     generator: UNetGenerator
-    discriminator: PatchDiscriminator
+    discriminator: Discriminator
     matcher: PSMNet
     crop: tuple[int, int]
 
@@ -62,7 +62,7 @@ def depth_networks() -> DepthNetworks:
     with torch.device("meta"):
         return DepthNetworks(
             UNetGenerator(view.generator),
-            PatchDiscriminator(view.discriminator_width),
+            Discriminator("patch", view.discriminator_width),
             PSMNet(stereo.matcher).eval(),
             view.pairs.augment.crop_px,
         )

@@ -1,7 +1,11 @@
+import io
+from base64 import b64decode
 from itertools import pairwise
 
+import numpy as np
 import pytest
 import torch
+from PIL import Image
 
 from depthpose.core.draw import (
     draw_depth,
@@ -12,7 +16,7 @@ from depthpose.core.draw import (
     draw_points,
     draw_share,
 )
-from depthpose.report.page import depth_scale, rising_scale, shrink_to_pixels
+from depthpose.report.page import Drawing, depth_scale, embedded, rising_scale
 
 
 def test_near_is_brighter_than_far_all_along() -> None:
@@ -102,8 +106,15 @@ def test_of_errors_that_overlap_the_largest_is_seen() -> None:
 
 def test_a_large_picture_shrinks_and_a_small_one_stays() -> None:
     image = torch.rand(3, 40, 60)
-    assert shrink_to_pixels(image, 2400) is image
-    small = shrink_to_pixels(image, 600)
-    assert small.shape == (3, 20, 30)
-    assert torch.allclose(small.mean(), image.mean(), atol=1e-6)
-    assert shrink_to_pixels(torch.rand(3, 1, 5000), 10).shape[1] == 1
+    wide = torch.rand(3, 1, 5000)
+    for most, picture, size in (
+        (2400, image, (60, 40)),
+        (600, image, (30, 20)),
+        (10, wide, (223, 1)),
+    ):
+        width, height, address = embedded(Drawing(image=picture, caption=""), most)
+        assert (width, height) == (picture.shape[2], picture.shape[1])
+        shown = Image.open(io.BytesIO(b64decode(address.removeprefix("data:image/jpeg;base64,"))))
+        assert shown.size == size
+        brightness = torch.from_numpy(np.array(shown)).double().mean() / 255
+        assert torch.allclose(brightness, picture.double().mean(), atol=0.01)

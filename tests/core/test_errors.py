@@ -8,8 +8,7 @@ from depthpose.core.errors import (
     InputError,
     MissingExtraError,
     full_memory,
-    import_open3d,
-    is_of_memory,
+    import_extra,
     nearest_name,
 )
 
@@ -38,7 +37,7 @@ def test_a_package_that_is_not_there_is_not_a_package_that_does_not_load(
 ) -> None:
     monkeypatch.setitem(sys.modules, "open3d", None)
     with pytest.raises(MissingExtraError, match=r"needs open3d, which is not installed: pip"):
-        import_open3d("registration")
+        import_extra("open3d", "open3d", "open3d", "registration")
 
     (tmp_path / "open3d.py").write_text(
         'raise ImportError("libusb-1.0.so.0: cannot open shared object file", name="open3d")\n'
@@ -46,12 +45,12 @@ def test_a_package_that_is_not_there_is_not_a_package_that_does_not_load(
     monkeypatch.delitem(sys.modules, "open3d")
     monkeypatch.syspath_prepend(tmp_path)
     with pytest.raises(InputError, match=r"is installed and does not load: libusb-1\.0\.so\.0: "):
-        import_open3d("registration")
+        import_extra("open3d", "open3d", "open3d", "registration")
 
     full = "libopenblas.so: failed to map segment from shared object"  # under ulimit -v
     (tmp_path / "open3d.py").write_text(f"raise ImportError({full!r}, name='open3d')\n")
     with pytest.raises(InputError, match=r"needs open3d: the memory is full \(libopenblas"):
-        import_open3d("registration")
+        import_extra("open3d", "open3d", "open3d", "registration")
 
 
 @pytest.mark.parametrize(
@@ -70,8 +69,10 @@ def test_a_package_that_is_not_there_is_not_a_package_that_does_not_load(
     ids=str,
 )
 def test_a_full_memory_is_said_whoever_meets_it(error: Exception) -> None:
-    assert is_of_memory(error)
-    assert full_memory(error).startswith("the memory is full (")
+    said = full_memory(error)
+    assert said is not None
+    assert said.startswith("the memory is full (")
+    assert full_memory(OSError(13, "Permission denied")) is None
 
 
 def test_an_input_that_is_too_large_for_the_memory_is_named() -> None:

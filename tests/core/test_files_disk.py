@@ -28,7 +28,6 @@ from depthpose.core.files import (
     write_video,
 )
 from depthpose.core.loop import RunLogger
-from depthpose.core.loop.folder import write_state
 from depthpose.core.run import claim_folder
 from depthpose.report.page import Section, write_page, write_table
 
@@ -183,7 +182,7 @@ def test_every_writer_names_a_full_disk_and_leaves_nothing(tmp_path: Path) -> No
     graph = Export(graph=Heavy, cases=list, limits={}, facts={})
     writers: dict[str, Callable[[Path], object]] = {
         "weights": lambda p: save_checkpoint(p / "w.safetensors", weights),
-        "state": lambda p: write_state(p, NOISE, keeps_last=True),
+        "state": lambda p: RunLogger(p, is_writer=True).save(NOISE),
         "run record": lambda p: claim_folder(p, {"a": long}),
         "config": lambda p: write_config(p / "c.yaml", Knobs()),
         "page": lambda p: write_page(p / "page.html", "t", [Section(title="t", text=long)], {}),

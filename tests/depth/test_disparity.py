@@ -7,10 +7,11 @@ from depthpose.depth.disparity import (
     depth_from_disparity,
     disparity_from_depth,
     left_right_difference_px,
-    resize_disparity,
+    resized_match,
     right_disparity_from_left,
     warp_right_to_left,
 )
+from depthpose.depth.types import Match
 
 
 def rig(offset_px: float = 0.0, f: float = 100.0) -> StereoRig:
@@ -39,14 +40,15 @@ def test_no_depth_without_positive_disparity(value: float) -> None:
 
 def test_resizing_keeps_the_depth_of_a_slanted_plane() -> None:
     plane = torch.linspace(10, 20, 32).expand(16, 32).contiguous()
-    half = resize_disparity(plane, 8, 16)
+    half = resized_match(Match(disparity_px=plane), 8, 16).disparity_px
     inner = (plane[::2, 0::2] + plane[::2, 1::2]) / 2
     torch.testing.assert_close(half, inner / 2)
 
 
 def test_resizing_to_its_own_size_changes_nothing() -> None:
     disparity_px = torch.rand(5, 9)
-    assert torch.equal(resize_disparity(disparity_px, 5, 9), disparity_px)
+    same = resized_match(Match(disparity_px=disparity_px), 5, 9)
+    assert torch.equal(same.disparity_px, disparity_px)
 
 
 def test_warping_by_zero_is_the_identity() -> None:

@@ -13,7 +13,7 @@ from depthpose import FakestereoNet
 from depthpose.cli import main
 from depthpose.core.errors import InputError
 from depthpose.depth.datasets import open_dataset
-from depthpose.depth.labels import LabelConfig, _refuse_bytes, label_pair, label_pairs
+from depthpose.depth.labels import LabelConfig, label_pair, label_pairs
 from depthpose.depth.stereo import CallableMatcher
 
 
@@ -193,6 +193,13 @@ def test_a_label_of_which_a_file_is_damaged_is_made_again(tmp_path: Path, place:
 
 
 def test_a_name_that_is_not_utf8_is_refused_by_itself(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match=r"not a name in UTF-8, as calib\.txt needs; rename"):
-        _refuse_bytes(os.fsdecode(b"n\xfe"))
-    _refuse_bytes("größe 5")
+    dataset = open_dataset(write_pairs(tmp_path / "pairs", (0.2, 0.25)))
+    names = [os.fsdecode(b"n\xfe"), "größe 5"]
+    frames = [replace(frame, name=n) for frame, n in zip(dataset.frames, names, strict=True)]
+    text = (tmp_path / "pairs/calib.txt").read_text()
+    (tmp_path / "pairs/calib.txt").write_text(text.replace("01 ", "größe 5 "))
+    dataset, failures = replace(dataset, frames=frames), []
+    labelled = label_pairs(brightness_matcher(), dataset, LabelConfig(), tmp_path / "out", {},
+                           failures=failures)  # fmt: skip
+    assert [name for name, _ in labelled] == ["größe 5"]
+    assert "not a name in UTF-8, as calib.txt needs; rename" in str(failures[0])

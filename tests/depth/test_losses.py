@@ -1,20 +1,24 @@
 import math
+from typing import Literal
 
 import pytest
 import torch
 
 from depthpose.core.config import config_from_dict
 from depthpose.core.errors import InputError
+from depthpose.core.loop import Update
+from depthpose.depth.augment import TrainingPair
+from depthpose.depth.config import GeneratorConfig
 from depthpose.depth.losses import (
     adversarial_loss,
-    discriminator_loss,
     disparity_loss,
     heads_loss,
-    l1_loss,
     log_disparity_loss,
     plane_loss,
     view_loss,
 )
+from depthpose.depth.synthesis import UNetGenerator
+from depthpose.depth.train import ViewTask
 from depthpose.depth.train.config import FinetuneTraining, StereoTraining, ViewTraining
 
 NAN = float("nan")
@@ -38,16 +42,31 @@ def test_least_squares_by_hand() -> None:
     assert float(fake) == pytest.approx((16 + 4) / 2)
 
 
-def test_the_discriminator_pays_half_of_both_mistakes() -> None:
-    loss = discriminator_loss(LOGITS, 3 * LOGITS, "vanilla")
+def updates_of(
+    discriminator: Literal["patch", "none"], monkeypatch: pytest.MonkeyPatch
+) -> list[Update]:
+    """Updates by a drawn view of zeros, and a real one of 0.5 and -1."""
+    config = ViewTraining(discriminator=discriminator)
+    task = ViewTask(UNetGenerator(GeneratorConfig(width=1, levels=2)), config, None)
+    monkeypatch.setattr(task.generator, "forward", torch.zeros_like)
+    for name in set(task.modules) - {"generator"}:
+        score = lambda _, view: LOGITS if bool(view.any()) else 3 * LOGITS  # noqa: E731
+        monkeypatch.setattr(task.modules[name], "forward", score)
+    right = torch.tensor([0.75, 0.0]).expand(1, 3, 1, 2)
+    return list(task.step(TrainingPair(right, right, right[:, 0], right[:, 0])))
+
+
+def test_the_discriminator_pays_half_of_both_mistakes(monkeypatch: pytest.MonkeyPatch) -> None:
+    loss = updates_of("patch", monkeypatch)[0].loss
     real = (log1exp(-2) + log1exp(1)) / 2
     fake = (log1exp(6) + log1exp(-3)) / 2
     assert float(loss) == pytest.approx((real + fake) / 2, rel=1e-6)
 
 
-def test_l1_by_hand() -> None:
-    generated, real = torch.zeros(1, 3, 1, 2), torch.tensor([0.5, -1.0]).expand(1, 3, 1, 2)
-    assert float(l1_loss(generated, real)) == pytest.approx(0.75)
+def test_l1_by_hand(monkeypatch: pytest.MonkeyPatch) -> None:
+    (update,) = updates_of("none", monkeypatch)
+    assert float(update.facts["l1"]) == pytest.approx(0.75)
+    assert float(update.loss) == pytest.approx(75)
 
 
 def test_smooth_l1_by_hand() -> None:

@@ -85,7 +85,7 @@ def test_without_onednn_operators_the_answer_is_the_same(monkeypatch: pytest.Mon
         calls.append("called")
         raise RuntimeError("no such operator")
 
-    monkeypatch.setattr(layers, "_by_onednn", refuse)
+    monkeypatch.setattr(torch, "mkldnn_convolution", refuse)
     layers.has_onednn_operators.cache_clear()
     try:
         documented = PSMNetMatcher(network).match(left, right)
@@ -105,7 +105,7 @@ def test_an_onednn_operator_that_answers_otherwise_is_not_used(
     def wrong(volume: torch.Tensor, *_: torch.Tensor) -> torch.Tensor:
         return torch.zeros_like(volume)
 
-    monkeypatch.setattr(layers, "_by_onednn", wrong)
+    monkeypatch.setattr(torch, "mkldnn_convolution", wrong)
     layers.has_onednn_operators.cache_clear()
     try:
         assert not layers.has_onednn_operators()
@@ -117,8 +117,7 @@ def test_an_onednn_operator_that_answers_otherwise_is_not_used(
 def test_any_number_of_rows_gives_one_answer_in_double_precision(rows: int) -> None:
     network = random_network(SMALL).double()
     left, right = torch.rand(2, 2, 3, 80, 96, dtype=torch.float64)
-    folded = layers.fold_volumes(copy.deepcopy(network), left)
-    layers.fold_features(folded.features, left)
+    folded = layers.fold(copy.deepcopy(network), left)
     folded.rows = rows
     with torch.no_grad():
         found_px, expected_px = (one(left, right)[-1] for one in (folded, network))

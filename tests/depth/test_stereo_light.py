@@ -30,6 +30,7 @@ from depthpose.depth.stereo.light import (
     confidence_near,
     correlation_volume,
     light_bytes,
+    unit_groups,
 )
 from depthpose.depth.stereo.matcher import CameraMatcher, pad_top_right
 from depthpose.depth.synthesis import LiteEncoder, load_encoder
@@ -68,7 +69,7 @@ def shifted_pair(height: int, width: int, shift: int) -> tuple[torch.Tensor, tor
 def test_the_volume_holds_the_cosine_of_each_group(width: int) -> None:
     seeded = torch.Generator().manual_seed(0)
     left, right = torch.randn(2, 2, 6, 4, width, generator=seeded).unbind()
-    found = correlation_volume(left, right, 8, 3)
+    found = correlation_volume(unit_groups(left, 3), unit_groups(right, 3), 8)
     assert found.shape == (2, 3, 8, 4, width)
     for d in range(8):
         for x in range(width):

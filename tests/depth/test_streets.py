@@ -14,9 +14,9 @@ from depthpose.core.errors import InputError
 from depthpose.depth.config import StreetsConfig
 from depthpose.depth.disparity import warp_right_to_left
 from depthpose.depth.synthetic import (
+    CAMERA_FROM_VELODYNE,
     StreetFrame,
     Streets,
-    camera_from_velodyne,
     draw_scene,
     draw_street,
     kitti_rig,
@@ -171,7 +171,7 @@ def test_occlusion_agrees_with_the_right_disparity(frames: list[StreetFrame]) ->
 def sparse_depth(points: Tensor, rig: StereoRig) -> Tensor:
     """Draw a scan into the left image: depth at the nearest pixel [m], the nearest return wins."""
     homogeneous = torch.cat([points[:, :3], torch.ones(len(points), 1)], 1).double()
-    in_camera = (homogeneous @ torch.from_numpy(camera_from_velodyne()).T)[:, :3]
+    in_camera = (homogeneous @ torch.from_numpy(CAMERA_FROM_VELODYNE).T)[:, :3]
     in_camera = in_camera[in_camera[:, 2] > 0.1]
     pixels = in_camera @ rig.K.T
     column, row = (pixels[:, :2] / pixels[:, 2:]).round().long().unbind(1)

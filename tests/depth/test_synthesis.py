@@ -1,3 +1,5 @@
+from typing import Literal
+
 import pytest
 import torch
 from torch import Tensor, nn
@@ -5,8 +7,7 @@ from torch import Tensor, nn
 from depthpose.core.errors import InputError
 from depthpose.depth.config import GeneratorConfig
 from depthpose.depth.synthesis import (
-    PatchDiscriminator,
-    PixelDiscriminator,
+    Discriminator,
     UNetGenerator,
     draw_right,
     make_synthesiser,
@@ -26,8 +27,8 @@ def small(levels: int = 4, **changes: object) -> UNetGenerator:
 
 def test_parameters_are_the_published_ones() -> None:
     assert parameters(UNetGenerator()) == 54_413_955
-    assert parameters(PatchDiscriminator()) == 2_768_705
-    assert parameters(PixelDiscriminator()) == 9_024
+    assert parameters(Discriminator("patch")) == 2_768_705
+    assert parameters(Discriminator("pixel")) == 9_024
 
 
 def test_widths_double_up_to_eight_times() -> None:
@@ -62,11 +63,9 @@ def test_initial_weights_follow_pix2pix() -> None:
     assert float(norm.std()) == pytest.approx(0.02, rel=0.15)
 
 
-@pytest.mark.parametrize(
-    ("discriminator", "field"), [(PatchDiscriminator, 70), (PixelDiscriminator, 1)]
-)
-def test_the_receptive_field_is_70_by_gradient(discriminator: type[nn.Module], field: int) -> None:
-    network = discriminator(4).eval()
+@pytest.mark.parametrize(("kind", "field"), [("patch", 70), ("pixel", 1)])
+def test_the_receptive_field_is_70_by_gradient(kind: Literal["patch", "pixel"], field: int) -> None:
+    network = Discriminator(kind, 4).eval()
     left = torch.rand(1, 3, 256, 256, requires_grad=True)
     logits = network(left, torch.rand(1, 3, 256, 256))
     assert logits.shape[-1] == (30 if field == 70 else 256)

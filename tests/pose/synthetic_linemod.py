@@ -11,7 +11,6 @@ from depthpose.core.files import write_depth_png, write_image
 from depthpose.pose.config import MeshConfig
 from depthpose.pose.datasets import BopDataset, open_bop
 from depthpose.pose.datasets.dataset import read_instance_mask, write_bop_models, write_mask
-from depthpose.pose.datasets.layouts import segnet_mask
 from depthpose.pose.mesh import make_model
 from depthpose.pose.types import ObjectModel
 from depthpose.thesis.pose_tables import LINEMOD_DIAMETERS_M
@@ -51,7 +50,9 @@ def make_linemod(
         _make_scene(folder, [model, models[k - 1]], frames)
     data = open_bop(folder)
     for instance in data.instances:
-        write_mask(segnet_mask(folder, instance), read_instance_mask(instance))
+        predicted = folder / "segnet_results" / f"{instance.object_id:02d}_label"
+        file = predicted / f"{instance.image_id:04d}_label.png"
+        write_mask(file, read_instance_mask(instance))
     return data
 
 

@@ -14,7 +14,7 @@ from depthpose.pose.estimator import GeoPoseNet
 from depthpose.pose.estimator.net import CloudToPose
 from depthpose.pose.mesh import make_model
 from depthpose.pose.network import ResUNet, ResUNetConfig
-from depthpose.pose.synthetic import PARTS
+from depthpose.pose.synthetic.parts import part_mesh
 from depthpose.pose.types import Axis, ObjectModel, PoseEstimate, Symmetries
 from depthpose.pose.weights import PoseWeights
 
@@ -154,7 +154,7 @@ def write_part(name: str, folder: Path) -> Path:
     """Write a part as an STL file in millimetres, as a CAD program would; give the file."""
     import trimesh
 
-    data = trimesh.Trimesh(*PARTS[name](), process=False).export(file_type="stl")
+    data = trimesh.Trimesh(*part_mesh(name), process=False).export(file_type="stl")
     assert isinstance(data, bytes)
     path = folder / f"{name}.stl"
     path.parent.mkdir(parents=True, exist_ok=True)

@@ -33,7 +33,7 @@ from depthpose.pose.mesh import (
     with_found_symmetries,
 )
 from depthpose.pose.metrics import add_m
-from depthpose.pose.types import Axis, ObjectModel, Symmetries
+from depthpose.pose.types import ObjectModel, Symmetries
 
 EYE = torch.eye(3, dtype=torch.float64)
 
@@ -153,11 +153,11 @@ def test_proposals_of_a_shape_are_kept_to_the_bit(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("DEPTHPOSE_CACHE", str(tmp_path))
-    axis = Axis(direction=(EYE[0] + EYE[2] / 3) / math.hypot(1, 1 / 3), point_m=EYE.mean(0) / 7)
-    about: dict[str, Any] = {"axis": axis, "deviation": 0.1 / 3, "certainty": 2 / 3}
+    direction = ((EYE[0] + EYE[2] / 3) / math.hypot(1, 1 / 3)).tolist()
+    point_m = (EYE.mean(0) / 7).tolist()
     given = [
-        SymmetryProposal(kind="continuous", angle_rad=None, **about),
-        SymmetryProposal(kind="discrete", angle_rad=math.pi, **about),
+        SymmetryProposal("continuous", direction, point_m, None, 0.1 / 3, 2 / 3),
+        SymmetryProposal("discrete", direction, point_m, math.pi, 0.1 / 3, 2 / 3),
     ]
     searches: list[float] = []
 

@@ -238,7 +238,7 @@ def test_every_weight_of_pointnet_learns_and_transforms_begin_as_nothing() -> No
     network = PointNet(POINTNET)
     points, cloud = 0.1 * torch.randn(20, 3), torch.arange(20) // 10
     for layer in (network.turn_points, network.turn_features):
-        turns = layer(torch.randn(20, layer.width), cloud, 2)
+        turns = layer(torch.randn(20, layer.width), [10, 10])
         torch.testing.assert_close(turns, torch.eye(layer.width).expand_as(turns))
         torch.nn.init.normal_(layer.final.weight, std=0.1)
     network(points, cloud).square().sum().backward()

@@ -25,7 +25,7 @@ from depthpose.pose.datasets import (
     write_bop_models,
     write_bop_scene,
 )
-from depthpose.pose.datasets.layouts import read_bop_models, segnet_mask
+from depthpose.pose.datasets.layouts import read_bop_models
 from depthpose.pose.mesh import make_model, turn_about
 from depthpose.pose.train.poses import keypoint_copies
 from depthpose.pose.types import ObjectModel, Symmetries
@@ -270,7 +270,6 @@ def test_linemod_preprocessed(tmp_path: Path) -> None:
     assert data[0].input.object == "obj_000002"
     assert int(data[0].input.mask.sum()) == 39 * 39
     assert check_bop(folder).problems == []
-    assert segnet_mask(folder, data.instances[0]).name == "0000_label.png"
     with pytest.raises(InputError, match="the splits are train and test"):
         open_bop(folder, "val")
     (folder / "data/02/test.txt").write_text("0009\n")

@@ -19,17 +19,15 @@ from depthpose.core.errors import InputError
 from depthpose.core.rigid import Rigid, perturb
 from depthpose.pose.config import EvaluationConfig
 from depthpose.pose.datasets import BopDataset, BopTarget
-from depthpose.pose.datasets.layouts import linemod_symmetries
 from depthpose.pose.evaluate import (
     InstanceRow,
     ObjectRow,
     Origin,
     RiskRow,
-    diameter_of,
+    error_context,
     errors,
     evaluate,
     frames_hash,
-    is_adds,
     nearest_copy,
     of_targets,
     read_any,
@@ -180,17 +178,20 @@ def test_several_of_an_object_are_set_against_their_nearest(synthetic: BopDatase
 def test_the_diameter_table_is_named_and_decides(synthetic: BopDataset) -> None:
     cat = replace(synthetic.objects[7], number=6, diameter_m=0.154546)
     pvnet = EvaluationConfig(diameters="pvnet")
-    assert diameter_of(cat, EvaluationConfig()) == 0.154546
-    assert diameter_of(cat, pvnet) == 0.152633
+    assert error_context(cat, EvaluationConfig()).diameter_m == 0.154546
+    assert error_context(cat, pvnet).diameter_m == 0.152633
     with pytest.raises(InputError, match=r"object 7 \(bracket\) .* no object of PVNet's table"):
         evaluate(synthetic, predictions_of(synthetic, lambda i: i.camera_from_model), pvnet)
 
 
 def test_symmetry_or_the_rule_decides_which_of_the_two_adds(synthetic: BopDataset) -> None:
-    glue = replace(synthetic.objects[7], symmetries=linemod_symmetries(11))
-    cat = replace(glue, symmetries=linemod_symmetries(6))
-    assert [is_adds(model, EvaluationConfig()) for model in (glue, cat)] == [True, False]
-    assert is_adds(cat, EvaluationConfig(adds="all"))
+    up, origin = torch.tensor([0.0, 0.0, 1.0]), torch.zeros(3)
+    turned = Symmetries(discrete=turn_about(up, origin, torch.tensor([math.pi])))
+    glue = replace(synthetic.objects[7], symmetries=turned)
+    cat = replace(glue, symmetries=Symmetries())
+    assert error_context(glue, EvaluationConfig()).is_adds
+    assert not error_context(cat, EvaluationConfig()).is_adds
+    assert error_context(cat, EvaluationConfig(adds="all")).is_adds
 
 
 def test_targets_keep_the_most_visible(synthetic: BopDataset) -> None:

@@ -4,10 +4,11 @@ import torch
 from tests.pose.synthetic_objects import Oracle, box_faces, bracket, cloud_of, pose_at, tiny_weights
 
 from depthpose.core.files import Cloud
+from depthpose.core.rigid import Rigid
 from depthpose.pose.mesh import make_model
 from depthpose.pose.types import CloudInput, ObjectModel
 from depthpose.report.page import Lines
-from depthpose.report.pose import TRUE, crease_edges, keypoint_layers, pose_layers, vote_layer
+from depthpose.report.pose import TRUE, keypoint_layers, pose_layers, vote_layer
 
 
 def cube(*, with_repeats: bool = False, faces: int = 12) -> ObjectModel:
@@ -17,17 +18,21 @@ def cube(*, with_repeats: bool = False, faces: int = 12) -> ObjectModel:
     return make_model(corners, every[:faces], name="cube")
 
 
-def lengths(ends_m: torch.Tensor) -> list[float]:
-    return (ends_m[:, 0] - ends_m[:, 1]).norm(dim=-1).tolist()
+def lengths(model: ObjectModel) -> list[float]:
+    unmoved = Rigid(torch.eye(3).double(), torch.zeros(3).double())
+    layers = {layer.name: layer.shape for layer in pose_layers(unmoved, model)}
+    edges = layers["its edges"]
+    assert isinstance(edges, Lines)
+    return (edges.ends_m[:, 0] - edges.ends_m[:, 1]).norm(dim=-1).tolist()
 
 
 def test_the_edges_of_a_cube_are_twelve_and_no_diagonal() -> None:
     for model in (cube(), cube(with_repeats=True)):
-        assert lengths(crease_edges(model)) == [1.0] * 12
+        assert lengths(model) == [1.0] * 12
 
 
 def test_an_open_sheet_shows_its_border() -> None:
-    assert lengths(crease_edges(cube(faces=2))) == [1.0] * 4
+    assert lengths(cube(faces=2)) == [1.0] * 4
 
 
 def test_a_posed_model_lies_where_its_pose_says() -> None:

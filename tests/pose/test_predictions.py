@@ -167,12 +167,12 @@ def test_damaged_files_are_refused(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("content", ["", "[{", "{}", '[{"name": 1}]'])
 def test_damaged_results_are_made_again_with_a_notice(tmp_path: Path, content: str) -> None:
-    assert kept_predictions(tmp_path) == []
+    assert kept_predictions(tmp_path) == {}
     write_predictions(tmp_path, [Prediction(estimate=answer())])
     assert len(kept_predictions(tmp_path)) == 1
     (tmp_path / "poses.json").write_text(content)
     with pytest.warns(Notice, match=r"poses\.json.* it is damaged, and made again"):
-        assert kept_predictions(tmp_path) == []
+        assert kept_predictions(tmp_path) == {}
 
 
 def schema() -> dict[str, Any]:

@@ -104,11 +104,8 @@ def test_pairs_find_the_pose_whatever_side_the_faces_look_at() -> None:
     seen_m, towards = truth.apply(points_m), normals @ truth.R.mT
     faces_us = (towards * seen_m).sum(-1) < 0
     for model in (part(), inside_out):
-        surface = prepare_surface(model)
-        found = propose_poses(
-            seen_m[faces_us], towards[faces_us], prepare_pairs(surface), surface, 5,
-            torch.Generator().manual_seed(0),
-        )  # fmt: skip
+        pairs, generator = prepare_pairs(prepare_surface(model)), torch.Generator().manual_seed(0)
+        found = propose_poses(seen_m[faces_us], towards[faces_us], pairs, 5, generator)
         off = geodesic_rad(found.R, truth.R.expand_as(found.R))
         assert float(off.min()) < 0.3
 

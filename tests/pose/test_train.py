@@ -4,7 +4,9 @@ import dataclasses
 import json
 import math
 import re
+from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
@@ -12,13 +14,13 @@ import torch.nn.functional as F
 from tests.pose.stopping import StoppedError, stop_after
 from tests.pose.synthetic_objects import bottle, bracket, tiny_weights, write_part
 
+from depthpose.core.checkpoint import read_checkpoint
 from depthpose.core.config import read_config
 from depthpose.core.errors import InputError
 from depthpose.core.loop import AdamConfig, LoopConfig, Run
 from depthpose.core.rigid import Rigid
 from depthpose.pose.config import CloudConfig, MeshConfig, ObjectsConfig, SensorConfig
 from depthpose.pose.datasets import write_bop_models, write_bop_scene
-from depthpose.pose.losses import unit_directions
 from depthpose.pose.network import ResUNet, ResUNetConfig, fold_norms
 from depthpose.pose.sparse import Voxels
 from depthpose.pose.synthetic import Objects, make_frames
@@ -44,7 +46,7 @@ from depthpose.pose.train.poses import keypoint_copies, packed
 from depthpose.pose.types import ObjectModel, PoseEstimate, SeenPoints, Symmetries
 from depthpose.pose.weights import (
     PoseWeights,
-    read_pose_network,
+    network_of,
     read_pose_weights,
     write_pose_weights,
 )
@@ -75,8 +77,13 @@ def _training(**changes: object) -> PoseTraining:
     return dataclasses.replace(config, **changes)
 
 
+def _clouds(models: Sequence[ObjectModel], **settings: Any) -> TrainingClouds:  # noqa: ANN401
+    config = PoseTraining(**{"objects": _VIEWS, "cloud": _CLOUD, **settings})
+    return TrainingClouds(models, config, 0)
+
+
 def test_an_index_gives_the_same_cloud_at_any_time() -> None:
-    one, other = (TrainingClouds(_models(), _VIEWS, None, _CLOUD, 0) for _ in range(2))
+    one, other = (_clouds(_models()) for _ in range(2))
     for ticket in (0, 5, 17):
         first, second = one[ticket], other[ticket]
         assert torch.equal(first.points_m, second.points_m)
@@ -85,21 +92,21 @@ def test_an_index_gives_the_same_cloud_at_any_time() -> None:
 
 
 def test_the_first_object_may_begin_alone() -> None:
-    clouds = TrainingClouds(_models(), _VIEWS, None, _CLOUD, 0, first_alone=4)
+    clouds = _clouds(_models(), first_alone=4)
     assert [clouds[i].class_number for i in range(8)] == [0, 0, 0, 0, 0, 1, 0, 1]
-    plain = TrainingClouds(_models(), _VIEWS, None, _CLOUD, 0)
+    plain = _clouds(_models())
     assert torch.equal(clouds[5].points_m, plain[5].points_m)
     # They are different views.
     assert not torch.equal(clouds[1].R, clouds[2].R)
 
 
 def test_a_batch_keeps_clouds_apart_and_points_in_their_voxels() -> None:
-    clouds = TrainingClouds(_models(), _VIEWS, None, _CLOUD, 0)
+    clouds = _clouds(_models())
     parts = [clouds[i] for i in range(3)]
     batch = TrainingClouds.collate(parts)
     assert batch.class_of.tolist() == [0, 1, 0]
     for number, part in enumerate(parts):
-        own = batch.instance == number
+        own = batch.coordinates[:, 0] == number
         assert torch.equal(batch.points_m[own], part.points_m)
         # Points of one cloud have voxels of their own: none is kept twice.
         assert len(torch.unique(part.coordinates, dim=0)) == len(part.coordinates)
@@ -120,13 +127,14 @@ class _Oracle(ResUNet):
 def _truth_of(batch, models, copy: int) -> torch.Tensor:  # noqa: ANN001
     copies = keypoint_copies(models)[batch.class_of, copy]
     posed = copies @ batch.R.mT + batch.t_m[:, None]
-    return unit_directions(batch.points_m, posed[batch.instance])
+    way = posed[batch.coordinates[:, 0].long()] - batch.points_m[:, None]
+    return F.normalize(way, dim=-1)
 
 
 @pytest.mark.parametrize("copy", [0, 7])
 def test_true_directions_cost_nothing_whichever_copy_they_point_at(copy: int) -> None:
     models = _models()
-    clouds = TrainingClouds(models, _VIEWS, None, _CLOUD, 0)
+    clouds = _clouds(models)
     batch = TrainingClouds.collate([clouds[0], clouds[1]])
     network = _Oracle(_SMALL)
     task = PoseTask(network, models, _training())
@@ -151,7 +159,7 @@ def test_copies_of_the_keypoints_lie_on_the_turned_object() -> None:
 def test_the_loss_falls() -> None:
     torch.manual_seed(0)
     models = _models()
-    clouds = TrainingClouds(models, _VIEWS, None, _CLOUD, 0)
+    clouds = _clouds(models)
     batch = TrainingClouds.collate([clouds[i] for i in range(4)])
     config = _training(adam=AdamConfig(learning_rate=0.01))
     task = PoseTask(ResUNet(_SMALL), models, config)
@@ -185,12 +193,16 @@ def test_frames_and_synthetic_views_mix_and_frames_stay_true(tmp_path: Path) -> 
     folder = _frames_folder(tmp_path)
     models = read_models(ModelsConfig(bop=str(folder)))
     frames = FramesConfig(folder=str(folder), share=0.5)
-    clouds = TrainingClouds(models, _VIEWS, frames, _CLOUD, 0)
-    real = TrainingClouds(models, _VIEWS, dataclasses.replace(frames, share=1.0), _CLOUD, 0)
+    clouds = _clouds(models, frames=frames)
+    real = TrainingClouds(
+        models,
+        PoseTraining(objects=_VIEWS, frames=dataclasses.replace(frames, share=1.0), cloud=_CLOUD),
+        0,
+    )
     assert len(clouds) == 2 * len(real)
     made = Objects(models, _VIEWS, _CLOUD)
     is_made = [
-        torch.allclose(clouds[i].t_m.norm(), made.sample(i).truth.camera_from_model.t_m.norm())
+        torch.allclose(clouds[i].t_m.norm(), made.view(i).truth.camera_from_model.t_m.norm())
         for i in range(30)
     ]
     assert 5 < sum(is_made) < 25
@@ -207,12 +219,14 @@ def test_frames_of_other_names_are_refused(tmp_path: Path) -> None:
     frames = FramesConfig(folder=str(folder))
     models = [dataclasses.replace(model, name=model.name + "_x") for model in _models()]
     with pytest.raises(InputError, match="is called 'bracket' there, and 'bracket_x' here"):
-        TrainingClouds(models, _VIEWS, frames, _CLOUD, 0)
+        _clouds(models, frames=frames)
 
 
 def test_views_too_far_for_their_voxels_are_refused_with_a_reason() -> None:
     far = dataclasses.replace(_VIEWS, distance_m=(19.0, 20.0))
-    clouds = TrainingClouds(_models(), far, None, CloudConfig(min_points=500), 0)
+    clouds = TrainingClouds(
+        _models(), PoseTraining(objects=far, cloud=CloudConfig(min_points=500)), 0
+    )
     with pytest.raises(InputError, match="20 samples in a row have fewer than 500 points; bring"):
         clouds[0]
 
@@ -220,7 +234,7 @@ def test_views_too_far_for_their_voxels_are_refused_with_a_reason() -> None:
 def test_held_out_views_are_not_those_that_are_trained_on() -> None:
     models, held_out = _models(), HeldOutConfig(number=2)
     task = PoseTask(ResUNet(_SMALL), models, _training(held_out=held_out))
-    trained = TrainingViews(models, _VIEWS, None, _CLOUD, 0).synthetic
+    trained = TrainingViews(models, PoseTraining(objects=_VIEWS, cloud=_CLOUD), 0).synthetic
     known = [trained.view(i).truth.camera_from_model.R for i in range(8)]
     numbers = task.validate().numbers
     assert task.network.training
@@ -280,8 +294,8 @@ def test_a_training_begins_with_what_other_objects_taught(
     parts = ModelsConfig(parts=("bracket", "mug"))
     config = _training(models=parts, start=str(first), adam=still, loop=loop)
     then = train_pose(config, Run(folder=tmp_path / "then"))
-    networks = [read_pose_network(path) for path in (first, then)]
-    cloud = TrainingClouds(_models(), _VIEWS, None, _CLOUD, seed=1)[0]
+    networks = [network_of(read_checkpoint(path), str(path)) for path in (first, then)]
+    cloud = TrainingClouds(_models(), PoseTraining(objects=_VIEWS, cloud=_CLOUD), seed=1)[0]
     voxels = Voxels.from_points(F.pad(cloud.coordinates, (1, 0)))
     seen = [n.features(voxels).at_points().detach() for n in networks if isinstance(n, ResUNet)]
     assert float((seen[1] - seen[0]).norm() / seen[0].norm()) < 0.1

@@ -21,7 +21,7 @@ from depthpose.core.errors import InputError
 from depthpose.core.files import write_image
 from depthpose.core.loop import AdamConfig, LoopConfig, Run, read_metrics
 from depthpose.core.rigid import Rigid
-from depthpose.pose.baselines import DepthImageConfig, PointNetConfig
+from depthpose.pose.baselines import DepthImageConfig, DepthImageNet, PointNetConfig
 from depthpose.pose.config import CloudConfig, ObjectsConfig
 from depthpose.pose.datasets import BopFrame, BopObject, write_bop_models, write_bop_scene
 from depthpose.pose.estimator import DepthImageRegressor, GeoPoseNet
@@ -43,7 +43,7 @@ from depthpose.pose.train.masks import (
     cut_window,
     jitter_colors,
 )
-from depthpose.pose.train.poses import TrainingCrops, surface_points, symmetric_copies
+from depthpose.pose.train.poses import DepthImageTask, TrainingCrops, symmetric_copies
 from depthpose.pose.types import CloudInput
 from depthpose.pose.weights import read_pose_weights
 
@@ -164,7 +164,12 @@ def test_crops_carry_the_truth_of_their_view() -> None:
 
 def test_points_and_copies_have_one_shape_for_all_objects() -> None:
     models = [bracket(), bottle()]
-    assert surface_points(models, 40).shape == (2, 40, 3)
+    sparse = dataclasses.replace(models[1], faces=models[1].faces[:0])
+    network = DepthImageConfig(classes=2, widths=(8, 8, 8, 8))
+    config = DepthImageTraining(network=network, surface_points=2000)
+    task = DepthImageTask(DepthImageNet(network), (models[0], sparse), config)
+    assert len(sparse.vertices_m) < 2000
+    assert task._points_m.shape == (2, 2000, 3)
     copies = symmetric_copies(models, 0.2).float()
     assert copies.R.shape[:2] == (2, 16)
     assert bool((copies.R[0] == torch.eye(3)).all())
@@ -345,8 +350,8 @@ def test_a_resumed_training_ends_as_one_that_nothing_stopped(
 def test_training_images_are_the_same_for_the_same_index(colored: Path) -> None:
     config = segmentation_config(colored, 1)
     images = AnnotatedImages(config.images)
-    samples = TrainingImages(images, config.augment, config.network, 3)
-    again = TrainingImages(images, config.augment, config.network, 3)
+    samples = TrainingImages(images, config.augment, config.network.long_side_px, 3)
+    again = TrainingImages(images, config.augment, config.network.long_side_px, 3)
     assert torch.equal(samples[11].image, again[11].image)
     assert torch.equal(samples[11].labels, again[11].labels)
     assert not torch.equal(samples[11].image, samples[12].image)

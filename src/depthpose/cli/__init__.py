@@ -22,7 +22,6 @@ from depthpose.core.errors import (
     MissingExtraError,
     Notice,
     full_memory,
-    is_of_memory,
     nearest_name,
 )
 
@@ -134,8 +133,8 @@ def _fail(reason: str, code: int = 2) -> int:
 
 def _explained(error: Exception) -> str | None:
     """Say in a line that memory or disk is full, or a path unusable; None of any other error."""
-    if is_of_memory(error):
-        return f"{full_memory(error)}; what was finished is kept"
+    if (said := full_memory(error)) is not None:
+        return f"{said}; what was finished is kept"
     if not isinstance(error, OSError) or error.errno not in (*_OF_THE_DISK, *_OF_A_PATH):
         return None
     from tempfile import gettempdir

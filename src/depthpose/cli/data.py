@@ -17,9 +17,7 @@ from depthpose.core.units import Unit, metres_of
 from depthpose.pose.config import SensorKind
 
 if TYPE_CHECKING:  # --help must not load torch
-    from torch import Tensor
-
-    from depthpose.core.camera import Rectifier
+    from depthpose.core.camera import RectificationReport, Rectifier
 
 _FRAMES_A_SCENE = 50
 _SCENES_A_SEED = 1000
@@ -388,7 +386,7 @@ def rectify(
     """
     from depthpose.cli.depth_predict import list_pairs
     from depthpose.core.camera import make_rectifier, read_raw_pair, write_camera
-    from depthpose.core.files import image_size, write_image
+    from depthpose.core.files import image_size, read_image, write_image
     from depthpose.core.run import claim_folder, claim_names
 
     unit_m = metres_of(unit) if unit else None
@@ -410,18 +408,13 @@ def rectify(
     claim_folder(out, settings, [*_SIDES, "camera.json"])
     claim_names(out, {pair[0].stem: pair for pair in pairs})
     for first, second in _shown(pairs, None, "pairs"):
-        for side, image in zip(_SIDES, _rectified(rectifier, first, second), strict=True):
+        names = [str(first), str(second)]
+        rectified = rectifier.rectify(read_image(first), read_image(second), names)
+        for side, image in zip(_SIDES, rectified, strict=True):
             write_image(out / side / f"{first.stem}.png", image)
     write_camera(out / "camera.json", rectifier.rig)
     print(f"{out}: {len(pairs)} pairs in left and right, their camera in camera.json")
     return 0
-
-
-def _rectified(rectifier: "Rectifier", *pair: Path) -> tuple["Tensor", "Tensor"]:
-    from depthpose.core.files import read_image
-
-    left, right = map(read_image, pair)
-    return rectifier.rectify(left, right, [str(path) for path in pair])
 
 
 def _check_rows(
@@ -431,17 +424,21 @@ def _check_rows(
     from statistics import median
 
     from depthpose.core.camera import check_rectified
+    from depthpose.core.files import read_image
 
-    rig = rectifier.rig
+    rig, (x, y) = rectifier.rig, rectifier.left_maps
+    is_seen = (x >= 0) & (x <= rig.width - 1) & (y >= 0) & (y <= rig.height - 1)
     print(
         f"rectified camera: {rig.width}x{rig.height}, fx {float(rig.K[0, 0]):.1f} px, baseline "
-        f"{rig.baseline_m:.4f} m; the raw images show {rectifier.seen_share:.1%} of the left view"
+        f"{rig.baseline_m:.4f} m; the raw images show {is_seen.mean():.1%} of the left view"
     )
     count = min(_LOOKED_AT, len(pairs))
     some = [pairs[k * len(pairs) // count] for k in range(count)]
-    reports = [
-        check_rectified(*_rectified(rectifier, *pair), rig.cx_right_minus_left_px) for pair in some
-    ]
+    reports: list[RectificationReport] = []
+    for first, second in some:
+        names = [str(first), str(second)]
+        left, right = rectifier.rectify(read_image(first), read_image(second), names)
+        reports.append(check_rectified(left, right, rig.cx_right_minus_left_px))
     known = [report for report in reports if report.is_rectified is not None]
     if not known:
         said = f"depthpose: the rows cannot be checked: {reports[0].message}"

@@ -1,6 +1,7 @@
 """``depthpose depth ...``."""
 
 import re
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
@@ -107,7 +108,8 @@ def match(
     from depthpose.core.files.images import refuse_among_inputs
 
     used = None if pairs.matcher == "sgbm" else pairs.matcher or pairs.weights or "default"
-    method = work.MethodSource(weights=used, config=matching.config, with_right=True, use="pairs")
+    config = replace(matching.config, with_left_right_check=matching.left_right_check)
+    method = work.MethodSource(weights=used, config=config, with_right=True, use="pairs")
     method = method.packed() if engine.engine == "ray" else method
 
     work_of = partial(work.pair_work, camera, pairs, method)

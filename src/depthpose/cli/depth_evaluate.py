@@ -3,7 +3,7 @@
 import hashlib
 import sys
 import tempfile
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -12,7 +12,7 @@ from typing import Any, cast, get_args
 from tqdm import tqdm
 
 from depthpose.cli.depth_options import MethodOptions
-from depthpose.cli.depth_predict import Method, MethodSource, sgbm_method
+from depthpose.cli.depth_predict import Method, MethodSource
 from depthpose.core import engine as jobs
 from depthpose.core.errors import InputError
 from depthpose.core.run import environment, find_rank, read_settings, wait_for
@@ -92,7 +92,9 @@ def choose_methods(options: MethodOptions, config: MatcherConfig, dataset: Datas
     """Build what is measured on a dataset: SGBM, weights and baselines, in this order."""
     chosen: list[Method] = []
     if options.matcher == "sgbm":
-        chosen.append(sgbm_method(with_filled_holes=options.holes == "fill"))
+        is_filled = options.holes == "fill"
+        sgbm = MethodSource(weights=None, config=config, with_filled_holes=is_filled)
+        chosen.append(sgbm.build())
     chosen += [named_method(name, config) for name in options.weights]
     names = [method.name for method in chosen]
     if twice := next((name for name in names if names.count(name) > 1), None):
@@ -139,10 +141,7 @@ def baseline_method(name: BaselineName, training: Dataset) -> Method:
         "train_frames": len(training),
         "train_sha256": hashlib.sha256(names.encode()).hexdigest(),
     }
-
-    def show(frames: Sequence[int]) -> Iterable[int]:
-        return tqdm(frames, f"fit {name}", unit=" frames", disable=None)
-
+    show = partial(tqdm, desc=f"fit {name}", unit=" frames", disable=None)
     return Method(f"baseline-{name}", kinds[name].fit(training, show), settings, with_right=False)
 
 

@@ -2,7 +2,7 @@
 
 import math
 import re
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -29,11 +29,17 @@ class MatcherOptions:
     @property
     def config(self) -> MatcherConfig:
         """Settings of the networks."""
+        limit, text = None, self.max_memory
+        if text is not None:  # such as 1GB, 800M or 1500000; 1GiB is 1024**3
+            size = re.fullmatch(r"\s*(\d+(?:\.\d+)?)\s*([KMGT]?)(i?)B?\s*", text, re.IGNORECASE)
+            if size is None or (size[3] and not size[2]) or not float(size[1]):
+                raise InputError(
+                    f"--max-memory {text!r}: not a size. Write, say, 1GB, 800MB or 1.5GiB."
+                )
+            step = 1024 if size[3] else 1000
+            limit = int(float(size[1]) * step ** _POWERS[size[2].upper()])
         return MatcherConfig(
-            device=self.device,
-            precision=self.precision,
-            max_memory_bytes=None if self.max_memory is None else parse_bytes(self.max_memory),
-            speed=self.speed,
+            device=self.device, precision=self.precision, max_memory_bytes=limit, speed=self.speed
         )
 
 
@@ -84,11 +90,6 @@ class MatchOptions(MatcherOptions):
 
     left_right_check: bool = False
     """match the mirrored pair too, which makes the confidence better."""
-
-    @property
-    def config(self) -> MatcherConfig:
-        """Settings of the matcher."""
-        return replace(super().config, with_left_right_check=self.left_right_check)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -179,11 +180,3 @@ class ProtocolOptions:
                 raise InputError(f"--cap {cap_m:g}: a distance in metres, above 0")
             if self.cap.count(cap_m) > 1:
                 raise InputError(f"--cap {cap_m:g} is given twice; each cap is a row: give it once")
-
-
-def parse_bytes(text: str) -> int:
-    """Read a size such as ``1GB``, ``800M`` or ``1500000`` (bytes); ``1GiB`` is 1024**3."""
-    size = re.fullmatch(r"\s*(\d+(?:\.\d+)?)\s*([KMGT]?)(i?)B?\s*", text, re.IGNORECASE)
-    if size is None or (size[3] and not size[2]) or not float(size[1]):
-        raise InputError(f"--max-memory {text!r}: not a size. Write, say, 1GB, 800MB or 1.5GiB.")
-    return int(float(size[1]) * (1024 if size[3] else 1000) ** _POWERS[size[2].upper()])

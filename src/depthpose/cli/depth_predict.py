@@ -3,7 +3,7 @@
 import re
 import sys
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass, field, replace
 from functools import partial
@@ -86,11 +86,15 @@ class MethodSource:
     allow_ood: bool = True  #: answer out-of-distribution images too, as a measurement must
     answer: Answer | None = None  #: where depth of one image comes from; None: as the weights say
     use: Use | None = None  #: build what these take alone; None: all networks
+    with_filled_holes: bool = False  #: of OpenCV's matcher: give every pixel an answer
 
     def build(self) -> Method:
         """Build the networks on the device of the config."""
-        if self.weights is None:
-            return sgbm_method(with_filled_holes=False)
+        if self.weights is None:  # OpenCV's StereoSGBM with the settings of our tables
+            sgbm = SGBMConfig(with_filled_holes=self.with_filled_holes)
+            name = "sgbm-filled" if self.with_filled_holes else "sgbm"
+            net = FakestereoNet.load(matcher="sgbm", config=sgbm)
+            return Method(name, net, {"matcher": "sgbm", **asdict(sgbm)})
         if isinstance(self.weights, Weights):
             with self.weights.unpacked() as file:
                 return replace(self, weights=file).build()
@@ -149,20 +153,8 @@ class MethodSource:
             )
         if not isinstance(self.weights, str):
             return self
-        return replace(self, weights=Weights.read(self.weights))
-
-    def settings(self) -> dict[str, Any]:
-        """Say what decides the results; this machine need not have the workers' device."""
-        settings = replace(self, config=replace(self.config, device="cpu")).build().settings
-        return settings | ({"device": self.config.device} if "device" in settings else {})
-
-
-def sgbm_method(*, with_filled_holes: bool) -> Method:
-    """OpenCV's StereoSGBM with the settings of our tables."""
-    config = SGBMConfig(with_filled_holes=with_filled_holes)
-    net = FakestereoNet.load(matcher="sgbm", config=config)
-    name = "sgbm-filled" if with_filled_holes else "sgbm"
-    return Method(name, net, {"matcher": "sgbm", **asdict(config)})
+        path = find_weights(self.weights)
+        return replace(self, weights=Weights(name=path.name, data=path.read_bytes()))
 
 
 def read_lens(options: LensOptions, sources: Sequence[Path]) -> Camera | FieldOfView | float:
@@ -361,7 +353,10 @@ def estimate_by_engine(
     inputs = Inputs.find(words, files)
     with inputs.first() as first:
         own = work_of(first)
-    settings = own.settings(own.method.settings())
+    here = replace(own.method, config=replace(own.method.config, device="cpu")).build().settings
+    if "device" in here:  # that of the workers, which this machine need not have
+        here["device"] = own.method.config.device
+    settings = own.settings(here)
     work = Work(start=own.start, files=files, endings=ENDINGS, batch=own.output.batch)
     what = "pairs" if files == PAIRS else "depth maps"
     return say(engine.run(work, inputs, out, settings), out, what)
@@ -377,12 +372,17 @@ def estimate_all(
     run.claim_names(out, {files[0].stem: files for files in sources}, endings, videos)
     process = run.find_rank()
     mine = sources[process.rank :: process.world]
-    predictor = Predictor(work, method, out)
+    needed = (LAST, CLOUD) if work.output.cloud else (LAST,)
+    whole = {name for name in run.read_results(out)
+             if run.is_whole(out, name, [f"{name}.{end}" for end in needed])}  # fmt: skip
+    predictor = Predictor(work, method, out, whole)
     stills = [files for files in mine if not _is_video(files[0])]
     named = (one for files in stills for one in work.inputs_of(files))
     done = len(predictor.predict(named, len(stills), "images"))
     done += sum(predictor.predict_video(video) for video, *_ in mine if _is_video(video))
     failures = list(predictor.failures.values())
+    ending = f".{LAST}"
+    made = {name for name in run.read_results(out) if run.is_whole(out, name, [name + ending])}
     if failures and not done and len(sources) == 1:
         raise failures[0]
     for failure in failures:
@@ -390,14 +390,11 @@ def estimate_all(
     count = f"{done} of {len(mine)} pairs" if work.files == PAIRS else f"{done} depth maps"
     print(f"{count} are in {out}")
     if process.rank == 0:
-        ending = f".{LAST}"
-        frames = sorted(path.name.removesuffix(ending) for path in out.glob(f"*_??????{ending}"))
         finished: dict[tuple[Path, ...], list[str]] = {}
         for files in sources:
-            stem = files[0].stem
-            finished[files] = [stem] if run.is_whole(out, stem, [stem + ending]) else []
+            finished[files] = [files[0].stem] if files[0].stem in made else []
             if _is_video(files[0]):
-                finished[files] = [name for name in frames if _frame_of(files[0], name)]
+                finished[files] = sorted(name for name in made if _frame_of(files[0], name))
         names = [name for some in finished.values() for name in some]
         chosen = [names[k] for k in spread_evenly(len(names), MOST_VIEWS)]
         shown: list[StereoInput] = []
@@ -432,11 +429,15 @@ def estimate_all(
 
 @dataclass(frozen=True)
 class Predictor:
-    """Inputs in, files out; what fails is remembered in ``failures``, by its name."""
+    """Inputs in, files out; what fails is remembered in ``failures``, by its name.
+
+    ``finished``: names of what an earlier run has made, and which is not even read.
+    """
 
     work: DepthWork
     method: Method
     out: Path
+    finished: Collection[str] = ()
     failures: dict[str, InputError] = field(default_factory=dict)
 
     def predict_video(self, source: Path) -> int:
@@ -462,21 +463,16 @@ class Predictor:
         return len(names)
 
     def predict(self, named: Named, total: int | None, what: str) -> list[str]:
-        """Estimate inputs, a batch together, and write their files; give the names that are done.
-
-        What an earlier run finished is not even read.
-        """
+        """Estimate inputs, a batch together, and write their files; give the names of the done."""
         names: list[str] = []
         output, scale, net = self.work.output, self.work.scale, self.method.net
         assert isinstance(net, FakestereoNet), "weights build no other"
-        endings = (LAST, CLOUD) if output.cloud else (LAST,)
         with tqdm(total=total, desc=what, disable=None, unit=f" {what}") as bar:
             while chunk := list(islice(named, output.batch)):
                 inputs: list[StereoInput] = []
                 for name, read in chunk:
                     try:
-                        if not run.is_whole(self.out, name, [f"{name}.{end}" for end in endings]):
-                            inputs.append(read())
+                        inputs += [] if name in self.finished else [read()]
                     except InputError as error:
                         self.failures[name] = error
                 check = self.work.with_check
@@ -491,15 +487,14 @@ class Predictor:
                             estimate = scale_by_distance(estimate, one.name, scale.distance)  # noqa: PLW2901
                         cloud_m = CLOUD_M if output.cloud else None
                         files = write_estimate(self.out, one, estimate, output.color_range, cloud_m)
+                        if estimate.warning:
+                            said = f"depthpose: warning: {one.name}: {estimate.warning}"
+                            tqdm.write(said, sys.stderr)
+                        if estimate.ground is not None:
+                            tqdm.write(f"{one.name}: {estimate.ground}")
                         run.note_result(self.out, one.name, files)
                     except InputError as error:
                         self.failures[one.name] = error
-                        continue
-                    if estimate.warning:
-                        said = f"depthpose: warning: {one.name}: {estimate.warning}"
-                        tqdm.write(said, sys.stderr)
-                    if estimate.ground is not None:
-                        tqdm.write(f"{one.name}: {estimate.ground}")
                 names += [name for name, _ in chunk if name not in self.failures]
                 bar.update(len(chunk))
         return names

@@ -15,7 +15,7 @@ from depthpose.core.errors import InputError
 from depthpose.core.files.images import opened_image, read_numbers, value_range
 from depthpose.pose.cloud import frame_advice, unit_advice
 from depthpose.pose.datasets import mask_from_rle
-from depthpose.pose.mesh import exact_diameter, mesh_suffixes, read_geometry
+from depthpose.pose.mesh import MESH_READERS, exact_diameter, read_geometry
 
 Size = tuple[int, int]
 
@@ -51,7 +51,8 @@ class FileFacts:
 def look_at_all(paths: Sequence[Path]) -> int:
     """Print what each file is and what is odd; give the exit code."""
     # What has a size comes first: a camera file may need it.
-    ordered = sorted(paths, key=_is_camera_like)
+    words = cameras.CAMERA_SUFFIXES
+    ordered = sorted(paths, key=lambda path: path.is_dir() or path.suffix.lower() in words)
     seen: list[FileFacts] = []
     for path in ordered:
         size = next((other.size for other in seen if other.size is not None), None)
@@ -79,17 +80,13 @@ def look_at_all(paths: Sequence[Path]) -> int:
     return 1 if is_odd else 0
 
 
-def _is_camera_like(path: Path) -> bool:
-    return path.is_dir() or path.suffix.lower() in cameras.CAMERA_SUFFIXES
-
-
 def _read(path: Path, size: Size | None) -> FileFacts:
     suffix = path.suffix.lower()
-    if _is_camera_like(path):
+    if path.is_dir() or suffix in cameras.CAMERA_SUFFIXES:
         return _read_words(path, size)
     if suffix in files.MAP_SUFFIXES:
         return _of_map(path)
-    if suffix in mesh_suffixes():
+    if suffix in MESH_READERS:
         vertices, faces = read_geometry(path)
         points = torch.from_numpy(vertices)
         if not len(faces):

@@ -74,14 +74,6 @@ class Weights:
     name: str
     data: bytes = field(repr=False)
 
-    @classmethod
-    def read(cls, word: str) -> "Weights":
-        """Read weights by path or name."""
-        from depthpose.core.checkpoint import find_weights
-
-        path = find_weights(word)
-        return cls(name=path.name, data=path.read_bytes())
-
     @contextmanager
     def unpacked(self) -> Iterator[str]:
         """Give it as a file while the block runs."""

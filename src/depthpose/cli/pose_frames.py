@@ -4,6 +4,7 @@ import re
 from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -60,7 +61,7 @@ def find_all(method: PoseMethod, inputs: OneObjectOptions, out: Path) -> int:
     facts = pose_predict.camera_facts(lens) | ({} if unit is None else {"unit": unit})
     settings = {**method.settings, "find": sorted(objects), **facts}
     pose_predict.claim(out, settings, jobs, pose_predict.is_result_of)
-    left = [p for p in kept_predictions(out) if p.estimate.status != "unreadable"]
+    left = [p for p in kept_predictions(out).values() if p.estimate.status != "unreadable"]
     results: list[tuple[Prediction, Job[Any]]] = []
     for job in tqdm(jobs, disable=None, unit=" images"):
         own = [p for p in left if pose_predict.is_result_of(p.estimate.name, job.name)]
@@ -73,7 +74,10 @@ def find_all(method: PoseMethod, inputs: OneObjectOptions, out: Path) -> int:
             else:
                 found = method.find(view, objects) or [nothing_found(view, ", ".join(objects))]
             own = [Prediction(estimate=one) for one in found]
-        results += [(one, explained_job(job, one.estimate, method)) for one in own]
+        results += [
+            (one, replace(job, name=one.estimate.name, read=partial(_explained, job, one, method)))
+            for one in own
+        ]
         write_predictions(out, [*(prediction for prediction, _ in results), *left])
     pose_predict.claim(out, settings, [job for _, job in results], pose_predict.is_result_of)
     answered = [pair for pair in results if pair[0].estimate.is_posed]
@@ -81,18 +85,14 @@ def find_all(method: PoseMethod, inputs: OneObjectOptions, out: Path) -> int:
     return pose_predict.say_result([prediction for prediction, _ in results], out)
 
 
-def explained_job(job: Job[Any], estimate: PoseEstimate, method: PoseMethod) -> Job[Any]:
-    """Take what was found in a whole depth image as if a mask had given it."""
-    model = next((one for one in method.models if one.name == estimate.object), None)
-
-    def read() -> AnyInput:
-        view, pose = job.read(), estimate.camera_from_model
-        if model is None or pose is None or not isinstance(view, ViewInput):
-            return view
-        mask = explained_mask(view, pose, prepare_surface(model))
-        return replace(view, name=estimate.name, mask=mask, object=model.name)
-
-    return replace(job, name=estimate.name, read=read)
+def _explained(job: Job[Any], found: Prediction, method: PoseMethod) -> AnyInput:
+    """Read a whole depth image as if a mask had shown what was found in it."""
+    view, pose = job.read(), found.estimate.camera_from_model
+    model = next((one for one in method.models if one.name == found.estimate.object), None)
+    if model is None or pose is None or not isinstance(view, ViewInput):
+        return view
+    mask = explained_mask(view, pose, prepare_surface(model))
+    return replace(view, name=found.estimate.name, mask=mask, object=model.name)
 
 
 def track_folder(method: PoseMethod, frames: SequenceOptions, out: Path) -> int:
@@ -130,25 +130,25 @@ def track_bop(method: PoseMethod, frames: SequenceOptions, out: Path) -> int:
     for one in sorted(dataset.instances, key=lambda i: (i.image_id, i.index)):
         images.setdefault((one.scene_id, one.object_id), {}).setdefault(one.image_id, one)
     sequences = [
-        (names[number], [_frame_job(one, names[number]) for one in some.values()])
-        for (_, number), some in sorted(images.items())
+        (names[number], list(some.values())) for (_, number), some in sorted(images.items())
     ]
+    sequences = [
+        (name, [Job(name=one.name, read=partial(_whole_view, one, name), object=name,
+                    place=place_of(one)) for one in some])
+        for name, some in sequences
+    ]  # fmt: skip
     jobs = [job for _, own in sequences for job in own]
     coming = (one for name, own in sequences for one in _followed(method, own, name))
     return _finish(method, coming, jobs, out, dataset)
 
 
-def _frame_job(instance: Instance, name: str) -> Job[Any]:
-    """Take the depth image of an instance without its mask."""
-
-    def read() -> ViewInput:
-        depth_m = read_depth_png(instance.depth, instance.depth_unit_m)
-        everywhere = torch.ones_like(depth_m, dtype=torch.bool)
-        return ViewInput(
-            name=instance.name, depth_m=depth_m, mask=everywhere, K=instance.K, object=name
-        )
-
-    return Job(name=instance.name, read=read, object=name, place=place_of(instance))
+def _whole_view(instance: Instance, name: str) -> ViewInput:
+    """Read the depth image of an instance without its mask."""
+    depth_m = read_depth_png(instance.depth, instance.depth_unit_m)
+    everywhere = torch.ones_like(depth_m, dtype=torch.bool)
+    return ViewInput(
+        name=instance.name, depth_m=depth_m, mask=everywhere, K=instance.K, object=name
+    )
 
 
 def _finish(
@@ -163,7 +163,7 @@ def _finish(
     They are written where the work is interrupted, too; what an earlier run found of frames that
     this one did not reach stays in the file.
     """
-    left = kept_predictions(out)
+    left = list(kept_predictions(out).values())
     predictions: list[Prediction] = []
     try:
         for one in coming:
@@ -175,7 +175,10 @@ def _finish(
             others = [p for p in left if p.estimate.name not in names]
             write_predictions(out, [*predictions, *others])
     pairs = zip(predictions, jobs, strict=True)
-    explained = [explained_job(job, prediction.estimate, method) for prediction, job in pairs]
+    explained = [
+        replace(job, name=one.estimate.name, read=partial(_explained, job, one, method))
+        for one, job in pairs
+    ]
     pose_predict.write_files(predictions, explained, out, method, dataset)
     code = pose_predict.say_result(predictions, out)
     kinds = Counter(p.estimate.tracking for p in predictions if p.estimate.tracking is not None)

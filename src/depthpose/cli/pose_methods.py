@@ -63,15 +63,13 @@ def find_masks(
             jobs = partial(predictions.detection_jobs, dataset, detections=detections)
             settings = {"masks_sha256": file_sha256(path)}
         elif kind == "predicted":
-            mask_of = datasets.LAYOUTS[dataset.layout].predicted_mask
-            if mask_of is None:
+            file = datasets.LAYOUTS[dataset.layout].predicted_mask
+            if file is None:
                 raise InputError(
                     f"{dataset.folder}: came without predicted masks, as Linemod_preprocessed has "
                     "them; give --masks a file of BOP detections, or weights of a segmentation"
                 )
-            jobs = partial(
-                predictions.instance_jobs, dataset, mask_of=partial(mask_of, dataset.folder)
-            )
+            jobs = partial(predictions.instance_jobs, dataset, predicted_mask=file)
             settings = {"masks_of": "segnet_results"}
         masks.append(Masks(name=name, jobs=jobs, settings=settings))
     return masks
@@ -300,12 +298,6 @@ class MethodSource:
             return _network(path, path.stem, config)
         with self.weights.unpacked() as name:
             return _network(Path(name), Path(name).stem, config)
-
-    def packed(self) -> "MethodSource":
-        """Give the same with the weights in memory."""
-        if not isinstance(self.weights, str):
-            return self
-        return replace(self, weights=Weights.read(self.weights))
 
 
 def source_of(

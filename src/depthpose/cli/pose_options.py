@@ -12,12 +12,6 @@ from depthpose.pose.config import DiameterTable, EstimateConfig, EvaluationConfi
 Voting = Literal["ransac", "least-squares"]
 
 
-def voting_config(voting: Voting, hypotheses: int = VotingConfig.hypotheses) -> VotingConfig:
-    """Give the config of a way to vote."""
-    method = "ransac" if voting == "ransac" else "least squares"
-    return VotingConfig(method=method, hypotheses=hypotheses)
-
-
 @dataclass(frozen=True, kw_only=True)
 class PoseDataOptions:
     """The data set of a table or figure of poses."""
@@ -60,7 +54,7 @@ class PoseMeasureOptions:
     @property
     def estimate(self) -> EstimateConfig:
         """Settings of the estimators."""
-        voting = voting_config(self.voting)
+        voting = VotingConfig(method="ransac" if self.voting == "ransac" else "least squares")
         return EstimateConfig(voting=voting, with_icp=self.icp, device=self.device)
 
     @property
@@ -145,8 +139,9 @@ class EstimateOptions:
 
         if self.batch < 1:
             raise InputError(f"--batch {self.batch}: at least 1 input in one call of the network")
+        method = "ransac" if self.voting == "ransac" else "least squares"
         return EstimateConfig(
-            voting=voting_config(self.voting, self.hypotheses),
+            voting=VotingConfig(method=method, hypotheses=self.hypotheses),
             with_icp=self.icp,
             min_certainty=self.min_certainty,
             up_to_symmetry=self.up_to_symmetry,

@@ -16,12 +16,12 @@ from scipy.spatial.transform import Rotation
 from tqdm import tqdm
 
 from depthpose.cli import pose_methods
-from depthpose.cli.engine import EngineOptions, say
+from depthpose.cli.engine import EngineOptions, Weights, say
 from depthpose.cli.pose_methods import MethodSource, PoseMethod
 from depthpose.cli.pose_options import DataSetOptions, OneObjectOptions
 from depthpose.core import run
 from depthpose.core.camera import Camera, camera_of
-from depthpose.core.checkpoint import file_sha256
+from depthpose.core.checkpoint import file_sha256, find_weights
 from depthpose.core.config import config_to_dict
 from depthpose.core.engine import (
     Files,
@@ -54,7 +54,7 @@ from depthpose.pose.datasets import (
     read_labels,
     read_targets,
 )
-from depthpose.pose.estimator.inputs import AnyInput, AnyMask, cloud_input, view_input
+from depthpose.pose.estimator.inputs import AnyMask, cloud_input, view_input
 from depthpose.pose.evaluate import of_targets
 from depthpose.pose.predictions import (
     CLOUD,
@@ -62,7 +62,7 @@ from depthpose.pose.predictions import (
     POSES,
     Job,
     Prediction,
-    known_predictions,
+    kept_predictions,
     predict,
     prediction_row,
     results_name,
@@ -101,7 +101,7 @@ def claim(
         (out / POSES).unlink(missing_ok=True)
 
     def is_finished(name: str) -> bool:
-        made = known_predictions(out).values()
+        made = kept_predictions(out).values()
         done = [p.estimate.name for p in made if p.estimate.status != "unreadable"]
         return any(is_result(one, name) for one in done)
 
@@ -121,7 +121,7 @@ def is_result_of(name: str, image: str) -> bool:
 def claim_bop(out: Path, settings: dict[str, Any], dataset: BopDataset) -> None:
     """Claim a folder for the poses of a data set."""
     images = sorted({(i.scene_id, i.image_id) for i in dataset.instances})
-    pictures = [_picture_name(*image) for image in images]
+    pictures = [f"{scene:06d}_{image:06d}.{PICTURE}" for scene, image in images]
     tables = [results_name(dataset), results_name(dataset, _WITH_ALTERNATIVES)]
     run.claim_folder(out, settings, [POSES, _PAGE, *tables, *pictures])
 
@@ -328,7 +328,7 @@ def predict_all(
     """
     process = run.find_rank()
     home = out if process.world == 1 else out / f"part-{process.rank}"
-    known = known_predictions(out)
+    known = kept_predictions(out)
     done = {name for name, made in known.items() if made.estimate.status != "unreadable"}
     left = [job for job in jobs[process.rank :: process.world] if job.name not in done]
     if left:
@@ -343,11 +343,11 @@ def predict_all(
         def is_there(name: str) -> bool:
             # Files of all parts are read for all names at once, every second.
             if name not in seen["names"] and time.monotonic() - seen["at"] > 1:
-                seen["names"], seen["at"] = set(known_predictions(out)), time.monotonic()
+                seen["names"], seen["at"] = set(kept_predictions(out)), time.monotonic()
             return name in seen["names"]
 
         run.wait_for([job.name for job in jobs], is_there)
-        known = known_predictions(out)
+        known = kept_predictions(out)
     predictions = [known.pop(job.name) for job in jobs]
     # Inputs of earlier runs stay in the file.
     write_predictions(out, [*known.values(), *predictions])
@@ -374,7 +374,7 @@ def write_files(
             if prediction.place is not None and prediction.estimate.is_posed:
                 posed[prediction.place[:2]].append(prediction.estimate)
         for image, estimates in posed.items():
-            name = _picture_name(*image)
+            name = f"{image[0]:06d}_{image[1]:06d}.{PICTURE}"
             if not is_whole(out, name, [name]):
                 picture = drawn.picture_of(image_of[image])
                 for estimate in estimates:
@@ -403,10 +403,6 @@ def write_files(
             )
         note_result(out, job.name, files)
     _write_page(out, predictions, jobs, models, dataset)
-
-
-def _picture_name(scene: int, image: int) -> str:
-    return f"{scene:06d}_{image:06d}.{PICTURE}"
 
 
 def say_result(predictions: list[Prediction], out: Path) -> int:
@@ -504,30 +500,24 @@ def _write_page(
 ENDING = "pose.json"  # of the one file of a result: an entry of poses.json
 
 
-def cloud_files() -> Files:
-    """Give the kinds of files that are clouds."""
-    return Files(roles=("cloud",), suffixes=cloud_suffixes())
-
-
 def start_files(
     source: MethodSource, object: str, unit: Unit | None, camera: Camera | None
 ) -> Function:
     """Build the estimator; clouds, or depth images and masks, to poses or the reasons for none."""
     method = source.build()
 
-    def read(sample: Sample) -> AnyInput:
-        if camera is None:
-            return cloud_input(sample.files[0], unit or "m", object, sample.name)
-        depth, mask = sample.files
-        return view_input(depth, mask, camera, object, sample.name, unit)
-
     def predict(samples: Sequence[Sample], out: Path) -> list[str]:
         inputs: list[Any] = []
         for sample in samples:
+            name = sample.name
             try:
-                inputs.append(read(sample))
+                if camera is None:
+                    inputs.append(cloud_input(sample.files[0], unit or "m", object, name))
+                else:
+                    depth, mask = sample.files
+                    inputs.append(view_input(depth, mask, camera, object, name, unit))
             except InputError as error:
-                inputs.append(unreadable(sample.name, object, error))
+                inputs.append(unreadable(name, object, error))
         answers = iter(method.estimate_many([i for i in inputs if not isinstance(i, PoseEstimate)]))
         reasons: list[str] = []
         for sample, one in zip(samples, inputs, strict=True):
@@ -547,7 +537,8 @@ def predict_on_ray(
     if options.depth is not None and (options.camera or options.focal_px) is None:
         raise InputError("--depth needs --camera or --focal-px beside it")
     views = Files(roles=("depth", "mask"), suffixes=(*LISTED_SUFFIXES, ".json"))
-    files = cloud_files() if options.depth is None else views
+    clouds = Files(roles=("cloud",), suffixes=cloud_suffixes())
+    files = clouds if options.depth is None else views
     words = [word for word in (options.cloud, options.depth, options.mask) if word is not None]
     inputs = Inputs.find(words, files)
     for item in inputs.items if len(words) == 2 else ():  # one manifest pairs as it likes
@@ -556,7 +547,9 @@ def predict_on_ray(
             raise InputError(
                 f"{words[1]}: no mask called {depth!r}; a mask has the name of its depth image"
             )
-    source = source.packed()
+    if isinstance(source.weights, str):
+        path = find_weights(source.weights)
+        source = replace(source, weights=Weights(name=path.name, data=path.read_bytes()))
     method = source.build("cpu")
     object = object_named(options.object or None, method)
     with inputs.first() as first:

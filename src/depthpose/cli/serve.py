@@ -30,7 +30,7 @@ def serve(
         max_upload_mb: all files of one request together [1e6 bytes].
     """
     try:
-        from depthpose.web import Limits, known_names, make_app, open_socket, run, taken_address
+        from depthpose.web import Limits, known_names, make_app, open_socket, run
     except ModuleNotFoundError as error:
         package = (error.name or "starlette").partition(".")[0]
         raise MissingExtraError(package, "serve", "the page in the browser") from error
@@ -40,8 +40,7 @@ def serve(
     if max_upload_mb < 1:
         raise InputError(f"--max-upload-mb {max_upload_mb}: take 1 at least; 64 is usual")
     taken = open_socket(host, port)
-    address = taken_address(taken)
-    names = known_names(host, address)
+    address, names = known_names(host, taken)
     limits = Limits(upload_bytes=max_upload_mb * 10**6, hosts=names)
     depth = FakestereoNet.load(weights, allow_ood=True)
     app = make_app(depth, GeoPoseNet.load(pose_weights), limits)

@@ -1,6 +1,7 @@
 """``depthpose reproduce ...`` and ``depthpose figure ...``."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
@@ -51,7 +52,7 @@ def reproduce(
         pictures: how many frames the page shows.
     """
     from depthpose.cli.depth_evaluate import baseline_method, open_frames, open_training
-    from depthpose.cli.depth_predict import Method, MethodSource, sgbm_method
+    from depthpose.cli.depth_predict import MethodSource
     from depthpose.cli.thesis_depth import reproduce_table
     from depthpose.depth.evaluate import find_protocol
     from depthpose.thesis.depth import TABLES
@@ -65,24 +66,25 @@ def reproduce(
     refuse_below(0, "--pictures", pictures, "3")
     _refuse_rows(published, weights, matcher, beside)
     dataset = open_frames(kitti, None if split == "all" else split)
-
-    def method_of(name: str) -> Method:
-        right = published.with_right
-        return MethodSource(weights=name, config=matching.config, with_right=right).build()
-
+    right = published.with_right
+    source = MethodSource(weights=None, config=matching.config, with_right=right)
     # Each method, with the thesis's own row that it stands for, if any.
     own = published.own
     owns = own if len(own) == len(weights) else [own[0]] * len(weights)
-    methods = [(row, method_of(file)) for row, file in zip(owns, weights, strict=True)]
+    methods = [
+        (row, replace(source, weights=file).build())
+        for row, file in zip(owns, weights, strict=True)
+    ]
     names = [method.name for _, method in methods]
     if len(set(names)) < len(names):
         raise InputError(
             f"two weights are called {names[0]!r}, and so would their predictions be: rename one."
         )
     if matcher is not None:
-        methods.append((own[0], sgbm_method(with_filled_holes=True)))
+        methods.append((own[0], replace(source, with_filled_holes=True).build()))
     if not published.with_right:
-        others = map(method_of, ("default",) if beside is None else beside)
+        files = ("default",) if beside is None else beside
+        others = [replace(source, weights=file).build() for file in files]
         methods += [("", other) for other in others if other.name not in names]
     if train:
         training = open_training(train, train_without, dataset)

@@ -4,10 +4,7 @@ import hashlib
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
-from jaxtyping import Float
-from torch import Tensor
 from tqdm import tqdm
 
 from depthpose.cli import depth_evaluate as evaluation
@@ -73,7 +70,8 @@ def reproduce_table(
         frames = [f for f in dataset.frames if has_prediction(folder, f.name)]
         shown = replace(dataset, frames=frames)
         for place, index in enumerate(choose_frames(shown, (), pictures)):
-            pair, lidar_m = shown.read_input(index), _lidar(frames[index])
+            pair, frame = shown.read_input(index), frames[index]
+            lidar_m = lidar_truth(frame, "camera_z") if has_lidar(frame, "camera_z") else None
             estimate = read_estimate(folder, pair.name, pair.camera)
             figures = {"2-5": draw_figure_2_5(pair, lidar_m, estimate)}
             if place == 0 and estimate.right is not None and pair.right is not None:
@@ -86,7 +84,14 @@ def reproduce_table(
         Section(title="Published rows, ours, and difference", text=how, rows=rows),
         *sections,
         *evaluation.write_details(measured, out),
-        Section(title="Settings", rows=[row for _, m in methods for row in _setting_rows(m)]),
+        Section(
+            title="Settings",
+            rows=[
+                {"method": method.name, "setting": name, "value": str(value)}
+                for _, method in methods
+                for name, value in method.settings.items()
+            ],
+        ),
     ]
     write_report(f"{table.title}, on {dataset.name}", sections, out)
     evaluation.say_skipped(measured)
@@ -131,7 +136,8 @@ def write_figure(
     columns: list[list[Drawing]] = []
     sections: list[Section] = []
     for index, frame in zip(tqdm(indices, unit=" frames", disable=None), frames, strict=True):
-        pair, lidar_m = dataset.read_input(index), _lidar(frame)
+        pair = dataset.read_input(index)
+        lidar_m = lidar_truth(frame, "camera_z") if has_lidar(frame, "camera_z") else None
         seen = pair if method.with_right else replace(pair, right=None)
         estimate = method.net.estimate_pair(seen)
         if number == "2-5":
@@ -142,7 +148,11 @@ def write_figure(
         sections.append(_panel_section(frame.name, columns[-1], out / "panels" / frame.name))
     path = out / f"figure-{number}.png"
     write_image(path, arrange(columns))
-    sections.append(Section(title="Settings", rows=_setting_rows(method)))
+    rows = [
+        {"method": method.name, "setting": name, "value": str(value)}
+        for name, value in method.settings.items()
+    ]
+    sections.append(Section(title="Settings", rows=rows))
     page.write_page(out / "report.html", f"Figure {number}", sections, environment())
     captions = "; ".join(panel.caption for panel in columns[0])
     print(f"{path}: each column from top to bottom: {captions}. {DEPTH_SCALE}; see the bar below.")
@@ -159,18 +169,7 @@ def _panel_section(title: str, panels: Sequence[Drawing], home: Path) -> Section
     return Section(title=title, text=DEPTH_SCALE, pictures=pictures)
 
 
-def _lidar(frame: Frame) -> Float[Tensor, "h w"] | None:
-    return lidar_truth(frame, "camera_z") if has_lidar(frame, "camera_z") else None
-
-
 def _frames_hash(frames: Sequence[Frame]) -> str:
     """Give the SHA-256 of the list of left images, a line each."""
     lines = "".join(f"{frame.left.resolve()}\n" for frame in frames)
     return hashlib.sha256(lines.encode()).hexdigest()
-
-
-def _setting_rows(method: Method) -> list[dict[str, Any]]:
-    return [
-        {"method": method.name, "setting": name, "value": str(value)}
-        for name, value in method.settings.items()
-    ]

@@ -3,7 +3,7 @@
 import sys
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, field, fields, replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
@@ -104,30 +104,31 @@ class TrainingOptions:
         return 0
 
 
+@dataclass(kw_only=True)
 class Lines:
     """A line a minute, for a log: the first step, the last, and what is left between them."""
 
-    def __init__(self, every_s: float = 60.0, clock: Callable[[], float] = time.monotonic) -> None:
-        self._every_s, self._clock = every_s, clock
-        self._began: tuple[int, float] | None = None
-        self._last_s = 0.0
-        self._numbers: dict[str, float] = {}
+    every_s: float = 60.0
+    clock: Callable[[], float] = time.monotonic
+    began: tuple[int, float] | None = None  #: the first step, and when it was done
+    last_s: float = 0.0  #: when the last line was printed
+    numbers: dict[str, float] = field(default_factory=dict)
 
     def show(self, progress: "Progress") -> None:
         """Print a line where one is due; the latest numbers stand in it."""
-        now_s = self._clock()
-        self._numbers = progress.numbers or self._numbers
-        if self._began is None:
-            self._began = (progress.step, now_s)
-        elif progress.step < progress.steps and now_s - self._last_s < self._every_s:
+        now_s = self.clock()
+        self.numbers = progress.numbers or self.numbers
+        if self.began is None:
+            self.began = (progress.step, now_s)
+        elif progress.step < progress.steps and now_s - self.last_s < self.every_s:
             return
-        self._last_s = now_s
-        first, began_s = self._began
+        self.last_s = now_s
+        first, began_s = self.began
         said = [f"step {progress.step} of {progress.steps}"]
         if first < progress.step < progress.steps:
             left_s = (progress.steps - progress.step) * (now_s - began_s) / (progress.step - first)
             said.append(f"{left_s / 60:.0f} min left")
-        said += [f"{name} {value:.4g}" for name, value in self._numbers.items()]
+        said += [f"{name} {value:.4g}" for name, value in self.numbers.items()]
         print(", ".join(said), flush=True)
 
 

@@ -1,6 +1,7 @@
 """``depthpose weights ...`` and ``depthpose export ...``."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from functools import partial
 from pathlib import Path
 from textwrap import shorten
 from typing import TYPE_CHECKING, Literal
@@ -228,8 +229,7 @@ def export_depth(out: NewPath, weights: WeightsName = "default", what: str | Non
 
     path = find_weights(weights)
     known = read_depth_weights(path)
-    facts = _facts(weights, path, known.facts)
-    return _freeze(out, depth_export(known, what, facts))
+    return _freeze(out, weights, path, known.facts, partial(depth_export, known, what))
 
 
 def export_pose(out: NewPath, weights: WeightsName = "parts") -> int:
@@ -252,28 +252,28 @@ def export_pose(out: NewPath, weights: WeightsName = "parts") -> int:
 
     path = find_weights(weights)
     known = read_pose_weights(path)
-    return _freeze(out, pose_export(known, _facts(weights, path, known.facts)))
+    return _freeze(out, weights, path, known.facts, partial(pose_export, known))
 
 
-def _facts(weights: str, path: Path, facts: Mapping[str, str]) -> dict[str, str]:
-    """Give the facts of weights for a graph of them; prints their terms."""
+def _freeze(
+    out: Path,
+    weights: str,
+    path: Path,
+    facts: Mapping[str, str],
+    export_of: Callable[[dict[str, str]], "Export"],
+) -> int:
+    """Print the terms of weights, write their graph, and print how it differs from PyTorch."""
     from depthpose.core.checkpoint import file_sha256, warn_of_terms
+    from depthpose.core.export import freeze
+    from depthpose.report.page import markdown_table
 
     warn_of_terms(facts)
     own = {"format": "onnx", "weights": Path(weights).name, "weights_sha256": file_sha256(path)}
-    return {**facts, **own}
-
-
-def _freeze(out: Path, export: "Export") -> int:
-    """Write the graph, and print how much it differs from PyTorch."""
-    from depthpose.core.export import freeze, proof_path
-    from depthpose.report.page import markdown_table
-
     rows = [
         {name: f"{v:.1e}" if isinstance(v, float) else v for name, v in row.items()}
-        for row in freeze(out, export)
+        for row in freeze(out, export_of({**facts, **own}))
     ]
     print(markdown_table(rows), end="")
     print(f"{out}: {out.stat().st_size / 1e6:.1f} MB; the differences are in "
-          f"{proof_path(out).name}")  # fmt: skip
+          f"{out.with_suffix('.proof.json').name}")  # fmt: skip
     return 0

@@ -25,7 +25,7 @@ from torch import Tensor, nn
 from torch.overrides import TorchFunctionMode
 
 from depthpose.core.errors import InputError, Notice, import_extra, nearest_name
-from depthpose.core.files.disk import refuse_number, refused_as, write_bytes
+from depthpose.core.files.disk import finite_number, refused_as, write_bytes
 
 NetworkT = TypeVar("NetworkT", bound=nn.Module)
 _DRAWS = (nn.init.normal_, nn.init.uniform_, nn.init.kaiming_normal_, nn.init.kaiming_uniform_)
@@ -201,7 +201,7 @@ def read_checkpoint(path: Path, kind: str | None = None) -> Checkpoint:
     if kind is not None and held != kind:
         raise InputError(f"{path}: holds weights of kind {held!r}, but {kind!r} is needed here.")
     try:
-        config = json.loads(metadata.pop("config"), parse_constant=refuse_number)
+        config = json.loads(metadata.pop("config"), parse_constant=finite_number)
     except (ValueError, RecursionError) as error:
         raise InputError(f"{path}: its 'config' is not JSON ({error}).") from error
     if not isinstance(config, dict):

@@ -10,7 +10,7 @@ from typing import TypeVar, cast
 
 import torch
 
-from depthpose.core.errors import InputError, Notice, full_memory, is_of_memory
+from depthpose.core.errors import InputError, Notice, full_memory
 
 _PROCESS = os.getpid()  # that loaded torch: one that is forked from it has another number
 Item = TypeVar("Item")
@@ -97,9 +97,9 @@ def refused_memory(name: str) -> Iterator[None]:
     try:
         yield
     except (MemoryError, RuntimeError) as error:
-        if not is_of_memory(error):
+        if (said := full_memory(error)) is None:
             raise
-        raise InputError(f"{name}: {full_memory(error)}") from error
+        raise InputError(f"{name}: {said}") from error
 
 
 def usable_device(name: str | torch.device) -> torch.device:

@@ -41,13 +41,10 @@ _OF_MEMORY = re.compile(
 )
 
 
-def is_of_memory(error: BaseException) -> bool:
-    """Whether an error says that the memory is full, whichever library raised it."""
-    return isinstance(error, MemoryError) or _OF_MEMORY.search(str(error)) is not None
-
-
-def full_memory(error: BaseException) -> str:
-    """Say that the memory is full, and what to do."""
+def full_memory(error: BaseException) -> str | None:
+    """Say that the memory is full, whichever library raised it, and what to do; else None."""
+    if not isinstance(error, MemoryError) and _OF_MEMORY.search(str(error)) is None:
+        return None
     said = " ".join(str(error).split())[:200] or "no more is given"
     return (
         f"the memory is full ({said}); end other programs, raise the limit (ulimit -v), take "
@@ -74,8 +71,8 @@ def import_extra(module: str, package: str, extra: str, purpose: str) -> Any:  #
         names = (module, module.partition(".")[0])
         if isinstance(error, ModuleNotFoundError) and error.name in names:
             raise MissingExtraError(package, extra, purpose) from error
-        if is_of_memory(error):
-            raise InputError(f"{purpose} needs {package}: {full_memory(error)}") from error
+        if (said := full_memory(error)) is not None:
+            raise InputError(f"{purpose} needs {package}: {said}") from error
         raise InputError(
             f"{purpose} needs {package}, which is installed and does not load: {error}; a library "
             "of the system is missing, or the package is damaged"
@@ -85,11 +82,6 @@ def import_extra(module: str, package: str, extra: str, purpose: str) -> Any:  #
 def import_opencv(purpose: str) -> Any:  # noqa: ANN401  OpenCV's classes carry no types
     """Import OpenCV, as :func:`import_extra`."""
     return import_extra("cv2", "opencv-python-headless", "opencv", purpose)
-
-
-def import_open3d(purpose: str) -> Any:  # noqa: ANN401  Open3D's classes carry no types
-    """Import Open3D, as :func:`import_extra`."""
-    return import_extra("open3d", "open3d", "open3d", purpose)
 
 
 def refuse_unknown(what: str, name: object, known: Iterable[str]) -> None:

@@ -7,9 +7,9 @@ where it shrinks. The proof: largest and mean difference to PyTorch's answers, a
 import json
 import logging
 import warnings
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import partialmethod
+from functools import partial, partialmethod
 from importlib import import_module
 from importlib.metadata import version
 from itertools import count
@@ -29,12 +29,20 @@ OPSET = 18
 Shape = Sequence[int | str]  # text names a side that is known only when the graph runs
 
 
+def import_export() -> Any:  # noqa: ANN401  what protobuf generates carries no types
+    """Import ONNX, and make sure that what goes with it is there too."""
+    parts = ("onnx.compose", "onnx.inliner", "onnx.numpy_helper", "onnxscript", "onnxruntime")
+    for name in ("onnx", *parts):
+        import_extra(name, "onnx, onnxruntime and onnxscript", "export", "export")
+    return import_module("onnx")
+
+
+@dataclass(frozen=True, eq=False)
 class Value:
     """A tensor of a graph; arithmetic on it adds nodes."""
 
-    def __init__(self, graph: "Graph", name: str) -> None:
-        self.graph = graph
-        self.name = name
+    graph: "Graph"
+    name: str
 
     def op(self, kind: str, *others: Any, **attributes: Any) -> "Value":  # noqa: ANN401
         """Feed it to an operator, first of its inputs."""
@@ -42,12 +50,9 @@ class Value:
 
     def cast(self, dtype: type) -> "Value":
         """Give the same numbers in another type."""
-        return self.op("Cast", to=_onnx_type(dtype))
+        return self.op("Cast", to=self.graph.onnx.helper.np_dtype_to_tensor_dtype(np.dtype(dtype)))
 
-    def slice(self, starts: Any, ends: Any, axes: Sequence[int]) -> "Value":  # noqa: ANN401
-        """Cut out a part; numbers are lists, or values of int64."""
-        return self.op("Slice", starts, ends, list(axes))
-
+    slice = partialmethod(op, "Slice")  # starts, ends, axes: lists, or values of int64
     __add__ = partialmethod(op, "Add")
     __sub__ = partialmethod(op, "Sub")
     __mul__ = partialmethod(op, "Mul")
@@ -55,82 +60,72 @@ class Value:
     __mod__ = partialmethod(op, "Mod")
 
 
+@dataclass(kw_only=True, eq=False)
 class Graph:
     """Nodes in the order in which they are written.
 
     Inputs of an operator are values, arrays, or numbers: an int becomes int64, a float float64.
     """
 
-    def __init__(self) -> None:
-        self._onnx = import_export()
-        self._nodes: list[Any] = []
-        self._constants: list[Any] = []
-        self._inputs: list[Any] = []
-        self._outputs: list[Any] = []
-        self._names = count(1)
+    onnx: Any = field(default_factory=import_export)
+    nodes: list[Any] = field(default_factory=list)
+    constants: list[Any] = field(default_factory=list)
+    inputs: list[Any] = field(default_factory=list)
+    outputs: list[Any] = field(default_factory=list)
+    names: Iterator[int] = field(default_factory=partial(count, 1))
 
     def input(self, name: str, dtype: type, shape: Shape) -> Value:
         """Add an input of the graph."""
-        described = self._onnx.helper.make_tensor_value_info(name, _onnx_type(dtype), list(shape))
-        self._inputs.append(described)
+        helper = self.onnx.helper
+        kind = helper.np_dtype_to_tensor_dtype(np.dtype(dtype))
+        self.inputs.append(helper.make_tensor_value_info(name, kind, list(shape)))
         return Value(self, name)
 
     def output(self, name: str, value: Value, dtype: type, shape: Shape) -> None:
         """Make a value an output of the graph."""
-        described = self._onnx.helper.make_tensor_value_info(name, _onnx_type(dtype), list(shape))
-        self._nodes.append(self._onnx.helper.make_node("Identity", [value.name], [name]))
-        self._outputs.append(described)
+        helper = self.onnx.helper
+        kind = helper.np_dtype_to_tensor_dtype(np.dtype(dtype))
+        self.nodes.append(helper.make_node("Identity", [value.name], [name]))
+        self.outputs.append(helper.make_tensor_value_info(name, kind, list(shape)))
 
     def op(self, kind: str, *inputs: Any, **attributes: Any) -> Value:  # noqa: ANN401
         """Add an operator and give its first output; None leaves an optional input out."""
-        out = f"{kind}_{next(self._names)}"
+        out = f"{kind}_{next(self.names)}"
         names: list[str] = []
         for value in inputs:
             if value is None or isinstance(value, Value):
                 names.append("" if value is None else value.name)
                 continue
-            names.append(f"constant_{next(self._names)}")
-            tensor = self._onnx.numpy_helper.from_array(np.asarray(value), names[-1])
-            self._constants.append(tensor)
-        self._nodes.append(self._onnx.helper.make_node(kind, names, [out], **attributes))
+            names.append(f"constant_{next(self.names)}")
+            tensor = self.onnx.numpy_helper.from_array(np.asarray(value), names[-1])
+            self.constants.append(tensor)
+        self.nodes.append(self.onnx.helper.make_node(kind, names, [out], **attributes))
         return Value(self, out)
 
     def call(self, network: Any, *inputs: Value) -> tuple[Value, ...]:  # noqa: ANN401
         """Put a whole model's nodes here and give its outputs."""
-        prefix = f"network_{next(self._names)}/"
-        inner = self._onnx.compose.add_prefix(network, prefix).graph
+        prefix = f"network_{next(self.names)}/"
+        inner = self.onnx.compose.add_prefix(network, prefix).graph
         for value, wanted in zip(inputs, inner.input, strict=True):
-            node = self._onnx.helper.make_node("Identity", [value.name], [wanted.name])
-            self._nodes.append(node)
-        self._nodes += inner.node
-        self._constants += inner.initializer
+            node = self.onnx.helper.make_node("Identity", [value.name], [wanted.name])
+            self.nodes.append(node)
+        self.nodes += inner.node
+        self.constants += inner.initializer
         return tuple(Value(self, output.name) for output in inner.output)
 
     def model(self, facts: Mapping[str, Any]) -> Any:  # noqa: ANN401
         """Close the graph."""
-        helper = self._onnx.helper
+        helper = self.onnx.helper
         graph = helper.make_graph(
-            self._nodes, "depthpose", self._inputs, self._outputs, self._constants
+            self.nodes, "depthpose", self.inputs, self.outputs, self.constants
         )
         opsets = [helper.make_opsetid("", OPSET)]
         model = helper.make_model(graph, opset_imports=opsets, producer_name="depthpose")
         model.ir_version = 10  # of onnx 1.16: younger ones would shut out older runtimes
         texts = {k: v if isinstance(v, str) else json.dumps(v) for k, v in facts.items()}
         helper.set_model_props(model, texts)
-        self._onnx.checker.check_model(model, full_check=True)
+        self.onnx.checker.check_model(model, full_check=True)
         return model
-
-
-def _onnx_type(dtype: type) -> int:
-    return import_export().helper.np_dtype_to_tensor_dtype(np.dtype(dtype))
-
-
-def import_export() -> Any:  # noqa: ANN401  what protobuf generates carries no types
-    """Import ONNX, and make sure that what goes with it is there too."""
-    parts = ("onnx.compose", "onnx.inliner", "onnx.numpy_helper", "onnxscript", "onnxruntime")
-    for name in ("onnx", *parts):
-        import_extra(name, "onnx, onnxruntime and onnxscript", "export", "export")
-    return import_module("onnx")
 
 
 Row = dict[str, str | float]
@@ -218,7 +213,8 @@ def freeze(path: Path, export: Export) -> list[Row]:
     """Write ``NAME.onnx``, once it agrees with PyTorch, and ``NAME.proof.json`` beside it."""
     if path.suffix != ".onnx":
         raise InputError(f"{path}: the graph is written as ONNX; end the name in .onnx.")
-    for file in (path, proof_path(path)):
+    proof = path.with_suffix(".proof.json")  # NAME.json may be a camera
+    for file in (path, proof):
         refuse_to_replace(file)
     onnx = import_export()
     with atomic_write(path) as part:
@@ -257,13 +253,8 @@ def freeze(path: Path, export: Export) -> list[Row]:
             "facts": facts,
             "differences": rows,
         }
-        write_json(proof_path(path), record)
+        write_json(proof, record)
     return rows
-
-
-def proof_path(path: Path) -> Path:
-    """Give the path of a graph's proof; NAME.json may be a camera."""
-    return path.with_suffix(".proof.json")
 
 
 MOST = 1 << 10  # multiple of a side for the exporter; the graph itself has no bound

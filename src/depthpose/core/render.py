@@ -149,17 +149,13 @@ def _edges(
     corners: Float64[Tensor, "n 3 3"],
 ) -> tuple[Float64[Tensor, "n 3 3"], Float64[Tensor, " n"]]:
     """Lines opposite to the corners, and the determinant, of homogeneous pixels."""
-
-    def cross(a: Tensor, b: Tensor) -> Tensor:
-        # Products are rounded one by one, so that the edge two triangles share has, up to the sign,
-        # the same three numbers in both: nothing shows through between them.
-        (ax, ay, az), (bx, by, bz) = a.unbind(-1), b.unbind(-1)
-        parts = [(ay * bz, az * by), (az * bx, ax * bz), (ax * by, ay * bx)]
-        return torch.stack([one - other for one, other in parts], -1)
-
-    a, b, c = corners.unbind(1)
-    edges = torch.stack([cross(b, c), cross(c, a), cross(a, b)], 1)
-    return edges, (a * edges[:, 0]).sum(-1)
+    # The cross product of the two other corners. Products are rounded one by one, so that the edge
+    # two triangles share has, up to the sign, the same three numbers in both: nothing shows through
+    # between them.
+    (ax, ay, az), (bx, by, bz) = (corners.roll(-k, 1).unbind(-1) for k in (1, 2))
+    parts = [(ay * bz, az * by), (az * bx, ax * bz), (ax * by, ay * bx)]
+    edges = torch.stack([one - other for one, other in parts], -1)
+    return edges, (corners[:, 0] * edges[:, 0]).sum(-1)
 
 
 def _draw(

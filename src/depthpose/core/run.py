@@ -34,6 +34,10 @@ RESULTS = "results.jsonl"
 _SOURCES = "sources.json"
 _LOCK = ".lock"
 _OF_RUNS = (RECORD, _SOURCES, _LOCK)  # what a folder holds before its first result
+NOT_OURS = (
+    "is there already, and no run of this command wrote it; choose another --out, or move it away"
+)
+"""Of a file that a run would write over."""
 _FRAME = re.compile(r"_\d{6}$")
 _PACKAGES = ("depthpose", "torch", "numpy", "opencv-python-headless")
 
@@ -194,7 +198,7 @@ def claim_folder(
     # Listed before the record is looked for, which other processes of a launch write first.
     there = [name for name in (_SOURCES, *results) if os.path.lexists(folder / name)]
     if there and not record.exists():
-        raise not_ours(folder / there[0])
+        raise InputError(f"{folder / there[0]}: {NOT_OURS}")
     is_alone = find_rank().world == 1
     is_new = lock_folder(folder, is_shared=not is_alone)
     try:
@@ -281,7 +285,7 @@ def claim_names(
         is_frame = _FRAME.sub("", stem) in new & set(videos)
         if stem not in known and (stem in new or is_frame):
             if file.relative_to(folder).as_posix() not in noted.get(stem, {}):
-                raise not_ours(file)
+                raise InputError(f"{file}: {NOT_OURS}")
             note_result(folder, stem, [])
     for name in filter(noted.get, new):  # of which source is not known any more
         note_result(folder, name, [])
@@ -317,7 +321,7 @@ def read_settings(folder: Path | str) -> dict[str, Any] | None:
     Raises:
         InputError: its record is damaged.
     """
-    if isinstance(folder, str) and stores.is_url(folder):
+    if isinstance(folder, str) and "://" in folder:
         record = stores.join(folder, RECORD)
         with refused_as(record, "record of a run", "choose another folder"):
             content = json.loads(stores.read_from(record)) if stores.exists(record) else None
@@ -332,14 +336,6 @@ def read_settings(folder: Path | str) -> dict[str, Any] | None:
             f"{record}: not a record of a run: it has no 'settings'; choose another folder"
         )
     return settings
-
-
-def not_ours(path: Path | str) -> InputError:
-    """Make the error for a file, by path or URL, that a run would write over."""
-    return InputError(
-        f"{path}: is there already, and no run of this command wrote it; choose another --out, or "
-        "move it away"
-    )
 
 
 def refuse_other_settings(

@@ -38,7 +38,8 @@ def degrade(image: View, config: DegradeConfig, generator: torch.Generator) -> V
     exposure, contrast, saturation, gamma = (between(low, high) for _ in range(4))
     third = config.colour / 3
     tint = torch.tensor([between(1 - third, 1 + third) for _ in range(3)])
-    image = _saturate(image, saturation)
+    grey = grey_of(image)
+    image = grey + (image - grey) * saturation
     mean = image.mean()
     image = ((image - mean) * contrast + mean) * exposure * tint[:, None, None]
     image = image.clamp(0, 1) ** gamma
@@ -203,8 +204,12 @@ def jitter_colors(pair: TrainingPair, strength: float, generator: torch.Generato
     ).tolist()
     left, right = pair.left * brightness, pair.right * brightness
     mean = (left.mean() + right.mean()) / 2  # one anchor, or the views would drift apart
-    views = [_saturate((view - mean) * contrast + mean, saturation) for view in (left, right)]
-    return pair._replace(left=views[0].clamp(0, 1), right=views[1].clamp(0, 1))
+    views = []
+    for view in (left, right):
+        contrasted = (view - mean) * contrast + mean
+        grey = grey_of(contrasted)
+        views.append((grey + (contrasted - grey) * saturation).clamp(0, 1))
+    return pair._replace(left=views[0], right=views[1])
 
 
 def set_apart(
@@ -243,8 +248,3 @@ def shift_rows(image: View, left_px: float, right_px: float) -> View:
     places = [(2 * columns + 1) / width - 1, (2 * rows + 1) / height - 1]
     grid = torch.stack(places, -1).to(image.dtype)
     return F.grid_sample(image[None], grid[None], padding_mode="border", align_corners=False)[0]
-
-
-def _saturate(image: View, factor: float) -> View:
-    grey = grey_of(image)
-    return grey + (image - grey) * factor

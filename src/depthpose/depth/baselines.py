@@ -5,6 +5,7 @@ learnt little about the picture.
 """
 
 from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -12,10 +13,10 @@ from jaxtyping import Float, Float64
 from torch import Tensor
 from torch.nn import functional as F
 
-from depthpose.core.camera import Camera, StereoRig
+from depthpose.core.camera import StereoRig
 from depthpose.core.errors import InputError
 from depthpose.core.files import read_image
-from depthpose.depth.datasets import Dataset, known_truths, read_known_depth, shrink
+from depthpose.depth.datasets import Dataset, known_truths, read_known_depth
 from depthpose.depth.disparity import disparity_from_depth
 from depthpose.depth.types import DepthEstimate, Map, StereoInput, View
 
@@ -27,18 +28,16 @@ _NEAR_M, _FAR_M, _STEPS = 1.0, 80.0, 4096
 Progress = Callable[[Sequence[int]], Iterable[int]]
 
 
+@dataclass(frozen=True, eq=False)
 class RowDepthBaseline:
     """The best constant depth of each image row: it uses the camera and not the image.
 
     A row is counted by its slope ``(v - cy) / fy``, not by its number: the road at one slope is
     equally far in every camera of one mounting height, whatever its focal length or crop.
-
-    Attributes:
-        depth_m: one depth a row of the canonical camera, the principal point in the middle.
     """
 
-    def __init__(self, depth_m: Float64[np.ndarray, " rows"]) -> None:
-        self.depth_m = depth_m
+    #: one depth a row of the canonical camera, the principal point in the middle
+    depth_m: Float64[np.ndarray, " rows"]
 
     @classmethod
     def fit(cls, dataset: Dataset, progress: Progress = iter) -> "RowDepthBaseline":
@@ -60,7 +59,9 @@ class RowDepthBaseline:
             true_m = known_m.double().numpy()
             v, u = np.nonzero((true_m > _NEAR_M) & (true_m < _FAR_M))
             true_m = true_m[v, u]
-            row = np.rint(_canonical_row(v, rig)).astype(np.int64).clip(0, _ROWS - 1)
+            slope = (v - float(rig.K[1, 2])) / float(rig.K[1, 1])
+            row = np.rint(slope * _CANONICAL_FOCAL_PX + _ROWS // 2).astype(np.int64)
+            row = row.clip(0, _ROWS - 1)
             step = np.log(true_m / _NEAR_M) / np.log(_FAR_M / _NEAR_M) * _STEPS
             flat, share = row * _STEPS + step.astype(np.int64), 1 / true_m / max(len(true_m), 1)
             weight += np.bincount(flat, share, _ROWS * _STEPS).reshape(_ROWS, _STEPS)
@@ -80,13 +81,15 @@ class RowDepthBaseline:
             InputError: the input has no rig.
         """
         rig, (height, width) = _rig_of(pair), pair.left.shape[1:]
-        row = _canonical_row(np.arange(height), rig)
+        slope = (np.arange(height) - float(rig.K[1, 2])) / float(rig.K[1, 1])
+        row = slope * _CANONICAL_FOCAL_PX + _ROWS // 2
         inverse = np.interp(row, np.arange(_ROWS), 1 / self.depth_m)
         depth_m = torch.from_numpy(1 / inverse).float()[:, None].expand(height, width)
         depth_m = depth_m.contiguous()
         return DepthEstimate(depth_m=depth_m, disparity_px=disparity_from_depth(depth_m, rig))
 
 
+@dataclass(frozen=True, eq=False)
 class NearestImageBaseline:
     """The depth of the training image that looks most alike.
 
@@ -97,10 +100,9 @@ class NearestImageBaseline:
     is twice as far.
     """
 
-    def __init__(
-        self, dataset: Dataset, indices: list[int], thumbnails: Float[Tensor, "n d"]
-    ) -> None:
-        self.dataset, self.indices, self.thumbnails = dataset, indices, thumbnails
+    dataset: Dataset  #: of training
+    indices: list[int]  #: of its frames that have a truth and a rig
+    thumbnails: Float[Tensor, "n d"]  #: of their left images
 
     @classmethod
     def fit(cls, dataset: Dataset, progress: Progress = iter) -> "NearestImageBaseline":
@@ -154,13 +156,8 @@ def fill_by_pyramid(values: Map) -> Map:
     return torch.where(is_known, values, fine[: values.shape[0], : values.shape[1]])
 
 
-def _canonical_row(v: np.ndarray, camera: Camera) -> Float64[np.ndarray, " rows"]:
-    slope = (v - float(camera.K[1, 2])) / float(camera.K[1, 1])
-    return slope * _CANONICAL_FOCAL_PX + _ROWS // 2
-
-
 def _thumbnail(image: View) -> Float[Tensor, " d"]:
-    cells = shrink(image, 8, 24).flatten()
+    cells = F.interpolate(image[None], (8, 24), mode="area").flatten()
     centred = cells - cells.mean()
     return centred / centred.norm().clamp(min=1e-9)
 

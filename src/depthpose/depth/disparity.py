@@ -100,16 +100,6 @@ def disparity_from_depth(
     return torch.where(depth_m > 0, disparity_px, torch.nan)
 
 
-def resize_disparity(disparity_px: Map, height: int, width: int) -> Float[Tensor, "height width"]:
-    """Resize bilinearly (pixel centres at halves) and scale the values by the ratio of the widths.
-
-    Disparity is what is interpolated, never depth: depth is not linear between two pixels.
-    """
-    if disparity_px.shape == (height, width):
-        return disparity_px
-    return resized_map(disparity_px, height, width) * (width / disparity_px.shape[1])
-
-
 def warp_right_to_left(right: Float[Tensor, "c h w"], disparity_px: Map) -> Float[Tensor, "c h w"]:
     """Look up, for each left pixel x, the right view at ``x - disparity`` (bilinear).
 
@@ -202,7 +192,11 @@ def resized_match(match: Match, height: int, width: int) -> Match:
 def resized_map(
     values: Float[Tensor, "_ _"], height: int, width: int
 ) -> Float[Tensor, "{height} {width}"]:
-    """Bring a map to another size, without averaging."""
+    """Bring a map to another size, bilinearly (pixel centres at halves), without averaging.
+
+    Of disparity the values still are of the old width. It is what is interpolated, never depth:
+    depth is not linear between two pixels.
+    """
     if values.shape == (height, width):
         return values
     return F.interpolate(values[None, None], (height, width), mode="bilinear")[0, 0]

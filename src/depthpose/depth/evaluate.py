@@ -382,7 +382,7 @@ def _prepare(dataset: Dataset, index: int, predictions: Path, rule: Protocol) ->
         K = torch.tensor([[width, 0, 0], [0, width, 0], [0, 0, 1]], dtype=torch.float64)
         rig = StereoRig(width=width, height=height, K=K, baseline_m=1.0)  # depth takes any
     found_px = files.read_disparity(predictions, frame.name, rig, with_disparity_png=is_stereo)
-    predicted_px = disparity.resize_disparity(found_px, height, width)
+    predicted_px = disparity.resized_map(found_px, height, width) * (width / found_px.shape[1])
     true_px = truth if is_stereo or rig is None else disparity.disparity_from_depth(truth, rig)
     # With principal points apart, the disparity of far points is negative.
     apart_px = 0.0 if rig is None else rig.cx_right_minus_left_px

@@ -34,19 +34,9 @@ from depthpose.depth.weights import DepthWeights, make_matcher
 _0, _1, _2, _HALF = np.float32(0), np.float32(1), np.float32(2), np.float32(0.5)
 
 
-def _size_of(image: Value) -> Value:
-    """Rows and columns of images."""
-    return image.op("Shape", start=2, end=4)
-
-
-def _rows(size: Value) -> Value:
-    """The first of two sides, as a list of one."""
-    return size.slice([0], [1], [0])
-
-
-def _columns(size: Value) -> Value:
-    """The second of two sides, as a list of one."""
-    return size.slice([1], [2], [0])
+def _side(size: Value, axis: int) -> Value:
+    """One of two sides, rows (0) or columns (1), as a list of one."""
+    return size.slice([axis], [axis + 1], [0])
 
 
 def _focal_size(size: Value, focal_px: Any, wanted_px: float) -> Value:  # noqa: ANN401
@@ -70,7 +60,7 @@ def _resized_map(values: Value, size: Value) -> Value:
 
 def _ratio(wide: Value, narrow: Value) -> Value:
     """How many times as wide, for disparities."""
-    many, few = (_columns(size).cast(np.float64) for size in (wide, narrow))
+    many, few = (_side(size, 1).cast(np.float64) for size in (wide, narrow))
     return (many / few).cast(np.float32)
 
 
@@ -111,12 +101,14 @@ class DynamicPSMNet(nn.Module):
         return disparity_px, (probability * is_near).sum(1).clamp(0, 1)
 
 
-class DynamicLightStereo(nn.Module):
-    """The light network with what its matcher makes of its scores."""
-
-    def __init__(self, network: LightStereo) -> None:
+class _Dynamic(nn.Module):
+    def __init__(self, network: Any) -> None:  # noqa: ANN401
         super().__init__()
         self.network = network
+
+
+class DynamicLightStereo(_Dynamic):
+    """The light network with what its matcher makes of its scores."""
 
     def forward(self, left: Views, right: Views) -> tuple[Maps, ...]:
         """Give disparity [px], confidence and, with that class, the sky of normalised images."""
@@ -134,12 +126,8 @@ DYNAMIC_SHAPE_NETWORKS: dict[type[StereoNetwork], Callable[[Any], nn.Module]] = 
 """Each kind of matcher network in its form with dynamic shapes: a new kind is one entry."""
 
 
-class DynamicSelection(nn.Module):
+class DynamicSelection(_Dynamic):
     """The generator that selects, and what its logits say, at half of the image's sides."""
-
-    def __init__(self, generator: SelectionGenerator) -> None:
-        super().__init__()
-        self.generator = generator
 
     def forward(self, image: Views) -> tuple[Tensor, ...]:
         """Give log of disparity, sky and confidence of the left view; the first two of the right.
@@ -147,11 +135,11 @@ class DynamicSelection(nn.Module):
         Disparity is counted in pixels of the image's width. Where the weights know streets, how
         probable one is follows, (b,).
         """
-        features = self.generator.encoder(image)
+        features = self.network.encoder(image)
         left, right = (
-            read_logits(logits, self.generator.planes) for logits in self.generator.decode(features)
+            read_logits(logits, self.network.planes) for logits in self.network.decode(features)
         )
-        street = self.generator.find_street(features[-1])
+        street = self.network.find_street(features[-1])
         return *left, *right[:2], *(() if street is None else (street,))
 
 
@@ -183,7 +171,7 @@ class _Drawn(NamedTuple):
 
 def _drawn(left: Value, generator: Generator) -> _Drawn:
     """What ``draw_right`` or ``select_views`` and ``shift_left`` do."""
-    size, multiple = _size_of(left), generator.config.side_multiple_px
+    size, multiple = left.op("Shape", start=2, end=4), generator.config.side_multiple_px
     # The multiple that a side is close to, or the side itself.
     sides = size.cast(np.float64)
     nearest = (sides / float(multiple)).op("Round").op("Max", 1.0) * float(multiple)
@@ -211,12 +199,12 @@ def _drawn(left: Value, generator: Generator) -> _Drawn:
     # Look the left image up at ``x + shift``; beyond the border the border repeats.
     graph = left.graph
     row, column = (  # 0, 1, ... of each side
-        graph.op("Range", 0, side(size).op("Squeeze", [0]), 1).cast(np.float32)
-        for side in (_rows, _columns)
+        graph.op("Range", 0, _side(size, axis).op("Squeeze", [0]), 1).cast(np.float32)
+        for axis in (0, 1)
     )
     y, x = (
-        (values * _2 + _1) / side(size).cast(np.float32) - _1
-        for values, side in ((row.op("Unsqueeze", [1]), _rows), (right_px + column, _columns))
+        (values * _2 + _1) / _side(size, axis).cast(np.float32) - _1
+        for axis, values in enumerate((row.op("Unsqueeze", [1]), right_px + column))
     )
     parts = (v.op("Expand", right_px.op("Shape")).op("Unsqueeze", [-1]) for v in (x, y))
     grid = graph.op("Concat", *parts, axis=-1)
@@ -256,7 +244,7 @@ def image_graph(weights: DepthWeights) -> Graph:
     graph = Graph()
     image = graph.input("image", np.float32, _IMAGES)
     K = graph.input("K", np.float64, (3, 3)).op("Reshape", [-1])
-    full = _size_of(image)
+    full = image.op("Shape", start=2, end=4)
     small = _focal_size(full, K.op("Gather", [4, 0]), rig.virtual_focal_px)
     left = _resized_image(image, small)
     right, own, street = _drawn(left, generator)
@@ -330,12 +318,12 @@ def _matched(
     """Match at the focal length that the weights want, and come back to the images' size."""
     network = _dynamic_shape_network(matcher)
     config, graph = matcher.config, left.graph
-    size = work = _size_of(left)
+    size = work = left.op("Shape", start=2, end=4)
     if config.work_focal_px is not None:
         work = _focal_size(size, focal_px, config.work_focal_px)
     least, step = config.min_side_px, config.step_px
     lacking = ((work + (step - 1)) / step * step).op("Max", least) - work
-    above, beside = _rows(lacking), _columns(lacking)
+    above, beside = _side(lacking, 0), _side(lacking, 1)
     pads = graph.op("Concat", [0, 0], above, [0, 0, 0, 0], beside, axis=0)
     mean, deviation = (
         np.array(v, np.float32)[:, None, None] for v in (IMAGENET_MEAN, IMAGENET_STD)
@@ -346,7 +334,7 @@ def _matched(
     example = [torch.rand(2, 3, least + step, least + 2 * step) for _ in range(2)]
     found = graph.call(network_model(network, example, step), *padded)
     first = graph.op("Concat", above, [0], axis=0)
-    last = graph.op("Concat", [1 << 62], _columns(work), axis=0)
+    last = graph.op("Concat", [1 << 62], _side(work, 1), axis=0)
     disparity_px, confidence, *sky = (
         _resized_map(m.slice(first, last, [1, 2]), size) for m in found
     )
@@ -403,14 +391,13 @@ def _pair_export(weights: DepthWeights, facts: dict[str, Any]) -> Export:
     def cases() -> Iterator[Case]:
         assert weights.matcher is not None
         net = FakestereoNet(make_matcher(weights.matcher, _QUICK))
-        sky = ("is_sky",) if _sees_sky(weights.matcher) else ()
+        sky = ("is_sky",) if getattr(weights.matcher.config, "with_sky", False) else ()
         work_px = weights.matcher.config.work_focal_px
         for size in _SIZES:
-            left, right = _scenes(size, with_sky=bool(sky))
+            left, right, camera = _scenes(size, work_px or 1.0, with_sky=bool(sky))
             inputs = {"left": left.numpy(), "right": right.numpy()}
             rig = None
             if work_px is not None:
-                camera = _camera(size, work_px)
                 rig = StereoRig(
                     width=camera.width, height=camera.height, K=camera.K, baseline_m=0.5
                 )
@@ -438,11 +425,12 @@ def _image_export(weights: DepthWeights, facts: dict[str, Any]) -> Export:
         synthesiser = make_synthesiser(weights.generator, speed=_QUICK.speed)
         net = FakestereoNet(matcher, synthesiser, allow_ood=True)
         selects = isinstance(weights.generator, SelectionGenerator)
-        sky = ("is_sky",) if selects or _sees_sky(weights.matcher) else ()
+        own = None if weights.matcher is None else weights.matcher.config
+        sky = ("is_sky",) if selects or getattr(own, "with_sky", False) else ()
         street = ("image_confidence",) if getattr(weights.generator, "street", None) else ()
         for size in _SIZES:
-            images, _ = _scenes(size, with_sky=bool(sky))
-            camera = _camera(size, weights.generator.config.virtual_focal_px)
+            focal_px = weights.generator.config.virtual_focal_px
+            images, _, camera = _scenes(size, focal_px, with_sky=bool(sky))
             inputs = {"image": images.numpy(), "K": camera.K.numpy()}
             # A depth beyond all bounds, or none, hangs on the last bit of a disparity near zero.
             given = (
@@ -474,10 +462,6 @@ TARGETS = {
 """One image to depth, a rectified pair to disparity: a new target is a function and one entry."""
 
 
-def _sees_sky(matcher: StereoNetwork | None) -> bool:
-    return matcher is not None and getattr(matcher.config, "with_sky", False)
-
-
 def _case(
     inputs: dict[str, np.ndarray], found: list[DepthEstimate], outputs: tuple[str, ...]
 ) -> Case:
@@ -489,16 +473,17 @@ def _case(
     return Case(name="x".join(map(str, shape)), inputs=inputs, expected=expected)
 
 
-def _camera(size: tuple[int, int, float, int], focal_px: float) -> Camera:
-    rows, columns, share, _ = size
+def _scenes(
+    size: tuple[int, int, float, int], focal_px: float, *, with_sky: bool
+) -> tuple[Tensor, Tensor, Camera]:
+    """Make images of smooth noise, the same moved to the left, which match everywhere; and a lens.
+
+    Its focal length is the share of ``size`` of that which the weights want.
+    """
+    rows, columns, share, count = size
     f = share * focal_px
     K = torch.tensor([[f, 0, columns / 2], [0, f, rows / 2], [0, 0, 1]], dtype=torch.float64)
-    return Camera(width=columns, height=rows, K=K)
-
-
-def _scenes(size: tuple[int, int, float, int], *, with_sky: bool) -> tuple[Tensor, Tensor]:
-    """Make images of smooth noise, and the same moved to the left: pairs that match everywhere."""
-    rows, columns, share, count = size
+    camera = Camera(width=columns, height=rows, K=K)
     shift, chance = round(_SHIFT_PX * share), torch.Generator().manual_seed(0)
     noise = torch.rand(count, 3, rows // 6, columns // 6, generator=chance)
     scene = F.interpolate(noise, (rows, columns + shift), mode="bicubic").clamp(0, 1)
@@ -506,4 +491,4 @@ def _scenes(size: tuple[int, int, float, int], *, with_sky: bool) -> tuple[Tenso
         top = rows * 2 // 5
         sky = torch.tensor(_SKY)[:, None, None] * torch.linspace(0.9, 1.0, top)[:, None]
         scene[:, :, :top] = torch.lerp(scene[:, :, :top], sky, 0.97)
-    return scene[..., :columns].contiguous(), scene[..., shift:].contiguous()
+    return scene[..., :columns].contiguous(), scene[..., shift:].contiguous(), camera

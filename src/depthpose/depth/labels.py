@@ -68,9 +68,12 @@ def label_pairs(
         failures.append(error)
 
     for number in usable:
+        name = frames[number].name
+        if any("\ud800" <= letter <= "\udfff" for letter in name):  # bytes that are no UTF-8
+            fail(InputError(f"{name!r}: not a name in UTF-8, as calib.txt needs; rename the file"))
+            continue
         try:
             rig = dataset.read_rig(number)
-            _refuse_bytes(frames[number].name)
         except InputError as error:
             fail(error)
             continue
@@ -116,11 +119,6 @@ def label_pair(net: FakestereoNet, pair: StereoInput, config: LabelConfig) -> Ma
     if one.is_sky is not None:
         is_known &= ~one.is_sky
     return torch.where(is_known, left_px, torch.nan)
-
-
-def _refuse_bytes(name: str) -> None:
-    if not name.isascii() and any("\ud800" <= letter <= "\udfff" for letter in name):
-        raise InputError(f"{name!r}: not a name in UTF-8, as calib.txt needs; rename the file")
 
 
 def _write_calibration(path: Path, rigs: Mapping[str, StereoRig]) -> None:

@@ -30,19 +30,6 @@ ADVERSARIAL_LOSSES: dict[str, Callable[[Tensor, Tensor], Tensor]] = {
 """Losses of logits and labels by their names in configs: a new one is one entry here."""
 
 
-def discriminator_loss(
-    real: Float[Tensor, "b 1 rows columns"], fake: Float[Tensor, "b 1 rows columns"], mode: str
-) -> Float[Tensor, ""]:
-    """Half the sum of both losses, which slows the discriminator (pix2pix)."""
-    real_loss = adversarial_loss(real, mode, is_real=True)
-    return (real_loss + adversarial_loss(fake, mode, is_real=False)) / 2
-
-
-def l1_loss(generated: Views, real: Views) -> Float[Tensor, ""]:
-    """Mean absolute difference (eq. 2.5 of the thesis)."""
-    return (generated - real).abs().mean()
-
-
 def valid_disparity(truth_px: Maps, max_px: int) -> Bool[Tensor, "b h w"]:
     """Where the truth is known, positive (0 is the sky) and in the matcher's range."""
     return (truth_px > 0) & (truth_px < max_px)

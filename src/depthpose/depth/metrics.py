@@ -125,9 +125,15 @@ def sparsification_area(error: Numbers, confidence: Numbers, steps: int = 50) ->
         raise InputError("sparsification_area: there is no pixel to compare.")
     if float(error.double().mean()) == 0:
         return 0.0
-    by_confidence = _remaining_error(error.double(), confidence.double(), steps)
-    by_oracle = _remaining_error(error.double(), -error.double(), steps)
-    return float(((by_confidence - by_oracle) / error.double().mean()).mean())
+    error, curves = error.double(), []
+    for keep_first in (confidence.double(), -error):
+        # The mean error of what is left, the pixels of low ``keep_first`` removed first.
+        descending = torch.argsort(keep_first, descending=True)
+        counts = torch.arange(1, len(error) + 1)
+        running = _shared_error(error, keep_first)[descending].cumsum(0) / counts
+        kept = len(error) * (1 - torch.arange(steps, dtype=error.dtype) / steps)
+        curves.append(running[kept.ceil().long().clamp(min=1) - 1])
+    return float(((curves[0] - curves[1]) / error.mean()).mean())
 
 
 def score_confidence(error: Numbers, confidence: Numbers) -> dict[str, float]:
@@ -152,15 +158,6 @@ def error_by_decile(error: Numbers, confidence: Numbers) -> Float[Tensor, "10"]:
     ascending = torch.argsort(confidence)
     tenths = _shared_error(error.double(), confidence)[ascending].tensor_split(10)
     return torch.stack([tenth.mean() for tenth in tenths])
-
-
-def _remaining_error(error: Numbers, keep_first: Numbers, steps: int) -> Float[Tensor, " steps"]:
-    """Mean error of what is left, the pixels of low ``keep_first`` removed first."""
-    descending = torch.argsort(keep_first, descending=True)
-    counts = torch.arange(1, len(error) + 1)
-    running = _shared_error(error, keep_first)[descending].cumsum(0) / counts
-    kept = len(error) * (1 - torch.arange(steps, dtype=error.dtype) / steps)
-    return running[kept.ceil().long().clamp(min=1) - 1]
 
 
 def _shared_error(error: Numbers, key: Numbers) -> Numbers:

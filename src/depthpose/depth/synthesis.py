@@ -14,6 +14,7 @@ from collections import OrderedDict
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Literal
 
 import torch
 import torch.nn.functional as F
@@ -88,19 +89,15 @@ class UNetGenerator(nn.Module):
         return torch.tanh(x)
 
 
-class _Level(nn.Module):
+class _Level(nn.Sequential):
     """Convolution, norm and dropout of one level; activations stand before it."""
 
     def __init__(
         self, conv: nn.Conv2d | nn.ConvTranspose2d, *, with_norm: bool, dropout: float = 0.0
     ) -> None:
-        super().__init__()
-        self.conv = conv
-        self.norm = nn.BatchNorm2d(conv.out_channels) if with_norm else nn.Identity()
-        self.dropout = nn.Dropout(dropout) if dropout else nn.Identity()
-
-    def forward(self, x: Tensor) -> Tensor:
-        return self.dropout(self.norm(self.conv(x)))
+        norm = nn.BatchNorm2d(conv.out_channels) if with_norm else nn.Identity()
+        rest = nn.Dropout(dropout) if dropout else nn.Identity()
+        super().__init__(OrderedDict(conv=conv, norm=norm, dropout=rest))
 
 
 def _initialise(module: nn.Module) -> None:
@@ -118,40 +115,29 @@ def _initialise(module: nn.Module) -> None:
 Scores = Float[Tensor, "b 1 rows columns"]
 
 
-class _Discriminator(nn.Module):
-    def __init__(self, *layers: nn.Module) -> None:
+class Discriminator(nn.Module):
+    """Score each 70x70 patch, or each pixel alone.
+
+    Of patches C64-C128-C256-C512-1, 2,768,705 parameters at width 64; of pixels 1x1 convolutions
+    64-128-1, 9,024 parameters.
+    """
+
+    def __init__(self, kind: Literal["patch", "pixel"] = "patch", width: int = 64) -> None:
         super().__init__()
+        kernel, stride, padding = (4, 2, 1) if kind == "patch" else (1, 1, 0)
+        layers: list[nn.Module] = [nn.Conv2d(6, width, kernel, stride, padding), nn.LeakyReLU(0.2)]
+        steps = ((width, 2), (2 * width, 2), (4 * width, 1)) if kind == "patch" else ((width, 1),)
+        for inputs, stride in steps:
+            conv = nn.Conv2d(inputs, 2 * inputs, kernel, stride, padding, bias=False)
+            layers += [conv, nn.BatchNorm2d(2 * inputs), nn.LeakyReLU(0.2)]
+        last = 2 * steps[-1][0]
+        layers.append(nn.Conv2d(last, 1, kernel, 1, padding, bias=kind == "patch"))
         self.layers = nn.Sequential(*layers)
         self.apply(_initialise)
 
     def forward(self, left: Views, right: Views) -> Scores:
         """Answer one logit a patch or pixel; images are RGB in [-1, 1]."""
         return self.layers(torch.cat([left, right], 1))
-
-
-class PatchDiscriminator(_Discriminator):
-    """Score each 70x70 patch: C64-C128-C256-C512-1; 2,768,705 parameters at width 64."""
-
-    def __init__(self, width: int = 64) -> None:
-        layers: list[nn.Module] = [nn.Conv2d(6, width, 4, 2, 1), nn.LeakyReLU(0.2)]
-        for inputs, stride in ((width, 2), (2 * width, 2), (4 * width, 1)):
-            conv = nn.Conv2d(inputs, 2 * inputs, 4, stride, 1, bias=False)
-            layers += [conv, nn.BatchNorm2d(2 * inputs), nn.LeakyReLU(0.2)]
-        super().__init__(*layers, nn.Conv2d(8 * width, 1, 4, 1, 1))
-
-
-class PixelDiscriminator(_Discriminator):
-    """Score each pixel alone: 1x1 convolutions 64-128-1; 9,024 parameters at width 64."""
-
-    def __init__(self, width: int = 64) -> None:
-        super().__init__(
-            nn.Conv2d(6, width, 1),
-            nn.LeakyReLU(0.2),
-            nn.Conv2d(width, 2 * width, 1, bias=False),
-            nn.BatchNorm2d(2 * width),
-            nn.LeakyReLU(0.2),
-            nn.Conv2d(2 * width, 1, 1, bias=False),
-        )
 
 
 Logits = Float[Tensor, "b classes rows columns"]
@@ -613,19 +599,16 @@ def import_encoder(file: Path, out: Path) -> None:
 
 
 def load_encoder(encoder: LiteEncoder, path: Path) -> None:
-    """Give an encoder of full width the weights of a file, as far as it reaches."""
-    state = read_encoder(path).state_dict()
-    own = encoder.state_dict()
+    """Give an encoder of full width the weights of a file, as far as it reaches.
+
+    The file is one that :func:`import_encoder` wrote.
+    """
+    whole = LiteEncoder()
+    load_weights(whole, read_checkpoint(path, ENCODER_KIND), str(path))
+    state, own = whole.state_dict(), encoder.state_dict()
     if any(state[name].shape != tensor.shape for name, tensor in own.items()):
         raise InputError(
             f"{path}: holds {ENCODER_KIND} at its full width, and this encoder is narrower; "
             "set encoder_width to 1, or begin at random."
         )
     encoder.load_state_dict({name: state[name] for name in own})
-
-
-def read_encoder(path: Path) -> LiteEncoder:
-    """Read an encoder that :func:`import_encoder` wrote."""
-    encoder = LiteEncoder()
-    load_weights(encoder, read_checkpoint(path, ENCODER_KIND), str(path))
-    return encoder

@@ -66,11 +66,6 @@ class PointNetConfig(Settings):
     head: Annotated[tuple[int, int, int], "[1, inf)"] = (512, 256, 128)
     """Channels of a point beside that maximum."""
 
-    @property
-    def outputs(self) -> int:
-        """Channels of the last layer."""
-        return self.classes * self.keypoints * 3
-
 
 EMPTY = -2.0  #: of a pixel without the object: below all that a depth can be, -1 to 1
 
@@ -190,7 +185,7 @@ class PointNet(nn.Module):
         self.turn_features = _Transform(c.local[1])
         self.pooled = _layers((c.local[1], *c.pooled))
         self.head = _layers((c.local[1] + c.pooled[2], *c.head))
-        self.final = nn.Linear(c.head[2], c.outputs)
+        self.final = nn.Linear(c.head[2], c.classes * c.keypoints * 3)
 
     def forward(
         self, points_m: Float[Tensor, "points 3"], cloud: Int[Tensor, " points"]
@@ -201,11 +196,13 @@ class PointNet(nn.Module):
             points_m: about the mean of their cloud.
             cloud: which cloud each belongs to, 0, 1, ..., ascending.
         """
-        x = points_m / self.config.unit_m
-        count = int(cloud.max()) + 1
-        x = self.local(_turned(x, self.turn_points(x, cloud, count), cloud))
-        x = _turned(x, self.turn_features(x, cloud, count), cloud)
-        whole = _largest(self.pooled(x), cloud, count)
+        x, sizes = points_m / self.config.unit_m, torch.bincount(cloud).tolist()
+        turns = self.turn_points(x, sizes)
+        x = torch.cat([part @ T for part, T in zip(x.split(sizes), turns, strict=True)])
+        x = self.local(x)
+        turns = self.turn_features(x, sizes)
+        x = torch.cat([part @ T for part, T in zip(x.split(sizes), turns, strict=True)])
+        whole = torch.stack([part.amax(0) for part in self.pooled(x).split(sizes)])
         outputs = self.final(self.head(torch.cat([x, whole[cloud]], 1)))
         return outputs.view(len(outputs), self.config.classes, self.config.keypoints, 3)
 
@@ -232,11 +229,12 @@ class _Transform(nn.Module):
         nn.init.zeros_(self.final.bias)
 
     def forward(
-        self, x: Float[Tensor, "points c"], cloud: Int[Tensor, " points"], count: int
+        self, x: Float[Tensor, "points c"], sizes: Sequence[int]
     ) -> Float[Tensor, "clouds c c"]:
-        matrix = self.final(self.head(_largest(self.pooled(x), cloud, count)))
+        """``sizes``: points of each cloud, one after the other."""
+        whole = torch.stack([part.amax(0) for part in self.pooled(x).split(list(sizes))])
         eye = torch.eye(self.width, device=x.device, dtype=x.dtype)
-        return matrix.view(count, self.width, self.width) + eye
+        return self.final(self.head(whole)).view(len(sizes), self.width, self.width) + eye
 
 
 def _layers(widths: Sequence[int]) -> nn.Sequential:
@@ -244,15 +242,3 @@ def _layers(widths: Sequence[int]) -> nn.Sequential:
     for inputs, outputs in pairwise(widths):
         layers += [nn.Linear(inputs, outputs, bias=False), RowNorm(outputs), nn.ReLU()]
     return nn.Sequential(*layers)
-
-
-def _turned(x: Tensor, turn: Tensor, cloud: Tensor) -> Float[Tensor, "points c"]:
-    """Multiply the rows of each cloud by its matrix."""
-    sizes = torch.bincount(cloud, minlength=len(turn)).tolist()
-    return torch.cat([part @ T for part, T in zip(x.split(sizes), turn, strict=True)])
-
-
-def _largest(x: Tensor, cloud: Tensor, count: int) -> Float[Tensor, "clouds c"]:
-    """Maximum over the points of each cloud."""
-    sizes = torch.bincount(cloud, minlength=count).tolist()
-    return torch.stack([part.amax(0) for part in x.split(sizes)])

@@ -13,13 +13,6 @@ from depthpose.core.rigid import Rigid
 Directions = Float[Tensor, "points keypoints 3"]
 
 
-def unit_directions(
-    points_m: Float[Tensor, "points 3"], keypoints_m: Float[Tensor, "points keypoints 3"]
-) -> Directions:
-    """Give the true directions from each point to its object's keypoints; 0 where they coincide."""
-    return F.normalize(keypoints_m - points_m[:, None], dim=-1, eps=1e-9)
-
-
 POINT_LOSSES: dict[str, Callable[[Directions, Directions], Float[Tensor, " points"]]] = {
     "mse": lambda found, truth: (found - truth).square().mean((-2, -1)),
     "cosine": lambda found, truth: (1 - F.cosine_similarity(found, truth, dim=-1)).mean(-1),
@@ -28,14 +21,6 @@ POINT_LOSSES: dict[str, Callable[[Directions, Directions], Float[Tensor, " point
 """Losses of the raw directions of each point, averaged over keypoints; a training config's ``loss``
 names one, and a new one is one more entry. ``mse`` and ``l1`` pull to unit length too; ``cosine``
 leaves the length alone."""
-
-
-def point_losses(
-    found: Directions, truth: Directions, mode: str = "mse"
-) -> Float[Tensor, " points"]:
-    """Give the loss of each point's raw directions; an unknown ``mode`` is an ``InputError``."""
-    refuse_unknown("loss", mode, POINT_LOSSES)
-    return POINT_LOSSES[mode](found, truth)
 
 
 def direction_loss(
@@ -58,13 +43,19 @@ def direction_loss(
             fewer than others repeat a copy.
         instance: which instance each point belongs to.
         mode: a key of ``POINT_LOSSES``.
+
+    Raises:
+        InputError: there is no such loss.
     """
+    refuse_unknown("loss", mode, POINT_LOSSES)
     if not len(found):
         return found.sum()
     points = torch.bincount(instance, minlength=len(copies_m))
 
     def means_of(truth_m: Float[Tensor, "instances keypoints 3"]) -> Float[Tensor, " instances"]:
-        losses = point_losses(found, unit_directions(points_m, truth_m[instance]), mode)
+        # 0 where a point lies on its keypoint.
+        truth = F.normalize(truth_m[instance] - points_m[:, None], dim=-1, eps=1e-9)
+        losses = POINT_LOSSES[mode](found, truth)
         sums = losses.new_zeros(len(points)).index_add(0, instance, losses)
         return sums / points.clamp(min=1).to(losses.dtype)
 

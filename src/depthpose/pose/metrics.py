@@ -7,7 +7,7 @@ Computed in float64.
 from collections.abc import Callable, Sequence
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from scipy.spatial import KDTree
 from torch import Tensor
 
@@ -30,11 +30,6 @@ RenderDepth = Callable[[Rigid], Float[Tensor, "h w"]]
 def rotation_error_rad(estimated: Rigid, true: Rigid) -> Float[Tensor, "*batch"]:
     """Angle between two poses' rotations [rad]."""
     return geodesic_rad(estimated.R.double(), true.R.double())
-
-
-def translation_error_m(estimated: Rigid, true: Rigid) -> Float[Tensor, "*batch"]:
-    """Distance between two poses' translations [m]."""
-    return (estimated.t_m.double() - true.t_m.double()).norm(dim=-1)
 
 
 def add_m(estimated: Rigid, true: Rigid, points_m: Float[Tensor, "n 3"]) -> Float[Tensor, "*batch"]:
@@ -150,8 +145,10 @@ def vsd(
         image_m.double().nan_to_num(nan=0.0, posinf=0.0) * rays
         for image_m in (depth_m, render(estimated), render(true))
     )
-    is_known = _is_visible(known, measured, delta_m)
-    is_found = _is_visible(found, measured, delta_m) | (is_known & (found > 0))
+    is_known, is_found = (
+        (model > 0) & ((model - measured <= delta_m) | (measured == 0)) for model in (known, found)
+    )
+    is_found |= is_known & (found > 0)
     both, either = is_known & is_found, is_known | is_found
     count = int(either.sum())
     if count == 0:
@@ -199,7 +196,3 @@ def _symmetric_copies(true: Rigid, symmetries: Rigid, points: int) -> list[Rigid
         Rigid(pose.R @ rows, pose.t_m + (pose.R @ shift[..., None]).squeeze(-1))
         for rows, shift in zip(R.split(size), t_m.split(size), strict=True)
     ]
-
-
-def _is_visible(model: Tensor, measured: Tensor, delta_m: float) -> Bool[Tensor, "h w"]:
-    return (model > 0) & ((model - measured <= delta_m) | (measured == 0))

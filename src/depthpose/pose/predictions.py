@@ -107,22 +107,23 @@ def read_predictions(folder: Path) -> Predictions:
     return found
 
 
-def kept_predictions(folder: Path) -> list[Prediction]:
-    """Read what earlier runs of this folder left; a damaged file is as none, and a notice."""
-    try:
-        return read_predictions(folder) if (folder / POSES).is_file() else []
-    except InputError as error:
-        warnings.warn(f"{error} - it is damaged, and made again", Notice, stacklevel=2)
-        return []
+def kept_predictions(folder: Path) -> dict[str, Prediction]:
+    """Read what earlier runs left in a folder, and in those of the parts of several processes.
 
-
-def known_predictions(folder: Path) -> dict[str, Prediction]:
-    """Read what earlier runs left in a folder, and in those of the parts of several processes."""
-    folders = [folder, *sorted(folder.glob("part-*"))]
-    every = [prediction for one in folders for prediction in kept_predictions(one)]
-    # What was read at last counts, whatever another part said of an earlier try.
-    every.sort(key=lambda prediction: prediction.estimate.status != "unreadable")
-    return {prediction.estimate.name: prediction for prediction in every}
+    By the names of estimates. A damaged file is as none, and a notice.
+    """
+    found: dict[str, Prediction] = {}
+    for home in (folder, *sorted(folder.glob("part-*"))):
+        try:
+            every = read_predictions(home) if (home / POSES).is_file() else []
+        except InputError as error:
+            warnings.warn(f"{error} - it is damaged, and made again", Notice, stacklevel=2)
+            continue
+        for one in every:
+            # What was read at last counts, whatever another part said of an earlier try.
+            if one.estimate.status != "unreadable" or one.estimate.name not in found:
+                found[one.estimate.name] = one
+    return found
 
 
 def score_of(estimate: PoseEstimate) -> float:
@@ -319,7 +320,7 @@ def predict(
     """
     claim_folder(folder, settings, [POSES])
     wanted = list(jobs)
-    done = {p.estimate.name: p for p in kept_predictions(folder)}
+    done = kept_predictions(folder)
     finished = {name for name, made in done.items() if made.estimate.status != "unreadable"}
     yield from (done[job.name] for job in wanted if job.name in finished)
     left = [job for job in wanted if job.name not in finished]
@@ -354,21 +355,31 @@ def predict(
 
 
 def instance_jobs(
-    dataset: BopDataset, names: Mapping[int, str], mask_of: Callable[[Instance], Path] | None = None
+    dataset: BopDataset, names: Mapping[int, str], predicted_mask: str | None = None
 ) -> list[Job[ViewInput]]:
-    """Take every annotated instance by the predicted mask that ``mask_of`` names, or its own.
+    """Take every annotated instance by its own mask, or a predicted one: see ``Layout``.
 
     ``names`` are those of the estimator, by the objects' numbers.
     """
+    jobs: list[Job[ViewInput]] = []
+    for instance in dataset.instances:
+        mask, object = None, names[instance.object_id]
+        if predicted_mask is not None:
+            file = predicted_mask.format(object=instance.object_id, image=instance.image_id)
+            mask = dataset.folder / file
+        read = partial(_read_view, dataset, instance, instance.name, object, mask)
+        jobs.append(Job(name=instance.name, read=read, place=place_of(instance)))
+    return jobs
 
-    def read(instance: Instance) -> ViewInput:
-        mask = None if mask_of is None else read_mask(mask_of(instance))
-        return replace(dataset.view(instance, mask).input, object=names[instance.object_id])
 
-    return [
-        Job(name=instance.name, read=partial(read, instance), place=place_of(instance))
-        for instance in dataset.instances
-    ]
+def _read_view(
+    dataset: BopDataset, instance: Instance, name: str, object: str, mask: Path | Detection | None
+) -> ViewInput:
+    """Read the view of an instance by the mask of a file or a detection; None: its own."""
+    pixels = mask.mask if isinstance(mask, Detection) else None
+    if isinstance(mask, Path):
+        pixels = read_mask(mask)
+    return replace(dataset.view(instance, pixels).input, name=name, object=object)
 
 
 def detection_jobs(
@@ -401,22 +412,13 @@ def detection_jobs(
         )
     sharing = Counter(place[:2] for place, _, _ in kept)
 
-    def read(instance: Instance, name: str, one: Detection) -> ViewInput:
-        view = dataset.view(instance, one.mask).input
-        return replace(view, name=name, object=names[instance.object_id])
-
     jobs: list[Job[ViewInput]] = []
     for place, k, one in sorted(kept, key=lambda item: item[:2]):
         name = f"{place.scene_id:06d}_{place.image_id:06d}_object{place.object_id}_{k}"
         seconds = {} if one.seconds is None else {"segmentation": one.seconds / sharing[place[:2]]}
-        jobs.append(
-            Job(
-                name=name,
-                read=partial(read, shown[place][0], name, one),
-                place=place,
-                seconds=seconds,
-            )
-        )
+        instance, object = shown[place][0], names[place.object_id]
+        read = partial(_read_view, dataset, instance, name, object, one)
+        jobs.append(Job(name=name, read=read, place=place, seconds=seconds))
     return jobs
 
 

@@ -170,12 +170,17 @@ def refine_best(
         short = replace(short, start_distance_diameters=config.end_distance_diameters)
         refined = refine_pose(points_m, tried[best], surface, short)
     found = refined.camera_from_model.double()
-    worth = worth.masked_fill(~_is_other(tried, found, surface), -torch.inf)
-    others: list[int] = []  # from the best down, each another than those before
+    # From the best down, those that carry the object elsewhere than any before, symmetries aside.
+    others: list[int] = []
+    own_m = surface.points_m[:: max(1, len(surface.points_m) // 50)]
+    copies_m = surface.copies.apply(own_m)
     for k in worth.argsort(descending=True).tolist():
         if len(others) == _MOST_OTHERS or worth[k] == -torch.inf:
             break
-        if all(bool(_is_other(tried[[k]], tried[one], surface)) for one in others):
+        before = Rigid.stack([found, *(tried[one] for one in others)])
+        moved_m = (before.inverse() @ tried[k]).apply(own_m)
+        gap_m = (moved_m[:, None] - copies_m).norm(dim=-1).mean(-1)
+        if float(gap_m.min()) > _OTHER * surface.diameter_m:
             others.append(k)
     return BestStart(refined, best % len(given.R), tried[others])
 
@@ -323,14 +328,6 @@ def _is_seen(
     distance_m = (eyes_m - surface.ball_m[:3]).norm(dim=-1)
     toward_m = ((eyes_m - surface.points_m[index]) * surface.outward[index]).sum(-1)
     return (toward_m >= -SLACK * distance_m) | (distance_m <= surface.ball_m[3])
-
-
-def _is_other(poses: Rigid, best: Rigid, surface: Surface) -> Bool[Tensor, " b"]:
-    """Whether poses carry the object elsewhere than the best does, by any of its symmetries."""
-    own_m = surface.points_m[:: max(1, len(surface.points_m) // 50)]
-    moved_m = (best.inverse() @ poses).apply(own_m)
-    gap_m = (moved_m[:, None] - surface.copies.apply(own_m)).norm(dim=-1).mean(-1)
-    return gap_m.amin(-1) > _OTHER * surface.diameter_m
 
 
 def _normal_equations(

@@ -283,11 +283,6 @@ class Segmenter:
         warn_of_terms(weights.facts)
         return cls(weights, device)
 
-    @property
-    def objects(self) -> tuple[str, ...]:
-        """Names of what it knows."""
-        return self.weights.objects
-
     def segment(self, image: Image) -> Segmentation:
         """Find the objects of an image of any size, a tensor of RGB in [0, 1] (not OpenCV's BGR).
 
@@ -300,7 +295,7 @@ class Segmenter:
         config = self._network.config
         masks: dict[str, Tensor] = {}
         scores: dict[str, Tensor] = {}
-        for number, name in enumerate(self.objects, 1):
+        for number, name in enumerate(self.weights.objects, 1):
             parts = connected_parts(label == number, config)
             if len(parts):
                 score = torch.stack([probability[number][part].mean() for part in parts])
@@ -358,21 +353,16 @@ def label_parts(mask: Bool[Tensor, "h w"]) -> tuple[Int64[Tensor, "h w"], Int64[
     return label, pixels
 
 
-class Overlap:
-    """Counts pixels of each class (background, objects) found, true and both, over all images."""
+def count_overlap(
+    found: Int[Tensor, "*b h w"], truth: Int[Tensor, "*b h w"], classes: int
+) -> Int64[Tensor, "classes classes"]:
+    """Count the pixels of an image or a batch by true class (row) and found class (column)."""
+    pairs = (truth * classes + found).flatten().cpu()
+    return torch.bincount(pairs, minlength=classes**2).view(classes, classes)
 
-    def __init__(self, classes: int) -> None:
-        self.both = torch.zeros(classes, dtype=torch.int64)
-        self.either = torch.zeros(classes, dtype=torch.int64)
 
-    def add(self, found: Int[Tensor, "*b h w"], truth: Int[Tensor, "*b h w"]) -> None:
-        """Count one image, or a batch."""
-        classes = len(self.both)
-        pairs = (truth * classes + found).flatten().cpu()
-        table = torch.bincount(pairs, minlength=classes**2).view(classes, classes)
-        self.both += table.diagonal()
-        self.either += table.sum(0) + table.sum(1) - table.diagonal()
-
-    def iou(self) -> Float[Tensor, " classes"]:
-        """Intersection over union of each class; NaN for one that is neither found nor true."""
-        return torch.where(self.either > 0, self.both / self.either, torch.nan)
+def intersection_over_union(table: Int64[Tensor, "c c"]) -> Float[Tensor, " c"]:
+    """Sum up a table of :func:`count_overlap`; NaN for a class that is neither found nor true."""
+    both = table.diagonal()
+    either = table.sum(0) + table.sum(1) - both
+    return torch.where(either > 0, both / either, torch.nan)

@@ -170,7 +170,7 @@ def read_pose_weights(path: Path) -> PoseWeights:
             config.
     """
     checkpoint, source = read_checkpoint(path), str(path)
-    network = _network_of(checkpoint, source)
+    network = network_of(checkpoint, source)
     if not any(f"models.0.{name}" in checkpoint.state for name in _SURFACE):
         word = quote(str(path))
         with suppress(InputError):  # a name where it leads there
@@ -231,16 +231,12 @@ def read_pose_weights(path: Path) -> PoseWeights:
     )
 
 
-def read_pose_network(path: Path) -> AnyNetwork:
-    """Read the network alone, in eval mode, of weights with or without their objects' surfaces.
+def network_of(checkpoint: Checkpoint, source: str) -> AnyNetwork:
+    """Build the network alone, in eval mode, of weights with or without their objects' surfaces.
 
     Raises:
-        InputError: no such weights, or weights that do not fit their own config.
+        InputError: they are of another kind, or do not fit their own config.
     """
-    return _network_of(read_checkpoint(path), str(path))
-
-
-def _network_of(checkpoint: Checkpoint, source: str) -> AnyNetwork:
     if checkpoint.kind not in _NETWORKS:
         raise InputError(
             f"{source}: holds weights of kind {checkpoint.kind!r}, but a pose takes one of "

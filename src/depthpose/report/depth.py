@@ -52,7 +52,8 @@ def depth_section(
     The colours of depth go from bright to dark over ``range_m``.
     """
     near_m, far_m = range_m
-    facts, grey = depth_facts(pair, estimate), grey_caption(estimate)
+    facts = depth_facts(pair, estimate)
+    grey = "grey: none" if estimate.is_sky is None else "grey: sky or no answer"
     true_m = None if error is None else error.true_depth_m
     scenes: list[Scene] = []
     if estimate.depth_m is not None and (camera := pair.camera) is not None:
@@ -140,11 +141,6 @@ def depth_facts(
     if estimate.confidence is not None:
         facts.append(("mean confidence", f"{float(estimate.confidence.nanmean()):.2f}"))
     return facts
-
-
-def grey_caption(estimate: DepthEstimate) -> str:
-    """Say what grey is in the picture of an estimate."""
-    return "grey: none" if estimate.is_sky is None else "grey: sky or no answer"
 
 
 def depth_scene(

@@ -214,22 +214,6 @@ class Picture:
     caption: str
     scale: Scale | None = None
 
-    @property
-    def size(self) -> tuple[int, int]:
-        """Width and height [px]: a page that knows them does not move when the picture comes."""
-        return image_size(self.path)
-
-    @property
-    def data_uri(self) -> str:
-        """The picture as a ``data:`` address, so that the page needs no other file.
-
-        A small file's own bytes; a large one is shrunk to what a page of many takes.
-        """
-        if self.path.stat().st_size > _MOST_BYTES:
-            return Drawing(image=read_image(self.path), caption=self.caption).data_uri
-        kind = "jpeg" if self.path.suffix.lower() in (".jpg", ".jpeg") else "png"
-        return f"data:image/{kind};base64," + base64.b64encode(self.path.read_bytes()).decode()
-
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Drawing:
@@ -239,26 +223,25 @@ class Drawing:
     caption: str
     scale: Scale | None = None
 
-    @property
-    def size(self) -> tuple[int, int]:
-        """Width and height [px]."""
-        return self.image.shape[2], self.image.shape[1]
 
-    @property
-    def data_uri(self) -> str:
-        """The picture as a ``data:`` address."""
-        encoded = encode_image(shrink_to_pixels(self.image, _MOST_PIXELS), "drawing.jpg", _QUALITY)
-        return "data:image/jpeg;base64," + base64.b64encode(encoded).decode()
+def embedded(picture: Picture | Drawing, most_pixels: int = _MOST_PIXELS) -> tuple[int, int, str]:
+    """Give a picture's width and height [px], and the picture as a ``data:`` address.
 
-
-def shrink_to_pixels(image: Float[Tensor, "3 h w"], most: int) -> Float[Tensor, "3 _ _"]:
-    """Scale a picture down to about so many pixels at most, its proportions kept."""
+    So the page needs no other file, and does not move when the picture comes. A small file's own
+    bytes are taken; another picture is shrunk to about so many pixels, its proportions kept.
+    """
+    if isinstance(picture, Picture) and picture.path.stat().st_size <= _MOST_BYTES:
+        kind = "jpeg" if picture.path.suffix.lower() in (".jpg", ".jpeg") else "png"
+        data = base64.b64encode(picture.path.read_bytes()).decode()
+        return *image_size(picture.path), f"data:image/{kind};base64,{data}"
+    image = read_image(picture.path) if isinstance(picture, Picture) else picture.image
     height, width = image.shape[1:]
-    scale = math.sqrt(most / (height * width))
-    if scale >= 1:
-        return image
-    size = (max(1, int(height * scale)), max(1, int(width * scale)))
-    return F.interpolate(image[None], size, mode="area")[0]
+    scale = math.sqrt(most_pixels / (height * width))
+    if scale < 1:
+        size = (max(1, int(height * scale)), max(1, int(width * scale)))
+        image = F.interpolate(image[None], size, mode="area")[0]
+    data = base64.b64encode(encode_image(image, "drawing.jpg", _QUALITY)).decode()
+    return width, height, f"data:image/jpeg;base64,{data}"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -303,10 +286,14 @@ def table_files(*names: str) -> list[str]:
 
 
 def write_table(folder: Path, rows: Sequence[Row], name: str = "rows") -> None:
-    """Write ``NAME.json``, ``NAME.csv`` and ``table.md`` (``NAME.md`` for other names)."""
+    """Write ``NAME.json``, ``NAME.csv`` (with every digit) and ``table.md``, else ``NAME.md``."""
     as_json, as_csv, as_markdown = table_files(name)
     write_json(folder / as_json, [dict(row) for row in rows])
-    write_bytes(folder / as_csv, csv_table(rows).encode(errors=_ERRORS))
+    text = io.StringIO()
+    writer = csv.DictWriter(text, column_names(rows), lineterminator="\n")
+    writer.writeheader()
+    writer.writerows(rows)
+    write_bytes(folder / as_csv, text.getvalue().encode(errors=_ERRORS))
     write_bytes(folder / as_markdown, markdown_table(rows).encode(errors=_ERRORS))
 
 
@@ -334,15 +321,6 @@ def plain_table(rows: Sequence[Row], names: Sequence[str] = ()) -> str:
         "  ".join(cell.ljust(w) for cell, w in zip(line, widths, strict=True)).rstrip() + "\n"
         for line in cells
     )
-
-
-def csv_table(rows: Sequence[Row]) -> str:
-    """Format rows as CSV with a header, every digit kept."""
-    text = io.StringIO()
-    writer = csv.DictWriter(text, column_names(rows), lineterminator="\n")
-    writer.writeheader()
-    writer.writerows(rows)
-    return text.getvalue()
 
 
 def write_markdown(
@@ -413,7 +391,11 @@ def write_page(
         lstrip_blocks=True,
     )
     pages.globals.update(
-        show_value=show_value, column_names=column_names, page_file=page_file, about=_ABOUT
+        show_value=show_value,
+        column_names=column_names,
+        page_file=page_file,
+        embedded=embedded,
+        about=_ABOUT,
     )
     html = pages.get_template("report.html").render(
         title=title, sections=sections, environment=environment

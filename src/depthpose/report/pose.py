@@ -89,32 +89,28 @@ def box_edges(model: ObjectModel) -> Float[Tensor, "12 2 3"]:
     return corners[torch.tensor(pairs)]
 
 
-def crease_edges(model: ObjectModel) -> Float[Tensor, "n 2 3"]:
-    """Give both ends of the edges where the surface ends, or bends by more than 30 degrees [m]."""
-    # By place, not by number: STL repeats the points of every face.
-    places_m, place = torch.unique(model.vertices_m, dim=0, return_inverse=True)
-    corners = place[model.faces]
-    side = torch.cat([corners[:, [0, 1]], corners[:, [1, 2]], corners[:, [2, 0]]]).sort(-1).values
-    edges, which, count = torch.unique(side, dim=0, return_inverse=True, return_counts=True)
-    a, b, c = model.vertices_m[model.faces].double().unbind(1)
-    normal = torch.nn.functional.normalize(torch.linalg.cross(b - a, c - a), dim=-1)
-    total = normal.new_zeros(len(edges), 3).index_add_(0, which, normal.repeat(3, 1))
-    # Two unit normals at an angle have a mean as long as the cosine of half of it.
-    is_bent = total.norm(dim=-1) / count < math.cos(_BEND / 2)
-    return places_m[edges[is_bent | (count == 1)]]
-
-
 def pose_layers(
     pose: Rigid, model: ObjectModel, *, is_true: bool = False, with_box: bool = False
 ) -> list[Layer]:
     """Show a posed object in space: surface, edges, box and axes; the truth by edges and box.
 
-    ``with_box``: whether an estimate's box is seen at first; that of a truth is.
+    Edges are where the surface ends, or bends by more than 30 degrees. ``with_box``: whether an
+    estimate's box is seen at first; that of a truth is.
     """
     pose = pose.double()
     box_m, edges_m = pose.apply(box_edges(model).double()).float(), None
     if len(model.faces):
-        edges_m = pose.apply(crease_edges(model).double()).float()
+        # By place, not by number: STL repeats the points of every face.
+        places_m, place = torch.unique(model.vertices_m, dim=0, return_inverse=True)
+        ends = place[model.faces]
+        side = torch.cat([ends[:, [0, 1]], ends[:, [1, 2]], ends[:, [2, 0]]]).sort(-1).values
+        edges, which, count = torch.unique(side, dim=0, return_inverse=True, return_counts=True)
+        a, b, c = model.vertices_m[model.faces].double().unbind(1)
+        normal = torch.nn.functional.normalize(torch.linalg.cross(b - a, c - a), dim=-1)
+        total = normal.new_zeros(len(edges), 3).index_add_(0, which, normal.repeat(3, 1))
+        # Two unit normals at an angle have a mean as long as the cosine of half of it.
+        is_bent = total.norm(dim=-1) / count < math.cos(_BEND / 2)
+        edges_m = pose.apply(places_m[edges[is_bent | (count == 1)]].double()).float()
     if is_true:
         layers = [Layer(name="true box", shape=colored_lines(box_m, TRUE))]
         if edges_m is not None:

@@ -126,14 +126,14 @@ def draw_features(
     view_from_model = torch.stack([right, torch.linalg.cross(forward, right), forward])
     scale = size_px / (_MARGIN * model.diameter_m)
     centre_px = torch.tensor([size_px / 2, size_px / 2, 0.0], dtype=torch.float64)
-
-    def places(of_m: Float[Tensor, "m 3"]) -> Float[Tensor, "m 3"]:
-        return (of_m - middle_m) @ view_from_model.T * scale + centre_px
-
+    back, front = (
+        (of_m - middle_m) @ view_from_model.T * scale + centre_px
+        for of_m in (surface_m, points_m.double())
+    )
     canvas = Image.new("RGB", (size_px, size_px), "white")
     pen = ImageDraw.Draw(canvas)
-    draw_discs(pen, places(surface_m), torch.zeros(len(surface_m), 3), 1.0)
-    draw_discs(pen, places(points_m.double()), spectral(share), max(2.0, size_px / 110))
+    draw_discs(pen, back, torch.zeros(len(surface_m), 3), 1.0)
+    draw_discs(pen, front, spectral(share), max(2.0, size_px / 110))
     return picture_tensor(canvas, "figure 3-2")
 
 
@@ -162,21 +162,18 @@ def draw_field(
     low, high = everything.amin(0), everything.amax(0)
     scale = (size_px - 3 * _ARROW_PX) / float((high - low).max().clamp(min=1e-9))
     middle = (low + high) / 2
-
-    def place(xy: Float[Tensor, "m 2"]) -> Float[Tensor, "m 2"]:
-        return (xy - middle) * scale + size_px / 2
-
+    plane, marks = ((xy - middle) * scale + size_px / 2 for xy in (plane, marks))
     canvas = Image.new("RGB", (size_px, size_px), "white")
     pen = ImageDraw.Draw(canvas)
     starts, shafts = take_evenly(plane, _ARROWS), take_evenly(directions.double(), _ARROWS)
     shafts = _ARROW_PX * shafts[:, :2]
-    for (x, y), (dx, dy) in zip(place(starts).tolist(), shafts.tolist(), strict=True):
+    for (x, y), (dx, dy) in zip(starts.tolist(), shafts.tolist(), strict=True):
         tip = (x + dx, y + dy)
         pen.line([(x, y), tip], _INK)
         for side in (-0.5, 0.5):
             barb = tip[0] - _HEAD * (dx + side * dy), tip[1] - _HEAD * (dy - side * dx)
             pen.line([tip, barb], _INK)
-    (x, y), (u, v) = place(marks).tolist()
+    (x, y), (u, v) = marks.tolist()
     rim = [(math.radians(36 * k - 90), 5 if k % 2 else 12) for k in range(10)]
     star = [(x + reach * math.cos(way), y + reach * math.sin(way)) for way, reach in rim]
     pen.polygon(star, fill=_YELLOW, outline=(0, 0, 0))

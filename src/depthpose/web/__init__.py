@@ -5,4 +5,3 @@ from depthpose.web.app import known_names as known_names
 from depthpose.web.app import make_app as make_app
 from depthpose.web.app import open_socket as open_socket
 from depthpose.web.app import run as run
-from depthpose.web.app import taken_address as taken_address

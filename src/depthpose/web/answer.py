@@ -13,7 +13,7 @@ from depthpose.core.errors import InputError
 from depthpose.core.files import DEPTH_SUFFIXES, cloud_suffixes, image_size, write_json
 from depthpose.core.files.disk import write_bytes
 from depthpose.core.files.images import LISTED_SUFFIXES
-from depthpose.pose.mesh import mesh_suffixes
+from depthpose.pose.mesh import MESH_READERS
 from depthpose.report.page import Scale, Scene
 
 
@@ -48,11 +48,6 @@ class Answer:
     files: Mapping[str, bytes] = field(default_factory=dict)
 
 
-def read_files(folder: Path) -> dict[str, bytes]:
-    """Take the files of a folder into memory, so that the folder can go."""
-    return {path.name: path.read_bytes() for path in sorted(folder.iterdir())}
-
-
 MOST_PIXELS = 12_500_000  # most pixels of a picture: those of a phone's
 KINDS: dict[str, tuple[str, tuple[str, ...]]] = {
     "image": ("a picture", LISTED_SUFFIXES),
@@ -61,7 +56,7 @@ KINDS: dict[str, tuple[str, tuple[str, ...]]] = {
     "mask": ("a mask", LISTED_SUFFIXES),
     "camera": ("a camera file", CAMERA_SUFFIXES),
     "cloud": ("a point cloud", cloud_suffixes()),
-    "cad": ("a model file", mesh_suffixes()),
+    "cad": ("a model file", tuple(MESH_READERS)),
 }
 """What each field of the forms takes."""
 
@@ -112,12 +107,6 @@ class Form:
         cx, cy = (size[0] - 1) / 2 if cx is None else cx, (size[1] - 1) / 2 if cy is None else cy
         K = [[focal_px, 0.0, cx], [0.0, focal_px, cy], [0.0, 0.0, 1.0]]
         return {"width": size[0], "height": size[1], "K": K}
-
-    def results(self) -> Path:
-        """Make the folder for the results."""
-        folder = self.folder / "results"
-        folder.mkdir()
-        return folder
 
 
 def without_paths(text: str, folder: Path) -> str:

@@ -11,7 +11,7 @@ import time
 import zipfile
 from collections import OrderedDict
 from collections.abc import Awaitable, Callable, Mapping, MutableMapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cache, partial
 from ipaddress import IPv4Address, IPv6Address, ip_address
 from pathlib import Path
@@ -28,7 +28,7 @@ from starlette.datastructures import MutableHeaders, UploadFile
 from starlette.exceptions import HTTPException
 from starlette.middleware import Middleware
 from starlette.requests import ClientDisconnect, Request
-from starlette.responses import HTMLResponse, JSONResponse, Response
+from starlette.responses import JSONResponse, Response
 from starlette.routing import Route
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
@@ -54,11 +54,12 @@ _SAFE = {
 _MOST_FILES, _MOST_FIELDS, _LONGEST_FIELD = 6, 30, 4096
 
 
+@dataclass(frozen=True)
 class HostCheck:
     """Refuses requests from other pages, and tells the browser what this page may load."""
 
-    def __init__(self, app: ASGIApp, hosts: tuple[str, ...] | None) -> None:
-        self._app, self._hosts = app, hosts
+    app: ASGIApp
+    hosts: tuple[str, ...] | None
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Answer a request."""
@@ -69,8 +70,8 @@ class HostCheck:
             await send(message)
 
         is_request = scope["type"] == "http"
-        refusal = refuse_other_host(Request(scope), self._hosts) if is_request else None
-        await (refusal or self._app)(scope, receive, send_safely)
+        refusal = refuse_other_host(Request(scope), self.hosts) if is_request else None
+        await (refusal or self.app)(scope, receive, send_safely)
 
 
 def refuse_other_host(request: Request, hosts: tuple[str, ...] | None) -> Response | None:
@@ -92,13 +93,9 @@ def refuse_other_host(request: Request, hosts: tuple[str, ...] | None) -> Respon
 
 
 async def error_response(_: Request, error: Exception) -> Response:
-    """Answer a refusal with its message."""
-    assert isinstance(error, HTTPException)
-    return _sentence(error.status_code, error.detail, error.headers)
-
-
-async def crash_response(_: Request, error: Exception) -> Response:
-    """Answer an unexpected error; the trace is on the server's terminal."""
+    """Answer a refusal with its message; the trace of another error is on the server's terminal."""
+    if isinstance(error, HTTPException):
+        return _sentence(error.status_code, error.detail, error.headers)
     kind = type(error).__name__
     return _sentence(500, f"depthpose failed ({kind}: {error}); see the server's terminal")
 
@@ -115,22 +112,18 @@ MOMENT_S = 0.02
 _FULL = "too many requests wait for one computation; try again later"
 
 
+@dataclass(frozen=True, eq=False)
 class Queue:
     """Computations, one at a time; so many requests may wait for the one that is computed."""
 
-    def __init__(self, most: int) -> None:
-        self._most = most
-        self._one = anyio.CapacityLimiter(1)
-        self._tickets: list[str] = []
+    most: int
+    one: anyio.CapacityLimiter = field(default_factory=partial(anyio.CapacityLimiter, 1))
+    tickets: list[str] = field(default_factory=list)
 
     def refuse_full(self) -> None:
         """Refuse one more."""
-        if len(self._tickets) > self._most:  # one of them is at work
+        if len(self.tickets) > self.most:  # one of them is at work
             raise HTTPException(503, _FULL)
-
-    def before(self, ticket: str) -> int | None:
-        """Count the computations that end before that of a ticket; None: it does not wait here."""
-        return self._tickets.index(ticket) if ticket in self._tickets else None
 
     async def compute(
         self, ticket: str, work: Callable[[], Result], is_gone: Callable[[], Awaitable[bool]]
@@ -140,14 +133,14 @@ class Queue:
         By the ticket the client asks for its place in the queue; 503 where too many wait.
         """
         self.refuse_full()
-        self._tickets.append(ticket)
+        self.tickets.append(ticket)
         try:
-            async with self._one:
+            async with self.one:
                 if await is_gone():
                     return None
                 return await anyio.to_thread.run_sync(work)
         finally:
-            self._tickets.remove(ticket)
+            self.tickets.remove(ticket)
 
 
 async def has_gone(receive: Receive) -> bool:
@@ -225,7 +218,7 @@ class Pages:
         self._kept: OrderedDict[str, Mapping[str, bytes]] = OrderedDict()
         loader = PackageLoader("depthpose.web", ".")
         template = Environment(loader=loader, autoescape=True, undefined=StrictUndefined)
-        self._page = template.get_template("page.html").render(
+        page = template.get_template("page.html").render(
             version=__version__,
             objects=pose.objects,
             kinds=KINDS,
@@ -235,18 +228,15 @@ class Pages:
         )
         own = Path(__file__).parent
         self._assets = {
+            "": ("text/html", page),
             "page.css": ("text/css", page_file("page.css") + (own / "web.css").read_text()),
             "viewer.js": ("text/javascript", page_file("viewer.js")),
             "web.js": ("text/javascript", (own / "web.js").read_text()),
         }
 
-    async def home(self, _: Request) -> Response:
-        """Give the page."""
-        return HTMLResponse(self._page)
-
     async def asset(self, request: Request) -> Response:
-        """Give a script or the style."""
-        name = request.path_params["name"]
+        """Give the page, a script or the style."""
+        name = request.path_params.get("name", "")
         if name not in self._assets:
             raise HTTPException(404, f"there is no {name!r}; the page is at /")
         media_type, text = self._assets[name]
@@ -263,7 +253,8 @@ class Pages:
 
     async def place(self, request: Request) -> Response:
         """Give the number of computations before that of a ticket; null: it does not wait here."""
-        return JSONResponse({"before": self._queue.before(request.path_params["ticket"])})
+        ticket, waiting = request.path_params["ticket"], self._queue.tickets
+        return JSONResponse({"before": waiting.index(ticket) if ticket in waiting else None})
 
     async def estimate(self, request: Request) -> Response:
         """Answer a form."""
@@ -371,7 +362,7 @@ def make_app(depth: FakestereoNet, pose: GeoPoseNet, limits: Limits | None = Non
 
     return Starlette(
         routes=[
-            Route("/", pages.home),
+            Route("/", pages.asset),
             Route("/assets/{name}", pages.asset),
             Route("/examples/{kind}", pages.example),
             Route("/estimate/{kind}", pages.estimate, methods=["POST"]),
@@ -379,7 +370,7 @@ def make_app(depth: FakestereoNet, pose: GeoPoseNet, limits: Limits | None = Non
             Route("/results/{key}/{name}", pages.download),
         ],
         middleware=[Middleware(HostCheck, hosts=limits.hosts)],
-        exception_handlers={HTTPException: error_response, Exception: crash_response},
+        exception_handlers={HTTPException: error_response, Exception: error_response},
     )
 
 
@@ -403,18 +394,18 @@ def open_socket(host: str, port: int) -> socket.socket:
         ) from error
 
 
-def taken_address(taken: socket.socket) -> IPv4Address | IPv6Address:
-    """Give the address that was taken, however it was written."""
-    address = ip_address(taken.getsockname()[0])
-    return address.ipv4_mapped or address if isinstance(address, IPv6Address) else address
+def known_names(
+    host: str, taken: socket.socket
+) -> tuple[IPv4Address | IPv6Address, tuple[str, ...] | None]:
+    """Give the address that was taken, and the host names under which the page may be requested.
 
-
-def known_names(host: str, address: IPv4Address | IPv6Address) -> tuple[str, ...] | None:
-    """Give the host names under which a page may be requested; None: any, it is open to all.
-
-    How the address was written does not say that: '', '0' and '0x0' mean all addresses too.
+    None: any, it is open to all. How the address was written does not say that: '', '0' and '0x0'
+    mean all addresses too.
     """
-    return None if address.is_unspecified else (*LOOPBACK, host.lower(), str(address))
+    address = ip_address(taken.getsockname()[0])
+    if isinstance(address, IPv6Address):
+        address = address.ipv4_mapped or address
+    return address, None if address.is_unspecified else (*LOOPBACK, host.lower(), str(address))
 
 
 def run(app: Starlette, taken: socket.socket) -> None:

@@ -16,7 +16,7 @@ from depthpose.depth.predictions import COLOR_RANGE_M, write_estimate
 from depthpose.depth.stereo import CameraMatcher
 from depthpose.depth.synthetic import Streets
 from depthpose.depth.types import DepthEstimate, StereoInput
-from depthpose.report.depth import depth_facts, depth_scene, grey_caption
+from depthpose.report.depth import depth_facts, depth_scene
 from depthpose.report.page import depth_scale, rising_scale
 from depthpose.web.answer import (
     EXAMPLE_SEED,
@@ -24,7 +24,6 @@ from depthpose.web.answer import (
     Form,
     Shown,
     example_form,
-    read_files,
     small_size,
 )
 
@@ -83,7 +82,8 @@ def answer_depth(form: Form, net: FakestereoNet) -> Answer:
     estimate = net.estimate_pair(pair)
     seconds = time.perf_counter() - began
     assert estimate.depth_m is not None
-    folder = form.results()
+    folder = form.folder / "results"
+    folder.mkdir()
     write_estimate(folder, pair, estimate, (near_m, far_m), far_m)
     write_image(folder / f"{pair.name}.input.jpg", pair.left)
     pictures = _pictures(pair, estimate, (near_m, far_m))
@@ -97,7 +97,7 @@ def answer_depth(form: Form, net: FakestereoNet) -> Answer:
         pictures=pictures,
         scene=depth_scene(pair, estimate, far_m),
         terms=net.terms,
-        files=read_files(folder),
+        files={path.name: path.read_bytes() for path in sorted(folder.iterdir())},
     )
 
 
@@ -143,10 +143,11 @@ def _pictures(
     pair: StereoInput, estimate: DepthEstimate, range_m: tuple[float, float]
 ) -> list[Shown]:
     name, (near_m, far_m) = pair.name, range_m
+    grey = "grey: none" if estimate.is_sky is None else "grey: sky or no answer"
     said = f"near bright and far dark, {near_m:g} m to {far_m:g} m by the logarithm"
     depth = Shown(
         file=f"{name}.color.png",
-        caption=f"depth: {said}; {grey_caption(estimate)}",
+        caption=f"depth: {said}; {grey}",
         values=f"{name}.depth_m.npy",
         unit="m",
         scale=depth_scale(*range_m),

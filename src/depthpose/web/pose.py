@@ -29,7 +29,6 @@ from depthpose.web.answer import (
     Form,
     Shown,
     example_form,
-    read_files,
     refuse_large,
     small_size,
 )
@@ -86,7 +85,8 @@ def answer_pose(form: Form, net: GeoPoseNet) -> Answer:
     if (least := form.number("min_certainty")) is not None:
         limit = EstimateConfig(min_certainty=least).min_certainty
         seen = [replace(one, estimate=with_status(one.estimate, limit)) for one in seen]
-    folder = form.results()
+    folder = form.folder / "results"
+    folder.mkdir()
     best = seen[0]
     agreeing = "votes that agree" if isinstance(target.net, GeoPoseNet) else "points near the model"
     found = [["", "status", "x [m]", "y [m]", "z [m]", "certainty"]]
@@ -117,7 +117,7 @@ def answer_pose(form: Form, net: GeoPoseNet) -> Answer:
         pictures=_write(folder, name, seen, target.model),
         scene=replace(scene, layers=layers),
         terms=net.terms if target.net is net else "",
-        files=read_files(folder),
+        files={path.name: path.read_bytes() for path in sorted(folder.iterdir())},
     )
 
 
@@ -158,22 +158,18 @@ def _target(form: Form, net: GeoPoseNet) -> _Target:
     model = mesh.read_model(
         cad, mesh.FIXED_UNITS.get(cad.suffix.lower()) or _unit(form, "cad_unit")
     )
-    for own in models:
-        if _is_same(own, model):
+    for own in models:  # of which the file may be one, in the same frame
+        is_same = abs(model.diameter_m / own.diameter_m - 1) <= _SAME
+        if is_same:
+            off_m = mesh.gap_to_surface_m(own.keypoints_m, model)
+            back_m = mesh.gap_to_surface_m(mesh.sample_surface(model, 500)[0], own)
+            is_same = max(off_m, back_m) < _SAME * own.diameter_m
+        if is_same:
             how = f"network; the CAD file is the weights' {own.name!r}"
             return _Target(model=own, net=net, how=how)
     model = mesh.with_found_symmetries(model, None, is_taken=True)
     how = "the CAD file alone, without training"
     return _Target(model=model, net=Registration([model], net.config), how=how)
-
-
-def _is_same(own: ObjectModel, model: ObjectModel) -> bool:
-    """Whether a CAD file is the object that the weights know, in the same frame."""
-    if abs(model.diameter_m / own.diameter_m - 1) > _SAME:
-        return False
-    off_m = mesh.gap_to_surface_m(own.keypoints_m, model)
-    back_m = mesh.gap_to_surface_m(mesh.sample_surface(model, 500)[0], own)
-    return max(off_m, back_m) < _SAME * own.diameter_m
 
 
 def _input(form: Form, model: ObjectModel) -> CloudInput | ViewInput:

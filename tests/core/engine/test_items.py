@@ -4,9 +4,9 @@ import fsspec
 import pytest
 from tests.core.engine.doubles import write_texts
 
-from depthpose.core.engine import Files, find_items, find_tars
+from depthpose.core.engine import Files, Inputs, find_items
 from depthpose.core.errors import InputError
-from depthpose.core.files.stores import list_files, local_copy, publish_bytes, read_all
+from depthpose.core.files.stores import list_files, local_copy, publish, read_all
 
 ONE = Files(roles=("text",), suffixes=(".txt",))
 TWO = Files(roles=("left", "right"), suffixes=(".txt",))
@@ -75,7 +75,7 @@ def test_nothing_found_is_an_error(tmp_path: Path) -> None:
         with pytest.raises(InputError, match=r"no \.txt file there"):
             find_items([word], ONE)
     with pytest.raises(InputError, match=r"no \.tar.* file there"):
-        find_tars([str(tmp_path / "no.tar")])
+        Inputs.find([str(tmp_path / "no.tar")], ONE)
 
 
 def test_a_remote_file_is_copied_and_a_missing_one_refused(tmp_path: Path) -> None:
@@ -90,6 +90,6 @@ def test_a_remote_file_is_copied_and_a_missing_one_refused(tmp_path: Path) -> No
 
 def test_stores_that_may_show_half_a_file_take_no_results() -> None:
     with pytest.raises(InputError, match="ftp:// may show half a file"):
-        publish_bytes(b"x", "ftp://host/file")
+        publish(b"x", "ftp://host/file")
     with pytest.raises(InputError, match="cannot be listed"):
         list_files("nonsense://x", (".txt",))

@@ -17,8 +17,9 @@ from depthpose.core.engine import (
     find_items,
     read_results,
     run_job,
+    shard_results,
 )
-from depthpose.core.engine.work import Block, Work, read_shard
+from depthpose.core.engine.work import Block, Work
 from depthpose.core.errors import InputError
 
 
@@ -187,9 +188,12 @@ def test_a_damaged_plan_is_made_again_and_a_damaged_record_of_settings_refused(
 
 
 def test_a_shard_whose_record_names_other_results_is_refused(tmp_path: Path) -> None:
-    tar = write_tar(tmp_path / "s.tar", {"a.length": "1"})
+    (tmp_path / "shards").mkdir()
+    write_tar(tmp_path / "shards/s.tar", {"a.length": "1"})
+    entries, endings = (("b", ""),), ("length",)
+    done = Done(shard="s.tar", entries=entries, endings=endings, stamp=(), block=0)
     with pytest.raises(InputError, match=r"holds 'a\.length', which its record does not name"):
-        list(read_shard(str(tar), ["b"], ["length"]))
+        list(shard_results(str(tmp_path), done))
 
 
 def test_what_engines_lose_is_missed(tmp_path: Path) -> None:

@@ -36,13 +36,12 @@ from depthpose.core.camera.pinhole import (
 from depthpose.core.camera.stored_camera import (
     Names,
     baseline_of,
+    facts_from_folder,
     facts_from_names,
-    facts_from_ros_pair,
     is_ros,
     lens_of,
     named,
     read_storage,
-    read_two_files,
     scalar,
 )
 from depthpose.core.errors import InputError, nearest_name
@@ -130,24 +129,6 @@ def kitti_matrix(
             "Copy the file anew."
         )
     return np.array(keys[name], dtype=np.float64).reshape(shape)
-
-
-def kitti_size(keys: Mapping[str, list[float]], camera: str = "02") -> Size | None:
-    """Size of the rectified images, where a calibration has it (``S_rect_02``)."""
-    said = keys.get(f"S_rect_{camera}", [])
-    return (int(said[0]), int(said[1])) if len(said) == 2 else None
-
-
-def _kitti_facts(path: AnyPath) -> CameraFacts:
-    """Take the colour pair (cameras 2 and 3) of a KITTI text, or the grey one; or one camera."""
-    keys = read_key_values(path)
-    left, right = next((pair for pair in _KITTI_NAMES if pair[0] in keys), _KITTI_NAMES[0])
-    return facts_from_projections(
-        "a KITTI calibration",
-        kitti_matrix(path, keys, left, (3, 4)),
-        kitti_matrix(path, keys, right, (3, 4)) if right in keys else None,
-        kitti_size(keys, left[-2:]),
-    )
 
 
 def _colmap_facts(text: str) -> CameraFacts:
@@ -410,33 +391,34 @@ def check_image_matches_camera(camera: Camera, width: int, height: int, name: st
 
 def _read_facts(path: AnyPath) -> CameraFacts:
     if Path(path).is_dir():
-        first, second = read_two_files(Path(path))
-        if is_ros(first) and is_ros(second) and "p2" not in first | second:
-            return facts_from_ros_pair(first, second)
-        facts = facts_from_names(first | second)
-        if facts is None:
-            raise InputError("its two files together describe no camera")
-        return facts
+        return facts_from_folder(Path(path))
     if Path(path).name == "cameras.bin":
         raise InputError("of COLMAP cameras.txt is read: colmap model_converter --output_type TXT")
     text = read_text(path, MAX_LIST_BYTES)
     if re.match(r"\s*(\{|\[\s*[-+\[\d])", text):
         return facts_from_json(read_json(path))
-    for sign, read in (
-        (_MIDDLEBURY, lambda: _middlebury_facts(path)),
-        (_KITTI, lambda: _kitti_facts(path)),
-        (_PLAIN, lambda: plain_facts(path, read_key_values(path))),
-        (_COLMAP, lambda: _colmap_facts(text)),
-    ):
-        if sign.search(text):
-            return read()
-    for sign, what in _FOREIGN.items():
-        if re.search(sign, text, re.MULTILINE):
-            raise InputError(f"{what}. {_WRITE}")
-    facts = _bare_facts(text)
-    if facts is None:
-        names = read_storage(path, text)
-        facts = None if names is None else _with_own_keys(facts_from_names(names), names)
+    facts: CameraFacts | None
+    if _MIDDLEBURY.search(text):
+        facts = _middlebury_facts(path)
+    elif _KITTI.search(text):  # the colour pair (cameras 2 and 3), or the grey one; or one camera
+        keys = read_key_values(path)
+        left, right = next((pair for pair in _KITTI_NAMES if pair[0] in keys), _KITTI_NAMES[0])
+        P = kitti_matrix(path, keys, left, (3, 4))
+        other = kitti_matrix(path, keys, right, (3, 4)) if right in keys else None
+        said = keys.get(f"S_rect_{left[-2:]}", [])  # the size of the rectified images
+        size = (int(said[0]), int(said[1])) if len(said) == 2 else None
+        facts = facts_from_projections("a KITTI calibration", P, other, size)
+    elif _PLAIN.search(text):
+        facts = plain_facts(path, read_key_values(path))
+    elif _COLMAP.search(text):
+        facts = _colmap_facts(text)
+    else:
+        for sign, what in _FOREIGN.items():
+            if re.search(sign, text, re.MULTILINE):
+                raise InputError(f"{what}. {_WRITE}")
+        facts = _bare_facts(text)
+        if facts is None and (names := read_storage(path, text)) is not None:
+            facts = _with_own_keys(facts_from_names(names), names)
     if facts is None:
         shown = " ".join(text[:200].split())[:40]
         raise InputError(f"no camera that is known; it begins with {shown!r}. Known: {KNOWN_FILES}")
@@ -502,10 +484,16 @@ def camera_of(camera: AnyLens | None, size: Size) -> Camera | None:
         return read_camera(Path(camera), size)
     if isinstance(camera, FieldOfView):
         camera = size[0] / 2 / math.tan(math.radians(camera.degrees / 2))
-    if isinstance(camera, int | float):
-        return centred_camera(size, camera)
     if isinstance(camera, np.generic | np.ndarray | Tensor) and camera.ndim == 0:
-        return centred_camera(size, float(camera))
+        camera = float(camera)
+    if isinstance(camera, int | float):  # its axis meets the centre
+        if not 1 < camera < 1e6:
+            raise InputError(
+                f"focal_px is {camera}: not a focal length in pixels; KITTI's is 721.5"
+            )
+        width, height = size
+        K = intrinsics(camera, camera, (width - 1) / 2, (height - 1) / 2)
+        return Camera(width=width, height=height, K=K)
     if isinstance(camera, Mapping):
         keys = {key: np.asarray(value).tolist() for key, value in camera.items()}
         has_size = bool({"width", "height"} & keys.keys())
@@ -530,15 +518,6 @@ def choose_lens(
         first, second = list(chosen)[:2]
         raise InputError(f"{first} and {second} are both given; omit one of the two")
     return next(iter(chosen.values()), None)
-
-
-def centred_camera(size: Size, focal_px: float) -> Camera:
-    """Make the camera of which the focal length alone is known; its axis meets the centre."""
-    if not 1 < focal_px < 1e6:
-        raise InputError(f"focal_px is {focal_px}: not a focal length in pixels; KITTI's is 721.5")
-    width, height = size
-    K = intrinsics(focal_px, focal_px, (width - 1) / 2, (height - 1) / 2)
-    return Camera(width=width, height=height, K=K)
 
 
 def intrinsics_of(K: object) -> Float[Tensor, "3 3"]:

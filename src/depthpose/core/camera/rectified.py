@@ -99,9 +99,10 @@ def check_rectified(
         InputError: the sizes differ.
     """
     if left.shape != right.shape:
+        one, other = (f"{image.shape[-1]}x{image.shape[-2]}" for image in (left, right))
         raise InputError(
-            f"the left image is {_size(left)} but the right one {_size(right)}; both images of a "
-            "rectified pair have one size, rectify them again"
+            f"the left image is {one} but the right one {other}; both images of a rectified pair "
+            "have one size, rectify them again"
         )
     if torch.equal(left, right):
         said = "left and right are the same picture; give the view of each camera"
@@ -217,18 +218,15 @@ def _place_finely(
     is_good = (best > _MIN_SCORE) & (row > 0) & (row < last) & (column > 0) & (column < last)
     row, column = row.clamp(1, last - 1), column.clamp(1, last - 1)
     n = torch.arange(len(places))
-    x = column + _peak(*(scores[n, row, column + i] for i in (-1, 0, 1)))
-    y = row + _peak(*(scores[n, row + i, column] for i in (-1, 0, 1)))
-    shift = matched - places + torch.stack([x, y], -1) - _REACH
+    peak = torch.stack([column, row], -1).float()
+    for axis in (0, 1):  # the top of the parabola through three scores, half a pixel off at most
+        before, at, after = (scores[n, row + k * axis, column + k * (1 - axis)] for k in (-1, 0, 1))
+        curvature = (2 * at - before - after).clamp_min(1e-6)
+        peak[:, axis] += ((after - before) / (2 * curvature)).clamp(-0.5, 0.5)
+    shift = matched - places + peak - _REACH
     scale = one.shape[1] / left.shape[2]
     centre = torch.tensor([one.shape[1], one.shape[0]]) / 2
     return ((places - centre) / scale)[is_good], (shift / scale)[is_good]
-
-
-def _peak(before: Tensor, at: Tensor, after: Tensor) -> Tensor:
-    """Place the top of the parabola through three scores, within half a pixel of the middle."""
-    curvature = (2 * at - before - after).clamp_min(1e-6)
-    return ((after - before) / (2 * curvature)).clamp(-0.5, 0.5)
 
 
 def _what_was_done(one: Grey, other: Grey, corners: Places) -> str | None:
@@ -242,8 +240,13 @@ def _what_was_done(one: Grey, other: Grey, corners: Places) -> str | None:
     for how, back in flips.items():
         if len(_match(one, back, some)[0]) >= _MIN_SOME:
             return f"the right image is {how} beside the left one; turn it back"
+    height, width = other.shape
     for turn_deg, scale in _CHANGES:
-        places, matched, _ = _match(one, _changed(other, -turn_deg, 1 / scale), some)
+        c, s = (f(math.radians(-turn_deg)) / (1 / scale) for f in (math.cos, math.sin))
+        there = torch.tensor([[[c, s * height / width, 0], [-s * width / height, c, 0]]])
+        grid = functional.affine_grid(there, [1, 1, height, width], align_corners=False)
+        back = functional.grid_sample(other[None, None], grid, align_corners=False)[0, 0]
+        places, matched, _ = _match(one, back, some)
         if len(places) >= _MIN_SOME:
             rest_deg, rest_scale, _ = _fit_rows(places, (matched - places)[:, 1])
             turn_deg += rest_deg  # noqa: PLW2901
@@ -252,15 +255,6 @@ def _what_was_done(one: Grey, other: Grey, corners: Places) -> str | None:
                 f"{scale * rest_scale:.2f} beside the left one; rectify the pair"
             )
     return None
-
-
-def _changed(grey: Grey, turn_deg: float, scale: float) -> Grey:
-    """Turn and enlarge about the centre."""
-    height, width = grey.shape
-    c, s = (f(math.radians(turn_deg)) / scale for f in (math.cos, math.sin))
-    there = torch.tensor([[[c, s * height / width, 0], [-s * width / height, c, 0]]])
-    grid = functional.affine_grid(there, [1, 1, height, width], align_corners=False)
-    return functional.grid_sample(grey[None, None], grid, align_corners=False)[0, 0]
 
 
 def _report(
@@ -349,7 +343,3 @@ def _grey(image: Float[Tensor, "3 h w"], pixels: int) -> Float[Tensor, "h2 w2"]:
         grey = functional.interpolate(grey[None, None], size, mode="area")[0, 0]
     # Correlation is the more exact the nearer the values lie to 0.
     return (grey - grey.mean()).cpu()
-
-
-def _size(image: Float[Tensor, "3 h w"]) -> str:
-    return f"{image.shape[-1]}x{image.shape[-2]}"

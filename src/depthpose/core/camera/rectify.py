@@ -3,7 +3,6 @@
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from functools import cached_property
 from pathlib import Path
 
 import numpy as np
@@ -273,13 +272,6 @@ class Rectifier:
     rectified_from_raw: Rigid  #: carries points from the raw left camera's frame to its
     left_maps: Maps  #: column and row of the raw left image for each pixel of the rectified one
     right_maps: Maps  #: the same of the right image
-
-    @cached_property
-    def seen_share(self) -> float:
-        """Share of the rectified left image that the raw one shows; the rest is black."""
-        x, y = self.left_maps
-        inside = (x >= 0) & (x <= self.rig.width - 1) & (y >= 0) & (y <= self.rig.height - 1)
-        return float(inside.mean())
 
     def rectify(
         self,

@@ -211,8 +211,14 @@ def read_two_files(folder: Path) -> tuple[Names, Names]:
     return first, second
 
 
-def facts_from_ros_pair(first: Names, second: Names) -> CameraFacts:
-    """Take the two cameras of a pair; the left one is that without ``Tx``."""
+def facts_from_folder(folder: Path) -> CameraFacts:
+    """Take the two files of a pair: each of a camera of ROS, or together those of OpenCV."""
+    first, second = read_two_files(folder)
+    if not (is_ros(first) and is_ros(second)) or "p2" in first | second:
+        facts = facts_from_names(first | second)
+        if facts is None:
+            raise InputError("its two files together describe no camera")
+        return facts
     left, right = ros_pair(first, second)
     P, other = (_need(published(names, _P, 12), "projection_matrix") for names in (left, right))
     facts = facts_from_projections("a pair of camera_info", P, other, size_of(first))

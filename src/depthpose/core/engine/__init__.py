@@ -17,6 +17,4 @@ from depthpose.core.engine.work import Item as Item
 from depthpose.core.engine.work import Sample as Sample
 from depthpose.core.engine.work import Work as Work
 from depthpose.core.engine.work import find_items as find_items
-from depthpose.core.engine.work import find_tars as find_tars
-from depthpose.core.engine.work import read_shard as read_shard
 from depthpose.core.engine.work import stem as stem

@@ -29,14 +29,15 @@ from depthpose.core.engine.work import (
     Work,
     is_unchanged,
     make_plan,
-    read_shard,
+    read_tar,
 )
 from depthpose.core.errors import InputError, MissingExtraError, import_extra
 from depthpose.core.files import remove_parts, stores
+from depthpose.core.files.disk import file_system
 from depthpose.core.run import (
+    NOT_OURS,
     RECORD,
     environment,
-    not_ours,
     read_settings,
     refuse_other_settings,
 )
@@ -74,10 +75,11 @@ def run_job(job: Job, engine: Engine) -> list[Done]:
     claim(out, {**job.settings, "shards": "tar"})
     blocks = make_plan(out, job.items, job.tars, job.block)
     folder = stores.join(out, SHARDS)
-    sizes, records = stores.list_sizes(folder), {one.name: one for one in read_results(out)}
+    sizes, records = stores.list_sizes(folder), {one.shard: one for one in read_results(out)}
     done: dict[str, Done] = {}
     for block in blocks:
-        one, record = records.get(block.shard), stores.join(folder, f"{block.shard}.json")
+        one = records.get(f"{block.shard}.tar")
+        record = stores.join(folder, f"{block.shard}.json")
         path = None if one is None else stores.local_path(stores.join(folder, one.shard))
         if one is None or one.block != block.checksum:
             is_whole = False
@@ -87,15 +89,16 @@ def run_job(job: Job, engine: Engine) -> list[Done]:
             is_whole = is_unchanged(path, one.stamp)
             if is_whole and (time_ns := path.stat().st_mtime_ns) != one.stamp[1]:  # a copy
                 one = replace(one, stamp=(one.stamp[0], time_ns, one.stamp[2]))
-                stores.publish_bytes(one.to_json().encode(), record)
+                stores.publish(one.to_json().encode(), record)
         if one is not None and is_whole:
             if not one.failures:
                 done[block.shard] = one
         elif f"{block.shard}.json" in sizes:
-            stores.remove(record)
+            with file_system(record, "removed") as (fs, inner):
+                fs.rm_file(inner)
     left = [block for block in blocks if block.shard not in done]
     if left:
-        done |= {one.name: one for one in engine(left, job.work, out)}
+        done |= {one.shard.removesuffix(".tar"): one for one in engine(left, job.work, out)}
     lost = [block.shard for block in blocks if block.shard not in done]
     if lost:
         raise InputError(
@@ -119,7 +122,7 @@ def run_job(job: Job, engine: Engine) -> list[Done]:
             seen[name] = one.shard
             table.writerow([name, one.shard, reason])
     manifest = text.getvalue().encode(errors="surrogateescape")
-    stores.publish_bytes(manifest, stores.join(out, MANIFEST))
+    stores.publish(manifest, stores.join(out, MANIFEST))
     return every
 
 
@@ -130,10 +133,10 @@ def claim(out: str, settings: Mapping[str, Any]) -> None:
         return
     for name in (MANIFEST, PLAN, SHARDS):
         if stores.exists(stores.join(out, name)):
-            raise not_ours(stores.join(out, name))
+            raise InputError(f"{stores.join(out, name)}: {NOT_OURS}")
     content = {"settings": dict(settings), "environment": environment()}
     record = f"{json.dumps(content, indent=2)}\n"
-    stores.publish_bytes(record.encode(), stores.join(out, RECORD))
+    stores.publish(record.encode(), stores.join(out, RECORD))
 
 
 def is_job(out: str) -> bool:
@@ -158,8 +161,24 @@ def shard_results(out: str, done: Done) -> Iterator[tuple[str, dict[str, bytes]]
     Raises:
         InputError: the shard is not there, or is damaged.
     """
+    url = stores.join(stores.absolute(out), SHARDS, done.shard)
     names = {name for name, reason in done.entries if not reason}
-    return read_shard(stores.join(stores.absolute(out), SHARDS, done.shard), names, done.endings)
+    known, files = "", dict[str, bytes]()
+    for member, data in read_tar(url):
+        # A tar does not separate the names of the results from the endings of their files.
+        dots = (k for k, letter in enumerate(member) if letter == ".")
+        pairs = ((member[:k], member[k + 1 :]) for k in dots)
+        parts = next((pair for pair in pairs if pair[0] in names and pair[1] in done.endings), None)
+        if parts is None:
+            raise InputError(
+                f"{url}: holds {member!r}, which its record does not name; make it anew"
+            )
+        if files and parts[0] != known:
+            yield known, files
+            files = {}
+        known, files[parts[1]] = parts[0], data
+    if files:
+        yield known, files
 
 
 _LEAST_VERSION = (2, 52)  # the first version of Ray that has passwords

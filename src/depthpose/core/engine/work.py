@@ -11,7 +11,7 @@ import shutil
 import tarfile
 import tempfile
 import zlib
-from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass
 from itertools import groupby, islice
@@ -19,9 +19,10 @@ from pathlib import Path, PurePosixPath
 
 from depthpose.core.errors import InputError
 from depthpose.core.files import stores
-from depthpose.core.files.disk import find_partners, refused_write
+from depthpose.core.files.disk import file_system, find_partners, refused_write
 
 PLAN, SHARDS = "plan.jsonl", "shards"
+_TARS = (".tar", ".tar.gz", ".tgz")
 
 
 @dataclass(frozen=True, slots=True)
@@ -101,24 +102,13 @@ def _read_manifest(url: str, roles: Sequence[str]) -> Iterator[Item]:
             )
         files = tuple(
             path
-            if stores.is_url(path) or path.startswith("/")
+            if "://" in path or path.startswith("/")
             else stores.absolute(stores.join(folder, path))
             for path in (row[role] for role in roles)
         )
         name = str(row.get("name") or stem(files[0]))
         _refuse_name(name, f"{url}: row {number}")
         yield Item(name, files)
-
-
-def find_tars(words: Iterable[str]) -> list[str]:
-    """List tar shards: files themselves, or those of a pattern."""
-    listed = (url for word in words for url in stores.list_files(word, (".tar", ".tgz", ".gz")))
-    return list(dict.fromkeys(filter(is_tar, listed)))
-
-
-def is_tar(word: str) -> bool:
-    """Whether a word names tar shards."""
-    return word.lower().endswith((".tar", ".tar.gz", ".tgz"))
 
 
 def stem(url: str) -> str:
@@ -187,37 +177,17 @@ def make_plan(out: str, items: Sequence[Item], tars: Sequence[str], size: int) -
         if tar not in there:
             blocks.append(Block(f"{len(blocks):06d}", tar=tar))
     if len(blocks) > known:
-        stores.publish_bytes("".join(f"{b.to_json()}\n" for b in blocks).encode(), plan)
+        stores.publish("".join(f"{b.to_json()}\n" for b in blocks).encode(), plan)
     return blocks
-
-
-def read_shard(
-    url: str, names: Collection[str], endings: Collection[str]
-) -> Iterator[tuple[str, dict[str, bytes]]]:
-    """Read the results of a shard one by one.
-
-    A tar does not separate the names of the results from the endings that their files may have.
-
-    Raises:
-        InputError: the shard is not there, or is damaged.
-    """
-
-    def split(member: str) -> tuple[str, str]:
-        for k in (k for k, letter in enumerate(member) if letter == "."):
-            if member[:k] in names and member[k + 1 :] in endings:
-                return member[:k], member[k + 1 :]
-        raise InputError(f"{url}: holds {member!r}, which its record does not name; make it anew")
-
-    members = ((*split(member), data) for member, data in read_tar(url))
-    for name, group in groupby(members, lambda member: member[0]):
-        yield name, {ending: data for _, ending, data in group}
 
 
 def read_tar(url: str) -> Iterator[tuple[str, bytes]]:
     """Read the files of a tar shard, plain or compressed, from its beginning to its end."""
     seen: set[str] = set()
     try:
-        with stores.opened(url) as file, tarfile.open(fileobj=file, mode="r|*") as tar:
+        with file_system(url, "read") as (fs, inner):
+            file = fs.open(inner, "rb")
+        with file, tarfile.open(fileobj=file, mode="r|*") as tar:
             for member in tar:
                 if not (member.isfile() or member.isdir()):
                     raise InputError(
@@ -255,11 +225,13 @@ class Inputs:
 
     @classmethod
     def find(cls, words: Sequence[str], files: Files) -> "Inputs":
-        """List files, manifests and tar shards."""
-        tars = [word for word in words if is_tar(word)]
-        others = [word for word in words if not is_tar(word)]
+        """List files, manifests and tar shards, these by name or by a pattern."""
+        tars = [word for word in words if word.lower().endswith(_TARS)]
+        others = [word for word in words if word not in tars]
         items = find_items(others, files) if others else []
-        return cls(items=items, tars=find_tars(tars), files=files)
+        listed = (url for word in tars for url in stores.list_files(word, (".tar", ".tgz", ".gz")))
+        shards = dict.fromkeys(url for url in listed if url.lower().endswith(_TARS))
+        return cls(items=items, tars=list(shards), files=files)
 
     @contextmanager
     def first(self) -> Iterator[Sequence[Path]]:
@@ -349,11 +321,6 @@ class Done:
     block: int  #: checksum of the inputs
 
     @property
-    def name(self) -> str:
-        """Name of the shard, without its suffix."""
-        return self.shard.rpartition(".")[0]
-
-    @property
     def failures(self) -> list[tuple[str, str]]:
         """Inputs without a result."""
         return [entry for entry in self.entries if entry[1]]
@@ -390,19 +357,20 @@ def is_unchanged(path: Path, stamp: Sequence[int]) -> bool:
         return False
 
 
+@dataclass(eq=False)
 class Runner:
     """Does blocks one after the other; what the work needs is loaded at the first."""
 
-    def __init__(self, work: Work, out: str) -> None:
-        self._work, self._out = work, out
-        self._function: Function | None = None
+    work: Work
+    out: str
+    function: Function | None = None  #: what the work has started
 
     def run(self, block: Block) -> Done:
         """Do a block, unless a shard of it without failures is there.
 
         The record ``SHARD.json`` is written after the shard: where it is, the shard is whole.
         """
-        record = stores.join(self._out, SHARDS, f"{block.shard}.json")
+        record = stores.join(self.out, SHARDS, f"{block.shard}.json")
         if stores.exists(record):
             done = Done.from_json(stores.read_from(record))
             if not done.failures:
@@ -411,34 +379,34 @@ class Runner:
         with refused_write(temporary.name), temporary as scratch:
             file = Path(scratch) / f"{block.shard}.tar"
             entries = tuple(self._write(block, file, Path(scratch)))
-            url = stores.join(self._out, SHARDS, file.name)
+            url = stores.join(self.out, SHARDS, file.name)
             stores.publish(file, url)
             stamp = file_stamp(stores.local_path(url) or file)
         done = Done(
             shard=file.name,
             entries=entries,
-            endings=tuple(self._work.endings),
+            endings=tuple(self.work.endings),
             stamp=stamp,
             block=block.checksum,
         )
-        stores.publish_bytes(done.to_json().encode(), record)
+        stores.publish(done.to_json().encode(), record)
         return done
 
     def _write(self, block: Block, file: Path, scratch: Path) -> Iterator[tuple[str, str]]:
         """Write the results of a block, and give each name with "" or the reason of a failure."""
-        self._function = self._function or self._work.start()
-        samples = _samples(block, self._work.files, scratch)
+        self.function = self.function or self.work.start()
+        samples = _samples(block, self.work.files, scratch)
         results = scratch / "results"
         results.mkdir()
         with tarfile.open(file, "w", format=tarfile.PAX_FORMAT) as tar:
-            while chunk := list(islice(samples, self._work.batch)):
-                reasons = iter(self._function([one for one in chunk if not one.reason], results))
+            while chunk := list(islice(samples, self.work.batch)):
+                reasons = iter(self.function([one for one in chunk if not one.reason], results))
                 for one in chunk:
                     reason = one.reason or next(reasons)
                     for path in one.files:
                         if scratch in path.parents:  # of a copy the name alone says something
                             reason = reason.replace(str(path), path.name)
-                    for ending in sorted(self._work.endings):
+                    for ending in sorted(self.work.endings):
                         path = results / f"{one.name}.{ending}"
                         if path.is_file():
                             if not reason:

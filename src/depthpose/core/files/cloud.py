@@ -13,7 +13,7 @@ import torch
 from jaxtyping import Float32
 from torch import Tensor
 
-from depthpose.core.errors import InputError, import_open3d
+from depthpose.core.errors import InputError, import_extra
 from depthpose.core.files.disk import (
     MAX_TEXT_BYTES,
     AnyPath,
@@ -54,7 +54,7 @@ class Cloud:
         Raises:
             MissingExtraError: Open3D is not installed.
         """
-        open3d = import_open3d("a cloud of Open3D")
+        open3d = import_extra("open3d", "open3d", "open3d", "a cloud of Open3D")
         cloud = open3d.geometry.PointCloud()
         cloud.points = open3d.utility.Vector3dVector(self.points.double().cpu().numpy())
         if self.color is not None:
@@ -186,8 +186,12 @@ def _read_text(path: AnyPath) -> Cloud:
     rows = _rows_of(text, noted)
     with refused_as(path, "text", "save it as UTF-8"):
         head = list(islice(rows, _LOOKED_AT))
+    names: list[str] = []
     first = _names_in(head[0]) if head else []
-    names = [] if all(map(_is_number, first)) else first
+    try:
+        list(map(float, filter(None, first)))
+    except ValueError:  # no row of numbers
+        names = first
     if names and not set("xyz") <= set(names):
         raise InputError(
             f"{path}: begins by {head[0][:60]!r}, neither numbers nor names of columns with x, y "
@@ -229,14 +233,6 @@ def _rows_of(text: Iterable[str], noted: list[str]) -> Iterator[str]:
 
 def _names_in(line: str) -> list[str]:
     return [word.strip("\"'").lower() for word in _PARTS.split(line.strip())]
-
-
-def _is_number(word: str) -> bool:
-    try:
-        float(word)
-    except ValueError:
-        return not word
-    return True
 
 
 def _blank_separated(path: AnyPath, head: list[str], names: list[str]) -> Callable[[str], str]:

@@ -17,7 +17,7 @@ from collections.abc import Hashable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from functools import lru_cache
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import Any
 
 import yaml
 
@@ -292,13 +292,12 @@ def read_json(path: AnyPath) -> object:
             seen[key] = value
         return seen
 
-    def finite(word: str) -> float:
-        value = float(word)
-        return value if math.isfinite(value) else refuse_number(word)
-
     with refused_as(path, "JSON file", "correct it there"):
         return json.loads(
-            text, parse_constant=refuse_number, parse_float=finite, object_pairs_hook=once_each
+            text,
+            parse_constant=finite_number,
+            parse_float=finite_number,
+            object_pairs_hook=once_each,
         )
 
 
@@ -397,9 +396,12 @@ def read_key_values(path: AnyPath) -> dict[str, list[float]]:
     return values
 
 
-def refuse_number(text: str) -> NoReturn:
-    """Refuse NaN and infinity, which Python's parser of JSON would take."""
-    raise ValueError(f"{text} is not a JSON number")
+def finite_number(text: str) -> float:
+    """Read a number of JSON; NaN and infinity, which Python's parser would take, are none."""
+    value = float(text)
+    if not math.isfinite(value):
+        raise ValueError(f"{text} is not a JSON number")
+    return value
 
 
 _MOST_SHOWN = 6

@@ -3,6 +3,7 @@
 Text and binary of both byte orders are read; little-endian binary is written.
 """
 
+import math
 import re
 from array import array
 from collections.abc import Iterable, Iterator
@@ -17,6 +18,7 @@ from depthpose.core.errors import InputError
 from depthpose.core.files.disk import MAX_TEXT_BYTES, AnyPath, read_bytes, refused_as
 
 _WORDS = re.compile(r"[-+]?(?:nan\(\w*\)|1[.,]#(?:QNAN|SNAN|IND|INF)\w*)")
+_FEW = "declares {} but {} rows follow; it is truncated, save it again"
 Columns = dict[str, np.ndarray]  # one array a name, all equally long
 
 
@@ -72,7 +74,7 @@ def split_rows(path: AnyPath, rows: Iterator[str], fields: list[Field], count: i
     """Take the next ``count`` rows of text apart into columns of the declared types."""
     table = parse_rows(path, islice(rows, count))
     if len(table) < count:
-        raise _truncated(path, f"{count} points", len(table))
+        raise InputError(f"{path}: {_FEW.format(f'{count} points', len(table))}")
     width = sum(f.count for f in fields)
     if count and table.shape[1] != width:
         raise InputError(f"{path}: rows of {table.shape[1]} values where {width} are declared")
@@ -91,12 +93,6 @@ def split_rows(path: AnyPath, rows: Iterator[str], fields: list[Field], count: i
         with np.errstate(over="ignore"):
             columns[f.name] = column.astype(dtype)
     return columns
-
-
-def _truncated(path: AnyPath, what: str, rows: int) -> InputError:
-    return InputError(
-        f"{path}: declares {what} but {rows} rows follow; it is truncated, save it again"
-    )
 
 
 def parse_rows(path: AnyPath, rows: Iterable[str]) -> np.ndarray:
@@ -179,7 +175,8 @@ def read_ply_elements(path: AnyPath, last: str | None = None) -> tuple[Columns, 
                         "the header declares (the number of values, then as many); save it again"
                     )
             if there < element.count:
-                raise _truncated(path, f"{element.count} {element.name}", there)
+                what = f"{element.count} {element.name}"
+                raise InputError(f"{path}: {_FEW.format(what, there)}")
             lists |= {
                 f"{element.name} {name}": Ragged(
                     np.array(sizes[name], np.int64), np.array(values[name])
@@ -332,13 +329,11 @@ def read_pcd(path: AnyPath) -> Columns:
     if len(set(real)) != len(real):
         raise InputError(f"{path}: PCD fields {names} repeat a name; keep one of them")
     fields = [Field(name=n, code=_PCD_CODES[k, s], count=int(c)) for n, k, s, c in rows]
-    match header.get("POINTS"), header.get("WIDTH"), header.get("HEIGHT"):
-        case [points], _, _ if _is_count(points):
-            count = int(points)
-        case None, [width], [height] if _is_count(width) and _is_count(height):
-            count = int(width) * int(height)
-        case _:
-            raise InputError(f"{path}: the PCD header says no number of POINTS; add that line")
+    sides = [header.get(name, []) for name in ("WIDTH", "HEIGHT")]
+    sides = [header["POINTS"]] if "POINTS" in header else sides
+    if not all(re.fullmatch(r"[0-9]{1,10}", " ".join(side)) for side in sides):
+        raise InputError(f"{path}: the PCD header says no number of POINTS; add that line")
+    count = math.prod(int(side[0]) for side in sides)
     body = memoryview(data)[end.end() :]
     if end[1] == b"binary":
         return split_records(path, body, fields, count)
@@ -410,7 +405,3 @@ def decompress_lzf(packed: memoryview, size: int) -> bytes:
     if len(out) != size or at > len(packed):
         raise ValueError(f"the compressed bytes do not unpack to {size}")
     return bytes(out)
-
-
-def _is_count(text: str) -> bool:
-    return re.fullmatch(r"[0-9]{1,10}", text) is not None

@@ -2,8 +2,7 @@
 
 import shutil
 import tempfile
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from pathlib import Path, PurePosixPath
 from typing import Any
 
@@ -14,14 +13,9 @@ _STORES = ("s3", "s3a", "gs", "gcs", "az", "abfs", "abfss")
 """Stores in which an upload appears whole or not at all."""
 
 
-def is_url(path: str) -> bool:
-    """Whether a path names its file system: ``s3://bucket/key``."""
-    return "://" in path
-
-
 def local_path(url: str) -> Path | None:
     """Give the local path behind a path or ``file://`` URL; None in an object store."""
-    if not is_url(url):
+    if "://" not in url:
         return Path(url)
     protocol, _, rest = url.partition("://")
     return Path(rest) if protocol in ("file", "local") else None
@@ -60,30 +54,29 @@ def read_all(folder: str, suffix: str) -> dict[str, bytes]:
     """Read the files of a folder, not below it, by suffix; none where there is no folder."""
     path = local_path(folder)
     if path is not None:
-        return {p.name: read_bytes(p) for p in sorted(path.glob(f"*{suffix}")) if _shown(p.name)}
+        files = sorted(p for p in path.glob(f"*{suffix}") if not p.name.startswith("."))
+        return {file.name: read_bytes(file) for file in files}
     with file_system(folder, "listed") as (fs, inner):
         names = sorted(e["name"] for e in _details(fs, inner) if e["name"].endswith(suffix))
         return {PurePosixPath(name).name: fs.cat_file(name) for name in names}
 
 
-def publish(file: Path, url: str) -> None:
-    """Put a finished local file under its final name, whole or not at all."""
+def publish(content: bytes | Path, url: str) -> None:
+    """Put bytes, or a finished local file, under a final name, whole or not at all."""
     path = local_path(url)
     if path is not None:
         with atomic_write(path) as part:
-            shutil.copyfile(file, part)
+            if isinstance(content, bytes):
+                part.write_bytes(content)
+            else:
+                shutil.copyfile(content, part)
         return
     refuse_unsafe(url)
     with file_system(url, "written") as (fs, inner):
-        fs.put_file(str(file), inner)
-
-
-def publish_bytes(data: bytes, url: str) -> None:
-    """Put bytes under a name, whole or not at all; see :func:`publish`."""
-    with tempfile.TemporaryDirectory(prefix="depthpose-") as scratch:
-        file = Path(scratch) / "part"
-        file.write_bytes(data)
-        publish(file, url)
+        if isinstance(content, bytes):
+            fs.pipe_file(inner, content)
+        else:
+            fs.put_file(str(content), inner)
 
 
 def refuse_unsafe(url: str) -> None:
@@ -110,15 +103,6 @@ def local_copy(url: str, scratch: Path) -> Path:
     return copy
 
 
-@contextmanager
-def opened(url: str) -> Iterator[Any]:
-    """Open a file for reading from its beginning to its end."""
-    with file_system(url, "read") as (fs, inner):
-        file = fs.open(inner, "rb")
-    with file:
-        yield file
-
-
 def list_files(path: str, suffixes: Sequence[str]) -> list[str]:
     """List files, not hidden ones, by their suffixes: one, those of a folder or of a pattern."""
     with file_system(path, "listed") as (fs, inner):
@@ -133,13 +117,14 @@ def list_files(path: str, suffixes: Sequence[str]) -> list[str]:
                 home, _, last = home.rpartition("/")
                 rest = f"{last}/{rest}"
             files = fs.glob(f"{home.replace('[', '[[]')}/{rest}" if "[" in home else inner)
-    kept = [p for p in files if PurePosixPath(p).suffix.lower() in suffixes and _shown(p)]
+    shown = (p for p in files if not PurePosixPath(p).name.startswith("."))
+    kept = [p for p in shown if PurePosixPath(p).suffix.lower() in suffixes]
     kept.sort(key=lambda p: natural_order(Path(p)))
     if not kept:
         raise InputError(
             f"{path}: no {', '.join(suffixes)} file there; give a file, a folder or a pattern"
         )
-    prefix = f"{path.partition('://')[0]}://" if is_url(path) else ""
+    prefix = f"{path.partition('://')[0]}://" if "://" in path else ""
     return [f"{prefix}{p}" for p in kept]
 
 
@@ -147,12 +132,6 @@ def list_sizes(folder: str) -> dict[str, int]:
     """Give the sizes [bytes] of the files of a folder, by name; none where there is no folder."""
     with file_system(folder, "listed") as (fs, inner):
         return {PurePosixPath(e["name"]).name: int(e["size"]) for e in _details(fs, inner)}
-
-
-def remove(url: str) -> None:
-    """Remove a file."""
-    with file_system(url, "removed") as (fs, inner):
-        fs.rm_file(inner)
 
 
 def list_tree(url: str) -> dict[str, str]:
@@ -168,7 +147,3 @@ def _details(fs: Any, folder: str) -> list[dict[str, Any]]:  # noqa: ANN401  fss
         return [entry for entry in fs.ls(folder, detail=True) if entry["type"] == "file"]
     except FileNotFoundError:
         return []
-
-
-def _shown(path: str) -> bool:
-    return not PurePosixPath(path).name.startswith(".")

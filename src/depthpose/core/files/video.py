@@ -18,6 +18,7 @@ from depthpose.core.files.disk import AnyPath, atomic_write, refused_suffix
 VIDEO_SUFFIXES = (".mp4", ".avi", ".mov", ".mkv", ".webm", ".m4v")
 """Files that are taken for a video."""
 
+_NO_VIDEO = "not a video that OpenCV can decode; convert it to MP4 (H.264)"
 _CODECS = {".mp4": "vp09", ".avi": "MJPG"}  # VP9: OpenCV's own wheels have no H.264
 
 
@@ -49,7 +50,7 @@ class Video:
         finally:
             capture.release()
         if index == 0:
-            raise _unreadable(self.path)
+            raise InputError(f"{self.path}: {_NO_VIDEO}")
 
 
 def read_video(path: AnyPath) -> Video:
@@ -70,7 +71,7 @@ def read_video(path: AnyPath) -> Video:
     is_read = capture.read()[0]
     capture.release()
     if not is_read or not 0 < fps < math.inf:
-        raise _unreadable(path)
+        raise InputError(f"{path}: {_NO_VIDEO}")
     return Video(path=path, fps=float(fps), frames=max(0, int(frames)))
 
 
@@ -133,9 +134,5 @@ def write_video(path: AnyPath, images: Iterable[Float[Tensor, "3 _ _"]], fps: fl
 def _open(path: Path) -> Any:  # noqa: ANN401  OpenCV's classes carry no types
     capture = import_opencv("reading a video").VideoCapture(str(path))
     if not capture.isOpened():
-        raise _unreadable(path)
+        raise InputError(f"{path}: {_NO_VIDEO}")
     return capture
-
-
-def _unreadable(path: Path) -> InputError:
-    return InputError(f"{path}: not a video that OpenCV can decode; convert it to MP4 (H.264)")

@@ -6,7 +6,7 @@ import shlex
 import warnings
 from collections.abc import Mapping
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import KW_ONLY, dataclass
 from io import BytesIO, StringIO
 from pathlib import Path
 from typing import Any
@@ -30,18 +30,19 @@ RUN_FILES = ("config.yaml", _METRICS, _PICTURES, "tensorboard", STATE, BEFORE)
 _HELD_OUT = "held_out/"  # begins the names of numbers that validation found
 
 
+@dataclass(eq=False)
 class RunLogger:
     """Writes one run; only the main process of a training has one that writes."""
 
-    def __init__(self, folder: Path, *, is_writer: bool) -> None:
-        self.folder = folder
-        self.has_good_last = True  # else the state before it is kept when the next is saved
-        self._is_writer = is_writer
-        self._board: Any = None
+    folder: Path
+    _: KW_ONLY
+    is_writer: bool
+    has_good_last: bool = True  #: else the state before it is kept when the next is saved
+    board: Any = None  #: TensorBoard's, once opened
 
     def open(self, step: int) -> None:
         """Begin at ``step``: remove what a killed run left: later lines and partial files."""
-        if not self._is_writer:
+        if not self.is_writer:
             return
         for folder in (self.folder, self.folder / _PICTURES):
             remove_parts(folder)
@@ -52,40 +53,52 @@ class RunLogger:
         from torch.utils.tensorboard.writer import SummaryWriter
 
         with refused_write(self.folder):
-            self._board = SummaryWriter(str(self.folder / "tensorboard"), purge_step=step + 1)
+            self.board = SummaryWriter(str(self.folder / "tensorboard"), purge_step=step + 1)
 
     def log(self, step: int, numbers: Mapping[str, float]) -> None:
         """Append one line of metrics."""
-        if not self._is_writer:
+        if not self.is_writer:
             return
         with refused_write(self.folder / _METRICS):
             with (self.folder / _METRICS).open("a") as file:
                 file.write(json.dumps({"step": step, **numbers}) + "\n")
             for name, value in numbers.items():
-                self._board.add_scalar(name, value, step)
+                self.board.add_scalar(name, value, step)
 
     def show(self, step: int, result: ValidationResult) -> None:
         """Write what validation found."""
-        if not self._is_writer:
+        if not self.is_writer:
             return
         if result.numbers:
             self.log(step, result.numbers)
         for name, picture in result.pictures.items():
             write_image(self.folder / _PICTURES / f"{step:07d}_{name}.png", picture)
             with refused_write(self.folder):
-                self._board.add_image(name, picture, step)
+                self.board.add_image(name, picture, step)
 
     def save(self, state: Mapping[str, Any]) -> None:
         """Write the last state, all or nothing; the one until now becomes the one before."""
-        if self._is_writer:
-            write_state(self.folder, state, keeps_last=self.has_good_last)
-            self.has_good_last = True
+        if not self.is_writer:
+            return
+        packed = BytesIO()  # on a full disk torch.save would say anything but that
+        torch.save(dict(state), packed)
+        last, before = self.folder / STATE, self.folder / BEFORE
+        with atomic_write(last) as part:
+            part.write_bytes(packed.getbuffer())
+            if self.has_good_last and last.is_file():
+                before.unlink(missing_ok=True)
+                try:
+                    os.link(last, before)  # a second name: there is a last state at any moment
+                except OSError:  # a disk without links
+                    with suppress(OSError):
+                        last.replace(before)
+        self.has_good_last = True
 
     def close(self) -> None:
         """Flush what TensorBoard holds back."""
-        if self._board is not None:
+        if self.board is not None:
             with refused_write(self.folder):
-                self._board.close()
+                self.board.close()
 
 
 def read_metrics(folder: Path) -> list[dict[str, Any]]:
@@ -223,22 +236,6 @@ class Parts:
 def saved_states(folder: Path) -> list[Path]:
     """List the states that a folder holds, the last one first."""
     return [path for name in (STATE, BEFORE) if (path := folder / name).is_file()]
-
-
-def write_state(folder: Path, state: Mapping[str, Any], *, keeps_last: bool) -> None:
-    """Write the last state, all or nothing; the one until now is kept as the one before."""
-    packed = BytesIO()  # on a full disk torch.save would say anything but that
-    torch.save(dict(state), packed)
-    last, before = folder / STATE, folder / BEFORE
-    with atomic_write(last) as part:
-        part.write_bytes(packed.getbuffer())
-        if keeps_last and last.is_file():
-            before.unlink(missing_ok=True)
-            try:
-                os.link(last, before)  # a second name: there is a last state at any moment
-            except OSError:  # a disk without links
-                with suppress(OSError):
-                    last.replace(before)
 
 
 def restore_last(folder: Path, parts: Parts) -> tuple[Path, int, float]:

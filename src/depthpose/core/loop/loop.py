@@ -10,7 +10,7 @@ import os
 import signal
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import suppress
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from datetime import timedelta
 from functools import wraps
@@ -131,8 +131,8 @@ class Run:
                 f"{self.folder}: holds no state of a training, so there is none to finish."
             )
         training.steps = training.step if self.finish else training.steps
-        with StopRequest() as request:
-            return training.take_steps(self.on_step, request)
+        with stop_requests() as asked:
+            return training.take_steps(self.on_step, asked)
 
 
 def releases_folder(stage: Callable[[_Config, Run], Path]) -> Callable[[_Config, Run], Path]:
@@ -205,15 +205,22 @@ class _Training:
         self.logger.open(self.step)
 
     def take_steps(
-        self, on_step: Callable[[Progress], None] | None, request: "StopRequest"
+        self, on_step: Callable[[Progress], None] | None, asked: Sequence[tuple[int, float]]
     ) -> float:
-        """Take the remaining steps, or up to the current one; give the whole training's seconds."""
+        """Take the remaining steps, or up to the current one; give the whole training's seconds.
+
+        ``asked``: by which signals it has been asked to stop, and when.
+        """
         batches = self._batches()
         while self.step < self.steps:
             self._take_step([next(batches) for _ in range(self.config.accumulate)])
             self.step += 1
-            stop = self._any_process(bool(request.asked))
-            if stop and self._any_process(request.to_finish()):
+            stop = self._any_process(bool(asked))
+            presses = [at for number, at in asked if number == signal.SIGINT]
+            while len(presses) == 1 and time.monotonic() - presses[0] < SECOND_CTRL_C_S:
+                time.sleep(0.05)
+                presses = [at for number, at in asked if number == signal.SIGINT]
+            if stop and self._any_process(len(presses) > 1):  # the steps so far are all
                 self.steps = self.step
             numbers: dict[str, float] = {}
             if self._is_due(self.config.log_every_steps):
@@ -287,7 +294,8 @@ class _Training:
                         "precision fp32; 'start' can take weights from before."
                     )
                 share = self.parts.scaler.scale(update.loss / len(iterators))
-                share.backward(inputs=_parameters(self.parts.optimizers[name]))
+                groups = self.parts.optimizers[name].param_groups
+                share.backward(inputs=[p for group in groups for p in group["params"]])
                 for fact, value in {"loss": loss, **update.facts}.items():
                     total, terms = self.sums.get(f"{name}/{fact}", (0.0, 0))
                     self.sums[f"{name}/{fact}"] = (total + float(value), terms + 1)
@@ -312,7 +320,7 @@ class _Training:
         optimizer, adam = self.task.optimizers[name]
         for group in optimizer.param_groups:
             group["lr"] = adam.rate_at(self.step, self.steps) * group.get("rate", 1.0)
-        parameters = _parameters(optimizer)
+        parameters = [p for group in optimizer.param_groups for p in group["params"]]
         if self.world > 1:
             grads = [torch.zeros_like(p) if p.grad is None else p.grad for p in parameters]
             flat = torch.cat([grad.flatten() for grad in grads])
@@ -342,46 +350,37 @@ class _Training:
         return bool(float(self.accelerator.reduce(flag, "sum")) > 0)
 
 
-class StopRequest:
-    """Lets SIGTERM and Ctrl-C end the training after the step, with its state saved."""
+@contextmanager
+def stop_requests() -> Iterator[list[tuple[int, float]]]:
+    """Let SIGTERM and Ctrl-C end the training after the step, with its state saved.
 
-    def __enter__(self) -> "StopRequest":
-        self.asked: list[tuple[int, float]] = []
-        self._handlers = {}
-        with suppress(ValueError):  # not the main thread: whoever runs us handles signals
-            numbers = (signal.SIGTERM, signal.SIGINT)
-            self._handlers = {number: signal.signal(number, self._remember) for number in numbers}
-        return self
+    Gives a list that grows by the number and the time of each signal.
+    """
+    asked: list[tuple[int, float]] = []
 
-    def __exit__(self, *_: object) -> None:
-        for number, handler in self._handlers.items():
-            signal.signal(number, handler)
-
-    def _remember(self, number: int, _: FrameType | None) -> None:
-        if not self.asked and number == signal.SIGINT:
+    def remember(number: int, _: FrameType | None) -> None:
+        if not asked and number == signal.SIGINT:
             message = (
                 "\ndepthpose: stopping after this step. Press Ctrl-C again within 3 s to finish "
                 "now: the weights of the steps so far are written.\n"
             )
             os.write(2, message.encode())  # print may be at work itself
-        self.asked.append((number, time.monotonic()))
+        asked.append((number, time.monotonic()))
 
-    def to_finish(self) -> bool:
-        """Whether to take the steps so far for all: Ctrl-C twice. Waits for the second one."""
-        presses = [at for number, at in self.asked if number == signal.SIGINT]
-        while len(presses) == 1 and time.monotonic() - presses[0] < SECOND_CTRL_C_S:
-            time.sleep(0.05)
-            presses = [at for number, at in self.asked if number == signal.SIGINT]
-        return len(presses) > 1
+    handlers = {}
+    with suppress(ValueError):  # not the main thread: whoever runs us handles signals
+        numbers = (signal.SIGTERM, signal.SIGINT)
+        handlers = {number: signal.signal(number, remember) for number in numbers}
+    try:
+        yield asked
+    finally:
+        for number, handler in handlers.items():
+            signal.signal(number, handler)
 
 
 def _leave_process_group(_: int) -> None:
     """Take a worker out of the job's process group: a killed worker would end the loop unsaved."""
     os.setsid()
-
-
-def _parameters(optimizer: torch.optim.Optimizer) -> list[Tensor]:
-    return [p for group in optimizer.param_groups for p in group["params"]]
 
 
 def _copied(module: torch.nn.Module) -> dict[str, Tensor]:

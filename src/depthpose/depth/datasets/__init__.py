@@ -3,7 +3,6 @@
 from depthpose.depth.datasets.check import Duplicate as Duplicate
 from depthpose.depth.datasets.check import check_dataset as check_dataset
 from depthpose.depth.datasets.check import find_duplicates as find_duplicates
-from depthpose.depth.datasets.check import shrink as shrink
 from depthpose.depth.datasets.check import similarity_matrix as similarity_matrix
 from depthpose.depth.datasets.dataset import Dataset as Dataset
 from depthpose.depth.datasets.dataset import Split as Split

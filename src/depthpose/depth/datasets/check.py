@@ -4,11 +4,10 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
 
 import torch
 from jaxtyping import Float
-from torch import Tensor
+from torch import Tensor, nn
 from torch.nn import functional as F
 
 from depthpose.core.camera import Camera, RectificationReport, StereoRig, check_rectified
@@ -57,7 +56,10 @@ def check_dataset(
         chosen = read_split(split)
         here = {frame.name: frame for frame in frames}
         missing = [name for name in chosen.names if name not in here]
-        found += [_problem(folder, "missing", f"frame {n} of {chosen.name}") for n in missing]
+        found += [
+            Problem(path=folder, kind="missing", message=f"frame {n} of {chosen.name}")
+            for n in missing
+        ]
         frames = [here[name] for name in chosen.names if name in here]
     found += _check_folder(folder, frames)
     for done, frame in enumerate(frames, 1):
@@ -74,24 +76,18 @@ def check_dataset(
     return make_report(layout, counts, found)
 
 
-def _problem(
-    path: Path, kind: Literal["missing", "mismatch", "empty", "note"], message: str
-) -> Problem:
-    return Problem(path=path, kind=kind, message=message)
-
-
 def _check_folder(folder: Path, frames: list[Frame]) -> Iterator[Problem]:
     """Names that are there twice, mixed formats, right views alone, and maps of other names."""
     seen: dict[str, Path] = {}
     for frame in frames:
         if frame.name in seen:
             message = f"has the same name as {seen[frame.name]}; rename one"
-            yield _problem(frame.left, "mismatch", message)
+            yield Problem(path=frame.left, kind="mismatch", message=message)
         seen[frame.name] = frame.left
     # Compression changes what networks predict, so a mixture is worth knowing.
     views = [path for frame in frames for path in (frame.left, frame.right) if path is not None]
     if len({path.suffix.lower() in (".jpg", ".jpeg") for path in views}) > 1:
-        yield _problem(folder, "note", "mixes PNG and JPEG images")
+        yield Problem(path=folder, kind="note", message="mixes PNG and JPEG images")
     # The folders are listed, not the frames: a split leaves many pairs out on purpose.
     folders = {
         (f.left.parent, f.right.parent) for f in frames if f.right and f.right.stem == f.left.stem
@@ -103,13 +99,13 @@ def _check_folder(folder: Path, frames: list[Frame]) -> Iterator[Problem]:
         for path in sorted(right.iterdir()):
             is_view = path.suffix.lower() in LISTED_SUFFIXES and path.name[0] != "."
             if is_view and path.stem not in stems:
-                yield _problem(path, "missing", "has no left view")
+                yield Problem(path=path, kind="missing", message="has no left view")
     for name, part in (("right", "right"), ("lidar_depth", "depth"), ("disp_occ", "disparity")):
         is_there = (folder / name).is_dir() and any((folder / name).iterdir())
         if is_there and not any(getattr(frame, part) for frame in frames):
             known = ", ".join((*LISTED_SUFFIXES, *(() if part == "right" else MAP_SUFFIXES)))
             message = f"holds no file of a frame's name in a format that is read: {known}"
-            yield _problem(folder / name, "missing", message)
+            yield Problem(path=folder / name, kind="missing", message=message)
 
 
 def _check_images(frame: Frame, *, with_decoding: bool) -> Iterator[Problem]:
@@ -117,7 +113,7 @@ def _check_images(frame: Frame, *, with_decoding: bool) -> Iterator[Problem]:
     images: list[Tensor] = []
     for path in (frame.left, frame.right):
         if path is None:
-            yield _problem(frame.left, "note", "has no right view")
+            yield Problem(path=frame.left, kind="note", message="has no right view")
             continue
         try:
             if with_decoding:
@@ -130,7 +126,7 @@ def _check_images(frame: Frame, *, with_decoding: bool) -> Iterator[Problem]:
             continue
         if size is not None and found != size:
             message = f"is {found[0]}x{found[1]}, but its left image is {size[0]}x{size[1]}"
-            yield _problem(path, "mismatch", message)
+            yield Problem(path=path, kind="mismatch", message=message)
         size = size or found
     rig, report = None, None
     if frame.right is not None and len(images) == 2 and images[0].shape == images[1].shape:
@@ -140,7 +136,9 @@ def _check_images(frame: Frame, *, with_decoding: bool) -> Iterator[Problem]:
         report = check_rectified(images[0], images[1], apart_px)
         if report.is_wrong or report.is_rectified is None:
             message = f"beside {frame.left.name}: {report.message}"
-            yield _problem(frame.right, "mismatch" if report.is_wrong else "note", message)
+            yield Problem(
+                path=frame.right, kind="mismatch" if report.is_wrong else "note", message=message
+            )
     yield from _check_measurements(frame)
     for path in (frame.scan, frame.depth, frame.disparity, frame.disparity_noc):
         if path is not None and size is not None:
@@ -152,22 +150,26 @@ def _check_measurements(frame: Frame) -> Iterator[Problem]:
     """Calibration and LiDAR points."""
     if frame.calibration is None:
         if frame.velodyne is None:
-            yield _problem(frame.left, "note", "has no calibration: disparity only, no metres")
+            yield Problem(
+                path=frame.left,
+                kind="note",
+                message="has no calibration: disparity only, no metres",
+            )
         else:
             message = "has no calibration, so its scan cannot be projected"
-            yield _problem(frame.left, "missing", message)
+            yield Problem(path=frame.left, kind="missing", message=message)
     else:
         try:
             frame_camera(frame)
             if frame.velodyne and kitti_calibration(frame).pixels_from_velodyne is None:
                 message = f"says nothing of the LiDAR, and {frame.velodyne.name} is there"
-                yield _problem(frame.calibration, "missing", message)
+                yield Problem(path=frame.calibration, kind="missing", message=message)
         except InputError as error:
             yield unreadable(frame.calibration, error)
     if frame.velodyne is not None:
         try:
             if not len(read_points_bin(frame.velodyne)):
-                yield _problem(frame.velodyne, "empty", "holds no LiDAR point")
+                yield Problem(path=frame.velodyne, kind="empty", message="holds no LiDAR point")
         except InputError as error:
             yield unreadable(frame.velodyne, error)
 
@@ -189,14 +191,14 @@ def _check_truth(
     height, width = truth.shape
     if (width, height) != size:
         message = f"is {width}x{height}, but its left image is {size[0]}x{size[1]}"
-        yield _problem(path, "mismatch", message)
+        yield Problem(path=path, kind="mismatch", message=message)
     if not bool(torch.isfinite(truth).any()):
-        yield _problem(path, "empty", "holds no value")
+        yield Problem(path=path, kind="empty", message="holds no value")
     largest = float(truth.nan_to_num(0.0).max())
     limit, unit = (_MAX_DEPTH_M, "m") if is_depth else (width, "px")
     if largest > limit:
         message = f"holds {largest:g} {unit}, beyond {limit} {unit}; is its unit 1/256?"
-        yield _problem(path, "mismatch", message)
+        yield Problem(path=path, kind="mismatch", message=message)
     if report is None or report.is_wrong or (width, height) != size:
         return
     if is_depth:
@@ -214,7 +216,7 @@ def _check_truth(
         if agreement is not None and agreement[0] >= max(_AGREE, best[0]):
             best, changed = agreement, f"; {words} it agrees with {agreement[0]:.0%}"
     message = f"{message}{changed}: is it of this pair, and in which unit?"
-    yield _problem(path, "mismatch", message)
+    yield Problem(path=path, kind="mismatch", message=message)
 
 
 def _agreement(disparity_px: Map, report: RectificationReport) -> tuple[float, int] | None:
@@ -252,11 +254,6 @@ class Duplicate:
     first: str  #: name of the frame in the first set
     second: str  #: name of the frame in the second set
     similarity: float  #: 1 for the same picture, about 0 for two streets
-
-
-def shrink(image: Float[Tensor, "c h w"], rows: int, columns: int) -> Float[Tensor, "c rows cols"]:
-    """Average an image over a grid of cells."""
-    return F.interpolate(image[None], (rows, columns), mode="area")[0]
 
 
 def find_duplicates(
@@ -319,14 +316,10 @@ def _fine_structure(dataset: Dataset, index: int) -> Float[Tensor, "zooms rows c
     for zoom in _ZOOMS:
         top, left = (round(side * (1 - 1 / zoom) / 2) for side in (height, width))
         middle = image[:, top : height - top, left : width - left]
-        parts.append(shrink(middle, _ROWS, _COLUMNS))
-    grey = torch.stack(parts)
-    detail = grey - _blur(grey)
-    return (detail / (_blur(detail**2).sqrt() + 0.01))[:, 0]
-
-
-def _blur(image: Float[Tensor, "n c h w"]) -> Float[Tensor, "n c h w"]:
-    return F.avg_pool2d(image, _BLUR, 1, _BLUR // 2, count_include_pad=False)
+        parts.append(F.interpolate(middle[None], (_ROWS, _COLUMNS), mode="area"))
+    grey, blur = torch.cat(parts), nn.AvgPool2d(_BLUR, 1, _BLUR // 2, count_include_pad=False)
+    detail = grey - blur(grey)
+    return (detail / (blur(detail**2).sqrt() + 0.01))[:, 0]
 
 
 def _unit(windows: Float[Tensor, "n h w"]) -> Float[Tensor, "n hw"]:

@@ -24,7 +24,7 @@ from depthpose.core.camera import (
     read_camera,
     read_rig,
 )
-from depthpose.core.camera.camera_file import Matrix, kitti_matrix, kitti_size, plain_facts
+from depthpose.core.camera.camera_file import Matrix, kitti_matrix, plain_facts
 from depthpose.core.camera.pinhole import (
     CameraFacts,
     Size,
@@ -124,7 +124,8 @@ def _projected_rig(
 ) -> tuple[StereoRig, Matrix]:
     """The rig of two projections, and that of the left camera."""
     left, right = (kitti_matrix(path, keys, name, (3, 4)) for name in names)
-    said = kitti_size(keys) or size
+    sides = keys.get("S_rect_02", [])  # of the rectified images
+    said = (int(sides[0]), int(sides[1])) if len(sides) == 2 else size
     if said != size:
         raise InputError(
             f"{path}: S_rect_02 says {said[0]}x{said[1]}, but the image is {size[0]}x{size[1]}. It "
@@ -286,7 +287,7 @@ def known_truths(frame: Frame) -> tuple[TruthKind, ...]:
     """Say which kinds of truth a frame has."""
     kinds: dict[TruthKind, bool] = {
         "scan": has_lidar(frame, "camera_z"),
-        "annotated": frame.depth is not None and not _is_plain(frame),
+        "annotated": frame.depth is not None and frame.depth != _drawn_scan(frame),
         "disparity": frame.disparity is not None,
     }
     return tuple(kind for kind, is_there in kinds.items() if is_there)
@@ -325,12 +326,9 @@ def lidar_truth(frame: Frame, depth: LidarDepth) -> Map:
 
 
 def _drawn_scan(frame: Frame) -> Path | None:
-    return frame.depth if _is_plain(frame) else frame.scan
-
-
-def _is_plain(frame: Frame) -> bool:
-    """Whether the depth of a frame is a LiDAR scan, as that of plain folders of pairs is."""
-    return frame.style in ("plain", "camera") and frame.scan is None
+    """Give the map of a LiDAR scan: the depth of a plain folder of pairs is one."""
+    is_plain = frame.style in ("plain", "camera") and frame.scan is None
+    return frame.depth if is_plain else frame.scan
 
 
 def check_map_size(path: Path, values: Shaped[Tensor, "*any h w"], size: tuple[int, int]) -> None:

@@ -184,7 +184,7 @@ def _raw(folder: Path) -> Iterable[Frame]:
     """KITTI raw: a root of dates, a date or a drive; its depth-prediction set inside or beside."""
     itself = [folder] if folder.name.endswith("_sync") else []
     for drive in sorted([*itself, *folder.glob("*_sync"), *folder.glob("*/*_sync")]):
-        date, lefts = drive.parent, _images(drive / "image_02/data")
+        date, lefts = drive.parent, _listed(drive / "image_02/data")
         is_calibrated = (date / "calib_cam_to_cam.txt").exists()
         yield from _frames(
             lefts,
@@ -218,7 +218,7 @@ def _depth_selection(folder: Path) -> Iterable[Frame]:
         return
     lenses = _by_stem(home / "intrinsics", (".txt",))
     scans, depth = _by_stem(home / "velodyne_raw"), _by_stem(home / "groundtruth_depth")
-    for left in _images(home / "image"):
+    for left in _listed(home / "image"):
         yield Frame(
             name=left.stem,
             left=left,
@@ -236,7 +236,7 @@ def _odometry(folder: Path) -> Iterable[Frame]:
         if not (home / "calib.txt").is_file():
             continue
         is_grey = not (home / "image_2").is_dir()
-        lefts = _images(home / ("image_0" if is_grey else "image_2"))
+        lefts = _listed(home / ("image_0" if is_grey else "image_2"))
         yield from _frames(
             lefts,
             "grey" if is_grey else "object",
@@ -250,7 +250,7 @@ def _odometry(folder: Path) -> Iterable[Frame]:
 def _benchmark(folder: Path, one: str, other: str, ending: str) -> Iterable[Frame]:
     """KITTI object, 2012 or 2015: of the stereo sets the frames that have truth, NNNNNN_10."""
     home = folder / "training" if (folder / "training" / one).is_dir() else folder
-    lefts = _images(home / one)
+    lefts = _listed(home / one)
     # Of the stereo sets the testing folder too.
     lefts = [left for left in lefts if left.stem.endswith("_10")] or lefts
     texts = _by_stem(home / "calib_cam_to_cam", (".txt",)) | _by_stem(home / "calib", (".txt",))
@@ -286,7 +286,7 @@ def _middlebury(folder: Path) -> Iterable[Frame]:
 def _pairs(folder: Path) -> Iterable[Frame]:
     cameras = _by_stem(folder, (".json", ".yaml", ".yml"))
     camera, text = cameras.get("camera"), folder / "calib.txt"
-    lefts, right = _images(folder / "left"), _by_stem(folder / "right")
+    lefts, right = _listed(folder / "left"), _by_stem(folder / "right")
     if right and not any(left.stem in right for left in lefts):
         with suppress(InputError):  # left_0004 and right_0004
             order = find_partners([left.stem for left in lefts], list(right), str(folder))
@@ -324,10 +324,6 @@ LAYOUTS = {
 """Layouts of folders, tried in this order: a new one is a function and one entry here."""
 
 
-def _images(folder: Path) -> list[Path]:
-    return _listed(folder, LISTED_SUFFIXES)
-
-
 def _by_stem(
     folder: Path, suffixes: tuple[str, ...] = (*LISTED_SUFFIXES, *files.MAP_SUFFIXES)
 ) -> dict[str, Path]:
@@ -336,7 +332,7 @@ def _by_stem(
     return {path.stem: path for path in reversed(found)}
 
 
-def _listed(folder: Path, suffixes: tuple[str, ...]) -> list[Path]:
+def _listed(folder: Path, suffixes: tuple[str, ...] = LISTED_SUFFIXES) -> list[Path]:
     if not folder.is_dir():
         return []
     found = (path for path in folder.iterdir() if not path.name.startswith("."))

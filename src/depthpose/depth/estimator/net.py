@@ -21,7 +21,6 @@ from tqdm import tqdm
 from depthpose.core.camera import (
     AnyCamera,
     AnyLens,
-    Camera,
     StereoRig,
     camera_of,
     check_image_matches_camera,
@@ -113,32 +112,19 @@ def exif_focal_px(image: object, name: str) -> float | None:
     return found[0]
 
 
-def refuse_unrectified(pair: StereoInput) -> str:
+def refuse_unrectified(pair: StereoInput, *, with_check: bool = True) -> str:
     """Raise where two images are no pair, are swapped, or their rows do not correspond.
+
+    Args:
+        pair: the images, and their rig where it is known.
+        with_check: look at what they show; else only whether they can be matched at all.
 
     Returns:
         A warning where this cannot be told, else nothing.
 
     Raises:
-        InputError: with what was measured and what to do.
-    """
-    right, camera = usable_right(pair), pair.camera
-    apart_px = camera.cx_right_minus_left_px if isinstance(camera, StereoRig) else 0.0
-    report = check_rectified(pair.left, right, apart_px)
-    if report.is_wrong:
-        raise InputError(
-            f"{pair.name}: {report.message} (--no-check, in Python with_check=False, matches them "
-            "all the same.)"
-        )
-    return report.message if report.is_rectified is None else ""
-
-
-def usable_right(pair: StereoInput) -> View:
-    """Give the right view of a pair, and refuse what cannot be matched.
-
-    Raises:
-        InputError: there is none, its size is another, the camera has no baseline, or an image
-            does not lie in [0, 1].
+        InputError: with what was measured and what to do; there is no right view, its size is
+            another, the camera has no baseline, or an image does not lie in [0, 1].
     """
     if pair.right is None:
         raise InputError(f"{pair.name}: there is no right image; give right=.")
@@ -158,7 +144,16 @@ def usable_right(pair: StereoInput) -> View:
                 f"{pair.name}: the camera has no baseline, so disparity cannot become metres. Add "
                 '"baseline_m" (the distance between the two cameras in metres) to its file.'
             )
-    return pair.right
+    if not with_check:
+        return ""
+    apart_px = 0.0 if pair.camera is None else pair.camera.cx_right_minus_left_px
+    report = check_rectified(pair.left, pair.right, apart_px)
+    if report.is_wrong:
+        raise InputError(
+            f"{pair.name}: {report.message} (--no-check, in Python with_check=False, matches them "
+            "all the same.)"
+        )
+    return report.message if report.is_rectified is None else ""
 
 
 DEFAULT = "default"
@@ -355,7 +350,12 @@ class FakestereoNet:
     @torch.no_grad()
     @own_arithmetic()
     def estimate_pair(self, pair: StereoInput, *, with_check: bool = True) -> DepthEstimate:
-        """Estimate depth of one input whose images are read already, as :meth:`estimate` does."""
+        """Estimate depth of one input whose images are read already, as :meth:`estimate` does.
+
+        Views of a rig with principal points apart are moved by their difference: what is farthest
+        then has a disparity of 0 px, where matchers search, and what is nearest that of a rig whose
+        principal points agree. The estimate has the disparities of the views as given.
+        """
         if pair.right is None:
             return self._estimate_alone([pair], self.virtual_sizes(pair))[0]
         if self.matcher is None:
@@ -365,12 +365,37 @@ class FakestereoNet:
                 "weights pack G --matcher S --trained-on DATA --licence L --out W' makes one file "
                 "of both."
             )
-        warning = refuse_unrectified(pair) if with_check else ""
-        if not with_check:
-            usable_right(pair)
-        assert pair.right is not None, "checked before"
+        warning = refuse_unrectified(pair, with_check=with_check)
+        left, right, rig, width = pair.left, pair.right, pair.camera, pair.left.shape[2]
+        apart_px = rig.cx_right_minus_left_px if isinstance(rig, StereoRig) else 0.0
+        columns = math.ceil(apart_px)
+        added = max(columns, 0)
+        if isinstance(rig, StereoRig) and columns != 0:
+            if abs(columns) >= width:
+                raise InputError(
+                    f"cx_right_minus_left_px is {apart_px:g}, and the images are {width} px wide: "
+                    "the two views share nothing that is far away. Take both principal points from "
+                    "one calibration of images of this size."
+                )
+            K = rig.K.clone()
+            K[0, 2] += added
+            rig = replace(rig, width=width + added, K=K, cx_right_minus_left_px=apart_px - columns)
+            # New columns repeat the border; those cut off the right view show nothing of the left.
+            left = F.pad(left[None], (added, 0, 0, 0), mode="replicate")[0]
+            right = F.pad(right[None], (added - columns, added, 0, 0), mode="replicate")
+            right = right[0, ..., : width + added]
         with refused_memory(pair.name):
-            (match,) = self._match([(pair.left, pair.right)], pair.camera)
+            if isinstance(self.matcher, CameraMatcher):
+                (match,) = self.matcher.match_many([(left, right)], rig)
+            else:
+                match = self.matcher.match(left, right)
+            if columns != 0:
+                match = disparity.changed_match(match, lambda values: values[:, added:])
+                match = replace(match, disparity_px=match.disparity_px - columns)
+            if columns != 0 and match.confidence is not None:
+                # The right view shows none of the first columns, even at infinity.
+                is_outside = torch.arange(width, device=match.confidence.device) < -columns
+                match = replace(match, confidence=match.confidence.where(~is_outside, 0.0))
             return disparity.from_pair(pair, match, warning)
 
     @own_arithmetic()
@@ -457,7 +482,7 @@ class FakestereoNet:
             for sizes, group in groupby(sized, itemgetter(1)):
                 alike = [one for one, _ in group]
                 if sizes is None:
-                    found += [self.estimate_pair(pair, with_check=with_check) for pair in alike]
+                    found += map(partial(self.estimate_pair, with_check=with_check), alike)
                 else:
                     found += self._estimate_alone(alike, sizes)
         except InputError as error:
@@ -512,7 +537,12 @@ class FakestereoNet:
             sky, confidence = views.is_sky, views.confidence
             if rig.answer == "matched":
                 camera = camera_of(rig.virtual_focal_px, (left.shape[3], left.shape[2]))
-                matches = self._match(list(zip(left, views.right, strict=True)), camera)
+                pairs = list(zip(left, views.right, strict=True))
+                if isinstance(self.matcher, CameraMatcher):
+                    matches = self.matcher.match_many(pairs, camera)
+                else:
+                    assert self.matcher is not None, "__init__ checked it"
+                    matches = [self.matcher.match(*pair) for pair in pairs]
             else:
                 assert views.disparity_px is not None, "it has an answer of its own"
                 assert confidence is not None
@@ -542,51 +572,3 @@ class FakestereoNet:
                     )
                 estimates[n] = replace(estimate, image_confidence=sure, warning=said)
         return estimates
-
-    def _match(self, pairs: list[tuple[Tensor, Tensor]], camera: Camera | None) -> list[Match]:
-        """Match pairs; with principal points apart, after views were moved by their difference.
-
-        What is farthest then has a disparity of 0 px, where matchers search, and what is nearest
-        that of a rig whose principal points agree. Disparities of the views as given are returned.
-        Where the right view shows nothing of the left one, the confidence is 0.
-        """
-        assert self.matcher is not None, "checked before"
-        rig = camera if isinstance(camera, StereoRig) else None
-        apart_px, width = 0.0 if rig is None else rig.cx_right_minus_left_px, pairs[0][0].shape[2]
-        columns = math.ceil(apart_px)
-        added = max(columns, 0)
-        if rig is not None and columns != 0:
-            if abs(columns) >= width:
-                raise InputError(
-                    f"cx_right_minus_left_px is {apart_px:g}, and the images are {width} px wide: "
-                    "the two views share nothing that is far away. Take both principal points from "
-                    "one calibration of images of this size."
-                )
-            K = rig.K.clone()
-            K[0, 2] += added
-            apart_px -= columns
-            camera = replace(rig, width=width + added, K=K, cx_right_minus_left_px=apart_px)
-            # New columns repeat the border; those cut off the right view show nothing of the left.
-            repeat = partial(F.pad, mode="replicate")
-            moved = (
-                (
-                    repeat(left[None], (added, 0, 0, 0)),
-                    repeat(right[None], (added - columns, added, 0, 0)),
-                )
-                for left, right in pairs
-            )
-            pairs = [(left[0], right[0, ..., : width + added]) for left, right in moved]
-        if isinstance(self.matcher, CameraMatcher):
-            found = self.matcher.match_many(pairs, camera)
-        else:
-            found = [self.matcher.match(*pair) for pair in pairs]
-        if columns == 0:
-            return found
-        cut = [disparity.changed_match(wide, lambda values: values[:, added:]) for wide in found]
-        # The right view shows none of the first columns, even at infinity.
-        is_outside = torch.arange(width, device=cut[0].disparity_px.device) < -columns
-        sure = (None if m.confidence is None else m.confidence.where(~is_outside, 0.0) for m in cut)
-        return [
-            replace(match, disparity_px=match.disparity_px - columns, confidence=confidence)
-            for match, confidence in zip(cut, sure, strict=True)
-        ]

@@ -4,6 +4,7 @@ import os
 import warnings
 from base64 import b64decode
 from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass
 from io import BytesIO
 from itertools import islice
 from pathlib import Path
@@ -32,17 +33,12 @@ _PHONE = 0.75
 """Focal length of a phone's main camera, in widths of the picture."""
 
 
+@dataclass(eq=False)
 class DepthPipeline:
-    """Pictures to ``{"predicted_depth", "depth"}``.
+    """Pictures to ``{"predicted_depth", "depth"}``."""
 
-    Args:
-        net: estimates images.
-        batch_size: pictures of one size in one call of its networks.
-    """
-
-    def __init__(self, net: FakestereoNet, batch_size: int = 1) -> None:
-        self.net = net
-        self.batch_size = batch_size
+    net: FakestereoNet  #: estimates images
+    batch_size: int = 1  #: pictures of one size in one call of its networks
 
     def __call__(
         self,

@@ -131,41 +131,35 @@ def folded_weight(layer: nn.Module) -> tuple[Tensor, Tensor]:
     return (conv.weight.double() * gain.view(shape)).detach(), bias.detach()
 
 
-def fold_features(features: ModuleT, like: Tensor) -> ModuleT:
-    """Fold every batch norm after a 2D convolution, in place, and bring all to ``like``'s type."""
-    for parent in list(features.modules()):
-        for name, layer in list(parent.named_children()):
-            if isinstance(getattr(layer, "norm", None), nn.BatchNorm2d):
-                weight, bias = folded_weight(layer)
-                conv = cast("nn.Conv2d", layer.conv)
-                conv.weight.data = weight
-                conv.bias = nn.Parameter(bias)
-                layer.norm = nn.Identity()
-                if isinstance(layer, ConvNorm):  # which then is its convolution
-                    setattr(parent, name, conv)
-    for parameter in features.parameters():
-        values = parameter.data.to(like)
-        order = torch.channels_last if values.ndim == 4 else torch.contiguous_format
-        parameter.data = values.contiguous(memory_format=order)
-        parameter.requires_grad_(False)
-    return features
+def fold(network: ModuleT, like: Tensor) -> ModuleT:
+    """Fold every batch norm into the convolution before it, in place, in the type of ``like``.
 
-
-def fold_volumes(module: ModuleT, like: Tensor) -> ModuleT:
-    """Fold every batch norm after a 3D convolution, in place; oneDNN is called by name after it.
-
-    So it is in 3D convolutions without a norm.
+    In 3D, with a norm or without, convolutions become :class:`VolumeConv`; those that are one
+    already stay as they are.
     """
-    for parent in list(module.modules()):
+    for parent in list(network.modules()):
         for name, layer in list(parent.named_children()):
-            if isinstance(layer, ConvNorm) and isinstance(layer.norm, nn.BatchNorm3d):
-                setattr(
-                    parent, name, VolumeConv(cast("Conv", layer.conv), *folded_weight(layer), like)
-                )
+            norm = getattr(layer, "norm", None)
+            if isinstance(norm, nn.BatchNorm3d):
+                conv = VolumeConv(cast("Conv", layer.conv), *folded_weight(layer), like)
+                setattr(parent, name, conv)
             elif isinstance(layer, nn.Conv3d) and not isinstance(parent, ConvNorm):
                 bias = torch.zeros(layer.out_channels) if layer.bias is None else layer.bias
                 setattr(parent, name, VolumeConv(layer, layer.weight, bias, like))
-    return module
+            elif isinstance(norm, nn.BatchNorm2d):
+                conv = cast("nn.Conv2d", layer.conv)
+                weight, bias = folded_weight(layer)
+                conv.weight.data, conv.bias = weight, nn.Parameter(bias)
+                layer.norm = nn.Identity()
+                if isinstance(layer, ConvNorm):  # which then is its convolution
+                    setattr(parent, name, conv)
+    for module in network.modules():
+        for parameter in () if isinstance(module, VolumeConv) else module.parameters(recurse=False):
+            values = parameter.data.to(like)
+            order = torch.channels_last if values.ndim == 4 else torch.contiguous_format
+            parameter.data = values.contiguous(memory_format=order)
+            parameter.requires_grad_(False)
+    return network
 
 
 class VolumeConv(nn.Module):
@@ -175,31 +169,25 @@ class VolumeConv(nn.Module):
         super().__init__()
         self.is_transposed = isinstance(conv, nn.ConvTranspose3d)
         self.stride = cast("Conv", conv).stride[0]
-        weight = weight.detach().to(like).contiguous(memory_format=torch.channels_last_3d)
+        weight = weight.detach().to(like).contiguous()
         self.weight = nn.Parameter(weight, requires_grad=False)
         self.bias = nn.Parameter(bias.detach().to(like), requires_grad=False)
+        self.with_onednn = has_onednn_operators()
 
     def forward(self, volume: Volume) -> Volume:
         """Convolve a volume, in the type of the weights."""
         volume = volume.to(self.weight.dtype)
         is_usable = volume.device.type == "cpu" and volume.dtype in (torch.float32, torch.bfloat16)
+        given, ones, steps = (volume, self.weight, self.bias), (1, 1, 1), (self.stride,) * 3
         # oneDNN is called by name: PyTorch's own choice takes a slow path for few rows.
-        if is_usable and has_onednn_operators():
-            return _by_onednn(
-                volume, self.weight, self.bias, None if self.is_transposed else self.stride
-            )
+        if is_usable and self.with_onednn and self.is_transposed:
+            more = (ones, ones, steps, ones, 1, "none", [], "")
+            return torch.ops.mkldnn._convolution_transpose_pointwise(*given, *more)
+        if is_usable and self.with_onednn:
+            return torch.mkldnn_convolution(*given, ones, steps, ones, 1)
         if self.is_transposed:
-            return F.conv_transpose3d(volume, self.weight, self.bias, 2, 1, 1)
-        return F.conv3d(volume, self.weight, self.bias, self.stride, 1)
-
-
-def _by_onednn(volume: Tensor, weight: Tensor, bias: Tensor, stride: int | None) -> Tensor:
-    """Convolve with a stride; transposed, which doubles the size, where it is None."""
-    ones, steps = (1, 1, 1), (stride or 2,) * 3
-    if stride is not None:
-        return torch.mkldnn_convolution(volume, weight, bias, ones, steps, ones, 1)
-    args = (volume, weight, bias, ones, ones, steps, ones, 1, "none", [], "")
-    return torch.ops.mkldnn._convolution_transpose_pointwise(*args)
+            return F.conv_transpose3d(*given, self.stride, 1, 1)
+        return F.conv3d(*given, self.stride, 1)
 
 
 @cache
@@ -210,15 +198,18 @@ def has_onednn_operators() -> bool:
     """
     if not torch.backends.mkldnn.is_available():
         return False
-    volume, weight, bias = torch.ones(1, 2, 4, 4, 4), torch.ones(2, 2, 3, 3, 3), torch.ones(2)
+    like = torch.empty(0, dtype=torch.float32, device="cpu")
+    given = like.new_ones(1, 2, 4, 4, 4), like.new_ones(2, 2, 3, 3, 3), like.new_ones(2)
+    ones, twos = (1, 1, 1), (2, 2, 2)
+    more = (ones, ones, twos, ones, 1, "none", [], "")
     try:
         with torch.no_grad():
-            convolved = _by_onednn(volume, weight, bias, 1)
-            transposed = _by_onednn(volume, weight, bias, None)
+            convolved = torch.mkldnn_convolution(*given, ones, ones, ones, 1)
+            transposed = torch.ops.mkldnn._convolution_transpose_pointwise(*given, *more)
     except (AttributeError, RuntimeError, TypeError):
         return False
     both = (
-        (convolved, F.conv3d(volume, weight, bias, 1, 1)),
-        (transposed, F.conv_transpose3d(volume, weight, bias, 2, 1, 1)),
+        (convolved, F.conv3d(*given, 1, 1)),
+        (transposed, F.conv_transpose3d(*given, 2, 1, 1)),
     )
     return all(one.shape == other.shape and torch.allclose(one, other) for one, other in both)

@@ -289,17 +289,17 @@ class LightFeatures(nn.Module):
 
 
 def correlation_volume(
-    left: Float[Tensor, "b c h w"], right: Float[Tensor, "b c h w"], bins: int, groups: int
-) -> Float[Tensor, "b {groups} {bins} h w"]:
-    """Give the cosine of each group of features of ``left[y, x]`` and ``right[y, x - d]``.
+    left: Float[Tensor, "b g k h w"], right: Float[Tensor, "b g k h w"], bins: int
+) -> Float[Tensor, "b g {bins} h w"]:
+    """Give the cosine of each of :func:`unit_groups` of ``left[y, x]`` and ``right[y, x - d]``.
 
     Zero where the right pixel falls outside the image.
     """
-    width = left.shape[-1]
-    left, right = unit_groups(left, groups), F.pad(unit_groups(right, groups), (bins - 1, 0))
-    firsts = (bins - 1 - d for d in range(bins))
-    # Groups last, as convolutions of volumes want them: no copy is made.
-    cosines = [(left * right[..., k : k + width]).sum(2).permute(0, 2, 3, 1) for k in firsts]
+    width, padded, cosines = left.shape[-1], F.pad(right, (bins - 1, 0)), []
+    for first in reversed(range(bins)):
+        # Groups last, as convolutions of volumes want them: no copy is made.
+        products = left * padded[..., first : first + width]
+        cosines.append(products.sum(2).permute(0, 2, 3, 1))
     return torch.stack(cosines, 1).permute(0, 4, 1, 2, 3)
 
 
@@ -308,7 +308,7 @@ class Aggregation(nn.Module):
 
     def __init__(self, config: LightConfig, guide_widths: tuple[int, ...]) -> None:
         super().__init__()
-        self.config, v = config, config.volume_widths
+        self.groups, v = config.groups, config.volume_widths
         self.first = ConvNorm(nn.Conv3d, config.groups, v[0])
         steps = list(pairwise(v))
         self.down = nn.ModuleList(ConvNorm(nn.Conv3d, a, b, stride=2) for a, b in steps)
@@ -338,7 +338,8 @@ class Aggregation(nn.Module):
         product = torch.Tensor.mul if torch.is_grad_enabled() else torch.Tensor.mul_
 
         def begin(left: Features, right: Features, guide: Volume) -> Volume:
-            volume = correlation_volume(left, right, bins, self.config.groups)
+            near, far = unit_groups(left, self.groups), unit_groups(right, self.groups)
+            volume = correlation_volume(near, far, bins)
             volume = volume.contiguous(memory_format=torch.channels_last_3d)
             return product(self.first(volume).relu_(), guide)
 
@@ -385,12 +386,12 @@ class LightStereo(StereoNetwork):
         self.sky_head = SkyHead(self.features.widths) if self.config.with_sky else None
 
     @property
-    def encoder(self) -> LiteEncoder:
+    def encoder(self) -> LiteEncoder:  # pyright: ignore[reportIncompatibleVariableOverride]
         """Of ImageNet, in the features."""
         return self.features.encoder
 
     @property
-    def sky(self) -> SkyHead | None:
+    def sky(self) -> SkyHead | None:  # pyright: ignore[reportIncompatibleVariableOverride]
         """The class of the sky."""
         return self.sky_head
 
@@ -500,7 +501,7 @@ class LightMatcher(NetworkMatcher):
         """Fold batch norm, and compute some rows at a time."""
         # A GPU has the memory, and is busy with whole volumes alone.
         network.rows = ROWS if self.device.type == "cpu" else None
-        return layers.fold_features(layers.fold_volumes(network, like), like)
+        return layers.fold(network, like)
 
     def run(self, left: Views, right: Views, network: LightConfig) -> list[Match]:
         """Match normalised pairs whose sides suit the network."""

@@ -8,6 +8,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from copy import deepcopy
 from dataclasses import replace
+from operator import itemgetter
 from typing import Any, ClassVar, Protocol, runtime_checkable
 
 import numpy as np
@@ -238,20 +239,13 @@ class StereoNetwork(nn.Module):
     """A normalised pair to disparity maps for the losses; the last is the output."""
 
     config: Any  #: its sizes and conventions, a :class:`~depthpose.depth.config.NetworkConfig`
+    #: the part that may begin with weights of ImageNet, which trains more slowly
+    encoder: LiteEncoder | None = None
+    sky: nn.Module | None = None  #: the class of the sky, which may be trained alone
 
     def forward_with_sky(self, left: Views, right: Views) -> tuple[tuple[Maps, ...], Maps | None]:
         """Give the disparity maps [px], and P(sky) where the network has that class."""
         return self(left, right), None
-
-    @property
-    def encoder(self) -> LiteEncoder | None:
-        """The part that may begin with weights of ImageNet, which trains more slowly."""
-        return None
-
-    @property
-    def sky(self) -> nn.Module | None:
-        """The class of the sky, which may be trained alone."""
-        return None
 
 
 class NetworkMatcher(ABC):
@@ -330,20 +324,40 @@ class NetworkMatcher(ABC):
             steps = math.ceil(round(trained.max_disparity_px * larger, 3) / trained.step_px)
             network = replace(trained, max_disparity_px=steps * trained.step_px)
             views = [tuple(disparity.resize_image(view, *size) for view in pair) for pair in pairs]
-        is_bounded = self.config.max_memory_bytes is not None
-        together = not is_bounded and len({left.shape for left, _ in views}) == 1
+        most = self.config.max_memory_bytes
+        together = most is None and len({left.shape for left, _ in views}) == 1
         matches: list[Match] = []
         for group in [views] if together else [[pair] for pair in views]:
             left, right = (
                 normalise(torch.stack(side).to(self.device, torch.float32))
                 for side in zip(*group, strict=True)
             )
-            found = self._match_padded(left, right, network)
+            sides = [(left, right)]
             if self.config.with_left_right_check:
-                mirrored = self._match_padded(right.flip(-1), left.flip(-1), network)
-                other_px = [match.disparity_px.flip(-1) for match in mirrored]
-                found = list(map(lower_where_disagreeing, found, other_px))
-            matches += found
+                sides.append((right.flip(-1), left.flip(-1)))
+            h, w = left.shape[-2:]
+            crop = itemgetter((slice(-h, None), slice(w)))  # values[-h:, :w]
+            answers: list[list[Match]] = []
+            for side in sides:
+                padded = [pad_top_right(view, network) for view in side]
+                height, width = padded[0].shape[-2:]
+                rows = self._network.rows or height // 4
+                least = 0
+                if most is not None:
+                    least = self.activation_bytes(network, height, width, self.dtype, rows)
+                if most is not None and least > most:  # volumes are held whole
+                    quick = "" if network.work_focal_px is None else " or speed='quick'"
+                    raise InputError(
+                        f"max_memory_bytes={most} is too small for images of {height}x{width} "
+                        f"(padded): this matcher takes {least}; allow that, take precision='bf16'"
+                        f"{quick}, or match the pair at a smaller size"
+                    )
+                found = self.run(padded[0], padded[1], network)
+                answers.append([disparity.changed_match(match, crop) for match in found])
+            if len(answers) == 2:
+                other_px = (match.disparity_px.flip(-1) for match in answers[1])
+                answers[0] = list(map(lower_where_disagreeing, answers[0], other_px))
+            matches += answers[0]
         home = pairs[0][0].device
         return [
             disparity.resized_match(
@@ -367,25 +381,6 @@ class NetworkMatcher(ABC):
             return trained_px
         share = math.sqrt(self.fine_pixels / (camera.height * camera.width))
         return max(trained_px, float(camera.K[0, 0]) * min(share, self.most_enlarged))
-
-    def _match_padded(self, left: Views, right: Views, network: NetworkConfig) -> list[Match]:
-        """Match normalised pairs of any size: padded, and cropped back."""
-        h, w = left.shape[-2:]
-        left, right = (pad_top_right(views, network) for views in (left, right))
-        height, width = left.shape[-2:]
-        most = self.config.max_memory_bytes
-        if most is not None:  # volumes are held whole, and cannot be traded
-            rows = self._network.rows or height // 4
-            least = self.activation_bytes(network, height, width, self.dtype, rows)
-            if least > most:
-                quick = "" if network.work_focal_px is None else " or speed='quick'"
-                raise InputError(
-                    f"max_memory_bytes={most} is too small for images of {height}x{width} "
-                    f"(padded): this matcher takes {least}; allow that, take precision='bf16'"
-                    f"{quick}, or match the pair at a smaller size"
-                )
-        matches = self.run(left, right, network)
-        return [disparity.changed_match(match, lambda values: values[-h:, :w]) for match in matches]
 
 
 def normalise(image: Float[Tensor, "*batch 3 h w"]) -> Float[Tensor, "*batch 3 h w"]:

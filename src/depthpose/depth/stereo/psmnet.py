@@ -4,6 +4,7 @@ The features of one view come first: residual layers and a spatial pyramid, at 1
 """
 
 import re
+from collections import OrderedDict
 from collections.abc import Mapping
 from pathlib import Path
 from typing import cast
@@ -156,17 +157,14 @@ class Hourglass(nn.Module):
         return down, up.add_(down if first is None else first).relu_()
 
 
-class Head(nn.Module):
+class Head(nn.Sequential):
     """Volume of features to one cost a voxel; a larger cost means a likelier match."""
 
     def __init__(self, c: int) -> None:
-        super().__init__()
-        self.hidden = ConvNorm(nn.Conv3d, c, c)
-        self.cost = nn.Conv3d(c, 1, 3, 1, 1, bias=False)
-
-    def forward(self, x: Volume) -> Volume:
-        """Score each voxel."""
-        return self.cost(self.hidden(x).relu_())
+        parts: OrderedDict[str, nn.Module] = OrderedDict(hidden=ConvNorm(nn.Conv3d, c, c))
+        parts["relu"] = nn.ReLU(inplace=True)
+        parts["cost"] = nn.Conv3d(c, 1, 3, 1, 1, bias=False)
+        super().__init__(parts)
 
 
 def concatenation_volume(
@@ -218,7 +216,10 @@ class PSMNet(StereoNetwork):
         self.dres1 = nn.ModuleList([ConvNorm(nn.Conv3d, c, c), ConvNorm(nn.Conv3d, c, c)])
         self.hourglasses = nn.ModuleList([Hourglass(c) for _ in range(3)])
         self.heads = nn.ModuleList([Head(c) for _ in range(3)])
-        self.apply(_initialise)
+        for module in self.modules():  # as the authors did: deconvolutions keep PyTorch's default
+            if isinstance(module, nn.Conv2d | nn.Conv3d):
+                taps = module.weight[0, 0].numel()
+                nn.init.normal_(module.weight, 0, (2 / (taps * module.out_channels)) ** 0.5)
 
     def forward(self, left: Views, right: Views) -> tuple[Maps, ...]:
         """Match the pair.
@@ -284,13 +285,6 @@ class PSMNet(StereoNetwork):
         return cast("tuple[Volume, Volume, Volume]", tuple(costs))
 
 
-def _initialise(module: nn.Module) -> None:
-    """Draw weights as the authors did: deconvolutions keep PyTorch's default."""
-    if isinstance(module, nn.Conv2d | nn.Conv3d):
-        taps = module.weight[0, 0].numel()
-        nn.init.normal_(module.weight, 0, (2 / (taps * module.out_channels)) ** 0.5)
-
-
 ROWS = 32
 """Rows at quarter size that a matcher computes at a time."""
 
@@ -338,10 +332,8 @@ class PSMNetMatcher(NetworkMatcher):
             # In float32 at least: 8 bits would round the expectation to whole pixels.
             cost, wide = cast("nn.Conv3d", head.cost), torch.empty(0, device=self.device)
             head.cost = layers.VolumeConv(cost, cost.weight, torch.zeros(1), wide)
-        layers.fold_volumes(network, like)
-        layers.fold_features(network.features, like)
         network.rows = ROWS
-        return network
+        return layers.fold(network, like)
 
     def run(self, left: Views, right: Views, network: PSMNetConfig) -> list[Match]:
         """Match normalised pairs whose sides suit the network."""

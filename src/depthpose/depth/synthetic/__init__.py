@@ -1,8 +1,8 @@
 """Synthetic street scenes with exact disparity: training data that costs nothing."""
 
+from depthpose.depth.synthetic.dataset import CAMERA_FROM_VELODYNE as CAMERA_FROM_VELODYNE
 from depthpose.depth.synthetic.dataset import StreetFrame as StreetFrame
 from depthpose.depth.synthetic.dataset import Streets as Streets
-from depthpose.depth.synthetic.dataset import camera_from_velodyne as camera_from_velodyne
 from depthpose.depth.synthetic.dataset import draw_scene as draw_scene
 from depthpose.depth.synthetic.dataset import draw_street as draw_street
 from depthpose.depth.synthetic.scene import StreetScene as StreetScene

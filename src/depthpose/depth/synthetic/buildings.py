@@ -40,11 +40,6 @@ class Plot(NamedTuple):
     height_m: float  # of the walls
     ground_m: Number  # y of the ground
 
-    @property
-    def top_m(self) -> Number:
-        """Y of the walls' top."""
-        return self.ground_m - self.height_m
-
 
 def add_house(b: MeshBuilder, plot: Plot, *, with_details: bool) -> None:
     """Add one house: its walls, of which the back and one end have no windows, and a roof."""
@@ -81,7 +76,7 @@ def add_house(b: MeshBuilder, plot: Plot, *, with_details: bool) -> None:
     if b.rng.random() < 0.7:
         _add_gable_roof(b, plot, style)
     else:
-        top, middle = plot.top_m, plot.x_m + plot.side * plot.depth_m / 2
+        top, middle = plot.ground_m - plot.height_m, plot.x_m + plot.side * plot.depth_m / 2
         tar, z = Surface("concrete", (0.3, 0.3, 0.3), 3.0), (plot.start_m + plot.stop_m) / 2
         b.box((middle, top - 0.1, z), (plot.depth_m + 0.4, 0.35, length + 0.4), tar)
         if b.rng.random() < 0.5:
@@ -162,7 +157,7 @@ def _add_gable_roof(b: MeshBuilder, plot: Plot, style: Style) -> None:
     """Two slopes over the eaves, the ridge along the street, and the walls' triangles below."""
     rng, start, stop, side = b.rng, plot.start_m, plot.stop_m, plot.side
     rise, over = rng.uniform(1.8, 4.2), rng.uniform(0.2, 0.5)
-    half, top = plot.depth_m / 2, plot.top_m
+    half, top = plot.depth_m / 2, plot.ground_m - plot.height_m
     ridge_x = plot.x_m + side * half
     slate = Surface("roof", _ROOFS[rng.integers(len(_ROOFS))], 2.4, int(rng.integers(3)))
     slope = np.hypot(half + over, rise)
@@ -198,7 +193,7 @@ def _add_trim(b: MeshBuilder, plot: Plot, style: Style) -> None:
     middle, length = (start + stop) / 2, stop - start
     plinth = Surface("stone", (0.2, 0.19, 0.18), 2.0)
     b.box((x, y - 0.25, middle), (0.12, 0.6, length), plinth)
-    foot, head = ((x - side * 0.07, at, start + 0.3) for at in (y, plot.top_m))
+    foot, head = ((x - side * 0.07, at, start + 0.3) for at in (y, y - plot.height_m))
     b.tube(foot, head, 0.05, Surface("metal", (0.2, 0.18, 0.15)))
     door_z = rng.uniform(start + 1, stop - 1.5)
     door = Surface("wood", tuple(rng.uniform(0.03, 0.35, 3)), 1.0, int(rng.integers(2)))

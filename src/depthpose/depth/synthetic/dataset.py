@@ -51,12 +51,6 @@ class Sight:
     edges: Float64[Tensor, "n 3 3"]  # edge functions of all triangles; see ``core.render``
     volume: Float64[Tensor, " n"]  # what they are divided by
 
-    def rays(self, pixels: Float64[Tensor, "n 2"]) -> Vectors:
-        """Directions of pixels, with z = 1."""
-        (a, b, c), (_, d, e), _ = self.K.inverse().tolist()
-        u, v = pixels.unbind(1)
-        return torch.stack([a * u + b * v + c, d * v + e, torch.ones_like(u)], 1).float()
-
 
 def view_from(
     stage: Stage, K: Float64[Tensor, "3 3"], size: tuple[int, int], eye: Float[Tensor, "3"]
@@ -137,18 +131,21 @@ def draw_light(stage: Stage, sight: Sight) -> Float[Tensor, "h w 3"]:
     is_edge = is_edge.flatten()
     light = torch.zeros(height * width, 3)
     whole, mixed = (~is_edge).nonzero()[:, 0], is_edge.nonzero()[:, 0]
-    light[whole] = _light(stage, sight, _centres(whole, width), _seen_at(sight, whole))
+    assert raster.barycentric is not None
+    seen = [v.flatten(0, 1) for v in (raster.primitive, raster.barycentric, raster.depth_m)]
+    nearest = Nearest(*(values.index_select(0, whole) for values in seen))
+    light[whole] = _light(stage, sight, _centres(whole, width), nearest)
     if len(mixed):  # the mean light of four places in each pixel
         candidates = neighbours(sight.raster.primitive, mixed)
-        own = _seen_at(sight, mixed)
+        own = [values.index_select(0, mixed) for values in seen]
         places = [_centres(mixed, width) + torch.tensor(o, dtype=torch.float64) for o in _OFFSETS]
         found = []
-        for seen in nearest_at(sight, candidates, places):
+        for there in nearest_at(sight, candidates, places):
             # A gap between all that was seen near by: take what the pixel's centre sees.
-            is_lost = (seen.primitive < 0) & (candidates >= 0).all(1)
+            is_lost = (there.primitive < 0) & (candidates >= 0).all(1)
             found.append([
                 torch.where(is_lost if one.ndim == 1 else is_lost[:, None], instead, one)
-                for one, instead in zip(seen, own, strict=True)
+                for one, instead in zip(there, own, strict=True)
             ])  # fmt: skip
         nearest = Nearest(*(torch.cat(parts) for parts in zip(*found, strict=True)))
         of_places = _light(stage, sight, torch.cat(places), nearest)
@@ -161,16 +158,11 @@ def _centres(index: Indices, width: int) -> Float64[Tensor, "n 2"]:
     return torch.stack([index % width, index // width], 1).double()
 
 
-def _seen_at(sight: Sight, index: Indices) -> Nearest:
-    raster = sight.raster
-    assert raster.barycentric is not None
-    parts = raster.primitive, raster.barycentric, raster.depth_m
-    return Nearest(*(values.flatten(0, 1).index_select(0, index) for values in parts))
-
-
 def _light(stage: Stage, sight: Sight, pixels: Float64[Tensor, "n 2"], nearest: Nearest) -> Vectors:
     primitive, shares, depth = nearest
-    rays = sight.rays(pixels)
+    (a, b, c), (_, d, e), _ = sight.K.inverse().tolist()
+    u, v = pixels.unbind(1)
+    rays = torch.stack([a * u + b * v + c, d * v + e, torch.ones_like(u)], 1).float()
     length = rays.norm(dim=1)
     towards = rays / length[:, None]
     light = torch.empty_like(rays)
@@ -264,18 +256,14 @@ _TURN_RAD = np.deg2rad(np.arange(-44.5, 44.5, 0.1728))
 _ORIGIN_M = (0.056, -0.076, -0.272)
 """Its place in the left camera's frame: a little above and behind."""
 
+_AXES = [[0, -1, 0], [0, 0, -1], [1, 0, 0]]
+CAMERA_FROM_VELODYNE = np.vstack([np.column_stack([_AXES, _ORIGIN_M]), [0, 0, 0, 1.0]])
+"""From the LiDAR (x forward, y left, z up) to the left camera."""
+
 _SIZE_PX = (440, 1200)
 _FOCAL_PX = 600.0
 _MAX_RANGE_M = 115.0
 _NOISE_M = 0.015
-
-
-def camera_from_velodyne() -> Float64[np.ndarray, "4 4"]:
-    """Give the transform from the LiDAR (x forward, y left, z up) to the left camera."""
-    transform = np.eye(4)
-    transform[:3, :3] = [[0, -1, 0], [0, 0, -1], [1, 0, 0]]
-    transform[:3, 3] = _ORIGIN_M
-    return transform
 
 
 def scan(stage: Stage, rng: np.random.Generator) -> Float[Tensor, "n 4"]:
@@ -374,7 +362,7 @@ def draw_scene(
         is_sky=primitive < 0,
         is_road=(primitive >= 0) & (stage.material[primitive.clamp(min=0)] == NUMBER["road"]),
         lidar_points=points,
-        camera_from_velodyne=camera_from_velodyne(),
+        camera_from_velodyne=CAMERA_FROM_VELODYNE,
         rig=rig,
     )
 

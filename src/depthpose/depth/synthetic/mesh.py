@@ -5,7 +5,7 @@ process, and shared by every scene. Metres; x right, y down, z forward, as in a 
 model stands at the origin on y = 0 and looks along z.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from functools import cache, partialmethod
 from typing import NamedTuple
@@ -103,7 +103,8 @@ def textures() -> Textures:
     stack = np.ones((LAYERS, SIDE_PX, SIDE_PX, 3), np.float32)
     for name, material in MATERIALS.items():
         for variant in range(material.variants):
-            painted = _PAINTERS[name](_Noise(rng), variant)
+            paint = _paint_thing if name in _THINGS else _paint_surface
+            painted = paint(name, _Noise(rng), variant)
             stack[FIRST_LAYER[name] + variant] = (
                 painted if painted.ndim == 3 else painted[..., None]
             )
@@ -146,11 +147,11 @@ def sample_texture(
     return torch.lerp(top, bottom, down)
 
 
+@dataclass(frozen=True)
 class _Noise:
     """Seamless fields of noise with a mean of 0 and a deviation of 1."""
 
-    def __init__(self, rng: np.random.Generator) -> None:
-        self.rng = rng
+    rng: np.random.Generator
 
     def smooth(
         self, fall: Number, band: tuple[Number, Number], stretch: tuple[Number, Number] = (1, 1)
@@ -169,6 +170,13 @@ class _Noise:
     fine = partialmethod(smooth, 0.3, (24, 128))  # grains
     broad = partialmethod(smooth, 2.4, (1, 20))  # patches
 
+    def mottled(self, shares: Mapping[str, float]) -> Plane:
+        """Grey with noise of the named kinds, drawn in their order."""
+        plane = np.ones((SIDE_PX, SIDE_PX), np.float32)
+        for kind, share in shares.items():
+            plane = plane + share * getattr(self, kind)()
+        return plane
+
     def bricks(
         self, rows: int, columns: int, joint: Number, spread: Number
     ) -> tuple[Plane, Picture, Plane]:
@@ -186,163 +194,132 @@ class _Noise:
         return is_brick, shade[row, column].astype(np.float32), in_row
 
 
-Painter = Callable[[_Noise, int], Plane | Picture]
-"""Paints one variant of a texture, grey or in colours."""
+_MOTTLED = {
+    "dirt": {"rough": 0.2, "fine": 0.18, "broad": 0.12},
+    "curb": {"rough": 0.2, "fine": 0.18, "broad": 0.12},
+    "pavement": {"rough": 0.08, "fine": 0.14},
+    "stone": {"fine": 0.09, "rough": 0.12},
+    "concrete": {"fine": 0.07, "rough": 0.09, "broad": 0.08},
+    "paint": {"broad": 0.03, "fine": 0.012},
+    "glass": {"broad": 0.15},
+    "tyre": {"fine": 0.2, "rough": 0.15},
+    "skin": {"broad": 0.06},
+}
+"""Materials that are grey with noise: its kinds, drawn in this order, and their shares."""
+
+_SLABS = {
+    "pavement": (((4, 4), (12, 6), (8, 8)), 0.05, 0.07),
+    "stone": (((8, 5), (6, 3), (12, 6)), 0.06, 0.14),
+}
+"""Rows and columns of the slabs of each variant, width of their joints, spread of their shades."""
 
 
-def _mottled(**shares: float) -> Painter:
-    """Grey with noise of the named kinds, drawn in their order."""
-
-    def paint(noise: _Noise, _variant: int) -> Plane:
-        plane = np.ones((SIDE_PX, SIDE_PX), np.float32)
-        for kind, share in shares.items():
-            plane = plane + share * getattr(noise, kind)()
-        return plane
-
-    return paint
-
-
-def _paved(
-    sizes: Sequence[tuple[int, int]], joint: Number, spread: Number, **shares: float
-) -> Painter:
-    """Slabs or stones, so many rows and columns of each variant, with noise as in mottled grey."""
-    grey = _mottled(**shares)
-
-    def paint(noise: _Noise, variant: int) -> Picture:
-        is_slab, shade, _ = noise.bricks(*sizes[variant], joint, spread)
-        return shade * (grey(noise, variant) * (0.55 + 0.45 * is_slab))[..., None]
-
-    return paint
-
-
-def _road(noise: _Noise, variant: int) -> Plane:
-    cracks = np.clip(1 - np.abs(noise.smooth(1.8, (2, 60))) / 0.035, 0, 1)
-    cracks = cracks * np.clip(noise.broad() - 0.4 * variant % 1, 0, 1)
-    rough, fine, broad = noise.rough(), noise.fine(), noise.broad()
-    return 1 + (0.24 + 0.05 * variant) * fine + 0.14 * rough + 0.06 * broad - 0.6 * cracks
-
-
-def _grass(noise: _Noise, variant: int) -> Picture:
-    fine, rough, broad = noise.fine(), noise.rough(), noise.broad()
-    dry = 0.14 + 0.1 * variant
-    red = 1 + 0.34 * fine + 0.26 * rough + dry * broad
-    green = 1 + 0.32 * fine + 0.24 * rough + 0.4 * dry * broad
-    return np.stack([red, green, 1 + 0.3 * fine + 0.22 * rough], 2)
-
-
-def _brick(noise: _Noise, variant: int) -> Picture:
-    is_brick, shade, _ = noise.bricks(24, (8, 6, 10)[variant], 0.1, 0.16)
-    wall = shade * (1 + 0.1 * noise.fine() + 0.08 * noise.rough())[..., None]
-    joint = (1.3 + 0.08 * noise.fine())[..., None] * np.array([0.9, 1.3, 1.5])
-    return np.where(is_brick[..., None] > 0.5, wall, joint) * (1 + 0.1 * noise.broad())[..., None]
-
-
-def _plaster(noise: _Noise, variant: int) -> Plane:
-    streaks = np.clip(noise.smooth(2.2, (1, 60), (0.25, 1)) - 0.6, 0, 2)
-    fine, rough, broad = noise.fine(), noise.rough(), noise.broad()
-    return 1 + 0.05 * fine + 0.06 * rough + 0.07 * broad - (0.06 + 0.06 * variant) * streaks
-
-
-def _roof(noise: _Noise, variant: int) -> Picture:
-    _, shade, in_row = noise.bricks((14, 20, 10)[variant], 12, 0.04, 0.13)
-    grains = 1 + 0.09 * noise.fine() + 0.1 * noise.broad()
-    return shade * ((0.55 + 0.65 * in_row) * grains)[..., None]
+def _paint_surface(name: str, noise: _Noise, variant: int) -> Plane | Picture:
+    """Paint one variant of what covers the ground, walls and plants, grey or in colours."""
+    match name:
+        case "road":
+            cracks = np.clip(1 - np.abs(noise.smooth(1.8, (2, 60))) / 0.035, 0, 1)
+            cracks = cracks * np.clip(noise.broad() - 0.4 * variant % 1, 0, 1)
+            rough, fine, broad = noise.rough(), noise.fine(), noise.broad()
+            painted = (
+                1 + (0.24 + 0.05 * variant) * fine + 0.14 * rough + 0.06 * broad - 0.6 * cracks
+            )
+        case "grass":
+            fine, rough, broad = noise.fine(), noise.rough(), noise.broad()
+            dry = 0.14 + 0.1 * variant
+            red = 1 + 0.34 * fine + 0.26 * rough + dry * broad
+            green = 1 + 0.32 * fine + 0.24 * rough + 0.4 * dry * broad
+            painted = np.stack([red, green, 1 + 0.3 * fine + 0.22 * rough], 2)
+        case "brick":
+            is_brick, shade, _ = noise.bricks(24, (8, 6, 10)[variant], 0.1, 0.16)
+            wall = shade * (1 + 0.1 * noise.fine() + 0.08 * noise.rough())[..., None]
+            joint = (1.3 + 0.08 * noise.fine())[..., None] * np.array([0.9, 1.3, 1.5])
+            wall = np.where(is_brick[..., None] > 0.5, wall, joint)
+            painted = wall * (1 + 0.1 * noise.broad())[..., None]
+        case "plaster":
+            streaks = np.clip(noise.smooth(2.2, (1, 60), (0.25, 1)) - 0.6, 0, 2)
+            fine, rough, broad = noise.fine(), noise.rough(), noise.broad()
+            plain = 1 + 0.05 * fine + 0.06 * rough + 0.07 * broad
+            painted = plain - (0.06 + 0.06 * variant) * streaks
+        case "roof":
+            _, shade, in_row = noise.bricks((14, 20, 10)[variant], 12, 0.04, 0.13)
+            grains = 1 + 0.09 * noise.fine() + 0.1 * noise.broad()
+            painted = shade * ((0.55 + 0.65 * in_row) * grains)[..., None]
+        case "leaf":  # light and dark clumps: a ball covered with it looks like foliage
+            fine, rough = noise.fine(), noise.rough()
+            clumps = np.clip(1 + 0.55 * noise.smooth(0.8, (6, 60)) + 0.2 * fine, 0.1, 2.5)
+            painted = np.stack([clumps + 0.15 * rough, clumps + 0.1 * rough, clumps], 2)
+        case "wood":
+            is_board, shade, _ = noise.bricks(1, 6, 0.03 * variant + 1e-3, 0.08)
+            grain = 0.2 * noise.smooth(1.4, (2, 128), (0.15, 1)) + 0.05 * noise.fine()
+            painted = shade * ((1 + grain) * (0.5 + 0.5 * is_board))[..., None]
+        case "bark":
+            painted = 1 + 0.38 * noise.smooth(1.2, (4, 128), (0.18, 1)) + 0.12 * noise.fine()
+        case "metal":
+            painted = 1 + 0.06 * noise.fine() + (0.08 + 0.1 * variant) * noise.broad()
+        case "hills":
+            painted = 1 + 0.4 * noise.smooth(1.0, (16, 128)) + 0.15 * noise.broad()
+        case "pavement" | "stone":
+            sizes, joint, spread = _SLABS[name]
+            is_slab, shade, _ = noise.bricks(*sizes[variant], joint, spread)
+            grey = noise.mottled(_MOTTLED[name])
+            painted = shade * (grey * (0.55 + 0.45 * is_slab))[..., None]
+        case _:
+            painted = noise.mottled(_MOTTLED[name])
+    return painted
 
 
-def _leaf(noise: _Noise, _variant: int) -> Picture:
-    """Light and dark clumps: a ball covered with it looks like foliage, not like a ball."""
-    fine, rough = noise.fine(), noise.rough()
-    clumps = np.clip(1 + 0.55 * noise.smooth(0.8, (6, 60)) + 0.2 * fine, 0.1, 2.5)
-    return np.stack([clumps + 0.15 * rough, clumps + 0.1 * rough, clumps], 2)
+_THINGS = ("side", "pane", "wheel", "plate", "lamp", "sign", "poster", "cloth")
+"""Materials whose textures have figures."""
 
 
-def _wood(noise: _Noise, variant: int) -> Picture:
-    is_board, shade, _ = noise.bricks(1, 6, 0.03 * variant + 1e-3, 0.08)
-    grain = 0.2 * noise.smooth(1.4, (2, 128), (0.15, 1)) + 0.05 * noise.fine()
-    return shade * ((1 + grain) * (0.5 + 0.5 * is_board))[..., None]
-
-
-def _side(noise: _Noise, variant: int) -> Plane:
-    """A car's flank from rear (u = 0) to front, sill (v = 0) to roof: doors, handles, a strip."""
-    picture = 1 + 0.04 * noise.broad() + 0.1 * np.clip((_y - 0.2) * 2, -0.5, 0.6)
-    is_door = (_y > 0.16) & (_y < 0.62)
-    for where in ((0.3, 0.5, 0.7), (0.34, 0.68), (0.28, 0.49, 0.72))[variant]:
-        picture -= 0.8 * np.clip(1 - np.abs(_x - where) / 0.006, 0, 1) * is_door
-        handle = (np.abs(_x - where - 0.04) < 0.018) & (np.abs(_y - 0.52) < 0.01)
-        picture[handle] = 0.35
-    picture[np.abs(_y - 0.34) < 0.012 * (variant > 0)] *= 0.55
-    picture[_y < 0.15] *= 0.3
-    dirt = np.clip((0.32 - _y) * 3, 0, 1) * (0.5 + 0.3 * noise.rough())
-    return picture * (1 - 0.35 * dirt)
-
-
-def _pane(noise: _Noise, variant: int) -> Plane:
-    """Curtains, blinds, or the dark of a room."""
-    curtain = np.clip(np.abs(_x - 0.5) * 2 - 0.55, 0, 1) * 2.5 * (1 + 0.3 * np.sin(_x * 90))
-    blind = 0.35 * np.sign(np.sin(_y * np.pi * 40)) * (_y > (0.2, 0.55, 2)[variant])
-    return 0.75 + 0.4 * _y + 0.15 * noise.broad() + curtain * (variant != 1) + blind
-
-
-def _wheel(_noise: _Noise, variant: int) -> Plane:
-    y, x = _y - 0.5, _x - 0.5
-    turn, out = np.arctan2(y, x), np.hypot(x, y)
-    spokes = np.cos(turn * (5, 7)[variant]) > -0.1
-    return np.where((spokes | (out > 0.42) | (out < 0.12)), 1.1, 0.15).astype(np.float32)
-
-
-def _plate(noise: _Noise, _variant: int) -> Picture:
-    picture = np.ones((SIDE_PX, SIDE_PX, 3), np.float32)
-    for x in range(22, 22 + 7 * 31, 31):
-        picture[10:50, x : x + int(noise.rng.integers(8, 22))] = 0.08
-    picture[:, :14] = (0.1, 0.2, 0.9)
-    return picture
-
-
-def _sign(noise: _Noise, variant: int) -> Picture:
-    """Dark figures on a light ground: bars, arrows, words."""
-    picture, rng = np.ones((SIDE_PX, SIDE_PX, 3), np.float32), noise.rng
-    colors = [(0.1, 0.1, 0.1), (0.05, 0.05, 0.05), (1.0, 0.08, 0.08), (0.1, 0.2, 0.9)]
-    color = np.array(colors[variant % 4])
-    for _ in range((3, 5, 8, 14, 24, 4)[variant]):
-        width, height = rng.integers(10, 110), rng.integers(8, 60)
-        x, y = rng.integers(30, 220 - width // 2), rng.integers(30, 220 - height // 2)
-        picture[y : y + height, x : x + width] = color * rng.uniform(0.5, 1.2)
-    return picture
-
-
-def _poster(noise: _Noise, _variant: int) -> Picture:
-    picture, rng = np.ones((SIDE_PX, SIDE_PX, 3), np.float32), noise.rng
-    for _ in range(50):
-        width, height = rng.integers(6, 90), rng.integers(4, 60)
-        x, y = rng.integers(0, SIDE_PX, 2)
-        picture[y : y + height, x : x + width] = rng.uniform(0.05, 1.4, 3)
-    return picture
-
-
-def _cloth(noise: _Noise, variant: int) -> Plane:
-    stripes = np.sign(np.sin(_x[:1] * 2 * np.pi * 6)) * (0, 0.18, 0, 0.3)[variant]
-    folds = noise.smooth(2.0, (2, 30), (0.4, 1))
-    return 1 + 0.16 * folds + 0.07 * noise.fine() + stripes
-
-
-_dirt = _mottled(rough=0.2, fine=0.18, broad=0.12)
-_PAINTERS: dict[str, Painter] = {
-    "road": _road, "grass": _grass, "dirt": _dirt, "curb": _dirt,
-    "pavement": _paved(((4, 4), (12, 6), (8, 8)), 0.05, 0.07, rough=0.08, fine=0.14),
-    "stone": _paved(((8, 5), (6, 3), (12, 6)), 0.06, 0.14, fine=0.09, rough=0.12),
-    "brick": _brick, "plaster": _plaster, "roof": _roof,
-    "leaf": _leaf, "wood": _wood, "side": _side, "pane": _pane,
-    "wheel": _wheel, "plate": _plate, "sign": _sign, "poster": _poster, "cloth": _cloth,
-    "concrete": _mottled(fine=0.07, rough=0.09, broad=0.08),
-    "paint": _mottled(broad=0.03, fine=0.012),
-    "glass": _mottled(broad=0.15),
-    "tyre": _mottled(fine=0.2, rough=0.15),
-    "skin": _mottled(broad=0.06),
-    "bark": lambda n, _: 1 + 0.38 * n.smooth(1.2, (4, 128), (0.18, 1)) + 0.12 * n.fine(),
-    "metal": lambda n, variant: 1 + 0.06 * n.fine() + (0.08 + 0.1 * variant) * n.broad(),
-    "lamp": lambda n, _: 1 + 0.15 * np.sign(np.sin(_x * 40 * np.pi)) + 0 * n.broad(),
-    "hills": lambda n, _: 1 + 0.4 * n.smooth(1.0, (16, 128)) + 0.15 * n.broad(),
-}  # fmt: skip
+def _paint_thing(name: str, noise: _Noise, variant: int) -> Plane | Picture:
+    """Paint one variant of a texture with figures, grey or in colours."""
+    colored, rng = np.ones((SIDE_PX, SIDE_PX, 3), np.float32), noise.rng
+    match name:
+        case "side":  # a car's flank from rear (u = 0) to front, sill to roof: doors, handles
+            grey = 1 + 0.04 * noise.broad() + 0.1 * np.clip((_y - 0.2) * 2, -0.5, 0.6)
+            is_door = (_y > 0.16) & (_y < 0.62)
+            for where in ((0.3, 0.5, 0.7), (0.34, 0.68), (0.28, 0.49, 0.72))[variant]:
+                grey -= 0.8 * np.clip(1 - np.abs(_x - where) / 0.006, 0, 1) * is_door
+                handle = (np.abs(_x - where - 0.04) < 0.018) & (np.abs(_y - 0.52) < 0.01)
+                grey[handle] = 0.35
+            grey[np.abs(_y - 0.34) < 0.012 * (variant > 0)] *= 0.55
+            grey[_y < 0.15] *= 0.3
+            dirt = np.clip((0.32 - _y) * 3, 0, 1) * (0.5 + 0.3 * noise.rough())
+            return grey * (1 - 0.35 * dirt)
+        case "pane":  # curtains, blinds, or the dark of a room
+            curtain = np.clip(np.abs(_x - 0.5) * 2 - 0.55, 0, 1) * 2.5 * (1 + 0.3 * np.sin(_x * 90))
+            blind = 0.35 * np.sign(np.sin(_y * np.pi * 40)) * (_y > (0.2, 0.55, 2)[variant])
+            return 0.75 + 0.4 * _y + 0.15 * noise.broad() + curtain * (variant != 1) + blind
+        case "wheel":
+            y, x = _y - 0.5, _x - 0.5
+            turn, out = np.arctan2(y, x), np.hypot(x, y)
+            spokes = np.cos(turn * (5, 7)[variant]) > -0.1
+            return np.where((spokes | (out > 0.42) | (out < 0.12)), 1.1, 0.15).astype(np.float32)
+        case "plate":
+            for x in range(22, 22 + 7 * 31, 31):
+                colored[10:50, x : x + int(rng.integers(8, 22))] = 0.08
+            colored[:, :14] = (0.1, 0.2, 0.9)
+        case "lamp":
+            return 1 + 0.15 * np.sign(np.sin(_x * 40 * np.pi)) + 0 * noise.broad()
+        case "sign":  # dark figures on a light ground: bars, arrows, words
+            colors = [(0.1, 0.1, 0.1), (0.05, 0.05, 0.05), (1.0, 0.08, 0.08), (0.1, 0.2, 0.9)]
+            color = np.array(colors[variant % 4])
+            for _ in range((3, 5, 8, 14, 24, 4)[variant]):
+                width, height = rng.integers(10, 110), rng.integers(8, 60)
+                x, y = rng.integers(30, 220 - width // 2), rng.integers(30, 220 - height // 2)
+                colored[y : y + height, x : x + width] = color * rng.uniform(0.5, 1.2)
+        case "poster":
+            for _ in range(50):
+                width, height = rng.integers(6, 90), rng.integers(4, 60)
+                x, y = rng.integers(0, SIDE_PX, 2)
+                colored[y : y + height, x : x + width] = rng.uniform(0.05, 1.4, 3)
+        case _:  # cloth
+            stripes = np.sign(np.sin(_x[:1] * 2 * np.pi * 6)) * (0, 0.18, 0, 0.3)[variant]
+            folds = noise.smooth(2.0, (2, 30), (0.4, 1))
+            return 1 + 0.16 * folds + 0.07 * noise.fine() + stripes
+    return colored
 
 
 Rotation = Float[np.ndarray, "3 3"]

@@ -122,17 +122,13 @@ def leaf_color(rng: np.random.Generator) -> Color:
     return float(r), float(g), float(b)
 
 
-def _builder(*seed: int) -> MeshBuilder:
-    return MeshBuilder(np.random.default_rng(seed))
-
-
 @cache
 def tree(number: int, coarseness: int = 0) -> Mesh:
     """Give tree model ``number``, about 10 m high: round crowns, columns and conifers.
 
     Coarseness 0 is to be seen from near, 1 from some 30 m, 2 from far away.
     """
-    b = _builder(11, number)
+    b = MeshBuilder(np.random.default_rng((11, number)))
     rng, kind, (leaves, length_m) = b.rng, number % 6, _TREE_LEAVES[coarseness]
     if kind == 4:  # a conifer
         b.tube((0, 0.2, 0), (0, -9, 0), (0.22, 0.05), Surface("bark", _BARK, 1.0, 1), 8)
@@ -175,7 +171,7 @@ def _add_clump(
 @cache
 def bush(number: int, coarseness: int = 0) -> Mesh:
     """Give bush model ``number``, about 1 m high and 1.4 m wide; coarseness 1 from far away."""
-    b = _builder(12, number)
+    b = MeshBuilder(np.random.default_rng((12, number)))
     rng = b.rng
     for _ in range(int(rng.integers(1, 4))):
         radii = np.array([0.55, 0.5, 0.55]) * rng.uniform(0.7, 1.1)
@@ -187,7 +183,7 @@ def bush(number: int, coarseness: int = 0) -> Mesh:
 @cache
 def hedge(number: int) -> Mesh:
     """Give hedge model ``number``: 4 m along z, 1 m high, 0.7 m wide, clipped."""
-    b = _builder(13, number)
+    b = MeshBuilder(np.random.default_rng((13, number)))
     variant = int(b.rng.integers(3))
     b.box((0, -0.48, 0), (0.6, 0.96, 4.0), Surface("leaf", (0.42, 0.42, 0.42), 0.8, variant))
     surface = Surface("leaf", (0.7, 0.7, 0.7), 0.9, variant)
@@ -240,7 +236,7 @@ FENCE_M = 4.0
 @cache
 def lamp(number: int) -> Mesh:
     """Give a street lamp at the kerb; its arm reaches towards +x."""
-    b = _builder(41, number)
+    b = MeshBuilder(np.random.default_rng((41, number)))
     height = b.rng.uniform(5, 9)
     steel, stone = Surface("metal", (0.22, 0.23, 0.23)), Surface("concrete", (0.4, 0.39, 0.37))
     pole = steel if number % 3 else stone
@@ -258,7 +254,7 @@ def lamp(number: int) -> Mesh:
 @cache
 def sign(number: int) -> Mesh:
     """Give a traffic sign whose face looks along -z, to the oncoming camera."""
-    b = _builder(42, number)
+    b = MeshBuilder(np.random.default_rng((42, number)))
     height, radius = b.rng.uniform(2.1, 2.8), b.rng.uniform(0.3, 0.42)
     b.tube((0, 0.1, 0), (0, -height - radius, 0), 0.035, _GREY)
     color, sides = _SIGN_COLORS[number % 4], (20, 3, 4, 8)[number % 4]
@@ -278,7 +274,7 @@ def sign(number: int) -> Mesh:
 @cache
 def traffic_light(number: int) -> Mesh:
     """Give a traffic light looking along -z; every second one reaches over the road, to +x."""
-    b = _builder(43, number)
+    b = MeshBuilder(np.random.default_rng((43, number)))
     b.tube((0, 0.1, 0), (0, -3.4, 0), (0.08, 0.07), _DARK, 10)
     heads = [(0.0, -2.6)]
     if number % 2:
@@ -298,7 +294,7 @@ def traffic_light(number: int) -> Mesh:
 @cache
 def small_thing(number: int) -> Mesh:
     """Give a bin, a box, a bollard, a guide post, a bench or a bus stop's pillar."""
-    b = _builder(44, number)
+    b = MeshBuilder(np.random.default_rng((44, number)))
     kind, plain = number % 6, Surface("concrete", tuple(b.rng.uniform(0.02, 0.3, 3)))
     if kind == 0:
         b.box((0, -0.5, 0), (0.55, 1.0, 0.6), plain, taper=1.1)
@@ -327,7 +323,7 @@ def small_thing(number: int) -> Mesh:
 @cache
 def fence(number: int) -> Mesh:
     """Give one piece of fence or wall along z: slats, bars, wire, a rail, or a low wall."""
-    b = _builder(45, number)
+    b = MeshBuilder(np.random.default_rng((45, number)))
     rng, kind = b.rng, number % 5
     if kind < 3:  # size and distance of the bars, heights of the rails [m]
         slats = (0.02, 1.1, 0.11), 0.16, (0.25, 0.85)
@@ -402,7 +398,7 @@ _BLACK = Surface("tyre", (0.02, 0.02, 0.022))
 @cache
 def vehicle(kind: str, number: int) -> Mesh:
     """Give model ``number`` of a kind, white, looking along z."""
-    b = _builder(21, list(BODIES).index(kind), number)
+    b = MeshBuilder(np.random.default_rng((21, list(BODIES).index(kind), number)))
     body = BODIES[kind]
     size = np.array(body.size_m) * b.rng.uniform(0.95, 1.05, 3)
     shift = np.zeros((len(body.stations), 3))
@@ -499,7 +495,7 @@ _RUBBER = Surface("tyre", (0.025, 0.025, 0.028))
 @cache
 def walker(number: int) -> Mesh:
     """Give a person on foot, looking along z, caught at some moment of a step."""
-    b = _builder(31, number)
+    b = MeshBuilder(np.random.default_rng((31, number)))
     height, step = b.rng.uniform(1.55, 1.9), b.rng.uniform(-0.28, 0.28)
     coat, trousers = _cloth(b, 0.45), _cloth(b, 0.22)
     for side in (-1, 1):
@@ -518,7 +514,7 @@ def walker(number: int) -> Mesh:
 @cache
 def rider(number: int) -> Mesh:
     """Give a person on a bicycle, riding along z."""
-    b = _builder(32, number)
+    b = MeshBuilder(np.random.default_rng((32, number)))
     frame = Surface("metal", tuple(b.rng.uniform(0.03, 0.4, 3)))
     for z in (-0.52, 0.52):
         angle = np.linspace(0, 2 * np.pi, 19)

@@ -265,7 +265,13 @@ def add_roadside(b: MeshBuilder, road: Road) -> None:
         }  # fmt: skip
         plots.get(road.place, beside.add_country)()
         beside.add_kerb()
-        beside.add_woods()
+        # The front of a wood: right behind a forest's first trees, far behind elsewhere.
+        is_forest, often = road.place == "forest", {"forest": 0.9, "city": 0.1, "suburb": 0.35}
+        if rng.random() <= often.get(road.place, 0.55):
+            near, height = (rng.uniform(8, 13), 13.0) if is_forest else (rng.uniform(14, 55), 9.0)
+            s, x = rng.uniform(-10, 0 if is_forest else 60), beside.x_m(near)
+            stop, other = s + rng.uniform(60, 200), x + beside.side * rng.uniform(-2, 15)
+            models.add_wood_edge(b, (x, s), (other, stop), height * rng.uniform(0.7, 1.3))
     if rng.random() < 0.85:  # trees across the end of the road's straight part
         for _ in range(int(rng.integers(30, 90))):
             beside = sides[int(rng.choice([-1, 1]))]
@@ -277,16 +283,17 @@ def add_roadside(b: MeshBuilder, road: Road) -> None:
         models.add_wood_edge(b, (-half, s), stop, rng.uniform(7, 14))
 
 
+@dataclass(frozen=True, eq=False)
 class _Roadside:
-    """One side of a road, 1 right, -1 left: every method adds to the mesh of the builder."""
+    """One side of a road: every method adds to the mesh of the builder."""
 
-    def __init__(self, b: MeshBuilder, road: Road, side: int) -> None:
-        self.b, self.rng, self.road, self.side = b, b.rng, road, side
-        self.edge_m = road.edge_m(side)
+    b: MeshBuilder
+    road: Road
+    side: int  # 1 right, -1 left
 
     def x_m(self, beyond_m: Number) -> Number:
         """Give x so far beyond the beginning of the plots, behind pavement and verge."""
-        plot_m = self.edge_m + self.side * (self.road.verge_m + self.road.walk_m)
+        plot_m = self.road.edge_m(self.side) + self.side * (self.road.verge_m + self.road.walk_m)
         return plot_m + self.side * beyond_m
 
     def is_free(self, s: Number, length: float) -> bool:
@@ -295,9 +302,9 @@ class _Roadside:
 
     def add_houses(self) -> None:
         """Houses at the pavement, wall to wall."""
-        rng = self.rng
+        rng = self.b.rng
         if self.road.walk_m > 2 and rng.random() < 0.55:
-            self.add_tree_row(self.edge_m + self.side * 0.9)
+            self.add_tree_row(self.road.edge_m(self.side) + self.side * 0.9)
         s, set_back = rng.uniform(-12, -4), rng.uniform(0, 3) * (rng.random() < 0.4)
         tall = rng.uniform(6, 17)
         while s < _FAR_M:
@@ -311,7 +318,7 @@ class _Roadside:
 
     def add_gardens(self) -> None:
         """Houses behind hedges and fences, with trees and bushes about them."""
-        rng = self.rng
+        rng = self.b.rng
         s, back = rng.uniform(-12, -2), rng.uniform(2.5, 7)
         border = int(rng.integers(4))
         while s < _FAR_M:
@@ -333,12 +340,12 @@ class _Roadside:
 
     def add_avenue(self) -> None:
         """A wide road: rows of trees, hedges or rails, and set-back houses or nothing behind."""
-        rng = self.rng
+        rng = self.b.rng
         has_row, has_border, has_houses = rng.random(3) < (0.7, 0.5, 0.35)
         rail = int(rng.integers(4))
         if has_row:
             beyond = rng.uniform(1.2, max(1.5, self.road.verge_m))
-            self.add_tree_row(self.edge_m + self.side * beyond)
+            self.add_tree_row(self.road.edge_m(self.side) + self.side * beyond)
         if has_border:
             self.add_border(-8, 100, rail)
         s = rng.uniform(-10, 5)
@@ -352,7 +359,7 @@ class _Roadside:
 
     def add_country(self) -> None:
         """Open fields with some trees, or a forest's edge."""
-        rng = self.rng
+        rng = self.b.rng
         is_forest = self.road.place == "forest"
         is_open = not is_forest and rng.random() < 0.55
         edge, height = rng.uniform(1.0, 4.5), rng.uniform(9, 15)
@@ -373,19 +380,9 @@ class _Roadside:
         if not is_forest and rng.random() < 0.45:
             self.add_border(-8, 90, int(rng.integers(4)))
 
-    def add_woods(self) -> None:
-        """The front of a wood: right behind a forest's first trees, far behind elsewhere."""
-        rng, is_forest = self.rng, self.road.place == "forest"
-        if rng.random() > {"forest": 0.9, "city": 0.1, "suburb": 0.35}.get(self.road.place, 0.55):
-            return
-        near, height = (rng.uniform(8, 13), 13.0) if is_forest else (rng.uniform(14, 55), 9.0)
-        s, x = rng.uniform(-10, 0 if is_forest else 60), self.x_m(near)
-        stop, other = s + rng.uniform(60, 200), x + self.side * rng.uniform(-2, 15)
-        models.add_wood_edge(self.b, (x, s), (other, stop), height * rng.uniform(0.7, 1.3))
-
     def add_copse(self, s: Number, length: Number, depth: Number) -> None:
         """Some trees and bushes."""
-        rng = self.rng
+        rng = self.b.rng
         is_street = self.road.is_side_street(s + length / 2, self.side, length / 2)
         for _ in range(int(rng.integers(1, 7))):
             x = self.x_m(1.5 + depth * rng.uniform(0, 1))
@@ -398,8 +395,8 @@ class _Roadside:
 
     def add_kerb(self) -> None:
         """Lamps in a row; signs, lights, posts and boxes here and there; poles with wires."""
-        rng, road, side = self.rng, self.road, self.side
-        x, y = self.edge_m + side * (0.5 if road.walk_m else 1.3), -road.curb_m
+        rng, road, side = self.b.rng, self.road, self.side
+        x, y = self.road.edge_m(self.side) + side * (0.5 if road.walk_m else 1.3), -road.curb_m
         if rng.random() <= {"forest": 0.1, "rural": 0.3}.get(road.place, 0.7):
             number, step = int(rng.integers(6)), rng.uniform(16, 34)
             for s in np.arange(rng.uniform(2, 25), 110, step):
@@ -451,7 +448,7 @@ class _Roadside:
             start_m=s,
             stop_m=s + length,
             side=self.side,
-            depth_m=self.rng.uniform(7, 12),
+            depth_m=self.b.rng.uniform(7, 12),
             height_m=height,
             ground_m=-self.road.curb_m + 0.2,
         )
@@ -461,7 +458,7 @@ class _Roadside:
         """A line of hedge or fence pieces at the back of the pavement; kind 0 is none."""
         if kind == 0:
             return
-        rng = self.rng
+        rng = self.b.rng
         number, height = int(rng.integers(20)), rng.uniform(0.7, 1.9)
         color = models.leaf_color(rng)
         for s in np.arange(start + 2, min(stop, 95), models.FENCE_M):
@@ -476,7 +473,7 @@ class _Roadside:
 
     def add_tree_row(self, x: Number) -> None:
         """Trees along the road, at even distances."""
-        rng = self.rng
+        rng = self.b.rng
         step, height = rng.uniform(6, 14), rng.uniform(5, 13)
         for s in np.arange(rng.uniform(-8, 6), _FAR_M, step):
             if not self.road.is_side_street(s, self.side, 2) and rng.random() < 0.85:
@@ -485,21 +482,20 @@ class _Roadside:
 
     def add_tree(self, x: Number, s: Number, height: Number | None) -> None:
         """A tree of some kind, coarser where it is far away."""
-        tall = self.rng.uniform(5, 12) if height is None else height
-        number = int(self.rng.integers(models.TREES))
-        wide = tall * self.rng.uniform(0.85, 1.15)
+        tall = self.b.rng.uniform(5, 12) if height is None else height
+        number = int(self.b.rng.integers(models.TREES))
+        wide = tall * self.b.rng.uniform(0.85, 1.15)
         model = models.tree(number, int(s > 24) + int(s > 48 or abs(x) > 25))
-        self.add_plant(model, x, s, np.array([wide, tall, wide]) / 10)
+        scale = np.array([wide, tall, wide]) / 10
+        tints = {"leaf": models.leaf_color(self.b.rng)}
+        self.b.add(place(model, (x, 0, s), self.b.rng.uniform(0, 6.28), scale, tints))
 
     def add_bush(self, x: Number, s: Number, size: Number) -> None:
         """A bush of some kind, coarser where it is far away."""
-        model = models.bush(int(self.rng.integers(models.BUSHES)), int(s > 20))
-        self.add_plant(model, x, s, size * self.rng.uniform(0.7, 1.3, 3))
-
-    def add_plant(self, model: Mesh, x: Number, s: Number, scale: np.ndarray) -> None:
-        """A model turned at random, with leaves of some colour."""
-        tints = {"leaf": models.leaf_color(self.rng)}
-        self.b.add(place(model, (x, 0, s), self.rng.uniform(0, 6.28), scale, tints))
+        model = models.bush(int(self.b.rng.integers(models.BUSHES)), int(s > 20))
+        scale = size * self.b.rng.uniform(0.7, 1.3, 3)
+        tints = {"leaf": models.leaf_color(self.b.rng)}
+        self.b.add(place(model, (x, 0, s), self.b.rng.uniform(0, 6.28), scale, tints))
 
 
 class Traffic:
@@ -535,7 +531,7 @@ class Traffic:
                 s += rng.uniform(5.0, 6.5)
 
     def add_driving(self) -> None:
-        """Vehicles in the lanes."""
+        """Vehicles in the lanes, and in the side streets, waiting or turning."""
         rng, road = self.rng, self.road
         usual = {"avenue": 1.3, "forest": 0.6, "rural": 0.6}.get(road.place, 0.9)
         density = rng.uniform(0.15, 1) * usual
@@ -548,10 +544,6 @@ class Traffic:
                     yaw = rng.normal(0, 0.02) + (np.pi if is_oncoming else 0)
                     self.add_vehicle(x + rng.normal(0, 0.25), s, yaw)
                 s += rng.uniform(7, 32)
-
-    def add_crossing(self) -> None:
-        """Vehicles in the side streets, waiting or turning."""
-        rng, road = self.rng, self.road
         for street in road.side_streets:
             for side in street.sides:
                 if rng.random() < 0.5 and street.s_m > 8:

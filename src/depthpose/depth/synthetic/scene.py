@@ -5,7 +5,6 @@ look like: upright walls beside a plane. Clutter has thin, slanted, round, leafy
 repetitive and mirroring things at every distance.
 """
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import Literal
@@ -109,7 +108,6 @@ def make_scene(seed: tuple[int, ...], mount_height_m: float = 1.65) -> StreetSce
     traffic = roads.Traffic(builder, road)
     traffic.add_parked()
     traffic.add_driving()
-    traffic.add_crossing()
     traffic.add_people()
     street = roads.bend(builder.finish(), road)
     # A ring of far hills or woods, 900 m away.
@@ -213,6 +211,8 @@ _PLAIN = ("paint", "skin", "glass", "plaster", "metal")
 _RICH = ("pavement", "grass", "brick", "stone", "concrete", "roof", "bark", "leaf", "wood", "side",
          "pane", "plate", "sign", "poster", "cloth", "dirt", "hills")  # fmt: skip
 _PLAIN_SHARE = 0.3
+_SHAPES = ("ball", "box", "box", "card", "pole", "pole", "fence", "wheel", "lattice", "leaves")
+"""What clutter is made of; one is named as often as it is met."""
 
 
 def make_clutter(seed: tuple[int, ...]) -> StreetScene:
@@ -248,7 +248,7 @@ def make_clutter(seed: tuple[int, ...]) -> StreetScene:
         z = _log_uniform(rng, *_DEPTHS_M)
         centre = np.array([rng.uniform(-0.95, 0.95) * z, rng.uniform(-0.3, 0.3) * z, z])
         size_m = min(z, 25.0) * _log_uniform(rng, 0.03, 0.3)
-        _SHAPES[int(rng.integers(len(_SHAPES)))](b, centre, size_m)
+        _add_shape(b, _SHAPES[int(rng.integers(len(_SHAPES)))], centre, size_m)
     mesh = b.finish()
     # Nothing may come nearer than the rig's largest disparity allows; but a backdrop reaches behind
     # the camera, and its triangles are large.
@@ -281,82 +281,64 @@ def _rotation(rng: np.random.Generator) -> Rotation:
     return q * np.sign(np.linalg.det(q))
 
 
-def _ball(b: MeshBuilder, centre: np.ndarray, size_m: float) -> None:
-    radii = size_m / 2 * b.rng.uniform(0.5, 1.5, 3)
-    dents = b.rng.uniform(0, 0.5) if b.rng.random() < 0.6 else 0.0
-    add_ball(b, centre, radii, _surface(b.rng, size_m), 3, dents)
-
-
-def _box(b: MeshBuilder, centre: np.ndarray, size_m: float) -> None:
-    R = _rotation(b.rng) if b.rng.random() < 0.5 else np.eye(3)
-    sides = size_m * np.exp(b.rng.normal(0, 0.6, 3))
-    b.box(centre, sides, _surface(b.rng, size_m), R, b.rng.uniform(0.4, 1))
-
-
-def _card(b: MeshBuilder, centre: np.ndarray, size_m: float) -> None:
-    R = _rotation(b.rng)
-    along, up = R[0] * size_m * b.rng.uniform(0.5, 2), R[1] * size_m * b.rng.uniform(0.5, 2)
-    b.rectangle(centre - (along + up) / 2, along, up, _surface(b.rng, size_m))
-
-
-def _pole(b: MeshBuilder, centre: np.ndarray, size_m: float) -> None:
-    half = _rotation(b.rng)[0] * size_m * b.rng.uniform(0.7, 3)
-    if b.rng.random() < 0.5:
-        half = half * [0.05, 1, 0.05]
-    radius = size_m * _log_uniform(b.rng, 0.01, 0.2)
-    radii = (radius, radius * b.rng.uniform(0.3, 1))
-    b.tube(centre - half, centre + half, radii, _surface(b.rng, size_m), 10)
-
-
-def _fence(b: MeshBuilder, centre: np.ndarray, size_m: float) -> None:
-    """Bars side by side: what repeats has many matches."""
-    turn = b.rng.uniform(-0.8, 0.8)
-    along = np.array([np.cos(turn), 0, np.sin(turn)]) * size_m * b.rng.uniform(1, 3)
-    up, surface = np.array([0, size_m / 2, 0]), _surface(b.rng, size_m)
-    count = int(b.rng.integers(4, 20))
-    radius = float(np.linalg.norm(along)) / count * b.rng.uniform(0.05, 0.3)
-    for share in np.linspace(-0.5, 0.5, count):
-        b.tube(centre + share * along - up, centre + share * along + up, radius, surface)
-    for height in (-0.8, 0.8):
-        b.tube(centre + height * up - along / 2, centre + height * up + along / 2, radius, surface)
-
-
-def _wheel(b: MeshBuilder, centre: np.ndarray, size_m: float) -> None:
-    """A rim with spokes: what lies behind is seen through the gaps."""
+def _add_shape(b: MeshBuilder, kind: str, centre: np.ndarray, size_m: float) -> None:
+    """Add one of ``_SHAPES`` about a point."""
     rng = b.rng
-    R = _rotation(rng) if rng.random() < 0.5 else np.eye(3)
-    surface, radius = _surface(rng, size_m), size_m * rng.uniform(0.5, 1.2)
-    angles = np.linspace(0, 2 * np.pi, 25)
-    rim = centre + radius * (np.cos(angles)[:, None] * R[0] + np.sin(angles)[:, None] * R[1])
-    thick = radius * rng.uniform(0.03, 0.2)
-    for start, end in pairwise(rim):
-        b.tube(start, end, thick, surface, 6)
-    thin = radius * rng.uniform(0.01, 0.08)
-    for place in np.linspace(0, 24, int(rng.integers(3, 14)), endpoint=False).astype(int):
-        b.tube(centre, rim[place], (thin * rng.uniform(1, 2), thin), surface, 6)
-
-
-def _lattice(b: MeshBuilder, centre: np.ndarray, size_m: float) -> None:
-    """Flat bars that cross, as shelves, window frames and the backs of benches do."""
-    rng = b.rng
-    R = _rotation(rng) if rng.random() < 0.3 else np.eye(3)
-    sides = size_m * rng.uniform(0.6, 2.5, 2)
-    surface, deep = _surface(rng, size_m), size_m * float(np.exp(rng.uniform(-4, 0)))
-    for axis in (0, 1):
-        count = int(rng.integers(2, 8))
-        bar = np.array([*sides, deep])
-        bar[axis] = sides[axis] / count * rng.uniform(0.05, 0.4)
-        for share in np.linspace(-0.5, 0.5, count):
-            b.box(centre + share * sides[axis] * R[:, axis], bar, surface, R)
-
-
-def _leaves(b: MeshBuilder, centre: np.ndarray, size_m: float) -> None:
-    radii = size_m * b.rng.uniform(0.4, 1.2, 3)
-    count, length_m = int(b.rng.integers(100, 1200)), size_m * b.rng.uniform(0.03, 0.2)
-    surface, is_block = _surface(b.rng, size_m), bool(b.rng.random() < 0.3)
-    add_leaves(b, centre, radii, count, length_m, surface, is_block)
-
-
-_SHAPES: tuple[Callable[[MeshBuilder, np.ndarray, float], None], ...] = (
-    _ball, _box, _box, _card, _pole, _pole, _fence, _wheel, _lattice, _leaves,
-)  # fmt: skip
+    match kind:
+        case "ball":
+            radii = size_m / 2 * rng.uniform(0.5, 1.5, 3)
+            dents = rng.uniform(0, 0.5) if rng.random() < 0.6 else 0.0
+            add_ball(b, centre, radii, _surface(rng, size_m), 3, dents)
+        case "box":
+            R = _rotation(rng) if rng.random() < 0.5 else np.eye(3)
+            sides = size_m * np.exp(rng.normal(0, 0.6, 3))
+            b.box(centre, sides, _surface(rng, size_m), R, rng.uniform(0.4, 1))
+        case "card":
+            R = _rotation(rng)
+            along, up = R[0] * size_m * rng.uniform(0.5, 2), R[1] * size_m * rng.uniform(0.5, 2)
+            b.rectangle(centre - (along + up) / 2, along, up, _surface(rng, size_m))
+        case "pole":
+            half = _rotation(rng)[0] * size_m * rng.uniform(0.7, 3)
+            if rng.random() < 0.5:
+                half = half * [0.05, 1, 0.05]
+            radius = size_m * _log_uniform(rng, 0.01, 0.2)
+            radii = (radius, radius * rng.uniform(0.3, 1))
+            b.tube(centre - half, centre + half, radii, _surface(rng, size_m), 10)
+        case "fence":  # bars side by side: what repeats has many matches
+            turn = rng.uniform(-0.8, 0.8)
+            along = np.array([np.cos(turn), 0, np.sin(turn)]) * size_m * rng.uniform(1, 3)
+            up, surface = np.array([0, size_m / 2, 0]), _surface(rng, size_m)
+            count = int(rng.integers(4, 20))
+            radius = float(np.linalg.norm(along)) / count * rng.uniform(0.05, 0.3)
+            for share in np.linspace(-0.5, 0.5, count):
+                foot = centre + share * along
+                b.tube(foot - up, foot + up, radius, surface)
+            for height in (-0.8, 0.8):
+                middle = centre + height * up
+                b.tube(middle - along / 2, middle + along / 2, radius, surface)
+        case "wheel":  # a rim with spokes: what lies behind is seen through the gaps
+            R = _rotation(rng) if rng.random() < 0.5 else np.eye(3)
+            surface, radius = _surface(rng, size_m), size_m * rng.uniform(0.5, 1.2)
+            angle = np.linspace(0, 2 * np.pi, 25)[:, None]
+            rim = centre + radius * (np.cos(angle) * R[0] + np.sin(angle) * R[1])
+            thick = radius * rng.uniform(0.03, 0.2)
+            for start, end in pairwise(rim):
+                b.tube(start, end, thick, surface, 6)
+            thin = radius * rng.uniform(0.01, 0.08)
+            for place in np.linspace(0, 24, int(rng.integers(3, 14)), endpoint=False).astype(int):
+                b.tube(centre, rim[place], (thin * rng.uniform(1, 2), thin), surface, 6)
+        case "lattice":  # flat bars that cross, as shelves, window frames and benches have
+            R = _rotation(rng) if rng.random() < 0.3 else np.eye(3)
+            sides = size_m * rng.uniform(0.6, 2.5, 2)
+            surface, deep = _surface(rng, size_m), size_m * float(np.exp(rng.uniform(-4, 0)))
+            for axis in (0, 1):
+                count = int(rng.integers(2, 8))
+                bar = np.array([*sides, deep])
+                bar[axis] = sides[axis] / count * rng.uniform(0.05, 0.4)
+                for share in np.linspace(-0.5, 0.5, count):
+                    b.box(centre + share * sides[axis] * R[:, axis], bar, surface, R)
+        case _:  # leaves
+            radii = size_m * rng.uniform(0.4, 1.2, 3)
+            count, length_m = int(rng.integers(100, 1200)), size_m * rng.uniform(0.03, 0.2)
+            surface, is_block = _surface(rng, size_m), bool(rng.random() < 0.3)
+            add_leaves(b, centre, radii, count, length_m, surface, is_block)

@@ -128,9 +128,13 @@ class SelectTraining(Settings):
     def __post_init__(self) -> None:
         refuse_unknown("disparity_loss", self.disparity_loss, DISPARITY_LOSSES)
         super().__post_init__()
-        _refuse_views_changed_apart(self.pairs)
-        if self.more is not None:
-            _refuse_views_changed_apart(self.more)
+        for pairs in (self.pairs, self.more):
+            augment = None if pairs is None else pairs.augment
+            if augment and (augment.per_view or augment.erased_share or augment.misaligned_px):
+                raise InputError(
+                    "pairs.augment changes each view on its own (per_view, erased_share or "
+                    "misaligned_px), and this training compares them; omit these"
+                )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -242,12 +246,3 @@ class FinetuneTraining(Settings):
 
     loop: LoopConfig = field(default_factory=lambda: LoopConfig(epochs=60.0))
     """How long."""
-
-
-def _refuse_views_changed_apart(pairs: PairsConfig) -> None:
-    augment = pairs.augment
-    if augment.per_view is not None or augment.erased_share or augment.misaligned_px:
-        raise InputError(
-            "pairs.augment changes each view on its own (per_view, erased_share or "
-            "misaligned_px), and this training compares them; omit these"
-        )

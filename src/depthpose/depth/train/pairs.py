@@ -87,8 +87,8 @@ class TrainingPairs:
             return
         # Every rig before any work: another baseline would change the metric scale.
         rigs = {
-            self._frame_name(number): source.read_rig(place)
-            for number, (source, place, _) in enumerate(self._places)
+            source.frames[number].name: source.read_rig(number)
+            for source, number, _ in self._places
             if isinstance(source, Dataset)
         }
         if self.config.streets is not None:  # five rigs, and perhaps millions of streets
@@ -136,8 +136,9 @@ class TrainingPairs:
         """Read a pair and its truth where one is asked for; 0 in the sky, where known."""
         source, number, kind = self._places[index]
         left_px = right_px = None
+        name = source.frames[number].name if isinstance(source, Dataset) else f"street {number}"
         if isinstance(source, Dataset):
-            given, name = source.read_input(number), source.frames[number].name
+            given = source.read_input(number)
             rig = given.camera if isinstance(given.camera, StereoRig) else None
             if kind == "disparity":
                 truth = source.read_truth(number)
@@ -176,14 +177,10 @@ class TrainingPairs:
             return pair
         if rig is None:
             raise InputError(
-                f"{self._frame_name(index)}: has no calibration, so it cannot be brought to a "
+                f"{name}: has no calibration, so it cannot be brought to a "
                 f"focal length of {wanted_px} px; add one, exclude it, or leave focal_px out"
             )
         return scale_pair(pair, wanted_px / float(focal_px))
-
-    def _frame_name(self, index: int) -> str:
-        source, place, _ = self._places[index]
-        return source.frames[place].name if isinstance(source, Dataset) else f"street {place}"
 
 
 def _usable(

@@ -14,7 +14,7 @@ from depthpose.core.config import config_to_dict
 from depthpose.core.errors import InputError
 from depthpose.core.loop import Run, Task, held_out_text, releases_folder, write_card
 from depthpose.core.run import find_rank
-from depthpose.depth.config import GeneratorConfig, PairsConfig, SelectionConfig
+from depthpose.depth.config import GeneratorConfig, SelectionConfig
 from depthpose.depth.datasets import refuse_common
 from depthpose.depth.stereo import StereoNetwork
 from depthpose.depth.synthesis import Generator, SelectionGenerator, UNetGenerator, load_encoder
@@ -109,7 +109,7 @@ def train_view(config: ViewTraining, run: Run) -> Path:
     config = _at_virtual_focal(config, config.generator)
     baseline_m = config.generator.virtual_baseline_m
     pairs = TrainingPairs(config.pairs, config.loop.seed, needs_truth=False, baseline_m=baseline_m)
-    held_out = _held_out(config.held_out, needs_truth=False)
+    held_out = config.held_out and TrainingPairs(config.held_out, 0, needs_truth=False)
     generator = UNetGenerator(config.generator)
     if config.start is not None:
         start_from(generator, read_generator(find_weights(config.start)), config.start)
@@ -137,7 +137,8 @@ def train_select(config: SelectTraining, run: Run) -> Path:
         load_encoder(generator.encoder, find_weights(config.encoder))
     if config.start is not None:
         start_from(generator, read_generator(find_weights(config.start)), config.start)
-    task = stages.SelectTask(generator, config, _held_out(config.held_out))
+    held_out = config.held_out and TrainingPairs(config.held_out, 0, needs_truth=True)
+    task = stages.SelectTask(generator, config, held_out)
     facts, seconds = _run_stage(task, samples, config, run)
     return _write_weights(run, "select", facts, seconds, generator=generator)
 
@@ -157,7 +158,7 @@ def train_stereo(config: StereoTraining, run: Run) -> Path:
         )
     torch.manual_seed(config.loop.seed)
     pairs = TrainingPairs(config.pairs, config.loop.seed, needs_truth=True)
-    held_out = _held_out(config.held_out)
+    held_out = config.held_out and TrainingPairs(config.held_out, 0, needs_truth=True)
     matcher = make_matcher_network(config)
     facts, seconds = _run_stage(stages.StereoTask(matcher, config, held_out), pairs, config, run)
     return _write_weights(run, "stereo", facts, seconds, matcher=matcher)
@@ -181,7 +182,8 @@ def train_finetune(config: FinetuneTraining, run: Run) -> Path:
     config = _at_virtual_focal(config, generator.config)
     baseline_m = generator.config.virtual_baseline_m
     pairs = TrainingPairs(config.pairs, config.loop.seed, needs_truth=True, baseline_m=baseline_m)
-    task = stages.FinetuneTask(generator, matcher, config, _held_out(config.held_out))
+    held_out = config.held_out and TrainingPairs(config.held_out, 0, needs_truth=True)
+    task = stages.FinetuneTask(generator, matcher, config, held_out)
     facts, seconds = _run_stage(task, pairs, config, run)
     return _write_weights(run, "finetune", facts, seconds, generator=generator, matcher=matcher)
 
@@ -280,7 +282,3 @@ def _at_virtual_focal(
     return replace(
         config, **{n: replace(p, focal_px=p.focal_px or focal_px) for n, p in there.items()}
     )
-
-
-def _held_out(config: PairsConfig | None, *, needs_truth: bool = True) -> TrainingPairs | None:
-    return None if config is None else TrainingPairs(config, 0, needs_truth=needs_truth)

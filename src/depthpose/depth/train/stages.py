@@ -5,7 +5,7 @@ The generator that selects learns from pairs and single images, synthetic and re
 """
 
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
 import torch
@@ -97,9 +97,9 @@ class StereoTask:
 
 @torch.no_grad()
 def validate_pairs(
-    matcher: StereoNetwork, held_out: TrainingPairs, draw: Callable[[Tensor], Tensor] | None = None
+    matcher: StereoNetwork, held_out: TrainingPairs, generator: synthesis.Generator | None = None
 ) -> ValidationResult:
-    """Disparity error of a matcher on held-out pairs, or on right views that ``draw`` draws.
+    """Disparity error of a matcher on held-out pairs, or on right views that a generator draws.
 
     What is taken for sky has a disparity of 0.
     """
@@ -107,7 +107,9 @@ def validate_pairs(
     device = next(matcher.parameters()).device
     for index in range(len(held_out)):
         pair = held_out.read(index)
-        right = pair.right if draw is None else draw(pair.left)
+        right = pair.right
+        if generator is not None:
+            right = synthesis.draw_right(generator, pair.left[None].to(device))[0].cpu()
         views = (normalise(view.to(device)) for view in (pair.left, right))
         heads, sky = matcher.forward_with_sky(
             *(pad_top_right(v, matcher.config)[None] for v in views)
@@ -160,10 +162,9 @@ class ViewTask:
         adam = config.generator_adam
         self.optimizers = {"generator": (make_adam(generator.parameters(), adam), adam)}
         if config.discriminator != "none":
-            kinds = {
-                "patch": synthesis.PatchDiscriminator, "pixel": synthesis.PixelDiscriminator
-            }  # fmt: skip
-            discriminator = kinds[config.discriminator](config.discriminator_width)
+            discriminator = synthesis.Discriminator(
+                config.discriminator, config.discriminator_width
+            )
             self.modules["discriminator"] = discriminator.train()
             adam = config.discriminator_adam
             self.optimizers["discriminator"] = (make_adam(discriminator.parameters(), adam), adam)
@@ -172,14 +173,15 @@ class ViewTask:
         """Draw once; the discriminator learns from it, then scores it anew."""
         left, right = 2 * batch.left - 1, 2 * batch.right - 1
         drawn = self.generator(left)
-        l1 = losses.l1_loss(drawn, right)
+        l1 = (drawn - right).abs().mean()  # eq. 2.5
         if self.config.discriminator == "none":
             yield Update("generator", self.config.l1_weight * l1, {"l1": l1.detach()})
             return
         discriminator, mode = self.modules["discriminator"], self.config.gan_mode
-        d_loss = losses.discriminator_loss(
-            discriminator(left, right), discriminator(left, drawn.detach()), mode
-        )
+        real = losses.adversarial_loss(discriminator(left, right), mode, is_real=True)
+        fake = discriminator(left, drawn.detach())
+        # Half the sum of both slows the discriminator (pix2pix).
+        d_loss = (real + losses.adversarial_loss(fake, mode, is_real=False)) / 2
         yield Update("discriminator", d_loss, {})
         adversarial = losses.adversarial_loss(discriminator(left, drawn), mode, is_real=True)
         loss = adversarial + self.config.l1_weight * l1
@@ -236,7 +238,7 @@ class FinetuneTask:
         max_disparity_px = self.matcher.config.max_disparity_px
         found_px = found_px.float()
         loss = losses.disparity_loss(found_px, batch.left_px, max_disparity_px)
-        l1 = losses.l1_loss(2 * drawn, 2 * batch.right)
+        l1 = (2 * drawn - 2 * batch.right).abs().mean()
         facts = {"epe": mean_error_px(found_px, batch.left_px, max_disparity_px), "l1": l1.detach()}
         yield Update("generator", loss + self.config.l1_weight * l1, facts)
 
@@ -246,12 +248,7 @@ class FinetuneTask:
         if self.held_out is None:
             return ValidationResult()
         self.generator.eval()
-        device = next(self.generator.parameters()).device
-
-        def draw(left: Tensor) -> Tensor:
-            return synthesis.draw_right(self.generator, left[None].to(device))[0].cpu()
-
-        result = validate_pairs(self.matcher, self.held_out, draw)
+        result = validate_pairs(self.matcher, self.held_out, self.generator)
         self.generator.train()
         return result
 

@@ -23,18 +23,6 @@ class Target(NamedTuple):
 
 
 @compiled
-def match(cloud, R, t, limit, target, how, local, eye, places):
-    """Find for each point of a cloud the place of a surface point that the camera may see."""
-    eye[:] = -(t @ R)
-    local[:] = (cloud - t) @ R
-    sought = _meet_planes(local, eye, target, places) if how == ON_RAY else local
-    distance = np.linalg.norm(eye - target.ball[:3])
-    # A camera within the ball sees no side.
-    least = -SLACK * distance if distance > target.ball[3] else -np.inf
-    find_places(sought, limit, target, how != LOOKED_UP, places, eye, least)
-
-
-@compiled
 def _meet_planes(local, eye, target, places):
     """Give where each ray meets the plane of its sample; a point without one stays."""
     meet = local.copy()
@@ -138,7 +126,13 @@ def refine(cloud, Rs, ts, limits, scale, converged, target, is_exact, every):
             limit, how = limits[k], SEARCHED if is_exact else LOOKED_UP
             if is_exact and 2 * k >= len(limits) - 1:
                 how = ON_RAY
-            match(cloud, R, t, limit, target, how, local, eye, places)
+            # The places of surface points that the camera may see; within the ball it sees no side.
+            eye[:] = -(t @ R)
+            local[:] = (cloud - t) @ R
+            sought = _meet_planes(local, eye, target, places) if how == ON_RAY else local
+            distance = np.linalg.norm(eye - target.ball[:3])
+            least = -SLACK * distance if distance > target.ball[3] else -np.inf
+            find_places(sought, limit, target, how != LOOKED_UP, places, eye, least)
             if k == len(limits) - 1:
                 break
             _add_equations(local, places, R, t - middle, limit, points, normals, eye, how, H, b)
@@ -150,19 +144,6 @@ def refine(cloud, Rs, ts, limits, scale, converged, target, is_exact, every):
             most = max(np.abs(motion[:3]).max(), np.abs(motion[3:]).max() / scale)
             if most < converged and how != SEARCHED and limit <= limits[-1]:
                 break
-
-
-@compiled
-def _step(J, residual, weight):
-    """Solve for turn, shift and growth; give the variance of the growth too."""
-    weighted = J * weight.reshape(-1, 1)
-    H = weighted.T @ J
-    damp(H, 1e-9)
-    inverse = np.linalg.inv(H)
-    motion = inverse @ (weighted.T @ residual)
-    left = residual - J @ motion
-    square = (weight * left * left).sum()
-    return motion, max(square / max(weight.sum() - 7, 1.0) * inverse[6, 6], 0.0)
 
 
 @compiled
@@ -197,7 +178,14 @@ def grow(local, times, middle, limits, target, is_exact, converged, variance):
                 row[0], row[1], row[2] = ay * nz - az * ny, az * nx - ax * nz, ax * ny - ay * nx
                 row[3], row[4], row[5], row[6] = nx, ny, nz, nx * ax + ny * ay + nz * az
                 residual[i], weight[i] = nx * gx + ny * gy + nz * gz, share * share
-            motion, variance[p] = _step(J, residual, weight)
+            weighted = J * weight.reshape(-1, 1)
+            H = weighted.T @ J
+            damp(H, 1e-9)
+            inverse = np.linalg.inv(H)
+            motion = inverse @ (weighted.T @ residual)  # turn, shift and growth
+            left = residual - J @ motion
+            square = (weight * left * left).sum()
+            variance[p] = max(square / max(weight.sum() - 7, 1.0) * inverse[6, 6], 0.0)
             times[p] = min(max(s * (1 + min(max(motion[6], -0.1), 0.1)), 0.5), 2.0)
             rotation(motion[0], motion[1], motion[2], turn)
             # By the inverse of the surface's motion.

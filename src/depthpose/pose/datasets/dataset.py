@@ -35,12 +35,12 @@ from depthpose.pose.cloud import (
     unit_advice,
 )
 from depthpose.pose.datasets.layouts import (
+    LAYOUTS,
     Instance,
-    find_layout,
     layout_of,
     model_path,
-    models_folder,
     object_name,
+    object_names,
     read_bop_models,
     read_models_info,
 )
@@ -115,9 +115,8 @@ class BopDataset:
         Raises:
             InputError: none is left.
         """
-        infos = read_models_info(models_folder(self.folder))
         there = sorted({instance.object_id for instance in self.instances})
-        names = {number: object_name(number, infos.get(number, {})) for number in there}
+        names = object_names(self.folder, there)
         digits = (o for o in objects if isinstance(o, str) and o.isdecimal())
         wanted = {*objects, *(int(o) for o in digits if o not in names.values())}
         kept = [i for i in self.instances if {i.object_id, names[i.object_id]} & wanted]
@@ -159,7 +158,7 @@ def open_bop(folder: str | Path, split: str = "test") -> BopDataset:
 
 def is_bop(folder: str | Path) -> bool:
     """Whether a folder holds a data set that :func:`open_bop` knows."""
-    return find_layout(Path(folder)) is not None
+    return any(layout.splits(Path(folder)) for layout in LAYOUTS.values())
 
 
 def read_instance_mask(instance: Instance) -> Bool[Tensor, "mask_h mask_w"]:
@@ -230,8 +229,7 @@ def _check_models(folder: Path, numbers: set[int], found: list[Problem]) -> dict
     """Read the models that can be read; what is wrong with them goes to ``found``."""
     models: dict[int, ObjectModel] = {}
     try:
-        home = models_folder(folder)
-        infos = read_models_info(home)
+        home, infos = read_models_info(folder)
     except InputError as error:
         found.append(Problem(path=folder, kind="missing", message=str(error)))
         return models

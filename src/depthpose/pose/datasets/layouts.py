@@ -59,7 +59,12 @@ def read_rows(path: Path) -> list[dict[str, Any]]:
 def numbers(entry: object, key: str, count: int, source: str) -> list[float]:
     """Take ``count`` finite numbers."""
     found = entry.get(key) if isinstance(entry, Mapping) else None
-    if not isinstance(found, list) or len(found) != count or not all(map(_is_number, found)):
+    # A whole number beyond 1e300 has no float.
+    if (
+        not isinstance(found, list)
+        or len(found) != count
+        or not all(type(value) in (int, float) and abs(value) < 1e300 for value in found)
+    ):
         raise InputError(f"{source}: {key} is {_short(found)}, where {count} numbers belong")
     return [float(value) for value in found]
 
@@ -77,17 +82,9 @@ def integer(entry: object, key: str, source: str) -> int:
 def number(entry: object, key: str, default: float | None, source: str) -> float:
     """Take a finite number; ``default`` where it is missing and there is one."""
     found = entry.get(key, default) if isinstance(entry, Mapping) else None
-    if not _is_number(found):
+    if not isinstance(found, int | float) or isinstance(found, bool) or not abs(found) < 1e300:
         raise InputError(f"{source}: {key} is {_short(found)}, where a number belongs")
-    assert isinstance(found, int | float)
     return float(found)
-
-
-def pose_from_bop(entry: object, source: str) -> Rigid:
-    """Read ``cam_R_m2c`` (row by row) and ``cam_t_m2c`` (mm)."""
-    return make_pose(
-        numbers(entry, "cam_R_m2c", 9, source), numbers(entry, "cam_t_m2c", 3, source), source
-    )
 
 
 def make_pose(R: list[float], t_mm: list[float], source: str) -> Rigid:
@@ -114,11 +111,6 @@ def camera_from_bop(entry: object, source: str) -> tuple[Float64[Tensor, "3 3"],
     if scale_mm <= 0:
         raise InputError(f"{source}: depth_scale is {scale_mm:g}; it is millimetres a unit")
     return K, 0.001 * scale_mm
-
-
-def _is_number(value: object) -> bool:
-    # A whole number beyond 1e300 has no float.
-    return isinstance(value, int | float) and not isinstance(value, bool) and abs(value) < 1e300
 
 
 def _short(value: object) -> str:
@@ -213,7 +205,9 @@ def bop_instances(scene: Path) -> Iterator[Instance]:
                 depth_unit_m=unit_m,
                 mask=mask if mask.is_file() else None,
                 rgb=rgb,
-                camera_from_model=pose_from_bop(entry, here),
+                camera_from_model=make_pose(
+                    numbers(entry, "cam_R_m2c", 9, here), numbers(entry, "cam_t_m2c", 3, here), here
+                ),
                 visible_fraction=visible if visible >= 0 else None,
                 is_measured=not str(extra.get("pose_source", "")).startswith("pseudo"),
             )
@@ -249,17 +243,6 @@ def read_targets(path: str | Path, folder: str | Path = ".") -> list[BopTarget]:
 _MAX_BYTES = 2**22  # of a list of images
 
 SYMMETRIC = (10, 11)  #: Eggbox and glue: measured by ADD-S ever since Hinterstoisser et al. (2012).
-
-
-def linemod_symmetries(number: int) -> Symmetries:
-    """Give what ``models_info.yml`` does not say: eggbox and glue, turned half about z, look alike.
-
-    BOP's ``models_info.json`` of the same meshes declares these turns.
-    """
-    if number not in SYMMETRIC:
-        return Symmetries()
-    up, origin = torch.tensor([0.0, 0.0, 1.0]).double(), torch.zeros(3).double()
-    return Symmetries(discrete=turn_about(up, origin, torch.tensor([math.pi]).double()))
 
 
 def linemod_instances(folder: Path, split: str) -> Iterator[Instance]:
@@ -301,14 +284,12 @@ def linemod_instances(folder: Path, split: str) -> Iterator[Instance]:
                 depth_unit_m=unit_m,
                 mask=mask if mask.is_file() else None,
                 rgb=rgb if rgb.is_file() else None,
-                camera_from_model=pose_from_bop(own[0], source),
+                camera_from_model=make_pose(
+                    numbers(own[0], "cam_R_m2c", 9, source),
+                    numbers(own[0], "cam_t_m2c", 3, source),
+                    source,
+                ),
             )
-
-
-def segnet_mask(folder: Path, instance: Instance) -> Path:
-    """Name the predicted mask that came with the data set (255 on the object)."""
-    home = folder / "segnet_results" / f"{instance.object_id:02d}_label"
-    return home / f"{instance.image_id:04d}_label.png"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -317,11 +298,11 @@ class Layout:
 
     splits: Callable[[Path], Sequence[str]]  #: names of a folder's splits; none in another layout
     instances: Callable[[Path, str], Iterable[Instance]]  #: of one split of a folder
-    #: of an object, by number, whose models declare none.
-    symmetries: Callable[[int], Symmetries] = lambda _: Symmetries()
-    #: file of the mask that came with the data, for a folder and an instance; None: the data set
-    #: has none.
-    predicted_mask: Callable[[Path, Instance], Path] | None = None
+    #: numbers of objects that look alike after half a turn about z, where their models declare no
+    #: symmetry.
+    half_turns: tuple[int, ...] = ()
+    #: file of the mask that came with the data, by ``{object}`` and ``{image}``; None: it has none.
+    predicted_mask: str | None = None
 
 
 LAYOUTS: dict[str, Layout] = {
@@ -330,8 +311,8 @@ LAYOUTS: dict[str, Layout] = {
             ("train", "test") if any(folder.glob("data/[0-9][0-9]/gt.yml")) else ()
         ),
         instances=linemod_instances,
-        symmetries=linemod_symmetries,
-        predicted_mask=segnet_mask,
+        half_turns=SYMMETRIC,  # as BOP's models_info.json of the same meshes declares
+        predicted_mask="segnet_results/{object:02d}_label/{image:04d}_label.png",
     ),
     "BOP": Layout(
         splits=bop_splits,
@@ -344,30 +325,26 @@ LAYOUTS: dict[str, Layout] = {
 split in it."""
 
 
-def find_layout(folder: Path) -> str | None:
-    """Name the layout of a folder; None where none fits."""
-    return next((name for name, layout in LAYOUTS.items() if layout.splits(folder)), None)
-
-
 def layout_of(folder: Path) -> tuple[str, Layout]:
     """Give the layout of a folder by name, BOP's where none fits."""
-    name = find_layout(folder) or "BOP"
+    name = next((name for name, layout in LAYOUTS.items() if layout.splits(folder)), "BOP")
     return name, LAYOUTS[name]
 
 
 _MODEL_FOLDERS = ("models", "models_eval", "models_points")
 
 
-def models_folder(folder: Path) -> Path:
-    """Find the folder of models of a data set."""
-    found = next((folder / name for name in _MODEL_FOLDERS if (folder / name).is_dir()), None)
-    if found is None:
+def read_models_info(folder: Path) -> tuple[Path, dict[int, dict[str, Any]]]:
+    """Find a data set's folder of models, and read what it says of each object, by number.
+
+    Nothing is said where there is neither ``models_info.json`` nor ``.yml``.
+
+    Raises:
+        InputError: there is no such folder, or the file is damaged.
+    """
+    home = next((folder / name for name in _MODEL_FOLDERS if (folder / name).is_dir()), None)
+    if home is None:
         raise InputError(f"{folder}: no folder {' or '.join(_MODEL_FOLDERS)}; put the meshes there")
-    return found
-
-
-def read_models_info(home: Path) -> dict[int, dict[str, Any]]:
-    """Read ``models_info.json`` or ``.yml`` by number of object; nothing where there is neither."""
     files = (home / "models_info.json", home / "models_info.yml")
     content = next((read_mapping(path) for path in files if path.is_file()), {})
     wrong = [k for k, v in content.items() if entry_number(k) is None or not isinstance(v, dict)]
@@ -375,7 +352,7 @@ def read_models_info(home: Path) -> dict[int, dict[str, Any]]:
         raise InputError(
             f"{home}: models_info entry {str(wrong[0])[:80]!r} is no object's; correct it"
         )
-    return {int(key): entry for key, entry in content.items()}
+    return home, {int(key): entry for key, entry in content.items()}
 
 
 def model_path(home: Path, number: int) -> Path | None:
@@ -392,8 +369,8 @@ def read_bop_models(
     The diameter is the declared one, where there is one: published numbers are shares of it. The
     two symmetric objects of Linemod_preprocessed, which declares none, get theirs.
     """
-    home = models_folder(folder)
-    infos, (_, layout) = read_models_info(home), layout_of(folder)
+    home, infos = read_models_info(folder)
+    _, layout = layout_of(folder)
     models: dict[int, ObjectModel] = {}
     for wanted in sorted(set(numbers)):
         path = model_path(home, wanted)
@@ -401,8 +378,10 @@ def read_bop_models(
             raise InputError(f"{home}: no obj_{wanted:06d}.ply for object {wanted}; put it there")
         info, source = infos.get(wanted, {}), f"{home / 'models_info.json'}: object {wanted}"
         symmetries = symmetries_from_bop(info, source=source)
-        if symmetries.is_none:
-            symmetries = layout.symmetries(wanted)
+        if symmetries.is_none and wanted in layout.half_turns:
+            up, origin = torch.tensor([0.0, 0.0, 1.0]).double(), torch.zeros(3).double()
+            turn = turn_about(up, origin, torch.tensor([math.pi]).double())
+            symmetries = Symmetries(discrete=turn)
         model = read_model(
             path,
             "mm",
@@ -416,14 +395,14 @@ def read_bop_models(
     return models
 
 
-def object_names(folder: Path) -> dict[int, str]:
-    """Say what samples call each object that ``models_info`` lists.
+def object_names(folder: Path, numbers: Iterable[int] | None = None) -> dict[int, str]:
+    """Say what samples call objects, by number; None: all that ``models_info`` lists.
 
     Raises:
         InputError: there is no folder of models, or the file is damaged.
     """
-    infos = read_models_info(models_folder(folder))
-    return {number: object_name(number, info) for number, info in infos.items()}
+    _, infos = read_models_info(folder)
+    return {k: object_name(k, infos.get(k, {})) for k in (infos if numbers is None else numbers)}
 
 
 def object_name(number: int, info: dict[str, Any]) -> str:

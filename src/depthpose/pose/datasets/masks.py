@@ -3,7 +3,7 @@
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, TypeGuard
+from typing import Any
 
 import numpy as np
 import torch
@@ -156,11 +156,16 @@ def read_runs(entry: object, source: str) -> Runs:
     if not isinstance(entry, Mapping) or "counts" not in entry:
         raise InputError(f'{what}; write {{"size": [height, width], "counts": [...]}}')
     size, counts = entry.get("size"), entry["counts"]
-    if not _is_list_of_counts(size) or len(size) != 2 or 0 in size:
+    if (
+        not isinstance(size, list)
+        or len(size) != 2
+        or not all(type(v) is int and v > 0 for v in size)
+    ):
         raise InputError(f"{what}: its size is {size!r}, where [height, width] belongs")
     height, width = size
     text = counts.decode("latin-1") if isinstance(counts, bytes) else counts
-    runs, value, shift = text, 0, 0
+    runs: Any = text
+    value = shift = 0
     if isinstance(text, str):  # five bits a character, runs as differences from the last but one
         runs = list[int]()
         for bits in (ord(character) - 48 for character in text):
@@ -172,13 +177,10 @@ def read_runs(entry: object, source: str) -> Runs:
                 value -= (1 << shift) if bits & 0x10 else 0
                 runs.append(value + (runs[-2] if len(runs) > 2 else 0))
                 value = shift = 0
-    if not _is_list_of_counts(runs) or sum(runs) != height * width or height * width > MAX_PIXELS:
+    is_list = isinstance(runs, list) and all(type(v) is int and v >= 0 for v in runs)
+    if not is_list or sum(runs) != height * width or height * width > MAX_PIXELS:
         raise InputError(f"{what} of {height}x{width} pixels: they do not add up to it")
     return tuple(runs), height, width
-
-
-def _is_list_of_counts(value: object) -> TypeGuard[list[int]]:
-    return isinstance(value, list) and all(type(v) is int and v >= 0 for v in value)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

@@ -16,7 +16,7 @@ from tqdm import tqdm
 from depthpose.core.arrays import take_evenly
 from depthpose.core.camera import AnyCamera, choose_lens
 from depthpose.core.devices import each_in_own_arithmetic, each_in_threads, own_arithmetic
-from depthpose.core.errors import InputError, full_memory, is_of_memory, nearest_name
+from depthpose.core.errors import InputError, full_memory, nearest_name
 from depthpose.core.rigid import Rigid
 from depthpose.core.units import Unit
 from depthpose.pose.cloud import Refusal, local_planes, prepare_cloud, thin
@@ -269,7 +269,6 @@ class PoseEstimator:
         """
         known = SearchTargets(
             names=objects,
-            surface_of=lambda name: self._known(name).surface,
             pairs_of=lambda name: self._pairs(self._known(name)),
             pose_near=self._pose_near,
             max_size_error=self.refusal.max_size_error,
@@ -384,9 +383,9 @@ def or_unreadable(work: Callable[[AnyInput], Made], given: AnyInput) -> Made | P
     except InputError as error:
         reason = str(error)
     except (MemoryError, RuntimeError) as error:
-        if not is_of_memory(error):
+        if (said := full_memory(error)) is None:
             raise
-        reason = f"{given.name}: {full_memory(error)}"
+        reason = f"{given.name}: {said}"
     return refused(given, Refusal(status="unreadable", reason=reason), {})
 
 
@@ -496,7 +495,7 @@ class Registration(PoseEstimator):
             dense_m = take_evenly(cloud_m, _SMOOTHED)
             some_m = dense_m[thin(dense_m, torch.zeros_like(dense_m), _VOXEL * surface.diameter_m)]
             normals, _ = local_planes(dense_m, some_m)
-            proposals = propose_poses(some_m, normals, pairs, surface, _PROPOSALS, generator)
+            proposals = propose_poses(some_m, normals, pairs, _PROPOSALS, generator)
         voted = time.perf_counter()
         seconds["voting"] = voted - began
         best = refine_best(cloud_m, proposals, surface, replace(self.config.icp, starts=1))

@@ -207,16 +207,16 @@ def find_candidates(
     """Refine ``others``, at which ICP ended elsewhere, and the nearly symmetric copies of the best.
 
     The best comes first, then those that are other poses than it and than each other. Where the
-    best was not refined the copies stay where they are. So do those by ``turns``, which lay most
-    of the surface where it is refined.
+    best was not refined the copies stay where they are. ``turns`` (of
+    :class:`~depthpose.pose.voting.point_pairs.PairTable`) give further copies, which are never
+    refined: most of their surface lies where that of the best does.
     """
     copies = known.copies
     assert copies is not None, "with_copies comes first"
     starts = Rigid.cat([others, best.pose @ copies.near])
     kept = [best]
     if not is_refined or len(starts.R) == 0:
-        poses = [starts[k] for k in range(len(starts.R))]
-        tried = [best._replace(pose=pose) for pose in poses]
+        tried = [best._replace(pose=starts[k]) for k in range(len(starts.R))]
     else:
         short = replace(
             config.icp,

@@ -6,7 +6,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import torch
-from jaxtyping import Bool, Float64
+from jaxtyping import Bool
 from torch import Tensor
 
 from depthpose.core.arrays import take_evenly
@@ -24,7 +24,6 @@ from depthpose.pose.estimator.fit import (
 )
 from depthpose.pose.estimator.hypotheses import (
     compare_with_image,
-    is_no_side,
     log_odds_wrong,
     propose_in_frame,
 )
@@ -51,8 +50,8 @@ size that is off by more deviations than the second counts as one that is off by
 _MOST_JUDGED, _LEAST_JUDGED = 40, 4
 """Poses that are judged in an image, and of each object at least."""
 _ALIGNED, _CLEARLY = 0.7, 0.01
-"""Cosine of the normals of readings and surface, and the share of the readings by which a turned
-pose must explain more."""
+"""Cosine of the normals from which a reading and the surface are alike, and by how much more a
+turned pose must score to take the place of the one that was proposed."""
 _ROUNDS = 3
 """So often an image is searched for an object that is there more than once, at most."""
 _MOST_TOGETHER, _NEARLY = 8, 0.2
@@ -82,15 +81,13 @@ class SearchTargets:
 
     Attributes:
         names: of the objects.
-        surface_of: gives the surface of an object by its name.
-        pairs_of: gives its point pairs.
+        pairs_of: gives the point pairs of an object, and its surface, by its name.
         pose_near: clouds and the poses that were proposed for them to estimates.
         max_size_error: of :class:`RefusalConfig`.
         is_sure: answer only what is likelier there than not, and search once, as tracking does.
     """
 
     names: Sequence[str]
-    surface_of: Callable[[str], Surface]
     pairs_of: Callable[[str], PairTable]
     pose_near: Callable[[Sequence[CloudInput], Sequence[Rigid]], list[PoseEstimate]]
     max_size_error: float
@@ -144,7 +141,7 @@ def find_objects(view: ViewInput, known: SearchTargets) -> list[PoseEstimate]:
             own = next((some for some in same if one.shared_with(some[0]) > _RIVAL), None)
             if own is None:
                 pose = _best_turned(frame, one.pose, known.pairs_of(one.object))
-                explained = _explained(frame, pose, known.surface_of(one.object))
+                explained = explained_mask(frame, pose, known.pairs_of(one.object).surface)
                 groups.append([replace(one, pose=pose, explained=explained)])
             elif len(own) < _MOST_TOGETHER:
                 own.append(one)
@@ -166,8 +163,8 @@ def _candidates(
     """Propose poses of every object, and take the likeliest of all, and of each object some."""
 
     def propose(name: str) -> list[_Proposal]:
-        surface, pairs = known.surface_of(name), known.pairs_of(name)
-        poses, log_odds = propose_in_frame(frame, is_left, surface, pairs, len(known.names))
+        pairs = known.pairs_of(name)
+        poses, log_odds = propose_in_frame(frame, is_left, pairs, len(known.names))
         likely = (log_odds < _MOST_LOG_ODDS).nonzero()[:_MOST_JUDGED, 0].tolist()
         return [
             _Proposal(object=name, pose=poses[k], log_odds=float(log_odds[k]), rank=rank)
@@ -179,28 +176,30 @@ def _candidates(
     found = list[_Candidate]()
     for k, one in enumerate(every):
         if k < _MOST_JUDGED or one.rank < _LEAST_JUDGED:
-            own = _explained(frame, one.pose, known.surface_of(one.object))
+            own = explained_mask(frame, one.pose, known.pairs_of(one.object).surface)
             if int(own.sum()) * frame.step**2 >= _LEAST_PIXELS:
                 found.append(_Candidate(**vars(one), explained=own))
     return found
 
 
 def _best_turned(frame: Frame, pose: Rigid, pairs: PairTable) -> Rigid:
-    """Choose among the turns that show most of an object alike the one that explains most readings.
+    """Give the pose or the one of its turns at which the object explains most readings about it.
 
     A handle that a wrong turn of a mug leaves out does not contradict it: a neighbour may be there.
+    So each is scored by the readings that it explains, over the most that one does, less the share
+    of its surface that the image contradicts.
     """
     if len(pairs.turns.R) == 0:
         return pose
     surface, every = pairs.surface, Rigid.cat([pose[None], pose[None] @ pairs.turns])
-    is_read = (frame.depth_m > 0) & ~is_no_side(frame, surface)
+    about = (frame.depth_m > 0) & (frame.plane_m < surface.diameter_m)
     middle_m = pose.apply(surface.middle_m[None])[0]
-    is_read &= (frame.points_m - middle_m).norm(dim=-1) < surface.diameter_m
-    local_m = every.inverse().apply(frame.points_m[is_read])
+    about &= (frame.points_m - middle_m).norm(dim=-1) < surface.diameter_m
+    local_m = every.inverse().apply(frame.points_m[about])
     index = surface.boxes.look_up(local_m)
     is_near = (local_m - surface.points_m[index]).norm(dim=-1) < NEAR * surface.diameter_m
-    cosine = ((surface.normals[index] @ every.R.mT) * frame.normals[is_read]).sum(-1).abs()
-    number = (is_near & ((cosine > _ALIGNED) | ~frame.is_smooth[is_read])).sum(-1)
+    cosine = ((surface.normals[index] @ every.R.mT) * frame.normals[about]).sum(-1).abs()
+    number = (is_near & ((cosine > _ALIGNED) | ~frame.is_smooth[about])).sum(-1)
     contradicted = compare_with_image(frame, every, surface).contradicted
     score = number / number.max().clamp(min=1) - contradicted
     best = int(score.argmax())
@@ -227,27 +226,24 @@ def _judged(
     for one, estimate in zip(inputs, estimates, strict=True):
         if estimate.camera_from_model is None:
             continue
-        surface = known.surface_of(estimate.object)
+        surface = known.pairs_of(estimate.object).surface
         pose = estimate.camera_from_model.double()
         fit = fit_of(seen_about(one.points_m, view, surface.diameter_m), pose, surface, rim=1)
         log_odds = float(log_odds_wrong(frame, pose[None], surface))
-        own = _explained(frame, pose, surface)
+        own = explained_mask(frame, pose, surface)
         log_odds += _DISAGREES * (1 - fit.agrees) + _UNSEEN * (1 - fit.seen)
-        log_odds += _GAP * _gap(frame.points_m[own], pose, surface)
+        # Median distance of points to the planes through the nearest samples, in diameters.
+        local_m = pose.inverse().apply(take_evenly(frame.points_m[own], _COMPARED))
+        index = surface.nearest(local_m)
+        along_m = ((local_m - surface.points_m[index]) * surface.normals[index]).sum(-1)
+        gap = float(along_m.abs().median()) / surface.diameter_m if len(along_m) else NEAR
+        log_odds += _GAP * gap
         off = size_deviations(estimate, view, surface, known.max_size_error)
         log_odds += 0.5 * min(off, _MOST_DEVIATIONS) ** 2  # of a normal distribution
         if log_odds < most_log_odds and not is_cut_out(view, pose, surface):
             found = _Candidate(object=estimate.object, pose=pose, log_odds=log_odds, explained=own)
             answers.append((found, estimate))
     return answers
-
-
-def _gap(points_m: Float64[Tensor, "n 3"], pose: Rigid, surface: Surface) -> float:
-    """Median distance of points to the planes through the nearest samples, in diameters."""
-    local_m = pose.inverse().apply(take_evenly(points_m, _COMPARED))
-    index = surface.nearest(local_m)
-    along_m = ((local_m - surface.points_m[index]) * surface.normals[index]).sum(-1)
-    return float(along_m.abs().median()) / surface.diameter_m if len(along_m) else NEAR
 
 
 def size_deviations(
@@ -294,19 +290,24 @@ def _without_rivals(
             if one.shared_with(other) > _RIVAL:
                 rivals.setdefault(other.object, (other.log_odds, its))
         log_odds = torch.tensor([log_odds for log_odds, _ in rivals.values()], dtype=torch.float64)
-        best, share = _given_others([its for _, its in rivals.values()], (-log_odds).softmax(0))
+        some, shares = [its for _, its in rivals.values()], (-log_odds).softmax(0)
+        best, share = _given_others(some, shares, 1 / (1 + math.exp(one.log_odds)))
         if share >= _LEAST_SHARE:  # else it may be another object
-            kept.append((one, _less_sure(best, 1 / (1 + math.exp(one.log_odds)))))
+            kept.append((one, best))
     return kept, taken
 
 
-def _on_surface(
-    points_m: Float64[Tensor, "h w 3"], is_read: Bool[Tensor, "h w"], pose: Rigid, surface: Surface
-) -> Bool[Tensor, "h w"]:
-    """Mark the pixels whose points lie on a posed surface."""
-    pose, found = pose.double(), is_read.clone()
+def explained_mask(seen: Frame | ViewInput, pose: Rigid, surface: Surface) -> Bool[Tensor, "h w"]:
+    """Mark the pixels whose points lie on a posed surface; in a frame, none of wider planes."""
+    if isinstance(seen, Frame):
+        points_m = seen.points_m
+        found = (seen.depth_m > 0) & (seen.plane_m < surface.diameter_m)
+    else:
+        points_m = back_project(seen.depth_m.double(), seen.K.double())
+        found = points_m.isfinite().all(-1) & seen.mask
+    pose = pose.double()
     middle_m = pose.apply(surface.points_m.mean(0, keepdim=True))
-    found[is_read] = (points_m[is_read] - middle_m).norm(dim=-1) < surface.diameter_m
+    found[found.clone()] = (points_m[found] - middle_m).norm(dim=-1) < surface.diameter_m
     local_m, limit_m = pose.inverse().apply(points_m[found]), NEAR * surface.diameter_m
     gap_m = (local_m - surface.points_m[surface.boxes.look_up(local_m)]).norm(dim=-1)
     # The nearest sample is nearer than the one of the box by its diagonal at most.
@@ -315,17 +316,6 @@ def _on_surface(
     gap_m[is_open] = (some_m - surface.points_m[surface.nearest(some_m)]).norm(dim=-1)
     found[found.clone()] = gap_m < limit_m
     return found
-
-
-def _explained(frame: Frame, pose: Rigid, surface: Surface) -> Bool[Tensor, "h w"]:
-    is_read = (frame.depth_m > 0) & ~is_no_side(frame, surface)
-    return _on_surface(frame.points_m, is_read, pose, surface)
-
-
-def explained_mask(view: ViewInput, pose: Rigid, surface: Surface) -> Bool[Tensor, "h w"]:
-    """Mark the pixels of a depth image whose points lie on a posed surface."""
-    points_m = back_project(view.depth_m.double(), view.K.double())
-    return _on_surface(points_m, points_m.isfinite().all(-1) & view.mask, pose, surface)
 
 
 def is_cut_out(view: ViewInput, pose: Rigid, surface: Surface) -> bool:
@@ -405,21 +395,22 @@ def which_object(estimates: Sequence[PoseEstimate], refusal: RefusalConfig) -> P
     return replace(best, seconds=dict(spent))
 
 
-def _given_others(some: Sequence[PoseEstimate], shares: Tensor) -> tuple[PoseEstimate, float]:
-    """Take the likeliest; the others lower its certainty."""
+def _given_others(
+    some: Sequence[PoseEstimate], shares: Tensor, there: float = 1.0
+) -> tuple[PoseEstimate, float]:
+    """Take the likeliest and its share of the probability ``there`` that any of them is right."""
     number = int(shares.argmax())
     share, estimate = float(shares[number]), some[number]
-    found = _less_sure(estimate, share)
+    certainty = estimate.certainty
+    if certainty is not None:
+        certainty = there * (share * certainty)
+    others = tuple(
+        replace(a, probability=there * (share * a.probability)) for a in estimate.alternatives
+    )
+    found = replace(estimate, certainty=certainty, alternatives=others)
     if len(some) > 1 and estimate.identity is not None and share < 1 - _NAMED:
         second = some[int(shares.topk(2).indices[1])].object
         reason = f"it may be {second} ({1 - share:.0%} for all other objects)"
         identity = replace(estimate.identity, status="not excluded", other=second, reason=reason)
         found = replace(found, identity=identity)
     return found, share
-
-
-def _less_sure(estimate: PoseEstimate, share: float) -> PoseEstimate:
-    """Give a pose and its alternatives together so much of their probability."""
-    certainty = None if estimate.certainty is None else share * estimate.certainty
-    others = tuple(replace(a, probability=share * a.probability) for a in estimate.alternatives)
-    return replace(estimate, certainty=certainty, alternatives=others)

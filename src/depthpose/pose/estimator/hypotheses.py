@@ -64,21 +64,21 @@ _STAGES = (
 
 
 def propose_in_frame(
-    frame: Frame, is_left: Bool[Tensor, "h w"], surface: Surface, table: PairTable, models: int = 1
+    frame: Frame, is_left: Bool[Tensor, "h w"], table: PairTable, models: int = 1
 ) -> tuple[Rigid, Float64[Tensor, " b"]]:
     """Let point pairs of the whole image vote; refine and keep what the image agrees with best.
 
     Args:
         frame: the image.
         is_left: the pixels that vote.
-        surface: of the model.
-        table: its point pairs.
+        table: point pairs of the model.
         models: so many are searched in the image.
 
     Returns:
         Poses, roughly refined, those with which the image agrees best first, and the rough log
         odds of each being wrong.
     """
+    surface = table.surface
     points_m, normals = _scene_points(frame, is_left, surface)
     generator = torch.Generator().manual_seed(0)
     order = torch.randperm(len(points_m), generator=generator)[:_MOST_POINTS]
@@ -100,16 +100,11 @@ def propose_in_frame(
     return poses[best], log_odds[best]
 
 
-def is_no_side(frame: Frame, surface: Surface) -> Bool[Tensor, "h w"]:
-    """Mark the pixels of planes that are too wide to be a side of the object."""
-    return frame.plane_m >= surface.diameter_m
-
-
 def _scene_points(
     frame: Frame, is_left: Bool[Tensor, "h w"], surface: Surface
 ) -> tuple[Float64[Tensor, "n 3"], Float64[Tensor, "n 3"]]:
     """Average points and normals in cells, without planes and what is too far to have a shape."""
-    used = frame.is_smooth & is_left & ~is_no_side(frame, surface)
+    used = frame.is_smooth & is_left & (frame.plane_m < surface.diameter_m)
     used &= _NOISE_PER_M * frame.depth_m.square() < NEAR * surface.diameter_m
     points_m, normals = frame.points_m[used], frame.normals[used]
     if len(points_m) == 0:
@@ -147,7 +142,7 @@ def _projected(frame: Frame, poses: Rigid, surface: Surface, stage: _Stage) -> R
     Point to plane, each point with the reading in its own direction (Blais and Levine 1995): the
     inner side of a thin wall draws no reading of the outer one.
     """
-    usable = frame.is_smooth & ~is_no_side(frame, surface)
+    usable = frame.is_smooth & (frame.plane_m < surface.diameter_m)
     radius_m = surface.diameter_m / 2
     held = _HELD * torch.diag(torch.tensor([radius_m**2] * 3 + [1.0] * 3, dtype=torch.float64))
     for share in stage.limits:
@@ -196,7 +191,8 @@ def compare_with_image(
     before it, and a surface that goes on beyond its silhouette contradict it.
     """
     posed_m, normals, is_inner, beside_m = _posed(poses, surface, stage.every)
-    at, no_side = _look_up(frame, posed_m), is_no_side(frame, surface).flatten()
+    # A plane that is wider than the object is no side of it.
+    at, no_side = _look_up(frame, posed_m), (frame.plane_m >= surface.diameter_m).flatten()
     limit_m = stage.fits * surface.diameter_m + 2 * _NOISE_PER_M * posed_m[..., 2].square()
     gap_m, is_side = at.depth_m - posed_m[..., 2], ~no_side[at.pixel]
     cosine = (normals * frame.normals.flatten(0, 1)[at.pixel]).sum(-1).abs()

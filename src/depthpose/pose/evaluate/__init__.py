@@ -10,9 +10,8 @@ from depthpose.pose.evaluate.evaluate import InstanceRow as InstanceRow
 from depthpose.pose.evaluate.evaluate import ObjectRow as ObjectRow
 from depthpose.pose.evaluate.evaluate import Origin as Origin
 from depthpose.pose.evaluate.evaluate import RiskRow as RiskRow
-from depthpose.pose.evaluate.evaluate import diameter_of as diameter_of
+from depthpose.pose.evaluate.evaluate import error_context as error_context
 from depthpose.pose.evaluate.evaluate import evaluate as evaluate
 from depthpose.pose.evaluate.evaluate import frames_hash as frames_hash
-from depthpose.pose.evaluate.evaluate import is_adds as is_adds
 from depthpose.pose.evaluate.evaluate import of_targets as of_targets
 from depthpose.pose.evaluate.evaluate import read_any as read_any

@@ -4,7 +4,7 @@ import math
 from collections import defaultdict
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cached_property, lru_cache
+from functools import lru_cache
 
 import numpy as np
 import torch
@@ -17,7 +17,7 @@ from depthpose.core.files import image_size, read_depth_png
 from depthpose.core.render import rasterize
 from depthpose.core.rigid import Rigid
 from depthpose.pose.datasets import BopDataset, Instance
-from depthpose.pose.mesh import drawn_triangles, symmetry_transforms, turn_about
+from depthpose.pose.mesh import turn_about
 from depthpose.pose.metrics import (
     BOP_PIXELS,
     BOP_SHARES,
@@ -29,7 +29,6 @@ from depthpose.pose.metrics import (
     mspd_px,
     mssd_m,
     rotation_error_rad,
-    translation_error_m,
     vsd,
 )
 from depthpose.pose.predictions import Place, Prediction, place_of, score_of
@@ -47,16 +46,8 @@ class ErrorContext:
     diameter_m: float  #: of the table that was asked for
     is_adds: bool  #: whether ADD-S decides a success
     vsd_delta_m: float | None  #: see ``EvaluationConfig``; None: VSD is not measured
-
-    @cached_property
-    def symmetries(self) -> Rigid:
-        """Motions of the model that leave it as it is, the identity first."""
-        return symmetry_transforms(self.model.symmetries)
-
-    @cached_property
-    def triangles_m(self) -> Float[Tensor, "f 3 3"]:
-        """What of the model VSD draws; a model of points is drawn as discs."""
-        return drawn_triangles(self.model).double()
+    symmetries: Rigid  #: motions of the model that leave it as it is, the identity first
+    triangles_m: Float[Tensor, "f 3 3"]  #: what VSD draws; a model of points is drawn as discs
 
 
 Errors = Float[Tensor, " n"]  #: one number, or several whose mean a row shows (VSD: one a tau)
@@ -88,11 +79,6 @@ def measure(
                 error = metric.measure(estimated, instance, context)
             found[name] = torch.as_tensor(error, dtype=torch.float64).reshape(-1)
     return found
-
-
-def _nearest(estimated: Rigid, instance: Instance, context: ErrorContext) -> Rigid:
-    true, declared = instance.camera_from_model, context.model.symmetries
-    return nearest_copy(estimated, true, context.symmetries, declared)
 
 
 def nearest_copy(
@@ -133,7 +119,7 @@ def _vsd(estimated: Rigid, instance: Instance, context: ErrorContext) -> Float[T
     poses, K = (estimated, instance.camera_from_model), instance.K.double().clone()
     # What neither pose covers does not count: only the window about both is drawn.
     size = torch.tensor(depth_m.shape).flip(0)
-    points_m = torch.cat([_apply(pose, context.triangles_m).reshape(-1, 3) for pose in poses])
+    points_m = torch.cat([one.double().apply(context.triangles_m).reshape(-1, 3) for one in poses])
     pixels = project(points_m, K)
     low, high = torch.zeros_like(size), size
     if bool(pixels.isfinite().all()):  # else something lies behind the camera
@@ -146,15 +132,11 @@ def _vsd(estimated: Rigid, instance: Instance, context: ErrorContext) -> Float[T
     height, width = window.shape
 
     def render(pose: Rigid) -> Float[Tensor, "h w"]:
-        triangles_m = _apply(pose, context.triangles_m)
+        triangles_m = pose.double().apply(context.triangles_m)
         return rasterize(triangles_m, K, width, height, with_barycentric=False).depth_m
 
     taus_m = [share * context.diameter_m for share in BOP_SHARES]
     return vsd(*poses, window, K, render, taus_m, context.vsd_delta_m)
-
-
-def _apply(pose: Rigid, triangles_m: Float[Tensor, "f 3 3"]) -> Float[Tensor, "f 3 3"]:
-    return triangles_m @ pose.R.double().mT + pose.t_m.double()
 
 
 _read_depth = lru_cache(maxsize=4)(read_depth_png)  # instances of one image follow each other
@@ -184,11 +166,16 @@ METRICS = {  # i: the instance, c: its context
         summaries={"ar_mspd": lambda errors, _: average_recall(errors, BOP_PIXELS)},
     ),
     "rotation_deg": Metric(
-        measure=lambda pose, i, c: rotation_error_rad(pose, _nearest(pose, i, c)).rad2deg(),
+        measure=lambda pose, i, c: rotation_error_rad(
+            pose, nearest_copy(pose, i.camera_from_model, c.symmetries, c.model.symmetries)
+        ).rad2deg(),
         has_median=True,
     ),
     "translation_m": Metric(
-        measure=lambda pose, i, c: translation_error_m(pose, _nearest(pose, i, c)),
+        measure=lambda pose, i, c: (
+            nearest_copy(pose, i.camera_from_model, c.symmetries, c.model.symmetries).t_m.double()
+            - pose.t_m.double()
+        ).norm(dim=-1),
         has_median=True,
     ),
     "vsd": Metric(
@@ -220,16 +207,21 @@ def match(
     BOP does so anew for each error and threshold. Refusals go to instances that are left over.
     """
     places = {instance.name: place_of(instance) for instance in instances}
-    own = [p for p in predictions if _is_own(p, places)]
-    found = {p.estimate.name: p.estimate for p in own}
+    found: dict[str, PoseEstimate] = {}
+    others: list[Prediction] = []
+    for prediction in predictions:
+        place = places.get(prediction.estimate.name)
+        if place is not None and prediction.place in (None, place):
+            found[prediction.estimate.name] = prediction.estimate
+        else:
+            others.append(prediction)
     waiting: dict[Place, list[Instance]] = defaultdict(list)
     for instance in instances:
         if instance.name not in found:
             waiting[place_of(instance)].append(instance)
     offered: dict[Place, list[PoseEstimate]] = defaultdict(list)
-    for prediction in predictions:
-        if not _is_own(prediction, places) and prediction.place in waiting:
-            assert prediction.place is not None
+    for prediction in others:
+        if prediction.place is not None and prediction.place in waiting:
             offered[prediction.place].append(prediction.estimate)
     for place, estimates in offered.items():
         left, model = waiting[place], models[place.object_id]
@@ -248,11 +240,6 @@ def match(
         left = [instance for instance in left if instance.name not in found]
         found |= {i.name: e for i, e in zip(left, refusals, strict=False)}
     return found
-
-
-def _is_own(prediction: Prediction, places: Mapping[str, Place]) -> bool:
-    place = places.get(prediction.estimate.name)
-    return place is not None and prediction.place in (None, place)
 
 
 _TRIED = 40  # instances that each change is tried on

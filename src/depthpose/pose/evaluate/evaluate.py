@@ -23,6 +23,7 @@ from depthpose.pose.evaluate.errors import (
     match,
     measure,
 )
+from depthpose.pose.mesh import drawn_triangles, symmetry_transforms
 from depthpose.pose.metrics import SUCCESS_SHARE
 from depthpose.pose.predictions import (
     STAGES,
@@ -268,26 +269,28 @@ PVNET_DIAMETERS_M = {
 _OTHER_DATA_SET = 0.25
 
 
-def diameter_of(model: ObjectModel, config: EvaluationConfig) -> float:
-    """Give the diameter [m] that the thresholds are shares of.
+def error_context(model: ObjectModel, config: EvaluationConfig) -> ErrorContext:
+    """Say what the errors of an object depend on: the thresholds' diameter, ADD or ADD-S, VSD.
 
     Raises:
         InputError: PVNet's table is asked for an object that it does not have.
     """
-    if config.diameters == "bop":
-        return model.diameter_m
-    printed_m = PVNET_DIAMETERS_M.get(model.number, 0.0)
-    if abs(printed_m / model.diameter_m - 1) > _OTHER_DATA_SET:
-        raise InputError(
-            f"object {model.number} ({model.name}) has a diameter of {model.diameter_m:.3f} m, "
-            "which is no object of PVNet's table of LineMOD; take the data set's diameters, bop"
-        )
-    return printed_m
-
-
-def is_adds(model: ObjectModel, config: EvaluationConfig) -> bool:
-    """Whether an object is measured by ADD-S."""
-    return config.adds == "all" or not model.symmetries.is_none
+    diameter_m = model.diameter_m
+    if config.diameters == "pvnet":
+        diameter_m = PVNET_DIAMETERS_M.get(model.number, 0.0)
+        if abs(diameter_m / model.diameter_m - 1) > _OTHER_DATA_SET:
+            raise InputError(
+                f"object {model.number} ({model.name}) has a diameter of {model.diameter_m:.3f} m, "
+                "which is no object of PVNet's table of LineMOD; take the data set's diameters, bop"
+            )
+    return ErrorContext(
+        model=model,
+        diameter_m=diameter_m,
+        is_adds=config.adds == "all" or not model.symmetries.is_none,
+        vsd_delta_m=config.vsd_delta_m if config.with_vsd else None,
+        symmetries=symmetry_transforms(model.symmetries),
+        triangles_m=drawn_triangles(model).double(),
+    )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -359,15 +362,7 @@ def evaluate(
             f"{len(dataset)} instances; the first is of {one.place or one.estimate.name!r}. Give "
             "the predictions of this very split"
         )
-    contexts = {
-        number: ErrorContext(
-            model=model,
-            diameter_m=diameter_of(model, config),
-            is_adds=is_adds(model, config),
-            vsd_delta_m=config.vsd_delta_m if config.with_vsd else None,
-        )
-        for number, model in dataset.objects.items()
-    }
+    contexts = {number: error_context(model, config) for number, model in dataset.objects.items()}
     # In the order of work; what a method of its own calls otherwise comes last.
     seen = dict.fromkeys(stage for p in predictions for stage in p.estimate.seconds)
     stages = [s for s in STAGES if s in seen] + [s for s in seen if s not in STAGES]

@@ -1,7 +1,7 @@
 """Known objects: model files, diameter, keypoints, surface points, symmetries, units."""
 
 from depthpose.pose.mesh.files import FIXED_UNITS as FIXED_UNITS
-from depthpose.pose.mesh.files import mesh_suffixes as mesh_suffixes
+from depthpose.pose.mesh.files import MESH_READERS as MESH_READERS
 from depthpose.pose.mesh.files import read_geometry as read_geometry
 from depthpose.pose.mesh.files import unit_of as unit_of
 from depthpose.pose.mesh.models import drawn_triangles as drawn_triangles

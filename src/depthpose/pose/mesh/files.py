@@ -61,7 +61,7 @@ def read_geometry(path: AnyPath) -> tuple[np.ndarray, np.ndarray]:
     suffix = Path(path).suffix.lower()
     if suffix not in MESH_READERS:
         if suffix not in cloud_suffixes():
-            known = dict.fromkeys((*mesh_suffixes(), *cloud_suffixes()))
+            known = dict.fromkeys((*MESH_READERS, *cloud_suffixes()))
             raise refused_suffix(path, "model", tuple(known))
         return read_cloud(path).points.double().numpy(), np.empty((0, 3), np.int64)
     vertices, faces = MESH_READERS[suffix](path)
@@ -94,11 +94,6 @@ def read_geometry(path: AnyPath) -> tuple[np.ndarray, np.ndarray]:
     _, first = np.unique(np.sort(place.reshape(-1)[faces], axis=-1), axis=0, return_index=True)
     is_first = np.isin(np.arange(len(faces)), first)
     return vertices, faces[is_first & (area > _NO_AREA * square)]
-
-
-def mesh_suffixes() -> tuple[str, ...]:
-    """Name the suffixes of model files that may have faces, in lower case."""
-    return tuple(MESH_READERS)
 
 
 def _read_ply(path: AnyPath) -> tuple[np.ndarray, Ragged]:

@@ -1,13 +1,13 @@
 """Symmetries found in a shape, near-symmetries, and how far it is from its mirror image."""
 
 import math
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from hashlib import sha256
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -66,15 +66,16 @@ that is off by 4 degrees moves the surface by about as much."""
 _SAME_RAD = 0.15
 _SUPPRESSION_RAD = 0.25
 SURE = 0.5  #: certainty from which a proposal is taken: that of a copy that is off by the tolerance
+_FOLLOWED = 15  # steps of ICP
 _MOST_AXES = 40  # a cube has 13 axes, an icosahedron 31
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class SymmetryProposal:
-    """One way in which an object may look alike."""
+class SymmetryProposal(NamedTuple):
+    """One way in which an object may look alike, in numbers that JSON holds."""
 
     kind: str  #: ``discrete`` or ``continuous``
-    axis: Axis  #: what to turn about
+    direction: Sequence[float]  #: unit vector of the axis to turn about
+    point_m: Sequence[float]  #: a point that the axis goes through
     angle_rad: float | None  #: by how much; nothing for a continuous symmetry
     #: distance of the turned surface from the surface, in diameters: the largest but for 2 % of the
     #: points, and for ``continuous`` over all turns.
@@ -111,17 +112,18 @@ class SurfaceDeviation:
     ) -> Float[Tensor, "*batch"]:
         """The 98th percentile of the distance to the surface, both ways, after turn and shift."""
         turn = Rigid(R, torch.zeros_like(R[..., 0]) if shift is None else shift)
-        return torch.maximum(self._one_way(turn), self._one_way(turn.inverse()))
-
-    def _one_way(self, turn: Rigid) -> Float[Tensor, "*batch"]:
-        moved = self.many @ turn.R.mT + turn.t_m[..., None, :]
-        distance, index = self.nearest(moved)
-        gap = moved.numpy() - self.points.numpy()[index]
-        height = np.abs((gap * self._normals[index]).sum(-1))
-        # Between samples the plane says the distance; beside an edge, the sample does.
         spacing = 2.0 / math.sqrt(len(self.points))
-        beside = np.maximum(distance - spacing, 0)
-        return torch.from_numpy(np.maximum(height, beside)).quantile(0.98, dim=-1)
+        farthest: list[Float[Tensor, "*batch"]] = []
+        for way in (turn, turn.inverse()):
+            moved = way.apply(self.many)
+            distance, index = self.nearest(moved)
+            gap = moved.numpy() - self.points.numpy()[index]
+            height = np.abs((gap * self._normals[index]).sum(-1))
+            # Between samples the plane says the distance; beside an edge, the sample does.
+            beside = np.maximum(distance - spacing, 0)
+            off = torch.from_numpy(np.maximum(height, beside))
+            farthest.append(off.quantile(0.98, dim=-1))
+        return torch.maximum(*farthest)
 
 
 def propose_symmetries(model: ObjectModel, tolerance: float = 0.02) -> list[SymmetryProposal]:
@@ -144,17 +146,28 @@ def propose_symmetries(model: ObjectModel, tolerance: float = 0.02) -> list[Symm
     surface = SurfaceDeviation(model)
     limit = 2 * tolerance
     found: list[SymmetryProposal] = []
-    tried: list[Tensor] = []
-    for R in promising_turns(surface):
-        revolved = [p.axis.direction for p in found if p.kind == "continuous"]
+    tried, revolved = list[Tensor](), list[Tensor]()  # axes, and those of revolution
+    for start in promising_turns(surface):
         if len(revolved) >= 2 or len(tried) >= _MOST_AXES:
             break
-        if _is_known(_axis_of(R), tried, revolved):
+        # The direction that a rotation leaves alone; well defined for half turns too.
+        direction = torch.linalg.svd(start - _EYE).Vh[-1]
+        if _is_known(direction, tried, revolved):
             continue
-        direction = _axis_of(_follow(surface, R))
+        R = start
+        weight = torch.ones(2 * len(surface.many), dtype=torch.float64)
+        for _ in range(_FOLLOWED):  # onto the surface: ICP about the fixed centre
+            _, index = surface.nearest(surface.many @ R.mT)
+            target = surface.points[torch.from_numpy(index)]
+            # With each point its mirror image through the centre, the fit cannot shift.
+            pairs = (torch.cat([surface.many, -surface.many]), torch.cat([target, -target]))
+            R = fit_rigid(*pairs, weight).R
+        direction = torch.linalg.svd(R - _EYE).Vh[-1]
         if not _is_known(direction, tried, revolved):
             tried.append(direction)
-            found += _measure(surface, direction, limit, tolerance)
+            measured = _measure(surface, direction, limit, tolerance)
+            revolved += [direction for p in measured if p.kind == "continuous"]
+            found += measured
     return sorted(found, key=lambda p: (p.kind != "continuous", -p.certainty))
 
 
@@ -164,13 +177,20 @@ def symmetries_from_proposals(proposals: list[SymmetryProposal]) -> Symmetries:
     Without an axis the turns are completed to a group: two symmetries one after the other are one.
     """
     sure = [p for p in proposals if p.certainty >= SURE]
-    axes = tuple(p.axis for p in sure if p.kind == "continuous")
+    lines = [
+        Axis(
+            direction=torch.tensor(p.direction, dtype=torch.float64),
+            point_m=torch.tensor(p.point_m, dtype=torch.float64),
+        )
+        for p in sure
+    ]
+    axes = tuple(line for line, p in zip(lines, sure, strict=True) if p.kind == "continuous")
     kept: list[Rigid] = []
-    for proposal in sure:
+    for line, proposal in zip(lines, sure, strict=True):
         if proposal.angle_rad is None:
             continue
-        turn = turn_about(proposal.axis.direction, proposal.axis.point_m,
-                          torch.tensor(proposal.angle_rad, dtype=torch.float64))  # fmt: skip
+        angle_rad = torch.tensor(proposal.angle_rad, dtype=torch.float64)
+        turn = turn_about(line.direction, line.point_m, angle_rad)
         # A turn about an axis makes it one of those kept where both move the axis alike.
         is_known = any(
             float(geodesic_rad(turn.R, other.R)) < _SAME_RAD
@@ -212,21 +232,8 @@ def with_found_symmetries(
     declared = model.symmetries
     if not (is_taken or on_message) or declared.discrete is not None or declared.continuous:
         return model
-    proposals = [
-        SymmetryProposal(
-            kind=kind,
-            axis=Axis(
-                direction=torch.tensor(direction, dtype=torch.float64),
-                point_m=torch.tensor(point_m, dtype=torch.float64),
-            ),
-            angle_rad=angle_rad,
-            deviation=deviation,
-            certainty=certainty,
-        )
-        for kind, direction, point_m, angle_rad, deviation, certainty in kept(
-            model, _proposal_rows, "symmetries", tolerance
-        )
-    ]
+    rows = kept(model, propose_symmetries, "symmetries", tolerance)
+    proposals = [SymmetryProposal(*row) for row in rows]
     found = replace(symmetries_from_proposals(proposals), is_found=True)
     if found.discrete is None and not found.continuous:
         return model
@@ -243,27 +250,6 @@ def with_found_symmetries(
             )
         )
     return replace(model, symmetries=found) if is_taken else model
-
-
-def _proposal_rows(model: ObjectModel, tolerance: float) -> list[Any]:
-    return [
-        (p.kind, p.axis.direction.tolist(), p.axis.point_m.tolist(), p.angle_rad, p.deviation,
-         p.certainty)
-        for p in propose_symmetries(model, tolerance)
-    ]  # fmt: skip
-
-
-def _is_apart(R: Tensor, others: Iterable[Tensor], limit_rad: float) -> bool:
-    return all(float(geodesic_rad(R, other)) > limit_rad for other in others)
-
-
-def _proposal(
-    kind: str, axis: Axis, angle_rad: float | None, deviation: float, tolerance: float
-) -> SymmetryProposal:
-    certainty = 1 / (1 + (deviation / tolerance) ** 2)
-    return SymmetryProposal(
-        kind=kind, axis=axis, angle_rad=angle_rad, deviation=deviation, certainty=certainty
-    )
 
 
 def _turns(direction: Float[Tensor, "3"], angles: Float[Tensor, " a"]) -> Float[Tensor, "a 3 3"]:
@@ -291,48 +277,35 @@ def _measure(
     surface: SurfaceDeviation, direction: Tensor, limit: float, tolerance: float
 ) -> list[SymmetryProposal]:
     """Measure the full circle about an axis and, unless that is sure, turns of order 2 to 12."""
-    axis = Axis(direction=direction, point_m=surface.centre_m)
     circle = _turns(direction, torch.arange(1, _TURNS) * (2 * math.pi / _TURNS))
-    found: list[SymmetryProposal] = []
+    full, turns = list[tuple[None, float]](), list[tuple[float, float]]()  # angle and deviation
+    worst = math.inf
     if bool((surface.rough_distance(circle) <= _COARSE).all()):
         worst = float(surface.deviation(circle).max())
-        if worst <= limit:
-            found = [_proposal("continuous", axis, None, worst, tolerance)]
-        if worst <= tolerance:
-            return found
+        full = [(None, worst)] if worst <= limit else []
     # Every turn of order 2 to 12, each once.
     shares = sorted({k / order for order in _TRIED_ORDERS for k in range(1, order)})
     angles = torch.tensor(shares, dtype=torch.float64) * (2 * math.pi)
     angles = angles[surface.rough_distance(_turns(direction, angles)) <= _COARSE]
-    if len(angles) == 0:
-        return found
-    deviation = surface.deviation(_turns(direction, angles))
-    kept: list[SymmetryProposal] = []
-    for i in deviation.argsort().tolist():
-        angle, value = float(angles[i]), float(deviation[i])
-        # A turn near a better one is the same symmetry (non-maximum suppression).
-        is_shadow = any(abs(angle - (p.angle_rad or 0)) < _SUPPRESSION_RAD for p in kept)
-        if value <= limit and not is_shadow:
-            kept.append(_proposal("discrete", axis, angle, value, tolerance))
-    return found + kept
-
-
-def _follow(surface: SurfaceDeviation, R: Float[Tensor, "3 3"]) -> Float[Tensor, "3 3"]:
-    """Refine the turned surface onto the surface (ICP about the fixed centre)."""
-    points = surface.many
-    weight = torch.ones(2 * len(points), dtype=torch.float64)
-    for _ in range(15):
-        _, index = surface.nearest(points @ R.mT)
-        target = surface.points[torch.from_numpy(index)]
-        # With each point its mirror image through the centre, the fit cannot shift.
-        R = fit_rigid(torch.cat([points, -points]), torch.cat([target, -target]), weight).R
-    return R
-
-
-def _axis_of(R: Float[Tensor, "3 3"]) -> Float[Tensor, "3"]:
-    """The direction that a rotation leaves alone; well defined for half turns too."""
-    _, _, vh = torch.linalg.svd(R - torch.eye(3, dtype=R.dtype))
-    return vh[-1]
+    if worst > tolerance and len(angles):
+        deviation = surface.deviation(_turns(direction, angles))
+        for i in deviation.argsort().tolist():
+            angle, value = float(angles[i]), float(deviation[i])
+            # A turn near a better one is the same symmetry (non-maximum suppression).
+            is_shadow = any(abs(angle - other) < _SUPPRESSION_RAD for other, _ in turns)
+            if value <= limit and not is_shadow:
+                turns.append((angle, value))
+    return [
+        SymmetryProposal(
+            kind="continuous" if angle is None else "discrete",
+            direction=direction.tolist(),
+            point_m=surface.centre_m.tolist(),
+            angle_rad=angle,
+            deviation=value,
+            certainty=1 / (1 + (value / tolerance) ** 2),
+        )
+        for angle, value in (*full, *turns)
+    ]
 
 
 MIRROR_ALIKE = 0.03
@@ -370,7 +343,9 @@ def _mirror_search(model: ObjectModel) -> float:
     every = torch.cat([c * across + s * crossed - along for c, s in ways])
     starts: list[Float64[Tensor, "3 3"]] = []
     for k in surface.rough_distance(every).argsort().tolist():
-        if len(starts) < _MIRROR_STARTS and _is_apart(every[k], starts, _APART_RAD):
+        if len(starts) == _MIRROR_STARTS:
+            break
+        if all(float(geodesic_rad(every[k], other)) > _APART_RAD for other in starts):
             starts.append(every[k])
     turns = [refine_turn(surface, R @ _FLIP, _FLIP) for R in starts]
     R, shift = torch.stack([t.R for t in turns]) @ _FLIP, torch.stack([t.t_m for t in turns])
@@ -469,7 +444,9 @@ def _search(model: ObjectModel) -> dict[str, Any]:
     quarters = torch.arange(1, 4).double() * (math.pi / 2)
     starts = [R for axis in surface.axes for R in _turns(axis, quarters)]
     for R in promising_turns(surface):
-        if len(starts) < _NEAR_STARTS and _is_apart(R, [_EYE, *starts], _NEAR_SUPPRESSION_RAD):
+        if len(starts) >= _NEAR_STARTS:
+            break
+        if all(float(geodesic_rad(R, o)) > _NEAR_SUPPRESSION_RAD for o in (_EYE, *starts)):
             starts.append(R)
     tried += [refine_turn(surface, R) for R in starts]
     measured = _deviations(tried, surface)

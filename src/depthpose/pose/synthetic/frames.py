@@ -34,11 +34,6 @@ class Pattern:
     phases: Float[Tensor, " w"]
     gloss: float
 
-    def at(self, points_m: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3"]:
-        """Colour of points of the object's own frame."""
-        waves = torch.tanh(2 * (points_m @ self.frequencies.mT + self.phases).sin())
-        return (self.base * (1 + waves @ self.waves)).clamp(0.01, 1)
-
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Solid:
@@ -123,7 +118,10 @@ def shade(
         # From below comes half of what comes from above.
         open_sky = 0.75 + 0.25 * (normal @ towards)[:, None]
         base = ambient * open_sky + lamp * facing
-        colour[own] = solid.pattern.at(local) * base + solid.pattern.gloss * shine * lamp
+        look = solid.pattern
+        waves = torch.tanh(2 * (local @ look.frequencies.mT + look.phases).sin())
+        plain = (look.base * (1 + waves @ look.waves)).clamp(0.01, 1)
+        colour[own] = plain * base + look.gloss * shine * lamp
         start = stop
     return colour
 

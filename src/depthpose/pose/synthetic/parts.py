@@ -5,7 +5,6 @@ in millimetres, as CAD files are.
 """
 
 import math
-from collections.abc import Callable
 
 import numpy as np
 import torch
@@ -22,15 +21,17 @@ _ROUND = 96  # corners of a circle
 _TEETH = 6
 
 
+PARTS = ("bracket", "flange", "mug", "connector", "spool")
+"""Parts by name."""
+
+
 def make_part(name: str, number: int = 0, config: MeshConfig | None = None) -> ObjectModel:
     """Make a part of our own by its name, with the symmetries that it has by construction.
 
     Raises:
         InputError: there is no such part.
     """
-    if name not in PARTS:
-        raise InputError(f"no part is called {name!r}; {nearest_name(name, PARTS)}")
-    vertices, faces = PARTS[name]()
+    vertices, faces = part_mesh(name)
     up, origin = torch.tensor([0.0, 0.0, 1.0]).double(), torch.zeros(3).double()
     symmetries = Symmetries()
     if name == "flange":
@@ -48,66 +49,55 @@ def make_part(name: str, number: int = 0, config: MeshConfig | None = None) -> O
     )
 
 
-def _bracket() -> Mesh:
-    """An angle of two plates with an off-centre hole each, and a rib: no symmetry."""
-    base = _plate((120.0, 70.0, 8.0), (25.0, 5.0), 12.0)
-    wall = turned(_plate((70.0, 80.0, 8.0), (-10.0, 12.0), 20.0), (0.0, 1.0, 0.0), 90.0)
-    rib = box((45.0, 8.0, 40.0))
-    return joined(
-        base,
-        moved(wall, (-56.0, 0.0, 36.0)),
-        moved(rib, (-32.0, 24.0, 22.0)),
-        moved(tube(9.0, 4.0, 22.0), (38.0, -18.0, 12.0)),
-    )
+def part_mesh(name: str) -> Mesh:
+    """Make the mesh of a part.
 
-
-def _flange() -> Mesh:
-    """A disc with six teeth and a hub on one side: it looks alike after sixths of a turn."""
-    angle = np.arange(_ROUND) * (2 * math.pi / _ROUND)
-    radius = 50 + 9 * np.tanh(4 * np.cos(_TEETH * angle))
-    outer = np.stack([radius * np.cos(angle), radius * np.sin(angle)], 1)
-    disc = _ring(outer, _circle(14.0), 14.0)
-    return joined(disc, moved(tube(26.0, 14.0, 30.0), (0.0, 0.0, 20.0)))
-
-
-def _mug() -> Mesh:
-    """A cup with a handle, wider above than below: no turn leaves it as it is."""
-    cup = revolved(
-        [(0.0, 0.0), (32.0, 0.0), (36.0, 6.0), (42.0, 95.0), (38.0, 95.0), (33.0, 10.0), (0.0, 6.0)]
-    )
-    bow = np.linspace(-1.25, 1.25, 24)
-    path = np.stack([37 + 30 * np.cos(bow), 0 * bow, 52 + 30 * np.sin(bow)], 1)
-    return joined(cup, _hose(path, 5.5))
-
-
-def _connector() -> Mesh:
-    """A plug: a body with a key, pins of two lengths and a bent cable: no symmetry."""
-    body, key = box((60.0, 34.0, 26.0)), box((26.0, 8.0, 7.0))
-    pins = [
-        moved(turned(tube(3.5, 1.5, length), (0.0, 1.0, 0.0), 90.0), (30.0 + length / 2.0, y, 4.0))
-        for y, length in ((-9.0, 24.0), (3.0, 14.0))
-    ]
-    bend = np.linspace(0, 1.4, 20)
-    path = np.stack([-28 - 40 * np.sin(bend), 6 + 0 * bend, 40 * (1 - np.cos(bend))], 1)
-    collar = moved(box((14.0, 44.0, 16.0)), (22.0, 0.0, -3.0))
-    return joined(body, moved(key, (-8.0, 6.0, 16.0)), collar, *pins, _hose(path, 7.0))
-
-
-def _spool() -> Mesh:
-    """A body of revolution with unlike ends: only its axis can be known."""
-    radii = (0.0, 34.0, 34.0, 14.0, 12.0, 24.0, 24.0, 8.0, 8.0, 0.0)
-    heights = (0.0, 0.0, 7.0, 14.0, 55.0, 62.0, 70.0, 70.0, 50.0, 50.0)
-    return revolved(list(zip(radii, heights, strict=True)))
-
-
-PARTS: dict[str, Callable[[], Mesh]] = {
-    "bracket": _bracket,
-    "flange": _flange,
-    "mug": _mug,
-    "connector": _connector,
-    "spool": _spool,
-}
-"""Parts by name."""
+    Raises:
+        InputError: there is no such part.
+    """
+    match name:
+        case "bracket":  # two plates with an off-centre hole each, and a rib: no symmetry
+            base = _plate((120.0, 70.0, 8.0), (25.0, 5.0), 12.0)
+            wall = turned(_plate((70.0, 80.0, 8.0), (-10.0, 12.0), 20.0), (0.0, 1.0, 0.0), 90.0)
+            return joined(
+                base,
+                moved(wall, (-56.0, 0.0, 36.0)),
+                moved(box((45.0, 8.0, 40.0)), (-32.0, 24.0, 22.0)),
+                moved(tube(9.0, 4.0, 22.0), (38.0, -18.0, 12.0)),
+            )
+        case "flange":  # a disc with teeth and a hub on one side: alike after sixths of a turn
+            angle = np.arange(_ROUND) * (2 * math.pi / _ROUND)
+            radius = 50 + 9 * np.tanh(4 * np.cos(_TEETH * angle))
+            outer = np.stack([radius * np.cos(angle), radius * np.sin(angle)], 1)
+            disc = _ring(outer, _circle(14.0), 14.0)
+            return joined(disc, moved(tube(26.0, 14.0, 30.0), (0.0, 0.0, 20.0)))
+        case "mug":  # a cup with a handle, wider above than below: no turn leaves it as it is
+            radii = (0.0, 32.0, 36.0, 42.0, 38.0, 33.0, 0.0)
+            heights = (0.0, 0.0, 6.0, 95.0, 95.0, 10.0, 6.0)
+            bow = np.linspace(-1.25, 1.25, 24)
+            path = np.stack([37 + 30 * np.cos(bow), 0 * bow, 52 + 30 * np.sin(bow)], 1)
+            return joined(revolved(list(zip(radii, heights, strict=True))), _hose(path, 5.5))
+        case "connector":  # a plug with a key, two pins and a bent cable: no symmetry
+            pins = [
+                moved(turned(tube(3.5, 1.5, length), (0.0, 1.0, 0.0), 90.0),
+                      (30.0 + length / 2.0, y, 4.0))
+                for y, length in ((-9.0, 24.0), (3.0, 14.0))
+            ]  # fmt: skip
+            bend = np.linspace(0, 1.4, 20)
+            path = np.stack([-28 - 40 * np.sin(bend), 6 + 0 * bend, 40 * (1 - np.cos(bend))], 1)
+            return joined(
+                box((60.0, 34.0, 26.0)),
+                moved(box((26.0, 8.0, 7.0)), (-8.0, 6.0, 16.0)),
+                moved(box((14.0, 44.0, 16.0)), (22.0, 0.0, -3.0)),  # a collar
+                *pins,
+                _hose(path, 7.0),
+            )
+        case "spool":  # a body of revolution with unlike ends: only its axis can be known
+            radii = (0.0, 34.0, 34.0, 14.0, 12.0, 24.0, 24.0, 8.0, 8.0, 0.0)
+            heights = (0.0, 0.0, 7.0, 14.0, 55.0, 62.0, 70.0, 70.0, 50.0, 50.0)
+            return revolved(list(zip(radii, heights, strict=True)))
+        case _:
+            raise InputError(f"no part is called {name!r}; {nearest_name(name, PARTS)}")
 
 
 def _circle(radius: float) -> np.ndarray:

@@ -245,7 +245,10 @@ MARGIN_PX = 8  #: around the object: what lies behind it must be seen where a ma
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Shape:
-    """What is drawn of an object; the corners of its hull are about the middle of its box."""
+    """What is drawn of an object; the corners of its hull are about the middle of its box.
+
+    ``Rigid(R, t - R @ middle_m)`` turns it and puts its middle at t of the camera.
+    """
 
     triangles_m: Float[Tensor, "n 3 3"]
     hull_m: Float[Tensor, "m 3"]
@@ -270,11 +273,6 @@ def make_shape(model: ObjectModel) -> Shape:
     with suppress(QhullError, ValueError):  # flat: every corner counts
         hull_m = corners[torch.from_numpy(ConvexHull(corners.numpy()).vertices).long()]
     return Shape(triangles_m=triangles, hull_m=hull_m - middle, middle_m=middle)
-
-
-def pose_of_middle(shape: Shape, R: Float[Tensor, "3 3"], middle_m: Float[Tensor, "3"]) -> Rigid:
-    """Make the pose that turns the object by R and puts its middle at a place of the camera."""
-    return Rigid(R, middle_m - R @ shape.middle_m)
 
 
 def gaze(direction: Float[Tensor, "3"], roll_rad: float) -> Float[Tensor, "3 3"]:
@@ -393,7 +391,8 @@ class Objects:
         """
         if not 0 <= index < len(self):
             raise IndexError(f"sample {index} of {len(self)}")
-        return self.sample(index)
+        diameter_m = self.models[index % len(self.models)].diameter_m
+        return lift_sample(self.view(index), diameter_m, self.cloud)
 
     def draw_stored(self, workers: int) -> None:
         """Draw all stored views now, in so many threads: processes forked later share them."""
@@ -402,20 +401,18 @@ class Objects:
             for _ in pool.map(self._stored, wanted):
                 pass
 
-    def sample(self, index: int) -> CloudSample:
-        """Make the partial cloud of any index, also beyond the number of samples."""
-        model = self.models[index % len(self.models)]
-        return lift_sample(self.view(index), model.diameter_m, self.cloud)
-
     def view(self, index: int) -> ViewSample:
         """Make the window of depth and the mask that a sample is lifted from."""
         number = index % len(self.models)
         generator = sample_generator(index, self.config.seed)
         shape, views = self._shapes[number], self.config.views
         if views is None:  # drawn anew
-            R, distance_m, K = self._pose(generator)
+            R, distance_m = random_rotation(generator), uniform(generator, *self.config.distance_m)
+            K = self.intrinsics(uniform(generator, *self.config.resolution))
             turn = self._gaze(number, distance_m, K, generator)
-            clean = draw_view(shape, pose_of_middle(shape, turn @ R, turn[:, 2] * distance_m), K)
+            R = turn @ R
+            pose = Rigid(R, turn[:, 2] * distance_m - R @ shape.middle_m)
+            clean = draw_view(shape, pose, K)
         else:  # the camera of a stored view is turned
             stored = self._stored((number, whole(generator, views)))
             K = self.intrinsics(float(stored.K[0, 0]) / self.config.focal_px[0])
@@ -458,18 +455,15 @@ class Objects:
         if key not in self._views:
             number, place = key
             index = place * len(self.models) + number
-            R, distance_m, K = self._pose(sample_generator(index, self.config.seed + _BANK_SEED))
+            generator = sample_generator(index, self.config.seed + _BANK_SEED)
             shape = self._shapes[number]
-            middle = torch.tensor([0.0, 0.0, distance_m], dtype=torch.float64)
-            view = draw_view(shape, pose_of_middle(shape, R, middle), K)
+            R, distance_m = random_rotation(generator), uniform(generator, *self.config.distance_m)
+            K = self.intrinsics(uniform(generator, *self.config.resolution))
+            middle_m = torch.tensor([0.0, 0.0, distance_m], dtype=torch.float64)
+            view = draw_view(shape, Rigid(R, middle_m - R @ shape.middle_m), K)
             depth_m = (view.depth_m - distance_m).half()
             self._views[key] = replace(view, depth_m=depth_m, distance_m=distance_m)
         return self._views[key]
-
-    def _pose(self, generator: torch.Generator) -> tuple[Tensor, float, Tensor]:
-        R = random_rotation(generator)
-        distance_m = uniform(generator, *self.config.distance_m)
-        return R, distance_m, self.intrinsics(uniform(generator, *self.config.resolution))
 
     def intrinsics(self, scale: float = 1.0) -> Float[Tensor, "3 3"]:
         """Intrinsic matrix of the sensor's image at so many times its size."""

@@ -4,7 +4,7 @@ import dataclasses
 import math
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import ClassVar, NamedTuple
+from typing import ClassVar, Generic, NamedTuple, TypeVar
 
 import torch
 from jaxtyping import Float, Int
@@ -17,7 +17,7 @@ from depthpose.pose.baselines import DepthImageNet
 from depthpose.pose.cloud import lift_sample, refusal_of, sample_points, voxelise
 from depthpose.pose.config import CloudConfig, ObjectsConfig
 from depthpose.pose.datasets import open_bop
-from depthpose.pose.datasets.layouts import models_folder, read_bop_models, read_models_info
+from depthpose.pose.datasets.layouts import read_bop_models, read_models_info
 from depthpose.pose.estimator import DepthImageRegressor, GeoPoseNet
 from depthpose.pose.mesh import (
     read_model,
@@ -28,12 +28,11 @@ from depthpose.pose.mesh import (
 )
 from depthpose.pose.metrics import SUCCESS_SHARE, add_of_nearest_m
 from depthpose.pose.synthetic import Objects, make_part
-from depthpose.pose.train.config import FramesConfig, HeldOutConfig, ModelsConfig, ViewsTraining
+from depthpose.pose.train.config import HeldOutConfig, ModelsConfig, PoseTraining, ViewsTraining
 from depthpose.pose.types import (
     CloudSample,
     ObjectModel,
     PoseEstimate,
-    PoseTruth,
     SeenPoints,
     ViewSample,
 )
@@ -64,42 +63,31 @@ class CloudBatch(NamedTuple):
     t_m: Float[Tensor, "clouds 3"]  #: translation
 
     @property
-    def instance(self) -> Int[Tensor, " points"]:
-        """Which cloud each point belongs to."""
-        return self.coordinates[:, 0].long()
-
-    @property
     def seen(self) -> SeenPoints:
         """What the network is shown: everything but the truth."""
         return SeenPoints(
             points_m=self.points_m,
             coordinates=self.coordinates,
             features=self.features,
-            class_of_point=self.class_of[self.instance],
+            class_of_point=self.class_of[self.coordinates[:, 0].long()],
         )
 
 
-class TrainingViews:
+Config = TypeVar("Config", bound=ViewsTraining)
+
+
+class TrainingViews(Generic[Config]):
     """What is learnt from by sample index: synthetic views, real frames, or both.
 
-    ``seed`` is that of the order of frames and of the choice of points; ``first_alone`` synthetic
-    views at the start show the first object.
+    ``seed`` is that of the order of frames and of the choice of points.
     """
 
-    def __init__(
-        self,
-        models: Sequence[ObjectModel],
-        synthetic: ObjectsConfig,
-        frames: FramesConfig | None,
-        cloud: CloudConfig,
-        seed: int,
-        first_alone: int = 0,
-    ) -> None:
-        self.models, self.cloud, self.seed = models, cloud, seed
-        self._first_alone = first_alone
-        self.synthetic = Objects(models, synthetic, cloud)
+    def __init__(self, models: Sequence[ObjectModel], config: Config, seed: int) -> None:
+        self.models, self.config, self.seed = models, config, seed
+        self.synthetic = Objects(models, config.objects, config.cloud)
         self._class_of = {model.name: k for k, model in enumerate(models)}
-        self._frames, self._real = frames, None
+        self._frames, self._real = config.frames, None
+        frames = config.frames
         if frames is not None:
             dataset = open_bop(frames.folder, frames.split)
             self._real = dataset.of_objects(*(model.number for model in models))
@@ -124,7 +112,7 @@ class TrainingViews:
         return self.synthetic.view(place), False
 
 
-class TrainingClouds(TrainingViews):
+class TrainingClouds(TrainingViews[PoseTraining]):
     """A cloud by sample index, synthetic or of a frame."""
 
     def __getitem__(self, index: int) -> Cloud:
@@ -133,15 +121,15 @@ class TrainingClouds(TrainingViews):
         Raises:
             InputError: so many in a row have too few points that the config must be wrong.
         """
-        generator = sample_generator(index, self.seed)
+        generator, cloud = sample_generator(index, self.seed), self.config.cloud
         for attempt in range(TRIES):
             # Far beyond any training, and the same object.
             place = index + attempt * len(self.models) * 2**32
             # Sample i shows object i modulo their number.
-            place *= len(self.models) if place < self._first_alone else 1
+            place *= len(self.models) if place < self.config.first_alone else 1
             view, is_frame = self._view(place, generator)
             number = self._class_of[view.input.object]
-            sample = lift_sample(view, self.models[number].diameter_m, self.cloud)
+            sample = lift_sample(view, self.models[number].diameter_m, cloud)
             if self._frames is not None and is_frame:
                 angle_rad = 2 * math.pi * float(torch.rand((), generator=generator))
                 if self._frames.with_roll:  # the camera turns: cloud and pose turn with it
@@ -154,11 +142,11 @@ class TrainingClouds(TrainingViews):
                         input=dataclasses.replace(sample.input, points_m=points_m),
                         truth=dataclasses.replace(sample.truth, camera_from_model=turned),
                     )
-            if refusal_of(sample.input.points_m, self.cloud) is None:
-                return voxelised_cloud(sample, number, self.cloud, generator)
+            if refusal_of(sample.input.points_m, cloud) is None:
+                return voxelised_cloud(sample, number, cloud, generator)
         raise InputError(
             f"sample {index}: {TRIES} samples in a row have fewer than "
-            f"{self.cloud.min_points} points; bring the camera nearer (distance_m), or lower "
+            f"{cloud.min_points} points; bring the camera nearer (distance_m), or lower "
             "min_points"
         )
 
@@ -219,9 +207,9 @@ def read_models(
     if config.bop:
         folder, numbers = Path(config.bop), config.objects
         if not numbers:
-            home = models_folder(folder)
+            home, infos = read_models_info(folder)
             files = [path.stem.removeprefix("obj_") for path in home.glob("obj_*.ply")]
-            there = {int(name) for name in files if name.isdigit()} | set(read_models_info(home))
+            there = {int(name) for name in files if name.isdigit()} | set(infos)
             numbers = tuple(sorted(there))
             if not numbers:
                 raise InputError(f"{home}: holds no obj_NNNNNN.ply; put the models there")
@@ -309,14 +297,10 @@ def held_out_objects(
     return Objects(models, config_here, cloud)
 
 
-def pose_error(estimate: PoseEstimate, truth: PoseTruth, model: ObjectModel) -> float:
-    """``add_error`` of an estimate; infinite where there is no answer."""
-    found = estimate.camera_from_model
-    return math.inf if found is None else add_error(found, truth.camera_from_model, model)
-
-
-def add_error(found: Rigid, truth: Rigid, model: ObjectModel) -> float:
-    """ADD to the nearest symmetric pose, in diameters."""
+def add_error(found: Rigid | None, truth: Rigid, model: ObjectModel) -> float:
+    """ADD to the nearest symmetric pose, in diameters; infinite where there is no answer."""
+    if found is None:
+        return math.inf
     points_m, copies = sample_surface(model, _SURFACE)[0], symmetry_transforms(model.symmetries)
     return float(add_of_nearest_m(found, truth, points_m, copies)) / model.diameter_m
 
@@ -376,6 +360,6 @@ def _posed(weights: PoseWeights, objects: Objects) -> tuple[list[PoseEstimate], 
         found = net.estimate_many([sample.input for sample in samples])
         estimates += found
         for place, estimate, sample in zip(places, found, samples, strict=True):
-            model = weights.models[place % len(weights.models)]
-            errors.append(pose_error(estimate, sample.truth, model))
+            model, pose = weights.models[place % len(weights.models)], estimate.camera_from_model
+            errors.append(add_error(pose, sample.truth.camera_from_model, model))
     return estimates, errors

@@ -1,6 +1,7 @@
 """Training of segmentation: annotated images, random changes of them, and the task."""
 
 from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
 
@@ -25,18 +26,17 @@ from depthpose.core.loop import (
     write_card,
 )
 from depthpose.core.run import find_rank
-from depthpose.pose.datasets import Instance, open_bop
+from depthpose.pose.datasets import Instance, object_names, open_bop
 from depthpose.pose.datasets.dataset import read_instance_mask
-from depthpose.pose.datasets.layouts import models_folder, object_name, read_models_info
 from depthpose.pose.losses import mask_loss
 from depthpose.pose.segmentation import (
     ENCODER_KIND,
     FCN,
     KIND,
-    Overlap,
-    SegmentationConfig,
     SegmentationWeights,
     class_probabilities,
+    count_overlap,
+    intersection_over_union,
     normalise_colors,
     write_segmentation,
 )
@@ -73,8 +73,7 @@ class AnnotatedImages:
                     f"{config.folder}: shows none of the objects {list(config.objects)}; it has "
                     f"{there}"
                 )
-            infos = read_models_info(models_folder(Path(config.folder)))
-            objects = {number: object_name(number, infos.get(number, {})) for number in wanted}
+            objects = object_names(Path(config.folder), wanted)
         self.objects = objects  # names by number, in the order of the classes
         self._class_of = {number: k for k, number in enumerate(objects, 1)}
         self._images = list(images.values())
@@ -109,18 +108,14 @@ class AnnotatedImages:
         return LabelledImage(held[0].float() / 255, held[1].long())
 
 
+@dataclass(frozen=True, eq=False)
 class TrainingImages:
     """An image by sample index, randomly changed and cut."""
 
-    def __init__(
-        self,
-        images: AnnotatedImages,
-        config: ImageAugmentConfig,
-        network: SegmentationConfig,
-        seed: int,
-    ) -> None:
-        self.images, self.config, self.seed = images, config, seed
-        self._long_side_px = network.long_side_px
+    images: AnnotatedImages  #: what is changed
+    config: ImageAugmentConfig  #: how
+    long_side_px: int  #: of the images that the network sees
+    seed: int  #: of the order and of the changes
 
     def __len__(self) -> int:
         return len(self.images)
@@ -129,7 +124,7 @@ class TrainingImages:
         """Make the sample of an index."""
         generator = sample_generator(index, self.seed)
         given = self.images[shuffled_index(index, len(self), self.seed)]
-        scale = self._long_side_px / max(given.image.shape[-2:])
+        scale = self.long_side_px / max(given.image.shape[-2:])
         scale *= uniform(generator, *self.config.scale)
         changed = cut_window(given, scale, self.config.crop_px, generator)
         image = jitter_colors(changed.image, self.config.jitter, generator)
@@ -198,24 +193,24 @@ class SegmentationTask:
         """One update: label and compare."""
         logits = self.network(normalise_colors(batch.image)).float()
         loss = mask_loss(logits, batch.labels, self.config.object_weight)
-        overlap = Overlap(self.network.classes)
-        overlap.add(logits.argmax(1), batch.labels)
-        yield Update("network", loss, {"iou": overlap.iou()[1:].nanmean().nan_to_num(0.0)})
+        table = count_overlap(logits.argmax(1), batch.labels, self.network.classes)
+        iou = intersection_over_union(table)[1:].nanmean().nan_to_num(0.0)
+        yield Update("network", loss, {"iou": iou})
 
     def validate(self) -> ValidationResult:
         """Intersection over union on held-out images; the first with its labels as a picture."""
         if self._held_out is None:
             return ValidationResult()
         self.network.eval()
-        overlap = Overlap(self.network.classes)
-        pictures = {}
+        classes, pictures = self.network.classes, {}
+        table = torch.zeros(classes, classes, dtype=torch.int64)
         for index in range(len(self._held_out)):
             image, labels = self._held_out[index]
             found = class_probabilities(self.network, image).argmax(0)
-            overlap.add(found, labels)
+            table += count_overlap(found, labels, classes)
             if index == 0:
                 # The background darkened, and each object tinted with a colour of its own.
-                classes, both = self.network.classes, torch.cat([found, labels], -1)
+                both = torch.cat([found, labels], -1)
                 angle = 2 * torch.pi * torch.arange(classes) / max(classes - 1, 1)
                 phase = torch.tensor([0.0, 2.0, 4.0]) * torch.pi / 3
                 tint = (0.5 + 0.5 * (angle[:, None] + phase).cos())[both].movedim(-1, 0)
@@ -224,7 +219,7 @@ class SegmentationTask:
                     both > 0, 0.5 * twice + 0.5 * tint, 0.3 * twice
                 )
         self.network.train()
-        iou = overlap.iou()
+        iou = intersection_over_union(table)
         numbers = {
             f"held_out/iou_{name}": float(value)
             for name, value in zip(("background", *self.objects.values()), iou, strict=True)
@@ -246,7 +241,7 @@ def train_segmentation(config: SegmentationTraining, run: Run) -> Path:
         load_weights(network.encoder, held, str(path))
     claim_run(config, run)
     task = SegmentationTask(network, config, images.objects)
-    samples = TrainingImages(images, config.augment, config.network, config.loop.seed)
+    samples = TrainingImages(images, config.augment, config.network.long_side_px, config.loop.seed)
     seconds = run.train(task, samples, config.loop)
     path = run.folder / "segmentation.safetensors"
     if find_rank().rank:

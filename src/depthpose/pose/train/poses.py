@@ -11,7 +11,13 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from depthpose.core.checkpoint import bound_facts, file_sha256, find_weights, warn_of_terms
+from depthpose.core.checkpoint import (
+    bound_facts,
+    file_sha256,
+    find_weights,
+    read_checkpoint,
+    warn_of_terms,
+)
 from depthpose.core.config import config_to_dict
 from depthpose.core.errors import InputError
 from depthpose.core.files import write_json
@@ -59,7 +65,7 @@ from depthpose.pose.weights import (
     AnyNetwork,
     DirectionNet,
     PoseWeights,
-    read_pose_network,
+    network_of,
     read_pose_weights,
     write_pose_weights,
 )
@@ -87,9 +93,8 @@ class PoseTask(ViewsTask):
         directions = self.network.directions(batch.seen).float()
         copies = self._copies_m.to(batch.R)[batch.class_of]
         copies_m = copies @ batch.R.mT[:, None] + batch.t_m[:, None, None]
-        loss = direction_loss(
-            directions, batch.points_m, copies_m, batch.instance, self.config.loss
-        )
+        instance = batch.coordinates[:, 0].long()
+        loss = direction_loss(directions, batch.points_m, copies_m, instance, self.config.loss)
         yield Update("network", loss, {"directions": loss.detach()})
 
     def held_out_error(self, view: ViewSample, index: int) -> float:
@@ -178,14 +183,8 @@ class CropSample(NamedTuple):
     t_m: Float[Tensor, "*b 3"]
 
 
-class TrainingCrops(TrainingViews):
+class TrainingCrops(TrainingViews[DepthImageTraining]):
     """A crop of a view, synthetic or of a frame, by sample index."""
-
-    def __init__(
-        self, models: Sequence[ObjectModel], config: DepthImageTraining, seed: int
-    ) -> None:
-        super().__init__(models, config.objects, config.frames, config.cloud, seed)
-        self.config = config.network
 
     def __getitem__(self, index: int) -> CropSample:
         """Make the sample of an index; one with too few pixels is replaced by another."""
@@ -194,12 +193,12 @@ class TrainingCrops(TrainingViews):
             place = index + attempt * len(self.models) * 2**32
             view, _ = self._view(place, sample_generator(place, self.seed))
             number = self._class_of[view.input.object]
-            crop = cut_depth(view.input, self.config, self.models[number].diameter_m)
+            crop = cut_depth(view.input, self.config.network, self.models[number].diameter_m)
             if crop is not None:
                 pose = view.truth.camera_from_model
                 return CropSample(crop, torch.tensor(number), pose.R.float(), pose.t_m.float())
         raise InputError(
-            f"{TRIES} views in a row have fewer than {self.config.min_points} masked "
+            f"{TRIES} views in a row have fewer than {self.config.network.min_points} masked "
             "pixels with a depth; bring the camera nearer (distance_m), or lower min_points"
         )
 
@@ -214,7 +213,10 @@ class DepthImageTask(ViewsTask):
     ) -> None:
         super().__init__(network, models, config)
         self.network, self.config = network, config
-        self._points_m = surface_points(models, config.surface_points)
+        # Points of each surface; those of a sparse model of points come again.
+        count = config.surface_points
+        every = [sample_surface(model, count)[0] for model in models]
+        self._points_m = torch.stack([some[torch.arange(count) % len(some)] for some in every])
         self._copies = symmetric_copies(models, _IMAGE_SYMMETRY_STEP).float()
         self._diameter_m = torch.tensor([model.diameter_m for model in models])
 
@@ -242,12 +244,6 @@ class DepthImageTask(ViewsTask):
         )
 
 
-def surface_points(models: Sequence[ObjectModel], count: int) -> Float[Tensor, "classes n 3"]:
-    """Points of each object's surface; those of a sparse model of points come again."""
-    every = [sample_surface(model, count)[0] for model in models]
-    return torch.stack([points[torch.arange(count) % len(points)] for points in every])
-
-
 _STATISTICS_CLOUDS = 64  # from which statistics of batch norm, lost by folding, are computed anew
 
 
@@ -270,14 +266,7 @@ def train_pose(config: PoseTraining | DepthImageTraining, run: Run) -> Path:
         network = DepthImageNet(config.network)
         task = DepthImageTask(network, models, config)
     else:
-        samples = TrainingClouds(
-            models,
-            config.objects,
-            config.frames,
-            config.cloud,
-            config.loop.seed,
-            first_alone=config.first_alone,
-        )
+        samples = TrainingClouds(models, config, config.loop.seed)
         if config.loop.workers > 1 and (config.frames is None or config.frames.share < 1):
             samples.synthetic.draw_stored(config.loop.workers)
         if isinstance(config.network, PointNetConfig):
@@ -310,9 +299,10 @@ def train_pose(config: PoseTraining | DepthImageTraining, run: Run) -> Path:
     return path
 
 
-def _start_from(network: AnyNetwork, start: str, samples: TrainingViews) -> None:
+def _start_from(network: AnyNetwork, start: str, samples: TrainingViews[Any]) -> None:
     """Copy weights; of other objects, all but the last layer, except of a depth image's."""
-    found = read_pose_network(find_weights(start))
+    path = find_weights(start)
+    found = network_of(read_checkpoint(path), str(path))
     wanted, given = config_to_dict(network.config), config_to_dict(found.config)
     has_norms = isinstance(network, ResUNet) and network.config.norm == "batch"
     free = ("classes", "norm", "with_bias") if has_norms else ("classes",)

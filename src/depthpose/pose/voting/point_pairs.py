@@ -9,10 +9,11 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import torch
-from jaxtyping import Bool, Float32, Float64, Int32, Int64
+from jaxtyping import Float32, Float64, Int32, Int64
 from torch import Tensor
 from torch.nn.functional import normalize
 
+from depthpose.core.arrays import take_evenly
 from depthpose.core.rigid import Rigid, geodesic_rad
 from depthpose.pose.cloud import thin
 from depthpose.pose.compiled import ANGLES, DISTANCES, MOST_ALIKE, TURNS, serves
@@ -46,8 +47,8 @@ _UNSEEN = 0.3
 _OWN_REFERENCES, _OWN_PEAKS, _OWN_POINTS = 40, 48, 250
 """Points of a model that look for it in itself, poses that each proposes, and points compared."""
 _ROUGHLY, _MOSTLY = 0.5, 0.8
-"""A turn that lays so much of a surface on itself is refined; then it shows it alike, but for a
-feature, if it lays so much."""
+"""A turn that lays the first share of a surface on itself is refined; one that then lays the
+second share there is kept."""
 _TURNED, _TURNED_RAD, _MOST_TURNS = 0.7, math.radians(12), 36
 """Cosine of the normals there, the least angle between two turns, and their number at most."""
 
@@ -57,7 +58,8 @@ class PairTable:
     """Pairs of points of a model, sorted by their features.
 
     Attributes:
-        points_m: of the surface as it is seen from outside, some 0.05 diameters apart.
+        points_m: of the surface as it is seen from outside, 0.07 diameters apart or more, in the
+            order of the model's faces.
         frames: of each point its normal, toward who sees it, and two tangents, as columns.
         bounds: pairs ``bounds[k]`` to ``bounds[k + 1]`` have feature ``k``.
         first: number of the first point of each pair.
@@ -74,40 +76,45 @@ class PairTable:
 
     @cached_property
     def turns(self) -> Rigid:
-        """Turns that lay most of the surface on itself, as ``model_from_model``; no symmetries.
+        """Motions that lay 80 % of the surface on itself, ``model_from_model``; no symmetries.
 
         A mug has them about its axis: but for its handle it looks alike. They are found by looking
-        for the model in itself.
+        for the model in itself, when they are first wanted.
         """
-        surface, references = self.surface, torch.arange(min(_OWN_REFERENCES, len(self.points_m)))
+        surface = self.surface
+        # Of all sides, not those of the first faces.
+        references = take_evenly(torch.arange(len(self.points_m)), _OWN_REFERENCES)
         found, _ = vote_poses(self.points_m, self.frames[..., 0], references, self, _OWN_PEAKS)
-        found = found[_apart_alike(found, surface, _ROUGHLY)]
+        found = found[_distinct_turns(found, surface, _ROUGHLY)]
         # With the camera in the middle of the model, from where it sees all.
         points_m, starts = surface.points_m - surface.middle_m, found.t_m - surface.middle_m
         found = refine_roughly(points_m, Rigid(found.R, starts), surface, IcpConfig())
         found = Rigid(found.R, found.t_m + surface.middle_m)
-        found = found[_apart_alike(found, surface, _MOSTLY)]
+        found = found[_distinct_turns(found, surface, _MOSTLY)]
         # One after the other they are turns too, which fill the gaps between those that were found.
         twice = found[:, None] @ found
         found = Rigid.cat([found, Rigid(twice.R.flatten(0, 1), twice.t_m.flatten(0, 1))])
-        return found[_apart_alike(found, surface, _MOSTLY)]
+        return found[_distinct_turns(found, surface, _MOSTLY)]
 
 
-def _apart_alike(turns: Rigid, surface: Surface, least: float) -> list[int]:
-    """Choose what lays so large a share of a surface on itself, none nearly as one before it."""
+def _distinct_turns(turns: Rigid, surface: Surface, least: float) -> list[int]:
+    """Choose turns that lay so large a share of a surface on itself, the best first.
+
+    None is within 12 degrees of one before it or of a symmetry, nor of the two together.
+    """
     every = max(1, len(surface.points_m) // _OWN_POINTS)
     local_m = turns.inverse().apply(surface.points_m[::every])
     index = surface.boxes.look_up(local_m)
     is_alike = (local_m - surface.points_m[index]).norm(dim=-1) < NEAR * surface.diameter_m
     cosine = ((surface.normals[index] @ turns.R.mT) * surface.normals[::every]).sum(-1)
     share = (is_alike & (cosine.abs() > _TURNED)).double().mean(-1)
-    chosen, known = list[int](), surface.copies.R
+    chosen, taken = list[int](), surface.copies.R
     for k in share.argsort(descending=True).tolist():
         if share[k] < least or len(chosen) == _MOST_TURNS:
             break
-        if float(geodesic_rad(turns.R[k].expand_as(known), known).min()) > _TURNED_RAD:
+        if float(geodesic_rad(turns.R[k].expand_as(taken), taken).min()) > _TURNED_RAD:
             chosen.append(k)
-            known = torch.cat([known, turns.R[k] @ surface.copies.R])
+            taken = torch.cat([taken, turns.R[k] @ surface.copies.R])
     return chosen
 
 
@@ -146,7 +153,6 @@ def propose_poses(
     points_m: Float64[Tensor, "n 3"],
     normals: Float64[Tensor, "n 3"],
     table: PairTable,
-    surface: Surface,
     count: int,
     generator: torch.Generator,
 ) -> Rigid:
@@ -156,7 +162,6 @@ def propose_poses(
         points_m: of the cloud, about 0.05 diameters apart, in the camera frame.
         normals: theirs, toward the camera.
         table: pairs of the model.
-        surface: of the same model.
         count: how many poses at most.
         generator: chooses the reference points.
     """
@@ -164,7 +169,7 @@ def propose_poses(
     points_m, normals = points_m[chosen[:_SCENE]], normals[chosen[:_SCENE]]
     references = torch.arange(min(_REFERENCES, len(points_m)))
     poses, _ = vote_poses(points_m, normals, references, table, _PEAKS)
-    scores = _scores(points_m, normals, poses, surface)
+    scores = _scores(points_m, normals, poses, table.surface)
     best = scores.argsort(descending=True, stable=True)[:count]
     return poses[best]
 
@@ -172,26 +177,23 @@ def propose_poses(
 def _seen_from_outside(
     surface: Surface,
 ) -> tuple[Float64[Tensor, "n 3"], Float64[Tensor, "n 3"]]:
-    """Give the points that a camera can see, with normals toward it; thin sheets have both."""
+    """Give the points that a camera far off sees, with normals toward it; thin sheets have both."""
     half = fibonacci_directions(_VIEWS // 2).double()
     directions = torch.cat([half, -half])
-    seen = torch.stack([_is_seen(surface, toward) for toward in directions])
-    cosine = directions @ surface.normals.T
+    every = []
+    for toward in directions:
+        across = torch.linalg.svd(toward[None]).Vh[1:]
+        cells = ((surface.points_m @ across.T) / surface.diameter_m * _CELLS).floor().long()
+        column, row = (cells - cells.amin(0)).unbind(-1)
+        width = int(row.max()) + 1
+        place, depth_m = column * width + row, surface.points_m @ toward
+        nearest_m = torch.full(((int(column.max()) + 1) * width,), -torch.inf, dtype=torch.float64)
+        nearest_m.scatter_reduce_(0, place, depth_m, "amax")
+        every.append(depth_m > nearest_m[place] - surface.diameter_m / _CELLS)
+    seen, cosine = torch.stack(every), directions @ surface.normals.T
     front, back = ((seen & (sign * cosine > _FACING)).any(0) for sign in (1, -1))
     points_m = torch.cat([surface.points_m[front], surface.points_m[back]])
     return points_m, torch.cat([surface.normals[front], -surface.normals[back]])
-
-
-def _is_seen(surface: Surface, toward: Float64[Tensor, "3"]) -> Bool[Tensor, " m"]:
-    """Mark the points that nothing hides from a camera far off in a direction."""
-    across = torch.linalg.svd(toward[None]).Vh[1:]
-    cells = ((surface.points_m @ across.T) / surface.diameter_m * _CELLS).floor().long()
-    column, row = (cells - cells.amin(0) + 1).unbind(-1)
-    width = int(row.max()) + 2
-    place, depth_m = column * width + row, surface.points_m @ toward
-    nearest_m = torch.full(((int(column.max()) + 2) * width,), -torch.inf, dtype=torch.float64)
-    nearest_m.scatter_reduce_(0, place, depth_m, "amax")
-    return depth_m > nearest_m[place] - surface.diameter_m / _CELLS
 
 
 def _frames(normals: Float64[Tensor, "n 3"]) -> Float64[Tensor, "n 3 3"]:
@@ -227,14 +229,6 @@ def _key(bins: Int64[Tensor, "*b 4"]) -> Int64[Tensor, "*b"]:
     d, a, b, c = bins.clamp(min=0).unbind(-1)
     a, b, c = (angle.clamp(max=ANGLES - 1) for angle in (a, b, c))
     return ((d.clamp(max=DISTANCES) * ANGLES + a) * ANGLES + b) * ANGLES + c
-
-
-def _neighbours(feature: Float64[Tensor, "p 4"]) -> Int64[Tensor, "p 5"]:
-    """Number the bin of each feature, and of each of its four values the next bin beside it."""
-    own = feature.floor().long()
-    aside = torch.where(feature - own < 0.5, -1, 1)
-    moved = own[:, None] + aside[:, None] * torch.eye(4, dtype=torch.int64)
-    return torch.cat([_key(own)[:, None], _key(moved)], 1)
 
 
 def vote_poses(
@@ -302,7 +296,11 @@ def _peaks(
     used = (far_m > step_m) & (far_m < DISTANCES * step_m)
     row, second = used.nonzero(as_tuple=True)
     feature, turn_rad = _features(points_m, frames, references[row], second, diameter_m)
-    keys = _neighbours(feature)
+    # The bin of each feature, and of each of its four values the next bin beside it.
+    own = feature.floor().long()
+    aside = torch.where(feature - own < 0.5, -1, 1)
+    moved = own[:, None] + aside[:, None] * torch.eye(4, dtype=torch.int64)
+    keys = torch.cat([_key(own)[:, None], _key(moved)], 1)
     size = (table.bounds[keys + 1] - table.bounds[keys]).long()
     same = (keys[:, 1:] == keys[:, :1]).nonzero(as_tuple=True)
     size[:, 1:][same] = 0
