@@ -119,11 +119,10 @@ def find_objects(view: ViewInput, known: SearchTargets) -> list[PoseEstimate]:
     """Pose every known object that a depth image shows, the surest first; what is none is left out.
 
     Point pairs of the whole image vote for poses of each object. Those with which the image agrees
-    are gathered by the readings that they explain; of those of the likeliest the object is
-    estimated. Where poses of
-    several objects explain the same, they share the probability of one by the evidence against
-    each, and where none has most of it none is answered. Where an object is there more than once,
-    the rest of the image is searched for more of it.
+    are gathered by the readings that they explain; from those of the likeliest the object is
+    estimated. Where poses of several objects explain the same, they share the probability of one by
+    the evidence against each, and where none has most of it none is answered. Where an object is
+    there more than once, the rest of the image is searched for more of it.
 
     Args:
         view: depth and camera; its mask limits where is looked.
@@ -209,10 +208,7 @@ def _best_turned(frame: Frame, pose: Rigid, pairs: PairTable) -> Rigid:
 def _judged(
     groups: Sequence[Sequence[_Candidate]], frame: Frame, view: ViewInput, known: SearchTargets
 ) -> list[tuple[_Candidate, PoseEstimate]]:
-    """Estimate each object from the readings that its likeliest pose explains, from all of its poses.
-
-    Leaves out what is refused.
-    """
+    """Estimate each object from what its likeliest pose explains; leave out what is refused."""
     inputs: list[CloudInput] = []
     height, width = view.depth_m.shape
     for k, some in enumerate(groups):
