@@ -65,6 +65,9 @@ _VOXEL = 0.05  # of the diameter
 _LEAST = 500  # points of a model without faces
 _PROPOSALS = 40
 _SMOOTHED = 1500  # of so many points 20 neighbours lay the plane that gives a normal
+_TILT_NOISE = 0.01
+"""By so much the tilt of one pose differs from one drawing of points to the next: less says nothing
+of which of two poses that look alike is the right one."""
 
 
 class PoseEstimator:
@@ -463,7 +466,8 @@ class Registration(PoseEstimator):
     def prepare(self) -> None:
         """Prepare every model now, about a second each; else it is done when first asked for."""
         for name in self.objects:
-            self._pairs(with_copies(self._known(name), up_to_symmetry=self.config.up_to_symmetry))
+            known = with_copies(self._known(name), up_to_symmetry=self.config.up_to_symmetry)
+            self._pairs(known).turns  # noqa: B018  found when first asked for
 
     def _pose_near(
         self, inputs: Sequence[CloudInput], poses: Sequence[Rigid]
@@ -501,10 +505,10 @@ class Registration(PoseEstimator):
             reason = "no pose lays the model near the points: another object, or too little of it"
             return refused(given, Refusal(status="votes do not meet", reason=reason), seconds)
         first = Candidate(icp.camera_from_model, icp.covariance, float(icp.residual_m))
-        turns = None if poses is None else pairs.turns  # in a mask the readings decide
-        candidates = find_candidates(
-            cloud_m, first, best.others, known, self.config, is_refined=True, turns=turns
-        )
+        others = best.others
+        if poses is not None:  # in a mask the readings decide between turns, which a search chose
+            others = Rigid.cat([others, first.pose @ pairs.turns])
+        candidates = find_candidates(cloud_m, first, others, known, self.config, is_refined=True)
         found = Rigid.stack([one.pose for one in candidates])
         evidence = surface_signals(cloud_m, found, surface)
         for pose, signals in zip([one.pose for one in candidates], evidence, strict=True):
@@ -512,6 +516,6 @@ class Registration(PoseEstimator):
             # whatever the pose: so it is on the cloud moved onto the posed surface.
             _, index = nearest_posed(cloud_m, pose, surface)
             own = tilt_of(pose.apply(surface.points_m[index]), pose[None], surface)
-            signals["tilt"] = max(0.0, signals["tilt"] - float(own))
+            signals["tilt"] = max(_TILT_NOISE, signals["tilt"] - float(own))
         seconds["icp"] = time.perf_counter() - voted
         return answer_of(prepared, known, candidates, evidence, self.refusal, self.config, seconds)

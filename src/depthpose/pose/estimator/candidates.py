@@ -202,14 +202,11 @@ def find_candidates(
     config: EstimateConfig,
     *,
     is_refined: bool,
-    turns: Rigid | None = None,
 ) -> list[Candidate]:
     """Refine ``others``, at which ICP ended elsewhere, and the nearly symmetric copies of the best.
 
     The best comes first, then those that are other poses than it and than each other. Where the
-    best was not refined the copies stay where they are. ``turns`` (of
-    :class:`~depthpose.pose.voting.point_pairs.PairTable`) give further copies, which are never
-    refined: most of their surface lies where that of the best does.
+    best was not refined the copies stay where they are.
     """
     copies = known.copies
     assert copies is not None, "with_copies comes first"
@@ -229,9 +226,6 @@ def find_candidates(
             for k in range(len(starts.R))
             if float(found.inlier_share[k]) > 0  # else it is near no surface
         ]
-    if turns is not None:
-        turned = best.pose @ turns
-        tried += [best._replace(pose=turned[k]) for k in range(len(turned.R))]
     for one in tried:
         every = Rigid.stack([other.pose for other in kept])[:, None] @ copies.same
         gap_m = one.pose.apply(copies.points_m) - every.apply(copies.points_m)

@@ -52,11 +52,10 @@ _MOST_JUDGED, _LEAST_JUDGED = 40, 4
 _ALIGNED, _CLEARLY = 0.7, 0.01
 """Cosine of the normals from which a reading and the surface are alike, and by how much more a
 turned pose must score to take the place of the one that was proposed."""
-_ROUNDS = 3
+_ROUNDS = 4
 """So often an image is searched for an object that is there more than once, at most."""
-_MOST_TOGETHER, _NEARLY = 8, 0.2
-"""Poses of one object at one place at most; the readings that one of them explains are the
-object's, if its log odds are at most so much above those of the best there."""
+_MOST_TOGETHER = 8
+"""Poses of one object at one place at most."""
 _LEAST_PIXELS = 100
 """Of the whole image: fewer show no shape."""
 _SHARED = 0.3
@@ -120,10 +119,10 @@ def find_objects(view: ViewInput, known: SearchTargets) -> list[PoseEstimate]:
     """Pose every known object that a depth image shows, the surest first; what is none is left out.
 
     Point pairs of the whole image vote for poses of each object. Those with which the image agrees
-    are gathered by the points that they explain, from which the object is estimated. Where poses of
-    several objects explain the same, they share the probability of one by the evidence against
-    each, and where none has most of it none is answered. Where an object is there more than once,
-    the rest of the image is searched for more of it.
+    are gathered by the readings that they explain; from those of the likeliest the object is
+    estimated. Where poses of several objects explain the same, they share the probability of one by
+    the evidence against each, and where none has most of it none is answered. Where an object is
+    there more than once, the rest of the image is searched for more of it.
 
     Args:
         view: depth and camera; its mask limits where is looked.
@@ -209,12 +208,11 @@ def _best_turned(frame: Frame, pose: Rigid, pairs: PairTable) -> Rigid:
 def _judged(
     groups: Sequence[Sequence[_Candidate]], frame: Frame, view: ViewInput, known: SearchTargets
 ) -> list[tuple[_Candidate, PoseEstimate]]:
-    """Estimate each object from the points that its poses explain; leave out what is refused."""
+    """Estimate each object from what its likeliest pose explains; leave out what is refused."""
     inputs: list[CloudInput] = []
     height, width = view.depth_m.shape
     for k, some in enumerate(groups):
-        likely = [one for one in some if one.log_odds < some[0].log_odds + _NEARLY]
-        mask = torch.stack([one.explained for one in likely]).any(0)
+        mask = some[0].explained
         mask = mask.repeat_interleave(frame.step, 0).repeat_interleave(frame.step, 1)
         cloud_m = cloud_from_depth(view.depth_m, mask[:height, :width] & view.mask, view.K)
         name = f"{view.name}_{k}"
