@@ -178,7 +178,9 @@ def test_an_answer_below_the_wanted_certainty_is_ambiguous() -> None:
 
 def test_settings_of_the_risk_of_before_are_left_out() -> None:
     old = {"max_risk": 0.3, "bias": -1.0, "slopes": {"far": 4.0}, "min_hold": 0.1}
-    assert config_from_dict(old, RefusalConfig, source="old") == RefusalConfig(min_hold=0.1)
+    assert config_from_dict(old, RefusalConfig, source="old") == RefusalConfig(
+        min_observability=0.1
+    )
     for path in SHIPPED.glob("*.safetensors"):
         refusal = read_checkpoint(path).config.get("refusal", {})
         config_from_dict(refusal, RefusalConfig, source=path.name)
@@ -189,7 +191,7 @@ def test_settings_of_the_risk_of_before_are_left_out() -> None:
     [
         ({"min_agreement": 1.5}, r"min_agreement must be in \[0, 1\], got 1.5; the default is 0.8"),
         ({"max_beyond": -1.0}, r"max_beyond must be in \[0, 1\], got -1.0"),
-        ({"min_hold": -0.1}, r"min_hold must be in \[0, 1\), got -0.1"),
+        ({"min_observability": -0.1}, r"min_observability must be in \[0, 1\), got -0.1"),
         ({"max_size_error": 0.0}, r"max_size_error must be in \(0, 1\], got 0.0"),
     ],
 )

@@ -221,7 +221,7 @@ def test_turns_that_fit_as_well_are_named() -> None:
     view = view_input(seen, mask & (local_m[..., 0] < 0.043), CAMERA, "mug", "view", None)
     cloud = CloudInput(name="view", points_m=cloud_from_depth(seen, view.mask, K), object="mug",
                        view=view)  # fmt: skip
-    net = Registration([mug], refusal=replace(REFUSAL, min_hold=0.0))
+    net = Registration([mug], refusal=replace(REFUSAL, min_observability=0.0))
     (found,) = net._pose_near([cloud], [truth[None]])
     assert found.camera_from_model is not None
     assert found.status == "ambiguous"

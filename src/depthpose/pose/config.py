@@ -150,6 +150,9 @@ class RefusalConfig(Settings):
     )
     """Settings of a calibrated risk, in weights written before 2026-11-26; they are left out."""
 
+    RENAMED: ClassVar[dict[str, str]] = {"min_hold": "min_observability"}
+    """Names in weights written before 2026-11-28, and those of today."""
+
     min_agreement: Annotated[float, "[0, 1]"] = 0.8
     """Of the posed surface that the camera saw, so much must lie where it saw something: an edge
     of a real sensor takes a tenth, other objects leave a fifth and more."""
@@ -168,7 +171,7 @@ class RefusalConfig(Settings):
     candidate_slopes: dict[str, float] = field(default_factory=lambda: dict(_CANDIDATE_SLOPES))
     """Weight of each signal's logarithm as evidence against a pose among several that fit."""
 
-    min_hold: Annotated[float, "[0, 1)"] = 0.02
+    min_observability: Annotated[float, "[0, 1)"] = 0.02
     """A motion that no symmetry allows must move the seen surface along its normals by this
     share of what it moves the object's points; one that moves it within itself (of a plane or
     ball) is not observable."""

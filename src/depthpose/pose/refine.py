@@ -18,7 +18,7 @@ from depthpose.pose.compiled import (
     ON_RAY,
     SEARCHED,
     SLACK,
-    serves,
+    use_numba,
 )
 from depthpose.pose.config import IcpConfig
 from depthpose.pose.surface import Surface, finite_array, look_along_rays
@@ -156,15 +156,15 @@ def refine_best(
     starts = Rigid((turns @ poses.R).flatten(0, 1), turned_m.flatten(0, 1))
     tried = refine_roughly(points_m, starts, surface, config)
     end_m = config.end_distance_diameters * surface.diameter_m
-    worth = _worth(points_m, tried, surface, end_m)
-    best = int(worth.argmax())
+    score = _score(points_m, tried, surface, end_m)
+    best = int(score.argmax())
     short = replace(config, iterations=(config.iterations + 1) // 2)
     refined = None
     if best < len(given.R):  # the table is rough: where little holds a pose, starts drift by it
         refined = refine_pose(points_m, given[best], surface, short)
         exact, rough = refined.camera_from_model.double(), tried[best]
         both = Rigid.stack([exact, rough])
-        if float(_worth(points_m, both, surface, end_m).diff()) > 0:
+        if float(_score(points_m, both, surface, end_m).diff()) > 0:
             refined = None  # it began farther off than exact steps reach
     if refined is None:
         short = replace(short, start_distance_diameters=config.end_distance_diameters)
@@ -174,8 +174,8 @@ def refine_best(
     others: list[int] = []
     own_m = surface.points_m[:: max(1, len(surface.points_m) // 50)]
     copies_m = surface.copies.apply(own_m)
-    for k in worth.argsort(descending=True).tolist():
-        if len(others) == _MOST_OTHERS or worth[k] == -torch.inf:
+    for k in score.argsort(descending=True).tolist():
+        if len(others) == _MOST_OTHERS or score[k] == -torch.inf:
             break
         before = Rigid.stack([found, *(tried[one] for one in others)])
         moved_m = (before.inverse() @ tried[k]).apply(own_m)
@@ -217,7 +217,7 @@ def _iterated(
             "not finite: leave those out, and refuse a cloud of none."
         )
     cloud = take_evenly(points_m.double(), most)
-    if serves(cloud, pose.R, pose.t_m):
+    if use_numba(cloud, pose.R, pose.t_m):
         from depthpose.pose.compiled.poses import refine
 
         parts = [part.detach().numpy() for part in (pose.R, pose.t_m)]
@@ -250,7 +250,7 @@ def _iterated(
     return pose, index
 
 
-def _worth(
+def _score(
     points_m: Float[Tensor, "n 3"], poses: Rigid, surface: Surface, limit_m: float
 ) -> Float64[Tensor, " b"]:
     """Score each pose: share of points near the surface, less distance and contradictions."""
@@ -261,9 +261,9 @@ def _worth(
     *_, weight, _, spread_m = _normal_equations(few, poses, surface, limit_m, index, LOOKED_UP)
     near = (weight > 0).double().mean(-1)
     # Of equals, the nearer one.
-    worth = near - spread_m / surface.diameter_m - front - _UNSEEN * unseen
-    worth[0] += _TRUST  # the first pose is trusted more
-    return worth
+    score = near - spread_m / surface.diameter_m - front - _UNSEEN * unseen
+    score[0] += _TRUST  # the first pose is trusted more
+    return score
 
 
 def match(

@@ -26,7 +26,7 @@ from torch import Tensor, nn
 from torch.autograd.function import once_differentiable
 
 from depthpose.core.errors import InputError
-from depthpose.pose.compiled import serves
+from depthpose.pose.compiled import use_numba
 
 FIELD_BITS = 17
 HALF = 1 << (FIELD_BITS - 1)
@@ -310,7 +310,7 @@ def conv(
         features, weight = features.to(narrower), weight.to(narrower)
     is_plain = features.dtype == weight.dtype == torch.float32
     near = kernel_map.neighbours
-    if is_plain and serves(features, weight) and near.table.numel() <= COMPILED_ELEMENTS:
+    if is_plain and use_numba(features, weight) and near.table.numel() <= COMPILED_ELEMENTS:
         from depthpose.pose.compiled.points import convolve
 
         read, written = near.fine_rows, near.table.shape[1]

@@ -12,7 +12,7 @@ from torch import Tensor
 from torch.nn.functional import avg_pool2d, max_pool2d, pad
 
 from depthpose.core.rigid import Rigid
-from depthpose.pose.compiled import serves
+from depthpose.pose.compiled import use_numba
 from depthpose.pose.mesh import sample_surface, symmetry_transforms
 from depthpose.pose.mesh.models import fibonacci_directions
 from depthpose.pose.types import ObjectModel
@@ -83,7 +83,7 @@ class Surface:
 
     def nearest(self, points_m: Float64[Tensor, "*batch n 3"]) -> Int64[Tensor, "*batch n"]:
         """Give the number of the surface point nearest to each point of the model frame."""
-        if serves(points_m):
+        if use_numba(points_m):
             from depthpose.pose.compiled.points import nearest_many
 
             points = finite_array(points_m.detach().numpy()).reshape(-1, 3)
@@ -293,7 +293,7 @@ def look_along_rays(
     seen = cloud_m[:, :2] / cloud_m[:, 2:] * scale
     middle = seen.median(0).values.floor()
     limit_m = 1.5 * NEAR * surface.diameter_m
-    if serves(cloud_m, poses.R, poses.t_m):
+    if use_numba(cloud_m, poses.R, poses.t_m):
         from depthpose.pose.compiled.points import compare_rays
 
         points_m = surface.points_m[::every]

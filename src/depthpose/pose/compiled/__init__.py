@@ -56,7 +56,7 @@ def is_compiled() -> bool:
     return True
 
 
-def serves(*tensors: Tensor) -> bool:
+def use_numba(*tensors: Tensor) -> bool:
     """Whether compiled functions serve for these: on the processor, and without gradients."""
     with_gradients = torch.is_grad_enabled() and any(t.requires_grad for t in tensors)
     return not with_gradients and all(t.device.type == "cpu" for t in tensors) and is_compiled()

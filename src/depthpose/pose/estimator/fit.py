@@ -20,7 +20,7 @@ from torch.nn.functional import max_pool2d
 from depthpose.core.arrays import take_evenly
 from depthpose.core.rigid import Rigid, cross_matrix, rotation_by
 from depthpose.pose.cloud import ObjectCloud, Refusal, cloud_from_depth, grow_mask
-from depthpose.pose.compiled import serves
+from depthpose.pose.compiled import use_numba
 from depthpose.pose.config import EstimateConfig, IcpConfig, RefusalConfig
 from depthpose.pose.estimator.candidates import (
     Candidate,
@@ -269,7 +269,7 @@ def _grow(
     """Step by step to the scale and place that fit; give also the moved points and the spread."""
     widths = (1 + (_WIDE_STEP - 1) * max(0.0, 1 - 2 * step / _STEPS) for step in range(_STEPS))
     limits_m = [NEAR * surface.diameter_m * width for width in widths]
-    if serves(local_m, times):
+    if use_numba(local_m, times):
         from depthpose.pose.compiled.poses import grow
 
         local_m, times = torch.from_numpy(finite_array(local_m.numpy()).copy()), times.clone()
@@ -502,7 +502,7 @@ def answer_of(
     reason, identity = misfit_of(fit, refusal), None
     if reason is None:
         observable, motion = observability(cloud.cloud_m, pose, surface, free)
-        if observable < refusal.min_hold:
+        if observable < refusal.min_observability:
             what = "turn" if float(motion[:3].norm()) > math.sqrt(0.5) else "shift"
             reason = Refusal(
                 status="not observable",

@@ -171,7 +171,7 @@ def _follow(given: AnyInput, last: _Last, known: TrackedObject) -> PoseEstimate 
     own_m = scene_m[_is_near(scene_m, Rigid.stack([pose]), surface, NEAR) & ~is_support]
     free = free_motions(known.model.symmetries.continuous, pose)
     observable, _ = observability(own_m, pose, surface, free)
-    if observable < known.refusal.min_hold:
+    if observable < known.refusal.min_observability:
         return Refusal(
             status="not observable",
             reason="the seen part of the object does not fix its pose (observability "

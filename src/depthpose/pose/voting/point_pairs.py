@@ -16,7 +16,7 @@ from torch.nn.functional import normalize
 from depthpose.core.arrays import take_evenly
 from depthpose.core.rigid import Rigid, geodesic_rad
 from depthpose.pose.cloud import thin
-from depthpose.pose.compiled import ANGLES, DISTANCES, MOST_ALIKE, TURNS, serves
+from depthpose.pose.compiled import ANGLES, DISTANCES, MOST_ALIKE, TURNS, use_numba
 from depthpose.pose.config import IcpConfig
 from depthpose.pose.mesh.models import fibonacci_directions
 from depthpose.pose.refine import refine_roughly
@@ -256,7 +256,7 @@ def vote_poses(
     """
     frames, models = _frames(normals), len(table.points_m)
     peaks = min(peaks, models)
-    if serves(points_m):
+    if use_numba(points_m):
         from depthpose.pose.compiled.pairs import vote
 
         shape = (len(references), peaks)
