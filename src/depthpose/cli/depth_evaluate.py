@@ -216,7 +216,9 @@ def measure(
     metrics = [metric.name for metric in METRICS.values() if metric.is_printed]
     about_row = ["method", "weights", "speed", "cap_m", "frames", "coverage"]
     print(page.plain_table(rows, [*about_row, *metrics, "ause"]))  # files hold every column
-    say_skipped(measured)
+    for name, why in measured.skipped.items():
+        print(f"skipped: {name}: {why}", file=sys.stderr)
+    print(f"{len(measured.skipped)} frames skipped")
     print(f"every column: {out / 'table.md'}, rows.csv; the page: {out / 'report.html'}")
     return 0
 
@@ -280,13 +282,6 @@ def write_details(measured: Evaluation, out: Path) -> list[Section]:
         Section(title="Skipped frames", rows=skipped),
     ]
     return [section for section in sections if section.rows]
-
-
-def say_skipped(measured: Evaluation) -> None:
-    """Name the frames that do not count."""
-    for name, why in measured.skipped.items():
-        print(f"skipped: {name}: {why}", file=sys.stderr)
-    print(f"{len(measured.skipped)} frames skipped")
 
 
 def measure_shards(

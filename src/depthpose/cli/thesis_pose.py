@@ -20,7 +20,7 @@ from depthpose.core.errors import InputError
 from depthpose.core.files import write_image
 from depthpose.core.run import claim_folder, environment
 from depthpose.pose.config import ObjectsConfig
-from depthpose.pose.datasets import BopDataset, Instance
+from depthpose.pose.datasets import Instance
 from depthpose.pose.datasets.dataset import read_instance_mask
 from depthpose.pose.estimator import GeoPoseNet
 from depthpose.pose.evaluate import frames_hash
@@ -87,17 +87,12 @@ def open_views(net: GeoPoseNet, data: PoseDataOptions, number: int | None, synth
         view = dataset.view(instance)
         own = replace(view.input, object=names[instance.object_id])
         samples.append(replace(view, input=own))
-    settings = _settings_of(dataset)
-    return Views(samples=samples, instances=dataset.instances, facts=facts, settings=settings)
-
-
-def _settings_of(dataset: BopDataset) -> dict[str, Any]:
-    """Say which instances of which data set results are of."""
-    return {
+    settings = {
         "data": str(dataset.folder.resolve()),
         "split": dataset.split,
         "frames_sha256": frames_hash(dataset.instances),
     }
+    return Views(samples=samples, instances=dataset.instances, facts=facts, settings=settings)
 
 
 def reproduce_by_object(
@@ -120,7 +115,9 @@ def reproduce_by_object(
     methods = pose_methods.pose_methods(weights, how.estimate, models)
     settings = {
         "table": number,
-        **_settings_of(dataset),
+        "data": str(dataset.folder.resolve()),
+        "split": dataset.split,
+        "frames_sha256": frames_hash(dataset.instances),
         "rule": config_to_dict(how.evaluation),
         "methods": {method.name: dict(method.settings) for method in methods},
         "masks": [

@@ -30,7 +30,6 @@ from depthpose.web.answer import (
     Shown,
     example_form,
     refuse_large,
-    small_size,
 )
 
 OWN_CAD = "cad"  # the value of the field object that means the CAD file
@@ -181,13 +180,14 @@ def _input(form: Form, model: ObjectModel) -> CloudInput | ViewInput:
     depth = form.file("depth")
     mask = form.file("mask") if "mask" in form.files else None
     if mask is not None:
-        small_size(mask)
+        refuse_large(mask.name, *files.image_size(mask))
     if depth.suffix.lower() in files.MAP_SUFFIXES:
         height, width = files.read_stored_depth(depth).shape
         refuse_large(depth.name, width, height)
         size = (width, height)
     else:
-        size = small_size(depth)
+        size = files.image_size(depth)
+        refuse_large(depth.name, *size)
     keys: dict[str, Any] = {}
     if "camera" not in form.files:
         focal_px = form.number("focal_px")

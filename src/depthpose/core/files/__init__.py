@@ -4,8 +4,8 @@ Readers accept any bytes and raise nothing but :class:`depthpose.core.errors.Inp
 leave a whole file or none.
 """
 
+from depthpose.core.files.cloud import CLOUD_READERS as CLOUD_READERS
 from depthpose.core.files.cloud import Cloud as Cloud
-from depthpose.core.files.cloud import cloud_suffixes as cloud_suffixes
 from depthpose.core.files.cloud import read_cloud as read_cloud
 from depthpose.core.files.cloud import read_points_bin as read_points_bin
 from depthpose.core.files.cloud import write_cloud as write_cloud
