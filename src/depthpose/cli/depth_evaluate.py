@@ -6,7 +6,7 @@ import tempfile
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from typing import Any, cast, get_args
 
 from tqdm import tqdm
@@ -288,7 +288,7 @@ def measure_shards(
     dataset: Dataset, predictions: str, protocol: str, caps_m: Sequence[float]
 ) -> Evaluation:
     """Measure shards of predictions, one after the other; the rows say whose they are."""
-    name, settings = jobs.stem(predictions.rstrip("/")), read_settings(predictions)
+    name, settings = PurePosixPath(predictions).stem, read_settings(predictions)
     places = {frame.name: index for index, frame in enumerate(dataset.frames)}
     rows: dict[str, list[Measured] | str] = {}
     for done in tqdm(jobs.read_results(predictions), name, disable=None, unit=" shards"):

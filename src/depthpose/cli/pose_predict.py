@@ -9,7 +9,7 @@ from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from functools import partial
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from typing import Any
 
 from scipy.spatial.transform import Rotation
@@ -29,7 +29,6 @@ from depthpose.core.engine import (
     Inputs,
     Sample,
     Work,
-    stem,
 )
 from depthpose.core.errors import InputError, nearest_name
 from depthpose.core.files import (
@@ -540,7 +539,7 @@ def predict_on_ray(
     words = [word for word in (options.cloud, options.depth, options.mask) if word is not None]
     inputs = Inputs.find(words, files)
     for item in inputs.items if len(words) == 2 else ():  # one manifest pairs as it likes
-        depth, mask = map(stem, item.files)
+        depth, mask = (PurePosixPath(file).stem for file in item.files)
         if depth != mask and len(inputs.items) > 1:
             raise InputError(
                 f"{words[1]}: no mask called {depth!r}; a mask has the name of its depth image"

@@ -238,7 +238,9 @@ class Pages:
 
     async def example(self, request: Request) -> Response:
         """Give files and fields to fill a form with; they are made at the first request."""
-        make = _of_kind(self._examples, request)
+        if (kind := request.path_params["kind"]) not in self._examples:
+            raise HTTPException(404, f"only {' and '.join(self._examples)} are estimated here")
+        make = self._examples[kind]
         try:
             made = await self._queue.compute("", make, partial(has_gone, request.receive))
         except InputError as error:
@@ -266,7 +268,9 @@ class Pages:
                 "MB allowed; send smaller ones, or start 'depthpose serve' with a larger "
                 "--max-upload-mb",
             )
-        estimate = _of_kind(self._kinds, request)
+        if (kind := request.path_params["kind"]) not in self._kinds:
+            raise HTTPException(404, f"only {' and '.join(self._kinds)} are estimated here")
+        estimate = self._kinds[kind]
         if len(self._queue.tickets) > self._queue.most:
             raise HTTPException(503, _FULL)
         with TemporaryDirectory(prefix="depthpose-") as folder:
@@ -342,12 +346,6 @@ class Pages:
             "files": [{"name": n, "bytes": len(data)} for n, data in answer.files.items()],
             "folder": f"results/{key}/",
         }
-
-
-def _of_kind(known: Mapping[str, Result], request: Request) -> Result:
-    if (kind := request.path_params["kind"]) not in known:
-        raise HTTPException(404, f"only {' and '.join(known)} are estimated here")
-    return known[kind]
 
 
 def make_app(depth: FakestereoNet, pose: GeoPoseNet, limits: Limits | None = None) -> Starlette:
