@@ -115,8 +115,7 @@ def make_objects(
 
     from depthpose.core.checkpoint import file_sha256
     from depthpose.core.config import config_to_dict
-    from depthpose.core.files import read_json
-    from depthpose.core.run import claim_folder, is_whole, note_result
+    from depthpose.core.run import claim_folder, note_result
     from depthpose.pose.config import ObjectsConfig, SensorConfig
     from depthpose.pose.datasets import write_bop_models, write_bop_scene
     from depthpose.pose.mesh import read_model, refuse_one_name, with_found_symmetries
@@ -152,14 +151,7 @@ def make_objects(
         seed * _SCENES_A_SEED + k: range(first, min(first + _FRAMES_A_SCENE, number))
         for k, first in enumerate(range(0, number, _FRAMES_A_SCENE))
     }
-    wanted: dict[int, range] = {}
-    for k, scene in scenes.items():
-        home = f"{split}/{k:06d}"
-        of_frames: object = None
-        if is_whole(out, home, [f"{home}/scene_camera.json"]):
-            of_frames = read_json(out / home / "scene_camera.json")
-        if not isinstance(of_frames, dict) or not {str(n) for n in scene} <= set(of_frames):
-            wanted[k] = scene
+    wanted = {k: scene for k, scene in scenes.items() if not _is_made(out, split, k, scene)}
     for k, scene in wanted.items():
         made = make_frames(models, config, len(scene), scene.start)
         shown = tqdm(made, total=len(scene), unit=" frames", leave=False, disable=None)
@@ -168,6 +160,18 @@ def make_objects(
         note_result(out, home.relative_to(out).as_posix(), files)
     print(f"{out}: {len(wanted)} scenes made, {len(scenes) - len(wanted)} were there")
     return 0
+
+
+def _is_made(out: Path, split: str, scene: int, frames: range) -> bool:
+    """Whether a scene exists with all of its frames, every file as it was written."""
+    from depthpose.core.files import read_json
+    from depthpose.core.run import is_whole
+
+    home = f"{split}/{scene:06d}"
+    if not is_whole(out, home, [f"{home}/scene_camera.json"]):
+        return False
+    there = read_json(out / home / "scene_camera.json")
+    return isinstance(there, dict) and {str(n) for n in frames} <= set(there)
 
 
 def check(

@@ -252,11 +252,15 @@ def _samples(block: Block, wanted: Files, scratch: Path) -> Iterator[Sample]:
     is_single = len(wanted.roles) == 1
     is_empty = True
     try:
-        for key, members in groupby(read_tar(block.tar), lambda member: _key_of(member[0])):
+        named = ((PurePosixPath(name), data) for name, data in read_tar(block.tar))
+        for place, members in groupby(
+            named, lambda member: member[0].parent / member[0].name.partition(".")[0]
+        ):
+            key = str(place)
             files: dict[str, Path] = {}
             is_empty = False
             for member, data in members:
-                ending = PurePosixPath(member).name.partition(".")[2]
+                ending = member.name.partition(".")[2]
                 role, _, suffix = ending.rpartition(".")
                 role = role or (wanted.roles[0] if is_single else "")
                 if role in wanted.roles and f".{suffix}".lower() in wanted.suffixes:
@@ -280,11 +284,6 @@ def _samples(block: Block, wanted: Files, scratch: Path) -> Iterator[Sample]:
         if is_empty:
             reason = f"{block.tar}: holds no file; pack inputs into it, or leave it out"
             yield Sample(PurePosixPath(block.tar).name, reason=reason)
-
-
-def _key_of(member: str) -> str:
-    path = PurePosixPath(member)
-    return str(path.parent / path.name.partition(".")[0])
 
 
 Function = Callable[[Sequence[Sample], Path], Sequence[str]]

@@ -196,7 +196,11 @@ class _Training:
             modules=task.modules,
             optimizers={name: adam for name, (adam, _) in task.optimizers.items()},
             scaler=scaler,
-            average={name: _copied(m) for name, m in task.modules.items() if has_average},
+            average={
+                name: {key: tensor.clone() for key, tensor in m.state_dict().items()}
+                for name, m in task.modules.items()
+                if has_average
+            },
         )
         if saved:
             path, self.step, seconds = restore_last(folder, self.parts)
@@ -231,7 +235,11 @@ class _Training:
             if is_last or self.step % self.config.validate_every_steps == 0:
                 if self.accelerator.is_main_process:
                     average = self.parts.average
-                    own = {name: _copied(m) for name, m in self.task.modules.items() if average}
+                    own = {
+                        name: {key: tensor.clone() for key, tensor in m.state_dict().items()}
+                        for name, m in self.task.modules.items()
+                        if average
+                    }
                     self._load(average)
                     self.logger.show(self.step, self.task.validate())
                     self._load(own)
@@ -379,7 +387,3 @@ def stop_requests() -> Iterator[list[tuple[int, float]]]:
 def _leave_process_group(_: int) -> None:
     """Take a worker out of the job's process group: a killed worker would end the loop unsaved."""
     os.setsid()
-
-
-def _copied(module: torch.nn.Module) -> dict[str, Tensor]:
-    return {name: tensor.detach().clone() for name, tensor in module.state_dict().items()}
