@@ -15,7 +15,7 @@ import numpy as np
 import torch
 from PIL import Image, ImageDraw
 
-from depthpose.core.files import read_disparity_png, read_image, write_json
+from depthpose.core.files import read_depth_png, read_image, write_json
 from depthpose.depth.config import StreetsConfig
 from depthpose.depth.synthetic import draw_street
 
@@ -63,7 +63,7 @@ def read_real(number: int, scale: float) -> tuple[list, list]:
         image = read_image(path)
         size = (round(image.shape[1] * scale), round(image.shape[2] * scale))
         images.append(torch.nn.functional.interpolate(image[None], size, mode="area")[0])
-        disparities.append(read_disparity_png(home / "disp_occ" / f"{path.stem}.png") * scale)
+        disparities.append(read_depth_png(home / "disp_occ" / f"{path.stem}.png") * scale)
     return images, disparities
 
 

@@ -16,7 +16,7 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from depthpose.core.camera import StereoRig
-from depthpose.core.files import cache_folder, write_disparity_png, write_image
+from depthpose.core.files import cache_folder, write_depth_png, write_image
 from depthpose.depth.disparity import disparity_from_depth
 from depthpose.depth.types import StereoInput, StereoSample, StereoTruth
 
@@ -319,7 +319,7 @@ def write_pairs(home: Path, scales: tuple[float, ...]) -> Path:
         name = f"{number:02d}"
         write_image(home / "left" / f"{name}.png", street.input.left)
         write_image(home / "right" / f"{name}.png", street.input.right)
-        write_disparity_png(home / "disp_occ" / f"{name}.png", truth)
+        write_depth_png(home / "disp_occ" / f"{name}.png", truth)
         numbers = [rig.K[0, 0], rig.K[0, 2], rig.K[1, 2], rig.baseline_m]
         values = " ".join(str(float(n)) for n in numbers)
         lines.append(f"{name} {rig.width} {rig.height} {values}")

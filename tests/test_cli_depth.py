@@ -31,7 +31,7 @@ from depthpose.core.files import (
     read_image,
     read_map,
     read_video,
-    write_disparity_png,
+    write_depth_png,
     write_image,
     write_video,
 )
@@ -550,7 +550,7 @@ def pairs(tmp_path_factory: pytest.TempPathFactory) -> Path:
     assert street.truth.disparity_px is not None
     write_image(folder / "left" / "a.png", street.input.left)
     write_image(folder / "right" / "a.png", street.input.right)
-    write_disparity_png(folder / "disp_occ" / "a.png", street.truth.disparity_px)
+    write_depth_png(folder / "disp_occ" / "a.png", street.truth.disparity_px)
     K = street.input.camera.K
     lines = [f"focal_px: {K[0, 0]}", f"cx: {K[0, 2]}", f"cy: {K[1, 2]}", "baseline_m: 0.5327"]
     (folder / "calib.txt").write_text("\n".join(lines))

@@ -31,7 +31,6 @@ from depthpose.core.files import (
     Cloud,
     write_cloud,
     write_depth_png,
-    write_disparity_png,
     write_image,
 )
 from depthpose.pose.config import ObjectsConfig
@@ -185,7 +184,7 @@ def truth(home: Path, tmp_path: Path) -> Path:
     for number in range(4):
         made = torch.Generator().manual_seed(number)
         disparity_px = 1 + 14 * torch.rand(48, 64, generator=made)
-        write_disparity_png(data / "disp_occ" / f"{number}.png", disparity_px)
+        write_depth_png(data / "disp_occ" / f"{number}.png", disparity_px)
         write_depth_png(data / "lidar_depth" / f"{number}.png", 35 / disparity_px)
     shutil.copyfile(home / "rig.json", data / "camera.json")
     return data

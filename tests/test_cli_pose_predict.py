@@ -29,8 +29,8 @@ from depthpose.cli import main, pose_methods
 from depthpose.cli.pose_methods import chosen_objects
 from depthpose.core.camera import Camera, write_camera
 from depthpose.core.files import (
+    CLOUD_READERS,
     Cloud,
-    cloud_suffixes,
     read_cloud,
     read_image,
     write_cloud,
@@ -79,7 +79,7 @@ def test_a_folder_gives_the_poses_of_clouds_of_every_format(weights: Path, tmp_p
     folder = tmp_path / "clouds"
     folder.mkdir()
     points = cloud_of(bracket(), TRUTH)
-    for suffix in cloud_suffixes():
+    for suffix in CLOUD_READERS:
         path = folder / f"of{suffix[1:]}{suffix.upper()}"
         if suffix in (".ply", ".pcd"):
             write_cloud(path, Cloud(points=points))

@@ -21,7 +21,6 @@ from depthpose.core.files import (
     image_size,
     read_cloud,
     read_depth_png,
-    read_disparity_png,
     read_image,
     read_json,
     read_key_values,
@@ -96,7 +95,7 @@ CASES: dict[str, tuple[str, tuple[Reader, ...], bytes]] = {
     "ppm": (".ppm", (read_image,), encoded("PPM")),
     "depth": (
         ".png",
-        (read_depth_png, read_disparity_png),
+        (read_depth_png,),
         written(write_depth_png, "x.png", torch.rand(5, 6, generator=SEEDED) * 200),
     ),
     "npy": (

@@ -16,10 +16,8 @@ from depthpose.core.files import (
     image_size,
     list_images,
     read_depth_png,
-    read_disparity_png,
     read_image,
     write_depth_png,
-    write_disparity_png,
     write_image,
 )
 from depthpose.core.files.disk import find_partners
@@ -126,8 +124,8 @@ def test_depth_png_round_trips_every_unit(
 
 def test_what_16_bits_cannot_hold_becomes_zero(tmp_path: Path) -> None:
     bad = torch.tensor([[torch.nan, -1, 0, 256, torch.inf, 255.999, 0.001]])
-    write_disparity_png(tmp_path / "d.png", bad)
-    assert torch.isnan(read_disparity_png(tmp_path / "d.png")).all()
+    write_depth_png(tmp_path / "d.png", bad)
+    assert torch.isnan(read_depth_png(tmp_path / "d.png")).all()
 
 
 def test_listing_a_file_a_folder_and_a_pattern(

@@ -66,7 +66,7 @@ def test_barycentric_shares_lead_to_the_seen_point() -> None:
 
 def test_edge_functions_give_barycentric_shares_over_depth() -> None:
     triangles = random_triangles(3, 1, near=4.0)
-    edges, volume = edge_functions(triangles, K)
+    edges, volume = edge_functions(triangles.double() @ K.mT)
     middle = triangles[0].mean(0)
     pixel = (middle @ K.mT) / middle[2]
     weight = edges[0] @ pixel / volume[0]

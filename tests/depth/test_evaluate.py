@@ -9,7 +9,7 @@ from PIL import Image
 
 from depthpose.core.camera import Camera, StereoRig, write_camera
 from depthpose.core.errors import InputError, Notice
-from depthpose.core.files import write_depth_png, write_disparity_png, write_image, write_map
+from depthpose.core.files import write_depth_png, write_image, write_map
 from depthpose.core.run import note_result
 from depthpose.depth.datasets import Dataset, check_dataset, open_dataset
 from depthpose.depth.disparity import depth_from_disparity, disparity_advice
@@ -51,7 +51,7 @@ def pairs(tmp_path: Path) -> Dataset:
         write_image(home / "left" / f"{name}.png", torch.rand(3, H, W))
         write_image(home / "right" / f"{name}.png", torch.rand(3, H, W))
         if name != "c":
-            write_disparity_png(home / "disp_occ" / f"{name}.png", truth_px(k))
+            write_depth_png(home / "disp_occ" / f"{name}.png", truth_px(k))
             depth_m = depth_from_disparity(truth_px(k), rig())
             write_depth_png(home / "lidar_depth" / f"{name}.png", depth_m)
     write_camera(home / "camera.json", rig())
@@ -194,7 +194,7 @@ def test_a_png_of_kitti_is_disparity_where_disparity_is_measured(
     pairs: Dataset, tmp_path: Path
 ) -> None:
     for k, name in enumerate("abc"):
-        write_disparity_png(tmp_path / "p" / f"{name}.png", truth_px(k))
+        write_depth_png(tmp_path / "p" / f"{name}.png", truth_px(k))
     assert evaluate(pairs, tmp_path / "p", "kitti-2015").rows[0].metrics["epe_px"] == 0
 
 

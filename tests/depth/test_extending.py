@@ -13,7 +13,7 @@ from depthpose.core.camera import StereoRig, write_camera
 from depthpose.core.config import config_from_dict
 from depthpose.core.errors import InputError
 from depthpose.core.export import Case, Export, Graph, Limit
-from depthpose.core.files import read_map, write_disparity_png, write_image, write_map
+from depthpose.core.files import read_map, write_depth_png, write_image, write_map
 from depthpose.core.loop import LoopConfig, Run
 from depthpose.depth.augment import TrainingPair
 from depthpose.depth.config import (
@@ -57,7 +57,7 @@ def pairs(tmp_path: Path) -> Path:
     for name in "ab":
         write_image(home / "left" / f"{name}.png", torch.rand(3, H, W))
         write_image(home / "right" / f"{name}.png", torch.rand(3, H, W))
-        write_disparity_png(home / "disp_occ" / f"{name}.png", torch.full((H, W), 5.0))
+        write_depth_png(home / "disp_occ" / f"{name}.png", torch.full((H, W), 5.0))
     write_camera(home / "camera.json", StereoRig(width=W, height=H, K=K, baseline_m=0.5))
     return home
 

@@ -12,7 +12,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from depthpose.core.errors import InputError
-from depthpose.core.files import write_depth_png, write_disparity_png, write_image, write_map
+from depthpose.core.files import write_depth_png, write_image, write_map
 from depthpose.depth.datasets import (
     check_dataset,
     known_truths,
@@ -68,14 +68,14 @@ def make_2015(home: Path) -> None:
         picture(home / "training/image_2" / f"{name}.png")
         picture(home / "training/image_3" / f"{name}.png")
     for kind in ("disp_occ_0", "disp_noc_0"):
-        write_disparity_png(home / "training" / kind / "000000_10.png", torch.full((H, W), 3.0))
+        write_depth_png(home / "training" / kind / "000000_10.png", torch.full((H, W), 3.0))
 
 
 def make_2012(home: Path) -> None:
     picture(home / "training/colored_0/000003_10.png")
     picture(home / "training/colored_1/000003_10.png")
     write(home / "training/calib/000003.txt", f"P0: {P2}\nP1: {P3}\nP2: {P2}\nP3: {P3}\n")
-    write_disparity_png(home / "training/disp_occ/000003_10.png", torch.full((H, W), 3.0))
+    write_depth_png(home / "training/disp_occ/000003_10.png", torch.full((H, W), 3.0))
 
 
 def make_middlebury(home: Path) -> None:

@@ -10,7 +10,7 @@ import torch
 from tests.synthetic_street import make_street
 
 from depthpose.core.errors import InputError
-from depthpose.core.files import write_depth_png, write_disparity_png, write_image, write_map
+from depthpose.core.files import write_depth_png, write_image, write_map
 from depthpose.depth.datasets import check_dataset, lidar_truth, open_dataset, read_split
 from depthpose.depth.datasets.frames import read_object_calibration
 
@@ -143,7 +143,7 @@ def _far_depth(home: Path) -> None:
 
 
 def _wide_disparity(home: Path) -> None:
-    write_disparity_png(home / "disp_occ/a.png", torch.full((H, W), 21.0))
+    write_depth_png(home / "disp_occ/a.png", torch.full((H, W), 21.0))
 
 
 def _wide_baseline(home: Path) -> None:
@@ -246,7 +246,7 @@ def test_truth_that_the_pair_contradicts_is_named(
     assert street.truth.disparity_px is not None
     write_image(tmp_path / "left/a.png", street.input.left)
     write_image(tmp_path / "right/a.png", street.input.right)
-    write_disparity_png(tmp_path / "disp_occ/a.png", change(street.truth.disparity_px))
+    write_depth_png(tmp_path / "disp_occ/a.png", change(street.truth.disparity_px))
     problems = [p.message for p in check_dataset(tmp_path).problems if p.kind == "mismatch"]
     assert len(problems) == bool(said)
     assert said in " ".join(problems)

@@ -9,7 +9,7 @@ from tests.depth.test_kitti_folders import make_object, make_raw, write
 
 from depthpose.core.config import config_to_dict
 from depthpose.core.errors import InputError
-from depthpose.core.files import read_json, write_depth_png, write_disparity_png, write_image
+from depthpose.core.files import read_json, write_depth_png, write_image
 from depthpose.core.loop import LoopConfig, Run
 from depthpose.depth.config import AugmentConfig, PairsConfig, PSMNetConfig, StreetsConfig
 from depthpose.depth.datasets import open_dataset
@@ -40,7 +40,7 @@ def test_a_camera_of_a_small_angle_keeps_the_focal_length_that_was_asked_for(
 ) -> None:
     """A focal length of 1.25 widths, a crop of one: the picture is narrower than the crop."""
     make_pairs(tmp_path)
-    write_disparity_png(tmp_path / "disp_occ" / "0.png", torch.full((60, 80), 20.0))
+    write_depth_png(tmp_path / "disp_occ" / "0.png", torch.full((60, 80), 20.0))
     config = PairsConfig(
         folders=(str(tmp_path),), focal_px=200.0, augment=AugmentConfig(crop_px=(100, 200))
     )
@@ -55,7 +55,7 @@ def test_a_camera_of_a_small_angle_keeps_the_focal_length_that_was_asked_for(
 
 def test_the_truth_of_a_folder_with_two_kinds_must_be_said(tmp_path: Path) -> None:
     make_pairs(tmp_path, names=("0", "1"))
-    write_disparity_png(tmp_path / "disp_occ" / "0.png", torch.full((60, 80), 20.0))
+    write_depth_png(tmp_path / "disp_occ" / "0.png", torch.full((60, 80), 20.0))
     write_depth_png(tmp_path / "lidar_depth" / "1.png", torch.full((60, 80), 10.0))
     message = r"several kinds of truth \(disparity of 1 frames, scan of 1 frames\).* set truth"
     with pytest.raises(InputError, match=message):
@@ -109,7 +109,7 @@ def test_each_folder_must_give_something(tmp_path: Path) -> None:
     """A folder that silently adds nothing would make another training than the one asked for."""
     for name in ("full", "empty"):
         make_pairs(tmp_path / name)
-    write_disparity_png(tmp_path / "full" / "disp_occ" / "0.png", torch.full((60, 80), 20.0))
+    write_depth_png(tmp_path / "full" / "disp_occ" / "0.png", torch.full((60, 80), 20.0))
     folders = (str(tmp_path / "full"), str(tmp_path / "empty"))
     with pytest.raises(InputError, match="empty: no frame has a right view and a truth"):
         TrainingPairs(PairsConfig(folders=folders), 0, needs_truth=True)

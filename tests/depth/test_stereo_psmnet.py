@@ -10,7 +10,7 @@ from torch import Tensor
 
 from depthpose.core.checkpoint import read_torch_file
 from depthpose.core.errors import InputError
-from depthpose.core.files import read_disparity_png, read_image
+from depthpose.core.files import read_depth_png, read_image
 from depthpose.depth.config import MatcherConfig, PSMNetConfig
 from depthpose.depth.metrics import sparsification_area
 from depthpose.depth.stereo import PSMNet, PSMNetMatcher, normalise, psmnet_from_published
@@ -215,7 +215,7 @@ def test_whole_frame_error_shows_which_corners_the_weights_want(
     folder = "depth/kitti_2015/training"
     left = read_image(real / f"{folder}/image_2/000046_10.png")
     right = read_image(real / f"{folder}/image_3/000046_10.png")
-    truth_px = read_disparity_png(real / f"{folder}/disp_occ_0/000046_10.png")
+    truth_px = read_depth_png(real / f"{folder}/disp_occ_0/000046_10.png")
     state = read_torch_file(weights)["state_dict"]
     matcher = PSMNetMatcher(psmnet_from_published(state, align_corners=align_corners))
     found = matcher.match(left, right)

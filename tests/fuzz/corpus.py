@@ -27,7 +27,6 @@ from depthpose.core.files import (
     image_size,
     read_cloud,
     read_depth_png,
-    read_disparity_png,
     read_image,
     read_json,
     read_key_values,
@@ -444,7 +443,7 @@ def _kitti() -> dict[str, Kind]:
     )  # fmt: skip
     depth = written(lambda path: write_depth_png(path, 80 * torch.rand(9, 8)), "d.png")
     found["depth png"] = Kind(file="d.png", good=depth, damage=damage.hurt_png,
-                              readers=(read_depth_png, read_disparity_png, look))  # fmt: skip
+                              readers=(read_depth_png, look))  # fmt: skip
     return found
 
 

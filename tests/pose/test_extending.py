@@ -15,8 +15,7 @@ from depthpose.cli import main
 from depthpose.cli.pose_predict import cloud_jobs
 from depthpose.core.config import config_from_dict
 from depthpose.core.errors import InputError
-from depthpose.core.files import Cloud, cloud_suffixes, read_cloud
-from depthpose.core.files.cloud import CLOUD_READERS
+from depthpose.core.files import CLOUD_READERS, Cloud, read_cloud
 from depthpose.core.files.disk import AnyPath
 from depthpose.core.rigid import Rigid
 from depthpose.pose.datasets import LAYOUTS, Instance, Layout, open_bop
@@ -46,7 +45,7 @@ def test_extending_clouds(
     assert torch.equal(read_cloud(path).points, points)
     (job,) = cloud_jobs(tmp_path, "m", "bracket", tmp_path.parent / "out")
     assert torch.equal(job.read().points_m, points)
-    assert ".points" in cloud_suffixes()
+    assert ".points" in CLOUD_READERS
     assert main(["doctor", str(path)]) in (0, 1)
     assert f"{len(points)} points" in capsys.readouterr().out
     assert np.allclose(read_model(path, "m").vertices_m, points)
@@ -138,5 +137,5 @@ def test_extending_losses(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_the_page_takes_every_cloud_and_mesh() -> None:
-    assert KINDS["cloud"][1] == cloud_suffixes()
+    assert KINDS["cloud"][1] == tuple(CLOUD_READERS)
     assert KINDS["cad"][1] == tuple(MESH_READERS)

@@ -3,7 +3,6 @@
 import math
 import re
 import sys
-from collections.abc import Iterable
 from dataclasses import asdict
 from functools import partial
 from pathlib import Path
@@ -50,6 +49,8 @@ def make_streets(
         clutter_share: share of scenes that show random shapes before a ground, a wall or in a box
             instead of a street; for training matchers.
     """
+    from tqdm import tqdm
+
     from depthpose.core.run import claim_folder
     from depthpose.depth.config import StreetsConfig
     from depthpose.depth.datasets import has_calibration, has_raw_frame, write_raw_frame
@@ -74,7 +75,7 @@ def make_streets(
     dates = {drive[:10]: index for index, drive in drives.items()}
     lost = {index for date, index in dates.items() if not has_calibration(out, date)}
     wanted = [i for i in indices if i in lost or not has_raw_frame(out, drives[i], i)]
-    for index in _shown(wanted, None, "frames"):
+    for index in tqdm(wanted, unit=" frames", leave=False, disable=None):
         write_raw_frame(out, drives[index], index, draw_street(config, index))
     print(f"{out}: {len(wanted)} frames made, {number - len(wanted)} were there")
     return 0
@@ -153,7 +154,8 @@ def make_objects(
     wanted = {k: scene for k, scene in scenes.items() if not _is_made(out, split, k, scene)}
     for k, scene in wanted.items():
         made = make_frames(models, config, len(scene), scene.start)
-        home = write_bop_scene(out, split, k, list(_shown(made, len(scene), "frames")))
+        shown = tqdm(made, total=len(scene), unit=" frames", leave=False, disable=None)
+        home = write_bop_scene(out, split, k, list(shown))
         files = sorted(path for path in home.rglob("*") if path.is_file())
         note_result(out, home.relative_to(out).as_posix(), files)
     print(f"{out}: {len(wanted)} scenes made, {len(scenes) - len(wanted)} were there")
@@ -314,6 +316,8 @@ def label(
         max_difference_share: the same as a share of the disparity; the larger limit counts.
         min_confidence: least confidence of the matcher.
     """
+    from tqdm import tqdm
+
     from depthpose.core.checkpoint import file_sha256, find_weights
     from depthpose.depth.config import MatcherConfig
     from depthpose.depth.datasets import open_dataset
@@ -332,19 +336,13 @@ def label(
     noted = failures if len(dataset) > 1 else None
     net = FakestereoNet.load(weights, config=MatcherConfig(device=device))
     labelled = label_pairs(net, dataset, config, out, settings, failures=noted)
-    shares = [share for _, share in _shown(labelled, None, "pairs")]
+    shares = [share for _, share in tqdm(labelled, unit=" pairs", leave=False, disable=None)]
     for failure in failures:
         print(f"depthpose: failed: {failure}", file=sys.stderr)
     known = f", {sum(shares) / len(shares):.0%} of their pixels labelled" if shares else ""
     failed = f"{len(failures)} failed, " if failures else ""
     print(f"{out}: {len(shares)} pairs labelled{known}; {failed}the others were there")
     return 1 if failures else 0
-
-
-def _shown(written: "Iterable[Any]", total: int | None, what: str) -> "Iterable[Any]":
-    from tqdm import tqdm
-
-    return tqdm(written, total=total, unit=f" {what}", leave=False, disable=None)
 
 
 _LOOKED_AT = 8  # pairs that are checked before anything is written
@@ -385,6 +383,8 @@ def rectify(
         keep: 0 keeps only what the raw images show, 1 all of it, with black borders.
         check: refuse what is swapped or differs by more than a row.
     """
+    from tqdm import tqdm
+
     from depthpose.cli.depth_predict import list_pairs
     from depthpose.core.camera import make_rectifier, read_raw_pair, write_camera
     from depthpose.core.files import image_size, read_image, write_image
@@ -408,7 +408,7 @@ def rectify(
         settings[side] = lens
     claim_folder(out, settings, [*_SIDES, "camera.json"])
     claim_names(out, {pair[0].stem: pair for pair in pairs})
-    for first, second in _shown(pairs, None, "pairs"):
+    for first, second in tqdm(pairs, unit=" pairs", leave=False, disable=None):
         names = [str(first), str(second)]
         rectified = rectifier.rectify(read_image(first), read_image(second), names)
         for side, image in zip(_SIDES, rectified, strict=True):

@@ -154,7 +154,8 @@ def evaluate(
         open_frames,
         predict_all,
     )
-    from depthpose.core.engine import is_job
+    from depthpose.core.engine import PLAN
+    from depthpose.core.files import stores
     from depthpose.core.run import claim_folder
     from depthpose.depth.evaluate import find_protocol
     from depthpose.report.page import table_files
@@ -176,7 +177,7 @@ def evaluate(
     claim_folder(out, {"command": "depth evaluate", **about}, files)
     folders = [predict_all(dataset, method, rule, out / "predictions") for method in chosen]
     name, caps_m, predictions = comparison.protocol, comparison.cap, methods.predictions
-    if predictions is not None and is_job(predictions):
+    if predictions is not None and stores.exists(stores.join(predictions, PLAN)):
         ready = measure_shards(dataset, predictions, name, caps_m)
         return measure(dataset, folders, name, caps_m, out, [ready])
     folders += [] if predictions is None else [Path(predictions)]

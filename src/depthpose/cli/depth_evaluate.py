@@ -6,7 +6,7 @@ import tempfile
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from typing import Any, cast, get_args
 
 from tqdm import tqdm
@@ -216,7 +216,9 @@ def measure(
     metrics = [metric.name for metric in METRICS.values() if metric.is_printed]
     about_row = ["method", "weights", "speed", "cap_m", "frames", "coverage"]
     print(page.plain_table(rows, [*about_row, *metrics, "ause"]))  # files hold every column
-    say_skipped(measured)
+    for name, why in measured.skipped.items():
+        print(f"skipped: {name}: {why}", file=sys.stderr)
+    print(f"{len(measured.skipped)} frames skipped")
     print(f"every column: {out / 'table.md'}, rows.csv; the page: {out / 'report.html'}")
     return 0
 
@@ -282,18 +284,11 @@ def write_details(measured: Evaluation, out: Path) -> list[Section]:
     return [section for section in sections if section.rows]
 
 
-def say_skipped(measured: Evaluation) -> None:
-    """Name the frames that do not count."""
-    for name, why in measured.skipped.items():
-        print(f"skipped: {name}: {why}", file=sys.stderr)
-    print(f"{len(measured.skipped)} frames skipped")
-
-
 def measure_shards(
     dataset: Dataset, predictions: str, protocol: str, caps_m: Sequence[float]
 ) -> Evaluation:
     """Measure shards of predictions, one after the other; the rows say whose they are."""
-    name, settings = jobs.stem(predictions.rstrip("/")), read_settings(predictions)
+    name, settings = PurePosixPath(predictions).stem, read_settings(predictions)
     places = {frame.name: index for index, frame in enumerate(dataset.frames)}
     rows: dict[str, list[Measured] | str] = {}
     for done in tqdm(jobs.read_results(predictions), name, disable=None, unit=" shards"):

@@ -97,7 +97,7 @@ def _read(path: Path, size: Size | None) -> FileFacts:
         unit = "millimetres (--unit mm)" if diameter > _ONLY_MM else unit
         what = f"mesh of {len(points)} points and {len(faces)} faces, {diameter:.4g} across: {unit}"
         return FileFacts(path=path, what=what, model=points)
-    if suffix in files.cloud_suffixes():
+    if suffix in files.CLOUD_READERS:
         return _of_points(path, files.read_cloud(path).points.double())
     return _of_picture(path)
 

@@ -1,6 +1,5 @@
 """``depthpose pose ...``."""
 
-from dataclasses import replace
 from pathlib import Path
 
 from depthpose.cli import pose_options as options
@@ -102,13 +101,14 @@ def evaluate(
     from depthpose.cli.pose_methods import find_masks, pose_methods, predict_all
     from depthpose.core.config import config_to_dict
     from depthpose.core.run import claim_folder
+    from depthpose.pose.config import EvaluationConfig
     from depthpose.report.page import table_files
 
     if not (weights or csv or predictions):
         raise InputError("measure --weights FILE, --csv FILE or --predictions DIR, or several.")
     dataset = open_instances(bop, split, objects, estimates.targets)
     files = [*table_files("rows", "instances", "risk"), "report.html", "predictions", "detections"]
-    rule = replace(estimates.evaluation, adds=adds)
+    rule = EvaluationConfig(diameters=estimates.diameters, with_vsd=estimates.vsd, adds=adds)
     # More objects, or all of the targets, may be asked for later.
     about = {"bop": str(bop.resolve()), "split": split, "rule": config_to_dict(rule)}
     claim_folder(out, {"command": "pose evaluate", **about}, files)

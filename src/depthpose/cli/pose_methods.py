@@ -50,7 +50,12 @@ def find_masks(
 ) -> list[Masks]:
     """Understand ``truth``, ``predicted``, files of BOP detections and segmentation weights."""
     paths = [mask_path(kind) for kind in kinds]
-    names = _names_of(kinds, paths)
+    names = distinct_names(
+        [
+            (None, kind) if path is None else (path.parent, path.stem)
+            for kind, path in zip(kinds, paths, strict=True)
+        ]
+    )
     masks: list[Masks] = []
     for kind, path, name in zip(kinds, paths, names, strict=True):
         settings: dict[str, Any] = {}
@@ -80,13 +85,6 @@ def mask_path(kind: str) -> Path | None:
     if kind in ("truth", "predicted"):
         return None
     return Path(kind) if kind.endswith(".json") else find_weights(kind)
-
-
-def _names_of(words: Sequence[str], paths: Sequence[Path | None]) -> list[str]:
-    """Name files by their stems, told apart by their folders, and what is no file by its word."""
-    return distinct_names(
-        [(None, w) if p is None else (p.parent, p.stem) for w, p in zip(words, paths, strict=True)]
-    )
 
 
 def named_file(path: Path) -> str:
@@ -225,7 +223,12 @@ def pose_methods(
     Files of one name are distinguished by their folders.
     """
     paths = [None if name == REGISTER else find_weights(name) for name in names]
-    labels = _names_of(names, paths)
+    labels = distinct_names(
+        [
+            (None, name) if path is None else (path.parent, path.stem)
+            for name, path in zip(names, paths, strict=True)
+        ]
+    )
     return [
         _network(path, label, config) if path else _register(label, models, config)
         for path, label in zip(paths, labels, strict=True)

@@ -7,7 +7,7 @@ from typing import Literal
 from depthpose.cli.arguments import Device, NewPath, Source
 from depthpose.core.errors import InputError
 from depthpose.core.units import Unit
-from depthpose.pose.config import DiameterTable, EstimateConfig, EvaluationConfig, VotingConfig
+from depthpose.pose.config import DiameterTable, EstimateConfig, VotingConfig
 
 Voting = Literal["ransac", "least-squares"]
 
@@ -56,11 +56,6 @@ class PoseMeasureOptions:
         """Settings of the estimators."""
         voting = VotingConfig(method="ransac" if self.voting == "ransac" else "least squares")
         return EstimateConfig(voting=voting, with_icp=self.icp, device=self.device)
-
-    @property
-    def evaluation(self) -> EvaluationConfig:
-        """Settings of the metrics."""
-        return EvaluationConfig(diameters=self.diameters, with_vsd=self.vsd)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -9,7 +9,7 @@ from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from functools import partial
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from typing import Any
 
 from scipy.spatial.transform import Rotation
@@ -29,12 +29,11 @@ from depthpose.core.engine import (
     Inputs,
     Sample,
     Work,
-    stem,
 )
 from depthpose.core.errors import InputError, nearest_name
 from depthpose.core.files import (
+    CLOUD_READERS,
     MAP_SUFFIXES,
-    cloud_suffixes,
     image_size,
     list_images,
     read_image,
@@ -147,7 +146,7 @@ def camera_facts(camera: Path | float) -> dict[str, Any]:
 
 def cloud_jobs(cloud: Path, unit: Unit, object: str, out: Path) -> list[Job[Any]]:
     """Take a cloud, or every one of a folder."""
-    known = cloud_suffixes()
+    known = tuple(CLOUD_READERS)
     files = [cloud]
     if cloud.is_dir():
         named = [path for path in cloud.iterdir() if not path.name.startswith(".")]
@@ -431,8 +430,10 @@ def say_result(predictions: list[Prediction], out: Path) -> int:
     for prediction in predictions[:_SAID]:
         for other in prediction.estimate.alternatives:
             print(f"{prediction.estimate.name}: {other}")
+    counts = Counter(estimate.status for estimate in shown)
+    statuses = ", ".join(f"{count} {status}" for status, count in sorted(counts.items()))
     inputs = "1 input" if len(predictions) == 1 else f"{len(predictions)} inputs"
-    print(f"{inputs}: {_statuses(shown) or 'none readable'}; {out / 'poses.json'}")
+    print(f"{inputs}: {statuses or 'none readable'}; {out / 'poses.json'}")
     return 1 if failed else 0
 
 
@@ -454,11 +455,6 @@ def _row(estimate: PoseEstimate) -> dict[str, Any]:
     }
 
 
-def _statuses(estimates: Sequence[PoseEstimate]) -> str:
-    counts = Counter(estimate.status for estimate in estimates)
-    return ", ".join(f"{count} {status}" for status, count in sorted(counts.items()))
-
-
 def _write_page(
     out: Path,
     predictions: Sequence[Prediction],
@@ -470,7 +466,8 @@ def _write_page(
     instances = () if dataset is None else dataset.instances
     image_of = {(i.scene_id, i.image_id): i.rgb for i in instances}
     estimates = [prediction.estimate for prediction in predictions]
-    counts = _statuses(estimates)
+    numbers = Counter(estimate.status for estimate in estimates)
+    counts = ", ".join(f"{count} {status}" for status, count in sorted(numbers.items()))
     rows = [_row(one) for one in sorted(estimates, key=lambda one: one.is_posed)[:_MOST_ROWS]]
     readable = [k for k, one in enumerate(estimates) if one.status != "unreadable"]
     sections: list[Section] = []
@@ -537,12 +534,12 @@ def predict_on_ray(
     if options.depth is not None and (options.camera or options.focal_px) is None:
         raise InputError("--depth needs --camera or --focal-px beside it")
     views = Files(roles=("depth", "mask"), suffixes=(*LISTED_SUFFIXES, ".json"))
-    clouds = Files(roles=("cloud",), suffixes=cloud_suffixes())
+    clouds = Files(roles=("cloud",), suffixes=tuple(CLOUD_READERS))
     files = clouds if options.depth is None else views
     words = [word for word in (options.cloud, options.depth, options.mask) if word is not None]
     inputs = Inputs.find(words, files)
     for item in inputs.items if len(words) == 2 else ():  # one manifest pairs as it likes
-        depth, mask = map(stem, item.files)
+        depth, mask = (PurePosixPath(file).stem for file in item.files)
         if depth != mask and len(inputs.items) > 1:
             raise InputError(
                 f"{words[1]}: no mask called {depth!r}; a mask has the name of its depth image"

@@ -1,6 +1,7 @@
 """Tables and figures of chapter 2: predict, measure, join with the printed rows, draw, write."""
 
 import hashlib
+import sys
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -12,7 +13,7 @@ from depthpose.cli.depth_predict import Method
 from depthpose.core.errors import InputError, nearest_name
 from depthpose.core.files import write_image
 from depthpose.core.run import claim_folder, environment, find_rank
-from depthpose.depth.datasets import Dataset, Frame, has_lidar, lidar_truth
+from depthpose.depth.datasets import Dataset, has_lidar, lidar_truth
 from depthpose.depth.evaluate import find_protocol
 from depthpose.depth.predictions import has_prediction, read_estimate
 from depthpose.report import page
@@ -40,11 +41,12 @@ def reproduce_table(
     pictures: int,
 ) -> int:
     """Predict what is missing, measure, join with the published rows, and write everything."""
+    listed = "".join(f"{frame.left.resolve()}\n" for frame in dataset.frames)
     settings = {
         "table": table.number,
         "dataset": dataset.name,
         "frames": len(dataset),
-        "frames_sha256": _frames_hash(dataset.frames),
+        "frames_sha256": hashlib.sha256(listed.encode()).hexdigest(),
         "protocol": protocol,
         "caps_m": list(caps_m),
         "methods": {method.name: method.settings for _, method in methods},
@@ -94,7 +96,9 @@ def reproduce_table(
         ),
     ]
     write_report(f"{table.title}, on {dataset.name}", sections, out)
-    evaluation.say_skipped(measured)
+    for name, why in measured.skipped.items():
+        print(f"skipped: {name}: {why}", file=sys.stderr)
+    print(f"{len(measured.skipped)} frames skipped")
     return 0
 
 
@@ -130,8 +134,13 @@ def write_figure(
 ) -> int:
     """Estimate the frames, draw the figure, and write it with a page that explains it."""
     frames = [dataset.frames[index] for index in indices]
-    about = {"frames": [f.name for f in frames], "frames_sha256": _frames_hash(frames)}
-    settings = {"command": f"figure {number}", **about, "method": method.settings}
+    listed = "".join(f"{frame.left.resolve()}\n" for frame in frames)
+    settings = {
+        "command": f"figure {number}",
+        "frames": [frame.name for frame in frames],
+        "frames_sha256": hashlib.sha256(listed.encode()).hexdigest(),
+        "method": method.settings,
+    }
     claim_folder(out, settings, (f"figure-{number}.png", "panels", "report.html"))
     columns: list[list[Drawing]] = []
     sections: list[Section] = []
@@ -167,9 +176,3 @@ def _panel_section(title: str, panels: Sequence[Drawing], home: Path) -> Section
         write_image(path, shrink_to_width(panel.image, _PICTURE_WIDTH_PX))
         pictures.append(Picture(path=path, caption=panel.caption, scale=panel.scale))
     return Section(title=title, text=DEPTH_SCALE, pictures=pictures)
-
-
-def _frames_hash(frames: Sequence[Frame]) -> str:
-    """Give the SHA-256 of the list of left images, a line each."""
-    lines = "".join(f"{frame.left.resolve()}\n" for frame in frames)
-    return hashlib.sha256(lines.encode()).hexdigest()

@@ -19,8 +19,8 @@ from depthpose.core.config import config_to_dict
 from depthpose.core.errors import InputError
 from depthpose.core.files import write_image
 from depthpose.core.run import claim_folder, environment
-from depthpose.pose.config import ObjectsConfig
-from depthpose.pose.datasets import BopDataset, Instance
+from depthpose.pose.config import EvaluationConfig, ObjectsConfig
+from depthpose.pose.datasets import Instance
 from depthpose.pose.datasets.dataset import read_instance_mask
 from depthpose.pose.estimator import GeoPoseNet
 from depthpose.pose.evaluate import frames_hash
@@ -87,17 +87,12 @@ def open_views(net: GeoPoseNet, data: PoseDataOptions, number: int | None, synth
         view = dataset.view(instance)
         own = replace(view.input, object=names[instance.object_id])
         samples.append(replace(view, input=own))
-    settings = _settings_of(dataset)
-    return Views(samples=samples, instances=dataset.instances, facts=facts, settings=settings)
-
-
-def _settings_of(dataset: BopDataset) -> dict[str, Any]:
-    """Say which instances of which data set results are of."""
-    return {
+    settings = {
         "data": str(dataset.folder.resolve()),
         "split": dataset.split,
         "frames_sha256": frames_hash(dataset.instances),
     }
+    return Views(samples=samples, instances=dataset.instances, facts=facts, settings=settings)
 
 
 def reproduce_by_object(
@@ -118,10 +113,13 @@ def reproduce_by_object(
     numbers = {model.name: pose_tables.linemod_number(model) if is_printed else model.number
                for model in models}  # fmt: skip
     methods = pose_methods.pose_methods(weights, how.estimate, models)
+    rule = EvaluationConfig(diameters=how.diameters, with_vsd=how.vsd)
     settings = {
         "table": number,
-        **_settings_of(dataset),
-        "rule": config_to_dict(how.evaluation),
+        "data": str(dataset.folder.resolve()),
+        "split": dataset.split,
+        "frames_sha256": frames_hash(dataset.instances),
+        "rule": config_to_dict(rule),
         "methods": {method.name: dict(method.settings) for method in methods},
         "masks": [
             kind
@@ -135,9 +133,7 @@ def reproduce_by_object(
     claim_folder(out, settings, (*results, "predictions", "detections", "figures"))
     shown = pose_methods.find_masks(how.masks, dataset, out, how.device) if methods else []
     folders = [pose_methods.predict_all(dataset, m, one, out) for m in methods for one in shown]
-    measured = pose_evaluate.join(
-        pose_evaluate.measure_each(dataset, [*folders, *csv], how.evaluation)
-    )
+    measured = pose_evaluate.join(pose_evaluate.measure_each(dataset, [*folders, *csv], rule))
     rows = pose_tables.join_by_object(measured.rows, numbers, with_published=is_printed)
     every = [row.columns() for row in measured.rows]
     page.write_table(out, rows)

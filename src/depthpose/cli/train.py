@@ -48,12 +48,19 @@ class TrainingOptions:
     ) -> Any:  # noqa: ANN401 - an instance of kind
         """Read the config of a training, or take its defaults, with what was said here."""
         from depthpose.core.config import read_config
-        from depthpose.core.loop import refuse_long_warmup
+        from depthpose.core.loop import AdamConfig
 
         config: Any = (default or kind()) if path is None else read_config(path, kind)
-        if not (self.resume or self.finish):
-            own = config.loop.steps
-            refuse_long_warmup(config, None if own is None else max(own, self.steps or 0))
+        steps = config.loop.steps  # None: they follow from epochs
+        if steps is not None and not (self.resume or self.finish):
+            steps = max(steps, self.steps or 0)
+            for name, adam in vars(config).items():
+                if isinstance(adam, AdamConfig) and adam.warmup_steps > steps:
+                    raise InputError(
+                        f"{name}.warmup_steps is {adam.warmup_steps}, but loop.steps is {steps}, "
+                        "so the learning rate would never be reached; take at most "
+                        f"{steps}, or 0 for no warm-up"
+                    )
         own = {"seed": self.seed, "device": self.device, "precision": self.precision}
         loop = changed(config.loop, workers=workers, **own)
         if self.steps is not None:

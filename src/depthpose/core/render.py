@@ -102,17 +102,26 @@ def rasterize_orthographic(
 
 
 def edge_functions(
-    triangles: Float[Tensor, "n 3 3"], K: Float64[Tensor, "3 3"]
+    corners: Float64[Tensor, "n 3 3"],
 ) -> tuple[Float64[Tensor, "n 3 3"], Float64[Tensor, " n"]]:
     """Give the edge functions of triangles and their volumes, for any fraction of a pixel.
 
     ``edges[i] @ (u, v, 1) / volume`` are the barycentric coordinates divided by the depth, so
     their sum is 1 / depth, and all three are positive inside the triangle.
 
+    Args:
+        corners: homogeneous pixels ``K @ (x, y, z)`` of each triangle.
+
     Returns:
         Edges and volumes; the volume is 0 where the plane goes through the camera.
     """
-    return _edges(triangles.double() @ K.to(triangles.device).mT)
+    # The cross product of the two other corners. Products are rounded one by one, so that the edge
+    # two triangles share has, up to the sign, the same three numbers in both: nothing shows through
+    # between them.
+    (ax, ay, az), (bx, by, bz) = (corners.roll(-k, 1).unbind(-1) for k in (1, 2))
+    parts = [(ay * bz, az * by), (az * bx, ax * bz), (ax * by, ay * bx)]
+    edges = torch.stack([one - other for one, other in parts], -1)
+    return edges, (corners[:, 0] * edges[:, 0]).sum(-1)
 
 
 def barycentric_shares(
@@ -145,19 +154,6 @@ def _check(triangles: Tensor, width: int, height: int) -> None:
         raise InputError("a corner of the triangles is not finite; leave such triangles out")
 
 
-def _edges(
-    corners: Float64[Tensor, "n 3 3"],
-) -> tuple[Float64[Tensor, "n 3 3"], Float64[Tensor, " n"]]:
-    """Lines opposite to the corners, and the determinant, of homogeneous pixels."""
-    # The cross product of the two other corners. Products are rounded one by one, so that the edge
-    # two triangles share has, up to the sign, the same three numbers in both: nothing shows through
-    # between them.
-    (ax, ay, az), (bx, by, bz) = (corners.roll(-k, 1).unbind(-1) for k in (1, 2))
-    parts = [(ay * bz, az * by), (az * bx, ax * bz), (ax * by, ay * bx)]
-    edges = torch.stack([one - other for one, other in parts], -1)
-    return edges, (corners[:, 0] * edges[:, 0]).sum(-1)
-
-
 def _draw(
     corners: Float64[Tensor, "n 3 3"],
     pixels: Float64[Tensor, "n 3 2"],
@@ -175,7 +171,7 @@ def _draw(
     is_seen = (first <= last).all(1) & (True if is_front is None else is_front.any(1))
     number = is_seen.nonzero()[:, 0]
     first, last = first[number].long(), last[number].long()
-    raw, volume = _edges(corners.index_select(0, number))
+    raw, volume = edge_functions(corners.index_select(0, number))
     scale = torch.where(volume != 0, 1 / volume, 0)[:, None]
     edges = raw * volume.sign()[:, None, None]  # not negative inside
     plane = raw.sum(1) * scale  # 1 / depth at (u, v, 1), or, of parallel rays, the depth
@@ -210,7 +206,7 @@ def _draw(
     primitive = torch.where(is_drawn, buffer & 0xFFFFFFFF, -1).reshape(height, width)
     depth_m = (buffer >> 32).int().view(torch.float32).double()
     depth_m = torch.where(is_drawn, depth_m, torch.nan).reshape(height, width)
-    shares = barycentric_shares(*_edges(corners), primitive) if with_barycentric else None
+    shares = barycentric_shares(*edge_functions(corners), primitive) if with_barycentric else None
     return Raster(depth_m=depth_m, primitive=primitive, barycentric=shares)
 
 

@@ -70,13 +70,9 @@ class Rigid:
         """Say it in one line: of a batch its size alone."""
         if self.t_m.ndim > 1:
             return f"Rigid(a batch of {tuple(self.t_m.shape[:-1])})"
-        rows = ", ".join(f"[{numbers_text(row)}]" for row in self.R.tolist())
-        return f"Rigid(R=[{rows}], t_m=[{numbers_text(self.t_m.tolist())}])"
-
-
-def numbers_text(numbers: Sequence[float]) -> str:
-    """Write numbers for people: ``0.1234, -1.0000``."""
-    return ", ".join(f"{number:.4f}" for number in numbers)
+        rows = (*self.R.tolist(), self.t_m.tolist())
+        x, y, z, t = (", ".join(f"{number:.4f}" for number in row) for row in rows)
+        return f"Rigid(R=[[{x}], [{y}], [{z}]], t_m=[{t}])"
 
 
 def fit_rigid(

@@ -10,7 +10,7 @@ import torch
 
 from depthpose.core.camera import StereoRig
 from depthpose.core.errors import InputError
-from depthpose.core.files import atomic_write, write_disparity_png, write_image
+from depthpose.core.files import atomic_write, write_depth_png, write_image
 from depthpose.core.files.disk import read_text
 from depthpose.core.run import claim_folder, claim_names, is_whole, note_result
 from depthpose.depth.config import Settings
@@ -97,7 +97,7 @@ def label_pairs(
         files = [folder / place / f"{name}.png" for place in ("left", "right", "disp_occ")]
         write_image(files[0], pair.left)
         write_image(files[1], pair.right)
-        write_disparity_png(files[2], known_px)
+        write_depth_png(files[2], known_px)
         note_result(folder, name, files)
         yield name, float(known_px.isfinite().float().mean())
 

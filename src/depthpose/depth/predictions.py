@@ -142,7 +142,7 @@ def read_disparity(
             f"{folder}: no prediction for frame {name!r}. Expected {EXPECTED.replace('NAME', name)}"
         )
     if with_disparity_png and path == _first(base, (_KITTI,)):
-        return files.read_disparity_png(path)
+        return files.read_depth_png(path)
     depth_m = read_depth(folder, name)
     assert depth_m is not None
     if not isinstance(camera, StereoRig):

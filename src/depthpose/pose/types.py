@@ -8,7 +8,7 @@ from jaxtyping import Bool, Float, Float64, Int, Int64
 from torch import Tensor
 
 from depthpose.core.errors import InputError
-from depthpose.core.rigid import Rigid, numbers_text
+from depthpose.core.rigid import Rigid
 
 Status = Literal[
     "ok",
@@ -314,7 +314,8 @@ class PoseEstimate:
     def __repr__(self) -> str:
         said = f"{self.object}: {self.status}"
         if self.camera_from_model is not None:
-            said += f", t_m=[{numbers_text(self.camera_from_model.t_m.tolist())}]"
+            at_m = (f"{metres:.4f}" for metres in self.camera_from_model.t_m.tolist())
+            said += f", t_m=[{', '.join(at_m)}]"
         if self.certainty is not None:
             said += f", certainty {self.certainty:.3f}"
         return f"PoseEstimate({said}{f', {self.reason}' if self.reason else ''})"

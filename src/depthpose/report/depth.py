@@ -3,6 +3,7 @@
 from dataclasses import replace
 
 import numpy as np
+import torch
 
 from depthpose.core.arrays import take_evenly
 from depthpose.core.camera import Camera, StereoRig, back_project
@@ -13,6 +14,7 @@ from depthpose.core.draw import (
     draw_points,
     draw_share,
 )
+from depthpose.core.files import Cloud
 from depthpose.depth.predictions import COLOR_RANGE_M
 from depthpose.depth.types import DepthError, DepthEstimate, StereoInput
 from depthpose.report.page import (
@@ -20,7 +22,6 @@ from depthpose.report.page import (
     Layer,
     Scene,
     Section,
-    colored_points,
     depth_scale,
     rising_scale,
 )
@@ -62,7 +63,8 @@ def depth_section(
             points_m = back_project(true_m, camera.K).reshape(-1, 3).float()
             points_m = points_m[points_m.isfinite().all(-1) & (points_m[:, 2] <= far_m)]
             points_m = take_evenly(points_m, _TRUE_POINTS)
-            layer = Layer(name="true points", shape=colored_points(points_m, _TRUE))
+            color = torch.tensor(_TRUE).expand(len(points_m), 3)
+            layer = Layer(name="true points", shape=Cloud(points=points_m, color=color))
             said, layers = f"{scenes[0].caption}; the truth in green", [*scenes[0].layers, layer]
             scenes = [Scene(caption=said, layers=layers)]
     pictures = [Drawing(image=pair.left, caption="image")] if with_image else []

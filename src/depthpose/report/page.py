@@ -105,11 +105,6 @@ def page_file(name: Literal["viewer.js", "page.css"]) -> str:
     return files("depthpose.report").joinpath(name).read_text(encoding="utf-8")
 
 
-def colored_points(points_m: Float[Tensor, "n 3"], color: tuple[float, float, float]) -> Cloud:
-    """Make points of one colour, RGB in [0, 1]."""
-    return Cloud(points=points_m, color=torch.tensor(color).expand(len(points_m), 3))
-
-
 def colored_lines(ends_m: Float[Tensor, "n 2 3"], color: tuple[float, float, float]) -> Lines:
     """Make lines of one colour."""
     return Lines(ends_m=ends_m, color=torch.tensor(color).expand(len(ends_m), 3))

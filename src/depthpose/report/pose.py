@@ -25,7 +25,6 @@ from depthpose.report.page import (
     Scene,
     Section,
     colored_lines,
-    colored_points,
     frame_axes,
 )
 
@@ -345,10 +344,13 @@ def pose_scene(
         layers += pose_layers(truth, model, is_true=True)
     if estimate.keypoints_m is not None:
         layers += keypoint_layers(estimate.keypoints_m, pose, model)
-    layers.insert(0, Layer(name="the object, as seen", shape=colored_points(points_m, _SEEN)))
+    color = torch.tensor(_SEEN).expand(len(points_m), 3)
+    seen = Layer(name="the object, as seen", shape=Cloud(points=points_m, color=color))
+    layers.insert(0, seen)
     if isinstance(pose_input, ViewInput):
         around_m = cloud_from_depth(pose_input.depth_m, ~pose_input.mask, pose_input.K).float()
-        around = colored_points(take_evenly(around_m, _AROUND_POINTS), _AROUND)
+        around_m = take_evenly(around_m, _AROUND_POINTS)
+        around = Cloud(points=around_m, color=torch.tensor(_AROUND).expand(len(around_m), 3))
         layers.append(Layer(name="all else", shape=around, is_shown=False))
     caption = "The cloud and the posed model" if pose is not None else "The cloud; there is no pose"
     return Scene(caption=caption, layers=layers)

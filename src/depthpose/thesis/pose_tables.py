@@ -73,12 +73,6 @@ class PublishedRow:
     note: str
     source: str
 
-    @property
-    def by_object(self) -> dict[int, float]:
-        """Percent by BOP's number."""
-        numbers = map(float, self.printed.split())
-        return dict(zip(LINEMOD, numbers, strict=True)) if self.printed else {}
-
 
 _TABLES = "tables in the READMEs of ethnhe/PVN3D and j96w/DenseFusion"
 _FFB6D = "table in the README of ethnhe/FFB6D"
@@ -168,7 +162,7 @@ def join_by_object(
             "method": row.method,
             "masks": "",
             "input": row.input,
-            **{LINEMOD[number]: percent for number, percent in row.by_object.items()},
+            **dict(zip(LINEMOD.values(), map(float, row.printed.split()), strict=False)),
             "mean": row.mean,
             "diameters": "pvnet" if row.method == "PVNet" else "bop",
             "note": row.note,

@@ -10,7 +10,7 @@ from typing import Any
 
 from depthpose.core.camera import CAMERA_SUFFIXES, Camera, read_camera
 from depthpose.core.errors import InputError
-from depthpose.core.files import DEPTH_SUFFIXES, cloud_suffixes, image_size, write_json
+from depthpose.core.files import CLOUD_READERS, DEPTH_SUFFIXES, write_json
 from depthpose.core.files.disk import write_bytes
 from depthpose.core.files.images import LISTED_SUFFIXES
 from depthpose.pose.mesh import MESH_READERS
@@ -55,7 +55,7 @@ KINDS: dict[str, tuple[str, tuple[str, ...]]] = {
     "depth": ("a depth image", DEPTH_SUFFIXES),
     "mask": ("a mask", LISTED_SUFFIXES),
     "camera": ("a camera file", CAMERA_SUFFIXES),
-    "cloud": ("a point cloud", cloud_suffixes()),
+    "cloud": ("a point cloud", tuple(CLOUD_READERS)),
     "cad": ("a model file", tuple(MESH_READERS)),
 }
 """What each field of the forms takes."""
@@ -113,13 +113,6 @@ def without_paths(text: str, folder: Path) -> str:
     """Take this machine's folders out of a message: a user knows the names of the files."""
     fields = "|".join(KINDS)
     return re.sub(f"{re.escape(str(folder))}/(({fields})/)?", "", text)
-
-
-def small_size(path: Path) -> tuple[int, int]:
-    """Give a picture's width and height before it is read."""
-    width, height = image_size(path)
-    refuse_large(path.name, width, height)
-    return width, height
 
 
 def refuse_large(name: str, width: int, height: int) -> None:

@@ -82,26 +82,24 @@ def refuse_other_host(request: Request, hosts: tuple[str, ...] | None) -> Respon
     except ValueError:  # such as half of a bracket
         name = None
     if hosts is not None and name not in hosts:
-        return _sentence(
-            403, f"this page answers to {', '.join(hosts)}, not to {host!r}; start "
-            "'depthpose serve' with --host to name another"
-        )  # fmt: skip
+        said = (
+            f"this page answers to {', '.join(hosts)}, not to {host!r}; start 'depthpose serve' "
+            "with --host to name another"
+        )
+        return JSONResponse({"error": said}, 403)
     origin = request.headers.get("origin")
     if origin is not None and origin.partition("://")[2] != host:
-        return _sentence(403, f"the request comes from another page, {origin}; open this one")
+        said = f"the request comes from another page, {origin}; open this one"
+        return JSONResponse({"error": said}, 403)
     return None
 
 
 async def error_response(_: Request, error: Exception) -> Response:
     """Answer a refusal with its message; the trace of another error is on the server's terminal."""
     if isinstance(error, HTTPException):
-        return _sentence(error.status_code, error.detail, error.headers)
-    kind = type(error).__name__
-    return _sentence(500, f"depthpose failed ({kind}: {error}); see the server's terminal")
-
-
-def _sentence(status: int, said: str, headers: Mapping[str, str] | None = None) -> Response:
-    return JSONResponse({"error": said}, status_code=status, headers=headers)
+        return JSONResponse({"error": error.detail}, error.status_code, error.headers)
+    said = f"depthpose failed ({type(error).__name__}: {error}); see the server's terminal"
+    return JSONResponse({"error": said}, 500)
 
 
 Result = TypeVar("Result")
@@ -120,11 +118,6 @@ class Queue:
     one: anyio.CapacityLimiter = field(default_factory=partial(anyio.CapacityLimiter, 1))
     tickets: list[str] = field(default_factory=list)
 
-    def refuse_full(self) -> None:
-        """Refuse one more."""
-        if len(self.tickets) > self.most:  # one of them is at work
-            raise HTTPException(503, _FULL)
-
     async def compute(
         self, ticket: str, work: Callable[[], Result], is_gone: Callable[[], Awaitable[bool]]
     ) -> Result | None:
@@ -132,7 +125,8 @@ class Queue:
 
         By the ticket the client asks for its place in the queue; 503 where too many wait.
         """
-        self.refuse_full()
+        if len(self.tickets) > self.most:  # one of them is at work
+            raise HTTPException(503, _FULL)
         self.tickets.append(ticket)
         try:
             async with self.one:
@@ -244,7 +238,9 @@ class Pages:
 
     async def example(self, request: Request) -> Response:
         """Give files and fields to fill a form with; they are made at the first request."""
-        make = _of_kind(self._examples, request)
+        if (kind := request.path_params["kind"]) not in self._examples:
+            raise HTTPException(404, f"only {' and '.join(self._examples)} are estimated here")
+        make = self._examples[kind]
         try:
             made = await self._queue.compute("", make, partial(has_gone, request.receive))
         except InputError as error:
@@ -272,8 +268,11 @@ class Pages:
                 "MB allowed; send smaller ones, or start 'depthpose serve' with a larger "
                 "--max-upload-mb",
             )
-        estimate = _of_kind(self._kinds, request)
-        self._queue.refuse_full()
+        if (kind := request.path_params["kind"]) not in self._kinds:
+            raise HTTPException(404, f"only {' and '.join(self._kinds)} are estimated here")
+        estimate = self._kinds[kind]
+        if len(self._queue.tickets) > self._queue.most:
+            raise HTTPException(503, _FULL)
         with TemporaryDirectory(prefix="depthpose-") as folder:
             try:
                 form = await self._upload(request, Path(folder))
@@ -347,12 +346,6 @@ class Pages:
             "files": [{"name": n, "bytes": len(data)} for n, data in answer.files.items()],
             "folder": f"results/{key}/",
         }
-
-
-def _of_kind(known: Mapping[str, Result], request: Request) -> Result:
-    if (kind := request.path_params["kind"]) not in known:
-        raise HTTPException(404, f"only {' and '.join(known)} are estimated here")
-    return known[kind]
 
 
 def make_app(depth: FakestereoNet, pose: GeoPoseNet, limits: Limits | None = None) -> Starlette:

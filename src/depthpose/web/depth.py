@@ -9,7 +9,7 @@ from typing import Any
 from depthpose.core.camera import StereoRig, camera_of, write_camera
 from depthpose.core.draw import draw_share
 from depthpose.core.errors import InputError
-from depthpose.core.files import read_exif_focal, read_image, write_image
+from depthpose.core.files import image_size, read_exif_focal, read_image, write_image
 from depthpose.depth.config import StreetsConfig
 from depthpose.depth.estimator import FakestereoNet
 from depthpose.depth.predictions import COLOR_RANGE_M, write_estimate
@@ -24,7 +24,7 @@ from depthpose.web.answer import (
     Form,
     Shown,
     example_form,
-    small_size,
+    refuse_large,
 )
 
 _MOST_WORK_PIXELS = 8_000_000
@@ -104,7 +104,8 @@ def answer_depth(form: Form, net: FakestereoNet) -> Answer:
 def _input(form: Form) -> tuple[StereoInput, str]:
     """Read the picture or pair; say where its focal length comes from, if nobody gave it."""
     path = form.file("image")
-    width, height = small_size(path)
+    width, height = image_size(path)
+    refuse_large(path.name, width, height)
     has_right = "right" in form.files
     focal_px, baseline_m = form.number("focal_px"), form.number("baseline_m")
     if has_right and baseline_m is None and "camera" not in form.files:
@@ -133,7 +134,7 @@ def _input(form: Form) -> tuple[StereoInput, str]:
             cx_right_minus_left_px=doffs_px or 0.0,
         )
     if has_right:
-        small_size(form.file("right"))
+        refuse_large(form.file("right").name, *image_size(form.file("right")))
     right = read_image(form.file("right")) if has_right else None
     pair = StereoInput(name=path.stem, left=read_image(path), right=right, camera=camera)
     return pair, origin

@@ -30,7 +30,6 @@ from depthpose.web.answer import (
     Shown,
     example_form,
     refuse_large,
-    small_size,
 )
 
 OWN_CAD = "cad"  # the value of the field object that means the CAD file
@@ -155,9 +154,9 @@ def _target(form: Form, net: GeoPoseNet) -> _Target:
             raise InputError(f"object {name!r}: the weights know {', '.join(net.objects)}")
         return _Target(model=known[0], net=net, how="network, by the weights' own model")
     cad = form.file("cad")
-    model = mesh.read_model(
-        cad, mesh.FIXED_UNITS.get(cad.suffix.lower()) or _unit(form, "cad_unit")
-    )
+    unit = mesh.FIXED_UNITS.get(cad.suffix.lower()) or form.fields.get("cad_unit", "")
+    refuse_unknown("cad_unit", unit, METRES)
+    model = mesh.read_model(cad, cast(Unit, unit))
     for own in models:  # of which the file may be one, in the same frame
         is_same = abs(model.diameter_m / own.diameter_m - 1) <= _SAME
         if is_same:
@@ -176,18 +175,20 @@ def _input(form: Form, model: ObjectModel) -> CloudInput | ViewInput:
     if "cloud" in form.files:
         if "depth" in form.files or "mask" in form.files:
             raise InputError("a cloud and a depth image are both given; choose one of the two")
-        path = form.file("cloud")
-        return cloud_input(path, _unit(form, "cloud_unit"), model.name, path.stem)
+        path, unit = form.file("cloud"), form.fields.get("cloud_unit", "")
+        refuse_unknown("cloud_unit", unit, METRES)
+        return cloud_input(path, cast(Unit, unit), model.name, path.stem)
     depth = form.file("depth")
     mask = form.file("mask") if "mask" in form.files else None
     if mask is not None:
-        small_size(mask)
+        refuse_large(mask.name, *files.image_size(mask))
     if depth.suffix.lower() in files.MAP_SUFFIXES:
         height, width = files.read_stored_depth(depth).shape
         refuse_large(depth.name, width, height)
         size = (width, height)
     else:
-        size = small_size(depth)
+        size = files.image_size(depth)
+        refuse_large(depth.name, *size)
     keys: dict[str, Any] = {}
     if "camera" not in form.files:
         focal_px = form.number("focal_px")
@@ -202,12 +203,6 @@ def _input(form: Form, model: ObjectModel) -> CloudInput | ViewInput:
         # Files of ROS, OpenCV and KITTI do not have it.
         camera = replace(camera, depth_unit_m=form.number("depth_unit_m"))
     return view_input(depth, mask, camera, model.name, depth.stem)
-
-
-def _unit(form: Form, field: str) -> Unit:
-    unit = form.fields.get(field, "")
-    refuse_unknown(field, unit, METRES)
-    return cast(Unit, unit)
 
 
 _UNIT_M = 0.0001

@@ -181,7 +181,8 @@ def facts_from_names(names: Names) -> CameraFacts | None:
         )
     elif left is not None and left[0, 0] != 0:
         if left[0, 3] == 0 and left[1, 3] == 0:  # of a single camera
-            undistort = _lens_remedy(names, _UNDISTORT_P)
+            is_fisheye = re.search("equidistant|fisheye", str(names.get("distortionmodel")).lower())
+            undistort = _UNDISTORT_FISHEYE if is_fisheye else _UNDISTORT_P
             facts = facts_from_projections(kind, left, None, size_of(names))
         else:  # of the right one of a pair: Tx = -fx B
             first = np.c_[left[:, :3], [0, 0, 0]]
@@ -269,7 +270,9 @@ def _from_intrinsics(names: Names, kind: str, distortion: tuple[float, ...]) -> 
         right = K if right is None else right
         left, right = np.c_[K, [0, 0, 0]], np.c_[right, [right[0, 0] * T[0], 0, 0]]
         facts = facts_from_projections(kind, left, right, size_of(names))
-    return replace(facts, distortion=distortion, undistort=_lens_remedy(names, facts.undistort))
+    is_fisheye = re.search("equidistant|fisheye", str(names.get("distortionmodel")).lower())
+    undistort = _UNDISTORT_FISHEYE if is_fisheye else facts.undistort
+    return replace(facts, distortion=distortion, undistort=undistort)
 
 
 def baseline_of(names: Names) -> float | None:
@@ -278,11 +281,6 @@ def baseline_of(names: Names) -> float | None:
         if name.startswith("baseline") and name != "baselinem":
             raise InputError(f"its {name!r} may be in any unit; write baseline_m, in metres")
     return scalar(names, "baselinem")
-
-
-def _lens_remedy(names: Names, of_pinhole: str) -> str:
-    is_fisheye = re.search("equidistant|fisheye", str(names.get("distortionmodel")).lower())
-    return _UNDISTORT_FISHEYE if is_fisheye else of_pinhole
 
 
 def lens_of(names: Names) -> tuple[float, ...]:

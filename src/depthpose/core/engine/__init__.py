@@ -3,9 +3,9 @@
 The engine knows files and names; what a worker does with them is a function that it is given.
 """
 
+from depthpose.core.engine.job import PLAN as PLAN
 from depthpose.core.engine.job import Job as Job
 from depthpose.core.engine.job import RayEngine as RayEngine
-from depthpose.core.engine.job import is_job as is_job
 from depthpose.core.engine.job import read_results as read_results
 from depthpose.core.engine.job import run_job as run_job
 from depthpose.core.engine.job import shard_results as shard_results
@@ -17,4 +17,3 @@ from depthpose.core.engine.work import Item as Item
 from depthpose.core.engine.work import Sample as Sample
 from depthpose.core.engine.work import Work as Work
 from depthpose.core.engine.work import find_items as find_items
-from depthpose.core.engine.work import stem as stem

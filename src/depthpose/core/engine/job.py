@@ -11,6 +11,7 @@ import json
 import os
 import secrets
 import socket
+import zlib
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
@@ -81,7 +82,7 @@ def run_job(job: Job, engine: Engine) -> list[Done]:
         one = records.get(f"{block.shard}.tar")
         record = stores.join(folder, f"{block.shard}.json")
         path = None if one is None else stores.local_path(stores.join(folder, one.shard))
-        if one is None or one.block != block.checksum:
+        if one is None or one.block != zlib.crc32(block.to_json().encode()):
             is_whole = False
         elif path is None:  # of a store sizes alone are compared
             is_whole = sizes.get(one.shard) == one.stamp[0]
@@ -137,11 +138,6 @@ def claim(out: str, settings: Mapping[str, Any]) -> None:
     content = {"settings": dict(settings), "environment": environment()}
     record = f"{json.dumps(content, indent=2)}\n"
     stores.publish(record.encode(), stores.join(out, RECORD))
-
-
-def is_job(out: str) -> bool:
-    """Whether a folder holds shards of a job."""
-    return stores.exists(stores.join(stores.absolute(out), PLAN))
 
 
 def read_results(out: str) -> list[Done]:

@@ -66,15 +66,16 @@ def find_items(words: Sequence[str], files: Files) -> list[Item]:
         )
     sides = [stores.list_files(word, files.suffixes) for word in others]
     if len(files.roles) == 1:
-        items += [Item(stem(url), (url,)) for side in sides for url in side]
+        items += [Item(PurePosixPath(url).stem, (url,)) for side in sides for url in side]
     else:
-        names = [[stem(url) for url in side] for side in sides]
+        names = [[PurePosixPath(url).stem for url in side] for side in sides]
         for k, word in enumerate(others[1:], 1):
             # Else two files were named.
-            if [stem(others[0])] != names[0] or [stem(word)] != names[k]:
+            one, other = PurePosixPath(others[0]).stem, PurePosixPath(word).stem
+            if (names[0], names[k]) != ([one], [other]):
                 partners = find_partners(names[0], names[k], f"{others[0]} and {word}")
                 sides[k] = [sides[k][partner] for partner in partners]
-        items += [Item(stem(some[0]), some) for some in zip(*sides, strict=True)]
+        items += [Item(PurePosixPath(some[0]).stem, some) for some in zip(*sides, strict=True)]
     first: dict[str, Item] = {}
     for item in items:
         other = first.setdefault(item.name, item)
@@ -106,14 +107,9 @@ def _read_manifest(url: str, roles: Sequence[str]) -> Iterator[Item]:
             else stores.absolute(stores.join(folder, path))
             for path in (row[role] for role in roles)
         )
-        name = str(row.get("name") or stem(files[0]))
+        name = str(row.get("name") or PurePosixPath(files[0]).stem)
         _refuse_name(name, f"{url}: row {number}")
         yield Item(name, files)
-
-
-def stem(url: str) -> str:
-    """Name the result of a file: its name without the suffix."""
-    return PurePosixPath(url).stem
 
 
 def _refuse_name(name: str, source: str) -> None:
@@ -137,11 +133,6 @@ class Block:
         """Write it as a line."""
         row = {"shard": self.shard, "items": [[i.name, *i.files] for i in self.items]}
         return json.dumps(row if self.tar is None else {"shard": self.shard, "tar": self.tar})
-
-    @property
-    def checksum(self) -> int:
-        """CRC-32 of what it is made of."""
-        return zlib.crc32(self.to_json().encode())
 
     @classmethod
     def from_json(cls, line: str) -> "Block":
@@ -261,11 +252,15 @@ def _samples(block: Block, wanted: Files, scratch: Path) -> Iterator[Sample]:
     is_single = len(wanted.roles) == 1
     is_empty = True
     try:
-        for key, members in groupby(read_tar(block.tar), lambda member: _key_of(member[0])):
+        named = ((PurePosixPath(name), data) for name, data in read_tar(block.tar))
+        for place, members in groupby(
+            named, lambda member: member[0].parent / member[0].name.partition(".")[0]
+        ):
+            key = str(place)
             files: dict[str, Path] = {}
             is_empty = False
             for member, data in members:
-                ending = PurePosixPath(member).name.partition(".")[2]
+                ending = member.name.partition(".")[2]
                 role, _, suffix = ending.rpartition(".")
                 role = role or (wanted.roles[0] if is_single else "")
                 if role in wanted.roles and f".{suffix}".lower() in wanted.suffixes:
@@ -289,11 +284,6 @@ def _samples(block: Block, wanted: Files, scratch: Path) -> Iterator[Sample]:
         if is_empty:
             reason = f"{block.tar}: holds no file; pack inputs into it, or leave it out"
             yield Sample(PurePosixPath(block.tar).name, reason=reason)
-
-
-def _key_of(member: str) -> str:
-    path = PurePosixPath(member)
-    return str(path.parent / path.name.partition(".")[0])
 
 
 Function = Callable[[Sequence[Sample], Path], Sequence[str]]
@@ -387,7 +377,7 @@ class Runner:
             entries=entries,
             endings=tuple(self.work.endings),
             stamp=stamp,
-            block=block.checksum,
+            block=zlib.crc32(block.to_json().encode()),
         )
         stores.publish(done.to_json().encode(), record)
         return done

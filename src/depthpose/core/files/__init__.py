@@ -4,8 +4,8 @@ Readers accept any bytes and raise nothing but :class:`depthpose.core.errors.Inp
 leave a whole file or none.
 """
 
+from depthpose.core.files.cloud import CLOUD_READERS as CLOUD_READERS
 from depthpose.core.files.cloud import Cloud as Cloud
-from depthpose.core.files.cloud import cloud_suffixes as cloud_suffixes
 from depthpose.core.files.cloud import read_cloud as read_cloud
 from depthpose.core.files.cloud import read_points_bin as read_points_bin
 from depthpose.core.files.cloud import write_cloud as write_cloud
@@ -26,13 +26,11 @@ from depthpose.core.files.images import image_size as image_size
 from depthpose.core.files.images import list_images as list_images
 from depthpose.core.files.images import picture_tensor as picture_tensor
 from depthpose.core.files.images import read_depth_png as read_depth_png
-from depthpose.core.files.images import read_disparity_png as read_disparity_png
 from depthpose.core.files.images import read_exif_focal as read_exif_focal
 from depthpose.core.files.images import read_image as read_image
 from depthpose.core.files.images import read_map as read_map
 from depthpose.core.files.images import read_stored_depth as read_stored_depth
 from depthpose.core.files.images import write_depth_png as write_depth_png
-from depthpose.core.files.images import write_disparity_png as write_disparity_png
 from depthpose.core.files.images import write_image as write_image
 from depthpose.core.files.images import write_map as write_map
 from depthpose.core.files.video import VIDEO_SUFFIXES as VIDEO_SUFFIXES

@@ -76,13 +76,8 @@ def read_cloud(path: AnyPath) -> Cloud:
     """
     reader = CLOUD_READERS.get(Path(path).suffix.lower())
     if reader is None:
-        raise refused_suffix(path, "point cloud", cloud_suffixes())
+        raise refused_suffix(path, "point cloud", tuple(CLOUD_READERS))
     return reader(path)
-
-
-def cloud_suffixes() -> tuple[str, ...]:
-    """Name the suffixes of the files that :func:`read_cloud` reads, in lower case."""
-    return tuple(CLOUD_READERS)
 
 
 def write_cloud(path: AnyPath, cloud: Cloud) -> None:
@@ -124,7 +119,9 @@ def _from_columns(path: AnyPath, columns: Columns) -> Cloud:
     missing = [name for name in "xyz" if name not in columns]
     if missing and columns:
         raise InputError(f"{path}: no {missing} among the columns {list(columns)}; name them x y z")
-    points = np.stack([to_float32(columns[n]) for n in "xyz"], -1) if columns else np.empty((0, 3))
+    points = np.empty((0, 3), np.float32)
+    if columns:
+        points = np.stack([to_float32(columns[name]) for name in "xyz"], -1)
     packed, color = columns.get("rgb", columns.get("rgba")), None
     if packed is not None and packed.dtype.itemsize == 4:
         if packed.dtype.kind == "f":
@@ -141,7 +138,15 @@ def _from_columns(path: AnyPath, columns: Columns) -> Cloud:
         if not ((color >= 0) & (color <= 1)).all():
             raise InputError(f"{path}: colours beyond [0, 1]; store floats in [0, 1], or uchar")
         color = to_float32(color)
-    return _finite_cloud(path, to_float32(points), color)
+    if np.isinf(points).any():
+        raise InputError(f"{path}: a coordinate is infinite or beyond float32; leave it out")
+    kept = ~np.isnan(points).any(-1)
+    if not kept.any():
+        raise InputError(f"{path}: {len(points)} points, none with finite coordinates; give some")
+    return Cloud(
+        points=torch.from_numpy(points[kept]),
+        color=None if color is None else torch.from_numpy(color[kept]),
+    )
 
 
 def _from_rows(path: AnyPath, table: np.ndarray) -> Cloud:
@@ -165,19 +170,7 @@ def _from_rows(path: AnyPath, table: np.ndarray) -> Cloud:
         )
     counts = (steps > 0).all() and ((steps == 1).all() or not is_whole[1:4].any())
     first = int(is_long and counts)
-    return _finite_cloud(path, to_float32(table[:, first : first + 3]), None)
-
-
-def _finite_cloud(path: AnyPath, points: np.ndarray, color: np.ndarray | None) -> Cloud:
-    if np.isinf(points).any():
-        raise InputError(f"{path}: a coordinate is infinite or beyond float32; leave it out")
-    kept = ~np.isnan(points).any(-1)
-    if not kept.any():
-        raise InputError(f"{path}: {len(points)} points, none with finite coordinates; give some")
-    return Cloud(
-        points=torch.from_numpy(points[kept]),
-        color=None if color is None else torch.from_numpy(color[kept]),
-    )
+    return _from_columns(path, {axis: table[:, first + k] for k, axis in enumerate("xyz")})
 
 
 def _read_text(path: AnyPath) -> Cloud:
@@ -187,7 +180,10 @@ def _read_text(path: AnyPath) -> Cloud:
     with refused_as(path, "text", "save it as UTF-8"):
         head = list(islice(rows, _LOOKED_AT))
     names: list[str] = []
-    first = _names_in(head[0]) if head else []
+    first, *comments = (
+        [word.strip("\"'").lower() for word in _PARTS.split(line.strip())]
+        for line in (head[0] if head else "", *noted)
+    )
     try:
         list(map(float, filter(None, first)))
     except ValueError:  # no row of numbers
@@ -202,8 +198,9 @@ def _read_text(path: AnyPath) -> Cloud:
     count = int(head[0]) if is_count else None
     body = head[1:] if is_count else head
     width = len(_PARTS.split(body[0])) if body else 0
-    comments = [] if names else [found for line in noted if len(found := _names_in(line)) == width]
-    names = next((found for found in comments if set("xyz") <= set(found)), names)
+    if not names:
+        fitting = (found for found in comments if len(found) == width and set("xyz") <= set(found))
+        names = next(fitting, [])
     rows = chain(body, rows)
     table = parse_rows(path, map(_blank_separated(path, body, names), rows))
     if count not in (None, len(table)):
@@ -229,10 +226,6 @@ def _rows_of(text: Iterable[str], noted: list[str]) -> Iterator[str]:
             yield row
         elif not is_begun:
             noted.append(said)
-
-
-def _names_in(line: str) -> list[str]:
-    return [word.strip("\"'").lower() for word in _PARTS.split(line.strip())]
 
 
 def _blank_separated(path: AnyPath, head: list[str], names: list[str]) -> Callable[[str], str]:

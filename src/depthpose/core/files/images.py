@@ -505,11 +505,11 @@ _NO_UNIT = "a unit of {} is not positive; KITTI's is 1/256, BOP's 0.001"
 
 
 def read_depth_png(path: AnyPath, unit_m: float = KITTI_UNIT) -> Float32[Tensor, "h w"]:
-    """Read depth [m] from a 16-bit PNG; NaN where the file holds 0.
+    """Read depth [m], or KITTI's disparity [px], from a 16-bit PNG; NaN where the file holds 0.
 
     Args:
         path: a 16-bit greyscale PNG, or a TIFF of that kind, as BOP's ITODD has.
-        unit_m: metres a unit.
+        unit_m: metres (or pixels) a unit.
 
     Raises:
         InputError: the file is missing, damaged, 8-bit or coloured, or the unit makes no sense.
@@ -553,7 +553,9 @@ def read_stored_depth(path: AnyPath) -> Shaped[Tensor, "h w"]:
 def write_depth_png(
     path: AnyPath, depth_m: Float[Tensor, "h w"], unit_m: float = KITTI_UNIT
 ) -> None:
-    """Write depth [m] as a 16-bit PNG; 0 where it is NaN, not positive or beyond 65535 units.
+    """Write depth [m], or disparity [px] as KITTI does, as a 16-bit PNG.
+
+    It holds 0 where the map is NaN, not positive or beyond 65535 units.
 
     Raises:
         InputError: the map is empty, the unit makes no sense, or the disk refuses.
@@ -568,21 +570,3 @@ def write_depth_png(
     with refused_as(path, "map", "check its size"):
         Image.fromarray(units.numpy().astype(np.uint16)).save(encoded, "PNG", **FAST_PNG)
     write_bytes(path, encoded.getvalue())
-
-
-def read_disparity_png(path: AnyPath) -> Float32[Tensor, "h w"]:
-    """Read disparity [px] from a 16-bit PNG of px x 256; NaN where the file holds 0.
-
-    Raises:
-        InputError: the file is missing, damaged, 8-bit or coloured.
-    """
-    return read_depth_png(path)
-
-
-def write_disparity_png(path: AnyPath, disparity_px: Float[Tensor, "h w"]) -> None:
-    """Write disparity [px] as a 16-bit PNG of px x 256; 0 where invalid or 256 px and beyond.
-
-    Raises:
-        InputError: the map is empty, or the disk refuses.
-    """
-    write_depth_png(path, disparity_px)

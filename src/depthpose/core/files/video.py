@@ -5,7 +5,6 @@ import warnings
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
@@ -36,7 +35,9 @@ class Video:
         Raises:
             InputError: not one frame can be decoded.
         """
-        capture = _open(self.path)
+        capture = import_opencv("reading a video").VideoCapture(str(self.path))
+        if not capture.isOpened():
+            raise InputError(f"{self.path}: {_NO_VIDEO}")
         index = 0
         try:
             while True:
@@ -66,7 +67,9 @@ def read_video(path: AnyPath) -> Video:
     cv2 = import_opencv("reading a video")
     if not path.is_file():  # OpenCV would take a pattern, an address or a camera's number too
         raise InputError(f"{path}: no such file; check the path")
-    capture = _open(path)
+    capture = cv2.VideoCapture(str(path))
+    if not capture.isOpened():
+        raise InputError(f"{path}: {_NO_VIDEO}")
     fps, frames = capture.get(cv2.CAP_PROP_FPS), capture.get(cv2.CAP_PROP_FRAME_COUNT)
     is_read = capture.read()[0]
     capture.release()
@@ -129,10 +132,3 @@ def write_video(path: AnyPath, images: Iterable[Float[Tensor, "3 _ _"]], fps: fl
                 "disk is full, else try .avi, or PNGs"
             )
     return count
-
-
-def _open(path: Path) -> Any:  # noqa: ANN401  OpenCV's classes carry no types
-    capture = import_opencv("reading a video").VideoCapture(str(path))
-    if not capture.isOpened():
-        raise InputError(f"{path}: {_NO_VIDEO}")
-    return capture

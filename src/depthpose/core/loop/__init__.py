@@ -16,6 +16,5 @@ from depthpose.core.loop.task import Task as Task
 from depthpose.core.loop.task import Update as Update
 from depthpose.core.loop.task import ValidationResult as ValidationResult
 from depthpose.core.loop.task import make_adam as make_adam
-from depthpose.core.loop.task import refuse_long_warmup as refuse_long_warmup
 from depthpose.core.loop.task import sample_generator as sample_generator
 from depthpose.core.loop.task import shuffled_index as shuffled_index

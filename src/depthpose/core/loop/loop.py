@@ -196,7 +196,11 @@ class _Training:
             modules=task.modules,
             optimizers={name: adam for name, (adam, _) in task.optimizers.items()},
             scaler=scaler,
-            average={name: _copied(m) for name, m in task.modules.items() if has_average},
+            average={
+                name: {key: tensor.clone() for key, tensor in m.state_dict().items()}
+                for name, m in task.modules.items()
+                if has_average
+            },
         )
         if saved:
             path, self.step, seconds = restore_last(folder, self.parts)
@@ -223,19 +227,24 @@ class _Training:
             if stop and self._any_process(len(presses) > 1):  # the steps so far are all
                 self.steps = self.step
             numbers: dict[str, float] = {}
-            if self._is_due(self.config.log_every_steps):
+            is_last = self.step == self.steps
+            if is_last or self.step % self.config.log_every_steps == 0:
                 numbers = {name: total / terms for name, (total, terms) in self.sums.items()}
                 self.sums = {}
                 self.logger.log(self.step, numbers)
-            if self._is_due(self.config.validate_every_steps):
+            if is_last or self.step % self.config.validate_every_steps == 0:
                 if self.accelerator.is_main_process:
                     average = self.parts.average
-                    own = {name: _copied(m) for name, m in self.task.modules.items() if average}
+                    own = {
+                        name: {key: tensor.clone() for key, tensor in m.state_dict().items()}
+                        for name, m in self.task.modules.items()
+                        if average
+                    }
                     self._load(average)
                     self.logger.show(self.step, self.task.validate())
                     self._load(own)
                 self.accelerator.wait_for_everyone()
-            if stop or self._is_due(self.config.save_every_steps):
+            if stop or is_last or self.step % self.config.save_every_steps == 0:
                 seconds = time.monotonic() - self.began
                 self.logger.save({"step": self.step, "seconds": seconds, **self.parts.state()})
             if on_step is not None and self.accelerator.is_main_process:
@@ -340,9 +349,6 @@ class _Training:
         for name, state in states.items():
             self.task.modules[name].load_state_dict(state)
 
-    def _is_due(self, every: int) -> bool:
-        return self.step % every == 0 or self.step == self.steps
-
     def _any_process(self, is_asked: bool) -> bool:
         if self.world == 1:
             return is_asked
@@ -381,7 +387,3 @@ def stop_requests() -> Iterator[list[tuple[int, float]]]:
 def _leave_process_group(_: int) -> None:
     """Take a worker out of the job's process group: a killed worker would end the loop unsaved."""
     os.setsid()
-
-
-def _copied(module: torch.nn.Module) -> dict[str, Tensor]:
-    return {name: tensor.detach().clone() for name, tensor in module.state_dict().items()}

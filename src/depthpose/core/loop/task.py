@@ -116,20 +116,6 @@ class LoopConfig(Settings):
         return max(1, round(self.epochs * samples / samples_a_step))
 
 
-def refuse_long_warmup(config: Any, steps: int | None) -> None:  # noqa: ANN401 - of any training
-    """Refuse a warm-up longer than the training; ``steps`` is None where they follow from epochs.
-
-    Raises:
-        InputError: the setting, its value and the steps.
-    """
-    for name, adam in vars(config).items():
-        if isinstance(adam, AdamConfig) and steps is not None and adam.warmup_steps > steps:
-            raise InputError(
-                f"{name}.warmup_steps is {adam.warmup_steps}, but loop.steps is {steps}, so the "
-                f"learning rate would never be reached; take at most {steps}, or 0 for no warm-up"
-            )
-
-
 def make_adam(
     parameters: Iterable[nn.Parameter] | list[dict[str, Any]], config: AdamConfig
 ) -> torch.optim.Adam:

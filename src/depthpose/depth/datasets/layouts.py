@@ -381,8 +381,8 @@ def write_raw_frame(folder: Path, drive: str, number: int, frame: RawFrame) -> N
         write_bytes(new("velodyne_points/data", ".bin"), scan.tobytes())
     files.write_image(new("sky"), frame.is_sky.float().expand(3, -1, -1))
     seen_by_both = torch.where(frame.occluded, torch.nan, frame.disparity_px)
-    files.write_disparity_png(new("disp_noc"), seen_by_both)
-    files.write_disparity_png(new("disp_occ"), frame.disparity_px)
+    files.write_depth_png(new("disp_noc"), seen_by_both)
+    files.write_depth_png(new("disp_occ"), frame.disparity_px)
     note_result(folder, f"{drive}/{name}", written)
 
 

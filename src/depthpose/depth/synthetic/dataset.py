@@ -58,7 +58,7 @@ def view_from(
     """Find what each pixel sees from ``eye`` [m]; ``size`` is height and width [px]."""
     corners = stage.corners - eye
     raster = rasterize(corners, K, size[1], size[0], NEAR_M, with_barycentric=False)
-    edges, volume = edge_functions(corners, K)
+    edges, volume = edge_functions(corners.double() @ K.to(corners.device).mT)
     shares = barycentric_shares(edges, volume, raster.primitive)
     raster = replace(raster, barycentric=shares)
     return Sight(raster=raster, K=K, eye=eye, edges=edges, volume=volume)

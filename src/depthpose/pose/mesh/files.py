@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 
 from depthpose.core.errors import InputError
-from depthpose.core.files import AnyPath, cloud_suffixes, read_bytes, read_cloud
+from depthpose.core.files import CLOUD_READERS, AnyPath, read_bytes, read_cloud
 from depthpose.core.files.disk import refused_as, refused_suffix
 from depthpose.core.files.points import Ragged, read_ply_elements
 from depthpose.core.units import Unit
@@ -60,8 +60,8 @@ def read_geometry(path: AnyPath) -> tuple[np.ndarray, np.ndarray]:
     """
     suffix = Path(path).suffix.lower()
     if suffix not in MESH_READERS:
-        if suffix not in cloud_suffixes():
-            known = dict.fromkeys((*MESH_READERS, *cloud_suffixes()))
+        if suffix not in CLOUD_READERS:
+            known = dict.fromkeys((*MESH_READERS, *CLOUD_READERS))
             raise refused_suffix(path, "model", tuple(known))
         return read_cloud(path).points.double().numpy(), np.empty((0, 3), np.int64)
     vertices, faces = MESH_READERS[suffix](path)
