@@ -47,7 +47,8 @@ class UNetGenerator(nn.Module):
     def __init__(self, config: GeneratorConfig | None = None) -> None:
         super().__init__()
         self.config = config or GeneratorConfig()
-        widths = self.config.widths
+        # Channels after each level of the encoder.
+        widths = [self.config.width * min(2**level, 8) for level in range(self.config.levels)]
         deepest = len(widths) - 1
         # No norm in the outermost level (raw colours) nor the innermost (one pixel may be left).
         self.down = nn.ModuleList(
@@ -285,12 +286,6 @@ class LiteEncoder(nn.Module):
         """Freeze the first layers: their ImageNet features (edges, colours) need no training."""
         for part in (self.stem, *self.blocks[: self._frozen]):
             part.requires_grad_(False)
-
-    def keep_statistics(self) -> None:
-        """Let batch norm use its stored statistics, whatever the mode: small batches spoil them."""
-        for part in self.modules():
-            if isinstance(part, nn.BatchNorm2d):
-                part.eval()
 
 
 class _ConvNorm(nn.Sequential):

@@ -304,7 +304,10 @@ def _best_shift(
     for top in range(2 * _SHIFT_ROWS + 1):
         for left in range(2 * _SHIFT_COLUMNS + 1):
             window = ours[:, top : top + height, left : left + width]
-            best = torch.maximum(best, _unit(window) @ _unit(middle).T)
+            one, other = (part.flatten(1) for part in (window, middle))
+            one, other = (part - part.mean(1, keepdim=True) for part in (one, other))
+            lengths = [part.norm(dim=1, keepdim=True).clamp(min=1e-9) for part in (one, other)]
+            best = torch.maximum(best, (one / lengths[0]) @ (other / lengths[1]).T)
     return best
 
 
@@ -320,9 +323,3 @@ def _fine_structure(dataset: Dataset, index: int) -> Float[Tensor, "zooms rows c
     grey, blur = torch.cat(parts), nn.AvgPool2d(_BLUR, 1, _BLUR // 2, count_include_pad=False)
     detail = grey - blur(grey)
     return (detail / (blur(detail**2).sqrt() + 0.01))[:, 0]
-
-
-def _unit(windows: Float[Tensor, "n h w"]) -> Float[Tensor, "n hw"]:
-    flat = windows.flatten(1)
-    centred = flat - flat.mean(1, keepdim=True)
-    return centred / centred.norm(dim=1, keepdim=True).clamp(min=1e-9)

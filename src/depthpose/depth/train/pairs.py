@@ -11,7 +11,7 @@ from depthpose.core.errors import InputError
 from depthpose.core.loop import sample_generator, shuffled_index
 from depthpose.depth.augment import TrainingPair, augment, scale_pair
 from depthpose.depth.config import PairsConfig, TruthKind
-from depthpose.depth.datasets import Dataset, Frame, known_truths, lidar_truth, open_dataset
+from depthpose.depth.datasets import Dataset, known_truths, lidar_truth, open_dataset
 from depthpose.depth.disparity import disparity_from_depth, right_disparity_from_left
 from depthpose.depth.synthetic import Streets, kitti_rig
 
@@ -39,6 +39,7 @@ class TrainingPairs:
         baseline_m: refuse pairs whose baseline is another (beyond 2 %).
 
     Attributes:
+        frames: those of folders, not what is rendered.
         truths: which kind of truth each source gives, ``NAME: KIND``; empty where none is needed.
 
     Raises:
@@ -77,6 +78,8 @@ class TrainingPairs:
                 f"exclude names {sorted(excluded)}, which no folder holds; a misspelt name would "
                 "train on what should be left out"
             )
+        found = ((source, number) for source, number, _ in self._places)
+        self.frames = [source.frames[n] for source, n in found if isinstance(source, Dataset)]
         names = (
             (source.name if isinstance(source, Dataset) else _STREETS, truth)
             for source, _, truth in self._places
@@ -108,12 +111,6 @@ class TrainingPairs:
 
     def __len__(self) -> int:
         return len(self._places)
-
-    @property
-    def frames(self) -> list[Frame]:
-        """Those of folders, not what is rendered."""
-        found = ((source, number) for source, number, _ in self._places)
-        return [source.frames[n] for source, n in found if isinstance(source, Dataset)]
 
     def __getitem__(self, sample_index: int) -> TrainingPair:
         """Make the n-th sample."""
