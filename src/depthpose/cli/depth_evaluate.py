@@ -29,10 +29,9 @@ from depthpose.depth.evaluate import (
     frame_result,
     has_truth,
     measure_frame,
-    ranking_metric,
     summarise,
 )
-from depthpose.depth.metrics import METRICS
+from depthpose.depth.metrics import METRICS, RANKING
 from depthpose.depth.predictions import is_finished, predict
 from depthpose.depth.types import DepthEstimate, StereoInput
 from depthpose.report import page
@@ -190,7 +189,7 @@ def measure(
     ):
         cap_m = of_folder[0].cap_m
         of_cap = [row for row in of_folder if row.cap_m == cap_m and row.pixels]
-        metric = ranking_metric(cap_m)
+        metric = METRICS[RANKING["disparity" if cap_m is None else "depth"]]
         sign = 1 if metric.better == "lower" else -1
         cap = "" if cap_m is None else f", truth up to {cap_m:g} m"
         errors = [sign * row.metrics[metric.name] for row in of_cap]

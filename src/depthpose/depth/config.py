@@ -294,11 +294,6 @@ class GeneratorConfig(Settings):
     virtual_baseline_m: Annotated[float, "(0, inf)"] = 0.5327
     """Baseline of the imitated rig [m]."""
 
-    @property
-    def widths(self) -> tuple[int, ...]:
-        """Channels after each level of the encoder."""
-        return tuple(self.width * min(2**level, 8) for level in range(self.levels))
-
     answer: ClassVar[Answer] = "matched"
     """Where depth comes from: this network has no disparity of its own."""
 

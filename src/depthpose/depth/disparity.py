@@ -134,14 +134,6 @@ def right_disparity_from_left(left_px: Map) -> Map:
     return torch.where(carried.isinf(), torch.nan, carried).reshape(height, width)
 
 
-def left_right_difference_px(left_px: Map, right_px: Map) -> Map:
-    """Compare the disparity of the left view with that of the right view at the same point.
-
-    Small where both views agree, large at occlusions; NaN where the point leaves the right view.
-    """
-    return (left_px - warp_right_to_left(right_px[None], left_px)[0]).abs()
-
-
 def focal_size(camera: Camera, focal_px: float) -> tuple[int, int]:
     """Rows and columns at which the camera's image has ``focal_px``, with square pixels.
 

@@ -21,10 +21,8 @@ from depthpose.depth import predictions as files
 from depthpose.depth.datasets import Dataset, Frame, has_lidar, lidar_truth, read_disparity
 from depthpose.depth.estimator import FakestereoNet
 from depthpose.depth.metrics import (
-    METRICS,
     RANKING,
     SMALLEST_DEPTH_M,
-    Metric,
     error_by_decile,
     garg_crop,
     measure,
@@ -282,18 +280,13 @@ def summarise(
         )
         deciles = [one.deciles for one in of_cap if one.deciles is not None]
         errors = torch.tensor(deciles, dtype=torch.float64).nanmean(0).tolist() if deciles else []
-        ranked_by = ranking_metric(cap_m).name
+        ranked_by = RANKING["disparity" if cap_m is None else "depth"]
         for n, error in enumerate(errors, 1):
             metrics = {ranked_by: error}
             evaluation.deciles.append(
                 row(cap_m=cap_m, frames=len(deciles), confidence_decile=n, metrics=metrics)
             )
     return evaluation
-
-
-def ranking_metric(cap_m: float | None) -> Metric:
-    """Give the metric by which frames are ranked: of depth up to a cap, or of disparity (None)."""
-    return METRICS[RANKING["disparity" if cap_m is None else "depth"]]
 
 
 def frame_result(

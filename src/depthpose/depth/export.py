@@ -39,12 +39,6 @@ def _side(size: Value, axis: int) -> Value:
     return size.slice([axis], [axis + 1], [0])
 
 
-def _focal_size(size: Value, focal_px: Any, wanted_px: float) -> Value:  # noqa: ANN401
-    """Rows and columns at which an image has the wanted focal length."""
-    scaled = (size.cast(np.float64) * float(wanted_px)) / focal_px
-    return scaled.op("Round").op("Max", 1.0).cast(np.int64)
-
-
 def _resized_image(image: Value, size: Value) -> Value:
     """Resize images, averaging where they shrink."""
     resized = image.op("Resize", None, None, size, mode="linear", axes=[2, 3],
@@ -245,7 +239,8 @@ def image_graph(weights: DepthWeights) -> Graph:
     image = graph.input("image", np.float32, _IMAGES)
     K = graph.input("K", np.float64, (3, 3)).op("Reshape", [-1])
     full = image.op("Shape", start=2, end=4)
-    small = _focal_size(full, K.op("Gather", [4, 0]), rig.virtual_focal_px)
+    scaled = full.cast(np.float64) * float(rig.virtual_focal_px) / K.op("Gather", [4, 0])
+    small = scaled.op("Round").op("Max", 1.0).cast(np.int64)
     left = _resized_image(image, small)
     right, own, street = _drawn(left, generator)
     found = own
@@ -284,12 +279,11 @@ def pair_graph(weights: DepthWeights) -> Graph:
     """
     if weights.matcher is None:
         raise InputError("these weights hold no matcher, only a generator; give a matcher's.")
-    _dynamic_shape_network(weights.matcher)  # refuses what has none, before its config is read
     graph = Graph()
     left = graph.input("left", np.float32, _IMAGES)
     right = graph.input("right", np.float32, _IMAGES)
     focal_px = None
-    if weights.matcher.config.work_focal_px is not None:
+    if getattr(weights.matcher.config, "work_focal_px", None) is not None:
         K = graph.input("K", np.float64, (3, 3))
         focal_px = K.op("Reshape", [-1]).op("Gather", [4, 0])
     disparity_px, confidence, sky = _matched(left, right, focal_px, weights.matcher)
@@ -302,25 +296,22 @@ def pair_graph(weights: DepthWeights) -> Graph:
     return graph
 
 
-def _dynamic_shape_network(matcher: StereoNetwork) -> nn.Module:
+def _matched(
+    left: Value, right: Value, focal_px: Value | np.ndarray | None, matcher: StereoNetwork
+) -> _Maps:
+    """Match at the focal length that the weights want, and come back to the images' size."""
     if type(matcher) not in DYNAMIC_SHAPE_NETWORKS:
         known = ", ".join(kind.__name__ for kind in DYNAMIC_SHAPE_NETWORKS)
         raise InputError(
             f"the matcher is {type(matcher).__name__}, and no file is made of it; give weights of "
             f"one of {known}."
         )
-    return DYNAMIC_SHAPE_NETWORKS[type(matcher)](matcher).eval()
-
-
-def _matched(
-    left: Value, right: Value, focal_px: Value | np.ndarray | None, matcher: StereoNetwork
-) -> _Maps:
-    """Match at the focal length that the weights want, and come back to the images' size."""
-    network = _dynamic_shape_network(matcher)
+    network = DYNAMIC_SHAPE_NETWORKS[type(matcher)](matcher).eval()
     config, graph = matcher.config, left.graph
     size = work = left.op("Shape", start=2, end=4)
     if config.work_focal_px is not None:
-        work = _focal_size(size, focal_px, config.work_focal_px)
+        scaled = size.cast(np.float64) * float(config.work_focal_px) / focal_px
+        work = scaled.op("Round").op("Max", 1.0).cast(np.int64)
     least, step = config.min_side_px, config.step_px
     lacking = ((work + (step - 1)) / step * step).op("Max", least) - work
     above, beside = _side(lacking, 0), _side(lacking, 1)

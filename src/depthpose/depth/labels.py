@@ -2,7 +2,6 @@
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
-from functools import partial
 from pathlib import Path
 from typing import Annotated
 
@@ -15,7 +14,7 @@ from depthpose.core.files.disk import read_text
 from depthpose.core.run import claim_folder, claim_names, is_whole, note_result
 from depthpose.depth.config import Settings
 from depthpose.depth.datasets import Dataset
-from depthpose.depth.disparity import left_right_difference_px
+from depthpose.depth.disparity import warp_right_to_left
 from depthpose.depth.estimator import FakestereoNet, refuse_unrectified
 from depthpose.depth.types import Map, StereoInput
 
@@ -59,7 +58,9 @@ def label_pairs(
         raise InputError(f"{dataset.name}: no frame has a right view and a calibration to match by")
     claim_folder(folder, settings, ("left", "right", "disp_occ", "calib.txt"))
     sources = {frames[n].name: frames[n].seen_files() for n in usable}
-    claim_names(folder, sources, is_finished=partial(_is_labelled, folder))
+    claim_names(
+        folder, sources, is_finished=lambda name: is_whole(folder, name, [f"disp_occ/{name}.png"])
+    )
     rigs: dict[int, StereoRig] = {}
 
     def fail(error: InputError) -> None:
@@ -84,7 +85,7 @@ def label_pairs(
     _write_calibration(folder / "calib.txt", {frames[n].name: rig for n, rig in rigs.items()})
     for number in rigs:
         name = frames[number].name
-        if _is_labelled(folder, name):
+        if is_whole(folder, name, [f"disp_occ/{name}.png"]):
             continue
         try:
             pair = dataset.read_input(number)
@@ -102,10 +103,6 @@ def label_pairs(
         yield name, float(known_px.isfinite().float().mean())
 
 
-def _is_labelled(folder: Path, name: str) -> bool:
-    return is_whole(folder, name, [f"disp_occ/{name}.png"])
-
-
 def label_pair(net: FakestereoNet, pair: StereoInput, config: LabelConfig) -> Map:
     """Match a pair both ways [px]; NaN where they disagree, in the sky, or where it is not sure."""
     assert pair.right is not None
@@ -113,7 +110,7 @@ def label_pair(net: FakestereoNet, pair: StereoInput, config: LabelConfig) -> Ma
     one, other = (net.estimate_pair(views, with_check=False) for views in (pair, mirrored))
     left_px, right_px = one.disparity_px, other.disparity_px.flip(-1)
     limit_px = (config.largest_share * left_px).clamp(min=config.largest_difference_px)
-    is_known = left_right_difference_px(left_px, right_px) <= limit_px
+    is_known = (left_px - warp_right_to_left(right_px[None], left_px)[0]).abs() <= limit_px
     if one.confidence is not None:
         is_known &= one.confidence >= config.least_confidence
     if one.is_sky is not None:

@@ -4,7 +4,7 @@ from collections.abc import Callable, Sequence
 
 import torch
 import torch.nn.functional as F
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from torch import Tensor
 
 from depthpose.depth.types import Maps, Views
@@ -30,11 +30,6 @@ ADVERSARIAL_LOSSES: dict[str, Callable[[Tensor, Tensor], Tensor]] = {
 """Losses of logits and labels by their names in configs: a new one is one entry here."""
 
 
-def valid_disparity(truth_px: Maps, max_px: int) -> Bool[Tensor, "b h w"]:
-    """Where the truth is known, positive (0 is the sky) and in the matcher's range."""
-    return (truth_px > 0) & (truth_px < max_px)
-
-
 def disparity_loss(
     found_px: Maps, truth_px: Maps, max_px: int, *, sky_weight: float = 0.0
 ) -> Float[Tensor, ""]:
@@ -42,7 +37,8 @@ def disparity_loss(
 
     A pixel of the sky (truth 0) counts as ``sky_weight`` pixels of a disparity of 0.
     """
-    weights = valid_disparity(truth_px, max_px).float() + sky_weight * (truth_px == 0)
+    is_valid = (truth_px > 0) & (truth_px < max_px)
+    weights = is_valid.float() + sky_weight * (truth_px == 0)
     # NaN truth must not reach the subtraction: its gradient would be NaN even where masked.
     difference = torch.where(weights > 0, found_px - truth_px.nan_to_num(0.0), 0.0)
     losses = F.smooth_l1_loss(difference, torch.zeros_like(difference), reduction="none")

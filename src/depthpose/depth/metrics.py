@@ -59,10 +59,6 @@ def measure(of: Quantity, predicted: Numbers, true: Numbers) -> dict[str, float]
     return {one.name: one.function(p, t) for one in METRICS.values() if one.of == of}
 
 
-def _rmse(p: Tensor, t: Tensor) -> float:
-    return float(((p - t) ** 2).mean().sqrt())
-
-
 def _end_point_error(p: Tensor, t: Tensor) -> float:
     return float((p - t).abs().mean())
 
@@ -82,8 +78,12 @@ METRICS = {
     for metric in (
         Metric(name="abs_rel", of="depth", function=lambda p, t: float(((p - t).abs() / t).mean())),
         Metric(name="sq_rel", of="depth", function=lambda p, t: float(((p - t) ** 2 / t).mean())),
-        Metric(name="rmse", of="depth", function=_rmse),
-        Metric(name="rmse_log", of="depth", function=lambda p, t: _rmse(p.log(), t.log())),
+        Metric(name="rmse", of="depth", function=lambda p, t: float(((p - t) ** 2).mean().sqrt())),
+        Metric(
+            name="rmse_log",
+            of="depth",
+            function=lambda p, t: float(((p.log() - t.log()) ** 2).mean().sqrt()),
+        ),
         Metric(name="d1", of="depth", function=_within[0], better="higher"),
         Metric(name="d2", of="depth", function=_within[1], better="higher", is_printed=False),
         Metric(name="d3", of="depth", function=_within[2], better="higher", is_printed=False),

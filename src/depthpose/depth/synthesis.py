@@ -47,22 +47,25 @@ class UNetGenerator(nn.Module):
     def __init__(self, config: GeneratorConfig | None = None) -> None:
         super().__init__()
         self.config = config or GeneratorConfig()
-        widths = self.config.widths
+        # Channels after each level of the encoder.
+        widths = [self.config.width * min(2**level, 8) for level in range(self.config.levels)]
         deepest = len(widths) - 1
         # No norm in the outermost level (raw colours) nor the innermost (one pixel may be left).
-        self.down = nn.ModuleList(
-            _Level(nn.Conv2d(inputs, outputs, 4, 2, 1, bias=False), with_norm=0 < level < deepest)
-            for level, (inputs, outputs) in enumerate(zip((3, *widths[:-1]), widths, strict=True))
-        )
+        # Activations stand before each level.
+        self.down, self.up = nn.ModuleList(), nn.ModuleList()
+        for level, (inputs, outputs) in enumerate(zip((3, *widths[:-1]), widths, strict=True)):
+            conv = nn.Conv2d(inputs, outputs, 4, 2, 1, bias=False)
+            norm = nn.BatchNorm2d(outputs) if 0 < level < deepest else nn.Identity()
+            self.down.append(nn.Sequential(OrderedDict(conv=conv, norm=norm)))
         # Each level of the decoder answers at the size of the encoder's input of that level.
-        self.up = nn.ModuleList()
         for level, outputs in enumerate((3, *widths[:-1])):
             inputs = widths[level] * (1 if level == deepest else 2)
             conv = nn.ConvTranspose2d(inputs, outputs, 4, 2, 1, bias=level == 0)
             # The three inner blocks between full widths, without the innermost itself.
             has_dropout = 5 <= level + 1 < self.config.levels and self.config.with_dropout
-            dropout = 0.5 if has_dropout else 0.0
-            self.up.append(_Level(conv, with_norm=level > 0, dropout=dropout))
+            norm = nn.BatchNorm2d(outputs) if level > 0 else nn.Identity()
+            dropout = nn.Dropout(0.5) if has_dropout else nn.Identity()
+            self.up.append(nn.Sequential(OrderedDict(conv=conv, norm=norm, dropout=dropout)))
         self.apply(_initialise)
 
     def forward(self, left: Views) -> Views:
@@ -87,17 +90,6 @@ class UNetGenerator(nn.Module):
             if level:
                 x = torch.cat([skips[level - 1], x], 1)
         return torch.tanh(x)
-
-
-class _Level(nn.Sequential):
-    """Convolution, norm and dropout of one level; activations stand before it."""
-
-    def __init__(
-        self, conv: nn.Conv2d | nn.ConvTranspose2d, *, with_norm: bool, dropout: float = 0.0
-    ) -> None:
-        norm = nn.BatchNorm2d(conv.out_channels) if with_norm else nn.Identity()
-        rest = nn.Dropout(dropout) if dropout else nn.Identity()
-        super().__init__(OrderedDict(conv=conv, norm=norm, dropout=rest))
 
 
 def _initialise(module: nn.Module) -> None:
@@ -285,12 +277,6 @@ class LiteEncoder(nn.Module):
         """Freeze the first layers: their ImageNet features (edges, colours) need no training."""
         for part in (self.stem, *self.blocks[: self._frozen]):
             part.requires_grad_(False)
-
-    def keep_statistics(self) -> None:
-        """Let batch norm use its stored statistics, whatever the mode: small batches spoil them."""
-        for part in self.modules():
-            if isinstance(part, nn.BatchNorm2d):
-                part.eval()
 
 
 class _ConvNorm(nn.Sequential):

@@ -157,9 +157,17 @@ class DepthEstimate:
     def __repr__(self) -> str:
         """Say it in one line: size, metres, certainty."""
         height, width = self.disparity_px.shape
-        said = [f"{width}x{height}", f"disparity {_spread(self.disparity_px, 'px')}"]
-        if self.depth_m is not None:
-            said[1] = f"depth {_spread(self.depth_m, 'm')}"
+        what, unit, values = "depth", "m", self.depth_m
+        if values is None:
+            what, unit, values = "disparity", "px", self.disparity_px
+        known, spread = values[values.isfinite()], "nowhere known"
+        if len(known):
+            # What is farthest is one pixel.
+            low, middle, high = np.percentile(known.numpy(force=True), (1, 50, 99))
+            share = len(known) / values.numel()
+            part = "" if share == 1 else f", known of {share:.0%}"
+            spread = f"{low:.1f} .. {high:.1f} {unit} (1 to 99 %, median {middle:.1f}{part})"
+        said = [f"{width}x{height}", f"{what} {spread}"]
         if self.confidence is not None:
             said.append(f"mean confidence {float(self.confidence.nanmean()):.2f}")
         if self.is_sky is not None:
@@ -178,12 +186,3 @@ class DepthError:
     error: Map
     is_disparity: bool  #: which of the two
     true_depth_m: Map | None = None  #: the truth as depth, where it is known
-
-
-def _spread(values: Map, unit: str) -> str:
-    known = values[values.isfinite()]
-    if not len(known):
-        return "nowhere known"
-    low, middle, high = np.percentile(known.numpy(force=True), (1, 50, 99))  # the far is one pixel
-    share = "" if len(known) == values.numel() else f", known of {len(known) / values.numel():.0%}"
-    return f"{low:.1f} .. {high:.1f} {unit} (1 to 99 %, median {middle:.1f}{share})"

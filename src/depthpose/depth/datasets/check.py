@@ -283,11 +283,27 @@ def find_duplicates(
 def similarity_matrix(
     first: Dataset, second: Dataset, progress: Progress = iter
 ) -> Float[Tensor, "n m"]:
-    """Largest correlation of fine structure over small shifts and zooms, for every pair."""
-    ours, theirs = (
-        torch.stack([_fine_structure(images, i) for i in progress(range(len(images)))], 1)
-        for images in (first, second)
-    )
+    """Largest correlation of fine structure over small shifts and zooms, for every pair.
+
+    Compared are grey thumbnails of each image and of its middle, one a zoom, contrast evened out.
+    """
+    found: list[Float[Tensor, "zooms n rows columns"]] = []
+    blur = nn.AvgPool2d(_BLUR, 1, _BLUR // 2, count_include_pad=False)
+    for images in (first, second):
+        details = []
+        for index in progress(range(len(images))):
+            image = read_image(images.frames[index].left).mean(0, keepdim=True)
+            height, width = image.shape[1:]
+            parts = []
+            for zoom in _ZOOMS:
+                top, left = (round(side * (1 - 1 / zoom) / 2) for side in (height, width))
+                middle = image[:, top : height - top, left : width - left]
+                parts.append(F.interpolate(middle[None], (_ROWS, _COLUMNS), mode="area"))
+            grey = torch.cat(parts)
+            detail = grey - blur(grey)
+            details.append((detail / (blur(detail**2).sqrt() + 0.01))[:, 0])
+        found.append(torch.stack(details, 1))
+    ours, theirs = found
     best = torch.full((len(first), len(second)), -1.0)
     for zoomed in range(len(_ZOOMS)):
         best = torch.maximum(best, _best_shift(ours[0], theirs[zoomed]))
@@ -304,25 +320,8 @@ def _best_shift(
     for top in range(2 * _SHIFT_ROWS + 1):
         for left in range(2 * _SHIFT_COLUMNS + 1):
             window = ours[:, top : top + height, left : left + width]
-            best = torch.maximum(best, _unit(window) @ _unit(middle).T)
+            one, other = (part.flatten(1) for part in (window, middle))
+            one, other = (part - part.mean(1, keepdim=True) for part in (one, other))
+            lengths = [part.norm(dim=1, keepdim=True).clamp(min=1e-9) for part in (one, other)]
+            best = torch.maximum(best, (one / lengths[0]) @ (other / lengths[1]).T)
     return best
-
-
-def _fine_structure(dataset: Dataset, index: int) -> Float[Tensor, "zooms rows columns"]:
-    """Make grey thumbnails of the image and of its middle, one a zoom, contrast evened out."""
-    image = read_image(dataset.frames[index].left).mean(0, keepdim=True)
-    height, width = image.shape[1:]
-    parts = []
-    for zoom in _ZOOMS:
-        top, left = (round(side * (1 - 1 / zoom) / 2) for side in (height, width))
-        middle = image[:, top : height - top, left : width - left]
-        parts.append(F.interpolate(middle[None], (_ROWS, _COLUMNS), mode="area"))
-    grey, blur = torch.cat(parts), nn.AvgPool2d(_BLUR, 1, _BLUR // 2, count_include_pad=False)
-    detail = grey - blur(grey)
-    return (detail / (blur(detail**2).sqrt() + 0.01))[:, 0]
-
-
-def _unit(windows: Float[Tensor, "n h w"]) -> Float[Tensor, "n hw"]:
-    flat = windows.flatten(1)
-    centred = flat - flat.mean(1, keepdim=True)
-    return centred / centred.norm(dim=1, keepdim=True).clamp(min=1e-9)

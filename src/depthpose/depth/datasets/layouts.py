@@ -46,7 +46,15 @@ def pack_frames(
         InputError: a file is missing or damaged, or the disk refuses.
     """
     rows: list[dict[str, Any]] = []
-    kept: dict[Path, str] = {}
+    kept: dict[Path, str] = {}  # where each calibration lies
+    for calibration in dict.fromkeys(frame.calibration for frame in frames if frame.calibration):
+        kept[calibration] = place = f"{_CALIBRATION}/{len(kept):06d}"
+        if calibration.is_file():
+            kept[calibration] = place = f"{place}{calibration.suffix}"
+            write_bytes(out / place, files.read_bytes(calibration))
+        else:  # KITTI raw: the folder of a date
+            for file in sorted(calibration.glob("calib_*.txt")):
+                write_bytes(out / place / file.name, files.read_bytes(file))
     remaining, shards = list(frames), 0
     while remaining:
         name, size = f"{shards:06d}.tar", 0
@@ -65,7 +73,7 @@ def pack_frames(
                     row[what] = f"{name}/{member.name}"
                     size += len(data)
                 if frame.calibration is not None:
-                    row["calibration"] = _keep(frame.calibration, out, kept)
+                    row["calibration"] = kept[frame.calibration]
                 rows.append(row)
                 show(frame.name)
                 if size >= shard_bytes:
@@ -118,19 +126,6 @@ def local_folder(folder: Path | str) -> Path:
     return here
 
 
-def _keep(calibration: Path, out: Path, kept: dict[Path, str]) -> str:
-    """Copy the calibration of a frame, once."""
-    if calibration not in kept:
-        kept[calibration] = place = f"{_CALIBRATION}/{len(kept):06d}"
-        if calibration.is_file():
-            kept[calibration] = place = f"{place}{calibration.suffix}"
-            write_bytes(out / place, files.read_bytes(calibration))
-        else:  # KITTI raw: the folder of a date
-            for file in sorted(calibration.glob("calib_*.txt")):
-                write_bytes(out / place / file.name, files.read_bytes(file))
-    return kept[calibration]
-
-
 @dataclass(frozen=True, kw_only=True)
 class Layout:
     """How the files of a dataset lie in its folder."""
@@ -144,12 +139,17 @@ def find_frames(folder: Path) -> tuple[str, list[Frame]]:
     if not folder.is_dir():
         raise InputError(f"{folder}: there is no such folder. Give the folder of a dataset.")
     folder = Path(os.path.abspath(folder))  # noqa: PTH100  '.' has no name, and a link keeps its own
-    known = _recognise(folder)
-    if known is not None:
-        return known
+    for name, layout in LAYOUTS.items():
+        frames = sorted(layout.find(folder), key=lambda frame: frame.name)
+        if frames:
+            return name, frames
     children = sorted(folder.iterdir())
     found = ", ".join(path.name for path in children[:8]) or "nothing"
-    inside = [path.name for path in children[:50] if path.is_dir() and _recognise(path)]
+    inside = [
+        path.name
+        for path in children[:50]
+        if path.is_dir() and any(next(iter(one.find(path)), None) for one in LAYOUTS.values())
+    ]
     hint = f" Open one of its folders instead: {', '.join(inside)}." if inside else ""
     drives = (folder, *children, *folder.glob("*/*_extract"))
     if any(path.name.endswith("_extract") for path in drives):
@@ -161,14 +161,6 @@ def find_frames(folder: Path) -> tuple[str, list[Frame]]:
     raise InputError(
         f"{folder}: no layout that is known here. It holds {found}. Known: {known_layouts}.{hint}"
     )
-
-
-def _recognise(folder: Path) -> tuple[str, list[Frame]] | None:
-    for name, layout in LAYOUTS.items():
-        frames = sorted(layout.find(folder), key=lambda frame: frame.name)
-        if frames:
-            return name, frames
-    return None
 
 
 def _frames(
@@ -186,6 +178,14 @@ def _raw(folder: Path) -> Iterable[Frame]:
     for drive in sorted([*itself, *folder.glob("*_sync"), *folder.glob("*/*_sync")]):
         date, lefts = drive.parent, _listed(drive / "image_02/data")
         is_calibrated = (date / "calib_cam_to_cam.txt").exists()
+        maps: list[Path] = []  # of the left camera, wherever in the tree the dataset was opened
+        for kind, archive in (("velodyne_raw", "velodyne"), ("groundtruth", "annotated")):
+            inside = f"proj_depth/{kind}/image_02"
+            tops = (date, date / f"data_depth_{archive}", date.parent)
+            roots = [*tops, date.parent / f"data_depth_{archive}"]
+            homes = [root / part / drive.name for root in roots for part in ("train", "val")]
+            found = (home / inside for home in (drive, *homes) if (home / inside).is_dir())
+            maps.append(next(found, drive / inside))
         yield from _frames(
             lefts,
             "raw",
@@ -193,21 +193,12 @@ def _raw(folder: Path) -> Iterable[Frame]:
             calibration={left.stem: date for left in lefts if is_calibrated},
             right=_by_stem(drive / "image_03/data"),
             velodyne=_by_stem(drive / "velodyne_points/data", (".bin",)),
-            scan=_by_stem(_depth_folder(drive, "velodyne_raw", "data_depth_velodyne")),
-            depth=_by_stem(_depth_folder(drive, "groundtruth", "data_depth_annotated")),
+            scan=_by_stem(maps[0]),
+            depth=_by_stem(maps[1]),
             disparity=_by_stem(drive / "disp_occ"),
             disparity_noc=_by_stem(drive / "disp_noc"),
             sky=_by_stem(drive / "sky"),
         )
-
-
-def _depth_folder(drive: Path, kind: str, archive: str) -> Path:
-    """Find maps of a drive's left camera, wherever in the tree the dataset was opened."""
-    inside = f"proj_depth/{kind}/image_02"
-    homes = (drive.parent, drive.parent.parent)
-    roots = [root for home in homes for root in (home, home / archive)]
-    homes = [drive, *(root / part / drive.name for root in roots for part in ("train", "val"))]
-    return next((home / inside for home in homes if (home / inside).is_dir()), drive / inside)
 
 
 def _depth_selection(folder: Path) -> Iterable[Frame]:

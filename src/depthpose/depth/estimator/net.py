@@ -95,21 +95,15 @@ def as_input(
     image: object, name: str, camera: AnyLens | None, *, with_exif: bool = True
 ) -> StereoInput:
     """Take a picture and what is known of its camera; without that, ask the picture's EXIF."""
-    left = as_tensor(image)
-    if camera is None and with_exif:
-        camera = exif_focal_px(image, name)
+    left, found = as_tensor(image), None
+    if camera is None and with_exif and isinstance(image, str | Path | Image.Image):
+        found = read_exif_focal(image)
+    if found is not None:
+        camera, source = found
+        said = f"{name}: a focal length of {camera:.0f} px, by its EXIF ({source})"
+        warnings.warn(f"{said}; of a cropped picture it is another", Notice, stacklevel=3)
     camera = camera_of(camera, (left.shape[2], left.shape[1]))
     return StereoInput(name=name, left=left, right=None, camera=camera)
-
-
-def exif_focal_px(image: object, name: str) -> float | None:
-    """Give the focal length of a photograph's EXIF [px], with a :class:`Notice` of it, or None."""
-    found = read_exif_focal(image) if isinstance(image, str | Path | Image.Image) else None
-    if found is None:
-        return None
-    said = f"{name}: a focal length of {found[0]:.0f} px, by its EXIF ({found[1]})"
-    warnings.warn(f"{said}; of a cropped picture it is another", Notice, stacklevel=4)
-    return found[0]
 
 
 def refuse_unrectified(pair: StereoInput, *, with_check: bool = True) -> str:

@@ -4,7 +4,7 @@ import os
 import warnings
 from base64 import b64decode
 from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from io import BytesIO
 from itertools import islice
 from pathlib import Path
@@ -16,7 +16,7 @@ import torch
 from PIL import Image
 from torch import Tensor
 
-from depthpose.core.camera import AnyCamera, AnyLens, choose_lens
+from depthpose.core.camera import AnyCamera, AnyLens, camera_of, choose_lens
 from depthpose.core.errors import InputError, Notice, refuse_unknown
 from depthpose.depth.config import MatcherConfig
 from depthpose.depth.estimator.net import (
@@ -24,8 +24,6 @@ from depthpose.depth.estimator.net import (
     FakestereoNet,
     Picture,
     as_input,
-    as_tensor,
-    exif_focal_px,
 )
 from depthpose.depth.types import StereoInput
 
@@ -91,18 +89,18 @@ class DepthPipeline:
         while some := list(islice(left, batch)):
             seen: list[StereoInput] = []
             for picture in some:
-                opened = _opened(picture, timeout)
-                image = as_tensor(opened)
-                known = exif_focal_px(opened, "the picture") if lens is None else lens
-                if known is None:
-                    known = _PHONE * image.shape[2]
+                taken = as_input(_opened(picture, timeout), "the picture", lens)
+                if taken.camera is None:
+                    height, width = taken.left.shape[1:]
+                    known = _PHONE * width
+                    taken = replace(taken, camera=camera_of(known, (width, height)))
                     warnings.warn(
                         f"no camera: a focal length of {known:g} px is taken, a phone's; the "
                         "metres are as wrong as it is. Give focal_px= or camera=",
                         Notice,
                         stacklevel=3,
                     )
-                seen.append(as_input(image, "the picture", known))
+                seen.append(taken)
             for found in self.net.estimate_many(seen, batch=batch):
                 if isinstance(found, InputError):
                     raise found

@@ -115,22 +115,6 @@ class ConvNorm(nn.Sequential):
         super().__init__(OrderedDict(conv=conv, norm=norm(outputs)))
 
 
-def folded_weight(layer: nn.Module) -> tuple[Tensor, Tensor]:
-    """Weight and bias of the one convolution that equals ``layer`` in eval mode, in float64.
-
-    ``norm(conv(x)) = gain * (conv(x) - mean) + bias`` with ``gain = weight / sqrt(var + eps)``.
-    """
-    conv, norm = cast("Conv", layer.conv), cast("Norm", layer.norm)
-    assert norm.running_mean is not None
-    assert norm.running_var is not None
-    gain = norm.weight.double() / (norm.running_var.double() + norm.eps).sqrt()
-    bias = norm.bias.double() - gain * norm.running_mean.double()
-    output_axis = 1 if isinstance(conv, nn.ConvTranspose3d) else 0
-    shape = [1] * conv.weight.ndim
-    shape[output_axis] = -1
-    return (conv.weight.double() * gain.view(shape)).detach(), bias.detach()
-
-
 def fold(network: ModuleT, like: Tensor) -> ModuleT:
     """Fold every batch norm into the convolution before it, in place, in the type of ``like``.
 
@@ -140,19 +124,28 @@ def fold(network: ModuleT, like: Tensor) -> ModuleT:
     for parent in list(network.modules()):
         for name, layer in list(parent.named_children()):
             norm = getattr(layer, "norm", None)
-            if isinstance(norm, nn.BatchNorm3d):
-                conv = VolumeConv(cast("Conv", layer.conv), *folded_weight(layer), like)
-                setattr(parent, name, conv)
-            elif isinstance(layer, nn.Conv3d) and not isinstance(parent, ConvNorm):
+            if isinstance(layer, nn.Conv3d) and not isinstance(parent, ConvNorm):
                 bias = torch.zeros(layer.out_channels) if layer.bias is None else layer.bias
                 setattr(parent, name, VolumeConv(layer, layer.weight, bias, like))
-            elif isinstance(norm, nn.BatchNorm2d):
-                conv = cast("nn.Conv2d", layer.conv)
-                weight, bias = folded_weight(layer)
-                conv.weight.data, conv.bias = weight, nn.Parameter(bias)
-                layer.norm = nn.Identity()
-                if isinstance(layer, ConvNorm):  # which then is its convolution
-                    setattr(parent, name, conv)
+            if not isinstance(norm, Norm):
+                continue
+            # norm(conv(x)) = gain * (conv(x) - mean) + bias with gain = weight / sqrt(var + eps),
+            # in float64.
+            conv = cast("Conv", layer.conv)
+            assert norm.running_mean is not None
+            assert norm.running_var is not None
+            gain = norm.weight.double() / (norm.running_var.double() + norm.eps).sqrt()
+            bias = (norm.bias.double() - gain * norm.running_mean.double()).detach()
+            shape = [1] * conv.weight.ndim
+            shape[1 if isinstance(conv, nn.ConvTranspose3d) else 0] = -1  # the axis of outputs
+            weight = (conv.weight.double() * gain.view(shape)).detach()
+            if isinstance(norm, nn.BatchNorm3d):
+                setattr(parent, name, VolumeConv(conv, weight, bias, like))
+                continue
+            conv.weight.data, conv.bias = weight, nn.Parameter(bias)
+            layer.norm = nn.Identity()
+            if isinstance(layer, ConvNorm):  # which then is its convolution
+                setattr(parent, name, conv)
     for module in network.modules():
         for parameter in () if isinstance(module, VolumeConv) else module.parameters(recurse=False):
             values = parameter.data.to(like)

@@ -407,7 +407,9 @@ def lower_where_disagreeing(found: Match, right_px: Map) -> Match:
     Halved at least where the matching point lies outside the right view: nothing there can
     agree, and nothing contradicts. That of the sky is kept.
     """
-    difference_px = disparity.left_right_difference_px(found.disparity_px, right_px)
+    # Small where both views agree, large at occlusions; NaN outside the right view.
+    there_px = disparity.warp_right_to_left(right_px[None], found.disparity_px)[0]
+    difference_px = (found.disparity_px - there_px).abs()
     agreement = torch.exp(-difference_px / AGREEMENT_PX).nan_to_num(0.0)
     confidence = agreement if found.confidence is None else found.confidence * (1 + agreement) / 2
     if found.confidence is not None and found.is_sky is not None:

@@ -25,7 +25,7 @@ from depthpose.core.config import config_to_dict
 from depthpose.core.errors import InputError
 from depthpose.depth.config import PSMNetConfig
 from depthpose.depth.stereo import layers
-from depthpose.depth.stereo.layers import ConvNorm, Features, Volume
+from depthpose.depth.stereo.layers import ConvNorm, Volume
 from depthpose.depth.stereo.matcher import NetworkMatcher, StereoNetwork
 from depthpose.depth.types import Map, Maps, Match, Views
 
@@ -255,12 +255,13 @@ class PSMNet(StereoNetwork):
         """
         bins = (max_disparity_px or self.config.max_disparity_px) // 4
 
-        def begin(left: Features, right: Features) -> Volume:
-            return self.aggregate(concatenation_volume(left, right, bins))
-
-        views = self.features(left), self.features(right)
-        # Four convolutions follow each other.
-        return self.refine(layers.by_rows(begin, views, halo=4, rows=self.rows))
+        volume = layers.by_rows(
+            lambda near, far: self.aggregate(concatenation_volume(near, far, bins)),
+            (self.features(left), self.features(right)),
+            halo=4,  # four convolutions follow each other
+            rows=self.rows,
+        )
+        return self.refine(volume)
 
     def aggregate(self, volume: Volume) -> Volume:
         """Give the volume that the hourglasses refine, of a concatenation volume."""

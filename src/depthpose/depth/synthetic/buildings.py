@@ -58,7 +58,7 @@ def add_house(b: MeshBuilder, plot: Plot, *, with_details: bool) -> None:
         frame=_FRAMES[b.rng.choice(3, p=[0.6, 0.2, 0.2])],
         with_details=with_details,
     )
-    b.begin_thing()
+    b.thing += 1
     away, length = np.array([float(plot.side), 0, 0]), plot.stop_m - plot.start_m
     back_m = plot.x_m + plot.side * plot.depth_m
     for x, z, along, outward, size, has_windows in (

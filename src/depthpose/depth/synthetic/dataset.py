@@ -134,11 +134,13 @@ def draw_light(stage: Stage, sight: Sight) -> Float[Tensor, "h w 3"]:
     assert raster.barycentric is not None
     seen = [v.flatten(0, 1) for v in (raster.primitive, raster.barycentric, raster.depth_m)]
     nearest = Nearest(*(values.index_select(0, whole) for values in seen))
-    light[whole] = _light(stage, sight, _centres(whole, width), nearest)
+    index = torch.arange(height * width)
+    centres = torch.stack([index % width, index // width], 1).double()
+    light[whole] = _light(stage, sight, centres[whole], nearest)
     if len(mixed):  # the mean light of four places in each pixel
         candidates = neighbours(sight.raster.primitive, mixed)
         own = [values.index_select(0, mixed) for values in seen]
-        places = [_centres(mixed, width) + torch.tensor(o, dtype=torch.float64) for o in _OFFSETS]
+        places = [centres[mixed] + torch.tensor(o, dtype=torch.float64) for o in _OFFSETS]
         found = []
         for there in nearest_at(sight, candidates, places):
             # A gap between all that was seen near by: take what the pixel's centre sees.
@@ -152,10 +154,6 @@ def draw_light(stage: Stage, sight: Sight) -> Float[Tensor, "h w 3"]:
         # A glint in a quarter of a pixel would outshine the rest, as it does not in a sensor.
         light[mixed] = of_places.clamp(max=4).reshape(len(_OFFSETS), -1, 3).mean(0)
     return light.reshape(height, width, 3)
-
-
-def _centres(index: Indices, width: int) -> Float64[Tensor, "n 2"]:
-    return torch.stack([index % width, index // width], 1).double()
 
 
 def _light(stage: Stage, sight: Sight, pixels: Float64[Tensor, "n 2"], nearest: Nearest) -> Vectors:
@@ -373,7 +371,7 @@ def _occluded(left: Sight, right: Sight, rig: StereoRig) -> Mask:
     primitive, depth_m = left.raster.primitive.flatten(), left.raster.depth_m.flatten()
     occluded = torch.zeros(height * width, dtype=torch.bool)
     index = (primitive >= 0).nonzero()[:, 0]
-    pixels = _centres(index, width)
+    pixels = torch.stack([index % width, index // width], 1).double()
     pixels[:, 0] -= disparity_from_depth(depth_m[None, index], rig)[0].double()
     pixels[:, 1] += right.K[1, 2] - left.K[1, 2]
     near = pixels.round().long()

@@ -6,7 +6,7 @@ model stands at the origin on y = 0 and looks along z.
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, field, fields, replace
 from functools import cache, partialmethod
 from typing import NamedTuple
 
@@ -380,25 +380,21 @@ _FACE_WIDTH = [2, 2, 2, 2, 0, 0]
 _FACE_HEIGHT = [1, 1, 0, 0, 1, 1]
 
 
+@dataclass(eq=False)
 class MeshBuilder:
-    """Collects triangles; every method adds to what is there. ``rng`` draws what is random."""
+    """Collects triangles; every method adds to what is there."""
 
-    def __init__(self, rng: np.random.Generator) -> None:
-        self.rng = rng
-        self._parts: list[Mesh] = []
-        self._boxes: list[tuple] = []
-        self._thing = 0
-
-    def begin_thing(self) -> None:
-        """Say that what follows is another object."""
-        self._thing += 1
+    rng: np.random.Generator  # draws what is random
+    thing: int = 0  # number of the object to which triangles belong
+    _parts: list[Mesh] = field(default_factory=list)
+    _boxes: list[tuple] = field(default_factory=list)
 
     def add(self, mesh: Mesh) -> None:
         """Add a placed model as one object, unless it would stand against the camera."""
         if len(mesh) and np.hypot(mesh.corners[..., 0], mesh.corners[..., 2]).min() < NEAREST_M:
             return
-        self.begin_thing()
-        self._parts.append(replace(mesh, thing=np.full(len(mesh), self._thing, np.int32)))
+        self.thing += 1
+        self._parts.append(replace(mesh, thing=np.full(len(mesh), self.thing, np.int32)))
 
     def triangles(
         self,
@@ -417,7 +413,7 @@ class MeshBuilder:
         uv = np.asarray(uv_m, np.float32) / surface.tile_m
         material, color = NUMBER[surface.material], surface.tint if tint is None else tint
         self._parts.append(
-            _mesh(positions, uv, normals, color, material, surface.layer, self._thing)
+            _mesh(positions, uv, normals, color, material, surface.layer, self.thing)
         )
 
     def quads(
@@ -454,7 +450,7 @@ class MeshBuilder:
     ) -> None:
         """Add a box; ``taper`` scales its top. Boxes are made all at once, in :meth:`finish`."""
         R = np.eye(3) if rotation is None else rotation
-        self._boxes.append((centre, size, R, taper, surface, self._thing))
+        self._boxes.append((centre, size, R, taper, surface, self.thing))
 
     def tube(
         self,

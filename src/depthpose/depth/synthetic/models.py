@@ -210,7 +210,7 @@ def add_wood_edge(
     points = np.stack([x + out, up, s + 0.5 * out[::-1]], -1)
     along = np.arange(count) * 1.5
     color = np.array(leaf_color(rng))
-    b.begin_thing()
+    b.thing += 1
     surface = Surface("leaf", tuple(0.3 * color), 3.0, int(rng.integers(3)))
     for low, high in pairwise(range(len(rows))):
         below, above = (np.stack([along, -up[row]], 1) for row in (low, high))

@@ -4,7 +4,7 @@ Everything is laid out along a straight street first, at (x to the right, y down
 camera's car at x = s = 0, and then bent as a whole.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from itertools import pairwise
 from typing import Literal
 
@@ -43,24 +43,15 @@ class Road:
     """The plan of a road."""
 
     place: Place  # what kind of place it runs through
-    left_m: Number  # x of its left edge
-    right_m: float
+    edge_m: dict[int, float]  # x of its left edge (-1) and of its right one (1)
     lanes: int  # how many there are
+    lane_m: float  # width of each
     parking_m: tuple[Number, Number]  # width of the strip for parked cars, on the left and right
     walk_m: Number  # width of the pavement; 0: none
     curb_m: float  # how much higher the pavement is
     verge_m: Number  # width of the grass between road and pavement
     side_streets: tuple[SideStreet, ...]
     centre: Float64[np.ndarray, "n 5"]  # of the road: s, x, y, z [m] and heading [rad]
-
-    @property
-    def lane_m(self) -> float:
-        """Width of a lane."""
-        return (self.right_m - self.left_m - sum(self.parking_m)) / self.lanes
-
-    def edge_m(self, side: int) -> float:
-        """Give x of the edge on one side."""
-        return self.right_m if side > 0 else self.left_m
 
     def is_side_street(self, s_m: Number, side: int, margin_m: Number = 0.0) -> bool:
         """Whether a side street joins here."""
@@ -115,12 +106,14 @@ def draw_road(rng: np.random.Generator) -> Road:
     heading -= np.interp(0.0, along, heading)
     line = np.cumsum(np.sin(heading)), -np.cumsum(slope), np.cumsum(np.cos(heading))
     x, y, z = (values - np.interp(0.0, along, values) for values in line)
+    left_m, right_m = float(right_m - width_m), float(right_m)
+    parking_m = (float(parking[0]), float(parking[1]))
     return Road(
         place=place,
-        left_m=float(right_m - width_m),
-        right_m=float(right_m),
+        edge_m={-1: left_m, 1: right_m},
         lanes=lanes,
-        parking_m=(float(parking[0]), float(parking[1])),
+        lane_m=(right_m - left_m - sum(parking_m)) / lanes,
+        parking_m=parking_m,
         walk_m=walk_m,
         curb_m=curb_m,
         verge_m=verge_m,
@@ -163,17 +156,22 @@ def add_ground(b: MeshBuilder, road: Road) -> None:
     color = (0.2 * grey, 0.19 * grey, 0.18 * grey)
     walk = Surface("pavement", color, rng.uniform(1.6, 3.2), variants[1])
     grass = Surface("grass", (0.075 * green * warm, 0.088 * green, 0.02 * green), 3.0, variants[2])
-    b.begin_thing()
-    _strip(b, (road.left_m, road.right_m), (0.0, 0.0), asphalt, _stations(road, 0))
+    b.thing += 1
+    even = np.concatenate(
+        [np.arange(-BEHIND_M, 60, 4), np.arange(60, 150, 10), np.arange(150, AHEAD_M + 1, 30)]
+    )
+    _strip(b, (road.edge_m[-1], road.edge_m[1]), (0.0, 0.0), asphalt, even)
     land = walk if road.place == "city" and rng.random() < 0.7 else grass
     for side in (-1, 1):
-        stations = _stations(road, side)
+        streets = [street for street in road.side_streets if side in street.sides]
+        cuts = [street.s_m + sign * street.half_m for street in streets for sign in (-1, 1)]
+        stations = np.unique(np.concatenate([even, cuts]))
         middle = (stations[1:] + stations[:-1]) / 2
         is_street = np.array([road.is_side_street(float(s), side) for s in middle])
         starts = [0, *(np.flatnonzero(is_street[1:] != is_street[:-1]) + 1), len(is_street)]
         for first, last in pairwise(starts):
-            b.begin_thing()
-            piece, edge = stations[first : last + 1], road.edge_m(side)
+            b.thing += 1
+            piece, edge = stations[first : last + 1], road.edge_m[side]
             if is_street[first]:
                 _strip(b, (edge, edge + side * _WIDE_M), (0.0, 0.0), asphalt, piece)
             else:
@@ -191,7 +189,7 @@ def _add_side(
 ) -> None:
     """From the road's edge outwards: kerb, verge, pavement, land; banks at both ends."""
     rng, high, curb = b.rng, -road.curb_m, Surface("curb", (0.3, 0.29, 0.28), 1.0)
-    x = edge = road.edge_m(side)
+    x = edge = road.edge_m[side]
 
     def strip(width: Number, heights: tuple[Number, Number], surface: Surface) -> None:
         _strip(b, (x, x + side * width), heights, surface, stations)
@@ -221,17 +219,6 @@ def _add_side(
         ]
         corners = np.array(faces, np.float32)
         b.quads(corners, corners[..., :2], curb if road.curb_m else land)
-
-
-def _stations(road: Road, side: int) -> Float64[np.ndarray, " n"]:
-    cuts = [
-        street.s_m + sign * street.half_m
-        for street in road.side_streets
-        if side in street.sides
-        for sign in (-1, 1)
-    ]
-    even = [np.arange(-BEHIND_M, 60, 4), np.arange(60, 150, 10), np.arange(150, AHEAD_M + 1, 30)]
-    return np.unique(np.concatenate([*even, cuts]))
 
 
 def _strip(
@@ -293,23 +280,20 @@ class _Roadside:
 
     def x_m(self, beyond_m: Number) -> Number:
         """Give x so far beyond the beginning of the plots, behind pavement and verge."""
-        plot_m = self.road.edge_m(self.side) + self.side * (self.road.verge_m + self.road.walk_m)
+        plot_m = self.road.edge_m[self.side] + self.side * (self.road.verge_m + self.road.walk_m)
         return plot_m + self.side * beyond_m
-
-    def is_free(self, s: Number, length: float) -> bool:
-        """Whether no side street lies in a stretch."""
-        return not self.road.is_side_street(s + length / 2, self.side, length / 2 + 1)
 
     def add_houses(self) -> None:
         """Houses at the pavement, wall to wall."""
         rng = self.b.rng
         if self.road.walk_m > 2 and rng.random() < 0.55:
-            self.add_tree_row(self.road.edge_m(self.side) + self.side * 0.9)
+            self.add_tree_row(self.road.edge_m[self.side] + self.side * 0.9)
         s, set_back = rng.uniform(-12, -4), rng.uniform(0, 3) * (rng.random() < 0.4)
         tall = rng.uniform(6, 17)
         while s < _FAR_M:
             length = rng.uniform(8, 20)
-            if self.is_free(s, length):
+            half = length / 2
+            if not self.road.is_side_street(s + half, self.side, half + 1):
                 height = tall * rng.uniform(0.75, 1.25)
                 self.add_house(s, length, set_back + rng.uniform(0, 0.6), height)
             elif rng.random() < 0.5:
@@ -323,7 +307,8 @@ class _Roadside:
         border = int(rng.integers(4))
         while s < _FAR_M:
             length = rng.uniform(8, 15)
-            if not self.is_free(s, length):
+            half = length / 2
+            if self.road.is_side_street(s + half, self.side, half + 1):
                 s += length
                 continue
             if rng.random() < 0.78:
@@ -345,13 +330,15 @@ class _Roadside:
         rail = int(rng.integers(4))
         if has_row:
             beyond = rng.uniform(1.2, max(1.5, self.road.verge_m))
-            self.add_tree_row(self.road.edge_m(self.side) + self.side * beyond)
+            self.add_tree_row(self.road.edge_m[self.side] + self.side * beyond)
         if has_border:
             self.add_border(-8, 100, rail)
         s = rng.uniform(-10, 5)
         while s < _FAR_M:
             length = rng.uniform(10, 26)
-            if has_houses and rng.random() < 0.7 and self.is_free(s, length):
+            half = length / 2
+            is_free = not self.road.is_side_street(s + half, self.side, half + 1)
+            if has_houses and rng.random() < 0.7 and is_free:
                 self.add_house(s, length, rng.uniform(5, 22), rng.uniform(5, 16))
             else:
                 self.add_copse(s, length, rng.uniform(4, 14))
@@ -396,7 +383,7 @@ class _Roadside:
     def add_kerb(self) -> None:
         """Lamps in a row; signs, lights, posts and boxes here and there; poles with wires."""
         rng, road, side = self.b.rng, self.road, self.side
-        x, y = self.road.edge_m(self.side) + side * (0.5 if road.walk_m else 1.3), -road.curb_m
+        x, y = self.road.edge_m[self.side] + side * (0.5 if road.walk_m else 1.3), -road.curb_m
         if rng.random() <= {"forest": 0.1, "rural": 0.3}.get(road.place, 0.7):
             number, step = int(rng.integers(6)), rng.uniform(16, 34)
             for s in np.arange(rng.uniform(2, 25), 110, step):
@@ -427,7 +414,7 @@ class _Roadside:
             at = x + side * rng.uniform(0.5, 3)
             height, gap = rng.uniform(6, 8), rng.uniform(22, 38)
             places = np.arange(rng.uniform(-15, 10), 120, gap)
-            self.b.begin_thing()
+            self.b.thing += 1
             for s in places:
                 self.b.tube((at, 0.2, s), (at, -height, s), (0.12, 0.09), _WOOD, 8)
                 self.b.box((at, -height + 0.3, s), (1.4, 0.1, 0.1), _WOOD)
@@ -498,13 +485,17 @@ class _Roadside:
         self.b.add(place(model, (x, 0, s), self.b.rng.uniform(0, 6.28), scale, tints))
 
 
+_OWN_CAR = (0.0, 0.5, 1.5, 4.5)
+"""x, s, half width and half length of the camera's own car, and of sight before it [m]."""
+
+
+@dataclass(frozen=True, eq=False)
 class Traffic:
     """Vehicles and people on a road, none where another one is; every method adds to the mesh."""
 
-    def __init__(self, b: MeshBuilder, road: Road) -> None:
-        self.b, self.rng, self.road = b, b.rng, road
-        # x, s, half width and half length of the camera's own car, and of sight before it [m].
-        self._taken = [(0.0, 0.5, 1.5, 4.5)]
+    b: MeshBuilder
+    road: Road
+    _taken: list[tuple[Number, float, Number, float]] = field(default_factory=lambda: [_OWN_CAR])
 
     def claim(self, x: Number, s: float, half_x: Number, half_s: float) -> bool:
         """Take a place [m], if it is free."""
@@ -516,7 +507,7 @@ class Traffic:
 
     def add_parked(self) -> None:
         """Cars in the strips for them, or at the edge of streets without one."""
-        rng, road = self.rng, self.road
+        rng, road = self.b.rng, self.road
         for side in (-1, 1):
             width = road.parking_m[(side + 1) // 2]
             on_edge = not width and road.place in ("city", "suburb") and rng.random() < 0.25
@@ -524,7 +515,7 @@ class Traffic:
                 continue
             fill, s = rng.uniform(0.3, 0.95), rng.uniform(-4, 9)
             while s < 85:
-                x = road.edge_m(side) - side * rng.uniform(0.92, 1.15)
+                x = road.edge_m[side] - side * rng.uniform(0.92, 1.15)
                 if rng.random() < fill and not road.is_side_street(s, side, 3):
                     ahead = 0.0 if (side > 0) == (rng.random() < 0.93) else np.pi
                     self.add_vehicle(x, s, ahead + rng.normal(0, 0.02))
@@ -532,11 +523,11 @@ class Traffic:
 
     def add_driving(self) -> None:
         """Vehicles in the lanes, and in the side streets, waiting or turning."""
-        rng, road = self.rng, self.road
+        rng, road = self.b.rng, self.road
         usual = {"avenue": 1.3, "forest": 0.6, "rural": 0.6}.get(road.place, 0.9)
         density = rng.uniform(0.15, 1) * usual
         for lane in range(road.lanes):
-            x = road.left_m + road.parking_m[0] + (lane + 0.5) * road.lane_m
+            x = road.edge_m[-1] + road.parking_m[0] + (lane + 0.5) * road.lane_m
             is_oncoming = lane < road.lanes // 2
             s = rng.uniform(7, 30)
             while s < 110:
@@ -547,13 +538,13 @@ class Traffic:
         for street in road.side_streets:
             for side in street.sides:
                 if rng.random() < 0.5 and street.s_m > 8:
-                    x = road.edge_m(side) + side * rng.uniform(2.5, 16)
+                    x = road.edge_m[side] + side * rng.uniform(2.5, 16)
                     s = street.s_m + rng.choice([-0.45, 0.45]) * street.half_m
                     self.add_vehicle(x, s, rng.choice([-1, 1]) * np.pi / 2 + rng.normal(0, 0.1))
 
     def add_vehicle(self, x: Number, s: Number, yaw: Number) -> None:
         """A vehicle of some kind and colour, if its place is free."""
-        rng, shares = self.rng, np.array([body.share for body in models.BODIES.values()])
+        rng, shares = self.b.rng, np.array([body.share for body in models.BODIES.values()])
         kind = list(models.BODIES)[rng.choice(len(shares), p=shares / shares.sum())]
         length, width, _ = models.BODIES[kind].size_m
         c, t = abs(np.cos(yaw)), abs(np.sin(yaw))
@@ -569,24 +560,24 @@ class Traffic:
 
     def add_people(self) -> None:
         """People on foot, on the pavement and now and then the road, and on bicycles."""
-        rng, road = self.rng, self.road
+        rng, road = self.b.rng, self.road
         mean = {"city": 5.0, "suburb": 1.5, "avenue": 2.0}.get(road.place, 0.4)
         for _ in range(int(rng.poisson(mean))):
             side = int(rng.choice([-1, 1]))
             s, strip = rng.uniform(5, 50), road.verge_m + road.walk_m
-            x = road.edge_m(side) + side * rng.uniform(0.3, max(0.6, strip - 0.2))
+            x = road.edge_m[side] + side * rng.uniform(0.3, max(0.6, strip - 0.2))
             if rng.random() < 0.12:
-                x = rng.uniform(road.left_m, road.right_m)
+                x = rng.uniform(road.edge_m[-1], road.edge_m[1])
             if not self.claim(x, s, 0.3, 0.3):
                 continue
-            on_road = road.left_m < x < road.right_m
+            on_road = road.edge_m[-1] < x < road.edge_m[1]
             turns = rng.choice([0, np.pi, np.pi / 2, -np.pi / 2], p=[0.35, 0.35, 0.15, 0.15])
             yaw = float(turns) + rng.normal(0, 0.2) + (np.pi / 2 if on_road else 0)
             y = 0.0 if on_road else -road.curb_m
             self.b.add(place(models.walker(int(rng.integers(models.WALKERS))), (x, y, s), yaw))
         for _ in range(int(rng.poisson(mean * 0.3))):
             side = int(rng.choice([-1, 1]))
-            x = road.edge_m(side) - side * (road.parking_m[(side + 1) // 2] + rng.uniform(0.3, 0.9))
+            x = road.edge_m[side] - side * (road.parking_m[(side + 1) // 2] + rng.uniform(0.3, 0.9))
             s = rng.uniform(6, 45)
             if self.claim(x, s, 0.4, 1.0):
                 yaw = rng.normal(0, 0.08) + (0 if side > 0 else np.pi)

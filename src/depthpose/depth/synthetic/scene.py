@@ -149,7 +149,7 @@ def _draw_markings(rng: np.random.Generator, road: roads.Road) -> Markings:
     is_marked = road.place in ("avenue", "rural", "forest") or rng.random() < 0.5
     dash, half = rng.uniform(2, 6), rng.uniform(0.05, 0.08)
     period = dash * rng.uniform(2, 3)
-    first = road.left_m + road.parking_m[0]
+    first = road.edge_m[-1] + road.parking_m[0]
     lines, bars = [], []
     for k in range(road.lanes + 1) if is_marked else ():
         is_edge = k in (0, road.lanes)
@@ -162,10 +162,10 @@ def _draw_markings(rng: np.random.Generator, road: roads.Road) -> Markings:
     for street in road.side_streets:
         start = street.s_m - street.half_m
         if rng.random() < 0.4:
-            bars.append((start - 3.5, 1.5, road.left_m, road.right_m, 1.0))
+            bars.append((start - 3.5, 1.5, road.edge_m[-1], road.edge_m[1], 1.0))
         if rng.random() < 0.4:
-            middle = (road.left_m + road.right_m) / 2
-            bars.append((start - 6, 0.2, middle, road.right_m, 0.0))
+            middle = (road.edge_m[-1] + road.edge_m[1]) / 2
+            bars.append((start - 6, 0.2, middle, road.edge_m[1], 0.0))
     return Markings(
         lines=np.array(lines, float).reshape(-1, 4),
         bars=np.array(bars, float).reshape(-1, 5),
@@ -221,7 +221,7 @@ def make_clutter(seed: tuple[int, ...]) -> StreetScene:
     b = MeshBuilder(rng)
 
     def sheet(corner: Values, along: Values, up: Values) -> None:
-        b.begin_thing()
+        b.thing += 1
         b.rectangle(corner, along, up, _surface(rng, rng.uniform(0.5, 4)))
 
     # A ground, somewhat aslant; a wall across the view and a ground; or the inside of a box.
@@ -244,7 +244,7 @@ def make_clutter(seed: tuple[int, ...]) -> StreetScene:
         y, slope = rng.uniform(1.0, 3.0), rng.normal(0, 0.02)
         sheet([-150, y, 0], [300, rng.normal(0, 8), 0], [0, slope * 300, 300])
     for _ in range(int(rng.integers(12, 60))):
-        b.begin_thing()
+        b.thing += 1
         z = _log_uniform(rng, *_DEPTHS_M)
         centre = np.array([rng.uniform(-0.95, 0.95) * z, rng.uniform(-0.3, 0.3) * z, z])
         size_m = min(z, 25.0) * _log_uniform(rng, 0.03, 0.3)

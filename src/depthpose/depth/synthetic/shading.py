@@ -190,10 +190,14 @@ def _shade(stage: Stage, hits: Hits, focal_px: float) -> Vectors:
     plane = rows[:, 18:21]
     facing = _dot(plane, hits.towards)
     plane = torch.where(facing[:, None] > 0, -plane, plane)
-    normal = _mix(rows[:, 6:15], hits.barycentric)
+    first, second, third = hits.barycentric.split(1, 1)
+    uv, normal = (
+        a * first + b * second + c * third
+        for a, b, c in (rows[:, :6].chunk(3, 1), rows[:, 6:15].chunk(3, 1))
+    )
     normal = normal / _dot(normal, normal).sqrt()[:, None]
     normal = torch.where((_dot(normal, plane) < 0)[:, None], -normal, normal)
-    uv, footprint_m = _mix(rows[:, :6], hits.barycentric), hits.distance_m / focal_px
+    footprint_m = hits.distance_m / focal_px
     # A compromise between the footprint's width and its length, which grows when seen aslant.
     level = torch.log2(footprint_m * rows[:, 21] * facing.abs().clamp(min=0.03) ** -0.6 + 1e-9)
     albedo = surfaces.sample_texture(surfaces.textures(), layer, uv, level) * rows[:, 15:18]
@@ -227,12 +231,6 @@ def _shade(stage: Stage, hits: Hits, focal_px: float) -> Vectors:
     thick = 1 - torch.exp(-hits.distance_m / weather.haze_m)
     haze = torch.from_numpy(weather.horizon).float() * 0.7
     return torch.lerp(color, haze.expand_as(color), thick[:, None])
-
-
-def _mix(values: Float[Tensor, "n triple"], shares: Vectors) -> Float[Tensor, "n m"]:
-    """Interpolate between the values of three corners."""
-    a, b, c = values.chunk(3, 1)
-    return a * shares[:, :1] + b * shares[:, 1:2] + c * shares[:, 2:]
 
 
 def _dot(one: Vectors, other: Vectors) -> Numbers:

@@ -1,7 +1,6 @@
 """Pairs, on disk or rendered, as training samples by index."""
 
 from collections import Counter
-from collections.abc import Sequence
 from typing import NamedTuple
 
 import torch
@@ -11,7 +10,7 @@ from depthpose.core.errors import InputError
 from depthpose.core.loop import sample_generator, shuffled_index
 from depthpose.depth.augment import TrainingPair, augment, scale_pair
 from depthpose.depth.config import PairsConfig, TruthKind
-from depthpose.depth.datasets import Dataset, Frame, known_truths, lidar_truth, open_dataset
+from depthpose.depth.datasets import Dataset, known_truths, lidar_truth, open_dataset
 from depthpose.depth.disparity import disparity_from_depth, right_disparity_from_left
 from depthpose.depth.synthetic import Streets, kitti_rig
 
@@ -39,6 +38,7 @@ class TrainingPairs:
         baseline_m: refuse pairs whose baseline is another (beyond 2 %).
 
     Attributes:
+        frames: those of folders, not what is rendered.
         truths: which kind of truth each source gives, ``NAME: KIND``; empty where none is needed.
 
     Raises:
@@ -59,24 +59,29 @@ class TrainingPairs:
         self.config, self.seed = config, seed
         if not config.folders and config.streets is None:
             raise InputError("there is nothing to train on: name a folder of pairs (--data PATH).")
-        self._places: list[_Place] = []
+        sources: list[list[_Place]] = []
         if config.streets is not None:
             made = Streets(config.streets)
             exact: TruthKind | None = "disparity" if needs_truth else None
-            self._places += _spread(
-                [_Place(made, k, exact) for k in range(len(made))], config.limit
-            )
+            sources.append([_Place(made, k, exact) for k in range(len(made))])
         excluded = set(config.exclude)
         for number, folder in enumerate(config.folders):
             dataset = open_dataset(folder, config.split if number == 0 else None)
             excluded -= {frame.name for frame in dataset.frames}
             usable = _usable(dataset, config, needs_truth=needs_truth, is_mixed=is_mixed)
-            self._places += _spread(usable, config.limit)
+            sources.append(usable)
         if excluded:
             raise InputError(
                 f"exclude names {sorted(excluded)}, which no folder holds; a misspelt name would "
                 "train on what should be left out"
             )
+        self._places: list[_Place] = []
+        for places in sources:  # at equal distances: neighbours in a drive look alike
+            most = len(places) if config.limit is None else min(config.limit, len(places))
+            last = len(places) - 1
+            self._places += [places[round(k * last / max(most - 1, 1))] for k in range(most)]
+        found = ((source, number) for source, number, _ in self._places)
+        self.frames = [source.frames[n] for source, n in found if isinstance(source, Dataset)]
         names = (
             (source.name if isinstance(source, Dataset) else _STREETS, truth)
             for source, _, truth in self._places
@@ -108,12 +113,6 @@ class TrainingPairs:
 
     def __len__(self) -> int:
         return len(self._places)
-
-    @property
-    def frames(self) -> list[Frame]:
-        """Those of folders, not what is rendered."""
-        found = ((source, number) for source, number, _ in self._places)
-        return [source.frames[n] for source, n in found if isinstance(source, Dataset)]
 
     def __getitem__(self, sample_index: int) -> TrainingPair:
         """Make the n-th sample."""
@@ -221,10 +220,3 @@ def _usable(
 
 _STREETS = "synthetic streets"
 """As ``run.json`` names them: a resumed training compares the names."""
-
-
-def _spread(items: Sequence[_Place], count: int | None) -> list[_Place]:
-    """Take ``count`` items at equal distances: neighbours in a drive look alike."""
-    if count is None or count >= len(items):
-        return list(items)
-    return [items[round(k * (len(items) - 1) / max(count - 1, 1))] for k in range(count)]

@@ -22,7 +22,6 @@ from depthpose.depth.disparity import right_disparity_from_left
 from depthpose.depth.metrics import measure
 from depthpose.depth.stereo import StereoNetwork, normalise
 from depthpose.depth.stereo.matcher import pad_top_right
-from depthpose.depth.synthesis import LiteEncoder
 from depthpose.depth.train.config import (
     FinetuneTraining,
     SelectTraining,
@@ -31,13 +30,6 @@ from depthpose.depth.train.config import (
 )
 from depthpose.depth.train.pairs import TrainingPairs
 from depthpose.depth.types import Maps
-
-
-def _groups(network: nn.Module, encoder: LiteEncoder, rate: float) -> list[dict[str, object]]:
-    """What is learnt, the encoder apart, at a share of the learning rate."""
-    ours = list(encoder.parameters())
-    rest = [p for p in network.parameters() if p not in set(ours)]
-    return [{"params": [p for p in ours if p.requires_grad], "rate": rate}, {"params": rest}]
 
 
 class StereoTask:
@@ -59,13 +51,19 @@ class StereoTask:
         self.modules: dict[str, nn.Module] = {"matcher": matcher}
         groups = [{"params": [p for p in matcher.parameters() if p.requires_grad]}]
         if self._alone is None and matcher.encoder is not None:
-            groups = _groups(matcher, matcher.encoder, config.encoder_rate)
+            own = set(matcher.encoder.parameters())
+            rest = [p for p in matcher.parameters() if p not in own]
+            learnt = [p for p in matcher.encoder.parameters() if p.requires_grad]
+            groups = [{"params": learnt, "rate": config.encoder_rate}, {"params": rest}]
         self.optimizers = {"matcher": (make_adam(groups, config.adam), config.adam)}
 
     def _train(self) -> None:
         self.matcher.train()
         if self._fixed is not None:
-            self._fixed.keep_statistics()
+            # Batch norm uses its stored statistics, whatever the mode: small batches spoil them.
+            for part in self._fixed.modules():
+                if isinstance(part, nn.BatchNorm2d):
+                    part.eval()
         if self._alone is not None:
             for part in self.matcher.children():
                 part.train(part is self._alone)
@@ -76,7 +74,9 @@ class StereoTask:
         heads, sky = self.matcher.forward_with_sky(*views)
         max_disparity_px, sky_weight = self.matcher.config.max_disparity_px, self.config.sky_weight
         heads = tuple(head.float() for head in heads)
-        facts = {"epe": mean_error_px(heads[-1], batch.left_px, max_disparity_px)}
+        is_valid = (batch.left_px > 0) & (batch.left_px < max_disparity_px)
+        error_px = (heads[-1].detach() - batch.left_px.nan_to_num(0.0)).abs()
+        facts = {"epe": error_px.where(is_valid, 0.0).sum() / is_valid.sum().clamp(min=1)}
         if sky is None:
             loss = losses.heads_loss(heads, batch.left_px, max_disparity_px, sky_weight=sky_weight)
         else:
@@ -117,7 +117,7 @@ def validate_pairs(
         height, width = pair.left.shape[-2:]
         found = heads[-1][0, -height:, :width].float().cpu()
         is_sky = None if sky is None else sky[0, -height:, :width].cpu() > 0.5
-        is_known = losses.valid_disparity(pair.left_px[None], matcher.config.max_disparity_px)[0]
+        is_known = (pair.left_px > 0) & (pair.left_px < matcher.config.max_disparity_px)
         is_true_sky = pair.left_px == 0
         if is_sky is not None:
             found = torch.where(is_sky, 0.0, found)
@@ -137,14 +137,6 @@ def validate_pairs(
     named |= {name: v for name, v in (("sky_missed", missed), ("sky_false", false)) if v}
     numbers = {f"held_out/{name}": sum(v) / max(len(v), 1) for name, v in named.items()}
     return ValidationResult(numbers=numbers, pictures=pictures)
-
-
-@torch.no_grad()
-def mean_error_px(found_px: Maps, truth_px: Maps, max_px: int) -> Float[Tensor, ""]:
-    """Mean absolute disparity error over the pixels with truth [px]."""
-    is_valid = losses.valid_disparity(truth_px, max_px)
-    error = torch.where(is_valid, (found_px - truth_px.nan_to_num(0.0)).abs(), 0.0)
-    return error.sum() / is_valid.sum().clamp(min=1)
 
 
 class ViewTask:
@@ -239,7 +231,10 @@ class FinetuneTask:
         found_px = found_px.float()
         loss = losses.disparity_loss(found_px, batch.left_px, max_disparity_px)
         l1 = (2 * drawn - 2 * batch.right).abs().mean()
-        facts = {"epe": mean_error_px(found_px, batch.left_px, max_disparity_px), "l1": l1.detach()}
+        is_valid = (batch.left_px > 0) & (batch.left_px < max_disparity_px)
+        error_px = (found_px.detach() - batch.left_px.nan_to_num(0.0)).abs()
+        epe = error_px.where(is_valid, 0.0).sum() / is_valid.sum().clamp(min=1)
+        facts = {"epe": epe, "l1": l1.detach()}
         yield Update("generator", loss + self.config.l1_weight * l1, facts)
 
     @torch.no_grad()
@@ -312,13 +307,20 @@ class SelectTask:
             generator.encoder.freeze_early()
         self.modules: dict[str, nn.Module] = {"generator": generator}
         self._train()
-        groups = _groups(generator, generator.encoder, config.encoder_rate)
+        # What is learnt, the encoder apart, at a share of the learning rate.
+        own = set(generator.encoder.parameters())
+        rest = [p for p in generator.parameters() if p not in own]
+        learnt = [p for p in generator.encoder.parameters() if p.requires_grad]
+        groups = [{"params": learnt, "rate": config.encoder_rate}, {"params": rest}]
         self.optimizers = {"generator": (make_adam(groups, config.adam), config.adam)}
 
     def _train(self) -> None:
         self.generator.train()
         if self.config.with_frozen_stem:
-            self.generator.encoder.keep_statistics()
+            # Batch norm uses its stored statistics, whatever the mode: small batches spoil them.
+            for part in self.generator.encoder.modules():
+                if isinstance(part, nn.BatchNorm2d):
+                    part.eval()
 
     def step(self, batch: SelectionSample) -> Iterator[Update]:
         """One update: predict disparity, warp the right view, compare."""
