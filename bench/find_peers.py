@@ -48,7 +48,7 @@ from depthpose.pose.cloud import thin
 from depthpose.pose.config import EvaluationConfig
 from depthpose.pose.datasets import Instance
 from depthpose.pose.evaluate import error_context, match
-from depthpose.pose.evaluate.errors import measure as bop_errors
+from depthpose.pose.evaluate.errors import METRICS
 from depthpose.pose.frame import label_regions, prepare_frame
 from depthpose.pose.mesh import sample_surface
 from depthpose.pose.metrics import BOP_PIXELS, BOP_SHARES, average_recall
@@ -254,12 +254,15 @@ def recall_errors(frame: Frame, found: Sequence[PoseEstimate]) -> list[Row]:
             model = models[instance.object_id]
             context = error_context(model, EvaluationConfig())
             answer = answers.get(instance.name)
-            errors = bop_errors(None if answer is None else answer.camera_from_model,
-                                instance, context)  # fmt: skip
+            pose = None if answer is None else answer.camera_from_model
+            vsd, mssd_m, mspd_px = (
+                metric.missing if pose is None else metric.measure(pose, instance, context)
+                for metric in (METRICS["vsd"], METRICS["mssd_m"], METRICS["mspd_px"])
+            )
             rows.append({
-                "vsd": errors["vsd"].tolist(),
-                "mssd": [float(errors["mssd_m"]) / model.diameter_m],
-                "mspd": [float(errors["mspd_px"])],
+                "vsd": torch.as_tensor(vsd).tolist(),
+                "mssd": [float(mssd_m) / model.diameter_m],
+                "mspd": [float(mspd_px)],
             })  # fmt: skip
     return rows
 

@@ -33,7 +33,8 @@ def test_parameters_are_the_published_ones() -> None:
 
 def test_widths_double_up_to_eight_times() -> None:
     with torch.device("meta"):
-        found = [level.conv.out_channels for level in UNetGenerator().down]
+        convolutions = [level.get_submodule("conv") for level in UNetGenerator().down]
+    found = [one.out_channels for one in convolutions if isinstance(one, nn.Conv2d)]
     assert found == [64, 128, 256, 512, 512, 512, 512, 512]
 
 
