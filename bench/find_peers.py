@@ -256,11 +256,13 @@ def recall_errors(frame: Frame, found: Sequence[PoseEstimate]) -> list[Row]:
             answer = answers.get(instance.name)
             pose = None if answer is None else answer.camera_from_model
             vsd, mssd_m, mspd_px = (
-                metric.missing if pose is None else metric.measure(pose, instance, context)
+                torch.as_tensor(
+                    metric.missing if pose is None else metric.measure(pose, instance, context)
+                )
                 for metric in (METRICS["vsd"], METRICS["mssd_m"], METRICS["mspd_px"])
             )
             rows.append({
-                "vsd": torch.as_tensor(vsd).tolist(),
+                "vsd": vsd.tolist(),
                 "mssd": [float(mssd_m) / model.diameter_m],
                 "mspd": [float(mspd_px)],
             })  # fmt: skip
