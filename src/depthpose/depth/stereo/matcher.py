@@ -236,7 +236,10 @@ AGREEMENT_PX = 3.0
 
 
 class StereoNetwork(nn.Module):
-    """A normalised pair to disparity maps for the losses; the last is the output."""
+    """A normalised pair to disparity maps for the losses; the last is the output.
+
+    In training it gives at most three maps, the last of which weighs most; else one.
+    """
 
     config: Any  #: its sizes and conventions, a :class:`~depthpose.depth.config.NetworkConfig`
     #: the part that may begin with weights of ImageNet, which trains more slowly
@@ -251,9 +254,10 @@ class StereoNetwork(nn.Module):
 class NetworkMatcher(ABC):
     """A network with pre- and post-processing: normalisation, padding, device, memory.
 
-    A kind of network adds :meth:`fold` and :meth:`run`. The weights are copied: training
-    ``network`` further does not change this matcher. Where the processor has no bf16, ``config``
-    says fp32 in its place.
+    A kind of network adds :meth:`fold`, :meth:`run`, :meth:`activation_bytes` and ``fine_pixels``;
+    what ``fold`` gives has ``rows``, how many rows of a volume are computed at a time, or None. The
+    weights are copied: training ``network`` further does not change this matcher. Where the
+    processor has no bf16, ``config`` says fp32 in its place.
 
     Raises:
         InputError: the device does not exist on this machine.

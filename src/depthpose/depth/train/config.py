@@ -148,8 +148,8 @@ class StereoTraining(Settings):
     """Train this light network in place of ``matcher``."""
 
     other: dict[str, dict[str, object]] = field(default_factory=dict)
-    """Train a network of another kind in its place: the name of the kind in ``stereo.MATCHERS``,
-    and its config."""
+    """Train a network of another kind in its place: the name of the kind in
+    ``depth.weights.MATCHERS``, and its config."""
 
     start: str | None = None
     """Weights of the whole network to begin with (or a whole set)."""
