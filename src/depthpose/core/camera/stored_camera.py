@@ -220,6 +220,11 @@ def facts_from_folder(folder: Path) -> CameraFacts:
         if facts is None:
             raise InputError("its two files together describe no camera")
         return facts
+    return facts_from_ros_pair(first, second)
+
+
+def facts_from_ros_pair(first: Names, second: Names) -> CameraFacts:
+    """Take the two cameras of a pair; the left one is that without ``Tx``."""
     left, right = ros_pair(first, second)
     P, other = (_need(published(names, _P, 12), "projection_matrix") for names in (left, right))
     facts = facts_from_projections("a pair of camera_info", P, other, size_of(first))
