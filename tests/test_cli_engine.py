@@ -276,7 +276,7 @@ def test_a_cad_file_alone_is_registered_by_workers_too(
     assert main([*words, str(tmp_path / "big"), *RAY]) == 0
     (wanted,) = json.loads((tmp_path / "plain" / "poses.json").read_text())
     found = json.loads(unpacked(tmp_path / "big")["0"]["pose.json"])
-    assert wanted["status"] == "ok"
+    assert wanted["status"] in ("ok", "ambiguous"), "it has a pose"
     assert {**found, "seconds": 0} == {**wanted, "seconds": 0}
 
 
