@@ -472,7 +472,8 @@ class Predictor:
                 inputs: list[StereoInput] = []
                 for name, read in chunk:
                     try:
-                        inputs += [] if name in self.finished else [read()]
+                        if name not in self.finished:
+                            inputs.append(read())
                     except InputError as error:
                         self.failures[name] = error
                 check = self.work.with_check

@@ -50,12 +50,7 @@ def find_masks(
 ) -> list[Masks]:
     """Understand ``truth``, ``predicted``, files of BOP detections and segmentation weights."""
     paths = [mask_path(kind) for kind in kinds]
-    names = distinct_names(
-        [
-            (None, kind) if path is None else (path.parent, path.stem)
-            for kind, path in zip(kinds, paths, strict=True)
-        ]
-    )
+    names = _file_names(kinds, paths)
     masks: list[Masks] = []
     for kind, path, name in zip(kinds, paths, names, strict=True):
         settings: dict[str, Any] = {}
@@ -170,6 +165,13 @@ def _segmented(
     return known
 
 
+def _file_names(words: Sequence[str], paths: Sequence[Path | None]) -> list[str]:
+    """Name files by their stems, told apart by their folders, and what is no file by its word."""
+    return distinct_names(
+        [(None, w) if p is None else (p.parent, p.stem) for w, p in zip(words, paths, strict=True)]
+    )
+
+
 def distinct_names(files: Sequence[tuple[Path | None, str]]) -> list[str]:
     """Give each its own name; of equal ones, with as many folders above it as distinguish them.
 
@@ -223,12 +225,7 @@ def pose_methods(
     Files of one name are distinguished by their folders.
     """
     paths = [None if name == REGISTER else find_weights(name) for name in names]
-    labels = distinct_names(
-        [
-            (None, name) if path is None else (path.parent, path.stem)
-            for name, path in zip(names, paths, strict=True)
-        ]
-    )
+    labels = _file_names(names, paths)
     return [
         _network(path, label, config) if path else _register(label, models, config)
         for path, label in zip(paths, labels, strict=True)

@@ -242,7 +242,8 @@ def _what_was_done(one: Grey, other: Grey, corners: Places) -> str | None:
             return f"the right image is {how} beside the left one; turn it back"
     height, width = other.shape
     for turn_deg, scale in _CHANGES:
-        c, s = (f(math.radians(-turn_deg)) / (1 / scale) for f in (math.cos, math.sin))
+        turn_rad = math.radians(-turn_deg)
+        c, s = scale * math.cos(turn_rad), scale * math.sin(turn_rad)
         there = torch.tensor([[[c, s * height / width, 0], [-s * width / height, c, 0]]])
         grid = functional.affine_grid(there, [1, 1, height, width], align_corners=False)
         back = functional.grid_sample(other[None, None], grid, align_corners=False)[0, 0]
