@@ -5,6 +5,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any, get_args
 
+import jsonschema
 import pytest
 import torch
 
@@ -181,7 +182,6 @@ def schema() -> dict[str, Any]:
 
 def test_the_schema_describes_what_is_written(tmp_path: Path) -> None:
     """Every kind of estimate is valid by it; another version, name or shape is not."""
-    jsonschema = pytest.importorskip("jsonschema")
     tracked = replace(answer("t", 2), tracking="tracked", camera_from_model=some_pose(2))
     sent = [
         Prediction(estimate=answer(), place=Place(1, 20, 6)),
