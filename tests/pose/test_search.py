@@ -177,7 +177,13 @@ def test_a_mug_turned_about_its_axis_looks_alike_but_for_its_handle(is_handle_fi
     every = torch.arange(-180.0, 180.0, 5.0)[:, None]
     apart = ((every - torch.cat([angle, torch.zeros(1)]) + 180) % 360 - 180).abs().amin(1)
     assert float(apart.max()) <= 20, "by any angle"
-    assert len(prepare_pairs(prepare_surface(bracket())).turns.R) == 0
+
+
+def test_half_turns_lay_half_of_a_part_on_itself() -> None:
+    pairs = prepare_pairs(prepare_surface(make_part("connector")))
+    angle = geodesic_rad(pairs.turns.R, torch.eye(3).double().expand_as(pairs.turns.R)).rad2deg()
+    assert len(angle) > 0
+    assert float(angle.min()) > 170
 
 
 @pytest.mark.parametrize("is_compiled", ["1", "0"])
@@ -298,6 +304,14 @@ def judged(
 def test_an_answer_is_as_sure_as_its_pose_and_that_it_is_there_at_all() -> None:
     kept, _ = find._without_rivals([judged("a", -2.0, slice(0, 10))], [])
     assert kept[0][1].certainty == pytest.approx(1 / (1 + math.exp(-2.0)))
+
+
+def test_a_further_one_of_an_object_must_be_surer_than_a_guess_among_four() -> None:
+    answers = [judged("a", -3.0 + k, slice(10 * k, 10 * k + 10), k) for k in range(3)]
+    answers = [(one, replace(estimate, certainty=0.2)) for one, estimate in answers]
+    kept, taken = find._without_rivals(answers, [])
+    assert [one.log_odds for one, _ in kept] == [-3.0], "it may be there once"
+    assert len(taken) == 1, "another pose may be right there"
 
 
 def test_what_may_be_either_of_two_objects_stays_unanswered_in_later_rounds() -> None:

@@ -227,7 +227,7 @@ def _iterated(
         places = np.full((len(arrays[2]), len(points)), -1)
         refine(*arrays, surface.diameter_m, _CONVERGED, target, is_exact, places)
         index = torch.from_numpy(np.append(target.tree.order, -1)[places])
-        return Rigid(R, t_m), index.view(*t_m.shape[:-1], -1)
+        return Rigid(R, t_m), index.view(*t_m.shape[:-1], len(points))
     scale = torch.tensor([1.0] * 3 + [surface.diameter_m] * 3, dtype=torch.float64)
     moves = torch.ones_like(pose.t_m[..., :1])
     index, steps = torch.full((*pose.t_m.shape[:-1], len(cloud)), -1), len(limits_m) - 1

@@ -50,7 +50,7 @@ from depthpose.pose.estimator.inputs import (
 from depthpose.pose.estimator.track import TrackedObject, track
 from depthpose.pose.mesh import read_model, refuse_one_name, with_found_symmetries
 from depthpose.pose.refine import refine_best
-from depthpose.pose.surface import prepare_surface
+from depthpose.pose.surface import NEAR, prepare_surface
 from depthpose.pose.types import CloudInput, ObjectModel, PoseEstimate, ViewInput
 from depthpose.pose.voting.point_pairs import PairTable, prepare_pairs, propose_poses
 
@@ -65,6 +65,7 @@ _VOXEL = 0.05  # of the diameter
 _LEAST = 500  # points of a model without faces
 _PROPOSALS = 40
 _SMOOTHED = 1500  # of so many points 20 neighbours lay the plane that gives a normal
+_FITS_LESS = 0.25
 _TILT_NOISE = 0.01
 """By so much the tilt of one pose differs from one drawing of points to the next: less says nothing
 of which of two poses that look alike is the right one."""
@@ -507,14 +508,21 @@ class Registration(PoseEstimator):
         first = Candidate(icp.camera_from_model, icp.covariance, float(icp.residual_m))
         others = best.others
         if poses is not None:  # in a mask the readings decide between turns, which a search chose
-            others = Rigid.cat([others, first.pose @ pairs.turns])
+            turned = first.pose @ pairs.turns
+            local_m = (
+                Rigid.cat([first.pose[None], turned]).inverse().apply(take_evenly(cloud_m, 500))
+            )
+            gap_m = (local_m - surface.points_m[surface.boxes.look_up(local_m)]).norm(dim=-1)
+            share = (gap_m < NEAR * surface.diameter_m).double().mean(-1)
+            others = Rigid.cat([others, turned[share[1:] > share[0] - _FITS_LESS]])
         candidates = find_candidates(cloud_m, first, others, known, self.config, is_refined=True)
         found = Rigid.stack([one.pose for one in candidates])
         evidence = surface_signals(cloud_m, found, surface)
+        thinned_m = take_evenly(cloud_m, 500)
         for pose, signals in zip([one.pose for one in candidates], evidence, strict=True):
             # The plane through neighbours is tilted where a part has edges and thin features too,
             # whatever the pose: so it is on the cloud moved onto the posed surface.
-            _, index = nearest_posed(cloud_m, pose, surface)
+            _, index = nearest_posed(thinned_m, pose, surface)
             own = tilt_of(pose.apply(surface.points_m[index]), pose[None], surface)
             signals["tilt"] = max(_TILT_NOISE, signals["tilt"] - float(own))
         seconds["icp"] = time.perf_counter() - voted

@@ -10,7 +10,7 @@ from jaxtyping import Bool
 from torch import Tensor
 
 from depthpose.core.arrays import take_evenly
-from depthpose.core.camera import back_project
+from depthpose.core.camera import back_project, project
 from depthpose.core.devices import each_in_threads
 from depthpose.core.rigid import Rigid
 from depthpose.pose.cloud import cloud_from_depth, grow_mask
@@ -39,6 +39,8 @@ _ANSWERED, _ANOTHER = 0.5, -0.5
 """A pose is answered where its log odds of being wrong, once refined, are below the first; a second
 one of an object, and what tracking begins at, where they are below the second. Most things are
 there once; where two are, there are often many, and the first limit holds again."""
+_LEAST_CERTAINTY = 0.25
+"""Of all but the surest of an object: less is a guess among four poses."""
 _DISAGREES, _UNSEEN, _GAP = 20.3, 4.6, 216.0
 """Weights in log odds of being wrong: of the share of the surface that disagrees with the camera,
 of what it did not see, and of the distance of the object's points to the surface, in diameters."""
@@ -280,7 +282,11 @@ def _without_rivals(
     for k, (one, estimate) in enumerate(ranked):
         if any(one.shared_with(other) > _SHARED for other in taken):
             continue
-        if one.log_odds > _ANOTHER and sum(one.object == other.object for other in taken) == 1:
+        same = sum(one.object == other.object for other in taken)
+        if same == 1 and one.log_odds > _ANOTHER:
+            continue
+        there = 1 / (1 + math.exp(one.log_odds))
+        if same > 0 and there * (estimate.certainty or 0.0) < _LEAST_CERTAINTY:
             continue
         taken.append(one)
         rivals = {one.object: (one.log_odds, estimate)}
@@ -289,7 +295,7 @@ def _without_rivals(
                 rivals.setdefault(other.object, (other.log_odds, its))
         log_odds = torch.tensor([log_odds for log_odds, _ in rivals.values()], dtype=torch.float64)
         some, shares = [its for _, its in rivals.values()], (-log_odds).softmax(0)
-        best, share = _given_others(some, shares, 1 / (1 + math.exp(one.log_odds)))
+        best, share = _given_others(some, shares, there)
         if share >= _LEAST_SHARE:  # else it may be another object
             kept.append((one, best))
     return kept, taken
@@ -324,6 +330,14 @@ def is_cut_out(view: ViewInput, pose: Rigid, surface: Surface) -> bool:
         pose: of the object.
         surface: of its model.
     """
+    # Nothing else of the image is looked at: it takes long.
+    middle_m = pose.apply(surface.points_m.mean(0, keepdim=True).to(pose.t_m))
+    reach = math.ceil((1 + 2 * _RIM) * surface.diameter_m / float(middle_m[0, 2] / view.K[0, 0]))
+    column, row = project(middle_m, view.K.to(middle_m))[0].long().tolist()
+    left, top, reach = max(0, column - reach), max(0, row - reach), reach + BORDER_PX
+    part, K = (slice(top, row + reach), slice(left, column + reach)), view.K.clone()
+    K[:2, 2] -= torch.tensor([left, top]).to(K)
+    view = replace(view, depth_m=view.depth_m[part], mask=view.mask[part], K=K)
     points_m = back_project(view.depth_m.double(), view.K.double())
     own = explained_mask(view, pose, surface)
     plane = largest_plane(points_m[own], torch.Generator().manual_seed(0))

@@ -46,7 +46,7 @@ _UNSEEN = 0.3
 """Weight of the share of the surface that should be seen and is not."""
 _OWN_REFERENCES, _OWN_PEAKS, _OWN_POINTS = 40, 48, 250
 """Points of a model that look for it in itself, poses that each proposes, and points compared."""
-_ROUGHLY, _MOSTLY = 0.5, 0.8
+_ROUGHLY, _MOSTLY, _NEARLY = 0.25, 0.8, 0.85
 """A turn that lays the first share of a surface on itself is refined; one that then lays the
 second share there is kept."""
 _TURNED, _TURNED_RAD, _MOST_TURNS = 0.7, math.radians(12), 36
@@ -90,11 +90,11 @@ class PairTable:
         points_m, starts = surface.points_m - surface.middle_m, found.t_m - surface.middle_m
         found = refine_roughly(points_m, Rigid(found.R, starts), surface, IcpConfig())
         found = Rigid(found.R, found.t_m + surface.middle_m)
-        found = found[_distinct_turns(found, surface, _MOSTLY)]
+        found = found[_distinct_turns(found, surface, _ROUGHLY)]
         # One after the other they are turns too, which fill the gaps between those that were found.
         twice = found[:, None] @ found
         found = Rigid.cat([found, Rigid(twice.R.flatten(0, 1), twice.t_m.flatten(0, 1))])
-        return found[_distinct_turns(found, surface, _MOSTLY)]
+        return found[_distinct_turns(found, surface, _ROUGHLY)]
 
 
 def _distinct_turns(turns: Rigid, surface: Surface, least: float) -> list[int]:
@@ -110,9 +110,11 @@ def _distinct_turns(turns: Rigid, surface: Surface, least: float) -> list[int]:
     share = (is_alike & (cosine.abs() > _TURNED)).double().mean(-1)
     chosen, taken = list[int](), surface.copies.R
     for k in share.argsort(descending=True).tolist():
-        if share[k] < least or len(chosen) == _MOST_TURNS:
+        most = float(share[chosen[0]]) if chosen else 0.0
+        if share[k] < max(least, _NEARLY * most) or len(chosen) == _MOST_TURNS:
             break
-        if float(geodesic_rad(turns.R[k].expand_as(taken), taken).min()) > _TURNED_RAD:
+        apart_rad = _TURNED_RAD if share[k] >= _MOSTLY else 5 * _TURNED_RAD
+        if float(geodesic_rad(turns.R[k].expand_as(taken), taken).min()) > apart_rad:
             chosen.append(k)
             taken = torch.cat([taken, turns.R[k] @ surface.copies.R])
     return chosen
