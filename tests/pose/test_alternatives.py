@@ -132,6 +132,8 @@ def test_shares_are_of_one_and_fall_with_what_speaks_against() -> None:
     shares = share_out([{"far": 0.0}, {"far": 0.01}, {"far": 0.03}], {"far": 1.0})
     # exp(-log x) is 1 / x: 1 / 0.01, 1 / 0.02 and 1 / 0.04.
     assert shares.tolist() == pytest.approx([4 / 7, 2 / 7, 1 / 7])
+    without_network = share_out([{"far": 0.0}, {"far": 0.01}], {"far": 1.0, "disagree": 1.0})
+    assert without_network.tolist() == pytest.approx([2 / 3, 1 / 3])
 
 
 def test_words_tell_the_axis_and_the_shift() -> None:
