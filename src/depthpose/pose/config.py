@@ -161,8 +161,7 @@ class RefusalConfig(Settings):
     """Of the object's readings so many may lie beside the posed silhouette, its border apart."""
 
     min_found: Annotated[float, "[0, 1]"] = 0.65
-    """So likely must the right pose be among those that were found: by how well it fits, and by how
-    well what was seen fixes it."""
+    """So likely must the right pose be among those that were found."""
 
     max_size_error: Annotated[float, "(0, 1]"] = 0.03
     """The size of the model that fits best may differ from 1 by so much beyond what the sensor

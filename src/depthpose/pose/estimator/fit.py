@@ -558,11 +558,8 @@ def answer_of(
 
 
 def _chance_found(fit: Fit, signals: Mapping[str, float], fixed: float, diameter_m: float) -> float:
-    """Give the chance that the right pose is among those found, by signs of the likeliest.
-
-    A logistic regression on synthetic views of all shipped objects, by networks and registration.
-    """
-    signs = (
+    """Give the chance that the right pose is among those found, by signs of the likeliest."""
+    signs = (  # of a logistic regression on synthetic views of all shipped objects
         (1 - fit.agrees, 1.0),
         (1 - fit.explained, 0.35),
         (signals.get("disagree", 0.4), 2.6),  # registration is as one that disagrees so much
