@@ -57,9 +57,7 @@ def cases_of(name: str, number: int) -> tuple[list[Case], int]:
     """Pose synthetic views of the objects of weights, with all candidates, nothing refused."""
     weights = read_pose_weights(find_weights(name))
     even = dict.fromkeys(RefusalConfig().candidate_slopes, 0.0)
-    opened = RefusalConfig(
-        min_agreement=0.0, max_beyond=1.0, min_explained=0.0, candidate_slopes=even
-    )
+    opened = RefusalConfig(min_agreement=0.0, max_beyond=1.0, min_found=0.0, candidate_slopes=even)
     net = GeoPoseNet(dataclasses.replace(weights, refusal=opened))
     config = ObjectsConfig(
         number=number * len(weights.models), seed=SEED, views=None, resolution=(1.0, 1.0),

@@ -141,9 +141,7 @@ def main() -> None:
     for name in words.weights:
         config = EstimateConfig(register_refused=words.method == "both")
         net = GeoPoseNet.load(find_weights(name), config)
-        opened = dataclasses.replace(
-            net.refusal, min_agreement=0.0, max_beyond=1.0, min_explained=0.0
-        )
+        opened = dataclasses.replace(net.refusal, min_agreement=0.0, max_beyond=1.0, min_found=0.0)
         if words.method == "register":
             net = Registration(net.models, refusal=opened if words.save else None)
         elif words.save:

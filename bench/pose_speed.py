@@ -37,7 +37,7 @@ HALF = ResUNetConfig(
     encoder=(16, 32, 64, 128), decoder=(32, 32, 32, 64),
 )  # fmt: skip
 FULL = ResUNetConfig(classes=1, norm="none")
-NO_RISK = RefusalConfig(min_agreement=0.0, max_beyond=1.0, min_explained=0.0, min_observability=0.0)
+NO_RISK = RefusalConfig(min_agreement=0.0, max_beyond=1.0, min_found=0.0, min_observability=0.0)
 
 
 class NoisyTruth(GeoPoseNet):

@@ -112,7 +112,7 @@ def test_up_to_symmetry_the_copies_are_one_answer() -> None:
     found = net.estimate(cloud=cloud_of(model, truth))
     assert found.is_ok, found.reason
     assert found.alternatives == ()
-    assert found.certainty == 1
+    assert found.certainty == pytest.approx(1)
 
 
 def test_only_what_has_a_copy_is_less_certain() -> None:
@@ -132,6 +132,8 @@ def test_shares_are_of_one_and_fall_with_what_speaks_against() -> None:
     shares = share_out([{"far": 0.0}, {"far": 0.01}, {"far": 0.03}], {"far": 1.0})
     # exp(-log x) is 1 / x: 1 / 0.01, 1 / 0.02 and 1 / 0.04.
     assert shares.tolist() == pytest.approx([4 / 7, 2 / 7, 1 / 7])
+    without_network = share_out([{"far": 0.0}, {"far": 0.01}], {"far": 1.0, "disagree": 1.0})
+    assert without_network.tolist() == pytest.approx([2 / 3, 1 / 3])
 
 
 def test_words_tell_the_axis_and_the_shift() -> None:

@@ -172,7 +172,7 @@ def test_a_cloud_that_hardly_shows_its_object_is_refused_early() -> None:
     """What is likely to be there is compared in all its poses; what is not, in the best alone."""
     generator = torch.Generator().manual_seed(0)
     blob = 0.03 * torch.randn(2000, 3, generator=generator) + torch.tensor([0.0, 0.0, 0.8])
-    strict = RefusalConfig(min_agreement=1.0, max_beyond=0.0, min_explained=1.0)
+    strict = RefusalConfig(min_agreement=1.0, max_beyond=0.0, min_found=1.0)
     net = Oracle(tiny_weights(bracket(), refusal=strict), [pose_at()])
     given = CloudInput(name="blob", points_m=blob, object="bracket")
     (early,), (whole,) = net._answers([given], is_likely=False), net.estimate_many([given])

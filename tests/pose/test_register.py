@@ -148,7 +148,7 @@ def test_registration_without_icp_is_an_error() -> None:
 def doubting_net() -> GeoPoseNet:
     """Trained weights that take none of their own answers."""
     weights = read_pose_weights(find_weights("parts"))
-    strict = replace(weights.refusal, min_agreement=1.0, max_beyond=0.0, min_explained=1.0)
+    strict = replace(weights.refusal, min_agreement=1.0, max_beyond=0.0, min_found=1.0)
     nothing = replace(weights, refusal=strict)
     return GeoPoseNet(nothing, EstimateConfig(register_refused=True))
 

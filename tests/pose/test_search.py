@@ -13,8 +13,8 @@ from tests.pose.synthetic_objects import CAMERA, K, box_faces, bracket, pose_at,
 from depthpose.core.camera import Camera, back_project
 from depthpose.core.rigid import Rigid, geodesic_rad, rotation_by
 from depthpose.pose.cloud import cloud_from_depth, grow_mask
+from depthpose.pose.config import RefusalConfig
 from depthpose.pose.estimator import Registration, find
-from depthpose.pose.estimator.base import REFUSAL
 from depthpose.pose.estimator.find import SearchTargets, find_objects, size_deviations
 from depthpose.pose.estimator.fit import fit_of, seen_about
 from depthpose.pose.estimator.hypotheses import (
@@ -227,7 +227,7 @@ def test_turns_that_fit_as_well_are_named() -> None:
     view = view_input(seen, mask & (local_m[..., 0] < 0.043), CAMERA, "mug", "view", None)
     cloud = CloudInput(name="view", points_m=cloud_from_depth(seen, view.mask, K), object="mug",
                        view=view)  # fmt: skip
-    net = Registration([mug], refusal=replace(REFUSAL, min_observability=0.0))
+    net = Registration([mug], refusal=RefusalConfig(min_observability=0.0))
     (found,) = net._pose_near([cloud], [truth[None]])
     assert found.camera_from_model is not None
     assert found.status == "ambiguous"

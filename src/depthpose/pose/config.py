@@ -146,9 +146,9 @@ class RefusalConfig(Settings):
     """When an estimate is withheld. The limits are shares of what was seen, on any sensor."""
 
     RETIRED: ClassVar[frozenset[str]] = frozenset(
-        {"max_risk", "bias", "slopes", "means", "max_scale_error"}
+        {"max_risk", "bias", "slopes", "means", "max_scale_error", "min_explained"}
     )
-    """Settings of a calibrated risk, in weights written before 2026-11-26; they are left out."""
+    """Settings in weights written before 2026-11-28, which are left out."""
 
     RENAMED: ClassVar[dict[str, str]] = {"min_hold": "min_observability"}
     """Names in weights written before 2026-11-28, and those of today."""
@@ -160,9 +160,8 @@ class RefusalConfig(Settings):
     max_beyond: Annotated[float, "[0, 1]"] = 0.03
     """Of the object's readings so many may lie beside the posed silhouette, its border apart."""
 
-    min_explained: Annotated[float, "[0, 1]"] = 0.75
-    """Of the object's readings so many must lie near the posed surface; the rest may be of what a
-    loose mask takes in."""
+    min_found: Annotated[float, "[0, 1]"] = 0.65
+    """So likely must the right pose be among those that were found."""
 
     max_size_error: Annotated[float, "(0, 1]"] = 0.03
     """The size of the model that fits best may differ from 1 by so much beyond what the sensor

@@ -250,8 +250,8 @@ class PoseEstimate:
     #: root mean square distance: of keypoints, or of points to the surface after ICP.
     residual_m: float | None = None
     fit: Fit | None = None  #: whether the pose fits what the camera saw; None: not compared
-    #: chance that this very pose is right, and none of the alternatives nor, where some of what was
-    #: seen does not agree, one that was not found; None: not compared.
+    #: chance that this very pose is right, and none of the alternatives nor one that was not found;
+    #: None: not compared.
     certainty: float | None = None
     identity: Identity | None = None  #: whether it is this object; None where that was not asked
     alternatives: tuple[Alternative, ...] = ()  #: other poses that fit, the likeliest first

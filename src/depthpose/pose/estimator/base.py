@@ -56,11 +56,6 @@ from depthpose.pose.voting.point_pairs import PairTable, prepare_pairs, propose_
 
 Made = TypeVar("Made")
 _NAME = "input"  # what an input is called that came without a name
-CANDIDATE_SLOPES = {
-    name: slope for name, slope in RefusalConfig().candidate_slopes.items() if name != "disagree"
-}
-"""As of :class:`RefusalConfig`; no network disagrees."""
-REFUSAL = RefusalConfig(candidate_slopes=CANDIDATE_SLOPES)
 _VOXEL = 0.05  # of the diameter
 _LEAST = 500  # points of a model without faces
 _PROPOSALS = 40
@@ -418,7 +413,7 @@ class Registration(PoseEstimator):
         config: EstimateConfig | None = None,
         refusal: RefusalConfig | None = None,
     ) -> None:
-        super().__init__(models, config, refusal or REFUSAL)
+        super().__init__(models, config, refusal or RefusalConfig())
         if not models:
             raise InputError(
                 "registration looks for CAD files and none is given; name one: STL, PLY, OBJ or GLB"

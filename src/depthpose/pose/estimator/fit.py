@@ -40,7 +40,6 @@ from depthpose.pose.types import (
     Fit,
     Identity,
     PoseEstimate,
-    Status,
     Symmetries,
     ViewInput,
     Vote,
@@ -49,7 +48,7 @@ from depthpose.pose.types import (
 BORDER_PX = 2
 """Readings so near an edge may be of either side: stereo and structured light match windows, and
 a mask ends so far from the silhouette."""
-SHOWN = 0.95  #: so much of the seen surface agrees at a right pose that a sensor reads well
+_SHOWN = 0.95  # so much of the seen surface agrees at a right pose that a sensor reads well
 _NOISES = 3.0
 _WIDEST = 2.0  # times the usual limit, whatever the noise: beyond, what was read is no surface
 FLOOR = 0.01
@@ -400,7 +399,7 @@ def identity_of(
         reason = f"{words}, and not that of the model"
     elif fit.beyond > _BESIDE:
         reason = f"{fit.beyond:.1%} of the object's readings lie beside the posed silhouette"
-    elif fit.agrees < SHOWN:
+    elif fit.agrees < _SHOWN:
         reason = f"{1 - fit.agrees:.0%} of what was seen of the surface does not agree"
     else:
         status = "confirmed"
@@ -458,10 +457,8 @@ def observability(
     # Declared symmetries as motions about the middle, turns in metres at the radius.
     turn, shift = free[:, :3].double(), free[:, 3:].double()
     own = torch.cat([turn * radius_m, shift + turn @ cross_matrix(middle)], -1)
-    basis = torch.eye(6).double()
-    if len(own):  # an orthonormal basis of what is orthogonal to all of them
-        _, sizes, rows = torch.linalg.svd(own)
-        basis = rows[int((sizes > 1e-9 * sizes[0]).sum()) :].T
+    _, _, rows = torch.linalg.svd(own)  # the last ones are orthogonal to all of them
+    basis = rows[int(torch.linalg.matrix_rank(own, rtol=1e-9)) :].T
     values, vectors = torch.linalg.eigh(basis.T @ (J.T @ J / len(J)) @ basis)
     return float(values[0].clamp(min=0).sqrt()), basis @ vectors[:, 0]
 
@@ -493,23 +490,32 @@ def answer_of(
     surface, copies = known.surface, known.copies
     assert copies is not None, "found with the candidates"
     shares = share_out(evidence, refusal.candidate_slopes)
+    number, *others = shares.argsort(descending=True, stable=True).tolist()
     seen = seen_about(cloud.cloud_m, cloud.view, surface.diameter_m)
-    number = int(shares.argsort(descending=True, stable=True)[0])
-    fit = fit_of(seen, candidates[number].pose, surface)
-    shares = shares * min(1.0, fit.agrees / SHOWN)  # the rest is that of a pose that was not found
     pose, covariance, residual_m = candidates[number]
+    fit = fit_of(seen, pose, surface)
     free = free_motions(known.model.symmetries.continuous, pose)
+    observable, motion = observability(cloud.cloud_m, pose, surface, free)
+    whole, _ = observability(pose.apply(surface.points_m), pose, surface, free)
+    fixed = observable / max(whole, FLOOR)
+    found = _chance_found(fit, evidence[number], fixed, surface.diameter_m)
+    shares = shares * found  # the rest is that of a pose that was not found
     reason, identity = misfit_of(fit, refusal), None
-    if reason is None:
-        observable, motion = observability(cloud.cloud_m, pose, surface, free)
-        if observable < refusal.min_observability:
-            what = "turn" if float(motion[:3].norm()) > math.sqrt(0.5) else "shift"
-            reason = Refusal(
-                status="not observable",
-                reason=f"the seen part of the object leaves one {what} undetermined: it moves the "
-                f"surface along its normals by {observable:.1%} of the motion only; no declared "
-                "symmetry allows it. Declare the symmetry, or look from a side that shows more",
-            )
+    if reason is None and observable < refusal.min_observability:
+        what = "turn" if float(motion[:3].norm()) > math.sqrt(0.5) else "shift"
+        reason = Refusal(
+            status="not observable",
+            reason=f"the seen part of the object leaves one {what} undetermined: it moves the "
+            f"surface along its normals by {observable:.1%} of the motion only; no declared "
+            "symmetry allows it. Declare the symmetry, or look from a side that shows more",
+        )
+    elif reason is None and found < refusal.min_found:
+        reason = Refusal(
+            status="doubtful",
+            reason=f"with a chance of {found:.0%} the right pose is among those that were found: "
+            f"{1 - fit.agrees:.0%} of the seen surface disagrees, {1 - fit.explained:.0%} of the "
+            f"readings are elsewhere, and the view fixes the pose {fixed:.0%} as well as it could",
+        )
     if reason is None and config.with_icp and refusal.max_size_error < 1:
         identity = identity_of(cloud, pose, known, copies, fit, seen, refusal.max_size_error)
         if identity.status == "contradicted":
@@ -536,52 +542,55 @@ def answer_of(
             probability=float(shares[k]),
             signals=evidence[k],
         )
-        for k in shares.argsort(descending=True, stable=True).tolist()[1:]
+        for k in others
         if float(shares[k]) >= _NAMED
     )
-    certainty = float(shares[number])
-    status, words = status_of(certainty, len(alternatives), config.min_certainty)
-    # Worked out in float64, given as points and models come: in float32.
-    return PoseEstimate(
-        status=status,
-        reason=words,
-        camera_from_model=pose.float(),
+    answer = PoseEstimate(
+        status="ok",
+        camera_from_model=pose.float(),  # worked out in float64, given as points and models come
         covariance=covariance.float(),
         free_motions=free.float(),
-        certainty=certainty,
+        certainty=float(shares[number]),
         alternatives=alternatives,
         **facts,
     )
+    return with_status(answer, config.min_certainty)
+
+
+def _chance_found(fit: Fit, signals: Mapping[str, float], fixed: float, diameter_m: float) -> float:
+    """Give the chance that the right pose is among those found, by signs of the likeliest."""
+    signs = (  # of a logistic regression on synthetic views of all shipped objects
+        (1 - fit.agrees, 1.0),
+        (1 - fit.explained, 0.35),
+        (signals.get("disagree", 0.4), 2.6),  # registration is as one that disagrees so much
+        (fit.noise_m / diameter_m, 0.5),
+        (min(fixed, 1.0), -1.6),
+    )
+    return 1 / (1 + 200 * math.prod((FLOOR + sign) ** power for sign, power in signs))
 
 
 def share_out(
     candidates: Sequence[Mapping[str, float]], slopes: Mapping[str, float]
 ) -> Float64[Tensor, " b"]:
     """Share the probability of one among candidates: ``exp(-sum slope log(0.01 + signal))``."""
-    odds = [
-        -sum(slope * math.log(FLOOR + one[name]) for name, slope in slopes.items())
-        for one in candidates
+    odds = [  # registration has no signal of a network
+        -sum(slopes[k] * math.log(FLOOR + one[k]) for k in one if k in slopes) for one in candidates
     ]
     return torch.tensor(odds, dtype=torch.float64).softmax(0)
 
 
-def status_of(certainty: float, others: int, min_certainty: float) -> tuple[Status, str]:
+def with_status(answer: PoseEstimate, min_certainty: float) -> PoseEstimate:
     """Say that a pose is ambiguous where its certainty is below the limit, and else ok."""
+    certainty, others = answer.certainty, len(answer.alternatives)
+    if certainty is None:  # refused, or not compared
+        return answer
     if certainty >= min_certainty:
-        return "ok", ""
-    return "ambiguous", (
+        return replace(answer, status="ok", reason="")
+    reason = (
         f"this pose has a certainty of {certainty:.0%}, below min_certainty {min_certainty:.0%}: "
         + (f"{others} others fit too" if others else "others may fit")
     )
-
-
-def with_status(answer: PoseEstimate, min_certainty: float) -> PoseEstimate:
-    """Say anew, by another limit, whether a pose is ambiguous or ok."""
-    if answer.camera_from_model is None:
-        return answer
-    certainty = 1.0 if answer.certainty is None else answer.certainty
-    status, reason = status_of(certainty, len(answer.alternatives), min_certainty)
-    return replace(answer, status=status, reason=reason)
+    return replace(answer, status="ambiguous", reason=reason)
 
 
 def misfit_of(fit: Fit, limits: RefusalConfig) -> Refusal | None:
@@ -595,11 +604,6 @@ def misfit_of(fit: Fit, limits: RefusalConfig) -> Refusal | None:
         reason = (
             f"{fit.beyond:.1%} of the object's readings lie beside the posed silhouette, and "
             f"{limits.max_beyond:.0%} may: another object, a larger one, or a mask of more than it"
-        )
-    elif fit.explained < limits.min_explained:
-        reason = (
-            f"{1 - fit.explained:.0%} of the object's readings are nowhere near the posed surface, "
-            f"and {1 - limits.min_explained:.0%} may be: another object, or a mask of more than it"
         )
     else:
         return None
