@@ -28,6 +28,7 @@ from depthpose.pose.estimator.candidates import (
     nearest_posed,
     surface_signals,
     tilt_of,
+    turn_best,
     with_copies,
 )
 from depthpose.pose.estimator.find import (
@@ -505,10 +506,12 @@ class Registration(PoseEstimator):
             reason = "no pose lays the model near the points: another object, or too little of it"
             return refused(given, Refusal(status="votes do not meet", reason=reason), seconds)
         first = Candidate(icp.camera_from_model, icp.covariance, float(icp.residual_m))
-        others = best.others
-        if poses is not None:  # in a mask the readings decide between turns, which a search chose
+        others, turned, config = best.others, list[Candidate](), self.config
+        if poses is None:
+            first, others, turned = turn_best(cloud_m, first, others, known, config.icp)
+        else:  # the readings are what a pose explains, and say nothing between its turns
             others = Rigid.cat([others, first.pose @ pairs.turns])
-        candidates = find_candidates(cloud_m, first, others, known, self.config, is_refined=True)
+        candidates = find_candidates(cloud_m, first, others, turned, known, config, is_refined=True)
         found = Rigid.stack([one.pose for one in candidates])
         evidence = surface_signals(cloud_m, found, surface)
         for pose, signals in zip([one.pose for one in candidates], evidence, strict=True):

@@ -5,7 +5,7 @@ bins and the check of every candidate follow Vidal et al., Sensors 2018.
 """
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import torch
@@ -18,9 +18,17 @@ from depthpose.core.rigid import Rigid, geodesic_rad
 from depthpose.pose.cloud import thin
 from depthpose.pose.compiled import ANGLES, DISTANCES, MOST_ALIKE, TURNS, use_numba
 from depthpose.pose.config import IcpConfig
+from depthpose.pose.mesh import true_symmetries
 from depthpose.pose.mesh.models import fibonacci_directions
 from depthpose.pose.refine import refine_roughly
-from depthpose.pose.surface import NEAR, Surface, finite_array, look_along_rays
+from depthpose.pose.surface import (
+    NEAR,
+    Surface,
+    finite_array,
+    look_along_rays,
+    prepare_surface,
+)
+from depthpose.pose.types import ObjectModel
 
 STEP = 0.07
 """Of the diameter: distance of the points of the model, and a bin of the distances of a pair."""
@@ -116,6 +124,12 @@ def _distinct_turns(turns: Rigid, surface: Surface, least: float) -> list[int]:
             chosen.append(k)
             taken = torch.cat([taken, turns.R[k] @ surface.copies.R])
     return chosen
+
+
+def find_turns(model: ObjectModel) -> list[list[list[float]]]:
+    """Find :attr:`PairTable.turns` of a model, as 4x4 matrices in numbers that JSON holds."""
+    model = replace(model, symmetries=true_symmetries(model))
+    return prepare_pairs(prepare_surface(model)).turns.matrix().tolist()
 
 
 def prepare_pairs(surface: Surface) -> PairTable:
