@@ -8,6 +8,7 @@ from typing import Any
 import pytest
 import torch
 from tests.pose.synthetic_objects import (
+    K,
     Oracle,
     bottle,
     box_faces,
@@ -15,11 +16,21 @@ from tests.pose.synthetic_objects import (
     cloud_of,
     pose_at,
     tiny_weights,
+    view_of,
 )
 
 from depthpose.core.rigid import Rigid, geodesic_rad
-from depthpose.pose.config import EstimateConfig
-from depthpose.pose.estimator.candidates import difference_of, find_copies
+from depthpose.pose.cloud import cloud_from_depth
+from depthpose.pose.config import EstimateConfig, IcpConfig
+from depthpose.pose.estimator.candidates import (
+    Candidate,
+    KnownObject,
+    difference_of,
+    find_candidates,
+    find_copies,
+    turn_best,
+    with_copies,
+)
 from depthpose.pose.estimator.fit import share_out
 from depthpose.pose.mesh import (
     NearSymmetry,
@@ -33,6 +44,8 @@ from depthpose.pose.mesh import (
     with_found_symmetries,
 )
 from depthpose.pose.metrics import add_m
+from depthpose.pose.surface import prepare_surface
+from depthpose.pose.synthetic.parts import make_part
 from depthpose.pose.types import ObjectModel, Symmetries
 
 EYE = torch.eye(3, dtype=torch.float64)
@@ -218,3 +231,41 @@ def test_what_was_found_is_kept_for_the_next_process(
     monkeypatch.setenv("DEPTHPOSE_CACHE", str(tmp_path / "file"))
     assert len(again()) == len(found), "what cannot be written is found again"
     assert len(searches) == 2
+
+
+@pytest.mark.parametrize("handle", ["at the side", "behind"])
+def test_a_mug_is_turned_to_its_handle_and_by_any_angle_where_none_is_seen(handle: str) -> None:
+    """A network takes a wrong turn of a mug: in its mask the readings say which one is right."""
+    mug = make_part("mug")
+    x = [1.0, 0, 0] if handle == "at the side" else [0, 0, 1.0]  # where the handle is
+    y = torch.linalg.cross(torch.tensor([0, -1.0, 0]), torch.tensor(x))
+    R = torch.stack([torch.tensor(x), y, torch.tensor([0, -1.0, 0])], 1)
+    truth = Rigid(R, torch.tensor([0.0, 0.05, 0.6])).double()
+    seen, mask = view_of(mug, truth.float())
+    cloud_m = cloud_from_depth(seen, mask, K).double()
+    known = KnownObject(number=0, model=mug, surface=prepare_surface(mug))
+    with_copies(known, up_to_symmetry=False)
+    about = turn_about(torch.tensor([0, 0, 1.0]).double(), torch.zeros(3).double(),
+                       torch.tensor(2.0).double())  # fmt: skip
+    wrong = Candidate(truth @ about, torch.eye(6).double(), 0.0)
+    none = wrong.pose[None][[]]
+    best, others, turned = turn_best(cloud_m, wrong, none, known, IcpConfig())
+    config = EstimateConfig()
+    found = find_candidates(cloud_m, best, others, turned, known, config, is_refined=True)
+    off = [float(add_m(one.pose, truth, mug.vertices_m.double())) for one in found]
+    if handle == "behind":
+        assert len(found) > 5
+        assert min(off) < 0.1 * mug.diameter_m
+    else:
+        assert len(found) == 1
+        assert off[0] < 0.02 * mug.diameter_m
+
+
+def test_turns_of_what_looks_nearly_alike_are_one_answer_up_to_symmetry_and_a_mugs_are_not() -> (
+    None
+):
+    near, mug = find_copies(bar(), up_to_symmetry=False), make_part("mug")
+    assert len(near.turns.R) == 3
+    assert len(find_copies(bar(), up_to_symmetry=True).turns.R) == 0
+    assert len(find_copies(mug, up_to_symmetry=True).turns.R) > 10
+    assert len(find_copies(bracket(), up_to_symmetry=False).turns.R) == 0

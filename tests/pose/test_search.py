@@ -15,6 +15,7 @@ from depthpose.core.rigid import Rigid, geodesic_rad, rotation_by
 from depthpose.pose.cloud import cloud_from_depth, grow_mask
 from depthpose.pose.config import RefusalConfig
 from depthpose.pose.estimator import Registration, find
+from depthpose.pose.estimator.candidates import find_copies
 from depthpose.pose.estimator.find import SearchTargets, find_objects, size_deviations
 from depthpose.pose.estimator.fit import fit_of, seen_about
 from depthpose.pose.estimator.hypotheses import (
@@ -164,12 +165,16 @@ def test_what_is_no_longer_left_votes_for_nothing() -> None:
     assert nearest_m(poses, TRUTHS[1], model) < 0.06 * model.diameter_m
 
 
+def turns_of(model: ObjectModel) -> Rigid:
+    return find_copies(model, up_to_symmetry=False).turns
+
+
 @pytest.mark.parametrize("is_handle_first", [False, True])
 def test_a_mug_turned_about_its_axis_looks_alike_but_for_its_handle(is_handle_first: bool) -> None:
     mug = make_part("mug")
     off_axis_m = mug.vertices_m[mug.faces].mean(1)[:, :2].norm(dim=-1)
     order = off_axis_m.argsort(descending=is_handle_first)
-    turns = prepare_pairs(prepare_surface(replace(mug, faces=mug.faces[order]))).turns
+    turns = turns_of(replace(mug, faces=mug.faces[order]))
     assert float((turns.R[:, 2, 2].abs() - 1).abs().max()) < 0.01, "about its axis"
     upright = turns.R[turns.R[:, 2, 2] > 0]
     assert len(turns.R) - len(upright) <= 1, "upside down it is barely as much alike"
@@ -180,8 +185,8 @@ def test_a_mug_turned_about_its_axis_looks_alike_but_for_its_handle(is_handle_fi
 
 
 def test_half_turns_lay_half_of_a_part_on_itself() -> None:
-    pairs = prepare_pairs(prepare_surface(make_part("connector")))
-    angle = geodesic_rad(pairs.turns.R, torch.eye(3).double().expand_as(pairs.turns.R)).rad2deg()
+    turns = turns_of(make_part("connector"))
+    angle = geodesic_rad(turns.R, torch.eye(3).double().expand_as(turns.R)).rad2deg()
     assert len(angle) > 0
     assert float(angle.min()) > 170
 
@@ -195,7 +200,7 @@ def test_a_needle_of_few_points_can_be_looked_for_in_itself(
     needle = make_model(corners * torch.tensor([0.002, 0.002, 0.2]), faces, name="needle")
     pairs = prepare_pairs(prepare_surface(needle))
     assert len(pairs.points_m) < 48, "fewer than each of them would propose"
-    assert pairs.turns.R.shape[1:] == (3, 3)
+    assert turns_of(needle).R.shape[1:] == (3, 3)
 
 
 @pytest.mark.parametrize("handle", ["seen", "hidden"])
@@ -211,8 +216,8 @@ def test_the_handle_of_a_mug_decides_its_turn(handle: str) -> None:
     errors = [float(add_m(pose, truth, mug.vertices_m)) for pose in poses if pose is not None]
     assert errors == ([pytest.approx(0, abs=0.05 * mug.diameter_m)] if handle == "seen" else [])
     about = Rigid(rotation_by(torch.tensor([0.0, 0, 1.8])), torch.zeros(3))  # 103 degrees
-    turned, pairs = (truth @ about).double(), prepare_pairs(prepare_surface(mug))
-    best = find._best_turned(prepare_frame(depth_m, K), turned, pairs)
+    best = find._best_turned(prepare_frame(depth_m, K), (truth @ about).double(),
+                             Registration([mug])._prepared("mug"))  # fmt: skip
     off = math.degrees(float(geodesic_rad(best.R, truth.R.double())))
     assert off < (20 if handle == "seen" else 70), "hidden: anywhere behind the mug"
 
@@ -278,7 +283,7 @@ def test_a_hundred_models_take_bounded_time(net: Registration) -> None:
 
     known = SearchTargets(
         names=[f"part {k}" for k in range(100)],
-        pairs_of=lambda _: net._pairs(net._known("bracket")),
+        object_of=lambda _: net._prepared("bracket"),
         pose_near=pose_near,
         max_size_error=net.refusal.max_size_error,
     )
@@ -349,7 +354,7 @@ def test_what_is_there_twice_is_searched_for_again(monkeypatch: pytest.MonkeyPat
     monkeypatch.setattr(find, "_candidates", candidates)
     monkeypatch.setattr(find, "_judged", lambda *_: rounds[len(searched) - 1])
     known = SearchTargets(
-        names=["a", "b"], pairs_of=MagicMock(), pose_near=MagicMock(),
+        names=["a", "b"], object_of=MagicMock(), pose_near=MagicMock(),
         max_size_error=0.03,
     )  # fmt: skip
     found = find_objects(view, known)

@@ -28,6 +28,8 @@ from depthpose.pose.estimator.candidates import (
     nearest_posed,
     surface_signals,
     tilt_of,
+    turn_best,
+    unexplained,
     with_copies,
 )
 from depthpose.pose.estimator.find import (
@@ -50,9 +52,9 @@ from depthpose.pose.estimator.inputs import (
 from depthpose.pose.estimator.track import TrackedObject, track
 from depthpose.pose.mesh import read_model, refuse_one_name, with_found_symmetries
 from depthpose.pose.refine import refine_best
-from depthpose.pose.surface import NEAR, prepare_surface
+from depthpose.pose.surface import prepare_surface
 from depthpose.pose.types import CloudInput, ObjectModel, PoseEstimate, ViewInput
-from depthpose.pose.voting.point_pairs import PairTable, prepare_pairs, propose_poses
+from depthpose.pose.voting.point_pairs import prepare_pairs, propose_poses
 
 Made = TypeVar("Made")
 _NAME = "input"  # what an input is called that came without a name
@@ -61,6 +63,7 @@ _LEAST = 500  # points of a model without faces
 _PROPOSALS = 40
 _SMOOTHED = 1500  # of so many points 20 neighbours lay the plane that gives a normal
 _FITS_LESS = 0.25
+"""A turn that leaves by so much more of the readings unexplained is none that a search names."""
 _TILT_NOISE = 0.01
 """By so much the tilt of one pose differs from one drawing of points to the next: less says nothing
 of which of two poses that look alike is the right one."""
@@ -265,7 +268,7 @@ class PoseEstimator:
         """
         known = SearchTargets(
             names=objects,
-            pairs_of=lambda name: self._pairs(self._known(name)),
+            object_of=self._prepared,
             pose_near=self._pose_near,
             max_size_error=self.refusal.max_size_error,
             is_sure=is_sure,
@@ -361,10 +364,12 @@ class PoseEstimator:
             self._objects[name] = KnownObject(number=number, model=model, surface=surface)
         return self._objects[name]
 
-    def _pairs(self, known: KnownObject) -> PairTable:
+    def _prepared(self, name: str) -> KnownObject:
+        """Give an object by its name, with its point pairs, near-symmetries and turns."""
+        known = with_copies(self._known(name), up_to_symmetry=self.config.up_to_symmetry)
         if known.pairs is None:
             known.pairs = prepare_pairs(known.surface)
-        return known.pairs
+        return known
 
 
 def or_unreadable(work: Callable[[AnyInput], Made], given: AnyInput) -> Made | PoseEstimate:
@@ -462,8 +467,7 @@ class Registration(PoseEstimator):
     def prepare(self) -> None:
         """Prepare every model now, about a second each; else it is done when first asked for."""
         for name in self.objects:
-            known = with_copies(self._known(name), up_to_symmetry=self.config.up_to_symmetry)
-            self._pairs(known).turns  # noqa: B018  found when first asked for
+            self._prepared(name)
 
     def _pose_near(
         self, inputs: Sequence[CloudInput], poses: Sequence[Rigid]
@@ -474,10 +478,9 @@ class Registration(PoseEstimator):
 
     def _estimate(self, given: AnyInput, poses: Rigid | None = None) -> PoseEstimate:
         """Estimate a pose, from those that were proposed if there are any."""
-        known = self._known(given.object)
-        # Once for all inputs, and in the seconds of none.
-        with_copies(known, up_to_symmetry=self.config.up_to_symmetry)
-        pairs = self._pairs(known)
+        known = self._prepared(given.object)  # once for all inputs, and in the seconds of none
+        assert known.pairs is not None
+        assert known.copies is not None
         model, surface = known.model, known.surface
         began = time.perf_counter()
         cloud = CloudConfig(voxel_m=min(0.9, _VOXEL * model.diameter_m), max_points=None)
@@ -492,7 +495,7 @@ class Registration(PoseEstimator):
             dense_m = take_evenly(cloud_m, _SMOOTHED)
             some_m = dense_m[thin(dense_m, torch.zeros_like(dense_m), _VOXEL * surface.diameter_m)]
             normals, _ = local_planes(dense_m, some_m)
-            proposals = propose_poses(some_m, normals, pairs, _PROPOSALS, generator)
+            proposals = propose_poses(some_m, normals, known.pairs, _PROPOSALS, generator)
         voted = time.perf_counter()
         seconds["voting"] = voted - began
         best = refine_best(cloud_m, proposals, surface, replace(self.config.icp, starts=1))
@@ -501,16 +504,14 @@ class Registration(PoseEstimator):
             reason = "no pose lays the model near the points: another object, or too little of it"
             return refused(given, Refusal(status="votes do not meet", reason=reason), seconds)
         first = Candidate(icp.camera_from_model, icp.covariance, float(icp.residual_m))
-        others = best.others
-        if poses is not None:  # in a mask the readings decide between turns, which a search chose
-            turned = first.pose @ pairs.turns
-            local_m = (
-                Rigid.cat([first.pose[None], turned]).inverse().apply(take_evenly(cloud_m, 500))
-            )
-            gap_m = (local_m - surface.points_m[surface.boxes.look_up(local_m)]).norm(dim=-1)
-            share = (gap_m < NEAR * surface.diameter_m).double().mean(-1)
-            others = Rigid.cat([others, turned[share[1:] > share[0] - _FITS_LESS]])
-        candidates = find_candidates(cloud_m, first, others, known, self.config, is_refined=True)
+        others, turned, config = best.others, list[Candidate](), self.config
+        if poses is None:
+            first, others, turned = turn_best(cloud_m, first, others, known, config.icp)
+        else:  # the readings are what a pose explains, and say little between its turns
+            copied = first.pose @ known.copies.turns
+            left = unexplained(cloud_m, Rigid.cat([first.pose[None], copied]), surface)
+            others = Rigid.cat([others, copied[left[1:] < left[0] + _FITS_LESS]])
+        candidates = find_candidates(cloud_m, first, others, turned, known, config, is_refined=True)
         found = Rigid.stack([one.pose for one in candidates])
         evidence = surface_signals(cloud_m, found, surface)
         thinned_m = take_evenly(cloud_m, 500)

@@ -1,6 +1,7 @@
 """Poses that fit: the evidence against each, how likely each is, how they differ in words."""
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
@@ -12,18 +13,19 @@ from torch.nn.functional import normalize
 from depthpose.core.arrays import take_evenly
 from depthpose.core.rigid import Rigid, geodesic_rad
 from depthpose.pose.cloud import ObjectCloud, local_planes
-from depthpose.pose.config import EstimateConfig
+from depthpose.pose.config import EstimateConfig, IcpConfig
 from depthpose.pose.mesh import (
+    kept,
     mirror_deviation,
     near_symmetries,
     sample_surface,
     symmetry_transforms,
 )
 from depthpose.pose.mesh import true_symmetries as find_true
-from depthpose.pose.refine import refine_pose
+from depthpose.pose.refine import refine_pose, refine_roughly
 from depthpose.pose.surface import NEAR, Surface, look_along_rays
 from depthpose.pose.types import ObjectModel
-from depthpose.pose.voting.point_pairs import PairTable
+from depthpose.pose.voting.point_pairs import PairTable, find_turns
 
 _SAMPLED = 1000
 """At most so many points of the cloud are used, evenly taken."""
@@ -39,6 +41,11 @@ _SAME = 0.1
 _STEP = math.pi / 16
 _ICP_POINTS = 250
 """Points of the cloud that refine candidates."""
+_TURNED_STEPS = 4
+"""Exact steps of ICP for turned poses, which were refined roughly: a mug has some 20."""
+_LEFT, _LEFT_MORE = 0.01, 0.1
+"""Of a mask's readings a pose may leave so large a share unexplained beyond what the best of its
+turns leaves, and so many times as many: else what is seen, as a handle, says that it is none."""
 _POINTS = 100
 _ALONG = math.cos(math.radians(15))
 _LONGER = 1.15
@@ -115,6 +122,7 @@ class PoseAmbiguities:
 
     same: Rigid  #: ``model_from_model`` of the copies that are one answer, the identity first
     near: Rigid  #: of those that are another answer and look nearly alike
+    turns: Rigid  #: of those that look alike but for a part, as a mug's handle
     mirror: float  #: how far the mirror image deviates from the model, in diameters
     trained: Rigid  #: of those that a network was trained to treat as one, the identity first
     points_m: Float64[Tensor, "n 3"]  #: of the model, by which poses are compared
@@ -149,10 +157,14 @@ def find_copies(model: ObjectModel, *, up_to_symmetry: bool) -> PoseAmbiguities:
     near = [one.model_from_model for one in near_symmetries(model)]
     none = Rigid(torch.zeros(0, 3, 3).double(), torch.zeros(0, 3).double())
     turns = Rigid.stack(near) if near else none
+    rows = torch.tensor(kept(model, find_turns, "turns"), dtype=torch.float64).reshape(-1, 4, 4)
+    turned = Rigid(rows[:, :3, :3], rows[:, :3, 3])
     true, mirror = find_true(model), mirror_deviation(model)
     same = symmetry_transforms(true, _STEP).double()
     if up_to_symmetry:
         every = symmetry_transforms(model.symmetries, _STEP)
+        if near:  # what is between them is nearly alike too
+            turns, turned = Rigid.cat([turns, turned]), none
         same = Rigid.cat([same, every.double(), turns])
         turns = none
     trained = symmetry_transforms(model.symmetries, 2 * _STEP)
@@ -160,13 +172,14 @@ def find_copies(model: ObjectModel, *, up_to_symmetry: bool) -> PoseAmbiguities:
     centre_m = true.ball_centre_m
     if centre_m is not None:  # every turn of a ball is the same pose: its centre alone says where
         compared_m = centre_m.to(points_m)[None]
-        turns = none
+        turns = turned = none
     offset_m = points_m - points_m.mean(0)
     axes = torch.linalg.eigh(offset_m.T @ offset_m).eigenvectors.T.flip(0)
     along_m = points_m @ axes.T
     return PoseAmbiguities(
         same=same,
         near=turns,
+        turns=turned,
         mirror=mirror,
         trained=trained.double(),
         points_m=compared_m,
@@ -194,10 +207,62 @@ def near_symmetry_lines(model: ObjectModel) -> list[str]:
     ]
 
 
+def turn_best(
+    cloud_m: Float64[Tensor, "n 3"],
+    best: Candidate,
+    others: Rigid,
+    known: KnownObject,
+    icp: IcpConfig,
+) -> tuple[Candidate, Rigid, list[Candidate]]:
+    """Compare a refined pose with its turns: a handle that is seen says which of them it is.
+
+    Args:
+        cloud_m: all that a mask shows, not what one pose explains of it.
+        best: the pose.
+        others: at which ICP ended elsewhere.
+        known: the object.
+        icp: of the refinement.
+
+    Returns:
+        The pose, or the one that explains the most where it explains clearly less; and of the
+        others and of its turns those that explain nearly as much.
+    """
+    copies, surface = known.copies, known.surface
+    assert copies is not None, "with_copies comes first"
+    if len(copies.turns.R) == 0:
+        return best, others, []
+    rough = refine_roughly(cloud_m, best.pose @ copies.turns, surface, icp)
+    every = Rigid.cat([best.pose[None], others, rough])
+    left, count = unexplained(cloud_m, every, surface), 1 + len(others.R)
+    most = left.min() * (1 + _LEFT_MORE) + _LEFT
+    icp = replace(icp, start_distance_diameters=icp.end_distance_diameters)
+    if left[0] > (left.min() + most) / 2:  # what is answered explains more than what is named
+        half = replace(icp, iterations=(icp.iterations + 1) // 2)
+        best = (*_refined(cloud_m, every[[int(left.argmin())]], surface, half), best)[0]
+    others, rough = others[left[1:count] <= most], rough[left[count:] <= most]
+    turned = best.pose @ copies.turns
+    turned = turned[unexplained(cloud_m, turned, surface) <= most]
+    if len(turned.R) == 0:  # what is seen says which it is
+        return best, others, []
+    icp = replace(icp, iterations=_TURNED_STEPS, cloud_points=min(_ICP_POINTS, icp.cloud_points))
+    found = _refined(cloud_m, rough, surface, icp)
+    return best, others, found + [best._replace(pose=turned[k]) for k in range(len(turned.R))]
+
+
+def unexplained(
+    cloud_m: Float64[Tensor, "n 3"], poses: Rigid, surface: Surface
+) -> Float64[Tensor, " b"]:
+    """Share of a cloud that is not near each posed surface, by the table of what lies near."""
+    local_m = poses.inverse().apply(take_evenly(cloud_m, _SAMPLED))
+    gap_m = (local_m - surface.points_m[surface.boxes.look_up(local_m)]).norm(dim=-1)
+    return (gap_m > NEAR * surface.diameter_m).double().mean(-1)
+
+
 def find_candidates(
     cloud_m: Float[Tensor, "n 3"],
     best: Candidate,
     others: Rigid,
+    turned: Sequence[Candidate],
     known: KnownObject,
     config: EstimateConfig,
     *,
@@ -205,33 +270,45 @@ def find_candidates(
 ) -> list[Candidate]:
     """Refine ``others``, at which ICP ended elsewhere, and the nearly symmetric copies of the best.
 
-    The best comes first, then those that are other poses than it and than each other. Where the
-    best was not refined the copies stay where they are.
+    The best comes first, then those that are other poses than it and than each other, then those
+    of ``turned``. Where the best was not refined the copies stay where they are.
     """
     copies = known.copies
     assert copies is not None, "with_copies comes first"
     starts = Rigid.cat([others, best.pose @ copies.near])
-    kept = [best]
-    if not is_refined or len(starts.R) == 0:
-        tried = [best._replace(pose=starts[k]) for k in range(len(starts.R))]
-    else:
+    if is_refined:
         short = replace(
             config.icp,
             iterations=(config.icp.iterations + 1) // 2,
             cloud_points=min(_ICP_POINTS, config.icp.cloud_points),
         )
-        found = refine_pose(cloud_m.double(), starts, known.surface, short)
-        tried = [
-            Candidate(found.camera_from_model[k], found.covariance[k], float(found.residual_m[k]))
-            for k in range(len(starts.R))
-            if float(found.inlier_share[k]) > 0  # else it is near no surface
-        ]
-    for one in tried:
-        every = Rigid.stack([other.pose for other in kept])[:, None] @ copies.same
+        tried = _refined(cloud_m.double(), starts, known.surface, short)
+    else:
+        tried = [best._replace(pose=starts[k]) for k in range(len(starts.R))]
+    candidates = [best]
+    for k, one in enumerate([*tried, *turned]):
+        every = Rigid.stack([other.pose for other in candidates])[:, None] @ copies.same
         gap_m = one.pose.apply(copies.points_m) - every.apply(copies.points_m)
-        if float(gap_m.norm(dim=-1).mean(-1).min()) >= _SAME * copies.diameter_m:
-            kept.append(one)
-    return kept
+        apart = gap_m.norm(dim=-1).mean(-1).amin(-1) / copies.diameter_m
+        # Of turned ones, twice as dense, one is near the truth wherever that is.
+        least = _SAME if k < len(tried) else _SAME / 2
+        if float(apart[0]) >= _SAME and float(apart.min()) >= least:
+            candidates.append(one)
+    return candidates
+
+
+def _refined(
+    cloud_m: Float64[Tensor, "n 3"], starts: Rigid, surface: Surface, icp: IcpConfig
+) -> list[Candidate]:
+    """Refine poses; leave out those that are near no point."""
+    if len(starts.R) == 0:
+        return []
+    found = refine_pose(cloud_m, starts, surface, icp)
+    return [
+        Candidate(found.camera_from_model[k], found.covariance[k], float(found.residual_m[k]))
+        for k in range(len(starts.R))
+        if float(found.inlier_share[k]) > 0
+    ]
 
 
 def difference_of(pose: Rigid, from_pose: Rigid, copies: PoseAmbiguities) -> str:

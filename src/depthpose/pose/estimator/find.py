@@ -15,6 +15,7 @@ from depthpose.core.devices import each_in_threads
 from depthpose.core.rigid import Rigid
 from depthpose.pose.cloud import cloud_from_depth, grow_mask
 from depthpose.pose.config import RefusalConfig
+from depthpose.pose.estimator.candidates import KnownObject
 from depthpose.pose.estimator.fit import (
     BORDER_PX,
     fit_of,
@@ -31,7 +32,6 @@ from depthpose.pose.estimator.inputs import nothing_seen
 from depthpose.pose.frame import Frame, is_on_plane, largest_plane, prepare_frame
 from depthpose.pose.surface import NEAR, Surface
 from depthpose.pose.types import CloudInput, PoseEstimate, ViewInput
-from depthpose.pose.voting.point_pairs import PairTable
 
 _MOST_LOG_ODDS = 4.0
 """Proposed poses with larger log odds of being wrong are not refined and judged."""
@@ -82,14 +82,14 @@ class SearchTargets:
 
     Attributes:
         names: of the objects.
-        pairs_of: gives the point pairs of an object, and its surface, by its name.
+        object_of: gives an object by its name, with its point pairs and turns.
         pose_near: clouds and the poses that were proposed for them to estimates.
         max_size_error: of :class:`RefusalConfig`.
         is_sure: answer only what is likelier there than not, and search once, as tracking does.
     """
 
     names: Sequence[str]
-    pairs_of: Callable[[str], PairTable]
+    object_of: Callable[[str], KnownObject]
     pose_near: Callable[[Sequence[CloudInput], Sequence[Rigid]], list[PoseEstimate]]
     max_size_error: float
     is_sure: bool = False
@@ -141,8 +141,8 @@ def find_objects(view: ViewInput, known: SearchTargets) -> list[PoseEstimate]:
             same = (some for some in groups if some[0].object == one.object)
             own = next((some for some in same if one.shared_with(some[0]) > _RIVAL), None)
             if own is None:
-                pose = _best_turned(frame, one.pose, known.pairs_of(one.object))
-                explained = explained_mask(frame, pose, known.pairs_of(one.object).surface)
+                pose = _best_turned(frame, one.pose, known.object_of(one.object))
+                explained = explained_mask(frame, pose, known.object_of(one.object).surface)
                 groups.append([replace(one, pose=pose, explained=explained)])
             elif len(own) < _MOST_TOGETHER:
                 own.append(one)
@@ -164,7 +164,8 @@ def _candidates(
     """Propose poses of every object, and take the likeliest of all, and of each object some."""
 
     def propose(name: str) -> list[_Proposal]:
-        pairs = known.pairs_of(name)
+        pairs = known.object_of(name).pairs
+        assert pairs is not None
         poses, log_odds = propose_in_frame(frame, is_left, pairs, len(known.names))
         likely = (log_odds < _MOST_LOG_ODDS).nonzero()[:_MOST_JUDGED, 0].tolist()
         return [
@@ -177,22 +178,24 @@ def _candidates(
     found = list[_Candidate]()
     for k, one in enumerate(every):
         if k < _MOST_JUDGED or one.rank < _LEAST_JUDGED:
-            own = explained_mask(frame, one.pose, known.pairs_of(one.object).surface)
+            own = explained_mask(frame, one.pose, known.object_of(one.object).surface)
             if int(own.sum()) * frame.step**2 >= _LEAST_PIXELS:
                 found.append(_Candidate(**vars(one), explained=own))
     return found
 
 
-def _best_turned(frame: Frame, pose: Rigid, pairs: PairTable) -> Rigid:
+def _best_turned(frame: Frame, pose: Rigid, known: KnownObject) -> Rigid:
     """Give the pose or the one of its turns at which the object explains most readings about it.
 
     A handle that a wrong turn of a mug leaves out does not contradict it: a neighbour may be there.
     So each is scored by the readings that it explains, over the most that one does, less the share
     of its surface that the image contradicts.
     """
-    if len(pairs.turns.R) == 0:
+    surface, copies = known.surface, known.copies
+    assert copies is not None
+    if len(copies.turns.R) == 0:
         return pose
-    surface, every = pairs.surface, Rigid.cat([pose[None], pose[None] @ pairs.turns])
+    every = Rigid.cat([pose[None], pose[None] @ copies.turns])
     about = (frame.depth_m > 0) & (frame.plane_m < surface.diameter_m)
     middle_m = pose.apply(surface.middle_m[None])[0]
     about &= (frame.points_m - middle_m).norm(dim=-1) < surface.diameter_m
@@ -226,7 +229,7 @@ def _judged(
     for one, estimate in zip(inputs, estimates, strict=True):
         if estimate.camera_from_model is None:
             continue
-        surface = known.pairs_of(estimate.object).surface
+        surface = known.object_of(estimate.object).surface
         pose = estimate.camera_from_model.double()
         fit = fit_of(seen_about(one.points_m, view, surface.diameter_m), pose, surface, rim=1)
         log_odds = float(log_odds_wrong(frame, pose[None], surface))

@@ -41,6 +41,7 @@ from depthpose.pose.estimator.candidates import (
     disagreement,
     find_candidates,
     surface_signals,
+    turn_best,
     with_copies,
 )
 from depthpose.pose.estimator.fit import answer_of, fit_of, misfit_of, refused, seen_about
@@ -277,19 +278,23 @@ class GeoPoseNet(PoseEstimator):
         seconds["svd"] = fitted - met
         cloud_m, pose = cloud.cloud_m, fits.camera_from_model.double()
         first = Candidate(pose[0], fits.covariance[0], float(fits.residual_m[0]))
-        others, is_refined = pose[[]], False
+        others, turned, is_refined = pose[[]], list[Candidate](), False
         if config.with_icp:
             best = refine_best(cloud_m.double(), pose, surface, config.icp)
             icp, is_refined = best.refined, float(best.refined.inlier_share) > 0
             if is_refined:
                 first = Candidate(icp.camera_from_model, icp.covariance, float(icp.residual_m))
-                others = best.others
+                first, others, turned = turn_best(
+                    cloud_m.double(), first, best.others, known, config.icp
+                )
         if not is_likely:
             seen = seen_about(cloud_m, cloud.view, surface.diameter_m)
             misfit = misfit_of(fit_of(seen, first.pose, surface), self.refusal)
             if misfit is not None:
                 return refused(given, misfit, {**seconds, "icp": time.perf_counter() - fitted})
-        candidates = find_candidates(cloud_m, first, others, known, config, is_refined=is_refined)
+        candidates = find_candidates(
+            cloud_m, first, others, turned, known, config, is_refined=is_refined
+        )
         poses = Rigid.stack([candidate.pose for candidate in candidates])
         # Of the copies that the network could not learn to distinguish, the best counts.
         assert known.copies is not None, "found with the candidates"

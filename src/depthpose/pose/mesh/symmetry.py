@@ -41,7 +41,8 @@ def kept(model: ObjectModel, compute: Callable[..., Any], name: str, *settings: 
         tensors.append(symmetries.discrete.R)
     tensors += [axis.direction for axis in symmetries.continuous]
     digest = sha256(f"{symmetries.is_found}".encode())
-    for path in sorted(Path(__file__).parent.glob("*.py")):
+    code = {*Path(__file__).parent.glob("*.py"), Path(compute.__code__.co_filename)}
+    for path in sorted(code):
         digest.update(path.read_bytes())
     for tensor in tensors:
         digest.update(tensor.contiguous().numpy().tobytes())

@@ -5,8 +5,7 @@ bins and the check of every candidate follow Vidal et al., Sensors 2018.
 """
 
 import math
-from dataclasses import dataclass
-from functools import cached_property
+from dataclasses import dataclass, replace
 
 import torch
 from jaxtyping import Float32, Float64, Int32, Int64
@@ -18,9 +17,17 @@ from depthpose.core.rigid import Rigid, geodesic_rad
 from depthpose.pose.cloud import thin
 from depthpose.pose.compiled import ANGLES, DISTANCES, MOST_ALIKE, TURNS, use_numba
 from depthpose.pose.config import IcpConfig
+from depthpose.pose.mesh import true_symmetries
 from depthpose.pose.mesh.models import fibonacci_directions
 from depthpose.pose.refine import refine_roughly
-from depthpose.pose.surface import NEAR, Surface, finite_array, look_along_rays
+from depthpose.pose.surface import (
+    NEAR,
+    Surface,
+    finite_array,
+    look_along_rays,
+    prepare_surface,
+)
+from depthpose.pose.types import ObjectModel
 
 STEP = 0.07
 """Of the diameter: distance of the points of the model, and a bin of the distances of a pair."""
@@ -46,9 +53,9 @@ _UNSEEN = 0.3
 """Weight of the share of the surface that should be seen and is not."""
 _OWN_REFERENCES, _OWN_PEAKS, _OWN_POINTS = 40, 48, 250
 """Points of a model that look for it in itself, poses that each proposes, and points compared."""
-_ROUGHLY, _MOSTLY, _NEARLY = 0.25, 0.8, 0.85
-"""A turn that lays the first share of a surface on itself is refined; one that then lays the
-second share there is kept."""
+_ROUGHLY, _NEARLY, _MOSTLY = 0.25, 0.85, 0.8
+"""A turn lays the first share of a surface on itself at least, and the second of what the best turn
+does; one that lays the third share there may be near another."""
 _TURNED, _TURNED_RAD, _MOST_TURNS = 0.7, math.radians(12), 36
 """Cosine of the normals there, the least angle between two turns, and their number at most."""
 
@@ -74,33 +81,38 @@ class PairTable:
     turn_rad: Float32[Tensor, " pairs"]
     surface: Surface
 
-    @cached_property
-    def turns(self) -> Rigid:
-        """Motions that lay 80 % of the surface on itself, ``model_from_model``; no symmetries.
 
-        A mug has them about its axis: but for its handle it looks alike. They are found by looking
-        for the model in itself, when they are first wanted.
-        """
-        surface = self.surface
-        # Of all sides, not those of the first faces.
-        references = take_evenly(torch.arange(len(self.points_m)), _OWN_REFERENCES)
-        found, _ = vote_poses(self.points_m, self.frames[..., 0], references, self, _OWN_PEAKS)
-        found = found[_distinct_turns(found, surface, _ROUGHLY)]
-        # With the camera in the middle of the model, from where it sees all.
-        points_m, starts = surface.points_m - surface.middle_m, found.t_m - surface.middle_m
-        found = refine_roughly(points_m, Rigid(found.R, starts), surface, IcpConfig())
-        found = Rigid(found.R, found.t_m + surface.middle_m)
-        found = found[_distinct_turns(found, surface, _ROUGHLY)]
-        # One after the other they are turns too, which fill the gaps between those that were found.
-        twice = found[:, None] @ found
-        found = Rigid.cat([found, Rigid(twice.R.flatten(0, 1), twice.t_m.flatten(0, 1))])
-        return found[_distinct_turns(found, surface, _ROUGHLY)]
+def find_turns(model: ObjectModel) -> list[list[list[float]]]:
+    """Find the motions that lay a model on itself the most, ``model_from_model``; no symmetries.
+
+    A mug has them about its axis: but for its handle it looks alike. A bracket has half turns,
+    which lay half of it on itself. They are found by looking for the model in itself.
+
+    Returns:
+        4x4 matrices in metres, in numbers that JSON holds, the best first.
+    """
+    surface = prepare_surface(replace(model, symmetries=true_symmetries(model)))
+    table = prepare_pairs(surface)
+    # Of all sides, not those of the first faces.
+    references = take_evenly(torch.arange(len(table.points_m)), _OWN_REFERENCES)
+    found, _ = vote_poses(table.points_m, table.frames[..., 0], references, table, _OWN_PEAKS)
+    found = found[_distinct_turns(found, surface)]
+    # With the camera in the middle of the model, from where it sees all.
+    points_m, starts = surface.points_m - surface.middle_m, found.t_m - surface.middle_m
+    found = refine_roughly(points_m, Rigid(found.R, starts), surface, IcpConfig())
+    found = Rigid(found.R, found.t_m + surface.middle_m)
+    found = found[_distinct_turns(found, surface)]
+    # One after the other they are turns too, which fill the gaps between those that were found.
+    twice = found[:, None] @ found
+    found = Rigid.cat([found, Rigid(twice.R.flatten(0, 1), twice.t_m.flatten(0, 1))])
+    return found[_distinct_turns(found, surface)].matrix().tolist()
 
 
-def _distinct_turns(turns: Rigid, surface: Surface, least: float) -> list[int]:
-    """Choose turns that lay so large a share of a surface on itself, the best first.
+def _distinct_turns(turns: Rigid, surface: Surface) -> list[int]:
+    """Choose the turns that lay the most of a surface on itself, the best first.
 
-    None is within 12 degrees of one before it or of a symmetry, nor of the two together.
+    None is within 12 degrees of one before it or of a symmetry, nor of the two together, or, where
+    it lays less than 80 % there, within 60: what is turned a little lies near itself too.
     """
     every = max(1, len(surface.points_m) // _OWN_POINTS)
     local_m = turns.inverse().apply(surface.points_m[::every])
@@ -110,8 +122,8 @@ def _distinct_turns(turns: Rigid, surface: Surface, least: float) -> list[int]:
     share = (is_alike & (cosine.abs() > _TURNED)).double().mean(-1)
     chosen, taken = list[int](), surface.copies.R
     for k in share.argsort(descending=True).tolist():
-        most = float(share[chosen[0]]) if chosen else 0.0
-        if share[k] < max(least, _NEARLY * most) or len(chosen) == _MOST_TURNS:
+        least = _NEARLY * float(share[chosen[0]]) if chosen else _ROUGHLY
+        if share[k] < max(least, _ROUGHLY) or len(chosen) == _MOST_TURNS:
             break
         apart_rad = _TURNED_RAD if share[k] >= _MOSTLY else 5 * _TURNED_RAD
         if float(geodesic_rad(turns.R[k].expand_as(taken), taken).min()) > apart_rad:
