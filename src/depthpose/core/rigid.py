@@ -41,7 +41,7 @@ class Rigid:
         return Rigid(self.R.float(), self.t_m.float())
 
     def __getitem__(
-        self, index: int | list[int] | Tensor | tuple[slice | None, ...] | None
+        self, index: int | list[int] | Tensor | slice | tuple[slice | None, ...] | None
     ) -> "Rigid":
         """Give one of a batch or several as a batch; each None is a new axis of one."""
         return Rigid(self.R[index], self.t_m[index])

@@ -122,7 +122,8 @@ class PoseAmbiguities:
 
     same: Rigid  #: ``model_from_model`` of the copies that are one answer, the identity first
     near: Rigid  #: of those that are another answer and look nearly alike
-    turns: Rigid  #: of those that look alike but for a part, as a mug's handle
+    turns: Rigid  #: of those that look alike but for a part, as a mug's handle, the best first
+    mostly: int  #: so many of the turns leave 80 % of the surface alike
     mirror: float  #: how far the mirror image deviates from the model, in diameters
     trained: Rigid  #: of those that a network was trained to treat as one, the identity first
     points_m: Float64[Tensor, "n 3"]  #: of the model, by which poses are compared
@@ -152,34 +153,36 @@ class Candidate(NamedTuple):
 
 
 def find_copies(model: ObjectModel, *, up_to_symmetry: bool) -> PoseAmbiguities:
-    """Search a model for its near-symmetries, or count them as one answer with the true ones."""
+    """Search a model for near-symmetries and turns, or count these as one answer with the true."""
     points_m = sample_surface(model, 2000)[0].double()
     near = [one.model_from_model for one in near_symmetries(model)]
     none = Rigid(torch.zeros(0, 3, 3).double(), torch.zeros(0, 3).double())
-    turns = Rigid.stack(near) if near else none
-    rows = torch.tensor(kept(model, find_turns, "turns"), dtype=torch.float64).reshape(-1, 4, 4)
-    turned = Rigid(rows[:, :3, :3], rows[:, :3, 3])
+    alike = Rigid.stack(near) if near else none
+    found = kept(model, find_turns, "turns")
+    rows = torch.tensor(found["turns"], dtype=torch.float64).reshape(-1, 4, 4)
+    turns, mostly = Rigid(rows[:, :3, :3], rows[:, :3, 3]), found["mostly"]
     true, mirror = find_true(model), mirror_deviation(model)
     same = symmetry_transforms(true, _STEP).double()
     if up_to_symmetry:
         every = symmetry_transforms(model.symmetries, _STEP)
         if near:  # what is between them is nearly alike too
-            turns, turned = Rigid.cat([turns, turned]), none
-        same = Rigid.cat([same, every.double(), turns])
-        turns = none
+            alike, turns, mostly = Rigid.cat([alike, turns[:mostly]]), turns[mostly:], 0
+        same = Rigid.cat([same, every.double(), alike])
+        alike = none
     trained = symmetry_transforms(model.symmetries, 2 * _STEP)
     compared_m = take_evenly(points_m, _POINTS)
     centre_m = true.ball_centre_m
     if centre_m is not None:  # every turn of a ball is the same pose: its centre alone says where
         compared_m = centre_m.to(points_m)[None]
-        turns = turned = none
+        alike, turns, mostly = none, none, 0
     offset_m = points_m - points_m.mean(0)
     axes = torch.linalg.eigh(offset_m.T @ offset_m).eigenvectors.T.flip(0)
     along_m = points_m @ axes.T
     return PoseAmbiguities(
         same=same,
-        near=turns,
-        turns=turned,
+        near=alike,
+        turns=turns,
+        mostly=mostly,
         mirror=mirror,
         trained=trained.double(),
         points_m=compared_m,
@@ -229,9 +232,10 @@ def turn_best(
     """
     copies, surface = known.copies, known.surface
     assert copies is not None, "with_copies comes first"
-    if len(copies.turns.R) == 0:
+    turns = copies.turns[: copies.mostly]  # of less than that anything fits some copy
+    if len(turns.R) == 0:
         return best, others, []
-    rough = refine_roughly(cloud_m, best.pose @ copies.turns, surface, icp)
+    rough = refine_roughly(cloud_m, best.pose @ turns, surface, icp)
     every = Rigid.cat([best.pose[None], others, rough])
     left, count = unexplained(cloud_m, every, surface), 1 + len(others.R)
     most = left.min() * (1 + _LEFT_MORE) + _LEFT
@@ -240,7 +244,7 @@ def turn_best(
         half = replace(icp, iterations=(icp.iterations + 1) // 2)
         best = (*_refined(cloud_m, every[[int(left.argmin())]], surface, half), best)[0]
     others, rough = others[left[1:count] <= most], rough[left[count:] <= most]
-    turned = best.pose @ copies.turns
+    turned = best.pose @ turns
     turned = turned[unexplained(cloud_m, turned, surface) <= most]
     if len(turned.R) == 0:  # what is seen says which it is
         return best, others, []

@@ -6,6 +6,7 @@ bins and the check of every candidate follow Vidal et al., Sensors 2018.
 
 import math
 from dataclasses import dataclass, replace
+from typing import Any
 
 import torch
 from jaxtyping import Float32, Float64, Int32, Int64
@@ -82,37 +83,39 @@ class PairTable:
     surface: Surface
 
 
-def find_turns(model: ObjectModel) -> list[list[list[float]]]:
+def find_turns(model: ObjectModel) -> dict[str, Any]:
     """Find the motions that lay a model on itself the most, ``model_from_model``; no symmetries.
 
     A mug has them about its axis: but for its handle it looks alike. A bracket has half turns,
     which lay half of it on itself. They are found by looking for the model in itself.
 
     Returns:
-        4x4 matrices in metres, in numbers that JSON holds, the best first.
+        What JSON holds: ``turns``, 4x4 matrices in metres, the best first, and ``mostly``, how many
+        of them lay 80 % of the surface on itself.
     """
     surface = prepare_surface(replace(model, symmetries=true_symmetries(model)))
     table = prepare_pairs(surface)
     # Of all sides, not those of the first faces.
     references = take_evenly(torch.arange(len(table.points_m)), _OWN_REFERENCES)
     found, _ = vote_poses(table.points_m, table.frames[..., 0], references, table, _OWN_PEAKS)
-    found = found[_distinct_turns(found, surface)]
+    found = found[_distinct_turns(found, surface)[0]]
     # With the camera in the middle of the model, from where it sees all.
     points_m, starts = surface.points_m - surface.middle_m, found.t_m - surface.middle_m
     found = refine_roughly(points_m, Rigid(found.R, starts), surface, IcpConfig())
     found = Rigid(found.R, found.t_m + surface.middle_m)
-    found = found[_distinct_turns(found, surface)]
+    found = found[_distinct_turns(found, surface)[0]]
     # One after the other they are turns too, which fill the gaps between those that were found.
     twice = found[:, None] @ found
     found = Rigid.cat([found, Rigid(twice.R.flatten(0, 1), twice.t_m.flatten(0, 1))])
-    return found[_distinct_turns(found, surface)].matrix().tolist()
+    chosen, mostly = _distinct_turns(found, surface)
+    return {"turns": found[chosen].matrix().tolist(), "mostly": mostly}
 
 
-def _distinct_turns(turns: Rigid, surface: Surface) -> list[int]:
-    """Choose the turns that lay the most of a surface on itself, the best first.
+def _distinct_turns(turns: Rigid, surface: Surface) -> tuple[list[int], int]:
+    """Choose the turns that lay the most of a surface on itself; say how many lay 80 % there.
 
-    None is within 12 degrees of one before it or of a symmetry, nor of the two together, or, where
-    it lays less than 80 % there, within 60: what is turned a little lies near itself too.
+    The best come first. None is within 12 degrees of one before it or of a symmetry, nor of the two
+    together, or, where it lays less there, within 60: what is turned a little lies near itself.
     """
     every = max(1, len(surface.points_m) // _OWN_POINTS)
     local_m = turns.inverse().apply(surface.points_m[::every])
@@ -129,7 +132,7 @@ def _distinct_turns(turns: Rigid, surface: Surface) -> list[int]:
         if float(geodesic_rad(turns.R[k].expand_as(taken), taken).min()) > apart_rad:
             chosen.append(k)
             taken = torch.cat([taken, turns.R[k] @ surface.copies.R])
-    return chosen
+    return chosen, int((share[chosen] >= _MOSTLY).sum())
 
 
 def prepare_pairs(surface: Surface) -> PairTable:
