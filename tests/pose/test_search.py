@@ -311,6 +311,15 @@ def test_an_answer_is_as_sure_as_its_pose_and_that_it_is_there_at_all() -> None:
     assert kept[0][1].certainty == pytest.approx(1 / (1 + math.exp(-2.0)))
 
 
+@pytest.mark.parametrize(("second", "number"), [(-3.6, 3), (-1.4, 1), (-0.4, 1)])
+def test_a_second_one_of_an_object_must_be_about_as_sure(second: float, number: int) -> None:
+    """What is there once and something that looks like it differ by more; a third is as ever."""
+    answers = [judged("a", log_odds, slice(10 * k, 10 * k + 10), k)
+               for k, log_odds in enumerate((-4.0, second, -0.3))]  # fmt: skip
+    kept, _ = find._without_rivals(answers, [])
+    assert len(kept) == number
+
+
 def test_a_further_one_of_an_object_must_be_surer_than_a_guess_among_four() -> None:
     answers = [judged("a", -3.0 + k, slice(10 * k, 10 * k + 10), k) for k in range(3)]
     answers = [(one, replace(estimate, certainty=0.2)) for one, estimate in answers]

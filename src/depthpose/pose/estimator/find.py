@@ -35,10 +35,11 @@ from depthpose.pose.types import CloudInput, PoseEstimate, ViewInput
 
 _MOST_LOG_ODDS = 4.0
 """Proposed poses with larger log odds of being wrong are not refined and judged."""
-_ANSWERED, _ANOTHER = 0.5, -0.5
+_ANSWERED, _ANOTHER, _LESS_SURE = 0.5, -0.5, 1.5
 """A pose is answered where its log odds of being wrong, once refined, are below the first; a second
-one of an object, and what tracking begins at, where they are below the second. Most things are
-there once; where two are, there are often many, and the first limit holds again."""
+one of an object, and what tracking begins at, where they are below the second, and no more than the
+third above those of the first one: of copies of a part the surest two are about as sure. Most
+things are there once; where two are, there are often many, and the first limit holds again."""
 _LEAST_CERTAINTY = 0.25
 """Of all but the surest of an object: less is a guess among four poses."""
 _DISAGREES, _UNSEEN, _GAP = 20.3, 4.6, 216.0
@@ -285,11 +286,11 @@ def _without_rivals(
     for k, (one, estimate) in enumerate(ranked):
         if any(one.shared_with(other) > _SHARED for other in taken):
             continue
-        same = sum(one.object == other.object for other in taken)
-        if same == 1 and one.log_odds > _ANOTHER:
+        same = [other.log_odds for other in taken if other.object == one.object]
+        if len(same) == 1 and one.log_odds > min(_ANOTHER, same[0] + _LESS_SURE):
             continue
         there = 1 / (1 + math.exp(one.log_odds))
-        if same > 0 and there * (estimate.certainty or 0.0) < _LEAST_CERTAINTY:
+        if same and there * (estimate.certainty or 0.0) < _LEAST_CERTAINTY:
             continue
         taken.append(one)
         rivals = {one.object: (one.log_odds, estimate)}
