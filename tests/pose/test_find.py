@@ -21,6 +21,7 @@ from depthpose.core.errors import InputError
 from depthpose.core.rigid import Rigid
 from depthpose.pose.config import RefusalConfig
 from depthpose.pose.estimator.find import explained_mask, is_cut_out, nothing_found
+from depthpose.pose.estimator.fit import Seen
 from depthpose.pose.mesh import make_model
 from depthpose.pose.metrics import add_m
 from depthpose.pose.surface import NEAR, prepare_surface
@@ -90,8 +91,8 @@ def test_a_piece_of_a_larger_plane_is_no_flat_part(
         depth_m[rows[0] : rows[-1] + 1, columns[-1] :] = top_m
     depth_m = torch.where(mask, seen.float(), depth_m)
     depth_m += 0.001 * torch.randn(240, 320, generator=torch.Generator().manual_seed(0))
-    view = ViewInput(name="", depth_m=depth_m, mask=mask, K=K.float(), object=model.name)
-    assert is_cut_out(view, pose, prepare_surface(model)) == is_cut
+    seen = Seen(depth_m=depth_m.double(), is_own=mask, K=K.double(), noise_m=0.001)
+    assert is_cut_out(seen, pose, prepare_surface(model)) == is_cut
 
 
 def test_readings_on_a_posed_surface_are_all_that_are_near_it() -> None:
@@ -101,9 +102,8 @@ def test_readings_on_a_posed_surface_are_all_that_are_near_it() -> None:
     depth_m = (table() + 0.01 * torch.randn(240, 320, generator=noise)).double()
     local_m = pose.inverse().apply(back_project(depth_m, K.double()))
     distance_m = torch.from_numpy(surface.tree.query(local_m.numpy())[0])
-    view = ViewInput(name="", depth_m=depth_m.float(), mask=depth_m > 0, K=K.float(),
-                     object=model.name)  # fmt: skip
-    found, near = explained_mask(view, pose, surface), distance_m < NEAR * surface.diameter_m
+    seen = Seen(depth_m=depth_m, is_own=depth_m > 0, K=K.double(), noise_m=0.01)
+    found, near = explained_mask(seen, pose, surface), distance_m < NEAR * surface.diameter_m
     assert int(near.sum()) > 500
     assert int((found != near).sum()) < 3, "but for rounding"
 

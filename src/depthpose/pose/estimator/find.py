@@ -10,7 +10,7 @@ from jaxtyping import Bool
 from torch import Tensor
 
 from depthpose.core.arrays import take_evenly
-from depthpose.core.camera import back_project, project
+from depthpose.core.camera import back_project
 from depthpose.core.devices import each_in_threads
 from depthpose.core.rigid import Rigid
 from depthpose.pose.cloud import cloud_from_depth, grow_mask
@@ -18,6 +18,7 @@ from depthpose.pose.config import RefusalConfig
 from depthpose.pose.estimator.candidates import KnownObject
 from depthpose.pose.estimator.fit import (
     BORDER_PX,
+    Seen,
     fit_of,
     seen_about,
     sensor_size_error,
@@ -232,7 +233,8 @@ def _judged(
             continue
         surface = known.object_of(estimate.object).surface
         pose = estimate.camera_from_model.double()
-        fit = fit_of(seen_about(one.points_m, view, surface.diameter_m), pose, surface, rim=1)
+        seen = seen_about(one.points_m, view, surface.diameter_m)
+        fit = fit_of(seen, pose, surface, rim=1)
         log_odds = float(log_odds_wrong(frame, pose[None], surface))
         own = explained_mask(frame, pose, surface)
         log_odds += _DISAGREES * (1 - fit.agrees) + _UNSEEN * (1 - fit.seen)
@@ -244,7 +246,7 @@ def _judged(
         log_odds += _GAP * gap
         off = size_deviations(estimate, view, surface, known.max_size_error)
         log_odds += 0.5 * min(off, _MOST_DEVIATIONS) ** 2  # of a normal distribution
-        if log_odds < most_log_odds and not is_cut_out(view, pose, surface):
+        if log_odds < most_log_odds and not is_cut_out(seen, pose, surface):
             found = _Candidate(object=estimate.object, pose=pose, log_odds=log_odds, explained=own)
             answers.append((found, estimate))
     return answers
@@ -305,14 +307,18 @@ def _without_rivals(
     return kept, taken
 
 
-def explained_mask(seen: Frame | ViewInput, pose: Rigid, surface: Surface) -> Bool[Tensor, "h w"]:
+def explained_mask(
+    seen: Frame | Seen | ViewInput, pose: Rigid, surface: Surface
+) -> Bool[Tensor, "h w"]:
     """Mark the pixels whose points lie on a posed surface; in a frame, none of wider planes."""
     if isinstance(seen, Frame):
         points_m = seen.points_m
         found = (seen.depth_m > 0) & (seen.plane_m < surface.diameter_m)
     else:
         points_m = back_project(seen.depth_m.double(), seen.K.double())
-        found = points_m.isfinite().all(-1) & seen.mask
+        found = points_m.isfinite().all(-1)
+        if isinstance(seen, ViewInput):
+            found &= seen.mask
     pose = pose.double()
     middle_m = pose.apply(surface.points_m.mean(0, keepdim=True))
     found[found.clone()] = (points_m[found] - middle_m).norm(dim=-1) < surface.diameter_m
@@ -326,28 +332,19 @@ def explained_mask(seen: Frame | ViewInput, pose: Rigid, surface: Surface) -> Bo
     return found
 
 
-def is_cut_out(view: ViewInput, pose: Rigid, surface: Surface) -> bool:
+def is_cut_out(seen: Seen, pose: Rigid, surface: Surface) -> bool:
     """Whether what lies on a posed surface is flat, and goes on in its plane beyond the outline.
 
     Args:
-        view: depth and camera; its mask limits what may lie on the surface, not what goes on.
+        seen: about the object.
         pose: of the object.
         surface: of its model.
     """
-    # Nothing else of the image is looked at: it takes long.
-    middle_m = pose.apply(surface.points_m.mean(0, keepdim=True).to(pose.t_m))
-    reach = math.ceil((1 + 2 * _RIM) * surface.diameter_m / float(middle_m[0, 2] / view.K[0, 0]))
-    column, row = project(middle_m, view.K.to(middle_m))[0].long().tolist()
-    left, top, reach = max(0, column - reach), max(0, row - reach), reach + BORDER_PX
-    part, K = (slice(top, row + reach), slice(left, column + reach)), view.K.clone()
-    K[:2, 2] -= torch.tensor([left, top]).to(K)
-    view = replace(view, depth_m=view.depth_m[part], mask=view.mask[part], K=K)
-    points_m = back_project(view.depth_m.double(), view.K.double())
-    own = explained_mask(view, pose, surface)
+    own, points_m = explained_mask(seen, pose, surface), back_project(seen.depth_m, seen.K)
     plane = largest_plane(points_m[own], torch.Generator().manual_seed(0))
     if plane is None or float(is_on_plane(points_m[own], plane).double().mean()) < _FLAT:
         return False
-    pixel_m = float(points_m[own][:, 2].median() / view.K[0, 0])
+    pixel_m = float(points_m[own][:, 2].median() / seen.K[0, 0])
     reach = BORDER_PX + math.ceil(_RIM * surface.diameter_m / pixel_m)
     rim = grow_mask(own, reach) & ~grow_mask(own, BORDER_PX)
     return float(is_on_plane(points_m[rim], plane).double().mean()) > _CONTINUED
