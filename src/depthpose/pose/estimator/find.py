@@ -37,11 +37,11 @@ from depthpose.pose.types import CloudInput, PoseEstimate, ViewInput
 _MOST_LOG_ODDS = 4.0
 """Proposed poses with larger log odds of being wrong are not refined and judged."""
 _ANSWERED, _ANOTHER, _LESS_SURE = 0.5, -0.5, 1.5
-"""A pose is answered where its log odds of being wrong, once refined, are below the first, or, where
-several objects are asked for and each may be missing, below 0; a second one of an object, and what
-tracking begins at, where they are below the second, and no more than the third above those of the
-first one: of copies of a part the surest two are about as sure. Most things are there once; where
-two are, there are often many, and the first limit holds again."""
+"""A pose is answered where its log odds of being wrong, once refined, are below the first, or below
+0 where several objects are asked for, of which each may be missing; a second one of an object, and
+what tracking begins at, where they are below the second, and no more than the third above those of
+the first one: of copies of a part the surest two are about as sure. Most things are there once;
+where two are, there are often many, and the first limit holds again."""
 _LEAST_CERTAINTY = 0.25
 """Of all but the surest of an object: less is a guess among four poses."""
 _DISAGREES, _UNSEEN, _GAP = 20.3, 4.6, 216.0
