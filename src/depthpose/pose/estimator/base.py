@@ -233,7 +233,8 @@ class PoseEstimator:
         """Find and pose known objects in a depth image without masks, the best answer first.
 
         Point pairs of the whole image vote for poses of each object; where the image agrees with
-        one, the object is estimated from the points there. What is refused is left out.
+        one, the object is estimated from the points there. What is refused is left out, and, where
+        several objects are asked for, what is likelier not there than there.
 
         Args:
             depth: as for :meth:`estimate`.
@@ -514,7 +515,7 @@ class Registration(PoseEstimator):
         candidates = find_candidates(cloud_m, first, others, turned, known, config, is_refined=True)
         found = Rigid.stack([one.pose for one in candidates])
         evidence = surface_signals(cloud_m, found, surface)
-        thinned_m = take_evenly(cloud_m, 500)
+        thinned_m = take_evenly(cloud_m, 500)  # as tilt_of takes of a cloud
         for pose, signals in zip([one.pose for one in candidates], evidence, strict=True):
             # The plane through neighbours is tilted where a part has edges and thin features too,
             # whatever the pose: so it is on the cloud moved onto the posed surface.
