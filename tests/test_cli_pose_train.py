@@ -91,6 +91,13 @@ def test_synthetic_frames_are_a_data_set_that_the_check_accepts(
     assert "sensor.kinds = ['structured light'], but now it is" in capsys.readouterr().err
     assert main([*words, "--number", "0"]) == 2
     assert "--number 0: at least 1 frame" in capsys.readouterr().err
+    assert main([*words, "--number", "3", "--clutter", "8", "16"]) == 2
+    assert "frame_clutter = [0, 4], but now it is [8, 16]" in capsys.readouterr().err
+    words[-1] = str(tmp_path / "cluttered")
+    assert main([*words, "--number", "1", "--clutter", "16", "8"]) == 2
+    assert "16" in capsys.readouterr().err
+    assert main([*words, "--number", "1", "--clutter", "12", "12"]) == 0
+    assert (tmp_path / "cluttered/train/000000/rgb/000000.png").read_bytes() != first
 
 
 def test_frames_are_not_made_of_two_objects_of_one_name(

@@ -90,6 +90,7 @@ def make_objects(
     seed: int = 0,
     distance: tuple[float, float] = (0.6, 1.1),
     sensor: SensorKind = "structured light",
+    clutter: tuple[int, int] = (0, 4),
     pile: int = 0,
     symmetries: Literal["none", "found"] = "none",
 ) -> int:
@@ -108,6 +109,7 @@ def make_objects(
         seed: of the random frames.
         distance: nearest and farthest view [m].
         sensor: kind of depth sensor whose errors are simulated.
+        clutter: fewest and most other things among the objects.
         pile: each frame shows so many copies of one part, dropped onto each other.
         symmetries: found: declare those that a part's shape shows; none: only print them.
     """
@@ -132,8 +134,9 @@ def make_objects(
         raise InputError(f"--split {split}: a name of letters and digits, not 'models'")
     kind = SensorConfig(kinds=(sensor,))
     config = ObjectsConfig(
-        seed=seed, distance_m=distance, sensor=kind, number=number, frame_pile=pile
-    )
+        seed=seed, distance_m=distance, sensor=kind, number=number, frame_clutter=clutter,
+        frame_pile=pile,
+    )  # fmt: skip
     # What decides the frames; of another seed, other scenes: they may share the folder.
     settings = {k: v for k, v in config_to_dict(config).items() if k not in ("number", "seed")}
     settings["cad"] = {
