@@ -132,10 +132,9 @@ def make_objects(
         )
     if not re.fullmatch(r"[\w-]+", split) or split == "models":
         raise InputError(f"--split {split}: a name of letters and digits, not 'models'")
-    kind = SensorConfig(kinds=(sensor,))
     config = ObjectsConfig(
-        seed=seed, distance_m=distance, sensor=kind, number=number, frame_clutter=clutter,
-        frame_pile=pile,
+        seed=seed, distance_m=distance, sensor=SensorConfig(kinds=(sensor,)), number=number,
+        frame_clutter=clutter, frame_pile=pile,
     )  # fmt: skip
     # What decides the frames; of another seed, other scenes: they may share the folder.
     settings = {k: v for k, v in config_to_dict(config).items() if k not in ("number", "seed")}
