@@ -138,11 +138,10 @@ def make_objects(
     )  # fmt: skip
     # What decides the frames; of another seed, other scenes: they may share the folder.
     settings = {k: v for k, v in config_to_dict(config).items() if k not in ("number", "seed")}
-    settings["cad"] = {
+    settings |= {"unit": unit, "symmetries": symmetries, "cad": {
         f"object {k}": {"file": path.name, "sha256": file_sha256(path)}
         for k, path in enumerate(cad, start=1)
-    }
-    settings |= {"unit": unit, "symmetries": symmetries}
+    }}  # fmt: skip
     models = [read_model(path, unit, number=k) for k, path in enumerate(cad, start=1)]
     refuse_one_name(models)
     known = partial(with_found_symmetries, on_message=tqdm.write, is_taken=symmetries == "found")
