@@ -22,7 +22,7 @@ from depthpose.pose.mesh import (
     symmetry_transforms,
 )
 from depthpose.pose.mesh import true_symmetries as find_true
-from depthpose.pose.refine import refine_pose, refine_roughly
+from depthpose.pose.refine import RefinedPose, refine_pose, refine_roughly
 from depthpose.pose.surface import NEAR, Surface, look_along_rays
 from depthpose.pose.types import ObjectModel
 from depthpose.pose.voting.point_pairs import PairTable, find_turns
@@ -242,14 +242,15 @@ def turn_best(
     icp = replace(icp, start_distance_diameters=icp.end_distance_diameters)
     if left[0] > (left.min() + most) / 2:  # what is answered explains more than what is named
         half = replace(icp, iterations=(icp.iterations + 1) // 2)
-        best = (*_refined(cloud_m, every[[int(left.argmin())]], surface, half), best)[0]
+        refined = refine_pose(cloud_m, every[[int(left.argmin())]], surface, half)
+        best = (*_near_points(refined), best)[0]
     others, rough = others[left[1:count] <= most], rough[left[count:] <= most]
     turned = best.pose @ turns
     turned = turned[unexplained(cloud_m, turned, surface) <= most]
     if len(turned.R) == 0:  # what is seen says which it is
         return best, others, []
     icp = replace(icp, iterations=_TURNED_STEPS, cloud_points=min(_ICP_POINTS, icp.cloud_points))
-    found = _refined(cloud_m, rough, surface, icp)
+    found = _near_points(refine_pose(cloud_m, rough, surface, icp)) if len(rough.R) else []
     return best, others, found + [best._replace(pose=turned[k]) for k in range(len(turned.R))]
 
 
@@ -280,13 +281,13 @@ def find_candidates(
     copies = known.copies
     assert copies is not None, "with_copies comes first"
     starts = Rigid.cat([others, best.pose @ copies.near])
-    if is_refined:
+    if is_refined and len(starts.R):
         short = replace(
             config.icp,
             iterations=(config.icp.iterations + 1) // 2,
             cloud_points=min(_ICP_POINTS, config.icp.cloud_points),
         )
-        tried = _refined(cloud_m.double(), starts, known.surface, short)
+        tried = _near_points(refine_pose(cloud_m.double(), starts, known.surface, short))
     else:
         tried = [best._replace(pose=starts[k]) for k in range(len(starts.R))]
     candidates = [best]
@@ -301,16 +302,11 @@ def find_candidates(
     return candidates
 
 
-def _refined(
-    cloud_m: Float64[Tensor, "n 3"], starts: Rigid, surface: Surface, icp: IcpConfig
-) -> list[Candidate]:
-    """Refine poses; leave out those that are near no point."""
-    if len(starts.R) == 0:
-        return []
-    found = refine_pose(cloud_m, starts, surface, icp)
+def _near_points(found: RefinedPose) -> list[Candidate]:
+    """Give refined poses as candidates; leave out those that are near no point."""
     return [
         Candidate(found.camera_from_model[k], found.covariance[k], float(found.residual_m[k]))
-        for k in range(len(starts.R))
+        for k in range(len(found.inlier_share))
         if float(found.inlier_share[k]) > 0
     ]
 
