@@ -1,4 +1,4 @@
-"""Whole commands on a synthetic street: tables, figures, baselines, duplicates, processes."""
+"""Whole commands on a synthetic street: tables, figures, baselines, processes."""
 
 import json
 import os
@@ -310,33 +310,6 @@ def test_an_unknown_frame_has_no_figure(
     ]
     assert main([*words, "--frames", "e"]) == 2
     assert "no frame 'e'; Known: 'a', 'b', 'c', 'd'" in capsys.readouterr().err
-
-
-def test_near_duplicates_are_listed(
-    street: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    write_image(tmp_path / "other/left/x.png", torch.rand(3, 150, 497))
-    assert main(["data", "duplicates", str(street), str(tmp_path / "other")]) == 0
-    assert (
-        "4 x 1 images: 0 pairs of similarity 0.3 or more; the most similar:"
-        in capsys.readouterr().out
-    )
-    words = ["data", "duplicates", str(street), str(street), "--out", str(tmp_path / "o")]
-    assert main(words) == 1
-    assert len(json.loads((tmp_path / "o/duplicates.json").read_text())) == 16
-    unlike = ["data", "duplicates", str(street), str(tmp_path / "other"), "--at-least", "-1"]
-    assert main(unlike) == 1
-    assert "4 pairs of similarity -1 or more" in capsys.readouterr().out
-    capsys.readouterr()
-    other = ["data", "duplicates", str(street), str(tmp_path / "other")]
-    assert main([*other, "--out", str(tmp_path / "o")]) == 2
-    assert "holds results made with evaluation = " in capsys.readouterr().err
-    assert main([*words, "--at-least", "0.2"]) == 2
-    assert "made with at_least = 0.3, but now it is 0.2" in capsys.readouterr().err
-    assert main([*other, "--out", str(tmp_path / "none")]) == 0
-    assert (tmp_path / "none/duplicates.md").read_text() == "none\n"
-    assert main([*words, "--at-least", "2"]) == 2
-    assert "a similarity is -1 .. 1" in capsys.readouterr().err
 
 
 def test_two_ranks_share_the_frames_and_the_first_measures(

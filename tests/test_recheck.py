@@ -1,23 +1,16 @@
 """The script that runs the quick tables of the results again."""
 
-import importlib.util
 import sys
 from pathlib import Path
 from types import ModuleType
 
 import pytest
-from tests.written import ROOT
+from tests.written import bench_module
 
 
 @pytest.fixture(scope="module")
 def recheck() -> ModuleType:
-    spec = importlib.util.spec_from_file_location("recheck", ROOT / "bench/recheck.py")
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    sys.modules["recheck"] = module  # its dataclass looks its own annotations up
-    spec.loader.exec_module(module)
-    return module
+    return bench_module("recheck")
 
 
 def test_every_quick_table_is_found_in_the_results(recheck: ModuleType) -> None:

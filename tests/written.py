@@ -11,10 +11,13 @@ they stand, and what follows as ```` ```text ```` must be in what they print. Ma
     slurm    a job script, run with the scheduler played
 """
 
+import importlib.util
 import re
 import shlex
+import sys
 from dataclasses import dataclass
 from pathlib import Path
+from types import ModuleType
 
 import pytest
 
@@ -72,3 +75,14 @@ def run_block(
     shown = "".join(capfd.readouterr())
     for line in block.printed:
         assert line in shown, f"{line!r} is not in\n{shown}"
+
+
+def bench_module(name: str) -> ModuleType:
+    """Import a script of the benchmarks, which are no package."""
+    spec = importlib.util.spec_from_file_location(name, ROOT / f"bench/{name}.py")
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    sys.modules[name] = module  # its dataclass looks its own annotations up
+    spec.loader.exec_module(module)
+    return module

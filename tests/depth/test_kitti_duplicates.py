@@ -2,11 +2,14 @@ from pathlib import Path
 
 import pytest
 import torch
+from tests.written import bench_module
 from torch.nn import functional as F
 
 from depthpose.core.files import write_image
-from depthpose.depth.datasets import Dataset, find_duplicates, open_dataset, similarity_matrix
+from depthpose.depth.datasets import Dataset, open_dataset
 
+DUPLICATES = bench_module("duplicates")
+find_duplicates, similarity_matrix = DUPLICATES.find_duplicates, DUPLICATES.similarity_matrix
 H, W = 120, 400
 
 
@@ -66,3 +69,15 @@ def test_known_overlaps_of_kitti_are_found_and_no_others(real: Path) -> None:
     assert {pair.first for pair in found} == {"train_000007", "train_000009"}
     drive_0056 = {"000105", "000106", "000107", "000108", "000109", "000110", "000111"}
     assert {pair.second for pair in found} <= drive_0056
+
+
+def test_the_script_lists_what_is_alike(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    write_set(tmp_path / "one", {"a": street(1), "b": street(2)})
+    write_set(tmp_path / "two", {"c": street(3)})
+    for second, said in (("two", "2 x 1 images: 0 pairs"), ("one", "2 x 2 images: 2 pairs")):
+        folders = [str(tmp_path / "one"), str(tmp_path / second)]
+        monkeypatch.setattr("sys.argv", ["duplicates.py", *folders])
+        DUPLICATES.main()
+        assert f"{said} of similarity 0.3 or more; the most similar: " in capsys.readouterr().out

@@ -91,7 +91,6 @@ COMMANDS: Sequence[Command] = (
     Command("data make objects --cad {home}/bracket.stl --unit mm --number 2"),
     Command("data pack {home}/pairs"),
     Command("data label {home}/pairs --weights {home}/m.safetensors --min-confidence 0"),
-    Command("data duplicates {home}/pairs {home}/pairs --at-least -1"),
     Command("data rectify {home}/raw/left.png {home}/raw/right.png --camera {home}/camchain.yaml"),
     Command(
         "weights pack {home}/w.safetensors --trained-on nothing --licence MIT",

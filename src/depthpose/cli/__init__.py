@@ -51,7 +51,6 @@ COMMANDS = {
     "data label": (
         "data:label", "truth for pairs that have none, by a matcher, where both views agree"),
     "data pack": ("data:pack", "a data set as tar shards: few large files, from a disk or a store"),
-    "data duplicates": ("data:duplicates", "find evaluation images that are in a training set"),
     "weights list": ("weights:list_weights", "list the weights"),
     "weights show": ("weights:show_weights", "print what a weights file holds"),
     "weights pack": ("weights:pack_weights", "one file of a generator and a matcher, with a card"),

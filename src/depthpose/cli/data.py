@@ -248,51 +248,6 @@ def pack(
     return 0
 
 
-def duplicates(
-    train: tyro.conf.Positional[Path],
-    evaluation: tyro.conf.Positional[Path],
-    at_least: float = 0.3,
-    out: NewPath | None = None,
-) -> int:
-    """List images of one set that show nearly the same as images of another.
-
-    Training on frames of the evaluation's drives makes every number too good. Left images are
-    compared by their fine structure over small shifts and zooms: 1 is the same image, two streets
-    stay below 0.3. Check the list by eye. Exit code 0: none is listed. 1: some are.
-
-        depthpose data duplicates my-pairs kitti-eval
-
-    Args:
-        train: folder of the first set, in any layout that 'data check' knows.
-        evaluation: folder of the second set.
-        at_least: least similarity of a listed pair.
-        out: folder to write the list to as well: duplicates.json, .csv and .md.
-    """
-    from tqdm import tqdm
-
-    from depthpose.core.run import claim_folder
-    from depthpose.depth.datasets import find_duplicates, open_dataset
-    from depthpose.report.page import markdown_table, table_files, write_table
-
-    if not -1 <= at_least <= 1:
-        raise InputError(f"--at-least {at_least:g}: a similarity is -1 .. 1; take 0.3")
-    sets = open_dataset(train), open_dataset(evaluation)
-    if out is not None:
-        about = {"train": str(train.resolve()), "evaluation": str(evaluation.resolve())}
-        about |= {"command": "data duplicates", "at_least": at_least}
-        claim_folder(out, about, table_files("duplicates"))
-    ranked = find_duplicates(*sets, at_least, partial(tqdm, unit=" frames", disable=None))
-    rows = [asdict(pair) for pair in ranked if pair.similarity >= at_least]
-    if rows:
-        print(markdown_table(rows))
-    if out is not None:
-        write_table(out, rows, name="duplicates")
-    best = f"{ranked[0].first} and {ranked[0].second}, {ranked[0].similarity:.3f}"
-    size = f"{len(sets[0])} x {len(sets[1])} images"
-    print(f"{size}: {len(rows)} pairs of similarity {at_least:g} or more; the most similar: {best}")
-    return 1 if rows else 0
-
-
 def label(
     path: tyro.conf.Positional[Path],
     out: NewPath,

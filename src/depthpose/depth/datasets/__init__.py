@@ -1,9 +1,6 @@
 """KITTI, Middlebury and plain folders of pairs: disk to samples, splits, the check of a folder."""
 
-from depthpose.depth.datasets.check import Duplicate as Duplicate
 from depthpose.depth.datasets.check import check_dataset as check_dataset
-from depthpose.depth.datasets.check import find_duplicates as find_duplicates
-from depthpose.depth.datasets.check import similarity_matrix as similarity_matrix
 from depthpose.depth.datasets.dataset import Dataset as Dataset
 from depthpose.depth.datasets.dataset import Split as Split
 from depthpose.depth.datasets.dataset import join_datasets as join_datasets

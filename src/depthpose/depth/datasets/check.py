@@ -1,13 +1,11 @@
 """The check of a folder before hours of work: everything wrong, a line each."""
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from contextlib import suppress
-from dataclasses import dataclass
 from pathlib import Path
 
 import torch
-from jaxtyping import Float
-from torch import Tensor, nn
+from torch import Tensor
 from torch.nn import functional as F
 
 from depthpose.core.camera import Camera, RectificationReport, StereoRig, check_rectified
@@ -15,7 +13,7 @@ from depthpose.core.errors import InputError
 from depthpose.core.files import MAP_SUFFIXES, image_size, read_image, read_points_bin
 from depthpose.core.files.images import LISTED_SUFFIXES
 from depthpose.core.findings import CheckReport, Problem, make_report, unreadable
-from depthpose.depth.datasets.dataset import Dataset, read_split
+from depthpose.depth.datasets.dataset import read_split
 from depthpose.depth.datasets.frames import Frame, frame_camera, kitti_calibration, read_depth
 from depthpose.depth.datasets.layouts import find_frames
 from depthpose.depth.disparity import disparity_from_depth
@@ -235,93 +233,3 @@ def _agreement(disparity_px: Map, report: RectificationReport) -> tuple[float, i
     if count < _MIN_TRUTH:
         return None
     return float(is_near.any(1)[is_there].float().mean()), count
-
-
-_ROWS, _COLUMNS = 40, 128
-_SHIFT_ROWS, _SHIFT_COLUMNS = 2, 6
-_BLUR = 9
-_ZOOMS = (1.0, 1.12, 1.25, 1.4)
-DUPLICATE_SIMILARITY = 0.3
-"""Similarity from which two images count as near-duplicates."""
-
-Progress = Callable[[Sequence[int]], Iterable[int]]
-
-
-@dataclass(frozen=True, kw_only=True)
-class Duplicate:
-    """Two images that show nearly the same."""
-
-    first: str  #: name of the frame in the first set
-    second: str  #: name of the frame in the second set
-    similarity: float  #: 1 for the same picture, about 0 for two streets
-
-
-def find_duplicates(
-    first: Dataset,
-    second: Dataset,
-    at_least: float = DUPLICATE_SIMILARITY,
-    progress: Progress = iter,
-) -> list[Duplicate]:
-    """List the pairs of left images, one of either set, that look alike, the most similar first.
-
-    The most similar pair is listed in any case: its similarity says how far the sets are apart.
-    The others have a similarity of ``at_least`` or more; ``progress`` wraps the sequence of frames.
-    """
-    similarity = similarity_matrix(first, second, progress)
-    pairs = (similarity >= min(at_least, float(similarity.max()))).nonzero().tolist()
-    found = [
-        Duplicate(
-            first=first.frames[i].name,
-            second=second.frames[j].name,
-            similarity=float(similarity[i, j]),
-        )
-        for i, j in pairs
-    ]
-    return sorted(found, key=lambda pair: (-pair.similarity, pair.first, pair.second))
-
-
-def similarity_matrix(
-    first: Dataset, second: Dataset, progress: Progress = iter
-) -> Float[Tensor, "n m"]:
-    """Largest correlation of fine structure over small shifts and zooms, for every pair.
-
-    Compared are grey thumbnails of each image and of its middle, one a zoom, contrast evened out.
-    """
-    found: list[Float[Tensor, "zooms n rows columns"]] = []
-    blur = nn.AvgPool2d(_BLUR, 1, _BLUR // 2, count_include_pad=False)
-    for images in (first, second):
-        details = []
-        for index in progress(range(len(images))):
-            image = read_image(images.frames[index].left).mean(0, keepdim=True)
-            height, width = image.shape[1:]
-            parts = []
-            for zoom in _ZOOMS:
-                top, left = (round(side * (1 - 1 / zoom) / 2) for side in (height, width))
-                middle = image[:, top : height - top, left : width - left]
-                parts.append(F.interpolate(middle[None], (_ROWS, _COLUMNS), mode="area"))
-            grey = torch.cat(parts)
-            detail = grey - blur(grey)
-            details.append((detail / (blur(detail**2).sqrt() + 0.01))[:, 0])
-        found.append(torch.stack(details, 1))
-    ours, theirs = found
-    best = torch.full((len(first), len(second)), -1.0)
-    for zoomed in range(len(_ZOOMS)):
-        best = torch.maximum(best, _best_shift(ours[0], theirs[zoomed]))
-        best = torch.maximum(best, _best_shift(theirs[0], ours[zoomed]).T)
-    return best
-
-
-def _best_shift(
-    ours: Float[Tensor, "n h w"], theirs: Float[Tensor, "m h w"]
-) -> Float[Tensor, "n m"]:
-    height, width = _ROWS - 2 * _SHIFT_ROWS, _COLUMNS - 2 * _SHIFT_COLUMNS
-    middle = theirs[:, _SHIFT_ROWS : _SHIFT_ROWS + height, _SHIFT_COLUMNS : _SHIFT_COLUMNS + width]
-    best = torch.full((len(ours), len(theirs)), -1.0)
-    for top in range(2 * _SHIFT_ROWS + 1):
-        for left in range(2 * _SHIFT_COLUMNS + 1):
-            window = ours[:, top : top + height, left : left + width]
-            one, other = (part.flatten(1) for part in (window, middle))
-            one, other = (part - part.mean(1, keepdim=True) for part in (one, other))
-            lengths = [part.norm(dim=1, keepdim=True).clamp(min=1e-9) for part in (one, other)]
-            best = torch.maximum(best, (one / lengths[0]) @ (other / lengths[1]).T)
-    return best
