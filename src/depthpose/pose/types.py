@@ -73,6 +73,16 @@ class CloudSample:
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
+class ColorImage:
+    """A colour image of a view, by the depth camera itself or by one beside it."""
+
+    rgb: Float[Tensor, "3 h w"]  #: 0..1, as a screen shows it (sRGB)
+    K: Float[Tensor, "3 3"]  #: intrinsic matrix of this image
+    #: from the depth camera's frame; None: both images are of one frame.
+    color_from_depth: Rigid | None = None
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
 class ViewInput:
     """A depth image with the mask of one object: what a :class:`CloudInput` is lifted from."""
 
@@ -82,6 +92,7 @@ class ViewInput:
     mask: Bool[Tensor, "h w"]  #: the object's pixels, as a segmentation gives them, with errors
     K: Float[Tensor, "3 3"]  #: intrinsic matrix of this image (a window shifts the principal point)
     object: str  # name of the object
+    color: ColorImage | None = None  #: of the same moment; None: depth alone
 
 
 AnyInput = CloudInput | ViewInput
@@ -136,6 +147,16 @@ class Symmetries:
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
+class SurfaceColors:
+    """Colours of a model at points spread evenly over its surface, whatever its mesh is."""
+
+    points_m: Float[Tensor, "n 3"]  #: in the model frame
+    normals: Float[Tensor, "n 3"]  #: outward unit normals
+    rgb: Float[Tensor, "n 3"]  #: 0..1, as a screen shows them (sRGB)
+    spacing_m: float  #: distance of neighbours; what is smaller is averaged in the colours
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
 class ObjectModel:
     """A known object: what its CAD file and the config say of it, in metres."""
 
@@ -147,6 +168,7 @@ class ObjectModel:
     diameter_m: float  #: largest distance of two points
     keypoints_m: Float[Tensor, "k 3"]  #: what the network's directions point at
     symmetries: Symmetries = field(default_factory=Symmetries)  #: as declared or found
+    colors: SurfaceColors | None = None  #: of its vertices or its texture; None: the file has none
 
     def __post_init__(self) -> None:
         if not self.diameter_m > 0:
