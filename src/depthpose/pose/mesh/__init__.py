@@ -1,5 +1,7 @@
 """Known objects: model files, diameter, keypoints, surface points, symmetries, units."""
 
+from depthpose.pose.mesh.colors import average_colors as average_colors
+from depthpose.pose.mesh.colors import read_colors as read_colors
 from depthpose.pose.mesh.files import FIXED_UNITS as FIXED_UNITS
 from depthpose.pose.mesh.files import MESH_READERS as MESH_READERS
 from depthpose.pose.mesh.files import read_geometry as read_geometry

@@ -19,7 +19,9 @@ from depthpose.core.files import AnyPath
 from depthpose.core.rigid import Rigid, rotation_by
 from depthpose.core.units import Unit, metres_of
 from depthpose.pose.config import MeshConfig
+from depthpose.pose.mesh.colors import read_colors
 from depthpose.pose.mesh.files import read_geometry, unit_of
+from depthpose.pose.mesh.sampling import surface_places
 from depthpose.pose.types import Axis, ObjectModel, Symmetries
 
 BOP_STEP = 0.01
@@ -132,7 +134,6 @@ def symmetries_to_bop(symmetries: Symmetries) -> dict[str, Any]:
 
 _NORMAL_NEIGHBOURS = 16
 _DENSE = 20_000
-_PLASTIC = 1.32471795724474602596
 
 
 def farthest_points(points_m: Float[Tensor, "n 3"], count: int) -> Int64[Tensor, " count"]:
@@ -167,9 +168,7 @@ def sample_surface(
 ) -> tuple[Float[Tensor, "m 3"], Float[Tensor, "m 3"]]:
     """Spread points evenly over the surface, always the same ones, with their outward normals.
 
-    Faces are entered in proportion to their area at equal steps, and each point placed by a
-    sequence of low discrepancy (Roberts 2018), which is more even than chance. A model of points
-    gives its own in even steps of their order, at most all.
+    A model of points gives its own in even steps of their order, at most all.
 
     Args:
         model: the object.
@@ -179,17 +178,10 @@ def sample_surface(
         # Farthest points would be evener, and quadratic; point models are even as they come.
         return take_evenly(model.vertices_m, count), take_evenly(model.normals, count)
     corners = model.vertices_m[model.faces].double()
+    face, share = surface_places(corners, count)
     doubled = torch.linalg.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    area = doubled.norm(dim=-1)
-    bounds = area.cumsum(0)
-    steps = (torch.arange(count, dtype=torch.float64) + 0.5) / count * bounds[-1]
-    face = torch.searchsorted(bounds, steps).clamp(max=len(area) - 1)
-    order = torch.arange(1, count + 1, dtype=torch.float64)
-    u, v = (order / _PLASTIC) % 1, (order / _PLASTIC**2) % 1
-    root = u.sqrt()
-    share = torch.stack([1 - root, root * (1 - v), root * v], -1)
     points = (corners[face] * share[..., None]).sum(-2)
-    normals = doubled[face] / area[face, None].clamp(min=1e-300)
+    normals = doubled[face] / doubled[face].norm(dim=-1, keepdim=True).clamp(min=1e-300)
     return points.to(model.vertices_m), normals.to(model.vertices_m)
 
 
@@ -259,7 +251,8 @@ def read_model(
     """Read a model file.
 
     Args:
-        path: mesh (PLY, STL, OBJ, GLB) or bare points (PLY, PCD, NPY, text).
+        path: mesh (PLY, STL, OBJ, GLB) or bare points (PLY, PCD, NPY, text), whose colours are
+            read where it has some.
         unit: unit of the numbers in the file; None: a GLB, whose are metres.
         name: what samples call the object; None: the file's name.
         number: BOP's ``obj_id``.
@@ -285,7 +278,7 @@ def read_model(
             f"{path}: the model is {extent_m * 1000:g} mm long, below what a sensor resolves; is "
             "it in metres? Then say unit m; of BOP, whose models are in mm, multiply it by 1000."
         )
-    return make_model(
+    model = make_model(
         vertices_m,
         torch.from_numpy(faces),
         name=Path(path).stem if name is None else name,
@@ -293,6 +286,7 @@ def read_model(
         symmetries=symmetries,
         config=config,
     )
+    return replace(model, colors=read_colors(path, scale, model))
 
 
 def make_model(

@@ -1,0 +1,264 @@
+"""Colours of a model file, of its vertices, faces, materials or texture, over its surface."""
+
+import logging
+import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
+from io import BytesIO
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from scipy.spatial import KDTree
+from torch import Tensor
+
+from depthpose.core.errors import InputError, Notice
+from depthpose.core.files import CLOUD_READERS, AnyPath, read_bytes, read_cloud
+from depthpose.core.files.disk import refused_as
+from depthpose.pose.mesh.sampling import surface_places
+from depthpose.pose.types import ObjectModel, SurfaceColors
+
+_SAMPLES = 10_000  # about 1 % of the diameter apart, as far as a pose is usually off
+_DENSE = 4  # so many colours are averaged in each sample
+_LEAST_CONTRAST = 0.01  # standard deviation of colours below which a model is of one colour
+_SAME_BOX = 1e-3  # of the extent: by less two readers of one file may differ
+_WITH_COLORS = (".ply", ".obj", ".glb")
+
+
+def read_colors(path: AnyPath, scale: float, model: ObjectModel) -> SurfaceColors | None:
+    """Read the colours of a model file and spread them evenly over its surface.
+
+    They are those of vertices or faces, of materials, or of textures (of PLY by ``TextureFile``, of
+    OBJ by its MTL file, of GLB inside). Each sample has the mean colour about it, so that print
+    finer than the samples is no noise.
+
+    Args:
+        path: PLY, OBJ, GLB, or points with colours.
+        scale: metres of its unit.
+        model: the same file's geometry, in metres.
+
+    Returns:
+        The colours; None where the file has none, or one alone: it then tells no side from
+        another. Where a texture or material file is missing a notice names it.
+    """
+    suffix = Path(path).suffix.lower()
+    if len(model.faces) == 0:
+        return _of_points(path, model) if suffix in CLOUD_READERS else None
+    if suffix not in _WITH_COLORS or not _may_have_colors(path, suffix):
+        return None
+    try:
+        with refused_as(path, "model with colours", "export it again"):
+            samples, lost = _colored_samples(path, suffix)
+    except InputError as error:
+        warnings.warn(f"{error} (its shape is read, its colours are not)", Notice, stacklevel=3)
+        return None
+    if lost:
+        warnings.warn(
+            f"{path}: its file {lost[0]!r} is not beside it, so what is coloured by it has no "
+            "colours; put it there, or export the model as GLB with its textures inside",
+            Notice,
+            stacklevel=3,
+        )
+    if samples is None:
+        return None
+    points_m = scale * samples.points
+    # The shape is read by another reader: the two must mean the same surface.
+    extent_m = float((model.vertices_m.amax(0) - model.vertices_m.amin(0)).max())
+    low_m, high_m = model.vertices_m.amin(0).double(), model.vertices_m.amax(0).double()
+    slack_m = _SAME_BOX * extent_m
+    if bool(((points_m < low_m - slack_m) | (points_m > high_m + slack_m)).any()):
+        warnings.warn(
+            f"{path}: its colours lie beside its shape, so they are left out; export it as GLB",
+            Notice,
+            stacklevel=3,
+        )
+        return None
+    return average_colors(points_m, samples.normals, samples.rgb)
+
+
+def average_colors(
+    points_m: Float[Tensor, "n 3"], normals: Float[Tensor, "n 3"], rgb: Float[Tensor, "n 3"]
+) -> SurfaceColors | None:
+    """Keep every fourth of the samples of a surface, each with the mean colour about it.
+
+    Returns:
+        None where all have one colour.
+    """
+    if float(rgb.double().std(0).max()) < _LEAST_CONTRAST:
+        return None
+    kept_m, kept_normals = points_m[::_DENSE].double(), normals[::_DENSE].double()
+    tree = KDTree(kept_m.numpy())
+    distance_m, _ = tree.query(kept_m.numpy()[:: max(1, len(kept_m) // 1000)], k=2)
+    spacing_m = float(np.median(distance_m[:, 1]))
+    # Of a thin sheet the nearest sample may be of the other side, whose colour is another.
+    _, nearest = tree.query(points_m.double().numpy())
+    owner = torch.from_numpy(np.asarray(nearest))
+    is_same_side = (normals.double() * kept_normals[owner]).sum(-1) > 0
+    owner, values = owner[is_same_side], rgb.double()[is_same_side]
+    count = torch.zeros(len(kept_m), dtype=torch.float64)
+    count.index_add_(0, owner, torch.ones_like(owner, dtype=torch.float64))
+    total = torch.zeros_like(kept_m).index_add_(0, owner, values)
+    mean = torch.where(count[:, None] > 0, total / count[:, None], rgb[::_DENSE].double())
+    return SurfaceColors(
+        points_m=kept_m.float(),
+        normals=kept_normals.float(),
+        rgb=mean.float(),
+        spacing_m=spacing_m,
+    )
+
+
+def _may_have_colors(path: AnyPath, suffix: str) -> bool:
+    """Whether a file names colours at all: most CAD files do not, and need no second reading."""
+    data = read_bytes(path)
+    if suffix == ".ply":
+        header = data[: data.find(b"end_header")].lower()
+        return b" red" in header or b"texturefile" in header
+    if suffix == ".obj":
+        vertex = data[: 2**16].partition(b"\nv ")[2].partition(b"\n")[0]
+        return b"mtllib" in data or len(vertex.split()) > 4
+    return True
+
+
+def _of_points(path: AnyPath, model: ObjectModel) -> SurfaceColors | None:
+    """Take the colours of bare points."""
+    rgb = read_cloud(path).color
+    if rgb is None or len(rgb) != len(model.vertices_m):
+        return None
+    if float(rgb.double().std(0).max()) < _LEAST_CONTRAST:
+        return None
+    points_m = model.vertices_m
+    distance_m, _ = KDTree(points_m.numpy()).query(points_m.numpy()[::10], k=2)
+    return SurfaceColors(
+        points_m=points_m,
+        normals=model.normals,
+        rgb=rgb,
+        spacing_m=float(np.median(distance_m[:, 1])),
+    )
+
+
+class _Samples(NamedTuple):
+    points: Float[Tensor, "n 3"]  # in the file's own unit
+    normals: Float[Tensor, "n 3"]
+    rgb: Float[Tensor, "n 3"]
+
+
+def _colored_samples(path: AnyPath, suffix: str) -> tuple[_Samples | None, list[str]]:
+    """Sample the coloured surface of a file, None without one; name files that are missing."""
+    import trimesh
+
+    files = _files_beside(path)
+    with _quiet():
+        scene: Any = trimesh.load_scene(
+            BytesIO(read_bytes(path)),
+            file_type=suffix[1:],
+            resolver=files,
+            process=False,
+            allow_remote=False,
+        )
+    parts = [
+        (mesh, np.asarray(mesh.vertices, np.float64) @ placed[:3, :3].T + placed[:3, 3])
+        for placed, mesh in (
+            (scene.graph[node][0], scene.geometry[scene.graph[node][1]])
+            for node in scene.graph.nodes_geometry
+        )
+        if len(getattr(mesh, "faces", ()))
+    ]
+    if not parts:
+        return None, files.lost
+
+    # Samples by area over all parts at once; then each part colours its own.
+    corners = torch.from_numpy(np.concatenate([placed[mesh.faces] for mesh, placed in parts]))
+    face, share = surface_places(corners, _DENSE * _SAMPLES)
+    points = (corners[face] * share[..., None]).sum(-2)
+    sides = corners[:, 1:] - corners[:, :1]
+    across = torch.linalg.cross(sides[:, 0], sides[:, 1])
+    # A file whose faces all look inward is turned inside out.
+    middle = corners.flatten(0, 1).mean(0)
+    volume = float(((corners.mean(1) - middle) * across).sum())
+    across = across if volume >= 0 else -across
+    normals = torch.nn.functional.normalize(across[face], dim=-1)
+    rgb = torch.full((len(face), 3), torch.nan, dtype=torch.float64)
+    first = 0
+    for mesh, _ in parts:
+        mine = (face >= first) & (face < first + len(mesh.faces))
+        own = face[mine] - first
+        first += len(mesh.faces)
+        colors = _colors_of(mesh, own.numpy(), share[mine].numpy(), lost=bool(files.lost))
+        if colors is not None:
+            rgb[mine] = torch.from_numpy(colors)
+    has_color = rgb.isfinite().all(-1)
+    if not bool(has_color.any()):
+        return None, files.lost
+    return _Samples(points[has_color], normals[has_color], rgb[has_color]), files.lost
+
+
+def _colors_of(mesh: Any, face: np.ndarray, share: np.ndarray, *, lost: bool) -> np.ndarray | None:  # noqa: ANN401  trimesh's classes carry no types
+    """Give the colour of places of a mesh, 0..1; None where it has none.
+
+    ``lost``: a file with colours is missing, so what trimesh puts in place of a material is none.
+    """
+    from trimesh.visual.color import uv_to_interpolated_color
+
+    visual, corners = mesh.visual, np.asarray(mesh.faces)[face]
+    if visual.kind == "face":
+        return np.asarray(visual.face_colors)[face, :3] / 255
+    if visual.kind == "vertex":
+        return _between(visual.vertex_colors, corners, share) / 255
+    if visual.kind != "texture":
+        return None
+    material, in_vertices = visual.material, visual.vertex_attributes.get("color")
+    image = getattr(material, "baseColorTexture", None) or getattr(material, "image", None)
+    # A factor of glTF is linear, and so multiplies what a screen shows by its root.
+    factor = getattr(material, "baseColorFactor", None)
+    tint = np.ones(3) if factor is None else (np.asarray(factor)[:3] / 255) ** (1 / 2.2)
+    colors = None
+    if image is not None and visual.uv is not None:
+        places = _between(visual.uv, corners, share)
+        colors = uv_to_interpolated_color(places, image)[:, :3] / 255 * tint
+    elif in_vertices is not None:
+        colors = _between(in_vertices, corners, share)[:, :3] / 255 * tint
+    elif not lost:
+        plain = tint if factor is not None else np.asarray(material.main_color)[:3] / 255
+        colors = np.broadcast_to(plain, (len(face), 3))
+    return colors
+
+
+def _between(values: Any, corners: np.ndarray, share: np.ndarray) -> np.ndarray:  # noqa: ANN401
+    """Interpolate values of vertices at places between the corners of faces."""
+    every = np.asarray(values, np.float64)[corners]
+    return (every[..., : min(every.shape[-1], 3)] * share[..., None]).sum(1)
+
+
+def _files_beside(path: AnyPath) -> Any:  # noqa: ANN401  trimesh's classes carry no types
+    """Give trimesh the files in the folder of a model, and note those that are missing."""
+    from trimesh.resolvers import FilePathResolver
+
+    class FilesBeside(FilePathResolver):
+        """Reads files in the model's folder alone, by their own name where the path is another."""
+
+        def __init__(self) -> None:
+            super().__init__(str(path))
+            self.lost: list[str] = []
+
+        def get(self, name: str) -> bytes:
+            try:
+                return super().get(name.replace("\\", "/"))
+            except (OSError, ValueError):
+                self.lost.append(name.strip())
+                raise
+
+    return FilesBeside()
+
+
+@contextmanager
+def _quiet() -> Iterator[None]:
+    """Keep trimesh from logging a traceback of a missing texture, which is said in a sentence."""
+    log = logging.getLogger("trimesh")
+    level = log.level
+    log.setLevel(logging.CRITICAL + 1)
+    try:
+        yield
+    finally:
+        log.setLevel(level)
