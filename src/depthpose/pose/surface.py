@@ -106,7 +106,11 @@ class Surface:
 
     @cached_property
     def target(self) -> Any:  # noqa: ANN401  a tuple of numba's
-        """Points, normals and table as compiled functions take them."""
+        """Points, normals and table as compiled functions take them, in memory of their own.
+
+        Where a surface is sent to another process, torch moves its tensors to shared memory and
+        frees where they were: an array that stood on a tensor's memory would point at nothing.
+        """
         from depthpose.pose.compiled.points import Tree, planted
         from depthpose.pose.compiled.poses import Target
 
@@ -116,13 +120,13 @@ class Surface:
         return Target(
             tree,
             np.ascontiguousarray(self.normals.numpy()[tree.order]),
-            boxes.low_m.numpy(),
+            boxes.low_m.numpy().copy(),
             boxes.side_m,
-            boxes.counts.numpy(),
+            boxes.counts.numpy().copy(),
             place[boxes.nearest.numpy()].astype(np.int32),  # half of the memory: read at random
             np.ascontiguousarray(self.outward.numpy()[tree.order]),
             place[self.across.numpy()[tree.order]].astype(np.int32),
-            self.ball_m.numpy(),
+            self.ball_m.numpy().copy(),
         )
 
 
@@ -180,7 +184,7 @@ def _view_of(surface: Surface, toward: Tensor, across: Tensor) -> tuple[Tensor, 
 def prepare_surface(model: ObjectModel, count: int = 10_000) -> Surface:
     """Sample a model once for many clouds."""
     points_m, normals = (part.double() for part in sample_surface(model, count))
-    tree = KDTree(points_m.numpy())
+    tree = KDTree(points_m.numpy(), copy_data=True)  # for other processes, as in Surface.target
     # A cell in which a ray finds about four samples.
     near_m = tree.query(points_m.numpy()[:: max(1, len(points_m) // 500)], k=min(5, len(points_m)))[
         0
