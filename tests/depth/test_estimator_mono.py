@@ -23,6 +23,7 @@ from depthpose import FakestereoNet
 from depthpose.core.camera import Camera, StereoRig
 from depthpose.core.checkpoint import LicenceNotice, read_checkpoint
 from depthpose.core.errors import InputError, Notice
+from depthpose.core.files import as_tensor
 from depthpose.depth.config import (
     Answer,
     GeneratorConfig,
@@ -33,7 +34,6 @@ from depthpose.depth.config import (
 )
 from depthpose.depth.disparity import disparity_from_depth, resize_image
 from depthpose.depth.estimator import DepthPipeline
-from depthpose.depth.estimator.net import as_tensor
 from depthpose.depth.evaluate import measure_image_confidence
 from depthpose.depth.stereo import CallableMatcher, PSMNet, PSMNetMatcher
 from depthpose.depth.synthesis import SelectionGenerator, UNetGenerator, make_synthesiser

@@ -33,6 +33,8 @@ from depthpose.core.files.images import read_stored_depth as read_stored_depth
 from depthpose.core.files.images import write_depth_png as write_depth_png
 from depthpose.core.files.images import write_image as write_image
 from depthpose.core.files.images import write_map as write_map
+from depthpose.core.files.pictures import Picture as Picture
+from depthpose.core.files.pictures import as_tensor as as_tensor
 from depthpose.core.files.video import VIDEO_SUFFIXES as VIDEO_SUFFIXES
 from depthpose.core.files.video import Video as Video
 from depthpose.core.files.video import read_video as read_video
