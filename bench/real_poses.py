@@ -43,11 +43,13 @@ class RealCase:
         model: of its object.
         is_symmetric: evaluated by ADD-S. All of YCB are: geometry alone does not show the sides of
             boxes, nor how a can is turned.
+        color: the picture of the depth camera's frame, where there is one.
     """
 
     sample: CloudSample | ViewSample
     model: ObjectModel
     is_symmetric: bool
+    color: Path | None = None
 
     @property
     def name(self) -> str:
@@ -94,7 +96,8 @@ def ycb_cases(folder: Path) -> Iterator[RealCase]:
     for instance in data.instances:
         model = data.objects[instance.object_id]
         name = f"ycb {instance.image_id} {model.name}"
-        yield _case(name, data.view(instance), model, is_symmetric=True)
+        case = _case(name, data.view(instance), model, is_symmetric=True)
+        yield replace(case, color=instance.rgb)
 
 
 def basket_cases(folder: Path) -> Iterator[RealCase]:

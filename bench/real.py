@@ -1,0 +1,109 @@
+"""The scoreboard: every figure of real data, beside those of an earlier run.
+
+    python bench/real.py $DEPTHPOSE_DATA --json out/real.json
+    python bench/real.py $DEPTHPOSE_DATA --before out/real.json
+    python bench/real.py $DEPTHPOSE_DATA --only masks scans --seeds 20
+
+Figures of the earlier run stand in brackets. ``use`` says of each set whether it takes part when a
+method or a limit is chosen (choice), or is only looked at afterwards (held). CPU seconds leave out
+the preparation of models. Each process computes with one thread.
+"""
+
+import argparse
+import json
+import multiprocessing
+import os
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+os.environ.setdefault("OMP_NUM_THREADS", "1")  # before torch is imported
+
+import torch
+from score import Job, Row, Section
+from score_instances import BOXES, MASKS, SCANS
+from score_scenes import BINS, FRAMES
+
+from depthpose.core.run import environment
+from depthpose.report.page import markdown_table
+
+SECTIONS: dict[str, Section] = {
+    "masks": MASKS, "scans": SCANS, "boxes": BOXES, "bins": BINS, "frames": FRAMES,
+}  # fmt: skip
+
+
+def main() -> None:
+    """Run the sections one after the other; print and store each as it is done."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("samples", type=Path, help="folder with pose/ and depth/")
+    parser.add_argument("--only", nargs="+", choices=SECTIONS, default=list(SECTIONS))
+    parser.add_argument("--seeds", type=int, default=1, help="of each instance (masks, scans)")
+    parser.add_argument("--processes", type=int, default=2)
+    parser.add_argument("--json", type=Path, help="file for all rows and tables")
+    parser.add_argument("--before", type=Path, help="such a file of an earlier run")
+    words = parser.parse_args()
+
+    before = {} if words.before is None else json.loads(words.before.read_text())["sections"]
+    result: Row = {"environment": environment(), "seeds": words.seeds, "sections": {}}
+    for name in words.only:
+        section = SECTIONS[name]
+        began = time.perf_counter()
+        rows, cpu_s = run_jobs(section.jobs(words.samples, words.seeds), words.processes)
+        table = section.table(rows)
+        result["sections"][name] = {"cpu_s": cpu_s, "table": table, "rows": rows}
+
+        print(f"\n## {section.title} ({name})\n")
+        print(markdown_table(beside(table, before.get(name, {}).get("table", []))))
+        print(f"{cpu_s:.0f} CPU s with all preparation, {time.perf_counter() - began:.0f} s",
+              flush=True)  # fmt: skip
+        if words.json is not None:
+            words.json.write_text(json.dumps(result, indent=1))
+
+
+def run_jobs(jobs: Sequence[Job], processes: int) -> tuple[list[Row], float]:
+    """Run jobs in so many processes; give all their rows in order, and the CPU seconds of all."""
+    with multiprocessing.get_context("spawn").Pool(
+        processes, initializer=torch.set_num_threads, initargs=(1,)
+    ) as pool:
+        done = list(pool.imap(timed, jobs))
+    return [row for rows, _ in done for row in rows], sum(cpu_s for _, cpu_s in done)
+
+
+def timed(job: Job) -> tuple[list[Row], float]:
+    """Run a job, and give its CPU seconds too."""
+    began = time.process_time()
+    rows = job()
+    return rows, time.process_time() - began
+
+
+def beside(table: Sequence[Row], before: Sequence[Row]) -> list[Row]:
+    """Write the figures of an earlier table in brackets; a line is known by its first column."""
+    earlier = {next(iter(line.values())): line for line in before}
+    lines = list[Row]()
+    for line in table:
+        name, *columns = line
+        old = earlier.get(line[name], {})
+        cells = {column: shown(line[column], old.get(column)) for column in columns}
+        lines.append({name: line[name], **cells})
+    return lines
+
+
+def shown(value: Any, old: Any) -> str:  # noqa: ANN401  a cell of any table
+    """Write a cell, and the earlier one in brackets where it is a number or another text."""
+    if old is None or (isinstance(value, str) and value == old):
+        return short(value)
+    return f"{short(value)} ({short(old)})"
+
+
+def short(value: Any) -> str:  # noqa: ANN401  a cell of any table
+    """Write three digits of a fraction, and nothing for None."""
+    if value is None:
+        return ""
+    return f"{value:.3g}" if isinstance(value, float) else str(value)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,95 @@
+"""What the sections of ``bench/real.py`` have in common: a section, and the errors of a pose.
+
+Errors are of points of the model's surface, in diameters: ADD, to the nearest copy of the true pose
+by the symmetries that the data set declares, and ADD-S, from each true point to the nearest posed
+one. Right is below 0.1.
+"""
+
+import inspect
+from collections.abc import Callable, Sequence
+from functools import lru_cache
+from pathlib import Path
+from typing import Any, Literal, NamedTuple
+
+from torch import Tensor
+
+from depthpose import Registration
+from depthpose.core.rigid import Rigid
+from depthpose.pose.config import EstimateConfig, VotingConfig
+from depthpose.pose.mesh import sample_surface, symmetry_transforms
+from depthpose.pose.metrics import add_of_nearest_m, adds_m
+from depthpose.pose.types import ObjectModel, PoseEstimate
+
+Row = dict[str, Any]
+Job = Callable[[], list[Row]]
+Use = Literal["choice", "held"]
+"""Whether a set takes part when a method or a limit is chosen, or is only looked at afterwards."""
+
+RIGHT = 0.1
+"""Of the diameter."""
+POINTS = 1000
+
+
+class Section(NamedTuple):
+    """What ``bench/real.py`` runs and prints.
+
+    ``jobs``: from the folder of the data and the number of seeds; each runs in one process and
+    gives rows. ``table``: of the rows of all jobs, its lines named by their first column.
+    """
+
+    title: str
+    jobs: Callable[[Path, int], list[Job]]
+    table: Callable[[Sequence[Row]], list[Row]]
+
+
+def errors_of(estimate: PoseEstimate, truth: Rigid, model: ObjectModel) -> Row:
+    """Give the status and the errors of an answer, and whether the true pose is named.
+
+    ``named``: the answer or an alternative is right by ADD.
+    """
+    row: Row = {
+        "status": estimate.status, "certainty": estimate.certainty,
+        "identity": None if estimate.identity is None else estimate.identity.status,
+        "add": None, "adds": None, "named": False,
+    }  # fmt: skip
+    pose = estimate.camera_from_model
+    if pose is None:
+        return row
+    row["add"] = add_to_copy(pose, truth, model)
+    row["adds"] = float(adds_m(pose, truth, surface_points(model))) / model.diameter_m
+    others = [other.camera_from_model for other in estimate.alternatives]
+    row["named"] = any(add_to_copy(one, truth, model) < RIGHT for one in [pose, *others])
+    return row
+
+
+def add_to_copy(pose: Rigid, truth: Rigid, model: ObjectModel) -> float:
+    """ADD in diameters to the nearest copy of the truth by the declared symmetries."""
+    copies = symmetry_transforms(model.symmetries)
+    error_m = add_of_nearest_m(pose, truth, surface_points(model), copies)
+    return float(error_m) / model.diameter_m
+
+
+@lru_cache(maxsize=64)
+def surface_points(model: ObjectModel) -> Tensor:
+    """Give points of a model's surface; of bare points a part."""
+    return sample_surface(model, POINTS)[0]
+
+
+def is_right(error: float | None) -> bool:
+    """Whether an error in diameters is that of a right answer; None: there is no answer."""
+    return error is not None and error < RIGHT
+
+
+def accepts(function: Callable[..., Any], argument: str) -> bool:
+    """Whether a function has an argument: a section leaves out what the package does not offer."""
+    return argument in inspect.signature(function).parameters
+
+
+def use_seed(registration: Registration, seed: int) -> None:
+    """Set what registration draws its points by."""
+    registration.config = EstimateConfig(voting=VotingConfig(seed=seed))
+
+
+def median(values: Sequence[float]) -> float | None:
+    """Give the middle value; None of none."""
+    return sorted(values)[len(values) // 2] if values else None

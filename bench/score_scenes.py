@@ -1,0 +1,185 @@
+"""Real images without masks: bins of parts, and whole frames of several objects.
+
+Of the ten bins of elbows, in alphabetical order, the odd ones may take part in a choice; the even
+ones, and the bin of tubes, are held back from it. All whole frames have been looked at.
+"""
+
+import time
+from collections.abc import Sequence
+from functools import cache, partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from find_tables import Frame, measure, real_frames, searches
+from PIL import Image
+from score import POINTS, RIGHT, Job, Row, Section, add_to_copy
+
+from depthpose import Registration
+from depthpose.core.camera import project
+from depthpose.core.files import read_json
+from depthpose.core.rigid import Rigid
+from depthpose.pose.mesh import read_model, sample_surface, symmetries_from_bop
+from depthpose.pose.types import ObjectModel, PoseEstimate
+
+SURE_VISIBLE = 0.7
+"""An instance of a bin counts where its truth is sure and so much of its silhouette is visible."""
+IGNORED = 0.5
+"""An answer with so many of its points in a region without truth is neither right nor wrong."""
+BEST = 3
+"""So many answers of a bin would be gripped first."""
+
+
+def bin_jobs(samples: Path, seeds: int) -> list[Job]:
+    """Search every bin for its part."""
+    del seeds
+    home = samples / "pose/bins"
+    return [partial(search_bin, home, str(scene.relative_to(home)))
+            for scene in [*bins_of(home, "elbows"), *bins_of(home, "tubes")]]  # fmt: skip
+
+
+def bins_of(home: Path, part: str) -> list[Path]:
+    """List the bins of one part in alphabetical order."""
+    return sorted(path.parent for path in (home / part).glob("*/truth.json"))
+
+
+def search_bin(home: Path, name: str) -> list[Row]:
+    """Find all parts of one bin, and count what is right."""
+    scene = home / name
+    registration, model = part_of(scene.parent)
+    depth, camera = scene / "depth.png", scene / "camera.json"
+    began = time.process_time()
+    found = registration.find(depth, camera)
+    cpu_s = time.process_time() - began
+
+    facts: Any = read_json(scene / "truth.json")
+    truths = [bop_pose(fact) for fact in facts["0"]]
+    counted = {k for k, fact in enumerate(facts["0"])
+               if fact["my_status"] == "sure" and fact["visib_fract"] >= SURE_VISIBLE}  # fmt: skip
+    lens: Any = read_json(camera)
+    ignored = torch.from_numpy(np.array(Image.open(scene / "ignore.png")) > 0)
+    verdicts = [verdict(one, truths, model, torch.tensor(lens["K"]), ignored) for one in found]
+    right = {verdict for verdict in verdicts if isinstance(verdict, int)}
+    sure = [verdict for one, verdict in zip(found, verdicts, strict=True) if one.is_ok]
+    number = [path.name for path in bins_of(home, scene.parent.name)].index(scene.name)
+    is_choice = scene.parent.name == "elbows" and number % 2 == 0
+    return [{
+        "scene": scene.name, "set": scene.parent.name, "use": "choice" if is_choice else "held",
+        "sure": len(counted), "right": len(counted & right), "answers": len(found),
+        "wrong": verdicts.count("wrong"), "ok": len(sure), "ok, wrong": sure.count("wrong"),
+        f"best {BEST} right": sum(isinstance(verdict, int) for verdict in verdicts[:BEST]),
+        "CPU s": cpu_s,
+    }]  # fmt: skip
+
+
+def verdict(
+    estimate: PoseEstimate,
+    truths: Sequence[Rigid],
+    model: ObjectModel,
+    K: torch.Tensor,
+    ignored: torch.Tensor,
+) -> int | str:
+    """Give the number of the instance that an answer fits; else whether it is wrong or ignored."""
+    pose = estimate.camera_from_model
+    assert pose is not None
+    errors = [add_to_copy(pose, truth, model) for truth in truths]
+    if min(errors) < RIGHT:
+        return errors.index(min(errors))
+    pixels = project(pose.apply(sample_surface(model, POINTS)[0].to(pose.R)), K.to(pose.R))
+    column, row = pixels.nan_to_num(-1.0).round().long().unbind(-1)
+    height, width = ignored.shape
+    is_inside = (column >= 0) & (row >= 0) & (column < width) & (row < height)
+    share = ignored[row[is_inside], column[is_inside]].float().mean()
+    return "ignored" if bool(is_inside.any()) and float(share) > IGNORED else "wrong"
+
+
+@cache
+def part_of(folder: Path) -> tuple[Registration, ObjectModel]:
+    """Prepare the part of bins as a user would, and give its model as its data set declares it."""
+    path = next((folder / "models").glob("*.ply"))
+    info: Any = read_json(folder / "models/models_info.json")
+    declared = symmetries_from_bop(next(iter(info.values())), source="models_info.json")
+    registration = Registration.load(path, unit="mm")
+    registration.prepare()
+    return registration, read_model(path, "mm", symmetries=declared)
+
+
+def bop_pose(fact: Any) -> Rigid:  # noqa: ANN401  an entry of a JSON file
+    """Read a pose of BOP's ``scene_gt.json``."""
+    R = torch.tensor(fact["cam_R_m2c"]).double().reshape(3, 3)
+    return Rigid(R, torch.tensor(fact["cam_t_m2c"]).double() / 1000)
+
+
+def bin_table(rows: Sequence[Row]) -> list[Row]:
+    """List the bins, and add up the halves of the elbows."""
+    lines = [{name: row[name] for name in row if name != "set"} for row in rows]
+    elbows = [line for row, line in zip(rows, lines, strict=True) if row["set"] == "elbows"]
+    for use in ("choice", "held"):
+        some = [line for line in elbows if line["use"] == use]
+        lines.append(total(f"elbows, {use}", use, some))
+    return [*lines, total("elbows, all", "", elbows)]
+
+
+def total(name: str, use: str, rows: Sequence[Row]) -> Row:
+    """Add up the numbers of rows."""
+    numbers = [key for key in rows[0] if key not in ("scene", "use")] if rows else []
+    return {"scene": name, "use": use, **{key: sum(row[key] for row in rows) for key in numbers}}
+
+
+def frame_jobs(samples: Path, seeds: int) -> list[Job]:
+    """Search whole frames for each object alone, then for all of them at once."""
+    del seeds
+    names = [(frame.name, part.name) for frame in real_frames(samples / "pose", None)
+             for part in searches(frame, alone=True)]  # fmt: skip
+    return [partial(search_frame, samples, *one) for one in names]
+
+
+def search_frame(samples: Path, frame: str, name: str) -> list[Row]:
+    """Do one search of one frame."""
+    whole = next(one for one in frames(samples) if one.name == frame)
+    part = next(one for one in searches(whole, alone=True) if one.name == name)
+    models = part.known or [thing.model for thing in part.shown]
+    registration = registration_of({model.name: model for model in models})
+    began = time.process_time()
+    found = registration.find(part.depth_m, part.K)
+    cpu_s = time.process_time() - began
+    counts = measure(part, found)
+    sure = [one for one in found if one.is_ok]
+    return [{
+        "search": part.name, "objects": "one" if len(models) == 1 else "several",
+        **{key: counts[key] for key in ("instances", "right", "wrong", "which")},
+        "answers": len(found), "ok": len(sure), "ok, wrong": measure(part, sure)["wrong"],
+        "cpu_s": cpu_s,
+    }]  # fmt: skip
+
+
+@cache
+def frames(samples: Path) -> list[Frame]:
+    """Read the frames once in a process."""
+    return list(real_frames(samples / "pose", None))
+
+
+def registration_of(models: dict[str, ObjectModel]) -> Registration:
+    """Prepare models; those of several are not kept, since no two searches have the same."""
+    registration = Registration(list(models.values()))
+    registration.prepare()
+    return registration
+
+
+def frame_table(rows: Sequence[Row]) -> list[Row]:
+    """Add up the searches for one object, and those for several."""
+    lines = list[Row]()
+    for objects in ("one", "several"):
+        some = [row for row in rows if row["objects"] == objects]
+        counts = ("instances", "right", "answers", "wrong", "ok", "ok, wrong")
+        lines.append({
+            "objects": objects, "use": "choice", "searches": len(some),
+            **{key: sum(row[key] for row in some) for key in counts},
+            "CPU s a search": sum(row["cpu_s"] for row in some) / max(1, len(some)),
+        })  # fmt: skip
+    return lines
+
+
+BINS = Section("Bins of parts without masks", bin_jobs, bin_table)
+FRAMES = Section("Whole frames without masks", frame_jobs, frame_table)
