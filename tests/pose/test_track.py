@@ -1,6 +1,7 @@
 """One object through synthetic frames: followed by ICP, lost where it is not, and found anew."""
 
 import math
+from typing import Any
 
 import pytest
 import torch
@@ -213,6 +214,31 @@ def test_frames_are_taken_as_they_come() -> None:
     answers = oracle(poses).track(camera_frames(), CAMERA, first=poses[0])
     assert next(answers).is_ok
     assert asked == [0]
+
+
+def test_a_frame_that_cannot_be_read_does_not_end_the_sequence() -> None:
+    poses = moving(6)
+    net = oracle(poses)
+    frames: list[Any] = [frame(pose, k) for k, pose in enumerate(poses)]
+    frames[2] = None  # a camera lost it
+    frames[4] = frames[4][:-7]  # one of another size
+    found = list(net.track(frames, CAMERA, first=poses[0]))
+    assert [one.name for one in found] == [f"input_{k}" for k in range(6)]
+    assert [one.tracking for one in found] == ["tracked"] * 2 + [None, "tracked", None, "tracked"]
+    assert [one.status for one in found].count("unreadable") == 2
+    assert "a NoneType where numbers belong" in found[2].reason
+    assert "320x233" in found[4].reason
+    assert max(error_of(found[k], poses[k]) for k in (3, 5)) < 0.003
+    assert net.calls == []  # nothing was looked for
+
+
+def test_clouds_that_cannot_be_read_do_not_end_the_sequence() -> None:
+    poses = moving(3)
+    clouds: list[Any] = [back_project(frame(p, k), K).reshape(-1, 3) for k, p in enumerate(poses)]
+    clouds[1] = torch.zeros(0)
+    found = list(oracle(poses).track(clouds, first=poses[0]))
+    assert [one.status for one in found] == ["ok", "unreadable", "ok"]
+    assert "give points as rows of x, y and z" in found[1].reason
 
 
 def test_the_first_pose_may_be_a_matrix() -> None:

@@ -189,24 +189,17 @@ def _finish(
 def _followed(
     method: PoseMethod, jobs: Sequence[Job[Any]], name: str, first: Rigid | None = None
 ) -> Iterator[Prediction]:
-    """Follow an object, frame by frame; one that cannot be read is skipped."""
-    places = {job.name: job.place for job in jobs}
-    skipped: list[PoseEstimate] = []
+    """Follow an object, frame by frame; of one that cannot be read the estimate says so."""
 
-    def readable() -> Iterator[Any]:
+    def frames() -> Iterator[AnyInput | PoseEstimate]:
         for job in tqdm(jobs, disable=None, unit=" frames"):
             try:
                 frame = job.read()
             except InputError as error:
-                skipped.append(unreadable(job.name, name, error))
-            else:
-                yield frame
+                frame = unreadable(job.name, name, error)
+            yield frame
 
     assert method.track is not None
-    for estimate in method.track(readable(), name, first):
-        # What could not be read was passed on the way to this frame.
-        for one in [*skipped, estimate]:
-            yield Prediction(estimate=one, place=places[one.name])
-        skipped.clear()
-    for one in skipped:
-        yield Prediction(estimate=one, place=places[one.name])
+    estimates = method.track(frames(), name, first)
+    for job, estimate in zip(jobs, estimates, strict=True):
+        yield Prediction(estimate=estimate, place=job.place)

@@ -213,7 +213,10 @@ class PoseMethod:
     models: Sequence[ObjectModel]
     settings: Mapping[str, Any]
     find: Callable[[ViewInput, Sequence[str]], list[PoseEstimate]] | None = None
-    track: Callable[[Iterable[AnyInput], str, Rigid | None], Iterator[PoseEstimate]] | None = None
+    track: (
+        Callable[[Iterable[AnyInput | PoseEstimate], str, Rigid | None], Iterator[PoseEstimate]]
+        | None
+    ) = None
     holder: str = "weights"
 
 

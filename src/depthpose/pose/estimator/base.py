@@ -303,10 +303,12 @@ class PoseEstimator:
             unit: as for :meth:`estimate`.
 
         Yields:
-            An estimate for each frame, whose ``tracking`` is ``tracked``, ``found`` or ``lost``.
+            An estimate for each frame, whose ``tracking`` is ``tracked``, ``found`` or ``lost``; one
+            that cannot be taken, as None, or an image of another size than the camera's, has the
+            status ``unreadable`` and costs the others nothing.
 
         Raises:
-            InputError: as for :meth:`estimate`.
+            InputError: an unknown object, or a ``first`` that is no pose.
         """
         which = self._known(object).model.name
         if isinstance(frames, str | Path):
@@ -318,13 +320,24 @@ class PoseEstimator:
         made = partial(cloud_input, unit=unit or "m", object=which)
         if camera is not None:
             made = partial(view_input, mask=None, camera=camera, object=which, unit=unit)
-        inputs = (made(frame, name=f"{_NAME}_{number}") for number, frame in enumerate(frames))
-        return self.track_in(inputs, which, start)
+
+        def read(number: int, frame: AnyArray) -> AnyInput | PoseEstimate:
+            name = f"{_NAME}_{number}"
+            try:
+                return made(frame, name=name)
+            except InputError as error:
+                reason = str(error)
+            return PoseEstimate(name=name, object=which, status="unreadable", reason=reason)
+
+        return self.track_in((read(*one) for one in enumerate(frames)), which, start)
 
     def track_in(
-        self, frames: Iterable[AnyInput], object: str, first: Rigid | None = None
+        self, frames: Iterable[AnyInput | PoseEstimate], object: str, first: Rigid | None = None
     ) -> Iterator[PoseEstimate]:
-        """Do as :meth:`track` does for views and clouds; a view's mask limits where is looked."""
+        """Do as :meth:`track` does for views and clouds; a view's mask limits where is looked.
+
+        In place of a frame that cannot be read there is an estimate that says so.
+        """
 
         def look(given: AnyInput) -> PoseEstimate:
             if isinstance(given, CloudInput):

@@ -84,11 +84,18 @@ class _Last:
 
 
 def track(
-    frames: Iterable[AnyInput], known: TrackedObject, first: Rigid | None = None
+    frames: Iterable[AnyInput | PoseEstimate], known: TrackedObject, first: Rigid | None = None
 ) -> Iterator[PoseEstimate]:
-    """Estimate one object in frame after frame, each from the pose of the frame before."""
+    """Estimate one object in frame after frame, each from the pose of the frame before.
+
+    In place of a frame that cannot be read there is an estimate that says so: it is given as it is,
+    and the object is looked for in the next where it was before.
+    """
     last = None if first is None else _Last(pose=first.double(), moved=None, origin=None)
     for given in frames:
+        if isinstance(given, PoseEstimate):
+            yield given
+            continue
         estimate = _next(given, last, known)
         if estimate.camera_from_model is None:
             # In a cloud of a whole scene it can be looked for only where it was.
