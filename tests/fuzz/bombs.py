@@ -40,9 +40,8 @@ from depthpose.depth.datasets import read_split
 from depthpose.depth.datasets.frames import read_plain_calibration
 from depthpose.depth.train import STAGES
 from depthpose.depth.weights import read_depth_weights
-from depthpose.pose.datasets import read_mask
+from depthpose.pose.datasets import read_detections, read_mask
 from depthpose.pose.datasets.layouts import read_mapping
-from depthpose.pose.datasets.masks import read_detections
 from depthpose.pose.mesh import read_model
 from depthpose.pose.predictions import read_bop_results
 

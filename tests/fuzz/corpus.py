@@ -45,9 +45,8 @@ from depthpose.depth.synthesis import UNetGenerator
 from depthpose.depth.train import STAGES as DEPTH_STAGES
 from depthpose.depth.types import RawFrame
 from depthpose.depth.weights import read_depth_weights, write_depth_weights
-from depthpose.pose.datasets import open_bop, read_mask
+from depthpose.pose.datasets import open_bop, read_detections, read_mask
 from depthpose.pose.datasets.layouts import read_mapping
-from depthpose.pose.datasets.masks import read_detections
 from depthpose.pose.mesh import read_model
 from depthpose.pose.predictions import read_bop_results, read_predictions
 from depthpose.pose.train import STAGES as POSE_STAGES
@@ -367,7 +366,7 @@ def open_bop_results(home: Path) -> dict[str, Kind]:
     """Results, detections and predictions of a data set."""
     from tests.pose.synthetic_frames import pose_in_frame
 
-    from depthpose.pose.datasets.masks import Detection, write_detections
+    from depthpose.pose.datasets import Detection, write_detections
     from depthpose.pose.predictions import Place, Prediction, write_bop_results, write_predictions
 
     pose = pose_in_frame(0.1, 3)

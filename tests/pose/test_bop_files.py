@@ -123,7 +123,7 @@ def test_written_detections_come_back(tmp_path: Path) -> None:
 def test_damaged_detections_are_refused(tmp_path: Path) -> None:
     row: dict[str, object] = {"scene_id": 1, "image_id": 2, "category_id": 3, "score": 0.5}
     for entry, said in (
-        (None, "write {"),
+        (None, "neither of a box and a mask"),
         ({"size": [4], "counts": [20]}, "where .height, width. belongs"),
         ({"size": [4, 5], "counts": [19]}, "do not add up"),
         ({"size": [4, 5], "counts": "garbage"}, "do not add up"),

@@ -61,7 +61,7 @@ def predict(
             "--mask and --camera, or weights that vote"
         )
     lens = inputs.camera or inputs.focal_px
-    if inputs.depth is not None and inputs.mask is None and lens is not None:
+    if inputs.depth is not None and not inputs.has_regions and lens is not None:
         return find_all(method, inputs, home)
     return predict_files(method, inputs, home, batch)
 

@@ -46,7 +46,10 @@ def find_all(method: PoseMethod, inputs: OneObjectOptions, out: Path) -> int:
     if inputs.object is not None:
         objects = (pose_predict.object_named(inputs.object, method),)
     if method.find is None:
-        raise InputError("--depth without --mask: these weights need masked views; give --mask")
+        raise InputError(
+            "--depth without --mask: these weights need masked views; give --mask, --box or "
+            "--detections"
+        )
     if find_rank().world > 1:
         raise InputError("--depth without --mask is done by one process; give --mask, or start one")
     unit = inputs.unit

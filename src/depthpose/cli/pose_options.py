@@ -2,9 +2,9 @@
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import Annotated, Literal
 
-from depthpose.cli.arguments import Device, NewPath, Source
+from depthpose.cli.arguments import Device, NewPath, Source, shown_as
 from depthpose.core.errors import InputError
 from depthpose.core.units import Unit
 from depthpose.pose.config import DiameterTable, EstimateConfig, VotingConfig
@@ -70,24 +70,37 @@ class PoseTableOptions(PoseMeasureOptions):
 class OneObjectOptions:
     """A cloud or a depth image of known objects, and what is known of it."""
 
-    cloud: Source | None = None
-    """points of one object (PLY, PCD, NPY, text), in the camera frame: x right, y down, z forward;
-    or a folder of such files."""
     depth: Source | None = None
-    """16-bit PNG in the camera's depth_unit_m, or a folder of them."""
-    mask: Source | None = None
-    """picture, not black is the object, or .json with COCO's run lengths; or a folder of masks with
-    the names of the depth images. Without, the whole image is searched for every object, or for
-    --object alone."""
+    """16-bit PNG in the camera's depth_unit_m, or a folder of them. Without --mask, --box and
+    --detections the whole image is searched for every object, or for --object alone."""
     camera: Path | None = None
     """of the depth images; JSON file: {"width", "height", "K": 3x3, "depth_unit_m"}, or that of
     BOP, TUM RGB-D, ROS, OpenCV, KITTI or Middlebury."""
-    focal_px: float | None = None
-    """focal length of the depth images [px], in place of --camera; the axis meets their centre."""
-    object: str | None = None
-    """which of the objects that are known; of a data set its name or number, all by default."""
+    mask: Source | None = None
+    """picture, not black is the object, or .json with COCO's run lengths; or a folder of masks with
+    the names of the depth images. Each number of a label map is an object (see --labels)."""
+    box: Annotated[tuple[str, ...], shown_as(metavar="X0,Y0,X1,Y1 ...")] = ()
+    """where objects are in the depth image: left, top, right and bottom edge [px]."""
+    detections: Source | None = None
+    """boxes or masks of a detector: .json of COCO or BOP, .txt of YOLO, or a folder of such files
+    with the names of the depth images."""
+    labels: Annotated[str | None, shown_as(metavar="CLASS=OBJECT,...")] = None
+    """which object a number of --mask or a class of --detections is: 1=bracket,2=gear; 3= leaves 3
+    out."""
+    cloud: Source | None = None
+    """points of one object (PLY, PCD, NPY, text), in the camera frame: x right, y down, z forward;
+    or a folder of such files."""
     unit: Unit | None = None
     """unit of clouds (default m), and of depth images whose camera file gives none."""
+    object: str | None = None
+    """which of the objects that are known; of a data set its name or number, all by default."""
+    focal_px: float | None = None
+    """focal length of the depth images [px], in place of --camera; the axis meets their centre."""
+
+    @property
+    def has_regions(self) -> bool:
+        """Whether it is said where objects are in the depth images."""
+        return self.mask is not None or bool(self.box) or self.detections is not None
 
 
 @dataclass(frozen=True, kw_only=True)

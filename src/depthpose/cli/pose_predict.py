@@ -5,7 +5,7 @@ import re
 import sys
 import time
 from collections import Counter, defaultdict
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from functools import partial
@@ -13,6 +13,7 @@ from pathlib import Path, PurePosixPath
 from typing import Any
 
 from scipy.spatial.transform import Rotation
+from torch import Tensor
 from tqdm import tqdm
 
 from depthpose.cli import pose_methods
@@ -37,6 +38,7 @@ from depthpose.core.files import (
     image_size,
     list_images,
     read_image,
+    read_stored_depth,
     write_cloud,
     write_image,
     write_json,
@@ -48,8 +50,14 @@ from depthpose.core.units import Unit
 from depthpose.pose.config import EstimateConfig
 from depthpose.pose.datasets import (
     BopDataset,
+    Detection,
     encode_rle,
+    name_objects,
+    of_images,
     open_bop,
+    parse_box,
+    parse_labels,
+    read_detections,
     read_labels,
     read_targets,
 )
@@ -171,48 +179,186 @@ def view_jobs(
     depth: Path,
     mask: Path,
     camera: Path | float,
-    object: str,
+    object: str | None,
     unit: Unit | None,
     out: Path,
+    labels: Mapping[str, str] | None = None,
 ) -> list[Job[Any]]:
     """Take a depth image, its mask and its camera, or images and masks of one name in two folders.
 
-    Of a mask that numbers several objects each is an input: NAME_1, NAME_2, ...
+    Of a mask that numbers several objects each is an input: NAME_1, NAME_2, ... All are of
+    ``object``, or each of the object that ``labels`` names by its number.
     """
     runs = sorted(mask.glob("*.json")) if mask.is_dir() else []  # of run lengths
     depths, pictures = _list_depths(depth), runs or list_images(mask)
     refuse_among_inputs(out, [depth, mask], [*depths, *pictures])
-    _refuse_one_name(depths)
-    _refuse_one_name(pictures)
-    masks = {path.stem: path for path in pictures}
-    if len(depths) == len(masks) == 1 and not depth.is_dir():
-        masks = {depths[0].stem: next(iter(masks.values()))}
-    lost = [path.stem for path in depths if path.stem not in masks]
-    if lost:
-        raise InputError(
-            f"{mask}: no mask called {lost[0]!r}; a mask has the name of its depth image"
-        )
+    masks = _beside_depths(depths, pictures, depth, mask, "mask")
     jobs: list[Job[Any]] = []
     for path in depths:
-        own: dict[str, AnyMask] = {"": masks[path.stem]}
-        with suppress(InputError):  # it will be said where the mask is read
-            labels = read_labels(masks[path.stem])
-            numbers = labels[labels != 0].unique().tolist()
-            runs = {k: encode_rle(labels == k)[0] for k in numbers if len(numbers) > 1}
-            size = list(labels.shape)
-            own = {f"_{k}": {"size": size, "counts": list(r)} for k, r in runs.items()} or own
-        for end, one in own.items():
-            name = path.stem + end
-            read = partial(view_input, path, one, camera, object, name, unit)
+        shown: dict[str, tuple[str, AnyMask]] = {}
+        if labels is not None:
+            shown = _labelled_masks(masks[path.stem], labels, object)
+        else:
+            assert object is not None
+            shown[""] = object, masks[path.stem]
+            with suppress(InputError):  # it will be said where the mask is read
+                numbered = read_labels(masks[path.stem])
+                numbers = numbered[numbered != 0].unique().tolist()
+                several = numbers if len(numbers) > 1 else []
+                shown = {f"_{k}": (object, _run_lengths(numbered == k)) for k in several} or shown
+        for end, (name, pixels) in shown.items():
+            read = partial(view_input, path, pixels, camera, name, path.stem + end, unit)
             files = (path, masks[path.stem])
-            jobs.append(Job(name=name, read=read, object=object, source=files))
+            jobs.append(Job(name=path.stem + end, read=read, object=name, source=files))
+    _refuse_twice(jobs, depth)
+    return jobs
+
+
+def _labelled_masks(
+    mask: Path, labels: Mapping[str, str], wanted: str | None
+) -> dict[str, tuple[str, AnyMask]]:
+    """Give the object and the run lengths of each number of a label map that is there."""
+    words = [label for label in labels if not label.isdecimal()]
+    if words:
+        raise InputError(
+            f"--labels {words[0]}={labels[words[0]]}: the objects of a mask have numbers; write "
+            "1=OBJECT,2=OBJECT"
+        )
+    objects = {int(label): name for label, name in labels.items()}
+    numbered = read_labels(mask, list(objects))
+    shown = [k for k in numbered[numbered != 0].unique().tolist() if objects[k]]
+    return {
+        f"_{k}": (objects[k], _run_lengths(numbered == k))
+        for k in shown
+        if wanted in (None, objects[k])
+    }
+
+
+def _run_lengths(pixels: Tensor) -> AnyMask:
+    counts, height, width = encode_rle(pixels)
+    return {"size": [height, width], "counts": list(counts)}
+
+
+def box_jobs(
+    depth: Path,
+    boxes: Sequence[str],
+    camera: Path | float,
+    object: str,
+    unit: Unit | None,
+    out: Path,
+) -> list[Job[Any]]:
+    """Take boxes of one object in a depth image: NAME, or of several NAME_1, NAME_2, ..."""
+    depths = _list_depths(depth)
+    refuse_among_inputs(out, [depth], depths)
+    if len(depths) > 1:
+        raise InputError(
+            f"--box: {depth} holds {len(depths)} depth images, and a box is of one; name that one, "
+            "or give a file for each by --detections"
+        )
+    found = [Detection(object=object, box=parse_box(text)) for text in boxes]
+    return _detection_jobs(depths[0], found, (depths[0],), camera, unit)
+
+
+def detection_jobs(
+    depth: Path,
+    detections: Path,
+    camera: Path | float,
+    objects: tuple[Mapping[str, str], Sequence[str], str | None],
+    unit: Unit | None,
+    out: Path,
+) -> list[Job[Any]]:
+    """Take what a detector found in depth images: NAME, or of several NAME_1 (the surest), ...
+
+    ``detections``: a file, or a folder of files with the names of the images. ``objects``: labels,
+    known names and the wanted one, as :func:`name_objects` takes them.
+    """
+    depths = _list_depths(depth)
+    _refuse_one_name(depths)
+    files = [detections]
+    if detections.is_dir():
+        named = [p for p in detections.iterdir() if p.suffix.lower() in (".json", ".txt")]
+        files = [p for p in named if not p.name.startswith(".")]
+    refuse_among_inputs(out, [depth, detections], [*depths, *files])
+    found: dict[str, list[Detection]] = {}
+    if len(files) == 1 and files[0].suffix.lower() == ".json":
+        read = read_detections(files[0])
+        beside = dict.fromkeys((path.stem for path in depths), files[0])
+        found = of_images(read, [path.stem for path in depths], str(files[0]))
+    else:
+        beside = _beside_depths(depths, files, depth, detections, "file of detections")
+        for path in depths:
+            file = beside[path.stem]
+            size = None
+            if file.suffix.lower() == ".txt":
+                height, width = read_stored_depth(path).shape
+                size = (width, height)
+            found[path.stem] = read_detections(file, size)
+    jobs: list[Job[Any]] = []
+    empty: list[str] = []
+    for path in depths:
+        own = name_objects(found[path.stem], *objects, source=str(beside[path.stem]))
+        own.sort(key=lambda one: -one.score)
+        jobs += _detection_jobs(path, own, (path, beside[path.stem]), camera, unit)
+        empty += [] if own else [path.stem]
+    if empty:
+        shown = ", ".join(empty[:_SAID]) + (", ..." if len(empty) > _SAID else "")
+        said = f"nothing is detected in {len(empty)} of {len(depths)} depth images: {shown}"
+        print(f"depthpose: {said}", file=sys.stderr)
+    if not jobs:
+        raise InputError(f"{detections}: holds no detection of what is asked for in {depth}")
+    _refuse_twice(jobs, depth)
+    return jobs
+
+
+def _detection_jobs(
+    path: Path,
+    found: Sequence[Detection],
+    files: tuple[Path, ...],
+    camera: Path | float,
+    unit: Unit | None,
+) -> list[Job[Any]]:
+    jobs: list[Job[Any]] = []
+    for k, one in enumerate(found, 1):
+        assert one.object is not None
+        name = path.stem + (f"_{k}" if len(found) > 1 else "")
+        read = partial(_read_detection, path, one, camera, name, unit)
+        jobs.append(Job(name=name, read=read, object=one.object, source=files))
+    return jobs
+
+
+def _read_detection(
+    path: Path, found: Detection, camera: Path | float, name: str, unit: Unit | None
+) -> ViewInput:
+    """Read a depth image with the pixels of a detection."""
+    assert found.object is not None
+    view = view_input(path, None, camera, found.object, name, unit)
+    return replace(view, mask=found.mask(*view.depth_m.shape))
+
+
+def _beside_depths(
+    depths: Sequence[Path], others: Sequence[Path], depth: Path, place: Path, what: str
+) -> dict[str, Path]:
+    """Give the file that belongs to each depth image, by the name of the image."""
+    _refuse_one_name(depths)
+    _refuse_one_name(others)
+    found = {path.stem: path for path in others}
+    if len(depths) == len(found) == 1 and not depth.is_dir():
+        found = {depths[0].stem: next(iter(found.values()))}
+    lost = [path.stem for path in depths if path.stem not in found]
+    if lost:
+        raise InputError(
+            f"{place}: no {what} called {lost[0]!r}; a {what} has the name of its depth image"
+        )
+    return found
+
+
+def _refuse_twice(jobs: Sequence[Job[Any]], depth: Path) -> None:
     twice = [name for name, count in Counter(job.name for job in jobs).items() if count > 1]
     if twice:
         raise InputError(
             f"{depth}: two results would be called {twice[0]!r}, the name of a depth image and a "
-            "number of its mask; rename the other"
+            "number of its mask or detection; rename the other"
         )
-    return jobs
 
 
 def frame_jobs(
@@ -257,28 +403,61 @@ def _refuse_one_name(files: Sequence[Path]) -> None:
 
 
 def predict_files(method: PoseMethod, inputs: OneObjectOptions, out: Path, batch: int) -> int:
-    """Pose clouds, or masked depth images, in this process; give the exit code."""
-    name, lens = object_named(inputs.object, method), inputs.camera or inputs.focal_px
-    settings = {**method.settings, "object": name}
+    """Pose clouds, or parts of depth images, in this process; give the exit code."""
+    settings, unit = dict(method.settings), inputs.unit
     if inputs.cloud is not None:
-        unit = inputs.unit or "m"
-        jobs = cloud_jobs(Path(inputs.cloud), unit, name, out)
-        settings |= {"unit": unit}
-    elif inputs.depth is None or inputs.mask is None or lens is None:
-        raise InputError(
-            "--depth needs --camera or --focal-px beside it, and --mask unless it is to be found"
-        )
+        settings["object"] = name = object_named(inputs.object, method)
+        jobs = cloud_jobs(Path(inputs.cloud), unit or "m", name, out)
+        settings |= {"unit": unit or "m"}
     else:
-        mask = Path(inputs.mask)
-        jobs = view_jobs(Path(inputs.depth), mask, lens, name, inputs.unit, out)
-        settings |= camera_facts(lens) | {"mask": str(mask.resolve())}
-        settings |= {} if inputs.unit is None else {"unit": inputs.unit}
+        jobs = region_jobs(method, inputs, out, settings)
+        settings |= {} if unit is None else {"unit": unit}
     claim(out, settings, jobs)
     predictions = predict_all(method, jobs, out, settings, batch)
     if predictions is None:
         return 0
     write_files(predictions, jobs, out, method)
     return say_result(predictions, out)
+
+
+def region_jobs(
+    method: PoseMethod, inputs: OneObjectOptions, out: Path, settings: dict[str, Any]
+) -> list[Job[Any]]:
+    """Take depth images and where objects are in them; add to the settings what decides that."""
+    lens, unit = inputs.camera or inputs.focal_px, inputs.unit
+    regions = {"mask": inputs.mask, "box": inputs.box, "detections": inputs.detections}
+    given = [f"--{name}" for name, value in regions.items() if value]
+    if inputs.depth is None or lens is None or not given:
+        raise InputError(
+            "--depth needs --camera or --focal-px beside it, and --mask, --box or --detections "
+            "unless it is to be found"
+        )
+    if len(given) > 1:
+        raise InputError(f"{' and '.join(given)} say where objects are; give one of them")
+    depth, known = Path(inputs.depth), [model.name for model in method.models]
+    labels = None if inputs.labels is None else parse_labels(inputs.labels, known)
+    is_one = inputs.object is not None or len(known) == 1
+    wanted = object_named(inputs.object, method) if is_one else None
+    settings |= camera_facts(lens) | ({} if labels is None else {"labels": labels})
+    if wanted is not None:
+        settings["object"] = wanted
+    if inputs.detections is not None:
+        settings["detections"] = str(Path(inputs.detections).resolve())
+        objects = (labels or {}, known, wanted)
+        return detection_jobs(depth, Path(inputs.detections), lens, objects, unit, out)
+    if inputs.box:
+        settings["box"] = list(inputs.box)
+        name = object_named(inputs.object, method)
+        return box_jobs(depth, inputs.box, lens, name, unit, out)
+    assert inputs.mask is not None
+    mask = Path(inputs.mask)
+    settings["mask"] = str(mask.resolve())
+    if wanted is None and labels is None:
+        raise InputError(
+            f"the {method.holder} know {', '.join(known)}; say which by --object, or which number "
+            f"of the mask is which by --labels 1={known[0]},2={known[1]}"
+        )
+    return view_jobs(depth, mask, lens, wanted, unit, out, labels)
 
 
 def predict_dataset(

@@ -16,12 +16,12 @@ from torch import Tensor
 
 from depthpose.core.config import config_from_dict
 from depthpose.core.errors import InputError, Notice, nearest_name
-from depthpose.core.files import write_json
+from depthpose.core.files import image_size, write_json
 from depthpose.core.files.disk import read_bytes, refuse_heavy, refused_as, write_bytes
 from depthpose.core.frame import data_frame
 from depthpose.core.rigid import Rigid
 from depthpose.core.run import claim_folder
-from depthpose.pose.datasets import BopDataset, Detection, Instance, decode_rle, read_mask
+from depthpose.pose.datasets import BopDataset, Detection, Instance, read_mask
 from depthpose.pose.datasets.layouts import MOST, integer, make_pose, number, read_rows
 from depthpose.pose.types import (
     POSED,
@@ -376,7 +376,10 @@ def _read_view(
     dataset: BopDataset, instance: Instance, name: str, object: str, mask: Path | Detection | None
 ) -> ViewInput:
     """Read the view of an instance by the mask of a file or a detection; None: its own."""
-    pixels = decode_rle(*mask.segmentation) if isinstance(mask, Detection) else None
+    pixels = None
+    if isinstance(mask, Detection):
+        width, height = image_size(instance.depth)
+        pixels = mask.mask(height, width)
     if isinstance(mask, Path):
         pixels = read_mask(mask)
     return replace(dataset.view(instance, pixels).input, name=name, object=object)
@@ -401,6 +404,11 @@ def detection_jobs(
         shown[place_of(instance)].append(instance)
     found: dict[Place, list[Detection]] = defaultdict(list)
     for one in sorted(detections, key=lambda d: -d.score):
+        if one.scene_id is None or one.image_id is None or one.object_id is None:
+            raise InputError(
+                f"{dataset.folder}: a detection of {one.label!r} lacks scene_id, image_id or "
+                "category_id; detections of a data set have all three"
+            )
         place = Place(one.scene_id, one.image_id, one.object_id)
         if len(found[place]) < len(shown.get(place, ())):
             found[place].append(one)

@@ -1,7 +1,6 @@
-"""Masks of one object: pictures, COCO's run lengths, and detections as BOP shares them."""
+"""Masks of one object: pictures, and COCO's run lengths."""
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Collection, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -11,9 +10,8 @@ from jaxtyping import Bool, Int64
 from torch import Tensor
 
 from depthpose.core.errors import InputError
-from depthpose.core.files import read_json, write_json
+from depthpose.core.files import read_json
 from depthpose.core.files.images import MAX_PIXELS, opened_image
-from depthpose.pose.datasets.layouts import integer, number, read_rows
 
 Runs = tuple[tuple[int, ...], int, int]  #: run lengths, height and width
 _MOST_LABELS, _HALF, _SOFT = 64, 127, 32
@@ -29,7 +27,9 @@ def read_mask(path: Path) -> Bool[Tensor, "mask_h mask_w"]:
     return one_mask(read_labels(path), str(path))
 
 
-def read_labels(path: Path) -> Int64[Tensor, "mask_h mask_w"]:
+def read_labels(
+    path: Path, labels: Collection[int] | None = None
+) -> Int64[Tensor, "mask_h mask_w"]:
     """Read a mask image of any kind: 0 where it is black or transparent, a number for each object.
 
     Of a picture in colour they are 1, 2, ... in the order of the colours. Where an alpha channel
@@ -37,10 +37,21 @@ def read_labels(path: Path) -> Int64[Tensor, "mask_h mask_w"]:
     run lengths (``size`` and ``counts``, compressed or not), an annotation or a detection with such
     a ``segmentation``, or a list of one of these.
 
+    Args:
+        path: picture or ``.json``.
+        labels: numbers of a label map that have a meaning: each keeps its value, also where it is
+            alone, and another number is refused; None: what the picture shows is numbered.
+
     Raises:
-        InputError: it is missing, no picture, a JPEG of numbered objects, or no list of one mask.
+        InputError: it is missing, no picture, a JPEG of numbered objects, or no list of one mask;
+            or it holds a number that is none of the labels.
     """
     if path.suffix.lower() == ".json":
+        if labels is not None:
+            raise InputError(
+                f"{path}: run lengths have no numbers of a label map; give a picture, or name the "
+                "file by --detections, whose entries have classes"
+            )
         content = read_json(path)
         entries = content if isinstance(content, list) else [content]
         if len(entries) != 1:
@@ -52,6 +63,8 @@ def read_labels(path: Path) -> Int64[Tensor, "mask_h mask_w"]:
     with opened_image(path) as image:
         if image.mode in ("LA", "PA", "RGBA", "RGBa", "La") or "transparency" in image.info:
             pixels = np.asarray(image.convert("RGBA"))
+        elif labels is not None and image.mode == "P":
+            pixels = np.asarray(image).astype(np.int32)[..., None]  # the palette is for the eye
         elif image.mode in ("1", "L", "I", "F") or image.mode.startswith("I;16"):
             kind = np.int64 if image.mode == "F" else np.int32
             pixels = np.asarray(image).astype(kind)[..., None]
@@ -77,7 +90,29 @@ def read_labels(path: Path) -> Int64[Tensor, "mask_h mask_w"]:
     if pixels.shape[2] == 4 and 0 < is_opaque.sum() < is_opaque.size:
         is_shape = len(np.unique(values[is_opaque])) not in range(2, _MOST_LABELS)
         values = np.where(is_opaque, 1 if is_shape else values, 0)
-    return number_objects(values)
+    return number_objects(values) if labels is None else _labelled(values, labels, path)
+
+
+def _labelled(
+    values: np.ndarray, labels: Collection[int], path: Path
+) -> Int64[Tensor, "mask_h mask_w"]:
+    """Keep the pixels of the labels; refuse another number that fills a square of three pixels."""
+    for other in sorted(_solid_numbers(values) - set(labels)):
+        raise InputError(
+            f"{path}: {int((values == other).sum())} pixels have the number {other}, which the "
+            f"labels do not name; add {other}=OBJECT, or {other}= to leave it out"
+        )
+    return torch.from_numpy(np.where(np.isin(values, list(labels)), values, 0)).long()
+
+
+def _solid_numbers(values: np.ndarray) -> set[int]:
+    """Give the numbers but 0 that fill a square of three pixels somewhere."""
+    middle = values[1:-1, 1:-1]
+    is_solid = middle != 0
+    for row, column in np.ndindex(3, 3):
+        height, width = middle.shape
+        is_solid &= values[row : row + height, column : column + width] == middle
+    return {int(number) for number in np.unique(middle[is_solid])}
 
 
 def number_objects(values: np.ndarray) -> Int64[Tensor, "h w"]:
@@ -89,15 +124,10 @@ def number_objects(values: np.ndarray) -> Int64[Tensor, "h w"]:
     shown = values[values != 0]
     if len(shown) == 0 or (shown == shown[0]).all():
         return torch.from_numpy(values != 0).long()
-    middle = values[1:-1, 1:-1]
-    is_solid = middle != 0
-    for row, column in np.ndindex(3, 3):
-        height, width = middle.shape
-        is_solid &= values[row : row + height, column : column + width] == middle
-    found = np.unique(middle[is_solid])
+    found = _solid_numbers(values)
     if not 2 <= len(found) <= _MOST_LABELS:
         return torch.from_numpy(values != 0).long()
-    return torch.from_numpy(np.where(np.isin(values, found), values, 0)).long()
+    return torch.from_numpy(np.where(np.isin(values, list(found)), values, 0)).long()
 
 
 def one_mask(labels: Int64[Tensor, "h w"], name: str) -> Bool[Tensor, "h w"]:
@@ -178,62 +208,6 @@ def read_runs(entry: object, source: str) -> Runs:
     if not is_list or sum(runs) != height * width or height * width > MAX_PIXELS:
         raise InputError(f"{what} of {height}x{width} pixels: they do not add up to it")
     return tuple(runs), height, width
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class Detection:
-    """One predicted object."""
-
-    scene_id: int  #: number of the scene
-    image_id: int  #: number of the image
-    object_id: int  #: which object (``category_id``)
-    score: float  #: how sure
-    segmentation: Runs  #: run lengths as in the file, checked
-    seconds: float | None = None  #: what the image took, where it is said
-
-
-def read_detections(path: str | Path) -> list[Detection]:
-    """Read a file of detections; run lengths compressed or not.
-
-    Raises:
-        InputError: it is missing or damaged, or an entry has no mask.
-    """
-    path = Path(path)
-    found: list[Detection] = []
-    for place, row in enumerate(read_rows(path)):
-        source = f"{path}: entry {place}"
-        seconds = number(row, "time", -1.0, source)
-        found.append(
-            Detection(
-                scene_id=integer(row, "scene_id", source),
-                image_id=integer(row, "image_id", source),
-                object_id=integer(row, "category_id", source),
-                score=number(row, "score", None, source),
-                segmentation=read_runs(row.get("segmentation"), source),
-                seconds=seconds if seconds >= 0 else None,
-            )
-        )
-    return found
-
-
-def write_detections(path: str | Path, detections: Sequence[Detection]) -> None:
-    """Write detections as BOP shares them, run lengths as plain numbers.
-
-    Raises:
-        InputError: the disk refuses.
-    """
-    rows: list[dict[str, Any]] = []
-    for one in detections:
-        counts, height, width = one.segmentation
-        row: dict[str, Any] = {
-            "scene_id": one.scene_id,
-            "image_id": one.image_id,
-            "category_id": one.object_id,
-        }
-        row |= {"score": one.score, "bbox": mask_box(decode_rle(*one.segmentation))}
-        row["segmentation"] = {"size": [height, width], "counts": list(counts)}
-        rows.append(row | {"time": -1.0 if one.seconds is None else one.seconds})
-    write_json(Path(path), rows)
 
 
 def mask_box(mask: Bool[Tensor, "h w"]) -> list[int]:

@@ -1,0 +1,392 @@
+"""What detectors find, from any of their files: boxes or masks, with a class and a score."""
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path, PurePosixPath
+from typing import Any
+
+import torch
+from jaxtyping import Bool
+from torch import Tensor
+
+from depthpose.core.errors import InputError, nearest_name
+from depthpose.core.files import read_json, read_text, write_json
+from depthpose.core.files.disk import refused_suffix
+from depthpose.pose.datasets.layouts import MOST, integer, number, numbers
+from depthpose.pose.datasets.masks import Runs, decode_rle, mask_box, read_runs
+
+Box = tuple[float, float, float, float]
+"""Left, top, right and bottom edge [px]: the first pixel reaches from 0 to 1, as COCO counts."""
+_NO_BOX = [-1.0] * 4  # as BOP writes the box of an empty mask
+_YOLO = "class cx cy w h [confidence]"
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Detection:
+    """One object that was found in an image: a mask, or a box about it.
+
+    Raises:
+        InputError: it has neither or both, or a box whose edges are not in order.
+    """
+
+    object: str | None = None  # name of its class, where it is said
+    object_id: int | None = None  #: number of its class (``category_id``), where it is said
+    score: float = 1.0  #: how sure; 1 where that is not said
+    box: Box | None = None  #: edges; may reach beyond the image
+    segmentation: Runs | None = None  #: run lengths as in the file, checked
+    scene_id: int | None = None  #: number of the scene, of BOP's data sets
+    image_id: int | None = None  #: number of the image, where it is said
+    image: str | None = None  #: name of the image's file without its ending, where it is said
+    seconds: float | None = None  #: what the image took, where it is said
+
+    def __post_init__(self) -> None:
+        if (self.box is None) == (self.segmentation is None):
+            how_many = "neither" if self.box is None else "both"
+            raise InputError(
+                f"a detection has {how_many} of a box and a mask; give one: bbox [left, top, "
+                'width, height], or a segmentation {"size": [height, width], "counts": [...]}'
+            )
+        if self.box is not None:
+            check_box(self.box)
+
+    @property
+    def label(self) -> str:
+        """The class as it is said: its name, or else its number."""
+        return str(self.object_id) if self.object is None else self.object
+
+    def mask(self, height: int, width: int) -> Bool[Tensor, "height width"]:
+        """Give its pixels: those of the mask, or all that the box touches.
+
+        Raises:
+            InputError: the mask is of an image of another size, or the box lies outside of this.
+        """
+        if self.segmentation is None:
+            assert self.box is not None
+            return box_mask(self.box, height, width)
+        if self.segmentation[1:] != (height, width):
+            rows, columns = self.segmentation[1:]
+            raise InputError(
+                f"the mask of a detection is {columns}x{rows}, but the image {width}x{height}; "
+                "detect in this very image, or resize the masks to its size"
+            )
+        return decode_rle(*self.segmentation)
+
+
+def parse_box(text: str) -> Box:
+    """Read ``X0,Y0,X1,Y1``: left, top, right and bottom edge [px].
+
+    Raises:
+        InputError: these are not four numbers in order.
+    """
+    try:
+        x0, y0, x1, y1 = (float(word) for word in text.split(","))
+    except ValueError as error:
+        raise InputError(
+            f"box {text!r} is not X0,Y0,X1,Y1: four numbers [px], the left, top, right and bottom "
+            "edge, as 120,80,260,210"
+        ) from error
+    check_box((x0, y0, x1, y1))
+    return x0, y0, x1, y1
+
+
+def check_box(box: Box) -> None:
+    """Refuse a box whose edges are no finite numbers, or not in order.
+
+    Raises:
+        InputError: that is so.
+    """
+    x0, y0, x1, y1 = box
+    if not all(math.isfinite(edge) for edge in box) or not x0 < x1 or not y0 < y1:
+        raise InputError(
+            f"box {_edges(box)}: the right edge is to lie right of the left edge, and the "
+            "bottom below the top; give left,top,right,bottom (of left,top,width,height add width "
+            "and height)"
+        )
+
+
+def box_mask(box: Box, height: int, width: int) -> Bool[Tensor, "height width"]:
+    """Give all pixels of an image that a box touches; the box may reach beyond the image.
+
+    Raises:
+        InputError: its centre lies outside of the image.
+    """
+    check_box(box)
+    x0, y0, x1, y1 = box
+    if not (0 <= (x0 + x1) / 2 <= width and 0 <= (y0 + y1) / 2 <= height):
+        raise InputError(
+            f"box {_edges(box)}: its centre lies outside of the image of {width}x{height} pixels; "
+            "give pixels of the depth image: a box of an image that is s times as large is to be "
+            "divided by s"
+        )
+    mask = torch.zeros(height, width, dtype=torch.bool)
+    rows = slice(max(0, math.floor(y0)), math.ceil(y1))
+    columns = slice(max(0, math.floor(x0)), math.ceil(x1))
+    mask[rows, columns] = True
+    return mask
+
+
+def read_detections(path: str | Path, size: tuple[int, int] | None = None) -> list[Detection]:
+    """Read a file of detections: JSON as BOP or COCO share them, or YOLO's text.
+
+    JSON is a list of entries with ``bbox`` (left, top, width, height) or a ``segmentation`` in run
+    lengths, ``category_id`` or the ``name`` of a class, ``score``, ``image_id`` and ``scene_id``,
+    or COCO's ``annotations`` with the names of its ``images`` and ``categories``. A ``.txt`` file
+    is YOLO's of one image: in each line the number of the class, centre, width and height in shares
+    of the image, and the confidence.
+
+    Args:
+        path: ``.json`` or ``.txt``.
+        size: width and height of the image; ``.txt`` needs it.
+
+    Raises:
+        InputError: it is missing or damaged, or an entry is neither a box nor a mask.
+    """
+    path = Path(path)
+    suffix = path.suffix.lower()
+    if suffix == ".json":
+        return _read_coco(path)
+    if suffix == ".txt":
+        return _read_yolo(path, size)
+    raise refused_suffix(path, "file of detections", (".json", ".txt"))
+
+
+def _read_coco(path: Path) -> list[Detection]:
+    """Read entries of BOP or COCO; where one has a mask, its box says nothing new."""
+    content = read_json(path)
+    names: dict[int, str] = {}  # of classes
+    files: dict[int, str] = {}  # of images
+    if isinstance(content, dict) and "annotations" in content:
+        for category in _entries(content.get("categories", []), f"{path}: categories"):
+            names[integer(category, "id", f"{path}: categories")] = str(category.get("name"))
+        for image in _entries(content.get("images", []), f"{path}: images"):
+            files[integer(image, "id", f"{path}: images")] = str(image.get("file_name"))
+        content = content["annotations"]
+    detections: list[Detection] = []
+    for place, row in enumerate(_entries(content, str(path))):
+        source = f"{path}: entry {place}"
+        name = row.get("name", row.get("category_name"))
+        object_id = None
+        if "category_id" in row or name is None:
+            object_id = integer(row, "category_id", source)
+        name = names.get(object_id) if name is None and object_id is not None else name
+        image_id = integer(row, "image_id", source) if _is_number(row, "image_id") else None
+        file = row.get("file_name", row.get("image_id") if image_id is None else None)
+        file = files.get(image_id) if file is None and image_id is not None else file
+        seconds = number(row, "time", -1.0, source)
+        segmentation = row.get("segmentation")
+        box = None
+        if row.get("bbox") is not None and not segmentation:
+            left, top, width, height = numbers(row, "bbox", 4, source)
+            box = (left, top, left + width, top + height)
+            box = None if [left, top, width, height] == _NO_BOX else box
+        try:
+            detections.append(
+                Detection(
+                    object=None if name is None else str(name),
+                    object_id=object_id,
+                    score=number(row, "score", 1.0, source),
+                    box=box,
+                    segmentation=read_runs(segmentation, source) if segmentation else None,
+                    scene_id=integer(row, "scene_id", source) if "scene_id" in row else None,
+                    image_id=image_id,
+                    image=None if file is None else PurePosixPath(str(file)).stem,
+                    seconds=seconds if seconds >= 0 else None,
+                )
+            )
+        except InputError as error:
+            reason = str(error)
+            raise InputError(reason if source in reason else f"{source}: {reason}") from error
+    return detections
+
+
+def _read_yolo(path: Path, size: tuple[int, int] | None) -> list[Detection]:
+    if size is None:
+        raise InputError(
+            f"{path}: its boxes are shares of an image whose size is not known here; give JSON, or "
+            "name it by --detections beside --depth"
+        )
+    detections: list[Detection] = []
+    for line, text in enumerate(read_text(path).splitlines(), 1):
+        words = text.split()
+        source = f"{path}: line {line}"
+        if not words:
+            continue
+        if len(words) not in (5, 6):
+            raise InputError(
+                f"{source}: {len(words)} numbers, where {_YOLO} belong; polygons are to be turned "
+                "into boxes, or masks given by --mask"
+            )
+        try:
+            object_id = int(words[0])
+            shares = [float(word) for word in words[1:]]
+        except ValueError as error:
+            raise InputError(f"{source}: {error}; write {_YOLO}") from error
+        cx, cy, w, h = shares[:4]
+        is_share = all(0 <= share <= 1 for share in shares)
+        if not is_share or not w * h > 0 or not 0 <= object_id <= MOST:
+            raise InputError(
+                f"{source}: {text.strip()[:80]!r} is not {_YOLO}, a class of 0 or more, and shares "
+                "of the image from 0 to 1; boxes in pixels go into JSON as COCO's bbox"
+            )
+        wide, high = size
+        box = ((cx - w / 2) * wide, (cy - h / 2) * high, (cx + w / 2) * wide, (cy + h / 2) * high)
+        score = shares[4] if len(shares) == 5 else 1.0
+        detections.append(Detection(object_id=object_id, score=score, box=box, image=path.stem))
+    return detections
+
+
+def write_detections(path: str | Path, detections: Sequence[Detection]) -> None:
+    """Write detections as BOP shares them, run lengths as plain numbers.
+
+    Raises:
+        InputError: one lacks its scene, image or number of object, or the disk refuses.
+    """
+    rows: list[dict[str, Any]] = []
+    for detection in detections:
+        row: dict[str, Any] = {
+            "scene_id": detection.scene_id,
+            "image_id": detection.image_id,
+            "category_id": detection.object_id,
+        }
+        missing = [key for key, value in row.items() if value is None]
+        if missing:
+            raise InputError(
+                f"{path}: a detection of {detection.label!r} has no {missing[0]}; BOP's has"
+            )
+        row["score"] = detection.score
+        if detection.segmentation is not None:
+            counts, height, width = detection.segmentation
+            row["segmentation"] = {"size": [height, width], "counts": list(counts)}
+        if detection.box is not None:
+            x0, y0, x1, y1 = detection.box
+            row["bbox"] = [x0, y0, x1 - x0, y1 - y0]
+        else:
+            assert detection.segmentation is not None
+            row["bbox"] = mask_box(decode_rle(*detection.segmentation))
+        rows.append(row | {"time": -1.0 if detection.seconds is None else detection.seconds})
+    write_json(Path(path), rows)
+
+
+def parse_labels(text: str, objects: Sequence[str]) -> dict[str, str]:
+    """Read ``1=bracket,2=gear``: classes, by number or name, and the objects that they are.
+
+    ``3=`` leaves class 3 out: its name is empty.
+
+    Raises:
+        InputError: it is written otherwise, a class is given twice, or an object is not known.
+    """
+    labels: dict[str, str] = {}
+    for part in text.split(","):
+        label, sign, name = (word.strip() for word in part.partition("="))
+        if not label or not sign:
+            raise InputError(
+                f"labels {text!r}: {part.strip()!r} is not CLASS=OBJECT; write 1=bracket,2=gear"
+            )
+        if label in labels:
+            raise InputError(f"labels {text!r}: class {label} is named twice; name it once")
+        if name and name not in objects:
+            raise InputError(
+                f"labels {text!r}: class {label} is {name!r}, which is no known object; "
+                f"{nearest_name(name, objects)}"
+            )
+        labels[label] = name
+    return labels
+
+
+def name_objects(
+    detections: Sequence[Detection],
+    labels: Mapping[str, str],
+    objects: Sequence[str],
+    wanted: str | None,
+    source: str,
+) -> list[Detection]:
+    """Give each detection the name of its object; those of no wanted object are left out.
+
+    Args:
+        detections: of any classes.
+        labels: of :func:`parse_labels`.
+        objects: names of those that are known; a class of such a name is that object.
+        wanted: the only object that is asked for, if any; where no class has a name and all are one
+            class, it is this object.
+        source: of the detections, in errors.
+
+    Raises:
+        InputError: a class is no known object.
+    """
+    named: list[Detection] = []
+    is_one_class = len({detection.label for detection in detections}) == 1
+    for detection in detections:
+        label = detection.label
+        name = labels.get(label, detection.object)
+        if name is None and wanted is not None and is_one_class:
+            name = wanted
+        if name is None:
+            raise InputError(
+                f"{source}: class {label} is a number without a name; say which object it is by "
+                f"--labels {label}={objects[0]}, or leave it out by --labels {label}="
+            )
+        if name and name not in objects and wanted is None:
+            raise InputError(
+                f"{source}: class {name!r} is no known object; {nearest_name(name, objects)} Say "
+                f"by --labels {label}=OBJECT which it is, or leave it out by --labels {label}="
+            )
+        if name == wanted or (name and wanted is None):
+            named.append(replace(detection, object=name))
+    return named
+
+
+def of_images(
+    detections: Sequence[Detection], images: Sequence[str], source: str
+) -> dict[str, list[Detection]]:
+    """Share detections among images, by the names of their files without endings.
+
+    A detection is of the image of its ``image``, or of that whose name is its ``image_id``. Where
+    there is one image, and all detections are of one, these are the same.
+
+    Raises:
+        InputError: a detection says no image, or none of the detections is of one of these.
+    """
+    places = {(detection.scene_id, detection.image_id, detection.image) for detection in detections}
+    if len({detection.scene_id for detection in detections}) > 1:
+        raise InputError(
+            f"{source}: holds detections of several scenes; name the data set by --bop, and the "
+            "file by --masks"
+        )
+    if len(images) == 1 and len(places) <= 1:
+        return {images[0]: list(detections)}
+    shares: dict[str, list[Detection]] = {image: [] for image in images}
+    by_number = {int(image): image for image in images if image.isascii() and image.isdecimal()}
+    for place, detection in enumerate(detections):
+        if detection.image is None and detection.image_id is None:
+            raise InputError(
+                f"{source}: entry {place} does not say of which image it is; add image_id, the "
+                "number that the depth image has for a name, or file_name"
+            )
+        image = detection.image
+        if image not in shares and detection.image_id is not None:
+            image = by_number.get(detection.image_id)
+        if image in shares:
+            shares[image].append(detection)
+    if detections and not any(shares.values()):
+        detection = detections[0]
+        raise InputError(
+            f"{source}: no detection is of {images[0]!r}{' or another image' * (len(images) > 1)}; "
+            f"the first is of {detection.image or detection.image_id!r}. Name the depth images as "
+            "the detections say (image_id 12 is 12.png or 000012.png), or correct the file"
+        )
+    return shares
+
+
+def _entries(content: object, source: str) -> list[dict[str, Any]]:
+    if not isinstance(content, list) or not all(isinstance(row, dict) for row in content):
+        raise InputError(f"{source}: is no list of objects, one an entry")
+    return content
+
+
+def _is_number(row: Mapping[str, Any], key: str) -> bool:
+    return isinstance(row.get(key), int) and not isinstance(row[key], bool)
+
+
+def _edges(box: Box) -> str:
+    return ",".join(f"{edge:g}" for edge in box)

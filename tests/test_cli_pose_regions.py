@@ -1,0 +1,188 @@
+"""``pose predict`` with boxes, detections and label maps, an oracle in place of the network."""
+
+import json
+from pathlib import Path
+
+import pytest
+import torch
+from PIL import Image
+from tests.pose.synthetic_objects import (
+    K,
+    Oracle,
+    bottle,
+    bracket,
+    pose_at,
+    tiny_weights,
+    view_of,
+)
+
+from depthpose.cli import main, pose_methods
+from depthpose.core.camera import Camera, write_camera
+from depthpose.core.files import write_depth_png
+from depthpose.pose.datasets import encode_rle
+from depthpose.pose.datasets.masks import mask_box
+from depthpose.pose.weights import write_pose_weights
+
+Scene = tuple[list[str], dict[str, torch.Tensor]]
+POSES = {"bracket": pose_at(-0.12, seed=1), "bottle": pose_at(0.14, seed=2)}
+
+
+@pytest.fixture
+def scene(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Scene:
+    """A depth image of two objects, what poses them, and their masks."""
+    weights = tmp_path / "known.safetensors"
+    oracle = Oracle(tiny_weights(bracket(), bottle()), list(POSES.values()))
+    write_pose_weights(weights, oracle.weights)
+    monkeypatch.setattr(pose_methods, "GeoPoseNet", lambda *_: oracle)
+    views = {m.name: view_of(m, POSES[m.name]) for m in (bracket(), bottle())}
+    depth_m = torch.stack([d.nan_to_num(9.0) for d, _ in views.values()]).amin(0)
+    (tmp_path / "depth").mkdir()
+    depth_m = torch.where(depth_m < 9, depth_m, torch.nan)
+    write_depth_png(tmp_path / "depth" / "000012.png", depth_m, 0.001)
+    write_camera(tmp_path / "camera.json", Camera(width=320, height=240, K=K, depth_unit_m=0.001))
+    words = ["pose", "predict", "--weights", str(weights), "--out", str(tmp_path / "out")]
+    words += ["--camera", str(tmp_path / "camera.json")]
+    words += ["--depth", str(tmp_path / "depth" / "000012.png")]
+    return words, {name: mask for name, (_, mask) in views.items()}
+
+
+def answers(folder: Path) -> dict[str, dict]:
+    return {row["name"]: row for row in json.loads((folder / "out/poses.json").read_text())}
+
+
+def assert_right(rows: dict[str, dict], expected: dict[str, str]) -> None:
+    assert {name: row["object"] for name, row in rows.items()} == expected
+    for row in rows.values():
+        pose = torch.tensor(row["camera_from_model"])
+        truth = POSES[row["object"]].t_m
+        assert float((pose[:3, 3] - truth).norm()) < 0.005, row["name"]
+
+
+def edges(mask: torch.Tensor, more: int = 2) -> list[int]:
+    left, top, width, height = mask_box(mask)
+    return [left - more, top - more, left + width + more, top + height + more]
+
+
+def test_a_box_is_enough(scene: Scene, tmp_path: Path) -> None:
+    words, masks = scene
+    box = ",".join(map(str, edges(masks["bracket"])))
+    assert main([*words, "--box", box, "--object", "bracket"]) == 0
+    assert_right(answers(tmp_path), {"000012": "bracket"})
+    # Another box needs another folder, as every setting does.
+    assert main([*words, "--box", "1,1,50,50", "--object", "bracket"]) == 2
+
+
+def test_boxes_that_cannot_be_are_named(
+    scene: Scene,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    words, _ = scene
+    for more, reason in (
+        (["--box", "9,1,2,50", "--object", "bracket"], "the right edge is to lie right"),
+        (["--box", "1,1,50,50"], "say which by --object"),
+        (["--box", "1,1,50,50", "--mask", "m.png", "--object", "bracket"], "no such file"),
+    ):
+        assert main([*words, *more]) == 2
+        assert reason in capsys.readouterr().err
+    assert main([*words, "--box", "400,1,600,50", "--object", "bracket"]) == 1
+    assert "its centre lies outside of the image of 320x240" in capsys.readouterr().err
+
+
+def coco(masks: dict[str, torch.Tensor], image_id: int) -> list[dict]:
+    rows = []
+    for k, (name, mask) in enumerate(masks.items(), 1):
+        x0, y0, x1, y1 = edges(mask)
+        rows.append({"image_id": image_id, "category_id": k, "bbox": [x0, y0, x1 - x0, y1 - y0],
+                     "score": 0.5 + 0.1 * k, "name": name})  # fmt: skip
+    return rows
+
+
+def test_detections_of_coco_are_posed(scene: Scene, tmp_path: Path) -> None:
+    words, masks = scene
+    file = tmp_path / "found.json"
+    file.write_text(json.dumps(coco(masks, 12)))
+    assert main([*words, "--detections", str(file)]) == 0
+    # The surest is the first.
+    assert_right(answers(tmp_path), {"000012_1": "bottle", "000012_2": "bracket"})
+
+
+def test_numbers_of_classes_need_names(
+    scene: Scene,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    words, masks = scene
+    rows = [{k: v for k, v in row.items() if k != "name"} for row in coco(masks, 12)]
+    counts, height, width = encode_rle(masks["bottle"])
+    rows[1]["segmentation"] = {"size": [height, width], "counts": list(counts)}
+    file = tmp_path / "found.json"
+    file.write_text(json.dumps(rows))
+    words = [*words, "--detections", str(file)]
+    assert main(words) == 2
+    assert "class 1 is a number without a name" in capsys.readouterr().err
+    assert main([*words, "--labels", "1=bracket,2=pot"]) == 2
+    assert "class 2 is 'pot', which is no known object" in capsys.readouterr().err
+    assert main([*words, "--labels", "1=bracket,2=bottle"]) == 0
+    assert_right(answers(tmp_path), {"000012_1": "bottle", "000012_2": "bracket"})
+
+
+def test_a_folder_of_yolo_s_text_is_posed(
+    scene: Scene,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    words, masks = scene
+    (tmp_path / "labels").mkdir()
+    x0, y0, x1, y1 = edges(masks["bracket"])
+    shares = ((x0 + x1) / 640, (y0 + y1) / 480, (x1 - x0) / 320, (y1 - y0) / 240)
+    line = " ".join(map(str, (0, *shares, 0.9)))
+    (tmp_path / "labels" / "000012.txt").write_text(line)
+    depth = tmp_path / "depth"
+    (depth / "000013.png").write_bytes((depth / "000012.png").read_bytes())
+    words[-1] = str(depth)
+    words = [*words, "--detections", str(tmp_path / "labels"), "--labels", "0=bracket"]
+    assert main(words) == 2
+    assert "no file of detections called '000013'" in capsys.readouterr().err
+    (tmp_path / "labels" / "000013.txt").write_text("")
+    assert main(words) == 0
+    assert "nothing is detected in 1 of 2 depth images: 000013" in capsys.readouterr().err
+    assert_right(answers(tmp_path), {"000012": "bracket"})
+
+
+def test_a_label_map_shows_several_objects(
+    scene: Scene,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    words, masks = scene
+    labels = masks["bracket"] * 4 + (masks["bottle"] & ~masks["bracket"]) * 9
+    Image.fromarray(labels.byte().numpy()).save(tmp_path / "labels.png")
+    words = [*words, "--mask", str(tmp_path / "labels.png")]
+    assert main(words) == 2
+    assert "which number of the mask is which by --labels 1=bracket,2=bottle" in (
+        capsys.readouterr().err
+    )
+    assert main([*words, "--labels", "bracket=bracket"]) == 2
+    assert "the objects of a mask have numbers" in capsys.readouterr().err
+    assert main([*words, "--labels", "4=bracket"]) == 2
+    assert "pixels have the number 9, which the labels do not name" in capsys.readouterr().err
+    assert main([*words, "--labels", "4=bracket,9=bottle"]) == 0
+    assert_right(answers(tmp_path), {"000012_4": "bracket", "000012_9": "bottle"})
+
+
+def test_options_of_regions_are_refused_where_they_do_nothing(
+    scene: Scene,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    words, masks = scene
+    file = tmp_path / "found.json"
+    file.write_text(json.dumps(coco(masks, 12)))
+    for more, reason in (
+        (["--labels", "1=bracket"], "--labels: has no effect here"),
+        (["--box", "1,1,9,9", "--labels", "1=bracket"], "all boxes are of one object"),
+        (["--box", "1,1,9,9", "--detections", str(file)], "say where objects are; give one"),
+        (["--box", "1,1,9,9", "--engine", "ray"], "workers take --mask"),
+    ):
+        assert main([*words, *more]) == 2
+        assert reason in capsys.readouterr().err
