@@ -152,3 +152,30 @@ def test_a_picture_of_ten_bits_is_no_depth(
     ramp[:4] = 0
     Image.fromarray(ramp.astype(np.uint16)).save(tmp_path / "depth.png")
     assert "16-bit depth of 64x48" in said(capsys, tmp_path / "depth.png")[1]
+
+
+def test_a_pose_is_no_cloud_of_four_points(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    matrix = pose_at(0.1, 0.6).matrix().double().numpy()
+    np.savetxt(tmp_path / "pose.txt", matrix)
+    matrix[:3, 3] *= 1000
+    (tmp_path / "pose.json").write_text(str(matrix.tolist()))
+    code, out = said(capsys, tmp_path / "pose.txt")
+    assert code == 0
+    assert out.startswith(f"{tmp_path / 'pose.txt'}: pose, turned by ")
+    assert "degrees, 0.6083 m away\n" in out
+    code, out = said(capsys, tmp_path / "pose.json")
+    assert code == 1
+    assert "odd: it moves by 608.3, taken as metres: is it in millimetres?" in out
+
+
+def test_points_that_faces_share_are_counted_once(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """STL repeats them for every face."""
+    import trimesh
+
+    trimesh.creation.box((0.1, 0.2, 0.3)).export(tmp_path / "box.stl")
+    _, out = said(capsys, tmp_path / "box.stl")
+    assert "mesh of 8 points and 12 faces, 0.3742 across" in out

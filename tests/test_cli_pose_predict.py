@@ -145,7 +145,7 @@ def test_a_depth_image_alone_is_searched(
     words = ["--depth", str(tmp_path / "depth"), "--camera", str(tmp_path / "c.json")]
     out = tmp_path / "out"
     assert main(["pose", "predict", *words, "--weights", str(weights), "--out", str(out)]) == 0
-    assert "3 inputs: 1 doubtful, 2 ok" in capsys.readouterr().out
+    assert "\n2 inputs, 3 answers: 1 doubtful, 2 ok; " in capsys.readouterr().out
     rows = poses_of(out)
     assert sorted(rows) == ["two_0", "two_1", "wall"]
     assert rows["wall"]["reason"].startswith("nothing beside the planes of the image is surely")

@@ -1,7 +1,9 @@
 """The road in a depth map, and the scale by the camera's height or one measured distance."""
 
+import json
 import math
 from dataclasses import replace
+from pathlib import Path
 
 import pytest
 import torch
@@ -13,6 +15,7 @@ from torch import Tensor
 from depthpose.core.camera import Camera
 from depthpose.core.errors import InputError
 from depthpose.depth.ground import fit_ground, scale_by_distance, scale_by_mount
+from depthpose.depth.predictions import write_estimate
 from depthpose.depth.types import DepthEstimate, StereoInput
 
 K = torch.tensor([[300.0, 0, 199.5], [0, 300, 99.5], [0, 0, 1]], dtype=torch.float64)
@@ -168,3 +171,19 @@ def test_a_known_distance_that_cannot_be_is_refused(
 ) -> None:
     with pytest.raises(InputError, match=message):
         scale_by_distance(estimate(road(1.6, 0, 0)), "a", known)
+
+
+def test_a_file_holds_the_digits_that_are_the_same_in_every_run(tmp_path: Path) -> None:
+    """Threads add up in another order, and the last digits of a fit change."""
+    ground = fit_ground(road(1.65, -1.0, 0.5), CAMERA)
+    assert ground is not None
+    written: list[bytes] = []
+    for changed in (0.0, 1e-13):
+        again = replace(ground, **{k: v * (1 + changed) for k, v in vars(ground).items()})
+        found = DepthEstimate(disparity_px=torch.ones(4, 5), depth_m=None, ground=again)
+        pair = StereoInput(name="a", left=torch.zeros(3, 4, 5), right=None, camera=None)
+        write_estimate(tmp_path, pair, found)
+        written.append((tmp_path / "a.ground.json").read_bytes())
+    assert written[0] == written[1]
+    row = json.loads(written[0])
+    assert row == {name: round(value, 6) for name, value in vars(ground).items()}

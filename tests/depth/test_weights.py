@@ -1,11 +1,14 @@
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
 
+from depthpose.cli import main
 from depthpose.core.checkpoint import Checkpoint, read_checkpoint, save_checkpoint
 from depthpose.core.errors import InputError
-from depthpose.depth.config import GeneratorConfig, PSMNetConfig
+from depthpose.depth.config import GeneratorConfig, PSMNetConfig, SelectionConfig
 from depthpose.depth.stereo import PSMNet
 from depthpose.depth.synthesis import UNetGenerator
 from depthpose.depth.weights import (
@@ -76,6 +79,50 @@ def test_one_network_alone_says_what_it_lacks(
         read_matcher(tmp_path / "g.safetensors")
     with pytest.raises(InputError, match="holds no generator, only a matcher"):
         read_generator(tmp_path / "s.safetensors")
+
+
+def test_retired_settings_are_not_shown(
+    networks: tuple[UNetGenerator, PSMNet], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    generator, matcher = networks
+    path = tmp_path / "old.safetensors"
+    write_depth_weights(path, generator=generator, matcher=matcher, facts=FACTS)
+    found = read_checkpoint(path)
+    config: dict[str, Any] = dict(found.config)
+    config["psmnet"] = {**config["psmnet"], "test_mode": "fast"}
+    save_checkpoint(path, replace(found, config=config))
+    assert main(["weights", "show", str(path)]) == 0
+    out = capsys.readouterr().out
+    assert "test_mode" not in out
+    assert "'pools': [2]" in out
+    assert "'virtual_focal_px': 100.0" in out
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        ("virtual_baseline_m", 1e308),
+        ("virtual_baseline_m", 1e-30),
+        ("virtual_focal_px", 1e300),
+        ("virtual_focal_px", 1e-30),
+    ],
+)
+def test_a_rig_that_no_camera_has_is_refused(
+    networks: tuple[UNetGenerator, PSMNet], tmp_path: Path, name: str, value: float
+) -> None:
+    """Depth from it would be infinite, or 0."""
+    path = tmp_path / "wild.safetensors"
+    write_depth_weights(path, generator=networks[0], facts=FACTS)
+    found = read_checkpoint(path)
+    save_checkpoint(path, replace(found, config={**found.config, name: value}))
+    with pytest.raises(InputError, match=f"{name} must be in "):
+        read_generator(path)
+
+
+@pytest.mark.parametrize("ends", [(1e-300, 88.0), (1.2, 1e308)])
+def test_disparities_that_no_image_has_are_refused(ends: tuple[float, float]) -> None:
+    with pytest.raises(InputError, match=r"disparity_px must be in \[0.01, 16384\]"):
+        SelectionConfig(disparity_px=ends)
 
 
 def test_weights_of_a_pose_network_are_refused(tmp_path: Path) -> None:

@@ -9,10 +9,12 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from depthpose.cli.pose_methods import read_pose
 from depthpose.core import camera as cameras
 from depthpose.core import files
 from depthpose.core.errors import InputError
 from depthpose.core.files.images import opened_image, read_numbers, value_range
+from depthpose.core.rigid import geodesic_rad
 from depthpose.pose.cloud import frame_advice, unit_advice
 from depthpose.pose.datasets import decode_rle
 from depthpose.pose.datasets.masks import read_runs
@@ -95,7 +97,9 @@ def _read(path: Path, size: Size | None) -> FileFacts:
         diameter = exact_diameter(points)
         unit = "metres (--unit m)" if diameter < _ONLY_M else "metres, cm or mm; measure it"
         unit = "millimetres (--unit mm)" if diameter > _ONLY_MM else unit
-        what = f"mesh of {len(points)} points and {len(faces)} faces, {diameter:.4g} across: {unit}"
+        # STL repeats the points of every face, and other files those at edges.
+        count = len(np.unique(vertices, axis=0))
+        what = f"mesh of {count} points and {len(faces)} faces, {diameter:.4g} across: {unit}"
         return FileFacts(path=path, what=what, model=points)
     if suffix in files.CLOUD_READERS:
         return _of_points(path, files.read_cloud(path).points.double())
@@ -103,7 +107,9 @@ def _read(path: Path, size: Size | None) -> FileFacts:
 
 
 def _read_words(path: Path, size: Size | None) -> FileFacts:
-    """A camera; or a mask in run lengths, or points in text."""
+    """A camera; or a pose, a mask in run lengths, or points in text."""
+    if (posed := _of_pose(path)) is not None:
+        return posed
     if path.suffix.lower() == ".json":
         content = files.read_json(path)
         one = content[0] if isinstance(content, list) and len(content) == 1 else content
@@ -129,6 +135,24 @@ def _read_words(path: Path, size: Size | None) -> FileFacts:
             "that was squeezed in one direction; was K scaled as the image was?"
         )
     return FileFacts(path=path, what=what, odd=odd, camera=camera)
+
+
+def _of_pose(path: Path) -> FileFacts | None:
+    """A 4x4 matrix as ``pose track --first`` takes it; None where the file holds something else."""
+    if path.is_dir():
+        return None
+    try:
+        pose = read_pose(path)
+    except InputError:
+        return None
+    turn = math.degrees(float(geodesic_rad(pose.R, torch.eye(3).to(pose.R))))
+    away = float(pose.t_m.norm())
+    odd = []
+    if away > _ONLY_MM:
+        odd.append(f"it moves by {away:.4g}, taken as metres: is it in millimetres?")
+    return FileFacts(
+        path=path, what=f"pose, turned by {turn:.1f} degrees, {away:.4g} m away", odd=odd
+    )
 
 
 def _of_picture(path: Path) -> FileFacts:

@@ -84,8 +84,9 @@ def find_all(method: PoseMethod, inputs: OneObjectOptions, out: Path) -> int:
         write_predictions(out, [*(prediction for prediction, _ in results), *left])
     pose_predict.claim(out, settings, [job for _, job in results], pose_predict.is_result_of)
     answered = [pair for pair in results if pair[0].estimate.is_posed]
-    pose_predict.write_files([p for p, _ in answered], [job for _, job in answered], out, method)
-    return pose_predict.say_result([prediction for prediction, _ in results], out)
+    own_jobs = [job for _, job in answered]
+    pose_predict.write_files([p for p, _ in answered], own_jobs, out, method, inputs=len(jobs))
+    return pose_predict.say_result([prediction for prediction, _ in results], out, len(jobs))
 
 
 def _explained(job: Job[Any], found: Prediction, method: PoseMethod) -> AnyInput:

@@ -538,8 +538,9 @@ def write_files(
     out: Path,
     method: PoseMethod,
     dataset: BopDataset | None = None,
+    inputs: int | None = None,
 ) -> None:
-    """Write the files of poses, or of a data set's, and the page."""
+    """Write the files of poses, or of a data set's, and the page; ``inputs``: their number."""
     models = {model.name: model for model in method.models}
     if dataset is not None:
         write_bop_results(out / results_name(dataset), predictions)
@@ -580,11 +581,14 @@ def write_files(
                 files[1], drawn.draw_pose(drawn.grey_depth(view.depth_m), pose, model, view.K)
             )
         note_result(out, job.name, files)
-    _write_page(out, predictions, jobs, models, dataset)
+    _write_page(out, predictions, jobs, models, dataset, inputs)
 
 
-def say_result(predictions: list[Prediction], out: Path) -> int:
-    """Print how many were posed and why others were not; give the exit code."""
+def say_result(predictions: list[Prediction], out: Path, inputs: int | None = None) -> int:
+    """Print how many were posed and why others were not; give the exit code.
+
+    ``inputs``: how many there were, where one may have several answers; None: one each.
+    """
     failed = [p.estimate for p in predictions if p.estimate.status == "unreadable"]
     shown = [p.estimate for p in predictions if p.estimate.status != "unreadable"]
     for estimate in failed:
@@ -611,9 +615,16 @@ def say_result(predictions: list[Prediction], out: Path) -> int:
             print(f"{prediction.estimate.name}: {other}")
     counts = Counter(estimate.status for estimate in shown)
     statuses = ", ".join(f"{count} {status}" for status, count in sorted(counts.items()))
-    inputs = "1 input" if len(predictions) == 1 else f"{len(predictions)} inputs"
-    print(f"{inputs}: {statuses or 'none readable'}; {out / 'poses.json'}")
+    total = _count_inputs(predictions, inputs)
+    print(f"{total}: {statuses or 'none readable'}; {out / 'poses.json'}")
     return 1 if failed else 0
+
+
+def _count_inputs(predictions: Sequence[Prediction], inputs: int | None) -> str:
+    """Say how many inputs there were, and how many answers where that is another number."""
+    count, answers = len(predictions) if inputs is None else inputs, len(predictions)
+    total = f"{count} input{'s' * (count != 1)}"
+    return total if count == answers else f"{total}, {answers} answer{'s' * (answers != 1)}"
 
 
 def _row(estimate: PoseEstimate) -> dict[str, Any]:
@@ -640,6 +651,7 @@ def _write_page(
     jobs: Sequence[Job[Any]],
     models: dict[str, ObjectModel],
     dataset: BopDataset | None,
+    inputs: int | None,
 ) -> None:
     """Write a page of some of the predictions, and of the reason of each refusal."""
     instances = () if dataset is None else dataset.instances
@@ -661,14 +673,14 @@ def _write_page(
         image = None if rgb is None else read_image(rgb)
         section = drawn.pose_section(estimate.name, shown_input, estimate, model, image=image)
         sections.append(section)
-    number = len(predictions)
-    text = f"{number} inputs: {counts}. Shown below: {len(sections)}"
+    number, total = len(predictions), _count_inputs(predictions, inputs)
+    text = f"{total}: {counts}. Shown below: {len(sections)}"
     text += "." if len(sections) == number else ", answers and refusals spread evenly."
     if number > _MOST_ROWS:
         text += f" The table holds the first {_MOST_ROWS}, refusals before answers; all are in "
         text += "poses.json."
     results = Section(title="What was found", text=text, rows=rows)
-    title = f"Poses of {number} input{'s' * (number != 1)}"
+    title = f"Poses of {total}"
     write_page(out / _PAGE, title, [results, *sections], run.environment())
     print(f"the page: {out / _PAGE}")
 

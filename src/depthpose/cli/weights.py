@@ -4,7 +4,7 @@ from collections.abc import Callable, Mapping
 from functools import partial
 from pathlib import Path
 from textwrap import shorten
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import tyro
 
@@ -13,6 +13,7 @@ from depthpose.core.errors import InputError
 from depthpose.core.units import Unit
 
 if TYPE_CHECKING:
+    from depthpose.core.checkpoint import Checkpoint
     from depthpose.core.export import Export
 
 
@@ -61,15 +62,27 @@ def show_weights(weights: tyro.conf.Positional[WeightsName]) -> int:
         for name, tensor in checkpoint.state.items()
         if not name.endswith(statistics) and not name.startswith("models.")
     ]
-    config = dict(checkpoint.config)
-    if "models" in config:
-        known = config.pop("models")
+    config = _settings_of(checkpoint, str(path))
+    if "models" in checkpoint.config:
+        known = checkpoint.config["models"]
         config["objects"] = ", ".join(f"{model['name']} ({model['number']})" for model in known)
     facts = {"file": path, "sha256": file_sha256(path), "kind": checkpoint.kind,
              "parameters": sum(tensor.numel() for tensor in learnt)}  # fmt: skip
     for name, value in {**facts, **checkpoint.facts, **config}.items():
         print(f"{name}: {value}")
     return 0
+
+
+def _settings_of(checkpoint: "Checkpoint", source: str) -> dict[str, Any]:
+    """Give the settings of weights as they are used today; of an encoder those of its file."""
+    from depthpose.depth import weights as of_depth
+    from depthpose.pose import weights as of_pose
+
+    if checkpoint.kind in of_pose.POSE_NETWORKS:
+        return of_pose.settings_of(checkpoint, source)
+    if checkpoint.kind in (of_depth.BOTH, *of_depth.GENERATORS, *of_depth.MATCHERS):
+        return of_depth.settings_of(checkpoint, source)
+    return dict(checkpoint.config)
 
 
 def import_weights(

@@ -12,6 +12,8 @@ TruthKind = Literal["scan", "annotated", "disparity"]
 
 _MOST_FOCAL_PX = 20_000
 """Of pairs: several times that of the largest images; beyond it they would fill the memory."""
+_FOCAL_PX, _BASELINE_M, _DISPARITY_PX = f"[1, {_MOST_FOCAL_PX}]", "[0.0001, 1000]", "[0.01, 16384]"
+"""What the rigs of weights may be like: depth from them is a finite number above 0."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -152,7 +154,7 @@ class NetworkConfig(Settings):
     max_disparity_px: int = 192
     """Disparities below this are considered; a multiple of ``step_px``."""
 
-    work_focal_px: Annotated[float | None, "(0, inf)"] = None
+    work_focal_px: Annotated[float | None, _FOCAL_PX] = None
     """Pairs are brought to this focal length before matching [px]; None: matched as they are."""
 
     step_px: ClassVar[int] = 16
@@ -287,11 +289,11 @@ class GeneratorConfig(Settings):
     with_dropout: bool = True
     """Dropout of 0.5 in the inner decoder blocks while training."""
 
-    virtual_focal_px: Annotated[float, "(0, inf)"] = 493.0
+    virtual_focal_px: Annotated[float, _FOCAL_PX] = 493.0
     """Focal length of the imitated rig [px]; by default that at which KITTI's images have the 256
     rows of the thesis's crops: with fewer of the rows a network must guess the horizon."""
 
-    virtual_baseline_m: Annotated[float, "(0, inf)"] = 0.5327
+    virtual_baseline_m: Annotated[float, _BASELINE_M] = 0.5327
     """Baseline of the imitated rig [m]."""
 
     answer: ClassVar[Answer] = "matched"
@@ -320,7 +322,7 @@ class SelectionConfig(Settings):
     planes: Annotated[int, "[2, inf)"] = 32
     """Disparities that are distinguished, evenly spaced in their logarithm."""
 
-    disparity_px: Annotated[tuple[float, float], "(0, inf)", ASCENDING] = (1.2, 88.0)
+    disparity_px: Annotated[tuple[float, float], _DISPARITY_PX, ASCENDING] = (1.2, 88.0)
     """Least and largest disparity at the virtual rig [px]: 165 to 2.25 m at the default rig."""
 
     answer: Answer = "own"
@@ -333,10 +335,10 @@ class SelectionConfig(Settings):
     """Probability of a street below which an image is out of distribution, or mean confidence where
     ``with_street`` is false; 0: not checked. 'depthpose depth calibrate' finds it."""
 
-    virtual_focal_px: Annotated[float, "(0, inf)"] = 372.0
+    virtual_focal_px: Annotated[float, _FOCAL_PX] = 372.0
     """Focal length of the imitated rig [px]: half of KITTI's, as wide as 640 columns."""
 
-    virtual_baseline_m: Annotated[float, "(0, inf)"] = 0.5327
+    virtual_baseline_m: Annotated[float, _BASELINE_M] = 0.5327
     """Baseline of the imitated rig [m]."""
 
     side_multiple_px: ClassVar[int] = 32

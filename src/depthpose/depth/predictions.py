@@ -49,6 +49,9 @@ ENDINGS = (
 )  # fmt: skip
 """What follows ``NAME.`` in the names of the files of an estimate."""
 
+_DECIMALS = 6
+"""Of the numbers of a road in its file; more change from one run to the next, as threads add up in
+another order."""
 CLOUD_M = 80.0
 """Distance up to which a cloud is written, unless another is given."""
 COLOR_RANGE_M = (3.0, 80.0)
@@ -84,7 +87,7 @@ def write_estimate(
             write_bytes,
             f"{estimate.warning}\n".encode() if estimate.warning else None,
         ),
-        "ground.json": (files.write_json, estimate.ground and asdict(estimate.ground)),
+        "ground.json": (files.write_json, _rounded(estimate.ground)),
         "depth_m.npy": (files.write_map, depth_m),
         "depth.png": (files.write_depth_png, depth_m),
         "confidence.npy": (files.write_map, estimate.confidence),
@@ -102,6 +105,13 @@ def write_estimate(
             written.append(folder / f"{pair.name}.{ending}")
             write(written[-1], content)
     return written
+
+
+def _rounded(ground: Ground | None) -> dict[str, float] | None:
+    """Give what a file holds of a road: its digits that are the same in every run."""
+    if ground is None:
+        return None
+    return {name: round(value, _DECIMALS) for name, value in asdict(ground).items()}
 
 
 def is_finished(folder: Path, name: str) -> bool:

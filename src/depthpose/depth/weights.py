@@ -54,7 +54,7 @@ _FORMER = ("candidates", "encoder_kind", "scales", "test_mode", "with_agreement"
 """Settings of before, which weights files hold: networks have one value of each."""
 Use = Literal["images", "pairs"]
 """What networks are for: depth of single images, or of real pairs."""
-_GENERATORS = {
+GENERATORS = {
     "generator": GeneratorKind(config=GeneratorConfig, network=UNetGenerator),
     _SELECTION: GeneratorKind(config=SelectionConfig, network=SelectionGenerator),
 }
@@ -83,7 +83,7 @@ def read_depth_weights(
     Raises:
         InputError: not such weights, or weights that do not fit their own config.
     """
-    checkpoint, kinds = checkpoints.read_checkpoint(path), {**_GENERATORS, **MATCHERS}
+    checkpoint, kinds = checkpoints.read_checkpoint(path), {**GENERATORS, **MATCHERS}
     if checkpoint.kind not in (*kinds, BOTH):
         raise InputError(
             f"{path}: holds weights of kind {checkpoint.kind!r}; depth takes "
@@ -100,26 +100,47 @@ def read_depth_weights(
         given = checkpoint.state.items()
         state = {key.removeprefix(prefix): t for key, t in given if key.startswith(prefix)}
         parts[kind] = checkpoints.Checkpoint(kind=kind, config=config, state=state)
-    if is_both and not (set(parts) & set(_GENERATORS) and set(parts) & set(MATCHERS)):
+    if is_both and not (set(parts) & set(GENERATORS) and set(parts) & set(MATCHERS)):
         raise InputError(
             f"{path}: its config names {sorted(checkpoint.config)}, but it should hold a "
             "generator and a matcher; the file is damaged."
         )
     built: dict[str, Any] = {}
     for kind, part in parts.items():  # a generator first
-        if use == "pairs" and is_both and kind in _GENERATORS:
+        if use == "pairs" and is_both and kind in GENERATORS:
             continue
-        settings = {name: v for name, v in part.config.items() if name not in _FORMER}
-        config = config_from_dict(settings, kinds[kind].config, source=str(path))
+        config = _config_of(kind, part.config, str(path))
         make = partial(kinds[kind].network, config)
         built[kind] = checkpoints.build_network(make, part, str(path)).eval()
-        if use == "images" and kind in _GENERATORS and (answer or config.answer) == "own":
+        if use == "images" and kind in GENERATORS and (answer or config.answer) == "own":
             break  # it takes no matcher
     return DepthWeights(
-        generator=next((built[kind] for kind in _GENERATORS if kind in built), None),
+        generator=next((built[kind] for kind in GENERATORS if kind in built), None),
         matcher=next((built[kind] for kind in MATCHERS if kind in built), None),
         facts=checkpoint.facts,
     )
+
+
+def _config_of(kind: str, settings: Mapping[str, Any], source: str) -> Any:  # noqa: ANN401
+    """Build the config of a network from what a file holds of it."""
+    today = {name: value for name, value in settings.items() if name not in _FORMER}
+    return config_from_dict(today, {**GENERATORS, **MATCHERS}[kind].config, source=source)
+
+
+def settings_of(checkpoint: checkpoints.Checkpoint, source: str) -> dict[str, Any]:
+    """Give the settings of a file's networks as they are used today, by kind where there are two.
+
+    Retired settings are left out; those that the file does not have are at their defaults.
+
+    Raises:
+        InputError: a setting is unknown, or has a value that is refused.
+    """
+    if checkpoint.kind != BOTH:
+        return config_to_dict(_config_of(checkpoint.kind, checkpoint.config, source))
+    return {
+        kind: config_to_dict(_config_of(kind, settings, source))
+        for kind, settings in checkpoint.config.items()
+    }
 
 
 def read_generator(path: Path) -> Generator:
@@ -164,7 +185,7 @@ def write_depth_weights(
         with_half: store 16-bit floats: half the size.
     """
     parts: dict[str, Any] = {}
-    for name, kind in (*_GENERATORS.items(), *MATCHERS.items()):
+    for name, kind in (*GENERATORS.items(), *MATCHERS.items()):
         for part in (generator, matcher):
             if isinstance(part, kind.network):
                 parts[name] = part

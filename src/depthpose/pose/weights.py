@@ -6,6 +6,7 @@ from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from shlex import quote
+from typing import Any
 
 import torch
 
@@ -34,7 +35,7 @@ from depthpose.pose.types import ObjectModel
 DirectionNet = ResUNet | PointNet  #: networks whose points vote
 AnyNetwork = DirectionNet | DepthImageNet
 KIND = "geoposenet"
-_NETWORKS: dict[str, tuple[type[AnyNetwork], type]] = {
+POSE_NETWORKS: dict[str, tuple[type[AnyNetwork], type]] = {
     KIND: (ResUNet, ResUNetConfig),
     "pointnet": (PointNet, PointNetConfig),
     "depth-image": (DepthImageNet, DepthImageConfig),
@@ -115,7 +116,7 @@ def write_pose_weights(
     facts = dict(weights.facts)
     if isinstance(network, ResUNet):
         facts["norm_mode"] = network.config.norm
-    kind = next(kind for kind, (made, _) in _NETWORKS.items() if type(network) is made)
+    kind = next(kind for kind, (made, _) in POSE_NETWORKS.items() if type(network) is made)
     save_checkpoint(path, Checkpoint(kind=kind, config=config, state=state, facts=facts))
 
 
@@ -158,7 +159,7 @@ def known_numbers(path: Path) -> tuple[int, ...]:
         InputError: they are of another kind, or damaged.
     """
     checkpoint = read_checkpoint(path)
-    if checkpoint.kind not in _NETWORKS:
+    if checkpoint.kind not in POSE_NETWORKS:
         raise InputError(
             f"{path}: holds weights of kind {checkpoint.kind!r}, which know no objects; give those "
             "of a pose network ('depthpose weights list')"
@@ -237,18 +238,34 @@ def read_pose_weights(path: Path) -> PoseWeights:
     )
 
 
+def settings_of(checkpoint: Checkpoint, source: str) -> dict[str, Any]:
+    """Give the settings of a file's network, clouds and refusal as they are used today.
+
+    Retired settings are left out; those that the file does not have are at their defaults.
+
+    Raises:
+        InputError: a setting is unknown, or has a value that is refused.
+    """
+    _, kind = POSE_NETWORKS[checkpoint.kind]
+    kinds = {"network": kind, "cloud": CloudConfig, "refusal": RefusalConfig}
+    return {
+        name: config_to_dict(config_from_dict(checkpoint.config[name], of, source=source))
+        for name, of in kinds.items()
+    }
+
+
 def network_of(checkpoint: Checkpoint, source: str) -> AnyNetwork:
     """Build the network alone, in eval mode, of weights with or without their objects' surfaces.
 
     Raises:
         InputError: they are of another kind, or do not fit their own config.
     """
-    if checkpoint.kind not in _NETWORKS:
+    if checkpoint.kind not in POSE_NETWORKS:
         raise InputError(
             f"{source}: holds weights of kind {checkpoint.kind!r}, but a pose takes one of "
-            f"{', '.join(map(repr, _NETWORKS))}."
+            f"{', '.join(map(repr, POSE_NETWORKS))}."
         )
-    made, kind = _NETWORKS[checkpoint.kind]
+    made, kind = POSE_NETWORKS[checkpoint.kind]
     for name in ("network", "cloud", "refusal"):
         if not isinstance(checkpoint.config.get(name), Mapping):
             raise InputError(

@@ -303,9 +303,9 @@ class PoseEstimator:
             unit: as for :meth:`estimate`.
 
         Yields:
-            An estimate for each frame, whose ``tracking`` is ``tracked``, ``found`` or ``lost``; one
-            that cannot be taken, as None, or an image of another size than the camera's, has the
-            status ``unreadable`` and costs the others nothing.
+            An estimate for each frame, whose ``tracking`` is ``tracked``, ``found`` or ``lost``. A
+            frame that cannot be taken, as None or an image of another size than the camera's, has
+            the status ``unreadable`` and costs the others nothing.
 
         Raises:
             InputError: an unknown object, or a ``first`` that is no pose.
