@@ -88,6 +88,7 @@ COMMANDS: Sequence[Command] = (
         "pose train --cad {home}/bracket.stl --unit mm --config {home}/part.yaml --resume",
     ),
     Command("data make streets --number 2 --scale 0.15"),
+    Command("data make near --number 1 --first 12"),
     Command("data make objects --cad {home}/bracket.stl --unit mm --number 2"),
     Command("data pack {home}/pairs"),
     Command("data label {home}/pairs --weights {home}/m.safetensors --min-confidence 0"),

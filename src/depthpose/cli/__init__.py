@@ -43,6 +43,8 @@ COMMANDS = {
     "depth evaluate": ("depth:evaluate", "measure predictions by a named protocol"),
     "data make streets": (
         "data:make_streets", "synthetic streets with exact disparity and LiDAR, in KITTI's layout"),
+    "data make near": (
+        "data:make_near", "synthetic rooms, tables, bins and shelves with exact disparity"),
     "data make objects": (
         "data:make_objects", "synthetic frames of your CAD files on a table, in BOP's layout"),
     "data rectify": (

@@ -104,6 +104,38 @@ class StreetsConfig(Settings):
 
 
 @dataclass(frozen=True, kw_only=True)
+class NearConfig(Settings):
+    """What synthetic near scenes are like: rooms, tables, bins, shelves, walls with things."""
+
+    seed: Annotated[int, "[0, inf)"] = 0
+    """Another seed, other scenes."""
+
+    columns_px: Annotated[tuple[float, float], "[64, 4096]", ASCENDING] = (448.0, 800.0)
+    """Range of the width of the pictures."""
+
+    largest_share: Annotated[float, "[0.02, 0.9]"] = 0.5
+    """Largest disparity of the nearest thing as a share of the width; the least is 8 px."""
+
+    infrared_share: Annotated[float, "[0, 1]"] = 0.3
+    """Share of the pairs that infrared cameras take."""
+
+    dots_share: Annotated[float, "[0, 1]"] = 0.5
+    """Share of these pairs in which a projector adds a pattern of dots."""
+
+    grey_share: Annotated[float, "[0, 1]"] = 0.15
+    """Share of the other pairs that grey cameras take."""
+
+    border_share: Annotated[float, "[0, 1]"] = 0.15
+    """Share of the pairs with black borders, as a rectification leaves them."""
+
+    jpeg_share: Annotated[float, "[0, 1]"] = 0.3
+    """Share of the pairs that went through JPEG."""
+
+    rectification_error_px: Annotated[float, "[0, 10)"] = 0.15
+    """Deviation of the rows by which the right view is off, as after a real calibration."""
+
+
+@dataclass(frozen=True, kw_only=True)
 class PairsConfig(Settings):
     """Which pairs a training sees, and how."""
 

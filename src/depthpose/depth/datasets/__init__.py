@@ -18,5 +18,7 @@ from depthpose.depth.datasets.frames import project_lidar as project_lidar
 from depthpose.depth.datasets.frames import read_disparity as read_disparity
 from depthpose.depth.datasets.layouts import has_calibration as has_calibration
 from depthpose.depth.datasets.layouts import has_raw_frame as has_raw_frame
+from depthpose.depth.datasets.layouts import has_scene as has_scene
 from depthpose.depth.datasets.layouts import pack_frames as pack_frames
 from depthpose.depth.datasets.layouts import write_raw_frame as write_raw_frame
+from depthpose.depth.datasets.layouts import write_scene as write_scene

@@ -377,6 +377,42 @@ def write_raw_frame(folder: Path, drive: str, number: int, frame: RawFrame) -> N
     note_result(folder, f"{drive}/{name}", written)
 
 
+def has_scene(folder: Path, name: str) -> bool:
+    """Whether a scene of :func:`write_scene` is there, and every file of it as it was written."""
+    return is_whole(folder, name, [f"{name}/disp0.pfm"])
+
+
+def write_scene(folder: Path, name: str, frame: RawFrame) -> None:
+    """Write a pair of a rig of its own in Middlebury's layout: images, disparity, calibration.
+
+    ``NAME/im0.png``, ``im1.png``, ``disp0.pfm`` (hidden pixels too, infinity where unknown) and
+    ``calib.txt``.
+
+    Raises:
+        InputError: the disk refuses.
+    """
+    home, rig = folder / name, frame.rig
+    written = [home / part for part in ("im0.png", "im1.png", "disp0.pfm", "calib.txt")]
+    files.write_image(written[0], frame.left)
+    files.write_image(written[1], frame.right)
+    files.write_map(written[2], frame.disparity_px)
+    right = rig.K.clone()
+    right[0, 2] += rig.cx_right_minus_left_px
+    matrices = (
+        "; ".join(" ".join(f"{value:.10g}" for value in row) for row in K.tolist())
+        for K in (rig.K, right)
+    )
+    lines = [f"cam{k}=[{text}]" for k, text in enumerate(matrices)]
+    lines += [
+        f"doffs={rig.cx_right_minus_left_px:.10g}",
+        f"baseline={1000 * rig.baseline_m:.10g}",
+        f"width={rig.width}",
+        f"height={rig.height}",
+    ]
+    write_bytes(written[3], ("\n".join(lines) + "\n").encode())
+    note_result(folder, name, written)
+
+
 def _write_calibration(folder: Path, date: str, frame: RawFrame) -> None:
     """Write the calibration of a date once; one that is not as it was written, again."""
     rig, eye = frame.rig, np.eye(3)

@@ -5,6 +5,7 @@ picture, and a LiDAR of 64 beams as KITTI's; then frames and the dataset of them
 """
 
 from dataclasses import dataclass, replace
+from functools import cache
 from typing import NamedTuple
 
 import numpy as np
@@ -329,8 +330,62 @@ def draw_street(config: StreetsConfig, index: int) -> StreetFrame:
     return draw_scene(scene, resize_camera(rig, width, height), config, seed)
 
 
+@dataclass(frozen=True, kw_only=True)
+class Projector:
+    """Throws dots onto a scene, as active stereo cameras do."""
+
+    place_m: tuple[float, float, float]  #: in the left camera's frame
+    dots_per_radian: float  #: how dense they are
+    strength: float  #: light of a dot as a share of the light that is there
+
+
+@cache
+def _dots() -> Float[Tensor, "1024 1024"]:
+    """Make a pattern that repeats after 341 dots: three pixels of it are a dot's cell."""
+    rng = np.random.default_rng(79)
+    cells = 341
+    pattern = torch.zeros(3 * cells + 1, 3 * cells + 1)
+    row, column = torch.from_numpy(rng.integers(0, 3 * cells, (2, cells * cells)))
+    pattern[row, column] = torch.from_numpy(rng.uniform(0.5, 1, cells * cells)).float()
+    kernel = torch.tensor([[0.2, 0.5, 0.2], [0.5, 1.0, 0.5], [0.2, 0.5, 0.2]])
+    padded = F.pad(pattern[None, None], (1, 1, 1, 1), mode="circular")
+    return F.conv2d(padded, kernel[None, None])[0, 0].clamp(max=1.5)
+
+
+def _project_dots(
+    light: Float[Tensor, "h w 3"], sight: Sight, projector: Projector
+) -> Float[Tensor, "h w 3"]:
+    """Add the light of the dots on what a camera sees; what hides the projector is left out."""
+    height, width = sight.raster.depth_m.shape
+    depth_m = sight.raster.depth_m
+    column, row = torch.meshgrid(
+        torch.arange(width).double(), torch.arange(height).double(), indexing="xy"
+    )
+    rays = torch.stack([column, row, torch.ones_like(row)], -1) @ sight.K.inverse().T
+    points = rays.float() * depth_m[..., None] + sight.eye - torch.tensor(projector.place_m)
+    pattern = _dots()
+    side = len(pattern)
+    x, y = (
+        (3 * projector.dots_per_radian * points[..., k] / points[..., 2]).nan_to_num(0.0)
+        for k in (0, 1)
+    )
+    left, top = x.floor(), y.floor()
+    across, down = x - left, y - top
+    left, top = left.long(), top.long()
+    upper, lower = (
+        torch.lerp(pattern[r % side, left % side], pattern[r % side, (left + 1) % side], across)
+        for r in (top, top + 1)
+    )
+    dots = torch.lerp(upper, lower, down).where(depth_m.isfinite(), 0.0)
+    return light * (1 + projector.strength * dots[..., None])
+
+
 def draw_scene(
-    scene: StreetScene, rig: StereoRig, config: StreetsConfig, seed: tuple[int, ...] = (0,)
+    scene: StreetScene,
+    rig: StereoRig,
+    config: StreetsConfig,
+    seed: tuple[int, ...] = (0,),
+    projector: Projector | None = None,
 ) -> StreetFrame:
     """Draw a scene with a rig.
 
@@ -346,6 +401,9 @@ def draw_scene(
     K[1, 2] += rng.normal(0, 1) * config.rectification_error_px
     right = view_from(stage, K, (rig.height, rig.width), torch.tensor([rig.baseline_m, 0.0, 0.0]))
     light, other_light = draw_light(stage, left), draw_light(stage, right)
+    if projector is not None:
+        light = _project_dots(light, left, projector)
+        other_light = _project_dots(other_light, right, projector)
     sensors = draw_sensors(rng, light, config.jpeg_share)
     points = scan(stage, rng) if config.with_lidar else None
     primitive, depth_m = left.raster.primitive, left.raster.depth_m

@@ -200,7 +200,8 @@ def kitti_rig(number: int = 0) -> StereoRig:
     return StereoRig(width=width, height=height, K=K, baseline_m=baseline_m)
 
 
-def _log_uniform(rng: np.random.Generator, low: float, high: float) -> float:
+def log_uniform(rng: np.random.Generator, low: float, high: float) -> float:
+    """Draw a number whose logarithm is equally likely between those of two others."""
     return float(np.exp(rng.uniform(np.log(low), np.log(high))))
 
 
@@ -222,7 +223,7 @@ def make_clutter(seed: tuple[int, ...]) -> StreetScene:
 
     def sheet(corner: Values, along: Values, up: Values) -> None:
         b.thing += 1
-        b.rectangle(corner, along, up, _surface(rng, rng.uniform(0.5, 4)))
+        b.rectangle(corner, along, up, random_surface(rng, rng.uniform(0.5, 4)))
 
     # A ground, somewhat aslant; a wall across the view and a ground; or the inside of a box.
     kind = int(rng.integers(3))
@@ -245,10 +246,10 @@ def make_clutter(seed: tuple[int, ...]) -> StreetScene:
         sheet([-150, y, 0], [300, rng.normal(0, 8), 0], [0, slope * 300, 300])
     for _ in range(int(rng.integers(12, 60))):
         b.thing += 1
-        z = _log_uniform(rng, *_DEPTHS_M)
+        z = log_uniform(rng, *_DEPTHS_M)
         centre = np.array([rng.uniform(-0.95, 0.95) * z, rng.uniform(-0.3, 0.3) * z, z])
-        size_m = min(z, 25.0) * _log_uniform(rng, 0.03, 0.3)
-        _add_shape(b, _SHAPES[int(rng.integers(len(_SHAPES)))], centre, size_m)
+        size_m = min(z, 25.0) * log_uniform(rng, 0.03, 0.3)
+        add_shape(b, _SHAPES[int(rng.integers(len(_SHAPES)))], centre, size_m)
     mesh = b.finish()
     # Nothing may come nearer than the rig's largest disparity allows; but a backdrop reaches behind
     # the camera, and its triangles are large.
@@ -265,49 +266,49 @@ def make_clutter(seed: tuple[int, ...]) -> StreetScene:
     )
 
 
-def _surface(rng: np.random.Generator, size_m: float) -> Surface:
+def random_surface(rng: np.random.Generator, size_m: float) -> Surface:
     """Anything of any colour, from nearly black to nearly white, mostly pale."""
     names = _PLAIN if rng.random() < _PLAIN_SHARE else _RICH
-    tile_m = size_m * _log_uniform(rng, 0.15, 3.0)
-    material, grey = names[int(rng.integers(len(names)))], _log_uniform(rng, 0.03, 0.8)
+    tile_m = size_m * log_uniform(rng, 0.15, 3.0)
+    material, grey = names[int(rng.integers(len(names)))], log_uniform(rng, 0.03, 0.8)
     color = np.clip(grey * np.exp(rng.normal(0, rng.choice([0.05, 0.4, 1.0]), 3)), 0.01, 0.9)
     return Surface(material, tuple(color.tolist()), tile_m, int(rng.integers(8)))
 
 
-def _rotation(rng: np.random.Generator) -> Rotation:
+def random_rotation(rng: np.random.Generator) -> Rotation:
     """Any rotation, all equally likely."""
     q, r = np.linalg.qr(rng.normal(size=(3, 3)))
     q = q * np.sign(np.diag(r))
     return q * np.sign(np.linalg.det(q))
 
 
-def _add_shape(b: MeshBuilder, kind: str, centre: np.ndarray, size_m: float) -> None:
+def add_shape(b: MeshBuilder, kind: str, centre: np.ndarray, size_m: float) -> None:
     """Add one of ``_SHAPES`` about a point."""
     rng = b.rng
     match kind:
         case "ball":
             radii = size_m / 2 * rng.uniform(0.5, 1.5, 3)
             dents = rng.uniform(0, 0.5) if rng.random() < 0.6 else 0.0
-            add_ball(b, centre, radii, _surface(rng, size_m), 3, dents)
+            add_ball(b, centre, radii, random_surface(rng, size_m), 3, dents)
         case "box":
-            R = _rotation(rng) if rng.random() < 0.5 else np.eye(3)
+            R = random_rotation(rng) if rng.random() < 0.5 else np.eye(3)
             sides = size_m * np.exp(rng.normal(0, 0.6, 3))
-            b.box(centre, sides, _surface(rng, size_m), R, rng.uniform(0.4, 1))
+            b.box(centre, sides, random_surface(rng, size_m), R, rng.uniform(0.4, 1))
         case "card":
-            R = _rotation(rng)
+            R = random_rotation(rng)
             along, up = R[0] * size_m * rng.uniform(0.5, 2), R[1] * size_m * rng.uniform(0.5, 2)
-            b.rectangle(centre - (along + up) / 2, along, up, _surface(rng, size_m))
+            b.rectangle(centre - (along + up) / 2, along, up, random_surface(rng, size_m))
         case "pole":
-            half = _rotation(rng)[0] * size_m * rng.uniform(0.7, 3)
+            half = random_rotation(rng)[0] * size_m * rng.uniform(0.7, 3)
             if rng.random() < 0.5:
                 half = half * [0.05, 1, 0.05]
-            radius = size_m * _log_uniform(rng, 0.01, 0.2)
+            radius = size_m * log_uniform(rng, 0.01, 0.2)
             radii = (radius, radius * rng.uniform(0.3, 1))
-            b.tube(centre - half, centre + half, radii, _surface(rng, size_m), 10)
+            b.tube(centre - half, centre + half, radii, random_surface(rng, size_m), 10)
         case "fence":  # bars side by side: what repeats has many matches
             turn = rng.uniform(-0.8, 0.8)
             along = np.array([np.cos(turn), 0, np.sin(turn)]) * size_m * rng.uniform(1, 3)
-            up, surface = np.array([0, size_m / 2, 0]), _surface(rng, size_m)
+            up, surface = np.array([0, size_m / 2, 0]), random_surface(rng, size_m)
             count = int(rng.integers(4, 20))
             radius = float(np.linalg.norm(along)) / count * rng.uniform(0.05, 0.3)
             for share in np.linspace(-0.5, 0.5, count):
@@ -317,8 +318,8 @@ def _add_shape(b: MeshBuilder, kind: str, centre: np.ndarray, size_m: float) -> 
                 middle = centre + height * up
                 b.tube(middle - along / 2, middle + along / 2, radius, surface)
         case "wheel":  # a rim with spokes: what lies behind is seen through the gaps
-            R = _rotation(rng) if rng.random() < 0.5 else np.eye(3)
-            surface, radius = _surface(rng, size_m), size_m * rng.uniform(0.5, 1.2)
+            R = random_rotation(rng) if rng.random() < 0.5 else np.eye(3)
+            surface, radius = random_surface(rng, size_m), size_m * rng.uniform(0.5, 1.2)
             angle = np.linspace(0, 2 * np.pi, 25)[:, None]
             rim = centre + radius * (np.cos(angle) * R[0] + np.sin(angle) * R[1])
             thick = radius * rng.uniform(0.03, 0.2)
@@ -328,9 +329,9 @@ def _add_shape(b: MeshBuilder, kind: str, centre: np.ndarray, size_m: float) -> 
             for place in np.linspace(0, 24, int(rng.integers(3, 14)), endpoint=False).astype(int):
                 b.tube(centre, rim[place], (thin * rng.uniform(1, 2), thin), surface, 6)
         case "lattice":  # flat bars that cross, as shelves, window frames and benches have
-            R = _rotation(rng) if rng.random() < 0.3 else np.eye(3)
+            R = random_rotation(rng) if rng.random() < 0.3 else np.eye(3)
             sides = size_m * rng.uniform(0.6, 2.5, 2)
-            surface, deep = _surface(rng, size_m), size_m * float(np.exp(rng.uniform(-4, 0)))
+            surface, deep = random_surface(rng, size_m), size_m * float(np.exp(rng.uniform(-4, 0)))
             for axis in (0, 1):
                 count = int(rng.integers(2, 8))
                 bar = np.array([*sides, deep])
@@ -340,5 +341,5 @@ def _add_shape(b: MeshBuilder, kind: str, centre: np.ndarray, size_m: float) -> 
         case _:  # leaves
             radii = size_m * rng.uniform(0.4, 1.2, 3)
             count, length_m = int(rng.integers(100, 1200)), size_m * rng.uniform(0.03, 0.2)
-            surface, is_block = _surface(rng, size_m), bool(rng.random() < 0.3)
+            surface, is_block = random_surface(rng, size_m), bool(rng.random() < 0.3)
             add_leaves(b, centre, radii, count, length_m, surface, is_block)

@@ -1,0 +1,425 @@
+"""Near scenes: rooms, tables, bins, shelves and walls with things, from 5 cm to 20 m.
+
+Disparity depends on the shape of a scene and on how far away it is in baselines, not on its size in
+metres. So a scene is built and lit at the scale at which its baseline is that of a street's rig,
+where textures, shadows and lenses have their usual sizes, and given in its true metres at the end.
+"""
+
+from dataclasses import dataclass, replace
+from itertools import pairwise
+from typing import Literal
+
+import numpy as np
+import torch
+
+from depthpose.core.camera import StereoRig
+from depthpose.core.camera.pinhole import intrinsics
+from depthpose.core.camera.rectified import grey_of
+from depthpose.core.errors import InputError
+from depthpose.depth.config import NearConfig, StreetsConfig
+from depthpose.depth.synthetic.dataset import Projector, StreetFrame, draw_scene
+from depthpose.depth.synthetic.mesh import MeshBuilder, Rotation, Surface, Values
+from depthpose.depth.synthetic.scene import (
+    Markings,
+    StreetScene,
+    add_shape,
+    draw_weather,
+    log_uniform,
+    random_rotation,
+    random_surface,
+)
+from depthpose.depth.types import Mask, View
+
+NearKind = Literal["room", "table", "bin", "shelf", "wall"]
+"""What a scene shows."""
+
+_KINDS: tuple[NearKind, ...] = ("room", "table", "table", "bin", "shelf", "wall")
+"""One is named as often as it is met."""
+
+_DRAWN_BASELINE_M = 0.5
+"""Baseline at which scenes are drawn; a true one of 5 cm makes everything ten times as small."""
+
+_BASELINES_M = (0.01, 0.54)
+_DISTANCES_M = (0.05, 5.0)
+"""Of the nearest thing, in true metres."""
+_FARTHEST_M = 20.0
+"""Of a backdrop, in true metres."""
+
+_BARE = ("paint", "skin", "plaster", "metal")
+"""Materials that show next to nothing where a tile of them is much larger than the surface."""
+
+_SHAPES = ("ball", "box", "box", "card", "pole", "fence", "wheel", "lattice", "leaves",
+           "bracket", "flange", "spool", "bottle", "mug", "books", "cable", "stool")  # fmt: skip
+"""What lies and stands in a scene; one is named as often as it is met."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class NearScene:
+    """A near scene at the scale at which it is drawn, and the rig that sees it."""
+
+    scene: StreetScene  #: what is drawn, in the frame of the left camera
+    rig: StereoRig  #: its cameras at that scale
+    metres_per_unit: float  #: true metres of one of its metres
+    kind: NearKind  #: what it shows
+
+
+def make_near(config: NearConfig, index: int) -> NearScene:
+    """Make scene ``index``: a function of the configuration and the index alone.
+
+    Raises:
+        InputError: the index is negative.
+    """
+    if index < 0:
+        raise InputError(f"index is {index}, but scenes are counted from 0; take another")
+    rng = np.random.default_rng([76, config.seed, index])
+    low, high = config.columns_px
+    width = 16 * round(rng.uniform(low, high) / 16)
+    height = 8 * round(width * float(rng.choice([3 / 4, 9 / 16, 5 / 8])) / 8)
+    focal_px = width * rng.uniform(0.55, 1.6)
+    largest_px = log_uniform(rng, 8, config.largest_share * width)
+    near_m = focal_px * _DRAWN_BASELINE_M / largest_px
+    # A baseline that puts the nearest thing into the true range.
+    baseline_m = log_uniform(rng, *_BASELINES_M)
+    distance_m = np.clip(near_m * baseline_m / _DRAWN_BASELINE_M, *_DISTANCES_M)
+    least, most = (limit_m / _DRAWN_BASELINE_M for limit_m in _BASELINES_M)
+    metres_per_unit = float(np.clip(distance_m / near_m, least, most))
+
+    K = intrinsics(focal_px, focal_px, (width - 1) / 2, (height - 1) / 2)
+    rig = StereoRig(width=width, height=height, K=K, baseline_m=_DRAWN_BASELINE_M)
+    kind = _KINDS[int(rng.integers(len(_KINDS)))]
+    place = _Place(rng, near_m, (width / focal_px / 2, height / focal_px / 2))
+    farthest = min(12.0, _FARTHEST_M / (near_m * metres_per_unit))
+    match kind:
+        case "room":
+            place.add_room(near_m * log_uniform(rng, 1.5, farthest))
+            place.scatter(int(rng.integers(6, 40)))
+        case "table" | "bin":
+            place.add_table(is_bin=kind == "bin")
+        case "shelf":
+            place.add_shelf()
+        case "wall":
+            place.add_wall(near_m * log_uniform(rng, 1.2, 6))
+            place.scatter(int(rng.integers(3, 30)))
+    mesh = place.builder.finish()
+    # Nothing but a backdrop, which reaches beside the camera, may come nearer than the nearest.
+    is_far = mesh.corners[:, :, 2].min(1) > 0.97 * near_m
+    kept = is_far | (mesh.thing <= place.backdrop)
+    weather = replace(draw_weather(rng), haze_m=1e5)
+    scene = StreetScene(
+        mesh=mesh.part(kept),
+        markings=Markings(
+            lines=np.zeros((0, 4)), bars=np.zeros((0, 5)), brightness=0.5, wheel_tracks=(0.0, 3.0)
+        ),
+        weather=weather,
+        camera_from_world=np.eye(3),
+        place="clutter",
+    )
+    return NearScene(scene=scene, rig=rig, metres_per_unit=metres_per_unit, kind=kind)
+
+
+def draw_near(config: NearConfig, index: int) -> StreetFrame:
+    """Draw scene ``index``, in true metres.
+
+    In a share of the pairs both cameras see infrared, in grey; in a share of these a projector
+    beside them adds dots. A share has black borders, whose truth is unknown.
+    """
+    made = make_near(config, index)
+    rng = np.random.default_rng([78, config.seed, index])
+    is_infrared = bool(rng.random() < config.infrared_share)
+    projector = None
+    if is_infrared and rng.random() < config.dots_share:
+        projector = Projector(
+            place_m=(float(rng.uniform(-0.5, 1.0)) * _DRAWN_BASELINE_M, 0.0, 0.0),
+            # Three to ten pixels apart.
+            dots_per_radian=float(made.rig.K[0, 0]) / log_uniform(rng, 3, 10),
+            strength=log_uniform(rng, 0.15, 4),
+        )
+    settings = StreetsConfig(
+        seed=config.seed,
+        jpeg_share=config.jpeg_share,
+        rectification_error_px=config.rectification_error_px,
+    )
+    seed = (config.seed, index, 78)
+    frame = draw_scene(made.scene, made.rig, settings, seed, projector)
+
+    views = [frame.left, frame.right]
+    if is_infrared:
+        shares = torch.from_numpy(rng.dirichlet([2, 2, 2])).float()[:, None, None]
+        views = [(view * shares).sum(0, keepdim=True).expand(3, -1, -1) for view in views]
+    elif rng.random() < config.grey_share:
+        views = [grey_of(view).expand(3, -1, -1) for view in views]
+    left_px, right_px = frame.disparity_px, frame.right_disparity_px
+    if rng.random() < config.border_share:
+        views, unknown = _with_borders(rng, views)
+        left_px, right_px = (
+            px.masked_fill(is_black, torch.nan)
+            for px, is_black in zip((left_px, right_px), unknown, strict=True)
+        )
+    true_rig = replace(frame.rig, baseline_m=frame.rig.baseline_m * made.metres_per_unit)
+    return replace(
+        frame,
+        left=(views[0] * 255).round() / 255,
+        right=(views[1] * 255).round() / 255,
+        disparity_px=left_px,
+        right_disparity_px=right_px,
+        depth_m=frame.depth_m * made.metres_per_unit,
+        rig=true_rig,
+    )
+
+
+def _with_borders(rng: np.random.Generator, views: list[View]) -> tuple[list[View], list[Mask]]:
+    """Blacken borders, each view its own, as a rectification leaves them; say which pixels."""
+    height, width = views[0].shape[1:]
+    blackened, unknown = [], []
+    for view in views:
+        columns, rows = (np.round(rng.uniform(0, 0.06, 2) * side).astype(int) for side in
+                         (width, height))  # fmt: skip
+        is_black = torch.ones(height, width, dtype=torch.bool)
+        is_black[rows[0] : height - rows[1], columns[0] : width - columns[1]] = False
+        blackened.append(view.masked_fill(is_black, 0.0))
+        unknown.append(is_black)
+    return blackened, unknown
+
+
+class _Place:
+    """Adds to a scene, within what a camera sees of it.
+
+    Args:
+        rng: decides.
+        near_m: nothing is nearer.
+        half: tangents of half of the camera's angles across and down.
+    """
+
+    def __init__(self, rng: np.random.Generator, near_m: float, half: tuple[float, float]) -> None:
+        self.rng, self.near_m, self.half = rng, near_m, half
+        self.builder = MeshBuilder(rng)
+        self.backdrop = 0
+        self.far_m = near_m
+
+    def surface(self, size_m: float, bare_share: float = 0.3) -> Surface:
+        """Anything of any colour, or something without any texture."""
+        rng = self.rng
+        chosen = random_surface(rng, size_m)
+        if rng.random() >= bare_share:
+            return chosen
+        material = _BARE[int(rng.integers(len(_BARE)))]
+        return chosen._replace(material=material, tile_m=size_m * rng.uniform(3, 40))
+
+    def sheet(self, corner: Values, along: Values, up: Values) -> None:
+        """Add a large rectangle; nothing of it is cut off for being near."""
+        self.builder.thing += 1
+        size_m = float(np.linalg.norm(np.asarray(along, float)))
+        surface = self.surface(self.near_m * log_uniform(self.rng, 0.3, 3), 0.45)
+        if surface.material in _BARE:
+            surface = surface._replace(tile_m=size_m)
+        self.builder.rectangle(corner, along, up, surface)
+        self.backdrop = self.builder.thing
+
+    def add_wall(self, far_m: float) -> None:
+        """Add a plane across the view, at any slant that keeps all of it far enough."""
+        turn, nod = self.rng.normal(0, 0.45, 2)
+        # z = far + turn * x + nod * y; on the ray (u, v, 1) that is far / (1 - turn u - nod v).
+        least = 1 - abs(turn) * self.half[0] - abs(nod) * self.half[1]
+        most = 1 + abs(turn) * self.half[0] + abs(nod) * self.half[1]
+        if least < 0.15:
+            turn, nod, most = 0.0, 0.0, 1.0
+        far_m = max(far_m, self.near_m * most)
+        reach = 30 * far_m
+        along = np.array([1, 0, turn]) * 2 * reach
+        up = np.array([0, -1, -nod]) * 2 * reach
+        self.sheet(np.array([0, 0, far_m]) - (along + up) / 2, along, up)
+        self.far_m = far_m
+
+    def add_room(self, far_m: float) -> None:
+        """Add a floor, a back wall, mostly two side walls, sometimes a ceiling."""
+        rng, near_m = self.rng, self.near_m
+        half = near_m * self.half[0] * log_uniform(rng, 1, 4)
+        floor, top = (near_m * self.half[1] * log_uniform(rng, 1, 4) for _ in range(2))
+        up = [0, -(floor + top), 0]
+        self.sheet([-half, floor, 0], [2 * half, 0, 0], [0, 0, far_m])
+        wide = max(half, 3 * far_m * self.half[0])
+        is_closed = rng.random() < 0.7
+        across = half if is_closed else wide
+        high = [0, -30 * far_m, 0]
+        self.sheet([-across, floor, far_m], [2 * across, 0, 0], up if is_closed else high)
+        if is_closed:
+            for x in (-half, half):
+                self.sheet([x, floor, 0], [0, 0, far_m], up)
+            self.sheet([-half, -top, 0], [2 * half, 0, 0], [0, 0, far_m])
+        self.far_m = far_m
+
+    def add_table(self, *, is_bin: bool) -> None:
+        """Add a plane seen from anywhere above it, a wall behind, and things that lie on it."""
+        rng, near_m = self.rng, self.near_m
+        tilt = np.deg2rad(rng.uniform(0, 75 if not is_bin else 35))
+        roll = rng.normal(0, 0.15)
+        # Up from the plane, towards the camera: straight at it, or aslant.
+        normal = np.array([np.sin(roll), -np.sin(tilt), -np.cos(tilt) * np.cos(roll)])
+        normal /= np.linalg.norm(normal)
+        right = np.cross(normal, [0.0, 1, 0]) if tilt < 0.1 else np.cross([0.0, 0, -1], normal)
+        right /= np.linalg.norm(right)
+        ahead = np.cross(right, normal)
+        # The plane passes through the axis so far away that its nearest visible corner is far
+        # enough; a ray (u, v, 1) meets it at z = distance * normal_z / (normal . ray).
+        rays = np.array([[u, v, 1.0] for u in (-1, 0, 1) for v in (-1, 0, 1)])
+        rays[:, :2] *= self.half
+        aligned = rays @ normal
+        nearest = (normal[2] / aligned[aligned < -0.03]).min()
+        distance_m = near_m * rng.uniform(1.05, 1.6) / nearest
+        middle = np.array([0, 0, distance_m])
+        extent_m = distance_m * log_uniform(rng, 0.5, 4)
+        if is_bin:
+            extent_m = distance_m * self.half[0] * rng.uniform(0.6, 1.2)
+        self.add_wall(distance_m * log_uniform(rng, 1.3, 5))
+        corner = middle - extent_m * (right + ahead)
+        self.sheet(corner, 2 * extent_m * right, 2 * extent_m * ahead)
+        height_m = extent_m * rng.uniform(0.15, 0.6)
+        if is_bin:
+            self.builder.thing += 1
+            for one, other in ((right, ahead), (-right, ahead), (ahead, right), (-ahead, right)):
+                start = middle + extent_m * (one - other)
+                surface = self.surface(extent_m)
+                self.builder.rectangle(start, 2 * extent_m * other, height_m * normal, surface)
+        # Things on it: their places by the rays that see the plane.
+        common = _SHAPES[int(rng.integers(len(_SHAPES)))] if is_bin else None
+        common_m = distance_m * self.half[0] * log_uniform(rng, 0.1, 0.5)
+        for _ in range(int(rng.integers(20, 70) if is_bin else rng.integers(2, 30))):
+            ray = np.array([*(rng.uniform(-1, 1, 2) * self.half), 1.0])
+            away = float(ray @ normal)
+            if away > -0.05:
+                continue
+            z = distance_m * normal[2] / away
+            size_m = common_m if common else z * self.half[0] * log_uniform(rng, 0.08, 0.7)
+            lift = rng.uniform(0.1, 1.0) * height_m if common else rng.uniform(0.2, 0.6) * size_m
+            self.thing(ray * z + lift * normal, size_m, common)
+        self.far_m = distance_m
+
+    def add_shelf(self) -> None:
+        """Add boards and uprights before a wall, with things between them."""
+        rng, near_m = self.rng, self.near_m
+        depth_m = near_m * rng.uniform(0.1, 0.8)
+        front_m = near_m * rng.uniform(1.02, 1.5)
+        back_m = front_m + depth_m
+        self.add_wall(back_m * rng.uniform(1.0, 1.6))
+        half_x, half_y = (back_m * side * rng.uniform(0.6, 1.5) for side in self.half)
+        thick_m = depth_m * rng.uniform(0.02, 0.12)
+        surface = self.surface(half_x)
+        turn = rng.normal(0, 0.25)
+        rotation = np.array(
+            [[np.cos(turn), 0, np.sin(turn)], [0, 1, 0], [-np.sin(turn), 0, np.cos(turn)]]
+        )
+        middle = np.array([0, 0, front_m + depth_m / 2])
+        levels = np.linspace(-half_y, half_y, int(rng.integers(2, 6)))
+        columns = np.linspace(-half_x, half_x, int(rng.integers(2, 6)))
+        self.builder.thing += 1
+        for y in levels:
+            size = (2 * half_x, thick_m, depth_m)
+            self.builder.box(middle + rotation @ [0, y, 0], size, surface, rotation)
+        for x in columns:
+            size = (thick_m, 2 * half_y, depth_m)
+            self.builder.box(middle + rotation @ [x, 0, 0], size, surface, rotation)
+        cell_m = float(levels[1] - levels[0])
+        for _ in range(int(rng.integers(5, 40))):
+            size_m = cell_m * rng.uniform(0.2, 0.8)
+            floor = levels[int(rng.integers(1, len(levels)))] - thick_m / 2
+            where = np.array([
+                rng.uniform(-half_x, half_x), floor - size_m / 2, rng.uniform(-0.4, 0.4) * depth_m
+            ])  # fmt: skip
+            self.thing(middle + rotation @ where, size_m)
+        self.far_m = back_m
+
+    def scatter(self, count: int) -> None:
+        """Put things anywhere between the nearest distance and the backdrop."""
+        rng = self.rng
+        for _ in range(count):
+            z = log_uniform(rng, 1.05 * self.near_m, max(1.1 * self.near_m, self.far_m))
+            centre = np.array([*(rng.uniform(-1, 1, 2) * self.half * z), z])
+            self.thing(centre, z * self.half[0] * log_uniform(rng, 0.06, 0.7))
+
+    def thing(self, centre: np.ndarray, size_m: float, kind: str | None = None) -> None:
+        """Add one of the shapes about a point, at least as far away as allowed."""
+        rng, b = self.rng, self.builder
+        b.thing += 1
+        least_m = self.near_m + 0.6 * size_m
+        centre = centre * max(1.0, least_m / max(float(centre[2]), 1e-6))
+        name = kind or _SHAPES[int(rng.integers(len(_SHAPES)))]
+        surface = self.surface(size_m)
+        R = random_rotation(rng) if rng.random() < 0.6 else np.eye(3)
+        match name:
+            case "bracket":  # two plates at a right angle, with a rib
+                long, wide, high = size_m * rng.uniform(0.4, 1, 3)
+                thick = size_m * rng.uniform(0.04, 0.15)
+                plates = (
+                    ((0, 0, 0), (long, thick, wide)),
+                    ((-long / 2, -high / 2, 0), (thick, high, wide)),
+                    ((-long / 3, -high / 5, 0), (long / 2, high / 2, thick)),
+                )
+                for at, size in plates:
+                    b.box(centre + R @ np.array(at), size, surface, R)
+            case "flange" | "spool":  # discs on a tube
+                axis, radius = R[:, 1], size_m * rng.uniform(0.3, 0.6)
+                length = size_m * rng.uniform(0.15, 1.0)
+                start, end = centre - axis * length / 2, centre + axis * length / 2
+                inner = radius * rng.uniform(0.3, 0.7)
+                b.tube(start, end, inner, surface, 24)
+                for at in (start, end) if name == "spool" else (start,):
+                    rim = at + axis * radius * rng.uniform(0.05, 0.25)
+                    b.tube(at, rim, radius, surface, 32)
+                    for face in (at, rim):
+                        b.disc(face, axis, radius, surface, 32)
+                b.disc(end, axis, inner, surface, 24)
+            case "bottle":
+                axis, radius = R[:, 1], size_m * rng.uniform(0.15, 0.3)
+                start = centre - axis * size_m / 2
+                marks = np.cumsum([0, *(size_m * rng.uniform(0.1, 0.5, 3))])
+                widths = (radius, radius, radius * rng.uniform(0.2, 0.5))
+                for low, high, one, other in zip(marks, marks[1:], widths, (*widths[1:], widths[2]),
+                                                 strict=False):  # fmt: skip
+                    b.tube(start + axis * low, start + axis * high, (one, other), surface, 24)
+                b.disc(start + axis * marks[3], axis, widths[2], surface, 24)
+            case "mug":
+                axis, radius = R[:, 1], size_m * rng.uniform(0.25, 0.4)
+                start, end = centre - axis * size_m / 2, centre + axis * size_m / 2
+                b.tube(start, end, radius, surface, 28)
+                b.tube(start, end, 0.9 * radius, surface, 28)
+                b.disc(start, axis, radius, surface, 28)
+                angle = np.linspace(-1.2, 1.2, 8)
+                for one, other in pairwise(angle):
+                    places = [
+                        centre + R[:, 0] * (radius * (0.8 + 0.7 * np.cos(a)))
+                        + axis * (0.4 * size_m * np.sin(a)) for a in (one, other)
+                    ]  # fmt: skip
+                    b.tube(places[0], places[1], 0.12 * radius, surface, 8)
+            case _:
+                self._household(name, centre, size_m, surface, R)
+
+    def _household(
+        self, name: str, centre: np.ndarray, size_m: float, surface: Surface, R: Rotation
+    ) -> None:
+        """Add books, a cable or a stool, or one of the shapes of clutter."""
+        rng, b = self.rng, self.builder
+        match name:
+            case "books":
+                at, down = np.zeros(3), np.array([0.0, 1, 0])
+                for _ in range(int(rng.integers(2, 9))):
+                    b.thing += 1
+                    thick = size_m * rng.uniform(0.03, 0.15)
+                    size = (size_m * rng.uniform(0.4, 0.7), thick, size_m * rng.uniform(0.5, 0.9))
+                    b.box(centre + R @ (at + down * thick / 2), size, self.surface(size_m), R)
+                    at = at + down * thick
+            case "cable":
+                at, heading = centre, R[0]
+                for _ in range(int(rng.integers(5, 25))):
+                    step = at + heading * size_m * 0.12
+                    b.tube(at, step, size_m * 0.02, surface, 6)
+                    at, heading = step, heading + rng.normal(0, 0.4, 3)
+                    heading = heading / np.linalg.norm(heading)
+            case "stool":
+                half = size_m / 2
+                b.box(centre - R[:, 1] * half, (size_m, 0.08 * size_m, size_m), surface, R)
+                for x, z in ((-1, -1), (-1, 1), (1, -1), (1, 1)):
+                    foot = centre + R @ np.array([0.9 * x * half, half, 0.9 * z * half])
+                    head = foot - R[:, 1] * size_m
+                    b.tube(head, foot, size_m * 0.03, surface, 8)
+            case _:
+                add_shape(b, name, centre, size_m)
