@@ -1,0 +1,405 @@
+"""Colour as evidence: which of the poses that depth cannot tell apart shows the right print?
+
+At each pose the coloured surface that the camera sees is compared with the image: brightness, and
+red and blue each against green, all as logarithms. Exposure, white balance and a screen's gamma are
+then constants and factors, which a correlation does not see. What light adds to brightness by the
+direction of a surface (Lambert) is taken off both by regression on the normal.
+
+A correlation ``r`` of ``n`` independent places says how much of the image a pose explains: its log
+likelihood above that of a pose whose print has nothing to do with the image is
+``-n / 2 log(1 - r^2)``, that of a linear regression. Neighbouring places are not independent: ``n``
+is the effective number of a correlation between two fields that each correlate with themselves
+(Clifford, Richardson and Hemon 1989; Dutilleul 1993), so a smooth shade counts for little and fine
+print for much.
+"""
+
+import math
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import torch
+import torch.nn.functional as F
+from jaxtyping import Float, Float64, Int64
+from torch import Tensor
+
+from depthpose.core.arrays import take_evenly
+from depthpose.core.rigid import Rigid, geodesic_rad
+from depthpose.pose.mesh import near_symmetries, turn_about
+from depthpose.pose.types import Axis, ColorImage, ObjectModel, SurfaceColors, ViewInput
+
+_SAMPLES = 4000  # coloured points of a model that are compared, about a third of them visible
+_SWEPT = 1500  # in a sweep about an axis
+_FACING = 0.3  # least cosine between ray and normal: more slanted print is blurred along the slant
+_NEAR = 0.05  # of the diameter: a reading farther before the surface is of something else
+_LEAST_VISIBLE = 40  # points; fewer say nothing
+_BLUR = 1.0  # standard deviation of the image's blur, in distances of the model's coloured points
+_BLACK = 0.05  # of the range: what noise and stray light make of black
+_SATURATED = 0.98  # a channel of more is clipped, so the colour is false
+_DARK = 0.06  # where no channel has more, the colour is noise
+_PLAIN = 0.03  # standard deviation of a logarithm: of less contrast is no print
+_POINTS_AT_ONCE = 1_000_000
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class ColorAgreement:
+    """How the colours of a posed model and an image agree, for a batch of poses."""
+
+    #: of brightness, red against green, blue against green; 0 where model or image are plain.
+    correlation: Float64[Tensor, "b 3"]
+    places: Float64[Tensor, "b 3"]  #: independent ones that each correlation is of
+    visible: Int64[Tensor, " b"]  #: coloured points that were compared
+
+    @property
+    def score(self) -> Float64[Tensor, " b"]:
+        """Mean of the three correlations, -1 to 1."""
+        return self.correlation.mean(-1)
+
+    @property
+    def log_likelihood(self) -> Float64[Tensor, " b"]:
+        """Log likelihood of the image above that of a print that has nothing to do with it.
+
+        Differences are log odds between poses, and between objects at one place. It is 0 where
+        colour says nothing: a grey model, too few places, or a print that runs the other way.
+        """
+        explained = self.correlation.clamp(0, _MOST).square()
+        freedom = (self.places - _FITTED).clamp(min=0)
+        return (-freedom / 2 * torch.log1p(-explained)).sum(-1)
+
+
+_MOST = 0.99  # correlation that an image and a model can have: both are digitised
+_FITTED = 2  # a factor and a constant are fitted to the image
+
+
+def color_agreement(
+    poses: Rigid, model: ObjectModel, view: ViewInput, *, samples: int = _SAMPLES
+) -> ColorAgreement:
+    """Compare the colours of a posed model with an image, for each of a batch of poses.
+
+    Args:
+        poses: ``camera_from_model`` of the depth camera.
+        model: the object; without ``colors`` colour says nothing.
+        view: depth and colour; without ``color`` colour says nothing. Its mask limits where the
+            object is.
+        samples: how many coloured points of the model are looked at.
+    """
+    if model.colors is None or view.color is None:
+        nothing = torch.zeros(len(poses.R), 3, dtype=torch.float64)
+        return ColorAgreement(correlation=nothing, places=nothing, visible=nothing[:, 0].long())
+    surface = _thinned(model.colors, samples)
+    image = _blurred(view.color, poses, surface)
+    parts: list[ColorAgreement] = []
+    at_once = max(1, _POINTS_AT_ONCE // len(surface.points_m))
+    for first in range(0, len(poses.R), at_once):
+        some = poses[first : first + at_once].double()
+        seen = _look(some, surface, view, image, _NEAR * model.diameter_m)
+        correlation = _correlation(seen)
+        places = torch.where(correlation != 0, _independent_places(seen, surface), 0.0)
+        visible = seen.weight[..., 0].sum(-1).long()
+        parts.append(ColorAgreement(correlation=correlation, places=places, visible=visible))
+    return ColorAgreement(
+        correlation=torch.cat([part.correlation for part in parts]),
+        places=torch.cat([part.places for part in parts]),
+        visible=torch.cat([part.visible for part in parts]),
+    )
+
+
+def _thinned(colors: SurfaceColors, samples: int) -> SurfaceColors:
+    return SurfaceColors(
+        points_m=take_evenly(colors.points_m, samples),
+        normals=take_evenly(colors.normals, samples),
+        rgb=take_evenly(colors.rgb, samples),
+        spacing_m=colors.spacing_m,  # over which each colour is a mean, not where the next one is
+    )
+
+
+class _BlurredImage(NamedTuple):
+    """The part of a colour image about an object, as blurred as the model's colours are."""
+
+    rgb: Float[Tensor, "3 h w"]
+    left: int
+    top: int
+
+
+def _in_color_camera(
+    points_m: Float64[Tensor, "*b n 3"], color: ColorImage
+) -> tuple[Float64[Tensor, "*b n 2"], Float64[Tensor, "*b n"]]:
+    """Give pixels of a colour image, and depths, of points in the depth camera's frame."""
+    beside = color.color_from_depth
+    moved_m = points_m if beside is None else beside.double().apply(points_m)
+    depth_m = moved_m[..., 2]
+    pixels = (moved_m @ color.K.double().mT)[..., :2] / depth_m.clamp(min=1e-6)[..., None]
+    return pixels, depth_m
+
+
+def _blurred(color: ColorImage, poses: Rigid, surface: SurfaceColors) -> _BlurredImage:
+    """Blur an image over the distance of the model's colours, where the poses lie."""
+    some_m = take_evenly(surface.points_m, 300).double()
+    pixels, depth_m = _in_color_camera(poses.double().apply(some_m), color)
+    is_front = depth_m > 0
+    height, width = color.rgb.shape[1:]
+    if not bool(is_front.any()):
+        return _BlurredImage(color.rgb, 0, 0)
+    sigma = _BLUR * surface.spacing_m * float(color.K[0, 0] / depth_m[is_front].median())
+    sigma = min(max(sigma, 1.0), max(height, width) / 8)
+    reach = math.ceil(3 * sigma)
+    low = pixels[is_front].amin(0) - 2 * reach
+    high = pixels[is_front].amax(0) + 2 * reach
+    left, right = int(low[0].clamp(0, width - 1)), int(high[0].clamp(0, width - 1)) + 1
+    top, bottom = int(low[1].clamp(0, height - 1)), int(high[1].clamp(0, height - 1)) + 1
+    steps = torch.arange(-reach, reach + 1, dtype=torch.float32)
+    kernel = torch.exp(-(steps**2) / (2 * sigma**2))
+    kernel /= kernel.sum()
+    part = color.rgb[:, None, top:bottom, left:right].float()
+    part = F.conv2d(F.pad(part, (reach, reach, 0, 0), "replicate"), kernel[None, None, None])
+    part = F.conv2d(F.pad(part, (0, 0, reach, reach), "replicate"), kernel[None, None, :, None])
+    return _BlurredImage(part[:, 0], left, top)
+
+
+class _Seen(NamedTuple):
+    """Features of a model and of an image at the same places, each less its mean and shading."""
+
+    weight: Float64[Tensor, "b n 3"]  # 1 where a feature is compared, else 0
+    of_model: Float64[Tensor, "b n 3"]
+    of_image: Float64[Tensor, "b n 3"]
+
+
+def _features(rgb: Float64[Tensor, "*b 3"]) -> Float64[Tensor, "*b 3"]:
+    """Give logarithms of brightness, of red over green, and of blue over green."""
+    red, green, blue = (rgb + _BLACK).log().unbind(-1)
+    return torch.stack([(rgb.mean(-1) + _BLACK).log(), red - green, blue - green], -1)
+
+
+def _look(
+    poses: Rigid, surface: SurfaceColors, view: ViewInput, image: _BlurredImage, near_m: float
+) -> _Seen:
+    """Find what the cameras see of the posed surface, and what colours are there."""
+    assert view.color is not None
+    points_m = poses.apply(surface.points_m.double())
+    normals = surface.normals.double() @ poses.R.mT
+    distance_m = points_m.norm(dim=-1)
+    facing = -(normals * points_m).sum(-1) / distance_m.clamp(min=1e-9)
+
+    # The depth camera sees the surface, and nothing before it.
+    pixels = (points_m @ view.K.double().mT)[..., :2] / points_m[..., 2:].clamp(min=1e-6)
+    height, width = view.depth_m.shape
+    column, row = pixels.round().long().unbind(-1)
+    is_seen = (facing > _FACING) & (points_m[..., 2] > 0)
+    is_seen &= (column >= 0) & (column < width) & (row >= 0) & (row < height)
+    place = row.clamp(0, height - 1) * width + column.clamp(0, width - 1)
+    read_m = view.depth_m.flatten()[place].double()
+    is_seen &= ((read_m - points_m[..., 2]).abs() < near_m) & view.mask.flatten()[place]
+
+    # The colour camera's image there.
+    at, depth_m = _in_color_camera(points_m, view.color)
+    rows, columns = view.color.rgb.shape[1:]
+    u, v = at.unbind(-1)
+    is_seen &= (depth_m > 0) & (u >= 0) & (u <= columns - 1) & (v >= 0) & (v <= rows - 1)
+    side = torch.tensor(image.rgb.shape[:0:-1]).double().sub(1).clamp(min=1)
+    corner = torch.tensor([image.left, image.top]).double()
+    grid = (2 * (at - corner) / side - 1).float()
+    rgb = F.grid_sample(image.rgb[None], grid[None], align_corners=True)[0].double()
+    rgb = rgb.permute(1, 2, 0)
+
+    # Colour is false where a channel is clipped, and noise where all are dark.
+    has_color = (rgb.amax(-1) < _SATURATED) & (rgb.amax(-1) > _DARK)
+    weight = torch.stack([is_seen, is_seen & has_color, is_seen & has_color], -1).double()
+    of_model = _features(surface.rgb.double()).expand(len(points_m), -1, -1)
+    return _Seen(
+        weight=weight,
+        of_model=_without_light(of_model, normals, weight),
+        of_image=_without_light(_features(rgb), normals, weight),
+    )
+
+
+_RIDGE = 1e-4  # of the normals' second moments: a plane has no second direction
+
+
+def _without_light(
+    features: Float64[Tensor, "b n 3"],
+    normals: Float64[Tensor, "b n 3"],
+    weight: Float64[Tensor, "b n 3"],
+) -> Float64[Tensor, "b n 3"]:
+    """Take means off features, and off brightness what is linear in the normal (Lambert)."""
+    total = weight.sum(1, keepdim=True).clamp(min=1)
+    features = (features - (weight * features).sum(1, keepdim=True) / total) * weight
+    lit, used = features[..., :1], weight[..., :1]
+    sides = (normals - (used * normals).sum(1, keepdim=True) / total[..., :1]) * used
+    moments = sides.mT @ sides + _RIDGE * total[..., :1] * torch.eye(3, dtype=torch.float64)
+    shade = sides @ torch.linalg.solve(moments, sides.mT @ lit)
+    return torch.cat([lit - shade, features[..., 1:]], -1)
+
+
+def _correlation(seen: _Seen) -> Float64[Tensor, "b 3"]:
+    """Correlate what is seen; 0 where too little is, or either has no print."""
+    total = seen.weight.sum(1)
+    of_model = seen.of_model.square().sum(1)
+    of_image = seen.of_image.square().sum(1)
+    both = (seen.of_model * seen.of_image).sum(1)
+    least = _PLAIN**2 * total
+    is_printed = (of_model > least) & (of_image > least) & (total >= _LEAST_VISIBLE)
+    return torch.where(is_printed, both / (of_model * of_image).clamp(min=1e-12).sqrt(), 0.0)
+
+
+_PAIRED = 250  # visible points whose pairs give the correlation of neighbours
+_BINS = 16  # of distances, the finer the nearer
+_POSES_AT_ONCE = 16
+
+
+def _independent_places(seen: _Seen, surface: SurfaceColors) -> Float64[Tensor, "b 3"]:
+    """Effective number of places of a correlation of two fields with neighbours alike.
+
+    The variance of the correlation of two unrelated fields is the mean product of their
+    autocorrelations over all pairs of places (Dutilleul 1993). Products below 0, as those of
+    chance, are left out, so that the number is rather too small.
+    """
+    generator = torch.Generator().manual_seed(0)
+    key = torch.rand(seen.weight.shape[1], generator=generator, dtype=torch.float64)
+    count = min(_PAIRED, seen.weight.shape[1])
+    reach_m = float((surface.points_m.amax(0) - surface.points_m.amin(0)).norm())
+    found: list[Tensor] = []
+    for first in range(0, len(seen.weight), _POSES_AT_ONCE):
+        here = slice(first, first + _POSES_AT_ONCE)
+        chosen = (seen.weight[here, :, 0] * (1 + key)).topk(count, dim=1).indices
+        points_m = surface.points_m.double()[chosen]
+        apart = torch.cdist(points_m, points_m) / reach_m
+        number = (apart.sqrt() * _BINS).long().clamp(max=_BINS - 1)
+        number += _BINS * torch.arange(len(chosen))[:, None, None]
+        each = chosen[..., None].expand(-1, -1, 3)
+        weight, *fields = (values[here].gather(1, each) for values in seen)
+        pairs = torch.einsum("bif,bjf->fbij", weight, weight)
+        alike: list[Tensor] = []
+        for values in fields:
+            products = torch.einsum("bif,bjf->fbij", values, values)
+            binned = _binned(products, number) / _binned(pairs, number).clamp(min=1)
+            variance = values.square().sum(1).mT / weight.sum(1).mT.clamp(min=1)
+            alike.append(binned / variance.clamp(min=1e-12)[..., None])
+        product = (alike[0] * alike[1]).clamp(min=0)
+        off_diagonal = _binned(pairs, number) * product
+        # A place with itself is alike, whatever its bin says.
+        itself = weight.square().sum(1).mT
+        off_diagonal[..., 0] -= itself * product[..., 0]
+        total = itself.square()
+        variance = (off_diagonal.sum(-1) + itself) / total.clamp(min=1)
+        found.append((1 / variance.clamp(min=1 / count)).mT)
+    return torch.cat(found)
+
+
+def _binned(
+    values: Float64[Tensor, "f b m m"], number: Int64[Tensor, "b m m"]
+) -> Float64[Tensor, "f b bins"]:
+    """Sum values of pairs by the bin of their distance."""
+    flat = values.flatten(1)
+    sums = flat.new_zeros(len(flat), len(number) * _BINS)
+    return sums.index_add_(1, number.flatten(), flat).unflatten(1, (len(number), _BINS))
+
+
+_STEP_DEG = 5.0
+_FINE = 5  # finer steps in each of a sweep
+_MOST_SPINS = 3  # of one axis that are kept
+
+
+def copies_about_axis(
+    pose: Rigid, axis: Axis, model: ObjectModel, view: ViewInput, *, step_deg: float = _STEP_DEG
+) -> Rigid:
+    """Turn a pose about an axis of the model to where its print agrees with the image.
+
+    A sweep of the full turn finds where the agreement is largest; there, finer steps and the
+    parabola through the best three follow.
+
+    Args:
+        pose: ``camera_from_model``, one.
+        axis: of revolution, of the model's shape, or nearly so.
+        model: the object, with colours.
+        view: depth and colour.
+        step_deg: of the sweep; print narrower than it along the circumference is stepped over.
+
+    Returns:
+        Poses at the largest agreements, at most three, the best first; ``pose`` alone where colour
+        says nothing.
+    """
+    if model.colors is None or view.color is None:
+        return pose.double()[None]
+    steps = max(3, math.ceil(360 / step_deg))
+    step_rad = 2 * math.pi / steps
+    sweep_rad = torch.arange(steps, dtype=torch.float64) * step_rad
+    rough = _explained(_turned(pose, axis, sweep_rad), model, view, _SWEPT)
+    is_peak = (rough >= rough.roll(1)) & (rough > rough.roll(-1)) & (rough > 0)
+    peaks = is_peak.nonzero()[:, 0]
+    peaks = peaks[rough[peaks].argsort(descending=True)][:_MOST_SPINS]
+    if len(peaks) == 0:
+        return pose.double()[None]
+    offsets = torch.arange(-_FINE, _FINE + 1, dtype=torch.float64) * (step_rad / _FINE)
+    angles_rad = sweep_rad[peaks, None] + offsets
+    fine = _explained(_turned(pose, axis, angles_rad.flatten()), model, view, _SAMPLES)
+    fine = fine.reshape(angles_rad.shape)
+    best = fine.argmax(1).clamp(1, 2 * _FINE - 1)
+    before, at, after = (fine.gather(1, best[:, None] + k)[:, 0] for k in (-1, 0, 1))
+    bend = (before - 2 * at + after).clamp(max=-1e-9)
+    shift = ((before - after) / (2 * bend)).clamp(-1, 1)
+    found_rad = angles_rad.gather(1, best[:, None])[:, 0] + shift * step_rad / _FINE
+    order = at.argsort(descending=True)
+    return _turned(pose, axis, found_rad[order])
+
+
+def _turned(pose: Rigid, axis: Axis, angles_rad: Float64[Tensor, " a"]) -> Rigid:
+    return pose.double()[None] @ turn_about(
+        axis.direction.double(), axis.point_m.double(), angles_rad
+    )
+
+
+def _explained(
+    poses: Rigid, model: ObjectModel, view: ViewInput, samples: int
+) -> Float64[Tensor, " b"]:
+    """Give what colours explain, a place alike for all poses: for sweeps of many of them."""
+    assert model.colors is not None
+    assert view.color is not None
+    surface = _thinned(model.colors, samples)
+    image = _blurred(view.color, poses, surface)
+    found: list[Tensor] = []
+    at_once = max(1, _POINTS_AT_ONCE // len(surface.points_m))
+    for first in range(0, len(poses.R), at_once):
+        some = poses[first : first + at_once]
+        seen = _look(some, surface, view, image, _NEAR * model.diameter_m)
+        explained = _correlation(seen).clamp(0, _MOST).square()
+        found.append((-seen.weight.sum(1) * torch.log1p(-explained)).sum(-1))
+    return torch.cat(found)
+
+
+_SAME_RAD = math.radians(3)
+
+
+def color_copies(pose: Rigid, model: ObjectModel, view: ViewInput) -> Rigid:
+    """Propose what a pose may be exchanged for by colour: copies that look alike to depth.
+
+    They are symmetric copies that were found in the shape, near-symmetric ones, and of each the
+    turns about axes of revolution by which its print agrees. Declared symmetries are none: their
+    copies are one answer.
+
+    Args:
+        pose: ``camera_from_model``, one.
+        model: the object.
+        view: depth and colour.
+
+    Returns:
+        A batch of poses, ``pose`` itself the first.
+    """
+    pose = pose.double()
+    if model.colors is None or view.color is None:
+        return pose[None]
+    found = model.symmetries if model.symmetries.is_found else None
+    turns = [near.model_from_model for near in near_symmetries(model)]
+    if found is not None and found.discrete is not None:
+        turns += [found.discrete.double()[k] for k in range(len(found.discrete.R))]
+    bases = [pose, *(pose @ turn.double() for turn in turns)]
+    axes = () if found is None else found.continuous
+    proposed = [pose[None]]
+    for base in bases:
+        spun = [copies_about_axis(base, axis, model, view) for axis in axes]
+        proposed += spun or [base[None]]
+    every = Rigid.cat(proposed)
+    kept = [0]
+    for k in range(1, len(every.R)):
+        apart_rad = geodesic_rad(every.R[k].expand(len(kept), 3, 3), every.R[kept])
+        if float(apart_rad.min()) > _SAME_RAD:
+            kept.append(k)
+    return every[kept]
