@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from depthpose.core.camera import Camera, StereoRig, read_camera, read_rig, resize_camera
-from depthpose.core.errors import InputError
+from depthpose.core.errors import InputError, Notice
 
 SIZE = (640, 480)
 ROS = """image_width: 640
@@ -145,6 +145,10 @@ def pinhole(camera: Camera) -> tuple[float, ...]:
     return tuple(float(camera.K[i, j]) for i, j in ((0, 0), (1, 1), (0, 2), (1, 2)))
 
 
+RIGHT_ALONE = pytest.mark.filterwarnings("ignore:the right camera_info alone")
+
+
+@RIGHT_ALONE
 @pytest.mark.parametrize("name", READ)
 def test_a_format_is_recognised_by_its_content(tmp_path: Path, name: str) -> None:
     text, lengths, more = READ[name]
@@ -175,11 +179,22 @@ def test_a_pair_of_ros_is_a_folder_recognised_by_its_content(tmp_path: Path) -> 
     assert (rig.baseline_m, rig.cx_right_minus_left_px) == pytest.approx((0.1, 4))
     assert pinhole(rig) == (490, 491, 321, 241)
     saved(tmp_path, ros(Tx=-49), "z.yaml")
-    with pytest.raises(InputError, match=r"have Tx -49 and -49, where the left one has 0 and"):
+    with pytest.raises(InputError, match=r"have Tx -49 and -49, where that of the right one"):
         read_rig(tmp_path)
     saved(tmp_path, ros(), "b.yml")
     with pytest.raises(InputError, match=r"a folder with 3 files .* left\.yaml and right\.yaml"):
         read_camera(tmp_path)
+
+
+def test_a_pair_of_ros_may_be_counted_from_a_third_camera(tmp_path: Path) -> None:
+    saved(tmp_path, ros(Tx=49 * 0.3), "left.yaml")
+    saved(tmp_path, ros(Tx=-49 * 0.7), "right.yaml")
+    assert read_rig(tmp_path).baseline_m == pytest.approx(0.1)
+    alone = tmp_path / "right.yaml"
+    with pytest.warns(
+        Notice, match=r"alone, whose Tx gives a baseline of 0\.07 m: that of the pair"
+    ):
+        read_rig(alone)
 
 
 def test_exchanged_cameras_are_asked_about(tmp_path: Path) -> None:
@@ -388,6 +403,7 @@ def test_yaml_takes_the_keys_of_our_json_too(tmp_path: Path, key: str) -> None:
         read_rig(path)
 
 
+@RIGHT_ALONE
 def test_a_camera_of_ros_is_that_of_the_window_and_binning(tmp_path: Path) -> None:
     window = "roi: {x_offset: 100, y_offset: 40, width: 320, height: 240, do_rectify: false}"
     cut = read_rig(saved(tmp_path, ECHO.replace("---", window)))

@@ -17,6 +17,7 @@ import torch
 from jaxtyping import Float, Float64
 from torch import Tensor
 
+from depthpose.core.camera.lens import is_fisheye_lens
 from depthpose.core.camera.pinhole import (
     KNOWN_FILES,
     MAX_SIDE_PX,
@@ -36,13 +37,14 @@ from depthpose.core.camera.pinhole import (
 from depthpose.core.camera.stored_camera import (
     Names,
     baseline_of,
+    coefficients_of,
     facts_from_folder,
     facts_from_names,
     is_ros,
-    lens_of,
     named,
     read_storage,
     scalar,
+    with_lens,
 )
 from depthpose.core.errors import InputError, nearest_name
 from depthpose.core.files import AnyPath, read_json, read_key_values, read_text, write_json
@@ -139,6 +141,7 @@ def _colmap_facts(text: str) -> CameraFacts:
             f"a cameras.txt of COLMAP with {len(cameras)} different cameras; keep the line of one"
         )
     model, width, height, listed = cameras.pop()
+    is_fisheye = bool(is_fisheye_lens({"cameramodel": model}))
     values = [float(word) for word in listed.split()]
     if model.startswith(("SIMPLE_", "RADIAL")):
         values.insert(0, values[0])
@@ -150,6 +153,7 @@ def _colmap_facts(text: str) -> CameraFacts:
         K=intrinsics(fx, fy, cx - 0.5, cy - 0.5),
         size=(int(width), int(height)),
         distortion=tuple(values[4:]),
+        is_fisheye=is_fisheye,
         undistort="colmap image_undistorter",
     )
 
@@ -230,6 +234,7 @@ def _foreign_facts(content: object) -> CameraFacts | None:
             f"not a {type(content).__name__}"
         )
     names, facts = named(content), None
+    is_fisheye = bool(is_fisheye_lens(names))
     # Matrices of OpenCV are objects with ``data``.
     is_storage = any(isinstance(value, dict) and "data" in value for value in content.values())
     if is_storage or is_ros(names) or {"ppx", "cameramatrix"} & names.keys():
@@ -253,11 +258,11 @@ def _foreign_facts(content: object) -> CameraFacts | None:
             size=_size(content) if {"width", "height"} <= content.keys() else None,
             baseline_m=baseline_of(names),
             depth_unit_m=_bop_unit_m(content),
-            distortion=lens_of(names),
+            distortion=coefficients_of(names),
         )
     elif content and all(isinstance(v, dict) and "cam_K" in v for v in content.values()):
         facts = _from_scene(content)
-    return facts
+    return None if facts is None else with_lens(facts, is_fisheye=is_fisheye)
 
 
 def _from_scene(images: dict[str, dict[str, Any]]) -> CameraFacts:

@@ -7,6 +7,7 @@ checked: from any format to one :class:`Camera`.
 import json
 import math
 import sys
+import warnings
 from dataclasses import dataclass, replace
 from typing import Any, TypeVar
 
@@ -15,7 +16,7 @@ import torch
 from jaxtyping import Float, Float64
 from torch import Tensor
 
-from depthpose.core.errors import InputError
+from depthpose.core.errors import InputError, Notice
 
 MAX_SIDE_PX = 2**20  # largest image side: a larger number in a file is a mistake, and is refused
 MAX_BASELINE_M = 100  # no rig on the ground is this wide: such a number was in millimetres
@@ -253,7 +254,9 @@ class CameraFacts:
     mount_height_m: float | None = None
     tilt_deg: float | None = None
     distortion: tuple[float, ...] = ()  # coefficients; none, or zeros, of a pinhole
+    is_fisheye: bool = False  # equidistant: without coefficients it is no pinhole either
     undistort: str = "cv2.undistort(image, K, distortion)"
+    doubt: str = ""  # what the file alone cannot say: shown where a camera is made of it
 
 
 def facts_from_projections(
@@ -300,13 +303,15 @@ def refuse_apart(left: Float64[np.ndarray, "3 _"], right: Float64[np.ndarray, "3
 
 def camera_from_facts(facts: CameraFacts, size: Size | None) -> Camera:
     """Make the camera of a file; refuse what cannot be that of an undistorted image in pixels."""
-    if not all(abs(k) <= _NO_DISTORTION for k in facts.distortion):
+    if facts.is_fisheye or not all(abs(k) <= _NO_DISTORTION for k in facts.distortion):
         after = "and give the camera of the result"
         if facts.size or size:
             after += f": {json.dumps(camera_keys(make_camera(facts, size)))}"
+        fisheye = " of a fisheye" if facts.is_fisheye else ""
+        coefficients = ", ".join(f"{k:g}" for k in facts.distortion) or "no coefficients"
         raise InputError(
-            f"{facts.kind} with lens distortion ({', '.join(f'{k:g}' for k in facts.distortion)}), "
-            f"and only images without are understood; undistort them by {facts.undistort}, {after}"
+            f"{facts.kind} with lens distortion{fisheye} ({coefficients}), and only images without "
+            f"are understood; undistort them by {facts.undistort}, {after}"
         )
     camera = make_camera(facts, size)
     fx = float(camera.K[0, 0])
@@ -337,6 +342,8 @@ def camera_from_facts(facts: CameraFacts, size: Size | None) -> Camera:
         raise InputError(f"depth_unit_m is {unit_m:g}, {what}")
     if facts.size is None:
         refuse_other_resolution(camera.K, camera.width, camera.height)
+    if facts.doubt:
+        warnings.warn(facts.doubt, Notice, stacklevel=2)
     return camera
 
 

@@ -1,6 +1,5 @@
 """Two cameras as they were calibrated (ROS, OpenCV, Kalibr), and their rectification by OpenCV."""
 
-import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,6 +10,7 @@ from jaxtyping import Float32, Float64
 from torch import Tensor
 
 from depthpose.core.camera.camera_file import naming
+from depthpose.core.camera.lens import is_fisheye_lens
 from depthpose.core.camera.pinhole import (
     WIDE_BASELINE_M,
     Size,
@@ -49,12 +49,6 @@ _D = {
               "distortioncoefficients2", "distortioncoefficientsright"),
 }  # fmt: skip
 _R, _T = ("r", "rotation", "rotationmatrix"), ("t", "translation", "translationvector")
-_MODELS = {
-    "plumbbob": False, "rationalpolynomial": False, "radtan": False, "pinhole": False,
-    "radialtangential": False, "brownconrady": False, "none": False,
-    "equidistant": True, "fisheye": True, "kannalabrandt": True, "kannalabrandt4": True,
-}  # fmt: skip
-"""Models of distortion by name: whether it is that of a fisheye lens."""
 _COUNTS = {False: (4, 5, 8, 12, 14), True: (4,)}
 _MAX_BASELINE_M = 10.0
 _MAX_ENLARGED = 4  # of a raw image by its rectification
@@ -132,13 +126,18 @@ def _read(path: Path, unit_m: float, is_fisheye: bool | None) -> RawPair:
         first, second = read_two_files(path)
         if is_ros(first) and is_ros(second) and "p2" not in first | second:
             both = ros_pair(first, second)
-            P = matrix(both[1], ("projectionmatrix", "p"), 12)
-            if P is None or P[0, 0] <= 0:
-                raise InputError("no projection_matrix with a focal length; calibrate as a pair")
+            xs = []  # of the two cameras, rectified, from the left one or from a third [m]
+            for names in both:
+                P = matrix(names, ("projectionmatrix", "p"), 12)
+                if P is None or P[0, 0] <= 0:
+                    raise InputError(
+                        "no projection_matrix with a focal length; calibrate as a pair"
+                    )
+                xs.append(-P[0, 3] / P[0, 0])
             cameras, turns = [], []
             for side, names in zip(("left", "right"), both, strict=True):
                 K, D = matrix(names, ("cameramatrix", "k"), 9), ("distortioncoefficients", "d")
-                kind = _kind(names.get("distortionmodel"), is_fisheye)
+                kind = _kind(names, is_fisheye)
                 cameras.append(_camera(K, _first(names, D), kind, f"the {side} camera"))
                 turn = matrix(names, ("rectificationmatrix", "r"), 9)
                 if turn is None:
@@ -146,7 +145,7 @@ def _read(path: Path, unit_m: float, is_fisheye: bool | None) -> RawPair:
                         f"no rectification_matrix of the {side} camera; write the whole pair"
                     )
                 turns.append(turn)
-            along = np.array([unit_m * P[0, 3] / P[0, 0], 0, 0])
+            along = np.array([unit_m * (xs[0] - xs[1]), 0, 0])
             motion = (turns[1].T @ turns[0], turns[1].T @ along)
             return _pair(cameras[0], cameras[1], motion, size_of(first))
         return _from_opencv(first | second, unit_m, is_fisheye)
@@ -164,7 +163,7 @@ def _from_opencv(names: Names, unit_m: float, is_fisheye: bool | None) -> RawPai
     if not any(name in names for both in _K.values() for name in both):
         one = "it describes one camera" if is_ros(names) or "cameramatrix" in names else "no K1"
         raise InputError(f"{one}, not two as they were calibrated; known are {_KNOWN}")
-    kind = _kind(names.get("distortionmodel") or names.get("cameramodel"), is_fisheye)
+    kind = _kind(names, is_fisheye)
     left, right = (
         _camera(matrix(names, _K[side], 9), _first(names, _D[side]), kind, f"the {side} camera")
         for side in ("left", "right")
@@ -189,15 +188,10 @@ def _from_kalibr(names: Names, unit_m: float, is_fisheye: bool | None) -> RawPai
     size = None if sizes[0] is None else (int(sizes[0][0]), int(sizes[0][-1]))
     cameras = []
     for one, who in ((first, "cam0"), (second, "cam1")):
-        if one.get("cameramodel", "pinhole") != "pinhole":
-            raise InputError(
-                f"{who} has camera_model {one['cameramodel']!r}; calibrate it as pinhole-radtan, "
-                "or as pinhole-equi where it is a fisheye lens"
-            )
+        kind = _kind(one, is_fisheye, f"{who}'s")
         values = numbers(one.get("intrinsics"))
         if values is None or len(values) != 4:
             raise InputError(f"{who} has no intrinsics [fx, fy, cx, cy]; copy the camchain anew")
-        kind = _kind(one.get("distortionmodel"), is_fisheye)
         lens = numbers(one.get("distortioncoeffs"))
         cameras.append(_camera(intrinsics(*values).numpy(), lens, kind, who))
     return _pair(cameras[0], cameras[1], (motion[:3, :3], unit_m * motion[:3, 3]), size)
@@ -207,19 +201,12 @@ def _first(names: Names, known: tuple[str, ...]) -> list[float] | None:
     return next((values for name in known if (values := numbers(names.get(name)))), None)
 
 
-def _kind(model: object, is_fisheye: bool | None) -> bool:
+def _kind(names: Names, is_fisheye: bool | None, who: str = "its") -> bool:
     """Say whether a lens is a fisheye: what the file names, else what is given."""
-    if model is None:
-        return bool(is_fisheye)
-    word = re.sub(r"[^a-z0-9]", "", str(model).lower())
-    if word not in _MODELS:
-        raise InputError(
-            f"its distortion model is {model!r}; known are radtan (plumb_bob), rational_polynomial "
-            "and equidistant (fisheye). Calibrate with one of them"
-        )
-    if is_fisheye and not _MODELS[word]:
-        raise InputError(f"its distortion model is {model!r}, no fisheye; omit --fisheye")
-    return _MODELS[word]
+    is_named_fisheye = is_fisheye_lens(names, who)
+    if is_fisheye and is_named_fisheye is False:
+        raise InputError(f"{who} distortion model is that of a pinhole, no fisheye; omit --fisheye")
+    return bool(is_fisheye) if is_named_fisheye is None else is_named_fisheye
 
 
 def _camera(

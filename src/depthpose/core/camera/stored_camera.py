@@ -11,6 +11,7 @@ import numpy as np
 import torch
 import yaml
 
+from depthpose.core.camera.lens import is_fisheye_lens
 from depthpose.core.camera.pinhole import (
     KNOWN_FILES,
     CameraFacts,
@@ -140,6 +141,20 @@ _RECTIFY = (
 
 def facts_from_names(names: Names) -> CameraFacts | None:
     """Take the camera that some names describe; None where they describe none."""
+    is_fisheye = is_fisheye_lens(names)  # may refuse what is no camera otherwise
+    facts = _facts_without_lens(names)
+    return None if facts is None else with_lens(facts, is_fisheye=bool(is_fisheye))
+
+
+def with_lens(facts: CameraFacts, *, is_fisheye: bool) -> CameraFacts:
+    """Add that the lens is a fisheye, where it is, and how its images are undistorted."""
+    if not is_fisheye:
+        return facts
+    undistort = _UNDISTORT_FISHEYE if facts.baseline_m is None else _RECTIFY
+    return replace(facts, is_fisheye=True, undistort=undistort)
+
+
+def _facts_without_lens(names: Names) -> CameraFacts | None:
     if "cam0" in names and "cam1" in names:
         raise InputError(
             "a camchain of Kalibr, whose images are not rectified; 'depthpose data rectify' "
@@ -161,10 +176,12 @@ def facts_from_names(names: Names) -> CameraFacts | None:
             size=size_of({key: names.get(f"camera{key}") for key in ("width", "height")}),
             baseline_m=None if is_rgbd else baseline_m,
             depth_unit_m=1 / factor if factor else None,
-            distortion=lens_of({key: names.get(f"{settings}{key}") for key in _DISTORTION_KEYS}),
+            distortion=coefficients_of(
+                {key: names.get(f"{settings}{key}") for key in _DISTORTION_KEYS}
+            ),
         )
     left, right = published(names, _P, 12), matrix(names, ("p2",), 12)
-    distortion, undistort = lens_of(names), _RECTIFY
+    distortion, undistort = coefficients_of(names), _RECTIFY
     kind = "a camera_info of ROS" if is_ros(names) else "a camera of OpenCV"
     if right is not None:
         facts = facts_from_projections("a rig of OpenCV", _need(left, "P1"), right, size_of(names))
@@ -181,12 +198,17 @@ def facts_from_names(names: Names) -> CameraFacts | None:
         )
     elif left is not None and left[0, 0] != 0:
         if left[0, 3] == 0 and left[1, 3] == 0:  # of a single camera
-            is_fisheye = re.search("equidistant|fisheye", str(names.get("distortionmodel")).lower())
-            undistort = _UNDISTORT_FISHEYE if is_fisheye else _UNDISTORT_P
+            undistort = _UNDISTORT_P
             facts = facts_from_projections(kind, left, None, size_of(names))
-        else:  # of the right one of a pair: Tx = -fx B
+        else:  # of the right one of a pair: Tx = -fx B, unless a third camera is at 0
             first = np.c_[left[:, :3], [0, 0, 0]]
             facts = facts_from_projections(kind, first, left, size_of(names))
+            doubt = (
+                "the right camera_info alone, whose Tx gives a baseline of "
+                f"{facts.baseline_m:g} m: that of the pair only where the left one's Tx is 0 "
+                "(KITTI's is not); name the folder of both files to be sure"
+            )
+            facts = replace(facts, doubt=doubt)
     else:
         return _from_intrinsics(names, kind, distortion)
     return replace(facts, distortion=distortion, undistort=undistort)
@@ -224,24 +246,30 @@ def facts_from_folder(folder: Path) -> CameraFacts:
 
 
 def facts_from_ros_pair(first: Names, second: Names) -> CameraFacts:
-    """Take the two cameras of a pair; the left one is that without ``Tx``."""
+    """Take the two cameras of a pair."""
     left, right = ros_pair(first, second)
     P, other = (_need(published(names, _P, 12), "projection_matrix") for names in (left, right))
     facts = facts_from_projections("a pair of camera_info", P, other, size_of(first))
-    return replace(facts, distortion=(*lens_of(first), *lens_of(second)), undistort=_RECTIFY)
+    coefficients = (*coefficients_of(first), *coefficients_of(second))
+    facts = replace(facts, distortion=coefficients, undistort=_RECTIFY)
+    are_fisheyes = [is_fisheye_lens(one) for one in (first, second)]
+    return with_lens(facts, is_fisheye=any(are_fisheyes))
 
 
 def ros_pair(first: Names, second: Names) -> tuple[Names, Names]:
-    """Give the left ``camera_info`` of a pair and the right one, which has a ``Tx``."""
+    """Give the left ``camera_info`` of a pair and the right one.
+
+    ``Tx`` is -fx times the x of a camera, from the left one or, as in KITTI, from a third.
+    """
     Tx = [_need(matrix(one, _P, 12), "projection_matrix")[0, 3] for one in (first, second)]
-    if (Tx[0] == 0) == (Tx[1] == 0):
+    if Tx[0] == Tx[1]:
         raise InputError(
-            f"the projections of the two camera_info have Tx {Tx[0]:g} and {Tx[1]:g}, where the "
-            "left one has 0 and the right one -fx times the baseline; calibrate them as a pair"
+            f"the projections of the two camera_info have Tx {Tx[0]:g} and {Tx[1]:g}, where that "
+            "of the right one is smaller by fx times the baseline; calibrate them as a pair"
         )
     if size_of(first) != size_of(second):
         raise InputError("the two camera_info are of images of two sizes; a pair has one")
-    return (first, second) if Tx[0] == 0 else (second, first)
+    return (first, second) if Tx[0] > Tx[1] else (second, first)
 
 
 def _from_intrinsics(names: Names, kind: str, distortion: tuple[float, ...]) -> CameraFacts | None:
@@ -275,9 +303,7 @@ def _from_intrinsics(names: Names, kind: str, distortion: tuple[float, ...]) -> 
         right = K if right is None else right
         left, right = np.c_[K, [0, 0, 0]], np.c_[right, [right[0, 0] * T[0], 0, 0]]
         facts = facts_from_projections(kind, left, right, size_of(names))
-    is_fisheye = re.search("equidistant|fisheye", str(names.get("distortionmodel")).lower())
-    undistort = _UNDISTORT_FISHEYE if is_fisheye else facts.undistort
-    return replace(facts, distortion=distortion, undistort=undistort)
+    return replace(facts, distortion=distortion)
 
 
 def baseline_of(names: Names) -> float | None:
@@ -288,7 +314,7 @@ def baseline_of(names: Names) -> float | None:
     return scalar(names, "baselinem")
 
 
-def lens_of(names: Names) -> tuple[float, ...]:
+def coefficients_of(names: Names) -> tuple[float, ...]:
     """Take every coefficient of every lens: whatever is called distortion, and loose k1, p1."""
     coefficients = [scalar(names, name) for name in _DISTORTION_KEYS]
     for name, value in names.items():
