@@ -244,7 +244,7 @@ def test_the_nearest_copy_of_what_turns_freely_is_the_estimate_itself() -> None:
 
 
 _SCORES = ["auc", "auc_adds", "ar_mssd", "ar_mspd", "ar_vsd", "ar", "rotation_deg_median",
-           "translation_m_median"]  # fmt: skip
+           "translation_m_median", "ap", "ap_mssd", "ap_mspd"]  # fmt: skip
 
 
 def test_columns_come_in_the_declared_order(synthetic: BopDataset) -> None:

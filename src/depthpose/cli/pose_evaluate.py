@@ -38,7 +38,7 @@ HOW = (
 )
 
 _SHOWN = ("method", "masks", "object", "instances", "success", "wrong", "refused", "auc", "ar",
-          "rotation_deg_median", "translation_m_median")  # fmt: skip
+          "ap", "rotation_deg_median", "translation_m_median")  # fmt: skip
 """Columns that are printed; the files hold all."""
 
 

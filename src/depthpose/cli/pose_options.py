@@ -39,7 +39,7 @@ class PoseMeasureOptions:
     """truth; predicted (those that came with Linemod_preprocessed); a JSON file of BOP detections;
     or weights of a segmentation. Each is a row of its own."""
     targets: NewPath | None = None
-    """a BOP list of targets, such as test_targets_bop19.json: a file, or its name in the folder of
+    """a BOP list of targets, such as test_targets_bop24.json: a file, or its name in the folder of
     the data set; by default all instances."""
     diameters: DiameterTable = "bop"
     """bop: as the data set declares them; pvnet: PVNet's table of LineMOD."""
@@ -110,12 +110,13 @@ class DataSetOptions:
     bop: Path | None = None
     """folder of a data set in BOP's layout, or of Linemod_preprocessed."""
     split: str = "test"
-    """of the data set."""
+    """of the data set; where it is of several sensors with the name of one, such as
+    val_photoneo."""
     masks: str = "truth"
     """truth (the annotated ones), predicted (those that came with Linemod_preprocessed), a JSON
     file of BOP detections, or weights of a segmentation, by name or file."""
     targets: NewPath | None = None
-    """a BOP list of targets, such as test_targets_bop19.json: a file, or its name in the folder of
+    """a BOP list of targets, such as test_targets_bop24.json: a file, or its name in the folder of
     the data set; by default all instances."""
 
 

@@ -436,7 +436,9 @@ _SAME_TIME_S = 0.001  # BOP's toolkit refuses rows of an image whose times diffe
 
 def results_name(dataset: BopDataset, method: str = "depthpose") -> str:
     """Name the BOP csv of a data set: ``METHOD_DATASET-SPLIT.csv``."""
-    split = dataset.split.replace("_", "-")  # as test_primesense; BOP's toolkit parts names at _
+    split = dataset.folder_of_split.replace(
+        "_", "-"
+    )  # as test_primesense; BOP's toolkit parts names at _
     return f"{method}_{dataset.folder.resolve().name}-{split}.csv"
 
 

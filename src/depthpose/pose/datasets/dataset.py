@@ -36,6 +36,7 @@ from depthpose.pose.cloud import (
 )
 from depthpose.pose.datasets.layouts import (
     Instance,
+    bop_splits,
     layout_of,
     object_names,
     read_bop_models,
@@ -57,13 +58,19 @@ class BopDataset:
     """Instances of one split, each a sample when it is asked for."""
 
     folder: Path  #: of the data set
-    split: str  #: its name
+    split: str  #: its name, with that of the sensor where there are several
     layout: str  #: a key of ``LAYOUTS``
     instances: Sequence[Instance]  #: what is annotated, in the order of scene, image and place
     sha256: str  #: of all annotations of the split: tells data sets of one name apart
 
     def __len__(self) -> int:
         return len(self.instances)
+
+    @property
+    def folder_of_split(self) -> str:
+        """The folder of the split: its name without that of the sensor."""
+        splits = bop_splits(self.folder) if self.layout == "BOP" else {}
+        return splits[self.split][0] if self.split in splits else self.split
 
     def __getitem__(self, index: int) -> ViewSample:
         """Give a view with the annotated mask; see :meth:`view`."""
@@ -131,7 +138,8 @@ def open_bop(folder: str | Path, split: str = "test") -> BopDataset:
 
     Args:
         folder: of the data set, with ``models`` and the splits in it.
-        split: ``test``, ``train_pbr``, ...; ``train`` or ``test`` of Linemod_preprocessed.
+        split: ``test``, ``train_pbr``, ..., of several sensors with that of one, such as
+            ``val_photoneo``; ``train`` or ``test`` of Linemod_preprocessed.
 
     Raises:
         InputError: no such folder or split, or an annotation is damaged.

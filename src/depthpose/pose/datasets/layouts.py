@@ -144,49 +144,82 @@ class Instance:
         return f"{self.scene_id:06d}_{self.image_id:06d}_{self.index:06d}"
 
 
-def bop_scenes(folder: Path, split: str) -> list[Path]:
-    """List the scenes of a split."""
-    scenes = sorted(path.parent for path in (folder / split).glob("*/scene_camera.json"))
-    if not scenes:
-        known = ", ".join(LAYOUTS["BOP"].splits(folder)) or "none"
+def bop_splits(folder: Path) -> dict[str, tuple[str, str]]:
+    """Give the splits of a data set by name: the folder of each, and the end of its files' names.
+
+    Where the scenes are of several sensors, as in BOP-Industrial, each has files of its own, such
+    as ``scene_camera_photoneo.json`` beside ``depth_photoneo``. The split ``test`` by that sensor
+    is called ``test_photoneo``; a sensor without depth images is none.
+    """
+    splits = {
+        path.parent.parent.name: (path.parent.parent.name, "")
+        for path in folder.glob("*/*/scene_camera.json")
+    }
+    for path in folder.glob("*/*/scene_camera_*.json"):
+        end = path.stem.removeprefix("scene_camera")
+        split = path.parent.parent.name
+        if (path.parent / f"depth{end}").is_dir():
+            splits.setdefault(split + end, (split, end))
+    return dict(sorted(splits.items()))
+
+
+def bop_scenes(folder: Path, split: str) -> tuple[list[Path], str]:
+    """List the scenes of a split, and give the end of the names of its files."""
+    splits = bop_splits(folder)
+    if split not in splits:
+        sensors = [name for name, (home, end) in splits.items() if home == split and end]
+        if sensors:
+            raise InputError(
+                f"{folder}: split {split!r} is of several sensors; name one of them with it: "
+                f"{', '.join(sensors)}"
+            )
         raise InputError(
             f"{folder}: no split {split!r} with a scene (SPLIT/000001/scene_camera.json). "
-            f"Here: {known}."
+            f"Here: {', '.join(splits) or 'none'}."
         )
+    home, end = splits[split]
+    scenes = sorted(path.parent for path in (folder / home).glob(f"*/scene_camera{end}.json"))
     for scene in scenes:
         if entry_number(scene.name) is None:
             raise InputError(f"{scene}: scenes have numbers for names, as 000001; rename it")
-    return scenes
+    return scenes, end
 
 
-def bop_instances(scene: Path) -> Iterator[Instance]:
-    """Read the annotations of one scene."""
-    cameras = read_mapping(scene / "scene_camera.json")
-    truths = read_mapping(scene / "scene_gt.json")
-    info_path = scene / "scene_gt_info.json"
+def bop_instances(scene: Path, end: str = "") -> Iterator[Instance]:
+    """Read the annotations of one scene; ``end``: of the names of its files, as _photoneo."""
+    camera_path = scene / f"scene_camera{end}.json"
+    truth_path = scene / f"scene_gt{end}.json"
+    info_path = scene / f"scene_gt_info{end}.json"
+    if not truth_path.is_file() and camera_path.is_file():
+        raise InputError(
+            f"{scene}: no {truth_path.name}: its poses are not annotated, or kept back by those who"
+            " measure; take a split that has them, such as val"
+        )
+    cameras = read_mapping(camera_path)
+    truths = read_mapping(truth_path)
     infos = read_mapping(info_path) if info_path.is_file() else {}
     wrong = [key for key in truths if entry_number(key) is None]
     if wrong:
         raise InputError(
-            f"scene_gt.json: {wrong[0][:80]!r} is no number of an image; name images 0, 1, ..."
+            f"{truth_path.name}: {wrong[0][:80]!r} is no number of an image; name images 0, 1, ..."
         )
     for key in sorted(truths, key=int):
-        source = f"{scene / 'scene_gt.json'}: image {key}"
+        source = f"{truth_path}: image {key}"
         if key not in cameras:
-            raise InputError(f"{source} has no entry in scene_camera.json; add its camera")
+            raise InputError(f"{source} has no entry in {camera_path.name}; add its camera")
         entries, more = truths[key], infos.get(key, [])
         if not isinstance(entries, list) or not isinstance(more, list):
             raise InputError(f"{source}: is no list of annotations")
-        at_camera = f"{scene / 'scene_camera.json'}: image {int(key)}"
+        at_camera = f"{camera_path}: image {int(key)}"
         image = f"{int(key):06d}"
-        tiff = scene / "depth" / f"{image}.tif"  # of ITODD
-        pictures = (scene / folder / f"{image}{suffix}"
+        tiff = scene / f"depth{end}" / f"{image}.tif"  # of ITODD
+        pictures = (scene / f"{folder}{end}" / f"{image}{suffix}"
                     for folder in _IMAGE_FOLDERS for suffix in LISTED_SUFFIXES)  # fmt: skip
         rgb = next((path for path in pictures if path.is_file()), None)
         for index, entry in enumerate(entries):
             K, unit_m = camera_from_bop(cameras[key], at_camera)
             extra = more[index] if index < len(more) and isinstance(more[index], dict) else {}
-            mask = scene / "mask_visib" / f"{image}_{index:06d}.png"
+            mask = scene / f"mask_visib{end}" / f"{image}_{index:06d}.png"
             here = f"{source}, annotation {index}"
             visible = number(extra, "visib_fract", -1.0, here)
             yield Instance(
@@ -207,18 +240,28 @@ def bop_instances(scene: Path) -> Iterator[Instance]:
             )
 
 
-@dataclass(frozen=True, kw_only=True, order=True)
+def _bop_split(folder: Path, split: str) -> Iterator[Instance]:
+    """Read the annotations of all scenes of a split."""
+    scenes, end = bop_scenes(folder, split)
+    for scene in scenes:
+        yield from bop_instances(scene, end)
+
+
+@dataclass(frozen=True, kw_only=True)
 class BopTarget:
-    """So many instances of an object in an image."""
+    """So many instances of an object in an image; without an object, all that it shows."""
 
     scene_id: int
     image_id: int
-    object_id: int
-    count: int
+    object_id: int | None = None
+    count: int | None = None
 
 
 def read_targets(path: str | Path, folder: str | Path = ".") -> list[BopTarget]:
     """Read a list of targets: a file, or the name of one in the folder of its data set.
+
+    ``test_targets_bop19.json`` asks for so many instances of an object; ``test_targets_bop24.json``
+    may name images alone, of which everything is asked for.
 
     Raises:
         InputError: it is missing or damaged.
@@ -227,10 +270,16 @@ def read_targets(path: str | Path, folder: str | Path = ".") -> list[BopTarget]:
     targets = []
     for row_number, row in enumerate(read_rows(path)):
         source = f"{path}: entry {row_number}"
-        scene, image, wanted, count = (
-            integer(row, key, source) for key in ("scene_id", "im_id", "obj_id", "inst_count")
+        keys = ("obj_id", "inst_count")
+        wanted, count = (integer(row, key, source) if key in row else None for key in keys)
+        targets.append(
+            BopTarget(
+                scene_id=integer(row, "scene_id", source),
+                image_id=integer(row, "im_id", source),
+                object_id=wanted,
+                count=count,
+            )
         )
-        targets.append(BopTarget(scene_id=scene, image_id=image, object_id=wanted, count=count))
     return targets
 
 
@@ -309,12 +358,8 @@ LAYOUTS: dict[str, Layout] = {
         predicted_mask="segnet_results/{object:02d}_label/{image:04d}_label.png",
     ),
     "BOP": Layout(
-        splits=lambda folder: sorted(
-            {path.parent.parent.name for path in folder.glob("*/*/scene_camera.json")}
-        ),
-        instances=lambda folder, split: (
-            one for scene in bop_scenes(folder, split) for one in bop_instances(scene)
-        ),
+        splits=lambda folder: list(bop_splits(folder)),
+        instances=_bop_split,
     ),
 }
 """Name to layout: one more entry, and every command takes it. A folder is of the first that finds a

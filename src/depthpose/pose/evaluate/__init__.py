@@ -1,5 +1,6 @@
 """Predictions and truth to rows: metrics read files, and missing answers count as failures."""
 
+from depthpose.pose.evaluate.detection import detection_scores as detection_scores
 from depthpose.pose.evaluate.errors import METRICS as METRICS
 from depthpose.pose.evaluate.errors import Metric as Metric
 from depthpose.pose.evaluate.errors import match as match

@@ -15,6 +15,7 @@ from depthpose.core.errors import InputError
 from depthpose.core.frame import data_frame
 from depthpose.pose.config import EvaluationConfig
 from depthpose.pose.datasets import BopDataset, BopTarget, Instance
+from depthpose.pose.evaluate.detection import detection_scores
 from depthpose.pose.evaluate.errors import (
     METRICS,
     ErrorContext,
@@ -137,6 +138,7 @@ class RiskRow(_Row):
     risk: float  #: share of wrong ones among them
 
 
+_PRECISIONS = ("ap", "ap_mssd", "ap_mspd")
 _RECALLS = ("ar_vsd", "ar_mssd", "ar_mspd")
 _DECILES = 10
 
@@ -175,10 +177,12 @@ def mean_row(rows: Sequence[ObjectRow]) -> ObjectRow:
         refused=sum(row.refused for row in rows) / count,
         wrong=sum(row.wrong for row in rows) / count,
         coverage=sum(row.coverage for row in rows) / count,
-        # A recall of some objects alone would pass for that of all; a median is of the answers.
+        # A recall of some objects alone would pass for that of all; a median is of the answers,
+        # and BOP's precision of the objects of which enough is seen somewhere.
         scores={
-            name: _mean(values) if None not in values or name.endswith("_median") else None
+            name: _mean(values) if None not in values or is_of_some else None
             for name, values in scores.items()
+            for is_of_some in [name in _PRECISIONS or name.endswith("_median")]
         },
         ms={stage: _mean([row.ms[stage] for row in rows]) for stage in rows[0].ms},
     )
@@ -238,16 +242,20 @@ def of_targets(dataset: BopDataset, targets: Sequence[BopTarget]) -> BopDataset:
     """Keep the instances that a list of targets asks for, the most visible where it takes fewer.
 
     Raises:
-        InputError: a target is not annotated so many times.
+        InputError: a target is not annotated so many times, or nothing of any.
     """
-    found: dict[Place, list[Instance]] = defaultdict(list)
+    of_place: dict[Place, list[Instance]] = defaultdict(list)
+    of_image: dict[tuple[int, int], list[Instance]] = defaultdict(list)
     for instance in dataset.instances:
-        found[place_of(instance)].append(instance)
+        of_place[place_of(instance)].append(instance)
+        of_image[instance.scene_id, instance.image_id].append(instance)
     kept: list[Instance] = []
     for target in targets:
-        place = Place(target.scene_id, target.image_id, target.object_id)
-        there = sorted(found[place], key=lambda i: -(i.visible_fraction or 0.0))
-        if len(there) < target.count:
+        there = of_image[target.scene_id, target.image_id]
+        if target.object_id is not None:
+            place = Place(target.scene_id, target.image_id, target.object_id)
+            there = sorted(of_place[place], key=lambda i: -(i.visible_fraction or 0.0))
+        if len(there) < (target.count or 0):
             raise InputError(
                 f"{dataset.folder}: the targets ask for {target.count} of object "
                 f"{target.object_id} in scene {target.scene_id}, image {target.image_id}, but "
@@ -255,6 +263,11 @@ def of_targets(dataset: BopDataset, targets: Sequence[BopTarget]) -> BopDataset:
                 "very split"
             )
         kept += there[: target.count]
+    if not kept:
+        raise InputError(
+            f"{dataset.folder}: nothing that the {len(targets)} targets ask for is annotated in "
+            f"split {dataset.split!r}; give the list of this very split"
+        )
     kept.sort(key=lambda i: (i.scene_id, i.image_id, i.index))
     return replace(dataset, instances=kept)
 
@@ -336,7 +349,8 @@ def evaluate(
     """Measure predictions; an instance without an answer is a failure and stays in every number.
 
     A success is an ADD (ADD-S of a symmetric object) below a tenth of the diameter, ``auc`` the
-    area to 10 cm; BOP's errors and recalls as ``pose.metrics`` has them.
+    area to 10 cm; BOP's errors and recalls as ``pose.metrics`` has them, and its precision of 6D
+    detection as :func:`~depthpose.pose.evaluate.detection.detection_scores` has it.
 
     Args:
         dataset: instances with truth.
@@ -374,14 +388,23 @@ def evaluate(
         frames=f"{dataset.folder.resolve().name} {dataset.split}",
         frames_sha256=frames_hash(dataset.instances)[:12],
     )
+    measured = {
+        (found[row.instance].name, row.instance): row.errors
+        for row in rows
+        if row.instance in found
+    }
+    precision = detection_scores(dataset, predictions, contexts, measured)
     summed: list[ObjectRow] = []
     numbers = [instance.object_id for instance in dataset.instances]
     for number, context in sorted(contexts.items()):
         own = [row for row, of in zip(rows, numbers, strict=True) if of == number]
         row = object_row(context.model.name, own)
+        row = replace(row, scores={**row.scores, **precision[number]})
         summed.append(replace(row, metric=own[0].metric, diameter_m=context.diameter_m))
     if len(summed) > 1:
-        summed += [mean_row(summed), object_row("all", rows)]
+        every = object_row("all", rows)  # BOP's precision is of an object, or the mean of objects
+        every = replace(every, scores={**every.scores, **dict.fromkeys(_PRECISIONS)})
+        summed += [mean_row(summed), every]
     return Evaluation(
         rows=[replace(row, conditions=conditions, origin=origin) for row in summed],
         per_instance=[replace(row, origin=origin) for row in rows],
