@@ -1,4 +1,4 @@
-"""Run the quick tables of docs/results.md and docs/experiments again; list what has changed.
+"""Run the quick tables of docs/results.md again; list what has changed.
 
     DEPTHPOSE_DATA=SAMPLES python bench/recheck.py [--only NAME ...] [--out out/bench/recheck]
 
@@ -22,8 +22,7 @@ from pathlib import Path
 from typing import Any
 
 ROOT = Path(__file__).parents[1]
-DATA = "experiments/data.md"
-"""Page of the protocols and ports."""
+PAGE = ROOT / "docs/results.md"
 _PSMNET = (
     "depthpose weights import psmnet SAMPLES/reference/psmnet/published_kitti2015.tar "
     "--align-corners true --out OUT/psmnet.safetensors"
@@ -36,7 +35,6 @@ _TRAIN = (
 )
 _DEPTH = {"AbsRel": "abs_rel", "SqRel": "sq_rel", "RMSE": "rmse", "RMSElog": "rmse_log"}
 _DELTAS = {"d1": "d1", "d2": "d2", "d3": "d3"}
-_SGBM = {"SGBM, holes filled": {"method": "sgbm (holes filled)"}}
 _BASELINES = {
     "best constant depth of each row": {"method": "baseline: rows"},
     "nearest training image's depth": {"method": "baseline: nearest"},
@@ -46,7 +44,23 @@ _ONE_IMAGE = {
     for name in ("default", "kitti-nc")
     for speed in ("fine", "quick")
 }
-_STEREO = {**_SGBM, "PSMNet, published KITTI-2015 weights": {"method": "psmnet"}}
+_PAIRS_BY = {
+    **{
+        f"real stereo, {name}, {speed}": {"weights": name, "speed": speed}
+        for name in ("default", "kitti-nc", "psmnet-compact")
+        for speed in ("fine", "quick")
+    },
+    "real stereo, SGBM, holes filled": {"method": "sgbm (holes filled)"},
+}
+_STEREO = {
+    "SGBM, holes filled": {"method": "sgbm (holes filled)"},
+    "PSMNet, published KITTI-2015 weights": {"method": "psmnet"},
+}
+
+
+def _at_80_m(rows: Mapping[str, Mapping[str, str]]) -> dict[str, dict[str, str]]:
+    """Say which of the caps of an evaluation its rows are of."""
+    return {name: {**values, "cap_m": "80"} for name, values in rows.items()}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -63,7 +77,6 @@ class Table:
         rows: values in the rows for each name in the first column; other names are not compared.
             None: it is a column of the rows itself, named in ``key``.
         tolerance: share of a number by which another processor may change it.
-        page: below ``docs``.
     """
 
     name: str
@@ -74,33 +87,29 @@ class Table:
     key: Mapping[str, str] = field(default_factory=dict)
     rows: Mapping[str, Mapping[str, str]] | None = None
     tolerance: float = 0.002
-    page: str = "results.md"
 
     def printed(self) -> list[dict[str, str]]:
-        """Read it from its page: cells by column, without marks."""
-        return printed_rows((ROOT / "docs" / self.page).read_text(), self.after)
-
-
-def _stereo(name: str, after: str, data: str, protocols: Sequence[str], **more: Any) -> Table:  # noqa: ANN401
-    runs = [
-        f"{_EVALUATE}/{data} --protocol {protocol} --matcher sgbm "
-        f"--weights OUT/psmnet.safetensors --out OUT/{name}/{protocol}"
-        for protocol in protocols
-    ]
-    files = tuple(f"{name}/{protocol}/rows.json" for protocol in protocols)
-    numbers = {**_DEPTH, **more.pop("numbers", {**_DELTAS, "AUSE": "ause"})}
-    return Table(name=name, after=after, commands=(_PSMNET, *runs), files=files, numbers=numbers,
-                 rows=_STEREO, page=DATA, **more)  # fmt: skip
+        """Read it from the page: cells by column, without marks."""
+        return printed_rows(PAGE.read_text(), self.after)
 
 
 TABLES = (
-    _stereo("object-x", "## Real stereo, three frames of KITTI object", "kitti_object",
-            ["eigen-raw"], key={"cap": "cap_m"}),
-    _stereo("object-z", "The same by `eigen-raw-camera`", "kitti_object", ["eigen-raw-camera"],
-            key={"cap": "cap_m"}),
-    _stereo("raw", "The raw layout, frames 0 and 1", "kitti_raw",
-            ["eigen-raw", "eigen-raw-camera"], numbers={"d1": "d1"},
-            key={"cap": "cap_m", "protocol": "protocol"}),
+    Table(
+        name="raw",
+        after="The raw layout, frames 0 and 1",
+        commands=(
+            _PSMNET,
+            *(
+                f"{_EVALUATE}/kitti_raw --protocol {protocol} --matcher sgbm "
+                f"--weights OUT/psmnet.safetensors --out OUT/raw/{protocol}"
+                for protocol in ("eigen-raw", "eigen-raw-camera")
+            ),
+        ),
+        files=("raw/eigen-raw/rows.json", "raw/eigen-raw-camera/rows.json"),
+        numbers={**_DEPTH, "d1": "d1"},
+        key={"protocol": "protocol"},
+        rows=_at_80_m(_STEREO),
+    ),
     Table(
         name="mono",
         after="25 real pairs of six Eigen test drives",
@@ -116,17 +125,7 @@ TABLES = (
         ),
         files=("mono/rows.json", "mono-quick/rows.json"),
         numbers={**_DEPTH, **_DELTAS},
-        key={"cap": "cap_m"},
-        rows={
-            **_BASELINES,
-            **_ONE_IMAGE,
-            **{
-                f"real stereo, {name}, {speed}": {"weights": name, "speed": speed}
-                for name in ("default", "kitti-nc", "psmnet-compact")
-                for speed in ("fine", "quick")
-            },
-            "real stereo, SGBM, holes filled": {"method": "sgbm (holes filled)"},
-        },
+        rows=_at_80_m({**_BASELINES, **_ONE_IMAGE, **_PAIRS_BY}),
     ),
     Table(
         name="mono-0052",
@@ -140,16 +139,12 @@ TABLES = (
             "--out OUT/mono-0052-quick",
         ),
         files=("mono-0052/rows.json", "mono-0052-quick/rows.json"),
-        numbers={**_DEPTH, **_DELTAS},
-        key={"cap": "cap_m"},
-        rows={
-            **_BASELINES,
-            **_ONE_IMAGE,
-        },
+        numbers={"AbsRel": "abs_rel", "RMSE": "rmse", "d1": "d1"},
+        rows=_at_80_m({**_BASELINES, **_ONE_IMAGE}),
     ),
     Table(
         name="disparity",
-        after="The same pairs by `--protocol kitti-2015`",
+        after="25 real pairs of six Eigen test drives",
         commands=(
             f"depthpose depth evaluate --data {_PAIRS}/kitti2015_eval_drives --protocol kitti-2015 "
             "--weights default fine:default quick:default kitti-nc fine:kitti-nc quick:kitti-nc "
@@ -159,21 +154,12 @@ TABLES = (
         ),
         files=("disparity/rows.json", "disparity-quick/rows.json"),
         numbers={"EPE [px]": "epe_px", "D1": "d1_all"},
-        rows={
-            **_ONE_IMAGE,
-            **{
-                f"both views, {name}, {speed}": {"weights": name, "speed": speed}
-                for name in ("default", "kitti-nc", "psmnet-compact")
-                for speed in ("fine", "quick")
-            },
-            **_SGBM,
-        },
+        rows={**_ONE_IMAGE, **_PAIRS_BY},
     ),
     Table(
         name="votes",
-        after="## Voting",
-        page="experiments/poses-by-geometry.md",
-        commands=("python bench/voting_speed.py --points 500 2000 5000",),
+        after="### Voting",
+        commands=("python bench/voting_speed.py --points 2000",),
         files=("out/bench/voting_speed.json",),
         numbers={"error, mm": "error_mm"},
         key={"points": "points", "method": "method", "hypotheses": "hypotheses"},
@@ -184,19 +170,8 @@ TABLES = (
         after="## Demo",
         commands=("depthpose demo --out OUT/demo",),
         files=("demo/depths.json",),
-        numbers={"EPE [px]": "epe_px", "D1": "d1_all", "AbsRel": "abs_rel", "RMSE": "rmse",
-                 "d1": "d1"},
+        numbers={"EPE [px]": "epe_px", "D1": "d1_all", "AbsRel": "abs_rel", "d1": "d1"},
         key={"scene": "scene", "method": "method"},
-    ),
-    Table(
-        name="demo-poses",
-        after="Over every pixel nearer than 80 m",
-        commands=("depthpose demo --out OUT/demo",),
-        files=("demo/poses.json",),
-        numbers={"visible": "visible_fraction", "error [mm]": "error_mm",
-                 "of the diameter": "of_diameter"},
-        key={"part": "object", "metric": "metric"},
-        tolerance=0.1,
     ),
 )  # fmt: skip
 """Every quick table."""

@@ -158,7 +158,7 @@ def own_part(start: str) -> PoseTraining:
 
     The backbone learns on as it ships, with batch norm folded into its convolutions, at a third of
     the rate: new norms would take the place of statistics that it learnt with, and after 600 steps
-    the loss of an unknown part is then a fifth higher (docs/experiments/poses-by-networks.md).
+    the loss of an unknown part is then a fifth higher (docs/experiments.md).
     """
     own = PoseTraining()
     return dataclasses.replace(
