@@ -40,7 +40,7 @@ def read_colors(path: AnyPath, scale: float, model: ObjectModel) -> SurfaceColor
         model: the same file's geometry, in metres.
 
     Returns:
-        The colours; None where the file has none, or one alone: it then tells no side from
+        The colours; None where the file has none, or a single one, which tells no side from
         another. Where a texture or material file is missing a notice names it.
     """
     suffix = Path(path).suffix.lower()
