@@ -6,9 +6,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-import trimesh
 from PIL import Image
-from tests.pose.textured_objects import BOX_M, saved_glb, textured_box
+from tests.pose.textured_objects import BOX_M, Mesh, saved_glb, textured_box, trimesh
 
 from depthpose.core.errors import Notice
 from depthpose.core.files import Cloud, write_cloud
@@ -18,12 +17,13 @@ from depthpose.pose.types import SurfaceColors
 SIDES = np.array([[1, 0, 0], [0, 1, 0], [0, 0, 1], [1, 1, 0], [0, 1, 1], [1, 0, 1]], float)
 
 
-def six_sided() -> trimesh.Trimesh:
+def six_sided() -> Mesh:
     """A cube of 100 whose sides -x, x, -y, y, -z, z have a colour each."""
     mesh = textured_box()
     picture = Image.new("RGB", (6 * 8, 8))
     for k, color in enumerate(SIDES):
-        picture.paste(tuple(int(255 * c) for c in color), (8 * k, 0, 8 * k + 8, 8))
+        red, green, blue = (int(255 * c) for c in color)
+        picture.paste((red, green, blue), (8 * k, 0, 8 * k + 8, 8))
     mesh.visual.material.image = picture
     mesh.vertices = mesh.vertices / BOX_M * 100
     return mesh
@@ -49,7 +49,7 @@ def check_sides(colors: SurfaceColors | None, most: float = 0.02) -> None:
     assert float(colors.points_m.abs().max()) == pytest.approx(0.05, abs=1e-4)
 
 
-def save_obj(folder: Path, mesh: trimesh.Trimesh) -> Path:
+def save_obj(folder: Path, mesh: Mesh) -> Path:
     text, files = trimesh.exchange.obj.export_obj(mesh, return_texture=True)
     for name, data in files.items():
         (folder / name).write_bytes(data)

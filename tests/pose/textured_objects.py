@@ -2,16 +2,20 @@
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
-import trimesh
+import trimesh as _trimesh
 from PIL import Image
 from torch import Tensor
 
 from depthpose.core.render import rasterize
 from depthpose.core.rigid import Rigid, rotation_by
 from depthpose.pose.types import ColorImage, ViewInput
+
+trimesh: Any = _trimesh  # its classes carry no types
+Mesh = Any
 
 K = torch.tensor([[600.0, 0, 160], [0, 600, 120], [0, 0, 1]], dtype=torch.float64)
 WIDTH, HEIGHT = 320, 240
@@ -35,7 +39,7 @@ def print_of(seed: int, width: int, height: int) -> Image.Image:
     return Image.fromarray((128 + 1.6 * mean).clip(0, 255).astype(np.uint8))
 
 
-def textured_box(seed: int = 0) -> trimesh.Trimesh:
+def textured_box(seed: int = 0) -> Mesh:
     """Eight corners, twelve faces, and a picture whose six fields are its sides; metres."""
     sides, corners, uv, faces = [], [], [], []
     for axis in range(3):
@@ -58,7 +62,7 @@ def textured_box(seed: int = 0) -> trimesh.Trimesh:
     return _textured(np.concatenate(corners), np.concatenate(faces), np.concatenate(uv), picture)
 
 
-def textured_can(seed: int = 0, steps: int = 64) -> trimesh.Trimesh:
+def textured_can(seed: int = 0, steps: int = 64) -> Mesh:
     """A cylinder about z with a label all around, and plain ends of one grey; metres."""
     radius, height = CAN_M
     angle = np.linspace(0, 2 * np.pi, steps + 1)
@@ -84,13 +88,13 @@ def textured_can(seed: int = 0, steps: int = 64) -> trimesh.Trimesh:
 
 def _textured(
     vertices: np.ndarray, faces: np.ndarray, uv: np.ndarray, picture: Image.Image
-) -> trimesh.Trimesh:
+) -> Mesh:
     material = trimesh.visual.material.SimpleMaterial(image=picture, diffuse=(255, 255, 255, 255))
     visual = trimesh.visual.TextureVisuals(uv=uv, material=material)
     return trimesh.Trimesh(vertices, faces, visual=visual, process=False)
 
 
-def saved_glb(mesh: trimesh.Trimesh, path: Path) -> Path:
+def saved_glb(mesh: Mesh, path: Path) -> Path:
     path.write_bytes(mesh.export(file_type="glb"))
     return path
 
@@ -107,7 +111,7 @@ class Light:
 
 
 def drawn_view(
-    mesh: trimesh.Trimesh,
+    mesh: Mesh,
     pose: Rigid,
     light: Light | None = None,
     *,

@@ -106,21 +106,23 @@ def view_input(
     return ViewInput(name=name, depth_m=depth_m, mask=pixels, K=K, object=object)
 
 
-def rigid_input(pose: Rigid | AnyArray) -> Rigid:
-    """Take a transform, or its 4x4 matrix in metres."""
+def rigid_input(
+    pose: Rigid | AnyArray, name: str = "first", what: str = "camera_from_model"
+) -> Rigid:
+    """Take a transform, or its 4x4 matrix in metres; in errors it is called ``name``."""
     if isinstance(pose, Rigid):
         return pose
     matrix = torch.zeros(0) if isinstance(pose, str | Path) else _tensor(pose).double()
     if tuple(matrix.shape) != (4, 4):
         raise InputError(
-            f"first is a {type(pose).__name__} of shape {tuple(matrix.shape)}; give a Rigid, or "
-            "the 4x4 matrix camera_from_model in metres"
+            f"{name} is a {type(pose).__name__} of shape {tuple(matrix.shape)}; give a Rigid, or "
+            f"the 4x4 matrix {what} in metres"
         )
     R, last = matrix[:3, :3], matrix.new_tensor([0, 0, 0, 1])
     is_rotation = torch.allclose(R @ R.T, torch.eye(3).to(R), atol=1e-4) and torch.det(R) > 0
     if not is_rotation or not torch.equal(matrix[3], last):
         raise InputError(
-            "first is no rigid transform; give [R t; 0 0 0 1], R a rotation, t in metres (a "
+            f"{name} is no rigid transform; give [R t; 0 0 0 1], R a rotation, t in metres (a "
             "transposed matrix has t in its last row)"
         )
     return Rigid(R.contiguous(), matrix[:3, 3].contiguous())

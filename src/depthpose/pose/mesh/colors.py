@@ -24,6 +24,7 @@ _SAMPLES = 10_000  # about 1 % of the diameter apart, as far as a pose is usuall
 _DENSE = 4  # so many colours are averaged in each sample
 _LEAST_CONTRAST = 0.01  # standard deviation of colours below which a model is of one colour
 _SAME_BOX = 1e-3  # of the extent: by less two readers of one file may differ
+_LEAST_INSIDE = 0.5  # share of the coloured surface in the shape's box, else they are not one
 _WITH_COLORS = (".ply", ".obj", ".glb")
 
 
@@ -64,18 +65,18 @@ def read_colors(path: AnyPath, scale: float, model: ObjectModel) -> SurfaceColor
     if samples is None:
         return None
     points_m = scale * samples.points
-    # The shape is read by another reader: the two must mean the same surface.
-    extent_m = float((model.vertices_m.amax(0) - model.vertices_m.amin(0)).max())
+    # The shape is read by another reader, which leaves stray bodies out.
     low_m, high_m = model.vertices_m.amin(0).double(), model.vertices_m.amax(0).double()
-    slack_m = _SAME_BOX * extent_m
-    if bool(((points_m < low_m - slack_m) | (points_m > high_m + slack_m)).any()):
+    slack_m = _SAME_BOX * float((high_m - low_m).max())
+    is_inside = ((points_m > low_m - slack_m) & (points_m < high_m + slack_m)).all(-1)
+    if float(is_inside.double().mean()) < _LEAST_INSIDE:
         warnings.warn(
             f"{path}: its colours lie beside its shape, so they are left out; export it as GLB",
             Notice,
             stacklevel=3,
         )
         return None
-    return average_colors(points_m, samples.normals, samples.rgb)
+    return average_colors(points_m[is_inside], samples.normals[is_inside], samples.rgb[is_inside])
 
 
 def average_colors(
