@@ -186,3 +186,50 @@ def test_options_of_regions_are_refused_where_they_do_nothing(
     ):
         assert main([*words, *more]) == 2
         assert reason in capsys.readouterr().err
+
+
+BASE = [0.0, -1, 0, 0.5, 1, 0, 0, -0.25, 0, 0, 1, 1.5, 0, 0, 0, 1]
+
+
+def test_poses_stand_in_the_frame_of_a_robot_too(
+    scene: Scene, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    words, masks = scene
+    words += ["--box", ",".join(map(str, edges(masks["bracket"]))), "--object", "bracket"]
+    given = [f"{value:g}" for value in BASE]
+    assert main([*words, "--base-from-camera", *given]) == 0
+    (row,) = answers(tmp_path).values()
+    base = torch.tensor(BASE, dtype=torch.float64).reshape(4, 4)
+    pose = torch.tensor(row["camera_from_model"], dtype=torch.float64)
+    expected = base @ pose
+    torch.testing.assert_close(torch.tensor(row["base_from_model"]), expected.float())
+    said = capsys.readouterr().out
+    assert ", ".join(f"{v:.4f}" for v in expected[:3, 3].tolist()) in said
+    page = (tmp_path / "out/report.html").read_text()
+    assert "base_from_model: R | t [m]" in page
+    # A file gives the same; another base is another run.
+    (tmp_path / "base.txt").write_text(json.dumps(base.tolist()))
+    assert main([*words, "--base-from-camera", str(tmp_path / "base.txt")]) == 0
+    assert main(words) == 2
+    words[words.index("--out") + 1] = str(tmp_path / "plain")
+    assert main(words) == 0
+    (plain,) = json.loads((tmp_path / "plain/poses.json").read_text())
+    assert plain["base_from_model"] is None
+
+
+@pytest.mark.parametrize(
+    ("given", "reason"),
+    [
+        ("1 2 3", "--base-from-camera: 3 numbers; give the 16"),
+        (" ".join(map(str, [*BASE[:3], 900, *BASE[4:]])), "is that in millimetres"),
+        (" ".join(map(str, [2, *BASE[1:]])), "base_from_camera is no rigid transform"),
+        ("lost.txt", "--base-from-camera: cannot be read as numbers"),
+    ],
+)
+def test_a_base_that_is_none_is_refused(
+    scene: Scene, capsys: pytest.CaptureFixture[str], given: str, reason: str
+) -> None:
+    words, _ = scene
+    words += ["--box", "1,1,90,90", "--object", "bracket", "--base-from-camera", *given.split()]
+    assert main(words) == 2
+    assert reason in capsys.readouterr().err

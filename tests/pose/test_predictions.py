@@ -189,6 +189,7 @@ def test_the_schema_describes_what_is_written(tmp_path: Path) -> None:
         Prediction(estimate=tracked),
         Prediction(estimate=replace(answer("bare"), covariance=None, fit=None, identity=None)),
         Prediction(estimate=replace(answer("far"), residual_m=torch.inf)),
+        Prediction(estimate=answer("based").in_base(some_pose(5))),
     ]
     write_predictions(tmp_path, sent)
     rows = json.loads((tmp_path / "poses.json").read_text())
@@ -206,6 +207,18 @@ def test_the_schema_describes_what_is_written(tmp_path: Path) -> None:
         assert not validator.is_valid([rows[0] | change]), change
     for name in ("version", "reason", "alternatives"):
         assert not validator.is_valid([{k: v for k, v in rows[0].items() if k != name}]), name
+
+
+def test_a_pose_in_the_base_frame_comes_back(tmp_path: Path) -> None:
+    base = some_pose(5)
+    sent = [answer().in_base(base), refusal().in_base(base)]
+    write_predictions(tmp_path, [Prediction(estimate=one) for one in sent])
+    posed, refused = (p.estimate for p in read_predictions(tmp_path))
+    assert posed.camera_from_model is not None
+    assert posed.base_from_model is not None
+    expected = base.double() @ posed.camera_from_model
+    torch.testing.assert_close(posed.base_from_model.matrix(), expected.matrix())
+    assert refused.base_from_model is None
 
 
 def test_the_schema_knows_every_status() -> None:

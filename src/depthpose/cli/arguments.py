@@ -186,6 +186,8 @@ _RULES: tuple[tuple[str, _Case, str, str], ...] = (
     ("pose predict, pose track", lambda o: "bop" in o,
      "mask box detections labels camera focal-px unit",
      "a data set says its cameras and units itself, and its masks are chosen by --masks"),
+    ("pose predict, pose track", lambda o: "bop" in o, "base-from-camera",
+     "the cameras of a data set move"),
     ("pose predict", lambda o: "bop" in o and "ray" in o["engine"], "engine",
      "a data set is posed by this process, or shared by those of torchrun"),
     ("pose predict", lambda o: "bop" not in o, "split masks targets",

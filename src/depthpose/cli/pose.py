@@ -49,7 +49,9 @@ def predict(
             f"{count} of --cloud, --depth and --bop are given; give one: a cloud, a depth image "
             "with --mask and --camera, or a data set"
         )
-    source = source_of(weights, register, inputs.unit, dataset, estimates.config)
+    source = source_of(
+        weights, register, inputs.unit, dataset, estimates.config, inputs.base_from_camera
+    )
     if engine.engine == "ray":
         return predict_on_ray(inputs, source, estimates.batch, out, engine)
     method, home, batch = source.build(), Path(out), estimates.batch
@@ -152,7 +154,8 @@ def track(
     if find_rank().world > 1:
         raise InputError("a sequence is followed by one process; start one")
     config = EstimateConfig(device=frames.device, min_certainty=frames.min_certainty)
-    method = source_of(weights, register, frames.unit, frames, config).build()
+    source = source_of(weights, register, frames.unit, frames, config, frames.base_from_camera)
+    method = source.build()
     if method.track is None:
         raise InputError(f"--weights {weights}: these need masked views; give weights that vote")
     follow = track_folder if frames.bop is None else track_bop

@@ -195,6 +195,7 @@ def distinct_names(files: Sequence[tuple[Path | None, str]]) -> list[str]:
 
 REGISTER = "register"  # the name of our own registration, which needs no training
 _SAME_DIAMETER = 0.05
+_FARTHEST_BASE_M = 50.0  # of a camera from the base of its robot
 
 EstimateMany = Callable[[Sequence[ViewInput]], Sequence[PoseEstimate]]
 
@@ -279,20 +280,51 @@ def _network(path: Path, name: str, config: EstimateConfig) -> PoseMethod:
     )
 
 
+def _in_base(method: PoseMethod, base: Rigid) -> PoseMethod:
+    """Let a method add ``base_from_model`` to its estimates."""
+    find, track = method.find, method.track
+
+    def estimate_many(views: Sequence[ViewInput]) -> list[PoseEstimate]:
+        return [estimate.in_base(base) for estimate in method.estimate_many(views)]
+
+    def find_in(view: ViewInput, objects: Sequence[str]) -> list[PoseEstimate]:
+        assert find is not None
+        return [estimate.in_base(base) for estimate in find(view, objects)]
+
+    def track_in(
+        frames: Iterable[AnyInput], object: str, first: Rigid | None
+    ) -> Iterator[PoseEstimate]:
+        assert track is not None
+        return (estimate.in_base(base) for estimate in track(frames, object, first))
+
+    return replace(
+        method,
+        estimate_many=estimate_many,
+        find=None if find is None else find_in,
+        track=None if track is None else track_in,
+        settings={**method.settings, "base_from_camera": base.matrix().tolist()},
+    )
+
+
 @dataclass(frozen=True, kw_only=True, eq=False)
 class MethodSource:
     """What an estimator is made from, in this process or by the workers of an engine.
 
     ``weights``: of a network, by name or file, or packed to travel; None: ``models`` are registered
-    without training.
+    without training. ``base_from_camera``: adds the pose in a robot's frame to every estimate.
     """
 
     config: EstimateConfig
     weights: str | Weights | None = None
     models: Sequence[ObjectModel] = ()
+    base_from_camera: Rigid | None = None
 
     def build(self, device: str | None = None) -> PoseMethod:
         """Build the estimator, on a device or on that of the config."""
+        method = self._build(device)
+        return method if self.base_from_camera is None else _in_base(method, self.base_from_camera)
+
+    def _build(self, device: str | None) -> PoseMethod:
         config = self.config if device is None else replace(self.config, device=device)
         if self.weights is None or self.weights == REGISTER:
             return _register(REGISTER, self.models, config)
@@ -309,20 +341,22 @@ def source_of(
     unit: Unit | None,
     dataset: DataSetOptions | SequenceOptions,
     config: EstimateConfig,
+    base: Sequence[str] = (),
 ) -> MethodSource:
     """Say what the options of a command make an estimator from."""
+    base_from_camera = read_base(base)
     # The unit of clouds is not that of CAD files that have their own.
     has_own = all(Path(path).suffix.lower() in FIXED_UNITS for path in register.cad)
     cad_unit = register.cad_unit or (None if has_own else unit)
     for path in register.cad:
         unit_of(path, cad_unit)
     if register.method == "network":
-        return MethodSource(config=config, weights=weights)
+        return MethodSource(config=config, weights=weights, base_from_camera=base_from_camera)
     if dataset.bop is not None:
         models = tuple(datasets.open_bop(dataset.bop, dataset.split).objects.values())
         return MethodSource(config=config, models=models)
     models = Registration.load(*register.cad, unit=cad_unit).models if register.cad else ()
-    return MethodSource(config=config, models=tuple(models))
+    return MethodSource(config=config, models=tuple(models), base_from_camera=base_from_camera)
 
 
 def predict_all(
@@ -364,22 +398,50 @@ def match_names(dataset: datasets.BopDataset, models: Sequence[ObjectModel]) -> 
     return names
 
 
-def read_pose(path: Path) -> Rigid:
+def read_pose(path: Path, option: str = "--first", what: str = "camera_from_model") -> Rigid:
     """Read the 4x4 matrix of a pose from a text file; brackets and commas do no harm."""
     try:
-        words = re.sub(r"[\[\],;]", " ", path.read_text()).split()
-        values = torch.tensor([float(word) for word in words], dtype=torch.float64)
+        text = path.read_text()
     except (OSError, ValueError) as error:
         raise InputError(
-            f"--first {path}: cannot be read as numbers ({error}); give a text file with the 4x4 "
-            "matrix camera_from_model in metres"
+            f"{option} {path}: cannot be read ({error}); give a text file with the 4x4 matrix "
+            f"{what} in metres"
+        ) from error
+    return _rigid_of(text, f"{option} {path}", what)
+
+
+def read_base(words: Sequence[str]) -> Rigid | None:
+    """Read ``--base-from-camera``: a text file, or 16 numbers row by row; None: it is unset."""
+    if not words:
+        return None
+    option, what = "--base-from-camera", "base_from_camera"
+    if len(words) == 1 and Path(words[0]).is_file():
+        base = read_pose(Path(words[0]), option, what)
+    else:
+        base = _rigid_of(" ".join(words), option, what)
+    if float(base.t_m.norm()) > _FARTHEST_BASE_M:
+        raise InputError(
+            f"{option}: the camera is {float(base.t_m.norm()):.0f} m from the base; is that in "
+            "millimetres? Give metres"
+        )
+    return base
+
+
+def _rigid_of(text: str, source: str, what: str) -> Rigid:
+    try:
+        words = re.sub(r"[\[\],;]", " ", text).split()
+        values = torch.tensor([float(word) for word in words], dtype=torch.float64)
+    except ValueError as error:
+        raise InputError(
+            f"{source}: cannot be read as numbers ({error}); give a text file with the 4x4 matrix "
+            f"{what} in metres"
         ) from error
     if len(values) != 16:
-        raise InputError(f"--first {path}: {len(values)} numbers; give the 16 of a 4x4 matrix")
+        raise InputError(f"{source}: {len(values)} numbers; give the 16 of a 4x4 matrix")
     try:
-        return rigid_input(values.reshape(4, 4))
+        return rigid_input(values.reshape(4, 4), what, what)
     except InputError as error:
-        raise InputError(f"--first {path}: {error}") from error
+        raise InputError(f"{source}: {error}") from error
 
 
 def chosen_objects(

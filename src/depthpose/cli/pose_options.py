@@ -96,6 +96,9 @@ class OneObjectOptions:
     """which of the objects that are known; of a data set its name or number, all by default."""
     focal_px: float | None = None
     """focal length of the depth images [px], in place of --camera; the axis meets their centre."""
+    base_from_camera: Annotated[tuple[str, ...], shown_as(metavar="PATH | 16 NUMBERS")] = ()
+    """hand-eye calibration of a camera that does not move: the 4x4 matrix row by row, in metres, or
+    a text file with it; base_from_model then stands beside camera_from_model."""
 
     @property
     def has_regions(self) -> bool:
@@ -194,6 +197,9 @@ class SequenceOptions:
     """which of the known objects; of a data set its name or number."""
     unit: Unit | None = None
     """of the clouds, metres by default; of depth images, where their camera says none."""
+    base_from_camera: Annotated[tuple[str, ...], shown_as(metavar="PATH | 16 NUMBERS")] = ()
+    """hand-eye calibration of a camera that does not move: the 4x4 matrix row by row, in metres, or
+    a text file with it; base_from_model then stands beside camera_from_model."""
     min_certainty: float = 0.9
     """below it a pose that is found is ambiguous, not ok, and so are those that follow from it."""
     device: Device = "cpu"

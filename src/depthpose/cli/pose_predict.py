@@ -45,6 +45,7 @@ from depthpose.core.files import (
 )
 from depthpose.core.files.disk import natural_order
 from depthpose.core.files.images import LISTED_SUFFIXES, refuse_among_inputs
+from depthpose.core.rigid import Rigid
 from depthpose.core.run import is_whole, note_result
 from depthpose.core.units import Unit
 from depthpose.pose.config import EstimateConfig
@@ -86,9 +87,10 @@ _WITH_ALTERNATIVES = "depthpose-alternatives"  # the method of a csv that has th
 _MOST_SHOWN = 20  # of the answers, on the terminal; poses.json holds all
 _SAID = 5  # of so many inputs the alternatives are printed; of all they are in poses.json
 _MOST_ROWS = 1000  # of the answers, in the table of the page
-_PRINTED = ("input", "object", "status", "x, y, z [m]", "qx, qy, qz, qw", "fit", "certainty",
-            "identity", "tracking")  # fmt: skip
+_PRINTED = ("input", "object", "status", "x, y, z [m]", "qx, qy, qz, qw", "base x, y, z [m]",
+            "base qx, qy, qz, qw", "fit", "certainty", "identity", "tracking")  # fmt: skip
 """Columns on the terminal."""
+_BASE_COLUMNS = ("base_x_m", "base_y_m", "base_z_m")
 _FRAME = """camera_from_model: x right, y down, z forward
 certainty: the chance that the pose is right and not one of its alternatives"""
 
@@ -596,11 +598,9 @@ def say_result(predictions: list[Prediction], out: Path, inputs: int | None = No
     if shown:
         rows: list[dict[str, Any]] = []
         for estimate in shown[:_MOST_SHOWN]:
-            row, pose = _row(estimate), estimate.camera_from_model
-            if pose is not None:
-                quaternion = Rotation.from_matrix(pose.R.double()).as_quat()
-                row["x, y, z [m]"] = ", ".join(f"{value:.4f}" for value in pose.t_m.tolist())
-                row["qx, qy, qz, qw"] = ", ".join(f"{value:.4f}" for value in quaternion.tolist())
+            row = _row(estimate)
+            row |= _pose_words(estimate.camera_from_model, "")
+            row |= _pose_words(estimate.base_from_model, "base ")
             certain = {
                 key: value for key in ("fit", "certainty") if (value := row[key]) is not None
             }
@@ -620,6 +620,17 @@ def say_result(predictions: list[Prediction], out: Path, inputs: int | None = No
     return 1 if failed else 0
 
 
+def _pose_words(pose: Rigid | None, before: str) -> dict[str, str]:
+    """Write place and quaternion of a pose under these names of columns."""
+    if pose is None:
+        return {}
+    quaternion = Rotation.from_matrix(pose.R.double()).as_quat()
+    return {
+        f"{before}x, y, z [m]": ", ".join(f"{value:.4f}" for value in pose.t_m.tolist()),
+        f"{before}qx, qy, qz, qw": ", ".join(f"{value:.4f}" for value in quaternion.tolist()),
+    }
+
+
 def _count_inputs(predictions: Sequence[Prediction], inputs: int | None) -> str:
     """Say how many inputs there were, and how many answers where that is another number."""
     count, answers = len(predictions) if inputs is None else inputs, len(predictions)
@@ -631,12 +642,14 @@ def _row(estimate: PoseEstimate) -> dict[str, Any]:
     """Say what was found of one input, as the page and the terminal show it."""
     pose, fit, identity = estimate.camera_from_model, estimate.fit, estimate.identity
     place = [None] * 3 if pose is None else pose.t_m.double().tolist()
+    base = estimate.base_from_model
     return {
         "input": estimate.name,
         "object": estimate.object,
         "status": estimate.status,
         **({} if estimate.tracking is None else {"tracking": estimate.tracking}),
         **dict(zip(("x_m", "y_m", "z_m"), place, strict=True)),
+        **({} if base is None else dict(zip(_BASE_COLUMNS, base.t_m.tolist(), strict=True))),
         "fit": None if fit is None else fit.agrees,
         "identity": None if identity is None else identity.status,
         "certainty": estimate.certainty,

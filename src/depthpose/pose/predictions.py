@@ -144,6 +144,8 @@ def prediction_row(prediction: Prediction) -> dict[str, Any]:
     row |= dict(zip(_PLACE, place, strict=True)) if place is not None else {}
     row |= {"status": estimate.status, "reason": estimate.reason}
     row["camera_from_model"] = None if pose is None else pose.matrix().tolist()
+    base = estimate.base_from_model
+    row["base_from_model"] = None if base is None else base.matrix().tolist()
     for name in ("covariance", "free_motions", "keypoints_m"):
         values: Tensor | None = getattr(estimate, name)
         row[name] = None if values is None else values.double().tolist()
@@ -234,6 +236,7 @@ def parse_prediction(row: dict[str, Any], source: str) -> Prediction:
         status=cast("Status", status),
         reason=str(reason),
         camera_from_model=pose,
+        base_from_model=_pose(row, source, "base_from_model"),
         alternatives=tuple(alternatives),
         tracking=cast("Tracking | None", tracking),
         **values,
@@ -243,8 +246,8 @@ def parse_prediction(row: dict[str, Any], source: str) -> Prediction:
     return Prediction(estimate=estimate, place=place)
 
 
-def _pose(row: dict[str, Any], source: str) -> Rigid | None:
-    matrix = _table(row, "camera_from_model", 4, source, rows=4)
+def _pose(row: dict[str, Any], source: str, key: str = "camera_from_model") -> Rigid | None:
+    matrix = _table(row, key, 4, source, rows=4)
     if matrix is None:
         return None
     R = matrix[:3, :3]
@@ -252,7 +255,7 @@ def _pose(row: dict[str, Any], source: str) -> Rigid | None:
     is_rotation = torch.allclose(R @ R.T, eye, atol=_ROTATION_SLACK) and torch.linalg.det(R) > 0
     if not is_rotation or matrix[3].tolist() != [0, 0, 0, 1]:
         raise InputError(
-            f"{source}: camera_from_model is no rigid transform; write 4 rows of 4, a rotation, "
+            f"{source}: {key} is no rigid transform; write 4 rows of 4, a rotation, "
             "metres, and 0 0 0 1 below"
         )
     return Rigid(R.clone(), matrix[:3, 3].clone())

@@ -1,6 +1,6 @@
 """Types of the pose package: input apart from truth, the object, and the estimate."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Literal
 
 import torch
@@ -281,6 +281,8 @@ class PoseEstimate:
     signals: dict[str, float] = field(default_factory=dict)
     seconds: dict[str, float] = field(default_factory=dict)  #: time of each stage
     tracking: Tracking | None = None  #: how it came about, in a sequence; None elsewhere
+    #: the pose in the frame of a robot's base, by :meth:`in_base`; None where no base is known.
+    base_from_model: Rigid | None = None
 
     def __post_init__(self) -> None:
         # No default may look like success: an answer has a pose, all others have a reason.
@@ -296,6 +298,13 @@ class PoseEstimate:
     def is_posed(self) -> bool:
         """Whether there is a pose, ok or ambiguous."""
         return self.status in POSED
+
+    def in_base(self, base_from_camera: Rigid) -> "PoseEstimate":
+        """Add ``base_from_model`` by a hand-eye calibration in metres; a refusal has none."""
+        if self.camera_from_model is None:
+            return self
+        pose = base_from_camera.double() @ self.camera_from_model.double()
+        return replace(self, base_from_model=pose)
 
     @property
     def origin_std_mm(self) -> Float64[Tensor, "3"] | None:

@@ -247,6 +247,9 @@ def pose_sentence(estimate: PoseEstimate) -> str:
         return f"Refused ({estimate.status}): {estimate.reason}."
     x, y, z = estimate.camera_from_model.t_m.tolist()
     said = f"The {estimate.object} is at x {x:.4f}, y {y:.4f}, z {z:.4f} m in the camera's frame."
+    if estimate.base_from_model is not None:
+        x, y, z = estimate.base_from_model.t_m.tolist()
+        said += f" From the robot's base it is at x {x:.4f}, y {y:.4f}, z {z:.4f} m."
     if estimate.status == "ambiguous":
         said += f" It is ambiguous: {estimate.reason}."
     if not estimate.alternatives:
@@ -300,8 +303,9 @@ def pose_tables(estimate: PoseEstimate) -> dict[str, Sequence[Sequence[str]]]:
     tables: dict[str, Sequence[Sequence[str]]] = {}
     pose = estimate.camera_from_model
     if pose is not None:
-        rows = torch.cat([pose.R, pose.t_m[:, None]], 1).tolist()
-        tables["camera_from_model: R | t [m]"] = [[f"{v:.5f}" for v in row] for row in rows]
+        tables["camera_from_model: R | t [m]"] = _matrix_rows(pose)
+    if estimate.base_from_model is not None:
+        tables["base_from_model: R | t [m]"] = _matrix_rows(estimate.base_from_model)
     if pose is not None and estimate.covariance is not None:
         assert estimate.origin_std_mm is not None
         assert estimate.rotation_std_deg is not None
@@ -320,6 +324,11 @@ def pose_tables(estimate: PoseEstimate) -> dict[str, Sequence[Sequence[str]]]:
             [f"{v:.2e}" for v in row] for row in estimate.covariance.tolist()
         ]
     return tables
+
+
+def _matrix_rows(pose: Rigid) -> list[list[str]]:
+    rows = torch.cat([pose.R, pose.t_m[:, None]], 1).tolist()
+    return [[f"{value:.5f}" for value in row] for row in rows]
 
 
 def pose_scene(
