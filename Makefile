@@ -64,7 +64,6 @@ bench: $(READY)
 	$(BIN)/python bench/stereo_speed.py
 	$(BIN)/python bench/stereo_memory.py
 	$(BIN)/python bench/mono_speed.py
-	$(BIN)/python bench/view_quality.py
 	$(BIN)/depthpose data make streets --out $(OUT)/bench/streets --number 20 --scale 0.5 --no-with-lidar
 	$(BIN)/python bench/training_speed.py --data $(OUT)/bench/streets
 	$(BIN)/python bench/voting_speed.py

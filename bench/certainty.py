@@ -17,12 +17,12 @@ from typing import Any, NamedTuple
 
 import torch
 from curves import draw_curves
-from pose_candidates import add_of
 
 from depthpose.core.checkpoint import find_weights
+from depthpose.core.rigid import Rigid
 from depthpose.pose.config import ObjectsConfig, SensorConfig
 from depthpose.pose.estimator import GeoPoseNet
-from depthpose.pose.estimator.candidates import find_copies
+from depthpose.pose.estimator.candidates import PoseAmbiguities, find_copies
 from depthpose.pose.synthetic import Objects
 from depthpose.pose.weights import read_pose_weights
 from depthpose.report.page import markdown_table, write_table
@@ -64,9 +64,18 @@ def answers_of(name: str, number: int) -> Iterator[Answer | None]:
                 yield None
                 continue
             every = [pose, *(other.camera_from_model for other in estimate.alternatives)]
-            right = [add_of(one, truth, copies[k % len(copies)]) < 0.1 for one in every]
+            errors = [add_in_diameters(one, truth, copies[k % len(copies)]) for one in every]
+            right = [error < 0.1 for error in errors]
             certainty = 1.0 if estimate.certainty is None else estimate.certainty
             yield Answer(Path(name).stem, estimate.object, certainty, right[0], any(right))
+
+
+def add_in_diameters(pose: Rigid, truth: Rigid, copies: PoseAmbiguities) -> float:
+    """ADD to the nearest true copy, in diameters."""
+    copies_of_truth = truth.double() @ copies.same
+    posed_m = pose.double().apply(copies.points_m)
+    true_m = copies_of_truth.apply(copies.points_m.expand(len(copies_of_truth.R), -1, -1))
+    return float((posed_m - true_m).norm(dim=-1).mean(-1).min()) / copies.diameter_m
 
 
 def band_rows(answers: Sequence[Answer]) -> list[dict[str, Any]]:

@@ -8,12 +8,13 @@ packages it would take, they are downloaded, and their files are counted.
 
 import json
 import subprocess
-import sys
 import tempfile
 import tomllib
 import venv
 import zipfile
 from pathlib import Path
+
+from shared import report
 
 PROJECT = Path(__file__).parents[1]
 CONSTRAINTS = str(PROJECT / "constraints.txt")
@@ -49,34 +50,33 @@ def size(file: Path) -> tuple[float, float]:
     return file.stat().st_size / 1e6, unpacked / 1e6
 
 
-def row(name: str, wheels: list[Path]) -> str:
+def row(name: str, wheels: list[Path]) -> dict[str, object]:
     """One row of the table; the three largest packages are named."""
     sizes = {file.name.split("-")[0]: size(file) for file in wheels}
     largest = sorted(sizes, key=lambda key: -sizes[key][1])[:3]
     named = ", ".join(f"{key} {sizes[key][1]:.0f}" for key in largest)
     download, disk = (sum(both[part] for both in sizes.values()) for part in (0, 1))
-    return f"| {name} | {len(sizes)} | {download:.1f} | {disk:.1f} | {named} |"
+    return {"installs": name, "packages": len(sizes), "download, MB": download,
+            "on disk, MB": disk, "largest, MB on disk": named}  # fmt: skip
 
 
 def main() -> None:
-    """Print a Markdown table: the core, then what each extra adds to it."""
+    """Print a table: the core, then what each extra adds to it."""
     extras = tomllib.loads((PROJECT / "pyproject.toml").read_text())["project"][
         "optional-dependencies"
     ]
     torch = next(line for line in Path(CONSTRAINTS).read_text().split() if line.startswith("torch"))
-    print("| installs | packages | download, MB | on disk, MB | largest, MB on disk |")
-    print("| --- | ---: | ---: | ---: | --- |")
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         venv.create(folder / "env", with_pip=True)
         python = folder / "env/bin/python"
         pip(python, "install", "--quiet", torch, "numpy")
         core = wanted(python, str(PROJECT))
-        print(row("core", [wheel(python, package, folder) for package in sorted(core)]))
+        rows = [row("core", [wheel(python, package, folder) for package in sorted(core)])]
         for extra in extras:
             more = sorted(wanted(python, f"{PROJECT}[{extra}]") - core)
-            print(row(f"`{extra}`", [wheel(python, package, folder) for package in more]))
-            sys.stdout.flush()
+            rows.append(row(f"`{extra}`", [wheel(python, package, folder) for package in more]))
+    report("install_sizes", rows)
 
 
 if __name__ == "__main__":

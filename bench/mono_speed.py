@@ -17,8 +17,8 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from stereo_memory import resident_bytes
-from stereo_speed import best_seconds, out_folder, peak_flops
+from shared import least_seconds, peak_growth_bytes, report, setting
+from stereo_speed import peak_flops
 from torch.utils.flop_counter import FlopCounterMode
 
 from depthpose.core.camera import StereoRig
@@ -63,7 +63,7 @@ def seconds(run: Callable[[], object], device: str) -> float:
             torch.cuda.synchronize()
 
     waited()
-    return best_seconds(waited, 3)
+    return least_seconds(waited, 3)
 
 
 def count_flops(run: Callable[[], object]) -> int:
@@ -98,12 +98,9 @@ def run_once(weights: str, precision: str, device: str) -> dict[str, object]:
     run: Any = {"precision": precision, "device": device}
     config = MatcherConfig(**run, speed="quick")
     net, image = make_net(weights, config), street()
-    before = resident_bytes("VmRSS")
-    Path("/proc/self/clear_refs").write_text("5")
-    begin = time.perf_counter()
-    net.estimate_pair(image)
-    first = time.perf_counter() - begin
-    memory = resident_bytes("VmHWM") - before
+    began = time.perf_counter()
+    memory = peak_growth_bytes(lambda: net.estimate_pair(image))
+    first = time.perf_counter() - began
     if device != "cpu":
         memory = torch.cuda.max_memory_allocated()
     assert net.synthesiser is not None
@@ -184,9 +181,8 @@ def main() -> None:
             command += ["--child", weights, precision]
             done = subprocess.run(command, check=True, capture_output=True, text=True)
             rows.append(json.loads(done.stdout.splitlines()[-1]))
-    print(f"{torch.get_num_threads()} threads, torch {torch.__version__}, {WIDTH}x{HEIGHT}")
-    print(markdown_table(rows))
-    (out_folder() / "mono_speed.json").write_text(json.dumps(rows, indent=1))
+    print(f"{setting()}, {WIDTH}x{HEIGHT}")
+    report("mono_speed", rows)
 
 
 if __name__ == "__main__":

@@ -11,7 +11,6 @@ growth of the resident set's peak over a step, each in its own process, Linux on
 """
 
 import argparse
-import json
 import subprocess
 import sys
 import time
@@ -23,6 +22,7 @@ from typing import Any
 from unittest.mock import patch
 
 import torch
+from shared import peak_growth_bytes, report, setting
 from torch import Tensor, nn
 
 from depthpose.pose.network import ResUNet, ResUNetConfig
@@ -142,12 +142,6 @@ def seconds(work: Callable[[Run], None], run: Run) -> float:
     return clock() - begin
 
 
-def status_bytes(name: str) -> int:
-    """Read a line of the process's status: VmRSS or VmHWM."""
-    lines = Path("/proc/self/status").read_text().splitlines()
-    return next(int(line.split()[1]) * 1024 for line in lines if line.startswith(name))
-
-
 def measure_memory(network: ResUNet, voxels: int, engine: str) -> int:
     """Peak growth of the resident set over a step [bytes], after one on a small cloud.
 
@@ -156,10 +150,7 @@ def measure_memory(network: ResUNet, voxels: int, engine: str) -> int:
     """
     run = engines(network, surface(voxels))[engine]
     step(engines(network, surface(50))[engine])
-    before = status_bytes("VmRSS")
-    Path("/proc/self/clear_refs").write_text("5")
-    step(run)
-    return status_bytes("VmHWM") - before
+    return peak_growth_bytes(lambda: step(run))
 
 
 def child_memory(script: str, *words: object) -> float:
@@ -190,17 +181,7 @@ def bench(network: ResUNet, voxels: int, args: argparse.Namespace) -> list[dict]
         difference = (answers[name] - answers["ours"]).abs().max() / answers["ours"].abs().max()
         rows[-1] |= {"forward_ratio": ahead / rows[0]["forward_s"], "difference": float(difference)}
         rows[-1] |= {"step_ratio": whole / rows[0]["step_s"]}
-        print(as_line(rows[-1]), flush=True)
     return rows
-
-
-def as_line(row: dict) -> str:
-    """Write a row in Markdown."""
-    return (
-        f"| {row['voxels']} | {row['engine']} | {1e3 * row['forward_s']:.1f} "
-        f"| {row['forward_ratio']:.2f} | {1e3 * row['step_s']:.1f} | {row['step_ratio']:.2f} "
-        f"| {row['memory_mb']:.0f} | {row['difference']:.0e} |"
-    )
 
 
 def main() -> None:
@@ -217,13 +198,9 @@ def main() -> None:
     if args.memory_of:
         print(measure_memory(network, args.voxels[0], args.memory_of))
         return
-    print(f"{args.threads} threads, torch {torch.__version__}, {ResUNetConfig(norm='none')}")
-    print("| voxels | engine | forward ms | x ours | step ms | x ours | step MB | difference |")
-    print("| --- | --- | --- | --- | --- | --- | --- | --- |")
+    print(f"{setting()}, {ResUNetConfig(norm='none')}")
     rows = [row for voxels in args.voxels for row in bench(network, voxels, args)]
-    folder = Path("out/bench")
-    folder.mkdir(parents=True, exist_ok=True)
-    (folder / "sparse_speed.json").write_text(json.dumps(rows, indent=1))
+    report("sparse_speed", rows)
 
 
 if __name__ == "__main__":

@@ -7,6 +7,8 @@ import subprocess
 import sys
 import time
 
+from shared import report
+
 from depthpose.cli import COMMANDS
 
 
@@ -21,17 +23,16 @@ def seconds(*words: str) -> float:
 
 
 def main() -> None:
-    """Print a Markdown table."""
-    rows: dict[str, tuple[str, ...]] = {
+    """Print a table and write out/bench/startup.json."""
+    words_of: dict[str, tuple[str, ...]] = {
         "python -c pass": ("-c", "pass"),
         "python -c 'import torch'": ("-c", "import torch"),
         "python -c 'import depthpose'": ("-c", "import depthpose"),
     }
     for name in ("", *COMMANDS):
-        rows[f"depthpose {name} --help"] = ("-m", "depthpose", *name.split(), "--help")
-    print("| command | seconds |\n| --- | --- |")
-    for name, words in rows.items():
-        print(f"| {name} | {seconds(*words):.2f} |")
+        words_of[f"depthpose {name} --help"] = ("-m", "depthpose", *name.split(), "--help")
+    rows = [{"command": name, "seconds": seconds(*words)} for name, words in words_of.items()]
+    report("startup", rows)
 
 
 if __name__ == "__main__":

@@ -4,7 +4,6 @@ python bench/stereo_memory.py [--size 375x1242] [--bound-mb 1000] [--weights F.t
 """
 
 import argparse
-import json
 import subprocess
 import sys
 import tempfile
@@ -12,7 +11,8 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from stereo_speed import network_for, out_folder, plain_match, random_pair, size_of
+from shared import peak_growth_bytes, report, size_of
+from stereo_speed import network_for, plain_match, random_pair
 
 from depthpose.depth.config import MatcherConfig
 from depthpose.depth.stereo import PSMNetMatcher
@@ -22,26 +22,22 @@ PLAIN = 0
 """Marks the plain network, in place of a bound."""
 
 
-def resident_bytes(field: str) -> int:
-    """Read a line of this process's memory, VmRSS or VmHWM [bytes]."""
-    status = Path("/proc/self/status").read_text()
-    return 1024 * int(next(line for line in status.splitlines() if field in line).split()[1])
-
-
 def run_once(size: tuple[int, int], weights: Path | None, bound: int | None, out: Path) -> None:
     """Match once and write disparity and the rise of peak memory after loading."""
     network = network_for(weights)
     left, right = random_pair(size, torch.Generator().manual_seed(0))
     matcher = PSMNetMatcher(network, MatcherConfig(max_memory_bytes=bound or None))
-    before = resident_bytes("VmRSS")
-    # Loading may have peaked higher: 5 resets the high-water mark (Linux, proc_pid_clear_refs).
-    Path("/proc/self/clear_refs").write_text("5")
-    if bound == PLAIN:
-        disparity_px = plain_match(network, (left, right))
-    else:
-        disparity_px = matcher.match(left, right).disparity_px
-    activations = resident_bytes("VmHWM") - before
-    np.savez(out, disparity_px=disparity_px.numpy(), activations=activations)
+
+    def match() -> None:
+        if bound == PLAIN:
+            disparity_px = plain_match(network, (left, right))
+        else:
+            disparity_px = matcher.match(left, right).disparity_px
+        maps.append(disparity_px.numpy())
+
+    maps: list[np.ndarray] = []
+    activations = peak_growth_bytes(match)
+    np.savez(out, disparity_px=maps[0], activations=activations)
 
 
 def measure(
@@ -79,12 +75,7 @@ def main() -> None:
         run_once(size_of(args.size[0]), args.weights, bound, args.child)
         return
     rows = [row for size in args.size for row in rows_of(size_of(size), args)]
-    print(
-        "| size | bound MB | peak activations MB | max difference px |\n| --- | --- | --- | --- |"
-    )
-    for row in rows:
-        print(f"| {row['size']} | {row['bound_mb']} | {row['peak_mb']} | {row['max_px']:.2g} |")
-    (out_folder() / "stereo_memory.json").write_text(json.dumps(rows, indent=1))
+    report("stereo_memory", rows)
 
 
 def rows_of(size: tuple[int, int], args: argparse.Namespace) -> list[dict[str, object]]:

@@ -7,13 +7,12 @@ Without weights they are random, and differences mean less. With a left and righ
 """
 
 import argparse
-import json
 import time
-from collections.abc import Callable
 from pathlib import Path
 
 import torch
 import torch.nn.functional as F
+from shared import least_seconds, report, setting, size_of
 from torch import Tensor
 from torch.utils.flop_counter import FlopCounterMode
 
@@ -31,19 +30,6 @@ from depthpose.depth.stereo.psmnet import expected_disparity
 from depthpose.depth.weights import read_matcher
 
 Pair = tuple[Tensor, Tensor]
-
-
-def size_of(text: str) -> tuple[int, int]:
-    """Read ``256x512`` as rows and columns."""
-    rows, columns = text.split("x")
-    return int(rows), int(columns)
-
-
-def out_folder() -> Path:
-    """Where benchmarks write."""
-    folder = Path("out/bench")
-    folder.mkdir(parents=True, exist_ok=True)
-    return folder
 
 
 def network_for(weights: Path | None) -> PSMNet:
@@ -89,26 +75,16 @@ def plain_match(network: PSMNet, pair: Pair) -> Tensor:
         return network(left, right)[-1][0, -h:, :w]
 
 
-def best_seconds(run: Callable[[], object], repeats: int) -> float:
-    """Least processor time of some runs, all threads together; the caller has warmed up."""
-    times = []
-    for _ in range(repeats):
-        begin = time.process_time()
-        run()
-        times.append(time.process_time() - begin)
-    return min(times)
-
-
 def peak_flops(dtype: torch.dtype) -> float:
     """Most operations a second [FLOP/s] that a matrix product reached, by two libraries.
 
     The second is a 1x1 convolution, which is the same product through oneDNN.
     """
     a, b = torch.randn(2, 4096, 1024).to(dtype)
-    by_matmul = best_seconds(lambda: a @ b.T, 5)
+    by_matmul = least_seconds(lambda: a @ b.T, 5)
     x = torch.randn(1, 512, 64, 128).to(dtype).contiguous(memory_format=torch.channels_last)
     w = torch.randn(512, 512, 1, 1).to(dtype).contiguous(memory_format=torch.channels_last)
-    by_convolution = best_seconds(lambda: F.conv2d(x, w), 5)
+    by_convolution = least_seconds(lambda: F.conv2d(x, w), 5)
     return max(2 * 4096 * 4096 * 1024 / by_matmul, 2 * 512 * 512 * 64 * 128 / by_convolution)
 
 
@@ -154,17 +130,7 @@ def bench(network: PSMNet, size: str, pair: Pair, args: argparse.Namespace) -> l
         row["ratio"] = rows[0]["seconds"] / row["seconds"]
         row["gflop"], row["peak_gflops"] = flops / 1e9, peak / 1e9
         row["share_of_peak"] = flops / row["seconds"] / peak
-        print(as_line(row), flush=True)
     return rows
-
-
-def as_line(row: dict) -> str:
-    """Write a row in Markdown."""
-    return (
-        f"| {row['size']} | {row['what']} | {row['seconds']:.2f} | {row['first_seconds']:.2f} "
-        f"| {row['ratio']:.2f} | {row['max_px']:.1e} | {row['mean_px']:.1e} "
-        f"| {row['gflop']:.0f} | {row['share_of_peak']:.2f} |"
-    )
 
 
 def timed(
@@ -179,7 +145,7 @@ def timed(
         answer, run = matcher.match(*pair).disparity_px, lambda: matcher.match(*pair)
     first = time.process_time() - begin
     difference = (answer.double() - exact).abs()
-    seconds = best_seconds(run, repeats)
+    seconds = least_seconds(run, repeats)
     return {
         "seconds": seconds,
         "first_seconds": first,
@@ -198,19 +164,12 @@ def main() -> None:
     parser.add_argument("--exact", action="store_true", help="compare with float64: a minute more")
     args = parser.parse_args()
     network = network_for(args.weights)
-    print(
-        f"{torch.get_num_threads()} threads, torch {torch.__version__}; differences from ", end=""
-    )
-    print("float64" if args.exact else "the plain network", end="")
-    print("; 'of peak': the plain network's operations a second against the best matrix product's")
-    print(
-        "| size | what | cpu s | first run s | times faster | max px | mean px | GFLOP | of peak |"
-    )
-    print("| --- | --- | --- | --- | --- | --- | --- | --- | --- |")
+    print(f"{setting()}; differences from {'float64' if args.exact else 'the plain network'};")
+    print("share_of_peak: the plain network's operations a second against the best product's")
     rows = [
         row for s in args.size for row in bench(network, s, pair_for(size_of(s), args.pair), args)
     ]
-    (out_folder() / "stereo_speed.json").write_text(json.dumps(rows, indent=1))
+    report("stereo_speed", rows)
 
 
 if __name__ == "__main__":

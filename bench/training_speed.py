@@ -8,13 +8,12 @@ rendered on the fly; then the samples a second that the compact training steps t
 
 import argparse
 import itertools
-import json
 import time
 from dataclasses import replace
 from pathlib import Path
 
 import torch
-from stereo_speed import out_folder
+from shared import report, setting
 from torch.utils.data import DataLoader
 
 from depthpose.core.config import read_config
@@ -24,7 +23,6 @@ from depthpose.depth.stereo import PSMNet
 from depthpose.depth.synthesis import UNetGenerator
 from depthpose.depth.train import FinetuneTask, StereoTask, TrainingPairs, ViewTask
 from depthpose.depth.train.config import FinetuneTraining, StereoTraining, ViewTraining
-from depthpose.report.page import markdown_table
 
 CONFIGS = Path(__file__).parents[1] / "configs" / "depth"
 
@@ -88,7 +86,7 @@ def step_rates(pairs: PairsConfig) -> dict[str, float]:
 
 
 def main() -> None:
-    """Print both tables and write out/bench/training_speed.json."""
+    """Print both tables and write them to out/bench."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else "")
     parser.add_argument("--data", required=True, help="folder of pairs with truth")
     parser.add_argument("--workers", nargs="+", type=int, default=[0, 1, 2])
@@ -97,15 +95,15 @@ def main() -> None:
     view = read_config(CONFIGS / "compact-view.yaml", ViewTraining)
     chosen = sources(options.data, view)
     steps = [{"stage": n, "samples_per_s": r} for n, r in step_rates(chosen["folder"]).items()]
-    print(f"{torch.get_num_threads()} threads\n{markdown_table(steps)}")
+    print(setting())
+    report("training_speed_steps", steps)
     rows = [
         {"source": name, "workers": workers,
          "samples_per_s": data_rate(config, workers, options.batches)}
         for name, config in chosen.items()
         for workers in options.workers
     ]  # fmt: skip
-    print(markdown_table(rows))
-    (out_folder() / "training_speed.json").write_text(json.dumps([steps, rows], indent=1))
+    report("training_speed", rows)
 
 
 if __name__ == "__main__":

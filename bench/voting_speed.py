@@ -10,13 +10,12 @@ come from one process.
 """
 
 import argparse
-import json
 import time
 from collections.abc import Callable
-from pathlib import Path
 
 import numpy as np
 import torch
+from shared import report
 
 from depthpose.pose.config import VotingConfig
 from depthpose.pose.voting import meet_lines, vote_ransac
@@ -104,14 +103,12 @@ def main() -> None:
     parser.add_argument("--noise", type=float, default=0.05)
     arguments = parser.parse_args()
     torch.set_num_threads(1)
-    rows = []
-    for points in arguments.points:
-        for row in measure(points, arguments.hypotheses, arguments.noise):
-            print(" | ".join(str(value) for value in row.values()), flush=True)
-            rows.append(row)
-    out = Path("out/bench")
-    out.mkdir(parents=True, exist_ok=True)
-    (out / "voting_speed.json").write_text(json.dumps(rows, indent=2))
+    rows = [
+        row
+        for points in arguments.points
+        for row in measure(points, arguments.hypotheses, arguments.noise)
+    ]
+    report("voting_speed", rows)
 
 
 if __name__ == "__main__":
