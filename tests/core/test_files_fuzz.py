@@ -50,6 +50,8 @@ LZF_PCD = (
 )
 JSON = b'{"width": 640, "height": 480, "K": [[500, 0, 320], [0, 5e2, 240], [0, 0, 1]], '
 CAMERA = JSON + b'"baseline_m": 0.5, "cx_right_minus_left_px": 1.5, "depth_unit_m": 0.001}'
+pytestmark = pytest.mark.filterwarnings("ignore::depthpose.core.errors.Notice")
+
 ROS = (
     b"image_width: 640\nimage_height: 480\ndistortion_coefficients: {data: [0.0, 0]}\n"
     b"projection_matrix:\n  rows: 3\n  data: [500, 0, 320, -60.0, 0, 5e2, 240, 0, 0, 0, 1, 0]\n"

@@ -1,7 +1,9 @@
 import re
 import struct
 from contextlib import nullcontext
+from io import BytesIO
 from pathlib import Path
+from typing import Any
 from zlib import compress, crc32
 
 import numpy as np
@@ -278,3 +280,63 @@ def test_an_archive_is_named_for_what_it_is(tmp_path: Path, name: str) -> None:
     file.write_bytes(b"PK")
     with pytest.raises(InputError, match="unpack the archive"):
         list_images(file)
+
+
+def jpeg(folder: Path, data: bytes | None = None, options: Any = None) -> tuple[Path, bytes]:
+    """Write a JPEG of a picture with texture, or these bytes, and give both."""
+    encoded = BytesIO()
+    tiles = np.random.default_rng(0).integers(0, 256, (12, 20, 3), dtype=np.uint8)
+    pixels = tiles.repeat(8, 0).repeat(8, 1)
+    Image.fromarray(pixels).save(encoded, "JPEG", quality=95, **(options or {}))
+    path = folder / "street.jpg"
+    path.write_bytes(encoded.getvalue() if data is None else data)
+    return path, path.read_bytes()
+
+
+@pytest.mark.parametrize("options", [{}, {"progressive": True}, {"subsampling": 0}], ids=str)
+def test_a_damaged_jpeg_is_refused(tmp_path: Path, options: dict[str, int]) -> None:
+    path, whole = jpeg(tmp_path, options=options)
+    with Image.open(path) as pillow:
+        assert np.array_equal(np.asarray(pillow), (read_image(path) * 255).byte().permute(1, 2, 0))
+    cut = whole[: len(whole) * 6 // 10]
+    damaged = {
+        "cut, and closed by an end marker": cut + b"\xff\xd9",
+        "cut": cut,
+        "bytes lost": whole[: len(whole) // 2] + whole[len(whole) // 2 + 40 :],
+    }
+    for how, data in damaged.items():
+        path, _ = jpeg(tmp_path, data)
+        with pytest.raises(InputError, match="JPEG"):
+            pytest.fail(f"{how}: {read_image(path).shape}")
+    assert image_size(path) == (160, 96)
+
+
+def test_of_several_pictures_in_a_file_the_first_is_read_with_a_notice(tmp_path: Path) -> None:
+    one, other = (Image.new("L", (8, 6), value) for value in (51, 255))
+    for suffix in ("tif", "gif", "png"):
+        path = tmp_path / suffix / f"x.{suffix}"
+        path.parent.mkdir()
+        one.save(path, save_all=True, append_images=[other])
+        with pytest.warns(
+            Notice, match=f"x.{suffix}: holds 2 pictures, of which the first is read"
+        ):
+            assert float(read_image(path).mean()) == pytest.approx(0.2, abs=0.01)
+    read_image(tmp_path / "tif" / "x.tif")  # a folder is told of once
+
+
+def test_a_16_bit_tiff_whose_0_is_white_is_not_read_inverted(tmp_path: Path) -> None:
+    values = np.linspace(0, 65535, 48).astype(np.uint16).reshape(6, 8)
+    path = tmp_path / "x.tif"
+    Image.fromarray(values).save(path, tiffinfo={0x0106: 0})
+    assert np.allclose(read_image(path)[0], 1 - values / 65535)
+
+
+def test_files_of_stereo_cameras_are_no_single_picture(tmp_path: Path) -> None:
+    left, right, small = (Image.new("RGB", size) for size in ((64, 48), (64, 48), (32, 24)))
+    left.save(tmp_path / "x.mpo", save_all=True, append_images=[right])
+    left.save(tmp_path / "x.jps", "JPEG")
+    for name in ("x.mpo", "x.jps"):
+        with pytest.raises(InputError, match=rf"{name}: holds both views .* data split {name}"):
+            read_image(tmp_path / name)
+    left.save(tmp_path / "gain.jpg", "MPO", save_all=True, append_images=[small])
+    assert read_image(tmp_path / "gain.jpg").shape == (3, 48, 64)

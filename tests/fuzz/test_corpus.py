@@ -12,6 +12,7 @@ from tests.fuzz.corpus import Kind, kinds
 
 from depthpose.core.errors import InputError
 
+pytestmark = pytest.mark.filterwarnings("ignore::depthpose.core.errors.Notice")
 CASES = 200
 """Of each kind."""
 _LONGEST_S = 20

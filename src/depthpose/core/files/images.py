@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import simplejpeg
 import torch
 from jaxtyping import Float, Float32, Shaped
 from PIL import Image
@@ -47,8 +48,11 @@ MAX_PIXELS = 2**25  # 0.4 GB of floats; a small file may declare any size
 
 # Named one by one: Pillow also opens formats that start other programs.
 _FORMATS = ("PNG", "JPEG", "BMP", "PPM", "TIFF", "WEBP", "GIF")
+_JPEG_COLOURS = {"RGB": "RGB", "L": "GRAY"}
+"""Modes of Pillow's, and what simplejpeg calls them."""
 _GREY_16 = ("I;16", "I;16L", "I;16B", "I;16N")
 _EXIF_ORIENTATION = 0x0112
+_PHOTOMETRIC = 0x0106  # of TIFF: 0 where the value 0 is white
 _UPRIGHT = {
     2: Image.Transpose.FLIP_LEFT_RIGHT,
     3: Image.Transpose.ROTATE_180,
@@ -64,13 +68,22 @@ def read_image(path: AnyPath) -> Float32[Tensor, "3 h w"]:
     """Read a picture as RGB in [0, 1].
 
     Greyscale becomes three equal channels, a palette its colours; alpha is dropped, the EXIF
-    orientation applied, and 16 bits a channel scaled by ``from_16_bit``.
+    orientation applied, and 16 bits a channel scaled by ``from_16_bit``. Of several pictures in one
+    file the first is read, with a notice.
 
     Raises:
-        InputError: the file is missing, damaged, too large or not a picture.
+        InputError: the file is missing, damaged, too large, not a picture, or holds both views of a
+            stereo camera.
     """
     with opened_image(path) as image:
         pixels = _decoded(path, image)
+        count = getattr(image, "n_frames", 1) if image.format != "MPO" else 1
+    if count > 1 and _is_new(path, "several"):
+        said = (
+            f"{path}: holds {count} pictures, of which the first is read (so it is of other files "
+            "there); save each in a file of its own to have them all"
+        )
+        warnings.warn(said, Notice, stacklevel=2)
     return _tensor_of(pixels, path)
 
 
@@ -112,12 +125,18 @@ def _decoded(name: AnyPath, image: Image.Image) -> np.ndarray:
             values = np.frombuffer(opened.fp.read(6 * image.width * image.height), ">u2")
             whole = values.reshape(image.height, image.width, 3).astype(np.float64)
             return (whole * (65535 / most)).round().clip(0, 65535).astype(np.uint16)
+    elif tiles and image.format == "JPEG" and image.mode in _JPEG_COLOURS:
+        opened.fp.seek(0)
+        parts = [_decoded_jpeg(name, opened.fp.read(), _JPEG_COLOURS[image.mode])]
     read: list[np.ndarray] = []
     for part in parts:
         one = part if turn is None else part.transpose(turn)
         # Pillow scales 16-bit PGM to 65535.
         if one.mode in _GREY_16 or (one.mode == "I" and image.format == "PPM"):
-            read.append(np.asarray(one).astype(np.uint16))
+            values = np.asarray(one).astype(np.uint16)
+            # Of 8 bits Pillow does this itself.
+            is_inverted = image.format == "TIFF" and opened.tag_v2.get(_PHOTOMETRIC) == 0
+            read.append(65535 - values if is_inverted else values)
             continue
         if one.mode in ("I", "F"):
             raise InputError(f"{name}: 32 bits a pixel; save it with 8 or 16 bits a channel")
@@ -126,6 +145,21 @@ def _decoded(name: AnyPath, image: Image.Image) -> np.ndarray:
         read.append(np.asarray(one.convert("RGB")))
     pixels, *low = read
     return pixels.astype(np.uint16) * 256 + low[0] if low else pixels
+
+
+def _decoded_jpeg(name: AnyPath, data: bytes, colours: str) -> Image.Image:
+    """Decode a JPEG by the same library as Pillow, and refuse what its decoder warns of.
+
+    Of damaged pixels libjpeg warns alone, and goes on with shifted, wrong or grey ones; Pillow does
+    not pass its warnings on.
+    """
+    try:
+        return Image.fromarray(simplejpeg.decode_jpeg(data, colours, strict=True).squeeze())
+    except ValueError as error:
+        raise InputError(
+            f"{name}: a damaged JPEG ({error}), whose pixels are wrong from there on; copy it "
+            "anew, or save it again where it looks whole"
+        ) from error
 
 
 def _tensor_of(pixels: np.ndarray, name: AnyPath) -> Float32[Tensor, "3 h w"]:
@@ -149,8 +183,7 @@ def from_16_bit(values: np.ndarray, name: AnyPath) -> np.ndarray:
     if not _LEAST_SPAN <= high - low < _FULL_SPAN:
         return values.astype(np.float32) / 65535
     black = low if low > high - low else 0
-    if (folder := Path(name).parent) not in _REPORTED:
-        _REPORTED.add(folder)
+    if _is_new(name, "range"):
         said = (
             f"{name}: of 16 bits, and its values are {low} to {high}: {black} is taken as black "
             f"and {high} as white; so are those of other pictures there"
@@ -193,7 +226,15 @@ def value_range(values: np.ndarray) -> tuple[int, int]:
 
 
 _LEAST_SPAN, _FULL_SPAN = 64, 2**14  # a mask has fewer values; more than 14 bits are taken for 16
-_REPORTED: set[Path] = set()  # folders whose range of values has been reported
+_REPORTED: set[tuple[Path, str]] = set()  # folders, and what has been reported of them
+
+
+def _is_new(name: AnyPath, what: str) -> bool:
+    """Whether this has not been reported of a folder before; it has from now on."""
+    key = Path(name).parent, what
+    is_new = key not in _REPORTED
+    _REPORTED.add(key)
+    return is_new
 
 
 def image_size(path: AnyPath) -> tuple[int, int]:
@@ -315,7 +356,29 @@ def opened_image(path: AnyPath) -> Iterator[Image.Image]:
                 f"{path}: declares {width}x{height} pixels, more than the {MAX_PIXELS} allowed; "
                 "scale it down"
             )
+        _refuse_two_views(path, image)
         yield image
+
+
+def _refuse_two_views(path: AnyPath, image: Image.Image) -> None:
+    """Refuse the formats of stereo cameras, which hold both views in one file."""
+    kind, file = "", Path(path).name
+    if any(what == "APP3" and b"_JPSJPS_" in data for what, data in getattr(image, "applist", ())):
+        kind = "JPS, side by side"
+    elif image.format == "MPO":  # telephones keep smaller pictures there, such as maps of gain
+        opened: Any = image
+        size, sizes = image.size, []
+        for frame in range(1, opened.n_frames):
+            opened.seek(frame)
+            sizes.append(opened.size)
+        opened.seek(0)
+        kind = "MPO, one after the other" if size in sizes else ""
+    if kind or file.lower().endswith(".jps"):
+        raise InputError(
+            f"{path}: holds both views of a stereo camera ({kind or 'JPS, side by side'}); "
+            f"'depthpose data split {file} --out DIR' parts them, and 'depthpose depth match' "
+            "takes the two"
+        )
 
 
 def _orientation(image: Image.Image) -> int:
