@@ -23,6 +23,7 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")  # before torch is imported
 import torch
 from score import Job, Row, Section
 from score_instances import BOXES, MASKS, SCANS
+from score_reports import REPORTS
 from score_scenes import BINS, FRAMES
 
 from depthpose.core.run import environment
@@ -30,6 +31,7 @@ from depthpose.report.page import markdown_table
 
 SECTIONS: dict[str, Section] = {
     "masks": MASKS, "scans": SCANS, "boxes": BOXES, "bins": BINS, "frames": FRAMES,
+    "reports": REPORTS,
 }  # fmt: skip
 
 
