@@ -128,43 +128,54 @@ def total(name: str, use: str, rows: Sequence[Row]) -> Row:
 
 
 def frame_jobs(samples: Path, seeds: int) -> list[Job]:
-    """Search whole frames for each object alone, then for all of them at once."""
+    """Search whole frames for each object alone, then for all of them at once.
+
+    A job is all searches for the same models, which are prepared once for them.
+    """
     del seeds
-    names = [(frame.name, part.name) for frame in real_frames(samples / "pose", None)
-             for part in searches(frame, alone=True)]  # fmt: skip
-    return [partial(search_frame, samples, *one) for one in names]
+    asked = dict.fromkeys(names_of(part) for part in frame_searches(samples))
+    return [partial(search_frames, samples, names) for names in asked]
 
 
-def search_frame(samples: Path, frame: str, name: str) -> list[Row]:
-    """Do one search of one frame."""
-    whole = next(one for one in frames(samples) if one.name == frame)
-    part = next(one for one in searches(whole, alone=True) if one.name == name)
-    models = part.known or [thing.model for thing in part.shown]
-    registration = registration_of({model.name: model for model in models})
+def search_frames(samples: Path, names: tuple[str, ...]) -> list[Row]:
+    """Search the frames that may show some objects for them."""
+    wanted = [part for part in frame_searches(samples) if names_of(part) == names]
+    registration = Registration(models_of(wanted[0]))
+    registration.prepare()
+    return [search_frame(part, registration) for part in wanted]
+
+
+def search_frame(frame: Frame, registration: Registration) -> Row:
+    """Search one frame, and count what is right."""
     began = time.process_time()
-    found = registration.find(part.depth_m, part.K)
+    found = registration.find(frame.depth_m, frame.K)
     cpu_s = time.process_time() - began
-    counts = measure(part, found)
+    counts = measure(frame, found)
     sure = [one for one in found if one.is_ok]
-    return [{
-        "search": part.name, "objects": "one" if len(models) == 1 else "several",
+    return {
+        "search": frame.name, "objects": "one" if len(registration.objects) == 1 else "several",
         **{key: counts[key] for key in ("instances", "right", "wrong", "which")},
-        "answers": len(found), "ok": len(sure), "ok, wrong": measure(part, sure)["wrong"],
+        "answers": len(found), "ok": len(sure), "ok, wrong": measure(frame, sure)["wrong"],
         "cpu_s": cpu_s,
-    }]  # fmt: skip
+    }  # fmt: skip
 
 
 @cache
-def frames(samples: Path) -> list[Frame]:
-    """Read the frames once in a process."""
-    return list(real_frames(samples / "pose", None))
+def frame_searches(samples: Path) -> list[Frame]:
+    """Read the frames once in a process; one for each search."""
+    frames = real_frames(samples / "pose", None)
+    return [part for frame in frames for part in searches(frame, alone=True)]
 
 
-def registration_of(models: dict[str, ObjectModel]) -> Registration:
-    """Prepare models; those of several are not kept, since no two searches have the same."""
-    registration = Registration(list(models.values()))
-    registration.prepare()
-    return registration
+def models_of(frame: Frame) -> list[ObjectModel]:
+    """Give the models that are searched in a frame, each once."""
+    models = frame.known or [thing.model for thing in frame.shown]
+    return list({model.name: model for model in models}.values())
+
+
+def names_of(frame: Frame) -> tuple[str, ...]:
+    """Name what is searched in a frame."""
+    return tuple(model.name for model in models_of(frame))
 
 
 def frame_table(rows: Sequence[Row]) -> list[Row]:
