@@ -4,9 +4,9 @@
     python bench/real.py $DEPTHPOSE_DATA --before out/real.json
     python bench/real.py $DEPTHPOSE_DATA --only masks scans --seeds 20
 
-Figures of the earlier run stand in brackets. ``use`` says of each set whether it takes part when a
-method or a limit is chosen (choice), or is only looked at afterwards (held). CPU seconds leave out
-the preparation of models. Each process computes with one thread.
+A figure of the earlier run stands in brackets where it was another. ``use`` says of each set
+whether it takes part when a method or a limit is chosen (choice), or is only looked at afterwards
+(held). CPU seconds leave out the preparation of models. Each process computes with one thread.
 """
 
 import argparse
@@ -16,12 +16,12 @@ import os
 import time
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")  # before torch is imported
 
 import torch
 from score import Job, Row, Section
+from score_depth import IMAGES, INDOOR, STREET_PAIRS
 from score_instances import BOXES, MASKS, SCANS
 from score_reports import REPORTS
 from score_scenes import BINS, FRAMES
@@ -31,7 +31,7 @@ from depthpose.report.page import markdown_table
 
 SECTIONS: dict[str, Section] = {
     "masks": MASKS, "scans": SCANS, "boxes": BOXES, "bins": BINS, "frames": FRAMES,
-    "reports": REPORTS,
+    "reports": REPORTS, "indoor": INDOOR, "streets": STREET_PAIRS, "image": IMAGES,
 }  # fmt: skip
 
 
@@ -82,29 +82,35 @@ def timed(job: Job) -> tuple[list[Row], float]:
 
 
 def beside(table: Sequence[Row], before: Sequence[Row]) -> list[Row]:
-    """Write the figures of an earlier table in brackets; a line is known by its first column."""
+    """Write what differs in an earlier table in brackets; a line is known by its first column."""
     earlier = {next(iter(line.values())): line for line in before}
     lines = list[Row]()
     for line in table:
         name, *columns = line
         old = earlier.get(line[name], {})
-        cells = {column: shown(line[column], old.get(column)) for column in columns}
+        cells = {column: shown(line[column], old.get(column, line[column])) for column in columns}
         lines.append({name: line[name], **cells})
     return lines
 
 
-def shown(value: Any, old: Any) -> str:  # noqa: ANN401  a cell of any table
-    """Write a cell, and the earlier one in brackets where it is a number or another text."""
-    if old is None or (isinstance(value, str) and value == old):
-        return short(value)
-    return f"{short(value)} ({short(old)})"
+def shown(value: object, old: object) -> str:
+    """Write a cell, and what it was if that was something else."""
+    return (
+        short(value) if short(value) == short(old) else f"{short(value)} ({short(old) or 'none'})"
+    )
 
 
-def short(value: Any) -> str:  # noqa: ANN401  a cell of any table
+def short(value: object) -> str:
     """Write three digits of a fraction, and nothing for None."""
-    if value is None:
-        return ""
-    return f"{value:.3g}" if isinstance(value, float) else str(value)
+    match value:
+        case None:
+            return ""
+        case bool():
+            return "yes" if value else "no"
+        case float():
+            return f"{value:.3g}"
+        case _:
+            return str(value)
 
 
 if __name__ == "__main__":

@@ -1,7 +1,7 @@
 """Cases that users' trials found: what the answer says of itself, and whether that is true.
 
-Rendered parts of awkward shape, in ``reports/third/pose``; its README says what was wrong with them.
-All of them may take part in a choice.
+Rendered parts of awkward shape, in ``reports/third/pose``; its README says what was wrong. All
+of them may take part in a choice.
 
 The diameter says little of long parts, whose turns move no point far: right is, beside an ADD below
 a tenth of the diameter, a rotation within 10 degrees, half a tooth of the gear.
