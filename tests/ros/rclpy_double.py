@@ -33,6 +33,10 @@ class Node:
         self.publishers_made[topic] = made
         return made
 
+    def create_service(self, kind: type, name: str, callback: Any) -> SimpleNamespace:  # noqa: ANN401
+        self.services_made = {name: SimpleNamespace(kind=kind, call=callback)}
+        return self.services_made[name]
+
     def get_logger(self) -> SimpleNamespace:
         return SimpleNamespace(warning=lambda said, **_: self.warnings.append(said))
 
@@ -64,10 +68,32 @@ def message(*fields: str) -> type:
     return Message
 
 
+def pose() -> SimpleNamespace:
+    return SimpleNamespace(position=SimpleNamespace(), orientation=SimpleNamespace())
+
+
 def pose_stamped() -> Any:  # noqa: ANN401
-    made = message("pose")()
-    made.pose.position, made.pose.orientation = SimpleNamespace(), SimpleNamespace()
+    made = message()()
+    made.pose = pose()
     return made
+
+
+def pose_with_covariance_stamped() -> Any:  # noqa: ANN401
+    made = message()()
+    made.pose = SimpleNamespace(pose=pose(), covariance=[])
+    return made
+
+
+def detection() -> Any:  # noqa: ANN401
+    made = message()()
+    made.bbox = SimpleNamespace(center=pose(), size=SimpleNamespace())
+    made.results, made.id = [], ""
+    return made
+
+
+def hypothesis() -> SimpleNamespace:
+    posed = SimpleNamespace(pose=pose(), covariance=[])
+    return SimpleNamespace(hypothesis=SimpleNamespace(), pose=posed)
 
 
 def install(monkeypatch: pytest.MonkeyPatch, **parameters: object) -> None:
@@ -87,7 +113,18 @@ def install(monkeypatch: pytest.MonkeyPatch, **parameters: object) -> None:
         "sensor_msgs": {},
         "sensor_msgs.msg": {"Image": message(), "CameraInfo": message()},
         "geometry_msgs": {},
-        "geometry_msgs.msg": {"PoseStamped": pose_stamped},
+        "geometry_msgs.msg": {
+            "PoseStamped": pose_stamped,
+            "PoseWithCovarianceStamped": pose_with_covariance_stamped,
+        },
+        "vision_msgs": {},
+        "vision_msgs.msg": {
+            "Detection3D": detection,
+            "Detection3DArray": message("detections"),
+            "ObjectHypothesisWithPose": hypothesis,
+        },
+        "depthpose_msgs": {},
+        "depthpose_msgs.srv": {"FindObjects": SimpleNamespace},
     }
     for name, content in modules.items():
         module = ModuleType(name)

@@ -10,12 +10,14 @@ import pytest
 import torch
 
 from depthpose.core.errors import InputError
-from depthpose.core.rigid import Rigid
+from depthpose.core.rigid import Rigid, perturb, rotation_by
+from depthpose.pose.types import PoseEstimate
 from depthpose_ros.messages import (
     Header,
     Image,
     Stamp,
     camera_of,
+    covariance_of,
     depth_of,
     image_from_depth,
     mask_of,
@@ -158,6 +160,40 @@ def test_a_pose_is_metres_and_a_unit_quaternion() -> None:
     pose = pose_from_rigid(HEADER, Rigid(R, torch.tensor([0.1, 0.2, 0.7])))
     assert pose.position == pytest.approx((0.1, 0.2, 0.7))
     assert pose.orientation == pytest.approx((0, 0, 0.5**0.5, 0.5**0.5))
+
+
+def test_a_covariance_is_that_of_the_place_and_of_turns_about_it() -> None:
+    """Draw motions as an estimate has them, and look where they take the object."""
+    generator = torch.Generator().manual_seed(0)
+    root = torch.randn(6, 6, generator=generator).double() * 1e-3
+    pose = Rigid(
+        rotation_by(torch.tensor([0.3, -0.2, 0.5]).double()), torch.tensor([0.1, 0.2, 0.7])
+    )
+    pose = pose.double()
+    estimate = PoseEstimate(
+        name="a", object="b", status="ok", camera_from_model=pose, covariance=root @ root.mT
+    )
+    motions = torch.randn(20_000, 6, generator=generator).double() @ root.mT
+    moved = perturb(Rigid(pose.R.expand(20_000, 3, 3), pose.t_m.expand(20_000, 3)), motions)
+    drawn = torch.cat([moved.t_m - pose.t_m, motions[:, :3]], 1)
+    expected = drawn.mT @ drawn / len(drawn)
+    found = torch.tensor(covariance_of(estimate)).reshape(6, 6)
+    assert float((found - expected).norm() / expected.norm()) < 0.03
+
+
+def test_a_turn_that_is_free_has_the_variance_of_an_even_one() -> None:
+    axis = torch.tensor([0.0, 0, 1])
+    place_m = torch.tensor([0.1, 0.2, 0.7])
+    # A turn about an axis through the object leaves its place where it is.
+    motion = torch.cat([axis, -torch.linalg.cross(axis, place_m)])
+    estimate = PoseEstimate(
+        name="a", object="b", status="ok", camera_from_model=Rigid(torch.eye(3), place_m),
+        covariance=torch.zeros(6, 6), free_motions=(motion / motion.norm())[None],
+    )  # fmt: skip
+    found = torch.tensor(covariance_of(estimate)).reshape(6, 6)
+    assert found.diagonal().tolist() == pytest.approx([0] * 5 + [np.pi**2 / 3], abs=1e-6)
+    nothing = PoseEstimate(name="a", object="b", status="doubtful", reason="why")
+    assert covariance_of(nothing) == (0.0,) * 36
 
 
 def test_a_slow_worker_takes_the_newest_frame_and_drops_those_between() -> None:

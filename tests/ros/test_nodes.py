@@ -5,6 +5,7 @@ What is around the networks in ``nodes.py`` runs on a test double of rclpy (``rc
 
 import dataclasses
 import importlib
+import re
 import time
 from pathlib import Path
 from types import SimpleNamespace
@@ -23,6 +24,9 @@ from depthpose.core.rigid import Rigid
 from depthpose.depth.config import StreetsConfig
 from depthpose.depth.synthetic import Streets
 from depthpose.depth.types import StereoSample
+from depthpose.pose.config import MeshConfig
+from depthpose.pose.mesh import make_model
+from depthpose.pose.types import Alternative, PoseEstimate
 from depthpose_ros.messages import depth_of
 from depthpose_ros.work import DepthFromImage, DepthFromPair, Poses
 
@@ -153,21 +157,38 @@ def test_the_answer_is_a_message_of_ros(street: StereoSample, recorded: dict[str
     assert np.array_equal(depth_of(back), depth_of(plain), equal_nan=True)
 
 
+CUP = make_model(
+    torch.tensor([[0.0, 0, 0], [0.1, 0, 0], [0, 0.2, 0], [0, 0, 0.3]]),
+    torch.tensor([[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]]),
+    name="cup",
+    config=MeshConfig(keypoints=4),
+)
+
+
 class KnowsPose:
     """Poses a cup wherever it is asked."""
 
     objects = ("cup",)
+    models = (CUP,)
     pose = Rigid(torch.eye(3), torch.tensor([0.1, 0.2, 0.7]))
+
+    def answer(self) -> PoseEstimate:
+        turned = Rigid(torch.diag(torch.tensor([1.0, -1, -1])), self.pose.t_m)
+        other = Alternative(camera_from_model=turned, probability=0.04, difference="upside down")
+        return PoseEstimate(
+            name="input", object="cup", status="ok", camera_from_model=self.pose, certainty=0.95,
+            covariance=torch.eye(6) * 1e-6, alternatives=(other,),
+        )  # fmt: skip
 
     def find(self, depth_m: np.ndarray, camera: Camera, objects: object) -> list[Any]:  # noqa: ARG002
         self.asked = (depth_m.shape, objects)
-        return [SimpleNamespace(object="cup", camera_from_model=self.pose, is_ok=True)]
+        return [self.answer()]
 
-    def estimate(self, *, mask: np.ndarray, object: str, **_: object) -> Any:  # noqa: ANN401
-        is_ok = bool(mask.any())
-        return SimpleNamespace(
-            object=object, camera_from_model=self.pose, is_ok=is_ok, reason="the mask is empty"
-        )
+    def estimate(self, *, mask: np.ndarray, object: str, **_: object) -> Any:  # noqa: ANN401, ARG002
+        if mask.any():
+            return self.answer()
+        reason = "the mask is empty"
+        return PoseEstimate(name="input", object="cup", status="too few points", reason=reason)
 
     def estimate_instances(self, *, mask: np.ndarray, object: str, **_: object) -> list[Any]:
         return [self.estimate(mask=mask == k, object=object) for k in np.unique(mask[mask > 0])]
@@ -258,6 +279,93 @@ def test_the_node_of_a_pair_publishes_depth_and_warns_of_what_it_cannot_use(
     wait_until(lambda: node.warnings)
     assert "no -fx * baseline" in node.warnings[0]
     node.destroy_node()
+
+
+def poses_node(monkeypatch: pytest.MonkeyPatch, **parameters: object) -> Any:  # noqa: ANN401
+    monkeypatch.setattr(GeoPoseNet, "load", lambda _: KnowsPose())
+    return started_node(monkeypatch, "PosesNode", **parameters)
+
+
+def test_the_node_of_poses_publishes_what_others_expect(
+    street: StereoSample, recorded: dict[str, Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    base = "0 -1 0 0.5 1 0 0 0 0 0 1 2 0 0 0 1"
+    node = poses_node(monkeypatch, base_from_camera=base, base_frame="world")
+    node._heard.callback(*depth_messages(street, recorded))
+    sent = {topic: made.sent for topic, made in node.publishers_made.items()}
+    assert sorted(sent) == [
+        "~/cup/base_pose", "~/cup/pose", "~/cup/pose_with_covariance", "~/detections",
+    ]  # fmt: skip
+    wait_until(lambda: all(sent.values()))
+    node.destroy_node()
+
+    (array,) = sent["~/detections"]
+    assert (array.header.stamp.sec, array.header.frame_id) == (STAMP[0], FRAME_ID)
+    (detection,) = array.detections
+    # The likeliest first, and the alternative behind it.
+    scores = [(r.hypothesis.class_id, r.hypothesis.score) for r in detection.results]
+    assert scores == [("cup", 0.95), ("cup", 0.04)]
+    assert detection.results[1].pose.pose.orientation.x == pytest.approx(1)
+    # The box is about the model, not about its origin.
+    assert vars(detection.bbox.center.position) == pytest.approx({"x": 0.15, "y": 0.3, "z": 0.85})
+    assert vars(detection.bbox.size) == pytest.approx({"x": 0.1, "y": 0.2, "z": 0.3})
+    (posed,) = sent["~/cup/pose_with_covariance"]
+    assert posed.pose.pose.position.z == pytest.approx(0.7)
+    assert len(posed.pose.covariance) == 36
+    (based,) = sent["~/cup/base_pose"]
+    assert based.header.frame_id == "world"
+    assert vars(based.pose.position) == pytest.approx({"x": 0.3, "y": 0.1, "z": 2.7})
+
+
+def test_the_service_answers_one_image(
+    street: StereoSample, recorded: dict[str, Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    node = poses_node(monkeypatch)
+    depth, info = depth_messages(street, recorded)
+    service = node.services_made["~/find_objects"]
+    empty = SimpleNamespace(height=0, width=0)
+
+    def ask(mask: Any = empty, **changes: Any) -> Any:  # noqa: ANN401
+        fields = {"depth": depth, "camera_info": info, "mask": mask, "objects": [], **changes}
+        return service.call(SimpleNamespace(**fields), SimpleNamespace(message=""))
+
+    found = ask()
+    assert (found.success, found.ids, found.scores) == (True, ["cup"], [0.95])
+    assert found.poses[0].pose.position.z == pytest.approx(0.7)
+    assert (found.missing, found.reasons) == ([], [])
+    # What is asked for and not found has a row too.
+    both = ask(objects=["cup", "plate"])
+    assert (both.ids, both.missing, len(both.reasons)) == (["cup"], ["plate"], 1)
+    pixels = np.zeros((depth.height, depth.width), np.uint8)
+    mask = SimpleNamespace(
+        header=depth.header, height=depth.height, width=depth.width, encoding="mono8",
+        is_bigendian=0, step=depth.width, data=pixels,
+    )  # fmt: skip
+    refused = ask(mask)
+    assert (refused.ids, refused.missing) == ([], ["cup"])
+    assert refused.reasons == ["the mask is empty"]
+    unusable = ask(depth=SimpleNamespace(**{**vars(depth), "encoding": "rgb8"}))
+    assert not unusable.success
+    assert "encoding of a depth image is 'rgb8'" in unusable.message
+    node.destroy_node()
+
+
+def test_the_service_has_the_fields_that_the_node_reads_and_sets() -> None:
+    types = pytest.importorskip("rosbags.typesys")
+    text = (ROS.parent / "depthpose_msgs" / "srv" / "FindObjects.srv").read_text()
+    asked, _, answered = text.partition("---")
+    store = ros2()
+    for name, part in (("Request", asked), ("Response", answered)):
+        known = types.get_types_from_msg(part, f"depthpose_msgs/msg/{name}")
+        store.register(known)
+    fields = {
+        name: set(store.types[f"depthpose_msgs/msg/{name}"].__dataclass_fields__)
+        for name in ("Request", "Response")
+    }
+    node = (ROS / "depthpose_ros" / "nodes.py").read_text()
+    for kind, word in (("Request", "request"), ("Response", "response")):
+        used = set(re.findall(rf"\b{word}\.(\w+)", node))
+        assert used == fields[kind] - {"__msgtype__"}, kind
 
 
 def test_every_parameter_of_the_file_is_one_that_the_node_declares(

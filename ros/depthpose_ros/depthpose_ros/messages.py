@@ -1,9 +1,11 @@
 """Messages as plain dataclasses, and their contents as arrays: nothing here needs ROS.
 
-The fields are those of ``std_msgs``, ``sensor_msgs`` and ``geometry_msgs``, so that a message of
-rclpy is read as it is, and :mod:`depthpose_ros.nodes` copies an answer field by field.
+The fields are those of ``std_msgs``, ``sensor_msgs``, ``geometry_msgs`` and ``vision_msgs``, so
+that a message of rclpy is read as it is, and :mod:`depthpose_ros.nodes` copies an answer field by
+field.
 """
 
+import math
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -16,7 +18,9 @@ from depthpose.core.camera.pinhole import CameraFacts, camera_from_facts
 from depthpose.core.camera.stored_camera import facts_from_names, facts_from_ros_pair, named
 from depthpose.core.errors import InputError, refuse_unknown
 from depthpose.core.files.images import from_16_bit
-from depthpose.core.rigid import Rigid
+from depthpose.core.rigid import Rigid, cross_matrix
+from depthpose.pose.predictions import score_of
+from depthpose.pose.types import ObjectModel, PoseEstimate
 
 
 @dataclass
@@ -55,6 +59,26 @@ class Pose:
     header: Header
     position: tuple[float, float, float]
     orientation: tuple[float, float, float, float]
+
+
+@dataclass
+class Hypothesis:
+    """``vision_msgs/ObjectHypothesisWithPose``, flat."""
+
+    class_id: str
+    score: float
+    pose: Pose
+    covariance: tuple[float, ...]  #: 36 numbers: x, y, z, and turns about these axes
+
+
+@dataclass
+class Detection:
+    """``vision_msgs/Detection3D``: its hypotheses, the likeliest first, and the box about it."""
+
+    header: Header
+    results: list[Hypothesis]
+    centre: Pose
+    size: tuple[float, float, float]
 
 
 _PICTURES = {"rgb8": (0, 1, 2), "bgr8": (2, 1, 0), "rgba8": (0, 1, 2), "bgra8": (2, 1, 0)}
@@ -176,6 +200,47 @@ def pose_from_rigid(header: Header, pose: Rigid) -> Pose:
     quaternion = Rotation.from_matrix(pose.R.double().cpu().numpy()).as_quat()
     qx, qy, qz, qw = (float(v) for v in quaternion)
     return Pose(header, (x, y, z), (qx, qy, qz, qw))
+
+
+def covariance_of(estimate: PoseEstimate) -> tuple[float, ...]:
+    """Give the covariance as ``geometry_msgs/PoseWithCovariance`` has it: place, then rotation.
+
+    That of an estimate is of a motion about the camera's origin; ROS's is of the place of the
+    object, and of turns about the camera's axes there. A turn that a symmetry leaves free has the
+    variance of an even distribution. All are 0, which says that nothing is known, where the
+    estimate has none.
+    """
+    if estimate.covariance is None or estimate.camera_from_model is None:
+        return (0.0,) * 36
+    covariance = estimate.covariance.double().cpu()
+    for motion in [] if estimate.free_motions is None else estimate.free_motions.double().cpu():
+        turn = float(motion[:3].norm())
+        if turn > 0:
+            covariance = covariance + math.pi**2 / 3 / turn**2 * torch.outer(motion, motion)
+    place_m = estimate.camera_from_model.t_m.double().cpu()
+    eye = torch.eye(3, dtype=torch.float64)
+    moved = torch.cat([-cross_matrix(place_m), eye], 1)  # a turn moves the place by turn x place
+    change = torch.cat([moved, torch.cat([eye, torch.zeros(3, 3).double()], 1)])
+    return tuple((change @ covariance @ change.mT).flatten().tolist())
+
+
+def detection_from(header: Header, estimate: PoseEstimate, model: ObjectModel) -> Detection:
+    """Make a detection of an estimate that has a pose; its alternatives are further hypotheses.
+
+    The covariance of an alternative is not known.
+    """
+    assert estimate.camera_from_model is not None
+    low, high = model.vertices_m.amin(0).double(), model.vertices_m.amax(0).double()
+    centre = Rigid(torch.eye(3).double(), (low + high) / 2)
+    poses = [(estimate.camera_from_model, score_of(estimate), covariance_of(estimate))]
+    poses += [(o.camera_from_model, o.probability, (0.0,) * 36) for o in estimate.alternatives]
+    results = [
+        Hypothesis(estimate.object, score, pose_from_rigid(header, pose), covariance)
+        for pose, score, covariance in poses
+    ]
+    x, y, z = (high - low).tolist()
+    boxed = estimate.camera_from_model.double() @ centre
+    return Detection(header, results, pose_from_rigid(header, boxed), (x, y, z))
 
 
 def copied_header(message: Any) -> Header:  # noqa: ANN401

@@ -1,21 +1,31 @@
 """The nodes: parameters, topics and threads around :mod:`depthpose_ros.work`."""
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import rclpy
-from geometry_msgs.msg import PoseStamped
+from depthpose_msgs.srv import FindObjects
+from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped
 from message_filters import ApproximateTimeSynchronizer, Subscriber
 from rclpy.node import Node
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import CameraInfo, Image
+from vision_msgs.msg import Detection3D, Detection3DArray, ObjectHypothesisWithPose
 
-from depthpose import FakestereoNet, GeoPoseNet
+from depthpose import FakestereoNet, GeoPoseNet, Registration
+from depthpose.cli.pose_methods import read_base
 from depthpose.core.errors import InputError
 from depthpose.depth.config import MatcherConfig
+from depthpose.pose.predictions import score_of
 from depthpose_ros import messages
-from depthpose_ros.work import DepthFromImage, DepthFromPair, Latest, Poses
+from depthpose_ros.work import (
+    DepthFromImage,
+    DepthFromPair,
+    Latest,
+    Poses,
+    refuse_unanswered,
+)
 
 NEWEST = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
 """Sensor data, and the last message alone."""
@@ -110,22 +120,95 @@ class DepthPairNode(WorkNode):
 
 
 class PosesNode(WorkNode):
-    """``depth``, ``camera_info`` and, if asked for, ``mask`` to ``~/OBJECT/pose``."""
+    """``depth``, ``camera_info`` and, if asked for, ``mask`` to poses of known objects.
+
+    ``~/detections`` has all that was found, with their alternatives, ``~/OBJECT/pose`` and
+    ``~/OBJECT/pose_with_covariance`` what is sure, ``~/OBJECT/base_pose`` the same in the frame of
+    a robot. The service ``~/find_objects`` answers one image.
+    """
 
     def __init__(self) -> None:
-        super().__init__("poses", weights="parts", object="", with_mask=False, slop_s=0.01)
-        net = GeoPoseNet.load(self.value("weights"))
-        work = Poses(net, self.value("object") or None)
-        found = {name: self.create_publisher(PoseStamped, f"~/{name}/pose", 10)
-                 for name in net.objects}  # fmt: skip
+        super().__init__(
+            "poses", weights="parts", cad="", cad_unit="mm", object="", with_mask=False,
+            slop_s=0.01, base_from_camera="", base_frame="base_link",
+        )  # fmt: skip
+        files = [file.strip() for file in self.value("cad").split(",") if file.strip()]
+        if files:
+            net = Registration.load(*files, unit=self.value("cad_unit"))
+            net.prepare()
+        else:
+            net = GeoPoseNet.load(self.value("weights"))
+        self._poses = Poses(net, self.value("object") or None)
+        self._models = {model.name: model for model in net.models}
+        self._base = read_base(self.value("base_from_camera").split())
+        self._detections = self.create_publisher(Detection3DArray, "~/detections", 10)
+        kinds = {"pose": PoseStamped, "pose_with_covariance": PoseWithCovarianceStamped}
+        kinds |= {} if self._base is None else {"base_pose": PoseStamped}
+        self._published = {
+            (name, topic): self.create_publisher(kind, f"~/{name}/{topic}", 10)
+            for name in net.objects
+            for topic, kind in kinds.items()
+        }
+        self.create_service(FindObjects, "~/find_objects", self._answer)
         topics = {"depth": Image, "camera_info": CameraInfo}
         topics |= {"mask": Image} if self.value("with_mask") else {}
+        self.work_on(topics, self.value("slop_s"), self._publish)
 
-        def publish(*given: Any) -> None:  # noqa: ANN401
-            for name, pose in work(*given):
-                found[name].publish(pose_message(pose))
+    def _publish(self, depth: Any, info: Any, mask: Any = None) -> None:  # noqa: ANN401
+        estimates = self._poses.estimates(depth, info, mask)
+        header = messages.copied_header(depth)
+        found = [
+            messages.detection_from(header, one, self._models[one.object])
+            for one in estimates
+            if one.is_posed
+        ]
+        self._detections.publish(detections_message(header, found))
+        for estimate in estimates:
+            pose = estimate.camera_from_model
+            if pose is None or not estimate.is_ok:
+                continue
+            plain = messages.pose_from_rigid(header, pose)
+            covariance = messages.covariance_of(estimate)
+            self._published[estimate.object, "pose"].publish(pose_message(plain))
+            self._published[estimate.object, "pose_with_covariance"].publish(
+                covariance_message(plain, covariance)
+            )
+            if self._base is not None:
+                there = messages.Header(header.stamp, self.value("base_frame"))
+                based = messages.pose_from_rigid(there, self._base @ pose.double())
+                self._published[estimate.object, "base_pose"].publish(pose_message(based))
+        refuse_unanswered(estimates, is_masked=mask is not None)
 
-        self.work_on(topics, self.value("slop_s"), publish)
+    def _answer(self, request: Any, response: Any) -> Any:  # noqa: ANN401
+        """Answer the service: ids, scores and poses, and what was not found."""
+        mask = request.mask if request.mask.height else None
+        objects = list(request.objects) or None
+        try:
+            estimates = self._poses.estimates(request.depth, request.camera_info, mask, objects)
+        except InputError as error:
+            response.success = False
+            response.message = str(error)
+            return response
+        header = messages.copied_header(request.depth)
+        found = [one for one in estimates if one.camera_from_model is not None]
+        refused = {one.object: one.reason for one in estimates if one.camera_from_model is None}
+        there = {one.object for one in found}
+        asked = objects or ([self._poses.object] if self._poses.object else list(self._models))
+        missing = [name for name in asked if name not in there] if mask is None else [*refused]
+        response.success = True
+        response.ids = [one.object for one in found]
+        response.scores = [score_of(one) for one in found]
+        response.poses = [
+            pose_message(messages.pose_from_rigid(header, one.camera_from_model))
+            for one in found
+            if one.camera_from_model is not None
+        ]
+        response.missing = missing
+        response.reasons = [
+            refused.get(name, "the image was searched for it, and nothing that fits was found")
+            for name in missing
+        ]
+        return response
 
 
 def image_message(plain: messages.Image) -> Image:
@@ -141,10 +224,50 @@ def pose_message(plain: messages.Pose) -> PoseStamped:
     """Copy a plain pose into ROS's."""
     message = PoseStamped()
     _copy_header(plain.header, message)
-    place, turn = message.pose.position, message.pose.orientation
+    _copy_pose(plain, message.pose)
+    return message
+
+
+def covariance_message(
+    plain: messages.Pose, covariance: Sequence[float]
+) -> PoseWithCovarianceStamped:
+    """Copy a plain pose and its covariance into ROS's."""
+    message = PoseWithCovarianceStamped()
+    _copy_header(plain.header, message)
+    _copy_pose(plain, message.pose.pose)
+    message.pose.covariance = list(covariance)
+    return message
+
+
+def detections_message(
+    header: messages.Header, detections: Sequence[messages.Detection]
+) -> Detection3DArray:
+    """Copy plain detections into ROS's."""
+    array = Detection3DArray()
+    _copy_header(header, array)
+    array.detections = []
+    for plain in detections:
+        detection = Detection3D()
+        _copy_header(header, detection)
+        _copy_pose(plain.centre, detection.bbox.center)
+        size = detection.bbox.size
+        size.x, size.y, size.z = plain.size
+        detection.results = []
+        for one in plain.results:
+            result = ObjectHypothesisWithPose()
+            result.hypothesis.class_id = one.class_id
+            result.hypothesis.score = one.score
+            _copy_pose(one.pose, result.pose.pose)
+            result.pose.covariance = list(one.covariance)
+            detection.results.append(result)
+        array.detections.append(detection)
+    return array
+
+
+def _copy_pose(plain: messages.Pose, pose: Any) -> None:  # noqa: ANN401
+    place, turn = pose.position, pose.orientation
     place.x, place.y, place.z = plain.position
     turn.x, turn.y, turn.z, turn.w = plain.orientation
-    return message
 
 
 def _copy_header(plain: messages.Header, message: Any) -> None:  # noqa: ANN401

@@ -1,13 +1,14 @@
 """The work of the nodes: messages in, messages out, the latest first. Nothing here needs ROS."""
 
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
-from depthpose import FakestereoNet, GeoPoseNet
+from depthpose import FakestereoNet, GeoPoseNet, Registration
 from depthpose.core.errors import InputError
 from depthpose.pose.datasets import number_objects
+from depthpose.pose.types import PoseEstimate
 from depthpose_ros.messages import (
     Image,
     Pose,
@@ -80,35 +81,63 @@ class Poses:
 
     Attributes:
         net: the pose estimator.
-        object: its name; None: the only one of the weights, or all objects without a mask.
+        object: its name; None: the only one that is known, or all objects without a mask.
     """
 
-    net: GeoPoseNet
+    net: GeoPoseNet | Registration
     object: str | None = None
+
+    def estimates(
+        self,
+        depth: Any,  # noqa: ANN401
+        info: Any,  # noqa: ANN401
+        mask: Any = None,  # noqa: ANN401
+        objects: Sequence[str] | None = None,
+    ) -> list[PoseEstimate]:
+        """Estimate what is there, the surest first; with a mask also what is refused.
+
+        A mask that numbers several objects (1, 2, ...) shows an instance of one object a number.
+        ``objects``: which may be there, in place of that of the node.
+
+        Raises:
+            InputError: what the messages lack.
+        """
+        depth_m, camera = depth_of(depth), camera_of(info)
+        wanted = ([] if self.object is None else [self.object]) if objects is None else [*objects]
+        if mask is None:
+            return self.net.find(depth_m, camera, wanted or None)
+        if len(wanted) > 1:
+            raise InputError(
+                f"a mask is of one object, and {', '.join(wanted)} are asked for; ask for one, or "
+                "leave the mask out"
+            )
+        given = {"depth": depth_m, "mask": mask_of(mask), "camera": camera}
+        given["object"] = wanted[0] if wanted else None
+        if int(number_objects(given["mask"]).max()) > 1:
+            return self.net.estimate_instances(**given)
+        return [self.net.estimate(**given)]
 
     def __call__(self, depth: Any, info: Any, mask: Any = None) -> list[tuple[str, Pose]]:  # noqa: ANN401
         """Give name and pose of what was found, the surest first; stamp and frame are the depth's.
 
-        A mask that numbers several objects (1, 2, ...) shows an instance of one object a number.
-
         Raises:
             InputError: what the messages lack; with a mask, also why nothing in it has a pose.
         """
-        depth_m, camera = depth_of(depth), camera_of(info)
-        if mask is None:
-            wanted = None if self.object is None else [self.object]
-            found = self.net.find(depth_m, camera, wanted)
-        else:
-            given = {"depth": depth_m, "mask": mask_of(mask), "camera": camera}
-            if int(number_objects(given["mask"]).max()) > 1:
-                found = self.net.estimate_instances(**given, object=self.object)
-            else:
-                found = [self.net.estimate(**given, object=self.object)]
-            if not any(one.is_ok for one in found):
-                raise InputError(f"{found[0].object}: no pose: {found[0].reason}")
+        estimates = self.estimates(depth, info, mask)
+        refuse_unanswered(estimates, is_masked=mask is not None)
         header = copied_header(depth)
-        poses = [(one.object, one.camera_from_model) for one in found if one.is_ok]
+        poses = [(one.object, one.camera_from_model) for one in estimates if one.is_ok]
         return [(name, pose_from_rigid(header, pose)) for name, pose in poses if pose is not None]
+
+
+def refuse_unanswered(estimates: Sequence[PoseEstimate], *, is_masked: bool) -> None:
+    """Say why nothing in a mask has a sure pose.
+
+    Raises:
+        InputError: that is so.
+    """
+    if is_masked and not any(one.is_ok for one in estimates):
+        raise InputError(f"{estimates[0].object}: no pose: {estimates[0].reason}")
 
 
 class Latest:
