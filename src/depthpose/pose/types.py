@@ -205,13 +205,12 @@ class PoseFit:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Alternative:
-    """Another pose that explains what was seen."""
+    """A competing pose that explains what was seen nearly as well."""
 
     camera_from_model: Rigid  #: the pose
     probability: float  #: that it is the right one, 0..1
     difference: str  #: from the estimate's own pose: "turned by 180 degrees about the long axis"
-    #: evidence against it, by name; not kept in files.
-    signals: dict[str, float] = field(default_factory=dict)
+    is_copy: bool = False  #: a near-symmetric copy of the estimate's pose, which looks nearly alike
 
     def __str__(self) -> str:
         """Say how it differs from the pose, and how likely it is."""
@@ -219,16 +218,36 @@ class Alternative:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Fit:
-    """Whether a pose fits what the camera saw, at the sensor's own scale."""
+class Evidence:
+    """How a posed model compares with a depth image, as :mod:`depthpose.pose.evidence` measures.
 
-    #: of the posed surface that was seen, the share that lies where the camera saw something; the
-    #: rest it saw through, or it lies behind the object's own readings.
-    agrees: float
-    seen: float  #: share of the visible posed surface that agrees; the rest may be occluded
-    beyond: float  #: share of the object's readings beside the posed silhouette
-    explained: float  #: share of these readings near the posed surface; a mask's border is not
-    noise_m: float  #: standard deviation of the sensor's readings there, estimated from them
+    Areas are counted in independent patches of readings: neighbouring readings share their error.
+    """
+
+    visible: float  #: area of the model that the camera would see, edges left out
+    supported: float  #: part of it on which readings lie, within three standard deviations
+    unobserved: float  #: part of it without a reading, or hidden by something nearer
+    seen_through: float  #: patches behind which the camera saw: free-space violations
+    bulging: float  #: patches of the object's own readings before the model
+    beside: float  #: patches of the object's own readings beside the model's silhouette
+    rms: float  #: root mean square residual of the supported part, in standard deviations
+    noise_m: float  #: standard deviation of a reading on the object, estimated from the image
+
+    @property
+    def contradicted(self) -> float:
+        """Area that contradicts the pose."""
+        return self.seen_through + self.bulging + self.beside
+
+    @property
+    def agreement(self) -> float:
+        """Share of the compared area that supports the pose, 0..1."""
+        compared = self.supported + self.contradicted
+        return self.supported / compared if compared > 0 else 0.0
+
+    @property
+    def observed(self) -> float:
+        """Share of the visible area on which readings lie, 0..1."""
+        return self.supported / self.visible if self.visible > 0 else 0.0
 
 
 IdentityStatus = Literal["confirmed", "not excluded", "contradicted"]
@@ -271,14 +290,14 @@ class PoseEstimate:
     inlier_share: float | None = None  #: share of the votes that agree, 0..1
     #: root mean square distance: of keypoints, or of points to the surface after ICP.
     residual_m: float | None = None
-    fit: Fit | None = None  #: whether the pose fits what the camera saw; None: not compared
-    #: chance that this very pose is right, and none of the alternatives nor one that was not found;
-    #: None: not compared.
+    evidence: Evidence | None = None  #: the pose beside what the camera saw; None: not compared
+    #: probability that the pose is right up to the near-symmetries of the model: that it or one of
+    #: its copies is. It makes the status. None: not compared.
     certainty: float | None = None
+    #: probability that this very pose is right, and none of its near-symmetric copies.
+    copy_certainty: float | None = None
     identity: Identity | None = None  #: whether it is this object; None where that was not asked
-    alternatives: tuple[Alternative, ...] = ()  #: other poses that fit, the likeliest first
-    #: by what the poses that fit were compared, by name; kept for refusals too.
-    signals: dict[str, float] = field(default_factory=dict)
+    alternatives: tuple[Alternative, ...] = ()  #: competing poses, the likeliest first
     seconds: dict[str, float] = field(default_factory=dict)  #: time of each stage
     tracking: Tracking | None = None  #: how it came about, in a sequence; None elsewhere
     #: the pose in the frame of a robot's base, by :meth:`in_base`; None where no base is known.

@@ -21,7 +21,7 @@ from depthpose.pose.mesh.models import turn_about as turn_about
 from depthpose.pose.mesh.symmetry import MIRROR_ALIKE as MIRROR_ALIKE
 from depthpose.pose.mesh.symmetry import NearSymmetry as NearSymmetry
 from depthpose.pose.mesh.symmetry import SymmetryProposal as SymmetryProposal
-from depthpose.pose.mesh.symmetry import kept as kept
+from depthpose.pose.mesh.symmetry import cached as cached
 from depthpose.pose.mesh.symmetry import mirror_deviation as mirror_deviation
 from depthpose.pose.mesh.symmetry import near_symmetries as near_symmetries
 from depthpose.pose.mesh.symmetry import propose_symmetries as propose_symmetries

@@ -29,7 +29,7 @@ from depthpose.pose.types import Axis, ObjectModel, Symmetries
 
 
 @lru_cache(maxsize=64)
-def kept(model: ObjectModel, compute: Callable[..., Any], name: str, *settings: float) -> Any:  # noqa: ANN401
+def cached(model: ObjectModel, compute: Callable[..., Any], name: str, *settings: float) -> Any:  # noqa: ANN401
     """Give JSON values of a model that take long to compute.
 
     They are kept in ``$DEPTHPOSE_CACHE``, where that can be written to, by the bytes of the shape
@@ -60,6 +60,7 @@ def kept(model: ObjectModel, compute: Callable[..., Any], name: str, *settings: 
 _EYE = torch.eye(3, dtype=torch.float64)
 _ORDERS = (2, 3, 4, 5, 6)
 _TRIED_ORDERS = range(2, 13)
+_TEETH = range(13, 61)  #: orders of which one step is tried: gears and knurls
 _TURNS = 36
 _COARSE = 0.04
 """Deviation, in diameters, from which following the surface may still find a symmetry: an axis
@@ -93,7 +94,9 @@ class SurfaceDeviation:
         self.points = (dense.double() - self.centre_m) / model.diameter_m
         self._normals = normals.double().numpy()
         self._tree = KDTree(self.points.numpy())
-        self.few, self.many = (take_evenly(self.points, count) for count in (100, 1000))
+        self.few, self.many, self.dense = (
+            take_evenly(self.points, count) for count in (100, 1000, 5000)
+        )
         self._rough_tree = KDTree(take_evenly(self.points, 2500).numpy())
         self.axes = torch.linalg.eigh(self.points.T @ self.points).eigenvectors.T
 
@@ -109,21 +112,28 @@ class SurfaceDeviation:
         return torch.from_numpy(np.asarray(distance)).mean(-1)
 
     def deviation(
-        self, R: Float[Tensor, "*batch 3 3"], shift: Float[Tensor, "*batch 3"] | None = None
+        self,
+        R: Float[Tensor, "*batch 3 3"],
+        shift: Float[Tensor, "*batch 3"] | None = None,
+        share: float = 0.98,
     ) -> Float[Tensor, "*batch"]:
-        """The 98th percentile of the distance to the surface, both ways, after turn and shift."""
+        """Distance to the surface after a rotation and a shift that a share of it stays within.
+
+        The larger of both ways is given, from the rotated surface to the other and back.
+        """
+        points = self.many if share < ALMOST_ALL else self.dense
         turn = Rigid(R, torch.zeros_like(R[..., 0]) if shift is None else shift)
         spacing = 2.0 / math.sqrt(len(self.points))
         farthest: list[Float[Tensor, "*batch"]] = []
         for way in (turn, turn.inverse()):
-            moved = way.apply(self.many)
+            moved = way.apply(points)
             distance, index = self.nearest(moved)
             gap = moved.numpy() - self.points.numpy()[index]
             height = np.abs((gap * self._normals[index]).sum(-1))
             # Between samples the plane says the distance; beside an edge, the sample does.
             beside = np.maximum(distance - spacing, 0)
             off = torch.from_numpy(np.maximum(height, beside))
-            farthest.append(off.quantile(0.98, dim=-1))
+            farthest.append(off.quantile(share, dim=-1))
         return torch.maximum(*farthest)
 
 
@@ -233,7 +243,7 @@ def with_found_symmetries(
     declared = model.symmetries
     if not (is_taken or on_message) or declared.discrete is not None or declared.continuous:
         return model
-    rows = kept(model, propose_symmetries, "symmetries", tolerance)
+    rows = cached(model, propose_symmetries, "symmetries", tolerance)
     proposals = [SymmetryProposal(*row) for row in rows]
     found = replace(symmetries_from_proposals(proposals), is_found=True)
     if found.discrete is None and not found.continuous:
@@ -285,7 +295,8 @@ def _measure(
         worst = float(surface.deviation(circle).max())
         full = [(None, worst)] if worst <= limit else []
     # Every turn of order 2 to 12, each once.
-    shares = sorted({k / order for order in _TRIED_ORDERS for k in range(1, order)})
+    shares = {k / order for order in _TRIED_ORDERS for k in range(1, order)}
+    shares = sorted(shares | {1 / order for order in _TEETH})
     angles = torch.tensor(shares, dtype=torch.float64) * (2 * math.pi)
     angles = angles[surface.rough_distance(_turns(direction, angles)) <= _COARSE]
     if worst > tolerance and len(angles):
@@ -330,7 +341,7 @@ def mirror_deviation(model: ObjectModel) -> float:
     Args:
         model: the object, a mesh or points with normals.
     """
-    return float(kept(model, _mirror_search, "mirror_deviation"))
+    return float(cached(model, _mirror_search, "mirror_deviation"))
 
 
 def _mirror_search(model: ObjectModel) -> float:
@@ -368,9 +379,11 @@ def refine_turn(
     return turn
 
 
-ALIKE = 0.01
-"""Deviation in diameters up to which a symmetry that was found in a scan is one; a copy that
-deviates by more differs in dents that are seen from near by, and is another pose."""
+ALIKE = 0.004
+"""Deviation in diameters up to which a symmetry that was found in a shape is exact: as much as a
+cylinder of 25 facets deviates. A copy that deviates by more, as a scan's dents or a keyway do, is
+another pose, though a view may not tell which."""
+ALMOST_ALL = 0.998  #: share of the surface that must be so near: a key or a notch is a few percent
 _TOLERANCE = 0.05
 """Deviation in diameters at which a sensor's noise begins to mask the difference of two poses: real
 points of LineMOD and YCB lie 1.4 to 2.6 % of the diameter off the posed surface. Twice as much is
@@ -398,7 +411,7 @@ def near_symmetries(model: ObjectModel) -> tuple[NearSymmetry, ...]:
     Not among them are those of :func:`true_symmetries`, which are no other pose. They are searched
     once for each shape, which takes a second or a few, and kept in ``$DEPTHPOSE_CACHE``.
     """
-    near = kept(model, _search, "near_symmetries")["near"]
+    near = cached(model, _search, "near_symmetries")["near"]
     turns = [(torch.tensor(matrix, dtype=torch.float64), deviation) for matrix, deviation in near]
     return tuple(
         NearSymmetry(model_from_model=Rigid(M[:3, :3], M[:3, 3]), deviation=deviation)
@@ -419,7 +432,7 @@ def true_symmetries(
     given = model.symmetries
     if not given.is_found:
         return given
-    turns, axes = kept(model, _search, "near_symmetries")["alike"] if alike is None else alike
+    turns, axes = cached(model, _search, "near_symmetries")["alike"] if alike is None else alike
     discrete = given.discrete
     if discrete is not None:
         discrete = discrete[torch.tensor(turns)] if any(turns) else None
@@ -432,9 +445,10 @@ def _search(model: ObjectModel) -> dict[str, Any]:
     # Which discrete symmetries, and which axes, have copies that lie on the surface.
     given, circle = model.symmetries, torch.arange(1, 8, dtype=torch.float64) * (math.pi / 4)
     turns = [_turns(axis.direction.double(), circle) for axis in given.continuous]
-    axes, discrete = [float(surface.deviation(R).max()) <= ALIKE for R in turns], list[bool]()
+    axes, discrete = [float(surface.deviation(R, share=ALMOST_ALL).max()) <= ALIKE for R in turns], list[bool]()
     if given.discrete is not None:
-        discrete = (surface.deviation(given.discrete.R.double()) <= ALIKE).tolist()
+        R = given.discrete.R.double()
+        discrete = (surface.deviation(R, share=ALMOST_ALL) <= ALIKE).tolist()
     alike = (discrete, axes)
     same = symmetry_transforms(true_symmetries(model, alike), _FINE_STEP).R
     # Symmetries that were found, and turns refined to where they fit best: a scan whose points lie

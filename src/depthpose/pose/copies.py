@@ -1,0 +1,185 @@
+"""Poses at which a model looks alike: symmetries, near-symmetric copies, and look-alikes."""
+
+import math
+from dataclasses import dataclass, replace
+
+import torch
+from jaxtyping import Bool, Float64
+from torch import Tensor
+
+from depthpose.core.arrays import take_evenly
+from depthpose.core.rigid import Rigid, geodesic_rad
+from depthpose.pose.mesh import (
+    cached,
+    mirror_deviation,
+    near_symmetries,
+    sample_surface,
+    symmetry_transforms,
+    true_symmetries,
+)
+from depthpose.pose.surface import Surface
+from depthpose.pose.types import ObjectModel
+from depthpose.pose.voting.point_pairs import PairTable, find_turns
+
+SAME_DIAMETERS = 0.1  #: mean distance of the model's points up to which two poses are one
+SAME_RAD = math.radians(8)  #: and angle; both must hold
+_STEP_RAD = math.pi / 16  # between the rotations about a continuous axis that are one pose
+_FOUND_STEP_RAD = math.pi / 18  # and about one that was found within a tolerance
+_COMPARED = 100  # points of the model by which poses are compared
+_ALONG = math.cos(math.radians(15))
+_LONGER = 1.15
+"""An axis is the longest or shortest where it differs by so much from the next."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class SymmetricCopies:
+    """Motions of a model, ``model_from_model``, after which it looks as before, or nearly.
+
+    Attributes:
+        symmetries: exact ones, whose copies are one pose; the identity first.
+        copies: near-symmetries, which map at least 85 % of the surface onto itself: another pose
+            that looks nearly alike, such as a gear turned by a tooth.
+        lookalikes: motions that map a smaller part of the surface onto itself, and half turns.
+        trained: symmetries that a network was trained to treat as one pose; the identity first.
+        mirror: how far the mirror image deviates from the model, in diameters.
+        points_m: of the model, by which poses are compared.
+        middle_m: of its box.
+        axes: rows: its principal axes, from the longest.
+        lengths_m: its extent along each.
+        diameter_m: of the model.
+    """
+
+    symmetries: Rigid
+    copies: Rigid
+    lookalikes: Rigid
+    trained: Rigid
+    mirror: float
+    points_m: Float64[Tensor, "n 3"]
+    middle_m: Float64[Tensor, "3"]
+    axes: Float64[Tensor, "3 3"]
+    lengths_m: Float64[Tensor, "3"]
+    diameter_m: float
+
+    def is_same(self, pose: Rigid, others: Rigid, motions: Rigid) -> Bool[Tensor, " n"]:
+        """Which of other poses are a pose, after one of some motions of the model."""
+        moved = others[:, None] @ motions
+        apart_m = pose.apply(self.points_m) - moved.apply(self.points_m)
+        is_near = apart_m.norm(dim=-1).mean(-1) < SAME_DIAMETERS * self.diameter_m
+        angle = geodesic_rad(pose.R.expand_as(moved.R), moved.R)
+        return (is_near & ((angle < SAME_RAD) | self._is_ball)).any(-1)
+
+    @property
+    def _is_ball(self) -> bool:
+        return len(self.points_m) == 1
+
+
+@dataclass(kw_only=True, eq=False)
+class PreparedObject:
+    """A known object, and what is computed of its model once for all inputs."""
+
+    number: int  #: among the models of an estimator
+    model: ObjectModel
+    surface: Surface
+    copies: SymmetricCopies | None = None
+    pairs: PairTable | None = None
+
+
+def find_copies(model: ObjectModel) -> SymmetricCopies:
+    """Search a model for its symmetries, near-symmetries and look-alikes."""
+    points_m = sample_surface(model, 2000)[0].double()
+    middle_m = (points_m.amin(0) + points_m.amax(0)) / 2
+    offset_m = points_m - points_m.mean(0)
+    axes = torch.linalg.eigh(offset_m.T @ offset_m).eigenvectors.T.flip(0)
+    along_m = points_m @ axes.T
+    exact = true_symmetries(model)
+    symmetries = symmetry_transforms(exact, _STEP_RAD).double()
+    compared_m = take_evenly(points_m, _COMPARED)
+    # Symmetries that were found within a tolerance, but for the exact ones, are near-symmetries.
+    declared = symmetry_transforms(model.symmetries, _FOUND_STEP_RAD).double()
+    near = [near.model_from_model[None] for near in near_symmetries(model)]
+    copies = Rigid.cat([declared, *near])
+    found = cached(model, find_turns, "turns")
+    rows = torch.tensor(found["turns"], dtype=torch.float64).reshape(-1, 4, 4)
+    turns = Rigid(rows[:, :3, :3], rows[:, :3, 3])
+    # Half turns about the principal axes: the usual mistake about a long or flat part.
+    half = 2 * axes[:, :, None] * axes[:, None] - torch.eye(3).double()
+    halves = Rigid(half, middle_m - half @ middle_m)
+    lookalikes = Rigid.cat([turns[found["mostly"] :], halves])
+    copies = Rigid.cat([copies, turns[: found["mostly"]]])
+    centre_m = exact.ball_centre_m
+    if centre_m is not None:  # every rotation of a ball is the same pose: its centre says where
+        compared_m = centre_m.to(points_m)[None]
+        copies = _empty()
+        lookalikes = _empty()
+    prepared = SymmetricCopies(
+        symmetries=symmetries,
+        copies=_empty(),
+        lookalikes=_empty(),
+        trained=symmetry_transforms(model.symmetries, 2 * _STEP_RAD).double(),
+        mirror=mirror_deviation(model),
+        points_m=compared_m,
+        middle_m=middle_m,
+        axes=axes,
+        lengths_m=along_m.amax(0) - along_m.amin(0),
+        diameter_m=model.diameter_m,
+    )
+    identity = Rigid(torch.eye(3)[None].double(), torch.zeros(1, 3).double())
+    copies = _distinct(copies, identity, prepared)
+    lookalikes = _distinct(lookalikes, Rigid.cat([identity, copies]), prepared)
+    return replace(prepared, copies=copies, lookalikes=lookalikes)
+
+
+def _distinct(motions: Rigid, others: Rigid, prepared: SymmetricCopies) -> Rigid:
+    """Leave out motions that are, up to a symmetry, one before them or one of others."""
+    chosen = others
+    for k in range(len(motions.R)):
+        if not bool(prepared.is_same(motions[k], chosen, prepared.symmetries).any()):
+            chosen = Rigid.cat([chosen, motions[k][None]])
+    return chosen[len(others.R) :]
+
+
+def _empty() -> Rigid:
+    return Rigid(torch.zeros(0, 3, 3).double(), torch.zeros(0, 3).double())
+
+
+def with_copies(prepared: PreparedObject) -> SymmetricCopies:
+    """Give an object's symmetric copies, searched when they are first asked for."""
+    if prepared.copies is None:
+        prepared.copies = find_copies(prepared.model)
+    return prepared.copies
+
+
+def near_symmetry_lines(model: ObjectModel) -> list[str]:
+    """Say after which rotations a model looks nearly as before, and by how much it deviates."""
+    copies = find_copies(model)
+    identity = Rigid(torch.eye(3, dtype=torch.float64), torch.zeros(3, dtype=torch.float64))
+    return [
+        f"{difference_of(near.model_from_model, identity, copies)} ({near.deviation:.1%})"
+        for near in near_symmetries(model)
+    ]
+
+
+def difference_of(pose: Rigid, from_pose: Rigid, copies: SymmetricCopies) -> str:
+    """Say how a pose differs from another: by which rotation about which axis of the model."""
+    turn = from_pose.R.double().mT @ pose.R.double()
+    angle = math.degrees(float(geodesic_rad(turn, torch.eye(3, dtype=torch.float64))))
+    middle_m = copies.middle_m[None]
+    shift_m = float((pose.apply(middle_m) - from_pose.apply(middle_m)).norm())
+    # The direction that the turn leaves alone, of the sign of a turn by up to 180 degrees.
+    axis = torch.linalg.svd(turn - torch.eye(3, dtype=turn.dtype)).Vh[-1]
+    skew = torch.stack([turn[2, 1] - turn[1, 2], turn[0, 2] - turn[2, 0], turn[1, 0] - turn[0, 1]])
+    axis = axis if float(axis @ skew) >= 0 else -axis
+    lengths, names = copies.lengths_m, {}
+    if lengths[0] > _LONGER * lengths[1]:
+        names[0] = "the long axis"
+    if lengths[1] > _LONGER * lengths[2]:
+        names[2] = "the short axis"
+    if len(names) == 2:  # then the one between is known too
+        names[1] = "the middle axis"
+    x, y, z = (round(value, 2) + 0.0 for value in axis.tolist())  # no -0.00
+    along = [name for k, name in names.items() if abs(float(copies.axes[k] @ axis)) > _ALONG]
+    about = along[0] if along else f"the model's axis ({x:.2f}, {y:.2f}, {z:.2f})"
+    words = f"rotated by {angle:.0f} degrees about {about}"
+    if shift_m > SAME_DIAMETERS / 2 * copies.diameter_m:
+        words += f" and shifted by {1000 * shift_m:.0f} mm"
+    return words

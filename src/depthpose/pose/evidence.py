@@ -1,0 +1,279 @@
+"""A posed model compared with a depth image: the evidence for and against the pose.
+
+The model is drawn as the camera would see it. Where it is drawn, the residual is the reading less
+the drawn depth, averaged over a few neighbours and counted in standard deviations of the sensor and
+the object (:mod:`depthpose.pose.sensor`). A connected patch of residuals beyond three deviations
+contradicts the pose, however small its share of the whole: behind the drawn surface the camera saw
+through it (a free-space violation), before it the object bulges where the model does not, and the
+object's own readings beside the drawn silhouette are not explained at all.
+"""
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Float64
+from scipy import ndimage
+from torch import Tensor
+
+from depthpose.core.arrays import take_evenly
+from depthpose.core.rigid import Rigid
+from depthpose.pose.cloud import grow_mask
+from depthpose.pose.sensor import CORRELATION_PX, DepthNoise, measure_noise
+from depthpose.pose.surface import Surface
+from depthpose.pose.types import Evidence, ViewInput
+
+THRESHOLD = 3.0  #: deviations beyond which a residual contradicts a pose
+AVERAGED_PX = 5  #: residuals are averaged over a square of this side
+BORDER_PX = 2
+"""Readings so near an edge may be of either side: stereo matches windows, and masks end so far from
+the silhouette."""
+_LEAST_FILLED = 0.3  # share of the averaged square that must have residuals
+_LEAST_PATCH = 0.25  # independent patches: smaller ones are accidents of edges and drop-outs
+_LEAST_INNER = 0.25  # share of the silhouette that its borders may leave
+_DISK = 1.3  # radius of the disk drawn for a sample, in median distances of samples
+_OBJECT_PX = 8000  # pixels of an object that are compared; of larger ones every n-th
+_JUMP_DIAMETERS = 0.02
+_JUMP_M = 0.01
+"""Drawn neighbours that differ in depth by more than both are the two sides of an edge."""
+_FAR_M = np.float32(1e6)
+_MARGIN = 0.6  # half of the window about an object, in diameters
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Observation:
+    """What a camera saw about an object, in a window of its image, thinned if it is large.
+
+    Attributes:
+        depth_m: (h, w), NaN where there is no reading.
+        is_object: (h, w) pixels that are known to be of the object, without their border.
+        K: intrinsic matrix of the window.
+        noise: of readings on the object.
+        step: every so many rows and columns of the image are used.
+    """
+
+    depth_m: np.ndarray
+    is_object: np.ndarray
+    K: Float64[Tensor, "3 3"]
+    noise: DepthNoise
+    step: int = 1
+
+
+def observe(
+    cloud_m: Float[Tensor, "n 3"],
+    view: ViewInput | None,
+    diameter_m: float,
+    object_m: float,
+    *,
+    is_masked: bool,
+) -> Observation:
+    """Cut the window about an object out of its depth image.
+
+    Args:
+        cloud_m: points that lie on the object, in the camera frame.
+        view: their depth image; None: the points are drawn as a camera would have seen them, to
+            which they are a pixel apart.
+        diameter_m: of the model.
+        object_m: standard deviation of the real surface from its model.
+        is_masked: whether the points are all of the object, as an exact mask gives them, so that
+            those which a pose does not explain contradict it.
+    """
+    cloud_m = cloud_m.double()
+    K = _camera_of_cloud(cloud_m) if view is None else view.K.double()
+    pixel = (cloud_m @ K.T)[:, :2].div(cloud_m[:, 2:]).round().long()
+    reach_px = int(_MARGIN * diameter_m / float(cloud_m[:, 2].median()) * float(K[0, 0])) + 4
+    low = pixel.amin(0) - reach_px
+    high = pixel.amax(0) + reach_px + 1
+    if view is not None:
+        low = low.clamp(min=0)
+        high = torch.minimum(high, torch.tensor(view.depth_m.shape).flip(0))
+    width, height = (high - low).tolist()
+    left, top = low.tolist()
+
+    # The object's pixels. Of a large cloud some points were left out: small gaps are closed.
+    inside = ((pixel >= low) & (pixel < high)).all(-1)
+    place = ((pixel - low)[:, 1] * width + (pixel - low)[:, 0])[inside]
+    is_object = torch.zeros(height * width, dtype=torch.bool)
+    is_object[place] = True
+    is_object = grow_mask(grow_mask(is_object.view(height, width), 1), -1)
+    if view is None:
+        depth_m = torch.full((height * width,), torch.inf, dtype=torch.float64)
+        depth_m.scatter_reduce_(0, place, cloud_m[inside, 2], "amin")
+        depth_m = depth_m.view(height, width)
+    else:
+        depth_m = view.depth_m[top : top + height, left : left + width].double()
+    depth_m = torch.where(depth_m.isfinite() & (depth_m > 0), depth_m, torch.nan)
+    inner = grow_mask(is_object, -BORDER_PX)
+    inner = inner if bool(inner.any()) else is_object  # thin things are all border
+    noise = measure_noise(depth_m.numpy(), inner.numpy(), object_m)
+
+    step = max(1, math.floor(math.sqrt(float(is_object.sum()) / _OBJECT_PX)))
+    window_K = K.clone()
+    window_K[:2, 2] -= torch.tensor([left, top], dtype=torch.float64)
+    window_K[:2] /= step
+    return Observation(
+        depth_m=np.ascontiguousarray(depth_m.float().numpy()[::step, ::step]),
+        is_object=np.ascontiguousarray(inner.numpy()[::step, ::step]) & is_masked,
+        K=window_K,
+        noise=noise,
+        step=step,
+    )
+
+
+def _camera_of_cloud(cloud_m: Float64[Tensor, "n 3"]) -> Float64[Tensor, "3 3"]:
+    """Intrinsic matrix of a camera to which the points of a cloud are a pixel apart."""
+    rays = cloud_m[:, :2] / cloud_m[:, 2:]
+    some_rays = take_evenly(rays, 5000)
+    apart = torch.cdist(take_evenly(rays, 200), some_rays)
+    nearest = apart.masked_fill(apart < 1e-9, torch.inf).amin(-1).median()
+    focal_px = math.sqrt(len(rays) / len(some_rays)) / (1.5 * float(nearest))
+    return torch.diag(torch.tensor([focal_px, focal_px, 1.0], dtype=torch.float64))
+
+
+def draw_surface(
+    surface: Surface, pose: Rigid, K: Float64[Tensor, "3 3"], height: int, width: int
+) -> tuple[np.ndarray, np.ndarray, tuple[slice, slice]]:
+    """Draw a surface as a camera sees it: each sample as a disk in its tangent plane.
+
+    Args:
+        surface: of the model.
+        pose: ``camera_from_model``.
+        K: intrinsic matrix of the image.
+        height: rows of the image.
+        width: its columns.
+
+    Returns:
+        Depth along the optical axis, NaN where nothing is drawn, and the cosine between ray and
+        normal, of the rows and columns that the drawing covers; and these rows and columns.
+    """
+    R, t_m = pose.R.double(), pose.t_m.double()
+    points_m = surface.points_m @ R.mT + t_m
+    is_facing = ((surface.outward @ R.mT) * points_m).sum(-1) <= 0
+    is_drawn = (points_m[:, 2] > 0) & is_facing
+    pixel = ((points_m @ K.mT)[:, :2] / points_m[:, 2:]).round()
+    is_drawn &= ((pixel >= 0) & (pixel < torch.tensor([width, height]))).all(-1)
+    nothing = slice(0, 0), slice(0, 0)
+    if not bool(is_drawn.any()):
+        return np.empty((0, 0)), np.empty((0, 0)), nothing
+    # Single precision: the depth of a pixel is exact to a ten-millionth.
+    points_m = points_m[is_drawn].float()
+    normals = (surface.normals @ R.mT)[is_drawn].float()
+    pixel = pixel[is_drawn].long()
+
+    # The pixels that a disk may cover, and where their rays meet its plane.
+    radius_m = _DISK * surface.spacing_m
+    radius_px = radius_m * float(K[0, 0]) / float(points_m[:, 2].median())
+    reach = math.ceil(radius_px)
+    low = (pixel.amin(0) - reach).clamp(min=0)
+    high = torch.minimum(pixel.amax(0) + reach + 1, torch.tensor([width, height]))
+    drawn_width, drawn_height = (high - low).tolist()
+    steps = torch.arange(-reach, reach + 1)
+    offsets = torch.cartesian_prod(steps, steps)
+    offsets = offsets[offsets.square().sum(-1) <= (radius_px + 0.71) ** 2]
+    column = pixel[:, 0, None] - low[0] + offsets[:, 0]
+    row = pixel[:, 1, None] - low[1] + offsets[:, 1]
+    (fx, skew, cx), (_, fy, cy), _ = K.tolist()
+    y = (row.float() + (float(low[1]) - cy)) / fy
+    x = (column.float() + (float(low[0]) - cx) - skew * y) / fx
+    along = normals[:, :1] * x + normals[:, 1:2] * y + normals[:, 2:]
+    depth_m = (normals * points_m).sum(-1, keepdim=True) / along
+    apart_m2 = (x * depth_m - points_m[:, :1]).square()
+    apart_m2 += (y * depth_m - points_m[:, 1:2]).square()
+    apart_m2 += (depth_m - points_m[:, 2:]).square()
+    is_hit = apart_m2 < radius_m**2
+    is_hit &= (column >= 0) & (column < drawn_width) & (row >= 0) & (row < drawn_height)
+
+    # The nearest disk of each pixel is seen.
+    place = (row * drawn_width + column)[is_hit]
+    depth_m = depth_m[is_hit]
+    cosine = along[is_hit].abs() / (x[is_hit].square() + y[is_hit].square() + 1).sqrt()
+    nearest_m = torch.full((drawn_height * drawn_width,), torch.inf)
+    nearest_m.scatter_reduce_(0, place, depth_m, "amin")
+    is_nearest = depth_m <= nearest_m[place]
+    drawn_cosine = torch.ones(drawn_height * drawn_width)
+    drawn_cosine[place[is_nearest]] = cosine[is_nearest]
+    drawn_m = torch.where(nearest_m.isfinite(), nearest_m, torch.nan)
+    (left, top), (right, bottom) = low.tolist(), high.tolist()
+    return (
+        drawn_m.view(drawn_height, drawn_width).numpy(),
+        drawn_cosine.view(drawn_height, drawn_width).numpy(),
+        (slice(top, bottom), slice(left, right)),
+    )
+
+
+def compare(observation: Observation, pose: Rigid, surface: Surface) -> Evidence:
+    """Compare a posed surface with an observation.
+
+    Args:
+        observation: of :func:`observe`.
+        pose: ``camera_from_model``.
+        surface: of the model.
+    """
+    noise, step = observation.noise, observation.step
+    patch_px = max(1.0, (CORRELATION_PX / step) ** 2)
+    drawn_m, cosine, window = draw_surface(surface, pose, observation.K, *observation.depth_m.shape)
+    depth_m = observation.depth_m[window]
+    is_object = observation.is_object[window]
+    is_read = np.isfinite(depth_m)
+    is_drawn = np.isfinite(drawn_m)
+    inner = _without_edges(drawn_m, is_drawn, surface.diameter_m, step)
+
+    # Residuals in standard deviations of their mean over some neighbours.
+    side = max(3, 2 * round((AVERAGED_PX / step - 1) / 2) + 1)
+    is_compared = is_read & inner
+    residual_m = np.where(is_compared, depth_m - drawn_m, 0).astype(np.float32)
+    filled = ndimage.uniform_filter(is_compared.astype(np.float32), side)
+    mean_m = ndimage.uniform_filter(residual_m, side)
+    is_compared &= filled > _LEAST_FILLED
+    mean_m = mean_m[is_compared] / filled[is_compared]
+    deviations = np.zeros_like(residual_m)
+    deviations[is_compared] = mean_m / noise.deviation_m(cosine[is_compared], side**2 // 3)
+
+    # Patches that contradict the pose, and what supports it.
+    is_supported = is_compared & (np.abs(deviations) <= THRESHOLD)
+    seen_through = _patch_area(deviations > THRESHOLD, patch_px)
+    bulging = _patch_area((deviations < -THRESHOLD) & is_object, patch_px)
+    is_beside = observation.is_object & np.isfinite(observation.depth_m)
+    border = max(1, round((BORDER_PX + 1) / step))
+    is_beside[window] &= ~ndimage.binary_dilation(is_drawn, iterations=border)
+    visible = float(inner.sum()) / patch_px
+    supported = float(is_supported.sum()) / patch_px
+    square = deviations[is_supported] ** 2
+    return Evidence(
+        visible=visible,
+        supported=supported,
+        # What neither supports the pose nor contradicts it has no reading, or is hidden.
+        unobserved=max(0.0, visible - supported - seen_through - bulging),
+        seen_through=seen_through,
+        bulging=bulging,
+        beside=_patch_area(is_beside, patch_px),
+        rms=float(np.sqrt(square.mean())) if len(square) else THRESHOLD,
+        noise_m=noise.white_m,
+    )
+
+
+def _without_edges(
+    drawn_m: np.ndarray, is_drawn: np.ndarray, diameter_m: float, step: int
+) -> np.ndarray:
+    """Leave out what is near an edge of the drawing, which a sensor moves by some pixels."""
+    jump_m = max(_JUMP_M, _JUMP_DIAMETERS * diameter_m)
+    nearest_m = ndimage.minimum_filter(np.where(is_drawn, drawn_m, _FAR_M), 3)
+    farthest_m = ndimage.maximum_filter(np.where(is_drawn, drawn_m, -_FAR_M), 3)
+    is_edge = farthest_m - nearest_m > jump_m
+    surface = is_drawn & ~is_edge
+    # Of what is thinner than two borders the middle remains.
+    for border in range(math.ceil(BORDER_PX / step), 0, -1):
+        inner = ndimage.binary_erosion(surface, iterations=border)
+        if inner.sum() >= _LEAST_INNER * is_drawn.sum():
+            return inner
+    return surface
+
+
+def _patch_area(mask: Bool[np.ndarray, "h w"], patch_px: float) -> float:
+    """Area of the connected patches in a mask that are no accident, in independent patches."""
+    labels, count = ndimage.label(mask)
+    if count == 0:
+        return 0.0
+    areas_px = np.bincount(labels.ravel())[1:]
+    return float(areas_px[areas_px >= _LEAST_PATCH * patch_px].sum()) / patch_px

@@ -1,0 +1,78 @@
+"""What a depth camera and a real object are off by: the deviations in which evidence is counted.
+
+A depth camera errs in three ways. Each reading has noise of its own. Neighbouring readings also
+share an error, because stereo and structured light match windows of several pixels: a patch of
+readings that is off together is one observation, not hundreds. And all readings of an object are
+shifted alike along the ray, which refinement takes up in the pose. Beside the camera, a real object
+deviates from its file: by a few tenths of a millimetre if it is machined, by a millimetre or more
+if the file is a scan or the object a carton.
+"""
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from depthpose.core.config import Settings
+
+LAG_PX = 3
+"""Noise is measured between readings so far apart: direct neighbours of a real sensor err alike."""
+SHARED_PER_WHITE = 2.5
+"""Error that neighbours share, in deviations of the noise of one reading. Planes before a Kinect
+and a RealSense show 2 to 4 (``bench/sensors.py``); a laser scanner less."""
+CORRELATION_PX = 12
+"""Readings so far apart err independently: a RealSense smooths over a Gaussian of 5 px."""
+_MEDIAN_TO_DEVIATION = 1.4826  # of a normal distribution
+_STEEPEST = 0.3
+"""Least cosine by which a deviation along the surface normal is divided: what is seen at a smaller
+angle is hardly measured at all."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class DepthNoise:
+    """Deviations of readings from the surface of a model, in metres along the ray.
+
+    Attributes:
+        white_m: standard deviation of a reading, independent of its neighbours.
+        shared_m: standard deviation of the error that neighbouring readings share.
+        object_m: standard deviation of the real surface from the model, along its normal.
+    """
+
+    white_m: float
+    shared_m: float
+    object_m: float
+
+    def deviation_m(self, cosine: np.ndarray, readings: int) -> np.ndarray:
+        """Standard deviation of the mean of neighbouring readings.
+
+        Args:
+            cosine: between the ray and the surface normal, any shape.
+            readings: how many are averaged.
+        """
+        variance = self.white_m**2 / readings + self.shared_m**2 + self.object_m**2
+        return math.sqrt(variance) / np.clip(cosine, _STEEPEST, 1.0)
+
+
+def measure_noise(depth_m: np.ndarray, is_object: np.ndarray, object_m: float) -> DepthNoise:
+    """Measure the noise of a depth image on an object, and derive what neighbours share.
+
+    The noise is the median second difference of readings three pixels apart, to which a slope adds
+    nothing and a curved surface little.
+
+    Args:
+        depth_m: (h, w), NaN where there is no reading.
+        is_object: (h, w) pixels of one object, without its border.
+        object_m: standard deviation of the real surface from its model.
+    """
+    masked_m = np.where(is_object, depth_m, np.nan)
+    differences = []
+    for along_m in (masked_m, masked_m.T):
+        ends_m = along_m[:, : -2 * LAG_PX] + along_m[:, 2 * LAG_PX :]
+        bend_m = ends_m - 2 * along_m[:, LAG_PX:-LAG_PX]
+        differences.append(bend_m[np.isfinite(bend_m)])
+    bend_m = np.abs(np.concatenate(differences))
+    white_m = 0.0
+    if len(bend_m) > 0:
+        # A second difference of independent readings has six times their variance.
+        white_m = _MEDIAN_TO_DEVIATION * float(np.median(bend_m)) / math.sqrt(6)
+    return DepthNoise(white_m=white_m, shared_m=SHARED_PER_WHITE * white_m, object_m=object_m)
