@@ -30,7 +30,8 @@ from depthpose.core.files import read_depth_png, read_json
 from depthpose.core.rigid import Rigid
 from depthpose.pose.config import ObjectsConfig
 from depthpose.pose.datasets import open_bop
-from depthpose.pose.estimator import GeoPoseNet, Registration
+from depthpose.pose.network_pose import GeoPoseNet
+from depthpose.pose.registration import Registration
 from depthpose.pose.mesh import read_model, sample_surface, with_found_symmetries
 from depthpose.pose.metrics import add_m, adds_m
 from depthpose.pose.synthetic import make_frames

@@ -25,7 +25,8 @@ from real_poses import RealCase, real_cases
 from depthpose.core.checkpoint import find_weights
 from depthpose.core.rigid import Rigid
 from depthpose.pose.config import EstimateConfig, VotingConfig
-from depthpose.pose.estimator import GeoPoseNet, Registration
+from depthpose.pose.network_pose import GeoPoseNet
+from depthpose.pose.registration import Registration
 from depthpose.pose.evaluate import nearest_copy
 from depthpose.pose.mesh import symmetry_transforms
 from depthpose.pose.metrics import add_m, adds_m, auc

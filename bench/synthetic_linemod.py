@@ -31,7 +31,8 @@ from fpfh import FpfhEstimator
 from depthpose.core.checkpoint import find_weights
 from depthpose.pose.config import EstimateConfig, ObjectsConfig, SensorConfig, SensorKind
 from depthpose.pose.datasets.layouts import read_bop_models, read_models_info
-from depthpose.pose.estimator import DepthImageRegressor, GeoPoseNet, Registration
+from depthpose.pose.network_pose import DepthImageRegressor, GeoPoseNet
+from depthpose.pose.registration import Registration
 from depthpose.pose.mesh import sample_surface
 from depthpose.pose.metrics import add_m, adds_m
 from depthpose.pose.synthetic import PARTS, Objects, make_part

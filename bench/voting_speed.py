@@ -18,7 +18,7 @@ import torch
 from shared import report
 
 from depthpose.pose.config import VotingConfig
-from depthpose.pose.voting import meet_lines, vote_ransac
+from depthpose.pose.propose import meet_lines, vote_ransac
 from depthpose.thesis.pose_tables import ransac_one_by_one
 
 KEYPOINTS = 8

@@ -7,7 +7,7 @@ import pytest
 from depthpose import __version__
 from depthpose.cli import main
 from depthpose.core.errors import InputError
-from depthpose.pose.estimator import GeoPoseNet
+from depthpose.pose.network_pose import GeoPoseNet
 
 
 def test_doctor_names_what_is_here_and_tries_depth_and_pose(

@@ -15,7 +15,7 @@ from depthpose.core.camera import Camera, write_camera
 from depthpose.core.files import Cloud, read_cloud, write_cloud, write_depth_png, write_image
 from depthpose.pose.config import ObjectsConfig
 from depthpose.pose.datasets import write_bop_models, write_bop_scene
-from depthpose.pose.estimator.inputs import rigid_input
+from depthpose.pose.inputs import rigid_input
 from depthpose.pose.metrics import add_m
 from depthpose.pose.synthetic import Objects, make_part
 

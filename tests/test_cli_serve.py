@@ -44,7 +44,7 @@ def served(monkeypatch: pytest.MonkeyPatch) -> list[Limits]:
             return None
 
     monkeypatch.setattr("depthpose.depth.estimator.FakestereoNet", Unloaded)
-    monkeypatch.setattr("depthpose.pose.estimator.GeoPoseNet", Unloaded)
+    monkeypatch.setattr("depthpose.pose.network_pose.GeoPoseNet", Unloaded)
     monkeypatch.setattr("depthpose.web.make_app", lambda *given: limits.append(given[-1]))
     monkeypatch.setattr("depthpose.web.run", lambda _, taken: taken.close())
     return limits

@@ -16,7 +16,7 @@ from depthpose.demo import _nets, make_demo, read_motorcycle
 from depthpose.depth.disparity import warp_right_to_left
 from depthpose.depth.estimator import FakestereoNet
 from depthpose.depth.synthesis import make_synthesiser
-from depthpose.pose.estimator import GeoPoseNet
+from depthpose.pose.network_pose import GeoPoseNet
 from depthpose.pose.predictions import read_predictions
 from depthpose.pose.synthetic import PARTS
 

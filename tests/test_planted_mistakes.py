@@ -29,7 +29,7 @@ from depthpose.depth.estimator import refuse_unrectified
 from depthpose.depth.types import StereoInput
 from depthpose.pose.cloud import Refusal, prepare_cloud
 from depthpose.pose.config import CloudConfig, EstimateConfig
-from depthpose.pose.estimator.inputs import AnyInput, cloud_input, view_input
+from depthpose.pose.inputs import AnyInput, cloud_input, view_input
 from depthpose.pose.mesh import read_model
 from depthpose.pose.types import CloudInput, ViewInput
 

@@ -30,7 +30,7 @@ from depthpose.pose.segmentation import FCN
 from depthpose.pose.sparse import Voxels
 from depthpose.pose.train import PoseTraining, SegmentationTraining
 from depthpose.pose.types import SeenPoints
-from depthpose.pose.voting import meet_lines, vote_ransac
+from depthpose.pose.propose import meet_lines, vote_ransac
 
 CONFIGS = Path(__file__).parents[2] / "configs"
 Diagram = tuple[list[Box], list[Arrow]]

@@ -6,16 +6,16 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from depthpose.depth.estimator import FakestereoNet as FakestereoNet
     from depthpose.depth.estimator import pipeline as pipeline
-    from depthpose.pose.estimator import GeoPoseNet as GeoPoseNet
-    from depthpose.pose.estimator import Registration as Registration
+    from depthpose.pose.network_pose import GeoPoseNet as GeoPoseNet
+    from depthpose.pose.registration import Registration as Registration
 
 __version__ = "0.1.0"
 __all__ = ["FakestereoNet", "GeoPoseNet", "Registration", "__version__", "pipeline"]
 
 _HOMES = {
     "FakestereoNet": "depthpose.depth.estimator",
-    "GeoPoseNet": "depthpose.pose.estimator",
-    "Registration": "depthpose.pose.estimator",
+    "GeoPoseNet": "depthpose.pose.network_pose",
+    "Registration": "depthpose.pose.registration",
     "pipeline": "depthpose.depth.estimator",
 }
 

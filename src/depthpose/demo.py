@@ -24,8 +24,8 @@ from depthpose.depth.types import DepthError, StereoInput, StereoSample, StereoT
 from depthpose.pose.config import ObjectsConfig
 from depthpose.pose.datasets import open_bop, write_bop_models, write_bop_scene
 from depthpose.pose.datasets.dataset import write_mask
-from depthpose.pose.estimator import GeoPoseNet
 from depthpose.pose.evaluate import evaluate
+from depthpose.pose.network_pose import GeoPoseNet
 from depthpose.pose.predictions import CLOUD, Prediction, place_of, write_predictions
 from depthpose.pose.synthetic import make_frames
 from depthpose.report import page as pages

@@ -10,8 +10,8 @@ from depthpose.core.camera import Camera, back_project
 from depthpose.core.render import rasterize
 from depthpose.core.rigid import Rigid
 from depthpose.pose.config import CloudConfig, MeshConfig, RefusalConfig
-from depthpose.pose.estimator import GeoPoseNet
-from depthpose.pose.estimator.net import CloudToPose
+from depthpose.pose.network_pose import GeoPoseNet
+from depthpose.pose.network_pose import CloudToPose
 from depthpose.pose.mesh import make_model
 from depthpose.pose.network import ResUNet, ResUNetConfig
 from depthpose.pose.synthetic.parts import part_mesh

@@ -22,7 +22,7 @@ from tests.pose.synthetic_objects import (
 from depthpose.core.rigid import Rigid, geodesic_rad
 from depthpose.pose.cloud import cloud_from_depth
 from depthpose.pose.config import EstimateConfig, IcpConfig
-from depthpose.pose.estimator.candidates import (
+from depthpose.pose.copies import (
     Candidate,
     KnownObject,
     difference_of,
@@ -31,7 +31,7 @@ from depthpose.pose.estimator.candidates import (
     turn_best,
     with_copies,
 )
-from depthpose.pose.estimator.fit import share_out
+from depthpose.pose.identity import share_out
 from depthpose.pose.mesh import (
     NearSymmetry,
     SymmetryProposal,

@@ -28,7 +28,7 @@ from depthpose.core.files import Cloud, write_cloud, write_depth_png, write_imag
 from depthpose.core.rigid import Rigid, geodesic_rad, rotation_by
 from depthpose.pose.cloud import ObjectCloud, prepare_cloud
 from depthpose.pose.config import CloudConfig, EstimateConfig, VotingConfig
-from depthpose.pose.estimator import GeoPoseNet
+from depthpose.pose.network_pose import GeoPoseNet
 from depthpose.pose.mesh import (
     make_model,
     propose_symmetries,

@@ -18,8 +18,8 @@ from torch.utils._python_dispatch import TorchDispatchMode
 
 from depthpose.core.rigid import Rigid
 from depthpose.pose.config import CloudConfig, EstimateConfig, VotingConfig
-from depthpose.pose.estimator import Registration
-from depthpose.pose.estimator.net import CloudToPose
+from depthpose.pose.registration import Registration
+from depthpose.pose.network_pose import CloudToPose
 from depthpose.pose.mesh import make_model
 from depthpose.pose.types import PoseEstimate
 

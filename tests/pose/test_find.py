@@ -20,8 +20,8 @@ from depthpose.core.camera import back_project
 from depthpose.core.errors import InputError
 from depthpose.core.rigid import Rigid
 from depthpose.pose.config import RefusalConfig
-from depthpose.pose.estimator.find import explained_mask, is_cut_out, nothing_found
-from depthpose.pose.estimator.fit import Seen
+from depthpose.pose.search import explained_mask, is_cut_out, nothing_found
+from depthpose.pose.identity import Seen
 from depthpose.pose.mesh import make_model
 from depthpose.pose.metrics import add_m
 from depthpose.pose.surface import NEAR, prepare_surface

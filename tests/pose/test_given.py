@@ -11,7 +11,7 @@ from PIL import Image
 from depthpose.core.camera import Camera
 from depthpose.core.errors import InputError
 from depthpose.core.files import read_map, write_depth_png
-from depthpose.pose.estimator.inputs import view_input
+from depthpose.pose.inputs import view_input
 
 K = torch.tensor([[50.0, 0, 31.5], [0, 50, 23.5], [0, 0, 1]], dtype=torch.float64)
 DEPTH_M = torch.linspace(0.5, 0.9, 48)[:, None].expand(48, 64).contiguous()

@@ -16,7 +16,7 @@ from depthpose.pose.datasets import (
     read_labels,
     read_mask,
 )
-from depthpose.pose.estimator.inputs import labels_input, split_instances, view_input
+from depthpose.pose.inputs import labels_input, split_instances, view_input
 
 MASK = torch.tensor([[False, True, False], [True, False, False]])
 # Column by column: one of the background, two of the object, three of the background.

@@ -16,7 +16,7 @@ from tests.fuzz.damage import pack_glb
 from depthpose.core.errors import InputError
 from depthpose.core.rigid import rotation_by
 from depthpose.pose.cloud import unit_advice
-from depthpose.pose.estimator import Registration
+from depthpose.pose.registration import Registration
 from depthpose.pose.mesh import read_geometry, read_model
 from depthpose.pose.mesh.files import cut_polygons
 

@@ -23,13 +23,13 @@ from depthpose.core.errors import InputError
 from depthpose.core.rigid import Rigid
 from depthpose.pose.cloud import ObjectCloud, grow_mask, prepare_cloud
 from depthpose.pose.config import CloudConfig, EstimateConfig, IcpConfig, RefusalConfig
-from depthpose.pose.estimator.candidates import (
+from depthpose.pose.copies import (
     Candidate,
     KnownObject,
     find_copies,
     surface_signals,
 )
-from depthpose.pose.estimator.fit import (
+from depthpose.pose.identity import (
     answer_of,
     fit_of,
     misfit_of,

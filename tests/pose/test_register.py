@@ -20,7 +20,7 @@ from depthpose.pose.metrics import add_m
 from depthpose.pose.surface import prepare_surface
 from depthpose.pose.synthetic import Objects, make_part
 from depthpose.pose.types import CloudSample, ObjectModel
-from depthpose.pose.voting.point_pairs import prepare_pairs, propose_poses
+from depthpose.pose.propose.point_pairs import prepare_pairs, propose_poses
 from depthpose.pose.weights import read_pose_weights
 
 

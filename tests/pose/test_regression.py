@@ -10,7 +10,7 @@ from depthpose.core.errors import InputError
 from depthpose.core.rigid import Rigid, perturb
 from depthpose.pose.baselines import DepthImageConfig, DepthImageNet
 from depthpose.pose.config import CloudConfig, EstimateConfig, IcpConfig, RefusalConfig
-from depthpose.pose.estimator import DepthImageRegressor
+from depthpose.pose.network_pose import DepthImageRegressor
 from depthpose.pose.metrics import add_m
 from depthpose.pose.types import ViewInput
 from depthpose.pose.weights import PoseWeights
@@ -38,7 +38,7 @@ def test_the_refinement_is_ours_from_several_starts(
     # So far turned that ICP from this start alone ends elsewhere.
     start = perturb(pose_at(), torch.tensor([math.radians(60), 0.0, 0.0, 0.0, 0.0, 0.0]))
     wrong = Rigid(start.R[None], pose_at().t_m[None])
-    monkeypatch.setattr("depthpose.pose.estimator.net.poses_of", lambda *_: wrong)
+    monkeypatch.setattr("depthpose.pose.network_pose.poses_of", lambda *_: wrong)
     errors_m: list[float] = []
     for starts in (7, 1):
         config = EstimateConfig(icp=IcpConfig(starts=starts))

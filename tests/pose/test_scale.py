@@ -10,8 +10,8 @@ from tests.pose.synthetic_objects import Oracle, bracket, cloud_of, noisy, pose_
 from depthpose.core.loop import sample_generator
 from depthpose.core.rigid import Rigid
 from depthpose.pose.config import EstimateConfig, RefusalConfig
-from depthpose.pose.estimator.fit import Scale, scale_of
-from depthpose.pose.refine import refine_pose
+from depthpose.pose.identity import Scale, scale_of
+from depthpose.pose.icp import refine_pose
 from depthpose.pose.surface import prepare_surface
 from depthpose.pose.types import PoseEstimate
 
@@ -62,7 +62,7 @@ def test_an_identity_is_confirmed_where_the_size_that_fits_is_near(
     times: float, status: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     scale = Scale(times, sigma=0.02, gain=0.03)
-    monkeypatch.setattr("depthpose.pose.estimator.fit.scale_of", lambda *_: scale)
+    monkeypatch.setattr("depthpose.pose.identity.scale_of", lambda *_: scale)
     identity = estimated(1.0).identity
     assert identity is not None
     assert identity.status == status

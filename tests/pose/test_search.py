@@ -15,22 +15,22 @@ from depthpose.core.rigid import Rigid, geodesic_rad, rotation_by
 from depthpose.pose.cloud import cloud_from_depth, grow_mask
 from depthpose.pose.config import RefusalConfig
 from depthpose.pose.estimator import Registration, find
-from depthpose.pose.estimator.candidates import find_copies
-from depthpose.pose.estimator.find import SearchTargets, find_objects, size_deviations
-from depthpose.pose.estimator.fit import fit_of, seen_about
-from depthpose.pose.estimator.hypotheses import (
+from depthpose.pose.copies import find_copies
+from depthpose.pose.search import SearchTargets, find_objects, size_deviations
+from depthpose.pose.identity import fit_of, seen_about
+from depthpose.pose.propose.image import (
     compare_with_image,
     log_odds_wrong,
     propose_in_frame,
 )
-from depthpose.pose.estimator.inputs import view_input
+from depthpose.pose.inputs import view_input
 from depthpose.pose.frame import prepare_frame
 from depthpose.pose.mesh import make_model
 from depthpose.pose.metrics import add_m
 from depthpose.pose.surface import prepare_surface
 from depthpose.pose.synthetic.parts import make_part
 from depthpose.pose.types import CloudInput, Identity, ObjectModel, PoseEstimate
-from depthpose.pose.voting.point_pairs import prepare_pairs
+from depthpose.pose.propose.point_pairs import prepare_pairs
 
 TRUTHS = [pose_at(-0.13, 0.7, seed=1), pose_at(0.12, 0.9, seed=2)]
 

@@ -10,7 +10,7 @@ from tests.pose.synthetic_objects import CAMERA, K, Oracle, bracket, pose_at, ti
 from depthpose.core.camera import back_project
 from depthpose.core.errors import InputError
 from depthpose.core.rigid import Rigid, rotation_by
-from depthpose.pose.estimator.track import TrackedObject, track
+from depthpose.pose.track import TrackedObject, track
 from depthpose.pose.metrics import add_m
 from depthpose.pose.predictions import Prediction, parse_prediction, prediction_row
 from depthpose.pose.surface import compare_depths, prepare_surface

@@ -31,7 +31,7 @@ from depthpose.core.rigid import Rigid
 from depthpose.pose.baselines import DepthImageConfig, DepthImageNet, PointNetConfig
 from depthpose.pose.config import CloudConfig, ObjectsConfig
 from depthpose.pose.datasets import BopFrame, BopObject, write_bop_models, write_bop_scene
-from depthpose.pose.estimator import DepthImageRegressor, GeoPoseNet
+from depthpose.pose.network_pose import DepthImageRegressor, GeoPoseNet
 from depthpose.pose.segmentation import ResNet18, SegmentationConfig, Segmenter
 from depthpose.pose.synthetic import Objects
 from depthpose.pose.synthetic.views import uniform

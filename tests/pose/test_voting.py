@@ -9,7 +9,7 @@ from depthpose.core.config import config_from_dict
 from depthpose.core.errors import InputError
 from depthpose.core.rigid import geodesic_rad
 from depthpose.pose.config import VotingConfig
-from depthpose.pose.voting import fit_pose, meet_lines, vote_ransac
+from depthpose.pose.propose import fit_pose, meet_lines, vote_ransac
 
 METHODS = {
     "nearest": lambda *votes: meet_lines(*votes, refinements=0),

@@ -24,7 +24,7 @@ SERVER = """
 import pathlib, sys, time, torch
 from depthpose.depth.estimator import FakestereoNet
 from depthpose.depth.stereo import CallableMatcher
-from depthpose.pose.estimator import GeoPoseNet
+from depthpose.pose.network_pose import GeoPoseNet
 from depthpose.web import Limits, make_app, open_socket, run
 
 class Counted:

@@ -105,8 +105,8 @@ def _try_depth() -> str:
 def _try_pose() -> str:
     """Pose a part in a synthetic view."""
     from depthpose.pose.config import ObjectsConfig
-    from depthpose.pose.estimator import GeoPoseNet
     from depthpose.pose.metrics import adds_m
+    from depthpose.pose.network_pose import GeoPoseNet
     from depthpose.pose.synthetic import Objects
 
     net = GeoPoseNet.load("parts")

@@ -19,8 +19,7 @@ from depthpose.core.files import read_depth_png
 from depthpose.core.rigid import Rigid
 from depthpose.core.run import find_rank
 from depthpose.pose.datasets import BopDataset, Instance, open_bop
-from depthpose.pose.estimator.find import explained_mask, nothing_found
-from depthpose.pose.estimator.inputs import AnyInput
+from depthpose.pose.inputs import AnyInput
 from depthpose.pose.predictions import (
     Job,
     Prediction,
@@ -29,6 +28,7 @@ from depthpose.pose.predictions import (
     unreadable,
     write_predictions,
 )
+from depthpose.pose.search import explained_mask, nothing_found
 from depthpose.pose.surface import prepare_surface
 from depthpose.pose.types import PoseEstimate, ViewInput
 

@@ -28,9 +28,10 @@ from depthpose.pose import datasets, predictions
 from depthpose.pose.baselines import DepthImageNet
 from depthpose.pose.config import EstimateConfig
 from depthpose.pose.datasets.layouts import integer, read_rows
-from depthpose.pose.estimator import DepthImageRegressor, GeoPoseNet, Registration
-from depthpose.pose.estimator.inputs import AnyInput, rigid_input
+from depthpose.pose.inputs import AnyInput, rigid_input
 from depthpose.pose.mesh import FIXED_UNITS, unit_of
+from depthpose.pose.network_pose import DepthImageRegressor, GeoPoseNet
+from depthpose.pose.registration import Registration
 from depthpose.pose.segmentation import Segmenter
 from depthpose.pose.types import ObjectModel, PoseEstimate, ViewInput
 from depthpose.pose.weights import read_pose_weights

@@ -62,8 +62,8 @@ from depthpose.pose.datasets import (
     read_labels,
     read_targets,
 )
-from depthpose.pose.estimator.inputs import AnyMask, cloud_input, view_input
 from depthpose.pose.evaluate import of_targets
+from depthpose.pose.inputs import AnyMask, cloud_input, view_input
 from depthpose.pose.predictions import (
     CLOUD,
     PICTURE,
@@ -88,11 +88,13 @@ _MOST_SHOWN = 20  # of the answers, on the terminal; poses.json holds all
 _SAID = 5  # of so many inputs the alternatives are printed; of all they are in poses.json
 _MOST_ROWS = 1000  # of the answers, in the table of the page
 _PRINTED = ("input", "object", "status", "x, y, z [m]", "qx, qy, qz, qw", "base x, y, z [m]",
-            "base qx, qy, qz, qw", "fit", "certainty", "identity", "tracking")  # fmt: skip
+            "base qx, qy, qz, qw", "agreement", "certainty", "of this copy", "identity",
+            "tracking")  # fmt: skip
 """Columns on the terminal."""
 _BASE_COLUMNS = ("base_x_m", "base_y_m", "base_z_m")
 _FRAME = """camera_from_model: x right, y down, z forward
-certainty: the chance that the pose is right and not one of its alternatives"""
+certainty: the probability that the pose is right, up to the near-symmetries of the model
+of this copy: that it is this very copy of a nearly symmetric model"""
 
 
 def claim(
@@ -602,7 +604,9 @@ def say_result(predictions: list[Prediction], out: Path, inputs: int | None = No
             row |= _pose_words(estimate.camera_from_model, "")
             row |= _pose_words(estimate.base_from_model, "base ")
             certain = {
-                key: value for key in ("fit", "certainty") if (value := row[key]) is not None
+                key: value
+                for key in ("agreement", "certainty", "of this copy")
+                if (value := row[key]) is not None
             }
             rows.append(row | {key: f"{value:.3f}" for key, value in certain.items()})
         print(plain_table(rows, _PRINTED), end="")
@@ -640,7 +644,7 @@ def _count_inputs(predictions: Sequence[Prediction], inputs: int | None) -> str:
 
 def _row(estimate: PoseEstimate) -> dict[str, Any]:
     """Say what was found of one input, as the page and the terminal show it."""
-    pose, fit, identity = estimate.camera_from_model, estimate.fit, estimate.identity
+    pose, evidence, identity = estimate.camera_from_model, estimate.evidence, estimate.identity
     place = [None] * 3 if pose is None else pose.t_m.double().tolist()
     base = estimate.base_from_model
     return {
@@ -650,9 +654,10 @@ def _row(estimate: PoseEstimate) -> dict[str, Any]:
         **({} if estimate.tracking is None else {"tracking": estimate.tracking}),
         **dict(zip(("x_m", "y_m", "z_m"), place, strict=True)),
         **({} if base is None else dict(zip(_BASE_COLUMNS, base.t_m.tolist(), strict=True))),
-        "fit": None if fit is None else fit.agrees,
+        "agreement": None if evidence is None else evidence.agreement,
         "identity": None if identity is None else identity.status,
         "certainty": estimate.certainty,
+        "of this copy": estimate.copy_certainty,
         "alternatives": "; ".join(map(str, estimate.alternatives)),
         "reason": estimate.reason,
     }

@@ -35,7 +35,7 @@ def serve(
         package = (error.name or "starlette").partition(".")[0]
         raise MissingExtraError(package, "serve", "the page in the browser") from error
     from depthpose.depth.estimator import FakestereoNet
-    from depthpose.pose.estimator import GeoPoseNet
+    from depthpose.pose.network_pose import GeoPoseNet
 
     if max_upload_mb < 1:
         raise InputError(f"--max-upload-mb {max_upload_mb}: take 1 at least; 64 is usual")

@@ -22,12 +22,12 @@ from depthpose.core.run import claim_folder, environment
 from depthpose.pose.config import EvaluationConfig, ObjectsConfig
 from depthpose.pose.datasets import Instance
 from depthpose.pose.datasets.dataset import read_instance_mask
-from depthpose.pose.estimator import GeoPoseNet
 from depthpose.pose.evaluate import frames_hash
+from depthpose.pose.network_pose import GeoPoseNet
 from depthpose.pose.predictions import read_predictions
+from depthpose.pose.propose import vote_ransac
 from depthpose.pose.synthetic import Objects
 from depthpose.pose.types import ViewSample
-from depthpose.pose.voting import vote_ransac
 from depthpose.report import page
 from depthpose.report.page import Drawing, Picture, Section
 from depthpose.report.pose import close_up, draw_pose, grey_depth, picture_of

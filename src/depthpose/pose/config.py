@@ -1,6 +1,6 @@
 """Settings of pose estimation: clouds, meshes, refusal, estimates, synthetic objects."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Annotated, ClassVar, Literal, get_args
 
 from depthpose.core.config import ASCENDING, Seed, Settings
@@ -129,49 +129,30 @@ class IcpConfig(Settings):
             )
 
 
-_CANDIDATE_SLOPES = {
-    "tilt": 1.52,
-    "gap": 0.78,
-    "far": 2.02,
-    "front": 1.43,
-    "unseen": 0.75,
-    "disagree": 0.77,
-}
-"""Of a conditional logit on synthetic views of all shipped objects, regularised by a ridge
-(``bench/pose_candidates.py``): how likely each of several poses is that fit."""
-
-
 @dataclass(frozen=True, kw_only=True)
 class RefusalConfig(Settings):
-    """When an estimate is withheld. The limits are shares of what was seen, on any sensor."""
+    """When an estimate is withheld."""
 
     RETIRED: ClassVar[frozenset[str]] = frozenset(
-        {"max_risk", "bias", "slopes", "means", "max_scale_error", "min_explained"}
-    )
-    """Settings in weights written before 2026-11-28, which are left out."""
+        {
+            "max_risk", "bias", "slopes", "means", "max_scale_error", "min_explained",
+            "min_agreement", "max_beyond", "min_found", "candidate_slopes",
+        }
+    )  # fmt: skip
+    """Settings in weights written before 2026-11-29, which are left out."""
 
     RENAMED: ClassVar[dict[str, str]] = {"min_hold": "min_observability"}
     """Names in weights written before 2026-11-28, and those of today."""
 
-    min_agreement: Annotated[float, "[0, 1]"] = 0.8
-    """Of the posed surface that the camera saw, so much must lie where it saw something: an edge
-    of a real sensor takes a tenth, other objects leave a fifth and more."""
-
-    max_beyond: Annotated[float, "[0, 1]"] = 0.03
-    """Of the object's readings so many may lie beside the posed silhouette, its border apart."""
-
-    min_found: Annotated[float, "[0, 1]"] = 0.65
-    """So likely must the right pose be among those that were found."""
+    min_probability: Annotated[float, "[0, 1]"] = 0.5
+    """The best pose must be right with this probability, by what contradicts it in the image."""
 
     max_size_error: Annotated[float, "(0, 1]"] = 0.03
     """The size of the model that fits best may differ from 1 by so much beyond what the sensor
     explains; 1: neither size nor mirror image is tested. Without ICP they are not."""
 
-    candidate_slopes: dict[str, float] = field(default_factory=lambda: dict(_CANDIDATE_SLOPES))
-    """Weight of each signal's logarithm as evidence against a pose among several that fit."""
-
     min_observability: Annotated[float, "[0, 1)"] = 0.02
-    """A motion that no symmetry allows must move the seen surface along its normals by this
+    """A motion that no symmetry allows must move the visible surface along its normals by this
     share of what it moves the object's points; one that moves it within itself (of a plane or
     ball) is not observable."""
 
@@ -191,11 +172,11 @@ class EstimateConfig(Settings):
 
     min_certainty: Annotated[float, "[0, 1]"] = 0.9
     """Below this certainty the status is ``ambiguous``, not ``ok``; pose and alternatives are given
-    all the same. 0: the likeliest pose is always the answer."""
+    all the same. 0: the likeliest pose is always ``ok``."""
 
-    up_to_symmetry: bool = False
-    """Whether copies of the object that look nearly alike count as one answer: its certainty is
-    then of them all, and they are not named as alternatives."""
+    object_deviation_m: Annotated[float, "[0, 1]"] = 0.001
+    """Standard deviation of the real surface from the model: some tenths of a millimetre for a
+    machined part, a millimetre or more for a scan, a casting or a carton."""
 
     register_refused: bool = False
     """Whether what a network doubts is registered by its model alone: tenths of a second for each,

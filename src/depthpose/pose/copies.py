@@ -17,9 +17,9 @@ from depthpose.pose.mesh import (
     symmetry_transforms,
     true_symmetries,
 )
+from depthpose.pose.propose.point_pairs import PairTable, find_turns
 from depthpose.pose.surface import Surface
 from depthpose.pose.types import ObjectModel
-from depthpose.pose.voting.point_pairs import PairTable, find_turns
 
 SAME_DIAMETERS = 0.1  #: mean distance of the model's points up to which two poses are one
 SAME_RAD = math.radians(8)  #: and angle; both must hold

@@ -11,15 +11,23 @@ much of a small object and little of a large one.
 """
 
 import math
+import time
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import Any
 
 import torch
 from jaxtyping import Float, Float64
 from torch import Tensor
 
 from depthpose.core.rigid import Rigid
-from depthpose.pose.types import Evidence
+from depthpose.pose.cloud import ObjectCloud, Refusal
+from depthpose.pose.config import EstimateConfig, RefusalConfig
+from depthpose.pose.copies import PreparedObject, difference_of, with_copies
+from depthpose.pose.evidence import Observation
+from depthpose.pose.identity import identify
+from depthpose.pose.observability import free_motions, observability, without_motions
+from depthpose.pose.types import Alternative, AnyInput, Evidence, PoseEstimate, Vote
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -44,12 +52,15 @@ RIGHT_UNOBSERVED = Rate(mean=0.2, shape=1.0)
 WRONG_UNOBSERVED = Rate(mean=0.5, shape=3.0)
 PRIOR_MASKED = 20.0
 """Odds of the best pose being right before its evidence is seen, where a mask shows the object."""
+PRIOR_PROPOSED = 1.0
+"""The same where a search proposed the pose: most places that votes point at show no object."""
 INDEPENDENT_SIDES = 6.0
 """A real object deviates from its model by whole sides, of which a body has about six: its residual
 is that of so few independent observations, however many readings there are."""
 VOTES_RAD = 0.15
 """Mean angle between a network's directions and those to the keypoints at a right pose."""
 LEAST_AREA = 1.0  # independent patches
+LEAST_NAMED = 0.01  #: alternatives of a smaller probability are not named
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -72,6 +83,28 @@ class Hypothesis:
     votes_rad: float | None = None
 
 
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Competition:
+    """Poses that compete for one object, and how they share the probability of one.
+
+    Attributes:
+        best: the likeliest pose.
+        best_share: its share.
+        copies: near-symmetric copies of it, with their shares.
+        others: other poses, with theirs.
+    """
+
+    best: Hypothesis
+    best_share: float
+    copies: list[tuple[Hypothesis, float]]
+    others: list[tuple[Hypothesis, float]]
+
+    @property
+    def group_share(self) -> float:
+        """Share of the best pose and its near-symmetric copies together."""
+        return self.best_share + sum(share for _, share in self.copies)
+
+
 def share_among_poses(hypotheses: Sequence[Hypothesis]) -> Float64[Tensor, " n"]:
     """Share the probability of one among different poses of an object.
 
@@ -80,7 +113,8 @@ def share_among_poses(hypotheses: Sequence[Hypothesis]) -> Float64[Tensor, " n"]
     """
     area = _common_area(hypotheses)
     weights = [
-        _log_odds(hypothesis.evidence, area) + _log_weight(hypothesis) for hypothesis in hypotheses
+        log_odds_right(hypothesis.evidence, area) + _log_weight(hypothesis)
+        for hypothesis in hypotheses
     ]
     return torch.tensor(weights, dtype=torch.float64).softmax(0)
 
@@ -103,7 +137,7 @@ def share_among_copies(hypotheses: Sequence[Hypothesis]) -> Float64[Tensor, " n"
 
 def probability_right(evidence: Evidence, prior_odds: float) -> float:
     """Probability that a pose is right, up to near-symmetry, and not the best of wrong ones."""
-    log_odds = math.log(prior_odds) + _log_odds(evidence, max(LEAST_AREA, evidence.visible))
+    log_odds = math.log(prior_odds) + log_odds_right(evidence)
     return 1 / (1 + math.exp(-min(log_odds, 50.0)))
 
 
@@ -112,8 +146,14 @@ def _common_area(hypotheses: Sequence[Hypothesis]) -> float:
     return max(LEAST_AREA, *(hypothesis.evidence.visible for hypothesis in hypotheses))
 
 
-def _log_odds(evidence: Evidence, area: float) -> float:
-    """Log likelihood ratio of a right and a wrong pose, by what is contradicted and unobserved."""
+def log_odds_right(evidence: Evidence, area: float | None = None) -> float:
+    """Log likelihood ratio of a right and a wrong pose, by what is contradicted and unobserved.
+
+    Args:
+        evidence: of the pose.
+        area: visible of the model, where several poses are compared; None: that of the evidence.
+    """
+    area = max(LEAST_AREA, evidence.visible if area is None else area)
     log_odds = RIGHT_CONTRADICTED.log_likelihood(evidence.contradicted, area)
     log_odds -= WRONG_CONTRADICTED.log_likelihood(evidence.contradicted, area)
     log_odds += RIGHT_UNOBSERVED.log_likelihood(evidence.unobserved, area)
@@ -128,3 +168,152 @@ def _log_weight(hypothesis: Hypothesis) -> float:
     if hypothesis.votes_rad is not None:
         log_weight -= hypothesis.votes_rad / VOTES_RAD
     return log_weight
+
+
+def decide(
+    cloud: ObjectCloud,
+    prepared: PreparedObject,
+    competition: Competition,
+    observation: Observation,
+    refusal: RefusalConfig,
+    config: EstimateConfig,
+    seconds: dict[str, float],
+    prior_odds: float,
+    vote: Vote | None = None,
+) -> PoseEstimate:
+    """Give the likeliest of competing poses as the estimate, or say why it is withheld.
+
+    Args:
+        cloud: points of the object.
+        prepared: the object.
+        competition: of its poses.
+        observation: that they were compared with.
+        refusal: limits.
+        config: settings of the estimate.
+        seconds: spent in the stages before.
+        prior_odds: of the best pose being right, before its evidence is seen.
+        vote: of a network.
+    """
+    began = time.perf_counter()
+    surface, model = prepared.surface, prepared.model
+    best = competition.best
+    evidence = best.evidence
+    probability = probability_right(evidence, prior_odds)
+
+    # Does the view determine a pose, and is it of this object?
+    free = free_motions(model.symmetries.continuous, best.pose)
+    observable, weakest = observability(cloud.cloud_m, best.pose, surface, free)
+    identity = None
+    reason = None
+    if observable < refusal.min_observability:
+        motion = "rotation" if float(weakest[:3].norm()) > math.sqrt(0.5) else "shift"
+        reason = Refusal(
+            status="not observable",
+            reason=f"the visible part of the object leaves one {motion} undetermined: it moves the "
+            f"surface along its normals by {observable:.1%} of the motion only; no declared "
+            "symmetry allows it. Declare the symmetry, or look from a side that shows more",
+        )
+    elif probability < refusal.min_probability:
+        reason = Refusal(status="doubtful", reason=_contradiction(evidence, probability))
+    elif config.with_icp and refusal.max_size_error < 1:
+        identity = identify(
+            cloud.cloud_m,
+            best.pose,
+            model.name,
+            surface,
+            with_copies(prepared).mirror,
+            evidence,
+            observation.step * float(observation.K[0, 0]),
+            refusal.max_size_error,
+        )
+        if identity.status == "contradicted":
+            reason = Refusal(status="doubtful", reason=identity.reason)
+    facts: dict[str, Any] = {
+        "name": cloud.name,
+        "object": model.name,
+        "keypoints_m": None if vote is None else vote.keypoints_m.float(),
+        "inlier_share": None if vote is None else float(vote.inlier_share.mean()),
+        "residual_m": best.residual_m,
+        "evidence": evidence,
+        "identity": identity,
+        "seconds": {**seconds, "decision": time.perf_counter() - began},
+    }
+    if reason is not None:  # all but the pose, so that nobody takes it for an estimate
+        return PoseEstimate(status=reason.status, reason=reason.reason, **facts)
+
+    covariance = without_motions(best.covariance, free) if len(free) else best.covariance
+    competitors = [(h, share, True) for h, share in competition.copies]
+    competitors += [(h, share, False) for h, share in competition.others]
+    competitors.sort(key=lambda competitor: -competitor[1])
+    alternatives = tuple(
+        Alternative(
+            camera_from_model=hypothesis.pose.float(),
+            probability=probability * share,
+            difference=difference_of(hypothesis.pose, best.pose, with_copies(prepared)),
+            is_copy=is_copy,
+        )
+        for hypothesis, share, is_copy in competitors
+        if probability * share >= LEAST_NAMED
+    )
+    estimate = PoseEstimate(
+        status="ok",
+        camera_from_model=best.pose.float(),  # computed in double precision
+        covariance=covariance.float(),
+        free_motions=free.float(),
+        certainty=probability * competition.group_share,
+        copy_certainty=probability * competition.best_share,
+        alternatives=alternatives,
+        **facts,
+    )
+    return with_status(estimate, config.min_certainty)
+
+
+def _contradiction(evidence: Evidence, probability: float) -> str:
+    """Say what contradicts a pose most."""
+    compared = max(evidence.supported + evidence.contradicted, 1e-9)
+    visible = max(evidence.visible, 1e-9)
+    parts = {
+        f"the camera saw through {evidence.seen_through / visible:.0%} of the posed surface": (
+            evidence.seen_through
+        ),
+        f"{evidence.bulging / compared:.0%} of its readings lie before the posed surface": (
+            evidence.bulging
+        ),
+        f"{evidence.beside / compared:.0%} of the object's readings lie beside the posed "
+        "silhouette": evidence.beside,
+        f"{evidence.unobserved / visible:.0%} of the posed surface was not observed": (
+            evidence.unobserved / 2
+        ),
+    }
+    worst = max(parts, key=lambda words: parts[words])
+    return (
+        f"the best pose is right with a probability of {probability:.0%}: {worst}. Another object, "
+        "a mask of more than the object, or too little of it"
+    )
+
+
+def with_status(estimate: PoseEstimate, min_certainty: float) -> PoseEstimate:
+    """Set the status by the certainty: ``ambiguous`` below the limit, else ``ok``."""
+    certainty = estimate.certainty
+    if certainty is None:  # refused, or not compared
+        return estimate
+    if certainty >= min_certainty:
+        return replace(estimate, status="ok", reason="")
+    others = sum(not alternative.is_copy for alternative in estimate.alternatives)
+    reason = (
+        f"this pose has a certainty of {100 * certainty:.3g} %, below min_certainty "
+        f"{100 * min_certainty:.3g} %: "
+        + (f"{others} others fit too" if others else "others may fit")
+    )
+    return replace(estimate, status="ambiguous", reason=reason)
+
+
+def refused(given: AnyInput, refusal: Refusal, seconds: dict[str, float]) -> PoseEstimate:
+    """Give the estimate of an input without a pose."""
+    return PoseEstimate(
+        name=given.name,
+        object=given.object,
+        status=refusal.status,
+        reason=refusal.reason,
+        seconds=seconds,
+    )

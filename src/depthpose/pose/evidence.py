@@ -236,7 +236,7 @@ def compare(observation: Observation, pose: Rigid, surface: Surface) -> Evidence
     bulging = _patch_area((deviations < -THRESHOLD) & is_object, patch_px)
     is_beside = observation.is_object & np.isfinite(observation.depth_m)
     border = max(1, round((BORDER_PX + 1) / step))
-    is_beside[window] &= ~ndimage.binary_dilation(is_drawn, iterations=border)
+    is_beside[window] &= np.logical_not(ndimage.binary_dilation(is_drawn, iterations=border))
     visible = float(inner.sum()) / patch_px
     supported = float(is_supported.sum()) / patch_px
     square = deviations[is_supported] ** 2
@@ -272,8 +272,6 @@ def _without_edges(
 
 def _patch_area(mask: Bool[np.ndarray, "h w"], patch_px: float) -> float:
     """Area of the connected patches in a mask that are no accident, in independent patches."""
-    labels, count = ndimage.label(mask)
-    if count == 0:
-        return 0.0
+    labels = np.asarray(ndimage.label(mask)[0])
     areas_px = np.bincount(labels.ravel())[1:]
     return float(areas_px[areas_px >= _LEAST_PATCH * patch_px].sum()) / patch_px

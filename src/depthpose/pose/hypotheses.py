@@ -1,9 +1,8 @@
 """Competing poses of one object: refined, distinct, each with its evidence."""
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable
+from dataclasses import replace
 
-import torch
 from jaxtyping import Float64
 from torch import Tensor
 
@@ -11,9 +10,9 @@ from depthpose.core.arrays import take_evenly
 from depthpose.core.rigid import Rigid
 from depthpose.pose.config import IcpConfig
 from depthpose.pose.copies import PreparedObject, with_copies
-from depthpose.pose.decide import Hypothesis, share_among_copies, share_among_poses
+from depthpose.pose.decide import Competition, Hypothesis, share_among_copies, share_among_poses
 from depthpose.pose.evidence import Observation, compare
-from depthpose.pose.refine import RefinedPose, refine_pose, refine_roughly
+from depthpose.pose.icp import RefinedPose, refine_pose, refine_roughly
 from depthpose.pose.surface import NEAR, Surface
 
 _POINTS = 250  # of the cloud that refine a competing pose
@@ -25,32 +24,13 @@ _MOST_LEADING = 8  #: poses that are compared, and of one of them so many copies
 _MOST_COPIES = 24
 
 
-@dataclass(frozen=True, kw_only=True)
-class Competition:
-    """Poses that compete for one object, and their probabilities.
-
-    Attributes:
-        best: the likeliest pose.
-        share: of the probability that it or one of its near-symmetric copies has.
-        copies: near-symmetric copies of it, with their shares of the whole.
-        others: other poses, with theirs.
-        best_share: share of the best itself.
-    """
-
-    best: Hypothesis
-    share: float
-    best_share: float
-    copies: list[tuple[Hypothesis, float]]
-    others: list[tuple[Hypothesis, float]]
-
-
 def compete(
     cloud_m: Float64[Tensor, "n 3"],
     refined: RefinedPose,
     others: Rigid,
     prepared: PreparedObject,
     observation: Observation,
-    icp: IcpConfig,
+    icp: IcpConfig | None,
     votes_rad: Callable[[Rigid], float] | None = None,
 ) -> Competition:
     """Compare a refined pose with others, with its look-alikes and with its near-symmetric copies.
@@ -61,19 +41,18 @@ def compete(
         others: at which refinement ended elsewhere.
         prepared: the object.
         observation: of it.
-        icp: of the refinement.
+        icp: of the refinement; None: poses stay where they are.
         votes_rad: mean angle between a network's directions and those to the keypoints of a pose.
     """
     copies = with_copies(prepared)
     surface = prepared.surface
 
-    def hypothesis(pose: Rigid, source: RefinedPose, k: int | None) -> Hypothesis:
-        covariance = source.covariance if k is None else source.covariance[k]
-        residual = source.residual_m if k is None else source.residual_m[k]
+    def hypothesis(source: RefinedPose) -> Hypothesis:
+        pose = source.camera_from_model.double()
         return Hypothesis(
             pose=pose,
-            covariance=covariance,
-            residual_m=float(residual),
+            covariance=source.covariance,
+            residual_m=float(source.residual_m),
             evidence=compare(observation, pose, surface),
             votes_rad=None if votes_rad is None else votes_rad(pose),
         )
@@ -81,64 +60,70 @@ def compete(
     # Which pose is it, up to near-symmetric copies?
     first = refined.camera_from_model.double()
     starts = Rigid.cat([others.double(), first @ copies.lookalikes])
-    tried = _refined(cloud_m, first, starts, surface, icp, _MOST_LEADING)
     alike = Rigid.cat([copies.symmetries, copies.copies])
-    leading = [hypothesis(first, refined, None)]
-    for k in range(0 if tried is None else len(tried.camera_from_model.R)):
-        pose = tried.camera_from_model[k]
+    leading = [hypothesis(refined)]
+    for candidate in _refined(cloud_m, refined, starts, surface, icp, _MOST_LEADING):
         before = Rigid.stack([h.pose for h in leading])
-        if not bool(copies.is_same(pose, before, alike).any()):
-            leading.append(hypothesis(pose, tried, k))
+        if not bool(copies.is_same(candidate.camera_from_model, before, alike).any()):
+            leading.append(hypothesis(candidate))
     shares = share_among_poses(leading)
     winner = int(shares.argmax())
-    rest = [(h, float(shares[k])) for k, h in enumerate(leading) if k != winner]
+    others_shares = [(h, float(shares[k])) for k, h in enumerate(leading) if k != winner]
 
     # And which of its copies?
     pose = leading[winner].pose
+    source = replace(refined, camera_from_model=pose, covariance=leading[winner].covariance)
     group = [leading[winner]]
-    tried = _refined(cloud_m, pose, pose @ copies.copies, surface, icp, _MOST_COPIES)
-    for k in range(0 if tried is None else len(tried.camera_from_model.R)):
-        copy = tried.camera_from_model[k]
+    for candidate in _refined(cloud_m, source, pose @ copies.copies, surface, icp, _MOST_COPIES):
         before = Rigid.stack([h.pose for h in group])
-        if not bool(copies.is_same(copy, before, copies.symmetries).any()):
-            group.append(hypothesis(copy, tried, k))
-    share = float(shares[winner])
-    copy_shares = share * share_among_copies(group)
+        if not bool(copies.is_same(candidate.camera_from_model, before, copies.symmetries).any()):
+            group.append(hypothesis(candidate))
+    copy_shares = float(shares[winner]) * share_among_copies(group)
     best = int(copy_shares.argmax())
     return Competition(
         best=group[best],
-        share=share,
         best_share=float(copy_shares[best]),
         copies=[(h, float(copy_shares[k])) for k, h in enumerate(group) if k != best],
-        others=rest,
+        others=others_shares,
     )
 
 
 def _refined(
     cloud_m: Float64[Tensor, "n 3"],
-    leading: Rigid,
+    leading: RefinedPose,
     starts: Rigid,
     surface: Surface,
-    icp: IcpConfig,
+    icp: IcpConfig | None,
     most: int,
-) -> RefinedPose | None:
+) -> list[RefinedPose]:
     """Refine competing poses, but for those that explain much less than the leading one."""
+    if icp is None:
+        return [replace(leading, camera_from_model=starts[k]) for k in range(len(starts.R))]
     if len(starts.R) == 0:
-        return None
+        return []
     rough = refine_roughly(cloud_m, starts, surface, icp)
-    every = Rigid.cat([leading[None], rough])
+    every = Rigid.cat([leading.camera_from_model.double()[None], rough])
     unexplained = _unexplained(cloud_m, every, surface)
     order = unexplained[1:].argsort(stable=True)[:most]
     order = order[unexplained[1:][order] <= unexplained[0] + _UNEXPLAINED_MORE]
     if len(order) == 0:
-        return None
+        return []
     short = replace(
         icp,
         iterations=_STEPS,
         cloud_points=min(_POINTS, icp.cloud_points),
         start_distance_diameters=icp.end_distance_diameters,
     )
-    return refine_pose(cloud_m, rough[order], surface, short)
+    batch = refine_pose(cloud_m, rough[order], surface, short)
+    return [
+        RefinedPose(
+            camera_from_model=batch.camera_from_model[k],
+            covariance=batch.covariance[k],
+            residual_m=batch.residual_m[k],
+            inlier_share=batch.inlier_share[k],
+        )
+        for k in range(len(order))
+    ]
 
 
 def _unexplained(

@@ -26,7 +26,7 @@ from depthpose.pose.datasets.layouts import MOST, integer, make_pose, number, re
 from depthpose.pose.types import (
     POSED,
     Alternative,
-    Fit,
+    Evidence,
     Identity,
     PoseEstimate,
     Status,
@@ -35,7 +35,7 @@ from depthpose.pose.types import (
 )
 
 POSES = "poses.json"
-VERSION = 1  #: of an entry of ``poses.json``; ``docs/poses.schema.json`` describes it
+VERSION = 2  #: of an entry of ``poses.json``; ``docs/poses.schema.json`` describes it
 PICTURE, CLOUD = "pose.png", "pose.ply"  #: what follows ``NAME.`` in files that show a pose
 STAGES = ("segmentation", "cloud", "network", "voting", "svd", "icp", "check", "registration")
 """What an estimate's ``seconds`` are of, in order; a stage that was not run is missing."""
@@ -67,7 +67,7 @@ class Predictions(list[Prediction]):
     def to_frame(self) -> Any:  # noqa: ANN401  pandas is no dependency
         """Give a ``pandas.DataFrame``: a row an estimate, the columns those of ``poses.json``.
 
-        What has names itself is a column each, such as ``fit.agrees`` and ``seconds.icp``.
+        What has names itself is a column each, such as ``evidence.supported`` and ``seconds.icp``.
 
         Raises:
             ImportError: pandas is not installed.
@@ -154,10 +154,10 @@ def prediction_row(prediction: Prediction) -> dict[str, Any]:
         values = None if pose is None else getattr(estimate, name)
         known = [] if values is None else values.tolist()
         row[name] = [v if math.isfinite(v) else None for v in known] or None
-    for name in ("inlier_share", "residual_m", "certainty"):
+    for name in ("inlier_share", "residual_m", "certainty", "copy_certainty"):
         value: float | None = getattr(estimate, name)
         row[name] = value if value is not None and math.isfinite(value) else None
-    for name in ("fit", "identity"):
+    for name in ("evidence", "identity"):
         answer = getattr(estimate, name)
         row[name] = None if answer is None else asdict(answer)
     row["alternatives"] = [
@@ -165,12 +165,13 @@ def prediction_row(prediction: Prediction) -> dict[str, Any]:
             "camera_from_model": other.camera_from_model.matrix().tolist(),
             "probability": other.probability,
             "difference": other.difference,
+            "is_copy": other.is_copy,
         }
         for other in estimate.alternatives
     ]
     if estimate.tracking is not None:
         row["tracking"] = estimate.tracking
-    return row | {"signals": dict(estimate.signals), "seconds": dict(estimate.seconds)}
+    return row | {"seconds": dict(estimate.seconds)}
 
 
 def parse_prediction(row: dict[str, Any], source: str) -> Prediction:
@@ -211,21 +212,25 @@ def parse_prediction(row: dict[str, Any], source: str) -> Prediction:
         probability = number(entry, "probability", None, where)
         words = str(entry.get("difference", ""))
         alternatives.append(
-            Alternative(camera_from_model=other, probability=probability, difference=words)
+            Alternative(
+                camera_from_model=other,
+                probability=probability,
+                difference=words,
+                is_copy=bool(entry.get("is_copy", False)),
+            )
         )
     values: dict[str, Any] = {
         "keypoints_m": _table(row, "keypoints_m", 3, source),
         "covariance": _table(row, "covariance", 6, source, rows=6),
         "free_motions": _table(row, "free_motions", 6, source),
     }
-    for key in ("inlier_share", "residual_m", "certainty"):
+    for key in ("inlier_share", "residual_m", "certainty", "copy_certainty"):
         values[key] = None if row.get(key) is None else number(row, key, None, source)
-    for key in ("signals", "seconds"):
-        found = row.get(key, {})
-        if not isinstance(found, dict):
-            raise InputError(f"{source}: {key} is {found!r}, where names to numbers belong")
-        values[key] = {str(k): number(found, k, None, source) for k in found}
-    for key, kind in (("fit", Fit), ("identity", Identity)):
+    seconds = row.get("seconds", {})
+    if not isinstance(seconds, dict):
+        raise InputError(f"{source}: seconds is {seconds!r}, where names to numbers belong")
+    values["seconds"] = {str(stage): number(seconds, stage, None, source) for stage in seconds}
+    for key, kind in (("evidence", Evidence), ("identity", Identity)):
         found, where = row.get(key), f"{source}: {key}"
         if found is not None and not isinstance(found, dict):
             raise InputError(f"{where} is {found!r}, where names to values belong")

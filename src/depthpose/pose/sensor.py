@@ -13,8 +13,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from depthpose.core.config import Settings
-
 LAG_PX = 3
 """Noise is measured between readings so far apart: direct neighbours of a real sensor err alike."""
 SHARED_PER_WHITE = 2.5

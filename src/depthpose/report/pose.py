@@ -15,7 +15,7 @@ from depthpose.core.render import rasterize
 from depthpose.core.rigid import Rigid
 from depthpose.pose.cloud import cloud_from_depth, is_reading
 from depthpose.pose.datasets import Instance
-from depthpose.pose.estimator.inputs import AnyInput
+from depthpose.pose.inputs import AnyInput
 from depthpose.pose.mesh import drawn_triangles, sample_surface
 from depthpose.pose.types import CloudInput, ObjectModel, PoseEstimate, ViewInput
 from depthpose.report.page import (
@@ -270,11 +270,11 @@ def pose_facts(
     facts = [("object", f"{estimate.object}, {model.diameter_m:.4f} m long")]
     if how:
         facts.append(("by", how))
-    if estimate.fit is not None:
+    if (evidence := estimate.evidence) is not None:
         facts += [
-            ("fits", f"{estimate.fit.agrees:.1%} of the posed surface that was seen agrees"),
-            ("seen", f"{estimate.fit.seen:.0%} of the surface that faces the camera"),
-            ("the sensor's noise there", f"{1000 * estimate.fit.noise_m:.1f} mm"),
+            ("agreement", f"{evidence.agreement:.1%} of what was compared supports the pose"),
+            ("observed", f"{evidence.observed:.0%} of the surface that faces the camera"),
+            ("noise of the sensor there", f"{1000 * evidence.noise_m:.1f} mm"),
         ]
     if estimate.identity is not None:
         identity = estimate.identity
@@ -283,7 +283,9 @@ def pose_facts(
             said += f"; size {identity.size:.3f} +- {identity.size_deviation:.3f} of the model's"
         facts.append(("identity", said))
     if estimate.certainty is not None:
-        facts.append(("certainty of this pose", f"{estimate.certainty:.3f}"))
+        facts.append(("certainty, up to near-symmetry", f"{estimate.certainty:.3f}"))
+    if estimate.copy_certainty is not None:
+        facts.append(("certainty of this very copy", f"{estimate.copy_certainty:.3f}"))
     facts += [("another pose that fits", str(other)) for other in estimate.alternatives]
     if estimate.inlier_share is not None:
         facts.append((agreeing, f"{estimate.inlier_share:.0%}"))

@@ -16,9 +16,9 @@ from depthpose.core.arrays import take_evenly
 from depthpose.core.errors import InputError
 from depthpose.core.files.images import picture_tensor
 from depthpose.pose.cloud import Refusal, prepare_cloud
-from depthpose.pose.estimator import GeoPoseNet
 from depthpose.pose.mesh import sample_surface
 from depthpose.pose.network import ResUNet
+from depthpose.pose.network_pose import GeoPoseNet
 from depthpose.pose.sparse import Voxels
 from depthpose.pose.types import AnyInput, ObjectModel
 

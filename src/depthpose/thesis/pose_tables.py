@@ -18,12 +18,12 @@ from depthpose.core.errors import InputError
 from depthpose.core.rigid import Rigid
 from depthpose.pose.cloud import cloud_from_depth, refusal_of, sample_points, voxelise
 from depthpose.pose.config import VotingConfig
-from depthpose.pose.estimator import GeoPoseNet
 from depthpose.pose.evaluate import ObjectRow
 from depthpose.pose.metrics import SUCCESS_SHARE, add_m, adds_m
 from depthpose.pose.network import ResUNet
+from depthpose.pose.network_pose import GeoPoseNet
+from depthpose.pose.propose import fit_pose, meet_lines, vote_ransac
 from depthpose.pose.types import ObjectModel, SeenPoints, ViewSample
-from depthpose.pose.voting import fit_pose, meet_lines, vote_ransac
 
 TITLES = {
     "3.1": "Table 3.1: comparison with baselines on LineMOD, ADD(-S)",

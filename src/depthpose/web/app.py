@@ -35,7 +35,7 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 from depthpose import __version__
 from depthpose.core.errors import InputError, MissingExtraError
 from depthpose.depth.estimator import FakestereoNet
-from depthpose.pose.estimator import GeoPoseNet
+from depthpose.pose.network_pose import GeoPoseNet
 from depthpose.report.page import page_file
 from depthpose.web.answer import KINDS, Answer, Form, keep_file, without_paths
 from depthpose.web.depth import answer_depth, depth_example

@@ -12,11 +12,12 @@ from depthpose.core.units import METRES, Unit
 from depthpose.pose import mesh
 from depthpose.pose.config import EstimateConfig, ObjectsConfig
 from depthpose.pose.datasets.dataset import write_mask
-from depthpose.pose.estimator import GeoPoseNet, Registration
-from depthpose.pose.estimator.find import explained_mask, nothing_found
-from depthpose.pose.estimator.fit import with_status
-from depthpose.pose.estimator.inputs import cloud_input, view_input
+from depthpose.pose.decide import with_status
+from depthpose.pose.inputs import cloud_input, view_input
+from depthpose.pose.network_pose import GeoPoseNet
 from depthpose.pose.predictions import CLOUD, PICTURE, Prediction, write_predictions
+from depthpose.pose.registration import Registration
+from depthpose.pose.search import explained_mask, nothing_found
 from depthpose.pose.surface import prepare_surface
 from depthpose.pose.synthetic import make_frames
 from depthpose.pose.types import CloudInput, ObjectModel, PoseEstimate, ViewInput

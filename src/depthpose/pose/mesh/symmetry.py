@@ -445,7 +445,10 @@ def _search(model: ObjectModel) -> dict[str, Any]:
     # Which discrete symmetries, and which axes, have copies that lie on the surface.
     given, circle = model.symmetries, torch.arange(1, 8, dtype=torch.float64) * (math.pi / 4)
     turns = [_turns(axis.direction.double(), circle) for axis in given.continuous]
-    axes, discrete = [float(surface.deviation(R, share=ALMOST_ALL).max()) <= ALIKE for R in turns], list[bool]()
+    axes, discrete = (
+        [float(surface.deviation(R, share=ALMOST_ALL).max()) <= ALIKE for R in turns],
+        list[bool](),
+    )
     if given.discrete is not None:
         R = given.discrete.R.double()
         discrete = (surface.deviation(R, share=ALMOST_ALL) <= ALIKE).tolist()

@@ -18,7 +18,6 @@ from depthpose.pose.cloud import lift_sample, refusal_of, sample_points, voxelis
 from depthpose.pose.config import CloudConfig, ObjectsConfig
 from depthpose.pose.datasets import open_bop
 from depthpose.pose.datasets.layouts import read_bop_models, read_models_info
-from depthpose.pose.estimator import DepthImageRegressor, GeoPoseNet
 from depthpose.pose.mesh import (
     read_model,
     refuse_one_name,
@@ -27,6 +26,7 @@ from depthpose.pose.mesh import (
     with_found_symmetries,
 )
 from depthpose.pose.metrics import SUCCESS_SHARE, add_of_nearest_m
+from depthpose.pose.network_pose import DepthImageRegressor, GeoPoseNet
 from depthpose.pose.synthetic import Objects, make_part
 from depthpose.pose.train.config import HeldOutConfig, ModelsConfig, PoseTraining, ViewsTraining
 from depthpose.pose.types import (

@@ -40,10 +40,11 @@ from depthpose.pose.baselines import (
 )
 from depthpose.pose.cloud import lift_sample, refusal_of
 from depthpose.pose.config import SHAPE_FEATURES, RefusalConfig
-from depthpose.pose.estimator.candidates import near_symmetry_lines
+from depthpose.pose.copies import near_symmetry_lines
 from depthpose.pose.losses import direction_loss, model_point_loss
 from depthpose.pose.mesh import sample_surface, symmetry_transforms
 from depthpose.pose.network import ResUNet, fold_norms, unfold_norms
+from depthpose.pose.propose import fit_pose, vote_ransac
 from depthpose.pose.sparse import Voxels
 from depthpose.pose.train.clouds import (
     HELD_OUT_SEED,
@@ -60,7 +61,6 @@ from depthpose.pose.train.clouds import (
 )
 from depthpose.pose.train.config import DepthImageTraining, PoseTraining, ViewsTraining
 from depthpose.pose.types import ObjectModel, ViewSample
-from depthpose.pose.voting import fit_pose, vote_ransac
 from depthpose.pose.weights import (
     AnyNetwork,
     DirectionNet,

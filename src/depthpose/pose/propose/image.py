@@ -11,8 +11,8 @@ from torch.nn.functional import normalize
 from depthpose.core.camera import project
 from depthpose.core.rigid import Rigid, perturb
 from depthpose.pose.frame import Frame
+from depthpose.pose.propose.point_pairs import STEP, PairTable, vote_poses
 from depthpose.pose.surface import BESIDE, NEAR, Surface
-from depthpose.pose.voting.point_pairs import STEP, PairTable, vote_poses
 
 _NOISE_PER_M = 0.0015
 """Standard deviation of a depth sensor's readings, for the square of the depth in metres (Nguyen et
@@ -32,9 +32,6 @@ _TURNED = 0.7
 """Cosine of the angle between the normals of the image and of the posed surface, at least."""
 _HELD = 0.02
 """Damping of ICP: a motion that moves the readings across the surface by less is hardly taken."""
-_ASIDE = 0.2
-"""A pose is compared with those moved across the view by so much of the diameter: where a wall or
-noise agrees with it, it agrees as well with these."""
 
 
 Points = Float64[Tensor, "b n 3"]
@@ -91,13 +88,10 @@ def propose_in_frame(
         agreement = compare_with_image(frame, poses, surface, stage).agreement
         poses = poses[_distinct(poses, agreement, surface, stage.kept)]
     poses = _projected(frame, poses, surface, _STAGES[-1])
-    seen = compare_with_image(frame, poses, surface)
-    best = _distinct(poses, seen.agreement, surface, _STAGES[-1].kept)
-    best = best[seen.agreement[best] >= _LEAST_AGREEMENT]
-    # Logistic regression on 18,000 such poses of synthetic frames: not refined yet.
-    log_odds = 4.1 - 1.5 * seen.agreement + 7.9 * seen.continued - 3.0 * seen.parted
-    log_odds += 5.2 * seen.contradicted
-    return poses[best], log_odds[best]
+    agreement = compare_with_image(frame, poses, surface).agreement
+    best = _distinct(poses, agreement, surface, _STAGES[-1].kept)
+    best = best[agreement[best] >= _LEAST_AGREEMENT]
+    return poses[best], agreement[best]
 
 
 def _scene_points(
@@ -220,27 +214,6 @@ def compare_with_image(
         parted=is_parted.sum(1) / beside,
         contradicted=contradicted.sum(1) / read,
     )
-
-
-def log_odds_wrong(frame: Frame, poses: Rigid, surface: Surface) -> Float64[Tensor, " b"]:
-    """Give the log odds of poses' being wrong, by the image alone.
-
-    What counts is how well the image agrees with poses beside it, as a wall does, what contradicts
-    it, and whether its silhouette is one: logistic regression on 1,800 judged poses of synthetic
-    frames, to which :mod:`depthpose.pose.estimator.find` adds what is known after refinement.
-
-    Args:
-        frame: the image.
-        poses: of the model, refined.
-        surface: of the model.
-    """
-    seen = compare_with_image(frame, poses, surface)
-    aside_m = _ASIDE * surface.diameter_m * torch.eye(3, dtype=torch.float64)[:2]
-    t_m = poses.t_m[:, None] + torch.cat([aside_m, -aside_m])
-    moved = Rigid(poses.R.repeat_interleave(4, 0), t_m.flatten(0, 1))
-    beside = compare_with_image(frame, moved, surface).agreement.reshape(-1, 4).amax(1)
-    log_odds = 2.1 * beside + 15.0 * seen.continued - 1.7 * seen.parted
-    return log_odds + 17.9 * seen.contradicted - 2.4
 
 
 def _posed(

@@ -15,6 +15,7 @@ from typing import NamedTuple, NoReturn
 import torch
 from jaxtyping import Float
 from torch import Tensor
+from torch.nn.functional import normalize
 
 from depthpose.core.checkpoint import find_weights, warn_of_terms
 from depthpose.core.devices import (
@@ -34,18 +35,14 @@ from depthpose.pose.cloud import (
     refusal_of,
 )
 from depthpose.pose.config import EstimateConfig
-from depthpose.pose.estimator.base import PoseEstimator, Registration, or_unreadable
-from depthpose.pose.estimator.candidates import (
-    Candidate,
-    KnownObject,
-    disagreement,
-    find_candidates,
-    surface_signals,
-    turn_best,
-    with_copies,
-)
-from depthpose.pose.estimator.fit import answer_of, fit_of, misfit_of, refused, seen_about
-from depthpose.pose.refine import refine_best
+from depthpose.pose.copies import PreparedObject, with_copies
+from depthpose.pose.decide import PRIOR_MASKED, PRIOR_PROPOSED, decide, refused
+from depthpose.pose.estimator import PoseEstimator, or_unreadable
+from depthpose.pose.evidence import observe
+from depthpose.pose.hypotheses import compete
+from depthpose.pose.icp import RefinedPose, refine_best
+from depthpose.pose.propose import fits_of, meet_lines, vote_ransac
+from depthpose.pose.registration import Registration
 from depthpose.pose.types import (
     AnyInput,
     CloudInput,
@@ -54,11 +51,11 @@ from depthpose.pose.types import (
     Status,
     ViewInput,
 )
-from depthpose.pose.voting import fits_of, meet_lines, vote_ransac
 from depthpose.pose.weights import PoseWeights, read_pose_weights
 
 _DOUBTED: tuple[Status, ...] = ("votes do not meet", "keypoints do not fit", "doubtful")
 """What the network could not answer, and another method may; the rest is due to the input."""
+_COMPARED = 100  # points at which the best of symmetric copies is chosen
 _NEEDS_MASK = "a regressed depth image takes a depth image with a mask; give both, or other weights"
 
 
@@ -74,10 +71,10 @@ class CloudToPose:
     """An input on its way: its object, its cloud, the seconds, and what the network says of it."""
 
     given: AnyInput
-    known: KnownObject
+    prepared: PreparedObject
     cloud: ObjectCloud
     seconds: dict[str, float]
-    outputs: Float[Tensor, "n k 3"] = field(default_factory=lambda: torch.empty(0, 0, 3))
+    directions: Float[Tensor, "n k 3"] = field(default_factory=lambda: torch.empty(0, 0, 3))
 
 
 def _batches(
@@ -181,10 +178,10 @@ class GeoPoseNet(PoseEstimator):
             self._registration._objects = self._objects
         return self._registration
 
-    def _pose_near(
-        self, inputs: Sequence[CloudInput], poses: Sequence[Rigid]
+    def _estimate_near(
+        self, inputs: Sequence[CloudInput], proposals: Sequence[Rigid]
     ) -> list[PoseEstimate]:
-        return self._by_models()._pose_near(inputs, poses)
+        return self._by_models()._estimate_near(inputs, proposals)
 
     @torch.no_grad()
     @own_arithmetic()
@@ -205,18 +202,18 @@ class GeoPoseNet(PoseEstimator):
             if isinstance(one, PoseEstimate):
                 return one, None
             self._ask_network([one])
-            found = self._vote(given, one=one, is_likely=True)
-            return found, CloudDirections(one.cloud, one.outputs)
+            found = self._vote(given, job=one, is_likely=True)
+            return found, CloudDirections(one.cloud, one.directions)
 
     def _prepare(self, given: AnyInput) -> CloudToPose | PoseEstimate:
-        known = self._known(given.object)
-        with_copies(known, up_to_symmetry=self.config.up_to_symmetry)  # in the seconds of no input
+        prepared = self._known(given.object)
+        with_copies(prepared)  # in the seconds of no input
         start = time.perf_counter()
-        prepared = prepare_cloud(given, known.model, self.weights.cloud, self.config)
+        cloud = prepare_cloud(given, prepared.model, self.weights.cloud, self.config)
         seconds = {"cloud": time.perf_counter() - start}
-        if isinstance(prepared, Refusal):
-            return refused(given, prepared, seconds)
-        return CloudToPose(given=given, known=known, cloud=prepared, seconds=seconds)
+        if isinstance(cloud, Refusal):
+            return refused(given, cloud, seconds)
+        return CloudToPose(given=given, prepared=prepared, cloud=cloud, seconds=seconds)
 
     def _ask_network(
         self, group: list[CloudToPose | PoseEstimate]
@@ -228,7 +225,7 @@ class GeoPoseNet(PoseEstimator):
         start = time.perf_counter()
         counts = [len(one.cloud.points_m) for one in ready]
         cloud_of_point = torch.repeat_interleave(torch.arange(len(ready)), torch.tensor(counts))
-        numbers = torch.tensor([one.known.number for one in ready])
+        numbers = torch.tensor([one.prepared.number for one in ready])
         grids = [one.cloud.voxels for one in ready]
         coordinates = torch.cat([grid.coordinates for grid in grids])
         points_m = [one.cloud.points_m @ one.cloud.voxels.grid_from_camera.mT for one in ready]
@@ -241,7 +238,7 @@ class GeoPoseNet(PoseEstimator):
         )
         outputs = self._network.directions(seen).float().cpu().split(counts)
         for one, some in zip(ready, outputs, strict=True):
-            one.outputs = some @ one.cloud.voxels.grid_from_camera
+            one.directions = some @ one.cloud.voxels.grid_from_camera
         spent_s = time.perf_counter() - start
         for one, count in zip(ready, counts, strict=True):  # each has a share of the time
             one.seconds["network"] = spent_s * count / sum(counts)
@@ -251,7 +248,7 @@ class GeoPoseNet(PoseEstimator):
         """Pose a cloud by its votes, or by registration where these are doubted."""
         if isinstance(one, PoseEstimate):
             return one
-        found = or_unreadable(partial(self._vote, one=one, is_likely=is_likely), one.given)
+        found = or_unreadable(partial(self._vote, job=one, is_likely=is_likely), one.given)
         if not (self.config.register_refused and is_likely) or found.status not in _DOUBTED:
             return found
         start = time.perf_counter()
@@ -260,52 +257,72 @@ class GeoPoseNet(PoseEstimator):
         best = registered if registered.is_posed else found
         return replace(best, seconds={**found.seconds, "registration": spent_s})
 
-    def _vote(self, given: AnyInput, *, one: CloudToPose, is_likely: bool) -> PoseEstimate:
-        """Vote for the keypoints, fit the pose, refine and check it."""
-        known, config, began = one.known, self.config, time.perf_counter()
-        model, surface, cloud = known.model, known.surface, one.cloud
-        points, directions = cloud.points_m.double(), one.outputs.double()
+    def _vote(self, given: AnyInput, *, job: CloudToPose, is_likely: bool) -> PoseEstimate:
+        """Vote for the keypoints, fit the pose to them, refine it, and decide by the evidence."""
+        config, prepared, cloud = self.config, job.prepared, job.cloud
+        cloud_m = cloud.cloud_m.double()
+        seconds = dict(job.seconds)
+
+        # Propose: where the directions meet are the keypoints, to which the model's are fitted.
+        began = time.perf_counter()
+        points_m, directions = cloud.points_m.double(), job.directions.double()
         if config.voting.method == "ransac":
-            vote = vote_ransac(points, directions, config=config.voting)
+            vote = vote_ransac(points_m, directions, config=config.voting)
         else:
-            vote = meet_lines(points, directions, refinements=config.voting.refinements)
-        met = time.perf_counter()
-        seconds = {**one.seconds, "voting": met - began}
-        fits = fits_of(vote, model, config)
+            vote = meet_lines(points_m, directions, refinements=config.voting.refinements)
+        fits = fits_of(vote, prepared.model, config)
+        seconds["proposal"] = time.perf_counter() - began
         if isinstance(fits, Refusal):
             return refused(given, fits, seconds)
-        fitted = time.perf_counter()
-        seconds["svd"] = fitted - met
-        cloud_m, pose = cloud.cloud_m, fits.camera_from_model.double()
-        first = Candidate(pose[0], fits.covariance[0], float(fits.residual_m[0]))
-        others, turned, is_refined = pose[[]], list[Candidate](), False
-        if config.with_icp:
-            best = refine_best(cloud_m.double(), pose, surface, config.icp)
-            icp, is_refined = best.refined, float(best.refined.inlier_share) > 0
-            if is_refined:
-                first = Candidate(icp.camera_from_model, icp.covariance, float(icp.residual_m))
-                first, others, turned = turn_best(
-                    cloud_m.double(), first, best.others, known, config.icp
-                )
-        if not is_likely:
-            seen = seen_about(cloud_m, cloud.view, surface.diameter_m)
-            misfit = misfit_of(fit_of(seen, first.pose, surface), self.refusal)
-            if misfit is not None:
-                return refused(given, misfit, {**seconds, "icp": time.perf_counter() - fitted})
-        candidates = find_candidates(
-            cloud_m, first, others, turned, known, config, is_refined=is_refined
+
+        # Refine.
+        began = time.perf_counter()
+        poses = fits.camera_from_model.double()
+        leading = RefinedPose(
+            camera_from_model=poses[0],
+            covariance=fits.covariance[0],
+            residual_m=fits.residual_m[0],
+            inlier_share=torch.ones(()),
         )
-        poses = Rigid.stack([candidate.pose for candidate in candidates])
-        # Of the copies that the network could not learn to distinguish, the best counts.
-        assert known.copies is not None, "found with the candidates"
-        every_m = (poses[:, None] @ known.copies.trained).apply(model.keypoints_m.double())
-        angles = disagreement(cloud, one.outputs, every_m).tolist()
-        evidence = surface_signals(cloud_m, poses, surface)
-        for signals, angle in zip(evidence, angles, strict=True):
-            signals["disagree"] = angle
+        others = poses[:0]
+        icp = None
         if config.with_icp:
-            seconds["icp"] = time.perf_counter() - fitted
-        return answer_of(cloud, known, candidates, evidence, self.refusal, config, seconds, vote)
+            refinement = refine_best(cloud_m, poses, prepared.surface, config.icp)
+            if float(refinement.refined.inlier_share) > 0:
+                leading, others = refinement.refined, refinement.others
+                icp = config.icp
+            seconds["icp"] = time.perf_counter() - began
+
+        # Compare with the depth image, and decide.
+        began = time.perf_counter()
+        surface = prepared.surface
+        observation = observe(
+            cloud_m, cloud.view, surface.diameter_m, config.object_deviation_m, is_masked=True
+        )
+        prior_odds = PRIOR_MASKED if is_likely else PRIOR_PROPOSED
+        votes_rad = partial(self._disagreement, job)
+        competition = compete(cloud_m, leading, others, prepared, observation, icp, votes_rad)
+        seconds["evidence"] = time.perf_counter() - began
+        return decide(
+            cloud, prepared, competition, observation, self.refusal, config, seconds, prior_odds,
+            vote,
+        )  # fmt: skip
+
+    def _disagreement(self, job: CloudToPose, pose: Rigid) -> float:
+        """Mean angle between the network's directions and those to the keypoints of a pose [rad].
+
+        Of the symmetric copies that the network was trained to treat as one, that counts at which
+        the directions point best.
+        """
+        keypoints_m = job.prepared.model.keypoints_m.double()
+        copies_m = (pose @ with_copies(job.prepared).trained).apply(keypoints_m)
+        points_m = job.cloud.points_m.double()
+        directions = normalize(job.directions.double(), dim=-1)
+        every = max(1, len(points_m) // _COMPARED)
+        toward = normalize(copies_m[:, None] - points_m[::every, None], dim=-1)
+        best = int((directions[::every] * toward).sum(-1).mean((-2, -1)).argmax())
+        toward = normalize(copies_m[best] - points_m[:, None], dim=-1)
+        return float((directions * toward).sum(-1).clamp(-1, 1).arccos().mean())
 
 
 class DepthImageRegressor(PoseEstimator):

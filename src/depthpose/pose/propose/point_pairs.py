@@ -18,9 +18,9 @@ from depthpose.core.rigid import Rigid, geodesic_rad
 from depthpose.pose.cloud import thin
 from depthpose.pose.compiled import ANGLES, DISTANCES, MOST_ALIKE, TURNS, use_numba
 from depthpose.pose.config import IcpConfig
+from depthpose.pose.icp import refine_roughly
 from depthpose.pose.mesh import true_symmetries
 from depthpose.pose.mesh.models import fibonacci_directions
-from depthpose.pose.refine import refine_roughly
 from depthpose.pose.surface import (
     NEAR,
     Surface,

@@ -1,7 +1,4 @@
-"""What every estimator of poses offers: one object, several, whole depth images, sequences.
-
-The one that needs no training follows it.
-"""
+"""What every estimator of poses offers: one object, several, whole depth images, sequences."""
 
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence, Sized
@@ -13,33 +10,16 @@ from typing import TypeVar
 import torch
 from tqdm import tqdm
 
-from depthpose.core.arrays import take_evenly
 from depthpose.core.camera import AnyCamera, choose_lens
 from depthpose.core.devices import each_in_own_arithmetic, each_in_threads, own_arithmetic
 from depthpose.core.errors import InputError, full_memory, nearest_name
 from depthpose.core.rigid import Rigid
 from depthpose.core.units import Unit
-from depthpose.pose.cloud import Refusal, local_planes, prepare_cloud, thin
-from depthpose.pose.config import CloudConfig, EstimateConfig, RefusalConfig
-from depthpose.pose.estimator.candidates import (
-    Candidate,
-    KnownObject,
-    find_candidates,
-    nearest_posed,
-    surface_signals,
-    tilt_of,
-    turn_best,
-    unexplained,
-    with_copies,
-)
-from depthpose.pose.estimator.find import (
-    SearchTargets,
-    find_objects,
-    nothing_found,
-    which_object,
-)
-from depthpose.pose.estimator.fit import answer_of, refused, with_status
-from depthpose.pose.estimator.inputs import (
+from depthpose.pose.cloud import Refusal
+from depthpose.pose.config import EstimateConfig, RefusalConfig
+from depthpose.pose.copies import PreparedObject, with_copies
+from depthpose.pose.decide import refused, with_status
+from depthpose.pose.inputs import (
     AnyArray,
     AnyInput,
     AnyMask,
@@ -49,24 +29,19 @@ from depthpose.pose.estimator.inputs import (
     split_instances,
     view_input,
 )
-from depthpose.pose.estimator.track import TrackedObject, track
-from depthpose.pose.mesh import read_model, refuse_one_name, with_found_symmetries
-from depthpose.pose.refine import refine_best
+from depthpose.pose.propose.point_pairs import prepare_pairs
+from depthpose.pose.search import (
+    SearchTargets,
+    find_objects,
+    nothing_found,
+    which_object,
+)
 from depthpose.pose.surface import prepare_surface
+from depthpose.pose.track import TrackedObject, track
 from depthpose.pose.types import CloudInput, ObjectModel, PoseEstimate, ViewInput
-from depthpose.pose.voting.point_pairs import prepare_pairs, propose_poses
 
 Made = TypeVar("Made")
 _NAME = "input"  # what an input is called that came without a name
-_VOXEL = 0.05  # of the diameter
-_LEAST = 500  # points of a model without faces
-_PROPOSALS = 40
-_SMOOTHED = 1500  # of so many points 20 neighbours lay the plane that gives a normal
-_FITS_LESS = 0.25
-"""A turn that leaves by so much more of the readings unexplained is none that a search names."""
-_TILT_NOISE = 0.01
-"""By so much the tilt of one pose differs from one drawing of points to the next: less says nothing
-of which of two poses that look alike is the right one."""
 
 
 class PoseEstimator:
@@ -88,7 +63,7 @@ class PoseEstimator:
         self.models, self.refusal = tuple(models), refusal
         self.objects = tuple(model.name for model in models)
         """Names of the objects."""
-        self._objects: dict[str, KnownObject] = {}  # those that were asked for
+        self._objects: dict[str, PreparedObject] = {}  # those that were asked for
 
     @torch.no_grad()
     @own_arithmetic()
@@ -136,8 +111,8 @@ class PoseEstimator:
             answers.append(one)
         return answers
 
-    def _pose_near(
-        self, inputs: Sequence[CloudInput], poses: Sequence[Rigid]
+    def _estimate_near(
+        self, inputs: Sequence[CloudInput], proposals: Sequence[Rigid]
     ) -> list[PoseEstimate]:
         """Estimate clouds by the poses that were proposed for each."""
         raise NotImplementedError
@@ -183,7 +158,7 @@ class PoseEstimator:
             return self._answers([given], is_likely=True)[0]
         tried = [replace(given, object=name) for name in self.objects]
         estimates = self._answers(tried, is_likely=False)
-        return with_status(which_object(estimates, self.refusal), self.config.min_certainty)
+        return with_status(which_object(estimates), self.config.min_certainty)
 
     @own_arithmetic()
     def estimate_instances(
@@ -270,8 +245,7 @@ class PoseEstimator:
         known = SearchTargets(
             names=objects,
             object_of=self._prepared,
-            pose_near=self._pose_near,
-            max_size_error=self.refusal.max_size_error,
+            estimate_near=self._estimate_near,
             is_sure=is_sure,
         )
         found = find_objects(view, known)
@@ -356,7 +330,7 @@ class PoseEstimator:
         )
         return each_in_own_arithmetic(track(frames, followed, first))
 
-    def _known(self, name: str | None) -> KnownObject:
+    def _known(self, name: str | None) -> PreparedObject:
         """Give an object by its name, with its surface; None where one alone is known."""
         names = self.objects
         if name is None:
@@ -375,12 +349,13 @@ class PoseEstimator:
             number = names.index(name)
             model = self.models[number]
             surface = prepare_surface(model, self.config.icp.surface_points)
-            self._objects[name] = KnownObject(number=number, model=model, surface=surface)
+            self._objects[name] = PreparedObject(number=number, model=model, surface=surface)
         return self._objects[name]
 
-    def _prepared(self, name: str) -> KnownObject:
+    def _prepared(self, name: str) -> PreparedObject:
         """Give an object by its name, with its point pairs, near-symmetries and turns."""
-        known = with_copies(self._known(name), up_to_symmetry=self.config.up_to_symmetry)
+        known = self._known(name)
+        with_copies(known)
         if known.pairs is None:
             known.pairs = prepare_pairs(known.surface)
         return known
@@ -402,138 +377,3 @@ def or_unreadable(work: Callable[[AnyInput], Made], given: AnyInput) -> Made | P
             raise
         reason = f"{given.name}: {said}"
     return refused(given, Refusal(status="unreadable", reason=reason), {})
-
-
-class Registration(PoseEstimator):
-    """Poses of objects whose models are seen for the first time.
-
-    Pairs of points of the cloud propose poses, ICP refines them, and the evidence against the best
-    decides whether it is the answer, as it does for :class:`~depthpose.GeoPoseNet`.
-
-    Example::
-
-        parts = Registration.load("part.stl", unit="mm")
-        found = parts.estimate(cloud="scan.ply", unit="mm")
-
-    Args:
-        models: the objects.
-        config: ICP, limits; the seed is that of voting.
-        refusal: when an answer is withheld; None: by the usual limits.
-
-    Raises:
-        InputError: no model, two of one name, or one of few points without faces.
-    """
-
-    _holder = "the models"
-
-    def __init__(
-        self,
-        models: Sequence[ObjectModel],
-        config: EstimateConfig | None = None,
-        refusal: RefusalConfig | None = None,
-    ) -> None:
-        super().__init__(models, config, refusal or RefusalConfig())
-        if not models:
-            raise InputError(
-                "registration looks for CAD files and none is given; name one: STL, PLY, OBJ or GLB"
-            )
-        refuse_one_name(models)
-        for model in models:
-            points = len(model.vertices_m)
-            if len(model.faces) == 0 and points < _LEAST:
-                raise InputError(
-                    f"{model.name}: {points} points without faces are no surface; export the part "
-                    f"as a mesh with triangles, such as STL, or give {_LEAST} points"
-                )
-        if config is not None and not config.with_icp:
-            raise InputError("registration refines by ICP; omit --no-icp (with_icp=False)")
-        if config is not None and config.register_refused:
-            raise InputError(
-                "registration has no network whose refusals it could register; omit "
-                "--register-refused (register_refused=True)"
-            )
-
-    @classmethod
-    @own_arithmetic()
-    def load(
-        cls, *cad: str | Path, unit: Unit | None = None, config: EstimateConfig | None = None
-    ) -> "Registration":
-        """Read CAD files; symmetries that are found in a part make its copies one answer.
-
-        Args:
-            cad: PLY, STL, OBJ, GLB; an object is called as its file.
-            unit: of the numbers in the files; None where all are GLB, which has metres.
-            config: as above.
-
-        Raises:
-            InputError: no file, two of one name, one that is not read, without a surface or unit.
-        """
-        if not all(isinstance(path, str | Path) for path in cad):
-            raise InputError("Registration.load takes paths one by one: load(*files, unit=...)")
-        models = [read_model(path, unit, number=k) for k, path in enumerate(cad, start=1)]
-        return cls([with_found_symmetries(m, None, is_taken=True) for m in models], config)
-
-    def __repr__(self) -> str:
-        names = self.objects
-        objects = ", ".join(names) if len(names) <= 5 else f"{len(names)} objects"
-        return f"Registration(of {objects})"
-
-    def prepare(self) -> None:
-        """Prepare every model now, about a second each; else it is done when first asked for."""
-        for name in self.objects:
-            self._prepared(name)
-
-    def _pose_near(
-        self, inputs: Sequence[CloudInput], poses: Sequence[Rigid]
-    ) -> list[PoseEstimate]:
-        """Refine the poses that were proposed, without votes of the clouds alone."""
-        both, threads = zip(inputs, poses, strict=True), torch.get_num_threads()
-        return list(each_in_threads(lambda one: self._estimate(*one), both, threads))
-
-    def _estimate(self, given: AnyInput, poses: Rigid | None = None) -> PoseEstimate:
-        """Estimate a pose, from those that were proposed if there are any."""
-        known = self._prepared(given.object)  # once for all inputs, and in the seconds of none
-        assert known.pairs is not None
-        assert known.copies is not None
-        model, surface = known.model, known.surface
-        began = time.perf_counter()
-        cloud = CloudConfig(voxel_m=min(0.9, _VOXEL * model.diameter_m), max_points=None)
-        prepared = prepare_cloud(given, model, cloud, self.config)
-        seconds = {"cloud": time.perf_counter() - began}
-        if isinstance(prepared, Refusal):
-            return refused(given, prepared, seconds)
-        began = time.perf_counter()
-        proposals, cloud_m = poses, prepared.cloud_m.double()
-        if proposals is None:
-            generator = torch.Generator().manual_seed(self.config.voting.seed)
-            dense_m = take_evenly(cloud_m, _SMOOTHED)
-            some_m = dense_m[thin(dense_m, torch.zeros_like(dense_m), _VOXEL * surface.diameter_m)]
-            normals, _ = local_planes(dense_m, some_m)
-            proposals = propose_poses(some_m, normals, known.pairs, _PROPOSALS, generator)
-        voted = time.perf_counter()
-        seconds["voting"] = voted - began
-        best = refine_best(cloud_m, proposals, surface, replace(self.config.icp, starts=1))
-        icp = best.refined
-        if float(icp.inlier_share) == 0:
-            reason = "no pose lays the model near the points: another object, or too little of it"
-            return refused(given, Refusal(status="votes do not meet", reason=reason), seconds)
-        first = Candidate(icp.camera_from_model, icp.covariance, float(icp.residual_m))
-        others, turned, config = best.others, list[Candidate](), self.config
-        if poses is None:
-            first, others, turned = turn_best(cloud_m, first, others, known, config.icp)
-        else:  # the readings are what a pose explains, and say little between its turns
-            copied = first.pose @ known.copies.turns
-            left = unexplained(cloud_m, Rigid.cat([first.pose[None], copied]), surface)
-            others = Rigid.cat([others, copied[left[1:] < left[0] + _FITS_LESS]])
-        candidates = find_candidates(cloud_m, first, others, turned, known, config, is_refined=True)
-        found = Rigid.stack([one.pose for one in candidates])
-        evidence = surface_signals(cloud_m, found, surface)
-        thinned_m = take_evenly(cloud_m, 500)  # as tilt_of takes of a cloud
-        for pose, signals in zip([one.pose for one in candidates], evidence, strict=True):
-            # The plane through neighbours is tilted where a part has edges and thin features too,
-            # whatever the pose: so it is on the cloud moved onto the posed surface.
-            _, index = nearest_posed(thinned_m, pose, surface)
-            own = tilt_of(pose.apply(surface.points_m[index]), pose[None], surface)
-            signals["tilt"] = max(_TILT_NOISE, signals["tilt"] - float(own))
-        seconds["icp"] = time.perf_counter() - voted
-        return answer_of(prepared, known, candidates, evidence, self.refusal, self.config, seconds)

@@ -15,10 +15,9 @@ from depthpose.core.arrays import take_evenly
 from depthpose.core.rigid import Rigid
 from depthpose.pose.cloud import Refusal, cloud_from_depth
 from depthpose.pose.config import IcpConfig, RefusalConfig
-from depthpose.pose.estimator.candidates import surface_signals
-from depthpose.pose.estimator.fit import free_motions, observability, without_motions
 from depthpose.pose.frame import is_on_plane, largest_plane
-from depthpose.pose.refine import refine_best
+from depthpose.pose.icp import refine_best
+from depthpose.pose.observability import free_motions, observability, without_motions
 from depthpose.pose.surface import NEAR, Surface, compare_depths
 from depthpose.pose.types import AnyInput, CloudInput, ObjectModel, PoseEstimate, ViewInput
 
@@ -129,7 +128,7 @@ def _next(given: AnyInput, last: _Last | None, known: TrackedObject) -> PoseEsti
     if doubt is not None:
         return PoseEstimate(
             name=given.name, object=found.object, status=doubt.status, reason=doubt.reason,
-            signals=found.signals, seconds=spent, tracking="lost",
+            seconds=spent, tracking="lost",
         )  # fmt: skip
     tracking = "lost" if pose is None else "found"
     return replace(found, name=given.name, seconds=spent, tracking=tracking)
@@ -187,7 +186,6 @@ def _follow(given: AnyInput, last: _Last, known: TrackedObject) -> PoseEstimate 
     covariance = refined.covariance
     if len(free):
         covariance = without_motions(covariance, free)
-    (signals,) = surface_signals(own_m, pose[None], surface)
     answer = PoseEstimate(
         name="",
         object=known.model.name,
@@ -196,7 +194,6 @@ def _follow(given: AnyInput, last: _Last, known: TrackedObject) -> PoseEstimate 
         covariance=covariance.float(),
         free_motions=free.float(),
         residual_m=float(refined.residual_m),
-        signals=signals | {"through": shares[1], "before": shares[2]},
         tracking="tracked",
     )
     if (origin := last.origin) is None:

@@ -1,0 +1,7 @@
+"""Directions to keypoints to pose: least squares, RANSAC, rigidity, Kabsch, covariances."""
+
+from depthpose.pose.propose.keypoints import consistent_keypoints as consistent_keypoints
+from depthpose.pose.propose.keypoints import fit_pose as fit_pose
+from depthpose.pose.propose.keypoints import fits_of as fits_of
+from depthpose.pose.propose.keypoints import meet_lines as meet_lines
+from depthpose.pose.propose.keypoints import vote_ransac as vote_ransac

@@ -1,0 +1,191 @@
+"""Registration: poses of objects from their models alone, without training.
+
+Point pairs propose poses, ICP refines them, the posed models are compared with the depth image, and
+the evidence decides.
+"""
+
+import time
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import torch
+
+from depthpose.core.arrays import take_evenly
+from depthpose.core.devices import each_in_threads, own_arithmetic
+from depthpose.core.errors import InputError
+from depthpose.core.rigid import Rigid
+from depthpose.core.units import Unit
+from depthpose.pose.cloud import ObjectCloud, Refusal, local_planes, prepare_cloud, thin
+from depthpose.pose.config import CloudConfig, EstimateConfig, RefusalConfig
+from depthpose.pose.copies import PreparedObject
+from depthpose.pose.decide import PRIOR_MASKED, PRIOR_PROPOSED, decide, refused
+from depthpose.pose.estimator import PoseEstimator
+from depthpose.pose.evidence import observe
+from depthpose.pose.hypotheses import compete
+from depthpose.pose.icp import refine_best
+from depthpose.pose.inputs import AnyInput
+from depthpose.pose.mesh import read_model, refuse_one_name, with_found_symmetries
+from depthpose.pose.propose.point_pairs import propose_poses
+from depthpose.pose.types import CloudInput, ObjectModel, PoseEstimate
+
+_VOXEL_DIAMETERS = 0.05  # distance of the points that vote
+_LEAST_POINTS = 500  # of a model without faces
+_PROPOSALS = 40
+_SMOOTHED_POINTS = 1500  # of so many, 20 neighbours give a normal that noise hardly turns
+
+
+class Registration(PoseEstimator):
+    """Poses of objects whose models are seen for the first time.
+
+    Pairs of points of the cloud propose poses, ICP refines them, and the evidence against the best
+    decides whether it is the answer, as it does for :class:`~depthpose.GeoPoseNet`.
+
+    Example::
+
+        parts = Registration.load("part.stl", unit="mm")
+        found = parts.estimate(cloud="scan.ply", unit="mm")
+
+    Args:
+        models: the objects.
+        config: ICP, limits; the seed is that of voting.
+        refusal: when an answer is withheld; None: by the usual limits.
+
+    Raises:
+        InputError: no model, two of one name, or one of few points without faces.
+    """
+
+    _holder = "the models"
+
+    def __init__(
+        self,
+        models: Sequence[ObjectModel],
+        config: EstimateConfig | None = None,
+        refusal: RefusalConfig | None = None,
+    ) -> None:
+        super().__init__(models, config, refusal or RefusalConfig())
+        if not models:
+            raise InputError(
+                "registration looks for CAD files and none is given; name one: STL, PLY, OBJ or GLB"
+            )
+        refuse_one_name(models)
+        for model in models:
+            points = len(model.vertices_m)
+            if len(model.faces) == 0 and points < _LEAST_POINTS:
+                raise InputError(
+                    f"{model.name}: {points} points without faces are no surface; export the part "
+                    f"as a mesh with triangles, such as STL, or give {_LEAST_POINTS} points"
+                )
+        if config is not None and not config.with_icp:
+            raise InputError("registration refines by ICP; omit --no-icp (with_icp=False)")
+        if config is not None and config.register_refused:
+            raise InputError(
+                "registration has no network whose refusals it could register; omit "
+                "--register-refused (register_refused=True)"
+            )
+
+    @classmethod
+    @own_arithmetic()
+    def load(
+        cls, *cad: str | Path, unit: Unit | None = None, config: EstimateConfig | None = None
+    ) -> "Registration":
+        """Read CAD files; symmetries that are found in a part make its copies one answer.
+
+        Args:
+            cad: PLY, STL, OBJ, GLB; an object is called as its file.
+            unit: of the numbers in the files; None where all are GLB, which has metres.
+            config: as above.
+
+        Raises:
+            InputError: no file, two of one name, one that is not read, without a surface or unit.
+        """
+        if not all(isinstance(path, str | Path) for path in cad):
+            raise InputError("Registration.load takes paths one by one: load(*files, unit=...)")
+        models = [read_model(path, unit, number=k) for k, path in enumerate(cad, start=1)]
+        return cls([with_found_symmetries(m, None, is_taken=True) for m in models], config)
+
+    def __repr__(self) -> str:
+        names = self.objects
+        objects = ", ".join(names) if len(names) <= 5 else f"{len(names)} objects"
+        return f"Registration(of {objects})"
+
+    def prepare(self) -> None:
+        """Prepare every model now, about a second each; else it is done when first asked for."""
+        for name in self.objects:
+            self._prepared(name)
+
+    def _estimate_near(
+        self, inputs: Sequence[CloudInput], proposals: Sequence[Rigid]
+    ) -> list[PoseEstimate]:
+        """Estimate objects of a search from the poses that were proposed for each."""
+        pairs = zip(inputs, proposals, strict=True)
+        threads = torch.get_num_threads()
+        return list(each_in_threads(lambda pair: self._estimate(*pair), pairs, threads))
+
+    def _estimate(self, given: AnyInput, proposals: Rigid | None = None) -> PoseEstimate:
+        """Estimate a pose from a mask's points, or from those at a pose that a search proposed."""
+        prepared = self._prepared(given.object)  # once for all inputs, and in the seconds of none
+        is_masked = proposals is None
+        began = time.perf_counter()
+        cloud = self._cloud(given, prepared)
+        seconds = {"cloud": time.perf_counter() - began}
+        if isinstance(cloud, Refusal):
+            return refused(given, cloud, seconds)
+
+        began = time.perf_counter()
+        if proposals is None:
+            proposals = self._propose(cloud, prepared)
+        seconds["proposal"] = time.perf_counter() - began
+
+        began = time.perf_counter()
+        icp = replace(self.config.icp, starts=1)
+        refinement = refine_best(cloud.cloud_m.double(), proposals, prepared.surface, icp)
+        seconds["icp"] = time.perf_counter() - began
+        if float(refinement.refined.inlier_share) == 0:
+            reason = "no pose lays the model near the points: another object, or too little of it"
+            return refused(given, Refusal(status="votes do not meet", reason=reason), seconds)
+
+        began = time.perf_counter()
+        observation = observe(
+            cloud.cloud_m,
+            cloud.view,
+            prepared.surface.diameter_m,
+            self.config.object_deviation_m,
+            is_masked=is_masked,
+        )
+        competition = compete(
+            cloud.cloud_m.double(),
+            refinement.refined,
+            refinement.others,
+            prepared,
+            observation,
+            icp,
+        )
+        seconds["evidence"] = time.perf_counter() - began
+        prior_odds = PRIOR_MASKED if is_masked else PRIOR_PROPOSED
+        return decide(
+            cloud,
+            prepared,
+            competition,
+            observation,
+            self.refusal,
+            self.config,
+            seconds,
+            prior_odds,
+        )
+
+    def _cloud(self, given: AnyInput, prepared: PreparedObject) -> ObjectCloud | Refusal:
+        """Lift the input to a cloud, with voxels as far apart as the points that vote."""
+        voxel_m = min(0.9, _VOXEL_DIAMETERS * prepared.model.diameter_m)
+        config = CloudConfig(voxel_m=voxel_m, max_points=None)
+        return prepare_cloud(given, prepared.model, config, self.config)
+
+    def _propose(self, cloud: ObjectCloud, prepared: PreparedObject) -> Rigid:
+        """Propose poses by the point pairs of a cloud."""
+        assert prepared.pairs is not None, "_prepared computes them"
+        dense_m = take_evenly(cloud.cloud_m.double(), _SMOOTHED_POINTS)
+        step_m = _VOXEL_DIAMETERS * prepared.surface.diameter_m
+        voting_m = dense_m[thin(dense_m, torch.zeros_like(dense_m), step_m)]
+        normals, _ = local_planes(dense_m, voting_m)
+        generator = torch.Generator().manual_seed(self.config.voting.seed)
+        return propose_poses(voting_m, normals, prepared.pairs, _PROPOSALS, generator)

@@ -1,0 +1,418 @@
+"""Known objects in a depth image without a mask: votes propose poses, the evidence decides.
+
+Point pairs of the whole image, or of a region of it, vote for poses of each object. Proposals that
+explain the same readings are one place; at each place the object is estimated from the readings
+that the best proposal explains. Places that explain the same readings compete.
+"""
+
+import math
+from collections import Counter
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import torch
+from jaxtyping import Bool
+from torch import Tensor
+
+from depthpose.core.camera import back_project
+from depthpose.core.devices import each_in_threads
+from depthpose.core.rigid import Rigid
+from depthpose.pose.cloud import cloud_from_depth, grow_mask
+from depthpose.pose.copies import PreparedObject, with_copies
+from depthpose.pose.decide import LEAST_NAMED, PRIOR_PROPOSED, log_odds_right
+from depthpose.pose.evidence import BORDER_PX
+from depthpose.pose.frame import Frame, is_on_plane, largest_plane, prepare_frame
+from depthpose.pose.inputs import nothing_seen
+from depthpose.pose.propose.image import compare_with_image, propose_in_frame
+from depthpose.pose.surface import NEAR, Surface
+from depthpose.pose.types import CloudInput, PoseEstimate, ViewInput
+
+_MOST_PLACES, _LEAST_PROPOSALS = 40, 4
+"""Proposals that are looked at in an image, and of each object at least."""
+_ALIGNED, _CLEARLY = 0.7, 0.01
+"""Cosine of the normals from which a reading and the surface are alike, and by how much more a
+copy must score to take the place of the pose that was proposed."""
+_ROUNDS = 4
+"""So often an image is searched for an object that is there more than once, at most."""
+_MOST_TOGETHER = 8
+"""Proposals of one object at one place at most."""
+_LEAST_PIXELS = 100
+"""Of the whole image: fewer show no shape."""
+_SHARED = 0.3
+"""Estimates that explain so large a share of the same readings are of one thing; one stays."""
+_RIVAL = 0.5
+"""Poses of two objects that explain so much of the same readings compete."""
+_FLAT = 0.9
+"""What lies on one plane by so large a share is flat: anything of its outline looks the same."""
+_CONTINUED = 0.4
+"""Where the plane goes on beside so much of it, the outline is a cut through something larger."""
+_RIM = 0.05
+"""Width of what is looked at beside it, in diameters."""
+_LEAST_SHARE = 0.8
+"""Where no object among several has so large a share of the probability, none is reported."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class SearchTargets:
+    """What is looked for.
+
+    Attributes:
+        names: of the objects.
+        object_of: gives an object by its name, with its point pairs and copies.
+        estimate_near: estimates objects from clouds and the poses that were proposed for them.
+        is_sure: search once, as tracking does, which looks for one thing.
+    """
+
+    names: Sequence[str]
+    object_of: Callable[[str], PreparedObject]
+    estimate_near: Callable[[Sequence[CloudInput], Sequence[Rigid]], list[PoseEstimate]]
+    is_sure: bool = False
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _Place:
+    """Where an object may be: a pose, and the readings of the frame that it explains."""
+
+    object: str
+    pose: Rigid
+    explained: Bool[Tensor, "h w"]
+
+    def shared_with(self, other: "_Place") -> float:
+        """Share of the smaller one's readings that both explain."""
+        both = float((self.explained & other.explained).sum())
+        return both / max(1.0, min(float(self.explained.sum()), float(other.explained.sum())))
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _Judged(_Place):
+    """A place whose object was estimated."""
+
+    estimate: PoseEstimate
+    log_odds: float  #: of its being right
+
+
+def find_objects(view: ViewInput, targets: SearchTargets) -> list[PoseEstimate]:
+    """Pose every known object that a depth image shows, the surest first.
+
+    Where poses of several objects explain the same readings, they share the probability of one, and
+    where none has most of it none is reported. Where an object is there more than once, the rest of
+    the image is searched for more of it.
+
+    Args:
+        view: depth and camera; its mask limits where is looked.
+        targets: what for.
+    """
+    frame = prepare_frame(torch.where(view.mask, view.depth_m, torch.nan), view.K)
+    is_left = torch.ones_like(frame.depth_m, dtype=torch.bool)
+    names = list(targets.names)
+    found: list[_Judged] = []
+    taken: list[_Judged] = []
+    for _ in range(1 if targets.is_sure else _ROUNDS):
+        groups = _group(_propose(frame, is_left, names, targets), taken, frame, targets)
+        judged = _judge(groups, frame, view, targets)
+        more, taken = _suppress(judged, taken)
+        found += more
+        for place in more:
+            is_left &= ~place.explained
+        count = Counter(place.object for place in found)
+        names = sorted({place.object for place in more if count[place.object] > 1})
+        if not names:
+            break
+    found.sort(key=lambda place: -place.log_odds)
+    return [
+        replace(place.estimate, name=f"{view.name}_{number}") for number, place in enumerate(found)
+    ]
+
+
+def _propose(
+    frame: Frame, is_left: Bool[Tensor, "h w"], names: Sequence[str], targets: SearchTargets
+) -> list[_Place]:
+    """Propose poses of every object; keep the best of all, and some of each object."""
+
+    def propose(name: str) -> list[tuple[float, int, str, Rigid]]:
+        pairs = targets.object_of(name).pairs
+        assert pairs is not None
+        poses, agreement = propose_in_frame(frame, is_left, pairs, len(names))
+        return [
+            (float(agreement[rank]), rank, name, poses[rank])
+            for rank in range(min(len(agreement), _MOST_PLACES))
+        ]
+
+    proposals = [
+        proposal
+        for group in each_in_threads(propose, names, torch.get_num_threads())
+        for proposal in group
+    ]
+    proposals.sort(key=lambda proposal: -proposal[0])
+    places: list[_Place] = []
+    for number, (_, rank, name, pose) in enumerate(proposals):
+        if number >= _MOST_PLACES and rank >= _LEAST_PROPOSALS:
+            continue
+        explained = explained_mask(frame, pose, targets.object_of(name).surface)
+        if int(explained.sum()) * frame.step**2 >= _LEAST_PIXELS:
+            places.append(_Place(object=name, pose=pose, explained=explained))
+    return places
+
+
+def _group(
+    places: Sequence[_Place], taken: Sequence[_Place], frame: Frame, targets: SearchTargets
+) -> list[list[_Place]]:
+    """Gather proposals of an object that explain the same readings, but for what is taken."""
+    groups: list[list[_Place]] = []
+    for place in places:
+        if any(place.shared_with(other) > _SHARED for other in taken):
+            continue
+        same = [group for group in groups if group[0].object == place.object]
+        group = next((group for group in same if place.shared_with(group[0]) > _RIVAL), None)
+        if group is None:
+            prepared = targets.object_of(place.object)
+            pose = _best_copy(frame, place.pose, prepared)
+            explained = explained_mask(frame, pose, prepared.surface)
+            groups.append([replace(place, pose=pose, explained=explained)])
+        elif len(group) < _MOST_TOGETHER:
+            group.append(place)
+    return groups
+
+
+def _best_copy(frame: Frame, pose: Rigid, prepared: PreparedObject) -> Rigid:
+    """Give the pose or the one of its copies at which the object explains most readings about it.
+
+    A handle that a wrong copy of a mug leaves out does not contradict it, for a neighbour may be
+    there. So each is scored by the readings that it explains, over the most that one does, less the
+    share of its surface that the image contradicts.
+    """
+    surface = prepared.surface
+    copies = with_copies(prepared)
+    motions = Rigid.cat([copies.copies, copies.lookalikes])
+    if len(motions.R) == 0:
+        return pose
+    every = Rigid.cat([pose[None], pose[None] @ motions])
+    about = (frame.depth_m > 0) & (frame.plane_m < surface.diameter_m)
+    middle_m = pose.apply(surface.middle_m[None])[0]
+    about &= (frame.points_m - middle_m).norm(dim=-1) < surface.diameter_m
+    local_m = every.inverse().apply(frame.points_m[about])
+    index = surface.boxes.look_up(local_m)
+    is_near = (local_m - surface.points_m[index]).norm(dim=-1) < NEAR * surface.diameter_m
+    cosine = ((surface.normals[index] @ every.R.mT) * frame.normals[about]).sum(-1).abs()
+    number = (is_near & ((cosine > _ALIGNED) | ~frame.is_smooth[about])).sum(-1)
+    contradicted = compare_with_image(frame, every, surface).contradicted
+    score = number / number.max().clamp(min=1) - contradicted
+    best = int(score.argmax())
+    return every[best] if float(score[best] - score[0]) > _CLEARLY else pose
+
+
+def _judge(
+    groups: Sequence[Sequence[_Place]], frame: Frame, view: ViewInput, targets: SearchTargets
+) -> list[_Judged]:
+    """Estimate the object of each place from what its best pose explains; drop what is refused."""
+    inputs: list[CloudInput] = []
+    height, width = view.depth_m.shape
+    for number, group in enumerate(groups):
+        mask = group[0].explained
+        mask = mask.repeat_interleave(frame.step, 0).repeat_interleave(frame.step, 1)
+        cloud_m = cloud_from_depth(view.depth_m, mask[:height, :width] & view.mask, view.K)
+        name = f"{view.name}_{number}"
+        inputs.append(CloudInput(name=name, points_m=cloud_m, object=group[0].object, view=view))
+    proposals = [Rigid.stack([place.pose for place in group]) for group in groups]
+    judged: list[_Judged] = []
+    for estimate in targets.estimate_near(inputs, proposals) if inputs else []:
+        if estimate.camera_from_model is None or estimate.evidence is None:
+            continue
+        surface = targets.object_of(estimate.object).surface
+        pose = estimate.camera_from_model.double()
+        if is_cut_out(view, pose, surface):
+            continue
+        judged.append(
+            _Judged(
+                object=estimate.object,
+                pose=pose,
+                explained=explained_mask(frame, pose, surface),
+                estimate=estimate,
+                log_odds=math.log(PRIOR_PROPOSED) + log_odds_right(estimate.evidence),
+            )
+        )
+    return judged
+
+
+def _suppress(
+    judged: Sequence[_Judged], before: Sequence[_Judged]
+) -> tuple[list[_Judged], list[_Judged]]:
+    """Non-maximum suppression: in order of probability, keep what explains other readings.
+
+    Returns:
+        What is kept; and all whose readings are taken, by what may be one of several objects too.
+    """
+    kept: list[_Judged] = []
+    taken = list(before)
+    ranked = sorted(judged, key=lambda place: -place.log_odds)
+    for number, place in enumerate(ranked):
+        if any(place.shared_with(other) > _SHARED for other in taken):
+            continue
+        taken.append(place)
+        rivals = {place.object: place}
+        for other in ranked[number + 1 :]:
+            if place.shared_with(other) > _RIVAL:
+                rivals.setdefault(other.object, other)
+        estimate, share = among_objects(list(rivals.values()))
+        if share >= _LEAST_SHARE:  # else it may be another object
+            kept.append(replace(place, estimate=estimate))
+    return kept, taken
+
+
+def explained_mask(image: Frame | ViewInput, pose: Rigid, surface: Surface) -> Bool[Tensor, "h w"]:
+    """Mark the pixels whose points lie on a posed surface; in a frame, none of wider planes."""
+    if isinstance(image, Frame):
+        points_m = image.points_m
+        found = (image.depth_m > 0) & (image.plane_m < surface.diameter_m)
+    else:
+        points_m = back_project(image.depth_m.double(), image.K.double())
+        found = points_m.isfinite().all(-1) & image.mask
+    pose = pose.double()
+    middle_m = pose.apply(surface.points_m.mean(0, keepdim=True))
+    found[found.clone()] = (points_m[found] - middle_m).norm(dim=-1) < surface.diameter_m
+    local_m, limit_m = pose.inverse().apply(points_m[found]), NEAR * surface.diameter_m
+    gap_m = (local_m - surface.points_m[surface.boxes.look_up(local_m)]).norm(dim=-1)
+    # The nearest sample is nearer than the one of the box by its diagonal at most.
+    is_open = (gap_m >= limit_m) & (gap_m < limit_m + math.sqrt(3) * surface.boxes.side_m)
+    some_m = local_m[is_open]
+    gap_m[is_open] = (some_m - surface.points_m[surface.nearest(some_m)]).norm(dim=-1)
+    found[found.clone()] = gap_m < limit_m
+    return found
+
+
+def is_cut_out(view: ViewInput, pose: Rigid, surface: Surface) -> bool:
+    """Whether what lies on a posed surface is flat, and goes on in its plane beyond the outline.
+
+    Args:
+        view: in which the pose was found.
+        pose: of the object.
+        surface: of its model.
+    """
+    window = _window_about(view, pose, surface)
+    explained = explained_mask(window, pose, surface)
+    points_m = back_project(window.depth_m.double(), window.K.double())
+    plane = largest_plane(points_m[explained], torch.Generator().manual_seed(0))
+    if plane is None:
+        return False
+    if float(is_on_plane(points_m[explained], plane).double().mean()) < _FLAT:
+        return False
+    pixel_m = float(points_m[explained][:, 2].median() / window.K[0, 0])
+    reach = BORDER_PX + math.ceil(_RIM * surface.diameter_m / pixel_m)
+    rim = grow_mask(explained, reach) & ~grow_mask(explained, BORDER_PX)
+    return float(is_on_plane(points_m[rim], plane).double().mean()) > _CONTINUED
+
+
+def _window_about(view: ViewInput, pose: Rigid, surface: Surface) -> ViewInput:
+    """Cut the window about a posed surface out of a view."""
+    posed_m = pose.apply(surface.points_m)
+    pixel = (posed_m @ view.K.double().mT)[:, :2] / posed_m[:, 2:]
+    margin = 0.1 * (pixel.amax(0) - pixel.amin(0)) + 2 * BORDER_PX
+    height, width = view.depth_m.shape
+    (left, top), (right, bottom) = (
+        (pixel.amin(0) - margin).tolist(),
+        (pixel.amax(0) + margin).tolist(),
+    )
+    left, right = (min(max(int(value), 0), width) for value in (left, right + 1))
+    top, bottom = (min(max(int(value), 0), height) for value in (top, bottom + 1))
+    K = view.K.clone()
+    K[0, 2] -= left
+    K[1, 2] -= top
+    part = (slice(top, bottom), slice(left, right))
+    return replace(view, depth_m=view.depth_m[part], mask=view.mask[part], K=K)
+
+
+def nothing_found(view: ViewInput, object: str, spent_s: float = 0.0) -> PoseEstimate:
+    """Say that a depth image shows no object, or none of several, surely."""
+    read_m = view.depth_m[view.mask & (view.depth_m > 0)]
+    spent = {"check": spent_s}
+    if len(read_m) == 0:
+        return PoseEstimate(
+            name=view.name,
+            object=object,
+            status="too few points",
+            reason=nothing_seen(view),
+            seconds=spent,
+        )
+    return PoseEstimate(
+        name=view.name,
+        object=object,
+        status="doubtful",
+        reason=f"nothing beside the planes of the image is surely {object}; its depths are "
+        f"{float(read_m.min()):.3g} to {float(read_m.max()):.3g} m: if they are right, give a "
+        "mask, or look from nearer by",
+        seconds=spent,
+    )
+
+
+def which_object(estimates: Sequence[PoseEstimate]) -> PoseEstimate:
+    """Choose which object one input shows, from the estimates for every object that it may be.
+
+    Those that are refused are none; the others share the probability of one.
+
+    Args:
+        estimates: for the same input, one an object.
+
+    Returns:
+        The best, its certainty given the others; refused where none is posed, or where another
+        object is too likely.
+    """
+    posed = [estimate for estimate in estimates if estimate.is_posed]
+    seconds: Counter[str] = Counter()
+    for estimate in estimates:
+        seconds.update(estimate.seconds)
+    if not posed:
+        nearest = max(estimates, key=lambda e: 0.0 if e.evidence is None else e.evidence.agreement)
+        names = ", ".join(estimate.object for estimate in estimates)
+        reason = f"none of {names} surely; {nearest.object} comes nearest: {nearest.reason}"
+        return replace(nearest, reason=reason, seconds=dict(seconds))
+    shares = _object_shares(posed)
+    best, share = _given_others(posed, shares)
+    if share < _LEAST_SHARE:
+        candidates = ", ".join(
+            f"{estimate.object} ({float(its_share):.0%})"
+            for estimate, its_share in zip(posed, shares, strict=True)
+        )
+        return PoseEstimate(
+            name=best.name,
+            object=best.object,
+            status="doubtful",
+            reason=f"it may be {candidates}; say which by object",
+            seconds=dict(seconds),
+        )
+    return replace(best, seconds=dict(seconds))
+
+
+def among_objects(places: Sequence[_Judged]) -> tuple[PoseEstimate, float]:
+    """Give the estimate of the likeliest object of one place, and its share among the objects."""
+    estimates = [place.estimate for place in places]
+    return _given_others(estimates, _object_shares(estimates))
+
+
+def _object_shares(estimates: Sequence[PoseEstimate]) -> Tensor:
+    """Share the probability of one among objects, by the evidence of their best poses."""
+    evidences = [estimate.evidence for estimate in estimates if estimate.evidence is not None]
+    area = max(evidence.visible for evidence in evidences)
+    log_odds = [log_odds_right(evidence, area) for evidence in evidences]
+    return torch.tensor(log_odds, dtype=torch.float64).softmax(0)
+
+
+def _given_others(estimates: Sequence[PoseEstimate], shares: Tensor) -> tuple[PoseEstimate, float]:
+    """Give the likeliest estimate, its probabilities multiplied by its share among the objects."""
+    best = int(shares.argmax())
+    share, estimate = float(shares[best]), estimates[best]
+    certainty, copy_certainty = estimate.certainty, estimate.copy_certainty
+    chosen = replace(
+        estimate,
+        certainty=None if certainty is None else share * certainty,
+        copy_certainty=None if copy_certainty is None else share * copy_certainty,
+        alternatives=tuple(
+            replace(alternative, probability=share * alternative.probability)
+            for alternative in estimate.alternatives
+        ),
+    )
+    if len(estimates) > 1 and estimate.identity is not None and share < 1 - LEAST_NAMED:
+        second = estimates[int(shares.topk(2).indices[1])].object
+        reason = f"it may be {second} ({1 - share:.0%} for all other objects)"
+        identity = replace(estimate.identity, status="not excluded", other=second, reason=reason)
+        chosen = replace(chosen, identity=identity)
+    return chosen, share

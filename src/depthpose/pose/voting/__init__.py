@@ -1,7 +1,0 @@
-"""Directions to keypoints to pose: least squares, RANSAC, rigidity, Kabsch, covariances."""
-
-from depthpose.pose.voting.keypoints import consistent_keypoints as consistent_keypoints
-from depthpose.pose.voting.keypoints import fit_pose as fit_pose
-from depthpose.pose.voting.keypoints import fits_of as fits_of
-from depthpose.pose.voting.keypoints import meet_lines as meet_lines
-from depthpose.pose.voting.keypoints import vote_ransac as vote_ransac
