@@ -52,8 +52,11 @@ RIGHT_UNOBSERVED = Rate(mean=0.2, shape=1.0)
 WRONG_UNOBSERVED = Rate(mean=0.5, shape=3.0)
 PRIOR_MASKED = 20.0
 """Odds of the best pose being right before its evidence is seen, where a mask shows the object."""
-PRIOR_PROPOSED = 1.0
+PRIOR_PROPOSED = 0.1
 """The same where a search proposed the pose: most places that votes point at show no object."""
+WRONG_RMS = 1.2
+"""Root mean square residual of what supports a wrong pose, in standard deviations: of residuals
+that are as often large as small it is 1.7, and refinement makes it smaller."""
 INDEPENDENT_SIDES = 6.0
 """A real object deviates from its model by whole sides, of which a body has about six: its residual
 is that of so few independent observations, however many readings there are."""
@@ -113,7 +116,7 @@ def share_among_poses(hypotheses: Sequence[Hypothesis]) -> Float64[Tensor, " n"]
     """
     area = _common_area(hypotheses)
     weights = [
-        log_odds_right(hypothesis.evidence, area) + _log_weight(hypothesis)
+        log_odds_right(hypothesis.evidence, area) + _log_votes(hypothesis)
         for hypothesis in hypotheses
     ]
     return torch.tensor(weights, dtype=torch.float64).softmax(0)
@@ -131,7 +134,7 @@ def share_among_copies(hypotheses: Sequence[Hypothesis]) -> Float64[Tensor, " n"
         evidence = hypothesis.evidence
         fits_right = RIGHT_CONTRADICTED.log_likelihood(evidence.contradicted, area)
         fits_right += RIGHT_UNOBSERVED.log_likelihood(evidence.unobserved, area)
-        weights.append(fits_right + _log_weight(hypothesis))
+        weights.append(fits_right + _log_fit(evidence.rms) + _log_votes(hypothesis))
     return torch.tensor(weights, dtype=torch.float64).softmax(0)
 
 
@@ -147,27 +150,30 @@ def _common_area(hypotheses: Sequence[Hypothesis]) -> float:
 
 
 def log_odds_right(evidence: Evidence, area: float | None = None) -> float:
-    """Log likelihood ratio of a right and a wrong pose, by what is contradicted and unobserved.
+    """Log likelihood ratio of a right and a wrong pose: contradicted, unobserved, residuals.
 
     Args:
         evidence: of the pose.
         area: visible of the model, where several poses are compared; None: that of the evidence.
     """
     area = max(LEAST_AREA, evidence.visible if area is None else area)
-    log_odds = RIGHT_CONTRADICTED.log_likelihood(evidence.contradicted, area)
-    log_odds -= WRONG_CONTRADICTED.log_likelihood(evidence.contradicted, area)
+    # Only what was observed can contradict a pose.
+    observed = max(LEAST_AREA, area - evidence.unobserved)
+    log_odds = RIGHT_CONTRADICTED.log_likelihood(evidence.contradicted, observed)
+    log_odds -= WRONG_CONTRADICTED.log_likelihood(evidence.contradicted, observed)
     log_odds += RIGHT_UNOBSERVED.log_likelihood(evidence.unobserved, area)
     log_odds -= WRONG_UNOBSERVED.log_likelihood(evidence.unobserved, area)
-    return log_odds
+    return log_odds + _log_fit(evidence.rms) - _log_fit(WRONG_RMS)
 
 
-def _log_weight(hypothesis: Hypothesis) -> float:
-    """Log likelihood of the residuals, and of a network's votes where there is one."""
-    # Normal residuals of unknown variance, of at least that of the sensor and the object.
-    log_weight = -INDEPENDENT_SIDES / 2 * math.log(1 + hypothesis.evidence.rms**2)
-    if hypothesis.votes_rad is not None:
-        log_weight -= hypothesis.votes_rad / VOTES_RAD
-    return log_weight
+def _log_fit(rms: float) -> float:
+    """Log likelihood of residuals: normal, of a variance of at least the sensor's and object's."""
+    return -INDEPENDENT_SIDES / 2 * math.log(1 + rms**2)
+
+
+def _log_votes(hypothesis: Hypothesis) -> float:
+    """Log likelihood of a network's votes, where there is one."""
+    return 0.0 if hypothesis.votes_rad is None else -hypothesis.votes_rad / VOTES_RAD
 
 
 def decide(
@@ -214,7 +220,7 @@ def decide(
             "symmetry allows it. Declare the symmetry, or look from a side that shows more",
         )
     elif probability < refusal.min_probability:
-        reason = Refusal(status="doubtful", reason=_contradiction(evidence, probability))
+        reason = Refusal(status="doubtful", reason=contradiction(evidence, probability))
     elif config.with_icp and refusal.max_size_error < 1:
         identity = identify(
             cloud.cloud_m,
@@ -268,7 +274,7 @@ def decide(
     return with_status(estimate, config.min_certainty)
 
 
-def _contradiction(evidence: Evidence, probability: float) -> str:
+def contradiction(evidence: Evidence, probability: float) -> str:
     """Say what contradicts a pose most."""
     compared = max(evidence.supported + evidence.contradicted, 1e-9)
     visible = max(evidence.visible, 1e-9)

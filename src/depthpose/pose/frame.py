@@ -13,9 +13,12 @@ from torch.nn.functional import max_pool2d, normalize, pad
 
 from depthpose.core.arrays import take_evenly
 from depthpose.core.camera import back_project
+from depthpose.pose.sensor import LAG_PX, SHARED_PER_WHITE
 
 _MOST_PIXELS = 110_000
 """Of a larger image every n-th row and column is used."""
+_OBJECT_PX = 60
+"""Pixels that an object is wide at least, if the image has them."""
 _WINDOW = 3
 """Pixels to each side of one through which its plane is laid."""
 _FILLED = 0.4
@@ -26,10 +29,16 @@ _ALONG = math.cos(math.radians(20))
 _JUMP_M = 0.004
 _JUMP_PER_M = 0.012
 """Neighbours are of one surface up to this difference in depth, and this share of it."""
-_TOLERANCE_M = 0.004
-_TOLERANCE_PER_M = 0.003
-"""Points lie on a plane up to 4 mm, and 3 mm for the square of their depth in metres: a Kinect's
-noise grows so."""
+_TOLERANCE_M = 0.0005
+_DEVIATIONS = 4.0
+"""Points lie on a plane up to half a millimetre, and four standard deviations of the error that
+neighbouring readings share, which grows with the square of the depth; but no farther than"""
+_WIDEST_M = 0.004
+_WIDEST_PER_M = 0.003
+"""4 mm, and 3 mm for the square of their depth in metres: a Kinect's noise."""
+NOISE_PER_M = 0.0015
+"""Standard deviation of a Kinect's readings, for the square of the depth in metres (Nguyen et al.
+2012): where nothing better is known."""
 _PLANES = 6
 _HYPOTHESES = 400
 _SAMPLE = 4000
@@ -59,6 +68,7 @@ class Frame:
         plane_m: of the plane that a pixel shows: objects up to this diameter have no such side; 0
             where it shows none.
         nearest_m: least depth of the pixels up to two away; infinite where none has a reading.
+        noise_per_m: standard deviation of a reading, for the square of the depth in metres.
     """
 
     step: int
@@ -69,9 +79,12 @@ class Frame:
     is_smooth: Bool[Tensor, "h w"]
     plane_m: Float64[Tensor, "h w"]
     nearest_m: Float64[Tensor, "h w"]
+    noise_per_m: float
 
 
-def prepare_frame(depth_m: Float[Tensor, "h w"], K: Float[Tensor, "3 3"]) -> Frame:
+def prepare_frame(
+    depth_m: Float[Tensor, "h w"], K: Float[Tensor, "3 3"], diameter_m: float | None = None
+) -> Frame:
     """Lay a plane through the neighbours of each pixel, and find the widest planes.
 
     Planes are found one after the other by RANSAC (Fischler and Bolles 1981) and refitted.
@@ -79,19 +92,38 @@ def prepare_frame(depth_m: Float[Tensor, "h w"], K: Float[Tensor, "3 3"]) -> Fra
     Args:
         depth_m: along the optical axis; NaN or 0 where there is no reading.
         K: intrinsic matrix.
+        diameter_m: of the smallest object that is looked for: the image is not thinned so much that
+            it would be few pixels wide.
     """
+    depth_m = torch.where(depth_m.isfinite() & (depth_m > 0), depth_m, 0.0).double()
+    noise_per_m = _measure_noise_per_m(depth_m)
     step = math.ceil(math.sqrt(depth_m.numel() / _MOST_PIXELS))
-    depth_m = depth_m[::step, ::step].double()
-    depth_m = torch.where(depth_m.isfinite() & (depth_m > 0), depth_m, 0.0)
+    is_read = depth_m > 0
+    if diameter_m is not None and bool(is_read.any()):
+        object_px = diameter_m * float(K[0, 0]) / float(depth_m[is_read].median())
+        step = min(step, max(1, math.floor(object_px / _OBJECT_PX)))
+    depth_m = depth_m[::step, ::step]
     K = K.double() / torch.tensor([[step], [step], [1]])
     points_m = back_project(depth_m, K)
     normals, is_smooth = _normals(depth_m, points_m, K)
-    plane_m = _planes(depth_m, points_m, normals)
+    plane_m = _planes(depth_m, points_m, normals, noise_per_m)
     nearest_m = -max_pool2d(-torch.where(depth_m > 0, depth_m, torch.inf)[None], 5, 1, 2)[0]
     return Frame(
         step=step, depth_m=depth_m, K=K, points_m=points_m, normals=normals, is_smooth=is_smooth,
-        plane_m=plane_m, nearest_m=nearest_m,
+        plane_m=plane_m, nearest_m=nearest_m, noise_per_m=noise_per_m,
     )  # fmt: skip
+
+
+def _measure_noise_per_m(depth_m: Float64[Tensor, "h w"]) -> float:
+    """Measure the noise of an image by second differences, over the square of the depth."""
+    scaled = torch.where(depth_m > 0, depth_m, torch.nan)
+    bends: list[Tensor] = []
+    for along in (scaled, scaled.T):
+        middle = along[:, LAG_PX:-LAG_PX]
+        bend = (along[:, : -2 * LAG_PX] + along[:, 2 * LAG_PX :] - 2 * middle) / middle.square()
+        bends.append(bend[bend.isfinite()])
+    bend = torch.cat(bends).abs()
+    return float(bend.median()) / 0.6745 / math.sqrt(6) if len(bend) else NOISE_PER_M
 
 
 def _normals(
@@ -138,6 +170,7 @@ def _planes(
     depth_m: Float64[Tensor, "h w"],
     points_m: Float64[Tensor, "h w 3"],
     normals: Float64[Tensor, "h w 3"],
+    noise_per_m: float,
 ) -> Float64[Tensor, "h w"]:
     """Find the planes of an image; give each of their pixels what objects have no such side."""
     is_left = depth_m > 0
@@ -145,13 +178,14 @@ def _planes(
     least = max(_LEAST_POINTS, _LEAST_SHARE * int(is_left.sum()))
     generator = torch.Generator().manual_seed(0)
     for _ in range(_PLANES):
-        plane = largest_plane(points_m[is_left], generator)
+        plane = largest_plane(points_m[is_left], generator, noise_per_m)
         if plane is None:
             break
-        near = is_on_plane(points_m, plane) & is_left
+        near = is_on_plane(points_m, plane, noise_per_m) & is_left
         if int(near.sum()) < least:
             break
-        bent = near | _bent(points_m, plane, near, is_left & ((normals @ plane[0]).abs() > _ALONG))
+        is_along = is_left & ((normals @ plane[0]).abs() > _ALONG)
+        bent = near | _bent(points_m, plane, near, is_along, noise_per_m)
         label = label_regions(depth_m, bent)
         sizes = torch.bincount(label[near], minlength=int(label.max()) + 1)
         piece = near & (label == sizes.argmax())
@@ -175,12 +209,13 @@ def _bent(
     plane: Plane,
     near: Bool[Tensor, "h w"],
     is_along: Bool[Tensor, "h w"],
+    noise_per_m: float,
 ) -> Bool[Tensor, "h w"]:
     """Mark what is turned as a plane and lies on it as the sensor bends it, by a quadratic."""
     off_m = points_m @ plane[0] - plane[1]
     x, y = (points_m[..., :2] / points_m[..., 2:].clamp(min=1e-6)).unbind(-1)
     terms = torch.stack([torch.ones_like(x), x, y, x * x, x * y, y * y], -1)
-    tolerance_m = _TOLERANCE_M + _TOLERANCE_PER_M * points_m[..., 2].square()
+    tolerance_m = _tolerance_m(points_m[..., 2], noise_per_m)
     found = near & is_along
     for _ in range(_BENDINGS):
         A, b = (take_evenly(grid[found], _SAMPLE) for grid in (terms, off_m))
@@ -191,7 +226,9 @@ def _bent(
     return found
 
 
-def largest_plane(points_m: Float64[Tensor, "n 3"], generator: torch.Generator) -> Plane | None:
+def largest_plane(
+    points_m: Float64[Tensor, "n 3"], generator: torch.Generator, noise_per_m: float = NOISE_PER_M
+) -> Plane | None:
     """Give the plane that most points lie on, by RANSAC; None for fewer than 60 points."""
     some = take_evenly(points_m, _SAMPLE)
     if len(some) < _LEAST_POINTS:
@@ -202,13 +239,13 @@ def largest_plane(points_m: Float64[Tensor, "n 3"], generator: torch.Generator) 
     length = normal.norm(dim=-1, keepdim=True)
     normal = normal / length.clamp(min=1e-12)
     offset = (normal * a).sum(-1)
-    tolerance_m = _TOLERANCE_M + _TOLERANCE_PER_M * some[:, 2].square()
+    tolerance_m = _tolerance_m(some[:, 2], noise_per_m)
     on = (some @ normal.T - offset).abs() < tolerance_m[:, None]
     on &= length[:, 0] > 1e-8
     best = int(on.sum(0).argmax())
     plane = (normal[best], offset[best])
     for _ in range(3):
-        near = some[is_on_plane(some, plane)]
+        near = some[is_on_plane(some, plane, noise_per_m)]
         if len(near) < 3:
             return None
         middle = near.mean(0)
@@ -217,10 +254,19 @@ def largest_plane(points_m: Float64[Tensor, "n 3"], generator: torch.Generator) 
     return plane
 
 
-def is_on_plane(points_m: Float64[Tensor, "*batch 3"], plane: Plane) -> Bool[Tensor, "*batch"]:
+def _tolerance_m(depth_m: Float64[Tensor, "*n"], noise_per_m: float) -> Float64[Tensor, "*n"]:
+    """How far from a plane a reading of it may lie, at each depth."""
+    square = depth_m.square()
+    tolerance_m = _TOLERANCE_M + _DEVIATIONS * SHARED_PER_WHITE * noise_per_m * square
+    return torch.minimum(tolerance_m, _WIDEST_M + _WIDEST_PER_M * square)
+
+
+def is_on_plane(
+    points_m: Float64[Tensor, "*batch 3"], plane: Plane, noise_per_m: float = NOISE_PER_M
+) -> Bool[Tensor, "*batch"]:
     """Whether points of the camera frame lie on a plane, as far as a depth sensor measures it."""
     normal, offset = plane
-    tolerance_m = _TOLERANCE_M + _TOLERANCE_PER_M * points_m[..., 2].square()
+    tolerance_m = _tolerance_m(points_m[..., 2], noise_per_m)
     return (points_m @ normal - offset).abs() < tolerance_m
 
 

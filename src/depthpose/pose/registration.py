@@ -19,9 +19,16 @@ from depthpose.core.units import Unit
 from depthpose.pose.cloud import ObjectCloud, Refusal, local_planes, prepare_cloud, thin
 from depthpose.pose.config import CloudConfig, EstimateConfig, RefusalConfig
 from depthpose.pose.copies import PreparedObject
-from depthpose.pose.decide import PRIOR_MASKED, PRIOR_PROPOSED, decide, refused
+from depthpose.pose.decide import (
+    PRIOR_MASKED,
+    PRIOR_PROPOSED,
+    contradiction,
+    decide,
+    probability_right,
+    refused,
+)
 from depthpose.pose.estimator import PoseEstimator
-from depthpose.pose.evidence import observe
+from depthpose.pose.evidence import compare, observe
 from depthpose.pose.hypotheses import compete
 from depthpose.pose.icp import refine_best
 from depthpose.pose.inputs import AnyInput
@@ -32,6 +39,8 @@ from depthpose.pose.types import CloudInput, ObjectModel, PoseEstimate
 _VOXEL_DIAMETERS = 0.05  # distance of the points that vote
 _LEAST_POINTS = 500  # of a model without faces
 _PROPOSALS = 40
+_HOPELESS = 0.02
+"""A proposal of a search that is less likely is not compared with its copies and look-alikes."""
 _SMOOTHED_POINTS = 1500  # of so many, 20 neighbours give a normal that noise hardly turns
 
 
@@ -153,6 +162,12 @@ class Registration(PoseEstimator):
             self.config.object_deviation_m,
             is_masked=is_masked,
         )
+        prior_odds = PRIOR_MASKED if is_masked else PRIOR_PROPOSED
+        first = compare(observation, refinement.refined.camera_from_model, prepared.surface)
+        if not is_masked and probability_right(first, prior_odds) < _HOPELESS:
+            seconds["evidence"] = time.perf_counter() - began
+            reason = contradiction(first, probability_right(first, prior_odds))
+            return refused(given, Refusal(status="doubtful", reason=reason), seconds)
         competition = compete(
             cloud.cloud_m.double(),
             refinement.refined,
@@ -162,7 +177,6 @@ class Registration(PoseEstimator):
             icp,
         )
         seconds["evidence"] = time.perf_counter() - began
-        prior_odds = PRIOR_MASKED if is_masked else PRIOR_PROPOSED
         return decide(
             cloud,
             prepared,

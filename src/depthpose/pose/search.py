@@ -102,7 +102,9 @@ def find_objects(view: ViewInput, targets: SearchTargets) -> list[PoseEstimate]:
         view: depth and camera; its mask limits where is looked.
         targets: what for.
     """
-    frame = prepare_frame(torch.where(view.mask, view.depth_m, torch.nan), view.K)
+    smallest_m = min(targets.object_of(name).surface.diameter_m for name in targets.names)
+    depth_m = torch.where(view.mask, view.depth_m, torch.nan)
+    frame = prepare_frame(depth_m, view.K, smallest_m)
     is_left = torch.ones_like(frame.depth_m, dtype=torch.bool)
     names = list(targets.names)
     found: list[_Judged] = []
