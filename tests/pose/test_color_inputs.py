@@ -13,7 +13,7 @@ from tests.pose.synthetic_objects import bracket
 from depthpose.core.camera import Camera
 from depthpose.core.errors import InputError, Notice
 from depthpose.core.rigid import Rigid, rotation_by
-from depthpose.pose.estimator.color_inputs import with_color
+from depthpose.pose.color_inputs import with_color
 from depthpose.pose.types import ObjectModel, SurfaceColors, ViewInput
 
 K = torch.tensor([[50.0, 0, 8], [0, 50, 6], [0, 0, 1]])

@@ -336,7 +336,8 @@ def _read_detection(
     """Read a depth image with the pixels of a detection."""
     assert found.object is not None
     view = view_input(path, None, camera, found.object, name, unit)
-    return replace(view, mask=found.mask(*view.depth_m.shape))
+    mask = found.mask(*view.depth_m.shape)
+    return replace(view, mask=mask, is_region=found.box is not None)
 
 
 def _beside_depths(

@@ -9,7 +9,7 @@ from depthpose.core.camera.camera_file import intrinsics_of
 from depthpose.core.errors import InputError, Notice
 from depthpose.core.files import Picture, as_tensor
 from depthpose.core.rigid import Rigid
-from depthpose.pose.estimator.inputs import AnyArray, rigid_input
+from depthpose.pose.inputs import AnyArray, rigid_input
 from depthpose.pose.types import ColorImage, ObjectModel, ViewInput
 
 

@@ -52,6 +52,8 @@ RIGHT_UNOBSERVED = Rate(mean=0.2, shape=1.0)
 WRONG_UNOBSERVED = Rate(mean=0.5, shape=3.0)
 PRIOR_MASKED = 20.0
 """Odds of the best pose being right before its evidence is seen, where a mask shows the object."""
+PRIOR_REGION = 2.0
+"""The same where a detector's box or a mask that does not fit says that one is there."""
 PRIOR_PROPOSED = 0.1
 """The same where a search proposed the pose: most places that votes point at show no object."""
 WRONG_RMS = 1.2
@@ -77,6 +79,7 @@ class Hypothesis:
         evidence: of the pose.
         votes_rad: mean angle between a network's directions and those to the keypoints of the
             pose; None without a network.
+        log_color: log likelihood of the colour image; 0 without one.
     """
 
     pose: Rigid
@@ -84,6 +87,7 @@ class Hypothesis:
     residual_m: float
     evidence: Evidence
     votes_rad: float | None = None
+    log_color: float = 0.0
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -116,7 +120,7 @@ def share_among_poses(hypotheses: Sequence[Hypothesis]) -> Float64[Tensor, " n"]
     """
     area = _common_area(hypotheses)
     weights = [
-        log_odds_right(hypothesis.evidence, area) + _log_votes(hypothesis)
+        log_odds_right(hypothesis.evidence, area) + _log_beside_depth(hypothesis)
         for hypothesis in hypotheses
     ]
     return torch.tensor(weights, dtype=torch.float64).softmax(0)
@@ -134,7 +138,7 @@ def share_among_copies(hypotheses: Sequence[Hypothesis]) -> Float64[Tensor, " n"
         evidence = hypothesis.evidence
         fits_right = RIGHT_CONTRADICTED.log_likelihood(evidence.contradicted, area)
         fits_right += RIGHT_UNOBSERVED.log_likelihood(evidence.unobserved, area)
-        weights.append(fits_right + _log_fit(evidence.rms) + _log_votes(hypothesis))
+        weights.append(fits_right + _log_fit(evidence.rms) + _log_beside_depth(hypothesis))
     return torch.tensor(weights, dtype=torch.float64).softmax(0)
 
 
@@ -171,9 +175,10 @@ def _log_fit(rms: float) -> float:
     return -INDEPENDENT_SIDES / 2 * math.log(1 + rms**2)
 
 
-def _log_votes(hypothesis: Hypothesis) -> float:
-    """Log likelihood of a network's votes, where there is one."""
-    return 0.0 if hypothesis.votes_rad is None else -hypothesis.votes_rad / VOTES_RAD
+def _log_beside_depth(hypothesis: Hypothesis) -> float:
+    """Log likelihood of what is known beside depth: a colour image, a network's votes."""
+    log_votes = 0.0 if hypothesis.votes_rad is None else -hypothesis.votes_rad / VOTES_RAD
+    return log_votes + hypothesis.log_color
 
 
 def decide(

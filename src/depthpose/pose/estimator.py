@@ -13,12 +13,15 @@ from tqdm import tqdm
 from depthpose.core.camera import AnyCamera, choose_lens
 from depthpose.core.devices import each_in_own_arithmetic, each_in_threads, own_arithmetic
 from depthpose.core.errors import InputError, full_memory, nearest_name
+from depthpose.core.files import Picture
 from depthpose.core.rigid import Rigid
 from depthpose.core.units import Unit
 from depthpose.pose.cloud import Refusal
+from depthpose.pose.color_inputs import with_color
 from depthpose.pose.config import EstimateConfig, RefusalConfig
 from depthpose.pose.copies import PreparedObject, with_copies
-from depthpose.pose.decide import refused, with_status
+from depthpose.pose.datasets.detections import Box, box_mask
+from depthpose.pose.decide import PRIOR_REGION, refused, with_status
 from depthpose.pose.inputs import (
     AnyArray,
     AnyInput,
@@ -111,14 +114,31 @@ class PoseEstimator:
             answers.append(one)
         return answers
 
+    def _estimate_in_region(self, view: ViewInput) -> PoseEstimate:
+        """Estimate the one object that is somewhere in the mask of a view, as in a box."""
+        began = time.perf_counter()
+        targets = SearchTargets(
+            names=[view.object],
+            object_of=self._prepared,
+            estimate_near=self._estimate_near,
+            prior_odds=PRIOR_REGION,
+            is_single=True,
+        )
+        found = find_objects(view, targets)
+        spent_s = time.perf_counter() - began
+        if not found:
+            return nothing_found(view, view.object, spent_s)
+        best = replace(found[0], name=view.name, seconds={**found[0].seconds, "search": spent_s})
+        return with_status(best, self.config.min_certainty)
+
     def _estimate_near(
-        self, inputs: Sequence[CloudInput], proposals: Sequence[Rigid]
+        self, inputs: Sequence[CloudInput], proposals: Sequence[Rigid], prior_odds: float
     ) -> list[PoseEstimate]:
         """Estimate clouds by the poses that were proposed for each."""
         raise NotImplementedError
 
     @own_arithmetic()
-    def estimate(
+    def estimate(  # noqa: PLR0913  every form of input
         self,
         *,
         cloud: AnyArray | None = None,
@@ -128,8 +148,12 @@ class PoseEstimator:
         camera: AnyCamera | None = None,
         focal_px: float | None = None,
         object: str | None = None,
+        box: Box | None = None,
+        color: Picture | None = None,
+        color_camera: AnyCamera | None = None,
+        color_from_depth: Rigid | AnyArray | None = None,
     ) -> PoseEstimate:
-        """Estimate one pose, from a cloud or from a depth image with a mask.
+        """Estimate one pose, from a cloud or from a depth image with a mask or a box.
 
         Args:
             cloud: points of the object alone, in the camera frame (x right, y down, z forward).
@@ -141,19 +165,33 @@ class PoseEstimator:
                 file has, or the 3x3 matrix K.
             focal_px: the focal length alone [px], in place of a camera.
             object: which one; None: whichever of those that are known it is, if any.
+            box: in place of a mask, the left, top, right and bottom edge of a detector's box [px]:
+                the object is searched for in it.
+            color: colour image of the same moment, which tells apart copies of a coloured model
+                that depth does not: RGB, of the depth camera's frame unless it has its own camera.
+            color_camera: of the colour image; None: that of the depth image.
+            color_from_depth: the depth camera in the colour camera's frame; None: at one place.
 
         Raises:
             InputError: an unknown object, a file that cannot be read, shapes that do not fit. What
                 the data themselves lack is no error but a refusal.
         """
         which = self.objects[0] if object is None else self._known(object).model.name
-        if cloud is not None and depth is None and mask is None:
+        if cloud is not None and depth is None and mask is None and box is None:
             given = cloud_input(cloud, unit or "m", which, _NAME)
         else:
             lens = choose_lens(camera, focal_px)
-            if cloud is not None or depth is None or mask is None or lens is None:
-                raise InputError("estimate: give cloud=, or depth=, mask= and camera= together")
+            is_view = cloud is None and depth is not None and (mask is None) != (box is None)
+            if depth is None or lens is None or not is_view:
+                raise InputError(
+                    "estimate: give cloud=, or depth=, camera= and one of mask= and box= together"
+                )
             given = view_input(depth, mask, lens, which, _NAME, unit)
+            if box is not None:
+                pixels = box_mask(box, *given.depth_m.shape)
+                given = replace(given, mask=pixels, is_region=True)
+            models = self.models if object is None else [self._known(object).model]
+            given = with_color(given, models, color, color_camera, color_from_depth)
         if object is not None or len(self.models) == 1:
             return self._answers([given], is_likely=True)[0]
         tried = [replace(given, object=name) for name in self.objects]
@@ -242,13 +280,13 @@ class PoseEstimator:
             objects: which may be there.
             is_sure: answer only what is likelier there than not, and search once.
         """
-        known = SearchTargets(
+        targets = SearchTargets(
             names=objects,
             object_of=self._prepared,
             estimate_near=self._estimate_near,
-            is_sure=is_sure,
+            is_single=is_sure,
         )
-        found = find_objects(view, known)
+        found = find_objects(view, targets)
         return [with_status(estimate, self.config.min_certainty) for estimate in found]
 
     def track(

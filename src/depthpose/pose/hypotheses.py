@@ -8,12 +8,14 @@ from torch import Tensor
 
 from depthpose.core.arrays import take_evenly
 from depthpose.core.rigid import Rigid
+from depthpose.pose.color import color_agreement, color_copies
 from depthpose.pose.config import IcpConfig
 from depthpose.pose.copies import PreparedObject, with_copies
 from depthpose.pose.decide import Competition, Hypothesis, share_among_copies, share_among_poses
 from depthpose.pose.evidence import Observation, compare
 from depthpose.pose.icp import RefinedPose, refine_pose, refine_roughly
 from depthpose.pose.surface import NEAR, Surface
+from depthpose.pose.types import ViewInput
 
 _POINTS = 250  # of the cloud that refine a competing pose
 _STEPS = 6  # of ICP for poses that were refined roughly
@@ -31,6 +33,7 @@ def compete(
     prepared: PreparedObject,
     observation: Observation,
     icp: IcpConfig | None,
+    view: ViewInput | None = None,
     votes_rad: Callable[[Rigid], float] | None = None,
 ) -> Competition:
     """Compare a refined pose with others, with its look-alikes and with its near-symmetric copies.
@@ -42,6 +45,7 @@ def compete(
         prepared: the object.
         observation: of it.
         icp: of the refinement; None: poses stay where they are.
+        view: whose colour image tells copies apart; None: depth alone.
         votes_rad: mean angle between a network's directions and those to the keypoints of a pose.
     """
     copies = with_copies(prepared)
@@ -55,6 +59,7 @@ def compete(
             residual_m=float(source.residual_m),
             evidence=compare(observation, pose, surface),
             votes_rad=None if votes_rad is None else votes_rad(pose),
+            log_color=0.0 if view is None else _log_color(pose, prepared, view),
         )
 
     # Which pose is it, up to near-symmetric copies?
@@ -74,7 +79,10 @@ def compete(
     pose = leading[winner].pose
     source = replace(refined, camera_from_model=pose, covariance=leading[winner].covariance)
     group = [leading[winner]]
-    for candidate in _refined(cloud_m, source, pose @ copies.copies, surface, icp, _MOST_COPIES):
+    starts = pose @ copies.copies
+    if view is not None:  # print shows finer steps about an axis than shape does
+        starts = Rigid.cat([color_copies(pose, prepared.model, view), starts])
+    for candidate in _refined(cloud_m, source, starts, surface, icp, _MOST_COPIES):
         before = Rigid.stack([h.pose for h in group])
         if not bool(copies.is_same(candidate.camera_from_model, before, copies.symmetries).any()):
             group.append(hypothesis(candidate))
@@ -86,6 +94,11 @@ def compete(
         copies=[(h, float(copy_shares[k])) for k, h in enumerate(group) if k != best],
         others=others_shares,
     )
+
+
+def _log_color(pose: Rigid, prepared: PreparedObject, view: ViewInput) -> float:
+    """Log likelihood of a view's colour image at a pose; 0 where it or the model has none."""
+    return float(color_agreement(pose[None], prepared.model, view).log_likelihood[0])
 
 
 def _refined(

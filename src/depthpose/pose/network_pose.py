@@ -179,9 +179,9 @@ class GeoPoseNet(PoseEstimator):
         return self._registration
 
     def _estimate_near(
-        self, inputs: Sequence[CloudInput], proposals: Sequence[Rigid]
+        self, inputs: Sequence[CloudInput], proposals: Sequence[Rigid], prior_odds: float
     ) -> list[PoseEstimate]:
-        return self._by_models()._estimate_near(inputs, proposals)
+        return self._by_models()._estimate_near(inputs, proposals, prior_odds)
 
     @torch.no_grad()
     @own_arithmetic()
@@ -206,6 +206,8 @@ class GeoPoseNet(PoseEstimator):
             return found, CloudDirections(one.cloud, one.directions)
 
     def _prepare(self, given: AnyInput) -> CloudToPose | PoseEstimate:
+        if isinstance(given, ViewInput) and given.is_region:
+            return self._estimate_in_region(given)
         prepared = self._known(given.object)
         with_copies(prepared)  # in the seconds of no input
         start = time.perf_counter()
@@ -301,7 +303,8 @@ class GeoPoseNet(PoseEstimator):
         )
         prior_odds = PRIOR_MASKED if is_likely else PRIOR_PROPOSED
         votes_rad = partial(self._disagreement, job)
-        competition = compete(cloud_m, leading, others, prepared, observation, icp, votes_rad)
+        view = cloud.view if cloud.view is not None and cloud.view.color is not None else None
+        competition = compete(cloud_m, leading, others, prepared, observation, icp, view, votes_rad)
         seconds["evidence"] = time.perf_counter() - began
         return decide(
             cloud, prepared, competition, observation, self.refusal, config, seconds, prior_odds,

@@ -21,7 +21,6 @@ from depthpose.pose.config import CloudConfig, EstimateConfig, RefusalConfig
 from depthpose.pose.copies import PreparedObject
 from depthpose.pose.decide import (
     PRIOR_MASKED,
-    PRIOR_PROPOSED,
     contradiction,
     decide,
     probability_right,
@@ -34,7 +33,7 @@ from depthpose.pose.icp import refine_best
 from depthpose.pose.inputs import AnyInput
 from depthpose.pose.mesh import read_model, refuse_one_name, with_found_symmetries
 from depthpose.pose.propose.point_pairs import propose_poses
-from depthpose.pose.types import CloudInput, ObjectModel, PoseEstimate
+from depthpose.pose.types import CloudInput, ObjectModel, PoseEstimate, ViewInput
 
 _VOXEL_DIAMETERS = 0.05  # distance of the points that vote
 _LEAST_POINTS = 500  # of a model without faces
@@ -124,14 +123,32 @@ class Registration(PoseEstimator):
             self._prepared(name)
 
     def _estimate_near(
-        self, inputs: Sequence[CloudInput], proposals: Sequence[Rigid]
+        self, inputs: Sequence[CloudInput], proposals: Sequence[Rigid], prior_odds: float
     ) -> list[PoseEstimate]:
         """Estimate objects of a search from the poses that were proposed for each."""
-        pairs = zip(inputs, proposals, strict=True)
-        threads = torch.get_num_threads()
-        return list(each_in_threads(lambda pair: self._estimate(*pair), pairs, threads))
 
-    def _estimate(self, given: AnyInput, proposals: Rigid | None = None) -> PoseEstimate:
+        def estimate(pair: tuple[CloudInput, Rigid]) -> PoseEstimate:
+            given, proposed = pair
+            return self._estimate_cloud(given, proposed, prior_odds)
+
+        pairs = zip(inputs, proposals, strict=True)
+        return list(each_in_threads(estimate, pairs, torch.get_num_threads()))
+
+    def _estimate(self, given: AnyInput) -> PoseEstimate:
+        """Estimate a pose from the points of a mask; from its region, if the mask does not fit."""
+        if isinstance(given, ViewInput) and given.is_region:
+            return self._estimate_in_region(given)
+        estimate = self._estimate_cloud(given, None, PRIOR_MASKED)
+        if estimate.status != "doubtful" or not isinstance(given, ViewInput):
+            return estimate
+        in_region = self._estimate_in_region(replace(given, is_region=True))
+        if not in_region.is_posed:
+            return estimate
+        return replace(in_region, seconds={**estimate.seconds, **in_region.seconds})
+
+    def _estimate_cloud(
+        self, given: AnyInput, proposals: Rigid | None, prior_odds: float
+    ) -> PoseEstimate:
         """Estimate a pose from a mask's points, or from those at a pose that a search proposed."""
         prepared = self._prepared(given.object)  # once for all inputs, and in the seconds of none
         is_masked = proposals is None
@@ -162,7 +179,6 @@ class Registration(PoseEstimator):
             self.config.object_deviation_m,
             is_masked=is_masked,
         )
-        prior_odds = PRIOR_MASKED if is_masked else PRIOR_PROPOSED
         first = compare(observation, refinement.refined.camera_from_model, prepared.surface)
         if not is_masked and probability_right(first, prior_odds) < _HOPELESS:
             seconds["evidence"] = time.perf_counter() - began
@@ -175,6 +191,7 @@ class Registration(PoseEstimator):
             prepared,
             observation,
             icp,
+            cloud.view if cloud.view is not None and cloud.view.color is not None else None,
         )
         seconds["evidence"] = time.perf_counter() - began
         return decide(

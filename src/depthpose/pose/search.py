@@ -48,6 +48,8 @@ _CONTINUED = 0.4
 """Where the plane goes on beside so much of it, the outline is a cut through something larger."""
 _RIM = 0.05
 """Width of what is looked at beside it, in diameters."""
+_REGION_MARGIN = 0.5
+"""Of the larger side of a region: so far about it planes and neighbours are looked at."""
 _LEAST_SHARE = 0.8
 """Where no object among several has so large a share of the probability, none is reported."""
 
@@ -60,13 +62,15 @@ class SearchTargets:
         names: of the objects.
         object_of: gives an object by its name, with its point pairs and copies.
         estimate_near: estimates objects from clouds and the poses that were proposed for them.
-        is_sure: search once, as tracking does, which looks for one thing.
+        prior_odds: of the best pose at a place being right.
+        is_single: search once, for one object.
     """
 
     names: Sequence[str]
     object_of: Callable[[str], PreparedObject]
-    estimate_near: Callable[[Sequence[CloudInput], Sequence[Rigid]], list[PoseEstimate]]
-    is_sure: bool = False
+    estimate_near: Callable[[Sequence[CloudInput], Sequence[Rigid], float], list[PoseEstimate]]
+    prior_odds: float = PRIOR_PROPOSED
+    is_single: bool = False
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -102,14 +106,14 @@ def find_objects(view: ViewInput, targets: SearchTargets) -> list[PoseEstimate]:
         view: depth and camera; its mask limits where is looked.
         targets: what for.
     """
+    view = _window_of_region(view)
     smallest_m = min(targets.object_of(name).surface.diameter_m for name in targets.names)
-    depth_m = torch.where(view.mask, view.depth_m, torch.nan)
-    frame = prepare_frame(depth_m, view.K, smallest_m)
-    is_left = torch.ones_like(frame.depth_m, dtype=torch.bool)
+    frame = prepare_frame(view.depth_m, view.K, smallest_m)
+    is_left = view.mask[:: frame.step, :: frame.step].clone()
     names = list(targets.names)
     found: list[_Judged] = []
     taken: list[_Judged] = []
-    for _ in range(1 if targets.is_sure else _ROUNDS):
+    for _ in range(1 if targets.is_single else _ROUNDS):
         groups = _group(_propose(frame, is_left, names, targets), taken, frame, targets)
         judged = _judge(groups, frame, view, targets)
         more, taken = _suppress(judged, taken)
@@ -212,12 +216,12 @@ def _judge(
     for number, group in enumerate(groups):
         mask = group[0].explained
         mask = mask.repeat_interleave(frame.step, 0).repeat_interleave(frame.step, 1)
-        cloud_m = cloud_from_depth(view.depth_m, mask[:height, :width] & view.mask, view.K)
+        cloud_m = cloud_from_depth(view.depth_m, mask[:height, :width], view.K)
         name = f"{view.name}_{number}"
         inputs.append(CloudInput(name=name, points_m=cloud_m, object=group[0].object, view=view))
     proposals = [Rigid.stack([place.pose for place in group]) for group in groups]
     judged: list[_Judged] = []
-    for estimate in targets.estimate_near(inputs, proposals) if inputs else []:
+    for estimate in targets.estimate_near(inputs, proposals, targets.prior_odds) if inputs else []:
         if estimate.camera_from_model is None or estimate.evidence is None:
             continue
         surface = targets.object_of(estimate.object).surface
@@ -230,7 +234,7 @@ def _judge(
                 pose=pose,
                 explained=explained_mask(frame, pose, surface),
                 estimate=estimate,
-                log_odds=math.log(PRIOR_PROPOSED) + log_odds_right(estimate.evidence),
+                log_odds=math.log(targets.prior_odds) + log_odds_right(estimate.evidence),
             )
         )
     return judged
@@ -280,6 +284,20 @@ def explained_mask(image: Frame | ViewInput, pose: Rigid, surface: Surface) -> B
     gap_m[is_open] = (some_m - surface.points_m[surface.nearest(some_m)]).norm(dim=-1)
     found[found.clone()] = gap_m < limit_m
     return found
+
+
+def _window_of_region(view: ViewInput) -> ViewInput:
+    """Cut a view about its mask, with a margin in which planes and neighbours show."""
+    rows, columns = view.mask.any(1).nonzero()[:, 0], view.mask.any(0).nonzero()[:, 0]
+    if len(rows) == 0:
+        return view
+    margin = int(_REGION_MARGIN * max(int(rows[-1] - rows[0]), int(columns[-1] - columns[0])))
+    top, left = max(int(rows[0]) - margin, 0), max(int(columns[0]) - margin, 0)
+    part = slice(top, int(rows[-1]) + margin + 1), slice(left, int(columns[-1]) + margin + 1)
+    K = view.K.clone()
+    K[0, 2] -= left
+    K[1, 2] -= top
+    return replace(view, depth_m=view.depth_m[part], mask=view.mask[part], K=K)
 
 
 def is_cut_out(view: ViewInput, pose: Rigid, surface: Surface) -> bool:

@@ -93,6 +93,9 @@ class ViewInput:
     K: Float[Tensor, "3 3"]  #: intrinsic matrix of this image (a window shifts the principal point)
     object: str  # name of the object
     color: ColorImage | None = None  #: of the same moment; None: depth alone
+    #: the mask only limits where the object is, as a detector's box does: what lies in it and is
+    #: not the object is no evidence against a pose.
+    is_region: bool = False
 
 
 AnyInput = CloudInput | ViewInput

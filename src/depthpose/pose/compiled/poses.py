@@ -1,4 +1,4 @@
-"""Poses: steps of point-to-plane ICP, and of a scale beside; formulas of pose.refine and fit."""
+"""Steps of point-to-plane ICP, and of a scale: the formulas of pose.icp and pose.identity."""
 
 from typing import NamedTuple
 
