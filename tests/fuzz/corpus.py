@@ -378,7 +378,7 @@ def open_bop_results(home: Path) -> dict[str, Kind]:
     estimate = PoseEstimate(
         name="a", object="b", status="ok", camera_from_model=pose,
         covariance=torch.eye(6), free_motions=torch.zeros(0, 6), keypoints_m=torch.rand(8, 3),
-        inlier_share=0.5, residual_m=0.1, certainty=0.9, signals={"x": 1.0}, seconds={"icp": 0.1},
+        inlier_share=0.5, residual_m=0.1, certainty=0.9, copy_certainty=0.6, seconds={"icp": 0.1},
     )  # fmt: skip
     rows = [Prediction(estimate=estimate, place=Place(0, k, 7)) for k in range(3)]
     write_bop_results(home / "r.csv", rows)

@@ -21,7 +21,6 @@ from depthpose.core.errors import InputError
 from depthpose.core.rigid import Rigid
 from depthpose.pose.config import RefusalConfig
 from depthpose.pose.search import explained_mask, is_cut_out, nothing_found
-from depthpose.pose.identity import Seen
 from depthpose.pose.mesh import make_model
 from depthpose.pose.metrics import add_m
 from depthpose.pose.surface import NEAR, prepare_surface
@@ -91,8 +90,8 @@ def test_a_piece_of_a_larger_plane_is_no_flat_part(
         depth_m[rows[0] : rows[-1] + 1, columns[-1] :] = top_m
     depth_m = torch.where(mask, seen.float(), depth_m)
     depth_m += 0.001 * torch.randn(240, 320, generator=torch.Generator().manual_seed(0))
-    seen = Seen(depth_m=depth_m.double(), is_own=mask, K=K.double(), noise_m=0.001)
-    assert is_cut_out(seen, pose, prepare_surface(model)) == is_cut
+    view = ViewInput(name="a", depth_m=depth_m, mask=mask, K=K, object=model.name)
+    assert is_cut_out(view, pose, prepare_surface(model)) == is_cut
 
 
 def test_readings_on_a_posed_surface_are_all_that_are_near_it() -> None:
@@ -102,8 +101,8 @@ def test_readings_on_a_posed_surface_are_all_that_are_near_it() -> None:
     depth_m = (table() + 0.01 * torch.randn(240, 320, generator=noise)).double()
     local_m = pose.inverse().apply(back_project(depth_m, K.double()))
     distance_m = torch.from_numpy(surface.tree.query(local_m.numpy())[0])
-    seen = Seen(depth_m=depth_m, is_own=depth_m > 0, K=K.double(), noise_m=0.01)
-    found, near = explained_mask(seen, pose, surface), distance_m < NEAR * surface.diameter_m
+    view = ViewInput(name="a", depth_m=depth_m, mask=depth_m > 0, K=K, object=model.name)
+    found, near = explained_mask(view, pose, surface), distance_m < NEAR * surface.diameter_m
     assert int(near.sum()) > 500
     assert int((found != near).sum()) < 3, "but for rounding"
 
@@ -116,8 +115,8 @@ def test_what_the_camera_saw_through_a_found_pose_counts() -> None:
     assert len(Oracle(tiny_weights(bracket()), TRUTHS).find(depth_m, CAMERA)) == 2
     depth_m[hole] = 1.2
     (found,) = Oracle(tiny_weights(bracket()), TRUTHS).find(depth_m, CAMERA)
-    assert found.fit is not None
-    assert found.fit.agrees > 0.95
+    assert found.evidence is not None
+    assert found.evidence.agreement > 0.95
 
 
 def test_the_same_thing_is_found_once_however_it_is_parted() -> None:

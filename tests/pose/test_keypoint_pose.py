@@ -11,7 +11,7 @@ from depthpose.core.rigid import Rigid, cross_matrix, perturb
 from depthpose.pose.cloud import voxelise
 from depthpose.pose.config import CloudConfig
 from depthpose.pose.datasets import open_bop
-from depthpose.pose.identity import free_motions
+from depthpose.pose.observability import free_motions
 from depthpose.pose.metrics import add_m
 from depthpose.pose.icp import refine_pose
 from depthpose.pose.surface import prepare_surface

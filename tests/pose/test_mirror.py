@@ -51,7 +51,7 @@ def test_the_mirror_image_fits_a_mirrored_copy_better_and_the_object_worse(seed:
 
 
 def estimated(model: ObjectModel, seen: ObjectModel) -> PoseEstimate:
-    refusal = RefusalConfig(max_beyond=1.0, min_agreement=0.0, min_found=0.0)
+    refusal = RefusalConfig(min_probability=0.0)
     net = Oracle(tiny_weights(model, refusal=refusal), [TRUTH])
     return net.estimate(cloud=noisy(cloud_of(seen, TRUTH)))
 

@@ -23,7 +23,7 @@ from depthpose.pose.predictions import (
     write_bop_results,
     write_predictions,
 )
-from depthpose.pose.types import Alternative, Fit, Identity, PoseEstimate, Status
+from depthpose.pose.types import Alternative, Evidence, Identity, PoseEstimate, Status
 
 
 def some_pose(seed: int) -> Rigid:
@@ -44,18 +44,28 @@ def answer(name: str = "a", seed: int = 0) -> PoseEstimate:
         free_motions=torch.randn(1, 6, generator=generator),
         inlier_share=0.75,
         residual_m=0.002,
-        fit=Fit(agrees=0.875, seen=0.5, beyond=0.0, explained=0.9, noise_m=0.001),
+        evidence=Evidence(
+            visible=40.0,
+            supported=30.5,
+            unobserved=8.0,
+            seen_through=1.5,
+            bulging=0.0,
+            beside=0.25,
+            rms=0.75,
+            noise_m=0.001,
+        ),
         certainty=0.5,
+        copy_certainty=0.375,
         identity=Identity(status="not excluded", size=1.02, size_deviation=0.01, reason="so"),
         alternatives=(
             Alternative(
                 camera_from_model=some_pose(seed + 9),
                 probability=0.375,
-                difference="turned by 180 degrees about the long axis",
+                difference="rotated by 180 degrees about the long axis",
+                is_copy=True,
             ),
         ),
-        signals={"gap": 0.01, "far": 0.2},
-        seconds={"network": 0.015, "voting": 0.007},
+        seconds={"network": 0.015, "proposal": 0.007},
     )
 
 

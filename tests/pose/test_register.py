@@ -49,8 +49,8 @@ def test_poses_of_a_part_that_no_training_saw_are_right_or_refused() -> None:
     assert len(errors_m) >= 3
     assert max(errors_m) < 0.05 * part().diameter_m
     for one in found:
-        assert one.fit is not None
-        assert {"voting", "icp", "check"} <= one.seconds.keys()
+        assert one.evidence is not None
+        assert {"cloud", "proposal", "icp", "evidence", "decision"} <= one.seconds.keys()
 
 
 def test_what_it_registers_is_said() -> None:
@@ -88,7 +88,7 @@ def test_one_seed_gives_one_answer() -> None:
     first, again = (registration().estimate_many([given])[0] for _ in range(2))
     other = Registration([part()], EstimateConfig(voting=VotingConfig(seed=0)))
     apart = other.estimate_many([given])[0]
-    assert first.signals == again.signals == apart.signals
+    assert first.certainty == again.certainty == apart.certainty
     assert first.camera_from_model is not None
     assert apart.camera_from_model is not None
     assert torch.equal(first.camera_from_model.R, apart.camera_from_model.R)
@@ -148,7 +148,7 @@ def test_registration_without_icp_is_an_error() -> None:
 def doubting_net() -> GeoPoseNet:
     """Trained weights that take none of their own answers."""
     weights = read_pose_weights(find_weights("parts"))
-    strict = replace(weights.refusal, min_agreement=1.0, max_beyond=0.0, min_found=1.0)
+    strict = replace(weights.refusal, min_probability=1.0)
     nothing = replace(weights, refusal=strict)
     return GeoPoseNet(nothing, EstimateConfig(register_refused=True))
 

@@ -31,9 +31,7 @@ def test_the_scale_of_a_copy_is_measured(times: float) -> None:
 
 def estimated(times: float, max_size_error: float = 0.03) -> PoseEstimate:
     model = bracket()
-    refusal = RefusalConfig(
-        max_size_error=max_size_error, max_beyond=1.0, min_agreement=0.0, min_found=0.0
-    )
+    refusal = RefusalConfig(max_size_error=max_size_error, min_probability=0.0)
     net = Oracle(tiny_weights(model, refusal=refusal), [TRUTH])
     return net.estimate(cloud=noisy(cloud_of(scaled(model, times), TRUTH)))
 

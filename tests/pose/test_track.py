@@ -180,7 +180,7 @@ def test_what_else_it_may_be_moves_along() -> None:
     poses = moving(2)
     half = Rigid(torch.diag(torch.tensor([-1.0, -1.0, 1.0])), torch.zeros(3))
     other = Alternative(
-        camera_from_model=poses[0] @ half, probability=0.3, difference="turned by 180 degrees"
+        camera_from_model=poses[0] @ half, probability=0.3, difference="rotated by 180 degrees"
     )
     start = PoseEstimate(
         name="a", object="bracket", status="ok", camera_from_model=poses[0], certainty=0.7,

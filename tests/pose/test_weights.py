@@ -38,7 +38,7 @@ def turned() -> ObjectModel:
 
 def test_network_and_objects_come_back_exactly(tmp_path: Path) -> None:
     cloud = CloudConfig(voxel_m=0.005, max_points=None)
-    refusal = RefusalConfig(min_agreement=0.7, candidate_slopes={"far": 2.0})
+    refusal = RefusalConfig(min_probability=0.7, max_size_error=0.05)
     weights = tiny_weights(bracket(), bottle(), turned(), cloud=cloud, refusal=refusal)
     write_pose_weights(tmp_path / "w.safetensors", weights)
     again = read_pose_weights(tmp_path / "w.safetensors")

@@ -1,0 +1,230 @@
+"""Evidence for and against a pose: drawn surfaces beside what the camera saw."""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from scipy import ndimage
+from tests.pose.synthetic_objects import K, bottle, box_faces, bracket, generator, pose_at, view_of
+from torch import Tensor
+
+from depthpose.core.render import rasterize
+from depthpose.core.rigid import Rigid
+from depthpose.pose.cloud import cloud_from_depth, grow_mask
+from depthpose.pose.evidence import Observation, compare, draw_surface, observe
+from depthpose.pose.mesh import make_model, turn_about
+from depthpose.pose.surface import prepare_surface
+from depthpose.pose.synthetic.parts import make_part
+from depthpose.pose.types import Evidence, ObjectModel, ViewInput
+
+WALL_M = 1.3
+OBJECT_M = 0.001
+
+Block = tuple[tuple[float, float, float], tuple[float, float, float]]
+"""Size and middle of a box [m]."""
+
+
+def boxes(name: str, *parts: Block) -> ObjectModel:
+    """A model of boxes."""
+    corners, faces = box_faces()
+    vertices = torch.cat([corners * torch.tensor(size) + torch.tensor(at) for size, at in parts])
+    every = torch.cat([faces + 8 * k for k in range(len(parts))])
+    return make_model(vertices, every, name=name, number=1)
+
+
+def view_before_wall(model: ObjectModel, pose: Rigid, noise_m: float = 0.0) -> ViewInput:
+    """A model before a wall, with independent noise, and its exact mask."""
+    depth_m, mask = view_of(model, pose)
+    depth_m = torch.where(mask, depth_m, torch.tensor(WALL_M).to(depth_m))
+    depth_m = depth_m + noise_m * torch.randn(240, 320, generator=generator(0))
+    return ViewInput(name="a", depth_m=depth_m.float(), mask=mask, K=K, object=model.name)
+
+
+def observation_of(view: ViewInput, model: ObjectModel, *, is_masked: bool = True) -> Observation:
+    cloud_m = cloud_from_depth(view.depth_m, view.mask, K)
+    return observe(cloud_m, view, model.diameter_m, OBJECT_M, is_masked=is_masked)
+
+
+def evidence_of(
+    view: ViewInput, model: ObjectModel, pose: Rigid, *, is_masked: bool = True
+) -> Evidence:
+    observation = observation_of(view, model, is_masked=is_masked)
+    return compare(observation, pose, prepare_surface(model))
+
+
+def left_part(mask: Tensor) -> Tensor:
+    """The pixels of a mask that are left of its middle column."""
+    columns = torch.arange(320).expand(240, 320)
+    return mask & (columns < columns[mask].median())
+
+
+@pytest.mark.parametrize("model", [bracket(), bottle(), make_part("mug")], ids=lambda m: m.name)
+@pytest.mark.parametrize("seed", [0, 3])
+def test_a_drawn_surface_is_what_the_renderer_draws(model: ObjectModel, seed: int) -> None:
+    pose = pose_at(z_m=0.6, seed=seed).double()
+    surface = prepare_surface(model)
+    drawn_m, cosine, window = draw_surface(surface, pose, K, 240, 320)
+    image_m = np.full((240, 320), np.nan)
+    image_m[window] = drawn_m
+    triangles = pose.apply(model.vertices_m.double())[model.faces]
+    exact_m = rasterize(triangles, K, 320, 240).depth_m.double().numpy()
+    is_drawn, is_exact = np.isfinite(image_m), np.isfinite(exact_m)
+    assert is_exact.sum() > 2000
+
+    # The silhouette is within two pixels.
+    assert not (is_drawn & ~ndimage.binary_dilation(is_exact, iterations=2)).any()
+    assert not (ndimage.binary_erosion(is_exact, iterations=2) & ~is_drawn).any()
+
+    # The depth is within 0.2 mm where the surface is smooth: away from silhouettes and edges.
+    bend_m = np.abs(ndimage.laplace(np.where(is_exact, exact_m, 9.0)))
+    inner = is_drawn & ~ndimage.binary_dilation(bend_m > 0.0003, iterations=4)
+    assert inner.sum() > 0.2 * is_exact.sum()
+    assert np.nanmax(np.abs(image_m - exact_m)[inner]) < 0.0002
+    assert np.all((cosine[np.isfinite(drawn_m)] > 0) & (cosine[np.isfinite(drawn_m)] <= 1 + 1e-6))
+
+
+def test_nothing_is_drawn_behind_the_camera_or_beside_the_image() -> None:
+    surface = prepare_surface(bracket())
+    for t_m in ([0.0, 0.0, -0.8], [5.0, 0.0, 0.8]):
+        pose = Rigid(torch.eye(3).double(), torch.tensor(t_m).double())
+        drawn_m, _, window = draw_surface(surface, pose, K, 240, 320)
+        assert drawn_m.size == 0
+        assert window == (slice(0, 0), slice(0, 0))
+
+
+@pytest.mark.parametrize("noise_m", [0.0, 0.001, 0.003])
+@pytest.mark.parametrize("seed", [0, 1, 2])
+def test_the_right_pose_is_not_contradicted(noise_m: float, seed: int) -> None:
+    model, truth = bracket(), pose_at(seed=seed)
+    evidence = evidence_of(view_before_wall(model, truth, noise_m), model, truth)
+    assert evidence.contradicted == 0
+    assert evidence.agreement == 1
+    assert evidence.rms < 1
+    assert evidence.observed > 0.9
+    if noise_m > 0:
+        assert evidence.noise_m == pytest.approx(noise_m, rel=0.3)
+
+
+@pytest.mark.parametrize(
+    ("grow_px", "right_px", "offset_m"), [(2, 0, 0.0), (-3, 0, 0.0), (0, 2, 0.0), (0, 0, 0.002)]
+)
+def test_errors_of_masks_and_sensors_contradict_little(
+    grow_px: int, right_px: int, offset_m: float
+) -> None:
+    """Masks are dilated, eroded or shifted; all readings are off along the ray alike."""
+    model, truth = bracket(), pose_at()
+    view = view_before_wall(model, truth, 0.001)
+    mask = grow_mask(view.mask, grow_px).roll(right_px, 1)
+    mask[:, :right_px] = False
+    mask &= view.depth_m < WALL_M - 0.1  # as flying pixels are dropped
+    evidence = evidence_of(replace(view, mask=mask, depth_m=view.depth_m + offset_m), model, truth)
+    assert evidence.agreement > 0.97, evidence
+
+
+def test_the_camera_saw_through_a_pose_behind_which_the_wall_is() -> None:
+    model, truth = bracket(), pose_at()
+    view = view_before_wall(model, truth, 0.001)
+    beside = Rigid(truth.R, truth.t_m + torch.tensor([0.4 * model.diameter_m, 0.0, 0.0]))
+    evidence = evidence_of(view, model, beside)
+    assert evidence.seen_through > 0.3 * evidence.visible
+    nearer = Rigid(truth.R, truth.t_m - torch.tensor([0.0, 0.0, 0.03]))
+    evidence = evidence_of(view, model, nearer)
+    assert evidence.seen_through > 0.8 * evidence.visible
+    assert evidence.bulging == 0
+
+
+def test_own_readings_before_the_posed_surface_bulge() -> None:
+    model, truth = bracket(), pose_at()
+    view = view_before_wall(model, truth, 0.001)
+    farther = Rigid(truth.R, truth.t_m + torch.tensor([0.0, 0.0, 0.03]))
+    evidence = evidence_of(view, model, farther)
+    assert evidence.bulging > 0.7 * evidence.visible
+    assert evidence.seen_through == 0
+    # Where it is not known what of the readings is the object, something else may be before it.
+    unmasked = evidence_of(view, model, farther, is_masked=False)
+    assert unmasked.contradicted == 0
+    assert unmasked.unobserved > 0.7 * unmasked.visible
+
+
+def test_own_readings_beside_the_silhouette_contradict() -> None:
+    with_arm = boxes("arm", ((0.16, 0.05, 0.04), (0, 0, 0)), ((0.03, 0.09, 0.03), (0.05, 0.06, 0)))
+    without = boxes("bar", ((0.16, 0.05, 0.04), (0, 0, 0)))
+    pose = Rigid(torch.eye(3), torch.tensor([0.0, 0.0, 0.7]))
+    view = view_before_wall(with_arm, pose, 0.001)
+    evidence = evidence_of(view, without, pose)
+    assert evidence.beside > 1
+    assert evidence.seen_through == evidence.bulging == 0
+    assert evidence_of(view, without, pose, is_masked=False).beside == 0
+    assert evidence_of(view, with_arm, pose).contradicted == 0
+
+
+@pytest.mark.parametrize("reading_m", [math.nan, 0.45], ids=["no reading", "something before it"])
+def test_a_hidden_part_is_unobserved_and_contradicts_nothing(reading_m: float) -> None:
+    model, truth = bracket(), pose_at()
+    view = view_before_wall(model, truth, 0.001)
+    left = left_part(view.mask)
+    depth_m = torch.where(left | ~view.mask, view.depth_m, torch.tensor(reading_m))
+    evidence = evidence_of(replace(view, depth_m=depth_m, mask=left), model, truth)
+    assert evidence.contradicted == 0
+    assert 0.3 < evidence.unobserved / evidence.visible < 0.7
+    assert evidence.rms < 1
+    # The same half, seen through: now it contradicts.
+    through_m = torch.where(left | ~view.mask, view.depth_m, torch.tensor(WALL_M))
+    evidence = evidence_of(replace(view, depth_m=through_m, mask=left), model, truth)
+    assert evidence.seen_through > 0.3 * evidence.visible
+
+
+@pytest.mark.parametrize(
+    "block",
+    [((0.03, 0.03, 0.025), (-0.135, 0, -0.0275)), ((0.025, 0.025, 0.03), (-0.1375, -0.0275, 0))],
+    ids=["toward the camera", "at the side"],
+)
+def test_a_long_part_with_its_ends_swapped_is_contradicted_by_a_patch(
+    block: Block,
+) -> None:
+    """A profile of 30 cm with a small block at one end: most of the wrong pose agrees."""
+    profile = boxes("profile", ((0.3, 0.03, 0.03), (0, 0, 0)), block)
+    truth = Rigid(torch.eye(3), torch.tensor([0.0, 0.0, 0.6])).double()
+    axis = torch.tensor([0.0, 0.0, 1.0] if block[1][2] else [0.0, 1.0, 0.0]).double()
+    swapped = truth @ turn_about(axis, torch.zeros(3).double(), torch.tensor(math.pi).double())
+    view = view_before_wall(profile, truth.float(), 0.001)
+    right, wrong = (evidence_of(view, profile, pose) for pose in (truth, swapped))
+    assert right.contradicted == 0
+    assert wrong.agreement > 0.6
+    assert wrong.contradicted > 1, "an independent patch"
+
+
+def test_a_large_object_is_thinned_and_the_evidence_stays() -> None:
+    """Of an object of very many pixels every n-th is compared: areas hardly change."""
+    model, near = bracket(), Rigid(pose_at().R, torch.tensor([0.0, 0.0, 0.3]))
+    shifted = Rigid(near.R, near.t_m + torch.tensor([0.03, 0.0, 0.0]))
+    wide_K = K * torch.tensor([[4.0], [4.0], [1.0]]).double()
+    found = []
+    for lens, width, height in ((K, 320, 240), (wide_K, 1280, 960)):
+        triangles = near.apply(model.vertices_m)[model.faces]
+        depth_m = rasterize(triangles, lens, width, height).depth_m.float()
+        mask = depth_m.isfinite()
+        view = ViewInput(name="a", depth_m=depth_m, mask=mask, K=lens, object="bracket")
+        cloud_m = cloud_from_depth(depth_m, mask, lens)
+        observation = observe(cloud_m, view, model.diameter_m, OBJECT_M, is_masked=True)
+        assert observation.depth_m.size < 250_000
+        found.append((observation.step, compare(observation, shifted, prepare_surface(model))))
+    (small_step, small), (large_step, large) = found
+    assert large_step > small_step
+    assert large.contradicted > 0
+    assert large.agreement == pytest.approx(small.agreement, abs=0.15)
+
+
+def test_a_cloud_without_its_image_is_compared_as_well() -> None:
+    model, truth = bracket(), pose_at()
+    view = view_before_wall(model, truth, 0.001)
+    cloud_m = cloud_from_depth(view.depth_m, view.mask, K)
+    surface = prepare_surface(model)
+    observation = observe(cloud_m, None, model.diameter_m, OBJECT_M, is_masked=True)
+    right = compare(observation, truth, surface)
+    assert right.agreement > 0.97
+    assert right.rms < 1
+    farther = Rigid(truth.R, truth.t_m + torch.tensor([0.0, 0.0, 0.03]))
+    assert compare(observation, farther, surface).bulging > 0.5 * right.visible

@@ -1,0 +1,55 @@
+"""The noise of a depth image, as evidence is counted in it."""
+
+import numpy as np
+import pytest
+
+from depthpose.pose.sensor import SHARED_PER_WHITE, DepthNoise, measure_noise
+
+
+def tilted_plane(noise_m: float) -> np.ndarray:
+    """A plane that leans away, 120 x 160 readings with independent noise."""
+    columns, rows = np.meshgrid(np.arange(160), np.arange(120))
+    noise = np.random.default_rng(0).normal(size=(120, 160))
+    return 0.8 + 0.0004 * columns + 0.0007 * rows + noise_m * noise
+
+
+@pytest.mark.parametrize("noise_m", [0.0, 0.0005, 0.003])
+def test_noise_of_a_leaning_plane_is_that_of_its_readings(noise_m: float) -> None:
+    everywhere = np.ones((120, 160), dtype=bool)
+    noise = measure_noise(tilted_plane(noise_m), everywhere, object_m=0.001)
+    assert noise.white_m == pytest.approx(noise_m, rel=0.05, abs=1e-9)
+    assert noise.shared_m == SHARED_PER_WHITE * noise.white_m
+    assert noise.object_m == 0.001
+
+
+def test_only_readings_of_the_object_are_measured() -> None:
+    """What is beside the object is rougher, and some of its own pixels have no reading."""
+    is_object = np.zeros((120, 160), dtype=bool)
+    is_object[30:90, 40:120] = True
+    depth_m = np.where(is_object, tilted_plane(0.001), tilted_plane(0.05))
+    depth_m[40:50, 60:70] = np.nan
+    noise = measure_noise(depth_m, is_object, object_m=0.0)
+    assert noise.white_m == pytest.approx(0.001, rel=0.1)
+
+
+def test_an_object_of_a_few_pixels_has_no_measured_noise() -> None:
+    is_object = np.zeros((120, 160), dtype=bool)
+    is_object[50:54, 50:54] = True
+    noise = measure_noise(tilted_plane(0.01), is_object, object_m=0.001)
+    assert noise.white_m == 0.0
+    assert noise.deviation_m(np.ones(1), 9) == pytest.approx(0.001)
+
+
+def test_averaging_lowers_independent_noise_alone() -> None:
+    noise = DepthNoise(white_m=0.003, shared_m=0.0, object_m=0.0)
+    assert noise.deviation_m(np.ones(1), 9) == pytest.approx(0.001)
+    shared = DepthNoise(white_m=0.0, shared_m=0.003, object_m=0.004)
+    assert shared.deviation_m(np.ones(1), 900) == pytest.approx(0.005)
+
+
+def test_a_slanted_surface_deviates_more_along_the_ray() -> None:
+    noise = DepthNoise(white_m=0.0, shared_m=0.0, object_m=0.001)
+    front, slanted, grazing = noise.deviation_m(np.array([1.0, 0.5, 0.01]), 9)
+    assert front == pytest.approx(0.001)
+    assert slanted == pytest.approx(0.002)
+    assert grazing < 0.004, "what is seen along the surface is hardly measured"
