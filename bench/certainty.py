@@ -22,7 +22,7 @@ from depthpose.core.checkpoint import find_weights
 from depthpose.core.rigid import Rigid
 from depthpose.pose.config import ObjectsConfig, SensorConfig
 from depthpose.pose.network_pose import GeoPoseNet
-from depthpose.pose.copies import find_copies
+from depthpose.pose.copies import SymmetricCopies, find_copies
 from depthpose.pose.synthetic import Objects
 from depthpose.pose.weights import read_pose_weights
 from depthpose.report.page import markdown_table, write_table
@@ -49,7 +49,7 @@ def answers_of(name: str, number: int) -> Iterator[Answer | None]:
     """Pose synthetic views of each object of weights; None where one is refused."""
     weights = read_pose_weights(find_weights(name))
     net = GeoPoseNet(weights)
-    copies = [find_copies(model, up_to_symmetry=False) for model in weights.models]
+    copies = [find_copies(model) for model in weights.models]
     count = math.ceil(number / len(NOISES)) * len(weights.models)
     for part, factor in enumerate(NOISES):
         config = ObjectsConfig(
@@ -70,9 +70,9 @@ def answers_of(name: str, number: int) -> Iterator[Answer | None]:
             yield Answer(Path(name).stem, estimate.object, certainty, right[0], any(right))
 
 
-def add_in_diameters(pose: Rigid, truth: Rigid, copies: PoseAmbiguities) -> float:
-    """ADD to the nearest true copy, in diameters."""
-    copies_of_truth = truth.double() @ copies.same
+def add_in_diameters(pose: Rigid, truth: Rigid, copies: SymmetricCopies) -> float:
+    """ADD to the nearest near-symmetric copy of the truth, in diameters: what a certainty is of."""
+    copies_of_truth = truth.double() @ Rigid.cat([copies.symmetries, copies.copies])
     posed_m = pose.double().apply(copies.points_m)
     true_m = copies_of_truth.apply(copies.points_m.expand(len(copies_of_truth.R), -1, -1))
     return float((posed_m - true_m).norm(dim=-1).mean(-1).min()) / copies.diameter_m

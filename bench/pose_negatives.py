@@ -99,7 +99,7 @@ def measure(
         rows.append({
             "kind": ALIKE if is_alike else kind, "object": sample.input.object,
             "status": found.status,
-            "right": is_right, "fit": found.fit and vars(found.fit), "signals": found.signals,
+            "right": is_right, "evidence": found.evidence and vars(found.evidence),
             "identity": found.identity and found.identity.status,
             "hidden": 1 - (sample.truth.visible_fraction or 0.0),
         })  # fmt: skip
@@ -142,7 +142,7 @@ def main() -> None:
     for name in words.weights:
         config = EstimateConfig(register_refused=words.method == "both")
         net = GeoPoseNet.load(find_weights(name), config)
-        opened = dataclasses.replace(net.refusal, min_agreement=0.0, max_beyond=1.0, min_found=0.0)
+        opened = dataclasses.replace(net.refusal, min_probability=0.0)
         if words.method == "register":
             net = Registration(net.models, refusal=opened if words.save else None)
         elif words.save:

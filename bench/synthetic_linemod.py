@@ -96,7 +96,7 @@ def without_refusal(name: str, files: Sequence[str], number: int) -> Iterator[Me
         dataclasses.replace(
             w,
             refusal=dataclasses.replace(
-                w.refusal, min_agreement=0.0, max_beyond=1.0, min_found=0.0
+                w.refusal, min_probability=0.0
             ),
         )
         for w in found

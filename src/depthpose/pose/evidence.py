@@ -272,6 +272,7 @@ def _without_edges(
 
 def _patch_area(mask: Bool[np.ndarray, "h w"], patch_px: float) -> float:
     """Area of the connected patches in a mask that are no accident, in independent patches."""
-    labels = np.asarray(ndimage.label(mask)[0])
+    labels = np.zeros(mask.shape, np.int32)
+    ndimage.label(mask, output=labels)
     areas_px = np.bincount(labels.ravel())[1:]
     return float(areas_px[areas_px >= _LEAST_PATCH * patch_px].sum()) / patch_px
