@@ -17,10 +17,10 @@ def predict(
     images: tyro.conf.Positional[tuple[Source, ...]],
     out: NewPlace,
     lens: options.LensOptions = options.LensOptions(),
-    scale: options.ScaleOptions = options.ScaleOptions(),
+    output: options.PredictOutput = options.PredictOutput(),
     networks: options.ImageNetworks = options.ImageNetworks(),
     matching: options.MatcherOptions = options.MatcherOptions(),
-    output: options.PredictOutput = options.PredictOutput(),
+    scale: options.ScaleOptions = options.ScaleOptions(),
     engine: EngineOptions = EngineOptions(),
 ) -> int:
     """Depth in metres from single images, by a synthesised right view.
