@@ -7,6 +7,7 @@ one. Right is below 0.1.
 
 import inspect
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
@@ -15,7 +16,6 @@ from torch import Tensor
 
 from depthpose import Registration
 from depthpose.core.rigid import Rigid
-from depthpose.pose.config import EstimateConfig, VotingConfig
 from depthpose.pose.mesh import sample_surface, symmetry_transforms
 from depthpose.pose.metrics import add_of_nearest_m, adds_m
 from depthpose.pose.types import ObjectModel, PoseEstimate
@@ -87,7 +87,8 @@ def accepts(function: Callable[..., Any], argument: str) -> bool:
 
 def use_seed(registration: Registration, seed: int) -> None:
     """Set what registration draws its points by."""
-    registration.config = EstimateConfig(voting=VotingConfig(seed=seed))
+    config = registration.config
+    registration.config = replace(config, voting=replace(config.voting, seed=seed))
 
 
 def median(values: Sequence[float]) -> float | None:
