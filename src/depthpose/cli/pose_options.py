@@ -172,6 +172,11 @@ class RegisterOptions:
     """of register: STL, PLY, OBJ or GLB files; an object has its file's name."""
     cad_unit: Unit | None = None
     """of the CAD files; as --unit by default, and of GLB metres."""
+    symmetry: tuple[str, ...] = ()
+    """of register: how a part looks alike, in place of what is found: z,18 after each of 18 equal
+    turns about an axis along z, z,free after any, z,6+x,2 about two axes; or a JSON file with BOP's
+    symmetries_discrete and symmetries_continuous. The axis goes where the surface fits best. Of
+    several CAD files with the name: NAME:z,18."""
 
 
 @dataclass(frozen=True, kw_only=True)

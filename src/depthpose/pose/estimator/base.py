@@ -4,7 +4,7 @@ The one that needs no training follows it.
 """
 
 import time
-from collections.abc import Callable, Iterable, Iterator, Sequence, Sized
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence, Sized
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -50,7 +50,14 @@ from depthpose.pose.estimator.inputs import (
     view_input,
 )
 from depthpose.pose.estimator.track import TrackedObject, track
-from depthpose.pose.mesh import read_model, refuse_one_name, with_found_symmetries
+from depthpose.pose.mesh import (
+    AnySymmetry,
+    declare_symmetry,
+    read_model,
+    refuse_one_name,
+    symmetry_of_each,
+    with_found_symmetries,
+)
 from depthpose.pose.refine import refine_best
 from depthpose.pose.surface import prepare_surface
 from depthpose.pose.types import CloudInput, ObjectModel, PoseEstimate, ViewInput
@@ -456,21 +463,34 @@ class Registration(PoseEstimator):
     @classmethod
     @own_arithmetic()
     def load(
-        cls, *cad: str | Path, unit: Unit | None = None, config: EstimateConfig | None = None
+        cls,
+        *cad: str | Path,
+        unit: Unit | None = None,
+        config: EstimateConfig | None = None,
+        symmetry: AnySymmetry | Mapping[str, AnySymmetry] | Sequence[str] | None = None,
     ) -> "Registration":
-        """Read CAD files; symmetries that are found in a part make its copies one answer.
+        """Read CAD files; declared or found symmetries of a part make its copies one answer.
 
         Args:
             cad: PLY, STL, OBJ, GLB; an object is called as its file.
             unit: of the numbers in the files; None where all are GLB, which has metres.
             config: as above.
+            symmetry: that a part has, in place of those that are found: ``"z,18"`` looks alike
+                after each of 18 equal turns about an axis along z, ``"z,free"`` after any, and
+                ``"z,6+x,2"`` has two axes; BOP's entry of an object, or a JSON file of it. The axis
+                goes where the surface has it. Of several files a dict from names.
 
         Raises:
-            InputError: no file, two of one name, one that is not read, without a surface or unit.
+            InputError: no file, two of one name, one that is not read, without a surface or unit; a
+                symmetry that is none, or of no object.
         """
         if not all(isinstance(path, str | Path) for path in cad):
             raise InputError("Registration.load takes paths one by one: load(*files, unit=...)")
         models = [read_model(path, unit, number=k) for k, path in enumerate(cad, start=1)]
+        declared = symmetry_of_each(symmetry, [model.name for model in models])
+        models = [
+            declare_symmetry(m, declared[m.name]) if m.name in declared else m for m in models
+        ]
         return cls([with_found_symmetries(m, None, is_taken=True) for m in models], config)
 
     def __repr__(self) -> str:
