@@ -407,11 +407,23 @@ def finite_number(text: str) -> float:
 _MOST_SHOWN = 6
 
 
-def natural_order(path: Path) -> tuple[list[list[str | int]], Path]:
-    """Give the key that sorts paths by name, and numbers in names by value: 2 before 10."""
-    pieces = [re.split(r"(\d+)", part) for part in (*path.parent.parts, path.stem)]
-    # Every second piece is a run of digits, so that like is compared with like.
-    return [[int(p) if k % 2 else p for k, p in enumerate(part)] for part in pieces], path
+_NUMBER = re.compile(r"((?<![\d.])\d+\.\d+(?!\d|\.\d)|\d+)")
+
+
+def natural_order(path: Path) -> tuple[list[list[str | tuple[int, str]]], Path]:
+    """Give the key that sorts paths by name, and numbers in names by value: 2 before 10.
+
+    Two runs of digits with a point between them are a decimal, as of a time in seconds: 0.45 comes
+    before 0.5. Three are none (1.2.10).
+    """
+    pieces = [_NUMBER.split(part) for part in (*path.parent.parts, path.stem)]
+
+    def value(piece: str) -> tuple[int, str]:
+        whole, _, decimals = piece.partition(".")
+        return int(whole), decimals  # digits behind the point sort as letters do
+
+    # Every second piece is a number, so that like is compared with like.
+    return [[value(p) if k % 2 else p for k, p in enumerate(part)] for part in pieces], path
 
 
 def find_partners(first: Sequence[str], second: Sequence[str], said: str) -> list[int]:
