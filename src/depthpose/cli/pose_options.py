@@ -87,6 +87,15 @@ class OneObjectOptions:
     labels: Annotated[str | None, shown_as(metavar="CLASS=OBJECT,...")] = None
     """which object a number of --mask or a class of --detections is: 1=bracket,2=gear; 3= leaves 3
     out."""
+    color: Source | None = None
+    """picture of the depth camera's frame and moment, or with its own --color-camera; or a folder
+    of them with the names of the depth images. Print on a part (PLY with colours of its vertices,
+    OBJ or GLB with a texture) then tells apart the copies that depth cannot."""
+    color_camera: Path | None = None
+    """of the colour pictures, as --camera; without it they are pixel by pixel of the depth."""
+    color_from_depth: Path | None = None
+    """text file with the pose of the depth camera in the frame of --color-camera: 4x4, in metres;
+    without it both are at one place."""
     cloud: Source | None = None
     """points of one object (PLY, PCD, NPY, text), in the camera frame: x right, y down, z forward;
     or a folder of such files."""
