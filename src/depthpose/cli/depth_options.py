@@ -90,6 +90,9 @@ class MatchOptions(MatcherOptions):
 
     left_right_check: bool = False
     """match the mirrored pair too, which makes the confidence better."""
+    max_disparity: float | None = None
+    """largest disparity in pixels of the images; left out, it is measured. What lies beyond is
+    named, and has a confidence of 0. Only for the light matcher, that of 'default'."""
 
 
 @dataclass(frozen=True, kw_only=True)
