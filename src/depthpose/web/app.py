@@ -82,15 +82,15 @@ def refuse_other_host(request: Request, hosts: tuple[str, ...] | None) -> Respon
     except ValueError:  # such as half of a bracket
         name = None
     if hosts is not None and name not in hosts:
-        said = (
+        message = (
             f"this page answers to {', '.join(hosts)}, not to {host!r}; start 'depthpose serve' "
             "with --host to name another"
         )
-        return JSONResponse({"error": said}, 403)
+        return JSONResponse({"error": message}, 403)
     origin = request.headers.get("origin")
     if origin is not None and origin.partition("://")[2] != host:
-        said = f"the request comes from another page, {origin}; open this one"
-        return JSONResponse({"error": said}, 403)
+        message = f"the request comes from another page, {origin}; open this one"
+        return JSONResponse({"error": message}, 403)
     return None
 
 
@@ -98,8 +98,8 @@ async def error_response(_: Request, error: Exception) -> Response:
     """Answer a refusal with its message; the trace of another error is on the server's terminal."""
     if isinstance(error, HTTPException):
         return JSONResponse({"error": error.detail}, error.status_code, error.headers)
-    said = f"depthpose failed ({type(error).__name__}: {error}); see the server's terminal"
-    return JSONResponse({"error": said}, 500)
+    message = f"depthpose failed ({type(error).__name__}: {error}); see the server's terminal"
+    return JSONResponse({"error": message}, 500)
 
 
 Result = TypeVar("Result")
@@ -220,12 +220,12 @@ class Pages:
             has_one_image=depth.synthesiser is not None,
             has_pair=depth.matcher is not None,
         )
-        own = Path(__file__).parent
+        folder = Path(__file__).parent
         self._assets = {
             "": ("text/html", page),
-            "page.css": ("text/css", page_file("page.css") + (own / "web.css").read_text()),
+            "page.css": ("text/css", page_file("page.css") + (folder / "web.css").read_text()),
             "viewer.js": ("text/javascript", page_file("viewer.js")),
-            "web.js": ("text/javascript", (own / "web.js").read_text()),
+            "web.js": ("text/javascript", (folder / "web.js").read_text()),
         }
 
     async def asset(self, request: Request) -> Response:
@@ -318,8 +318,8 @@ class Pages:
         if name == "all.zip" and name not in files:
             packed = io.BytesIO()
             with zipfile.ZipFile(packed, "w") as archive:  # most files are compressed already
-                for one, data in files.items():
-                    archive.writestr(one, data)
+                for file_name, data in files.items():
+                    archive.writestr(file_name, data)
             files = {name: packed.getvalue()}
         media_type = _TYPES.get(Path(name).suffix, "application/octet-stream")
         headers = {"Content-Disposition": f'attachment; filename="{name}"'}
@@ -331,10 +331,13 @@ class Pages:
         while len(self._kept) > _RESULTS:
             self._kept.popitem(last=False)
         pictures = []
-        for one in answer.pictures:  # with their sizes, so that nothing moves when they come
-            with Image.open(io.BytesIO(answer.files[one.file])) as image:  # a file of our own
-                said = {"scale": one.scale and vars(one.scale), "size": list(image.size)}
-            pictures.append({**vars(one), **said})
+        for picture in answer.pictures:  # with their sizes, so that nothing moves when they come
+            with Image.open(io.BytesIO(answer.files[picture.file])) as image:  # a file of our own
+                size_and_scale = {
+                    "scale": picture.scale and vars(picture.scale),
+                    "size": list(image.size),
+                }
+            pictures.append({**vars(picture), **size_and_scale})
         return {
             "ok": answer.is_ok,
             "said": answer.said,
@@ -388,20 +391,20 @@ def open_socket(host: str, port: int) -> socket.socket:
 
 
 def known_names(
-    host: str, taken: socket.socket
+    host: str, listener: socket.socket
 ) -> tuple[IPv4Address | IPv6Address, tuple[str, ...] | None]:
     """Give the address that was taken, and the host names under which the page may be requested.
 
     None: any, it is open to all. How the address was written does not say that: '', '0' and '0x0'
     mean all addresses too.
     """
-    address = ip_address(taken.getsockname()[0])
+    address = ip_address(listener.getsockname()[0])
     if isinstance(address, IPv6Address):
         address = address.ipv4_mapped or address
     return address, None if address.is_unspecified else (*LOOPBACK, host.lower(), str(address))
 
 
-def run(app: Starlette, taken: socket.socket) -> None:
+def run(app: Starlette, listener: socket.socket) -> None:
     """Answer requests until the process is stopped; only errors are logged."""
     config = uvicorn.Config(
         app,
@@ -411,4 +414,4 @@ def run(app: Starlette, taken: socket.socket) -> None:
         limit_concurrency=_CONNECTIONS,
         timeout_graceful_shutdown=_LEAVE_S,
     )
-    uvicorn.Server(config).run(sockets=[taken])
+    uvicorn.Server(config).run(sockets=[listener])
