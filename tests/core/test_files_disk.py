@@ -1,16 +1,19 @@
 import errno
 import os
+import re
 import subprocess
 import sys
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import pytest
 import torch
 
+from depthpose.cli import main
 from depthpose.core.checkpoint import Checkpoint, save_checkpoint
 from depthpose.core.config import write_config
 from depthpose.core.errors import InputError
@@ -29,7 +32,7 @@ from depthpose.core.files import (
 )
 from depthpose.core.files.disk import natural_order
 from depthpose.core.loop import RunLogger
-from depthpose.core.run import claim_folder
+from depthpose.core.run import claim_folder, lock_folder
 from depthpose.report.page import Section, write_page, write_table
 
 
@@ -249,3 +252,33 @@ def test_decimals_are_sorted_as_decimals() -> None:
 def test_three_numbers_between_points_are_no_decimal() -> None:
     names = ["v1.2.9.png", "v1.2.10.png", "v1.10.1.png", "frame.2.png", "frame.10.png"]
     assert in_order(*names[3:], *names[:3]) == names[3:] + names[:3]
+
+
+@pytest.mark.parametrize("behind", ["", "deeper/out"])
+def test_links_that_lead_nowhere_are_named(
+    tmp_path: Path, behind: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Not 'free the space', and no traceback."""
+    (tmp_path / "a").symlink_to("b")
+    (tmp_path / "b").symlink_to("a")
+    (tmp_path / "gone").symlink_to("nowhere/x")
+    (tmp_path / "cloud.xyz").write_text("1 2 3\n")
+    for link, leads in (("a", "in a circle"), ("gone", "to 'nowhere/x', which is not there")):
+        out = tmp_path / link / behind
+        said = f"{tmp_path / link}: is a link that leads {leads}; remove it, or choose another"
+        words = ["pose", "predict", "--cloud", str(tmp_path / "cloud.xyz"), "--out", str(out)]
+        assert main(words) == 2
+        assert said in capsys.readouterr().err
+        for write in (
+            partial(lock_folder, is_shared=False),
+            lambda path: write_json(path / "x.json", {}),
+        ):
+            with pytest.raises(InputError, match=re.escape(said)):
+                write(out)
+
+
+def test_a_link_to_a_folder_is_one(tmp_path: Path) -> None:
+    (tmp_path / "there").mkdir()
+    (tmp_path / "link").symlink_to("there")
+    write_json(tmp_path / "link/new/x.json", {})
+    assert (tmp_path / "there/new/x.json").is_file()

@@ -4,6 +4,7 @@ Types become words (``{None}|PATH`` is PATH), and a default that is nothing is n
 weights that do not exist are refused before anything is loaded, and so is what has no effect.
 """
 
+import os
 import re
 import shutil
 import textwrap
@@ -162,9 +163,12 @@ def _described(hint: Any) -> tuple[str | None, _Names | None]:  # noqa: ANN401  
 
 
 def refuse_missing(options: Sequence[Option], values: Mapping[str, Any]) -> None:
-    """Refuse paths and weights that do not exist; paths first: weights are looked up by torch."""
+    """Refuse paths and weights that do not exist; paths first: weights are looked up by torch.
+
+    What need not exist is refused where a broken link is on its way.
+    """
     for parameter, name, names in sorted(options, key=lambda option: option[2] is _Names.WEIGHTS):
-        if parameter not in values or names in (None, _Names.NEW):
+        if parameter not in values or names is None:
             continue
         value = values[parameter] if parameter == name else getattr(values[parameter], name)
         for one in value if isinstance(value, list | tuple) else [value]:
@@ -176,7 +180,13 @@ def refuse_missing(options: Sequence[Option], values: Mapping[str, Any]) -> None
                     find_weights(bare)
             elif one is not None and not any(mark in str(one) for mark in ("://", *"*?[{")):
                 wanted = Path(one)
-                if wanted.exists():
+                if os.path.exists(wanted):  # noqa: PTH110 - which never raises
+                    continue
+                if any(map(os.path.islink, (wanted, *wanted.parents))):
+                    from depthpose.core.files.disk import refuse_broken_link  # loads torch
+
+                    refuse_broken_link(wanted)
+                if names is _Names.NEW:
                     continue
                 home = wanted.parent
                 beside = [path.name for path in home.iterdir()] if home.is_dir() else []

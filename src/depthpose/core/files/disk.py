@@ -4,6 +4,7 @@ Reading is guarded, writing atomic. A path through a tar shard, ``000000.tar/a.l
 as through a folder.
 """
 
+import errno
 import json
 import math
 import os
@@ -63,12 +64,34 @@ def refused_as(path: AnyPath, kind: str, remedy: str) -> Iterator[None]:
         raise InputError(f"{path}: not a readable {kind} ({said}); {remedy}") from error
 
 
+def refuse_broken_link(path: AnyPath) -> None:
+    """Refuse a path on whose way a link leads nowhere, or in a circle.
+
+    Raises:
+        InputError: the link, and where it leads.
+    """
+    for place in (Path(path), *Path(path).parents):
+        if not os.path.islink(place) or os.path.exists(place):  # noqa: PTH110, PTH114 - never raise
+            continue
+        try:
+            place.stat()
+        except OSError as error:
+            is_circle = error.errno == errno.ELOOP
+            leads = "in a circle" if is_circle else f"to {os.readlink(place)!r}, which is not there"  # noqa: PTH115
+        else:  # made by another process meanwhile
+            return
+        raise InputError(
+            f"{place}: is a link that leads {leads}; remove it, or choose another place"
+        )
+
+
 @contextmanager
 def refused_write(path: AnyPath) -> Iterator[None]:
     """Turn what a disk refuses to take into an :class:`InputError`."""
     try:
         yield
     except OSError as error:
+        refuse_broken_link(path)
         file = next((folder for folder in Path(path).parents if os.path.isfile(folder)), None)  # noqa: PTH113 - which never raises
         if file is not None:
             raise InputError(
