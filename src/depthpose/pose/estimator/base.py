@@ -41,6 +41,7 @@ from depthpose.pose.estimator.find import (
 from depthpose.pose.estimator.fit import answer_of, refused, with_status
 from depthpose.pose.estimator.inputs import (
     AnyArray,
+    AnyCloud,
     AnyInput,
     AnyMask,
     cloud_input,
@@ -51,6 +52,7 @@ from depthpose.pose.estimator.inputs import (
 )
 from depthpose.pose.estimator.track import TrackedObject, track
 from depthpose.pose.mesh import (
+    AnyModel,
     AnySymmetry,
     declare_symmetry,
     read_model,
@@ -153,7 +155,7 @@ class PoseEstimator:
     def estimate(
         self,
         *,
-        cloud: AnyArray | None = None,
+        cloud: AnyCloud | None = None,
         unit: Unit | None = None,
         depth: AnyArray | None = None,
         mask: AnyMask | None = None,
@@ -164,7 +166,8 @@ class PoseEstimator:
         """Estimate one pose, from a cloud or from a depth image with a mask.
 
         Args:
-            cloud: points of the object alone, in the camera frame (x right, y down, z forward).
+            cloud: points of the object alone, in the camera frame (x right, y down, z forward); a
+                file, rows of points, or a cloud of trimesh or Open3D.
             unit: of the cloud, metres by default; of a depth image, where its camera says none.
             depth: a 16-bit PNG or whole numbers in the camera's ``depth_unit_m``, or metres.
             mask: the object's pixels, not 0; a picture, an array, or COCO's run lengths. One that
@@ -464,7 +467,7 @@ class Registration(PoseEstimator):
     @own_arithmetic()
     def load(
         cls,
-        *cad: str | Path,
+        *cad: AnyModel,
         unit: Unit | None = None,
         config: EstimateConfig | None = None,
         symmetry: AnySymmetry | Mapping[str, AnySymmetry] | Sequence[str] | None = None,
@@ -472,7 +475,8 @@ class Registration(PoseEstimator):
         """Read CAD files; declared or found symmetries of a part make its copies one answer.
 
         Args:
-            cad: PLY, STL, OBJ, GLB; an object is called as its file.
+            cad: PLY, STL, OBJ, GLB, or meshes of trimesh or Open3D; an object is called as its
+                file, or as :func:`~depthpose.pose.mesh.read_model` says.
             unit: of the numbers in the files; None where all are GLB, which has metres.
             config: as above.
             symmetry: that a part has, in place of those that are found: ``"z,18"`` looks alike
@@ -484,8 +488,6 @@ class Registration(PoseEstimator):
             InputError: no file, two of one name, one that is not read, without a surface or unit; a
                 symmetry that is none, or of no object.
         """
-        if not all(isinstance(path, str | Path) for path in cad):
-            raise InputError("Registration.load takes paths one by one: load(*files, unit=...)")
         models = [read_model(path, unit, number=k) for k, path in enumerate(cad, start=1)]
         declared = symmetry_of_each(symmetry, [model.name for model in models])
         models = [

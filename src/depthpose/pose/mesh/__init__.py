@@ -8,6 +8,7 @@ from depthpose.pose.mesh.declared import read_symmetry as read_symmetry
 from depthpose.pose.mesh.declared import symmetry_of_each as symmetry_of_each
 from depthpose.pose.mesh.files import FIXED_UNITS as FIXED_UNITS
 from depthpose.pose.mesh.files import MESH_READERS as MESH_READERS
+from depthpose.pose.mesh.files import AnyModel as AnyModel
 from depthpose.pose.mesh.files import read_geometry as read_geometry
 from depthpose.pose.mesh.files import unit_of as unit_of
 from depthpose.pose.mesh.models import drawn_triangles as drawn_triangles

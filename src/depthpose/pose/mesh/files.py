@@ -23,6 +23,7 @@ from depthpose.core.files.disk import refused_as, refused_suffix
 from depthpose.core.files.points import Ragged, read_ply_elements
 from depthpose.core.units import Unit
 from depthpose.pose.mesh.bodies import faces_of_part
+from depthpose.pose.mesh.shapes import shape_geometry, shape_unit
 
 _MOST_VALUES = 2 * 10**7  # that the accessors of a GLB may declare: six million points
 _MOST_TEXT = 2**25  # bytes of an OBJ or STL in text, which are read in some seconds
@@ -37,16 +38,20 @@ _LEAST_AREA = 1e-6  # of the squared extent: all faces of less are no surface; a
 _FARTHEST = 1e9  # a coordinate beyond is no model's, in whatever unit, and overflows in float32
 
 
+AnyModel = AnyPath | object  #: a model file, or a mesh of trimesh or Open3D
 FIXED_UNITS: dict[str, Unit] = {".glb": "m"}  #: of formats that fix theirs
 
 
-def unit_of(path: AnyPath, unit: Unit | None) -> Unit:
-    """Give the unit of a model file: what is said, else what its format fixes.
+def unit_of(path: AnyModel, unit: Unit | None) -> Unit:
+    """Give the unit of a model: what is said, else what its format fixes, or the mesh itself says.
 
     Raises:
         InputError: neither.
     """
-    found = unit or FIXED_UNITS.get(Path(path).suffix.lower())
+    if isinstance(path, str | Path):
+        found = unit or FIXED_UNITS.get(Path(path).suffix.lower())
+    else:
+        found = unit or shape_unit(path)
     if found is None:
         raise InputError(
             f"{path}: no unit is given, and such a file does not say its own; give --unit mm, "
@@ -55,8 +60,8 @@ def unit_of(path: AnyPath, unit: Unit | None) -> Unit:
     return found
 
 
-def read_geometry(path: AnyPath) -> tuple[np.ndarray, np.ndarray]:
-    """Read points and triangles of a model file in its own unit; bare points have no triangles.
+def read_geometry(path: AnyModel) -> tuple[np.ndarray, np.ndarray]:
+    """Read points and triangles of a model in its own unit; bare points have no triangles.
 
     Raises:
         InputError: the file is missing, damaged or of another format, has no surface, or bodies far
@@ -65,13 +70,16 @@ def read_geometry(path: AnyPath) -> tuple[np.ndarray, np.ndarray]:
     Warns:
         Notice: a small body far from the rest is left out.
     """
-    suffix = Path(path).suffix.lower()
-    if suffix not in MESH_READERS:
-        if suffix not in CLOUD_READERS:
-            known = dict.fromkeys((*MESH_READERS, *CLOUD_READERS))
-            raise refused_suffix(path, "model", tuple(known))
-        return read_cloud(path).points.double().numpy(), np.empty((0, 3), np.int64)
-    vertices, faces = MESH_READERS[suffix](path)
+    if not isinstance(path, str | Path):
+        vertices, faces = shape_geometry(path)
+    else:
+        suffix = Path(path).suffix.lower()
+        if suffix not in MESH_READERS:
+            if suffix not in CLOUD_READERS:
+                known = dict.fromkeys((*MESH_READERS, *CLOUD_READERS))
+                raise refused_suffix(path, "model", tuple(known))
+            return read_cloud(path).points.double().numpy(), np.empty((0, 3), np.int64)
+        vertices, faces = MESH_READERS[suffix](path)
     if len(vertices) < 4 or not (np.abs(vertices) < _FARTHEST).all():
         raise InputError(
             f"{path}: holds {len(vertices)} points, or one that is not finite or beyond "
@@ -83,7 +91,7 @@ def read_geometry(path: AnyPath) -> tuple[np.ndarray, np.ndarray]:
     if (sizes == 3).all() and ((corners >= 0) & (corners < len(vertices))).all():
         faces = corners.reshape(-1, 3)
     else:
-        faces = cut_polygons(path, vertices, sizes, corners)
+        faces = cut_polygons(str(path), vertices, sizes, corners)
     if len(faces) == 0:
         return vertices, faces
     # Dropped are faces without area, and all but the first of those on the same three points: a
@@ -102,7 +110,7 @@ def read_geometry(path: AnyPath) -> tuple[np.ndarray, np.ndarray]:
     _, first = np.unique(np.sort(merged, axis=-1), axis=0, return_index=True)
     kept = np.isin(np.arange(len(faces)), first) & (area > _NO_AREA * square)
     faces, merged, area = faces[kept], merged[kept], area[kept]
-    is_part = faces_of_part(path, places, merged, area)
+    is_part = faces_of_part(str(path), places, merged, area)
     if is_part.all():
         return vertices, faces
     used, faces = np.unique(faces[is_part], return_inverse=True)
