@@ -13,6 +13,7 @@ import argparse
 import json
 import multiprocessing
 import os
+import sys
 import time
 from collections.abc import Sequence
 from pathlib import Path
@@ -22,7 +23,7 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")  # before torch is imported
 import torch
 from score import Job, Row, Section
 from score_depth import IMAGES, INDOOR, STREET_PAIRS
-from score_instances import BOXES, MASKS, SCANS
+from score_instances import BOXES, MASKS, NETWORKS, SCANS
 from score_reports import REPORTS
 from score_scenes import BINS, FRAMES
 from score_tracking import TRACKING
@@ -33,6 +34,7 @@ from depthpose.report.page import markdown_table
 SECTIONS: dict[str, Section] = {
     "masks": MASKS,
     "scans": SCANS,
+    "networks": NETWORKS,
     "boxes": BOXES,
     "bins": BINS,
     "frames": FRAMES,
@@ -51,7 +53,7 @@ def main() -> None:
     )
     parser.add_argument("samples", type=Path, help="folder with pose/ and depth/")
     parser.add_argument("--only", nargs="+", choices=SECTIONS, default=list(SECTIONS))
-    parser.add_argument("--seeds", type=int, default=1, help="of each instance (masks, scans)")
+    parser.add_argument("--seeds", type=int, default=1, help="of each instance one by one")
     parser.add_argument("--processes", type=int, default=2)
     parser.add_argument(
         "--json", type=Path, help="file for all rows and tables; other sections stay"
@@ -77,6 +79,7 @@ def main() -> None:
         print(f"{cpu_s:.0f} CPU s with all preparation, {time.perf_counter() - began:.0f} s")
         if earlier:
             print(f"in brackets: {described(earlier)}")
+        sys.stdout.flush()
         if words.json is not None:
             words.json.write_text(json.dumps(done, indent=1))
 

@@ -14,7 +14,7 @@ from typing import Any, Literal, NamedTuple
 
 from torch import Tensor
 
-from depthpose import Registration
+from depthpose import GeoPoseNet, Registration
 from depthpose.core.rigid import Rigid
 from depthpose.pose.mesh import sample_surface, symmetry_transforms
 from depthpose.pose.metrics import add_of_nearest_m, adds_m
@@ -85,10 +85,10 @@ def accepts(function: Callable[..., Any], argument: str) -> bool:
     return argument in inspect.signature(function).parameters
 
 
-def use_seed(registration: Registration, seed: int) -> None:
-    """Set what registration draws its points by."""
-    config = registration.config
-    registration.config = replace(config, voting=replace(config.voting, seed=seed))
+def use_seed(estimator: Registration | GeoPoseNet, seed: int) -> None:
+    """Set what an estimator draws its points by."""
+    config = estimator.config
+    estimator.config = replace(config, voting=replace(config.voting, seed=seed))
 
 
 def median(values: Sequence[float]) -> float | None:
