@@ -9,6 +9,7 @@ import time
 from collections.abc import Sequence
 from functools import cache, partial
 from pathlib import Path
+from typing import Literal, NamedTuple
 
 import torch
 from real_poses import RealCase, real_cases
@@ -19,13 +20,25 @@ from depthpose import GeoPoseNet, Registration
 from depthpose.pose.types import ViewInput
 
 WEIGHTS = "ycb"
-BOX_MARGINS_PX = (5, 15)
-MASK_GROWTH_PX = 8
+
+
+class Region(NamedTuple):
+    """What says where the object is: its exact mask or the box about it, grown on all sides."""
+
+    kind: Literal["mask", "box"]
+    margin_px: int = 0
+
+    def __str__(self) -> str:
+        return f"{self.kind} + {self.margin_px} px"
+
+
+EXACT = Region("mask")
+ROUGH = (Region("box", 5), Region("box", 15), Region("mask", 8))
 
 
 def mask_jobs(samples: Path, seeds: int) -> list[Job]:
     """Pose every instance by its exact mask; a bunny by its cloud."""
-    return [partial(pose_instance, samples, name, "mask", seeds) for name in cases(samples)]
+    return [partial(pose_instance, samples, name, EXACT, seeds) for name in cases(samples)]
 
 
 def network_jobs(samples: Path, seeds: int) -> list[Job]:
@@ -38,11 +51,10 @@ def box_jobs(samples: Path, seeds: int) -> list[Job]:
     """Pose every instance of an image by boxes and by a grown mask in place of the exact one."""
     if not accepts(Registration.estimate, "box"):
         print("boxes: estimate takes no box=; a mask of the box's pixels is given")
-    regions = [*(f"box + {margin} px" for margin in BOX_MARGINS_PX), f"mask + {MASK_GROWTH_PX} px"]
     views = [name for name, case in cases(samples).items()
              if isinstance(case.sample.input, ViewInput)]  # fmt: skip
     return [partial(pose_instance, samples, name, region, seeds)
-            for region in regions for name in views]  # fmt: skip
+            for region in ROUGH for name in views]  # fmt: skip
 
 
 def scan_jobs(samples: Path, seeds: int) -> list[Job]:
@@ -55,18 +67,18 @@ def scan_jobs(samples: Path, seeds: int) -> list[Job]:
     return jobs + [partial(pose_scan, samples, name, seeds, True) for name in scanned]
 
 
-def pose_instance(samples: Path, name: str, region: str, seeds: int) -> list[Row]:
+def pose_instance(samples: Path, name: str, region: Region, seeds: int) -> list[Row]:
     """Pose one instance by a mask, a box or a grown mask."""
     case = cases(samples)[name]
     arguments = arguments_of(case, region)
     rows = pose_by_seeds(registration_of(samples, name), arguments, case, seeds)
-    return [{"set": name.split()[0], "region": region, **row} for row in rows]
+    return [{"set": name.split()[0], "region": str(region), **row} for row in rows]
 
 
 def pose_by_network(samples: Path, name: str, seeds: int) -> list[Row]:
     """Pose one instance by its mask with the shipped weights of YCB."""
     case = cases(samples)[name]
-    arguments = {**arguments_of(case, "mask"), "object": case.model.name}
+    arguments = {**arguments_of(case, EXACT), "object": case.model.name}
     rows = pose_by_seeds(network(), arguments, case, seeds)
     return [{"set": WEIGHTS, **row} for row in rows]
 
@@ -74,7 +86,7 @@ def pose_by_network(samples: Path, name: str, seeds: int) -> list[Row]:
 def pose_scan(samples: Path, name: str, seeds: int, with_color: bool) -> list[Row]:
     """Pose one instance by the textured mesh of its object."""
     case = cases(samples)[name]
-    arguments = arguments_of(case, "mask")
+    arguments = arguments_of(case, EXACT)
     if with_color:
         arguments["color"] = case.color
     registration = registration_by_file(scan_of(samples, case))
@@ -98,7 +110,7 @@ def pose_by_seeds(
     return rows
 
 
-def arguments_of(case: RealCase, region: str) -> Row:
+def arguments_of(case: RealCase, region: Region) -> Row:
     """Give the arguments of ``estimate``: depth, camera and where the object is, or a cloud."""
     given = case.sample.input
     if isinstance(given, ViewInput):
@@ -106,16 +118,17 @@ def arguments_of(case: RealCase, region: str) -> Row:
     return {"cloud": given.points_m, "unit": "m"}
 
 
-def region_of(mask: Tensor, region: str) -> Row:
+def region_of(mask: Tensor, region: Region) -> Row:
     """Give the argument of ``estimate`` that says where the object is."""
-    kind, _, margin = region.removesuffix(" px").partition(" + ")
-    if kind == "mask":
-        return {"mask": grown(mask, int(margin)) if margin else mask}
+    margin_px = region.margin_px
+    if region.kind == "mask":
+        return {"mask": grown(mask, margin_px) if margin_px else mask}
+    height, width = mask.shape
     rows, columns = mask.nonzero().unbind(1)
-    top = max(0, int(rows.min()) - int(margin))
-    left = max(0, int(columns.min()) - int(margin))
-    bottom = min(mask.shape[0], int(rows.max()) + 1 + int(margin))
-    right = min(mask.shape[1], int(columns.max()) + 1 + int(margin))
+    top = max(0, int(rows.min()) - margin_px)
+    left = max(0, int(columns.min()) - margin_px)
+    bottom = min(height, int(rows.max()) + 1 + margin_px)
+    right = min(width, int(columns.max()) + 1 + margin_px)
     if accepts(Registration.estimate, "box"):
         return {"box": (left, top, right, bottom)}
     filled = torch.zeros_like(mask)
