@@ -21,8 +21,8 @@ from curves import draw_curves
 from depthpose.core.checkpoint import find_weights
 from depthpose.core.rigid import Rigid
 from depthpose.pose.config import ObjectsConfig, SensorConfig
-from depthpose.pose.network_pose import GeoPoseNet
 from depthpose.pose.copies import SymmetricCopies, find_copies
+from depthpose.pose.network_pose import GeoPoseNet
 from depthpose.pose.synthetic import Objects
 from depthpose.pose.weights import read_pose_weights
 from depthpose.report.page import markdown_table, write_table

@@ -26,8 +26,8 @@ from depthpose.core.render import rasterize
 from depthpose.core.rigid import Rigid, cross_matrix
 from depthpose.pose.cloud import cloud_from_depth
 from depthpose.pose.config import IcpConfig, SensorConfig, SensorKind
-from depthpose.pose.mesh import drawn_triangles
 from depthpose.pose.icp import refine_pose
+from depthpose.pose.mesh import drawn_triangles
 from depthpose.pose.surface import prepare_surface
 from depthpose.pose.synthetic.views import measure, random_rotation
 from depthpose.report.page import markdown_table

@@ -1,12 +1,10 @@
-"""Known objects found in depth alone, without masks: synthetic tables, piles, and real frames.
+"""Known objects found in depth alone, without masks, on synthetic tables and in piles.
 
     python bench/find_tables.py --weights parts --tables 20
     python bench/find_tables.py --weights parts --register --piles 20
-    python bench/find_tables.py --weights linemod.safetensors ycb --real $DEPTHPOSE_DATA/pose
-    python bench/find_tables.py --register --real $DEPTHPOSE_DATA/pose
 
-``--register`` searches by the models alone, without the network; real frames then show the basket
-and the bottle too, and each object is searched alone, then, where there are several, all at once.
+``--register`` searches by the models alone, without the network. Real frames are those of
+``bench/real.py``.
 
 A synthetic table has two to all of the objects, each at most once, between other things, with a
 sensor's errors. An instance counts if half its silhouette and 200 pixels are visible. Right is an
@@ -19,21 +17,18 @@ is visible.
 import argparse
 import time
 from collections.abc import Iterator, Sequence
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import torch
 
 from depthpose.core.camera import Camera
 from depthpose.core.checkpoint import find_weights
-from depthpose.core.files import read_depth_png, read_json
 from depthpose.core.rigid import Rigid
 from depthpose.pose.config import ObjectsConfig
-from depthpose.pose.datasets import open_bop
+from depthpose.pose.mesh import sample_surface
+from depthpose.pose.metrics import add_m, adds_m
 from depthpose.pose.network_pose import GeoPoseNet
 from depthpose.pose.registration import Registration
-from depthpose.pose.mesh import read_model, sample_surface, with_found_symmetries
-from depthpose.pose.metrics import add_m, adds_m
 from depthpose.pose.synthetic import make_frames
 from depthpose.pose.types import ObjectModel, PoseEstimate
 from depthpose.report.page import markdown_table
@@ -88,50 +83,6 @@ def synthetic_frames(
         yield Frame(f"frame {frame.number}", frame.depth_m, frame.K, shown, known)
 
 
-def real_frames(folder: Path, models: Sequence[ObjectModel] | None) -> Iterator[Frame]:
-    """Give the frames of LineMOD and YCB that show an object of the weights; None: all there is."""
-    if models is None:
-        yield from single_scenes(folder / "real_frames")
-    for part in ("lm", "ycb_frames"):
-        data = open_bop(folder / part)
-        by_name = {model.name: model for model in models or data.objects.values()}
-        for image in sorted({(i.scene_id, i.image_id) for i in data.instances}):
-            here = [i for i in data.instances if (i.scene_id, i.image_id) == image]
-            named = [(data.objects[i.object_id].name, i) for i in here]
-            is_ycb = part == "ycb_frames"  # geometry alone shows neither faces of boxes nor turns
-            shown = [Shown(by_name[name], i.camera_from_model, True, is_ycb)
-                     for name, i in named if name in by_name]  # fmt: skip
-            if shown:
-                depth_m = read_depth_png(here[0].depth, here[0].depth_unit_m)
-                every = list(data.objects.values()) if is_ycb else None
-                yield Frame(f"{part} {image[1]}", depth_m, here[0].K, shown, every)
-
-
-def single_scenes(folder: Path) -> Iterator[Frame]:
-    """Give the frame of the basket and the two of the bottle."""
-    facts: Any = read_json(folder / "basket/truth.json")
-    pose = Rigid(torch.tensor(facts["cam_R_m2c"]).reshape(3, 3),
-                 torch.tensor(facts["cam_t_m2c_mm"]) / 1000)  # fmt: skip
-    model = read_model(folder / "basket/obj_000019.ply", "mm", name="basket")
-    model = with_found_symmetries(model, None, is_taken=True)
-    lens: Any = read_json(folder / "basket/camera.json")
-    K = torch.tensor(lens["K"]).double()
-    depth_m = read_depth_png(folder / "basket/depth.png", 0.001)
-    yield Frame("basket", depth_m, K, [Shown(model, pose, True)])
-    facts = read_json(folder / "bottle/poses.json")
-    fx, fy, cx, cy = facts["depth_K"]
-    K = torch.tensor([[fx, 0, cx], [0, fy, cy], [0, 0, 1]]).double()
-    to_color = torch.tensor(facts["depth_camera_to_color_camera"]).double()
-    there = torch.tensor(facts["model_to_color_camera_authors_test_pose"]).double()
-    matrix = (to_color.inverse() @ there).float()
-    model = read_model(folder / "bottle/bottle.obj", "m", name="bottle")
-    model = with_found_symmetries(model, None, is_taken=True)
-    for number in facts["frames"]:
-        depth_m = read_depth_png(folder / f"bottle/depth_{number}.png", 0.001)
-        pose = Rigid(matrix[:3, :3], matrix[:3, 3])
-        yield Frame(f"bottle {number}", depth_m, K, [Shown(model, pose, True)])
-
-
 def measure(frame: Frame, found: Sequence[PoseEstimate]) -> Row:
     """Count found instances and answers that fit none."""
     right: set[int] = set()
@@ -162,16 +113,6 @@ def error_of(pose: Rigid, thing: Shown) -> float:
     return float(measure(pose, thing.pose, points_m)) / thing.model.diameter_m
 
 
-def searches(frame: Frame, alone: bool) -> Iterator[Frame]:
-    """Give a frame for each object that is searched in it alone, and one for all of them."""
-    names = sorted({thing.model.name for thing in frame.shown})
-    for name in names if alone else []:
-        shown = [thing for thing in frame.shown if thing.model.name == name]
-        yield frame._replace(name=f"{frame.name} {name}", shown=shown, known=[shown[0].model])
-    if len(names) > 1 or not alone:
-        yield frame
-
-
 def main() -> None:
     """Find the objects of every frame, and print what was found."""
     parser = argparse.ArgumentParser(description=__doc__)
@@ -179,41 +120,27 @@ def main() -> None:
     parser.add_argument("--register", action="store_true", help="without the network")
     parser.add_argument("--tables", type=int, default=20)
     parser.add_argument("--piles", type=int, default=0, help="in place of tables")
-    parser.add_argument("--real", type=Path, help="real frames in place of tables")
     words = parser.parse_args()
     torch.set_num_threads(1)
     for name in words.weights:
         net = GeoPoseNet.load(find_weights(name))
         models = net.weights.models
-        if words.real:
-            frames = real_frames(words.real, None if words.register else models)
-        else:
-            frames = synthetic_frames(models, words.piles or words.tables, 20 * bool(words.piles))
-        rows, alone = [], bool(words.register and words.real)
-        for frame in (part for whole in frames for part in searches(whole, alone)):
+        rows = list[Row]()
+        number = words.piles or words.tables
+        for frame in synthetic_frames(models, number, 20 * bool(words.piles)):
             height, width = frame.depth_m.shape
             camera = Camera(width=width, height=height, K=frame.K)
             known = frame.known or [thing.model for thing in frame.shown]
             used = registration(known) if words.register else net
-            asked = [model.name for model in known if model.name in used.objects]
+            asked = sorted({model.name for model in known})
             began, cpu = time.perf_counter(), time.process_time()
-            found = used.find(frame.depth_m, camera, sorted(set(asked)))
+            found = used.find(frame.depth_m, camera, asked)
             spent = {"s": time.perf_counter() - began, "cpu s": time.process_time() - cpu}
-            rows.append({**measure(frame, found), "known": len(set(asked)), **spent})
+            rows.append({**measure(frame, found), **spent})
             print(rows[-1], flush=True)
-        print(markdown_table(summary(name, rows)))
-
-
-def summary(name: str, rows: Sequence[Row]) -> list[Row]:
-    """Add up the searches for one object, and those for several."""
-    table = []
-    for several in sorted({row["known"] > 1 for row in rows}):
-        some = [row for row in rows if (row["known"] > 1) == several]
         kinds = ("instances", "right", "missed", "wrong", "s", "cpu s")
-        total = {key: sum(row[key] for row in some) for key in kinds}
-        objects = "several" if several else "one"
-        table.append({"weights": name, "searches": len(some), "objects": objects, **total})
-    return table
+        total = {key: sum(row[key] for row in rows) for key in kinds}
+        print(markdown_table([{"weights": name, "frames": len(rows), **total}]))
 
 
 _PREPARED: dict[tuple[str, ...], Registration] = {}

@@ -20,9 +20,9 @@ import trimesh
 
 from depthpose.core.config import read_config
 from depthpose.pose.config import EstimateConfig
+from depthpose.pose.metrics import SUCCESS_SHARE
 from depthpose.pose.network_pose import GeoPoseNet
 from depthpose.pose.registration import Registration
-from depthpose.pose.metrics import SUCCESS_SHARE
 from depthpose.pose.train.clouds import add_error, held_out_objects
 from depthpose.pose.train.config import PoseTraining
 from depthpose.pose.weights import PoseWeights, read_pose_weights

@@ -28,10 +28,10 @@ from negatives import SCALES, NegativeKind, negative_of
 from depthpose.core.checkpoint import find_weights
 from depthpose.core.loop import sample_generator
 from depthpose.pose.config import EstimateConfig, ObjectsConfig
-from depthpose.pose.network_pose import GeoPoseNet
-from depthpose.pose.registration import Registration
 from depthpose.pose.estimator import PoseEstimator
 from depthpose.pose.mesh import MIRROR_ALIKE, mirror_deviation
+from depthpose.pose.network_pose import GeoPoseNet
+from depthpose.pose.registration import Registration
 from depthpose.pose.synthetic import Objects
 from depthpose.pose.train.clouds import add_error
 from depthpose.pose.types import CloudSample, ObjectModel, ViewSample

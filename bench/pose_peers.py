@@ -1,184 +1,79 @@
 """Real instances of known pose: ours beside Open3D's FPFH + RANSAC + ICP, in one run.
 
-    python bench/pose_peers.py $DEPTHPOSE_DATA/pose --seeds 5 [--weights W.safetensors ...]
+    python bench/pose_peers.py $DEPTHPOSE_DATA --seeds 20 --register --weights ycb
 
-``pip install -e '.[open3d]'`` first. Ours runs on the objects of the weights. Seconds
-are wall time, one thread each (``OMP_NUM_THREADS=1``), without the preparation of models.
-Success is ADD (ADD-S where the table has it) below 10 % of the diameter; other answers are
-wrong, no answer is refused. A second table uses ADD alone, to the nearest of the
-copies that the data set declares: right, right among the alternatives, refused, wrong, and
-wrong with a certainty of 0.9 and more. ``--no-peer`` leaves Open3D out.
+``pip install -e '.[open3d]'`` first. Ours runs on the objects of the weights. What is counted is
+that of ``bench/real.py`` (see ``score``); Open3D names no alternatives and is never unsure. Seconds
+are of one thread each, without the preparation of models.
 """
 
 import argparse
-import os
 import time
-from collections.abc import Callable, Sequence
-from functools import cache, partial
+from collections.abc import Callable, Iterator, Sequence
+from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Protocol
 
 import torch
 from fpfh import VOXEL_DIAMETERS, FpfhEstimator
-from real_poses import RealCase, real_cases
+from real_poses import RealCase
+from score import Row, errors_of, use_seed
+from score_instances import cases, line, registration_of
 
+from depthpose import GeoPoseNet
 from depthpose.core.checkpoint import find_weights
-from depthpose.core.rigid import Rigid
-from depthpose.pose.config import EstimateConfig, VotingConfig
-from depthpose.pose.network_pose import GeoPoseNet
-from depthpose.pose.registration import Registration
-from depthpose.pose.evaluate import nearest_copy
-from depthpose.pose.mesh import symmetry_transforms
-from depthpose.pose.metrics import add_m, adds_m, auc
 from depthpose.pose.types import CloudInput, PoseEstimate, ViewInput
-from depthpose.pose.weights import PoseWeights, read_pose_weights
 from depthpose.report.page import markdown_table, write_table
 
-POINTS = 2000
-AnyInput = CloudInput | ViewInput
-Row = dict[str, Any]
-Method = Callable[[AnyInput], PoseEstimate]
-_PREPARED: dict[str, Registration] = {}
-"""By object: the model is prepared once, whatever the seed."""
+
+class Method(Protocol):
+    """What poses one input after the other."""
+
+    def estimate_many(self, inputs: Sequence[CloudInput | ViewInput]) -> list[PoseEstimate]:
+        """Pose inputs."""
+        ...
 
 
-def measure(case: RealCase, estimate: PoseEstimate) -> Row:
-    """Errors of one estimate in diameters, and the verdict."""
-    row: Row = {
-        "metric": "ADD-S" if case.is_symmetric else "ADD",
-        "add": None, "adds": None, "error_m": None,
-        "success": False, "refused": not estimate.is_posed, "wrong": False,
-        "add_declared": None, "named": False, "certainty": estimate.certainty,
-    }  # fmt: skip
-    if estimate.camera_from_model is None:
-        return row
-    step = max(1, len(case.model.vertices_m) // POINTS)
-    points_m = case.model.vertices_m[::step]
-    pair = (estimate.camera_from_model, case.sample.truth.camera_from_model, points_m)
-    row["add"] = float(add_m(*pair)) / case.model.diameter_m
-    row["adds"] = float(adds_m(*pair)) / case.model.diameter_m
-    error = row["adds" if case.is_symmetric else "add"]
-    row["success"], row["error_m"] = error < 0.1, error * case.model.diameter_m
-    row["add_declared"] = declared_add(case, estimate.camera_from_model, points_m)
-    others = [a.camera_from_model for a in estimate.alternatives]
-    row["named"] = any(declared_add(case, pose, points_m) < 0.1 for pose in others)
-    return row | {"wrong": not row["success"]}
+MethodOf = Callable[[RealCase, int], Method]
+"""Makes the method that poses an instance, by a seed."""
 
 
-def declared_add(case: RealCase, pose: Rigid, points_m: torch.Tensor) -> float:
-    """ADD in diameters to the nearest copy of the truth that the data set declares."""
-    truth = case.sample.truth.camera_from_model
-    declared = case.model.symmetries
-    truth = nearest_copy(pose, truth, symmetry_transforms(declared), declared)
-    return float(add_m(pose, truth, points_m)) / case.model.diameter_m
+def open3d_for(case: RealCase, seed: int, voxel_diameters: float) -> Method:
+    """Open3D's registration of one model."""
+    return FpfhEstimator([case.model], voxel_diameters, seed)
 
 
-def open3d_method(case: RealCase, seed: int, words: argparse.Namespace) -> Method:
-    """Open3D's registration for one model."""
-    peer = FpfhEstimator([case.model], words.voxel, seed)
-    cloud = CloudInput(name=case.name, points_m=case.points_m, object=case.model.name)
-    return lambda _: peer.estimate_many([cloud])[0]
+def registration_for(case: RealCase, seed: int, samples: Path) -> Method:
+    """Our registration of one model, prepared once."""
+    registration = registration_of(samples, case.name)
+    use_seed(registration, seed)
+    return registration
 
 
-def zero_shot_method(case: RealCase, seed: int) -> Method:
-    """Our registration without training; the seed draws points of the cloud."""
-    if case.model.name not in _PREPARED:
-        _PREPARED[case.model.name] = Registration([case.model])
-        _PREPARED[case.model.name].prepare()
-    net = _PREPARED[case.model.name]
-    net.config = EstimateConfig(voting=VotingConfig(seed=seed))
-    return lambda given: net.estimate_many([given])[0]
+def network_for(case: RealCase, seed: int, net: GeoPoseNet) -> Method:
+    """Trained weights, one object of which is posed."""
+    del case
+    use_seed(net, seed)
+    return net
 
 
-def our_method(weights: Sequence[str], case: RealCase, seed: int, with_icp: bool) -> Method:
-    """Trained weights with the object; the seed draws points and pairs of votes."""
-    config = EstimateConfig(with_icp=with_icp, voting=VotingConfig(seed=seed))
-    net = next(n for n in map(read_weights, weights) if case.sample.input.object in names_in(n))
-    estimator = GeoPoseNet(net, config)
-    estimator.estimate_many([case.sample.input])  # the model's surface is prepared once
-    return lambda given: estimator.estimate_many([given])[0]
-
-
-@cache
-def read_weights(name: str) -> PoseWeights:
-    """Read a file once."""
-    return read_pose_weights(find_weights(name))
-
-
-def names_in(weights: PoseWeights) -> set[str]:
-    """List the objects of weights."""
-    return {model.name for model in weights.models}
-
-
-def run_method(
-    name: str, cases: Sequence[RealCase], make: Callable[[RealCase, int], Method], seeds: int
-) -> list[Row]:
-    """Pose every case with every seed."""
-    rows = []
-    for case in cases:
-        for seed in range(seeds):
-            method = make(case, seed)
-            began = time.perf_counter()
-            estimate = method(case.sample.input)
-            seconds = time.perf_counter() - began
-            row = {"instance": case.name, "method": name, "seed": seed, **measure(case, estimate)}
-            rows.append(row | {"seconds": seconds})
-    return rows
-
-
-def grouped(rows: list[Row]) -> dict[tuple[str, str], list[Row]]:
-    """Rows of all seeds by instance and method, in the order in which they come."""
-    groups: dict[tuple[str, str], list[Row]] = {}
-    for row in rows:
-        groups.setdefault((row["instance"], row["method"]), []).append(row)
-    return groups
-
-
-def summary(rows: list[Row]) -> list[Row]:
-    """One row for each instance and method, over its seeds."""
-    table = []
-    for (instance, method), group in grouped(rows).items():
-        shares = {
-            name: sum(bool(r[name]) for r in group) for name in ("success", "refused", "wrong")
-        }
-        key = "adds" if group[0]["metric"] == "ADD-S" else "add"
-        errors = sorted(float(r[key]) for r in group if r[key] is not None)
-        lost = [torch.inf if r["error_m"] is None else r["error_m"] for r in group]
-        seconds = sorted(float(r["seconds"]) for r in group)
-        table.append({
-            "instance": instance, "method": method, "metric": group[0]["metric"],
-            "of": len(group), **shares,
-            "AUC": round(auc(torch.tensor(lost)), 3),
-            "median error [diameters]": round(errors[len(errors) // 2], 4) if errors else None,
-            "median s": round(seconds[len(seconds) // 2], 3),
-        })  # fmt: skip
-    return table
-
-
-def verdicts(rows: list[Row]) -> list[Row]:
-    """One row for each instance and method: verdicts by ADD with declared symmetries alone."""
-    table = []
-    for (instance, method), group in grouped(rows).items():
-        answered = [r for r in group if not r["refused"]]
-        wrong = [r for r in answered if r["add_declared"] >= 0.1]
-        sure = [r for r in wrong if (1.0 if r["certainty"] is None else r["certainty"]) >= 0.9]
-        named = sum(bool(r["named"]) for r in wrong)
-        certainties = sorted(r["certainty"] for r in answered if r["certainty"] is not None)
-        table.append({
-            "instance": instance, "method": method, "of": len(group),
-            "right": len(answered) - len(wrong), "right among the named": named,
-            "refused": len(group) - len(answered), "wrong": len(wrong) - named,
-            "wrong and sure": len(sure),
-            "median certainty": certainties[len(certainties) // 2] if certainties else None,
-        })  # fmt: skip
-    return table
+def pose(method_of: MethodOf, case: RealCase, seeds: int) -> Iterator[Row]:
+    """Pose an instance by each seed, and measure each answer."""
+    given = case.sample.input
+    method_of(case, 0).estimate_many([given])  # the first prepares the model
+    for seed in range(seeds):
+        method = method_of(case, seed)
+        began = time.process_time()
+        (estimate,) = method.estimate_many([given])
+        cpu_s = time.process_time() - began
+        errors = errors_of(estimate, case.sample.truth.camera_from_model, case.model)
+        yield {"instance": case.name, "seed": seed, **errors, "cpu_s": cpu_s}
 
 
 def main() -> None:
-    """Run the methods on the cases."""
+    """Run the methods on the instances; count for YCB's and for the others."""
     parser = argparse.ArgumentParser(description=__doc__)
-    default = Path(os.environ.get("DEPTHPOSE_DATA", ".")) / "pose"
-    parser.add_argument("samples", type=Path, nargs="?", default=default)
+    parser.add_argument("samples", type=Path, help="folder with pose/")
     parser.add_argument("--seeds", type=int, default=5)
     parser.add_argument("--only", default="", help="instances whose name contains this")
     parser.add_argument("--voxel", type=float, default=VOXEL_DIAMETERS)
@@ -188,21 +83,31 @@ def main() -> None:
     parser.add_argument("--out", type=Path, default=Path("out/pose_peers"))
     words = parser.parse_args()
     torch.set_num_threads(1)
-    cases = [case for case in real_cases(words.samples) if words.only in case.name]
-    rows = [] if words.no_peer else run_method(
-        "Open3D FPFH + RANSAC + ICP", cases,
-        lambda case, seed: open3d_method(case, seed, words), words.seeds,
-    )  # fmt: skip
-    objects = set[str]().union(*(names_in(read_weights(name)) for name in words.weights))
-    known = [case for case in cases if case.sample.input.object in objects]
-    for name, with_icp in (("Geo-PoseNet", False), ("Geo-PoseNet + ICP", True)):
-        make = partial(our_method, words.weights, with_icp=with_icp)
-        rows += run_method(name, known, make, words.seeds)
+
+    wanted = [case for name, case in cases(words.samples).items() if words.only in name]
+    runs = dict[str, tuple[MethodOf, list[RealCase]]]()
+    if not words.no_peer:
+        runs["Open3D"] = (partial(open3d_for, voxel_diameters=words.voxel), wanted)
     if words.register:
-        rows += run_method("ours, without training", cases, zero_shot_method, words.seeds)
+        runs["registration"] = (partial(registration_for, samples=words.samples), wanted)
+    for name in words.weights:
+        net = GeoPoseNet.load(find_weights(name))
+        own = [case for case in wanted if case.model.name in net.objects]
+        runs[name] = (partial(network_for, net=net), own)
+
+    rows = list[Row]()
+    table = list[Row]()
+    for name, (method_of, shown) in runs.items():
+        mine = [{"method": name, **row} for case in shown
+                for row in pose(method_of, case, words.seeds)]  # fmt: skip
+        groups = {
+            "YCB": [row for row in mine if row["instance"].startswith("ycb")],
+            "others": [row for row in mine if not row["instance"].startswith("ycb")],
+        }
+        table += [line(f"{name}, {group}", some) for group, some in groups.items() if some]
+        rows += mine
     write_table(words.out, rows)
-    print(markdown_table(summary(rows)))
-    print(markdown_table(verdicts(rows)))
+    print(markdown_table(table))
 
 
 if __name__ == "__main__":

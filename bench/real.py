@@ -13,6 +13,7 @@ import argparse
 import json
 import multiprocessing
 import os
+import sys
 import time
 from collections.abc import Sequence
 from pathlib import Path
@@ -22,17 +23,27 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")  # before torch is imported
 import torch
 from score import Job, Row, Section
 from score_depth import IMAGES, INDOOR, STREET_PAIRS
-from score_instances import BOXES, MASKS, SCANS
+from score_instances import BOXES, MASKS, NETWORKS, SCANS
 from score_reports import REPORTS
 from score_scenes import BINS, FRAMES
+from score_tracking import TRACKING
 
 from depthpose.core.run import environment
 from depthpose.report.page import markdown_table
 
 SECTIONS: dict[str, Section] = {
-    "masks": MASKS, "scans": SCANS, "boxes": BOXES, "bins": BINS, "frames": FRAMES,
-    "reports": REPORTS, "indoor": INDOOR, "streets": STREET_PAIRS, "image": IMAGES,
-}  # fmt: skip
+    "masks": MASKS,
+    "scans": SCANS,
+    "networks": NETWORKS,
+    "boxes": BOXES,
+    "bins": BINS,
+    "frames": FRAMES,
+    "reports": REPORTS,
+    "tracking": TRACKING,
+    "indoor": INDOOR,
+    "streets": STREET_PAIRS,
+    "image": IMAGES,
+}
 
 
 def main() -> None:
@@ -42,27 +53,41 @@ def main() -> None:
     )
     parser.add_argument("samples", type=Path, help="folder with pose/ and depth/")
     parser.add_argument("--only", nargs="+", choices=SECTIONS, default=list(SECTIONS))
-    parser.add_argument("--seeds", type=int, default=1, help="of each instance (masks, scans)")
+    parser.add_argument("--seeds", type=int, default=1, help="of each instance one by one")
     parser.add_argument("--processes", type=int, default=2)
-    parser.add_argument("--json", type=Path, help="file for all rows and tables")
+    parser.add_argument(
+        "--json", type=Path, help="file for all rows and tables; other sections stay"
+    )
     parser.add_argument("--before", type=Path, help="such a file of an earlier run")
     words = parser.parse_args()
 
-    before = {} if words.before is None else json.loads(words.before.read_text())["sections"]
-    result: Row = {"environment": environment(), "seeds": words.seeds, "sections": {}}
+    before = {} if words.before is None else json.loads(words.before.read_text())
+    done = (
+        {} if words.json is None or not words.json.exists() else json.loads(words.json.read_text())
+    )
     for name in words.only:
         section = SECTIONS[name]
         began = time.perf_counter()
         rows, cpu_s = run_jobs(section.jobs(words.samples, words.seeds), words.processes)
         table = section.table(rows)
-        result["sections"][name] = {"cpu_s": cpu_s, "table": table, "rows": rows}
 
+        earlier = before.get(name, {})
+        facts = {"seeds": words.seeds, "environment": environment()}
+        done[name] = {**facts, "cpu_s": cpu_s, "table": table, "rows": rows}
         print(f"\n## {section.title} ({name})\n")
-        print(markdown_table(beside(table, before.get(name, {}).get("table", []))))
-        print(f"{cpu_s:.0f} CPU s with all preparation, {time.perf_counter() - began:.0f} s",
-              flush=True)  # fmt: skip
+        print(markdown_table(beside(table, earlier.get("table", []))))
+        print(f"{cpu_s:.0f} CPU s with all preparation, {time.perf_counter() - began:.0f} s")
+        if earlier:
+            print(f"in brackets: {described(earlier)}")
+        sys.stdout.flush()
         if words.json is not None:
-            words.json.write_text(json.dumps(result, indent=1))
+            words.json.write_text(json.dumps(done, indent=1))
+
+
+def described(section: Row) -> str:
+    """Say of what an earlier section was measured."""
+    facts = section["environment"]
+    return f"commit {facts.get('commit', 'unknown')} of {facts['date']}, {section['seeds']} seeds"
 
 
 def run_jobs(jobs: Sequence[Job], processes: int) -> tuple[list[Row], float]:

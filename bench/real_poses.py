@@ -43,12 +43,14 @@ class RealCase:
         model: of its object.
         is_symmetric: evaluated by ADD-S. All of YCB are: geometry alone does not show the sides of
             boxes, nor how a can is turned.
+        frame: the image that shows it; images of tables show several.
         color: the picture of the depth camera's frame, where there is one.
     """
 
     sample: CloudSample | ViewSample
     model: ObjectModel
     is_symmetric: bool
+    frame: str
     color: Path | None = None
 
     @property
@@ -68,7 +70,8 @@ def lm_cases(folder: Path) -> Iterator[RealCase]:
     for instance in data.instances:
         model = data.objects[instance.object_id]
         name = f"lm {model.name}"
-        yield _case(name, data.view(instance), model, not model.symmetries.is_none)
+        is_symmetric = not model.symmetries.is_none
+        yield _case(name, data.view(instance), model, is_symmetric, frame="lm")
 
 
 def bunny_cases(folder: Path, every: int = 5) -> Iterator[RealCase]:
@@ -96,7 +99,8 @@ def ycb_cases(folder: Path) -> Iterator[RealCase]:
     for instance in data.instances:
         model = data.objects[instance.object_id]
         name = f"ycb {instance.image_id} {model.name}"
-        case = _case(name, data.view(instance), model, is_symmetric=True)
+        frame = f"ycb {instance.image_id}"
+        case = _case(name, data.view(instance), model, is_symmetric=True, frame=frame)
         yield replace(case, color=instance.rgb)
 
 
@@ -104,6 +108,7 @@ def basket_cases(folder: Path) -> Iterator[RealCase]:
     """A basket on a table; its mask is the annotated pose, drawn, where the depth is near it."""
     home = folder / "real_frames/basket"
     model = read_model(home / "obj_000019.ply", "mm", name="basket")
+    model = with_found_symmetries(model, None, is_taken=True)
     truth = json.loads((home / "truth.json").read_text())
     R = torch.tensor(truth["cam_R_m2c"]).reshape(3, 3).double()
     pose = Rigid(R, torch.tensor(truth["cam_t_m2c_mm"]).double() / 1000)
@@ -146,7 +151,15 @@ def real_cases(folder: Path) -> list[RealCase]:
 
 
 def _case(
-    name: str, sample: CloudSample | ViewSample, model: ObjectModel, is_symmetric: bool
+    name: str,
+    sample: CloudSample | ViewSample,
+    model: ObjectModel,
+    is_symmetric: bool,
+    frame: str | None = None,
 ) -> RealCase:
-    given = replace(sample.input, name=name)
-    return RealCase(sample=replace(sample, input=given), model=model, is_symmetric=is_symmetric)
+    return RealCase(
+        sample=replace(sample, input=replace(sample.input, name=name)),
+        model=model,
+        is_symmetric=is_symmetric,
+        frame=frame or name,
+    )

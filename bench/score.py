@@ -7,15 +7,15 @@ one. Right is below 0.1.
 
 import inspect
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
 from torch import Tensor
 
-from depthpose import Registration
+from depthpose import GeoPoseNet, Registration
 from depthpose.core.rigid import Rigid
-from depthpose.pose.config import EstimateConfig, VotingConfig
 from depthpose.pose.mesh import sample_surface, symmetry_transforms
 from depthpose.pose.metrics import add_of_nearest_m, adds_m
 from depthpose.pose.types import ObjectModel, PoseEstimate
@@ -85,9 +85,10 @@ def accepts(function: Callable[..., Any], argument: str) -> bool:
     return argument in inspect.signature(function).parameters
 
 
-def use_seed(registration: Registration, seed: int) -> None:
-    """Set what registration draws its points by."""
-    registration.config = EstimateConfig(voting=VotingConfig(seed=seed))
+def use_seed(estimator: Registration | GeoPoseNet, seed: int) -> None:
+    """Set what an estimator draws its points by."""
+    config = estimator.config
+    estimator.config = replace(config, voting=replace(config.voting, seed=seed))
 
 
 def median(values: Sequence[float]) -> float | None:

@@ -12,16 +12,18 @@ from typing import Any
 
 import numpy as np
 import torch
-from find_tables import Frame, measure, real_frames, searches
+from find_tables import Frame, Shown, measure
 from PIL import Image
+from real_poses import RealCase
 from score import POINTS, RIGHT, Job, Row, Section, add_to_copy
+from score_instances import cases
 
 from depthpose import Registration
 from depthpose.core.camera import project
 from depthpose.core.files import read_json
 from depthpose.core.rigid import Rigid
 from depthpose.pose.mesh import read_model, sample_surface, symmetries_from_bop
-from depthpose.pose.types import ObjectModel, PoseEstimate
+from depthpose.pose.types import ObjectModel, PoseEstimate, ViewInput
 
 SURE_VISIBLE = 0.7
 """An instance of a bin counts where its truth is sure and so much of its silhouette is visible."""
@@ -162,9 +164,28 @@ def search_frame(frame: Frame, registration: Registration) -> Row:
 
 @cache
 def frame_searches(samples: Path) -> list[Frame]:
-    """Read the frames once in a process; one for each search."""
-    frames = real_frames(samples / "pose", None)
-    return [part for frame in frames for part in searches(frame, alone=True)]
+    """Give each real frame once for each object that is searched alone, and once for all of them.
+
+    In both frames of YCB the objects of both are searched together.
+    """
+    by_frame = dict[str, list[RealCase]]()
+    for case in cases(samples).values():
+        if isinstance(case.sample.input, ViewInput):
+            by_frame.setdefault(case.frame, []).append(case)
+    ycb = [case.model for name, case in cases(samples).items() if name.startswith("ycb")]
+    alone = [frame_of(case.name, [case]) for some in by_frame.values() for case in some]
+    together = [frame_of(name, some, ycb if name.startswith("ycb") else None)
+                for name, some in by_frame.items() if len(some) > 1]  # fmt: skip
+    return alone + together
+
+
+def frame_of(name: str, shown: Sequence[RealCase], known: list[ObjectModel] | None = None) -> Frame:
+    """Make a frame of the instances that are counted in it, and of which objects may be there."""
+    view = shown[0].sample.input
+    assert isinstance(view, ViewInput)
+    instances = [Shown(case.model, case.sample.truth.camera_from_model, True, case.is_symmetric)
+                 for case in shown]  # fmt: skip
+    return Frame(name, view.depth_m, view.K, instances, known)
 
 
 def models_of(frame: Frame) -> list[ObjectModel]:

@@ -31,10 +31,10 @@ from fpfh import FpfhEstimator
 from depthpose.core.checkpoint import find_weights
 from depthpose.pose.config import EstimateConfig, ObjectsConfig, SensorConfig, SensorKind
 from depthpose.pose.datasets.layouts import read_bop_models, read_models_info
-from depthpose.pose.network_pose import DepthImageRegressor, GeoPoseNet
-from depthpose.pose.registration import Registration
 from depthpose.pose.mesh import sample_surface
 from depthpose.pose.metrics import add_m, adds_m
+from depthpose.pose.network_pose import DepthImageRegressor, GeoPoseNet
+from depthpose.pose.registration import Registration
 from depthpose.pose.synthetic import PARTS, Objects, make_part
 from depthpose.pose.types import ObjectModel, PoseEstimate, ViewInput, ViewSample
 from depthpose.pose.weights import read_pose_weights
@@ -95,9 +95,7 @@ def without_refusal(name: str, files: Sequence[str], number: int) -> Iterator[Me
     open_ = [
         dataclasses.replace(
             w,
-            refusal=dataclasses.replace(
-                w.refusal, min_probability=0.0
-            ),
+            refusal=dataclasses.replace(w.refusal, min_probability=0.0),
         )
         for w in found
     ]

@@ -32,9 +32,9 @@ from depthpose.core.loop import sample_generator
 from depthpose.core.render import rasterize
 from depthpose.core.rigid import Rigid, rotation_by
 from depthpose.pose.config import SensorConfig
-from depthpose.pose.network_pose import GeoPoseNet
 from depthpose.pose.mesh import drawn_triangles, sample_surface
 from depthpose.pose.metrics import add_m, adds_m
+from depthpose.pose.network_pose import GeoPoseNet
 from depthpose.pose.synthetic.views import measure, random_rotation
 from depthpose.pose.types import ObjectModel, PoseEstimate, ViewInput
 from depthpose.report.page import markdown_table

@@ -77,7 +77,9 @@ for words in {[[], *NAMES]}:
 def test_help_names_every_command_and_exit_code(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["--help"]) == 0
     text = capsys.readouterr().out
-    assert all(name in text for name in COMMANDS)
+    for name in COMMANDS:
+        shown = f"{name.split()[0]} ID" if name.split()[0] in ("reproduce", "figure") else name
+        assert f"\n  {shown} " in text, name
     assert "130  interrupted" in text
 
 
@@ -87,12 +89,26 @@ def test_help_lists_the_stages_and_sets_the_thesis_apart(
     assert main(["depth", "train", "--help"]) == 0
     text = capsys.readouterr().out
     for stage in ("view", "select", "stereo", "finetune"):
-        assert f"\n    {stage} " in text, stage
+        assert f"\n      {stage} " in text, stage
     assert main(["--help"]) == 0
     first, _, of_thesis = capsys.readouterr().out.partition("tables and figures of the thesis:")
     assert "reproduce" not in first
-    assert "figure 3-5" in of_thesis
-    assert first.index("pose train") < first.index("depth match") < first.index("depth predict")
+    for name in COMMANDS:
+        if name.startswith(("reproduce ", "figure ")):
+            assert name.split()[1] in of_thesis, name
+
+
+def test_help_has_no_line_breaks_of_the_code(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("COLUMNS", "100")
+    assert main(["depth", "predict", "--help"]) == 0
+    text = capsys.readouterr().out
+    assert "height of the camera above the road in metres: with --camera-tilt the road" in text
+    assert max(len(line) for line in text.splitlines()) <= 100
+    between = text.partition("height of the camera")[2].partition("--camera-tilt NUMBER")[0]
+    lines = [line.strip("│ ") for line in between.splitlines()[1:-1]]
+    assert all(len(line) > 60 for line in lines[:-1]), lines  # filled, but for the last
 
 
 @pytest.mark.parametrize(

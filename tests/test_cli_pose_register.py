@@ -12,6 +12,7 @@ from tests.pose.synthetic_objects import write_part
 
 from depthpose.cli import main
 from depthpose.core.camera import Camera, write_camera
+from depthpose.core.errors import Notice
 from depthpose.core.files import Cloud, read_cloud, write_cloud, write_depth_png, write_image
 from depthpose.pose.config import ObjectsConfig
 from depthpose.pose.datasets import write_bop_models, write_bop_scene
@@ -66,6 +67,15 @@ def test_a_cad_file_and_a_cloud_give_a_pose(cad: Path, tmp_path: Path) -> None:
     assert (row["object"], row["status"]) == ("connector", "ok")
     assert (tmp_path / "out/scan.pose.ply").is_file()
     assert (tmp_path / "out/report.html").is_file()
+
+
+def test_a_declared_symmetry_is_taken_and_doubted_aloud(cad: Path, tmp_path: Path) -> None:
+    words = ["--cad", cad, "--unit", "mm", "--cloud", tmp_path / "scan.ply"]
+    with pytest.warns(Notice, match="connector: turned by the symmetry z,2 its surface lies"):
+        assert predict(*words, "--symmetry", "connector:z,2", "--out", tmp_path / "out") == 0
+    assert rows(tmp_path / "out")[0]["status"] == "ok"
+    # Results of other symmetries are other results.
+    assert predict(*words, "--out", tmp_path / "out") == 2
 
 
 def test_a_depth_image_has_a_unit_of_its_own(cad: Path, tmp_path: Path) -> None:
@@ -135,6 +145,12 @@ def test_a_cad_file_is_followed_through_frames(
         ("--method register --cad connector.stl --bop .", "Leave --cad out"),
         ("--cad-unit mm --cloud scan.ply", "no CAD file is given. Leave --cad-unit out"),
         ("--method register --cad scan.txt --unit mm --cloud scan.ply", "triangles, such as STL"),
+        ("--symmetry z,2 --cloud scan.ply", "--symmetry z,2: is of --method register with --cad"),
+        ("--method register --symmetry z,2 --bop .", "--symmetry z,2: is of --method register"),
+        ("--method register --cad connector.stl --unit mm --symmetry z,two --cloud scan.ply",
+         "symmetry 'z,two': 'z,two' is no axis with 2 to 360 turns; write AXIS,N"),
+        ("--method register --cad connector.stl --unit mm --symmetry plug:z,2 --cloud scan.ply",
+         "no object is called so; Known: 'connector'"),
     ],
 )  # fmt: skip
 def test_what_is_missing_is_said(

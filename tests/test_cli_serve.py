@@ -108,6 +108,16 @@ def test_nothing_may_be_uploaded_is_refused(capsys: pytest.CaptureFixture[str]) 
     assert "--max-upload-mb 0: take 1 at least" in capsys.readouterr().err
 
 
+def test_the_time_of_a_computation_is_limited(
+    served: list[Limits], capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["serve", "--port", "0", "--max-seconds", "7"]) == 0
+    assert main(["serve", "--port", "0"]) == 0
+    assert [limits.compute_s for limits in served] == [7, 120]
+    assert main(["serve", "--max-seconds", "0"]) == 2
+    assert "--max-seconds 0: take 1 at least" in capsys.readouterr().err
+
+
 def test_without_the_extra_it_says_which(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:

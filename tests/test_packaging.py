@@ -1,4 +1,4 @@
-"""Dockerfile, CI file and release checklist, read line by line: what they name exists.
+"""Image, CI file and release checklist: what they name exists.
 
 No builder of images is at hand where these tests run; the CI file builds one.
 """
@@ -46,11 +46,6 @@ def of(name: str) -> list[str]:
     return [rest for instruction, rest in STEPS if instruction == name]
 
 
-def place(instruction: str, words: str) -> int:
-    (found,) = (k for k, (name, rest) in enumerate(STEPS) if name == instruction and words in rest)
-    return found
-
-
 def is_sent(path: str) -> bool:
     """Whether .dockerignore lets a file through: the last line that matches decides."""
     sent = True
@@ -63,21 +58,6 @@ def is_sent(path: str) -> bool:
         if any(fnmatch(name, pattern) or fnmatch(Path(name).name, bare) for name in names):
             sent = is_kept
     return sent
-
-
-def test_every_instruction_is_one_that_is_known() -> None:
-    known = {"FROM", "ARG", "ENV", "RUN", "WORKDIR", "COPY", "USER", "EXPOSE", "HEALTHCHECK",
-             "ENTRYPOINT", "CMD"}  # fmt: skip
-    assert {name for name, _ in STEPS} == known
-    assert STEPS[0][0] == "FROM"
-
-
-def test_the_base_is_the_public_image_of_our_python() -> None:
-    (base,) = of("FROM")
-    version = re.fullmatch(r"python:(3\.\d+)-slim", base)
-    assert version
-    assert f"Programming Language :: Python :: {version[1]}" in PROJECT["project"]["classifiers"]
-    assert PROJECT["project"]["requires-python"] == f">={version[1]}"
 
 
 @pytest.mark.parametrize("name", ["Dockerfile", ".dockerignore", ".github/workflows/ci.yml"])
@@ -103,46 +83,6 @@ def test_what_is_not_for_everyone_is_not_sent() -> None:
     assert kept_back
     for name in (*(f"src/depthpose/weights/{kept}" for kept in kept_back), ".git", "out", "tests"):
         assert not is_sent(name), name
-
-
-def test_the_package_is_installed_after_all_that_its_build_reads() -> None:
-    project = PROJECT["project"]
-    needed = [project["readme"], *project["license-files"], "pyproject.toml"]
-    needed += [PROJECT["tool"]["hatch"]["version"]["path"]]
-    needed += PROJECT["tool"]["hatch"]["build"]["targets"]["wheel"]["packages"]
-    installed = place("RUN", "'.[")
-    copied = [source for name, rest in STEPS[:installed] if name == "COPY"
-              for source in shlex.split(rest)[:-1]]  # fmt: skip
-    for path in needed:
-        parts = [path, *map(str, Path(path).parents)]
-        assert set(parts) & set(copied), path
-
-
-def test_what_pip_installs_is_named_by_the_project() -> None:
-    torch, package = (rest for rest in of("RUN") if rest.startswith("pip install"))
-    for words in (torch, package):
-        assert shlex.split(words)[:4] == ["pip", "install", "-c", "constraints.txt"]
-    assert re.search(r"^torch==", (ROOT / "constraints.txt").read_text(), re.MULTILINE)
-    assert any(re.match(r"torch\b", need) for need in PROJECT["project"]["dependencies"])
-    (extras,) = re.findall(r"\.\[([\w,]+)\]", package)
-    assert set(extras.split(",")) <= set(PROJECT["project"]["optional-dependencies"])
-    assert "serve" in extras
-
-
-def test_pip_asks_its_own_way_for_the_cpu_build() -> None:
-    assert of("ARG") == ["PIP_EXTRA_INDEX_URL"]
-    help_text = subprocess.run(
-        [sys.executable, "-m", "pip", "install", "--help"], capture_output=True, check=True
-    ).stdout.decode()
-    assert "--extra-index-url" in help_text
-
-
-def test_nothing_runs_as_root() -> None:
-    (user,) = of("USER")
-    made = place("RUN", "useradd")
-    assert shlex.split(STEPS[made][1])[-1] == user != "root"
-    assert made < place("USER", user) < place("ENTRYPOINT", "")
-    assert max(k for k, (name, _) in enumerate(STEPS) if name == "RUN") < place("USER", user)
 
 
 def test_what_starts_is_a_command_with_its_options() -> None:
@@ -197,48 +137,6 @@ def test_the_health_check_tells_a_page_from_none() -> None:
     assert health(port) != 0
     with answering(500) as port:
         assert health(port) != 0
-
-
-def read_ci() -> dict[str, Any]:
-    return yaml.safe_load((ROOT / ".github/workflows/ci.yml").read_text())
-
-
-def test_ci_runs_what_must_pass_and_builds_the_image() -> None:
-    jobs = read_ci()["jobs"]
-    runs = [step["run"] for step in jobs["everything"]["steps"] if "run" in step]
-    assert runs == [".ci/run"]
-    assert os.access(ROOT / ".ci/run", os.X_OK)
-    image = " ".join(step.get("run", "") for step in jobs["image"]["steps"])
-    assert "docker build --build-arg PIP_EXTRA_INDEX_URL --tag depthpose ." in image
-    (command,) = re.findall(r"docker run --rm depthpose (\w+)", image)
-    assert command in COMMANDS
-    assert ".State.Health.Status" in image
-
-
-def test_ci_checks_out_reads_only_and_knows_our_python() -> None:
-    ci = read_ci()
-    assert ci["permissions"] == {"contents": "read"}
-    for job in ci["jobs"].values():
-        assert job["steps"][0]["uses"].startswith("actions/checkout@v")
-        assert {step["uses"].partition("/")[0] for step in job["steps"] if "uses" in step} == {
-            "actions"
-        }
-    base = ci["jobs"]["everything"]["container"]
-    assert f"{base}-slim" == of("FROM")[0]
-
-
-def test_a_release_is_checked_before_it_is_published() -> None:
-    jobs = yaml.safe_load((ROOT / ".github/workflows/release.yml").read_text())["jobs"]
-    assert (jobs["wheel"]["needs"], jobs["publish"]["needs"]) == ("build", "wheel")
-    said = "\n".join(step.get("run", "") for job in jobs.values() for step in job["steps"])
-    for words in ("python -m build", "twine check --strict", "depthpose doctor", "depthpose demo"):
-        assert words in said, words
-    tried = jobs["wheel"]["strategy"]["matrix"]["python"]
-    known = [c.rpartition(" ")[2] for c in PROJECT["project"]["classifiers"] if "Python ::" in c]
-    assert set(known) <= set(tried)
-    assert jobs["publish"]["permissions"] == {"id-token": "write"}
-    assert jobs["pages"]["needs"] == "publish"
-    assert '.ci/pages site "$GITHUB_REF_NAME"' in said
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="a script of bash")

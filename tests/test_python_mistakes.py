@@ -23,7 +23,7 @@ MISTAKES = {
     ),
     "a list of CAD files": (
         "Registration.load(['part.stl'], unit='mm')",
-        "Registration.load takes paths one by one: load(*files, unit=...)",
+        "a list is no model: give files, or meshes of trimesh or Open3D, one by one",
     ),
     "a depth image in another format": (
         "pose.estimate(depth='depth.exr', mask=mask, camera=camera, object='flange')",

@@ -104,8 +104,8 @@ def _show_scene(
     sections: list[Section] = []
     homes = {method: out / method.lower().replace(",", "").replace(" ", "-") for method in nets}
     for method, (views, net) in nets.items():
-        seen = pair if views == _FROM_PAIR else replace(pair, right=None)
-        estimate = net.estimate_pair(seen, with_check=False)
+        views_used = pair if views == _FROM_PAIR else replace(pair, right=None)
+        estimate = net.estimate_pair(views_used, with_check=False)
         predicted_m = clamped_depth(estimate.disparity_px, pair.camera, _CAP_M)
         counts = truth.depth_m < _CAP_M
         mask = counts & torch.isfinite(estimate.disparity_px)
@@ -113,12 +113,14 @@ def _show_scene(
         row["coverage"] = float(mask.sum() / counts.sum())
         row |= measure("disparity", estimate.disparity_px[mask], truth.disparity_px[mask])
         rows.append(row | measure("depth", predicted_m[mask], truth.depth_m[mask]))
-        write_estimate(homes[method], seen, estimate, range_m, CLOUD_M)
+        write_estimate(homes[method], views_used, estimate, range_m, CLOUD_M)
         error_px = (estimate.disparity_px - truth.disparity_px).abs()
         error = DepthError(error=error_px, is_disparity=True)
         title = f"{pair.name}: {method}, {views}"
         sections.append(
-            depth_section(title, seen, estimate, range_m=range_m, error=error, with_image=False)
+            depth_section(
+                title, views_used, estimate, range_m=range_m, error=error, with_image=False
+            )
         )
     best, scale = next(iter(nets)), depth_scale(*range_m)
     colors, true = homes[best] / f"{pair.name}.color.png", folder / "depth.color.png"

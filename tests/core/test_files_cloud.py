@@ -1,4 +1,5 @@
 import struct
+import warnings
 from pathlib import Path
 
 import numpy as np
@@ -243,3 +244,29 @@ def test_a_signalling_nan_is_read_without_a_warning(tmp_path: Path) -> None:
     table.view(np.uint32)[2, 0] = 0x7FA00000
     np.save(tmp_path / "x.npy", table)
     assert read_cloud(tmp_path / "x.npy").points[:, 1].eq(1).all()
+
+
+@pytest.mark.parametrize(
+    ("viewpoint", "is_said"),
+    [
+        ("0 0 0 1 0 0 0", False),
+        ("0 0 0 -1 0 0 0", False),
+        ("0 0 0 0 0 0 0", False),
+        ("0 0 1.2 1 0 0 0", True),
+        ("0 0 0 0.7071 0 0.7071 0", True),
+        ("0 0 0 nan 0 0 0", True),
+        ("sensor", True),
+    ],
+)
+def test_a_viewpoint_that_is_not_applied_is_named(
+    tmp_path: Path, viewpoint: str, is_said: bool
+) -> None:
+    head = "FIELDS x y z\nSIZE 4 4 4\nTYPE F F F\nWIDTH 2\nHEIGHT 1\n"
+    text = f"{head}VIEWPOINT {viewpoint}\nPOINTS 2\nDATA ascii\n0 1.5 -2\n3.25 4 5\n"
+    (tmp_path / "x.pcd").write_text(text)
+    with warnings.catch_warnings(record=True) as said:
+        warnings.simplefilter("always")
+        assert same(read_cloud(tmp_path / "x.pcd"), color=None)
+    expected = [f"its VIEWPOINT {viewpoint} "] if is_said else []
+    assert [str(one.message)[len(str(tmp_path / "x.pcd: ")) :][: len(e)]
+            for one, e in zip(said, expected, strict=True)] == expected  # fmt: skip

@@ -1,16 +1,19 @@
 import errno
 import os
+import re
 import subprocess
 import sys
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import pytest
 import torch
 
+from depthpose.cli import main
 from depthpose.core.checkpoint import Checkpoint, save_checkpoint
 from depthpose.core.config import write_config
 from depthpose.core.errors import InputError
@@ -27,8 +30,9 @@ from depthpose.core.files import (
     write_map,
     write_video,
 )
+from depthpose.core.files.disk import natural_order
 from depthpose.core.loop import RunLogger
-from depthpose.core.run import claim_folder
+from depthpose.core.run import claim_folder, lock_folder
 from depthpose.report.page import Section, write_page, write_table
 
 
@@ -222,3 +226,59 @@ def test_a_folder_may_be_called_as_a_pattern_is_written(tmp_path: Path) -> None:
     assert stores.read_all(str(folder), ".json") == {"0.json": b"{}"}
     assert stores.read_all(f"file://{folder}", ".json") == {"0.json": b"{}"}
     assert stores.exists(str(folder / "0.json"))
+
+
+def in_order(*names: str) -> list[str]:
+    """Sort names, given in their order, from the other end."""
+    paths = sorted((Path(name) for name in reversed(names)), key=natural_order)
+    return [str(path) for path in paths]
+
+
+def test_names_are_sorted_by_the_value_of_their_numbers() -> None:
+    names = ["a2.png", "a10.png", "b1_left.png", "b1_right.png", "b09.png", "b10.png"]
+    assert in_order(*names) == names
+
+
+def test_decimals_are_sorted_as_decimals() -> None:
+    """Times in seconds, whose writer leaves out zeros at their ends."""
+    times = ["0.3", "0.45", "0.5", "0.625", "0.7", "0.85", "0.9", "1.05", "10.0"]
+    assert in_order(*(f"{time}.png" for time in times)) == [f"{time}.png" for time in times]
+    long = ["1311868164.363181.png", "1311868164.4.png", "1311868165.png", "1311868165.0001.png"]
+    assert in_order(*long) == long
+    folders = ["run 0.25/a.png", "run 0.5/a.png", "run 0.5/b.png"]
+    assert in_order(*folders) == folders
+
+
+def test_three_numbers_between_points_are_no_decimal() -> None:
+    names = ["v1.2.9.png", "v1.2.10.png", "v1.10.1.png", "frame.2.png", "frame.10.png"]
+    assert in_order(*names[3:], *names[:3]) == names[3:] + names[:3]
+
+
+@pytest.mark.parametrize("behind", ["", "deeper/out"])
+def test_links_that_lead_nowhere_are_named(
+    tmp_path: Path, behind: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Not 'free the space', and no traceback."""
+    (tmp_path / "a").symlink_to("b")
+    (tmp_path / "b").symlink_to("a")
+    (tmp_path / "gone").symlink_to("nowhere/x")
+    (tmp_path / "cloud.xyz").write_text("1 2 3\n")
+    for link, leads in (("a", "in a circle"), ("gone", "to 'nowhere/x', which is not there")):
+        out = tmp_path / link / behind
+        said = f"{tmp_path / link}: is a link that leads {leads}; remove it, or choose another"
+        words = ["pose", "predict", "--cloud", str(tmp_path / "cloud.xyz"), "--out", str(out)]
+        assert main(words) == 2
+        assert said in capsys.readouterr().err
+        for write in (
+            partial(lock_folder, is_shared=False),
+            lambda path: write_json(path / "x.json", {}),
+        ):
+            with pytest.raises(InputError, match=re.escape(said)):
+                write(out)
+
+
+def test_a_link_to_a_folder_is_one(tmp_path: Path) -> None:
+    (tmp_path / "there").mkdir()
+    (tmp_path / "link").symlink_to("there")
+    write_json(tmp_path / "link/new/x.json", {})
+    assert (tmp_path / "there/new/x.json").is_file()

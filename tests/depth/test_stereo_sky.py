@@ -144,7 +144,7 @@ def test_what_is_surely_matched_is_not_the_sky(
         (network.sky, "forward", 0.97),
     ):
         monkeypatch.setattr(
-            where, name, lambda *given, value=value: torch.full_like(given[1], value)
+            where, name, lambda *given, value=value, **_: torch.full_like(given[1], value)
         )
     with torch.no_grad():
         read = network.read(left, right, SMALL.max_disparity_px, with_confidence=True)

@@ -82,6 +82,25 @@ def many_nodes() -> bytes:
     return pack_glb(tree, good[20 + size :])
 
 
+def deep_nodes() -> bytes:
+    """A chain of nodes, each with a mesh: the cube of its length for each of them."""
+    good = trimesh.creation.box().export(file_type="glb")
+    assert isinstance(good, bytes)
+    (size,) = struct.unpack("<I", good[12:16])
+    tree = json.loads(good[20 : 20 + size])
+    tree["nodes"] = [{"mesh": 0, "children": [k + 1]} for k in range(5000)] + [{"mesh": 0}]
+    tree["scenes"] = [{"nodes": [0]}]
+    return pack_glb(tree, good[20 + size :])
+
+
+def comb_obj(teeth: int, times: int) -> bytes:
+    """Polygons that turn back at each tooth."""
+    rows = [f"v {2 * k + x} {y} 0\n" for k in range(teeth)
+            for x, y in ((0, 0), (0.9, 10), (1, 10), (1.9, 0))]  # fmt: skip
+    text = "".join(rows) + f"v {2 * teeth} -1 0\nv 0 -1 0\n"
+    return (text + times * f"f {' '.join(map(str, range(1, 4 * teeth + 3)))}\n").encode()
+
+
 def npy(shape: object, descr: str = "<f4") -> bytes:
     """A header and nothing behind it."""
     text = repr({"descr": descr, "fortran_order": False, "shape": shape}).encode().ljust(117)
@@ -131,6 +150,10 @@ LINES = 2**26
 BOMBS: dict[str, Bomb] = {
     "GLB, a sparse accessor": ("x.glb", lambda: sparse_glb(10**9), in_mm),
     "GLB, 200,000 nodes": ("x.glb", many_nodes, in_mm),
+    "GLB, nodes in nodes": ("x.glb", deep_nodes, in_mm),
+    "OBJ of a comb": ("x.obj", lambda: comb_obj(1200, 1), in_mm),
+    "OBJ of combs": ("x.obj", lambda: comb_obj(1200, 1000), in_mm),
+    "OBJ of a line that goes on": ("x.obj", lambda: 2**23 * b"a\\\n", in_mm),
     "PCD, LZF of 1 GB": ("x.pcd", lambda: packed_pcd(2**30 // 12), read_cloud),
     "PCD, LZF that says 1 GB": ("x.pcd", lambda: LZF + struct.pack("<II", 2, 1073741820) + b"\0\0",
                                 read_cloud),

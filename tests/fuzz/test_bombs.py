@@ -11,7 +11,7 @@ import pytest
 from tests.fuzz.bombs import BOMBS
 
 ROOT = Path(__file__).parents[2]
-READ = ("key values of lines",)
+READ = ("key values of lines", "OBJ of a comb")
 """Large, and no bomb."""
 
 

@@ -4,6 +4,7 @@ import json
 import struct
 from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -13,7 +14,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from tests.fuzz.damage import pack_glb
 
-from depthpose.core.errors import InputError
+from depthpose.core.errors import InputError, Notice
 from depthpose.core.rigid import rotation_by
 from depthpose.pose.cloud import unit_advice
 from depthpose.pose.registration import Registration
@@ -265,3 +266,117 @@ def test_a_model_in_centimetres_is_not_called_inches(factor: float, said: str) -
     diameter, seen = float(np.linalg.norm(POINTS.max(0))), torch.from_numpy(0.6 * POINTS)
     assert said in (unit_advice(diameter, factor * seen) or "")
     assert "mask fit it? Or is the model in cm?" in (unit_advice(diameter / 10, seen) or "")
+
+
+def part_and(*others: tuple[float, float]) -> Any:  # noqa: ANN401  a mesh of trimesh's
+    """A box of 60 x 40 x 20, and cubes of a side at a place along x."""
+    cubes = [trimesh.creation.box([side] * 3) for side, _ in others]
+    for cube, (_, x) in zip(cubes, others, strict=True):
+        cube.apply_translation([x, 0, 0])
+    return trimesh.util.concatenate([trimesh.creation.box((60, 40, 20)), *cubes])
+
+
+@pytest.mark.parametrize("ending", ["stl", "ply", "obj", "glb"])
+def test_a_small_body_far_from_the_part_is_named_and_left_out(tmp_path: Path, ending: str) -> None:
+    path = tmp_path / f"part.{ending}"
+    part_and((2, 1200)).export(path)
+    said = r"left out 1 small body far from the part of 74.83 \(one of 3.46 at \(1199, -1, -1\)"
+    with pytest.warns(Notice, match=said):
+        points, faces = read_geometry(path)
+    assert len(faces) == 12
+    assert np.abs(points).max() <= 30
+
+
+def test_what_is_near_the_part_is_of_it(tmp_path: Path, recwarn: pytest.WarningsRecorder) -> None:
+    """A body at a quarter of its length, and one that is near to that one."""
+    path = tmp_path / "part.stl"
+    part_and((2, 45), (2, 64), (30, 110)).export(path)
+    points, faces = read_geometry(path)
+    assert len(faces) == 4 * 12
+    assert points[:, 0].max() == 125
+    assert not [one for one in recwarn if issubclass(one.category, Notice)]
+
+
+def test_many_small_bodies_are_counted(tmp_path: Path) -> None:
+    path = tmp_path / "part.stl"
+    part_and(*((2, 500.0 + 100 * k) for k in range(5))).export(path)
+    with pytest.warns(Notice, match=r"left out 5 small bodies .* and 2 more, in the file's unit"):
+        assert len(read_geometry(path)[1]) == 12
+
+
+def test_two_parts_far_from_each_other_are_refused(tmp_path: Path) -> None:
+    path = tmp_path / "two.stl"
+    part_and((30, 500)).export(path)
+    with pytest.raises(InputError, match="cannot be known which of them is the object"):
+        read_geometry(path)
+
+
+def box_glb(**change: object) -> bytes:
+    """A box whose JSON is changed at its top."""
+    good = trimesh.creation.box((0.1, 0.2, 0.3)).export(file_type="glb")
+    assert isinstance(good, bytes)
+    (size,) = struct.unpack("<I", good[12:16])
+    return pack_glb(json.loads(good[20 : 20 + size]) | change, good[20 + size :])
+
+
+SCENE = {"scene": 0, "scenes": [{"nodes": [0]}]}
+
+
+@pytest.mark.parametrize(
+    ("nodes", "said"),
+    [
+        ([{"mesh": 0, "matrix": [1e308, *[0] * 4, 1, *[0] * 4, 1, *[0] * 4, 1]}], "1e.308, which"),
+        ([{"mesh": 0, "translation": [0, 1e20, 0]}], "translation of node 0 holds 1e.20, which"),
+        ([{"mesh": 0, "scale": [1, "nan", 1]}], "scale of node 0 holds nan"),
+        ([{"children": [1, 2]}, {"children": [3]}, {"children": [3]}, {"mesh": 0}],
+         "node 3 hangs under nodes (1 and 2|2 and 1)"),
+        ([{"mesh": 0}, {"children": [2]}, {"children": [1]}], "node 1 hangs under itself"),
+        ([{"mesh": 0, "children": [0]}], "node 0 hangs under itself"),
+        ([*({"mesh": 0, "children": [k + 1]} for k in range(400)), {"mesh": 0}],
+         "401 nodes hang too deep in each other"),
+    ],
+)  # fmt: skip
+def test_nodes_of_a_glb_that_are_no_tree_are_refused(
+    tmp_path: Path, nodes: list[object], said: str
+) -> None:
+    with pytest.raises(InputError, match=said):
+        read_geometry(saved(tmp_path, "a.glb", box_glb(nodes=nodes, **SCENE)))
+
+
+def test_nodes_of_a_glb_that_are_a_tree_are_read(tmp_path: Path) -> None:
+    """One mesh in two places is no mistake."""
+    nodes = [{"children": [1, 2]}, {"mesh": 0}, {"mesh": 0, "translation": [0.2, 0, 0]}]
+    path = saved(tmp_path, "a.glb", box_glb(nodes=nodes, **SCENE))
+    assert size_of(path) == pytest.approx((0.44, 0.012))
+
+
+def test_a_line_that_goes_on_is_one_line(tmp_path: Path) -> None:
+    text = VERTICES + faces_of_obj()
+    text = text.replace("f 6 5", "f 6 \\\n5").replace("v 30 0 0", "v \\\n30 \\\n0 0", 1)
+    # The last line of the file too, behind which nothing comes.
+    text = text.removesuffix("\n") + " \\"
+    assert size_of(saved(tmp_path, "a.obj", text)) == pytest.approx((AREA, VOLUME))
+
+
+def comb(teeth: int) -> np.ndarray:
+    """An outline that turns back twice at each tooth."""
+    rows = [(2 * k + x, y) for k in range(teeth) for x, y in ((0, 0), (0.9, 10), (1, 10), (1.9, 0))]
+    return np.array([(x, y, 0) for x, y in [*rows, (2 * teeth, -1), (0, -1)]], dtype=float)
+
+
+def test_a_polygon_of_many_corners_is_cut() -> None:
+    """By looking at each corner some times, not at each of them for each that is cut."""
+    points = comb(300)
+    triangles = cut_polygons("comb", points, np.array([len(points)]), np.arange(len(points)))
+    sides = points[triangles[:, 1:]] - points[triangles[:, :1]]
+    area = np.linalg.norm(np.cross(sides[:, 0], sides[:, 1]), axis=-1).sum() / 2
+    x, y, _ = points.T
+    outline = (x * np.roll(y, -1) - y * np.roll(x, -1)).sum() / 2
+    assert area == pytest.approx(abs(outline))
+
+
+def test_polygons_that_take_too_long_are_refused() -> None:
+    points = comb(1200)
+    sizes = np.full(40, len(points))
+    with pytest.raises(InputError, match="too many corners to be cut in some seconds"):
+        cut_polygons("combs", points, sizes, np.tile(np.arange(len(points)), 40))

@@ -4,6 +4,7 @@ import io
 import json
 import tempfile
 import threading
+import time
 import zipfile
 from base64 import b64decode
 from collections.abc import Iterator
@@ -594,6 +595,39 @@ def test_one_computation_at_a_time(
         found = [first.result(60).status_code, second.result(60).status_code]
     assert found == statuses
     assert slow.most == 1
+
+
+def test_a_computation_that_takes_too_long_is_stopped_and_the_next_one_is_done(
+    nets: tuple[FakestereoNet, GeoPoseNet], samples: Path
+) -> None:
+    calls = list[int]()
+    stopped = threading.Event()
+
+    def endless(left: torch.Tensor, _: torch.Tensor) -> torch.Tensor:
+        calls.append(1)
+        try:
+            while len(calls) == 1:
+                time.sleep(0.01)
+        finally:
+            stopped.set()
+        return torch.full(left.shape[1:], 8.0)
+
+    app = make_app(FakestereoNet(CallableMatcher(endless)), nets[1], Limits(compute_s=1.0))
+    files = {**PAIR, "camera": "camera.json"}
+    with TestClient(app, base_url=URL) as client:
+        status, text = refusal(ask(client, "depth", samples, files))
+        assert status == 503
+        assert text.startswith("the computation took more than 1 s and was stopped; send a smaller")
+        assert stopped.is_set(), "it does not go on beside the next one"
+        assert ask(client, "depth", samples, files).status_code == 200
+
+
+@pytest.mark.parametrize("digits", [18, 19, 4401])
+def test_a_size_of_any_number_of_digits_is_refused(page: TestClient, digits: int) -> None:
+    found = page.post("/estimate/depth", headers={"Content-Length": "9" * digits}, content=b"")
+    status, text = refusal(found)
+    assert status == 413
+    assert "more than the 64 MB allowed" in text
 
 
 def test_a_fault_of_ours_is_said_and_leaves_nothing(

@@ -11,6 +11,7 @@ import time
 from collections import Counter
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -213,3 +214,40 @@ def test_nothing_is_computed_for_who_has_gone(
         assert first.result().status_code == 200
         assert ask(served, samples).status_code == 200
     assert served.stop() == (1, 2)
+
+
+def test_half_heads_do_not_keep_others_out(serve: Callable[[float], Served], samples: Path) -> None:
+    """More connections than are taken at once, of which each sends the beginning of a request."""
+    served = serve(0.0)
+    with ExitStack() as stack:
+        open_ones = list[socket.socket]()
+        for _ in range(405):
+            one = socket.create_connection(("127.0.0.1", served.port), timeout=60)
+            open_ones.append(stack.enter_context(one))
+            one.sendall(b"POST /estimate/depth HTTP/1.1\r\nHost: 127")
+        assert ask(served, samples).status_code == 503
+        until = time.monotonic() + 60
+        while ask(served, samples).status_code != 200:
+            assert time.monotonic() < until
+            time.sleep(0.5)
+        assert all(one.recv(10) == b"" for one in open_ones), "they were closed"
+
+
+def test_half_a_head_behind_an_answer_is_closed_too(serve: Callable[[float], Served]) -> None:
+    served = serve(0.0)
+    with socket.create_connection(("127.0.0.1", served.port), timeout=60) as one:
+        one.sendall(b"GET /queue/x HTTP/1.1\r\nHost: 127.0.0.1\r\n\r\n")
+        answer = b""
+        while not answer.endswith(b'{"before":null}'):
+            answer += one.recv(4096)
+        one.sendall(b"GET /queue/x HTTP/1.1\r\nHost: ")
+        assert one.recv(4096) == b""
+
+
+def test_a_size_of_thousands_of_digits_is_refused(serve: Callable[[float], Served]) -> None:
+    served = serve(0.0)
+    with socket.create_connection(("127.0.0.1", served.port), timeout=60) as one:
+        size = "9" * 4401
+        head = f"POST /estimate/depth HTTP/1.1\r\nHost: 127.0.0.1\r\nContent-Length: {size}"
+        one.sendall(f"{head}\r\n\r\n".encode())
+        assert one.recv(4096).startswith((b"HTTP/1.1 413 ", b"HTTP/1.1 400 "))

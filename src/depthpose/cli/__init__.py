@@ -9,11 +9,10 @@ import os
 import platform
 import sys
 import warnings
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass
 from importlib import import_module
-from inspect import cleandoc
 from typing import Any
 
 from depthpose import __version__
@@ -70,7 +69,21 @@ COMMANDS = {
     "figure 3-4": ("thesis:figure_3_4", "true and predicted directions to a keypoint"),
     "figure 3-5": ("thesis:figure_3_5", "boxes of true and estimated poses"),
 }  # fmt: skip
-_THESIS = ("reproduce", "figure")  # groups of commands that reproduce the thesis
+_TITLES = {
+    "demo doctor serve": "to begin",
+    "pose": "poses from a depth sensor",
+    "depth": "depth from images",
+    "data": "data sets",
+    "weights export": "weights",
+    "reproduce figure": "the tables and figures of the thesis",
+}
+"""A title for each group of commands, by the first words of its commands."""
+_THESIS = ("reproduce", "figure")
+_OF_THESIS = {
+    "reproduce ID": "a table: 2.1, 2.2, 2.3, 3.1, 3.2 or 3.3, published rows beside ours",
+    "figure ID": "a figure: 2-1, 2-5, 3-2, 3-4 or 3-5, from your frames and weights",
+}
+"""In place of a line for each table and figure where all commands are listed."""
 _EXIT_CODES = """exit codes:
   0    done
   1    done, but something in the input failed, or the output could not be written (it is named)
@@ -200,6 +213,18 @@ def lasting_streams() -> Iterator[Output]:
             sys.stdin, sys.stdout, sys.stderr = before
 
 
+def _list_commands(group: str, described: Mapping[str, str]) -> str:
+    """Write the help of a group of commands, or of all of them: a line each, under titles."""
+    width = max(map(len, described)) + 2
+    lines = [f"usage: depthpose {group or 'COMMAND'} ... [--help]", ""]
+    lines += ["The 6-DoF pose of a known object from a depth sensor, and metric depth from images."]
+    for first_words, title in _TITLES.items():
+        names = [name for name in described if name.split()[0] in first_words.split()]
+        if names:
+            lines += ["", f"{title}:", *(f"  {name:<{width}}{described[name]}" for name in names)]
+    return "\n".join([*lines, "", _EXIT_CODES])
+
+
 def _run(words: list[str]) -> int:
     """Read the words after ``depthpose`` as a command and its options, and call it."""
     if words in (["--version"], ["-V"]):
@@ -224,18 +249,12 @@ def _run(words: list[str]) -> int:
             near = nearest_name(verb, [name.partition(" ")[2] for name in inside])
             print(f"depthpose {group}: error: no command {verb!r}; {near}", file=sys.stderr)
             return 2
-        width = max(map(len, inside)) + 2
-        lines = [f"usage: depthpose {group or 'COMMAND'} ... [--help]", ""]
-        lines += [
-            "The 6-DoF pose of a known object from a depth sensor, and metric depth from images."
-        ]
-        parts = {"commands": False, "the tables and figures of the thesis": True}
-        for title, is_thesis in parts.items():
-            names = [n for n in inside if (n.partition(" ")[0] in _THESIS) == is_thesis]
-            if names:
-                lines += ["", f"{title}:", *(f"  {n:<{width}}{inside[n]}" for n in names)]
+        if not group:
+            inside = {
+                n: what for n, what in inside.items() if n.split()[0] not in _THESIS
+            } | _OF_THESIS
         stream = sys.stdout if asked_help else sys.stderr
-        print("\n".join([*lines, "", _EXIT_CODES]), file=stream)
+        print(_list_commands(group, inside), file=stream)
         return 0 if asked_help else 2
     rest = words[len(name.split()) :]
     import tyro
@@ -249,7 +268,7 @@ def _run(words: list[str]) -> int:
         given = tyro.cli(
             parse,
             prog=f"depthpose {name}",
-            description=cleandoc(command.__doc__ or "").partition("\nArgs:")[0],
+            description=arguments.description_of(command),
             args=rest,
             config=(tyro.conf.PositionalMetavarFromFieldName, tyro.conf.OmitArgPrefixes),
         )

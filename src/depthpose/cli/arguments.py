@@ -4,13 +4,17 @@ Types become words (``{None}|PATH`` is PATH), and a default that is nothing is n
 weights that do not exist are refused before anything is loaded, and so is what has no effect.
 """
 
+import os
 import re
+import shutil
+import textwrap
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import is_dataclass, replace
 from difflib import get_close_matches
 from enum import Enum
 from functools import partial
-from inspect import BoundArguments, signature, unwrap
+from inspect import BoundArguments, cleandoc, signature, unwrap
+from itertools import groupby
 from pathlib import Path
 from types import NoneType, UnionType
 from typing import (
@@ -25,6 +29,7 @@ from typing import (
     get_type_hints,
 )
 
+import docstring_parser
 import tyro
 
 from depthpose.core.errors import InputError
@@ -51,6 +56,8 @@ _PREFIXES = "^(both|sgbm|own|matched|quick|fine):"
 _POSITIONAL = get_args(tyro.conf.Positional[int])[1]
 _OF_TYPES = {Path: "PATH", str: "TEXT", int: "N", float: "NUMBER"}
 _NOTHING = ("", "None")
+_WIDEST = 100
+"""Characters of a line of help; a wider terminal is not filled, for long lines are hard to read."""
 Config = TypeVar("Config", bound=Any)
 
 
@@ -80,17 +87,21 @@ def parser_of(
     options: list[Option] = []
     for parameter in shape.parameters.values():
         group = type(parameter.default) if is_dataclass(parameter.default) else None
-        own = {parameter.name: hints[parameter.name]}
-        own = own if group is None else get_type_hints(group, include_extras=True)
-        for name, hint in own.items():
+        types = {parameter.name: hints[parameter.name]}
+        types = types if group is None else get_type_hints(group, include_extras=True)
+        texts = _help_texts(command if group is None else group)
+        for name, hint in types.items():
             metavar, names = _described(hint)
             options.append(Option(parameter.name, name, names))
-            if not any(hasattr(mark, "metavar") for mark in getattr(hint, "__metadata__", ())):
-                own[name] = Annotated[hint, shown_as(metavar=metavar)]
+            has_metavar = any(
+                hasattr(mark, "metavar") for mark in getattr(hint, "__metadata__", ())
+            )
+            shown = shown_as(metavar=None if has_metavar else metavar, help=texts.get(name))
+            types[name] = Annotated[hint, shown]
         if group is None:
-            hints |= own
+            hints |= types
         else:
-            group.__annotations__ = own
+            group.__annotations__ = types
     worded = [p.replace(annotation=hints[n]) for n, p in shape.parameters.items()]
 
     def parse(*words: object, **options: object) -> BoundArguments:
@@ -101,6 +112,34 @@ def parser_of(
     function.__annotations__ = hints
     vars(function)["__signature__"] = shape.replace(parameters=worded)
     return function, options
+
+
+def _help_texts(described: type | Callable[..., int]) -> dict[str, str]:
+    """Read what the docstrings of a command or a group of options say of each option.
+
+    A text is one line: tyro keeps the line breaks of indented docstrings, which belong to the code.
+    """
+    texts: dict[str, str] = {}
+    for source in reversed(described.mro()) if isinstance(described, type) else [described]:
+        if source is not object:
+            parameters = docstring_parser.parse_from_object(source).params
+            texts |= {p.arg_name: " ".join((p.description or "").split()) for p in parameters}
+    return texts
+
+
+def description_of(command: Callable[..., int]) -> str:
+    """Give a command's docstring without its arguments, wrapped to the terminal's width.
+
+    Lines are indented, since tyro joins those that begin with a letter; lines that the docstring
+    indents (examples, lists) stay as they are.
+    """
+    width = min(shutil.get_terminal_size().columns, _WIDEST) - 2
+    text = cleandoc(command.__doc__ or "").partition("\nArgs:")[0].strip()
+    wrapped: list[str] = []
+    for is_prose, run in groupby(text.splitlines(), lambda line: line[:1] not in ("", " ")):
+        lines = list(run)
+        wrapped += textwrap.wrap(" ".join(lines), width) if is_prose else lines
+    return textwrap.indent("\n".join(wrapped), "  ")
 
 
 def _described(hint: Any) -> tuple[str | None, _Names | None]:  # noqa: ANN401  any type
@@ -124,9 +163,12 @@ def _described(hint: Any) -> tuple[str | None, _Names | None]:  # noqa: ANN401  
 
 
 def refuse_missing(options: Sequence[Option], values: Mapping[str, Any]) -> None:
-    """Refuse paths and weights that do not exist; paths first: weights are looked up by torch."""
+    """Refuse paths and weights that do not exist; paths first: weights are looked up by torch.
+
+    What need not exist is refused where a broken link is on its way.
+    """
     for parameter, name, names in sorted(options, key=lambda option: option[2] is _Names.WEIGHTS):
-        if parameter not in values or names in (None, _Names.NEW):
+        if parameter not in values or names is None:
             continue
         value = values[parameter] if parameter == name else getattr(values[parameter], name)
         for one in value if isinstance(value, list | tuple) else [value]:
@@ -138,7 +180,13 @@ def refuse_missing(options: Sequence[Option], values: Mapping[str, Any]) -> None
                     find_weights(bare)
             elif one is not None and not any(mark in str(one) for mark in ("://", *"*?[{")):
                 wanted = Path(one)
-                if wanted.exists():
+                if os.path.exists(wanted):  # noqa: PTH110 - which never raises
+                    continue
+                if any(map(os.path.islink, (wanted, *wanted.parents))):
+                    from depthpose.core.files.disk import refuse_broken_link  # loads torch
+
+                    refuse_broken_link(wanted)
+                if names is _Names.NEW:
                     continue
                 home = wanted.parent
                 beside = [path.name for path in home.iterdir()] if home.is_dir() else []

@@ -17,10 +17,10 @@ def predict(
     images: tyro.conf.Positional[tuple[Source, ...]],
     out: NewPlace,
     lens: options.LensOptions = options.LensOptions(),
-    scale: options.ScaleOptions = options.ScaleOptions(),
+    output: options.PredictOutput = options.PredictOutput(),
     networks: options.ImageNetworks = options.ImageNetworks(),
     matching: options.MatcherOptions = options.MatcherOptions(),
-    output: options.PredictOutput = options.PredictOutput(),
+    scale: options.ScaleOptions = options.ScaleOptions(),
     engine: EngineOptions = EngineOptions(),
 ) -> int:
     """Depth in metres from single images, by a synthesised right view.
@@ -108,7 +108,11 @@ def match(
     from depthpose.core.files.images import refuse_among_inputs
 
     used = None if pairs.matcher == "sgbm" else pairs.matcher or pairs.weights or "default"
-    config = replace(matching.config, with_left_right_check=matching.left_right_check)
+    config = replace(
+        matching.config,
+        with_left_right_check=matching.left_right_check,
+        max_disparity_px=matching.max_disparity,
+    )
     method = work.MethodSource(weights=used, config=config, with_right=True, use="pairs")
     method = method.packed() if engine.engine == "ray" else method
 

@@ -17,14 +17,14 @@ _POWERS = {"": 0, "K": 1, "M": 2, "G": 3, "T": 4}
 class MatcherOptions:
     """How the weights run."""
 
-    device: Device = "cpu"
-    precision: Literal["fp32", "bf16"] = "fp32"
-    """fp32, or bf16: faster, with errors of a few hundredths of a pixel."""
-    max_memory: Annotated[str | None, shown_as(metavar="SIZE")] = None
-    """limit on a matcher's activations, such as 1GB or 800MB; the result stays exact."""
     speed: Speed = "fine"
     """quick: at the size that the weights were trained at; fine: one image in a larger size too, a
     pair at up to 280,000 pixels (PSMNet) or 650,000 (light): for KITTI 3 times the time."""
+    device: Device = "cpu"
+    max_memory: Annotated[str | None, shown_as(metavar="SIZE")] = None
+    """limit on a matcher's activations, such as 1GB or 800MB; the result stays exact."""
+    precision: Literal["fp32", "bf16"] = "fp32"
+    """fp32, or bf16: faster, with errors of a few hundredths of a pixel."""
 
     @property
     def config(self) -> MatcherConfig:
@@ -90,19 +90,22 @@ class MatchOptions(MatcherOptions):
 
     left_right_check: bool = False
     """match the mirrored pair too, which makes the confidence better."""
+    max_disparity: float | None = None
+    """largest disparity in pixels of the images; left out, it is measured. What lies beyond is
+    named, and has a confidence of 0. Only for the light matcher, that of 'default'."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class PairNetworks:
     """What matches real pairs, whether they are checked, and what is written."""
 
+    cloud: bool = False
+    """write a coloured point cloud of what is nearer than 80 m, NAME.cloud.ply."""
     weights: WeightsName | None = None
     """weights with a matcher, by name or file; 'default' unless sgbm matches."""
     matcher: WeightsName | None = None
     """what matches the two views: sgbm (OpenCV's, which needs no weights), or weights with a
     matcher, by name or file. Left out: that of the weights."""
-    cloud: bool = False
-    """write a coloured point cloud of what is nearer than 80 m, NAME.cloud.ply."""
     check: bool = True
     """refuse pairs that are swapped, not rectified or no pair; warn where this cannot be told."""
 
@@ -127,12 +130,12 @@ class ImageNetworks:
 class PredictOutput:
     """What is written, and how many images go together."""
 
+    cloud: bool = False
+    """write a coloured point cloud of what is nearer than 80 m, NAME.cloud.ply."""
     color_range: tuple[float, float] = (3.0, 80.0)
     """metres of the brightest and the darkest colour, the same for all pictures."""
     batch: int = 1
     """images of one size that go through the networks together: for a GPU."""
-    cloud: bool = False
-    """write a coloured point cloud of what is nearer than 80 m, NAME.cloud.ply."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -116,7 +116,7 @@ class MethodSource:
         facts["weights_sha256"] = file_sha256(path)
         if not is_matcher:
             facts["input"] = "both views" if with_right else "left view"
-        own, matcher, answer = asdict(config), None, self.answer
+        settings, matcher, answer = asdict(config), None, self.answer
         if self.matcher is None:
             name = path.stem + ("-both" if with_right and not is_matcher else "")
             name += "" if answer is None else f"-{answer}"
@@ -124,7 +124,7 @@ class MethodSource:
             other, answer = self.matcher, "matched"
             if self.matcher == "sgbm":
                 sgbm = SGBMConfig(with_filled_holes=True)
-                matcher, own = SGBMMatcher(sgbm), {**own, **asdict(sgbm)}
+                matcher, settings = SGBMMatcher(sgbm), {**settings, **asdict(sgbm)}
             else:
                 matcher = find_weights(self.matcher)
                 other, facts["matcher_sha256"] = matcher.stem, file_sha256(matcher)
@@ -141,7 +141,7 @@ class MethodSource:
         if not with_right and net.synthesiser is not None:
             facts["answer"] = net.synthesiser.config.answer
             facts["scales"] = list(net.synthesiser.scales)
-        return Method(name, net, {**facts, **own}, with_right)
+        return Method(name, net, {**facts, **settings}, with_right)
 
     def packed(self) -> "MethodSource":
         """Give the same with the weights in memory."""
@@ -165,7 +165,7 @@ def read_lens(options: LensOptions, sources: Sequence[Path]) -> Camera | FieldOf
     if fov is not None:
         return FieldOfView(fov)
     if options.camera is None and focal_px is None:  # what the EXIF of all images says
-        known: dict[str, tuple[float, str]] = {}
+        focal_of: dict[str, tuple[float, str]] = {}
         for source in sources:
             try:
                 focal = None if _is_video(source) else read_exif_focal(source)
@@ -178,12 +178,12 @@ def read_lens(options: LensOptions, sources: Sequence[Path]) -> Camera | FieldOf
                     "right (a phone's main camera has about 0.75 times the image's width, or 67 "
                     "degrees)"
                 )
-            known[source.name] = focal
-        if not known:
+            focal_of[source.name] = focal
+        if not focal_of:
             raise InputError(
                 "no image can be read; give --camera, --focal-px or --fov, and intact ones"
             )
-        (first, (focal_px, tags)), *others = known.items()
+        (first, (focal_px, tags)), *others = focal_of.items()
         for other, (other_px, _) in others:
             if abs(other_px / focal_px - 1) > _SAME_FOCAL:
                 raise InputError(
@@ -314,18 +314,18 @@ class DepthWork:
 
     def settings(self, method: dict[str, Any]) -> dict[str, Any]:
         """Give what decides the results, as JSON values, for the record of a run."""
-        known: dict[str, Any] = {"focal_px": self.camera}
+        camera: dict[str, Any] = {"focal_px": self.camera}
         if isinstance(self.camera, FieldOfView):
-            known = {"fov_deg": self.camera.degrees}
+            camera = {"fov_deg": self.camera.degrees}
         elif isinstance(self.camera, StereoRig):
-            known = {"K": self.camera.K.tolist(), "baseline_m": self.camera.baseline_m}
-            known["cx_right_minus_left_px"] = self.camera.cx_right_minus_left_px
+            camera = {"K": self.camera.K.tolist(), "baseline_m": self.camera.baseline_m}
+            camera["cx_right_minus_left_px"] = self.camera.cx_right_minus_left_px
         elif isinstance(self.camera, Camera):
             keys = camera_keys(self.camera)
-            known = {key: keys[key] for key in ("K", "mount_height_m", "tilt_deg") if key in keys}
-        known |= {key: v for key, v in asdict(self.scale).items() if v is not None}
-        own = {} if self.files == PAIRS else {"color_range_m": list(self.output.color_range)}
-        return {**method, "camera": known, **own}
+            camera = {key: keys[key] for key in ("K", "mount_height_m", "tilt_deg") if key in keys}
+        camera |= {key: v for key, v in asdict(self.scale).items() if v is not None}
+        output = {} if self.files == PAIRS else {"color_range_m": list(self.output.color_range)}
+        return {**method, "camera": camera, **output}
 
     def start(self) -> Function:
         """Build the networks."""
@@ -333,7 +333,10 @@ class DepthWork:
 
         def estimate(samples: Sequence[Sample], out: Path) -> list[str]:
             predictor = Predictor(self, method, out)
-            named = ((one.name, partial(self.input_of, one.name, *one.files)) for one in samples)
+            named = (
+                (sample.name, partial(self.input_of, sample.name, *sample.files))
+                for sample in samples
+            )
             predictor.predict(named, len(samples), "images")
             return [str(predictor.failures.get(sample.name, "")) for sample in samples]
 
@@ -352,12 +355,16 @@ def estimate_by_engine(
         raise InputError(f"{video}: --engine ray takes no videos; omit --engine for them")
     inputs = Inputs.find(words, files)
     with inputs.first() as first:
-        own = work_of(first)
-    here = replace(own.method, config=replace(own.method.config, device="cpu")).build().settings
+        first_work = work_of(first)
+    here = (
+        replace(first_work.method, config=replace(first_work.method.config, device="cpu"))
+        .build()
+        .settings
+    )
     if "device" in here:  # that of the workers, which this machine need not have
-        here["device"] = own.method.config.device
-    settings = own.settings(here)
-    work = Work(start=own.start, files=files, endings=ENDINGS, batch=own.output.batch)
+        here["device"] = first_work.method.config.device
+    settings = first_work.settings(here)
+    work = Work(start=first_work.start, files=files, endings=ENDINGS, batch=first_work.output.batch)
     what = "pairs" if files == PAIRS else "depth maps"
     return say(engine.run(work, inputs, out, settings), out, what)
 
@@ -377,7 +384,7 @@ def estimate_all(
              if run.is_whole(out, name, [f"{name}.{end}" for end in needed])}  # fmt: skip
     predictor = Predictor(work, method, out, whole)
     stills = [files for files in mine if not _is_video(files[0])]
-    named = (one for files in stills for one in work.inputs_of(files))
+    named = (depth_input for files in stills for depth_input in work.inputs_of(files))
     done = len(predictor.predict(named, len(stills), "images"))
     done += sum(predictor.predict_video(video) for video, *_ in mine if _is_video(video))
     failures = list(predictor.failures.values())
@@ -398,8 +405,8 @@ def estimate_all(
         names = [name for some in finished.values() for name in some]
         chosen = [names[k] for k in spread_evenly(len(names), MOST_VIEWS)]
         shown: list[StereoInput] = []
-        for files, own in finished.items():
-            wanted = [name for name in own if name in chosen]
+        for files, made_of_files in finished.items():
+            wanted = [name for name in made_of_files if name in chosen]
             with suppress(InputError):
                 for name, read in work.inputs_of(files) if wanted else ():
                     if name in wanted:
@@ -415,12 +422,16 @@ def estimate_all(
         rows += [{"warning": f"{name}: {read_text(path).strip()}"}
                  for name, path in doubts.items() if path.is_file()]  # fmt: skip
         sections = [Section(title="What is here", text=text, rows=rows)]
-        said = f"depth, {near_m:g} m bright to {far_m:g} m dark"
-        films = [Film(path=p, caption=f"{p.name}: {said}") for p in sorted(out.glob(f"*{_VIDEO}"))]
+        colours = f"depth, {near_m:g} m bright to {far_m:g} m dark"
+        films = [
+            Film(path=p, caption=f"{p.name}: {colours}") for p in sorted(out.glob(f"*{_VIDEO}"))
+        ]
         sections += [Section(title="Videos", films=films)] if films else []
-        for one in shown:
-            estimate = read_estimate(out, one.name, one.camera)
-            sections.append(depth_section(one.name, one, estimate, range_m=(near_m, far_m)))
+        for depth_input in shown:
+            estimate = read_estimate(out, depth_input.name, depth_input.camera)
+            sections.append(
+                depth_section(depth_input.name, depth_input, estimate, range_m=(near_m, far_m))
+            )
         title = f"Depth of {len(names)} image{'s' * (len(names) != 1)}"
         write_page(out / _PAGE, title, sections, run.environment())
         print(f"the page: {out / _PAGE}")
@@ -448,8 +459,8 @@ class Predictor:
             lost = {name for name in self.failures if _frame_of(source, name)}
             unknown = torch.full_like(read_map(self.out / f"{names[0]}.depth_m.npy"), torch.nan)
             for name in sorted([*names, *lost]):
-                known = unknown if name in lost else read_map(self.out / f"{name}.depth_m.npy")
-                yield draw_depth(known, *self.work.output.color_range)
+                depth_m = unknown if name in lost else read_map(self.out / f"{name}.depth_m.npy")
+                yield draw_depth(depth_m, *self.work.output.color_range)
 
         try:
             video = read_video(source)
@@ -478,24 +489,26 @@ class Predictor:
                         self.failures[name] = error
                 check = self.work.with_check
                 estimates = net.estimate_together(
-                    [(one.name, one) for one in inputs], with_check=check
+                    [(depth_input.name, depth_input) for depth_input in inputs], with_check=check
                 )
-                for one, estimate in zip(inputs, estimates, strict=True):
+                for depth_input, estimate in zip(inputs, estimates, strict=True):
                     try:
                         if isinstance(estimate, InputError):
                             raise estimate
                         if scale.known_distance is not None:
-                            estimate = scale_by_distance(estimate, one.name, scale.distance)  # noqa: PLW2901
+                            estimate = scale_by_distance(estimate, depth_input.name, scale.distance)  # noqa: PLW2901
                         cloud_m = CLOUD_M if output.cloud else None
-                        files = write_estimate(self.out, one, estimate, output.color_range, cloud_m)
+                        files = write_estimate(
+                            self.out, depth_input, estimate, output.color_range, cloud_m
+                        )
                         if estimate.warning:
-                            said = f"depthpose: warning: {one.name}: {estimate.warning}"
-                            tqdm.write(said, sys.stderr)
+                            message = f"depthpose: warning: {depth_input.name}: {estimate.warning}"
+                            tqdm.write(message, sys.stderr)
                         if estimate.ground is not None:
-                            tqdm.write(f"{one.name}: {estimate.ground}")
-                        run.note_result(self.out, one.name, files)
+                            tqdm.write(f"{depth_input.name}: {estimate.ground}")
+                        run.note_result(self.out, depth_input.name, files)
                     except InputError as error:
-                        self.failures[one.name] = error
+                        self.failures[depth_input.name] = error
                 names += [name for name, _ in chunk if name not in self.failures]
                 bar.update(len(chunk))
         return names

@@ -56,6 +56,8 @@ def predict(
         return predict_on_ray(inputs, source, estimates.batch, out, engine)
     method, home, batch = source.build(), Path(out), estimates.batch
     if dataset.bop is not None:
+        if inputs.color is not None:
+            raise InputError("--color is beside --depth; leave it out where --bop is given")
         return predict_dataset(method, dataset, inputs.object, source.config, home, batch)
     if inputs.cloud is not None and not method.takes_clouds:
         raise InputError(

@@ -63,6 +63,8 @@ def find_all(method: PoseMethod, inputs: OneObjectOptions, out: Path) -> int:
             )
     facts = pose_predict.camera_facts(lens) | ({} if unit is None else {"unit": unit})
     settings = {**method.settings, "find": sorted(objects), **facts}
+    models = [model for model in method.models if model.name in objects]
+    jobs = pose_predict.colored_jobs(jobs, inputs, models, out, settings)
     pose_predict.claim(out, settings, jobs, pose_predict.is_result_of)
     left = [p for p in kept_predictions(out).values() if p.estimate.status != "unreadable"]
     results: list[tuple[Prediction, Job[Any]]] = []

@@ -1,5 +1,6 @@
 """Methods and masks of pose commands, by their names."""
 
+import json
 import re
 import sys
 from collections import Counter
@@ -29,7 +30,7 @@ from depthpose.pose.baselines import DepthImageNet
 from depthpose.pose.config import EstimateConfig
 from depthpose.pose.datasets.layouts import integer, read_rows
 from depthpose.pose.inputs import AnyInput, rigid_input
-from depthpose.pose.mesh import FIXED_UNITS, unit_of
+from depthpose.pose.mesh import FIXED_UNITS, symmetries_to_bop, unit_of
 from depthpose.pose.network_pose import DepthImageRegressor, GeoPoseNet
 from depthpose.pose.registration import Registration
 from depthpose.pose.segmentation import Segmenter
@@ -245,9 +246,11 @@ def _register(name: str, models: Sequence[ObjectModel], config: EstimateConfig) 
         )
     net = Registration(models, config)
     known: dict[str, str] = {}
-    for model in models:  # a shape is named by its bytes
+    for model in models:  # a shape is named by its bytes, and by what is declared of it
         digest = sha256(model.vertices_m.contiguous().numpy().tobytes())
         digest.update(model.faces.contiguous().numpy().tobytes())
+        if not model.symmetries.is_found and not model.symmetries.is_none:
+            digest.update(json.dumps(symmetries_to_bop(model.symmetries)).encode())
         known[model.name] = digest.hexdigest()[:16]
     return PoseMethod(
         name=name,
@@ -351,13 +354,20 @@ def source_of(
     cad_unit = register.cad_unit or (None if has_own else unit)
     for path in register.cad:
         unit_of(path, cad_unit)
+    if register.symmetry and (register.method == "network" or not register.cad):
+        raise InputError(
+            f"--symmetry {register.symmetry[0]}: is of --method register with --cad; a network and "
+            "a data set have the symmetries that they declare"
+        )
     if register.method == "network":
         return MethodSource(config=config, weights=weights, base_from_camera=base_from_camera)
     if dataset.bop is not None:
         models = tuple(datasets.open_bop(dataset.bop, dataset.split).objects.values())
         return MethodSource(config=config, models=models)
-    models = Registration.load(*register.cad, unit=cad_unit).models if register.cad else ()
-    return MethodSource(config=config, models=tuple(models), base_from_camera=base_from_camera)
+    if not register.cad:
+        return MethodSource(config=config, base_from_camera=base_from_camera)
+    loaded = Registration.load(*register.cad, unit=cad_unit, symmetry=register.symmetry or None)
+    return MethodSource(config=config, models=loaded.models, base_from_camera=base_from_camera)
 
 
 def predict_all(

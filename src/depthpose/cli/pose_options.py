@@ -87,6 +87,15 @@ class OneObjectOptions:
     labels: Annotated[str | None, shown_as(metavar="CLASS=OBJECT,...")] = None
     """which object a number of --mask or a class of --detections is: 1=bracket,2=gear; 3= leaves 3
     out."""
+    color: Source | None = None
+    """picture of the depth camera's frame and moment, or with its own --color-camera; or a folder
+    of them with the names of the depth images. Print on a part (PLY with colours of its vertices,
+    OBJ or GLB with a texture) then tells apart the copies that depth cannot."""
+    color_camera: Path | None = None
+    """of the colour pictures, as --camera; without it they are pixel by pixel of the depth."""
+    color_from_depth: Path | None = None
+    """text file with the pose of the depth camera in the frame of --color-camera: 4x4, in metres;
+    without it both are at one place."""
     cloud: Source | None = None
     """points of one object (PLY, PCD, NPY, text), in the camera frame: x right, y down, z forward;
     or a folder of such files."""
@@ -173,6 +182,11 @@ class RegisterOptions:
     """of register: STL, PLY, OBJ or GLB files; an object has its file's name."""
     cad_unit: Unit | None = None
     """of the CAD files; as --unit by default, and of GLB metres."""
+    symmetry: tuple[str, ...] = ()
+    """of register: how a part looks alike, in place of what is found: z,18 after each of 18 equal
+    turns about an axis along z, z,free after any, z,6+x,2 about two axes; or a JSON file with BOP's
+    symmetries_discrete and symmetries_continuous. The axis goes where the surface fits best. Of
+    several CAD files with the name: NAME:z,18."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -48,6 +48,7 @@ from depthpose.core.files.images import LISTED_SUFFIXES, refuse_among_inputs
 from depthpose.core.rigid import Rigid
 from depthpose.core.run import is_whole, note_result
 from depthpose.core.units import Unit
+from depthpose.pose.color_inputs import with_color
 from depthpose.pose.config import EstimateConfig
 from depthpose.pose.datasets import (
     BopDataset,
@@ -384,6 +385,55 @@ def frame_jobs(
     ]
 
 
+def colored_jobs(
+    jobs: list[Job[Any]],
+    inputs: OneObjectOptions,
+    models: Sequence[ObjectModel],
+    out: Path,
+    settings: dict[str, Any],
+) -> list[Job[Any]]:
+    """Give each depth image its colour picture, if any; add to the settings what decides that.
+
+    ``models``: those that may be there.
+    """
+    if inputs.color is None:
+        if inputs.color_camera is not None or inputs.color_from_depth is not None:
+            raise InputError("--color-camera and --color-from-depth are of --color; give that too")
+        return jobs
+    if inputs.depth is None:
+        raise InputError(f"--color {inputs.color}: is beside --depth; a cloud has no colour image")
+    color, depth = Path(inputs.color), Path(inputs.depth)
+    pictures = list_images(color)
+    refuse_among_inputs(out, [color], pictures)
+    beside = _beside_depths(_list_depths(depth), pictures, depth, color, "colour picture")
+    settings["color"] = str(color.resolve())
+    camera, moved = inputs.color_camera, None
+    if camera is not None:
+        settings["color_camera"] = pose_methods.named_file(camera)
+    if inputs.color_from_depth is not None:
+        file, what = inputs.color_from_depth, "color_from_depth"
+        moved = pose_methods.read_pose(file, "--color-from-depth", what)
+        settings["color_from_depth"] = moved.matrix().tolist()
+    found: list[Job[Any]] = []
+    for job in jobs:
+        sources = job.source if isinstance(job.source, tuple) else (job.source,)
+        assert sources[0] is not None
+        picture = beside[sources[0].stem]
+        read = partial(_read_colored, job.read, models, picture, camera, moved)
+        found.append(replace(job, read=read, source=(*sources, picture)))
+    return found
+
+
+def _read_colored(
+    read: Callable[[], ViewInput],
+    models: Sequence[ObjectModel],
+    picture: Path,
+    camera: Path | None,
+    moved: Rigid | None,
+) -> ViewInput:
+    return with_color(read(), models, picture, camera, moved)
+
+
 def _list_depths(depth: Path) -> list[Path]:
     """List depth images: pictures, or the maps of a folder without such."""
     try:
@@ -417,6 +467,9 @@ def predict_files(method: PoseMethod, inputs: OneObjectOptions, out: Path, batch
     else:
         jobs = region_jobs(method, inputs, out, settings)
         settings |= {} if unit is None else {"unit": unit}
+    posed = {job.object for job in jobs}
+    models = [model for model in method.models if model.name in posed]
+    jobs = colored_jobs(jobs, inputs, models, out, settings)
     claim(out, settings, jobs)
     predictions = predict_all(method, jobs, out, settings, batch)
     if predictions is None:
@@ -743,6 +796,8 @@ def predict_on_ray(
     """Pose clouds, depth images and masks, manifests or tar shards by the workers of an engine."""
     if options.depth is not None and (options.camera or options.focal_px) is None:
         raise InputError("--depth needs --camera or --focal-px beside it")
+    if options.color is not None:
+        raise InputError("--color is read in this process alone; leave --engine ray out")
     views = Files(roles=("depth", "mask"), suffixes=(*LISTED_SUFFIXES, ".json"))
     clouds = Files(roles=("cloud",), suffixes=tuple(CLOUD_READERS))
     files = clouds if options.depth is None else views

@@ -10,6 +10,7 @@ def serve(
     weights: WeightsName = "default",
     pose_weights: WeightsName = "parts",
     max_upload_mb: int = 64,
+    max_seconds: int = 120,
 ) -> int:
     """Serve a page for your browser: drop an image, a pair, a depth image or a cloud onto it.
 
@@ -28,6 +29,7 @@ def serve(
         weights: of the depth networks, by name or file ('depthpose weights list').
         pose_weights: of a pose network, by name or file.
         max_upload_mb: all files of one request together [1e6 bytes].
+        max_seconds: of one computation; a longer one is stopped, as others wait for it.
     """
     try:
         from depthpose.web import Limits, known_names, make_app, open_socket, run
@@ -39,9 +41,11 @@ def serve(
 
     if max_upload_mb < 1:
         raise InputError(f"--max-upload-mb {max_upload_mb}: take 1 at least; 64 is usual")
+    if max_seconds < 1:
+        raise InputError(f"--max-seconds {max_seconds}: take 1 at least; 120 is usual")
     taken = open_socket(host, port)
     address, names = known_names(host, taken)
-    limits = Limits(upload_bytes=max_upload_mb * 10**6, hosts=names)
+    limits = Limits(upload_bytes=max_upload_mb * 10**6, compute_s=max_seconds, hosts=names)
     depth = FakestereoNet.load(weights, allow_ood=True)
     app = make_app(depth, GeoPoseNet.load(pose_weights), limits)
     shown = f"[{address}]" if address.version == 6 else address

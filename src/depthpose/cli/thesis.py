@@ -33,7 +33,8 @@ def reproduce(
     """Reproduce a table of the thesis, from data on disk to published rows, ours and difference.
 
     2.1: depth from one image. 2.2: from the real stereo pair. 2.3: from one image without and with
-    fine-tuning: give two weights, in this order. Writes rows.json, rows.csv, table.md, report.md
+    fine-tuning: give two weights, in this order. Tables of poses have options of their own:
+    'depthpose reproduce 3.1 --help', 3.2 and 3.3. Writes rows.json, rows.csv, table.md, report.md
     and report.html (with the frames of figures 2-1 and 2-5). A rerun uses existing predictions.
 
         depthpose reproduce 2.1 --kitti /data/kitti --weights apart.safetensors --out out/table-2.1
@@ -140,7 +141,8 @@ def figure(
 
     2-1, one frame: left, real right, synthesised right, depth from left and synthesised right, from
     the real pair, LiDAR. 2-5, a column a frame: left, real right, predicted depth, predicted right,
-    LiDAR. Colours mean the same metres in every panel. Writes figure-NUMBER.png and report.html.
+    LiDAR. Colours mean the same metres in every panel. Figures of poses have options of their own:
+    'depthpose figure 3-2 --help', 3-4 and 3-5. Writes figure-NUMBER.png and report.html.
 
         depthpose figure 2-5 --kitti /data/kitti --weights W.safetensors --out out/figure-2-5
 

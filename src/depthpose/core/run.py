@@ -21,7 +21,7 @@ import torch
 
 from depthpose.core.errors import InputError
 from depthpose.core.files import read_json, refused_as, remove_parts, stores, write_json
-from depthpose.core.files.disk import refused_write
+from depthpose.core.files.disk import refuse_broken_link, refused_write
 
 try:
     import fcntl
@@ -61,6 +61,7 @@ def lock_folder(folder: Path, *, is_shared: bool, timeout_s: float = 10.0) -> bo
         InputError: another command holds the folder, and goes on holding it; or nothing can be
             written there.
     """
+    refuse_broken_link(folder)
     if folder.resolve() in _locks:
         return False
     with refused_write(folder / _LOCK):

@@ -273,6 +273,10 @@ class MatcherConfig(Settings):
     the disparities: for KITTI 3 to 5 times the time. Weights that match pairs as they are have one
     speed."""
 
+    max_disparity_px: Annotated[float | None, "(0, inf)"] = None
+    """Largest disparity of real pairs, in their own pixels; None: it is measured (light network).
+    What lies beyond it is named, and has a confidence of 0."""
+
     max_memory_bytes: Annotated[int | None, "[1, inf)"] = None
     """Bound on the memory of activations; None: no bound."""
 

@@ -119,9 +119,9 @@ class EvaluationRow:
 
         A field that is None is no column.
         """
-        found = {field.name: getattr(self, field.name) for field in fields(self)}
-        metrics = found.pop("metrics")
-        return {**{name: value for name, value in found.items() if value is not None}, **metrics}
+        values = {field.name: getattr(self, field.name) for field in fields(self)}
+        metrics = values.pop("metrics")
+        return {**{name: value for name, value in values.items() if value is not None}, **metrics}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -175,11 +175,11 @@ def evaluate(
     Raises:
         InputError: an unknown protocol, a missing prediction, or no frame with truth.
     """
-    found = {
+    measured = {
         dataset.frames[index].name: measure_frame(dataset, index, predictions, protocol, caps_m)
         for index in progress(range(len(dataset)))
     }
-    return summarise(dataset, protocol, found)
+    return summarise(dataset, protocol, measured)
 
 
 def measure_frame(
@@ -210,9 +210,11 @@ def measure_frame(
                 error = error / truth
             elif prepared.frame.disparity_noc is not None:
                 seen_px = read_disparity(prepared.frame.disparity_noc)
-                seen = torch.isfinite(seen_px) & torch.isfinite(prepared.disparity_px)
-                if bool(seen.any()):
-                    metrics |= measure("disparity_noc", prepared.disparity_px[seen], seen_px[seen])
+                is_compared = torch.isfinite(seen_px) & torch.isfinite(prepared.disparity_px)
+                if bool(is_compared.any()):
+                    metrics |= measure(
+                        "disparity_noc", prepared.disparity_px[is_compared], seen_px[is_compared]
+                    )
             metrics |= prepared.view
             if prepared.confidence is not None:
                 metrics |= score_confidence(error, prepared.confidence[mask])
@@ -232,19 +234,21 @@ def measure_frame(
 
 
 def summarise(
-    dataset: Dataset, protocol: str, found: Mapping[str, list[Measured] | str]
+    dataset: Dataset, protocol: str, results: Mapping[str, list[Measured] | str]
 ) -> Evaluation:
     """Make the rows of a table of its frames, the same ones wherever they were measured.
 
-    ``found`` has for each frame's name what :func:`measure_frame` gave.
+    ``results`` has for each frame's name what :func:`measure_frame` gave.
 
     Raises:
         InputError: no frame has truth.
     """
     rule = find_protocol(protocol)
-    each = {frame.name: found[frame.name] for frame in dataset.frames}
+    each = {frame.name: results[frame.name] for frame in dataset.frames}
     skipped = {name: why for name, why in each.items() if isinstance(why, str)}
-    measured = [one for some in each.values() if not isinstance(some, str) for one in some]
+    measured = [
+        frame_row for some in each.values() if not isinstance(some, str) for frame_row in some
+    ]
     if not measured and NO_PREDICTION in skipped.values():
         name = next(name for name, why in skipped.items() if why == NO_PREDICTION)
         raise InputError(
@@ -261,24 +265,31 @@ def summarise(
         )
     row = partial(EvaluationRow, protocol=protocol, dataset=dataset.name)
     names = ("frame", "cap_m", "pixels", "coverage", "metrics")
-    per_frame = [row(**{name: getattr(one, name) for name in names}) for one in measured]
+    per_frame = [
+        row(**{name: getattr(frame_row, name) for name in names}) for frame_row in measured
+    ]
     evaluation = Evaluation(rows=[], per_frame=per_frame, deciles=[], skipped=skipped)
-    for cap_m in dict.fromkeys(one.cap_m for one in measured):
-        of_cap = [one for one in measured if one.cap_m == cap_m]
-        answered = [one for one in of_cap if one.pixels]
+    for cap_m in dict.fromkeys(frame_row.cap_m for frame_row in measured):
+        of_cap = [frame_row for frame_row in measured if frame_row.cap_m == cap_m]
+        answered = [frame_row for frame_row in of_cap if frame_row.pixels]
         if not answered:
             raise InputError(f"{dataset.name}: no prediction has a pixel where there is truth")
-        names = [n for n in answered[0].metrics if all(n in one.metrics for one in answered)]
+        names = [
+            n for n in answered[0].metrics if all(n in frame_row.metrics for frame_row in answered)
+        ]
         evaluation.rows.append(
             row(
                 cap_m=cap_m,
                 frames=len(of_cap),
-                pixels=sum(one.pixels for one in of_cap),
-                coverage=sum(one.coverage for one in of_cap) / len(of_cap),
-                metrics={n: sum(one.metrics[n] for one in answered) / len(answered) for n in names},
+                pixels=sum(frame_row.pixels for frame_row in of_cap),
+                coverage=sum(frame_row.coverage for frame_row in of_cap) / len(of_cap),
+                metrics={
+                    n: sum(frame_row.metrics[n] for frame_row in answered) / len(answered)
+                    for n in names
+                },
             )
         )
-        deciles = [one.deciles for one in of_cap if one.deciles is not None]
+        deciles = [frame_row.deciles for frame_row in of_cap if frame_row.deciles is not None]
         errors = torch.tensor(deciles, dtype=torch.float64).nanmean(0).tolist() if deciles else []
         ranked_by = RANKING["disparity" if cap_m is None else "depth"]
         for n, error in enumerate(errors, 1):
@@ -422,7 +433,7 @@ def _compared(prepared: _Prepared, rule: Protocol, cap_m: float | None) -> tuple
 
 def measure_image_confidence(net: FakestereoNet, images: Iterable[StereoInput]) -> list[float]:
     """Give the confidence in each image as a whole, 0..1 (``DepthEstimate.image_confidence``)."""
-    found: list[float] = []
+    confidences: list[float] = []
     for image in images:
         image_confidence = net.estimate_pair(replace(image, right=None)).image_confidence
         if image_confidence is None:
@@ -430,5 +441,5 @@ def measure_image_confidence(net: FakestereoNet, images: Iterable[StereoInput]) 
                 "these weights have no generator with a confidence of its own; take those of "
                 "'depthpose depth train select'"
             )
-        found.append(image_confidence)
-    return found
+        confidences.append(image_confidence)
+    return confidences

@@ -176,8 +176,8 @@ def _drawn(left: Value, generator: Generator) -> _Drawn:
     if not isinstance(generator, SelectionGenerator):
         image = _resized_image(left, near) * _2 - _1
         network = network_model(generator, [example], multiple)
-        (found,) = left.graph.call(network, _mirrored(image, near, multiple))
-        cropped = (found + _1).slice([0, 0], near, [2, 3]) / _2
+        (selection,) = left.graph.call(network, _mirrored(image, near, multiple))
+        cropped = (selection + _1).slice([0, 0], near, [2, 3]) / _2
         return _Drawn(_resized_image(cropped, size))
     even = (near / 2 * 2).op("Max", 2)  # since logits stand for two rows and two columns
     image = _mirrored(_resized_image(left, even), even, multiple)
@@ -187,7 +187,7 @@ def _drawn(left: Value, generator: Generator) -> _Drawn:
     log_px, sky, sure, right_log_px, right_sky = (_resized_map(m, size) for m in maps)
     scale, is_sky = _ratio(size, even), sky.op("Greater", _HALF)
     confidence = is_sky.op("Where", sky, sure * (sky * np.float32(-1) + _1))
-    own = _Maps(log_px.op("Exp") * scale, confidence, is_sky.cast(np.float32))
+    of_left = _Maps(log_px.op("Exp") * scale, confidence, is_sky.cast(np.float32))
     right_px = right_sky.op("Greater", _HALF).op("Where", _0, right_log_px.op("Exp") * scale)
     street = outputs[5] if generator.config.with_street else None
     # Look the left image up at ``x + shift``; beyond the border the border repeats.
@@ -203,7 +203,7 @@ def _drawn(left: Value, generator: Generator) -> _Drawn:
     parts = (v.op("Expand", right_px.op("Shape")).op("Unsqueeze", [-1]) for v in (x, y))
     grid = graph.op("Concat", *parts, axis=-1)
     right = left.op("GridSample", grid, mode="bilinear", padding_mode="border", align_corners=0)
-    return _Drawn(right, own, street)
+    return _Drawn(right, of_left, street)
 
 
 def _mirrored(image: Value, size: Value, multiple: int) -> Value:
@@ -242,27 +242,27 @@ def image_graph(weights: DepthWeights) -> Graph:
     scaled = full.cast(np.float64) * float(rig.virtual_focal_px) / K.op("Gather", [4, 0])
     small = scaled.op("Round").op("Max", 1.0).cast(np.int64)
     left = _resized_image(image, small)
-    right, own, street = _drawn(left, generator)
-    found = own
+    right, of_left, street = _drawn(left, generator)
+    maps = of_left
     if rig.answer == "matched":
         assert weights.matcher is not None, "checked before"
-        found = _matched(left, right, np.array([rig.virtual_focal_px] * 2), weights.matcher)
-        if own is not None:
-            found = found._replace(sky=own.sky)
-    assert found is not None
-    disparity_px = _resized_map(found.disparity_px, full) * _ratio(full, small)
+        maps = _matched(left, right, np.array([rig.virtual_focal_px] * 2), weights.matcher)
+        if of_left is not None:
+            maps = maps._replace(sky=of_left.sky)
+    assert maps is not None
+    disparity_px = _resized_map(maps.disparity_px, full) * _ratio(full, small)
     # Depth is that over disparity.
     focal_m_px = K.op("Gather", 0).cast(np.float32) * np.float32(rig.virtual_baseline_m)
     is_known = disparity_px.op("Greater", _0)
     depth_m = is_known.op("Where", focal_m_px / disparity_px, np.float32(np.nan))
-    if found.sky is not None:
-        is_sky = _resized_map(found.sky, full).op("Greater", _HALF)
+    if maps.sky is not None:
+        is_sky = _resized_map(maps.sky, full).op("Greater", _HALF)
         depth_m = is_sky.op("Where", np.float32(np.nan), depth_m)
         disparity_px = is_sky.op("Where", focal_m_px / np.float32(SKY_M), disparity_px)
         graph.output("is_sky", is_sky, np.bool_, _MAPS)
     graph.output("depth_m", depth_m, np.float32, _MAPS)
     graph.output("disparity_px", disparity_px, np.float32, _MAPS)
-    graph.output("confidence", _resized_map(found.confidence, full), np.float32, _MAPS)
+    graph.output("confidence", _resized_map(maps.confidence, full), np.float32, _MAPS)
     graph.output("right", _resized_image(right, full), np.float32, _IMAGES)
     if street is not None:
         graph.output("image_confidence", street, np.float32, ("batch",))
@@ -301,10 +301,10 @@ def _matched(
 ) -> _Maps:
     """Match at the focal length that the weights want, and come back to the images' size."""
     if type(matcher) not in DYNAMIC_SHAPE_NETWORKS:
-        known = ", ".join(kind.__name__ for kind in DYNAMIC_SHAPE_NETWORKS)
+        kinds = ", ".join(kind.__name__ for kind in DYNAMIC_SHAPE_NETWORKS)
         raise InputError(
             f"the matcher is {type(matcher).__name__}, and no file is made of it; give weights of "
-            f"one of {known}."
+            f"one of {kinds}."
         )
     network = DYNAMIC_SHAPE_NETWORKS[type(matcher)](matcher).eval()
     config, graph = matcher.config, left.graph
@@ -323,11 +323,11 @@ def _matched(
         ((_resized_image(view, work) - mean) / deviation).op("Pad", pads) for view in (left, right)
     ]
     example = [torch.rand(2, 3, least + step, least + 2 * step) for _ in range(2)]
-    found = graph.call(network_model(network, example, step), *padded)
+    maps = graph.call(network_model(network, example, step), *padded)
     first = graph.op("Concat", above, [0], axis=0)
     last = graph.op("Concat", [1 << 62], _side(work, 1), axis=0)
     disparity_px, confidence, *sky = (
-        _resized_map(m.slice(first, last, [1, 2]), size) for m in found
+        _resized_map(m.slice(first, last, [1, 2]), size) for m in maps
     )
     is_sky = [values.op("Greater", _HALF).cast(np.float32) for values in sky]
     return _Maps(disparity_px * _ratio(size, work), confidence, *is_sky)
@@ -393,12 +393,12 @@ def _pair_export(weights: DepthWeights, facts: dict[str, Any]) -> Export:
                     width=camera.width, height=camera.height, K=camera.K, baseline_m=0.5
                 )
                 inputs["K"] = camera.K.numpy()
-            given = (
-                StereoInput(name="proof", left=one, right=other, camera=rig)
-                for one, other in zip(left, right, strict=True)
+            pairs = (
+                StereoInput(name="proof", left=left_view, right=right_view, camera=rig)
+                for left_view, right_view in zip(left, right, strict=True)
             )
-            found = [net.estimate_pair(pair, with_check=False) for pair in given]
-            yield _case(inputs, found, ("disparity_px", "confidence", *sky))
+            estimates = [net.estimate_pair(pair, with_check=False) for pair in pairs]
+            yield _case(inputs, estimates, ("disparity_px", "confidence", *sky))
 
     return Export(
         graph=lambda: pair_graph(weights),
@@ -416,20 +416,20 @@ def _image_export(weights: DepthWeights, facts: dict[str, Any]) -> Export:
         synthesiser = make_synthesiser(weights.generator, speed=_QUICK.speed)
         net = FakestereoNet(matcher, synthesiser, allow_ood=True)
         selects = isinstance(weights.generator, SelectionGenerator)
-        own = None if weights.matcher is None else weights.matcher.config
-        sky = ("is_sky",) if selects or getattr(own, "with_sky", False) else ()
+        matcher_config = None if weights.matcher is None else weights.matcher.config
+        sky = ("is_sky",) if selects or getattr(matcher_config, "with_sky", False) else ()
         street = ("image_confidence",) if getattr(weights.generator, "street", None) else ()
         for size in _SIZES:
             focal_px = weights.generator.config.virtual_focal_px
             images, _, camera = _scenes(size, focal_px, with_sky=bool(sky))
             inputs = {"image": images.numpy(), "K": camera.K.numpy()}
             # A depth beyond all bounds, or none, hangs on the last bit of a disparity near zero.
-            given = (
-                StereoInput(name="proof", left=one, right=None, camera=camera) for one in images
+            views = (
+                StereoInput(name="proof", left=view, right=None, camera=camera) for view in images
             )
-            found = [net.estimate_pair(one) for one in given]
+            estimates = [net.estimate_pair(view) for view in views]
             case = _case(
-                inputs, found, ("depth_m", "disparity_px", "confidence", "right", *sky, *street)
+                inputs, estimates, ("depth_m", "disparity_px", "confidence", "right", *sky, *street)
             )
             is_near = case.expected["disparity_px"] >= _LEAST_PX
             where = {"depth_m": is_near | case.expected["is_sky"] if sky else is_near}
@@ -454,10 +454,12 @@ TARGETS = {
 
 
 def _case(
-    inputs: dict[str, np.ndarray], found: list[DepthEstimate], outputs: tuple[str, ...]
+    inputs: dict[str, np.ndarray], estimates: list[DepthEstimate], outputs: tuple[str, ...]
 ) -> Case:
     expected = {
-        name: torch.stack([torch.as_tensor(getattr(one, name)) for one in found]).numpy()
+        name: torch.stack(
+            [torch.as_tensor(getattr(estimate, name)) for estimate in estimates]
+        ).numpy()
         for name in outputs
     }
     shape = next(iter(inputs.values())).shape

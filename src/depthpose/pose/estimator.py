@@ -24,6 +24,7 @@ from depthpose.pose.datasets.detections import Box, box_mask
 from depthpose.pose.decide import PRIOR_REGION, refused, with_status
 from depthpose.pose.inputs import (
     AnyArray,
+    AnyCloud,
     AnyInput,
     AnyMask,
     cloud_input,
@@ -141,7 +142,7 @@ class PoseEstimator:
     def estimate(  # noqa: PLR0913  every form of input
         self,
         *,
-        cloud: AnyArray | None = None,
+        cloud: AnyCloud | None = None,
         unit: Unit | None = None,
         depth: AnyArray | None = None,
         mask: AnyMask | None = None,
@@ -156,7 +157,8 @@ class PoseEstimator:
         """Estimate one pose, from a cloud or from a depth image with a mask or a box.
 
         Args:
-            cloud: points of the object alone, in the camera frame (x right, y down, z forward).
+            cloud: points of the object alone, in the camera frame (x right, y down, z forward); a
+                file, rows of points, or a cloud of trimesh or Open3D.
             unit: of the cloud, metres by default; of a depth image, where its camera says none.
             depth: a 16-bit PNG or whole numbers in the camera's ``depth_unit_m``, or metres.
             mask: the object's pixels, not 0; a picture, an array, or COCO's run lengths. One that

@@ -26,18 +26,22 @@ from depthpose.core.units import Unit, metres_of
 from depthpose.pose.cloud import nothing_seen as nothing_seen
 from depthpose.pose.datasets import decode_rle, number_objects, one_mask, read_labels
 from depthpose.pose.datasets.masks import read_runs
+from depthpose.pose.mesh.shapes import is_shape, shape_geometry
 from depthpose.pose.segmentation import label_parts
 from depthpose.pose.types import AnyInput as AnyInput
 from depthpose.pose.types import CloudInput, ViewInput
 
 AnyArray = str | Path | np.ndarray | Tensor  #: a file, an array or a tensor
+AnyCloud = AnyArray | object  #: a cloud as rows of points, its file, or one of trimesh or Open3D
 AnyMask = AnyArray | Mapping[str, Any]  #: a mask, its file, or COCO's run lengths
 _SMALLEST_INSTANCE = 0.2
 """Pieces of a mask below this share of the largest are fragments of a segmentation, not objects."""
 
 
-def cloud_input(cloud: AnyArray, unit: Unit, object: str, name: str) -> CloudInput:
+def cloud_input(cloud: AnyCloud, unit: Unit, object: str, name: str) -> CloudInput:
     """Take points in a unit to a cloud in metres."""
+    if is_shape(cloud):
+        cloud = shape_geometry(cloud)[0]
     points = read_cloud(cloud).points if isinstance(cloud, str | Path) else _tensor(cloud)
     if points.ndim != 2 or points.shape[1] != 3:
         raise InputError(

@@ -5,9 +5,8 @@ the evidence decides.
 """
 
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from pathlib import Path
 
 import torch
 
@@ -31,7 +30,15 @@ from depthpose.pose.evidence import compare, observe
 from depthpose.pose.hypotheses import compete
 from depthpose.pose.icp import refine_best
 from depthpose.pose.inputs import AnyInput
-from depthpose.pose.mesh import read_model, refuse_one_name, with_found_symmetries
+from depthpose.pose.mesh import (
+    AnyModel,
+    AnySymmetry,
+    declare_symmetry,
+    read_model,
+    refuse_one_name,
+    symmetry_of_each,
+    with_found_symmetries,
+)
 from depthpose.pose.propose.point_pairs import propose_poses
 from depthpose.pose.types import CloudInput, ObjectModel, PoseEstimate, ViewInput
 
@@ -95,21 +102,33 @@ class Registration(PoseEstimator):
     @classmethod
     @own_arithmetic()
     def load(
-        cls, *cad: str | Path, unit: Unit | None = None, config: EstimateConfig | None = None
+        cls,
+        *cad: AnyModel,
+        unit: Unit | None = None,
+        config: EstimateConfig | None = None,
+        symmetry: AnySymmetry | Mapping[str, AnySymmetry] | Sequence[str] | None = None,
     ) -> "Registration":
-        """Read CAD files; symmetries that are found in a part make its copies one answer.
+        """Read CAD files; declared or found symmetries of a part make its copies one answer.
 
         Args:
-            cad: PLY, STL, OBJ, GLB; an object is called as its file.
+            cad: PLY, STL, OBJ, GLB, or meshes of trimesh or Open3D; an object is called as its
+                file, or as :func:`~depthpose.pose.mesh.read_model` says.
             unit: of the numbers in the files; None where all are GLB, which has metres.
             config: as above.
+            symmetry: that a part has, in place of those that are found: ``"z,18"`` looks alike
+                after each of 18 equal turns about an axis along z, ``"z,free"`` after any, and
+                ``"z,6+x,2"`` has two axes; BOP's entry of an object, or a JSON file of it. The axis
+                goes where the surface has it. Of several files a dict from names.
 
         Raises:
-            InputError: no file, two of one name, one that is not read, without a surface or unit.
+            InputError: no file, two of one name, one that is not read, without a surface or unit; a
+                symmetry that is none, or of no object.
         """
-        if not all(isinstance(path, str | Path) for path in cad):
-            raise InputError("Registration.load takes paths one by one: load(*files, unit=...)")
         models = [read_model(path, unit, number=k) for k, path in enumerate(cad, start=1)]
+        declared = symmetry_of_each(symmetry, [model.name for model in models])
+        models = [
+            declare_symmetry(m, declared[m.name]) if m.name in declared else m for m in models
+        ]
         return cls([with_found_symmetries(m, None, is_taken=True) for m in models], config)
 
     def __repr__(self) -> str:

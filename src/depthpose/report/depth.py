@@ -65,8 +65,8 @@ def depth_section(
             points_m = take_evenly(points_m, _TRUE_POINTS)
             color = torch.tensor(_TRUE).expand(len(points_m), 3)
             layer = Layer(name="true points", shape=Cloud(points=points_m, color=color))
-            said, layers = f"{scenes[0].caption}; the truth in green", [*scenes[0].layers, layer]
-            scenes = [Scene(caption=said, layers=layers)]
+            caption, layers = f"{scenes[0].caption}; the truth in green", [*scenes[0].layers, layer]
+            scenes = [Scene(caption=caption, layers=layers)]
     pictures = [Drawing(image=pair.left, caption="image")] if with_image else []
     if estimate.depth_m is None:
         disparity = Drawing(
@@ -97,8 +97,8 @@ def depth_section(
                 image = draw_points(left, true_m, far_m, _RADIUS_PX, near_m)
             else:
                 image = draw_depth(true_m, near_m, far_m)
-            said, bar = f"true depth; {where}", depth_scale(near_m, far_m)
-            pictures.append(Drawing(image=image, caption=said, scale=bar))
+            caption, bar = f"true depth; {where}", depth_scale(near_m, far_m)
+            pictures.append(Drawing(image=image, caption=caption, scale=bar))
         if is_sparse:
             image = draw_error_points(left, wrong, top, _RADIUS_PX)
         else:

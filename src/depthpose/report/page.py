@@ -78,9 +78,9 @@ class Scene:
                 # the rows of a depth image would leave lines of points.
                 fixed = torch.Generator().manual_seed(0)
                 chance = torch.rand(most, generator=fixed, dtype=torch.float64)
-                kept = ((torch.arange(most) + chance) * (len(places) / most)).long()
-                kept = kept.clamp(max=len(places) - 1)
-                places, color = places[kept], color[kept]
+                sampled = ((torch.arange(most) + chance) * (len(places) / most)).long()
+                sampled = sampled.clamp(max=len(places) - 1)
+                places, color = places[sampled], color[sampled]
             bytes_of_color = (color.detach().cpu().clamp(0, 1) * 255).round().byte().numpy()
             flat_m = places.detach().cpu().numpy().astype(np.float64).reshape(-1, 3)
             low = flat_m.min(0) if len(flat_m) else np.zeros(3)

@@ -71,8 +71,8 @@ def draw_pose(
     if pose is not None:
         ends_px = project(pose.double().apply(box_edges(model).double()), K)
         posed_m = pose.double().apply(drawn_triangles(model).double())
-        seen = rasterize(posed_m, K, image.shape[2], image.shape[1], with_barycentric=False)
-        image = draw_outline(image, seen.depth_m.isfinite(), FOUND)
+        raster = rasterize(posed_m, K, image.shape[2], image.shape[1], with_barycentric=False)
+        image = draw_outline(image, raster.depth_m.isfinite(), FOUND)
         image = draw_lines(image, ends_px, FOUND)
     if truth is not None:
         ends_px = project(truth.double().apply(box_edges(model).double()), K)
@@ -165,11 +165,13 @@ def posed_cloud(cloud_m: Float[Tensor, "n 3"], pose: Rigid | None, model: Object
     return Cloud(points=torch.cat([cloud_m.float(), surface_m.float()]), color=torch.cat(colors))
 
 
-def object_points(given: CloudInput | ViewInput, diameter_m: float) -> Float[Tensor, "n 3"]:
+def object_points(pose_input: CloudInput | ViewInput, diameter_m: float) -> Float[Tensor, "n 3"]:
     """Give the points of an input that are readings, of a depth image without flying pixels."""
-    if isinstance(given, ViewInput):
-        return cloud_from_depth(given.depth_m, given.mask, given.K, diameter_m).float()
-    return given.points_m[is_reading(given.points_m)].float()
+    if isinstance(pose_input, ViewInput):
+        return cloud_from_depth(
+            pose_input.depth_m, pose_input.mask, pose_input.K, diameter_m
+        ).float()
+    return pose_input.points_m[is_reading(pose_input.points_m)].float()
 
 
 def grey_depth(depth_m: Float[Tensor, "h w"]) -> Float[Tensor, "3 h w"]:
@@ -177,11 +179,11 @@ def grey_depth(depth_m: Float[Tensor, "h w"]) -> Float[Tensor, "3 h w"]:
 
     From the 1st to the 99th percentile of the readings: a stray one does not set the scale.
     """
-    seen = depth_m[depth_m.isfinite() & (depth_m > 0)].sort().values
-    if len(seen) == 0:
+    depths_m = depth_m[depth_m.isfinite() & (depth_m > 0)].sort().values
+    if len(depths_m) == 0:
         return torch.zeros(3, *depth_m.shape)
-    last = len(seen) - 1
-    low, high = float(seen[round(0.01 * last)]), float(seen[round(0.99 * last)])
+    last = len(depths_m) - 1
+    low, high = float(depths_m[round(0.01 * last)]), float(depths_m[round(0.99 * last)])
     share = 1 - ((depth_m - low) / max(high - low, 1e-6)).clamp(0, 1)
     grey = torch.where(depth_m > 0, 0.15 + 0.85 * share, 0.0)
     return grey.nan_to_num(0.0).float().expand(3, -1, -1)
@@ -217,18 +219,18 @@ def pose_section(
         pose, mask, K = estimate.camera_from_model, pose_input.mask, pose_input.K
         what = "depth image, near bright" if image is None else "picture"
         image = grey_depth(pose_input.depth_m) if image is None else image
-        said = f"{what}; the estimated pose blue"
+        caption = f"{what}; the estimated pose blue"
         if pose is None:
             image = draw_outline(image, mask, _MASKED)
-            said = f"{what}; the border of the mask yellow"
-        said += ", the box of the truth green and dashed" if truth is not None else ""
+            caption = f"{what}; the border of the mask yellow"
+        caption += ", the box of the truth green and dashed" if truth is not None else ""
         whole = draw_pose(image, pose, model, K, truth)
-        drawings.append(Drawing(image=whole, caption=said))
+        drawings.append(Drawing(image=whole, caption=caption))
         if bool(mask.any()):
             near, K = close_up(image, mask, K)
             near = draw_pose(near, pose, model, K, truth)
-            said = f"the object from near by; {said.partition('; ')[2]}"
-            drawings.append(Drawing(image=near, caption=said))
+            caption = f"the object from near by; {caption.partition('; ')[2]}"
+            drawings.append(Drawing(image=near, caption=caption))
     points_m = object_points(pose_input, model.diameter_m)
     return Section(
         title=title,
@@ -246,15 +248,17 @@ def pose_sentence(estimate: PoseEstimate) -> str:
     if estimate.camera_from_model is None:
         return f"Refused ({estimate.status}): {estimate.reason}."
     x, y, z = estimate.camera_from_model.t_m.tolist()
-    said = f"The {estimate.object} is at x {x:.4f}, y {y:.4f}, z {z:.4f} m in the camera's frame."
+    sentence = (
+        f"The {estimate.object} is at x {x:.4f}, y {y:.4f}, z {z:.4f} m in the camera's frame."
+    )
     if estimate.base_from_model is not None:
         x, y, z = estimate.base_from_model.t_m.tolist()
-        said += f" From the robot's base it is at x {x:.4f}, y {y:.4f}, z {z:.4f} m."
+        sentence += f" From the robot's base it is at x {x:.4f}, y {y:.4f}, z {z:.4f} m."
     if estimate.status == "ambiguous":
-        said += f" It is ambiguous: {estimate.reason}."
+        sentence += f" It is ambiguous: {estimate.reason}."
     if not estimate.alternatives:
-        return said
-    return f"{said} Other poses fit as well: {'; '.join(map(str, estimate.alternatives))}."
+        return sentence
+    return f"{sentence} Other poses fit as well: {'; '.join(map(str, estimate.alternatives))}."
 
 
 def pose_facts(
@@ -278,10 +282,12 @@ def pose_facts(
         ]
     if estimate.identity is not None:
         identity = estimate.identity
-        said = identity.status + (f" ({identity.reason})" if identity.reason else "")
+        identity_text = identity.status + (f" ({identity.reason})" if identity.reason else "")
         if identity.size is not None and identity.size_deviation is not None:
-            said += f"; size {identity.size:.3f} +- {identity.size_deviation:.3f} of the model's"
-        facts.append(("identity", said))
+            identity_text += (
+                f"; size {identity.size:.3f} +- {identity.size_deviation:.3f} of the model's"
+            )
+        facts.append(("identity", identity_text))
     if estimate.certainty is not None:
         facts.append(("certainty, up to near-symmetry", f"{estimate.certainty:.3f}"))
     if estimate.copy_certainty is not None:
@@ -356,8 +362,8 @@ def pose_scene(
     if estimate.keypoints_m is not None:
         layers += keypoint_layers(estimate.keypoints_m, pose, model)
     color = torch.tensor(_SEEN).expand(len(points_m), 3)
-    seen = Layer(name="the object, as seen", shape=Cloud(points=points_m, color=color))
-    layers.insert(0, seen)
+    observed = Layer(name="the object, as seen", shape=Cloud(points=points_m, color=color))
+    layers.insert(0, observed)
     if isinstance(pose_input, ViewInput):
         around_m = cloud_from_depth(pose_input.depth_m, ~pose_input.mask, pose_input.K).float()
         around_m = take_evenly(around_m, _AROUND_POINTS)

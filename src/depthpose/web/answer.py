@@ -136,9 +136,9 @@ def keep_file(folder: Path, field: str, sent_name: str, data: bytes) -> Path:
         raise InputError(
             f"{field}: {sent_name!r} is not {what}; this field takes {', '.join(suffixes)}"
         )
-    kept = folder / field / f"{path.stem[:_LONGEST_NAME]}{path.suffix}"
-    write_bytes(kept, data)
-    return kept
+    path_of_copy = folder / field / f"{path.stem[:_LONGEST_NAME]}{path.suffix}"
+    write_bytes(path_of_copy, data)
+    return path_of_copy
 
 
 EXAMPLE_SEED = 9  # no weights were trained on streets or views of this seed

@@ -4,9 +4,12 @@ Host and origin, sizes and files are checked; uploads that are too slow are ende
 on the disk.
 """
 
+import asyncio
+import ctypes
 import io
 import secrets
 import socket
+import threading
 import time
 import zipfile
 from collections import OrderedDict
@@ -20,6 +23,7 @@ from typing import Any, TypeVar
 from urllib.parse import urlsplit
 
 import anyio
+import h11
 import uvicorn
 from jinja2 import Environment, PackageLoader, StrictUndefined
 from PIL import Image
@@ -31,6 +35,7 @@ from starlette.requests import ClientDisconnect, Request
 from starlette.responses import JSONResponse, Response
 from starlette.routing import Route
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
+from uvicorn.protocols.http.h11_impl import H11Protocol
 
 from depthpose import __version__
 from depthpose.core.errors import InputError, MissingExtraError
@@ -82,15 +87,15 @@ def refuse_other_host(request: Request, hosts: tuple[str, ...] | None) -> Respon
     except ValueError:  # such as half of a bracket
         name = None
     if hosts is not None and name not in hosts:
-        said = (
+        message = (
             f"this page answers to {', '.join(hosts)}, not to {host!r}; start 'depthpose serve' "
             "with --host to name another"
         )
-        return JSONResponse({"error": said}, 403)
+        return JSONResponse({"error": message}, 403)
     origin = request.headers.get("origin")
     if origin is not None and origin.partition("://")[2] != host:
-        said = f"the request comes from another page, {origin}; open this one"
-        return JSONResponse({"error": said}, 403)
+        message = f"the request comes from another page, {origin}; open this one"
+        return JSONResponse({"error": message}, 403)
     return None
 
 
@@ -98,8 +103,8 @@ async def error_response(_: Request, error: Exception) -> Response:
     """Answer a refusal with its message; the trace of another error is on the server's terminal."""
     if isinstance(error, HTTPException):
         return JSONResponse({"error": error.detail}, error.status_code, error.headers)
-    said = f"depthpose failed ({type(error).__name__}: {error}); see the server's terminal"
-    return JSONResponse({"error": said}, 500)
+    message = f"depthpose failed ({type(error).__name__}: {error}); see the server's terminal"
+    return JSONResponse({"error": message}, 500)
 
 
 Result = TypeVar("Result")
@@ -108,6 +113,47 @@ GRACE_S, LEAST_BYTES_S = 10.0, 20_000
 """An upload with fewer bytes a second, after so many seconds, is ended: it keeps others waiting."""
 MOMENT_S = 0.02
 _FULL = "too many requests wait for one computation; try again later"
+_STOP_S = 10.0  # so long a computation has to end once it was stopped: one step of it may be long
+
+
+class _Stopped(BaseException):
+    """Ends a computation in its thread: no ``except Exception`` of it goes on."""
+
+
+class TookTooLong(Exception):  # noqa: N818  what happened
+    """A computation was stopped after its time."""
+
+
+def run_in_time(work: Callable[[], Result], most_s: float) -> Result:
+    """Compute in a thread, and stop it after so many seconds.
+
+    It ends at the next step of Python's; one that is in a long call of a library then goes on
+    beside what comes after it, until that call ends.
+
+    Raises:
+        TookTooLong: it did not end before.
+    """
+    results, errors = list[Result](), list[BaseException]()
+
+    def run() -> None:
+        try:
+            results.append(work())
+        except BaseException as error:  # noqa: BLE001  raised where it was asked for
+            errors.append(error)
+
+    thread = threading.Thread(target=run, daemon=True)
+    thread.start()
+    thread.join(most_s)
+    if thread.is_alive():
+        assert thread.ident is not None
+        ident, kind = ctypes.c_ulong(thread.ident), ctypes.py_object(_Stopped)
+        ctypes.pythonapi.PyThreadState_SetAsyncExc(ident, kind)
+        thread.join(_STOP_S)
+    if results:
+        return results[0]
+    if errors and not isinstance(errors[0], _Stopped):
+        raise errors[0]
+    raise TookTooLong
 
 
 @dataclass(frozen=True, eq=False)
@@ -115,6 +161,7 @@ class Queue:
     """Computations, one at a time; so many requests may wait for the one that is computed."""
 
     most: int
+    most_s: float  #: of one computation; it is stopped then
     one: anyio.CapacityLimiter = field(default_factory=partial(anyio.CapacityLimiter, 1))
     tickets: list[str] = field(default_factory=list)
 
@@ -123,7 +170,8 @@ class Queue:
     ) -> Result | None:
         """Compute in a thread once all earlier computations are done; None: the client has left.
 
-        By the ticket the client asks for its place in the queue; 503 where too many wait.
+        By the ticket the client asks for its place in the queue; 503 where too many wait, and where
+        the computation takes too long.
         """
         if len(self.tickets) > self.most:  # one of them is at work
             raise HTTPException(503, _FULL)
@@ -132,7 +180,13 @@ class Queue:
             async with self.one:
                 if await is_gone():
                     return None
-                return await anyio.to_thread.run_sync(work)
+                return await anyio.to_thread.run_sync(run_in_time, work, self.most_s)
+        except TookTooLong as error:
+            raise HTTPException(
+                503,
+                f"the computation took more than {self.most_s:g} s and was stopped; send a smaller "
+                "picture, or start 'depthpose serve' with a larger --max-seconds",
+            ) from error
         finally:
             self.tickets.remove(ticket)
 
@@ -172,6 +226,7 @@ def paced(receive: Receive) -> Receive:
     return receive_in_time
 
 
+_MOST_DIGITS = 18  # of a Content-Length
 TICKET = "x-ticket"
 """Header of a request: a random name, by which the page asks for its place in the queue."""
 _RESULTS = 3  # answers whose files are kept in memory for downloads
@@ -187,6 +242,8 @@ class Limits:
     """All files of one request together."""
     waiting: int = 4
     """Requests that may wait for the one that is computed."""
+    compute_s: float = 120.0
+    """Seconds of one computation: longer ones are stopped."""
     uploads: int = 32
     """Requests whose files may arrive at the same time."""
     hosts: tuple[str, ...] | None = LOOPBACK
@@ -207,7 +264,7 @@ class Pages:
             "depth": cache(depth_example),
             "pose": cache(partial(pose_example, pose)),
         }
-        self._queue = Queue(limits.waiting)
+        self._queue = Queue(limits.waiting, limits.compute_s)
         self._uploads = 0
         self._kept: OrderedDict[str, Mapping[str, bytes]] = OrderedDict()
         loader = PackageLoader("depthpose.web", ".")
@@ -220,12 +277,12 @@ class Pages:
             has_one_image=depth.synthesiser is not None,
             has_pair=depth.matcher is not None,
         )
-        own = Path(__file__).parent
+        folder = Path(__file__).parent
         self._assets = {
             "": ("text/html", page),
-            "page.css": ("text/css", page_file("page.css") + (own / "web.css").read_text()),
+            "page.css": ("text/css", page_file("page.css") + (folder / "web.css").read_text()),
             "viewer.js": ("text/javascript", page_file("viewer.js")),
-            "web.js": ("text/javascript", (own / "web.js").read_text()),
+            "web.js": ("text/javascript", (folder / "web.js").read_text()),
         }
 
     async def asset(self, request: Request) -> Response:
@@ -261,10 +318,12 @@ class Pages:
                 411, "the request has no Content-Length, or comes in chunks; send it whole, with "
                 "its size",
             )  # fmt: skip
-        if int(text) > most:
+        # Of more digits than these Python makes no number.
+        size = int(text) if len(text) <= _MOST_DIGITS else 10**_MOST_DIGITS
+        if size > most:
             raise HTTPException(
                 413,
-                f"the files are {int(text) / 1e6:.1f} MB together, more than the {most / 1e6:.0f} "
+                f"the files are {size / 1e6:.1f} MB together, more than the {most / 1e6:.0f} "
                 "MB allowed; send smaller ones, or start 'depthpose serve' with a larger "
                 "--max-upload-mb",
             )
@@ -318,8 +377,8 @@ class Pages:
         if name == "all.zip" and name not in files:
             packed = io.BytesIO()
             with zipfile.ZipFile(packed, "w") as archive:  # most files are compressed already
-                for one, data in files.items():
-                    archive.writestr(one, data)
+                for file_name, data in files.items():
+                    archive.writestr(file_name, data)
             files = {name: packed.getvalue()}
         media_type = _TYPES.get(Path(name).suffix, "application/octet-stream")
         headers = {"Content-Disposition": f'attachment; filename="{name}"'}
@@ -331,10 +390,13 @@ class Pages:
         while len(self._kept) > _RESULTS:
             self._kept.popitem(last=False)
         pictures = []
-        for one in answer.pictures:  # with their sizes, so that nothing moves when they come
-            with Image.open(io.BytesIO(answer.files[one.file])) as image:  # a file of our own
-                said = {"scale": one.scale and vars(one.scale), "size": list(image.size)}
-            pictures.append({**vars(one), **said})
+        for picture in answer.pictures:  # with their sizes, so that nothing moves when they come
+            with Image.open(io.BytesIO(answer.files[picture.file])) as image:  # a file of our own
+                size_and_scale = {
+                    "scale": picture.scale and vars(picture.scale),
+                    "size": list(image.size),
+                }
+            pictures.append({**vars(picture), **size_and_scale})
         return {
             "ok": answer.is_ok,
             "said": answer.said,
@@ -370,6 +432,40 @@ def make_app(depth: FakestereoNet, pose: GeoPoseNet, limits: Limits | None = Non
 _CONNECTIONS = 400
 """Connections at once; more are answered with 503 before anything of them is read."""
 _LEAVE_S = 2  # seconds that open connections have to finish after Ctrl+C
+HEAD_S = 10.0
+"""Seconds in which the head of a request must come: a connection that sends none counts among
+those that are open at once."""
+
+
+class TimedProtocol(H11Protocol):
+    """Closes a connection whose request's head does not come in time; uvicorn would wait for it."""
+
+    _closing: asyncio.TimerHandle | None = None
+
+    def connection_made(self, transport: asyncio.BaseTransport) -> None:
+        """Begin to wait for the first request."""
+        super().connection_made(transport)  # pyright: ignore[reportArgumentType]
+        self._wait_for_head()
+
+    def data_received(self, data: bytes) -> None:
+        """Read on; what is half of a head changes nothing."""
+        super().data_received(data)
+        self._wait_for_head()
+
+    def connection_lost(self, exc: Exception | None) -> None:
+        """Wait for nothing more."""
+        super().connection_lost(exc)
+        if self._closing is not None:
+            self._closing.cancel()
+
+    def _wait_for_head(self) -> None:
+        """Start the time of a head that is not yet there, and end it where one is."""
+        is_waiting = self.conn.their_state is h11.IDLE
+        if is_waiting and self._closing is None:
+            self._closing = self.loop.call_later(HEAD_S, self.transport.close)
+        elif not is_waiting and self._closing is not None:
+            self._closing.cancel()
+            self._closing = None
 
 
 def open_socket(host: str, port: int) -> socket.socket:
@@ -388,27 +484,28 @@ def open_socket(host: str, port: int) -> socket.socket:
 
 
 def known_names(
-    host: str, taken: socket.socket
+    host: str, listener: socket.socket
 ) -> tuple[IPv4Address | IPv6Address, tuple[str, ...] | None]:
     """Give the address that was taken, and the host names under which the page may be requested.
 
     None: any, it is open to all. How the address was written does not say that: '', '0' and '0x0'
     mean all addresses too.
     """
-    address = ip_address(taken.getsockname()[0])
+    address = ip_address(listener.getsockname()[0])
     if isinstance(address, IPv6Address):
         address = address.ipv4_mapped or address
     return address, None if address.is_unspecified else (*LOOPBACK, host.lower(), str(address))
 
 
-def run(app: Starlette, taken: socket.socket) -> None:
+def run(app: Starlette, listener: socket.socket) -> None:
     """Answer requests until the process is stopped; only errors are logged."""
     config = uvicorn.Config(
         app,
+        http=TimedProtocol,
         log_level="error",
         access_log=False,
         server_header=False,
         limit_concurrency=_CONNECTIONS,
         timeout_graceful_shutdown=_LEAVE_S,
     )
-    uvicorn.Server(config).run(sockets=[taken])
+    uvicorn.Server(config).run(sockets=[listener])

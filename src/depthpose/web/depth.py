@@ -63,9 +63,9 @@ def answer_depth(form: Form, net: FakestereoNet) -> Answer:
         sizes += net.virtual_sizes(pair)
         camera = camera_of(rig.virtual_focal_px, (sizes[0][1], sizes[0][0])) or camera
     if rig is None or rig.answer != "own":
-        own = (camera.height, camera.width)
+        full_size = (camera.height, camera.width)
         matcher = net.matcher
-        sizes.append(matcher.work_size(camera) if isinstance(matcher, CameraMatcher) else own)
+        sizes.append(matcher.work_size(camera) if isinstance(matcher, CameraMatcher) else full_size)
     rows, columns = max(sizes, key=math.prod)
     if (rows, columns) == (height, width) and rows * columns > _MOST_WORK_PIXELS:
         raise InputError(
@@ -145,10 +145,10 @@ def _pictures(
 ) -> list[Shown]:
     name, (near_m, far_m) = pair.name, range_m
     grey = "grey: none" if estimate.is_sky is None else "grey: sky or no answer"
-    said = f"near bright and far dark, {near_m:g} m to {far_m:g} m by the logarithm"
+    colours = f"near bright and far dark, {near_m:g} m to {far_m:g} m by the logarithm"
     depth = Shown(
         file=f"{name}.color.png",
-        caption=f"depth: {said}; {grey}",
+        caption=f"depth: {colours}; {grey}",
         values=f"{name}.depth_m.npy",
         unit="m",
         scale=depth_scale(*range_m),

@@ -63,39 +63,42 @@ def answer_pose(form: Form, net: GeoPoseNet) -> Answer:
     if "depth" in form.files and "mask" not in form.files:
         assert isinstance(pose_input, ViewInput)
         answers = target.net.find_in(pose_input, [target.model.name])
-        seen = []
+        shown_poses = []
         for k, answer in enumerate(answers):  # each pose with the pixels that it explains
-            own = f"{name}_{k}" if len(answers) > 1 else name
+            row_name = f"{name}_{k}" if len(answers) > 1 else name
             found_pose = answer.camera_from_model
             assert found_pose is not None
             mask = explained_mask(pose_input, found_pose, prepare_surface(target.model))
-            shown = replace(pose_input, name=own, mask=mask)
-            seen.append(_Seen(input=shown, estimate=replace(answer, name=own)))
-        if not seen:
+            shown = replace(pose_input, name=row_name, mask=mask)
+            shown_poses.append(_Seen(input=shown, estimate=replace(answer, name=row_name)))
+        if not shown_poses:
             nothing = nothing_found(pose_input, target.model.name)
-            seen.append(_Seen(input=pose_input, estimate=nothing))
+            shown_poses.append(_Seen(input=pose_input, estimate=nothing))
     elif isinstance(target.net, GeoPoseNet):
         estimate, voted = target.net.estimate_with_votes(pose_input)
-        seen = [_Seen(input=pose_input, estimate=estimate)]
+        shown_poses = [_Seen(input=pose_input, estimate=estimate)]
     else:
         (estimate,) = target.net.estimate_many([pose_input])
         if estimate.status == "unreadable":
             raise InputError(estimate.reason)
-        seen = [_Seen(input=pose_input, estimate=estimate)]
+        shown_poses = [_Seen(input=pose_input, estimate=estimate)]
     if (least := form.number("min_certainty")) is not None:
         limit = EstimateConfig(min_certainty=least).min_certainty
-        seen = [replace(one, estimate=with_status(one.estimate, limit)) for one in seen]
+        shown_poses = [
+            replace(shown_pose, estimate=with_status(shown_pose.estimate, limit))
+            for shown_pose in shown_poses
+        ]
     folder = form.folder / "results"
     folder.mkdir()
-    best = seen[0]
+    best = shown_poses[0]
     agreeing = "votes that agree" if isinstance(target.net, GeoPoseNet) else "points near the model"
-    found = [["", "status", "x [m]", "y [m]", "z [m]", "certainty"]]
-    for one in seen if len(seen) > 1 else ():
-        pose, certainty = one.estimate.camera_from_model, one.estimate.certainty
+    table = [["", "status", "x [m]", "y [m]", "z [m]", "certainty"]]
+    for shown_pose in shown_poses if len(shown_poses) > 1 else ():
+        pose, certainty = shown_pose.estimate.camera_from_model, shown_pose.estimate.certainty
         place = [] if pose is None else [f"{v:.4f}" for v in pose.t_m.tolist()]
         sure = "" if certainty is None else f"{certainty:.3f}"
-        found.append([one.input.name, one.estimate.status, *place, sure])
-    pose_input, estimate = seen[0].input, seen[0].estimate
+        table.append([shown_pose.input.name, shown_pose.estimate.status, *place, sure])
+    pose_input, estimate = shown_poses[0].input, shown_poses[0].estimate
     scene = report.pose_scene(
         pose_input, object_points(pose_input, target.model.diameter_m), estimate, target.model
     )
@@ -104,35 +107,41 @@ def answer_pose(form: Form, net: GeoPoseNet) -> Answer:
         layers.append(
             report.vote_layer(voted.cloud.points_m, voted.directions, estimate.keypoints_m)
         )
-    for one in seen[1:]:
-        points_m = object_points(one.input, target.model.diameter_m)
-        cloud = report.posed_cloud(points_m, one.estimate.camera_from_model, target.model)
-        layers.append(Layer(name=one.input.name, shape=cloud))
+    for shown_pose in shown_poses[1:]:
+        points_m = object_points(shown_pose.input, target.model.diameter_m)
+        cloud = report.posed_cloud(points_m, shown_pose.estimate.camera_from_model, target.model)
+        layers.append(Layer(name=shown_pose.input.name, shape=cloud))
     return Answer(
         is_ok=best.estimate.is_posed,
         said=report.pose_sentence(best.estimate),
         facts=report.pose_facts(best.estimate, target.model, target.how, agreeing),
-        tables=({"found in this image": found} if len(seen) > 1 else {})
+        tables=({"found in this image": table} if len(shown_poses) > 1 else {})
         | report.pose_tables(best.estimate),
-        pictures=_write(folder, name, seen, target.model),
+        pictures=_write(folder, name, shown_poses, target.model),
         scene=replace(scene, layers=layers),
         terms=net.terms if target.net is net else "",
         files={path.name: path.read_bytes() for path in sorted(folder.iterdir())},
     )
 
 
-def _write(folder: Path, name: str, seen: list[_Seen], model: ObjectModel) -> list[Shown]:
+def _write(folder: Path, name: str, shown_poses: list[_Seen], model: ObjectModel) -> list[Shown]:
     """Write ``poses.json``, each cloud with the posed model, and the picture that is shown."""
-    write_predictions(folder, [Prediction(estimate=one.estimate) for one in seen])
-    for one in seen:
-        points_m = object_points(one.input, model.diameter_m)
-        cloud = report.posed_cloud(points_m, one.estimate.camera_from_model, model)
-        files.write_cloud(folder / f"{one.input.name}.{CLOUD}", cloud)
-    pose_input = seen[0].input
+    write_predictions(
+        folder, [Prediction(estimate=shown_pose.estimate) for shown_pose in shown_poses]
+    )
+    for shown_pose in shown_poses:
+        points_m = object_points(shown_pose.input, model.diameter_m)
+        cloud = report.posed_cloud(points_m, shown_pose.estimate.camera_from_model, model)
+        files.write_cloud(folder / f"{shown_pose.input.name}.{CLOUD}", cloud)
+    pose_input = shown_poses[0].input
     if not isinstance(pose_input, ViewInput):
         return []
     picture, caption = report.grey_depth(pose_input.depth_m), "depth image, near bright"
-    poses = [pose for one in seen if (pose := one.estimate.camera_from_model) is not None]
+    poses = [
+        pose
+        for shown_pose in shown_poses
+        if (pose := shown_pose.estimate.camera_from_model) is not None
+    ]
     for pose in poses:
         picture = report.draw_pose(picture, pose, model, pose_input.K.double())
     if poses:
@@ -150,23 +159,23 @@ def _target(form: Form, net: GeoPoseNet) -> _Target:
                 f"object {name!r} and the CAD file {form.files['cad'].name} are both given; choose "
                 "'the CAD file above' as the object, or take the file out"
             )
-        known = [model for model in models if model.name == name]
-        if not known:
+        same_name = [model for model in models if model.name == name]
+        if not same_name:
             raise InputError(f"object {name!r}: the weights know {', '.join(net.objects)}")
-        return _Target(model=known[0], net=net, how="network, by the weights' own model")
+        return _Target(model=same_name[0], net=net, how="network, by the weights' own model")
     cad = form.file("cad")
     unit = mesh.FIXED_UNITS.get(cad.suffix.lower()) or form.fields.get("cad_unit", "")
     refuse_unknown("cad_unit", unit, METRES)
     model = mesh.read_model(cad, cast(Unit, unit))
-    for own in models:  # of which the file may be one, in the same frame
-        is_same = abs(model.diameter_m / own.diameter_m - 1) <= _SAME
+    for known_model in models:  # of which the file may be one, in the same frame
+        is_same = abs(model.diameter_m / known_model.diameter_m - 1) <= _SAME
         if is_same:
-            off_m = mesh.gap_to_surface_m(own.keypoints_m, model)
-            back_m = mesh.gap_to_surface_m(mesh.sample_surface(model, 500)[0], own)
-            is_same = max(off_m, back_m) < _SAME * own.diameter_m
+            off_m = mesh.gap_to_surface_m(known_model.keypoints_m, model)
+            back_m = mesh.gap_to_surface_m(mesh.sample_surface(model, 500)[0], known_model)
+            is_same = max(off_m, back_m) < _SAME * known_model.diameter_m
         if is_same:
-            how = f"network; the CAD file is the weights' {own.name!r}"
-            return _Target(model=own, net=net, how=how)
+            how = f"network; the CAD file is the weights' {known_model.name!r}"
+            return _Target(model=known_model, net=net, how=how)
     model = mesh.with_found_symmetries(model, None, is_taken=True)
     how = "the CAD file alone, without training"
     return _Target(model=model, net=Registration([model], net.config), how=how)

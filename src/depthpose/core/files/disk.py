@@ -4,6 +4,7 @@ Reading is guarded, writing atomic. A path through a tar shard, ``000000.tar/a.l
 as through a folder.
 """
 
+import errno
 import json
 import math
 import os
@@ -63,12 +64,34 @@ def refused_as(path: AnyPath, kind: str, remedy: str) -> Iterator[None]:
         raise InputError(f"{path}: not a readable {kind} ({said}); {remedy}") from error
 
 
+def refuse_broken_link(path: AnyPath) -> None:
+    """Refuse a path on whose way a link leads nowhere, or in a circle.
+
+    Raises:
+        InputError: the link, and where it leads.
+    """
+    for place in (Path(path), *Path(path).parents):
+        if not os.path.islink(place) or os.path.exists(place):  # noqa: PTH110, PTH114 - never raise
+            continue
+        try:
+            place.stat()
+        except OSError as error:
+            is_circle = error.errno == errno.ELOOP
+            leads = "in a circle" if is_circle else f"to {os.readlink(place)!r}, which is not there"  # noqa: PTH115
+        else:  # made by another process meanwhile
+            return
+        raise InputError(
+            f"{place}: is a link that leads {leads}; remove it, or choose another place"
+        )
+
+
 @contextmanager
 def refused_write(path: AnyPath) -> Iterator[None]:
     """Turn what a disk refuses to take into an :class:`InputError`."""
     try:
         yield
     except OSError as error:
+        refuse_broken_link(path)
         file = next((folder for folder in Path(path).parents if os.path.isfile(folder)), None)  # noqa: PTH113 - which never raises
         if file is not None:
             raise InputError(
@@ -407,11 +430,23 @@ def finite_number(text: str) -> float:
 _MOST_SHOWN = 6
 
 
-def natural_order(path: Path) -> tuple[list[list[str | int]], Path]:
-    """Give the key that sorts paths by name, and numbers in names by value: 2 before 10."""
-    pieces = [re.split(r"(\d+)", part) for part in (*path.parent.parts, path.stem)]
-    # Every second piece is a run of digits, so that like is compared with like.
-    return [[int(p) if k % 2 else p for k, p in enumerate(part)] for part in pieces], path
+_NUMBER = re.compile(r"((?<![\d.])\d+\.\d+(?!\d|\.\d)|\d+)")
+
+
+def natural_order(path: Path) -> tuple[list[list[str | tuple[int, str]]], Path]:
+    """Give the key that sorts paths by name, and numbers in names by value: 2 before 10.
+
+    Two runs of digits with a point between them are a decimal, as of a time in seconds: 0.45 comes
+    before 0.5. Three are none (1.2.10).
+    """
+    pieces = [_NUMBER.split(part) for part in (*path.parent.parts, path.stem)]
+
+    def value(piece: str) -> tuple[int, str]:
+        whole, _, decimals = piece.partition(".")
+        return int(whole), decimals  # digits behind the point sort as letters do
+
+    # Every second piece is a number, so that like is compared with like.
+    return [[value(p) if k % 2 else p for k, p in enumerate(part)] for part in pieces], path
 
 
 def find_partners(first: Sequence[str], second: Sequence[str], said: str) -> list[int]:

@@ -5,6 +5,7 @@ Text and binary of both byte orders are read; little-endian binary is written.
 
 import math
 import re
+import warnings
 from array import array
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
@@ -14,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from depthpose.core.errors import InputError
+from depthpose.core.errors import InputError, Notice
 from depthpose.core.files.disk import MAX_TEXT_BYTES, AnyPath, read_bytes, refused_as
 
 _WORDS = re.compile(r"[-+]?(?:nan\(\w*\)|1[.,]#(?:QNAN|SNAN|IND|INF)\w*)")
@@ -307,7 +308,12 @@ _DATA = re.compile(rb"(?:^|\n)DATA[ \t]+(ascii|binary|binary_compressed)[ \t]*(?
 
 
 def read_pcd(path: AnyPath) -> Columns:
-    """Read the columns of a PCD file; ``rgb`` stays packed."""
+    """Read the columns of a PCD file; ``rgb`` stays packed.
+
+    Warns:
+        Notice: its ``VIEWPOINT`` is not the identity, so that the points may be in a frame that is
+            not the sensor's. Programs differ in what they mean by it, so it is not applied.
+    """
     data = read_bytes(path)
     end = _DATA.search(data, 0, _MAX_HEADER)
     if end is None:
@@ -328,6 +334,15 @@ def read_pcd(path: AnyPath) -> Columns:
         )
     if len(set(real)) != len(real):
         raise InputError(f"{path}: PCD fields {names} repeat a name; keep one of them")
+    viewpoint = " ".join(header.get("VIEWPOINT", []))
+    if viewpoint and not _is_identity(viewpoint):
+        warnings.warn(
+            f"{path}: its VIEWPOINT {viewpoint[:100]} (x y z, qw qx qy qz of the sensor) is not "
+            "applied: the points are taken as they are. If they are in that other frame, turn them "
+            "into the sensor's (x right, y down, z forward) and write VIEWPOINT 0 0 0 1 0 0 0",
+            Notice,
+            stacklevel=4,
+        )
     fields = [Field(name=n, code=_PCD_CODES[k, s], count=int(c)) for n, k, s, c in rows]
     sides = [header.get(name, []) for name in ("WIDTH", "HEIGHT")]
     sides = [header["POINTS"]] if "POINTS" in header else sides
@@ -358,6 +373,15 @@ def read_pcd(path: AnyPath) -> Columns:
             unpacked = unpacked[values.nbytes :]
         return columns
     return split_rows(path, text_rows(path, body), fields, count)
+
+
+def _is_identity(viewpoint: str) -> bool:
+    """Whether a viewpoint, ``x y z qw qx qy qz``, says nothing; writers that know none put 0."""
+    try:
+        *moved, qw, qx, qy, qz = (float(word) for word in viewpoint.split())
+    except ValueError:
+        return False
+    return len(moved) == 3 and not any((*moved, qx, qy, qz)) and math.isfinite(qw)
 
 
 def encode_pcd(points: np.ndarray, color: np.ndarray | None) -> bytes:

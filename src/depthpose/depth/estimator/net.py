@@ -14,7 +14,6 @@ import numpy as np
 import torch
 from PIL import Image
 from torch import Tensor
-from torch.nn import functional as F
 from tqdm import tqdm
 
 from depthpose.core.camera import (
@@ -35,7 +34,17 @@ from depthpose.core.files.images import check_image
 from depthpose.depth import disparity
 from depthpose.depth.config import Answer, MatcherConfig, SelectionConfig, SGBMConfig
 from depthpose.depth.ground import scale_by_distance, scale_by_mount
-from depthpose.depth.stereo import CameraMatcher, Matcher, SGBMMatcher
+from depthpose.depth.stereo import (
+    CameraMatcher,
+    Matcher,
+    NetworkMatcher,
+    SGBMMatcher,
+    choose_window,
+    doubt_outside,
+    measure_reach,
+    move_views,
+    moved_back,
+)
 from depthpose.depth.synthesis import SelectionGenerator, Synthesiser, make_synthesiser
 from depthpose.depth.types import DepthEstimate, Match, StereoInput
 from depthpose.depth.weights import Use, make_matcher, read_depth_weights
@@ -296,9 +305,11 @@ class FakestereoNet:
     def estimate_pair(self, pair: StereoInput, *, with_check: bool = True) -> DepthEstimate:
         """Estimate depth of one input whose images are read already, as :meth:`estimate` does.
 
-        Views of a rig with principal points apart are moved by their difference: what is farthest
-        then has a disparity of 0 px, where matchers search, and what is nearest that of a rig whose
-        principal points agree. The estimate has the disparities of the views as given.
+        Networks that find the range measure the disparities of the pair first, and search where
+        they lie; the estimate's ``warning`` names what lies beyond. For other matchers views of a
+        rig with principal points apart are moved by their difference: what is farthest then has a
+        disparity of 0 px, where matchers search. The estimate has the disparities of the views as
+        given.
         """
         if pair.right is None:
             return self._estimate_alone([pair], self.virtual_sizes(pair))[0]
@@ -312,34 +323,33 @@ class FakestereoNet:
         warning = refuse_unrectified(pair, with_check=with_check)
         left, right, rig, width = pair.left, pair.right, pair.camera, pair.left.shape[2]
         apart_px = rig.cx_right_minus_left_px if isinstance(rig, StereoRig) else 0.0
-        columns = math.ceil(apart_px)
-        added = max(columns, 0)
-        if isinstance(rig, StereoRig) and columns != 0:
-            if abs(columns) >= width:
-                raise InputError(
-                    f"cx_right_minus_left_px is {apart_px:g}, and the images are {width} px wide: "
-                    "the two views share nothing that is far away. Take both principal points from "
-                    "one calibration of images of this size."
-                )
-            K = rig.K.clone()
-            K[0, 2] += added
-            rig = replace(rig, width=width + added, K=K, cx_right_minus_left_px=apart_px - columns)
-            # New columns repeat the border; those cut off the right view show nothing of the left.
-            left = F.pad(left[None], (added, 0, 0, 0), mode="replicate")[0]
-            right = F.pad(right[None], (added - columns, added, 0, 0), mode="replicate")
-            right = right[0, ..., : width + added]
+        if abs(math.ceil(apart_px)) >= width:
+            raise InputError(
+                f"cx_right_minus_left_px is {apart_px:g}, and the images are {width} px wide: "
+                "the two views share nothing that is far away. Take both principal points from "
+                "one calibration of images of this size."
+            )
         with refused_memory(pair.name):
+            if isinstance(self.matcher, NetworkMatcher) and self.matcher.finds_range:
+                reach = measure_reach(self.matcher, left, right, -apart_px)
+                window = choose_window(self.matcher, reach, left.shape[1:], rig)
+                (match,) = self.matcher.match_many([(left, right)], rig, window.search)
+                match, doubt = doubt_outside(match, reach, window)
+                warning = "; ".join(said for said in (warning, doubt) if said)
+                return disparity.from_pair(pair, match, warning)
+            # Other matchers search from 0 on: the views are moved so that infinity is there.
+            first_px = -math.ceil(apart_px)
+            left, right = move_views(left, right, first_px)
+            if isinstance(rig, StereoRig) and first_px != 0:
+                K = rig.K.clone()
+                K[0, 2] += left.shape[2] - width
+                moved_px = apart_px + first_px
+                rig = replace(rig, width=left.shape[2], K=K, cx_right_minus_left_px=moved_px)
             if isinstance(self.matcher, CameraMatcher):
                 (match,) = self.matcher.match_many([(left, right)], rig)
             else:
                 match = self.matcher.match(left, right)
-            if columns != 0:
-                match = disparity.changed_match(match, lambda values: values[:, added:])
-                match = replace(match, disparity_px=match.disparity_px - columns)
-            if columns != 0 and match.confidence is not None:
-                # The right view shows none of the first columns, even at infinity.
-                is_outside = torch.arange(width, device=match.confidence.device) < -columns
-                match = replace(match, confidence=match.confidence.where(~is_outside, 0.0))
+            match = moved_back(match, first_px)
             return disparity.from_pair(pair, match, warning)
 
     @own_arithmetic()

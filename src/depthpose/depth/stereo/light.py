@@ -125,7 +125,13 @@ class Refinement(nn.Module):
         for parameter in self.correction.parameters():
             nn.init.zeros_(parameter)
 
-    def forward(self, enlarged_px: Maps, left_half: Features, right_half: Features) -> Maps:
+    def forward(
+        self,
+        enlarged_px: Maps,
+        left_half: Features,
+        right_half: Features,
+        least_px: float = LEAST_PX,
+    ) -> Maps:
         """Correct a disparity of the left view [px] by features of both views at half size."""
         four = F.pixel_unshuffle(enlarged_px.detach()[:, None], 2) / 2
         middle = four.mean(1)
@@ -142,7 +148,7 @@ class Refinement(nn.Module):
         correction_px = F.pixel_shuffle(self.correction(x).to(enlarged_px), 2)[:, 0]
         # Frozen, it passes gradients on to what drew the views.
         corrected = (enlarged_px.detach() if self.training else enlarged_px) + correction_px
-        return corrected if self.training else corrected.clamp_min(LEAST_PX)
+        return corrected if self.training else corrected.clamp_min(least_px)
 
 
 def _neighbours(quarter: Quarter) -> Float[Tensor, "b 9 h2 w2"]:
@@ -174,10 +180,11 @@ _SKY_WIDTH = 32
 """Channels of the class of the sky."""
 
 
-def confidence_near(scores: Scores, disparity_px: Quarter) -> Quarter:
+def confidence_near(scores: Scores, disparity_px: Quarter, first_px: int = 0) -> Quarter:
     """Give the probability of what lies within 15 % of a disparity, as selecting generators do.
 
-    Between the disparities that have a score, scores are interpolated.
+    Between the disparities that have a score, scores are interpolated. The first score is that of
+    ``first_px``.
     """
     bins = scores.shape[1]
     count = STEP_PX * (bins - 1) + 1
@@ -186,7 +193,7 @@ def confidence_near(scores: Scores, disparity_px: Quarter) -> Quarter:
     )
     probability = F.conv2d(scores, matrix[..., None, None]).softmax(1)
     steps_px = torch.arange(count, dtype=scores.dtype, device=scores.device)[:, None, None]
-    distance_px = (steps_px - disparity_px[:, None]).abs()
+    distance_px = (first_px + steps_px - disparity_px[:, None]).abs()
     window_px = _WINDOW * disparity_px.clamp(min=1)[:, None]
     # Each whole disparity stands for the half pixel on both sides of it.
     share = (window_px + 0.5 - distance_px).clamp(0, 1)
@@ -289,16 +296,19 @@ class LightFeatures(nn.Module):
 
 
 def correlation_volume(
-    left: Float[Tensor, "b g k h w"], right: Float[Tensor, "b g k h w"], bins: int
+    left: Float[Tensor, "b g k h w"], right: Float[Tensor, "b g k h w"], bins: int, first: int = 0
 ) -> Float[Tensor, "b g {bins} h w"]:
     """Give the cosine of each of :func:`unit_groups` of ``left[y, x]`` and ``right[y, x - d]``.
 
-    Zero where the right pixel falls outside the image.
+    Disparities d are ``first``, which may be negative, and those that follow. Zero where the right
+    pixel falls outside the image.
     """
-    width, padded, cosines = left.shape[-1], F.pad(right, (bins - 1, 0)), []
-    for first in reversed(range(bins)):
+    before, after = max(first + bins - 1, 0), max(-first, 0)
+    width, padded, cosines = left.shape[-1], F.pad(right, (before, after)), []
+    for disparity in range(first, first + bins):
         # Groups last, as convolutions of volumes want them: no copy is made.
-        products = left * padded[..., first : first + width]
+        start = before - disparity
+        products = left * padded[..., start : start + width]
         cosines.append(products.sum(2).permute(0, 2, 3, 1))
     return torch.stack(cosines, 1).permute(0, 4, 1, 2, 3)
 
@@ -327,6 +337,7 @@ class Aggregation(nn.Module):
         bins: int,
         levels: tuple[Features, ...],
         rows: int | None = None,
+        first: int = 0,
     ) -> Scores:
         """Score each disparity by the descriptions of both views; more is likelier.
 
@@ -339,7 +350,7 @@ class Aggregation(nn.Module):
 
         def begin(left: Features, right: Features, guide: Volume) -> Volume:
             near, far = unit_groups(left, self.groups), unit_groups(right, self.groups)
-            volume = correlation_volume(near, far, bins)
+            volume = correlation_volume(near, far, bins, first)
             volume = volume.contiguous(memory_format=torch.channels_last_3d)
             return product(self.first(volume).relu_(), guide)
 
@@ -405,9 +416,23 @@ class LightStereo(StereoNetwork):
         return read.heads, read.sky
 
     def read(
-        self, left: Views, right: Views, max_disparity_px: int, *, with_confidence: bool = False
+        self,
+        left: Views,
+        right: Views,
+        max_disparity_px: int,
+        *,
+        first_px: int = 0,
+        with_confidence: bool = False,
     ) -> Reading:
         """Match the pair, and read disparity, confidence and sky off the scores.
+
+        Args:
+            left: normalised left views.
+            right: normalised right views.
+            max_disparity_px: so many disparities are searched.
+            first_px: the least of them, a multiple of 4; negative where rigs have principal points
+                apart.
+            with_confidence: say how sure each pixel is.
 
         Raises:
             InputError: the images' size does not suit the network.
@@ -423,29 +448,32 @@ class LightStereo(StereoNetwork):
         right_half = far.half
         del far
         bins = max_disparity_px // STEP_PX
-        scores = self.aggregation(*described, bins, near.levels, self.rows)
+        first = first_px // STEP_PX
+        scores = self.aggregation(*described, bins, near.levels, self.rows, first)
         # In float32 at least: 8 bits would round the expectation to whole pixels.
         scores = scores.to(torch.promote_types(scores.dtype, torch.float32))
         best = scores.topk(_CANDIDATES, 1)
-        quarter_px = STEP_PX * (best.values.softmax(1) * best.indices).sum(1)
+        quarter_px = first_px + STEP_PX * (best.values.softmax(1) * best.indices).sum(1)
         quarters = [quarter_px]
         if with_confidence or self.sky_head is not None:
             with torch.no_grad():
                 # By rows: probabilities between the scores are the largest volume.
                 parts = (scores, quarter_px)
-                quarters.append(by_rows(confidence_near, parts, halo=0, rows=self.rows))
+                near_px = partial(confidence_near, first_px=first_px)
+                quarters.append(by_rows(near_px, parts, halo=0, rows=self.rows))
         if self.sky_head is not None:
             quarters.append(self.sky_head(near.levels, *quarters))
         coarse_px = None
         if self.training:  # the mean over all disparities
             steps = torch.arange(bins, dtype=scores.dtype, device=scores.device)[:, None, None]
-            coarse_px = STEP_PX * (scores.softmax(1) * steps).sum(1, keepdim=True)
+            coarse_px = first_px + STEP_PX * (scores.softmax(1) * steps).sum(1, keepdim=True)
         del scores
         parts = (torch.stack(quarters, 1), near.half, near.levels[0], right_half)
         found_px, *rest = by_rows(self.enlargement, parts, halo=2, rows=self.rows).unbind(1)
         parts = (found_px, near.half, right_half)
         half_rows = None if self.rows is None else 2 * self.rows
-        heads = (by_rows(self.refinement, parts, halo=5, rows=half_rows),)
+        refine = partial(self.refinement, least_px=first_px + LEAST_PX)
+        heads = (by_rows(refine, parts, halo=5, rows=half_rows),)
         if coarse_px is not None:
             wide_px = F.interpolate(coarse_px, scale_factor=4.0, mode="bilinear")[:, 0]
             heads = (wide_px, found_px, *heads)
@@ -495,6 +523,7 @@ class LightMatcher(NetworkMatcher):
     """Pixels of a fine match at most: an image of KITTI, enlarged 1.18 times."""
     most_enlarged = 1.5
     most_disparities = 1.75
+    finds_range = True
     activation_bytes = staticmethod(light_bytes)
 
     def fold(self, network: LightStereo, like: Tensor) -> LightStereo:
@@ -503,12 +532,15 @@ class LightMatcher(NetworkMatcher):
         network.rows = ROWS if self.device.type == "cpu" else None
         return layers.fold(network, like)
 
-    def run(self, left: Views, right: Views, network: LightConfig) -> list[Match]:
+    def run(
+        self, left: Views, right: Views, network: LightConfig, first_px: int = 0
+    ) -> list[Match]:
         """Match normalised pairs whose sides suit the network."""
         read = self._network.read(
             left.to(self.dtype),
             right.to(self.dtype),
             network.max_disparity_px,
+            first_px=first_px,
             with_confidence=self.config.with_confidence,
         )
         nothing = [None] * len(left)

@@ -7,7 +7,7 @@ import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from copy import deepcopy
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from operator import itemgetter
 from typing import Any, ClassVar, Protocol, runtime_checkable
 
@@ -24,7 +24,7 @@ from depthpose.core.files.images import check_image
 from depthpose.depth import disparity
 from depthpose.depth.config import MatcherConfig, NetworkConfig, SGBMConfig
 from depthpose.depth.synthesis import LiteEncoder
-from depthpose.depth.types import Map, Maps, Match, Views
+from depthpose.depth.types import Map, Maps, Match, View, Views
 
 
 @runtime_checkable
@@ -46,6 +46,15 @@ class Matcher(Protocol):
             InputError: the images are no such pair, or this matcher cannot take them.
         """
         ...
+
+
+@dataclass(frozen=True, kw_only=True)
+class Search:
+    """The size at which a pair is matched, and how many disparities are looked through there."""
+
+    scale: float  #: rows and columns are so many times those of the images
+    first_px: int  #: the least disparity that is searched at that size, a multiple of 4
+    max_disparity_px: int  #: so many disparities are searched from there on
 
 
 @runtime_checkable
@@ -269,6 +278,8 @@ class NetworkMatcher(ABC):
     """Times the size of the images at which a fine match may be."""
     most_disparities: ClassVar[float] = 1.5
     """Times the disparities of training that a fine match looks through at most."""
+    finds_range: ClassVar[bool] = False
+    """Whether the disparities of a pair are measured first, and searched where they lie."""
     activation_bytes: ClassVar[Callable[..., int]]
     """Peak memory of a padded pair [bytes], by the network's config, height, width, type, rows."""
 
@@ -287,13 +298,21 @@ class NetworkMatcher(ABC):
         """Fold batch norm into the convolutions; weights get the type of ``like``."""
 
     @abstractmethod
-    def run(self, left: Views, right: Views, network: Any) -> list[Match]:  # noqa: ANN401
+    def run(
+        self,
+        left: Views,
+        right: Views,
+        network: Any,  # noqa: ANN401
+        first_px: int = 0,
+    ) -> list[Match]:
         """Match normalised pairs whose sides suit the network.
 
         Args:
             left: left views.
             right: right views, the same size.
             network: the network's config, perhaps with more disparities than it was trained with.
+            first_px: the least disparity that is searched, a multiple of 4; other
+                than 0 for networks alone that find the range.
         """
 
     @torch.no_grad()
@@ -307,12 +326,15 @@ class NetworkMatcher(ABC):
 
     @torch.no_grad()
     def match_many(
-        self, pairs: Sequence[tuple[Tensor, Tensor]], camera: Camera | None = None
+        self,
+        pairs: Sequence[tuple[Tensor, Tensor]],
+        camera: Camera | None = None,
+        search: Search | None = None,
     ) -> list[Match]:
         """Match pairs; those of one size together, unless memory is bounded.
 
-        Pairs of a known camera are matched at the size of :meth:`work_size`. A processor is busy
-        with one pair; it is a GPU that gains from several.
+        Pairs of a known camera are matched at the size of :meth:`work_size`, or all at that of
+        ``search``. A processor is busy with one pair; it is a GPU that gains from several.
 
         Raises:
             InputError: as :meth:`match`.
@@ -321,12 +343,17 @@ class NetworkMatcher(ABC):
             check_pair(left, right)
         trained = network = self.network_config
         views = pairs
-        if camera is not None and trained.work_focal_px is not None:
+        first_px = 0 if search is None else search.first_px
+        if search is not None:
+            network = replace(trained, max_disparity_px=search.max_disparity_px)
+            sizes = [_scaled_size(left, search.scale, camera) for left, _ in pairs]
+            views = [
+                tuple(disparity.resize_image(view, *size) for view in pair)
+                for pair, size in zip(pairs, sizes, strict=True)
+            ]
+        elif camera is not None and trained.work_focal_px is not None:
             size = self.work_size(camera)
-            # A larger size needs more disparities; the same filters look through them.
-            larger = min(self.work_focal_px(camera) / trained.work_focal_px, self.most_disparities)
-            steps = math.ceil(round(trained.max_disparity_px * larger, 3) / trained.step_px)
-            network = replace(trained, max_disparity_px=steps * trained.step_px)
+            network = replace(trained, max_disparity_px=self.work_disparities(camera))
             views = [tuple(disparity.resize_image(view, *size) for view in pair) for pair in pairs]
         most = self.config.max_memory_bytes
         together = most is None and len({left.shape for left, _ in views}) == 1
@@ -356,7 +383,7 @@ class NetworkMatcher(ABC):
                         f"(padded): this matcher takes {least}; allow that, take precision='bf16'"
                         f"{quick}, or match the pair at a smaller size"
                     )
-                found = self.run(padded[0], padded[1], network)
+                found = self.run(padded[0], padded[1], network, first_px)
                 answers.append([disparity.changed_match(match, crop) for match in found])
             if len(answers) == 2:
                 other_px = (match.disparity_px.flip(-1) for match in answers[1])
@@ -376,6 +403,20 @@ class NetworkMatcher(ABC):
             return camera.height, camera.width
         return disparity.focal_size(camera, self.work_focal_px(camera))
 
+    def work_disparities(self, camera: Camera) -> int:
+        """Disparities that are searched at :meth:`work_size` [px]."""
+        trained = self.network_config
+        if trained.work_focal_px is None:
+            return trained.max_disparity_px
+        # A larger size needs more disparities; the same filters look through them.
+        larger = min(self.work_focal_px(camera) / trained.work_focal_px, self.most_disparities)
+        return self.whole_steps(trained.max_disparity_px * larger)
+
+    def whole_steps(self, disparity_px: float) -> int:
+        """Disparities of a volume that reaches up to one [px]: a multiple of the network's step."""
+        step_px = self.network_config.step_px
+        return max(1, math.ceil(round(disparity_px, 3) / step_px)) * step_px
+
     def work_focal_px(self, camera: Camera) -> float:
         """Focal length at which images of a camera are matched [px]."""
         trained_px = self.network_config.work_focal_px
@@ -385,6 +426,13 @@ class NetworkMatcher(ABC):
             return trained_px
         share = math.sqrt(self.fine_pixels / (camera.height * camera.width))
         return max(trained_px, float(camera.K[0, 0]) * min(share, self.most_enlarged))
+
+
+def _scaled_size(left: View, scale: float, camera: Camera | None) -> tuple[int, int]:
+    """Give so many times the sides of a view; pixels of a known camera become square."""
+    if camera is not None:
+        return disparity.focal_size(camera, scale * float(camera.K[0, 0]))
+    return max(1, round(left.shape[1] * scale)), max(1, round(left.shape[2] * scale))
 
 
 def normalise(image: Float[Tensor, "*batch 3 h w"]) -> Float[Tensor, "*batch 3 h w"]:

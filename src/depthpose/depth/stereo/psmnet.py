@@ -336,8 +336,11 @@ class PSMNetMatcher(NetworkMatcher):
         network.rows = ROWS
         return layers.fold(network, like)
 
-    def run(self, left: Views, right: Views, network: PSMNetConfig) -> list[Match]:
+    def run(
+        self, left: Views, right: Views, network: PSMNetConfig, first_px: int = 0
+    ) -> list[Match]:
         """Match normalised pairs whose sides suit the network."""
+        assert first_px == 0, "its volume begins at 0; the views are moved instead"
         near, far = (one.to(self.dtype, memory_format=torch.channels_last) for one in (left, right))
         costs = self._network.costs(near, far, network.max_disparity_px)[-1][:, 0]
         height, width = left.shape[-2:]

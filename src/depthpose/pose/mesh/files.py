@@ -8,6 +8,7 @@ import math
 import struct
 from array import array
 from codecs import BOM_UTF8
+from collections import deque
 from collections.abc import Callable, Iterator
 from contextlib import suppress
 from io import BytesIO
@@ -21,11 +22,14 @@ from depthpose.core.files import CLOUD_READERS, AnyPath, read_bytes, read_cloud
 from depthpose.core.files.disk import refused_as, refused_suffix
 from depthpose.core.files.points import Ragged, read_ply_elements
 from depthpose.core.units import Unit
+from depthpose.pose.mesh.bodies import faces_of_part
+from depthpose.pose.mesh.shapes import shape_geometry, shape_unit
 
 _MOST_VALUES = 2 * 10**7  # that the accessors of a GLB may declare: six million points
 _MOST_TEXT = 2**25  # bytes of an OBJ or STL in text, which are read in some seconds
 _NO_FACES = Ragged(np.empty(0, np.int64), np.empty(0, np.int64))
 _MOST_NODES, _MOST_SCENE_BYTES = 10_000, 2**22
+_MOST_NESTED = 6e7  # sum of the cubes of the depths of a GLB's nodes: some ten seconds of trimesh
 _WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT2": 4, "MAT3": 9, "MAT4": 16}
 _KNOWN = ("KHR_materials", "KHR_texture", "KHR_lights", "KHR_xmp", "EXT_texture", "KHR_mesh_quant")
 """How extensions of glTF begin that change no surface, or that trimesh reads."""
@@ -34,16 +38,20 @@ _LEAST_AREA = 1e-6  # of the squared extent: all faces of less are no surface; a
 _FARTHEST = 1e9  # a coordinate beyond is no model's, in whatever unit, and overflows in float32
 
 
+AnyModel = AnyPath | object  #: a model file, or a mesh of trimesh or Open3D
 FIXED_UNITS: dict[str, Unit] = {".glb": "m"}  #: of formats that fix theirs
 
 
-def unit_of(path: AnyPath, unit: Unit | None) -> Unit:
-    """Give the unit of a model file: what is said, else what its format fixes.
+def unit_of(path: AnyModel, unit: Unit | None) -> Unit:
+    """Give the unit of a model: what is said, else what its format fixes, or the mesh itself says.
 
     Raises:
         InputError: neither.
     """
-    found = unit or FIXED_UNITS.get(Path(path).suffix.lower())
+    if isinstance(path, str | Path):
+        found = unit or FIXED_UNITS.get(Path(path).suffix.lower())
+    else:
+        found = unit or shape_unit(path)
     if found is None:
         raise InputError(
             f"{path}: no unit is given, and such a file does not say its own; give --unit mm, "
@@ -52,19 +60,26 @@ def unit_of(path: AnyPath, unit: Unit | None) -> Unit:
     return found
 
 
-def read_geometry(path: AnyPath) -> tuple[np.ndarray, np.ndarray]:
-    """Read points and triangles of a model file in its own unit; bare points have no triangles.
+def read_geometry(path: AnyModel) -> tuple[np.ndarray, np.ndarray]:
+    """Read points and triangles of a model in its own unit; bare points have no triangles.
 
     Raises:
-        InputError: the file is missing, damaged or of another format, or has no surface.
+        InputError: the file is missing, damaged or of another format, has no surface, or bodies far
+            from each other.
+
+    Warns:
+        Notice: a small body far from the rest is left out.
     """
-    suffix = Path(path).suffix.lower()
-    if suffix not in MESH_READERS:
-        if suffix not in CLOUD_READERS:
-            known = dict.fromkeys((*MESH_READERS, *CLOUD_READERS))
-            raise refused_suffix(path, "model", tuple(known))
-        return read_cloud(path).points.double().numpy(), np.empty((0, 3), np.int64)
-    vertices, faces = MESH_READERS[suffix](path)
+    if not isinstance(path, str | Path):
+        vertices, faces = shape_geometry(path)
+    else:
+        suffix = Path(path).suffix.lower()
+        if suffix not in MESH_READERS:
+            if suffix not in CLOUD_READERS:
+                known = dict.fromkeys((*MESH_READERS, *CLOUD_READERS))
+                raise refused_suffix(path, "model", tuple(known))
+            return read_cloud(path).points.double().numpy(), np.empty((0, 3), np.int64)
+        vertices, faces = MESH_READERS[suffix](path)
     if len(vertices) < 4 or not (np.abs(vertices) < _FARTHEST).all():
         raise InputError(
             f"{path}: holds {len(vertices)} points, or one that is not finite or beyond "
@@ -76,7 +91,7 @@ def read_geometry(path: AnyPath) -> tuple[np.ndarray, np.ndarray]:
     if (sizes == 3).all() and ((corners >= 0) & (corners < len(vertices))).all():
         faces = corners.reshape(-1, 3)
     else:
-        faces = cut_polygons(path, vertices, sizes, corners)
+        faces = cut_polygons(str(path), vertices, sizes, corners)
     if len(faces) == 0:
         return vertices, faces
     # Dropped are faces without area, and all but the first of those on the same three points: a
@@ -90,10 +105,16 @@ def read_geometry(path: AnyPath) -> tuple[np.ndarray, np.ndarray]:
             "lines or points. Export it again as triangles, or as points without faces."
         )
     # By place, not by number: STL repeats the points of every face.
-    _, place = np.unique(vertices, axis=0, return_inverse=True)
-    _, first = np.unique(np.sort(place.reshape(-1)[faces], axis=-1), axis=0, return_index=True)
-    is_first = np.isin(np.arange(len(faces)), first)
-    return vertices, faces[is_first & (area > _NO_AREA * square)]
+    places, place = np.unique(vertices, axis=0, return_inverse=True)
+    merged = place.reshape(-1)[faces]
+    _, first = np.unique(np.sort(merged, axis=-1), axis=0, return_index=True)
+    kept = np.isin(np.arange(len(faces)), first) & (area > _NO_AREA * square)
+    faces, merged, area = faces[kept], merged[kept], area[kept]
+    is_part = faces_of_part(str(path), places, merged, area)
+    if is_part.all():
+        return vertices, faces
+    used, faces = np.unique(faces[is_part], return_inverse=True)
+    return vertices[used], faces.reshape(-1, 3)
 
 
 def _read_ply(path: AnyPath) -> tuple[np.ndarray, Ragged]:
@@ -121,14 +142,15 @@ def _rows_of(path: AnyPath, data: bytes) -> Iterator[tuple[int, list[bytes]]]:
             f"{path}: {len(data)} bytes of text, more than the {_MOST_TEXT} that are read; save it "
             "as binary PLY or STL"
         )
-    before = b""
+    before: list[bytes] = []
     text = data.removeprefix(BOM_UTF8).replace(b"\r\n", b"\n").replace(b"\r", b"\n")
-    for number, line in enumerate(BytesIO(text), 1):
+    # A backslash joins lines; behind one that ends the file comes an empty line.
+    for number, line in enumerate(BytesIO(text + b"\n\n"), 1):
         if line.endswith(b"\\\n"):
-            before += line[:-2]
+            before.append(line[:-2])
             continue
-        words = (before + line).partition(b"#")[0].split()
-        before = b""
+        words = b"".join([*before, line]).partition(b"#")[0].split()
+        before.clear()
         if words:
             yield number, [words[0].lower(), *words[1:]]
 
@@ -240,7 +262,7 @@ def _refuse_scene(path: AnyPath, data: bytes) -> None:
             for part in scene["meshes"][node["mesh"]]["primitives"]
             if "POSITION" in part.get("attributes", {})
         )
-        nodes = len(scene.get("nodes", []))
+        nodes, work = len(scene.get("nodes", [])), _refuse_nodes(path, scene.get("nodes", []))
         needed = [n for n in scene.get("extensionsRequired", []) if not n.startswith(_KNOWN)]
         parts = [part for mesh in scene.get("meshes", []) for part in mesh["primitives"]]
         needed += ["TRIANGLE_FAN" for part in parts if part.get("mode") == 6]
@@ -264,11 +286,52 @@ def _refuse_scene(path: AnyPath, data: bytes) -> None:
             f"{path}: needs {needed[0][:60]!r}, which is not read; export it as plain triangles, "
             "uncompressed"
         )
+    if work > _MOST_NESTED:
+        raise InputError(
+            f"{path}: its {nodes} nodes hang too deep in each other to be read in seconds; export "
+            "the part alone, its transforms applied"
+        )
     if max(sum(values), placed) > _MOST_VALUES or nodes > _MOST_NODES:
         raise InputError(
             f"{path}: declares {max(sum(values), placed)} numbers in {nodes} nodes, more than "
             f"{_MOST_VALUES} and {_MOST_NODES}; export the part alone"
         )
+
+
+def _refuse_nodes(path: AnyPath, nodes: list[dict[str, Any]]) -> float:
+    """Refuse nodes that are no trees, or whose numbers no transform has; give what they cost.
+
+    Readers differ in what they make of them: a mesh would be lost, or placed anywhere. The cost is
+    that of trimesh's products of matrices, the sum of the cubes of the nodes' depths.
+    """
+    parents: dict[int, int] = {}
+    for number, node in enumerate(nodes):
+        for child in node.get("children", []):
+            if parents.setdefault(child, number) != number:
+                raise InputError(
+                    f"{path}: node {child} hangs under nodes {parents[child]} and {number}; of a "
+                    "tree each has one parent. Export it again."
+                )
+        for name in ("matrix", "translation", "rotation", "scale"):
+            numbers = [abs(float(value)) for value in node.get(name, [])]
+            wild = [value for value in numbers if not value < _FARTHEST]  # NaN too
+            if wild:
+                raise InputError(
+                    f"{path}: the {name} of node {number} holds {wild[0]:g}, which moves nothing "
+                    "to where a sensor sees it; export it again"
+                )
+    depths: dict[int, int] = {}
+    left = [(number, 1) for number in range(len(nodes)) if number not in parents]
+    while left:
+        number, depth = left.pop()
+        depths[number] = depth
+        left += [(child, depth + 1) for child in nodes[number].get("children", [])]
+    if len(depths) < len(nodes):
+        lost = next(number for number in range(len(nodes)) if number not in depths)
+        raise InputError(
+            f"{path}: node {lost} hangs under itself, in a circle of nodes; export it again"
+        )
+    return sum(float(depth) ** 3 for depth in depths.values())
 
 
 MESH_READERS: dict[str, Callable[[AnyPath], tuple[np.ndarray, np.ndarray | Ragged]]] = {
@@ -280,7 +343,11 @@ MESH_READERS: dict[str, Callable[[AnyPath], tuple[np.ndarray, np.ndarray | Ragge
 """Suffix to reader of points (n, 3; float64) in the file's unit, and faces (f, corners; int64)."""
 
 
-_MOST_CORNERS = 5_000  # of one polygon: clipping takes time by the square of them, here 3 s
+_MOST_CORNERS = 5_000  # of one polygon
+_MOST_CLIPPED = 2e8
+"""Of polygons that are not convex, the sum of corners times 1,000 and the corners that turn back:
+each is clipped in about so many steps, together some ten seconds."""
+_MOST_ROUNDS = 3  # about a polygon in search of ears; one that needs more crosses itself
 _FLAT = 1e-9  # of the square of a polygon's area: a corner that turns back by less is straight
 _OVERLAP = 1e-3  # of all area: polygons that cross themselves may lay so much of it twice
 
@@ -309,10 +376,22 @@ def cut_polygons(
         )
     found, owners = [np.empty((0, 3), np.int64)], [np.empty(0, np.int64)]
     overlap, area = np.zeros(len(sizes)), 0.0
-    for size in np.unique(sizes[sizes > 2]):
-        which = np.flatnonzero(sizes == size)
+    steps = 0.0
+    order = np.argsort(sizes, kind="stable")
+    for which in np.split(order, np.flatnonzero(np.diff(sizes[order])) + 1):
+        size = int(sizes[which[0]]) if len(which) else 0
+        if size < 3:
+            continue
         polygons = corners[starts[which, None] + np.arange(size)]
-        normals, local = _cut(vertices[polygons])
+        normals, is_back = _back_turns(vertices[polygons])
+        backs = is_back.sum(1)
+        steps += float((size * (1000.0 + backs[backs > 0])).sum())
+        if steps > _MOST_CLIPPED:
+            raise InputError(
+                f"{path}: its polygons that are not convex have too many corners to be cut in some "
+                f"seconds (one of {size} among them); export it as triangles"
+            )
+        local = _cut(vertices[polygons], normals, is_back)
         triangles = np.take_along_axis(polygons[:, None], local, 2)
         found.append(triangles.reshape(-1, 3))
         owners.append(which.repeat(size - 2))
@@ -333,14 +412,19 @@ def cut_polygons(
     return np.concatenate(found)[np.argsort(np.concatenate(owners), kind="stable")]
 
 
-def _cut(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Cut polygons (m, n, 3) of equally many corners; normals (m, 3), corners (m, n - 2, 3)."""
-    count = points.shape[1]
+def _back_turns(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Give the normals (m, 3) of polygons (m, n, 3), and which corners turn back (m, n)."""
     points = points - points[:, :1]
     after, before = np.roll(points, -1, 1), np.roll(points, 1, 1)
     normals = np.cross(points, after).sum(1)
     turns = np.einsum("mnc,mc->mn", np.cross(points - before, after - points), normals)
-    is_back = turns < -_FLAT * (normals**2).sum(-1, keepdims=True)
+    return normals, turns < -_FLAT * (normals**2).sum(-1, keepdims=True)
+
+
+def _cut(points: np.ndarray, normals: np.ndarray, is_back: np.ndarray) -> np.ndarray:
+    """Cut polygons (m, n, 3) of equally many corners; give their corners (m, n - 2, 3)."""
+    count = points.shape[1]
+    points = points - points[:, :1]
     steps = np.arange(count - 2)
     fan = np.stack([0 * steps, steps + 1, steps + 2], -1)
     local = np.repeat(fan[None], len(points), 0)
@@ -350,29 +434,57 @@ def _cut(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         basis = np.stack([across, np.cross(normals[k], across)], -1)
         flat = points[k] @ (basis / np.linalg.norm(basis, axis=0).clip(1e-300))
         local[k] = _clip_ears(flat, is_back[k])
-    return normals, local
+    return local
 
 
 def _clip_ears(points: np.ndarray, is_back: np.ndarray) -> list[list[int]]:
     """Cut off a corner whose triangle holds no other, again and again; points (n, 2), in order.
 
-    If a triangle holds any, then one of the corners that turn back.
+    If a triangle holds any, then one of the corners that turn back. A cut changes what its two
+    neighbours are, so that these alone are looked at again: three corners for each that is cut.
     """
-    left, ears, tried = list(range(len(points))), list[list[int]](), 0
+    count, ears, rounds = len(points), list[list[int]](), 0
+    before, after = [*range(-1, count - 1)], [*range(1, count), 0]
+    before[0] = count - 1
     least = _FLAT * float(np.ptp(points, axis=0).max()) ** 2
-    while len(left) > 3:
-        ear = points[left[:3]]
-        sides = np.roll(ear, -1, 0) - ear
-        turn = sides[0, 0] * sides[1, 1] - sides[0, 1] * sides[1, 0]
-        gaps = points[is_back] - ear[:, None]  # from each corner of the ear to each of the others
-        is_within = (sides[:, :1] * gaps[..., 1] >= sides[:, 1:] * gaps[..., 0]).all(0)
-        is_within &= gaps.any(-1).all(0)  # what is at the same place does no harm
-        is_ear = abs(turn) <= least or (turn > 0 and not is_within.any())
-        if is_ear or tried > len(left):  # none at all: the polygon crosses itself
-            # The corner before is skipped: a fan of needles is cut where it can be avoided.
-            ears.append(left[:3])
-            is_back[left[1]] = False
-            left, tried = [*left[2:], left[0]], 0
-        else:
-            left, tried = [*left[1:], left[0]], tried + 1
-    return [*ears, left]
+    is_left, is_waiting = [True] * count, [True] * count
+    waiting = deque([*range(1, count), 0])
+    is_cut, must_cut = False, False
+    while len(ears) < count - 3:
+        if not waiting:
+            # No ear is left: the polygon crosses itself, or touches itself. All are looked at once
+            # more, and if there is none then, any corner is cut.
+            waiting.extend(k for k in range(count) if is_left[k])
+            for k in waiting:
+                is_waiting[k] = True
+            must_cut, is_cut, rounds = not is_cut, False, rounds + 1
+        k = waiting.popleft()
+        is_waiting[k] = False
+        if not is_left[k]:
+            continue
+        ear = [before[k], k, after[k]]
+        if not (must_cut or rounds > _MOST_ROUNDS or _is_ear(points, ear, is_back, least)):
+            continue
+        ears.append(ear)
+        is_left[k], is_back[k] = False, False
+        is_cut, must_cut = True, False
+        after[ear[0]], before[ear[2]] = ear[2], ear[0]
+        # The corner before comes later: a fan of needles is cut where it can be avoided.
+        for beside in (ear[2], ear[0]):
+            if not is_waiting[beside]:
+                waiting.append(beside)
+                is_waiting[beside] = True
+    return [*ears, [k for k in range(count) if is_left[k]]]
+
+
+def _is_ear(points: np.ndarray, corners: list[int], is_back: np.ndarray, least: float) -> bool:
+    """Whether the triangle of three corners in a row lies within, and holds no other corner."""
+    ear = points[corners]
+    sides = np.roll(ear, -1, 0) - ear
+    turn = sides[0, 0] * sides[1, 1] - sides[0, 1] * sides[1, 0]
+    if abs(turn) <= least or turn < 0:
+        return bool(abs(turn) <= least)
+    gaps = points[is_back] - ear[:, None]  # from each corner of the ear to each of the others
+    is_within = (sides[:, :1] * gaps[..., 1] >= sides[:, 1:] * gaps[..., 0]).all(0)
+    is_within &= gaps.any(-1).all(0)  # what is at the same place does no harm
+    return not is_within.any()

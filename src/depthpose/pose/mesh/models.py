@@ -15,13 +15,13 @@ from torch import Tensor
 
 from depthpose.core.arrays import take_evenly
 from depthpose.core.errors import InputError
-from depthpose.core.files import AnyPath
 from depthpose.core.rigid import Rigid, rotation_by
 from depthpose.core.units import Unit, metres_of
 from depthpose.pose.config import MeshConfig
 from depthpose.pose.mesh.colors import read_colors
-from depthpose.pose.mesh.files import read_geometry, unit_of
+from depthpose.pose.mesh.files import AnyModel, read_geometry, unit_of
 from depthpose.pose.mesh.sampling import surface_places
+from depthpose.pose.mesh.shapes import is_shape, shape_name
 from depthpose.pose.types import Axis, ObjectModel, Symmetries
 
 BOP_STEP = 0.01
@@ -240,7 +240,7 @@ _LARGEST_M, _SMALLEST_M = 20.0, 0.002
 
 
 def read_model(
-    path: AnyPath,
+    path: AnyModel,
     unit: Unit | None = None,
     *,
     name: str | None = None,
@@ -252,9 +252,11 @@ def read_model(
 
     Args:
         path: mesh (PLY, STL, OBJ, GLB) or bare points (PLY, PCD, NPY, text), whose colours are
-            read where it has some.
-        unit: unit of the numbers in the file; None: a GLB, whose are metres.
-        name: what samples call the object; None: the file's name.
+            read where it has some; or a mesh or cloud of trimesh or Open3D.
+        unit: unit of the numbers in the file; None: a GLB, whose are metres, or a mesh that says
+            its own.
+        name: what samples call the object; None: the file's name, or that of a mesh
+            (``metadata["name"]`` of trimesh), or object_NUMBER.
         number: BOP's ``obj_id``.
         symmetries: as declared; None: none.
         config: how many keypoints.
@@ -263,6 +265,14 @@ def read_model(
         InputError: the file is missing, damaged or of another format, holds no extent or faces
             without area, has no unit, or is so large or small that the unit must be another.
     """
+    is_file = isinstance(path, str | Path)
+    if not is_file and not is_shape(path):
+        raise InputError(
+            f"a {type(path).__name__} is no model: give files, or meshes of trimesh or Open3D, one "
+            "by one"
+        )
+    if name is None:
+        name = Path(path).stem if is_file else shape_name(path, number)
     unit = unit_of(path, unit)
     scale = metres_of(unit)
     vertices, faces = read_geometry(path)
@@ -281,12 +291,12 @@ def read_model(
     model = make_model(
         vertices_m,
         torch.from_numpy(faces),
-        name=Path(path).stem if name is None else name,
+        name=name,
         number=number,
         symmetries=symmetries,
         config=config,
     )
-    return replace(model, colors=read_colors(path, scale, model))
+    return replace(model, colors=read_colors(path, scale, model)) if is_file else model
 
 
 def make_model(

@@ -1,0 +1,197 @@
+"""Where the disparities of a pair lie, and at which size and from which one on they are searched.
+
+A network looks through a fixed number of disparities, and gives wrong ones where the true ones lie
+beyond. So the pair is first matched in a copy so narrow that every disparity it can have is within
+reach. Where nothing is infinitely far away, the search begins at the least disparity that is found;
+where the usual number of disparities does not hold the largest one, the size is chosen so that the
+volume of the search is no larger than usual: twice the disparities at four fifths of the sides take
+the same time and memory.
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+from torch.nn import functional as F
+
+from depthpose.core.camera import Camera
+from depthpose.depth.disparity import changed_match
+from depthpose.depth.stereo.matcher import NetworkMatcher, Search
+from depthpose.depth.types import Match
+
+_TAIL = 0.001
+"""Share of the copy's pixels that may lie beyond either end: single pixels at edges are wrong."""
+_SURE = 0.5
+"""Confidence from which a near place counts: it is more probable than not. What is far is always
+less sure, by the few disparities that are like it, so every far place counts."""
+STEP_PX = 4
+"""Between disparities that have a score, of every network here: volumes are of a quarter's size."""
+_NAMED = 0.001
+"""Share of the image beyond the search from which it is named."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Reach:
+    """Where the disparities of a pair lie, in pixels of its images."""
+
+    low_px: float  #: the least, or infinity's where that may be there
+    high_px: float  #: the largest
+    step_px: float  #: how exactly they are known, which both ends include
+    coarse: Match  #: the match of the copy, at the size of the images
+
+
+@dataclass(frozen=True, kw_only=True)
+class Window:
+    """Disparities that are searched, in pixels of the images."""
+
+    search: Search  #: how they are searched
+    first_px: float  #: the least
+    last_px: float  #: the largest
+
+
+def _window(search: Search) -> Window:
+    first_px = search.first_px / search.scale
+    last_px = first_px + search.max_disparity_px / search.scale
+    return Window(search=search, first_px=first_px, last_px=last_px)
+
+
+def move_views(left: Tensor, right: Tensor, first_px: int) -> tuple[Tensor, Tensor]:
+    """Move the views of a pair so that a disparity of ``first_px`` becomes 0.
+
+    Where that is negative, both become wider by so many columns, so that nothing is cut off that
+    both show. New columns repeat the border.
+
+    Args:
+        left: ``(3, H, W)``.
+        right: the same size.
+        first_px: in whole pixels.
+    """
+    width, added = left.shape[2], max(-first_px, 0)
+    moved = F.pad(right[None], (added + first_px, added, 0, 0), mode="replicate")[0]
+    wider = F.pad(left[None], (added, 0, 0, 0), mode="replicate")[0]
+    return wider, moved[..., : width + added]
+
+
+def moved_back(match: Match, first_px: int) -> Match:
+    """Give the match of a pair as it was before :func:`move_views`."""
+    if first_px == 0:
+        return match
+    added = max(-first_px, 0)
+    found = changed_match(match, lambda values: values[:, added:])
+    found = replace(found, disparity_px=found.disparity_px + first_px)
+    if found.confidence is None:
+        return found
+    # The right view shows none of the first columns, even of what is farthest.
+    columns = torch.arange(found.confidence.shape[1], device=found.confidence.device)
+    return replace(found, confidence=found.confidence.where(columns >= first_px, 0.0))
+
+
+def measure_reach(
+    matcher: NetworkMatcher, left: Tensor, right: Tensor, infinity_px: float
+) -> Reach:
+    """Measure the disparities of a pair in a narrow copy of it.
+
+    Args:
+        matcher: a network that matches pairs of any size.
+        left: left image, ``(3, H, W)`` RGB in [0, 1].
+        right: right image, the same size.
+        infinity_px: disparity of what is infinitely far away: 0, or less where the principal point
+            of the right camera lies farther to the right.
+    """
+    trained, width = matcher.network_config, left.shape[2]
+    reach_px = matcher.whole_steps(trained.max_disparity_px * matcher.most_disparities)
+    scale = min(1.0, reach_px / (width + abs(infinity_px)))
+    step_px = STEP_PX / scale
+    first_px = STEP_PX * math.floor(infinity_px * scale / STEP_PX)
+    search = Search(scale=scale, first_px=first_px, max_disparity_px=reach_px)
+    (coarse,) = matcher.match_many([(left, right)], search=search)
+    # Every pixel of the copy, of the maps at the size of the images.
+    stride = max(1, round(1 / scale))
+    each = (slice(None, None, stride), slice(None, None, stride))
+    found_px = coarse.disparity_px[each]
+    # What the right view cannot show was not measured: it would lie to the left of its border.
+    is_near = found_px <= torch.arange(width, device=found_px.device)[::stride]
+    if coarse.confidence is not None:
+        is_near &= coarse.confidence[each] >= _SURE
+    far_px, near_px = found_px.flatten().sort().values, found_px[is_near].sort().values
+    tail = int(_TAIL * len(far_px))
+    low_px = float(far_px[tail]) - step_px
+    high_px = float(near_px[-1 - tail] if len(near_px) > tail else far_px[-1 - tail]) + step_px
+    return Reach(
+        low_px=max(low_px, infinity_px),
+        high_px=max(high_px, low_px + step_px),
+        step_px=step_px,
+        coarse=coarse,
+    )
+
+
+def choose_window(
+    matcher: NetworkMatcher, reach: Reach, size: Sequence[int], camera: Camera | None
+) -> Window:
+    """Choose what is searched, so that it holds the disparities that were measured.
+
+    There are as many as usual where fewer would do: what a network was trained for.
+
+    Args:
+        matcher: a network.
+        reach: what was measured.
+        size: rows and columns of the images.
+        camera: of the left image, where it is known.
+    """
+    scale, most = _usual_size(matcher, size, camera)
+    high_px = reach.high_px
+    if matcher.config.max_disparity_px is not None:
+        high_px = matcher.config.max_disparity_px
+    # The volume has scale^2 H W pixels and scale span disparities.
+    span_px = max(high_px - reach.low_px, reach.step_px)
+    if span_px * scale > most:
+        scale = (most * scale**2 / span_px) ** (1 / 3)
+    first_px = STEP_PX * math.floor(reach.low_px * scale / STEP_PX)
+    searched = max(most, matcher.whole_steps(high_px * scale - first_px))
+    return _window(Search(scale=scale, first_px=first_px, max_disparity_px=searched))
+
+
+def _usual_size(
+    matcher: NetworkMatcher, size: Sequence[int], camera: Camera | None
+) -> tuple[float, int]:
+    """Give the usual size of a match, in times the images', and its disparities.
+
+    Without a camera a fine match has as many pixels as with one.
+    """
+    trained = matcher.network_config
+    if camera is not None and trained.work_focal_px is not None:
+        scale = matcher.work_focal_px(camera) / float(camera.K[0, 0])
+        return scale, matcher.work_disparities(camera)
+    if matcher.config.speed == "quick" or trained.work_focal_px is None:
+        return 1.0, trained.max_disparity_px
+    share = math.sqrt(matcher.fine_pixels / (size[0] * size[1]))
+    most = matcher.whole_steps(trained.max_disparity_px * matcher.most_disparities)
+    return min(share, matcher.most_enlarged), most
+
+
+def doubt_outside(match: Match, reach: Reach, window: Window) -> tuple[Match, str]:
+    """Set the confidence to 0 where the true disparity may lie beyond what was searched; say it.
+
+    That is where the copy has a disparity beyond, and where the answer is the last that the search
+    has. Named is the share where the copy is sure.
+    """
+    if match.confidence is None:
+        return match, ""
+    coarse_px, sure = reach.coarse.disparity_px, reach.coarse.confidence
+    is_beyond = coarse_px > window.last_px + reach.step_px
+    is_beyond &= coarse_px <= torch.arange(coarse_px.shape[1], device=coarse_px.device)
+    is_last = match.disparity_px > window.last_px - STEP_PX / window.search.scale
+    doubted = replace(match, confidence=match.confidence.masked_fill(is_beyond | is_last, 0.0))
+    if sure is not None:
+        is_beyond &= sure >= _SURE
+    share = float(is_beyond.float().mean())
+    if share < _NAMED:
+        return doubted, ""
+    return doubted, (
+        f"{share:.1%} of the image have disparities beyond {window.last_px:.0f} px, the largest "
+        f"that was searched (up to {float(coarse_px[is_beyond].max()):.0f} px); their confidence "
+        "is 0. Give a larger --max-disparity (in Python MatcherConfig(max_disparity_px=...)), or "
+        "none, and it is measured"
+    )

@@ -1,0 +1,209 @@
+"""Where the disparities of a pair lie is measured, and they are searched there."""
+
+import dataclasses
+from functools import cache
+
+import pytest
+import torch
+from torch import Tensor
+
+from depthpose.core.camera import Camera, StereoRig
+from depthpose.core.camera.pinhole import intrinsics
+from depthpose.core.checkpoint import SHIPPED
+from depthpose.depth.config import MatcherConfig
+from depthpose.depth.estimator import FakestereoNet
+from depthpose.depth.stereo import (
+    LightMatcher,
+    Reach,
+    Search,
+    Window,
+    choose_window,
+    doubt_outside,
+    measure_reach,
+    move_views,
+    moved_back,
+)
+from depthpose.depth.stereo.light import correlation_volume, unit_groups
+from depthpose.depth.types import Match, StereoInput
+
+needs_weights = pytest.mark.skipif(
+    not (SHIPPED / "default.safetensors").is_file(), reason="no weights ship yet"
+)
+
+
+@cache
+def matcher(max_disparity_px: float | None = None) -> LightMatcher:
+    config = MatcherConfig(max_disparity_px=max_disparity_px)
+    found = FakestereoNet.load("default", config=config, use="pairs").matcher
+    assert isinstance(found, LightMatcher)
+    return found
+
+
+def planes(near_px: int, far_px: int, width: int = 320, height: int = 96) -> tuple[Tensor, ...]:
+    """A textured strip before a textured wall: left view, right view, true disparity."""
+    generator = torch.Generator().manual_seed(3)
+    # Coarse and fine, as surfaces are, so that it is seen in a small copy too.
+    texture = torch.zeros(2, 3, height, 2 * width)
+    for block in (2, 8, 24):
+        noise = torch.rand(2, 3, height // block + 1, 2 * width // block + 1, generator=generator)
+        larger = torch.nn.functional.interpolate(noise, scale_factor=float(block), mode="nearest")
+        texture += larger[..., :height, : 2 * width] / 3
+    wall, strip = texture
+    start = width // 2
+    is_near = (torch.arange(width) >= width // 2) & (torch.arange(width) < 3 * width // 4)
+    left = torch.where(is_near, strip[..., start : start + width], wall[..., start : start + width])
+    columns = torch.arange(width)
+    right = wall[..., start + far_px : start + far_px + width].clone()
+    shown = (columns + near_px >= width // 2) & (columns + near_px < 3 * width // 4)
+    right[..., shown] = strip[..., start + near_px + columns[shown]]
+    truth_px = torch.where(is_near, near_px, far_px).float().expand(height, width)
+    return left, right, truth_px
+
+
+def reach_of(low_px: float, high_px: float, size: tuple[int, int] = (96, 320)) -> Reach:
+    flat = Match(disparity_px=torch.full(size, high_px), confidence=torch.ones(size))
+    return Reach(low_px=low_px, high_px=high_px, step_px=4.0, coarse=flat)
+
+
+def rig(width: int = 320, height: int = 96, apart_px: float = 0.0) -> StereoRig:
+    K = intrinsics(558.0, 558.0, width / 2, height / 2)
+    return StereoRig(
+        width=width, height=height, K=K, baseline_m=0.1, cx_right_minus_left_px=apart_px
+    )
+
+
+@needs_weights
+@pytest.mark.parametrize(("near_px", "far_px"), [(30, 6), (140, 20), (150, 110)])
+def test_both_ends_of_a_pair_are_measured(near_px: int, far_px: int) -> None:
+    left, right, _ = planes(near_px, far_px)
+    reach = measure_reach(matcher(), left, right, 0.0)
+    assert reach.low_px <= far_px
+    if far_px < 50:  # else the right view shows nothing of a third of the left one
+        assert far_px <= reach.low_px + 3 * reach.step_px
+    assert reach.high_px - 3 * reach.step_px <= near_px <= reach.high_px
+
+
+@needs_weights
+@pytest.mark.parametrize(("near_px", "far_px"), [(40, 10), (260, 180), (200, 24)])
+def test_a_pair_is_matched_wherever_its_disparities_lie(near_px: int, far_px: int) -> None:
+    left, right, truth_px = planes(near_px, far_px, width=640)
+    net = FakestereoNet(matcher())
+    pair = StereoInput(name="planes", left=left, right=right, camera=None)
+    found = net.estimate_pair(pair, with_check=False)
+    is_seen = truth_px <= torch.arange(640)
+    is_seen[:, :320] &= torch.arange(320) >= far_px
+    # The wall is hidden beside the strip where the right view sees the strip.
+    hidden = (torch.arange(640) >= 320 - (near_px - far_px)) & (torch.arange(640) < 320)
+    error_px = (found.disparity_px - truth_px).abs()[is_seen & ~hidden]
+    assert float(error_px.median()) < 1
+    assert float((error_px > 3).float().mean()) < 0.1
+    assert not found.warning
+
+
+@needs_weights
+def test_streets_are_searched_as_before() -> None:
+    """From infinity on, at the camera's usual size, through the usual disparities."""
+    camera = rig(1242, 375)
+    window = choose_window(matcher(), reach_of(0.0, 90.0), (375, 1242), camera)
+    assert window.search.first_px == 0
+    assert window.search.max_disparity_px == matcher().work_disparities(camera)
+    assert window.search.scale * 558 == pytest.approx(matcher().work_focal_px(camera))
+
+
+@needs_weights
+def test_a_search_takes_no_more_memory_than_usual() -> None:
+    camera = rig(1280, 720)
+    usual = choose_window(matcher(), reach_of(0.0, 100.0), (720, 1280), camera).search
+    for high_px in (200.0, 300.0, 450.0, 640.0):
+        window = choose_window(matcher(), reach_of(0.0, high_px), (720, 1280), camera)
+        search = window.search
+        assert window.first_px <= 0
+        assert window.last_px >= high_px
+        voxels = search.scale**2 * search.max_disparity_px
+        step = 1 + 36 / search.max_disparity_px  # disparities are searched in whole steps
+        assert voxels <= step * usual.scale**2 * usual.max_disparity_px * 1.001
+    near = choose_window(matcher(), reach_of(420.0, 540.0), (720, 1280), camera).search
+    assert near.scale == usual.scale, "a table at arm's length needs no smaller size"
+    assert near.first_px > 0
+
+
+@needs_weights
+def test_what_lies_beyond_the_search_is_named_and_has_no_confidence() -> None:
+    left, right, truth_px = planes(250, 16, width=640)
+    net = FakestereoNet(matcher(60.0))
+    pair = StereoInput(name="planes", left=left, right=right, camera=rig(640))
+    found = net.estimate_pair(pair, with_check=False)
+    # At the camera's usual size a search holds more than what was asked for, but not 250 px.
+    assert "disparities beyond" in found.warning
+    assert "--max-disparity" in found.warning
+    assert found.confidence is not None
+    is_near = truth_px > 200
+    assert float(found.confidence[is_near].median()) == 0
+    assert float((found.confidence[is_near] > 0.1).float().mean()) < 0.1
+
+
+def test_doubt_leaves_what_was_searched() -> None:
+    confidence = torch.full((2, 4), 0.9)
+    match = Match(disparity_px=torch.full((2, 4), 50.0), confidence=confidence)
+    coarse_px = torch.tensor([[0.0, 1, 2, 3], [0, 1, 2, 3]]) + 48
+    far = dataclasses.replace(match, disparity_px=coarse_px, confidence=confidence)
+    reach = Reach(low_px=0.0, high_px=60.0, step_px=4.0, coarse=far)
+    search = Search(scale=1.0, first_px=0, max_disparity_px=128)
+    window = Window(search=search, first_px=0.0, last_px=128.0)
+    kept, said = doubt_outside(match, reach, window)
+    assert said == ""
+    assert kept.confidence is not None
+    assert torch.equal(kept.confidence, confidence)
+    at_end = dataclasses.replace(match, disparity_px=torch.full((2, 4), 126.0))
+    doubted, _ = doubt_outside(at_end, reach, window)
+    assert doubted.confidence is not None
+    assert not bool(doubted.confidence.any()), "the last step may stand for all that is beyond"
+
+
+@pytest.mark.parametrize("first", [0, 3, -2])
+def test_a_volume_may_begin_anywhere(first: int) -> None:
+    generator = torch.Generator().manual_seed(1)
+    left, right = torch.randn(2, 1, 6, 3, 9, generator=generator).unbind()
+    groups = unit_groups(left, 2), unit_groups(right, 2)
+    found = correlation_volume(*groups, 4, first)
+    for k in range(4):
+        for x in range(9):
+            at = x - (first + k)
+            expected = torch.zeros(1, 2, 3)
+            if 0 <= at < 9:
+                expected = (groups[0][..., x] * groups[1][..., at]).sum(2)
+            torch.testing.assert_close(found[:, :, k, :, x], expected)
+
+
+@pytest.mark.parametrize("first_px", [-7, 0, 5])
+def test_views_are_moved_and_their_match_moved_back(first_px: int) -> None:
+    left = torch.rand(3, 4, 30)
+    right = torch.rand(3, 4, 30)
+    one, other = move_views(left, right, first_px)
+    assert one.shape == other.shape
+    added = max(-first_px, 0)
+    for x in range(10, 25):
+        d = 8
+        # Disparity d of the given pair is d - first of the moved one.
+        torch.testing.assert_close(one[..., x + added], left[..., x])
+        torch.testing.assert_close(other[..., x + added - (d - first_px)], right[..., x - d])
+    flat = torch.full(one.shape[1:], 8.0 - first_px)
+    back = moved_back(Match(disparity_px=flat, confidence=torch.ones_like(flat)), first_px)
+    assert torch.equal(back.disparity_px, torch.full((4, 30), 8.0))
+    assert back.confidence is not None
+    assert int((back.confidence == 0).sum()) == 4 * max(first_px, 0)
+
+
+@needs_weights
+def test_principal_points_apart_move_the_search() -> None:
+    """Infinity of such a rig has a negative disparity."""
+    left, right, truth_px = planes(20, -25, width=320)
+    net = FakestereoNet(matcher())
+    camera: Camera = rig(320, apart_px=30.0)
+    pair = StereoInput(name="apart", left=left, right=right, camera=camera)
+    found = net.estimate_pair(pair, with_check=False)
+    is_wall = truth_px < 0
+    is_wall[:, 110:160] = False
+    is_wall[:, 290:] = False
+    error_px = (found.disparity_px - truth_px).abs()[is_wall]
+    assert float(error_px.median()) < 1
