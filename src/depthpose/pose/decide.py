@@ -133,12 +133,12 @@ def share_among_copies(hypotheses: Sequence[Hypothesis]) -> Float64[Tensor, " n"
     its evidence fits a right pose.
     """
     area = _common_area(hypotheses)
-    weights = []
+    weights: list[float] = []
     for hypothesis in hypotheses:
-        evidence = hypothesis.evidence
-        fits_right = RIGHT_CONTRADICTED.log_likelihood(evidence.contradicted, area)
-        fits_right += RIGHT_UNOBSERVED.log_likelihood(evidence.unobserved, area)
-        weights.append(fits_right + _log_fit(evidence.rms) + _log_beside_depth(hypothesis))
+        fits_right = _log_rates(hypothesis.evidence, area, RIGHT_CONTRADICTED, RIGHT_UNOBSERVED)
+        weights.append(
+            fits_right + _log_fit(hypothesis.evidence.rms) + _log_beside_depth(hypothesis)
+        )
     return torch.tensor(weights, dtype=torch.float64).softmax(0)
 
 
@@ -161,13 +161,19 @@ def log_odds_right(evidence: Evidence, area: float | None = None) -> float:
         area: visible of the model, where several poses are compared; None: that of the evidence.
     """
     area = max(LEAST_AREA, evidence.visible if area is None else area)
-    # Only what was observed can contradict a pose.
-    observed = max(LEAST_AREA, area - evidence.unobserved)
-    log_odds = RIGHT_CONTRADICTED.log_likelihood(evidence.contradicted, observed)
-    log_odds -= WRONG_CONTRADICTED.log_likelihood(evidence.contradicted, observed)
-    log_odds += RIGHT_UNOBSERVED.log_likelihood(evidence.unobserved, area)
-    log_odds -= WRONG_UNOBSERVED.log_likelihood(evidence.unobserved, area)
+    log_odds = _log_rates(evidence, area, RIGHT_CONTRADICTED, RIGHT_UNOBSERVED)
+    log_odds -= _log_rates(evidence, area, WRONG_CONTRADICTED, WRONG_UNOBSERVED)
     return log_odds + _log_fit(evidence.rms) - _log_fit(WRONG_RMS)
+
+
+def _log_rates(evidence: Evidence, area: float, contradicted: Rate, unobserved: Rate) -> float:
+    """Log likelihood of what contradicts a pose and of what was not observed of it."""
+    # Only what was observed can contradict, and of what does only the rest can be unobserved.
+    observed = max(LEAST_AREA, area - evidence.unobserved)
+    rest = max(LEAST_AREA, area - evidence.seen_through - evidence.bulging)
+    return contradicted.log_likelihood(evidence.contradicted, observed) + (
+        unobserved.log_likelihood(evidence.unobserved, rest)
+    )
 
 
 def _log_fit(rms: float) -> float:

@@ -360,15 +360,15 @@ class PoseEstimator:
             found = self.find_in(given, [object], is_sure=True)
             return found[0] if found else nothing_found(given, object, time.perf_counter() - began)
 
-        known = self._known(object)
-        followed = TrackedObject(
-            model=known.model,
-            surface=known.surface,
+        prepared = self._known(object)
+        target = TrackedObject(
+            model=prepared.model,
+            surface=prepared.surface,
             refusal=self.refusal,
-            icp=self.config.icp,
+            config=self.config,
             look=look,
         )
-        return each_in_own_arithmetic(track(frames, followed, first))
+        return each_in_own_arithmetic(track(frames, target, first))
 
     def _known(self, name: str | None) -> PreparedObject:
         """Give an object by its name, with its surface; None where one alone is known."""

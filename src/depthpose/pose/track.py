@@ -3,6 +3,7 @@
 A frame costs ICP alone as long as what was seen agrees with the pose that comes out.
 """
 
+import math
 import time
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, replace
@@ -14,22 +15,37 @@ from torch import Tensor
 from depthpose.core.arrays import take_evenly
 from depthpose.core.rigid import Rigid
 from depthpose.pose.cloud import Refusal, cloud_from_depth
-from depthpose.pose.config import IcpConfig, RefusalConfig
+from depthpose.pose.config import EstimateConfig, RefusalConfig
+from depthpose.pose.decide import (
+    PRIOR_MASKED,
+    contradiction,
+    log_odds_right,
+    probability_right,
+    with_status,
+)
+from depthpose.pose.evidence import compare, observe
 from depthpose.pose.frame import is_on_plane, largest_plane
 from depthpose.pose.icp import refine_best
 from depthpose.pose.observability import free_motions, observability, without_motions
-from depthpose.pose.surface import NEAR, Surface, compare_depths
-from depthpose.pose.types import AnyInput, CloudInput, ObjectModel, PoseEstimate, ViewInput
+from depthpose.pose.surface import NEAR, Surface
+from depthpose.pose.types import (
+    Alternative,
+    AnyInput,
+    CloudInput,
+    ObjectModel,
+    PoseEstimate,
+    ViewInput,
+)
 
 MARGIN = 0.15
 """Of the diameter: points so far from the surface at the last or the predicted pose may be the
 object's; between two frames it moves by less."""
 _MOST_POINTS = 10_000  # of what a camera saw about the object, evenly taken
 _LEAST_POINTS = 60
-_THROUGH = 0.1  # where the camera saw through more of the posed surface, the object is not there
-_SEEN = 0.35  # where less of the posed surface was seen, it may be anywhere
-_SEEN_BESIDE, _REST_SEEN = 0.2, 0.5
-"""Of an object that is followed and occluded less is enough, if so much of the rest was seen."""
+_NEW_PER_FRAME = 0.2
+"""Of the evidence of a frame so much is new: the sensor and the object err alike in the next."""
+_MOST_LOG_ODDS = 9.0  # of a track: a few contradicting frames must be able to end it
+_LEAST_CERTAINTY = 1e-4
 _SUPPORTS = 2  # planes beside the object that are looked for: a table and a wall
 _BESIDE = 1000  # points beside the object that show them
 _ON = 3.0  # standard deviations of a plane's points: nearer ones are of it
@@ -69,143 +85,174 @@ class TrackedObject:
     model: ObjectModel  #: the object
     surface: Surface  #: of the model
     refusal: RefusalConfig  #: when a pose is refused
-    icp: IcpConfig  #: of the first steps
+    config: EstimateConfig  #: settings of the estimates
     look: Callable[[AnyInput], PoseEstimate]  #: estimates the object in a frame not yet known
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class _Last:
-    """The last pose, how it moved from the one before, and the estimate that all began with."""
+class _Track:
+    """What is known of an object that is followed.
+
+    Attributes:
+        pose: in the last frame.
+        moved: how it moved from the frame before; None: not known.
+        log_odds: of the pose being right, up to near-symmetries, by all frames.
+        origin: the estimate that the track began with; None: a pose that was given.
+    """
 
     pose: Rigid
     moved: Rigid | None
+    log_odds: float
     origin: PoseEstimate | None
 
 
 def track(
-    frames: Iterable[AnyInput | PoseEstimate], known: TrackedObject, first: Rigid | None = None
+    frames: Iterable[AnyInput | PoseEstimate], target: TrackedObject, first: Rigid | None = None
 ) -> Iterator[PoseEstimate]:
     """Estimate one object in frame after frame, each from the pose of the frame before.
 
     In place of a frame that cannot be read there is an estimate that says so: it is given as it is,
     and the object is looked for in the next where it was before.
     """
-    last = None if first is None else _Last(pose=first.double(), moved=None, origin=None)
+    current = None
+    if first is not None:
+        current = _Track(
+            pose=first.double(), moved=None, log_odds=math.log(PRIOR_MASKED), origin=None
+        )
     for given in frames:
         if isinstance(given, PoseEstimate):
             yield given
             continue
-        estimate = _next(given, last, known)
-        if estimate.camera_from_model is None:
-            # In a cloud of a whole scene it can be looked for only where it was.
-            is_scene = isinstance(given, CloudInput) and given.view is None
-            last = replace(last, moved=None) if is_scene and last is not None else None
-        else:
-            pose = estimate.camera_from_model.double()
-            if estimate.tracking == "found" or last is None:
-                last = _Last(pose=pose, moved=None, origin=estimate)
-            else:  # the turn about the object's origin, and its shift
-                moved = Rigid(pose.R @ last.pose.R.mT, pose.t_m - last.pose.t_m)
-                last = replace(last, pose=pose, moved=moved)
+        estimate, following = _next(given, current, target)
+        # In a cloud of a whole scene an object that is lost can be looked for only where it was.
+        is_scene = isinstance(given, CloudInput) and given.view is None
+        if following is None and is_scene and current is not None:
+            following = replace(current, moved=None)
+        current = following
         yield estimate
 
 
-def _next(given: AnyInput, last: _Last | None, known: TrackedObject) -> PoseEstimate:
+def _next(
+    given: AnyInput, current: _Track | None, target: TrackedObject
+) -> tuple[PoseEstimate, _Track | None]:
     """Follow the object into a frame, or look for it there."""
-    followed_s = 0.0
-    if last is not None:
+    spent_s = 0.0
+    if current is not None:
         began = time.perf_counter()
-        followed = _follow(given, last, known)
-        followed_s = time.perf_counter() - began
-        if isinstance(followed, PoseEstimate):
-            return replace(followed, name=given.name, seconds={"icp": followed_s})
-    found = known.look(given)
-    spent = {**found.seconds, "icp": found.seconds.get("icp", 0.0) + followed_s}
-    doubt, pose = None, found.camera_from_model
-    if pose is not None:  # compared with the frame, as one that was followed is
-        scene_m = scene_about(given, Rigid.stack([pose.double()]), known.surface)
-        doubt = _contradiction(compare_depths(scene_m, pose.double(), known.surface))
-    if doubt is not None:
-        return PoseEstimate(
-            name=given.name, object=found.object, status=doubt.status, reason=doubt.reason,
-            seconds=spent, tracking="lost",
-        )  # fmt: skip
+        followed = _follow(given, current, target)
+        spent_s = time.perf_counter() - began
+        if not isinstance(followed, Refusal):
+            estimate, following = followed
+            return replace(estimate, name=given.name, seconds={"icp": spent_s}), following
+    found = target.look(given)
+    seconds = {**found.seconds, "icp": found.seconds.get("icp", 0.0) + spent_s}
+    pose = found.camera_from_model
     tracking = "lost" if pose is None else "found"
-    return replace(found, name=given.name, seconds=spent, tracking=tracking)
+    estimate = replace(found, name=given.name, seconds=seconds, tracking=tracking)
+    if pose is None:
+        return estimate, None
+    certainty = min(max(found.certainty or 0.0, _LEAST_CERTAINTY), 1 - _LEAST_CERTAINTY)
+    log_odds = math.log(certainty / (1 - certainty))
+    return estimate, _Track(pose=pose.double(), moved=None, log_odds=log_odds, origin=found)
 
 
-def _contradiction(
-    shares: tuple[float, float, float], *, is_followed: bool = False
-) -> Refusal | None:
-    """Say why a posed surface seen, seen through and occluded to these shares is not there."""
-    agrees, through, before = shares
-    least = min(_SEEN, max(_SEEN_BESIDE, _REST_SEEN * (1 - before))) if is_followed else _SEEN
-    if through > _THROUGH:
-        return Refusal(
-            status="doubtful", reason=f"the camera saw through {through:.0%} of the posed surface"
-        )
-    if agrees >= least:
-        return None
-    return Refusal(
-        status="doubtful",
-        reason=f"{agrees:.0%} of the posed surface was seen, {before:.0%} is occluded, and "
-        f"{least:.0%} must be seen",
-    )
-
-
-def _follow(given: AnyInput, last: _Last, known: TrackedObject) -> PoseEstimate | Refusal:
-    """Refine the last pose and the predicted one; take the better if the scene agrees with it."""
-    surface, starts = known.surface, [last.pose]
-    if last.moved is not None:  # the pose that goes on as it moved last
-        moved = Rigid(last.moved.R @ last.pose.R, last.pose.t_m + last.moved.t_m)
-        starts.insert(0, moved)
-    starts = Rigid.stack(starts)
-    scene_m = scene_about(given, starts, surface)
-    near = _is_near(scene_m, starts, surface, MARGIN)
-    is_support = _is_support(scene_m, near, last.pose.apply(surface.points_m))
+def _follow(
+    given: AnyInput, current: _Track, target: TrackedObject
+) -> tuple[PoseEstimate, _Track] | Refusal:
+    """Refine the last pose and the predicted one; weigh the better by the evidence of the frame."""
+    surface = target.surface
+    starts = [current.pose]
+    if current.moved is not None:  # the pose that goes on as it moved last
+        R = current.moved.R @ current.pose.R
+        starts.insert(0, Rigid(R, current.pose.t_m + current.moved.t_m))
+    poses = Rigid.stack(starts)
+    scene_m = scene_about(given, poses, surface)
+    near = _is_near(scene_m, poses, surface, MARGIN)
+    is_support = _is_support(scene_m, near, current.pose.apply(surface.points_m))
     cloud_m = scene_m[near & ~is_support]
     if len(cloud_m) < _LEAST_POINTS:
         return Refusal(
             status="too few points",
             reason=f"{len(cloud_m)} points lie where the object was, below {_LEAST_POINTS}",
         )
-    refined = refine_best(cloud_m, starts, surface, replace(known.icp, starts=1)).refined
+    icp = replace(target.config.icp, starts=1)
+    refined = refine_best(cloud_m, poses, surface, icp).refined
     pose = refined.camera_from_model.double()
-    shares = compare_depths(scene_m, pose, surface)
-    if (contradiction := _contradiction(shares, is_followed=True)) is not None:
-        return contradiction
-    own_m = scene_m[_is_near(scene_m, Rigid.stack([pose]), surface, NEAR) & ~is_support]
-    free = free_motions(known.model.symmetries.continuous, pose)
-    observable, _ = observability(own_m, pose, surface, free)
-    if observable < known.refusal.min_observability:
+    object_m = scene_m[_is_near(scene_m, pose[None], surface, NEAR) & ~is_support]
+    if len(object_m) < _LEAST_POINTS:
+        return Refusal(
+            status="too few points",
+            reason=f"{len(object_m)} points lie on the object, below {_LEAST_POINTS}",
+        )
+
+    # What the frame says: by itself, and together with the frames before.
+    view = given if isinstance(given, ViewInput) else given.view
+    observation = observe(
+        object_m,
+        view,
+        surface.diameter_m,
+        target.config.object_deviation_m,
+        is_masked=False,
+    )
+    evidence = compare(observation, pose, surface)
+    probability = probability_right(evidence, PRIOR_MASKED)
+    if probability < target.refusal.min_probability:
+        return Refusal(status="doubtful", reason=contradiction(evidence, probability))
+    log_odds = current.log_odds + _NEW_PER_FRAME * log_odds_right(evidence)
+    log_odds = min(max(log_odds, -_MOST_LOG_ODDS), _MOST_LOG_ODDS)
+    certainty = 1 / (1 + math.exp(-log_odds))
+    if certainty < target.refusal.min_probability:
+        return Refusal(status="doubtful", reason=contradiction(evidence, certainty))
+
+    free = free_motions(target.model.symmetries.continuous, pose)
+    observable, _ = observability(object_m, pose, surface, free)
+    if observable < target.refusal.min_observability:
         return Refusal(
             status="not observable",
-            reason="the seen part of the object does not fix its pose (observability "
+            reason="the visible part of the object does not determine its pose (observability "
             f"{observable:.1%})",
         )
-    covariance = refined.covariance
-    if len(free):
-        covariance = without_motions(covariance, free)
-    answer = PoseEstimate(
+    estimate = PoseEstimate(
         name="",
-        object=known.model.name,
+        object=target.model.name,
         status="ok",
         camera_from_model=refined.camera_from_model.float(),
-        covariance=covariance.float(),
+        covariance=(
+            without_motions(refined.covariance, free) if len(free) else refined.covariance
+        ).float(),
         free_motions=free.float(),
         residual_m=float(refined.residual_m),
+        evidence=evidence,
+        certainty=certainty,
+        copy_certainty=certainty,
         tracking="tracked",
     )
-    if (origin := last.origin) is None:
-        return answer
+    estimate = _with_copies(estimate, pose, current.origin)
+    estimate = with_status(estimate, target.config.min_certainty)
+    turned = pose.R @ current.pose.R.mT  # about the object's origin
+    moved = Rigid(turned, pose.t_m - current.pose.t_m)
+    following = replace(current, pose=pose, moved=moved, log_odds=log_odds)
+    return estimate, following
+
+
+def _with_copies(estimate: PoseEstimate, pose: Rigid, origin: PoseEstimate | None) -> PoseEstimate:
+    """Carry the near-symmetric copies that the track began with along with its pose."""
+    if origin is None or not origin.certainty or origin.copy_certainty is None:
+        return estimate
     assert origin.camera_from_model is not None
-    back = origin.camera_from_model.double().inverse()
-    carried = tuple(
-        replace(a, camera_from_model=(pose @ (back @ a.camera_from_model.double())).float())
-        for a in origin.alternatives
+    assert estimate.certainty is not None
+    # Which of the copies it is does not change while it is followed.
+    scale = estimate.certainty / origin.certainty
+    model_from_origin = origin.camera_from_model.double().inverse()
+    copies: list[Alternative] = []
+    for copy in origin.alternatives:
+        if copy.is_copy:
+            moved = pose @ (model_from_origin @ copy.camera_from_model.double())
+            probability = scale * copy.probability
+            copies.append(replace(copy, camera_from_model=moved.float(), probability=probability))
+    return replace(
+        estimate, copy_certainty=scale * origin.copy_certainty, alternatives=tuple(copies)
     )
-    return replace(answer, status=origin.status, reason=origin.reason,
-                   certainty=origin.certainty, alternatives=carried)  # fmt: skip
 
 
 def _is_support(
