@@ -101,7 +101,7 @@ def is_fair(case: Case, best: PoseEstimate, errors: Row) -> bool:
         return False
     if case.cad == TWINS and TWINS[1] not in (best.object, best.identity and best.identity.other):
         return False
-    return not best.is_posed or errors["right"] or (errors["named"] and not best.is_ok)
+    return not best.is_posed or errors["named"]
 
 
 def case_errors(estimate: PoseEstimate, truth: Rigid, model: ObjectModel) -> Row:

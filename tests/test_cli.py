@@ -1,6 +1,7 @@
 import errno
 import json
 import os
+import re
 import subprocess
 import sys
 from importlib.metadata import version
@@ -109,6 +110,21 @@ def test_help_has_no_line_breaks_of_the_code(
     between = text.partition("height of the camera")[2].partition("--camera-tilt NUMBER")[0]
     lines = [line.strip("│ ") for line in between.splitlines()[1:-1]]
     assert all(len(line) > 60 for line in lines[:-1]), lines  # filled, but for the last
+
+
+def test_help_of_poses_begins_with_what_matters_and_ends_with_the_cluster(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    assert main(["pose", "predict", "--help"]) == 0
+    text = capsys.readouterr().out
+    shown = re.findall(r"^[│ ] (?:-h, )?--([a-z][a-z-]*)", text, re.MULTILINE)
+    assert shown[:9] == [
+        "help", "out", "cad", "cad-unit", "depth", "camera", "mask", "box", "cloud",
+    ]  # fmt: skip
+    of_networks, of_ray = shown.index("weights"), shown.index("engine")
+    assert of_networks > shown.index("min-certainty") > shown.index("bop")
+    assert shown[of_ray:] == ["engine", "address", "workers", "worker-cpus", "worker-gpus", "block"]
+    assert {"voting", "hypotheses", "batch", "device"} < set(shown[of_networks:of_ray])
 
 
 @pytest.mark.parametrize(

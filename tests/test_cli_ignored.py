@@ -21,7 +21,8 @@ IGNORED = [
     ("pose predict", "--voting least-squares --hypotheses 64", "--hypotheses"),
     ("pose predict", "--hypotheses=64 --voting=least-squares", "--hypotheses"),
     ("pose predict", "--depth d.png --camera c.json --batch 4", "--batch"),
-    ("pose predict", "--cad p.stl --cloud c.ply", "--cad"),
+    ("pose predict", "--cad p.stl --cloud c.ply --method network", "--cad"),
+    ("pose predict", "--cad p.stl --cloud c.ply --batch 4", "--batch"),
     ("pose predict", "--bop b --masks truth --mask m", "--mask"),
     ("pose predict", "--bop b --engine ray", "--engine"),
     ("pose predict", "--depth d --mask m --camera c --masks truth", "--masks"),
@@ -42,6 +43,7 @@ IGNORED = [
     ("weights complete", "w --models . --unit m", "--unit"),
 ]
 USED = [
+    ("pose predict", "--cad p.stl --cloud c.ply"),
     ("pose predict", "--voting ransac --hypotheses 64"),
     ("pose predict", "--depth d.png --mask m.png --camera c.json --batch 4"),
     ("pose evaluate", "--bop b --weights register parts --voting ransac --no-icp"),

@@ -126,7 +126,7 @@ def test_a_cad_file_is_followed_through_frames(
     for k in range(3):
         moved = scan + torch.tensor([2.0 * k, 0.0, 0.0])
         write_cloud(tmp_path / f"frames/{k}.ply", Cloud(points=moved))
-    words = ["--method", "register", "--cad", str(cad), "--unit", "mm"]
+    words = ["--cad", str(cad), "--unit", "mm"]  # a CAD file is registered
     frames = ["--cloud", str(tmp_path / "frames"), "--out", str(tmp_path / "out")]
     assert main(["pose", "track", *words, *frames]) == 0
     assert "2 tracked, 1 found, 0 lost" in capsys.readouterr().out
@@ -141,7 +141,9 @@ def test_a_cad_file_is_followed_through_frames(
     [
         ("--method register --cloud scan.ply", "give --cad part.stl --unit mm, or --bop"),
         ("--method register --cad connector.stl --cloud scan.ply", "give --unit mm"),
-        ("--cad connector.stl --unit mm --cloud scan.ply", "add --method register"),
+        ("--cad connector.stl --unit mm --cloud scan.ply --method network",
+         "weights know their own objects; leave --method network out"),
+        ("--cad connector.stl --unit mm --cloud scan.ply --weights parts", "without a network"),
         ("--method register --cad connector.stl --bop .", "Leave --cad out"),
         ("--cad-unit mm --cloud scan.ply", "no CAD file is given. Leave --cad-unit out"),
         ("--method register --cad scan.txt --unit mm --cloud scan.ply", "triangles, such as STL"),

@@ -325,6 +325,7 @@ MISTAKES: dict[str, tuple[Work, Work, str]] = {
 }
 
 
+@pytest.mark.filterwarnings("ignore:a camera_info of ROS. it is the right one alone")
 @pytest.mark.parametrize("name", MISTAKES)
 def test_a_planted_mistake_is_named_and_the_right_input_is_not(tmp_path: Path, name: str) -> None:
     wrong, right, text = MISTAKES[name]

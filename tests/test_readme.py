@@ -112,3 +112,26 @@ def test_nothing_names_a_release_that_there_is_not() -> None:
     for path in [ROOT / "README.md", *ROOT.glob("docs/**/*.md"), *ROOT.glob("src/**/*.py")]:
         if path.name != "fresh.md":  # what was typed there installed a wheel
             assert not re.search(r"pip install [^\n`]*depthpose\[", path.read_text()), path
+
+
+def extras_of(script: Path) -> set[str]:
+    """Extras that a bench needs for other systems, by its text and that of what it imports."""
+    text = script.read_text()
+    needed = {"open3d"} & set(re.findall(r'import_extra\("(\w+)"', text))
+    needed |= {"opencv"} if re.search(r"import cv2|\bSGBM(Matcher|Config)\b", text) else set()
+    for name in re.findall(r"^ *from (\w+) import", text, re.MULTILINE):
+        if (other := script.with_name(f"{name}.py")).is_file():
+            needed |= extras_of(other)
+    return needed
+
+
+def test_results_say_which_extra_each_command_needs() -> None:
+    text = (ROOT / "docs/results.md").read_text()
+    head, _, rest = text.partition("## One image")
+    rows = re.findall(r"^\| `(\w+)` \| (.*) \|$", head, re.MULTILINE)
+    said = {extra: set(re.findall(r"bench/(\w+)\.py", row)) for extra, row in rows}
+    needed: dict[str, set[str]] = {"open3d": set(), "opencv": set()}
+    for script in set(re.findall(r"bench/(\w+)\.py", rest)):
+        for extra in extras_of(ROOT / f"bench/{script}.py"):
+            needed[extra].add(script)
+    assert said == needed

@@ -15,7 +15,7 @@ from depthpose.core.camera import (
     read_rig,
     write_camera,
 )
-from depthpose.core.errors import InputError
+from depthpose.core.errors import InputError, Notice
 
 KITTI: dict[str, Any] = {
     "width": 1242,
@@ -51,6 +51,7 @@ def test_a_camera_without_baseline_is_no_rig(tmp_path: Path) -> None:
         read_rig(path)
 
 
+@pytest.mark.filterwarnings("ignore:.*The file names that size itself")
 @given(
     lengths=st.tuples(LENGTHS, st.floats(0.6, 1.7), st.floats(0, 1241)),
     baseline_m=st.none() | st.floats(0.01, 4.9),
@@ -166,3 +167,11 @@ def test_an_image_of_another_size_is_refused_with_both_sizes(tmp_path: Path) -> 
     said = r"left\.png is 1226x340 .*; the aspect differs too: follow a crop with crop_camera"
     with pytest.raises(InputError, match=said):
         check_image_matches_camera(camera, 1226, 340, "left.png")
+
+
+def test_a_matrix_of_another_size_than_the_file_names_is_told_of(tmp_path: Path) -> None:
+    path = tmp_path / "c.json"
+    twice = {"width": 320, "height": 240, "K": [[500, 0, 310], [0, 500, 232], [0, 0, 1]]}
+    path.write_text(json.dumps(twice))
+    with pytest.warns(Notice, match="K looks like that of about 620x465.*names that size itself"):
+        read_camera(path)

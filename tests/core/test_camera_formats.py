@@ -145,7 +145,7 @@ def pinhole(camera: Camera) -> tuple[float, ...]:
     return tuple(float(camera.K[i, j]) for i, j in ((0, 0), (1, 1), (0, 2), (1, 2)))
 
 
-RIGHT_ALONE = pytest.mark.filterwarnings("ignore:the right camera_info alone")
+RIGHT_ALONE = pytest.mark.filterwarnings("ignore:a camera_info of ROS. it is the right one alone")
 
 
 @RIGHT_ALONE

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from PIL import Image, TiffImagePlugin
 
-from depthpose.core.errors import InputError
+from depthpose.core.errors import InputError, Notice
 from depthpose.core.files import read_exif_focal
 
 Rational = TiffImagePlugin.IFDRational
@@ -58,3 +58,11 @@ def test_a_picture_of_pillow_is_asked_too_and_what_is_no_picture_is_refused(tmp_
     (tmp_path / "b.jpg").write_text("no picture")
     with pytest.raises(InputError, match=r"b\.jpg"):
         read_exif_focal(tmp_path / "b.jpg")
+
+
+def test_exif_of_a_picture_that_was_cut_is_none(tmp_path: Path) -> None:
+    tags: dict[int, object] = {0xA405: 26, 0xA002: 4000, 0xA003: 3000}
+    assert read_exif_focal(photograph(tmp_path / "scaled.jpg", tags)) is not None
+    assert read_exif_focal(photograph(tmp_path / "turned.jpg", tags, (300, 400))) is not None
+    with pytest.warns(Notice, match="EXIF of a picture of 4000x3000, and this one is 400x120, cut"):
+        assert read_exif_focal(photograph(tmp_path / "cut.jpg", tags, (400, 120))) is None

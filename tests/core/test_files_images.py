@@ -3,7 +3,7 @@ import struct
 from contextlib import nullcontext
 from io import BytesIO
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 from zlib import compress, crc32
 
 import numpy as np
@@ -282,12 +282,14 @@ def test_an_archive_is_named_for_what_it_is(tmp_path: Path, name: str) -> None:
         list_images(file)
 
 
-def jpeg(folder: Path, data: bytes | None = None, options: Any = None) -> tuple[Path, bytes]:
+def jpeg(
+    folder: Path, data: bytes | None = None, options: dict[str, int] | None = None
+) -> tuple[Path, bytes]:
     """Write a JPEG of a picture with texture, or these bytes, and give both."""
     encoded = BytesIO()
     tiles = np.random.default_rng(0).integers(0, 256, (12, 20, 3), dtype=np.uint8)
     pixels = tiles.repeat(8, 0).repeat(8, 1)
-    Image.fromarray(pixels).save(encoded, "JPEG", quality=95, **(options or {}))
+    Image.fromarray(pixels).save(encoded, "JPEG", quality=95, **cast("Any", options or {}))
     path = folder / "street.jpg"
     path.write_bytes(encoded.getvalue() if data is None else data)
     return path, path.read_bytes()

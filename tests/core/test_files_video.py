@@ -111,3 +111,34 @@ def test_without_opencv_the_extra_is_named(monkeypatch: pytest.MonkeyPatch) -> N
     monkeypatch.setitem(sys.modules, "cv2", None)
     with pytest.raises(MissingExtraError, match=r"reading a video.*pip install -e '.\[opencv"):
         read_video("v.mp4")
+
+
+@pytest.mark.parametrize(("ratio", "size"), [((2, 1), (128, 48)), ((1, 2), (64, 96))])
+def test_pixels_that_are_not_square_become_so(
+    tmp_path: Path, ratio: tuple[int, int], size: tuple[int, int], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = tmp_path / "anamorphic.avi"
+    write_video(path, iter(moving_square(2)), fps=10)
+    cv2 = pytest.importorskip("cv2")
+    capture = cv2.VideoCapture
+
+    class Anamorphic:
+        """A capture whose file names the shape of its pixels, which OpenCV cannot write."""
+
+        def __init__(self, name: str) -> None:
+            self.inner = capture(name)
+
+        def get(self, what: int) -> float:
+            said = {cv2.CAP_PROP_SAR_NUM: ratio[0], cv2.CAP_PROP_SAR_DEN: ratio[1]}
+            return said[what] if what in said else self.inner.get(what)
+
+        def __getattr__(self, name: str) -> object:
+            return getattr(self.inner, name)
+
+    monkeypatch.setattr(cv2, "VideoCapture", Anamorphic)
+    with pytest.warns(Notice, match=f"frames of 64x48 become {size[0]}x{size[1]}"):
+        video = read_video(path)
+    (_, image), *_ = list(video)
+    assert video.size == size
+    assert (image.shape[2], image.shape[1]) == size
+    assert float(image[0].mean()) == pytest.approx(float(moving_square(1)[0][0].mean()), abs=0.03)

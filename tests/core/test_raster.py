@@ -49,6 +49,17 @@ def test_it_sees_what_rays_see_even_across_the_camera_plane(seed: int) -> None:
     assert bool(drawn.depth_m[~seen].isnan().all())
 
 
+@pytest.mark.parametrize("near_m", [0.5, 2.0, 4.0])
+def test_of_triangles_that_cross_the_near_plane_what_lies_beyond_is_seen(near_m: float) -> None:
+    triangles = random_triangles(3, 60)
+    is_near = triangles[..., 2] < near_m
+    assert int((is_near.any(1) & ~is_near.all(1)).sum()) > 3, "some cross it"
+    _, which = by_rays(triangles, near_m)
+    drawn = rasterize(triangles, K, WIDTH, HEIGHT, near_m)
+    assert torch.equal(drawn.primitive, which)
+    assert float(drawn.depth_m[which >= 0].min()) >= near_m
+
+
 def test_barycentric_shares_lead_to_the_seen_point() -> None:
     triangles = random_triangles(9, 40)
     drawn = rasterize(triangles, K, WIDTH, HEIGHT)

@@ -3,7 +3,14 @@ import pytest
 import torch
 
 from depthpose.core.errors import InputError
-from depthpose.core.rigid import Rigid, fit_rigid, geodesic_rad
+from depthpose.core.rigid import (
+    Rigid,
+    cross_matrix,
+    fit_rigid,
+    geodesic_rad,
+    perturb,
+    rotation_by,
+)
 
 Batch = tuple[int, ...]
 
@@ -101,3 +108,19 @@ def test_batches_are_stacked_joined_and_taken_apart() -> None:
     assert torch.equal(Rigid.cat([both[[1]], one[None]]).t_m, both[[1, 0]].t_m)
     assert both.double().R.dtype == torch.float64
     assert both.double().float().t_m.dtype == torch.float32
+
+
+@pytest.mark.parametrize("angle_rad", [0.0, 1e-9, 1e-3, 0.5, 2.0, 3.1, 3.14159265, 6.0])
+def test_a_rotation_is_the_exponential_of_its_vector(angle_rad: float) -> None:
+    vector = torch.randn(20, 3, dtype=torch.float64)
+    vector = angle_rad * vector / vector.norm(dim=-1, keepdim=True)
+    expected = torch.linalg.matrix_exp(cross_matrix(vector))
+    torch.testing.assert_close(rotation_by(vector), expected, rtol=0, atol=1e-12)
+
+
+def test_a_motion_is_one_in_the_frame_of_the_camera() -> None:
+    """Not of the model: the object turns about the camera and is shifted along its axes."""
+    pose, motion = random_rigid(()), torch.randn(6, dtype=torch.float64)
+    point = torch.randn(5, 3, dtype=torch.float64)
+    seen = pose.apply(point) @ rotation_by(motion[:3]).mT + motion[3:]
+    torch.testing.assert_close(perturb(pose, motion).apply(point), seen)

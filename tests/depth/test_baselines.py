@@ -99,6 +99,17 @@ def test_the_nearest_image_gives_its_own_depth(tmp_path: Path) -> None:
     assert torch.allclose(farther, torch.full((H, W), 10.0), rtol=1e-3)
 
 
+def test_haze_changes_nothing_about_what_looks_most_alike(tmp_path: Path) -> None:
+    """A picture of little contrast is as grey as any other: what counts is where it is brighter."""
+    pattern, other = torch.rand(2, 3, H, W)
+    grey = 0.6 + 0.02 * (other - 0.5)
+    frames = {"a": (pattern, torch.full((H, W), 4.0)), "b": (grey, torch.full((H, W), 9.0))}
+    baseline = NearestImageBaseline.fit(write_frames(tmp_path, frames))
+    depth_m = baseline.estimate_pair(pair_of(0.2 * pattern + 0.5)).depth_m
+    assert depth_m is not None
+    assert torch.allclose(depth_m, torch.full((H, W), 4.0), rtol=1e-3)
+
+
 def test_holes_take_the_smallest_cell_with_values() -> None:
     nan = torch.nan
     values = torch.tensor(

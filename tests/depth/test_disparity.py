@@ -44,6 +44,13 @@ def test_resizing_keeps_the_depth_of_a_slanted_plane() -> None:
     torch.testing.assert_close(half, inner / 2)
 
 
+def test_resizing_in_one_direction_scales_disparity_by_the_columns() -> None:
+    px = torch.full((6, 8), 12.0)
+    assert torch.equal(resized_match(Match(disparity_px=px), 3, 8).disparity_px, px[:3])
+    narrow = resized_match(Match(disparity_px=px), 6, 4).disparity_px
+    assert torch.equal(narrow, torch.full((6, 4), 6.0))
+
+
 def test_resizing_to_its_own_size_changes_nothing() -> None:
     disparity_px = torch.rand(5, 9)
     same = resized_match(Match(disparity_px=disparity_px), 5, 9)
@@ -104,3 +111,10 @@ def test_points_outside_the_right_view_are_dropped() -> None:
     right_px = right_disparity_from_left(left_px)
     assert right_px[0, 1] == 1.0
     assert right_px[0, [0, 2]].isnan().all()
+
+
+def test_a_point_lands_on_the_pixel_nearest_to_its_place() -> None:
+    left_px = torch.full((1, 12), torch.nan)
+    left_px[0, 10], left_px[0, 6] = 1.3, 1.6  # at 8.7 and 4.4 of the right view
+    known = right_disparity_from_left(left_px)[0].isfinite().nonzero().flatten().tolist()
+    assert known == [4, 9]

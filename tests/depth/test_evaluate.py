@@ -12,7 +12,7 @@ from depthpose.core.errors import InputError, Notice
 from depthpose.core.files import write_depth_png, write_image, write_map
 from depthpose.core.run import note_result
 from depthpose.depth.datasets import Dataset, check_dataset, open_dataset
-from depthpose.depth.disparity import depth_from_disparity, disparity_advice
+from depthpose.depth.disparity import depth_from_disparity, disparity_advice, resized_map
 from depthpose.depth.estimator import FakestereoNet
 from depthpose.depth.evaluate import (
     Measured,
@@ -147,6 +147,8 @@ def test_what_a_poor_estimate_could_be_too_is_a_notice() -> None:
         (256 / 1000, "3.91 times .* PNG of millimetres"),
         (1000 / 256, "its truth a PNG of millimetres"),
         (16.0, "pixels x 16"),
+        (5.4, "0.185 times .* monodepth2, trained with a baseline of 0.1 m"),
+        (1 / 9, "9 times .* is it without a scale"),
     ):
         with pytest.warns(Notice, match=said):
             assert disparity_advice(factor * true_px, true_px) is None
@@ -198,12 +200,32 @@ def test_a_png_of_kitti_is_disparity_where_disparity_is_measured(
     assert evaluate(pairs, tmp_path / "p", "kitti-2015").rows[0].metrics["epe_px"] == 0
 
 
+@pytest.mark.filterwarnings("ignore:a prediction lies")
 def test_a_prediction_of_half_the_size_is_scaled(pairs: Dataset, tmp_path: Path) -> None:
     for name in "abc":
         write_map(tmp_path / "p" / f"{name}.disparity_px.npy", torch.full((H // 2, W // 2), 3.0))
     whole = write_predictions(tmp_path / "w", lambda d: torch.full_like(d, 6.0))
     half = evaluate(pairs, tmp_path / "p", "kitti-2015").rows
     assert half == evaluate(pairs, whole, "kitti-2015").rows
+
+
+def test_a_prediction_of_another_shape_is_stretched_with_a_notice_or_refused(
+    pairs: Dataset, tmp_path: Path
+) -> None:
+    def written(folder: str, change: Callable[[torch.Tensor], torch.Tensor]) -> Path:
+        for k, name in enumerate("abc"):
+            write_map(tmp_path / folder / f"{name}.disparity_px.npy", change(truth_px(k)))
+        return tmp_path / folder
+
+    with pytest.raises(InputError, match=rf"is {H}x{W}, and its truth {W}x{H}: it is transposed"):
+        evaluate(pairs, written("turned", lambda px: px.T.contiguous()), "kitti-2015")
+    top, left = 4, 3
+    cut = written("cut", lambda px: px[top:, left:-left].contiguous())
+    with pytest.raises(InputError, match=rf"cut out at column {left}, row {top} .* NaN around it"):
+        evaluate(pairs, cut, "kitti-2015")
+    squeezed = written("squeezed", lambda px: resized_map(px, H, W // 2) / 2)
+    with pytest.warns(Notice, match="of another aspect, so it is stretched"):
+        evaluate(pairs, squeezed, "kitti-2015")
 
 
 def test_depth_files_of_others_count_as_disparity(pairs: Dataset, tmp_path: Path) -> None:

@@ -52,6 +52,24 @@ def test_an_unsure_matcher_labels_nothing() -> None:
     assert not bool(label_pair(net, pair, LabelConfig(least_confidence=0.1)).isnan().all())
 
 
+def test_the_sky_is_no_label() -> None:
+    """Its disparity agrees in both views and is sure; it is that of no thing."""
+
+    class SeesSky:
+        def match(self, left: Tensor, right: Tensor):  # noqa: ANN202, ARG002
+            from depthpose.depth.types import Match
+
+            is_sky = torch.zeros(left.shape[1:], dtype=torch.bool)
+            is_sky[:2] = True
+            return Match(disparity_px=torch.full(left.shape[1:], 4.0), is_sky=is_sky)
+
+    views = {"left": torch.rand(3, 6, 20), "right": torch.rand(3, 6, 20)}
+    pair = replace(make_street(0.1).input, camera=None, **views)
+    known_px = label_pair(FakestereoNet(SeesSky()), pair, LabelConfig())
+    assert bool(known_px[:2].isnan().all())
+    assert bool((known_px[2:, 4:] == 4).all())
+
+
 def test_a_labelled_folder_trains_and_is_gone_on_with(tmp_path: Path) -> None:
     dataset = open_dataset(write_pairs(tmp_path / "pairs", (0.2, 0.25)))
     out = tmp_path / "out"

@@ -63,6 +63,16 @@ def test_the_discriminator_pays_half_of_both_mistakes(monkeypatch: pytest.Monkey
     assert float(loss) == pytest.approx((real + fake) / 2, rel=1e-6)
 
 
+def test_the_generator_is_paid_for_views_that_are_taken_for_real(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Not for those that the discriminator sees through: then it would learn to draw fakes."""
+    update = updates_of("patch", monkeypatch)[1]
+    taken_for_real = (log1exp(-6) + log1exp(3)) / 2
+    assert float(update.facts["adversarial"]) == pytest.approx(taken_for_real, rel=1e-6)
+    assert float(update.loss) == pytest.approx(taken_for_real + 75, rel=1e-6)
+
+
 def test_l1_by_hand(monkeypatch: pytest.MonkeyPatch) -> None:
     (update,) = updates_of("none", monkeypatch)
     assert float(update.facts["l1"]) == pytest.approx(0.75)
@@ -87,6 +97,13 @@ def test_the_heads_weigh_a_half_seven_tenths_and_one() -> None:
     truth = torch.full((1, 1, 1), 5.0)
     heads = [truth + 1.5, truth + 2.5, truth + 3.5]
     assert float(heads_loss(heads, truth, 96)) == pytest.approx(0.5 * 1 + 0.7 * 2 + 1.0 * 3)
+
+
+def test_the_last_of_fewer_heads_weighs_one_too() -> None:
+    truth = torch.full((1, 1, 1), 5.0)
+    heads = [truth + 2.5, truth + 3.5]
+    assert float(heads_loss(heads, truth, 96)) == pytest.approx(0.7 * 2 + 1.0 * 3)
+    assert float(heads_loss(heads[1:], truth, 96)) == pytest.approx(1.0 * 3)
 
 
 def test_unknown_truth_gives_no_gradient_and_no_nan() -> None:

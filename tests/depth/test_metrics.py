@@ -114,6 +114,14 @@ def test_the_area_of_a_constant_is_that_under_the_oracle() -> None:
     assert area == pytest.approx(0.49, abs=0.01)  # remaining error 1 against (1 - removed)
 
 
+def test_the_area_of_a_worked_example() -> None:
+    """Of three pixels none is removed, then a half: what is left is rounded up to two."""
+    error, confidence = torch.tensor([1.0, 2.0, 6.0]), torch.tensor([1.0, 2.0, 3.0])
+    left, oracle, mean = (2 + 6) / 2, (1 + 2) / 2, 3
+    area = sparsification_area(error, confidence, steps=2)
+    assert area == pytest.approx((0 + (left - oracle) / mean) / 2)
+
+
 def test_ties_do_not_depend_on_the_order() -> None:
     error = torch.rand(100)
     confidence = (torch.rand(100) * 4).round()

@@ -35,6 +35,15 @@ def test_a_cloud_projects_onto_its_mask() -> None:
     assert bool(mask[pixels[:, 1], pixels[:, 0]].all())
 
 
+def test_a_cloud_of_slanted_pixels_projects_onto_its_mask() -> None:
+    mask = torch.zeros(48, 64, dtype=torch.bool)
+    mask[10:40, 20:50] = True
+    slanted = K.clone()
+    slanted[0, 1] = 25.0
+    pixels = project(cloud_from_depth(torch.full((48, 64), 0.8).double(), mask, slanted), slanted)
+    torch.testing.assert_close(pixels, mask.nonzero().flip(-1).double(), rtol=0, atol=1e-9)
+
+
 def test_flying_pixels_are_dropped() -> None:
     depth = torch.full((48, 64), 0.8)
     depth[:, 33:] = 2.0

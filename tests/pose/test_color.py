@@ -21,7 +21,12 @@ from tests.pose.textured_objects import (
 from torch import Tensor
 
 from depthpose.core.rigid import Rigid, geodesic_rad, rotation_by
-from depthpose.pose.color import color_agreement, color_copies, copies_about_axis
+from depthpose.pose.color import (
+    color_agreement,
+    color_copies,
+    copies_about_axis,
+    settle_spin,
+)
 from depthpose.pose.mesh import read_model
 from depthpose.pose.types import Axis, ColorImage, ObjectModel, Symmetries
 
@@ -226,6 +231,49 @@ def test_copies_of_a_can_hold_the_right_one(tmp_path: Path) -> None:
     # What the user declares alike is one answer, and no copy is proposed.
     declared = replace(model, symmetries=replace(model.symmetries, is_found=False))
     assert len(color_copies(wrong, declared, view).R) < len(copies.R)
+
+
+def test_an_axis_of_many_turns_is_swept(tmp_path: Path) -> None:
+    # A can whose shape was found to be alike after turns by 30 degrees, upside down too.
+    angles = torch.arange(1, 12).double() * (math.pi / 6)
+    spins = rotation_by(angles[:, None] * Z.direction.double())
+    flip = rotation_by(torch.tensor([[math.pi, 0, 0]]).double())
+    turns = torch.cat([spins, flip, flip @ spins])
+    off_m = torch.tensor([0.0001, -0.0002, 0.0]).double()
+    found = Rigid(turns, off_m - turns @ off_m)
+    model = replace(can(tmp_path), symmetries=Symmetries(discrete=found, is_found=True))
+    pose = random_pose(2, 0.5)
+    view = drawn_view(textured_can(), pose)
+    wrong = Rigid(pose.R @ rotation_by(torch.tensor([0, 0, 2.2]).double()), pose.t_m)
+    for start in (wrong, Rigid(wrong.R @ flip[0], wrong.t_m)):
+        copies = color_copies(start, model, view)
+        assert 2 <= len(copies.R) <= 9
+        # Between the turns that were found, and the first of those that are proposed.
+        assert math.degrees(float(geodesic_rad(copies.R[1], pose.R))) < 4
+    assert len(color_copies(wrong, model, view, most=1).R) == 2
+
+
+@pytest.mark.parametrize("off_deg", [-13.0, 4.0, 18.0])
+def test_a_spin_that_depth_does_not_fix_is_settled(tmp_path: Path, off_deg: float) -> None:
+    model = replace(can(tmp_path), symmetries=Symmetries(continuous=(Z,), is_found=True))
+    pose = random_pose(3, 0.5)
+    view = drawn_view(textured_can(), pose)
+    turn = rotation_by(math.radians(off_deg) * Z.direction.double())
+    drifted = Rigid(pose.R @ turn, pose.t_m)
+    settled = settle_spin(drifted, model, view)
+    assert math.degrees(float(geodesic_rad(settled.R, pose.R))) < 2
+    mute = settle_spin(drifted, model, replace(view, color=None))
+    assert torch.equal(mute.R, drifted.R)
+    declared = replace(model, symmetries=replace(model.symmetries, is_found=False))
+    assert torch.equal(settle_spin(drifted, declared, view).R, drifted.R)
+
+
+def test_half_turns_of_a_box_are_proposed(tmp_path: Path) -> None:
+    model, pose = box(tmp_path), random_pose(6)
+    view = drawn_view(textured_box(), pose)
+    for wrong in half_turns(pose)[1:].R:
+        copies = color_copies(Rigid(wrong, pose.t_m), model, view)
+        assert math.degrees(float(geodesic_rad(copies.R[1], pose.R))) < 1
 
 
 def test_a_window_of_the_depth_image_changes_nothing(tmp_path: Path) -> None:

@@ -170,6 +170,14 @@ def test_a_damaged_texture_leaves_the_shape(tmp_path: Path) -> None:
         assert read_model(path, "mm").colors is None
 
 
+def test_a_texture_too_large_to_read_leaves_the_shape(tmp_path: Path) -> None:
+    path = save_obj(tmp_path, six_sided())
+    Image.new("1", (8200, 8200)).save(tmp_path / "material_0.png")
+    with pytest.warns(Notice, match=r"cube.obj: its texture is 8200x8200, more than 67108864"):
+        model = read_model(path, "mm")
+    assert model.colors is None
+
+
 def test_an_absolute_path_of_another_machine_is_found_beside_the_model(tmp_path: Path) -> None:
     path = save_obj(tmp_path, six_sided())
     mtl = (tmp_path / "material.mtl").read_text()

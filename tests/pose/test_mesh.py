@@ -225,6 +225,12 @@ def test_the_diameter_of_a_large_smooth_hull_is_found_in_directions(
     ball = torch.stack([up.sin() * around.cos(), up.sin() * around.sin(), up.cos()], -1)
     points = ball.reshape(-1, 3) * torch.tensor([0.1, 0.2, 0.25])
     points = points @ rotation_by(torch.tensor([0.3, 1.0, 0.2])).mT
+    # A ball is alike on both sides; where it is cut it has no corner opposite to another.
+    cut = points[points @ torch.tensor([0.6, 0.0, 0.8]) > -0.08]
+    assert len(cut) > 500
+    monkeypatch.setattr("depthpose.pose.mesh.models._HULL", 400)
+    assert exact_diameter(cut) == pytest.approx(float(torch.cdist(cut, cut).max()), rel=1e-3)
+    monkeypatch.setattr("depthpose.pose.mesh.models._HULL", 800)
     with patch.object(torch, "cdist", wraps=torch.cdist) as compared:
         assert exact_diameter(points) == pytest.approx(0.5 * math.cos(0.01), rel=2e-3)
     assert sum(len(call.args[0]) for call in compared.call_args_list) < 900

@@ -164,3 +164,18 @@ def test_a_point_behind_the_camera_has_no_picture() -> None:
     pose = Rigid(torch.eye(3).double(), torch.tensor([0, 0, -1.0]).double())
     eye = symmetry_transforms(Symmetries())
     assert math.isinf(float(mspd_px(pose, random_pose(1), torch.zeros(1, 3), eye, K)))
+
+
+def test_vsd_is_along_the_ray_of_a_slanted_pixel() -> None:
+    """A pixel with ray (x, y, 1), x = -3 y by the skew: 0.1 m of depth are 0.1 |ray| along it."""
+    slanted = torch.tensor([[10.0, 30, 0], [0, 10, 0], [0, 0, 1]], dtype=torch.float64)
+    true, found = (pose_of([1, 0, 0, 0, 1, 0, 0, 0, 1], [k, 0, 0]) for k in (0, 1))
+
+    def render(pose: Rigid) -> Tensor:
+        return torch.full((11, 1), 1.0 if float(pose.t_m[0]) == 0 else 1.1, dtype=torch.float64)
+
+    measured = torch.zeros(11, 1, dtype=torch.float64)
+    y = torch.arange(11).double() / 10
+    off = float((0.1 * (1 + 10 * y.square()).sqrt() >= 0.2).double().mean())
+    assert off == 5 / 11
+    assert vsd(found, true, measured, slanted, render, [0.2]).tolist() == pytest.approx([off])

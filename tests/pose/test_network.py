@@ -45,7 +45,8 @@ def trained(network: ResUNet) -> ResUNet:
     generator = torch.Generator().manual_seed(1)
     for module in network.modules():
         if isinstance(module, nn.BatchNorm1d):
-            for tensor in (module.running_var, module.weight.data, module.bias.data):
+            given = (module.running_mean, module.running_var, module.weight.data, module.bias.data)
+            for tensor in given:
                 assert tensor is not None
                 tensor.copy_(torch.rand(tensor.shape, generator=generator) + 0.5)
     return network.double().eval()

@@ -13,7 +13,7 @@ from depthpose.core.rigid import Rigid
 from depthpose.pose.config import CloudConfig, RefusalConfig
 from depthpose.pose.datasets import write_bop_models
 from depthpose.pose.synthetic import make_part
-from depthpose.pose.types import ObjectModel, Symmetries
+from depthpose.pose.types import ObjectModel, SurfaceColors, Symmetries
 from depthpose.pose.weights import (
     PoseWeights,
     complete_weights,
@@ -126,6 +126,30 @@ def test_half_precision_halves_the_network_and_keeps_models_exact(tmp_path: Path
     sizes = [(tmp_path / f"{name}.safetensors").stat().st_size for name in ("full", "half")]
     numbers = sum(t.numel() for t in weights.network.parameters())
     assert sizes[0] - sizes[1] == pytest.approx(2 * numbers, rel=0.05)
+
+
+def test_colours_of_a_model_come_back(tmp_path: Path) -> None:
+    torch.manual_seed(0)
+    points_m, rgb = torch.rand(500, 3), torch.rand(500, 3)
+    normals = torch.nn.functional.normalize(torch.randn(500, 3), dim=-1)
+    colors = SurfaceColors(points_m=points_m, normals=normals, rgb=rgb, spacing_m=0.0025)
+    colored = dataclasses.replace(bracket(), colors=colors)
+    write_pose_weights(tmp_path / "w.safetensors", tiny_weights(colored, bottle()))
+    first, second = read_pose_weights(tmp_path / "w.safetensors").models
+    assert second.colors is None
+    assert first.colors is not None
+    assert torch.equal(first.colors.points_m, points_m)
+    torch.testing.assert_close(first.colors.normals, normals, atol=1e-3, rtol=0)
+    torch.testing.assert_close(first.colors.rgb, rgb, atol=1 / 500, rtol=0)
+    assert first.colors.spacing_m == pytest.approx(0.0025)
+    # They are of the surface: kept back with it, and put in again with it.
+    without, whole = tmp_path / "n.safetensors", tmp_path / "c.safetensors"
+    write_pose_weights(without, tiny_weights(colored), with_meshes=False)
+    assert not any("colors" in name for name in read_checkpoint(without).state)
+    complete_weights(without, {colored.number: colored}, whole)
+    again = read_pose_weights(whole).models[0].colors
+    assert again is not None
+    assert torch.equal(again.points_m, points_m)
 
 
 def test_many_objects_stay_small(tmp_path: Path) -> None:

@@ -222,11 +222,12 @@ _NETWORK = "precision max-memory"
 _OF_FOLDER = "it chooses from a data set, and none is named; give --linemod or --bop"
 _Case = Callable[[Typed], bool]
 _RULES: tuple[tuple[str, _Case, str, str], ...] = (
-    ("pose predict, pose track", lambda o: "register" in o["method"],
+    ("pose predict, pose track",
+     lambda o: "register" in o["method"] or ("cad" in o and "method" not in o),
      "weights voting hypotheses batch device",
-     "--method register fits the CAD file alone, one input after the other on the processor"),
-    ("pose predict, pose track", lambda o: "register" not in o["method"], "cad",
-     "weights know their own objects; add --method register, or train weights of this part by "
+     "CAD files are posed without a network, one input after the other on the processor"),
+    ("pose predict, pose track", lambda o: "network" in o["method"], "cad symmetry",
+     "weights know their own objects; leave --method network out, or train weights of this part by "
      "'depthpose pose train --cad'"),
     ("pose predict, pose track", lambda o: "cad" not in o, "cad-unit",
      "it is the unit of --cad, and no CAD file is given"),

@@ -11,11 +11,10 @@ from depthpose.pose.config import EstimateConfig, SymmetryRule
 
 def predict(
     out: NewPlace,
-    weights: WeightsName = "parts",
-    inputs: options.OneObjectOptions = options.OneObjectOptions(),
+    first: options.FirstOptions = options.FirstOptions(),
+    more: options.MoreOptions = options.MoreOptions(),
     dataset: options.DataSetOptions = options.DataSetOptions(),
     estimates: options.EstimateOptions = options.EstimateOptions(),
-    register: options.RegisterOptions = options.RegisterOptions(),
     engine: EngineOptions = EngineOptions(),
 ) -> int:
     """The pose of known objects from clouds, depth images or a data set; or the reason for none.
@@ -29,20 +28,29 @@ def predict(
     shows some of them in 3D, and every refusal. A rerun skips what is finished; other settings need
     another --out; only files of the same run are overwritten. Processes of torchrun share the work.
 
-        depthpose pose predict --cloud part.ply --unit mm --object part --out out
-        depthpose pose predict --depth d.png --mask m.png --camera cam.json --out out
-        depthpose pose predict --depth d.png --camera cam.json --out out
+        depthpose pose predict --cad p.stl --cad-unit mm --depth d.png --camera c.json --out out
+        depthpose pose predict --cad p.stl --cad-unit mm --depth d.png --camera c.json
+            --box 120,80,260,210 --out out
+        depthpose pose predict --cad p.stl --unit mm --cloud p.ply --out out
+        depthpose pose predict --depth d.png --mask m.png --camera c.json --object flange
+            --out out
         depthpose pose predict --bop lm --split test --weights linemod.safetensors --out out
-        depthpose pose predict --method register --cad p.stl --unit mm --cloud p.ply --out out
 
     Args:
         out: folder for the results.
-        weights: of a pose network, by name or file ('depthpose weights list').
     """
     from depthpose.cli.pose_frames import find_all
     from depthpose.cli.pose_methods import source_of
     from depthpose.cli.pose_predict import predict_dataset, predict_files, predict_on_ray
 
+    inputs = options.OneObjectOptions(**vars(first), **vars(more))
+    register = options.RegisterOptions(
+        method=estimates.method,
+        cad=inputs.cad,
+        cad_unit=inputs.cad_unit,
+        symmetry=inputs.symmetry,
+    )
+    weights = estimates.weights
     count = sum(word is not None for word in (inputs.cloud, inputs.depth, dataset.bop))
     if count != 1:
         raise InputError(

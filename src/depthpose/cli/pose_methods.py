@@ -354,12 +354,12 @@ def source_of(
     cad_unit = register.cad_unit or (None if has_own else unit)
     for path in register.cad:
         unit_of(path, cad_unit)
-    if register.symmetry and (register.method == "network" or not register.cad):
+    if register.symmetry and (not register.is_register or not register.cad):
         raise InputError(
             f"--symmetry {register.symmetry[0]}: is of --method register with --cad; a network and "
             "a data set have the symmetries that they declare"
         )
-    if register.method == "network":
+    if not register.is_register:
         return MethodSource(config=config, weights=weights, base_from_camera=base_from_camera)
     if dataset.bop is not None:
         models = tuple(datasets.open_bop(dataset.bop, dataset.split).objects.values())

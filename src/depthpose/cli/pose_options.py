@@ -4,7 +4,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Literal
 
-from depthpose.cli.arguments import Device, NewPath, Source, shown_as
+from depthpose.cli.arguments import Device, NewPath, Source, WeightsName, shown_as
 from depthpose.core.errors import InputError
 from depthpose.core.units import Unit
 from depthpose.pose.config import DiameterTable, EstimateConfig, VotingConfig
@@ -67,9 +67,14 @@ class PoseTableOptions(PoseMeasureOptions):
 
 
 @dataclass(frozen=True, kw_only=True)
-class OneObjectOptions:
-    """A cloud or a depth image of known objects, and what is known of it."""
+class FirstOptions:
+    """What is looked for, and in what."""
 
+    cad: tuple[Source, ...] = ()
+    """STL, PLY, OBJ or GLB files of the parts: they are posed without training, a second or two for
+    each; an object has its file's name."""
+    cad_unit: Unit | None = None
+    """of the CAD files; as --unit by default, and of GLB metres."""
     depth: Source | None = None
     """16-bit PNG in the camera's depth_unit_m, or a folder of them. Without --mask, --box and
     --detections the whole image is searched for every object, or for --object alone."""
@@ -81,12 +86,33 @@ class OneObjectOptions:
     the names of the depth images. Each number of a label map is an object (see --labels)."""
     box: Annotated[tuple[str, ...], shown_as(metavar="X0,Y0,X1,Y1 ...")] = ()
     """where objects are in the depth image: left, top, right and bottom edge [px]."""
+    cloud: Source | None = None
+    """points of one object (PLY, PCD, NPY, text), in the camera frame: x right, y down, z forward;
+    or a folder of such files."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class MoreOptions:
+    """What else is known of the objects and the images."""
+
     detections: Source | None = None
     """boxes or masks of a detector: .json of COCO or BOP, .txt of YOLO, or a folder of such files
     with the names of the depth images."""
     labels: Annotated[str | None, shown_as(metavar="CLASS=OBJECT,...")] = None
     """which object a number of --mask or a class of --detections is: 1=bracket,2=gear; 3= leaves 3
     out."""
+    object: str | None = None
+    """which of the objects that are known; of a data set its name or number, all by default."""
+    unit: Unit | None = None
+    """unit of clouds (default m), of depth images whose camera file gives none, and of CAD files
+    without --cad-unit."""
+    symmetry: tuple[str, ...] = ()
+    """of --cad: how a part looks alike, in place of what is found: z,18 after each of 18 equal
+    turns about an axis along z, z,free after any, z,6+x,2 about two axes; or a JSON file with BOP's
+    symmetries_discrete and symmetries_continuous. The axis goes where the surface fits best. Of
+    several CAD files with the name: NAME:z,18."""
+    focal_px: float | None = None
+    """focal length of the depth images [px], in place of --camera; the axis meets their centre."""
     color: Source | None = None
     """picture of the depth camera's frame and moment, or with its own --color-camera; or a folder
     of them with the names of the depth images. Print on a part (PLY with colours of its vertices,
@@ -96,18 +122,14 @@ class OneObjectOptions:
     color_from_depth: Path | None = None
     """text file with the pose of the depth camera in the frame of --color-camera: 4x4, in metres;
     without it both are at one place."""
-    cloud: Source | None = None
-    """points of one object (PLY, PCD, NPY, text), in the camera frame: x right, y down, z forward;
-    or a folder of such files."""
-    unit: Unit | None = None
-    """unit of clouds (default m), and of depth images whose camera file gives none."""
-    object: str | None = None
-    """which of the objects that are known; of a data set its name or number, all by default."""
-    focal_px: float | None = None
-    """focal length of the depth images [px], in place of --camera; the axis meets their centre."""
     base_from_camera: Annotated[tuple[str, ...], shown_as(metavar="PATH | 16 NUMBERS")] = ()
     """hand-eye calibration of a camera that does not move: the 4x4 matrix row by row, in metres, or
     a text file with it; base_from_model then stands beside camera_from_model."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class OneObjectOptions(FirstOptions, MoreOptions):
+    """A cloud or a depth image of known objects, and what is known of it."""
 
     @property
     def has_regions(self) -> bool:
@@ -134,19 +156,24 @@ class DataSetOptions:
 
 @dataclass(frozen=True, kw_only=True)
 class EstimateOptions:
-    """How poses are estimated."""
+    """How poses are estimated; the last ones are of networks alone."""
 
+    min_certainty: float = 0.9
+    """below it the status is ambiguous, not ok: the likeliest pose with its alternatives."""
+    object_deviation_mm: float = 1.0
+    """standard deviation of the real surface from its file [mm]: 0.3 for a machined part, 2 for a
+    carton or a scan."""
+    method: Literal["network", "register"] | None = None
+    """network: trained weights. register: the CAD files alone, or the models of --bop; it is taken
+    where --cad is given."""
+    weights: WeightsName = "parts"
+    """of a pose network, by name or file ('depthpose weights list')."""
     voting: Voting = "ransac"
     """how a network's directions become keypoints."""
     hypotheses: int = 128
     """of RANSAC, for each keypoint of a network."""
     icp: bool = True
     """refine the voted pose by ICP."""
-    min_certainty: float = 0.9
-    """below it the status is ambiguous, not ok: the likeliest pose with its alternatives."""
-    object_deviation_mm: float = 1.0
-    """standard deviation of the real surface from its file [mm]: 0.3 for a machined part, 2 for a
-    carton or a scan."""
     register_refused: bool = False
     """what a network doubts is registered by its model alone, some tenths of a second each; not
     where an image is searched."""
@@ -176,8 +203,9 @@ class EstimateOptions:
 class RegisterOptions:
     """Poses by a CAD file alone, without training."""
 
-    method: Literal["network", "register"] = "network"
-    """network: trained weights. register: the CAD file alone, a second or two for each part."""
+    method: Literal["network", "register"] | None = None
+    """network: trained weights. register: the CAD files alone, a second or two for each part, or
+    the models of --bop; it is taken where --cad is given."""
     cad: tuple[Source, ...] = ()
     """of register: STL, PLY, OBJ or GLB files; an object has its file's name."""
     cad_unit: Unit | None = None
@@ -187,6 +215,11 @@ class RegisterOptions:
     turns about an axis along z, z,free after any, z,6+x,2 about two axes; or a JSON file with BOP's
     symmetries_discrete and symmetries_continuous. The axis goes where the surface fits best. Of
     several CAD files with the name: NAME:z,18."""
+
+    @property
+    def is_register(self) -> bool:
+        """Whether poses are registered: that is said, or CAD files are given."""
+        return self.method == "register" or (self.method is None and bool(self.cad))
 
 
 @dataclass(frozen=True, kw_only=True)

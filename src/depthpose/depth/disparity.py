@@ -25,6 +25,7 @@ _DOUBTS = {
     1000 / 256: "is it a PNG of millimetres, read as metres x 256?",
     256 / 1000: "is its truth a PNG of millimetres, read as metres x 256?",
     1 / 16: "is its disparity pixels x 16, as OpenCV's matchers give it?",
+    1 / 5.4: "is it of monodepth2, trained with a baseline of 0.1 m (multiply its depth by 5.4)?",
 }
 """What may have been meant by a scale that a poor estimate could have too."""
 _ABOUT = 1.4
@@ -32,6 +33,8 @@ _ABOUT = 1.4
 _said: set[str] = set()
 _NEARLY_ALL = 0.9
 _NEAR, _OPPOSITE = 1.1, -0.8
+_FAR_OFF = 3.0
+"""A median so far off is told of: an estimate of the right scale has one near 1."""
 LEAST_PX = 0.01
 """Of a corrected disparity in use: depth stays finite. It is what a pair without a rig has in the
 sky."""
@@ -64,17 +67,18 @@ def disparity_advice(predicted_px: Map, true_px: Map) -> str | None:
     for factor, question in _MISTAKES.items():
         if factor / _ABOUT < farther < factor * _ABOUT:
             return f"it lies {farther:.4g} times as far as the truth: {question}"
-    doubts = [
-        f"lies about {factor:.3g} times as far as the truth: {question}"
-        for factor, question in _DOUBTS.items()
-        if factor / _NEAR < farther < factor * _NEAR
-    ]
+    doubts: list[str] = []
+    if farther > 0 and not 1 / _FAR_OFF < farther < _FAR_OFF:
+        known = (q for factor, q in _DOUBTS.items() if factor / _NEAR < farther < factor * _NEAR)
+        question = next(known, "is it without a scale, or of another focal length or baseline?")
+        doubts.append(f"lies {farther:.3g} times as far as the truth in the median: {question}")
     both = torch.stack([predicted_px, true_px]).double().clamp_min(1e-3).log()
     if len(true_px) > 1 and float(both.corrcoef()[0, 1]) < _OPPOSITE:
         doubts.append("is the nearer the farther its truth is: is it inverse depth?")
     for doubt in doubts:
-        if doubt not in _said:
-            _said.add(doubt)  # of a whole data set once
+        question = doubt.partition(":")[2]
+        if question not in _said:
+            _said.add(question)  # of a whole data set once
             warnings.warn(f"a prediction {doubt}", Notice, stacklevel=2)
     return None
 

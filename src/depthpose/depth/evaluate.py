@@ -4,6 +4,7 @@ A protocol fixes the truth, the pixels that count and how the prediction is prep
 two protocols do not compare; every row carries its protocol's name.
 """
 
+import warnings
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from functools import partial
@@ -11,9 +12,11 @@ from pathlib import Path
 from typing import Any, Literal
 
 import torch
+from jaxtyping import Float
+from torch import Tensor
 
 from depthpose.core.camera import StereoRig
-from depthpose.core.errors import InputError, nearest_name
+from depthpose.core.errors import InputError, Notice, nearest_name
 from depthpose.core.files import read_image
 from depthpose.core.frame import data_frame
 from depthpose.depth import disparity
@@ -31,6 +34,11 @@ from depthpose.depth.metrics import (
 )
 from depthpose.depth.types import DepthError, DepthEstimate, Map, StereoInput
 
+_SAME_ASPECT = 1.01
+"""Of a map made of an image that was scaled: sides are rounded to whole pixels, often to 32."""
+_CLEARLY = 0.7
+"""Of the error of the map when it is stretched: with less it is a part of the image."""
+_stretched: set[str] = set()
 NO_PREDICTION = "no right view to match, and no prediction"
 
 
@@ -386,8 +394,8 @@ def _prepare(dataset: Dataset, index: int, predictions: Path, rule: Protocol) ->
         K = torch.tensor([[width, 0, 0], [0, width, 0], [0, 0, 1]], dtype=torch.float64)
         rig = StereoRig(width=width, height=height, K=K, baseline_m=1.0)  # depth takes any
     found_px = files.read_disparity(predictions, frame.name, rig, with_disparity_png=is_stereo)
-    predicted_px = disparity.resized_map(found_px, height, width) * (width / found_px.shape[1])
     true_px = truth if is_stereo or rig is None else disparity.disparity_from_depth(truth, rig)
+    predicted_px = _at_size_of(true_px, found_px, predictions / frame.name)
     # With principal points apart, the disparity of far points is negative.
     apart_px = 0.0 if rig is None else rig.cx_right_minus_left_px
     advice = disparity.disparity_advice(predicted_px + apart_px, true_px + apart_px)
@@ -415,6 +423,44 @@ def _prepare(dataset: Dataset, index: int, predictions: Path, rule: Protocol) ->
         rig=rig,
         view=view,
     )
+
+
+def _at_size_of(true_px: Map, found_px: Float[Tensor, "_ _"], path: Path) -> Map:
+    """Bring a prediction to the size of the truth.
+
+    Networks that take squeezed images give maps of another aspect, which are stretched back, with a
+    notice; a map that is turned, or a part of the image's, is refused.
+    """
+    (height, width), (rows, columns) = true_px.shape, found_px.shape
+    stretched_px = disparity.resized_map(found_px, height, width) * (width / columns)
+    aspect, turned = columns * height / (rows * width), rows * height / (columns * width)
+    if 1 / _SAME_ASPECT < aspect < _SAME_ASPECT:
+        return stretched_px
+    shown = f"{columns}x{rows}, and its truth {width}x{height}"
+    if 1 / _SAME_ASPECT < turned < _SAME_ASPECT:
+        raise InputError(f"{path}: is {shown}: it is transposed; save rows first, (H, W)")
+    if rows <= height and columns <= width:
+        left, errors_px = (width - columns) // 2, {}
+        for top in ((height - rows) // 2, height - rows):  # from the middle, or as KITTI's 1216x352
+            window = true_px[top : top + rows, left : left + columns]
+            errors_px[top] = float((found_px - window).abs().nanmedian())
+        top = min(errors_px, key=lambda row: errors_px[row])
+        stretched = float((stretched_px - true_px).abs().nanmedian())
+        if errors_px[top] < _CLEARLY * stretched:
+            raise InputError(
+                f"{path}: is {shown}: it is a part of the image, cut out at column {left}, row "
+                f"{top} (there the median error is {errors_px[top]:.2f} px, stretched to all of it "
+                f"{stretched:.2f} px); put it into a map of {width}x{height}, NaN around it"
+            )
+    if shown not in _stretched:
+        _stretched.add(shown)  # of a whole data set once
+        said = (
+            f"{path}: is {shown}, of another aspect, so it is stretched: right where the image was "
+            "squeezed for it; what was cut out of the image is put into a map of its size, NaN "
+            "around it"
+        )
+        warnings.warn(said, Notice, stacklevel=2)
+    return stretched_px
 
 
 def _compared(prepared: _Prepared, rule: Protocol, cap_m: float | None) -> tuple[Map, Map]:

@@ -14,7 +14,9 @@ print for much.
 """
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import NamedTuple
 
 import torch
@@ -333,11 +335,9 @@ def copies_about_axis(
     fine = _explained(_turned(pose, axis, angles_rad.flatten()), model, view, _SAMPLES)
     fine = fine.reshape(angles_rad.shape)
     best = fine.argmax(1).clamp(1, 2 * _FINE - 1)
-    before, at, after = (fine.gather(1, best[:, None] + k)[:, 0] for k in (-1, 0, 1))
-    bend = (before - 2 * at + after).clamp(max=-1e-9)
-    shift = ((before - after) / (2 * bend)).clamp(-1, 1)
-    found_rad = angles_rad.gather(1, best[:, None])[:, 0] + shift * step_rad / _FINE
-    order = at.argsort(descending=True)
+    beside = fine.gather(1, best[:, None] + torch.tensor([-1, 0, 1]))
+    found_rad = angles_rad.gather(1, best[:, None])[:, 0] + _peak(beside) * step_rad / _FINE
+    order = beside[:, 1].argsort(descending=True)
     return _turned(pose, axis, found_rad[order])
 
 
@@ -366,40 +366,131 @@ def _explained(
 
 
 _SAME_RAD = math.radians(3)
+_MOST_COPIES = 8
+_ONE_TURN_RAD = math.radians(10)
+_MANY_TURNS = 6  # about one line: the shape nearly is a body of revolution
+_ALONG = math.cos(math.radians(8))  # cosine from which two directions are one
 
 
-def color_copies(pose: Rigid, model: ObjectModel, view: ViewInput) -> Rigid:
+def color_copies(
+    pose: Rigid, model: ObjectModel, view: ViewInput, *, most: int = _MOST_COPIES
+) -> Rigid:
     """Propose what a pose may be exchanged for by colour: copies that look alike to depth.
 
-    They are symmetric copies that were found in the shape, near-symmetric ones, and of each the
-    turns about axes of revolution by which its print agrees. Declared symmetries are none: their
-    copies are one answer.
+    They are symmetric copies that were found in the shape, near-symmetric ones, half turns about
+    the principal axes, and of each the turns about axes of revolution, or nearly so, by which its
+    print agrees. Declared symmetries are none: their copies are one answer. A copy is to be refined
+    by depth, and settled (:func:`settle_spin`), before its evidence is compared.
 
     Args:
         pose: ``camera_from_model``, one.
         model: the object.
         view: depth and colour.
+        most: so many are given beside ``pose``.
 
     Returns:
-        A batch of poses, ``pose`` itself the first.
+        A batch of poses, ``pose`` itself the first, then the others, what agrees best before.
     """
     pose = pose.double()
     if model.colors is None or view.color is None:
         return pose[None]
-    found = model.symmetries if model.symmetries.is_found else None
-    turns = [near.model_from_model for near in near_symmetries(model)]
-    if found is not None and found.discrete is not None:
-        turns += [found.discrete.double()[k] for k in range(len(found.discrete.R))]
-    bases = [pose, *(pose @ turn.double() for turn in turns)]
-    axes = () if found is None else found.continuous
-    proposed = [pose[None]]
-    for base in bases:
+    turns, axes = _look_alikes(model)
+
+    # Of copies that a turn about an axis carries into each other one is swept.
+    eye = Rigid(torch.eye(3).double(), torch.zeros(3).double())
+    kept = [eye]
+    for turn in turns:
+        is_swept = any(_is_spun(turn, other, axis) for axis in axes for other in kept)
+        apart_rad = [float(geodesic_rad(turn.R, other.R)) for other in kept]
+        if not is_swept and min(apart_rad) > _ONE_TURN_RAD:
+            kept.append(turn)
+    proposed: list[Rigid] = []
+    for base in (pose @ turn for turn in kept):
         spun = [copies_about_axis(base, axis, model, view) for axis in axes]
         proposed += spun or [base[None]]
     every = Rigid.cat(proposed)
-    kept = [0]
-    for k in range(1, len(every.R)):
-        apart_rad = geodesic_rad(every.R[k].expand(len(kept), 3, 3), every.R[kept])
-        if float(apart_rad.min()) > _SAME_RAD:
-            kept.append(k)
-    return every[kept]
+    order = _explained(every, model, view, _SAMPLES).argsort(descending=True, stable=True)
+    best = [pose[None]]
+    for k in order.tolist():
+        before = Rigid.cat(best)
+        apart_rad = geodesic_rad(every.R[k].expand_as(before.R), before.R)
+        if float(apart_rad.min()) > _SAME_RAD and len(best) <= most:
+            best.append(every[k][None])
+    return Rigid.cat(best)
+
+
+def settle_spin(pose: Rigid, model: ObjectModel, view: ViewInput) -> Rigid:
+    """Turn a pose a little about axes that depth does not fix, to where its print agrees best.
+
+    Refinement by depth drifts about an axis of revolution; print says where it stands.
+
+    Args:
+        pose: ``camera_from_model``, one; within 20 degrees of where it belongs.
+        model: the object.
+        view: depth and colour.
+
+    Returns:
+        The pose, turned; as it was where colour says nothing or the shape has no such axis.
+    """
+    pose = pose.double()
+    if model.colors is None or view.color is None:
+        return pose
+    offsets_rad = torch.arange(-10, 11).double() * math.radians(2)
+    for axis in _look_alikes(model)[1]:
+        explained = _explained(_turned(pose, axis, offsets_rad), model, view, _SWEPT)
+        best = int(explained.argmax().clamp(1, len(offsets_rad) - 2))
+        if float(explained[best]) > 0:
+            peak = _peak(explained[best - 1 : best + 2])
+            pose = _turned(pose, axis, offsets_rad[best, None] + peak * math.radians(2))[0]
+    return pose
+
+
+def _peak(values: Float64[Tensor, "*b 3"]) -> Float64[Tensor, "*b"]:
+    """Place of the largest value of a parabola through three, from the middle one, -1..1."""
+    before, at, after = values.unbind(-1)
+    bend = (before - 2 * at + after).clamp(max=-1e-9)
+    return ((before - after) / (2 * bend)).clamp(-1, 1)
+
+
+@lru_cache(maxsize=64)
+def _look_alikes(model: ObjectModel) -> tuple[list[Rigid], list[Axis]]:
+    """Give the turns after which a shape looks alike or nearly, and axes of any turn."""
+    assert model.colors is not None
+    found = model.symmetries if model.symmetries.is_found else None
+    turns = [near.model_from_model.double() for near in near_symmetries(model)]
+    if found is not None and found.discrete is not None:
+        turns += [found.discrete.double()[k] for k in range(len(found.discrete.R))]
+    axes = [] if found is None else list(found.continuous)
+    axes += _axes_of_many(turns, axes)
+    # A box whose halves differ a little looks alike after half turns about its middle.
+    points_m = model.colors.points_m.double()
+    principal = torch.linalg.eigh((points_m - points_m.mean(0)).T.cov()).eigenvectors.T
+    along_m = points_m @ principal.T
+    middle_m = (along_m.amin(0) + along_m.amax(0)) / 2 @ principal
+    half = torch.tensor(math.pi, dtype=torch.float64)
+    turns += [turn_about(direction, middle_m, half) for direction in principal]
+    return turns, axes
+
+
+def _axes_of_many(turns: Sequence[Rigid], known: Sequence[Axis]) -> list[Axis]:
+    """Find lines about which a shape looks alike after many turns, beside those that are known."""
+    eye = torch.eye(3).double()
+    # The direction that a rotation leaves alone, and a point that it does.
+    directions = [torch.linalg.svd(turn.R - eye).Vh[-1] for turn in turns]
+    found: list[Axis] = []
+    for direction in directions:
+        others = [*known, *found]
+        is_known = any(abs(float(direction @ axis.direction.double())) > _ALONG for axis in others)
+        alike = [k for k, d in enumerate(directions) if abs(float(d @ direction)) > _ALONG]
+        if is_known or len(alike) < _MANY_TURNS:
+            continue
+        points = [torch.linalg.pinv(eye - turns[k].R, rtol=1e-3) @ turns[k].t_m for k in alike]
+        point_m = torch.stack(points).median(0).values
+        found.append(Axis(direction=direction, point_m=point_m))
+    return found
+
+
+def _is_spun(turn: Rigid, other: Rigid, axis: Axis) -> bool:
+    """Whether two turns differ by a turn about an axis of the model: both move it alike."""
+    direction = axis.direction.double()
+    return float((turn.R @ direction) @ (other.R @ direction)) > _ALONG

@@ -9,6 +9,7 @@ from shlex import quote
 from typing import Any
 
 import torch
+from torch import Tensor
 
 from depthpose.core.checkpoint import (
     Checkpoint,
@@ -30,7 +31,7 @@ from depthpose.pose.mesh import (
     symmetries_to_bop,
 )
 from depthpose.pose.network import ResUNet, ResUNetConfig
-from depthpose.pose.types import ObjectModel
+from depthpose.pose.types import ObjectModel, SurfaceColors
 
 DirectionNet = ResUNet | PointNet  #: networks whose points vote
 AnyNetwork = DirectionNet | DepthImageNet
@@ -99,6 +100,7 @@ def write_pose_weights(
             # A copy: two models may be made of one tensor, which safetensors refuses to write.
             stored = tensor.dtype if tensor.is_floating_point() else torch.int32
             state[f"models.{k}.{name}"] = tensor.to(stored, copy=True)
+        state |= _color_tensors(k, model) if with_meshes else {}
     config = {
         "network": config_to_dict(network.config),
         "cloud": config_to_dict(weights.cloud),
@@ -149,7 +151,38 @@ def complete_weights(path: Path, meshes: Mapping[int, ObjectModel], out: Path) -
             tensor = getattr(model, name)
             stored = tensor.dtype if tensor.is_floating_point() else torch.int32
             state[f"models.{k}.{name}"] = tensor.to(stored, copy=True)
+        state |= _color_tensors(k, model)
     save_checkpoint(out, dataclasses.replace(checkpoint, state=state))
+
+
+_COLORS = "colors."  # begins the names of a model's coloured points
+
+
+def _color_tensors(k: int, model: ObjectModel) -> dict[str, Tensor]:
+    """Give the colours of model k by the names that a file has them under, a byte a channel."""
+    colors = model.colors
+    if colors is None:
+        return {}
+    tensors = {
+        "points_m": colors.points_m.clone(),
+        "normals": colors.normals.half(),
+        "rgb": (255 * colors.rgb).round().clamp(0, 255).to(torch.uint8),
+        # A row as all tensors of a model are; its columns are one number.
+        "spacing_m": torch.full((1, 3), colors.spacing_m),
+    }
+    return {f"models.{k}.{_COLORS}{name}": tensor for name, tensor in tensors.items()}
+
+
+def _colors_of(state: Mapping[str, Tensor]) -> SurfaceColors | None:
+    """Give the colours among the tensors of a model, if it has any."""
+    tensors = {n.removeprefix(_COLORS): t for n, t in state.items() if n.startswith(_COLORS)}
+    if not tensors:
+        return None
+    points_m, normals, rgb = (tensors[name].float() for name in ("points_m", "normals", "rgb"))
+    if not len(points_m) == len(normals) == len(rgb) > 0:
+        raise ValueError(f"{len(points_m)} coloured points have {len(rgb)} colours")
+    spacing_m = float(tensors["spacing_m"][0, 0])
+    return SurfaceColors(points_m=points_m, normals=normals, rgb=rgb / 255, spacing_m=spacing_m)
 
 
 def known_numbers(path: Path) -> tuple[int, ...]:
@@ -223,6 +256,7 @@ def read_pose_weights(path: Path) -> PoseWeights:
                     diameter_m=float(record["diameter_m"]),
                     keypoints_m=state["keypoints_m"],
                     symmetries=symmetries_from_bop(record, source=f"{source}: model {k}"),
+                    colors=_colors_of(state),
                 )
             )
     known = ("network.", *(f"models.{k}." for k in range(len(models))))

@@ -340,10 +340,15 @@ def camera_from_facts(facts: CameraFacts, size: Size | None) -> Camera:
         if unit_m > 1:
             what = f"which looks like units a metre; it is metres a unit: write {1 / unit_m:g}"
         raise InputError(f"depth_unit_m is {unit_m:g}, {what}")
-    if facts.size is None:
+    doubt = facts.doubt
+    try:
         refuse_other_resolution(camera.K, camera.width, camera.height)
-    if facts.doubt:
-        warnings.warn(facts.doubt, Notice, stacklevel=2)
+    except InputError as error:
+        if facts.size is None:
+            raise
+        doubt = f"{error}. The file names that size itself, so it is believed: a crop may be so"
+    if doubt:
+        warnings.warn(f"{facts.kind}: {doubt}", Notice, stacklevel=2)
     return camera
 
 

@@ -204,7 +204,7 @@ def _facts_without_lens(names: Names) -> CameraFacts | None:
             first = np.c_[left[:, :3], [0, 0, 0]]
             facts = facts_from_projections(kind, first, left, size_of(names))
             doubt = (
-                "the right camera_info alone, whose Tx gives a baseline of "
+                "it is the right one alone, whose Tx gives a baseline of "
                 f"{facts.baseline_m:g} m: that of the pair only where the left one's Tx is 0 "
                 "(KITTI's is not); name the folder of both files to be sure"
             )

@@ -390,7 +390,8 @@ def _orientation(image: Image.Image) -> int:
 
 _EXIF_IFD = 0x8769
 _FOCAL_MM, _FOCAL_35MM = 0x920A, 0xA405
-_RESOLUTION, _RESOLUTION_UNIT, _PIXELS = 0xA20E, 0xA210, 0xA002
+_RESOLUTION, _RESOLUTION_UNIT, _PIXELS, _PIXELS_DOWN = 0xA20E, 0xA210, 0xA002, 0xA003
+_SAME_ASPECT = 1.02  # scaled pictures are rounded to whole pixels, and cameras cut some rows
 _MM = {2: 25.4, 3: 10.0, 4: 1.0, 5: 0.001}  # of a unit of resolution: inch, cm, mm, micrometre
 _DIAGONAL_MM = math.hypot(36, 24)
 
@@ -403,28 +404,49 @@ def read_exif_focal(picture: AnyPath | Image.Image) -> tuple[float, str] | None:
     times the ratio of this width and the one that was taken (``PixelXDimension``).
 
     Returns:
-        None where the picture has no such tags, or zeros, which mean unknown.
+        None where the picture has no such tags, or zeros, which mean unknown; and, with a notice,
+        where they are of a picture of another aspect, from which this one was cut.
 
     Raises:
         InputError: the file is no picture.
     """
-    if not isinstance(picture, Image.Image):
+    if isinstance(picture, Image.Image):
+        focal, doubt = _exif_focal(picture)
+    else:
         with opened_image(picture) as opened:
-            return read_exif_focal(opened)
+            focal, doubt = _exif_focal(opened)
+    if doubt:
+        warnings.warn(doubt, Notice, stacklevel=2)
+    return focal
+
+
+def _exif_focal(picture: Image.Image) -> tuple[tuple[float, str] | None, str]:
+    """Read the focal length, and why there is none though its tags are there."""
     if picture.format == "PNG" and "exif" not in picture.info:
-        return None
+        return None, ""
     tags = picture.getexif().get_ifd(_EXIF_IFD)
     film_mm, focal_mm = _positive(tags.get(_FOCAL_35MM)), _positive(tags.get(_FOCAL_MM))
+    across, down = _positive(tags.get(_PIXELS)), _positive(tags.get(_PIXELS_DOWN))
+    if (film_mm or focal_mm) and across and down:
+        taken = max(across, down) / min(across, down)
+        aspect = max(picture.size) / min(picture.size)
+        if not 1 / _SAME_ASPECT < taken / aspect < _SAME_ASPECT:
+            said = (
+                f"EXIF of a picture of {across:g}x{down:g}, and this one is {picture.size[0]}x"
+                f"{picture.size[1]}, cut from it: the focal length there is not that of this one"
+            )
+            return None, said
     if film_mm is not None:
         focal_px = film_mm / _DIAGONAL_MM * math.hypot(*picture.size)
-        return focal_px, f"FocalLengthIn35mmFilm {film_mm:g} mm"
+        return (focal_px, f"FocalLengthIn35mmFilm {film_mm:g} mm"), ""
     per_unit, unit_mm = _positive(tags.get(_RESOLUTION)), _MM.get(tags.get(_RESOLUTION_UNIT, 2))
     if focal_mm is None or per_unit is None or unit_mm is None:
-        return None
+        return None, ""
     taken = _positive(tags.get(_PIXELS)) or max(picture.size)
     # A picture stored turned has the sensor's width along its longer side.
     focal_px = focal_mm * per_unit / unit_mm * max(picture.size) / taken
-    return focal_px, f"FocalLength {focal_mm:g} mm, {taken * unit_mm / per_unit:.1f} mm of sensor"
+    sensor_mm = taken * unit_mm / per_unit
+    return (focal_px, f"FocalLength {focal_mm:g} mm, {sensor_mm:.1f} mm of sensor"), ""
 
 
 def _positive(value: Any) -> float | None:  # noqa: ANN401  whatever a file holds

@@ -13,6 +13,7 @@ from torch import Tensor
 
 from depthpose.core.errors import InputError, Notice, import_opencv
 from depthpose.core.files.disk import AnyPath, atomic_write, refused_suffix
+from depthpose.core.files.images import MAX_PIXELS
 
 VIDEO_SUFFIXES = (".mp4", ".avi", ".mov", ".mkv", ".webm", ".m4v")
 """Files that are taken for a video."""
@@ -28,6 +29,7 @@ class Video:
     path: Path  #: the file
     fps: float  #: frames a second
     frames: int  #: the number in the file's header; 0 where it has none
+    size: tuple[int, int]  #: width and height of a frame with square pixels
 
     def __iter__(self) -> Iterator[tuple[str, Float[Tensor, "3 h w"]]]:
         """Yield the name (``STEM_000000``, ``STEM_000001``, ...) and RGB in [0, 1] of each frame.
@@ -35,7 +37,8 @@ class Video:
         Raises:
             InputError: not one frame can be decoded.
         """
-        capture = import_opencv("reading a video").VideoCapture(str(self.path))
+        cv2 = import_opencv("reading a video")
+        capture = cv2.VideoCapture(str(self.path))
         if not capture.isOpened():
             raise InputError(f"{self.path}: {_NO_VIDEO}")
         index = 0
@@ -44,6 +47,8 @@ class Video:
                 is_read, blue_green_red = capture.read()
                 if not is_read:
                     break
+                if blue_green_red.shape[1::-1] != self.size:  # pixels that are not square
+                    blue_green_red = cv2.resize(blue_green_red, self.size)
                 red_green_blue = np.ascontiguousarray(blue_green_red[..., ::-1])
                 image = torch.from_numpy(red_green_blue).permute(2, 0, 1).float() / 255
                 yield f"{self.path.stem}_{index:06d}", image
@@ -56,6 +61,9 @@ class Video:
 
 def read_video(path: AnyPath) -> Video:
     """Open a video and look at its first frame.
+
+    Where the file says that pixels are wider than high, frames are widened until they are square,
+    with a notice; where they are higher than wide, heightened.
 
     Raises:
         InputError: no such file, no video, or not one frame can be decoded.
@@ -71,11 +79,24 @@ def read_video(path: AnyPath) -> Video:
     if not capture.isOpened():
         raise InputError(f"{path}: {_NO_VIDEO}")
     fps, frames = capture.get(cv2.CAP_PROP_FPS), capture.get(cv2.CAP_PROP_FRAME_COUNT)
-    is_read = capture.read()[0]
+    aspect = capture.get(cv2.CAP_PROP_SAR_NUM), capture.get(cv2.CAP_PROP_SAR_DEN)
+    is_read, first = capture.read()
     capture.release()
     if not is_read or not 0 < fps < math.inf:
         raise InputError(f"{path}: {_NO_VIDEO}")
-    return Video(path=path, fps=float(fps), frames=max(0, int(frames)))
+    height, width = first.shape[:2]
+    size = width, height
+    if min(aspect) > 0 and aspect[0] != aspect[1]:
+        wide = aspect[0] / aspect[1]
+        size = round(width * max(wide, 1)), round(height * max(1 / wide, 1))
+        said = (
+            f"{path}: its pixels are {aspect[0]:g}:{aspect[1]:g}, so frames of {width}x{height} "
+            f"become {size[0]}x{size[1]}; a focal length or camera is taken to be of that size"
+        )
+        warnings.warn(said, Notice, stacklevel=2)
+    if size[0] * size[1] > MAX_PIXELS:
+        raise InputError(f"{path}: frames of {size[0]}x{size[1]}; scale it down")
+    return Video(path=path, fps=float(fps), frames=max(0, int(frames)), size=size)
 
 
 def write_video(path: AnyPath, images: Iterable[Float[Tensor, "3 _ _"]], fps: float) -> int:

@@ -25,6 +25,7 @@ _DENSE = 4  # so many colours are averaged in each sample
 _LEAST_CONTRAST = 0.01  # standard deviation of colours below which a model is of one colour
 _SAME_BOX = 1e-3  # of the extent: by less two readers of one file may differ
 _LEAST_INSIDE = 0.5  # share of the coloured surface in the shape's box, else they are not one
+_MOST_TEXELS = 2**26  # 8192 x 8192
 _WITH_COLORS = (".ply", ".obj", ".glb")
 
 
@@ -53,7 +54,8 @@ def read_colors(path: AnyPath, scale: float, model: ObjectModel) -> SurfaceColor
         with refused_as(path, "model with colours", "export it again"):
             samples, lost = _colored_samples(path, suffix)
     except InputError as error:
-        warnings.warn(f"{error} (its shape is read, its colours are not)", Notice, stacklevel=3)
+        said = f"{path}: {str(error).removeprefix(f'{path}: ')}"
+        warnings.warn(f"{said} (its shape is read, its colours are not)", Notice, stacklevel=3)
         return None
     if lost:
         warnings.warn(
@@ -215,6 +217,11 @@ def _colors_of(mesh: Any, face: np.ndarray, share: np.ndarray, *, lost: bool) ->
     factor = getattr(material, "baseColorFactor", None)
     tint = np.ones(3) if factor is None else (np.asarray(factor)[:3] / 255) ** (1 / 2.2)
     colors = None
+    if image is not None and image.width * image.height > _MOST_TEXELS:
+        raise InputError(
+            f"its texture is {image.width}x{image.height}, more than {_MOST_TEXELS} pixels; save "
+            "it smaller"
+        )
     if image is not None and visual.uv is not None:
         places = _between(visual.uv, corners, share)
         colors = uv_to_interpolated_color(places, image)[:, :3] / 255 * tint
