@@ -123,7 +123,7 @@ def test_a_cloud_gives_its_pose_and_the_posed_model(
     np.testing.assert_allclose(turn, found.camera_from_model.R, atol=1e-3)
     assert float(add_m(found.camera_from_model, TRUTH, bracket().vertices_m)) < 0.001
     row = poses_of(out)["part"]
-    assert {"network", "voting", "icp"} <= row["seconds"].keys()
+    assert {"network", "proposal", "icp", "evidence", "decision"} <= row["seconds"].keys()
     assert torch.tensor(row["covariance"]).shape == (6, 6)
     beside = read_cloud(out / "part.pose.ply")
     assert len(beside.points) == len(cloud) + 5000

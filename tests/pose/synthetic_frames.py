@@ -81,7 +81,7 @@ def predictions_of(
             reason="the directions are parallel" if pose is None else "",
             camera_from_model=pose,
             inlier_share=0.5,
-            seconds={"network": 0.02, "voting": 0.005},
+            seconds={"network": 0.02, "proposal": 0.005},
         )
         found.append(Prediction(estimate=estimate, place=place_of(instance)))
     return found

@@ -10,11 +10,10 @@ from depthpose.core.camera import Camera, back_project
 from depthpose.core.render import rasterize
 from depthpose.core.rigid import Rigid
 from depthpose.pose.config import CloudConfig, MeshConfig, RefusalConfig
-from depthpose.pose.network_pose import GeoPoseNet
-from depthpose.pose.network_pose import CloudToPose
 from depthpose.pose.mesh import make_model
 from depthpose.pose.network import ResUNet, ResUNetConfig
-from depthpose.pose.synthetic.parts import part_mesh
+from depthpose.pose.network_pose import CloudToPose, GeoPoseNet
+from depthpose.pose.synthetic.parts import circle, part_mesh, ring
 from depthpose.pose.types import Axis, ObjectModel, PoseEstimate, Symmetries
 from depthpose.pose.weights import PoseWeights
 
@@ -55,6 +54,31 @@ def bottle(name: str = "bottle") -> ObjectModel:
         torch.cat([torch.stack(f, -1) for f in faces]),
         name=name,
         symmetries=Symmetries(continuous=(axis,)),
+    )
+
+
+def bar(bump_m: float = 0.004) -> ObjectModel:
+    """A bar of 20 x 7 x 3 cm, one end of which is a little narrower."""
+    corners, faces = box_faces()
+    vertices = corners * torch.tensor([0.2, 0.07, 0.03])
+    is_end = (vertices[:, 0] > 0)[:, None]
+    vertices = torch.where(is_end, vertices - bump_m * vertices.sign() * torch.tensor([0, 1, 0]),
+                           vertices)  # fmt: skip
+    return make_model(vertices, faces, name="bar", number=1)
+
+
+def gear(teeth: int = 12, keyway_mm: float = 0.0) -> ObjectModel:
+    """A gear of 60 mm with a bore, of 8, 12 or 24 teeth; a keyway makes no two teeth alike."""
+    number = torch.arange(96)
+    angle = number * (2 * torch.pi / 96)
+    is_tooth = number % (96 // teeth) < 48 // teeth
+    radius_mm = torch.where(is_tooth, 30.0, 25.0)
+    outline = torch.stack([radius_mm * angle.cos(), radius_mm * angle.sin()], 1)
+    bore = torch.from_numpy(circle(8.0)).clone()
+    bore[torch.minimum(number, 96 - number) <= 5] *= 1 + keyway_mm / 8
+    vertices_mm, faces = ring(outline.double().numpy(), bore.numpy(), 12.0)
+    return make_model(
+        torch.from_numpy(vertices_mm) * 0.001, torch.from_numpy(faces), name="gear", number=3
     )
 
 
@@ -133,7 +157,7 @@ class Oracle(GeoPoseNet):
         ready = [one for one in group if isinstance(one, CloudToPose)]
         self.calls += [len(ready)] if ready else []
         for one in ready:
-            one.outputs = self._true(one.cloud.points_m, one.known.number)
+            one.outputs = self._true(one.cloud.points_m, one.prepared.number)
             one.seconds["network"] = 0.01
         return group
 

@@ -1,6 +1,7 @@
 """Poses that fit as well as the best: found by the shape of the model, shared, named, counted."""
 
 import math
+import re
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -10,32 +11,20 @@ import torch
 from tests.pose.synthetic_objects import (
     K,
     Oracle,
+    bar,
     bottle,
-    box_faces,
     bracket,
     cloud_of,
+    noisy,
     pose_at,
     tiny_weights,
     view_of,
 )
 
 from depthpose.core.rigid import Rigid, geodesic_rad
-from depthpose.pose.cloud import cloud_from_depth
-from depthpose.pose.config import EstimateConfig, IcpConfig
-from depthpose.pose.copies import (
-    Candidate,
-    KnownObject,
-    difference_of,
-    find_candidates,
-    find_copies,
-    turn_best,
-    with_copies,
-)
-from depthpose.pose.identity import share_out
 from depthpose.pose.mesh import (
     NearSymmetry,
     SymmetryProposal,
-    make_model,
     near_symmetries,
     symmetries_from_proposals,
     symmetry,
@@ -44,21 +33,11 @@ from depthpose.pose.mesh import (
     with_found_symmetries,
 )
 from depthpose.pose.metrics import add_m
-from depthpose.pose.surface import prepare_surface
+from depthpose.pose.registration import Registration
 from depthpose.pose.synthetic.parts import make_part
-from depthpose.pose.types import ObjectModel, Symmetries
+from depthpose.pose.types import ObjectModel, Symmetries, ViewInput
 
 EYE = torch.eye(3, dtype=torch.float64)
-
-
-def bar(bump_m: float = 0.004) -> ObjectModel:
-    """A bar of 20 x 7 x 3 cm, one end of which is a little narrower."""
-    corners, faces = box_faces()
-    vertices = corners * torch.tensor([0.2, 0.07, 0.03])
-    is_end = (vertices[:, 0] > 0)[:, None]
-    vertices = torch.where(is_end, vertices - bump_m * vertices.sign() * torch.tensor([0, 1, 0]),
-                           vertices)  # fmt: skip
-    return make_model(vertices, faces, name="bar", number=1)
 
 
 def half_turn(axis: list[float]) -> Rigid:
@@ -101,70 +80,57 @@ def test_declared_symmetries_are_no_other_pose_and_rough_found_ones_are() -> Non
 
 
 def test_an_answer_that_may_be_turned_names_the_other_ends() -> None:
+    """Which end is which hardly shows: the pose is sure up to that, and the copies are named."""
     model, truth = bar(0.002), pose_at(seed=3)
-    cloud = cloud_of(model, truth)
+    cloud = noisy(cloud_of(model, truth))
     found = Oracle(tiny_weights(model), [truth], noise=0.3).estimate(cloud=cloud)
-    assert found.status == "ambiguous", found.reason
-    assert found.certainty is not None
-    assert found.certainty < 0.9
-    assert {a.difference for a in found.alternatives} <= {
-        f"turned by {angle} degrees about the {axis} axis"
-        for axis in ("long", "middle", "short") for angle in (178, 179, 180)
-    }  # fmt: skip
-    likely = [a.probability for a in found.alternatives]
-    assert likely == sorted(likely, reverse=True)
-    assert 0.93 < found.certainty + sum(likely) <= 1 + 1e-9
-    for other in found.alternatives:
-        assert float(add_m(other.camera_from_model, truth, model.vertices_m)) > 0.02
-
-
-def test_up_to_symmetry_the_copies_are_one_answer() -> None:
-    model, truth = bar(), pose_at(seed=3)
-    config = EstimateConfig(up_to_symmetry=True)
-    net = Oracle(tiny_weights(model), [truth], config=config)
-    found = net.estimate(cloud=cloud_of(model, truth))
     assert found.is_ok, found.reason
-    assert found.alternatives == ()
-    assert found.certainty == pytest.approx(1)
+    assert found.certainty is not None
+    assert found.copy_certainty is not None
+    assert found.certainty > 0.9
+    assert found.copy_certainty < 0.9
+    copies = [other for other in found.alternatives if other.is_copy]
+    assert copies
+    assert all(
+        re.fullmatch(
+            r"rotated by 1(79|80) degrees about the (long|middle|short) axis", c.difference
+        )
+        for c in copies
+    )
+    likely = [other.probability for other in found.alternatives]
+    assert likely == sorted(likely, reverse=True)
+    of_copies = sum(other.probability for other in copies)
+    assert found.certainty == pytest.approx(found.copy_certainty + of_copies, abs=0.05)
+    poses = [found.camera_from_model, *(other.camera_from_model for other in copies)]
+    errors_m = [float(add_m(pose, truth, model.vertices_m)) for pose in poses if pose is not None]
+    assert min(errors_m) < 0.005
 
 
-def test_only_what_has_a_copy_is_less_certain() -> None:
+def test_the_ends_that_differ_clearly_are_told_apart() -> None:
+    model, truth = bar(0.012), pose_at(seed=3)
+    found = Oracle(tiny_weights(model), [truth]).estimate(cloud=noisy(cloud_of(model, truth)))
+    assert found.is_ok, found.reason
+    assert found.copy_certainty is not None
+    assert found.copy_certainty > 0.9
+    assert found.camera_from_model is not None
+    assert float(add_m(found.camera_from_model, truth, model.vertices_m)) < 0.005
+
+
+def test_only_what_has_a_copy_is_less_certain_of_it() -> None:
     """A bottle whose ends are alike declares its axis alone: it may stand on its head."""
     for model in (bracket(), bottle()):
         truth = pose_at(seed=5)
         net = Oracle(tiny_weights(model), [truth])
-        found = net.estimate(cloud=cloud_of(model, truth))
-        assert found.is_posed, found.reason
-        assert found.certainty is not None
-        assert (found.certainty > 0.99) == (model.name == "bracket")
-        assert len(found.alternatives) == (model.name == "bottle")
-        assert all("turned by 180 degrees" in one.difference for one in found.alternatives)
+        found = net.estimate(cloud=noisy(cloud_of(model, truth)))
+        assert found.is_ok, found.reason
+        assert found.copy_certainty is not None
+        assert (found.copy_certainty > 0.95) == (model.name == "bracket"), found.alternatives
+        on_its_head = [a for a in found.alternatives if "rotated by 180 degrees" in a.difference]
+        assert bool(on_its_head) == (model.name == "bottle")
+        assert all(other.is_copy for other in on_its_head)
 
 
-def test_shares_are_of_one_and_fall_with_what_speaks_against() -> None:
-    shares = share_out([{"far": 0.0}, {"far": 0.01}, {"far": 0.03}], {"far": 1.0})
-    # exp(-log x) is 1 / x: 1 / 0.01, 1 / 0.02 and 1 / 0.04.
-    assert shares.tolist() == pytest.approx([4 / 7, 2 / 7, 1 / 7])
-    without_network = share_out([{"far": 0.0}, {"far": 0.01}], {"far": 1.0, "disagree": 1.0})
-    assert without_network.tolist() == pytest.approx([2 / 3, 1 / 3])
-
-
-def test_words_tell_the_axis_and_the_shift() -> None:
-    copies = find_copies(bar(), up_to_symmetry=False)
-    first = pose_at(seed=1)
-    first = Rigid(first.R.double(), first.t_m.double())
-    turned = first @ half_turn([0, 0, 1.0])
-    assert difference_of(turned, first, copies) == "turned by 180 degrees about the short axis"
-    moved = Rigid(turned.R, turned.t_m + torch.tensor([0.03, 0, 0]))
-    words = "turned by 180 degrees about the short axis and shifted by 30 mm"
-    assert difference_of(moved, first, copies) == words
-    oblique = first @ turn_about(torch.tensor([1.0, 1.0, 0]).double(), torch.zeros(3).double(),
-                                 torch.tensor(math.pi / 2, dtype=torch.float64))  # fmt: skip
-    said = difference_of(oblique, first, copies)
-    assert said == "turned by 90 degrees about the model's axis (0.71, 0.71, 0.00)"
-
-
-def test_proposals_of_a_shape_are_kept_to_the_bit(
+def test_proposals_of_a_shape_are_cached_to_the_bit(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("DEPTHPOSE_CACHE", str(tmp_path))
@@ -183,7 +149,7 @@ def test_proposals_of_a_shape_are_kept_to_the_bit(
     monkeypatch.setattr(symmetry, "propose_symmetries", search)
     wanted = symmetries_from_proposals(given)
     for tolerance in (0.02, 0.02, 0.03):
-        symmetry.kept.cache_clear()
+        symmetry.cached.cache_clear()
         model = with_found_symmetries(bar(), None, is_taken=True, tolerance=tolerance)
         found, (own,) = model.symmetries, wanted.continuous
         assert found.discrete is not None
@@ -198,7 +164,7 @@ def test_what_was_found_is_kept_for_the_next_process(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("DEPTHPOSE_CACHE", str(tmp_path))
-    symmetry.kept.cache_clear()
+    symmetry.cached.cache_clear()
     model = replace(bar(), symmetries=Symmetries(is_found=True))
     true = symmetry._search(model)
     searches: list[ObjectModel] = []
@@ -214,7 +180,7 @@ def test_what_was_found_is_kept_for_the_next_process(
     searches.clear()
 
     def again() -> tuple[NearSymmetry, ...]:
-        symmetry.kept.cache_clear()
+        symmetry.cached.cache_clear()
         return near_symmetries(model)
 
     assert all(
@@ -235,37 +201,25 @@ def test_what_was_found_is_kept_for_the_next_process(
 
 @pytest.mark.parametrize("handle", ["at the side", "behind"])
 def test_a_mug_is_turned_to_its_handle_and_by_any_angle_where_none_is_seen(handle: str) -> None:
-    """A network takes a wrong turn of a mug: in its mask the readings say which one is right."""
+    """In an exact mask a handle says which rotation is right; without one many fit."""
     mug = make_part("mug")
     x = [1.0, 0, 0] if handle == "at the side" else [0, 0, 1.0]  # where the handle is
     y = torch.linalg.cross(torch.tensor([0, -1.0, 0]), torch.tensor(x))
     R = torch.stack([torch.tensor(x), y, torch.tensor([0, -1.0, 0])], 1)
-    truth = Rigid(R, torch.tensor([0.0, 0.05, 0.6])).double()
-    seen, mask = view_of(mug, truth.float())
-    cloud_m = cloud_from_depth(seen, mask, K).double()
-    known = KnownObject(number=0, model=mug, surface=prepare_surface(mug))
-    with_copies(known, up_to_symmetry=False)
-    about = turn_about(torch.tensor([0, 0, 1.0]).double(), torch.zeros(3).double(),
-                       torch.tensor(2.0).double())  # fmt: skip
-    wrong = Candidate(truth @ about, torch.eye(6).double(), 0.0)
-    none = wrong.pose[None][[]]
-    best, others, turned = turn_best(cloud_m, wrong, none, known, IcpConfig())
-    config = EstimateConfig()
-    found = find_candidates(cloud_m, best, others, turned, known, config, is_refined=True)
-    off = [float(add_m(one.pose, truth, mug.vertices_m.double())) for one in found]
-    if handle == "behind":
-        assert len(found) > 5
-        assert min(off) < 0.1 * mug.diameter_m
+    truth = Rigid(R, torch.tensor([0.0, 0.05, 0.6]))
+    seen, mask = view_of(mug, truth)
+    depth_m = torch.where(mask, seen, torch.tensor(1.2).to(seen)).float()
+    depth_m += 0.0005 * torch.randn(240, 320, generator=torch.Generator().manual_seed(0))
+    view = ViewInput(name="a", depth_m=depth_m, mask=mask, K=K, object="mug")
+    (found,) = Registration([mug]).estimate_many([view])
+    if handle == "at the side":
+        assert found.camera_from_model is not None, found.reason
+        assert float(add_m(found.camera_from_model, truth, mug.vertices_m)) < 0.003
+        assert (found.certainty or 0) > 0.9
+    elif found.camera_from_model is not None:
+        poses = [found.camera_from_model, *(a.camera_from_model for a in found.alternatives)]
+        assert len(poses) > 3
+        off_m = min(float(add_m(pose, truth, mug.vertices_m)) for pose in poses)
+        assert off_m < 0.2 * mug.diameter_m
     else:
-        assert len(found) == 1
-        assert off[0] < 0.02 * mug.diameter_m
-
-
-def test_turns_of_what_looks_nearly_alike_are_one_answer_up_to_symmetry_and_a_mugs_are_not() -> (
-    None
-):
-    near, mug = find_copies(bar(), up_to_symmetry=False), make_part("mug")
-    assert near.mostly == 3
-    assert find_copies(bar(), up_to_symmetry=True).mostly == 0
-    assert find_copies(mug, up_to_symmetry=True).mostly > 10
-    assert find_copies(bracket(), up_to_symmetry=False).mostly == 0
+        assert found.status in ("not observable", "doubtful"), found.reason

@@ -28,7 +28,6 @@ from depthpose.core.files import Cloud, write_cloud, write_depth_png, write_imag
 from depthpose.core.rigid import Rigid, geodesic_rad, rotation_by
 from depthpose.pose.cloud import ObjectCloud, prepare_cloud
 from depthpose.pose.config import CloudConfig, EstimateConfig, VotingConfig
-from depthpose.pose.network_pose import GeoPoseNet
 from depthpose.pose.mesh import (
     make_model,
     propose_symmetries,
@@ -36,6 +35,7 @@ from depthpose.pose.mesh import (
     symmetries_from_proposals,
 )
 from depthpose.pose.metrics import add_m, adds_m
+from depthpose.pose.network_pose import GeoPoseNet
 from depthpose.pose.types import CloudInput, ObjectModel, PoseEstimate, ViewInput
 from depthpose.pose.weights import write_pose_weights
 
@@ -62,7 +62,7 @@ def test_true_directions_give_the_true_pose(part: ObjectModel, method: str, with
     net = Oracle(tiny_weights(part), [truth], config=config)
     found = net.estimate(cloud=cloud_of(part, truth))
     assert_close(found, truth, 0.0005)
-    stages = ["cloud", "network", "voting", "svd", "icp", "check"]
+    stages = ["cloud", "network", "proposal", "icp", "evidence", "decision"]
     assert list(found.seconds) == [s for s in stages if with_icp or s != "icp"]
     assert found.covariance is not None
     assert bool(torch.linalg.eigvalsh(found.covariance.double()).min() > 0)

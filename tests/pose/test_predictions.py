@@ -207,7 +207,7 @@ def test_the_schema_describes_what_is_written(tmp_path: Path) -> None:
     validator.check_schema(schema())
     assert [error.message for error in validator.iter_errors(rows)] == []
     broken = [
-        {"version": 2},
+        {"version": 1},
         {"status": "fine"},
         {"camera_from_model": [[1, 0, 0], [0, 1, 0], [0, 0, 1]]},
         {"certainty": 1.5},
@@ -243,8 +243,8 @@ def test_another_version_is_refused_and_none_is_taken(tmp_path: Path) -> None:
     assert row.pop("version") == VERSION
     (tmp_path / "poses.json").write_text(json.dumps([row]))
     assert read_predictions(tmp_path)[0].estimate.name == "a"
-    (tmp_path / "poses.json").write_text(json.dumps([row | {"version": 2}]))
-    with pytest.raises(InputError, match="entry 0: version is 2, and this depthpose reads 1"):
+    (tmp_path / "poses.json").write_text(json.dumps([row | {"version": 1}]))
+    with pytest.raises(InputError, match="entry 0: version is 1, and this depthpose reads 2"):
         read_predictions(tmp_path)
 
 
@@ -254,8 +254,8 @@ def test_estimates_become_a_data_frame(tmp_path: Path, monkeypatch: pytest.Monke
     frame = read_predictions(tmp_path).to_frame()
     assert list(frame["name"]) == ["a", "b"]
     assert list(frame["status"]) == ["ok", "too few points"]
-    assert frame["fit.agrees"][0] == 0.875
-    assert frame["seconds.voting"][0] == 0.007
+    assert frame["evidence.supported"][0] == 30.5
+    assert frame["seconds.proposal"][0] == 0.007
     monkeypatch.setitem(sys.modules, "pandas", None)
     with pytest.raises(ImportError, match=r"a data frame needs pandas, .*: pip install pandas"):
         read_predictions(tmp_path).to_frame()

@@ -12,25 +12,23 @@ from tests.pose.synthetic_objects import CAMERA, K, box_faces, bracket, pose_at,
 
 from depthpose.core.camera import Camera, back_project
 from depthpose.core.rigid import Rigid, geodesic_rad, rotation_by
+from depthpose.pose import search
 from depthpose.pose.cloud import cloud_from_depth, grow_mask
 from depthpose.pose.config import RefusalConfig
-from depthpose.pose.estimator import Registration, find
 from depthpose.pose.copies import find_copies
-from depthpose.pose.search import SearchTargets, find_objects, size_deviations
-from depthpose.pose.identity import fit_of, seen_about
-from depthpose.pose.propose.image import (
-    compare_with_image,
-    log_odds_wrong,
-    propose_in_frame,
-)
-from depthpose.pose.inputs import view_input
+from depthpose.pose.decide import PRIOR_PROPOSED
+from depthpose.pose.evidence import compare, observe
 from depthpose.pose.frame import prepare_frame
+from depthpose.pose.inputs import view_input
 from depthpose.pose.mesh import make_model
 from depthpose.pose.metrics import add_m
+from depthpose.pose.propose.image import compare_with_image, propose_in_frame
+from depthpose.pose.propose.point_pairs import prepare_pairs
+from depthpose.pose.registration import Registration
+from depthpose.pose.search import SearchTargets, find_objects
 from depthpose.pose.surface import prepare_surface
 from depthpose.pose.synthetic.parts import make_part
-from depthpose.pose.types import CloudInput, Identity, ObjectModel, PoseEstimate
-from depthpose.pose.propose.point_pairs import prepare_pairs
+from depthpose.pose.types import CloudInput, Evidence, ObjectModel, PoseEstimate
 
 TRUTHS = [pose_at(-0.13, 0.7, seed=1), pose_at(0.12, 0.9, seed=2)]
 
@@ -107,9 +105,6 @@ def test_the_image_agrees_with_the_true_pose_and_with_none_beside_it() -> None:
     assert float(seen.agreement[1:].max()) < 0.3
     assert float(seen.continued[0]) < 0.02
     assert float(seen.parted[0]) > 0.8
-    log_odds = log_odds_wrong(frame, Rigid.stack([truth, *aside]), surface)
-    assert float(log_odds[0]) < -2
-    assert float(log_odds[1:].min()) > float(log_odds[0]) + 1.5, "before what a refined pose adds"
 
 
 def test_edges_that_a_sensor_cuts_contradict_no_pose_and_a_missing_half_does() -> None:
@@ -120,19 +115,18 @@ def test_edges_that_a_sensor_cuts_contradict_no_pose_and_a_missing_half_does() -
     cut, half = mask & ~grow_mask(mask, -4), mask.clone()
     half[:, : int(mask.nonzero()[:, 1].median())] = False
     pose = Rigid(truth.R.double(), truth.t_m.double())
-    share, agrees = {}, {}
+    share, agreement = {}, {}
     for name, lost in (("cut", cut), ("half", half)):
         depth_m = torch.where(mask & ~lost, seen.float(), 1.25)
         frame = prepare_frame(depth_m, K.float())
         share[name] = float(compare_with_image(frame, pose[None], surface).contradicted)
         view = view_input(depth_m, mask & ~lost, CAMERA, model.name, "view", None)
         own_m = cloud_from_depth(depth_m, mask & ~lost, K.float())
-        about = seen_about(own_m, view, surface.diameter_m)
-        agrees[name] = [fit_of(about, pose, surface, rim).agrees for rim in (0, 1)]
+        observation = observe(own_m, view, surface.diameter_m, 0.001, is_masked=False)
+        agreement[name] = compare(observation, pose, surface).agreement
     assert share["cut"] < 0.02
     assert share["half"] > 0.1
-    assert agrees["cut"][0] < agrees["cut"][1] > 0.97
-    assert agrees["half"][1] < 0.9
+    assert agreement["half"] < 0.7 < agreement["cut"]
 
 
 def nearest_m(poses: Rigid, truth: Rigid, model: ObjectModel) -> float:
@@ -145,10 +139,10 @@ def test_point_pairs_propose_every_instance() -> None:
     surface = prepare_surface(model)
     frame = prepare_frame(table(), K)
     everywhere = torch.ones(frame.depth_m.shape, dtype=torch.bool)
-    poses, log_odds = propose_in_frame(frame, everywhere, prepare_pairs(surface))
-    agreement = compare_with_image(frame, poses, surface).agreement
+    poses, agreement = propose_in_frame(frame, everywhere, prepare_pairs(surface))
+    expected = compare_with_image(frame, poses, surface).agreement
+    assert torch.allclose(agreement, expected)
     assert bool((agreement.diff() <= 1e-9).all()), "what the image agrees with best comes first"
-    assert len(log_odds) == len(agreement)
     for truth in TRUTHS:
         assert nearest_m(poses, truth, model) < 0.06 * model.diameter_m
 
@@ -166,7 +160,8 @@ def test_what_is_no_longer_left_votes_for_nothing() -> None:
 
 
 def turns_of(model: ObjectModel) -> Rigid:
-    return find_copies(model, up_to_symmetry=False).turns
+    copies = find_copies(model)
+    return Rigid.cat([copies.copies, copies.lookalikes])
 
 
 @pytest.mark.parametrize("is_handle_first", [False, True])
@@ -175,9 +170,7 @@ def test_a_mug_turned_about_its_axis_looks_alike_but_for_its_handle(is_handle_fi
     off_axis_m = mug.vertices_m[mug.faces].mean(1)[:, :2].norm(dim=-1)
     order = off_axis_m.argsort(descending=is_handle_first)
     turns = turns_of(replace(mug, faces=mug.faces[order]))
-    assert float((turns.R[:, 2, 2].abs() - 1).abs().max()) < 0.01, "about its axis"
-    upright = turns.R[turns.R[:, 2, 2] > 0]
-    assert len(turns.R) - len(upright) <= 1, "upside down it is barely as much alike"
+    upright = turns.R[turns.R[:, 2, 2] > 0.99]
     angle = torch.atan2(upright[:, 1, 0], upright[:, 0, 0]).rad2deg()
     every = torch.arange(-180.0, 180.0, 5.0)[:, None]
     apart = ((every - torch.cat([angle, torch.zeros(1)]) + 180) % 360 - 180).abs().amin(1)
@@ -188,7 +181,7 @@ def test_half_turns_lay_half_of_a_part_on_itself() -> None:
     turns = turns_of(make_part("connector"))
     angle = geodesic_rad(turns.R, torch.eye(3).double().expand_as(turns.R)).rad2deg()
     assert len(angle) > 0
-    assert float(angle.min()) > 170
+    assert float(angle.max()) > 170
 
 
 @pytest.mark.parametrize("is_compiled", ["1", "0"])
@@ -216,8 +209,8 @@ def test_the_handle_of_a_mug_decides_its_turn(handle: str) -> None:
     errors = [float(add_m(pose, truth, mug.vertices_m)) for pose in poses if pose is not None]
     assert errors == ([pytest.approx(0, abs=0.05 * mug.diameter_m)] if handle == "seen" else [])
     about = Rigid(rotation_by(torch.tensor([0.0, 0, 1.8])), torch.zeros(3))  # 103 degrees
-    best = find._best_turned(prepare_frame(depth_m, K), (truth @ about).double(),
-                             Registration([mug])._prepared("mug"))  # fmt: skip
+    prepared = Registration([mug])._prepared("mug")
+    best = search._best_copy(prepare_frame(depth_m, K), (truth @ about).double(), prepared)
     off = math.degrees(float(geodesic_rad(best.R, truth.R.double())))
     assert off < (20 if handle == "seen" else 70), "hidden: anywhere behind the mug"
 
@@ -232,10 +225,9 @@ def test_turns_that_fit_as_well_are_named() -> None:
     view = view_input(seen, mask & (local_m[..., 0] < 0.043), CAMERA, "mug", "view", None)
     cloud = CloudInput(name="view", points_m=cloud_from_depth(seen, view.mask, K), object="mug",
                        view=view)  # fmt: skip
-    net = Registration([mug], refusal=RefusalConfig(min_observability=0.0))
-    (found,) = net._pose_near([cloud], [truth[None]])
+    net = Registration([mug], refusal=RefusalConfig(min_observability=0.0, min_probability=0.0))
+    (found,) = net._estimate_near([cloud], [truth[None]], PRIOR_PROPOSED)
     assert found.camera_from_model is not None
-    assert found.status == "ambiguous"
     named = [found.camera_from_model, *(one.camera_from_model for one in found.alternatives)]
     assert len(named) > 5
     assert min(float(add_m(pose, truth, mug.vertices_m)) for pose in named) < 0.1 * mug.diameter_m
@@ -275,17 +267,18 @@ def test_a_hundred_models_take_bounded_time(net: Registration) -> None:
     view = view_input(table(), None, CAMERA, "bracket", "input", None)
     judged = list[int]()
 
-    def pose_near(inputs: Sequence[CloudInput], poses: Sequence[Rigid]) -> list[PoseEstimate]:
+    def estimate_near(
+        inputs: Sequence[CloudInput], poses: Sequence[Rigid], prior_odds: float
+    ) -> list[PoseEstimate]:
         judged.append(len(inputs))
         given = [replace(one, object="bracket") for one in inputs]
-        found = net._pose_near(given, poses)
+        found = net._estimate_near(given, poses, prior_odds)
         return [replace(e, object=one.object) for e, one in zip(found, inputs, strict=True)]
 
     known = SearchTargets(
         names=[f"part {k}" for k in range(100)],
         object_of=lambda _: net._prepared("bracket"),
-        pose_near=pose_near,
-        max_size_error=net.refusal.max_size_error,
+        estimate_near=estimate_near,
     )
     began = time.process_time()
     assert find_objects(view, known) == []
@@ -293,54 +286,59 @@ def test_a_hundred_models_take_bounded_time(net: Registration) -> None:
     assert time.process_time() - began < 120
 
 
+EVIDENCE = Evidence(
+    visible=20.0, supported=20.0, unobserved=0.0, seen_through=0.0, bulging=0.0, beside=0.0,
+    rms=0.5, noise_m=0.001,
+)  # fmt: skip
+
+
 def judged(
-    object: str, log_odds: float, columns: slice, number: int = 0
-) -> "tuple[find._Candidate, PoseEstimate]":
+    object: str, log_odds: float, columns: slice, number: int = 0, seen_through: float = 0.0
+) -> "search._Judged":
     """An answer that explains some columns of an image of 4 x 40, of a certainty of 1."""
     explained = torch.zeros(4, 40, dtype=torch.bool)
     explained[:, columns] = True
     pose = pose_at(0.01 * number, 0.7, seed=number)
-    estimate = PoseEstimate(name="", object=object, status="ok", certainty=1.0,
-                            camera_from_model=pose)  # fmt: skip
-    one = find._Candidate(object=object, pose=pose, log_odds=log_odds, explained=explained)
-    return one, estimate
-
-
-def test_an_answer_is_as_sure_as_its_pose_and_that_it_is_there_at_all() -> None:
-    kept, _ = find._without_rivals([judged("a", -2.0, slice(0, 10))], [])
-    assert kept[0][1].certainty == pytest.approx(1 / (1 + math.exp(-2.0)))
-
-
-@pytest.mark.parametrize(("second", "number"), [(-3.6, 3), (-1.4, 1), (-0.4, 1)])
-def test_a_second_one_of_an_object_must_be_about_as_sure(second: float, number: int) -> None:
-    """What is there once and something that looks like it differ by more; a third is as ever."""
-    answers = [judged("a", log_odds, slice(10 * k, 10 * k + 10), k)
-               for k, log_odds in enumerate((-4.0, second, -0.3))]  # fmt: skip
-    kept, _ = find._without_rivals(answers, [])
-    assert len(kept) == number
-
-
-def test_a_further_one_of_an_object_must_be_surer_than_a_guess_among_four() -> None:
-    answers = [judged("a", -3.0 + k, slice(10 * k, 10 * k + 10), k) for k in range(3)]
-    answers = [(one, replace(estimate, certainty=0.2)) for one, estimate in answers]
-    kept, taken = find._without_rivals(answers, [])
-    assert [one.log_odds for one, _ in kept] == [-3.0], "it may be there once"
-    assert len(taken) == 1, "another pose may be right there"
+    evidence = replace(EVIDENCE, seen_through=seen_through, supported=20.0 - seen_through)
+    estimate = PoseEstimate(
+        name="", object=object, status="ok", certainty=1.0, copy_certainty=1.0,
+        camera_from_model=pose, evidence=evidence,
+    )  # fmt: skip
+    return search._Judged(
+        object=object, pose=pose, explained=explained, estimate=estimate, log_odds=log_odds
+    )
 
 
 def test_what_may_be_either_of_two_objects_stays_unanswered_in_later_rounds() -> None:
-    both = [judged("a", -2.0, slice(0, 10)), judged("b", -1.9, slice(0, 10))]
-    kept, taken = find._without_rivals(both, [])
+    both = [judged("a", 2.0, slice(0, 10)), judged("b", 1.9, slice(0, 10))]
+    kept, taken = search._suppress(both, [])
     assert kept == []
-    assert find._without_rivals(both[:1], taken)[0] == []
+    assert search._suppress(both[:1], taken)[0] == []
+
+
+def test_the_object_whose_pose_is_contradicted_less_is_answered() -> None:
+    both = [judged("a", 4.0, slice(0, 10)), judged("b", -4.0, slice(0, 10), seen_through=12.0)]
+    (kept,), _ = search._suppress(both, [])
+    assert kept.object == "a"
+    assert kept.estimate.certainty is not None
+    assert 0.8 < kept.estimate.certainty < 1
 
 
 def test_what_lies_on_something_surer_is_no_rival_of_what_is_beside_it() -> None:
     """``b`` shares a third with ``a``, which is surer, and most with ``c``: ``c`` is itself."""
-    answers = [judged("a", -5.0, slice(0, 20)), judged("b", -4.0, slice(13, 33), 1),
-               judged("c", -2.0, slice(18, 38), 2)]  # fmt: skip
-    kept, _ = find._without_rivals(answers, [])
-    assert [(one.object, estimate.object) for one, estimate in kept] == [("a", "a"), ("c", "c")]
+    answers = [
+        judged("a", 5.0, slice(0, 20)),
+        judged("b", 4.0, slice(13, 33), 1),
+        judged("c", 2.0, slice(20, 40), 2),
+    ]
+    kept, _ = search._suppress(answers, [])
+    assert [(place.object, place.estimate.object) for place in kept] == [("a", "a"), ("c", "c")]
+
+
+def test_poses_of_one_object_on_the_same_readings_are_one_answer() -> None:
+    answers = [judged("a", 3.0, slice(0, 20)), judged("a", 2.0, slice(10, 24), 1)]
+    kept, _ = search._suppress(answers, [])
+    assert [place.log_odds for place in kept] == [3.0]
 
 
 def test_what_is_there_twice_is_searched_for_again(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -349,29 +347,32 @@ def test_what_is_there_twice_is_searched_for_again(monkeypatch: pytest.MonkeyPat
     camera = Camera(width=40, height=4, K=small)
     view = view_input(torch.full((4, 40), 0.7), None, camera, "a", "x", None)
     rounds = [
-        [judged("a", -3.0, slice(0, 8)), judged("a", -2.0, slice(8, 16), 1),
-         judged("b", -1.0, slice(16, 24), 2)],
-        [judged("a", -4.0, slice(24, 32), 3)],
+        [judged("a", 3.0, slice(0, 8)), judged("a", 2.0, slice(8, 16), 1),
+         judged("b", 1.0, slice(16, 24), 2)],
+        [judged("a", 4.0, slice(24, 32), 3)],
         [],
     ]  # fmt: skip
     searched = list[tuple[Sequence[str], int]]()
 
-    def candidates(_: object, is_left: torch.Tensor, known: SearchTargets) -> list[object]:
-        searched.append((known.names, int(is_left[0].sum())))
+    def propose(
+        _: object, is_left: torch.Tensor, names: Sequence[str], targets: SearchTargets
+    ) -> list[object]:
+        del targets
+        searched.append((list(names), int(is_left[0].sum())))
         return []
 
-    monkeypatch.setattr(find, "_candidates", candidates)
-    monkeypatch.setattr(find, "_judged", lambda *_: rounds[len(searched) - 1])
-    known = SearchTargets(
-        names=["a", "b"], object_of=MagicMock(), pose_near=MagicMock(),
-        max_size_error=0.03,
+    monkeypatch.setattr(search, "_propose", propose)
+    monkeypatch.setattr(search, "_judge", lambda *_: rounds[len(searched) - 1])
+    targets = SearchTargets(
+        names=["a", "b"], object_of=MagicMock(**{"return_value.surface.diameter_m": 0.1}),
+        estimate_near=MagicMock(),
     )  # fmt: skip
-    found = find_objects(view, known)
+    found = find_objects(view, targets)
     assert searched == [(["a", "b"], 40), (["a"], 16), (["a"], 8)]
     assert [estimate.object for estimate in found] == ["a", "a", "a", "b"], "the surest first"
     assert [estimate.name for estimate in found] == ["x_0", "x_1", "x_2", "x_3"]
-    certainties = [estimate.certainty or 0.0 for estimate in found]
-    assert certainties == sorted(certainties, reverse=True)
+    searched.clear()
+    assert len(find_objects(view, replace(targets, is_single=True))) == 3, "searched once"
 
 
 def test_every_instance_is_found_once_and_nothing_else(net: Registration) -> None:
@@ -383,24 +384,34 @@ def test_every_instance_is_found_once_and_nothing_else(net: Registration) -> Non
         assert min(errors) < 0.01
 
 
-@pytest.mark.parametrize(
-    ("size", "deviation", "low", "high"),
-    [(1.0, 0.01, 0.0, 0.0), (1.32, 0.053, 2.5, 4.0), (1.21, 0.094, 0.8, 1.3), (0.8, 0.02, 3.0, 6)],
-)
-def test_the_size_that_fits_is_off_by_so_many_deviations(
-    size: float, deviation: float, low: float, high: float
-) -> None:
-    view = view_input(table(), None, CAMERA, "bracket", "a", None)
-    identity = Identity(status="not excluded", size=size, size_deviation=deviation)
-    found = PoseEstimate(name="a", object="bracket", status="ok", camera_from_model=TRUTHS[0],
-                         identity=identity)  # fmt: skip
-    assert low <= size_deviations(found, view, prepare_surface(bracket()), 0.03) <= high
+def test_a_box_finds_the_object_that_its_mask_does(net: Registration) -> None:
+    """A detector's box shows a part of the wall too, and of no other object."""
+    depth_m = table()
+    for truth in TRUTHS:
+        _, mask = view_of(bracket(), truth)
+        rows, columns = mask.any(1).nonzero()[:, 0], mask.any(0).nonzero()[:, 0]
+        edges = (int(columns[0]) - 6, int(rows[0]) - 6, int(columns[-1]) + 7, int(rows[-1]) + 7)
+        by_box = net.estimate(depth=depth_m, box=edges, camera=CAMERA, object="bracket")
+        assert by_box.camera_from_model is not None, by_box.reason
+        assert float(add_m(by_box.camera_from_model, truth, bracket().vertices_m)) < 0.005
+        assert by_box.name == "input"
+        assert "search" in by_box.seconds
+        by_mask = net.estimate(depth=depth_m, mask=mask.numpy(), camera=CAMERA, object="bracket")
+        assert by_mask.camera_from_model is not None, by_mask.reason
+        apart_m = add_m(by_box.camera_from_model, by_mask.camera_from_model, bracket().vertices_m)
+        assert float(apart_m) < 0.005
 
 
-def test_what_is_followed_must_be_surer(net: Registration, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A track that begins at a wrong pose stays there."""
-    view = view_input(table(), None, CAMERA, "bracket", "view", None)
-    assert len(net.find_in(view, ["bracket"], is_sure=True)) == 2
-    monkeypatch.setattr(find, "_ANOTHER", -100.0)
-    assert len(net.find_in(view, ["bracket"])) >= 1
-    assert not net.find_in(view, ["bracket"], is_sure=True)
+def test_a_box_without_the_object_is_refused(net: Registration) -> None:
+    found = net.estimate(depth=table(), box=(130, 180, 200, 235), camera=CAMERA, object="bracket")
+    assert found.camera_from_model is None
+    assert found.reason
+
+
+def test_a_mask_that_does_not_fit_is_searched_as_a_region(net: Registration) -> None:
+    """A loose mask shows wall beside the object, which is no evidence against the right pose."""
+    _, mask = view_of(bracket(), TRUTHS[0])
+    loose = grow_mask(mask, 12)
+    found = net.estimate(depth=table(), mask=loose.numpy(), camera=CAMERA, object="bracket")
+    assert found.camera_from_model is not None, found.reason
+    assert float(add_m(found.camera_from_model, TRUTHS[0], bracket().vertices_m)) < 0.005

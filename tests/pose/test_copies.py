@@ -1,0 +1,143 @@
+"""Symmetries, near-symmetric copies and look-alikes of a model, and the words for them."""
+
+import math
+import re
+from functools import cache
+from typing import Any
+
+import pytest
+import torch
+import trimesh as _trimesh
+from tests.pose.synthetic_objects import bar, bottle, box_faces, bracket, gear, pose_at
+
+from depthpose.core.rigid import Rigid, geodesic_rad
+from depthpose.pose.copies import SymmetricCopies, difference_of, find_copies, near_symmetry_lines
+from depthpose.pose.mesh import make_model, turn_about, with_found_symmetries
+from depthpose.pose.synthetic.parts import make_part
+
+trimesh: Any = _trimesh  # its classes carry no types
+ORIGIN = torch.zeros(3, dtype=torch.float64)
+
+
+def rotation(axis: list[float], degrees: float) -> Rigid:
+    angle = torch.tensor(math.radians(degrees), dtype=torch.float64)
+    return turn_about(torch.tensor(axis).double(), ORIGIN, angle)
+
+
+def degrees_to(motions: Rigid, wanted: Rigid) -> float:
+    """Angle between a motion and the nearest of several."""
+    if len(motions.R) == 0:
+        return math.inf
+    return math.degrees(float(geodesic_rad(motions.R, wanted.R.expand_as(motions.R)).min()))
+
+
+def every_copy(copies: SymmetricCopies) -> Rigid:
+    """The copies with those of their poses that are the same after a symmetry."""
+    moved = copies.copies[:, None] @ copies.symmetries
+    return Rigid(moved.R.flatten(0, 1), moved.t_m.flatten(0, 1))
+
+
+@cache
+def copies_of_gear(keyway_mm: float) -> SymmetricCopies:
+    return find_copies(with_found_symmetries(gear(12, keyway_mm), None, is_taken=True))
+
+
+def test_a_gear_is_the_same_after_a_step_of_any_number_of_teeth() -> None:
+    copies = copies_of_gear(0.0)
+    for step in range(1, 12):
+        about = rotation([0.0, 0, 1.0], 30.0 * step)
+        assert degrees_to(copies.symmetries, about) < 2, step
+    assert len(copies.copies.R) <= 1, "all are one pose, but for the two faces at most"
+
+
+def test_a_keyway_makes_the_steps_of_a_gear_other_poses() -> None:
+    copies = copies_of_gear(1.0)
+    for step in range(1, 12):
+        about = rotation([0.0, 0, 1.0], 30.0 * step)
+        assert degrees_to(copies.symmetries, about) > 15, step
+        assert degrees_to(every_copy(copies), about) < 2, step
+
+
+def test_a_gear_says_how_much_its_keyway_deviates() -> None:
+    lines = near_symmetry_lines(with_found_symmetries(gear(12, 1.0), None, is_taken=True))
+    assert lines
+    for line in lines:
+        assert re.fullmatch(r"rotated by \d+ degrees about .* \(\d+\.\d%\)", line), line
+
+
+@pytest.mark.parametrize("bump_m", [0.002, 0.004])
+def test_the_ends_of_a_bar_that_differ_a_little_are_copies_and_no_symmetries(
+    bump_m: float,
+) -> None:
+    copies = find_copies(with_found_symmetries(bar(bump_m), None, is_taken=True))
+    for axis in ([0, 1.0, 0], [0, 0, 1.0]):
+        assert degrees_to(copies.symmetries, rotation(axis, 180)) > 90
+        assert degrees_to(every_copy(copies), rotation(axis, 180)) < 2
+    # About the long axis it is the same.
+    assert degrees_to(copies.symmetries, rotation([1.0, 0, 0], 180)) < 2
+
+
+def test_what_is_declared_is_no_copy() -> None:
+    flange = find_copies(make_part("flange"))
+    for step in range(1, 6):
+        assert degrees_to(flange.symmetries, rotation([0.0, 0, 1.0], 60.0 * step)) < 1
+        assert degrees_to(flange.copies, rotation([0.0, 0, 1.0], 60.0 * step)) > 20
+    upright = find_copies(bottle())
+    assert len(upright.copies.R) == 1, "after any rotation about its axis it is one pose"
+    assert float(upright.copies.R[0, 2, 2]) < -0.99, "it may stand on its head"
+
+
+def test_what_looks_alike_from_no_two_sides_has_no_copy() -> None:
+    copies = find_copies(bracket())
+    assert len(copies.symmetries.R) == 1
+    assert len(copies.copies.R) == 0
+    assert copies.mirror > 0.02
+
+
+def test_a_ball_is_one_pose_whatever_its_rotation() -> None:
+    mesh = trimesh.creation.icosphere(subdivisions=3, radius=0.05)
+    vertices_m, faces = torch.tensor(mesh.vertices), torch.tensor(mesh.faces).long()
+    ball = make_model(vertices_m, faces, name="ball", number=1)
+    copies = find_copies(with_found_symmetries(ball, None, is_taken=True))
+    assert len(copies.copies.R) == len(copies.lookalikes.R) == 0
+    first = pose_at(seed=1).double()
+    other = Rigid(pose_at(seed=2).R.double(), first.t_m)[None]
+    assert bool(copies.is_same(first, other, copies.symmetries).all())
+    beside = Rigid(first.R, first.t_m + torch.tensor([0.02, 0, 0]))[None]
+    assert not bool(copies.is_same(first, beside, copies.symmetries).any())
+
+
+def test_two_poses_are_one_where_both_angle_and_distance_are_small() -> None:
+    copies, pose = find_copies(bracket()), pose_at(seed=1).double()
+    identity = copies.symmetries
+    for degrees, is_same in ((3.0, True), (15.0, False)):
+        other = (pose @ rotation([0.0, 0, 1.0], degrees))[None]
+        assert bool(copies.is_same(pose, other, identity)[0]) == is_same
+    for shift, is_same in ((0.02, True), (0.2, False)):
+        moved = pose.t_m + torch.tensor([shift * copies.diameter_m, 0, 0])
+        assert bool(copies.is_same(pose, Rigid(pose.R, moved)[None], identity)[0]) == is_same
+
+
+def test_half_turns_about_the_principal_axes_are_look_alikes() -> None:
+    corners, faces = box_faces()
+    sizes = torch.tensor([0.2, 0.03, 0.03])
+    ends = torch.tensor([0.03, 0.03, 0.06])
+    at = torch.tensor([0.1, 0.0, 0.03])
+    vertices = torch.cat([corners * sizes, corners * ends + at])
+    profile = make_model(vertices, torch.cat([faces, faces + 8]), name="profile", number=1)
+    copies = find_copies(profile)
+    every = Rigid.cat([copies.copies, copies.lookalikes])
+    for axis in ([1.0, 0, 0], [0, 1.0, 0], [0, 0, 1.0]):
+        assert degrees_to(every, rotation(axis, 180)) < 20, axis
+
+
+def test_words_tell_the_axis_and_the_shift() -> None:
+    copies, first = find_copies(bar()), pose_at(seed=1).double()
+    turned = first @ rotation([0.0, 0, 1.0], 180)
+    assert difference_of(turned, first, copies) == "rotated by 180 degrees about the short axis"
+    moved = Rigid(turned.R, turned.t_m + torch.tensor([0.03, 0, 0]))
+    words = "rotated by 180 degrees about the short axis and shifted by 30 mm"
+    assert difference_of(moved, first, copies) == words
+    oblique = first @ rotation([1.0, 1.0, 0], 90)
+    words = "rotated by 90 degrees about the model's axis (0.71, 0.71, 0.00)"
+    assert difference_of(oblique, first, copies) == words

@@ -1,0 +1,155 @@
+"""Evidence of competing poses to probabilities, a status and its reason."""
+
+import math
+from dataclasses import replace
+
+import pytest
+import torch
+from tests.pose.synthetic_objects import pose_at
+
+from depthpose.core.errors import InputError
+from depthpose.core.rigid import Rigid
+from depthpose.pose.config import EstimateConfig
+from depthpose.pose.decide import (
+    PRIOR_MASKED,
+    PRIOR_PROPOSED,
+    Competition,
+    Hypothesis,
+    Rate,
+    contradiction,
+    log_odds_right,
+    probability_right,
+    share_among_copies,
+    share_among_poses,
+    with_status,
+)
+from depthpose.pose.types import Alternative, Evidence, PoseEstimate
+
+GOOD = Evidence(
+    visible=40.0, supported=38.0, unobserved=2.0, seen_through=0.0, bulging=0.0, beside=0.0,
+    rms=0.5, noise_m=0.001,
+)  # fmt: skip
+"""What a right pose leaves."""
+BAD = replace(GOOD, supported=20.0, unobserved=6.0, seen_through=8.0, bulging=6.0, rms=1.3)
+"""What a wrong one leaves."""
+
+
+def hypothesis(evidence: Evidence, votes_rad: float | None = None, color: float = 0) -> Hypothesis:
+    return Hypothesis(
+        pose=pose_at().double(), covariance=torch.eye(6), residual_m=0.001, evidence=evidence,
+        votes_rad=votes_rad, log_color=color,
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize("rate", [Rate(mean=0.1, shape=1.0), Rate(mean=0.5, shape=3.0)])
+@pytest.mark.parametrize("area", [1.0, 30.0])
+def test_a_rate_is_a_distribution_of_counts(rate: Rate, area: float) -> None:
+    probabilities = [math.exp(rate.log_likelihood(count, area)) for count in range(2000)]
+    assert sum(probabilities) == pytest.approx(1)
+    mean = sum(count * p for count, p in enumerate(probabilities))
+    assert mean == pytest.approx(rate.mean * area, rel=1e-6)
+
+
+def test_each_kind_of_contradiction_lowers_the_probability() -> None:
+    right = probability_right(GOOD, PRIOR_MASKED)
+    assert right > 0.99
+    for kind in ("seen_through", "bulging", "beside"):
+        before = right
+        evidence = GOOD
+        for patches in (2.0, 8.0, 20.0):
+            evidence = replace(GOOD, supported=38.0 - patches, **{kind: patches})
+            assert evidence.contradicted == patches
+            after = probability_right(evidence, PRIOR_MASKED)
+            assert after < before, (kind, patches)
+            before = after
+        # Where the rest lies no nearer than it does by accident, it is refused.
+        assert probability_right(replace(evidence, rms=1.7), PRIOR_PROPOSED) < 0.1, kind
+
+
+def test_what_was_not_observed_lowers_it_less_than_what_contradicts() -> None:
+    hidden = replace(GOOD, supported=20.0, unobserved=20.0)
+    through = replace(GOOD, supported=20.0, seen_through=18.0)
+    assert log_odds_right(through) < log_odds_right(hidden) < log_odds_right(GOOD)
+
+
+def test_a_pose_that_a_search_proposed_needs_more_evidence_than_one_in_a_mask() -> None:
+    evidence = replace(GOOD, supported=28.0, unobserved=10.0, seen_through=2.0)
+    masked, proposed = (
+        probability_right(evidence, odds) for odds in (PRIOR_MASKED, PRIOR_PROPOSED)
+    )
+    assert masked > proposed
+    odds = [p / (1 - p) for p in (masked, proposed)]
+    assert odds[0] / odds[1] == pytest.approx(PRIOR_MASKED / PRIOR_PROPOSED, rel=1e-6)
+
+
+def test_poses_share_the_probability_of_one() -> None:
+    shares = share_among_poses([hypothesis(GOOD), hypothesis(BAD), hypothesis(BAD)])
+    assert float(shares.sum()) == pytest.approx(1)
+    assert float(shares[0]) > 0.99
+    assert float(shares[1]) == float(shares[2])
+    assert share_among_poses([hypothesis(BAD)]).tolist() == [1.0]
+
+
+def test_copies_share_by_a_patch_that_tells_them_apart() -> None:
+    """A keyway where the model has none contradicts a copy by a few patches, of very many."""
+    keyway = replace(GOOD, supported=35.0, bulging=1.5, seen_through=1.5)
+    shares = share_among_copies([hypothesis(GOOD), *[hypothesis(keyway)] * 3])
+    assert float(shares.sum()) == pytest.approx(1)
+    assert float(shares[0]) > float(shares[1])
+    alike = share_among_copies([hypothesis(GOOD)] * 4)
+    assert alike.tolist() == pytest.approx([0.25] * 4)
+
+
+def test_votes_and_colour_tell_apart_what_depth_does_not() -> None:
+    shares = share_among_poses([hypothesis(GOOD, votes_rad=0.1), hypothesis(GOOD, votes_rad=1.0)])
+    assert float(shares[0]) > 0.95
+    for share in (share_among_poses, share_among_copies):
+        shares = share([hypothesis(GOOD, color=0.0), hypothesis(GOOD, color=math.log(9.0))])
+        assert shares.tolist() == pytest.approx([0.1, 0.9])
+
+
+def test_a_pose_and_its_copies_have_the_share_of_the_group() -> None:
+    competition = Competition(
+        best=hypothesis(GOOD), best_share=0.5, copies=[(hypothesis(GOOD), 0.3)] * 1,
+        others=[(hypothesis(BAD), 0.2)],
+    )  # fmt: skip
+    assert competition.group_share == pytest.approx(0.8)
+
+
+@pytest.mark.parametrize(
+    ("kind", "words"),
+    [
+        ("seen_through", "the camera saw through 50% of the posed surface"),
+        ("bulging", "50% of its readings lie before the posed surface"),
+        ("beside", "50% of the object's readings lie beside the posed silhouette"),
+        ("unobserved", "50% of the posed surface was not observed"),
+    ],
+)
+def test_a_refusal_says_what_contradicts_the_pose_most(kind: str, words: str) -> None:
+    evidence = replace(GOOD, supported=20.0, unobserved=0.0)
+    evidence = replace(evidence, **{kind: 20.0})
+    reason = contradiction(evidence, 0.125)
+    assert reason.startswith("the best pose is right with a probability of 12%: ")
+    assert words in reason
+
+
+def test_an_answer_below_the_wanted_certainty_is_ambiguous() -> None:
+    pose = Rigid(torch.eye(3), torch.zeros(3))
+    other = Alternative(camera_from_model=pose, probability=0.2, difference="so")
+    sure = PoseEstimate(
+        name="a", object="b", status="ok", camera_from_model=pose, certainty=0.6,
+        alternatives=(other, replace(other, is_copy=True)),
+    )  # fmt: skip
+    found = with_status(sure, 0.9)
+    assert (found.status, found.is_ok, found.is_posed) == ("ambiguous", False, True)
+    assert found.camera_from_model is pose
+    words = "this pose has a certainty of 60 %, below min_certainty 90 %: "
+    assert found.reason == words + "1 others fit too", "copies are the same up to near-symmetry"
+    alone = with_status(replace(sure, alternatives=()), 0.9)
+    assert alone.reason == words + "others may fit"
+    assert with_status(found, 0.5).status == "ok"
+    assert with_status(found, 0.5).reason == ""
+    refusal = PoseEstimate(name="a", object="b", status="doubtful", reason="so")
+    assert with_status(refusal, 0.5) is refusal
+    with pytest.raises(InputError, match=r"min_certainty must be in \[0, 1\], got 1.5"):
+        EstimateConfig(min_certainty=1.5)
