@@ -23,7 +23,7 @@ from depthpose.pose.types import ObjectModel
 
 SAME_DIAMETERS = 0.1  #: mean distance of the model's points up to which two poses are one
 SAME_RAD = math.radians(8)  #: and angle; both must hold
-_STEP_RAD = math.pi / 16  # between the rotations about a continuous axis that are one pose
+_STEP_RAD = math.pi / 32  # half of the step between rotations about an axis: within SAME_RAD
 _FOUND_STEP_RAD = math.pi / 18  # and about one that was found within a tolerance
 _COMPARED = 100  # points of the model by which poses are compared
 _ALONG = math.cos(math.radians(15))
@@ -115,7 +115,7 @@ def find_copies(model: ObjectModel) -> SymmetricCopies:
         symmetries=symmetries,
         copies=_empty(),
         lookalikes=_empty(),
-        trained=symmetry_transforms(model.symmetries, 2 * _STEP_RAD).double(),
+        trained=symmetry_transforms(model.symmetries, 4 * _STEP_RAD).double(),
         mirror=mirror_deviation(model),
         points_m=compared_m,
         middle_m=middle_m,
