@@ -27,7 +27,8 @@ from depthpose.pose.color import (
     copies_about_axis,
     settle_spin,
 )
-from depthpose.pose.mesh import read_model
+from depthpose.pose.mesh import read_model, with_found_symmetries
+from depthpose.pose.registration import Registration
 from depthpose.pose.types import Axis, ColorImage, ObjectModel, Symmetries
 
 Z = Axis(direction=torch.tensor([0.0, 0, 1]), point_m=torch.zeros(3))
@@ -300,3 +301,18 @@ def test_a_can_is_as_wide_as_drawn() -> None:
     assert float(width_px) == pytest.approx(2 * CAN_M[0] / 0.5 * float(K[0, 0]), rel=0.03)
     assert float(height_px) == pytest.approx(CAN_M[1] / 0.466 * float(K[1, 1]), rel=0.05)
     assert isinstance(view.color, ColorImage)
+
+
+def test_a_printed_box_is_posed_as_its_print_says(tmp_path: Path) -> None:
+    """By shape alone a box fits at four poses; a colour image says which of them is right."""
+    model = replace(box(tmp_path), name="thing")
+    net = Registration([with_found_symmetries(model, None, is_taken=True)])
+    pose = random_pose(1)
+    view = drawn_view(textured_box(), pose)
+    (found,) = net.estimate_many([view])
+    assert found.camera_from_model is not None, found.reason
+    assert math.degrees(float(geodesic_rad(found.camera_from_model.R.double(), pose.R))) < 3
+    assert found.copy_certainty is not None
+    assert found.copy_certainty > 0.9
+    (by_shape,) = net.estimate_many([replace(view, color=None)])
+    assert by_shape.is_ok, by_shape.reason

@@ -10,10 +10,10 @@ from tests.pose.synthetic_objects import CAMERA, K, Oracle, bracket, pose_at, ti
 from depthpose.core.camera import back_project
 from depthpose.core.errors import InputError
 from depthpose.core.rigid import Rigid, rotation_by
-from depthpose.pose.track import TrackedObject, track
 from depthpose.pose.metrics import add_m
 from depthpose.pose.predictions import Prediction, parse_prediction, prediction_row
 from depthpose.pose.surface import compare_depths, prepare_surface
+from depthpose.pose.track import TrackedObject, track
 from depthpose.pose.types import Alternative, PoseEstimate
 
 HIDDEN = 0.68
@@ -180,17 +180,18 @@ def test_what_else_it_may_be_moves_along() -> None:
     poses = moving(2)
     half = Rigid(torch.diag(torch.tensor([-1.0, -1.0, 1.0])), torch.zeros(3))
     other = Alternative(
-        camera_from_model=poses[0] @ half, probability=0.3, difference="rotated by 180 degrees"
-    )
+        camera_from_model=poses[0] @ half, probability=0.3, difference="rotated by 180 degrees",
+        is_copy=True,
+    )  # fmt: skip
     start = PoseEstimate(
-        name="a", object="bracket", status="ok", camera_from_model=poses[0], certainty=0.7,
-        alternatives=(other,),
+        name="a", object="bracket", status="ok", camera_from_model=poses[0], certainty=0.8,
+        copy_certainty=0.5, alternatives=(other,),
     )  # fmt: skip
     net = oracle(poses)
     model = net.weights.models[0]
     known = TrackedObject(
         model=model, surface=prepare_surface(model), refusal=net.weights.refusal,
-        icp=net.config.icp, look=lambda _: start,
+        config=net.config, look=lambda _: start,
     )  # fmt: skip
     views = [back_project(frame(p).double(), K).reshape(-1, 3) for p in poses]
     from depthpose.pose.types import CloudInput
@@ -198,7 +199,11 @@ def test_what_else_it_may_be_moves_along() -> None:
     inputs = [CloudInput(name=str(k), points_m=v, object="bracket") for k, v in enumerate(views)]
     first, second = track(inputs, known)
     assert (first.tracking, second.tracking) == ("found", "tracked")
-    assert second.certainty == 0.7
+    assert second.certainty is not None
+    assert second.copy_certainty is not None
+    assert second.certainty > 0.8, "another frame agrees"
+    assert second.copy_certainty == pytest.approx(second.certainty * 0.5 / 0.8)
+    assert second.alternatives[0].probability == pytest.approx(second.certainty * 0.3 / 0.8)
     moved = second.alternatives[0].camera_from_model
     assert float(add_m(moved, poses[1] @ half, model.vertices_m)) < 0.003
 
