@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import replace
+from typing import NamedTuple
 
 from jaxtyping import Float64
 from torch import Tensor
@@ -23,7 +24,7 @@ _SHARE_POINTS = 1000  # of the cloud that say what a pose leaves unexplained
 _UNEXPLAINED_MORE = 0.25
 """A competing pose that leaves by so much more of the readings unexplained is not compared."""
 _MOST_LEADING = 8  #: poses that are compared, and of one of them so many copies
-_MOST_COPIES = 24
+_MOST_COPIES = 36
 
 
 def compete(
@@ -69,8 +70,9 @@ def compete(
     leading = [hypothesis(refined)]
     for candidate in _refined(cloud_m, refined, starts, surface, icp, _MOST_LEADING):
         before = Rigid.stack([h.pose for h in leading])
-        if not bool(copies.is_same(candidate.camera_from_model, before, alike).any()):
-            leading.append(hypothesis(candidate))
+        pose = candidate.refined.camera_from_model
+        if not bool(copies.is_same(pose, before, alike).any()):
+            leading.append(hypothesis(candidate.refined))
     shares = share_among_poses(leading)
     winner = int(shares.argmax())
     others_shares = [(h, float(shares[k])) for k, h in enumerate(leading) if k != winner]
@@ -84,8 +86,12 @@ def compete(
         starts = Rigid.cat([color_copies(pose, prepared.model, view), starts])
     for candidate in _refined(cloud_m, source, starts, surface, icp, _MOST_COPIES):
         before = Rigid.stack([h.pose for h in group])
-        if not bool(copies.is_same(candidate.camera_from_model, before, copies.symmetries).any()):
-            group.append(hypothesis(candidate))
+        # Refinement may slide a copy onto another, where nothing observed tells them apart: then
+        # it stays where the symmetry has it.
+        for copy in (candidate.refined, candidate.unrefined):
+            if not bool(copies.is_same(copy.camera_from_model, before, copies.symmetries).any()):
+                group.append(hypothesis(copy))
+                break
     copy_shares = float(shares[winner]) * share_among_copies(group)
     best = int(copy_shares.argmax())
     return Competition(
@@ -94,6 +100,13 @@ def compete(
         copies=[(h, float(copy_shares[k])) for k, h in enumerate(group) if k != best],
         others=others_shares,
     )
+
+
+class _Candidate(NamedTuple):
+    """A competing pose, refined and as it was proposed."""
+
+    refined: RefinedPose
+    unrefined: RefinedPose
 
 
 def _log_color(pose: Rigid, prepared: PreparedObject, view: ViewInput) -> float:
@@ -108,10 +121,11 @@ def _refined(
     surface: Surface,
     icp: IcpConfig | None,
     most: int,
-) -> list[RefinedPose]:
+) -> list[_Candidate]:
     """Refine competing poses, but for those that explain much less than the leading one."""
+    unrefined = [replace(leading, camera_from_model=starts[k]) for k in range(len(starts.R))]
     if icp is None:
-        return [replace(leading, camera_from_model=starts[k]) for k in range(len(starts.R))]
+        return [_Candidate(candidate, candidate) for candidate in unrefined]
     if len(starts.R) == 0:
         return []
     rough = refine_roughly(cloud_m, starts, surface, icp)
@@ -128,15 +142,16 @@ def _refined(
         start_distance_diameters=icp.end_distance_diameters,
     )
     batch = refine_pose(cloud_m, rough[order], surface, short)
-    return [
-        RefinedPose(
+    candidates: list[_Candidate] = []
+    for k, number in enumerate(order.tolist()):
+        refined = RefinedPose(
             camera_from_model=batch.camera_from_model[k],
             covariance=batch.covariance[k],
             residual_m=batch.residual_m[k],
             inlier_share=batch.inlier_share[k],
         )
-        for k in range(len(order))
-    ]
+        candidates.append(_Candidate(refined, unrefined[number]))
+    return candidates
 
 
 def _unexplained(
