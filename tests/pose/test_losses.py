@@ -58,6 +58,13 @@ def test_one_copy_serves_a_whole_instance() -> None:
     assert float(loss) == pytest.approx((0 + 4 / 3) / 2)
 
 
+def test_an_instance_without_points_is_none_that_is_right() -> None:
+    copies = torch.tensor([[[[0.0, 0, 1]]], [[[0.0, 1, 0]]], [[[1.0, 0, 0]]]])
+    found = torch.tensor([[[0.0, 0, -1]], [[0.0, -1, 0]]])
+    loss = direction_loss(found, torch.zeros(2, 3), copies, torch.tensor([0, 1]))
+    assert float(loss) == pytest.approx(4 / 3)
+
+
 def test_gradients_are_finite_on_a_keypoint_and_reach_no_truth() -> None:
     points = torch.zeros(2, 3)
     found = torch.zeros(2, 1, 3, requires_grad=True)
