@@ -2,9 +2,11 @@ import pytest
 import torch
 from torch import Tensor
 
+from depthpose.core.rigid import Rigid, rotation_by
 from depthpose.pose.losses import (
     POINT_LOSSES,
     direction_loss,
+    model_point_loss,
 )
 
 
@@ -82,3 +84,25 @@ def test_no_points_no_loss() -> None:
     loss = direction_loss(found, torch.zeros(0, 3), torch.zeros(1, 1, 2, 3), nothing)
     loss.backward()
     assert float(loss.detach()) == 0
+
+
+def test_a_pose_that_looks_like_the_truth_costs_nothing() -> None:
+    """Symmetries are motions in the model's frame, before the pose."""
+    truth = Rigid(rotation_by(random(2, 3, seed=1)), random(2, 3, seed=2))
+    turn = Rigid(rotation_by(random(3, seed=3)), random(3, seed=4))
+    eye = Rigid(torch.eye(3).double(), torch.zeros(3).double())
+    copies = Rigid.stack([Rigid.stack([eye, turn])] * 2)
+    points_m = random(2, 20, 3, seed=5)
+    alike = truth @ Rigid.stack([turn, turn])
+    assert model_point_loss(alike, truth, points_m, copies).tolist() == pytest.approx([0, 0])
+    other = Rigid.stack([turn, turn]) @ truth
+    assert float(model_point_loss(other, truth, points_m, copies).min()) > 0.1
+
+
+def test_the_loss_of_a_shifted_pose_is_its_shift() -> None:
+    truth = Rigid(rotation_by(random(2, 3, seed=1)), random(2, 3, seed=2))
+    shifted = Rigid(truth.R, truth.t_m + torch.tensor([0.0, 3.0, 4.0]))
+    eye = Rigid(torch.eye(3).double()[None], torch.zeros(1, 3).double())
+    copies = Rigid.stack([eye, eye])
+    found = model_point_loss(shifted, truth, random(2, 20, 3, seed=5), copies)
+    assert found.tolist() == pytest.approx([5, 5])
