@@ -532,7 +532,9 @@ def answer_of(
         "seconds": {**seconds, "check": time.perf_counter() - began},
     }
     if reason is not None:  # all that was found out but the pose: nobody takes it for an answer
-        return PoseEstimate(status=reason.status, reason=reason.reason, **facts)
+        is_doubted_cloud = cloud.view is None and reason.status == "doubtful"
+        said = reason.reason + OTHER_FRAME * is_doubted_cloud
+        return PoseEstimate(status=reason.status, reason=said, **facts)
     if len(free):
         covariance = without_motions(covariance, free)
     alternatives = tuple(
@@ -555,6 +557,13 @@ def answer_of(
         **facts,
     )
     return with_status(answer, config.min_certainty)
+
+
+OTHER_FRAME = (
+    ". Or is the cloud not in the camera's frame (x right, y down, z forward)? A robot's base and "
+    "the world have z up: give it as the camera saw it"
+)
+"""What may be wrong with a cloud that fits no pose: its origin is not where the camera was."""
 
 
 def _chance_found(fit: Fit, signals: Mapping[str, float], fixed: float, diameter_m: float) -> float:
