@@ -6,6 +6,7 @@ from pathlib import Path
 import pytest
 import torch
 from PIL import Image
+from tests.pages.read_page import read_page
 from tests.pose.synthetic_objects import (
     K,
     Oracle,
@@ -21,6 +22,7 @@ from depthpose.core.camera import Camera, write_camera
 from depthpose.core.files import write_depth_png
 from depthpose.pose.datasets import encode_rle
 from depthpose.pose.datasets.masks import mask_box
+from depthpose.pose.types import PoseEstimate, ViewInput
 from depthpose.pose.weights import write_pose_weights
 
 Scene = tuple[list[str], dict[str, torch.Tensor]]
@@ -233,3 +235,42 @@ def test_a_base_that_is_none_is_refused(
     words += ["--box", "1,1,90,90", "--object", "bracket", "--base-from-camera", *given.split()]
     assert main(words) == 2
     assert reason in capsys.readouterr().err
+
+
+def test_every_object_that_is_looked_for_has_a_row(
+    scene: Scene,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    """The bracket is found, the bottle is not: tables, poses.json and page say both."""
+    words, _ = scene
+
+    def find_in(_: Oracle, view: ViewInput, __: object) -> list[PoseEstimate]:
+        if not bool(view.depth_m.isfinite().any()):
+            return []
+        pose = POSES["bracket"]
+        return [PoseEstimate(name="x", object="bracket", status="ok", camera_from_model=pose)]
+
+    monkeypatch.setattr(Oracle, "find_in", find_in)
+    write_depth_png(tmp_path / "depth" / "dark.png", torch.full((240, 320), torch.nan), 0.001)
+    words[-1] = str(tmp_path / "depth")
+    assert main(words) == 0
+    rows = answers(tmp_path)
+    assert {name: (row["object"], row["status"]) for name, row in rows.items()} == {
+        "000012_0": ("bracket", "ok"),
+        "000012_1": ("bottle", "doubtful"),
+        "dark_0": ("bracket", "too few points"),
+        "dark_1": ("bottle", "too few points"),
+    }
+    said = capsys.readouterr().out
+    assert "2 inputs, 4 answers: 1 doubtful, 1 ok, 2 too few points" in said
+    reason = rows["000012_1"]["reason"]
+    assert "bottle" in reason
+    assert f"000012_1: no bottle: {reason}" in said
+    page = read_page(tmp_path / "out/report.html")
+    assert any(reason in cell for cell in page.texts["td"])
+    # A rerun looks for nothing again.
+    monkeypatch.setattr(Oracle, "find_in", lambda *_: pytest.fail("it was searched again"))
+    assert main(words) == 0
+    assert answers(tmp_path) == rows

@@ -225,7 +225,11 @@ def test_a_prediction_of_another_shape_is_stretched_with_a_notice_or_refused(
         evaluate(pairs, cut, "kitti-2015")
     squeezed = written("squeezed", lambda px: resized_map(px, H, W // 2) / 2)
     with pytest.warns(Notice, match="of another aspect, so it is stretched"):
-        evaluate(pairs, squeezed, "kitti-2015")
+        found = evaluate(pairs, squeezed, "kitti-2015")
+    # Columns alone were squeezed: rows, which are as many as before, scale no disparity.
+    plain = written("plain", lambda px: resized_map(resized_map(px, H, W // 2), H, W))
+    expected = evaluate(pairs, plain, "kitti-2015").rows[0].metrics["epe_px"]
+    assert found.rows[0].metrics["epe_px"] == pytest.approx(expected, abs=1e-4)
 
 
 def test_depth_files_of_others_count_as_disparity(pairs: Dataset, tmp_path: Path) -> None:

@@ -10,9 +10,10 @@ import torch
 import torch.nn.functional as F
 from tests.depth.random_norms import with_random_norms
 
+from depthpose.core.camera import Camera
 from depthpose.core.devices import PrecisionNotice, computes_bf16
 from depthpose.core.errors import InputError
-from depthpose.depth.config import MatcherConfig, PSMNetConfig
+from depthpose.depth.config import MatcherConfig, PSMNetConfig, Speed
 from depthpose.depth.stereo import (
     PSMNet,
     PSMNetMatcher,
@@ -151,6 +152,22 @@ def test_more_disparities_than_in_training_equal_a_network_made_for_them() -> No
 
 
 @pytest.mark.skipif(not computes_bf16("cpu"), reason="this processor has no arithmetic for bf16")
+@pytest.mark.parametrize(
+    ("speed", "focal_px", "disparities"),
+    [("quick", 400.0, 64), ("fine", 40.0, 64), ("fine", 70.0, 96), ("fine", 400.0, 96)],
+)
+def test_a_larger_size_is_searched_through_half_as_many_disparities_more_at_most(
+    speed: Speed, focal_px: float, disparities: int
+) -> None:
+    """The filters of the volume know no more."""
+    config = PSMNetConfig(
+        width=2, max_disparity_px=64, blocks=(1, 1, 1, 1), pools=(2,), work_focal_px=50.0
+    )
+    matcher = PSMNetMatcher(random_network(config), MatcherConfig(speed=speed))
+    K = torch.tensor([[focal_px, 0, 100], [0, focal_px, 50], [0, 0, 1]], dtype=torch.float64)
+    assert matcher.work_disparities(Camera(width=200, height=100, K=K)) == disparities
+
+
 def test_bf16_stays_near() -> None:
     network = random_network(SMALL)
     left, right = torch.rand(2, 3, 64, 96)

@@ -2,9 +2,11 @@ import pytest
 import torch
 from torch import Tensor
 
+from depthpose.core.rigid import Rigid, rotation_by
 from depthpose.pose.losses import (
     POINT_LOSSES,
     direction_loss,
+    model_point_loss,
 )
 
 
@@ -58,6 +60,13 @@ def test_one_copy_serves_a_whole_instance() -> None:
     assert float(loss) == pytest.approx((0 + 4 / 3) / 2)
 
 
+def test_an_instance_without_points_is_none_that_is_right() -> None:
+    copies = torch.tensor([[[[0.0, 0, 1]]], [[[0.0, 1, 0]]], [[[1.0, 0, 0]]]])
+    found = torch.tensor([[[0.0, 0, -1]], [[0.0, -1, 0]]])
+    loss = direction_loss(found, torch.zeros(2, 3), copies, torch.tensor([0, 1]))
+    assert float(loss) == pytest.approx(4 / 3)
+
+
 def test_gradients_are_finite_on_a_keypoint_and_reach_no_truth() -> None:
     points = torch.zeros(2, 3)
     found = torch.zeros(2, 1, 3, requires_grad=True)
@@ -75,3 +84,25 @@ def test_no_points_no_loss() -> None:
     loss = direction_loss(found, torch.zeros(0, 3), torch.zeros(1, 1, 2, 3), nothing)
     loss.backward()
     assert float(loss.detach()) == 0
+
+
+def test_a_pose_that_looks_like_the_truth_costs_nothing() -> None:
+    """Symmetries are motions in the model's frame, before the pose."""
+    truth = Rigid(rotation_by(random(2, 3, seed=1)), random(2, 3, seed=2))
+    turn = Rigid(rotation_by(random(3, seed=3)), random(3, seed=4))
+    eye = Rigid(torch.eye(3).double(), torch.zeros(3).double())
+    copies = Rigid.stack([Rigid.stack([eye, turn])] * 2)
+    points_m = random(2, 20, 3, seed=5)
+    alike = truth @ Rigid.stack([turn, turn])
+    assert model_point_loss(alike, truth, points_m, copies).tolist() == pytest.approx([0, 0])
+    other = Rigid.stack([turn, turn]) @ truth
+    assert float(model_point_loss(other, truth, points_m, copies).min()) > 0.1
+
+
+def test_the_loss_of_a_shifted_pose_is_its_shift() -> None:
+    truth = Rigid(rotation_by(random(2, 3, seed=1)), random(2, 3, seed=2))
+    shifted = Rigid(truth.R, truth.t_m + torch.tensor([0.0, 3.0, 4.0]))
+    eye = Rigid(torch.eye(3).double()[None], torch.zeros(1, 3).double())
+    copies = Rigid.stack([eye, eye])
+    found = model_point_loss(shifted, truth, random(2, 20, 3, seed=5), copies)
+    assert found.tolist() == pytest.approx([5, 5])

@@ -13,7 +13,7 @@ from depthpose.core.rigid import Rigid
 from depthpose.pose.config import ObjectsConfig, SensorConfig
 from depthpose.pose.datasets import check_bop, open_bop, write_bop_models, write_bop_scene
 from depthpose.pose.mesh import drawn_triangles, make_model
-from depthpose.pose.synthetic import Objects, make_frames
+from depthpose.pose.synthetic import Objects, make_frames, views
 from depthpose.pose.synthetic.views import (
     draw_view,
     gaze,
@@ -305,3 +305,15 @@ def test_frames_refuse_what_they_cannot_show() -> None:
         next(make_frames([], _FRAME, 1))
     with pytest.raises(InputError, match=r"frame_objects must be in \[1, inf\), got \(0, 2\)"):
         dataclasses.replace(_FRAME, frame_objects=(0, 2))
+
+
+def test_the_projector_throws_the_shadow_of_a_thing_onto_what_lies_behind_it() -> None:
+    """To one side alone, as wide as its disparities differ."""
+    depth_m = torch.full((3, 60), 2.0)
+    depth_m[:, 20:30] = 1.0
+    is_shadowed = views._is_shadowed(depth_m, focal_px=100.0, baseline_m=0.2)
+    columns = is_shadowed[0].nonzero().flatten().tolist()
+    wide_px = 100 * 0.2 * (1 / 1.0 - 1 / 2.0)
+    # Half a pixel more than one is tolerated at its end.
+    assert columns == list(range(30, 30 + int(wide_px) - 2))
+    assert torch.equal(is_shadowed, is_shadowed[:1].expand(3, -1))

@@ -83,6 +83,17 @@ def test_a_foreign_part_is_refused(index: int) -> None:
     assert not registration().estimate_many([given])[0].is_ok
 
 
+def test_a_cloud_in_the_frame_of_a_robot_is_refused_and_its_frame_is_named() -> None:
+    """A camera saw the part from above; the points are in the base's frame, z up."""
+    z_up = torch.tensor([[1.0, 0, 0], [0, -1, 0], [0, 0, -1]])
+    for index in range(3):
+        points_m = view(part(), index).input.points_m.float()
+        base_m = (points_m - points_m.mean(0)) @ z_up.T + torch.tensor([0.05, 0.04, 0.35])
+        found = registration().estimate(cloud=base_m)
+        assert not found.is_ok
+        assert "A robot's base and the world have z up" in found.reason
+
+
 def test_one_seed_gives_one_answer() -> None:
     given = view(part(), 0).input
     first, again = (registration().estimate_many([given])[0] for _ in range(2))

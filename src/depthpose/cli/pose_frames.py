@@ -36,8 +36,9 @@ from depthpose.pose.types import PoseEstimate, ViewInput
 def find_all(method: PoseMethod, inputs: OneObjectOptions, out: Path) -> int:
     """Find objects in every depth image, write the files of each, and give the exit code.
 
-    What is found in NAME is called NAME_0, NAME_1, ...; an image where nothing is found has one
-    entry, NAME, that says so. A rerun goes on where it was, and reads again what could not be read.
+    Every object that is looked for has an entry, found or not: in an image NAME they are called
+    NAME_0, NAME_1, ..., or NAME where one was looked for and not found. A rerun goes on where it
+    was, and reads again what could not be read.
     """
     lens = inputs.camera or inputs.focal_px
     assert inputs.depth is not None
@@ -77,7 +78,7 @@ def find_all(method: PoseMethod, inputs: OneObjectOptions, out: Path) -> int:
             except InputError as error:
                 found = [unreadable(job.name, objects[0], error)]
             else:
-                found = method.find(view, objects) or [nothing_found(view, ", ".join(objects))]
+                found = with_every_object(method.find(view, objects), view, objects)
             own = [Prediction(estimate=one) for one in found]
         results += [
             (one, replace(job, name=one.estimate.name, read=partial(_explained, job, one, method)))
@@ -85,10 +86,24 @@ def find_all(method: PoseMethod, inputs: OneObjectOptions, out: Path) -> int:
         ]
         write_predictions(out, [*(prediction for prediction, _ in results), *left])
     pose_predict.claim(out, settings, [job for _, job in results], pose_predict.is_result_of)
-    answered = [pair for pair in results if pair[0].estimate.is_posed]
-    own_jobs = [job for _, job in answered]
-    pose_predict.write_files([p for p, _ in answered], own_jobs, out, method, inputs=len(jobs))
-    return pose_predict.say_result([prediction for prediction, _ in results], out, len(jobs))
+    predictions = [prediction for prediction, _ in results]
+    searched = [job for _, job in results]
+    pose_predict.write_files(predictions, searched, out, method, inputs=len(jobs))
+    return pose_predict.say_result(predictions, out, len(jobs))
+
+
+def with_every_object(
+    estimates: Sequence[PoseEstimate], view: ViewInput, objects: Sequence[str]
+) -> list[PoseEstimate]:
+    """Add a refusal for each object that was looked for and has no estimate, and number them all.
+
+    They are called NAME_0, NAME_1, ...; a refusal that is alone is called as the image.
+    """
+    there = {estimate.object for estimate in estimates}
+    every = [*estimates, *(nothing_found(view, name) for name in objects if name not in there)]
+    if len(every) == 1 and not every[0].is_posed:
+        return [replace(every[0], name=view.name)]
+    return [replace(estimate, name=f"{view.name}_{k}") for k, estimate in enumerate(every)]
 
 
 def _explained(job: Job[Any], found: Prediction, method: PoseMethod) -> AnyInput:

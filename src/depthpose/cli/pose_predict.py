@@ -668,6 +668,9 @@ def say_result(predictions: list[Prediction], out: Path, inputs: int | None = No
     if len(shown) == 1 and not shown[0].is_ok:
         what = "refused" if shown[0].camera_from_model is None else shown[0].status
         print(f"{what}: {shown[0].reason}")
+    refused = [estimate for estimate in shown if not estimate.is_posed]
+    for estimate in refused[:_SAID] if len(shown) > 1 else ():
+        print(f"{estimate.name}: no {estimate.object}: {estimate.reason}")
     for prediction in predictions[:_SAID]:
         for other in prediction.estimate.alternatives:
             print(f"{prediction.estimate.name}: {other}")
@@ -739,6 +742,9 @@ def _write_page(
         try:
             shown_input = jobs[readable[k]].read()
         except InputError:  # unreadable by now
+            continue
+        is_searched = isinstance(shown_input, ViewInput) and bool(shown_input.mask.all())
+        if is_searched and not estimate.is_posed:  # a whole image; its row says why
             continue
         rgb = None if place is None else image_of[place[:2]]
         model = models[estimate.object]

@@ -64,6 +64,11 @@ INDEPENDENT_SIDES = 6.0
 is that of so few independent observations, however many readings there are."""
 VOTES_RAD = 0.15
 """Mean angle between a network's directions and those to the keypoints at a right pose."""
+OTHER_FRAME = (
+    ". Or is the cloud not in the camera's frame (x right, y down, z forward)? A robot's base and "
+    "the world have z up: give it as the camera saw it"
+)
+"""What may be wrong with a cloud that fits no pose: its origin is not where the camera was."""
 LEAST_AREA = 1.0  # independent patches
 LEAST_NAMED = 0.01  #: alternatives of a smaller probability are not named
 
@@ -256,7 +261,9 @@ def decide(
         "seconds": {**seconds, "decision": time.perf_counter() - began},
     }
     if reason is not None:  # all but the pose, so that nobody takes it for an estimate
-        return PoseEstimate(status=reason.status, reason=reason.reason, **facts)
+        is_doubtful_cloud = cloud.view is None and reason.status == "doubtful"
+        words = reason.reason + OTHER_FRAME * is_doubtful_cloud
+        return PoseEstimate(status=reason.status, reason=words, **facts)
 
     covariance = without_motions(best.covariance, free) if len(free) else best.covariance
     competitors = [(h, share, True) for h, share in competition.copies]
