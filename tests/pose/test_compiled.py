@@ -17,13 +17,13 @@ from depthpose.core.errors import Notice
 from depthpose.core.rigid import Rigid, rotation_by
 from depthpose.pose import compiled
 from depthpose.pose.config import IcpConfig
+from depthpose.pose.icp import RefinedPose, refine_best, refine_pose, refine_roughly
 from depthpose.pose.identity import scale_of
 from depthpose.pose.network import ResUNet, ResUNetConfig
-from depthpose.pose.icp import RefinedPose, refine_best, refine_pose, refine_roughly
+from depthpose.pose.propose.point_pairs import prepare_pairs, vote_poses
 from depthpose.pose.sparse import Voxels, conv
 from depthpose.pose.surface import Surface, look_along_rays, prepare_surface
 from depthpose.pose.synthetic.parts import make_part
-from depthpose.pose.propose.point_pairs import prepare_pairs, vote_poses
 
 pytest.importorskip("numba")
 
