@@ -12,7 +12,7 @@ from tests.pose.synthetic_objects import bracket, cloud_of, pose_at
 
 from depthpose import Registration
 from depthpose.core.errors import InputError
-from depthpose.pose.estimator.inputs import cloud_input
+from depthpose.pose.inputs import cloud_input
 from depthpose.pose.mesh import read_model
 
 TRUTH = pose_at(seed=1)

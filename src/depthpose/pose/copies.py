@@ -25,6 +25,7 @@ SAME_DIAMETERS = 0.1  #: mean distance of the model's points up to which two pos
 SAME_RAD = math.radians(8)  #: and angle; both must hold
 _STEP_RAD = math.pi / 32  # half of the step between rotations about an axis: within SAME_RAD
 _FOUND_STEP_RAD = math.pi / 18  # and about one that was found within a tolerance
+_COPY_DIAMETERS = 0.05  # deviation of a near-symmetric copy: of more it is another pose
 _COMPARED = 100  # points of the model by which poses are compared
 _ALONG = math.cos(math.radians(15))
 _LONGER = 1.15
@@ -96,15 +97,17 @@ def find_copies(model: ObjectModel) -> SymmetricCopies:
     compared_m = take_evenly(points_m, _COMPARED)
     # Symmetries that were found within a tolerance, but for the exact ones, are near-symmetries.
     declared = symmetry_transforms(model.symmetries, _FOUND_STEP_RAD).double()
-    near = [near.model_from_model[None] for near in near_symmetries(model)]
-    copies = Rigid.cat([declared, *near])
+    near = near_symmetries(model)
+    alike = [n.model_from_model[None] for n in near if n.deviation <= _COPY_DIAMETERS]
+    unlike = [n.model_from_model[None] for n in near if n.deviation > _COPY_DIAMETERS]
+    copies = Rigid.cat([declared, *alike])
     found = cached(model, find_turns, "turns")
     rows = torch.tensor(found["turns"], dtype=torch.float64).reshape(-1, 4, 4)
     turns = Rigid(rows[:, :3, :3], rows[:, :3, 3])
     # Half turns about the principal axes: the usual mistake about a long or flat part.
     half = 2 * axes[:, :, None] * axes[:, None] - torch.eye(3).double()
     halves = Rigid(half, middle_m - half @ middle_m)
-    lookalikes = Rigid.cat([turns[found["mostly"] :], halves])
+    lookalikes = Rigid.cat([*unlike, turns[found["mostly"] :], halves])
     copies = Rigid.cat([copies, turns[: found["mostly"]]])
     centre_m = exact.ball_centre_m
     if centre_m is not None:  # every rotation of a ball is the same pose: its centre says where

@@ -5,7 +5,7 @@ contradicts it, the area that was not observed, and its residual. And is the bes
 all? Its evidence is compared with what right and wrong poses leave.
 
 At a right pose a tenth of the visible area is contradicted on average, by edges, reflections and
-dents that the model has not; at a wrong pose half of it. Both shares vary from view to view, so
+dents that the model does not have; at a wrong pose half of it. Both shares vary from view to view, so
 that a count of contradicting patches has a negative binomial distribution: ten patches more say
 much of a small object and little of a large one.
 """
@@ -46,7 +46,7 @@ class Rate:
         return log_binomial + log_none + count * (math.log(area) - math.log(scale + area))
 
 
-RIGHT_CONTRADICTED = Rate(mean=0.1, shape=1.0)
+RIGHT_CONTRADICTED = Rate(mean=0.1, shape=2.0)
 WRONG_CONTRADICTED = Rate(mean=0.5, shape=3.0)
 RIGHT_UNOBSERVED = Rate(mean=0.2, shape=1.0)
 WRONG_UNOBSERVED = Rate(mean=0.5, shape=3.0)
@@ -140,15 +140,20 @@ def share_among_copies(hypotheses: Sequence[Hypothesis]) -> Float64[Tensor, " n"
     area = _common_area(hypotheses)
     weights: list[float] = []
     for hypothesis in hypotheses:
-        fits_right = _log_rates(hypothesis.evidence, area, RIGHT_CONTRADICTED, RIGHT_UNOBSERVED)
-        weights.append(
-            fits_right + _log_fit(hypothesis.evidence.rms) + _log_beside_depth(hypothesis)
-        )
+        evidence = hypothesis.evidence
+        fits_right = RIGHT_CONTRADICTED.log_likelihood(evidence.contradicted, area)
+        fits_right += RIGHT_UNOBSERVED.log_likelihood(evidence.unobserved, area)
+        weights.append(fits_right + _log_fit(evidence.rms) + _log_beside_depth(hypothesis))
     return torch.tensor(weights, dtype=torch.float64).softmax(0)
 
 
 def probability_right(evidence: Evidence, prior_odds: float) -> float:
-    """Probability that a pose is right, up to near-symmetry, and not the best of wrong ones."""
+    """Probability that a pose is right, up to near-symmetry, and not the best of wrong ones.
+
+    It is 0 where more of what was observed contradicts the pose than supports it.
+    """
+    if evidence.contradicted >= evidence.supported:
+        return 0.0
     log_odds = math.log(prior_odds) + log_odds_right(evidence)
     return 1 / (1 + math.exp(-min(log_odds, 50.0)))
 
@@ -166,19 +171,16 @@ def log_odds_right(evidence: Evidence, area: float | None = None) -> float:
         area: visible of the model, where several poses are compared; None: that of the evidence.
     """
     area = max(LEAST_AREA, evidence.visible if area is None else area)
-    log_odds = _log_rates(evidence, area, RIGHT_CONTRADICTED, RIGHT_UNOBSERVED)
-    log_odds -= _log_rates(evidence, area, WRONG_CONTRADICTED, WRONG_UNOBSERVED)
-    return log_odds + _log_fit(evidence.rms) - _log_fit(WRONG_RMS)
-
-
-def _log_rates(evidence: Evidence, area: float, contradicted: Rate, unobserved: Rate) -> float:
-    """Log likelihood of what contradicts a pose and of what was not observed of it."""
-    # Only what was observed can contradict, and of what does only the rest can be unobserved.
+    # Only what was observed can contradict a pose, and what contradicts it was observed.
     observed = max(LEAST_AREA, area - evidence.unobserved)
     rest = max(LEAST_AREA, area - evidence.seen_through - evidence.bulging)
-    return contradicted.log_likelihood(evidence.contradicted, observed) + (
-        unobserved.log_likelihood(evidence.unobserved, rest)
-    )
+    contradicted = RIGHT_CONTRADICTED.log_likelihood(evidence.contradicted, observed)
+    contradicted -= WRONG_CONTRADICTED.log_likelihood(evidence.contradicted, observed)
+    unobserved = RIGHT_UNOBSERVED.log_likelihood(evidence.unobserved, rest)
+    unobserved -= WRONG_UNOBSERVED.log_likelihood(evidence.unobserved, rest)
+    # Residuals are of the supported part alone.
+    fit = evidence.observed * (_log_fit(evidence.rms) - _log_fit(WRONG_RMS))
+    return contradicted + unobserved + fit
 
 
 def _log_fit(rms: float) -> float:

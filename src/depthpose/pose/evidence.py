@@ -150,7 +150,7 @@ def draw_surface(
     R, t_m = pose.R.double(), pose.t_m.double()
     points_m = surface.points_m @ R.mT + t_m
     is_facing = ((surface.outward @ R.mT) * points_m).sum(-1) <= 0
-    is_drawn = (points_m[:, 2] > 0) & is_facing
+    is_drawn = (points_m[:, 2] > 0) & is_facing & ~surface.is_hidden
     pixel = ((points_m @ K.mT)[:, :2] / points_m[:, 2:]).round()
     is_drawn &= ((pixel >= 0) & (pixel < torch.tensor([width, height]))).all(-1)
     nothing = slice(0, 0), slice(0, 0)

@@ -72,6 +72,7 @@ class Surface:
     points_m: Float64[Tensor, "m 3"]  #: of the surface, in the model frame
     normals: Float64[Tensor, "m 3"]  #: theirs; their side does not matter
     outward: Float64[Tensor, "m 3"]  #: normals on the outer side, 0 where none is known
+    is_hidden: Bool[Tensor, " m"]  #: samples that no camera sees from afar, as faces inside a part
     across: Int64[Tensor, " m"]  #: number of the sample on the other side of a wall, or -1
     diameter_m: float  #: of the object
     spacing_m: float  #: distance from a point to the third nearest, in the median
@@ -191,7 +192,8 @@ def prepare_surface(model: ObjectModel, count: int = 10_000) -> Surface:
     ]
     cell_m = _SAMPLES_CELL * float(np.median(near_m[:, -1])) * np.sqrt(np.pi) / 2
     limit_m = 3 * NEAR * model.diameter_m
-    outward, across = outer_sides(points_m.numpy(), normals.numpy(), cell_m, limit_m)
+    sides = outer_sides(points_m.numpy(), normals.numpy(), cell_m, limit_m)
+    outward, across, is_hidden = (torch.from_numpy(part) for part in sides)
     low_m = points_m.amin(0) - _MARGIN * model.diameter_m
     size_m = points_m.amax(0) + _MARGIN * model.diameter_m - low_m
     side_m = float(size_m.max()) / _BOXES
@@ -205,8 +207,9 @@ def prepare_surface(model: ObjectModel, count: int = 10_000) -> Surface:
     return Surface(
         points_m=points_m,
         normals=normals,
-        outward=torch.from_numpy(outward),
-        across=torch.from_numpy(across),
+        outward=outward,
+        is_hidden=is_hidden,
+        across=across,
         diameter_m=model.diameter_m,
         spacing_m=float(np.median(tree.query(some_m, k=4, workers=1)[0][:, -1])),
         middle_m=middle_m,
@@ -227,12 +230,12 @@ _CLEARER = 0.4  # the inner side is seen in at most so many times the directions
 
 def outer_sides(
     points: np.ndarray, normals: np.ndarray, cell: float, limit: float
-) -> tuple[np.ndarray, np.ndarray]:
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Turn normals to the side from which the surface is seen from afar.
 
     What is thinner than half the distance of the samples, open sheets and what is never seen have
     no outer side: their normals become 0. Given beside them is, for each sample, the number of the
-    nearest one of an opposite side within the limit, or -1.
+    nearest one of an opposite side within the limit, or -1, and which samples are never seen.
     """
     seen, looked = np.zeros((2, len(points))), np.full((2, len(points)), 1e-9)
     for axis in fibonacci_directions(_SIDE_DIRECTIONS).numpy():
@@ -267,7 +270,7 @@ def outer_sides(
         is_better = is_opposite & (distance < nearest)
         across = np.where(is_better, number, across)
         nearest = np.where(is_better, distance, nearest)
-    return outward, across
+    return outward, across, share.max(0) <= _SEEN_FROM
 
 
 def look_along_rays(

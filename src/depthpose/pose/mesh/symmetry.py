@@ -62,6 +62,7 @@ _ORDERS = (2, 3, 4, 5, 6)
 _TRIED_ORDERS = range(2, 13)
 _TEETH = range(13, 61)  #: orders of which one step is tried: gears and knurls
 _TURNS = 36
+_NEAREST_SAMPLES = 4
 _COARSE = 0.04
 """Deviation, in diameters, from which following the surface may still find a symmetry: an axis
 that is off by 4 degrees moves the surface by about as much."""
@@ -127,12 +128,14 @@ class SurfaceDeviation:
         farthest: list[Float[Tensor, "*batch"]] = []
         for way in (turn, turn.inverse()):
             moved = way.apply(points)
-            distance, index = self.nearest(moved)
-            gap = moved.numpy() - self.points.numpy()[index]
+            workers = torch.get_num_threads()
+            distance, index = self._tree.query(moved.numpy(), k=_NEAREST_SAMPLES, workers=workers)
+            gap = moved.numpy()[..., None, :] - self.points.numpy()[index]
             height = np.abs((gap * self._normals[index]).sum(-1))
-            # Between samples the plane says the distance; beside an edge, the sample does.
+            # Between samples the plane says the distance; beside an edge, the sample does. The
+            # nearest sample may lie on the other side of an edge, so the next ones count too.
             beside = np.maximum(distance - spacing, 0)
-            off = torch.from_numpy(np.maximum(height, beside))
+            off = torch.from_numpy(np.maximum(height, beside).min(-1))
             farthest.append(off.quantile(share, dim=-1))
         return torch.maximum(*farthest)
 
