@@ -8,12 +8,12 @@ import pytest
 import torch
 from tests.pose.synthetic_frames import HEIGHT, WIDTH, make_dataset
 
+from depthpose import GeoPoseNet
 from depthpose.cli import main
 from depthpose.core.files import write_image
 from depthpose.pose.datasets import (
     BopDataset,
     Detection,
-    decode_rle,
     encode_rle,
     read_detections,
     read_mask,
@@ -27,6 +27,7 @@ from depthpose.pose.segmentation import (
     normalise_colors,
     write_segmentation,
 )
+from depthpose.pose.types import PoseEstimate, ViewInput
 
 LEFT = torch.arange(WIDTH).expand(HEIGHT, WIDTH) < WIDTH // 2
 PICTURE = torch.stack([LEFT, ~LEFT, LEFT & False]).float()
@@ -108,7 +109,7 @@ def test_predict_segments_by_weights_once(
     assert sorted((d.image_id, d.object_id) for d in found) == [(0, 7), (0, 10), (1, 7), (1, 10)]
     for one in found:
         half = LEFT if one.object_id == 7 else ~LEFT
-        assert float((decode_rle(*one.segmentation) == half).float().mean()) > 0.75
+        assert float((one.mask(HEIGHT, WIDTH) == half).float().mean()) > 0.75
     places = {p.place for p in read_predictions(out)}
     assert len(places) == 4
     assert all(p.estimate.seconds["segmentation"] > 0 for p in read_predictions(out))
@@ -190,3 +191,40 @@ def test_masks_of_one_name_are_distinguished_by_their_folders(
     assert {row["masks"] for row in rows} == {"x-found", "y-found"}
     assert main([*words, files[0], files[0]]) == 2
     assert "x/found: 2 that are given have this name" in capsys.readouterr().err
+
+
+def test_a_data_set_is_searched_without_masks(
+    synthetic: BopDataset, weights: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """6D detection: what is found is right for one object, and the other has a row that says no."""
+    truths = {(i.image_id, i.object_id): i.camera_from_model for i in synthetic.instances}
+    searched: list[str] = []
+
+    def find_in(_: GeoPoseNet, view: ViewInput, objects: Sequence[str]) -> list[PoseEstimate]:
+        searched.append(view.name)
+        assert sorted(objects) == ["bottle", "bracket"]
+        assert bool(view.mask.all())
+        pose = truths[int(view.name[-6:]), 7]
+        return [PoseEstimate(name="x", object="bracket", status="ok", camera_from_model=pose)]
+
+    monkeypatch.setattr(GeoPoseNet, "find_in", find_in)
+    words = ["pose", "predict", "--bop", str(synthetic.folder), "--weights", str(weights)]
+    words += ["--masks", "search", "--out", str(tmp_path / "out")]
+    assert main(words) == 0
+    rows = {
+        p.estimate.name: (p.place, p.estimate.status) for p in read_predictions(tmp_path / "out")
+    }
+    assert rows == {
+        f"000001_{image:06d}_{k}": ((1, image, number), status)
+        for image in (0, 1)
+        for k, (number, status) in enumerate(((7, "ok"), (10, "doubtful")))
+    }
+    assert searched == ["000001_000000", "000001_000001"]
+    assert main(words) == 0
+    assert len(searched) == 2, "what is there is not searched again"
+    out = tmp_path / "measured"
+    words = ["--bop", str(synthetic.folder), "--predictions", str(tmp_path / "out"), "--no-vsd"]
+    assert main(["pose", "evaluate", *words, "--out", str(out)]) == 0
+    found = {row["object"]: row["ap"] for row in json.loads((out / "rows.json").read_text())}
+    assert found == {"bracket": pytest.approx(1), "bottle": 0, "mean": pytest.approx(0.5),
+                     "all": None}  # fmt: skip

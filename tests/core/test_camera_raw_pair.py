@@ -1,5 +1,6 @@
 """Calibrations of raw pairs, as OpenCV, ROS and Kalibr write them."""
 
+import math
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +13,7 @@ pytest.importorskip("cv2")
 from tests.raw_pairs import DrawnPair, make_raw, opencv_names, write_kalibr, write_opencv, write_ros
 
 from depthpose.core.camera import RawPair, StereoRig, read_camera, read_raw_pair
-from depthpose.core.errors import InputError
+from depthpose.core.errors import InputError, Notice
 from depthpose.depth.types import StereoInput
 
 SIZE = (64, 48)
@@ -179,3 +180,17 @@ def test_two_camera_info_of_single_cameras_are_no_pair(tmp_path: Path, drawn: Dr
     folder = write_ros(tmp_path / "calibration", drawn, 0.0)
     with pytest.raises(InputError, match=r"Tx 0 and -?0, .*calibrate them as a pair"):
         read_raw_pair(folder)
+
+
+def test_a_rotation_that_looks_transposed_is_told_of(tmp_path: Path) -> None:
+    turn = math.radians(0.3)
+    R = np.array(
+        [[math.cos(turn), 0, math.sin(turn)], [0, 1, 0], [-math.sin(turn), 0, math.cos(turn)]]
+    )
+    T = R @ [-0.5, 0, 0]  # the left camera stands square to the line between both
+    path = tmp_path / "stereo.yaml"
+    path.write_text(yaml.safe_dump({**GOOD, "R": R.ravel().tolist(), "T": T.tolist()}))
+    read_raw_pair(path)
+    path.write_text(yaml.safe_dump({**GOOD, "R": R.T.ravel().tolist(), "T": T.tolist()}))
+    with pytest.warns(Notice, match=r"is R transposed\? .* turned 0\.90 .* transpose by 0\.30"):
+        read_raw_pair(path)

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from depthpose.core.errors import InputError
 from depthpose.core.files import read_json, read_key_values, read_text, write_json
-from depthpose.core.files.disk import parse_yaml
+from depthpose.core.files.disk import find_partners, parse_yaml, stem_of
 
 JSON = st.recursive(
     st.none()
@@ -91,3 +91,16 @@ def test_a_name_that_is_not_utf8_goes_through_json(tmp_path: Path) -> None:
     write_json(tmp_path / "a.json", {name: "ä"})
     assert read_json(tmp_path / "a.json") == {name: "ä"}
     assert (tmp_path / "a.json").read_text(encoding="utf-8").count("\\udcfe") == 1
+
+
+def test_what_follows_a_sign_of_comments_is_no_value(tmp_path: Path) -> None:
+    path = tmp_path / "calib.txt"
+    path.write_text("# of today\nP2: 1 0 2  # the left camera\nfocal_px: 3 # px\n")
+    assert read_key_values(path) == {"P2": [1, 0, 2], "focal_px": [3]}
+
+
+def test_names_pair_however_their_accents_are_stored() -> None:
+    composed, apart = "stra\u00dfe_\u00e9", "stra\u00dfe_e\u0301"
+    assert composed != apart
+    assert find_partners([composed, "b"], ["b", apart], "x") == [1, 0]
+    assert stem_of(Path(f"{composed}.png")) == stem_of(Path(f"{apart}.jpg"))

@@ -275,6 +275,8 @@ def test_half_turns_of_a_box_are_proposed(tmp_path: Path) -> None:
     for wrong in half_turns(pose)[1:].R:
         copies = color_copies(Rigid(wrong, pose.t_m), model, view)
         assert math.degrees(float(geodesic_rad(copies.R[1], pose.R))) < 1
+        alone = color_copies(Rigid(wrong, pose.t_m), model, view, turns=half_turns(pose)[:0])
+        assert torch.equal(alone.R, wrong[None])
 
 
 def test_a_window_of_the_depth_image_changes_nothing(tmp_path: Path) -> None:

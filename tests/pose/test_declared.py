@@ -11,8 +11,8 @@ from tests.pose.synthetic_objects import K, bottle, pose_at, view_of
 
 from depthpose.core.errors import InputError, Notice
 from depthpose.core.rigid import Rigid, geodesic_rad, rotation_by
-from depthpose.pose.registration import Registration
 from depthpose.pose.mesh import declare_symmetry, make_model, read_symmetry, symmetry_of_each
+from depthpose.pose.registration import Registration
 from depthpose.pose.synthetic.parts import make_part
 from depthpose.pose.types import ObjectModel, Symmetries, ViewInput
 

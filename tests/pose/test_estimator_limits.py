@@ -18,9 +18,9 @@ from torch.utils._python_dispatch import TorchDispatchMode
 
 from depthpose.core.rigid import Rigid
 from depthpose.pose.config import CloudConfig, EstimateConfig, VotingConfig
-from depthpose.pose.registration import Registration
-from depthpose.pose.network_pose import CloudToPose
 from depthpose.pose.mesh import make_model
+from depthpose.pose.network_pose import CloudToPose
+from depthpose.pose.registration import Registration
 from depthpose.pose.types import PoseEstimate
 
 MILLIONS = 10_000_000

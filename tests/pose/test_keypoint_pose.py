@@ -11,16 +11,16 @@ from depthpose.core.rigid import Rigid, cross_matrix, perturb
 from depthpose.pose.cloud import voxelise
 from depthpose.pose.config import CloudConfig
 from depthpose.pose.datasets import open_bop
-from depthpose.pose.observability import free_motions
-from depthpose.pose.metrics import add_m
 from depthpose.pose.icp import refine_pose
-from depthpose.pose.surface import prepare_surface
-from depthpose.pose.types import Axis
+from depthpose.pose.metrics import add_m
+from depthpose.pose.observability import free_motions
 from depthpose.pose.propose import (
     consistent_keypoints,
     fit_pose,
     vote_ransac,
 )
+from depthpose.pose.surface import prepare_surface
+from depthpose.pose.types import Axis
 from depthpose.report.pose import object_points
 
 

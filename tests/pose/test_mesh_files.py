@@ -17,9 +17,9 @@ from tests.fuzz.damage import pack_glb
 from depthpose.core.errors import InputError, Notice
 from depthpose.core.rigid import rotation_by
 from depthpose.pose.cloud import unit_advice
-from depthpose.pose.registration import Registration
 from depthpose.pose.mesh import read_geometry, read_model
 from depthpose.pose.mesh.files import cut_polygons
+from depthpose.pose.registration import Registration
 
 # An L of 30 x 20 x 10 (mm), its caps concave: volume 4000, area 2 * 400 + 100 * 10.
 OUTLINE = [(0, 0), (30, 0), (30, 10), (10, 10), (10, 20), (0, 20)]

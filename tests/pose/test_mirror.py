@@ -14,9 +14,9 @@ from tests.pose.synthetic_objects import (
 
 from depthpose.core.rigid import Rigid
 from depthpose.pose.config import RefusalConfig
+from depthpose.pose.icp import refine_pose
 from depthpose.pose.identity import mirror_gain
 from depthpose.pose.mesh import MIRROR_ALIKE, mirror_deviation
-from depthpose.pose.icp import refine_pose
 from depthpose.pose.surface import prepare_surface
 from depthpose.pose.synthetic.parts import make_part
 from depthpose.pose.types import ObjectModel, PoseEstimate

@@ -14,10 +14,10 @@ from depthpose.core.rigid import Rigid, cross_matrix, geodesic_rad, perturb
 from depthpose.pose.cloud import cloud_from_depth
 from depthpose.pose.config import IcpConfig, SensorConfig, SensorKind
 from depthpose.pose.datasets import open_bop
+from depthpose.pose.icp import _covariance, refine_best, refine_pose
 from depthpose.pose.mesh import drawn_triangles, make_model, sample_surface
 from depthpose.pose.mesh.models import turn_about
 from depthpose.pose.metrics import add_m
-from depthpose.pose.icp import _covariance, refine_best, refine_pose
 from depthpose.pose.surface import Surface, prepare_surface
 from depthpose.pose.synthetic.views import measure
 from depthpose.pose.types import ObjectModel, Symmetries

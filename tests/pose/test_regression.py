@@ -10,8 +10,8 @@ from depthpose.core.errors import InputError
 from depthpose.core.rigid import Rigid, perturb
 from depthpose.pose.baselines import DepthImageConfig, DepthImageNet
 from depthpose.pose.config import CloudConfig, EstimateConfig, IcpConfig, RefusalConfig
-from depthpose.pose.network_pose import DepthImageRegressor
 from depthpose.pose.metrics import add_m
+from depthpose.pose.network_pose import DepthImageRegressor
 from depthpose.pose.types import ViewInput
 from depthpose.pose.weights import PoseWeights
 

@@ -10,8 +10,8 @@ from tests.pose.synthetic_objects import Oracle, bracket, cloud_of, noisy, pose_
 from depthpose.core.loop import sample_generator
 from depthpose.core.rigid import Rigid
 from depthpose.pose.config import EstimateConfig, RefusalConfig
-from depthpose.pose.identity import Scale, scale_of
 from depthpose.pose.icp import refine_pose
+from depthpose.pose.identity import Scale, scale_of
 from depthpose.pose.surface import prepare_surface
 from depthpose.pose.types import PoseEstimate
 

@@ -9,8 +9,8 @@ from tests.pose.synthetic_objects import bracket, tiny_weights
 from depthpose.core.errors import InputError
 from depthpose.core.rigid import Rigid
 from depthpose.pose.config import CloudConfig
-from depthpose.pose.network_pose import GeoPoseNet
 from depthpose.pose.evaluate import Conditions, ObjectRow, Origin
+from depthpose.pose.network_pose import GeoPoseNet
 from depthpose.pose.synthetic import Objects
 from depthpose.thesis.pose_tables import (
     LINEMOD,

@@ -28,8 +28,8 @@ from depthpose.core.rigid import Rigid
 from depthpose.depth.estimator import FakestereoNet
 from depthpose.depth.stereo import CallableMatcher, LightMatcher
 from depthpose.depth.synthesis import make_synthesiser
-from depthpose.pose.network_pose import GeoPoseNet
 from depthpose.pose.metrics import adds_m
+from depthpose.pose.network_pose import GeoPoseNet
 from depthpose.pose.synthetic import make_part
 from depthpose.web import Limits, make_app
 from depthpose.web import pose as pose_tab

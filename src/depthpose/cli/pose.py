@@ -39,7 +39,7 @@ def predict(
     Args:
         out: folder for the results.
     """
-    from depthpose.cli.pose_frames import find_all
+    from depthpose.cli.pose_frames import find_all, search_dataset
     from depthpose.cli.pose_methods import source_of
     from depthpose.cli.pose_predict import predict_dataset, predict_files, predict_on_ray
 
@@ -66,6 +66,8 @@ def predict(
     if dataset.bop is not None:
         if inputs.color is not None:
             raise InputError("--color is beside --depth; leave it out where --bop is given")
+        if dataset.masks == "search":
+            return search_dataset(method, dataset, inputs.object, home)
         return predict_dataset(method, dataset, inputs.object, source.config, home, batch)
     if inputs.cloud is not None and not method.takes_clouds:
         raise InputError(

@@ -13,15 +13,17 @@ from tqdm import tqdm
 
 from depthpose.cli import pose_methods, pose_predict
 from depthpose.cli.pose_methods import PoseMethod
-from depthpose.cli.pose_options import OneObjectOptions, SequenceOptions
+from depthpose.cli.pose_options import DataSetOptions, OneObjectOptions, SequenceOptions
 from depthpose.core.errors import InputError
 from depthpose.core.files import read_depth_png
 from depthpose.core.rigid import Rigid
 from depthpose.core.run import find_rank
-from depthpose.pose.datasets import BopDataset, Instance, open_bop
+from depthpose.pose.datasets import BopDataset, Instance, open_bop, read_targets
+from depthpose.pose.evaluate import of_targets
 from depthpose.pose.inputs import AnyInput
 from depthpose.pose.predictions import (
     Job,
+    Place,
     Prediction,
     kept_predictions,
     place_of,
@@ -90,6 +92,54 @@ def find_all(method: PoseMethod, inputs: OneObjectOptions, out: Path) -> int:
     searched = [job for _, job in results]
     pose_predict.write_files(predictions, searched, out, method, inputs=len(jobs))
     return pose_predict.say_result(predictions, out, len(jobs))
+
+
+def search_dataset(
+    method: PoseMethod, options: DataSetOptions, object: str | None, out: Path
+) -> int:
+    """Search every image of a data set for every object of it, as 6D detection; give the exit code.
+
+    No mask and no identity is told. A rerun goes on where it was.
+    """
+    assert options.bop is not None
+    if method.find is None:
+        raise InputError("--masks search: these weights need masked views; give other --masks")
+    if find_rank().world > 1:
+        raise InputError("--masks search is done by one process; give other --masks, or start one")
+    dataset = open_bop(options.bop, options.split)
+    if options.targets is not None:
+        dataset = of_targets(dataset, read_targets(options.targets, options.bop))
+    dataset = pose_methods.chosen_objects(dataset, method, object)
+    numbers = {name: n for n, name in pose_methods.match_names(dataset, method.models).items()}
+    settings = {**method.settings, **pose_methods.of_dataset(dataset), "masks": "search"}
+    settings["find"] = sorted(numbers)
+    pose_predict.claim_bop(out, settings, dataset)
+    images = {(i.scene_id, i.image_id): i for i in dataset.instances}
+    left = list(kept_predictions(out).values())
+    results: list[tuple[Prediction, Job[Any]]] = []
+    for (scene, image), instance in tqdm(sorted(images.items()), disable=None, unit=" images"):
+        job = Job[Any](
+            name=f"{scene:06d}_{image:06d}",
+            read=partial(_whole_view, instance, next(iter(numbers))),
+        )
+        of_image = [p for p in left if p.place is not None and p.place[:2] == (scene, image)]
+        if not of_image:
+            view = replace(job.read(), name=job.name)
+            estimates = with_every_object(method.find(view, list(numbers)), view, list(numbers))
+            of_image = [
+                Prediction(estimate=one, place=Place(scene, image, numbers[one.object]))
+                for one in estimates
+            ]
+        results += [
+            (one, replace(job, name=one.estimate.name, read=partial(_explained, job, one, method)))
+            for one in of_image
+        ]
+        left = [p for p in left if p not in of_image]
+        write_predictions(out, [*(prediction for prediction, _ in results), *left])
+    predictions = [prediction for prediction, _ in results]
+    searched = [job for _, job in results]
+    pose_predict.write_files(predictions, searched, out, method, dataset, inputs=len(images))
+    return pose_predict.say_result(predictions, out, len(images))
 
 
 def with_every_object(

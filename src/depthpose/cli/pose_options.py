@@ -148,7 +148,8 @@ class DataSetOptions:
     val_photoneo."""
     masks: str = "truth"
     """truth (the annotated ones), predicted (those that came with Linemod_preprocessed), a JSON
-    file of BOP detections, or weights of a segmentation, by name or file."""
+    file of BOP detections, or weights of a segmentation, by name or file; or search: no mask is
+    told, and every image is searched for every object of the data set."""
     targets: NewPath | None = None
     """a BOP list of targets, such as test_targets_bop24.json: a file, or its name in the folder of
     the data set; by default all instances."""

@@ -13,6 +13,7 @@ from depthpose.core.camera import Camera, StereoRig
 from depthpose.core.errors import InputError, Notice
 from depthpose.depth.config import GeneratorConfig, SelectionConfig
 from depthpose.depth.types import DepthEstimate, Map, Match, StereoInput
+from depthpose.depth.visible import texture, without_picture
 
 _MISTAKES = {
     1000.0: "is its depth in millimetres (divide by 1000), or its disparity in shares of the width "
@@ -199,8 +200,20 @@ def resized_map(
 
 
 def from_pair(pair: StereoInput, match: Match, warning: str = "") -> DepthEstimate:
-    """Give what was found in a rectified pair: metres where its camera has a baseline."""
+    """Give what was found in a rectified pair: metres where its camera has a baseline.
+
+    There is no answer where the left image has no picture. The confidence is 0 where the right one
+    has none, and falls to 0 where the left one is plain, for nothing can be matched there.
+    """
     px, depth_m, is_sky = match.disparity_px, None, match.is_sky
+    confidence, blank = match.confidence, without_picture(pair.left).to(px.device)
+    if is_sky is not None:
+        is_sky = is_sky & ~blank
+    if confidence is not None and pair.right is not None:
+        right_blank = without_picture(pair.right).to(px)
+        unseen = warp_right_to_left(right_blank[None], px)[0].nan_to_num(0.0) > 0.5
+        confidence = confidence * texture(pair.left).to(confidence)
+        confidence = torch.where(blank | unseen, 0.0, confidence)
     rig = pair.camera if isinstance(pair.camera, StereoRig) else None
     if is_sky is not None:
         is_sky = is_sky & (is_sky.float().mean() >= _LEAST_SKY)
@@ -208,13 +221,14 @@ def from_pair(pair: StereoInput, match: Match, warning: str = "") -> DepthEstima
         if rig is not None:
             far_px = float(rig.K[0, 0]) * rig.baseline_m / SKY_M - rig.cx_right_minus_left_px
         px = torch.where(is_sky, far_px, px)
+    px = torch.where(blank, torch.nan, px)
     if rig is not None:
         depth_m = depth_from_disparity(px, rig)
         depth_m = depth_m if is_sky is None else torch.where(is_sky, torch.nan, depth_m)
     return DepthEstimate(
         depth_m=depth_m,
         disparity_px=px,
-        confidence=match.confidence,
+        confidence=confidence,
         is_sky=is_sky,
         warning=warning,
         seen=pair,
@@ -227,7 +241,7 @@ def from_virtual(
     match: Match,
     right: Float[Tensor, "3 _ _"],
 ) -> DepthEstimate:
-    """Bring what was found at the virtual rig back to the image."""
+    """Bring what was found at the virtual rig back to the image; NaN where it has no picture."""
     camera = image.camera
     assert camera is not None
     height, width = image.left.shape[1:]
@@ -235,14 +249,19 @@ def from_virtual(
     px, is_sky = seen.disparity_px, seen.is_sky
     focal_m_px = float(camera.K[0, 0]) * rig.virtual_baseline_m
     depth_m = torch.where(px > 0, focal_m_px / px, torch.nan)
+    blank, confidence = without_picture(image.left).to(px.device), seen.confidence
     if is_sky is not None:
+        is_sky = is_sky & ~blank
         is_sky = is_sky & (is_sky.float().mean() >= _LEAST_SKY)
         depth_m = torch.where(is_sky, SKY_M, depth_m)
         px = torch.where(is_sky, focal_m_px / SKY_M, px)
+    depth_m, px = (torch.where(blank, torch.nan, values) for values in (depth_m, px))
+    if confidence is not None:
+        confidence = torch.where(blank, 0.0, confidence)
     return DepthEstimate(
         depth_m=depth_m if is_sky is None else torch.where(is_sky, torch.nan, depth_m),
         disparity_px=disparity_from_depth(depth_m, camera) if isinstance(camera, StereoRig) else px,
-        confidence=seen.confidence,
+        confidence=confidence,
         right=resize_image(right, height, width),
         is_sky=is_sky,
         seen=image,

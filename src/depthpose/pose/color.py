@@ -373,7 +373,12 @@ _ALONG = math.cos(math.radians(8))  # cosine from which two directions are one
 
 
 def color_copies(
-    pose: Rigid, model: ObjectModel, view: ViewInput, *, most: int = _MOST_COPIES
+    pose: Rigid,
+    model: ObjectModel,
+    view: ViewInput,
+    *,
+    turns: Rigid | None = None,
+    most: int = _MOST_COPIES,
 ) -> Rigid:
     """Propose what a pose may be exchanged for by colour: copies that look alike to depth.
 
@@ -386,6 +391,7 @@ def color_copies(
         pose: ``camera_from_model``, one.
         model: the object.
         view: depth and colour.
+        turns: motions of the model to try in place of those that its shape shows.
         most: so many are given beside ``pose``.
 
     Returns:
@@ -394,12 +400,13 @@ def color_copies(
     pose = pose.double()
     if model.colors is None or view.color is None:
         return pose[None]
-    turns, axes = _look_alikes(model)
+    shown, axes = _look_alikes(model)
+    tried = shown if turns is None else [turns.double()[k] for k in range(len(turns.R))]
 
     # Of copies that a turn about an axis carries into each other one is swept.
     eye = Rigid(torch.eye(3).double(), torch.zeros(3).double())
     kept = [eye]
-    for turn in turns:
+    for turn in tried:
         is_swept = any(_is_spun(turn, other, axis) for axis in axes for other in kept)
         apart_rad = [float(geodesic_rad(turn.R, other.R)) for other in kept]
         if not is_swept and min(apart_rad) > _ONE_TURN_RAD:

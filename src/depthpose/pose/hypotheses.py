@@ -8,8 +8,8 @@ from jaxtyping import Float64
 from torch import Tensor
 
 from depthpose.core.arrays import take_evenly
-from depthpose.core.rigid import Rigid
-from depthpose.pose.color import color_agreement, color_copies
+from depthpose.core.rigid import Rigid, geodesic_rad
+from depthpose.pose.color import color_agreement, color_copies, settle_spin
 from depthpose.pose.config import IcpConfig
 from depthpose.pose.copies import PreparedObject, with_copies
 from depthpose.pose.decide import Competition, Hypothesis, share_among_copies, share_among_poses
@@ -25,6 +25,7 @@ _UNEXPLAINED_MORE = 0.25
 """A competing pose that leaves by so much more of the readings unexplained is not compared."""
 _MOST_LEADING = 8  #: poses that are compared, and of one of them so many copies
 _MOST_COPIES = 36
+_SAME_PRINT_RAD = 0.1  # poses at which the same print is observed
 
 
 def compete(
@@ -73,6 +74,8 @@ def compete(
         pose = candidate.refined.camera_from_model
         if not bool(copies.is_same(pose, before, alike).any()):
             leading.append(hypothesis(candidate.refined))
+    if view is not None:  # one of its copies may have the print that is observed
+        leading = _by_best_print(leading, prepared, view, alike)
     shares = share_among_poses(leading)
     winner = int(shares.argmax())
     others_shares = [(h, float(shares[k])) for k, h in enumerate(leading) if k != winner]
@@ -81,6 +84,8 @@ def compete(
     pose = leading[winner].pose
     source = replace(refined, camera_from_model=pose, covariance=leading[winner].covariance)
     group = [leading[winner]]
+    if view is not None:
+        group = [replace(group[0], log_color=_log_color(pose, prepared, view))]
     starts = pose @ copies.copies
     if view is not None:  # print shows finer steps about an axis than shape does
         starts = Rigid.cat([color_copies(pose, prepared.model, view), starts])
@@ -88,7 +93,11 @@ def compete(
         before = Rigid.stack([h.pose for h in group])
         # Refinement may slide a copy onto another, where nothing observed tells them apart: then
         # it stays where the symmetry has it.
-        for copy in (candidate.refined, candidate.unrefined):
+        refined_copy = candidate.refined
+        if view is not None:
+            settled = settle_spin(refined_copy.camera_from_model, prepared.model, view)
+            refined_copy = replace(refined_copy, camera_from_model=settled)
+        for copy in (refined_copy, candidate.unrefined):
             if not bool(copies.is_same(copy.camera_from_model, before, copies.symmetries).any()):
                 group.append(hypothesis(copy))
                 break
@@ -100,6 +109,25 @@ def compete(
         copies=[(h, float(copy_shares[k])) for k, h in enumerate(group) if k != best],
         others=others_shares,
     )
+
+
+def _by_best_print(
+    leading: list[Hypothesis], prepared: PreparedObject, view: ViewInput, alike: Rigid
+) -> list[Hypothesis]:
+    """Give each pose the colour evidence of the best of its copies, for it stands for all of them.
+
+    Poses whose best copies are one pose are copies of each other: the first stands for them.
+    """
+    kept: list[Hypothesis] = []
+    prints: list[Rigid] = []
+    for hypothesis in leading:
+        copies = color_copies(hypothesis.pose, prepared.model, view, turns=alike)
+        likelihood = color_agreement(copies, prepared.model, view).log_likelihood
+        best = copies[int(likelihood.argmax())]
+        if all(float(geodesic_rad(best.R, other.R)) > _SAME_PRINT_RAD for other in prints):
+            kept.append(replace(hypothesis, log_color=float(likelihood.max())))
+            prints.append(best)
+    return kept
 
 
 class _Candidate(NamedTuple):

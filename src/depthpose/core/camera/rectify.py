@@ -1,5 +1,7 @@
 """Two cameras as they were calibrated (ROS, OpenCV, Kalibr), and their rectification by OpenCV."""
 
+import math
+import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -33,7 +35,7 @@ from depthpose.core.camera.stored_camera import (
     ros_pair,
     size_of,
 )
-from depthpose.core.errors import InputError, import_opencv
+from depthpose.core.errors import InputError, Notice, import_opencv
 from depthpose.core.files import AnyPath, read_json, read_text
 from depthpose.core.files.disk import MAX_LIST_BYTES
 from depthpose.core.rigid import Rigid
@@ -51,6 +53,7 @@ _D = {
 _R, _T = ("r", "rotation", "rotationmatrix"), ("t", "translation", "translationvector")
 _COUNTS = {False: (4, 5, 8, 12, 14), True: (4,)}
 _MAX_BASELINE_M = 10.0
+_CLEARLY, _LEAST_TURN_DEG = 0.5, 0.2  # when R looks transposed
 _MAX_ENLARGED = 4  # of a raw image by its rectification
 _MAX_FOCAL_RATIO = 1.5  # of the two cameras of a pair; more are of images of two sizes
 _KNOWN = (
@@ -107,6 +110,7 @@ def read_raw_pair(
         refuse_baseline(length, said, _MAX_BASELINE_M if unit_m else WIDE_BASELINE_M)
         if not torch.allclose(R @ R.mT, torch.eye(3).double(), atol=1e-3) or torch.det(R) < 0:
             raise InputError(f"R is {R.tolist()}, which is no rotation; copy it anew")
+        _doubt_transposed(path, pair.right_from_left)
         x, y, z = pair.right_from_left.inverse().t_m.tolist()
         if abs(x) < max(abs(y), abs(z)):
             raise InputError(
@@ -119,6 +123,29 @@ def read_raw_pair(
                 "R becomes its transpose, T becomes -R^T T"
             )
         return pair
+
+
+def _doubt_transposed(path: AnyPath, right_from_left: Rigid) -> None:
+    """Say that R looks transposed: it then turns both cameras far more from the line between them.
+
+    A wrong turn about the vertical moves disparities alone, which no comparison of rows can see.
+    """
+    R, t_m = right_from_left.R, right_from_left.t_m
+    of_right = _off_axis_deg(t_m)
+    as_read = _off_axis_deg(R.mT @ t_m) + of_right
+    transposed = _off_axis_deg(R @ t_m) + of_right
+    if transposed < _CLEARLY * as_read and as_read - transposed > _LEAST_TURN_DEG:
+        said = (
+            f"{path}: is R transposed? By it the cameras are turned {as_read:.2f} degrees from "
+            f"the line between them, with its transpose by {transposed:.2f}; it carries points of "
+            "camera 1 to camera 2. Compare a measured distance"
+        )
+        warnings.warn(said, Notice, stacklevel=3)
+
+
+def _off_axis_deg(t_m: Tensor) -> float:
+    """Angle between the line of both cameras and the rows of one [degrees]."""
+    return math.degrees(math.atan2(float(t_m[1:].norm()), abs(float(t_m[0]))))
 
 
 def _read(path: Path, unit_m: float, is_fisheye: bool | None) -> RawPair:

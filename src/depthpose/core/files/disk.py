@@ -12,6 +12,7 @@ import re
 import secrets
 import stat
 import tarfile
+import unicodedata
 import warnings
 from collections import Counter
 from collections.abc import Hashable, Iterator, Mapping, Sequence
@@ -393,7 +394,7 @@ def read_key_values(path: AnyPath) -> dict[str, list[float]]:
     """Read ``KEY: numbers`` lines, as in KITTI's calibration files.
 
     ``key=[a b; c d]``, as in Middlebury's, is read row by row. Values that are not all numbers
-    (dates) are left out, and so are blank lines and those that start with ``#``.
+    (dates) are left out, and so are blank lines and what follows ``#``.
 
     Raises:
         InputError: the file is missing or not text, a line has no key or repeats one, or a number
@@ -401,8 +402,8 @@ def read_key_values(path: AnyPath) -> dict[str, list[float]]:
     """
     values: dict[str, list[float]] = {}
     for number, line in enumerate(read_text(path, MAX_LIST_BYTES).splitlines(), start=1):
-        text = line.strip()
-        if not text or text.startswith("#"):
+        text = line.partition("#")[0].strip()
+        if not text:
             continue
         match = _KEY_VALUE.fullmatch(text)
         if match is None:
@@ -449,6 +450,14 @@ def natural_order(path: Path) -> tuple[list[list[str | tuple[int, str]]], Path]:
     return [[value(p) if k % 2 else p for k, p in enumerate(part)] for part in pieces], path
 
 
+def stem_of(path: Path) -> str:
+    """Give a file's name without its suffix, in one spelling.
+
+    A letter with an accent may be stored as one character (NFC) or two (NFD: disks of macOS).
+    """
+    return unicodedata.normalize("NFC", path.stem)
+
+
 def find_partners(first: Sequence[str], second: Sequence[str], said: str) -> list[int]:
     """Give for each name of one side the index of its partner on the other.
 
@@ -456,6 +465,9 @@ def find_partners(first: Sequence[str], second: Sequence[str], said: str) -> lis
     side share (``left_0004`` and ``right_0004``, ``1_L`` and ``1_R``), numbers by value. Two lone
     names belong together unless each has numbers and none of them is the other's.
     """
+    first, second = (
+        [unicodedata.normalize("NFC", name) for name in side] for side in (first, second)
+    )
     keys: tuple[Sequence[Hashable], Sequence[Hashable]] = first, second
     if not set(first) & set(second):
         keys = _own_parts(first, second)

@@ -11,6 +11,7 @@ from torch.nn import functional as F
 from depthpose.core.camera import Camera, RectificationReport, StereoRig, check_rectified
 from depthpose.core.errors import InputError
 from depthpose.core.files import MAP_SUFFIXES, image_size, read_image, read_points_bin
+from depthpose.core.files.disk import stem_of
 from depthpose.core.files.images import LISTED_SUFFIXES
 from depthpose.core.findings import CheckReport, Problem, make_report, unreadable
 from depthpose.depth.datasets.dataset import read_split
@@ -88,15 +89,17 @@ def _check_folder(folder: Path, frames: list[Frame]) -> Iterator[Problem]:
         yield Problem(path=folder, kind="note", message="mixes PNG and JPEG images")
     # The folders are listed, not the frames: a split leaves many pairs out on purpose.
     folders = {
-        (f.left.parent, f.right.parent) for f in frames if f.right and f.right.stem == f.left.stem
+        (f.left.parent, f.right.parent)
+        for f in frames
+        if f.right and stem_of(f.right) == stem_of(f.left)
     }
     for left, right in sorted(folders):
         if left == right or not left.is_dir():  # packed
             continue
-        stems = {path.stem for path in left.iterdir()}
+        stems = {stem_of(path) for path in left.iterdir()}
         for path in sorted(right.iterdir()):
             is_view = path.suffix.lower() in LISTED_SUFFIXES and path.name[0] != "."
-            if is_view and path.stem not in stems:
+            if is_view and stem_of(path) not in stems:
                 yield Problem(path=path, kind="missing", message="has no left view")
     for name, part in (("right", "right"), ("lidar_depth", "depth"), ("disp_occ", "disparity")):
         is_there = (folder / name).is_dir() and any((folder / name).iterdir())

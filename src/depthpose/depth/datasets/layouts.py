@@ -17,7 +17,7 @@ import torch
 
 from depthpose.core import files
 from depthpose.core.errors import InputError
-from depthpose.core.files.disk import SOURCE, find_partners, write_bytes
+from depthpose.core.files.disk import SOURCE, find_partners, stem_of, write_bytes
 from depthpose.core.files.images import LISTED_SUFFIXES
 from depthpose.core.run import is_whole, note_result
 from depthpose.depth.datasets.frames import CalibrationStyle, Frame
@@ -168,8 +168,8 @@ def _frames(
 ) -> Iterator[Frame]:
     """Frames of left images, with the parts of the same stem."""
     for left in lefts:
-        others = {part: found.get(left.stem) for part, found in parts.items()}
-        yield Frame(name=prefix + left.stem, left=left, style=style, **others)
+        others = {part: found.get(stem_of(left)) for part, found in parts.items()}
+        yield Frame(name=prefix + stem_of(left), left=left, style=style, **others)
 
 
 def _raw(folder: Path) -> Iterable[Frame]:
@@ -190,7 +190,7 @@ def _raw(folder: Path) -> Iterable[Frame]:
             lefts,
             "raw",
             f"{drive.name}_",
-            calibration={left.stem: date for left in lefts if is_calibrated},
+            calibration={stem_of(left): date for left in lefts if is_calibrated},
             right=_by_stem(drive / "image_03/data"),
             velodyne=_by_stem(drive / "velodyne_points/data", (".bin",)),
             scan=_by_stem(maps[0]),
@@ -211,12 +211,12 @@ def _depth_selection(folder: Path) -> Iterable[Frame]:
     scans, depth = _by_stem(home / "velodyne_raw"), _by_stem(home / "groundtruth_depth")
     for left in _listed(home / "image"):
         yield Frame(
-            name=left.stem,
+            name=stem_of(left),
             left=left,
-            calibration=lenses.get(left.stem),
+            calibration=lenses.get(stem_of(left)),
             style="camera",
-            scan=scans.get(left.stem.replace("_image_", "_velodyne_raw_", 1)),
-            depth=depth.get(left.stem.replace("_image_", "_groundtruth_depth_", 1)),
+            scan=scans.get(stem_of(left).replace("_image_", "_velodyne_raw_", 1)),
+            depth=depth.get(stem_of(left).replace("_image_", "_groundtruth_depth_", 1)),
         )
 
 
@@ -232,7 +232,7 @@ def _odometry(folder: Path) -> Iterable[Frame]:
             lefts,
             "grey" if is_grey else "object",
             "" if home == folder else f"{home.name}_",
-            calibration={left.stem: home / "calib.txt" for left in lefts},
+            calibration={stem_of(left): home / "calib.txt" for left in lefts},
             right=_by_stem(home / ("image_1" if is_grey else "image_3")),
             velodyne=_by_stem(home / "velodyne", (".bin",)),
         )
@@ -243,7 +243,7 @@ def _benchmark(folder: Path, one: str, other: str, ending: str) -> Iterable[Fram
     home = folder / "training" if (folder / "training" / one).is_dir() else folder
     lefts = _listed(home / one)
     # Of the stereo sets the testing folder too.
-    lefts = [left for left in lefts if left.stem.endswith("_10")] or lefts
+    lefts = [left for left in lefts if stem_of(left).endswith("_10")] or lefts
     texts = _by_stem(home / "calib_cam_to_cam", (".txt",)) | _by_stem(home / "calib", (".txt",))
     texts = {f"{stem}_10": path for stem, path in texts.items()} | texts
     return _frames(
@@ -278,16 +278,16 @@ def _pairs(folder: Path) -> Iterable[Frame]:
     cameras = _by_stem(folder, (".json", ".yaml", ".yml"))
     camera, text = cameras.get("camera"), folder / "calib.txt"
     lefts, right = _listed(folder / "left"), _by_stem(folder / "right")
-    if right and not any(left.stem in right for left in lefts):
+    if right and not any(stem_of(left) in right for left in lefts):
         with suppress(InputError):  # left_0004 and right_0004
-            order = find_partners([left.stem for left in lefts], list(right), str(folder))
+            order = find_partners([stem_of(left) for left in lefts], list(right), str(folder))
             views = list(right.values())
-            right = {left.stem: views[k] for left, k in zip(lefts, order, strict=True)}
+            right = {stem_of(left): views[k] for left, k in zip(lefts, order, strict=True)}
     calibration = camera or (text if text.is_file() else None)
     return _frames(
         lefts,
         "camera" if camera else "plain",
-        calibration={left.stem: calibration for left in lefts if calibration},
+        calibration={stem_of(left): calibration for left in lefts if calibration},
         right=right,
         depth=_by_stem(folder / "lidar_depth"),
         disparity=_by_stem(folder / "disp_occ"),
@@ -320,7 +320,7 @@ def _by_stem(
 ) -> dict[str, Path]:
     """List files by their names; of two suffixes the first one counts, in capitals or not."""
     found = sorted(_listed(folder, suffixes), key=lambda path: suffixes.index(path.suffix.lower()))
-    return {path.stem: path for path in reversed(found)}
+    return {stem_of(path): path for path in reversed(found)}
 
 
 def _listed(folder: Path, suffixes: tuple[str, ...] = LISTED_SUFFIXES) -> list[Path]:

@@ -1,12 +1,13 @@
 """Pairs, on disk or rendered, as training samples by index."""
 
+import warnings
 from collections import Counter
 from typing import NamedTuple
 
 import torch
 
 from depthpose.core.camera import StereoRig
-from depthpose.core.errors import InputError
+from depthpose.core.errors import InputError, Notice
 from depthpose.core.loop import sample_generator, shuffled_index
 from depthpose.depth.augment import TrainingPair, augment, scale_pair
 from depthpose.depth.config import PairsConfig, TruthKind
@@ -192,6 +193,10 @@ def _usable(
         for index, frame in enumerate(dataset.frames)
         if (frame.right is not None or is_mixed) and frame.name not in config.exclude
     }
+    alone = sum(frame.right is None for frame in dataset.frames)
+    if alone and not is_mixed and there:
+        said = f"{name}: {alone} of {len(dataset)} images have no right view, and are left out"
+        warnings.warn(said, Notice, stacklevel=2)
     kind: TruthKind | None = None
     if needs_truth:
         counts: Counter[TruthKind] = Counter(kind for kinds in there.values() for kind in kinds)

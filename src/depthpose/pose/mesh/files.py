@@ -142,14 +142,14 @@ def _rows_of(path: AnyPath, data: bytes) -> Iterator[tuple[int, list[bytes]]]:
             f"{path}: {len(data)} bytes of text, more than the {_MOST_TEXT} that are read; save it "
             "as binary PLY or STL"
         )
-    before: list[bytes] = []
+    before = bytearray()  # which grows in place, as bytes do not
     text = data.removeprefix(BOM_UTF8).replace(b"\r\n", b"\n").replace(b"\r", b"\n")
     # A backslash joins lines; behind one that ends the file comes an empty line.
     for number, line in enumerate(BytesIO(text + b"\n\n"), 1):
         if line.endswith(b"\\\n"):
-            before.append(line[:-2])
+            before += line[:-2]
             continue
-        words = b"".join([*before, line]).partition(b"#")[0].split()
+        words = bytes(before + line).partition(b"#")[0].split()
         before.clear()
         if words:
             yield number, [words[0].lower(), *words[1:]]
@@ -347,6 +347,7 @@ _MOST_CORNERS = 5_000  # of one polygon
 _MOST_CLIPPED = 2e8
 """Of polygons that are not convex, the sum of corners times 1,000 and the corners that turn back:
 each is clipped in about so many steps, together some ten seconds."""
+_MOST_TOGETHER = 2**20  # corners of polygons that are cut at a time
 _MOST_ROUNDS = 3  # about a polygon in search of ears; one that needs more crosses itself
 _FLAT = 1e-9  # of the square of a polygon's area: a corner that turns back by less is straight
 _OVERLAP = 1e-3  # of all area: polygons that cross themselves may lay so much of it twice
@@ -378,10 +379,8 @@ def cut_polygons(
     overlap, area = np.zeros(len(sizes)), 0.0
     steps = 0.0
     order = np.argsort(sizes, kind="stable")
-    for which in np.split(order, np.flatnonzero(np.diff(sizes[order])) + 1):
-        size = int(sizes[which[0]]) if len(which) else 0
-        if size < 3:
-            continue
+    for which in _alike(sizes, order):
+        size = int(sizes[which[0]])
         polygons = corners[starts[which, None] + np.arange(size)]
         normals, is_back = _back_turns(vertices[polygons])
         backs = is_back.sum(1)
@@ -410,6 +409,15 @@ def cut_polygons(
             "its border), so its surface is unknown; export it as triangles"
         )
     return np.concatenate(found)[np.argsort(np.concatenate(owners), kind="stable")]
+
+
+def _alike(sizes: np.ndarray, order: np.ndarray) -> Iterator[np.ndarray]:
+    """Give the numbers of polygons of equally many corners, so many that they fit in memory."""
+    for alike in np.split(order, np.flatnonzero(np.diff(sizes[order])) + 1):
+        size = int(sizes[alike[0]]) if len(alike) else 0
+        step = max(1, _MOST_TOGETHER // max(size, 1))
+        for start in range(0, len(alike) if size > 2 else 0, step):
+            yield alike[start : start + step]
 
 
 def _back_turns(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
