@@ -5,8 +5,8 @@ contradicts it, the area that was not observed, and its residual. And is the bes
 all? Its evidence is compared with what right and wrong poses leave.
 
 At a right pose a tenth of the visible area is contradicted on average, by edges, reflections and
-dents that the model does not have; at a wrong pose half of it. Both shares vary from view to view, so
-that a count of contradicting patches has a negative binomial distribution: ten patches more say
+dents that the model does not have; at a wrong pose half of it. Both shares vary from view to view,
+so that a count of contradicting patches has a negative binomial distribution: ten patches more say
 much of a small object and little of a large one.
 """
 
