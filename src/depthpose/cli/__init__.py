@@ -48,6 +48,8 @@ COMMANDS = {
         "data:make_objects", "synthetic frames of your CAD files on a table, in BOP's layout"),
     "data rectify": (
         "data:rectify", "raw pairs and their calibration to rectified pairs for depth match"),
+    "data split": (
+        "data:split", "pictures and videos that hold both views to a left and a right folder"),
     "data check": ("data:check", "read a whole data set and list what is wrong"),
     "data label": (
         "data:label", "truth for pairs that have none, by a matcher, where both views agree"),

@@ -413,6 +413,51 @@ def rectify(
     return 0
 
 
+def split(files: tyro.conf.Positional[tuple[Source, ...]], out: NewPath) -> int:
+    """Part pictures and videos that hold both views of a stereo camera.
+
+    Finds whether the views are side by side, one above the other or one after the other (.mpo), and
+    which is the left one. Writes left/NAME.png and right/NAME.png: OUT is input for 'depth match',
+    or for 'data rectify' where the views are raw.
+
+        depthpose data split street.jps drive.mp4 --out parted
+
+    Args:
+        files: pictures, videos, folders or quoted patterns.
+        out: folder for the results.
+    """
+    from depthpose.cli.depth_predict import find_sources
+    from depthpose.core.camera import find_two_views, halves, order_views
+    from depthpose.core.files import VIDEO_SUFFIXES, read_video, write_image
+    from depthpose.core.files.images import read_views
+    from depthpose.core.run import claim_folder
+
+    sources = find_sources(files, out)
+    claim_folder(out, {"command": "data split"}, _SIDES)
+    count = 0
+    for source in sources:
+        is_video = source.suffix.lower() in VIDEO_SUFFIXES
+        pictures = (
+            ((name, [frame]) for name, frame in read_video(source))
+            if is_video
+            else [(source.stem, read_views(source))]
+        )
+        for name, views in pictures:
+            if len(views) == 1:
+                how = find_two_views(views[0])
+                if how is None:
+                    raise InputError(
+                        f"{source}: {name} does not look like two views of one scene, side by "
+                        "side or one above the other; leave it out"
+                    )
+                views = list(halves(views[0], how))  # noqa: PLW2901
+            for side, view in zip(_SIDES, order_views(views[0], views[1]), strict=True):
+                write_image(out / side / f"{name}.png", view)
+            count += 1
+    print(f"{out}: {count} pairs in left and right")
+    return 0
+
+
 def _check_rows(
     rectifier: "Rectifier", pairs: list[tuple[Path, Path]], *, is_refused: bool
 ) -> None:
