@@ -1,5 +1,7 @@
 """Where an image shows nothing: borders without a picture, surfaces without any texture."""
 
+from typing import cast
+
 import numpy as np
 import torch
 from jaxtyping import Bool, Float
@@ -45,7 +47,7 @@ def without_picture(image: Float[Tensor, "3 h w"]) -> Bool[Tensor, "h w"]:
     dark = (image.amax(0) <= _BLACK).cpu().numpy()
     on_edge = np.concatenate([dark[0], dark[-1], dark[:, 0], dark[:, -1]])
     if on_edge.any():
-        regions, count = ndimage.label(dark)
+        regions, count = cast("tuple[np.ndarray, int]", ndimage.label(dark))
         at_edge = (regions[0], regions[-1], regions[:, 0], regions[:, -1])
         is_border = np.zeros(count + 1, dtype=bool)
         is_border[np.unique(np.concatenate(at_edge))] = True
