@@ -35,7 +35,8 @@ LISTED_SUFFIXES = (
 )  # fmt: skip
 """Suffixes of pictures in a listed folder; a file that is named may have any."""
 _UNREAD = re.compile(
-    r"\.(heic|heif|avif|jp2|j2k|jxl|tga|dib|exr|hdr|dng|cr[23w]|nef|arw|orf|rw2|raw|pfm|svg|psd)",
+    r"\.(heic|heif|avif|jp2|j2k|jxl|tga|dib|exr|hdr|dng|cr[23w]|nef|arw|orf|rw2|raw|pfm|svg|psd"
+    r"|mpo|jps)",
     re.IGNORECASE,
 )
 """Suffixes of pictures that are not read: in a folder they are named."""
