@@ -120,7 +120,7 @@ def edge_functions(
     # between them.
     (ax, ay, az), (bx, by, bz) = (corners.roll(-k, 1).unbind(-1) for k in (1, 2))
     parts = [(ay * bz, az * by), (az * bx, ax * bz), (ax * by, ay * bx)]
-    edges = torch.stack([one - other for one, other in parts], -1)
+    edges = torch.stack([start - other for start, other in parts], -1)
     return edges, (corners[:, 0] * edges[:, 0]).sum(-1)
 
 
@@ -136,13 +136,13 @@ def barycentric_shares(
     """
     height, width = primitive.shape
     shares = torch.zeros(height * width, 3, device=edges.device)
-    seen = (primitive.reshape(-1) >= 0).nonzero()[:, 0]
-    which = primitive.reshape(-1)[seen]
-    u, v = (seen % width).double()[:, None], (seen // width).double()[:, None]
+    covered = (primitive.reshape(-1) >= 0).nonzero()[:, 0]
+    which = primitive.reshape(-1)[covered]
+    u, v = (covered % width).double()[:, None], (covered // width).double()[:, None]
     across, down, constant = edges.index_select(0, which).unbind(-1)
     weight = torch.addcmul(constant, across, u).addcmul_(down, v).div_(volume[which, None])
     weight = weight.clamp_(min=0)  # beyond the edge by a rounding, where a pixel lies on it
-    shares[seen] = (weight / _most(torch.add, weight)[:, None]).float()
+    shares[covered] = (weight / _most(torch.add, weight)[:, None]).float()
     return shares.reshape(height, width, 3)
 
 
@@ -186,9 +186,9 @@ def _draw(
         across, down, constant = edges.index_select(0, which).unbind(-1)
         offset = torch.addcmul(constant, down, v[:, None])
         start, stop = _span(across, offset, first[which, 0], last[which, 0])
-        kept = (start <= stop).nonzero()[:, 0]
+        not_empty = (start <= stop).nonzero()[:, 0]
         which, row, start, stop, v = (
-            values.index_select(0, kept) for values in (which, row, start, stop, v)
+            values.index_select(0, not_empty) for values in (which, row, start, stop, v)
         )
         slope, down, constant = plane.index_select(0, which).unbind(-1)
         at_row = down * v + constant

@@ -56,7 +56,7 @@ def measure(of: Quantity, predicted: Numbers, true: Numbers) -> dict[str, float]
                     "clamp them first, as the protocol says."
                 )
     p, t = predicted.double(), true.double()
-    return {one.name: one.function(p, t) for one in METRICS.values() if one.of == of}
+    return {metric.name: metric.function(p, t) for metric in METRICS.values() if metric.of == of}
 
 
 def _end_point_error(p: Tensor, t: Tensor) -> float:
@@ -131,8 +131,8 @@ def sparsification_area(error: Numbers, confidence: Numbers, steps: int = 50) ->
         descending = torch.argsort(keep_first, descending=True)
         counts = torch.arange(1, len(error) + 1)
         running = _shared_error(error, keep_first)[descending].cumsum(0) / counts
-        kept = len(error) * (1 - torch.arange(steps, dtype=error.dtype) / steps)
-        curves.append(running[kept.ceil().long().clamp(min=1) - 1])
+        remaining = len(error) * (1 - torch.arange(steps, dtype=error.dtype) / steps)
+        curves.append(running[remaining.ceil().long().clamp(min=1) - 1])
     return float(((curves[0] - curves[1]) / error.mean()).mean())
 
 

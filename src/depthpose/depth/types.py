@@ -160,21 +160,21 @@ class DepthEstimate:
         what, unit, values = "depth", "m", self.depth_m
         if values is None:
             what, unit, values = "disparity", "px", self.disparity_px
-        known, spread = values[values.isfinite()], "nowhere known"
-        if len(known):
+        finite, spread = values[values.isfinite()], "nowhere known"
+        if len(finite):
             # What is farthest is one pixel.
-            low, middle, high = np.percentile(known.numpy(force=True), (1, 50, 99))
-            share = len(known) / values.numel()
+            low, middle, high = np.percentile(finite.numpy(force=True), (1, 50, 99))
+            share = len(finite) / values.numel()
             part = "" if share == 1 else f", known of {share:.0%}"
             spread = f"{low:.1f} .. {high:.1f} {unit} (1 to 99 %, median {middle:.1f}{part})"
-        said = [f"{width}x{height}", f"{what} {spread}"]
+        parts = [f"{width}x{height}", f"{what} {spread}"]
         if self.confidence is not None:
-            said.append(f"mean confidence {float(self.confidence.nanmean()):.2f}")
+            parts.append(f"mean confidence {float(self.confidence.nanmean()):.2f}")
         if self.is_sky is not None:
-            said.append(f"sky {float(self.is_sky.float().mean()):.0%}")
+            parts.append(f"sky {float(self.is_sky.float().mean()):.0%}")
         if self.warning:
-            said.append(f"warning: {self.warning}")
-        return f"DepthEstimate({', '.join(said)})"
+            parts.append(f"warning: {self.warning}")
+        return f"DepthEstimate({', '.join(parts)})"
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

@@ -97,8 +97,8 @@ def read_depth_weights(
         config, prefix = checkpoint.config[kind], f"{kind}."
         if not isinstance(config, Mapping):
             raise InputError(f"{path}: its config has no {kind!r}; the file is damaged.")
-        given = checkpoint.state.items()
-        state = {key.removeprefix(prefix): t for key, t in given if key.startswith(prefix)}
+        tensors = checkpoint.state.items()
+        state = {key.removeprefix(prefix): t for key, t in tensors if key.startswith(prefix)}
         parts[kind] = checkpoints.Checkpoint(kind=kind, config=config, state=state)
     if is_both and not (set(parts) & set(GENERATORS) and set(parts) & set(MATCHERS)):
         raise InputError(
@@ -250,14 +250,14 @@ def calibrate_weights(
     """
     refuse_share(len(image_confidence), alarm_share)
     least = min(round(float(np.quantile(image_confidence, alarm_share)), 4), 0.9999)
-    found = checkpoints.read_checkpoint(weights)
-    config = dict(found.config)
-    own = {BOTH: config.get(_SELECTION), _SELECTION: config}.get(found.kind)
-    if not isinstance(own, dict):
+    checkpoint = checkpoints.read_checkpoint(weights)
+    config = dict(checkpoint.config)
+    selection = {BOTH: config.get(_SELECTION), _SELECTION: config}.get(checkpoint.kind)
+    if not isinstance(selection, dict):
         raise InputError(
             f"{weights}: holds no generator that selects; take weights of 'train select'"
         )
-    changed = {**own, "least_confidence": least}
-    config = {**config, _SELECTION: changed} if found.kind == BOTH else changed
-    checkpoints.save_checkpoint(out, replace(found, config=config))
+    changed = {**selection, "least_confidence": least}
+    config = {**config, _SELECTION: changed} if checkpoint.kind == BOTH else changed
+    checkpoints.save_checkpoint(out, replace(checkpoint, config=config))
     return least

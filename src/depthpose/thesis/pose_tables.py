@@ -255,8 +255,10 @@ def cases_of(
     numbers = {model.name: k for k, model in enumerate(net.weights.models)}
     for view in views:
         number = numbers[view.input.object]
-        model, seen = net.weights.models[number], view.input
-        cloud = cloud_from_depth(seen.depth_m, seen.mask, seen.K, model.diameter_m).float()
+        model, view_input = net.weights.models[number], view.input
+        cloud = cloud_from_depth(
+            view_input.depth_m, view_input.mask, view_input.K, model.diameter_m
+        ).float()
         generator = torch.Generator().manual_seed(0)
         points_m = sample_points(cloud, points, generator)
         if refusal_of(points_m, net.weights.cloud) is not None:
@@ -264,14 +266,14 @@ def cases_of(
             continue
         grid = voxelise(points_m, net.weights.cloud)
         places = torch.nn.functional.pad(grid.coordinates, (1, 0))
-        given = SeenPoints(
+        seen_points = SeenPoints(
             points_m=points_m[grid.kept],
             coordinates=places,
             features=grid.features,
             class_of_point=torch.full((len(places),), number),
         )
         with torch.inference_mode():
-            outputs = network.directions(given) @ grid.grid_from_camera
+            outputs = network.directions(seen_points) @ grid.grid_from_camera
             directions = torch.nn.functional.normalize(outputs, dim=-1)[grid.row_of_point]
         yield VotingCase(
             points_m=points_m,
@@ -359,7 +361,7 @@ def ransac_one_by_one(
     Published practice is 50 hypotheses for each keypoint.
     """
     random = np.random.default_rng(seed)
-    found = []
+    keypoints = []
     for k in range(directions.shape[1]):
         n = directions[:, k]
         best, chosen = -1, np.ones(len(n), bool)
@@ -378,8 +380,8 @@ def ransac_one_by_one(
             refitted = np.linalg.solve(*_normal_equations(points_m[chosen], n[chosen]))
         except np.linalg.LinAlgError:  # no inlier but parallel ones, or none: all votes count
             refitted = np.linalg.lstsq(*_normal_equations(points_m, n), rcond=None)[0]
-        found.append(refitted)
-    return np.stack(found)
+        keypoints.append(refitted)
+    return np.stack(keypoints)
 
 
 def _normal_equations(points_m: np.ndarray, n: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

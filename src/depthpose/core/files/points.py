@@ -68,7 +68,7 @@ def plain_numbers(line: str) -> str:
     """Write ``nan`` and ``inf`` for the words by which Microsoft's C library prints them."""
     if "#" not in line and "(" not in line:
         return line
-    return _WORDS.sub(lambda found: "inf" if "INF" in found[0] else "nan", line)
+    return _WORDS.sub(lambda match: "inf" if "INF" in match[0] else "nan", line)
 
 
 def split_rows(path: AnyPath, rows: Iterator[str], fields: list[Field], count: int) -> Columns:
@@ -203,7 +203,7 @@ def _binary_lists(
     steps = [(f, np.dtype(order + (f.size_code or "u1")), np.dtype(order + f.code))
              for f in element.fields]  # fmt: skip
     runs: list[Any] = []
-    known: dict[tuple[int, ...], np.dtype] = {}
+    dtypes: dict[tuple[int, ...], np.dtype] = {}
     at, left, ahead = 0, element.count, 64
     while left:
         lengths, end = [], at
@@ -219,13 +219,13 @@ def _binary_lists(
             end += length * value.itemsize
         need_bytes(path, len(body), end, what)
         key = tuple(lengths)
-        if key not in known:
+        if key not in dtypes:
             kinds: list[Any] = []
             for (f, size, value), length in zip(steps, key, strict=True):
                 kinds += [(f"{f.name} size", size)] if f.size_code else []
                 kinds.append((f.name, value, (length,)))
-            known[key] = np.dtype(kinds)
-        dtype = known[key]
+            dtypes[key] = np.dtype(kinds)
+        dtype = dtypes[key]
         rows = min(left, ahead, (len(body) - at) // dtype.itemsize)
         records: Any = np.frombuffer(body, dtype, rows, at)
         sizes = [records[f"{f.name} size"] for f in element.fields if f.size_code]
@@ -287,13 +287,13 @@ def _parse_header(path: AnyPath, lines: list[str]) -> tuple[str, list[_Element]]
     names = [e.name for e in elements]
     if names.count("vertex") != 1:
         raise InputError(f"{path}: elements {names}, where exactly one 'vertex' is needed")
-    for one in elements:
-        properties = [f.name for f in one.fields]
-        has_list = one.name == "vertex" and any(f.size_code for f in one.fields)
+    for element in elements:
+        properties = [f.name for f in element.fields]
+        has_list = element.name == "vertex" and any(f.size_code for f in element.fields)
         if has_list or not properties or len(set(properties)) != len(properties):
             raise InputError(
-                f"{path}: {one.name} properties {properties} are none, a list or repeat a name; "
-                "give each vertex x, y and z"
+                f"{path}: {element.name} properties {properties} are none, a list or repeat a "
+                "name; give each vertex x, y and z"
             )
     return order, elements
 

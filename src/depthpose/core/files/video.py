@@ -127,8 +127,10 @@ def write_video(path: AnyPath, images: Iterable[Float[Tensor, "3 _ _"]], fps: fl
                     first, codec = size, cv2.VideoWriter_fourcc(*_CODECS[suffix])
                     writer = cv2.VideoWriter(str(part), codec, float(fps), size)
                     if suffix == ".mp4" and not writer.isOpened():
-                        said = "OpenCV encodes no VP9 here, so it is MPEG-4, which no browser plays"
-                        warnings.warn(f"{path}: {said}", Notice, stacklevel=2)
+                        message = (
+                            "OpenCV encodes no VP9 here, so it is MPEG-4, which no browser plays"
+                        )
+                        warnings.warn(f"{path}: {message}", Notice, stacklevel=2)
                         codec = cv2.VideoWriter_fourcc(*"mp4v")
                         writer = cv2.VideoWriter(str(part), codec, float(fps), size)
                 if size != first:

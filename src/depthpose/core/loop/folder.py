@@ -46,9 +46,9 @@ class RunLogger:
             return
         for folder in (self.folder, self.folder / _PICTURES):
             remove_parts(folder)
-        kept = [row for row in read_metrics(self.folder) if row["step"] <= step]
+        earlier = [row for row in read_metrics(self.folder) if row["step"] <= step]
         with atomic_write(self.folder / _METRICS) as part:
-            part.write_text("".join(json.dumps(row) + "\n" for row in kept))
+            part.write_text("".join(json.dumps(row) + "\n" for row in earlier))
         import_extra("tensorboard", "tensorboard", "train", "training")
         from torch.utils.tensorboard.writer import SummaryWriter
 
@@ -194,11 +194,11 @@ class Parts:
 
     def restore(self, state: Mapping[str, Any]) -> None:
         """Take over a state; one that does not fit is refused with what differs."""
-        own = self.state()
+        present = self.state()
         problems = [
             f"{words}{key}: {fault}"
             for words, name in (("", "modules"), ("average of ", "average"))
-            for key, tensors in own[name].items()
+            for key, tensors in present[name].items()
             for fault in misfits(tensors, state[name][key])
         ]
         for name, optimizer in self.optimizers.items():
@@ -249,8 +249,8 @@ def restore_last(folder: Path, parts: Parts) -> tuple[Path, int, float]:
                 parts.restore(state)
                 step, seconds = state["step"], float(state.get("seconds", 0.0))
         except InputError as error:
-            said = str(error)
-            damages.append(said if said.startswith(str(path)) else f"{path}: {said}")
+            message = str(error)
+            damages.append(message if message.startswith(str(path)) else f"{path}: {message}")
             continue
         if path.name != STATE:
             reason = "; ".join(damages) or f"{folder}: there is no {STATE}"

@@ -81,27 +81,27 @@ def read_plain_calibration(path: Path, name: str, width: int, height: int) -> St
         keys = files.read_key_values(path)
         return _rig(path, plain_facts(path, keys), (width, height))
     lines = re.findall(rf"^[ \t]*{re.escape(name)}[ \t]+(.+)$", text, re.MULTILINE)
-    own: list[list[float]] = []
+    of_frame: list[list[float]] = []
     for line in lines:
         numbers: list[float] = []
         with suppress(ValueError):  # what begins the line counts
             for word in line.split():
                 numbers.append(float(word))  # noqa: PERF401  those before an error stay
-        own += [numbers] if len(numbers) >= 6 else []
-    if lines and not own:
+        of_frame += [numbers] if len(numbers) >= 6 else []
+    if lines and not of_frame:
         raise InputError(
             f"{path}: the line of {name!r} is no calibration: {lines[0][:80]!r} does not begin "
             "with six numbers, width height focal_px cx cy baseline_m"
         )
-    if len(own) > 1:
-        raise InputError(f"{path}: {len(own)} lines for {name!r}. Keep one of them.")
-    if not own:
+    if len(of_frame) > 1:
+        raise InputError(f"{path}: {len(of_frame)} lines for {name!r}. Keep one of them.")
+    if not of_frame:
         raise InputError(
             f"{path}: neither 'focal_px: ...' nor a line '{name} width height focal_px cx cy "
             "baseline_m'. Write focal_px, cx, cy and baseline_m, a line each."
         )
     try:
-        numbers = own[0] if len(own[0]) == 8 else own[0][:6]
+        numbers = of_frame[0] if len(of_frame[0]) == 8 else of_frame[0][:6]
         size = int(numbers[0]), int(numbers[1])
         names = ("focal_px", "cx", "cy", "baseline_m", "focal_y_px", "cx_right_minus_left_px")
         values: dict[str, list[float]] = {n: [v] for n, v in zip(names, numbers[2:], strict=False)}
@@ -125,11 +125,12 @@ def _projected_rig(
     """The rig of two projections, and that of the left camera."""
     left, right = (kitti_matrix(path, keys, name, (3, 4)) for name in names)
     sides = keys.get("S_rect_02", [])  # of the rectified images
-    said = (int(sides[0]), int(sides[1])) if len(sides) == 2 else size
-    if said != size:
+    declared = (int(sides[0]), int(sides[1])) if len(sides) == 2 else size
+    if declared != size:
         raise InputError(
-            f"{path}: S_rect_02 says {said[0]}x{said[1]}, but the image is {size[0]}x{size[1]}. It "
-            "was cropped or scaled: give its own calibration, in a folder of pairs."
+            f"{path}: S_rect_02 says {declared[0]}x{declared[1]}, but the image is "
+            f"{size[0]}x{size[1]}. It was cropped or scaled: give its own calibration, in a "
+            "folder of pairs."
         )
     try:
         facts = facts_from_projections("a KITTI calibration", left, right)
@@ -229,14 +230,14 @@ class Frame:
 
     def seen_files(self, *, with_right: bool = True) -> list[Path]:
         """List what an estimate depends on: left image, right image, files of the calibration."""
-        seen = [self.left]
+        paths = [self.left]
         if with_right and self.right is not None:
-            seen.append(self.right)
+            paths.append(self.right)
         if self.calibration is not None and self.calibration.is_dir():
-            seen += sorted(self.calibration.glob("calib_*.txt"))
+            paths += sorted(self.calibration.glob("calib_*.txt"))
         elif self.calibration is not None:
-            seen.append(self.calibration)
-        return seen
+            paths.append(self.calibration)
+        return paths
 
 
 def frame_camera(frame: Frame) -> Camera | None:

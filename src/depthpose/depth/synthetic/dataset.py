@@ -77,7 +77,7 @@ def nearest_at(
     volume = sight.volume.index_select(0, which)[:, None]
     lines = (sight.edges.flatten(1).index_select(0, which) / volume).unflatten(0, candidates.shape)
     missing, row = candidates < 0, torch.arange(len(candidates))
-    found = []
+    hits = []
     for pixels in places:
         u, v = pixels[:, :1], pixels[:, 1:]
         # Corner by corner: a sum over so short an axis would take ten times as long.
@@ -92,8 +92,8 @@ def nearest_at(
         primitive = torch.where(inverse > 0, candidates[row, first], -1)
         chosen = torch.stack([weight[row, first] for weight in weights], 1)
         shares = (chosen / inverse[:, None]).float()
-        found.append(Nearest(primitive, shares, (1 / inverse).float()))
-    return found
+        hits.append(Nearest(primitive, shares, (1 / inverse).float()))
+    return hits
 
 
 def neighbours(primitive: Int[Tensor, "h w"], index: Indices) -> Int[Tensor, "n 5"]:
@@ -122,35 +122,35 @@ def draw_light(stage: Stage, sight: Sight) -> Float[Tensor, "h w 3"]:
     kind = torch.where(raster.primitive >= 0, stage.kind[shown], -1)
     normal = stage.attributes[:, 18:21].index_select(0, shown.flatten()).unflatten(0, shown.shape)
     every, after, before = slice(None), slice(1, None), slice(None, -1)
-    for one, other in (((every, after), (every, before)), ((after, every), (before, every))):
-        is_other = raster.primitive[one] != raster.primitive[other]
-        x, y, z = (normal[one] * normal[other]).unbind(-1)
+    for here, other in (((every, after), (every, before)), ((after, every), (before, every))):
+        is_other = raster.primitive[here] != raster.primitive[other]
+        x, y, z = (normal[here] * normal[other]).unbind(-1)
         is_bent = (x + y + z).abs() < 0.9
-        differs = is_other & ((kind[one] != kind[other]) | is_bent)
-        is_edge[one] |= differs
+        differs = is_other & ((kind[here] != kind[other]) | is_bent)
+        is_edge[here] |= differs
         is_edge[other] |= differs
     is_edge = is_edge.flatten()
     light = torch.zeros(height * width, 3)
     whole, mixed = (~is_edge).nonzero()[:, 0], is_edge.nonzero()[:, 0]
     assert raster.barycentric is not None
-    seen = [v.flatten(0, 1) for v in (raster.primitive, raster.barycentric, raster.depth_m)]
-    nearest = Nearest(*(values.index_select(0, whole) for values in seen))
+    flat = [v.flatten(0, 1) for v in (raster.primitive, raster.barycentric, raster.depth_m)]
+    nearest = Nearest(*(values.index_select(0, whole) for values in flat))
     index = torch.arange(height * width)
     centres = torch.stack([index % width, index // width], 1).double()
     light[whole] = _light(stage, sight, centres[whole], nearest)
     if len(mixed):  # the mean light of four places in each pixel
         candidates = neighbours(sight.raster.primitive, mixed)
-        own = [values.index_select(0, mixed) for values in seen]
+        at_centre = [values.index_select(0, mixed) for values in flat]
         places = [centres[mixed] + torch.tensor(o, dtype=torch.float64) for o in _OFFSETS]
-        found = []
+        hits = []
         for there in nearest_at(sight, candidates, places):
             # A gap between all that was seen near by: take what the pixel's centre sees.
             is_lost = (there.primitive < 0) & (candidates >= 0).all(1)
-            found.append([
-                torch.where(is_lost if one.ndim == 1 else is_lost[:, None], instead, one)
-                for one, instead in zip(there, own, strict=True)
+            hits.append([
+                torch.where(is_lost if here.ndim == 1 else is_lost[:, None], instead, here)
+                for here, instead in zip(there, at_centre, strict=True)
             ])  # fmt: skip
-        nearest = Nearest(*(torch.cat(parts) for parts in zip(*found, strict=True)))
+        nearest = Nearest(*(torch.cat(parts) for parts in zip(*hits, strict=True)))
         of_places = _light(stage, sight, torch.cat(places), nearest)
         # A glint in a quarter of a pixel would outshine the rest, as it does not in a sensor.
         light[mixed] = of_places.clamp(max=4).reshape(len(_OFFSETS), -1, 3).mean(0)
@@ -287,13 +287,13 @@ def scan(stage: Stage, rng: np.random.Generator) -> Float[Tensor, "n 4"]:
     primitive, _, depth_m = nearest_at(sight, candidates, [pixels])[0]
     range_m = depth_m / towards[:, 2]
     # Few beams come back from glass, fewer from afar and from what is dark.
-    chance, seen = torch.from_numpy(rng.random(len(primitive))), primitive.clamp(min=0)
-    material, tint = stage.material[seen], stage.attributes[seen, 15:18].mean(1)
+    chance, hit = torch.from_numpy(rng.random(len(primitive))), primitive.clamp(min=0)
+    material, tint = stage.material[hit], stage.attributes[hit, 15:18].mean(1)
     is_glass = (material == NUMBER["glass"]) | (material == NUMBER["pane"])
     dark = (0.12 - tint).clamp(min=0) * 2.5
     lost = 0.03 + 0.0025 * range_m + 0.65 * is_glass + dark * (range_m / 40).clamp(max=1)
-    kept = (primitive >= 0) & (range_m < _MAX_RANGE_M) & (chance > lost)
-    returned = kept.nonzero()[:, 0]
+    is_returned = (primitive >= 0) & (range_m < _MAX_RANGE_M) & (chance > lost)
+    returned = is_returned.nonzero()[:, 0]
     noise = torch.from_numpy(rng.normal(0, _NOISE_M, len(returned)))
     far = range_m[returned].double() + noise
     x, y, z = (towards[returned] * far[:, None]).unbind(1)
@@ -438,9 +438,9 @@ def _occluded(left: Sight, right: Sight, rig: StereoRig) -> Mask:
     candidates = neighbours(right.raster.primitive, near)
     # Most see the same triangle there, and nothing else need be asked.
     is_same = (candidates[:, :1] == primitive[index, None])[:, 0] & ~is_outside
-    asked = (~is_same & ~is_outside).nonzero()[:, 0]
-    _, _, seen_m = nearest_at(right, candidates[asked], [pixels[asked]])[0]
-    occluded[index[asked]] = seen_m < depth_m[index[asked]] * (1 - _OCCLUSION_SHARE)
+    undecided = (~is_same & ~is_outside).nonzero()[:, 0]
+    _, _, seen_m = nearest_at(right, candidates[undecided], [pixels[undecided]])[0]
+    occluded[index[undecided]] = seen_m < depth_m[index[undecided]] * (1 - _OCCLUSION_SHARE)
     occluded[index[is_outside]] = True
     return occluded.reshape(height, width)
 

@@ -340,9 +340,9 @@ class Mesh:
     def __len__(self) -> int:
         return len(self.corners)
 
-    def part(self, kept: Bool[np.ndarray, " n"]) -> "Mesh":
+    def part(self, is_part: Bool[np.ndarray, " n"]) -> "Mesh":
         """Some of its triangles."""
-        return Mesh(**{field.name: getattr(self, field.name)[kept] for field in fields(Mesh)})
+        return Mesh(**{field.name: getattr(self, field.name)[is_part] for field in fields(Mesh)})
 
 
 def join(meshes: Sequence[Mesh]) -> Mesh:

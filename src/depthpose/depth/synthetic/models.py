@@ -458,8 +458,8 @@ def _ring(
     high = half * lean if roof > belt + 0.1 else half * 0.95
     x = [half * 0.96, half, half * 0.985, high, high * 0.6]
     y = [sill, sill + 0.4 * (belt - sill), belt, roof, roof + 0.012 * height]
-    one = [(a, -b, place * length) for a, b in zip(x, y, strict=True)]
-    return np.array(one + [(-a, b, c) for a, b, c in reversed(one)])
+    side = [(a, -b, place * length) for a, b in zip(x, y, strict=True)]
+    return np.array(side + [(-a, b, c) for a, b, c in reversed(side)])
 
 
 def _add_trim(b: MeshBuilder, length: float, width: float, height: float) -> None:

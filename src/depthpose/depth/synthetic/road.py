@@ -425,8 +425,8 @@ class _Roadside:
                     points = start * (1 - share) + stop * share
                     sag = (4 * share * (1 - share))[:, 0] * 0.02
                     points[:, 1] += sag * np.linalg.norm(stop - start)
-                    for one, other in pairwise(points):
-                        self.b.tube(one, other, 0.018, _DARK, 3)
+                    for here, there in pairwise(points):
+                        self.b.tube(here, there, 0.018, _DARK, 3)
 
     def add_house(self, s: Number, length: Number, back: Number, height: float) -> None:
         """A house so far behind the pavement."""

@@ -254,9 +254,9 @@ def make_clutter(seed: tuple[int, ...]) -> StreetScene:
     # Nothing may come nearer than the rig's largest disparity allows; but a backdrop reaches behind
     # the camera, and its triangles are large.
     is_far = mesh.corners[:, :, 2].min(1) > 0.85 * _DEPTHS_M[0]
-    kept = is_far | (np.ptp(mesh.corners, axis=1).max(1) > _DEPTHS_M[0])
+    is_far_enough = is_far | (np.ptp(mesh.corners, axis=1).max(1) > _DEPTHS_M[0])
     return StreetScene(
-        mesh=mesh.part(kept),
+        mesh=mesh.part(is_far_enough),
         markings=Markings(
             lines=np.zeros((0, 4)), bars=np.zeros((0, 5)), brightness=0.5, wheel_tracks=(0.0, 3.0)
         ),

@@ -86,7 +86,7 @@ def prepare(scene: StreetScene, pixels: int = 1242 * 375) -> Stage:
         kind=torch.from_numpy(mesh.thing.astype(np.int64)) * len(MATERIALS) + material,
         to_sun=to_sun,
         up=up,
-        sun_maps=[_light_map(casters, to_sun, *one, share) for one in maps],
+        sun_maps=[_light_map(casters, to_sun, *light_map, share) for light_map in maps],
         sky_map=_light_map(casters, up, *_SKY_MAP, share),
     )
 
@@ -233,9 +233,9 @@ def _shade(stage: Stage, hits: Hits, focal_px: float) -> Vectors:
     return torch.lerp(color, haze.expand_as(color), thick[:, None])
 
 
-def _dot(one: Vectors, other: Vectors) -> Numbers:
+def _dot(a: Vectors, b: Vectors) -> Numbers:
     """Written out: a sum over so short an axis would take ten times as long."""
-    return one[:, 0] * other[:, 0] + one[:, 1] * other[:, 1] + one[:, 2] * other[:, 2]
+    return a[:, 0] * b[:, 0] + a[:, 1] * b[:, 1] + a[:, 2] * b[:, 2]
 
 
 def _add_mirrored(
@@ -257,8 +257,8 @@ def _add_mirrored(
     light *= (1 - 0.78 * hidden)[:, None]
     glint = 2 * lit[some] * (mirrored @ stage.to_sun).clamp(min=0) ** 300
     sun_color = torch.from_numpy(stage.scene.weather.sun_color).float()
-    own = color[some] * (1 - share)[:, None]
-    color[some] = own + share[:, None] * light + glint[:, None] * sun_color
+    diffuse = color[some] * (1 - share)[:, None]
+    color[some] = diffuse + share[:, None] * light + glint[:, None] * sun_color
 
 
 def sky_light(stage: Stage, towards: Vectors, *, with_sun: bool = True) -> Vectors:

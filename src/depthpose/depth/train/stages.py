@@ -51,8 +51,8 @@ class StereoTask:
         self.modules: dict[str, nn.Module] = {"matcher": matcher}
         groups = [{"params": [p for p in matcher.parameters() if p.requires_grad]}]
         if self._alone is None and matcher.encoder is not None:
-            own = set(matcher.encoder.parameters())
-            rest = [p for p in matcher.parameters() if p not in own]
+            of_encoder = set(matcher.encoder.parameters())
+            rest = [p for p in matcher.parameters() if p not in of_encoder]
             learnt = [p for p in matcher.encoder.parameters() if p.requires_grad]
             groups = [{"params": learnt, "rate": config.encoder_rate}, {"params": rest}]
         self.optimizers = {"matcher": (make_adam(groups, config.adam), config.adam)}
@@ -115,22 +115,22 @@ def validate_pairs(
             *(pad_top_right(v, matcher.config)[None] for v in views)
         )
         height, width = pair.left.shape[-2:]
-        found = heads[-1][0, -height:, :width].float().cpu()
+        predicted_px = heads[-1][0, -height:, :width].float().cpu()
         is_sky = None if sky is None else sky[0, -height:, :width].cpu() > 0.5
         is_known = (pair.left_px > 0) & (pair.left_px < matcher.config.max_disparity_px)
         is_true_sky = pair.left_px == 0
         if is_sky is not None:
-            found = torch.where(is_sky, 0.0, found)
+            predicted_px = torch.where(is_sky, 0.0, predicted_px)
             if bool(is_true_sky.any()):
                 missed.append(float((~is_sky[is_true_sky]).float().mean()))
             if bool(is_known.any()):
                 false.append(float(is_sky[is_known].float().mean()))
         if index == 0:
-            views = [pair.left, right, draw_disparity(found)]
+            views = [pair.left, right, draw_disparity(predicted_px)]
             pictures["left_right_disparity"] = torch.cat(views, 1)
         if not bool(is_known.any()):
             continue
-        metrics = measure("disparity", found[is_known], pair.left_px[is_known])
+        metrics = measure("disparity", predicted_px[is_known], pair.left_px[is_known])
         errors.append(metrics["epe_px"])
         bad.append(metrics["d1_all"])
     named = {"epe_px": errors, "d1": bad}
@@ -271,7 +271,7 @@ class SelectionSamples:
     ) -> None:
         self.sources, self.config, self.seed = sources, config, seed
         self.more_share = more_share if len(sources) > 1 else 0.0
-        self.truths = tuple(said for source in sources for said in source.truths)
+        self.truths = tuple(truth for source in sources for truth in source.truths)
 
     def __len__(self) -> int:
         return len(self.sources[0])
@@ -280,12 +280,12 @@ class SelectionSamples:
         """Make the n-th sample."""
         before, now = int(sample_index * self.more_share), int((sample_index + 1) * self.more_share)
         pair = self.sources[1][before] if now > before else self.sources[0][sample_index - before]
-        seen = degrade(pair.left, self.config, sample_generator(sample_index, self.seed + 1))
+        degraded = degrade(pair.left, self.config, sample_generator(sample_index, self.seed + 1))
         left, right, left_px, right_px, _ = pair
         has_right = torch.tensor(not torch.equal(left, right))
         if not has_right:  # one image stands for both views
             right_px = right_disparity_from_left(left_px)
-        return SelectionSample(seen, left, right, left_px, right_px, has_right)
+        return SelectionSample(degraded, left, right, left_px, right_px, has_right)
 
 
 _CAP_M = 80.0
@@ -308,8 +308,8 @@ class SelectTask:
         self.modules: dict[str, nn.Module] = {"generator": generator}
         self._train()
         # What is learnt, the encoder apart, at a share of the learning rate.
-        own = set(generator.encoder.parameters())
-        rest = [p for p in generator.parameters() if p not in own]
+        of_encoder = set(generator.encoder.parameters())
+        rest = [p for p in generator.parameters() if p not in of_encoder]
         learnt = [p for p in generator.encoder.parameters() if p.requires_grad]
         groups = [{"params": learnt, "rate": config.encoder_rate}, {"params": rest}]
         self.optimizers = {"generator": (make_adam(groups, config.adam), config.adam)}
