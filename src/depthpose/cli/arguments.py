@@ -144,7 +144,8 @@ def description_of(command: Callable[..., int]) -> str:
 
 def _described(hint: Any) -> tuple[str | None, _Names | None]:  # noqa: ANN401  any type
     """Name a value, None where tyro's own name will do, and say what it names."""
-    origin, parts = get_origin(hint), get_args(hint)
+    origin = get_origin(hint)
+    parts = get_args(hint)
     if origin is Annotated:
         own = next((mark for mark in parts if isinstance(mark, _Names)), None)
         if own is None:
@@ -312,7 +313,8 @@ def refuse_words(command: str, options: Sequence[Option], words: Sequence[str]) 
 
     Such a name is that of a script whose variable is unset.
     """
-    typed, spelled = Typed(), dict[str, str]()
+    typed = Typed()
+    spelled = dict[str, str]()
     here: list[str] = []
     for word in words:
         if word.startswith("--"):

@@ -54,7 +54,8 @@ def predict_all(dataset: Dataset, method: Method, rule: Protocol, folder: Path) 
 
     Of several processes each predicts its share, and the first goes on when all files are there.
     """
-    process, home = find_rank(), folder / method.name
+    process = find_rank()
+    home = folder / method.name
     usable = [
         (i, frame)
         for i, frame in enumerate(dataset.frames)
@@ -196,7 +197,8 @@ def measure(
         cap = "" if cap_m is None else f", truth up to {cap_m:g} m"
         errors = [sign * row.metrics[metric.name] for row in of_cap]
         for role, k in page.choose_ranked(errors, most):
-            row, value = of_cap[k], of_cap[k].metrics[metric.name]
+            row = of_cap[k]
+            value = of_cap[k].metrics[metric.name]
             frames = f"{len(of_cap)} frame{'' if len(of_cap) == 1 else 's'}"
             text = f"The {role} of {frames} by {metric.name}: {value:.4f}{cap}."
             index = places[row.frame or ""]
@@ -291,7 +293,8 @@ def measure_shards(
     dataset: Dataset, predictions: str, protocol: str, caps_m: Sequence[float]
 ) -> Evaluation:
     """Measure shards of predictions, one after the other; the rows say whose they are."""
-    name, settings = PurePosixPath(predictions).stem, read_settings(predictions)
+    name = PurePosixPath(predictions).stem
+    settings = read_settings(predictions)
     places = {frame.name: index for index, frame in enumerate(dataset.frames)}
     rows: dict[str, list[Measured] | str] = {}
     for done in tqdm(jobs.read_results(predictions), name, disable=None, unit=" shards"):

@@ -29,7 +29,8 @@ class MatcherOptions:
     @property
     def config(self) -> MatcherConfig:
         """Settings of the networks."""
-        limit, text = None, self.max_memory
+        limit = None
+        text = self.max_memory
         if text is not None:  # such as 1GB, 800M or 1500000; 1GiB is 1024**3
             size = re.fullmatch(r"\s*(\d+(?:\.\d+)?)\s*([KMGT]?)(i?)B?\s*", text, re.IGNORECASE)
             if size is None or (size[3] and not size[2]) or not float(size[1]):

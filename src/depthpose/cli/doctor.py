@@ -93,7 +93,8 @@ def _try_depth() -> str:
     noise = torch.rand(3, 48, 160, generator=torch.Generator().manual_seed(0))
     scene = torch.nn.functional.interpolate(noise[None], scale_factor=4, mode="bicubic")[0]
     scene = scene.clamp(0, 1)
-    left, right = scene[..., :-_SHIFT_PX], scene[..., _SHIFT_PX:]
+    left = scene[..., :-_SHIFT_PX]
+    right = scene[..., _SHIFT_PX:]
     net = FakestereoNet.load("default")
     estimate = net.estimate(left, None, right=right, with_check=False)
     median_px = float(estimate.disparity_px[:, 2 * _SHIFT_PX :].median())

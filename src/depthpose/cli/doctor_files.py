@@ -23,12 +23,16 @@ from depthpose.pose.mesh import MESH_READERS, exact_diameter, read_geometry
 Size = tuple[int, int]
 
 _UNITS_M = {"most sensors": 0.001, "TUM RGB-D": 0.0002, "KITTI": 1 / 256}
-_NEAR_M, _FAR_M = 0.05, 100.0
-_ONLY_MM, _ONLY_M, _LEAST_MM = 20.0, 2.0, 150.0
+_NEAR_M = 0.05
+_FAR_M = 100.0
+_ONLY_MM = 20.0
+_ONLY_M = 2.0
+_LEAST_MM = 150.0
 """A part is no longer than 20 m, a scan no farther; no part is shorter than 2 mm, and no depth
 camera sees what is nearer than 15 cm."""
 _EIGHT_BIT = 255
-_FEW_UNKNOWN, _ROUGH = 0.02, 0.012
+_FEW_UNKNOWN = 0.02
+_ROUGH = 0.012
 """Of depth, pixels without a reading (sensors: 6 % and more) and the mean step between neighbours
 as a share of the range (dense depth: 0.004 at most, pictures: 0.024 at least)."""
 _SQUARE = 0.05
@@ -121,7 +125,8 @@ def _read_words(path: Path, size: Size | None) -> FileFacts:
         if path.suffix.lower() != ".txt" or "no camera that is known" not in str(error):
             raise
         return _of_points(path, files.read_cloud(path).points.double())
-    fx, fy = float(camera.K[0, 0]), float(camera.K[1, 1])
+    fx = float(camera.K[0, 0])
+    fy = float(camera.K[1, 1])
     wide = math.degrees(2 * math.atan(camera.width / (2 * fx)))
     what = f"camera of {camera.width}x{camera.height}, fx {fx:.1f} px, {wide:.0f} degrees wide"
     if isinstance(camera, cameras.StereoRig):
@@ -156,13 +161,15 @@ def _of_pose(path: Path) -> FileFacts | None:
 
 
 def _of_picture(path: Path) -> FileFacts:
-    what, units = "", None
+    what = ""
+    units = None
     with opened_image(path) as image:
         if image.mode == "I;16":
             units = torch.from_numpy(np.asarray(image).astype(np.float32))
     if units is not None:
         has_reading, (low, high) = units > 0, value_range(units.numpy())
-        unknown, span = 1 - float(has_reading.float().mean()), max(high - low, 1)
+        unknown = 1 - float(has_reading.float().mean())
+        span = max(high - low, 1)
         rough = float((units[:, 1:] - units[:, :-1]).abs().mean()) / span
         if unknown > _FEW_UNKNOWN or rough < _ROUGH:
             return _of_depth(path, torch.where(has_reading, units, torch.nan))
@@ -196,7 +203,8 @@ def _of_depth(path: Path, units: Tensor) -> FileFacts:
     if len(readings) == 0:
         file_facts.odd.append("every pixel is 0: no reading")
         return file_facts
-    median, share = float(readings.median()), len(readings) / units.numel()
+    median = float(readings.median())
+    share = len(readings) / units.numel()
     maybe = ", ".join(f"{median * unit:.3g} m ({who})" for who, unit in _UNITS_M.items())
     file_facts.what += f", {share:.0%} known, median {median:g} units: {maybe}"
     if share == 1:

@@ -131,7 +131,8 @@ def measure(
     by_masks: dict[tuple[str, str], dict[str, Any]] = {}
     for row in measured.rows:
         assert row.origin is not None
-        method, masks = row.origin.method, row.origin.masks
+        method = row.origin.method
+        masks = row.origin.masks
         entry = by_masks.setdefault((method, row.object), {"method": method, "object": row.object})
         entry[f"{masks or 'their'} masks"] = row.success
     instances = {instance.name: instance for instance in dataset.instances}
@@ -144,8 +145,10 @@ def measure(
             continue
         estimates = match(dataset.instances, read_any(path), dataset.objects)
         for role, row in _choose(of_path, most):
-            instance, estimate = instances[row.instance], estimates[row.instance]
-            model, truth = dataset.objects[instance.object_id], instance.camera_from_model
+            instance = instances[row.instance]
+            estimate = estimates[row.instance]
+            model = dataset.objects[instance.object_id]
+            truth = instance.camera_from_model
             # Of copies that look alike the one nearest to the estimate.
             if (pose := estimate.camera_from_model) is not None:
                 truth = nearest_copy(

@@ -128,11 +128,13 @@ def _segmented(
         print(f"{path}: segments no objects {lost}; each is missing", file=sys.stderr)
     home = out / "detections" / name
     claim_folder(home, {"weights_sha256": file_sha256(path), **of_dataset(dataset)})
-    file, record = home.parent / f"{name}.json", home / "images.json"
+    file = home.parent / f"{name}.json"
+    record = home / "images.json"
     done: set[tuple[int, int]] = set()
     detections: list[datasets.Detection] = []
     with suppress(InputError):  # damaged or missing: all is segmented again
-        earlier, record_name = datasets.read_detections(file), str(record)
+        earlier = datasets.read_detections(file)
+        record_name = str(record)
         rows = read_rows(record)
         done = {
             (integer(row, "scene_id", record_name), integer(row, "im_id", record_name))
@@ -292,7 +294,8 @@ def _network(path: Path, name: str, config: EstimateConfig) -> PoseMethod:
 
 def _in_base(method: PoseMethod, base: Rigid) -> PoseMethod:
     """Let a method add ``base_from_model`` to its estimates."""
-    find, track = method.find, method.track
+    find = method.find
+    track = method.track
 
     def estimate_many(views: Sequence[ViewInput]) -> list[PoseEstimate]:
         return [estimate.in_base(base) for estimate in method.estimate_many(views)]
@@ -432,7 +435,8 @@ def read_base(words: Sequence[str]) -> Rigid | None:
     """Read ``--base-from-camera``: a text file, or 16 numbers row by row; None: it is unset."""
     if not words:
         return None
-    option, what = "--base-from-camera", "base_from_camera"
+    option = "--base-from-camera"
+    what = "base_from_camera"
     if len(words) == 1 and Path(words[0]).is_file():
         base = read_pose(Path(words[0]), option, what)
     else:

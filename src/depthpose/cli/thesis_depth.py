@@ -53,7 +53,8 @@ def reproduce_table(
     }
     results = (*page.table_files("rows", "frames", "confidence"), "report.md", "report.html")
     claim_folder(out, settings, (*results, "predictions", "figures"))
-    rule, home = find_protocol(protocol), out / "predictions"
+    rule = find_protocol(protocol)
+    home = out / "predictions"
     folders = [evaluation.predict_all(dataset, method, rule, home) for _, method in methods]
     if find_rank().rank > 0:
         return 0
@@ -72,7 +73,8 @@ def reproduce_table(
         frames = [f for f in dataset.frames if has_prediction(folder, f.name)]
         shown = replace(dataset, frames=frames)
         for place, index in enumerate(choose_frames(shown, (), pictures)):
-            pair, frame = shown.read_input(index), frames[index]
+            pair = shown.read_input(index)
+            frame = frames[index]
             lidar_m = lidar_truth(frame, "camera_z") if has_lidar(frame, "camera_z") else None
             estimate = read_estimate(folder, pair.name, pair.camera)
             figures = {"2-5": draw_figure_2_5(pair, lidar_m, estimate)}

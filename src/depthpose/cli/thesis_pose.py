@@ -56,7 +56,8 @@ class Views:
 
     def close_up(self, index: int) -> tuple[Float[Tensor, "3 h w"], Float[Tensor, "3 3"]]:
         """Give the picture of a view near its object, or its depth in grey, and its camera."""
-        instance, view = self.instances[index], self.samples[index].input
+        instance = self.instances[index]
+        view = self.samples[index].input
         picture = None if instance is None or instance.rgb is None else picture_of(instance)
         picture = grey_depth(view.depth_m) if picture is None else picture
         return close_up(picture, view.mask, view.K)
@@ -149,7 +150,8 @@ def reproduce_by_object(
             if estimate is None:  # of a detection: it bears no instance's name
                 continue
             picture, K = close_up(picture_of(instance), read_instance_mask(instance), instance.K)
-            true, estimated = instance.camera_from_model, estimate.camera_from_model
+            true = instance.camera_from_model
+            estimated = estimate.camera_from_model
             model = dataset.objects[instance.object_id]
             path = out / "figures" / folder.name / f"3-5_{instance.name}.jpg"
             write_image(path, draw_pose(picture, estimated, model, K, true))
@@ -232,7 +234,8 @@ def write_figure(
     net = GeoPoseNet.load(weights)
     views = open_views(net, data, number, number)
     command = {"command": f"figure {figure}", "weights_sha256": file_sha256(find_weights(weights))}
-    path, text = out / f"figure-{figure}.png", _TEXTS[figure]
+    path = out / f"figure-{figure}.png"
+    text = _TEXTS[figure]
     claim_folder(
         out, {**command, **views.settings, **settings}, (path.name, "panels", "report.html")
     )
@@ -309,7 +312,8 @@ def box_panels(net: GeoPoseNet, views: Views) -> list[Drawing]:
     for k, view in enumerate(views.samples):
         (estimate,) = net.estimate_many([view.input])
         picture, K = views.close_up(k)
-        true, estimated = view.truth.camera_from_model, estimate.camera_from_model
+        true = view.truth.camera_from_model
+        estimated = estimate.camera_from_model
         name = view.input.name
         image = draw_pose(picture, estimated, models[view.input.object], K, true)
         caption = name if estimate.is_posed else f"{name}: refused, {estimate.reason}"

@@ -37,7 +37,8 @@ class Settings:
 
     def __post_init__(self) -> None:
         for name, (words, interval, more) in _rules_of(type(self)).items():
-            value, default = getattr(self, name), getattr(type(self), name, None)
+            value = getattr(self, name)
+            default = getattr(type(self), name, None)
             several = value if isinstance(value, tuple) else (value,)
             for single in (each for each in several if each is not None):
                 if words and single not in words:
@@ -155,7 +156,8 @@ def config_from_dict(
 
 def _value_of(value: Any, hint: Any, source: str, name: str) -> Any:  # noqa: ANN401, C901, PLR0911, PLR0912
     """Give a value of the type that a setting has; nothing is cast to what was not meant."""
-    origin, parts = get_origin(hint), get_args(hint)
+    origin = get_origin(hint)
+    parts = get_args(hint)
     if origin in (Union, types.UnionType):
         if value is None and type(None) in parts:
             return None
@@ -193,7 +195,8 @@ def _value_of(value: Any, hint: Any, source: str, name: str) -> Any:  # noqa: AN
         except OverflowError:
             number = math.inf
         except (TypeError, ValueError):
-            number, what = math.nan, "number is needed: write one"
+            number = math.nan
+            what = "number is needed: write one"
         if not math.isfinite(number):
             raise InputError(f"{context}, but a {what}")
         return number

@@ -242,7 +242,8 @@ def freeze(path: Path, export: Export) -> list[Row]:
                 "no output is compared with PyTorch's; nothing is written. Name a case."
             )
         for row in rows:
-            difference, limit = row[f"{row['limited']} difference"], row["limit"]
+            difference = row[f"{row['limited']} difference"]
+            limit = row["limit"]
             if not difference <= limit:  # pyright: ignore[reportOperatorIssue]  NaN fails too
                 raise InputError(
                     f"{row['output']} of {row['input']}: PyTorch and onnxruntime differ by "

@@ -281,7 +281,8 @@ def claim_names(
                 f"{named}: has changed since its result {name!r} in {folder} was "
                 "made; choose another folder, or delete this one"
             )
-    new, noted = wanted.keys() - recorded.keys(), read_results(folder)
+    new = wanted.keys() - recorded.keys()
+    noted = read_results(folder)
     for stem, file in results.items():
         is_frame = _FRAME.sub("", stem) in new & set(videos)
         if stem not in recorded and (stem in new or is_frame):
@@ -350,7 +351,8 @@ def refuse_other_settings(
     Raises:
         InputError: the first difference is named.
     """
-    before, now = _flat(earlier), _flat(settings)
+    before = _flat(earlier)
+    now = _flat(settings)
     for name in sorted(before.keys() | now.keys()):
         # A later version may add settings: one that either does not know counts as off.
         is_off = (name not in before or name not in now) and not (before | now)[name]
@@ -413,7 +415,8 @@ def read_results(folder: Path) -> dict[str, dict[str, list[int]]]:
         status = path.stat()
         number, end, results = _read.get(path, (status.st_ino, 0, {}))
         if number != status.st_ino or status.st_size < end:
-            end, results = 0, {}
+            end = 0
+            results = {}
         if status.st_size > end:
             with path.open("rb") as file:
                 file.seek(end)

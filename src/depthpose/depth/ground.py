@@ -20,11 +20,14 @@ _LEAST_SHARE = 0.25
 """Of the points in the lower part of the image, on the plane; with less there is no ground."""
 _MOST_ROLL_DEG = 10.0
 _MOST_TILT, _MOST_ROLL = (math.tan(math.radians(angle)) for angle in (25, _MOST_ROLL_DEG))
-_LEAST_HEIGHT_M, _MOST_HEIGHT_M = 0.2, 20.0
-_MOST_ROAD_TILT_DEG, _MOST_TILT_APART_DEG = 15.0, 8.0
+_LEAST_HEIGHT_M = 0.2
+_MOST_HEIGHT_M = 20.0
+_MOST_ROAD_TILT_DEG = 15.0
+_MOST_TILT_APART_DEG = 8.0
 """Steeper planes were no road in any of 59 views by cameras tilted up to 7 degrees, and roads were
 at most 5.5 degrees off the true tilt."""
-_ON_PLANE, _FARTHEST_M = 0.15, 200.0
+_ON_PLANE = 0.15
+_FARTHEST_M = 200.0
 """What is off the plane by less, in the logarithm of depth, lies on it; by twice as much, not."""
 _WINDOW_PX = 5
 """Side of the square around a pixel whose distance is known."""
@@ -78,7 +81,8 @@ def _lower_points(
     height, width = depth_m.shape
     top = height * 3 // 5
     step = max(math.isqrt((height - top) * width // _POINTS), 1)
-    rows, columns = torch.arange(top, height, step), torch.arange(width // 7, width * 6 // 7, step)
+    rows = torch.arange(top, height, step)
+    columns = torch.arange(width // 7, width * 6 // 7, step)
     v, u = (part.flatten() for part in torch.meshgrid(rows, columns, indexing="ij"))
     inverse = 1 / depth_m.detach().cpu().double()[v, u]
     has_depth = inverse.isfinite() & (inverse > 0)
@@ -104,7 +108,8 @@ def scale_by_mount(estimate: DepthEstimate, image: StereoInput) -> DepthEstimate
     How large things look says another scale, so that the square root of the ground's factor is
     taken. With a tilt too the plane is known, and what lies on the ground gets its depth.
     """
-    camera, name = image.camera, image.name
+    camera = image.camera
+    name = image.name
     assert camera is not None and estimate.depth_m is not None  # noqa: PT018
     ground = fit_ground(estimate.depth_m, camera)
     if camera.mount_height_m is None:
@@ -180,7 +185,9 @@ def scale_by_distance(
             f"{context}: the image is {width}x{height}, columns 0 to {width - 1} and rows 0 to "
             f"{height - 1}; give X,Y,METRES of a pixel of it"
         )
-    reach, x, y = _WINDOW_PX // 2, round(column), round(row)
+    reach = _WINDOW_PX // 2
+    x = round(column)
+    y = round(row)
     around = estimate.depth_m[max(y - reach, 0) : y + reach + 1, max(x - reach, 0) : x + reach + 1]
     if not bool(estimate.depth_m[min(y, height - 1), min(x, width - 1)].isfinite()):
         raise InputError(f"{context}: there is no depth at this pixel (the sky?); take another")

@@ -74,7 +74,8 @@ def write_estimate(
     (``DepthEstimate.cloud``) of what is nearer than ``cloud_m``, if that is given. The disparity is
     that of the frame's own rig.
     """
-    depth_m, is_sky = estimate.depth_m, estimate.is_sky
+    depth_m = estimate.depth_m
+    is_sky = estimate.is_sky
     color = (
         draw_disparity(estimate.disparity_px, is_sky=is_sky)
         if depth_m is None

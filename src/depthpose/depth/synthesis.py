@@ -179,7 +179,8 @@ class SelectionGenerator(nn.Module):
         super().__init__()
         self.config = config or SelectionConfig()
         self.encoder = LiteEncoder(self.config.encoder_width)
-        widths, skips = self.config.widths, self.encoder.channels[-2::-1]
+        widths = self.config.widths
+        skips = self.encoder.channels[-2::-1]
         self.top = nn.Conv2d(self.encoder.channels[-1], widths[0], 1)
         inputs = (widths[0], *widths[:-1])
         self.decoder = nn.ModuleList()
@@ -382,7 +383,8 @@ def mix_shifts(left: Views, logits: Logits, planes: Planes) -> Views:
     for number, shift in enumerate(planes.tolist(), 1):
         whole = math.floor(shift)
         part = shift - whole
-        near, far = padded[..., whole : whole + width], padded[..., whole + 1 : whole + 1 + width]
+        near = padded[..., whole : whole + width]
+        far = padded[..., whole + 1 : whole + 1 + width]
         drawn = drawn + shares[:, number : number + 1] * torch.lerp(near, far, part)
     return drawn
 
@@ -447,7 +449,9 @@ class SelectionSynthesiser:
         limits_px = [most_px * size[1] / images.shape[-1] for images in sizes]
         views = [select_views(self.generator, images, size) for images in sizes]
         lefts, rights = zip(*views, strict=True)
-        of_left, other, home = average(lefts, limits_px), average(rights, limits_px), left.device
+        of_left = average(lefts, limits_px)
+        other = average(rights, limits_px)
+        home = left.device
         right = shift_left(sizes[0], torch.where(other.sky > 0.5, 0.0, other.disparity_px))
         is_sky = of_left.sky > 0.5
         return SynthesisedViews(
@@ -591,7 +595,8 @@ def load_encoder(encoder: LiteEncoder, path: Path) -> None:
     """
     whole = LiteEncoder()
     load_weights(whole, read_checkpoint(path, ENCODER_KIND), str(path))
-    state, needed = whole.state_dict(), encoder.state_dict()
+    state = whole.state_dict()
+    needed = encoder.state_dict()
     if any(state[name].shape != tensor.shape for name, tensor in needed.items()):
         raise InputError(
             f"{path}: holds {ENCODER_KIND} at its full width, and this encoder is narrower; "

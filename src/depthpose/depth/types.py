@@ -157,10 +157,15 @@ class DepthEstimate:
     def __repr__(self) -> str:
         """Say it in one line: size, metres, certainty."""
         height, width = self.disparity_px.shape
-        what, unit, values = "depth", "m", self.depth_m
+        what = "depth"
+        unit = "m"
+        values = self.depth_m
         if values is None:
-            what, unit, values = "disparity", "px", self.disparity_px
-        finite, spread = values[values.isfinite()], "nowhere known"
+            what = "disparity"
+            unit = "px"
+            values = self.disparity_px
+        finite = values[values.isfinite()]
+        spread = "nowhere known"
         if len(finite):
             # What is farthest is one pixel.
             low, middle, high = np.percentile(finite.numpy(force=True), (1, 50, 99))

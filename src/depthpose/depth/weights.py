@@ -49,7 +49,8 @@ MATCHERS = {
 }
 """Kinds of matchers with weights: a new one is a file with its three parts and one entry here."""
 
-BOTH, _SELECTION = "fakestereo", "selection"
+BOTH = "fakestereo"
+_SELECTION = "selection"
 _FORMER = ("candidates", "encoder_kind", "scales", "test_mode", "with_agreement", "with_refinement")
 """Settings of before, which weights files hold: networks have one value of each."""
 Use = Literal["images", "pairs"]
@@ -83,7 +84,8 @@ def read_depth_weights(
     Raises:
         InputError: not such weights, or weights that do not fit their own config.
     """
-    checkpoint, kinds = checkpoints.read_checkpoint(path), {**GENERATORS, **MATCHERS}
+    checkpoint = checkpoints.read_checkpoint(path)
+    kinds = {**GENERATORS, **MATCHERS}
     if checkpoint.kind not in (*kinds, BOTH):
         raise InputError(
             f"{path}: holds weights of kind {checkpoint.kind!r}; depth takes "
@@ -94,7 +96,8 @@ def read_depth_weights(
     for kind in kinds if is_both else ():  # its config names the networks
         if kind not in checkpoint.config:
             continue
-        config, prefix = checkpoint.config[kind], f"{kind}."
+        config = checkpoint.config[kind]
+        prefix = f"{kind}."
         if not isinstance(config, Mapping):
             raise InputError(f"{path}: its config has no {kind!r}; the file is damaged.")
         tensors = checkpoint.state.items()
@@ -197,9 +200,11 @@ def write_depth_weights(
     configs = {kind: config_to_dict(part.config) for kind, part in parts.items()}
     if len(parts) == 1:
         kind = next(iter(parts))
-        config, state = configs[kind], states[kind]
+        config = configs[kind]
+        state = states[kind]
     else:
-        kind, config = BOTH, configs
+        kind = BOTH
+        config = configs
         state = {f"{name}.{key}": t for name, s in states.items() for key, t in s.items()}
     checkpoints.save_checkpoint(
         path, checkpoints.Checkpoint(kind=kind, config=config, state=state, facts=facts)

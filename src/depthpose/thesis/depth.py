@@ -156,7 +156,8 @@ TABLES = {table.number: table for table in (
 """Tables by the thesis's numbers; every figure as printed."""
 
 
-_NEAR_M, _FAR_M = 3.0, 80.0
+_NEAR_M = 3.0
+_FAR_M = 80.0
 _GAP_PX = 8
 _BAR_PX = 18
 

@@ -178,7 +178,8 @@ def _own(rows: Sequence[ObjectRow], columns: Mapping[str, str]) -> dict[str, Any
     by_name = {row.object: row for row in rows}
     # Of one object there is no row of means: it is its own.
     mean = by_name.get("mean", rows[0])
-    origin, conditions = mean.origin, mean.conditions
+    origin = mean.origin
+    conditions = mean.conditions
     assert origin is not None
     assert conditions is not None
     return {
@@ -255,7 +256,8 @@ def cases_of(
     numbers = {model.name: k for k, model in enumerate(net.weights.models)}
     for view in views:
         number = numbers[view.input.object]
-        model, view_input = net.weights.models[number], view.input
+        model = net.weights.models[number]
+        view_input = view.input
         cloud = cloud_from_depth(
             view_input.depth_m, view_input.mask, view_input.K, model.diameter_m
         ).float()
@@ -315,7 +317,8 @@ def compare_voting(cases: Sequence[VotingCase | None], points: int) -> list[dict
     rows: list[dict[str, Any]] = []
     threads = torch.get_num_threads()
     for (method, hypotheses, test), vote in ways.items():
-        successes, seconds = 0, []
+        successes = 0
+        seconds = []
         torch.set_num_threads(1)
         try:
             vote(usable[0])  # warm
@@ -327,7 +330,8 @@ def compare_voting(cases: Sequence[VotingCase | None], points: int) -> list[dict
                 alike = torch.eye(3, dtype=torch.float64).expand(len(keypoints_m), 3, 3)
                 fit = fit_pose(keypoints_m.double(), alike, case.model.keypoints_m)
                 some_m = case.model.vertices_m[:: max(1, len(case.model.vertices_m) // _ADD_POINTS)]
-                pose, diameter_m = fit.camera_from_model, case.model.diameter_m
+                pose = fit.camera_from_model
+                diameter_m = case.model.diameter_m
                 error_m = (adds_m if case.is_adds else add_m)(pose, case.truth, some_m)
                 successes += float(error_m) / diameter_m < SUCCESS_SHARE
         finally:
@@ -364,7 +368,8 @@ def ransac_one_by_one(
     keypoints = []
     for k in range(directions.shape[1]):
         n = directions[:, k]
-        best, chosen = -1, np.ones(len(n), bool)
+        best = -1
+        chosen = np.ones(len(n), bool)
         for _ in range(hypotheses):
             pair = random.choice(len(points_m), 2, replace=False)
             try:
@@ -375,7 +380,8 @@ def ransac_one_by_one(
             inliers = (way * n).sum(1) / np.sqrt((way * way).sum(1)).clip(1e-300) > min_cosine
             count = np.count_nonzero(inliers)
             if count > best:
-                best, chosen = count, inliers
+                best = count
+                chosen = inliers
         try:
             refitted = np.linalg.solve(*_normal_equations(points_m[chosen], n[chosen]))
         except np.linalg.LinAlgError:  # no inlier but parallel ones, or none: all votes count

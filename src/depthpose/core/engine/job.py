@@ -76,7 +76,8 @@ def run_job(job: Job, engine: Engine) -> list[Done]:
     claim(out, {**job.settings, "shards": "tar"})
     blocks = make_plan(out, job.items, job.tars, job.block)
     folder = stores.join(out, SHARDS)
-    sizes, records = stores.list_sizes(folder), {shard.shard: shard for shard in read_results(out)}
+    sizes = stores.list_sizes(folder)
+    records = {shard.shard: shard for shard in read_results(out)}
     done: dict[str, Done] = {}
     for block in blocks:
         shard = records.get(f"{block.shard}.tar")
@@ -159,7 +160,8 @@ def shard_results(out: str, done: Done) -> Iterator[tuple[str, dict[str, bytes]]
     """
     url = stores.join(stores.absolute(out), SHARDS, done.shard)
     names = {name for name, reason in done.entries if not reason}
-    name, files = "", dict[str, bytes]()
+    name = ""
+    files = dict[str, bytes]()
     for member, data in read_tar(url):
         # A tar does not separate the names of the results from the endings of their files.
         dots = (k for k, letter in enumerate(member) if letter == ".")

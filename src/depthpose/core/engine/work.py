@@ -21,7 +21,8 @@ from depthpose.core.errors import InputError
 from depthpose.core.files import stores
 from depthpose.core.files.disk import file_system, find_partners, refused_write
 
-PLAN, SHARDS = "plan.jsonl", "shards"
+PLAN = "plan.jsonl"
+SHARDS = "shards"
 _TARS = (".tar", ".tar.gz", ".tgz")
 
 
@@ -71,7 +72,8 @@ def find_items(words: Sequence[str], files: Files) -> list[Item]:
         names = [[PurePosixPath(url).stem for url in side] for side in sides]
         for k, word in enumerate(others[1:], 1):
             # Else two files were named.
-            one, other = PurePosixPath(others[0]).stem, PurePosixPath(word).stem
+            one = PurePosixPath(others[0]).stem
+            other = PurePosixPath(word).stem
             if (names[0], names[k]) != ([one], [other]):
                 partners = find_partners(names[0], names[k], f"{others[0]} and {word}")
                 sides[k] = [sides[k][partner] for partner in partners]
@@ -160,7 +162,8 @@ def make_plan(out: str, items: Sequence[Item], tars: Sequence[str], size: int) -
                 f"{out}: {item.name!r} is the result of {files[item.name][0]}, not of "
                 f"{item.files[0]}; two files of one name need two folders: choose another"
             )
-    count_before, there = len(blocks), {block.tar for block in blocks}
+    count_before = len(blocks)
+    there = {block.tar for block in blocks}
     new = [item for item in items if item.name not in files]
     for k in range(0, len(new), size):
         blocks.append(Block(f"{len(blocks):06d}", tuple(new[k : k + size])))
@@ -266,7 +269,8 @@ def _samples(block: Block, wanted: Files, scratch: Path) -> Iterator[Sample]:
                 if role in wanted.roles and f".{suffix}".lower() in wanted.suffixes:
                     files[role] = Path(tempfile.mkdtemp(dir=scratch)) / f"{role}.{suffix}"
                     files[role].write_bytes(data)
-            missing, reason = [role for role in wanted.roles if role not in files], ""
+            missing = [role for role in wanted.roles if role not in files]
+            reason = ""
             if missing:
                 reason = f"{block.tar}: {key!r} has no {missing[0]}; a sample holds "
                 reason += ", ".join(wanted.roles)
@@ -329,7 +333,8 @@ class Done:
 
 def file_stamp(path: Path) -> tuple[int, int, int]:
     """Give size [bytes], time of the last change [ns] and CRC-32 of a file."""
-    status, checksum = path.stat(), 0
+    status = path.stat()
+    checksum = 0
     with path.open("rb") as file:
         while chunk := file.read(2**22):
             checksum = zlib.crc32(chunk, checksum)

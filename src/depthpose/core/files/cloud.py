@@ -122,7 +122,8 @@ def _from_columns(path: AnyPath, columns: Columns) -> Cloud:
     points = np.empty((0, 3), np.float32)
     if columns:
         points = np.stack([to_float32(columns[name]) for name in "xyz"], -1)
-    packed, color = columns.get("rgb", columns.get("rgba")), None
+    packed = columns.get("rgb", columns.get("rgba"))
+    color = None
     if packed is not None and packed.dtype.itemsize == 4:
         if packed.dtype.kind == "f":
             bits = packed.astype(np.float32).view(np.uint32)

@@ -180,7 +180,8 @@ def read_bytes(path: AnyPath, most: int = MAX_FILE_BYTES) -> bytes:
             shards = (folder for folder in inside.parents if folder.suffix == ".tar")
             if (shard := next((one for one in shards if not one.is_dir()), None)) is not None:
                 return _read_in_shard(shard, inside.relative_to(shard).as_posix(), most)
-        status, reason = inside.stat(), ""
+        status = inside.stat()
+        reason = ""
         if stat.S_ISDIR(status.st_mode):
             reason = "a folder where a file is needed; name a file inside it"
         elif not stat.S_ISREG(status.st_mode):
@@ -349,7 +350,8 @@ def refuse_yaml_bomb(path: AnyPath, text: str) -> None:
     unfinished: list[tuple[str | None, int]] = []
     with suppress(yaml.YAMLError):  # what is no YAML the parser refuses
         for event in yaml.parse(text, YamlLoader):
-            anchor, size = getattr(event, "anchor", None), 0
+            anchor = getattr(event, "anchor", None)
+            size = 0
             match event:
                 case yaml.CollectionStartEvent():
                     unfinished.append((anchor, 1))
@@ -502,7 +504,9 @@ def _own_parts(first: Sequence[str], second: Sequence[str]) -> tuple[list[Any], 
             texts = column
             for turn in (1, -1):
                 turned = [text[::turn] for text in texts]
-                low, high = min(turned), max(turned)  # what these two share, all share
+                # what these two share, all share
+                low = min(turned)
+                high = max(turned)
                 ends = (k for k, (a, b) in enumerate(zip(low, high, strict=False)) if a != b)
                 shared = re.sub(r"\d+$", "", low[: next(ends, len(low))])
                 texts = [text[len(shared) :][::turn] for text in turned]

@@ -82,7 +82,8 @@ def split_rows(path: AnyPath, rows: Iterator[str], fields: list[Field], count: i
     columns: Columns = {}
     starts = accumulate((f.count for f in fields), initial=0)
     for f, start in zip(fields if count else (), starts, strict=False):
-        column, dtype = table[:, start], np.dtype(f.code)
+        column = table[:, start]
+        dtype = np.dtype(f.code)
         if dtype.kind != "f":
             limits = np.iinfo(dtype)
             if not ((column >= limits.min) & (column <= limits.max)).all():
@@ -153,13 +154,15 @@ def read_ply_elements(path: AnyPath, last: str | None = None) -> tuple[Columns, 
             columns = split_rows(path, rows, element.fields, element.count)
         elif rows is None:
             more_lists, used = _binary_lists(path, body, element, order)
-            body, lists = body[used:], lists | more_lists
+            body = body[used:]
+            lists = lists | more_lists
         else:
             sizes = {f.name: array("q") for f in element.fields if f.size_code}
             values = {name: array("d") for name in sizes}
             there = 0
             for there, row in enumerate(islice(rows, element.count), 1):
-                words, at = row.split(), 0
+                words = row.split()
+                at = 0
                 try:
                     for f in element.fields:
                         if f.size_code:
@@ -204,9 +207,12 @@ def _binary_lists(
              for f in element.fields]  # fmt: skip
     runs: list[Any] = []
     dtypes: dict[tuple[int, ...], np.dtype] = {}
-    at, left, ahead = 0, element.count, 64
+    at = 0
+    left = element.count
+    ahead = 64
     while left:
-        lengths, end = [], at
+        lengths = []
+        end = at
         for f, size, value in steps:
             length = 1
             if f.size_code:
@@ -234,7 +240,9 @@ def _binary_lists(
         runs.append(records)
         if len(runs) > _MOST_RUNS:
             raise InputError(f"{path}: {what} of ever other lengths; export triangles alone")
-        at, left, ahead = at + records.nbytes, left - len(records), 2 * len(records) + 64
+        at = at + records.nbytes
+        left = left - len(records)
+        ahead = 2 * len(records) + 64
     return {
         f"{element.name} {f.name}": Ragged(
             sizes=np.concatenate([np.empty(0, int), *(r[f"{f.name} size"] for r in runs)]),
@@ -303,7 +311,9 @@ _PCD_CODES = {
     **{("I", size): f"i{size}" for size in "1248"},
     **{("U", size): f"u{size}" for size in "1248"},
 }
-_MAX_PACKED, _MAX_UNPACKED = 2**25, 2**27  # of compressed points: eight million, byte by byte
+# of compressed points: eight million, byte by byte
+_MAX_PACKED = 2**25
+_MAX_UNPACKED = 2**27
 _DATA = re.compile(rb"(?:^|\n)DATA[ \t]+(ascii|binary|binary_compressed)[ \t]*(?:\r\n|\n)")
 
 

@@ -22,9 +22,12 @@ from depthpose.core.files.disk import refuse_heavy, refused_as, refused_write
 from depthpose.core.loop.task import ValidationResult
 from depthpose.core.run import environment
 
-STATE, BEFORE = "state.pt", "state.before.pt"  # the last, and the one before, if that is damaged
+# the last, and the one before, if that is damaged
+STATE = "state.pt"
+BEFORE = "state.before.pt"
 _NEEDED = ("step", "modules", "optimizers", "scaler", "average")
-_METRICS, _PICTURES = "metrics.jsonl", "pictures"
+_METRICS = "metrics.jsonl"
+_PICTURES = "pictures"
 RUN_FILES = ("config.yaml", _METRICS, _PICTURES, "tensorboard", STATE, BEFORE)
 """What a training leaves in its folder beside weights."""
 _HELD_OUT = "held_out/"  # begins the names of numbers that validation found
@@ -82,7 +85,8 @@ class RunLogger:
             return
         packed = BytesIO()  # on a full disk torch.save would say anything but that
         torch.save(dict(state), packed)
-        last, before = self.folder / STATE, self.folder / BEFORE
+        last = self.folder / STATE
+        before = self.folder / BEFORE
         with atomic_write(last) as part:
             part.write_bytes(packed.getbuffer())
             if self.has_good_last and last.is_file():
@@ -146,7 +150,8 @@ def write_card(
     ``words`` are those of the command, as ``depth train view``; ``measured`` is Markdown, as
     :func:`held_out_text` where validation measured.
     """
-    folder, here = weights.parent, environment()
+    folder = weights.parent
+    here = environment()
     where = ", ".join(here[name] for name in ("machine", "gpu") if name in here)
     took = f"{seconds:.0f} s" if seconds < 120 else f"{seconds / 60:.0f} min"
     took = took if seconds < 7200 else f"{seconds / 3600:.1f} h"
@@ -247,7 +252,8 @@ def restore_last(folder: Path, parts: Parts) -> tuple[Path, int, float]:
             remedy = "it is damaged, or of another training"
             with refused_as(path, "state of this training", remedy):
                 parts.restore(state)
-                step, seconds = state["step"], float(state.get("seconds", 0.0))
+                step = state["step"]
+                seconds = float(state.get("seconds", 0.0))
         except InputError as error:
             message = str(error)
             damages.append(message if message.startswith(str(path)) else f"{path}: {message}")

@@ -267,7 +267,8 @@ class _Training:
 
         # Micro-batch m of a step belongs to place m // world of process m % world: N processes see
         # in a step what one process sees that accumulates N times as much.
-        rank, size = self.accelerator.process_index, self.config.batch_size
+        rank = self.accelerator.process_index
+        size = self.config.batch_size
         places = range(self.step * self.config.accumulate, self.steps * self.config.accumulate)
         starts = ((place * self.world + rank) * size for place in places)
         loader = DataLoader(
@@ -289,12 +290,14 @@ class _Training:
                 # Dropout follows the micro-batch, not the process that happens to hold it.
                 micro = place * self.world + self.accelerator.process_index
                 torch.manual_seed(mixed_seed(self.config.seed, self.step, micro, number))
-                device, precision = self.accelerator.device.type, self.precision
+                device = self.accelerator.device.type
+                precision = self.precision
                 with torch.autocast(device, precision, enabled=precision is not None):
                     update = next(iterator, None)
                 if update is None:
                     continue
-                name, loss = update.optimizer, update.loss.detach()
+                name = update.optimizer
+                loss = update.loss.detach()
                 # fp16 overflows now and then, and its scaler skips such steps by itself.
                 if self.config.precision != "fp16" and not math.isfinite(float(loss)):
                     raise InputError(

@@ -22,7 +22,9 @@ from depthpose.depth.types import Map
 
 _MAX_DEPTH_M = 200
 """KITTI's LiDAR sees 120 m."""
-_TRUTH_RADIUS, _TRUTH_PX, _TRUTH_SHARE = 3, 2.0, 0.03
+_TRUTH_RADIUS = 3
+_TRUTH_PX = 2.0
+_TRUTH_SHARE = 0.03
 """A value within so many pixels of a match may be so far from its disparity: px, and a share."""
 _MIN_TRUTH = 25
 """Matches with truth beside them, without which a map is not judged."""
@@ -129,7 +131,8 @@ def _check_images(frame: Frame, *, with_decoding: bool) -> Iterator[Problem]:
             message = f"is {image_px[0]}x{image_px[1]}, but its left image is {size[0]}x{size[1]}"
             yield Problem(path=path, kind="mismatch", message=message)
         size = size or image_px
-    rig, report = None, None
+    rig = None
+    report = None
     if frame.right is not None and len(images) == 2 and images[0].shape == images[1].shape:
         with suppress(InputError):  # which is told by itself
             rig = frame_camera(frame)
@@ -206,7 +209,8 @@ def _check_truth(
         if not isinstance(rig, StereoRig):
             return
         truth = disparity_from_depth(truth, rig)
-    best, changed = _agreement(truth, report), ""
+    best = _agreement(truth, report)
+    changed = ""
     if best is None or best[0] >= _AGREE:
         return
     message = f"agrees with {best[0]:.0%} of {best[1]} matches between left and right"
@@ -215,7 +219,8 @@ def _check_truth(
     for words, other in changes.items():
         agreement = _agreement(other, report)
         if agreement is not None and agreement[0] >= max(_AGREE, best[0]):
-            best, changed = agreement, f"; {words} it agrees with {agreement[0]:.0%}"
+            best = agreement
+            changed = f"; {words} it agrees with {agreement[0]:.0%}"
     message = f"{message}{changed}: is it of this pair, and in which unit?"
     yield Problem(path=path, kind="mismatch", message=message)
 

@@ -146,7 +146,8 @@ def _composed(
     camera_from_velodyne: Float64[np.ndarray, "3 4"],
 ) -> Float64[np.ndarray, "3 4"]:
     """LiDAR points to pixels; a 3x3 rotation or a 3x4 transform is extended to 4x4."""
-    turned, moved = np.eye(4), np.eye(4)
+    turned = np.eye(4)
+    moved = np.eye(4)
     turned[:3, :3], moved[:3] = rectify, camera_from_velodyne
     with np.errstate(all="ignore"):
         composed = left @ turned @ moved
@@ -189,7 +190,8 @@ def project_lidar(
     is_inside = ((pixel >= 0) & (pixel < (width, height))).all(1)
     u, v = pixel[is_inside].astype(np.int64).T
     # The last point of a pixel wins: keep one write a pixel, for NumPy promises no order.
-    value_m, written = value_m[is_inside], np.zeros((height, width))
+    value_m = value_m[is_inside]
+    written = np.zeros((height, width))
     pixels, last = np.unique((v * width + u)[::-1], return_index=True)
     written.flat[pixels] = value_m[::-1][last]
     shared = v * (width - 1) + u - 1
@@ -244,7 +246,8 @@ def frame_camera(frame: Frame) -> Camera | None:
     """Read the camera of a frame, or None where it has no calibration; of a pair, the rig."""
     if frame.calibration is None:
         return None
-    path, size = frame.calibration, files.image_size(frame.left)
+    path = frame.calibration
+    size = files.image_size(frame.left)
     match frame.style:
         case "raw" | "object" | "grey":
             camera = kitti_calibration(frame).rig
@@ -269,17 +272,20 @@ def kitti_calibration(frame: Frame) -> KittiCalibration:
             f"{frame.name}: no KITTI calibration, so its LiDAR scan cannot be projected. Put "
             "calib_cam_to_cam.txt and calib_velo_to_cam.txt into the folder of its date."
         )
-    home, size = frame.calibration, files.image_size(frame.left)
+    home = frame.calibration
+    size = files.image_size(frame.left)
     if frame.style != "raw":
         return read_object_calibration(home, *size, is_grey=frame.style == "grey")
-    cameras, lidar = home / "calib_cam_to_cam.txt", home / "calib_velo_to_cam.txt"
+    cameras = home / "calib_cam_to_cam.txt"
+    lidar = home / "calib_velo_to_cam.txt"
     keys = files.read_key_values(cameras)
     rig, left = _projected_rig(cameras, keys, ("P_rect_02", "P_rect_03"), size)
     if not lidar.is_file():
         return KittiCalibration(rig=rig, pixels_from_velodyne=None)
     rectify = kitti_matrix(cameras, keys, "R_rect_00", (3, 3))
     of_lidar = files.read_key_values(lidar)
-    R, t = kitti_matrix(lidar, of_lidar, "R", (3, 3)), kitti_matrix(lidar, of_lidar, "T", (3, 1))
+    R = kitti_matrix(lidar, of_lidar, "R", (3, 3))
+    t = kitti_matrix(lidar, of_lidar, "T", (3, 1))
     composed = _composed(lidar, left, rectify, np.hstack([R, t]))
     return KittiCalibration(rig=rig, pixels_from_velodyne=composed)
 

@@ -159,7 +159,8 @@ class TrainingPairs:
                 left_px = disparity_from_depth(depth_m, rig)
         else:
             made = source[number]
-            views, rig = made.input, made.input.camera
+            views = made.input
+            rig = made.input.camera
             if kind is not None:
                 exact = (made.truth.disparity_px, made.truth.right_disparity_px)
                 left_px, right_px = (px if px is None else px.nan_to_num(0.0) for px in exact)
@@ -187,7 +188,8 @@ def _usable(
     dataset: Dataset, config: PairsConfig, *, needs_truth: bool, is_mixed: bool
 ) -> list[_Place]:
     """Frames of a folder that can be learnt from, all with one kind of truth if it is needed."""
-    name, wanted = dataset.name, config.truth
+    name = dataset.name
+    wanted = config.truth
     there = {
         index: known_truths(frame)
         for index, frame in enumerate(dataset.frames)

@@ -55,10 +55,8 @@ def start_from(network: Generator | StereoNetwork, loaded: nn.Module, source: st
             f"{source}: holds weights of {type(loaded).__name__}, but the config trains "
             f"{type(network).__name__}. Give weights of that network."
         )
-    wanted, loaded_config = (
-        config_to_dict(network.config),
-        config_to_dict(cast("Any", loaded).config),
-    )
+    wanted = config_to_dict(network.config)
+    loaded_config = config_to_dict(cast("Any", loaded).config)
     for setting, value in wanted.items():
         is_added = setting in _CAN_BE_ADDED and value and not loaded_config[setting]
         if loaded_config[setting] != value and setting not in _FREE_OF_WEIGHTS and not is_added:
@@ -125,7 +123,8 @@ def train_select(config: SelectTraining, run: Run) -> Path:
     """Train the generator that selects; give its weights file."""
     refuse_frozen_random(config)
     torch.manual_seed(config.loop.seed)
-    rig, seed = config.generator, config.loop.seed
+    rig = config.generator
+    seed = config.loop.seed
     config = _at_virtual_focal(config, rig)
     sources = [
         TrainingPairs(
