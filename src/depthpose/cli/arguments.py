@@ -147,19 +147,19 @@ def _described(hint: Any) -> tuple[str | None, _Names | None]:  # noqa: ANN401  
     origin = get_origin(hint)
     parts = get_args(hint)
     if origin is Annotated:
-        own = next((mark for mark in parts if isinstance(mark, _Names)), None)
-        if own is None:
+        named = next((mark for mark in parts if isinstance(mark, _Names)), None)
+        if named is None:
             return None, _described(parts[0])[1]
-        word = "NAME|FILE" if own is _Names.WEIGHTS else "PATH"
-        return None if _POSITIONAL in parts else word, own
+        word = "NAME|FILE" if named is _Names.WEIGHTS else "PATH"
+        return None if _POSITIONAL in parts else word, named
     if origin in (Union, UnionType):
         return _described(next(part for part in parts if part is not NoneType))
     if origin is Literal:
         return f"{{{','.join(map(str, parts))}}}", None
     if origin in (tuple, list):
-        one, names = _described(parts[0])
-        many = f"{one} ..." if parts[1:] in ((), (...,)) else " ".join([str(one)] * len(parts))
-        return one and many, names
+        word, names = _described(parts[0])
+        many = f"{word} ..." if parts[1:] in ((), (...,)) else " ".join([str(word)] * len(parts))
+        return word and many, names
     return _OF_TYPES.get(hint), _Names.INPUT if hint is Path else None
 
 
@@ -172,15 +172,15 @@ def refuse_missing(options: Sequence[Option], values: Mapping[str, Any]) -> None
         if parameter not in values or names is None:
             continue
         value = values[parameter] if parameter == name else getattr(values[parameter], name)
-        for one in value if isinstance(value, list | tuple) else [value]:
-            if names is _Names.WEIGHTS and one is not None:
-                bare = re.sub(_PREFIXES, "", one)
+        for word in value if isinstance(value, list | tuple) else [value]:
+            if names is _Names.WEIGHTS and word is not None:
+                bare = re.sub(_PREFIXES, "", word)
                 if bare not in _WORDS and not bare.startswith("hf:/"):  # of the hub
                     from depthpose.core.checkpoint import find_weights  # loads torch
 
                     find_weights(bare)
-            elif one is not None and not any(mark in str(one) for mark in ("://", *"*?[{")):
-                wanted = Path(one)
+            elif word is not None and not any(mark in str(word) for mark in ("://", *"*?[{")):
+                wanted = Path(word)
                 if os.path.exists(wanted):  # noqa: PTH110 - which never raises
                     continue
                 if any(map(os.path.islink, (wanted, *wanted.parents))):
@@ -193,7 +193,7 @@ def refuse_missing(options: Sequence[Option], values: Mapping[str, Any]) -> None
                 beside = [path.name for path in home.iterdir()] if home.is_dir() else []
                 near = get_close_matches(wanted.name, beside, n=1)
                 hint = f"did you mean {str(home / near[0])!r}?" if near else "check the path"
-                raise InputError(f"{one}: there is no such file or folder; {hint}")
+                raise InputError(f"{word}: there is no such file or folder; {hint}")
 
 
 def refuse_below(least: int, option: str, value: int, usual: str) -> None:

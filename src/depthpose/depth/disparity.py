@@ -33,7 +33,8 @@ _ABOUT = 1.4
 """No estimate is wrong by 250 or 1000 in the median, and a slip is met to within this factor."""
 _said: set[str] = set()
 _NEARLY_ALL = 0.9
-_NEAR, _OPPOSITE = 1.1, -0.8
+_NEAR = 1.1
+_OPPOSITE = -0.8
 _FAR_OFF = 3.0
 """A median so far off is told of: an estimate of the right scale has one near 1."""
 LEAST_PX = 0.01
@@ -56,7 +57,8 @@ def disparity_advice(predicted_px: Map, true_px: Map) -> str | None:
     counts = torch.isfinite(predicted_px) & torch.isfinite(true_px)
     if not bool(counts.any()):
         return None
-    predicted_px, true_px = predicted_px[counts], true_px[counts]
+    predicted_px = predicted_px[counts]
+    true_px = true_px[counts]
     negative = float((predicted_px < 0).float().mean())
     if negative > _NEARLY_ALL:
         return (
@@ -161,11 +163,11 @@ def resize_image(
     image: Float[Tensor, "*batch 3 _ _"], height: int, width: int
 ) -> Float[Tensor, "*batch 3 {height} {width}"]:
     """Resize one image, or a batch, bilinearly, averaging where it shrinks."""
-    own = image.shape[-2:]
-    if own == (height, width):
+    size = image.shape[-2:]
+    if size == (height, width):
         return image
     images = image if image.ndim == 4 else image[None]
-    shrinks = height < own[0] or width < own[1]
+    shrinks = height < size[0] or width < size[1]
     resized = F.interpolate(images, (height, width), mode="bilinear", antialias=shrinks)
     return resized.clamp(0, 1).reshape(*image.shape[:-2], height, width)
 
@@ -178,7 +180,9 @@ def changed_match(match: Match, change: Callable[[Tensor], Tensor]) -> Match:
 
 def resized_match(match: Match, height: int, width: int) -> Match:
     """Bring a match to another size of its image."""
-    px, sure, sky = match.disparity_px, match.confidence, match.is_sky
+    px = match.disparity_px
+    sure = match.confidence
+    sky = match.is_sky
     return Match(
         disparity_px=resized_map(px, height, width) * (width / px.shape[1]),
         confidence=None if sure is None else resized_map(sure, height, width),
@@ -205,8 +209,11 @@ def from_pair(pair: StereoInput, match: Match, warning: str = "") -> DepthEstima
     There is no answer where the left image has no picture. The confidence is 0 where the right one
     has none, and falls to 0 where the left one is plain, for nothing can be matched there.
     """
-    px, depth_m, is_sky = match.disparity_px, None, match.is_sky
-    confidence, blank = match.confidence, without_picture(pair.left).to(px.device)
+    px = match.disparity_px
+    depth_m = None
+    is_sky = match.is_sky
+    confidence = match.confidence
+    blank = without_picture(pair.left).to(px.device)
     if is_sky is not None:
         is_sky = is_sky & ~blank
     if confidence is not None and pair.right is not None:
@@ -245,11 +252,13 @@ def from_virtual(
     camera = image.camera
     assert camera is not None
     height, width = image.left.shape[1:]
-    seen = resized_match(match, height, width)
-    px, is_sky = seen.disparity_px, seen.is_sky
+    resized = resized_match(match, height, width)
+    px = resized.disparity_px
+    is_sky = resized.is_sky
     focal_m_px = float(camera.K[0, 0]) * rig.virtual_baseline_m
     depth_m = torch.where(px > 0, focal_m_px / px, torch.nan)
-    blank, confidence = without_picture(image.left).to(px.device), seen.confidence
+    blank = without_picture(image.left).to(px.device)
+    confidence = resized.confidence
     if is_sky is not None:
         is_sky = is_sky & ~blank
         is_sky = is_sky & (is_sky.float().mean() >= _LEAST_SKY)

@@ -441,14 +441,16 @@ def _at_size_of(true_px: Map, found_px: Float[Tensor, "_ _"], path: Path) -> Map
     """
     (height, width), (rows, columns) = true_px.shape, found_px.shape
     stretched_px = disparity.resized_map(found_px, height, width) * (width / columns)
-    aspect, turned = columns * height / (rows * width), rows * height / (columns * width)
+    aspect = columns * height / (rows * width)
+    turned = rows * height / (columns * width)
     if 1 / _SAME_ASPECT < aspect < _SAME_ASPECT:
         return stretched_px
     shown = f"{columns}x{rows}, and its truth {width}x{height}"
     if 1 / _SAME_ASPECT < turned < _SAME_ASPECT:
         raise InputError(f"{path}: is {shown}: it is transposed; save rows first, (H, W)")
     if rows <= height and columns <= width:
-        left, errors_px = (width - columns) // 2, {}
+        left = (width - columns) // 2
+        errors_px = {}
         for top in ((height - rows) // 2, height - rows):  # from the middle, or as KITTI's 1216x352
             window = true_px[top : top + rows, left : left + columns]
             errors_px[top] = float((found_px - window).abs().nanmedian())

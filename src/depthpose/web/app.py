@@ -136,7 +136,8 @@ def run_in_time(work: Callable[[], Result], most_s: float) -> Result:
     Raises:
         TookTooLong: it did not end before.
     """
-    results, errors = list[Result](), list[BaseException]()
+    results = list[Result]()
+    errors = list[BaseException]()
 
     def run() -> None:
         try:
@@ -149,7 +150,8 @@ def run_in_time(work: Callable[[], Result], most_s: float) -> Result:
     thread.join(most_s)
     if thread.is_alive():
         assert thread.ident is not None
-        ident, kind = ctypes.c_ulong(thread.ident), ctypes.py_object(_Stopped)
+        ident = ctypes.c_ulong(thread.ident)
+        kind = ctypes.py_object(_Stopped)
         ctypes.pythonapi.PyThreadState_SetAsyncExc(ident, kind)
         thread.join(_STOP_S)
     if results:
