@@ -181,7 +181,7 @@ def refuse_missing(options: Sequence[Option], values: Mapping[str, Any]) -> None
                     find_weights(bare)
             elif word is not None and not any(mark in str(word) for mark in ("://", *"*?[{")):
                 wanted = Path(word)
-                if os.path.exists(wanted):  # noqa: PTH110 - which never raises
+                if wanted.exists():
                     continue
                 if any(map(os.path.islink, (wanted, *wanted.parents))):
                     from depthpose.core.files.disk import refuse_broken_link  # loads torch
