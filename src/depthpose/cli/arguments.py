@@ -250,9 +250,15 @@ _RULES: tuple[tuple[str, _Case, str, str], ...] = (
     ("depth predict", lambda o: "focal-px" in o, "fov", "--focal-px is the focal length"),
     ("pose predict", lambda o: "least-squares" in o["voting"], "hypotheses",
      "--voting least-squares draws no hypotheses"),
+    ("pose predict", lambda o: "left" not in o, "right matcher min-confidence",
+     "it is of a pair, and there is none; give --left"),
+    ("pose predict", lambda o: "left" in o and "ray" in o["engine"], "engine",
+     "pairs are matched and posed by this process"),
+    ("pose predict", lambda o: "sgbm" in o["matcher"], "min-confidence",
+     "sgbm has no confidence"),
     ("pose predict",
-     lambda o: "depth" in o and not {"mask", "box", "detections"} & o.keys() and
-     "ray" not in o["engine"],
+     lambda o: ("depth" in o or "left" in o) and not {"mask", "box", "detections"} & o.keys()
+     and "ray" not in o["engine"],
      "batch register-refused labels",
      "an image without --mask, --box or --detections is searched alone, and registers nothing; "
      "give one of them"),

@@ -240,7 +240,7 @@ def pair_work(
 ) -> "DepthWork":
     """Say what is done with pairs, of which the first may say the size for the camera's file."""
     rig = read_rig(camera, image_size(files[0]))
-    output = PredictOutput(cloud=pairs.cloud)
+    output = PredictOutput(cloud=pairs.cloud, min_confidence=pairs.min_confidence)
     return DepthWork(method=method, camera=rig, output=output, with_check=pairs.check, files=PAIRS)
 
 
@@ -330,7 +330,11 @@ class DepthWork:
             keys = camera_keys(self.camera)
             camera = {key: keys[key] for key in ("K", "mount_height_m", "tilt_deg") if key in keys}
         camera |= {key: v for key, v in asdict(self.scale).items() if v is not None}
-        output = {} if self.files == PAIRS else {"color_range_m": list(self.output.color_range)}
+        output: dict[str, Any] = {}
+        if self.files != PAIRS:
+            output["color_range_m"] = list(self.output.color_range)
+        if self.output.cloud:
+            output["min_confidence"] = self.output.min_confidence
         return {**method, "camera": camera, **output}
 
     def start(self) -> Function:
@@ -507,8 +511,16 @@ class Predictor:
                             estimate = scale_by_distance(estimate, depth_input.name, scale.distance)  # noqa: PLW2901
                         cloud_m = CLOUD_M if output.cloud else None
                         files = write_estimate(
-                            self.out, depth_input, estimate, output.color_range, cloud_m
-                        )
+                            self.out, depth_input, estimate, output.color_range, cloud_m,
+                            output.min_confidence,
+                        )  # fmt: skip
+                        if output.cloud and output.min_confidence > 0:
+                            sure = estimate.is_sure(output.min_confidence).sum()
+                            share = 1 - float(sure / estimate.is_sure(0.0).sum().clamp(min=1))
+                            tqdm.write(
+                                f"{depth_input.name}: {share:.1%} of the depth is less sure than "
+                                f"{output.min_confidence:g} and left out of the cloud"
+                            )
                         if estimate.warning:
                             message = f"depthpose: warning: {depth_input.name}: {estimate.warning}"
                             tqdm.write(message, sys.stderr)

@@ -107,6 +107,32 @@ def disparity_from_depth(
     return torch.where(depth_m > 0, disparity_px, torch.nan)
 
 
+_DEVIATIONS = ((0.0, 0.5), (0.4, 0.2), (0.6, 0.17), (0.8, 0.12), (0.9, 0.03), (0.95, 0.02),
+               (1.0, 0.0075))  # fmt: skip
+"""Deviation of a disparity, as a share of it, by its confidence: 68 % of the errors of `default` on
+16 near scenes and 8 streets, synthetic and not trained on, made to fall with the confidence."""
+_LEAST_DEVIATION_PX = 0.25
+"""Of what is surest on these."""
+
+
+def depth_deviation(
+    depth_m: Float[Tensor, "*batch h w"], confidence: Float[Tensor, "*batch h w"], rig: StereoRig
+) -> Float[Tensor, "*batch h w"]:
+    """Standard deviation of a matched depth: ``z^2 / (fx B)`` times that of the disparity [m].
+
+    That of the disparity follows from the confidence, as measured on synthetic scenes. NaN where
+    depth is.
+    """
+    knots = torch.tensor(_DEVIATIONS, dtype=depth_m.dtype, device=depth_m.device)
+    sure, shares = knots.T.contiguous()
+    place = confidence.clamp(0, 1).contiguous()
+    after = torch.searchsorted(sure, place).clamp(1, len(sure) - 1)
+    between = (place - sure[after - 1]) / (sure[after] - sure[after - 1])
+    share = torch.lerp(shares[after - 1], shares[after], between)
+    deviation_px = (share * disparity_from_depth(depth_m, rig)).clamp(min=_LEAST_DEVIATION_PX)
+    return depth_m.square() / (float(rig.K[0, 0]) * rig.baseline_m) * deviation_px
+
+
 def warp_right_to_left(right: Float[Tensor, "c h w"], disparity_px: Map) -> Float[Tensor, "c h w"]:
     """Look up, for each left pixel x, the right view at ``x - disparity`` (bilinear).
 

@@ -128,8 +128,28 @@ class DepthEstimate:
     #: alone
     seen: StereoInput | None = None
 
-    def cloud(self, far_m: float = 80.0) -> Cloud:
+    def is_sure(self, min_confidence: float | None = None) -> Mask:
+        """Say which pixels have a depth that is as sure as that.
+
+        Args:
+            min_confidence: 0..1; None: 0.5 of a pair, where it says that the disparity is more
+                probably right within 15 % than not; all of one image, and where the matcher has no
+                confidence.
+        """
+        values = self.disparity_px if self.depth_m is None else self.depth_m
+        known = torch.isfinite(values)
+        is_pair = self.seen is not None and self.seen.right is not None
+        least = (0.5 if is_pair else 0.0) if min_confidence is None else min_confidence
+        if self.confidence is None or least <= 0:
+            return known
+        return known & (self.confidence >= least)
+
+    def cloud(self, far_m: float = 80.0, min_confidence: float | None = None) -> Cloud:
         """Give the coloured points nearer than ``far_m``, in metres in the left camera's frame.
+
+        Args:
+            far_m: farther ones are left out.
+            min_confidence: less sure ones are left out, as :meth:`is_sure` says.
 
         Raises:
             InputError: there are no metres, or what was seen is not known.
@@ -141,7 +161,8 @@ class DepthEstimate:
                 f"{self.seen.name}: a cloud needs metres: give a camera with a baseline."
             )
         points_m = back_project(self.depth_m, self.seen.camera.K).reshape(-1, 3)
-        is_kept = torch.isfinite(points_m).all(-1) & (points_m[:, 2] <= far_m)
+        is_kept = self.is_sure(min_confidence).reshape(-1)
+        is_kept &= torch.isfinite(points_m).all(-1) & (points_m[:, 2] <= far_m)
         color = self.seen.left.permute(1, 2, 0).reshape(-1, 3)
         return Cloud(points=points_m[is_kept].float(), color=color[is_kept])
 

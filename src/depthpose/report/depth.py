@@ -148,6 +148,10 @@ def depth_facts(
         facts.insert(0, ("warning", estimate.warning))
     if estimate.confidence is not None:
         facts.append(("mean confidence", f"{float(estimate.confidence.nanmean()):.2f}"))
+        shown = replace(estimate, seen=pair)
+        doubted = 1 - float(shown.is_sure().sum() / shown.is_sure(0.0).sum().clamp(min=1))
+        if pair.right is not None:
+            facts.append(("unsure, not in the cloud", f"{doubted:.1%} of the depth"))
     return facts
 
 
