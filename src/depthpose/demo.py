@@ -36,7 +36,8 @@ from depthpose.report.pose import draw_pose, grey_depth, object_points, pose_lay
 _STREETS_SEED = 9  # no weights were trained on streets of this seed
 _STREET = 1
 _CAP_M = 80.0
-_FROM_ONE, _FROM_PAIR = "one image", "both images"
+_FROM_ONE = "one image"
+_FROM_PAIR = "both images"
 Nets = Mapping[str, tuple[str, FakestereoNet]]
 
 _STREET_TEXT = (
@@ -91,7 +92,9 @@ def _show_scene(
     out: Path, sample: StereoSample, nets: Nets, text: str, range_m: tuple[float, float]
 ) -> tuple[list[dict[str, Any]], list[Section]]:
     """Write the pair as files that commands take; estimate by each method; rows and sections."""
-    pair, truth, folder = sample.input, sample.truth, out / sample.input.name
+    pair = sample.input
+    truth = sample.truth
+    folder = out / sample.input.name
     assert pair.right is not None
     assert isinstance(pair.camera, StereoRig)
     assert truth.depth_m is not None
@@ -122,8 +125,10 @@ def _show_scene(
                 title, views_used, estimate, range_m=range_m, error=error, with_image=False
             )
         )
-    best, scale = next(iter(nets)), depth_scale(*range_m)
-    colors, true = homes[best] / f"{pair.name}.color.png", folder / "depth.color.png"
+    best = next(iter(nets))
+    scale = depth_scale(*range_m)
+    colors = homes[best] / f"{pair.name}.color.png"
+    true = folder / "depth.color.png"
     pictures = [
         Picture(path=folder / "left.png", caption="left image"),
         Picture(path=folder / "right.png", caption="right image"),
@@ -211,9 +216,11 @@ def show_poses(out: Path, weights: str | Path) -> tuple[list[dict[str, Any]], li
     is_seen = points_m.isfinite().all(-1) & (points_m[:, 2] > 0)
     color = frame.rgb.permute(1, 2, 0).reshape(-1, 3)[is_seen]
     table = Cloud(points=points_m[is_seen].float(), color=color)
-    picture, layers = frame.rgb, [Layer(name="table, as the sensor sees it", shape=table)]
+    picture = frame.rgb
+    layers = [Layer(name="table, as the sensor sees it", shape=table)]
     for view, estimate, instance in zip(views, estimates, dataset.instances, strict=True):
-        model, K = models[instance.object_id], instance.K.double()
+        model = models[instance.object_id]
+        K = instance.K.double()
         if (pose := estimate.camera_from_model) is not None:
             picture = draw_pose(picture, pose, model, K)
             cloud = posed_cloud(object_points(view, model.diameter_m), pose, model)
@@ -234,7 +241,8 @@ def show_poses(out: Path, weights: str | Path) -> tuple[list[dict[str, Any]], li
 
 def _row(measured: dict[str, Any]) -> dict[str, Any]:
     """The columns that a newcomer reads, in units that parts have."""
-    error_m, moved_m = measured["error_m"], measured["translation_m"]
+    error_m = measured["error_m"]
+    moved_m = measured["translation_m"]
     row = measured | {
         "error_mm": None if error_m is None else 1000 * error_m,
         "of_diameter": None if error_m is None else error_m / measured["diameter_m"],

@@ -191,6 +191,17 @@ def test_a_card_says_what_how_how_long_and_how_good(tmp_path: Path) -> None:
     assert card_text("net", {"licence": "MIT"}) == "# net\n\n- **Licence**: MIT\n"
 
 
+def test_what_is_logged_is_the_mean_of_the_steps_since(tmp_path: Path) -> None:
+    losses: dict[int, list[float]] = {}
+    for every in (1, 5):
+        trained(tmp_path / str(every), loop(steps=10, log_every_steps=every))
+        rows = [row for row in read_metrics(tmp_path / str(every)) if "regressor/loss" in row]
+        losses[every] = [row["regressor/loss"] for row in rows]
+    assert len(losses[1]) == 10
+    means = [sum(losses[1][:5]) / 5, sum(losses[1][5:]) / 5]
+    assert losses[5] == pytest.approx(means, rel=1e-5)
+
+
 def test_training_learns_and_says_so(tmp_path: Path) -> None:
     seen: list[Progress] = []
     task = trained(tmp_path, loop(steps=200, log_every_steps=20), on_step=seen.append)

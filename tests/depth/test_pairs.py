@@ -8,7 +8,7 @@ import torch
 from tests.depth.test_kitti_folders import make_object, make_raw, write
 
 from depthpose.core.config import config_to_dict
-from depthpose.core.errors import InputError
+from depthpose.core.errors import InputError, Notice
 from depthpose.core.files import read_json, write_depth_png, write_image
 from depthpose.core.loop import LoopConfig, Run
 from depthpose.depth.config import AugmentConfig, PairsConfig, PSMNetConfig, StreetsConfig
@@ -138,3 +138,20 @@ def test_the_record_of_a_run_says_the_truth_of_each_folder(tmp_path: Path) -> No
         in path.with_suffix(".md").read_text()
     )
     assert config_to_dict(config)["pairs"]["truth"] is None
+
+
+def test_right_views_that_are_missing_are_counted(tmp_path: Path) -> None:
+    make_pairs(tmp_path, ("0", "1", "2"))
+    TrainingPairs(PairsConfig(folders=(str(tmp_path),)), 0, needs_truth=False)
+    (tmp_path / "right" / "1.png").unlink()
+    with pytest.warns(Notice, match="1 of 3 images have no right view, and are left out"):
+        pairs = TrainingPairs(PairsConfig(folders=(str(tmp_path),)), 0, needs_truth=False)
+    assert len(pairs) == 2
+
+
+def test_both_spellings_of_an_accent_are_one_name(tmp_path: Path) -> None:
+    make_pairs(tmp_path, ("caf\u00e9", "street"))
+    (tmp_path / "right" / "caf\u00e9.png").rename(tmp_path / "right" / "cafe\u0301.png")
+    frames = open_dataset(tmp_path).frames
+    assert [frame.name for frame in frames] == ["caf\u00e9", "street"]
+    assert all(frame.right is not None for frame in frames)

@@ -20,7 +20,7 @@ from tests.pose.synthetic_frames import make_dataset
 from tests.pose.synthetic_objects import bracket, tiny_weights
 
 from depthpose.cli.doctor_files import look_at_all
-from depthpose.core.camera import StereoRig, read_camera
+from depthpose.core.camera import StereoRig, read_camera, read_raw_pair
 from depthpose.core.checkpoint import read_checkpoint, read_torch_file
 from depthpose.core.config import read_config
 from depthpose.core.files import (
@@ -35,6 +35,7 @@ from depthpose.core.files import (
     write_depth_png,
     write_json,
 )
+from depthpose.core.files.images import read_views
 from depthpose.core.loop import read_metrics
 from depthpose.core.run import claim_folder, claim_names, read_settings
 from depthpose.depth.config import GeneratorConfig, PSMNetConfig
@@ -127,6 +128,19 @@ def _pictures() -> dict[str, Kind]:
         file="g.png", good=stream.getvalue(), damage=damage.hurt_png,
         readers=(read_image, read_mask, image_size, read_depth_png),
     )  # fmt: skip
+    views = [Image.fromarray(np.full((16, 24, 3), value, np.uint8)) for value in (90, 160)]
+    stream = io.BytesIO()
+    views[0].save(stream, "MPO", save_all=True, append_images=views[1:])
+    found["both views, mpo"] = Kind(
+        file="x.mpo", good=stream.getvalue(), damage=damage.hurt_bytes,
+        readers=(read_views,),
+    )  # fmt: skip
+    stream = io.BytesIO()
+    pages = [Image.new("RGB", (24, 16)), Image.new("RGB", (24, 16))]
+    pages[0].save(stream, "TIFF", save_all=True, append_images=pages[1:])
+    found["pages, tiff"] = Kind(
+        file="x.tif", good=stream.getvalue(), damage=damage.hurt_bytes, readers=(read_image,)
+    )
     return found
 
 
@@ -221,7 +235,14 @@ def _cameras() -> dict[str, Kind]:
                     "data": [500.0, 0, 320, 0, 500, 240, 0, 0, 1]}, "image_width": 640,
               "image_height": 480}  # fmt: skip
     plain = b"focal_px: 500\ncx: 320\ncy: 240\nbaseline_m: 0.5\nwidth: 640\nheight: 480\n"
+    realsense = {"width": 640, "height": 480, "fx": 500, "fy": 500, "ppx": 320, "ppy": 240,
+                 "model": "distortion.brown_conrady", "coeffs": [0, 0, 0, 0, 0]}  # fmt: skip
+    lens = b"camera_model: pinhole\nfisheye_model: 0\nxi: 0.0\ndistortion_model: plumb_bob\n"
     goods = {
+        "RealSense camera": ("c.json", json.dumps(realsense).encode(), damage.hurt_json),
+        "COLMAP camera": ("c.txt", b"# Camera list\n1 OPENCV 640 480 500 500 320 240 0 0 0 0\n",
+                          damage.hurt_text),
+        "lens by name": ("c.yaml", ROS + lens, damage.hurt_yaml),
         "camera": ("c.json", CAMERA, damage.hurt_json),
         "BOP camera": ("c.json", json.dumps(bop).encode(), damage.hurt_json),
         "BOP scene camera": ("c.json", json.dumps(scene).encode(), damage.hurt_json),
@@ -245,6 +266,13 @@ def _cameras() -> dict[str, Kind]:
     found["ROS pair"] = Kind(
         file="left.yaml", good=ROS, damage=damage.hurt_yaml, beside={"right.yaml": right},
         is_folder=True, readers=(lambda folder: read_camera(folder, (640, 480)),),
+    )  # fmt: skip
+    eye, K = [1, 0, 0, 0, 1, 0, 0, 0, 1], [500, 0, 320, 0, 500, 240, 0, 0, 1]
+    stereo = {"K1": K, "D1": [0.1, 0, 0, 0], "K2": K, "D2": [0.1, 0, 0, 0], "R": eye,
+              "T": [-0.1, 0, 0], "fisheye_model": 1}  # fmt: skip
+    found["stereo calibration"] = Kind(
+        file="stereo.json", good=json.dumps(stereo).encode(), damage=damage.hurt_json,
+        readers=(read_raw_pair,),
     )  # fmt: skip
     return found
 

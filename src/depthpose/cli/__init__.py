@@ -48,6 +48,8 @@ COMMANDS = {
         "data:make_objects", "synthetic frames of your CAD files on a table, in BOP's layout"),
     "data rectify": (
         "data:rectify", "raw pairs and their calibration to rectified pairs for depth match"),
+    "data split": (
+        "data:split", "pictures and videos that hold both views to a left and a right folder"),
     "data check": ("data:check", "read a whole data set and list what is wrong"),
     "data label": (
         "data:label", "truth for pairs that have none, by a matcher, where both views agree"),
@@ -124,9 +126,9 @@ def main(words: Sequence[str] | None = None) -> int:
         except KeyboardInterrupt as stop:
             code = _fail(f"{str(stop) or 'interrupted'}; what was finished is kept", 130)
         except Exception as error:
-            if (said := _explained(error)) is None:
+            if (reason := _explained(error)) is None:
                 raise
-            code = _fail(f"error: {said}")
+            code = _fail(f"error: {reason}")
         finally:
             warnings.formatwarning = as_usual
             if (lock := sys.modules.get("depthpose.core.run")) is not None:
@@ -147,8 +149,8 @@ def _fail(reason: str, code: int = 2) -> int:
 
 def _explained(error: Exception) -> str | None:
     """Say in a line that memory or disk is full, or a path unusable; None of any other error."""
-    if (said := full_memory(error)) is not None:
-        return f"{said}; what was finished is kept"
+    if (reason := full_memory(error)) is not None:
+        return f"{reason}; what was finished is kept"
     if not isinstance(error, OSError) or error.errno not in (*_OF_THE_DISK, *_OF_A_PATH):
         return None
     from tempfile import gettempdir
@@ -240,9 +242,9 @@ def _run(words: list[str]) -> int:
     if name is None:
         asked_help = {"-h", "--help"} & set(words)
         group = words[0] if words and not words[0].startswith("-") else ""
-        known = {name.partition(" ")[0] for name in COMMANDS}
-        if group and group not in known:
-            return _fail(f"error: no command {group!r}; {nearest_name(group, known)}")
+        groups = {name.partition(" ")[0] for name in COMMANDS}
+        if group and group not in groups:
+            return _fail(f"error: no command {group!r}; {nearest_name(group, groups)}")
         inside = {name: what for name, (_, what) in COMMANDS.items() if name.startswith(group)}
         verb = next((word for word in words[1:] if not word.startswith("-")), "")
         if group and verb:
@@ -265,7 +267,7 @@ def _run(words: list[str]) -> int:
     command: Callable[..., int] = getattr(import_module(f"depthpose.cli.{home}"), function)
     parse, options = arguments.parser_of(command)
     try:
-        given = tyro.cli(
+        parsed = tyro.cli(
             parse,
             prog=f"depthpose {name}",
             description=arguments.description_of(command),
@@ -275,11 +277,11 @@ def _run(words: list[str]) -> int:
     except SystemExit as stop:  # tyro has printed help (0) or the wrong arguments (2)
         return int(stop.code or 0)
     arguments.refuse_words(name, options, rest)
-    arguments.refuse_missing(options, given.arguments)
+    arguments.refuse_missing(options, parsed.arguments)
     if sys.platform != "win32":
         import resource
 
         if 0 <= (limit := resource.getrlimit(resource.RLIMIT_AS)[0]) < _LEAST_KIB * 1024:
             raise InputError(f"the limit of {limit // 1024} KiB (ulimit -v) is below the "
                              f"{_LEAST_KIB} that the libraries alone take; raise it")  # fmt: skip
-    return command(*given.args, **given.kwargs)
+    return command(*parsed.args, **parsed.kwargs)

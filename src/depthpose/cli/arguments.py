@@ -144,21 +144,22 @@ def description_of(command: Callable[..., int]) -> str:
 
 def _described(hint: Any) -> tuple[str | None, _Names | None]:  # noqa: ANN401  any type
     """Name a value, None where tyro's own name will do, and say what it names."""
-    origin, parts = get_origin(hint), get_args(hint)
+    origin = get_origin(hint)
+    parts = get_args(hint)
     if origin is Annotated:
-        own = next((mark for mark in parts if isinstance(mark, _Names)), None)
-        if own is None:
+        named = next((mark for mark in parts if isinstance(mark, _Names)), None)
+        if named is None:
             return None, _described(parts[0])[1]
-        word = "NAME|FILE" if own is _Names.WEIGHTS else "PATH"
-        return None if _POSITIONAL in parts else word, own
+        word = "NAME|FILE" if named is _Names.WEIGHTS else "PATH"
+        return None if _POSITIONAL in parts else word, named
     if origin in (Union, UnionType):
         return _described(next(part for part in parts if part is not NoneType))
     if origin is Literal:
         return f"{{{','.join(map(str, parts))}}}", None
     if origin in (tuple, list):
-        one, names = _described(parts[0])
-        many = f"{one} ..." if parts[1:] in ((), (...,)) else " ".join([str(one)] * len(parts))
-        return one and many, names
+        word, names = _described(parts[0])
+        many = f"{word} ..." if parts[1:] in ((), (...,)) else " ".join([str(word)] * len(parts))
+        return word and many, names
     return _OF_TYPES.get(hint), _Names.INPUT if hint is Path else None
 
 
@@ -171,16 +172,16 @@ def refuse_missing(options: Sequence[Option], values: Mapping[str, Any]) -> None
         if parameter not in values or names is None:
             continue
         value = values[parameter] if parameter == name else getattr(values[parameter], name)
-        for one in value if isinstance(value, list | tuple) else [value]:
-            if names is _Names.WEIGHTS and one is not None:
-                bare = re.sub(_PREFIXES, "", one)
+        for word in value if isinstance(value, list | tuple) else [value]:
+            if names is _Names.WEIGHTS and word is not None:
+                bare = re.sub(_PREFIXES, "", word)
                 if bare not in _WORDS and not bare.startswith("hf:/"):  # of the hub
                     from depthpose.core.checkpoint import find_weights  # loads torch
 
                     find_weights(bare)
-            elif one is not None and not any(mark in str(one) for mark in ("://", *"*?[{")):
-                wanted = Path(one)
-                if os.path.exists(wanted):  # noqa: PTH110 - which never raises
+            elif word is not None and not any(mark in str(word) for mark in ("://", *"*?[{")):
+                wanted = Path(word)
+                if wanted.exists():
                     continue
                 if any(map(os.path.islink, (wanted, *wanted.parents))):
                     from depthpose.core.files.disk import refuse_broken_link  # loads torch
@@ -192,7 +193,7 @@ def refuse_missing(options: Sequence[Option], values: Mapping[str, Any]) -> None
                 beside = [path.name for path in home.iterdir()] if home.is_dir() else []
                 near = get_close_matches(wanted.name, beside, n=1)
                 hint = f"did you mean {str(home / near[0])!r}?" if near else "check the path"
-                raise InputError(f"{one}: there is no such file or folder; {hint}")
+                raise InputError(f"{word}: there is no such file or folder; {hint}")
 
 
 def refuse_below(least: int, option: str, value: int, usual: str) -> None:
@@ -249,9 +250,15 @@ _RULES: tuple[tuple[str, _Case, str, str], ...] = (
     ("depth predict", lambda o: "focal-px" in o, "fov", "--focal-px is the focal length"),
     ("pose predict", lambda o: "least-squares" in o["voting"], "hypotheses",
      "--voting least-squares draws no hypotheses"),
+    ("pose predict", lambda o: "left" not in o, "right matcher min-confidence",
+     "it is of a pair, and there is none; give --left"),
+    ("pose predict", lambda o: "left" in o and "ray" in o["engine"], "engine",
+     "pairs are matched and posed by this process"),
+    ("pose predict", lambda o: "sgbm" in o["matcher"], "min-confidence",
+     "sgbm has no confidence"),
     ("pose predict",
-     lambda o: "depth" in o and not {"mask", "box", "detections"} & o.keys() and
-     "ray" not in o["engine"],
+     lambda o: ("depth" in o or "left" in o) and not {"mask", "box", "detections"} & o.keys()
+     and "ray" not in o["engine"],
      "batch register-refused labels",
      "an image without --mask, --box or --detections is searched alone, and registers nothing; "
      "give one of them"),
@@ -312,7 +319,8 @@ def refuse_words(command: str, options: Sequence[Option], words: Sequence[str]) 
 
     Such a name is that of a script whose variable is unset.
     """
-    typed, spelled = Typed(), dict[str, str]()
+    typed = Typed()
+    spelled = dict[str, str]()
     here: list[str] = []
     for word in words:
         if word.startswith("--"):

@@ -183,8 +183,10 @@ def make_objects(
     }}  # fmt: skip
     models = [read_model(path, unit, number=k) for k, path in enumerate(cad, start=1)]
     refuse_one_name(models)
-    known = partial(with_found_symmetries, on_message=tqdm.write, is_taken=symmetries == "found")
-    models = [known(model) for model in models]
+    with_symmetries = partial(
+        with_found_symmetries, on_message=tqdm.write, is_taken=symmetries == "found"
+    )
+    models = [with_symmetries(model) for model in models]
     claim_folder(out, settings, ["models", split])
     write_bop_models(out, models)
     scenes = {
@@ -334,9 +336,9 @@ def label(
     shares = [share for _, share in tqdm(labelled, unit=" pairs", leave=False, disable=None)]
     for failure in failures:
         print(f"depthpose: failed: {failure}", file=sys.stderr)
-    known = f", {sum(shares) / len(shares):.0%} of their pixels labelled" if shares else ""
+    labelled_share = f", {sum(shares) / len(shares):.0%} of their pixels labelled" if shares else ""
     failed = f"{len(failures)} failed, " if failures else ""
-    print(f"{out}: {len(shares)} pairs labelled{known}; {failed}the others were there")
+    print(f"{out}: {len(shares)} pairs labelled{labelled_share}; {failed}the others were there")
     return 1 if failures else 0
 
 
@@ -398,8 +400,8 @@ def rectify(
     _check_rows(rectifier, pairs, is_refused=check)
     settings: dict[str, Any] = {"command": "data rectify", "keep": keep}
     settings["right_from_left"] = calibration.right_from_left.matrix().tolist()
-    for side, one in zip(_SIDES, (calibration.left, calibration.right), strict=True):
-        lens = {"K": one.K.tolist(), "D": list(one.distortion), "is_fisheye": one.is_fisheye}
+    for side, raw in zip(_SIDES, (calibration.left, calibration.right), strict=True):
+        lens = {"K": raw.K.tolist(), "D": list(raw.distortion), "is_fisheye": raw.is_fisheye}
         settings[side] = lens
     claim_folder(out, settings, [*_SIDES, "camera.json"])
     claim_names(out, {pair[0].stem: pair for pair in pairs})
@@ -410,6 +412,51 @@ def rectify(
             write_image(out / side / f"{first.stem}.png", image)
     write_camera(out / "camera.json", rectifier.rig)
     print(f"{out}: {len(pairs)} pairs in left and right, their camera in camera.json")
+    return 0
+
+
+def split(files: tyro.conf.Positional[tuple[Source, ...]], out: NewPath) -> int:
+    """Part pictures and videos that hold both views of a stereo camera.
+
+    Finds whether the views are side by side, one above the other or one after the other (.mpo), and
+    which is the left one. Writes left/NAME.png and right/NAME.png: OUT is input for 'depth match',
+    or for 'data rectify' where the views are raw.
+
+        depthpose data split street.jps drive.mp4 --out parted
+
+    Args:
+        files: pictures, videos, folders or quoted patterns.
+        out: folder for the results.
+    """
+    from depthpose.cli.depth_predict import find_sources
+    from depthpose.core.camera import find_two_views, halves, order_views
+    from depthpose.core.files import VIDEO_SUFFIXES, read_video, write_image
+    from depthpose.core.files.images import read_views
+    from depthpose.core.run import claim_folder
+
+    sources = find_sources(files, out)
+    claim_folder(out, {"command": "data split"}, _SIDES)
+    count = 0
+    for source in sources:
+        is_video = source.suffix.lower() in VIDEO_SUFFIXES
+        pictures = (
+            ((name, [frame]) for name, frame in read_video(source))
+            if is_video
+            else [(source.stem, read_views(source))]
+        )
+        for name, views in pictures:
+            if len(views) == 1:
+                how = find_two_views(views[0])
+                if how is None:
+                    raise InputError(
+                        f"{source}: {name} does not look like two views of one scene, side by "
+                        "side or one above the other; leave it out"
+                    )
+                views = list(halves(views[0], how))  # noqa: PLW2901
+            for side, view in zip(_SIDES, order_views(views[0], views[1]), strict=True):
+                write_image(out / side / f"{name}.png", view)
+            count += 1
+    print(f"{out}: {count} pairs in left and right")
     return 0
 
 
@@ -435,30 +482,32 @@ def _check_rows(
         names = [str(first), str(second)]
         left, right = rectifier.rectify(read_image(first), read_image(second), names)
         reports.append(check_rectified(left, right, rig.cx_right_minus_left_px))
-    known = [report for report in reports if report.is_rectified is not None]
-    if not known:
-        said = f"depthpose: the rows cannot be checked: {reports[0].message}"
-        print(said, file=sys.stderr)
+    judged = [report for report in reports if report.is_rectified is not None]
+    if not judged:
+        message = f"depthpose: the rows cannot be checked: {reports[0].message}"
+        print(message, file=sys.stderr)
         return
-    measured = [report for report in known if report.matches] or known
+    measured = [report for report in judged if report.matches] or judged
     offset_px = median(abs(report.vertical_offset_px) for report in measured)
     spread_px = median(report.vertical_spread_px for report in measured)
     differ = f"they differ by {offset_px:.2f} px, with a spread of {spread_px:.2f} px"
     if not math.isfinite(offset_px):
         differ = "no difference is common to their matches"
-    matches = sum(report.matches for report in known)
-    said = f"rows of {len(known)} pairs: {differ} ({matches} matches)"
+    matches = sum(report.matches for report in judged)
+    message = f"rows of {len(judged)} pairs: {differ} ({matches} matches)"
     wrong = ""
-    if 2 * sum(bool(report.is_swapped) for report in known) > len(known):
+    if 2 * sum(bool(report.is_swapped) for report in judged) > len(judged):
         wrong = "left and right look swapped (disparities are negative); exchange LEFT and RIGHT"
-    elif 2 * sum(report.is_wrong for report in known) > len(known):
+    elif 2 * sum(report.is_wrong for report in judged) > len(judged):
         wrong = (
             "they are not rectified by it, so this is not the calibration of these images, or "
             f"LEFT and RIGHT are exchanged; {_ASK}"
         )
     if wrong and is_refused:
-        raise InputError(f"{said}: {wrong}. Nothing was written (--no-check writes all the same)")
-    print(said)
+        raise InputError(
+            f"{message}: {wrong}. Nothing was written (--no-check writes all the same)"
+        )
+    print(message)
     if wrong or offset_px > _WARN_PX:
         wrong = wrong or f"that is above {_WARN_PX:g} px, which costs depth far away; {_ASK}"
         print(f"depthpose: {wrong}", file=sys.stderr)

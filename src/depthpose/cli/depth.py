@@ -43,7 +43,8 @@ def predict(
     if not images:
         raise InputError("name images, folders of them, patterns or videos to predict from")
     near, far = output.color_range
-    height_m, tilt_deg = scale.camera_height, scale.camera_tilt
+    height_m = scale.camera_height
+    tilt_deg = scale.camera_tilt
     if not 0 < near < far:
         raise InputError(f"--color-range {near, far}: give near and far metres, near first.")
     if output.batch < 1:
@@ -67,7 +68,8 @@ def predict(
     if engine.engine == "ray":
         return work.estimate_by_engine(images, work.IMAGES, work_of, out, engine)
     sources = work.find_sources(images, Path(out))
-    this, built = work_of(sources), method.build()
+    this = work_of(sources)
+    built = method.build()
     is_plain = (matching.precision, matching.max_memory) == ("fp32", None)
     if built.settings.get("answer") == "own" and not is_plain:
         raise InputError(
@@ -124,7 +126,8 @@ def match(
         raise InputError(f"{left}: there is no right image beside it; give it second")
     files = work.list_pairs(left, right)
     refuse_among_inputs(Path(out), (left, right), [path for pair in files for path in pair])
-    this, built = work_of(files[0]), method.build()
+    this = work_of(files[0])
+    built = method.build()
     return work.estimate_all(files, this, built, Path(out))
 
 
@@ -180,7 +183,9 @@ def evaluate(
     files = [*table_files("rows", "frames", "confidence"), "report.html", "predictions"]
     claim_folder(out, {"command": "depth evaluate", **about}, files)
     folders = [predict_all(dataset, method, rule, out / "predictions") for method in chosen]
-    name, caps_m, predictions = comparison.protocol, comparison.cap, methods.predictions
+    name = comparison.protocol
+    caps_m = comparison.cap
+    predictions = methods.predictions
     if predictions is not None and stores.exists(stores.join(predictions, PLAN)):
         ready = measure_shards(dataset, predictions, name, caps_m)
         return measure(dataset, folders, name, caps_m, out, [ready])

@@ -54,7 +54,8 @@ def predict_all(dataset: Dataset, method: Method, rule: Protocol, folder: Path) 
 
     Of several processes each predicts its share, and the first goes on when all files are there.
     """
-    process, home = find_rank(), folder / method.name
+    process = find_rank()
+    home = folder / method.name
     usable = [
         (i, frame)
         for i, frame in enumerate(dataset.frames)
@@ -102,7 +103,9 @@ def choose_methods(options: MethodOptions, config: MatcherConfig, dataset: Datas
             "method once, or give files of other names"
         )
     has_right = any(frame.right is not None for frame in dataset.frames)
-    if not has_right and (matching := next((one for one in chosen if one.with_right), None)):
+    if not has_right and (
+        matching := next((method for method in chosen if method.with_right), None)
+    ):
         raise InputError(
             f"{matching.name} matches both views, and {dataset.name} has no right view; leave it "
             "out ('quick:' and 'fine:' are for both views: for one image, give --speed)"
@@ -174,18 +177,18 @@ def measure(
     about = f"{protocol}: {PROTOCOLS[protocol].summary}."
     unknown = sum(frame.right is not None and not frame.calibration for frame in dataset.frames)
     if unknown:
-        said = (
+        message = (
             f"{unknown} of {len(dataset)} pairs have no calibration, so a network matches them at "
             "their own focal length, not at the one it knows: compare no numbers with those of "
             "frames that have one (KITTI 2015 has calib_cam_to_cam in a download of its own)"
         )
-        print(f"depthpose: {said}", file=sys.stderr)
-        about += f" {said}."
+        print(f"depthpose: {message}", file=sys.stderr)
+        about += f" {message}."
     places = {frame.name: i for i, frame in enumerate(dataset.frames)}
     sections: list[Section] = []
     shares = page.share_views(len(folders))
     for folder, of_folder, most in zip(
-        folders, [one.per_frame for one in each], shares, strict=True
+        folders, [evaluation.per_frame for evaluation in each], shares, strict=True
     ):
         cap_m = of_folder[0].cap_m
         of_cap = [row for row in of_folder if row.cap_m == cap_m and row.pixels]
@@ -194,16 +197,17 @@ def measure(
         cap = "" if cap_m is None else f", truth up to {cap_m:g} m"
         errors = [sign * row.metrics[metric.name] for row in of_cap]
         for role, k in page.choose_ranked(errors, most):
-            row, value = of_cap[k], of_cap[k].metrics[metric.name]
+            row = of_cap[k]
+            value = of_cap[k].metrics[metric.name]
             frames = f"{len(of_cap)} frame{'' if len(of_cap) == 1 else 's'}"
             text = f"The {role} of {frames} by {metric.name}: {value:.4f}{cap}."
             index = places[row.frame or ""]
             estimate, error = frame_result(dataset, index, folder, protocol, row.cap_m)
             pair = dataset.read_input(index)
-            own = {name: v for name, v in row.columns().items() if name not in _SAID_ABOVE}
+            columns = {name: v for name, v in row.columns().items() if name not in _SAID_ABOVE}
             title = f"{folder.name}: {row.frame}, {role}"
             sections.append(
-                replace(depth_section(title, pair, estimate, text, error=error), rows=[own])
+                replace(depth_section(title, pair, estimate, text, error=error), rows=[columns])
             )
     sections = [
         Section(title="Mean over frames", text=about, rows=rows),
@@ -228,22 +232,24 @@ def measure_each(
     """Measure folders of predictions one by one; each row says whose it is."""
     show = partial(tqdm, unit=" frames", disable=None)
     return [
-        signed(evaluate(dataset, one, protocol, caps_m, show), one.name, read_settings(one))
-        for one in folders
+        signed(
+            evaluate(dataset, folder, protocol, caps_m, show), folder.name, read_settings(folder)
+        )
+        for folder in folders
     ]
 
 
 def signed(result: Evaluation, name: str, settings: dict[str, Any] | None) -> Evaluation:
     """Add the source of the predictions to each row."""
     holes = {True: " (holes filled)", False: " (matched pixels)"}
-    known = settings or {"matcher": name, "input": ""}
+    made_by = settings or {"matcher": name, "input": ""}
     source = {
-        "method": known.get("matcher", "") + holes.get(known.get("with_filled_holes", ""), ""),
-        "input": known.get("input", "both views"),
-        "speed": known.get("speed", ""),
-        "weights": known.get("weights", ""),
+        "method": made_by.get("matcher", "") + holes.get(made_by.get("with_filled_holes", ""), ""),
+        "input": made_by.get("input", "both views"),
+        "speed": made_by.get("speed", ""),
+        "weights": made_by.get("weights", ""),
     }
-    sha256 = known.get("weights_sha256", "")[:12]
+    sha256 = made_by.get("weights_sha256", "")[:12]
     return replace(
         result,
         rows=[replace(row, weights_sha256=sha256, **source) for row in result.rows],
@@ -255,10 +261,10 @@ def signed(result: Evaluation, name: str, settings: dict[str, Any] | None) -> Ev
 def join(each: Sequence[Evaluation]) -> Evaluation:
     """Put the rows of several evaluations below each other."""
     return Evaluation(
-        rows=[row for one in each for row in one.rows],
-        per_frame=[row for one in each for row in one.per_frame],
-        deciles=[row for one in each for row in one.deciles],
-        skipped={name: why for one in each for name, why in one.skipped.items()},
+        rows=[row for evaluation in each for row in evaluation.rows],
+        per_frame=[row for evaluation in each for row in evaluation.per_frame],
+        deciles=[row for evaluation in each for row in evaluation.deciles],
+        skipped={name: why for evaluation in each for name, why in evaluation.skipped.items()},
     )
 
 
@@ -287,7 +293,8 @@ def measure_shards(
     dataset: Dataset, predictions: str, protocol: str, caps_m: Sequence[float]
 ) -> Evaluation:
     """Measure shards of predictions, one after the other; the rows say whose they are."""
-    name, settings = PurePosixPath(predictions).stem, read_settings(predictions)
+    name = PurePosixPath(predictions).stem
+    settings = read_settings(predictions)
     places = {frame.name: index for index, frame in enumerate(dataset.frames)}
     rows: dict[str, list[Measured] | str] = {}
     for done in tqdm(jobs.read_results(predictions), name, disable=None, unit=" shards"):

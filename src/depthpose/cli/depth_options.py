@@ -29,7 +29,8 @@ class MatcherOptions:
     @property
     def config(self) -> MatcherConfig:
         """Settings of the networks."""
-        limit, text = None, self.max_memory
+        limit = None
+        text = self.max_memory
         if text is not None:  # such as 1GB, 800M or 1500000; 1GiB is 1024**3
             size = re.fullmatch(r"\s*(\d+(?:\.\d+)?)\s*([KMGT]?)(i?)B?\s*", text, re.IGNORECASE)
             if size is None or (size[3] and not size[2]) or not float(size[1]):
@@ -101,6 +102,8 @@ class PairNetworks:
 
     cloud: bool = False
     """write a coloured point cloud of what is nearer than 80 m, NAME.cloud.ply."""
+    min_confidence: float = 0.5
+    """of clouds: depth that is less sure is left out, 0 to 1; the share is said."""
     weights: WeightsName | None = None
     """weights with a matcher, by name or file; 'default' unless sgbm matches."""
     matcher: WeightsName | None = None
@@ -132,10 +135,19 @@ class PredictOutput:
 
     cloud: bool = False
     """write a coloured point cloud of what is nearer than 80 m, NAME.cloud.ply."""
+    min_confidence: float = 0.0
+    """of clouds: depth that is less sure is left out, 0 to 1; the share is said."""
     color_range: tuple[float, float] = (3.0, 80.0)
     """metres of the brightest and the darkest colour, the same for all pictures."""
     batch: int = 1
     """images of one size that go through the networks together: for a GPU."""
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.min_confidence <= 1:
+            raise InputError(
+                f"--min-confidence {self.min_confidence:g}: a confidence lies in 0 to 1; 0 leaves "
+                "nothing out"
+            )
 
 
 @dataclass(frozen=True, kw_only=True)

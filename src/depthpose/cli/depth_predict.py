@@ -116,15 +116,19 @@ class MethodSource:
         facts["weights_sha256"] = file_sha256(path)
         if not is_matcher:
             facts["input"] = "both views" if with_right else "left view"
-        settings, matcher, answer = asdict(config), None, self.answer
+        settings = asdict(config)
+        matcher = None
+        answer = self.answer
         if self.matcher is None:
             name = path.stem + ("-both" if with_right and not is_matcher else "")
             name += "" if answer is None else f"-{answer}"
         else:  # OpenCV, or other weights, match the view of the generator
-            other, answer = self.matcher, "matched"
+            other = self.matcher
+            answer = "matched"
             if self.matcher == "sgbm":
                 sgbm = SGBMConfig(with_filled_holes=True)
-                matcher, settings = SGBMMatcher(sgbm), {**settings, **asdict(sgbm)}
+                matcher = SGBMMatcher(sgbm)
+                settings = {**settings, **asdict(sgbm)}
             else:
                 matcher = find_weights(self.matcher)
                 other, facts["matcher_sha256"] = matcher.stem, file_sha256(matcher)
@@ -159,7 +163,8 @@ class MethodSource:
 
 def read_lens(options: LensOptions, sources: Sequence[Path]) -> Camera | FieldOfView | float:
     """Read what the user knows of the camera; without any of it the EXIF of the images is asked."""
-    focal_px, fov = options.focal_px, options.fov
+    focal_px = options.focal_px
+    fov = options.fov
     if focal_px is not None and not 1 < focal_px < 1e6:
         raise InputError(f"--focal-px {focal_px}: not a focal length in pixels; KITTI's is 721.5.")
     if fov is not None:
@@ -235,7 +240,7 @@ def pair_work(
 ) -> "DepthWork":
     """Say what is done with pairs, of which the first may say the size for the camera's file."""
     rig = read_rig(camera, image_size(files[0]))
-    output = PredictOutput(cloud=pairs.cloud)
+    output = PredictOutput(cloud=pairs.cloud, min_confidence=pairs.min_confidence)
     return DepthWork(method=method, camera=rig, output=output, with_check=pairs.check, files=PAIRS)
 
 
@@ -270,7 +275,8 @@ def _is_video(path: str | Path) -> bool:
 
 def list_pairs(left: str, right: str) -> list[tuple[Path, Path]]:
     """List the images of both sides, paired by their names or the numbers in them."""
-    lefts, rights = list_images(left), list_images(right)
+    lefts = list_images(left)
+    rights = list_images(right)
     stems, others = ([path.stem for path in side] for side in (lefts, rights))
     if len(set(stems)) != len(stems):
         twice = next(stem for stem in stems if stems.count(stem) > 1)
@@ -324,7 +330,11 @@ class DepthWork:
             keys = camera_keys(self.camera)
             camera = {key: keys[key] for key in ("K", "mount_height_m", "tilt_deg") if key in keys}
         camera |= {key: v for key, v in asdict(self.scale).items() if v is not None}
-        output = {} if self.files == PAIRS else {"color_range_m": list(self.output.color_range)}
+        output: dict[str, Any] = {}
+        if self.files != PAIRS:
+            output["color_range_m"] = list(self.output.color_range)
+        if self.output.cloud:
+            output["min_confidence"] = self.output.min_confidence
         return {**method, "camera": camera, **output}
 
     def start(self) -> Function:
@@ -476,7 +486,9 @@ class Predictor:
     def predict(self, named: Named, total: int | None, what: str) -> list[str]:
         """Estimate inputs, a batch together, and write their files; give the names of the done."""
         names: list[str] = []
-        output, scale, net = self.work.output, self.work.scale, self.method.net
+        output = self.work.output
+        scale = self.work.scale
+        net = self.method.net
         assert isinstance(net, FakestereoNet), "weights build no other"
         with tqdm(total=total, desc=what, disable=None, unit=f" {what}") as bar:
             while chunk := list(islice(named, output.batch)):
@@ -499,8 +511,16 @@ class Predictor:
                             estimate = scale_by_distance(estimate, depth_input.name, scale.distance)  # noqa: PLW2901
                         cloud_m = CLOUD_M if output.cloud else None
                         files = write_estimate(
-                            self.out, depth_input, estimate, output.color_range, cloud_m
-                        )
+                            self.out, depth_input, estimate, output.color_range, cloud_m,
+                            output.min_confidence,
+                        )  # fmt: skip
+                        if output.cloud and output.min_confidence > 0:
+                            sure = estimate.is_sure(output.min_confidence).sum()
+                            share = 1 - float(sure / estimate.is_sure(0.0).sum().clamp(min=1))
+                            tqdm.write(
+                                f"{depth_input.name}: {share:.1%} of the depth is less sure than "
+                                f"{output.min_confidence:g} and left out of the cloud"
+                            )
                         if estimate.warning:
                             message = f"depthpose: warning: {depth_input.name}: {estimate.warning}"
                             tqdm.write(message, sys.stderr)

@@ -53,25 +53,26 @@ def doctor(files: tyro.conf.Positional[tuple[NewPath, ...]] = ()) -> int:
         except metadata.PackageNotFoundError:
             lacking[extra].append(package)
     for extra, packages in lacking.items():
-        said = f"lacks {', '.join(packages)}" if packages else "installed"
-        print(f"extra {extra}: {said}")
+        outcome = f"lacks {', '.join(packages)}" if packages else "installed"
+        print(f"extra {extra}: {outcome}")
     print(f"another extra: {install_command('EXTRA')}")
     for path in sorted(SHIPPED.glob("*.safetensors")):
         try:
-            known = read_checkpoint(path)
-            print(f"weights {path.stem}: {known.kind}, {known.facts.get('licence', 'no licence')}")
+            checkpoint = read_checkpoint(path)
+            licence = checkpoint.facts.get("licence", "no licence")
+            print(f"weights {path.stem}: {checkpoint.kind}, {licence}")
         except InputError as error:
             print(f"weights {path.stem}: {error}")
     code = 0
     for what, work in {"depth": _try_depth, "pose": _try_pose}.items():
         began = perf_counter()
         try:
-            said = work()
+            outcome = work()
         except Exception as error:  # noqa: BLE001 - whatever it is, it is what is asked for
             print(f"{what}: failed: {type(error).__name__}: {error}", file=sys.stderr)
             code = 1
         else:
-            print(f"{what}: {said}, {perf_counter() - began:.1f} s with loading")
+            print(f"{what}: {outcome}, {perf_counter() - began:.1f} s with loading")
     return code
 
 
@@ -92,14 +93,15 @@ def _try_depth() -> str:
     noise = torch.rand(3, 48, 160, generator=torch.Generator().manual_seed(0))
     scene = torch.nn.functional.interpolate(noise[None], scale_factor=4, mode="bicubic")[0]
     scene = scene.clamp(0, 1)
-    left, right = scene[..., :-_SHIFT_PX], scene[..., _SHIFT_PX:]
+    left = scene[..., :-_SHIFT_PX]
+    right = scene[..., _SHIFT_PX:]
     net = FakestereoNet.load("default")
     estimate = net.estimate(left, None, right=right, with_check=False)
     median_px = float(estimate.disparity_px[:, 2 * _SHIFT_PX :].median())
-    said = f"a pair shifted by {_SHIFT_PX} px was matched at {median_px:.2f} px"
+    outcome = f"a pair shifted by {_SHIFT_PX} px was matched at {median_px:.2f} px"
     if abs(median_px - _SHIFT_PX) > 1:
-        raise RuntimeError(said)
-    return said
+        raise RuntimeError(outcome)
+    return outcome
 
 
 def _try_pose() -> str:
@@ -116,7 +118,7 @@ def _try_pose() -> str:
     if estimate.camera_from_model is None:
         raise RuntimeError(f"a synthetic view of a flange was refused: {estimate.reason}")
     off_m = adds_m(estimate.camera_from_model, view.truth.camera_from_model, flange.vertices_m)
-    said = f"a synthetic flange was posed {1000 * float(off_m):.1f} mm off (ADD-S)"
+    outcome = f"a synthetic flange was posed {1000 * float(off_m):.1f} mm off (ADD-S)"
     if off_m > flange.diameter_m / 10:
-        raise RuntimeError(said)
-    return said
+        raise RuntimeError(outcome)
+    return outcome

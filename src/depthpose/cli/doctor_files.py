@@ -23,12 +23,16 @@ from depthpose.pose.mesh import MESH_READERS, exact_diameter, read_geometry
 Size = tuple[int, int]
 
 _UNITS_M = {"most sensors": 0.001, "TUM RGB-D": 0.0002, "KITTI": 1 / 256}
-_NEAR_M, _FAR_M = 0.05, 100.0
-_ONLY_MM, _ONLY_M, _LEAST_MM = 20.0, 2.0, 150.0
+_NEAR_M = 0.05
+_FAR_M = 100.0
+_ONLY_MM = 20.0
+_ONLY_M = 2.0
+_LEAST_MM = 150.0
 """A part is no longer than 20 m, a scan no farther; no part is shorter than 2 mm, and no depth
 camera sees what is nearer than 15 cm."""
 _EIGHT_BIT = 255
-_FEW_UNKNOWN, _ROUGH = 0.02, 0.012
+_FEW_UNKNOWN = 0.02
+_ROUGH = 0.012
 """Of depth, pixels without a reading (sensors: 6 % and more) and the mean step between neighbours
 as a share of the range (dense depth: 0.004 at most, pictures: 0.024 at least)."""
 _SQUARE = 0.05
@@ -56,29 +60,29 @@ def look_at_all(paths: Sequence[Path]) -> int:
     # What has a size comes first: a camera file may need it.
     words = cameras.CAMERA_SUFFIXES
     ordered = sorted(paths, key=lambda path: path.is_dir() or path.suffix.lower() in words)
-    seen: list[FileFacts] = []
+    all_facts: list[FileFacts] = []
     for path in ordered:
-        size = next((other.size for other in seen if other.size is not None), None)
+        size = next((other.size for other in all_facts if other.size is not None), None)
         try:
-            seen.append(_read(path, size))
+            all_facts.append(_read(path, size))
         except InputError as error:
-            seen.append(FileFacts(path=path, odd=[str(error).removeprefix(f"{path}: ")]))
-    for one in seen:
-        one.odd += _beside(one, seen)
+            all_facts.append(FileFacts(path=path, odd=[str(error).removeprefix(f"{path}: ")]))
+    for file_facts in all_facts:
+        file_facts.odd += _beside(file_facts, all_facts)
     for path in paths:
-        one = next(s for s in seen if s.path == path)
-        print(f"{path}: {one.what}" if one.what else f"{path}: cannot be used")
-        for said in one.odd:
-            print(f"  odd: {said}")
-    is_odd = any(one.odd for one in seen)
-    pictures = [one for one in seen if one.image is not None]
+        file_facts = next(s for s in all_facts if s.path == path)
+        print(f"{path}: {file_facts.what}" if file_facts.what else f"{path}: cannot be used")
+        for oddity in file_facts.odd:
+            print(f"  odd: {oddity}")
+    is_odd = any(file_facts.odd for file_facts in all_facts)
+    pictures = [file_facts for file_facts in all_facts if file_facts.image is not None]
     if len(pictures) == 2 and pictures[0].size == pictures[1].size:  # a pair, the left one first
-        left, right = (one.image for one in pictures)
+        left, right = (file_facts.image for file_facts in pictures)
         assert left is not None
         assert right is not None
         report = cameras.check_rectified(left, right)
-        said = f"{chr(10)}  odd: {report.message}" if report.is_wrong else f": {report.message}"
-        print(f"{pictures[0].path.name} and {pictures[1].path.name} as a pair{said}")
+        oddity = f"{chr(10)}  odd: {report.message}" if report.is_wrong else f": {report.message}"
+        print(f"{pictures[0].path.name} and {pictures[1].path.name} as a pair{oddity}")
         is_odd = is_odd or report.is_wrong
     return 1 if is_odd else 0
 
@@ -112,23 +116,24 @@ def _read_words(path: Path, size: Size | None) -> FileFacts:
         return posed
     if path.suffix.lower() == ".json":
         content = files.read_json(path)
-        one = content[0] if isinstance(content, list) and len(content) == 1 else content
-        if isinstance(one, dict) and {"counts", "segmentation"} & one.keys():
-            return _of_mask(path, decode_rle(*read_runs(one, str(path))))
+        record = content[0] if isinstance(content, list) and len(content) == 1 else content
+        if isinstance(record, dict) and {"counts", "segmentation"} & record.keys():
+            return _of_mask(path, decode_rle(*read_runs(record, str(path))))
     try:
         camera = cameras.read_camera(path, size)
     except InputError as error:
         if path.suffix.lower() != ".txt" or "no camera that is known" not in str(error):
             raise
         return _of_points(path, files.read_cloud(path).points.double())
-    fx, fy = float(camera.K[0, 0]), float(camera.K[1, 1])
+    fx = float(camera.K[0, 0])
+    fy = float(camera.K[1, 1])
     wide = math.degrees(2 * math.atan(camera.width / (2 * fx)))
     what = f"camera of {camera.width}x{camera.height}, fx {fx:.1f} px, {wide:.0f} degrees wide"
     if isinstance(camera, cameras.StereoRig):
         what += f", baseline {camera.baseline_m:.4g} m"
     if camera.depth_unit_m is not None:
         what += f", depth in units of {camera.depth_unit_m:.4g} m"
-    odd = [said] if (said := cameras.suspicious_centre(camera)) is not None else []
+    odd = [oddity] if (oddity := cameras.suspicious_centre(camera)) is not None else []
     if abs(fx / fy - 1) > _SQUARE:
         odd.append(
             f"fx {fx:.1f} and fy {fy:.1f} differ by {abs(fx / fy - 1):.0%}, as of an image "
@@ -156,16 +161,18 @@ def _of_pose(path: Path) -> FileFacts | None:
 
 
 def _of_picture(path: Path) -> FileFacts:
-    what, units = "", None
+    what = ""
+    units = None
     with opened_image(path) as image:
         if image.mode == "I;16":
             units = torch.from_numpy(np.asarray(image).astype(np.float32))
     if units is not None:
-        known, (low, high) = units > 0, value_range(units.numpy())
-        unknown, span = 1 - float(known.float().mean()), max(high - low, 1)
+        has_reading, (low, high) = units > 0, value_range(units.numpy())
+        unknown = 1 - float(has_reading.float().mean())
+        span = max(high - low, 1)
         rough = float((units[:, 1:] - units[:, :-1]).abs().mean()) / span
         if unknown > _FEW_UNKNOWN or rough < _ROUGH:
-            return _of_depth(path, torch.where(known, units, torch.nan))
+            return _of_depth(path, torch.where(has_reading, units, torch.nan))
         what = f", 16 bits a value, from {low} to {high}"
     picture = files.read_image(path)
     size = (picture.shape[2], picture.shape[1])
@@ -190,20 +197,21 @@ def _of_mask(path: Path, mask: Tensor) -> FileFacts:
 def _of_depth(path: Path, units: Tensor) -> FileFacts:
     """16-bit depth: its unit stands nowhere in the file."""
     height, width = units.shape
-    known = units[units.isfinite()]
-    seen = FileFacts(path=path, size=(width, height), depth_units=units)
-    seen.what = f"16-bit depth of {width}x{height}"
-    if len(known) == 0:
-        seen.odd.append("every pixel is 0: no reading")
-        return seen
-    median, share = float(known.median()), len(known) / units.numel()
+    readings = units[units.isfinite()]
+    file_facts = FileFacts(path=path, size=(width, height), depth_units=units)
+    file_facts.what = f"16-bit depth of {width}x{height}"
+    if len(readings) == 0:
+        file_facts.odd.append("every pixel is 0: no reading")
+        return file_facts
+    median = float(readings.median())
+    share = len(readings) / units.numel()
     maybe = ", ".join(f"{median * unit:.3g} m ({who})" for who, unit in _UNITS_M.items())
-    seen.what += f", {share:.0%} known, median {median:g} units: {maybe}"
+    file_facts.what += f", {share:.0%} known, median {median:g} units: {maybe}"
     if share == 1:
-        seen.what += "; or, as no pixel is 0, a picture of 16 bits"
-    if float(known.max()) <= _EIGHT_BIT:
-        seen.odd.append("no value is above 255: a picture of depth, not the data?")
-    return seen
+        file_facts.what += "; or, as no pixel is 0, a picture of 16 bits"
+    if float(readings.max()) <= _EIGHT_BIT:
+        file_facts.odd.append("no value is above 255: a picture of depth, not the data?")
+    return file_facts
 
 
 def _of_map(path: Path) -> FileFacts:
@@ -215,52 +223,58 @@ def _of_map(path: Path) -> FileFacts:
         if stored.ndim != 2 or stored.shape[1] in (3, 4):
             return _of_points(path, files.read_cloud(path).points.double())
     values = files.read_map(path)
-    known = values[values.isfinite()]
+    readings = values[values.isfinite()]
     height, width = values.shape
-    seen = FileFacts(path=path, what=f"map of {width}x{height}", size=(width, height))
-    if len(known) == 0:
-        seen.odd.append("no value is known")
-        return seen
-    median = float(known.median())
-    seen.what += f", {len(known) / values.numel():.0%} known, median {median:.4g}"
-    if float((known < 0).float().mean()) > _MOST:
-        seen.odd.append("most values are negative: disparity of exchanged views, or z backward?")
+    file_facts = FileFacts(path=path, what=f"map of {width}x{height}", size=(width, height))
+    if len(readings) == 0:
+        file_facts.odd.append("no value is known")
+        return file_facts
+    median = float(readings.median())
+    file_facts.what += f", {len(readings) / values.numel():.0%} known, median {median:.4g}"
+    if float((readings < 0).float().mean()) > _MOST:
+        file_facts.odd.append(
+            "most values are negative: disparity of exchanged views, or z backward?"
+        )
     elif median > 2 * _FAR_M:
-        seen.odd.append(
+        file_facts.odd.append(
             f"as metres the median {median:.4g} is too far; is it in millimetres? Divide by 1000"
         )
-    return seen
+    return file_facts
 
 
 def _of_points(path: Path, points: Tensor) -> FileFacts:
     away = float(points.median(0).values.norm())
     unit = "metres" if away < _ONLY_MM else "centimetres" if away < _LEAST_MM else "millimetres"
     what = f"{len(points)} points, {away:.4g} from the origin: {unit}"
-    odd = [said] if (said := frame_advice(points)) is not None else []
+    odd = [oddity] if (oddity := frame_advice(points)) is not None else []
     if away < float((points - points.median(0).values).norm(dim=-1).median()):
         odd = ["it lies about the origin: centred, or in a model's frame, not in the camera's"]
     return FileFacts(path=path, what=what, odd=odd, cloud=points)
 
 
-def _beside(one: FileFacts, seen: Sequence[FileFacts]) -> Iterator[str]:
+def _beside(file_facts: FileFacts, all_facts: Sequence[FileFacts]) -> Iterator[str]:
     """Say what is odd about a file beside the others."""
-    for other in seen:
-        if (camera := other.camera) is not None and one.size is not None:
+    for other in all_facts:
+        if (camera := other.camera) is not None and file_facts.size is not None:
             try:
-                cameras.check_image_matches_camera(camera, *one.size, "it")
+                cameras.check_image_matches_camera(camera, *file_facts.size, "it")
             except InputError as error:
                 yield f"beside {other.path.name}: {error}"
-        if camera is not None and one.depth_units is not None and camera.depth_unit_m is not None:
-            median_m = float(one.depth_units.nanmedian()) * camera.depth_unit_m
+        if (
+            camera is not None
+            and file_facts.depth_units is not None
+            and camera.depth_unit_m is not None
+        ):
+            median_m = float(file_facts.depth_units.nanmedian()) * camera.depth_unit_m
             if not _NEAR_M < median_m < _FAR_M:
                 yield (
                     f"beside {other.path.name}: its median is {median_m:.3g} m by the camera's "
                     f"depth_unit_m {camera.depth_unit_m:g}; 0.001 means millimetres"
                 )
         is_depth = other.depth_units is not None
-        if one.mask is not None and is_depth and other.size != one.size:
+        if file_facts.mask is not None and is_depth and other.size != file_facts.size:
             yield f"it is not of the size of {other.path.name}; give the mask of this very image"
-        if one.model is not None and other.cloud is not None:
-            advice = unit_advice(exact_diameter(one.model), other.cloud)
+        if file_facts.model is not None and other.cloud is not None:
+            advice = unit_advice(exact_diameter(file_facts.model), other.cloud)
             if advice is not None:
                 yield f"beside {other.path.name}: {advice}"

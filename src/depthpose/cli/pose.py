@@ -1,5 +1,6 @@
 """``depthpose pose ...``."""
 
+from dataclasses import replace
 from pathlib import Path
 
 from depthpose.cli import pose_options as options
@@ -13,11 +14,12 @@ def predict(
     out: NewPlace,
     first: options.FirstOptions = options.FirstOptions(),
     more: options.MoreOptions = options.MoreOptions(),
+    pair: options.PairOptions = options.PairOptions(),
     dataset: options.DataSetOptions = options.DataSetOptions(),
     estimates: options.EstimateOptions = options.EstimateOptions(),
     engine: EngineOptions = EngineOptions(),
 ) -> int:
-    """The pose of known objects from clouds, depth images or a data set; or the reason for none.
+    """The pose of known objects from clouds, depth images, pairs or a data set; or why none.
 
     poses.json holds for each input camera_from_model (metres), its covariance (about this answer
     alone), its certainty, the alternatives that fit as well with their probabilities, the risk that
@@ -34,6 +36,8 @@ def predict(
         depthpose pose predict --cad p.stl --unit mm --cloud p.ply --out out
         depthpose pose predict --depth d.png --mask m.png --camera c.json --object flange
             --out out
+        depthpose pose predict --cad p.stl --cad-unit mm --left l.png --right r.png
+            --camera rig.json --mask m.png --out out
         depthpose pose predict --bop lm --split test --weights linemod.safetensors --out out
 
     Args:
@@ -51,12 +55,18 @@ def predict(
         symmetry=inputs.symmetry,
     )
     weights = estimates.weights
-    count = sum(word is not None for word in (inputs.cloud, inputs.depth, dataset.bop))
+    given = (inputs.cloud, inputs.depth, pair.left, dataset.bop)
+    count = sum(word is not None for word in given)
     if count != 1:
         raise InputError(
-            f"{count} of --cloud, --depth and --bop are given; give one: a cloud, a depth image "
-            "with --mask and --camera, or a data set"
+            f"{count} of --cloud, --depth, --left and --bop are given; give one: a cloud, a depth "
+            "image with --mask and --camera, a pair with --camera, or a data set"
         )
+    if pair.left is not None:
+        from depthpose.cli.pose_pairs import match_pairs
+
+        depth = match_pairs(pair, inputs.camera, estimates.device, Path(out))
+        inputs = replace(inputs, depth=str(depth))
     source = source_of(
         weights, register, inputs.unit, dataset, estimates.config, inputs.base_from_camera
     )

@@ -64,11 +64,11 @@ def measure_each(
     show = partial(tqdm, unit=" instances", disable=None)
     for path, origin in zip(predictions, describe(predictions), strict=True):
         settings = (read_settings(path) if path.is_dir() else None) or {}
-        for what, own in of_dataset(dataset).items():
-            if (theirs := settings.get(what, own)) != own:
+        for what, setting in of_dataset(dataset).items():
+            if (theirs := settings.get(what, setting)) != setting:
                 raise InputError(
-                    f"{path}: predictions of the {what} {theirs!r}, but {own!r} is measured; give "
-                    f"those of this very {what}, or measure that one"
+                    f"{path}: predictions of the {what} {theirs!r}, but {setting!r} is measured; "
+                    f"give those of this very {what}, or measure that one"
                 )
         evaluations.append(evaluate(dataset, read_any(path), config, show, origin))
         if (advice := evaluations[-1].advice) is not None:
@@ -79,10 +79,10 @@ def measure_each(
 def join(each: Sequence[Evaluation]) -> Evaluation:
     """Put the rows of several evaluations below each other."""
     return Evaluation(
-        rows=[row for one in each for row in one.rows],
-        per_instance=[row for one in each for row in one.per_instance],
-        risk=[row for one in each for row in one.risk],
-        advice="; ".join(one.advice for one in each if one.advice) or None,
+        rows=[row for evaluation in each for row in evaluation.rows],
+        per_instance=[row for evaluation in each for row in evaluation.per_instance],
+        risk=[row for evaluation in each for row in evaluation.risk],
+        advice="; ".join(evaluation.advice for evaluation in each if evaluation.advice) or None,
     )
 
 
@@ -107,16 +107,16 @@ def describe(predictions: Sequence[Path]) -> list[Origin]:
         )
         origins.append(origin)
     pairs = list(zip([path.resolve().parent for path in predictions], origins, strict=True))
-    rows = Counter((home, one.method, one.masks) for home, one in pairs)
+    rows = Counter((home, origin.method, origin.masks) for home, origin in pairs)
     for (home, method, masks), count in rows.items():
         if count > 1:
             raise InputError(
                 f"{home}: two predictions by {method!r}, masks {masks!r}, are given, and their "
                 "rows would be one; give one of them, or rename it"
             )
-    own = list({(home, one.method): None for home, one in pairs})
-    names = dict(zip(own, distinct_names(own), strict=True))
-    return [replace(one, method=names[home, one.method]) for home, one in pairs]
+    places = list({(home, origin.method): None for home, origin in pairs})
+    names = dict(zip(places, distinct_names(places), strict=True))
+    return [replace(origin, method=names[home, origin.method]) for home, origin in pairs]
 
 
 def measure(
@@ -126,26 +126,29 @@ def measure(
     each = measure_each(dataset, predictions, config)
     measured = join(each)
     rows = [row.columns() for row in measured.rows]
-    said = HOW if measured.advice is None else f"{measured.advice}. {HOW}"
+    text = HOW if measured.advice is None else f"{measured.advice}. {HOW}"
     page.write_table(out, rows)
     by_masks: dict[tuple[str, str], dict[str, Any]] = {}
     for row in measured.rows:
         assert row.origin is not None
-        method, masks = row.origin.method, row.origin.masks
+        method = row.origin.method
+        masks = row.origin.masks
         entry = by_masks.setdefault((method, row.object), {"method": method, "object": row.object})
         entry[f"{masks or 'their'} masks"] = row.success
     instances = {instance.name: instance for instance in dataset.instances}
     sections: list[Section] = []
     shares = page.share_views(len(predictions))
     for path, of_path, most in zip(
-        predictions, [one.per_instance for one in each], shares, strict=True
+        predictions, [evaluation.per_instance for evaluation in each], shares, strict=True
     ):
         if not most:
             continue
         estimates = match(dataset.instances, read_any(path), dataset.objects)
         for role, row in _choose(of_path, most):
-            instance, estimate = instances[row.instance], estimates[row.instance]
-            model, truth = dataset.objects[instance.object_id], instance.camera_from_model
+            instance = instances[row.instance]
+            estimate = estimates[row.instance]
+            model = dataset.objects[instance.object_id]
+            truth = instance.camera_from_model
             # Of copies that look alike the one nearest to the estimate.
             if (pose := estimate.camera_from_model) is not None:
                 truth = nearest_copy(
@@ -153,7 +156,7 @@ def measure(
                 )
             title = f"{path.stem}: {row.object} in {row.instance}, {role}"
             columns = row.columns()
-            own = {name: columns[name] for name in _MEASURED}
+            metrics = {name: columns[name] for name in _MEASURED}
             section = pose_section(
                 title,
                 dataset.view(instance).input,
@@ -162,11 +165,11 @@ def measure(
                 _OF_TRUTH,
                 image=None if instance.rgb is None else read_image(instance.rgb),
                 truth=truth,
-                rows=[own],
+                rows=[metrics],
             )
             sections.append(section)
     sections = [
-        Section(title="Success by masks", text=said, rows=list(by_masks.values())),
+        Section(title="Success by masks", text=text, rows=list(by_masks.values())),
         Section(title="All numbers", rows=rows),
         *sections,
         *write_details(measured, out),

@@ -111,16 +111,16 @@ def _segmented(
     segmenter = Segmenter.load(path, device)
     names = datasets.object_names(dataset.folder)
     by_name = {name: number for number, name in names.items()}
-    own = dict(zip(segmenter.weights.objects, segmenter.weights.numbers, strict=True))
+    numbers_of = dict(zip(segmenter.weights.objects, segmenter.weights.numbers, strict=True))
     numbers = {
         name: by_name.get(name, number)
-        for name, number in own.items()
-        if name in by_name or names.get(number) not in own
+        for name, number in numbers_of.items()
+        if name in by_name or names.get(number) not in numbers_of
     }
     wanted = {instance.object_id for instance in dataset.instances}
     lost = sorted(wanted - set(numbers.values()))
     if len(lost) == len(wanted):
-        theirs = ", ".join(f"{name} ({number})" for name, number in own.items())
+        theirs = ", ".join(f"{name} ({number})" for name, number in numbers_of.items())
         raise InputError(
             f"{path}: segments {theirs}, but {dataset.folder} shows objects {lost}; give weights "
             "of its objects"
@@ -129,14 +129,19 @@ def _segmented(
         print(f"{path}: segments no objects {lost}; each is missing", file=sys.stderr)
     home = out / "detections" / name
     claim_folder(home, {"weights_sha256": file_sha256(path), **of_dataset(dataset)})
-    file, record = home.parent / f"{name}.json", home / "images.json"
+    file = home.parent / f"{name}.json"
+    record = home / "images.json"
     done: set[tuple[int, int]] = set()
-    known: list[datasets.Detection] = []
+    detections: list[datasets.Detection] = []
     with suppress(InputError):  # damaged or missing: all is segmented again
-        earlier, said = datasets.read_detections(file), str(record)
+        earlier = datasets.read_detections(file)
+        record_name = str(record)
         rows = read_rows(record)
-        done = {(integer(row, "scene_id", said), integer(row, "im_id", said)) for row in rows}
-        known = [d for d in earlier if (d.scene_id, d.image_id) in done]
+        done = {
+            (integer(row, "scene_id", record_name), integer(row, "im_id", record_name))
+            for row in rows
+        }
+        detections = [d for d in earlier if (d.scene_id, d.image_id) in done]
     images = {(i.scene_id, i.image_id): i for i in dataset.instances}
     left = [images[place] for place in sorted(images.keys() - done)]
     if left:
@@ -146,7 +151,7 @@ def _segmented(
             start = perf_counter()
             objects = segmenter.segment(read_image(shown.rgb))
             spent_s = perf_counter() - start
-            known += [
+            detections += [
                 datasets.Detection(
                     scene_id=shown.scene_id,
                     image_id=shown.image_id,
@@ -161,10 +166,10 @@ def _segmented(
                     objects.masks[object], objects.scores[object].tolist(), strict=True
                 )
             ]
-        datasets.write_detections(file, known)
+        datasets.write_detections(file, detections)
         places = sorted(done | images.keys())
         write_json(record, [{"scene_id": scene, "im_id": image} for scene, image in places])
-    return known
+    return detections
 
 
 def _file_names(words: Sequence[str], paths: Sequence[Path | None]) -> list[str]:
@@ -245,19 +250,19 @@ def _register(name: str, models: Sequence[ObjectModel], config: EstimateConfig) 
             "models it takes"
         )
     net = Registration(models, config)
-    known: dict[str, str] = {}
+    fingerprints: dict[str, str] = {}
     for model in models:  # a shape is named by its bytes, and by what is declared of it
         digest = sha256(model.vertices_m.contiguous().numpy().tobytes())
         digest.update(model.faces.contiguous().numpy().tobytes())
         if not model.symmetries.is_found and not model.symmetries.is_none:
             digest.update(json.dumps(symmetries_to_bop(model.symmetries)).encode())
-        known[model.name] = digest.hexdigest()[:16]
+        fingerprints[model.name] = digest.hexdigest()[:16]
     return PoseMethod(
         name=name,
         estimate_many=net.estimate_many,
         takes_clouds=True,
         models=models,
-        settings={"kind": REGISTER, "models": known, "estimate": config_to_dict(config)},
+        settings={"kind": REGISTER, "models": fingerprints, "estimate": config_to_dict(config)},
         find=net.find_in,
         track=net.track_in,
         holder="models",
@@ -265,10 +270,14 @@ def _register(name: str, models: Sequence[ObjectModel], config: EstimateConfig) 
 
 
 def _network(path: Path, name: str, config: EstimateConfig) -> PoseMethod:
-    known = read_pose_weights(path)
-    warn_of_terms(known.facts)
-    is_regressor = isinstance(known.network, DepthImageNet)
-    net = DepthImageRegressor(known, config) if is_regressor else GeoPoseNet(known, config)
+    pose_weights = read_pose_weights(path)
+    warn_of_terms(pose_weights.facts)
+    is_regressor = isinstance(pose_weights.network, DepthImageNet)
+    net = (
+        DepthImageRegressor(pose_weights, config)
+        if is_regressor
+        else GeoPoseNet(pose_weights, config)
+    )
     name += "" if config.voting.method == "ransac" else "-least-squares"
     name += "" if config.with_icp else "-without-icp"
     facts = {"kind": read_checkpoint(path).kind, "weights": path.stem}
@@ -277,7 +286,7 @@ def _network(path: Path, name: str, config: EstimateConfig) -> PoseMethod:
         name=name,
         estimate_many=net.estimate_many,
         takes_clouds=not is_regressor,
-        models=known.models,
+        models=pose_weights.models,
         settings={**facts, "estimate": config_to_dict(config)},
         find=None if isinstance(net, DepthImageRegressor) else net.find_in,
         track=None if isinstance(net, DepthImageRegressor) else net.track_in,
@@ -286,7 +295,8 @@ def _network(path: Path, name: str, config: EstimateConfig) -> PoseMethod:
 
 def _in_base(method: PoseMethod, base: Rigid) -> PoseMethod:
     """Let a method add ``base_from_model`` to its estimates."""
-    find, track = method.find, method.track
+    find = method.find
+    track = method.track
 
     def estimate_many(views: Sequence[ViewInput]) -> list[PoseEstimate]:
         return [estimate.in_base(base) for estimate in method.estimate_many(views)]
@@ -392,18 +402,19 @@ def match_names(dataset: datasets.BopDataset, models: Sequence[ObjectModel]) -> 
     by_name = {model.name: model for model in models}
     by_number = {model.number: model for model in models}
     names: dict[int, str] = {}
-    for number, own in dataset.objects.items():
-        model = by_name.get(own.name) or by_number.get(number)
+    for number, dataset_model in dataset.objects.items():
+        model = by_name.get(dataset_model.name) or by_number.get(number)
         if model is None:
-            known = ", ".join(f"{m.name} ({m.number})" for m in models)
+            model_names = ", ".join(f"{m.name} ({m.number})" for m in models)
             raise InputError(
-                f"object {number} ({own.name}) is none of those the weights know: {known}. Leave "
-                "it out by --objects"
+                f"object {number} ({dataset_model.name}) is none of those the weights know: "
+                f"{model_names}. Leave it out by --objects"
             )
-        if abs(model.diameter_m / own.diameter_m - 1) > _SAME_DIAMETER:
+        if abs(model.diameter_m / dataset_model.diameter_m - 1) > _SAME_DIAMETER:
             raise InputError(
-                f"object {number} ({own.name}) is {own.diameter_m:.4f} m across, but the weights' "
-                f"{model.name} is {model.diameter_m:.4f} m: another object, or another unit"
+                f"object {number} ({dataset_model.name}) is {dataset_model.diameter_m:.4f} m "
+                f"across, but the weights' {model.name} is {model.diameter_m:.4f} m: another "
+                "object, or another unit"
             )
         names[number] = model.name
     return names
@@ -425,7 +436,8 @@ def read_base(words: Sequence[str]) -> Rigid | None:
     """Read ``--base-from-camera``: a text file, or 16 numbers row by row; None: it is unset."""
     if not words:
         return None
-    option, what = "--base-from-camera", "base_from_camera"
+    option = "--base-from-camera"
+    what = "base_from_camera"
     if len(words) == 1 and Path(words[0]).is_file():
         base = read_pose(Path(words[0]), option, what)
     else:
@@ -464,14 +476,14 @@ def chosen_objects(
         is_theirs = object in datasets.object_names(dataset.folder).values()
         return dataset.of_objects(object if is_theirs else numbers.get(object, object))
     there = sorted({instance.object_id for instance in dataset.instances})
-    known = [n for n in there if n in numbers.values() or dataset.objects[n].name in numbers]
-    left_out = sorted(set(there) - set(known))
-    if not known:
+    estimable = [n for n in there if n in numbers.values() or dataset.objects[n].name in numbers]
+    left_out = sorted(set(there) - set(estimable))
+    if not estimable:
         raise InputError(
             f"{dataset.folder}: holds objects {left_out}, but the {method.holder} know "
             f"{', '.join(numbers)}; give {method.holder} of its objects"
         )
     if left_out:
-        said = f"left out, as the {method.holder} do not know them: objects {left_out}"
-        print(said, file=sys.stderr)
-    return dataset.of_objects(*known)
+        message = f"left out, as the {method.holder} do not know them: objects {left_out}"
+        print(message, file=sys.stderr)
+    return dataset.of_objects(*estimable)

@@ -138,6 +138,21 @@ class OneObjectOptions(FirstOptions, MoreOptions):
 
 
 @dataclass(frozen=True, kw_only=True)
+class PairOptions:
+    """A rectified pair in place of a depth image: it is matched first."""
+
+    left: Source | None = None
+    """left image, or a folder of them, in place of --depth; --camera is the rig, with "baseline_m".
+    Masks, boxes and detections are of the left image."""
+    right: Source | None = None
+    """right image, or a folder of them with the names or the numbers of the left ones."""
+    matcher: WeightsName | None = None
+    """what matches the pair: weights with a matcher, by name or file ('default'), or sgbm."""
+    min_confidence: float = 0.5
+    """depth that is less sure is left out, 0 to 1."""
+
+
+@dataclass(frozen=True, kw_only=True)
 class DataSetOptions:
     """A data set, in place of --cloud and --depth."""
 

@@ -43,18 +43,18 @@ def serve(
         raise InputError(f"--max-upload-mb {max_upload_mb}: take 1 at least; 64 is usual")
     if max_seconds < 1:
         raise InputError(f"--max-seconds {max_seconds}: take 1 at least; 120 is usual")
-    taken = open_socket(host, port)
-    address, names = known_names(host, taken)
+    listener = open_socket(host, port)
+    address, names = known_names(host, listener)
     limits = Limits(upload_bytes=max_upload_mb * 10**6, compute_s=max_seconds, hosts=names)
     depth = FakestereoNet.load(weights, allow_ood=True)
     app = make_app(depth, GeoPoseNet.load(pose_weights), limits)
     shown = f"[{address}]" if address.version == 6 else address
-    print(f"http://{shown}:{taken.getsockname()[1]}/  (Ctrl+C stops it)", flush=True)
+    print(f"http://{shown}:{listener.getsockname()[1]}/  (Ctrl+C stops it)", flush=True)
     if not address.is_loopback:
         print("whoever can reach this address may use the page: no password, no encryption",
               flush=True)  # fmt: skip
     try:
-        run(app, taken)
+        run(app, listener)
     except KeyboardInterrupt:
         print("stopped")
     return 0

@@ -91,7 +91,7 @@ def reproduce(
         training = open_training(train, train_without, dataset)
         baselines = [baseline_method(name, training) for name in ("rows", "nearest")]
         # A baseline uses no right image, but is measured on the frames of the other rows.
-        methods += [("", one._replace(with_right=published.with_right)) for one in baselines]
+        methods += [("", method._replace(with_right=published.with_right)) for method in baselines]
     return reproduce_table(
         published, dataset, methods, out, comparison.protocol, comparison.cap, pictures
     )

@@ -53,7 +53,8 @@ def reproduce_table(
     }
     results = (*page.table_files("rows", "frames", "confidence"), "report.md", "report.html")
     claim_folder(out, settings, (*results, "predictions", "figures"))
-    rule, home = find_protocol(protocol), out / "predictions"
+    rule = find_protocol(protocol)
+    home = out / "predictions"
     folders = [evaluation.predict_all(dataset, method, rule, home) for _, method in methods]
     if find_rank().rank > 0:
         return 0
@@ -72,7 +73,8 @@ def reproduce_table(
         frames = [f for f in dataset.frames if has_prediction(folder, f.name)]
         shown = replace(dataset, frames=frames)
         for place, index in enumerate(choose_frames(shown, (), pictures)):
-            pair, frame = shown.read_input(index), frames[index]
+            pair = shown.read_input(index)
+            frame = frames[index]
             lidar_m = lidar_truth(frame, "camera_z") if has_lidar(frame, "camera_z") else None
             estimate = read_estimate(folder, pair.name, pair.camera)
             figures = {"2-5": draw_figure_2_5(pair, lidar_m, estimate)}
@@ -116,12 +118,12 @@ def choose_frames(dataset: Dataset, names: Sequence[str], number: int) -> list[i
     Frames chosen by us have a right view, and LiDAR where any frame has both.
     """
     if names:
-        known = {frame.name: i for i, frame in enumerate(dataset.frames)}
-        unknown = [name for name in names if name not in known]
+        index_of = {frame.name: i for i, frame in enumerate(dataset.frames)}
+        unknown = [name for name in names if name not in index_of]
         if unknown:
-            hint = nearest_name(unknown[0], known)[:300]
+            hint = nearest_name(unknown[0], index_of)[:300]
             raise InputError(f"{dataset.name}: no frame {unknown[0]!r}; {hint}")
-        return [known[name] for name in names]
+        return [index_of[name] for name in names]
     pairs = [i for i, frame in enumerate(dataset.frames) if frame.right is not None]
     chosen = [i for i in pairs if has_lidar(dataset.frames[i], "camera_z")] or pairs
     if not chosen:
@@ -147,8 +149,8 @@ def write_figure(
     for index, frame in zip(tqdm(indices, unit=" frames", disable=None), frames, strict=True):
         pair = dataset.read_input(index)
         lidar_m = lidar_truth(frame, "camera_z") if has_lidar(frame, "camera_z") else None
-        seen = pair if method.with_right else replace(pair, right=None)
-        estimate = method.net.estimate_pair(seen)
+        views = pair if method.with_right else replace(pair, right=None)
+        estimate = method.net.estimate_pair(views)
         if number == "2-5":
             columns.append(draw_figure_2_5(pair, lidar_m, estimate))
         else:

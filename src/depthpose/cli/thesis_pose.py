@@ -56,10 +56,11 @@ class Views:
 
     def close_up(self, index: int) -> tuple[Float[Tensor, "3 h w"], Float[Tensor, "3 3"]]:
         """Give the picture of a view near its object, or its depth in grey, and its camera."""
-        instance, seen = self.instances[index], self.samples[index].input
+        instance = self.instances[index]
+        view = self.samples[index].input
         picture = None if instance is None or instance.rgb is None else picture_of(instance)
-        picture = grey_depth(seen.depth_m) if picture is None else picture
-        return close_up(picture, seen.mask, seen.K)
+        picture = grey_depth(view.depth_m) if picture is None else picture
+        return close_up(picture, view.mask, view.K)
 
 
 def open_views(net: GeoPoseNet, data: PoseDataOptions, number: int | None, synthetic: int) -> Views:
@@ -79,14 +80,14 @@ def open_views(net: GeoPoseNet, data: PoseDataOptions, number: int | None, synth
         "frames_sha256": frames_hash(dataset.instances)[:12],
     }
     if number is not None and number < len(dataset):
-        kept = [dataset.instances[i] for i in page.spread_evenly(len(dataset), number)]
-        dataset = replace(dataset, instances=kept)
+        instances = [dataset.instances[i] for i in page.spread_evenly(len(dataset), number)]
+        dataset = replace(dataset, instances=instances)
     names = pose_methods.match_names(dataset, net.weights.models)
     samples: list[ViewSample] = []
     for instance in dataset.instances:
         view = dataset.view(instance)
-        own = replace(view.input, object=names[instance.object_id])
-        samples.append(replace(view, input=own))
+        named_input = replace(view.input, object=names[instance.object_id])
+        samples.append(replace(view, input=named_input))
     settings = {
         "data": str(dataset.folder.resolve()),
         "split": dataset.split,
@@ -132,7 +133,7 @@ def reproduce_by_object(
     results = (*page.table_files("rows", "all", "instances", "risk"), "report.md", "report.html")
     claim_folder(out, settings, (*results, "predictions", "detections", "figures"))
     shown = pose_methods.find_masks(how.masks, dataset, out, how.device) if methods else []
-    folders = [pose_methods.predict_all(dataset, m, one, out) for m in methods for one in shown]
+    folders = [pose_methods.predict_all(dataset, m, masks, out) for m in methods for masks in shown]
     measured = pose_evaluate.join(pose_evaluate.measure_each(dataset, [*folders, *csv], rule))
     rows = pose_tables.join_by_object(measured.rows, numbers, with_published=is_printed)
     every = [row.columns() for row in measured.rows]
@@ -140,19 +141,20 @@ def reproduce_by_object(
     page.write_table(out, every, name="all")
     sections: list[Section] = []
     for folder in folders:
-        known = {p.estimate.name: p.estimate for p in read_predictions(folder)}
+        estimates = {p.estimate.name: p.estimate for p in read_predictions(folder)}
         pictures: list[Picture] = []
         for instance in (
             dataset.instances[i] for i in page.spread_evenly(len(dataset), how.pictures)
         ):
-            estimate = known.get(instance.name)
+            estimate = estimates.get(instance.name)
             if estimate is None:  # of a detection: it bears no instance's name
                 continue
             picture, K = close_up(picture_of(instance), read_instance_mask(instance), instance.K)
-            true, found = instance.camera_from_model, estimate.camera_from_model
+            true = instance.camera_from_model
+            estimated = estimate.camera_from_model
             model = dataset.objects[instance.object_id]
             path = out / "figures" / folder.name / f"3-5_{instance.name}.jpg"
-            write_image(path, draw_pose(picture, found, model, K, true))
+            write_image(path, draw_pose(picture, estimated, model, K, true))
             caption = instance.name if estimate.is_posed else f"{instance.name}: {estimate.reason}"
             pictures.append(Picture(path=path, caption=caption))
         if pictures:
@@ -195,8 +197,10 @@ def reproduce_voting(
     views = open_views(net, data, None, synthetic)
     sha256 = file_sha256(path)
     facts = {"weights": path.stem, "weights_sha256": sha256[:12], **views.facts}
-    own = {"command": "reproduce 3.3", "weights_sha256": sha256, "points": list(points)}
-    claim_folder(out, own | views.settings, [*page.table_files("rows"), "report.md", "report.html"])
+    command = {"command": "reproduce 3.3", "weights_sha256": sha256, "points": list(points)}
+    claim_folder(
+        out, command | views.settings, [*page.table_files("rows"), "report.md", "report.html"]
+    )
     rows: list[dict[str, Any]] = []
     for count in points:
         cases = list(
@@ -229,9 +233,12 @@ def write_figure(
     refuse_below(1, "--number", number, "4")
     net = GeoPoseNet.load(weights)
     views = open_views(net, data, number, number)
-    own = {"command": f"figure {figure}", "weights_sha256": file_sha256(find_weights(weights))}
-    path, text = out / f"figure-{figure}.png", _TEXTS[figure]
-    claim_folder(out, {**own, **views.settings, **settings}, (path.name, "panels", "report.html"))
+    command = {"command": f"figure {figure}", "weights_sha256": file_sha256(find_weights(weights))}
+    path = out / f"figure-{figure}.png"
+    text = _TEXTS[figure]
+    claim_folder(
+        out, {**command, **views.settings, **settings}, (path.name, "panels", "report.html")
+    )
     panels = draw(net, views, **settings)
     write_image(path, pose_figures.arrange_grid([panel.image for panel in panels], columns))
     pictures: list[Picture] = []
@@ -249,16 +256,16 @@ def feature_panels(net: GeoPoseNet, views: Views, perplexity: float) -> list[Dra
     """Draw the features of each view, in one colour scale for all."""
     models = {model.name: model for model in net.weights.models}
     pairs = [(view, pose_figures.seen_points(net, view.input)) for view in views.samples]
-    seen = [(view, *pair) for view, pair in pairs if pair is not None]
-    if not seen:
+    featured = [(view, *pair) for view, pair in pairs if pair is not None]
+    if not featured:
         raise InputError(f"none of the {len(views.samples)} views has enough points to be posed")
-    step = -(-sum(len(features) for _, _, features in seen) // _MOST_POINTS)
-    thinned = [features[::step] for _, _, features in seen]
+    step = -(-sum(len(features) for _, _, features in featured) // _MOST_POINTS)
+    thinned = [features[::step] for _, _, features in featured]
     shares = pose_figures.embed_line(torch.cat(thinned), perplexity).split(
         [len(part) for part in thinned]
     )
     panels: list[Drawing] = []
-    for (view, points_m, _), share in zip(seen, shares, strict=True):
+    for (view, points_m, _), share in zip(featured, shares, strict=True):
         model_from_camera = view.truth.camera_from_model.inverse()
         local = model_from_camera.apply(points_m[::step].to(model_from_camera.R))
         image = pose_figures.draw_features(local, share, models[view.input.object])
@@ -281,7 +288,7 @@ def field_panels(net: GeoPoseNet, views: Views, keypoint: int | None) -> list[Dr
         errors.append((float(error_m[k]), index, k, case, true_m[k], vote.keypoints_m[k]))
     if not errors:
         raise InputError(f"none of the {len(views.samples)} views has enough points to be posed")
-    error_m, index, k, case, true_m, voted_m = max(errors, key=lambda one: one[0])
+    error_m, index, k, case, true_m, voted_m = max(errors, key=lambda row: row[0])
     exact = torch.nn.functional.normalize(true_m - case.points_m, dim=-1)
     view = views.samples[index]
     image, _ = views.close_up(index)
@@ -305,9 +312,10 @@ def box_panels(net: GeoPoseNet, views: Views) -> list[Drawing]:
     for k, view in enumerate(views.samples):
         (estimate,) = net.estimate_many([view.input])
         picture, K = views.close_up(k)
-        true, found = view.truth.camera_from_model, estimate.camera_from_model
+        true = view.truth.camera_from_model
+        estimated = estimate.camera_from_model
         name = view.input.name
-        image = draw_pose(picture, found, models[view.input.object], K, true)
+        image = draw_pose(picture, estimated, models[view.input.object], K, true)
         caption = name if estimate.is_posed else f"{name}: refused, {estimate.reason}"
         panels.append(Drawing(image=image, caption=caption))
     return panels

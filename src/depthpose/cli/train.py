@@ -61,8 +61,8 @@ class TrainingOptions:
                         "so the learning rate would never be reached; take at most "
                         f"{steps}, or 0 for no warm-up"
                     )
-        own = {"seed": self.seed, "device": self.device, "precision": self.precision}
-        loop = changed(config.loop, workers=workers, **own)
+        values = {"seed": self.seed, "device": self.device, "precision": self.precision}
+        loop = changed(config.loop, workers=workers, **values)
         if self.steps is not None:
             loop = replace(loop, steps=self.steps, epochs=None)
         return replace(config, loop=loop)
@@ -131,12 +131,12 @@ class Lines:
             return
         self.last_s = now_s
         first, began_s = self.began
-        said = [f"step {progress.step} of {progress.steps}"]
+        parts = [f"step {progress.step} of {progress.steps}"]
         if first < progress.step < progress.steps:
             left_s = (progress.steps - progress.step) * (now_s - began_s) / (progress.step - first)
-            said.append(f"{left_s / 60:.0f} min left")
-        said += [f"{name} {value:.4g}" for name, value in self.numbers.items()]
-        print(", ".join(said), flush=True)
+            parts.append(f"{left_s / 60:.0f} min left")
+        parts += [f"{name} {value:.4g}" for name, value in self.numbers.items()]
+        print(", ".join(parts), flush=True)
 
 
 _LOOKED_AT = 20  # held-out pairs of a folder, by default
@@ -189,14 +189,14 @@ def train_depth(
     if held_out:
         # A generator is measured at the focal length of its own rig, whatever it is trained on.
         focal_px = settings.pairs.focal_px if stage == "stereo" else None
-        own = PairsConfig(focal_px=focal_px, truth=settings.pairs.truth, limit=_LOOKED_AT)
-        pairs = replace(settings.held_out or own, folders=held_out)
+        default_pairs = PairsConfig(focal_px=focal_px, truth=settings.pairs.truth, limit=_LOOKED_AT)
+        pairs = replace(settings.held_out or default_pairs, folders=held_out)
         settings = replace(settings, held_out=pairs)
-    known = {field.name for field in fields(settings)}
-    known -= set() if stage == "finetune" else {"generator", "matcher"}
+    setting_names = {field.name for field in fields(settings)}
+    setting_names -= set() if stage == "finetune" else {"generator", "matcher"}
     begin = {"generator": generator, "matcher": matcher, "start": start, "encoder": encoder}
     for name, value in begin.items():
-        if value is not None and name not in known:
+        if value is not None and name not in setting_names:
             raise InputError(f"--{name} has no meaning for '{stage}'; see --help.")
     return training.run(run_stage, changed(settings, **begin), out)
 
@@ -242,9 +242,9 @@ def calibrate(
     refuse_share(len(dataset), alarm_share)
     net = FakestereoNet.load(path, config=MatcherConfig(device=device), allow_ood=True)
     shown = tqdm(range(len(dataset)), unit=" images", disable=None)
-    known = measure_image_confidence(net, map(dataset.read_input, shown))
-    least = calibrate_weights(path, known, alarm_share, out)
-    print(f"{len(known)} images: confidence {min(known):.3f} to {max(known):.3f}")
+    confidences = measure_image_confidence(net, map(dataset.read_input, shown))
+    least = calibrate_weights(path, confidences, alarm_share, out)
+    print(f"{len(confidences)} images: confidence {min(confidences):.3f} to {max(confidences):.3f}")
     print(f"refused below {least:.3f}; calibrated weights: {out}")
     return 0
 
@@ -305,9 +305,9 @@ def train_pose(
                 "--cad has no meaning for 'segmentation', which learns from pictures: make them by "
                 "'depthpose data make objects --cad ...' and name the folder in the config"
             )
-        found = None if symmetries is None else symmetries == "found"
-        own = {"cad": cad or None, "unit": unit, "with_found_symmetries": found}
-        models = changed(settings.models, **own)
+        with_found = None if symmetries is None else symmetries == "found"
+        values = {"cad": cad or None, "unit": unit, "with_found_symmetries": with_found}
+        models = changed(settings.models, **values)
         if cad:  # they take the place of a data set's models
             models = replace(models, bop=None, objects=(), parts=())
         settings = replace(settings, models=models)
@@ -319,7 +319,7 @@ def train_pose(
             if hasattr(getattr(settings, part, None), "folder"):
                 changes[part] = replace(getattr(settings, part), folder=data)
         if not changes:
-            said = "the config learns from no data set; see --cad and --what"
-            raise InputError(f"--data {data}: {said}")
+            message = "the config learns from no data set; see --cad and --what"
+            raise InputError(f"--data {data}: {message}")
         settings = replace(settings, **changes)
     return training.run(run_stage, settings, out, with_messages=True)

@@ -64,8 +64,8 @@ def show_weights(weights: tyro.conf.Positional[WeightsName]) -> int:
     ]
     config = _settings_of(checkpoint, str(path))
     if "models" in checkpoint.config:
-        known = checkpoint.config["models"]
-        config["objects"] = ", ".join(f"{model['name']} ({model['number']})" for model in known)
+        models = checkpoint.config["models"]
+        config["objects"] = ", ".join(f"{model['name']} ({model['number']})" for model in models)
     facts = {"file": path, "sha256": file_sha256(path), "kind": checkpoint.kind,
              "parameters": sum(tensor.numel() for tensor in learnt)}  # fmt: skip
     for name, value in {**facts, **checkpoint.facts, **config}.items():
@@ -163,15 +163,17 @@ def pack_weights(
     card = out.with_suffix(".md")
     refuse_to_replace(out)
     refuse_to_replace(card)
-    known = read_depth_weights(find_weights(weights))
+    depth_weights = read_depth_weights(find_weights(weights))
     made_of = [weights] if matcher is None else [weights, matcher]
     warn_of_terms(bound_facts({}, made_of))
-    own = {"trained_on": trained_on, "licence": licence} | ({"terms": terms} if terms else {})
-    facts = bound_facts(own, made_of)
+    terms_of_file = {"trained_on": trained_on, "licence": licence} | (
+        {"terms": terms} if terms else {}
+    )
+    facts = bound_facts(terms_of_file, made_of)
     write_depth_weights(
         out,
-        generator=known.generator,
-        matcher=known.matcher if matcher is None else read_matcher(find_weights(matcher)),
+        generator=depth_weights.generator,
+        matcher=depth_weights.matcher if matcher is None else read_matcher(find_weights(matcher)),
         facts=facts,
         with_half=half,
     )
@@ -241,8 +243,10 @@ def export_depth(out: NewPath, weights: WeightsName = "default", what: str | Non
     from depthpose.depth.weights import read_depth_weights
 
     path = find_weights(weights)
-    known = read_depth_weights(path)
-    return _freeze(out, weights, path, known.facts, partial(depth_export, known, what))
+    depth_weights = read_depth_weights(path)
+    return _freeze(
+        out, weights, path, depth_weights.facts, partial(depth_export, depth_weights, what)
+    )
 
 
 def export_pose(out: NewPath, weights: WeightsName = "parts") -> int:
@@ -264,8 +268,8 @@ def export_pose(out: NewPath, weights: WeightsName = "parts") -> int:
     from depthpose.pose.weights import read_pose_weights
 
     path = find_weights(weights)
-    known = read_pose_weights(path)
-    return _freeze(out, weights, path, known.facts, partial(pose_export, known))
+    pose_weights = read_pose_weights(path)
+    return _freeze(out, weights, path, pose_weights.facts, partial(pose_export, pose_weights))
 
 
 def _freeze(
@@ -281,10 +285,10 @@ def _freeze(
     from depthpose.report.page import markdown_table
 
     warn_of_terms(facts)
-    own = {"format": "onnx", "weights": Path(weights).name, "weights_sha256": file_sha256(path)}
+    origin = {"format": "onnx", "weights": Path(weights).name, "weights_sha256": file_sha256(path)}
     rows = [
         {name: f"{v:.1e}" if isinstance(v, float) else v for name, v in row.items()}
-        for row in freeze(out, export_of({**facts, **own}))
+        for row in freeze(out, export_of({**facts, **origin}))
     ]
     print(markdown_table(rows), end="")
     print(f"{out}: {out.stat().st_size / 1e6:.1f} MB; the differences are in "

@@ -197,16 +197,18 @@ def read_checkpoint(path: Path, kind: str | None = None) -> Checkpoint:
             f"{path}: no 'kind' and 'config' in its metadata, so no depthpose weights. A "
             "published checkpoint is imported by 'depthpose weights import'."
         )
-    held = metadata.pop("kind")
-    if kind is not None and held != kind:
-        raise InputError(f"{path}: holds weights of kind {held!r}, but {kind!r} is needed here.")
+    stored_kind = metadata.pop("kind")
+    if kind is not None and stored_kind != kind:
+        raise InputError(
+            f"{path}: holds weights of kind {stored_kind!r}, but {kind!r} is needed here."
+        )
     try:
         config = json.loads(metadata.pop("config"), parse_constant=finite_number)
     except (ValueError, RecursionError) as error:
         raise InputError(f"{path}: its 'config' is not JSON ({error}).") from error
     if not isinstance(config, dict):
         raise InputError(f"{path}: its 'config' is not a mapping.")
-    return Checkpoint(kind=held, config=config, state=_finite(path, state), facts=metadata)
+    return Checkpoint(kind=stored_kind, config=config, state=_finite(path, state), facts=metadata)
 
 
 def file_sha256(path: Path) -> str:

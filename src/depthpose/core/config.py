@@ -37,15 +37,16 @@ class Settings:
 
     def __post_init__(self) -> None:
         for name, (words, interval, more) in _rules_of(type(self)).items():
-            value, default = getattr(self, name), getattr(type(self), name, None)
+            value = getattr(self, name)
+            default = getattr(type(self), name, None)
             several = value if isinstance(value, tuple) else (value,)
-            for one in (each for each in several if each is not None):
-                if words and one not in words:
-                    refuse_unknown(name, one, words)
+            for single in (each for each in several if each is not None):
+                if words and single not in words:
+                    refuse_unknown(name, single, words)
                 if interval:
                     low, high = (float(end) for end in interval[1:-1].split(", "))
-                    is_above = one >= low if interval[0] == "[" else one > low
-                    is_below = one <= high if interval[-1] == "]" else one < high
+                    is_above = single >= low if interval[0] == "[" else single > low
+                    is_below = single <= high if interval[-1] == "]" else single < high
                     if not (is_above and is_below):
                         remedy = "" if default is None else f"; the default is {default}"
                         raise InputError(
@@ -70,7 +71,7 @@ def _rules_of(kind: type) -> dict[str, tuple[tuple[Any, ...], str, tuple[Any, ..
         is_annotated = get_origin(hint) is Annotated
         interval, *more = hint.__metadata__ if is_annotated else ("",)
         plain = get_args(hint)[0] if is_annotated else hint
-        choices = (one for one in (plain, *get_args(plain)) if get_origin(one) is Literal)
+        choices = (choice for choice in (plain, *get_args(plain)) if get_origin(choice) is Literal)
         words = get_args(next(choices, None))
         if not all(isinstance(word, str) for word in words):
             words = ()
@@ -102,14 +103,14 @@ def _over_defaults(content: Mapping[Any, Any], kind: type) -> dict[Any, Any]:
     """Merge nested differences into the defaults of ``kind``."""
     laid = dict(content)
     for field in dataclasses.fields(kind):
-        own = content.get(field.name)
+        nested = content.get(field.name)
         make = field.default_factory
         default = field.default if make is dataclasses.MISSING else make()
-        if isinstance(own, Mapping) and dataclasses.is_dataclass(default):
+        if isinstance(nested, Mapping) and dataclasses.is_dataclass(default):
             rivals = getattr(default, "INSTEAD", {})  # given, it removes the other's default
-            left_out = {rivals[key] for key in own if key in rivals}
-            kept = {k: v for k, v in config_to_dict(default).items() if k not in left_out}
-            laid[field.name] = kept | _over_defaults(own, type(default))
+            left_out = {rivals[key] for key in nested if key in rivals}
+            defaults = {k: v for k, v in config_to_dict(default).items() if k not in left_out}
+            laid[field.name] = defaults | _over_defaults(nested, type(default))
     return laid
 
 
@@ -155,7 +156,8 @@ def config_from_dict(
 
 def _value_of(value: Any, hint: Any, source: str, name: str) -> Any:  # noqa: ANN401, C901, PLR0911, PLR0912
     """Give a value of the type that a setting has; nothing is cast to what was not meant."""
-    origin, parts = get_origin(hint), get_args(hint)
+    origin = get_origin(hint)
+    parts = get_args(hint)
     if origin in (Union, types.UnionType):
         if value is None and type(None) in parts:
             return None
@@ -164,7 +166,7 @@ def _value_of(value: Any, hint: Any, source: str, name: str) -> Any:  # noqa: AN
             with suppress(InputError):
                 return _value_of(value, other, source, name)
         return _value_of(value, last, source, name)
-    said = f"{source}: {name} is {value!r:.{_LONGEST}}"
+    context = f"{source}: {name} is {value!r:.{_LONGEST}}"
     if origin in (tuple, list):
         is_free = origin is list or parts[-1] is Ellipsis
         times = 1 if is_free else len(parts)
@@ -173,9 +175,9 @@ def _value_of(value: Any, hint: Any, source: str, name: str) -> Any:  # noqa: AN
             remedy = "write its values in brackets, or leave the key out"
             if isinstance(value, str | int | float):
                 remedy = f"write [{', '.join([str(value)[:_LONGEST]] * times)}]"
-            raise InputError(f"{said}, but {count} is needed: {remedy}")
+            raise InputError(f"{context}, but {count} is needed: {remedy}")
         if not is_free and len(value) != times:
-            raise InputError(f"{said}, but {times} values are needed: give so many")
+            raise InputError(f"{context}, but {times} values are needed: give so many")
         pairs = zip(value, parts[:1] * len(value) if is_free else parts, strict=True)
         items = [_value_of(v, part, source, f"{name}[{k}]") for k, (v, part) in enumerate(pairs)]
         return items if origin is list else tuple(items)
@@ -193,17 +195,18 @@ def _value_of(value: Any, hint: Any, source: str, name: str) -> Any:  # noqa: AN
         except OverflowError:
             number = math.inf
         except (TypeError, ValueError):
-            number, what = math.nan, "number is needed: write one"
+            number = math.nan
+            what = "number is needed: write one"
         if not math.isfinite(number):
-            raise InputError(f"{said}, but a {what}")
+            raise InputError(f"{context}, but a {what}")
         return number
     if hint is int and isinstance(value, bool):
-        raise InputError(f"{said}, but a whole number is needed: write one")
+        raise InputError(f"{context}, but a whole number is needed: write one")
     if hint is Path and isinstance(value, str):
         return Path(value)
     if isinstance(hint, type) and isinstance(value, hint):
         return value
-    raise InputError(f"{said}, which is not of type {hint}. Give a value of that type.")
+    raise InputError(f"{context}, which is not of type {hint}. Give a value of that type.")
 
 
 def config_to_dict(config: object) -> dict[str, Any]:

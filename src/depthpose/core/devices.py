@@ -52,10 +52,10 @@ def each_in_own_arithmetic(made: Iterator[Made]) -> Iterator[Made]:
     nothing = object()
     while True:
         with own_arithmetic():
-            one = next(made, nothing)
-        if one is nothing:
+            item = next(made, nothing)
+        if item is nothing:
             return
-        yield cast(Made, one)
+        yield cast(Made, item)
 
 
 def each_in_threads(
@@ -79,8 +79,8 @@ def each_in_threads(
     share = (max(1, cores // threads),)
     with ThreadPoolExecutor(threads, initializer=torch.set_num_threads, initargs=share) as pool:
         try:
-            for one in items:
-                waiting.append(pool.submit(quiet, one))
+            for item in items:
+                waiting.append(pool.submit(quiet, item))
                 if len(waiting) == threads:
                     yield waiting.popleft().result()
             while waiting:
@@ -97,9 +97,9 @@ def refused_memory(name: str) -> Iterator[None]:
     try:
         yield
     except (MemoryError, RuntimeError) as error:
-        if (said := full_memory(error)) is None:
+        if (reason := full_memory(error)) is None:
             raise
-        raise InputError(f"{name}: {said}") from error
+        raise InputError(f"{name}: {reason}") from error
 
 
 def usable_device(name: str | torch.device) -> torch.device:
@@ -117,9 +117,9 @@ def usable_device(name: str | torch.device) -> torch.device:
     try:
         torch.ones(1, dtype=torch.float64, device=device).cpu()
     except (RuntimeError, AssertionError, TypeError, ImportError) as error:
-        said = str(error).splitlines()[0].partition(". ")[0]
+        cause = str(error).splitlines()[0].partition(". ")[0]
         raise InputError(
-            f"device {str(name)!r} cannot be used here ({said}); take 'cpu'"
+            f"device {str(name)!r} cannot be used here ({cause}); take 'cpu'"
         ) from error
     return device
 

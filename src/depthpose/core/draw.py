@@ -76,8 +76,8 @@ def draw_error_points(
 
 def _grow(values: Float[Tensor, "h w"], radius_px: int) -> Float[Tensor, "h w"]:
     """Grow each number to a square; where squares overlap the largest wins."""
-    known = values.nan_to_num(-torch.inf)[None]
-    grown = F.max_pool2d(known, 2 * radius_px + 1, 1, radius_px)[0]
+    filled = values.nan_to_num(-torch.inf)[None]
+    grown = F.max_pool2d(filled, 2 * radius_px + 1, 1, radius_px)[0]
     return torch.where(torch.isfinite(grown), grown, torch.nan)
 
 

@@ -45,9 +45,9 @@ def full_memory(error: BaseException) -> str | None:
     """Say that the memory is full, whichever library raised it, and what to do; else None."""
     if not isinstance(error, MemoryError) and _OF_MEMORY.search(str(error)) is None:
         return None
-    said = " ".join(str(error).split())[:200] or "no more is given"
+    cause = " ".join(str(error).split())[:200] or "no more is given"
     return (
-        f"the memory is full ({said}); end other programs, raise the limit (ulimit -v), take "
+        f"the memory is full ({cause}); end other programs, raise the limit (ulimit -v), take "
         "smaller images, or give a stereo matcher --max-memory"
     )
 
@@ -71,8 +71,8 @@ def import_extra(module: str, package: str, extra: str, purpose: str) -> Any:  #
         names = (module, module.partition(".")[0])
         if isinstance(error, ModuleNotFoundError) and error.name in names:
             raise MissingExtraError(package, extra, purpose) from error
-        if (said := full_memory(error)) is not None:
-            raise InputError(f"{purpose} needs {package}: {said}") from error
+        if (reason := full_memory(error)) is not None:
+            raise InputError(f"{purpose} needs {package}: {reason}") from error
         raise InputError(
             f"{purpose} needs {package}, which is installed and does not load: {error}; a library "
             "of the system is missing, or the package is damaged"

@@ -155,17 +155,21 @@ class Limit:
     flips: float = 0.0  #: share of the numbers that may be off by more
 
 
-def _row(case: str, output: str, answer: np.ndarray, expected: np.ndarray, limit: Limit) -> Row:
-    answer, expected = (np.asarray(values, np.float64) for values in (answer, expected))
-    is_nan = np.isnan(answer), np.isnan(expected)
-    is_other = answer.shape != expected.shape
+def _row(
+    case: str, output: str, output_values: np.ndarray, expected: np.ndarray, limit: Limit
+) -> Row:
+    output_values, expected = (
+        np.asarray(values, np.float64) for values in (output_values, expected)
+    )
+    is_nan = np.isnan(output_values), np.isnan(expected)
+    is_other = output_values.shape != expected.shape
     if is_other or ((is_nan[0] != is_nan[1]).any() and not limit.flips):
         raise InputError(
-            f"{output} of {case}: onnxruntime answers {answer.shape} with "
+            f"{output} of {case}: onnxruntime answers {output_values.shape} with "
             f"{is_nan[0].sum()} NaN, PyTorch {expected.shape} with "
             f"{is_nan[1].sum()}; nothing is written."
         )
-    difference = np.abs(answer - expected)
+    difference = np.abs(output_values - expected)
     if limit.is_relative:
         difference /= np.abs(expected)
     difference = np.where(is_nan[0] != is_nan[1], np.inf, difference)
@@ -227,16 +231,19 @@ def freeze(path: Path, export: Export) -> list[Row]:
         rows: list[Row] = []
         for case in export.cases():
             answers = session.run(list(case.expected), dict(case.inputs))
-            for (name, expected), answer in zip(case.expected.items(), answers, strict=True):
-                if name in case.where and answer.shape == expected.shape:
-                    answer, expected = (m[case.where[name]] for m in (answer, expected))  # noqa: PLW2901
-                rows.append(_row(case.name, name, answer, expected, export.limits[name]))
+            for (name, expected), output_values in zip(case.expected.items(), answers, strict=True):
+                if name in case.where and output_values.shape == expected.shape:
+                    where = case.where[name]
+                    output_values = output_values[where]  # noqa: PLW2901
+                    expected = expected[where]  # noqa: PLW2901
+                rows.append(_row(case.name, name, output_values, expected, export.limits[name]))
         if not rows:
             raise InputError(
                 "no output is compared with PyTorch's; nothing is written. Name a case."
             )
         for row in rows:
-            difference, limit = row[f"{row['limited']} difference"], row["limit"]
+            difference = row[f"{row['limited']} difference"]
+            limit = row["limit"]
             if not difference <= limit:  # pyright: ignore[reportOperatorIssue]  NaN fails too
                 raise InputError(
                     f"{row['output']} of {row['input']}: PyTorch and onnxruntime differ by "

@@ -120,7 +120,7 @@ def edge_functions(
     # between them.
     (ax, ay, az), (bx, by, bz) = (corners.roll(-k, 1).unbind(-1) for k in (1, 2))
     parts = [(ay * bz, az * by), (az * bx, ax * bz), (ax * by, ay * bx)]
-    edges = torch.stack([one - other for one, other in parts], -1)
+    edges = torch.stack([start - other for start, other in parts], -1)
     return edges, (corners[:, 0] * edges[:, 0]).sum(-1)
 
 
@@ -136,13 +136,14 @@ def barycentric_shares(
     """
     height, width = primitive.shape
     shares = torch.zeros(height * width, 3, device=edges.device)
-    seen = (primitive.reshape(-1) >= 0).nonzero()[:, 0]
-    which = primitive.reshape(-1)[seen]
-    u, v = (seen % width).double()[:, None], (seen // width).double()[:, None]
+    covered = (primitive.reshape(-1) >= 0).nonzero()[:, 0]
+    which = primitive.reshape(-1)[covered]
+    u = (covered % width).double()[:, None]
+    v = (covered // width).double()[:, None]
     across, down, constant = edges.index_select(0, which).unbind(-1)
     weight = torch.addcmul(constant, across, u).addcmul_(down, v).div_(volume[which, None])
     weight = weight.clamp_(min=0)  # beyond the edge by a rounding, where a pixel lies on it
-    shares[seen] = (weight / _most(torch.add, weight)[:, None]).float()
+    shares[covered] = (weight / _most(torch.add, weight)[:, None]).float()
     return shares.reshape(height, width, 3)
 
 
@@ -170,7 +171,8 @@ def _draw(
     last = torch.minimum(pixels.amax(1).floor(), pixels.new_tensor([width - 1, height - 1]))
     is_seen = (first <= last).all(1) & (True if is_front is None else is_front.any(1))
     number = is_seen.nonzero()[:, 0]
-    first, last = first[number].long(), last[number].long()
+    first = first[number].long()
+    last = last[number].long()
     raw, volume = edge_functions(corners.index_select(0, number))
     scale = torch.where(volume != 0, 1 / volume, 0)[:, None]
     edges = raw * volume.sign()[:, None, None]  # not negative inside
@@ -186,9 +188,9 @@ def _draw(
         across, down, constant = edges.index_select(0, which).unbind(-1)
         offset = torch.addcmul(constant, down, v[:, None])
         start, stop = _span(across, offset, first[which, 0], last[which, 0])
-        kept = (start <= stop).nonzero()[:, 0]
+        not_empty = (start <= stop).nonzero()[:, 0]
         which, row, start, stop, v = (
-            values.index_select(0, kept) for values in (which, row, start, stop, v)
+            values.index_select(0, not_empty) for values in (which, row, start, stop, v)
         )
         slope, down, constant = plane.index_select(0, which).unbind(-1)
         at_row = down * v + constant
@@ -248,8 +250,10 @@ def _expand(
 def _chunks(counts: Int64[Tensor, " n"], limit: int) -> Iterator[slice]:
     """Cut a list so that the counts of each part sum to ``limit`` at most, or it is one item."""
     ends = counts.cumsum(0).cpu().numpy()
-    start, done = 0, 0
+    start = 0
+    done = 0
     while start < len(ends):
         stop = max(int(np.searchsorted(ends, done + limit, side="right")), start + 1)
         yield slice(start, stop)
-        start, done = stop, int(ends[stop - 1])
+        start = stop
+        done = int(ends[stop - 1])

@@ -126,7 +126,8 @@ def perturb(pose: Rigid, motion: Float[Tensor, "*batch 6"]) -> Rigid:
 def rotation_by(vector: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3 3"]:
     """Give the rotation by a rotation vector [rad]: Rodrigues' formula, exact down to no turn."""
     angle = torch.linalg.vector_norm(vector, dim=-1)[..., None, None]
-    cross, eye = cross_matrix(vector), torch.eye(3, dtype=vector.dtype, device=vector.device)
+    cross = cross_matrix(vector)
+    eye = torch.eye(3, dtype=vector.dtype, device=vector.device)
     # torch.sinc(x) is sin(pi x) / (pi x); (1 - cos a) / a^2 is half of the square of sinc(a / 2).
     half = torch.sinc(angle / (2 * torch.pi))
     return eye + torch.sinc(angle / torch.pi) * cross + half.square() / 2 * (cross @ cross)

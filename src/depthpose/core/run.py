@@ -118,13 +118,13 @@ def find_rank() -> ProcessRank:
     Raises:
         InputError: they are no numbers that go together.
     """
-    said = (os.environ.get("RANK", "0"), os.environ.get("WORLD_SIZE", "1"))
-    if not all(word.isdecimal() for word in said) or not int(said[0]) < int(said[1]):
+    variables = (os.environ.get("RANK", "0"), os.environ.get("WORLD_SIZE", "1"))
+    if not all(word.isdecimal() for word in variables) or not int(variables[0]) < int(variables[1]):
         raise InputError(
-            f"RANK is {said[0]!r} and WORLD_SIZE {said[1]!r}, but a rank is 0 .. WORLD_SIZE - 1; "
-            "let torchrun or accelerate launch set them, or unset both"
+            f"RANK is {variables[0]!r} and WORLD_SIZE {variables[1]!r}, but a rank is "
+            "0 .. WORLD_SIZE - 1; let torchrun or accelerate launch set them, or unset both"
         )
-    return ProcessRank(rank=int(said[0]), world=int(said[1]))
+    return ProcessRank(rank=int(variables[0]), world=int(variables[1]))
 
 
 def wait_for(
@@ -254,7 +254,7 @@ def claim_names(
         for ending in endings
         if file.name.endswith(ending)
     }
-    known = read_sources(folder)
+    recorded = read_sources(folder)
     made = {*results, *(_FRAME.sub("", stem) for stem in results)}
     wanted: dict[str, list[str]] = {}
     for name, files in sources.items():
@@ -267,7 +267,7 @@ def claim_names(
                     stamps.append(f"{facts.st_size} bytes of {facts.st_mtime_ns}")
         wanted[name] = [str(every[0].resolve()), ", ".join(stamps)]
     for name, (path, stamp) in wanted.items():
-        earlier, before = known.get(name, [path, stamp])
+        earlier, before = recorded.get(name, [path, stamp])
         if earlier != path:
             raise InputError(
                 f"{folder}: {name!r} is the result of {earlier}, not of {path}; two files of "
@@ -276,32 +276,33 @@ def claim_names(
         is_other = before and stamp and before != stamp
         if is_other and (name in made if is_finished is None else is_finished(name)):
             files = sources[name]
-            said = path if isinstance(files, Path) else " or ".join(map(str, files))
+            named = path if isinstance(files, Path) else " or ".join(map(str, files))
             raise InputError(
-                f"{said}: has changed since its result {name!r} in {folder} was "
+                f"{named}: has changed since its result {name!r} in {folder} was "
                 "made; choose another folder, or delete this one"
             )
-    new, noted = wanted.keys() - known.keys(), read_results(folder)
+    new = wanted.keys() - recorded.keys()
+    noted = read_results(folder)
     for stem, file in results.items():
         is_frame = _FRAME.sub("", stem) in new & set(videos)
-        if stem not in known and (stem in new or is_frame):
+        if stem not in recorded and (stem in new or is_frame):
             if file.relative_to(folder).as_posix() not in noted.get(stem, {}):
                 raise InputError(f"{file}: {NOT_OURS}")
             note_result(folder, stem, [])
     for name in filter(noted.get, new):  # of which source is not known any more
         note_result(folder, name, [])
-    if any(known.get(name) != entry for name, entry in wanted.items()):
-        write_json(record, known | wanted)
+    if any(recorded.get(name) != entry for name, entry in wanted.items()):
+        write_json(record, recorded | wanted)
 
 
 def read_sources(folder: Path) -> dict[str, list[str]]:
     """Give path and stamp of the file that each result is of, by name; none of a damaged record."""
-    known = None
+    content = None
     with suppress(InputError):
-        known = read_json(folder / _SOURCES) if (folder / _SOURCES).exists() else {}
+        content = read_json(folder / _SOURCES) if (folder / _SOURCES).exists() else {}
     return {
         name: entry
-        for name, entry in (known.items() if isinstance(known, dict) else ())
+        for name, entry in (content.items() if isinstance(content, dict) else ())
         if isinstance(entry, list) and list(map(type, entry)) == [str, str]
     }
 
@@ -350,7 +351,8 @@ def refuse_other_settings(
     Raises:
         InputError: the first difference is named.
     """
-    before, now = _flat(earlier), _flat(settings)
+    before = _flat(earlier)
+    now = _flat(settings)
     for name in sorted(before.keys() | now.keys()):
         # A later version may add settings: one that either does not know counts as off.
         is_off = (name not in before or name not in now) and not (before | now)[name]
@@ -413,7 +415,8 @@ def read_results(folder: Path) -> dict[str, dict[str, list[int]]]:
         status = path.stat()
         number, end, results = _read.get(path, (status.st_ino, 0, {}))
         if number != status.st_ino or status.st_size < end:
-            end, results = 0, {}
+            end = 0
+            results = {}
         if status.st_size > end:
             with path.open("rb") as file:
                 file.seek(end)

@@ -34,7 +34,8 @@ def degrade(image: View, config: DegradeConfig, generator: torch.Generator) -> V
 
     if between(0.0, 1.0) < config.hue_share:
         image = image[torch.randperm(3, generator=generator)]
-    low, high = 1 - config.colour, 1 + config.colour
+    low = 1 - config.colour
+    high = 1 + config.colour
     exposure, contrast, saturation, gamma = (between(low, high) for _ in range(4))
     third = config.colour / 3
     tint = torch.tensor([between(1 - third, 1 + third) for _ in range(3)])
@@ -53,7 +54,8 @@ def degrade(image: View, config: DegradeConfig, generator: torch.Generator) -> V
         reach = between(0.2, 0.8)
         image = image + between(0.1, 0.6) * torch.exp(-(x**2 + y**2) / (2 * reach**2))
     if between(0.0, 1.0) < config.blur_share:
-        places, deviation_px = torch.arange(-3.0, 4.0), between(0.3, config.blur_px)
+        places = torch.arange(-3.0, 4.0)
+        deviation_px = between(0.3, config.blur_px)
         kernel = torch.exp(-(places**2) / (2 * deviation_px**2))
         kernel = kernel / kernel.sum()
         padded = F.pad(image[:, None], (3, 3, 3, 3), mode="replicate")
@@ -202,7 +204,8 @@ def jitter_colors(pair: TrainingPair, strength: float, generator: torch.Generato
     brightness, contrast, saturation = (
         1 + strength * (2 * torch.rand(3, generator=generator) - 1)
     ).tolist()
-    left, right = pair.left * brightness, pair.right * brightness
+    left = pair.left * brightness
+    right = pair.right * brightness
     mean = (left.mean() + right.mean()) / 2  # one anchor, or the views would drift apart
     views = []
     for view in (left, right):

@@ -23,7 +23,9 @@ from depthpose.depth.types import DepthEstimate, Map, StereoInput, View
 _CANONICAL_FOCAL_PX = 721.5377
 """Rows are counted in a camera of this focal length (KITTI's), centred at its principal point."""
 _ROWS = 1443
-_NEAR_M, _FAR_M, _STEPS = 1.0, 80.0, 4096
+_NEAR_M = 1.0
+_FAR_M = 80.0
+_STEPS = 4096
 
 Progress = Callable[[Sequence[int]], Iterable[int]]
 
@@ -53,7 +55,8 @@ class RowDepthBaseline:
         """
         weight = np.zeros((_ROWS, _STEPS))
         for index in progress(range(len(dataset))):
-            known_m, rig = read_known_depth(dataset, index), dataset.read_rig(index)
+            known_m = read_known_depth(dataset, index)
+            rig = dataset.read_rig(index)
             if known_m is None or rig is None:
                 continue
             true_m = known_m.double().numpy()
@@ -63,7 +66,8 @@ class RowDepthBaseline:
             row = np.rint(slope * _CANONICAL_FOCAL_PX + _ROWS // 2).astype(np.int64)
             row = row.clip(0, _ROWS - 1)
             step = np.log(true_m / _NEAR_M) / np.log(_FAR_M / _NEAR_M) * _STEPS
-            flat, share = row * _STEPS + step.astype(np.int64), 1 / true_m / max(len(true_m), 1)
+            flat = row * _STEPS + step.astype(np.int64)
+            share = 1 / true_m / max(len(true_m), 1)
             weight += np.bincount(flat, share, _ROWS * _STEPS).reshape(_ROWS, _STEPS)
         has_truth = weight.sum(1) > 0
         if not has_truth.any():
@@ -130,7 +134,8 @@ class NearestImageBaseline:
         """
         rig, (height, width) = _rig_of(pair), pair.left.shape[1:]
         nearest = self.indices[int((self.thumbnails @ _thumbnail(pair.left)).argmax())]
-        known_m, other = read_known_depth(self.dataset, nearest), self.dataset.read_rig(nearest)
+        known_m = read_known_depth(self.dataset, nearest)
+        other = self.dataset.read_rig(nearest)
         assert known_m is not None  # `fit` chose frames that have both
         assert other is not None
         inverse = fill_by_pyramid(1 / known_m)

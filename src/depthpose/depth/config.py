@@ -12,7 +12,9 @@ TruthKind = Literal["scan", "annotated", "disparity"]
 
 _MOST_FOCAL_PX = 20_000
 """Of pairs: several times that of the largest images; beyond it they would fill the memory."""
-_FOCAL_PX, _BASELINE_M, _DISPARITY_PX = f"[1, {_MOST_FOCAL_PX}]", "[0.0001, 1000]", "[0.01, 16384]"
+_FOCAL_PX = f"[1, {_MOST_FOCAL_PX}]"
+_BASELINE_M = "[0.0001, 1000]"
+_DISPARITY_PX = "[0.01, 16384]"
 """What the rigs of weights may be like: depth from them is a finite number above 0."""
 
 

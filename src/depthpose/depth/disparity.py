@@ -33,7 +33,8 @@ _ABOUT = 1.4
 """No estimate is wrong by 250 or 1000 in the median, and a slip is met to within this factor."""
 _said: set[str] = set()
 _NEARLY_ALL = 0.9
-_NEAR, _OPPOSITE = 1.1, -0.8
+_NEAR = 1.1
+_OPPOSITE = -0.8
 _FAR_OFF = 3.0
 """A median so far off is told of: an estimate of the right scale has one near 1."""
 LEAST_PX = 0.01
@@ -56,7 +57,8 @@ def disparity_advice(predicted_px: Map, true_px: Map) -> str | None:
     counts = torch.isfinite(predicted_px) & torch.isfinite(true_px)
     if not bool(counts.any()):
         return None
-    predicted_px, true_px = predicted_px[counts], true_px[counts]
+    predicted_px = predicted_px[counts]
+    true_px = true_px[counts]
     negative = float((predicted_px < 0).float().mean())
     if negative > _NEARLY_ALL:
         return (
@@ -103,6 +105,32 @@ def disparity_from_depth(
     """Undo :func:`depth_from_disparity`; NaN where depth is NaN or not positive."""
     disparity_px = float(rig.K[0, 0]) * rig.baseline_m / depth_m - rig.cx_right_minus_left_px
     return torch.where(depth_m > 0, disparity_px, torch.nan)
+
+
+_DEVIATIONS = ((0.0, 0.5), (0.4, 0.2), (0.6, 0.17), (0.8, 0.12), (0.9, 0.03), (0.95, 0.02),
+               (1.0, 0.0075))  # fmt: skip
+"""Deviation of a disparity, as a share of it, by its confidence: 68 % of the errors of `default` on
+16 near scenes and 8 streets, synthetic and not trained on, made to fall with the confidence."""
+_LEAST_DEVIATION_PX = 0.25
+"""Of what is surest on these."""
+
+
+def depth_deviation(
+    depth_m: Float[Tensor, "*batch h w"], confidence: Float[Tensor, "*batch h w"], rig: StereoRig
+) -> Float[Tensor, "*batch h w"]:
+    """Standard deviation of a matched depth: ``z^2 / (fx B)`` times that of the disparity [m].
+
+    That of the disparity follows from the confidence, as measured on synthetic scenes. NaN where
+    depth is.
+    """
+    knots = torch.tensor(_DEVIATIONS, dtype=depth_m.dtype, device=depth_m.device)
+    sure, shares = knots.T.contiguous()
+    place = confidence.clamp(0, 1).contiguous()
+    after = torch.searchsorted(sure, place).clamp(1, len(sure) - 1)
+    between = (place - sure[after - 1]) / (sure[after] - sure[after - 1])
+    share = torch.lerp(shares[after - 1], shares[after], between)
+    deviation_px = (share * disparity_from_depth(depth_m, rig)).clamp(min=_LEAST_DEVIATION_PX)
+    return depth_m.square() / (float(rig.K[0, 0]) * rig.baseline_m) * deviation_px
 
 
 def warp_right_to_left(right: Float[Tensor, "c h w"], disparity_px: Map) -> Float[Tensor, "c h w"]:
@@ -161,11 +189,11 @@ def resize_image(
     image: Float[Tensor, "*batch 3 _ _"], height: int, width: int
 ) -> Float[Tensor, "*batch 3 {height} {width}"]:
     """Resize one image, or a batch, bilinearly, averaging where it shrinks."""
-    own = image.shape[-2:]
-    if own == (height, width):
+    size = image.shape[-2:]
+    if size == (height, width):
         return image
     images = image if image.ndim == 4 else image[None]
-    shrinks = height < own[0] or width < own[1]
+    shrinks = height < size[0] or width < size[1]
     resized = F.interpolate(images, (height, width), mode="bilinear", antialias=shrinks)
     return resized.clamp(0, 1).reshape(*image.shape[:-2], height, width)
 
@@ -178,7 +206,9 @@ def changed_match(match: Match, change: Callable[[Tensor], Tensor]) -> Match:
 
 def resized_match(match: Match, height: int, width: int) -> Match:
     """Bring a match to another size of its image."""
-    px, sure, sky = match.disparity_px, match.confidence, match.is_sky
+    px = match.disparity_px
+    sure = match.confidence
+    sky = match.is_sky
     return Match(
         disparity_px=resized_map(px, height, width) * (width / px.shape[1]),
         confidence=None if sure is None else resized_map(sure, height, width),
@@ -205,8 +235,11 @@ def from_pair(pair: StereoInput, match: Match, warning: str = "") -> DepthEstima
     There is no answer where the left image has no picture. The confidence is 0 where the right one
     has none, and falls to 0 where the left one is plain, for nothing can be matched there.
     """
-    px, depth_m, is_sky = match.disparity_px, None, match.is_sky
-    confidence, blank = match.confidence, without_picture(pair.left).to(px.device)
+    px = match.disparity_px
+    depth_m = None
+    is_sky = match.is_sky
+    confidence = match.confidence
+    blank = without_picture(pair.left).to(px.device)
     if is_sky is not None:
         is_sky = is_sky & ~blank
     if confidence is not None and pair.right is not None:
@@ -245,11 +278,13 @@ def from_virtual(
     camera = image.camera
     assert camera is not None
     height, width = image.left.shape[1:]
-    seen = resized_match(match, height, width)
-    px, is_sky = seen.disparity_px, seen.is_sky
+    resized = resized_match(match, height, width)
+    px = resized.disparity_px
+    is_sky = resized.is_sky
     focal_m_px = float(camera.K[0, 0]) * rig.virtual_baseline_m
     depth_m = torch.where(px > 0, focal_m_px / px, torch.nan)
-    blank, confidence = without_picture(image.left).to(px.device), seen.confidence
+    blank = without_picture(image.left).to(px.device)
+    confidence = resized.confidence
     if is_sky is not None:
         is_sky = is_sky & ~blank
         is_sky = is_sky & (is_sky.float().mean() >= _LEAST_SKY)

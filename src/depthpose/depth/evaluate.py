@@ -209,9 +209,12 @@ def measure_frame(
         mask = counts & torch.isfinite(predicted)
         if not bool(counts.any()):
             continue
-        metrics, deciles, pixels = {}, None, int(mask.sum())
+        metrics = {}
+        deciles = None
+        pixels = int(mask.sum())
         if pixels:
-            predicted, truth = predicted[mask], truth[mask]
+            predicted = predicted[mask]
+            truth = truth[mask]
             error = (predicted - truth).abs()
             metrics = measure("disparity" if cap_m is None else "depth", predicted, truth)
             if cap_m is not None:
@@ -318,7 +321,8 @@ def frame_result(
     Raises:
         InputError: the frame does not count, or a file is damaged.
     """
-    rule, name = find_protocol(protocol), dataset.frames[index].name
+    rule = find_protocol(protocol)
+    name = dataset.frames[index].name
     prepared = _prepare(dataset, index, predictions, rule)
     if isinstance(prepared, str):
         raise InputError(f"{name}: {prepared}; choose a frame that counts")
@@ -329,7 +333,8 @@ def frame_result(
     if is_sky is not None and depth_m is not None and is_sky.shape == depth_m.shape:
         depth_m = torch.where(is_sky, torch.nan, depth_m)
     predicted, truth = _compared(prepared, rule, cap_m)
-    error, true_m = (predicted - truth).abs(), truth
+    error = (predicted - truth).abs()
+    true_m = truth
     if cap_m is None:
         true_m = None if rig is None else disparity.depth_from_disparity(truth, rig)
     else:
@@ -369,7 +374,8 @@ class _Prepared:
 
 def _prepare(dataset: Dataset, index: int, predictions: Path, rule: Protocol) -> _Prepared | str:
     """Read truth and prediction of a frame, or say why it does not count."""
-    frame, is_stereo = dataset.frames[index], rule.truth == "disparity"
+    frame = dataset.frames[index]
+    is_stereo = rule.truth == "disparity"
     if not has_truth(frame, rule):
         return f"no truth of the kind {rule.truth}"
     if frame.right is None and not files.has_prediction(predictions, frame.name):
@@ -381,7 +387,8 @@ def _prepare(dataset: Dataset, index: int, predictions: Path, rule: Protocol) ->
         truth = shipped.disparity_px if is_stereo else shipped.depth_m
     assert truth is not None, "has_truth said so"
     height, width = truth.shape
-    rig, depth_m = dataset.read_rig(index), None
+    rig = dataset.read_rig(index)
+    depth_m = None
     has_disparity = files.has_prediction(predictions, frame.name, of_disparity=True)
     if not is_stereo and (rig is None or not has_disparity):
         depth_m = files.read_depth(predictions, frame.name)
@@ -404,7 +411,8 @@ def _prepare(dataset: Dataset, index: int, predictions: Path, rule: Protocol) ->
     confidence = files.read_part(predictions, frame.name, "confidence.npy")
     if confidence is not None and confidence.shape != truth.shape:
         confidence = disparity.resized_map(confidence, height, width)
-    drawn, view = files.read_part(predictions, frame.name, "right.png"), {}
+    drawn = files.read_part(predictions, frame.name, "right.png")
+    view = {}
     if drawn is not None and frame.right is not None:
         real = read_image(frame.right)
         if real.shape != drawn.shape:
@@ -433,14 +441,16 @@ def _at_size_of(true_px: Map, found_px: Float[Tensor, "_ _"], path: Path) -> Map
     """
     (height, width), (rows, columns) = true_px.shape, found_px.shape
     stretched_px = disparity.resized_map(found_px, height, width) * (width / columns)
-    aspect, turned = columns * height / (rows * width), rows * height / (columns * width)
+    aspect = columns * height / (rows * width)
+    turned = rows * height / (columns * width)
     if 1 / _SAME_ASPECT < aspect < _SAME_ASPECT:
         return stretched_px
     shown = f"{columns}x{rows}, and its truth {width}x{height}"
     if 1 / _SAME_ASPECT < turned < _SAME_ASPECT:
         raise InputError(f"{path}: is {shown}: it is transposed; save rows first, (H, W)")
     if rows <= height and columns <= width:
-        left, errors_px = (width - columns) // 2, {}
+        left = (width - columns) // 2
+        errors_px = {}
         for top in ((height - rows) // 2, height - rows):  # from the middle, or as KITTI's 1216x352
             window = true_px[top : top + rows, left : left + columns]
             errors_px[top] = float((found_px - window).abs().nanmedian())
@@ -465,7 +475,8 @@ def _at_size_of(true_px: Map, found_px: Float[Tensor, "_ _"], path: Path) -> Map
 
 def _compared(prepared: _Prepared, rule: Protocol, cap_m: float | None) -> tuple[Map, Map]:
     """Prepare prediction and truth as the protocol says; NaN where there is none or none counts."""
-    truth, predicted_m = prepared.truth, prepared.depth_m
+    truth = prepared.truth
+    predicted_m = prepared.depth_m
     if cap_m is None:
         return prepared.disparity_px, truth
     counts = (truth > SMALLEST_DEPTH_M) & (truth < cap_m)

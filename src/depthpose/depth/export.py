@@ -31,7 +31,10 @@ from depthpose.depth.synthesis import (
 from depthpose.depth.types import DepthEstimate, StereoInput, Views
 from depthpose.depth.weights import DepthWeights, make_matcher
 
-_0, _1, _2, _HALF = np.float32(0), np.float32(1), np.float32(2), np.float32(0.5)
+_0 = np.float32(0)
+_1 = np.float32(1)
+_2 = np.float32(2)
+_HALF = np.float32(0.5)
 
 
 def _side(size: Value, axis: int) -> Value:
@@ -83,7 +86,8 @@ class DynamicPSMNet(nn.Module):
         self, left: Views, right: Views
     ) -> tuple[Float[Tensor, "b h w"], Float[Tensor, "b h w"]]:
         """Give disparity [px] and confidence of normalised images."""
-        near, far = self.network.features(left), self.network.features(right)
+        near = self.network.features(left)
+        far = self.network.features(right)
         cost0 = self.network.aggregate(gathered_volume(near, far, self.bins))
         cost = self.network.refine(cost0)[-1][:, 0]
         align = self.network.config.align_corners
@@ -165,7 +169,8 @@ class _Drawn(NamedTuple):
 
 def _drawn(left: Value, generator: Generator) -> _Drawn:
     """What ``draw_right`` or ``select_views`` and ``shift_left`` do."""
-    size, multiple = left.op("Shape", start=2, end=4), generator.config.side_multiple_px
+    size = left.op("Shape", start=2, end=4)
+    multiple = generator.config.side_multiple_px
     # The multiple that a side is close to, or the side itself.
     sides = size.cast(np.float64)
     nearest = (sides / float(multiple)).op("Round").op("Max", 1.0) * float(multiple)
@@ -185,7 +190,8 @@ def _drawn(left: Value, generator: Generator) -> _Drawn:
     outputs = left.graph.call(network, image)
     maps = [m.slice([0, 0], even / 2, [1, 2]) for m in outputs[:5]]
     log_px, sky, sure, right_log_px, right_sky = (_resized_map(m, size) for m in maps)
-    scale, is_sky = _ratio(size, even), sky.op("Greater", _HALF)
+    scale = _ratio(size, even)
+    is_sky = sky.op("Greater", _HALF)
     confidence = is_sky.op("Where", sky, sure * (sky * np.float32(-1) + _1))
     of_left = _Maps(log_px.op("Exp") * scale, confidence, is_sky.cast(np.float32))
     right_px = right_sky.op("Greater", _HALF).op("Where", _0, right_log_px.op("Exp") * scale)
@@ -307,14 +313,17 @@ def _matched(
             f"one of {kinds}."
         )
     network = DYNAMIC_SHAPE_NETWORKS[type(matcher)](matcher).eval()
-    config, graph = matcher.config, left.graph
+    config = matcher.config
+    graph = left.graph
     size = work = left.op("Shape", start=2, end=4)
     if config.work_focal_px is not None:
         scaled = size.cast(np.float64) * float(config.work_focal_px) / focal_px
         work = scaled.op("Round").op("Max", 1.0).cast(np.int64)
-    least, step = config.min_side_px, config.step_px
+    least = config.min_side_px
+    step = config.step_px
     lacking = ((work + (step - 1)) / step * step).op("Max", least) - work
-    above, beside = _side(lacking, 0), _side(lacking, 1)
+    above = _side(lacking, 0)
+    beside = _side(lacking, 1)
     pads = graph.op("Concat", [0, 0], above, [0, 0, 0, 0], beside, axis=0)
     mean, deviation = (
         np.array(v, np.float32)[:, None, None] for v in (IMAGENET_MEAN, IMAGENET_STD)
@@ -435,7 +444,8 @@ def _image_export(weights: DepthWeights, facts: dict[str, Any]) -> Export:
             where = {"depth_m": is_near | case.expected["is_sky"] if sky else is_near}
             yield replace(case, where=where)
 
-    generator, names = weights.generator, ("virtual_focal_px", "virtual_baseline_m", "answer")
+    generator = weights.generator
+    names = ("virtual_focal_px", "virtual_baseline_m", "answer")
     rig = {} if generator is None else {name: getattr(generator.config, name) for name in names}
     chooses = isinstance(generator, SelectionGenerator) or isinstance(weights.matcher, _FLIPPING)
     return Export(
@@ -477,7 +487,8 @@ def _scenes(
     f = share * focal_px
     K = torch.tensor([[f, 0, columns / 2], [0, f, rows / 2], [0, 0, 1]], dtype=torch.float64)
     camera = Camera(width=columns, height=rows, K=K)
-    shift, chance = round(_SHIFT_PX * share), torch.Generator().manual_seed(0)
+    shift = round(_SHIFT_PX * share)
+    chance = torch.Generator().manual_seed(0)
     noise = torch.rand(count, 3, rows // 6, columns // 6, generator=chance)
     scene = F.interpolate(noise, (rows, columns + shift), mode="bicubic").clamp(0, 1)
     if with_sky:  # bright and smooth, over the upper two fifths

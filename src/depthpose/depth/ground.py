@@ -20,11 +20,14 @@ _LEAST_SHARE = 0.25
 """Of the points in the lower part of the image, on the plane; with less there is no ground."""
 _MOST_ROLL_DEG = 10.0
 _MOST_TILT, _MOST_ROLL = (math.tan(math.radians(angle)) for angle in (25, _MOST_ROLL_DEG))
-_LEAST_HEIGHT_M, _MOST_HEIGHT_M = 0.2, 20.0
-_MOST_ROAD_TILT_DEG, _MOST_TILT_APART_DEG = 15.0, 8.0
+_LEAST_HEIGHT_M = 0.2
+_MOST_HEIGHT_M = 20.0
+_MOST_ROAD_TILT_DEG = 15.0
+_MOST_TILT_APART_DEG = 8.0
 """Steeper planes were no road in any of 59 views by cameras tilted up to 7 degrees, and roads were
 at most 5.5 degrees off the true tilt."""
-_ON_PLANE, _FARTHEST_M = 0.15, 200.0
+_ON_PLANE = 0.15
+_FARTHEST_M = 200.0
 """What is off the plane by less, in the logarithm of depth, lies on it; by twice as much, not."""
 _WINDOW_PX = 5
 """Side of the square around a pixel whose distance is known."""
@@ -61,8 +64,8 @@ def fit_ground(depth_m: Map, camera: Camera) -> Ground | None:
     is_upright = abs(tilt_deg) <= _MOST_ROAD_TILT_DEG and abs(roll_deg) < _MOST_ROLL_DEG
     if share < _LEAST_SHARE or not (is_upright and _LEAST_HEIGHT_M < height_m < _MOST_HEIGHT_M):
         return None
-    kept = [k for k in (is_on & (strips != n) for n in range(_STRIPS)) if int(k.sum()) >= 30]
-    parts = torch.tensor([_fit_plane(rays[k], inverse[k])[1] for k in kept])
+    selections = [k for k in (is_on & (strips != n) for n in range(_STRIPS)) if int(k.sum()) >= 30]
+    parts = torch.tensor([_fit_plane(rays[k], inverse[k])[1] for k in selections])
     # The jackknife's deviation: how far the fit moves when a part of the columns is left out.
     spread = ((len(parts) - 1) / len(parts) * ((parts - parts.mean(0)) ** 2).sum(0)).sqrt()
     return Ground(
@@ -78,13 +81,14 @@ def _lower_points(
     height, width = depth_m.shape
     top = height * 3 // 5
     step = max(math.isqrt((height - top) * width // _POINTS), 1)
-    rows, columns = torch.arange(top, height, step), torch.arange(width // 7, width * 6 // 7, step)
+    rows = torch.arange(top, height, step)
+    columns = torch.arange(width // 7, width * 6 // 7, step)
     v, u = (part.flatten() for part in torch.meshgrid(rows, columns, indexing="ij"))
     inverse = 1 / depth_m.detach().cpu().double()[v, u]
-    known = inverse.isfinite() & (inverse > 0)
+    has_depth = inverse.isfinite() & (inverse > 0)
     pixels = torch.stack([u, v, torch.ones_like(u)], 1).double()
     rays = pixels @ torch.linalg.inv(camera.K).T
-    return rays[known], inverse[known], (u * _STRIPS // width)[known]
+    return rays[has_depth], inverse[has_depth], (u * _STRIPS // width)[has_depth]
 
 
 def _fit_plane(
@@ -98,43 +102,44 @@ def _fit_plane(
     return plane, (1 / math.hypot(x, y, z), tilt_deg, roll_deg)
 
 
-def scale_by_mount(found: DepthEstimate, image: StereoInput) -> DepthEstimate:
+def scale_by_mount(estimate: DepthEstimate, image: StereoInput) -> DepthEstimate:
     """Find the ground and, where the camera's height is known, correct the scale by it.
 
     How large things look says another scale, so that the square root of the ground's factor is
     taken. With a tilt too the plane is known, and what lies on the ground gets its depth.
     """
-    camera, name = image.camera, image.name
-    assert camera is not None and found.depth_m is not None  # noqa: PT018
-    ground = fit_ground(found.depth_m, camera)
+    camera = image.camera
+    name = image.name
+    assert camera is not None and estimate.depth_m is not None  # noqa: PT018
+    ground = fit_ground(estimate.depth_m, camera)
     if camera.mount_height_m is None:
-        return replace(found, ground=ground)
+        return replace(estimate, ground=ground)
     if ground is None:
         raise InputError(
             f"{name}: no road is seen in its lower part, so a camera height of "
             f"{camera.mount_height_m:g} m cannot set the scale; omit it, or give --known-distance"
         )
     if camera.tilt_deg is None:
-        return rescale(found, (camera.mount_height_m / ground.height_m) ** 0.5, fit=ground)
+        return rescale(estimate, (camera.mount_height_m / ground.height_m) ** 0.5, fit=ground)
     mounted = replace(ground, height_m=camera.mount_height_m, tilt_deg=camera.tilt_deg)
-    rays, inverse, _ = _lower_points(found.depth_m, camera)
-    known = rays @ _plane(mounted)
-    is_on = ((rays @ _plane(ground) / inverse - 1).abs() < _INLIER) & (known > 0)
+    rays, inverse, _ = _lower_points(estimate.depth_m, camera)
+    true_inverse = rays @ _plane(mounted)
+    is_on = ((rays @ _plane(ground) / inverse - 1).abs() < _INLIER) & (true_inverse > 0)
     if abs(camera.tilt_deg - ground.tilt_deg) > _MOST_TILT_APART_DEG or int(is_on.sum()) < 30:
         raise InputError(
             f"{name}: a tilt of {camera.tilt_deg:g} degrees is given, and the road that is seen "
             f"says {ground.tilt_deg:.1f}. Negative is down; correct it, or omit it"
         )
-    factor = (inverse[is_on] / known[is_on]).median() ** 0.5
-    height, width = found.depth_m.shape
+    factor = (inverse[is_on] / true_inverse[is_on]).median() ** 0.5
+    height, width = estimate.depth_m.shape
     v, u = torch.meshgrid(torch.arange(height), torch.arange(width), indexing="ij")
     rays = torch.stack([u, v, torch.ones_like(u)], 2).double() @ torch.linalg.inv(camera.K).T
-    depth_m = found.depth_m.cpu().double()
+    depth_m = estimate.depth_m.cpu().double()
     off = (rays @ _plane(ground) * depth_m).log().abs()
     on_plane = (2 - off / _ON_PLANE).clamp(0, 1).nan_to_num(0.0)
     to_plane = 1 / (rays @ _plane(mounted)).clamp(min=1 / _FARTHEST_M) / depth_m
     changed = factor ** (1 - on_plane) * to_plane**on_plane
-    return replace(rescale(found, changed.to(found.depth_m)), ground=mounted)
+    return replace(rescale(estimate, changed.to(estimate.depth_m)), ground=mounted)
 
 
 def _plane(ground: Ground) -> Float[Tensor, "3"]:
@@ -144,23 +149,23 @@ def _plane(ground: Ground) -> Float[Tensor, "3"]:
 
 
 def rescale(
-    found: DepthEstimate, factor: float | Map, *, fit: Ground | None = None
+    estimate: DepthEstimate, factor: float | Map, *, fit: Ground | None = None
 ) -> DepthEstimate:
     """Multiply the depth of an estimate by ``factor``, and divide its disparity; not the sky's."""
-    assert found.depth_m is not None
-    ground = found.ground if fit is None else fit
+    assert estimate.depth_m is not None
+    ground = estimate.ground if fit is None else fit
     if ground is not None and not isinstance(factor, Tensor):
         ground = replace(
             ground, height_m=ground.height_m * factor, height_std_m=ground.height_std_m * factor
         )
-    px = found.disparity_px / factor
-    if found.is_sky is not None:
-        px = torch.where(found.is_sky, found.disparity_px, px)
-    return replace(found, depth_m=found.depth_m * factor, disparity_px=px, ground=ground)
+    px = estimate.disparity_px / factor
+    if estimate.is_sky is not None:
+        px = torch.where(estimate.is_sky, estimate.disparity_px, px)
+    return replace(estimate, depth_m=estimate.depth_m * factor, disparity_px=px, ground=ground)
 
 
 def scale_by_distance(
-    found: DepthEstimate, name: str, known: tuple[float, float, float]
+    estimate: DepthEstimate, name: str, distance: tuple[float, float, float]
 ) -> DepthEstimate:
     """Make the depth around a pixel what was measured there: its column, its row, camera z [m].
 
@@ -169,19 +174,21 @@ def scale_by_distance(
     Raises:
         InputError: a pixel outside the image, no depth around it (the sky), or no distance.
     """
-    column, row, metres = known
-    assert found.depth_m is not None
-    height, width = found.depth_m.shape
-    said = f"{name}: known distance {column:g},{row:g},{metres:g}"
+    column, row, metres = distance
+    assert estimate.depth_m is not None
+    height, width = estimate.depth_m.shape
+    context = f"{name}: known distance {column:g},{row:g},{metres:g}"
     if not (math.isfinite(metres) and metres > 0):
-        raise InputError(f"{said}: metres must be a positive number")
+        raise InputError(f"{context}: metres must be a positive number")
     if not (-0.5 <= column < width - 0.5 and -0.5 <= row < height - 0.5):
         raise InputError(
-            f"{said}: the image is {width}x{height}, columns 0 to {width - 1} and rows 0 to "
+            f"{context}: the image is {width}x{height}, columns 0 to {width - 1} and rows 0 to "
             f"{height - 1}; give X,Y,METRES of a pixel of it"
         )
-    reach, x, y = _WINDOW_PX // 2, round(column), round(row)
-    around = found.depth_m[max(y - reach, 0) : y + reach + 1, max(x - reach, 0) : x + reach + 1]
-    if not bool(found.depth_m[min(y, height - 1), min(x, width - 1)].isfinite()):
-        raise InputError(f"{said}: there is no depth at this pixel (the sky?); take another")
-    return rescale(found, metres / float(around[around.isfinite()].median()))
+    reach = _WINDOW_PX // 2
+    x = round(column)
+    y = round(row)
+    around = estimate.depth_m[max(y - reach, 0) : y + reach + 1, max(x - reach, 0) : x + reach + 1]
+    if not bool(estimate.depth_m[min(y, height - 1), min(x, width - 1)].isfinite()):
+        raise InputError(f"{context}: there is no depth at this pixel (the sky?); take another")
+    return rescale(estimate, metres / float(around[around.isfinite()].median()))

@@ -107,14 +107,17 @@ def label_pair(net: FakestereoNet, pair: StereoInput, config: LabelConfig) -> Ma
     """Match a pair both ways [px]; NaN where they disagree, in the sky, or where it is not sure."""
     assert pair.right is not None
     mirrored = replace(pair, left=pair.right.flip(-1), right=pair.left.flip(-1))
-    one, other = (net.estimate_pair(views, with_check=False) for views in (pair, mirrored))
-    left_px, right_px = one.disparity_px, other.disparity_px.flip(-1)
+    of_pair, of_mirrored = (
+        net.estimate_pair(views, with_check=False) for views in (pair, mirrored)
+    )
+    left_px = of_pair.disparity_px
+    right_px = of_mirrored.disparity_px.flip(-1)
     limit_px = (config.largest_share * left_px).clamp(min=config.largest_difference_px)
     is_known = (left_px - warp_right_to_left(right_px[None], left_px)[0]).abs() <= limit_px
-    if one.confidence is not None:
-        is_known &= one.confidence >= config.least_confidence
-    if one.is_sky is not None:
-        is_known &= ~one.is_sky
+    if of_pair.confidence is not None:
+        is_known &= of_pair.confidence >= config.least_confidence
+    if of_pair.is_sky is not None:
+        is_known &= ~of_pair.is_sky
     return torch.where(is_known, left_px, torch.nan)
 
 
@@ -127,7 +130,8 @@ def _write_calibration(path: Path, rigs: Mapping[str, StereoRig]) -> None:
     parts = [line.rsplit(maxsplit=8) for line in there]
     lines = {part[0]: line for part, line in zip(parts, there, strict=True) if len(part) == 9}
     for name, rig in rigs.items():
-        K, shift_px = rig.K, rig.cx_right_minus_left_px
+        K = rig.K
+        shift_px = rig.cx_right_minus_left_px
         values = (K[0, 0], K[0, 2], K[1, 2], rig.baseline_m, K[1, 1], shift_px)
         numbers = " ".join(f"{float(value):.9g}" for value in values)
         lines[name] = f"{name} {rig.width} {rig.height} {numbers}"

@@ -56,7 +56,8 @@ def heads_loss(
 
 def sky_loss(probability: Maps, truth_px: Maps) -> Float[Tensor, ""]:
     """Mean cross entropy of the class of the sky, where it is known whether it is (truth 0)."""
-    is_known, is_sky = truth_px >= 0, truth_px == 0
+    is_known = truth_px >= 0
+    is_sky = truth_px == 0
     of_truth = torch.where(is_sky, probability, 1 - probability)
     # Gradients stay finite where a probability is 0 in float32.
     losses = torch.where(is_known, -(of_truth + 1e-4).log(), 0.0)
@@ -109,7 +110,8 @@ def plane_loss(
     share = torch.where(is_sky, 0.0, place - lower)
     first = torch.where(is_sky, 0, lower.long() + 1)[:, None]
     scores = logits.float().log_softmax(1)
-    near, far = scores.gather(1, first)[:, 0], scores.gather(1, first + 1)[:, 0]
+    near = scores.gather(1, first)[:, 0]
+    far = scores.gather(1, first + 1)[:, 0]
     return _mean_of_images(-(near * (1 - share) + far * share), truth_px >= 0)
 
 

@@ -55,8 +55,9 @@ def measure(of: Quantity, predicted: Numbers, true: Numbers) -> dict[str, float]
                     f"the {role} depth holds values that are not positive and finite; mask or "
                     "clamp them first, as the protocol says."
                 )
-    p, t = predicted.double(), true.double()
-    return {one.name: one.function(p, t) for one in METRICS.values() if one.of == of}
+    p = predicted.double()
+    t = true.double()
+    return {metric.name: metric.function(p, t) for metric in METRICS.values() if metric.of == of}
 
 
 def _end_point_error(p: Tensor, t: Tensor) -> float:
@@ -106,7 +107,8 @@ RANKING: dict[Quantity, str] = {"depth": "abs_rel", "disparity": "epe_px"}
 def garg_crop(height: int, width: int) -> Bool[Tensor, "height width"]:
     """Mask of Garg et al. (2016), its corners truncated as in the published script."""
     mask = torch.zeros(height, width, dtype=torch.bool)
-    top, bottom = int(0.40810811 * height), int(0.99189189 * height)
+    top = int(0.40810811 * height)
+    bottom = int(0.99189189 * height)
     mask[top:bottom, int(0.03594771 * width) : int(0.96405229 * width)] = True
     return mask
 
@@ -125,14 +127,15 @@ def sparsification_area(error: Numbers, confidence: Numbers, steps: int = 50) ->
         raise InputError("sparsification_area: there is no pixel to compare.")
     if float(error.double().mean()) == 0:
         return 0.0
-    error, curves = error.double(), []
+    error = error.double()
+    curves = []
     for keep_first in (confidence.double(), -error):
         # The mean error of what is left, the pixels of low ``keep_first`` removed first.
         descending = torch.argsort(keep_first, descending=True)
         counts = torch.arange(1, len(error) + 1)
         running = _shared_error(error, keep_first)[descending].cumsum(0) / counts
-        kept = len(error) * (1 - torch.arange(steps, dtype=error.dtype) / steps)
-        curves.append(running[kept.ceil().long().clamp(min=1) - 1])
+        remaining = len(error) * (1 - torch.arange(steps, dtype=error.dtype) / steps)
+        curves.append(running[remaining.ceil().long().clamp(min=1) - 1])
     return float(((curves[0] - curves[1]) / error.mean()).mean())
 
 

@@ -64,6 +64,7 @@ def write_estimate(
     estimate: DepthEstimate,
     range_m: tuple[float, float] = COLOR_RANGE_M,
     cloud_m: float | None = None,
+    min_confidence: float | None = None,
 ) -> list[Path]:
     """Write the files of one estimate, and give them; the disparity comes last.
 
@@ -71,16 +72,17 @@ def write_estimate(
     ``NAME.color.png``, ``NAME.right.png`` (synthesised), ``NAME.sky.png`` (8 bit, 255 in the sky),
     ``NAME.ground.json`` (:class:`~depthpose.depth.types.Ground`), ``NAME.warning.txt`` and
     ``NAME.disparity_px.npy``, each where the estimate has it, and ``NAME.cloud.ply``
-    (``DepthEstimate.cloud``) of what is nearer than ``cloud_m``, if that is given. The disparity is
-    that of the frame's own rig.
+    (``DepthEstimate.cloud``) of what is nearer than ``cloud_m``, if that is given, and as sure as
+    ``min_confidence``. The disparity is that of the frame's own rig.
     """
-    depth_m, is_sky = estimate.depth_m, estimate.is_sky
+    depth_m = estimate.depth_m
+    is_sky = estimate.is_sky
     color = (
         draw_disparity(estimate.disparity_px, is_sky=is_sky)
         if depth_m is None
         else draw_depth(depth_m, *range_m)
     )
-    cloud = None if cloud_m is None else replace(estimate, seen=pair).cloud(cloud_m)
+    cloud = None if cloud_m is None else replace(estimate, seen=pair).cloud(cloud_m, min_confidence)
     parts: dict[str, tuple[Callable[..., None], Any]] = {
         CLOUD: (files.write_cloud, cloud),
         "warning.txt": (

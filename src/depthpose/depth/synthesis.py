@@ -179,7 +179,8 @@ class SelectionGenerator(nn.Module):
         super().__init__()
         self.config = config or SelectionConfig()
         self.encoder = LiteEncoder(self.config.encoder_width)
-        widths, skips = self.config.widths, self.encoder.channels[-2::-1]
+        widths = self.config.widths
+        skips = self.encoder.channels[-2::-1]
         self.top = nn.Conv2d(self.encoder.channels[-1], widths[0], 1)
         inputs = (widths[0], *widths[:-1])
         self.decoder = nn.ModuleList()
@@ -382,7 +383,8 @@ def mix_shifts(left: Views, logits: Logits, planes: Planes) -> Views:
     for number, shift in enumerate(planes.tolist(), 1):
         whole = math.floor(shift)
         part = shift - whole
-        near, far = padded[..., whole : whole + width], padded[..., whole + 1 : whole + 1 + width]
+        near = padded[..., whole : whole + width]
+        far = padded[..., whole + 1 : whole + 1 + width]
         drawn = drawn + shares[:, number : number + 1] * torch.lerp(near, far, part)
     return drawn
 
@@ -447,15 +449,17 @@ class SelectionSynthesiser:
         limits_px = [most_px * size[1] / images.shape[-1] for images in sizes]
         views = [select_views(self.generator, images, size) for images in sizes]
         lefts, rights = zip(*views, strict=True)
-        seen, other, home = average(lefts, limits_px), average(rights, limits_px), left.device
+        of_left = average(lefts, limits_px)
+        other = average(rights, limits_px)
+        home = left.device
         right = shift_left(sizes[0], torch.where(other.sky > 0.5, 0.0, other.disparity_px))
-        is_sky = seen.sky > 0.5
+        is_sky = of_left.sky > 0.5
         return SynthesisedViews(
             right=right.to(home),
-            disparity_px=seen.disparity_px.to(home),
-            confidence=torch.where(is_sky, seen.sky, seen.sure * (1 - seen.sky)).to(home),
+            disparity_px=of_left.disparity_px.to(home),
+            confidence=torch.where(is_sky, of_left.sky, of_left.sure * (1 - of_left.sky)).to(home),
             is_sky=is_sky.to(home),
-            street=None if seen.street is None else seen.street.to(home),
+            street=None if of_left.street is None else of_left.street.to(home),
         )
 
 
@@ -511,10 +515,10 @@ def select_views(
     columns = max(_near_multiple(width, multiple, COLUMNS_SHARE) // 2 * 2, 2)
     padded = pad_to_multiple(resize_image(left, rows, columns), multiple)
     features = generator.encoder(padded)
-    kept = (logits[..., : rows // 2, : columns // 2] for logits in generator.decode(features))
+    cropped = (logits[..., : rows // 2, : columns // 2] for logits in generator.decode(features))
     planes = generator.planes * (size[1] / columns)
     views = []
-    for logits, street in zip(kept, (generator.find_street(features[-1]), None), strict=True):
+    for logits, street in zip(cropped, (generator.find_street(features[-1]), None), strict=True):
         log_px, sky, sure = (
             F.interpolate(part[:, None], size, mode="bilinear")[:, 0]
             for part in read_logits(logits, planes)
@@ -572,14 +576,14 @@ def import_encoder(file: Path, out: Path) -> None:
     Raises:
         InputError: names or shapes are not those of the network.
     """
-    kept = {}
+    state = {}
     for name, tensor in read_published(file, "EfficientNet-Lite0").items():
         for pattern, ours in _NAMES:
             name = re.sub(pattern, ours, name)  # noqa: PLW2901
         if not name.startswith(_OF_THE_CLASSIFIER):
-            kept[name] = tensor
+            state[name] = tensor
     encoder = LiteEncoder()
-    load_weights(encoder, Checkpoint(kind=ENCODER_KIND, config={}, state=kept), "the checkpoint")
+    load_weights(encoder, Checkpoint(kind=ENCODER_KIND, config={}, state=state), "the checkpoint")
     facts = {"trained_on": "ImageNet", "licence": "Apache-2.0"}
     save_imported(out, ENCODER_KIND, encoder.eval(), file, facts)
 
@@ -591,10 +595,11 @@ def load_encoder(encoder: LiteEncoder, path: Path) -> None:
     """
     whole = LiteEncoder()
     load_weights(whole, read_checkpoint(path, ENCODER_KIND), str(path))
-    state, own = whole.state_dict(), encoder.state_dict()
-    if any(state[name].shape != tensor.shape for name, tensor in own.items()):
+    state = whole.state_dict()
+    needed = encoder.state_dict()
+    if any(state[name].shape != tensor.shape for name, tensor in needed.items()):
         raise InputError(
             f"{path}: holds {ENCODER_KIND} at its full width, and this encoder is narrower; "
             "set encoder_width to 1, or begin at random."
         )
-    encoder.load_state_dict({name: state[name] for name in own})
+    encoder.load_state_dict({name: state[name] for name in needed})

@@ -128,8 +128,28 @@ class DepthEstimate:
     #: alone
     seen: StereoInput | None = None
 
-    def cloud(self, far_m: float = 80.0) -> Cloud:
+    def is_sure(self, min_confidence: float | None = None) -> Mask:
+        """Say which pixels have a depth that is as sure as that.
+
+        Args:
+            min_confidence: 0..1; None: 0.5 of a pair, where it says that the disparity is more
+                probably right within 15 % than not; all of one image, and where the matcher has no
+                confidence.
+        """
+        values = self.disparity_px if self.depth_m is None else self.depth_m
+        known = torch.isfinite(values)
+        is_pair = self.seen is not None and self.seen.right is not None
+        least = (0.5 if is_pair else 0.0) if min_confidence is None else min_confidence
+        if self.confidence is None or least <= 0:
+            return known
+        return known & (self.confidence >= least)
+
+    def cloud(self, far_m: float = 80.0, min_confidence: float | None = None) -> Cloud:
         """Give the coloured points nearer than ``far_m``, in metres in the left camera's frame.
+
+        Args:
+            far_m: farther ones are left out.
+            min_confidence: less sure ones are left out, as :meth:`is_sure` says.
 
         Raises:
             InputError: there are no metres, or what was seen is not known.
@@ -141,7 +161,8 @@ class DepthEstimate:
                 f"{self.seen.name}: a cloud needs metres: give a camera with a baseline."
             )
         points_m = back_project(self.depth_m, self.seen.camera.K).reshape(-1, 3)
-        is_kept = torch.isfinite(points_m).all(-1) & (points_m[:, 2] <= far_m)
+        is_kept = self.is_sure(min_confidence).reshape(-1)
+        is_kept &= torch.isfinite(points_m).all(-1) & (points_m[:, 2] <= far_m)
         color = self.seen.left.permute(1, 2, 0).reshape(-1, 3)
         return Cloud(points=points_m[is_kept].float(), color=color[is_kept])
 
@@ -157,24 +178,29 @@ class DepthEstimate:
     def __repr__(self) -> str:
         """Say it in one line: size, metres, certainty."""
         height, width = self.disparity_px.shape
-        what, unit, values = "depth", "m", self.depth_m
+        what = "depth"
+        unit = "m"
+        values = self.depth_m
         if values is None:
-            what, unit, values = "disparity", "px", self.disparity_px
-        known, spread = values[values.isfinite()], "nowhere known"
-        if len(known):
+            what = "disparity"
+            unit = "px"
+            values = self.disparity_px
+        finite = values[values.isfinite()]
+        spread = "nowhere known"
+        if len(finite):
             # What is farthest is one pixel.
-            low, middle, high = np.percentile(known.numpy(force=True), (1, 50, 99))
-            share = len(known) / values.numel()
+            low, middle, high = np.percentile(finite.numpy(force=True), (1, 50, 99))
+            share = len(finite) / values.numel()
             part = "" if share == 1 else f", known of {share:.0%}"
             spread = f"{low:.1f} .. {high:.1f} {unit} (1 to 99 %, median {middle:.1f}{part})"
-        said = [f"{width}x{height}", f"{what} {spread}"]
+        parts = [f"{width}x{height}", f"{what} {spread}"]
         if self.confidence is not None:
-            said.append(f"mean confidence {float(self.confidence.nanmean()):.2f}")
+            parts.append(f"mean confidence {float(self.confidence.nanmean()):.2f}")
         if self.is_sky is not None:
-            said.append(f"sky {float(self.is_sky.float().mean()):.0%}")
+            parts.append(f"sky {float(self.is_sky.float().mean()):.0%}")
         if self.warning:
-            said.append(f"warning: {self.warning}")
-        return f"DepthEstimate({', '.join(said)})"
+            parts.append(f"warning: {self.warning}")
+        return f"DepthEstimate({', '.join(parts)})"
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

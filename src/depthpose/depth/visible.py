@@ -1,5 +1,7 @@
 """Where an image shows nothing: borders without a picture, surfaces without any texture."""
 
+from typing import cast
+
 import numpy as np
 import torch
 from jaxtyping import Bool, Float
@@ -15,13 +17,15 @@ _DARK = 24 / 255
 """The bars of films are black, which videos store as 16 of 255."""
 _BLACK = 2 / 255
 """What a rectified image has where the raw one shows nothing, as it is stored in JPEG too."""
-_LEAST_BAR, _LEAST_SHARE = 0.01, 0.0005
+_LEAST_BAR = 0.01
+_LEAST_SHARE = 0.0005
 """Of a side, and of the image: what is smaller is a dark pixel of the picture."""
 _LEAST_PICTURE = 0.1
 """Of the image: where less would be left, it is black or plain itself, and nothing is a border."""
 _MIXED_PX = 2
 """So far into the border, pixels are a mixture of picture and black: cubic resampling."""
-_PATCH_SHARE, _LEAST_RADIUS_PX = 8 / 1242, 4
+_PATCH_SHARE = 8 / 1242
+_LEAST_RADIUS_PX = 4
 """Radius of a patch, as a share of the width."""
 _ROUNDING = 0.5 / 255
 """Spread of grey values in a patch, below which it is rounding alone: half a level of 8 bits."""
@@ -45,7 +49,7 @@ def without_picture(image: Float[Tensor, "3 h w"]) -> Bool[Tensor, "h w"]:
     dark = (image.amax(0) <= _BLACK).cpu().numpy()
     on_edge = np.concatenate([dark[0], dark[-1], dark[:, 0], dark[:, -1]])
     if on_edge.any():
-        regions, count = ndimage.label(dark)
+        regions, count = cast("tuple[np.ndarray, int]", ndimage.label(dark))
         at_edge = (regions[0], regions[-1], regions[:, 0], regions[:, -1])
         is_border = np.zeros(count + 1, dtype=bool)
         is_border[np.unique(np.concatenate(at_edge))] = True
@@ -63,7 +67,9 @@ def _bars(image: Float[Tensor, "3 _ _"]) -> tuple[int, int]:
     """
     counts: list[int] = []
     dark: list[bool] = []
-    least, most = image.amin(2), image.amax(2)  # of each channel and row
+    # of each channel and row
+    least = image.amin(2)
+    most = image.amax(2)
     for low, high in ((least, most), (least.flip(1), most.flip(1))):
         is_same = (high - low[:, :1] <= _SAME) & (high[:, :1] - low <= _SAME)
         count = int(is_same.all(0).long().cumprod(0).sum())

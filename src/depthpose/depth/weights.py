@@ -49,7 +49,8 @@ MATCHERS = {
 }
 """Kinds of matchers with weights: a new one is a file with its three parts and one entry here."""
 
-BOTH, _SELECTION = "fakestereo", "selection"
+BOTH = "fakestereo"
+_SELECTION = "selection"
 _FORMER = ("candidates", "encoder_kind", "scales", "test_mode", "with_agreement", "with_refinement")
 """Settings of before, which weights files hold: networks have one value of each."""
 Use = Literal["images", "pairs"]
@@ -83,7 +84,8 @@ def read_depth_weights(
     Raises:
         InputError: not such weights, or weights that do not fit their own config.
     """
-    checkpoint, kinds = checkpoints.read_checkpoint(path), {**GENERATORS, **MATCHERS}
+    checkpoint = checkpoints.read_checkpoint(path)
+    kinds = {**GENERATORS, **MATCHERS}
     if checkpoint.kind not in (*kinds, BOTH):
         raise InputError(
             f"{path}: holds weights of kind {checkpoint.kind!r}; depth takes "
@@ -94,11 +96,12 @@ def read_depth_weights(
     for kind in kinds if is_both else ():  # its config names the networks
         if kind not in checkpoint.config:
             continue
-        config, prefix = checkpoint.config[kind], f"{kind}."
+        config = checkpoint.config[kind]
+        prefix = f"{kind}."
         if not isinstance(config, Mapping):
             raise InputError(f"{path}: its config has no {kind!r}; the file is damaged.")
-        given = checkpoint.state.items()
-        state = {key.removeprefix(prefix): t for key, t in given if key.startswith(prefix)}
+        tensors = checkpoint.state.items()
+        state = {key.removeprefix(prefix): t for key, t in tensors if key.startswith(prefix)}
         parts[kind] = checkpoints.Checkpoint(kind=kind, config=config, state=state)
     if is_both and not (set(parts) & set(GENERATORS) and set(parts) & set(MATCHERS)):
         raise InputError(
@@ -197,9 +200,11 @@ def write_depth_weights(
     configs = {kind: config_to_dict(part.config) for kind, part in parts.items()}
     if len(parts) == 1:
         kind = next(iter(parts))
-        config, state = configs[kind], states[kind]
+        config = configs[kind]
+        state = states[kind]
     else:
-        kind, config = BOTH, configs
+        kind = BOTH
+        config = configs
         state = {f"{name}.{key}": t for name, s in states.items() for key, t in s.items()}
     checkpoints.save_checkpoint(
         path, checkpoints.Checkpoint(kind=kind, config=config, state=state, facts=facts)
@@ -250,14 +255,14 @@ def calibrate_weights(
     """
     refuse_share(len(image_confidence), alarm_share)
     least = min(round(float(np.quantile(image_confidence, alarm_share)), 4), 0.9999)
-    found = checkpoints.read_checkpoint(weights)
-    config = dict(found.config)
-    own = {BOTH: config.get(_SELECTION), _SELECTION: config}.get(found.kind)
-    if not isinstance(own, dict):
+    checkpoint = checkpoints.read_checkpoint(weights)
+    config = dict(checkpoint.config)
+    selection = {BOTH: config.get(_SELECTION), _SELECTION: config}.get(checkpoint.kind)
+    if not isinstance(selection, dict):
         raise InputError(
             f"{weights}: holds no generator that selects; take weights of 'train select'"
         )
-    changed = {**own, "least_confidence": least}
-    config = {**config, _SELECTION: changed} if found.kind == BOTH else changed
-    checkpoints.save_checkpoint(out, replace(found, config=config))
+    changed = {**selection, "least_confidence": least}
+    config = {**config, _SELECTION: changed} if checkpoint.kind == BOTH else changed
+    checkpoints.save_checkpoint(out, replace(checkpoint, config=config))
     return least

@@ -390,7 +390,9 @@ def _read_view(
         pixels = mask.mask(height, width)
     if isinstance(mask, Path):
         pixels = read_mask(mask)
-    return replace(dataset.view(instance, pixels).input, name=name, object=object)
+    is_region = isinstance(mask, Detection) and mask.box is not None
+    view = dataset.view(instance, pixels).input
+    return replace(view, name=name, object=object, is_region=is_region)
 
 
 def detection_jobs(

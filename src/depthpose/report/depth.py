@@ -65,7 +65,8 @@ def depth_section(
             points_m = take_evenly(points_m, _TRUE_POINTS)
             color = torch.tensor(_TRUE).expand(len(points_m), 3)
             layer = Layer(name="true points", shape=Cloud(points=points_m, color=color))
-            caption, layers = f"{scenes[0].caption}; the truth in green", [*scenes[0].layers, layer]
+            caption = f"{scenes[0].caption}; the truth in green"
+            layers = [*scenes[0].layers, layer]
             scenes = [Scene(caption=caption, layers=layers)]
     pictures = [Drawing(image=pair.left, caption="image")] if with_image else []
     if estimate.depth_m is None:
@@ -83,21 +84,25 @@ def depth_section(
         )
         pictures.append(depth)
     if error is not None:
-        wrong, left = error.error, pair.left
+        wrong = error.error
+        left = pair.left
         is_sparse = float(wrong.isfinite().double().mean()) < _SPARSE
         where = "over the dimmed image" if is_sparse else "grey: not compared"
         if error.is_disparity:
-            top, what = WORST_PX, "disparity error"
+            top = WORST_PX
+            what = "disparity error"
             scale = rising_scale("disparity error [px]", top, has_more=True)
         else:
-            top, what = WORST_SHARE, "depth error as a share of the truth"
+            top = WORST_SHARE
+            what = "depth error as a share of the truth"
             scale = rising_scale("depth error [%]", 100 * top, has_more=True)
         if true_m is not None:
             if is_sparse:
                 image = draw_points(left, true_m, far_m, _RADIUS_PX, near_m)
             else:
                 image = draw_depth(true_m, near_m, far_m)
-            caption, bar = f"true depth; {where}", depth_scale(near_m, far_m)
+            caption = f"true depth; {where}"
+            bar = depth_scale(near_m, far_m)
             pictures.append(Drawing(image=image, caption=caption, scale=bar))
         if is_sparse:
             image = draw_error_points(left, wrong, top, _RADIUS_PX)
@@ -121,7 +126,8 @@ def depth_facts(
     pair: StereoInput, estimate: DepthEstimate, focal: str = ""
 ) -> list[tuple[str, str]]:
     """Say the sizes and the metres of an estimate; ``focal``: words behind the focal length."""
-    camera, depth_m = pair.camera, estimate.depth_m
+    camera = pair.camera
+    depth_m = estimate.depth_m
     height, width = pair.left.shape[1:]
     facts = [("size", f"{width} x {height} px")]
     if isinstance(camera, Camera):
@@ -142,6 +148,10 @@ def depth_facts(
         facts.insert(0, ("warning", estimate.warning))
     if estimate.confidence is not None:
         facts.append(("mean confidence", f"{float(estimate.confidence.nanmean()):.2f}"))
+        shown = replace(estimate, seen=pair)
+        doubted = 1 - float(shown.is_sure().sum() / shown.is_sure(0.0).sum().clamp(min=1))
+        if pair.right is not None:
+            facts.append(("unsure, not in the cloud", f"{doubted:.1%} of the depth"))
     return facts
 
 

@@ -68,10 +68,16 @@ class Scene:
         for layer in self.layers:
             shape = layer.shape
             if isinstance(shape, Cloud):
-                kind, most, places, color = "points", MOST_POINTS, shape.points, shape.color
+                kind = "points"
+                most = MOST_POINTS
+                places = shape.points
+                color = shape.color
                 color = torch.full_like(places, _GREY) if color is None else color
             else:
-                kind, most, places, color = "lines", MOST_LINES, shape.ends_m, shape.color
+                kind = "lines"
+                most = MOST_LINES
+                places = shape.ends_m
+                color = shape.color
             if len(places) > most:
                 thinned.append(f"{layer.name}: {most} of {len(places)}, thinned evenly")
                 # One of each of equal runs, by chance, always the same ones: equal steps through
@@ -80,7 +86,8 @@ class Scene:
                 chance = torch.rand(most, generator=fixed, dtype=torch.float64)
                 sampled = ((torch.arange(most) + chance) * (len(places) / most)).long()
                 sampled = sampled.clamp(max=len(places) - 1)
-                places, color = places[sampled], color[sampled]
+                places = places[sampled]
+                color = color[sampled]
             bytes_of_color = (color.detach().cpu().clamp(0, 1) * 255).round().byte().numpy()
             flat_m = places.detach().cpu().numpy().astype(np.float64).reshape(-1, 3)
             low = flat_m.min(0) if len(flat_m) else np.zeros(3)

@@ -82,7 +82,8 @@ def draw_pose(
 
 def box_edges(model: ObjectModel) -> Float[Tensor, "12 2 3"]:
     """Give both ends of the edges of the model's box, along its axes [m]."""
-    low, high = model.vertices_m.amin(0), model.vertices_m.amax(0)
+    low = model.vertices_m.amin(0)
+    high = model.vertices_m.amax(0)
     corners = torch.cartesian_prod(*torch.stack([low, high], -1))
     pairs = [(a, a | bit) for bit in (1, 2, 4) for a in range(8) if not a & bit]
     return corners[torch.tensor(pairs)]
@@ -97,7 +98,8 @@ def pose_layers(
     estimate's box is seen at first; that of a truth is.
     """
     pose = pose.double()
-    box_m, edges_m = pose.apply(box_edges(model).double()).float(), None
+    box_m = pose.apply(box_edges(model).double()).float()
+    edges_m = None
     if len(model.faces):
         # By place, not by number: STL repeats the points of every face.
         places_m, place = torch.unique(model.vertices_m, dim=0, return_inverse=True)
@@ -145,7 +147,8 @@ def vote_layer(
     voted_m: Float[Tensor, "k 3"],
 ) -> Layer:
     """Show votes: from some points, along directions of any length, past the voted keypoints."""
-    from_m, toward = take_evenly(points_m, _VOTES), take_evenly(directions, _VOTES)
+    from_m = take_evenly(points_m, _VOTES)
+    toward = take_evenly(directions, _VOTES)
     toward = torch.nn.functional.normalize(toward, dim=-1)
     way_m = ((voted_m - from_m[:, None]) * toward).sum(-1, keepdim=True).clamp(min=0)
     starts_m = from_m[:, None].expand_as(toward)
@@ -183,7 +186,8 @@ def grey_depth(depth_m: Float[Tensor, "h w"]) -> Float[Tensor, "3 h w"]:
     if len(depths_m) == 0:
         return torch.zeros(3, *depth_m.shape)
     last = len(depths_m) - 1
-    low, high = float(depths_m[round(0.01 * last)]), float(depths_m[round(0.99 * last)])
+    low = float(depths_m[round(0.01 * last)])
+    high = float(depths_m[round(0.99 * last)])
     share = 1 - ((depth_m - low) / max(high - low, 1e-6)).clamp(0, 1)
     grey = torch.where(depth_m > 0, 0.15 + 0.85 * share, 0.0)
     return grey.nan_to_num(0.0).float().expand(3, -1, -1)
@@ -216,7 +220,9 @@ def pose_section(
     """
     drawings: list[Drawing] = []
     if isinstance(pose_input, ViewInput):
-        pose, mask, K = estimate.camera_from_model, pose_input.mask, pose_input.K
+        pose = estimate.camera_from_model
+        mask = pose_input.mask
+        K = pose_input.K
         what = "depth image, near bright" if image is None else "picture"
         image = grey_depth(pose_input.depth_m) if image is None else image
         caption = f"{what}; the estimated pose blue"
@@ -347,7 +353,8 @@ def pose_scene(
     truth: Rigid | None = None,
 ) -> Scene:
     """Show what was seen, the posed model, its keypoints, and the truth where it is known."""
-    pose, layers = estimate.camera_from_model, list[Layer]()
+    pose = estimate.camera_from_model
+    layers = list[Layer]()
     if pose is not None:
         layers += pose_layers(pose, model, with_box=truth is not None)
     for other in estimate.alternatives:  # by axes and box, not shown at first

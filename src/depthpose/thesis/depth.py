@@ -80,15 +80,15 @@ def join_published(
         for row in table.rows
     ]
     rows: list[dict[str, Any]] = [*printed]
-    for own, row in ours:
+    for counterpart, row in ours:
         assert row.cap_m is not None, "the tables are of depth, and reproduce takes no disparity"
-        one = {**dict.fromkeys(_FIRST, ""), **row.columns(), "source": "ours"}
-        rows.append(one)
+        our_row = {**dict.fromkeys(_FIRST, ""), **row.columns(), "source": "ours"}
+        rows.append(our_row)
         for other in printed:
-            if (other["method"], other["cap_m"]) == (own, row.cap_m):
-                difference = {name: one[name] for name in _FIRST}
-                difference |= {"source": "difference", "method": f"{row.method} - {own}"}
-                difference |= {name: one[name] - other[name] for name in _METRICS}
+            if (other["method"], other["cap_m"]) == (counterpart, row.cap_m):
+                difference = {name: our_row[name] for name in _FIRST}
+                difference |= {"source": "difference", "method": f"{row.method} - {counterpart}"}
+                difference |= {name: our_row[name] - other[name] for name in _METRICS}
                 if row.protocol != other["protocol"]:
                     difference["protocol"] = f"{row.protocol} against {other['protocol']}"
                 rows.append(difference)
@@ -156,7 +156,8 @@ TABLES = {table.number: table for table in (
 """Tables by the thesis's numbers; every figure as printed."""
 
 
-_NEAR_M, _FAR_M = 3.0, 80.0
+_NEAR_M = 3.0
+_FAR_M = 80.0
 _GAP_PX = 8
 _BAR_PX = 18
 

@@ -77,7 +77,8 @@ def draw_discs(
 
 _SURFACE = 4000
 _MARGIN = 1.08
-_TURN_RAD, _TILT_RAD = math.radians(35), math.radians(20)
+_TURN_RAD = math.radians(35)
+_TILT_RAD = math.radians(20)
 """From where models are looked at: from the side and somewhat from above."""
 
 
@@ -140,7 +141,10 @@ def draw_features(
 _ARROWS = 220
 _ARROW_PX = 22.0
 _HEAD = 0.35
-_YELLOW, _RED, _INK, _WHITE = (242, 191, 0), (217, 13, 13), (38, 64, 140), (255, 255, 255)
+_YELLOW = (242, 191, 0)
+_RED = (217, 13, 13)
+_INK = (38, 64, 140)
+_WHITE = (255, 255, 255)
 
 
 def draw_field(
@@ -159,13 +163,15 @@ def draw_field(
     marks = torch.stack([true_m, true_m if voted_m is None else voted_m]).double()[:, :2]
     plane = points_m.double()[:, :2]
     everything = torch.cat([plane, marks])
-    low, high = everything.amin(0), everything.amax(0)
+    low = everything.amin(0)
+    high = everything.amax(0)
     scale = (size_px - 3 * _ARROW_PX) / float((high - low).max().clamp(min=1e-9))
     middle = (low + high) / 2
     plane, marks = ((xy - middle) * scale + size_px / 2 for xy in (plane, marks))
     canvas = Image.new("RGB", (size_px, size_px), "white")
     pen = ImageDraw.Draw(canvas)
-    starts, shafts = take_evenly(plane, _ARROWS), take_evenly(directions.double(), _ARROWS)
+    starts = take_evenly(plane, _ARROWS)
+    shafts = take_evenly(directions.double(), _ARROWS)
     shafts = _ARROW_PX * shafts[:, :2]
     for (x, y), (dx, dy) in zip(starts.tolist(), shafts.tolist(), strict=True):
         tip = (x + dx, y + dy)
@@ -212,7 +218,8 @@ def embed_line(features: Float[Tensor, "n c"], perplexity: float = 40.0) -> Floa
     centred = features.double() - features.double().mean(0)
     y = centred @ torch.linalg.svd(centred, full_matrices=False)[2][0]
     y = 1e-4 * y / y.std().clamp(min=1e-12)
-    speed, gain = torch.zeros_like(y), torch.ones_like(y)
+    speed = torch.zeros_like(y)
+    gain = torch.ones_like(y)
     # A larger one than the curvature at the start allows tears groups apart, and on a line they
     # never come together again.
     rate = len(y) / (4 * _EXAGGERATION)
@@ -223,7 +230,8 @@ def embed_line(features: Float[Tensor, "n c"], perplexity: float = 40.0) -> Floa
         gain = torch.where(agrees, gain + 0.2, gain * 0.8).clamp(min=0.01)
         speed = (0.5 if is_early else 0.8) * speed - rate * gain * gradient
         y = y + speed
-    low, high = y.amin(), y.amax()
+    low = y.amin()
+    high = y.amax()
     return (y - low) / (high - low).clamp(min=1e-12)
 
 
@@ -236,14 +244,16 @@ def joint_probabilities(
     squares.fill_diagonal_(torch.inf)
     near = squares.amin(1, keepdim=True)
     shifted = squares - near  # the nearest counts 1, so nothing vanishes
-    low, high = torch.full_like(near, 1e-12), torch.full_like(near, 1e12)
+    low = torch.full_like(near, 1e-12)
+    high = torch.full_like(near, 1e12)
     for _ in range(_SEARCH):
         precision = (low * high).sqrt()
         rows = torch.exp(-shifted * precision)
         total = rows.sum(1, keepdim=True)
         mean = torch.where(rows > 0, shifted * rows, 0).sum(1, keepdim=True) / total
         is_wide = total.log() + precision * mean > math.log(perplexity)  # entropy over its limit
-        low, high = torch.where(is_wide, precision, low), torch.where(is_wide, high, precision)
+        low = torch.where(is_wide, precision, low)
+        high = torch.where(is_wide, high, precision)
     rows = torch.exp(-shifted * high)
     rows = rows / rows.sum(1, keepdim=True)
     return (rows + rows.T) / (2 * len(x))

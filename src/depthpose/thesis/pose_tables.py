@@ -178,7 +178,8 @@ def _own(rows: Sequence[ObjectRow], columns: Mapping[str, str]) -> dict[str, Any
     by_name = {row.object: row for row in rows}
     # Of one object there is no row of means: it is its own.
     mean = by_name.get("mean", rows[0])
-    origin, conditions = mean.origin, mean.conditions
+    origin = mean.origin
+    conditions = mean.conditions
     assert origin is not None
     assert conditions is not None
     return {
@@ -255,8 +256,11 @@ def cases_of(
     numbers = {model.name: k for k, model in enumerate(net.weights.models)}
     for view in views:
         number = numbers[view.input.object]
-        model, seen = net.weights.models[number], view.input
-        cloud = cloud_from_depth(seen.depth_m, seen.mask, seen.K, model.diameter_m).float()
+        model = net.weights.models[number]
+        view_input = view.input
+        cloud = cloud_from_depth(
+            view_input.depth_m, view_input.mask, view_input.K, model.diameter_m
+        ).float()
         generator = torch.Generator().manual_seed(0)
         points_m = sample_points(cloud, points, generator)
         if refusal_of(points_m, net.weights.cloud) is not None:
@@ -264,14 +268,14 @@ def cases_of(
             continue
         grid = voxelise(points_m, net.weights.cloud)
         places = torch.nn.functional.pad(grid.coordinates, (1, 0))
-        given = SeenPoints(
+        seen_points = SeenPoints(
             points_m=points_m[grid.kept],
             coordinates=places,
             features=grid.features,
             class_of_point=torch.full((len(places),), number),
         )
         with torch.inference_mode():
-            outputs = network.directions(given) @ grid.grid_from_camera
+            outputs = network.directions(seen_points) @ grid.grid_from_camera
             directions = torch.nn.functional.normalize(outputs, dim=-1)[grid.row_of_point]
         yield VotingCase(
             points_m=points_m,
@@ -313,7 +317,8 @@ def compare_voting(cases: Sequence[VotingCase | None], points: int) -> list[dict
     rows: list[dict[str, Any]] = []
     threads = torch.get_num_threads()
     for (method, hypotheses, test), vote in ways.items():
-        successes, seconds = 0, []
+        successes = 0
+        seconds = []
         torch.set_num_threads(1)
         try:
             vote(usable[0])  # warm
@@ -325,7 +330,8 @@ def compare_voting(cases: Sequence[VotingCase | None], points: int) -> list[dict
                 alike = torch.eye(3, dtype=torch.float64).expand(len(keypoints_m), 3, 3)
                 fit = fit_pose(keypoints_m.double(), alike, case.model.keypoints_m)
                 some_m = case.model.vertices_m[:: max(1, len(case.model.vertices_m) // _ADD_POINTS)]
-                pose, diameter_m = fit.camera_from_model, case.model.diameter_m
+                pose = fit.camera_from_model
+                diameter_m = case.model.diameter_m
                 error_m = (adds_m if case.is_adds else add_m)(pose, case.truth, some_m)
                 successes += float(error_m) / diameter_m < SUCCESS_SHARE
         finally:
@@ -359,10 +365,11 @@ def ransac_one_by_one(
     Published practice is 50 hypotheses for each keypoint.
     """
     random = np.random.default_rng(seed)
-    found = []
+    keypoints = []
     for k in range(directions.shape[1]):
         n = directions[:, k]
-        best, chosen = -1, np.ones(len(n), bool)
+        best = -1
+        chosen = np.ones(len(n), bool)
         for _ in range(hypotheses):
             pair = random.choice(len(points_m), 2, replace=False)
             try:
@@ -373,13 +380,14 @@ def ransac_one_by_one(
             inliers = (way * n).sum(1) / np.sqrt((way * way).sum(1)).clip(1e-300) > min_cosine
             count = np.count_nonzero(inliers)
             if count > best:
-                best, chosen = count, inliers
+                best = count
+                chosen = inliers
         try:
             refitted = np.linalg.solve(*_normal_equations(points_m[chosen], n[chosen]))
         except np.linalg.LinAlgError:  # no inlier but parallel ones, or none: all votes count
             refitted = np.linalg.lstsq(*_normal_equations(points_m, n), rcond=None)[0]
-        found.append(refitted)
-    return np.stack(found)
+        keypoints.append(refitted)
+    return np.stack(keypoints)
 
 
 def _normal_equations(points_m: np.ndarray, n: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -103,8 +103,10 @@ class Form:
 
     def pinhole_keys(self, size: tuple[int, int], focal_px: float | None) -> dict[str, Any]:
         """Give size and K of a camera from the fields; the principal point may be the centre."""
-        cx, cy = self.number("cx_px"), self.number("cy_px")
-        cx, cy = (size[0] - 1) / 2 if cx is None else cx, (size[1] - 1) / 2 if cy is None else cy
+        cx = self.number("cx_px")
+        cy = self.number("cy_px")
+        cx = (size[0] - 1) / 2 if cx is None else cx
+        cy = (size[1] - 1) / 2 if cy is None else cy
         K = [[focal_px, 0.0, cx], [0.0, focal_px, cy], [0.0, 0.0, 1.0]]
         return {"width": size[0], "height": size[1], "K": K}
 

@@ -56,7 +56,9 @@ _SAFE = {
     "Referrer-Policy": "no-referrer",
     "Cache-Control": "no-store",
 }
-_MOST_FILES, _MOST_FIELDS, _LONGEST_FIELD = 6, 30, 4096
+_MOST_FILES = 6
+_MOST_FIELDS = 30
+_LONGEST_FIELD = 4096
 
 
 @dataclass(frozen=True)
@@ -109,7 +111,8 @@ async def error_response(_: Request, error: Exception) -> Response:
 
 Result = TypeVar("Result")
 
-GRACE_S, LEAST_BYTES_S = 10.0, 20_000
+GRACE_S = 10.0
+LEAST_BYTES_S = 20_000
 """An upload with fewer bytes a second, after so many seconds, is ended: it keeps others waiting."""
 MOMENT_S = 0.02
 _FULL = "too many requests wait for one computation; try again later"
@@ -133,7 +136,8 @@ def run_in_time(work: Callable[[], Result], most_s: float) -> Result:
     Raises:
         TookTooLong: it did not end before.
     """
-    results, errors = list[Result](), list[BaseException]()
+    results = list[Result]()
+    errors = list[BaseException]()
 
     def run() -> None:
         try:
@@ -146,7 +150,8 @@ def run_in_time(work: Callable[[], Result], most_s: float) -> Result:
     thread.join(most_s)
     if thread.is_alive():
         assert thread.ident is not None
-        ident, kind = ctypes.c_ulong(thread.ident), ctypes.py_object(_Stopped)
+        ident = ctypes.c_ulong(thread.ident)
+        kind = ctypes.py_object(_Stopped)
         ctypes.pythonapi.PyThreadState_SetAsyncExc(ident, kind)
         thread.join(_STOP_S)
     if results:
@@ -204,7 +209,8 @@ async def has_gone(receive: Receive) -> bool:
 
 def paced(receive: Receive) -> Receive:
     """Give a request's body as long as it keeps a pace."""
-    start, size = time.monotonic(), 0
+    start = time.monotonic()
+    size = 0
 
     async def receive_in_time() -> MutableMapping[str, Any]:
         nonlocal size
@@ -306,13 +312,15 @@ class Pages:
 
     async def place(self, request: Request) -> Response:
         """Give the number of computations before that of a ticket; null: it does not wait here."""
-        ticket, waiting = request.path_params["ticket"], self._queue.tickets
+        ticket = request.path_params["ticket"]
+        waiting = self._queue.tickets
         return JSONResponse({"before": waiting.index(ticket) if ticket in waiting else None})
 
     async def estimate(self, request: Request) -> Response:
         """Answer a form."""
         # What is too large is refused unread: a server reads no more than is announced.
-        text, most = request.headers.get("content-length", ""), self._limits.upload_bytes
+        text = request.headers.get("content-length", "")
+        most = self._limits.upload_bytes
         if not text.isdecimal() or "transfer-encoding" in request.headers:
             raise HTTPException(
                 411, "the request has no Content-Length, or comes in chunks; send it whole, with "
@@ -368,7 +376,8 @@ class Pages:
 
     async def download(self, request: Request) -> Response:
         """Give a file of one of the latest answers, or all of them as a ZIP."""
-        key, name = request.path_params["key"], request.path_params["name"]
+        key = request.path_params["key"]
+        name = request.path_params["name"]
         files = self._kept.get(key)
         if files is None or name not in {*files, "all.zip"}:
             raise HTTPException(

@@ -55,7 +55,8 @@ def answer_depth(form: Form, net: FakestereoNet) -> Answer:
             "'depthpose serve' with --weights that have a matcher"
         )
     assert pair.camera is not None
-    camera, focal_px = pair.camera, float(pair.camera.K[0, 0])
+    camera = pair.camera
+    focal_px = float(pair.camera.K[0, 0])
     rig = None if pair.right is not None or net.synthesiser is None else net.synthesiser.config
     height, width = pair.left.shape[1:]
     sizes = []
@@ -107,7 +108,8 @@ def _input(form: Form) -> tuple[StereoInput, str]:
     width, height = image_size(path)
     refuse_large(path.name, width, height)
     has_right = "right" in form.files
-    focal_px, baseline_m = form.number("focal_px"), form.number("baseline_m")
+    focal_px = form.number("focal_px")
+    baseline_m = form.number("baseline_m")
     if has_right and baseline_m is None and "camera" not in form.files:
         raise InputError(
             "baseline: the depth of a pair needs the distance of its two cameras; fill in the "
@@ -179,7 +181,8 @@ def _sentence(pair: StereoInput, estimate: DepthEstimate) -> str:
         if pair.right is not None and sky < _ALL_SKY:
             why = ": is the pair rectified, and are left and right as they should be?"
         return f"{warning}No pixel got a depth from {images}{why}"
-    share, middle_m = len(known_m) / estimate.depth_m.numel(), float(known_m.median())
+    share = len(known_m) / estimate.depth_m.numel()
+    middle_m = float(known_m.median())
     return (
         f"{warning}Depth from {images} for {share:.0%} of the pixels; half of these are nearer "
         f"than {middle_m:.2f} m.{f' {sky:.0%} are sky.' if is_sky is not None else ''}"

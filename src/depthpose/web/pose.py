@@ -59,7 +59,8 @@ def answer_pose(form: Form, net: GeoPoseNet) -> Answer:
     """Pose what a form asks for."""
     target = _target(form, net)
     pose_input = _input(form, target.model)
-    name, voted = pose_input.name, None
+    name = pose_input.name
+    voted = None
     if "depth" in form.files and "mask" not in form.files:
         assert isinstance(pose_input, ViewInput)
         answers = target.net.find_in(pose_input, [target.model.name])
@@ -94,11 +95,13 @@ def answer_pose(form: Form, net: GeoPoseNet) -> Answer:
     agreeing = "votes that agree" if isinstance(target.net, GeoPoseNet) else "points near the model"
     table = [["", "status", "x [m]", "y [m]", "z [m]", "certainty"]]
     for shown_pose in shown_poses if len(shown_poses) > 1 else ():
-        pose, certainty = shown_pose.estimate.camera_from_model, shown_pose.estimate.certainty
+        pose = shown_pose.estimate.camera_from_model
+        certainty = shown_pose.estimate.certainty
         place = [] if pose is None else [f"{v:.4f}" for v in pose.t_m.tolist()]
         sure = "" if certainty is None else f"{certainty:.3f}"
         table.append([shown_pose.input.name, shown_pose.estimate.status, *place, sure])
-    pose_input, estimate = shown_poses[0].input, shown_poses[0].estimate
+    pose_input = shown_poses[0].input
+    estimate = shown_poses[0].estimate
     scene = report.pose_scene(
         pose_input, object_points(pose_input, target.model.diameter_m), estimate, target.model
     )
@@ -136,7 +139,8 @@ def _write(folder: Path, name: str, shown_poses: list[_Seen], model: ObjectModel
     pose_input = shown_poses[0].input
     if not isinstance(pose_input, ViewInput):
         return []
-    picture, caption = report.grey_depth(pose_input.depth_m), "depth image, near bright"
+    picture = report.grey_depth(pose_input.depth_m)
+    caption = "depth image, near bright"
     poses = [
         pose
         for shown_pose in shown_poses
@@ -152,7 +156,8 @@ def _write(folder: Path, name: str, shown_poses: list[_Seen], model: ObjectModel
 
 def _target(form: Form, net: GeoPoseNet) -> _Target:
     """Find the object among those of the weights, or in a CAD file."""
-    name, models = form.fields.get("object", ""), net.weights.models
+    name = form.fields.get("object", "")
+    models = net.weights.models
     if name != OWN_CAD:
         if "cad" in form.files:
             raise InputError(
@@ -185,7 +190,8 @@ def _input(form: Form, model: ObjectModel) -> CloudInput | ViewInput:
     if "cloud" in form.files:
         if "depth" in form.files or "mask" in form.files:
             raise InputError("a cloud and a depth image are both given; choose one of the two")
-        path, unit = form.file("cloud"), form.fields.get("cloud_unit", "")
+        path = form.file("cloud")
+        unit = form.fields.get("cloud_unit", "")
         refuse_unknown("cloud_unit", unit, METRES)
         return cloud_input(path, cast(Unit, unit), model.name, path.stem)
     depth = form.file("depth")

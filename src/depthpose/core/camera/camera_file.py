@@ -142,7 +142,10 @@ def _colmap_facts(text: str) -> CameraFacts:
         )
     model, width, height, listed = cameras.pop()
     is_fisheye = bool(is_fisheye_lens({"cameramodel": model}))
-    values = [float(word) for word in listed.split()]
+    try:
+        values = [float(word) for word in listed.split()]
+    except ValueError as error:
+        raise InputError(f"a camera of COLMAP whose parameters are {listed:.60}") from error
     if model.startswith(("SIMPLE_", "RADIAL")):
         values.insert(0, values[0])
     if len(values) < 4:

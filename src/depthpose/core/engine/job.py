@@ -76,30 +76,31 @@ def run_job(job: Job, engine: Engine) -> list[Done]:
     claim(out, {**job.settings, "shards": "tar"})
     blocks = make_plan(out, job.items, job.tars, job.block)
     folder = stores.join(out, SHARDS)
-    sizes, records = stores.list_sizes(folder), {one.shard: one for one in read_results(out)}
+    sizes = stores.list_sizes(folder)
+    records = {shard.shard: shard for shard in read_results(out)}
     done: dict[str, Done] = {}
     for block in blocks:
-        one = records.get(f"{block.shard}.tar")
+        shard = records.get(f"{block.shard}.tar")
         record = stores.join(folder, f"{block.shard}.json")
-        path = None if one is None else stores.local_path(stores.join(folder, one.shard))
-        if one is None or one.block != zlib.crc32(block.to_json().encode()):
+        path = None if shard is None else stores.local_path(stores.join(folder, shard.shard))
+        if shard is None or shard.block != zlib.crc32(block.to_json().encode()):
             is_whole = False
         elif path is None:  # of a store sizes alone are compared
-            is_whole = sizes.get(one.shard) == one.stamp[0]
+            is_whole = sizes.get(shard.shard) == shard.stamp[0]
         else:
-            is_whole = is_unchanged(path, one.stamp)
-            if is_whole and (time_ns := path.stat().st_mtime_ns) != one.stamp[1]:  # a copy
-                one = replace(one, stamp=(one.stamp[0], time_ns, one.stamp[2]))
-                stores.publish(one.to_json().encode(), record)
-        if one is not None and is_whole:
-            if not one.failures:
-                done[block.shard] = one
+            is_whole = is_unchanged(path, shard.stamp)
+            if is_whole and (time_ns := path.stat().st_mtime_ns) != shard.stamp[1]:  # a copy
+                shard = replace(shard, stamp=(shard.stamp[0], time_ns, shard.stamp[2]))
+                stores.publish(shard.to_json().encode(), record)
+        if shard is not None and is_whole:
+            if not shard.failures:
+                done[block.shard] = shard
         elif f"{block.shard}.json" in sizes:
             with file_system(record, "removed") as (fs, inner):
                 fs.rm_file(inner)
     left = [block for block in blocks if block.shard not in done]
     if left:
-        done |= {one.shard.removesuffix(".tar"): one for one in engine(left, job.work, out)}
+        done |= {shard.shard.removesuffix(".tar"): shard for shard in engine(left, job.work, out)}
     lost = [block.shard for block in blocks if block.shard not in done]
     if lost:
         raise InputError(
@@ -112,16 +113,16 @@ def run_job(job: Job, engine: Engine) -> list[Done]:
     table = csv.writer(text, lineterminator="\n")
     table.writerow(["name", "shard", "reason"])
     every = [done[block.shard] for block in blocks]
-    seen: dict[str, str] = {}
-    for one in every:
-        for name, reason in one.entries:
-            if name in seen:
+    shard_of: dict[str, str] = {}
+    for shard in every:
+        for name, reason in shard.entries:
+            if name in shard_of:
                 raise InputError(
-                    f"{out}: {seen[name]} and {one.shard} hold two results called {name!r}; give "
-                    "the samples of tar shards names of their own"
+                    f"{out}: {shard_of[name]} and {shard.shard} hold two results called {name!r}; "
+                    "give the samples of tar shards names of their own"
                 )
-            seen[name] = one.shard
-            table.writerow([name, one.shard, reason])
+            shard_of[name] = shard.shard
+            table.writerow([name, shard.shard, reason])
     manifest = text.getvalue().encode(errors="surrogateescape")
     stores.publish(manifest, stores.join(out, MANIFEST))
     return every
@@ -142,13 +143,13 @@ def claim(out: str, settings: Mapping[str, Any]) -> None:
 
 def read_results(out: str) -> list[Done]:
     """Say what an earlier job left, shard by shard; a record that is damaged is as none."""
-    found: list[Done] = []
+    records: list[Done] = []
     for _, text in sorted(
         stores.read_all(stores.join(stores.absolute(out), SHARDS), ".json").items()
     ):
         with suppress(ValueError, KeyError, TypeError):
-            found.append(Done.from_json(text))
-    return found
+            records.append(Done.from_json(text))
+    return records
 
 
 def shard_results(out: str, done: Done) -> Iterator[tuple[str, dict[str, bytes]]]:
@@ -159,7 +160,8 @@ def shard_results(out: str, done: Done) -> Iterator[tuple[str, dict[str, bytes]]
     """
     url = stores.join(stores.absolute(out), SHARDS, done.shard)
     names = {name for name, reason in done.entries if not reason}
-    known, files = "", dict[str, bytes]()
+    name = ""
+    files = dict[str, bytes]()
     for member, data in read_tar(url):
         # A tar does not separate the names of the results from the endings of their files.
         dots = (k for k, letter in enumerate(member) if letter == ".")
@@ -169,12 +171,12 @@ def shard_results(out: str, done: Done) -> Iterator[tuple[str, dict[str, bytes]]
             raise InputError(
                 f"{url}: holds {member!r}, which its record does not name; make it anew"
             )
-        if files and parts[0] != known:
-            yield known, files
+        if files and parts[0] != name:
+            yield name, files
             files = {}
-        known, files[parts[1]] = parts[0], data
+        name, files[parts[1]] = parts[0], data
     if files:
-        yield known, files
+        yield name, files
 
 
 _LEAST_VERSION = (2, 52)  # the first version of Ray that has passwords
@@ -263,11 +265,11 @@ class RayEngine:
     def _capacity(self, ray: Any) -> int:  # noqa: ANN401
         """Say how many workers fit into the cluster."""
         there: Mapping[str, float] = ray.cluster_resources()
-        asked = {"CPU": self.worker_cpus, "GPU": self.worker_gpus}
-        most = min(int(there.get(name, 0) / n) for name, n in asked.items() if n > 0)
+        needs = {"CPU": self.worker_cpus, "GPU": self.worker_gpus}
+        most = min(int(there.get(name, 0) / n) for name, n in needs.items() if n > 0)
         if most < 1:
-            had = ", ".join(f"{there.get(name, 0):g} {name}" for name in asked)
-            wanted = ", ".join(f"{n:g} {name}" for name, n in asked.items())
+            had = ", ".join(f"{there.get(name, 0):g} {name}" for name in needs)
+            wanted = ", ".join(f"{n:g} {name}" for name, n in needs.items())
             raise InputError(
                 f"a worker asks for {wanted}, but the cluster has {had}; ask for less by "
                 "--worker-cpus and --worker-gpus"

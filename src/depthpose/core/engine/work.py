@@ -21,7 +21,8 @@ from depthpose.core.errors import InputError
 from depthpose.core.files import stores
 from depthpose.core.files.disk import file_system, find_partners, refused_write
 
-PLAN, SHARDS = "plan.jsonl", "shards"
+PLAN = "plan.jsonl"
+SHARDS = "shards"
 _TARS = (".tar", ".tar.gz", ".tgz")
 
 
@@ -71,7 +72,8 @@ def find_items(words: Sequence[str], files: Files) -> list[Item]:
         names = [[PurePosixPath(url).stem for url in side] for side in sides]
         for k, word in enumerate(others[1:], 1):
             # Else two files were named.
-            one, other = PurePosixPath(others[0]).stem, PurePosixPath(word).stem
+            one = PurePosixPath(others[0]).stem
+            other = PurePosixPath(word).stem
             if (names[0], names[k]) != ([one], [other]):
                 partners = find_partners(names[0], names[k], f"{others[0]} and {word}")
                 sides[k] = [sides[k][partner] for partner in partners]
@@ -160,21 +162,22 @@ def make_plan(out: str, items: Sequence[Item], tars: Sequence[str], size: int) -
                 f"{out}: {item.name!r} is the result of {files[item.name][0]}, not of "
                 f"{item.files[0]}; two files of one name need two folders: choose another"
             )
-    known, there = len(blocks), {block.tar for block in blocks}
+    count_before = len(blocks)
+    there = {block.tar for block in blocks}
     new = [item for item in items if item.name not in files]
     for k in range(0, len(new), size):
         blocks.append(Block(f"{len(blocks):06d}", tuple(new[k : k + size])))
     for tar in tars:
         if tar not in there:
             blocks.append(Block(f"{len(blocks):06d}", tar=tar))
-    if len(blocks) > known:
+    if len(blocks) > count_before:
         stores.publish("".join(f"{b.to_json()}\n" for b in blocks).encode(), plan)
     return blocks
 
 
 def read_tar(url: str) -> Iterator[tuple[str, bytes]]:
     """Read the files of a tar shard, plain or compressed, from its beginning to its end."""
-    seen: set[str] = set()
+    names: set[str] = set()
     try:
         with file_system(url, "read") as (fs, inner):
             file = fs.open(inner, "rb")
@@ -185,11 +188,11 @@ def read_tar(url: str) -> Iterator[tuple[str, bytes]]:
                         f"{url}: {member.name!r} is a link or device, and no file; pack the files "
                         "themselves (tar --dereference --hard-dereference)"
                     )
-                if member.isfile() and member.name in seen:
+                if member.isfile() and member.name in names:
                     raise InputError(
                         f"{url}: holds {member.name!r} twice; keep one of the two, and pack it anew"
                     )
-                seen.add(member.name)
+                names.add(member.name)
                 content = tar.extractfile(member) if member.isfile() else None
                 if content is not None:
                     yield member.name, content.read()
@@ -266,7 +269,8 @@ def _samples(block: Block, wanted: Files, scratch: Path) -> Iterator[Sample]:
                 if role in wanted.roles and f".{suffix}".lower() in wanted.suffixes:
                     files[role] = Path(tempfile.mkdtemp(dir=scratch)) / f"{role}.{suffix}"
                     files[role].write_bytes(data)
-            missing, reason = [role for role in wanted.roles if role not in files], ""
+            missing = [role for role in wanted.roles if role not in files]
+            reason = ""
             if missing:
                 reason = f"{block.tar}: {key!r} has no {missing[0]}; a sample holds "
                 reason += ", ".join(wanted.roles)
@@ -329,7 +333,8 @@ class Done:
 
 def file_stamp(path: Path) -> tuple[int, int, int]:
     """Give size [bytes], time of the last change [ns] and CRC-32 of a file."""
-    status, checksum = path.stat(), 0
+    status = path.stat()
+    checksum = 0
     with path.open("rb") as file:
         while chunk := file.read(2**22):
             checksum = zlib.crc32(chunk, checksum)
@@ -390,22 +395,22 @@ class Runner:
         results.mkdir()
         with tarfile.open(file, "w", format=tarfile.PAX_FORMAT) as tar:
             while chunk := list(islice(samples, self.work.batch)):
-                reasons = iter(self.function([one for one in chunk if not one.reason], results))
-                for one in chunk:
-                    reason = one.reason or next(reasons)
-                    for path in one.files:
+                reasons = iter(self.function([item for item in chunk if not item.reason], results))
+                for item in chunk:
+                    reason = item.reason or next(reasons)
+                    for path in item.files:
                         if scratch in path.parents:  # of a copy the name alone says something
                             reason = reason.replace(str(path), path.name)
                     for ending in sorted(self.work.endings):
-                        path = results / f"{one.name}.{ending}"
+                        path = results / f"{item.name}.{ending}"
                         if path.is_file():
                             if not reason:
                                 data = path.read_bytes()
-                                member = tarfile.TarInfo(f"{one.name}.{ending}")
+                                member = tarfile.TarInfo(f"{item.name}.{ending}")
                                 member.size = len(data)  # neither time nor owner: equal bytes
                                 tar.addfile(member, io.BytesIO(data))
                             path.unlink()
-                    yield one.name, reason
-                    for path in one.files:
+                    yield item.name, reason
+                    for path in item.files:
                         if scratch in path.parents:  # a copy, alone in its folder
                             shutil.rmtree(path.parent, ignore_errors=True)

@@ -122,7 +122,8 @@ def _from_columns(path: AnyPath, columns: Columns) -> Cloud:
     points = np.empty((0, 3), np.float32)
     if columns:
         points = np.stack([to_float32(columns[name]) for name in "xyz"], -1)
-    packed, color = columns.get("rgb", columns.get("rgba")), None
+    packed = columns.get("rgb", columns.get("rgba"))
+    color = None
     if packed is not None and packed.dtype.itemsize == 4:
         if packed.dtype.kind == "f":
             bits = packed.astype(np.float32).view(np.uint32)
@@ -140,12 +141,12 @@ def _from_columns(path: AnyPath, columns: Columns) -> Cloud:
         color = to_float32(color)
     if np.isinf(points).any():
         raise InputError(f"{path}: a coordinate is infinite or beyond float32; leave it out")
-    kept = ~np.isnan(points).any(-1)
-    if not kept.any():
+    is_complete = ~np.isnan(points).any(-1)
+    if not is_complete.any():
         raise InputError(f"{path}: {len(points)} points, none with finite coordinates; give some")
     return Cloud(
-        points=torch.from_numpy(points[kept]),
-        color=None if color is None else torch.from_numpy(color[kept]),
+        points=torch.from_numpy(points[is_complete]),
+        color=None if color is None else torch.from_numpy(color[is_complete]),
     )
 
 
@@ -199,7 +200,7 @@ def _read_text(path: AnyPath) -> Cloud:
     body = head[1:] if is_count else head
     width = len(_PARTS.split(body[0])) if body else 0
     if not names:
-        fitting = (found for found in comments if len(found) == width and set("xyz") <= set(found))
+        fitting = (words for words in comments if len(words) == width and set("xyz") <= set(words))
         names = next(fitting, [])
     rows = chain(body, rows)
     table = parse_rows(path, map(_blank_separated(path, body, names), rows))
@@ -218,14 +219,14 @@ def _rows_of(text: Iterable[str], noted: list[str]) -> Iterator[str]:
     for line in text:
         if line.isspace():
             continue
-        row, _, said = plain_numbers(line).partition("#")
+        row, _, comment = plain_numbers(line).partition("#")
         if row.lstrip().startswith("//"):
-            row, said = "", row.strip().removeprefix("//")
+            row, comment = "", row.strip().removeprefix("//")
         if row := row.strip():
             is_begun = True
             yield row
         elif not is_begun:
-            noted.append(said)
+            noted.append(comment)
 
 
 def _blank_separated(path: AnyPath, head: list[str], names: list[str]) -> Callable[[str], str]:

@@ -61,8 +61,8 @@ def refused_as(path: AnyPath, kind: str, remedy: str) -> Iterator[None]:
         raise
     except Exception as error:  # a decoder fed with random bytes may raise anything
         text = _ADDRESS.sub("", f"{type(error).__name__}: {error}")
-        said = " ".join(text.split())[:200]
-        raise InputError(f"{path}: not a readable {kind} ({said}); {remedy}") from error
+        cause = " ".join(text.split())[:200]
+        raise InputError(f"{path}: not a readable {kind} ({cause}); {remedy}") from error
 
 
 def refuse_broken_link(path: AnyPath) -> None:
@@ -156,10 +156,10 @@ def write_bytes(path: AnyPath, data: bytes) -> None:
         part.write_bytes(data)
 
 
-def refused_suffix(path: AnyPath, kind: str, known: tuple[str, ...]) -> InputError:
+def refused_suffix(path: AnyPath, kind: str, suffixes: tuple[str, ...]) -> InputError:
     """Make the error for a file name with an unknown suffix."""
     suffix = Path(path).suffix or "no suffix"
-    return InputError(f"{path}: {suffix} is no {kind} format; use {', '.join(known)}")
+    return InputError(f"{path}: {suffix} is no {kind} format; use {', '.join(suffixes)}")
 
 
 SOURCE = "source.json"  # beside shards fetched when first read: {"url": ...}, where from
@@ -180,7 +180,8 @@ def read_bytes(path: AnyPath, most: int = MAX_FILE_BYTES) -> bytes:
             shards = (folder for folder in inside.parents if folder.suffix == ".tar")
             if (shard := next((one for one in shards if not one.is_dir()), None)) is not None:
                 return _read_in_shard(shard, inside.relative_to(shard).as_posix(), most)
-        status, reason = inside.stat(), ""
+        status = inside.stat()
+        reason = ""
         if stat.S_ISDIR(status.st_mode):
             reason = "a folder where a file is needed; name a file inside it"
         elif not stat.S_ISREG(status.st_mode):
@@ -258,9 +259,9 @@ def file_system(url: str, done: str) -> Iterator[tuple[Any, str]]:
     except ImportError as error:
         raise InputError(f"{url}: its file system is not installed: {error}") from error
     except Exception as error:  # each file system raises errors of its own
-        said = " ".join(f"{type(error).__name__}: {error}".split())[:200]
+        cause = " ".join(f"{type(error).__name__}: {error}".split())[:200]
         raise InputError(
-            f"{url}: cannot be {done} ({said}); check the address and the credentials"
+            f"{url}: cannot be {done} ({cause}); check the address and the credentials"
         ) from error
 
 
@@ -309,12 +310,12 @@ def read_json(path: AnyPath) -> object:
     refuse_heavy(path, text.encode(), _OF_JSON)
 
     def once_each(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-        seen: dict[str, Any] = {}
+        members: dict[str, Any] = {}
         for key, value in pairs:
-            if key in seen:
+            if key in members:
                 raise ValueError(f"key {key!r} is given twice")
-            seen[key] = value
-        return seen
+            members[key] = value
+        return members
 
     with refused_as(path, "JSON file", "correct it there"):
         return json.loads(
@@ -349,7 +350,8 @@ def refuse_yaml_bomb(path: AnyPath, text: str) -> None:
     unfinished: list[tuple[str | None, int]] = []
     with suppress(yaml.YAMLError):  # what is no YAML the parser refuses
         for event in yaml.parse(text, YamlLoader):
-            anchor, size = getattr(event, "anchor", None), 0
+            anchor = getattr(event, "anchor", None)
+            size = 0
             match event:
                 case yaml.CollectionStartEvent():
                     unfinished.append((anchor, 1))
@@ -458,7 +460,7 @@ def stem_of(path: Path) -> str:
     return unicodedata.normalize("NFC", path.stem)
 
 
-def find_partners(first: Sequence[str], second: Sequence[str], said: str) -> list[int]:
+def find_partners(first: Sequence[str], second: Sequence[str], sides: str) -> list[int]:
     """Give for each name of one side the index of its partner on the other.
 
     Names belong together that are equal; else those that are equal without what all names of their
@@ -478,8 +480,8 @@ def find_partners(first: Sequence[str], second: Sequence[str], said: str) -> lis
     if lone:
         shown = ", ".join(map(repr, lone[:_MOST_SHOWN])) + (", ..." if lone[_MOST_SHOWN:] else "")
         raise InputError(
-            f"{said} hold {len(first)} and {len(second)} files, and no partner of the same name or "
-            f"number is there for {shown}; remove these, add their partners, or rename them"
+            f"{sides} hold {len(first)} and {len(second)} files, and no partner of the same name "
+            f"or number is there for {shown}; remove these, add their partners, or rename them"
         )
     return [places[key] for key in keys[0]]
 
@@ -502,10 +504,12 @@ def _own_parts(first: Sequence[str], second: Sequence[str]) -> tuple[list[Any], 
             texts = column
             for turn in (1, -1):
                 turned = [text[::turn] for text in texts]
-                low, high = min(turned), max(turned)  # what these two share, all share
+                # what these two share, all share
+                low = min(turned)
+                high = max(turned)
                 ends = (k for k, (a, b) in enumerate(zip(low, high, strict=False)) if a != b)
                 shared = re.sub(r"\d+$", "", low[: next(ends, len(low))])
                 texts = [text[len(shared) :][::turn] for text in turned]
-            parts = [re.sub(r"\d+", lambda found: str(int(found[0])), text) for text in texts]
+            parts = [re.sub(r"\d+", lambda match: str(int(match[0])), text) for text in texts]
             keys[side] = [(*key, part) for key, part in zip(keys[side], parts, strict=True)]
     return keys[0], keys[1]

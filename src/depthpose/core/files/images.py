@@ -35,7 +35,8 @@ LISTED_SUFFIXES = (
 )  # fmt: skip
 """Suffixes of pictures in a listed folder; a file that is named may have any."""
 _UNREAD = re.compile(
-    r"\.(heic|heif|avif|jp2|j2k|jxl|tga|dib|exr|hdr|dng|cr[23w]|nef|arw|orf|rw2|raw|pfm|svg|psd)",
+    r"\.(heic|heif|avif|jp2|j2k|jxl|tga|dib|exr|hdr|dng|cr[23w]|nef|arw|orf|rw2|raw|pfm|svg|psd"
+    r"|mpo|jps)",
     re.IGNORECASE,
 )
 """Suffixes of pictures that are not read: in a folder they are named."""
@@ -342,9 +343,26 @@ def refuse_among_inputs(out: Path, words: Iterable[str | Path], files: Iterable[
         )
 
 
+def read_views(path: AnyPath) -> list[Float32[Tensor, "3 _ _"]]:
+    """Read the pictures of a file as :func:`read_image` does: two of an MPO, else one.
+
+    Raises:
+        InputError: as there; a file of a stereo camera is none here.
+    """
+    with opened_image(path, with_views=True) as image:
+        pixels = [_decoded(path, image)]
+        if image.format == "MPO":
+            image.seek(1)
+            pixels.append(_decoded(path, image))
+    return [_tensor_of(one, path) for one in pixels]
+
+
 @contextmanager
-def opened_image(path: AnyPath) -> Iterator[Image.Image]:
-    """Open a picture's header; whatever decoding raises inside the block is an input error."""
+def opened_image(path: AnyPath, *, with_views: bool = False) -> Iterator[Image.Image]:
+    """Open a picture's header; whatever decoding raises inside the block is an input error.
+
+    Files of stereo cameras are refused, unless ``with_views``.
+    """
     data = read_bytes(path)
     with (
         refused_as(path, "picture", "give an intact PNG or JPEG"),
@@ -356,7 +374,8 @@ def opened_image(path: AnyPath) -> Iterator[Image.Image]:
                 f"{path}: declares {width}x{height} pixels, more than the {MAX_PIXELS} allowed; "
                 "scale it down"
             )
-        _refuse_two_views(path, image)
+        if not with_views:
+            _refuse_two_views(path, image)
         yield image
 
 

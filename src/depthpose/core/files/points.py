@@ -68,7 +68,7 @@ def plain_numbers(line: str) -> str:
     """Write ``nan`` and ``inf`` for the words by which Microsoft's C library prints them."""
     if "#" not in line and "(" not in line:
         return line
-    return _WORDS.sub(lambda found: "inf" if "INF" in found[0] else "nan", line)
+    return _WORDS.sub(lambda match: "inf" if "INF" in match[0] else "nan", line)
 
 
 def split_rows(path: AnyPath, rows: Iterator[str], fields: list[Field], count: int) -> Columns:
@@ -82,7 +82,8 @@ def split_rows(path: AnyPath, rows: Iterator[str], fields: list[Field], count: i
     columns: Columns = {}
     starts = accumulate((f.count for f in fields), initial=0)
     for f, start in zip(fields if count else (), starts, strict=False):
-        column, dtype = table[:, start], np.dtype(f.code)
+        column = table[:, start]
+        dtype = np.dtype(f.code)
         if dtype.kind != "f":
             limits = np.iinfo(dtype)
             if not ((column >= limits.min) & (column <= limits.max)).all():
@@ -153,13 +154,15 @@ def read_ply_elements(path: AnyPath, last: str | None = None) -> tuple[Columns, 
             columns = split_rows(path, rows, element.fields, element.count)
         elif rows is None:
             more_lists, used = _binary_lists(path, body, element, order)
-            body, lists = body[used:], lists | more_lists
+            body = body[used:]
+            lists = lists | more_lists
         else:
             sizes = {f.name: array("q") for f in element.fields if f.size_code}
             values = {name: array("d") for name in sizes}
             there = 0
             for there, row in enumerate(islice(rows, element.count), 1):
-                words, at = row.split(), 0
+                words = row.split()
+                at = 0
                 try:
                     for f in element.fields:
                         if f.size_code:
@@ -203,10 +206,13 @@ def _binary_lists(
     steps = [(f, np.dtype(order + (f.size_code or "u1")), np.dtype(order + f.code))
              for f in element.fields]  # fmt: skip
     runs: list[Any] = []
-    known: dict[tuple[int, ...], np.dtype] = {}
-    at, left, ahead = 0, element.count, 64
+    dtypes: dict[tuple[int, ...], np.dtype] = {}
+    at = 0
+    left = element.count
+    ahead = 64
     while left:
-        lengths, end = [], at
+        lengths = []
+        end = at
         for f, size, value in steps:
             length = 1
             if f.size_code:
@@ -219,13 +225,13 @@ def _binary_lists(
             end += length * value.itemsize
         need_bytes(path, len(body), end, what)
         key = tuple(lengths)
-        if key not in known:
+        if key not in dtypes:
             kinds: list[Any] = []
             for (f, size, value), length in zip(steps, key, strict=True):
                 kinds += [(f"{f.name} size", size)] if f.size_code else []
                 kinds.append((f.name, value, (length,)))
-            known[key] = np.dtype(kinds)
-        dtype = known[key]
+            dtypes[key] = np.dtype(kinds)
+        dtype = dtypes[key]
         rows = min(left, ahead, (len(body) - at) // dtype.itemsize)
         records: Any = np.frombuffer(body, dtype, rows, at)
         sizes = [records[f"{f.name} size"] for f in element.fields if f.size_code]
@@ -234,7 +240,9 @@ def _binary_lists(
         runs.append(records)
         if len(runs) > _MOST_RUNS:
             raise InputError(f"{path}: {what} of ever other lengths; export triangles alone")
-        at, left, ahead = at + records.nbytes, left - len(records), 2 * len(records) + 64
+        at = at + records.nbytes
+        left = left - len(records)
+        ahead = 2 * len(records) + 64
     return {
         f"{element.name} {f.name}": Ragged(
             sizes=np.concatenate([np.empty(0, int), *(r[f"{f.name} size"] for r in runs)]),
@@ -287,13 +295,13 @@ def _parse_header(path: AnyPath, lines: list[str]) -> tuple[str, list[_Element]]
     names = [e.name for e in elements]
     if names.count("vertex") != 1:
         raise InputError(f"{path}: elements {names}, where exactly one 'vertex' is needed")
-    for one in elements:
-        properties = [f.name for f in one.fields]
-        has_list = one.name == "vertex" and any(f.size_code for f in one.fields)
+    for element in elements:
+        properties = [f.name for f in element.fields]
+        has_list = element.name == "vertex" and any(f.size_code for f in element.fields)
         if has_list or not properties or len(set(properties)) != len(properties):
             raise InputError(
-                f"{path}: {one.name} properties {properties} are none, a list or repeat a name; "
-                "give each vertex x, y and z"
+                f"{path}: {element.name} properties {properties} are none, a list or repeat a "
+                "name; give each vertex x, y and z"
             )
     return order, elements
 
@@ -303,7 +311,9 @@ _PCD_CODES = {
     **{("I", size): f"i{size}" for size in "1248"},
     **{("U", size): f"u{size}" for size in "1248"},
 }
-_MAX_PACKED, _MAX_UNPACKED = 2**25, 2**27  # of compressed points: eight million, byte by byte
+# of compressed points: eight million, byte by byte
+_MAX_PACKED = 2**25
+_MAX_UNPACKED = 2**27
 _DATA = re.compile(rb"(?:^|\n)DATA[ \t]+(ascii|binary|binary_compressed)[ \t]*(?:\r\n|\n)")
 
 

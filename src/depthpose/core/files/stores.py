@@ -118,14 +118,14 @@ def list_files(path: str, suffixes: Sequence[str]) -> list[str]:
                 rest = f"{last}/{rest}"
             files = fs.glob(f"{home.replace('[', '[[]')}/{rest}" if "[" in home else inner)
     shown = (p for p in files if not PurePosixPath(p).name.startswith("."))
-    kept = [p for p in shown if PurePosixPath(p).suffix.lower() in suffixes]
-    kept.sort(key=lambda p: natural_order(Path(p)))
-    if not kept:
+    files = [p for p in shown if PurePosixPath(p).suffix.lower() in suffixes]
+    files.sort(key=lambda p: natural_order(Path(p)))
+    if not files:
         raise InputError(
             f"{path}: no {', '.join(suffixes)} file there; give a file, a folder or a pattern"
         )
     prefix = f"{path.partition('://')[0]}://" if "://" in path else ""
-    return [f"{prefix}{p}" for p in kept]
+    return [f"{prefix}{p}" for p in files]
 
 
 def list_sizes(folder: str) -> dict[str, int]:

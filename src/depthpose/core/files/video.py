@@ -78,7 +78,8 @@ def read_video(path: AnyPath) -> Video:
     capture = cv2.VideoCapture(str(path))
     if not capture.isOpened():
         raise InputError(f"{path}: {_NO_VIDEO}")
-    fps, frames = capture.get(cv2.CAP_PROP_FPS), capture.get(cv2.CAP_PROP_FRAME_COUNT)
+    fps = capture.get(cv2.CAP_PROP_FPS)
+    frames = capture.get(cv2.CAP_PROP_FRAME_COUNT)
     aspect = capture.get(cv2.CAP_PROP_SAR_NUM), capture.get(cv2.CAP_PROP_SAR_DEN)
     is_read, first = capture.read()
     capture.release()
@@ -118,17 +119,23 @@ def write_video(path: AnyPath, images: Iterable[Float[Tensor, "3 _ _"]], fps: fl
     if not 0 < fps < math.inf:
         raise InputError(f"{path}: fps is {fps:g}, but a video has a positive rate; give, say, 10")
     cv2 = import_opencv("writing a video")
-    writer, first, count, readable = None, (0, 0), 0, 0
+    writer = None
+    first = (0, 0)
+    count = 0
+    readable = 0
     with atomic_write(path) as part:
         try:
             for image in images:
                 size = (image.shape[2], image.shape[1])
                 if writer is None:
-                    first, codec = size, cv2.VideoWriter_fourcc(*_CODECS[suffix])
+                    first = size
+                    codec = cv2.VideoWriter_fourcc(*_CODECS[suffix])
                     writer = cv2.VideoWriter(str(part), codec, float(fps), size)
                     if suffix == ".mp4" and not writer.isOpened():
-                        said = "OpenCV encodes no VP9 here, so it is MPEG-4, which no browser plays"
-                        warnings.warn(f"{path}: {said}", Notice, stacklevel=2)
+                        message = (
+                            "OpenCV encodes no VP9 here, so it is MPEG-4, which no browser plays"
+                        )
+                        warnings.warn(f"{path}: {message}", Notice, stacklevel=2)
                         codec = cv2.VideoWriter_fourcc(*"mp4v")
                         writer = cv2.VideoWriter(str(part), codec, float(fps), size)
                 if size != first:

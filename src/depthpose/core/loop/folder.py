@@ -22,9 +22,12 @@ from depthpose.core.files.disk import refuse_heavy, refused_as, refused_write
 from depthpose.core.loop.task import ValidationResult
 from depthpose.core.run import environment
 
-STATE, BEFORE = "state.pt", "state.before.pt"  # the last, and the one before, if that is damaged
+# the last, and the one before, if that is damaged
+STATE = "state.pt"
+BEFORE = "state.before.pt"
 _NEEDED = ("step", "modules", "optimizers", "scaler", "average")
-_METRICS, _PICTURES = "metrics.jsonl", "pictures"
+_METRICS = "metrics.jsonl"
+_PICTURES = "pictures"
 RUN_FILES = ("config.yaml", _METRICS, _PICTURES, "tensorboard", STATE, BEFORE)
 """What a training leaves in its folder beside weights."""
 _HELD_OUT = "held_out/"  # begins the names of numbers that validation found
@@ -46,9 +49,9 @@ class RunLogger:
             return
         for folder in (self.folder, self.folder / _PICTURES):
             remove_parts(folder)
-        kept = [row for row in read_metrics(self.folder) if row["step"] <= step]
+        earlier = [row for row in read_metrics(self.folder) if row["step"] <= step]
         with atomic_write(self.folder / _METRICS) as part:
-            part.write_text("".join(json.dumps(row) + "\n" for row in kept))
+            part.write_text("".join(json.dumps(row) + "\n" for row in earlier))
         import_extra("tensorboard", "tensorboard", "train", "training")
         from torch.utils.tensorboard.writer import SummaryWriter
 
@@ -82,7 +85,8 @@ class RunLogger:
             return
         packed = BytesIO()  # on a full disk torch.save would say anything but that
         torch.save(dict(state), packed)
-        last, before = self.folder / STATE, self.folder / BEFORE
+        last = self.folder / STATE
+        before = self.folder / BEFORE
         with atomic_write(last) as part:
             part.write_bytes(packed.getbuffer())
             if self.has_good_last and last.is_file():
@@ -146,7 +150,8 @@ def write_card(
     ``words`` are those of the command, as ``depth train view``; ``measured`` is Markdown, as
     :func:`held_out_text` where validation measured.
     """
-    folder, here = weights.parent, environment()
+    folder = weights.parent
+    here = environment()
     where = ", ".join(here[name] for name in ("machine", "gpu") if name in here)
     took = f"{seconds:.0f} s" if seconds < 120 else f"{seconds / 60:.0f} min"
     took = took if seconds < 7200 else f"{seconds / 3600:.1f} h"
@@ -194,11 +199,11 @@ class Parts:
 
     def restore(self, state: Mapping[str, Any]) -> None:
         """Take over a state; one that does not fit is refused with what differs."""
-        own = self.state()
+        present = self.state()
         problems = [
             f"{words}{key}: {fault}"
             for words, name in (("", "modules"), ("average of ", "average"))
-            for key, tensors in own[name].items()
+            for key, tensors in present[name].items()
             for fault in misfits(tensors, state[name][key])
         ]
         for name, optimizer in self.optimizers.items():
@@ -247,10 +252,11 @@ def restore_last(folder: Path, parts: Parts) -> tuple[Path, int, float]:
             remedy = "it is damaged, or of another training"
             with refused_as(path, "state of this training", remedy):
                 parts.restore(state)
-                step, seconds = state["step"], float(state.get("seconds", 0.0))
+                step = state["step"]
+                seconds = float(state.get("seconds", 0.0))
         except InputError as error:
-            said = str(error)
-            damages.append(said if said.startswith(str(path)) else f"{path}: {said}")
+            message = str(error)
+            damages.append(message if message.startswith(str(path)) else f"{path}: {message}")
             continue
         if path.name != STATE:
             reason = "; ".join(damages) or f"{folder}: there is no {STATE}"

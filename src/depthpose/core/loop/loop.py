@@ -90,7 +90,7 @@ class Run:
         settings = {"stage": type(config).__name__, **config_to_dict(config), **(more or {})}
         decisive = {k: v for k, v in settings["loop"].items() if k not in _FREE}
         settings["loop"] = decisive | {"processes": find_rank().world}
-        kept = {k: v for k, v in settings.items() if k not in without}
+        compared = {k: v for k, v in settings.items() if k not in without}
         ends = ("safetensors", "md", "json")
         files = [*RUN_FILES, *(f"{name}.{end}" for name in weights for end in ends)]
         remedy = "choose another, or delete this one"
@@ -98,7 +98,7 @@ class Run:
             if path.is_file():
                 option = "--start" if hasattr(config, "start") else "--generator"
                 remedy += f"; to train on from its weights, give a new --out and {option} {path}"
-        claim_folder(self.folder, kept, files, remedy)
+        claim_folder(self.folder, compared, files, remedy)
         write_config(self.folder / "config.yaml", config)
 
     def train(self, task: Task, samples: Samples, config: LoopConfig) -> float:
@@ -131,8 +131,8 @@ class Run:
                 f"{self.folder}: holds no state of a training, so there is none to finish."
             )
         training.steps = training.step if self.finish else training.steps
-        with stop_requests() as asked:
-            return training.take_steps(self.on_step, asked)
+        with stop_requests() as requests:
+            return training.take_steps(self.on_step, requests)
 
 
 def releases_folder(stage: Callable[[_Config, Run], Path]) -> Callable[[_Config, Run], Path]:
@@ -209,7 +209,7 @@ class _Training:
         self.logger.open(self.step)
 
     def take_steps(
-        self, on_step: Callable[[Progress], None] | None, asked: Sequence[tuple[int, float]]
+        self, on_step: Callable[[Progress], None] | None, requests: Sequence[tuple[int, float]]
     ) -> float:
         """Take the remaining steps, or up to the current one; give the whole training's seconds.
 
@@ -219,11 +219,11 @@ class _Training:
         while self.step < self.steps:
             self._take_step([next(batches) for _ in range(self.config.accumulate)])
             self.step += 1
-            stop = self._any_process(bool(asked))
-            presses = [at for number, at in asked if number == signal.SIGINT]
+            stop = self._any_process(bool(requests))
+            presses = [at for number, at in requests if number == signal.SIGINT]
             while len(presses) == 1 and time.monotonic() - presses[0] < SECOND_CTRL_C_S:
                 time.sleep(0.05)
-                presses = [at for number, at in asked if number == signal.SIGINT]
+                presses = [at for number, at in requests if number == signal.SIGINT]
             if stop and self._any_process(len(presses) > 1):  # the steps so far are all
                 self.steps = self.step
             numbers: dict[str, float] = {}
@@ -235,14 +235,14 @@ class _Training:
             if is_last or self.step % self.config.validate_every_steps == 0:
                 if self.accelerator.is_main_process:
                     average = self.parts.average
-                    own = {
+                    state = {
                         name: {key: tensor.clone() for key, tensor in m.state_dict().items()}
                         for name, m in self.task.modules.items()
                         if average
                     }
                     self._load(average)
                     self.logger.show(self.step, self.task.validate())
-                    self._load(own)
+                    self._load(state)
                 self.accelerator.wait_for_everyone()
             if stop or is_last or self.step % self.config.save_every_steps == 0:
                 seconds = time.monotonic() - self.began
@@ -267,7 +267,8 @@ class _Training:
 
         # Micro-batch m of a step belongs to place m // world of process m % world: N processes see
         # in a step what one process sees that accumulates N times as much.
-        rank, size = self.accelerator.process_index, self.config.batch_size
+        rank = self.accelerator.process_index
+        size = self.config.batch_size
         places = range(self.step * self.config.accumulate, self.steps * self.config.accumulate)
         starts = ((place * self.world + rank) * size for place in places)
         loader = DataLoader(
@@ -289,12 +290,14 @@ class _Training:
                 # Dropout follows the micro-batch, not the process that happens to hold it.
                 micro = place * self.world + self.accelerator.process_index
                 torch.manual_seed(mixed_seed(self.config.seed, self.step, micro, number))
-                device, precision = self.accelerator.device.type, self.precision
+                device = self.accelerator.device.type
+                precision = self.precision
                 with torch.autocast(device, precision, enabled=precision is not None):
                     update = next(iterator, None)
                 if update is None:
                     continue
-                name, loss = update.optimizer, update.loss.detach()
+                name = update.optimizer
+                loss = update.loss.detach()
                 # fp16 overflows now and then, and its scaler skips such steps by itself.
                 if self.config.precision != "fp16" and not math.isfinite(float(loss)):
                     raise InputError(
@@ -318,11 +321,11 @@ class _Training:
         with torch.no_grad():
             for name, module in self.task.modules.items():
                 for key, tensor in module.state_dict().items():
-                    held = self.parts.average[name][key]
+                    average = self.parts.average[name][key]
                     if tensor.is_floating_point():
-                        held.lerp_(tensor, 1 - decay)
+                        average.lerp_(tensor, 1 - decay)
                     else:
-                        held.copy_(tensor)
+                        average.copy_(tensor)
 
     def _move(self, name: str) -> None:
         """Average the gradients over processes and step the optimiser."""
@@ -362,23 +365,23 @@ def stop_requests() -> Iterator[list[tuple[int, float]]]:
 
     Gives a list that grows by the number and the time of each signal.
     """
-    asked: list[tuple[int, float]] = []
+    requests: list[tuple[int, float]] = []
 
     def remember(number: int, _: FrameType | None) -> None:
-        if not asked and number == signal.SIGINT:
+        if not requests and number == signal.SIGINT:
             message = (
                 "\ndepthpose: stopping after this step. Press Ctrl-C again within 3 s to finish "
                 "now: the weights of the steps so far are written.\n"
             )
             os.write(2, message.encode())  # print may be at work itself
-        asked.append((number, time.monotonic()))
+        requests.append((number, time.monotonic()))
 
     handlers = {}
     with suppress(ValueError):  # not the main thread: whoever runs us handles signals
         numbers = (signal.SIGTERM, signal.SIGINT)
         handlers = {number: signal.signal(number, remember) for number in numbers}
     try:
-        yield asked
+        yield requests
     finally:
         for number, handler in handlers.items():
             signal.signal(number, handler)

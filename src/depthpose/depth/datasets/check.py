@@ -22,7 +22,9 @@ from depthpose.depth.types import Map
 
 _MAX_DEPTH_M = 200
 """KITTI's LiDAR sees 120 m."""
-_TRUTH_RADIUS, _TRUTH_PX, _TRUTH_SHARE = 3, 2.0, 0.03
+_TRUTH_RADIUS = 3
+_TRUTH_PX = 2.0
+_TRUTH_SHARE = 0.03
 """A value within so many pixels of a match may be so far from its disparity: px, and a share."""
 _MIN_TRUTH = 25
 """Matches with truth beside them, without which a map is not judged."""
@@ -50,19 +52,19 @@ def check_dataset(
     """
     folder = Path(folder)
     layout, frames = find_frames(folder)
-    found: list[Problem] = []
+    problems: list[Problem] = []
     if split is not None:
         chosen = read_split(split)
         here = {frame.name: frame for frame in frames}
         missing = [name for name in chosen.names if name not in here]
-        found += [
+        problems += [
             Problem(path=folder, kind="missing", message=f"frame {n} of {chosen.name}")
             for n in missing
         ]
         frames = [here[name] for name in chosen.names if name in here]
-    found += _check_folder(folder, frames)
+    problems += _check_folder(folder, frames)
     for done, frame in enumerate(frames, 1):
-        found += _check_images(frame, with_decoding=with_decoding)
+        problems += _check_images(frame, with_decoding=with_decoding)
         if progress is not None:
             progress(done, len(frames))
     parts = {"right views": ("right",), "calibrations": ("calibration",),
@@ -72,17 +74,17 @@ def check_dataset(
         what: sum(any(getattr(frame, part) for part in names) for frame in frames)
         for what, names in parts.items()
     }
-    return make_report(layout, counts, found)
+    return make_report(layout, counts, problems)
 
 
 def _check_folder(folder: Path, frames: list[Frame]) -> Iterator[Problem]:
     """Names that are there twice, mixed formats, right views alone, and maps of other names."""
-    seen: dict[str, Path] = {}
+    path_of: dict[str, Path] = {}
     for frame in frames:
-        if frame.name in seen:
-            message = f"has the same name as {seen[frame.name]}; rename one"
+        if frame.name in path_of:
+            message = f"has the same name as {path_of[frame.name]}; rename one"
             yield Problem(path=frame.left, kind="mismatch", message=message)
-        seen[frame.name] = frame.left
+        path_of[frame.name] = frame.left
     # Compression changes what networks predict, so a mixture is worth knowing.
     views = [path for frame in frames for path in (frame.left, frame.right) if path is not None]
     if len({path.suffix.lower() in (".jpg", ".jpeg") for path in views}) > 1:
@@ -104,8 +106,8 @@ def _check_folder(folder: Path, frames: list[Frame]) -> Iterator[Problem]:
     for name, part in (("right", "right"), ("lidar_depth", "depth"), ("disp_occ", "disparity")):
         is_there = (folder / name).is_dir() and any((folder / name).iterdir())
         if is_there and not any(getattr(frame, part) for frame in frames):
-            known = ", ".join((*LISTED_SUFFIXES, *(() if part == "right" else MAP_SUFFIXES)))
-            message = f"holds no file of a frame's name in a format that is read: {known}"
+            suffixes = ", ".join((*LISTED_SUFFIXES, *(() if part == "right" else MAP_SUFFIXES)))
+            message = f"holds no file of a frame's name in a format that is read: {suffixes}"
             yield Problem(path=folder / name, kind="missing", message=message)
 
 
@@ -119,17 +121,18 @@ def _check_images(frame: Frame, *, with_decoding: bool) -> Iterator[Problem]:
         try:
             if with_decoding:
                 images.append(read_image(path))
-                found = (images[-1].shape[2], images[-1].shape[1])
+                image_px = (images[-1].shape[2], images[-1].shape[1])
             else:
-                found = image_size(path)
+                image_px = image_size(path)
         except InputError as error:
             yield unreadable(path, error)
             continue
-        if size is not None and found != size:
-            message = f"is {found[0]}x{found[1]}, but its left image is {size[0]}x{size[1]}"
+        if size is not None and image_px != size:
+            message = f"is {image_px[0]}x{image_px[1]}, but its left image is {size[0]}x{size[1]}"
             yield Problem(path=path, kind="mismatch", message=message)
-        size = size or found
-    rig, report = None, None
+        size = size or image_px
+    rig = None
+    report = None
     if frame.right is not None and len(images) == 2 and images[0].shape == images[1].shape:
         with suppress(InputError):  # which is told by itself
             rig = frame_camera(frame)
@@ -206,7 +209,8 @@ def _check_truth(
         if not isinstance(rig, StereoRig):
             return
         truth = disparity_from_depth(truth, rig)
-    best, changed = _agreement(truth, report), ""
+    best = _agreement(truth, report)
+    changed = ""
     if best is None or best[0] >= _AGREE:
         return
     message = f"agrees with {best[0]:.0%} of {best[1]} matches between left and right"
@@ -215,7 +219,8 @@ def _check_truth(
     for words, other in changes.items():
         agreement = _agreement(other, report)
         if agreement is not None and agreement[0] >= max(_AGREE, best[0]):
-            best, changed = agreement, f"; {words} it agrees with {agreement[0]:.0%}"
+            best = agreement
+            changed = f"; {words} it agrees with {agreement[0]:.0%}"
     message = f"{message}{changed}: is it of this pair, and in which unit?"
     yield Problem(path=path, kind="mismatch", message=message)
 
@@ -229,9 +234,9 @@ def _agreement(disparity_px: Map, report: RectificationReport) -> tuple[float, i
     column, row = report.places_px.round().long().unbind(-1)
     height, width = disparity_px.shape
     near = windows[row.clamp(0, height - 1), column.clamp(0, width - 1)].flatten(1)
-    seen = report.disparities_px[:, None]
+    matched_px = report.disparities_px[:, None]
     is_there = torch.isfinite(near).any(1)
-    is_near = (near - seen).abs() <= _TRUTH_PX + _TRUTH_SHARE * seen.abs()
+    is_near = (near - matched_px).abs() <= _TRUTH_PX + _TRUTH_SHARE * matched_px.abs()
     count = int(is_there.sum())
     if count < _MIN_TRUTH:
         return None

@@ -178,8 +178,8 @@ def open_dataset(folder: Path | str, split: str | Path | None = None) -> Dataset
             f"missing, first {', '.join(missing[:3])}. 'depthpose data check' lists them all; "
             "without a split what is there is used."
         )
-    kept = [by_name[name] for name in chosen.names]
-    return Dataset(name=f"{name} {chosen.name}", layout=layout, frames=kept)
+    chosen_frames = [by_name[name] for name in chosen.names]
+    return Dataset(name=f"{name} {chosen.name}", layout=layout, frames=chosen_frames)
 
 
 def join_datasets(datasets: Sequence[Dataset], without: Sequence[str] = ()) -> Dataset:
@@ -212,8 +212,8 @@ def refuse_common(
     Raises:
         InputError: a left image is in both.
     """
-    seen = {frame.left.resolve() for frame in trained}
-    common = [frame.name for frame in measured if frame.left.resolve() in seen]
+    trained_files = {frame.left.resolve() for frame in trained}
+    common = [frame.name for frame in measured if frame.left.resolve() in trained_files]
     if common:
         raise InputError(
             f"{len(common)} of the {what} are trained on too, {common[0]} first, so their error "

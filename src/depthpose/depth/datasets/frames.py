@@ -81,27 +81,27 @@ def read_plain_calibration(path: Path, name: str, width: int, height: int) -> St
         keys = files.read_key_values(path)
         return _rig(path, plain_facts(path, keys), (width, height))
     lines = re.findall(rf"^[ \t]*{re.escape(name)}[ \t]+(.+)$", text, re.MULTILINE)
-    own: list[list[float]] = []
+    of_frame: list[list[float]] = []
     for line in lines:
         numbers: list[float] = []
         with suppress(ValueError):  # what begins the line counts
             for word in line.split():
                 numbers.append(float(word))  # noqa: PERF401  those before an error stay
-        own += [numbers] if len(numbers) >= 6 else []
-    if lines and not own:
+        of_frame += [numbers] if len(numbers) >= 6 else []
+    if lines and not of_frame:
         raise InputError(
             f"{path}: the line of {name!r} is no calibration: {lines[0][:80]!r} does not begin "
             "with six numbers, width height focal_px cx cy baseline_m"
         )
-    if len(own) > 1:
-        raise InputError(f"{path}: {len(own)} lines for {name!r}. Keep one of them.")
-    if not own:
+    if len(of_frame) > 1:
+        raise InputError(f"{path}: {len(of_frame)} lines for {name!r}. Keep one of them.")
+    if not of_frame:
         raise InputError(
             f"{path}: neither 'focal_px: ...' nor a line '{name} width height focal_px cx cy "
             "baseline_m'. Write focal_px, cx, cy and baseline_m, a line each."
         )
     try:
-        numbers = own[0] if len(own[0]) == 8 else own[0][:6]
+        numbers = of_frame[0] if len(of_frame[0]) == 8 else of_frame[0][:6]
         size = int(numbers[0]), int(numbers[1])
         names = ("focal_px", "cx", "cy", "baseline_m", "focal_y_px", "cx_right_minus_left_px")
         values: dict[str, list[float]] = {n: [v] for n, v in zip(names, numbers[2:], strict=False)}
@@ -125,11 +125,12 @@ def _projected_rig(
     """The rig of two projections, and that of the left camera."""
     left, right = (kitti_matrix(path, keys, name, (3, 4)) for name in names)
     sides = keys.get("S_rect_02", [])  # of the rectified images
-    said = (int(sides[0]), int(sides[1])) if len(sides) == 2 else size
-    if said != size:
+    declared = (int(sides[0]), int(sides[1])) if len(sides) == 2 else size
+    if declared != size:
         raise InputError(
-            f"{path}: S_rect_02 says {said[0]}x{said[1]}, but the image is {size[0]}x{size[1]}. It "
-            "was cropped or scaled: give its own calibration, in a folder of pairs."
+            f"{path}: S_rect_02 says {declared[0]}x{declared[1]}, but the image is "
+            f"{size[0]}x{size[1]}. It was cropped or scaled: give its own calibration, in a "
+            "folder of pairs."
         )
     try:
         facts = facts_from_projections("a KITTI calibration", left, right)
@@ -145,7 +146,8 @@ def _composed(
     camera_from_velodyne: Float64[np.ndarray, "3 4"],
 ) -> Float64[np.ndarray, "3 4"]:
     """LiDAR points to pixels; a 3x3 rotation or a 3x4 transform is extended to 4x4."""
-    turned, moved = np.eye(4), np.eye(4)
+    turned = np.eye(4)
+    moved = np.eye(4)
     turned[:3, :3], moved[:3] = rectify, camera_from_velodyne
     with np.errstate(all="ignore"):
         composed = left @ turned @ moved
@@ -188,7 +190,8 @@ def project_lidar(
     is_inside = ((pixel >= 0) & (pixel < (width, height))).all(1)
     u, v = pixel[is_inside].astype(np.int64).T
     # The last point of a pixel wins: keep one write a pixel, for NumPy promises no order.
-    value_m, written = value_m[is_inside], np.zeros((height, width))
+    value_m = value_m[is_inside]
+    written = np.zeros((height, width))
     pixels, last = np.unique((v * width + u)[::-1], return_index=True)
     written.flat[pixels] = value_m[::-1][last]
     shared = v * (width - 1) + u - 1
@@ -229,21 +232,22 @@ class Frame:
 
     def seen_files(self, *, with_right: bool = True) -> list[Path]:
         """List what an estimate depends on: left image, right image, files of the calibration."""
-        seen = [self.left]
+        paths = [self.left]
         if with_right and self.right is not None:
-            seen.append(self.right)
+            paths.append(self.right)
         if self.calibration is not None and self.calibration.is_dir():
-            seen += sorted(self.calibration.glob("calib_*.txt"))
+            paths += sorted(self.calibration.glob("calib_*.txt"))
         elif self.calibration is not None:
-            seen.append(self.calibration)
-        return seen
+            paths.append(self.calibration)
+        return paths
 
 
 def frame_camera(frame: Frame) -> Camera | None:
     """Read the camera of a frame, or None where it has no calibration; of a pair, the rig."""
     if frame.calibration is None:
         return None
-    path, size = frame.calibration, files.image_size(frame.left)
+    path = frame.calibration
+    size = files.image_size(frame.left)
     match frame.style:
         case "raw" | "object" | "grey":
             camera = kitti_calibration(frame).rig
@@ -268,17 +272,20 @@ def kitti_calibration(frame: Frame) -> KittiCalibration:
             f"{frame.name}: no KITTI calibration, so its LiDAR scan cannot be projected. Put "
             "calib_cam_to_cam.txt and calib_velo_to_cam.txt into the folder of its date."
         )
-    home, size = frame.calibration, files.image_size(frame.left)
+    home = frame.calibration
+    size = files.image_size(frame.left)
     if frame.style != "raw":
         return read_object_calibration(home, *size, is_grey=frame.style == "grey")
-    cameras, lidar = home / "calib_cam_to_cam.txt", home / "calib_velo_to_cam.txt"
+    cameras = home / "calib_cam_to_cam.txt"
+    lidar = home / "calib_velo_to_cam.txt"
     keys = files.read_key_values(cameras)
     rig, left = _projected_rig(cameras, keys, ("P_rect_02", "P_rect_03"), size)
     if not lidar.is_file():
         return KittiCalibration(rig=rig, pixels_from_velodyne=None)
     rectify = kitti_matrix(cameras, keys, "R_rect_00", (3, 3))
     of_lidar = files.read_key_values(lidar)
-    R, t = kitti_matrix(lidar, of_lidar, "R", (3, 3)), kitti_matrix(lidar, of_lidar, "T", (3, 1))
+    R = kitti_matrix(lidar, of_lidar, "R", (3, 3))
+    t = kitti_matrix(lidar, of_lidar, "T", (3, 1))
     composed = _composed(lidar, left, rectify, np.hstack([R, t]))
     return KittiCalibration(rig=rig, pixels_from_velodyne=composed)
 

@@ -46,21 +46,24 @@ def pack_frames(
         InputError: a file is missing or damaged, or the disk refuses.
     """
     rows: list[dict[str, Any]] = []
-    kept: dict[Path, str] = {}  # where each calibration lies
+    place_of: dict[Path, str] = {}  # where each calibration lies
     for calibration in dict.fromkeys(frame.calibration for frame in frames if frame.calibration):
-        kept[calibration] = place = f"{_CALIBRATION}/{len(kept):06d}"
+        place_of[calibration] = place = f"{_CALIBRATION}/{len(place_of):06d}"
         if calibration.is_file():
-            kept[calibration] = place = f"{place}{calibration.suffix}"
+            place_of[calibration] = place = f"{place}{calibration.suffix}"
             write_bytes(out / place, files.read_bytes(calibration))
         else:  # KITTI raw: the folder of a date
             for file in sorted(calibration.glob("calib_*.txt")):
                 write_bytes(out / place / file.name, files.read_bytes(file))
-    remaining, shards = list(frames), 0
+    remaining = list(frames)
+    shards = 0
     while remaining:
-        name, size = f"{shards:06d}.tar", 0
+        name = f"{shards:06d}.tar"
+        size = 0
         with files.atomic_write(out / name) as part, tarfile.open(part, "w") as tar:
             while remaining:
-                frame, key = remaining.pop(0), f"{len(rows):08d}"
+                frame = remaining.pop(0)
+                key = f"{len(rows):08d}"
                 row = {"name": frame.name, "style": frame.style}
                 for what in _PARTS:
                     path = getattr(frame, what)
@@ -73,7 +76,7 @@ def pack_frames(
                     row[what] = f"{name}/{member.name}"
                     size += len(data)
                 if frame.calibration is not None:
-                    row["calibration"] = kept[frame.calibration]
+                    row["calibration"] = place_of[frame.calibration]
                 rows.append(row)
                 show(frame.name)
                 if size >= shard_bytes:
@@ -88,13 +91,13 @@ def packed_frames(folder: Path) -> Iterator[Frame]:
     index = folder / INDEX
     if not index.is_file():
         return
-    known = {field.name for field in fields(Frame)}
-    found = files.read_json(index)
-    rows = found.get("frames") if isinstance(found, dict) else None
+    columns = {field.name for field in fields(Frame)}
+    content = files.read_json(index)
+    rows = content.get("frames") if isinstance(content, dict) else None
     if not isinstance(rows, list):
         return  # an index of somebody else
     for number, row in enumerate(rows):
-        is_row = isinstance(row, dict) and {"name", "style", "left"} <= set(row) <= known
+        is_row = isinstance(row, dict) and {"name", "style", "left"} <= set(row) <= columns
         if not is_row or not all(isinstance(value, str) for value in row.values()):
             raise InputError(f"{index}: frame {number} is not as 'depthpose data pack' writes it")
         paths = {k: folder / v for k, v in row.items() if k not in ("name", "style")}
@@ -144,11 +147,11 @@ def find_frames(folder: Path) -> tuple[str, list[Frame]]:
         if frames:
             return name, frames
     children = sorted(folder.iterdir())
-    found = ", ".join(path.name for path in children[:8]) or "nothing"
+    names = ", ".join(path.name for path in children[:8]) or "nothing"
     inside = [
         path.name
         for path in children[:50]
-        if path.is_dir() and any(next(iter(one.find(path)), None) for one in LAYOUTS.values())
+        if path.is_dir() and any(next(iter(layout.find(path)), None) for layout in LAYOUTS.values())
     ]
     hint = f" Open one of its folders instead: {', '.join(inside)}." if inside else ""
     drives = (folder, *children, *folder.glob("*/*_extract"))
@@ -157,9 +160,9 @@ def find_frames(folder: Path) -> tuple[str, list[Frame]]:
             " Drives called _extract hold KITTI's raw images, which are neither rectified nor "
             "synchronised: take those called _sync."
         )
-    known_layouts = ", ".join(f"{name} ({one.parts})" for name, one in LAYOUTS.items())
+    known_layouts = ", ".join(f"{name} ({layout.parts})" for name, layout in LAYOUTS.items())
     raise InputError(
-        f"{folder}: no layout that is known here. It holds {found}. Known: {known_layouts}.{hint}"
+        f"{folder}: no layout that is known here. It holds {names}. Known: {known_layouts}.{hint}"
     )
 
 
@@ -176,7 +179,8 @@ def _raw(folder: Path) -> Iterable[Frame]:
     """KITTI raw: a root of dates, a date or a drive; its depth-prediction set inside or beside."""
     itself = [folder] if folder.name.endswith("_sync") else []
     for drive in sorted([*itself, *folder.glob("*_sync"), *folder.glob("*/*_sync")]):
-        date, lefts = drive.parent, _listed(drive / "image_02/data")
+        date = drive.parent
+        lefts = _listed(drive / "image_02/data")
         is_calibrated = (date / "calib_cam_to_cam.txt").exists()
         maps: list[Path] = []  # of the left camera, wherever in the tree the dataset was opened
         for kind, archive in (("velodyne_raw", "velodyne"), ("groundtruth", "annotated")):
@@ -184,8 +188,8 @@ def _raw(folder: Path) -> Iterable[Frame]:
             tops = (date, date / f"data_depth_{archive}", date.parent)
             roots = [*tops, date.parent / f"data_depth_{archive}"]
             homes = [root / part / drive.name for root in roots for part in ("train", "val")]
-            found = (home / inside for home in (drive, *homes) if (home / inside).is_dir())
-            maps.append(next(found, drive / inside))
+            folders = (home / inside for home in (drive, *homes) if (home / inside).is_dir())
+            maps.append(next(folders, drive / inside))
         yield from _frames(
             lefts,
             "raw",
@@ -208,7 +212,8 @@ def _depth_selection(folder: Path) -> Iterable[Frame]:
     if not (home / "intrinsics").is_dir():
         return
     lenses = _by_stem(home / "intrinsics", (".txt",))
-    scans, depth = _by_stem(home / "velodyne_raw"), _by_stem(home / "groundtruth_depth")
+    scans = _by_stem(home / "velodyne_raw")
+    depth = _by_stem(home / "groundtruth_depth")
     for left in _listed(home / "image"):
         yield Frame(
             name=stem_of(left),
@@ -238,10 +243,10 @@ def _odometry(folder: Path) -> Iterable[Frame]:
         )
 
 
-def _benchmark(folder: Path, one: str, other: str, ending: str) -> Iterable[Frame]:
+def _benchmark(folder: Path, left_name: str, right_name: str, ending: str) -> Iterable[Frame]:
     """KITTI object, 2012 or 2015: of the stereo sets the frames that have truth, NNNNNN_10."""
-    home = folder / "training" if (folder / "training" / one).is_dir() else folder
-    lefts = _listed(home / one)
+    home = folder / "training" if (folder / "training" / left_name).is_dir() else folder
+    lefts = _listed(home / left_name)
     # Of the stereo sets the testing folder too.
     lefts = [left for left in lefts if stem_of(left).endswith("_10")] or lefts
     texts = _by_stem(home / "calib_cam_to_cam", (".txt",)) | _by_stem(home / "calib", (".txt",))
@@ -250,7 +255,7 @@ def _benchmark(folder: Path, one: str, other: str, ending: str) -> Iterable[Fram
         lefts,
         "object",
         calibration=texts,
-        right=_by_stem(home / other),
+        right=_by_stem(home / right_name),
         velodyne=_by_stem(home / "velodyne", (".bin",)),
         depth=_by_stem(home / "gt_depth_map"),
         disparity=_by_stem(home / f"disp_occ{ending}"),
@@ -262,7 +267,8 @@ def _middlebury(folder: Path) -> Iterable[Frame]:
     for scene in [folder, *folder.glob("*"), *folder.glob("*/*")]:
         if not (scene / "calib.txt").is_file():
             continue
-        views, truth = _by_stem(scene, LISTED_SUFFIXES), _by_stem(scene, (".pfm",))
+        views = _by_stem(scene, LISTED_SUFFIXES)
+        truth = _by_stem(scene, (".pfm",))
         if "im0" in views:
             yield Frame(
                 name="_".join(scene.relative_to(folder).parts) or scene.name,
@@ -276,8 +282,10 @@ def _middlebury(folder: Path) -> Iterable[Frame]:
 
 def _pairs(folder: Path) -> Iterable[Frame]:
     cameras = _by_stem(folder, (".json", ".yaml", ".yml"))
-    camera, text = cameras.get("camera"), folder / "calib.txt"
-    lefts, right = _listed(folder / "left"), _by_stem(folder / "right")
+    camera = cameras.get("camera")
+    text = folder / "calib.txt"
+    lefts = _listed(folder / "left")
+    right = _by_stem(folder / "right")
     if right and not any(stem_of(left) in right for left in lefts):
         with suppress(InputError):  # left_0004 and right_0004
             order = find_partners([stem_of(left) for left in lefts], list(right), str(folder))
@@ -302,11 +310,11 @@ LAYOUTS = {
     ),
     "KITTI odometry": Layout(find=_odometry, parts="sequences/NN/image_2, image_3, calib.txt"),
     "KITTI object or 2015": Layout(
-        find=partial(_benchmark, one="image_2", other="image_3", ending="_0"),
+        find=partial(_benchmark, left_name="image_2", right_name="image_3", ending="_0"),
         parts="image_2, image_3, calib or disp_occ_0",
     ),
     "KITTI 2012": Layout(
-        find=partial(_benchmark, one="colored_0", other="colored_1", ending=""),
+        find=partial(_benchmark, left_name="colored_0", right_name="colored_1", ending=""),
         parts="colored_0, colored_1",
     ),
     "Middlebury": Layout(find=_middlebury, parts="SCENE/im0.png, calib.txt"),
@@ -319,15 +327,15 @@ def _by_stem(
     folder: Path, suffixes: tuple[str, ...] = (*LISTED_SUFFIXES, *files.MAP_SUFFIXES)
 ) -> dict[str, Path]:
     """List files by their names; of two suffixes the first one counts, in capitals or not."""
-    found = sorted(_listed(folder, suffixes), key=lambda path: suffixes.index(path.suffix.lower()))
-    return {stem_of(path): path for path in reversed(found)}
+    paths = sorted(_listed(folder, suffixes), key=lambda path: suffixes.index(path.suffix.lower()))
+    return {stem_of(path): path for path in reversed(paths)}
 
 
 def _listed(folder: Path, suffixes: tuple[str, ...] = LISTED_SUFFIXES) -> list[Path]:
     if not folder.is_dir():
         return []
-    found = (path for path in folder.iterdir() if not path.name.startswith("."))
-    return sorted(path for path in found if path.suffix.lower() in suffixes and path.is_file())
+    paths = (path for path in folder.iterdir() if not path.name.startswith("."))
+    return sorted(path for path in paths if path.suffix.lower() in suffixes and path.is_file())
 
 
 _CALIBRATION_FILES = ("calib_cam_to_cam.txt", "calib_velo_to_cam.txt")
@@ -391,7 +399,8 @@ def write_scene(folder: Path, name: str, frame: RawFrame) -> None:
     Raises:
         InputError: the disk refuses.
     """
-    home, rig = folder / name, frame.rig
+    home = folder / name
+    rig = frame.rig
     written = [home / part for part in ("im0.png", "im1.png", "disp0.pfm", "calib.txt")]
     files.write_image(written[0], frame.left)
     files.write_image(written[1], frame.right)
@@ -415,7 +424,8 @@ def write_scene(folder: Path, name: str, frame: RawFrame) -> None:
 
 def _write_calibration(folder: Path, date: str, frame: RawFrame) -> None:
     """Write the calibration of a date once; one that is not as it was written, again."""
-    rig, eye = frame.rig, np.eye(3)
+    rig = frame.rig
+    eye = np.eye(3)
     left = np.zeros((3, 4))
     left[:, :3] = rig.K.numpy()
     right = left.copy()

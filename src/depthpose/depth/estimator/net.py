@@ -24,6 +24,7 @@ from depthpose.core.camera import (
     check_image_matches_camera,
     check_rectified,
     choose_lens,
+    find_two_views,
 )
 from depthpose.core.checkpoint import find_weights, join_terms, warn_of_terms
 from depthpose.core.devices import each_in_threads, own_arithmetic, refused_memory
@@ -462,6 +463,11 @@ class FakestereoNet:
                 "right=, or weights with a generator ('depthpose weights list')."
             )
         check_image(image.left, f"{image.name}: the image")
+        if not self.allow_ood and (how := find_two_views(image.left)) is not None:
+            raise InputError(
+                f"{image.name}: holds two views of one scene, {how}; 'depthpose data split' parts "
+                "them, and a pair has metres by itself (--allow-ood takes it for one image)"
+            )
         if image.camera is None:
             raise InputError(
                 f"{image.name}: metres from one image need its focal length, and its EXIF has "

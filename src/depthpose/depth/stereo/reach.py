@@ -17,7 +17,7 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from depthpose.core.camera import Camera
-from depthpose.depth.disparity import changed_match
+from depthpose.depth.disparity import changed_match, warp_right_to_left
 from depthpose.depth.stereo.matcher import NetworkMatcher, Search
 from depthpose.depth.types import Match
 
@@ -106,19 +106,26 @@ def measure_reach(
     step_px = STEP_PX / scale
     first_px = STEP_PX * math.floor(infinity_px * scale / STEP_PX)
     search = Search(scale=scale, first_px=first_px, max_disparity_px=reach_px)
-    (coarse,) = matcher.match_many([(left, right)], search=search)
+    views, mirrored = (left, right), (right.flip(-1), left.flip(-1))
+    coarse, other = matcher.match_many([views, mirrored], search=search)
+    # How far a pair reaches is told where both views agree: not at hidden places and the left
+    # border. How near, where the right view can show it: near things are in one view alone often.
+    right_px = other.disparity_px.flip(-1)[None]
+    there_px = warp_right_to_left(right_px, coarse.disparity_px)[0]
+    agrees = (coarse.disparity_px - there_px).abs() <= step_px
     # Every pixel of the copy, of the maps at the size of the images.
     stride = max(1, round(1 / scale))
     each = (slice(None, None, stride), slice(None, None, stride))
     found_px = coarse.disparity_px[each]
-    # What the right view cannot show was not measured: it would lie to the left of its border.
+    is_far = agrees[each]
     is_near = found_px <= torch.arange(width, device=found_px.device)[::stride]
     if coarse.confidence is not None:
         is_near &= coarse.confidence[each] >= _SURE
-    far_px, near_px = found_px.flatten().sort().values, found_px[is_near].sort().values
-    tail = int(_TAIL * len(far_px))
-    low_px = float(far_px[tail]) - step_px
-    high_px = float(near_px[-1 - tail] if len(near_px) > tail else far_px[-1 - tail]) + step_px
+    tail = int(_TAIL * found_px.numel())
+    far_px, near_px = (found_px[which].sort().values for which in (is_far, is_near))
+    if min(len(far_px), len(near_px)) <= tail:  # nothing is known: all that was found counts
+        far_px = near_px = found_px.flatten().sort().values
+    low_px, high_px = float(far_px[tail]) - step_px, float(near_px[-1 - tail]) + step_px
     return Reach(
         low_px=max(low_px, infinity_px),
         high_px=max(high_px, low_px + step_px),

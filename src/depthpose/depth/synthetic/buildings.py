@@ -14,7 +14,8 @@ _PLASTERS: list[Color] = [
 _ROOFS: list[Color] = [(0.2, 0.075, 0.045), (0.06, 0.06, 0.067), (0.14, 0.08, 0.06)]
 _FRAMES: list[Color] = [(0.75, 0.75, 0.73), (0.07, 0.045, 0.03), (0.03, 0.033, 0.036)]
 _SQUARE = np.array([[0.0, 0], [1, 0], [1, 1], [0, 1]])
-_UP, _AHEAD = np.array([0.0, -1, 0]), np.array([0.0, 0, 1])
+_UP = np.array([0.0, -1, 0])
+_AHEAD = np.array([0.0, 0, 1])
 
 
 class Style(NamedTuple):
@@ -59,7 +60,8 @@ def add_house(b: MeshBuilder, plot: Plot, *, with_details: bool) -> None:
         with_details=with_details,
     )
     b.thing += 1
-    away, length = np.array([float(plot.side), 0, 0]), plot.stop_m - plot.start_m
+    away = np.array([float(plot.side), 0, 0])
+    length = plot.stop_m - plot.start_m
     back_m = plot.x_m + plot.side * plot.depth_m
     for x, z, along, outward, size, has_windows in (
         (plot.x_m, plot.start_m, _AHEAD, -away, length, True),
@@ -76,8 +78,10 @@ def add_house(b: MeshBuilder, plot: Plot, *, with_details: bool) -> None:
     if b.rng.random() < 0.7:
         _add_gable_roof(b, plot, style)
     else:
-        top, middle = plot.ground_m - plot.height_m, plot.x_m + plot.side * plot.depth_m / 2
-        tar, z = Surface("concrete", (0.3, 0.3, 0.3), 3.0), (plot.start_m + plot.stop_m) / 2
+        top = plot.ground_m - plot.height_m
+        middle = plot.x_m + plot.side * plot.depth_m / 2
+        tar = Surface("concrete", (0.3, 0.3, 0.3), 3.0)
+        z = (plot.start_m + plot.stop_m) / 2
         b.box((middle, top - 0.1, z), (plot.depth_m + 0.4, 0.35, length + 0.4), tar)
         if b.rng.random() < 0.5:
             z = b.rng.uniform(plot.start_m + 2, plot.stop_m - 2)
@@ -114,9 +118,11 @@ def _add_windows(b: MeshBuilder, wall: _Wall, style: Style, length: Number, heig
     cells = _rectangles(x0, x1, y0, y1)
     is_window = np.zeros(cells.shape[:2], bool)
     is_window[1::2, 1::2] = True
-    panels, windows = cells[~is_window], cells[is_window]
+    panels = cells[~is_window]
+    windows = cells[is_window]
     b.quads(wall.at(panels), panels + rng.uniform(0, 5, 2), style.wall)
-    outer, inner = wall.at(windows), wall.at(windows, -style.recess_m)
+    outer = wall.at(windows)
+    inner = wall.at(windows, -style.recess_m)
     count = len(windows)
     uv = _SQUARE + rng.integers(0, 8, (count, 1, 2))
     is_covered = rng.random((count, 1)) < 0.3  # by blinds or curtains
@@ -130,7 +136,8 @@ def _add_windows(b: MeshBuilder, wall: _Wall, style: Style, length: Number, heig
     if not style.with_details:
         return
     (left, low), (right, high) = windows[:, 0].T, windows[:, 2].T
-    middle, bar = (left + right) / 2, 0.07
+    middle = (left + right) / 2
+    bar = 0.07
     frames = np.concatenate(
         [
             _rectangles(left, left + bar, low, high),
@@ -142,7 +149,8 @@ def _add_windows(b: MeshBuilder, wall: _Wall, style: Style, length: Number, heig
     )
     b.quads(wall.at(frames, 0.03 - style.recess_m), frames, Surface("wood", style.frame))
     sill = _rectangles(left - 0.1, right + 0.1, low - 0.09, low)
-    front, stone = wall.at(sill, 0.12), Surface("concrete", (0.4, 0.39, 0.36))
+    front = wall.at(sill, 0.12)
+    stone = Surface("concrete", (0.4, 0.39, 0.36))
     b.quads(front, sill, stone)
     top = np.stack([front[:, 3], front[:, 2], wall.at(sill)[:, 2], wall.at(sill)[:, 3]], 1)
     b.quads(top, _SQUARE * [1, 0.12], stone)
@@ -155,14 +163,20 @@ def _rectangles(x0: np.ndarray, x1: np.ndarray, y0: np.ndarray, y1: np.ndarray) 
 
 def _add_gable_roof(b: MeshBuilder, plot: Plot, style: Style) -> None:
     """Two slopes over the eaves, the ridge along the street, and the walls' triangles below."""
-    rng, start, stop, side = b.rng, plot.start_m, plot.stop_m, plot.side
-    rise, over = rng.uniform(1.8, 4.2), rng.uniform(0.2, 0.5)
-    half, top = plot.depth_m / 2, plot.ground_m - plot.height_m
+    rng = b.rng
+    start = plot.start_m
+    stop = plot.stop_m
+    side = plot.side
+    rise = rng.uniform(1.8, 4.2)
+    over = rng.uniform(0.2, 0.5)
+    half = plot.depth_m / 2
+    top = plot.ground_m - plot.height_m
     ridge_x = plot.x_m + side * half
     slate = Surface("roof", _ROOFS[rng.integers(len(_ROOFS))], 2.4, int(rng.integers(3)))
     slope = np.hypot(half + over, rise)
     eave_y = top + rise * over / half  # the slopes go on, below the walls' top, over the eaves
-    first, last = start - over, stop + over
+    first = start - over
+    last = stop + over
     for sign in (-1, 1):
         x = ridge_x + sign * (half + over)
         face = [(x, eave_y, first), (x, eave_y, last),
@@ -173,7 +187,8 @@ def _add_gable_roof(b: MeshBuilder, plot: Plot, style: Style) -> None:
     for z in (start, stop):
         gable = [(ridge_x - half, top, z), (ridge_x + half, top, z), (ridge_x, top - rise, z)]
         b.triangles([gable], [[[0, 0], [plot.depth_m, 0], [half, rise]]], style.wall)
-    x, z = ridge_x + rng.uniform(-1, 1) * half * 0.5, rng.uniform(start + 1, stop - 1)
+    x = ridge_x + rng.uniform(-1, 1) * half * 0.5
+    z = rng.uniform(start + 1, stop - 1)
     chimney = Surface("brick", (0.28, 0.13, 0.09), 1.8)
     b.box((x, top - rise * 0.8, z), (0.6, 1.8, 0.6), chimney)
     if rng.random() < 0.5:  # dormers
@@ -188,9 +203,14 @@ def _add_gable_roof(b: MeshBuilder, plot: Plot, style: Style) -> None:
 
 def _add_trim(b: MeshBuilder, plot: Plot, style: Style) -> None:
     """A plinth, a gutter's pipe and a door; here and there balconies or a shop."""
-    rng, x, y, side = b.rng, plot.x_m, plot.ground_m, plot.side
-    start, stop = plot.start_m, plot.stop_m
-    middle, length = (start + stop) / 2, stop - start
+    rng = b.rng
+    x = plot.x_m
+    y = plot.ground_m
+    side = plot.side
+    start = plot.start_m
+    stop = plot.stop_m
+    middle = (start + stop) / 2
+    length = stop - start
     plinth = Surface("stone", (0.2, 0.19, 0.18), 2.0)
     b.box((x, y - 0.25, middle), (0.12, 0.6, length), plinth)
     foot, head = ((x - side * 0.07, at, start + 0.3) for at in (y, y - plot.height_m))
@@ -199,11 +219,10 @@ def _add_trim(b: MeshBuilder, plot: Plot, style: Style) -> None:
     door = Surface("wood", tuple(rng.uniform(0.03, 0.35, 3)), 1.0, int(rng.integers(2)))
     b.box((x, y - 1.05, door_z), (0.1, 2.1, 1.1), door)
     if rng.random() < 0.25:
-        slab, rail = (
-            Surface("concrete", (0.42, 0.42, 0.4), 2.0),
-            Surface("metal", (0.05, 0.05, 0.05)),
-        )
-        z, outer = rng.uniform(start + 1.5, stop - 1.5), x - side * 0.98
+        slab = Surface("concrete", (0.42, 0.42, 0.4), 2.0)
+        rail = Surface("metal", (0.05, 0.05, 0.05))
+        z = rng.uniform(start + 1.5, stop - 1.5)
+        outer = x - side * 0.98
         for storey in range(1, int((plot.height_m - 0.6) // style.storey_m)):
             up = y - storey * style.storey_m
             b.box((x - side * 0.5, up, z), (1.0, 0.14, 2.4), slab)
@@ -217,8 +236,11 @@ def _add_trim(b: MeshBuilder, plot: Plot, style: Style) -> None:
         board = Surface("poster", tuple(rng.uniform(0.2, 0.9, 3)), 2.0, int(rng.integers(4)))
         b.box((x - side * 0.1, y - 3.0, middle), (0.15, 0.6, width), board)
         if rng.random() < 0.5:
-            low, high, out = y - 2.3, y - 2.75, x - side * 1.3
-            first, last = middle - width / 2, middle + width / 2
+            low = y - 2.3
+            high = y - 2.75
+            out = x - side * 1.3
+            first = middle - width / 2
+            last = middle + width / 2
             face = [(out, low, first), (out, low, last), (x, high, last), (x, high, first)]
             cloth = Surface("cloth", tuple(rng.uniform(0.05, 0.7, 3)))
             b.quads([face], [_SQUARE * [width, 1.4]], cloth)

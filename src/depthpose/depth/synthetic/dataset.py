@@ -76,10 +76,12 @@ def nearest_at(
     which = candidates.clamp(min=0).flatten()
     volume = sight.volume.index_select(0, which)[:, None]
     lines = (sight.edges.flatten(1).index_select(0, which) / volume).unflatten(0, candidates.shape)
-    missing, row = candidates < 0, torch.arange(len(candidates))
-    found = []
+    missing = candidates < 0
+    row = torch.arange(len(candidates))
+    hits = []
     for pixels in places:
-        u, v = pixels[:, :1], pixels[:, 1:]
+        u = pixels[:, :1]
+        v = pixels[:, 1:]
         # Corner by corner: a sum over so short an axis would take ten times as long.
         weights = [
             torch.addcmul(lines[..., i + 2], lines[..., i], u).addcmul_(lines[..., i + 1], v)
@@ -92,14 +94,15 @@ def nearest_at(
         primitive = torch.where(inverse > 0, candidates[row, first], -1)
         chosen = torch.stack([weight[row, first] for weight in weights], 1)
         shares = (chosen / inverse[:, None]).float()
-        found.append(Nearest(primitive, shares, (1 / inverse).float()))
-    return found
+        hits.append(Nearest(primitive, shares, (1 / inverse).float()))
+    return hits
 
 
 def neighbours(primitive: Int[Tensor, "h w"], index: Indices) -> Int[Tensor, "n 5"]:
     """Triangles seen at some pixels and at the four beside each."""
     height, width = primitive.shape
-    column, row = index % width, index // width
+    column = index % width
+    row = index // width
     places = [
         (row + y).clamp(0, height - 1) * width + (column + x).clamp(0, width - 1)
         for x, y in ((0, 0), (1, 0), (-1, 0), (0, 1), (0, -1))
@@ -121,36 +124,39 @@ def draw_light(stage: Stage, sight: Sight) -> Float[Tensor, "h w 3"]:
     shown = raster.primitive.clamp(min=0)
     kind = torch.where(raster.primitive >= 0, stage.kind[shown], -1)
     normal = stage.attributes[:, 18:21].index_select(0, shown.flatten()).unflatten(0, shown.shape)
-    every, after, before = slice(None), slice(1, None), slice(None, -1)
-    for one, other in (((every, after), (every, before)), ((after, every), (before, every))):
-        is_other = raster.primitive[one] != raster.primitive[other]
-        x, y, z = (normal[one] * normal[other]).unbind(-1)
+    every = slice(None)
+    after = slice(1, None)
+    before = slice(None, -1)
+    for here, other in (((every, after), (every, before)), ((after, every), (before, every))):
+        is_other = raster.primitive[here] != raster.primitive[other]
+        x, y, z = (normal[here] * normal[other]).unbind(-1)
         is_bent = (x + y + z).abs() < 0.9
-        differs = is_other & ((kind[one] != kind[other]) | is_bent)
-        is_edge[one] |= differs
+        differs = is_other & ((kind[here] != kind[other]) | is_bent)
+        is_edge[here] |= differs
         is_edge[other] |= differs
     is_edge = is_edge.flatten()
     light = torch.zeros(height * width, 3)
-    whole, mixed = (~is_edge).nonzero()[:, 0], is_edge.nonzero()[:, 0]
+    whole = (~is_edge).nonzero()[:, 0]
+    mixed = is_edge.nonzero()[:, 0]
     assert raster.barycentric is not None
-    seen = [v.flatten(0, 1) for v in (raster.primitive, raster.barycentric, raster.depth_m)]
-    nearest = Nearest(*(values.index_select(0, whole) for values in seen))
+    flat = [v.flatten(0, 1) for v in (raster.primitive, raster.barycentric, raster.depth_m)]
+    nearest = Nearest(*(values.index_select(0, whole) for values in flat))
     index = torch.arange(height * width)
     centres = torch.stack([index % width, index // width], 1).double()
     light[whole] = _light(stage, sight, centres[whole], nearest)
     if len(mixed):  # the mean light of four places in each pixel
         candidates = neighbours(sight.raster.primitive, mixed)
-        own = [values.index_select(0, mixed) for values in seen]
+        at_centre = [values.index_select(0, mixed) for values in flat]
         places = [centres[mixed] + torch.tensor(o, dtype=torch.float64) for o in _OFFSETS]
-        found = []
+        hits = []
         for there in nearest_at(sight, candidates, places):
             # A gap between all that was seen near by: take what the pixel's centre sees.
             is_lost = (there.primitive < 0) & (candidates >= 0).all(1)
-            found.append([
-                torch.where(is_lost if one.ndim == 1 else is_lost[:, None], instead, one)
-                for one, instead in zip(there, own, strict=True)
+            hits.append([
+                torch.where(is_lost if here.ndim == 1 else is_lost[:, None], instead, here)
+                for here, instead in zip(there, at_centre, strict=True)
             ])  # fmt: skip
-        nearest = Nearest(*(torch.cat(parts) for parts in zip(*found, strict=True)))
+        nearest = Nearest(*(torch.cat(parts) for parts in zip(*hits, strict=True)))
         of_places = _light(stage, sight, torch.cat(places), nearest)
         # A glint in a quarter of a pixel would outshine the rest, as it does not in a sensor.
         light[mixed] = of_places.clamp(max=4).reshape(len(_OFFSETS), -1, 3).mean(0)
@@ -165,7 +171,8 @@ def _light(stage: Stage, sight: Sight, pixels: Float64[Tensor, "n 2"], nearest: 
     length = rays.norm(dim=1)
     towards = rays / length[:, None]
     light = torch.empty_like(rays)
-    sky, hit = (primitive < 0).nonzero()[:, 0], (primitive >= 0).nonzero()[:, 0]
+    sky = (primitive < 0).nonzero()[:, 0]
+    hit = (primitive >= 0).nonzero()[:, 0]
     light[sky] = sky_light(stage, towards[sky])
     hits = Hits(
         primitive=primitive.index_select(0, hit),
@@ -287,13 +294,15 @@ def scan(stage: Stage, rng: np.random.Generator) -> Float[Tensor, "n 4"]:
     primitive, _, depth_m = nearest_at(sight, candidates, [pixels])[0]
     range_m = depth_m / towards[:, 2]
     # Few beams come back from glass, fewer from afar and from what is dark.
-    chance, seen = torch.from_numpy(rng.random(len(primitive))), primitive.clamp(min=0)
-    material, tint = stage.material[seen], stage.attributes[seen, 15:18].mean(1)
+    chance = torch.from_numpy(rng.random(len(primitive)))
+    hit = primitive.clamp(min=0)
+    material = stage.material[hit]
+    tint = stage.attributes[hit, 15:18].mean(1)
     is_glass = (material == NUMBER["glass"]) | (material == NUMBER["pane"])
     dark = (0.12 - tint).clamp(min=0) * 2.5
     lost = 0.03 + 0.0025 * range_m + 0.65 * is_glass + dark * (range_m / 40).clamp(max=1)
-    kept = (primitive >= 0) & (range_m < _MAX_RANGE_M) & (chance > lost)
-    returned = kept.nonzero()[:, 0]
+    is_returned = (primitive >= 0) & (range_m < _MAX_RANGE_M) & (chance > lost)
+    returned = is_returned.nonzero()[:, 0]
     noise = torch.from_numpy(rng.normal(0, _NOISE_M, len(returned)))
     far = range_m[returned].double() + noise
     x, y, z = (towards[returned] * far[:, None]).unbind(1)
@@ -369,9 +378,12 @@ def _project_dots(
         (3 * projector.dots_per_radian * points[..., k] / points[..., 2]).nan_to_num(0.0)
         for k in (0, 1)
     )
-    left, top = x.floor(), y.floor()
-    across, down = x - left, y - top
-    left, top = left.long(), top.long()
+    left = x.floor()
+    top = y.floor()
+    across = x - left
+    down = y - top
+    left = left.long()
+    top = top.long()
     upper, lower = (
         torch.lerp(pattern[r % side, left % side], pattern[r % side, (left + 1) % side], across)
         for r in (top, top + 1)
@@ -400,13 +412,15 @@ def draw_scene(
     K[0, 2] += rig.cx_right_minus_left_px
     K[1, 2] += rng.normal(0, 1) * config.rectification_error_px
     right = view_from(stage, K, (rig.height, rig.width), torch.tensor([rig.baseline_m, 0.0, 0.0]))
-    light, other_light = draw_light(stage, left), draw_light(stage, right)
+    light = draw_light(stage, left)
+    other_light = draw_light(stage, right)
     if projector is not None:
         light = _project_dots(light, left, projector)
         other_light = _project_dots(other_light, right, projector)
     sensors = draw_sensors(rng, light, config.jpeg_share)
     points = scan(stage, rng) if config.with_lidar else None
-    primitive, depth_m = left.raster.primitive, left.raster.depth_m
+    primitive = left.raster.primitive
+    depth_m = left.raster.depth_m
     disparity_px = disparity_from_depth(depth_m, rig)
     return StreetFrame(
         left=expose(light, sensors[0]),
@@ -426,7 +440,8 @@ def draw_scene(
 def _occluded(left: Sight, right: Sight, rig: StereoRig) -> Mask:
     """Ask for each left point what the right camera sees where it should be."""
     height, width = left.raster.primitive.shape
-    primitive, depth_m = left.raster.primitive.flatten(), left.raster.depth_m.flatten()
+    primitive = left.raster.primitive.flatten()
+    depth_m = left.raster.depth_m.flatten()
     occluded = torch.zeros(height * width, dtype=torch.bool)
     index = (primitive >= 0).nonzero()[:, 0]
     pixels = torch.stack([index % width, index // width], 1).double()
@@ -438,9 +453,9 @@ def _occluded(left: Sight, right: Sight, rig: StereoRig) -> Mask:
     candidates = neighbours(right.raster.primitive, near)
     # Most see the same triangle there, and nothing else need be asked.
     is_same = (candidates[:, :1] == primitive[index, None])[:, 0] & ~is_outside
-    asked = (~is_same & ~is_outside).nonzero()[:, 0]
-    _, _, seen_m = nearest_at(right, candidates[asked], [pixels[asked]])[0]
-    occluded[index[asked]] = seen_m < depth_m[index[asked]] * (1 - _OCCLUSION_SHARE)
+    undecided = (~is_same & ~is_outside).nonzero()[:, 0]
+    _, _, seen_m = nearest_at(right, candidates[undecided], [pixels[undecided]])[0]
+    occluded[index[undecided]] = seen_m < depth_m[index[undecided]] * (1 - _OCCLUSION_SHARE)
     occluded[index[is_outside]] = True
     return occluded.reshape(height, width)
 

@@ -108,7 +108,8 @@ def textures() -> Textures:
             stack[FIRST_LAYER[name] + variant] = (
                 painted if painted.ndim == 3 else painted[..., None]
             )
-    level, levels = np.clip(stack, 0.02, 3), []
+    level = np.clip(stack, 0.02, 3)
+    levels = []
     for _ in range(LEVELS):
         levels.append(level.reshape(-1, 3))
         half = level.shape[1] // 2
@@ -135,15 +136,19 @@ def sample_texture(
     column, row = low.long().unbind(1)
     mask = side - 1  # sides are powers of two
     start = textures.starts.to(layer.device)[whole] + layer * side * side
-    left, right = column & mask, (column + 1) & mask
-    above, below = start + (row & mask) * side, start + ((row + 1) & mask) * side
+    left = column & mask
+    right = (column + 1) & mask
+    above = start + (row & mask) * side
+    below = start + ((row + 1) & mask) * side
     texels = textures.texels
     a, b, c, d = (
         texels.index_select(0, index).float()
         for index in (above + left, above + right, below + left, below + right)
     )
-    across, down = share[:, :1], share[:, 1:]
-    top, bottom = torch.lerp(a, b, across), torch.lerp(c, d, across)
+    across = share[:, :1]
+    down = share[:, 1:]
+    top = torch.lerp(a, b, across)
+    bottom = torch.lerp(c, d, across)
     return torch.lerp(top, bottom, down)
 
 
@@ -184,7 +189,8 @@ class _Noise:
         row = np.floor(_y * rows).astype(int)
         across = _x * columns + 0.5 * (row % 2)
         column = np.floor(across).astype(int) % columns
-        in_row, in_column = (_y * rows) % 1, across % 1
+        in_row = (_y * rows) % 1
+        in_column = across % 1
         edge = np.minimum(
             np.minimum(in_column, 1 - in_column) * rows / columns, np.minimum(in_row, 1 - in_row)
         )
@@ -220,12 +226,16 @@ def _paint_surface(name: str, noise: _Noise, variant: int) -> Plane | Picture:
         case "road":
             cracks = np.clip(1 - np.abs(noise.smooth(1.8, (2, 60))) / 0.035, 0, 1)
             cracks = cracks * np.clip(noise.broad() - 0.4 * variant % 1, 0, 1)
-            rough, fine, broad = noise.rough(), noise.fine(), noise.broad()
+            rough = noise.rough()
+            fine = noise.fine()
+            broad = noise.broad()
             painted = (
                 1 + (0.24 + 0.05 * variant) * fine + 0.14 * rough + 0.06 * broad - 0.6 * cracks
             )
         case "grass":
-            fine, rough, broad = noise.fine(), noise.rough(), noise.broad()
+            fine = noise.fine()
+            rough = noise.rough()
+            broad = noise.broad()
             dry = 0.14 + 0.1 * variant
             red = 1 + 0.34 * fine + 0.26 * rough + dry * broad
             green = 1 + 0.32 * fine + 0.24 * rough + 0.4 * dry * broad
@@ -238,7 +248,9 @@ def _paint_surface(name: str, noise: _Noise, variant: int) -> Plane | Picture:
             painted = wall * (1 + 0.1 * noise.broad())[..., None]
         case "plaster":
             streaks = np.clip(noise.smooth(2.2, (1, 60), (0.25, 1)) - 0.6, 0, 2)
-            fine, rough, broad = noise.fine(), noise.rough(), noise.broad()
+            fine = noise.fine()
+            rough = noise.rough()
+            broad = noise.broad()
             plain = 1 + 0.05 * fine + 0.06 * rough + 0.07 * broad
             painted = plain - (0.06 + 0.06 * variant) * streaks
         case "roof":
@@ -246,7 +258,8 @@ def _paint_surface(name: str, noise: _Noise, variant: int) -> Plane | Picture:
             grains = 1 + 0.09 * noise.fine() + 0.1 * noise.broad()
             painted = shade * ((0.55 + 0.65 * in_row) * grains)[..., None]
         case "leaf":  # light and dark clumps: a ball covered with it looks like foliage
-            fine, rough = noise.fine(), noise.rough()
+            fine = noise.fine()
+            rough = noise.rough()
             clumps = np.clip(1 + 0.55 * noise.smooth(0.8, (6, 60)) + 0.2 * fine, 0.1, 2.5)
             painted = np.stack([clumps + 0.15 * rough, clumps + 0.1 * rough, clumps], 2)
         case "wood":
@@ -275,7 +288,8 @@ _THINGS = ("side", "pane", "wheel", "plate", "lamp", "sign", "poster", "cloth")
 
 def _paint_thing(name: str, noise: _Noise, variant: int) -> Plane | Picture:
     """Paint one variant of a texture with figures, grey or in colours."""
-    colored, rng = np.ones((SIDE_PX, SIDE_PX, 3), np.float32), noise.rng
+    colored = np.ones((SIDE_PX, SIDE_PX, 3), np.float32)
+    rng = noise.rng
     match name:
         case "side":  # a car's flank from rear (u = 0) to front, sill to roof: doors, handles
             grey = 1 + 0.04 * noise.broad() + 0.1 * np.clip((_y - 0.2) * 2, -0.5, 0.6)
@@ -293,8 +307,10 @@ def _paint_thing(name: str, noise: _Noise, variant: int) -> Plane | Picture:
             blind = 0.35 * np.sign(np.sin(_y * np.pi * 40)) * (_y > (0.2, 0.55, 2)[variant])
             return 0.75 + 0.4 * _y + 0.15 * noise.broad() + curtain * (variant != 1) + blind
         case "wheel":
-            y, x = _y - 0.5, _x - 0.5
-            turn, out = np.arctan2(y, x), np.hypot(x, y)
+            y = _y - 0.5
+            x = _x - 0.5
+            turn = np.arctan2(y, x)
+            out = np.hypot(x, y)
             spokes = np.cos(turn * (5, 7)[variant]) > -0.1
             return np.where((spokes | (out > 0.42) | (out < 0.12)), 1.1, 0.15).astype(np.float32)
         case "plate":
@@ -307,12 +323,15 @@ def _paint_thing(name: str, noise: _Noise, variant: int) -> Plane | Picture:
             colors = [(0.1, 0.1, 0.1), (0.05, 0.05, 0.05), (1.0, 0.08, 0.08), (0.1, 0.2, 0.9)]
             color = np.array(colors[variant % 4])
             for _ in range((3, 5, 8, 14, 24, 4)[variant]):
-                width, height = rng.integers(10, 110), rng.integers(8, 60)
-                x, y = rng.integers(30, 220 - width // 2), rng.integers(30, 220 - height // 2)
+                width = rng.integers(10, 110)
+                height = rng.integers(8, 60)
+                x = rng.integers(30, 220 - width // 2)
+                y = rng.integers(30, 220 - height // 2)
                 colored[y : y + height, x : x + width] = color * rng.uniform(0.5, 1.2)
         case "poster":
             for _ in range(50):
-                width, height = rng.integers(6, 90), rng.integers(4, 60)
+                width = rng.integers(6, 90)
+                height = rng.integers(4, 60)
                 x, y = rng.integers(0, SIDE_PX, 2)
                 colored[y : y + height, x : x + width] = rng.uniform(0.05, 1.4, 3)
         case _:  # cloth
@@ -340,9 +359,9 @@ class Mesh:
     def __len__(self) -> int:
         return len(self.corners)
 
-    def part(self, kept: Bool[np.ndarray, " n"]) -> "Mesh":
+    def part(self, is_part: Bool[np.ndarray, " n"]) -> "Mesh":
         """Some of its triangles."""
-        return Mesh(**{field.name: getattr(self, field.name)[kept] for field in fields(Mesh)})
+        return Mesh(**{field.name: getattr(self, field.name)[is_part] for field in fields(Mesh)})
 
 
 def join(meshes: Sequence[Mesh]) -> Mesh:
@@ -360,7 +379,8 @@ def place(
 ) -> Mesh:
     """Copy a model to its place; a positive yaw turns z towards x, to the right."""
     factor = np.broadcast_to(np.asarray(scale, np.float32), 3)
-    c, s = np.cos(yaw_rad), np.sin(yaw_rad)
+    c = np.cos(yaw_rad)
+    s = np.sin(yaw_rad)
     R = np.array([[c, 0, s], [0, 1, 0], [-s, 0, c]]).astype(np.float32)
     corners = (mesh.corners * factor) @ R.T + np.asarray(position, np.float32)
     tint = mesh.tint
@@ -411,7 +431,8 @@ class MeshBuilder:
         """
         positions = np.asarray(corners, np.float32)
         uv = np.asarray(uv_m, np.float32) / surface.tile_m
-        material, color = NUMBER[surface.material], surface.tint if tint is None else tint
+        material = NUMBER[surface.material]
+        color = surface.tint if tint is None else tint
         self._parts.append(
             _mesh(positions, uv, normals, color, material, surface.layer, self.thing)
         )
@@ -436,7 +457,8 @@ class MeshBuilder:
     def rectangle(self, corner: Values, along: Values, up: Values, surface: Surface) -> None:
         """Add one rectangle: a corner and its two sides [m]."""
         p, a, b = (np.asarray(v, np.float64) for v in (corner, along, up))
-        width, height = np.linalg.norm(a), np.linalg.norm(b)
+        width = np.linalg.norm(a)
+        height = np.linalg.norm(b)
         uv = [[0, 0], [width, 0], [width, height], [0, height]]
         self.quads([[p, p + a, p + a + b, p + b]], [uv], surface)
 
@@ -462,12 +484,14 @@ class MeshBuilder:
     ) -> None:
         """Add a cone's frustum without ends, from one point to another; one radius: a cylinder."""
         first, last = radii_m if isinstance(radii_m, tuple) else (radii_m, radii_m)
-        p, q = np.asarray(start, np.float64), np.asarray(stop, np.float64)
+        p = np.asarray(start, np.float64)
+        q = np.asarray(stop, np.float64)
         length = float(np.linalg.norm(q - p))
         across, other = _across((q - p) / length)
         angle = np.linspace(0, 2 * np.pi, sides + 1)
         ring = np.cos(angle)[:, None] * across + np.sin(angle)[:, None] * other
-        low, high = p + ring * first, q + ring * last
+        low = p + ring * first
+        high = q + ring * last
         around = angle * max(first, last)
         below, above = (np.stack([around, 0 * around + d], -1) for d in (0.0, length))
         self.quads(between(low, high), between(below, above), surface, between(ring, ring))
@@ -483,7 +507,8 @@ class MeshBuilder:
         rim_uv = np.stack([np.cos(angle), np.sin(angle)], -1)
         rim = middle + radius_m * (rim_uv[:, :1] * across + rim_uv[:, 1:] * other)
         uv = (0.5 + 0.5 * rim_uv) * surface.tile_m
-        hub, hub_uv = np.broadcast_to(middle, rim.shape), np.full_like(uv, 0.5 * surface.tile_m)
+        hub = np.broadcast_to(middle, rim.shape)
+        hub_uv = np.full_like(uv, 0.5 * surface.tile_m)
         faces, places = (np.stack([c[1:], e[:-1], e[1:]], 1) for c, e in ((hub, rim), (hub_uv, uv)))
         self.triangles(faces, places, surface)
 

@@ -61,7 +61,9 @@ def add_leaves(
     """
     rng = b.rng
     if is_block:
-        places, axis, rows = rng.uniform(-1, 1, (count, 3)), rng.integers(0, 3, count), range(count)
+        places = rng.uniform(-1, 1, (count, 3))
+        axis = rng.integers(0, 3, count)
+        rows = range(count)
         places[rows, axis] = np.sign(places[rows, axis]) * rng.uniform(0.8, 1.05, count)
         outward = _unit(places)
     else:
@@ -71,7 +73,8 @@ def add_leaves(
     along = _unit(rng.normal(size=(count, 3)) + 0.7 * np.cross(outward, [0.3, 1, 0.2]))
     across = _unit(np.cross(along, outward + 0.6 * rng.normal(size=(count, 3))))
     size = length_m * rng.uniform(0.6, 1.4, (count, 1))
-    low, side = points - across * size * 0.3, along * size * 0.5
+    low = points - across * size * 0.3
+    side = along * size * 0.5
     corners = np.stack([low - side, low + side, points + across * size * 0.6], 1)
     shade = rng.uniform(0.55, 1.25, (count, 1)) * (1 + 0.1 * rng.normal(size=(count, 3)))
     uv = rng.uniform(0, 1, (count, 1, 2)) + np.array([[0, 0], [0.3, 0], [0.15, 0.3]])
@@ -147,7 +150,8 @@ def tree(number: int, coarseness: int = 0) -> Mesh:
     for clump in range(clumps):
         # A ring of clumps around and above the trunk's top, the last one at the tip.
         height = -(10 - trunk_m - 1.2) * (clump + 0.3) / clumps
-        turn, out = rng.uniform(0, 6.28), radius_m * rng.uniform(0.3, 0.75)
+        turn = rng.uniform(0, 6.28)
+        out = radius_m * rng.uniform(0.3, 0.75)
         out *= 1 - 0.6 * (clump / clumps) ** 2
         centre = top + np.array([out * np.cos(turn), height - 0.4, out * np.sin(turn)])
         b.tube(top, centre, (thick_m * 0.4, 0.03), bark, 5)
@@ -161,7 +165,8 @@ def _add_clump(
 ) -> None:
     """A dark core that occludes what is behind, and leaves about it."""
     light = b.rng.uniform(0.8, 1.15)
-    dark, pale = 0.3 * light, light * 0.7
+    dark = 0.3 * light
+    pale = light * 0.7
     core = Surface("leaf", (dark, dark, dark), 0.9, int(b.rng.integers(3)))
     add_ball(b, centre, radii * 0.76, core, int(length_m < 0.4), 0.25)
     surface = Surface("leaf", (pale, pale, pale), 0.9, int(b.rng.integers(3)))
@@ -238,7 +243,8 @@ def lamp(number: int) -> Mesh:
     """Give a street lamp at the kerb; its arm reaches towards +x."""
     b = MeshBuilder(np.random.default_rng((41, number)))
     height = b.rng.uniform(5, 9)
-    steel, stone = Surface("metal", (0.22, 0.23, 0.23)), Surface("concrete", (0.4, 0.39, 0.37))
+    steel = Surface("metal", (0.22, 0.23, 0.23))
+    stone = Surface("concrete", (0.4, 0.39, 0.37))
     pole = steel if number % 3 else stone
     b.tube((0, 0.1, 0), (0, -height, 0), (0.1, 0.055), pole, 10)
     b.tube((0, 0, 0), (0, -0.9, 0), 0.13, pole, 10)
@@ -255,9 +261,11 @@ def lamp(number: int) -> Mesh:
 def sign(number: int) -> Mesh:
     """Give a traffic sign whose face looks along -z, to the oncoming camera."""
     b = MeshBuilder(np.random.default_rng((42, number)))
-    height, radius = b.rng.uniform(2.1, 2.8), b.rng.uniform(0.3, 0.42)
+    height = b.rng.uniform(2.1, 2.8)
+    radius = b.rng.uniform(0.3, 0.42)
     b.tube((0, 0.1, 0), (0, -height - radius, 0), 0.035, _GREY)
-    color, sides = _SIGN_COLORS[number % 4], (20, 3, 4, 8)[number % 4]
+    color = _SIGN_COLORS[number % 4]
+    sides = (20, 3, 4, 8)[number % 4]
     if number % 5 == 4:
         wide = b.rng.uniform(0.8, 2.2)
         b.box((0, -height, -0.05), (wide, 0.7, 0.04), Surface("sign", color, 1.0, number))
@@ -295,7 +303,8 @@ def traffic_light(number: int) -> Mesh:
 def small_thing(number: int) -> Mesh:
     """Give a bin, a box, a bollard, a guide post, a bench or a bus stop's pillar."""
     b = MeshBuilder(np.random.default_rng((44, number)))
-    kind, plain = number % 6, Surface("concrete", tuple(b.rng.uniform(0.02, 0.3, 3)))
+    kind = number % 6
+    plain = Surface("concrete", tuple(b.rng.uniform(0.02, 0.3, 3)))
     if kind == 0:
         b.box((0, -0.5, 0), (0.55, 1.0, 0.6), plain, taper=1.1)
         b.box((0, -1.03, 0), (0.6, 0.08, 0.66), plain)
@@ -324,7 +333,8 @@ def small_thing(number: int) -> Mesh:
 def fence(number: int) -> Mesh:
     """Give one piece of fence or wall along z: slats, bars, wire, a rail, or a low wall."""
     b = MeshBuilder(np.random.default_rng((45, number)))
-    rng, kind = b.rng, number % 5
+    rng = b.rng
+    kind = number % 5
     if kind < 3:  # size and distance of the bars, heights of the rails [m]
         slats = (0.02, 1.1, 0.11), 0.16, (0.25, 0.85)
         bars = (0.02, 1.2, 0.02), 0.14, (0.15, 1.1)
@@ -451,24 +461,29 @@ def _ring(
 ) -> Float[np.ndarray, "10 3"]:
     """One cross-section: sill, flank, belt, roof edge and roof of one side, then the other's."""
     length, width, height = size
-    place, belt, roof = station[0], station[1] * height, station[2] * height
+    place = station[0]
+    belt = station[1] * height
+    roof = station[2] * height
     sill = 0.16 * min(height, 1.8) + 0.03
     half = width / 2 * (1 - 0.1 * abs(2 * place) ** 6)
     lean = 0.8 if height < 1.9 else 0.93
     high = half * lean if roof > belt + 0.1 else half * 0.95
     x = [half * 0.96, half, half * 0.985, high, high * 0.6]
     y = [sill, sill + 0.4 * (belt - sill), belt, roof, roof + 0.012 * height]
-    one = [(a, -b, place * length) for a, b in zip(x, y, strict=True)]
-    return np.array(one + [(-a, b, c) for a, b, c in reversed(one)])
+    side = [(a, -b, place * length) for a, b in zip(x, y, strict=True)]
+    return np.array(side + [(-a, b, c) for a, b, c in reversed(side)])
 
 
 def _add_trim(b: MeshBuilder, length: float, width: float, height: float) -> None:
     """Lights, mirrors, plates and bumpers."""
-    low, sill = min(height, 1.6), 0.16 * min(height, 1.8) + 0.03
-    white, red = Surface("lamp", (0.8, 0.81, 0.83)), Surface("lamp", (0.4, 0.02, 0.02))
+    low = min(height, 1.6)
+    sill = 0.16 * min(height, 1.8) + 0.03
+    white = Surface("lamp", (0.8, 0.81, 0.83))
+    red = Surface("lamp", (0.4, 0.02, 0.02))
     b.box((0, -sill + 0.02, 0), (width * 0.9, 0.14, length * 0.94), _BLACK)
     for side in (-1, 1):
-        front, rear = side * width * 0.36, side * width * 0.4
+        front = side * width * 0.36
+        rear = side * width * 0.4
         b.box((front, -0.46 * low, 0.487 * length), (0.32, 0.13, 0.08), white)
         b.box((rear, -0.55 * low, -0.488 * length), (0.2, 0.22, 0.06), red)
         mirror = (side * (width / 2 + 0.08), -0.66 * min(height, 2), 0.2 * length)
@@ -496,15 +511,19 @@ _RUBBER = Surface("tyre", (0.025, 0.025, 0.028))
 def walker(number: int) -> Mesh:
     """Give a person on foot, looking along z, caught at some moment of a step."""
     b = MeshBuilder(np.random.default_rng((31, number)))
-    height, step = b.rng.uniform(1.55, 1.9), b.rng.uniform(-0.28, 0.28)
-    coat, trousers = _cloth(b, 0.45), _cloth(b, 0.22)
+    height = b.rng.uniform(1.55, 1.9)
+    step = b.rng.uniform(-0.28, 0.28)
+    coat = _cloth(b, 0.45)
+    trousers = _cloth(b, 0.22)
     for side in (-1, 1):
-        foot, hip = (side * 0.1, -0.04, side * step), np.array([side * 0.09, -0.48 * height, 0])
+        foot = (side * 0.1, -0.04, side * step)
+        hip = np.array([side * 0.09, -0.48 * height, 0])
         b.tube(foot, hip, (0.06, 0.09), trousers)
         b.box((foot[0], -0.04, foot[2] + 0.05), (0.09, 0.08, 0.26), _RUBBER)
         hand = (side * 0.27, -0.47 * height, -side * step * 0.8)
         b.tube(hand, (side * 0.2, -0.81 * height, 0), (0.045, 0.06), coat)
-    hip, neck = np.array([0, -0.48 * height, 0]), np.array([0, -0.82 * height, 0.02])
+    hip = np.array([0, -0.48 * height, 0])
+    neck = np.array([0, -0.82 * height, 0.02])
     _add_upper_body(b, hip, neck, np.array([0, -0.93 * height, 0.03]), coat)
     if b.rng.random() < 0.4:
         b.box((0.3, -0.4 * height, 0), (0.12, 0.3, 0.34), _cloth(b, 0.4))
@@ -533,10 +552,13 @@ def rider(number: int) -> Mesh:
         b.tube(start, stop, 0.022, frame, 5)
     b.tube((-0.28, -1.06, 0.36), (0.28, -1.06, 0.36), 0.016, _RUBBER, 4)
     b.box((0, -0.94, -0.22), (0.16, 0.06, 0.26), _RUBBER)
-    coat, trousers = _cloth(b, 0.45), _cloth(b, 0.22)
-    hip, neck = np.array([0, -0.98, -0.22]), np.array([0, -1.5, 0.02])
+    coat = _cloth(b, 0.45)
+    trousers = _cloth(b, 0.22)
+    hip = np.array([0, -0.98, -0.22])
+    neck = np.array([0, -1.5, 0.02])
     for side in (-1, 1):
-        knee, pedal = (side * 0.1, -0.68, 0.15), (side * 0.1, -0.28 - 0.13 * side, 0.0)
+        knee = (side * 0.1, -0.68, 0.15)
+        pedal = (side * 0.1, -0.28 - 0.13 * side, 0.0)
         b.tube(pedal, knee, (0.05, 0.065), trousers)
         b.tube(knee, hip + np.array([side * 0.08, 0, 0]), (0.065, 0.09), trousers)
         shoulder = neck + np.array([side * 0.18, 0, 0])

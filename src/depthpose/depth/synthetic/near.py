@@ -148,7 +148,8 @@ def draw_near(config: NearConfig, index: int) -> StreetFrame:
         views = [(view * shares).sum(0, keepdim=True).expand(3, -1, -1) for view in views]
     elif rng.random() < config.grey_share:
         views = [grey_of(view).expand(3, -1, -1) for view in views]
-    left_px, right_px = frame.disparity_px, frame.right_disparity_px
+    left_px = frame.disparity_px
+    right_px = frame.right_disparity_px
     if rng.random() < config.border_share:
         views, unknown = _with_borders(rng, views)
         left_px, right_px = (
@@ -170,7 +171,8 @@ def draw_near(config: NearConfig, index: int) -> StreetFrame:
 def _with_borders(rng: np.random.Generator, views: list[View]) -> tuple[list[View], list[Mask]]:
     """Blacken borders, each view its own, as a rectification leaves them; say which pixels."""
     height, width = views[0].shape[1:]
-    blackened, unknown = [], []
+    blackened = []
+    unknown = []
     for view in views:
         columns, rows = (np.round(rng.uniform(0, 0.06, 2) * side).astype(int) for side in
                          (width, height))  # fmt: skip
@@ -222,7 +224,9 @@ class _Place:
         least = 1 - abs(turn) * self.half[0] - abs(nod) * self.half[1]
         most = 1 + abs(turn) * self.half[0] + abs(nod) * self.half[1]
         if least < 0.15:
-            turn, nod, most = 0.0, 0.0, 1.0
+            turn = 0.0
+            nod = 0.0
+            most = 1.0
         far_m = max(far_m, self.near_m * most)
         reach = 30 * far_m
         along = np.array([1, 0, turn]) * 2 * reach
@@ -232,7 +236,8 @@ class _Place:
 
     def add_room(self, far_m: float) -> None:
         """Add a floor, a back wall, mostly two side walls, sometimes a ceiling."""
-        rng, near_m = self.rng, self.near_m
+        rng = self.rng
+        near_m = self.near_m
         half = near_m * self.half[0] * log_uniform(rng, 1, 4)
         floor, top = (near_m * self.half[1] * log_uniform(rng, 1, 4) for _ in range(2))
         up = [0, -(floor + top), 0]
@@ -250,7 +255,8 @@ class _Place:
 
     def add_table(self, *, is_bin: bool) -> None:
         """Add a plane seen from anywhere above it, a wall behind, and things that lie on it."""
-        rng, near_m = self.rng, self.near_m
+        rng = self.rng
+        near_m = self.near_m
         tilt = np.deg2rad(rng.uniform(0, 75 if not is_bin else 35))
         roll = rng.normal(0, 0.15)
         # Up from the plane, towards the camera: straight at it, or aslant.
@@ -296,7 +302,8 @@ class _Place:
 
     def add_shelf(self) -> None:
         """Add boards and uprights before a wall, with things between them."""
-        rng, near_m = self.rng, self.near_m
+        rng = self.rng
+        near_m = self.near_m
         depth_m = near_m * rng.uniform(0.1, 0.8)
         front_m = near_m * rng.uniform(1.02, 1.5)
         back_m = front_m + depth_m
@@ -338,7 +345,8 @@ class _Place:
 
     def thing(self, centre: np.ndarray, size_m: float, kind: str | None = None) -> None:
         """Add one of the shapes about a point, at least as far away as allowed."""
-        rng, b = self.rng, self.builder
+        rng = self.rng
+        b = self.builder
         b.thing += 1
         least_m = self.near_m + 0.6 * size_m
         centre = centre * max(1.0, least_m / max(float(centre[2]), 1e-6))
@@ -357,9 +365,11 @@ class _Place:
                 for at, size in plates:
                     b.box(centre + R @ np.array(at), size, surface, R)
             case "flange" | "spool":  # discs on a tube
-                axis, radius = R[:, 1], size_m * rng.uniform(0.3, 0.6)
+                axis = R[:, 1]
+                radius = size_m * rng.uniform(0.3, 0.6)
                 length = size_m * rng.uniform(0.15, 1.0)
-                start, end = centre - axis * length / 2, centre + axis * length / 2
+                start = centre - axis * length / 2
+                end = centre + axis * length / 2
                 inner = radius * rng.uniform(0.3, 0.7)
                 b.tube(start, end, inner, surface, 24)
                 for at in (start, end) if name == "spool" else (start,):
@@ -369,7 +379,8 @@ class _Place:
                         b.disc(face, axis, radius, surface, 32)
                 b.disc(end, axis, inner, surface, 24)
             case "bottle":
-                axis, radius = R[:, 1], size_m * rng.uniform(0.15, 0.3)
+                axis = R[:, 1]
+                radius = size_m * rng.uniform(0.15, 0.3)
                 start = centre - axis * size_m / 2
                 marks = np.cumsum([0, *(size_m * rng.uniform(0.1, 0.5, 3))])
                 widths = (radius, radius, radius * rng.uniform(0.2, 0.5))
@@ -378,8 +389,10 @@ class _Place:
                     b.tube(start + axis * low, start + axis * high, (one, other), surface, 24)
                 b.disc(start + axis * marks[3], axis, widths[2], surface, 24)
             case "mug":
-                axis, radius = R[:, 1], size_m * rng.uniform(0.25, 0.4)
-                start, end = centre - axis * size_m / 2, centre + axis * size_m / 2
+                axis = R[:, 1]
+                radius = size_m * rng.uniform(0.25, 0.4)
+                start = centre - axis * size_m / 2
+                end = centre + axis * size_m / 2
                 b.tube(start, end, radius, surface, 28)
                 b.tube(start, end, 0.9 * radius, surface, 28)
                 b.disc(start, axis, radius, surface, 28)
@@ -397,10 +410,12 @@ class _Place:
         self, name: str, centre: np.ndarray, size_m: float, surface: Surface, R: Rotation
     ) -> None:
         """Add books, a cable or a stool, or one of the shapes of clutter."""
-        rng, b = self.rng, self.builder
+        rng = self.rng
+        b = self.builder
         match name:
             case "books":
-                at, down = np.zeros(3), np.array([0.0, 1, 0])
+                at = np.zeros(3)
+                down = np.array([0.0, 1, 0])
                 for _ in range(int(rng.integers(2, 9))):
                     b.thing += 1
                     thick = size_m * rng.uniform(0.03, 0.15)
@@ -408,11 +423,13 @@ class _Place:
                     b.box(centre + R @ (at + down * thick / 2), size, self.surface(size_m), R)
                     at = at + down * thick
             case "cable":
-                at, heading = centre, R[0]
+                at = centre
+                heading = R[0]
                 for _ in range(int(rng.integers(5, 25))):
                     step = at + heading * size_m * 0.12
                     b.tube(at, step, size_m * 0.02, surface, 6)
-                    at, heading = step, heading + rng.normal(0, 0.4, 3)
+                    at = step
+                    heading = heading + rng.normal(0, 0.4, 3)
                     heading = heading / np.linalg.norm(heading)
             case "stool":
                 half = size_m / 2

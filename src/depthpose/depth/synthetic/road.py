@@ -79,14 +79,16 @@ def draw_road(rng: np.random.Generator) -> Road:
     walk_m, curb_m = (rng.uniform(1.4, 4.0), rng.uniform(0.06, 0.15)) if has_walk else (0.0, 0.0)
     verge_m = rng.uniform(1, 5) if place == "avenue" else 0.0
     often = {"city": 0.7, "suburb": 0.65, "avenue": 0.6}.get(place, 0.2)
-    streets, s = [], rng.uniform(4, 40)
+    streets = []
+    s = rng.uniform(4, 40)
     while rng.random() < often and s < 110:
         sides = ((1,), (-1,), (-1, 1))[rng.choice(3, p=[0.3, 0.3, 0.4])]
         streets.append(SideStreet(s_m=s, half_m=rng.uniform(2.8, 6), sides=sides))
         s += rng.uniform(25, 60)
     # The centre by its curvature and slope; at the car the road is level and leads ahead.
     along = np.arange(-BEHIND_M - 2, AHEAD_M + 2, 1.0)
-    curvature, slope = np.zeros_like(along), np.zeros_like(along)
+    curvature = np.zeros_like(along)
+    slope = np.zeros_like(along)
     if rng.random() < {"city": 0.35, "avenue": 0.45}.get(place, 0.65):
         start = rng.uniform(-5, 45)
         for _ in range(3):
@@ -99,14 +101,16 @@ def draw_road(rng: np.random.Generator) -> Road:
             start += length + rng.uniform(0, 60)
     if rng.random() < 0.55:
         for _ in range(3):
-            where, width = rng.uniform(10, 160), rng.uniform(15, 50)
+            where = rng.uniform(10, 160)
+            width = rng.uniform(15, 50)
             slope += rng.normal(0, 0.022) * (1 + np.tanh((along - where) / width)) / 2
         slope -= np.interp(0.0, along, slope)
     heading = np.cumsum(curvature)
     heading -= np.interp(0.0, along, heading)
     line = np.cumsum(np.sin(heading)), -np.cumsum(slope), np.cumsum(np.cos(heading))
     x, y, z = (values - np.interp(0.0, along, values) for values in line)
-    left_m, right_m = float(right_m - width_m), float(right_m)
+    left_m = float(right_m - width_m)
+    right_m = float(right_m)
     parking_m = (float(parking[0]), float(parking[1]))
     return Road(
         place=place,
@@ -136,7 +140,8 @@ def bend(mesh: Mesh, road: Road) -> Mesh:
     # On the inside of a curve nothing may lie beyond its centre: the ground would fold.
     inward = np.clip(points[:, 0] * curvature, 0, None)
     across = points[:, 0] / (1 + inward**4) ** 0.25
-    cos, sin = np.cos(heading), np.sin(heading)
+    cos = np.cos(heading)
+    sin = np.sin(heading)
     bent = np.stack([x + across * cos, y + points[:, 1], z - across * sin], 1)
     nx, ny, nz = mesh.normals.reshape(-1, 3).T
     turned = np.stack([nx * cos + nz * sin, ny, nz * cos - nx * sin], 1)
@@ -151,7 +156,8 @@ def add_ground(b: MeshBuilder, road: Road) -> None:
     color = (0.105 * light, 0.105 * light, 0.107 * light)
     asphalt = Surface("road", color, 3.0, int(rng.integers(4)))
     variants = [int(v) for v in rng.integers(0, 6, 4)]
-    grey, green = rng.uniform(0.6, 1.2), rng.uniform(0.75, 1.4)
+    grey = rng.uniform(0.6, 1.2)
+    green = rng.uniform(0.75, 1.4)
     warm = 1 + 0.2 * rng.normal()
     color = (0.2 * grey, 0.19 * grey, 0.18 * grey)
     walk = Surface("pavement", color, rng.uniform(1.6, 3.2), variants[1])
@@ -171,7 +177,8 @@ def add_ground(b: MeshBuilder, road: Road) -> None:
         starts = [0, *(np.flatnonzero(is_street[1:] != is_street[:-1]) + 1), len(is_street)]
         for first, last in pairwise(starts):
             b.thing += 1
-            piece, edge = stations[first : last + 1], road.edge_m[side]
+            piece = stations[first : last + 1]
+            edge = road.edge_m[side]
             if is_street[first]:
                 _strip(b, (edge, edge + side * _WIDE_M), (0.0, 0.0), asphalt, piece)
             else:
@@ -188,7 +195,9 @@ def _add_side(
     stations: Float64[np.ndarray, " n"],
 ) -> None:
     """From the road's edge outwards: kerb, verge, pavement, land; banks at both ends."""
-    rng, high, curb = b.rng, -road.curb_m, Surface("curb", (0.3, 0.29, 0.28), 1.0)
+    rng = b.rng
+    high = -road.curb_m
+    curb = Surface("curb", (0.3, 0.29, 0.28), 1.0)
     x = edge = road.edge_m[side]
 
     def strip(width: Number, heights: tuple[Number, Number], surface: Surface) -> None:
@@ -245,7 +254,8 @@ _DARK = Surface("metal", (0.03, 0.035, 0.035))
 
 def add_roadside(b: MeshBuilder, road: Road) -> None:
     """Fill both sides of the road, and close the view at its end."""
-    rng, sides = b.rng, {side: _Roadside(b, road, side) for side in (-1, 1)}
+    rng = b.rng
+    sides = {side: _Roadside(b, road, side) for side in (-1, 1)}
     for beside in sides.values():
         plots = {
             "city": beside.add_houses, "suburb": beside.add_gardens, "avenue": beside.add_avenue
@@ -253,11 +263,14 @@ def add_roadside(b: MeshBuilder, road: Road) -> None:
         plots.get(road.place, beside.add_country)()
         beside.add_kerb()
         # The front of a wood: right behind a forest's first trees, far behind elsewhere.
-        is_forest, often = road.place == "forest", {"forest": 0.9, "city": 0.1, "suburb": 0.35}
+        is_forest = road.place == "forest"
+        often = {"forest": 0.9, "city": 0.1, "suburb": 0.35}
         if rng.random() <= often.get(road.place, 0.55):
             near, height = (rng.uniform(8, 13), 13.0) if is_forest else (rng.uniform(14, 55), 9.0)
-            s, x = rng.uniform(-10, 0 if is_forest else 60), beside.x_m(near)
-            stop, other = s + rng.uniform(60, 200), x + beside.side * rng.uniform(-2, 15)
+            s = rng.uniform(-10, 0 if is_forest else 60)
+            x = beside.x_m(near)
+            stop = s + rng.uniform(60, 200)
+            other = x + beside.side * rng.uniform(-2, 15)
             models.add_wood_edge(b, (x, s), (other, stop), height * rng.uniform(0.7, 1.3))
     if rng.random() < 0.85:  # trees across the end of the road's straight part
         for _ in range(int(rng.integers(30, 90))):
@@ -265,7 +278,8 @@ def add_roadside(b: MeshBuilder, road: Road) -> None:
             x = beside.x_m(rng.uniform(2, 90))
             beside.add_tree(x, rng.uniform(90, 230), rng.uniform(7, 16))
     if rng.random() < 0.6:
-        s, half = rng.uniform(170, 300), rng.uniform(60, 160)
+        s = rng.uniform(170, 300)
+        half = rng.uniform(60, 160)
         stop = (half, s + rng.uniform(-40, 40))
         models.add_wood_edge(b, (-half, s), stop, rng.uniform(7, 14))
 
@@ -288,7 +302,8 @@ class _Roadside:
         rng = self.b.rng
         if self.road.walk_m > 2 and rng.random() < 0.55:
             self.add_tree_row(self.road.edge_m[self.side] + self.side * 0.9)
-        s, set_back = rng.uniform(-12, -4), rng.uniform(0, 3) * (rng.random() < 0.4)
+        s = rng.uniform(-12, -4)
+        set_back = rng.uniform(0, 3) * (rng.random() < 0.4)
         tall = rng.uniform(6, 17)
         while s < _FAR_M:
             length = rng.uniform(8, 20)
@@ -303,7 +318,8 @@ class _Roadside:
     def add_gardens(self) -> None:
         """Houses behind hedges and fences, with trees and bushes about them."""
         rng = self.b.rng
-        s, back = rng.uniform(-12, -2), rng.uniform(2.5, 7)
+        s = rng.uniform(-12, -2)
+        back = rng.uniform(2.5, 7)
         border = int(rng.integers(4))
         while s < _FAR_M:
             length = rng.uniform(8, 15)
@@ -349,7 +365,8 @@ class _Roadside:
         rng = self.b.rng
         is_forest = self.road.place == "forest"
         is_open = not is_forest and rng.random() < 0.55
-        edge, height = rng.uniform(1.0, 4.5), rng.uniform(9, 15)
+        edge = rng.uniform(1.0, 4.5)
+        height = rng.uniform(9, 15)
         s = rng.uniform(-10, -4)
         while s < _FAR_M + 30:
             if is_forest:
@@ -382,10 +399,14 @@ class _Roadside:
 
     def add_kerb(self) -> None:
         """Lamps in a row; signs, lights, posts and boxes here and there; poles with wires."""
-        rng, road, side = self.b.rng, self.road, self.side
-        x, y = self.road.edge_m[self.side] + side * (0.5 if road.walk_m else 1.3), -road.curb_m
+        rng = self.b.rng
+        road = self.road
+        side = self.side
+        x = self.road.edge_m[self.side] + side * (0.5 if road.walk_m else 1.3)
+        y = -road.curb_m
         if rng.random() <= {"forest": 0.1, "rural": 0.3}.get(road.place, 0.7):
-            number, step = int(rng.integers(6)), rng.uniform(16, 34)
+            number = int(rng.integers(6))
+            step = rng.uniform(16, 34)
             for s in np.arange(rng.uniform(2, 25), 110, step):
                 if not road.is_side_street(s, side):
                     self.b.add(place(models.lamp(number), (x, y, s), 0.0 if side < 0 else np.pi))
@@ -412,7 +433,8 @@ class _Roadside:
                 self.b.add(place(light, where, 0, (-side, 1, 1)))
         if rng.random() < 0.25:  # wooden poles with cables between them, which hang
             at = x + side * rng.uniform(0.5, 3)
-            height, gap = rng.uniform(6, 8), rng.uniform(22, 38)
+            height = rng.uniform(6, 8)
+            gap = rng.uniform(22, 38)
             places = np.arange(rng.uniform(-15, 10), 120, gap)
             self.b.thing += 1
             for s in places:
@@ -425,8 +447,8 @@ class _Roadside:
                     points = start * (1 - share) + stop * share
                     sag = (4 * share * (1 - share))[:, 0] * 0.02
                     points[:, 1] += sag * np.linalg.norm(stop - start)
-                    for one, other in pairwise(points):
-                        self.b.tube(one, other, 0.018, _DARK, 3)
+                    for here, there in pairwise(points):
+                        self.b.tube(here, there, 0.018, _DARK, 3)
 
     def add_house(self, s: Number, length: Number, back: Number, height: float) -> None:
         """A house so far behind the pavement."""
@@ -446,7 +468,8 @@ class _Roadside:
         if kind == 0:
             return
         rng = self.b.rng
-        number, height = int(rng.integers(20)), rng.uniform(0.7, 1.9)
+        number = int(rng.integers(20))
+        height = rng.uniform(0.7, 1.9)
         color = models.leaf_color(rng)
         for s in np.arange(start + 2, min(stop, 95), models.FENCE_M):
             if self.road.is_side_street(s, self.side, 2.2):
@@ -461,7 +484,8 @@ class _Roadside:
     def add_tree_row(self, x: Number) -> None:
         """Trees along the road, at even distances."""
         rng = self.b.rng
-        step, height = rng.uniform(6, 14), rng.uniform(5, 13)
+        step = rng.uniform(6, 14)
+        height = rng.uniform(5, 13)
         for s in np.arange(rng.uniform(-8, 6), _FAR_M, step):
             if not self.road.is_side_street(s, self.side, 2) and rng.random() < 0.85:
                 place_m = (x + rng.normal(0, 0.3), s + rng.normal(0, 0.8))
@@ -507,13 +531,15 @@ class Traffic:
 
     def add_parked(self) -> None:
         """Cars in the strips for them, or at the edge of streets without one."""
-        rng, road = self.b.rng, self.road
+        rng = self.b.rng
+        road = self.road
         for side in (-1, 1):
             width = road.parking_m[(side + 1) // 2]
             on_edge = not width and road.place in ("city", "suburb") and rng.random() < 0.25
             if not width and not on_edge:
                 continue
-            fill, s = rng.uniform(0.3, 0.95), rng.uniform(-4, 9)
+            fill = rng.uniform(0.3, 0.95)
+            s = rng.uniform(-4, 9)
             while s < 85:
                 x = road.edge_m[side] - side * rng.uniform(0.92, 1.15)
                 if rng.random() < fill and not road.is_side_street(s, side, 3):
@@ -523,7 +549,8 @@ class Traffic:
 
     def add_driving(self) -> None:
         """Vehicles in the lanes, and in the side streets, waiting or turning."""
-        rng, road = self.b.rng, self.road
+        rng = self.b.rng
+        road = self.road
         usual = {"avenue": 1.3, "forest": 0.6, "rural": 0.6}.get(road.place, 0.9)
         density = rng.uniform(0.15, 1) * usual
         for lane in range(road.lanes):
@@ -544,11 +571,14 @@ class Traffic:
 
     def add_vehicle(self, x: Number, s: Number, yaw: Number) -> None:
         """A vehicle of some kind and colour, if its place is free."""
-        rng, shares = self.b.rng, np.array([body.share for body in models.BODIES.values()])
+        rng = self.b.rng
+        shares = np.array([body.share for body in models.BODIES.values()])
         kind = list(models.BODIES)[rng.choice(len(shares), p=shares / shares.sum())]
         length, width, _ = models.BODIES[kind].size_m
-        c, t = abs(np.cos(yaw)), abs(np.sin(yaw))
-        half_x, half_s = (width * c + length * t) / 2 + 0.1, (length * c + width * t) / 2 + 0.3
+        c = abs(np.cos(yaw))
+        t = abs(np.sin(yaw))
+        half_x = (width * c + length * t) / 2 + 0.1
+        half_s = (length * c + width * t) / 2 + 0.3
         if not self.claim(x, s, half_x, half_s):
             return
         shares = np.array([share for _, share in models.PAINTS])
@@ -560,11 +590,13 @@ class Traffic:
 
     def add_people(self) -> None:
         """People on foot, on the pavement and now and then the road, and on bicycles."""
-        rng, road = self.b.rng, self.road
+        rng = self.b.rng
+        road = self.road
         mean = {"city": 5.0, "suburb": 1.5, "avenue": 2.0}.get(road.place, 0.4)
         for _ in range(int(rng.poisson(mean))):
             side = int(rng.choice([-1, 1]))
-            s, strip = rng.uniform(5, 50), road.verge_m + road.walk_m
+            s = rng.uniform(5, 50)
+            strip = road.verge_m + road.walk_m
             x = road.edge_m[side] + side * rng.uniform(0.3, max(0.6, strip - 0.2))
             if rng.random() < 0.12:
                 x = rng.uniform(road.edge_m[-1], road.edge_m[1])

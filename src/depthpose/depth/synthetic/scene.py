@@ -102,7 +102,8 @@ def make_scene(seed: tuple[int, ...], mount_height_m: float = 1.65) -> StreetSce
     """
     rng = np.random.default_rng([71, *seed])
     road = roads.draw_road(rng)
-    builder, far = MeshBuilder(rng), MeshBuilder(rng)
+    builder = MeshBuilder(rng)
+    far = MeshBuilder(rng)
     roads.add_ground(builder, road)
     roads.add_roadside(builder, road)
     traffic = roads.Traffic(builder, road)
@@ -116,16 +117,20 @@ def make_scene(seed: tuple[int, ...], mount_height_m: float = 1.65) -> StreetSce
     for often in (3, 7, 17, 43):
         wave += np.sin(angle * often + rng.uniform(0, 6.28)) / often**0.7
     high = rng.uniform(8, 40) * np.clip(0.55 + 0.45 * wave, 0.1, None)
-    x, z, along = 900 * np.sin(angle), 900 * np.cos(angle), np.arange(len(angle)) * 12.0
+    x = 900 * np.sin(angle)
+    z = 900 * np.cos(angle)
+    along = np.arange(len(angle)) * 12.0
     faces = between(np.stack([x, 0 * x + 90, z], 1), np.stack([x, -high, z], 1))
     uv = between(np.stack([along, 0 * along - 90], 1), np.stack([along, high], 1))
     far.quads(faces, uv, Surface("hills", (0.045, 0.065, 0.03), 150.0, int(rng.integers(2))))
     hills = far.finish()
     hills = replace(hills, thing=hills.thing + street.thing.max() + 1)
     # The camera's attitude: near level, now and then turned off the road's direction.
-    pitch, roll = rng.normal(0, 0.012), rng.normal(0, 0.009)
+    pitch = rng.normal(0, 0.012)
+    roll = rng.normal(0, 0.009)
     yaw = rng.normal(0, 0.03) if rng.random() < 0.8 else rng.normal(0, 0.2)
-    c, s = np.cos([pitch, yaw, roll]), np.sin([pitch, yaw, roll])
+    c = np.cos([pitch, yaw, roll])
+    s = np.sin([pitch, yaw, roll])
     about_x = np.array([[1, 0, 0], [0, c[0], -s[0]], [0, s[0], c[0]]])
     about_y = np.array([[c[1], 0, s[1]], [0, 1, 0], [-s[1], 0, c[1]]])
     about_z = np.array([[c[2], -s[2], 0], [s[2], c[2], 0], [0, 0, 1]])
@@ -147,10 +152,12 @@ def make_scene(seed: tuple[int, ...], mount_height_m: float = 1.65) -> StreetSce
 def _draw_markings(rng: np.random.Generator, road: roads.Road) -> Markings:
     """Lines; stop lines and zebra crossings before side streets, dashes across their mouths."""
     is_marked = road.place in ("avenue", "rural", "forest") or rng.random() < 0.5
-    dash, half = rng.uniform(2, 6), rng.uniform(0.05, 0.08)
+    dash = rng.uniform(2, 6)
+    half = rng.uniform(0.05, 0.08)
     period = dash * rng.uniform(2, 3)
     first = road.edge_m[-1] + road.parking_m[0]
-    lines, bars = [], []
+    lines = []
+    bars = []
     for k in range(road.lanes + 1) if is_marked else ():
         is_edge = k in (0, road.lanes)
         is_whole = is_edge or (k == road.lanes // 2 and rng.random() < 0.3)
@@ -228,8 +235,10 @@ def make_clutter(seed: tuple[int, ...]) -> StreetScene:
     # A ground, somewhat aslant; a wall across the view and a ground; or the inside of a box.
     kind = int(rng.integers(3))
     if kind == 2:
-        half, depth = rng.uniform(3, 14), rng.uniform(8, 45)
-        floor, top = rng.uniform(1, 3), rng.uniform(-6, -2)
+        half = rng.uniform(3, 14)
+        depth = rng.uniform(8, 45)
+        floor = rng.uniform(1, 3)
+        top = rng.uniform(-6, -2)
         up = [0, -(floor - top), 0]
         sheet([-half, floor, 0], [2 * half, 0, 0], [0, 0, depth])
         sheet([-half, floor, depth], [2 * half, 0, 0], up)
@@ -238,11 +247,13 @@ def make_clutter(seed: tuple[int, ...]) -> StreetScene:
         if rng.random() < 0.6:
             sheet([-half, top, 0], [2 * half, 0, 0], [0, 0, depth])
     elif kind == 1:
-        turn, z = rng.uniform(-0.9, 0.9), rng.uniform(18, 60)
+        turn = rng.uniform(-0.9, 0.9)
+        z = rng.uniform(18, 60)
         along = np.array([np.cos(turn), rng.normal(0, 0.1), np.sin(turn)]) * 300
         sheet(np.array([0, 20, z]) - along / 2, along, [0, -40, rng.normal(0, 10)])
     if kind != 2:
-        y, slope = rng.uniform(1.0, 3.0), rng.normal(0, 0.02)
+        y = rng.uniform(1.0, 3.0)
+        slope = rng.normal(0, 0.02)
         sheet([-150, y, 0], [300, rng.normal(0, 8), 0], [0, slope * 300, 300])
     for _ in range(int(rng.integers(12, 60))):
         b.thing += 1
@@ -254,9 +265,9 @@ def make_clutter(seed: tuple[int, ...]) -> StreetScene:
     # Nothing may come nearer than the rig's largest disparity allows; but a backdrop reaches behind
     # the camera, and its triangles are large.
     is_far = mesh.corners[:, :, 2].min(1) > 0.85 * _DEPTHS_M[0]
-    kept = is_far | (np.ptp(mesh.corners, axis=1).max(1) > _DEPTHS_M[0])
+    is_far_enough = is_far | (np.ptp(mesh.corners, axis=1).max(1) > _DEPTHS_M[0])
     return StreetScene(
-        mesh=mesh.part(kept),
+        mesh=mesh.part(is_far_enough),
         markings=Markings(
             lines=np.zeros((0, 4)), bars=np.zeros((0, 5)), brightness=0.5, wheel_tracks=(0.0, 3.0)
         ),
@@ -270,7 +281,8 @@ def random_surface(rng: np.random.Generator, size_m: float) -> Surface:
     """Anything of any colour, from nearly black to nearly white, mostly pale."""
     names = _PLAIN if rng.random() < _PLAIN_SHARE else _RICH
     tile_m = size_m * log_uniform(rng, 0.15, 3.0)
-    material, grey = names[int(rng.integers(len(names)))], log_uniform(rng, 0.03, 0.8)
+    material = names[int(rng.integers(len(names)))]
+    grey = log_uniform(rng, 0.03, 0.8)
     color = np.clip(grey * np.exp(rng.normal(0, rng.choice([0.05, 0.4, 1.0]), 3)), 0.01, 0.9)
     return Surface(material, tuple(color.tolist()), tile_m, int(rng.integers(8)))
 
@@ -296,7 +308,8 @@ def add_shape(b: MeshBuilder, kind: str, centre: np.ndarray, size_m: float) -> N
             b.box(centre, sides, random_surface(rng, size_m), R, rng.uniform(0.4, 1))
         case "card":
             R = random_rotation(rng)
-            along, up = R[0] * size_m * rng.uniform(0.5, 2), R[1] * size_m * rng.uniform(0.5, 2)
+            along = R[0] * size_m * rng.uniform(0.5, 2)
+            up = R[1] * size_m * rng.uniform(0.5, 2)
             b.rectangle(centre - (along + up) / 2, along, up, random_surface(rng, size_m))
         case "pole":
             half = random_rotation(rng)[0] * size_m * rng.uniform(0.7, 3)
@@ -308,7 +321,8 @@ def add_shape(b: MeshBuilder, kind: str, centre: np.ndarray, size_m: float) -> N
         case "fence":  # bars side by side: what repeats has many matches
             turn = rng.uniform(-0.8, 0.8)
             along = np.array([np.cos(turn), 0, np.sin(turn)]) * size_m * rng.uniform(1, 3)
-            up, surface = np.array([0, size_m / 2, 0]), random_surface(rng, size_m)
+            up = np.array([0, size_m / 2, 0])
+            surface = random_surface(rng, size_m)
             count = int(rng.integers(4, 20))
             radius = float(np.linalg.norm(along)) / count * rng.uniform(0.05, 0.3)
             for share in np.linspace(-0.5, 0.5, count):
@@ -319,7 +333,8 @@ def add_shape(b: MeshBuilder, kind: str, centre: np.ndarray, size_m: float) -> N
                 b.tube(middle - along / 2, middle + along / 2, radius, surface)
         case "wheel":  # a rim with spokes: what lies behind is seen through the gaps
             R = random_rotation(rng) if rng.random() < 0.5 else np.eye(3)
-            surface, radius = random_surface(rng, size_m), size_m * rng.uniform(0.5, 1.2)
+            surface = random_surface(rng, size_m)
+            radius = size_m * rng.uniform(0.5, 1.2)
             angle = np.linspace(0, 2 * np.pi, 25)[:, None]
             rim = centre + radius * (np.cos(angle) * R[0] + np.sin(angle) * R[1])
             thick = radius * rng.uniform(0.03, 0.2)
@@ -331,7 +346,8 @@ def add_shape(b: MeshBuilder, kind: str, centre: np.ndarray, size_m: float) -> N
         case "lattice":  # flat bars that cross, as shelves, window frames and benches have
             R = random_rotation(rng) if rng.random() < 0.3 else np.eye(3)
             sides = size_m * rng.uniform(0.6, 2.5, 2)
-            surface, deep = random_surface(rng, size_m), size_m * float(np.exp(rng.uniform(-4, 0)))
+            surface = random_surface(rng, size_m)
+            deep = size_m * float(np.exp(rng.uniform(-4, 0)))
             for axis in (0, 1):
                 count = int(rng.integers(2, 8))
                 bar = np.array([*sides, deep])
@@ -340,6 +356,8 @@ def add_shape(b: MeshBuilder, kind: str, centre: np.ndarray, size_m: float) -> N
                     b.box(centre + share * sides[axis] * R[:, axis], bar, surface, R)
         case _:  # leaves
             radii = size_m * rng.uniform(0.4, 1.2, 3)
-            count, length_m = int(rng.integers(100, 1200)), size_m * rng.uniform(0.03, 0.2)
-            surface, is_block = random_surface(rng, size_m), bool(rng.random() < 0.3)
+            count = int(rng.integers(100, 1200))
+            length_m = size_m * rng.uniform(0.03, 0.2)
+            surface = random_surface(rng, size_m)
+            is_block = bool(rng.random() < 0.3)
             add_leaves(b, centre, radii, count, length_m, surface, is_block)

@@ -62,7 +62,8 @@ def prepare(scene: StreetScene, pixels: int = 1242 * 375) -> Stage:
     """Make a scene ready for drawing."""
     share = float(np.clip((pixels / (1242 * 375)) ** (1 / 3), 0.4, 1))
     mesh = scene.mesh
-    corners, uv = torch.from_numpy(mesh.corners), torch.from_numpy(mesh.uv)
+    corners = torch.from_numpy(mesh.corners)
+    uv = torch.from_numpy(mesh.uv)
     turn = torch.from_numpy(scene.camera_from_world).float()
     to_sun = turn @ torch.from_numpy(scene.weather.sun).float()
     up = turn @ torch.tensor([0.0, -1, 0])
@@ -71,10 +72,12 @@ def prepare(scene: StreetScene, pixels: int = 1242 * 375) -> Stage:
     hides[[NUMBER[name] for name in _GROUND]] = False
     casters = corners[hides[material]]
     across = torch.linalg.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    a, b = uv[:, 1] - uv[:, 0], uv[:, 2] - uv[:, 0]
+    a = uv[:, 1] - uv[:, 0]
+    b = uv[:, 2] - uv[:, 0]
     tiles = (a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]).abs()
     texels_per_m = (tiles / across.norm(dim=1).clamp(min=1e-12)).sqrt().clamp(1e-4, 50) * SIDE_PX
-    normals, tint = torch.from_numpy(mesh.normals), torch.from_numpy(mesh.tint)
+    normals = torch.from_numpy(mesh.normals)
+    tint = torch.from_numpy(mesh.tint)
     parts = uv.flatten(1), normals.flatten(1), tint, F.normalize(across, dim=1)
     maps = () if scene.weather.is_overcast else _SUN_MAPS
     return Stage(
@@ -86,7 +89,7 @@ def prepare(scene: StreetScene, pixels: int = 1242 * 375) -> Stage:
         kind=torch.from_numpy(mesh.thing.astype(np.int64)) * len(MATERIALS) + material,
         to_sun=to_sun,
         up=up,
-        sun_maps=[_light_map(casters, to_sun, *one, share) for one in maps],
+        sun_maps=[_light_map(casters, to_sun, *light_map, share) for light_map in maps],
         sky_map=_light_map(casters, up, *_SKY_MAP, share),
     )
 
@@ -107,7 +110,8 @@ def _light_map(
     rotation = torch.stack([x, torch.linalg.cross(away, x), away])
     box = torch.tensor([[a, b, c] for a in (-half_m, half_m) for b in (1.7, -3) for c in reach_m])
     within = (box @ rotation.T)[:, :2]
-    low, high = within.amin(0), within.amax(0)
+    low = within.amin(0)
+    high = within.amax(0)
     scale = (side_px - 1) / (high - low)
     turned = corners @ rotation.T
     placed = torch.cat([(turned[..., :2] - low) * scale, turned[..., 2:]], -1)
@@ -130,14 +134,18 @@ def _sunlit_share(stage: Stage, points: Vectors, normals: Vectors) -> Numbers:
         column, row, depth_m = light.place(points + normals * (2 * light.texel_m))
         side = len(light.depth_m)
         is_inside = (column > 1) & (row > 1) & (column < side - 3) & (row < side - 3)
-        left, top = column.floor().clamp(1, side - 3), row.floor().clamp(1, side - 3)
-        across, down = column - left, row - top
+        left = column.floor().clamp(1, side - 3)
+        top = row.floor().clamp(1, side - 3)
+        across = column - left
+        down = row - top
         start = top.long() * side + left.long()
-        flat, limit = light.depth_m.flatten(), depth_m - 0.8 * light.texel_m
+        flat = light.depth_m.flatten()
+        limit = depth_m - 0.8 * light.texel_m
         a, b, c, d = (
             (flat.index_select(0, start + step) >= limit).float() for step in (0, 1, side, side + 1)
         )
-        upper, lower = torch.lerp(a, b, across), torch.lerp(c, d, across)
+        upper = torch.lerp(a, b, across)
+        lower = torch.lerp(c, d, across)
         lit = torch.where(is_inside, torch.lerp(upper, lower, down).clamp(0, 1), lit)
     return lit
 
@@ -202,16 +210,19 @@ def _shade(stage: Stage, hits: Hits, focal_px: float) -> Vectors:
     level = torch.log2(footprint_m * rows[:, 21] * facing.abs().clamp(min=0.03) ** -0.6 + 1e-9)
     albedo = surfaces.sample_texture(surfaces.textures(), layer, uv, level) * rows[:, 15:18]
     # Unevenness over metres hides that textures repeat.
-    weather, points = stage.scene.weather, hits.points
+    weather = stage.scene.weather
+    points = hits.points
     u = points[:, 0] * 0.021 + points[:, 1] * 0.013 + weather.shift[0]
     stains = _looked_up(surfaces.textures().stains, u, points[:, 2] * 0.021 + weather.shift[1])
     albedo *= (1 + 0.07 * stains)[:, None]
     is_road = (material == NUMBER["road"]).nonzero()[:, 0]
     if len(is_road):
-        place_m, width_m = uv[is_road] * 3.0, footprint_m[is_road]
+        place_m = uv[is_road] * 3.0
+        width_m = footprint_m[is_road]
         length_m = width_m / facing[is_road].abs().clamp(min=0.02)
         albedo[is_road] = _paint_road(stage.scene, albedo[is_road], place_m, width_m, length_m)
-    slant, through = normal @ stage.to_sun, _TRANSLUCENCY[material]
+    slant = normal @ stage.to_sun
+    through = _TRANSLUCENCY[material]
     faced = (plane @ stage.to_sun > 0).float()
     sun = (1 - through) * slant.clamp(min=0) * faced + through * slant.abs()
     lit = torch.ones_like(sun)
@@ -233,9 +244,9 @@ def _shade(stage: Stage, hits: Hits, focal_px: float) -> Vectors:
     return torch.lerp(color, haze.expand_as(color), thick[:, None])
 
 
-def _dot(one: Vectors, other: Vectors) -> Numbers:
+def _dot(a: Vectors, b: Vectors) -> Numbers:
     """Written out: a sum over so short an axis would take ten times as long."""
-    return one[:, 0] * other[:, 0] + one[:, 1] * other[:, 1] + one[:, 2] * other[:, 2]
+    return a[:, 0] * b[:, 0] + a[:, 1] * b[:, 1] + a[:, 2] * b[:, 2]
 
 
 def _add_mirrored(
@@ -245,7 +256,9 @@ def _add_mirrored(
     some = (mirror > 0).nonzero()[:, 0]
     if not len(some):
         return
-    normal, towards, mirror = normal[some], towards[some], mirror[some]
+    normal = normal[some]
+    towards = towards[some]
+    mirror = mirror[some]
     aligned = _dot(towards, normal)
     mirrored = towards - 2 * aligned[:, None] * normal
     share = mirror + (1 - mirror) * (1 + aligned.clamp(-1, 0)) ** 5
@@ -257,13 +270,14 @@ def _add_mirrored(
     light *= (1 - 0.78 * hidden)[:, None]
     glint = 2 * lit[some] * (mirrored @ stage.to_sun).clamp(min=0) ** 300
     sun_color = torch.from_numpy(stage.scene.weather.sun_color).float()
-    own = color[some] * (1 - share)[:, None]
-    color[some] = own + share[:, None] * light + glint[:, None] * sun_color
+    diffuse = color[some] * (1 - share)[:, None]
+    color[some] = diffuse + share[:, None] * light + glint[:, None] * sun_color
 
 
 def sky_light(stage: Stage, towards: Vectors, *, with_sun: bool = True) -> Vectors:
     """Give the light of the sky (and of the ground, below) from each direction."""
-    weather, height = stage.scene.weather, towards @ stage.up
+    weather = stage.scene.weather
+    height = towards @ stage.up
     zenith, horizon, sun_color = (
         torch.from_numpy(color).float()
         for color in (weather.zenith, weather.horizon, weather.sun_color)
@@ -271,7 +285,8 @@ def sky_light(stage: Stage, towards: Vectors, *, with_sun: bool = True) -> Vecto
     share = (height.clamp(0, 1) ** 0.33)[:, None]
     color = torch.lerp(horizon.expand(len(height), 3), zenith.expand(len(height), 3), share)
     far = towards / height.clamp(min=0.03)[:, None]
-    u, v = far[:, 0] * 0.05 + weather.shift[0], far[:, 2] * 0.05 + weather.shift[1]
+    u = far[:, 0] * 0.05 + weather.shift[0]
+    v = far[:, 2] * 0.05 + weather.shift[1]
     density = _looked_up(surfaces.textures().clouds, u, v)
     cover = torch.sigmoid(3 * (density - 1.4 + 2.2 * weather.cloud)) * (height * 6).clamp(0, 1)
     lit = (horizon * 0.9 + sun_color * 0.12).expand_as(color)
@@ -339,5 +354,6 @@ def _inside(off: Tensor, half: float, foot: Tensor) -> Tensor:
 
 def _looked_up(field: Tensor, u: Tensor, v: Tensor) -> Tensor:
     """Values of a field of noise, which repeats, at places in tiles."""
-    column, row = (u * SIDE_PX).long() % SIDE_PX, (v * SIDE_PX).long() % SIDE_PX
+    column = (u * SIDE_PX).long() % SIDE_PX
+    row = (v * SIDE_PX).long() % SIDE_PX
     return field.flatten().index_select(0, row * SIDE_PX + column)

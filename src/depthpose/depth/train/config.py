@@ -187,11 +187,11 @@ class StereoTraining(Settings):
 
     def __post_init__(self) -> None:
         # A config that a run has written holds the defaults of ``matcher`` beside the others.
-        given = ["matcher"] if self.matcher != PSMNetConfig() else []
-        given += [*(["light"] if self.light is not None else []), *self.other]
-        if len(given) > 1:
+        networks = ["matcher"] if self.matcher != PSMNetConfig() else []
+        networks += [*(["light"] if self.light is not None else []), *self.other]
+        if len(networks) > 1:
             raise InputError(
-                f"{' and '.join(given)} are given, and one network is trained; keep one"
+                f"{' and '.join(networks)} are given, and one network is trained; keep one"
             )
         for kind in self.other:
             refuse_unknown("other", kind, MATCHERS)

@@ -81,8 +81,8 @@ class TrainingPairs:
             most = len(places) if config.limit is None else min(config.limit, len(places))
             last = len(places) - 1
             self._places += [places[round(k * last / max(most - 1, 1))] for k in range(most)]
-        found = ((source, number) for source, number, _ in self._places)
-        self.frames = [source.frames[n] for source, n in found if isinstance(source, Dataset)]
+        numbered = ((source, number) for source, number, _ in self._places)
+        self.frames = [source.frames[n] for source, n in numbered if isinstance(source, Dataset)]
         names = (
             (source.name if isinstance(source, Dataset) else _STREETS, truth)
             for source, _, truth in self._places
@@ -129,8 +129,8 @@ class TrainingPairs:
             pair = self._read(index)
             views = [(view * 255).round().to(torch.uint8) for view in (pair.left, pair.right)]
             self._cache[index] = pair._replace(left=views[0], right=views[1])
-        kept = self._cache[index]
-        return kept._replace(left=kept.left.float() / 255, right=kept.right.float() / 255)
+        cached = self._cache[index]
+        return cached._replace(left=cached.left.float() / 255, right=cached.right.float() / 255)
 
     def _read(self, index: int) -> TrainingPair:
         """Read a pair and its truth where one is asked for; 0 in the sky, where known."""
@@ -138,8 +138,8 @@ class TrainingPairs:
         left_px = right_px = None
         name = source.frames[number].name if isinstance(source, Dataset) else f"street {number}"
         if isinstance(source, Dataset):
-            given = source.read_input(number)
-            rig = given.camera if isinstance(given.camera, StereoRig) else None
+            views = source.read_input(number)
+            rig = views.camera if isinstance(views.camera, StereoRig) else None
             if kind == "disparity":
                 truth = source.read_truth(number)
                 assert truth.disparity_px is not None, "frames without truth were left out"
@@ -159,19 +159,20 @@ class TrainingPairs:
                 left_px = disparity_from_depth(depth_m, rig)
         else:
             made = source[number]
-            given, rig = made.input, made.input.camera
+            views = made.input
+            rig = made.input.camera
             if kind is not None:
                 exact = (made.truth.disparity_px, made.truth.right_disparity_px)
                 left_px, right_px = (px if px is None else px.nan_to_num(0.0) for px in exact)
         if left_px is None:
-            left_px = torch.full_like(given.left[0], torch.nan)
+            left_px = torch.full_like(views.left[0], torch.nan)
         focal_px = torch.tensor(torch.nan if rig is None else float(rig.K[0, 0]))
-        if given.right is None:
+        if views.right is None:
             right_px = left_px
         elif right_px is None:
             right_px = right_disparity_from_left(left_px)
-        right = given.left if given.right is None else given.right
-        pair = TrainingPair(given.left, right, left_px, right_px, focal_px)
+        right = views.left if views.right is None else views.right
+        pair = TrainingPair(views.left, right, left_px, right_px, focal_px)
         wanted_px = self.config.focal_px
         if wanted_px is None:
             return pair
@@ -187,7 +188,8 @@ def _usable(
     dataset: Dataset, config: PairsConfig, *, needs_truth: bool, is_mixed: bool
 ) -> list[_Place]:
     """Frames of a folder that can be learnt from, all with one kind of truth if it is needed."""
-    name, wanted = dataset.name, config.truth
+    name = dataset.name
+    wanted = config.truth
     there = {
         index: known_truths(frame)
         for index, frame in enumerate(dataset.frames)
@@ -200,27 +202,28 @@ def _usable(
     kind: TruthKind | None = None
     if needs_truth:
         counts: Counter[TruthKind] = Counter(kind for kinds in there.values() for kind in kinds)
-        said = ", ".join(f"{kind} of {count} frames" for kind, count in counts.items())
+        listed = ", ".join(f"{kind} of {count} frames" for kind, count in counts.items())
         if wanted is not None and counts and wanted not in counts:
-            raise InputError(f"{name}: no frame has truth: {wanted}; there is {said}")
+            raise InputError(f"{name}: no frame has truth: {wanted}; there is {listed}")
         if wanted is None and len(counts) > 1:
             raise InputError(
-                f"{name}: has several kinds of truth ({said}), and one kind alone is learnt from; "
-                f"set truth in pairs (or held_out) of the config to one of {', '.join(counts)}"
+                f"{name}: has several kinds of truth ({listed}), and one kind alone is learnt "
+                "from; set truth in pairs (or held_out) of the config to one of "
+                f"{', '.join(counts)}"
             )
         kind = wanted or next(iter(counts), None)
     places = [
         _Place(dataset, index, kind if kind in kinds else None) for index, kinds in there.items()
     ]
     if is_mixed:  # an image alone without truth teaches nothing
-        found = [p for p in places if p.truth or dataset.frames[p.number].right is not None]
+        usable = [p for p in places if p.truth or dataset.frames[p.number].right is not None]
     else:
-        found = [p for p in places if p.truth or not needs_truth]
-    if not found:
+        usable = [p for p in places if p.truth or not needs_truth]
+    if not usable:
         what = " or ".join if is_mixed else " and ".join
         parts = ["a right view", "a truth"] if needs_truth or is_mixed else ["a right view"]
         raise InputError(f"{name}: no frame has {what(parts)}; nothing to train on.")
-    return found
+    return usable
 
 
 _STREETS = "synthetic streets"

@@ -45,26 +45,27 @@ def refuse_frozen_random(config: SelectTraining | StereoTraining) -> None:
         )
 
 
-def start_from(network: Generator | StereoNetwork, found: nn.Module, source: str) -> None:
+def start_from(network: Generator | StereoNetwork, loaded: nn.Module, source: str) -> None:
     """Copy weights whose config is the network's own, but for what no weight depends on.
 
     What the network has beyond them keeps its beginning, where that has no effect.
     """
-    if type(found) is not type(network):
+    if type(loaded) is not type(network):
         raise InputError(
-            f"{source}: holds weights of {type(found).__name__}, but the config trains "
+            f"{source}: holds weights of {type(loaded).__name__}, but the config trains "
             f"{type(network).__name__}. Give weights of that network."
         )
-    wanted, given = config_to_dict(network.config), config_to_dict(cast("Any", found).config)
+    wanted = config_to_dict(network.config)
+    loaded_config = config_to_dict(cast("Any", loaded).config)
     for setting, value in wanted.items():
-        is_added = setting in _CAN_BE_ADDED and value and not given[setting]
-        if given[setting] != value and setting not in _FREE_OF_WEIGHTS and not is_added:
+        is_added = setting in _CAN_BE_ADDED and value and not loaded_config[setting]
+        if loaded_config[setting] != value and setting not in _FREE_OF_WEIGHTS and not is_added:
             raise InputError(
-                f"{source}: was trained with {setting} = {given[setting]!r}, but the config says "
-                f"{value!r}. Give the config the weights' own."
+                f"{source}: was trained with {setting} = {loaded_config[setting]!r}, but the "
+                f"config says {value!r}. Give the config the weights' own."
             )
-    own = network.state_dict()
-    network.load_state_dict(own | {k: t for k, t in found.state_dict().items() if k in own})
+    state = network.state_dict()
+    network.load_state_dict(state | {k: t for k, t in loaded.state_dict().items() if k in state})
 
 
 def make_matcher_network(config: StereoTraining) -> StereoNetwork:
@@ -122,7 +123,8 @@ def train_select(config: SelectTraining, run: Run) -> Path:
     """Train the generator that selects; give its weights file."""
     refuse_frozen_random(config)
     torch.manual_seed(config.loop.seed)
-    rig, seed = config.generator, config.loop.seed
+    rig = config.generator
+    seed = config.loop.seed
     config = _at_virtual_focal(config, rig)
     sources = [
         TrainingPairs(
@@ -265,7 +267,7 @@ def _at_virtual_focal(
     """Bring all pairs, those held out too, to the rig that the generator imitates."""
     focal_px = generator.virtual_focal_px
     sources = ("pairs", "more", "held_out")
-    there = {name: found for name in sources if (found := getattr(config, name, None)) is not None}
+    there = {name: value for name in sources if (value := getattr(config, name, None)) is not None}
     for name, pairs in there.items():
         if isinstance(generator, SelectionConfig) and name != "held_out":
             continue  # it answers pixels of any image, a U-Net those of its own rig alone

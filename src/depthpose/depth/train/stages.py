@@ -51,8 +51,8 @@ class StereoTask:
         self.modules: dict[str, nn.Module] = {"matcher": matcher}
         groups = [{"params": [p for p in matcher.parameters() if p.requires_grad]}]
         if self._alone is None and matcher.encoder is not None:
-            own = set(matcher.encoder.parameters())
-            rest = [p for p in matcher.parameters() if p not in own]
+            of_encoder = set(matcher.encoder.parameters())
+            rest = [p for p in matcher.parameters() if p not in of_encoder]
             learnt = [p for p in matcher.encoder.parameters() if p.requires_grad]
             groups = [{"params": learnt, "rate": config.encoder_rate}, {"params": rest}]
         self.optimizers = {"matcher": (make_adam(groups, config.adam), config.adam)}
@@ -72,7 +72,8 @@ class StereoTask:
         """One update: match and compare."""
         views = normalise(batch.left), normalise(batch.right)
         heads, sky = self.matcher.forward_with_sky(*views)
-        max_disparity_px, sky_weight = self.matcher.config.max_disparity_px, self.config.sky_weight
+        max_disparity_px = self.matcher.config.max_disparity_px
+        sky_weight = self.config.sky_weight
         heads = tuple(head.float() for head in heads)
         is_valid = (batch.left_px > 0) & (batch.left_px < max_disparity_px)
         error_px = (heads[-1].detach() - batch.left_px.nan_to_num(0.0)).abs()
@@ -103,7 +104,11 @@ def validate_pairs(
 
     What is taken for sky has a disparity of 0.
     """
-    errors, bad, missed, false, pictures = [], [], [], [], {}
+    errors = []
+    bad = []
+    missed = []
+    false = []
+    pictures = {}
     device = next(matcher.parameters()).device
     for index in range(len(held_out)):
         pair = held_out.read(index)
@@ -115,22 +120,22 @@ def validate_pairs(
             *(pad_top_right(v, matcher.config)[None] for v in views)
         )
         height, width = pair.left.shape[-2:]
-        found = heads[-1][0, -height:, :width].float().cpu()
+        predicted_px = heads[-1][0, -height:, :width].float().cpu()
         is_sky = None if sky is None else sky[0, -height:, :width].cpu() > 0.5
         is_known = (pair.left_px > 0) & (pair.left_px < matcher.config.max_disparity_px)
         is_true_sky = pair.left_px == 0
         if is_sky is not None:
-            found = torch.where(is_sky, 0.0, found)
+            predicted_px = torch.where(is_sky, 0.0, predicted_px)
             if bool(is_true_sky.any()):
                 missed.append(float((~is_sky[is_true_sky]).float().mean()))
             if bool(is_known.any()):
                 false.append(float(is_sky[is_known].float().mean()))
         if index == 0:
-            views = [pair.left, right, draw_disparity(found)]
+            views = [pair.left, right, draw_disparity(predicted_px)]
             pictures["left_right_disparity"] = torch.cat(views, 1)
         if not bool(is_known.any()):
             continue
-        metrics = measure("disparity", found[is_known], pair.left_px[is_known])
+        metrics = measure("disparity", predicted_px[is_known], pair.left_px[is_known])
         errors.append(metrics["epe_px"])
         bad.append(metrics["d1_all"])
     named = {"epe_px": errors, "d1": bad}
@@ -163,13 +168,15 @@ class ViewTask:
 
     def step(self, batch: TrainingPair) -> Iterator[Update]:
         """Draw once; the discriminator learns from it, then scores it anew."""
-        left, right = 2 * batch.left - 1, 2 * batch.right - 1
+        left = 2 * batch.left - 1
+        right = 2 * batch.right - 1
         drawn = self.generator(left)
         l1 = (drawn - right).abs().mean()  # eq. 2.5
         if self.config.discriminator == "none":
             yield Update("generator", self.config.l1_weight * l1, {"l1": l1.detach()})
             return
-        discriminator, mode = self.modules["discriminator"], self.config.gan_mode
+        discriminator = self.modules["discriminator"]
+        mode = self.config.gan_mode
         real = losses.adversarial_loss(discriminator(left, right), mode, is_real=True)
         fake = discriminator(left, drawn.detach())
         # Half the sum of both slows the discriminator (pix2pix).
@@ -185,7 +192,9 @@ class ViewTask:
         if self.held_out is None:
             return ValidationResult()
         self.generator.eval()
-        errors, squares, pictures = [], [], {}
+        errors = []
+        squares = []
+        pictures = {}
         for index in range(len(self.held_out)):
             pair = self.held_out.read(index)
             device = next(self.generator.parameters()).device
@@ -271,21 +280,22 @@ class SelectionSamples:
     ) -> None:
         self.sources, self.config, self.seed = sources, config, seed
         self.more_share = more_share if len(sources) > 1 else 0.0
-        self.truths = tuple(said for source in sources for said in source.truths)
+        self.truths = tuple(truth for source in sources for truth in source.truths)
 
     def __len__(self) -> int:
         return len(self.sources[0])
 
     def __getitem__(self, sample_index: int) -> SelectionSample:
         """Make the n-th sample."""
-        before, now = int(sample_index * self.more_share), int((sample_index + 1) * self.more_share)
+        before = int(sample_index * self.more_share)
+        now = int((sample_index + 1) * self.more_share)
         pair = self.sources[1][before] if now > before else self.sources[0][sample_index - before]
-        seen = degrade(pair.left, self.config, sample_generator(sample_index, self.seed + 1))
+        degraded = degrade(pair.left, self.config, sample_generator(sample_index, self.seed + 1))
         left, right, left_px, right_px, _ = pair
         has_right = torch.tensor(not torch.equal(left, right))
         if not has_right:  # one image stands for both views
             right_px = right_disparity_from_left(left_px)
-        return SelectionSample(seen, left, right, left_px, right_px, has_right)
+        return SelectionSample(degraded, left, right, left_px, right_px, has_right)
 
 
 _CAP_M = 80.0
@@ -308,8 +318,8 @@ class SelectTask:
         self.modules: dict[str, nn.Module] = {"generator": generator}
         self._train()
         # What is learnt, the encoder apart, at a share of the learning rate.
-        own = set(generator.encoder.parameters())
-        rest = [p for p in generator.parameters() if p not in own]
+        of_encoder = set(generator.encoder.parameters())
+        rest = [p for p in generator.parameters() if p not in of_encoder]
         learnt = [p for p in generator.encoder.parameters() if p.requires_grad]
         groups = [{"params": learnt, "rate": config.encoder_rate}, {"params": rest}]
         self.optimizers = {"generator": (make_adam(groups, config.adam), config.adam)}
@@ -343,7 +353,8 @@ class SelectTask:
         self, logits: Float[Tensor, "b k rows columns"], truth_px: Maps
     ) -> Float[Tensor, ""]:
         """Losses of the disparity of one view."""
-        planes, range_px = self.generator.planes, self.generator.config.disparity_px
+        planes = self.generator.planes
+        range_px = self.generator.config.disparity_px
         log_px = synthesis.read_logits(logits, planes)[0][:, None]
         log_px = F.interpolate(log_px, truth_px.shape[1:], mode="bilinear", align_corners=False)
         loss = losses.DISPARITY_LOSSES[self.config.disparity_loss](log_px[:, 0], truth_px, range_px)
@@ -360,10 +371,14 @@ class SelectTask:
         if self.held_out is None:
             return ValidationResult()
         self.generator.eval()
-        device, rig = next(self.generator.parameters()).device, self.generator.config
+        device = next(self.generator.parameters()).device
+        rig = self.generator.config
         synthesiser = synthesis.SelectionSynthesiser(self.generator, device)
         far_px = rig.virtual_focal_px * rig.virtual_baseline_m / _CAP_M
-        errors, within, missed, pictures = [], [], [], {}
+        errors = []
+        within = []
+        missed = []
+        pictures = {}
         for index in range(len(self.held_out)):
             pair = self.held_out.read(index)
             drawn = synthesiser.draw(pair.left[None])
@@ -374,7 +389,8 @@ class SelectTask:
             if index == 0:
                 views = [pair.left, pair.right, drawn.right[0], draw_disparity(found_px)]
                 pictures["left_right_drawn_disparity"] = torch.cat(views, 1)
-            is_known, is_true_sky = pair.left_px >= far_px, pair.left_px == 0
+            is_known = pair.left_px >= far_px
+            is_true_sky = pair.left_px == 0
             if bool(is_known.any()):
                 metrics = {"abs_rel": math.nan, "d1": math.nan}  # of a network that diverged
                 if bool(found_px.isfinite().all()):
