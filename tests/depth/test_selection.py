@@ -193,7 +193,7 @@ def test_another_checkpoint_is_no_encoder(tmp_path: Path, change, message: str) 
         ({"encoder_width": 0.0}, r"encoder_width must be in \(0, 4\], got 0.0"),
         ({"planes": 1}, r"planes must be in \[2, inf\), got 1"),
         ({"disparity_px": (4.0, 2.0)}, "disparity_px must be a range, the lower end first"),
-        ({"virtual_focal_px": 0.0}, r"virtual_focal_px must be in \(0, inf\), got 0.0"),
+        ({"virtual_focal_px": 0.0}, r"virtual_focal_px must be in \[1, 20000\], got 0.0"),
     ],
 )
 def test_sizes_that_cannot_be_are_refused(changes: dict[str, Any], message: str) -> None:

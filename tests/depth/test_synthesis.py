@@ -131,7 +131,7 @@ def _warmed(network: UNetGenerator) -> UNetGenerator:
     [
         ({"width": 0}, r"width must be in \[1, inf\), got 0"),
         ({"levels": 1}, r"levels must be in \[2, 10\], got 1"),
-        ({"virtual_focal_px": 0.0}, r"virtual_focal_px must be in \(0, inf\), got 0.0"),
+        ({"virtual_focal_px": 0.0}, r"virtual_focal_px must be in \[1, 20000\], got 0.0"),
     ],
 )
 def test_bad_settings_are_refused(changes: dict[str, object], message: str) -> None:

@@ -117,7 +117,7 @@ class IcpConfig(Settings):
 
     starts: Annotated[int, "[1, 7]"] = 7
     """From each fit of the keypoints so many: 1, it alone; up to 7, also turned by 15 degrees one
-    way and the other about each axis of the camera (``bench/refine_starts.py``)."""
+    way and the other about each axis of the camera (``docs/experiments.md``)."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
