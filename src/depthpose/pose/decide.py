@@ -48,9 +48,11 @@ class Rate:
 
 RIGHT_CONTRADICTED = Rate(mean=0.1, shape=2.0)
 WRONG_CONTRADICTED = Rate(mean=0.5, shape=3.0)
+COPY_CONTRADICTED = Rate(mean=0.1, shape=1.0)
+"""Of copies, of which the one with the least contradicted is always the likeliest."""
 RIGHT_UNOBSERVED = Rate(mean=0.2, shape=1.0)
 WRONG_UNOBSERVED = Rate(mean=0.5, shape=3.0)
-PRIOR_MASKED = 20.0
+PRIOR_MASKED = 5.0
 """Odds of the best pose being right before its evidence is seen, where a mask shows the object."""
 PRIOR_REGION = 2.0
 """The same where a detector's box or a mask that does not fit says that one is there."""
@@ -69,6 +71,7 @@ OTHER_FRAME = (
     "the world have z up: give it as the camera saw it"
 )
 """What may be wrong with a cloud that fits no pose: its origin is not where the camera was."""
+LEAST_AGREEMENT = 2 / 3  #: share of what was compared that must support a pose
 LEAST_AREA = 1.0  # independent patches
 LEAST_NAMED = 0.01  #: alternatives of a smaller probability are not named
 
@@ -141,7 +144,7 @@ def share_among_copies(hypotheses: Sequence[Hypothesis]) -> Float64[Tensor, " n"
     weights: list[float] = []
     for hypothesis in hypotheses:
         evidence = hypothesis.evidence
-        fits_right = RIGHT_CONTRADICTED.log_likelihood(evidence.contradicted, area)
+        fits_right = COPY_CONTRADICTED.log_likelihood(evidence.contradicted, area)
         fits_right += RIGHT_UNOBSERVED.log_likelihood(evidence.unobserved, area)
         weights.append(fits_right + _log_fit(evidence.rms) + _log_beside_depth(hypothesis))
     return torch.tensor(weights, dtype=torch.float64).softmax(0)
@@ -150,9 +153,9 @@ def share_among_copies(hypotheses: Sequence[Hypothesis]) -> Float64[Tensor, " n"
 def probability_right(evidence: Evidence, prior_odds: float) -> float:
     """Probability that a pose is right, up to near-symmetry, and not the best of wrong ones.
 
-    It is 0 where more of what was observed contradicts the pose than supports it.
+    It is 0 where less than two thirds of what was observed supports the pose.
     """
-    if evidence.contradicted >= evidence.supported:
+    if evidence.agreement < LEAST_AGREEMENT:
         return 0.0
     log_odds = math.log(prior_odds) + log_odds_right(evidence)
     return 1 / (1 + math.exp(-min(log_odds, 50.0)))

@@ -15,12 +15,13 @@ import numpy as np
 import torch
 from jaxtyping import Bool, Float, Float64
 from scipy import ndimage
+from scipy.spatial import KDTree
 from torch import Tensor
 
 from depthpose.core.arrays import take_evenly
 from depthpose.core.rigid import Rigid
 from depthpose.pose.cloud import grow_mask
-from depthpose.pose.sensor import CORRELATION_PX, DepthNoise, measure_noise
+from depthpose.pose.sensor import CORRELATION_PX, CORRELATION_RAD, DepthNoise, measure_noise
 from depthpose.pose.surface import Surface
 from depthpose.pose.types import Evidence, ViewInput
 
@@ -34,6 +35,7 @@ _LEAST_PATCH = 0.25  # independent patches: smaller ones are accidents of edges 
 _LEAST_INNER = 0.25  # share of the silhouette that its borders may leave
 _DISK = 1.3  # radius of the disk drawn for a sample, in median distances of samples
 _OBJECT_PX = 8000  # pixels of an object that are compared; of larger ones every n-th
+_POINT_PX = 1.5  # side of a pixel of a drawn cloud, in distances of its points
 _JUMP_DIAMETERS = 0.02
 _JUMP_M = 0.01
 """Drawn neighbours that differ in depth by more than both are the two sides of an edge."""
@@ -51,6 +53,7 @@ class Observation:
         K: intrinsic matrix of the window.
         noise: of readings on the object.
         step: every so many rows and columns of the image are used.
+        patch_px: side of a square of readings that is one observation, in pixels of the window.
     """
 
     depth_m: np.ndarray
@@ -58,6 +61,7 @@ class Observation:
     K: Float64[Tensor, "3 3"]
     noise: DepthNoise
     step: int = 1
+    patch_px: float = CORRELATION_PX
 
 
 def observe(
@@ -109,6 +113,8 @@ def observe(
     noise = measure_noise(depth_m.numpy(), inner.numpy(), object_m)
 
     step = max(1, math.floor(math.sqrt(float(is_object.sum()) / _OBJECT_PX)))
+    # The pixels of a drawn cloud, or of a smaller image, are wider than those of the sensor.
+    correlation_px = min(CORRELATION_PX, CORRELATION_RAD * float(K[0, 0]))
     window_K = K.clone()
     window_K[:2, 2] -= torch.tensor([left, top], dtype=torch.float64)
     window_K[:2] /= step
@@ -118,16 +124,15 @@ def observe(
         K=window_K,
         noise=noise,
         step=step,
+        patch_px=max(1.0, correlation_px / step),
     )
 
 
 def _camera_of_cloud(cloud_m: Float64[Tensor, "n 3"]) -> Float64[Tensor, "3 3"]:
     """Intrinsic matrix of a camera to which the points of a cloud are a pixel apart."""
-    rays = cloud_m[:, :2] / cloud_m[:, 2:]
-    some_rays = take_evenly(rays, 5000)
-    apart = torch.cdist(take_evenly(rays, 200), some_rays)
-    nearest = apart.masked_fill(apart < 1e-9, torch.inf).amin(-1).median()
-    focal_px = math.sqrt(len(rays) / len(some_rays)) / (1.5 * float(nearest))
+    rays = (cloud_m[:, :2] / cloud_m[:, 2:]).unique(dim=0)  # some clouds hold points twice
+    nearest, _ = KDTree(rays.numpy()).query(take_evenly(rays, 200).numpy(), k=2, workers=1)
+    focal_px = 1 / (_POINT_PX * float(np.median(nearest[:, 1])))
     return torch.diag(torch.tensor([focal_px, focal_px, 1.0], dtype=torch.float64))
 
 
@@ -211,7 +216,7 @@ def compare(observation: Observation, pose: Rigid, surface: Surface) -> Evidence
         surface: of the model.
     """
     noise, step = observation.noise, observation.step
-    patch_px = max(1.0, (CORRELATION_PX / step) ** 2)
+    patch_px = observation.patch_px**2
     drawn_m, cosine, window = draw_surface(surface, pose, observation.K, *observation.depth_m.shape)
     depth_m = observation.depth_m[window]
     is_object = observation.is_object[window]
@@ -225,7 +230,8 @@ def compare(observation: Observation, pose: Rigid, surface: Surface) -> Evidence
     residual_m = np.where(is_compared, depth_m - drawn_m, 0).astype(np.float32)
     filled = ndimage.uniform_filter(is_compared.astype(np.float32), side)
     mean_m = ndimage.uniform_filter(residual_m, side)
-    is_compared &= filled > _LEAST_FILLED
+    # A pixel without a reading of its own has that of its neighbours: clouds are sparse.
+    is_compared = inner & (filled > _LEAST_FILLED)
     mean_m = mean_m[is_compared] / filled[is_compared]
     deviations = np.zeros_like(residual_m)
     deviations[is_compared] = mean_m / noise.deviation_m(cosine[is_compared], side**2 // 3)

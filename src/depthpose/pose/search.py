@@ -324,7 +324,7 @@ def is_cut_out(view: ViewInput, pose: Rigid, surface: Surface) -> bool:
 
 def _window_about(view: ViewInput, pose: Rigid, surface: Surface) -> ViewInput:
     """Cut the window about a posed surface out of a view."""
-    posed_m = pose.apply(surface.points_m)
+    posed_m = pose.double().apply(surface.points_m)
     pixel = (posed_m @ view.K.double().mT)[:, :2] / posed_m[:, 2:]
     margin = 0.1 * (pixel.amax(0) - pixel.amin(0)) + 2 * BORDER_PX
     height, width = view.depth_m.shape

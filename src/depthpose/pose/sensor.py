@@ -18,8 +18,14 @@ LAG_PX = 3
 SHARED_PER_WHITE = 2.5
 """Error that neighbours share, in deviations of the noise of one reading. Planes before a Kinect
 and a RealSense show 2 to 4 (``bench/sensors.py``); a laser scanner less."""
-CORRELATION_PX = 12
-"""Readings so far apart err independently: a RealSense smooths over a Gaussian of 5 px."""
+CORRELATION_PX = 10
+"""Side of a square of readings that is one observation: noise that a Gaussian of 3 px smoothed, as
+a Kinect's, is as many independent readings as squares of 4 pi 3^2 pixels; a RealSense smooths by
+5 px."""
+CORRELATION_RAD = CORRELATION_PX / 570  #: the same as an angle, for a Kinect of 640 columns
+NOISIEST_PER_M = 0.003
+"""Largest noise that is believed, for the square of the depth in metres: twice a Kinect's (Nguyen
+et al. 2012)."""
 _MEDIAN_TO_DEVIATION = 1.4826  # of a normal distribution
 _STEEPEST = 0.3
 """Least cosine by which a deviation along the surface normal is divided: what is seen at a smaller
@@ -73,4 +79,6 @@ def measure_noise(depth_m: np.ndarray, is_object: np.ndarray, object_m: float) -
     if len(bend_m) > 0:
         # A second difference of independent readings has six times their variance.
         white_m = _MEDIAN_TO_DEVIATION * float(np.median(bend_m)) / math.sqrt(6)
+        # On a small object its own curvature is in the differences: no sensor is so noisy.
+        white_m = min(white_m, NOISIEST_PER_M * float(np.nanmedian(masked_m)) ** 2)
     return DepthNoise(white_m=white_m, shared_m=SHARED_PER_WHITE * white_m, object_m=object_m)

@@ -122,18 +122,19 @@ class SurfaceDeviation:
 
         The larger of both ways is given, from the rotated surface to the other and back.
         """
-        points = self.many if share < ALMOST_ALL else self.dense
+        points, near = (self.many, 1) if share < ALMOST_ALL else (self.dense, _NEAREST_SAMPLES)
         turn = Rigid(R, torch.zeros_like(R[..., 0]) if shift is None else shift)
         spacing = 2.0 / math.sqrt(len(self.points))
         farthest: list[Float[Tensor, "*batch"]] = []
         for way in (turn, turn.inverse()):
             moved = way.apply(points)
             workers = torch.get_num_threads()
-            distance, index = self._tree.query(moved.numpy(), k=_NEAREST_SAMPLES, workers=workers)
+            distance, index = self._tree.query(moved.numpy(), k=range(1, near + 1), workers=workers)
             gap = moved.numpy()[..., None, :] - self.points.numpy()[index]
             height = np.abs((gap * self._normals[index]).sum(-1))
-            # Between samples the plane says the distance; beside an edge, the sample does. The
-            # nearest sample may lie on the other side of an edge, so the next ones count too.
+            # Between samples the plane says the distance; beside an edge, the sample does. Of the
+            # few points that decide, the nearest sample may lie on the other side of an edge: the
+            # next ones count too.
             beside = np.maximum(distance - spacing, 0)
             off = torch.from_numpy(np.maximum(height, beside).min(-1))
             farthest.append(off.quantile(share, dim=-1))
@@ -298,8 +299,7 @@ def _measure(
         worst = float(surface.deviation(circle).max())
         full = [(None, worst)] if worst <= limit else []
     # Every turn of order 2 to 12, each once.
-    shares = {k / order for order in _TRIED_ORDERS for k in range(1, order)}
-    shares = sorted(shares | {1 / order for order in _TEETH})
+    shares = sorted({k / order for order in _TRIED_ORDERS for k in range(1, order)})
     angles = torch.tensor(shares, dtype=torch.float64) * (2 * math.pi)
     angles = angles[surface.rough_distance(_turns(direction, angles)) <= _COARSE]
     if worst > tolerance and len(angles):
@@ -310,6 +310,7 @@ def _measure(
             is_shadow = any(abs(angle - other) < _SUPPRESSION_RAD for other, _ in turns)
             if value <= limit and not is_shadow:
                 turns.append((angle, value))
+    teeth = [] if full else _measure_teeth(surface, direction, tolerance)
     return [
         SymmetryProposal(
             kind="continuous" if angle is None else "discrete",
@@ -319,8 +320,27 @@ def _measure(
             deviation=value,
             certainty=1 / (1 + (value / tolerance) ** 2),
         )
-        for angle, value in (*full, *turns)
+        for angle, value in (*full, *turns, *teeth)
     ]
+
+
+def _measure_teeth(
+    surface: SurfaceDeviation, direction: Tensor, tolerance: float
+) -> list[tuple[float, float]]:
+    """Measure rotations by one of many teeth, and by half of one, which is to look otherwise.
+
+    Gives the angle and the deviation of the order that fits best, if there is one.
+    """
+    found: list[tuple[float, float]] = []
+    for order in _TEETH:
+        step = 2 * math.pi / order
+        angles = torch.tensor([step, 0.5 * step, 1.5 * step], dtype=torch.float64)
+        if float(surface.rough_distance(_turns(direction, angles[:1]))) > _COARSE:
+            continue
+        tooth, *between = surface.deviation(_turns(direction, angles)).tolist()
+        if tooth <= tolerance and min(between) > 2 * tooth + ALIKE:
+            found.append((step, tooth))
+    return sorted(found, key=lambda pair: pair[1])[:1]
 
 
 MIRROR_ALIKE = 0.03
