@@ -15,7 +15,7 @@ from depthpose.cli import main, pose_methods
 from depthpose.cli.pose_predict import cloud_jobs
 from depthpose.core.camera import Camera, back_project, write_camera
 from depthpose.core.files import read_cloud, write_depth_png
-from depthpose.pose.estimator import track as tracking_module
+from depthpose.pose import track as tracking_module
 from depthpose.pose.metrics import add_m
 from depthpose.pose.predictions import read_bop_results, read_predictions
 from depthpose.pose.types import PoseEstimate

@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 import torch
 
+from depthpose.core.errors import Notice
 from depthpose.core.files import write_map
 from depthpose.depth.datasets import lidar_truth, open_dataset, project_lidar
 from depthpose.depth.datasets.frames import LidarDepth
@@ -96,7 +97,8 @@ def test_the_reference_metrics_are_reproduced(real: Path, tmp_path: Path) -> Non
     for row in rows:
         reference_px = _reference_prediction(row["k"])
         write_map(tmp_path / f"{row['drive']}_{row['frame']}.disparity_px.npy", reference_px)
-    result = evaluate(dataset, tmp_path, "eigen-raw", caps_m=(80.0, 50.0))
+    with pytest.warns(Notice, match="of another aspect"):
+        result = evaluate(dataset, tmp_path, "eigen-raw", caps_m=(80.0, 50.0))
     ours = {(row.frame, row.cap_m): row for row in result.per_frame}
     assert len(rows) == len(ours) == 20
     for row in rows:

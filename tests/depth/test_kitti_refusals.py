@@ -56,7 +56,7 @@ def _small_depth(home: Path) -> None:
 
 
 def _wide_camera(home: Path) -> None:
-    put(home / "calib.txt", "".join(f"{n} 1242 375 700 10 6 0.5\n" for n in "ab"))
+    put(home / "calib.txt", "".join(f"{n} 1242 375 700 600 180 0.5\n" for n in "ab"))
 
 
 def _two_lines(home: Path) -> None:

@@ -53,7 +53,7 @@ def test_the_numbers_are_those_of_the_estimate() -> None:
         assert std is not None
         assert [float(cell) for cell in row[1:]] == pytest.approx(std.tolist(), abs=1e-3)
     assert [float(row[k]) for k, row in enumerate(covariance)] == [1e-6] * 6
-    assert dict(section.facts)["certainty of this pose"] == "0.875"
+    assert dict(section.facts)["certainty, up to near-symmetry"] == "0.875"
     x, y, z = POSE.t_m.tolist()
     assert (
         section.text

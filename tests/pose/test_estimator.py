@@ -247,7 +247,7 @@ def test_an_axis_that_nobody_declared_is_not_observable() -> None:
     truth = pose_at(seed=5)
     found = Oracle(tiny_weights(model), [truth]).estimate(cloud=cloud_of(model, truth))
     assert found.status == "not observable"
-    assert "the seen part of the object leaves one turn undetermined" in found.reason
+    assert "the visible part of the object leaves one rotation undetermined" in found.reason
     assert found.camera_from_model is None
 
 
@@ -344,7 +344,7 @@ def test_terms_are_said_and_names_are_found(part: ObjectModel, tmp_path: Path) -
 @pytest.mark.parametrize(
     ("given", "text"),
     [
-        ({}, "give cloud=, or depth=, mask= and camera= together"),
+        ({}, "give cloud=, or depth=, camera= and one of mask= and box= together"),
         ({"cloud": torch.zeros(3, 3), "depth": torch.zeros(2, 2)}, "give cloud=, or depth="),
         ({"depth": torch.ones(240, 320), "mask": torch.ones(240, 320)}, "give cloud=, or depth="),
         ({"cloud": torch.zeros(3, 50)}, r"is of shape \(3, 50\); give points as rows"),

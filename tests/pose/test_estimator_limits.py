@@ -64,8 +64,8 @@ class _Noisy(Oracle):
     ) -> list[CloudToPose | PoseEstimate]:
         for one in super()._ask_network(group):
             assert isinstance(one, CloudToPose)
-            noise = torch.randn(one.outputs.shape, generator=self.generator)
-            one.outputs = one.outputs + 0.03 * noise
+            noise = torch.randn(one.directions.shape, generator=self.generator)
+            one.directions = one.directions + 0.03 * noise
         return group
 
 

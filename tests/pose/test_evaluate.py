@@ -251,7 +251,7 @@ def test_columns_come_in_the_declared_order(synthetic: BopDataset) -> None:
     origin = Origin(method="ours", masks="truth", weights="w", weights_sha256="ab")
     exact = predictions_of(synthetic, lambda i: i.camera_from_model)
     found = evaluate(synthetic, exact, origin=origin)
-    who, times = ["method", "masks"], ["ms_network", "ms_voting", "ms_total"]
+    who, times = ["method", "masks"], ["ms_network", "ms_proposal", "ms_total"]
     stamp = ["diameters", "frames", "frames_sha256"]
     assert list(found.per_instance[0].columns()) == [
         *who, "instance", "object", "status", "is_success", "score", "visible_fraction", "truth",

@@ -106,7 +106,7 @@ def test_a_distance_that_is_none_is_no_number_in_the_file(tmp_path: Path) -> Non
 
 
 def test_the_csv_has_no_row_of_a_refusal_but_its_time(tmp_path: Path) -> None:
-    by_votes = replace(answer("c", 1), seconds={}, fit=None, certainty=None, alternatives=())
+    by_votes = replace(answer("c", 1), seconds={}, evidence=None, certainty=None, alternatives=())
     slow = replace(refusal(), seconds={"segmentation": 0.1})
     sent = [
         Prediction(estimate=answer(), place=Place(1, 20, 6)),
@@ -197,7 +197,7 @@ def test_the_schema_describes_what_is_written(tmp_path: Path) -> None:
         Prediction(estimate=answer(), place=Place(1, 20, 6)),
         Prediction(estimate=refusal(), place=Place(1, 20, 5)),
         Prediction(estimate=tracked),
-        Prediction(estimate=replace(answer("bare"), covariance=None, fit=None, identity=None)),
+        Prediction(estimate=replace(answer("bare"), covariance=None, evidence=None, identity=None)),
         Prediction(estimate=replace(answer("far"), residual_m=torch.inf)),
         Prediction(estimate=answer("based").in_base(some_pose(5))),
     ]

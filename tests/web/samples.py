@@ -2,7 +2,9 @@
 
 from pathlib import Path
 
+import torch
 from tests.pose.synthetic_objects import write_part
+from torch.nn.functional import pad
 
 from depthpose.core.camera import Camera, write_camera
 from depthpose.core.files import Cloud, write_cloud, write_depth_png, write_image
@@ -30,16 +32,21 @@ def write_street(folder: Path, scale: float = 0.25) -> Path:
 
 def write_view(folder: Path) -> Rigid:
     """Write ``depth.png``, ``mask.png``, ``view.json``, ``cloud.ply`` and STLs; give the pose."""
-    config = ObjectsConfig(seed=4, number=1, occluded_share=0.0, views=None)
+    config = ObjectsConfig(seed=4, number=1, occluded_share=0.0, views=None, resolution=(1.0, 1.0))
     sample = Objects((make_part(PART),), config).view(0)
-    view = sample.input
-    height, width = view.mask.shape
-    K = view.K.double()
+    window = sample.input
+    # The window of the object leaves the principal point out: a margin takes it in.
+    margin = 8
+    K = window.K.double()
+    K[:2, 2] += margin
+    depth_m = pad(window.depth_m, [margin] * 4, value=torch.nan)
+    mask = pad(window.mask, [margin] * 4)
+    height, width = mask.shape
     camera = Camera(width=width, height=height, K=K, depth_unit_m=0.0001)
     write_camera(folder / "view.json", camera)
-    write_depth_png(folder / "depth.png", view.depth_m, 0.0001)
-    write_mask(folder / "mask.png", view.mask)
-    points_m = cloud_from_depth(view.depth_m, view.mask, K).float()
+    write_depth_png(folder / "depth.png", depth_m, 0.0001)
+    write_mask(folder / "mask.png", mask)
+    points_m = cloud_from_depth(depth_m, mask, K).float()
     write_cloud(folder / "cloud.ply", Cloud(points=1000 * points_m))
     write_part(PART, folder)
     write_part("mug", folder)

@@ -138,7 +138,7 @@ def share_among_copies(hypotheses: Sequence[Hypothesis]) -> Float64[Tensor, " n"
     """Share the probability of one among near-symmetric copies of a pose.
 
     Wrong copies are contradicted little, for they look nearly alike: so each is weighed by how well
-    its evidence fits a right pose.
+    its evidence fits a right pose. A network's votes say nothing here: it saw no more.
     """
     area = _common_area(hypotheses)
     weights: list[float] = []
@@ -146,7 +146,7 @@ def share_among_copies(hypotheses: Sequence[Hypothesis]) -> Float64[Tensor, " n"
         evidence = hypothesis.evidence
         fits_right = COPY_CONTRADICTED.log_likelihood(evidence.contradicted, area)
         fits_right += RIGHT_UNOBSERVED.log_likelihood(evidence.unobserved, area)
-        weights.append(fits_right + _log_fit(evidence.rms) + _log_beside_depth(hypothesis))
+        weights.append(fits_right + _log_fit(evidence.rms) + hypothesis.log_color)
     return torch.tensor(weights, dtype=torch.float64).softmax(0)
 
 

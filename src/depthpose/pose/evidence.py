@@ -27,7 +27,7 @@ from depthpose.pose.types import Evidence, ViewInput
 
 THRESHOLD = 3.0  #: deviations beyond which a residual contradicts a pose
 AVERAGED_PX = 5  #: residuals are averaged over a square of this side
-BORDER_PX = 2
+BORDER_PX = 3
 """Readings so near an edge may be of either side: stereo matches windows, and masks end so far from
 the silhouette."""
 _LEAST_FILLED = 0.3  # share of the averaged square that must have residuals
@@ -113,8 +113,8 @@ def observe(
     noise = measure_noise(depth_m.numpy(), inner.numpy(), object_m)
 
     step = max(1, math.floor(math.sqrt(float(is_object.sum()) / _OBJECT_PX)))
-    # The pixels of a drawn cloud, or of a smaller image, are wider than those of the sensor.
-    correlation_px = min(CORRELATION_PX, CORRELATION_RAD * float(K[0, 0]))
+    # The pixels of a drawn cloud are not those of its sensor: of that the angle is assumed.
+    correlation_px = CORRELATION_PX if view is not None else CORRELATION_RAD * float(K[0, 0])
     window_K = K.clone()
     window_K[:2, 2] -= torch.tensor([left, top], dtype=torch.float64)
     window_K[:2] /= step
@@ -281,4 +281,6 @@ def _patch_area(mask: Bool[np.ndarray, "h w"], patch_px: float) -> float:
     labels = np.zeros(mask.shape, np.int32)
     ndimage.label(mask, output=labels)
     areas_px = np.bincount(labels.ravel())[1:]
-    return float(areas_px[areas_px >= _LEAST_PATCH * patch_px].sum()) / patch_px
+    areas_px = areas_px[areas_px >= _LEAST_PATCH * patch_px]
+    # What remains is wider than a sensor moves an edge: it is one observation at least.
+    return float(np.maximum(areas_px / patch_px, 1.0).sum())

@@ -116,6 +116,8 @@ def find_objects(view: ViewInput, targets: SearchTargets) -> list[PoseEstimate]:
     for _ in range(1 if targets.is_single else _ROUNDS):
         groups = _group(_propose(frame, is_left, names, targets), taken, frame, targets)
         judged = _judge(groups, frame, view, targets)
+        if targets.is_single:  # what lies mostly beside the region is something else
+            judged = [p for p in judged if float(is_left[p.explained].double().mean()) > 0.5]
         more, taken = _suppress(judged, taken)
         found += more
         for place in more:

@@ -23,9 +23,9 @@ CORRELATION_PX = 10
 a Kinect's, is as many independent readings as squares of 4 pi 3^2 pixels; a RealSense smooths by
 5 px."""
 CORRELATION_RAD = CORRELATION_PX / 570  #: the same as an angle, for a Kinect of 640 columns
-NOISIEST_PER_M = 0.003
-"""Largest noise that is believed, for the square of the depth in metres: twice a Kinect's (Nguyen
-et al. 2012)."""
+NOISIEST_PER_M = 0.006
+"""Largest noise that is believed, for the square of the depth in metres: four times a Kinect's
+(Nguyen et al. 2012)."""
 _MEDIAN_TO_DEVIATION = 1.4826  # of a normal distribution
 _STEEPEST = 0.3
 """Least cosine by which a deviation along the surface normal is divided: what is seen at a smaller
