@@ -26,11 +26,11 @@ from depthpose.depth.synthesis import Discriminator, UNetGenerator
 from depthpose.depth.train.config import StereoTraining, ViewTraining
 from depthpose.pose.cloud import voxelise
 from depthpose.pose.network import ResUNet
+from depthpose.pose.propose import meet_lines, vote_ransac
 from depthpose.pose.segmentation import FCN
 from depthpose.pose.sparse import Voxels
 from depthpose.pose.train import PoseTraining, SegmentationTraining
 from depthpose.pose.types import SeenPoints
-from depthpose.pose.propose import meet_lines, vote_ransac
 
 CONFIGS = Path(__file__).parents[2] / "configs"
 Diagram = tuple[list[Box], list[Arrow]]
