@@ -93,7 +93,7 @@ def test_a_drawn_surface_is_what_the_renderer_draws(
 
     # The depth is that of the surface where it is smooth: away from silhouettes and edges.
     bend_m = np.abs(ndimage.laplace(np.where(is_exact, exact_m, 9.0)))
-    inner = is_drawn & ~ndimage.binary_dilation(bend_m > 0.0003, iterations=5)
+    inner = is_drawn & np.logical_not(ndimage.binary_dilation(bend_m > 0.0003, iterations=5))
     assert inner.sum() > 0.2 * is_exact.sum()
     assert np.quantile(np.abs(image_m - exact_m)[inner], 0.98) < off_m
 

@@ -128,8 +128,8 @@ class SurfaceDeviation:
         farthest: list[Float[Tensor, "*batch"]] = []
         for way in (turn, turn.inverse()):
             moved = way.apply(points)
-            workers = torch.get_num_threads()
-            distance, index = self._tree.query(moved.numpy(), k=range(1, near + 1), workers=workers)
+            nearest = self._tree.query(moved.numpy(), k=near, workers=torch.get_num_threads())
+            distance, index = (np.reshape(part, (*moved.shape[:-1], near)) for part in nearest)
             gap = moved.numpy()[..., None, :] - self.points.numpy()[index]
             height = np.abs((gap * self._normals[index]).sum(-1))
             # Between samples the plane says the distance; beside an edge, the sample does. Of the
