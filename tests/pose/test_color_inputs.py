@@ -29,7 +29,9 @@ RGB = np.random.default_rng(0).integers(0, 256, (12, 16, 3), dtype=np.uint8)
 
 def colored() -> ObjectModel:
     one = torch.rand(50, 3)
-    return replace(bracket(), colors=SurfaceColors(points_m=one, normals=one, rgb=one, spacing_m=1))
+    return replace(
+        bracket(), colors=SurfaceColors(points_m=one, normals=one, rgb=one, spacing_m=1.0)
+    )
 
 
 def test_every_form_of_a_picture_is_the_same_image(tmp_path: Path) -> None:
