@@ -118,7 +118,7 @@ def test_pixels_that_are_not_square_become_so(
     tmp_path: Path, ratio: tuple[int, int], size: tuple[int, int], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     path = tmp_path / "anamorphic.avi"
-    write_video(path, iter(moving_square(2)), fps=10)
+    write_video(path, iter(moving_square(2)), fps=10.0)
     cv2 = pytest.importorskip("cv2")
     capture = cv2.VideoCapture
 

@@ -13,7 +13,7 @@ from depthpose.depth.synthetic import StreetFrame, draw_near, make_near
 from depthpose.depth.synthetic.near import NearScene
 
 SMALL = NearConfig(
-    columns_px=(144, 192), infrared_share=0.0, border_share=0.0, jpeg_share=0.0,
+    columns_px=(144.0, 192.0), infrared_share=0.0, border_share=0.0, jpeg_share=0.0,
     rectification_error_px=0.0,
 )  # fmt: skip
 
