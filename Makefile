@@ -16,7 +16,7 @@ PYTEST := PYTHONDONTWRITEBYTECODE= OMP_NUM_THREADS=1 $(BIN)/python -m pytest \
 # Shapes and types of every call, checked while tests run: slower, so only with TYPES=1, as .ci/run
 # has it for the quick tests. Most slow ones start commands, and in those processes nothing is checked.
 TYPES ?=
-CHECKED := --jaxtyping-packages=depthpose,beartype.beartype
+CHECKED := --jaxtyping-packages=depthpose,tests.typecheck.check
 
 .PHONY: all setup demo test test-slow check docs bench clean
 all: check test

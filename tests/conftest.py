@@ -6,6 +6,7 @@ import tempfile
 from pathlib import Path
 
 import pytest
+import tests.typecheck  # noqa: F401  # loaded, since `make test TYPES=1` names it
 import torch
 from filelock import FileLock  # torch brings it
 from hypothesis import settings

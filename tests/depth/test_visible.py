@@ -52,9 +52,19 @@ def test_what_rectification_leaves_black_is_no_picture() -> None:
     assert float(blank.float().mean()) < 1.2 * float(is_black.float().mean())
 
 
+def tree(image: Tensor, column: int) -> Tensor:
+    """A dark tree at the upper border, through whose leaves the sky is seen."""
+    leaves = torch.rand(30, 40, generator=torch.Generator().manual_seed(2)) < 0.8
+    crown = image[:, :30, column : column + 40]
+    crown[:, leaves] = 0
+    return image
+
+
 @pytest.mark.parametrize(
     "image",
     [
+        tree(noise(), 0),
+        tree(noise(), 60),
         bars(noise(), 1.0, bottom=0),  # an over-exposed sky
         bars(noise(), 0.5, bottom=0),  # a drawn one
         torch.zeros(3, H, W),
@@ -62,7 +72,16 @@ def test_what_rectification_leaves_black_is_no_picture() -> None:
         noise(),
         torch.linspace(0.2, 0.8, W).expand(3, H, -1),
     ],
-    ids=["white above", "grey above", "black", "white", "noise", "ramp"],
+    ids=[
+        "tree in a corner",
+        "tree",
+        "white above",
+        "grey above",
+        "black",
+        "white",
+        "noise",
+        "ramp",
+    ],
 )
 def test_a_picture_has_no_blank_border(image: Tensor) -> None:
     assert not bool(without_picture(image).any())

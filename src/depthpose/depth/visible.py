@@ -22,6 +22,8 @@ _LEAST_SHARE = 0.0005
 """Of a side, and of the image: what is smaller is a dark pixel of the picture."""
 _LEAST_PICTURE = 0.1
 """Of the image: where less would be left, it is black or plain itself, and nothing is a border."""
+_LEAST_FILLED = 0.95
+"""Of a black region's pixels: so many have nothing but black towards a side of the image."""
 _MIXED_PX = 2
 """So far into the border, pixels are a mixture of picture and black: cubic resampling."""
 _PATCH_SHARE = 8 / 1242
@@ -35,7 +37,7 @@ def without_picture(image: Float[Tensor, "3 h w"]) -> Bool[Tensor, "h w"]:
     """Find the borders in which there is no picture.
 
     These are bars of one colour along whole sides (letterboxes), dark or at two opposite sides, and
-    black regions that touch the border, as rectification leaves them.
+    black regions along the border, as rectification leaves them.
     """
     height, width = image.shape[1:]
     blank = torch.zeros(height, width, dtype=torch.bool, device=image.device)
@@ -46,18 +48,38 @@ def without_picture(image: Float[Tensor, "3 h w"]) -> Bool[Tensor, "h w"]:
     blank[:, : columns[0]] = True
     blank[:, width - columns[1] :] = True
 
-    dark = (image.amax(0) <= _BLACK).cpu().numpy()
-    on_edge = np.concatenate([dark[0], dark[-1], dark[:, 0], dark[:, -1]])
-    if on_edge.any():
-        regions, count = cast("tuple[np.ndarray, int]", ndimage.label(dark))
-        at_edge = (regions[0], regions[-1], regions[:, 0], regions[:, -1])
-        is_border = np.zeros(count + 1, dtype=bool)
-        is_border[np.unique(np.concatenate(at_edge))] = True
-        is_border &= np.bincount(regions.ravel(), minlength=count + 1) >= _LEAST_SHARE * dark.size
-        is_border[0] = False
-        found = ndimage.binary_dilation(is_border[regions], iterations=_MIXED_PX)
-        blank |= torch.from_numpy(found).to(blank.device)
+    border = _black_border((image.amax(0) <= _BLACK).cpu().numpy())
+    blank |= torch.from_numpy(border).to(blank.device)
     return blank if float((~blank).float().mean()) >= _LEAST_PICTURE else torch.zeros_like(blank)
+
+
+def _black_border(is_black: np.ndarray) -> np.ndarray:
+    """Find what rectification leaves black; a dark thing at the border is of the picture.
+
+    The picture of a rectified image is bulged or cut straight: a black region beside it reaches a
+    corner of the image or along half a side, and has no holes.
+    """
+    height, width = is_black.shape
+    sides = (is_black[0], is_black[-1], is_black[:, 0], is_black[:, -1])
+    if not any(side.any() for side in sides):
+        return np.zeros_like(is_black)
+    # Pixels between which and a side of the image everything is black.
+    from_side = np.zeros_like(is_black)
+    for axis in (0, 1):
+        from_side |= np.logical_and.accumulate(is_black, axis)
+        from_side |= np.flip(np.logical_and.accumulate(np.flip(is_black, axis), axis), axis)
+
+    regions, count = cast("tuple[np.ndarray, int]", ndimage.label(is_black))
+    corners = regions[[0, 0, -1, -1], [0, -1, 0, -1]]
+    area_px = np.bincount(regions.ravel(), minlength=count + 1)
+    filled_px = np.bincount(regions[from_side], minlength=count + 1)
+    reaches = np.isin(np.arange(count + 1), corners)
+    for side in (regions[0], regions[-1], regions[:, 0], regions[:, -1]):
+        reaches |= np.bincount(side, minlength=count + 1) > len(side) / 2
+    is_border = reaches & (area_px >= _LEAST_SHARE * height * width)
+    is_border &= filled_px >= _LEAST_FILLED * area_px
+    is_border[0] = False  # what is not black
+    return ndimage.binary_dilation(is_border[regions], iterations=_MIXED_PX)
 
 
 def _bars(image: Float[Tensor, "3 _ _"]) -> tuple[int, int]:

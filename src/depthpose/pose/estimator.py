@@ -5,7 +5,7 @@ from collections.abc import Callable, Iterable, Iterator, Sequence, Sized
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import torch
 from tqdm import tqdm
@@ -335,7 +335,7 @@ class PoseEstimator:
         if camera is not None:
             made = partial(view_input, mask=None, camera=camera, object=which, unit=unit)
 
-        def read(number: int, frame: AnyArray) -> AnyInput | PoseEstimate:
+        def read(number: int, frame: Any) -> AnyInput | PoseEstimate:  # noqa: ANN401  # bad ones too
             name = f"{_NAME}_{number}"
             try:
                 return made(frame, name=name)

@@ -129,10 +129,11 @@ def observe(
 
 
 def _camera_of_cloud(cloud_m: Float64[Tensor, "n 3"]) -> Float64[Tensor, "3 3"]:
-    """Intrinsic matrix of a camera to which the points of a cloud are a pixel apart."""
-    rays = (cloud_m[:, :2] / cloud_m[:, 2:]).unique(dim=0)  # some clouds hold points twice
-    nearest, _ = KDTree(rays.numpy()).query(take_evenly(rays, 200).numpy(), k=2, workers=1)
-    focal_px = 1 / (_POINT_PX * float(np.median(nearest[:, 1])))
+    """Intrinsic matrix of a camera to which neighbouring points of a cloud are a pixel apart."""
+    points_m = cloud_m.unique(dim=0)  # some clouds hold points twice
+    sample_m = take_evenly(points_m, 200)
+    apart_m, _ = KDTree(points_m.numpy()).query(sample_m.numpy(), k=2, workers=1)
+    focal_px = float(sample_m[:, 2].median()) / (_POINT_PX * float(np.median(apart_m[:, 1])))
     return torch.diag(torch.tensor([focal_px, focal_px, 1.0], dtype=torch.float64))
 
 
