@@ -84,6 +84,21 @@ def test_both_ends_of_a_pair_are_measured(near_px: int, far_px: int) -> None:
 
 
 @needs_weights
+def test_black_borders_say_nothing_about_a_pair() -> None:
+    """They match each other over the whole width."""
+    left, right, _ = planes(30, 6)
+    usual = measure_reach(matcher(), left, right, 0.0)
+    for view, columns in ((left, 16), (right, 24)):
+        view[..., :columns] = 0.0
+        view[..., -columns:] = 0.0
+        view[..., -8:, :] = 0.0
+    reach = measure_reach(matcher(), left, right, 0.0)
+    assert reach.high_px <= usual.high_px + reach.step_px
+    assert reach.coarse.confidence is not None
+    assert not bool(reach.coarse.confidence[:, :16].any())
+
+
+@needs_weights
 @pytest.mark.parametrize(("near_px", "far_px"), [(40, 10), (260, 180), (200, 24)])
 def test_a_pair_is_matched_wherever_its_disparities_lie(near_px: int, far_px: int) -> None:
     left, right, truth_px = planes(near_px, far_px, width=640)

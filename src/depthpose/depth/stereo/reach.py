@@ -20,6 +20,7 @@ from depthpose.core.camera import Camera
 from depthpose.depth.disparity import changed_match, warp_right_to_left
 from depthpose.depth.stereo.matcher import NetworkMatcher, Search
 from depthpose.depth.types import Match
+from depthpose.depth.visible import without_picture
 
 _TAIL = 0.001
 """Share of the copy's pixels that may lie beyond either end: single pixels at edges are wrong."""
@@ -113,12 +114,19 @@ def measure_reach(
     right_px = other.disparity_px.flip(-1)[None]
     there_px = warp_right_to_left(right_px, coarse.disparity_px)[0]
     agrees = (coarse.disparity_px - there_px).abs() <= step_px
+    # Borders without a picture match each other at any disparity, and tell nothing.
+    left_blank, right_blank = (without_picture(view).to(agrees.device) for view in (left, right))
+    meets = warp_right_to_left(right_blank.to(right_px)[None], coarse.disparity_px)[0]
+    is_picture = ~left_blank & ~(meets > 0)
+    if coarse.confidence is not None:
+        coarse = replace(coarse, confidence=coarse.confidence.where(is_picture, 0.0))
     # Every pixel of the copy, of the maps at the size of the images.
     stride = max(1, round(1 / scale))
     each = (slice(None, None, stride), slice(None, None, stride))
     found_px = coarse.disparity_px[each]
-    is_far = agrees[each]
+    is_far = agrees[each] & is_picture[each]
     is_near = found_px <= torch.arange(width, device=found_px.device)[::stride]
+    is_near &= is_picture[each]
     if coarse.confidence is not None:
         is_near &= coarse.confidence[each] >= _SURE
     tail = int(_TAIL * found_px.numel())
