@@ -72,9 +72,12 @@ def predict(home: Path, out: Path, *words: str) -> int:
 
 
 @pytest.mark.slow
-def test_a_pair_becomes_a_pose(pair: Path, tmp_path: Path) -> None:
+def test_a_pair_becomes_a_pose(
+    pair: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     out = tmp_path / "out"
     assert predict(pair, out, "--mask", str(pair / "mask.png")) == 0
+    assert "% of the depth is less sure than 0.5 and left out" in capsys.readouterr().err
     (row,) = json.loads((out / "poses.json").read_text())
     assert row["status"] in ("ok", "ambiguous")
     found, truth = np.array(row["camera_from_model"]), np.loadtxt(pair / "truth.txt")

@@ -1,5 +1,6 @@
 """A rectified pair as the depth image of a pose: matched, without what the match is unsure of."""
 
+import sys
 from pathlib import Path
 
 import torch
@@ -75,6 +76,11 @@ def _keep_sure(name: str, rig: StereoRig, min_confidence: float, out: Path) -> N
             f"{name}: no depth is as sure as {min_confidence:g}, so there is nothing to pose; "
             "give a lower --min-confidence"
         )
+    left_out = 1 - float(kept_m.isfinite().sum() / depth_m.isfinite().sum())
+    print(
+        f"{name}: {left_out:.1%} of the depth is less sure than {min_confidence:g} and left out",
+        file=sys.stderr,
+    )
     deviation_m = depth_deviation(depth_m, confidence, rig)
     for folder, values in zip(folders, (kept_m, deviation_m), strict=True):
         write_map(folder / f"{name}.npy", torch.where(is_sure, values, torch.nan))

@@ -190,15 +190,19 @@ def doubt_outside(match: Match, reach: Reach, window: Window) -> tuple[Match, st
     """Set the confidence to 0 where the true disparity may lie beyond what was searched; say it.
 
     That is where the copy has a disparity beyond, and where the answer is the last that the search
-    has. Named is the share where the copy is sure.
+    has. Named is the share where the copy is sure, of what the right view can show.
     """
     if match.confidence is None:
         return match, ""
     coarse_px, sure = reach.coarse.disparity_px, reach.coarse.confidence
-    is_beyond = coarse_px > window.last_px + reach.step_px
-    is_beyond &= coarse_px <= torch.arange(coarse_px.shape[1], device=coarse_px.device)
+    # Beside what is beyond, two pixels of the copy or its error away, it may be beyond too.
+    radius = round(2 * reach.step_px / STEP_PX)
+    nearest_px = F.max_pool2d(coarse_px[None], 2 * radius + 1, 1, radius)[0]
+    is_beyond = nearest_px > window.last_px - reach.step_px
     is_last = match.disparity_px > window.last_px - STEP_PX / window.search.scale
     doubted = replace(match, confidence=match.confidence.masked_fill(is_beyond | is_last, 0.0))
+    is_beyond = coarse_px > window.last_px + reach.step_px
+    is_beyond &= coarse_px <= torch.arange(coarse_px.shape[1], device=coarse_px.device)
     if sure is not None:
         is_beyond &= sure >= _SURE
     share = float(is_beyond.float().mean())
