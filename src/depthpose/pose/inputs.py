@@ -27,6 +27,7 @@ from depthpose.pose.cloud import nothing_seen as nothing_seen
 from depthpose.pose.datasets import decode_rle, number_objects, one_mask, read_labels
 from depthpose.pose.datasets.masks import read_runs
 from depthpose.pose.mesh.shapes import is_shape, shape_geometry
+from depthpose.pose.rays import warn_of_rays
 from depthpose.pose.segmentation import label_parts
 from depthpose.pose.types import AnyInput as AnyInput
 from depthpose.pose.types import CloudInput, ViewInput
@@ -107,6 +108,7 @@ def view_input(
             f"{name}: K is of another image or size: {error}. Resizing an image by s makes fx, fy, "
             "cx and cy s times as large"
         ) from error
+    warn_of_rays(depth_m, K)
     return ViewInput(name=name, depth_m=depth_m, mask=pixels, K=K, object=object)
 
 

@@ -1,0 +1,130 @@
+"""Whether a depth image holds depth along the optical axis, or distance along each pixel's ray.
+
+Simulators and some cameras write the distance ``r`` from the camera to the point, where ``z = r /
+sqrt(1 + x^2 + y^2)`` belongs for the ray ``(x, y, 1)``. Taken for z it bends every table and wall
+towards the camera, as much as a ball whose radius is their distance. On a plane ``1 / z`` is linear
+in x and y, so that a plane of some extent tells one from the other.
+"""
+
+import warnings
+
+import torch
+from jaxtyping import Bool, Float, Float64
+from torch import Tensor
+
+from depthpose.core.arrays import take_evenly
+from depthpose.core.errors import Notice
+
+_SAMPLE = 1000
+_HYPOTHESES = 120
+_PLANES = 3
+_REFITS = 3
+_TOLERANCE_M = 0.0015
+_TOLERANCE_PER_M = 0.004
+"""Readings lie on a plane up to so much, and so much for the square of their depth in metres."""
+_LEAST_SHARE = 0.05
+"""Of the readings: fewer make no plane."""
+_CLEARLY = 1.1
+"""By so much more readings must lie on the planes of one assumption than on those of the other."""
+_LEAST_BEND = 0.007
+"""Least bend that distance along the ray gives the planes, as a share of their depth, for an
+answer: sensors bend planes themselves, by up to 0.1 % of the depth in the real frames."""
+_RAY_BEND = (0.75, 1.3)
+"""Planes of real frames have a bend of -0.08 to 0.08 of that of the ray, and 0.92 to 1.08 after
+their depth was turned into distance."""
+
+
+def warn_of_rays(depth_m: Float[Tensor, "h w"], K: Float[Tensor, "3 3"]) -> None:
+    """Give a notice where the planes of a depth image are bent as distance along the ray is."""
+    bend = ray_bend(depth_m, K)
+    if bend is None or not _RAY_BEND[0] < bend < _RAY_BEND[1]:
+        return
+    warnings.warn(
+        "a depth image looks like distance along each pixel's ray, for its planes are bent so, but "
+        "depth is along the optical axis: its poses are up to centimetres off. Divide it by "
+        "sqrt(1 + ((u - cx) / fx)^2 + ((v - cy) / fy)^2), or write depth to the image plane",
+        Notice,
+        stacklevel=3,
+    )
+
+
+def ray_bend(depth_m: Float[Tensor, "h w"], K: Float[Tensor, "3 3"]) -> float | None:
+    """Measure how planes are bent: 0 of depth along the axis, 1 of distance along the ray.
+
+    Planes are sought by RANSAC under both assumptions; those of the one by which more readings lie
+    on planes are fitted anew, with the bend as a further unknown.
+
+    Args:
+        depth_m: NaN or 0 where there is no reading.
+        K: intrinsic matrix.
+
+    Returns:
+        The mean bend of the planes; None where they are too few or too small to tell.
+    """
+    v, u = (depth_m > 0).nonzero(as_tuple=True)
+    pixels = take_evenly(torch.stack([u, v, torch.ones_like(u)], 1), _SAMPLE)
+    reading_m = depth_m[pixels[:, 1], pixels[:, 0]].double()
+    rays = pixels.double() @ torch.linalg.inv(K.double()).mT
+    is_finite = reading_m.isfinite()
+    rays = rays[is_finite]
+    reading_m = reading_m[is_finite]
+    if len(rays) < 10:
+        return None
+    stretch = rays.norm(dim=1)
+
+    of_axis = _planes(rays, reading_m, torch.ones_like(stretch))
+    of_ray = _planes(rays, reading_m, stretch)
+    on_axis = sum(int(plane.sum()) for plane in of_axis)
+    on_ray = sum(int(plane.sum()) for plane in of_ray)
+    if max(on_axis, on_ray) < _CLEARLY * min(on_axis, on_ray):
+        return None
+    planes = of_axis if on_axis > on_ray else of_ray
+    count = max(on_axis, on_ray)
+    total = 0.0
+    weighted = 0.0
+    for plane in planes:
+        # (1 + bend (s - 1)) / d = a x + b y + c, times d: linear in the plane and the bend.
+        given = rays[plane] * reading_m[plane, None]
+        known = torch.ones(len(given), dtype=torch.float64)
+        bent = 1 - stretch[plane]
+        plane_alone = torch.linalg.lstsq(given, torch.stack([known, bent], 1)).solution
+        known = known - given @ plane_alone[:, 0]
+        bent = bent - given @ plane_alone[:, 1]
+        total += float(bent.square().sum())
+        weighted += float((known * bent).sum())
+    if count == 0 or total < count * _LEAST_BEND**2:
+        return None
+    return weighted / total
+
+
+def _planes(
+    rays: Float64[Tensor, "n 3"], reading_m: Float64[Tensor, " n"], stretch: Float64[Tensor, " n"]
+) -> list[Bool[Tensor, " n"]]:
+    """Find planes one after the other, where ``reading_m / stretch`` is depth along the axis."""
+    depth_m = reading_m / stretch
+    points_m = rays * depth_m[:, None]
+    tolerance = _TOLERANCE_M / depth_m + _TOLERANCE_PER_M * depth_m
+    generator = torch.Generator().manual_seed(0)
+    is_left = torch.ones(len(rays), dtype=torch.bool)
+    least = max(3, _LEAST_SHARE * len(rays))
+    planes: list[Bool[Tensor, " n"]] = []
+    while len(planes) < _PLANES and int(is_left.sum()) >= least:
+        left = is_left.nonzero()[:, 0]
+        triples = points_m[left[torch.randint(len(left), (_HYPOTHESES, 3), generator=generator)]]
+        is_good = torch.linalg.det(triples).abs() > 1e-9
+        triples = triples[is_good]
+        if len(triples) == 0:
+            break
+        inverse = torch.linalg.solve(triples, torch.ones(len(triples), 3, 1, dtype=torch.float64))
+        off = (points_m @ inverse[..., 0].mT - 1).abs()
+        is_on = (off < tolerance[:, None]) & is_left[:, None]
+        on_plane = is_on[:, int(is_on.sum(0).argmax())]
+        for _ in range(_REFITS):
+            ones = torch.ones(int(on_plane.sum()), 1, dtype=torch.float64)
+            plane = torch.linalg.lstsq(points_m[on_plane], ones).solution[:, 0]
+            on_plane = is_left & ((points_m @ plane - 1).abs() < tolerance)
+        if int(on_plane.sum()) < least:
+            break
+        planes.append(on_plane)
+        is_left = is_left & ~on_plane
+    return planes
