@@ -114,12 +114,14 @@ def test_the_area_of_a_constant_is_that_under_the_oracle() -> None:
     assert area == pytest.approx(0.49, abs=0.01)  # remaining error 1 against (1 - removed)
 
 
-def test_the_area_of_a_worked_example() -> None:
-    """Of three pixels none is removed, then a half: what is left is rounded up to two."""
-    error, confidence = torch.tensor([1.0, 2.0, 6.0]), torch.tensor([1.0, 2.0, 3.0])
-    left, oracle, mean = (2 + 6) / 2, (1 + 2) / 2, 3
-    area = sparsification_area(error, confidence, steps=2)
-    assert area == pytest.approx((0 + (left - oracle) / mean) / 2)
+@pytest.mark.parametrize(("count", "left"), [(3, 2), (5, 3)])
+def test_the_area_of_a_worked_example(count: int, left: int) -> None:
+    """None is removed, then a half: what is left is rounded up."""
+    error = torch.tensor([1.0, 2.0, 6.0, 7.0, 9.0])[:count]
+    area = sparsification_area(error, error, steps=2)
+    worst = error[-left:].mean()
+    oracle = error[:left].mean()
+    assert area == pytest.approx(float((worst - oracle) / error.mean()) / 2)
 
 
 def test_ties_do_not_depend_on_the_order() -> None:

@@ -98,6 +98,21 @@ def test_a_drawn_surface_is_what_the_renderer_draws(
     assert np.quantile(np.abs(image_m - exact_m)[inner], 0.98) < off_m
 
 
+def test_slanted_pixels_are_drawn_as_the_renderer_draws_them() -> None:
+    """A skew of 40 px moves the plane of a disk by 8 % of its rays' height."""
+    slanted = K.clone()
+    slanted[0, 1] = 40.0
+    pose = pose_at(z_m=0.6, seed=3).double()
+    drawn_m, _, window = draw_surface(prepare_surface(BAR), pose, slanted, 240, 320)
+    triangles = pose.apply(BAR.vertices_m.double())[BAR.faces]
+    exact_m = rasterize(triangles, slanted, 320, 240).depth_m.double().numpy()[window]
+    bend_m = np.abs(ndimage.laplace(np.where(np.isfinite(exact_m), exact_m, 9.0)))
+    inner = np.logical_not(ndimage.binary_dilation(bend_m > 0.0003, iterations=5))
+    inner &= np.isfinite(drawn_m)
+    assert inner.sum() > 2000
+    assert np.abs(drawn_m - exact_m)[inner].max() < 1e-6
+
+
 def test_nothing_is_drawn_behind_the_camera_or_beside_the_image() -> None:
     surface = prepare_surface(bracket())
     for t_m in ([0.0, 0.0, -0.8], [5.0, 0.0, 0.8]):

@@ -365,3 +365,19 @@ def test_a_covariance_of_few_points_is_finite_and_symmetric() -> None:
     found = _covariance(cloud_m, H, J, weight, residual_m, 0.01, 0.2)
     assert found.isfinite().all()
     assert torch.allclose(found, found.mT, rtol=1e-6, atol=0)
+
+
+def test_a_covariance_is_of_as_many_residuals_as_are_free() -> None:
+    """A fit of 6 numbers leaves n - 6; all points in one block, and weights of 1 nearly."""
+    torch.manual_seed(3)
+    count = 10
+    cloud_m = 0.002 * torch.rand(count, 3).double() + torch.tensor([0.001, 0.001, 0.7])
+    J = torch.randn(count, 6).double()
+    root, _ = torch.linalg.qr(J)
+    noise_m = 0.001 * torch.randn(count).double()
+    residual_m = noise_m - root @ (root.mT @ noise_m)  # as a fit leaves them
+    H = J.mT @ J
+    weight = torch.ones(count).double()
+    found = _covariance(cloud_m, H, J, weight, residual_m, 10.0, 0.2)
+    variance_m2 = residual_m.square().sum() / (count - 6)
+    assert torch.allclose(found, variance_m2 * torch.linalg.inv(H), rtol=1e-3)

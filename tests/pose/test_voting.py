@@ -155,6 +155,19 @@ def test_covariances_of_keypoints_are_honest(method: str) -> None:
     assert float((square < 7.815).double().mean()) == pytest.approx(0.95, abs=0.025)
 
 
+@pytest.mark.parametrize("method", ["nearest", "least squares"])
+def test_few_lines_look_no_surer_than_they_are(method: str) -> None:
+    """n lines of rank 2 leave 2 n - 3 residuals free: their mean square is divided by as many."""
+    points, directions, _ = exact_votes(9, n=4)
+    noisy = with_noise(directions, 0.02, seed=10)
+    once = METHODS[method](points, noisy)
+    twice = METHODS[method](points.repeat(2, 1), noisy.repeat(2, 1, 1))
+    assert torch.allclose(once.keypoints_m, twice.keypoints_m)
+    # Of eight independent lines with these residuals half the covariance is left.
+    expected = once.covariance_m2 / 2 * (16 / (16 - 3)) / (8 / (8 - 3))
+    assert torch.allclose(twice.covariance_m2, expected, rtol=1e-6)
+
+
 def test_parallel_votes_are_detected_by_their_condition() -> None:
     points = torch.rand(50, 3, generator=generator(5)).double()
     directions = torch.tensor([0, 0, 1.0]).double().expand(50, 2, 3)
