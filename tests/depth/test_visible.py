@@ -8,7 +8,8 @@ from torch import Tensor
 
 from depthpose import FakestereoNet
 from depthpose.core.camera import StereoRig
-from depthpose.depth.disparity import from_pair
+from depthpose.depth.config import SelectionConfig
+from depthpose.depth.disparity import from_pair, from_virtual
 from depthpose.depth.stereo import CallableMatcher
 from depthpose.depth.types import Match, StereoInput
 from depthpose.depth.visible import texture, without_picture
@@ -130,3 +131,18 @@ def test_the_confidence_of_a_plain_wall_and_of_what_the_right_view_lacks_is_0() 
     assert float(found.confidence[30:60, 70:110].max()) == 0
     assert float(found.confidence[:10, 60:].min()) == 1
     assert float(found.confidence[:, 8:46].max()) == 0
+
+
+def test_plain_sky_of_one_image_may_be_a_wall_and_depth_beside_it_keeps_its_confidence() -> None:
+    """Depth of a plain road comes from what is about it: there is no reason to doubt it."""
+    image = noise()
+    image[:, 20:90, 60:120] = 1.0
+    sky = torch.zeros(H, W, dtype=torch.bool)
+    sky[:50] = True
+    match = Match(disparity_px=torch.full((H, W), 8.0), confidence=torch.ones(H, W), is_sky=sky)
+    seen = StereoInput(name="x", left=image, right=None, camera=rig())
+    found = from_virtual(seen, SelectionConfig(), match, image)
+    assert found.confidence is not None
+    assert float(found.confidence[30:50, 70:110].max()) == 0
+    assert float(found.confidence[:10].min()) == 1
+    assert float(found.confidence[50:].min()) == 1

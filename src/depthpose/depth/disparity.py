@@ -274,7 +274,10 @@ def from_virtual(
     match: Match,
     right: Float[Tensor, "3 _ _"],
 ) -> DepthEstimate:
-    """Bring what was found at the virtual rig back to the image; NaN where it has no picture."""
+    """Bring what was found at the virtual rig back to the image; NaN where it has no picture.
+
+    The confidence of sky falls to 0 where the image is plain, for a bright wall looks the same.
+    """
     camera = image.camera
     assert camera is not None
     height, width = image.left.shape[1:]
@@ -288,6 +291,9 @@ def from_virtual(
     if is_sky is not None:
         is_sky = is_sky & ~blank
         is_sky = is_sky & (is_sky.float().mean() >= _LEAST_SKY)
+        if confidence is not None:
+            of_sky = confidence * texture(image.left).to(confidence)
+            confidence = torch.where(is_sky, of_sky, confidence)
         depth_m = torch.where(is_sky, SKY_M, depth_m)
         px = torch.where(is_sky, focal_m_px / SKY_M, px)
     depth_m, px = (torch.where(blank, torch.nan, values) for values in (depth_m, px))
