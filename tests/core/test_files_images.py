@@ -289,7 +289,7 @@ def jpeg(
     encoded = BytesIO()
     tiles = np.random.default_rng(0).integers(0, 256, (12, 20, 3), dtype=np.uint8)
     pixels = tiles.repeat(8, 0).repeat(8, 1)
-    Image.fromarray(pixels).save(encoded, "JPEG", quality=95, **cast("Any", options or {}))
+    Image.fromarray(pixels).save(encoded, "JPEG", **cast("Any", {"quality": 95, **(options or {})}))
     path = folder / "street.jpg"
     path.write_bytes(encoded.getvalue() if data is None else data)
     return path, path.read_bytes()
@@ -311,6 +311,43 @@ def test_a_damaged_jpeg_is_refused(tmp_path: Path, options: dict[str, int]) -> N
         with pytest.raises(InputError, match="JPEG"):
             pytest.fail(f"{how}: {read_image(path).shape}")
     assert image_size(path) == (160, 96)
+
+
+@pytest.mark.parametrize("quality", [50, 75, 95])
+@pytest.mark.parametrize("options", [{}, {"optimize": True}, {"subsampling": 0}], ids=str)
+def test_zeros_in_place_of_compressed_pixels_are_refused(
+    tmp_path: Path, options: dict[str, int], quality: int
+) -> None:
+    """As of a file that was not copied whole: the decoder itself warns of half of them."""
+    grains = np.random.default_rng(0).normal(0, 12, (96, 160, 3))
+    pixels = (100 + 5 * np.cumsum(grains, 1) / 12 + grains).clip(0, 255).astype(np.uint8)
+    encoded = BytesIO()
+    Image.fromarray(pixels).save(encoded, "JPEG", quality=quality, **cast("Any", options))
+    whole = encoded.getvalue()
+    path, _ = jpeg(tmp_path, whole)
+    assert read_image(path).shape == (3, 96, 160)
+    begin = whole.rindex(b"\xff\xda") + 14
+    for place in range(begin, len(whole) - 60, len(whole) // 20):
+        holed = whole[:place] + bytes(40) + whole[place + 40 :]
+        path, _ = jpeg(tmp_path, holed)
+        with pytest.raises(InputError, match="a damaged JPEG"):
+            pytest.fail(f"zeros at {place}: {read_image(path).shape}")
+
+
+@pytest.mark.parametrize("options", [{"optimize": True}, {"progressive": True}], ids=str)
+def test_zeros_that_are_a_plain_surface_are_read(tmp_path: Path, options: dict[str, int]) -> None:
+    pixels = np.full((640, 640, 3), 255, np.uint8)
+    pixels[:8, :8] = 0
+    path = tmp_path / "plain.jpg"
+    Image.fromarray(pixels).save(path, quality=75, **cast("Any", options))
+    assert bytes(40) in path.read_bytes()
+    assert float(read_image(path)[:, 40:].min()) == 1
+
+
+def test_zeros_behind_a_picture_are_no_damage(tmp_path: Path) -> None:
+    _, whole = jpeg(tmp_path)
+    path, _ = jpeg(tmp_path, whole + bytes(400))
+    assert read_image(path).shape == (3, 96, 160)
 
 
 def test_of_several_pictures_in_a_file_the_first_is_read_with_a_notice(tmp_path: Path) -> None:

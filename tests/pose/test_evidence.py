@@ -177,6 +177,35 @@ def test_own_readings_before_the_posed_surface_bulge() -> None:
     assert unmasked.unobserved > 0.7 * unmasked.visible
 
 
+@pytest.mark.parametrize(
+    ("off_m", "through", "bulging"),
+    [(0.0028, 0, 0), (-0.0028, 0, 0), (0.0033, 1, 0), (-0.0033, 0, 1)],
+)
+def test_more_than_three_deviations_contradict_behind_and_before(
+    off_m: float, through: int, bulging: int
+) -> None:
+    """Before a camera without noise the deviation is that of the object: a millimetre."""
+    pose = Rigid(torch.eye(3), torch.tensor([0.0, 0.0, 0.6]))
+    view = view_before_wall(BAR, pose)
+    moved = replace(view, depth_m=torch.where(view.mask, view.depth_m + off_m, view.depth_m))
+    evidence = evidence_of(moved, BAR, pose)
+    visible = evidence.visible
+    assert visible > 50
+    assert evidence.seen_through == (pytest.approx(visible, rel=0.02) if through else 0)
+    # The border of the mask, a tenth of the bar, may be of what is before it.
+    assert evidence.bulging == (pytest.approx(0.9 * visible, rel=0.03) if bulging else 0)
+    if through + bulging == 0:
+        assert evidence.supported == pytest.approx(visible, rel=0.02)
+        assert evidence.rms == pytest.approx(2.8, rel=0.02)
+    else:
+        assert evidence.supported == 0
+    # What lies before it and is not known to be the object hides it, and contradicts nothing.
+    unmasked = evidence_of(moved, BAR, pose, is_masked=False)
+    assert unmasked.seen_through == evidence.seen_through
+    assert unmasked.bulging == 0
+    assert unmasked.unobserved == pytest.approx(bulging * visible, abs=0.02 * visible)
+
+
 def test_own_readings_beside_the_silhouette_contradict() -> None:
     with_arm = boxes("arm", ((0.16, 0.05, 0.04), (0, 0, 0)), ((0.03, 0.09, 0.03), (0.05, 0.06, 0)))
     without = boxes("bar", ((0.16, 0.05, 0.04), (0, 0, 0)))

@@ -51,6 +51,10 @@ MAX_PIXELS = 2**25  # 0.4 GB of floats; a small file may declare any size
 _FORMATS = ("PNG", "JPEG", "BMP", "PPM", "TIFF", "WEBP", "GIF")
 _JPEG_COLOURS = {"RGB": "RGB", "L": "GRAY"}
 """Modes of Pillow's, and what simplejpeg calls them."""
+_HOLE = bytes(16)
+"""More zeros than 2,600 compressed pictures of all qualities hold in a row, which is 6."""
+_NEXT_MARKER = re.compile(rb"\xff[^\x00\xd0-\xd7\xff]")
+"""The end of a JPEG's compressed pixels."""
 _GREY_16 = ("I;16", "I;16L", "I;16B", "I;16N")
 _EXIF_ORIENTATION = 0x0112
 _PHOTOMETRIC = 0x0106  # of TIFF: 0 where the value 0 is white
@@ -155,12 +159,52 @@ def _decoded_jpeg(name: AnyPath, data: bytes, colours: str) -> Image.Image:
     not pass its warnings on.
     """
     try:
-        return Image.fromarray(simplejpeg.decode_jpeg(data, colours, strict=True).squeeze())
+        pixels = simplejpeg.decode_jpeg(data, colours, strict=True).squeeze()
     except ValueError as error:
-        raise InputError(
-            f"{name}: a damaged JPEG ({error}), whose pixels are wrong from there on; copy it "
-            "anew, or save it again where it looks whole"
-        ) from error
+        raise _damaged_jpeg(name, str(error)) from error
+    if _has_hole(data):
+        raise _damaged_jpeg(name, "zeros in place of compressed pixels")
+    return Image.fromarray(pixels)
+
+
+def _damaged_jpeg(name: AnyPath, reason: str) -> InputError:
+    return InputError(
+        f"{name}: a damaged JPEG ({reason}), whose pixels are wrong from there on; copy it anew, "
+        "or save it again where it looks whole"
+    )
+
+
+def _has_hole(data: bytes) -> bool:
+    """Whether zeros stand in place of compressed pixels, as of a file that was not copied whole.
+
+    Zeros are the first code of a Huffman table. Where that is a coefficient of 1, sixteen bytes of
+    them are forty such in a row, which no picture has. Where it ends a block, as in progressive
+    files, zeros are a plain surface, and nothing can be said.
+    """
+    if _HOLE not in data:
+        return False
+    first_codes: dict[int, int] = {}
+    place = 2
+    while data[place : place + 1] == b"\xff" and place + 4 < len(data):
+        marker = data[place + 1]
+        if marker == 0xFF:  # filling
+            place += 1
+            continue
+        end = place + 2 + int.from_bytes(data[place + 2 : place + 4], "big")
+        segment = data[place + 4 : end]
+        if marker == 0xC2:  # progressive
+            return False
+        while marker == 0xC4 and len(segment) > 17:  # Huffman tables: kind, 16 counts, symbols
+            first_codes[segment[0]] = segment[17]
+            segment = segment[17 + sum(segment[1:17]) :]
+        if marker == 0xDA and len(segment) > 2:
+            # The table of the first component's coefficients, 16 and up.
+            table = 16 + (segment[2] & 15)
+            stop = _NEXT_MARKER.search(data, end)
+            is_coefficient = first_codes.get(table, 0) & 15 > 0
+            return is_coefficient and _HOLE in data[end : stop.start() if stop else None]
+        place = end
+    return False
 
 
 def _tensor_of(pixels: np.ndarray, name: AnyPath) -> Float32[Tensor, "3 h w"]:
