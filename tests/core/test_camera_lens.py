@@ -77,6 +77,13 @@ def test_a_fisheye_is_no_pinhole_whatever_its_coefficients(tmp_path: Path, name:
         read_camera(saved(tmp_path, FISHEYES[name]), SIZE)
 
 
+def test_a_pair_of_fisheyes_is_rectified_as_fisheyes(tmp_path: Path) -> None:
+    lens = "Camera.k1: 0.1\nCamera.k2: 0.01\nCamera.k3: 0\nCamera.k4: 0\n"
+    text = f'Camera.type: "KannalaBrandt8"\n{_ORB}{lens}Stereo.b: 0.12\n'
+    with pytest.raises(InputError, match=r"or by cv2\.fisheye\.initUndistortRectifyMap"):
+        read_camera(saved(tmp_path, text), SIZE)
+
+
 @pytest.mark.parametrize("name", OTHERS)
 def test_other_lenses_are_refused_by_name_with_what_undistorts_them(
     tmp_path: Path, name: str

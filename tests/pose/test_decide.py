@@ -147,6 +147,8 @@ def test_an_answer_below_the_wanted_certainty_is_ambiguous() -> None:
     assert found.reason == words + "1 others fit too", "copies are the same up to near-symmetry"
     alone = with_status(replace(sure, alternatives=()), 0.9)
     assert alone.reason == words + "others may fit"
+    nearly = with_status(replace(sure, certainty=0.8996), 0.9)
+    assert "a certainty of 89.96 %, below min_certainty 90 %" in nearly.reason
     assert with_status(found, 0.5).status == "ok"
     assert with_status(found, 0.5).reason == ""
     refusal = PoseEstimate(name="a", object="b", status="doubtful", reason="so")

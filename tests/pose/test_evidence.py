@@ -206,6 +206,15 @@ def test_more_than_three_deviations_contradict_behind_and_before(
     assert unmasked.unobserved == pytest.approx(bulging * visible, abs=0.02 * visible)
 
 
+@pytest.mark.parametrize(("side_px", "through"), [(5, 1.0), (0, 0.0)])
+def test_a_small_hole_is_one_observation(side_px: int, through: float) -> None:
+    """Averaged over 5 px it is 9 px wide, less than the 10 px that are independent."""
+    pose = Rigid(torch.eye(3), torch.tensor([0.0, 0.0, 0.6]))
+    view = view_before_wall(BAR, pose)
+    view.depth_m[118 : 118 + side_px, 150 : 150 + side_px] = WALL_M
+    assert evidence_of(view, BAR, pose).seen_through == through
+
+
 def test_own_readings_beside_the_silhouette_contradict() -> None:
     with_arm = boxes("arm", ((0.16, 0.05, 0.04), (0, 0, 0)), ((0.03, 0.09, 0.03), (0.05, 0.06, 0)))
     without = boxes("bar", ((0.16, 0.05, 0.04), (0, 0, 0)))

@@ -86,7 +86,7 @@ def test_a_foreign_part_is_refused(index: int) -> None:
 def test_a_cloud_in_the_frame_of_a_robot_is_refused_and_its_frame_is_named() -> None:
     """A camera saw the part from above; the points are in the base's frame, z up."""
     z_up = torch.tensor([[1.0, 0, 0], [0, -1, 0], [0, 0, -1]])
-    for index in range(3):
+    for index in (0, 1, 6):  # doubtful, and ambiguous the last
         points_m = view(part(), index).input.points_m.float()
         base_m = (points_m - points_m.mean(0)) @ z_up.T + torch.tensor([0.05, 0.04, 0.35])
         found = registration().estimate(cloud=base_m)

@@ -22,8 +22,8 @@ def predict(
     """The pose of known objects from clouds, depth images, pairs or a data set; or why none.
 
     poses.json holds for each input camera_from_model (metres), its covariance (about this answer
-    alone), its certainty, the alternatives that fit as well with their probabilities, the risk that
-    none of them is right, status and reason, and the seconds of each stage.
+    alone), its certainty, the alternatives that fit as well with their probabilities, status and
+    reason, and the seconds of each stage.
     A cloud or depth image NAME gives NAME.pose.ply, the posed model beside the cloud, and
     NAME.pose.png over the depth image; a data set gives depthpose_DATASET-SPLIT.csv, if there
     are alternatives depthpose-alternatives_DATASET-SPLIT.csv, and SCENE_IMAGE.pose.png. report.html

@@ -294,7 +294,10 @@ def decide(
         alternatives=alternatives,
         **facts,
     )
-    return with_status(estimate, config.min_certainty)
+    answer = with_status(estimate, config.min_certainty)
+    if answer.status == "ambiguous" and cloud.view is None:
+        return replace(answer, reason=answer.reason + OTHER_FRAME)
+    return answer
 
 
 def contradiction(evidence: Evidence, probability: float) -> str:
@@ -329,9 +332,13 @@ def with_status(estimate: PoseEstimate, min_certainty: float) -> PoseEstimate:
     if certainty >= min_certainty:
         return replace(estimate, status="ok", reason="")
     others = sum(not alternative.is_copy for alternative in estimate.alternatives)
+    percents = (100 * certainty, 100 * min_certainty)
+    digits = 3
+    while digits < 17 and len({f"{percent:.{digits}g}" for percent in percents}) == 1:
+        digits += 1  # until one is seen to be below the other
     reason = (
-        f"this pose has a certainty of {100 * certainty:.3g} %, below min_certainty "
-        f"{100 * min_certainty:.3g} %: "
+        f"this pose has a certainty of {percents[0]:.{digits}g} %, below min_certainty "
+        f"{percents[1]:.{digits}g} %: "
         + (f"{others} others fit too" if others else "others may fit")
     )
     return replace(estimate, status="ambiguous", reason=reason)

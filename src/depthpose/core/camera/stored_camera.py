@@ -133,6 +133,10 @@ _UNDISTORT_P = "cv2.undistort(image, K, distortion, None, P[:, :3]) (image_proc 
 _UNDISTORT_FISHEYE = (
     "cv2.fisheye.undistortImage(image, K, distortion, Knew=K), or Knew=P[:, :3] where there is a P"
 )
+_RECTIFY_FISHEYE = (
+    "'depthpose data rectify', or by cv2.fisheye.initUndistortRectifyMap and cv2.remap, each view "
+    "with its own K, R and P"
+)
 _RECTIFY = (
     "'depthpose data rectify', or by cv2.initUndistortRectifyMap and cv2.remap, each view with its "
     "own K, R and P (stereo_image_proc in ROS)"
@@ -150,7 +154,7 @@ def with_lens(facts: CameraFacts, *, is_fisheye: bool) -> CameraFacts:
     """Add that the lens is a fisheye, where it is, and how its images are undistorted."""
     if not is_fisheye:
         return facts
-    undistort = _UNDISTORT_FISHEYE if facts.baseline_m is None else _RECTIFY
+    undistort = _UNDISTORT_FISHEYE if facts.baseline_m is None else _RECTIFY_FISHEYE
     return replace(facts, is_fisheye=True, undistort=undistort)
 
 
