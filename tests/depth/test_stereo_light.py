@@ -354,6 +354,21 @@ def test_it_learns_and_every_part_gets_gradients() -> None:
     assert sum(losses[-3:]) / 3 < 0.6 * losses[0]
 
 
+def test_frozen_norms_keep_their_statistics_while_the_rest_learns() -> None:
+    task = stereo_task(with_frozen_stem=False, encoder_rate=1.0, with_frozen_norms=True)
+    network = task.matcher
+    before = {name: values.clone() for name, values in network.state_dict().items()}
+    (turn,) = task.step(training_batch())
+    turn.loss.backward()
+    after = network.state_dict()
+    statistics = [name for name in before if "running" in name]
+    assert any("aggregation" in name for name in statistics)
+    assert all(torch.equal(before[name], after[name]) for name in statistics)
+    gradient = network.get_parameter("aggregation.score.weight").grad
+    assert gradient is not None
+    assert bool(gradient.any())
+
+
 def test_a_fixed_start_keeps_what_imagenet_taught() -> None:
     task = stereo_task()
     encoder = task.matcher.encoder

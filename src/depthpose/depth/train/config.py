@@ -162,6 +162,10 @@ class StereoTraining(Settings):
     """light: keep the encoder's first layers and its batch norm statistics: right for ImageNet's
     weights, wrong for an encoder that begins at random."""
 
+    with_frozen_norms: bool = False
+    """Keep the statistics of every batch norm, the encoder's and the rest's: right for a few steps
+    of small batches from trained weights."""
+
     encoder_rate: Annotated[float, "[0, 1]"] = 0.3
     """light: learning rate of the encoder as a share of the rest's."""
 

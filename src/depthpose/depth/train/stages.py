@@ -40,9 +40,12 @@ class StereoTask:
     ) -> None:
         self.config, self.held_out = config, held_out
         self.matcher = matcher
-        self._fixed = matcher.encoder if config.with_frozen_stem else None
-        if self._fixed is not None:
-            self._fixed.freeze_early()
+        self._with_fixed_norms: list[nn.Module] = []
+        if config.with_frozen_stem and matcher.encoder is not None:
+            matcher.encoder.freeze_early()
+            self._with_fixed_norms.append(matcher.encoder)
+        if config.with_frozen_norms:
+            self._with_fixed_norms.append(matcher)
         self._alone = matcher.sky if config.sky_alone else None
         if self._alone is not None:
             matcher.requires_grad_(False)
@@ -59,10 +62,10 @@ class StereoTask:
 
     def _train(self) -> None:
         self.matcher.train()
-        if self._fixed is not None:
-            # Batch norm uses its stored statistics, whatever the mode: small batches spoil them.
-            for part in self._fixed.modules():
-                if isinstance(part, nn.BatchNorm2d):
+        # Batch norm uses its stored statistics, whatever the mode: small batches spoil them.
+        for module in self._with_fixed_norms:
+            for part in module.modules():
+                if isinstance(part, nn.BatchNorm2d | nn.BatchNorm3d):
                     part.eval()
         if self._alone is not None:
             for part in self.matcher.children():
