@@ -2,9 +2,10 @@
 
     python bench/pose_peers.py $DEPTHPOSE_DATA --seeds 20 --register --weights ycb
 
-``pip install -e '.[open3d]'`` first. Ours runs on the objects of the weights. What is counted is
-that of ``bench/real.py`` (see ``score``); Open3D names no alternatives and is never unsure. Seconds
-are of one thread each, without the preparation of models.
+``pip install -e '.[open3d]'`` first, and of the system libusb-1.0 and libGL (Debian: ``apt install
+libusb-1.0-0 libgl1``). Ours runs on the objects of the weights. What is counted is that of
+``bench/real.py`` (see ``score``); Open3D names no alternatives and is never unsure. Seconds are of
+one thread each, without the preparation of models.
 """
 
 import argparse

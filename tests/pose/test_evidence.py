@@ -194,6 +194,7 @@ def test_more_than_three_deviations_contradict_behind_and_before(
     assert evidence.seen_through == (pytest.approx(visible, rel=0.02) if through else 0)
     # The border of the mask, a tenth of the bar, may be of what is before it.
     assert evidence.bulging == (pytest.approx(0.9 * visible, rel=0.03) if bulging else 0)
+    assert evidence.unobserved == pytest.approx(0.1 * bulging * visible, abs=0.03 * visible)
     if through + bulging == 0:
         assert evidence.supported == pytest.approx(visible, rel=0.02)
         assert evidence.rms == pytest.approx(2.8, rel=0.02)
@@ -213,6 +214,18 @@ def test_a_small_hole_is_one_observation(side_px: int, through: float) -> None:
     view = view_before_wall(BAR, pose)
     view.depth_m[118 : 118 + side_px, 150 : 150 + side_px] = WALL_M
     assert evidence_of(view, BAR, pose).seen_through == through
+
+
+@pytest.mark.parametrize(("grow_px", "is_beside"), [(8, False), (12, True)])
+def test_a_mask_may_end_a_few_pixels_beside_the_silhouette(grow_px: int, is_beside: bool) -> None:
+    """Of its border 3 px are left out, and 4 px beside the drawing may be its edge.
+
+    On each side of the drawing, above it and below too, and disks reach a pixel beyond the edge.
+    """
+    pose = Rigid(torch.eye(3), torch.tensor([0.0, 0.0, 0.6]))
+    view = view_before_wall(BAR, pose)
+    view = replace(view, mask=grow_mask(view.mask, grow_px), depth_m=view.depth_m.clamp(max=0.6))
+    assert (evidence_of(view, BAR, pose).beside > 1) == is_beside
 
 
 def test_own_readings_beside_the_silhouette_contradict() -> None:

@@ -243,7 +243,9 @@ def compare(observation: Observation, pose: Rigid, surface: Surface) -> Evidence
     bulging = _patch_area((deviations < -THRESHOLD) & is_object, patch_px)
     is_beside = observation.is_object & np.isfinite(observation.depth_m)
     border = max(1, round((BORDER_PX + 1) / step))
-    is_beside[window] &= np.logical_not(ndimage.binary_dilation(is_drawn, iterations=border))
+    is_shown = np.zeros_like(is_beside)
+    is_shown[window] = is_drawn
+    is_beside &= np.logical_not(ndimage.binary_dilation(is_shown, iterations=border))
     visible = float(inner.sum()) / patch_px
     supported = float(is_supported.sum()) / patch_px
     square = deviations[is_supported] ** 2
