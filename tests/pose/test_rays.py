@@ -63,7 +63,10 @@ def test_what_is_no_plane_or_too_small_a_one_is_no_answer() -> None:
     assert ray_bend(distance_m, far) is None
 
 
-def test_a_view_of_distances_is_told_of_with_the_remedy() -> None:
+def test_a_view_of_distances_is_told_of_once_with_the_remedy(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr("depthpose.pose.rays._told", set())
     depth_m = plane(NORMALS["table"]).float()
     with warnings.catch_warnings():
         warnings.simplefilter("error")
@@ -71,6 +74,9 @@ def test_a_view_of_distances_is_told_of_with_the_remedy() -> None:
     distance_m = depth_m * rays().norm(dim=-1).float()
     with pytest.warns(Notice, match=r"distance along each pixel's ray.* Divide it by sqrt\(1 \+"):
         view_input(distance_m, None, K, "part", "view")
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        view_input(distance_m, None, K, "part", "next")
 
 
 def test_real_depth_is_along_the_axis_and_real_distance_is_told_of(real: Path) -> None:

@@ -33,12 +33,19 @@ _RAY_BEND = (0.75, 1.3)
 """Planes of real frames have a bend of -0.08 to 0.08 of that of the ray, and 0.92 to 1.08 after
 their depth was turned into distance."""
 
+_told: set[tuple[float, ...]] = set()
+"""Intrinsics of cameras that were told of: of a folder of images once."""
+
 
 def warn_of_rays(depth_m: Float[Tensor, "h w"], K: Float[Tensor, "3 3"]) -> None:
     """Give a notice where the planes of a depth image are bent as distance along the ray is."""
+    camera = tuple(K.flatten().tolist())
+    if camera in _told:
+        return
     bend = ray_bend(depth_m, K)
     if bend is None or not _RAY_BEND[0] < bend < _RAY_BEND[1]:
         return
+    _told.add(camera)
     warnings.warn(
         "a depth image looks like distance along each pixel's ray, for its planes are bent so, but "
         "depth is along the optical axis: its poses are up to centimetres off. Divide it by "
