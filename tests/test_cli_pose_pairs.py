@@ -119,8 +119,8 @@ def test_the_deviation_of_depth_grows_with_its_square_and_with_doubt() -> None:
     depth_m = torch.tensor([[1.0, 2.0, 10.0, 20.0, 1.0, torch.nan]])
     confidence = torch.tensor([[0.95, 0.95, 1.0, 1.0, 0.4, 0.9]])
     first, second, far, farther, unsure, unknown = depth_deviation(depth_m, confidence, rig)[0]
-    assert float(first) == pytest.approx(0.25 / 5)
-    assert float(second) == pytest.approx(4 * 0.25 / 5)
+    assert float(first) == pytest.approx(0.2 / 5)
+    assert float(second) == pytest.approx(4 * 0.2 / 5)
     assert float(farther) == pytest.approx(4 * float(far))
-    assert float(unsure) == pytest.approx(0.2 * 5 / 5)
+    assert float(unsure) == pytest.approx(0.085 * 5 / 5)
     assert bool(unknown.isnan())

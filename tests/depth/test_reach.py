@@ -18,6 +18,7 @@ from depthpose.depth.stereo import (
     Search,
     Window,
     choose_window,
+    doubt_hidden,
     doubt_outside,
     measure_reach,
     move_views,
@@ -62,7 +63,9 @@ def planes(near_px: int, far_px: int, width: int = 320, height: int = 96) -> tup
 
 def reach_of(low_px: float, high_px: float, size: tuple[int, int] = (96, 320)) -> Reach:
     flat = Match(disparity_px=torch.full(size, high_px), confidence=torch.ones(size))
-    return Reach(low_px=low_px, high_px=high_px, step_px=4.0, coarse=flat)
+    return Reach(
+        low_px=low_px, high_px=high_px, step_px=4.0, coarse=flat, right_px=flat.disparity_px
+    )
 
 
 def rig(width: int = 320, height: int = 96, apart_px: float = 0.0) -> StereoRig:
@@ -116,12 +119,15 @@ def test_a_pair_is_matched_wherever_its_disparities_lie(near_px: int, far_px: in
 
 
 @needs_weights
-def test_streets_are_searched_as_before() -> None:
-    """From infinity on, at the camera's usual size, through the usual disparities."""
+@pytest.mark.parametrize("high_px", [20.0, 90.0])
+def test_streets_are_searched_from_infinity_on(high_px: float) -> None:
+    """At the camera's usual size, through the disparities of training and those that are there."""
     camera = rig(1242, 375)
-    window = choose_window(matcher(), reach_of(0.0, 90.0), (375, 1242), camera)
+    window = choose_window(matcher(), reach_of(0.0, high_px), (375, 1242), camera)
+    trained_px = matcher().network_config.max_disparity_px
     assert window.search.first_px == 0
-    assert window.search.max_disparity_px == matcher().work_disparities(camera)
+    assert trained_px <= window.search.max_disparity_px <= matcher().work_disparities(camera)
+    assert window.last_px >= high_px
     assert window.search.scale * 558 == pytest.approx(matcher().work_focal_px(camera))
 
 
@@ -162,7 +168,7 @@ def test_doubt_leaves_what_was_searched() -> None:
     match = Match(disparity_px=torch.full((2, 4), 50.0), confidence=confidence)
     coarse_px = torch.tensor([[0.0, 1, 2, 3], [0, 1, 2, 3]]) + 48
     far = dataclasses.replace(match, disparity_px=coarse_px, confidence=confidence)
-    reach = Reach(low_px=0.0, high_px=60.0, step_px=4.0, coarse=far)
+    reach = Reach(low_px=0.0, high_px=60.0, step_px=4.0, coarse=far, right_px=coarse_px)
     search = Search(scale=1.0, first_px=0, max_disparity_px=128)
     window = Window(search=search, first_px=0.0, last_px=128.0)
     kept, said = doubt_outside(match, reach, window)
@@ -173,6 +179,26 @@ def test_doubt_leaves_what_was_searched() -> None:
     doubted, _ = doubt_outside(at_end, reach, window)
     assert doubted.confidence is not None
     assert not bool(doubted.confidence.any()), "the last step may stand for all that is beyond"
+
+
+def test_hidden_places_are_doubted_by_the_copy_of_the_right_view() -> None:
+    """Where the right view sees a near strip, the wall behind it is hidden from it."""
+    left_px = torch.full((4, 40), 2.0)
+    right_px = left_px.clone()
+    right_px[:, 10:20] = 12.0
+    confidence = torch.ones(4, 40)
+    confidence[:, 39] = 0.9
+    match = Match(disparity_px=left_px, confidence=confidence)
+    reach = Reach(low_px=0.0, high_px=20.0, step_px=4.0, coarse=match, right_px=right_px)
+    doubted = doubt_hidden(match, reach).confidence
+    assert doubted is not None
+    hidden = torch.zeros(40, dtype=torch.bool)
+    hidden[12:22] = True
+    hidden[:2] = True  # outside the right view
+    assert float(doubted[:, hidden].max()) < 0.51
+    torch.testing.assert_close(doubted[:, ~hidden], confidence[:, ~hidden])
+    unsure = dataclasses.replace(match, confidence=None)
+    assert doubt_hidden(unsure, reach).confidence is None
 
 
 @pytest.mark.parametrize("first", [0, 3, -2])

@@ -41,6 +41,7 @@ from depthpose.depth.stereo import (
     NetworkMatcher,
     SGBMMatcher,
     choose_window,
+    doubt_hidden,
     doubt_outside,
     measure_reach,
     move_views,
@@ -335,6 +336,8 @@ class FakestereoNet:
                 reach = measure_reach(self.matcher, left, right, -apart_px)
                 window = choose_window(self.matcher, reach, left.shape[1:], rig)
                 (match,) = self.matcher.match_many([(left, right)], rig, window.search)
+                if not self.matcher.config.with_left_right_check:
+                    match = doubt_hidden(match, reach)
                 match, doubt = doubt_outside(match, reach, window)
                 warning = "; ".join(said for said in (warning, doubt) if said)
                 return disparity.from_pair(pair, match, warning)

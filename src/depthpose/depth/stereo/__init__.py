@@ -19,6 +19,7 @@ from depthpose.depth.stereo.psmnet import psmnet_from_published as psmnet_from_p
 from depthpose.depth.stereo.reach import Reach as Reach
 from depthpose.depth.stereo.reach import Window as Window
 from depthpose.depth.stereo.reach import choose_window as choose_window
+from depthpose.depth.stereo.reach import doubt_hidden as doubt_hidden
 from depthpose.depth.stereo.reach import doubt_outside as doubt_outside
 from depthpose.depth.stereo.reach import measure_reach as measure_reach
 from depthpose.depth.stereo.reach import move_views as move_views

@@ -453,16 +453,24 @@ def pad_top_right(
     return F.pad(image, (0, w - image.shape[-1], h - image.shape[-2], 0))
 
 
-def lower_where_disagreeing(found: Match, right_px: Map) -> Match:
+def lower_where_disagreeing(
+    found: Match, right_px: Map, tolerance_px: float = 0.0, falls_px: float = AGREEMENT_PX
+) -> Match:
     """Lower the confidence where the right view's own disparity is another.
 
     Halved at least where the matching point lies outside the right view: nothing there can
     agree, and nothing contradicts. That of the sky is kept.
+
+    Args:
+        found: the match of the left view.
+        right_px: disparity of the right view.
+        tolerance_px: a difference that says nothing.
+        falls_px: what is larger by so much takes the agreement down to 1/e.
     """
     # Small where both views agree, large at occlusions; NaN outside the right view.
     there_px = disparity.warp_right_to_left(right_px[None], found.disparity_px)[0]
-    difference_px = (found.disparity_px - there_px).abs()
-    agreement = torch.exp(-difference_px / AGREEMENT_PX).nan_to_num(0.0)
+    difference_px = ((found.disparity_px - there_px).abs() - tolerance_px).clamp(min=0)
+    agreement = torch.exp(-difference_px / falls_px).nan_to_num(0.0)
     confidence = agreement if found.confidence is None else found.confidence * (1 + agreement) / 2
     if found.confidence is not None and found.is_sky is not None:
         confidence = torch.where(found.is_sky, found.confidence, confidence)

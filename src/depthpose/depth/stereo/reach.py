@@ -18,8 +18,8 @@ from torch.nn import functional as F
 
 from depthpose.core.camera import Camera
 from depthpose.depth.disparity import changed_match, warp_right_to_left
-from depthpose.depth.stereo.matcher import NetworkMatcher, Search
-from depthpose.depth.types import Match
+from depthpose.depth.stereo.matcher import NetworkMatcher, Search, lower_where_disagreeing
+from depthpose.depth.types import Map, Match
 from depthpose.depth.visible import without_picture
 
 _TAIL = 0.001
@@ -41,6 +41,7 @@ class Reach:
     high_px: float  #: the largest
     step_px: float  #: how exactly they are known, which both ends include
     coarse: Match  #: the match of the copy, at the size of the images
+    right_px: Map  #: disparity of the right view in the copy, at the size of the images
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -139,6 +140,7 @@ def measure_reach(
         high_px=max(high_px, low_px + step_px),
         step_px=step_px,
         coarse=coarse,
+        right_px=right_px[0],
     )
 
 
@@ -147,7 +149,7 @@ def choose_window(
 ) -> Window:
     """Choose what is searched, so that it holds the disparities that were measured.
 
-    There are as many as usual where fewer would do: what a network was trained for.
+    There are no fewer than those that the network was trained with.
 
     Args:
         matcher: a network.
@@ -164,7 +166,8 @@ def choose_window(
     if span_px * scale > most:
         scale = (most * scale**2 / span_px) ** (1 / 3)
     first_px = STEP_PX * math.floor(reach.low_px * scale / STEP_PX)
-    searched = max(most, matcher.whole_steps(high_px * scale - first_px))
+    trained_px = matcher.network_config.max_disparity_px
+    searched = max(trained_px, matcher.whole_steps(high_px * scale - first_px))
     return _window(Search(scale=scale, first_px=first_px, max_disparity_px=searched))
 
 
@@ -184,6 +187,18 @@ def _usual_size(
     share = math.sqrt(matcher.fine_pixels / (size[0] * size[1]))
     most = matcher.whole_steps(trained.max_disparity_px * matcher.most_disparities)
     return min(share, matcher.most_enlarged), most
+
+
+def doubt_hidden(match: Match, reach: Reach) -> Match:
+    """Lower the confidence where the right view of the copy contradicts: mostly hidden places.
+
+    A difference of up to a pixel of the copy says nothing. A check at full size finds what is
+    smaller too, in twice the time.
+    """
+    if match.confidence is None:
+        return match
+    pixel_px = reach.step_px / STEP_PX
+    return lower_where_disagreeing(match, reach.right_px, pixel_px, 2 * pixel_px)
 
 
 def doubt_outside(match: Match, reach: Reach, window: Window) -> tuple[Match, str]:
