@@ -62,12 +62,14 @@ class ScaleOptions:
     """What sets the metres of single images."""
 
     camera_height: float | None = None
-    """height of the camera above the road in metres: with --camera-tilt the road gets the depth of
-    that plane; what stands on it, and all without a tilt, is scaled half of the way to it
-    ("mount_height_m" of a camera file)."""
-    camera_tilt: float | None = None
-    """tilt of the camera in degrees, negative downwards, for --camera-height ("tilt_deg" of a
+    """height of the camera above the road in metres, which else is estimated ("mount_height_m" of a
     camera file)."""
+    camera_tilt: float | None = None
+    """tilt of the camera in degrees, negative downwards, which else is estimated of each image
+    ("tilt_deg" of a camera file)."""
+    one_mount: bool = False
+    """the images, by their names, are frames of one camera on one vehicle, as those of a video
+    always are: its height is held, its tilt smoothed."""
     known_distance: str | None = None
     """X,Y,METRES: column and row of a pixel and its measured depth along the optical axis, which
     sets the scale of each image."""

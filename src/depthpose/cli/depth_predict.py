@@ -39,7 +39,7 @@ from depthpose.core.files.disk import find_partners, read_text
 from depthpose.core.files.images import LISTED_SUFFIXES, refuse_among_inputs
 from depthpose.depth.config import Answer, MatcherConfig, SGBMConfig
 from depthpose.depth.estimator import FakestereoNet
-from depthpose.depth.ground import scale_by_distance
+from depthpose.depth.ground import MountFilter, scale_by_distance
 from depthpose.depth.predictions import (
     CLOUD,
     CLOUD_M,
@@ -47,6 +47,7 @@ from depthpose.depth.predictions import (
     LAST,
     Estimator,
     read_estimate,
+    read_ground,
     write_estimate,
 )
 from depthpose.depth.stereo import SGBMMatcher
@@ -226,12 +227,6 @@ def image_work(
 ) -> "DepthWork":
     """Say what is done with single images, whose camera may be known by them alone."""
     camera = read_lens(lens, sources)
-    mount_m = scale.camera_height or getattr(camera, "mount_height_m", None)
-    if scale.camera_tilt is not None and mount_m is None:
-        raise InputError(
-            "--camera-tilt says where the road is together with --camera-height, or the "
-            "camera file's mount_height_m; give the height, or omit the tilt"
-        )
     return DepthWork(method=method, camera=camera, scale=scale, output=output)
 
 
@@ -329,7 +324,7 @@ class DepthWork:
         elif isinstance(self.camera, Camera):
             keys = camera_keys(self.camera)
             camera = {key: keys[key] for key in ("K", "mount_height_m", "tilt_deg") if key in keys}
-        camera |= {key: v for key, v in asdict(self.scale).items() if v is not None}
+        camera |= {key: v for key, v in asdict(self.scale).items() if v not in (None, False)}
         output: dict[str, Any] = {}
         if self.files != PAIRS:
             output["color_range_m"] = list(self.output.color_range)
@@ -366,6 +361,8 @@ def estimate_by_engine(
     inputs = Inputs.find(words, files)
     with inputs.first() as first:
         first_work = work_of(first)
+    if first_work.scale.one_mount:
+        raise InputError("--one-mount takes the images one after the other; omit it, or --engine")
     here = (
         replace(first_work.method, config=replace(first_work.method.config, device="cpu"))
         .build()
@@ -388,6 +385,8 @@ def estimate_all(
     endings = [f".{end}" for end in ENDINGS] + [_VIDEO]
     run.claim_names(out, {files[0].stem: files for files in sources}, endings, videos)
     process = run.find_rank()
+    if work.scale.one_mount and process.world > 1:
+        raise InputError("--one-mount takes the images one after the other; omit it, or run alone")
     mine = sources[process.rank :: process.world]
     needed = (LAST, CLOUD) if work.output.cloud else (LAST,)
     whole = {name for name in run.read_results(out)
@@ -395,7 +394,8 @@ def estimate_all(
     predictor = Predictor(work, method, out, whole)
     stills = [files for files in mine if not _is_video(files[0])]
     named = (depth_input for files in stills for depth_input in work.inputs_of(files))
-    done = len(predictor.predict(named, len(stills), "images"))
+    mount = MountFilter() if work.scale.one_mount else None
+    done = len(predictor.predict(named, len(stills), "images", mount))
     done += sum(predictor.predict_video(video) for video, *_ in mine if _is_video(video))
     failures = list(predictor.failures.values())
     ending = f".{LAST}"
@@ -475,7 +475,7 @@ class Predictor:
         try:
             video = read_video(source)
             frames = self.work.inputs_of([source])
-            names = self.predict(frames, video.frames or None, source.name)
+            names = self.predict(frames, video.frames or None, source.name, MountFilter())
             drawn = colors() if names else ()
             write_video(self.out / f"{source.stem}{_VIDEO}", drawn, video.fps)
         except InputError as error:
@@ -483,25 +483,36 @@ class Predictor:
             return 0
         return len(names)
 
-    def predict(self, named: Named, total: int | None, what: str) -> list[str]:
-        """Estimate inputs, a batch together, and write their files; give the names of the done."""
+    def predict(
+        self, named: Named, total: int | None, what: str, mount: MountFilter | None = None
+    ) -> list[str]:
+        """Estimate inputs, a batch together, and write their files; give the names of the done.
+
+        ``mount`` is that of the inputs, where they are frames of one camera.
+        """
         names: list[str] = []
         output = self.work.output
         scale = self.work.scale
         net = self.method.net
         assert isinstance(net, FakestereoNet), "weights build no other"
         with tqdm(total=total, desc=what, disable=None, unit=f" {what}") as bar:
-            while chunk := list(islice(named, output.batch)):
+            # What an earlier run has made may lie between what is left, and its mount counts.
+            size = 1 if mount is not None and self.finished else output.batch
+            while chunk := list(islice(named, size)):
                 inputs: list[StereoInput] = []
                 for name, read in chunk:
                     try:
                         if name not in self.finished:
                             inputs.append(read())
+                        elif mount is not None:
+                            mount.last = read_ground(self.out, name) or mount.last
                     except InputError as error:
                         self.failures[name] = error
                 check = self.work.with_check
                 estimates = net.estimate_together(
-                    [(depth_input.name, depth_input) for depth_input in inputs], with_check=check
+                    [(depth_input.name, depth_input) for depth_input in inputs],
+                    with_check=check,
+                    mount=mount,
                 )
                 for depth_input, estimate in zip(inputs, estimates, strict=True):
                     try:

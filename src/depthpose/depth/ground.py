@@ -1,7 +1,12 @@
-"""The road in a depth map: how high the camera stands, how it is tilted, and metres by that."""
+"""The road in a depth map: how high the camera stands, how it is tilted, and metres by that.
+
+A network judges depth by where the ground is, as the camera of its training saw it, and by how
+large things look. Where the ground is follows from the camera's mount, which the image itself, the
+frames before or the user know better. Both are joined for each pixel by their uncertainties.
+"""
 
 import math
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import torch
 from jaxtyping import Float, Int
@@ -9,6 +14,7 @@ from torch import Tensor
 
 from depthpose.core.camera import Camera
 from depthpose.core.errors import InputError
+from depthpose.depth.horizon import Angles, find_angles
 from depthpose.depth.types import DepthEstimate, Ground, Map, StereoInput
 
 _INLIER = 0.06
@@ -26,9 +32,33 @@ _MOST_ROAD_TILT_DEG = 15.0
 _MOST_TILT_APART_DEG = 8.0
 """Steeper planes were no road in any of 59 views by cameras tilted up to 7 degrees, and roads were
 at most 5.5 degrees off the true tilt."""
-_ON_PLANE = 0.15
-_FARTHEST_M = 200.0
-"""What is off the plane by less, in the logarithm of depth, lies on it; by twice as much, not."""
+_MAP_TILT_OFF_DEG = -0.4
+"""Of roads in maps, whose far end is too near: -0.5 degrees on KITTI, -0.2 on synthetic streets."""
+_MAP_TILT_STD_DEG = 0.8
+_MAP_ROLL_STD_DEG = 1.2
+_ROAD_STD_DEG = 0.3
+"""Of the near road's tilt against that of the far one, to which edges run."""
+_TILT_STEP_DEG = 0.5
+"""By which a vehicle tilts from frame to frame."""
+_GIVEN_TILT_STD_DEG = 0.2
+_GIVEN_HEIGHT_STD = 0.03
+"""As a share; a tape measure is better, but a loaded car stands lower."""
+_HEIGHT_PER_DEG = 0.06
+"""By how much of a share the camera stands higher, where the map's tilt is a degree too large. A
+map has the height of its training near by, and the true one far off, where things have sizes, which
+together look like a tilt: 2.4 degrees a unit of the logarithm of height on synthetic streets. Most
+of what a tilt is off has other causes, so this is the slope that remains by Bayes' rule."""
+_HEIGHT_STD = 0.15
+_HEIGHT_NOISE = 0.06
+"""Of an estimated height, as shares: the deviation of all frames alike, and that between them."""
+_CUE_STD = 0.12
+"""Of the logarithm of depth by how large things look, and by where things touch the ground."""
+_ON_PLANE = 0.1
+_FARTHEST_M = 400.0
+"""What is off the map's plane by less, in the logarithm of depth, is ground; by twice as much, it
+stands on it."""
+_DECIMALS = 6
+"""Of the numbers of a mount: as files hold them, so that a rerun goes on from the same."""
 _WINDOW_PX = 5
 """Side of the square around a pixel whose distance is known."""
 
@@ -102,44 +132,149 @@ def _fit_plane(
     return plane, (1 / math.hypot(x, y, z), tilt_deg, roll_deg)
 
 
-def scale_by_mount(estimate: DepthEstimate, image: StereoInput) -> DepthEstimate:
-    """Find the ground and, where the camera's height is known, correct the scale by it.
+@dataclass
+class MountFilter:
+    """What the frames of one camera on one vehicle, taken in order, say of its mount together.
 
-    How large things look says another scale, so that the square root of the ground's factor is
-    taken. With a tilt too the plane is known, and what lies on the ground gets its depth.
+    The height is held: it is the mean of all frames. The tilt is free to change from frame to
+    frame, and smoothed (a Kalman filter whose state is the last frame's :class:`Ground`).
+    """
+
+    last: Ground | None = None  #: of the last frame with a road
+
+
+def find_mount(fit: Ground, image: StereoInput, before: Ground | None = None) -> Ground:
+    """Find the camera's height, tilt and roll above a road, with their deviations.
+
+    What the camera says of its mount is taken. Else the tilt is joined of that of the road in the
+    map, that of the frame before and that of the edges in the image (:func:`find_angles`), and the
+    height is that in the map, corrected by how far its tilt is off.
+
+    Args:
+        fit: the road in the map of the image (:func:`fit_ground`).
+        image: the image and its camera.
+        before: the mount by the frames before, where they are of the same camera.
+    """
+    camera = image.camera
+    assert camera is not None
+    expected = Angles(
+        tilt_deg=fit.tilt_deg - _MAP_TILT_OFF_DEG, tilt_std_deg=_MAP_TILT_STD_DEG,
+        roll_deg=fit.roll_deg, roll_std_deg=_MAP_ROLL_STD_DEG,
+    )  # fmt: skip
+    if before is not None:
+        step = math.hypot(before.tilt_std_deg, _TILT_STEP_DEG)
+        tilt = _join((expected.tilt_deg, expected.tilt_std_deg), (before.tilt_deg, step))
+        step = math.hypot(_MAP_ROLL_STD_DEG / 2, _TILT_STEP_DEG)
+        roll = _join((expected.roll_deg, expected.roll_std_deg), (before.roll_deg, step))
+        expected = Angles(
+            tilt_deg=tilt[0], tilt_std_deg=tilt[1], roll_deg=roll[0], roll_std_deg=roll[1]
+        )
+    if camera.tilt_deg is not None:
+        expected = replace(expected, tilt_deg=camera.tilt_deg, tilt_std_deg=_GIVEN_TILT_STD_DEG)
+    angles = find_angles(image.left, camera, expected)
+    tilt_deg = angles.tilt_deg
+    tilt_std_deg = math.hypot(angles.tilt_std_deg, _ROAD_STD_DEG)
+    if camera.tilt_deg is not None:
+        tilt_deg = camera.tilt_deg
+        tilt_std_deg = _GIVEN_TILT_STD_DEG
+
+    if camera.mount_height_m is not None:
+        height_m = camera.mount_height_m
+        share = _GIVEN_HEIGHT_STD
+    else:
+        off_deg = fit.tilt_deg - _MAP_TILT_OFF_DEG - tilt_deg
+        height_m = fit.height_m * math.exp(_HEIGHT_PER_DEG * off_deg)
+        noise = _HEIGHT_NOISE
+        if before is not None:
+            # The deviation of the frames before is larger than what they share by their noise.
+            past = math.sqrt(max((before.height_std_m / before.height_m) ** 2 - _HEIGHT_STD**2, 0))
+            mean = _join((math.log(height_m), noise), (math.log(before.height_m), past))
+            height_m = math.exp(mean[0])
+            noise = mean[1]
+        share = math.hypot(_HEIGHT_STD, noise)
+    numbers = {
+        "height_m": height_m, "tilt_deg": tilt_deg, "roll_deg": angles.roll_deg,
+        "share": fit.share, "height_std_m": share * height_m, "tilt_std_deg": tilt_std_deg,
+    }  # fmt: skip
+    return Ground(**{name: round(number, _DECIMALS) for name, number in numbers.items()})
+
+
+def _join(one: tuple[float, float], other: tuple[float, float]) -> tuple[float, float]:
+    """Give mean and deviation by two means with their deviations, weighed by inverse variances."""
+    weights = [1 / max(std, 1e-9) ** 2 for _, std in (one, other)]
+    mean = (weights[0] * one[0] + weights[1] * other[0]) / sum(weights)
+    return mean, math.sqrt(1 / sum(weights))
+
+
+def scale_by_mount(
+    estimate: DepthEstimate, image: StereoInput, mount: MountFilter | None = None
+) -> DepthEstimate:
+    """Find the camera's mount, and correct each pixel's depth by where the ground then is.
+
+    In the map every thing stands on the map's road. On the true road its foot has another depth,
+    and so has it: inverse depth changes by a multiple and a plane. This and the map's own depth are
+    joined by inverse variances of their logarithms. That of the ground grows with the distance, for
+    its tilt is not known exactly, and is larger for what stands on it than for the ground itself.
+
+    Args:
+        estimate: depth as the network judges it.
+        image: what it was judged by. Height and tilt of its camera are taken where they are given.
+        mount: of the frames before, in whose place that of this frame comes.
+
+    Returns:
+        The corrected estimate with its ``ground``, the mount; unchanged where no road is seen.
+
+    Raises:
+        InputError: a height or tilt is given, and no road is seen or its tilt is far off.
     """
     camera = image.camera
     name = image.name
     assert camera is not None and estimate.depth_m is not None  # noqa: PT018
-    ground = fit_ground(estimate.depth_m, camera)
-    if camera.mount_height_m is None:
-        return replace(estimate, ground=ground)
-    if ground is None:
-        raise InputError(
-            f"{name}: no road is seen in its lower part, so a camera height of "
-            f"{camera.mount_height_m:g} m cannot set the scale; omit it, or give --known-distance"
-        )
-    if camera.tilt_deg is None:
-        return rescale(estimate, (camera.mount_height_m / ground.height_m) ** 0.5, fit=ground)
-    mounted = replace(ground, height_m=camera.mount_height_m, tilt_deg=camera.tilt_deg)
-    rays, inverse, _ = _lower_points(estimate.depth_m, camera)
-    true_inverse = rays @ _plane(mounted)
-    is_on = ((rays @ _plane(ground) / inverse - 1).abs() < _INLIER) & (true_inverse > 0)
-    if abs(camera.tilt_deg - ground.tilt_deg) > _MOST_TILT_APART_DEG or int(is_on.sum()) < 30:
+    fit = fit_ground(estimate.depth_m, camera)
+    if fit is None:
+        said = {"height": (camera.mount_height_m, "m"), "tilt": (camera.tilt_deg, "degrees")}
+        for what, (number, unit) in said.items():
+            if number is not None:
+                raise InputError(
+                    f"{name}: no road is seen in its lower part, so a camera {what} of "
+                    f"{number:g} {unit} cannot set the scale; omit it, or give --known-distance"
+                )
+        return estimate
+    if camera.tilt_deg is not None and abs(camera.tilt_deg - fit.tilt_deg) > _MOST_TILT_APART_DEG:
         raise InputError(
             f"{name}: a tilt of {camera.tilt_deg:g} degrees is given, and the road that is seen "
-            f"says {ground.tilt_deg:.1f}. Negative is down; correct it, or omit it"
+            f"says {fit.tilt_deg:.1f}. Negative is down; correct it, or omit it"
         )
-    factor = (inverse[is_on] / true_inverse[is_on]).median() ** 0.5
-    height, width = estimate.depth_m.shape
-    v, u = torch.meshgrid(torch.arange(height), torch.arange(width), indexing="ij")
-    rays = torch.stack([u, v, torch.ones_like(u)], 2).double() @ torch.linalg.inv(camera.K).T
-    depth_m = estimate.depth_m.cpu().double()
-    off = (rays @ _plane(ground) * depth_m).log().abs()
-    on_plane = (2 - off / _ON_PLANE).clamp(0, 1).nan_to_num(0.0)
-    to_plane = 1 / (rays @ _plane(mounted)).clamp(min=1 / _FARTHEST_M) / depth_m
-    changed = factor ** (1 - on_plane) * to_plane**on_plane
-    return replace(rescale(estimate, changed.to(estimate.depth_m)), ground=mounted)
+    found = find_mount(fit, image, None if mount is None else mount.last)
+    if mount is not None:
+        mount.last = found
+
+    depth_m = estimate.depth_m
+    seen = _plane(fit)
+    true = _plane(found)
+    multiple = float(true[1] / seen[1])
+    inverse = multiple / depth_m + _over_image(true - multiple * seen, camera, depth_m)
+    by_ground_m = 1 / inverse.clamp(min=1 / _FARTHEST_M)
+    off_plane = (_over_image(seen, camera, depth_m) * depth_m).clamp(min=1e-3).log().abs()
+    stands = (off_plane / _ON_PLANE - 1).clamp(0, 1)
+    # A tilt that is off by an angle changes the logarithm of depth by it times depth / height.
+    tilt_std = math.radians(found.tilt_std_deg) / found.height_m
+    ground_variance = (
+        (torch.maximum(by_ground_m, depth_m) * tilt_std).square()
+        + stands * _CUE_STD**2
+        + _GIVEN_HEIGHT_STD**2
+    )
+    weight = _CUE_STD**2 / (_CUE_STD**2 + ground_variance)
+    return replace(rescale(estimate, (by_ground_m / depth_m) ** weight), ground=found)
+
+
+def _over_image(plane: Float[Tensor, "3"], camera: Camera, like: Map) -> Map:
+    """Give ``plane @ ray`` for the rays (z = 1) of all pixels of a map."""
+    a, b, c = (plane @ torch.linalg.inv(camera.K)).tolist()
+    height, width = like.shape
+    u = torch.arange(width, dtype=like.dtype, device=like.device)
+    v = torch.arange(height, dtype=like.dtype, device=like.device)
+    return a * u + (b * v + c)[:, None]
 
 
 def _plane(ground: Ground) -> Float[Tensor, "3"]:

@@ -200,26 +200,35 @@ def read_estimate(folder: Path, name: str, camera: Camera | None) -> DepthEstima
     disparity_px = read_part(folder, name, LAST)
     if disparity_px is None:
         raise InputError(f"{folder}: no prediction for frame {name!r}; predict it again")
-    warning, ground = (_first(folder / name, (end,)) for end in ("warning.txt", "ground.json"))
+    warning = _first(folder / name, ("warning.txt",))
     metres, sky = (read_part(folder, name, end) for end in ("depth_m.npy", "sky.png"))
     if metres is None and isinstance(camera, StereoRig):
         metres = depth_from_disparity(disparity_px, camera)
-    plane = None
-    if ground is not None:
-        content = files.read_json(ground)
-        if not isinstance(content, dict):
-            kind = type(content).__name__
-            raise InputError(f"{ground}: holds no ground, but {kind}; predict again")
-        plane = config_from_dict(content, Ground, source=str(ground))
     return DepthEstimate(
         depth_m=metres,
         disparity_px=disparity_px,
         confidence=read_part(folder, name, "confidence.npy"),
         right=read_part(folder, name, "right.png"),
         is_sky=None if sky is None else sky[0] > 0,
-        ground=plane,
+        ground=read_ground(folder, name),
         warning="" if warning is None else read_text(warning).strip(),
     )
+
+
+def read_ground(folder: Path, name: str) -> Ground | None:
+    """Read the road of an estimate; None where it has none.
+
+    Raises:
+        InputError: the file is damaged.
+    """
+    path = _first(folder / name, ("ground.json",))
+    if path is None:
+        return None
+    content = files.read_json(path)
+    if not isinstance(content, dict):
+        kind = type(content).__name__
+        raise InputError(f"{path}: holds no ground, but {kind}; predict again")
+    return config_from_dict(content, Ground, source=str(path))
 
 
 def predict(

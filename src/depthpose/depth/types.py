@@ -83,14 +83,14 @@ class Match:
 
 @dataclass(frozen=True, kw_only=True)
 class Ground:
-    """The plane of the road in a depth map, in the map's own metres."""
+    """The plane of a road below a camera: of a map alone, or the camera's mount by all cues."""
 
     height_m: float  #: of the camera above it
     tilt_deg: float  #: of the optical axis against it; positive looks up
     roll_deg: float  #: positive where the horizon falls to the right
     share: float  #: of the lower part of the image that lies on it, 0..1
-    #: how far the height moves by the choice of columns (a jackknife's standard deviation); the
-    #: scale of the depth itself is not in it
+    #: standard deviation of the height; of a map alone by the choice of columns (a jackknife), to
+    #: which the scale of the depth adds
     height_std_m: float
     tilt_std_deg: float  #: the same of the tilt
 

@@ -34,7 +34,7 @@ from depthpose.core.files import as_tensor, read_exif_focal
 from depthpose.core.files.images import check_image
 from depthpose.depth import disparity
 from depthpose.depth.config import Answer, MatcherConfig, SelectionConfig, SGBMConfig
-from depthpose.depth.ground import scale_by_distance, scale_by_mount
+from depthpose.depth.ground import MountFilter, scale_by_distance, scale_by_mount
 from depthpose.depth.stereo import (
     CameraMatcher,
     Matcher,
@@ -264,6 +264,7 @@ class FakestereoNet:
         fov_deg: float | None = None,
         right: Picture | None = None,
         known_distance: tuple[float, float, float] | None = None,
+        mount: MountFilter | None = None,
         name: str | None = None,
         with_check: bool = True,
     ) -> DepthEstimate:
@@ -283,6 +284,8 @@ class FakestereoNet:
             right: right image, the same size and rows.
             known_distance: column, row [px] and camera z [m] of a measured point, which sets the
                 scale of one image.
+            mount: the same for all frames of one camera on one vehicle, taken in order: holds its
+                height and smooths its tilt.
             name: what to call the input in errors; the file's name by default.
             with_check: look first whether both images show one scene, rectified and in the right
                 order; where that cannot be told, the estimate has a ``warning``.
@@ -299,12 +302,14 @@ class FakestereoNet:
             pair = replace(pair, right=as_tensor(right, "the right image"))
             if known_distance is not None:
                 raise InputError(f"{chosen}: a pair has metres of its own; omit known_distance")
-        depth = self.estimate_pair(pair, with_check=with_check)
+        depth = self.estimate_pair(pair, with_check=with_check, mount=mount)
         return depth if known_distance is None else scale_by_distance(depth, chosen, known_distance)
 
     @torch.no_grad()
     @own_arithmetic()
-    def estimate_pair(self, pair: StereoInput, *, with_check: bool = True) -> DepthEstimate:
+    def estimate_pair(
+        self, pair: StereoInput, *, with_check: bool = True, mount: MountFilter | None = None
+    ) -> DepthEstimate:
         """Estimate depth of one input whose images are read already, as :meth:`estimate` does.
 
         Networks that find the range measure the disparities of the pair first, and search where
@@ -314,7 +319,7 @@ class FakestereoNet:
         given.
         """
         if pair.right is None:
-            return self._estimate_alone([pair], self.virtual_sizes(pair))[0]
+            return self._estimate_alone([pair], self.virtual_sizes(pair), mount)[0]
         if self.matcher is None:
             raise InputError(
                 f"{pair.name}: there is a right image, and these weights answer one image alone: "
@@ -417,6 +422,7 @@ class FakestereoNet:
         lens: AnyLens | None = None,
         *,
         with_check: bool = True,
+        mount: MountFilter | None = None,
     ) -> list[DepthEstimate | InputError]:
         """Estimate one batch; where an image of it is unusable, each alone.
 
@@ -424,11 +430,13 @@ class FakestereoNet:
             named: names and inputs, or pictures.
             lens: camera of the pictures, as for :meth:`estimate_many`.
             with_check: of pairs, as for :meth:`estimate`.
+            mount: as for :meth:`estimate`; the images are its frames, in order.
 
         Returns:
             As :meth:`estimate_many`.
         """
         found: list[DepthEstimate | InputError] = []
+        before = None if mount is None else mount.last
         try:
             inputs = [
                 image if isinstance(image, StereoInput) else as_input(image, name, lens)
@@ -442,11 +450,16 @@ class FakestereoNet:
                 if sizes is None:
                     found += map(partial(self.estimate_pair, with_check=with_check), alike)
                 else:
-                    found += self._estimate_alone(alike, sizes)
+                    found += self._estimate_alone(alike, sizes, mount)
         except InputError as error:
             if len(named) == 1:
                 return [error]
-            alone = (self.estimate_together([one], lens, with_check=with_check) for one in named)
+            if mount is not None:
+                mount.last = before
+            alone = (
+                self.estimate_together([one], lens, with_check=with_check, mount=mount)
+                for one in named
+            )
             return [one for (one,) in alone]
         return found
 
@@ -484,11 +497,32 @@ class FakestereoNet:
         used = [s for s in self.synthesiser.scales if s == 1 or s * rig_px <= own_px]
         return [disparity.focal_size(image.camera, scale * rig_px) for scale in used]
 
-    @torch.no_grad()
     def _estimate_alone(
-        self, images: list[StereoInput], sizes: list[tuple[int, int]]
+        self,
+        images: list[StereoInput],
+        sizes: list[tuple[int, int]],
+        mount: MountFilter | None = None,
     ) -> list[DepthEstimate]:
-        """Bring images to the virtual rig, draw their right views, match, and come back."""
+        """Estimate images whose virtual sizes are the same, one after the other in time."""
+        judged = self.judge(images, sizes)
+        return [
+            scale_by_mount(estimate, image, mount)
+            for estimate, image in zip(judged, images, strict=True)
+        ]
+
+    @torch.no_grad()
+    def judge(self, images: list[StereoInput], sizes: list[tuple[int, int]]) -> list[DepthEstimate]:
+        """Estimate depth by the networks alone, before the camera's mount corrects it.
+
+        Images are brought to the virtual rig, their right views drawn and matched.
+
+        Args:
+            images: single images, all of the same virtual sizes.
+            sizes: these sizes, by :meth:`virtual_sizes`.
+
+        Raises:
+            InputError: an image unlike what the weights know.
+        """
         assert self.synthesiser is not None, "virtual_sizes checked it"
         rig = self.synthesiser.config
         with refused_memory(images[0].name):
@@ -515,7 +549,6 @@ class FakestereoNet:
             for n, (image, found) in enumerate(zip(images, matches, strict=True)):
                 match = found if sky is None else replace(found, is_sky=sky[n])
                 estimate = disparity.from_virtual(image, rig, match, views.right[n])
-                estimate = scale_by_mount(estimate, image)
                 estimates.append(estimate)
                 if confidence is None:
                     continue
