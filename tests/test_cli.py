@@ -105,7 +105,7 @@ def test_help_has_no_line_breaks_of_the_code(
     monkeypatch.setenv("COLUMNS", "100")
     assert main(["depth", "predict", "--help"]) == 0
     text = capsys.readouterr().out
-    assert "height of the camera above the road in metres: with --camera-tilt the road" in text
+    assert "height of the camera above the road in metres, which else is estimated" in text
     assert max(len(line) for line in text.splitlines()) <= 100
     between = text.partition("height of the camera")[2].partition("--camera-tilt NUMBER")[0]
     lines = [line.strip("│ ") for line in between.splitlines()[1:-1]]

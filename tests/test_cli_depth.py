@@ -9,6 +9,7 @@ import subprocess
 import sys
 import time
 import warnings
+from collections.abc import Iterator
 from pathlib import Path
 from unittest.mock import patch
 
@@ -281,22 +282,85 @@ def test_a_frame_of_a_video_that_is_refused_leaves_the_others(
     frames = [torch.full((3, 48, 64), 0.2 + 0.1 * k) for k in range(4)]
     write_video(tmp_path / "drive.avi", frames, 5.0)
     refused = InputError("drive_000001: a black frame")
-    estimate_alone = FakestereoNet._estimate_alone
+    judge = FakestereoNet.judge
 
-    def estimate(
+    def refuse_one(
         net: FakestereoNet, images: list[StereoInput], sizes: list[tuple[int, int]]
     ) -> list[DepthEstimate]:
         if any(image.name == "drive_000001" for image in images):
             raise refused
-        return estimate_alone(net, images, sizes)
+        return judge(net, images, sizes)
 
     out = tmp_path / "out"
-    with patch.object(FakestereoNet, "_estimate_alone", estimate):
+    with patch.object(FakestereoNet, "judge", refuse_one):
         assert predict(home, out, str(tmp_path / "drive.avi"), "--focal-px", "70") == 1
     assert "failed: drive_000001: a black frame" in capsys.readouterr().err
     assert len(list(out.glob("*.depth_m.npy"))) == 3
     assert len(list(read_video(out / "drive.color.mp4"))) == 4, "a grey frame in its place"
     assert "black frame" in " ".join(read_page(out / "report.html").texts["td"])
+
+
+@pytest.fixture
+def roads() -> Iterator[None]:
+    """Let networks see a road in every image, as high and tilted as its name says."""
+
+    def judge(
+        net: FakestereoNet, images: list[StereoInput], sizes: list[tuple[int, int]]
+    ) -> list[DepthEstimate]:
+        estimates: list[DepthEstimate] = []
+        for image in images:
+            number = int(image.name[-1])
+            rows = (torch.arange(48.0) - 23.5) / 70
+            inverse = (rows + math.tan(math.radians(2 + 0.5 * number))) / (1.5 + 0.1 * number)
+            depth_m = (1 / inverse.clamp(min=1 / 60))[:, None].expand(48, 64).contiguous()
+            estimates.append(DepthEstimate(depth_m=depth_m, disparity_px=35 / depth_m))
+        return estimates
+
+    with patch.object(FakestereoNet, "judge", judge):
+        yield
+
+
+def grounds(out: Path) -> dict[str, dict[str, float]]:
+    """Read the roads of a folder of results."""
+    return {path.name: json.loads(path.read_text()) for path in sorted(out.glob("*.ground.json"))}
+
+
+@pytest.mark.usefixtures("roads")
+@pytest.mark.parametrize("batch", ["1", "3"])
+def test_frames_of_a_video_have_one_mount_also_where_a_run_goes_on(
+    home: Path, tmp_path: Path, batch: str
+) -> None:
+    frames = [torch.full((3, 48, 64), 0.2 + 0.1 * k) for k in range(4)]
+    write_video(tmp_path / "drive.avi", frames, 5.0)
+    out = tmp_path / "out"
+    words = [str(tmp_path / "drive.avi"), "--focal-px", "70", "--batch", batch]
+    assert predict(home, out, *words) == 0
+    whole = grounds(out)
+    heights = [ground["height_m"] for ground in whole.values()]
+    assert len(heights) == 4
+    assert heights[3] - heights[0] < 0.5 * 0.3, "the height is held"
+    for name in ("drive_000001", "drive_000003"):
+        for path in out.glob(f"{name}.*"):
+            path.unlink()
+    assert predict(home, out, *words) == 0
+    assert grounds(out) == whole
+
+
+@pytest.mark.usefixtures("roads")
+def test_images_have_a_mount_each_or_one_together(home: Path, tmp_path: Path) -> None:
+    images = tmp_path / "images"
+    for number in range(4):
+        write_image(images / f"{number}.png", torch.full((3, 48, 64), 0.2 + 0.1 * number))
+    apart = tmp_path / "apart"
+    together = tmp_path / "together"
+    assert predict(home, apart, str(images), "--focal-px", "70") == 0
+    assert predict(home, together, str(images), "--focal-px", "70", "--one-mount") == 0
+    spreads: list[float] = []
+    for out in (apart, together):
+        heights = [ground["height_m"] for ground in grounds(out).values()]
+        spreads.append(max(heights) - min(heights))
+    assert spreads[0] > 0.25
+    assert spreads[1] < 0.6 * spreads[0]
 
 
 def test_sides_of_other_names_are_not_paired_by_order(
@@ -469,7 +533,7 @@ def test_one_image_of_another_camera_stops_no_other_of_its_batch(
         (["--fov", "90", "--known-distance", "1,2"], "write X,Y,METRES, such as 640,300,12.5"),
         (["--fov", "90", "--camera-height", "150"], "--camera-height 150: give 0.1 to 20 metres"),
         (["--fov", "90", "--camera-tilt", "-80"], "--camera-tilt -80: give -45 to 45 degrees"),
-        (["--fov", "90", "--camera-tilt", "-8"], "give the height, or omit the tilt"),
+        (["--fov", "90", "--camera-tilt", "-8"], "so a camera tilt of -8 degrees cannot set"),
         (
             ["--fov", "90", "--camera-height", "1.4", "--known-distance", "1,2,3"],
             "--known-distance: has no effect here; --camera-height sets the scale",
