@@ -30,7 +30,7 @@ from scipy.spatial.transform import Rotation
 from depthpose.core.camera import Camera, StereoRig, read_rig
 from depthpose.core.errors import InputError
 from depthpose.core.files import read_image
-from depthpose.depth.config import MatcherConfig
+from depthpose.depth.config import MatcherConfig, SelectionConfig
 from depthpose.depth.estimator import FakestereoNet
 from depthpose.depth.ground import MountFilter, fit_ground, scale_by_mount
 from depthpose.depth.synthetic.dataset import draw_light, draw_sensors, expose, view_from
@@ -112,7 +112,8 @@ def synthetic(folder: Path, first: int, streets: int) -> Iterator[View]:
         image = StereoInput(name=name, left=left, right=None, camera=camera_of_fov(fov_deg))
         depth_m = look["depth_m"].astype(np.float32)
         mount = (height_m, float(tilt_deg))
-        yield View(f"synthetic, {height_m} m", "", image, depth_m, mount)
+        what = "choice, synthetic" if street >= CHOICE_STREETS else "synthetic"
+        yield View(f"{what} {height_m} m", "", image, depth_m, mount)
 
 
 def mount_of(points: np.ndarray) -> tuple[float, float] | None:
@@ -289,7 +290,10 @@ def measured(view: View, net: FakestereoNet, mount: MountFilter) -> list[dict[st
     camera = view.image.camera
     assert camera is not None
     (judged,) = net.judge([view.image], net.virtual_sizes(view.image))
-    nothing = scale_by_mount(judged, view.image)
+    assert net.synthesiser is not None
+    rig = net.synthesiser.config
+    assert isinstance(rig, SelectionConfig)
+    nothing = scale_by_mount(judged, view.image, None, rig)
     rows: list[dict[str, Any]] = []
     for way in WAYS if view.drive else WAYS[:-1]:
         found = nothing
@@ -297,14 +301,14 @@ def measured(view: View, net: FakestereoNet, mount: MountFilter) -> list[dict[st
         if way == "map":
             found = judged
         elif way == "frames":
-            found = scale_by_mount(judged, asked, mount)
+            found = scale_by_mount(judged, asked, mount, rig)
         elif way != "nothing" and view.mount is not None:
             height_m, tilt_deg = view.mount
             known = {"mount_height_m": height_m}
             known |= {"tilt_deg": tilt_deg} if way == "height and tilt" else {}
             asked = replace(asked, camera=replace(camera, **known))
             try:
-                found = scale_by_mount(judged, asked)
+                found = scale_by_mount(judged, asked, None, rig)
             except InputError:
                 found = nothing
         assert found.depth_m is not None and judged.depth_m is not None  # noqa: PT018

@@ -14,6 +14,7 @@ from torch import Tensor
 
 from depthpose.core.camera import Camera
 from depthpose.core.errors import InputError
+from depthpose.depth.config import SelectionConfig
 from depthpose.depth.horizon import Angles, find_angles
 from depthpose.depth.types import DepthEstimate, Ground, Map, StereoInput
 
@@ -32,8 +33,6 @@ _MOST_ROAD_TILT_DEG = 15.0
 _MOST_TILT_APART_DEG = 8.0
 """Steeper planes were no road in any of 59 views by cameras tilted up to 7 degrees, and roads were
 at most 5.5 degrees off the true tilt."""
-_MAP_TILT_OFF_DEG = -0.4
-"""Of roads in maps, whose far end is too near: -0.5 degrees on KITTI, -0.2 on synthetic streets."""
 _MAP_TILT_STD_DEG = 0.8
 _MAP_ROLL_STD_DEG = 1.2
 _ROAD_STD_DEG = 0.3
@@ -51,12 +50,13 @@ of what a tilt is off has other causes, so this is the slope that remains by Bay
 _HEIGHT_STD = 0.15
 _HEIGHT_NOISE = 0.06
 """Of an estimated height, as shares: the deviation of all frames alike, and that between them."""
-_CUE_STD = 0.12
-"""Of the logarithm of depth by how large things look, and by where things touch the ground."""
+_FOOT_STD = 0.12
+"""Of the logarithm of depth by where things touch the ground."""
 _ON_PLANE = 0.1
 _FARTHEST_M = 400.0
 """What is off the map's plane by less, in the logarithm of depth, is ground; by twice as much, it
 stands on it."""
+_RIG = SelectionConfig()
 _DECIMALS = 6
 """Of the numbers of a mount: as files hold them, so that a rerun goes on from the same."""
 _WINDOW_PX = 5
@@ -143,7 +143,12 @@ class MountFilter:
     last: Ground | None = None  #: of the last frame with a road
 
 
-def find_mount(fit: Ground, image: StereoInput, before: Ground | None = None) -> Ground:
+def find_mount(
+    fit: Ground,
+    image: StereoInput,
+    before: Ground | None = None,
+    rig: SelectionConfig = _RIG,
+) -> Ground:
     """Find the camera's height, tilt and roll above a road, with their deviations.
 
     What the camera says of its mount is taken. Else the tilt is joined of that of the road in the
@@ -154,11 +159,12 @@ def find_mount(fit: Ground, image: StereoInput, before: Ground | None = None) ->
         fit: the road in the map of the image (:func:`fit_ground`).
         image: the image and its camera.
         before: the mount by the frames before, where they are of the same camera.
+        rig: of the network that estimated the map; by how much its roads are tilted too far.
     """
     camera = image.camera
     assert camera is not None
     expected = Angles(
-        tilt_deg=fit.tilt_deg - _MAP_TILT_OFF_DEG, tilt_std_deg=_MAP_TILT_STD_DEG,
+        tilt_deg=fit.tilt_deg - rig.road_tilt_off_deg, tilt_std_deg=_MAP_TILT_STD_DEG,
         roll_deg=fit.roll_deg, roll_std_deg=_MAP_ROLL_STD_DEG,
     )  # fmt: skip
     if before is not None:
@@ -182,7 +188,7 @@ def find_mount(fit: Ground, image: StereoInput, before: Ground | None = None) ->
         height_m = camera.mount_height_m
         share = _GIVEN_HEIGHT_STD
     else:
-        off_deg = fit.tilt_deg - _MAP_TILT_OFF_DEG - tilt_deg
+        off_deg = fit.tilt_deg - rig.road_tilt_off_deg - tilt_deg
         height_m = fit.height_m * math.exp(_HEIGHT_PER_DEG * off_deg)
         noise = _HEIGHT_NOISE
         if before is not None:
@@ -207,7 +213,10 @@ def _join(one: tuple[float, float], other: tuple[float, float]) -> tuple[float, 
 
 
 def scale_by_mount(
-    estimate: DepthEstimate, image: StereoInput, mount: MountFilter | None = None
+    estimate: DepthEstimate,
+    image: StereoInput,
+    mount: MountFilter | None = None,
+    rig: SelectionConfig = _RIG,
 ) -> DepthEstimate:
     """Find the camera's mount, and correct each pixel's depth by where the ground then is.
 
@@ -220,6 +229,7 @@ def scale_by_mount(
         estimate: depth as the network judges it.
         image: what it was judged by. Height and tilt of its camera are taken where they are given.
         mount: of the frames before, in whose place that of this frame comes.
+        rig: of the network, with the deviation of its depth.
 
     Returns:
         The corrected estimate with its ``ground``, the mount; unchanged where no road is seen.
@@ -245,7 +255,7 @@ def scale_by_mount(
             f"{name}: a tilt of {camera.tilt_deg:g} degrees is given, and the road that is seen "
             f"says {fit.tilt_deg:.1f}. Negative is down; correct it, or omit it"
         )
-    found = find_mount(fit, image, None if mount is None else mount.last)
+    found = find_mount(fit, image, None if mount is None else mount.last, rig)
     if mount is not None:
         mount.last = found
 
@@ -261,10 +271,10 @@ def scale_by_mount(
     tilt_std = math.radians(found.tilt_std_deg) / found.height_m
     ground_variance = (
         (torch.maximum(by_ground_m, depth_m) * tilt_std).square()
-        + stands * _CUE_STD**2
+        + stands * _FOOT_STD**2
         + _GIVEN_HEIGHT_STD**2
     )
-    weight = _CUE_STD**2 / (_CUE_STD**2 + ground_variance)
+    weight = rig.depth_std**2 / (rig.depth_std**2 + ground_variance)
     return replace(rescale(estimate, (by_ground_m / depth_m) ** weight), ground=found)
 
 

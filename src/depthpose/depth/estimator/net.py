@@ -505,8 +505,11 @@ class FakestereoNet:
     ) -> list[DepthEstimate]:
         """Estimate images whose virtual sizes are the same, one after the other in time."""
         judged = self.judge(images, sizes)
+        assert self.synthesiser is not None, "judge needs it"
+        rig = self.synthesiser.config
+        rig = rig if isinstance(rig, SelectionConfig) else SelectionConfig()
         return [
-            scale_by_mount(estimate, image, mount)
+            scale_by_mount(estimate, image, mount, rig)
             for estimate, image in zip(judged, images, strict=True)
         ]
 
