@@ -37,7 +37,7 @@ _MAP_TILT_STD_DEG = 0.8
 _MAP_ROLL_STD_DEG = 1.2
 _ROAD_STD_DEG = 0.3
 """Of the near road's tilt against that of the far one, to which edges run."""
-_TILT_STEP_DEG = 0.5
+_TILT_STEP_DEG = 0.3
 """By which a vehicle tilts from frame to frame."""
 _GIVEN_TILT_STD_DEG = 0.2
 _GIVEN_HEIGHT_STD = 0.03
