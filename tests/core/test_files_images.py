@@ -344,6 +344,18 @@ def test_zeros_that_are_a_plain_surface_are_read(tmp_path: Path, options: dict[s
     assert float(read_image(path)[:, 40:].min()) == 1
 
 
+def test_zeros_of_a_progressive_picture_are_no_coefficients(tmp_path: Path) -> None:
+    """Whatever table stands before its first scan, which is of no coefficients but the first."""
+    plain = BytesIO()
+    Image.new("RGB", (2000, 2000), "white").save(plain, "JPEG", progressive=True)
+    counts = bytes([0, 1, *[0] * 14])
+    table = b"\xff\xc4\x00\x14\x10" + counts + b"\x01"
+    data = plain.getvalue()
+    path, _ = jpeg(tmp_path, data[:2] + table + data[2:])
+    assert bytes(16) in path.read_bytes()
+    assert float(read_image(path).min()) == 1
+
+
 def test_zeros_behind_a_picture_are_no_damage(tmp_path: Path) -> None:
     _, whole = jpeg(tmp_path)
     path, _ = jpeg(tmp_path, whole + bytes(400))
