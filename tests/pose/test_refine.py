@@ -381,3 +381,24 @@ def test_a_covariance_is_of_as_many_residuals_as_are_free() -> None:
     found = _covariance(cloud_m, H, J, weight, residual_m, 10.0, 0.2)
     variance_m2 = residual_m.square().sum() / (count - 6)
     assert torch.allclose(found, variance_m2 * torch.linalg.inv(H), rtol=1e-3)
+
+
+def test_a_covariance_is_of_the_slope_of_tukeys_residuals() -> None:
+    """Where residuals are not small beside the limit, they hold less than they weigh."""
+    torch.manual_seed(4)
+    count = 200
+    limit_m = 0.004
+    cloud_m = 0.002 * torch.rand(count, 3).double() + torch.tensor([0.001, 0.001, 0.7])
+    residual_m = 0.001 * torch.randn(count).double().clamp(-3, 3)
+    root = 1 - (residual_m / limit_m).square()
+    weight = root.square()
+    pull = (weight * residual_m)[:, None]
+    J = torch.randn(count, 6).double()
+    J = J - pull @ (pull.mT @ J) / pull.square().sum()  # at the best pose nothing pulls
+    H = (weight[:, None] * J).mT @ J
+    found = _covariance(cloud_m, H, J, weight, residual_m, limit_m, 0.2)
+    slope = root * (root - 4 * (residual_m / limit_m).square())
+    variance_m2 = (weight * residual_m.square()).sum() / (weight.sum() - 6)
+    expected = variance_m2 * torch.linalg.inv((slope[:, None] * J).mT @ J)
+    assert torch.allclose(found, expected, rtol=1e-3, atol=1e-3 * float(expected.abs().max()))
+    assert float(expected.trace()) > 1.2 * float(variance_m2 * torch.linalg.inv(H).trace())
