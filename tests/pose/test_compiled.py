@@ -147,7 +147,7 @@ def test_the_best_pose(surface: Surface, monkeypatch: pytest.MonkeyPatch) -> Non
 def test_scales(times: float, surface: Surface, monkeypatch: pytest.MonkeyPatch) -> None:
     pose = poses(surface, 1)[0]
     cloud_m = pose.apply(times * pose.inverse().apply(seen(surface, pose)))
-    a, b = both(lambda: scale_of(cloud_m, pose, surface), monkeypatch)
+    a, b = both(lambda: scale_of(cloud_m, pose, surface, 0.001), monkeypatch)
     assert abs(a.times - b.times) < 1e-6
     assert abs(a.sigma - b.sigma) < 1e-6
     assert abs(a.gain - b.gain) < 1e-6

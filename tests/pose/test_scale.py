@@ -23,7 +23,7 @@ def test_the_scale_of_a_copy_is_measured(times: float) -> None:
     model = bracket()
     surface, cloud_m = prepare_surface(model), noisy(cloud_of(scaled(model, times), TRUTH))
     begun = refine_pose(cloud_m.double(), Rigid(TRUTH.R.double(), TRUTH.t_m.double()), surface)
-    scale = scale_of(cloud_m, begun.camera_from_model, surface)
+    scale = scale_of(cloud_m, begun.camera_from_model, surface, 0.0)
     assert scale.times == pytest.approx(times, abs=0.012)
     assert scale.sigma < 0.02
     assert (scale.gain > 0.05) == (abs(times - 1) > 0.09)

@@ -27,6 +27,7 @@ from depthpose.pose.copies import PreparedObject, difference_of, with_copies
 from depthpose.pose.evidence import Observation
 from depthpose.pose.identity import identify
 from depthpose.pose.observability import free_motions, observability, without_motions
+from depthpose.pose.sensor import INDEPENDENT_SIDES
 from depthpose.pose.types import Alternative, AnyInput, Evidence, PoseEstimate, Vote
 
 
@@ -56,14 +57,12 @@ PRIOR_MASKED = 5.0
 """Odds of the best pose being right before its evidence is seen, where a mask shows the object."""
 PRIOR_REGION = 2.0
 """The same where a detector's box or a mask that does not fit says that one is there."""
-PRIOR_PROPOSED = 0.1
-"""The same where a search proposed the pose: most places that votes point at show no object."""
+PRIOR_PROPOSED = 0.02
+"""The same where a search proposed the pose: votes of a whole image refine to some fifty poses for
+each object that is there."""
 WRONG_RMS = 1.2
 """Root mean square residual of what supports a wrong pose, in standard deviations: of residuals
 that are as often large as small it is 1.7, and refinement makes it smaller."""
-INDEPENDENT_SIDES = 6.0
-"""A real object deviates from its model by whole sides, of which a body has about six: its residual
-is that of so few independent observations, however many readings there are."""
 VOTES_RAD = 0.15
 """Mean angle between a network's directions and those to the keypoints at a right pose."""
 OTHER_FRAME = (
@@ -124,13 +123,16 @@ def share_among_poses(hypotheses: Sequence[Hypothesis]) -> Float64[Tensor, " n"]
     """Share the probability of one among different poses of an object.
 
     If one of them is right the others are wrong, and wrong poses leave much contradicted: so each
-    is weighed by how much better its evidence fits a right pose than a wrong one.
+    is weighed by how much better its evidence fits a right pose than a wrong one. They are poses of
+    the same readings: what another one explains and a pose does not contradicts it.
     """
-    area = _common_area(hypotheses)
-    weights = [
-        log_odds_right(hypothesis.evidence, area) + _log_beside_depth(hypothesis)
-        for hypothesis in hypotheses
-    ]
+    most = max(hypothesis.evidence.supported for hypothesis in hypotheses)
+    weights: list[float] = []
+    for hypothesis in hypotheses:
+        evidence = hypothesis.evidence
+        unexplained = max(evidence.beside, most - evidence.supported)
+        log_odds = log_odds_right(replace(evidence, beside=unexplained))
+        weights.append(log_odds + _log_beside_depth(hypothesis))
     return torch.tensor(weights, dtype=torch.float64).softmax(0)
 
 
@@ -140,7 +142,7 @@ def share_among_copies(hypotheses: Sequence[Hypothesis]) -> Float64[Tensor, " n"
     Wrong copies are contradicted little, for they look nearly alike: so each is weighed by how well
     its evidence fits a right pose. A network's votes say nothing here: it saw no more.
     """
-    area = _common_area(hypotheses)
+    area = max(LEAST_AREA, *(hypothesis.evidence.visible for hypothesis in hypotheses))
     weights: list[float] = []
     for hypothesis in hypotheses:
         evidence = hypothesis.evidence
@@ -161,19 +163,12 @@ def probability_right(evidence: Evidence, prior_odds: float) -> float:
     return 1 / (1 + math.exp(-min(log_odds, 50.0)))
 
 
-def _common_area(hypotheses: Sequence[Hypothesis]) -> float:
-    """One visible area for all: a pose that shows little would have little to contradict it."""
-    return max(LEAST_AREA, *(hypothesis.evidence.visible for hypothesis in hypotheses))
-
-
-def log_odds_right(evidence: Evidence, area: float | None = None) -> float:
+def log_odds_right(evidence: Evidence) -> float:
     """Log likelihood ratio of a right and a wrong pose: contradicted, unobserved, residuals.
 
-    Args:
-        evidence: of the pose.
-        area: visible of the model, where several poses are compared; None: that of the evidence.
+    It grows with the area that was compared: a pose that shows little has little to support it.
     """
-    area = max(LEAST_AREA, evidence.visible if area is None else area)
+    area = max(LEAST_AREA, evidence.visible)
     # Only what was observed can contradict a pose, and what contradicts it was observed.
     observed = max(LEAST_AREA, area - evidence.unobserved)
     rest = max(LEAST_AREA, area - evidence.seen_through - evidence.bulging)
@@ -252,6 +247,7 @@ def decide(
             evidence,
             observation.step * float(observation.K[0, 0]),
             refusal.max_size_error,
+            config.object_deviation_m,
         )
         if identity.status == "contradicted":
             reason = Refusal(status="doubtful", reason=identity.reason)

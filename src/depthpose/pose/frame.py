@@ -131,6 +131,7 @@ def _normals(
 ) -> tuple[Float64[Tensor, "h w 3"], Bool[Tensor, "h w"]]:
     """Fit 1 / depth, which is linear in the picture of a plane, in a window of the same surface."""
     height, width = depth_m.shape
+    depth_m = depth_m.float()  # differences of neighbours are exact enough, and twice as fast
     inverse = torch.where(depth_m > 0, 1 / depth_m, 0.0)
     limit = (_JUMP_M + _JUMP_PER_M * depth_m) * inverse.square()
     padded, side = pad(inverse, (_WINDOW,) * 4), 2 * _WINDOW + 1
@@ -163,7 +164,7 @@ def _normals(
     ray = torch.where((depth_m > 0)[..., None], points_m[..., :2] * inverse[..., None], 0.0)
     last = inverse + q - a * x - b * y - (along * ray).sum(-1)
     normals = -normalize(torch.cat([along, last[..., None]], -1), dim=-1)
-    return normals, (n >= _FILLED * side * side) & (spread > 0.3) & (depth_m > 0)
+    return normals.double(), (n >= _FILLED * side * side) & (spread > 0.3) & (depth_m > 0)
 
 
 def _planes(

@@ -4,6 +4,7 @@ Another size is fitted as a seventh unknown of ICP, and the mirror image as a mo
 """
 
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -18,6 +19,7 @@ from depthpose.pose.evidence import BORDER_PX
 from depthpose.pose.icp import refine_pose, refine_roughly
 from depthpose.pose.mesh import MIRROR_ALIKE
 from depthpose.pose.mesh.models import fibonacci_directions
+from depthpose.pose.sensor import INDEPENDENT_SIDES
 from depthpose.pose.surface import NEAR, Surface, finite_array
 from depthpose.pose.types import Evidence, Identity
 
@@ -58,70 +60,114 @@ class Scale:
     gain: float
 
 
-def scale_of(cloud_m: Float[Tensor, "n 3"], pose: Rigid, surface: Surface) -> Scale:
+def scale_of(
+    cloud_m: Float[Tensor, "n 3"], pose: Rigid, surface: Surface, object_m: float
+) -> Scale:
     """Measure the scale of the model that fits a cloud best, the pose moving with it.
 
     Point-to-plane ICP with a seventh unknown: the model grows about its middle ``c`` by ``s``,
     which moves its point ``p`` across the surface by ``n . (p - c) s``.
+
+    Args:
+        cloud_m: points of the object, in the camera frame.
+        pose: ``camera_from_model``.
+        surface: of the model.
+        object_m: standard deviation of the real surface from the model.
     """
     local_m = pose.inverse().apply(take_evenly(cloud_m.double(), POINTS))
-    middle_m = surface.middle_m
     starts = torch.tensor(_STARTS, dtype=torch.float64)
     few_m = take_evenly(local_m, _ROUGH_POINTS).expand(len(starts), -1, -1)
-    times, turned_m, _ = _grow(few_m, starts, middle_m, surface, is_exact=False)
-    costs = distance_to(turned_m, surface, times, is_exact=False).square()
+    times, grown_m = _grow(few_m, starts, surface, is_exact=False)
+    costs = distance_to(grown_m, surface, times, is_exact=False).square()
     costs[0] -= _TRUST
     start = starts[costs.argmin()][None]
-    times, turned_m, sigma = _grow(local_m[None], start, middle_m, surface, is_exact=True)
-    reached = distance_to(turned_m, surface, times, is_exact=True)
+    times, grown_m = _grow(local_m[None], start, surface, is_exact=True)
+    reached = distance_to(grown_m, surface, times, is_exact=True)
     gain = distance_to(local_m, surface, is_exact=True) - reached[0]
-    return Scale(float(times), float(sigma), float(gain))
+    equations = _growth_equations(grown_m, times, surface, NEAR * surface.diameter_m, is_exact=True)
+    return Scale(float(times), _scale_deviation(equations, object_m), float(gain))
+
+
+class _Equations(NamedTuple):
+    """Point-to-plane equations of turn, shift and growth, one a point."""
+
+    J: Float64[Tensor, "b n 7"]
+    residual_m: Float64[Tensor, "b n"]
+    weight: Float64[Tensor, "b n"]
+
+
+def _growth_equations(
+    local_m: Float64[Tensor, "b n 3"],
+    times: Float64[Tensor, " b"],
+    surface: Surface,
+    limit_m: float,
+    *,
+    is_exact: bool,
+) -> _Equations:
+    """Linearise the distances of points to a surface that is so many times as large."""
+    middle_m = surface.middle_m
+    scale = times[:, None, None]
+    own_m = (local_m - middle_m) / scale + middle_m
+    index = surface.nearest(own_m) if is_exact else surface.boxes.look_up(own_m)
+    normal = surface.normals[index]
+    arm_m = scale * (surface.points_m[index] - middle_m)
+    offset_m = local_m - middle_m - arm_m
+    growth_m = (normal * arm_m).sum(-1, keepdim=True)
+    return _Equations(
+        J=torch.cat([torch.linalg.cross(arm_m, normal), normal, growth_m], -1),
+        residual_m=(normal * offset_m).sum(-1),
+        weight=(1 - offset_m.square().sum(-1) / limit_m**2).clamp(min=0).square(),
+    )
+
+
+def _damped(H: Float64[Tensor, "b 7 7"]) -> Float64[Tensor, "b 7 7"]:
+    """Damp what the points leave undetermined."""
+    largest = H.diagonal(dim1=1, dim2=2).amax(-1)[:, None, None].clamp(min=1e-9)
+    return H + 1e-9 * largest * torch.eye(7, dtype=torch.float64)
+
+
+def _scale_deviation(equations: _Equations, object_m: float) -> float:
+    """Standard deviation of a scale: noise that neighbours share, and sides that deviate."""
+    J = equations.J[0]
+    weight = equations.weight[0]
+    inverse = torch.linalg.inv(_damped(((J.mT * weight) @ J)[None]))[0]
+    noise_m2 = (weight * equations.residual_m[0].square()).sum() / (weight.sum() - 7).clamp(min=1)
+    variance = _INDEPENDENT * noise_m2 * inverse[6, 6]
+    variance += object_m**2 * weight.sum() * inverse[6, 6] / INDEPENDENT_SIDES
+    return float(variance.clamp(min=0).sqrt())
 
 
 def _grow(
     local_m: Float64[Tensor, "b n 3"],
     times: Float64[Tensor, " b"],
-    middle_m: Float64[Tensor, "3"],
     surface: Surface,
     *,
     is_exact: bool,
-) -> tuple[Float64[Tensor, " b"], Float64[Tensor, "b n 3"], Float64[Tensor, " b"]]:
-    """Step by step to the scale and place that fit; give also the moved points and the spread."""
+) -> tuple[Float64[Tensor, " b"], Float64[Tensor, "b n 3"]]:
+    """Step by step to the scale and place that fit; give also the moved points."""
+    middle_m = surface.middle_m
     widths = (1 + (_WIDE_STEP - 1) * max(0.0, 1 - 2 * step / _STEPS) for step in range(_STEPS))
     limits_m = [NEAR * surface.diameter_m * width for width in widths]
     if use_numba(local_m, times):
         from depthpose.pose.compiled.poses import grow
 
-        local_m, times = torch.from_numpy(finite_array(local_m.numpy()).copy()), times.clone()
-        variance = torch.ones_like(times)
+        local_m = torch.from_numpy(finite_array(local_m.numpy()).copy())
+        times = times.clone()
         arrays = (local_m.numpy(), times.numpy(), middle_m.numpy(), np.array(limits_m))
-        grow(*arrays, surface.target, is_exact, _CONVERGED, variance.numpy())
-        return times, local_m, (_INDEPENDENT * variance).sqrt()
-    sigma = torch.ones_like(times)
+        grow(*arrays, surface.target, is_exact, _CONVERGED)
+        return times, local_m
     for limit_m in limits_m:
-        own_m = (local_m - middle_m) / times[:, None, None] + middle_m
-        index = surface.nearest(own_m) if is_exact else surface.boxes.look_up(own_m)
-        normal = surface.normals[index]
-        arm_m = times[:, None, None] * (surface.points_m[index] - middle_m)
-        gap_m = local_m - middle_m - arm_m
-        residual_m = (normal * gap_m).sum(-1)
-        weight = (1 - gap_m.square().sum(-1) / limit_m**2).clamp(min=0).square()
-        growth_m = (normal * arm_m).sum(-1, keepdim=True)
-        J = torch.cat([torch.linalg.cross(arm_m, normal), normal, growth_m], -1)
+        J, residual_m, weight = _growth_equations(
+            local_m, times, surface, limit_m, is_exact=is_exact
+        )
         weighted = J.mT * weight[:, None]
-        H = weighted @ J
-        size = H.diagonal(dim1=1, dim2=2).amax(-1)[:, None, None].clamp(min=1e-9)
-        inverse = torch.linalg.inv(H + 1e-9 * size * torch.eye(7, dtype=torch.float64))
-        motion = (inverse @ (weighted @ residual_m[..., None])).squeeze(-1)
-        left_m = residual_m - (J @ motion[..., None]).squeeze(-1)
-        variance = (weight * left_m.square()).sum(-1) / (weight.sum(-1) - 7).clamp(min=1)
-        sigma = (_INDEPENDENT * variance * inverse[:, 6, 6]).clamp(min=0).sqrt()
+        motion = torch.linalg.solve(_damped(weighted @ J), weighted @ residual_m[..., None])[..., 0]
         times = (times * (1 + motion[:, 6].clamp(-0.1, 0.1))).clamp(0.5, 2.0)
         turn = rotation_by(motion[:, :3])
         local_m = (local_m - middle_m - motion[:, None, 3:6]) @ turn + middle_m
         if float(motion[:, [0, 1, 2, 6]].abs().max()) < _CONVERGED:
             break
-    return times, local_m, sigma
+    return times, local_m
 
 
 def distance_to(
@@ -183,6 +229,7 @@ def identify(
     evidence: Evidence,
     focal_px: float,
     max_size_error: float,
+    object_m: float,
 ) -> Identity:
     """Fit another size and the mirror image, and say whether one of them is what was seen.
 
@@ -195,8 +242,9 @@ def identify(
         evidence: of the pose.
         focal_px: of the depth image.
         max_size_error: by so much a real object may differ in size from its model.
+        object_m: standard deviation of its surface from the model's.
     """
-    scale = scale_of(cloud_m, pose, surface)
+    scale = scale_of(cloud_m, pose, surface, object_m)
     mirror = None
     if mirror_deviation > MIRROR_ALIKE:
         mirror = mirror_gain(cloud_m, pose, surface)

@@ -9,12 +9,13 @@ import math
 from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import torch
-from jaxtyping import Bool
+from jaxtyping import Bool, Float
 from torch import Tensor
 
-from depthpose.core.camera import back_project
+from depthpose.core.camera import back_project, project
 from depthpose.core.devices import each_in_threads
 from depthpose.core.rigid import Rigid
 from depthpose.pose.cloud import cloud_from_depth, grow_mask
@@ -81,10 +82,15 @@ class _Place:
     pose: Rigid
     explained: Bool[Tensor, "h w"]
 
+    @cached_property
+    def area_px(self) -> int:
+        """Readings that it explains."""
+        return int(self.explained.count_nonzero())
+
     def shared_with(self, other: "_Place") -> float:
         """Share of the smaller one's readings that both explain."""
-        both = float((self.explained & other.explained).sum())
-        return both / max(1.0, min(float(self.explained.sum()), float(other.explained.sum())))
+        both_px = int((self.explained & other.explained).count_nonzero())
+        return both_px / max(1, min(self.area_px, other.area_px))
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -269,23 +275,51 @@ def _suppress(
 
 def explained_mask(image: Frame | ViewInput, pose: Rigid, surface: Surface) -> Bool[Tensor, "h w"]:
     """Mark the pixels whose points lie on a posed surface; in a frame, none of wider planes."""
-    if isinstance(image, Frame):
-        points_m = image.points_m
-        found = (image.depth_m > 0) & (image.plane_m < surface.diameter_m)
-    else:
-        points_m = back_project(image.depth_m.double(), image.K.double())
-        found = points_m.isfinite().all(-1) & image.mask
     pose = pose.double()
-    middle_m = pose.apply(surface.points_m.mean(0, keepdim=True))
-    found[found.clone()] = (points_m[found] - middle_m).norm(dim=-1) < surface.diameter_m
-    local_m, limit_m = pose.inverse().apply(points_m[found]), NEAR * surface.diameter_m
-    gap_m = (local_m - surface.points_m[surface.boxes.look_up(local_m)]).norm(dim=-1)
+    window = _pixels_about(image, pose, surface)
+    depth_m = image.depth_m[window].double()
+    if isinstance(image, Frame):
+        points_m = image.points_m[window]
+        is_explained = (depth_m > 0) & (image.plane_m[window] < surface.diameter_m)
+    else:
+        points_m = back_project(depth_m, _K_of_window(image.K, window).double())
+        is_explained = points_m.isfinite().all(-1) & image.mask[window]
+    local_m = pose.inverse().apply(points_m[is_explained])
+    distance_m = (local_m - surface.points_m[surface.boxes.look_up(local_m)]).norm(dim=-1)
     # The nearest sample is nearer than the one of the box by its diagonal at most.
-    is_open = (gap_m >= limit_m) & (gap_m < limit_m + math.sqrt(3) * surface.boxes.side_m)
-    some_m = local_m[is_open]
-    gap_m[is_open] = (some_m - surface.points_m[surface.nearest(some_m)]).norm(dim=-1)
-    found[found.clone()] = gap_m < limit_m
-    return found
+    limit_m = NEAR * surface.diameter_m
+    is_open = (distance_m >= limit_m) & (distance_m < limit_m + math.sqrt(3) * surface.boxes.side_m)
+    nearest_m = surface.points_m[surface.nearest(local_m[is_open])]
+    distance_m[is_open] = (local_m[is_open] - nearest_m).norm(dim=-1)
+    is_explained[is_explained.clone()] = distance_m < limit_m
+    explained = torch.zeros(image.depth_m.shape, dtype=torch.bool)
+    explained[window] = is_explained
+    return explained
+
+
+def _pixels_about(image: Frame | ViewInput, pose: Rigid, surface: Surface) -> tuple[slice, slice]:
+    """Rows and columns in which a posed surface lies, with a margin."""
+    height, width = image.depth_m.shape
+    posed_m = pose.apply(surface.points_m)
+    pixel = project(posed_m[posed_m[:, 2] > 0], image.K.double())
+    if len(pixel) == 0:
+        return slice(0, 0), slice(0, 0)
+    low = pixel.amin(0)
+    high = pixel.amax(0)
+    margin = 0.1 * (high - low) + 2 * BORDER_PX
+    left, top = (low - margin).floor().tolist()
+    right, bottom = (high + margin).ceil().tolist()
+    rows = slice(min(max(int(top), 0), height), min(max(int(bottom) + 1, 0), height))
+    columns = slice(min(max(int(left), 0), width), min(max(int(right) + 1, 0), width))
+    return rows, columns
+
+
+def _K_of_window(K: Float[Tensor, "3 3"], window: tuple[slice, slice]) -> Float[Tensor, "3 3"]:
+    """Intrinsic matrix of a part of an image."""
+    K = K.clone()
+    K[0, 2] -= window[1].start
+    K[1, 2] -= window[0].start
+    return K
 
 
 def _window_of_region(view: ViewInput) -> ViewInput:
@@ -294,11 +328,16 @@ def _window_of_region(view: ViewInput) -> ViewInput:
     if len(rows) == 0:
         return view
     margin = int(_REGION_MARGIN * max(int(rows[-1] - rows[0]), int(columns[-1] - columns[0])))
-    top, left = max(int(rows[0]) - margin, 0), max(int(columns[0]) - margin, 0)
-    part = slice(top, int(rows[-1]) + margin + 1), slice(left, int(columns[-1]) + margin + 1)
-    K = view.K.clone()
-    K[0, 2] -= left
-    K[1, 2] -= top
+    part = (
+        slice(max(int(rows[0]) - margin, 0), int(rows[-1]) + margin + 1),
+        slice(max(int(columns[0]) - margin, 0), int(columns[-1]) + margin + 1),
+    )
+    return _cut(view, part)
+
+
+def _cut(view: ViewInput, part: tuple[slice, slice]) -> ViewInput:
+    """Cut a part out of a view."""
+    K = _K_of_window(view.K, part)
     return replace(view, depth_m=view.depth_m[part], mask=view.mask[part], K=K)
 
 
@@ -310,7 +349,7 @@ def is_cut_out(view: ViewInput, pose: Rigid, surface: Surface) -> bool:
         pose: of the object.
         surface: of its model.
     """
-    window = _window_about(view, pose, surface)
+    window = _cut(view, _pixels_about(view, pose, surface))
     explained = explained_mask(window, pose, surface)
     points_m = back_project(window.depth_m.double(), window.K.double())
     plane = largest_plane(points_m[explained], torch.Generator().manual_seed(0))
@@ -322,25 +361,6 @@ def is_cut_out(view: ViewInput, pose: Rigid, surface: Surface) -> bool:
     reach = BORDER_PX + math.ceil(_RIM * surface.diameter_m / pixel_m)
     rim = grow_mask(explained, reach) & ~grow_mask(explained, BORDER_PX)
     return float(is_on_plane(points_m[rim], plane).double().mean()) > _CONTINUED
-
-
-def _window_about(view: ViewInput, pose: Rigid, surface: Surface) -> ViewInput:
-    """Cut the window about a posed surface out of a view."""
-    posed_m = pose.double().apply(surface.points_m)
-    pixel = (posed_m @ view.K.double().mT)[:, :2] / posed_m[:, 2:]
-    margin = 0.1 * (pixel.amax(0) - pixel.amin(0)) + 2 * BORDER_PX
-    height, width = view.depth_m.shape
-    (left, top), (right, bottom) = (
-        (pixel.amin(0) - margin).tolist(),
-        (pixel.amax(0) + margin).tolist(),
-    )
-    left, right = (min(max(int(value), 0), width) for value in (left, right + 1))
-    top, bottom = (min(max(int(value), 0), height) for value in (top, bottom + 1))
-    K = view.K.clone()
-    K[0, 2] -= left
-    K[1, 2] -= top
-    part = (slice(top, bottom), slice(left, right))
-    return replace(view, depth_m=view.depth_m[part], mask=view.mask[part], K=K)
 
 
 def nothing_found(view: ViewInput, object: str, spent_s: float = 0.0) -> PoseEstimate:
@@ -413,8 +433,7 @@ def among_objects(places: Sequence[_Judged]) -> tuple[PoseEstimate, float]:
 def _object_shares(estimates: Sequence[PoseEstimate]) -> Tensor:
     """Share the probability of one among objects, by the evidence of their best poses."""
     evidences = [estimate.evidence for estimate in estimates if estimate.evidence is not None]
-    area = max(evidence.visible for evidence in evidences)
-    log_odds = [log_odds_right(evidence, area) for evidence in evidences]
+    log_odds = [log_odds_right(evidence) for evidence in evidences]
     return torch.tensor(log_odds, dtype=torch.float64).softmax(0)
 
 

@@ -26,6 +26,9 @@ CORRELATION_RAD = CORRELATION_PX / 570  #: the same as an angle, for a Kinect of
 NOISIEST_PER_M = 0.006
 """Largest noise that is believed, for the square of the depth in metres: four times a Kinect's
 (Nguyen et al. 2012)."""
+INDEPENDENT_SIDES = 6.0
+"""A real object deviates from its model by whole sides, of which a body has about six: they are so
+few independent deviations, however many readings there are."""
 _MEDIAN_TO_DEVIATION = 1.4826  # of a normal distribution
 _STEEPEST = 0.3
 """Least cosine by which a deviation along the surface normal is divided: what is seen at a smaller

@@ -147,7 +147,7 @@ def refine(cloud, Rs, ts, limits, scale, converged, target, is_exact, every):
 
 
 @compiled
-def grow(local, times, middle, limits, target, is_exact, converged, variance):
+def grow(local, times, middle, limits, target, is_exact, converged):
     """Move points and grow a surface about its middle, step by step, in place."""
     count = local.shape[1]
     places = np.full((len(times), count), -1)
@@ -181,11 +181,7 @@ def grow(local, times, middle, limits, target, is_exact, converged, variance):
             weighted = J * weight.reshape(-1, 1)
             H = weighted.T @ J
             damp(H, 1e-9)
-            inverse = np.linalg.inv(H)
-            motion = inverse @ (weighted.T @ residual)  # turn, shift and growth
-            left = residual - J @ motion
-            square = (weight * left * left).sum()
-            variance[p] = max(square / max(weight.sum() - 7, 1.0) * inverse[6, 6], 0.0)
+            motion = np.linalg.solve(H, weighted.T @ residual)  # turn, shift and growth
             times[p] = min(max(s * (1 + min(max(motion[6], -0.1), 0.1)), 0.5), 2.0)
             rotation(motion[0], motion[1], motion[2], turn)
             # By the inverse of the surface's motion.
