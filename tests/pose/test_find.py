@@ -207,7 +207,7 @@ def test_an_image_in_which_nothing_is_found_says_what_it_shows(
         K=K.float(),
         object="bracket",
     )
-    found = nothing_found(view, "bracket")
+    found = nothing_found(view, "bracket", [], 0.1)
     assert found.status == status
     assert found.reason is not None
     assert said in found.reason

@@ -281,7 +281,7 @@ def test_a_hundred_models_take_bounded_time(net: Registration) -> None:
         estimate_near=estimate_near,
     )
     began = time.process_time()
-    assert find_objects(view, known) == []
+    assert not any(estimate.is_posed for estimate in find_objects(view, known))
     assert judged[0] <= 400, "which bounds the memory too"
     assert time.process_time() - began < 120
 
@@ -362,7 +362,7 @@ def test_what_is_there_twice_is_searched_for_again(monkeypatch: pytest.MonkeyPat
         return []
 
     monkeypatch.setattr(search, "_propose", propose)
-    monkeypatch.setattr(search, "_judge", lambda *_: rounds[len(searched) - 1])
+    monkeypatch.setattr(search, "_judge", lambda *_: (rounds[len(searched) - 1], []))
     targets = SearchTargets(
         names=["a", "b"], object_of=MagicMock(**{"return_value.surface.diameter_m": 0.1}),
         estimate_near=MagicMock(),

@@ -30,7 +30,7 @@ from depthpose.pose.predictions import (
     unreadable,
     write_predictions,
 )
-from depthpose.pose.search import explained_mask, nothing_found
+from depthpose.pose.search import explained_mask
 from depthpose.pose.surface import prepare_surface
 from depthpose.pose.types import PoseEstimate, ViewInput
 
@@ -80,7 +80,7 @@ def find_all(method: PoseMethod, inputs: OneObjectOptions, out: Path) -> int:
             except InputError as error:
                 found = [unreadable(job.name, objects[0], error)]
             else:
-                found = with_every_object(method.find(view, objects), view, objects)
+                found = method.find(view, objects)
             own = [Prediction(estimate=one) for one in found]
         results += [
             (one, replace(job, name=one.estimate.name, read=partial(_explained, job, one, method)))
@@ -125,7 +125,7 @@ def search_dataset(
         of_image = [p for p in left if p.place is not None and p.place[:2] == (scene, image)]
         if not of_image:
             view = replace(job.read(), name=job.name)
-            estimates = with_every_object(method.find(view, list(numbers)), view, list(numbers))
+            estimates = method.find(view, list(numbers))
             of_image = [
                 Prediction(estimate=one, place=Place(scene, image, numbers[one.object]))
                 for one in estimates
@@ -140,20 +140,6 @@ def search_dataset(
     searched = [job for _, job in results]
     pose_predict.write_files(predictions, searched, out, method, dataset, inputs=len(images))
     return pose_predict.say_result(predictions, out, len(images))
-
-
-def with_every_object(
-    estimates: Sequence[PoseEstimate], view: ViewInput, objects: Sequence[str]
-) -> list[PoseEstimate]:
-    """Add a refusal for each object that was looked for and has no estimate, and number them all.
-
-    They are called NAME_0, NAME_1, ...; a refusal that is alone is called as the image.
-    """
-    there = {estimate.object for estimate in estimates}
-    every = [*estimates, *(nothing_found(view, name) for name in objects if name not in there)]
-    if len(every) == 1 and not every[0].is_posed:
-        return [replace(every[0], name=view.name)]
-    return [replace(estimate, name=f"{view.name}_{k}") for k, estimate in enumerate(every)]
 
 
 def _explained(job: Job[Any], found: Prediction, method: PoseMethod) -> AnyInput:

@@ -37,7 +37,6 @@ from depthpose.pose.propose.point_pairs import prepare_pairs
 from depthpose.pose.search import (
     SearchTargets,
     find_objects,
-    nothing_found,
     which_object,
 )
 from depthpose.pose.surface import prepare_surface
@@ -117,7 +116,6 @@ class PoseEstimator:
 
     def _estimate_in_region(self, view: ViewInput) -> PoseEstimate:
         """Estimate the one object that is somewhere in the mask of a view, as in a box."""
-        began = time.perf_counter()
         targets = SearchTargets(
             names=[view.object],
             object_of=self._prepared,
@@ -125,12 +123,8 @@ class PoseEstimator:
             prior_odds=PRIOR_REGION,
             is_single=True,
         )
-        found = find_objects(view, targets)
-        spent_s = time.perf_counter() - began
-        if not found:
-            return nothing_found(view, view.object, spent_s)
-        best = replace(found[0], name=view.name, seconds={**found[0].seconds, "search": spent_s})
-        return with_status(best, self.config.min_certainty)
+        best = find_objects(view, targets)[0]
+        return with_status(replace(best, name=view.name), self.config.min_certainty)
 
     def _estimate_near(
         self, inputs: Sequence[CloudInput], proposals: Sequence[Rigid], prior_odds: float
@@ -268,14 +262,16 @@ class PoseEstimator:
         if not names:
             raise InputError("find: objects names none; give those that may be there, or omit it")
         view = view_input(depth, None, camera, names[0], _NAME, unit)
-        return self.find_in(view, names)
+        return [estimate for estimate in self.find_in(view, names) if estimate.is_posed]
 
     @torch.no_grad()
     @own_arithmetic()
     def find_in(
         self, view: ViewInput, objects: Sequence[str], *, is_sure: bool = False
     ) -> list[PoseEstimate]:
-        """Do as :meth:`find` does for a view; its mask limits where is looked.
+        """Do as :meth:`find` does for a view, with a refusal for each object that is not found.
+
+        A refusal says what the nearest miss was. The mask of the view limits where is looked.
 
         Args:
             view: depth and camera.
@@ -356,9 +352,7 @@ class PoseEstimator:
         def look(given: AnyInput) -> PoseEstimate:
             if isinstance(given, CloudInput):
                 return self._answers([given], is_likely=False)[0]
-            began = time.perf_counter()
-            found = self.find_in(given, [object], is_sure=True)
-            return found[0] if found else nothing_found(given, object, time.perf_counter() - began)
+            return self.find_in(given, [object], is_sure=True)[0]
 
         prepared = self._known(object)
         target = TrackedObject(

@@ -6,10 +6,12 @@ that the best proposal explains. Places that explain the same readings compete.
 """
 
 import math
+import time
 from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Any
 
 import torch
 from jaxtyping import Bool, Float
@@ -101,17 +103,37 @@ class _Judged(_Place):
     log_odds: float  #: of its being right
 
 
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _Miss:
+    """A place at which an object was refused.
+
+    Attributes:
+        object: its name.
+        middle_m: of the proposed pose, in the camera frame.
+        agreement: share of what was compared that supports the pose.
+        reason: of the refusal.
+    """
+
+    object: str
+    middle_m: Float[Tensor, "3"]
+    agreement: float
+    reason: str
+
+
 def find_objects(view: ViewInput, targets: SearchTargets) -> list[PoseEstimate]:
-    """Pose every known object that a depth image shows, the surest first.
+    """Pose every known object that a depth image shows, the surest first; refuse the others.
 
     Where poses of several objects explain the same readings, they share the probability of one, and
     where none has most of it none is reported. Where an object is there more than once, the rest of
-    the image is searched for more of it.
+    the image is searched for more of it. Of an object that is not found a refusal says where it was
+    looked for and what its nearest miss was.
 
     Args:
         view: depth and camera; its mask limits where is looked.
         targets: what for.
     """
+    began = time.perf_counter()
+    whole = view
     view = _window_of_region(view)
     smallest_m = min(targets.object_of(name).surface.diameter_m for name in targets.names)
     frame = prepare_frame(view.depth_m, view.K, smallest_m)
@@ -119,9 +141,11 @@ def find_objects(view: ViewInput, targets: SearchTargets) -> list[PoseEstimate]:
     names = list(targets.names)
     found: list[_Judged] = []
     taken: list[_Judged] = []
+    misses: list[_Miss] = []
     for _ in range(1 if targets.is_single else _ROUNDS):
         groups = _group(_propose(frame, is_left, names, targets), taken, frame, targets)
-        judged = _judge(groups, frame, view, targets)
+        judged, missed = _judge(groups, frame, view, targets)
+        misses += missed
         if targets.is_single:  # what lies mostly beside the region is something else
             judged = [p for p in judged if float(is_left[p.explained].double().mean()) > 0.5]
         more, taken = _suppress(judged, taken)
@@ -133,9 +157,20 @@ def find_objects(view: ViewInput, targets: SearchTargets) -> list[PoseEstimate]:
         if not names:
             break
     found.sort(key=lambda place: -place.log_odds)
-    return [
-        replace(place.estimate, name=f"{view.name}_{number}") for number, place in enumerate(found)
+    spent_s = time.perf_counter() - began
+    estimates = [
+        replace(place.estimate, seconds={**place.estimate.seconds, "search": spent_s})
+        for place in found
     ]
+    there = {estimate.object for estimate in estimates}
+    estimates += [
+        nothing_found(whole, name, [miss for miss in misses if miss.object == name], spent_s)
+        for name in targets.names
+        if name not in there
+    ]
+    if len(estimates) == 1:
+        return [replace(estimates[0], name=view.name)]
+    return [replace(estimate, name=f"{view.name}_{k}") for k, estimate in enumerate(estimates)]
 
 
 def _propose(
@@ -217,8 +252,8 @@ def _best_copy(frame: Frame, pose: Rigid, prepared: PreparedObject) -> Rigid:
 
 def _judge(
     groups: Sequence[Sequence[_Place]], frame: Frame, view: ViewInput, targets: SearchTargets
-) -> list[_Judged]:
-    """Estimate the object of each place from what its best pose explains; drop what is refused."""
+) -> tuple[list[_Judged], list[_Miss]]:
+    """Estimate the object of each place from what its best pose explains; part what is refused."""
     inputs: list[CloudInput] = []
     height, width = view.depth_m.shape
     for number, group in enumerate(groups):
@@ -229,23 +264,39 @@ def _judge(
         inputs.append(CloudInput(name=name, points_m=cloud_m, object=group[0].object, view=view))
     proposals = [Rigid.stack([place.pose for place in group]) for group in groups]
     judged: list[_Judged] = []
-    for estimate in targets.estimate_near(inputs, proposals, targets.prior_odds) if inputs else []:
-        if estimate.camera_from_model is None or estimate.evidence is None:
-            continue
+    misses: list[_Miss] = []
+    estimates = targets.estimate_near(inputs, proposals, targets.prior_odds) if inputs else []
+    for estimate, group in zip(estimates, groups, strict=True):
         surface = targets.object_of(estimate.object).surface
-        pose = estimate.camera_from_model.double()
-        if is_cut_out(view, pose, surface):
+        evidence = estimate.evidence
+        reason = estimate.reason
+        if estimate.camera_from_model is not None and is_cut_out(
+            view, estimate.camera_from_model.double(), surface
+        ):
+            reason = "it would be cut out of a plane that goes on beside it"
+        elif estimate.camera_from_model is not None:
+            reason = ""
+        if estimate.camera_from_model is None or evidence is None or reason:
+            misses.append(
+                _Miss(
+                    object=estimate.object,
+                    middle_m=group[0].pose.apply(surface.middle_m[None])[0],
+                    agreement=0.0 if evidence is None else evidence.agreement,
+                    reason=reason,
+                )
+            )
             continue
+        pose = estimate.camera_from_model.double()
         judged.append(
             _Judged(
                 object=estimate.object,
                 pose=pose,
                 explained=explained_mask(frame, pose, surface),
                 estimate=estimate,
-                log_odds=math.log(targets.prior_odds) + log_odds_right(estimate.evidence),
+                log_odds=math.log(targets.prior_odds) + log_odds_right(evidence),
             )
         )
-    return judged
+    return judged, misses
 
 
 def _suppress(
@@ -300,7 +351,7 @@ def explained_mask(image: Frame | ViewInput, pose: Rigid, surface: Surface) -> B
 def _pixels_about(image: Frame | ViewInput, pose: Rigid, surface: Surface) -> tuple[slice, slice]:
     """Rows and columns in which a posed surface lies, with a margin."""
     height, width = image.depth_m.shape
-    posed_m = pose.apply(surface.points_m)
+    posed_m = pose.double().apply(surface.points_m)
     pixel = project(posed_m[posed_m[:, 2] > 0], image.K.double())
     if len(pixel) == 0:
         return slice(0, 0), slice(0, 0)
@@ -363,27 +414,24 @@ def is_cut_out(view: ViewInput, pose: Rigid, surface: Surface) -> bool:
     return float(is_on_plane(points_m[rim], plane).double().mean()) > _CONTINUED
 
 
-def nothing_found(view: ViewInput, object: str, spent_s: float = 0.0) -> PoseEstimate:
-    """Say that a depth image shows no object, or none of several, surely."""
+def nothing_found(
+    view: ViewInput, object: str, misses: Sequence[_Miss], spent_s: float
+) -> PoseEstimate:
+    """Say that a depth image does not show an object surely, and what its nearest miss was."""
     read_m = view.depth_m[view.mask & (view.depth_m > 0)]
-    spent = {"check": spent_s}
+    facts: dict[str, Any] = {"name": view.name, "object": object, "seconds": {"search": spent_s}}
     if len(read_m) == 0:
-        return PoseEstimate(
-            name=view.name,
-            object=object,
-            status="too few points",
-            reason=nothing_seen(view),
-            seconds=spent,
-        )
-    return PoseEstimate(
-        name=view.name,
-        object=object,
-        status="doubtful",
-        reason=f"nothing beside the planes of the image is surely {object}; its depths are "
+        return PoseEstimate(status="too few points", reason=nothing_seen(view), **facts)
+    reason = (
+        f"nothing beside the planes of the image is surely {object}; its depths are "
         f"{float(read_m.min()):.3g} to {float(read_m.max()):.3g} m: if they are right, give a "
-        "mask, or look from nearer by",
-        seconds=spent,
+        "mask, or look from nearer by"
     )
+    if misses:
+        nearest = max(misses, key=lambda miss: miss.agreement)
+        x, y, z = nearest.middle_m.tolist()
+        reason += f". The nearest miss, at ({x:.3f}, {y:.3f}, {z:.3f}) m: {nearest.reason}"
+    return PoseEstimate(status="doubtful", reason=reason, **facts)
 
 
 def which_object(estimates: Sequence[PoseEstimate]) -> PoseEstimate:

@@ -17,7 +17,7 @@ from depthpose.pose.inputs import cloud_input, view_input
 from depthpose.pose.network_pose import GeoPoseNet
 from depthpose.pose.predictions import CLOUD, PICTURE, Prediction, write_predictions
 from depthpose.pose.registration import Registration
-from depthpose.pose.search import explained_mask, nothing_found
+from depthpose.pose.search import explained_mask
 from depthpose.pose.surface import prepare_surface
 from depthpose.pose.synthetic import make_frames
 from depthpose.pose.types import CloudInput, ObjectModel, PoseEstimate, ViewInput
@@ -63,18 +63,15 @@ def answer_pose(form: Form, net: GeoPoseNet) -> Answer:
     voted = None
     if "depth" in form.files and "mask" not in form.files:
         assert isinstance(pose_input, ViewInput)
-        answers = target.net.find_in(pose_input, [target.model.name])
         shown_poses = []
-        for k, answer in enumerate(answers):  # each pose with the pixels that it explains
-            row_name = f"{name}_{k}" if len(answers) > 1 else name
-            found_pose = answer.camera_from_model
-            assert found_pose is not None
-            mask = explained_mask(pose_input, found_pose, prepare_surface(target.model))
-            shown = replace(pose_input, name=row_name, mask=mask)
-            shown_poses.append(_Seen(input=shown, estimate=replace(answer, name=row_name)))
-        if not shown_poses:
-            nothing = nothing_found(pose_input, target.model.name)
-            shown_poses.append(_Seen(input=pose_input, estimate=nothing))
+        for estimate in target.net.find_in(pose_input, [target.model.name]):
+            shown = pose_input
+            if estimate.camera_from_model is not None:  # with the pixels that it explains
+                surface = prepare_surface(target.model)
+                mask = explained_mask(pose_input, estimate.camera_from_model, surface)
+                shown = replace(pose_input, mask=mask)
+            shown = replace(shown, name=estimate.name)
+            shown_poses.append(_Seen(input=shown, estimate=estimate))
     elif isinstance(target.net, GeoPoseNet):
         estimate, voted = target.net.estimate_with_votes(pose_input)
         shown_poses = [_Seen(input=pose_input, estimate=estimate)]
