@@ -1,6 +1,5 @@
 """What every estimator of poses offers: one object, several, whole depth images, sequences."""
 
-import time
 from collections.abc import Callable, Iterable, Iterator, Sequence, Sized
 from dataclasses import replace
 from functools import partial

@@ -333,7 +333,7 @@ def explained_mask(image: Frame | ViewInput, pose: Rigid, surface: Surface) -> B
         points_m = image.points_m[window]
         is_explained = (depth_m > 0) & (image.plane_m[window] < surface.diameter_m)
     else:
-        points_m = back_project(depth_m, _K_of_window(image.K, window).double())
+        points_m = back_project(depth_m, _window_intrinsics(image.K, window).double())
         is_explained = points_m.isfinite().all(-1) & image.mask[window]
     local_m = pose.inverse().apply(points_m[is_explained])
     distance_m = (local_m - surface.points_m[surface.boxes.look_up(local_m)]).norm(dim=-1)
@@ -365,7 +365,9 @@ def _pixels_about(image: Frame | ViewInput, pose: Rigid, surface: Surface) -> tu
     return rows, columns
 
 
-def _K_of_window(K: Float[Tensor, "3 3"], window: tuple[slice, slice]) -> Float[Tensor, "3 3"]:
+def _window_intrinsics(
+    K: Float[Tensor, "3 3"], window: tuple[slice, slice]
+) -> Float[Tensor, "3 3"]:
     """Intrinsic matrix of a part of an image."""
     K = K.clone()
     K[0, 2] -= window[1].start
@@ -388,7 +390,7 @@ def _window_of_region(view: ViewInput) -> ViewInput:
 
 def _cut(view: ViewInput, part: tuple[slice, slice]) -> ViewInput:
     """Cut a part out of a view."""
-    K = _K_of_window(view.K, part)
+    K = _window_intrinsics(view.K, part)
     return replace(view, depth_m=view.depth_m[part], mask=view.mask[part], K=K)
 
 
