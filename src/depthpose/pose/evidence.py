@@ -32,6 +32,10 @@ BORDER_PX = 3
 the silhouette."""
 _LEAST_FILLED = 0.3  # share of the averaged square that must have residuals
 _LEAST_PATCH = 0.25  # independent patches: smaller ones are accidents of edges and drop-outs
+_ACROSS = (-1.0, -0.5, 0.5, 1.0)
+"""Where readings are compared across a silhouette: as shares of the way from it to a pixel."""
+_LEVEL_M = 0.0005  #: a surface is plane to so much
+_STRAIGHT = 2.0  #: deviations of the noise, by which readings are off their line at most
 _LEAST_INNER = 0.25  # share of the silhouette that its borders may leave
 _DISK = 1.3  # radius of the disk drawn for a sample, in median distances of samples
 _OBJECT_PX = 8000  # pixels of an object that are compared; of larger ones every n-th
@@ -40,6 +44,9 @@ _JUMP_DIAMETERS = 0.02
 _JUMP_M = 0.01
 """Drawn neighbours that differ in depth by more than both are the two sides of an edge."""
 _FAR_M = np.float32(1e6)
+_HIDDEN_DIAMETERS = 0.03  #: of larger noise, steps at which an object ends are not seen
+_line = np.stack([np.ones(4), np.array(_ACROSS)], 1)
+_OFF_LINE = np.eye(4) - _line @ np.linalg.pinv(_line)  # residuals of the line through four values
 _MARGIN = 0.6  # half of the window about an object, in diameters
 
 
@@ -241,11 +248,16 @@ def compare(observation: Observation, pose: Rigid, surface: Surface) -> Evidence
     is_supported = is_compared & (np.abs(deviations) <= THRESHOLD)
     seen_through = _patch_area(deviations > THRESHOLD, patch_px)
     bulging = _patch_area((deviations < -THRESHOLD) & is_object, patch_px)
-    is_beside = observation.is_object & np.isfinite(observation.depth_m)
-    border = max(1, round((BORDER_PX + 1) / step))
-    is_shown = np.zeros_like(is_beside)
-    is_shown[window] = is_drawn
-    is_beside &= np.logical_not(ndimage.binary_dilation(is_shown, iterations=border))
+    if observation.is_object.any():
+        is_beside = observation.is_object & np.isfinite(observation.depth_m)
+        border = max(1, round((BORDER_PX + 1) / step))
+        is_shown = np.zeros_like(is_beside)
+        is_shown[window] = is_drawn
+        is_beside &= np.logical_not(ndimage.binary_dilation(is_shown, iterations=border))
+        beside_px = patch_px
+    else:  # no mask says which readings are the object's: those that go on where the model ends
+        is_beside = _is_continued(observation, is_drawn, is_supported, window, surface.diameter_m)
+        beside_px = patch_px / 2  # a patch beside the silhouette is as long as others, half as wide
     visible = float(inner.sum()) / patch_px
     supported = float(is_supported.sum()) / patch_px
     square = deviations[is_supported] ** 2
@@ -256,10 +268,63 @@ def compare(observation: Observation, pose: Rigid, surface: Surface) -> Evidence
         unobserved=max(0.0, visible - supported - seen_through - bulging),
         seen_through=seen_through,
         bulging=bulging,
-        beside=_patch_area(is_beside, patch_px),
+        beside=_patch_area(is_beside, beside_px),
         rms=float(np.sqrt(square.mean())) if len(square) else THRESHOLD,
         noise_m=noise.white_m,
     )
+
+
+def _is_continued(
+    observation: Observation,
+    is_drawn: np.ndarray,
+    is_supported: np.ndarray,
+    window: tuple[slice, slice],
+    diameter_m: float,
+) -> Bool[np.ndarray, "h w"]:
+    """Mark readings beside the silhouette in which the surface within it goes on.
+
+    At its silhouette an object ends: by a step in depth, or by an edge where it touches something.
+    A box that is posed on the side of a larger one ends where the readings go on straight. Four
+    readings on a line across the silhouette, two of them within it, are straight in 1 / depth where
+    they are of one plane.
+    """
+    border = math.ceil(BORDER_PX / observation.step + observation.patch_px / 2)
+    reach = border + max(1, round(observation.patch_px / 2))
+    height, width = observation.depth_m.shape
+    rows = slice(max(0, window[0].start - reach), min(height, window[0].stop + reach))
+    columns = slice(max(0, window[1].start - reach), min(width, window[1].stop + reach))
+    inner = (
+        slice(window[0].start - rows.start, window[0].stop - rows.start),
+        slice(window[1].start - columns.start, window[1].stop - columns.start),
+    )
+    shape = rows.stop - rows.start, columns.stop - columns.start
+    is_object = np.zeros(shape, bool)
+    is_object[inner] = is_drawn
+    supports = np.zeros(shape, bool)
+    supports[inner] = is_supported
+
+    # The pixels beside the silhouette, and the nearest of the silhouette.
+    distance, nearest = ndimage.distance_transform_edt(~is_object, return_indices=True)
+    beside = np.stack(np.nonzero((distance > border) & (distance <= reach)))
+    edge = nearest[:, beside[0], beside[1]]
+    outward = beside - edge
+    inverse = 1 / observation.depth_m[rows, columns]
+    across = []
+    for times in _ACROSS:
+        pixel = edge + np.rint(times * outward).astype(int)
+        row, column = np.clip(pixel, 0, np.array(shape)[:, None] - 1)
+        across.append(inverse[row, column])
+        if times < 0:
+            across[-1] = np.where(supports[row, column], across[-1], np.nan)
+    values = np.stack(across)
+    bend = np.abs(_OFF_LINE @ values).max(0)
+    off_line_m = _STRAIGHT * math.hypot(observation.noise.white_m, _LEVEL_M)
+    is_continued = np.zeros((height, width), bool)
+    if off_line_m > _HIDDEN_DIAMETERS * diameter_m:  # noise hides the steps at which it ends
+        return is_continued
+    is_straight = bend <= off_line_m * values[0] ** 2
+    is_continued[rows, columns][tuple(beside)] = is_straight
+    return ndimage.binary_closing(is_continued)
 
 
 def _without_edges(
