@@ -236,8 +236,22 @@ def test_own_readings_beside_the_silhouette_contradict() -> None:
     evidence = evidence_of(view, without, pose)
     assert evidence.beside > 1
     assert evidence.seen_through == evidence.bulging == 0
-    assert evidence_of(view, without, pose, is_masked=False).beside == 0
     assert evidence_of(view, with_arm, pose).contradicted == 0
+
+
+@pytest.mark.parametrize(("step_m", "is_continued"), [(0.0, True), (0.02, False)])
+def test_without_a_mask_a_surface_that_goes_on_contradicts(
+    step_m: float, is_continued: bool
+) -> None:
+    """A bar is posed on a longer one, or stands a step before what lies beside it."""
+    bar = boxes("bar", ((0.1, 0.05, 0.04), (0, 0, 0)))
+    more = boxes("more", ((0.1, 0.05, 0.04), (0, 0, 0)), ((0.1, 0.05, 0.04), (0.1, 0, step_m)))
+    pose = Rigid(torch.eye(3), torch.tensor([0.0, 0.0, 0.7]))
+    evidence = evidence_of(view_before_wall(more, pose, 0.001), bar, pose, is_masked=False)
+    assert (evidence.beside > 1) == is_continued
+    assert evidence.seen_through == evidence.bulging == 0
+    rough = evidence_of(view_before_wall(more, pose, 0.004), bar, pose, is_masked=False)
+    assert rough.beside == 0, "noise hides where it would end"
 
 
 @pytest.mark.parametrize("reading_m", [math.nan, 0.45], ids=["no reading", "something before it"])
