@@ -69,7 +69,7 @@ def test_each_class_of_the_api_has_a_page(site: Path) -> None:
         ("core.camera", "StereoRig"),
         ("core.camera", "Rectifier"),
         ("depth.estimator", "FakestereoNet"),
-        ("pose.estimator", "GeoPoseNet"),
+        ("pose.network_pose", "GeoPoseNet"),
         ("core.errors", "InputError"),
     ):
         full = f"depthpose.{module}.{name}"

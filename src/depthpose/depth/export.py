@@ -16,7 +16,7 @@ from depthpose.core.export import Case, Export, Graph, Limit, Value, network_mod
 from depthpose.depth.config import MatcherConfig
 from depthpose.depth.disparity import LEAST_PX, SKY_M
 from depthpose.depth.estimator import FakestereoNet
-from depthpose.depth.stereo import LightStereo, PSMNet, StereoNetwork
+from depthpose.depth.stereo import LightStereo, NetworkMatcher, PSMNet, StereoNetwork
 from depthpose.depth.stereo.layers import interpolation_matrix, linear_taps
 from depthpose.depth.stereo.matcher import IMAGENET_MEAN, IMAGENET_STD
 from depthpose.depth.stereo.psmnet import WINDOW_PX
@@ -390,7 +390,10 @@ def depth_export(weights: DepthWeights, what: str | None, facts: dict[str, Any])
 def _pair_export(weights: DepthWeights, facts: dict[str, Any]) -> Export:
     def cases() -> Iterator[Case]:
         assert weights.matcher is not None
-        net = FakestereoNet(make_matcher(weights.matcher, _QUICK))
+        matcher = make_matcher(weights.matcher, _QUICK)
+        if isinstance(matcher, NetworkMatcher):
+            matcher.finds_range = False  # nor does a graph
+        net = FakestereoNet(matcher)
         sky = ("is_sky",) if getattr(weights.matcher.config, "with_sky", False) else ()
         work_px = weights.matcher.config.work_focal_px
         for size in _SIZES:

@@ -318,13 +318,22 @@ def _is_continued(
             across[-1] = np.where(supports[row, column], across[-1], np.nan)
     values = np.stack(across)
     bend = np.abs(_OFF_LINE @ values).max(0)
-    off_line_m = _STRAIGHT * math.hypot(observation.noise.white_m, _LEVEL_M)
     is_continued = np.zeros((height, width), bool)
-    if off_line_m > _HIDDEN_DIAMETERS * diameter_m:  # noise hides the steps at which it ends
+    if hides_ends(observation.noise.white_m, diameter_m):
         return is_continued
-    is_straight = bend <= off_line_m * values[0] ** 2
+    is_straight = bend <= _off_line_m(observation.noise.white_m) * values[0] ** 2
     is_continued[rows, columns][tuple(beside)] = is_straight
     return ndimage.binary_closing(is_continued)
+
+
+def hides_ends(noise_m: float, diameter_m: float) -> bool:
+    """Whether the noise of a reading hides the steps at which an object of a diameter ends."""
+    return _off_line_m(noise_m) > _HIDDEN_DIAMETERS * diameter_m
+
+
+def _off_line_m(noise_m: float) -> float:
+    """How far readings of one plane lie from their line at most."""
+    return _STRAIGHT * math.hypot(noise_m, _LEVEL_M)
 
 
 def _without_edges(

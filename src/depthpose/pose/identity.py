@@ -3,6 +3,7 @@
 Another size is fitted as a seventh unknown of ICP, and the mirror image as a model of its own.
 """
 
+import math
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
@@ -258,7 +259,10 @@ def identify(
     )
 
     status, reason = "not excluded", ""
-    if mirror is not None and mirror > max(_MIRROR_GAIN, scale.gain if is_other_size else 0.0):
+    # Sides that deviate from the model may fit its mirror image a little better.
+    deviation = object_m / math.sqrt(INDEPENDENT_SIDES) / (NEAR * surface.diameter_m)
+    least_gain = max(_MIRROR_GAIN, deviation, scale.gain if is_other_size else 0.0)
+    if mirror is not None and mirror > least_gain:
         status = "contradicted"
         reason = (
             f"the mirror image of {name} fits better (by {NEAR * mirror:.2%} of the "

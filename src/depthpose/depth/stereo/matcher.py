@@ -278,7 +278,7 @@ class NetworkMatcher(ABC):
     """Times the size of the images at which a fine match may be."""
     most_disparities: ClassVar[float] = 1.5
     """Times the disparities of training that a fine match looks through at most."""
-    finds_range: ClassVar[bool] = False
+    finds_range: bool = False
     """Whether the disparities of a pair are measured first, and searched where they lie."""
     activation_bytes: ClassVar[Callable[..., int]]
     """Peak memory of a padded pair [bytes], by the network's config, height, width, type, rows."""

@@ -122,7 +122,8 @@ def _read_ply(path: AnyPath) -> tuple[np.ndarray, Ragged]:
     columns, lists = read_ply_elements(path)
     if not columns.keys() >= set("xyz"):
         raise InputError(f"{path}: no x, y and z among {list(columns)}. Export it again.")
-    vertices = np.stack([columns[axis].astype(np.float64) for axis in "xyz"], -1)
+    with np.errstate(invalid="ignore"):  # a signalling NaN is a NaN, and refused as such
+        vertices = np.stack([columns[axis].astype(np.float64) for axis in "xyz"], -1)
     faces = [name for name in lists if name.split()[0] in ("face", "tristrips")]
     indices = [name for name in faces if name.startswith("face ") and "ind" in name]
     named = [name for name in indices if "vert" in name] or indices
