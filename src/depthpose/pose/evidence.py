@@ -39,6 +39,7 @@ _STRAIGHT = 2.0  #: deviations of the noise, by which readings are off their lin
 _LEAST_INNER = 0.25  # share of the silhouette that its borders may leave
 _DISK = 1.3  # radius of the disk drawn for a sample, in median distances of samples
 _OBJECT_PX = 8000  # pixels of an object that are compared; of larger ones every n-th
+_NEIGHBOURS = 4
 _POINT_PX = 1.5  # side of a pixel of a drawn cloud, in distances of its points
 _JUMP_DIAMETERS = 0.02
 _JUMP_M = 0.01
@@ -136,11 +137,15 @@ def observe(
 
 
 def _camera_of_cloud(cloud_m: Float64[Tensor, "n 3"]) -> Float64[Tensor, "3 3"]:
-    """Intrinsic matrix of a camera to which neighbouring points of a cloud are a pixel apart."""
-    points_m = cloud_m.unique(dim=0)  # some clouds hold points twice
-    sample_m = take_evenly(points_m, 200)
-    apart_m, _ = KDTree(points_m.numpy()).query(sample_m.numpy(), k=2, workers=1)
-    focal_px = float(sample_m[:, 2].median()) / (_POINT_PX * float(np.median(apart_m[:, 1])))
+    """Intrinsic matrix of a camera to which neighbouring points of a cloud are a pixel apart.
+
+    The fourth neighbour of a pixel is as far as the first; of a cloud in which one surface is seen
+    through another, the first is much nearer than the points of one surface are.
+    """
+    rays = (cloud_m[:, :2] / cloud_m[:, 2:]).unique(dim=0)  # some clouds hold points twice
+    neighbours = min(_NEIGHBOURS + 1, len(rays))
+    apart, _ = KDTree(rays.numpy()).query(take_evenly(rays, 200).numpy(), neighbours, workers=1)
+    focal_px = 1 / (_POINT_PX * float(np.median(apart[:, -1])))
     return torch.diag(torch.tensor([focal_px, focal_px, 1.0], dtype=torch.float64))
 
 
