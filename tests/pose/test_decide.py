@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import replace
+from functools import partial
 
 import pytest
 import torch
@@ -83,11 +84,19 @@ def test_a_pose_that_a_search_proposed_needs_more_evidence_than_one_in_a_mask() 
 
 
 def test_poses_share_the_probability_of_one() -> None:
-    shares = share_among_poses([hypothesis(GOOD), hypothesis(BAD), hypothesis(BAD)])
+    shares = share_among_poses([hypothesis(GOOD), hypothesis(BAD), hypothesis(BAD)], is_masked=True)
     assert float(shares.sum()) == pytest.approx(1)
     assert float(shares[0]) > 0.99
     assert float(shares[1]) == float(shares[2])
-    assert share_among_poses([hypothesis(BAD)]).tolist() == [1.0]
+    assert share_among_poses([hypothesis(BAD)], is_masked=True).tolist() == [1.0]
+
+
+def test_without_a_mask_the_pose_that_explains_more_of_the_same_readings_is_likelier() -> None:
+    small = replace(GOOD, visible=10.0, supported=10.0)
+    few = replace(GOOD, seen_through=2.0, supported=38.0)
+    assert GOOD.visible == 40.0
+    shares = share_among_poses([hypothesis(small), hypothesis(few)], is_masked=False)
+    assert float(shares[1]) > 0.8
 
 
 def test_copies_share_by_a_patch_that_tells_them_apart() -> None:
@@ -101,9 +110,10 @@ def test_copies_share_by_a_patch_that_tells_them_apart() -> None:
 
 
 def test_votes_and_colour_tell_apart_what_depth_does_not() -> None:
-    shares = share_among_poses([hypothesis(GOOD, votes_rad=0.1), hypothesis(GOOD, votes_rad=1.0)])
+    voted = [hypothesis(GOOD, votes_rad=0.1), hypothesis(GOOD, votes_rad=1.0)]
+    shares = share_among_poses(voted, is_masked=True)
     assert float(shares[0]) > 0.95
-    for share in (share_among_poses, share_among_copies):
+    for share in (partial(share_among_poses, is_masked=True), share_among_copies):
         shares = share([hypothesis(GOOD, color=0.0), hypothesis(GOOD, color=math.log(9.0))])
         assert shares.tolist() == pytest.approx([0.1, 0.9])
 

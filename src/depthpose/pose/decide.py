@@ -119,14 +119,19 @@ class Competition:
         return self.best_share + sum(share for _, share in self.copies)
 
 
-def share_among_poses(hypotheses: Sequence[Hypothesis]) -> Float64[Tensor, " n"]:
+def share_among_poses(
+    hypotheses: Sequence[Hypothesis], *, is_masked: bool
+) -> Float64[Tensor, " n"]:
     """Share the probability of one among different poses of an object.
 
     If one of them is right the others are wrong, and wrong poses leave much contradicted: so each
     is weighed by how much better its evidence fits a right pose than a wrong one. They are poses of
-    the same readings: what another one explains and a pose does not contradicts it.
+    the same readings: where no mask says which, what another pose explains, and a pose does not,
+    contradicts it.
     """
-    most = max(hypothesis.evidence.supported for hypothesis in hypotheses)
+    most = 0.0
+    if not is_masked:
+        most = max(hypothesis.evidence.supported for hypothesis in hypotheses)
     weights: list[float] = []
     for hypothesis in hypotheses:
         evidence = hypothesis.evidence

@@ -76,7 +76,7 @@ def compete(
             leading.append(hypothesis(candidate.refined))
     if view is not None:  # one of its copies may have the print that is observed
         leading = _by_best_print(leading, prepared, view, alike)
-    shares = share_among_poses(leading)
+    shares = share_among_poses(leading, is_masked=bool(observation.is_object.any()))
     winner = int(shares.argmax())
     others_shares = [(h, float(shares[k])) for k, h in enumerate(leading) if k != winner]
 
