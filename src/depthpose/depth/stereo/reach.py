@@ -211,9 +211,16 @@ def doubt_outside(match: Match, reach: Reach, window: Window) -> tuple[Match, st
         return match, ""
     coarse_px, sure = reach.coarse.disparity_px, reach.coarse.confidence
     # Beside what is beyond, two pixels of the copy or its error away, it may be beyond too.
-    radius = round(2 * reach.step_px / STEP_PX)
-    nearest_px = F.max_pool2d(coarse_px[None], 2 * radius + 1, 1, radius)[0]
-    is_beyond = nearest_px > window.last_px - reach.step_px
+    is_beyond = coarse_px > window.last_px - reach.step_px
+    if bool(is_beyond.any()):
+        radius = round(2 * reach.step_px / STEP_PX)
+        wide = is_beyond.float()[None]
+        for kernel, padding in (
+            ((1, 2 * radius + 1), (0, radius)),
+            ((2 * radius + 1, 1), (radius, 0)),
+        ):
+            wide = F.max_pool2d(wide, kernel, 1, padding)
+        is_beyond = wide[0] > 0
     is_last = match.disparity_px > window.last_px - STEP_PX / window.search.scale
     doubted = replace(match, confidence=match.confidence.masked_fill(is_beyond | is_last, 0.0))
     is_beyond = coarse_px > window.last_px + reach.step_px
