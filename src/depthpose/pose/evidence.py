@@ -10,6 +10,7 @@ object's own readings beside the drawn silhouette are not explained at all.
 
 import math
 from dataclasses import dataclass
+from typing import cast
 
 import numpy as np
 import torch
@@ -309,7 +310,10 @@ def _is_continued(
     supports[inner] = is_supported
 
     # The pixels beside the silhouette, and the nearest of the silhouette.
-    distance, nearest = ndimage.distance_transform_edt(~is_object, return_indices=True)
+    distance, nearest = cast(
+        "tuple[np.ndarray, np.ndarray]",
+        ndimage.distance_transform_edt(~is_object, return_indices=True),
+    )
     beside = np.stack(np.nonzero((distance > border) & (distance <= reach)))
     edge = nearest[:, beside[0], beside[1]]
     outward = beside - edge
