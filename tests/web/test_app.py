@@ -303,7 +303,7 @@ def test_a_picture_of_the_sky_alone_is_said_to_be_one(
     files = {"image": "left.png", "camera": "camera.json"}
     found = ask(page_without_matcher(0, nets), "depth", samples, files).json()
     assert found["said"] == (
-        "No pixel got a depth from one image; 95% of the image is taken for sky."
+        "No pixel got a depth from one image; 100% of the image is taken for sky."
     )
     assert found["scene"]["layers"][0]["count"] == 0
     assert "left.sky.png" in [file["name"] for file in found["files"]]
