@@ -5,7 +5,8 @@ the drawn depth, averaged over a few neighbours and counted in standard deviatio
 the object (:mod:`depthpose.pose.sensor`). A connected patch of residuals beyond three deviations
 contradicts the pose, however small its share of the whole: behind the drawn surface the camera saw
 through it (a free-space violation), before it the object bulges where the model does not, and the
-object's own readings beside the drawn silhouette are not explained at all.
+object's own readings beside the drawn silhouette are not explained at all. Where no mask says which
+readings are the object's, a surface that goes on straight across the silhouette does not end there.
 """
 
 import math

@@ -232,7 +232,9 @@ class Evidence:
     unobserved: float  #: part of it without a reading, or hidden by something nearer
     seen_through: float  #: patches behind which the camera saw: free-space violations
     bulging: float  #: patches of the object's own readings before the model
-    beside: float  #: patches of the object's own readings beside the model's silhouette
+    #: patches beside the model's silhouette: of the object's own readings; without a mask, of those
+    #: in which the surface within the silhouette goes on
+    beside: float
     rms: float  #: root mean square residual of the supported part, in standard deviations
     noise_m: float  #: standard deviation of a reading on the object, estimated from the image
 
