@@ -2,6 +2,7 @@
 
 import json
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -20,6 +21,7 @@ from depthpose.pose.datasets import (
     write_detections,
 )
 from depthpose.pose.predictions import read_predictions
+from depthpose.pose.search import nothing_found
 from depthpose.pose.segmentation import (
     FCN,
     SegmentationConfig,
@@ -205,7 +207,10 @@ def test_a_data_set_is_searched_without_masks(
         assert sorted(objects) == ["bottle", "bracket"]
         assert bool(view.mask.all())
         pose = truths[int(view.name[-6:]), 7]
-        return [PoseEstimate(name="x", object="bracket", status="ok", camera_from_model=pose)]
+        found = PoseEstimate(
+            name=f"{view.name}_0", object="bracket", status="ok", camera_from_model=pose
+        )
+        return [found, replace(nothing_found(view, "bottle", [], 0.0), name=f"{view.name}_1")]
 
     monkeypatch.setattr(GeoPoseNet, "find_in", find_in)
     words = ["pose", "predict", "--bop", str(synthetic.folder), "--weights", str(weights)]

@@ -1,6 +1,8 @@
 """``pose predict`` with boxes, detections and label maps, an oracle in place of the network."""
 
 import json
+from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -22,6 +24,7 @@ from depthpose.core.camera import Camera, write_camera
 from depthpose.core.files import write_depth_png
 from depthpose.pose.datasets import encode_rle
 from depthpose.pose.datasets.masks import mask_box
+from depthpose.pose.search import nothing_found
 from depthpose.pose.types import PoseEstimate, ViewInput
 from depthpose.pose.weights import write_pose_weights
 
@@ -246,11 +249,13 @@ def test_every_object_that_is_looked_for_has_a_row(
     """The bracket is found, the bottle is not: tables, poses.json and page say both."""
     words, _ = scene
 
-    def find_in(_: Oracle, view: ViewInput, __: object) -> list[PoseEstimate]:
-        if not bool(view.depth_m.isfinite().any()):
-            return []
-        pose = POSES["bracket"]
-        return [PoseEstimate(name="x", object="bracket", status="ok", camera_from_model=pose)]
+    def find_in(_: Oracle, view: ViewInput, objects: Sequence[str]) -> list[PoseEstimate]:
+        rows = [nothing_found(view, name, [], 0.0) for name in objects]
+        if bool(view.depth_m.isfinite().any()):
+            rows[0] = PoseEstimate(
+                name="x", object="bracket", status="ok", camera_from_model=POSES["bracket"]
+            )
+        return [replace(row, name=f"{view.name}_{k}") for k, row in enumerate(rows)]
 
     monkeypatch.setattr(Oracle, "find_in", find_in)
     write_depth_png(tmp_path / "depth" / "dark.png", torch.full((240, 320), torch.nan), 0.001)

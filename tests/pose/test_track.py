@@ -231,7 +231,7 @@ def test_a_frame_that_cannot_be_read_does_not_end_the_sequence() -> None:
     assert [one.name for one in found] == [f"input_{k}" for k in range(6)]
     assert [one.tracking for one in found] == ["tracked"] * 2 + [None, "tracked", None, "tracked"]
     assert [one.status for one in found].count("unreadable") == 2
-    assert "a NoneType where numbers belong" in found[2].reason
+    assert "there is no frame" in found[2].reason
     assert "320x233" in found[4].reason
     assert max(error_of(found[k], poses[k]) for k in (3, 5)) < 0.003
     assert net.calls == []  # nothing was looked for

@@ -4,7 +4,7 @@ from collections.abc import Callable, Iterable, Iterator, Sequence, Sized
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import TypeVar
 
 import torch
 from tqdm import tqdm
@@ -288,7 +288,7 @@ class PoseEstimator:
 
     def track(
         self,
-        frames: Iterable[AnyArray],
+        frames: Iterable[AnyArray | None],
         camera: AnyCamera | None = None,
         object: str | None = None,
         first: Rigid | AnyArray | None = None,
@@ -330,12 +330,14 @@ class PoseEstimator:
         if camera is not None:
             made = partial(view_input, mask=None, camera=camera, object=which, unit=unit)
 
-        def read(number: int, frame: Any) -> AnyInput | PoseEstimate:  # noqa: ANN401  # bad ones too
+        def read(number: int, frame: AnyArray | None) -> AnyInput | PoseEstimate:
             name = f"{_NAME}_{number}"
-            try:
-                return made(frame, name=name)
-            except InputError as error:
-                reason = str(error)
+            reason = f"{name}: there is no frame, a None in its place"
+            if frame is not None:
+                try:
+                    return made(frame, name=name)
+                except InputError as error:
+                    reason = str(error)
             return PoseEstimate(name=name, object=which, status="unreadable", reason=reason)
 
         return self.track_in((read(*one) for one in enumerate(frames)), which, start)
