@@ -231,17 +231,17 @@ def decide(
     free = free_motions(model.symmetries.continuous, best.pose)
     observable, weakest = observability(cloud.cloud_m, best.pose, surface, free)
     identity = None
-    reason = None
+    withheld = None
     if observable < refusal.min_observability:
         motion = "rotation" if float(weakest[:3].norm()) > math.sqrt(0.5) else "shift"
-        reason = Refusal(
+        withheld = Refusal(
             status="not observable",
             reason=f"the visible part of the object leaves one {motion} undetermined: it moves the "
             f"surface along its normals by {observable:.1%} of the motion only; no declared "
             "symmetry allows it. Declare the symmetry, or look from a side that shows more",
         )
     elif probability < refusal.min_probability:
-        reason = Refusal(status="doubtful", reason=contradiction(evidence, probability))
+        withheld = Refusal(status="doubtful", reason=contradiction(evidence, probability))
     elif config.with_icp and refusal.max_size_error < 1:
         identity = identify(
             cloud.cloud_m,
@@ -255,7 +255,7 @@ def decide(
             config.object_deviation_m,
         )
         if identity.status == "contradicted":
-            reason = Refusal(status="doubtful", reason=identity.reason)
+            withheld = Refusal(status="doubtful", reason=identity.reason)
     facts: dict[str, Any] = {
         "name": cloud.name,
         "object": model.name,
@@ -266,10 +266,10 @@ def decide(
         "identity": identity,
         "seconds": {**seconds, "decision": time.perf_counter() - began},
     }
-    if reason is not None:  # all but the pose, so that nobody takes it for an estimate
-        is_doubtful_cloud = cloud.view is None and reason.status == "doubtful"
-        words = reason.reason + OTHER_FRAME * is_doubtful_cloud
-        return PoseEstimate(status=reason.status, reason=words, **facts)
+    if withheld is not None:  # all but the pose, so that nobody takes it for an estimate
+        is_doubtful_cloud = cloud.view is None and withheld.status == "doubtful"
+        words = withheld.reason + OTHER_FRAME * is_doubtful_cloud
+        return PoseEstimate(status=withheld.status, reason=words, **facts)
 
     covariance = without_motions(best.covariance, free) if len(free) else best.covariance
     competitors = [(h, share, True) for h, share in competition.copies]
@@ -319,6 +319,10 @@ def contradiction(evidence: Evidence, probability: float) -> str:
         ),
     }
     worst = max(parts, key=lambda words: parts[words])
+    if parts[worst] < LEAST_AREA / 4:
+        worst = "too little of the object was observed"
+        if evidence.rms > WRONG_RMS:
+            worst = f"its residuals are {evidence.rms:.1f} times what the sensor explains"
     return (
         f"the best pose is right with a probability of {probability:.0%}: {worst}. Another object, "
         "a mask of more than the object, or too little of it"

@@ -241,8 +241,7 @@ class PoseEstimator:
         """Find and pose known objects in a depth image without masks, the best answer first.
 
         Point pairs of the whole image vote for poses of each object; where the image agrees with
-        one, the object is estimated from the points there. What is refused is left out, and, where
-        several objects are asked for, what is likelier not there than there.
+        one, the object is estimated from the points there. What is refused is left out.
 
         Args:
             depth: as for :meth:`estimate`.
@@ -275,7 +274,7 @@ class PoseEstimator:
         Args:
             view: depth and camera.
             objects: which may be there.
-            is_sure: answer only what is likelier there than not, and search once.
+            is_sure: search once, without further rounds for more of the same object.
         """
         targets = SearchTargets(
             names=objects,

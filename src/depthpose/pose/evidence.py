@@ -42,6 +42,8 @@ _LEAST_INNER = 0.25  # share of the silhouette that its borders may leave
 _DISK = 1.3  # radius of the disk drawn for a sample, in median distances of samples
 _OBJECT_PX = 8000  # pixels of an object that are compared; of larger ones every n-th
 _NEIGHBOURS = 4
+_FINEST_RAD = 2e-4
+"""No sensor has finer pixels: nearer neighbours are of several frames in one cloud."""
 _POINT_PX = 1.5  # side of a pixel of a drawn cloud, in distances of its points
 _JUMP_DIAMETERS = 0.02
 _JUMP_M = 0.01
@@ -147,7 +149,8 @@ def _camera_of_cloud(cloud_m: Float64[Tensor, "n 3"]) -> Float64[Tensor, "3 3"]:
     rays = (cloud_m[:, :2] / cloud_m[:, 2:]).unique(dim=0)  # some clouds hold points twice
     neighbours = min(_NEIGHBOURS + 1, len(rays))
     apart, _ = KDTree(rays.numpy()).query(take_evenly(rays, 200).numpy(), neighbours, workers=1)
-    focal_px = 1 / (_POINT_PX * float(np.median(apart[:, -1])))
+    spacing = max(float(np.median(apart[:, -1])), _FINEST_RAD)
+    focal_px = 1 / (_POINT_PX * spacing)
     return torch.diag(torch.tensor([focal_px, focal_px, 1.0], dtype=torch.float64))
 
 
@@ -300,20 +303,20 @@ def _is_continued(
     height, width = observation.depth_m.shape
     rows = slice(max(0, window[0].start - reach), min(height, window[0].stop + reach))
     columns = slice(max(0, window[1].start - reach), min(width, window[1].stop + reach))
-    inner = (
+    inset = (
         slice(window[0].start - rows.start, window[0].stop - rows.start),
         slice(window[1].start - columns.start, window[1].stop - columns.start),
     )
     shape = rows.stop - rows.start, columns.stop - columns.start
-    is_object = np.zeros(shape, bool)
-    is_object[inner] = is_drawn
+    is_silhouette = np.zeros(shape, bool)
+    is_silhouette[inset] = is_drawn
     supports = np.zeros(shape, bool)
-    supports[inner] = is_supported
+    supports[inset] = is_supported
 
     # The pixels beside the silhouette, and the nearest of the silhouette.
     distance, nearest = cast(
         "tuple[np.ndarray, np.ndarray]",
-        ndimage.distance_transform_edt(~is_object, return_indices=True),
+        ndimage.distance_transform_edt(~is_silhouette, return_indices=True),
     )
     beside = np.stack(np.nonzero((distance > border) & (distance <= reach)))
     edge = nearest[:, beside[0], beside[1]]

@@ -1,4 +1,4 @@
-"""A whole depth image as an object is searched in it: points, normals, and planes that are none."""
+"""A depth image prepared for a search: points, normals, and wide planes that are left out."""
 
 import math
 from dataclasses import dataclass
@@ -65,8 +65,8 @@ class Frame:
         points_m: in the camera frame.
         normals: toward the camera.
         is_smooth: where a normal is known.
-        plane_m: of the plane that a pixel shows: objects up to this diameter have no such side; 0
-            where it shows none.
+        plane_m: diameter [m] up to which no object has the plane at a pixel as a side; 0 where
+            there is no wide plane.
         nearest_m: least depth of the pixels up to two away; infinite where none has a reading.
         noise_per_m: standard deviation of a reading, for the square of the depth in metres.
     """
@@ -173,7 +173,7 @@ def _planes(
     normals: Float64[Tensor, "h w 3"],
     noise_per_m: float,
 ) -> Float64[Tensor, "h w"]:
-    """Find the planes of an image; give each of their pixels what objects have no such side."""
+    """Find wide planes by RANSAC; give each of their pixels its ``Frame.plane_m``."""
     is_left = depth_m > 0
     plane_m = torch.zeros_like(depth_m)
     least = max(_LEAST_POINTS, _LEAST_SHARE * int(is_left.sum()))

@@ -25,7 +25,7 @@ _UNEXPLAINED_MORE = 0.25
 """A competing pose that leaves by so much more of the readings unexplained is not compared."""
 _MOST_LEADING = 8  #: poses that are compared, and of one of them so many copies
 _MOST_COPIES = 36
-_SAME_PRINT_RAD = 0.1  # poses at which the same print is observed
+_SAME_PRINT_RAD = 0.1  # poses nearer than this show the same surface colours, the "print"
 
 
 def compete(
@@ -82,7 +82,12 @@ def compete(
 
     # And which of its copies?
     pose = leading[winner].pose
-    source = replace(refined, camera_from_model=pose, covariance=leading[winner].covariance)
+    source = replace(
+        refined,
+        camera_from_model=pose,
+        covariance=leading[winner].covariance,
+        residual_m=refined.residual_m.new_tensor(leading[winner].residual_m),
+    )
     group = [leading[winner]]
     if view is not None:
         group = [replace(group[0], log_color=_log_color(pose, prepared, view))]

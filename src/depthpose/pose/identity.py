@@ -78,14 +78,16 @@ def scale_of(
     local_m = pose.inverse().apply(take_evenly(cloud_m.double(), POINTS))
     starts = torch.tensor(_STARTS, dtype=torch.float64)
     few_m = take_evenly(local_m, _ROUGH_POINTS).expand(len(starts), -1, -1)
-    times, grown_m = _grow(few_m, starts, surface, is_exact=False)
-    costs = distance_to(grown_m, surface, times, is_exact=False).square()
+    times, grunscaled_m = _grow(few_m, starts, surface, is_exact=False)
+    costs = distance_to(grunscaled_m, surface, times, is_exact=False).square()
     costs[0] -= _TRUST
     start = starts[costs.argmin()][None]
-    times, grown_m = _grow(local_m[None], start, surface, is_exact=True)
-    reached = distance_to(grown_m, surface, times, is_exact=True)
+    times, grunscaled_m = _grow(local_m[None], start, surface, is_exact=True)
+    reached = distance_to(grunscaled_m, surface, times, is_exact=True)
     gain = distance_to(local_m, surface, is_exact=True) - reached[0]
-    equations = _growth_equations(grown_m, times, surface, NEAR * surface.diameter_m, is_exact=True)
+    equations = _growth_equations(
+        grunscaled_m, times, surface, NEAR * surface.diameter_m, is_exact=True
+    )
     return Scale(float(times), _scale_deviation(equations, object_m), float(gain))
 
 
@@ -108,8 +110,8 @@ def _growth_equations(
     """Linearise the distances of points to a surface that is so many times as large."""
     middle_m = surface.middle_m
     scale = times[:, None, None]
-    own_m = (local_m - middle_m) / scale + middle_m
-    index = surface.nearest(own_m) if is_exact else surface.boxes.look_up(own_m)
+    unscaled_m = (local_m - middle_m) / scale + middle_m
+    index = surface.nearest(unscaled_m) if is_exact else surface.boxes.look_up(unscaled_m)
     normal = surface.normals[index]
     arm_m = scale * (surface.points_m[index] - middle_m)
     offset_m = local_m - middle_m - arm_m
@@ -205,15 +207,15 @@ def mirror_gain(cloud_m: Float[Tensor, "n 3"], pose: Rigid, surface: Surface) ->
     tried = refine_roughly(mirrored_m, Rigid(R, middle_m - R @ middle_m), surface, config)
     few_m = take_evenly(mirrored_m, 100).expand(len(tried.R), -1, -1)
     rough = distance_to(tried.inverse().apply(few_m), surface, is_exact=False)
-    own = distance_to(take_evenly(local_m, 100), surface, is_exact=False)
-    if float(rough.min() - own) > _CLEAR:
-        return float(own - rough.min())
+    unmirrored = distance_to(take_evenly(local_m, 100), surface, is_exact=False)
+    if float(rough.min() - unmirrored) > _CLEAR:
+        return float(unmirrored - rough.min())
     nearest = rough.argmin()[None]  # one is enough: three found no other gain in 24 views
     config = replace(config, start_distance_diameters=config.end_distance_diameters)
-    found = refine_pose(mirrored_m, tried[nearest], surface, config)
-    exact_m = found.camera_from_model.inverse().apply(mirrored_m[None])
-    own = distance_to(local_m, surface, is_exact=True)
-    return float(own - distance_to(exact_m, surface, is_exact=True).min())
+    refined = refine_pose(mirrored_m, tried[nearest], surface, config)
+    exact_m = refined.camera_from_model.inverse().apply(mirrored_m[None])
+    unmirrored = distance_to(local_m, surface, is_exact=True)
+    return float(unmirrored - distance_to(exact_m, surface, is_exact=True).min())
 
 
 def sensor_size_error(distance_m: float, focal_px: float, diameter_m: float) -> float:

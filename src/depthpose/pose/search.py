@@ -137,21 +137,21 @@ def find_objects(view: ViewInput, targets: SearchTargets) -> list[PoseEstimate]:
     view = _window_of_region(view)
     smallest_m = min(targets.object_of(name).surface.diameter_m for name in targets.names)
     frame = prepare_frame(view.depth_m, view.K, smallest_m)
-    is_left = view.mask[:: frame.step, :: frame.step].clone()
+    is_unclaimed = view.mask[:: frame.step, :: frame.step].clone()
     names = list(targets.names)
     found: list[_Judged] = []
     taken: list[_Judged] = []
     misses: list[_Miss] = []
     for _ in range(1 if targets.is_single else _ROUNDS):
-        groups = _group(_propose(frame, is_left, names, targets), taken, frame, targets)
+        groups = _group(_propose(frame, is_unclaimed, names, targets), taken, frame, targets)
         judged, missed = _judge(groups, frame, view, targets)
         misses += missed
         if targets.is_single:  # what lies mostly beside the region is something else
-            judged = [p for p in judged if float(is_left[p.explained].double().mean()) > 0.5]
+            judged = [p for p in judged if float(is_unclaimed[p.explained].double().mean()) > 0.5]
         more, taken = _suppress(judged, taken)
         found += more
         for place in more:
-            is_left &= ~place.explained
+            is_unclaimed &= ~place.explained
         count = Counter(place.object for place in found)
         names = sorted({place.object for place in more if count[place.object] > 1})
         if not names:
@@ -188,14 +188,14 @@ def _noise_and_size(place: _Place, frame: Frame, targets: SearchTargets) -> tupl
 
 
 def _propose(
-    frame: Frame, is_left: Bool[Tensor, "h w"], names: Sequence[str], targets: SearchTargets
+    frame: Frame, is_unclaimed: Bool[Tensor, "h w"], names: Sequence[str], targets: SearchTargets
 ) -> list[_Place]:
     """Propose poses of every object; keep the best of all, and some of each object."""
 
     def propose(name: str) -> list[tuple[float, int, str, Rigid]]:
         pairs = targets.object_of(name).pairs
         assert pairs is not None
-        poses, agreement = propose_in_frame(frame, is_left, pairs, len(names))
+        poses, agreement = propose_in_frame(frame, is_unclaimed, pairs, len(names))
         return [
             (float(agreement[rank]), rank, name, poses[rank])
             for rank in range(min(len(agreement), _MOST_PLACES))

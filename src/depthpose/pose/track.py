@@ -178,17 +178,17 @@ def _follow(
     icp = replace(target.config.icp, starts=1)
     refined = refine_best(cloud_m, poses, surface, icp).refined
     pose = refined.camera_from_model.double()
-    object_m = scene_m[_is_near(scene_m, pose[None], surface, NEAR) & ~is_support]
-    if len(object_m) < _LEAST_POINTS:
+    object_points_m = scene_m[_is_near(scene_m, pose[None], surface, NEAR) & ~is_support]
+    if len(object_points_m) < _LEAST_POINTS:
         return Refusal(
             status="too few points",
-            reason=f"{len(object_m)} points lie on the object, below {_LEAST_POINTS}",
+            reason=f"{len(object_points_m)} points lie on the object, below {_LEAST_POINTS}",
         )
 
     # What the frame says: by itself, and together with the frames before.
     view = given if isinstance(given, ViewInput) else given.view
     observation = observe(
-        object_m,
+        object_points_m,
         view,
         surface.diameter_m,
         target.config.object_deviation_m,
@@ -205,7 +205,7 @@ def _follow(
         return Refusal(status="doubtful", reason=contradiction(evidence, certainty))
 
     free = free_motions(target.model.symmetries.continuous, pose)
-    observable, _ = observability(object_m, pose, surface, free)
+    observable, _ = observability(object_points_m, pose, surface, free)
     if observable < target.refusal.min_observability:
         return Refusal(
             status="not observable",

@@ -1,4 +1,4 @@
-"""Directions to keypoints to pose: least squares, RANSAC, rigidity, Kabsch, covariances."""
+"""Proposals of poses: a network's keypoints, point pairs of a cloud, and of a whole image."""
 
 from depthpose.pose.propose.keypoints import consistent_keypoints as consistent_keypoints
 from depthpose.pose.propose.keypoints import fit_pose as fit_pose

@@ -67,13 +67,13 @@ def propose_in_frame(
 
     Args:
         frame: the image.
-        is_left: the pixels that vote.
+        is_left: pixels that may vote: in the mask, and not explained by an object found before.
         table: point pairs of the model.
         models: so many are searched in the image.
 
     Returns:
-        Poses, roughly refined, those with which the image agrees best first, and the rough log
-        odds of each being wrong.
+        Poses, roughly refined, the best first, and how well the image agrees with each, at most 1
+        (``ImageEvidence.agreement``).
     """
     surface = table.surface
     points_m, normals = _scene_points(frame, is_left, surface)

@@ -322,22 +322,22 @@ def _peaks(
     same = (keys[:, 1:] == keys[:, :1]).nonzero(as_tuple=True)
     size[:, 1:][same] = 0
     turn_bin = ((turn_rad + math.pi) / (2 * math.pi) * TURNS).long().clamp(max=TURNS - 1)
-    said = (row[:, None] * len(table.bounds) + keys) * TURNS + turn_bin[:, None]
-    said = torch.where(size > 0, said, -1).flatten()
-    _, place = said.unique(return_inverse=True)
-    first = torch.full((int(place.max()) + 1 if len(place) else 0,), len(said))
-    first = first.scatter_reduce_(0, place, torch.arange(len(said)), "amin")
-    first = first[said[first] >= 0].sort().values
+    vote_key = (row[:, None] * len(table.bounds) + keys) * TURNS + turn_bin[:, None]
+    vote_key = torch.where(size > 0, vote_key, -1).flatten()
+    _, place = vote_key.unique(return_inverse=True)
+    first = torch.full((int(place.max()) + 1 if len(place) else 0,), len(vote_key))
+    first = first.scatter_reduce_(0, place, torch.arange(len(vote_key)), "amin")
+    first = first[vote_key[first] >= 0].sort().values
     size = size.flatten()[first]
-    few = size.clamp(max=MOST_ALIKE)
-    asked = torch.repeat_interleave(torch.arange(len(few)), few)
-    offset = torch.arange(len(asked)) - (few.cumsum(0) - few)[asked]
-    pair = table.bounds[keys.flatten()[first][asked]] + offset
-    scene = first[asked] // keys.shape[1]
+    pairs_read = size.clamp(max=MOST_ALIKE)
+    key_of_pair = torch.repeat_interleave(torch.arange(len(pairs_read)), pairs_read)
+    offset = torch.arange(len(key_of_pair)) - (pairs_read.cumsum(0) - pairs_read)[key_of_pair]
+    pair = table.bounds[keys.flatten()[first][key_of_pair]] + offset
+    scene = first[key_of_pair] // keys.shape[1]
     turn = (turn_rad[scene] - table.turn_rad[pair]) / (2 * math.pi) % 1
     bin_ = (turn * TURNS).long().clamp(max=TURNS - 1)
     cell = (row[scene] * models + table.first[pair]) * TURNS + bin_
-    weight = 1 / size[asked].double().sqrt()
+    weight = 1 / size[key_of_pair].double().sqrt()
     votes = torch.bincount(cell, weight, minlength=count * models * TURNS)
     votes = votes.reshape(count, models, TURNS)
     votes = 2 * votes + votes.roll(1, -1) + votes.roll(-1, -1)
