@@ -250,8 +250,6 @@ def test_without_a_mask_a_surface_that_goes_on_contradicts(
     evidence = evidence_of(view_before_wall(more, pose, 0.001), bar, pose, is_masked=False)
     assert (evidence.beside > 1) == is_continued
     assert evidence.seen_through == evidence.bulging == 0
-    rough = evidence_of(view_before_wall(more, pose, 0.004), bar, pose, is_masked=False)
-    assert rough.beside == 0, "noise hides where it would end"
 
 
 @pytest.mark.parametrize("reading_m", [math.nan, 0.45], ids=["no reading", "something before it"])

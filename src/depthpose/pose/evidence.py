@@ -34,8 +34,10 @@ BORDER_PX = 3
 the silhouette."""
 _LEAST_FILLED = 0.3  # share of the averaged square that must have residuals
 _LEAST_PATCH = 0.25  # independent patches: smaller ones are accidents of edges and drop-outs
-_ACROSS = (-1.0, -0.5, 0.5, 1.0)
-"""Where readings are compared across a silhouette: as shares of the way from it to a pixel."""
+_WITHIN = -0.5
+_ACROSS = (-1.0, _WITHIN, 0.5, 1.0)
+"""Where readings are compared across a silhouette: as shares of the way from it to a pixel. The
+nearest one within supports the pose; of thin things the next lies beyond."""
 _LEVEL_M = 0.0005  #: a surface is plane to so much
 _STRAIGHT = 2.0  #: deviations of the noise, by which readings are off their line at most
 _LEAST_INNER = 0.25  # share of the silhouette that its borders may leave
@@ -49,7 +51,6 @@ _JUMP_DIAMETERS = 0.02
 _JUMP_M = 0.01
 """Drawn neighbours that differ in depth by more than both are the two sides of an edge."""
 _FAR_M = np.float32(1e6)
-_HIDDEN_DIAMETERS = 0.03  #: of larger noise, steps at which an object ends are not seen
 _line = np.stack([np.ones(4), np.array(_ACROSS)], 1)
 _OFF_LINE = np.eye(4) - _line @ np.linalg.pinv(_line)  # residuals of the line through four values
 _MARGIN = 0.6  # half of the window about an object, in diameters
@@ -266,7 +267,7 @@ def compare(observation: Observation, pose: Rigid, surface: Surface) -> Evidence
         is_beside &= np.logical_not(ndimage.binary_dilation(is_shown, iterations=border))
         beside_px = patch_px
     else:  # no mask says which readings are the object's: those that go on where the model ends
-        is_beside = _is_continued(observation, is_drawn, is_supported, window, surface.diameter_m)
+        is_beside = _is_continued(observation, is_drawn, is_supported, window)
         beside_px = patch_px / 2  # a patch beside the silhouette is as long as others, half as wide
     visible = float(inner.sum()) / patch_px
     supported = float(is_supported.sum()) / patch_px
@@ -289,14 +290,13 @@ def _is_continued(
     is_drawn: np.ndarray,
     is_supported: np.ndarray,
     window: tuple[slice, slice],
-    diameter_m: float,
 ) -> Bool[np.ndarray, "h w"]:
     """Mark readings beside the silhouette in which the surface within it goes on.
 
     At its silhouette an object ends: by a step in depth, or by an edge where it touches something.
     A box that is posed on the side of a larger one ends where the readings go on straight. Four
-    readings on a line across the silhouette, two of them within it, are straight in 1 / depth where
-    they are of one plane.
+    readings on a line across the silhouette, one or two of them within it, are straight in
+    1 / depth where they are of one plane.
     """
     border = math.ceil(BORDER_PX / observation.step + observation.patch_px / 2)
     reach = border + max(1, round(observation.patch_px / 2))
@@ -327,26 +327,15 @@ def _is_continued(
         pixel = edge + np.rint(times * outward).astype(int)
         row, column = np.clip(pixel, 0, np.array(shape)[:, None] - 1)
         across.append(inverse[row, column])
-        if times < 0:
+        if times == _WITHIN:
             across[-1] = np.where(supports[row, column], across[-1], np.nan)
     values = np.stack(across)
     bend = np.abs(_OFF_LINE @ values).max(0)
     is_continued = np.zeros((height, width), bool)
-    if hides_ends(observation.noise.white_m, diameter_m):
-        return is_continued
-    is_straight = bend <= _off_line_m(observation.noise.white_m) * values[0] ** 2
+    noise_m = math.hypot(observation.noise.white_m, _LEVEL_M)
+    is_straight = bend <= _STRAIGHT * noise_m * values[0] ** 2
     is_continued[rows, columns][tuple(beside)] = is_straight
     return ndimage.binary_closing(is_continued)
-
-
-def hides_ends(noise_m: float, diameter_m: float) -> bool:
-    """Whether the noise of a reading hides the steps at which an object of a diameter ends."""
-    return _off_line_m(noise_m) > _HIDDEN_DIAMETERS * diameter_m
-
-
-def _off_line_m(noise_m: float) -> float:
-    """How far readings of one plane lie from their line at most."""
-    return _STRAIGHT * math.hypot(noise_m, _LEVEL_M)
 
 
 def _without_edges(

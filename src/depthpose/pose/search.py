@@ -23,7 +23,7 @@ from depthpose.core.rigid import Rigid
 from depthpose.pose.cloud import cloud_from_depth, grow_mask
 from depthpose.pose.copies import PreparedObject, with_copies
 from depthpose.pose.decide import LEAST_NAMED, PRIOR_PROPOSED, log_odds_right
-from depthpose.pose.evidence import BORDER_PX, hides_ends
+from depthpose.pose.evidence import BORDER_PX
 from depthpose.pose.frame import Frame, is_on_plane, largest_plane, prepare_frame
 from depthpose.pose.inputs import nothing_seen
 from depthpose.pose.propose.image import compare_with_image, propose_in_frame
@@ -157,13 +157,6 @@ def find_objects(view: ViewInput, targets: SearchTargets) -> list[PoseEstimate]:
         if not names:
             break
     found.sort(key=lambda place: -place.log_odds)
-    # Where noise hides the ends of an object, it fits everywhere: only the likeliest is given.
-    best = {place.object: place for place in reversed(found)}
-    found = [
-        place
-        for place in found
-        if place is best[place.object] or not hides_ends(*_noise_and_size(place, frame, targets))
-    ]
     spent_s = time.perf_counter() - began
     estimates = [
         replace(place.estimate, seconds={**place.estimate.seconds, "search": spent_s})
@@ -178,13 +171,6 @@ def find_objects(view: ViewInput, targets: SearchTargets) -> list[PoseEstimate]:
     if len(estimates) == 1:
         return [replace(estimates[0], name=view.name)]
     return [replace(estimate, name=f"{view.name}_{k}") for k, estimate in enumerate(estimates)]
-
-
-def _noise_and_size(place: _Place, frame: Frame, targets: SearchTargets) -> tuple[float, float]:
-    """Noise of a reading at a place, and the diameter of its object [m]."""
-    distance_m = float(place.pose.t_m[2])
-    diameter_m = targets.object_of(place.object).surface.diameter_m
-    return frame.noise_per_m * distance_m**2, diameter_m
 
 
 def _propose(

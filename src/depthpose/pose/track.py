@@ -149,7 +149,8 @@ def _next(
     pose = found.camera_from_model
     tracking = "lost" if pose is None else "found"
     estimate = replace(found, name=given.name, seconds=seconds, tracking=tracking)
-    if pose is None:
+    # A track that begins at something else stays there: it begins at an estimate that is `ok`.
+    if pose is None or (found.certainty is not None and not found.is_ok):
         return estimate, None
     certainty = min(max(found.certainty or 0.0, _LEAST_CERTAINTY), 1 - _LEAST_CERTAINTY)
     log_odds = math.log(certainty / (1 - certainty))
