@@ -149,8 +149,11 @@ def _next(
     pose = found.camera_from_model
     tracking = "lost" if pose is None else "found"
     estimate = replace(found, name=given.name, seconds=seconds, tracking=tracking)
-    # A track that begins at something else stays there: it begins at an estimate that is `ok`.
-    if pose is None or (found.certainty is not None and not found.is_ok):
+    if pose is None:
+        return estimate, None
+    # A track that begins at something else stays there: what was searched for must be `ok`.
+    is_searched = isinstance(given, ViewInput) and found.certainty is not None
+    if is_searched and not found.is_ok:
         return estimate, None
     certainty = min(max(found.certainty or 0.0, _LEAST_CERTAINTY), 1 - _LEAST_CERTAINTY)
     log_odds = math.log(certainty / (1 - certainty))
