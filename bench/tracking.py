@@ -236,9 +236,8 @@ def anew(net: GeoPoseNet, model: ObjectModel, frames: Sequence[Frame]) -> Row:
     said = []
     began = time.process_time()
     for frame in frames:
-        found = net.find_in(frame.view, [model.name])
-        nothing = PoseEstimate(name="", object=model.name, status="doubtful", reason="none")
-        said.append(verdict(model, points_m, frame, found[0] if found else nothing)[0])
+        best = net.find_in(frame.view, [model.name])[0]
+        said.append(verdict(model, points_m, frame, best)[0])
     spent = time.process_time() - began
     return {"object": model.name, "frames": len(frames), **counts(said),
             "frames a second": round(len(frames) / spent, 2)}  # fmt: skip

@@ -205,10 +205,10 @@ def find_mount(
     return Ground(**{name: round(number, _DECIMALS) for name, number in numbers.items()})
 
 
-def _join(one: tuple[float, float], other: tuple[float, float]) -> tuple[float, float]:
+def _join(first: tuple[float, float], second: tuple[float, float]) -> tuple[float, float]:
     """Give mean and deviation by two means with their deviations, weighed by inverse variances."""
-    weights = [1 / max(std, 1e-9) ** 2 for _, std in (one, other)]
-    mean = (weights[0] * one[0] + weights[1] * other[0]) / sum(weights)
+    weights = [1 / max(std, 1e-9) ** 2 for _, std in (first, second)]
+    mean = (weights[0] * first[0] + weights[1] * second[0]) / sum(weights)
     return mean, math.sqrt(1 / sum(weights))
 
 
@@ -242,8 +242,11 @@ def scale_by_mount(
     assert camera is not None and estimate.depth_m is not None  # noqa: PT018
     fit = fit_ground(estimate.depth_m, camera)
     if fit is None:
-        said = {"height": (camera.mount_height_m, "m"), "tilt": (camera.tilt_deg, "degrees")}
-        for what, (number, unit) in said.items():
+        mount_values = {
+            "height": (camera.mount_height_m, "m"),
+            "tilt": (camera.tilt_deg, "degrees"),
+        }
+        for what, (number, unit) in mount_values.items():
             if number is not None:
                 raise InputError(
                     f"{name}: no road is seen in its lower part, so a camera {what} of "
@@ -255,27 +258,27 @@ def scale_by_mount(
             f"{name}: a tilt of {camera.tilt_deg:g} degrees is given, and the road that is seen "
             f"says {fit.tilt_deg:.1f}. Negative is down; correct it, or omit it"
         )
-    found = find_mount(fit, image, None if mount is None else mount.last, rig)
+    ground = find_mount(fit, image, None if mount is None else mount.last, rig)
     if mount is not None:
-        mount.last = found
+        mount.last = ground
 
     depth_m = estimate.depth_m
-    seen = _plane(fit)
-    true = _plane(found)
-    multiple = float(true[1] / seen[1])
-    inverse = multiple / depth_m + _over_image(true - multiple * seen, camera, depth_m)
+    map_plane = _plane(fit)
+    road_plane = _plane(ground)
+    multiple = float(road_plane[1] / map_plane[1])
+    inverse = multiple / depth_m + _over_image(road_plane - multiple * map_plane, camera, depth_m)
     by_ground_m = 1 / inverse.clamp(min=1 / _FARTHEST_M)
-    off_plane = (_over_image(seen, camera, depth_m) * depth_m).clamp(min=1e-3).log().abs()
+    off_plane = (_over_image(map_plane, camera, depth_m) * depth_m).clamp(min=1e-3).log().abs()
     stands = (off_plane / _ON_PLANE - 1).clamp(0, 1)
     # A tilt that is off by an angle changes the logarithm of depth by it times depth / height.
-    tilt_std = math.radians(found.tilt_std_deg) / found.height_m
+    tilt_std = math.radians(ground.tilt_std_deg) / ground.height_m
     ground_variance = (
         (torch.maximum(by_ground_m, depth_m) * tilt_std).square()
         + stands * _FOOT_STD**2
         + _GIVEN_HEIGHT_STD**2
     )
     weight = rig.depth_std**2 / (rig.depth_std**2 + ground_variance)
-    return replace(rescale(estimate, (by_ground_m / depth_m) ** weight), ground=found)
+    return replace(rescale(estimate, (by_ground_m / depth_m) ** weight), ground=ground)
 
 
 def _over_image(plane: Float[Tensor, "3"], camera: Camera, like: Map) -> Map:

@@ -83,7 +83,7 @@ def find_segments(grey: Float[np.ndarray, "h w"]) -> Segments:
     if not count:
         return np.zeros((0, 5))
 
-    # Neighbours of like gradients hang together.
+    # Neighbours of like gradients are connected.
     number = np.full((grey.shape[0] + 2, grey.shape[1] + 2), -1)
     number[rows + 1, columns + 1] = np.arange(count)
     power = strength[rows, columns]

@@ -51,8 +51,8 @@ _JUMP_DIAMETERS = 0.02
 _JUMP_M = 0.01
 """Drawn neighbours that differ in depth by more than both are the two sides of an edge."""
 _FAR_M = np.float32(1e6)
-_line = np.stack([np.ones(4), np.array(_ACROSS)], 1)
-_OFF_LINE = np.eye(4) - _line @ np.linalg.pinv(_line)  # residuals of the line through four values
+_LINE = np.stack([np.ones(4), np.array(_ACROSS)], 1)
+_OFF_LINE = np.eye(4) - _LINE @ np.linalg.pinv(_LINE)  # residuals of the line through four values
 _MARGIN = 0.6  # half of the window about an object, in diameters
 
 
@@ -291,12 +291,18 @@ def _is_continued(
     is_supported: np.ndarray,
     window: tuple[slice, slice],
 ) -> Bool[np.ndarray, "h w"]:
-    """Mark readings beside the silhouette in which the surface within it goes on.
+    """Mark pixels beside the silhouette in which the surface within it goes on.
 
     At its silhouette an object ends: by a step in depth, or by an edge where it touches something.
     A box that is posed on the side of a larger one ends where the readings go on straight. Four
     readings on a line across the silhouette, one or two of them within it, are straight in
     1 / depth where they are of one plane.
+
+    Args:
+        observation: its readings, (h, w).
+        is_drawn: pixels of the silhouette, in the window of the drawing.
+        is_supported: of these the ones on which readings lie.
+        window: rows and columns of the drawing in the observation.
     """
     border = math.ceil(BORDER_PX / observation.step + observation.patch_px / 2)
     reach = border + max(1, round(observation.patch_px / 2))
@@ -331,9 +337,9 @@ def _is_continued(
             across[-1] = np.where(supports[row, column], across[-1], np.nan)
     values = np.stack(across)
     bend = np.abs(_OFF_LINE @ values).max(0)
-    is_continued = np.zeros((height, width), bool)
     noise_m = math.hypot(observation.noise.white_m, _LEVEL_M)
     is_straight = bend <= _STRAIGHT * noise_m * values[0] ** 2
+    is_continued = np.zeros((height, width), bool)
     is_continued[rows, columns][tuple(beside)] = is_straight
     return ndimage.binary_closing(is_continued)
 

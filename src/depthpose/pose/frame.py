@@ -274,7 +274,7 @@ def is_on_plane(
 def label_regions(
     depth_m: Float[Tensor, "h w"], is_left: Bool[Tensor, "h w"]
 ) -> Int64[Tensor, "h w"]:
-    """Number the pixels that hang together: neighbours, at corners too, without a jump in depth.
+    """Number the connected regions: neighbours, at corners too, without a jump in depth.
 
     Those that ``is_left`` marks count; what is beside them has the number of a region of its own.
     """

@@ -78,16 +78,14 @@ def scale_of(
     local_m = pose.inverse().apply(take_evenly(cloud_m.double(), POINTS))
     starts = torch.tensor(_STARTS, dtype=torch.float64)
     few_m = take_evenly(local_m, _ROUGH_POINTS).expand(len(starts), -1, -1)
-    times, grunscaled_m = _grow(few_m, starts, surface, is_exact=False)
-    costs = distance_to(grunscaled_m, surface, times, is_exact=False).square()
+    times, grown_m = _grow(few_m, starts, surface, is_exact=False)
+    costs = distance_to(grown_m, surface, times, is_exact=False).square()
     costs[0] -= _TRUST
     start = starts[costs.argmin()][None]
-    times, grunscaled_m = _grow(local_m[None], start, surface, is_exact=True)
-    reached = distance_to(grunscaled_m, surface, times, is_exact=True)
+    times, grown_m = _grow(local_m[None], start, surface, is_exact=True)
+    reached = distance_to(grown_m, surface, times, is_exact=True)
     gain = distance_to(local_m, surface, is_exact=True) - reached[0]
-    equations = _growth_equations(
-        grunscaled_m, times, surface, NEAR * surface.diameter_m, is_exact=True
-    )
+    equations = _growth_equations(grown_m, times, surface, NEAR * surface.diameter_m, is_exact=True)
     return Scale(float(times), _scale_deviation(equations, object_m), float(gain))
 
 

@@ -91,14 +91,15 @@ def ray_bend(depth_m: Float[Tensor, "h w"], K: Float[Tensor, "3 3"]) -> float | 
     weighted = 0.0
     for plane in planes:
         # (1 + bend (s - 1)) / d = a x + b y + c, times d: linear in the plane and the bend.
-        given = rays[plane] * reading_m[plane, None]
-        known = torch.ones(len(given), dtype=torch.float64)
+        points_m = rays[plane] * reading_m[plane, None]
+        ones = torch.ones(len(points_m), dtype=torch.float64)
         bent = 1 - stretch[plane]
-        plane_alone = torch.linalg.lstsq(given, torch.stack([known, bent], 1)).solution
-        known = known - given @ plane_alone[:, 0]
-        bent = bent - given @ plane_alone[:, 1]
+        plane_alone = torch.linalg.lstsq(points_m, torch.stack([ones, bent], 1)).solution
+        # What the plane alone leaves of both.
+        off_plane = ones - points_m @ plane_alone[:, 0]
+        bent = bent - points_m @ plane_alone[:, 1]
         total += float(bent.square().sum())
-        weighted += float((known * bent).sum())
+        weighted += float((off_plane * bent).sum())
     if count == 0 or total < count * _LEAST_BEND**2:
         return None
     return weighted / total
@@ -133,5 +134,5 @@ def _planes(
         if int(on_plane.sum()) < least:
             break
         planes.append(on_plane)
-        is_left = is_left & ~on_plane
+        is_left &= ~on_plane
     return planes

@@ -139,7 +139,7 @@ def find_objects(view: ViewInput, targets: SearchTargets) -> list[PoseEstimate]:
     frame = prepare_frame(view.depth_m, view.K, smallest_m)
     is_unclaimed = view.mask[:: frame.step, :: frame.step].clone()
     names = list(targets.names)
-    found: list[_Judged] = []
+    accepted: list[_Judged] = []
     taken: list[_Judged] = []
     misses: list[_Miss] = []
     for _ in range(1 if targets.is_single else _ROUNDS):
@@ -149,24 +149,24 @@ def find_objects(view: ViewInput, targets: SearchTargets) -> list[PoseEstimate]:
         if targets.is_single:  # what lies mostly beside the region is something else
             judged = [p for p in judged if float(is_unclaimed[p.explained].double().mean()) > 0.5]
         more, taken = _suppress(judged, taken)
-        found += more
+        accepted += more
         for place in more:
             is_unclaimed &= ~place.explained
-        count = Counter(place.object for place in found)
+        count = Counter(place.object for place in accepted)
         names = sorted({place.object for place in more if count[place.object] > 1})
         if not names:
             break
-    found.sort(key=lambda place: -place.log_odds)
+    accepted.sort(key=lambda place: -place.log_odds)
     spent_s = time.perf_counter() - began
     estimates = [
         replace(place.estimate, seconds={**place.estimate.seconds, "search": spent_s})
-        for place in found
+        for place in accepted
     ]
-    there = {estimate.object for estimate in estimates}
+    posed = {estimate.object for estimate in estimates}
     estimates += [
         nothing_found(whole, name, [miss for miss in misses if miss.object == name], spent_s)
         for name in targets.names
-        if name not in there
+        if name not in posed
     ]
     if len(estimates) == 1:
         return [replace(estimates[0], name=view.name)]

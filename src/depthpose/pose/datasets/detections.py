@@ -16,7 +16,7 @@ from depthpose.core.files.disk import refused_suffix
 from depthpose.pose.datasets.layouts import MOST, integer, number, numbers
 from depthpose.pose.datasets.masks import Runs, decode_rle, mask_box, read_runs
 
-Box = tuple[float | int, float | int, float | int, float | int]
+Box = tuple[float, float, float, float]
 """Left, top, right and bottom edge [px]: the first pixel reaches from 0 to 1, as COCO counts."""
 _NO_BOX = [-1.0] * 4  # as BOP writes the box of an empty mask
 _YOLO = "class cx cy w h [confidence]"
