@@ -3,6 +3,8 @@
 import csv
 import json
 import shutil
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -69,6 +71,29 @@ def test_a_cad_file_and_a_cloud_give_a_pose(cad: Path, tmp_path: Path) -> None:
     assert row["status"] in ("ok", "ambiguous")
     assert (tmp_path / "out/scan.pose.ply").is_file()
     assert (tmp_path / "out/report.html").is_file()
+
+
+def test_a_notice_on_a_file_that_the_report_reads_again_is_given_once(
+    cad: Path, tmp_path: Path
+) -> None:
+    write_cloud(tmp_path / "scan.pcd", read_cloud(tmp_path / "scan.ply"))
+    data = (tmp_path / "scan.pcd").read_bytes()
+    moved = data.replace(b"VIEWPOINT 0 0 0 1", b"VIEWPOINT 0.5 0 0 1")
+    (tmp_path / "scan.pcd").write_bytes(moved)
+    words = [
+        "--cad",
+        cad,
+        "--unit",
+        "mm",
+        "--cloud",
+        tmp_path / "scan.pcd",
+        "--out",
+        tmp_path / "o",
+    ]
+    command = [sys.executable, "-m", "depthpose", "pose", "predict", "--method", "register"]
+    done = subprocess.run([*command, *map(str, words)], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    assert done.stderr.count("VIEWPOINT 0.5 0 0 1 0 0 0") == 1
 
 
 def test_a_declared_symmetry_is_taken_and_doubted_aloud(cad: Path, tmp_path: Path) -> None:

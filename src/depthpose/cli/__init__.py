@@ -111,11 +111,17 @@ def main(words: Sequence[str] | None = None) -> int:
     lock = sys.modules.get("depthpose.core.run")  # not imported for --help
     before = lock.held_folders() if lock is not None else ()
     as_usual = warnings.formatwarning
+    shown: set[str] = set()
 
     def in_a_line(message: Warning | str, kind: type[Warning], *place: Any, **line: Any) -> str:  # noqa: ANN401
-        """Show our notices without the file and line of the code that gives them."""
-        is_ours = issubclass(kind, Notice)
-        return f"depthpose: {message}\n" if is_ours else as_usual(message, kind, *place, **line)
+        """Show each of our notices once, without the file and line of the code that gives it."""
+        if not issubclass(kind, Notice):
+            return as_usual(message, kind, *place, **line)
+        text = f"depthpose: {message}\n"
+        if text in shown:  # of a file that is read once more for the report
+            return ""
+        shown.add(text)
+        return text
 
     with lasting_streams() as output:
         warnings.formatwarning = in_a_line
