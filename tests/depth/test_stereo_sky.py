@@ -22,6 +22,7 @@ from depthpose.depth.labels import LabelConfig, label_pair
 from depthpose.depth.losses import sky_loss
 from depthpose.depth.predictions import read_estimate, write_estimate
 from depthpose.depth.stereo import LightMatcher, LightStereo, StereoNetwork, light, normalise
+from depthpose.depth.stereo.matcher import lower_where_disagreeing
 from depthpose.depth.train import StereoTask
 from depthpose.depth.train.config import StereoTraining
 from depthpose.depth.train.pairs import TrainingPairs
@@ -67,6 +68,15 @@ def estimated(apart_px: float = 0.0) -> DepthEstimate:
     image = torch.rand(3, 20, 30, generator=torch.Generator().manual_seed(0))
     net = FakestereoNet(UpperHalf())
     return net.estimate(image, rig(20, 30, apart_px), right=image, with_check=False)
+
+
+def test_the_sky_is_as_sure_as_it_was_where_the_right_view_matches_it_otherwise() -> None:
+    """Of a plain sky the two views never agree on a disparity, which says nothing against it."""
+    found = UpperHalf().match(torch.zeros(3, 4, 30), torch.zeros(3, 4, 30))
+    checked = lower_where_disagreeing(found, torch.full((4, 30), 14.0))
+    assert checked.confidence is not None
+    assert bool((checked.confidence[:2] == 1).all())
+    assert bool((checked.confidence[2:] < 0.6).all())
 
 
 def test_the_loss_is_the_cross_entropy_where_the_sky_is_known() -> None:

@@ -61,11 +61,18 @@ def tree(image: Tensor, column: int) -> Tensor:
     return image
 
 
+def car(image: Tensor) -> Tensor:
+    """A black car that the lower border cuts, a third as wide as the image."""
+    image[:, 70:, 50:104] = 0
+    return image
+
+
 @pytest.mark.parametrize(
     "image",
     [
         tree(noise(), 0),
         tree(noise(), 60),
+        car(noise()),
         bars(noise(), 1.0, bottom=0),  # an over-exposed sky
         bars(noise(), 0.5, bottom=0),  # a drawn one
         torch.zeros(3, H, W),
@@ -76,6 +83,7 @@ def tree(image: Tensor, column: int) -> Tensor:
     ids=[
         "tree in a corner",
         "tree",
+        "car",
         "white above",
         "grey above",
         "black",
@@ -97,6 +105,13 @@ def test_texture_is_what_spreads_by_more_than_rounding() -> None:
     assert float(seen[:10].min()) == 1
     image[:, 20:70, 30:120] = 0.9 + 3 * levels
     assert float(texture(image)[30:60, 40:110].min()) == 1
+
+
+def test_texture_of_a_large_image_is_that_of_the_picture_not_of_its_pixels() -> None:
+    """Bricks of 32 columns in an image of 2484, which a matcher sees at half that size."""
+    stripes = (torch.arange(2484) // 32 % 2).float().expand(3, 60, -1)
+    assert float(texture(stripes[:, :30, ::2])[:, 32:-32].min()) == 1
+    assert float(texture(stripes)[:, 64:-64].min()) == 1
 
 
 def rig() -> StereoRig:
