@@ -18,6 +18,7 @@ from depthpose.depth.datasets import (
     known_truths,
     lidar_truth,
     open_dataset,
+    read_known_depth,
     read_split,
 )
 from depthpose.depth.datasets.frames import read_object_calibration, read_plain_calibration
@@ -201,6 +202,17 @@ def test_annotated_depth_is_found_beside_the_drives(tmp_path: Path) -> None:
     inside = f"{drive}/proj_depth/groundtruth/image_02/0000000007.png"
     write_depth_png(tmp_path / "val" / inside, torch.full((H, W), 5.0))
     assert open_dataset(tmp_path).frames[0].depth == tmp_path / "val" / inside
+
+
+def test_what_is_known_of_a_depth_is_the_scan_where_there_is_one(tmp_path: Path) -> None:
+    make_raw(tmp_path)
+    drive = "2011_09_26_drive_0002_sync"
+    inside = f"{drive}/proj_depth/groundtruth/image_02/0000000007.png"
+    write_depth_png(tmp_path / "val" / inside, torch.full((H, W), 5.0))
+    for index in range(2):  # with an annotated map, and with a scan alone
+        known_m = read_known_depth(open_dataset(tmp_path), index)
+        assert known_m is not None
+        assert known_m[known_m.isfinite()].tolist() == pytest.approx([20.003, 10.003], abs=0.01)
 
 
 @pytest.mark.parametrize("home", ["", "data_depth_velodyne/"])

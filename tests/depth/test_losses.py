@@ -121,12 +121,12 @@ def test_no_truth_at_all_costs_nothing() -> None:
 
 
 def test_the_error_of_the_logarithm_counts_each_image_alike() -> None:
-    """Image 1 has one known pixel, off by a factor of e; image 2 has two, one off by e^2."""
+    """Image 1 has one known pixel, off by a factor of e; image 2 has two, one off by e^4."""
     truth = torch.tensor([[[2.0, NAN, 0.0]], [[2.0, 4.0, NAN]], [[NAN, NAN, 0.0]]])
     found = torch.tensor([[[2.0, 9.0, 9.0]], [[2.0, 4.0, 9.0]], [[9.0, 9.0, 9.0]]]).log()
     found[0, 0, 0] += 1
-    found[1, 0, 1] -= 2
-    assert float(log_disparity_loss(found, truth, (0.5, 50.0))) == pytest.approx((1 + 1) / 2)
+    found[1, 0, 1] -= 4
+    assert float(log_disparity_loss(found, truth, (0.5, 50.0))) == pytest.approx((1 + 2) / 2)
 
 
 def test_truth_beyond_the_range_counts_as_its_end() -> None:
