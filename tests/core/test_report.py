@@ -16,6 +16,7 @@ from depthpose.report.page import (
     Scene,
     Section,
     embedded,
+    frame_axes,
     markdown_table,
     plain_table,
     rising_scale,
@@ -32,6 +33,15 @@ def test_markdown_has_every_column_in_order() -> None:
         "| name | x | n | more |\n| --- | --- | --- | --- |\n"
         "| a\\|b | 0.1235 | 3 |  |\n| c | 80 |  |  |\n"
     )
+
+
+def test_a_frame_is_drawn_by_where_its_axes_point() -> None:
+    """Turned by 90 degrees about z: x points along the camera's y, y against its x."""
+    R = torch.tensor([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])
+    origin_m = torch.tensor([1.0, 2, 3])
+    axes = frame_axes(origin_m, R, 0.5)
+    assert axes.ends_m[:, 0].tolist() == [[1, 2, 3]] * 3
+    assert axes.ends_m[:, 1].tolist() == [[1, 2.5, 3], [0.5, 2, 3], [1, 2, 3.5]]
 
 
 def test_csv_keeps_every_digit(tmp_path: Path) -> None:

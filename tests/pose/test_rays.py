@@ -77,6 +77,9 @@ def test_a_view_of_distances_is_told_of_once_with_the_remedy(
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         view_input(distance_m, None, K, "part", "next")
+    other = K + torch.diag(torch.tensor([3.0, 3.0, 0.0]).double())
+    with pytest.warns(Notice, match="distance along each pixel's ray"):
+        view_input(distance_m, None, other, "part", "of another camera")
 
 
 def test_real_depth_is_along_the_axis_and_real_distance_is_told_of(real: Path) -> None:
