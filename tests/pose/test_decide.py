@@ -97,6 +97,12 @@ def test_without_a_mask_the_pose_that_explains_more_of_the_same_readings_is_like
     assert GOOD.visible == 40.0
     shares = share_among_poses([hypothesis(small), hypothesis(few)], is_masked=False)
     assert float(shares[1]) > 0.8
+    # Also one that nothing contradicts; within a mask it is the readings beside it that count.
+    clean = replace(GOOD, visible=20.0, supported=20.0, unobserved=0.0)
+    most = replace(GOOD, visible=60.0, supported=40.0, unobserved=10.0, seen_through=10.0)
+    both = [hypothesis(clean), hypothesis(most)]
+    assert float(share_among_poses(both, is_masked=False)[1]) > 0.9
+    assert float(share_among_poses(both, is_masked=True)[0]) > 0.9
 
 
 def test_copies_share_by_a_patch_that_tells_them_apart() -> None:

@@ -1,14 +1,16 @@
 """What a 3D view shows of a pose."""
 
+import pytest
 import torch
 from tests.pose.synthetic_objects import Oracle, box_faces, bracket, cloud_of, pose_at, tiny_weights
 
+from depthpose.core.camera import project
 from depthpose.core.files import Cloud
 from depthpose.core.rigid import Rigid
 from depthpose.pose.mesh import make_model
 from depthpose.pose.types import CloudInput, ObjectModel
 from depthpose.report.page import Lines
-from depthpose.report.pose import TRUE, keypoint_layers, pose_layers, vote_layer
+from depthpose.report.pose import TRUE, close_up, keypoint_layers, pose_layers, vote_layer
 
 
 def cube(*, with_repeats: bool = False, faces: int = 12) -> ObjectModel:
@@ -98,3 +100,20 @@ def test_a_refused_pose_still_shows_what_was_voted() -> None:
     middles_m = voted.shape.ends_m.mean(1).unflatten(0, (-1, 3))
     torch.testing.assert_close(middles_m, model.keypoints_m[:, None].expand_as(middles_m))
     assert len(keypoint_layers(model.keypoints_m, pose_at(), model)) == 2
+
+
+@pytest.mark.parametrize("place", [(120, 90), (0, 5), (198, 149)])
+def test_a_close_up_draws_a_pose_where_the_picture_shows_it(place: tuple[int, int]) -> None:
+    """Also at the border of the picture, beyond which the close-up is black."""
+    column, row = place
+    K = torch.tensor([[200.0, 0, 99.5], [0, 180, 74.5], [0, 0, 1]], dtype=torch.float64)
+    image = torch.zeros(3, 150, 200)
+    image[:, row, column] = 1
+    mask = torch.zeros(150, 200, dtype=torch.bool)
+    mask[max(row - 8, 0) : row + 9, max(column - 12, 0) : column + 13] = True
+    near, near_K = close_up(image, mask, K)
+    rows, columns = (near[0] > 0.5).nonzero(as_tuple=True)
+    middle = torch.stack([columns.double().mean(), rows.double().mean()])
+    ray = torch.linalg.inv(K) @ torch.tensor([column, row, 1.0], dtype=torch.float64)
+    assert torch.allclose(project(ray[None], near_K)[0], middle, atol=1.0)
+    assert len(rows) > 25
