@@ -111,6 +111,9 @@ def test_copies_share_by_a_patch_that_tells_them_apart() -> None:
     shares = share_among_copies([hypothesis(GOOD), *[hypothesis(keyway)] * 3])
     assert float(shares.sum()) == pytest.approx(1)
     assert float(shares[0]) > float(shares[1])
+    # A handle that should be seen and is not: another copy has it on the far side.
+    unseen = replace(GOOD, supported=30.0, unobserved=10.0)
+    assert float(share_among_copies([hypothesis(GOOD), hypothesis(unseen)])[0]) > 0.6
     alike = share_among_copies([hypothesis(GOOD)] * 4)
     assert alike.tolist() == pytest.approx([0.25] * 4)
 
