@@ -67,6 +67,18 @@ def test_an_identity_is_confirmed_where_the_size_that_fits_is_near(
     assert identity.reason.endswith(", and not that of the model") == (status == "not excluded")
 
 
+@pytest.mark.parametrize(("gain", "status"), [(0.03, "ok"), (0.07, "doubtful")])
+def test_another_size_refuses_where_it_fits_clearly_better(
+    gain: float, status: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """What is seen of a bowl from above fits at many sizes: one that gains little says nothing."""
+    monkeypatch.setattr("depthpose.pose.identity.scale_of", lambda *_: Scale(1.2, 0.02, gain))
+    found = estimated(1.0)
+    assert found.status == status
+    assert found.identity is not None
+    assert found.identity.status == ("not excluded" if status == "ok" else "contradicted")
+
+
 def test_without_icp_nobody_asks_whether_it_is_the_object() -> None:
     config = EstimateConfig(with_icp=False)
     net = Oracle(tiny_weights(bracket()), [TRUTH], config=config)
