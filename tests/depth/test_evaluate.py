@@ -2,6 +2,7 @@ import json
 import warnings
 from collections.abc import Callable
 from dataclasses import asdict, replace
+from functools import partial
 from pathlib import Path
 
 import pytest
@@ -12,6 +13,7 @@ from depthpose.core.camera import Camera, StereoRig, write_camera
 from depthpose.core.errors import InputError, Notice
 from depthpose.core.files import write_depth_png, write_image, write_map
 from depthpose.core.run import note_result
+from depthpose.core.runner import Job
 from depthpose.depth.datasets import Dataset, check_dataset, open_dataset
 from depthpose.depth.disparity import depth_from_disparity, disparity_advice, resized_map
 from depthpose.depth.estimator import FakestereoNet
@@ -373,15 +375,15 @@ def test_a_prediction_of_which_a_file_is_damaged_is_made_again(
 
     net = FakestereoNet(CallableMatcher(answer))
     sources = {frame.name: frame.left for frame in pairs.frames}
-    readers = {name: lambda i=i: pairs.read_input(i) for i, name in enumerate(sources)}
-    list(predict(net, readers, tmp_path, {}, sources))
+    jobs = [Job(name=f.name, read=partial(pairs.read_input, i)) for i, f in enumerate(pairs.frames)]
+    list(predict(net, jobs, tmp_path, {}, sources))
     files = {path: path.read_bytes() for path in sorted(tmp_path.glob("a.*"))}
     assert len(files) == 5, list(files)
     for path, good in files.items():
         for damaged in (None, good[: len(good) // 2], b"", good[:-1] + b"?"):
             path.unlink() if damaged is None else path.write_bytes(damaged)
             calls.clear()
-            list(predict(net, readers, tmp_path, {}, sources))
+            list(predict(net, jobs, tmp_path, {}, sources))
             assert len(calls) == 1, "this frame, and no other"
             assert path.read_bytes() == good
 
@@ -395,17 +397,17 @@ def test_predicting_goes_on_where_it_stopped(pairs: Dataset, tmp_path: Path) -> 
 
     net = FakestereoNet(CallableMatcher(answer))
     sources = {frame.name: frame.left for frame in pairs.frames}
-    readers = {name: lambda i=i: pairs.read_input(i) for i, name in enumerate(sources)}
+    jobs = [Job(name=f.name, read=partial(pairs.read_input, i)) for i, f in enumerate(pairs.frames)]
     constant = {"method": "constant"}
-    first = iter(predict(net, readers, tmp_path / "p", constant, sources))
+    first = iter(predict(net, jobs, tmp_path / "p", constant, sources))
     assert next(first) == "a"
-    assert len(list(predict(net, readers, tmp_path / "p", constant, sources))) == 3
+    assert len(list(predict(net, jobs, tmp_path / "p", constant, sources))) == 3
     assert len(calls) == 3
     with pytest.raises(InputError, match="Two settings never share a folder"):
-        list(predict(net, readers, tmp_path / "p", {"method": "another"}, sources))
+        list(predict(net, jobs, tmp_path / "p", {"method": "another"}, sources))
     others = {name: tmp_path / f"other/{name}.png" for name in sources}
     with pytest.raises(InputError, match="'a' is the result of"):
-        list(predict(net, readers, tmp_path / "p", constant, others))
+        list(predict(net, jobs, tmp_path / "p", constant, others))
 
 
 def test_disparity_alone_is_written_without_metres(tmp_path: Path) -> None:

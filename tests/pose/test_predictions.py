@@ -13,10 +13,10 @@ from depthpose.core.errors import InputError, Notice
 from depthpose.core.rigid import Rigid, perturb
 from depthpose.pose.predictions import (
     VERSION,
-    Job,
     Place,
+    PoseJob,
     Prediction,
-    kept_predictions,
+    earlier_predictions,
     predict,
     read_bop_results,
     read_predictions,
@@ -137,8 +137,8 @@ def test_finished_work_is_not_done_again(tmp_path: Path) -> None:
         asked.extend(names)
         return [answer(name) for name in names]
 
-    def jobs(*names: str) -> list[Job[str]]:
-        return [Job(name=name, read=lambda name=name: name) for name in names]
+    def jobs(*names: str) -> list[PoseJob[str]]:
+        return [PoseJob(name=name, read=lambda name=name: name) for name in names]
 
     run = predict(estimate, jobs("a", "b", "c"), tmp_path, {"voxel_m": 0.008})
     assert [next(run).estimate.name for _ in range(2)] == ["a", "b"]
@@ -178,12 +178,12 @@ def test_damaged_files_are_refused(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("content", ["", "[{", "{}", '[{"name": 1}]'])
 def test_damaged_results_are_made_again_with_a_notice(tmp_path: Path, content: str) -> None:
-    assert kept_predictions(tmp_path) == {}
+    assert earlier_predictions(tmp_path) == {}
     write_predictions(tmp_path, [Prediction(estimate=answer())])
-    assert len(kept_predictions(tmp_path)) == 1
+    assert len(earlier_predictions(tmp_path)) == 1
     (tmp_path / "poses.json").write_text(content)
     with pytest.warns(Notice, match=r"poses\.json.* it is damaged, and made again"):
-        assert kept_predictions(tmp_path) == {}
+        assert earlier_predictions(tmp_path) == {}
 
 
 def schema() -> dict[str, Any]:

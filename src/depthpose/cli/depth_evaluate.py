@@ -13,9 +13,10 @@ from tqdm import tqdm
 
 from depthpose.cli.depth_options import MethodOptions
 from depthpose.cli.depth_predict import Method, MethodSource
-from depthpose.core import engine as jobs
+from depthpose.core import engine
 from depthpose.core.errors import InputError
 from depthpose.core.run import environment, find_rank, read_settings, wait_for
+from depthpose.core.runner import Job
 from depthpose.depth.baselines import NearestImageBaseline, RowDepthBaseline
 from depthpose.depth.config import Answer, BaselineName, MatcherConfig, Speed
 from depthpose.depth.datasets import Dataset, join_datasets, open_dataset, refuse_common
@@ -66,12 +67,12 @@ def predict_all(dataset: Dataset, method: Method, rule: Protocol, folder: Path) 
         pair = dataset.read_input(index)
         return pair if method.with_right else replace(pair, right=None)  # what it must not see
 
-    mine = usable[process.rank :: process.world]
-    readers = {frame.name: partial(read, i) for i, frame in mine}
+    mine = process.share_of(usable)
+    frame_jobs = [Job(name=frame.name, read=partial(read, i)) for i, frame in mine]
     sources = {f.name: f.seen_files(with_right=method.with_right) for _, f in usable}
     net = _Unchecked(method.net) if isinstance(method.net, FakestereoNet) else method.net
-    written = predict(net, readers, home, method.settings, sources)
-    for _ in tqdm(written, method.name, total=len(readers), disable=None, unit=" frames"):
+    written = predict(net, frame_jobs, home, method.settings, sources)
+    for _ in tqdm(written, method.name, total=len(frame_jobs), disable=None, unit=" frames"):
         pass
     if process.rank == 0:
         wait_for(list(sources), partial(is_finished, home))
@@ -297,8 +298,8 @@ def measure_shards(
     settings = read_settings(predictions)
     places = {frame.name: index for index, frame in enumerate(dataset.frames)}
     rows: dict[str, list[Measured] | str] = {}
-    for done in tqdm(jobs.read_results(predictions), name, disable=None, unit=" shards"):
-        for frame, files in jobs.shard_results(predictions, done):
+    for done in tqdm(engine.read_results(predictions), name, disable=None, unit=" shards"):
+        for frame, files in engine.shard_results(predictions, done):
             if frame not in places:
                 continue
             with tempfile.TemporaryDirectory(prefix="depthpose-") as folder:

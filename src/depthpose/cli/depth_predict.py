@@ -3,11 +3,10 @@
 import re
 import sys
 from collections import Counter
-from collections.abc import Callable, Collection, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass, field, replace
 from functools import partial
-from itertools import islice
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -37,21 +36,21 @@ from depthpose.core.files import (
 )
 from depthpose.core.files.disk import find_partners, read_text
 from depthpose.core.files.images import LISTED_SUFFIXES, refuse_among_inputs
+from depthpose.core.runner import Job, run_jobs
 from depthpose.depth.config import Answer, MatcherConfig, SGBMConfig
 from depthpose.depth.estimator import FakestereoNet
 from depthpose.depth.ground import MountFilter, scale_by_distance
 from depthpose.depth.predictions import (
-    CLOUD,
     CLOUD_M,
     ENDINGS,
     LAST,
+    DepthResults,
     Estimator,
     read_estimate,
     read_ground,
-    write_estimate,
 )
 from depthpose.depth.stereo import SGBMMatcher
-from depthpose.depth.types import StereoInput
+from depthpose.depth.types import DepthEstimate, StereoInput
 from depthpose.depth.weights import MATCHERS, Use
 from depthpose.report.depth import depth_section
 from depthpose.report.page import MOST_VIEWS, Film, Section, spread_evenly, write_page
@@ -61,7 +60,6 @@ PAIRS = Files(roles=("left", "right"), suffixes=LISTED_SUFFIXES)
 _PAGE = "report.html"
 _VIDEO = ".color.mp4"
 _SAME_FOCAL = 0.01
-Named = Iterator[tuple[str, Callable[[], StereoInput]]]  # names of inputs, and how each is read
 
 
 class Method(NamedTuple):
@@ -305,13 +303,38 @@ class DepthWork:
         other = None if right is None else read_image(right)
         return StereoInput(name=name, left=image, right=other, camera=camera)
 
-    def inputs_of(self, files: Sequence[Path]) -> Named:
-        """Give the one input of an image or a pair, or every frame of a video."""
+    def jobs_of(self, files: Sequence[Path]) -> Iterator[Job[StereoInput]]:
+        """Give the one job of an image or a pair, or that of every frame of a video."""
         if not _is_video(files[0]):
-            yield files[0].stem, partial(self.input_of, files[0].stem, *files)
+            name = files[0].stem
+            yield Job(name=name, read=partial(self.input_of, name, *files))
             return
         for name, frame in read_video(files[0]):
-            yield name, partial(self.input_of, name, frame)
+            yield Job(name=name, read=partial(self.input_of, name, frame))
+
+    def estimate_many(
+        self, net: FakestereoNet, inputs: Sequence[StereoInput], mount: MountFilter | None = None
+    ) -> list[DepthEstimate | InputError]:
+        """Estimate inputs together; ``mount`` is that of frames of one camera."""
+        named = [(depth_input.name, depth_input) for depth_input in inputs]
+        estimates = net.estimate_together(named, with_check=self.with_check, mount=mount)
+        if self.scale.known_distance is None:
+            return estimates
+        return [
+            self._scaled(depth_input.name, estimate)
+            for depth_input, estimate in zip(inputs, estimates, strict=True)
+        ]
+
+    def _scaled(
+        self, name: str, estimate: DepthEstimate | InputError
+    ) -> DepthEstimate | InputError:
+        """Scale an estimate by the distance that the user knows."""
+        if isinstance(estimate, InputError):
+            return estimate
+        try:
+            return scale_by_distance(estimate, name, self.scale.distance)
+        except InputError as error:
+            return error
 
     def settings(self, method: dict[str, Any]) -> dict[str, Any]:
         """Give what decides the results, as JSON values, for the record of a run."""
@@ -337,13 +360,13 @@ class DepthWork:
         method = self.method.build()
 
         def estimate(samples: Sequence[Sample], out: Path) -> list[str]:
-            predictor = Predictor(self, method, out)
-            named = (
-                (sample.name, partial(self.input_of, sample.name, *sample.files))
+            depth_run = DepthRun(work=self, method=method, out=out)
+            jobs = [
+                Job(name=sample.name, read=partial(self.input_of, sample.name, *sample.files))
                 for sample in samples
-            )
-            predictor.predict(named, len(samples), "images")
-            return [str(predictor.failures.get(sample.name, "")) for sample in samples]
+            ]
+            depth_run.estimate(jobs, len(samples), "images")
+            return [str(depth_run.failures.get(sample.name, "")) for sample in samples]
 
         return estimate
 
@@ -379,7 +402,10 @@ def estimate_by_engine(
 def estimate_all(
     sources: Sequence[tuple[Path, ...]], work: DepthWork, method: Method, out: Path
 ) -> int:
-    """Estimate what is not finished; an input that fails is named and stops no other."""
+    """Estimate what is not finished; an input that fails is named and stops no other.
+
+    Of several processes each takes its share, and the first writes the page.
+    """
     videos = [files[0].stem for files in sources if _is_video(files[0])]
     run.claim_folder(out, work.settings(method.settings), [_PAGE])
     endings = [f".{end}" for end in ENDINGS] + [_VIDEO]
@@ -387,159 +413,164 @@ def estimate_all(
     process = run.find_rank()
     if work.scale.one_mount and process.world > 1:
         raise InputError("--one-mount takes the images one after the other; omit it, or run alone")
-    mine = sources[process.rank :: process.world]
-    needed = (LAST, CLOUD) if work.output.cloud else (LAST,)
-    whole = {name for name in run.read_results(out)
-             if run.is_whole(out, name, [f"{name}.{end}" for end in needed])}  # fmt: skip
-    predictor = Predictor(work, method, out, whole)
+
+    mine = process.share_of(sources)
+    depth_run = DepthRun(work=work, method=method, out=out)
     stills = [files for files in mine if not _is_video(files[0])]
-    named = (depth_input for files in stills for depth_input in work.inputs_of(files))
+    still_jobs = (job for files in stills for job in work.jobs_of(files))
     mount = MountFilter() if work.scale.one_mount else None
-    done = len(predictor.predict(named, len(stills), "images", mount))
-    done += sum(predictor.predict_video(video) for video, *_ in mine if _is_video(video))
-    failures = list(predictor.failures.values())
-    ending = f".{LAST}"
-    made = {name for name in run.read_results(out) if run.is_whole(out, name, [name + ending])}
-    if failures and not done and len(sources) == 1:
+    count = len(depth_run.estimate(still_jobs, len(stills), "images", mount))
+    count += sum(depth_run.estimate_video(video) for video, *_ in mine if _is_video(video))
+
+    failures = list(depth_run.failures.values())
+    if failures and not count and len(sources) == 1:
         raise failures[0]
     for failure in failures:
         print(f"depthpose: failed: {failure}", file=sys.stderr)
-    count = f"{done} of {len(mine)} pairs" if work.files == PAIRS else f"{done} depth maps"
-    print(f"{count} are in {out}")
+    total = f"{count} of {len(mine)} pairs" if work.files == PAIRS else f"{count} depth maps"
+    print(f"{total} are in {out}")
     if process.rank == 0:
-        finished: dict[tuple[Path, ...], list[str]] = {}
-        for files in sources:
-            finished[files] = [files[0].stem] if files[0].stem in made else []
-            if _is_video(files[0]):
-                finished[files] = sorted(name for name in made if _frame_of(files[0], name))
-        names = [name for some in finished.values() for name in some]
-        chosen = [names[k] for k in spread_evenly(len(names), MOST_VIEWS)]
-        shown: list[StereoInput] = []
-        for files, made_of_files in finished.items():
-            wanted = [name for name in made_of_files if name in chosen]
-            with suppress(InputError):
-                for name, read in work.inputs_of(files) if wanted else ():
-                    if name in wanted:
-                        shown.append(read())
-                    if name == wanted[-1]:
-                        break
-        near_m, far_m = work.output.color_range
-        which = "all" if len(shown) == len(names) else "spread evenly"
-        number = f"{len(names)} depth map{'s' * (len(names) != 1)}"
-        text = f"Shown: {len(shown)} of {number} in this folder ({which})."
-        rows = [{"not estimated, because": str(reason)} for reason in failures]
-        doubts = {name: out / f"{name}.warning.txt" for name in names}
-        rows += [{"warning": f"{name}: {read_text(path).strip()}"}
-                 for name, path in doubts.items() if path.is_file()]  # fmt: skip
-        sections = [Section(title="What is here", text=text, rows=rows)]
-        colours = f"depth, {near_m:g} m bright to {far_m:g} m dark"
-        films = [
-            Film(path=p, caption=f"{p.name}: {colours}") for p in sorted(out.glob(f"*{_VIDEO}"))
-        ]
-        sections += [Section(title="Videos", films=films)] if films else []
-        for depth_input in shown:
-            estimate = read_estimate(out, depth_input.name, depth_input.camera)
-            sections.append(
-                depth_section(depth_input.name, depth_input, estimate, range_m=(near_m, far_m))
-            )
-        title = f"Depth of {len(names)} image{'s' * (len(names) != 1)}"
-        write_page(out / _PAGE, title, sections, run.environment())
-        print(f"the page: {out / _PAGE}")
+        write_depth_page(sources, work, out, failures)
     return 1 if failures else 0
 
 
-@dataclass(frozen=True)
-class Predictor:
-    """Inputs in, files out; what fails is remembered in ``failures``, by its name.
+def write_depth_page(
+    sources: Sequence[tuple[Path, ...]], work: DepthWork, out: Path, failures: Sequence[InputError]
+) -> None:
+    """Write a page of some of the finished depth maps, of every failure and of every warning."""
+    finished_names = {
+        name for name in run.read_results(out) if run.is_whole(out, name, [f"{name}.{LAST}"])
+    }
+    names_of: dict[tuple[Path, ...], list[str]] = {}
+    for files in sources:
+        if _is_video(files[0]):
+            frames = (name for name in finished_names if _frame_of(files[0], name))
+            names_of[files] = sorted(frames)
+        else:
+            names_of[files] = [name for name in (files[0].stem,) if name in finished_names]
+    names = [name for names_of_source in names_of.values() for name in names_of_source]
+    chosen = {names[k] for k in spread_evenly(len(names), MOST_VIEWS)}
+    shown = list(_read_chosen(names_of, work, chosen))
 
-    ``finished``: names of what an earlier run has made, and which is not even read.
-    """
+    which = "all" if len(shown) == len(names) else "spread evenly"
+    number = f"{len(names)} depth map{'s' * (len(names) != 1)}"
+    text = f"Shown: {len(shown)} of {number} in this folder ({which})."
+    rows = [{"not estimated, because": str(reason)} for reason in failures]
+    warnings = {name: out / f"{name}.warning.txt" for name in names}
+    rows += [
+        {"warning": f"{name}: {read_text(path).strip()}"}
+        for name, path in warnings.items()
+        if path.is_file()
+    ]
+    sections = [Section(title="What is here", text=text, rows=rows)]
+
+    range_m = work.output.color_range
+    colours = f"depth, {range_m[0]:g} m bright to {range_m[1]:g} m dark"
+    films = [Film(path=p, caption=f"{p.name}: {colours}") for p in sorted(out.glob(f"*{_VIDEO}"))]
+    sections += [Section(title="Videos", films=films)] if films else []
+    for depth_input in shown:
+        estimate = read_estimate(out, depth_input.name, depth_input.camera)
+        sections.append(depth_section(depth_input.name, depth_input, estimate, range_m=range_m))
+    title = f"Depth of {len(names)} image{'s' * (len(names) != 1)}"
+    write_page(out / _PAGE, title, sections, run.environment())
+    print(f"the page: {out / _PAGE}")
+
+
+def _read_chosen(
+    names_of: Mapping[tuple[Path, ...], Sequence[str]], work: DepthWork, chosen: Collection[str]
+) -> Iterator[StereoInput]:
+    """Read the chosen inputs again; what cannot be read any more is left out."""
+    for files, names in names_of.items():
+        wanted = [name for name in names if name in chosen]
+        with suppress(InputError):
+            for job in work.jobs_of(files) if wanted else ():
+                if job.name in wanted:
+                    yield job.read()
+                if job.name == wanted[-1]:
+                    break
+
+
+@dataclass(frozen=True, kw_only=True)
+class DepthRun:
+    """Estimates of one process as files in ``out``, and its failures by the names of inputs."""
 
     work: DepthWork
     method: Method
     out: Path
-    finished: Collection[str] = ()
     failures: dict[str, InputError] = field(default_factory=dict)
 
-    def predict_video(self, source: Path) -> int:
-        """Predict a video's frames, and make a video of them; give how many are done."""
+    def estimate(
+        self,
+        jobs: Iterable[Job[StereoInput]],
+        total: int | None,
+        what: str,
+        mount: MountFilter | None = None,
+    ) -> list[str]:
+        """Estimate what is not finished, and give the names of all that is now.
 
-        def colors() -> Iterator[Tensor]:
-            """Draw each frame's depth, in grey where there is none, so that none is missing."""
-            lost = {name for name in self.failures if _frame_of(source, name)}
-            unknown = torch.full_like(read_map(self.out / f"{names[0]}.depth_m.npy"), torch.nan)
-            for name in sorted([*names, *lost]):
-                depth_m = unknown if name in lost else read_map(self.out / f"{name}.depth_m.npy")
-                yield draw_depth(depth_m, *self.work.output.color_range)
+        Args:
+            jobs: images, pairs or the frames of a video.
+            total: how many there are; None: unknown.
+            what: they are called, beside the progress.
+            mount: that of the inputs, where they are frames of one camera.
+        """
+        output = self.work.output
+        results = DepthResults(
+            folder=self.out,
+            range_m=output.color_range,
+            cloud_m=CLOUD_M if output.cloud else None,
+            min_confidence=output.min_confidence,
+        )
+        assert isinstance(self.method.net, FakestereoNet), "weights build no other"
+        estimate_many = partial(self.work.estimate_many, self.method.net, mount=mount)
+        outcomes = run_jobs(jobs, estimate_many, results, output.batch)
+        names: list[str] = []
+        for outcome in tqdm(outcomes, what, total, disable=None, unit=f" {what}"):
+            name = outcome.job.name
+            try:
+                if outcome.failure is not None:
+                    raise outcome.failure
+                if outcome.result is not None:
+                    self._print_remarks(name, outcome.result)
+                elif mount is not None:  # of an earlier run, whose mount counts for what follows
+                    mount.last = read_ground(self.out, name) or mount.last
+                names.append(name)
+            except InputError as error:
+                self.failures[name] = error
+        return names
 
+    def estimate_video(self, source: Path) -> int:
+        """Estimate the frames of a video, and make a video of them; give how many are done."""
         try:
             video = read_video(source)
-            frames = self.work.inputs_of([source])
-            names = self.predict(frames, video.frames or None, source.name, MountFilter())
-            drawn = colors() if names else ()
+            jobs = self.work.jobs_of([source])
+            names = self.estimate(jobs, video.frames or None, source.name, MountFilter())
+            drawn = self._draw_frames(source, names) if names else ()
             write_video(self.out / f"{source.stem}{_VIDEO}", drawn, video.fps)
         except InputError as error:
             self.failures[source.name] = error
             return 0
         return len(names)
 
-    def predict(
-        self, named: Named, total: int | None, what: str, mount: MountFilter | None = None
-    ) -> list[str]:
-        """Estimate inputs, a batch together, and write their files; give the names of the done.
+    def _draw_frames(self, source: Path, names: Sequence[str]) -> Iterator[Tensor]:
+        """Draw each frame's depth, in grey where there is none, so that none is missing."""
+        failed = {name for name in self.failures if _frame_of(source, name)}
+        unknown = torch.full_like(read_map(self.out / f"{names[0]}.depth_m.npy"), torch.nan)
+        for name in sorted([*names, *failed]):
+            depth_m = unknown if name in failed else read_map(self.out / f"{name}.depth_m.npy")
+            yield draw_depth(depth_m, *self.work.output.color_range)
 
-        ``mount`` is that of the inputs, where they are frames of one camera.
-        """
-        names: list[str] = []
+    def _print_remarks(self, name: str, estimate: DepthEstimate) -> None:
+        """Print the warning of an estimate, its mount, and how much its cloud leaves out."""
         output = self.work.output
-        scale = self.work.scale
-        net = self.method.net
-        assert isinstance(net, FakestereoNet), "weights build no other"
-        with tqdm(total=total, desc=what, disable=None, unit=f" {what}") as bar:
-            # What an earlier run has made may lie between what is left, and its mount counts.
-            size = 1 if mount is not None and self.finished else output.batch
-            while chunk := list(islice(named, size)):
-                inputs: list[StereoInput] = []
-                for name, read in chunk:
-                    try:
-                        if name not in self.finished:
-                            inputs.append(read())
-                        elif mount is not None:
-                            mount.last = read_ground(self.out, name) or mount.last
-                    except InputError as error:
-                        self.failures[name] = error
-                check = self.work.with_check
-                estimates = net.estimate_together(
-                    [(depth_input.name, depth_input) for depth_input in inputs],
-                    with_check=check,
-                    mount=mount,
-                )
-                for depth_input, estimate in zip(inputs, estimates, strict=True):
-                    try:
-                        if isinstance(estimate, InputError):
-                            raise estimate
-                        if scale.known_distance is not None:
-                            estimate = scale_by_distance(estimate, depth_input.name, scale.distance)  # noqa: PLW2901
-                        cloud_m = CLOUD_M if output.cloud else None
-                        files = write_estimate(
-                            self.out, depth_input, estimate, output.color_range, cloud_m,
-                            output.min_confidence,
-                        )  # fmt: skip
-                        if output.cloud and output.min_confidence > 0:
-                            sure = estimate.is_sure(output.min_confidence).sum()
-                            share = 1 - float(sure / estimate.is_sure(0.0).sum().clamp(min=1))
-                            tqdm.write(
-                                f"{depth_input.name}: {share:.1%} of the depth is less sure than "
-                                f"{output.min_confidence:g} and left out of the cloud"
-                            )
-                        if estimate.warning:
-                            message = f"depthpose: warning: {depth_input.name}: {estimate.warning}"
-                            tqdm.write(message, sys.stderr)
-                        if estimate.ground is not None:
-                            tqdm.write(f"{depth_input.name}: {estimate.ground}")
-                        run.note_result(self.out, depth_input.name, files)
-                    except InputError as error:
-                        self.failures[depth_input.name] = error
-                names += [name for name, _ in chunk if name not in self.failures]
-                bar.update(len(chunk))
-        return names
+        if output.cloud and output.min_confidence > 0:
+            sure = estimate.is_sure(output.min_confidence).sum()
+            share = 1 - float(sure / estimate.is_sure(0.0).sum().clamp(min=1))
+            tqdm.write(
+                f"{name}: {share:.1%} of the depth is less sure than {output.min_confidence:g} "
+                "and left out of the cloud"
+            )
+        if estimate.warning:
+            tqdm.write(f"depthpose: warning: {name}: {estimate.warning}", sys.stderr)
+        if estimate.ground is not None:
+            tqdm.write(f"{name}: {estimate.ground}")

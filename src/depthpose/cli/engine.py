@@ -54,9 +54,9 @@ class EngineOptions:
         self, work: "Work", inputs: "Inputs", out: str, settings: dict[str, Any]
     ) -> "Sequence[Done]":
         """Do the work on all inputs, and give what is done."""
-        from depthpose.core.engine import Job, run_job
+        from depthpose.core.engine import ShardedJob, run_job
 
-        job = Job(
+        job = ShardedJob(
             work=work,
             items=inputs.items,
             tars=inputs.tars,

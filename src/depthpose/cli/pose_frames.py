@@ -2,7 +2,7 @@
 
 import re
 from collections import Counter
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -18,14 +18,15 @@ from depthpose.core.errors import InputError
 from depthpose.core.files import read_depth_png
 from depthpose.core.rigid import Rigid
 from depthpose.core.run import find_rank
+from depthpose.core.runner import Job, Results, run_jobs
 from depthpose.pose.datasets import BopDataset, Instance, open_bop, read_targets
 from depthpose.pose.evaluate import of_targets
 from depthpose.pose.inputs import AnyInput
 from depthpose.pose.predictions import (
-    Job,
     Place,
+    PoseJob,
     Prediction,
-    kept_predictions,
+    earlier_predictions,
     place_of,
     unreadable,
     write_predictions,
@@ -33,6 +34,87 @@ from depthpose.pose.predictions import (
 from depthpose.pose.search import explained_mask
 from depthpose.pose.surface import prepare_surface
 from depthpose.pose.types import PoseEstimate, ViewInput
+
+
+class SearchResults(Results[ViewInput, list[PoseEstimate]]):
+    """The estimates of each image, perhaps several, in the ``poses.json`` of a folder.
+
+    The file is written after every image, and keeps what earlier runs found in other images.
+    """
+
+    def __init__(
+        self,
+        folder: Path,
+        earlier: list[Prediction],
+        is_of_image: Callable[[Prediction, str], bool],
+        numbers: Mapping[str, int] | None = None,
+    ) -> None:
+        self.by_image: dict[str, list[Prediction]] = {}
+        self._folder = folder
+        self._earlier = earlier
+        self._is_of_image = is_of_image
+        self._numbers = numbers  # of the objects in a data set, where it is one
+
+    def is_finished(self, job: Job[ViewInput]) -> bool:
+        """Whether an earlier run has searched the image; its estimates are taken over."""
+        of_image = [p for p in self._earlier if self._is_of_image(p, job.name)]
+        if of_image:
+            self._earlier = [p for p in self._earlier if p not in of_image]
+            self.by_image[job.name] = of_image
+        return bool(of_image)
+
+    def store(self, job: Job[ViewInput], data: ViewInput, result: list[PoseEstimate]) -> None:  # noqa: ARG002
+        """Write what was found in an image."""
+        assert isinstance(job, PoseJob)
+        self.by_image[job.name] = [
+            Prediction(estimate=estimate, place=self._place_of(job, estimate))
+            for estimate in result
+        ]
+        self.flush()
+
+    def store_failure(self, job: Job[ViewInput], error: InputError) -> None:
+        """Write why an image cannot be read; of a data set, which must be whole, it is an error."""
+        assert isinstance(job, PoseJob)
+        if job.object is None:
+            raise error
+        self.by_image[job.name] = [Prediction(estimate=unreadable(job.name, job.object, error))]
+        self.flush()
+
+    def flush(self) -> None:
+        """Write ``poses.json``."""
+        predictions = [p for of_image in self.by_image.values() for p in of_image]
+        write_predictions(self._folder, [*predictions, *self._earlier])
+
+    def _place_of(self, job: PoseJob[ViewInput], estimate: PoseEstimate) -> Place | None:
+        if self._numbers is None or job.place is None:
+            return None
+        return job.place._replace(object_id=self._numbers[estimate.object])
+
+
+def _search(
+    method: PoseMethod,
+    objects: Sequence[str],
+    jobs: Sequence[PoseJob[Any]],
+    results: SearchResults,
+) -> tuple[list[Prediction], list[PoseJob[Any]]]:
+    """Search images for objects; give the predictions, and a job for each that shows it alone."""
+    find = method.find
+    assert find is not None
+
+    def find_in_each(views: Sequence[ViewInput]) -> list[list[PoseEstimate]]:
+        return [find(view, objects) for view in views]
+
+    outcomes = run_jobs(jobs, find_in_each, results)
+    for _ in tqdm(outcomes, total=len(jobs), disable=None, unit=" images"):
+        pass
+    predictions: list[Prediction] = []
+    single_jobs: list[PoseJob[Any]] = []
+    for job in jobs:
+        for prediction in results.by_image[job.name]:
+            read = partial(_explained, job, prediction, method)
+            predictions.append(prediction)
+            single_jobs.append(replace(job, name=prediction.estimate.name, read=read))
+    return predictions, single_jobs
 
 
 def find_all(method: PoseMethod, inputs: OneObjectOptions, out: Path) -> int:
@@ -69,27 +151,14 @@ def find_all(method: PoseMethod, inputs: OneObjectOptions, out: Path) -> int:
     models = [model for model in method.models if model.name in objects]
     jobs = pose_predict.colored_jobs(jobs, inputs, models, out, settings)
     pose_predict.claim(out, settings, jobs, pose_predict.is_result_of)
-    left = [p for p in kept_predictions(out).values() if p.estimate.status != "unreadable"]
-    results: list[tuple[Prediction, Job[Any]]] = []
-    for job in tqdm(jobs, disable=None, unit=" images"):
-        own = [p for p in left if pose_predict.is_result_of(p.estimate.name, job.name)]
-        left = [p for p in left if p not in own]
-        if not own:
-            try:
-                view = job.read()
-            except InputError as error:
-                found = [unreadable(job.name, objects[0], error)]
-            else:
-                found = method.find(view, objects)
-            own = [Prediction(estimate=one) for one in found]
-        results += [
-            (one, replace(job, name=one.estimate.name, read=partial(_explained, job, one, method)))
-            for one in own
-        ]
-        write_predictions(out, [*(prediction for prediction, _ in results), *left])
-    pose_predict.claim(out, settings, [job for _, job in results], pose_predict.is_result_of)
-    predictions = [prediction for prediction, _ in results]
-    searched = [job for _, job in results]
+    earlier = [p for p in earlier_predictions(out).values() if p.estimate.status != "unreadable"]
+
+    def is_of_image(prediction: Prediction, image: str) -> bool:
+        return pose_predict.is_result_of(prediction.estimate.name, image)
+
+    results = SearchResults(out, earlier, is_of_image)
+    predictions, searched = _search(method, objects, jobs, results)
+    pose_predict.claim(out, settings, searched, pose_predict.is_result_of)
     pose_predict.write_files(predictions, searched, out, method, inputs=len(jobs))
     return pose_predict.say_result(predictions, out, len(jobs))
 
@@ -115,34 +184,39 @@ def search_dataset(
     settings["find"] = sorted(numbers)
     pose_predict.claim_bop(out, settings, dataset)
     images = {(i.scene_id, i.image_id): i for i in dataset.instances}
-    left = list(kept_predictions(out).values())
-    results: list[tuple[Prediction, Job[Any]]] = []
-    for (scene, image), instance in tqdm(sorted(images.items()), disable=None, unit=" images"):
-        job = Job[Any](
-            name=f"{scene:06d}_{image:06d}",
-            read=partial(_whole_view, instance, next(iter(numbers))),
+    some_object = next(iter(numbers))
+    jobs = [
+        PoseJob(
+            name=_image_name(place),
+            read=partial(_whole_view, instance, some_object, _image_name(place)),
+            place=place_of(instance),
         )
-        of_image = [p for p in left if p.place is not None and p.place[:2] == (scene, image)]
-        if not of_image:
-            view = replace(job.read(), name=job.name)
-            estimates = method.find(view, list(numbers))
-            of_image = [
-                Prediction(estimate=one, place=Place(scene, image, numbers[one.object]))
-                for one in estimates
-            ]
-        results += [
-            (one, replace(job, name=one.estimate.name, read=partial(_explained, job, one, method)))
-            for one in of_image
-        ]
-        left = [p for p in left if p not in of_image]
-        write_predictions(out, [*(prediction for prediction, _ in results), *left])
-    predictions = [prediction for prediction, _ in results]
-    searched = [job for _, job in results]
+        for place, instance in sorted(images.items())
+    ]
+
+    def is_of_image(prediction: Prediction, image: str) -> bool:
+        return prediction.place is not None and _image_name(prediction.place[:2]) == image
+
+    earlier = list(earlier_predictions(out).values())
+    results = SearchResults(out, earlier, is_of_image, numbers)
+    predictions, searched = _search(method, list(numbers), jobs, results)
     pose_predict.write_files(predictions, searched, out, method, dataset, inputs=len(images))
     return pose_predict.say_result(predictions, out, len(images))
 
 
-def _explained(job: Job[Any], found: Prediction, method: PoseMethod) -> AnyInput:
+def _frame_job(instance: Instance, object: str) -> PoseJob[Any]:
+    """Take the whole depth image of an instance as a frame of a sequence."""
+    read = partial(_whole_view, instance, object, instance.name)
+    return PoseJob(name=instance.name, read=read, object=object, place=place_of(instance))
+
+
+def _image_name(place: tuple[int, int]) -> str:
+    """Name an image of a data set by its scene and its number."""
+    scene_id, image_id = place
+    return f"{scene_id:06d}_{image_id:06d}"
+
+
+def _explained(job: PoseJob[Any], found: Prediction, method: PoseMethod) -> AnyInput:
     """Read a whole depth image as if a mask had shown what was found in it."""
     view, pose = job.read(), found.estimate.camera_from_model
     model = next((one for one in method.models if one.name == found.estimate.object), None)
@@ -183,35 +257,35 @@ def track_bop(method: PoseMethod, frames: SequenceOptions, out: Path) -> int:
         "track": sorted(names.values()),
     }
     pose_predict.claim_bop(out, settings, dataset)
-    images: dict[tuple[int, int], dict[int, Instance]] = {}
-    for one in sorted(dataset.instances, key=lambda i: (i.image_id, i.index)):
-        images.setdefault((one.scene_id, one.object_id), {}).setdefault(one.image_id, one)
+    # The first instance of an object in each image of a scene is followed.
+    first_instances: dict[tuple[int, int], dict[int, Instance]] = {}
+    for instance in sorted(dataset.instances, key=lambda i: (i.image_id, i.index)):
+        of_object = first_instances.setdefault((instance.scene_id, instance.object_id), {})
+        of_object.setdefault(instance.image_id, instance)
     sequences = [
-        (names[number], list(some.values())) for (_, number), some in sorted(images.items())
+        [_frame_job(instance, names[number]) for instance in by_image.values()]
+        for (_, number), by_image in sorted(first_instances.items())
     ]
-    sequences = [
-        (name, [Job(name=one.name, read=partial(_whole_view, one, name), object=name,
-                    place=place_of(one)) for one in some])
-        for name, some in sequences
-    ]  # fmt: skip
-    jobs = [job for _, own in sequences for job in own]
-    coming = (one for name, own in sequences for one in _followed(method, own, name))
+    jobs = [job for sequence in sequences for job in sequence]
+    coming = (
+        prediction
+        for sequence in sequences
+        for prediction in _followed(method, sequence, str(sequence[0].object))
+    )
     return _finish(method, coming, jobs, out, dataset)
 
 
-def _whole_view(instance: Instance, name: str) -> ViewInput:
+def _whole_view(instance: Instance, object: str, name: str) -> ViewInput:
     """Read the depth image of an instance without its mask."""
     depth_m = read_depth_png(instance.depth, instance.depth_unit_m)
     everywhere = torch.ones_like(depth_m, dtype=torch.bool)
-    return ViewInput(
-        name=instance.name, depth_m=depth_m, mask=everywhere, K=instance.K, object=name
-    )
+    return ViewInput(name=name, depth_m=depth_m, mask=everywhere, K=instance.K, object=object)
 
 
 def _finish(
     method: PoseMethod,
     coming: Iterable[Prediction],
-    jobs: Sequence[Job[Any]],
+    jobs: Sequence[PoseJob[Any]],
     out: Path,
     dataset: BopDataset | None = None,
 ) -> int:
@@ -220,7 +294,7 @@ def _finish(
     They are written where the work is interrupted, too; what an earlier run found of frames that
     this one did not reach stays in the file.
     """
-    left = list(kept_predictions(out).values())
+    left = list(earlier_predictions(out).values())
     predictions: list[Prediction] = []
     try:
         for one in coming:
@@ -244,7 +318,7 @@ def _finish(
 
 
 def _followed(
-    method: PoseMethod, jobs: Sequence[Job[Any]], name: str, first: Rigid | None = None
+    method: PoseMethod, jobs: Sequence[PoseJob[Any]], name: str, first: Rigid | None = None
 ) -> Iterator[Prediction]:
     """Follow an object, frame by frame; of one that cannot be read the estimate says so."""
 

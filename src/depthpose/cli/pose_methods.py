@@ -43,7 +43,7 @@ class Masks:
     """Which pixels a method is given: what to call them, and the jobs that they make."""
 
     name: str
-    jobs: Callable[[Mapping[int, str]], list[predictions.Job[ViewInput]]]
+    jobs: Callable[[Mapping[int, str]], list[predictions.PoseJob[ViewInput]]]
     settings: Mapping[str, Any]
 
 

@@ -1,5 +1,6 @@
 """The work behind ``depthpose pose predict``, here or by an engine."""
 
+import math
 import operator
 import re
 import sys
@@ -7,7 +8,7 @@ import time
 from collections import Counter, defaultdict
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path, PurePosixPath
 from typing import Any
@@ -47,6 +48,7 @@ from depthpose.core.files.disk import natural_order
 from depthpose.core.files.images import LISTED_SUFFIXES, refuse_among_inputs
 from depthpose.core.rigid import Rigid
 from depthpose.core.run import is_whole, note_result
+from depthpose.core.runner import Job, Results, run_jobs
 from depthpose.core.units import Unit
 from depthpose.pose.color_inputs import with_color
 from depthpose.pose.config import EstimateConfig
@@ -69,13 +71,12 @@ from depthpose.pose.predictions import (
     CLOUD,
     PICTURE,
     POSES,
-    Job,
+    PoseJob,
     Prediction,
-    kept_predictions,
+    earlier_predictions,
     predict,
     prediction_row,
     results_name,
-    unreadable,
     write_bop_results,
     write_predictions,
 )
@@ -101,7 +102,7 @@ of this copy: that it is this very copy of a nearly symmetric model"""
 def claim(
     out: Path,
     settings: dict[str, Any],
-    jobs: list[Job[Any]],
+    jobs: list[PoseJob[Any]],
     is_result: Callable[[str, str], bool] = operator.eq,
 ) -> None:
     """Claim a folder for the poses of clouds or depth images, whose jobs name their files.
@@ -113,7 +114,7 @@ def claim(
         (out / POSES).unlink(missing_ok=True)
 
     def is_finished(name: str) -> bool:
-        made = kept_predictions(out).values()
+        made = earlier_predictions(out).values()
         done = [p.estimate.name for p in made if p.estimate.status != "unreadable"]
         return any(is_result(one, name) for one in done)
 
@@ -157,7 +158,7 @@ def camera_facts(camera: Path | float) -> dict[str, Any]:
     return {"camera": str(camera.resolve()), "camera_sha256": file_sha256(camera)}
 
 
-def cloud_jobs(cloud: Path, unit: Unit, object: str, out: Path) -> list[Job[Any]]:
+def cloud_jobs(cloud: Path, unit: Unit, object: str, out: Path) -> list[PoseJob[Any]]:
     """Take a cloud, or every one of a folder."""
     known = tuple(CLOUD_READERS)
     files = [cloud]
@@ -170,7 +171,7 @@ def cloud_jobs(cloud: Path, unit: Unit, object: str, out: Path) -> list[Job[Any]
     _refuse_one_name(files)
     refuse_among_inputs(out, [cloud], files)
     return [
-        Job(
+        PoseJob(
             name=p.stem,
             read=partial(cloud_input, p, unit, object, p.stem),
             object=object,
@@ -188,7 +189,7 @@ def view_jobs(
     unit: Unit | None,
     out: Path,
     labels: Mapping[str, str] | None = None,
-) -> list[Job[Any]]:
+) -> list[PoseJob[Any]]:
     """Take a depth image, its mask and its camera, or images and masks of one name in two folders.
 
     Of a mask that numbers several objects each is an input: NAME_1, NAME_2, ... All are of
@@ -198,7 +199,7 @@ def view_jobs(
     depths, pictures = _list_depths(depth), runs or list_images(mask)
     refuse_among_inputs(out, [depth, mask], [*depths, *pictures])
     masks = _beside_depths(depths, pictures, depth, mask, "mask")
-    jobs: list[Job[Any]] = []
+    jobs: list[PoseJob[Any]] = []
     for path in depths:
         shown: dict[str, tuple[str, AnyMask]] = {}
         if labels is not None:
@@ -214,7 +215,7 @@ def view_jobs(
         for end, (name, pixels) in shown.items():
             read = partial(view_input, path, pixels, camera, name, path.stem + end, unit)
             files = (path, masks[path.stem])
-            jobs.append(Job(name=path.stem + end, read=read, object=name, source=files))
+            jobs.append(PoseJob(name=path.stem + end, read=read, object=name, source=files))
     _refuse_twice(jobs, depth)
     return jobs
 
@@ -251,7 +252,7 @@ def box_jobs(
     object: str,
     unit: Unit | None,
     out: Path,
-) -> list[Job[Any]]:
+) -> list[PoseJob[Any]]:
     """Take boxes of one object in a depth image: NAME, or of several NAME_1, NAME_2, ..."""
     depths = _list_depths(depth)
     refuse_among_inputs(out, [depth], depths)
@@ -271,7 +272,7 @@ def detection_jobs(
     objects: tuple[Mapping[str, str], Sequence[str], str | None],
     unit: Unit | None,
     out: Path,
-) -> list[Job[Any]]:
+) -> list[PoseJob[Any]]:
     """Take what a detector found in depth images: NAME, or of several NAME_1 (the surest), ...
 
     ``detections``: a file, or a folder of files with the names of the images. ``objects``: labels,
@@ -298,7 +299,7 @@ def detection_jobs(
                 height, width = read_stored_depth(path).shape
                 size = (width, height)
             found[path.stem] = read_detections(file, size)
-    jobs: list[Job[Any]] = []
+    jobs: list[PoseJob[Any]] = []
     empty: list[str] = []
     for path in depths:
         own = name_objects(found[path.stem], *objects, source=str(beside[path.stem]))
@@ -321,13 +322,13 @@ def _detection_jobs(
     files: tuple[Path, ...],
     camera: Path | float,
     unit: Unit | None,
-) -> list[Job[Any]]:
-    jobs: list[Job[Any]] = []
+) -> list[PoseJob[Any]]:
+    jobs: list[PoseJob[Any]] = []
     for k, one in enumerate(found, 1):
         assert one.object is not None
         name = path.stem + (f"_{k}" if len(found) > 1 else "")
         read = partial(_read_detection, path, one, camera, name, unit)
-        jobs.append(Job(name=name, read=read, object=one.object, source=files))
+        jobs.append(PoseJob(name=name, read=read, object=one.object, source=files))
     return jobs
 
 
@@ -358,7 +359,7 @@ def _beside_depths(
     return found
 
 
-def _refuse_twice(jobs: Sequence[Job[Any]], depth: Path) -> None:
+def _refuse_twice(jobs: Sequence[PoseJob[Any]], depth: Path) -> None:
     twice = [name for name, count in Counter(job.name for job in jobs).items() if count > 1]
     if twice:
         raise InputError(
@@ -369,13 +370,13 @@ def _refuse_twice(jobs: Sequence[Job[Any]], depth: Path) -> None:
 
 def frame_jobs(
     depth: Path, camera: Path | float, object: str, unit: Unit | None, out: Path
-) -> list[Job[Any]]:
+) -> list[PoseJob[Any]]:
     """Take whole depth images, without masks."""
     depths = _list_depths(depth)
     refuse_among_inputs(out, [depth], depths)
     _refuse_one_name(depths)
     return [
-        Job(
+        PoseJob(
             name=p.stem,
             read=partial(view_input, p, None, camera, object, p.stem, unit),
             object=object,
@@ -386,12 +387,12 @@ def frame_jobs(
 
 
 def colored_jobs(
-    jobs: list[Job[Any]],
+    jobs: list[PoseJob[Any]],
     inputs: OneObjectOptions,
     models: Sequence[ObjectModel],
     out: Path,
     settings: dict[str, Any],
-) -> list[Job[Any]]:
+) -> list[PoseJob[Any]]:
     """Give each depth image its colour picture, if any; add to the settings what decides that.
 
     ``models``: those that may be there.
@@ -414,7 +415,7 @@ def colored_jobs(
         file, what = inputs.color_from_depth, "color_from_depth"
         moved = pose_methods.read_pose(file, "--color-from-depth", what)
         settings["color_from_depth"] = moved.matrix().tolist()
-    found: list[Job[Any]] = []
+    found: list[PoseJob[Any]] = []
     for job in jobs:
         sources = job.source if isinstance(job.source, tuple) else (job.source,)
         assert sources[0] is not None
@@ -480,7 +481,7 @@ def predict_files(method: PoseMethod, inputs: OneObjectOptions, out: Path, batch
 
 def region_jobs(
     method: PoseMethod, inputs: OneObjectOptions, out: Path, settings: dict[str, Any]
-) -> list[Job[Any]]:
+) -> list[PoseJob[Any]]:
     """Take depth images and where objects are in them; add to the settings what decides that."""
     lens, unit = inputs.camera or inputs.focal_px, inputs.unit
     regions = {"mask": inputs.mask, "box": inputs.box, "detections": inputs.detections}
@@ -534,7 +535,7 @@ def predict_dataset(
     dataset = pose_methods.chosen_objects(dataset, method, object)
     (found,) = pose_methods.find_masks([options.masks], dataset, out, config.device)
     names = pose_methods.match_names(dataset, method.models)
-    jobs: list[Job[Any]] = [
+    jobs: list[PoseJob[Any]] = [
         replace(job, object=names[job.place.object_id])
         for job in found.jobs(names)
         if job.place is not None
@@ -553,7 +554,7 @@ def predict_dataset(
 
 def predict_all(
     method: PoseMethod,
-    jobs: list[Job[Any]],
+    jobs: list[PoseJob[Any]],
     out: Path,
     settings: dict[str, Any],
     batch: int,
@@ -564,35 +565,38 @@ def predict_all(
     """
     process = run.find_rank()
     home = out if process.world == 1 else out / f"part-{process.rank}"
-    known = kept_predictions(out)
-    done = {name for name, made in known.items() if made.estimate.status != "unreadable"}
-    left = [job for job in jobs[process.rank :: process.world] if job.name not in done]
-    if left:
-        made = predict(method.estimate_many, left, home, settings, batch)
-        for prediction in tqdm(made, total=len(left), disable=None, unit=" poses"):
-            known[prediction.estimate.name] = prediction
+    by_name = earlier_predictions(out)
+    finished = {name for name, made in by_name.items() if made.estimate.status != "unreadable"}
+    unfinished = [job for job in process.share_of(jobs) if job.name not in finished]
+    if unfinished:
+        made = predict(method.estimate_many, unfinished, home, settings, batch)
+        for prediction in tqdm(made, total=len(unfinished), disable=None, unit=" poses"):
+            by_name[prediction.estimate.name] = prediction
     if process.rank:
         return None
     if process.world > 1:
-        seen: dict[str, Any] = {"at": -10.0, "names": set()}
+        names_there: set[str] = set()
+        last_read_s = -math.inf
 
         def is_there(name: str) -> bool:
+            nonlocal names_there, last_read_s
             # Files of all parts are read for all names at once, every second.
-            if name not in seen["names"] and time.monotonic() - seen["at"] > 1:
-                seen["names"], seen["at"] = set(kept_predictions(out)), time.monotonic()
-            return name in seen["names"]
+            if name not in names_there and time.monotonic() - last_read_s > 1:
+                names_there = set(earlier_predictions(out))
+                last_read_s = time.monotonic()
+            return name in names_there
 
         run.wait_for([job.name for job in jobs], is_there)
-        known = kept_predictions(out)
-    predictions = [known.pop(job.name) for job in jobs]
+        by_name = earlier_predictions(out)
+    predictions = [by_name.pop(job.name) for job in jobs]
     # Inputs of earlier runs stay in the file.
-    write_predictions(out, [*known.values(), *predictions])
+    write_predictions(out, [*by_name.values(), *predictions])
     return predictions
 
 
 def write_files(
     predictions: list[Prediction],
-    jobs: list[Job[Any]],
+    jobs: list[PoseJob[Any]],
     out: Path,
     method: PoseMethod,
     dataset: BopDataset | None = None,
@@ -723,7 +727,7 @@ def _row(estimate: PoseEstimate) -> dict[str, Any]:
 def _write_page(
     out: Path,
     predictions: Sequence[Prediction],
-    jobs: Sequence[Job[Any]],
+    jobs: Sequence[PoseJob[Any]],
     models: dict[str, ObjectModel],
     dataset: BopDataset | None,
     inputs: int | None,
@@ -766,34 +770,39 @@ def _write_page(
 ENDING = "pose.json"  # of the one file of a result: an entry of poses.json
 
 
+@dataclass(frozen=True)
+class EntryFiles(Results[Any, PoseEstimate]):
+    """A file for each estimate, for the shards of an engine."""
+
+    folder: Path
+
+    def store(self, job: Job[Any], data: Any, result: PoseEstimate) -> None:  # noqa: ANN401, ARG002
+        """Write an estimate as an entry of ``poses.json`` has it."""
+        row = prediction_row(Prediction(estimate=result))
+        write_json(self.folder / f"{job.name}.{ENDING}", row)
+
+
 def start_files(
     source: MethodSource, object: str, unit: Unit | None, camera: Camera | None
 ) -> Function:
     """Build the estimator; clouds, or depth images and masks, to poses or the reasons for none."""
     method = source.build()
 
-    def predict(samples: Sequence[Sample], out: Path) -> list[str]:
-        inputs: list[Any] = []
-        for sample in samples:
-            name = sample.name
-            try:
-                if camera is None:
-                    inputs.append(cloud_input(sample.files[0], unit or "m", object, name))
-                else:
-                    depth, mask = sample.files
-                    inputs.append(view_input(depth, mask, camera, object, name, unit))
-            except InputError as error:
-                inputs.append(unreadable(name, object, error))
-        answers = iter(method.estimate_many([i for i in inputs if not isinstance(i, PoseEstimate)]))
-        reasons: list[str] = []
-        for sample, one in zip(samples, inputs, strict=True):
-            estimate = one if isinstance(one, PoseEstimate) else next(answers)
-            prediction = Prediction(estimate=estimate)
-            write_json(out / f"{sample.name}.{ENDING}", prediction_row(prediction))
-            reasons.append("" if prediction.estimate.status != "unreadable" else estimate.reason)
-        return reasons
+    def job_of(sample: Sample) -> Job[Any]:
+        if camera is None:
+            cloud = sample.files[0]
+            read = partial(cloud_input, cloud, unit or "m", object, sample.name)
+        else:
+            depth, mask = sample.files
+            read = partial(view_input, depth, mask, camera, object, sample.name, unit)
+        return Job(name=sample.name, read=read)
 
-    return predict
+    def estimate(samples: Sequence[Sample], out: Path) -> list[str]:
+        jobs = [job_of(sample) for sample in samples]
+        outcomes = run_jobs(jobs, method.estimate_many, EntryFiles(out), max(1, len(jobs)))
+        return ["" if o.failure is None else f"cannot be read: {o.failure}" for o in outcomes]
+
+    return estimate
 
 
 def predict_on_ray(

@@ -15,7 +15,7 @@ from dataclasses import dataclass
 from datetime import UTC, datetime
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import torch
 
@@ -40,6 +40,8 @@ NOT_OURS = (
 """Of a file that a run would write over."""
 _FRAME = re.compile(r"_\d{6}$")
 _PACKAGES = ("depthpose", "torch", "numpy", "opencv-python-headless")
+
+Item = TypeVar("Item")
 
 _locks: dict[Path, int] = {}  # folders that are locked, and the descriptors of their locks
 
@@ -103,13 +105,14 @@ def release_folders(but: Collection[Path] = ()) -> None:
 
 @dataclass(frozen=True, kw_only=True)
 class ProcessRank:
-    """Rank of this process among several that share the work through files.
-
-    Of a list each takes ``[rank::world]``.
-    """
+    """Rank of this process among several that share the work through files."""
 
     rank: int = 0  #: 0 .. world - 1
     world: int = 1  #: how many processes there are
+
+    def share_of(self, items: Sequence[Item]) -> Sequence[Item]:
+        """Give the part of a list that this process does: every ``world``-th item."""
+        return items[self.rank :: self.world]
 
 
 def find_rank() -> ProcessRank:

@@ -1,7 +1,7 @@
 """Estimates as files: writing them all or nothing, and reading them back."""
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import asdict, replace
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any, Protocol, runtime_checkable
@@ -16,6 +16,7 @@ from depthpose.core.draw import draw_depth, draw_disparity
 from depthpose.core.errors import InputError
 from depthpose.core.files.disk import read_text, write_bytes
 from depthpose.core.run import claim_folder, claim_names, is_whole, note_result
+from depthpose.core.runner import Job, Results, run_jobs
 from depthpose.depth.disparity import depth_from_disparity, disparity_from_depth
 from depthpose.depth.metrics import SMALLEST_DEPTH_M
 from depthpose.depth.types import DepthEstimate, Ground, Map, StereoInput
@@ -231,27 +232,55 @@ def read_ground(folder: Path, name: str) -> Ground | None:
     return config_from_dict(content, Ground, source=str(path))
 
 
+@dataclass(frozen=True, kw_only=True)
+class DepthResults(Results[StereoInput, DepthEstimate]):
+    """Estimates as files of one folder, as :func:`write_estimate` names them."""
+
+    folder: Path  #: claimed before (:func:`depthpose.core.run.claim_folder`)
+    range_m: tuple[float, float] = COLOR_RANGE_M
+    cloud_m: float | None = None  #: None: no cloud is written
+    min_confidence: float | None = None  #: of clouds
+
+    def is_finished(self, job: Job[StereoInput]) -> bool:
+        """Whether an earlier run left the files whole, with the cloud if one is wanted."""
+        needed = (LAST,) if self.cloud_m is None else (LAST, CLOUD)
+        return is_whole(self.folder, job.name, [f"{job.name}.{ending}" for ending in needed])
+
+    def store(self, job: Job[StereoInput], data: StereoInput, result: DepthEstimate) -> None:
+        """Write the files of an estimate, and note that it is finished."""
+        written = write_estimate(
+            self.folder, data, result, self.range_m, self.cloud_m, self.min_confidence
+        )
+        note_result(self.folder, job.name, written)
+
+
 def predict(
     net: Estimator,
-    inputs: Mapping[str, Callable[[], StereoInput]],
+    jobs: Sequence[Job[StereoInput]],
     folder: Path,
     settings: dict[str, Any],
     sources: Mapping[str, Path | Sequence[Path]],
-) -> Iterable[str]:
+) -> Iterator[str]:
     """Estimate what is not finished yet, one frame at a time, and yield each name.
 
     Args:
         net: the estimator.
-        inputs: readers of the inputs by name, called only for unfinished frames.
+        jobs: what this process estimates.
         folder: where the files go; refused if other settings or images made what it holds.
         settings: what decides the results.
         sources: the files behind each name, the image first, of all processes that write to the
             folder.
+
+    Raises:
+        InputError: an input cannot be read or estimated.
     """
-    claim_folder(folder, settings, (f"{name}.{end}" for name in inputs for end in ENDINGS))
+    claim_folder(folder, settings, (f"{job.name}.{end}" for job in jobs for end in ENDINGS))
     claim_names(folder, sources, is_finished=partial(is_finished, folder))
-    for name, read_input in inputs.items():
-        if not is_finished(folder, name):
-            pair = read_input()
-            note_result(folder, name, write_estimate(folder, pair, net.estimate_pair(pair)))
-        yield name
+
+    def estimate_many(pairs: Sequence[StereoInput]) -> list[DepthEstimate]:
+        return [net.estimate_pair(pair) for pair in pairs]
+
+    for outcome in run_jobs(jobs, estimate_many, DepthResults(folder=folder)):
+        if outcome.failure is not None:
+            raise outcome.failure
+        yield outcome.job.name

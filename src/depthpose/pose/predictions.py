@@ -5,11 +5,12 @@ import math
 import warnings
 from collections import Counter, defaultdict
 from collections.abc import Callable, Generator, Iterable, Mapping, Sequence
+from contextlib import closing
 from dataclasses import asdict, dataclass, field, replace
 from functools import partial
 from io import StringIO
 from pathlib import Path
-from typing import Any, Generic, NamedTuple, TypeVar, cast, get_args
+from typing import Any, NamedTuple, TypeVar, cast, get_args
 
 import torch
 from torch import Tensor
@@ -21,6 +22,7 @@ from depthpose.core.files.disk import read_bytes, refuse_heavy, refused_as, writ
 from depthpose.core.frame import data_frame
 from depthpose.core.rigid import Rigid
 from depthpose.core.run import claim_folder
+from depthpose.core.runner import Job, Results, run_jobs
 from depthpose.pose.datasets import BopDataset, Detection, Instance, read_mask
 from depthpose.pose.datasets.layouts import MOST, integer, make_pose, number, read_rows
 from depthpose.pose.types import (
@@ -107,7 +109,7 @@ def read_predictions(folder: Path) -> Predictions:
     return found
 
 
-def kept_predictions(folder: Path) -> dict[str, Prediction]:
+def earlier_predictions(folder: Path) -> dict[str, Prediction]:
     """Read what earlier runs left in a folder, and in those of the parts of several processes.
 
     By the names of estimates. A damaged file is as none, and a notice.
@@ -287,17 +289,14 @@ Input = TypeVar("Input")
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Job(Generic[Input]):
-    """One thing to estimate: what it is called, where it belongs, and how its input is read."""
+class PoseJob(Job[Input]):
+    """One input of an estimator of poses."""
 
-    name: str  #: that of the input: unique in a run
-    read: Callable[[], Input]  #: gives the input; called where no estimate is there yet
     #: what is posed, where an input that cannot be read gives an estimate that says so; else it is
     #: an error
     object: str | None = None
     place: Place | None = None  #: as :class:`Prediction` has it
     seconds: Mapping[str, float] = field(default_factory=dict)  #: what was spent before, on a mask
-    source: Path | tuple[Path, ...] | None = None  #: file or files that the input is read from
 
 
 def unreadable(name: str, object: str, error: InputError) -> PoseEstimate:
@@ -306,18 +305,60 @@ def unreadable(name: str, object: str, error: InputError) -> PoseEstimate:
     return PoseEstimate(name=name, object=object, status="unreadable", reason=reason)
 
 
+class PoseResults(Results[Input, PoseEstimate]):
+    """One estimate for each input, in the ``poses.json`` of a folder.
+
+    What was unreadable is tried again: it may have been repaired. The file is written every 200
+    results, and when the run ends or is interrupted.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        self.predictions = earlier_predictions(folder)  #: by the names of the inputs
+        self._finished = {
+            name for name, made in self.predictions.items() if made.estimate.status != "unreadable"
+        }
+        self._unsaved = 0
+
+    def is_finished(self, job: Job[Input]) -> bool:
+        """Whether an earlier run estimated or refused this input."""
+        return job.name in self._finished
+
+    def store(self, job: Job[Input], data: Input, result: PoseEstimate) -> None:  # noqa: ARG002
+        """Keep an estimate with the place of its input, and the time that was spent before."""
+        assert isinstance(job, PoseJob)
+        assert result.name == job.name, f"{result.name!r} is not {job.name!r}"
+        self._keep(job, result)
+
+    def store_failure(self, job: Job[Input], error: InputError) -> None:
+        """Keep an estimate that says why the input cannot be read, if the job names an object."""
+        assert isinstance(job, PoseJob)
+        if job.object is None:
+            raise error
+        self._keep(job, unreadable(job.name, job.object, error))
+
+    def _keep(self, job: PoseJob[Input], estimate: PoseEstimate) -> None:
+        timed = replace(estimate, seconds={**job.seconds, **estimate.seconds})
+        self.predictions[job.name] = Prediction(estimate=timed, place=job.place)
+        self._unsaved += 1
+        if self._unsaved >= _SAVE_EVERY:
+            self.flush()
+
+    def flush(self) -> None:
+        """Write ``poses.json``."""
+        if self._unsaved or not (self.folder / POSES).is_file():
+            write_predictions(self.folder, self.predictions.values())
+            self._unsaved = 0
+
+
 def predict(
     estimate_many: Callable[[Sequence[Input]], Sequence[PoseEstimate]],
-    jobs: Iterable[Job[Input]],
+    jobs: Iterable[PoseJob[Input]],
     folder: Path,
     settings: dict[str, Any],
     batch: int = 1,
 ) -> Generator[Prediction, None, None]:
-    """Yield the finished, and estimate and yield the others; ``poses.json`` grows as it goes.
-
-    What was unreadable is tried again: it may have been repaired.
-
-    What was estimated is saved every 200 jobs, and when the work ends or is interrupted.
+    """Estimate what is not finished, and yield all predictions in the order of the jobs.
 
     Args:
         estimate_many: gives an estimate for each input, of the same name.
@@ -325,58 +366,32 @@ def predict(
         folder: where ``poses.json`` goes; refused if other settings made what it holds.
         settings: what decides the results.
         batch: how many inputs are handed over at once. Each then takes an equal share of the time.
+
+    Raises:
+        InputError: an input whose job names no object cannot be read.
     """
     claim_folder(folder, settings, [POSES])
-    wanted = list(jobs)
-    done = kept_predictions(folder)
-    finished = {name for name, made in done.items() if made.estimate.status != "unreadable"}
-    yield from (done[job.name] for job in wanted if job.name in finished)
-    left = [job for job in wanted if job.name not in finished]
-    unsaved = 0
-    try:
-        for start in range(0, len(left), batch):
-            some = left[start : start + batch]
-            inputs: list[Input | PoseEstimate] = []
-            for job in some:
-                try:
-                    inputs.append(job.read())
-                except InputError as error:
-                    if job.object is None:
-                        raise
-                    inputs.append(unreadable(job.name, job.object, error))
-            answers = iter(estimate_many([i for i in inputs if not isinstance(i, PoseEstimate)]))
-            estimates = [i if isinstance(i, PoseEstimate) else next(answers) for i in inputs]
-            for job, estimate in zip(some, estimates, strict=True):
-                assert estimate.name == job.name, f"{estimate.name!r} is not {job.name!r}"
-                spent = {**job.seconds, **estimate.seconds}
-                done[job.name] = Prediction(
-                    estimate=replace(estimate, seconds=spent), place=job.place
-                )
-                unsaved += 1
-                yield done[job.name]
-            if unsaved >= _SAVE_EVERY:
-                write_predictions(folder, done.values())
-                unsaved = 0
-    finally:
-        if unsaved or not (folder / POSES).is_file():
-            write_predictions(folder, done.values())
+    results = PoseResults[Input](folder)
+    with closing(run_jobs(jobs, estimate_many, results, batch)) as outcomes:
+        for outcome in outcomes:
+            yield results.predictions[outcome.job.name]
 
 
 def instance_jobs(
     dataset: BopDataset, names: Mapping[int, str], predicted_mask: str | None = None
-) -> list[Job[ViewInput]]:
+) -> list[PoseJob[ViewInput]]:
     """Take every annotated instance by its own mask, or a predicted one: see ``Layout``.
 
     ``names`` are those of the estimator, by the objects' numbers.
     """
-    jobs: list[Job[ViewInput]] = []
+    jobs: list[PoseJob[ViewInput]] = []
     for instance in dataset.instances:
         mask, object = None, names[instance.object_id]
         if predicted_mask is not None:
             file = predicted_mask.format(object=instance.object_id, image=instance.image_id)
             mask = dataset.folder / file
         read = partial(_read_view, dataset, instance, instance.name, object, mask)
-        jobs.append(Job(name=instance.name, read=read, place=place_of(instance)))
+        jobs.append(PoseJob(name=instance.name, read=read, place=place_of(instance)))
     return jobs
 
 
@@ -397,7 +412,7 @@ def _read_view(
 
 def detection_jobs(
     dataset: BopDataset, names: Mapping[int, str], detections: Sequence[Detection]
-) -> list[Job[ViewInput]]:
+) -> list[PoseJob[ViewInput]]:
     """Take the surest detections of each object, as many as an image shows of it.
 
     What is not detected has no job, and is missing in what is measured. The time of an image's
@@ -430,13 +445,13 @@ def detection_jobs(
         )
     sharing = Counter(place[:2] for place, _, _ in kept)
 
-    jobs: list[Job[ViewInput]] = []
+    jobs: list[PoseJob[ViewInput]] = []
     for place, k, one in sorted(kept, key=lambda item: item[:2]):
         name = f"{place.scene_id:06d}_{place.image_id:06d}_object{place.object_id}_{k}"
         seconds = {} if one.seconds is None else {"segmentation": one.seconds / sharing[place[:2]]}
         instance, object = shown[place][0], names[place.object_id]
         read = partial(_read_view, dataset, instance, name, object, one)
-        jobs.append(Job(name=name, read=read, place=place, seconds=seconds))
+        jobs.append(PoseJob(name=name, read=read, place=place, seconds=seconds))
     return jobs
 
 

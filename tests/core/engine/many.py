@@ -11,7 +11,7 @@ from pathlib import Path
 
 from tests.core.engine.doubles import TEXTS
 
-from depthpose.core.engine import Function, Job, RayEngine, Sample, Work, find_items, run_job
+from depthpose.core.engine import Function, RayEngine, Sample, ShardedJob, Work, find_items, run_job
 
 
 def _start() -> Function:
@@ -34,7 +34,7 @@ def main(total: int, home: Path) -> None:
     (home / "small.txt").write_text("small")
     rows = [f"small.txt,{k:06d}" for k in range(total)]
     (home / "list.csv").write_text("\n".join(["text,name", *rows]))
-    job = Job(
+    job = ShardedJob(
         work=Work(start=_start, files=TEXTS, endings=("peak_kb",), batch=16),
         items=find_items([str(home / "list.csv")], TEXTS),
         out=str(home / "out"),

@@ -13,7 +13,7 @@ from tests.core.engine.doubles import InProcessEngine, reverse_work, unpacked, w
 from depthpose.core.engine import (
     Done,
     Inputs,
-    Job,
+    ShardedJob,
     find_items,
     read_results,
     run_job,
@@ -23,11 +23,11 @@ from depthpose.core.engine.work import Block, Work
 from depthpose.core.errors import InputError
 
 
-def job_of(tmp_path: Path, words: list[str], **changed: object) -> Job:
+def job_of(tmp_path: Path, words: list[str], **changed: object) -> ShardedJob:
     work = reverse_work(str(tmp_path / "log"))
     given = {"out": str(tmp_path / "out"), "settings": {"way": "back"}, "block": 2} | changed
     items = find_items(words, work.files) if words else []
-    return Job(work=work, items=items, **given)  # pyright: ignore[reportArgumentType]
+    return ShardedJob(work=work, items=items, **given)  # pyright: ignore[reportArgumentType]
 
 
 def calls(tmp_path: Path) -> list[str]:

@@ -4,8 +4,8 @@ The engine knows files and names; what a worker does with them is a function tha
 """
 
 from depthpose.core.engine.job import PLAN as PLAN
-from depthpose.core.engine.job import Job as Job
 from depthpose.core.engine.job import RayEngine as RayEngine
+from depthpose.core.engine.job import ShardedJob as ShardedJob
 from depthpose.core.engine.job import read_results as read_results
 from depthpose.core.engine.job import run_job as run_job
 from depthpose.core.engine.job import shard_results as shard_results

@@ -50,7 +50,7 @@ Engine = Callable[[Sequence[Block], Work, str], Iterable[Done]]
 
 
 @dataclass(frozen=True, kw_only=True)
-class Job:
+class ShardedJob:
     """What is done, to which inputs, and where the results go."""
 
     work: Work  #: what is done
@@ -61,7 +61,7 @@ class Job:
     block: int = 64  #: inputs of a shard
 
 
-def run_job(job: Job, engine: Engine) -> list[Done]:
+def run_job(job: ShardedJob, engine: Engine) -> list[Done]:
     """Do what is not finished of a job, and write the list of all: ``manifest.csv``.
 
     Returns:
