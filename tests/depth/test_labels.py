@@ -129,7 +129,7 @@ def test_the_command_says_what_it_did_and_what_failed(
     said = capsys.readouterr()
     assert said.err.count(f"depthpose: failed: {damaged}") == 1
     assert "1 pairs labelled, " in said.out
-    assert "; 1 failed, the others were there" in said.out
+    assert "; 1 failed, the others were labelled before" in said.out
     assert [path.name for path in (out / "disp_occ").iterdir()] == ["01.png"]
     damaged.write_bytes(whole)
     assert main(words) == 0

@@ -214,7 +214,9 @@ def lasting_streams() -> Iterator[Output]:
         for stream in (output, errors):
             if (reconfigure := getattr(stream, "reconfigure", None)) is not None:
                 reconfigure(errors="backslashreplace")  # names of files need not be UTF-8
-        sys.stdin, sys.stdout, sys.stderr = real[0], output, errors
+        sys.stdin = real[0]
+        sys.stdout = output
+        sys.stderr = errors
         try:
             yield output
         finally:

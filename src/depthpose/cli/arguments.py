@@ -108,7 +108,8 @@ def parser_of(
         return shape.bind(*words, **options)
 
     function = unwrap(parse)  # tyro looks behind what checks types in tests, and so do we
-    function.__doc__, function.__module__ = command.__doc__, command.__module__
+    function.__doc__ = command.__doc__
+    function.__module__ = command.__module__
     function.__annotations__ = hints
     vars(function)["__signature__"] = shape.replace(parameters=worded)
     return function, options
@@ -321,23 +322,24 @@ def refuse_words(command: str, options: Sequence[Option], words: Sequence[str]) 
     """
     typed = Typed()
     spelled = dict[str, str]()
-    here: list[str] = []
+    values: list[str] = []
     for word in words:
         if word.startswith("--"):
             option, sign, value = word.removeprefix("--").partition("=")
             name = option.replace("_", "-").removeprefix("no-")
-            spelled[name], here = f"--{option}", typed.setdefault(name, [])
-            here += [value] if sign else []
+            spelled[name] = f"--{option}"
+            values = typed.setdefault(name, [])
+            values += [value] if sign else []
         else:
-            here.append(word)
+            values.append(word)
     for name in (option.name.replace("_", "-") for option in options if option.names is not None):
         if typed.get(name, [])[:1] == [""]:
             raise InputError(
                 f"{spelled[name]} is empty; name a file or folder (the current folder is '.'), or "
                 "check the variable that should hold it"
             )
-    for commands, case, ignored_names, why in _RULES:
+    for commands, case, ignored_names, reason in _RULES:
         ignored = [spelled[name] for name in ignored_names.split() if name in typed]
         if ignored and command in commands.split(", ") and case(typed):
             named = " and ".join(ignored)
-            raise InputError(f"{named}: has no effect here; {why}. Leave {named} out")
+            raise InputError(f"{named}: has no effect here; {reason}. Leave {named} out")

@@ -212,8 +212,8 @@ def _is_made(out: Path, split: str, scene: int, frames: range) -> bool:
     home = f"{split}/{scene:06d}"
     if not is_whole(out, home, [f"{home}/scene_camera.json"]):
         return False
-    there = read_json(out / home / "scene_camera.json")
-    return isinstance(there, dict) and {str(n) for n in frames} <= set(there)
+    frames_of_scene = read_json(out / home / "scene_camera.json")
+    return isinstance(frames_of_scene, dict) and {str(n) for n in frames} <= set(frames_of_scene)
 
 
 def check(
@@ -330,15 +330,16 @@ def label(
     sha256 = file_sha256(find_weights(weights))
     settings = {"dataset": dataset.name, "weights_sha256": sha256, **asdict(config)}
     failures: list[InputError] = []
-    noted = failures if len(dataset) > 1 else None
+    collected = failures if len(dataset) > 1 else None  # that of the only pair ends the command
     net = FakestereoNet.load(weights, config=MatcherConfig(device=device))
-    labelled = label_pairs(net, dataset, config, out, settings, failures=noted)
+    labelled = label_pairs(net, dataset, config, out, settings, failures=collected)
     shares = [share for _, share in tqdm(labelled, unit=" pairs", leave=False, disable=None)]
     for failure in failures:
         print(f"depthpose: failed: {failure}", file=sys.stderr)
     labelled_share = f", {sum(shares) / len(shares):.0%} of their pixels labelled" if shares else ""
     failed = f"{len(failures)} failed, " if failures else ""
-    print(f"{out}: {len(shares)} pairs labelled{labelled_share}; {failed}the others were there")
+    counts = f"{len(shares)} pairs labelled{labelled_share}; {failed}"
+    print(f"{out}: {counts}the others were labelled before")
     return 1 if failures else 0
 
 
@@ -446,13 +447,13 @@ def split(files: tyro.conf.Positional[tuple[Source, ...]], out: NewPath) -> int:
         )
         for name, views in pictures:
             if len(views) == 1:
-                how = find_two_views(views[0])
-                if how is None:
+                layout_of_views = find_two_views(views[0])
+                if layout_of_views is None:
                     raise InputError(
                         f"{source}: {name} does not look like two views of one scene, side by "
                         "side or one above the other; leave it out"
                     )
-                views = list(halves(views[0], how))  # noqa: PLW2901
+                views = list(halves(views[0], layout_of_views))  # noqa: PLW2901
             for side, view in zip(_SIDES, order_views(views[0], views[1]), strict=True):
                 write_image(out / side / f"{name}.png", view)
             count += 1
@@ -469,16 +470,17 @@ def _check_rows(
     from depthpose.core.camera import check_rectified
     from depthpose.core.files import read_image
 
-    rig, (x, y) = rectifier.rig, rectifier.left_maps
+    rig = rectifier.rig
+    x, y = rectifier.left_maps
     is_seen = (x >= 0) & (x <= rig.width - 1) & (y >= 0) & (y <= rig.height - 1)
     print(
         f"rectified camera: {rig.width}x{rig.height}, fx {float(rig.K[0, 0]):.1f} px, baseline "
         f"{rig.baseline_m:.4f} m; the raw images show {is_seen.mean():.1%} of the left view"
     )
     count = min(_LOOKED_AT, len(pairs))
-    some = [pairs[k * len(pairs) // count] for k in range(count)]
+    checked_pairs = [pairs[k * len(pairs) // count] for k in range(count)]
     reports: list[RectificationReport] = []
-    for first, second in some:
+    for first, second in checked_pairs:
         names = [str(first), str(second)]
         left, right = rectifier.rectify(read_image(first), read_image(second), names)
         reports.append(check_rectified(left, right, rig.cx_right_minus_left_px))

@@ -68,7 +68,7 @@ def predict(
     if engine.engine == "ray":
         return work.estimate_by_engine(images, work.IMAGES, work_of, out, engine)
     sources = work.find_sources(images, Path(out))
-    this = work_of(sources)
+    depth_work = work_of(sources)
     built = method.build()
     is_plain = (matching.precision, matching.max_memory) == ("fp32", None)
     if built.settings.get("answer") == "own" and not is_plain:
@@ -76,7 +76,7 @@ def predict(
             "--precision and --max-memory are for a matcher with weights, and none runs here; "
             "leave them out"
         )
-    return work.estimate_all([(path,) for path in sources], this, built, Path(out))
+    return work.estimate_all([(path,) for path in sources], depth_work, built, Path(out))
 
 
 def match(
@@ -109,13 +109,13 @@ def match(
     from depthpose.cli import depth_predict as work
     from depthpose.core.files.images import refuse_among_inputs
 
-    used = None if pairs.matcher == "sgbm" else pairs.matcher or pairs.weights or "default"
+    weights = None if pairs.matcher == "sgbm" else pairs.matcher or pairs.weights or "default"
     config = replace(
         matching.config,
         with_left_right_check=matching.left_right_check,
         max_disparity_px=matching.max_disparity,
     )
-    method = work.MethodSource(weights=used, config=config, with_right=True, use="pairs")
+    method = work.MethodSource(weights=weights, config=config, with_right=True, use="pairs")
     method = method.packed() if engine.engine == "ray" else method
 
     work_of = partial(work.pair_work, camera, pairs, method)
@@ -126,9 +126,9 @@ def match(
         raise InputError(f"{left}: there is no right image beside it; give it second")
     files = work.list_pairs(left, right)
     refuse_among_inputs(Path(out), (left, right), [path for pair in files for path in pair])
-    this = work_of(files[0])
+    depth_work = work_of(files[0])
     built = method.build()
-    return work.estimate_all(files, this, built, Path(out))
+    return work.estimate_all(files, depth_work, built, Path(out))
 
 
 def evaluate(
@@ -177,8 +177,8 @@ def evaluate(
     dataset = open_frames(data, split)
     chosen = choose_methods(methods, matching.config, dataset)
     is_url = re.match(r"\w+:/", str(data)) is not None
-    where = str(data if is_url else data.resolve())
-    about = {"data": where, "split": None if split is None else str(split)}
+    location = str(data if is_url else data.resolve())
+    about = {"data": location, "split": None if split is None else str(split)}
     about |= {"protocol": comparison.protocol, "cap": list(comparison.cap)}
     files = [*table_files("rows", "frames", "confidence"), "report.html", "predictions"]
     claim_folder(out, {"command": "depth evaluate", **about}, files)

@@ -171,8 +171,8 @@ def measure(
     """Measure, write rows, a table and a page, and print; rows that are ``ready`` come last."""
     if find_rank().rank > 0:
         return 0
-    each = measure_each(dataset, folders, protocol, caps_m)
-    measured = join([*each, *ready])
+    evaluations = measure_each(dataset, folders, protocol, caps_m)
+    measured = join([*evaluations, *ready])
     rows = [row.columns() for row in measured.rows]
     page.write_table(out, rows)
     about = f"{protocol}: {PROTOCOLS[protocol].summary}."
@@ -189,7 +189,7 @@ def measure(
     sections: list[Section] = []
     shares = page.share_views(len(folders))
     for folder, of_folder, most in zip(
-        folders, [evaluation.per_frame for evaluation in each], shares, strict=True
+        folders, [evaluation.per_frame for evaluation in evaluations], shares, strict=True
     ):
         cap_m = of_folder[0].cap_m
         of_cap = [row for row in of_folder if row.cap_m == cap_m and row.pixels]
@@ -220,8 +220,8 @@ def measure(
     metrics = [metric.name for metric in METRICS.values() if metric.is_printed]
     about_row = ["method", "weights", "speed", "cap_m", "frames", "coverage"]
     print(page.plain_table(rows, [*about_row, *metrics, "ause"]))  # files hold every column
-    for name, why in measured.skipped.items():
-        print(f"skipped: {name}: {why}", file=sys.stderr)
+    for name, reason in measured.skipped.items():
+        print(f"skipped: {name}: {reason}", file=sys.stderr)
     print(f"{len(measured.skipped)} frames skipped")
     print(f"every column: {out / 'table.md'}, rows.csv; the page: {out / 'report.html'}")
     return 0
@@ -233,15 +233,18 @@ def measure_each(
     """Measure folders of predictions one by one; each row says whose it is."""
     show = partial(tqdm, unit=" frames", disable=None)
     return [
-        signed(
+        with_source(
             evaluate(dataset, folder, protocol, caps_m, show), folder.name, read_settings(folder)
         )
         for folder in folders
     ]
 
 
-def signed(result: Evaluation, name: str, settings: dict[str, Any] | None) -> Evaluation:
-    """Add the source of the predictions to each row."""
+def with_source(result: Evaluation, name: str, settings: dict[str, Any] | None) -> Evaluation:
+    """Add to each row which method, weights and input made the predictions.
+
+    ``settings``: those of the run that made them; None of files by others, which ``name`` names.
+    """
     holes = {True: " (holes filled)", False: " (matched pixels)"}
     made_by = settings or {"matcher": name, "input": ""}
     source = {
@@ -259,13 +262,17 @@ def signed(result: Evaluation, name: str, settings: dict[str, Any] | None) -> Ev
     )
 
 
-def join(each: Sequence[Evaluation]) -> Evaluation:
+def join(evaluations: Sequence[Evaluation]) -> Evaluation:
     """Put the rows of several evaluations below each other."""
     return Evaluation(
-        rows=[row for evaluation in each for row in evaluation.rows],
-        per_frame=[row for evaluation in each for row in evaluation.per_frame],
-        deciles=[row for evaluation in each for row in evaluation.deciles],
-        skipped={name: why for evaluation in each for name, why in evaluation.skipped.items()},
+        rows=[row for evaluation in evaluations for row in evaluation.rows],
+        per_frame=[row for evaluation in evaluations for row in evaluation.per_frame],
+        deciles=[row for evaluation in evaluations for row in evaluation.deciles],
+        skipped={
+            name: reason
+            for evaluation in evaluations
+            for name, reason in evaluation.skipped.items()
+        },
     )
 
 
@@ -281,7 +288,7 @@ def write_details(measured: Evaluation, out: Path) -> list[Section]:
         for file in page.table_files("confidence"):
             (out / file).unlink(missing_ok=True)
     text = "Mean error of the least sure tenth of each frame's pixels (1) to the surest (10)"
-    skipped = [{"frame": name, "why": why} for name, why in measured.skipped.items()]
+    skipped = [{"frame": name, "why": reason} for name, reason in measured.skipped.items()]
     sections = [
         Section(title="Error by confidence", text=text, rows=deciles),
         Section(title="Each frame", rows=frames),
@@ -312,4 +319,4 @@ def measure_shards(
         for frame, index in places.items():
             if frame not in rows:  # it has no truth, or its absence is an error
                 rows[frame] = measure_frame(dataset, index, Path(nothing), protocol, caps_m)
-    return signed(summarise(dataset, protocol, rows), name, settings)
+    return with_source(summarise(dataset, protocol, rows), name, settings)

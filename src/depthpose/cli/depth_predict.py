@@ -130,8 +130,10 @@ class MethodSource:
                 settings = {**settings, **asdict(sgbm)}
             else:
                 matcher = find_weights(self.matcher)
-                other, facts["matcher_sha256"] = matcher.stem, file_sha256(matcher)
-            name, facts["matcher"] = f"{path.stem}-{other}", f"{kind} with {other}"
+                other = matcher.stem
+                facts["matcher_sha256"] = file_sha256(matcher)
+            name = f"{path.stem}-{other}"
+            facts["matcher"] = f"{kind} with {other}"
         net = FakestereoNet.load(
             path, matcher=matcher, config=config, answer=answer, allow_ood=self.allow_ood,
             use=self.use,
@@ -386,14 +388,14 @@ def estimate_by_engine(
         first_work = work_of(first)
     if first_work.scale.one_mount:
         raise InputError("--one-mount takes the images one after the other; omit it, or --engine")
-    here = (
+    method_settings = (
         replace(first_work.method, config=replace(first_work.method.config, device="cpu"))
         .build()
         .settings
     )
-    if "device" in here:  # that of the workers, which this machine need not have
-        here["device"] = first_work.method.config.device
-    settings = first_work.settings(here)
+    if "device" in method_settings:  # that of the workers, which this machine need not have
+        method_settings["device"] = first_work.method.config.device
+    settings = first_work.settings(method_settings)
     work = Work(start=first_work.start, files=files, endings=ENDINGS, batch=first_work.output.batch)
     what = "pairs" if files == PAIRS else "depth maps"
     return say(engine.run(work, inputs, out, settings), out, what)
@@ -452,9 +454,9 @@ def write_depth_page(
     chosen = {names[k] for k in spread_evenly(len(names), MOST_VIEWS)}
     shown = list(_read_chosen(names_of, work, chosen))
 
-    which = "all" if len(shown) == len(names) else "spread evenly"
+    selection = "all" if len(shown) == len(names) else "spread evenly"
     number = f"{len(names)} depth map{'s' * (len(names) != 1)}"
-    text = f"Shown: {len(shown)} of {number} in this folder ({which})."
+    text = f"Shown: {len(shown)} of {number} in this folder ({selection})."
     rows = [{"not estimated, because": str(reason)} for reason in failures]
     warnings = {name: out / f"{name}.warning.txt" for name in names}
     rows += [
@@ -564,8 +566,8 @@ class DepthRun:
         """Print the warning of an estimate, its mount, and how much its cloud leaves out."""
         output = self.work.output
         if output.cloud and output.min_confidence > 0:
-            sure = estimate.is_sure(output.min_confidence).sum()
-            share = 1 - float(sure / estimate.is_sure(0.0).sum().clamp(min=1))
+            sure_count = estimate.is_sure(output.min_confidence).sum()
+            share = 1 - float(sure_count / estimate.is_sure(0.0).sum().clamp(min=1))
             tqdm.write(
                 f"{name}: {share:.1%} of the depth is less sure than {output.min_confidence:g} "
                 "and left out of the cloud"

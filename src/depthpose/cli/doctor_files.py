@@ -68,7 +68,7 @@ def look_at_all(paths: Sequence[Path]) -> int:
         except InputError as error:
             all_facts.append(FileFacts(path=path, odd=[str(error).removeprefix(f"{path}: ")]))
     for file_facts in all_facts:
-        file_facts.odd += _beside(file_facts, all_facts)
+        file_facts.odd += _contradictions(file_facts, all_facts)
     for path in paths:
         file_facts = next(s for s in all_facts if s.path == path)
         print(f"{path}: {file_facts.what}" if file_facts.what else f"{path}: cannot be used")
@@ -167,7 +167,8 @@ def _of_picture(path: Path) -> FileFacts:
         if image.mode == "I;16":
             units = torch.from_numpy(np.asarray(image).astype(np.float32))
     if units is not None:
-        has_reading, (low, high) = units > 0, value_range(units.numpy())
+        has_reading = units > 0
+        low, high = value_range(units.numpy())
         unknown = 1 - float(has_reading.float().mean())
         span = max(high - low, 1)
         rough = float((units[:, 1:] - units[:, :-1]).abs().mean()) / span
@@ -205,7 +206,7 @@ def _of_depth(path: Path, units: Tensor) -> FileFacts:
         return file_facts
     median = float(readings.median())
     share = len(readings) / units.numel()
-    maybe = ", ".join(f"{median * unit:.3g} m ({who})" for who, unit in _UNITS_M.items())
+    maybe = ", ".join(f"{median * unit:.3g} m ({device})" for device, unit in _UNITS_M.items())
     file_facts.what += f", {share:.0%} known, median {median:g} units: {maybe}"
     if share == 1:
         file_facts.what += "; or, as no pixel is 0, a picture of 16 bits"
@@ -252,8 +253,8 @@ def _of_points(path: Path, points: Tensor) -> FileFacts:
     return FileFacts(path=path, what=what, odd=odd, cloud=points)
 
 
-def _beside(file_facts: FileFacts, all_facts: Sequence[FileFacts]) -> Iterator[str]:
-    """Say what is odd about a file beside the others."""
+def _contradictions(file_facts: FileFacts, all_facts: Sequence[FileFacts]) -> Iterator[str]:
+    """Say what of a file contradicts the others: sizes, units, the scale of a model."""
     for other in all_facts:
         if (camera := other.camera) is not None and file_facts.size is not None:
             try:

@@ -86,13 +86,13 @@ class Weights:
             yield str(path)
 
 
-def say(every: "Sequence[Done]", out: str, what: str) -> int:
+def say(shards: "Sequence[Done]", out: str, what: str) -> int:
     """List what failed, print how much is done, and give the exit code."""
-    failures = [failure for done in every for failure in done.failures]
+    failures = [failure for done in shards for failure in done.failures]
     for name, reason in failures[:20]:
         print(f"depthpose: failed: {name}: {reason}", file=sys.stderr)
     if len(failures) > 20:
         print(f"depthpose: {len(failures)} failed; all are in manifest.csv", file=sys.stderr)
-    total = sum(len(done.entries) for done in every)
-    print(f"{total - len(failures)} of {total} {what} are in {len(every)} shards of {out}")
+    total = sum(len(done.entries) for done in shards)
+    print(f"{total - len(failures)} of {total} {what} are in {len(shards)} shards of {out}")
     return 1 if failures else 0

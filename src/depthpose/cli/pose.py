@@ -55,8 +55,8 @@ def predict(
         symmetry=inputs.symmetry,
     )
     weights = estimates.weights
-    given = (inputs.cloud, inputs.depth, pair.left, dataset.bop)
-    count = sum(word is not None for word in given)
+    sources = (inputs.cloud, inputs.depth, pair.left, dataset.bop)
+    count = sum(word is not None for word in sources)
     if count != 1:
         raise InputError(
             f"{count} of --cloud, --depth, --left and --bop are given; give one: a cloud, a depth "
@@ -72,7 +72,9 @@ def predict(
     )
     if engine.engine == "ray":
         return predict_on_ray(inputs, source, estimates.batch, out, engine)
-    method, home, batch = source.build(), Path(out), estimates.batch
+    method = source.build()
+    home = Path(out)
+    batch = estimates.batch
     if dataset.bop is not None:
         if inputs.color is not None:
             raise InputError("--color is beside --depth; leave it out where --bop is given")
@@ -138,7 +140,7 @@ def evaluate(
     claim_folder(out, {"command": "pose evaluate", **about}, files)
     methods = pose_methods(weights, estimates.estimate, tuple(dataset.objects.values()))
     shown = find_masks(estimates.masks, dataset, out, estimates.device) if methods else []
-    paths = [predict_all(dataset, method, one, out) for method in methods for one in shown]
+    paths = [predict_all(dataset, method, masks, out) for method in methods for masks in shown]
     return measure(dataset, [*paths, *csv, *predictions], rule, out)
 
 

@@ -65,10 +65,11 @@ def measure_each(
     for path, origin in zip(predictions, describe(predictions), strict=True):
         settings = (read_settings(path) if path.is_dir() else None) or {}
         for what, setting in of_dataset(dataset).items():
-            if (theirs := settings.get(what, setting)) != setting:
+            predicted = settings.get(what, setting)
+            if predicted != setting:
                 raise InputError(
-                    f"{path}: predictions of the {what} {theirs!r}, but {setting!r} is measured; "
-                    f"give those of this very {what}, or measure that one"
+                    f"{path}: predictions of the {what} {predicted!r}, but {setting!r} is "
+                    f"measured; give those of this very {what}, or measure that one"
                 )
         evaluations.append(evaluate(dataset, read_any(path), config, show, origin))
         if (advice := evaluations[-1].advice) is not None:
@@ -76,13 +77,14 @@ def measure_each(
     return evaluations
 
 
-def join(each: Sequence[Evaluation]) -> Evaluation:
+def join(evaluations: Sequence[Evaluation]) -> Evaluation:
     """Put the rows of several evaluations below each other."""
     return Evaluation(
-        rows=[row for evaluation in each for row in evaluation.rows],
-        per_instance=[row for evaluation in each for row in evaluation.per_instance],
-        risk=[row for evaluation in each for row in evaluation.risk],
-        advice="; ".join(evaluation.advice for evaluation in each if evaluation.advice) or None,
+        rows=[row for evaluation in evaluations for row in evaluation.rows],
+        per_instance=[row for evaluation in evaluations for row in evaluation.per_instance],
+        risk=[row for evaluation in evaluations for row in evaluation.risk],
+        advice="; ".join(evaluation.advice for evaluation in evaluations if evaluation.advice)
+        or None,
     )
 
 
@@ -123,8 +125,8 @@ def measure(
     dataset: BopDataset, predictions: Sequence[Path], config: EvaluationConfig, out: Path
 ) -> int:
     """Measure, write rows.json, rows.csv, table.md, report.html and instances.csv, and print."""
-    each = measure_each(dataset, predictions, config)
-    measured = join(each)
+    evaluations = measure_each(dataset, predictions, config)
+    measured = join(evaluations)
     rows = [row.columns() for row in measured.rows]
     text = HOW if measured.advice is None else f"{measured.advice}. {HOW}"
     page.write_table(out, rows)
@@ -139,7 +141,7 @@ def measure(
     sections: list[Section] = []
     shares = page.share_views(len(predictions))
     for path, of_path, most in zip(
-        predictions, [evaluation.per_instance for evaluation in each], shares, strict=True
+        predictions, [evaluation.per_instance for evaluation in evaluations], shares, strict=True
     ):
         if not most:
             continue
@@ -217,9 +219,9 @@ def _choose(rows: Sequence[InstanceRow], most: int) -> list[tuple[str, InstanceR
         for role, k in page.choose_ranked(shares, min(most, 3))
     ]
     refused = [r for r in rows if errors[r.instance] is None and r.status != "missing"]
-    few = min(most - len(chosen), 1)
+    refused_count = min(most - len(chosen), 1)
     chosen += [
         (f"one of {len(refused)} refused", refused[k])
-        for k in page.spread_evenly(len(refused), few)
+        for k in page.spread_evenly(len(refused), refused_count)
     ]
     return chosen

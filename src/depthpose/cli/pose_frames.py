@@ -45,23 +45,26 @@ class SearchResults(Results[ViewInput, list[PoseEstimate]]):
     def __init__(
         self,
         folder: Path,
-        earlier: list[Prediction],
+        images: Sequence[str],
+        earlier: Sequence[Prediction],
         is_of_image: Callable[[Prediction, str], bool],
         numbers: Mapping[str, int] | None = None,
     ) -> None:
+        """Sort the predictions of earlier runs by images; ``numbers``: of a data set's objects."""
         self.by_image: dict[str, list[Prediction]] = {}
         self._folder = folder
-        self._earlier = earlier
-        self._is_of_image = is_of_image
-        self._numbers = numbers  # of the objects in a data set, where it is one
+        self._images = images
+        self._numbers = numbers
+        self._of_other_images = list(earlier)
+        for image in images:
+            of_image = [p for p in self._of_other_images if is_of_image(p, image)]
+            if of_image:
+                self.by_image[image] = of_image
+                self._of_other_images = [p for p in self._of_other_images if p not in of_image]
 
     def is_finished(self, job: Job[ViewInput]) -> bool:
-        """Whether an earlier run has searched the image; its estimates are taken over."""
-        of_image = [p for p in self._earlier if self._is_of_image(p, job.name)]
-        if of_image:
-            self._earlier = [p for p in self._earlier if p not in of_image]
-            self.by_image[job.name] = of_image
-        return bool(of_image)
+        """Whether the image has been searched."""
+        return job.name in self.by_image
 
     def store(self, job: Job[ViewInput], data: ViewInput, result: list[PoseEstimate]) -> None:  # noqa: ARG002
         """Write what was found in an image."""
@@ -82,8 +85,8 @@ class SearchResults(Results[ViewInput, list[PoseEstimate]]):
 
     def flush(self) -> None:
         """Write ``poses.json``."""
-        predictions = [p for of_image in self.by_image.values() for p in of_image]
-        write_predictions(self._folder, [*predictions, *self._earlier])
+        predictions = [p for image in self._images for p in self.by_image.get(image, ())]
+        write_predictions(self._folder, [*predictions, *self._of_other_images])
 
     def _place_of(self, job: PoseJob[ViewInput], estimate: PoseEstimate) -> Place | None:
         if self._numbers is None or job.place is None:
@@ -156,7 +159,7 @@ def find_all(method: PoseMethod, inputs: OneObjectOptions, out: Path) -> int:
     def is_of_image(prediction: Prediction, image: str) -> bool:
         return pose_predict.is_result_of(prediction.estimate.name, image)
 
-    results = SearchResults(out, earlier, is_of_image)
+    results = SearchResults(out, [job.name for job in jobs], earlier, is_of_image)
     predictions, searched = _search(method, objects, jobs, results)
     pose_predict.claim(out, settings, searched, pose_predict.is_result_of)
     pose_predict.write_files(predictions, searched, out, method, inputs=len(jobs))
@@ -198,7 +201,7 @@ def search_dataset(
         return prediction.place is not None and _image_name(prediction.place[:2]) == image
 
     earlier = list(earlier_predictions(out).values())
-    results = SearchResults(out, earlier, is_of_image, numbers)
+    results = SearchResults(out, [job.name for job in jobs], earlier, is_of_image, numbers)
     predictions, searched = _search(method, list(numbers), jobs, results)
     pose_predict.write_files(predictions, searched, out, method, dataset, inputs=len(images))
     return pose_predict.say_result(predictions, out, len(images))
@@ -216,14 +219,22 @@ def _image_name(place: tuple[int, int]) -> str:
     return f"{scene_id:06d}_{image_id:06d}"
 
 
-def _explained(job: PoseJob[Any], found: Prediction, method: PoseMethod) -> AnyInput:
+def _explained(job: PoseJob[Any], prediction: Prediction, method: PoseMethod) -> AnyInput:
     """Read a whole depth image as if a mask had shown what was found in it."""
-    view, pose = job.read(), found.estimate.camera_from_model
-    model = next((one for one in method.models if one.name == found.estimate.object), None)
+    view = job.read()
+    pose = prediction.estimate.camera_from_model
+    model = next(
+        (
+            known_model
+            for known_model in method.models
+            if known_model.name == prediction.estimate.object
+        ),
+        None,
+    )
     if model is None or pose is None or not isinstance(view, ViewInput):
         return view
     mask = explained_mask(view, pose, prepare_surface(model))
-    return replace(view, name=found.estimate.name, mask=mask, object=model.name)
+    return replace(view, name=prediction.estimate.name, mask=mask, object=model.name)
 
 
 def track_folder(method: PoseMethod, frames: SequenceOptions, out: Path) -> int:

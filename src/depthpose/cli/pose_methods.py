@@ -120,10 +120,10 @@ def _segmented(
     wanted = {instance.object_id for instance in dataset.instances}
     lost = sorted(wanted - set(numbers.values()))
     if len(lost) == len(wanted):
-        theirs = ", ".join(f"{name} ({number})" for name, number in numbers_of.items())
+        known_objects = ", ".join(f"{name} ({number})" for name, number in numbers_of.items())
         raise InputError(
-            f"{path}: segments {theirs}, but {dataset.folder} shows objects {lost}; give weights "
-            "of its objects"
+            f"{path}: segments {known_objects}, but {dataset.folder} shows objects {lost}; give "
+            "weights of its objects"
         )
     if lost:
         print(f"{path}: segments no objects {lost}; each is missing", file=sys.stderr)
@@ -185,16 +185,18 @@ def distinct_names(files: Sequence[tuple[Path | None, str]]) -> list[str]:
     ``files``: the folder that something lies in, None where it lies in none, and its name.
     """
     parts = [(*(folder.resolve().parts[1:] if folder else ()), name) for folder, name in files]
-    for some, count in Counter(parts).items():
+    for path_parts, count in Counter(parts).items():
         if count > 1:
             raise InputError(
-                f"{'/'.join(some[-2:])}: {count} that are given have this name, and their results "
-                "would be one; give it once, or rename a file"
+                f"{'/'.join(path_parts[-2:])}: {count} that are given have this name, and their "
+                "results would be one; give it once, or rename a file"
             )
     names: list[str] = []
     depths = [1] * len(parts)
     for _ in range(max(map(len, parts), default=0)):
-        names = ["-".join(some[-depth:]) for some, depth in zip(parts, depths, strict=True)]
+        names = [
+            "-".join(path_parts[-depth:]) for path_parts, depth in zip(parts, depths, strict=True)
+        ]
         counts = Counter(names)
         depths = [d + (counts[name] > 1) for d, name in zip(depths, names, strict=True)]
     return names
@@ -475,9 +477,11 @@ def chosen_objects(
     if object is not None:
         is_theirs = object in datasets.object_names(dataset.folder).values()
         return dataset.of_objects(object if is_theirs else numbers.get(object, object))
-    there = sorted({instance.object_id for instance in dataset.instances})
-    estimable = [n for n in there if n in numbers.values() or dataset.objects[n].name in numbers]
-    left_out = sorted(set(there) - set(estimable))
+    object_ids = sorted({instance.object_id for instance in dataset.instances})
+    estimable = [
+        n for n in object_ids if n in numbers.values() or dataset.objects[n].name in numbers
+    ]
+    left_out = sorted(set(object_ids) - set(estimable))
     if not estimable:
         raise InputError(
             f"{dataset.folder}: holds objects {left_out}, but the {method.holder} know "

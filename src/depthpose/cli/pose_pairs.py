@@ -16,7 +16,9 @@ from depthpose.core.run import claim_folder, is_whole, note_result
 from depthpose.depth.config import MatcherConfig
 from depthpose.depth.disparity import depth_deviation
 
-MATCHED, DEPTH, DEVIATION = "matched", "depth", "depth_std"
+MATCHED = "matched"
+DEPTH = "depth"
+DEVIATION = "depth_std"
 """Folders of what 'depth match' writes, of the depth that is posed, and of its deviation."""
 
 
@@ -45,7 +47,8 @@ def match_pairs(pair: PairOptions, camera: Path | None, device: str, out: Path) 
     method = work.MethodSource(
         weights=used, config=MatcherConfig(device=device), with_right=True, use="pairs"
     )
-    this, built = work.pair_work(camera, networks, method, pairs[0]), method.build()
+    this = work.pair_work(camera, networks, method, pairs[0])
+    built = method.build()
     work.estimate_all(pairs, this, built, out / MATCHED)
     rig = read_rig(camera, image_size(pairs[0][0]))
     for first, _ in pairs:

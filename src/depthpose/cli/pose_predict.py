@@ -114,9 +114,9 @@ def claim(
         (out / POSES).unlink(missing_ok=True)
 
     def is_finished(name: str) -> bool:
-        made = earlier_predictions(out).values()
-        done = [p.estimate.name for p in made if p.estimate.status != "unreadable"]
-        return any(is_result(one, name) for one in done)
+        predictions = earlier_predictions(out).values()
+        done = [p.estimate.name for p in predictions if p.estimate.status != "unreadable"]
+        return any(is_result(result_name, name) for result_name in done)
 
     run.claim_names(
         out,
@@ -141,14 +141,17 @@ def claim_bop(out: Path, settings: dict[str, Any], dataset: BopDataset) -> None:
 
 def object_named(name: str | None, method: PoseMethod) -> str:
     """Give the object that is meant."""
-    known = [model.name for model in method.models]
-    if name is None and len(known) > 1:
-        raise InputError(f"the {method.holder} know {', '.join(known)}; say which by --object")
-    if name is not None and name not in known:
+    known_names = [model.name for model in method.models]
+    if name is None and len(known_names) > 1:
         raise InputError(
-            f"--object {name}: the {method.holder} do not know it; {nearest_name(name, known)}"
+            f"the {method.holder} know {', '.join(known_names)}; say which by --object"
         )
-    return known[0] if name is None else name
+    if name is not None and name not in known_names:
+        raise InputError(
+            f"--object {name}: the {method.holder} do not know it; "
+            f"{nearest_name(name, known_names)}"
+        )
+    return known_names[0] if name is None else name
 
 
 def camera_facts(camera: Path | float) -> dict[str, Any]:
@@ -160,14 +163,14 @@ def camera_facts(camera: Path | float) -> dict[str, Any]:
 
 def cloud_jobs(cloud: Path, unit: Unit, object: str, out: Path) -> list[PoseJob[Any]]:
     """Take a cloud, or every one of a folder."""
-    known = tuple(CLOUD_READERS)
+    suffixes = tuple(CLOUD_READERS)
     files = [cloud]
     if cloud.is_dir():
         named = [path for path in cloud.iterdir() if not path.name.startswith(".")]
-        files = [path for path in named if path.suffix.lower() in known]
+        files = [path for path in named if path.suffix.lower() in suffixes]
     files.sort(key=natural_order)
     if not files:
-        raise InputError(f"{cloud}: no {', '.join(known)} file there; give a cloud, or a folder")
+        raise InputError(f"{cloud}: no {', '.join(suffixes)} file there; give a cloud, or a folder")
     _refuse_one_name(files)
     refuse_among_inputs(out, [cloud], files)
     return [
@@ -196,7 +199,8 @@ def view_jobs(
     ``object``, or each of the object that ``labels`` names by its number.
     """
     runs = sorted(mask.glob("*.json")) if mask.is_dir() else []  # of run lengths
-    depths, pictures = _list_depths(depth), runs or list_images(mask)
+    depths = _list_depths(depth)
+    pictures = runs or list_images(mask)
     refuse_among_inputs(out, [depth, mask], [*depths, *pictures])
     masks = _beside_depths(depths, pictures, depth, mask, "mask")
     jobs: list[PoseJob[Any]] = []
@@ -261,8 +265,8 @@ def box_jobs(
             f"--box: {depth} holds {len(depths)} depth images, and a box is of one; name that one, "
             "or give a file for each by --detections"
         )
-    found = [Detection(object=object, box=parse_box(text)) for text in boxes]
-    return _detection_jobs(depths[0], found, (depths[0],), camera, unit)
+    detections = [Detection(object=object, box=parse_box(text)) for text in boxes]
+    return _detection_jobs(depths[0], detections, (depths[0],), camera, unit)
 
 
 def detection_jobs(
@@ -285,11 +289,11 @@ def detection_jobs(
         named = [p for p in detections.iterdir() if p.suffix.lower() in (".json", ".txt")]
         files = [p for p in named if not p.name.startswith(".")]
     refuse_among_inputs(out, [depth, detections], [*depths, *files])
-    found: dict[str, list[Detection]] = {}
+    by_image: dict[str, list[Detection]] = {}
     if len(files) == 1 and files[0].suffix.lower() == ".json":
         read = read_detections(files[0])
         beside = dict.fromkeys((path.stem for path in depths), files[0])
-        found = of_images(read, [path.stem for path in depths], str(files[0]))
+        by_image = of_images(read, [path.stem for path in depths], str(files[0]))
     else:
         beside = _beside_depths(depths, files, depth, detections, "file of detections")
         for path in depths:
@@ -298,18 +302,18 @@ def detection_jobs(
             if file.suffix.lower() == ".txt":
                 height, width = read_stored_depth(path).shape
                 size = (width, height)
-            found[path.stem] = read_detections(file, size)
+            by_image[path.stem] = read_detections(file, size)
     jobs: list[PoseJob[Any]] = []
     empty: list[str] = []
     for path in depths:
-        own = name_objects(found[path.stem], *objects, source=str(beside[path.stem]))
-        own.sort(key=lambda one: -one.score)
-        jobs += _detection_jobs(path, own, (path, beside[path.stem]), camera, unit)
-        empty += [] if own else [path.stem]
+        of_image = name_objects(by_image[path.stem], *objects, source=str(beside[path.stem]))
+        of_image.sort(key=lambda detection: -detection.score)
+        jobs += _detection_jobs(path, of_image, (path, beside[path.stem]), camera, unit)
+        empty += [] if of_image else [path.stem]
     if empty:
         shown = ", ".join(empty[:_SAID]) + (", ..." if len(empty) > _SAID else "")
-        said = f"nothing is detected in {len(empty)} of {len(depths)} depth images: {shown}"
-        print(f"depthpose: {said}", file=sys.stderr)
+        message = f"nothing is detected in {len(empty)} of {len(depths)} depth images: {shown}"
+        print(f"depthpose: {message}", file=sys.stderr)
     if not jobs:
         raise InputError(f"{detections}: holds no detection of what is asked for in {depth}")
     _refuse_twice(jobs, depth)
@@ -318,28 +322,28 @@ def detection_jobs(
 
 def _detection_jobs(
     path: Path,
-    found: Sequence[Detection],
+    detections: Sequence[Detection],
     files: tuple[Path, ...],
     camera: Path | float,
     unit: Unit | None,
 ) -> list[PoseJob[Any]]:
     jobs: list[PoseJob[Any]] = []
-    for k, one in enumerate(found, 1):
-        assert one.object is not None
-        name = path.stem + (f"_{k}" if len(found) > 1 else "")
-        read = partial(_read_detection, path, one, camera, name, unit)
-        jobs.append(PoseJob(name=name, read=read, object=one.object, source=files))
+    for k, detection in enumerate(detections, 1):
+        assert detection.object is not None
+        name = path.stem + (f"_{k}" if len(detections) > 1 else "")
+        read = partial(_read_detection, path, detection, camera, name, unit)
+        jobs.append(PoseJob(name=name, read=read, object=detection.object, source=files))
     return jobs
 
 
 def _read_detection(
-    path: Path, found: Detection, camera: Path | float, name: str, unit: Unit | None
+    path: Path, detection: Detection, camera: Path | float, name: str, unit: Unit | None
 ) -> ViewInput:
     """Read a depth image with the pixels of a detection."""
-    assert found.object is not None
-    view = view_input(path, None, camera, found.object, name, unit)
-    mask = found.mask(*view.depth_m.shape)
-    return replace(view, mask=mask, is_region=found.box is not None)
+    assert detection.object is not None
+    view = view_input(path, None, camera, detection.object, name, unit)
+    mask = detection.mask(*view.depth_m.shape)
+    return replace(view, mask=mask, is_region=detection.box is not None)
 
 
 def _beside_depths(
@@ -348,15 +352,15 @@ def _beside_depths(
     """Give the file that belongs to each depth image, by the name of the image."""
     _refuse_one_name(depths)
     _refuse_one_name(others)
-    found = {path.stem: path for path in others}
-    if len(depths) == len(found) == 1 and not depth.is_dir():
-        found = {depths[0].stem: next(iter(found.values()))}
-    lost = [path.stem for path in depths if path.stem not in found]
+    by_name = {path.stem: path for path in others}
+    if len(depths) == len(by_name) == 1 and not depth.is_dir():
+        by_name = {depths[0].stem: next(iter(by_name.values()))}
+    lost = [path.stem for path in depths if path.stem not in by_name]
     if lost:
         raise InputError(
             f"{place}: no {what} called {lost[0]!r}; a {what} has the name of its depth image"
         )
-    return found
+    return by_name
 
 
 def _refuse_twice(jobs: Sequence[PoseJob[Any]], depth: Path) -> None:
@@ -403,26 +407,29 @@ def colored_jobs(
         return jobs
     if inputs.depth is None:
         raise InputError(f"--color {inputs.color}: is beside --depth; a cloud has no colour image")
-    color, depth = Path(inputs.color), Path(inputs.depth)
+    color = Path(inputs.color)
+    depth = Path(inputs.depth)
     pictures = list_images(color)
     refuse_among_inputs(out, [color], pictures)
     beside = _beside_depths(_list_depths(depth), pictures, depth, color, "colour picture")
     settings["color"] = str(color.resolve())
-    camera, moved = inputs.color_camera, None
+    camera = inputs.color_camera
+    moved = None
     if camera is not None:
         settings["color_camera"] = pose_methods.named_file(camera)
     if inputs.color_from_depth is not None:
-        file, what = inputs.color_from_depth, "color_from_depth"
+        file = inputs.color_from_depth
+        what = "color_from_depth"
         moved = pose_methods.read_pose(file, "--color-from-depth", what)
         settings["color_from_depth"] = moved.matrix().tolist()
-    found: list[PoseJob[Any]] = []
+    colored: list[PoseJob[Any]] = []
     for job in jobs:
         sources = job.source if isinstance(job.source, tuple) else (job.source,)
         assert sources[0] is not None
         picture = beside[sources[0].stem]
         read = partial(_read_colored, job.read, models, picture, camera, moved)
-        found.append(replace(job, read=read, source=(*sources, picture)))
-    return found
+        colored.append(replace(job, read=read, source=(*sources, picture)))
+    return colored
 
 
 def _read_colored(
@@ -460,7 +467,8 @@ def _refuse_one_name(files: Sequence[Path]) -> None:
 
 def predict_files(method: PoseMethod, inputs: OneObjectOptions, out: Path, batch: int) -> int:
     """Pose clouds, or parts of depth images, in this process; give the exit code."""
-    settings, unit = dict(method.settings), inputs.unit
+    settings = dict(method.settings)
+    unit = inputs.unit
     if inputs.cloud is not None:
         settings["object"] = name = object_named(inputs.object, method)
         jobs = cloud_jobs(Path(inputs.cloud), unit or "m", name, out)
@@ -483,26 +491,28 @@ def region_jobs(
     method: PoseMethod, inputs: OneObjectOptions, out: Path, settings: dict[str, Any]
 ) -> list[PoseJob[Any]]:
     """Take depth images and where objects are in them; add to the settings what decides that."""
-    lens, unit = inputs.camera or inputs.focal_px, inputs.unit
+    lens = inputs.camera or inputs.focal_px
+    unit = inputs.unit
     regions = {"mask": inputs.mask, "box": inputs.box, "detections": inputs.detections}
-    given = [f"--{name}" for name, value in regions.items() if value]
-    if inputs.depth is None or lens is None or not given:
+    options = [f"--{name}" for name, value in regions.items() if value]
+    if inputs.depth is None or lens is None or not options:
         raise InputError(
             "--depth needs --camera or --focal-px beside it, and --mask, --box or --detections "
             "unless it is to be found"
         )
-    if len(given) > 1:
-        raise InputError(f"{' and '.join(given)} say where objects are; give one of them")
-    depth, known = Path(inputs.depth), [model.name for model in method.models]
-    labels = None if inputs.labels is None else parse_labels(inputs.labels, known)
-    is_one = inputs.object is not None or len(known) == 1
+    if len(options) > 1:
+        raise InputError(f"{' and '.join(options)} say where objects are; give one of them")
+    depth = Path(inputs.depth)
+    known_names = [model.name for model in method.models]
+    labels = None if inputs.labels is None else parse_labels(inputs.labels, known_names)
+    is_one = inputs.object is not None or len(known_names) == 1
     wanted = object_named(inputs.object, method) if is_one else None
     settings |= camera_facts(lens) | ({} if labels is None else {"labels": labels})
     if wanted is not None:
         settings["object"] = wanted
     if inputs.detections is not None:
         settings["detections"] = str(Path(inputs.detections).resolve())
-        objects = (labels or {}, known, wanted)
+        objects = (labels or {}, known_names, wanted)
         return detection_jobs(depth, Path(inputs.detections), lens, objects, unit, out)
     if inputs.box:
         settings["box"] = list(inputs.box)
@@ -513,8 +523,8 @@ def region_jobs(
     settings["mask"] = str(mask.resolve())
     if wanted is None and labels is None:
         raise InputError(
-            f"the {method.holder} know {', '.join(known)}; say which by --object, or which number "
-            f"of the mask is which by --labels 1={known[0]},2={known[1]}"
+            f"the {method.holder} know {', '.join(known_names)}; say which by --object, or which "
+            f"number of the mask is which by --labels 1={known_names[0]},2={known_names[1]}"
         )
     return view_jobs(depth, mask, lens, wanted, unit, out, labels)
 
@@ -533,15 +543,15 @@ def predict_dataset(
     if options.targets is not None:
         dataset = of_targets(dataset, read_targets(options.targets, options.bop))
     dataset = pose_methods.chosen_objects(dataset, method, object)
-    (found,) = pose_methods.find_masks([options.masks], dataset, out, config.device)
+    (masks,) = pose_methods.find_masks([options.masks], dataset, out, config.device)
     names = pose_methods.match_names(dataset, method.models)
     jobs: list[PoseJob[Any]] = [
         replace(job, object=names[job.place.object_id])
-        for job in found.jobs(names)
+        for job in masks.jobs(names)
         if job.place is not None
     ]
     settings = {**method.settings, "estimate": config_to_dict(config)}
-    settings |= {**pose_methods.of_dataset(dataset), "masks": found.name, **found.settings}
+    settings |= {**pose_methods.of_dataset(dataset), "masks": masks.name, **masks.settings}
     if object is not None:
         settings["objects"] = sorted({i.object_id for i in dataset.instances})
     claim_bop(out, settings, dataset)
@@ -607,8 +617,8 @@ def write_files(
     if dataset is not None:
         write_bop_results(out / results_name(dataset), predictions)
         if any(p.estimate.alternatives for p in predictions):
-            more = out / results_name(dataset, _WITH_ALTERNATIVES)
-            write_bop_results(more, predictions, with_alternatives=True)
+            table = out / results_name(dataset, _WITH_ALTERNATIVES)
+            write_bop_results(table, predictions, with_alternatives=True)
         image_of = {(i.scene_id, i.image_id): i for i in dataset.instances}
         posed: dict[tuple[int, int], list[PoseEstimate]] = defaultdict(list)
         for prediction in predictions:
@@ -621,7 +631,8 @@ def write_files(
                 for estimate in estimates:
                     assert estimate.camera_from_model is not None
                     model = models[estimate.object]
-                    pose, K = estimate.camera_from_model, image_of[image].K
+                    pose = estimate.camera_from_model
+                    K = image_of[image].K
                     picture = drawn.draw_pose(picture, pose, model, K)
                 write_image(out / name, picture)
                 note_result(out, name, [out / name])
@@ -698,14 +709,17 @@ def _pose_words(pose: Rigid | None, before: str) -> dict[str, str]:
 
 def _count_inputs(predictions: Sequence[Prediction], inputs: int | None) -> str:
     """Say how many inputs there were, and how many answers where that is another number."""
-    count, answers = len(predictions) if inputs is None else inputs, len(predictions)
+    count = len(predictions) if inputs is None else inputs
+    answers = len(predictions)
     total = f"{count} input{'s' * (count != 1)}"
     return total if count == answers else f"{total}, {answers} answer{'s' * (answers != 1)}"
 
 
 def _row(estimate: PoseEstimate) -> dict[str, Any]:
     """Say what was found of one input, as the page and the terminal show it."""
-    pose, evidence, identity = estimate.camera_from_model, estimate.evidence, estimate.identity
+    pose = estimate.camera_from_model
+    evidence = estimate.evidence
+    identity = estimate.identity
     place = [None] * 3 if pose is None else pose.t_m.double().tolist()
     base = estimate.base_from_model
     return {
@@ -742,7 +756,8 @@ def _write_page(
     readable = [k for k, one in enumerate(estimates) if one.status != "unreadable"]
     sections: list[Section] = []
     for k in choose_answers([predictions[k].estimate.is_posed for k in readable]):
-        estimate, place = predictions[readable[k]].estimate, predictions[readable[k]].place
+        estimate = predictions[readable[k]].estimate
+        place = predictions[readable[k]].place
         try:
             shown_input = jobs[readable[k]].read()
         except InputError:  # unreadable by now
@@ -755,7 +770,8 @@ def _write_page(
         image = None if rgb is None else read_image(rgb)
         section = drawn.pose_section(estimate.name, shown_input, estimate, model, image=image)
         sections.append(section)
-    number, total = len(predictions), _count_inputs(predictions, inputs)
+    number = len(predictions)
+    total = _count_inputs(predictions, inputs)
     text = f"{total}: {counts}. Shown below: {len(sections)}"
     text += "." if len(sections) == number else ", answers and refusals spread evenly."
     if number > _MOST_ROWS:

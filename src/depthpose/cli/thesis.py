@@ -69,12 +69,13 @@ def reproduce(
     dataset = open_frames(kitti, None if split == "all" else split)
     right = published.with_right
     source = MethodSource(weights=None, config=matching.config, with_right=right)
-    # Each method, with the thesis's own row that it stands for, if any.
-    own = published.own
-    owns = own if len(own) == len(weights) else [own[0]] * len(weights)
+    # Each method beside the row of the thesis that it stands for, "" where it stands for none.
+    published_rows = published.own_rows
+    if len(published_rows) != len(weights):
+        published_rows = (published.own_rows[0],) * len(weights)
     methods = [
         (row, replace(source, weights=file).build())
-        for row, file in zip(owns, weights, strict=True)
+        for row, file in zip(published_rows, weights, strict=True)
     ]
     names = [method.name for _, method in methods]
     if len(set(names)) < len(names):
@@ -82,7 +83,7 @@ def reproduce(
             f"two weights are called {names[0]!r}, and so would their predictions be: rename one."
         )
     if matcher is not None:
-        methods.append((own[0], replace(source, with_filled_holes=True).build()))
+        methods.append((published.own_rows[0], replace(source, with_filled_holes=True).build()))
     if not published.with_right:
         files = ("default",) if beside is None else beside
         others = [replace(source, weights=file).build() for file in files]
@@ -115,12 +116,12 @@ def _refuse_rows(
             "2.2 takes it."
         )
     if not weights and matcher is None:
-        more = " or --matcher sgbm" if table.with_right else ""
+        alternative = " or --matcher sgbm" if table.with_right else ""
         raise InputError(
-            f"table {table.number}: there is nothing to measure; give --weights FILE{more}."
+            f"table {table.number}: there is nothing to measure; give --weights FILE{alternative}."
         )
-    if len(table.own) > 1 and len(weights) != len(table.own):
-        rows = " and ".join(f"'{name}'" for name in table.own)
+    if len(table.own_rows) > 1 and len(weights) != len(table.own_rows):
+        rows = " and ".join(f"'{name}'" for name in table.own_rows)
         raise InputError(
             f"table {table.number}: has the rows {rows}, but {len(weights)} weights were given; "
             "give one for each, in this order."
@@ -278,8 +279,8 @@ def figure_3_2(
     """
     from depthpose.cli.thesis_pose import feature_panels, write_figure
 
-    how = {"perplexity": perplexity}
-    return write_figure("3-2", weights, data, number, out, feature_panels, columns=4, **how)
+    settings = {"perplexity": perplexity}
+    return write_figure("3-2", weights, data, number, out, feature_panels, columns=4, **settings)
 
 
 def figure_3_4(
@@ -305,8 +306,8 @@ def figure_3_4(
     """
     from depthpose.cli.thesis_pose import field_panels, write_figure
 
-    how = {"keypoint": keypoint}
-    return write_figure("3-4", weights, data, number, out, field_panels, columns=3, **how)
+    settings = {"keypoint": keypoint}
+    return write_figure("3-4", weights, data, number, out, field_panels, columns=3, **settings)
 
 
 def figure_3_5(

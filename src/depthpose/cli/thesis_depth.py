@@ -59,8 +59,8 @@ def reproduce_table(
     if find_rank().rank > 0:
         return 0
     measured = evaluation.join(evaluation.measure_each(dataset, folders, protocol, caps_m))
-    owns = [own for own, _ in methods for _ in caps_m]
-    rows = join_published(table, list(zip(owns, measured.rows, strict=True)))
+    own_rows = [own_row for own_row, _ in methods for _ in caps_m]
+    rows = join_published(table, list(zip(own_rows, measured.rows, strict=True)))
     page.write_table(out, rows)
     how = (
         f"Ours: {protocol}: {rule.summary}. The printed rows are of the 697 frames of "
@@ -98,8 +98,8 @@ def reproduce_table(
         ),
     ]
     write_report(f"{table.title}, on {dataset.name}", sections, out)
-    for name, why in measured.skipped.items():
-        print(f"skipped: {name}: {why}", file=sys.stderr)
+    for name, reason in measured.skipped.items():
+        print(f"skipped: {name}: {reason}", file=sys.stderr)
     print(f"{len(measured.skipped)} frames skipped")
     return 0
 

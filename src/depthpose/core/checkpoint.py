@@ -106,10 +106,10 @@ def find_weights(name: str | Path) -> Path:
         named = [file for file in files if file.name == WEIGHTS_FILE] or files
         if len(named) == 1:
             return named[0]
-        which = ", ".join(file.name for file in files) or "none"
+        file_names = ", ".join(file.name for file in files) or "none"
         raise InputError(
             f"{path}: a folder of weights holds one .safetensors file, or one called "
-            f"{WEIGHTS_FILE}; here: {which}. Name the file."
+            f"{WEIGHTS_FILE}; here: {file_names}. Name the file."
         )
     if str(name).startswith(ON_HUB):
         return fetch_weights(str(name))
@@ -167,10 +167,10 @@ def fetch_weights(name: str) -> Path:
     try:
         path = hub.hf_hub_download(reference["repository"], file, revision=reference["revision"])
     except Exception as error:
-        said = " ".join(str(error).split())[:200] or type(error).__name__
+        reason = " ".join(str(error).split())[:200] or type(error).__name__
         for kinds, remedy in remedies.items():
             if isinstance(error, kinds):
-                raise InputError(f"{name}: {remedy.replace('{said}', said)}") from error
+                raise InputError(f"{name}: {remedy.replace('{reason}', reason)}") from error
         raise
     return Path(path)
 

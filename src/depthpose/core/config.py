@@ -101,7 +101,7 @@ def read_config(path: Path, kind: type[ConfigT]) -> ConfigT:
 
 def _over_defaults(content: Mapping[Any, Any], kind: type) -> dict[Any, Any]:
     """Merge nested differences into the defaults of ``kind``."""
-    laid = dict(content)
+    merged = dict(content)
     for field in dataclasses.fields(kind):
         nested = content.get(field.name)
         make = field.default_factory
@@ -110,8 +110,8 @@ def _over_defaults(content: Mapping[Any, Any], kind: type) -> dict[Any, Any]:
             rivals = getattr(default, "INSTEAD", {})  # given, it removes the other's default
             left_out = {rivals[key] for key in nested if key in rivals}
             defaults = {k: v for k, v in config_to_dict(default).items() if k not in left_out}
-            laid[field.name] = defaults | _over_defaults(nested, type(default))
-    return laid
+            merged[field.name] = defaults | _over_defaults(nested, type(default))
+    return merged
 
 
 def config_from_dict(

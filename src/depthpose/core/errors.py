@@ -84,24 +84,24 @@ def import_opencv(purpose: str) -> Any:  # noqa: ANN401  OpenCV's classes carry 
     return import_extra("cv2", "opencv-python-headless", "opencv", purpose)
 
 
-def refuse_unknown(what: str, name: object, known: Iterable[str]) -> None:
+def refuse_unknown(what: str, name: object, names: Iterable[str]) -> None:
     """Refuse a word that is none of the known ones.
 
     Raises:
         InputError: that is so; the nearest is said.
     """
-    known = tuple(known)
-    if name not in known:
-        raise InputError(f"{what} is {name!r}; {nearest_name(str(name), known)}")
+    names = tuple(names)
+    if name not in names:
+        raise InputError(f"{what} is {name!r}; {nearest_name(str(name), names)}")
 
 
-def nearest_name(name: str, known: Iterable[str]) -> str:
+def nearest_name(name: str, candidates: Iterable[str]) -> str:
     """Say which known name was probably meant, and list them all: the tail of an error message.
 
     Returns:
         ``did you mean 'x'? Known: 'a', 'x'.``, or only the list where nothing is near.
     """
-    names = sorted(known)
+    names = sorted(candidates)
     near = get_close_matches(name, names, n=1)
     hint = f"did you mean {near[0]!r}? " if near else ""
     return f"{hint}Known: {', '.join(map(repr, names)) or 'none'}."

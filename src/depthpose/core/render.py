@@ -195,15 +195,17 @@ def _draw(
         slope, down, constant = plane.index_select(0, which).unbind(-1)
         at_row = down * v + constant
         names = number.index_select(0, which)
-        for some in _chunks(stop - start + 1, _MAX_PIXELS):
-            span, u = _expand(start[some], stop[some])
-            at_start = at_row[some].index_select(0, span)
-            value = torch.addcmul(at_start, slope[some].index_select(0, span), u)
+        for pixel_chunk in _chunks(stop - start + 1, _MAX_PIXELS):
+            span, u = _expand(start[pixel_chunk], stop[pixel_chunk])
+            at_start = at_row[pixel_chunk].index_select(0, span)
+            value = torch.addcmul(at_start, slope[pixel_chunk].index_select(0, span), u)
             depth = (1 / value if above_m is None else value.clamp(min=0)).float()
-            key = (depth.view(torch.int32).long() << 32) | names[some].index_select(0, span)
+            key = (depth.view(torch.int32).long() << 32) | names[pixel_chunk].index_select(0, span)
             # Where 1 / depth is not positive, the plane is met behind the camera.
             key = torch.where((depth >= near_m) & depth.isfinite(), key, _EMPTY)
-            buffer.scatter_reduce_(0, (row * width)[some].index_select(0, span) + u, key, "amin")
+            buffer.scatter_reduce_(
+                0, (row * width)[pixel_chunk].index_select(0, span) + u, key, "amin"
+            )
     is_drawn = buffer != _EMPTY
     primitive = torch.where(is_drawn, buffer & 0xFFFFFFFF, -1).reshape(height, width)
     depth_m = (buffer >> 32).int().view(torch.float32).double()

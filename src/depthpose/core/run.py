@@ -200,9 +200,9 @@ def claim_folder(
     """
     record = folder / RECORD
     # Listed before the record is looked for, which other processes of a launch write first.
-    there = [name for name in (_SOURCES, *results) if os.path.lexists(folder / name)]
-    if there and not record.exists():
-        raise InputError(f"{folder / there[0]}: {NOT_OURS}")
+    existing = [name for name in (_SOURCES, *results) if os.path.lexists(folder / name)]
+    if existing and not record.exists():
+        raise InputError(f"{folder / existing[0]}: {NOT_OURS}")
     is_alone = find_rank().world == 1
     is_new = lock_folder(folder, is_shared=not is_alone)
     try:
@@ -258,7 +258,7 @@ def claim_names(
         if file.name.endswith(ending)
     }
     recorded = read_sources(folder)
-    made = {*results, *(_FRAME.sub("", stem) for stem in results)}
+    finished = {*results, *(_FRAME.sub("", stem) for stem in results)}
     wanted: dict[str, list[str]] = {}
     for name, files in sources.items():
         every = [files] if isinstance(files, Path) else list(files)
@@ -277,7 +277,7 @@ def claim_names(
                 "one name need two folders: choose another"
             )
         is_other = before and stamp and before != stamp
-        if is_other and (name in made if is_finished is None else is_finished(name)):
+        if is_other and (name in finished if is_finished is None else is_finished(name)):
             files = sources[name]
             named = path if isinstance(files, Path) else " or ".join(map(str, files))
             raise InputError(

@@ -113,7 +113,8 @@ def augment(pair: TrainingPair, config: AugmentConfig, generator: torch.Generato
     sides = zip(config.crop_px, pair.left.shape[-2:], strict=True)
     half = max((crop + 1) / 2 / side for crop, side in sides)
     scaled = scale_pair(pair, max(drawn, min(half, high)))
-    (height, width), (rows, columns) = scaled.left.shape[-2:], config.crop_px
+    height, width = scaled.left.shape[-2:]
+    rows, columns = config.crop_px
     cropped = crop_pair(scaled, (min(height, rows), min(width, columns)), generator)
     if float(torch.rand((), generator=generator)) < config.flip_share:
         cropped = flip_and_swap(cropped)

@@ -84,7 +84,8 @@ class RowDepthBaseline:
         Raises:
             InputError: the input has no rig.
         """
-        rig, (height, width) = _rig_of(pair), pair.left.shape[1:]
+        rig = _rig_of(pair)
+        height, width = pair.left.shape[1:]
         slope = (np.arange(height) - float(rig.K[1, 2])) / float(rig.K[1, 1])
         row = slope * _CANONICAL_FOCAL_PX + _ROWS // 2
         inverse = np.interp(row, np.arange(_ROWS), 1 / self.depth_m)
@@ -132,7 +133,8 @@ class NearestImageBaseline:
         Raises:
             InputError: the input has no rig.
         """
-        rig, (height, width) = _rig_of(pair), pair.left.shape[1:]
+        rig = _rig_of(pair)
+        height, width = pair.left.shape[1:]
         nearest = self.indices[int((self.thumbnails @ _thumbnail(pair.left)).argmax())]
         known_m = read_known_depth(self.dataset, nearest)
         other = self.dataset.read_rig(nearest)

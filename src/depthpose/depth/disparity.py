@@ -72,8 +72,8 @@ def disparity_advice(predicted_px: Map, true_px: Map) -> str | None:
             return f"it lies {farther:.4g} times as far as the truth: {question}"
     doubts: list[str] = []
     if farther > 0 and not 1 / _FAR_OFF < farther < _FAR_OFF:
-        known = (q for factor, q in _DOUBTS.items() if factor / _NEAR < farther < factor * _NEAR)
-        question = next(known, "is it without a scale, or of another focal length or baseline?")
+        likely = (q for factor, q in _DOUBTS.items() if factor / _NEAR < farther < factor * _NEAR)
+        question = next(likely, "is it without a scale, or of another focal length or baseline?")
         doubts.append(f"lies {farther:.3g} times as far as the truth in the median: {question}")
     both = torch.stack([predicted_px, true_px]).double().clamp_min(1e-3).log()
     if len(true_px) > 1 and float(both.corrcoef()[0, 1]) < _OPPOSITE:

@@ -256,12 +256,15 @@ def summarise(
     """
     rule = find_protocol(protocol)
     each = {frame.name: results[frame.name] for frame in dataset.frames}
-    skipped = {name: why for name, why in each.items() if isinstance(why, str)}
+    skipped = {name: reason for name, reason in each.items() if isinstance(reason, str)}
     measured = [
-        frame_row for some in each.values() if not isinstance(some, str) for frame_row in some
+        frame_row
+        for outcome in each.values()
+        if not isinstance(outcome, str)
+        for frame_row in outcome
     ]
     if not measured and NO_PREDICTION in skipped.values():
-        name = next(name for name, why in skipped.items() if why == NO_PREDICTION)
+        name = next(name for name, reason in skipped.items() if reason == NO_PREDICTION)
         raise InputError(
             f"{dataset.name}: no frame has both truth and a prediction; {name!r} has the truth and "
             f"{NO_PREDICTION}. Predictions are called {files.EXPECTED}"
@@ -314,9 +317,10 @@ def summarise(
 def frame_result(
     dataset: Dataset, index: int, predictions: Path, protocol: str, cap_m: float | None
 ) -> tuple[DepthEstimate, DepthError]:
-    """Read one frame again as :func:`evaluate` measured it: at the image's size, and its error.
+    """Give the estimate of one frame and its error by pixel, as :func:`evaluate` measured them.
 
-    ``cap_m`` is that of the row, None for a protocol of disparity.
+    Both have the size of the truth. ``cap_m`` is that of the row, None for a protocol of disparity;
+    the error is then one of disparity [px], else one of depth as a share of the true depth.
 
     Raises:
         InputError: the frame does not count, or a file is damaged.
@@ -327,18 +331,23 @@ def frame_result(
     if isinstance(prepared, str):
         raise InputError(f"{name}: {prepared}; choose a frame that counts")
     rig = prepared.rig
+
+    # What is shown: the whole prediction, without the sky.
     depth_m = None if rig is None else disparity.depth_from_disparity(prepared.disparity_px, rig)
     sky = files.read_part(predictions, name, "sky.png")
     is_sky = None if sky is None else sky[0] > 0
     if is_sky is not None and depth_m is not None and is_sky.shape == depth_m.shape:
         depth_m = torch.where(is_sky, torch.nan, depth_m)
+
+    # What is measured: the pixels that count, clamped to the cap.
     predicted, truth = _compared(prepared, rule, cap_m)
     error = (predicted - truth).abs()
-    true_m = truth
-    if cap_m is None:
-        true_m = None if rig is None else disparity.depth_from_disparity(truth, rig)
-    else:
+    if cap_m is not None:
         error = error / truth
+        true_m = truth
+    else:
+        true_m = None if rig is None else disparity.depth_from_disparity(truth, rig)
+
     estimate = DepthEstimate(
         depth_m=depth_m,
         disparity_px=prepared.disparity_px,
@@ -439,7 +448,8 @@ def _at_size_of(true_px: Map, found_px: Float[Tensor, "_ _"], path: Path) -> Map
     Networks that take squeezed images give maps of another aspect, which are stretched back, with a
     notice; a map that is turned, or a part of the image's, is refused.
     """
-    (height, width), (rows, columns) = true_px.shape, found_px.shape
+    height, width = true_px.shape
+    rows, columns = found_px.shape
     stretched_px = disparity.resized_map(found_px, height, width) * (width / columns)
     aspect = columns * height / (rows * width)
     turned = rows * height / (columns * width)
@@ -464,12 +474,12 @@ def _at_size_of(true_px: Map, found_px: Float[Tensor, "_ _"], path: Path) -> Map
             )
     if shown not in _stretched:
         _stretched.add(shown)  # of a whole data set once
-        said = (
+        message = (
             f"{path}: is {shown}, of another aspect, so it is stretched: right where the image was "
             "squeezed for it; what was cut out of the image is put into a map of its size, NaN "
             "around it"
         )
-        warnings.warn(said, Notice, stacklevel=2)
+        warnings.warn(message, Notice, stacklevel=2)
     return stretched_px
 
 

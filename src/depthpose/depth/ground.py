@@ -90,7 +90,8 @@ def fit_ground(depth_m: Map, camera: Camera) -> Ground | None:
         is_on = (rays @ plane / inverse - 1).abs() < _INLIER
         if int(is_on.sum()) < 30:
             return None
-    share, (height_m, tilt_deg, roll_deg) = float(is_on.double().mean()), angles
+    share = float(is_on.double().mean())
+    height_m, tilt_deg, roll_deg = angles
     is_upright = abs(tilt_deg) <= _MOST_ROAD_TILT_DEG and abs(roll_deg) < _MOST_ROLL_DEG
     if share < _LEAST_SHARE or not (is_upright and _LEAST_HEIGHT_M < height_m < _MOST_HEIGHT_M):
         return None

@@ -34,7 +34,9 @@ _SEGMENTS = 60
 _OFF_PX = 0.5
 _OFF_RAD = math.radians(0.6)
 """Deviation of the ends of a segment, and of the directions of what is built straight."""
-_FORWARD, _UPRIGHT, _ACROSS = 0.25, 0.15, 0.1
+_FORWARD = 0.25
+_UPRIGHT = 0.15
+_ACROSS = 0.1
 """Shares of the segments that run in these directions; the rest has any."""
 _PER_SEGMENT = 0.2
 """How much of an observation a segment is: those of one house or lane err together."""

@@ -124,18 +124,20 @@ def label_pair(net: FakestereoNet, pair: StereoInput, config: LabelConfig) -> Ma
 def _write_calibration(path: Path, rigs: Mapping[str, StereoRig]) -> None:
     """Write a line for each pair, beside those of other pairs that are there."""
     try:
-        there = read_text(path).splitlines() if path.is_file() else []
+        existing_lines = read_text(path).splitlines() if path.is_file() else []
     except InputError:  # damaged: the lines of these pairs are made again
-        there = []
-    parts = [line.rsplit(maxsplit=8) for line in there]
-    lines = {part[0]: line for part, line in zip(parts, there, strict=True) if len(part) == 9}
+        existing_lines = []
+    parts = [line.rsplit(maxsplit=8) for line in existing_lines]
+    lines = {
+        part[0]: line for part, line in zip(parts, existing_lines, strict=True) if len(part) == 9
+    }
     for name, rig in rigs.items():
         K = rig.K
         shift_px = rig.cx_right_minus_left_px
         values = (K[0, 0], K[0, 2], K[1, 2], rig.baseline_m, K[1, 1], shift_px)
         numbers = " ".join(f"{float(value):.9g}" for value in values)
         lines[name] = f"{name} {rig.width} {rig.height} {numbers}"
-    if list(lines.values()) == there:
+    if list(lines.values()) == existing_lines:
         return  # a file that is written again counts as changed
     with atomic_write(path) as part:
         part.write_text("\n".join(lines.values()) + "\n")

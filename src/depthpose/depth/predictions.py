@@ -125,7 +125,7 @@ def is_finished(folder: Path, name: str) -> bool:
 def has_prediction(folder: Path, name: str, *, of_disparity: bool = False) -> bool:
     """Whether the folder holds a prediction of this frame, or one of disparity by its name."""
     endings = _DISPARITY if of_disparity else (*_DISPARITY, *_DEPTH, _KITTI)
-    return _first(folder / name, endings) is not None
+    return _find_file(folder / name, endings) is not None
 
 
 def read_disparity(
@@ -133,9 +133,10 @@ def read_disparity(
 ) -> Map:
     """Read one predicted disparity [px at its own width], ours or anybody's.
 
-    ``NAME.disparity_px.npy`` (or ``.pfm``) is taken first; what :func:`read_depth` finds is turned
-    into disparity by the rig. NaN alone says that there is no answer: depth of zero or below is
-    the smallest of the protocol, as the published script takes it.
+    ``NAME.disparity_px.npy`` (or ``.pfm``) is taken first; without it, the depth that
+    :func:`read_depth` finds is converted by the rig. A pixel without a prediction is NaN. Depth of
+    zero or below is a prediction too, and becomes the smallest depth of the protocol, as in the
+    published script.
 
     Args:
         folder: of the predictions.
@@ -147,14 +148,14 @@ def read_disparity(
         InputError: no file is there, or depth without a rig.
     """
     base = folder / name
-    if (path := _first(base, _DISPARITY)) is not None:
+    if (path := _find_file(base, _DISPARITY)) is not None:
         return files.read_map(path)
-    path = _first(base, (*_DEPTH, _KITTI))
+    path = _find_file(base, (*_DEPTH, _KITTI))
     if path is None:
         raise InputError(
             f"{folder}: no prediction for frame {name!r}. Expected {EXPECTED.replace('NAME', name)}"
         )
-    if with_disparity_png and path == _first(base, (_KITTI,)):
+    if with_disparity_png and path == _find_file(base, (_KITTI,)):
         return files.read_depth_png(path)
     depth_m = read_depth(folder, name)
     assert depth_m is not None
@@ -172,21 +173,25 @@ def read_depth(folder: Path, name: str) -> Map | None:
 
     ``NAME.depth_m.npy`` or ``.pfm`` comes before ``NAME.depth.png`` and ``NAME.png``.
     """
-    path = _first(folder / name, (*_DEPTH, _KITTI))
+    path = _find_file(folder / name, (*_DEPTH, _KITTI))
     if path is None:
         return None
     return files.read_depth_png(path) if path.suffix.lower() == ".png" else files.read_map(path)
 
 
-def _first(base: Path, endings: tuple[str, ...]) -> Path | None:
-    named = (base.with_name(f"{base.name}.{end}") for end in endings)
-    both = (path for file in named for path in (file, file.with_suffix(file.suffix.upper())))
-    return next((path for path in both if path.is_file()), None)
+def _find_file(base: Path, endings: tuple[str, ...]) -> Path | None:
+    """Find the first file ``BASE.ENDING`` that exists; its suffix may be in capitals."""
+    for ending in endings:
+        file = base.with_name(f"{base.name}.{ending}")
+        for path in (file, file.with_suffix(file.suffix.upper())):
+            if path.is_file():
+                return path
+    return None
 
 
 def read_part(folder: Path, name: str, ending: str) -> Float[Tensor, "*c h w"] | None:
     """Read a map or a picture of ``ENDINGS``; None where the prediction has none."""
-    path = _first(folder / name, (ending,))
+    path = _find_file(folder / name, (ending,))
     if path is None:
         return None
     return files.read_image(path) if path.suffix.lower() == ".png" else files.read_map(path)
@@ -201,12 +206,13 @@ def read_estimate(folder: Path, name: str, camera: Camera | None) -> DepthEstima
     disparity_px = read_part(folder, name, LAST)
     if disparity_px is None:
         raise InputError(f"{folder}: no prediction for frame {name!r}; predict it again")
-    warning = _first(folder / name, ("warning.txt",))
-    metres, sky = (read_part(folder, name, end) for end in ("depth_m.npy", "sky.png"))
-    if metres is None and isinstance(camera, StereoRig):
-        metres = depth_from_disparity(disparity_px, camera)
+    warning = _find_file(folder / name, ("warning.txt",))
+    sky = read_part(folder, name, "sky.png")
+    depth_m = read_part(folder, name, "depth_m.npy")
+    if depth_m is None and isinstance(camera, StereoRig):
+        depth_m = depth_from_disparity(disparity_px, camera)
     return DepthEstimate(
-        depth_m=metres,
+        depth_m=depth_m,
         disparity_px=disparity_px,
         confidence=read_part(folder, name, "confidence.npy"),
         right=read_part(folder, name, "right.png"),
@@ -222,7 +228,7 @@ def read_ground(folder: Path, name: str) -> Ground | None:
     Raises:
         InputError: the file is damaged.
     """
-    path = _first(folder / name, ("ground.json",))
+    path = _find_file(folder / name, ("ground.json",))
     if path is None:
         return None
     content = files.read_json(path)

@@ -52,7 +52,8 @@ class UNetGenerator(nn.Module):
         deepest = len(widths) - 1
         # No norm in the outermost level (raw colours) nor the innermost (one pixel may be left).
         # Activations stand before each level.
-        self.down, self.up = nn.ModuleList(), nn.ModuleList()
+        self.down = nn.ModuleList()
+        self.up = nn.ModuleList()
         for level, (inputs, outputs) in enumerate(zip((3, *widths[:-1]), widths, strict=True)):
             conv = nn.Conv2d(inputs, outputs, 4, 2, 1, bias=False)
             norm = nn.BatchNorm2d(outputs) if 0 < level < deepest else nn.Identity()
@@ -248,7 +249,9 @@ class LiteEncoder(nn.Module):
         stem = max(round(_STEM * width), 1)
         self.stem = _ConvNorm(3, stem, 3, 2)
         blocks: list[nn.Module] = []
-        inputs, self._taps, self._frozen = stem, [], 0
+        inputs = stem
+        self._taps = []
+        self._frozen = 0
         self.channels: list[int] = []
         stages = _STAGES[: _LAST_AT_STRIDE[levels - 1] + 1]
         for number, (count, kernel, stride, expansion, channels) in enumerate(stages):

@@ -137,12 +137,12 @@ class DepthEstimate:
                 confidence.
         """
         values = self.disparity_px if self.depth_m is None else self.depth_m
-        known = torch.isfinite(values)
+        is_estimated = torch.isfinite(values)
         is_pair = self.seen is not None and self.seen.right is not None
         least = (0.5 if is_pair else 0.0) if min_confidence is None else min_confidence
         if self.confidence is None or least <= 0:
-            return known
-        return known & (self.confidence >= least)
+            return is_estimated
+        return is_estimated & (self.confidence >= least)
 
     def cloud(self, far_m: float = 80.0, min_confidence: float | None = None) -> Cloud:
         """Give the coloured points nearer than ``far_m``, in metres in the left camera's frame.

@@ -87,7 +87,7 @@ def depth_section(
         wrong = error.error
         left = pair.left
         is_sparse = float(wrong.isfinite().double().mean()) < _SPARSE
-        where = "over the dimmed image" if is_sparse else "grey: not compared"
+        note = "over the dimmed image" if is_sparse else "grey: not compared"
         if error.is_disparity:
             top = WORST_PX
             what = "disparity error"
@@ -101,14 +101,14 @@ def depth_section(
                 image = draw_points(left, true_m, far_m, _RADIUS_PX, near_m)
             else:
                 image = draw_depth(true_m, near_m, far_m)
-            caption = f"true depth; {where}"
+            caption = f"true depth; {note}"
             bar = depth_scale(near_m, far_m)
             pictures.append(Drawing(image=image, caption=caption, scale=bar))
         if is_sparse:
             image = draw_error_points(left, wrong, top, _RADIUS_PX)
         else:
             image = draw_share(1 - wrong / top)
-        caption = f"{what}: dark is right, bright is wrong; {where}"
+        caption = f"{what}: dark is right, bright is wrong; {note}"
         pictures.append(Drawing(image=image, caption=caption, scale=scale))
     if estimate.confidence is not None:
         confidence = Drawing(

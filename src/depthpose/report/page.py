@@ -141,9 +141,9 @@ def choose_answers(is_ok: Sequence[bool]) -> list[int]:
     """Choose answers and some refusals, each spread evenly; give their places in order."""
     answered = [k for k, ok in enumerate(is_ok) if ok]
     refused = [k for k, ok in enumerate(is_ok) if not ok]
-    few = min(len(refused), max(_REFUSED, MOST_VIEWS - len(answered)))
-    chosen = [refused[i] for i in spread_evenly(len(refused), few)]
-    chosen += [answered[i] for i in spread_evenly(len(answered), MOST_VIEWS - few)]
+    refused_count = min(len(refused), max(_REFUSED, MOST_VIEWS - len(answered)))
+    chosen = [refused[i] for i in spread_evenly(len(refused), refused_count)]
+    chosen += [answered[i] for i in spread_evenly(len(answered), MOST_VIEWS - refused_count)]
     return sorted(chosen)
 
 

@@ -44,14 +44,14 @@ class PublishedRow:
 class PublishedTable:
     """One printed table: every author's row, in the order of print.
 
-    ``own``: names of the thesis's own methods, in the order in which weights are given;
+    ``own_rows``: names of the thesis's own methods, in the order in which weights are given;
     ``with_right``: whether the methods see the real right view.
     """
 
     number: str
     title: str
     rows: tuple[PublishedRow, ...]
-    own: tuple[str, ...]
+    own_rows: tuple[str, ...]
     with_right: bool
 
 
@@ -65,7 +65,7 @@ def join_published(
     Args:
         table: the printed table.
         ours: for each of our rows the name of the thesis's own method that it stands for (one of
-            ``table.own``, or empty where it stands for none, as a baseline), and the row.
+            ``table.own_rows``, or empty where it stands for none, as a baseline), and the row.
 
     Returns:
         The columns of each row; ``source`` is ``published``, ``ours`` or ``difference``.
@@ -125,7 +125,7 @@ TABLES = {table.number: table for table in (
                  _DENSE, "with dense depth map as ground truth"),
             _Row("thesis, Ours", 50.0, _OURS_50),
         ),
-        own=("thesis, Ours",),
+        own_rows=("thesis, Ours",),
         with_right=False,
     ),
     PublishedTable(
@@ -137,7 +137,7 @@ TABLES = {table.number: table for table in (
             _Row("Luo et al. [73]", 50.0, "0.058 0.316 2.675 0.152 0.947 0.971 0.983"),
             _Row("thesis, Ours", 50.0, "0.074 0.423 2.862 0.168 0.940 0.966 0.980"),
         ),
-        own=("thesis, Ours",),
+        own_rows=("thesis, Ours",),
         with_right=True,
     ),
     PublishedTable(
@@ -149,7 +149,7 @@ TABLES = {table.number: table for table in (
             _Row(_APART, 50.0, _OURS_50),
             _Row(_FINETUNED, 50.0, "0.121 0.674 3.817 0.207 0.849 0.950 0.978"),
         ),
-        own=(_APART, _FINETUNED),
+        own_rows=(_APART, _FINETUNED),
         with_right=False,
     ),
 )}  # fmt: skip

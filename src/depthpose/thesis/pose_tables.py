@@ -122,10 +122,10 @@ def linemod_number(model: ObjectModel) -> int:
     theirs_m = LINEMOD_DIAMETERS_M.get(number, 0.0)
     if abs(theirs_m / model.diameter_m - 1) <= (_SAME_NAMED if is_named else _SAME_DIAMETER):
         return number
-    theirs = f"; LineMOD's object {number} is {theirs_m:.4f} m" if theirs_m else ""
+    remark = f"; LineMOD's object {number} is {theirs_m:.4f} m" if theirs_m else ""
     raise InputError(
         f"object {model.number} ({model.name}, {model.diameter_m:.4f} m across) is none of "
-        f"LineMOD{theirs}. Table 3.2 compares with numbers of LineMOD's objects; for other data "
+        f"LineMOD{remark}. Table 3.2 compares with numbers of LineMOD's objects; for other data "
         "sets take 'reproduce 3.1', or leave the object out by --objects"
     )
 
@@ -152,10 +152,10 @@ def join_by_object(
     for row in rows:
         assert row.origin is not None, "rows of an evaluation say whose they are"
         groups.setdefault((row.origin.method, row.origin.masks), []).append(row)
-    ours = [_own(group, columns) for group in groups.values()]
+    our_rows = [_own(group, columns) for group in groups.values()]
     names = list(columns.values())
     if not with_published:
-        return [*ours, *(_difference(ours[0], other, names) for other in ours[1:])]
+        return [*our_rows, *(_difference(our_rows[0], other, names) for other in our_rows[1:])]
     printed = [
         {
             "source": "published",
@@ -171,7 +171,11 @@ def join_by_object(
         for row in ROWS
     ]
     peers = [row for row in printed if row["method"] in PEERS]
-    return [*printed, *ours, *(_difference(row, peer, names) for row in ours for peer in peers)]
+    return [
+        *printed,
+        *our_rows,
+        *(_difference(row, peer, names) for row in our_rows for peer in peers),
+    ]
 
 
 def _own(rows: Sequence[ObjectRow], columns: Mapping[str, str]) -> dict[str, Any]:

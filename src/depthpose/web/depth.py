@@ -145,7 +145,8 @@ def _input(form: Form) -> tuple[StereoInput, str]:
 def _pictures(
     pair: StereoInput, estimate: DepthEstimate, range_m: tuple[float, float]
 ) -> list[Shown]:
-    name, (near_m, far_m) = pair.name, range_m
+    name = pair.name
+    near_m, far_m = range_m
     grey = "grey: none" if estimate.is_sky is None else "grey: sky or no answer"
     colours = f"near bright and far dark, {near_m:g} m to {far_m:g} m by the logarithm"
     depth = Shown(
@@ -177,10 +178,10 @@ def _sentence(pair: StereoInput, estimate: DepthEstimate) -> str:
     sky = 0.0 if is_sky is None else float(is_sky.float().mean())
     warning = f"Careful: {estimate.warning}. " if estimate.warning else ""
     if len(known_m) == 0:
-        why = f"; {sky:.0%} of the image is taken for sky." if is_sky is not None else "."
+        doubt = f"; {sky:.0%} of the image is taken for sky." if is_sky is not None else "."
         if pair.right is not None and sky < _ALL_SKY:
-            why = ": is the pair rectified, and are left and right as they should be?"
-        return f"{warning}No pixel got a depth from {images}{why}"
+            doubt = ": is the pair rectified, and are left and right as they should be?"
+        return f"{warning}No pixel got a depth from {images}{doubt}"
     share = len(known_m) / estimate.depth_m.numel()
     middle_m = float(known_m.median())
     return (

@@ -95,8 +95,8 @@ def answer_pose(form: Form, net: GeoPoseNet) -> Answer:
         pose = shown_pose.estimate.camera_from_model
         certainty = shown_pose.estimate.certainty
         place = [] if pose is None else [f"{v:.4f}" for v in pose.t_m.tolist()]
-        sure = "" if certainty is None else f"{certainty:.3f}"
-        table.append([shown_pose.input.name, shown_pose.estimate.status, *place, sure])
+        certainty_text = "" if certainty is None else f"{certainty:.3f}"
+        table.append([shown_pose.input.name, shown_pose.estimate.status, *place, certainty_text])
     pose_input = shown_poses[0].input
     estimate = shown_poses[0].estimate
     scene = report.pose_scene(

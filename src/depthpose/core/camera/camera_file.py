@@ -70,7 +70,8 @@ _WRITE = (
 )
 _TUM = {(517.3, 516.5, 318.6, 255.3), (520.9, 521.0, 325.1, 249.7), (535.4, 539.2, 320.1, 247.6)}
 """Published intrinsics of TUM RGB-D's three cameras, which belong to no other data."""
-_TUM_SIZE, _TUM_UNIT_M = (640, 480), 1 / 5000
+_TUM_SIZE = (640, 480)
+_TUM_UNIT_M = 1 / 5000
 _DOFFS = "cx_right_minus_left_px"
 _PLAIN_KEYS = ("width", "height", "focal_y_px", _DOFFS)
 
@@ -106,15 +107,15 @@ def _middlebury_facts(path: AnyPath) -> CameraFacts:
 def plain_facts(path: AnyPath, keys: Mapping[str, list[float]]) -> CameraFacts:
     """Take the keys, a line each: ``_PLAIN_KEYS`` where they are given, the others always."""
     wanted = ("focal_px", "cx", "cy", "baseline_m", *(key for key in _PLAIN_KEYS if key in keys))
-    said = {key: _number(path, keys, key) for key in wanted}
-    focal_px = said["focal_px"]
-    has_size = {"width", "height"} <= said.keys()
+    values = {key: _number(path, keys, key) for key in wanted}
+    focal_px = values["focal_px"]
+    has_size = {"width", "height"} <= values.keys()
     return CameraFacts(
         kind="a calibration",
-        K=intrinsics(focal_px, said.get("focal_y_px", focal_px), said["cx"], said["cy"]),
-        size=(int(said["width"]), int(said["height"])) if has_size else None,
-        baseline_m=said["baseline_m"],
-        cx_right_minus_left_px=said.get(_DOFFS, 0.0),
+        K=intrinsics(focal_px, values.get("focal_y_px", focal_px), values["cx"], values["cy"]),
+        size=(int(values["width"]), int(values["height"])) if has_size else None,
+        baseline_m=values["baseline_m"],
+        cx_right_minus_left_px=values.get(_DOFFS, 0.0),
         is_metric=True,
     )
 
@@ -169,7 +170,8 @@ def _bare_facts(text: str) -> CameraFacts | None:
         numbers = [float(word) for word in words[:20]]
     except ValueError:
         return None
-    count, baseline_m = len(numbers), None
+    count = len(numbers)
+    baseline_m = None
     if count == 10:
         baseline_m = numbers[9]
     elif count in (12, 16) and numbers[3] and numbers[0]:
@@ -221,10 +223,14 @@ def facts_from_json(content: object) -> CameraFacts:
         raise InputError(f"missing {', '.join(map(repr, missing))}; add it to the camera")
     if "cx_right_minus_left_px" in content and "baseline_m" not in content:
         raise InputError("'cx_right_minus_left_px' needs 'baseline_m' beside it; add it")
-    known = ("baseline_m", _DOFFS, *OPTIONAL_KEYS)
-    said: dict[str, Any] = {key: _json_number(content, key) for key in known if key in content}
+    optional_keys = ("baseline_m", _DOFFS, *OPTIONAL_KEYS)
+    values: dict[str, Any] = {
+        key: _json_number(content, key) for key in optional_keys if key in content
+    }
     size = _size(content)
-    return CameraFacts(kind="a camera", K=_matrix(content["K"]), size=size, is_metric=True, **said)
+    return CameraFacts(
+        kind="a camera", K=_matrix(content["K"]), size=size, is_metric=True, **values
+    )
 
 
 def _foreign_facts(content: object) -> CameraFacts | None:
@@ -236,7 +242,8 @@ def _foreign_facts(content: object) -> CameraFacts | None:
             f"a camera is a JSON object with the keys {', '.join(_KEYS)}, "
             f"not a {type(content).__name__}"
         )
-    names, facts = named(content), None
+    names = named(content)
+    facts = None
     is_fisheye = bool(is_fisheye_lens(names))
     # Matrices of OpenCV are objects with ``data``.
     is_storage = any(isinstance(value, dict) and "data" in value for value in content.values())
@@ -413,8 +420,8 @@ def _read_facts(path: AnyPath) -> CameraFacts:
         left, right = next((pair for pair in _KITTI_NAMES if pair[0] in keys), _KITTI_NAMES[0])
         P = kitti_matrix(path, keys, left, (3, 4))
         other = kitti_matrix(path, keys, right, (3, 4)) if right in keys else None
-        said = keys.get(f"S_rect_{left[-2:]}", [])  # the size of the rectified images
-        size = (int(said[0]), int(said[1])) if len(said) == 2 else None
+        size_px = keys.get(f"S_rect_{left[-2:]}", [])  # the size of the rectified images
+        size = (int(size_px[0]), int(size_px[1])) if len(size_px) == 2 else None
         facts = facts_from_projections("a KITTI calibration", P, other, size)
     elif _PLAIN.search(text):
         facts = plain_facts(path, read_key_values(path))

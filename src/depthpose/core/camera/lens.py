@@ -56,12 +56,12 @@ _REALSENSE = ("none", "modifiedbrownconrady", "inversebrownconrady", "ftheta", "
 """Models of librealsense (``rs2_distortion``) in the order of their numbers."""
 
 
-def is_fisheye_lens(names: Mapping[str, Any], who: str = "its") -> bool | None:
+def is_fisheye_lens(names: Mapping[str, Any], owner: str = "its") -> bool | None:
     """Say whether the lens that a camera file names is an equidistant fisheye, or a pinhole.
 
     Args:
         names: values of the file by name; names in small letters and digits alone.
-        who: whose lens it is, for the error.
+        owner: whose lens it is, for the error.
 
     Returns:
         None where the file names no lens, or a projection alone (a pinhole of any distortion).
@@ -69,7 +69,7 @@ def is_fisheye_lens(names: Mapping[str, Any], who: str = "its") -> bool | None:
     Raises:
         InputError: the lens is neither, or two names contradict each other.
     """
-    said: dict[str, tuple[str, bool]] = {}
+    kind_of: dict[str, tuple[str, bool]] = {}
     for key in (*_SURE_KEYS, *_KEYS):
         value = names.get(key)
         if isinstance(value, int) and not isinstance(value, bool) and "ppx" in names:
@@ -79,18 +79,22 @@ def is_fisheye_lens(names: Mapping[str, Any], who: str = "its") -> bool | None:
         word = re.sub(r"[^a-z0-9]", "", value.lower())
         word = re.sub(r"^(rs2?)?distortion|(camera|lens|model)+$", "", word)
         if word in _REFUSED or word.startswith("mei") or _is_strange(word, key):
-            raise _refused(f"{who} {_shown(key)} is {value!r}", _REFUSED.get(word, _BY_ITS_TOOL))
+            raise _refused(f"{owner} {_shown(key)} is {value!r}", _REFUSED.get(word, _BY_ITS_TOOL))
         if word in _RADIAL or word in _FISHEYE:
-            said[key] = value, word in _FISHEYE
-    said |= {key: (str(names[key]), True) for key in _FLAGS if _is_set(names.get(key))}
+            kind_of[key] = value, word in _FISHEYE
+    kind_of |= {key: (str(names[key]), True) for key in _FLAGS if _is_set(names.get(key))}
     for key, value in names.items():
         inner = value.get("xi") if isinstance(value, Mapping) else value if key == "xi" else None
         if _is_set(inner):
-            raise _refused(f"{who} xi is {inner}, of MEI's omnidirectional model", _OMNIDIRECTIONAL)
-    kinds = {is_fisheye for _, is_fisheye in said.values()}
+            raise _refused(
+                f"{owner} xi is {inner}, of MEI's omnidirectional model", _OMNIDIRECTIONAL
+            )
+    kinds = {is_fisheye for _, is_fisheye in kind_of.values()}
     if len(kinds) == 2:
-        both = " and ".join(f"{_shown(key)} {value!r}" for key, (value, _) in said.items())
-        raise InputError(f"{who} lens is named twice, as {both}; keep the true one")
+        named_kinds = " and ".join(
+            f"{_shown(key)} {value!r}" for key, (value, _) in kind_of.items()
+        )
+        raise InputError(f"{owner} lens is named twice, as {named_kinds}; keep the true one")
     return kinds.pop() if kinds else None
 
 

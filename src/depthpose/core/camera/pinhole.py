@@ -47,7 +47,8 @@ class Camera:
 
 
 _SIDE = (1, MAX_SIDE_PX, f"an image has 1 to {MAX_SIDE_PX} pixels in a row or column; correct it")
-_TINY, _HUGE = math.ulp(0.0), sys.float_info.max
+_TINY = math.ulp(0.0)
+_HUGE = sys.float_info.max
 _RULES = {
     "width": _SIDE,
     "height": _SIDE,
@@ -201,7 +202,8 @@ def resize_camera(camera: AnyCamera, width: int, height: int) -> AnyCamera:
     """
     if width < 1 or height < 1:
         raise InputError(f"cannot resize to {width}x{height}; both sizes are 1 at least")
-    sx, sy = width / camera.width, height / camera.height
+    sx = width / camera.width
+    sy = height / camera.height
     scale = camera.K.new_tensor([[sx, 0, sx / 2 - 0.5], [0, sy, sy / 2 - 0.5], [0, 0, 1]])
     resized = replace(camera, width=width, height=height, K=scale @ camera.K)
     if isinstance(resized, StereoRig):
@@ -292,26 +294,27 @@ def refuse_apart(left: Float64[np.ndarray, "3 _"], right: Float64[np.ndarray, "3
     """Refuse two matrices that are not those of one rectified pair: only cx may differ."""
     within = {"fx": ((0, 0), _SAME_FOCAL * left[0, 0]), "fy": ((1, 1), _SAME_FOCAL * left[1, 1]),
               "cy": ((1, 2), _SAME_ROW_PX)}  # fmt: skip
-    for name, (at, most) in within.items():
-        if not math.isclose(left[at], right[at], rel_tol=0, abs_tol=abs(most)):
+    for name, (index, most) in within.items():
+        if not math.isclose(left[index], right[index], rel_tol=0, abs_tol=abs(most)):
             raise InputError(
-                f"{name} of the left camera is {left[at]:g} and of the right one {right[at]:g}, "
-                "but a rectified pair shares fx, fy and cy; are they of two calibrations, "
-                "or of raw images ('depthpose data rectify')? Copy both of one rectification"
+                f"{name} of the left camera is {left[index]:g} and of the right one "
+                f"{right[index]:g}, but a rectified pair shares fx, fy and cy; are they of two "
+                "calibrations, or of raw images ('depthpose data rectify')? Copy both of one "
+                "rectification"
             )
 
 
 def camera_from_facts(facts: CameraFacts, size: Size | None) -> Camera:
     """Make the camera of a file; refuse what cannot be that of an undistorted image in pixels."""
     if facts.is_fisheye or not all(abs(k) <= _NO_DISTORTION for k in facts.distortion):
-        after = "and give the camera of the result"
+        next_step = "and give the camera of the result"
         if facts.size or size:
-            after += f": {json.dumps(camera_keys(make_camera(facts, size)))}"
+            next_step += f": {json.dumps(camera_keys(make_camera(facts, size)))}"
         fisheye = " of a fisheye" if facts.is_fisheye else ""
         coefficients = ", ".join(f"{k:g}" for k in facts.distortion) or "no coefficients"
         raise InputError(
             f"{facts.kind} with lens distortion{fisheye} ({coefficients}), and only images without "
-            f"are understood; undistort them by {facts.undistort}, {after}"
+            f"are understood; undistort them by {facts.undistort}, {next_step}"
         )
     camera = make_camera(facts, size)
     fx = float(camera.K[0, 0])
@@ -325,10 +328,10 @@ def camera_from_facts(facts: CameraFacts, size: Size | None) -> Camera:
     refuse_squeezed(camera.K)
     refuse_outside(camera.K, camera.width, camera.height)
     if isinstance(camera, StereoRig):
-        how = 'written as ours: width, height, K, "baseline_m"'
-        how = "made in Python, as a StereoRig" if facts.is_metric else how
+        way = 'written as ours: width, height, K, "baseline_m"'
+        way = "made in Python, as a StereoRig" if facts.is_metric else way
         most_m = _FILE_BASELINE_M if facts.is_metric else WIDE_BASELINE_M
-        refuse_baseline(camera.baseline_m, f"a rig that is truly this wide is {how}", most_m)
+        refuse_baseline(camera.baseline_m, f"a rig that is truly this wide is {way}", most_m)
         if abs(camera.cx_right_minus_left_px) >= camera.width:
             raise InputError(
                 f"the principal points differ by {camera.cx_right_minus_left_px:g} px, more than "
@@ -354,13 +357,13 @@ def camera_from_facts(facts: CameraFacts, size: Size | None) -> Camera:
 
 def make_camera(facts: CameraFacts, size: Size | None) -> Camera:
     """Make a camera, or a rig where there is a baseline, without asking whether it is likely."""
-    known = facts.size or size
-    if known is None:
+    image_size = facts.size or size
+    if image_size is None:
         raise InputError(
             f"{facts.kind} without the image's size; give it beside the image, or write a camera "
             "of ours (width, height, K)"
         )
-    common: dict[str, Any] = {"width": known[0], "height": known[1], "K": facts.K}
+    common: dict[str, Any] = {"width": image_size[0], "height": image_size[1], "K": facts.K}
     common |= {key: getattr(facts, key) for key in OPTIONAL_KEYS}
     if facts.baseline_m is None:
         return Camera(**common)
@@ -375,8 +378,8 @@ def camera_keys(camera: Camera) -> dict[str, Any]:
         keys["baseline_m"] = camera.baseline_m
         if camera.cx_right_minus_left_px:
             keys["cx_right_minus_left_px"] = camera.cx_right_minus_left_px
-    known = {key: getattr(camera, key) for key in OPTIONAL_KEYS}
-    return keys | {key: value for key, value in known.items() if value is not None}
+    optional = {key: getattr(camera, key) for key in OPTIONAL_KEYS}
+    return keys | {key: value for key, value in optional.items() if value is not None}
 
 
 def refuse_other_resolution(K: Float[Tensor, "3 3"], width: int, height: int) -> None:
@@ -391,8 +394,10 @@ def refuse_other_resolution(K: Float[Tensor, "3 3"], width: int, height: int) ->
     """
     _refuse_normalised(K, width, height)
     refuse_outside(K, width, height)
-    cx, cy = float(K[0, 2]), float(K[1, 2])
-    across, down = (cx + 0.5) / width - 0.5, (cy + 0.5) / height - 0.5
+    cx = float(K[0, 2])
+    cy = float(K[1, 2])
+    across = (cx + 0.5) / width - 0.5
+    down = (cy + 0.5) / height - 0.5
     scale = 1 + across + down
     is_alike = abs(across - down) <= _SAME_SHARE * max(scale, 1)
     if min(abs(across), abs(down)) < _OFF_CENTRE or not is_alike:
@@ -415,7 +420,8 @@ def refuse_outside(K: Float[Tensor, "3 3"], width: int, height: int) -> None:
     Raises:
         InputError: that is so.
     """
-    cx, cy = float(K[0, 2]), float(K[1, 2])
+    cx = float(K[0, 2])
+    cy = float(K[1, 2])
     if not (-0.5 <= cx <= width - 0.5 and -0.5 <= cy <= height - 0.5):
         raise InputError(
             f"the principal point ({cx:g}, {cy:g}) lies outside the image of {width}x{height}; do "
@@ -432,8 +438,10 @@ def suspicious_centre(camera: Camera) -> str | None:
         refuse_other_resolution(camera.K, camera.width, camera.height)
     except InputError as error:
         return str(error)
-    cx, cy = float(camera.K[0, 2]), float(camera.K[1, 2])
-    across, down = (cx + 0.5) / camera.width, (cy + 0.5) / camera.height
+    cx = float(camera.K[0, 2])
+    cy = float(camera.K[1, 2])
+    across = (cx + 0.5) / camera.width
+    down = (cy + 0.5) / camera.height
     if max(abs(across - 0.5), abs(down - 0.5)) <= _QUARTER:
         return None
     return (
@@ -471,7 +479,8 @@ def refuse_baseline(length: float, remedy: str, most_m: float = WIDE_BASELINE_M)
 
 def refuse_squeezed(K: Float[Tensor, "3 3"]) -> None:
     """Refuse a K whose two focal lengths are not those of one lens."""
-    fx, fy = float(K[0, 0]), float(K[1, 1])
+    fx = float(K[0, 0])
+    fy = float(K[1, 1])
     if not 1 / _MAX_SQUEEZE < fy / fx < _MAX_SQUEEZE:
         raise InputError(
             f"K has fx {fx:g} and fy {fy:g}, as if pixels were {max(fx / fy, fy / fx):.2g} times "

@@ -15,13 +15,16 @@ from torch.nn import functional
 
 from depthpose.core.errors import InputError
 
-_COARSE_PIXELS, _FINE_PIXELS = 36_000, 180_000
-_RADIUS, _FINE_RADIUS = 5, 7  # of a patch: 11x11 pixels of the coarse copy, 15x15 of the fine one
+_COARSE_PIXELS = 36_000  # of the copy in which matches are sought
+_FINE_PIXELS = 180_000  # of that in which they are placed
+_RADIUS = 5  # of a patch of the coarse copy: 11x11 pixels
+_FINE_RADIUS = 7  # of a patch of the fine copy: 15x15 pixels
 _REACH = 4  # of the fine search around a coarse match
 _CELL = 8  # one corner a cell spreads the corners over the image
 _MAX_CORNERS = 200
 _MIN_CORNER = 1e-5  # smaller eigenvalue, for grey in [0, 1]: below is noise
-_MIN_CONTRAST, _MIN_DEVIATION = 0.01, 0.004  # of grey in a patch, and in an image
+_MIN_CONTRAST = 0.01  # standard deviation of the grey values of a patch
+_MIN_DEVIATION = 0.004  # of those of an image
 _MIN_SCORE = 0.8
 _MAX_RIVAL = 0.95  # of the best score: a rival so near means a repeated pattern
 _RIVAL_RADIUS = 4
@@ -29,15 +32,18 @@ _RETURN_PX = 1
 
 _MIN_MATCHES = 25
 _MIN_WRONG = 12  # so few show that rows differ, but not that they agree
-_MIN_TEXTURED, _MIN_FOUND = 60, 0.1  # of so many corners a pair has this share in common
+_MIN_TEXTURED = 60  # corners of an image from which the share below can be judged
+_MIN_FOUND = 0.1  # share of the corners that both images of a pair have in common
 _MAX_ALIKE = 0.7  # of them look like some place of another scene; more is a repeated pattern
 _MAX_OFFSET_PX = 1.0  # street pairs have up to 0.3
 _MAX_SPREAD_PX = 0.75  # street pairs have 0.1 to 0.4; a turn by 0.3 degrees makes 1.2 to 2.5
 _LIMITS_WIDTH = 1280  # of wider images the limits grow with the width
 _MAX_SHARE_SWAPPED = 0.2
-_SAME_PX, _SAME_SHARE = 0.5, 0.9
+_SAME_PX = 0.5  # a match within this of its own place has not moved
+_SAME_SHARE = 0.9  # of matches that have not moved: both images show the same view
 _MAD_TO_DEVIATION = 1.4826  # of a normal distribution
-_SOME_CORNERS, _MIN_SOME = 100, 20
+_SOME_CORNERS = 100  # that are looked for in a mirrored, turned or scaled right image
+_MIN_SOME = 20  # of them that must match there
 _LUMA = (0.299, 0.587, 0.114)  # shares of red, green and blue in the brightness, ITU-R BT.601
 _CHANGES = [
     *((sign * turn, 1.0) for turn in (90.0, 20.0, 40.0, 65.0) for sign in (1, -1)),
@@ -99,49 +105,52 @@ def check_rectified(
         InputError: the sizes differ.
     """
     if left.shape != right.shape:
-        one, other = (f"{image.shape[-1]}x{image.shape[-2]}" for image in (left, right))
+        left_size, right_size = (f"{image.shape[-1]}x{image.shape[-2]}" for image in (left, right))
         raise InputError(
-            f"the left image is {one} but the right one {other}; both images of a rectified pair "
-            "have one size, rectify them again"
+            f"the left image is {left_size} but the right one {right_size}; both images of a "
+            "rectified pair have one size, rectify them again"
         )
     if torch.equal(left, right):
-        said = "left and right are the same picture; give the view of each camera"
-        return RectificationReport(is_pair=False, message=said)
+        finding = "left and right are the same picture; give the view of each camera"
+        return RectificationReport(is_pair=False, message=finding)
     with torch.no_grad():
-        one, other = (_grey(image, _COARSE_PIXELS) for image in (left, right))
-        for side, grey in (("left", one), ("right", other)):
+        left_grey, right_grey = (_grey(image, _COARSE_PIXELS) for image in (left, right))
+        for side, grey in (("left", left_grey), ("right", right_grey)):
             deviation = float(grey.std(correction=0))
             if deviation < _MIN_DEVIATION:
-                said = (
+                finding = (
                     f"the {side} image shows nothing that could be matched: its grey values have "
                     f"a standard deviation of {deviation:.4f} (at least {_MIN_DEVIATION:g} is "
                     "needed); is the lens covered, or the file empty?"
                 )
-                return RectificationReport(is_pair=False, message=said)
-        corners = _find_corners(one)
-        places, matched, alike = _match(one, other, corners)
+                return RectificationReport(is_pair=False, message=finding)
+        corners = _find_corners(left_grey)
+        places, matched, alike_count = _match(left_grey, right_grey, corners)
         if len(places) < _MIN_MATCHES:
             unlike = RectificationReport(corners=len(corners), matches=len(places), message="")
-            done = _what_was_done(one, other, corners)
+            done = _what_was_done(left_grey, right_grey, corners)
             if done is not None:
                 return replace(unlike, is_rectified=False, message=done)
-            is_other = len(places) < _MIN_FOUND * len(corners) and alike < _MAX_ALIKE * len(corners)
+            is_other = len(places) < _MIN_FOUND * len(corners) and alike_count < _MAX_ALIKE * len(
+                corners
+            )
             if is_other and len(corners) >= _MIN_TEXTURED:
-                said = (
+                finding = (
                     f"the images do not belong together: {len(places)} of {len(corners)} corners "
                     f"of the left image are found in the right one (at least {_MIN_FOUND:.0%} are "
                     "needed); give both views of one moment"
                 )
-                return replace(unlike, is_pair=False, message=said)
-        where, shift_px = _place_finely(left, right, places, matched)
-    report = _report(where, shift_px, len(corners), left.shape[-1], apart_px)
+                return replace(unlike, is_pair=False, message=finding)
+        matched_px, shift_px = _place_finely(left, right, places, matched)
+    report = _report(matched_px, shift_px, len(corners), left.shape[-1], apart_px)
     centre = torch.tensor([left.shape[-1], left.shape[-2]]) / 2
-    return replace(report, places_px=where + centre, disparities_px=-shift_px[:, 0].float())
+    return replace(report, places_px=matched_px + centre, disparities_px=-shift_px[:, 0].float())
 
 
 def _find_corners(grey: Grey) -> Places:
     padded = functional.pad(grey[None, None], (1, 1, 1, 1), mode="replicate")[0, 0]
-    dx, dy = (padded[1:-1, 2:] - padded[1:-1, :-2]) / 2, (padded[2:, 1:-1] - padded[:-2, 1:-1]) / 2
+    dx = (padded[1:-1, 2:] - padded[1:-1, :-2]) / 2
+    dy = (padded[2:, 1:-1] - padded[:-2, 1:-1]) / 2
     products = torch.stack([dx * dx, dx * dy, dy * dy])[None]
     xx, xy, yy = functional.avg_pool2d(products, 5, stride=1, padding=2)[0]
     smaller = (xx + yy) / 2 - ((xx - yy).square() / 4 + xy.square()).sqrt()
@@ -158,11 +167,12 @@ def _find_corners(grey: Grey) -> Places:
 def _match(source: Grey, target: Grey, corners: Places) -> tuple[Places, Places, int]:
     """Give corners with a mutual match, their places, and how many look like some place there."""
     matched, is_alike, is_sole = _search(source, target, corners)
-    alike = int(is_alike.sum())
-    corners, matched = corners[is_alike & is_sole], matched[is_alike & is_sole]
+    alike_count = int(is_alike.sum())
+    corners = corners[is_alike & is_sole]
+    matched = matched[is_alike & is_sole]
     back, is_alike, is_sole = _search(target, source, matched)
     is_mutual = ((back - corners).abs() <= _RETURN_PX).all(-1) & is_alike & is_sole
-    return corners[is_mutual], matched[is_mutual], alike
+    return corners[is_mutual], matched[is_mutual], alike_count
 
 
 def _search(source: Grey, target: Grey, corners: Places) -> tuple[Places, Flags, Flags]:
@@ -203,20 +213,22 @@ def _place_finely(
     left: Float[Tensor, "3 h w"], right: Float[Tensor, "3 h w"], places: Places, matched: Places
 ) -> tuple[Float[Tensor, "n 2"], Float[Tensor, "n 2"]]:
     """Give where matches lie, from the centre, and their shifts, right less left [px]."""
-    one, other = (_grey(image, _FINE_PIXELS) for image in (left, right))
-    larger = one.shape[1] / _grey(left, _COARSE_PIXELS).shape[1]
+    left_grey, right_grey = (_grey(image, _FINE_PIXELS) for image in (left, right))
+    larger = left_grey.shape[1] / _grey(left, _COARSE_PIXELS).shape[1]
     places, matched = (((p + 0.5) * larger - 0.5).round().long() for p in (places, matched))
     rim = _FINE_RADIUS + _REACH
-    padded = functional.pad(one, (rim,) * 4), functional.pad(other, (rim,) * 4)
+    padded = functional.pad(left_grey, (rim,) * 4), functional.pad(right_grey, (rim,) * 4)
     patches = _unit(_windows(padded[0], places + _REACH, 2 * _FINE_RADIUS + 1))
     windows = _windows(padded[1], matched, 2 * rim + 1)
     steps = windows.unfold(1, 2 * _FINE_RADIUS + 1, 1).unfold(2, 2 * _FINE_RADIUS + 1, 1)
     scores = (_unit(steps) * patches[:, None, None]).sum((-2, -1))
     best, index = scores.flatten(1).max(1)
-    row, column = index // scores.shape[2], index % scores.shape[2]
+    row = index // scores.shape[2]
+    column = index % scores.shape[2]
     last = 2 * _REACH
     is_good = (best > _MIN_SCORE) & (row > 0) & (row < last) & (column > 0) & (column < last)
-    row, column = row.clamp(1, last - 1), column.clamp(1, last - 1)
+    row = row.clamp(1, last - 1)
+    column = column.clamp(1, last - 1)
     n = torch.arange(len(places))
     peak = torch.stack([column, row], -1).float()
     for axis in (0, 1):  # the top of the parabola through three scores, half a pixel off at most
@@ -224,30 +236,31 @@ def _place_finely(
         curvature = (2 * at - before - after).clamp_min(1e-6)
         peak[:, axis] += ((after - before) / (2 * curvature)).clamp(-0.5, 0.5)
     shift = matched - places + peak - _REACH
-    scale = one.shape[1] / left.shape[2]
-    centre = torch.tensor([one.shape[1], one.shape[0]]) / 2
+    scale = left_grey.shape[1] / left.shape[2]
+    centre = torch.tensor([left_grey.shape[1], left_grey.shape[0]]) / 2
     return ((places - centre) / scale)[is_good], (shift / scale)[is_good]
 
 
-def _what_was_done(one: Grey, other: Grey, corners: Places) -> str | None:
+def _what_was_done(left: Grey, right: Grey, corners: Places) -> str | None:
     """Seek the right image mirrored, turned and scaled back; None where it is still not found."""
-    some = corners[:_SOME_CORNERS]
+    some_corners = corners[:_SOME_CORNERS]
     flips = {
-        "mirrored": other.flip(1),
-        "upside down": other.flip(0, 1),
-        "mirrored top to bottom": other.flip(0),
+        "mirrored": right.flip(1),
+        "upside down": right.flip(0, 1),
+        "mirrored top to bottom": right.flip(0),
     }
-    for how, back in flips.items():
-        if len(_match(one, back, some)[0]) >= _MIN_SOME:
-            return f"the right image is {how} beside the left one; turn it back"
-    height, width = other.shape
+    for change, back in flips.items():
+        if len(_match(left, back, some_corners)[0]) >= _MIN_SOME:
+            return f"the right image is {change} beside the left one; turn it back"
+    height, width = right.shape
     for turn_deg, scale in _CHANGES:
         turn_rad = math.radians(-turn_deg)
-        c, s = scale * math.cos(turn_rad), scale * math.sin(turn_rad)
-        there = torch.tensor([[[c, s * height / width, 0], [-s * width / height, c, 0]]])
-        grid = functional.affine_grid(there, [1, 1, height, width], align_corners=False)
-        back = functional.grid_sample(other[None, None], grid, align_corners=False)[0, 0]
-        places, matched, _ = _match(one, back, some)
+        c = scale * math.cos(turn_rad)
+        s = scale * math.sin(turn_rad)
+        affine = torch.tensor([[[c, s * height / width, 0], [-s * width / height, c, 0]]])
+        grid = functional.affine_grid(affine, [1, 1, height, width], align_corners=False)
+        back = functional.grid_sample(right[None, None], grid, align_corners=False)[0, 0]
+        places, matched, _ = _match(left, back, some_corners)
         if len(places) >= _MIN_SOME:
             rest_deg, rest_scale, _ = _fit_rows(places, (matched - places)[:, 1])
             turn_deg += rest_deg  # noqa: PLW2901
@@ -259,19 +272,21 @@ def _what_was_done(one: Grey, other: Grey, corners: Places) -> str | None:
 
 
 def _report(
-    where: Tensor, shift_px: Tensor, corners: int, width: int, apart_px: float
+    places_px: Tensor, shift_px: Tensor, corners: int, width: int, apart_px: float
 ) -> RectificationReport:
     """Say what the matches show, ``where`` counted from the centre [px]."""
     matches = len(shift_px)
     disparity_px = apart_px - shift_px[:, 0]
     clear = disparity_px[disparity_px.abs() > 1]
     share = float((clear > 0).float().mean()) if len(clear) else math.nan
-    offset, spread = math.nan, math.nan
+    offset = math.nan
+    spread = math.nan
     if matches:
         offset = float(shift_px[:, 1].median())
         spread = _MAD_TO_DEVIATION * float((shift_px[:, 1] - offset).abs().median())
     larger = max(1.0, width / _LIMITS_WIDTH)
-    most_offset, most_spread = larger * _MAX_OFFSET_PX, larger * _MAX_SPREAD_PX
+    most_offset = larger * _MAX_OFFSET_PX
+    most_spread = larger * _MAX_SPREAD_PX
     is_same = shift_px.abs().amax(-1) <= larger * _SAME_PX
     is_level = abs(offset) <= most_offset and spread <= most_spread
     is_known = matches >= _MIN_MATCHES or (matches >= _MIN_WRONG and not is_level)
@@ -287,11 +302,11 @@ def _report(
         message="",
     )
     if not is_known:
-        said = (
+        message = (
             f"only {matches} of the {_MIN_MATCHES} matches needed: cannot tell whether the pair is "
             "rectified"
         )
-        return replace(report, message=said)
+        return replace(report, message=message)
     findings: list[str] = []
     if report.is_pair is False:
         findings.append(
@@ -305,11 +320,11 @@ def _report(
             "the two images (or both are mirrored: mirror them back)"
         )
     if report.is_rectified is False:
-        turn_deg, scale, left_px = _fit_rows(where, shift_px[:, 1])
-        how = f", turned by {turn_deg:+.1f} degrees and scaled by {scale:.3f}"
+        turn_deg, scale, left_px = _fit_rows(places_px, shift_px[:, 1])
+        turn = f", turned by {turn_deg:+.1f} degrees and scaled by {scale:.3f}"
         findings.append(
             f"rows do not agree: the right image lies {offset:+.1f} px lower, with a spread of "
-            f"{spread:.1f} px{how if left_px < spread / 2 else ''} (at most "
+            f"{spread:.1f} px{turn if left_px < spread / 2 else ''} (at most "
             f"{most_offset:.3g} and {most_spread:.3g} are allowed); rectify the pair ('depthpose "
             "data rectify', with the calibration of both cameras)"
         )
@@ -317,17 +332,19 @@ def _report(
     return replace(report, message=f"{'. '.join(findings) or good} ({matches} matches)")
 
 
-def _fit_rows(where: Tensor, lower_px: Tensor) -> tuple[float, float, float]:
+def _fit_rows(places_px: Tensor, lower_px: Tensor) -> tuple[float, float, float]:
     """Fit the turn [degrees] and the scale of the right image, and give the spread that is left."""
-    where, lower_px = where.float(), lower_px.float()
-    design = torch.cat([torch.ones_like(where[:, :1]), where], -1)
+    places_px = places_px.float()
+    lower_px = lower_px.float()
+    design = torch.cat([torch.ones_like(places_px[:, :1]), places_px], -1)
     is_near = torch.ones_like(lower_px, dtype=torch.bool)
-    rest, fit = lower_px, lower_px.new_zeros(3)
+    residual_px = lower_px
+    fit = lower_px.new_zeros(3)
     for _ in range(5):
         fit = torch.linalg.lstsq(design[is_near], lower_px[is_near, None]).solution[:, 0]
-        rest = (lower_px - design @ fit).abs()
-        is_near = rest <= 2.5 * rest.median() + 1e-3
-    left = _MAD_TO_DEVIATION * float(rest.median())
+        residual_px = (lower_px - design @ fit).abs()
+        is_near = residual_px <= 2.5 * residual_px.median() + 1e-3
+    left = _MAD_TO_DEVIATION * float(residual_px.median())
     return math.degrees(math.atan(float(fit[1]))), 1 + float(fit[2]), left
 
 

@@ -50,10 +50,12 @@ _D = {
     "right": ("d2", "distcoeffs2", "distcoefs2", "distcoef2", "distortion2", "distcoeffsright",
               "distortioncoefficients2", "distortioncoefficientsright"),
 }  # fmt: skip
-_R, _T = ("r", "rotation", "rotationmatrix"), ("t", "translation", "translationvector")
+_R = ("r", "rotation", "rotationmatrix")
+_T = ("t", "translation", "translationvector")
 _COUNTS = {False: (4, 5, 8, 12, 14), True: (4,)}
 _MAX_BASELINE_M = 10.0
-_CLEARLY, _LEAST_TURN_DEG = 0.5, 0.2  # when R looks transposed
+_LEAST_TURN_DEG = 0.2  # a difference in turn that can be told from an error of the calibration
+_CLEARLY = 0.5  # R looks transposed if its transpose turns the cameras by less than this share
 _MAX_ENLARGED = 4  # of a raw image by its rectification
 _MAX_FOCAL_RATIO = 1.5  # of the two cameras of a pair; more are of images of two sizes
 _KNOWN = (
@@ -103,11 +105,12 @@ def read_raw_pair(
     """
     with naming(path):
         pair = _read(Path(path), unit_m or 1.0, is_fisheye)
-        R, length = pair.right_from_left.R, float(pair.right_from_left.t_m.norm())
+        R = pair.right_from_left.R
+        length = float(pair.right_from_left.t_m.norm())
         if not length:
             raise InputError("T is 0: both cameras stand in one place; calibrate as a pair")
-        said = "--unit cm or mm scales it, and --unit m says that it is in metres"
-        refuse_baseline(length, said, _MAX_BASELINE_M if unit_m else WIDE_BASELINE_M)
+        remedy = "--unit cm or mm scales it, and --unit m says that it is in metres"
+        refuse_baseline(length, remedy, _MAX_BASELINE_M if unit_m else WIDE_BASELINE_M)
         if not torch.allclose(R @ R.mT, torch.eye(3).double(), atol=1e-3) or torch.det(R) < 0:
             raise InputError(f"R is {R.tolist()}, which is no rotation; copy it anew")
         _doubt_transposed(path, pair.right_from_left)
@@ -130,17 +133,18 @@ def _doubt_transposed(path: AnyPath, right_from_left: Rigid) -> None:
 
     A wrong turn about the vertical moves disparities alone, which no comparison of rows can see.
     """
-    R, t_m = right_from_left.R, right_from_left.t_m
+    R = right_from_left.R
+    t_m = right_from_left.t_m
     of_right = _off_axis_deg(t_m)
     as_read = _off_axis_deg(R.mT @ t_m) + of_right
     transposed = _off_axis_deg(R @ t_m) + of_right
     if transposed < _CLEARLY * as_read and as_read - transposed > _LEAST_TURN_DEG:
-        said = (
+        message = (
             f"{path}: is R transposed? By it the cameras are turned {as_read:.2f} degrees from "
             f"the line between them, with its transpose by {transposed:.2f}; it carries points of "
             "camera 1 to camera 2. Compare a measured distance"
         )
-        warnings.warn(said, Notice, stacklevel=3)
+        warnings.warn(message, Notice, stacklevel=3)
 
 
 def _off_axis_deg(t_m: Tensor) -> float:
@@ -161,9 +165,11 @@ def _read(path: Path, unit_m: float, is_fisheye: bool | None) -> RawPair:
                         "no projection_matrix with a focal length; calibrate as a pair"
                     )
                 xs.append(-P[0, 3] / P[0, 0])
-            cameras, turns = [], []
+            cameras = []
+            turns = []
             for side, names in zip(("left", "right"), both, strict=True):
-                K, D = matrix(names, ("cameramatrix", "k"), 9), ("distortioncoefficients", "d")
+                K = matrix(names, ("cameramatrix", "k"), 9)
+                D = ("distortioncoefficients", "d")
                 kind = _kind(names, is_fisheye)
                 cameras.append(_camera(K, _first(names, D), kind, f"the {side} camera"))
                 turn = matrix(names, ("rectificationmatrix", "r"), 9)
@@ -187,15 +193,16 @@ def _read(path: Path, unit_m: float, is_fisheye: bool | None) -> RawPair:
 
 def _from_opencv(names: Names, unit_m: float, is_fisheye: bool | None) -> RawPair:
     """OpenCV's ``stereoCalibrate``: points of camera 1 to camera 2 by R and T."""
-    if not any(name in names for both in _K.values() for name in both):
-        one = "it describes one camera" if is_ros(names) or "cameramatrix" in names else "no K1"
-        raise InputError(f"{one}, not two as they were calibrated; known are {_KNOWN}")
+    if not any(name in names for keys in _K.values() for name in keys):
+        reason = "it describes one camera" if is_ros(names) or "cameramatrix" in names else "no K1"
+        raise InputError(f"{reason}, not two as they were calibrated; known are {_KNOWN}")
     kind = _kind(names, is_fisheye)
     left, right = (
         _camera(matrix(names, _K[side], 9), _first(names, _D[side]), kind, f"the {side} camera")
         for side in ("left", "right")
     )
-    R, T = matrix(names, _R, 9), _first(names, _T)
+    R = matrix(names, _R, 9)
+    T = _first(names, _T)
     if R is None or T is None or len(T) != 3:
         raise InputError("no R of 9 numbers and T of 3, from camera 1 to 2; write both")
     return _pair(left, right, (R, unit_m * np.array(T)), size_of(names))
@@ -203,9 +210,10 @@ def _from_opencv(names: Names, unit_m: float, is_fisheye: bool | None) -> RawPai
 
 def _from_kalibr(names: Names, unit_m: float, is_fisheye: bool | None) -> RawPair:
     """Kalibr's camchain: ``T_cn_cnm1`` carries points of cam0 to cam1."""
-    if not all(isinstance(names.get(who), Mapping) for who in ("cam0", "cam1")):
+    if not all(isinstance(names.get(owner), Mapping) for owner in ("cam0", "cam1")):
         raise InputError("a camchain without cam0 and cam1; calibrate both cameras together")
-    first, second = named(names["cam0"]), named(names["cam1"])
+    first = named(names["cam0"])
+    second = named(names["cam1"])
     motion = matrix(second, ("tcncnm1",), 16)
     if motion is None:
         raise InputError("cam1 has no T_cn_cnm1 of 16 numbers; calibrate both cameras together")
@@ -214,40 +222,42 @@ def _from_kalibr(names: Names, unit_m: float, is_fisheye: bool | None) -> RawPai
         raise InputError("cam0 and cam1 have images of two sizes; a pair has one")
     size = None if sizes[0] is None else (int(sizes[0][0]), int(sizes[0][-1]))
     cameras = []
-    for one, who in ((first, "cam0"), (second, "cam1")):
-        kind = _kind(one, is_fisheye, f"{who}'s")
+    for one, owner in ((first, "cam0"), (second, "cam1")):
+        kind = _kind(one, is_fisheye, f"{owner}'s")
         values = numbers(one.get("intrinsics"))
         if values is None or len(values) != 4:
-            raise InputError(f"{who} has no intrinsics [fx, fy, cx, cy]; copy the camchain anew")
+            raise InputError(f"{owner} has no intrinsics [fx, fy, cx, cy]; copy the camchain anew")
         lens = numbers(one.get("distortioncoeffs"))
-        cameras.append(_camera(intrinsics(*values).numpy(), lens, kind, who))
+        cameras.append(_camera(intrinsics(*values).numpy(), lens, kind, owner))
     return _pair(cameras[0], cameras[1], (motion[:3, :3], unit_m * motion[:3, 3]), size)
 
 
-def _first(names: Names, known: tuple[str, ...]) -> list[float] | None:
-    return next((values for name in known if (values := numbers(names.get(name)))), None)
+def _first(names: Names, keys: tuple[str, ...]) -> list[float] | None:
+    return next((values for name in keys if (values := numbers(names.get(name)))), None)
 
 
-def _kind(names: Names, is_fisheye: bool | None, who: str = "its") -> bool:
+def _kind(names: Names, is_fisheye: bool | None, owner: str = "its") -> bool:
     """Say whether a lens is a fisheye: what the file names, else what is given."""
-    is_named_fisheye = is_fisheye_lens(names, who)
+    is_named_fisheye = is_fisheye_lens(names, owner)
     if is_fisheye and is_named_fisheye is False:
-        raise InputError(f"{who} distortion model is that of a pinhole, no fisheye; omit --fisheye")
+        raise InputError(
+            f"{owner} distortion model is that of a pinhole, no fisheye; omit --fisheye"
+        )
     return bool(is_fisheye) if is_named_fisheye is None else is_named_fisheye
 
 
 def _camera(
-    K: np.ndarray | None, distortion: list[float] | None, is_fisheye: bool, who: str
+    K: np.ndarray | None, distortion: list[float] | None, is_fisheye: bool, owner: str
 ) -> RawCamera:
     if K is None:
-        raise InputError(f"no camera matrix of 9 numbers of {who}; write K1 and K2")
+        raise InputError(f"no camera matrix of 9 numbers of {owner}; write K1 and K2")
     if distortion is None:
-        raise InputError(f"no distortion of {who}; write D1 and D2, zeros where a lens has none")
+        raise InputError(f"no distortion of {owner}; write D1 and D2, zeros where a lens has none")
     counts = _COUNTS[is_fisheye]
     if len(distortion) not in counts:
         model = "a fisheye lens" if is_fisheye else "a pinhole with distortion"
         raise InputError(
-            f"{who} has {len(distortion)} coefficients of distortion, and {model} has "
+            f"{owner} has {len(distortion)} coefficients of distortion, and {model} has "
             f"{' or '.join(map(str, counts))}; look at its model"
         )
     own_K = torch.from_numpy(np.ascontiguousarray(K, np.float64))
@@ -261,11 +271,12 @@ def _pair(
 ) -> RawPair:
     if left.is_fisheye != right.is_fisheye:
         raise InputError("one lens is a fisheye and the other is none; calibrate both as one kind")
-    one, other = float(left.K[0, 0]), float(right.K[0, 0])
-    if not 1 / _MAX_FOCAL_RATIO < one / other < _MAX_FOCAL_RATIO:
+    left_fx = float(left.K[0, 0])
+    right_fx = float(right.K[0, 0])
+    if not 1 / _MAX_FOCAL_RATIO < left_fx / right_fx < _MAX_FOCAL_RATIO:
         raise InputError(
-            f"fx is {one:g} on the left and {other:g} on the right, as of images of two sizes; "
-            "scale one camera matrix and its images to those of the other"
+            f"fx is {left_fx:g} on the left and {right_fx:g} on the right, as of images of two "
+            "sizes; scale one camera matrix and its images to those of the other"
         )
     R, t_m = (torch.from_numpy(np.array(part, np.float64)) for part in motion)
     return RawPair(left=left, right=right, right_from_left=Rigid(R, t_m), size=size)
@@ -301,8 +312,8 @@ class Rectifier:
         cv2 = import_opencv("rectifying a pair")
         size = (self.rig.width, self.rig.height)
         warped: list[Tensor] = []
-        both = zip((left, right), names, (self.left_maps, self.right_maps), strict=True)
-        for image, name, maps in both:
+        views = zip((left, right), names, (self.left_maps, self.right_maps), strict=True)
+        for image, name, maps in views:
             if (image.shape[2], image.shape[1]) != size:
                 raise InputError(
                     f"{name} is {image.shape[2]}x{image.shape[1]}, but the cameras were calibrated "
@@ -330,7 +341,8 @@ def make_rectifier(pair: RawPair, size: Size, keep: float = 0.0) -> Rectifier:
     size = pair.size or size
     R, t = (part.numpy() for part in (pair.right_from_left.R, pair.right_from_left.t_m[:, None]))
     left, right = ((one.K.numpy(), np.array(one.distortion)) for one in (pair.left, pair.right))
-    flags, make_maps = cv2.CALIB_ZERO_DISPARITY, cv2.initUndistortRectifyMap
+    flags = cv2.CALIB_ZERO_DISPARITY
+    make_maps = cv2.initUndistortRectifyMap
     if pair.left.is_fisheye:
         make_maps = cv2.fisheye.initUndistortRectifyMap
         R1, R2, P1, P2, *_ = cv2.fisheye.stereoRectify(
@@ -340,7 +352,8 @@ def make_rectifier(pair: RawPair, size: Size, keep: float = 0.0) -> Rectifier:
         R1, R2, P1, P2, *_ = cv2.stereoRectify(*left, *right, size, R, t, flags=flags, alpha=keep)
     rig = camera_from_facts(facts_from_projections("the rectified pair", P1, P2, size), size)
     assert isinstance(rig, StereoRig), "two projections have a baseline"
-    raw_px, found_px = float(pair.left.K[0, 0]), float(rig.K[0, 0])
+    raw_px = float(pair.left.K[0, 0])
+    found_px = float(rig.K[0, 0])
     if found_px > _MAX_ENLARGED * raw_px:
         raise InputError(
             f"rectified, fx would be {found_px:.0f} px where the raw lens has {raw_px:.0f}: so "

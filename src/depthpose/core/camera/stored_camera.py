@@ -70,9 +70,9 @@ def named(content: Mapping[Any, Any]) -> Names:
     return {re.sub(r"[^a-z0-9]", "", str(key).lower()): value for key, value in content.items()}
 
 
-def matrix(names: Names, known: tuple[str, ...], count: int) -> np.ndarray | None:
+def matrix(names: Names, keys: tuple[str, ...], count: int) -> np.ndarray | None:
     """Take the first matrix of ``count`` numbers among some names, in rows."""
-    for name in known:
+    for name in keys:
         values = numbers(names.get(name))
         if values is not None and len(values) == count:
             return np.array(values).reshape(count // (4 if count > 9 else 3), -1)
@@ -125,7 +125,8 @@ _K = ("k", "cameramatrix", "intrinsicmatrix", "k1", "m1", "cameramatrix1", "came
 _K_RIGHT = ("k2", "m2", "cameramatrix2", "cameramatrixright")
 _D = ("d", "d1", "d2", "coeffs")
 _P = ("p", "projectionmatrix", "p1")
-_WIDTH, _HEIGHT = ("width", "imagewidth"), ("height", "imageheight")
+_WIDTH = ("width", "imagewidth")
+_HEIGHT = ("height", "imageheight")
 _ROS = ("projectionmatrix", "distortionmodel", "p")
 _DISTORTION_KEYS = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
 _LEVEL = 1e-3
@@ -164,12 +165,13 @@ def _facts_without_lens(names: Names) -> CameraFacts | None:
             "a camchain of Kalibr, whose images are not rectified; 'depthpose data rectify' "
             "rectifies them and writes the camera of the result"
         )
-    settings = next((who for who in ("camera", "camera1") if f"{who}fx" in names), None)
+    settings = next((prefix for prefix in ("camera", "camera1") if f"{prefix}fx" in names), None)
     if settings is not None:
         fx, fy, cx, cy = (
             scalar(names, f"{settings}{key}") or 0.0 for key in ("fx", "fy", "cx", "cy")
         )
-        baseline_m, product = scalar(names, "stereob"), scalar(names, "camerabf")
+        baseline_m = scalar(names, "stereob")
+        product = scalar(names, "camerabf")
         factor = scalar(names, "depthmapfactor") or scalar(names, "rgbddepthmapfactor")
         is_rgbd = factor is not None
         if baseline_m is None and product is not None and not is_rgbd and fx > 0:
@@ -184,8 +186,10 @@ def _facts_without_lens(names: Names) -> CameraFacts | None:
                 {key: names.get(f"{settings}{key}") for key in _DISTORTION_KEYS}
             ),
         )
-    left, right = published(names, _P, 12), matrix(names, ("p2",), 12)
-    distortion, undistort = coefficients_of(names), _RECTIFY
+    left = published(names, _P, 12)
+    right = matrix(names, ("p2",), 12)
+    distortion = coefficients_of(names)
+    undistort = _RECTIFY
     kind = "a camera_info of ROS" if is_ros(names) else "a camera of OpenCV"
     if right is not None:
         facts = facts_from_projections("a rig of OpenCV", _need(left, "P1"), right, size_of(names))
@@ -256,7 +260,7 @@ def facts_from_ros_pair(first: Names, second: Names) -> CameraFacts:
     facts = facts_from_projections("a pair of camera_info", P, other, size_of(first))
     coefficients = (*coefficients_of(first), *coefficients_of(second))
     facts = replace(facts, distortion=coefficients, undistort=_RECTIFY)
-    are_fisheyes = [is_fisheye_lens(one) for one in (first, second)]
+    are_fisheyes = [is_fisheye_lens(names_of_camera) for names_of_camera in (first, second)]
     return with_lens(facts, is_fisheye=any(are_fisheyes))
 
 
@@ -265,7 +269,7 @@ def ros_pair(first: Names, second: Names) -> tuple[Names, Names]:
 
     ``Tx`` is -fx times the x of a camera, from the left one or, as in KITTI, from a third.
     """
-    Tx = [_need(matrix(one, _P, 12), "projection_matrix")[0, 3] for one in (first, second)]
+    Tx = [_need(matrix(names, _P, 12), "projection_matrix")[0, 3] for names in (first, second)]
     if Tx[0] == Tx[1]:
         raise InputError(
             f"the projections of the two camera_info have Tx {Tx[0]:g} and {Tx[1]:g}, where that "
@@ -280,9 +284,9 @@ def _from_intrinsics(names: Names, kind: str, distortion: tuple[float, ...]) -> 
     K = published(names, _K, 9)
     if K is None:
         is_realsense = "ppx" in names
-        which = ("fx", "fy", "ppx", "ppy") if is_realsense else ("fx", "fy", "cx", "cy")
-        values = [value for name in which if (value := scalar(names, name)) is not None]
-        if len(values) < len(which):
+        keys = ("fx", "fy", "ppx", "ppy") if is_realsense else ("fx", "fy", "cx", "cy")
+        values = [value for name in keys if (value := scalar(names, name)) is not None]
+        if len(values) < len(keys):
             return None
         fx, fy, cx, cy = values
         return CameraFacts(
@@ -294,7 +298,8 @@ def _from_intrinsics(names: Names, kind: str, distortion: tuple[float, ...]) -> 
             distortion=distortion,
         )
     facts = CameraFacts(kind=kind, K=torch.from_numpy(K), size=size_of(names))
-    T, R = numbers(names.get("t")), numbers(names.get("r"))  # of stereoCalibrate
+    T = numbers(names.get("t"))  # of stereoCalibrate, as R
+    R = numbers(names.get("r"))
     if T is not None and len(T) == 3:
         eye = np.eye(3).ravel()
         is_turned = R is not None and len(R) == 9 and not np.allclose(R, eye, atol=_LEVEL)
@@ -305,7 +310,8 @@ def _from_intrinsics(names: Names, kind: str, distortion: tuple[float, ...]) -> 
             )
         right = matrix(names, _K_RIGHT, 9)
         right = K if right is None else right
-        left, right = np.c_[K, [0, 0, 0]], np.c_[right, [right[0, 0] * T[0], 0, 0]]
+        left = np.c_[K, [0, 0, 0]]
+        right = np.c_[right, [right[0, 0] * T[0], 0, 0]]
         facts = facts_from_projections(kind, left, right, size_of(names))
     return replace(facts, distortion=distortion)
 
@@ -326,16 +332,16 @@ def coefficients_of(names: Names) -> tuple[float, ...]:
         if is_list or name.startswith("distortion"):
             is_named = isinstance(value, Mapping) and "data" not in value
             inner = value.get("data") if isinstance(value, Mapping) and not is_named else value
-            some = numbers(list(value.values()) if is_named else value)
-            if some is None and is_list and inner:
+            numbers_of_lens = numbers(list(value.values()) if is_named else value)
+            if numbers_of_lens is None and is_list and inner:
                 raise InputError(f"its {name} are no list of numbers; write [k1, k2, p1, p2, k3]")
-            coefficients += some or []
+            coefficients += numbers_of_lens or []
     return tuple(value for value in coefficients if value is not None)
 
 
-def published(names: Names, known: tuple[str, ...], count: int) -> np.ndarray | None:
+def published(names: Names, keys: tuple[str, ...], count: int) -> np.ndarray | None:
     """Take a matrix as it is of the image that ROS publishes: cut to its ROI, then binned."""
-    P = matrix(names, known, count)
+    P = matrix(names, keys, count)
     if P is None:
         return None
     (left, top), _, (across, down) = _window(names)
@@ -360,12 +366,12 @@ def _window(names: Names) -> tuple[Size, Size, Size]:
 def size_of(names: Names) -> Size | None:
     """Take the image's size, where some names say it; of ROS, that of the published image."""
     width, height = (
-        next((v for name in which if (v := scalar(names, name)) is not None), None)
-        for which in (_WIDTH, _HEIGHT)
+        next((v for name in keys if (v := scalar(names, name)) is not None), None)
+        for keys in (_WIDTH, _HEIGHT)
     )
-    both = numbers(names.get("imagesize") or names.get("size"))
-    if width is None and both is not None and len(both) == 2:
-        width, height = both
+    size = numbers(names.get("imagesize") or names.get("size"))
+    if width is None and size is not None and len(size) == 2:
+        width, height = size
     if not width or not height:
         return None
     (left, top), (roi_width, roi_height), (across, down) = _window(names)

@@ -9,7 +9,9 @@ from torch.nn import functional
 from depthpose.core.camera.rectified import check_rectified, grey_of
 
 Arrangement = Literal["side by side", "top and bottom"]
-_ROWS, _COLUMNS, _REACH = 32, 64, 12
+_ROWS = 32
+_COLUMNS = 64
+_REACH = 12
 """Of the small copies of both halves, and by how many columns they are moved."""
 _ALIKE = 0.6
 """Least correlation of the halves, less what is common to whole rows and columns: 0.77 to 0.95 of

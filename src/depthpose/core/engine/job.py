@@ -174,7 +174,8 @@ def shard_results(out: str, done: Done) -> Iterator[tuple[str, dict[str, bytes]]
         if files and parts[0] != name:
             yield name, files
             files = {}
-        name, files[parts[1]] = parts[0], data
+        name = parts[0]
+        files[parts[1]] = data
     if files:
         yield name, files
 
@@ -246,16 +247,16 @@ class RayEngine:
                 ray.shutdown()
 
     def _connect(self, ray: Any) -> None:  # noqa: ANN401  Ray is loaded where it is used
-        here: dict[str, Any] = {}
+        options: dict[str, Any] = {}
         if self.address is None:
             cores = None if self.workers is None else max(1.0, self.workers * self.worker_cpus)
-            here = {"num_cpus": cores, "include_dashboard": False}
+            options = {"num_cpus": cores, "include_dashboard": False}
         try:
             host, _, port = (self.address or "").rpartition(":")
             if host and "/" not in host and port.isdecimal():
                 # Ray waits for minutes where nothing answers.
                 socket.create_connection((host, int(port)), timeout=10).close()
-            ray.init(address=self.address or "local", **here)
+            ray.init(address=self.address or "local", **options)
         except (OSError, ValueError, RuntimeError) as error:
             raise InputError(
                 f"--address {self.address}: no Ray cluster answers there ({error}); start one by "
@@ -264,11 +265,11 @@ class RayEngine:
 
     def _capacity(self, ray: Any) -> int:  # noqa: ANN401
         """Say how many workers fit into the cluster."""
-        there: Mapping[str, float] = ray.cluster_resources()
+        resources: Mapping[str, float] = ray.cluster_resources()
         needs = {"CPU": self.worker_cpus, "GPU": self.worker_gpus}
-        most = min(int(there.get(name, 0) / n) for name, n in needs.items() if n > 0)
+        most = min(int(resources.get(name, 0) / n) for name, n in needs.items() if n > 0)
         if most < 1:
-            had = ", ".join(f"{there.get(name, 0):g} {name}" for name in needs)
+            had = ", ".join(f"{resources.get(name, 0):g} {name}" for name in needs)
             wanted = ", ".join(f"{n:g} {name}" for name, n in needs.items())
             raise InputError(
                 f"a worker asks for {wanted}, but the cluster has {had}; ask for less by "

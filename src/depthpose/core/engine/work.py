@@ -72,12 +72,15 @@ def find_items(words: Sequence[str], files: Files) -> list[Item]:
         names = [[PurePosixPath(url).stem for url in side] for side in sides]
         for k, word in enumerate(others[1:], 1):
             # Else two files were named.
-            one = PurePosixPath(others[0]).stem
+            first_stem = PurePosixPath(others[0]).stem
             other = PurePosixPath(word).stem
-            if (names[0], names[k]) != ([one], [other]):
+            if (names[0], names[k]) != ([first_stem], [other]):
                 partners = find_partners(names[0], names[k], f"{others[0]} and {word}")
                 sides[k] = [sides[k][partner] for partner in partners]
-        items += [Item(PurePosixPath(some[0]).stem, some) for some in zip(*sides, strict=True)]
+        items += [
+            Item(PurePosixPath(files_of_input[0]).stem, files_of_input)
+            for files_of_input in zip(*sides, strict=True)
+        ]
     first: dict[str, Item] = {}
     for item in items:
         other = first.setdefault(item.name, item)
@@ -163,12 +166,12 @@ def make_plan(out: str, items: Sequence[Item], tars: Sequence[str], size: int) -
                 f"{item.files[0]}; two files of one name need two folders: choose another"
             )
     count_before = len(blocks)
-    there = {block.tar for block in blocks}
+    planned_tars = {block.tar for block in blocks}
     new = [item for item in items if item.name not in files]
     for k in range(0, len(new), size):
         blocks.append(Block(f"{len(blocks):06d}", tuple(new[k : k + size])))
     for tar in tars:
-        if tar not in there:
+        if tar not in planned_tars:
             blocks.append(Block(f"{len(blocks):06d}", tar=tar))
     if len(blocks) > count_before:
         stores.publish("".join(f"{b.to_json()}\n" for b in blocks).encode(), plan)
@@ -280,8 +283,8 @@ def _samples(block: Block, wanted: Files, scratch: Path) -> Iterator[Sample]:
                 reason = str(error)
             for file in files.values() if reason else ():
                 shutil.rmtree(file.parent, ignore_errors=True)
-            there = () if reason else tuple(files[role] for role in wanted.roles)
-            yield Sample(key, there, reason)
+            paths = () if reason else tuple(files[role] for role in wanted.roles)
+            yield Sample(key, paths, reason)
     except InputError as error:
         yield Sample(PurePosixPath(block.tar).name, reason=str(error))
     else:

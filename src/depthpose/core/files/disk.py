@@ -178,7 +178,9 @@ def read_bytes(path: AnyPath, most: int = MAX_FILE_BYTES) -> bytes:
     try:
         if ".tar/" in inside.as_posix():
             shards = (folder for folder in inside.parents if folder.suffix == ".tar")
-            if (shard := next((one for one in shards if not one.is_dir()), None)) is not None:
+            if (
+                shard := next((candidate for candidate in shards if not candidate.is_dir()), None)
+            ) is not None:
                 return _read_in_shard(shard, inside.relative_to(shard).as_posix(), most)
         status = inside.stat()
         reason = ""

@@ -84,11 +84,11 @@ def read_image(path: AnyPath) -> Float32[Tensor, "3 h w"]:
         pixels = _decoded(path, image)
         count = getattr(image, "n_frames", 1) if image.format != "MPO" else 1
     if count > 1 and _is_new(path, "several"):
-        said = (
+        message = (
             f"{path}: holds {count} pictures, of which the first is read (so it is of other files "
             "there); save each in a file of its own to have them all"
         )
-        warnings.warn(said, Notice, stacklevel=2)
+        warnings.warn(message, Notice, stacklevel=2)
     return _tensor_of(pixels, path)
 
 
@@ -105,7 +105,8 @@ def picture_tensor(image: Image.Image, name: AnyPath) -> Float32[Tensor, "3 h w"
 
 def _decoded(name: AnyPath, image: Image.Image) -> np.ndarray:
     """Give RGB or grey, upright, of 8 or 16 bits."""
-    turn, parts = _UPRIGHT.get(_orientation(image)), [image]
+    turn = _UPRIGHT.get(_orientation(image))
+    parts = [image]
     opened: Any = image  # a picture that is not of a file has neither
     tiles = [] if getattr(image, "fp", None) is None else getattr(image, "tile", None) or []
     raws = [tile.args if isinstance(tile.args, str) else tile.args[0] for tile in tiles]
@@ -135,19 +136,19 @@ def _decoded(name: AnyPath, image: Image.Image) -> np.ndarray:
         parts = [_decoded_jpeg(name, opened.fp.read(), _JPEG_COLOURS[image.mode])]
     read: list[np.ndarray] = []
     for part in parts:
-        one = part if turn is None else part.transpose(turn)
+        picture = part if turn is None else part.transpose(turn)
         # Pillow scales 16-bit PGM to 65535.
-        if one.mode in _GREY_16 or (one.mode == "I" and image.format == "PPM"):
-            values = np.asarray(one).astype(np.uint16)
+        if picture.mode in _GREY_16 or (picture.mode == "I" and image.format == "PPM"):
+            values = np.asarray(picture).astype(np.uint16)
             # Of 8 bits Pillow does this itself.
             is_inverted = image.format == "TIFF" and opened.tag_v2.get(_PHOTOMETRIC) == 0
             read.append(65535 - values if is_inverted else values)
             continue
-        if one.mode in ("I", "F"):
+        if picture.mode in ("I", "F"):
             raise InputError(f"{name}: 32 bits a pixel; save it with 8 or 16 bits a channel")
-        if one.mode == "P" and "transparency" in one.info:
-            one = one.convert("RGBA")
-        read.append(np.asarray(one.convert("RGB")))
+        if picture.mode == "P" and "transparency" in picture.info:
+            picture = picture.convert("RGBA")
+        read.append(np.asarray(picture.convert("RGB")))
     pixels, *low = read
     return pixels.astype(np.uint16) * 256 + low[0] if low else pixels
 
@@ -229,11 +230,11 @@ def from_16_bit(values: np.ndarray, name: AnyPath) -> np.ndarray:
         return values.astype(np.float32) / 65535
     black = low if low > high - low else 0
     if _is_new(name, "range"):
-        said = (
+        message = (
             f"{name}: of 16 bits, and its values are {low} to {high}: {black} is taken as black "
             f"and {high} as white; so are those of other pictures there"
         )
-        warnings.warn(said, Notice, stacklevel=2)
+        warnings.warn(message, Notice, stacklevel=2)
     return ((values.astype(np.float32) - black) / (high - black)).clip(0, 1)
 
 
@@ -255,7 +256,8 @@ def check_image(image: object, name: str, slack: float = 0.5) -> Float[Tensor, "
         raise InputError(f"{name} is empty: shape {tuple(image.shape)}; give it pixels")
     if not bool(torch.isfinite(image).all()):
         raise InputError(f"{name} holds NaN or infinite values; replace or mask them first")
-    low, high = float(image.min()), float(image.max())
+    low = float(image.min())
+    high = float(image.max())
     if low < -slack or high > 1 + slack:
         raise InputError(
             f"{name} must lie in [0, 1], got {low:.4g} .. {high:.4g}; divide 8-bit values by 255, "
@@ -270,7 +272,8 @@ def value_range(values: np.ndarray) -> tuple[int, int]:
     return int(low), int(high)
 
 
-_LEAST_SPAN, _FULL_SPAN = 64, 2**14  # a mask has fewer values; more than 14 bits are taken for 16
+_LEAST_SPAN = 64  # values between the darkest and the brightest; a mask has fewer
+_FULL_SPAN = 2**14  # what spans more is taken for 16 bits
 _REPORTED: set[tuple[Path, str]] = set()  # folders, and what has been reported of them
 
 
@@ -320,9 +323,11 @@ def encode_image(image: Tensor, name: AnyPath, quality: int = 95) -> bytes:
         raise refused_suffix(name, "picture", WRITTEN_SUFFIXES)
     check_image(image, f"{name}: the image", slack=0.25)
     pixels = image.detach().cpu().float().clamp(0, 1).mul(255).round().byte().permute(1, 2, 0)
-    form, options = "PNG", FAST_PNG
+    form = "PNG"
+    options = FAST_PNG
     if suffix != ".png":
-        form, options = "JPEG", {"quality": quality, "subsampling": 0}
+        form = "JPEG"
+        options = {"quality": quality, "subsampling": 0}
     encoded = BytesIO()
     with refused_as(name, "picture", "check its size"):
         Image.fromarray(pixels.contiguous().numpy()).save(encoded, form, **options)
@@ -348,7 +353,8 @@ def list_images(path: AnyPath) -> list[Path]:
         if wanted.is_dir():
             files = list(wanted.iterdir())
         else:
-            home, parts = Path(wanted.anchor), list(wanted.relative_to(wanted.anchor).parts)
+            home = Path(wanted.anchor)
+            parts = list(wanted.relative_to(wanted.anchor).parts)
             while len(parts) > 1 and (home / parts[0]).is_dir():  # its brackets are no pattern
                 home /= parts.pop(0)
             files = [p for p in home.glob("/".join(parts)) if p.is_file()]
@@ -358,8 +364,8 @@ def list_images(path: AnyPath) -> list[Path]:
     pictures = sorted(shown, key=natural_order)
     unread = [p.name for p in files if _UNREAD.fullmatch(p.suffix) and p.name[0] != "."]
     if unread and pictures:
-        said = f"{path}: {len(unread)} files are left out, {min(unread)} first: save them as PNG"
-        warnings.warn(said, Notice, stacklevel=2)
+        message = f"{path}: {len(unread)} files are left out, {min(unread)} first: save them as PNG"
+        warnings.warn(message, Notice, stacklevel=2)
     if not pictures:
         remedy = "give a picture, a folder of pictures or a pattern such as 'left/*.png'"
         if any(p.suffix.lower() in _ARCHIVES for p in files):
@@ -425,21 +431,27 @@ def opened_image(path: AnyPath, *, with_views: bool = False) -> Iterator[Image.I
 
 def _refuse_two_views(path: AnyPath, image: Image.Image) -> None:
     """Refuse the formats of stereo cameras, which hold both views in one file."""
-    kind, file = "", Path(path).name
-    if any(what == "APP3" and b"_JPSJPS_" in data for what, data in getattr(image, "applist", ())):
-        kind = "JPS, side by side"
-    elif image.format == "MPO":  # telephones keep smaller pictures there, such as maps of gain
-        opened: Any = image
-        size, sizes = image.size, []
-        for frame in range(1, opened.n_frames):
-            opened.seek(frame)
-            sizes.append(opened.size)
-        opened.seek(0)
-        kind = "MPO, one after the other" if size in sizes else ""
-    if kind or file.lower().endswith(".jps"):
+    file_name = Path(path).name
+    segments = getattr(image, "applist", ())  # of a JPEG
+    has_jps_segment = any(what == "APP3" and b"_JPSJPS_" in data for what, data in segments)
+    layout = ""
+    if has_jps_segment or file_name.lower().endswith(".jps"):
+        layout = "JPS, side by side"
+    elif image.format == "MPO":
+        # Telephones keep smaller pictures in an MPO, such as maps of gain; a second view is as
+        # large as the first.
+        frames: Any = image
+        first_size = image.size
+        other_sizes = []
+        for frame in range(1, frames.n_frames):
+            frames.seek(frame)
+            other_sizes.append(frames.size)
+        frames.seek(0)
+        layout = "MPO, one after the other" if first_size in other_sizes else ""
+    if layout:
         raise InputError(
-            f"{path}: holds both views of a stereo camera ({kind or 'JPS, side by side'}); "
-            f"'depthpose data split {file} --out DIR' parts them, and 'depthpose depth match' "
+            f"{path}: holds both views of a stereo camera ({layout}); "
+            f"'depthpose data split {file_name} --out DIR' parts them, and 'depthpose depth match' "
             "takes the two"
         )
 
@@ -452,8 +464,12 @@ def _orientation(image: Image.Image) -> int:
 
 
 _EXIF_IFD = 0x8769
-_FOCAL_MM, _FOCAL_35MM = 0x920A, 0xA405
-_RESOLUTION, _RESOLUTION_UNIT, _PIXELS, _PIXELS_DOWN = 0xA20E, 0xA210, 0xA002, 0xA003
+_FOCAL_MM = 0x920A
+_FOCAL_35MM = 0xA405
+_RESOLUTION = 0xA20E
+_RESOLUTION_UNIT = 0xA210
+_PIXELS = 0xA002
+_PIXELS_DOWN = 0xA003
 _SAME_ASPECT = 1.02  # scaled pictures are rounded to whole pixels, and cameras cut some rows
 _MM = {2: 25.4, 3: 10.0, 4: 1.0, 5: 0.001}  # of a unit of resolution: inch, cm, mm, micrometre
 _DIAGONAL_MM = math.hypot(36, 24)
@@ -488,21 +504,24 @@ def _exif_focal(picture: Image.Image) -> tuple[tuple[float, str] | None, str]:
     if picture.format == "PNG" and "exif" not in picture.info:
         return None, ""
     tags = picture.getexif().get_ifd(_EXIF_IFD)
-    film_mm, focal_mm = _positive(tags.get(_FOCAL_35MM)), _positive(tags.get(_FOCAL_MM))
-    across, down = _positive(tags.get(_PIXELS)), _positive(tags.get(_PIXELS_DOWN))
+    film_mm = _positive(tags.get(_FOCAL_35MM))
+    focal_mm = _positive(tags.get(_FOCAL_MM))
+    across = _positive(tags.get(_PIXELS))
+    down = _positive(tags.get(_PIXELS_DOWN))
     if (film_mm or focal_mm) and across and down:
         taken = max(across, down) / min(across, down)
         aspect = max(picture.size) / min(picture.size)
         if not 1 / _SAME_ASPECT < taken / aspect < _SAME_ASPECT:
-            said = (
+            message = (
                 f"EXIF of a picture of {across:g}x{down:g}, and this one is {picture.size[0]}x"
                 f"{picture.size[1]}, cut from it: the focal length there is not that of this one"
             )
-            return None, said
+            return None, message
     if film_mm is not None:
         focal_px = film_mm / _DIAGONAL_MM * math.hypot(*picture.size)
         return (focal_px, f"FocalLengthIn35mmFilm {film_mm:g} mm"), ""
-    per_unit, unit_mm = _positive(tags.get(_RESOLUTION)), _MM.get(tags.get(_RESOLUTION_UNIT, 2))
+    per_unit = _positive(tags.get(_RESOLUTION))
+    unit_mm = _MM.get(tags.get(_RESOLUTION_UNIT, 2))
     if focal_mm is None or per_unit is None or unit_mm is None:
         return None, ""
     taken = _positive(tags.get(_PIXELS)) or max(picture.size)
@@ -528,7 +547,8 @@ _HEADER_READERS = {
     (1, 0): np.lib.format.read_array_header_1_0,
     (2, 0): np.lib.format.read_array_header_2_0,
 }
-_MAX_DIMENSIONS, _MAX_VALUES = 8, 2**26
+_MAX_DIMENSIONS = 8
+_MAX_VALUES = 2**26
 _PFM_HEADER = re.compile(
     rb"P([fF])\s+(\d{1,9})\s+(\d{1,9})\s+([-+]?[0-9.]{1,32}(?:[eE][-+]?\d{1,3})?)(?:\r\n|\s)"
 )
@@ -553,7 +573,8 @@ def read_map(path: AnyPath) -> Float32[Tensor, "h w"]:
             )
         if header[1] == b"F":
             raise InputError(f"{path}: a colour PFM (PF), not a map; save one channel (Pf)")
-        width, height = int(header[2]), int(header[3])
+        width = int(header[2])
+        height = int(header[3])
         body = memoryview(data)[header.end() :]
         if width * height == 0 or width * height * 4 != len(body):
             raise InputError(

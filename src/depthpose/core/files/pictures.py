@@ -51,10 +51,10 @@ def _rgb(values: Tensor, sides: tuple[int, int], what: str) -> Float[Tensor, "3 
             f"{what} of shape {shape}, a batch; give one image, or the batch to "
             "estimate_many(batch, camera)"
         )
-    one = values[0] if values.ndim == 4 else values
-    planes = one[None] if one.ndim == 2 else one
+    values_3d = values[0] if values.ndim == 4 else values
+    planes = values_3d[None] if values_3d.ndim == 2 else values_3d
     found = (k for k in sides if planes.ndim == 3 and planes.shape[k] in _CHANNELS)
-    side = 0 if one.ndim == 2 else next(found, None)
+    side = 0 if values_3d.ndim == 2 else next(found, None)
     if side is None:
         raise InputError(f"{what} of shape {shape}; give (H, W, 3), (3, H, W) or grey (H, W)")
     planes = planes.movedim(side, 0)[:3]

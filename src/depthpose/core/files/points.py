@@ -153,14 +153,14 @@ def read_ply_elements(path: AnyPath, last: str | None = None) -> tuple[Columns, 
             assert rows is not None
             columns = split_rows(path, rows, element.fields, element.count)
         elif rows is None:
-            more_lists, used = _binary_lists(path, body, element, order)
-            body = body[used:]
+            more_lists, used_bytes = _binary_lists(path, body, element, order)
+            body = body[used_bytes:]
             lists = lists | more_lists
         else:
             sizes = {f.name: array("q") for f in element.fields if f.size_code}
             values = {name: array("d") for name in sizes}
-            there = 0
-            for there, row in enumerate(islice(rows, element.count), 1):
+            row_count = 0
+            for row_count, row in enumerate(islice(rows, element.count), 1):
                 words = row.split()
                 at = 0
                 try:
@@ -175,12 +175,13 @@ def read_ply_elements(path: AnyPath, last: str | None = None) -> tuple[Columns, 
                     at = -1
                 if at != len(words):
                     raise InputError(
-                        f"{path}: row {there} of {element.name}, {row.strip()[:60]!r}, is not what "
-                        "the header declares (the number of values, then as many); save it again"
+                        f"{path}: row {row_count} of {element.name}, {row.strip()[:60]!r}, is not "
+                        "what the header declares (the number of values, then as many); save it "
+                        "again"
                     )
-            if there < element.count:
+            if row_count < element.count:
                 what = f"{element.count} {element.name}"
-                raise InputError(f"{path}: {_FEW.format(what, there)}")
+                raise InputError(f"{path}: {_FEW.format(what, row_count)}")
             lists |= {
                 f"{element.name} {name}": Ragged(
                     np.array(sizes[name], np.int64), np.array(values[name])

@@ -90,11 +90,11 @@ def read_video(path: AnyPath) -> Video:
     if min(aspect) > 0 and aspect[0] != aspect[1]:
         wide = aspect[0] / aspect[1]
         size = round(width * max(wide, 1)), round(height * max(1 / wide, 1))
-        said = (
+        message = (
             f"{path}: its pixels are {aspect[0]:g}:{aspect[1]:g}, so frames of {width}x{height} "
             f"become {size[0]}x{size[1]}; a focal length or camera is taken to be of that size"
         )
-        warnings.warn(said, Notice, stacklevel=2)
+        warnings.warn(message, Notice, stacklevel=2)
     if size[0] * size[1] > MAX_PIXELS:
         raise InputError(f"{path}: frames of {size[0]}x{size[1]}; scale it down")
     return Video(path=path, fps=float(fps), frames=max(0, int(frames)), size=size)

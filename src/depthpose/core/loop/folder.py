@@ -151,8 +151,8 @@ def write_card(
     :func:`held_out_text` where validation measured.
     """
     folder = weights.parent
-    here = environment()
-    where = ", ".join(here[name] for name in ("machine", "gpu") if name in here)
+    versions = environment()
+    machine = ", ".join(versions[name] for name in ("machine", "gpu") if name in versions)
     took = f"{seconds:.0f} s" if seconds < 120 else f"{seconds / 60:.0f} min"
     took = took if seconds < 7200 else f"{seconds / 3600:.1f} h"
     step = 0  # of the last state that is whole
@@ -161,7 +161,7 @@ def write_card(
             step = _read_state(path)["step"]
     made = {
         "command": f"`depthpose {words} --config config.yaml --out {shlex.quote(folder.name)}`",
-        "time": f"{step} steps in {took} on {where}; {here['date']}",
+        "time": f"{step} steps in {took} on {machine}; {versions['date']}",
     }
     with atomic_write(weights.with_suffix(".md")) as part:
         part.write_text(card_text(weights.stem, {**facts, **made}, measured))

@@ -154,7 +154,9 @@ class _Training:
         self, task: Task, samples: Samples, config: LoopConfig, folder: Path, *, resume: bool
     ) -> None:
         """Bring everything to the device and, where asked, to the state of an earlier run."""
-        self.task, self.samples, self.config = task, samples, config
+        self.task = task
+        self.samples = samples
+        self.config = config
         accelerate = import_extra("accelerate", "accelerate", "train", "training")
         # The other processes wait while rank 0 validates.
         patience = accelerate.InitProcessGroupKwargs(timeout=timedelta(hours=2))
@@ -178,7 +180,8 @@ class _Training:
         self.world = self.accelerator.num_processes
         self.steps = config.total_steps(len(samples), self.world)
         self.logger = RunLogger(folder, is_writer=self.accelerator.is_main_process)
-        self.step, self.began = 0, time.monotonic()
+        self.step = 0
+        self.began = time.monotonic()
         self.sums: dict[str, tuple[float, int]] = {}
         saved = saved_states(folder)
         if saved and not resume:

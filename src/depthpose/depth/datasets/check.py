@@ -55,13 +55,13 @@ def check_dataset(
     problems: list[Problem] = []
     if split is not None:
         chosen = read_split(split)
-        here = {frame.name: frame for frame in frames}
-        missing = [name for name in chosen.names if name not in here]
+        frames_here = {frame.name: frame for frame in frames}
+        missing = [name for name in chosen.names if name not in frames_here]
         problems += [
             Problem(path=folder, kind="missing", message=f"frame {n} of {chosen.name}")
             for n in missing
         ]
-        frames = [here[name] for name in chosen.names if name in here]
+        frames = [frames_here[name] for name in chosen.names if name in frames_here]
     problems += _check_folder(folder, frames)
     for done, frame in enumerate(frames, 1):
         problems += _check_images(frame, with_decoding=with_decoding)

@@ -148,7 +148,8 @@ def _composed(
     """LiDAR points to pixels; a 3x3 rotation or a 3x4 transform is extended to 4x4."""
     turned = np.eye(4)
     moved = np.eye(4)
-    turned[:3, :3], moved[:3] = rectify, camera_from_velodyne
+    turned[:3, :3] = rectify
+    moved[:3] = camera_from_velodyne
     with np.errstate(all="ignore"):
         composed = left @ turned @ moved
     if not np.isfinite(composed).all():

@@ -115,7 +115,7 @@ def local_folder(folder: Path | str) -> Path:
     if _URL.match(text) is None:
         return Path(folder)
     url = _URL.sub(r"\1://", text, count=1).rstrip("/")  # a Path has made one slash of two
-    here = files.cache_folder() / "shards" / hashlib.sha256(url.encode()).hexdigest()[:16]
+    local = files.cache_folder() / "shards" / hashlib.sha256(url.encode()).hexdigest()[:16]
     from depthpose.core.files.disk import fetch  # fsspec takes time
     from depthpose.core.files.stores import exists, join, list_tree
 
@@ -123,10 +123,10 @@ def local_folder(folder: Path | str) -> Path:
         raise InputError(f"{url}: holds no {INDEX}; 'depthpose data pack' makes one")
     for name, of_file in list_tree(join(url, _CALIBRATION)).items():
         if ".." not in Path(name).parts:
-            fetch(of_file, here / _CALIBRATION / name)
-    fetch(join(url, INDEX), here / INDEX)
-    files.write_json(here / SOURCE, {"url": url})
-    return here
+            fetch(of_file, local / _CALIBRATION / name)
+    fetch(join(url, INDEX), local / INDEX)
+    files.write_json(local / SOURCE, {"url": url})
+    return local
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -56,13 +56,14 @@ def as_input(
     image: object, name: str, camera: AnyLens | None, *, with_exif: bool = True
 ) -> StereoInput:
     """Take a picture and what is known of its camera; without that, ask the picture's EXIF."""
-    left, found = as_tensor(image), None
+    left = as_tensor(image)
+    exif_focal = None
     if camera is None and with_exif and isinstance(image, str | Path | Image.Image):
-        found = read_exif_focal(image)
-    if found is not None:
-        camera, source = found
-        said = f"{name}: a focal length of {camera:.0f} px, by its EXIF ({source})"
-        warnings.warn(f"{said}; of a cropped picture it is another", Notice, stacklevel=3)
+        exif_focal = read_exif_focal(image)
+    if exif_focal is not None:
+        camera, source = exif_focal
+        message = f"{name}: a focal length of {camera:.0f} px, by its EXIF ({source})"
+        warnings.warn(f"{message}; of a cropped picture it is another", Notice, stacklevel=3)
     camera = camera_of(camera, (left.shape[2], left.shape[1]))
     return StereoInput(name=name, left=left, right=None, camera=camera)
 
@@ -86,7 +87,8 @@ def refuse_unrectified(pair: StereoInput, *, with_check: bool = True) -> str:
     check_image(pair.left, f"{pair.name}: the left image")
     check_image(pair.right, f"{pair.name}: the right image")
     if pair.right.shape != pair.left.shape:
-        left, right = pair.left.shape[1:], pair.right.shape[1:]
+        left = pair.left.shape[1:]
+        right = pair.right.shape[1:]
         raise InputError(
             f"{pair.name}: the left image is {left[1]}x{left[0]} and the right one "
             f"{right[1]}x{right[0]}; a rectified pair has one size. Rectify the pair again."
@@ -162,11 +164,11 @@ class FakestereoNet:
     def __repr__(self) -> str:
         """Give one line: generator and matcher, weights, device."""
         parts = [part for part in (self.synthesiser, self.matcher) if part is not None]
-        said = [" + ".join(type(part).__name__ for part in parts)]
-        said += [f"weights {self.weights!r}"] if self.weights else []
-        known = (getattr(part, "device", None) for part in parts)
-        devices = {str(device) for device in known if device is not None}
-        return f"FakestereoNet({', '.join(said + sorted(devices))})"
+        parts_shown = [" + ".join(type(part).__name__ for part in parts)]
+        parts_shown += [f"weights {self.weights!r}"] if self.weights else []
+        part_devices = (getattr(part, "device", None) for part in parts)
+        devices = {str(device) for device in part_devices if device is not None}
+        return f"FakestereoNet({', '.join(parts_shown + sorted(devices))})"
 
     @classmethod
     @own_arithmetic()
@@ -328,7 +330,10 @@ class FakestereoNet:
                 "of both."
             )
         warning = refuse_unrectified(pair, with_check=with_check)
-        left, right, rig, width = pair.left, pair.right, pair.camera, pair.left.shape[2]
+        left = pair.left
+        right = pair.right
+        rig = pair.camera
+        width = pair.left.shape[2]
         apart_px = rig.cx_right_minus_left_px if isinstance(rig, StereoRig) else 0.0
         if abs(math.ceil(apart_px)) >= width:
             raise InputError(
@@ -404,16 +409,16 @@ class FakestereoNet:
         if is_one or (isinstance(images, np.ndarray | Tensor) and images.ndim < 4):
             images = [cast("Picture", images)]
         several = cast("Iterable[object]", images)
-        named = iter((f"image {k}", one) for k, one in enumerate(several))
+        named = iter((f"image {k}", image) for k, image in enumerate(several))
         batches = iter(lambda: list(islice(named, batch)), [])
-        found: list[DepthEstimate | InputError] = []
+        estimates: list[DepthEstimate | InputError] = []
         total = len(several) if isinstance(several, Sized) else None
         with tqdm(total=total, unit=" images", disable=not with_progress) as bar:
             work = partial(self.estimate_together, lens=lens, with_check=with_check)
-            for some in each_in_threads(work, batches, threads):
-                found += some
-                bar.update(len(some))
-        return found
+            for of_batch in each_in_threads(work, batches, threads):
+                estimates += of_batch
+                bar.update(len(of_batch))
+        return estimates
 
     @own_arithmetic()
     def estimate_together(
@@ -435,7 +440,7 @@ class FakestereoNet:
         Returns:
             As :meth:`estimate_many`.
         """
-        found: list[DepthEstimate | InputError] = []
+        estimates: list[DepthEstimate | InputError] = []
         before = None if mount is None else mount.last
         try:
             inputs = [
@@ -446,11 +451,11 @@ class FakestereoNet:
                 (one, None if one.right is not None else self.virtual_sizes(one)) for one in inputs
             ]
             for sizes, group in groupby(sized, itemgetter(1)):
-                alike = [one for one, _ in group]
+                same_sizes = [one for one, _ in group]
                 if sizes is None:
-                    found += map(partial(self.estimate_pair, with_check=with_check), alike)
+                    estimates += map(partial(self.estimate_pair, with_check=with_check), same_sizes)
                 else:
-                    found += self._estimate_alone(alike, sizes, mount)
+                    estimates += self._estimate_alone(same_sizes, sizes, mount)
         except InputError as error:
             if len(named) == 1:
                 return [error]
@@ -461,7 +466,7 @@ class FakestereoNet:
                 for one in named
             )
             return [one for (one,) in alone]
-        return found
+        return estimates
 
     def virtual_sizes(self, image: StereoInput) -> list[tuple[int, int]]:
         """Rows and columns at which one image is looked at.
@@ -479,10 +484,10 @@ class FakestereoNet:
                 "right=, or weights with a generator ('depthpose weights list')."
             )
         check_image(image.left, f"{image.name}: the image")
-        if not self.allow_ood and (how := find_two_views(image.left)) is not None:
+        if not self.allow_ood and (layout := find_two_views(image.left)) is not None:
             raise InputError(
-                f"{image.name}: holds two views of one scene, {how}; 'depthpose data split' parts "
-                "them, and a pair has metres by itself (--allow-ood takes it for one image)"
+                f"{image.name}: holds two views of one scene, {layout}; 'depthpose data split' "
+                "parts them, and a pair has metres by itself (--allow-ood takes it for one image)"
             )
         if image.camera is None:
             raise InputError(
@@ -494,8 +499,8 @@ class FakestereoNet:
         check_image_matches_camera(image.camera, width, height, image.name)
         rig_px = self.synthesiser.config.virtual_focal_px
         own_px = float(image.camera.K.diagonal()[:2].min())
-        used = [s for s in self.synthesiser.scales if s == 1 or s * rig_px <= own_px]
-        return [disparity.focal_size(image.camera, scale * rig_px) for scale in used]
+        usable_scales = [s for s in self.synthesiser.scales if s == 1 or s * rig_px <= own_px]
+        return [disparity.focal_size(image.camera, scale * rig_px) for scale in usable_scales]
 
     def _estimate_alone(
         self,
@@ -534,7 +539,8 @@ class FakestereoNet:
                 for size in sizes
             )
             views = self.synthesiser.draw(left, *larger)
-            sky, confidence = views.is_sky, views.confidence
+            sky = views.is_sky
+            confidence = views.confidence
             if rig.answer == "matched":
                 camera = camera_of(rig.virtual_focal_px, (left.shape[3], left.shape[2]))
                 pairs = list(zip(left, views.right, strict=True))
@@ -549,25 +555,27 @@ class FakestereoNet:
                 parts = zip(views.disparity_px, confidence, strict=True)
                 matches = [Match(disparity_px=px, confidence=sure) for px, sure in parts]
             estimates = []
-            for n, (image, found) in enumerate(zip(images, matches, strict=True)):
-                match = found if sky is None else replace(found, is_sky=sky[n])
-                estimate = disparity.from_virtual(image, rig, match, views.right[n])
+            for n, (image, match) in enumerate(zip(images, matches, strict=True)):
+                match_with_sky = match if sky is None else replace(match, is_sky=sky[n])
+                estimate = disparity.from_virtual(image, rig, match_with_sky, views.right[n])
                 estimates.append(estimate)
                 if confidence is None:
                     continue
                 mean = confidence[n].mean() if views.street is None else views.street[n]
-                sure, said = float(mean), ""
-                if isinstance(rig, SelectionConfig) and sure < rig.least_confidence:
+                image_confidence = float(mean)
+                warning = ""
+                if isinstance(rig, SelectionConfig) and image_confidence < rig.least_confidence:
                     what = "probability of a street" if rig.with_street else "mean confidence"
-                    said = (
-                        f"out of distribution for these weights ({what} {sure:.2f}, below "
+                    warning = (
+                        f"out of distribution for these weights ({what} "
+                        f"{image_confidence:.2f}, below "
                         f"{rig.least_confidence:.2f}), so its depth is a guess"
                     )
-                if said and not self.allow_ood:
+                if warning and not self.allow_ood:
                     raise InputError(
-                        f"{image.name}: {said}. Check that it is upright and that the focal length "
-                        "is its own; --allow-ood (in Python, load(..., allow_ood=True)) answers "
-                        "it all the same."
+                        f"{image.name}: {warning}. Check that it is upright and that the focal "
+                        "length is its own; --allow-ood (in Python, load(..., allow_ood=True)) "
+                        "answers it all the same."
                     )
-                estimates[n] = replace(estimate, image_confidence=sure, warning=said)
+                estimates[n] = replace(estimate, image_confidence=image_confidence, warning=warning)
         return estimates

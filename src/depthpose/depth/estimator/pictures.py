@@ -73,22 +73,22 @@ class DepthPipeline:
         """
         if (inputs is None) == (images is None):
             raise InputError("give the pictures, as the first argument or as images=")
-        given = images if inputs is None else inputs
+        pictures_given = images if inputs is None else inputs
         lens = choose_lens(camera, focal_px, fov_deg)
-        is_one = isinstance(given, str | Path | Image.Image | np.ndarray | Tensor)
-        pictures = [given] if is_one else cast("Iterable[Picture]", given)
+        is_one = isinstance(pictures_given, str | Path | Image.Image | np.ndarray | Tensor)
+        pictures = [pictures_given] if is_one else cast("Iterable[Picture]", pictures_given)
         found = self._each(pictures, lens, batch_size or self.batch_size, timeout)
         if is_one:
             return next(found)
-        return list(found) if isinstance(given, list | tuple) else found
+        return list(found) if isinstance(pictures_given, list | tuple) else found
 
     def _each(
         self, pictures: Iterable[Picture], lens: AnyLens | None, batch: int, timeout: float | None
     ) -> Iterator[dict[str, Any]]:
         left = iter(pictures)
-        while some := list(islice(left, batch)):
-            seen: list[StereoInput] = []
-            for picture in some:
+        while chunk := list(islice(left, batch)):
+            inputs: list[StereoInput] = []
+            for picture in chunk:
                 taken = as_input(_opened(picture, timeout), "the picture", lens)
                 if taken.camera is None:
                     height, width = taken.left.shape[1:]
@@ -100,13 +100,13 @@ class DepthPipeline:
                         Notice,
                         stacklevel=3,
                     )
-                seen.append(taken)
-            for found in self.net.estimate_many(seen, batch=batch):
-                if isinstance(found, InputError):
-                    raise found
-                assert found.depth_m is not None
+                inputs.append(taken)
+            for estimate in self.net.estimate_many(inputs, batch=batch):
+                if isinstance(estimate, InputError):
+                    raise estimate
+                assert estimate.depth_m is not None
                 # From the nearest (black) to the farthest (white); what has none is white too.
-                depth_m = found.depth_m
+                depth_m = estimate.depth_m
                 known_m = depth_m[depth_m.isfinite()]
                 low, high = known_m.aminmax() if len(known_m) else torch.tensor([0.0, 1.0])
                 share = ((depth_m - low) / (high - low).clamp(min=1e-6)).nan_to_num(1.0)
@@ -179,6 +179,6 @@ def _opened(picture: Picture, timeout: float | None) -> Picture:
         return Image.open(BytesIO(content))
     except (OSError, ValueError) as error:
         if is_address or picture.startswith("data:"):
-            said = picture if is_address else f"{picture[:30]}..."
-            raise InputError(f"{said}: is no picture that can be read ({error})") from error
+            shown = picture if is_address else f"{picture[:30]}..."
+            raise InputError(f"{shown}: is no picture that can be read ({error})") from error
         return picture

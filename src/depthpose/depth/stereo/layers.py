@@ -38,22 +38,26 @@ def by_rows(
     """
     if rows is None:
         return function(*inputs)
-    height, whole = min(x.shape[-2] for x in inputs if x is not None), into
+    height = min(x.shape[-2] for x in inputs if x is not None)
+    whole = into
     for first in range(0, height, rows):
         stop = min(first + rows, height)
-        before, after = max(first - halo, 0), min(stop + halo, height)
+        before = max(first - halo, 0)
+        after = min(stop + halo, height)
         pieces = []
         for x in inputs:
             times = 1 if x is None else x.shape[-2] // height
             pieces.append(None if x is None else x[..., times * before : times * after, :])
-        some = function(*pieces)
-        times = some.shape[-2] // (after - before)
+        piece_result = function(*pieces)
+        times = piece_result.shape[-2] // (after - before)
         if whole is None:  # in the order of memory that convolutions of volumes like
-            order = torch.channels_last_3d if some.ndim == 5 else torch.contiguous_format
-            size = (*some.shape[:-2], times * height, some.shape[-1])
-            whole = torch.empty(size, dtype=some.dtype, device=some.device, memory_format=order)
-        own = some[..., times * (first - before) : times * (stop - before), :]
-        whole[..., times * first : times * stop, :] = own
+            order = torch.channels_last_3d if piece_result.ndim == 5 else torch.contiguous_format
+            size = (*piece_result.shape[:-2], times * height, piece_result.shape[-1])
+            whole = torch.empty(
+                size, dtype=piece_result.dtype, device=piece_result.device, memory_format=order
+            )
+        own_rows = piece_result[..., times * (first - before) : times * (stop - before), :]
+        whole[..., times * first : times * stop, :] = own_rows
     assert whole is not None, "there are rows"
     return whole
 
@@ -66,15 +70,15 @@ class Taps(NamedTuple):
     share: Tensor
 
 
-def linear_taps(small: int, large: int, like: Tensor, *, align_corners: bool) -> Taps:
+def linear_taps(small: int, large: int, example: Tensor, *, align_corners: bool) -> Taps:
     """Find where each of ``large`` samples falls among ``small`` ones, as F.interpolate does."""
-    index = torch.arange(large, dtype=torch.float64, device=like.device)
+    index = torch.arange(large, dtype=torch.float64, device=example.device)
     if align_corners:
         at = index * ((small - 1) / max(large - 1, 1))
     else:
         at = ((index + 0.5) * (small / large) - 0.5).clamp(min=0)
     low = at.floor().long().clamp(max=small - 1)
-    return Taps(low, (low + 1).clamp(max=small - 1), (at - low).to(like))
+    return Taps(low, (low + 1).clamp(max=small - 1), (at - low).to(example))
 
 
 def interpolation_matrix(taps: Taps, small: int) -> Float[Tensor, "large small"]:
@@ -142,7 +146,8 @@ def fold(network: ModuleT, like: Tensor) -> ModuleT:
             if isinstance(norm, nn.BatchNorm3d):
                 setattr(parent, name, VolumeConv(conv, weight, bias, like))
                 continue
-            conv.weight.data, conv.bias = weight, nn.Parameter(bias)
+            conv.weight.data = weight
+            conv.bias = nn.Parameter(bias)
             layer.norm = nn.Identity()
             if isinstance(layer, ConvNorm):  # which then is its convolution
                 setattr(parent, name, conv)
@@ -171,7 +176,9 @@ class VolumeConv(nn.Module):
         """Convolve a volume, in the type of the weights."""
         volume = volume.to(self.weight.dtype)
         is_usable = volume.device.type == "cpu" and volume.dtype in (torch.float32, torch.bfloat16)
-        given, ones, steps = (volume, self.weight, self.bias), (1, 1, 1), (self.stride,) * 3
+        given = (volume, self.weight, self.bias)
+        ones = (1, 1, 1)
+        steps = (self.stride,) * 3
         # oneDNN is called by name: PyTorch's own choice takes a slow path for few rows.
         if is_usable and self.with_onednn and self.is_transposed:
             more = (ones, ones, steps, ones, 1, "none", [], "")
@@ -193,7 +200,8 @@ def has_onednn_operators() -> bool:
         return False
     like = torch.empty(0, dtype=torch.float32, device="cpu")
     given = like.new_ones(1, 2, 4, 4, 4), like.new_ones(2, 2, 3, 3, 3), like.new_ones(2)
-    ones, twos = (1, 1, 1), (2, 2, 2)
+    ones = (1, 1, 1)
+    twos = (2, 2, 2)
     more = (ones, ones, twos, ones, 1, "none", [], "")
     try:
         with torch.no_grad():

@@ -40,7 +40,8 @@ STEM = 16
 """Channels at half size."""
 _OFFSETS = (-2, -1, 0, 1, 2)
 """Where the refinement compares the views: so many pixels at half size from the disparity."""
-_GROUPS, _REFINED = 4, 32
+_GROUPS = 4
+_REFINED = 32
 """Groups of features that the refinement compares, and its channels at half size."""
 
 
@@ -116,7 +117,8 @@ class Refinement(nn.Module):
         super().__init__()
         self.compared = ConvNorm(nn.Conv2d, STEM, STEM)
         seen = _GROUPS * len(_OFFSETS) + STEM + 4
-        widths, dilations = (seen, _REFINED, _REFINED), (1, 2, 1)
+        widths = (seen, _REFINED, _REFINED)
+        dilations = (1, 2, 1)
         self.layers = nn.ModuleList(
             ConvNorm(nn.Conv2d, width, _REFINED, dilation=dilation)
             for width, dilation in zip(widths, dilations, strict=True)
@@ -135,7 +137,8 @@ class Refinement(nn.Module):
         """Correct a disparity of the left view [px] by features of both views at half size."""
         four = F.pixel_unshuffle(enlarged_px.detach()[:, None], 2) / 2
         middle = four.mean(1)
-        left, right = self.compared(left_half), self.compared(right_half)
+        left = self.compared(left_half)
+        right = self.compared(right_half)
         # The cosine of each group of features at five disparities about that one.
         near, far = (unit_groups(half.float(), _GROUPS) for half in (left, right))
         cosines = [
@@ -266,7 +269,8 @@ class LightFeatures(nn.Module):
         quarter, eighth, sixteenth, _ = self.encoder.channels
         skips = (sixteenth, eighth, quarter + w)
         self.widths = (w, _DEEP // 2, _DEEP // 2, _DEEP)
-        outputs, above = self.widths[-2::-1], self.widths[:0:-1]
+        outputs = self.widths[-2::-1]
+        above = self.widths[:0:-1]
         self.decoder = nn.ModuleList(
             ConvNorm(nn.Conv2d, a + skip, out)
             for a, skip, out in zip(above, skips, outputs, strict=True)
@@ -303,8 +307,11 @@ def correlation_volume(
     Disparities d are ``first``, which may be negative, and those that follow. Zero where the right
     pixel falls outside the image.
     """
-    before, after = max(first + bins - 1, 0), max(-first, 0)
-    width, padded, cosines = left.shape[-1], F.pad(right, (before, after)), []
+    before = max(first + bins - 1, 0)
+    after = max(-first, 0)
+    width = left.shape[-1]
+    padded = F.pad(right, (before, after))
+    cosines = []
     for disparity in range(first, first + bins):
         # Groups last, as convolutions of volumes want them: no copy is made.
         start = before - disparity
@@ -318,7 +325,8 @@ class Aggregation(nn.Module):
 
     def __init__(self, config: LightConfig, guide_widths: tuple[int, ...]) -> None:
         super().__init__()
-        self.groups, v = config.groups, config.volume_widths
+        self.groups = config.groups
+        v = config.volume_widths
         self.first = ConvNorm(nn.Conv3d, config.groups, v[0])
         steps = list(pairwise(v))
         self.down = nn.ModuleList(ConvNorm(nn.Conv3d, a, b, stride=2) for a, b in steps)
@@ -349,7 +357,8 @@ class Aggregation(nn.Module):
         product = torch.Tensor.mul if torch.is_grad_enabled() else torch.Tensor.mul_
 
         def begin(left: Features, right: Features, guide: Volume) -> Volume:
-            near, far = unit_groups(left, self.groups), unit_groups(right, self.groups)
+            near = unit_groups(left, self.groups)
+            far = unit_groups(right, self.groups)
             volume = correlation_volume(near, far, bins, first)
             volume = volume.contiguous(memory_format=torch.channels_last_3d)
             return product(self.first(volume).relu_(), guide)
@@ -366,7 +375,8 @@ class Aggregation(nn.Module):
         x = scales.pop()
         for up, joined in zip(self.up[:0:-1], self.joined[:0:-1], strict=True):
             x = joined(raised(up, x, scales.pop())).relu_()
-        largest, half = scales.pop(), None if rows is None else rows // 2
+        largest = scales.pop()
+        half = None if rows is None else rows // 2
         x = by_rows(partial(raised, self.up[0]), (x, largest), halo=1, rows=half, into=largest)
         return by_rows(end, (x,), halo=2, rows=rows)[:, 0]
 
@@ -443,7 +453,8 @@ class LightStereo(StereoNetwork):
                 f"the light matcher takes sides that are multiples of 32, got {h}x{w}; pad the "
                 "pair, as LightMatcher does"
             )
-        near, far = self.features(left), self.features(right)
+        near = self.features(left)
+        far = self.features(right)
         described = self.describe(near.levels[0]), self.describe(far.levels[0])
         right_half = far.half
         del far
@@ -501,7 +512,7 @@ def light_bytes(
     """
     pixels = height * width // 16
     slab_pixels = min((rows + 4) * width // 4, pixels)
-    kept = pixels * (2 * 4 * 16 + 3 * config.width) * dtype.itemsize
+    feature_bytes = pixels * (2 * 4 * 16 + 3 * config.width) * dtype.itemsize
     # Both views in float32: at this size, normalised, padded.
     images = 6 * 3 * 4 * height * width
     # A volume at quarter size, the smaller ones, and three of the rows at a time.
@@ -513,7 +524,10 @@ def light_bytes(
     joined = 4 * (16 + config.width + 32) * dtype.itemsize
     compared = 4 * (4 * 16 + 9 + 3 * 9) * 4
     weights = slab_pixels * (joined + compared + 3 * 4 * 36 * 4)
-    return int(layers.MARGIN * (images + kept + max(volumes, weights))) + layers.OVERHEAD_BYTES // 2
+    return (
+        int(layers.MARGIN * (images + feature_bytes + max(volumes, weights)))
+        + layers.OVERHEAD_BYTES // 2
+    )
 
 
 class LightMatcher(NetworkMatcher):

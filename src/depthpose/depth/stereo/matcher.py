@@ -120,7 +120,8 @@ class CallableMatcher:
                 f"the wrapped matcher answered {type(answer).__name__}; let it answer a tensor or "
                 f"array of disparities"
             )
-        disparity_px, size = answer.detach().to(torch.float32), tuple(left.shape[-2:])
+        disparity_px = answer.detach().to(torch.float32)
+        size = tuple(left.shape[-2:])
         if tuple(disparity_px.shape) != size:
             raise InputError(
                 f"the wrapped matcher answered shape {tuple(disparity_px.shape)} for images of "
@@ -146,7 +147,8 @@ def check_pair(left: object, right: object) -> None:
         InputError: not tensors, not ``(3, H, W)``, not float, empty, of two sizes, not finite or
             not in [0, 1].
     """
-    first, second = check_image(left, "left image", 1e-3), check_image(right, "right image", 1e-3)
+    first = check_image(left, "left image", 1e-3)
+    second = check_image(right, "right image", 1e-3)
     if first.shape != second.shape:
         sizes = [f"{image.shape[-2]}x{image.shape[-1]}" for image in (first, second)]
         raise InputError(
@@ -355,8 +357,8 @@ class NetworkMatcher(ABC):
             size = self.work_size(camera)
             network = replace(trained, max_disparity_px=self.work_disparities(camera))
             views = [tuple(disparity.resize_image(view, *size) for view in pair) for pair in pairs]
-        most = self.config.max_memory_bytes
-        together = most is None and len({left.shape for left, _ in views}) == 1
+        limit_bytes = self.config.max_memory_bytes
+        together = limit_bytes is None and len({left.shape for left, _ in views}) == 1
         matches: list[Match] = []
         for group in [views] if together else [[pair] for pair in views]:
             left, right = (
@@ -373,18 +375,18 @@ class NetworkMatcher(ABC):
                 padded = [pad_top_right(view, network) for view in side]
                 height, width = padded[0].shape[-2:]
                 rows = self._network.rows or height // 4
-                least = 0
-                if most is not None:
-                    least = self.activation_bytes(network, height, width, self.dtype, rows)
-                if most is not None and least > most:  # volumes are held whole
+                needed_bytes = 0
+                if limit_bytes is not None:
+                    needed_bytes = self.activation_bytes(network, height, width, self.dtype, rows)
+                if limit_bytes is not None and needed_bytes > limit_bytes:  # volumes are held whole
                     quick = "" if network.work_focal_px is None else " or speed='quick'"
                     raise InputError(
-                        f"max_memory_bytes={most} is too small for images of {height}x{width} "
-                        f"(padded): this matcher takes {least}; allow that, take precision='bf16'"
-                        f"{quick}, or match the pair at a smaller size"
+                        f"max_memory_bytes={limit_bytes} is too small for images of "
+                        f"{height}x{width} (padded): this matcher takes {needed_bytes}; allow "
+                        f"that, take precision='bf16'{quick}, or match the pair at a smaller size"
                     )
-                found = self.run(padded[0], padded[1], network, first_px)
-                answers.append([disparity.changed_match(match, crop) for match in found])
+                padded_matches = self.run(padded[0], padded[1], network, first_px)
+                answers.append([disparity.changed_match(match, crop) for match in padded_matches])
             if len(answers) == 2:
                 other_px = (match.disparity_px.flip(-1) for match in answers[1])
                 answers[0] = list(map(lower_where_disagreeing, answers[0], other_px))
@@ -429,7 +431,7 @@ class NetworkMatcher(ABC):
 
 
 def _scaled_size(left: View, scale: float, camera: Camera | None) -> tuple[int, int]:
-    """Give so many times the sides of a view; pixels of a known camera become square."""
+    """Give the rows and columns of a view that is scaled; with a camera, pixels become square."""
     if camera is not None:
         return disparity.focal_size(camera, scale * float(camera.K[0, 0]))
     return max(1, round(left.shape[1] * scale)), max(1, round(left.shape[2] * scale))
@@ -448,13 +450,14 @@ def pad_top_right(
 
     Top and right, as PSMNet's authors do: columns stay where they are, so disparity does too.
     """
-    step, least = network.step_px, network.min_side_px
+    step = network.step_px
+    least = network.min_side_px
     h, w = (max(least, -(-side // step) * step) for side in image.shape[-2:])
     return F.pad(image, (0, w - image.shape[-1], h - image.shape[-2], 0))
 
 
 def lower_where_disagreeing(
-    found: Match, right_px: Map, tolerance_px: float = 0.0, falls_px: float = AGREEMENT_PX
+    match: Match, right_px: Map, tolerance_px: float = 0.0, falls_px: float = AGREEMENT_PX
 ) -> Match:
     """Lower the confidence where the right view's own disparity is another.
 
@@ -462,16 +465,16 @@ def lower_where_disagreeing(
     agree, and nothing contradicts. That of the sky is kept.
 
     Args:
-        found: the match of the left view.
+        match: that of the left view.
         right_px: disparity of the right view.
         tolerance_px: a difference that says nothing.
         falls_px: what is larger by so much takes the agreement down to 1/e.
     """
     # Small where both views agree, large at occlusions; NaN outside the right view.
-    there_px = disparity.warp_right_to_left(right_px[None], found.disparity_px)[0]
-    difference_px = ((found.disparity_px - there_px).abs() - tolerance_px).clamp(min=0)
+    there_px = disparity.warp_right_to_left(right_px[None], match.disparity_px)[0]
+    difference_px = ((match.disparity_px - there_px).abs() - tolerance_px).clamp(min=0)
     agreement = torch.exp(-difference_px / falls_px).nan_to_num(0.0)
-    confidence = agreement if found.confidence is None else found.confidence * (1 + agreement) / 2
-    if found.confidence is not None and found.is_sky is not None:
-        confidence = torch.where(found.is_sky, found.confidence, confidence)
-    return replace(found, confidence=confidence)
+    confidence = agreement if match.confidence is None else match.confidence * (1 + agreement) / 2
+    if match.confidence is not None and match.is_sky is not None:
+        confidence = torch.where(match.is_sky, match.confidence, confidence)
+    return replace(match, confidence=confidence)

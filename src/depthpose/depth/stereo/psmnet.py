@@ -124,7 +124,8 @@ class FeatureExtractor(nn.Module):
         levels = []
         for layer, pool in zip(reversed(self.pyramid), reversed(self.pools), strict=True):
             pooled = F.relu(layer(F.avg_pool2d(last, pool)))
-            size, align = last.shape[-2:], self.align_corners
+            size = last.shape[-2:]
+            align = self.align_corners
             levels.append(F.interpolate(pooled, size, mode="bilinear", align_corners=align))
         return self.project(F.relu(self.fuse(torch.cat([raw, last, *levels], 1))))
 
@@ -231,7 +232,8 @@ class PSMNet(StereoNetwork):
         Raises:
             InputError: the images' size does not suit the network.
         """
-        (h, w), least = left.shape[-2:], self.config.min_side_px
+        h, w = left.shape[-2:]
+        least = self.config.min_side_px
         if h % 16 or w % 16 or min(h, w) < least:
             raise InputError(
                 f"PSMNet takes sides that are multiples of 16 and at least {least} px, got "
@@ -272,7 +274,10 @@ class PSMNet(StereoNetwork):
 
     def refine(self, cost0: Volume) -> tuple[Volume, Volume, Volume]:
         """Give the cost after each hourglass."""
-        x, first, up, costs = cost0, None, None, []
+        x = cost0
+        first = None
+        up = None
+        costs = []
         for module, head in zip(self.hourglasses, self.heads, strict=True):
             hourglass = cast("Hourglass", module)
             # Under the same name, so that one volume of the full size is held beside ``cost0``.
@@ -297,7 +302,8 @@ def psmnet_bytes(
 
     Two volumes of the largest size are held whole; ``rows`` at quarter size are computed at a time.
     """
-    h, w = height // 4, width // 4
+    h = height // 4
+    w = width // 4
     row_bytes = config.width * w * dtype.itemsize
     map_bytes = row_bytes * h
     bins = config.max_disparity_px // 4
@@ -331,7 +337,8 @@ class PSMNetMatcher(NetworkMatcher):
         """Fold batch norm, and compute some rows at a time."""
         for head in network.heads:
             # In float32 at least: 8 bits would round the expectation to whole pixels.
-            cost, wide = cast("nn.Conv3d", head.cost), torch.empty(0, device=self.device)
+            cost = cast("nn.Conv3d", head.cost)
+            wide = torch.empty(0, device=self.device)
             head.cost = layers.VolumeConv(cost, cost.weight, torch.zeros(1), wide)
         network.rows = ROWS
         return layers.fold(network, like)
@@ -404,8 +411,10 @@ def psmnet_from_published(state: Mapping[str, Tensor], *, align_corners: bool) -
         renamed[f"features.{name}" if prefix else name] = value
     # The count of batches steers nothing at inference; files older than 2018 do not hold it.
     uncounted = {n: v for n, v in network.state_dict().items() if n.endswith("batches_tracked")}
-    given = Checkpoint(kind="psmnet", config={}, state={**uncounted, **renamed})
-    load_weights(network, given, "the checkpoint of the stacked-hourglass PSMNet ('state_dict')")
+    checkpoint = Checkpoint(kind="psmnet", config={}, state={**uncounted, **renamed})
+    load_weights(
+        network, checkpoint, "the checkpoint of the stacked-hourglass PSMNet ('state_dict')"
+    )
     return network.eval()
 
 

@@ -70,7 +70,8 @@ def move_views(left: Tensor, right: Tensor, first_px: int) -> tuple[Tensor, Tens
         right: the same size.
         first_px: in whole pixels.
     """
-    width, added = left.shape[2], max(-first_px, 0)
+    width = left.shape[2]
+    added = max(-first_px, 0)
     moved = F.pad(right[None], (added + first_px, added, 0, 0), mode="replicate")[0]
     wider = F.pad(left[None], (added, 0, 0, 0), mode="replicate")[0]
     return wider, moved[..., : width + added]
@@ -81,13 +82,13 @@ def moved_back(match: Match, first_px: int) -> Match:
     if first_px == 0:
         return match
     added = max(-first_px, 0)
-    found = changed_match(match, lambda values: values[:, added:])
-    found = replace(found, disparity_px=found.disparity_px + first_px)
-    if found.confidence is None:
-        return found
+    moved = changed_match(match, lambda values: values[:, added:])
+    moved = replace(moved, disparity_px=moved.disparity_px + first_px)
+    if moved.confidence is None:
+        return moved
     # The right view shows none of the first columns, even of what is farthest.
-    columns = torch.arange(found.confidence.shape[1], device=found.confidence.device)
-    return replace(found, confidence=found.confidence.where(columns >= first_px, 0.0))
+    columns = torch.arange(moved.confidence.shape[1], device=moved.confidence.device)
+    return replace(moved, confidence=moved.confidence.where(columns >= first_px, 0.0))
 
 
 def measure_reach(
@@ -102,13 +103,15 @@ def measure_reach(
         infinity_px: disparity of what is infinitely far away: 0, or less where the principal point
             of the right camera lies farther to the right.
     """
-    trained, width = matcher.network_config, left.shape[2]
+    trained = matcher.network_config
+    width = left.shape[2]
     reach_px = matcher.whole_steps(trained.max_disparity_px * matcher.most_disparities)
     scale = min(1.0, reach_px / (width + abs(infinity_px)))
     step_px = STEP_PX / scale
     first_px = STEP_PX * math.floor(infinity_px * scale / STEP_PX)
     search = Search(scale=scale, first_px=first_px, max_disparity_px=reach_px)
-    views, mirrored = (left, right), (right.flip(-1), left.flip(-1))
+    views = (left, right)
+    mirrored = (right.flip(-1), left.flip(-1))
     coarse, other = matcher.match_many([views, mirrored], search=search)
     # How far a pair reaches is told where both views agree: not at hidden places and the left
     # border. How near, where the right view can show it: near things are in one view alone often.
@@ -134,7 +137,8 @@ def measure_reach(
     far_px, near_px = (found_px[which].sort().values for which in (is_far, is_near))
     if min(len(far_px), len(near_px)) <= tail:  # nothing is known: all that was found counts
         far_px = near_px = found_px.flatten().sort().values
-    low_px, high_px = float(far_px[tail]) - step_px, float(near_px[-1 - tail]) + step_px
+    low_px = float(far_px[tail]) - step_px
+    high_px = float(near_px[-1 - tail]) + step_px
     return Reach(
         low_px=max(low_px, infinity_px),
         high_px=max(high_px, low_px + step_px),
@@ -209,7 +213,8 @@ def doubt_outside(match: Match, reach: Reach, window: Window) -> tuple[Match, st
     """
     if match.confidence is None:
         return match, ""
-    coarse_px, sure = reach.coarse.disparity_px, reach.coarse.confidence
+    coarse_px = reach.coarse.disparity_px
+    coarse_confidence = reach.coarse.confidence
     # Beside what is beyond, two pixels of the copy or its error away, it may be beyond too.
     is_beyond = coarse_px > window.last_px - reach.step_px
     if bool(is_beyond.any()):
@@ -225,8 +230,8 @@ def doubt_outside(match: Match, reach: Reach, window: Window) -> tuple[Match, st
     doubted = replace(match, confidence=match.confidence.masked_fill(is_beyond | is_last, 0.0))
     is_beyond = coarse_px > window.last_px + reach.step_px
     is_beyond &= coarse_px <= torch.arange(coarse_px.shape[1], device=coarse_px.device)
-    if sure is not None:
-        is_beyond &= sure >= _SURE
+    if coarse_confidence is not None:
+        is_beyond &= coarse_confidence >= _SURE
     share = float(is_beyond.float().mean())
     if share < _NAMED:
         return doubted, ""

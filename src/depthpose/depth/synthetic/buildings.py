@@ -105,7 +105,8 @@ class _Wall(NamedTuple):
 
 def _add_windows(b: MeshBuilder, wall: _Wall, style: Style, length: Number, height: Number) -> None:
     """Cut a wall by lines across and up; the odd cells both ways are windows, the others wall."""
-    rng, (width, tall) = b.rng, style.window_m
+    rng = b.rng
+    width, tall = style.window_m
     count = max(1, int(length // (width + style.gap_m)))
     storeys = max(1, int((height - 0.5) // style.storey_m))
     left = (np.arange(count) + 0.5) * (length / count) - width / 2
@@ -135,7 +136,8 @@ def _add_windows(b: MeshBuilder, wall: _Wall, style: Style, length: Number, heig
     b.quads(reveal, _SQUARE * [0.5, 0.1], Surface("plaster", style.wall.tint))
     if not style.with_details:
         return
-    (left, low), (right, high) = windows[:, 0].T, windows[:, 2].T
+    left, low = windows[:, 0].T
+    right, high = windows[:, 2].T
     middle = (left + right) / 2
     bar = 0.07
     frames = np.concatenate(

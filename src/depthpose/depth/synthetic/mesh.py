@@ -535,7 +535,8 @@ class MeshBuilder:
             np.array([surface.layer for surface in surfaces])[row],
             np.array(things)[row],
         )
-        self._parts, self._boxes = [*self._parts, boxes], []
+        self._parts = [*self._parts, boxes]
+        self._boxes = []
         return join(self._parts)
 
 

@@ -132,7 +132,9 @@ def tree(number: int, coarseness: int = 0) -> Mesh:
     Coarseness 0 is to be seen from near, 1 from some 30 m, 2 from far away.
     """
     b = MeshBuilder(np.random.default_rng((11, number)))
-    rng, kind, (leaves, length_m) = b.rng, number % 6, _TREE_LEAVES[coarseness]
+    rng = b.rng
+    kind = number % 6
+    leaves, length_m = _TREE_LEAVES[coarseness]
     if kind == 4:  # a conifer
         b.tube((0, 0.2, 0), (0, -9, 0), (0.22, 0.05), Surface("bark", _BARK, 1.0, 1), 8)
         for share in np.arange(9) / 9:
@@ -204,7 +206,8 @@ def add_wood_edge(
     Both ends are x and s [m].
     """
     rng = b.rng
-    (x0, s0), (x1, s1) = start, stop
+    x0, s0 = start
+    x1, s1 = stop
     count = max(3, int(np.hypot(x1 - x0, s1 - s0) / 1.5))
     share = np.linspace(0, 1, count)
     x = x0 + (x1 - x0) * share + rng.normal(0, 0.6, count)

@@ -193,7 +193,9 @@ class _Place:
     """
 
     def __init__(self, rng: np.random.Generator, near_m: float, half: tuple[float, float]) -> None:
-        self.rng, self.near_m, self.half = rng, near_m, half
+        self.rng = rng
+        self.near_m = near_m
+        self.half = half
         self.builder = MeshBuilder(rng)
         self.backdrop = 0
         self.far_m = near_m

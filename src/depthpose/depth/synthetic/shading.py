@@ -192,6 +192,7 @@ def shade(stage: Stage, hits: Hits, focal_px: float) -> Vectors:
 
 
 def _shade(stage: Stage, hits: Hits, focal_px: float) -> Vectors:
+    """Give the linear colour of each point that a ray hits, with light, glare and haze."""
     rows = stage.attributes.index_select(0, hits.primitive)
     material, layer = (n.index_select(0, hits.primitive) for n in (stage.material, stage.layer))
     # The triangle's own normal, and a smooth one; both look to the camera.
@@ -205,22 +206,27 @@ def _shade(stage: Stage, hits: Hits, focal_px: float) -> Vectors:
     )
     normal = normal / _dot(normal, normal).sqrt()[:, None]
     normal = torch.where((_dot(normal, plane) < 0)[:, None], -normal, normal)
+
     footprint_m = hits.distance_m / focal_px
     # A compromise between the footprint's width and its length, which grows when seen aslant.
     level = torch.log2(footprint_m * rows[:, 21] * facing.abs().clamp(min=0.03) ** -0.6 + 1e-9)
     albedo = surfaces.sample_texture(surfaces.textures(), layer, uv, level) * rows[:, 15:18]
+
     # Unevenness over metres hides that textures repeat.
     weather = stage.scene.weather
     points = hits.points
     u = points[:, 0] * 0.021 + points[:, 1] * 0.013 + weather.shift[0]
     stains = _looked_up(surfaces.textures().stains, u, points[:, 2] * 0.021 + weather.shift[1])
     albedo *= (1 + 0.07 * stains)[:, None]
+
     is_road = (material == NUMBER["road"]).nonzero()[:, 0]
     if len(is_road):
         place_m = uv[is_road] * 3.0
         width_m = footprint_m[is_road]
         length_m = width_m / facing[is_road].abs().clamp(min=0.02)
         albedo[is_road] = _paint_road(stage.scene, albedo[is_road], place_m, width_m, length_m)
+
+    # Light of the sun, where it is not in shadow; leaves let some through.
     slant = normal @ stage.to_sun
     through = _TRANSLUCENCY[material]
     faced = (plane @ stage.to_sun > 0).float()
@@ -230,6 +236,8 @@ def _shade(stage: Stage, hits: Hits, focal_px: float) -> Vectors:
         reached = (sun > 0).nonzero()[:, 0]
         lit[reached] = _sunlit_share(stage, points[reached], plane[reached])
     sun_color = torch.from_numpy(weather.sun_color).float()
+
+    # Light of the sky, as far as it is not hidden.
     upward = 0.5 + 0.5 * (normal @ stage.up)
     openness = _open_share(stage.sky_map, points + 0.05 * plane)
     sky = torch.from_numpy(0.5 * (weather.zenith + weather.horizon)).float()
@@ -239,9 +247,10 @@ def _shade(stage: Stage, hits: Hits, focal_px: float) -> Vectors:
     color = albedo * ((sun * lit)[:, None] * sun_color + ambient + bounced)
     color += albedo * (2 * _GLOW[material])[:, None]
     _add_mirrored(stage, hits.towards, normal, _SPECULAR[material], lit, color)
-    thick = 1 - torch.exp(-hits.distance_m / weather.haze_m)
+
+    haze_share = 1 - torch.exp(-hits.distance_m / weather.haze_m)
     haze = torch.from_numpy(weather.horizon).float() * 0.7
-    return torch.lerp(color, haze.expand_as(color), thick[:, None])
+    return torch.lerp(color, haze.expand_as(color), haze_share[:, None])
 
 
 def _dot(a: Vectors, b: Vectors) -> Numbers:

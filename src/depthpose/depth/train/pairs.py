@@ -57,7 +57,8 @@ class TrainingPairs:
         is_mixed: bool = False,
         baseline_m: float | None = None,
     ) -> None:
-        self.config, self.seed = config, seed
+        self.config = config
+        self.seed = seed
         if not config.folders and config.streets is None:
             raise InputError("there is nothing to train on: name a folder of pairs (--data PATH).")
         sources: list[list[_Place]] = []
@@ -158,11 +159,11 @@ class TrainingPairs:
                 assert depth_m is not None, "frames without truth were left out"
                 left_px = disparity_from_depth(depth_m, rig)
         else:
-            made = source[number]
-            views = made.input
-            rig = made.input.camera
+            sample = source[number]
+            views = sample.input
+            rig = sample.input.camera
             if kind is not None:
-                exact = (made.truth.disparity_px, made.truth.right_disparity_px)
+                exact = (sample.truth.disparity_px, sample.truth.right_disparity_px)
                 left_px, right_px = (px if px is None else px.nan_to_num(0.0) for px in exact)
         if left_px is None:
             left_px = torch.full_like(views.left[0], torch.nan)
@@ -197,8 +198,8 @@ def _usable(
     }
     alone = sum(frame.right is None for frame in dataset.frames)
     if alone and not is_mixed and there:
-        said = f"{name}: {alone} of {len(dataset)} images have no right view, and are left out"
-        warnings.warn(said, Notice, stacklevel=2)
+        message = f"{name}: {alone} of {len(dataset)} images have no right view, and are left out"
+        warnings.warn(message, Notice, stacklevel=2)
     kind: TruthKind | None = None
     if needs_truth:
         counts: Counter[TruthKind] = Counter(kind for kinds in there.values() for kind in kinds)

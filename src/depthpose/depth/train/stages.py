@@ -38,7 +38,8 @@ class StereoTask:
     def __init__(
         self, matcher: StereoNetwork, config: StereoTraining, held_out: TrainingPairs | None
     ) -> None:
-        self.config, self.held_out = config, held_out
+        self.config = config
+        self.held_out = held_out
         self.matcher = matcher
         self._with_fixed_norms: list[nn.Module] = []
         if config.with_frozen_stem and matcher.encoder is not None:
@@ -156,7 +157,8 @@ class ViewTask:
         config: ViewTraining,
         held_out: TrainingPairs | None,
     ) -> None:
-        self.config, self.held_out = config, held_out
+        self.config = config
+        self.held_out = held_out
         self.generator = generator.train()
         self.modules: dict[str, nn.Module] = {"generator": generator}
         adam = config.generator_adam
@@ -227,7 +229,8 @@ class FinetuneTask:
         config: FinetuneTraining,
         held_out: TrainingPairs | None,
     ) -> None:
-        self.config, self.held_out = config, held_out
+        self.config = config
+        self.held_out = held_out
         self.generator = generator.train()
         self.matcher = matcher.eval().requires_grad_(False)
         self.modules: dict[str, nn.Module] = {"generator": generator, "matcher": matcher}
@@ -281,7 +284,9 @@ class SelectionSamples:
     def __init__(
         self, sources: Sequence[TrainingPairs], more_share: float, config: DegradeConfig, seed: int
     ) -> None:
-        self.sources, self.config, self.seed = sources, config, seed
+        self.sources = sources
+        self.config = config
+        self.seed = seed
         self.more_share = more_share if len(sources) > 1 else 0.0
         self.truths = tuple(truth for source in sources for truth in source.truths)
 
@@ -314,7 +319,8 @@ class SelectTask:
         config: SelectTraining,
         held_out: TrainingPairs | None,
     ) -> None:
-        self.config, self.held_out = config, held_out
+        self.config = config
+        self.held_out = held_out
         self.generator = generator
         if config.with_frozen_stem:
             generator.encoder.freeze_early()
