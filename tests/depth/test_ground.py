@@ -54,6 +54,45 @@ def seen(**mount: float) -> StereoInput:
     return StereoInput(name="street", left=torch.zeros(3, 200, 400), right=None, camera=camera)
 
 
+def test_ground_that_is_not_quite_flat_is_ground_and_what_stands_on_it_is_less_sure() -> None:
+    """Of a road judged 7 % too far the camera's height says as much as of the plane beside it."""
+    depth_m = road(1.5, 0, 0)
+    bump = (slice(150, 160), slice(180, 220))
+    box = (slice(150, 160), slice(250, 290))
+    plane = (slice(150, 160), slice(100, 140))
+    depth_m[bump] *= 1.07
+    depth_m[box] *= 0.7
+    found = scale_by_mount(estimate(depth_m), seen(mount_height_m=2.0, tilt_deg=0.0))
+    assert found.depth_m is not None
+    factor = found.depth_m / depth_m
+    assert float(factor[plane].mean()) > 1.2
+    torch.testing.assert_close(factor[bump], factor[plane], rtol=0.005, atol=0)
+    assert float(factor[box].mean()) < 0.98 * float(factor[plane].mean())
+
+
+def test_where_the_map_is_tilted_up_too_far_the_camera_stands_higher_than_in_it() -> None:
+    """A map has the height of its training near by and the true one far off."""
+    heights_m: list[float] = []
+    for tilt_deg in (-2.0, 0.0, 2.0):
+        found = scale_by_mount(estimate(road(1.5, tilt_deg, 0)), seen(tilt_deg=0.0))
+        assert found.ground is not None
+        heights_m.append(found.ground.height_m)
+    assert heights_m == sorted(heights_m)
+    assert heights_m[2] / heights_m[0] == pytest.approx(math.exp(4 * 0.06), rel=0.05)
+
+
+def test_a_measured_distance_scales_the_height_and_its_deviation_alike() -> None:
+    judged = scale_by_mount(estimate(road(1.5, 0, 0)), seen())
+    assert judged.ground is not None
+    assert judged.depth_m is not None
+    twice_m = 2 * float(judged.depth_m[190, 200])
+    found = scale_by_distance(judged, "street", (200, 190, twice_m)).ground
+    assert found is not None
+    assert found.height_m == pytest.approx(2 * judged.ground.height_m, rel=0.02)
+    share = judged.ground.height_std_m / judged.ground.height_m
+    assert found.height_std_m == pytest.approx(share * found.height_m)
+
+
 @settings(max_examples=5, deadline=None)
 @given(st.floats(0.8, 3.5), st.floats(-8, 4), st.floats(-6, 6))
 def test_height_tilt_and_roll_of_a_plane_are_found(height: float, tilt: float, roll: float) -> None:

@@ -22,9 +22,16 @@ from depthpose.core.rigid import Rigid
 from depthpose.pose.config import RefusalConfig
 from depthpose.pose.mesh import make_model
 from depthpose.pose.metrics import add_m
-from depthpose.pose.search import explained_mask, is_cut_out, nothing_found
+from depthpose.pose.search import explained_mask, is_cut_out, nothing_found, which_object
 from depthpose.pose.surface import NEAR, prepare_surface
-from depthpose.pose.types import CloudInput, ObjectModel, ViewInput
+from depthpose.pose.types import (
+    Alternative,
+    CloudInput,
+    Evidence,
+    ObjectModel,
+    PoseEstimate,
+    ViewInput,
+)
 
 TRUTHS = [pose_at(-0.13, 0.7, seed=1), pose_at(0.12, 0.9, seed=2)]
 REFUSAL = RefusalConfig()
@@ -155,6 +162,27 @@ def test_which_object_a_cloud_shows_is_answered() -> None:
         assert found.certainty is not None
         assert named.certainty is not None
         assert found.certainty <= named.certainty
+
+
+def test_another_object_that_fits_too_lowers_the_probability_of_every_pose() -> None:
+    evidence = Evidence(
+        visible=20.0, supported=18.0, unobserved=1.0, seen_through=1.0, bulging=0.0, beside=0.0,
+        rms=0.6, noise_m=0.001,
+    )  # fmt: skip
+    copy = Alternative(
+        camera_from_model=TRUTHS[1], probability=0.4, difference="turned", is_copy=True
+    )
+    likely = PoseEstimate(
+        name="a", object="bracket", status="ok", camera_from_model=TRUTHS[0], certainty=0.9,
+        copy_certainty=0.5, alternatives=(copy,), evidence=evidence,
+    )  # fmt: skip
+    less = replace(evidence, supported=16.0, seen_through=3.0)
+    found = which_object([likely, replace(likely, object="bottle", evidence=less)])
+    assert found.certainty is not None
+    share = found.certainty / 0.9
+    assert 0.8 < share < 0.99
+    assert found.copy_certainty == pytest.approx(0.5 * share)
+    assert found.alternatives[0].probability == pytest.approx(0.4 * share)
 
 
 def test_a_cloud_of_none_of_several_objects_is_refused() -> None:

@@ -60,6 +60,14 @@ def test_a_known_first_pose_is_followed_without_the_network() -> None:
     assert found[0].covariance is not None
 
 
+def test_frames_that_agree_make_it_surer_little_by_little() -> None:
+    """The sensor and the object err alike in each: a second frame is no second opinion."""
+    poses = moving(3)
+    frames = [frame(p, k) for k, p in enumerate(poses)]
+    found = [e.certainty or 0.0 for e in oracle(poses).track(frames, CAMERA, first=poses[0])]
+    assert found[0] < 0.99 < found[1] < found[2] < 1
+
+
 def test_without_a_first_pose_it_is_found_and_then_followed() -> None:
     poses = moving(3)
     net = oracle(poses[:1])
