@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from depthpose import FakestereoNet
-from depthpose.core.devices import each_in_own_arithmetic, own_arithmetic
+from depthpose.core.devices import each_in_float32, force_float32
 from depthpose.core.errors import InputError
 from depthpose.depth.stereo import CallableMatcher
 
@@ -37,7 +37,7 @@ def _refuse_others() -> None:
 @pytest.mark.usefixtures("foreign_arithmetic")
 def test_default_dtype_and_autocast_are_ours_inside_and_the_callers_after() -> None:
     assert arithmetic()[0] == torch.float64
-    with pytest.raises(InputError), own_arithmetic():
+    with pytest.raises(InputError), force_float32():
         _refuse_others()
     assert torch.get_default_dtype() == torch.float64
     assert torch.is_autocast_enabled("cpu")
@@ -49,7 +49,7 @@ def test_a_generator_computes_in_ours_and_its_caller_does_not() -> None:
         yield arithmetic()
         yield arithmetic()
 
-    for one in each_in_own_arithmetic(made()):
+    for one in each_in_float32(made()):
         assert one == (torch.float32, torch.float32)
         assert torch.get_default_dtype() == torch.float64
 
@@ -73,14 +73,14 @@ def test_an_estimator_matches_in_its_own_arithmetic() -> None:
 def test_a_forked_process_waits_for_no_thread_of_its_parent() -> None:
     text = """
 import os, torch
-from depthpose.core.devices import own_arithmetic
+from depthpose.core.devices import force_float32
 torch.set_num_threads(2)
 a = torch.rand(600, 600)
-with own_arithmetic():
+with force_float32():
     a @ a, a.exp().sum()
 child = os.fork()
 if not child:
-    with own_arithmetic():
+    with force_float32():
         (a @ a).exp().sum()
     os._exit(torch.get_num_threads())
 assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == 1

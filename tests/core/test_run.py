@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from depthpose.core.devices import computes_bf16, own_device, usable_device
+from depthpose.core.devices import computes_bf16, device_of_process, usable_device
 from depthpose.core.errors import InputError
 from depthpose.core.files.images import refuse_among_inputs
 from depthpose.core.loop import LoopConfig, Run
@@ -152,12 +152,16 @@ def test_the_shard_is_read_from_the_launcher(monkeypatch: pytest.MonkeyPatch) ->
     for name in ("RANK", "WORLD_SIZE", "LOCAL_RANK"):
         monkeypatch.delenv(name, raising=False)
     assert find_rank() == ProcessRank(rank=0, world=1)
-    assert own_device("cuda") == "cuda"
+    assert device_of_process("cuda") == "cuda"
     monkeypatch.setenv("RANK", "2")
     monkeypatch.setenv("WORLD_SIZE", "4")
     monkeypatch.setenv("LOCAL_RANK", "1")
     assert find_rank() == ProcessRank(rank=2, world=4)
-    assert [own_device(name) for name in ("cuda", "cuda:3", "cpu")] == ["cuda:1", "cuda:3", "cpu"]
+    assert [device_of_process(name) for name in ("cuda", "cuda:3", "cpu")] == [
+        "cuda:1",
+        "cuda:3",
+        "cpu",
+    ]
 
 
 @pytest.mark.parametrize(("rank", "world"), [("4", "4"), ("-1", "2"), ("x", "2"), ("0", "")])

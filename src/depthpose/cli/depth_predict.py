@@ -20,7 +20,7 @@ from depthpose.core import run
 from depthpose.core.camera import Camera, FieldOfView, StereoRig, camera_of, read_camera, read_rig
 from depthpose.core.camera.pinhole import camera_keys
 from depthpose.core.checkpoint import file_sha256, find_weights, read_checkpoint
-from depthpose.core.devices import own_device, usable_device, usable_precision
+from depthpose.core.devices import device_of_process, usable_device, usable_precision
 from depthpose.core.draw import draw_depth
 from depthpose.core.engine import Files, Function, Inputs, Sample, Work
 from depthpose.core.errors import InputError
@@ -97,7 +97,7 @@ class MethodSource:
         if isinstance(self.weights, Weights):
             with self.weights.unpacked() as file:
                 return replace(self, weights=file).build()
-        device = own_device(self.config.device)
+        device = device_of_process(self.config.device)
         usable_device(device)  # refused before anything is read
         is_bf16 = usable_precision(self.config.precision, device) == "bf16"
         precision = "bf16" if is_bf16 else "fp32"  # what is computed in is what is recorded

@@ -200,7 +200,7 @@ class EstimateOptions:
     @property
     def config(self) -> EstimateConfig:
         """Settings of the estimator, on the device of this process."""
-        from depthpose.core.devices import own_device  # --help must not load torch
+        from depthpose.core.devices import device_of_process  # --help must not load torch
 
         if self.batch < 1:
             raise InputError(f"--batch {self.batch}: at least 1 input in one call of the network")
@@ -211,7 +211,7 @@ class EstimateOptions:
             min_certainty=self.min_certainty,
             object_deviation_m=self.object_deviation_mm / 1000,
             register_refused=self.register_refused,
-            device=own_device(self.device),
+            device=device_of_process(self.device),
         )
 
 

@@ -139,7 +139,7 @@ class Lines:
         print(", ".join(parts), flush=True)
 
 
-_LOOKED_AT = 20  # held-out pairs of a folder, by default
+_HELD_OUT = 20  # pairs of a folder that validate, by default
 
 
 def train_depth(
@@ -189,7 +189,7 @@ def train_depth(
     if held_out:
         # A generator is measured at the focal length of its own rig, whatever it is trained on.
         focal_px = settings.pairs.focal_px if stage == "stereo" else None
-        default_pairs = PairsConfig(focal_px=focal_px, truth=settings.pairs.truth, limit=_LOOKED_AT)
+        default_pairs = PairsConfig(focal_px=focal_px, truth=settings.pairs.truth, limit=_HELD_OUT)
         pairs = replace(settings.held_out or default_pairs, folders=held_out)
         settings = replace(settings, held_out=pairs)
     setting_names = {field.name for field in fields(settings)}
@@ -249,8 +249,8 @@ def calibrate(
     return 0
 
 
-_START = "parts"  # the weights that ship and may go with any licence
-_NOTHING = "nothing"  # the word for no weights
+_START = "parts"  # weights that ship, under a licence that allows any use
+_NO_START = "nothing"  # as --start: begin without weights
 
 
 def train_pose(
@@ -292,13 +292,15 @@ def train_pose(
     from depthpose.pose.train.config import own_part
 
     kind, run_stage = STAGES[what]
-    is_own = what == "pose" and cad and start != _NOTHING
-    default = own_part(start or _START) if is_own else None
+    is_fine_tuned = what == "pose" and cad and start != _NO_START
+    default = own_part(start or _START) if is_fine_tuned else None
     settings = training.read(config, kind, default=default, workers=workers)
     for path in cad:
         unit_of(path, unit)
     if start is not None:
-        settings = replace(settings, start=None if start == _NOTHING else start)
+        settings = replace(settings, start=None if start == _NO_START else start)
+
+    # The options replace what the config says of models ...
     if cad or unit or symmetries:
         if what == "segmentation":
             raise InputError(
@@ -311,6 +313,8 @@ def train_pose(
         if cad:  # they take the place of a data set's models
             models = replace(models, bop=None, objects=(), parts=())
         settings = replace(settings, models=models)
+
+    # ... and of the folders of a data set.
     if data is not None:
         changes = {}
         if (models := getattr(settings, "models", None)) is not None and models.bop is not None:

@@ -22,12 +22,13 @@ class PrecisionNotice(Notice):
 
 
 @contextmanager
-def own_arithmetic() -> Iterator[None]:
-    """Compute in float32 on the processor where nothing else is said, whatever the caller has set.
+def force_float32() -> Iterator[None]:
+    """Make float32 on the processor torch's default, without autocast, whatever the caller has set.
 
-    Around a caller's autocast, default dtype or default device, weights and inputs would be of two
-    kinds. In a process that was forked from one that has loaded this, one thread computes: OpenMP's
-    others did not come along, and would be waited for without end.
+    With a caller's autocast, default dtype or default device, weights and inputs would differ in
+    dtype or device. In a process that was forked after this module was imported, torch computes
+    with one thread: OpenMP's other threads do not exist there, and torch would wait for them
+    forever.
     """
     if os.getpid() != _PROCESS:
         torch.set_num_threads(1)
@@ -47,11 +48,11 @@ def own_arithmetic() -> Iterator[None]:
             torch.set_default_dtype(dtype)
 
 
-def each_in_own_arithmetic(made: Iterator[Made]) -> Iterator[Made]:
-    """Give what a generator makes, each in :func:`own_arithmetic`."""
+def each_in_float32(made: Iterator[Made]) -> Iterator[Made]:
+    """Give the items of a generator, each made inside :func:`force_float32`."""
     nothing = object()
     while True:
-        with own_arithmetic():
+        with force_float32():
             item = next(made, nothing)
         if item is nothing:
             return
@@ -61,26 +62,26 @@ def each_in_own_arithmetic(made: Iterator[Made]) -> Iterator[Made]:
 def each_in_threads(
     work: Callable[[Item], Made], items: Iterable[Item], threads: int
 ) -> Iterator[Made]:
-    """Do work for each item, in its order, without gradients.
+    """Do work for each item without gradients, and give the results in the order of the items.
 
-    No more is taken at a time than the threads work at; they share torch's processor cores.
+    Items are taken only as threads become free. The threads share torch's processor cores.
 
     Raises:
         InputError: fewer than one thread.
     """
     if threads < 1:
         raise InputError(f"threads is {threads}; take 1 or more, 2 where two cores are free")
-    quiet = torch.no_grad()(work)
+    without_gradients = torch.no_grad()(work)
     if threads == 1:
-        yield from map(quiet, items)
+        yield from map(without_gradients, items)
         return
     cores = torch.get_num_threads()
     waiting: deque[Future[Made]] = deque()
-    share = (max(1, cores // threads),)
-    with ThreadPoolExecutor(threads, initializer=torch.set_num_threads, initargs=share) as pool:
+    thread_cores = max(1, cores // threads)
+    with ThreadPoolExecutor(threads, "", torch.set_num_threads, (thread_cores,)) as pool:
         try:
             for item in items:
-                waiting.append(pool.submit(quiet, item))
+                waiting.append(pool.submit(without_gradients, item))
                 if len(waiting) == threads:
                     yield waiting.popleft().result()
             while waiting:
@@ -93,7 +94,7 @@ def each_in_threads(
 
 @contextmanager
 def refused_memory(name: str) -> Iterator[None]:
-    """Turn a full memory into an :class:`InputError`: smaller inputs of a folder may fit."""
+    """Turn an out-of-memory error into an :class:`InputError`: other inputs may be smaller."""
     try:
         yield
     except (MemoryError, RuntimeError) as error:
@@ -124,14 +125,14 @@ def usable_device(name: str | torch.device) -> torch.device:
     return device
 
 
-def own_device(device: str) -> str:
-    """Give each process of a machine a GPU of its own: ``cuda`` is ``cuda:LOCAL_RANK``."""
+def device_of_process(device: str) -> str:
+    """Give the device of this process: of ``cuda``, that which a launcher chose (LOCAL_RANK)."""
     local_rank = os.environ.get("LOCAL_RANK", "")
     return f"cuda:{local_rank}" if device == "cuda" and local_rank.isdecimal() else device
 
 
 def computes_bf16(device: str | torch.device) -> bool:
-    """Whether bfloat16 is computed in itself there.
+    """Whether a device has instructions for bfloat16.
 
     Any accelerator does; of processors those for which oneDNN has such kernels: with AVX-512 (BW,
     VL and DQ), AMX or AVX-NE-CONVERT, and ARM's with BF16. Elsewhere oneDNN refuses bfloat16, or

@@ -10,7 +10,7 @@ import torch
 from tqdm import tqdm
 
 from depthpose.core.camera import AnyCamera, choose_lens
-from depthpose.core.devices import each_in_own_arithmetic, each_in_threads, own_arithmetic
+from depthpose.core.devices import each_in_float32, each_in_threads, force_float32
 from depthpose.core.errors import InputError, full_memory, nearest_name
 from depthpose.core.files import Picture
 from depthpose.core.rigid import Rigid
@@ -68,7 +68,7 @@ class PoseEstimator:
         self._objects: dict[str, PreparedObject] = {}  # those that were asked for
 
     @torch.no_grad()
-    @own_arithmetic()
+    @force_float32()
     def estimate_many(
         self, inputs: Iterable[AnyInput], *, threads: int = 1, with_progress: bool = False
     ) -> list[PoseEstimate]:
@@ -103,7 +103,7 @@ class PoseEstimator:
         raise NotImplementedError
 
     @torch.no_grad()
-    @own_arithmetic()
+    @force_float32()
     def _answers(self, inputs: Sequence[AnyInput], *, is_likely: bool) -> list[PoseEstimate]:
         """Estimate inputs; raise the :class:`InputError` of one that could not be taken."""
         answers: list[PoseEstimate] = []
@@ -131,7 +131,7 @@ class PoseEstimator:
         """Estimate clouds by the poses that were proposed for each."""
         raise NotImplementedError
 
-    @own_arithmetic()
+    @force_float32()
     def estimate(  # noqa: PLR0913  every form of input
         self,
         *,
@@ -193,7 +193,7 @@ class PoseEstimator:
         estimates = self._answers(tried, is_likely=False)
         return with_status(which_object(estimates), self.config.min_certainty)
 
-    @own_arithmetic()
+    @force_float32()
     def estimate_instances(
         self,
         *,
@@ -230,7 +230,7 @@ class PoseEstimator:
         views = [replace(view, mask=m, name=f"{_NAME}_{k}") for k, m in enumerate(pieces)]
         return self.estimate_many(views)
 
-    @own_arithmetic()
+    @force_float32()
     def find(
         self,
         depth: AnyArray,
@@ -263,7 +263,7 @@ class PoseEstimator:
         return [estimate for estimate in self.find_in(view, names) if estimate.is_posed]
 
     @torch.no_grad()
-    @own_arithmetic()
+    @force_float32()
     def find_in(
         self, view: ViewInput, objects: Sequence[str], *, is_sure: bool = False
     ) -> list[PoseEstimate]:
@@ -362,7 +362,7 @@ class PoseEstimator:
             config=self.config,
             look=look,
         )
-        return each_in_own_arithmetic(track(frames, target, first))
+        return each_in_float32(track(frames, target, first))
 
     def _known(self, name: str | None) -> PreparedObject:
         """Give an object by its name, with its surface; None where one alone is known."""

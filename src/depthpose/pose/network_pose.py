@@ -20,7 +20,7 @@ from torch.nn.functional import normalize
 from depthpose.core.checkpoint import find_weights, warn_of_terms
 from depthpose.core.devices import (
     each_in_threads,
-    own_arithmetic,
+    force_float32,
     refused_memory,
     usable_device,
 )
@@ -131,7 +131,7 @@ class GeoPoseNet(PoseEstimator):
             self._by_models()  # models without a surface are refused at once
 
     @classmethod
-    @own_arithmetic()
+    @force_float32()
     def load(
         cls, weights: str | Path = "parts", config: EstimateConfig | None = None
     ) -> "GeoPoseNet":
@@ -184,7 +184,7 @@ class GeoPoseNet(PoseEstimator):
         return self._by_models()._estimate_near(inputs, proposals, prior_odds)
 
     @torch.no_grad()
-    @own_arithmetic()
+    @force_float32()
     def estimate_with_votes(self, given: AnyInput) -> tuple[PoseEstimate, CloudDirections | None]:
         """Estimate one pose, and give what the network said of each keypoint at each point.
 

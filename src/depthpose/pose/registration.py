@@ -11,7 +11,7 @@ from dataclasses import replace
 import torch
 
 from depthpose.core.arrays import take_evenly
-from depthpose.core.devices import each_in_threads, own_arithmetic
+from depthpose.core.devices import each_in_threads, force_float32
 from depthpose.core.errors import InputError
 from depthpose.core.rigid import Rigid
 from depthpose.core.units import Unit
@@ -100,7 +100,7 @@ class Registration(PoseEstimator):
             )
 
     @classmethod
-    @own_arithmetic()
+    @force_float32()
     def load(
         cls,
         *cad: AnyModel,

@@ -40,7 +40,7 @@ from depthpose.core.run import claim_folder, find_rank, held_folders, release_fo
 SECOND_CTRL_C_S = 3.0  # between the first Ctrl-C, which stops, and the second, which finishes
 
 _TYPES = {"fp32": None, "bf16": torch.bfloat16, "fp16": torch.float16}
-_FREE = ("workers", "device", "save_every_steps", "validate_every_steps", "log_every_steps")
+_NOT_DECISIVE = ("workers", "device", "save_every_steps", "validate_every_steps", "log_every_steps")
 """Settings of the loop that change no weight: a resumed run may have others."""
 
 _Config = TypeVar("_Config")
@@ -88,7 +88,7 @@ class Run:
             InputError: the folder is another config's.
         """
         settings = {"stage": type(config).__name__, **config_to_dict(config), **(more or {})}
-        decisive = {k: v for k, v in settings["loop"].items() if k not in _FREE}
+        decisive = {k: v for k, v in settings["loop"].items() if k not in _NOT_DECISIVE}
         settings["loop"] = decisive | {"processes": find_rank().world}
         compared = {k: v for k, v in settings.items() if k not in without}
         ends = ("safetensors", "md", "json")
@@ -214,21 +214,27 @@ class _Training:
     def take_steps(
         self, on_step: Callable[[Progress], None] | None, requests: Sequence[tuple[int, float]]
     ) -> float:
-        """Take the remaining steps, or up to the current one; give the whole training's seconds.
+        """Take the remaining steps; give the seconds of the whole training.
 
-        ``asked``: by which signals it has been asked to stop, and when.
+        ``requests``: signals that ask it to stop, by number and time; the list grows meanwhile.
+
+        Raises:
+            Interrupted: it was asked to stop, and its state is saved.
         """
         batches = self._batches()
         while self.step < self.steps:
             self._take_step([next(batches) for _ in range(self.config.accumulate)])
             self.step += 1
+
+            # One Ctrl-C stops; a second one within seconds makes this step the last.
             stop = self._any_process(bool(requests))
             presses = [at for number, at in requests if number == signal.SIGINT]
             while len(presses) == 1 and time.monotonic() - presses[0] < SECOND_CTRL_C_S:
                 time.sleep(0.05)
                 presses = [at for number, at in requests if number == signal.SIGINT]
-            if stop and self._any_process(len(presses) > 1):  # the steps so far are all
+            if stop and self._any_process(len(presses) > 1):
                 self.steps = self.step
+
             numbers: dict[str, float] = {}
             is_last = self.step == self.steps
             if is_last or self.step % self.config.log_every_steps == 0:
@@ -237,15 +243,7 @@ class _Training:
                 self.logger.log(self.step, numbers)
             if is_last or self.step % self.config.validate_every_steps == 0:
                 if self.accelerator.is_main_process:
-                    average = self.parts.average
-                    state = {
-                        name: {key: tensor.clone() for key, tensor in m.state_dict().items()}
-                        for name, m in self.task.modules.items()
-                        if average
-                    }
-                    self._load(average)
-                    self.logger.show(self.step, self.task.validate())
-                    self._load(state)
+                    self._validate()
                 self.accelerator.wait_for_everyone()
             if stop or is_last or self.step % self.config.save_every_steps == 0:
                 seconds = time.monotonic() - self.began
@@ -260,9 +258,21 @@ class _Training:
                     "--finish makes weights of it"
                 )
         self.accelerator.wait_for_everyone()  # none leaves while another still needs it
-        self._load(self.parts.average)  # what is exported
+        self._load_weights(self.parts.average)  # what is exported
         self.logger.close()
         return time.monotonic() - self.began
+
+    def _validate(self) -> None:
+        """Validate with the averaged weights, if there are any, and log the result."""
+        average = self.parts.average
+        trained = {
+            name: {key: tensor.clone() for key, tensor in m.state_dict().items()}
+            for name, m in self.task.modules.items()
+            if average
+        }
+        self._load_weights(average)
+        self.logger.show(self.step, self.task.validate())
+        self._load_weights(trained)
 
     def _batches(self) -> Iterator[Any]:
         """Load this process's micro-batches, from the first that is still to do."""
@@ -285,7 +295,10 @@ class _Training:
         return (send_to_device(batch, self.accelerator.device) for batch in loader)
 
     def _take_step(self, micro_batches: list[Any]) -> None:
-        """Run the first update of all micro-batches, then the second, and so on."""
+        """Take one step: the first optimiser's update for all micro-batches, then the second's.
+
+        A task yields one loss for each of its optimisers (``Task.step``).
+        """
         iterators = [iter(self.task.step(batch)) for batch in micro_batches]
         for number in count():
             owner = None
@@ -317,10 +330,13 @@ class _Training:
                 owner = owner or name
             if owner is None:
                 break
-            self._move(owner)
-        if self.config.ema_decay is None:
-            return
-        decay = min(self.config.ema_decay, (1 + self.step) / (10 + self.step))
+            self._step_optimizer(owner)
+        if self.config.ema_decay is not None:
+            self._update_average(self.config.ema_decay)
+
+    def _update_average(self, ema_decay: float) -> None:
+        """Move the average of the weights towards them; at first faster, as it begins at random."""
+        decay = min(ema_decay, (1 + self.step) / (10 + self.step))
         with torch.no_grad():
             for name, module in self.task.modules.items():
                 for key, tensor in module.state_dict().items():
@@ -330,7 +346,7 @@ class _Training:
                     else:
                         average.copy_(tensor)
 
-    def _move(self, name: str) -> None:
+    def _step_optimizer(self, name: str) -> None:
         """Average the gradients over processes and step the optimiser."""
         optimizer, adam = self.task.optimizers[name]
         for group in optimizer.param_groups:
@@ -351,7 +367,7 @@ class _Training:
         scaler.update()
         optimizer.zero_grad()
 
-    def _load(self, states: Mapping[str, dict[str, Tensor]]) -> None:
+    def _load_weights(self, states: Mapping[str, dict[str, Tensor]]) -> None:
         for name, state in states.items():
             self.task.modules[name].load_state_dict(state)
 

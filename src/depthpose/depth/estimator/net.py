@@ -27,7 +27,7 @@ from depthpose.core.camera import (
     find_two_views,
 )
 from depthpose.core.checkpoint import find_weights, join_terms, warn_of_terms
-from depthpose.core.devices import each_in_threads, own_arithmetic, refused_memory
+from depthpose.core.devices import each_in_threads, force_float32, refused_memory
 from depthpose.core.errors import InputError, Notice
 from depthpose.core.files import Picture as Picture
 from depthpose.core.files import as_tensor, read_exif_focal
@@ -171,7 +171,7 @@ class FakestereoNet:
         return f"FakestereoNet({', '.join(parts_shown + sorted(devices))})"
 
     @classmethod
-    @own_arithmetic()
+    @force_float32()
     def load(
         cls,
         weights: str | Path | None = None,
@@ -256,7 +256,7 @@ class FakestereoNet:
     from_pretrained = load
     """The same as :meth:`load`."""
 
-    @own_arithmetic()
+    @force_float32()
     def estimate(
         self,
         image: Picture,
@@ -308,7 +308,7 @@ class FakestereoNet:
         return depth if known_distance is None else scale_by_distance(depth, chosen, known_distance)
 
     @torch.no_grad()
-    @own_arithmetic()
+    @force_float32()
     def estimate_pair(
         self, pair: StereoInput, *, with_check: bool = True, mount: MountFilter | None = None
     ) -> DepthEstimate:
@@ -366,7 +366,7 @@ class FakestereoNet:
             match = moved_back(match, first_px)
             return disparity.from_pair(pair, match, warning)
 
-    @own_arithmetic()
+    @force_float32()
     def estimate_many(
         self,
         images: Iterable[StereoInput] | Iterable[Picture] | Picture,
@@ -420,7 +420,7 @@ class FakestereoNet:
                 bar.update(len(of_batch))
         return estimates
 
-    @own_arithmetic()
+    @force_float32()
     def estimate_together(
         self,
         named: Sequence[tuple[str, object]],

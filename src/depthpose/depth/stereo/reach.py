@@ -62,8 +62,8 @@ def _window(search: Search) -> Window:
 def move_views(left: Tensor, right: Tensor, first_px: int) -> tuple[Tensor, Tensor]:
     """Move the views of a pair so that a disparity of ``first_px`` becomes 0.
 
-    Where that is negative, both become wider by so many columns, so that nothing is cut off that
-    both show. New columns repeat the border.
+    If ``first_px`` is negative, both views become wider by that many columns, so that no part that
+    both show is cut off. New columns repeat the border.
 
     Args:
         left: ``(3, H, W)``.
@@ -78,7 +78,7 @@ def move_views(left: Tensor, right: Tensor, first_px: int) -> tuple[Tensor, Tens
 
 
 def moved_back(match: Match, first_px: int) -> Match:
-    """Give the match of a pair as it was before :func:`move_views`."""
+    """Give the match of moved views in the pixels of the views before :func:`move_views`."""
     if first_px == 0:
         return match
     added = max(-first_px, 0)
@@ -113,30 +113,36 @@ def measure_reach(
     views = (left, right)
     mirrored = (right.flip(-1), left.flip(-1))
     coarse, other = matcher.match_many([views, mirrored], search=search)
-    # How far a pair reaches is told where both views agree: not at hidden places and the left
-    # border. How near, where the right view can show it: near things are in one view alone often.
+
+    # The farthest point is measured where both views agree, which excludes hidden places and the
+    # left border. The nearest is measured wherever the right view can show it: near things are
+    # often in one view alone, so there the views need not agree.
     right_px = other.disparity_px.flip(-1)[None]
     there_px = warp_right_to_left(right_px, coarse.disparity_px)[0]
     agrees = (coarse.disparity_px - there_px).abs() <= step_px
-    # Borders without a picture match each other at any disparity, and tell nothing.
+    # Borders without a picture match each other at any disparity.
     left_blank, right_blank = (without_picture(view).to(agrees.device) for view in (left, right))
-    meets = warp_right_to_left(right_blank.to(right_px)[None], coarse.disparity_px)[0]
-    is_picture = ~left_blank & ~(meets > 0)
+    matched_blank = warp_right_to_left(right_blank.to(right_px)[None], coarse.disparity_px)[0]
+    is_picture = ~left_blank & ~(matched_blank > 0)
     if coarse.confidence is not None:
         coarse = replace(coarse, confidence=coarse.confidence.where(is_picture, 0.0))
-    # Every pixel of the copy, of the maps at the size of the images.
+
+    # The maps have the size of the images: one sample for each pixel of the narrow copy.
     stride = max(1, round(1 / scale))
-    each = (slice(None, None, stride), slice(None, None, stride))
-    found_px = coarse.disparity_px[each]
-    is_far = agrees[each] & is_picture[each]
-    is_near = found_px <= torch.arange(width, device=found_px.device)[::stride]
-    is_near &= is_picture[each]
+    samples = (slice(None, None, stride), slice(None, None, stride))
+    sampled_px = coarse.disparity_px[samples]
+    counts_as_far = agrees[samples] & is_picture[samples]
+    counts_as_near = sampled_px <= torch.arange(width, device=sampled_px.device)[::stride]
+    counts_as_near &= is_picture[samples]
     if coarse.confidence is not None:
-        is_near &= coarse.confidence[each] >= _SURE
-    tail = int(_TAIL * found_px.numel())
-    far_px, near_px = (found_px[which].sort().values for which in (is_far, is_near))
-    if min(len(far_px), len(near_px)) <= tail:  # nothing is known: all that was found counts
-        far_px = near_px = found_px.flatten().sort().values
+        counts_as_near &= coarse.confidence[samples] >= _SURE
+
+    # The range, without the outermost samples, which may be wrong matches.
+    tail = int(_TAIL * sampled_px.numel())
+    far_px = sampled_px[counts_as_far].sort().values
+    near_px = sampled_px[counts_as_near].sort().values
+    if min(len(far_px), len(near_px)) <= tail:  # too few are left: all samples count
+        far_px = near_px = sampled_px.flatten().sort().values
     low_px = float(far_px[tail]) - step_px
     high_px = float(near_px[-1 - tail]) + step_px
     return Reach(
@@ -151,9 +157,9 @@ def measure_reach(
 def choose_window(
     matcher: NetworkMatcher, reach: Reach, size: Sequence[int], camera: Camera | None
 ) -> Window:
-    """Choose what is searched, so that it holds the disparities that were measured.
+    """Choose the disparities that are searched, so that those that were measured are among them.
 
-    There are no fewer than those that the network was trained with.
+    They are at least as many as the network was trained with.
 
     Args:
         matcher: a network.
@@ -161,14 +167,15 @@ def choose_window(
         size: rows and columns of the images.
         camera: of the left image, where it is known.
     """
-    scale, most = _usual_size(matcher, size, camera)
+    scale, usual_span_px = _usual_size(matcher, size, camera)
     high_px = reach.high_px
     if matcher.config.max_disparity_px is not None:
         high_px = matcher.config.max_disparity_px
-    # The volume has scale^2 H W pixels and scale span disparities.
+    # The volume has scale^2 H W pixels and scale span disparities: a wider span is searched at a
+    # smaller scale, in the same memory.
     span_px = max(high_px - reach.low_px, reach.step_px)
-    if span_px * scale > most:
-        scale = (most * scale**2 / span_px) ** (1 / 3)
+    if span_px * scale > usual_span_px:
+        scale = (usual_span_px * scale**2 / span_px) ** (1 / 3)
     first_px = STEP_PX * math.floor(reach.low_px * scale / STEP_PX)
     trained_px = matcher.network_config.max_disparity_px
     searched = max(trained_px, matcher.whole_steps(high_px * scale - first_px))
@@ -178,9 +185,9 @@ def choose_window(
 def _usual_size(
     matcher: NetworkMatcher, size: Sequence[int], camera: Camera | None
 ) -> tuple[float, int]:
-    """Give the usual size of a match, in times the images', and its disparities.
+    """Give the usual scale of a match beside the images, and how many disparities it searches.
 
-    Without a camera a fine match has as many pixels as with one.
+    Without a camera, a fine match has a fixed number of pixels.
     """
     trained = matcher.network_config
     if camera is not None and trained.work_focal_px is not None:
@@ -188,16 +195,16 @@ def _usual_size(
         return scale, matcher.work_disparities(camera)
     if matcher.config.speed == "quick" or trained.work_focal_px is None:
         return 1.0, trained.max_disparity_px
-    share = math.sqrt(matcher.fine_pixels / (size[0] * size[1]))
-    most = matcher.whole_steps(trained.max_disparity_px * matcher.most_disparities)
-    return min(share, matcher.most_enlarged), most
+    scale = math.sqrt(matcher.fine_pixels / (size[0] * size[1]))
+    span_px = matcher.whole_steps(trained.max_disparity_px * matcher.most_disparities)
+    return min(scale, matcher.most_enlarged), span_px
 
 
 def doubt_hidden(match: Match, reach: Reach) -> Match:
-    """Lower the confidence where the right view of the copy contradicts: mostly hidden places.
+    """Lower the confidence where the narrow copy's right view disagrees: mostly hidden places.
 
-    A difference of up to a pixel of the copy says nothing. A check at full size finds what is
-    smaller too, in twice the time.
+    A difference of up to a pixel of the copy is within its error. A check at full size would find
+    smaller differences too, in twice the time.
     """
     if match.confidence is None:
         return match
@@ -206,16 +213,20 @@ def doubt_hidden(match: Match, reach: Reach) -> Match:
 
 
 def doubt_outside(match: Match, reach: Reach, window: Window) -> tuple[Match, str]:
-    """Set the confidence to 0 where the true disparity may lie beyond what was searched; say it.
+    """Set the confidence to 0 where the true disparity may lie beyond what was searched.
 
-    That is where the copy has a disparity beyond, and where the answer is the last that the search
-    has. Named is the share where the copy is sure, of what the right view can show.
+    That is where the narrow copy has a larger disparity than was searched, and where the match is
+    the last disparity of the search.
+
+    Returns:
+        The match; and a warning with the share of pixels beyond the search, counted where the copy
+        is sure and the right view can show them; "" where the share is small.
     """
     if match.confidence is None:
         return match, ""
     coarse_px = reach.coarse.disparity_px
     coarse_confidence = reach.coarse.confidence
-    # Beside what is beyond, two pixels of the copy or its error away, it may be beyond too.
+    # Within two pixels of the copy, its error, neighbours may be beyond too.
     is_beyond = coarse_px > window.last_px - reach.step_px
     if bool(is_beyond.any()):
         radius = round(2 * reach.step_px / STEP_PX)
