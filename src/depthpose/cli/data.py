@@ -195,8 +195,8 @@ def make_objects(
     }
     wanted = {k: scene for k, scene in scenes.items() if not _is_made(out, split, k, scene)}
     for k, scene in wanted.items():
-        made = make_frames(models, config, len(scene), scene.start)
-        shown = tqdm(made, total=len(scene), unit=" frames", leave=False, disable=None)
+        frames = make_frames(models, config, len(scene), scene.start)
+        shown = tqdm(frames, total=len(scene), unit=" frames", leave=False, disable=None)
         home = write_bop_scene(out, split, k, list(shown))
         files = sorted(path for path in home.rglob("*") if path.is_file())
         note_result(out, home.relative_to(out).as_posix(), files)

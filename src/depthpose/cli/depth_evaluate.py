@@ -119,16 +119,16 @@ def choose_methods(options: MethodOptions, config: MatcherConfig, dataset: Datas
 
 def named_method(word: str, config: MatcherConfig) -> Method:
     """Build the method of a name: weights by file or name, perhaps with ``both:`` and the like."""
-    how, _, name = word.rpartition(":")
-    source = MethodSource(weights=name, config=config, with_right=how not in get_args(Answer))
-    if how in get_args(Answer):  # what depth of one image comes from
-        return replace(source, answer=cast("Answer", how)).build()
-    if how == "both":
+    prefix, _, name = word.rpartition(":")
+    source = MethodSource(weights=name, config=config, with_right=prefix not in get_args(Answer))
+    if prefix in get_args(Answer):  # what depth of one image comes from
+        return replace(source, answer=cast("Answer", prefix)).build()
+    if prefix == "both":
         return source.build()
-    if how in get_args(Speed):  # how much time the match of a real pair may take
-        method = replace(source, config=replace(config, speed=how)).build()
-        return method._replace(name=f"{method.name}-{how}")
-    if how == "sgbm":
+    if prefix in get_args(Speed):  # how much time the match of a real pair may take
+        method = replace(source, config=replace(config, speed=prefix)).build()
+        return method._replace(name=f"{method.name}-{prefix}")
+    if prefix == "sgbm":
         return replace(source, with_right=False, matcher="sgbm").build()
     return MethodSource(weights=word, config=config).build()
 

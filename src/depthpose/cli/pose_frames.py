@@ -308,18 +308,20 @@ def _finish(
     left = list(earlier_predictions(out).values())
     predictions: list[Prediction] = []
     try:
-        for one in coming:
-            predictions.append(one)  # noqa: PERF402  those before an interruption must be there
+        for prediction in coming:
+            predictions.append(prediction)  # noqa: PERF402  those before an interruption must be there
         left = []
     finally:
-        names = {one.estimate.name for one in predictions}
+        names = {prediction.estimate.name for prediction in predictions}
         if predictions:
             others = [p for p in left if p.estimate.name not in names]
             write_predictions(out, [*predictions, *others])
     pairs = zip(predictions, jobs, strict=True)
     explained = [
-        replace(job, name=one.estimate.name, read=partial(_explained, job, one, method))
-        for one, job in pairs
+        replace(
+            job, name=prediction.estimate.name, read=partial(_explained, job, prediction, method)
+        )
+        for prediction, job in pairs
     ]
     pose_predict.write_files(predictions, explained, out, method, dataset)
     code = pose_predict.say_result(predictions, out)

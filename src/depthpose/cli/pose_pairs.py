@@ -43,13 +43,13 @@ def match_pairs(pair: PairOptions, camera: Path | None, device: str, out: Path) 
     pairs = work.list_pairs(pair.left, pair.right)
     refuse_among_inputs(out, (pair.left, pair.right), [path for both in pairs for path in both])
     networks = PairNetworks(matcher=pair.matcher)
-    used = None if pair.matcher == "sgbm" else pair.matcher or "default"
+    weights = None if pair.matcher == "sgbm" else pair.matcher or "default"
     method = work.MethodSource(
-        weights=used, config=MatcherConfig(device=device), with_right=True, use="pairs"
+        weights=weights, config=MatcherConfig(device=device), with_right=True, use="pairs"
     )
-    this = work.pair_work(camera, networks, method, pairs[0])
+    depth_work = work.pair_work(camera, networks, method, pairs[0])
     built = method.build()
-    work.estimate_all(pairs, this, built, out / MATCHED)
+    work.estimate_all(pairs, depth_work, built, out / MATCHED)
     rig = read_rig(camera, image_size(pairs[0][0]))
     for first, _ in pairs:
         _keep_sure(first.stem, rig, pair.min_confidence, out)

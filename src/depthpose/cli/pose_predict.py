@@ -752,8 +752,11 @@ def _write_page(
     estimates = [prediction.estimate for prediction in predictions]
     numbers = Counter(estimate.status for estimate in estimates)
     counts = ", ".join(f"{count} {status}" for status, count in sorted(numbers.items()))
-    rows = [_row(one) for one in sorted(estimates, key=lambda one: one.is_posed)[:_MOST_ROWS]]
-    readable = [k for k, one in enumerate(estimates) if one.status != "unreadable"]
+    rows = [
+        _row(listed)
+        for listed in sorted(estimates, key=lambda listed: listed.is_posed)[:_MOST_ROWS]
+    ]
+    readable = [k for k, listed in enumerate(estimates) if listed.status != "unreadable"]
     sections: list[Section] = []
     for k in choose_answers([predictions[k].estimate.is_posed for k in readable]):
         estimate = predictions[readable[k]].estimate

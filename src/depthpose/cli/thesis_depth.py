@@ -62,7 +62,7 @@ def reproduce_table(
     own_rows = [own_row for own_row, _ in methods for _ in caps_m]
     rows = join_published(table, list(zip(own_rows, measured.rows, strict=True)))
     page.write_table(out, rows)
-    how = (
+    method_note = (
         f"Ours: {protocol}: {rule.summary}. The printed rows are of the 697 frames of "
         "eigen-test. Difference: ours minus the thesis's own row. A row of another protocol, or of "
         "other frames (see the columns), does not compare with the printed ones."
@@ -85,7 +85,7 @@ def reproduce_table(
                 title = f"Figure {figure}: {method.name}, {pair.name}"
                 sections.append(_panel_section(title, panels, home / f"{figure}_{pair.name}"))
     sections = [
-        Section(title="Published rows, ours, and difference", text=how, rows=rows),
+        Section(title="Published rows, ours, and difference", text=method_note, rows=rows),
         *sections,
         *evaluation.write_details(measured, out),
         Section(

@@ -99,22 +99,22 @@ def open_views(net: GeoPoseNet, data: PoseDataOptions, number: int | None, synth
 def reproduce_by_object(
     number: str,
     data: PoseDataOptions,
-    how: PoseTableOptions,
+    options: PoseTableOptions,
     weights: Sequence[str],
     csv: Sequence[Path],
     out: Path,
 ) -> int:
     """Make table 3.1 or 3.2: predict what is missing, measure, join with published rows, write."""
-    refuse_below(0, "--pictures", how.pictures, "4")
+    refuse_below(0, "--pictures", options.pictures, "4")
     if data.folder is None:
         raise InputError(f"table {number}: give --linemod FOLDER, or --bop FOLDER.")
-    dataset = pose_evaluate.open_instances(data.folder, data.split, data.objects, how.targets)
+    dataset = pose_evaluate.open_instances(data.folder, data.split, data.objects, options.targets)
     models = tuple(dataset.objects.values())
     is_printed = number == "3.2"
     numbers = {model.name: pose_tables.linemod_number(model) if is_printed else model.number
                for model in models}  # fmt: skip
-    methods = pose_methods.pose_methods(weights, how.estimate, models)
-    rule = EvaluationConfig(diameters=how.diameters, with_vsd=how.vsd)
+    methods = pose_methods.pose_methods(weights, options.estimate, models)
+    rule = EvaluationConfig(diameters=options.diameters, with_vsd=options.vsd)
     settings = {
         "table": number,
         "data": str(dataset.folder.resolve()),
@@ -126,13 +126,13 @@ def reproduce_by_object(
             kind
             if (path := pose_methods.mask_path(kind)) is None
             else pose_methods.named_file(path)
-            for kind in (how.masks if methods else ())
+            for kind in (options.masks if methods else ())
         ],
         "csv": [pose_methods.named_file(path) for path in csv],
     }
     results = (*page.table_files("rows", "all", "instances", "risk"), "report.md", "report.html")
     claim_folder(out, settings, (*results, "predictions", "detections", "figures"))
-    shown = pose_methods.find_masks(how.masks, dataset, out, how.device) if methods else []
+    shown = pose_methods.find_masks(options.masks, dataset, out, options.device) if methods else []
     folders = [pose_methods.predict_all(dataset, m, masks, out) for m in methods for masks in shown]
     measured = pose_evaluate.join(pose_evaluate.measure_each(dataset, [*folders, *csv], rule))
     rows = pose_tables.join_by_object(measured.rows, numbers, with_published=is_printed)
@@ -144,7 +144,7 @@ def reproduce_by_object(
         estimates = {p.estimate.name: p.estimate for p in read_predictions(folder)}
         pictures: list[Picture] = []
         for instance in (
-            dataset.instances[i] for i in page.spread_evenly(len(dataset), how.pictures)
+            dataset.instances[i] for i in page.spread_evenly(len(dataset), options.pictures)
         ):
             estimate = estimates.get(instance.name)
             if estimate is None:  # of a detection: it bears no instance's name

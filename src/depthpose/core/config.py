@@ -36,7 +36,7 @@ class Settings:
     """
 
     def __post_init__(self) -> None:
-        for name, (words, interval, more) in _rules_of(type(self)).items():
+        for name, (words, interval, notes) in _rules_of(type(self)).items():
             value = getattr(self, name)
             default = getattr(type(self), name, None)
             several = value if isinstance(value, tuple) else (value,)
@@ -52,11 +52,11 @@ class Settings:
                         raise InputError(
                             f"{name} must be in {interval}, got {value!r:.{_LONGEST}}{remedy}"
                         )
-            if ASCENDING in more and value is not None and value[0] > value[1]:
+            if ASCENDING in notes and value is not None and value[0] > value[1]:
                 raise InputError(
                     f"{name} must be a range, the lower end first, got {value}; turn it"
                 )
-            steps = [step for step in more if step != ASCENDING]
+            steps = [step for step in notes if step != ASCENDING]
             if any(value % step for step in steps):
                 raise InputError(
                     f"{name} must be a multiple of {steps[0]}, got {value}; take {default}"
@@ -69,14 +69,14 @@ def _rules_of(kind: type) -> dict[str, tuple[tuple[Any, ...], str, tuple[Any, ..
     rules: dict[str, tuple[tuple[Any, ...], str, tuple[Any, ...]]] = {}
     for name, hint in get_type_hints(kind, include_extras=True).items():
         is_annotated = get_origin(hint) is Annotated
-        interval, *more = hint.__metadata__ if is_annotated else ("",)
+        interval, *notes = hint.__metadata__ if is_annotated else ("",)
         plain = get_args(hint)[0] if is_annotated else hint
         choices = (choice for choice in (plain, *get_args(plain)) if get_origin(choice) is Literal)
         words = get_args(next(choices, None))
         if not all(isinstance(word, str) for word in words):
             words = ()
-        if words or interval or more:
-            rules[name] = words, interval, tuple(more)
+        if words or interval or notes:
+            rules[name] = words, interval, tuple(notes)
     return rules
 
 

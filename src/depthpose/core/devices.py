@@ -48,12 +48,12 @@ def force_float32() -> Iterator[None]:
             torch.set_default_dtype(dtype)
 
 
-def each_in_float32(made: Iterator[Made]) -> Iterator[Made]:
+def each_in_float32(items: Iterator[Made]) -> Iterator[Made]:
     """Give the items of a generator, each made inside :func:`force_float32`."""
     nothing = object()
     while True:
         with force_float32():
-            item = next(made, nothing)
+            item = next(items, nothing)
         if item is nothing:
             return
         yield cast(Made, item)

@@ -233,9 +233,9 @@ def freeze(path: Path, export: Export) -> list[Row]:
             answers = session.run(list(case.expected), dict(case.inputs))
             for (name, expected), output_values in zip(case.expected.items(), answers, strict=True):
                 if name in case.where and output_values.shape == expected.shape:
-                    where = case.where[name]
-                    output_values = output_values[where]  # noqa: PLW2901
-                    expected = expected[where]  # noqa: PLW2901
+                    mask = case.where[name]
+                    output_values = output_values[mask]  # noqa: PLW2901
+                    expected = expected[mask]  # noqa: PLW2901
                 rows.append(_row(case.name, name, output_values, expected, export.limits[name]))
         if not rows:
             raise InputError(

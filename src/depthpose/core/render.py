@@ -137,11 +137,11 @@ def barycentric_shares(
     height, width = primitive.shape
     shares = torch.zeros(height * width, 3, device=edges.device)
     covered = (primitive.reshape(-1) >= 0).nonzero()[:, 0]
-    which = primitive.reshape(-1)[covered]
+    triangle = primitive.reshape(-1)[covered]
     u = (covered % width).double()[:, None]
     v = (covered // width).double()[:, None]
-    across, down, constant = edges.index_select(0, which).unbind(-1)
-    weight = torch.addcmul(constant, across, u).addcmul_(down, v).div_(volume[which, None])
+    across, down, constant = edges.index_select(0, triangle).unbind(-1)
+    weight = torch.addcmul(constant, across, u).addcmul_(down, v).div_(volume[triangle, None])
     weight = weight.clamp_(min=0)  # beyond the edge by a rounding, where a pixel lies on it
     shares[covered] = (weight / _most(torch.add, weight)[:, None]).float()
     return shares.reshape(height, width, 3)

@@ -166,8 +166,8 @@ def environment() -> dict[str, str]:
     )
     if torch.cuda.is_available():
         facts["gpu"] = torch.cuda.get_device_name()
-    here = str(Path(__file__).resolve().parent)
-    command = ["git", "-C", here, "describe", "--always", "--dirty", "--exclude", "*"]
+    package_folder = str(Path(__file__).resolve().parent)
+    command = ["git", "-C", package_folder, "describe", "--always", "--dirty", "--exclude", "*"]
     with suppress(OSError, subprocess.TimeoutExpired):
         commit = subprocess.run(command, capture_output=True, text=True, check=False, timeout=5)  # noqa: S603
         if commit.returncode == 0 and commit.stdout.strip():

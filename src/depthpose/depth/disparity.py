@@ -124,10 +124,10 @@ def depth_deviation(
     depth is.
     """
     knots = torch.tensor(_DEVIATIONS, dtype=depth_m.dtype, device=depth_m.device)
-    sure, shares = knots.T.contiguous()
+    confidences, shares = knots.T.contiguous()
     place = confidence.clamp(0, 1).contiguous()
-    after = torch.searchsorted(sure, place).clamp(1, len(sure) - 1)
-    between = (place - sure[after - 1]) / (sure[after] - sure[after - 1])
+    after = torch.searchsorted(confidences, place).clamp(1, len(confidences) - 1)
+    between = (place - confidences[after - 1]) / (confidences[after] - confidences[after - 1])
     share = torch.lerp(shares[after - 1], shares[after], between)
     deviation_px = (share * disparity_from_depth(depth_m, rig)).clamp(min=_LEAST_DEVIATION_PX)
     return depth_m.square() / (float(rig.K[0, 0]) * rig.baseline_m) * deviation_px
@@ -207,11 +207,11 @@ def changed_match(match: Match, change: Callable[[Tensor], Tensor]) -> Match:
 def resized_match(match: Match, height: int, width: int) -> Match:
     """Bring a match to another size of its image."""
     px = match.disparity_px
-    sure = match.confidence
+    confidence = match.confidence
     sky = match.is_sky
     return Match(
         disparity_px=resized_map(px, height, width) * (width / px.shape[1]),
-        confidence=None if sure is None else resized_map(sure, height, width),
+        confidence=None if confidence is None else resized_map(confidence, height, width),
         is_sky=None if sky is None else resized_map(sky.float(), height, width) > 0.5,
     )
 

@@ -159,16 +159,16 @@ class _Maps(NamedTuple):
     sky: Value | None = None
 
 
-class _Drawn(NamedTuple):
-    """Right views; what the generator itself says of the left one, and how probable a street is."""
+class _Generated(NamedTuple):
+    """What a generator makes of left views."""
 
     right: Value
-    own: _Maps | None = None
-    street: Value | None = None
+    left_maps: _Maps | None = None  # of a generator that estimates disparity
+    street: Value | None = None  # probability that the image shows a street
 
 
-def _drawn(left: Value, generator: Generator) -> _Drawn:
-    """What ``draw_right`` or ``select_views`` and ``shift_left`` do."""
+def _generate(left: Value, generator: Generator) -> _Generated:
+    """Do in ONNX operators what ``draw_right``, or ``select_views`` and ``shift_left``, do."""
     size = left.op("Shape", start=2, end=4)
     multiple = generator.config.side_multiple_px
     # The multiple that a side is close to, or the side itself.
@@ -183,16 +183,16 @@ def _drawn(left: Value, generator: Generator) -> _Drawn:
         network = network_model(generator, [example], multiple)
         (selection,) = left.graph.call(network, _mirrored(image, near, multiple))
         cropped = (selection + _1).slice([0, 0], near, [2, 3]) / _2
-        return _Drawn(_resized_image(cropped, size))
+        return _Generated(_resized_image(cropped, size))
     even = (near / 2 * 2).op("Max", 2)  # since logits stand for two rows and two columns
     image = _mirrored(_resized_image(left, even), even, multiple)
     network = network_model(DynamicSelection(generator).eval(), [example], multiple)
     outputs = left.graph.call(network, image)
     maps = [m.slice([0, 0], even / 2, [1, 2]) for m in outputs[:5]]
-    log_px, sky, sure, right_log_px, right_sky = (_resized_map(m, size) for m in maps)
+    log_px, sky, match_confidence, right_log_px, right_sky = (_resized_map(m, size) for m in maps)
     scale = _ratio(size, even)
     is_sky = sky.op("Greater", _HALF)
-    confidence = is_sky.op("Where", sky, sure * (sky * np.float32(-1) + _1))
+    confidence = is_sky.op("Where", sky, match_confidence * (sky * np.float32(-1) + _1))
     of_left = _Maps(log_px.op("Exp") * scale, confidence, is_sky.cast(np.float32))
     right_px = right_sky.op("Greater", _HALF).op("Where", _0, right_log_px.op("Exp") * scale)
     street = outputs[5] if generator.config.with_street else None
@@ -209,7 +209,7 @@ def _drawn(left: Value, generator: Generator) -> _Drawn:
     parts = (v.op("Expand", right_px.op("Shape")).op("Unsqueeze", [-1]) for v in (x, y))
     grid = graph.op("Concat", *parts, axis=-1)
     right = left.op("GridSample", grid, mode="bilinear", padding_mode="border", align_corners=0)
-    return _Drawn(right, of_left, street)
+    return _Generated(right, of_left, street)
 
 
 def _mirrored(image: Value, size: Value, multiple: int) -> Value:
@@ -248,7 +248,7 @@ def image_graph(weights: DepthWeights) -> Graph:
     scaled = full.cast(np.float64) * float(rig.virtual_focal_px) / K.op("Gather", [4, 0])
     small = scaled.op("Round").op("Max", 1.0).cast(np.int64)
     left = _resized_image(image, small)
-    right, of_left, street = _drawn(left, generator)
+    right, of_left, street = _generate(left, generator)
     maps = of_left
     if rig.answer == "matched":
         assert weights.matcher is not None, "checked before"
@@ -444,8 +444,8 @@ def _image_export(weights: DepthWeights, facts: dict[str, Any]) -> Export:
                 inputs, estimates, ("depth_m", "disparity_px", "confidence", "right", *sky, *street)
             )
             is_near = case.expected["disparity_px"] >= _LEAST_PX
-            where = {"depth_m": is_near | case.expected["is_sky"] if sky else is_near}
-            yield replace(case, where=where)
+            compared = {"depth_m": is_near | case.expected["is_sky"] if sky else is_near}
+            yield replace(case, where=compared)
 
     generator = weights.generator
     names = ("virtual_focal_px", "virtual_baseline_m", "answer")

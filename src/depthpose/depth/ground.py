@@ -282,12 +282,12 @@ def scale_by_mount(
     return replace(rescale(estimate, (by_ground_m / depth_m) ** weight), ground=ground)
 
 
-def _over_image(plane: Float[Tensor, "3"], camera: Camera, like: Map) -> Map:
+def _over_image(plane: Float[Tensor, "3"], camera: Camera, example: Map) -> Map:
     """Give ``plane @ ray`` for the rays (z = 1) of all pixels of a map."""
     a, b, c = (plane @ torch.linalg.inv(camera.K)).tolist()
-    height, width = like.shape
-    u = torch.arange(width, dtype=like.dtype, device=like.device)
-    v = torch.arange(height, dtype=like.dtype, device=like.device)
+    height, width = example.shape
+    u = torch.arange(width, dtype=example.dtype, device=example.device)
+    v = torch.arange(height, dtype=example.dtype, device=example.device)
     return a * u + (b * v + c)[:, None]
 
 

@@ -270,7 +270,7 @@ def pose_sentence(estimate: PoseEstimate) -> str:
 def pose_facts(
     estimate: PoseEstimate,
     model: ObjectModel,
-    how: str = "",
+    method: str = "",
     agreeing: str = "votes or points that agree",
 ) -> list[tuple[str, str]]:
     """Say what is known of an estimate besides its pose.
@@ -278,8 +278,8 @@ def pose_facts(
     ``how``: by what it was found, if not empty; ``agreeing``: what its ``inlier_share`` is of.
     """
     facts = [("object", f"{estimate.object}, {model.diameter_m:.4f} m long")]
-    if how:
-        facts.append(("by", how))
+    if method:
+        facts.append(("by", method))
     if (evidence := estimate.evidence) is not None:
         facts += [
             ("agreement", f"{evidence.agreement:.1%} of what was compared supports the pose"),

@@ -56,7 +56,7 @@ class PublishedTable:
 
 
 def join_published(
-    table: PublishedTable, ours: Sequence[tuple[str, EvaluationRow]]
+    table: PublishedTable, our_rows: Sequence[tuple[str, EvaluationRow]]
 ) -> list[dict[str, Any]]:
     """Set our rows beside the printed ones, cap by cap: published, ours, difference.
 
@@ -64,8 +64,8 @@ def join_published(
 
     Args:
         table: the printed table.
-        ours: for each of our rows the name of the thesis's own method that it stands for (one of
-            ``table.own_rows``, or empty where it stands for none, as a baseline), and the row.
+        our_rows: for each of our rows the name of the thesis's own method that it stands for (one
+            of ``table.own_rows``, or empty where it stands for none, as a baseline), and the row.
 
     Returns:
         The columns of each row; ``source`` is ``published``, ``ours`` or ``difference``.
@@ -80,7 +80,7 @@ def join_published(
         for row in table.rows
     ]
     rows: list[dict[str, Any]] = [*printed]
-    for counterpart, row in ours:
+    for counterpart, row in our_rows:
         assert row.cap_m is not None, "the tables are of depth, and reproduce takes no disparity"
         our_row = {**dict.fromkeys(_FIRST, ""), **row.columns(), "source": "ours"}
         rows.append(our_row)

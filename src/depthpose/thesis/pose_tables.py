@@ -207,19 +207,19 @@ def _own(rows: Sequence[ObjectRow], columns: Mapping[str, str]) -> dict[str, Any
 
 
 def _difference(
-    ours: Mapping[str, Any], other: Mapping[str, Any], names: Sequence[str]
+    our_row: Mapping[str, Any], other: Mapping[str, Any], names: Sequence[str]
 ) -> dict[str, Any]:
     """Subtract a row from one of ours, by the names of our objects."""
-    theirs = names if other["source"] == "ours" else [n for n in LINEMOD.values() if n in other]
+    compared = names if other["source"] == "ours" else [n for n in LINEMOD.values() if n in other]
     difference = {
         "source": "difference",
-        "method": f"{ours['method']} - {other['method']}",
-        "masks": ours["masks"],
-        **{name: ours[name] - other[name] for name in names if name in theirs},
-        "mean": ours["mean"] - other["mean"] if set(theirs) == set(names) else None,
+        "method": f"{our_row['method']} - {other['method']}",
+        "masks": our_row["masks"],
+        **{name: our_row[name] - other[name] for name in names if name in compared},
+        "mean": our_row["mean"] - other["mean"] if set(compared) == set(names) else None,
     }
-    if ours["diameters"] != other["diameters"]:
-        difference["diameters"] = f"{ours['diameters']} against {other['diameters']}"
+    if our_row["diameters"] != other["diameters"]:
+        difference["diameters"] = f"{our_row['diameters']} against {other['diameters']}"
     return difference
 
 
@@ -331,8 +331,8 @@ def compare_voting(cases: Sequence[VotingCase | None], points: int) -> list[dict
                 start = time.thread_time()
                 keypoints_m = vote(case)
                 seconds.append(time.thread_time() - start)
-                alike = torch.eye(3, dtype=torch.float64).expand(len(keypoints_m), 3, 3)
-                fit = fit_pose(keypoints_m.double(), alike, case.model.keypoints_m)
+                isotropic = torch.eye(3, dtype=torch.float64).expand(len(keypoints_m), 3, 3)
+                fit = fit_pose(keypoints_m.double(), isotropic, case.model.keypoints_m)
                 some_m = case.model.vertices_m[:: max(1, len(case.model.vertices_m) // _ADD_POINTS)]
                 pose = fit.camera_from_model
                 diameter_m = case.model.diameter_m

@@ -305,10 +305,10 @@ class Pages:
             raise HTTPException(404, f"only {' and '.join(self._examples)} are estimated here")
         make = self._examples[kind]
         try:
-            made = await self._queue.compute("", make, partial(has_gone, request.receive))
+            fields = await self._queue.compute("", make, partial(has_gone, request.receive))
         except InputError as error:
             raise HTTPException(400, str(error)) from error
-        return JSONResponse(made)
+        return JSONResponse(fields)
 
     async def place(self, request: Request) -> Response:
         """Give the number of computations before that of a ticket; null: it does not wait here."""

@@ -217,17 +217,17 @@ def _from_kalibr(names: Names, unit_m: float, is_fisheye: bool | None) -> RawPai
     motion = matrix(second, ("tcncnm1",), 16)
     if motion is None:
         raise InputError("cam1 has no T_cn_cnm1 of 16 numbers; calibrate both cameras together")
-    sizes = [numbers(one.get("resolution")) for one in (first, second)]
+    sizes = [numbers(camera_names.get("resolution")) for camera_names in (first, second)]
     if sizes[0] != sizes[1]:
         raise InputError("cam0 and cam1 have images of two sizes; a pair has one")
     size = None if sizes[0] is None else (int(sizes[0][0]), int(sizes[0][-1]))
     cameras = []
-    for one, owner in ((first, "cam0"), (second, "cam1")):
-        kind = _kind(one, is_fisheye, f"{owner}'s")
-        values = numbers(one.get("intrinsics"))
+    for camera_names, owner in ((first, "cam0"), (second, "cam1")):
+        kind = _kind(camera_names, is_fisheye, f"{owner}'s")
+        values = numbers(camera_names.get("intrinsics"))
         if values is None or len(values) != 4:
             raise InputError(f"{owner} has no intrinsics [fx, fy, cx, cy]; copy the camchain anew")
-        lens = numbers(one.get("distortioncoeffs"))
+        lens = numbers(camera_names.get("distortioncoeffs"))
         cameras.append(_camera(intrinsics(*values).numpy(), lens, kind, owner))
     return _pair(cameras[0], cameras[1], (motion[:3, :3], unit_m * motion[:3, 3]), size)
 
@@ -340,7 +340,9 @@ def make_rectifier(pair: RawPair, size: Size, keep: float = 0.0) -> Rectifier:
         raise InputError(f"--keep {keep:g}: 0 keeps what both lenses show, 1 keeps all; take 0")
     size = pair.size or size
     R, t = (part.numpy() for part in (pair.right_from_left.R, pair.right_from_left.t_m[:, None]))
-    left, right = ((one.K.numpy(), np.array(one.distortion)) for one in (pair.left, pair.right))
+    left, right = (
+        (camera.K.numpy(), np.array(camera.distortion)) for camera in (pair.left, pair.right)
+    )
     flags = cv2.CALIB_ZERO_DISPARITY
     make_maps = cv2.initUndistortRectifyMap
     if pair.left.is_fisheye:

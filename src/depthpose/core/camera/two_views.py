@@ -20,9 +20,9 @@ _LEAST_DEVIATION = 0.01
 _MIN_MATCHES = 25
 
 
-def halves(image: Float[Tensor, "3 h w"], how: Arrangement) -> tuple[Tensor, Tensor]:
+def halves(image: Float[Tensor, "3 h w"], arrangement: Arrangement) -> tuple[Tensor, Tensor]:
     """Part a picture: left and right half, or upper and lower one, of one size."""
-    if how == "side by side":
+    if arrangement == "side by side":
         width = image.shape[2] // 2
         return image[:, :, :width].contiguous(), image[:, :, -width:].contiguous()
     height = image.shape[1] // 2
@@ -33,21 +33,24 @@ def find_two_views(image: Float[Tensor, "3 h w"]) -> Arrangement | None:
     """Say how a picture holds two views of one scene; None where it is one view."""
     if min(image.shape[1:]) < 2 * _ROWS:
         return None
-    for how in ("side by side", "top and bottom"):
-        one, other = halves(image, how)
-        if _likeness(one, other) > _ALIKE and check_rectified(one, other).matches >= _MIN_MATCHES:
-            return how
+    for arrangement in ("side by side", "top and bottom"):
+        first_half, second_half = halves(image, arrangement)
+        if (
+            _likeness(first_half, second_half) > _ALIKE
+            and check_rectified(first_half, second_half).matches >= _MIN_MATCHES
+        ):
+            return arrangement
     return None
 
 
-def _likeness(one: Tensor, other: Tensor) -> float:
+def _likeness(first_half: Tensor, second_half: Tensor) -> float:
     """Correlate small copies of both halves at the shift that suits best."""
-    first, second = (
-        functional.interpolate(grey_of(half).float()[None, None], (_ROWS, _COLUMNS), mode="area")[
-            0, 0
-        ]
-        for half in (one, other)
-    )
+    small_copies: list[Tensor] = []
+    for half in (first_half, second_half):
+        grey = grey_of(half).float()[None, None]
+        copy = functional.interpolate(grey, (_ROWS, _COLUMNS), mode="area")
+        small_copies.append(copy[0, 0])
+    first, second = small_copies
     best = 0.0
     for shift in range(-_REACH, _REACH + 1):
         a = _centred(first[:, max(shift, 0) : _COLUMNS + min(shift, 0)])
@@ -63,7 +66,7 @@ def _centred(grey: Tensor) -> Tensor:
 
 
 def order_views(
-    one: Float[Tensor, "3 h w"], other: Float[Tensor, "3 h w"]
+    first: Float[Tensor, "3 h w"], second: Float[Tensor, "3 h w"]
 ) -> tuple[Tensor, Tensor]:
     """Give two views, left first: for crossed eyes, as in JPS files, the right one comes first."""
-    return (other, one) if check_rectified(one, other).is_swapped else (one, other)
+    return (second, first) if check_rectified(first, second).is_swapped else (first, second)

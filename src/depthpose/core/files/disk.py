@@ -272,14 +272,14 @@ class YamlLoader(_PLAIN):
 
     def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
         """Give a mapping; of a key that stands twice the first value would be lost."""
-        seen: set[tuple[str, str]] = set()
+        keys_of_map: set[tuple[str, str]] = set()
         for key, _ in node.value:
             if not isinstance(key, yaml.ScalarNode) or key.tag == _MERGE:
                 continue
-            if (key.tag, key.value) in seen:
+            if (key.tag, key.value) in keys_of_map:
                 line = key.start_mark.line + 1
                 raise ValueError(f"line {line}: key {key.value!r} is given twice")
-            seen.add((key.tag, key.value))
+            keys_of_map.add((key.tag, key.value))
         return super().construct_mapping(node, deep)
 
 

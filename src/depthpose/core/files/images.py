@@ -404,7 +404,7 @@ def read_views(path: AnyPath) -> list[Float32[Tensor, "3 _ _"]]:
         if image.format == "MPO":
             image.seek(1)
             pixels.append(_decoded(path, image))
-    return [_tensor_of(one, path) for one in pixels]
+    return [_tensor_of(view, path) for view in pixels]
 
 
 @contextmanager

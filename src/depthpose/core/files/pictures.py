@@ -53,8 +53,8 @@ def _rgb(values: Tensor, sides: tuple[int, int], what: str) -> Float[Tensor, "3 
         )
     values_3d = values[0] if values.ndim == 4 else values
     planes = values_3d[None] if values_3d.ndim == 2 else values_3d
-    found = (k for k in sides if planes.ndim == 3 and planes.shape[k] in _CHANNELS)
-    side = 0 if values_3d.ndim == 2 else next(found, None)
+    channel_axes = (k for k in sides if planes.ndim == 3 and planes.shape[k] in _CHANNELS)
+    side = 0 if values_3d.ndim == 2 else next(channel_axes, None)
     if side is None:
         raise InputError(f"{what} of shape {shape}; give (H, W, 3), (3, H, W) or grey (H, W)")
     planes = planes.movedim(side, 0)[:3]

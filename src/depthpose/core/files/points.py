@@ -190,10 +190,11 @@ def read_ply_elements(path: AnyPath, last: str | None = None) -> tuple[Columns, 
             }
         if element.name == last:
             return columns, lists
-    more = len(body) if rows is None else sum(1 for _ in rows)
-    if more > (3 if rows is None else 0):  # a line end behind binary data does no harm
+    surplus = len(body) if rows is None else sum(1 for _ in rows)
+    if surplus > (3 if rows is None else 0):  # a line end behind binary data does no harm
+        what = "bytes" if rows is None else "rows"
         raise InputError(
-            f"{path}: {more} {'bytes' if rows is None else 'rows'} follow what its header declares "
+            f"{path}: {surplus} {what} follow what its header declares "
             f"({', '.join(f'{e.count} {e.name}' for e in elements)}); correct it, or save it again"
         )
     return columns, lists
@@ -427,12 +428,12 @@ def decompress_lzf(packed: memoryview, size: int) -> bytes:
             out += packed[at : at + control + 1]
             at += control + 1
             continue
-        more = (control >> 5) // 7  # bytes of the length that follow
-        if at + more >= len(packed):
+        more_bytes = (control >> 5) // 7  # bytes of the length that follow
+        if at + more_bytes >= len(packed):
             raise ValueError("the compressed bytes end in the middle of a reference")
-        length = (control >> 5) + more * packed[at]
-        start = len(out) - ((control & 31) << 8) - packed[at + more] - 1
-        at += more + 1
+        length = (control >> 5) + more_bytes * packed[at]
+        start = len(out) - ((control & 31) << 8) - packed[at + more_bytes] - 1
+        at += more_bytes + 1
         if start < 0:
             raise ValueError("the compressed bytes refer to before their beginning")
         piece = out[start : start + length + 2]  # shorter where source and target overlap

@@ -159,12 +159,12 @@ def write_card(
     for path in reversed(saved_states(folder)):
         with suppress(InputError):
             step = _read_state(path)["step"]
-    made = {
+    record = {
         "command": f"`depthpose {words} --config config.yaml --out {shlex.quote(folder.name)}`",
         "time": f"{step} steps in {took} on {machine}; {versions['date']}",
     }
     with atomic_write(weights.with_suffix(".md")) as part:
-        part.write_text(card_text(weights.stem, {**facts, **made}, measured))
+        part.write_text(card_text(weights.stem, {**facts, **record}, measured))
 
 
 def held_out_text(folder: Path, sentence: str) -> str:

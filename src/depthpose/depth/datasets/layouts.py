@@ -171,7 +171,7 @@ def _frames(
 ) -> Iterator[Frame]:
     """Frames of left images, with the parts of the same stem."""
     for left in lefts:
-        others = {part: found.get(stem_of(left)) for part, found in parts.items()}
+        others = {part: files_of_part.get(stem_of(left)) for part, files_of_part in parts.items()}
         yield Frame(name=prefix + stem_of(left), left=left, style=style, **others)
 
 

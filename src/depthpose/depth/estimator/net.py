@@ -349,7 +349,7 @@ class FakestereoNet:
                 if not self.matcher.config.with_left_right_check:
                     match = doubt_hidden(match, reach)
                 match, doubt = doubt_outside(match, reach, window)
-                warning = "; ".join(said for said in (warning, doubt) if said)
+                warning = "; ".join(text for text in (warning, doubt) if text)
                 return disparity.from_pair(pair, match, warning)
             # Other matchers search from 0 on: the views are moved so that infinity is there.
             first_px = -math.ceil(apart_px)
@@ -448,10 +448,14 @@ class FakestereoNet:
                 for name, image in named
             ]
             sized = [
-                (one, None if one.right is not None else self.virtual_sizes(one)) for one in inputs
+                (
+                    depth_input,
+                    None if depth_input.right is not None else self.virtual_sizes(depth_input),
+                )
+                for depth_input in inputs
             ]
             for sizes, group in groupby(sized, itemgetter(1)):
-                same_sizes = [one for one, _ in group]
+                same_sizes = [depth_input for depth_input, _ in group]
                 if sizes is None:
                     estimates += map(partial(self.estimate_pair, with_check=with_check), same_sizes)
                 else:
@@ -462,10 +466,10 @@ class FakestereoNet:
             if mount is not None:
                 mount.last = before
             alone = (
-                self.estimate_together([one], lens, with_check=with_check, mount=mount)
-                for one in named
+                self.estimate_together([depth_input], lens, with_check=with_check, mount=mount)
+                for depth_input in named
             )
-            return [one for (one,) in alone]
+            return [depth_input for (depth_input,) in alone]
         return estimates
 
     def virtual_sizes(self, image: StereoInput) -> list[tuple[int, int]]:
@@ -553,7 +557,10 @@ class FakestereoNet:
                 assert views.disparity_px is not None, "it has an answer of its own"
                 assert confidence is not None
                 parts = zip(views.disparity_px, confidence, strict=True)
-                matches = [Match(disparity_px=px, confidence=sure) for px, sure in parts]
+                matches = [
+                    Match(disparity_px=px, confidence=pixel_confidence)
+                    for px, pixel_confidence in parts
+                ]
             estimates = []
             for n, (image, match) in enumerate(zip(images, matches, strict=True)):
                 match_with_sky = match if sky is None else replace(match, is_sky=sky[n])

@@ -77,10 +77,10 @@ class DepthPipeline:
         lens = choose_lens(camera, focal_px, fov_deg)
         is_one = isinstance(pictures_given, str | Path | Image.Image | np.ndarray | Tensor)
         pictures = [pictures_given] if is_one else cast("Iterable[Picture]", pictures_given)
-        found = self._each(pictures, lens, batch_size or self.batch_size, timeout)
+        estimates = self._each(pictures, lens, batch_size or self.batch_size, timeout)
         if is_one:
-            return next(found)
-        return list(found) if isinstance(pictures_given, list | tuple) else found
+            return next(estimates)
+        return list(estimates) if isinstance(pictures_given, list | tuple) else estimates
 
     def _each(
         self, pictures: Iterable[Picture], lens: AnyLens | None, batch: int, timeout: float | None
@@ -92,11 +92,11 @@ class DepthPipeline:
                 taken = as_input(_opened(picture, timeout), "the picture", lens)
                 if taken.camera is None:
                     height, width = taken.left.shape[1:]
-                    known = _PHONE * width
-                    taken = replace(taken, camera=camera_of(known, (width, height)))
+                    phone_focal_px = _PHONE * width
+                    taken = replace(taken, camera=camera_of(phone_focal_px, (width, height)))
                     warnings.warn(
-                        f"no camera: a focal length of {known:g} px is taken, a phone's; the "
-                        "metres are as wrong as it is. Give focal_px= or camera=",
+                        f"no camera: a focal length of {phone_focal_px:g} px is taken, a phone's; "
+                        "the metres are as wrong as it is. Give focal_px= or camera=",
                         Notice,
                         stacklevel=3,
                     )

@@ -119,7 +119,7 @@ class ConvNorm(nn.Sequential):
         super().__init__(OrderedDict(conv=conv, norm=norm(outputs)))
 
 
-def fold(network: ModuleT, like: Tensor) -> ModuleT:
+def fold(network: ModuleT, example: Tensor) -> ModuleT:
     """Fold every batch norm into the convolution before it, in place, in the type of ``like``.
 
     In 3D, with a norm or without, convolutions become :class:`VolumeConv`; those that are one
@@ -130,7 +130,7 @@ def fold(network: ModuleT, like: Tensor) -> ModuleT:
             norm = getattr(layer, "norm", None)
             if isinstance(layer, nn.Conv3d) and not isinstance(parent, ConvNorm):
                 bias = torch.zeros(layer.out_channels) if layer.bias is None else layer.bias
-                setattr(parent, name, VolumeConv(layer, layer.weight, bias, like))
+                setattr(parent, name, VolumeConv(layer, layer.weight, bias, example))
             if not isinstance(norm, Norm):
                 continue
             # norm(conv(x)) = gain * (conv(x) - mean) + bias with gain = weight / sqrt(var + eps),
@@ -144,7 +144,7 @@ def fold(network: ModuleT, like: Tensor) -> ModuleT:
             shape[1 if isinstance(conv, nn.ConvTranspose3d) else 0] = -1  # the axis of outputs
             weight = (conv.weight.double() * gain.view(shape)).detach()
             if isinstance(norm, nn.BatchNorm3d):
-                setattr(parent, name, VolumeConv(conv, weight, bias, like))
+                setattr(parent, name, VolumeConv(conv, weight, bias, example))
                 continue
             conv.weight.data = weight
             conv.bias = nn.Parameter(bias)
@@ -153,7 +153,7 @@ def fold(network: ModuleT, like: Tensor) -> ModuleT:
                 setattr(parent, name, conv)
     for module in network.modules():
         for parameter in () if isinstance(module, VolumeConv) else module.parameters(recurse=False):
-            values = parameter.data.to(like)
+            values = parameter.data.to(example)
             order = torch.channels_last if values.ndim == 4 else torch.contiguous_format
             parameter.data = values.contiguous(memory_format=order)
             parameter.requires_grad_(False)
@@ -176,18 +176,18 @@ class VolumeConv(nn.Module):
         """Convolve a volume, in the type of the weights."""
         volume = volume.to(self.weight.dtype)
         is_usable = volume.device.type == "cpu" and volume.dtype in (torch.float32, torch.bfloat16)
-        given = (volume, self.weight, self.bias)
+        tensors = (volume, self.weight, self.bias)
         ones = (1, 1, 1)
         steps = (self.stride,) * 3
         # oneDNN is called by name: PyTorch's own choice takes a slow path for few rows.
         if is_usable and self.with_onednn and self.is_transposed:
             more = (ones, ones, steps, ones, 1, "none", [], "")
-            return torch.ops.mkldnn._convolution_transpose_pointwise(*given, *more)
+            return torch.ops.mkldnn._convolution_transpose_pointwise(*tensors, *more)
         if is_usable and self.with_onednn:
-            return torch.mkldnn_convolution(*given, ones, steps, ones, 1)
+            return torch.mkldnn_convolution(*tensors, ones, steps, ones, 1)
         if self.is_transposed:
-            return F.conv_transpose3d(*given, self.stride, 1, 1)
-        return F.conv3d(*given, self.stride, 1)
+            return F.conv_transpose3d(*tensors, self.stride, 1, 1)
+        return F.conv3d(*tensors, self.stride, 1)
 
 
 @cache
@@ -198,19 +198,19 @@ def has_onednn_operators() -> bool:
     """
     if not torch.backends.mkldnn.is_available():
         return False
-    like = torch.empty(0, dtype=torch.float32, device="cpu")
-    given = like.new_ones(1, 2, 4, 4, 4), like.new_ones(2, 2, 3, 3, 3), like.new_ones(2)
+    example = torch.empty(0, dtype=torch.float32, device="cpu")
+    tensors = example.new_ones(1, 2, 4, 4, 4), example.new_ones(2, 2, 3, 3, 3), example.new_ones(2)
     ones = (1, 1, 1)
     twos = (2, 2, 2)
     more = (ones, ones, twos, ones, 1, "none", [], "")
     try:
         with torch.no_grad():
-            convolved = torch.mkldnn_convolution(*given, ones, ones, ones, 1)
-            transposed = torch.ops.mkldnn._convolution_transpose_pointwise(*given, *more)
+            convolved = torch.mkldnn_convolution(*tensors, ones, ones, ones, 1)
+            transposed = torch.ops.mkldnn._convolution_transpose_pointwise(*tensors, *more)
     except (AttributeError, RuntimeError, TypeError):
         return False
     both = (
-        (convolved, F.conv3d(*given, 1, 1)),
-        (transposed, F.conv_transpose3d(*given, 2, 1, 1)),
+        (convolved, F.conv3d(*tensors, 1, 1)),
+        (transposed, F.conv_transpose3d(*tensors, 2, 1, 1)),
     )
     return all(one.shape == other.shape and torch.allclose(one, other) for one, other in both)

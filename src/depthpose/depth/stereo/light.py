@@ -540,11 +540,11 @@ class LightMatcher(NetworkMatcher):
     finds_range = True
     activation_bytes = staticmethod(light_bytes)
 
-    def fold(self, network: LightStereo, like: Tensor) -> LightStereo:
+    def fold(self, network: LightStereo, example: Tensor) -> LightStereo:
         """Fold batch norm, and compute some rows at a time."""
         # A GPU has the memory, and is busy with whole volumes alone.
         network.rows = ROWS if self.device.type == "cpu" else None
-        return layers.fold(network, like)
+        return layers.fold(network, example)
 
     def run(
         self, left: Views, right: Views, network: LightConfig, first_px: int = 0
@@ -558,7 +558,7 @@ class LightMatcher(NetworkMatcher):
             with_confidence=self.config.with_confidence,
         )
         nothing = [None] * len(left)
-        sure = nothing if read.confidence is None else read.confidence
+        confidence = nothing if read.confidence is None else read.confidence
         sky = nothing if read.sky is None else read.sky > 0.5
-        parts = zip(read.heads[-1], sure, sky, strict=True)
+        parts = zip(read.heads[-1], confidence, sky, strict=True)
         return [Match(disparity_px=d, confidence=c, is_sky=s) for d, c, s in parts]

@@ -197,10 +197,10 @@ class SGBMMatcher:
         )
         # The 8-bit BGR that OpenCV reads from a file.
         images = ((view.detach().cpu().clamp(0, 1) * 255).round().byte() for view in (left, right))
-        found = matcher.compute(
+        fixed_point = matcher.compute(
             *(np.ascontiguousarray(image.flip(0).permute(1, 2, 0).numpy()) for image in images)
         )
-        disparity_px = torch.from_numpy(found.astype(np.float32) / 16).to(left.device)
+        disparity_px = torch.from_numpy(fixed_point.astype(np.float32) / 16).to(left.device)
         disparity_px = disparity_px.where(disparity_px > 0, torch.nan)
         if not self.config.with_filled_holes:
             return Match(disparity_px=disparity_px)
@@ -292,11 +292,11 @@ class NetworkMatcher(ABC):
         self.config = replace(config, precision=precision)
         self.dtype = DTYPES[precision]
         self.network_config: NetworkConfig = network.config
-        like = torch.empty(0, dtype=self.dtype, device=self.device)
-        self._network = self.fold(deepcopy(network).eval().to(self.device), like)
+        example = torch.empty(0, dtype=self.dtype, device=self.device)
+        self._network = self.fold(deepcopy(network).eval().to(self.device), example)
 
     @abstractmethod
-    def fold(self, network: Any, like: Tensor) -> Any:  # noqa: ANN401
+    def fold(self, network: Any, example: Tensor) -> Any:  # noqa: ANN401
         """Fold batch norm into the convolutions; weights get the type of ``like``."""
 
     @abstractmethod

@@ -333,7 +333,7 @@ class PSMNetMatcher(NetworkMatcher):
     """Pixels of a fine match at most: an image of KITTI at three quarters of its resolution."""
     activation_bytes = staticmethod(psmnet_bytes)
 
-    def fold(self, network: PSMNet, like: Tensor) -> PSMNet:
+    def fold(self, network: PSMNet, example: Tensor) -> PSMNet:
         """Fold batch norm, and compute some rows at a time."""
         for head in network.heads:
             # In float32 at least: 8 bits would round the expectation to whole pixels.
@@ -341,7 +341,7 @@ class PSMNetMatcher(NetworkMatcher):
             wide = torch.empty(0, device=self.device)
             head.cost = layers.VolumeConv(cost, cost.weight, torch.zeros(1), wide)
         network.rows = ROWS
-        return layers.fold(network, like)
+        return layers.fold(network, example)
 
     def run(
         self, left: Views, right: Views, network: PSMNetConfig, first_px: int = 0
@@ -351,7 +351,7 @@ class PSMNetMatcher(NetworkMatcher):
         near, far = (one.to(self.dtype, memory_format=torch.channels_last) for one in (left, right))
         costs = self._network.costs(near, far, network.max_disparity_px)[-1][:, 0]
         height, width = left.shape[-2:]
-        found = [
+        matches = [
             expected_disparity(
                 cost.permute(1, 2, 0).contiguous(),
                 (network.max_disparity_px, height, width),
@@ -360,7 +360,7 @@ class PSMNetMatcher(NetworkMatcher):
             )
             for cost in costs
         ]
-        return [Match(disparity_px=d, confidence=c) for d, c in found]
+        return [Match(disparity_px=d, confidence=c) for d, c in matches]
 
 
 _PARTS = {"0": "conv", "1": "norm"}

@@ -63,9 +63,9 @@ class TrainingPairs:
             raise InputError("there is nothing to train on: name a folder of pairs (--data PATH).")
         sources: list[list[_Place]] = []
         if config.streets is not None:
-            made = Streets(config.streets)
+            streets = Streets(config.streets)
             exact: TruthKind | None = "disparity" if needs_truth else None
-            sources.append([_Place(made, k, exact) for k in range(len(made))])
+            sources.append([_Place(streets, k, exact) for k in range(len(streets))])
         excluded = set(config.exclude)
         for number, folder in enumerate(config.folders):
             dataset = open_dataset(folder, config.split if number == 0 else None)
@@ -191,18 +191,20 @@ def _usable(
     """Frames of a folder that can be learnt from, all with one kind of truth if it is needed."""
     name = dataset.name
     wanted = config.truth
-    there = {
+    kinds_by_index = {
         index: known_truths(frame)
         for index, frame in enumerate(dataset.frames)
         if (frame.right is not None or is_mixed) and frame.name not in config.exclude
     }
     alone = sum(frame.right is None for frame in dataset.frames)
-    if alone and not is_mixed and there:
+    if alone and not is_mixed and kinds_by_index:
         message = f"{name}: {alone} of {len(dataset)} images have no right view, and are left out"
         warnings.warn(message, Notice, stacklevel=2)
     kind: TruthKind | None = None
     if needs_truth:
-        counts: Counter[TruthKind] = Counter(kind for kinds in there.values() for kind in kinds)
+        counts: Counter[TruthKind] = Counter(
+            kind for kinds in kinds_by_index.values() for kind in kinds
+        )
         listed = ", ".join(f"{kind} of {count} frames" for kind, count in counts.items())
         if wanted is not None and counts and wanted not in counts:
             raise InputError(f"{name}: no frame has truth: {wanted}; there is {listed}")
@@ -214,7 +216,8 @@ def _usable(
             )
         kind = wanted or next(iter(counts), None)
     places = [
-        _Place(dataset, index, kind if kind in kinds else None) for index, kinds in there.items()
+        _Place(dataset, index, kind if kind in kinds else None)
+        for index, kinds in kinds_by_index.items()
     ]
     if is_mixed:  # an image alone without truth teaches nothing
         usable = [p for p in places if p.truth or dataset.frames[p.number].right is not None]

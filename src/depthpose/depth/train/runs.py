@@ -207,9 +207,11 @@ def _run_stage(
 ) -> tuple[dict[str, str], float]:
     """Claim the folder for this config, then train; give the facts of the card, and the seconds."""
     named = {k: name for k in _BEGINS_WITH if isinstance(name := getattr(config, k, None), str)}
-    more: dict[str, Any] = {f"{k}_sha256": file_sha256(find_weights(v)) for k, v in named.items()}
+    checksums: dict[str, Any] = {
+        f"{k}_sha256": file_sha256(find_weights(v)) for k, v in named.items()
+    }
     if samples.truths:
-        more["truth"] = list(samples.truths)
+        checksums["truth"] = list(samples.truths)
     sources = samples.sources if isinstance(samples, stages.SelectionSamples) else [samples]
     frames = [frame for source in sources for frame in source.frames]
     if frames:
@@ -217,7 +219,7 @@ def _run_stage(
         for frame in frames:
             size = frame.left.stat().st_size if frame.left.is_file() else 0  # 0: in a shard
             digest.update(f"{frame.name} {size}\n".encode())
-        more["frames_sha256"] = digest.hexdigest()
+        checksums["frames_sha256"] = digest.hexdigest()
     held_out: TrainingPairs | None = getattr(task, "held_out", None)
     if held_out is not None:
         remedy = "give --held-out other pairs, or exclude these in the config"
@@ -237,7 +239,7 @@ def _run_stage(
         facts["began_with"] = ", ".join(Path(name).stem for name in began_with)
     facts = bound_facts(facts, began_with)
     warn_of_terms(facts)
-    run.claim(config, ("generator", "matcher", "fakestereo"), more, ("held_out",))
+    run.claim(config, ("generator", "matcher", "fakestereo"), checksums, ("held_out",))
     return facts, run.train(task, samples, config.loop)
 
 
@@ -267,8 +269,10 @@ def _at_virtual_focal(
     """Bring all pairs, those held out too, to the rig that the generator imitates."""
     focal_px = generator.virtual_focal_px
     sources = ("pairs", "more", "held_out")
-    there = {name: value for name in sources if (value := getattr(config, name, None)) is not None}
-    for name, pairs in there.items():
+    pair_sources = {
+        name: value for name in sources if (value := getattr(config, name, None)) is not None
+    }
+    for name, pairs in pair_sources.items():
         if isinstance(generator, SelectionConfig) and name != "held_out":
             continue  # it answers pixels of any image, a U-Net those of its own rig alone
         if pairs.focal_px not in (None, focal_px):
@@ -282,5 +286,5 @@ def _at_virtual_focal(
                 "length, and the generator imitates one; leave it out"
             )
     return replace(
-        config, **{n: replace(p, focal_px=p.focal_px or focal_px) for n, p in there.items()}
+        config, **{n: replace(p, focal_px=p.focal_px or focal_px) for n, p in pair_sources.items()}
     )
