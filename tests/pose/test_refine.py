@@ -148,6 +148,29 @@ def test_a_pose_that_would_hide_what_was_seen_is_not_the_best() -> None:
     assert float(((best.refined.camera_from_model.t_m - TRUE.t_m) @ toward).abs()) < 1e-3
 
 
+def test_a_shelf_whose_upper_board_was_seen_is_not_posed_by_its_lower_one() -> None:
+    """The lower board fits as well, but then the upper one would hide what was seen."""
+    boards = [trimesh.creation.box((0.16, 0.1, 0.004)) for _ in range(2)]
+    boards[1].apply_translation([0, 0, 0.03])
+    wall = trimesh.creation.box((0.004, 0.1, 0.03))
+    wall.apply_translation([-0.08, 0, 0.015])
+    mesh = trimesh.util.concatenate([*boards, wall])
+    vertices, faces = (torch.from_numpy(np.array(part)) for part in (mesh.vertices, mesh.faces))
+    shelf = make_model(vertices, faces, name="shelf")
+    true = perturb(
+        Rigid(torch.eye(3).double(), torch.zeros(3).double()),
+        torch.tensor([0.02, -0.03, 0.4, 0.0, 0.0, 0.8]).double(),
+    )
+    points_m = sample_surface(shelf, 8000)[0].double()
+    seen_m = true.apply(points_m[points_m[:, 2] < -0.0019])
+    lower = Rigid(true.R, true.t_m - 0.03 * true.R[:, 2])
+    batch = Rigid(true.R.expand(2, 3, 3), torch.stack([lower.t_m, true.t_m]))
+    best = refine_best(seen_m, batch, prepare_surface(shelf))
+    assert best.start == 1
+    off_m = (best.refined.camera_from_model.t_m - true.t_m) @ true.R[:, 2]
+    assert float(off_m.abs()) < 1e-3
+
+
 @pytest.mark.parametrize("kind", ["mesh", "inside out", "mixed", "points"])
 def test_a_thin_plate_is_not_found_on_its_back(kind: str) -> None:
     """Its own thickness nearer to the camera the back lies where the front was seen."""
