@@ -27,6 +27,7 @@ from depthpose.pose.mesh import (
     symmetry_transforms,
     turn_about,
 )
+from depthpose.pose.mesh.symmetry import SurfaceDeviation
 from depthpose.pose.types import Axis, ObjectModel, Symmetries
 
 
@@ -362,6 +363,25 @@ def test_a_nearly_round_block_of_points_is_square() -> None:
     assert found.continuous == ()
     assert found.discrete is not None
     assert len(found.discrete.R) == 7
+
+
+def test_two_knobs_of_four_are_no_quarter_turn_either_way_however_dense_they_are() -> None:
+    """A scan has many points of one knob and few of the next, which a share of points overlooks."""
+    generator = np.random.default_rng(0)
+    plate = trimesh.creation.box((0.2, 0.2, 0.01))
+    knobs = [trimesh.creation.box((0.02, 0.02, 0.08)) for _ in range(2)]
+    knobs[0].apply_translation([0.08, 0, 0.045])
+    knobs[1].apply_translation([0, 0.08, 0.045])
+    parts = []
+    for mesh, count in ((plate, 4400), (knobs[0], 550), (knobs[1], 50)):
+        points, faces = trimesh.sample.sample_surface(mesh, count, seed=0)
+        parts.append(np.hstack([points, mesh.face_normals[faces]]))
+    rows = torch.from_numpy(generator.permutation(np.concatenate(parts)))
+    model = make_model(rows[:, :3], torch.zeros(0, 3).long(), name="knobs")
+    surface = SurfaceDeviation(model)
+    quarter = torch.tensor([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]], dtype=torch.float64)
+    off = surface.deviation(torch.stack([quarter, quarter.mT]))
+    assert bool((off > 0.1).all()), off
 
 
 def test_real_symmetries(real: Path) -> None:
