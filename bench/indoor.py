@@ -92,7 +92,7 @@ def match_sgbm(sample: StereoSample) -> DepthEstimate:
     disparity_px = matcher.match(pair.left, pair.right).disparity_px
     rig = pair.camera if isinstance(pair.camera, StereoRig) else None
     depth_m = None if rig is None else depth_from_disparity(disparity_px, rig)
-    return DepthEstimate(depth_m=depth_m, disparity_px=disparity_px, seen=pair)
+    return DepthEstimate(depth_m=depth_m, disparity_px=disparity_px, input=pair)
 
 
 def pair_errors(found: DepthEstimate, truth: StereoTruth) -> dict[str, float]:

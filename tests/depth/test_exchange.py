@@ -43,7 +43,7 @@ def test_an_estimate_holds_its_coloured_cloud_up_to_a_distance() -> None:
 
 
 def test_an_estimate_from_files_says_that_it_has_no_colours() -> None:
-    with pytest.raises(InputError, match="came without its image; estimate again, or set seen="):
+    with pytest.raises(InputError, match="came without its image; estimate again, or set input="):
         DepthEstimate(depth_m=DEPTH_M, disparity_px=DEPTH_M).to_open3d()
 
 

@@ -268,9 +268,9 @@ def test_labels_leave_the_sky_out() -> None:
 
 def test_the_sky_is_written_beside_the_depth(tmp_path: Path) -> None:
     found = estimated()
-    assert found.seen is not None
-    write_estimate(tmp_path, found.seen, found)
-    written = read_estimate(tmp_path, found.seen.name, None).is_sky
+    assert found.input is not None
+    write_estimate(tmp_path, found.input, found)
+    written = read_estimate(tmp_path, found.input.name, None).is_sky
     assert written is not None
     assert found.is_sky is not None
     assert torch.equal(written, found.is_sky)

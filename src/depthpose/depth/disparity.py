@@ -264,7 +264,7 @@ def from_pair(pair: StereoInput, match: Match, warning: str = "") -> DepthEstima
         confidence=confidence,
         is_sky=is_sky,
         warning=warning,
-        seen=pair,
+        input=pair,
     )
 
 
@@ -305,5 +305,5 @@ def from_virtual(
         confidence=confidence,
         right=resize_image(right, height, width),
         is_sky=is_sky,
-        seen=image,
+        input=image,
     )

@@ -83,7 +83,9 @@ def write_estimate(
         if depth_m is None
         else draw_depth(depth_m, *range_m)
     )
-    cloud = None if cloud_m is None else replace(estimate, seen=pair).cloud(cloud_m, min_confidence)
+    cloud = None
+    if cloud_m is not None:
+        cloud = replace(estimate, input=pair).cloud(cloud_m, min_confidence)
     parts: dict[str, tuple[Callable[..., None], Any]] = {
         CLOUD: (files.write_cloud, cloud),
         "warning.txt": (

@@ -126,7 +126,7 @@ class DepthEstimate:
     warning: str = ""
     #: what it was estimated from, for its colours and camera; None where files hold the estimate
     #: alone
-    seen: StereoInput | None = None
+    input: StereoInput | None = None
 
     def is_sure(self, min_confidence: float | None = None) -> Mask:
         """Say which pixels have a depth that is as sure as that.
@@ -138,7 +138,7 @@ class DepthEstimate:
         """
         values = self.disparity_px if self.depth_m is None else self.depth_m
         is_estimated = torch.isfinite(values)
-        is_pair = self.seen is not None and self.seen.right is not None
+        is_pair = self.input is not None and self.input.right is not None
         least = (0.5 if is_pair else 0.0) if min_confidence is None else min_confidence
         if self.confidence is None or least <= 0:
             return is_estimated
@@ -152,18 +152,18 @@ class DepthEstimate:
             min_confidence: less sure ones are left out, as :meth:`is_sure` says.
 
         Raises:
-            InputError: there are no metres, or what was seen is not known.
+            InputError: there are no metres, or the input is not known.
         """
-        if self.seen is None:
-            raise InputError("this estimate came without its image; estimate again, or set seen=")
-        if self.depth_m is None or self.seen.camera is None:
+        if self.input is None:
+            raise InputError("this estimate came without its image; estimate again, or set input=")
+        if self.depth_m is None or self.input.camera is None:
             raise InputError(
-                f"{self.seen.name}: a cloud needs metres: give a camera with a baseline."
+                f"{self.input.name}: a cloud needs metres: give a camera with a baseline."
             )
-        points_m = back_project(self.depth_m, self.seen.camera.K).reshape(-1, 3)
+        points_m = back_project(self.depth_m, self.input.camera.K).reshape(-1, 3)
         is_kept = self.is_sure(min_confidence).reshape(-1)
         is_kept &= torch.isfinite(points_m).all(-1) & (points_m[:, 2] <= far_m)
-        color = self.seen.left.permute(1, 2, 0).reshape(-1, 3)
+        color = self.input.left.permute(1, 2, 0).reshape(-1, 3)
         return Cloud(points=points_m[is_kept].float(), color=color[is_kept])
 
     def to_open3d(self, far_m: float = 80.0) -> Any:  # noqa: ANN401  Open3D carries no types

@@ -148,7 +148,7 @@ def depth_facts(
         facts.insert(0, ("warning", estimate.warning))
     if estimate.confidence is not None:
         facts.append(("mean confidence", f"{float(estimate.confidence.nanmean()):.2f}"))
-        shown = replace(estimate, seen=pair)
+        shown = replace(estimate, input=pair)
         doubted = 1 - float(shown.is_sure().sum() / shown.is_sure(0.0).sum().clamp(min=1))
         if pair.right is not None:
             facts.append(("unsure, not in the cloud", f"{doubted:.1%} of the depth"))
@@ -161,5 +161,5 @@ def depth_scene(
     """Show the points nearer than ``far_m`` in the colours of the image."""
     return Scene(
         caption=f"{caption} up to {far_m:g} m, in the camera's frame",
-        layers=[Layer(name="points", shape=replace(estimate, seen=pair).cloud(far_m))],
+        layers=[Layer(name="points", shape=replace(estimate, input=pair).cloud(far_m))],
     )

@@ -266,7 +266,7 @@ class FinetuneTask:
 class SelectionSample(NamedTuple):
     """What one step of the selecting generator sees; disparity is NaN if unknown, 0 in the sky."""
 
-    seen: Float[Tensor, "*b 3 h w"]  # the left image as a camera may deliver it: the input
+    observed: Float[Tensor, "*b 3 h w"]  # the left image as a camera may deliver it: the input
     left: Float[Tensor, "*b 3 h w"]  # the left image itself, which the right view is drawn from
     right: Float[Tensor, "*b 3 h w"]
     left_px: Float[Tensor, "*b h w"]
@@ -344,7 +344,7 @@ class SelectTask:
     def step(self, batch: SelectionSample) -> Iterator[Update]:
         """One update: predict disparity, warp the right view, compare."""
         planes = self.generator.planes
-        left, right = self.generator(batch.seen)
+        left, right = self.generator(batch.observed)
         of_left = self._truth_loss(left, batch.left_px)
         of_right = self._truth_loss(right, batch.right_px)
         loss = of_left + self.config.right_share * of_right
