@@ -154,7 +154,7 @@ def _fail(reason: str, code: int = 2) -> int:
 
 
 def _explained(error: Exception) -> str | None:
-    """Say in a line that memory or disk is full, or a path unusable; None of any other error."""
+    """Explain a full memory, a full disk or an unusable path in a line; None of any other error."""
     if (reason := full_memory(error)) is not None:
         return f"{reason}; what was finished is kept"
     if not isinstance(error, OSError) or error.errno not in (*_OF_THE_DISK, *_OF_A_PATH):

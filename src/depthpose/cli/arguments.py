@@ -36,7 +36,7 @@ from depthpose.core.errors import InputError
 
 
 class _Names(Enum):
-    """What the value of an option names, where its type alone does not say it."""
+    """What the value of an option names, where its type does not say so."""
 
     INPUT = "what is read"
     NEW = "what need not exist"
@@ -144,7 +144,7 @@ def description_of(command: Callable[..., int]) -> str:
 
 
 def _described(hint: Any) -> tuple[str | None, _Names | None]:  # noqa: ANN401  any type
-    """Name a value, None where tyro's own name will do, and say what it names."""
+    """Give the placeholder of a value, None where tyro's will do, and what it names."""
     origin = get_origin(hint)
     parts = get_args(hint)
     if origin is Annotated:

@@ -105,7 +105,7 @@ class PairNetworks:
     cloud: bool = False
     """write a coloured point cloud of what is nearer than 80 m, NAME.cloud.ply."""
     min_confidence: float = 0.5
-    """of clouds: depth that is less sure is left out, 0 to 1; the share is said."""
+    """of clouds: depth with a lower confidence, 0 to 1, is left out; the share is printed."""
     weights: WeightsName | None = None
     """weights with a matcher, by name or file; 'default' unless sgbm matches."""
     matcher: WeightsName | None = None
@@ -138,7 +138,7 @@ class PredictOutput:
     cloud: bool = False
     """write a coloured point cloud of what is nearer than 80 m, NAME.cloud.ply."""
     min_confidence: float = 0.0
-    """of clouds: depth that is less sure is left out, 0 to 1; the share is said."""
+    """of clouds: depth with a lower confidence, 0 to 1, is left out; the share is printed."""
     color_range: tuple[float, float] = (3.0, 80.0)
     """metres of the brightest and the darkest colour, the same for all pictures."""
     batch: int = 1

@@ -111,7 +111,7 @@ def _read(path: Path, size: Size | None) -> FileFacts:
 
 
 def _read_words(path: Path, size: Size | None) -> FileFacts:
-    """A camera; or a pose, a mask in run lengths, or points in text."""
+    """Read a text file as a camera, a pose, run lengths of a mask, or points."""
     if (posed := _of_pose(path)) is not None:
         return posed
     if path.suffix.lower() == ".json":
@@ -196,7 +196,7 @@ def _of_mask(path: Path, mask: Tensor) -> FileFacts:
 
 
 def _of_depth(path: Path, units: Tensor) -> FileFacts:
-    """16-bit depth: its unit stands nowhere in the file."""
+    """Describe a 16-bit depth image, whose unit the file does not say."""
     height, width = units.shape
     readings = units[units.isfinite()]
     file_facts = FileFacts(path=path, size=(width, height), depth_units=units)

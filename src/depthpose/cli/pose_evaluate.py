@@ -210,7 +210,7 @@ _MEASURED = (
 
 
 def _choose(rows: Sequence[InstanceRow], most: int) -> list[tuple[str, InstanceRow]]:
-    """Choose answers by their error in diameters, and the middle one of the refusals."""
+    """Choose estimates by their error in diameters, and a middle one of the refusals."""
     errors = {row.instance: row.error("error_m") for row in rows}
     answers = [row for row in rows if errors[row.instance] is not None]
     shares = [(errors[row.instance] or 0.0) / row.diameter_m for row in answers]

@@ -220,7 +220,7 @@ def _image_name(place: tuple[int, int]) -> str:
 
 
 def _explained(job: PoseJob[Any], prediction: Prediction, method: PoseMethod) -> AnyInput:
-    """Read a whole depth image as if a mask had shown what was found in it."""
+    """Read a whole depth image with the mask of the pixels that a predicted pose explains."""
     view = job.read()
     pose = prediction.estimate.camera_from_model
     model = next(
@@ -333,7 +333,7 @@ def _finish(
 def _followed(
     method: PoseMethod, jobs: Sequence[PoseJob[Any]], name: str, first: Rigid | None = None
 ) -> Iterator[Prediction]:
-    """Follow an object, frame by frame; of one that cannot be read the estimate says so."""
+    """Follow an object frame by frame; an unreadable frame gets an estimate that says so."""
 
     def frames() -> Iterator[AnyInput | PoseEstimate]:
         for job in tqdm(jobs, disable=None, unit=" frames"):

@@ -173,7 +173,7 @@ def _segmented(
 
 
 def _file_names(words: Sequence[str], paths: Sequence[Path | None]) -> list[str]:
-    """Name files by their stems, told apart by their folders, and what is no file by its word."""
+    """Name files by their stems, with folders where stems are equal; words stay as they are."""
     return distinct_names(
         [(None, w) if p is None else (p.parent, p.stem) for w, p in zip(words, paths, strict=True)]
     )
@@ -296,7 +296,7 @@ def _network(path: Path, name: str, config: EstimateConfig) -> PoseMethod:
 
 
 def _in_base(method: PoseMethod, base: Rigid) -> PoseMethod:
-    """Let a method add ``base_from_model`` to its estimates."""
+    """Make a method add ``base_from_model`` to its estimates."""
     find = method.find
     track = method.track
 

@@ -58,7 +58,7 @@ def match_pairs(pair: PairOptions, camera: Path | None, device: str, out: Path) 
 
 
 def _keep_sure(name: str, rig: StereoRig, min_confidence: float, out: Path) -> None:
-    """Write the depth of a pair that is sure enough, and how far off it may be."""
+    """Write the depth of a pair where it is sure enough, and its standard deviation."""
     home = out / MATCHED
     if not is_whole(home, name, [f"{name}.depth_m.npy"]):
         return  # it failed, as was said

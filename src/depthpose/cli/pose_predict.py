@@ -140,7 +140,7 @@ def claim_bop(out: Path, settings: dict[str, Any], dataset: BopDataset) -> None:
 
 
 def object_named(name: str | None, method: PoseMethod) -> str:
-    """Give the object that is meant."""
+    """Give the object of this name, or the only one; refuse unknown names."""
     known_names = [model.name for model in method.models]
     if name is None and len(known_names) > 1:
         raise InputError(
@@ -349,7 +349,7 @@ def _read_detection(
 def _beside_depths(
     depths: Sequence[Path], others: Sequence[Path], depth: Path, place: Path, what: str
 ) -> dict[str, Path]:
-    """Give the file that belongs to each depth image, by the name of the image."""
+    """Give the file of each depth image that has its name."""
     _refuse_one_name(depths)
     _refuse_one_name(others)
     by_name = {path.stem: path for path in others}
@@ -443,7 +443,7 @@ def _read_colored(
 
 
 def _list_depths(depth: Path) -> list[Path]:
-    """List depth images: pictures, or the maps of a folder without such."""
+    """List depth images: pictures; in a folder without pictures, maps."""
     try:
         return list_images(depth)
     except InputError:
@@ -454,7 +454,7 @@ def _list_depths(depth: Path) -> list[Path]:
 
 
 def _refuse_one_name(files: Sequence[Path]) -> None:
-    """Results bear the names of their inputs, without the suffix."""
+    """Refuse files of one stem: results bear the stems of their inputs."""
     first: dict[str, Path] = {}
     for path in files:
         other = first.setdefault(path.stem, path)
@@ -697,7 +697,7 @@ def say_result(predictions: list[Prediction], out: Path, inputs: int | None = No
 
 
 def _pose_words(pose: Rigid | None, before: str) -> dict[str, str]:
-    """Write place and quaternion of a pose under these names of columns."""
+    """Format position and quaternion of a pose for the columns of a table."""
     if pose is None:
         return {}
     quaternion = Rotation.from_matrix(pose.R.double()).as_quat()
@@ -708,7 +708,7 @@ def _pose_words(pose: Rigid | None, before: str) -> dict[str, str]:
 
 
 def _count_inputs(predictions: Sequence[Prediction], inputs: int | None) -> str:
-    """Say how many inputs there were, and how many answers where that is another number."""
+    """Give the number of inputs, and that of estimates where it is another."""
     count = len(predictions) if inputs is None else inputs
     answers = len(predictions)
     total = f"{count} input{'s' * (count != 1)}"
@@ -716,7 +716,7 @@ def _count_inputs(predictions: Sequence[Prediction], inputs: int | None) -> str:
 
 
 def _row(estimate: PoseEstimate) -> dict[str, Any]:
-    """Say what was found of one input, as the page and the terminal show it."""
+    """Give the row of an estimate for the page and the terminal."""
     pose = estimate.camera_from_model
     evidence = estimate.evidence
     identity = estimate.identity
@@ -746,7 +746,7 @@ def _write_page(
     dataset: BopDataset | None,
     inputs: int | None,
 ) -> None:
-    """Write a page of some of the predictions, and of the reason of each refusal."""
+    """Write a page with some of the predictions and the reason of every refusal."""
     instances = () if dataset is None else dataset.instances
     image_of = {(i.scene_id, i.image_id): i.rgb for i in instances}
     estimates = [prediction.estimate for prediction in predictions]

@@ -104,7 +104,7 @@ def _refuse_rows(
     matcher: str | None,
     beside: Sequence[str] | None,
 ) -> None:
-    """Refuse, before any work, rows that a table does not have, and those that it lacks."""
+    """Refuse, before any work, rows that a table does not have, and missing ones."""
     if beside is not None and table.with_right:
         raise InputError(
             f"--beside {' '.join(beside)}: adds methods of one image, and table {table.number} is "

@@ -171,7 +171,7 @@ def write_figure(
 
 
 def _panel_section(title: str, panels: Sequence[Drawing], home: Path) -> Section:
-    """Write each panel as a picture of its own, small enough for a page of many."""
+    """Write each panel as a file, small enough for a page of many."""
     pictures: list[Picture] = []
     for k, panel in enumerate(panels, 1):
         path = home.with_name(f"{home.name}.{k}.jpg")

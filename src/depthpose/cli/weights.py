@@ -74,7 +74,7 @@ def show_weights(weights: tyro.conf.Positional[WeightsName]) -> int:
 
 
 def _settings_of(checkpoint: "Checkpoint", source: str) -> dict[str, Any]:
-    """Give the settings of weights as they are used today; of an encoder those of its file."""
+    """Give the settings of weights with today's defaults; of an encoder those of its file."""
     from depthpose.depth import weights as of_depth
     from depthpose.pose import weights as of_pose
 

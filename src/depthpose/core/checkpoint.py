@@ -387,7 +387,7 @@ def bound_facts(facts: Mapping[str, str], made_of: Iterable[str | Path]) -> dict
 
 
 def _finite(path: Path, state: Mapping[str, Tensor]) -> Mapping[str, Tensor]:
-    """Refuse numbers of which a network would make depth or poses of nothing."""
+    """Refuse tensors with NaN or infinity, of which a network would make plausible nonsense."""
     for name, tensor in state.items():
         # A sum takes no memory; a large one may overflow though every number is finite.
         is_finite = not tensor.is_floating_point() or tensor.sum(dtype=torch.float32).isfinite()

@@ -65,7 +65,7 @@ class Settings:
 
 @cache
 def _rules_of(kind: type) -> dict[str, tuple[tuple[Any, ...], str, tuple[Any, ...]]]:
-    """Give of each setting the words that its type knows, its interval, and what follows it."""
+    """Give the allowed words, the interval and the notes of each setting, from its type."""
     rules: dict[str, tuple[tuple[Any, ...], str, tuple[Any, ...]]] = {}
     for name, hint in get_type_hints(kind, include_extras=True).items():
         is_annotated = get_origin(hint) is Annotated
@@ -155,7 +155,7 @@ def config_from_dict(
 
 
 def _value_of(value: Any, hint: Any, source: str, name: str) -> Any:  # noqa: ANN401, C901, PLR0911, PLR0912
-    """Give a value of the type that a setting has; nothing is cast to what was not meant."""
+    """Convert a value to the type of a setting; only lossless conversions are done."""
     origin = get_origin(hint)
     parts = get_args(hint)
     if origin in (Union, types.UnionType):

@@ -220,7 +220,7 @@ def _span(
     first: Int64[Tensor, " n"],
     last: Int64[Tensor, " n"],
 ) -> tuple[Int64[Tensor, " n"], Int64[Tensor, " n"]]:
-    """Columns from which and up to which all three ``slope * u + offset`` are not negative."""
+    """Give the first and last column where all three ``slope * u + offset`` are not negative."""
     cross = -offset / slope
     left = _most(torch.maximum, torch.where(slope > 0, cross, -torch.inf))
     right = _most(torch.minimum, torch.where(slope < 0, cross, torch.inf))
@@ -242,7 +242,7 @@ def _most(join: Callable[[Tensor, Tensor], Tensor], values: Tensor) -> Tensor:
 def _expand(
     first: Int64[Tensor, " n"], last: Int64[Tensor, " n"]
 ) -> tuple[Int64[Tensor, " m"], Int64[Tensor, " m"]]:
-    """List every whole number from ``first`` to ``last``, and whose it is."""
+    """List the whole numbers from ``first`` to ``last`` of each range, and its index."""
     count = last - first + 1
     owner = torch.repeat_interleave(torch.arange(len(count), device=first.device), count)
     begin = first - (count.cumsum(0) - count)
@@ -250,7 +250,7 @@ def _expand(
 
 
 def _chunks(counts: Int64[Tensor, " n"], limit: int) -> Iterator[slice]:
-    """Cut a list so that the counts of each part sum to ``limit`` at most, or it is one item."""
+    """Split a list into parts whose counts sum to at most ``limit``, or which are one item."""
     ends = counts.cumsum(0).cpu().numpy()
     start = 0
     done = 0

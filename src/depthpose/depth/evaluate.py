@@ -382,7 +382,7 @@ class _Prepared:
 
 
 def _prepare(dataset: Dataset, index: int, predictions: Path, rule: Protocol) -> _Prepared | str:
-    """Read truth and prediction of a frame, or say why it does not count."""
+    """Read truth and prediction of a frame, or give the reason why it is not measured."""
     frame = dataset.frames[index]
     is_stereo = rule.truth == "disparity"
     if not has_truth(frame, rule):

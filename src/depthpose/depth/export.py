@@ -38,7 +38,7 @@ _HALF = np.float32(0.5)
 
 
 def _side(size: Value, axis: int) -> Value:
-    """One of two sides, rows (0) or columns (1), as a list of one."""
+    """Give the number of rows (axis 0) or columns (1), as a list of one."""
     return size.slice([axis], [axis + 1], [0])
 
 
@@ -56,7 +56,7 @@ def _resized_map(values: Value, size: Value) -> Value:
 
 
 def _ratio(wide: Value, narrow: Value) -> Value:
-    """How many times as wide, for disparities."""
+    """Give the ratio of two widths, by which disparities scale."""
     many, few = (_side(size, 1).cast(np.float64) for size in (wide, narrow))
     return (many / few).cast(np.float32)
 
@@ -213,7 +213,7 @@ def _generate(left: Value, generator: Generator) -> _Generated:
 
 
 def _mirrored(image: Value, size: Value, multiple: int) -> Value:
-    """Mirror the right and lower border until both sides are multiples."""
+    """Pad images at the right and below by mirroring, until both sides are multiples."""
     lacking = (size + (multiple - 1)) / multiple * multiple - size
     none = [0, 0]
     pads = image.graph.op("Concat", none, none, none, lacking, axis=0)
@@ -305,7 +305,7 @@ def pair_graph(weights: DepthWeights) -> Graph:
 def _matched(
     left: Value, right: Value, focal_px: Value | np.ndarray | None, matcher: StereoNetwork
 ) -> _Maps:
-    """Match at the focal length that the weights want, and come back to the images' size."""
+    """Match at the focal length that the weights need, and resize the result to the images."""
     if type(matcher) not in DYNAMIC_SHAPE_NETWORKS:
         kinds = ", ".join(kind.__name__ for kind in DYNAMIC_SHAPE_NETWORKS)
         raise InputError(

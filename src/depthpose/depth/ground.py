@@ -108,7 +108,7 @@ def fit_ground(depth_m: Map, camera: Camera) -> Ground | None:
 def _lower_points(
     depth_m: Map, camera: Camera
 ) -> tuple[Float[Tensor, "n 3"], Float[Tensor, " n"], Int[Tensor, " n"]]:
-    """Rays (z = 1), inverse depths and column strips of points below and not at the sides."""
+    """Give rays (z = 1), inverse depths and column strips of points in the lower middle."""
     height, width = depth_m.shape
     top = height * 3 // 5
     step = max(math.isqrt((height - top) * width // _POINTS), 1)
@@ -125,7 +125,7 @@ def _lower_points(
 def _fit_plane(
     rays: Float[Tensor, "n 3"], inverse: Float[Tensor, " n"]
 ) -> tuple[Float[Tensor, "3"], tuple[float, float, float]]:
-    """Fit ``plane @ ray = 1 / depth``; its height [m], tilt and roll [degrees] too."""
+    """Fit ``plane @ ray = 1 / depth``; give its height [m], tilt and roll [degrees] too."""
     weighed = rays / inverse[:, None]
     plane = torch.linalg.lstsq(weighed, torch.ones_like(inverse)[:, None]).solution[:, 0]
     x, y, z = plane.tolist()
@@ -207,7 +207,7 @@ def find_mount(
 
 
 def _join(first: tuple[float, float], second: tuple[float, float]) -> tuple[float, float]:
-    """Give mean and deviation by two means with their deviations, weighed by inverse variances."""
+    """Combine two estimates with their deviations, weighted by inverse variances."""
     weights = [1 / max(std, 1e-9) ** 2 for _, std in (first, second)]
     mean = (weights[0] * first[0] + weights[1] * second[0]) / sum(weights)
     return mean, math.sqrt(1 / sum(weights))

@@ -128,7 +128,7 @@ def find_segments(grey: Float[np.ndarray, "h w"]) -> Segments:
 def _top(
     strength: np.ndarray, rows: np.ndarray, columns: np.ndarray, step_y: int, step_x: int
 ) -> np.ndarray:
-    """Give where between two neighbours the strength is largest, -0.5 to 0.5."""
+    """Give the offset of the maximum of a parabola through three strengths, -0.5 to 0.5."""
     before = strength[rows - step_y, columns - step_x]
     after = strength[rows + step_y, columns + step_x]
     bend = before - 2 * strength[rows, columns] + after
@@ -192,7 +192,7 @@ def _log_likelihood(
     rolls_deg: np.ndarray,
     off_px: float,
 ) -> Float[np.ndarray, " angles"]:
-    """Give how well each choice of angles explains the directions of all segments."""
+    """Give the log likelihood of the directions of all segments, for each choice of angles."""
     pan, tilt, roll = (np.radians(angle) for angle in (pans_deg, tilts_deg, rolls_deg))
     down = np.stack([-np.tan(roll), np.ones_like(roll), -np.tan(tilt)], 1)
     down /= np.linalg.norm(down, axis=1, keepdims=True)

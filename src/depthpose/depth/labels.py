@@ -122,7 +122,7 @@ def label_pair(net: FakestereoNet, pair: StereoInput, config: LabelConfig) -> Ma
 
 
 def _write_calibration(path: Path, rigs: Mapping[str, StereoRig]) -> None:
-    """Write a line for each pair, beside those of other pairs that are there."""
+    """Write the line of each pair, and keep the lines of other pairs."""
     try:
         existing_lines = read_text(path).splitlines() if path.is_file() else []
     except InputError:  # damaged: the lines of these pairs are made again

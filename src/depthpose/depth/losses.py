@@ -77,7 +77,7 @@ def log_disparity_loss(
 
 
 def _mean_of_images(error: Tensor, is_known: Tensor) -> Tensor:
-    """Mean over images with truth of each one's mean over its pixels with truth."""
+    """Average over the pixels with truth of each image, then over the images that have any."""
     counts = is_known.sum((1, 2))
     means = torch.where(is_known, error, 0.0).sum((1, 2)) / counts.clamp(min=1)
     return means.sum() / (counts > 0).sum().clamp(min=1)

@@ -164,7 +164,7 @@ def error_by_decile(error: Numbers, confidence: Numbers) -> Float[Tensor, "10"]:
 
 
 def _shared_error(error: Numbers, key: Numbers) -> Numbers:
-    """Give pixels of an equal key their mean error: no answer may depend on the order of ties."""
+    """Give pixels of an equal key their mean error: their order must not matter."""
     values, group = key.unique(return_inverse=True)
     count = torch.zeros(len(values), dtype=error.dtype).index_add_(0, group, torch.ones_like(error))
     mean = torch.zeros(len(values), dtype=error.dtype).index_add_(0, group, error) / count

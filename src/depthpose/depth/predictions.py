@@ -113,7 +113,7 @@ def write_estimate(
 
 
 def _rounded(ground: Ground | None) -> dict[str, float] | None:
-    """Give what a file holds of a road: its digits that are the same in every run."""
+    """Give the values of a road to the digits that are the same in every run."""
     if ground is None:
         return None
     return {name: round(value, _DECIMALS) for name, value in asdict(ground).items()}

@@ -125,7 +125,7 @@ def read_depth_weights(
 
 
 def _config_of(kind: str, settings: Mapping[str, Any], source: str) -> Any:  # noqa: ANN401
-    """Build the config of a network from what a file holds of it."""
+    """Make the config of a network from the metadata of its file."""
     today = {name: value for name, value in settings.items() if name not in _FORMER}
     return config_from_dict(today, {**GENERATORS, **MATCHERS}[kind].config, source=source)
 

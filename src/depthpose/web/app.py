@@ -120,7 +120,7 @@ _STOP_S = 10.0  # so long a computation has to end once it was stopped: one step
 
 
 class _Stopped(BaseException):
-    """Ends a computation in its thread: no ``except Exception`` of it goes on."""
+    """Raised in the thread of a computation to end it; ``except Exception`` does not catch it."""
 
 
 class TookTooLong(Exception):  # noqa: N818  what happened
@@ -468,7 +468,7 @@ class TimedProtocol(H11Protocol):
             self._closing.cancel()
 
     def _wait_for_head(self) -> None:
-        """Start the time of a head that is not yet there, and end it where one is."""
+        """Start the timer of a request's head if it has not arrived; stop it if it has."""
         is_waiting = self.conn.their_state is h11.IDLE
         if is_waiting and self._closing is None:
             self._closing = self.loop.call_later(HEAD_S, self.transport.close)

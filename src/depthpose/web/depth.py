@@ -103,7 +103,7 @@ def answer_depth(form: Form, net: FakestereoNet) -> Answer:
 
 
 def _input(form: Form) -> tuple[StereoInput, str]:
-    """Read the picture or pair; say where its focal length comes from, if nobody gave it."""
+    """Read the picture or pair; give the origin of its focal length too, if the user gave none."""
     path = form.file("image")
     width, height = image_size(path)
     refuse_large(path.name, width, height)

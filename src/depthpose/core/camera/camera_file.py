@@ -163,7 +163,7 @@ def _colmap_facts(text: str) -> CameraFacts:
 
 
 def _bare_facts(text: str) -> CameraFacts | None:
-    """Take bare numbers: ``fx fy cx cy``, with distortion behind; K, with a baseline behind; P."""
+    """Read bare numbers: ``fx fy cx cy`` and distortion; K, perhaps with a baseline; or P."""
     lines = (line.partition("#")[0] for line in text.splitlines())
     words = " ".join(lines).replace(",", " ").split()
     try:
@@ -441,7 +441,7 @@ def _read_facts(path: AnyPath) -> CameraFacts:
 
 
 def _with_own_keys(facts: CameraFacts | None, names: Names) -> CameraFacts | None:
-    """Take what files of ROS and OpenCV lack from the keys of our JSON, where they were added."""
+    """Add the keys of our JSON that stand in a file of ROS or OpenCV, which has no such values."""
     if facts is None:
         return None
     added: dict[str, float] = {}

@@ -104,7 +104,7 @@ def _is_strange(word: str, key: str) -> bool:
 
 
 def _is_set(value: object) -> bool:
-    """Whether a flag is raised, or a coefficient is not 0; OpenCV writes either as a matrix too."""
+    """Whether a flag is true or a coefficient is not 0; OpenCV writes either as a matrix too."""
     if isinstance(value, Mapping):
         value = value.get("data")
     if isinstance(value, list):
@@ -116,7 +116,7 @@ def _is_set(value: object) -> bool:
 
 
 def _shown(key: str) -> str:
-    """Give a key as files write it."""
+    """Spell a normalised key as files do."""
     words = re.sub("(distortion|camera1?|lens|projection|fisheye)(?=model|type)", r"\1_", key)
     return re.sub("^is", "is_", words)
 

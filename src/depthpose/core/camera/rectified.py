@@ -165,7 +165,7 @@ def _find_corners(grey: Grey) -> Places:
 
 
 def _match(source: Grey, target: Grey, corners: Places) -> tuple[Places, Places, int]:
-    """Give corners with a mutual match, their places, and how many look like some place there."""
+    """Give corners with a mutual match, where they match, and how many have any good match."""
     matched, is_alike, is_sole = _search(source, target, corners)
     alike_count = int(is_alike.sum())
     corners = corners[is_alike & is_sole]
@@ -176,7 +176,7 @@ def _match(source: Grey, target: Grey, corners: Places) -> tuple[Places, Places,
 
 
 def _search(source: Grey, target: Grey, corners: Places) -> tuple[Places, Flags, Flags]:
-    """Find the best place of each corner's patch, whether it is good, and without a rival."""
+    """Find the best match of each corner's patch, whether it is good, and whether it is unique."""
     if len(corners) == 0:
         return corners, corners[:, 0].bool(), corners[:, 0].bool()
     patches = _unit(_windows(source, corners - _RADIUS, 2 * _RADIUS + 1))
@@ -212,7 +212,7 @@ def _unit(patches: Tensor) -> Tensor:
 def _place_finely(
     left: Float[Tensor, "3 h w"], right: Float[Tensor, "3 h w"], places: Places, matched: Places
 ) -> tuple[Float[Tensor, "n 2"], Float[Tensor, "n 2"]]:
-    """Give where matches lie, from the centre, and their shifts, right less left [px]."""
+    """Give the places of matches from the centre, and their shifts, right less left [px]."""
     left_grey, right_grey = (_grey(image, _FINE_PIXELS) for image in (left, right))
     larger = left_grey.shape[1] / _grey(left, _COARSE_PIXELS).shape[1]
     places, matched = (((p + 0.5) * larger - 0.5).round().long() for p in (places, matched))
@@ -242,7 +242,7 @@ def _place_finely(
 
 
 def _what_was_done(left: Grey, right: Grey, corners: Places) -> str | None:
-    """Seek the right image mirrored, turned and scaled back; None where it is still not found."""
+    """Find out whether the right image is mirrored, turned or scaled; None: by none of these."""
     some_corners = corners[:_SOME_CORNERS]
     flips = {
         "mirrored": right.flip(1),
@@ -274,7 +274,7 @@ def _what_was_done(left: Grey, right: Grey, corners: Places) -> str | None:
 def _report(
     places_px: Tensor, shift_px: Tensor, corners: int, width: int, apart_px: float
 ) -> RectificationReport:
-    """Say what the matches show, ``where`` counted from the centre [px]."""
+    """Summarise the matches; their places are counted from the centre [px]."""
     matches = len(shift_px)
     disparity_px = apart_px - shift_px[:, 0]
     clear = disparity_px[disparity_px.abs() > 1]
@@ -333,7 +333,7 @@ def _report(
 
 
 def _fit_rows(places_px: Tensor, lower_px: Tensor) -> tuple[float, float, float]:
-    """Fit the turn [degrees] and the scale of the right image, and give the spread that is left."""
+    """Fit rotation [degrees] and scale of the right image; give the spread of the residuals too."""
     places_px = places_px.float()
     lower_px = lower_px.float()
     design = torch.cat([torch.ones_like(places_px[:, :1]), places_px], -1)

@@ -237,7 +237,7 @@ def _first(names: Names, keys: tuple[str, ...]) -> list[float] | None:
 
 
 def _kind(names: Names, is_fisheye: bool | None, owner: str = "its") -> bool:
-    """Say whether a lens is a fisheye: what the file names, else what is given."""
+    """Say whether a lens is a fisheye: as its file says, else as the user says."""
     is_named_fisheye = is_fisheye_lens(names, owner)
     if is_fisheye and is_named_fisheye is False:
         raise InputError(

@@ -44,7 +44,7 @@ def find_two_views(image: Float[Tensor, "3 h w"]) -> Arrangement | None:
 
 
 def _likeness(first_half: Tensor, second_half: Tensor) -> float:
-    """Correlate small copies of both halves at the shift that suits best."""
+    """Give the correlation of small copies of both halves, at the shift where it is largest."""
     small_copies: list[Tensor] = []
     for half in (first_half, second_half):
         grey = grey_of(half).float()[None, None]
@@ -61,7 +61,7 @@ def _likeness(first_half: Tensor, second_half: Tensor) -> float:
 
 
 def _centred(grey: Tensor) -> Tensor:
-    """Take away the mean of each row and column: a bright sky above a road is in every half."""
+    """Subtract the mean of each row and column: bright sky above a road is common to all halves."""
     return grey - grey.mean(0) - grey.mean(1, keepdim=True) + grey.mean()
 
 

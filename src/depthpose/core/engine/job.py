@@ -279,7 +279,7 @@ class RayEngine:
 
 
 class _Worker:
-    """What Ray runs: a runner that lives as long as its process."""
+    """What a worker of Ray runs; it keeps its runner for all its blocks."""
 
     def __init__(self, shipped: list[Any], out: str) -> None:
         self._runner = Runner(_import_ray().get(shipped[0]), out)
@@ -290,7 +290,7 @@ class _Worker:
 
 
 def _import_ray() -> Any:  # noqa: ANN401  Ray is loaded where it is used
-    """Import Ray, which sends no statistics of its use unless it is set to."""
+    """Import Ray, with its statistics of use switched off unless the user switched them on."""
     os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
     import_extra("ray.data", "ray[data]", "ray", "--engine ray")
     ray = import_module("ray")

@@ -246,7 +246,7 @@ class Inputs:
 
 
 def _samples(block: Block, wanted: Files, scratch: Path) -> Iterator[Sample]:
-    """Bring the inputs of a block here; the members of a tar shard's share a key, as neighbours."""
+    """Make the files of inputs local; in a tar shard, neighbours with one key are an input."""
     for item in block.items:
         try:
             sample = Sample(item.name, tuple(stores.local_copy(url, scratch) for url in item.files))

@@ -214,7 +214,7 @@ def _read_text(path: AnyPath) -> Cloud:
 
 
 def _rows_of(text: Iterable[str], noted: list[str]) -> Iterator[str]:
-    """Give rows without comments, which go to ``noted`` as far as they stand before the first."""
+    """Give rows without comments; comments before the first row are added to ``noted``."""
     is_begun = False
     for line in text:
         if line.isspace():
@@ -230,7 +230,7 @@ def _rows_of(text: Iterable[str], noted: list[str]) -> Iterator[str]:
 
 
 def _blank_separated(path: AnyPath, head: list[str], names: list[str]) -> Callable[[str], str]:
-    """Understand by the first rows what commas mean; give what makes blanks of separators."""
+    """Tell from the first rows what commas mean; give a function that blanks separators."""
     text = " ".join(head)
     words = [re.split(r"[\s;]+", row.strip(" ;,")) for row in head]
     commas = [word.rstrip(",").count(",") for row in words for word in row]

@@ -231,7 +231,7 @@ def _read_in_shard(shard: Path, name: str, most: int) -> bytes:
 
 @lru_cache(maxsize=4096)
 def _places(shard: Path, _changed_ns: int, _size: int) -> dict[str, tuple[int, int]]:
-    """Say where each file of a shard begins, and how many bytes it has."""
+    """Give offset and size [bytes] of each file of a shard."""
     try:
         with tarfile.open(shard, "r:") as tar:
             return {m.name: (m.offset_data, m.size) for m in tar if m.isfile() and not m.sparse}
@@ -489,7 +489,7 @@ def find_partners(first: Sequence[str], second: Sequence[str], sides: str) -> li
 
 
 def _own_parts(first: Sequence[str], second: Sequence[str]) -> tuple[list[Any], list[Any]]:
-    """Take from each name what the names of its side share, and read numbers by value."""
+    """Remove from each name what all names of its side share, and read numbers by value."""
     split = [[re.split(r"(\d+)", name) for name in side] for side in (first, second)]
     if len(first) == len(second) == 1:
         numbers = [{int(piece) for piece in side[0][1::2]} for side in split]

@@ -104,7 +104,7 @@ def picture_tensor(image: Image.Image, name: AnyPath) -> Float32[Tensor, "3 h w"
 
 
 def _decoded(name: AnyPath, image: Image.Image) -> np.ndarray:
-    """Give RGB or grey, upright, of 8 or 16 bits."""
+    """Decode to RGB or grey of 8 or 16 bits, turned upright by EXIF."""
     turn = _UPRIGHT.get(_orientation(image))
     parts = [image]
     opened: Any = image  # a picture that is not of a file has neither
@@ -209,7 +209,7 @@ def _has_hole(data: bytes) -> bool:
 
 
 def _tensor_of(pixels: np.ndarray, name: AnyPath) -> Float32[Tensor, "3 h w"]:
-    """Bring pixels to RGB in [0, 1]: apart from decoding, during which warnings are silenced."""
+    """Convert pixels to RGB in [0, 1]; apart from decoding, where warnings are silenced."""
     # Channels are parted while a pixel is an integer: the floats are there once.
     planes = np.ascontiguousarray(pixels[None] if pixels.ndim == 2 else pixels.transpose(2, 0, 1))
     if planes.dtype.itemsize == 2:
@@ -278,7 +278,7 @@ _REPORTED: set[tuple[Path, str]] = set()  # folders, and what has been reported 
 
 
 def _is_new(name: AnyPath, what: str) -> bool:
-    """Whether this has not been reported of a folder before; it has from now on."""
+    """Whether this has not been reported of a folder yet; it counts as reported from now on."""
     key = Path(name).parent, what
     is_new = key not in _REPORTED
     _REPORTED.add(key)
@@ -500,7 +500,7 @@ def read_exif_focal(picture: AnyPath | Image.Image) -> tuple[float, str] | None:
 
 
 def _exif_focal(picture: Image.Image) -> tuple[tuple[float, str] | None, str]:
-    """Read the focal length, and why there is none though its tags are there."""
+    """Read the focal length; or say why there is none although its tags are present."""
     if picture.format == "PNG" and "exif" not in picture.info:
         return None, ""
     tags = picture.getexif().get_ifd(_EXIF_IFD)

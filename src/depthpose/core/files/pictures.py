@@ -44,7 +44,7 @@ def as_tensor(image: object, name: str = "the image") -> Float[Tensor, "3 h w"]:
 
 
 def _rgb(values: Tensor, sides: tuple[int, int], what: str) -> Float[Tensor, "3 h w"]:
-    """Bring three channels in [0, 1] to the front."""
+    """Move the channel axis to the front, as three channels in [0, 1]."""
     shape = tuple(values.shape)
     if values.ndim == 4 and shape[0] != 1:
         raise InputError(

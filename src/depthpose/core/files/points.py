@@ -203,7 +203,7 @@ def read_ply_elements(path: AnyPath, last: str | None = None) -> tuple[Columns, 
 def _binary_lists(
     path: AnyPath, body: memoryview, element: _Element, order: str
 ) -> tuple[dict[str, Ragged], int]:
-    """Read the lists of an element, rows of equal lists at once; say how many bytes it takes."""
+    """Read the lists of an element, rows of equal length at once; give the bytes read."""
     what = f"{element.count} {element.name}"
     steps = [(f, np.dtype(order + (f.size_code or "u1")), np.dtype(order + f.code))
              for f in element.fields]  # fmt: skip
@@ -388,7 +388,7 @@ def read_pcd(path: AnyPath) -> Columns:
 
 
 def _is_identity(viewpoint: str) -> bool:
-    """Whether a viewpoint, ``x y z qw qx qy qz``, says nothing; writers that know none put 0."""
+    """Whether a viewpoint, ``x y z qw qx qy qz``, moves nothing; writers without one put 0."""
     try:
         *moved, qw, qx, qy, qz = (float(word) for word in viewpoint.split())
     except ValueError:

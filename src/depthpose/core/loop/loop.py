@@ -407,5 +407,5 @@ def stop_requests() -> Iterator[list[tuple[int, float]]]:
 
 
 def _leave_process_group(_: int) -> None:
-    """Take a worker out of the job's process group: a killed worker would end the loop unsaved."""
+    """Leave the job's process group: a signal to it must not end workers before a save."""
     os.setsid()

@@ -78,7 +78,7 @@ def check_dataset(
 
 
 def _check_folder(folder: Path, frames: list[Frame]) -> Iterator[Problem]:
-    """Names that are there twice, mixed formats, right views alone, and maps of other names."""
+    """Find duplicate names, mixed formats, lone right views, and maps without an image."""
     path_of: dict[str, Path] = {}
     for frame in frames:
         if frame.name in path_of:
@@ -186,7 +186,7 @@ def _check_truth(
     *,
     is_depth: bool,
 ) -> Iterator[Problem]:
-    """Size and range of a map, and whether it is that of the pair's images."""
+    """Check size and range of a map, and whether it fits the images of its pair."""
     try:
         truth = read_depth(path)
     except InputError as error:
@@ -226,7 +226,7 @@ def _check_truth(
 
 
 def _agreement(disparity_px: Map, report: RectificationReport) -> tuple[float, int] | None:
-    """Share and number of matches that a map agrees with; None where it says too little."""
+    """Give share and number of matches that agree with a map; None where these are too few."""
     # Corners lie at edges, so a value within a window may be the one that a match saw.
     side = 2 * _TRUTH_RADIUS + 1
     padded = F.pad(disparity_px.float(), (_TRUTH_RADIUS,) * 4, value=float("nan"))

@@ -145,7 +145,7 @@ def _composed(
     rectify: Float64[np.ndarray, "3 3"],
     camera_from_velodyne: Float64[np.ndarray, "3 4"],
 ) -> Float64[np.ndarray, "3 4"]:
-    """LiDAR points to pixels; a 3x3 rotation or a 3x4 transform is extended to 4x4."""
+    """Compose the transform of LiDAR points to pixels; 3x3 and 3x4 parts are extended to 4x4."""
     turned = np.eye(4)
     moved = np.eye(4)
     turned[:3, :3] = rectify

@@ -326,7 +326,7 @@ LAYOUTS = {
 def _by_stem(
     folder: Path, suffixes: tuple[str, ...] = (*LISTED_SUFFIXES, *files.MAP_SUFFIXES)
 ) -> dict[str, Path]:
-    """List files by their names; of two suffixes the first one counts, in capitals or not."""
+    """List files by their stems; of two suffixes the first one counts, in capitals or not."""
     paths = sorted(_listed(folder, suffixes), key=lambda path: suffixes.index(path.suffix.lower()))
     return {stem_of(path): path for path in reversed(paths)}
 

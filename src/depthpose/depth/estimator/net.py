@@ -512,7 +512,7 @@ class FakestereoNet:
         sizes: list[tuple[int, int]],
         mount: MountFilter | None = None,
     ) -> list[DepthEstimate]:
-        """Estimate images whose virtual sizes are the same, one after the other in time."""
+        """Estimate single images of one virtual size together; with ``mount``, frames in order."""
         judged = self.judge(images, sizes)
         assert self.synthesiser is not None, "judge needs it"
         rig = self.synthesiser.config

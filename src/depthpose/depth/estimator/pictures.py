@@ -166,7 +166,7 @@ def pipeline(
 
 
 def _opened(picture: Picture, timeout: float | None) -> Picture:
-    """Open an address or base64 text as transformers does; anything else stays as it is."""
+    """Open an address or base64 text as transformers does; return anything else unchanged."""
     if not isinstance(picture, str) or os.path.isfile(picture):  # noqa: PTH113  long text is no path
         return picture
     is_address = picture.startswith(("http://", "https://"))

@@ -98,7 +98,7 @@ class ConvexUpsampling(nn.Module):
 def _moved(
     right: Float[Tensor, "b c h2 w2"], shift: Float[Tensor, "b h2 w2"]
 ) -> Float[Tensor, "b c h2 w2"]:
-    """Give each pixel of the left view what lies ``shift`` to the left of it in the right one."""
+    """Give for each left pixel the features ``shift`` pixels to the left in the right view."""
     lines = torch.arange(right.shape[2], device=right.device).float()
     columns = torch.arange(right.shape[3], device=right.device).float()
     # The last index as a tensor: the exporter to ONNX takes no quotient of unknown sizes.
@@ -155,7 +155,7 @@ class Refinement(nn.Module):
 
 
 def _neighbours(quarter: Quarter) -> Float[Tensor, "b 9 h2 w2"]:
-    """Give the nine neighbours at 1/4 of each pixel at half size."""
+    """Give for each pixel at half size the nine neighbours at a quarter of the size."""
     h, w = quarter.shape[1:]
     padded = F.pad(quarter[:, None], (1, 1, 1, 1), mode="replicate")
     near = [padded[:, :, y : y + h, x : x + w] for y, x in product(range(3), repeat=2)]

@@ -134,7 +134,7 @@ class TrainingPairs:
         return cached._replace(left=cached.left.float() / 255, right=cached.right.float() / 255)
 
     def _read(self, index: int) -> TrainingPair:
-        """Read a pair and its truth where one is asked for; 0 in the sky, where known."""
+        """Read a pair, and its truth if it is needed; 0 in the sky, where that is known."""
         source, number, kind = self._places[index]
         left_px = right_px = None
         name = source.frames[number].name if isinstance(source, Dataset) else f"street {number}"

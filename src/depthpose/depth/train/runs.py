@@ -266,7 +266,7 @@ def _write_weights(
 def _at_virtual_focal(
     config: _OfGenerator, generator: GeneratorConfig | SelectionConfig
 ) -> _OfGenerator:
-    """Bring all pairs, those held out too, to the rig that the generator imitates."""
+    """Bring all pairs, the held-out ones too, to the rig that the generator imitates."""
     focal_px = generator.virtual_focal_px
     sources = ("pairs", "more", "held_out")
     pair_sources = {
