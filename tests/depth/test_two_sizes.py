@@ -49,7 +49,7 @@ def test_an_average_is_as_sure_as_the_first() -> None:
     found = average([seen(4.0, 0.9, 0.7), seen(9.0, 0.3, 0.2)], [80.0, 40.0])
     torch.testing.assert_close(found.disparity_px, torch.full((1, 2, 3), 6.0))
     torch.testing.assert_close(found.sky, torch.full((1, 2, 3), 0.6))
-    torch.testing.assert_close(found.sure, torch.full((1, 2, 3), 0.7))
+    torch.testing.assert_close(found.confidence, torch.full((1, 2, 3), 0.7))
     alone = average([seen(35.0, 0.9, 0.7), seen(9.0, 0.3, 0.2)], [80.0, 40.0])
     torch.testing.assert_close(alone.disparity_px, torch.full((1, 2, 3), 35.0))
     torch.testing.assert_close(alone.sky, torch.full((1, 2, 3), 0.9))

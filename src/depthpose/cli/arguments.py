@@ -81,7 +81,7 @@ class Option(NamedTuple):
 def parser_of(
     command: Callable[..., int],
 ) -> tuple[Callable[..., BoundArguments], list[Option]]:
-    """Give tyro what parses a command's arguments, with option types in words, and its options."""
+    """Make the parser of a command for tyro, with its options."""
     hints = get_type_hints(command, include_extras=True)
     shape = signature(command)
     options: list[Option] = []
@@ -204,7 +204,7 @@ def refuse_below(least: int, option: str, value: int, usual: str) -> None:
 
 
 def changed(config: Config, **values: object) -> Config:
-    """Give a config with other values; None leaves a setting as it is."""
+    """Return a config with other values; None leaves a setting as it is."""
     return replace(config, **{k: v for k, v in values.items() if v is not None})
 
 

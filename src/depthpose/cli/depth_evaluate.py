@@ -39,12 +39,12 @@ from depthpose.report import page
 from depthpose.report.depth import depth_section
 from depthpose.report.page import Section
 
-_SAID_ABOVE = ("method", "input", "speed", "weights", "protocol", "dataset")
+_IN_THE_TABLE = ("method", "input", "speed", "weights", "protocol", "dataset")
 """Columns that the title of a frame's part of the page says already."""
 
 
 def open_frames(data: Path, split: str | None) -> Dataset:
-    """Open the dataset and say what it is."""
+    """Open the dataset and print what it is."""
     dataset = open_dataset(data, split)
     print(f"{dataset.name}: {len(dataset)} frames, layout {dataset.layout}")
     return dataset
@@ -90,7 +90,7 @@ class _Unchecked:
 
 
 def choose_methods(options: MethodOptions, config: MatcherConfig, dataset: Dataset) -> list[Method]:
-    """Build what is measured on a dataset: SGBM, weights and baselines, in this order."""
+    """Build the methods that are measured: SGBM, weights and baselines, in this order."""
     chosen: list[Method] = []
     if options.matcher == "sgbm":
         is_filled = options.holes == "fill"
@@ -205,7 +205,7 @@ def measure(
             index = places[row.frame or ""]
             estimate, error = frame_result(dataset, index, folder, protocol, row.cap_m)
             pair = dataset.read_input(index)
-            columns = {name: v for name, v in row.columns().items() if name not in _SAID_ABOVE}
+            columns = {name: v for name, v in row.columns().items() if name not in _IN_THE_TABLE}
             title = f"{folder.name}: {row.frame}, {role}"
             sections.append(
                 replace(depth_section(title, pair, estimate, text, error=error), rows=[columns])

@@ -154,7 +154,7 @@ class PredictOutput:
 
 @dataclass(frozen=True, kw_only=True)
 class MethodOptions:
-    """What is measured; several at once share the table."""
+    """The methods that are measured; several share one table."""
 
     weights: tuple[WeightsName, ...] = ()
     """files or names. Weights with a generator are given the left view alone; 'both:NAME' gives

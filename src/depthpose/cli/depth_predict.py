@@ -163,7 +163,7 @@ class MethodSource:
 
 
 def read_lens(options: LensOptions, sources: Sequence[Path]) -> Camera | FieldOfView | float:
-    """Read what the user knows of the camera; without any of it the EXIF of the images is asked."""
+    """Read the camera of the options; without one, the EXIF of the images."""
     focal_px = options.focal_px
     fov = options.fov
     if focal_px is not None and not 1 < focal_px < 1e6:
@@ -225,7 +225,7 @@ def image_work(
     method: MethodSource,
     sources: Sequence[Path],
 ) -> "DepthWork":
-    """Say what is done with single images, whose camera may be known by them alone."""
+    """Describe the work on single images, whose EXIF may be the only source of their camera."""
     camera = read_lens(lens, sources)
     return DepthWork(method=method, camera=camera, scale=scale, output=output)
 
@@ -233,7 +233,7 @@ def image_work(
 def pair_work(
     camera: Path, pairs: PairNetworks, method: MethodSource, files: Sequence[Path]
 ) -> "DepthWork":
-    """Say what is done with pairs, of which the first may say the size for the camera's file."""
+    """Describe the work on pairs; the first gives the size if the camera's file has none."""
     rig = read_rig(camera, image_size(files[0]))
     output = PredictOutput(cloud=pairs.cloud, min_confidence=pairs.min_confidence)
     return DepthWork(method=method, camera=rig, output=output, with_check=pairs.check, files=PAIRS)
@@ -306,7 +306,7 @@ class DepthWork:
         return StereoInput(name=name, left=image, right=other, camera=camera)
 
     def jobs_of(self, files: Sequence[Path]) -> Iterator[Job[StereoInput]]:
-        """Give the one job of an image or a pair, or that of every frame of a video."""
+        """Give the job of an image or a pair, or the jobs of all frames of a video."""
         if not _is_video(files[0]):
             name = files[0].stem
             yield Job(name=name, read=partial(self.input_of, name, *files))
@@ -339,7 +339,7 @@ class DepthWork:
             return error
 
     def settings(self, method: dict[str, Any]) -> dict[str, Any]:
-        """Give what decides the results, as JSON values, for the record of a run."""
+        """Give the JSON values that decide the results, for the record of a run."""
         camera: dict[str, Any] = {"focal_px": self.camera}
         if isinstance(self.camera, FieldOfView):
             camera = {"fov_deg": self.camera.degrees}

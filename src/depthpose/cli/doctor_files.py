@@ -56,7 +56,7 @@ class FileFacts:
 
 
 def look_at_all(paths: Sequence[Path]) -> int:
-    """Print what each file is and what is odd; give the exit code."""
+    """Print what each file is and what is odd about it; give the exit code."""
     # What has a size comes first: a camera file may need it.
     words = cameras.CAMERA_SUFFIXES
     ordered = sorted(paths, key=lambda path: path.is_dir() or path.suffix.lower() in words)

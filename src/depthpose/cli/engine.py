@@ -53,7 +53,7 @@ class EngineOptions:
     def run(
         self, work: "Work", inputs: "Inputs", out: str, settings: dict[str, Any]
     ) -> "Sequence[Done]":
-        """Do the work on all inputs, and give what is done."""
+        """Do the work on all inputs, and give the records of its shards."""
         from depthpose.core.engine import ShardedJob, run_job
 
         job = ShardedJob(

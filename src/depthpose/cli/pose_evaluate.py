@@ -45,7 +45,7 @@ _SHOWN = ("method", "masks", "object", "instances", "success", "wrong", "refused
 def open_instances(
     bop: Path, split: str, objects: Sequence[str], targets: Path | None
 ) -> BopDataset:
-    """Open what is to be measured, and say what it is."""
+    """Open the instances that are measured, and print what they are."""
     dataset = open_bop(bop, split)
     if targets is not None:
         dataset = of_targets(dataset, read_targets(targets, bop))

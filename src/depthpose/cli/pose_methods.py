@@ -40,7 +40,7 @@ from depthpose.pose.weights import read_pose_weights
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Masks:
-    """Which pixels a method is given: what to call them, and the jobs that they make."""
+    """The pixels that a method is given: their name in tables, and the jobs that they make."""
 
     name: str
     jobs: Callable[[Mapping[int, str]], list[predictions.PoseJob[ViewInput]]]
@@ -85,7 +85,7 @@ def mask_path(kind: str) -> Path | None:
 
 
 def named_file(path: Path) -> str:
-    """Name a file with the start of its SHA-256: another one of that name is another name."""
+    """Name a file with the start of its SHA-256, so that another file of that name differs."""
     try:
         return f"{path.name} {file_sha256(path)[:12]}"
     except OSError as error:
@@ -93,7 +93,7 @@ def named_file(path: Path) -> str:
 
 
 def of_dataset(dataset: datasets.BopDataset) -> dict[str, Any]:
-    """Settings that say which data set results are of, wherever its folder lies."""
+    """Give the settings that identify a data set, wherever its folder lies."""
     return {
         "dataset": dataset.folder.resolve().name,
         "split": dataset.split,
@@ -472,7 +472,7 @@ def _rigid_of(text: str, source: str, what: str) -> Rigid:
 def chosen_objects(
     dataset: datasets.BopDataset, method: PoseMethod, object: str | None
 ) -> datasets.BopDataset:
-    """Keep the objects of a data set that the weights know, and say others; or the one named."""
+    """Keep the objects of a data set that the weights know, or the one named; print the others."""
     numbers = {model.name: model.number for model in method.models}
     if object is not None:
         is_theirs = object in datasets.object_names(dataset.folder).values()

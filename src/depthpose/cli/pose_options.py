@@ -93,7 +93,7 @@ class FirstOptions:
 
 @dataclass(frozen=True, kw_only=True)
 class MoreOptions:
-    """What else is known of the objects and the images."""
+    """More about the objects and the images."""
 
     detections: Source | None = None
     """boxes or masks of a detector: .json of COCO or BOP, .txt of YOLO, or a folder of such files
@@ -133,7 +133,7 @@ class OneObjectOptions(FirstOptions, MoreOptions):
 
     @property
     def has_regions(self) -> bool:
-        """Whether it is said where objects are in the depth images."""
+        """Whether masks, boxes or detections are given."""
         return self.mask is not None or bool(self.box) or self.detections is not None
 
 
@@ -234,7 +234,7 @@ class RegisterOptions:
 
     @property
     def is_register(self) -> bool:
-        """Whether poses are registered: that is said, or CAD files are given."""
+        """Whether poses are registered: by --method, or because CAD files are given."""
         return self.method == "register" or (self.method is None and bool(self.cad))
 
 

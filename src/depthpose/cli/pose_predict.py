@@ -87,7 +87,7 @@ from depthpose.report.page import Section, choose_answers, plain_table, write_pa
 _PAGE = "report.html"
 _WITH_ALTERNATIVES = "depthpose-alternatives"  # the method of a csv that has them too
 _MOST_SHOWN = 20  # of the answers, on the terminal; poses.json holds all
-_SAID = 5  # of so many inputs the alternatives are printed; of all they are in poses.json
+_MOST_PRINTED = 5  # inputs whose alternatives are printed; poses.json holds those of all
 _MOST_ROWS = 1000  # of the answers, in the table of the page
 _PRINTED = ("input", "object", "status", "x, y, z [m]", "qx, qy, qz, qw", "base x, y, z [m]",
             "base qx, qy, qz, qw", "agreement", "certainty", "of this copy", "identity",
@@ -155,14 +155,14 @@ def object_named(name: str | None, method: PoseMethod) -> str:
 
 
 def camera_facts(camera: Path | float) -> dict[str, Any]:
-    """Give what of a camera file, or a focal length, decides the poses, for the record of a run."""
+    """Give the values of a camera file or a focal length that decide the poses, for the record."""
     if not isinstance(camera, Path):
         return {"focal_px": camera}
     return {"camera": str(camera.resolve()), "camera_sha256": file_sha256(camera)}
 
 
 def cloud_jobs(cloud: Path, unit: Unit, object: str, out: Path) -> list[PoseJob[Any]]:
-    """Take a cloud, or every one of a folder."""
+    """Make a job of a cloud, or of every cloud of a folder."""
     suffixes = tuple(CLOUD_READERS)
     files = [cloud]
     if cloud.is_dir():
@@ -257,7 +257,7 @@ def box_jobs(
     unit: Unit | None,
     out: Path,
 ) -> list[PoseJob[Any]]:
-    """Take boxes of one object in a depth image: NAME, or of several NAME_1, NAME_2, ..."""
+    """Make a job of each box in a depth image: NAME, or of several NAME_1, NAME_2, ..."""
     depths = _list_depths(depth)
     refuse_among_inputs(out, [depth], depths)
     if len(depths) > 1:
@@ -311,7 +311,7 @@ def detection_jobs(
         jobs += _detection_jobs(path, of_image, (path, beside[path.stem]), camera, unit)
         empty += [] if of_image else [path.stem]
     if empty:
-        shown = ", ".join(empty[:_SAID]) + (", ..." if len(empty) > _SAID else "")
+        shown = ", ".join(empty[:_MOST_PRINTED]) + (", ..." if len(empty) > _MOST_PRINTED else "")
         message = f"nothing is detected in {len(empty)} of {len(depths)} depth images: {shown}"
         print(f"depthpose: {message}", file=sys.stderr)
     if not jobs:
@@ -684,9 +684,9 @@ def say_result(predictions: list[Prediction], out: Path, inputs: int | None = No
         what = "refused" if shown[0].camera_from_model is None else shown[0].status
         print(f"{what}: {shown[0].reason}")
     refused = [estimate for estimate in shown if not estimate.is_posed]
-    for estimate in refused[:_SAID] if len(shown) > 1 else ():
+    for estimate in refused[:_MOST_PRINTED] if len(shown) > 1 else ():
         print(f"{estimate.name}: no {estimate.object}: {estimate.reason}")
-    for prediction in predictions[:_SAID]:
+    for prediction in predictions[:_MOST_PRINTED]:
         for other in prediction.estimate.alternatives:
             print(f"{prediction.estimate.name}: {other}")
     counts = Counter(estimate.status for estimate in shown)

@@ -46,7 +46,7 @@ class TrainingOptions:
     def read(
         self, path: Path | None, kind: type, default: object = None, workers: int | None = None
     ) -> Any:  # noqa: ANN401 - an instance of kind
-        """Read the config of a training, or take its defaults, with what was said here."""
+        """Read the config of a training, or take its defaults, and apply these options."""
         from depthpose.core.config import read_config
         from depthpose.core.loop import AdamConfig
 
@@ -113,7 +113,7 @@ class TrainingOptions:
 
 @dataclass(kw_only=True)
 class Lines:
-    """A line a minute, for a log: the first step, the last, and what is left between them."""
+    """Prints a line a minute for a log, and the first and the last step."""
 
     every_s: float = 60.0
     clock: Callable[[], float] = time.monotonic

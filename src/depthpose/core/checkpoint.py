@@ -57,7 +57,7 @@ class LicenceNotice(Notice):
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Checkpoint:
-    """What a weights file holds."""
+    """The contents of a weights file."""
 
     kind: str  #: which network the weights belong to, e.g. ``psmnet``
     config: Mapping[str, Any]  #: of that network, as ``config_to_dict`` gives it
@@ -273,7 +273,7 @@ class _WithoutDrawing(TorchFunctionMode):
 
 
 def misfits(wanted: Mapping[str, Tensor], tensors: Mapping[str, Tensor]) -> list[str]:
-    """Say in order of the names which tensors are missing, unexpected or of another shape."""
+    """List the tensors that are missing, unexpected or of another shape, by name."""
     problems = [f"{name} is missing" for name in wanted.keys() - tensors.keys()]
     problems += [f"{name} is unexpected" for name in tensors.keys() - wanted.keys()]
     problems += [

@@ -87,7 +87,7 @@ def draw_lines(
     color: tuple[float, float, float],
     dash_px: float | None = None,
 ) -> Float[Tensor, "3 h w"]:
-    """Draw lines two pixels wide; what lies outside is cut, a line with a NaN end left out.
+    """Draw lines two pixels wide, clipped to the picture; a line with a NaN end is not drawn.
 
     Args:
         image: what they are drawn on; it is not changed.

@@ -25,7 +25,7 @@ class MissingExtraError(ImportError):
 
 
 def install_command(extra: str) -> str:
-    """Say how an extra is installed; the package index has no release yet."""
+    """Give the command that installs an extra; the package index has no release yet."""
     clone = f"pip install -e '.[{extra}]' in the clone of depthpose"
     return f"{clone}, or pip install 'WHEEL[{extra}]' with the file of the wheel"
 
@@ -42,7 +42,7 @@ _OF_MEMORY = re.compile(
 
 
 def full_memory(error: BaseException) -> str | None:
-    """Say that the memory is full, whichever library raised it, and what to do; else None."""
+    """Give the message of an out-of-memory error of any library, with the remedy; else None."""
     if not isinstance(error, MemoryError) and _OF_MEMORY.search(str(error)) is None:
         return None
     cause = " ".join(str(error).split())[:200] or "no more is given"
@@ -96,7 +96,7 @@ def refuse_unknown(what: str, name: object, names: Iterable[str]) -> None:
 
 
 def nearest_name(name: str, candidates: Iterable[str]) -> str:
-    """Say which known name was probably meant, and list them all: the tail of an error message.
+    """Give the end of an error message: the name that was probably meant, and all names.
 
     Returns:
         ``did you mean 'x'? Known: 'a', 'x'.``, or only the list where nothing is near.

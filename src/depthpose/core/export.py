@@ -30,7 +30,7 @@ Shape = Sequence[int | str]  # text names a side that is known only when the gra
 
 
 def import_export() -> Any:  # noqa: ANN401  what protobuf generates carries no types
-    """Import ONNX, and make sure that what goes with it is there too."""
+    """Import ONNX, and check that the packages that it needs are installed."""
     parts = ("onnx.compose", "onnx.inliner", "onnx.numpy_helper", "onnxscript", "onnxruntime")
     for name in ("onnx", *parts):
         import_extra(name, "onnx, onnxruntime and onnxscript", "export", "export")

@@ -11,7 +11,7 @@ _LFS_POINTER = b"version https://git-lfs"
 
 @dataclass(frozen=True, kw_only=True)
 class Problem:
-    """One thing that is wrong, or worth knowing."""
+    """One fault of a data set, or a fact worth knowing."""
 
     path: Path  #: the file or folder
     kind: str  #: ``missing``, ``unreadable``, ``mismatch``, ``empty`` or ``note``
@@ -20,7 +20,7 @@ class Problem:
 
 @dataclass(frozen=True, kw_only=True)
 class CheckReport:
-    """What the check of a folder found."""
+    """The result of checking a folder."""
 
     layout: str  #: the layout that was recognised
     counts: dict[str, int]  #: how many frames, and how many of them have each part
@@ -41,7 +41,7 @@ class CheckReport:
 
 
 def make_report(layout: str, counts: dict[str, int], remarks: list[Problem]) -> CheckReport:
-    """Part what is wrong from what is only worth knowing."""
+    """Separate faults from facts that are only worth knowing."""
     return CheckReport(
         layout=layout,
         counts=counts,
@@ -51,7 +51,7 @@ def make_report(layout: str, counts: dict[str, int], remarks: list[Problem]) -> 
 
 
 def unreadable(path: Path, error: InputError) -> Problem:
-    """Say that a file cannot be read, and why: a Git LFS pointer is the commonest reason."""
+    """Describe a file that cannot be read, and why: mostly it is a Git LFS pointer."""
     message = str(error).removeprefix(f"{path}: ")
     with suppress(OSError), path.open("rb") as file:
         if file.read(len(_LFS_POINTER)) == _LFS_POINTER:

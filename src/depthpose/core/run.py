@@ -89,7 +89,7 @@ def lock_folder(folder: Path, *, is_shared: bool, timeout_s: float = 10.0) -> bo
 
 
 def held_folders() -> frozenset[Path]:
-    """Give the folders that this process holds."""
+    """Give the folders that this process has locked."""
     return frozenset(_locks)
 
 
@@ -156,7 +156,7 @@ def wait_for(
 
 
 def environment() -> dict[str, str]:
-    """Say what a number was measured with: versions, device, threads, commit, date."""
+    """Give what a number was measured with: versions, device, threads, commit, date."""
     facts = {"date": datetime.now(UTC).strftime("%Y-%m-%d"), "python": platform.python_version()}
     for name in _PACKAGES:
         with suppress(PackageNotFoundError):
@@ -311,7 +311,7 @@ def read_sources(folder: Path) -> dict[str, list[str]]:
 
 
 def refuse_to_replace(path: Path) -> None:
-    """Refuse to write one file over another that is there already.
+    """Refuse to write over a file that exists.
 
     Raises:
         InputError: there is one.
@@ -380,7 +380,7 @@ _read: dict[Path, tuple[int, int, dict[str, dict[str, Any]]]] = {}
 
 
 def note_result(folder: Path, name: str, files: Iterable[Path]) -> None:
-    """Remember that a result is finished, and its files; none: that it is to be made again."""
+    """Record that a result is finished, with its files; with none, that it is to be made again."""
     stats = {file.relative_to(folder).as_posix(): file.stat() for file in files}
     stamps = {file: [status.st_size, status.st_mtime_ns] for file, status in stats.items()}
     # In one piece, and apart from what a killed process may have left of its last line.
@@ -391,7 +391,7 @@ def note_result(folder: Path, name: str, files: Iterable[Path]) -> None:
 
 
 def is_whole(folder: Path, name: str, needed: Collection[str]) -> bool:
-    """Whether a result is there, and every file of it as it was written, by size and time.
+    """Whether a result exists, and every file of it is as it was written, by size and time.
 
     Args:
         folder: of the results.

@@ -21,7 +21,7 @@ from depthpose.depth.types import View
 
 
 def degrade(image: View, config: DegradeConfig, generator: torch.Generator) -> View:
-    """Change colours and sharpness of an image at random; where things are stays as it is.
+    """Change colours and sharpness of an image at random, but not where things are.
 
     Args:
         image: RGB in [0, 1].
@@ -219,7 +219,7 @@ def jitter_colors(pair: TrainingPair, strength: float, generator: torch.Generato
 def set_apart(
     pair: TrainingPair, config: AugmentConfig, generator: torch.Generator
 ) -> TrainingPair:
-    """Change each view on its own, as two real cameras differ; disparity stays what it is."""
+    """Change each view on its own, as two real cameras differ; disparity does not change."""
     if config.per_view is not None:
         left, right = (
             degrade(view, config.per_view, generator) for view in (pair.left, pair.right)

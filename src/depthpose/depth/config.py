@@ -183,7 +183,7 @@ Speed = Literal["quick", "fine"]
 
 @dataclass(frozen=True, kw_only=True)
 class NetworkConfig(Settings):
-    """What every stereo network says of itself."""
+    """What every stereo network declares."""
 
     max_disparity_px: int = 192
     """Disparities below this are considered; a multiple of ``step_px``."""

@@ -315,20 +315,20 @@ class _InvertedResidual(nn.Module):
 
 @dataclass(frozen=True, eq=False)
 class Selected:
-    """What the distributions say of one view, at the size of the image."""
+    """What the distributions over shifts say of one view, at the size of the image."""
 
     disparity_px: Maps  #: the expectation in the logarithm, sky left out
     sky: Maps  #: probability of the sky
-    sure: Maps  #: probability of what lies within 15 % of the disparity, sky left out
+    confidence: Maps  #: probability of what lies within 15 % of the disparity, sky left out
     #: probability that the image shows a street; None where the weights do not say
     street: Float[Tensor, " b"] | None = None
 
 
 def average(views: Sequence[Selected], limits_px: Sequence[float]) -> Selected:
-    """Give the mean of what was found in one view at several sizes, as sure as the first.
+    """Average the estimates of one view at several sizes; the confidence is that of the first.
 
-    The means over sizes err less. How sure the first is ranks their errors better than the mean of
-    all (AUSE 0.34 and 0.41 of chance).
+    The mean over sizes has the smaller error; the confidence of the first size ranks these errors
+    better than a mean of confidences (AUSE 0.34 and 0.41 of chance).
 
     Args:
         views: at one size; where the disparity of the first comes near the limit of another, that
@@ -343,14 +343,17 @@ def average(views: Sequence[Selected], limits_px: Sequence[float]) -> Selected:
     shares = shares / shares.sum(0)
     log_px = torch.stack([view.disparity_px.log() for view in views])
     sky = torch.stack([view.sky for view in views])
-    return Selected((shares * log_px).sum(0).exp(), (shares * sky).sum(0), first.sure, first.street)
+    return Selected(
+        (shares * log_px).sum(0).exp(), (shares * sky).sum(0), first.confidence, first.street
+    )
 
 
 def read_logits(logits: Logits, planes: Planes) -> tuple[Tensor, Tensor, Tensor]:
-    """Give the log of disparity, the sky, and what lies near that disparity, sky left out.
+    """Give the log of disparity, the probability of sky, and the confidence of the disparity.
 
-    Each (b, rows, columns), at the size of the logits. The mean of disparity itself would be drawn
-    to the near: one plane at 88 px outweighs many at 2 px.
+    Each (b, rows, columns), at the size of the logits; the confidence is the probability of planes
+    near the disparity, without the sky. The mean is taken of logarithms: in the mean of disparity
+    itself, one plane at 88 px would outweigh many at 2 px.
     """
     logits = logits.float()
     shares = logits[:, 1:].softmax(1)
@@ -360,7 +363,7 @@ def read_logits(logits: Logits, planes: Planes) -> tuple[Tensor, Tensor, Tensor]
 
 
 def shift_left(left: Views, right_px: Maps) -> Views:
-    """Draw the right view by one shift a pixel: ``left`` looked up at ``x + disparity``.
+    """Synthesise the right view by one shift a pixel: ``left`` sampled at ``x + disparity``.
 
     Beyond the border the border repeats. A mixture of shifts has the lower L1, but ghosts, which
     no matcher can match.
@@ -460,7 +463,9 @@ class SelectionSynthesiser:
         return SynthesisedViews(
             right=right.to(home),
             disparity_px=of_left.disparity_px.to(home),
-            confidence=torch.where(is_sky, of_left.sky, of_left.sure * (1 - of_left.sky)).to(home),
+            confidence=torch.where(is_sky, of_left.sky, of_left.confidence * (1 - of_left.sky)).to(
+                home
+            ),
             is_sky=is_sky.to(home),
             street=None if of_left.street is None else of_left.street.to(home),
         )
@@ -522,11 +527,11 @@ def select_views(
     planes = generator.planes * (size[1] / columns)
     views = []
     for logits, street in zip(cropped, (generator.find_street(features[-1]), None), strict=True):
-        log_px, sky, sure = (
+        log_px, sky, confidence = (
             F.interpolate(part[:, None], size, mode="bilinear")[:, 0]
             for part in read_logits(logits, planes)
         )
-        views.append(Selected(log_px.exp(), sky, sure, street))
+        views.append(Selected(log_px.exp(), sky, confidence, street))
     return views[0], views[1]
 
 
@@ -592,7 +597,7 @@ def import_encoder(file: Path, out: Path) -> None:
 
 
 def load_encoder(encoder: LiteEncoder, path: Path) -> None:
-    """Give an encoder of full width the weights of a file, as far as it reaches.
+    """Load weights of a full-width encoder, for as many layers as this one has.
 
     The file is one that :func:`import_encoder` wrote.
     """

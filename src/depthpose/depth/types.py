@@ -70,7 +70,7 @@ class RawFrame:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Match:
-    """What a stereo matcher answers for one pair."""
+    """What a stereo matcher returns for one pair."""
 
     disparity_px: Map  #: disparity of the left image, dense or NaN where the matcher has no answer
     #: 0 (guess) to 1 (sure), from the matching distribution; None where the matcher has no
@@ -129,7 +129,7 @@ class DepthEstimate:
     input: StereoInput | None = None
 
     def is_sure(self, min_confidence: float | None = None) -> Mask:
-        """Say which pixels have a depth that is as sure as that.
+        """Give the pixels whose depth has at least this confidence.
 
         Args:
             min_confidence: 0..1; None: 0.5 of a pair, where it says that the disparity is more

@@ -34,7 +34,7 @@ _ROUNDING = 0.5 / 255
 
 
 def without_picture(image: Float[Tensor, "3 h w"]) -> Bool[Tensor, "h w"]:
-    """Find the borders in which there is no picture.
+    """Find borders that show nothing, such as those of rectification.
 
     These are bars of one colour along whole sides (letterboxes), dark or at two opposite sides, and
     black regions along the border, as rectification leaves them.
@@ -107,7 +107,7 @@ def _bars(image: Float[Tensor, "3 _ _"]) -> tuple[int, int]:
 
 
 def texture(image: Float[Tensor, "3 h w"]) -> Float[Tensor, "h w"]:
-    """Say where something can be matched, from 0 to 1.
+    """Give how well each place can be matched, from 0 (plain) to 1.
 
     It is 0 where the patch around a pixel is plain, such as a wall or what is over-exposed, and 1
     where its grey values spread by more than rounding does.

@@ -125,7 +125,7 @@ def depth_section(
 def depth_facts(
     pair: StereoInput, estimate: DepthEstimate, focal: str = ""
 ) -> list[tuple[str, str]]:
-    """Say the sizes and the metres of an estimate; ``focal``: words behind the focal length."""
+    """List sizes and metres of an estimate; ``focal``: words behind the focal length."""
     camera = pair.camera
     depth_m = estimate.depth_m
     height, width = pair.left.shape[1:]

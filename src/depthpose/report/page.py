@@ -129,7 +129,7 @@ _REFUSED = 2  # refusals shown at least, where there are so many
 
 
 def spread_evenly(total: int, number: int) -> list[int]:
-    """Choose so many of 0 .. total - 1, the middle of each equal part; all where there are fewer.
+    """Choose ``count`` of 0 .. total - 1, the middle of each equal part; all where there are fewer.
 
     None where ``number`` is 0.
     """
@@ -148,7 +148,7 @@ def choose_answers(is_ok: Sequence[bool]) -> list[int]:
 
 
 def choose_ranked(errors: Sequence[float], most: int = 3) -> list[tuple[str, int]]:
-    """Choose the worst, the median and the best of finite errors; at most so many, each once."""
+    """Choose the worst, the median and the best of finite errors; at most ``most``, each once."""
     order = sorted(range(len(errors)), key=errors.__getitem__)
     if len(order) <= 1:
         return [("only", place) for place in order][:most]

@@ -157,7 +157,7 @@ def vote_layer(
 
 
 def posed_cloud(cloud_m: Float[Tensor, "n 3"], pose: Rigid | None, model: ObjectModel) -> Cloud:
-    """Put the posed surface beside the cloud: what was seen is grey, the model blue.
+    """Join the observed cloud (grey) and the posed surface of the model (blue).
 
     Without a pose, the cloud alone.
     """
@@ -273,7 +273,7 @@ def pose_facts(
     method: str = "",
     agreeing: str = "votes or points that agree",
 ) -> list[tuple[str, str]]:
-    """Say what is known of an estimate besides its pose.
+    """List the facts of an estimate besides its pose.
 
     ``how``: by what it was found, if not empty; ``agreeing``: what its ``inlier_share`` is of.
     """
@@ -383,7 +383,7 @@ def pose_scene(
 def close_up(
     image: Float[Tensor, "3 h w"], mask: Bool[Tensor, "h w"], K: Float[Tensor, "3 3"]
 ) -> tuple[Float[Tensor, "3 _ _"], Float[Tensor, "3 3"]]:
-    """Cut out a square about what the mask shows and enlarge it to a panel, with its camera."""
+    """Cut out a square about the mask and enlarge it to a panel, with its camera."""
     rows, columns = mask.nonzero(as_tuple=True)
     if len(rows) == 0:
         return image, K

@@ -250,6 +250,6 @@ def _lidar(pair: StereoInput, lidar_m: Float[Tensor, "h w"] | None) -> list[Draw
 
 
 def shrink_to_width(image: Float[Tensor, "3 _ _"], width_px: int) -> Float[Tensor, "3 _ _"]:
-    """Scale a picture to a width, its proportions kept, every pixel an average."""
+    """Scale a picture to a width by area averaging, with its proportions kept."""
     height = max(1, round(image.shape[1] * width_px / image.shape[2]))
     return F.interpolate(image[None], (height, width_px), mode="area")[0]

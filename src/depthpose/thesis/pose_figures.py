@@ -238,7 +238,7 @@ def embed_line(features: Float[Tensor, "n c"], perplexity: float = 40.0) -> Floa
 def joint_probabilities(
     features: Float[Tensor, "n c"], perplexity: float
 ) -> Float64[Tensor, "n n"]:
-    """Say how near each pair is: Gaussian neighbourhoods of equal perplexity, made symmetric."""
+    """Give the similarity of each pair: Gaussian neighbourhoods of equal perplexity, symmetric."""
     x = features.double()
     squares = torch.cdist(x, x, compute_mode="donot_use_mm_for_euclid_dist").square()
     squares.fill_diagonal_(torch.inf)

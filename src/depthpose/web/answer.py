@@ -127,7 +127,7 @@ def refuse_large(name: str, width: int, height: int) -> None:
 
 
 def keep_file(folder: Path, field: str, sent_name: str, data: bytes) -> Path:
-    """Write a file that was sent, under its own name where that is harmless."""
+    """Write an uploaded file, under its own name where that is harmless."""
     if field not in KINDS:
         raise InputError(f"{field!r} is no file field of this page; known are {', '.join(KINDS)}")
     what, suffixes = KINDS[field]

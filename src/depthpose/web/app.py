@@ -128,7 +128,7 @@ class TookTooLong(Exception):  # noqa: N818  what happened
 
 
 def run_in_time(work: Callable[[], Result], most_s: float) -> Result:
-    """Compute in a thread, and stop it after so many seconds.
+    """Compute in a thread, and stop it after a time limit.
 
     It ends at the next step of Python's; one that is in a long call of a library then goes on
     beside what comes after it, until that call ends.
@@ -163,7 +163,7 @@ def run_in_time(work: Callable[[], Result], most_s: float) -> Result:
 
 @dataclass(frozen=True, eq=False)
 class Queue:
-    """Computations, one at a time; so many requests may wait for the one that is computed."""
+    """Computations, one at a time; a limited number of requests may wait for one."""
 
     most: int
     most_s: float  #: of one computation; it is stopped then
@@ -208,7 +208,7 @@ async def has_gone(receive: Receive) -> bool:
 
 
 def paced(receive: Receive) -> Receive:
-    """Give a request's body as long as it keeps a pace."""
+    """Give a request's body as long as it arrives fast enough."""
     start = time.monotonic()
     size = 0
 
@@ -457,7 +457,7 @@ class TimedProtocol(H11Protocol):
         self._wait_for_head()
 
     def data_received(self, data: bytes) -> None:
-        """Read on; what is half of a head changes nothing."""
+        """Read on; half of a head changes nothing."""
         super().data_received(data)
         self._wait_for_head()
 

@@ -37,7 +37,7 @@ _PHONE = 0.75
 
 
 def answer_depth(form: Form, net: FakestereoNet) -> Answer:
-    """Estimate what a form asks for."""
+    """Estimate depth for a form."""
     began = time.perf_counter()
     pair, focal = _input(form)
     near_m, far_m = (

@@ -56,7 +56,7 @@ class _Seen:
 
 
 def answer_pose(form: Form, net: GeoPoseNet) -> Answer:
-    """Pose what a form asks for."""
+    """Estimate poses for a form."""
     target = _target(form, net)
     pose_input = _input(form, target.model)
     name = pose_input.name

@@ -206,7 +206,7 @@ _BOP = ("fx", "fy", "cx", "cy")
 
 
 def facts_from_json(content: object) -> CameraFacts:
-    """Take the camera of a JSON file: ours, or one of those that we know."""
+    """Read the camera of a JSON file: ours, or a known one of other systems."""
     if not isinstance(content, dict) or not content.keys() <= set(_KEYS):
         facts = _foreign_facts(content)
         if facts is not None:
@@ -483,7 +483,7 @@ image's centre."""
 
 
 def camera_of(camera: AnyLens | None, size: Size) -> Camera | None:
-    """Make the camera of an image from what is known of it; None where nothing is.
+    """Make the camera of an image from what the caller knows; None where the caller knows nothing.
 
     Args:
         camera: what is known. A dict without width and height, a matrix and a focal length take
@@ -521,7 +521,7 @@ def camera_of(camera: AnyLens | None, size: Size) -> Camera | None:
 def choose_lens(
     camera: AnyLens | None, focal_px: float | None, fov_deg: float | None = None
 ) -> AnyLens | None:
-    """Give the one that was given; None where none was.
+    """Give the one of these arguments that is set; None where none is.
 
     Raises:
         InputError: several were, or the field of view is none.

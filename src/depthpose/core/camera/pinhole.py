@@ -244,7 +244,7 @@ _CORNER = 0.1
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class CameraFacts:
-    """Values of a camera file, before it is a camera: the image's size may be missing."""
+    """Values of a camera file before they are checked; the image's size may be missing."""
 
     kind: str  # of file, for errors
     K: Float[Tensor, "3 3"]
@@ -267,7 +267,7 @@ def facts_from_projections(
     right: Float64[np.ndarray, "3 4"] | None,
     size: Size | None = None,
 ) -> CameraFacts:
-    """Take the rectified projections of a pair, or of one camera, apart: ``P[0, 3] = -fx x``."""
+    """Read the rectified projections of a pair or of one camera: ``P[0, 3] = -fx x``."""
     K = torch.from_numpy(left[:, :3].copy())
     if right is None:
         return CameraFacts(kind=kind, K=K, size=size)
@@ -291,7 +291,7 @@ def facts_from_projections(
 
 
 def refuse_apart(left: Float64[np.ndarray, "3 _"], right: Float64[np.ndarray, "3 _"]) -> None:
-    """Refuse two matrices that are not those of one rectified pair: only cx may differ."""
+    """Refuse two matrices that are not of one rectified pair: only cx may differ."""
     within = {"fx": ((0, 0), _SAME_FOCAL * left[0, 0]), "fy": ((1, 1), _SAME_FOCAL * left[1, 1]),
               "cy": ((1, 2), _SAME_ROW_PX)}  # fmt: skip
     for name, (index, most) in within.items():
@@ -356,7 +356,7 @@ def camera_from_facts(facts: CameraFacts, size: Size | None) -> Camera:
 
 
 def make_camera(facts: CameraFacts, size: Size | None) -> Camera:
-    """Make a camera, or a rig where there is a baseline, without asking whether it is likely."""
+    """Make a camera, or a rig where there is a baseline, without checking that it is plausible."""
     image_size = facts.size or size
     if image_size is None:
         raise InputError(
@@ -372,7 +372,7 @@ def make_camera(facts: CameraFacts, size: Size | None) -> Camera:
 
 
 def camera_keys(camera: Camera) -> dict[str, Any]:
-    """Give what our JSON holds of a camera."""
+    """Give the values of a camera by the keys of our JSON."""
     keys: dict[str, Any] = {"width": camera.width, "height": camera.height, "K": camera.K.tolist()}
     if isinstance(camera, StereoRig):
         keys["baseline_m"] = camera.baseline_m
@@ -430,7 +430,7 @@ def refuse_outside(K: Float[Tensor, "3 3"], width: int, height: int) -> None:
 
 
 def suspicious_centre(camera: Camera) -> str | None:
-    """Say that a camera which names its size looks like one of another; None where it does not.
+    """Give a warning where a camera of a named size looks like one of another size; else None.
 
     A point more than a quarter of the size off the centre is doubted too.
     """
@@ -478,7 +478,7 @@ def refuse_baseline(length: float, remedy: str, most_m: float = WIDE_BASELINE_M)
 
 
 def refuse_squeezed(K: Float[Tensor, "3 3"]) -> None:
-    """Refuse a K whose two focal lengths are not those of one lens."""
+    """Refuse a K whose two focal lengths differ too much for one lens."""
     fx = float(K[0, 0])
     fy = float(K[1, 1])
     if not 1 / _MAX_SQUEEZE < fy / fx < _MAX_SQUEEZE:

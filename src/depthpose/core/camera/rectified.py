@@ -84,7 +84,7 @@ class RectificationReport:
 
     @property
     def is_wrong(self) -> bool:
-        """Whether such a pair gives no true depth."""
+        """Whether a pair like this gives wrong depth."""
         return self.is_pair is False or self.is_rectified is False or bool(self.is_swapped)
 
 

@@ -287,7 +287,7 @@ Maps = tuple[np.ndarray, np.ndarray]
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Rectifier:
-    """What takes a calibrated pair to a rectified one.
+    """Maps from the images of a calibrated pair to rectified ones.
 
     What is known of the raw left camera, such as where a LiDAR stands, is carried along by
     ``rectified_from_raw``, a rotation alone.

@@ -80,13 +80,13 @@ def matrix(names: Names, keys: tuple[str, ...], count: int) -> np.ndarray | None
 
 
 def scalar(names: Names, name: str) -> float | None:
-    """Take one number."""
+    """Read one number."""
     values = numbers(names.get(name))
     return None if values is None or len(values) != 1 else values[0]
 
 
 def numbers(value: object) -> list[float] | None:
-    """Take the numbers of a matrix, a list of lists, a list, text or one number; else None."""
+    """Read the numbers of a matrix, a list of lists, a list, text or one number; else None."""
     words: Any = value.get("data") if isinstance(value, Mapping) else value
     if isinstance(words, list):
         words = [v for row in words for v in (row if isinstance(row, list) else [row])]
@@ -152,7 +152,7 @@ def facts_from_names(names: Names) -> CameraFacts | None:
 
 
 def with_lens(facts: CameraFacts, *, is_fisheye: bool) -> CameraFacts:
-    """Add that the lens is a fisheye, where it is, and how its images are undistorted."""
+    """Add whether the lens is a fisheye, and the function that undistorts its images."""
     if not is_fisheye:
         return facts
     undistort = _UNDISTORT_FISHEYE if facts.baseline_m is None else _RECTIFY_FISHEYE
@@ -228,7 +228,7 @@ def is_ros(names: Names) -> bool:
 
 
 def read_two_files(folder: Path) -> tuple[Names, Names]:
-    """Read what the two files of a folder say, in the order of their names."""
+    """Read the two files of a folder, in the order of their names."""
     with refused_as(folder, "folder", "check who may read it"):
         files = sorted(p for p in folder.iterdir() if p.suffix.lower() in _SUFFIXES)
     read = [read_storage(path, read_text(path, MAX_LIST_BYTES)) for path in files]
@@ -317,7 +317,7 @@ def _from_intrinsics(names: Names, kind: str, distortion: tuple[float, ...]) -> 
 
 
 def baseline_of(names: Names) -> float | None:
-    """Take ``baseline_m``; under another name it does not say metres, and is refused."""
+    """Read ``baseline_m``; a baseline under another name, whose unit is unknown, is refused."""
     for name in names:
         if name.startswith("baseline") and name != "baselinem":
             raise InputError(f"its {name!r} may be in any unit; write baseline_m, in metres")
@@ -340,7 +340,7 @@ def coefficients_of(names: Names) -> tuple[float, ...]:
 
 
 def published(names: Names, keys: tuple[str, ...], count: int) -> np.ndarray | None:
-    """Take a matrix as it is of the image that ROS publishes: cut to its ROI, then binned."""
+    """Read a matrix and adapt it to the image that ROS publishes: cut to its ROI, then binned."""
     P = matrix(names, keys, count)
     if P is None:
         return None
@@ -364,7 +364,7 @@ def _window(names: Names) -> tuple[Size, Size, Size]:
 
 
 def size_of(names: Names) -> Size | None:
-    """Take the image's size, where some names say it; of ROS, that of the published image."""
+    """Read the image's size, where the file has it; of ROS, that of the published image."""
     width, height = (
         next((v for name in keys if (v := scalar(names, name)) is not None), None)
         for keys in (_WIDTH, _HEIGHT)

@@ -21,7 +21,7 @@ _MIN_MATCHES = 25
 
 
 def halves(image: Float[Tensor, "3 h w"], arrangement: Arrangement) -> tuple[Tensor, Tensor]:
-    """Part a picture: left and right half, or upper and lower one, of one size."""
+    """Split a picture into its left and right half, or its upper and lower one."""
     if arrangement == "side by side":
         width = image.shape[2] // 2
         return image[:, :, :width].contiguous(), image[:, :, -width:].contiguous()
@@ -30,7 +30,7 @@ def halves(image: Float[Tensor, "3 h w"], arrangement: Arrangement) -> tuple[Ten
 
 
 def find_two_views(image: Float[Tensor, "3 h w"]) -> Arrangement | None:
-    """Say how a picture holds two views of one scene; None where it is one view."""
+    """Give the arrangement of two views of one scene in a picture; None where it is one view."""
     if min(image.shape[1:]) < 2 * _ROWS:
         return None
     for arrangement in ("side by side", "top and bottom"):
@@ -68,5 +68,5 @@ def _centred(grey: Tensor) -> Tensor:
 def order_views(
     first: Float[Tensor, "3 h w"], second: Float[Tensor, "3 h w"]
 ) -> tuple[Tensor, Tensor]:
-    """Give two views, left first: for crossed eyes, as in JPS files, the right one comes first."""
+    """Put the left view first: files for crossed eyes, such as JPS, begin with the right one."""
     return (second, first) if check_rectified(first, second).is_swapped else (first, second)

@@ -62,7 +62,7 @@ class ShardedJob:
 
 
 def run_job(job: ShardedJob, engine: Engine) -> list[Done]:
-    """Do what is not finished of a job, and write the list of all: ``manifest.csv``.
+    """Do what is not finished of a job, and write ``manifest.csv``, the list of all its inputs.
 
     Returns:
         What became of every block, in the order of the shards.
@@ -142,7 +142,7 @@ def claim(out: str, settings: Mapping[str, Any]) -> None:
 
 
 def read_results(out: str) -> list[Done]:
-    """Say what an earlier job left, shard by shard; a record that is damaged is as none."""
+    """Read the records of the shards that earlier runs left; damaged records are skipped."""
     records: list[Done] = []
     for _, text in sorted(
         stores.read_all(stores.join(stores.absolute(out), SHARDS), ".json").items()

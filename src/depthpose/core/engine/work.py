@@ -128,7 +128,7 @@ def _refuse_name(name: str, source: str) -> None:
 
 @dataclass(frozen=True, slots=True)
 class Block:
-    """Inputs whose results are one shard, named without a suffix: listed ones, or a tar shard's."""
+    """Inputs whose results go into one shard: listed inputs, or those of a tar shard."""
 
     shard: str
     items: tuple[Item, ...] = ()
@@ -148,7 +148,7 @@ class Block:
 
 
 def make_plan(out: str, items: Sequence[Item], tars: Sequence[str], size: int) -> list[Block]:
-    """Divide inputs into blocks as an earlier run did; what is new gets blocks of its own.
+    """Divide inputs into blocks as an earlier run did; new inputs get new blocks.
 
     The plan is a file in ``out``, so that a shard means the same inputs in every run, whatever
     has been added to a folder since.
@@ -214,7 +214,7 @@ class Sample:
 
 @dataclass(frozen=True, kw_only=True)
 class Inputs:
-    """Inputs of a command: listed ones, tar shards of them, and what each is made of."""
+    """The inputs of a command: listed ones and tar shards of them, and the files of each input."""
 
     items: Sequence[Item]
     tars: Sequence[str] = ()
@@ -345,7 +345,7 @@ def file_stamp(path: Path) -> tuple[int, int, int]:
 
 
 def is_unchanged(path: Path, stamp: Sequence[int]) -> bool:
-    """Whether a file is as it was when it had this stamp; it is read if its time is another one."""
+    """Whether a file still has this stamp; it is read only if its time differs."""
     try:
         status = path.stat()
         if not path.is_file() or status.st_size != stamp[0]:
@@ -357,7 +357,7 @@ def is_unchanged(path: Path, stamp: Sequence[int]) -> bool:
 
 @dataclass(eq=False)
 class Runner:
-    """Does blocks one after the other; what the work needs is loaded at the first."""
+    """Does blocks one after the other; the work is started at the first."""
 
     work: Work
     out: str

@@ -88,7 +88,7 @@ def refuse_broken_link(path: AnyPath) -> None:
 
 @contextmanager
 def refused_write(path: AnyPath) -> Iterator[None]:
-    """Turn what a disk refuses to take into an :class:`InputError`."""
+    """Turn the errors of a disk that cannot be written into an :class:`InputError`."""
     try:
         yield
     except OSError as error:
@@ -105,7 +105,7 @@ def refused_write(path: AnyPath) -> Iterator[None]:
 
 
 def cache_folder() -> Path:
-    """Give the folder of what can be fetched or computed again.
+    """Give the folder for files that can be downloaded or computed again.
 
     It is ``$DEPTHPOSE_CACHE``, by default ``~/.cache/depthpose``; it need not exist.
     """
@@ -144,7 +144,7 @@ def atomic_write(path: AnyPath) -> Iterator[Path]:
 
 
 def remove_parts(folder: Path) -> None:
-    """Remove what killed writers left in a folder, not below it; none may be at work there."""
+    """Remove partial files of killed writers in a folder, not below; no writer may be running."""
     for part in folder.glob(f"{_PART}*"):
         with suppress(OSError):
             part.unlink()
@@ -455,7 +455,7 @@ def natural_order(path: Path) -> tuple[list[list[str | tuple[int, str]]], Path]:
 
 
 def stem_of(path: Path) -> str:
-    """Give a file's name without its suffix, in one spelling.
+    """Give a file's name without its suffix, normalised to one Unicode form.
 
     A letter with an accent may be stored as one character (NFC) or two (NFD: disks of macOS).
     """

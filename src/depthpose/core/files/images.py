@@ -220,7 +220,7 @@ def _tensor_of(pixels: np.ndarray, name: AnyPath) -> Float32[Tensor, "3 h w"]:
 
 
 def from_16_bit(values: np.ndarray, name: AnyPath) -> np.ndarray:
-    """Bring 16-bit numbers to floats in [0, 1], and say so where not by 65535.
+    """Convert 16-bit numbers to floats in [0, 1]; a notice names a divisor other than 65535.
 
     Cameras of 10, 12 or 14 bits, and thermal ones, use a part of the range: black and white are
     then what 0.1 % of the values lie below and above; black is 0 unless all lie far from it.
@@ -239,7 +239,7 @@ def from_16_bit(values: np.ndarray, name: AnyPath) -> np.ndarray:
 
 
 def check_image(image: object, name: str, slack: float = 0.5) -> Float[Tensor, "3 h w"]:
-    """Give an RGB image back, or refuse what is none; values may leave [0, 1] by ``slack``."""
+    """Return an RGB image, or refuse what is not one; values may leave [0, 1] by ``slack``."""
     if not isinstance(image, Tensor):
         raise InputError(
             f"{name} must be a tensor, got {type(image).__name__}; read files with "
@@ -286,7 +286,7 @@ def _is_new(name: AnyPath, what: str) -> bool:
 
 
 def image_size(path: AnyPath) -> tuple[int, int]:
-    """Say (width, height) of a picture as :func:`read_image` would return it, without decoding.
+    """Give (width, height) of a picture as :func:`read_image` returns it, without decoding.
 
     Raises:
         InputError: the file is missing, too large or not a picture.
@@ -375,7 +375,7 @@ def list_images(path: AnyPath) -> list[Path]:
 
 
 def refuse_among_inputs(out: Path, words: Iterable[str | Path], files: Iterable[Path]) -> None:
-    """Refuse results in a folder whose files are inputs: the next run would take them for such.
+    """Refuse to write results beside the inputs: the next run would read them as inputs.
 
     Args:
         out: where the results go.
@@ -476,7 +476,7 @@ _DIAGONAL_MM = math.hypot(36, 24)
 
 
 def read_exif_focal(picture: AnyPath | Image.Image) -> tuple[float, str] | None:
-    """Read the focal length of a photograph [px], and by which tags it is known.
+    """Read the focal length of a photograph [px], and the tags that it follows from.
 
     ``FocalLengthIn35mmFilm`` is compared by the diagonal, as CIPA DC-008 defines it; else
     ``FocalLength`` is divided by the width of a pixel on the sensor (``FocalPlaneXResolution``),

@@ -80,7 +80,7 @@ class RunLogger:
                 self.board.add_image(name, picture, step)
 
     def save(self, state: Mapping[str, Any]) -> None:
-        """Write the last state, all or nothing; the one until now becomes the one before."""
+        """Write the last state, all or nothing; the previous one is kept beside it."""
         if not self.is_writer:
             return
         packed = BytesIO()  # on a full disk torch.save would say anything but that
@@ -168,7 +168,7 @@ def write_card(
 
 
 def held_out_text(folder: Path, sentence: str) -> str:
-    """Show what a run's last validation found; ``sentence``: of what, and what the numbers mean."""
+    """Describe a run's last validation; ``sentence``: of what, and what the numbers mean."""
     lines: list[str] = []
     for row in read_metrics(folder):
         measured = {k: value for k, value in row.items() if k.startswith(_HELD_OUT)}
@@ -181,7 +181,7 @@ def held_out_text(folder: Path, sentence: str) -> str:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Parts:
-    """What a state is of: everything of a training that its steps change, by name."""
+    """Everything of a training that its steps change, by name: what a saved state holds."""
 
     modules: Mapping[str, nn.Module]
     optimizers: Mapping[str, Any]
@@ -239,12 +239,12 @@ class Parts:
 
 
 def saved_states(folder: Path) -> list[Path]:
-    """List the states that a folder holds, the last one first."""
+    """List the saved states of a folder, the last one first."""
     return [path for name in (STATE, BEFORE) if (path := folder / name).is_file()]
 
 
 def restore_last(folder: Path, parts: Parts) -> tuple[Path, int, float]:
-    """Go on from the last state that is whole; give its path, step and seconds of training."""
+    """Restore the last state that is intact; give its path, step and seconds of training."""
     damages: list[str] = []
     for path in saved_states(folder):
         try:

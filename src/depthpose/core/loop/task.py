@@ -192,7 +192,7 @@ class Samples(Protocol):
 
 
 def shuffled_index(sample_index: int, count: int, seed: int) -> int:
-    """Turn an index in the whole training into one of the data; each epoch is shuffled anew."""
+    """Map an index in the whole training to one in the data; each epoch is shuffled anew."""
     epoch, position = divmod(sample_index, count)
     generator = torch.Generator().manual_seed(mixed_seed(seed, epoch, 1))
     return int(torch.randperm(count, generator=generator)[position])

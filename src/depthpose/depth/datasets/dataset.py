@@ -183,7 +183,7 @@ def open_dataset(folder: Path | str, split: str | Path | None = None) -> Dataset
 
 
 def join_datasets(datasets: Sequence[Dataset], without: Sequence[str] = ()) -> Dataset:
-    """Make one dataset of several, less the frames of some names.
+    """Join several datasets, without the frames of some names.
 
     Raises:
         InputError: a name that no frame has, which would leave in what was to be kept out.
@@ -205,7 +205,7 @@ def join_datasets(datasets: Sequence[Dataset], without: Sequence[str] = ()) -> D
 def refuse_common(
     trained: Iterable[Frame], measured: Iterable[Frame], what: str, remedy: str
 ) -> None:
-    """Refuse to measure by what is trained on.
+    """Refuse frames that are both trained on and measured.
 
     The error says ``what`` the measured frames are, and the ``remedy``.
 

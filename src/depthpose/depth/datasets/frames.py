@@ -292,7 +292,7 @@ def kitti_calibration(frame: Frame) -> KittiCalibration:
 
 
 def known_truths(frame: Frame) -> tuple[TruthKind, ...]:
-    """Say which kinds of truth a frame has."""
+    """Give the kinds of truth that a frame has."""
     kinds: dict[TruthKind, bool] = {
         "scan": has_lidar(frame, "camera_z"),
         "annotated": frame.depth is not None and frame.depth != _drawn_scan(frame),
