@@ -374,7 +374,7 @@ def test_two_knobs_of_four_are_no_quarter_turn_either_way_however_dense_they_are
     knobs[1].apply_translation([0, 0.08, 0.045])
     parts = []
     for mesh, count in ((plate, 4400), (knobs[0], 550), (knobs[1], 50)):
-        points, faces = trimesh.sample.sample_surface(mesh, count, seed=0)
+        points, faces = trimesh.sample.sample_surface(mesh, count, seed=0)[:2]
         parts.append(np.hstack([points, mesh.face_normals[faces]]))
     rows = torch.from_numpy(generator.permutation(np.concatenate(parts)))
     model = make_model(rows[:, :3], torch.zeros(0, 3).long(), name="knobs")

@@ -1,5 +1,6 @@
 import math
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -154,7 +155,7 @@ def test_a_shelf_whose_upper_board_was_seen_is_not_posed_by_its_lower_one() -> N
     boards[1].apply_translation([0, 0, 0.03])
     wall = trimesh.creation.box((0.004, 0.1, 0.03))
     wall.apply_translation([-0.08, 0, 0.015])
-    mesh = trimesh.util.concatenate([*boards, wall])
+    mesh: Any = trimesh.util.concatenate([*boards, wall])
     vertices, faces = (torch.from_numpy(np.array(part)) for part in (mesh.vertices, mesh.faces))
     shelf = make_model(vertices, faces, name="shelf")
     true = perturb(
