@@ -15,7 +15,7 @@ from torch import Tensor
 from tqdm import tqdm
 
 from depthpose.cli.depth_options import LensOptions, PairNetworks, PredictOutput, ScaleOptions
-from depthpose.cli.engine import EngineOptions, Weights, say
+from depthpose.cli.engine import EngineOptions, Weights, print_shards
 from depthpose.core import run
 from depthpose.core.camera import Camera, FieldOfView, StereoRig, camera_of, read_camera, read_rig
 from depthpose.core.camera.pinhole import camera_keys
@@ -398,7 +398,7 @@ def estimate_by_engine(
     settings = first_work.settings(method_settings)
     work = Work(start=first_work.start, files=files, endings=ENDINGS, batch=first_work.output.batch)
     what = "pairs" if files == PAIRS else "depth maps"
-    return say(engine.run(work, inputs, out, settings), out, what)
+    return print_shards(engine.run(work, inputs, out, settings), out, what)
 
 
 def estimate_all(

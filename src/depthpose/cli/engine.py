@@ -86,7 +86,7 @@ class Weights:
             yield str(path)
 
 
-def say(shards: "Sequence[Done]", out: str, what: str) -> int:
+def print_shards(shards: "Sequence[Done]", out: str, what: str) -> int:
     """List what failed, print how much is done, and give the exit code."""
     failures = [failure for done in shards for failure in done.failures]
     for name, reason in failures[:20]:

@@ -163,7 +163,7 @@ def find_all(method: PoseMethod, inputs: OneObjectOptions, out: Path) -> int:
     predictions, searched = _search(method, objects, jobs, results)
     pose_predict.claim(out, settings, searched, pose_predict.is_result_of)
     pose_predict.write_files(predictions, searched, out, method, inputs=len(jobs))
-    return pose_predict.say_result(predictions, out, len(jobs))
+    return pose_predict.print_result(predictions, out, len(jobs))
 
 
 def search_dataset(
@@ -204,7 +204,7 @@ def search_dataset(
     results = SearchResults(out, [job.name for job in jobs], earlier, is_of_image, numbers)
     predictions, searched = _search(method, list(numbers), jobs, results)
     pose_predict.write_files(predictions, searched, out, method, dataset, inputs=len(images))
-    return pose_predict.say_result(predictions, out, len(images))
+    return pose_predict.print_result(predictions, out, len(images))
 
 
 def _frame_job(instance: Instance, object: str) -> PoseJob[Any]:
@@ -324,7 +324,7 @@ def _finish(
         for prediction, job in pairs
     ]
     pose_predict.write_files(predictions, explained, out, method, dataset)
-    code = pose_predict.say_result(predictions, out)
+    code = pose_predict.print_result(predictions, out)
     kinds = Counter(p.estimate.tracking for p in predictions if p.estimate.tracking is not None)
     print(", ".join(f"{kinds[kind]} {kind}" for kind in ("tracked", "found", "lost")))
     return code

@@ -18,7 +18,7 @@ from torch import Tensor
 from tqdm import tqdm
 
 from depthpose.cli import pose_methods
-from depthpose.cli.engine import EngineOptions, Weights, say
+from depthpose.cli.engine import EngineOptions, Weights, print_shards
 from depthpose.cli.pose_methods import MethodSource, PoseMethod
 from depthpose.cli.pose_options import DataSetOptions, OneObjectOptions
 from depthpose.core import run
@@ -484,7 +484,7 @@ def predict_files(method: PoseMethod, inputs: OneObjectOptions, out: Path, batch
     if predictions is None:
         return 0
     write_files(predictions, jobs, out, method)
-    return say_result(predictions, out)
+    return print_result(predictions, out)
 
 
 def region_jobs(
@@ -559,7 +559,7 @@ def predict_dataset(
     if predictions is None:
         return 0
     write_files(predictions, jobs, out, method, dataset)
-    return say_result(predictions, out)
+    return print_result(predictions, out)
 
 
 def predict_all(
@@ -657,15 +657,17 @@ def write_files(
     _write_page(out, predictions, jobs, models, dataset, inputs)
 
 
-def say_result(predictions: list[Prediction], out: Path, inputs: int | None = None) -> int:
-    """Print how many were posed and why others were not; give the exit code.
+def print_result(predictions: list[Prediction], out: Path, inputs: int | None = None) -> int:
+    """Print the poses, their alternatives and the reasons of refusals; give the exit code.
 
-    ``inputs``: how many there were, where one may have several answers; None: one each.
+    ``inputs``: their number, where an input may have several estimates; None: one each.
     """
     failed = [p.estimate for p in predictions if p.estimate.status == "unreadable"]
     shown = [p.estimate for p in predictions if p.estimate.status != "unreadable"]
     for estimate in failed:
         print(f"depthpose: failed: {estimate.name}: {estimate.reason}", file=sys.stderr)
+
+    # A table of the first estimates.
     if shown:
         rows: list[dict[str, Any]] = []
         for estimate in shown[:_MOST_SHOWN]:
@@ -680,6 +682,8 @@ def say_result(predictions: list[Prediction], out: Path, inputs: int | None = No
             rows.append(row | {key: f"{value:.3f}" for key, value in certain.items()})
         print(plain_table(rows, _PRINTED), end="")
         print(_FRAME)
+
+    # Why there is no sure pose, and what else fits.
     if len(shown) == 1 and not shown[0].is_ok:
         what = "refused" if shown[0].camera_from_model is None else shown[0].status
         print(f"{what}: {shown[0].reason}")
@@ -689,6 +693,7 @@ def say_result(predictions: list[Prediction], out: Path, inputs: int | None = No
     for prediction in predictions[:_MOST_PRINTED]:
         for other in prediction.estimate.alternatives:
             print(f"{prediction.estimate.name}: {other}")
+
     counts = Counter(estimate.status for estimate in shown)
     statuses = ", ".join(f"{count} {status}" for status, count in sorted(counts.items()))
     total = _count_inputs(predictions, inputs)
@@ -857,4 +862,4 @@ def predict_on_ray(
     settings |= {"unit": options.unit}
     if camera is not None:
         settings |= {"K": camera.K.tolist(), "depth_unit_m": camera.depth_unit_m}
-    return say(engine.run(work, inputs, out, settings), out, "inputs")
+    return print_shards(engine.run(work, inputs, out, settings), out, "inputs")

@@ -274,9 +274,9 @@ def from_virtual(
     match: Match,
     right: Float[Tensor, "3 _ _"],
 ) -> DepthEstimate:
-    """Bring what was found at the virtual rig back to the image; NaN where it has no picture.
+    """Convert a match at the virtual rig to depth of the image; NaN where that shows nothing.
 
-    The confidence of sky falls to 0 where the image is plain, for a bright wall looks the same.
+    Sky on plain areas gets a confidence of 0, because a bright wall looks the same.
     """
     camera = image.camera
     assert camera is not None
@@ -286,6 +286,8 @@ def from_virtual(
     is_sky = resized.is_sky
     focal_m_px = float(camera.K[0, 0]) * rig.virtual_baseline_m
     depth_m = torch.where(px > 0, focal_m_px / px, torch.nan)
+
+    # The sky is far away, and is no sky if it is only a few pixels.
     blank = without_picture(image.left).to(px.device)
     confidence = resized.confidence
     if is_sky is not None:
@@ -296,7 +298,10 @@ def from_virtual(
             confidence = torch.where(is_sky, of_sky, confidence)
         depth_m = torch.where(is_sky, SKY_M, depth_m)
         px = torch.where(is_sky, focal_m_px / SKY_M, px)
-    depth_m, px = (torch.where(blank, torch.nan, values) for values in (depth_m, px))
+
+    # Borders that show nothing have no depth.
+    depth_m = torch.where(blank, torch.nan, depth_m)
+    px = torch.where(blank, torch.nan, px)
     if confidence is not None:
         confidence = torch.where(blank, 0.0, confidence)
     return DepthEstimate(

@@ -291,17 +291,17 @@ def cases_of(
 
 
 def compare_voting(cases: Sequence[VotingCase | None], points: int) -> list[dict[str, Any]]:
-    """Let every way vote on every case, one after the other; give the columns of a row for each.
+    """Compare methods of voting on the same cases; give the columns of a row for each method.
 
-    The pose follows by the same fit for all: without the covariances that only ours give. What has
-    too few points is a failure of every way. The time is that of the vote alone, its median, on one
-    thread. ``points``: at most so many of each cloud; ``votes``: their mean.
+    The pose follows from the keypoints by the same fit for all, without covariances, which only our
+    methods give. A view with too few points counts as a failure of every method. The time is the
+    median of the vote alone, on one thread. ``points``: the most of a cloud, for its column.
     """
     usable = [case for case in cases if case is not None]
     if not usable:
         raise InputError(f"none of the {len(cases)} views has enough points to be posed")
-    # Name, number of hypotheses and test for inliers to the vote itself.
-    ways: dict[tuple[str, int | None, str], Callable[[VotingCase], Tensor]] = {
+    # From the name, the number of hypotheses and the test for inliers to the function that votes.
+    voting_methods: dict[tuple[str, int | None, str], Callable[[VotingCase], Tensor]] = {
         ("RANSAC, one by one (NumPy)", LOOP_HYPOTHESES, "angle"): lambda case: torch.from_numpy(
             ransac_one_by_one(
                 case.points_m.double().numpy(), case.directions.double().numpy(), LOOP_HYPOTHESES
@@ -311,16 +311,16 @@ def compare_voting(cases: Sequence[VotingCase | None], points: int) -> list[dict
     for hypotheses in OUR_HYPOTHESES:
         for test in ("angle", "distance"):
             config = VotingConfig(hypotheses=hypotheses, inlier_test=test)
-            ways["RANSAC, ours", hypotheses, test] = lambda case, config=config: (
+            voting_methods["RANSAC, ours", hypotheses, test] = lambda case, config=config: (
                 vote_ransac(case.points_m, case.directions, None, config).keypoints_m
             )
     for name, steps in (("least squares, published", 0), ("least squares, ours", 3)):
-        ways[name, None, ""] = lambda case, steps=steps: (
+        voting_methods[name, None, ""] = lambda case, steps=steps: (
             meet_lines(case.points_m, case.directions, None, steps).keypoints_m
         )
     rows: list[dict[str, Any]] = []
     threads = torch.get_num_threads()
-    for (method, hypotheses, test), vote in ways.items():
+    for (method, hypotheses, test), vote in voting_methods.items():
         successes = 0
         seconds = []
         torch.set_num_threads(1)

@@ -65,10 +65,10 @@ class Cloud:
 def read_cloud(path: AnyPath) -> Cloud:
     """Read a point cloud: ``.ply``, ``.pcd``, ``.npy`` or text (``.xyz``, ``.txt``).
 
-    NPY and text hold a point a row; columns after the third are left out, and so is a first one
-    that counts the points. Text may have a line of names (``x y z`` among them) or the number of
-    points before it, and decimal commas where blanks or semicolons part the numbers. Points with a
-    NaN coordinate, which organised clouds put where the sensor saw nothing, are left out too.
+    NPY and text hold a point a row. Columns after the third are ignored, and so is a first column
+    that numbers the points. Text may begin with a line of column names (``x y z`` among them) or
+    with the number of points, and may have decimal commas if blanks or semicolons separate the
+    numbers. Points with a NaN coordinate, as organised clouds have without a reading, are left out.
 
     Raises:
         InputError: the file is missing, damaged, without x, y and z, or no point is finite; a
