@@ -60,6 +60,8 @@ PRIOR_REGION = 2.0
 PRIOR_PROPOSED = 0.02
 """The same where a search proposed the pose: votes of a whole image refine to some fifty poses for
 each object that is there."""
+PRIOR_MANY = 0.1
+"""Odds of a search showing any number of instances of an object, and not one at most."""
 WRONG_RMS = 1.2
 """Root mean square residual of what supports a wrong pose, in standard deviations: of residuals
 that are as often large as small it is 1.7, and refinement makes it smaller."""

@@ -119,6 +119,7 @@ class PoseEstimator:
             names=[view.object],
             object_of=self._prepared,
             estimate_near=self._estimate_near,
+            min_probability=self.refusal.min_probability,
             prior_odds=PRIOR_REGION,
             is_single=True,
         )
@@ -280,6 +281,7 @@ class PoseEstimator:
             names=objects,
             object_of=self._prepared,
             estimate_near=self._estimate_near,
+            min_probability=self.refusal.min_probability,
             is_single=is_sure,
         )
         found = find_objects(view, targets)

@@ -1,7 +1,9 @@
 """A depth image prepared for a search: points, normals, and wide planes that are left out."""
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -12,7 +14,7 @@ from torch import Tensor
 from torch.nn.functional import max_pool2d, normalize, pad
 
 from depthpose.core.arrays import take_evenly
-from depthpose.core.camera import back_project
+from depthpose.core.camera import back_project, project
 from depthpose.pose.sensor import LAG_PX, SHARED_PER_WHITE
 
 _MOST_PIXELS = 110_000
@@ -69,6 +71,7 @@ class Frame:
             there is no wide plane.
         nearest_m: least depth of the pixels up to two away; infinite where none has a reading.
         noise_per_m: standard deviation of a reading, for the square of the depth in metres.
+        planes: the wide ones.
     """
 
     step: int
@@ -80,6 +83,20 @@ class Frame:
     plane_m: Float64[Tensor, "h w"]
     nearest_m: Float64[Tensor, "h w"]
     noise_per_m: float
+    planes: Sequence["WidePlane"]
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class WidePlane:
+    """A table, a wall, or the side of something large.
+
+    Attributes:
+        plane: through its readings.
+        diameter_m: up to which no object has it as a side, as ``Frame.plane_m``.
+    """
+
+    plane: Plane
+    diameter_m: float
 
 
 def prepare_frame(
@@ -106,11 +123,12 @@ def prepare_frame(
     K = K.double() / torch.tensor([[step], [step], [1]])
     points_m = back_project(depth_m, K)
     normals, is_smooth = _normals(depth_m, points_m, K)
-    plane_m = _planes(depth_m, points_m, normals, noise_per_m)
+    plane_m, planes = _planes(depth_m, points_m, normals, noise_per_m)
     nearest_m = -max_pool2d(-torch.where(depth_m > 0, depth_m, torch.inf)[None], 5, 1, 2)[0]
     return Frame(
         step=step, depth_m=depth_m, K=K, points_m=points_m, normals=normals, is_smooth=is_smooth,
         plane_m=plane_m, nearest_m=nearest_m, noise_per_m=noise_per_m,
+        planes=planes,
     )  # fmt: skip
 
 
@@ -172,9 +190,10 @@ def _planes(
     points_m: Float64[Tensor, "h w 3"],
     normals: Float64[Tensor, "h w 3"],
     noise_per_m: float,
-) -> Float64[Tensor, "h w"]:
+) -> tuple[Float64[Tensor, "h w"], list[WidePlane]]:
     """Find wide planes by RANSAC; give each of their pixels its ``Frame.plane_m``."""
     is_left = depth_m > 0
+    planes: list[WidePlane] = []
     plane_m = torch.zeros_like(depth_m)
     least = max(_LEAST_POINTS, _LEAST_SHARE * int(is_left.sum()))
     generator = torch.Generator().manual_seed(0)
@@ -201,8 +220,10 @@ def _planes(
             _, axes = torch.linalg.eigh(offset.T @ offset)
             along = offset @ axes[:, 1:]
             width_m, length_m = (along.quantile(0.95, 0) - along.quantile(0.05, 0)).tolist()
-            plane_m[joined] = max(width_m / _WIDER, length_m / _LONGER)
-    return plane_m
+            diameter_m = max(width_m / _WIDER, length_m / _LONGER)
+            plane_m[joined] = diameter_m
+            planes.append(WidePlane(plane=plane, diameter_m=diameter_m))
+    return plane_m, planes
 
 
 def _bent(
@@ -253,6 +274,46 @@ def largest_plane(
         _, axes = torch.linalg.eigh((near - middle).T @ (near - middle))
         plane = (axes[:, 0], axes[:, 0] @ middle)
     return plane
+
+
+class Readings(NamedTuple):
+    """The pixels in whose direction points lie, their depth, and whether they have one."""
+
+    pixel: Int64[Tensor, "*n"]
+    depth_m: Float64[Tensor, "*n"]
+    is_read: Bool[Tensor, "*n"]
+
+
+def readings_toward(frame: Frame, points_m: Float64[Tensor, "*n 3"]) -> Readings:
+    """Look up what was read in the direction of points of the camera frame."""
+    height, width = frame.depth_m.shape
+    column, row = project(points_m, frame.K).round().unbind(-1)
+    is_inside = (column >= 0) & (column < width) & (row >= 0) & (row < height)
+    is_inside &= points_m[..., 2] > 0
+    pixel = torch.where(is_inside, row * width + column, 0).long()
+    depth_m = frame.depth_m.flatten()[pixel]
+    return Readings(pixel, depth_m, is_inside & (depth_m > 0))
+
+
+def share_behind(
+    frame: Frame, wide: WidePlane, points_m: Float64[Tensor, "n 3"], margin_m: float
+) -> float:
+    """Give the share of points that lie behind a wide plane, where the image does not end it.
+
+    Args:
+        frame: the image.
+        wide: one of its planes.
+        points_m: of a posed surface, in the camera frame.
+        margin_m: points so far behind count, beyond what the sensor explains.
+    """
+    normal, offset = wide.plane
+    beyond_m = (points_m @ normal - offset) * offset.sign()  # the camera is on the other side
+    foot_m = points_m - ((points_m @ normal - offset)[:, None]) * normal
+    margin_m = margin_m + _tolerance_m(foot_m[:, 2].clamp(min=0), frame.noise_per_m)
+    # What stands before the plane hides it; where the camera saw farther it has ended.
+    readings = readings_toward(frame, foot_m)
+    is_solid = readings.is_read & (readings.depth_m < foot_m[:, 2] + margin_m)
+    return float((is_solid & (beyond_m > margin_m)).double().mean())
 
 
 def _tolerance_m(depth_m: Float64[Tensor, "*n"], noise_per_m: float) -> Float64[Tensor, "*n"]:

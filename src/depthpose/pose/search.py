@@ -16,15 +16,22 @@ from typing import Any
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
+from torch.nn.functional import softplus
 
 from depthpose.core.camera import back_project, project
 from depthpose.core.devices import each_in_threads
 from depthpose.core.rigid import Rigid
 from depthpose.pose.cloud import cloud_from_depth, grow_mask
 from depthpose.pose.copies import PreparedObject, with_copies
-from depthpose.pose.decide import LEAST_NAMED, PRIOR_PROPOSED, log_odds_right
+from depthpose.pose.decide import LEAST_NAMED, PRIOR_MANY, PRIOR_PROPOSED, log_odds_right
 from depthpose.pose.evidence import BORDER_PX
-from depthpose.pose.frame import Frame, is_on_plane, largest_plane, prepare_frame
+from depthpose.pose.frame import (
+    Frame,
+    is_on_plane,
+    largest_plane,
+    prepare_frame,
+    share_behind,
+)
 from depthpose.pose.inputs import nothing_seen
 from depthpose.pose.propose.image import compare_with_image, propose_in_frame
 from depthpose.pose.surface import NEAR, Surface
@@ -53,6 +60,8 @@ _RIM = 0.05
 """Width of what is looked at beside it, in diameters."""
 _REGION_MARGIN = 0.5
 """Of the larger side of a region: so far about it planes and neighbours are looked at."""
+_SUNK = 0.05
+"""Of a surface no larger share lies in a table or wall: its pose is off by less."""
 _LEAST_SHARE = 0.8
 """Where no object among several has so large a share of the probability, none is reported."""
 
@@ -65,6 +74,7 @@ class SearchTargets:
         names: of the objects.
         object_of: gives an object by its name, with its point pairs and copies.
         estimate_near: estimates objects from clouds and the poses that were proposed for them.
+        min_probability: with which a pose must be right to be given.
         prior_odds: of the best pose at a place being right.
         is_single: search once, for one object.
     """
@@ -72,6 +82,7 @@ class SearchTargets:
     names: Sequence[str]
     object_of: Callable[[str], PreparedObject]
     estimate_near: Callable[[Sequence[CloudInput], Sequence[Rigid], float], list[PoseEstimate]]
+    min_probability: float
     prior_odds: float = PRIOR_PROPOSED
     is_single: bool = False
 
@@ -156,6 +167,8 @@ def find_objects(view: ViewInput, targets: SearchTargets) -> list[PoseEstimate]:
         names = sorted({place.object for place in more if count[place.object] > 1})
         if not names:
             break
+    accepted, missed = _weigh_instances(accepted, targets)
+    misses += missed
     accepted.sort(key=lambda place: -place.log_odds)
     spent_s = time.perf_counter() - began
     estimates = [
@@ -270,21 +283,11 @@ def _judge(
         surface = targets.object_of(estimate.object).surface
         evidence = estimate.evidence
         reason = estimate.reason
-        if estimate.camera_from_model is not None and is_cut_out(
-            view, estimate.camera_from_model.double(), surface
-        ):
-            reason = "it would be cut out of a plane that goes on beside it"
-        elif estimate.camera_from_model is not None:
-            reason = ""
+        if estimate.camera_from_model is not None:
+            reason = _impossible(frame, view, estimate.camera_from_model.double(), surface)
         if estimate.camera_from_model is None or evidence is None or reason:
-            misses.append(
-                _Miss(
-                    object=estimate.object,
-                    middle_m=group[0].pose.apply(surface.middle_m[None])[0],
-                    agreement=0.0 if evidence is None else evidence.agreement,
-                    reason=reason,
-                )
-            )
+            agreement = 0.0 if evidence is None else evidence.agreement
+            misses.append(_miss_at(group[0], agreement, reason, targets))
             continue
         pose = estimate.camera_from_model.double()
         judged.append(
@@ -297,6 +300,46 @@ def _judge(
             )
         )
     return judged, misses
+
+
+def _miss_at(place: _Place, agreement: float, reason: str, targets: SearchTargets) -> _Miss:
+    """Describe a place at which an object is not."""
+    surface = targets.object_of(place.object).surface
+    middle_m = place.pose.apply(surface.middle_m[None])[0]
+    return _Miss(object=place.object, middle_m=middle_m, agreement=agreement, reason=reason)
+
+
+def _weigh_instances(
+    accepted: Sequence[_Judged], targets: SearchTargets
+) -> tuple[list[_Judged], list[_Miss]]:
+    """Weigh places of an object by each other: it is there once, or any number of times.
+
+    A table holds one of each object, a bin holds many: so a second place needs more evidence than
+    the first, and where several have it further ones need no more.
+
+    Returns:
+        Places that remain, and those at which it is not likely enough any more.
+    """
+    remaining: list[_Judged] = []
+    misses: list[_Miss] = []
+    for name in dict.fromkeys(place.object for place in accepted):
+        places = [place for place in accepted if place.object == name]
+        log_odds = torch.tensor([place.log_odds for place in places], dtype=torch.float64)
+        independent = log_odds.sigmoid()
+        log_one = torch.cat([log_odds.new_zeros(1), log_odds])
+        log_many = math.log(PRIOR_MANY) + softplus(log_odds).sum()
+        many = (log_many - log_one.logsumexp(0)).sigmoid()
+        probability = many * independent + (1 - many) * log_one.softmax(0)[1:]
+        scale = (probability / independent).tolist()
+        for place, probable, its_scale in zip(places, probability.tolist(), scale, strict=True):
+            if probable >= targets.min_probability:
+                remaining.append(replace(place, estimate=_scaled(place.estimate, its_scale)))
+                continue
+            reason = f"beside the surer ones it is right with a probability of {probable:.0%}"
+            evidence = place.estimate.evidence
+            agreement = 0.0 if evidence is None else evidence.agreement
+            misses.append(_miss_at(place, agreement, reason, targets))
+    return remaining, misses
 
 
 def _suppress(
@@ -392,6 +435,19 @@ def _cut(view: ViewInput, part: tuple[slice, slice]) -> ViewInput:
     """Cut a part out of a view."""
     K = _window_intrinsics(view.K, part)
     return replace(view, depth_m=view.depth_m[part], mask=view.mask[part], K=K)
+
+
+def _impossible(frame: Frame, view: ViewInput, pose: Rigid, surface: Surface) -> str:
+    """Say why the planes of an image exclude a pose; nothing where they do not."""
+    if is_cut_out(view, pose, surface):
+        return "it would be cut out of a plane that goes on beside it"
+    points_m = pose.apply(surface.points_m)
+    wider = [wide for wide in frame.planes if wide.diameter_m >= surface.diameter_m]
+    for wide in wider:
+        share = share_behind(frame, wide, points_m, NEAR * surface.diameter_m)
+        if share > _SUNK:
+            return f"{share:.0%} of it would lie in the table or wall before which it is seen"
+    return ""
 
 
 def is_cut_out(view: ViewInput, pose: Rigid, surface: Surface) -> bool:
@@ -491,8 +547,19 @@ def _given_others(estimates: Sequence[PoseEstimate], shares: Tensor) -> tuple[Po
     """Give the likeliest estimate, its probabilities multiplied by its share among the objects."""
     best = int(shares.argmax())
     share, estimate = float(shares[best]), estimates[best]
+    chosen = _scaled(estimate, share)
+    if len(estimates) > 1 and estimate.identity is not None and share < 1 - LEAST_NAMED:
+        second = estimates[int(shares.topk(2).indices[1])].object
+        reason = f"it may be {second} ({1 - share:.0%} for all other objects)"
+        identity = replace(estimate.identity, status="not excluded", other=second, reason=reason)
+        chosen = replace(chosen, identity=identity)
+    return chosen, share
+
+
+def _scaled(estimate: PoseEstimate, share: float) -> PoseEstimate:
+    """Multiply the probabilities of an estimate by a share."""
     certainty, copy_certainty = estimate.certainty, estimate.copy_certainty
-    chosen = replace(
+    return replace(
         estimate,
         certainty=None if certainty is None else share * certainty,
         copy_certainty=None if copy_certainty is None else share * copy_certainty,
@@ -501,9 +568,3 @@ def _given_others(estimates: Sequence[PoseEstimate], shares: Tensor) -> tuple[Po
             for alternative in estimate.alternatives
         ),
     )
-    if len(estimates) > 1 and estimate.identity is not None and share < 1 - LEAST_NAMED:
-        second = estimates[int(shares.topk(2).indices[1])].object
-        reason = f"it may be {second} ({1 - share:.0%} for all other objects)"
-        identity = replace(estimate.identity, status="not excluded", other=second, reason=reason)
-        chosen = replace(chosen, identity=identity)
-    return chosen, share

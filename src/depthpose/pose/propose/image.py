@@ -8,9 +8,8 @@ from jaxtyping import Bool, Float64, Int64
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from depthpose.core.camera import project
 from depthpose.core.rigid import Rigid, perturb
-from depthpose.pose.frame import Frame
+from depthpose.pose.frame import Frame, readings_toward
 from depthpose.pose.propose.point_pairs import STEP, PairTable, vote_poses
 from depthpose.pose.surface import BESIDE, NEAR, Surface
 
@@ -141,7 +140,7 @@ def _projected(frame: Frame, poses: Rigid, surface: Surface, stage: _Stage) -> R
     held = _HELD * torch.diag(torch.tensor([radius_m**2] * 3 + [1.0] * 3, dtype=torch.float64))
     for share in stage.limits:
         posed_m, normals, _, _ = _posed(poses, surface, stage.every)
-        at = _look_up(frame, posed_m)
+        at = readings_toward(frame, posed_m)
         normal = frame.normals.flatten(0, 1)[at.pixel]
         seen_m = frame.points_m.flatten(0, 1)[at.pixel]
         gap_m, limit_m = seen_m - posed_m, share * surface.diameter_m
@@ -186,7 +185,7 @@ def compare_with_image(
     """
     posed_m, normals, is_inner, beside_m = _posed(poses, surface, stage.every)
     # A plane that is wider than the object is no side of it.
-    at, no_side = _look_up(frame, posed_m), (frame.plane_m >= surface.diameter_m).flatten()
+    at, no_side = readings_toward(frame, posed_m), (frame.plane_m >= surface.diameter_m).flatten()
     limit_m = stage.fits * surface.diameter_m + 2 * _NOISE_PER_M * posed_m[..., 2].square()
     gap_m, is_side = at.depth_m - posed_m[..., 2], ~no_side[at.pixel]
     cosine = (normals * frame.normals.flatten(0, 1)[at.pixel]).sum(-1).abs()
@@ -202,7 +201,7 @@ def compare_with_image(
     number = posed_m[..., 2].isfinite().sum(1).clamp(min=1)
     read = (at.is_read & ~is_cut).sum(1).maximum(number / 2).double()
     good = agrees.sum(1) - contradicted.sum(1) - 0.5 * partly.sum(1)
-    at = _look_up(frame, beside_m)
+    at = readings_toward(frame, beside_m)
     gap_m, limit_m = at.depth_m - beside_m[..., 2], BESIDE * surface.diameter_m
     is_level, is_table = at.is_read & (gap_m.abs() < limit_m), no_side[at.pixel]
     is_parted = (at.is_read & (gap_m >= limit_m)) | (is_level & is_table)
@@ -228,21 +227,3 @@ def _posed(
                           for part in (views.points_m, views.beside_m))  # fmt: skip
     normals = views.normals[side, ::every] @ poses.R.mT
     return points_m, normals, views.is_inner[side, ::every], beside_m
-
-
-class _Looked(NamedTuple):
-    """The pixels in which points lie, their depth, and whether there is any."""
-
-    pixel: Int64[Tensor, "b n"]
-    depth_m: Float64[Tensor, "b n"]
-    is_read: Bool[Tensor, "b n"]
-
-
-def _look_up(frame: Frame, points_m: Float64[Tensor, "b n 3"]) -> _Looked:
-    height, width = frame.depth_m.shape
-    pixel = project(points_m, frame.K).round()
-    column, row = pixel.unbind(-1)
-    inside = (column >= 0) & (column < width) & (row >= 0) & (row < height) & (points_m[..., 2] > 0)
-    place = torch.where(inside, row * width + column, 0).long()
-    depth_m = frame.depth_m.flatten()[place]
-    return _Looked(place, depth_m, inside & (depth_m > 0))
