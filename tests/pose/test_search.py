@@ -279,6 +279,7 @@ def test_a_hundred_models_take_bounded_time(net: Registration) -> None:
         names=[f"part {k}" for k in range(100)],
         object_of=lambda _: net._prepared("bracket"),
         estimate_near=estimate_near,
+        min_probability=0.5,
     )
     began = time.process_time()
     assert not any(estimate.is_posed for estimate in find_objects(view, known))
@@ -341,6 +342,57 @@ def test_poses_of_one_object_on_the_same_readings_are_one_answer() -> None:
     assert [place.log_odds for place in kept] == [3.0]
 
 
+def of_one_object(*log_odds: float) -> list["search._Judged"]:
+    """Places of one object, whose probabilities are those of their log odds."""
+    places = [judged("a", odds, slice(8 * k, 8 * k + 8), k) for k, odds in enumerate(log_odds)]
+    return [
+        replace(place, estimate=replace(place.estimate, certainty=1 / (1 + math.exp(-odds))))
+        for place, odds in zip(places, log_odds, strict=True)
+    ]
+
+
+TARGETS = SearchTargets(
+    names=["a"], object_of=MagicMock(), estimate_near=MagicMock(), min_probability=0.5
+)
+
+
+def test_a_second_place_needs_more_than_the_first() -> None:
+    """Two to one is enough for what is there once, and too little beside what is surely there."""
+    (alone,), _ = search._weigh_instances(of_one_object(math.log(2)), TARGETS)
+    assert alone.estimate.certainty is not None
+    assert 0.6 < alone.estimate.certainty < 0.7
+    (first,), misses = search._weigh_instances(of_one_object(5.0, math.log(2)), TARGETS)
+    assert first.log_odds == 5
+    assert len(misses) == 1
+    assert "beside" in misses[0].reason
+
+
+def test_in_a_bin_of_many_each_is_as_likely_as_alone() -> None:
+    bin_of_six = of_one_object(5.0, 5.0, 5.0, 5.0, 5.0, math.log(2))
+    remaining, misses = search._weigh_instances(bin_of_six, TARGETS)
+    assert not misses
+    alone = [place.estimate.certainty for place in bin_of_six]
+    weighed = [place.estimate.certainty for place in remaining]
+    assert weighed == pytest.approx(alone, abs=0.01)
+
+
+def test_what_would_lie_in_the_wall_is_not_possible(net: Registration) -> None:
+    """The wall hides no half of an object that stands before it; beside its end all is possible."""
+    depth_m = table()
+    surface = net._prepared("bracket").surface
+    pose = pose_at(0.0, 1.19, seed=1)  # the wall is 1.2 m away there
+    in_wall = prepare_frame(depth_m, K.float())
+    view = view_input(depth_m, None, CAMERA, "bracket", "x", None)
+    assert "would lie in" in search._impossible(in_wall, view, pose.double(), surface)
+    before = pose_at(0.0, 1.0, seed=1)
+    assert "would lie in" not in search._impossible(in_wall, view, before.double(), surface)
+    assert in_wall.planes
+    depth_m[:, 80:240] = 3.0  # a gap in the wall
+    gap = replace(in_wall, depth_m=depth_m.double())
+    view = view_input(depth_m, None, CAMERA, "bracket", "x", None)
+    assert "would lie in" not in search._impossible(gap, view, pose.double(), surface)
+
+
 def test_what_is_there_twice_is_searched_for_again(monkeypatch: pytest.MonkeyPatch) -> None:
     """Two of ``a`` and one of ``b`` at first, then a third ``a``, the surest; then nothing."""
     small = torch.tensor([[300.0, 0, 20], [0, 300, 2], [0, 0, 1]]).double()
@@ -365,7 +417,7 @@ def test_what_is_there_twice_is_searched_for_again(monkeypatch: pytest.MonkeyPat
     monkeypatch.setattr(search, "_judge", lambda *_: (rounds[len(searched) - 1], []))
     targets = SearchTargets(
         names=["a", "b"], object_of=MagicMock(**{"return_value.surface.diameter_m": 0.1}),
-        estimate_near=MagicMock(),
+        estimate_near=MagicMock(), min_probability=0.5,
     )  # fmt: skip
     found = find_objects(view, targets)
     assert searched == [(["a", "b"], 40), (["a"], 16), (["a"], 8)]

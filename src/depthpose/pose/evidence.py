@@ -40,7 +40,6 @@ _ACROSS = (-1.0, _WITHIN, 0.5, 1.0)
 nearest one within supports the pose; of thin things the next lies beyond."""
 _LEVEL_M = 0.0005  #: a surface is plane to so much
 _STRAIGHT = 2.0  #: deviations of the noise, by which readings are off their line at most
-_EDGE_PX = 5  #: a sensor spreads a step over so many pixels
 _LEAST_INNER = 0.25  # share of the silhouette that its borders may leave
 _DISK = 1.3  # radius of the disk drawn for a sample, in median distances of samples
 _OBJECT_PX = 8000  # pixels of an object that are compared; of larger ones every n-th
@@ -50,7 +49,7 @@ _FINEST_RAD = 2e-4
 _POINT_PX = 1.5  # side of a pixel of a drawn cloud, in distances of its points
 _JUMP_DIAMETERS = 0.02
 _JUMP_M = 0.01
-"""Neighbours that differ in depth by more than both are the two sides of an edge."""
+"""Drawn neighbours that differ in depth by more than both are the two sides of an edge."""
 _FAR_M = np.float32(1e6)
 _LINE = np.stack([np.ones(4), np.array(_ACROSS)], 1)
 _OFF_LINE = np.eye(4) - _LINE @ np.linalg.pinv(_LINE)  # residuals of the line through four values
@@ -242,8 +241,7 @@ def compare(observation: Observation, pose: Rigid, surface: Surface) -> Evidence
     is_object = observation.is_object[window]
     is_read = np.isfinite(depth_m)
     is_drawn = np.isfinite(drawn_m)
-    jump_m = max(_JUMP_M, _JUMP_DIAMETERS * surface.diameter_m)
-    inner = _without_edges(drawn_m, is_drawn, jump_m, step)
+    inner = _without_edges(drawn_m, is_drawn, surface.diameter_m, step)
 
     # Residuals in standard deviations of their mean over some neighbours.
     side = max(3, 2 * round((AVERAGED_PX / step - 1) / 2) + 1)
@@ -260,9 +258,8 @@ def compare(observation: Observation, pose: Rigid, surface: Surface) -> Evidence
     # Patches that contradict the pose, and what supports it.
     is_supported = is_compared & (np.abs(deviations) <= THRESHOLD)
     seen_through = _patch_area(deviations > THRESHOLD, patch_px)
-    is_before = deviations < -THRESHOLD
+    bulging = _patch_area((deviations < -THRESHOLD) & is_object, patch_px)
     if observation.is_object.any():
-        bulging = _patch_area(is_before & is_object, patch_px)
         is_beside = observation.is_object & np.isfinite(observation.depth_m)
         border = max(1, round((BORDER_PX + 1) / step))
         is_shown = np.zeros_like(is_beside)
@@ -270,7 +267,6 @@ def compare(observation: Observation, pose: Rigid, surface: Surface) -> Evidence
         is_beside &= np.logical_not(ndimage.binary_dilation(is_shown, iterations=border))
         beside_px = patch_px
     else:  # no mask says which readings are the object's: those that go on where the model ends
-        bulging = _patch_area(_is_joined(is_before, is_supported, depth_m, jump_m), patch_px)
         is_beside = _is_continued(observation, is_drawn, is_supported, window)
         beside_px = patch_px / 2  # a patch beside the silhouette is as long as others, half as wide
     visible = float(inner.sum()) / patch_px
@@ -287,33 +283,6 @@ def compare(observation: Observation, pose: Rigid, surface: Surface) -> Evidence
         rms=float(np.sqrt(square.mean())) if len(square) else THRESHOLD,
         noise_m=noise.white_m,
     )
-
-
-def _is_joined(
-    is_before: Bool[np.ndarray, "h w"],
-    is_supported: Bool[np.ndarray, "h w"],
-    depth_m: Float[np.ndarray, "h w"],
-    jump_m: float,
-) -> Bool[np.ndarray, "h w"]:
-    """Mark the patches before the posed surface that are of one surface with what supports it.
-
-    What hides a part of the object parts from it by a step in depth along most of its outline.
-    Where the readings go on without one, they are of the surface that is posed, and contradict it.
-
-    Args:
-        is_before: readings before the posed surface.
-        is_supported: readings on it.
-        depth_m: the readings, NaN where there is none.
-        jump_m: by which neighbours of two surfaces differ.
-    """
-    labels = np.zeros(is_before.shape, np.int32)
-    ndimage.label(is_before, output=labels)
-    is_outline = is_before & ndimage.binary_dilation(is_supported)
-    is_smooth = is_outline & ~_is_edge(depth_m, np.isfinite(depth_m), jump_m, _EDGE_PX)
-    patches = int(labels.max()) + 1
-    outline_px = np.bincount(labels[is_outline], minlength=patches)
-    smooth_px = np.bincount(labels[is_smooth], minlength=patches)
-    return is_before & (smooth_px > outline_px / 2)[labels]
 
 
 def _is_continued(
@@ -376,25 +345,20 @@ def _is_continued(
 
 
 def _without_edges(
-    drawn_m: np.ndarray, is_drawn: np.ndarray, jump_m: float, step: int
+    drawn_m: np.ndarray, is_drawn: np.ndarray, diameter_m: float, step: int
 ) -> np.ndarray:
     """Leave out what is near an edge of the drawing, which a sensor moves by some pixels."""
-    surface = is_drawn & ~_is_edge(drawn_m, is_drawn, jump_m, 3)
+    jump_m = max(_JUMP_M, _JUMP_DIAMETERS * diameter_m)
+    nearest_m = ndimage.minimum_filter(np.where(is_drawn, drawn_m, _FAR_M), 3)
+    farthest_m = ndimage.maximum_filter(np.where(is_drawn, drawn_m, -_FAR_M), 3)
+    is_edge = farthest_m - nearest_m > jump_m
+    surface = is_drawn & ~is_edge
     # Of what is thinner than two borders the middle remains.
     for border in range(math.ceil(BORDER_PX / step), 0, -1):
         inner = ndimage.binary_erosion(surface, iterations=border)
         if inner.sum() >= _LEAST_INNER * is_drawn.sum():
             return inner
     return surface
-
-
-def _is_edge(
-    depth_m: Float[np.ndarray, "h w"], is_valid: Bool[np.ndarray, "h w"], jump_m: float, side: int
-) -> Bool[np.ndarray, "h w"]:
-    """Mark pixels about which the valid depths of a square differ by more than a jump."""
-    nearest_m = ndimage.minimum_filter(np.where(is_valid, depth_m, _FAR_M), side)
-    farthest_m = ndimage.maximum_filter(np.where(is_valid, depth_m, -_FAR_M), side)
-    return farthest_m - nearest_m > jump_m
 
 
 def _patch_area(mask: Bool[np.ndarray, "h w"], patch_px: float) -> float:

@@ -312,34 +312,41 @@ def _miss_at(place: _Place, agreement: float, reason: str, targets: SearchTarget
 def _weigh_instances(
     accepted: Sequence[_Judged], targets: SearchTargets
 ) -> tuple[list[_Judged], list[_Miss]]:
-    """Weigh places of an object by each other: it is there once, or any number of times.
-
-    A table holds one of each object, a bin holds many: so a second place needs more evidence than
-    the first, and where several have it further ones need no more.
-
-    Returns:
-        Places that remain, and those at which it is not likely enough any more.
-    """
+    """Weigh the places of each object by each other; part those that are not likely enough."""
     remaining: list[_Judged] = []
     misses: list[_Miss] = []
     for name in dict.fromkeys(place.object for place in accepted):
         places = [place for place in accepted if place.object == name]
         log_odds = torch.tensor([place.log_odds for place in places], dtype=torch.float64)
-        independent = log_odds.sigmoid()
-        log_one = torch.cat([log_odds.new_zeros(1), log_odds])
-        log_many = math.log(PRIOR_MANY) + softplus(log_odds).sum()
-        many = (log_many - log_one.logsumexp(0)).sigmoid()
-        probability = many * independent + (1 - many) * log_one.softmax(0)[1:]
-        scale = (probability / independent).tolist()
-        for place, probable, its_scale in zip(places, probability.tolist(), scale, strict=True):
+        alone = log_odds.sigmoid()
+        probability = probability_of_instances(log_odds)
+        for place, probable, scale in zip(
+            places, probability.tolist(), (probability / alone).tolist(), strict=True
+        ):
             if probable >= targets.min_probability:
-                remaining.append(replace(place, estimate=_scaled(place.estimate, its_scale)))
+                remaining.append(replace(place, estimate=_scaled(place.estimate, scale)))
                 continue
             reason = f"beside the surer ones it is right with a probability of {probable:.0%}"
             evidence = place.estimate.evidence
             agreement = 0.0 if evidence is None else evidence.agreement
             misses.append(_miss_at(place, agreement, reason, targets))
     return remaining, misses
+
+
+def probability_of_instances(log_odds: Float64[Tensor, " n"]) -> Float64[Tensor, " n"]:
+    """Give the probability of each place of one object, of which there is one or any number.
+
+    A table holds one of each object, a bin holds many: so a second place needs more evidence than
+    the first, and where several have it further ones need no more.
+
+    Args:
+        log_odds: of each place being right, by itself.
+    """
+    by_itself = log_odds.sigmoid()
+    none_or_one = torch.cat([log_odds.new_zeros(1), log_odds])
+    log_many = math.log(PRIOR_MANY) + softplus(log_odds).sum()  # of all choices of places
+    many = (log_many - none_or_one.logsumexp(0)).sigmoid()
+    return many * by_itself + (1 - many) * none_or_one.softmax(0)[1:]
 
 
 def _suppress(
