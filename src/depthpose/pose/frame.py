@@ -309,11 +309,11 @@ def share_behind(
     normal, offset = wide.plane
     beyond_m = (points_m @ normal - offset) * offset.sign()  # the camera is on the other side
     foot_m = points_m - ((points_m @ normal - offset)[:, None]) * normal
-    margin_m = margin_m + _tolerance_m(foot_m[:, 2].clamp(min=0), frame.noise_per_m)
+    limit_m = margin_m + _tolerance_m(foot_m[:, 2].clamp(min=0), frame.noise_per_m)
     # What stands before the plane hides it; where the camera saw farther it has ended.
     readings = readings_toward(frame, foot_m)
-    is_solid = readings.is_read & (readings.depth_m < foot_m[:, 2] + margin_m)
-    return float((is_solid & (beyond_m > margin_m)).double().mean())
+    is_solid = readings.is_read & (readings.depth_m < foot_m[:, 2] + limit_m)
+    return float((is_solid & (beyond_m > limit_m)).double().mean())
 
 
 def _tolerance_m(depth_m: Float64[Tensor, "*n"], noise_per_m: float) -> Float64[Tensor, "*n"]:
