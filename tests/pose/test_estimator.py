@@ -345,7 +345,14 @@ def test_terms_are_said_and_names_are_found(part: ObjectModel, tmp_path: Path) -
     ("given", "text"),
     [
         ({}, "give cloud=, or depth=, camera= and one of mask= and box= together"),
-        ({"cloud": torch.zeros(3, 3), "depth": torch.zeros(2, 2)}, "give cloud=, or depth="),
+        (
+            {"cloud": torch.zeros(3, 3), "depth": torch.zeros(2, 2)},
+            "depth= belong to a depth image",
+        ),
+        (
+            {"cloud": torch.zeros(3, 3), "camera": K, "color": torch.zeros(2, 2, 3)},
+            "camera=, color= belong to a depth image, not to cloud=",
+        ),
         ({"depth": torch.ones(240, 320), "mask": torch.ones(240, 320)}, "give cloud=, or depth="),
         ({"cloud": torch.zeros(3, 50)}, r"is of shape \(3, 50\); give points as rows"),
         ({"cloud": torch.zeros(30, 3), "object": "braket"}, "did you mean 'bracket'"),

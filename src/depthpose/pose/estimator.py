@@ -173,12 +173,21 @@ class PoseEstimator:
                 the data themselves lack is no error but a refusal.
         """
         which = self.objects[0] if object is None else self._known(object).model.name
-        if cloud is not None and depth is None and mask is None and box is None:
+        of_view = {
+            "depth": depth, "mask": mask, "box": box, "camera": camera, "focal_px": focal_px,
+            "color": color, "color_camera": color_camera, "color_from_depth": color_from_depth,
+        }  # fmt: skip
+        unused = [f"{name}=" for name, value in of_view.items() if value is not None]
+        if cloud is not None and unused:
+            raise InputError(
+                f"estimate: {', '.join(unused)} belong to a depth image, not to cloud=; omit them, "
+                "or omit cloud= and give depth=, camera= and one of mask= and box= together"
+            )
+        if cloud is not None:
             given = cloud_input(cloud, unit or "m", which, _NAME)
         else:
             lens = choose_lens(camera, focal_px)
-            is_view = cloud is None and depth is not None and (mask is None) != (box is None)
-            if depth is None or lens is None or not is_view:
+            if depth is None or lens is None or (mask is None) == (box is None):
                 raise InputError(
                     "estimate: give cloud=, or depth=, camera= and one of mask= and box= together"
                 )
