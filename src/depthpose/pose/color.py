@@ -258,7 +258,7 @@ def _independent_places(seen: _Seen, surface: SurfaceColors) -> Float64[Tensor, 
     key = torch.rand(seen.weight.shape[1], generator=generator, dtype=torch.float64)
     count = min(_PAIRED, seen.weight.shape[1])
     reach_m = float((surface.points_m.amax(0) - surface.points_m.amin(0)).norm())
-    found: list[Tensor] = []
+    places: list[Tensor] = []
     for first in range(0, len(seen.weight), _POSES_AT_ONCE):
         here = slice(first, first + _POSES_AT_ONCE)
         chosen = (seen.weight[here, :, 0] * (1 + key)).topk(count, dim=1).indices
@@ -282,8 +282,8 @@ def _independent_places(seen: _Seen, surface: SurfaceColors) -> Float64[Tensor, 
         off_diagonal[..., 0] -= itself * product[..., 0]
         total = itself.square()
         variance = (off_diagonal.sum(-1) + itself) / total.clamp(min=1)
-        found.append((1 / variance.clamp(min=1 / count)).mT)
-    return torch.cat(found)
+        places.append((1 / variance.clamp(min=1 / count)).mT)
+    return torch.cat(places)
 
 
 def _binned(
@@ -355,14 +355,14 @@ def _explained(
     assert view.color is not None
     surface = _thinned(model.colors, samples)
     image = _blurred(view.color, poses, surface)
-    found: list[Tensor] = []
+    shares: list[Tensor] = []
     at_once = max(1, _POINTS_AT_ONCE // len(surface.points_m))
     for first in range(0, len(poses.R), at_once):
         some = poses[first : first + at_once]
         seen = _look(some, surface, view, image, _NEAR * model.diameter_m)
         explained = _correlation(seen).clamp(0, _MOST).square()
-        found.append((-seen.weight.sum(1) * torch.log1p(-explained)).sum(-1))
-    return torch.cat(found)
+        shares.append((-seen.weight.sum(1) * torch.log1p(-explained)).sum(-1))
+    return torch.cat(shares)
 
 
 _SAME_RAD = math.radians(3)
@@ -463,11 +463,11 @@ def _peak(values: Float64[Tensor, "*b 3"]) -> Float64[Tensor, "*b"]:
 def _look_alikes(model: ObjectModel) -> tuple[list[Rigid], list[Axis]]:
     """Give the turns after which a shape looks alike or nearly, and axes of any turn."""
     assert model.colors is not None
-    found = model.symmetries if model.symmetries.is_found else None
+    symmetries = model.symmetries if model.symmetries.is_found else None
     turns = [near.model_from_model.double() for near in near_symmetries(model)]
-    if found is not None and found.discrete is not None:
-        turns += [found.discrete.double()[k] for k in range(len(found.discrete.R))]
-    axes = [] if found is None else list(found.continuous)
+    if symmetries is not None and symmetries.discrete is not None:
+        turns += [symmetries.discrete.double()[k] for k in range(len(symmetries.discrete.R))]
+    axes = [] if symmetries is None else list(symmetries.continuous)
     axes += _axes_of_many(turns, axes)
     # A box whose halves differ a little looks alike after half turns about its middle.
     points_m = model.colors.points_m.double()
@@ -484,17 +484,17 @@ def _axes_of_many(turns: Sequence[Rigid], known: Sequence[Axis]) -> list[Axis]:
     eye = torch.eye(3).double()
     # The direction that a rotation leaves alone, and a point that it does.
     directions = [torch.linalg.svd(turn.R - eye).Vh[-1] for turn in turns]
-    found: list[Axis] = []
+    axes: list[Axis] = []
     for direction in directions:
-        others = [*known, *found]
+        others = [*known, *axes]
         is_known = any(abs(float(direction @ axis.direction.double())) > _ALONG for axis in others)
         alike = [k for k, d in enumerate(directions) if abs(float(d @ direction)) > _ALONG]
         if is_known or len(alike) < _MANY_TURNS:
             continue
         points = [torch.linalg.pinv(eye - turns[k].R, rtol=1e-3) @ turns[k].t_m for k in alike]
         point_m = torch.stack(points).median(0).values
-        found.append(Axis(direction=direction, point_m=point_m))
-    return found
+        axes.append(Axis(direction=direction, point_m=point_m))
+    return axes
 
 
 def _is_spun(turn: Rigid, other: Rigid, axis: Axis) -> bool:

@@ -101,14 +101,14 @@ def find_copies(model: ObjectModel) -> SymmetricCopies:
     alike = [n.model_from_model[None] for n in near if n.deviation <= _COPY_DIAMETERS]
     unlike = [n.model_from_model[None] for n in near if n.deviation > _COPY_DIAMETERS]
     copies = Rigid.cat([declared, *alike])
-    found = cached(model, find_turns, "turns")
-    rows = torch.tensor(found["turns"], dtype=torch.float64).reshape(-1, 4, 4)
+    proposed = cached(model, find_turns, "turns")
+    rows = torch.tensor(proposed["turns"], dtype=torch.float64).reshape(-1, 4, 4)
     turns = Rigid(rows[:, :3, :3], rows[:, :3, 3])
     # Half turns about the principal axes: the usual mistake about a long or flat part.
     half = 2 * axes[:, :, None] * axes[:, None] - torch.eye(3).double()
     halves = Rigid(half, middle_m - half @ middle_m)
-    lookalikes = Rigid.cat([*unlike, turns[found["mostly"] :], halves])
-    copies = Rigid.cat([copies, turns[: found["mostly"]]])
+    lookalikes = Rigid.cat([*unlike, turns[proposed["mostly"] :], halves])
+    copies = Rigid.cat([copies, turns[: proposed["mostly"]]])
     centre_m = exact.ball_centre_m
     if centre_m is not None:  # every rotation of a ball is the same pose: its centre says where
         compared_m = centre_m.to(points_m)[None]

@@ -107,10 +107,10 @@ class PoseEstimator:
     def _answers(self, inputs: Sequence[AnyInput], *, is_likely: bool) -> list[PoseEstimate]:
         """Estimate inputs; raise the :class:`InputError` of one that could not be taken."""
         answers: list[PoseEstimate] = []
-        for one in self._each(inputs, 1, is_likely=is_likely):
-            if one.status == "unreadable":
-                raise InputError(one.reason)
-            answers.append(one)
+        for estimate in self._each(inputs, 1, is_likely=is_likely):
+            if estimate.status == "unreadable":
+                raise InputError(estimate.reason)
+            answers.append(estimate)
         return answers
 
     def _estimate_in_region(self, view: ViewInput) -> PoseEstimate:
@@ -293,8 +293,8 @@ class PoseEstimator:
             min_probability=self.refusal.min_probability,
             is_single=is_sure,
         )
-        found = find_objects(view, targets)
-        return [with_status(estimate, self.config.min_certainty) for estimate in found]
+        estimates = find_objects(view, targets)
+        return [with_status(estimate, self.config.min_certainty) for estimate in estimates]
 
     def track(
         self,
@@ -350,7 +350,7 @@ class PoseEstimator:
                     reason = str(error)
             return PoseEstimate(name=name, object=which, status="unreadable", reason=reason)
 
-        return self.track_in((read(*one) for one in enumerate(frames)), which, start)
+        return self.track_in((read(*numbered) for numbered in enumerate(frames)), which, start)
 
     def track_in(
         self, frames: Iterable[AnyInput | PoseEstimate], object: str, first: Rigid | None = None
@@ -385,8 +385,8 @@ class PoseEstimator:
                 )
             name = self.models[0].name
         if not isinstance(name, str):
-            known = ", ".join(map(repr, names))
-            raise InputError(f"object {name!r} is no text; give the name of one: {known}")
+            listing = ", ".join(map(repr, names))
+            raise InputError(f"object {name!r} is no text; give the name of one: {listing}")
         if name not in names:
             nearest = nearest_name(name, names)
             raise InputError(f"object {name!r}: {self._holder} do not know it; {nearest}")
@@ -399,11 +399,11 @@ class PoseEstimator:
 
     def _prepared(self, name: str) -> PreparedObject:
         """Give an object by its name, with its point pairs, near-symmetries and turns."""
-        known = self._known(name)
-        with_copies(known)
-        if known.pairs is None:
-            known.pairs = prepare_pairs(known.surface)
-        return known
+        prepared = self._known(name)
+        with_copies(prepared)
+        if prepared.pairs is None:
+            prepared.pairs = prepare_pairs(prepared.surface)
+        return prepared
 
 
 def or_unreadable(work: Callable[[AnyInput], Made], given: AnyInput) -> Made | PoseEstimate:
@@ -418,7 +418,7 @@ def or_unreadable(work: Callable[[AnyInput], Made], given: AnyInput) -> Made | P
     except InputError as error:
         reason = str(error)
     except (MemoryError, RuntimeError) as error:
-        if (said := full_memory(error)) is None:
+        if (message := full_memory(error)) is None:
             raise
-        reason = f"{given.name}: {said}"
+        reason = f"{given.name}: {message}"
     return refused(given, Refusal(status="unreadable", reason=reason), {})

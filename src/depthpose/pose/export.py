@@ -118,7 +118,7 @@ def pose_export(weights: PoseWeights, facts: dict[str, Any]) -> Export:
             f"these weights are of a baseline ({type(network).__name__}); what is exported is the "
             "sparse network: give weights of kind 'geoposenet'."
         )
-    known = {
+    model_facts = {
         "cloud": config_to_dict(weights.cloud),
         "objects": [model.name for model in weights.models],
         "keypoints_m": [model.keypoints_m.tolist() for model in weights.models],
@@ -128,7 +128,7 @@ def pose_export(weights: PoseWeights, facts: dict[str, Any]) -> Export:
         cases=partial(_cases, weights, network),
         limits={"directions": Limit(value=1e-4)},
         facts={
-            **facts, **known,
+            **facts, **model_facts,
             "what": "voxels (cloud, x, y, z) and their features -> directions to keypoints",
         },
     )  # fmt: skip

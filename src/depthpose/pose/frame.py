@@ -238,14 +238,14 @@ def _bent(
     x, y = (points_m[..., :2] / points_m[..., 2:].clamp(min=1e-6)).unbind(-1)
     terms = torch.stack([torch.ones_like(x), x, y, x * x, x * y, y * y], -1)
     tolerance_m = _tolerance_m(points_m[..., 2], noise_per_m)
-    found = near & is_along
+    is_bent = near & is_along
     for _ in range(_BENDINGS):
-        A, b = (take_evenly(grid[found], _SAMPLE) for grid in (terms, off_m))
+        A, b = (take_evenly(grid[is_bent], _SAMPLE) for grid in (terms, off_m))
         if len(b) < _LEAST_POINTS:
             break
         bend_m = terms @ torch.linalg.lstsq(A, b[:, None]).solution
-        found = is_along & ((off_m - bend_m[..., 0]).abs() < tolerance_m)
-    return found
+        is_bent = is_along & ((off_m - bend_m[..., 0]).abs() < tolerance_m)
+    return is_bent
 
 
 def largest_plane(

@@ -169,7 +169,7 @@ def refine_best(
     if refined is None:
         short = replace(short, start_distance_diameters=config.end_distance_diameters)
         refined = refine_pose(points_m, tried[best], surface, short)
-    found = refined.camera_from_model.double()
+    pose = refined.camera_from_model.double()
     # From the best down, those that carry the object elsewhere than any before, symmetries aside.
     others: list[int] = []
     own_m = surface.points_m[:: max(1, len(surface.points_m) // 50)]
@@ -177,7 +177,7 @@ def refine_best(
     for k in score.argsort(descending=True).tolist():
         if len(others) == _MOST_OTHERS or score[k] == -torch.inf:
             break
-        before = Rigid.stack([found, *(tried[one] for one in others)])
+        before = Rigid.stack([pose, *(tried[one] for one in others)])
         moved_m = (before.inverse() @ tried[k]).apply(own_m)
         gap_m = (moved_m[:, None] - copies_m).norm(dim=-1).mean(-1)
         if float(gap_m.min()) > _OTHER * surface.diameter_m:
@@ -233,8 +233,8 @@ def _iterated(
     index, steps = torch.full((*pose.t_m.shape[:-1], len(cloud)), -1), len(limits_m) - 1
     for k, limit_m in enumerate(limits_m):
         how = LOOKED_UP if not is_exact else SEARCHED if 2 * k < steps else ON_RAY
-        found = match(cloud, pose, surface, limit_m, how, index)
-        index = torch.where(moves > 0, found, index)
+        matches = match(cloud, pose, surface, limit_m, how, index)
+        index = torch.where(moves > 0, matches, index)
         if k == steps:
             break
         H, pull, *_ = _normal_equations(cloud, pose, surface, limit_m, index, how)
@@ -309,13 +309,13 @@ def match(
     which, place = (index < 0).nonzero(as_tuple=True)
     while len(which):
         asked = local_m[which, place].numpy()
-        _, found = surface.tree.query(asked, k=range(1, count + 1), distance_upper_bound=limit_m)
-        found = torch.from_numpy(found)
-        is_some = found < total  # the tree's word for none within the limit
-        found = found.clamp(max=total - 1)
-        is_good = is_some & _is_seen(eyes_m[which, 0, None], found, surface)
+        _, nearest = surface.tree.query(asked, k=range(1, count + 1), distance_upper_bound=limit_m)
+        nearest = torch.from_numpy(nearest)
+        is_some = nearest < total  # the tree's word for none within the limit
+        nearest = nearest.clamp(max=total - 1)
+        is_good = is_some & _is_seen(eyes_m[which, 0, None], nearest, surface)
         first, is_done = is_good.int().argmax(1), is_good.any(1)
-        index[which[is_done], place[is_done]] = found[is_done, first[is_done]]
+        index[which[is_done], place[is_done]] = nearest[is_done, first[is_done]]
         is_left = ~is_done & is_some.all(1) & (count < total)
         which, place = which[is_left], place[is_left]
         count = min(8 * count, total)
@@ -413,10 +413,10 @@ def _covariance(
         rest = eye * (1 + _REST) - held @ inverse[..., None, :, :]
         moves = torch.linalg.solve(rest, pull[..., None]).squeeze(-1) @ inverse
         moves = from_own @ moves.mT
-        values, found = torch.linalg.eigh(moves @ moves.mT)
+        values, axes = torch.linalg.eigh(moves @ moves.mT)
         is_more = values.sum(-1, keepdim=True) > most.sum(-1, keepdim=True)
         most = torch.where(is_more, values, most)
-        ways = torch.where(is_more[..., None], found, ways)
+        ways = torch.where(is_more[..., None], axes, ways)
     least = most.mean(-1, keepdim=True).clamp(min=1)
     spread = own @ ways
     return (spread * torch.maximum(most, least)[..., None, :]) @ spread.mT

@@ -68,8 +68,8 @@ def view_input(
         raise InputError(f"{name}: the depth is of shape {tuple(values.shape)}, not (h, w)")
     height, width = values.shape
     is_said = isinstance(camera, str | Path | Mapping | float | int)
-    known = camera_of(camera, (width, height)) if is_said else camera
-    said_m = known.depth_unit_m if isinstance(known, Camera) else None
+    lens = camera_of(camera, (width, height)) if is_said else camera
+    said_m = lens.depth_unit_m if isinstance(lens, Camera) else None
     file = str(depth) if isinstance(depth, str | Path) else name
     given_m = None if unit is None else metres_of(unit)
     if not values.is_floating_point():
@@ -89,19 +89,19 @@ def view_input(
     depth_m = torch.where(values > 0, values * (given_m or 1.0), torch.nan).float()
     pixels = torch.ones(height, width).bool()
     if mask is not None:
-        said = str(mask) if isinstance(mask, str | Path) else name
-        pixels = one_mask(labels_input(mask, name), said)
+        mask_name = str(mask) if isinstance(mask, str | Path) else name
+        pixels = one_mask(labels_input(mask, name), mask_name)
     if tuple(pixels.shape) != (height, width):
         raise InputError(
             f"{name}: the mask is of shape {tuple(pixels.shape)}, but the depth image of "
             f"{(height, width)}; give the mask of this very image"
         )
-    if isinstance(known, Camera):
-        check_image_matches_camera(known, width, height, name)
-    K = known.K if isinstance(known, Camera) else intrinsics_of(known)
+    if isinstance(lens, Camera):
+        check_image_matches_camera(lens, width, height, name)
+    K = lens.K if isinstance(lens, Camera) else intrinsics_of(lens)
     try:
         # A crop may leave the centre; its camera says the size, which was compared above.
-        refuse = refuse_outside if isinstance(known, Camera) else refuse_other_resolution
+        refuse = refuse_outside if isinstance(lens, Camera) else refuse_other_resolution
         refuse(K, width, height)
     except InputError as error:
         raise InputError(

@@ -56,8 +56,11 @@ def add_of_nearest_m(
     90 degrees, and not only those that leave the object as it is. Poses are ``camera_from_model``,
     symmetries a batch with the identity, of ``mesh.symmetry_transforms``.
     """
-    found, copies = _moved(estimated, points_m), _symmetric_copies(true, symmetries, len(points_m))
-    return torch.cat([(_moved(c, points_m) - found).norm(dim=-1).mean(-1) for c in copies]).min()
+    moved_m, copies = (
+        _moved(estimated, points_m),
+        _symmetric_copies(true, symmetries, len(points_m)),
+    )
+    return torch.cat([(_moved(c, points_m) - moved_m).norm(dim=-1).mean(-1) for c in copies]).min()
 
 
 def mssd_m(
@@ -67,8 +70,11 @@ def mssd_m(
 
     The arguments are those of :func:`add_of_nearest_m`.
     """
-    found, copies = _moved(estimated, points_m), _symmetric_copies(true, symmetries, len(points_m))
-    return torch.cat([(_moved(c, points_m) - found).norm(dim=-1).amax(-1) for c in copies]).min()
+    moved_m, copies = (
+        _moved(estimated, points_m),
+        _symmetric_copies(true, symmetries, len(points_m)),
+    )
+    return torch.cat([(_moved(c, points_m) - moved_m).norm(dim=-1).amax(-1) for c in copies]).min()
 
 
 def mspd_px(
@@ -83,9 +89,9 @@ def mspd_px(
     Infinite where a point lies behind the camera. BOP scales it by 640 / image width before its
     thresholds; see :func:`average_recall`.
     """
-    found = project(_moved(estimated, points_m), K)
+    pixels = project(_moved(estimated, points_m), K)
     largest = [
-        (project(_moved(copy, points_m), K) - found).norm(dim=-1).nan_to_num(torch.inf).amax(-1)
+        (project(_moved(copy, points_m), K) - pixels).norm(dim=-1).nan_to_num(torch.inf).amax(-1)
         for copy in _symmetric_copies(true, symmetries, len(points_m))
     ]
     return torch.cat(largest).min()

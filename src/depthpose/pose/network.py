@@ -241,6 +241,6 @@ def unfold_norms(folded: ResUNet, network: ResUNet, voxels: Voxels) -> None:
         norm.bias.copy_(mean)
     is_alike = folded.final.weight.shape == network.final.weight.shape
     parts = ("mix.", "final.") if is_alike else ("mix.",)
-    known = network.state_dict()
-    others = {k: v for k, v in folded.state_dict().items() if k.startswith(parts) and k in known}
+    state = network.state_dict()
+    others = {k: v for k, v in folded.state_dict().items() if k.startswith(parts) and k in state}
     network.load_state_dict(others, strict=False)

@@ -83,12 +83,12 @@ def _batches(
     """Group clouds so that each group has ``most`` voxels at most, or is one cloud."""
     group: list[CloudToPose | PoseEstimate] = []
     total = 0
-    for one in clouds:
-        count = len(one.cloud.points_m) if isinstance(one, CloudToPose) else 0
+    for job in clouds:
+        count = len(job.cloud.points_m) if isinstance(job, CloudToPose) else 0
         if group and total + count > most:
             yield group
             group, total = [], 0
-        group.append(one)
+        group.append(job)
         total += count
     if group:
         yield group
@@ -142,9 +142,9 @@ class GeoPoseNet(PoseEstimator):
         Raises:
             InputError: no such weights, or none of a pose network.
         """
-        found = read_pose_weights(find_weights(weights))
-        warn_of_terms(found.facts)
-        net = cls(found, config)
+        loaded = read_pose_weights(find_weights(weights))
+        warn_of_terms(loaded.facts)
+        net = cls(loaded, config)
         net.name = str(weights)
         return net
 
@@ -198,12 +198,12 @@ class GeoPoseNet(PoseEstimator):
             InputError: an unknown object, or a mask that does not fit its depth image.
         """
         with refused_memory(given.name):
-            one = self._prepare(given)
-            if isinstance(one, PoseEstimate):
-                return one, None
-            self._ask_network([one])
-            found = self._vote(given, job=one, is_likely=True)
-            return found, CloudDirections(one.cloud, one.directions)
+            job = self._prepare(given)
+            if isinstance(job, PoseEstimate):
+                return job, None
+            self._ask_network([job])
+            voted = self._vote(given, job=job, is_likely=True)
+            return voted, CloudDirections(job.cloud, job.directions)
 
     def _prepare(self, given: AnyInput) -> CloudToPose | PoseEstimate:
         if isinstance(given, ViewInput) and given.is_region:
@@ -221,16 +221,16 @@ class GeoPoseNet(PoseEstimator):
         self, group: list[CloudToPose | PoseEstimate]
     ) -> list[CloudToPose | PoseEstimate]:
         """Ask together for the directions of a group's clouds, in the camera frame."""
-        ready = [one for one in group if isinstance(one, CloudToPose)]
+        ready = [job for job in group if isinstance(job, CloudToPose)]
         if not ready:
             return group
         start = time.perf_counter()
-        counts = [len(one.cloud.points_m) for one in ready]
+        counts = [len(job.cloud.points_m) for job in ready]
         cloud_of_point = torch.repeat_interleave(torch.arange(len(ready)), torch.tensor(counts))
-        numbers = torch.tensor([one.prepared.number for one in ready])
-        grids = [one.cloud.voxels for one in ready]
+        numbers = torch.tensor([job.prepared.number for job in ready])
+        grids = [job.cloud.voxels for job in ready]
         coordinates = torch.cat([grid.coordinates for grid in grids])
-        points_m = [one.cloud.points_m @ one.cloud.voxels.grid_from_camera.mT for one in ready]
+        points_m = [job.cloud.points_m @ job.cloud.voxels.grid_from_camera.mT for job in ready]
         device = self.config.device
         seen = SeenPoints(
             points_m=torch.cat(points_m).to(device),
@@ -239,25 +239,25 @@ class GeoPoseNet(PoseEstimator):
             class_of_point=numbers[cloud_of_point].to(device),
         )
         outputs = self._network.directions(seen).float().cpu().split(counts)
-        for one, some in zip(ready, outputs, strict=True):
-            one.directions = some @ one.cloud.voxels.grid_from_camera
+        for job, some in zip(ready, outputs, strict=True):
+            job.directions = some @ job.cloud.voxels.grid_from_camera
         spent_s = time.perf_counter() - start
-        for one, count in zip(ready, counts, strict=True):  # each has a share of the time
-            one.seconds["network"] = spent_s * count / sum(counts)
+        for job, count in zip(ready, counts, strict=True):  # each has a share of the time
+            job.seconds["network"] = spent_s * count / sum(counts)
         return group
 
-    def _pose(self, one: CloudToPose | PoseEstimate, *, is_likely: bool) -> PoseEstimate:
+    def _pose(self, job: CloudToPose | PoseEstimate, *, is_likely: bool) -> PoseEstimate:
         """Pose a cloud by its votes, or by registration where these are doubted."""
-        if isinstance(one, PoseEstimate):
-            return one
-        found = or_unreadable(partial(self._vote, job=one, is_likely=is_likely), one.given)
-        if not (self.config.register_refused and is_likely) or found.status not in _DOUBTED:
-            return found
+        if isinstance(job, PoseEstimate):
+            return job
+        voted = or_unreadable(partial(self._vote, job=job, is_likely=is_likely), job.given)
+        if not (self.config.register_refused and is_likely) or voted.status not in _DOUBTED:
+            return voted
         start = time.perf_counter()
-        (registered,) = self._by_models().estimate_many([one.given])
+        (registered,) = self._by_models().estimate_many([job.given])
         spent_s = time.perf_counter() - start
-        best = registered if registered.is_posed else found
-        return replace(best, seconds={**found.seconds, "registration": spent_s})
+        best = registered if registered.is_posed else voted
+        return replace(best, seconds={**voted.seconds, "registration": spent_s})
 
     def _vote(self, given: AnyInput, *, job: CloudToPose, is_likely: bool) -> PoseEstimate:
         """Vote for the keypoints, fit the pose to them, refine it, and decide by the evidence."""
@@ -355,7 +355,7 @@ class DepthImageRegressor(PoseEstimator):
 
     def _answers(self, inputs: Sequence[AnyInput], *, is_likely: bool) -> list[PoseEstimate]:
         if len(inputs) > 1:
-            names = ", ".join(one.object for one in inputs)
+            names = ", ".join(item.object for item in inputs)
             raise InputError(f"object: say which of {names}; a regressor refuses none")
         return super()._answers(inputs, is_likely=is_likely)
 
@@ -367,19 +367,19 @@ class DepthImageRegressor(PoseEstimator):
         raise InputError(_NEEDS_MASK)
 
     def _estimate(self, given: AnyInput) -> PoseEstimate:
-        known = self._known(given.object)
+        prepared = self._known(given.object)
         if not isinstance(given, ViewInput):
             raise InputError(_NEEDS_MASK)
-        config, model, began = self._network.config, known.model, time.perf_counter()
+        config, model, began = self._network.config, prepared.model, time.perf_counter()
         crop = cut_depth(given, config, model.diameter_m)
         if crop is None:
             reason = f"fewer than {config.min_points} masked pixels have a depth"
             return refused(given, Refusal(status="too few points", reason=reason), {})
         batch = DepthCrop(*(part[None].to(self.config.device) for part in crop))
-        numbers = torch.tensor([known.number], device=self.config.device)
+        numbers = torch.tensor([prepared.number], device=self.config.device)
         poses = poses_of(self._network(batch.image, numbers), batch)
         regressed = time.perf_counter()
-        found = PoseEstimate(
+        estimate = PoseEstimate(
             name=given.name,
             object=given.object,
             status="ok",
@@ -387,20 +387,20 @@ class DepthImageRegressor(PoseEstimator):
             seconds={"network": regressed - began},
         )
         if not self.config.with_icp:
-            return found
+            return estimate
         points_m = cloud_from_depth(
             given.depth_m, given.mask, given.K, model.diameter_m, self._cloud
         ).float()
         if (few := refusal_of(points_m, self._cloud)) is not None:
-            return replace(found, status="too few points", reason=few, camera_from_model=None)
-        pose = found.camera_from_model
+            return replace(estimate, status="too few points", reason=few, camera_from_model=None)
+        pose = estimate.camera_from_model
         assert pose is not None
-        refined = refine_best(points_m, pose, known.surface, self.config.icp).refined
-        seconds = {**found.seconds, "icp": time.perf_counter() - regressed}
+        refined = refine_best(points_m, pose, prepared.surface, self.config.icp).refined
+        seconds = {**estimate.seconds, "icp": time.perf_counter() - regressed}
         if float(refined.inlier_share) == 0:  # nothing near the surface: ICP had no say
-            return replace(found, seconds=seconds)
+            return replace(estimate, seconds=seconds)
         return replace(
-            found,
+            estimate,
             seconds=seconds,
             camera_from_model=refined.camera_from_model,
             covariance=refined.covariance,

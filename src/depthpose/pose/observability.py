@@ -57,9 +57,9 @@ def observability(
     J = torch.cat([torch.linalg.cross(arm, normal) / radius_m, normal], -1)
     # Declared symmetries as motions about the middle, turns in metres at the radius.
     turn, shift = free[:, :3].double(), free[:, 3:].double()
-    own = torch.cat([turn * radius_m, shift + turn @ cross_matrix(middle)], -1)
-    _, _, rows = torch.linalg.svd(own)  # the last ones are orthogonal to all of them
-    basis = rows[int(torch.linalg.matrix_rank(own, rtol=1e-9)) :].T
+    motions = torch.cat([turn * radius_m, shift + turn @ cross_matrix(middle)], -1)
+    _, _, rows = torch.linalg.svd(motions)  # the last ones are orthogonal to all of them
+    basis = rows[int(torch.linalg.matrix_rank(motions, rtol=1e-9)) :].T
     values, vectors = torch.linalg.eigh(basis.T @ (J.T @ J / len(J)) @ basis)
     return float(values[0].clamp(min=0).sqrt()), basis @ vectors[:, 0]
 

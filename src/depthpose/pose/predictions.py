@@ -74,7 +74,7 @@ class Predictions(list[Prediction]):
         Raises:
             ImportError: pandas is not installed.
         """
-        return data_frame(prediction_row(one) for one in self)
+        return data_frame(prediction_row(prediction) for prediction in self)
 
 
 def place_of(instance: Instance) -> Place:
@@ -99,14 +99,14 @@ def read_predictions(folder: Path) -> Predictions:
     """
     path = folder / POSES
     rows = enumerate(read_rows(path))
-    found = Predictions(parse_prediction(row, f"{path}: entry {i}") for i, row in rows)
+    predictions = Predictions(parse_prediction(row, f"{path}: entry {i}") for i, row in rows)
     names: set[str] = set()
-    for prediction in found:
+    for prediction in predictions:
         name = prediction.estimate.name
         if name in names:
             raise InputError(f"{path}: two estimates are called {name!r}; keep one of them")
         names.add(name)
-    return found
+    return predictions
 
 
 def earlier_predictions(folder: Path) -> dict[str, Prediction]:
@@ -114,18 +114,21 @@ def earlier_predictions(folder: Path) -> dict[str, Prediction]:
 
     By the names of estimates. A damaged file is as none, and a notice.
     """
-    found: dict[str, Prediction] = {}
+    predictions: dict[str, Prediction] = {}
     for home in (folder, *sorted(folder.glob("part-*"))):
         try:
             every = read_predictions(home) if (home / POSES).is_file() else []
         except InputError as error:
             warnings.warn(f"{error} - it is damaged, and made again", Notice, stacklevel=2)
             continue
-        for one in every:
+        for prediction in every:
             # What was read at last counts, whatever another part said of an earlier try.
-            if one.estimate.status != "unreadable" or one.estimate.name not in found:
-                found[one.estimate.name] = one
-    return found
+            if (
+                prediction.estimate.status != "unreadable"
+                or prediction.estimate.name not in predictions
+            ):
+                predictions[prediction.estimate.name] = prediction
+    return predictions
 
 
 def score_of(estimate: PoseEstimate) -> float:
@@ -154,8 +157,8 @@ def prediction_row(prediction: Prediction) -> dict[str, Any]:
     # JSON has no infinity: a free axis has no deviation, nothing near the surface no distance.
     for name in ("origin_std_mm", "rotation_std_deg"):
         values = None if pose is None else getattr(estimate, name)
-        known = [] if values is None else values.tolist()
-        row[name] = [v if math.isfinite(v) else None for v in known] or None
+        certainties = [] if values is None else values.tolist()
+        row[name] = [v if math.isfinite(v) else None for v in certainties] or None
     for name in ("inlier_share", "residual_m", "certainty", "copy_certainty"):
         value: float | None = getattr(estimate, name)
         row[name] = value if value is not None and math.isfinite(value) else None
@@ -192,8 +195,8 @@ def parse_prediction(row: dict[str, Any], source: str) -> Prediction:
         raise InputError(f"{source}: name and object are {name!r} and {what!r}; write two words")
     status, reason = row.get("status"), row.get("reason", "")
     if status not in get_args(Status):
-        known = get_args(Status)
-        raise InputError(f"{source}: status {status!r}: {nearest_name(str(status), known)}")
+        statuses = get_args(Status)
+        raise InputError(f"{source}: status {status!r}: {nearest_name(str(status), statuses)}")
     tracking = row.get("tracking")
     if tracking is not None and tracking not in get_args(Tracking):
         raise InputError(f"{source}: tracking is {tracking!r}; write one of {get_args(Tracking)}")
@@ -233,10 +236,10 @@ def parse_prediction(row: dict[str, Any], source: str) -> Prediction:
         raise InputError(f"{source}: seconds is {seconds!r}, where names to numbers belong")
     values["seconds"] = {str(stage): number(seconds, stage, None, source) for stage in seconds}
     for key, kind in (("evidence", Evidence), ("identity", Identity)):
-        found, where = row.get(key), f"{source}: {key}"
-        if found is not None and not isinstance(found, dict):
-            raise InputError(f"{where} is {found!r}, where names to values belong")
-        values[key] = None if found is None else config_from_dict(found, kind, source=where)
+        value, where = row.get(key), f"{source}: {key}"
+        if value is not None and not isinstance(value, dict):
+            raise InputError(f"{where} is {value!r}, where names to values belong")
+        values[key] = None if value is None else config_from_dict(value, kind, source=where)
     estimate = PoseEstimate(
         name=name,
         object=what,
@@ -427,17 +430,21 @@ def detection_jobs(
     shown: dict[Place, list[Instance]] = defaultdict(list)
     for instance in dataset.instances:
         shown[place_of(instance)].append(instance)
-    found: dict[Place, list[Detection]] = defaultdict(list)
-    for one in sorted(detections, key=lambda d: -d.score):
-        if one.scene_id is None or one.image_id is None or one.object_id is None:
+    of_place: dict[Place, list[Detection]] = defaultdict(list)
+    for detection in sorted(detections, key=lambda d: -d.score):
+        if detection.scene_id is None or detection.image_id is None or detection.object_id is None:
             raise InputError(
-                f"{dataset.folder}: a detection of {one.label!r} lacks scene_id, image_id or "
+                f"{dataset.folder}: a detection of {detection.label!r} lacks scene_id, image_id or "
                 "category_id; detections of a data set have all three"
             )
-        place = Place(one.scene_id, one.image_id, one.object_id)
-        if len(found[place]) < len(shown.get(place, ())):
-            found[place].append(one)
-    kept = [(place, k, one) for place, every in found.items() for k, one in enumerate(every)]
+        place = Place(detection.scene_id, detection.image_id, detection.object_id)
+        if len(of_place[place]) < len(shown.get(place, ())):
+            of_place[place].append(detection)
+    kept = [
+        (place, k, detection)
+        for place, every in of_place.items()
+        for k, detection in enumerate(every)
+    ]
     if not kept:
         raise InputError(
             f"{dataset.folder}: none of the {len(detections)} detections is of an image and object "
@@ -446,11 +453,15 @@ def detection_jobs(
     sharing = Counter(place[:2] for place, _, _ in kept)
 
     jobs: list[PoseJob[ViewInput]] = []
-    for place, k, one in sorted(kept, key=lambda item: item[:2]):
+    for place, k, detection in sorted(kept, key=lambda item: item[:2]):
         name = f"{place.scene_id:06d}_{place.image_id:06d}_object{place.object_id}_{k}"
-        seconds = {} if one.seconds is None else {"segmentation": one.seconds / sharing[place[:2]]}
+        seconds = (
+            {}
+            if detection.seconds is None
+            else {"segmentation": detection.seconds / sharing[place[:2]]}
+        )
         instance, object = shown[place][0], names[place.object_id]
-        read = partial(_read_view, dataset, instance, name, object, one)
+        read = partial(_read_view, dataset, instance, name, object, detection)
         jobs.append(PoseJob(name=name, read=read, place=place, seconds=seconds))
     return jobs
 
@@ -481,7 +492,7 @@ def read_bop_results(path: str | Path) -> list[Prediction]:
         rows = list(csv.reader(data.decode("utf-8-sig").splitlines()))
     if not rows or [name.strip() for name in rows[0]] != _HEADER:
         raise InputError(f"{path}: the first line is not {','.join(_HEADER)}; put it there")
-    found: list[tuple[Place, PoseEstimate]] = []
+    estimates: list[tuple[Place, PoseEstimate]] = []
     image_s: dict[tuple[int, int], float] = {}
     for line, row in enumerate(rows[1:], 2):
         if not row:
@@ -502,25 +513,27 @@ def read_bop_results(path: str | Path) -> list[Prediction]:
         if len(R) != 9 or len(t_mm) != 3 or not all(map(math.isfinite, [score, time_s, *R, *t_mm])):
             raise InputError(f"{source}: {len(R)} numbers of R and {len(t_mm)} of t, where 9 and 3 "
                              "finite ones belong")  # fmt: skip
-        said = image_s.setdefault(place[:2], time_s)
-        if (said < 0) != (time_s < 0) or (time_s >= 0 and abs(said - time_s) > _SAME_TIME_S):
+        first_time_s = image_s.setdefault(place[:2], time_s)
+        if (first_time_s < 0) != (time_s < 0) or (
+            time_s >= 0 and abs(first_time_s - time_s) > _SAME_TIME_S
+        ):
             raise InputError(
-                f"{path}: scene {place.scene_id} image {place.image_id} took {said} s in one row "
-                f"and {time_s} s in another; time is that of the whole image, the same in all"
+                f"{path}: scene {place.scene_id} image {place.image_id} took {first_time_s} s in "
+                f"one row and {time_s} s in another; time is that of the whole image, the same in all"
             )
         estimate = PoseEstimate(
-            name=f"row {len(found) + 1}",
+            name=f"row {len(estimates) + 1}",
             object=f"obj_{place.object_id:06d}",
             status="ok",
             camera_from_model=make_pose(R, t_mm, source),
             inlier_share=score,
         )
-        found.append((place, estimate))
-    rows_of = Counter(place[:2] for place, _ in found)
+        estimates.append((place, estimate))
+    rows_of = Counter(place[:2] for place, _ in estimates)
     shares = {image: {"image": s / rows_of[image]} for image, s in image_s.items() if s >= 0}
     return [
         Prediction(estimate=replace(estimate, seconds=shares.get(place[:2], {})), place=place)
-        for place, estimate in found
+        for place, estimate in estimates
     ]
 
 
@@ -539,15 +552,15 @@ def write_bop_results(
     Raises:
         InputError: a pose belongs to no scene, or the disk refuses.
     """
-    known = list(predictions)
+    entries = list(predictions)
     image_s: dict[tuple[int, int], float] = defaultdict(float)
-    for prediction in known:
+    for prediction in entries:
         if prediction.place is not None:
             image_s[prediction.place[:2]] += sum(prediction.estimate.seconds.values())
     text = StringIO()
     writer = csv.writer(text, lineterminator="\n")
     writer.writerow(_HEADER)
-    for prediction in known:
+    for prediction in entries:
         estimate, place = prediction.estimate, prediction.place
         if estimate.camera_from_model is None:
             continue

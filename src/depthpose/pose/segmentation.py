@@ -117,11 +117,11 @@ def import_resnet18(file: Path, out: Path) -> None:
         load_weights(network, held, ENCODER_KIND)
     except InputError as error:
         raise InputError(f"{file}: not the published weights of a ResNet-18: {error}") from error
-    said = {
+    facts = {
         "trained_on": "ImageNet, as its publisher says",
         "licence": "as published by its authors",
     }
-    save_imported(out, ENCODER_KIND, network.eval(), file, said)
+    save_imported(out, ENCODER_KIND, network.eval(), file, facts)
 
 
 KIND = "segmentation"
@@ -184,13 +184,13 @@ class FCN(nn.Module):
         (:func:`normalise_colors`).
         """
         features = self.encoder(image)[::-1]
-        found = self.scores[0](features[0])
+        scores = self.scores[0](features[0])
         for enlarge, score, finer in zip(
             self.enlarge, self.scores[1:], features[1 : len(self.scores)], strict=True
         ):
-            found = enlarge(found) + score(finer)
+            scores = enlarge(scores) + score(finer)
         size = (image.shape[-2], image.shape[-1])
-        return F.interpolate(found, size, mode="bilinear", align_corners=False)
+        return F.interpolate(scores, size, mode="bilinear", align_corners=False)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

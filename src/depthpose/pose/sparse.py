@@ -353,15 +353,15 @@ class _Convolution(torch.autograd.Function):
         if way == "table":
             return for_x, (_table(x, m) @ gradient).view(weight.shape), None
         if way == "grid":
-            found = torch.bmm(_read(x, m).mT, _read(gradient, back))
+            for_weight = torch.bmm(_read(x, m).mT, _read(gradient, back))
         else:
-            found = torch.zeros_like(weight)
+            for_weight = torch.zeros_like(weight)
             for offset, read, write in m.by_offset():
                 pulls = gradient.index_select(0, write)
-                torch.mm(x.index_select(0, read).T, pulls, out=found[offset])
+                torch.mm(x.index_select(0, read).T, pulls, out=for_weight[offset])
         if (centre := m.neighbours.centre) is not None:
-            torch.mm(x.T, gradient, out=found[centre])
-        return for_x, found, None
+            torch.mm(x.T, gradient, out=for_weight[centre])
+        return for_x, for_weight, None
 
 
 def _convolve(x: Tensor, weight: Tensor, m: KernelMap) -> Tensor:

@@ -164,10 +164,10 @@ def _view_of(surface: Surface, toward: Tensor, across: Tensor) -> tuple[Tensor, 
     shown_m = torch.where(filled > 0, picture_m, 0.0)
     border_m = avg_pool2d(shown_m, 5, 1, 2) / avg_pool2d(filled, 5, 1, 2)
     # So many at most, in an order of chance: the first ones are a sample of all.
-    found = is_seen.nonzero()[:, 0], ((wide > 0) & (narrow == 0)).flatten().nonzero()[:, 0]
+    cell_and_ring = is_seen.nonzero()[:, 0], ((wide > 0) & (narrow == 0)).flatten().nonzero()[:, 0]
     cells, ring = (
         index[torch.randperm(len(index), generator=torch.Generator().manual_seed(0))[:most]]
-        for index, most in zip(found, (_POINTS, _RING), strict=True)
+        for index, most in zip(cell_and_ring, (_POINTS, _RING), strict=True)
     )
     shown = first[cells]
     at = torch.stack([ring % side, ring.div(side, rounding_mode="floor")], -1).double()
@@ -261,11 +261,11 @@ def outer_sides(
     outward = normals * ((1 - 2 * outer) * is_clear)[:, None]
     across, nearest = np.full(len(points), -1), np.full(len(points), np.inf)
     for column, sign in ((c, s) for c in range(3) for s in (1, -1)):
-        (own,) = np.nonzero(sign * outward[:, column] > 0.577)
-        if len(own) == 0:
+        (is_of_side,) = np.nonzero(sign * outward[:, column] > 0.577)
+        if len(is_of_side) == 0:
             continue
-        distance, found = KDTree(points[own]).query(points, distance_upper_bound=limit)
-        number = own[np.minimum(found, len(own) - 1)]
+        distance, neighbour = KDTree(points[is_of_side]).query(points, distance_upper_bound=limit)
+        number = is_of_side[np.minimum(neighbour, len(is_of_side) - 1)]
         is_opposite = (outward[number] * outward).sum(1) < 0
         is_better = is_opposite & (distance < nearest)
         across = np.where(is_better, number, across)

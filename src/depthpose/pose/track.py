@@ -144,20 +144,20 @@ def _next(
         if not isinstance(followed, Refusal):
             estimate, following = followed
             return replace(estimate, name=given.name, seconds={"icp": spent_s}), following
-    found = target.look(given)
-    seconds = {**found.seconds, "icp": found.seconds.get("icp", 0.0) + spent_s}
-    pose = found.camera_from_model
+    looked = target.look(given)
+    seconds = {**looked.seconds, "icp": looked.seconds.get("icp", 0.0) + spent_s}
+    pose = looked.camera_from_model
     tracking = "lost" if pose is None else "found"
-    estimate = replace(found, name=given.name, seconds=seconds, tracking=tracking)
+    estimate = replace(looked, name=given.name, seconds=seconds, tracking=tracking)
     if pose is None:
         return estimate, None
     # A track that begins at something else stays there: what was searched for must be `ok`.
-    is_searched = isinstance(given, ViewInput) and found.certainty is not None
-    if is_searched and not found.is_ok:
+    is_searched = isinstance(given, ViewInput) and looked.certainty is not None
+    if is_searched and not looked.is_ok:
         return estimate, None
-    certainty = min(max(found.certainty or 0.0, _LEAST_CERTAINTY), 1 - _LEAST_CERTAINTY)
+    certainty = min(max(looked.certainty or 0.0, _LEAST_CERTAINTY), 1 - _LEAST_CERTAINTY)
     log_odds = math.log(certainty / (1 - certainty))
-    return estimate, _Track(pose=pose.double(), moved=None, log_odds=log_odds, origin=found)
+    return estimate, _Track(pose=pose.double(), moved=None, log_odds=log_odds, origin=looked)
 
 
 def _follow(

@@ -367,10 +367,10 @@ class PoseEstimate:
         return std.masked_fill(is_free, torch.inf)
 
     def __repr__(self) -> str:
-        said = f"{self.object}: {self.status}"
+        text = f"{self.object}: {self.status}"
         if self.camera_from_model is not None:
             at_m = (f"{metres:.4f}" for metres in self.camera_from_model.t_m.tolist())
-            said += f", t_m=[{', '.join(at_m)}]"
+            text += f", t_m=[{', '.join(at_m)}]"
         if self.certainty is not None:
-            said += f", certainty {self.certainty:.3f}"
-        return f"PoseEstimate({said}{f', {self.reason}' if self.reason else ''})"
+            text += f", certainty {self.certainty:.3f}"
+        return f"PoseEstimate({text}{f', {self.reason}' if self.reason else ''})"

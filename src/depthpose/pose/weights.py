@@ -259,8 +259,8 @@ def read_pose_weights(path: Path) -> PoseWeights:
                     colors=_colors_of(state),
                 )
             )
-    known = ("network.", *(f"models.{k}." for k in range(len(models))))
-    strays = [name for name in checkpoint.state if not name.startswith(known)]
+    prefixes = ("network.", *(f"models.{k}." for k in range(len(models))))
+    strays = [name for name in checkpoint.state if not name.startswith(prefixes)]
     if strays:
         raise InputError(f"{source}: tensor {strays[0]!r} is unexpected; it belongs to no part.")
     return PoseWeights(

@@ -51,7 +51,7 @@ def find_places(local, limit, target, is_exact, places, eye=None, least=0.0):
     points, axes, values = target.tree.points, target.tree.axes, target.tree.values
     low, side, counts, outward = target.low, target.side, target.counts, target.outward
     stack, bounds = np.empty((64, 3), np.int64), np.empty((64, 4))
-    found, square = np.empty(1, np.int64), np.empty(1)
+    nearest, square = np.empty(1, np.int64), np.empty(1)
     for i in range(len(local)):
         x, y, z = local[i, 0], local[i, 1], local[i, 2]
         place = places[i]
@@ -65,15 +65,15 @@ def find_places(local, limit, target, is_exact, places, eye=None, least=0.0):
         if eye is not None and place >= 0 and not faces(place, points, outward, eye, least):
             place = -1
         if is_exact:
-            found[0], square[0] = -1, limit * limit
+            nearest[0], square[0] = -1, limit * limit
             if place >= 0:
                 a, b, c = points[place, 0] - x, points[place, 1] - y, points[place, 2] - z
                 if a * a + b * b + c * c < limit * limit:
-                    found[0], square[0] = place, a * a + b * b + c * c
+                    nearest[0], square[0] = place, a * a + b * b + c * c
             neighbours(
-                x, y, z, points, axes, values, found, square, stack, bounds, outward, eye, least
+                x, y, z, points, axes, values, nearest, square, stack, bounds, outward, eye, least
             )
-            place = found[0]
+            place = nearest[0]
         places[i] = place
 
 

@@ -126,9 +126,9 @@ class BopDataset:
         kept = [i for i in self.instances if {i.object_id, names[i.object_id]} & wanted]
         if not kept:
             asked = ", ".join(map(repr, objects))
-            known = ", ".join(f"{number} ({name})" for number, name in names.items())
+            listing = ", ".join(f"{number} ({name})" for number, name in names.items())
             raise InputError(
-                f"{self.folder}: no instance of {asked}; objects here: {known}; name one of them"
+                f"{self.folder}: no instance of {asked}; objects here: {listing}; name one of them"
             )
         return replace(self, instances=kept)
 
@@ -146,18 +146,18 @@ def open_bop(folder: str | Path, split: str = "test") -> BopDataset:
     """
     folder = Path(folder)
     name, layout = layout_of(folder)
-    instances, said = list(layout.instances(folder, split)), hashlib.sha256()
-    for one in instances:
-        pose = one.camera_from_model
-        said.update(f"{one.name} {one.object_id} {one.depth_unit_m}".encode())
-        numbers = torch.cat([one.K.flatten(), pose.R.flatten(), pose.t_m]).double().numpy()
-        said.update(numbers.tobytes())
+    instances, digest = list(layout.instances(folder, split)), hashlib.sha256()
+    for instance in instances:
+        pose = instance.camera_from_model
+        digest.update(f"{instance.name} {instance.object_id} {instance.depth_unit_m}".encode())
+        numbers = torch.cat([instance.K.flatten(), pose.R.flatten(), pose.t_m]).double().numpy()
+        digest.update(numbers.tobytes())
     return BopDataset(
         folder=folder,
         split=split,
         layout=name,
         instances=instances,
-        sha256=said.hexdigest(),
+        sha256=digest.hexdigest(),
     )
 
 
@@ -194,25 +194,25 @@ def check_bop(
     """
     folder = Path(folder)
     name, layout = layout_of(folder)
-    known = layout.splits(folder)
-    if split is not None and split not in known:
-        raise InputError(f"{folder}: no split {split!r}. Here: {', '.join(known) or 'none'}.")
-    found: list[Problem] = []
+    splits = layout.splits(folder)
+    if split is not None and split not in splits:
+        raise InputError(f"{folder}: no split {split!r}. Here: {', '.join(splits) or 'none'}.")
+    problems: list[Problem] = []
     instances: list[Instance] = []
-    for one in known if split is None else [split]:
+    for split_name in splits if split is None else [split]:
         try:
-            instances += open_bop(folder, one).instances
+            instances += open_bop(folder, split_name).instances
         except InputError as error:
-            found.append(Problem(path=folder, kind="unreadable", message=str(error)))
-    models = _check_models(folder, {i.object_id for i in instances}, found)
+            problems.append(Problem(path=folder, kind="unreadable", message=str(error)))
+    models = _check_models(folder, {i.object_id for i in instances}, problems)
     for done, instance in enumerate(instances, 1):
         model = models.get(instance.object_id) if with_decoding else None
         try:
-            found += _check_instance(instance, model)
+            problems += _check_instance(instance, model)
         except InputError as error:
             paths = (p for p in (instance.mask, instance.rgb) if p and str(p) in str(error))
             problem = unreadable(next(paths, instance.depth), error)
-            found.append(problem if problem.path.is_file() else replace(problem, kind="missing"))
+            problems.append(problem if problem.path.is_file() else replace(problem, kind="missing"))
         if progress is not None:
             progress(done, len(instances))
     counts = {
@@ -222,7 +222,7 @@ def check_bop(
         "objects": len({i.object_id for i in instances}),
         "models": len(models),
     }
-    return make_report(name, counts, found)
+    return make_report(name, counts, problems)
 
 
 def _check_models(folder: Path, numbers: set[int], found: list[Problem]) -> dict[int, ObjectModel]:
@@ -258,8 +258,8 @@ def _check_models(folder: Path, numbers: set[int], found: list[Problem]) -> dict
     names = object_names(folder, numbers)
     for name, count in sorted(Counter(names.values()).items()):
         if count > 1:
-            own = " and ".join(str(n) for n in sorted(names) if names[n] == name)
-            message = f"calls objects {own} {name!r}; rename all but one in models_info"
+            of_name = " and ".join(str(n) for n in sorted(names) if names[n] == name)
+            message = f"calls objects {of_name} {name!r}; rename all but one in models_info"
             found.append(Problem(path=home, kind="mismatch", message=message))
     return models
 
@@ -350,8 +350,8 @@ def write_bop_scene(
     infos: dict[str, list[dict[str, Any]]] = {}
     for frame in frames:
         name = f"{frame.number:06d}"
-        own, more = list[dict[str, Any]](), list[dict[str, Any]]()
-        truths[str(frame.number)], infos[str(frame.number)] = own, more
+        poses, more = list[dict[str, Any]](), list[dict[str, Any]]()
+        truths[str(frame.number)], infos[str(frame.number)] = poses, more
         write_depth_png(scene / "depth" / f"{name}.png", frame.depth_m, _DEPTH_UNIT_M)
         if frame.rgb is not None:
             write_image(scene / "rgb" / f"{name}.png", frame.rgb)
@@ -360,7 +360,7 @@ def write_bop_scene(
             write_mask(scene / "mask" / f"{name}_{index:06d}.png", shown.silhouette)
             pose, full = shown.camera_from_model, int(shown.silhouette.sum())
             visible = int(shown.visible.sum())
-            own.append(
+            poses.append(
                 {
                     "cam_R_m2c": pose.R.double().flatten().tolist(),
                     "cam_t_m2c": (1000 * pose.t_m.double()).tolist(),

@@ -58,33 +58,33 @@ def read_rows(path: Path) -> list[dict[str, Any]]:
 
 def numbers(entry: object, key: str, count: int, source: str) -> list[float]:
     """Take ``count`` finite numbers."""
-    found = entry.get(key) if isinstance(entry, Mapping) else None
+    values = entry.get(key) if isinstance(entry, Mapping) else None
     # A whole number beyond 1e300 has no float.
     if (
-        not isinstance(found, list)
-        or len(found) != count
-        or not all(type(value) in (int, float) and abs(value) < 1e300 for value in found)
+        not isinstance(values, list)
+        or len(values) != count
+        or not all(type(value) in (int, float) and abs(value) < 1e300 for value in values)
     ):
-        raise InputError(f"{source}: {key} is {_short(found)}, where {count} numbers belong")
-    return [float(value) for value in found]
+        raise InputError(f"{source}: {key} is {_short(values)}, where {count} numbers belong")
+    return [float(value) for value in values]
 
 
 def integer(entry: object, key: str, source: str) -> int:
     """Take a whole number of 0 or more."""
-    found = entry.get(key) if isinstance(entry, Mapping) else None
-    if not isinstance(found, int) or isinstance(found, bool) or not 0 <= found <= MOST:
+    value = entry.get(key) if isinstance(entry, Mapping) else None
+    if not isinstance(value, int) or isinstance(value, bool) or not 0 <= value <= MOST:
         raise InputError(
-            f"{source}: {key} is {_short(found)}, where a number from 0 to {MOST} belongs"
+            f"{source}: {key} is {_short(value)}, where a number from 0 to {MOST} belongs"
         )
-    return found
+    return value
 
 
 def number(entry: object, key: str, default: float | None, source: str) -> float:
     """Take a finite number; ``default`` where it is missing and there is one."""
-    found = entry.get(key, default) if isinstance(entry, Mapping) else None
-    if not isinstance(found, int | float) or isinstance(found, bool) or not abs(found) < 1e300:
-        raise InputError(f"{source}: {key} is {_short(found)}, where a number belongs")
-    return float(found)
+    value = entry.get(key, default) if isinstance(entry, Mapping) else None
+    if not isinstance(value, int | float) or isinstance(value, bool) or not abs(value) < 1e300:
+        raise InputError(f"{source}: {key} is {_short(value)}, where a number belongs")
+    return float(value)
 
 
 def make_pose(R: list[float], t_mm: list[float], source: str) -> Rigid:
@@ -307,10 +307,10 @@ def linemod_instances(folder: Path, split: str) -> Iterator[Instance]:
             entries = truths.get(image)
             if not isinstance(entries, list):
                 raise InputError(f"{source} has no annotation; is the list of another download?")
-            own = [e for e in entries if integer(e, "obj_id", source) == number]
-            if len(own) != 1:
+            of_object = [e for e in entries if integer(e, "obj_id", source) == number]
+            if len(of_object) != 1:
                 raise InputError(
-                    f"{source} annotates object {number} {len(own)} times, where once belongs"
+                    f"{source} annotates object {number} {len(of_object)} times, where once belongs"
                 )
             at_camera = f"{scene / 'info.yml'}: image {image}"
             K, unit_m = camera_from_bop(infos.get(image), at_camera)
@@ -320,7 +320,7 @@ def linemod_instances(folder: Path, split: str) -> Iterator[Instance]:
             yield Instance(
                 scene_id=number,
                 image_id=image,
-                index=entries.index(own[0]),
+                index=entries.index(of_object[0]),
                 object_id=number,
                 K=K,
                 depth=depth,
@@ -328,8 +328,8 @@ def linemod_instances(folder: Path, split: str) -> Iterator[Instance]:
                 mask=mask if mask.is_file() else None,
                 rgb=rgb if rgb.is_file() else None,
                 camera_from_model=make_pose(
-                    numbers(own[0], "cam_R_m2c", 9, source),
-                    numbers(own[0], "cam_t_m2c", 3, source),
+                    numbers(of_object[0], "cam_R_m2c", 9, source),
+                    numbers(of_object[0], "cam_t_m2c", 3, source),
                     source,
                 ),
             )

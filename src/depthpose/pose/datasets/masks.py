@@ -124,10 +124,10 @@ def number_objects(values: np.ndarray) -> Int64[Tensor, "h w"]:
     shown = values[values != 0]
     if len(shown) == 0 or (shown == shown[0]).all():
         return torch.from_numpy(values != 0).long()
-    found = _solid_numbers(values)
-    if not 2 <= len(found) <= _MOST_LABELS:
+    numbers = _solid_numbers(values)
+    if not 2 <= len(numbers) <= _MOST_LABELS:
         return torch.from_numpy(values != 0).long()
-    return torch.from_numpy(np.where(np.isin(values, list(found)), values, 0)).long()
+    return torch.from_numpy(np.where(np.isin(values, list(numbers)), values, 0)).long()
 
 
 def one_mask(labels: Int64[Tensor, "h w"], name: str) -> Bool[Tensor, "h w"]:
@@ -136,13 +136,13 @@ def one_mask(labels: Int64[Tensor, "h w"], name: str) -> Bool[Tensor, "h w"]:
     Raises:
         InputError: there are several; which, and how large they are.
     """
-    found = np.unique(labels.cpu().numpy())
-    found = found[found != 0]
-    if len(found) > 1:
-        said = [f"{k} ({int((labels == k).sum())} px)" for k in found.tolist()]
+    numbers = np.unique(labels.cpu().numpy())
+    numbers = numbers[numbers != 0]
+    if len(numbers) > 1:
+        sizes = [f"{k} ({int((labels == k).sum())} px)" for k in numbers.tolist()]
         raise InputError(
-            f"{name}: shows {len(found)} objects, numbered {', '.join(said[:5])}"
-            f"{', ...' if len(said) > 5 else ''}, where one mask is of one; give that of one "
+            f"{name}: shows {len(numbers)} objects, numbered {', '.join(sizes[:5])}"
+            f"{', ...' if len(sizes) > 5 else ''}, where one mask is of one; give that of one "
             "(mask == 1), or take each as an instance (estimate_instances, pose predict)"
         )
     return labels != 0

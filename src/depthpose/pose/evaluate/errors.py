@@ -192,17 +192,17 @@ def match(
     BOP does so anew for each error and threshold. Refusals go to instances that are left over.
     """
     places = {instance.name: place_of(instance) for instance in instances}
-    found: dict[str, PoseEstimate] = {}
+    matched: dict[str, PoseEstimate] = {}
     others: list[Prediction] = []
     for prediction in predictions:
         place = places.get(prediction.estimate.name)
         if place is not None and prediction.place in (None, place):
-            found[prediction.estimate.name] = prediction.estimate
+            matched[prediction.estimate.name] = prediction.estimate
         else:
             others.append(prediction)
     waiting: dict[Place, list[Instance]] = defaultdict(list)
     for instance in instances:
-        if instance.name not in found:
+        if instance.name not in matched:
             waiting[place_of(instance)].append(instance)
     offered: dict[Place, list[PoseEstimate]] = defaultdict(list)
     for prediction in others:
@@ -220,11 +220,11 @@ def match(
             error_m = float(adds_m(pose, true, points_m))
             costs[row, column] = min(error_m, _NEAR_DIAMETERS * model.diameter_m)
         for row, column in zip(*linear_sum_assignment(costs), strict=True):
-            found[left[row].name] = answers[column]
+            matched[left[row].name] = answers[column]
         refusals = [estimate for estimate in estimates if not estimate.is_posed]
-        left = [instance for instance in left if instance.name not in found]
-        found |= {i.name: e for i, e in zip(left, refusals, strict=False)}
-    return found
+        left = [instance for instance in left if instance.name not in matched]
+        matched |= {i.name: e for i, e in zip(left, refusals, strict=False)}
+    return matched
 
 
 _TRIED = 40  # instances that each change is tried on
@@ -296,7 +296,9 @@ def convention_advice(
         for turn in _TURNS
         for scale, words in _SCALES.items()
     ]
-    best, of, said = max(changes, key=lambda change: change[0])
+    best, of, advice = max(changes, key=lambda change: change[0])
     if best < now + max(1, min(3, of), _MORE * of):
         return None
-    return f"{now} of {tried} answers that were tried are right, but {best} of {of} were if {said}"
+    return (
+        f"{now} of {tried} answers that were tried are right, but {best} of {of} were if {advice}"
+    )

@@ -65,20 +65,20 @@ class _Row:
 
     def columns(self) -> dict[str, Any]:
         """Give the columns of a table, in its order."""
-        found = {} if self.origin is None else asdict(self.origin)
+        columns = {} if self.origin is None else asdict(self.origin)
         if not isinstance(self, ObjectRow):
-            found = {name: found[name] for name in ("method", "masks") if name in found}
-        for one in fields(self):
-            value = getattr(self, one.name)
-            if isinstance(self, InstanceRow) and one.name == "errors":
-                found |= {name: self.error(name) for name in METRICS}
-            elif one.name == "ms":
-                found |= {f"ms_{stage}": number for stage, number in value.items()}
+            columns = {name: columns[name] for name in ("method", "masks") if name in columns}
+        for field in fields(self):
+            value = getattr(self, field.name)
+            if isinstance(self, InstanceRow) and field.name == "errors":
+                columns |= {name: self.error(name) for name in METRICS}
+            elif field.name == "ms":
+                columns |= {f"ms_{stage}": number for stage, number in value.items()}
             elif isinstance(value, Mapping):
-                found |= value
-            elif one.name not in _LAST and not (value is None and one.default is None):
-                found[one.name] = value
-        return found | ({} if self.conditions is None else asdict(self.conditions))
+                columns |= value
+            elif field.name not in _LAST and not (value is None and field.default is None):
+                columns[field.name] = value
+        return columns | ({} if self.conditions is None else asdict(self.conditions))
 
 
 _LAST = ("conditions", "origin")
@@ -213,23 +213,23 @@ def _scores(rows: Sequence[InstanceRow]) -> dict[str, Number]:
     """Sum up every metric; then BOP's average recall; then the medians of the answers."""
     answered = [row for row in rows if row.status in POSED]
     diameters_m = torch.tensor([row.diameter_m for row in rows], dtype=torch.float64)
-    found: dict[str, Number] = {}
+    scores: dict[str, Number] = {}
     for name, metric in METRICS.items():
         is_measured = all(name in row.errors for row in rows)
         errors = torch.stack([row.errors[name] for row in rows]) if is_measured else None
         for column, summary in metric.summaries.items():
-            found[column] = None if errors is None else summary(errors, diameters_m)
-    known = [value for value in map(found.get, _RECALLS) if value is not None]
-    found["ar"] = sum(known) / len(_RECALLS) if len(known) == len(_RECALLS) else None
+            scores[column] = None if errors is None else summary(errors, diameters_m)
+    recalls = [value for value in map(scores.get, _RECALLS) if value is not None]
+    scores["ar"] = sum(recalls) / len(_RECALLS) if len(recalls) == len(_RECALLS) else None
     for name in (name for name, metric in METRICS.items() if metric.has_median):
         values = [float(row.errors[name].mean()) for row in answered if name in row.errors]
-        found[f"{name}_median"] = statistics.median(values) if values else None
-    return found
+        scores[f"{name}_median"] = statistics.median(values) if values else None
+    return scores
 
 
 def _mean(values: Sequence[Number]) -> Number:
-    known = [value for value in values if value is not None]
-    return sum(known) / len(known) if known else None
+    numbers = [value for value in values if value is not None]
+    return sum(numbers) / len(numbers) if numbers else None
 
 
 def frames_hash(instances: Sequence[Instance]) -> str:
@@ -333,10 +333,10 @@ def read_any(path: Path) -> list[Prediction]:
     Raises:
         InputError: it is neither, damaged, or holds no pose and no refusal.
     """
-    found = read_predictions(path) if path.is_dir() else read_bop_results(path)
-    if not found:
+    predictions = read_predictions(path) if path.is_dir() else read_bop_results(path)
+    if not predictions:
         raise InputError(f"{path}: holds no pose, so there is nothing to measure; predict some")
-    return found
+    return predictions
 
 
 def evaluate(
@@ -364,24 +364,24 @@ def evaluate(
             damaged.
     """
     config = EvaluationConfig() if config is None else config
-    found = match(dataset.instances, predictions, dataset.objects)
+    matched = match(dataset.instances, predictions, dataset.objects)
     if len(dataset) == 0:
         raise InputError(f"{dataset.folder}: split {dataset.split!r} has no instance to measure")
     # A file of another data set would be measured as all missing, and look like a bad method.
-    if predictions and not found:
-        one = predictions[0]
+    if predictions and not matched:
+        prediction = predictions[0]
         raise InputError(
             f"{dataset.folder}: none of the {len(predictions)} predictions is of one of its "
-            f"{len(dataset)} instances; the first is of {one.place or one.estimate.name!r}. Give "
-            "the predictions of this very split"
+            f"{len(dataset)} instances; the first is of "
+            f"{prediction.place or prediction.estimate.name!r}. Give the predictions of this very split"
         )
     contexts = {number: error_context(model, config) for number, model in dataset.objects.items()}
     # In the order of work; what a method of its own calls otherwise comes last.
     seen = dict.fromkeys(stage for p in predictions for stage in p.estimate.seconds)
     stages = [s for s in STAGES if s in seen] + [s for s in seen if s not in STAGES]
     rows = [
-        _instance_row(one, found.get(one.name), contexts[one.object_id], stages)
-        for one in progress(dataset.instances)
+        _instance_row(instance, matched.get(instance.name), contexts[instance.object_id], stages)
+        for instance in progress(dataset.instances)
     ]
     conditions = Conditions(
         diameters=config.diameters,
@@ -389,18 +389,18 @@ def evaluate(
         frames_sha256=frames_hash(dataset.instances)[:12],
     )
     measured = {
-        (found[row.instance].name, row.instance): row.errors
+        (matched[row.instance].name, row.instance): row.errors
         for row in rows
-        if row.instance in found
+        if row.instance in matched
     }
     precision = detection_scores(dataset, predictions, contexts, measured)
     summed: list[ObjectRow] = []
     numbers = [instance.object_id for instance in dataset.instances]
     for number, context in sorted(contexts.items()):
-        own = [row for row, of in zip(rows, numbers, strict=True) if of == number]
-        row = object_row(context.model.name, own)
+        of_object = [row for row, of in zip(rows, numbers, strict=True) if of == number]
+        row = object_row(context.model.name, of_object)
         row = replace(row, scores={**row.scores, **precision[number]})
-        summed.append(replace(row, metric=own[0].metric, diameter_m=context.diameter_m))
+        summed.append(replace(row, metric=of_object[0].metric, diameter_m=context.diameter_m))
     if len(summed) > 1:
         every = object_row("all", rows)  # BOP's precision is of an object, or the mean of objects
         every = replace(every, scores={**every.scores, **dict.fromkeys(_PRECISIONS)})

@@ -67,7 +67,7 @@ def faces_of_part(
 
     left_out = np.flatnonzero(~is_part)
     extent = np.linalg.norm(high - low, axis=1)
-    said = ", ".join(
+    listing = ", ".join(
         f"one of {extent[k]:.3g} at ({', '.join(f'{value:.4g}' for value in low[k])})"
         for k in left_out[:_MOST_NAMED]
     )
@@ -75,12 +75,12 @@ def faces_of_part(
     if size[left_out].sum() >= _SMALL * size[is_part].sum():
         raise InputError(
             f"{path}: holds bodies that lie farther from each other than they are long (a part of "
-            f"{diagonal:.4g}; {said}{more}), and it cannot be known which of them is the object; "
-            "export that one alone"
+            f"{diagonal:.4g}; {listing}{more}), and it cannot be known which of them is the "
+            "object; export that one alone"
         )
     bodies = f"{len(left_out)} small {'body' if len(left_out) == 1 else 'bodies'}"
     warnings.warn(
-        f"{path}: left out {bodies} far from the part of {diagonal:.4g} ({said}{more}, in the "
+        f"{path}: left out {bodies} far from the part of {diagonal:.4g} ({listing}{more}, in the "
         "file's unit); export the part alone",
         Notice,
         stacklevel=3,

@@ -54,8 +54,8 @@ def read_colors(path: AnyPath, scale: float, model: ObjectModel) -> SurfaceColor
         with refused_as(path, "model with colours", "export it again"):
             samples, lost = _colored_samples(path, suffix)
     except InputError as error:
-        said = f"{path}: {str(error).removeprefix(f'{path}: ')}"
-        warnings.warn(f"{said} (its shape is read, its colours are not)", Notice, stacklevel=3)
+        message = f"{path}: {str(error).removeprefix(f'{path}: ')}"
+        warnings.warn(f"{message} (its shape is read, its colours are not)", Notice, stacklevel=3)
         return None
     if lost:
         warnings.warn(

@@ -58,7 +58,7 @@ def read_symmetry(text: str) -> tuple[DeclaredTurns, ...]:
     Raises:
         InputError: it is none.
     """
-    found: list[DeclaredTurns] = []
+    declared: list[DeclaredTurns] = []
     for part in text.split("+"):
         axis, _, count = (word.strip().lower() for word in part.rpartition(","))
         try:
@@ -74,8 +74,8 @@ def read_symmetry(text: str) -> tuple[DeclaredTurns, ...]:
                 f"symmetry {text!r}: {part.strip()!r} is no axis with 2 to {_MOST_TURNS} turns; "
                 f"{_FORM}"
             )
-        found.append(DeclaredTurns(direction=direction / length, turns=turns))
-    return tuple(found)
+        declared.append(DeclaredTurns(direction=direction / length, turns=turns))
+    return tuple(declared)
 
 
 def declare_symmetry(model: ObjectModel, symmetry: AnySymmetry) -> ObjectModel:
@@ -106,9 +106,9 @@ def declare_symmetry(model: ObjectModel, symmetry: AnySymmetry) -> ObjectModel:
         raise InputError(f"symmetry of {model.name}: there is none in it; {_FORM}")
     deviation = _deviation(declared, surface, model)
     if deviation > _CONTRADICTED:
-        said = symmetry if isinstance(symmetry, str | Path) else "that was given"
+        source = symmetry if isinstance(symmetry, str | Path) else "that was given"
         warnings.warn(
-            f"{model.name}: turned by the symmetry {said} its surface lies up to {deviation:.1%} "
+            f"{model.name}: turned by the symmetry {source} its surface lies up to {deviation:.1%} "
             f"of its diameter ({1000 * deviation * model.diameter_m:.1f} mm) off itself, so the "
             "copies look different; they count as one pose because you say so",
             Notice,
@@ -139,23 +139,25 @@ def symmetry_of_each(
         return dict(given)
     is_one = isinstance(given, str | Path | Mapping | Symmetries)
     every: Sequence[AnySymmetry] = [given] if is_one else list(given)
-    found: dict[str, AnySymmetry] = {}
-    for one in every:
-        name, colon, rest = one.partition(":") if isinstance(one, str) else ("", "", "")
+    declared: dict[str, AnySymmetry] = {}
+    for declaration in every:
+        name, colon, rest = (
+            declaration.partition(":") if isinstance(declaration, str) else ("", "", "")
+        )
         if colon and (name in names or "," in rest):
-            _refuse_other(name, names, f"symmetry {one!r}")
+            _refuse_other(name, names, f"symmetry {declaration!r}")
             symmetry: AnySymmetry = rest
         elif len(names) == 1:
-            name, symmetry = names[0], one
+            name, symmetry = names[0], declaration
         else:
             raise InputError(
-                f"symmetry {one!r}: {len(names)} objects are known ({', '.join(names)}); say whose "
-                f"it is: {names[0]}:z,18, in Python symmetry={{{names[0]!r}: 'z,18'}}"
+                f"symmetry {declaration!r}: {len(names)} objects are known ({', '.join(names)}); say "
+                f"whose it is: {names[0]}:z,18, in Python symmetry={{{names[0]!r}: 'z,18'}}"
             )
-        if name in found:
+        if name in declared:
             raise InputError(f"symmetry of {name!r} is given twice; join the two by +: z,6+x,2")
-        found[name] = symmetry
-    return found
+        declared[name] = symmetry
+    return declared
 
 
 def _refuse_other(name: str, names: Sequence[str], said: str) -> None:
@@ -227,7 +229,7 @@ def _point_on_axis(
     angle_rad = torch.tensor(2 * math.pi * half / (term.turns or 2), dtype=torch.float64)
     low, high = surface.points.amin(0), surface.points.amax(0)
     origin = -surface.centre_m / model.diameter_m
-    found: list[tuple[float, Tensor]] = []
+    candidates: list[tuple[float, Tensor]] = []
     for start in (torch.zeros(3).double(), (low + high) / 2, origin):
         point = start
         for _ in range(_FOLLOWED):
@@ -240,8 +242,8 @@ def _point_on_axis(
             lever = across @ (torch.eye(3).double() - turn.R) @ across.T
             point = point + across.T @ torch.linalg.solve(lever, across @ gap)
         turns = turn_about(axis, point, term.angles_rad[:: max(1, len(term.angles_rad) // 6)])
-        found.append((float(surface.deviation(turns.R, turns.t_m).max()), point))
-    _, best = min(found, key=lambda pair: pair[0])
+        candidates.append((float(surface.deviation(turns.R, turns.t_m).max()), point))
+    _, best = min(candidates, key=lambda pair: pair[0])
     return best * model.diameter_m + surface.centre_m
 
 

@@ -49,15 +49,15 @@ def unit_of(path: AnyModel, unit: Unit | None) -> Unit:
         InputError: neither.
     """
     if isinstance(path, str | Path):
-        found = unit or FIXED_UNITS.get(Path(path).suffix.lower())
+        declared = unit or FIXED_UNITS.get(Path(path).suffix.lower())
     else:
-        found = unit or shape_unit(path)
-    if found is None:
+        declared = unit or shape_unit(path)
+    if declared is None:
         raise InputError(
             f"{path}: no unit is given, and such a file does not say its own; give --unit mm, "
             "where depth or a cloud is given too --cad-unit mm, or unit: mm in a config"
         )
-    return found
+    return declared
 
 
 def read_geometry(path: AnyModel) -> tuple[np.ndarray, np.ndarray]:
@@ -76,8 +76,8 @@ def read_geometry(path: AnyModel) -> tuple[np.ndarray, np.ndarray]:
         suffix = Path(path).suffix.lower()
         if suffix not in MESH_READERS:
             if suffix not in CLOUD_READERS:
-                known = dict.fromkeys((*MESH_READERS, *CLOUD_READERS))
-                raise refused_suffix(path, "model", tuple(known))
+                suffixes = dict.fromkeys((*MESH_READERS, *CLOUD_READERS))
+                raise refused_suffix(path, "model", tuple(suffixes))
             return read_cloud(path).points.double().numpy(), np.empty((0, 3), np.int64)
         vertices, faces = MESH_READERS[suffix](path)
     if len(vertices) < 4 or not (np.abs(vertices) < _FARTHEST).all():
@@ -224,9 +224,9 @@ def _read_obj(path: AnyPath) -> tuple[np.ndarray, Ragged]:
         is_other |= words[0] in (b"surf", b"curv", b"curv2", b"l")
     vertices = np.array(places).reshape(-1, 3)
     if highest > len(vertices) or (is_other and not sizes):
-        said = f"line {highest_line} names point {highest} of {len(vertices)}; it is damaged"
-        said = said if sizes else "holds free-form surfaces or lines alone, and no triangles"
-        raise InputError(f"{path}: {said}. Export it again.")
+        problem = f"line {highest_line} names point {highest} of {len(vertices)}; it is damaged"
+        problem = problem if sizes else "holds free-form surfaces or lines alone, and no triangles"
+        raise InputError(f"{path}: {problem}. Export it again.")
     return vertices, Ragged(np.array(sizes, np.int64), np.array(corners, np.int64))
 
 
@@ -255,7 +255,7 @@ def _refuse_scene(path: AnyPath, data: bytes) -> None:
             raise InputError(f"{path}: {size} bytes of JSON in a GLB; export the part alone")
         scene: Any = json.loads(data[20 : 20 + size])
         accessors = scene.get("accessors", [])
-        values = [abs(int(one["count"])) * _WIDTHS[one["type"]] for one in accessors]
+        values = [abs(int(entry["count"])) * _WIDTHS[entry["type"]] for entry in accessors]
         placed = sum(
             values[part["attributes"]["POSITION"]]
             for node in scene.get("nodes", [])
@@ -273,7 +273,7 @@ def _refuse_scene(path: AnyPath, data: bytes) -> None:
         needed += ["sparse accessors" for k in read if accessors[k].get("sparse")]
         meshes = [node for node in scene.get("nodes", []) if "mesh" in node]
         needed += ["a skin" for node in meshes if "skin" in node]
-        weights = [one.get("weights", []) for one in (*scene.get("meshes", []), *meshes)]
+        weights = [entry.get("weights", []) for entry in (*scene.get("meshes", []), *meshes)]
         needed += ["morph targets" for some in weights if any(some)]
         links = [str(buffer.get("uri") or "data:") for buffer in scene.get("buffers", [])]
         outside = [link for link in links if not link.startswith("data:")]
@@ -376,7 +376,7 @@ def cut_polygons(
             f"{path}: face {wrong.argmax()} has {sizes[wrong.argmax()]} corners, and 3 to "
             f"{_MOST_CORNERS} are read; the file is truncated, or export it as triangles"
         )
-    found, owners = [np.empty((0, 3), np.int64)], [np.empty(0, np.int64)]
+    pieces, owners = [np.empty((0, 3), np.int64)], [np.empty(0, np.int64)]
     overlap, area = np.zeros(len(sizes)), 0.0
     steps = 0.0
     order = np.argsort(sizes, kind="stable")
@@ -393,7 +393,7 @@ def cut_polygons(
             )
         local = _cut(vertices[polygons], normals, is_back)
         triangles = np.take_along_axis(polygons[:, None], local, 2)
-        found.append(triangles.reshape(-1, 3))
+        pieces.append(triangles.reshape(-1, 3))
         owners.append(which.repeat(size - 2))
         if size > 3:
             sides = vertices[triangles[..., 1:]] - vertices[triangles[..., :1]]
@@ -409,7 +409,7 @@ def cut_polygons(
             f"{path}: face {overlap.argmax()} crosses itself (its corners are not in the order of "
             "its border), so its surface is unknown; export it as triangles"
         )
-    return np.concatenate(found)[np.argsort(np.concatenate(owners), kind="stable")]
+    return np.concatenate(pieces)[np.argsort(np.concatenate(owners), kind="stable")]
 
 
 def _alike(sizes: np.ndarray, order: np.ndarray) -> Iterator[np.ndarray]:

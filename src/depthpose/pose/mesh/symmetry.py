@@ -160,7 +160,7 @@ def propose_symmetries(model: ObjectModel, tolerance: float = 0.02) -> list[Symm
     """
     surface = SurfaceDeviation(model)
     limit = 2 * tolerance
-    found: list[SymmetryProposal] = []
+    proposals: list[SymmetryProposal] = []
     tried, revolved = list[Tensor](), list[Tensor]()  # axes, and those of revolution
     for start in promising_turns(surface):
         if len(revolved) >= 2 or len(tried) >= _MOST_AXES:
@@ -182,8 +182,8 @@ def propose_symmetries(model: ObjectModel, tolerance: float = 0.02) -> list[Symm
             tried.append(direction)
             measured = _measure(surface, direction, limit, tolerance)
             revolved += [direction for p in measured if p.kind == "continuous"]
-            found += measured
-    return sorted(found, key=lambda p: (p.kind != "continuous", -p.certainty))
+            proposals += measured
+    return sorted(proposals, key=lambda p: (p.kind != "continuous", -p.certainty))
 
 
 def symmetries_from_proposals(proposals: list[SymmetryProposal]) -> Symmetries:
@@ -223,8 +223,8 @@ def symmetries_from_proposals(proposals: list[SymmetryProposal]) -> Symmetries:
     for first in every if not axes else ():  # grows under way: products until there is no new one
         for second in kept:
             product = first @ second
-            known = [_EYE, *(turn.R for turn in every)]
-            if all(float(geodesic_rad(product.R, R)) > _SAME_RAD for R in known):
+            rotations = [_EYE, *(turn.R for turn in every)]
+            if all(float(geodesic_rad(product.R, R)) > _SAME_RAD for R in rotations):
                 every.append(product)
         if len(every) > 60:  # what passes 60 was no group (an icosahedron's)
             every = kept
@@ -249,22 +249,22 @@ def with_found_symmetries(
         return model
     rows = cached(model, propose_symmetries, "symmetries", tolerance)
     proposals = [SymmetryProposal(*row) for row in rows]
-    found = replace(symmetries_from_proposals(proposals), is_found=True)
-    if found.discrete is None and not found.continuous:
+    symmetries = replace(symmetries_from_proposals(proposals), is_found=True)
+    if symmetries.discrete is None and not symmetries.continuous:
         return model
-    turns = 0 if found.discrete is None else len(found.discrete.R)
+    turns = 0 if symmetries.discrete is None else len(symmetries.discrete.R)
     certainty = min(p.certainty for p in proposals if p.certainty >= SURE)
     if on_message is not None:
         on_message(
-            f"{model.name}: looks the same after {turns} turns, about {len(found.continuous)} axes "
-            f"(certainty {certainty:.2f} and more); "
+            f"{model.name}: looks the same after {turns} turns, about "
+            f"{len(symmetries.continuous)} axes (certainty {certainty:.2f} and more); "
             + (
                 "each copy counts as right"
                 if is_taken
                 else "if that is so, say --symmetries found: no network can distinguish the copies"
             )
         )
-    return replace(model, symmetries=found) if is_taken else model
+    return replace(model, symmetries=symmetries) if is_taken else model
 
 
 def _turns(direction: Float[Tensor, "3"], angles: Float[Tensor, " a"]) -> Float[Tensor, "a 3 3"]:
@@ -331,7 +331,7 @@ def _measure_teeth(
 
     Gives the angle and the deviation of the order that fits best, if there is one.
     """
-    found: list[tuple[float, float]] = []
+    measured: list[tuple[float, float]] = []
     for order in _TEETH:
         step = 2 * math.pi / order
         angles = torch.tensor([step, 0.5 * step, 1.5 * step], dtype=torch.float64)
@@ -339,8 +339,8 @@ def _measure_teeth(
             continue
         tooth, *between = surface.deviation(_turns(direction, angles)).tolist()
         if tooth <= tolerance and min(between) > 2 * tooth + ALIKE:
-            found.append((step, tooth))
-    return sorted(found, key=lambda pair: pair[1])[:1]
+            measured.append((step, tooth))
+    return sorted(measured, key=lambda pair: pair[1])[:1]
 
 
 MIRROR_ALIKE = 0.03

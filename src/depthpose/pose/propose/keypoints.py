@@ -256,13 +256,13 @@ class InlierTest:
     ) -> Float[Tensor, "*batch k h n"]:
         """Give 1 where a line agrees with a hypothesis, else 0; the answer lies in ``memory``."""
         flat = tried.detach().flatten(0, -3)
-        square, one = flat.square().sum(-1, keepdim=True), torch.ones_like(flat[..., :1])
+        square, ones = flat.square().sum(-1, keepdim=True), torch.ones_like(flat[..., :1])
         shape = (*flat.shape[:2], self._w.shape[-1])
         size = math.prod(shape)
         memory = tried.new_empty(2, size) if memory is None else memory
         along, far = (part[:size].view(shape) for part in memory)
-        torch.bmm(torch.cat([flat, one], -1), self._along, out=along)
-        torch.bmm(torch.cat([flat, square, one], -1), self._far, out=far)
+        torch.bmm(torch.cat([flat, ones], -1), self._along, out=along)
+        torch.bmm(torch.cat([flat, square, ones], -1), self._far, out=far)
         if self._limit is not None:
             agreed = far.addcmul_(along, along, value=-1).lt_(self._limit)
         else:  # what points away reaches nothing, and no square is below its own share
@@ -280,20 +280,21 @@ def fits_of(vote: Vote, model: ObjectModel, config: EstimateConfig) -> PoseFit |
     Returns:
         One fit or two as a batch; or why there is none.
     """
-    found = (vote.condition <= config.voting.max_condition) & (vote.inlier_share > 0)
-    total = len(found)
-    if int(found.sum()) < _LEAST:
+    is_intersection = (vote.condition <= config.voting.max_condition) & (vote.inlier_share > 0)
+    total = len(is_intersection)
+    met = int(is_intersection.sum())
+    if met < _LEAST:
         return Refusal(
             status="votes do not meet",
-            reason=f"the directions meet at {int(found.sum())} of {total} keypoints, but {_LEAST} "
-            "are needed: too few points, or not the object that the mask promises",
+            reason=f"the directions meet at {met} of {total} keypoints, but {_LEAST} are "
+            "needed: too few points, or not the object that the mask promises",
         )
     strict, rough = config.voting.rigidity_diameters, config.rough_rigidity_diameters
     limit_m = model.diameter_m * (rough if config.with_icp else strict)
-    used = consistent_keypoints(vote.keypoints_m, model.keypoints_m, limit_m, found)
+    used = consistent_keypoints(vote.keypoints_m, model.keypoints_m, limit_m, is_intersection)
     choices = [used] if int(used.sum()) >= _LEAST else []
-    if config.with_icp and not torch.equal(used, found):
-        choices.append(found)
+    if config.with_icp and not torch.equal(used, is_intersection):
+        choices.append(is_intersection)
     if not choices:
         return Refusal(
             status="keypoints do not fit",

@@ -97,18 +97,18 @@ def find_turns(model: ObjectModel) -> dict[str, Any]:
     table = prepare_pairs(surface)
     # Of all sides, not those of the first faces.
     references = take_evenly(torch.arange(len(table.points_m)), _OWN_REFERENCES)
-    found, _ = vote_poses(table.points_m, table.frames[..., 0], references, table, _OWN_PEAKS)
-    found = found[_distinct_turns(found, surface)[0]]
+    candidates, _ = vote_poses(table.points_m, table.frames[..., 0], references, table, _OWN_PEAKS)
+    candidates = candidates[_distinct_turns(candidates, surface)[0]]
     # With the camera in the middle of the model, from where it sees all.
-    points_m, starts = surface.points_m - surface.middle_m, found.t_m - surface.middle_m
-    found = refine_roughly(points_m, Rigid(found.R, starts), surface, IcpConfig())
-    found = Rigid(found.R, found.t_m + surface.middle_m)
-    found = found[_distinct_turns(found, surface)[0]]
+    points_m, starts = surface.points_m - surface.middle_m, candidates.t_m - surface.middle_m
+    candidates = refine_roughly(points_m, Rigid(candidates.R, starts), surface, IcpConfig())
+    candidates = Rigid(candidates.R, candidates.t_m + surface.middle_m)
+    candidates = candidates[_distinct_turns(candidates, surface)[0]]
     # One after the other they are turns too, which fill the gaps between those that were found.
-    twice = found[:, None] @ found
-    found = Rigid.cat([found, Rigid(twice.R.flatten(0, 1), twice.t_m.flatten(0, 1))])
-    chosen, mostly = _distinct_turns(found, surface)
-    return {"turns": found[chosen].matrix().tolist(), "mostly": mostly}
+    twice = candidates[:, None] @ candidates
+    candidates = Rigid.cat([candidates, Rigid(twice.R.flatten(0, 1), twice.t_m.flatten(0, 1))])
+    chosen, mostly = _distinct_turns(candidates, surface)
+    return {"turns": candidates[chosen].matrix().tolist(), "mostly": mostly}
 
 
 def _distinct_turns(turns: Rigid, surface: Surface) -> tuple[list[int], int]:
@@ -292,8 +292,8 @@ def vote_poses(
     # Model points and their normals on reference points, turned about the normals.
     angle = ((bin_ + 0.5) * (2 * math.pi / TURNS)).double()
     reference = references.repeat_interleave(peaks)
-    one, zero, c, s = torch.ones_like(angle), torch.zeros_like(angle), angle.cos(), angle.sin()
-    turn = torch.stack([one, zero, zero, zero, c, -s, zero, s, c], -1).reshape(-1, 3, 3)
+    ones, zero, c, s = torch.ones_like(angle), torch.zeros_like(angle), angle.cos(), angle.sin()
+    turn = torch.stack([ones, zero, zero, zero, c, -s, zero, s, c], -1).reshape(-1, 3, 3)
     R = frames[reference] @ turn @ table.frames[number].mT
     t_m = points_m[reference] - (R @ table.points_m[number][..., None]).squeeze(-1)
     return Rigid(R, t_m), votes
@@ -314,10 +314,10 @@ def _peaks(
     row, second = used.nonzero(as_tuple=True)
     feature, turn_rad = _features(points_m, frames, references[row], second, diameter_m)
     # The bin of each feature, and of each of its four values the next bin beside it.
-    own = feature.floor().long()
-    aside = torch.where(feature - own < 0.5, -1, 1)
-    moved = own[:, None] + aside[:, None] * torch.eye(4, dtype=torch.int64)
-    keys = torch.cat([_key(own)[:, None], _key(moved)], 1)
+    own_bin = feature.floor().long()
+    aside = torch.where(feature - own_bin < 0.5, -1, 1)
+    moved = own_bin[:, None] + aside[:, None] * torch.eye(4, dtype=torch.int64)
+    keys = torch.cat([_key(own_bin)[:, None], _key(moved)], 1)
     size = (table.bounds[keys + 1] - table.bounds[keys]).long()
     same = (keys[:, 1:] == keys[:, :1]).nonzero(as_tuple=True)
     size[:, 1:][same] = 0

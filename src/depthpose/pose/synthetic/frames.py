@@ -54,10 +54,10 @@ def random_pattern(
     grey, hue = uniform(generator, 0.1, 0.8), torch.rand(3, generator=generator)
     share = uniform(generator, *colourful)
     common = torch.randn(_WAVES, 1, generator=generator)
-    own = 0.5 * torch.randn(_WAVES, 3, generator=generator)
+    waves = 0.5 * torch.randn(_WAVES, 3, generator=generator)
     return Pattern(
         base=(1 - share) * grey + share * hue,
-        waves=strength * (common + own) / math.sqrt(_WAVES),
+        waves=strength * (common + waves) / math.sqrt(_WAVES),
         frequencies=directions * (2 * math.pi / size_m * uniform(generator, 1.0, 4.0)),
         phases=2 * math.pi * torch.rand(_WAVES, generator=generator),
         gloss=uniform(generator, 0.0, 0.4),
@@ -105,11 +105,11 @@ def shade(
     start = 0
     for solid, pose in placed:
         stop = start + len(solid.triangles_m)
-        own = ((primitive >= start) & (primitive < stop)).nonzero()[:, 0]
-        corners = solid.normals[primitive[own] - start]
-        normal = (corners * share[own, :, None]).sum(1) @ pose.R.mT
-        local = pose.inverse().apply(points[own])
-        normal, sight = F.normalize(normal, dim=-1), F.normalize(-points[own], dim=-1)
+        of_body = ((primitive >= start) & (primitive < stop)).nonzero()[:, 0]
+        corners = solid.normals[primitive[of_body] - start]
+        normal = (corners * share[of_body, :, None]).sum(1) @ pose.R.mT
+        local = pose.inverse().apply(points[of_body])
+        normal, sight = F.normalize(normal, dim=-1), F.normalize(-points[of_body], dim=-1)
         # Both sides of a thin part are seen.
         normal = normal * torch.where((normal * sight).sum(-1, keepdim=True) < 0, -1.0, 1.0)
         facing = (normal @ towards).clamp(min=0)[:, None]
@@ -121,7 +121,7 @@ def shade(
         look = solid.pattern
         waves = torch.tanh(2 * (local @ look.frequencies.mT + look.phases).sin())
         plain = (look.base * (1 + waves @ look.waves)).clamp(0.01, 1)
-        colour[own] = plain * base + look.gloss * shine * lamp
+        colour[of_body] = plain * base + look.gloss * shine * lamp
         start = stop
     return colour
 

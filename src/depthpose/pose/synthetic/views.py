@@ -169,8 +169,8 @@ def measure(
         read_m = scale / (scale / read_m).round()
     elif kind == "active stereo":
         is_lost |= _is_shadowed(depth_m.flip(1), focal_px[0], _STEREO_BASELINE_M).flip(1)
-        one, other = (_displaced(depth_m, of_full, generator) for _ in range(2))
-        read_m = torch.lerp(one, other, torch.rand(depth_m.shape, generator=generator))
+        first, other = (_displaced(depth_m, of_full, generator) for _ in range(2))
+        read_m = torch.lerp(first, other, torch.rand(depth_m.shape, generator=generator))
         read_m = read_m + white * 0.003 * read_m.square()
         scale = _STEREO_STEPS_A_PIXEL * focal_px[1] * _STEREO_BASELINE_M
         read_m = scale / (scale / read_m).round()
@@ -320,9 +320,9 @@ def turn_view(
     # A comparison with NaN is false: where a corner sees nothing, the nearest decides.
     highest = torch.maximum(torch.maximum(nw, ne), torch.maximum(sw, se))
     lowest = torch.minimum(torch.minimum(nw, ne), torch.minimum(sw, se))
-    found = torch.where(highest - lowest < _JUMP * smooth, smooth, nearest)
+    turned = torch.where(highest - lowest < _JUMP * smooth, smooth, nearest)
     is_inside = (x - 0.5).abs().maximum((y - 0.5).abs()) <= 1
-    inverse_m = torch.where(is_inside, found, torch.nan)
+    inverse_m = torch.where(is_inside, turned, torch.nan)
     return CleanView(depth_m=1 / (inverse_m * w), K=moved, camera_from_model=pose)
 
 

@@ -91,12 +91,12 @@ class TrainingViews(Generic[Config]):
         if frames is not None:
             dataset = open_bop(frames.folder, frames.split)
             self._real = dataset.of_objects(*(model.number for model in models))
-            known = {model.number: model.name for model in models}
-            for number, found in self._real.objects.items():
-                if known[number] != found.name:
+            names = {model.number: model.name for model in models}
+            for number, instances in self._real.objects.items():
+                if names[number] != instances.name:
                     raise InputError(
-                        f"{frames.folder}: object {number} is called {found.name!r} there, and "
-                        f"{known[number]!r} here; take the models from this folder (models: bop)"
+                        f"{frames.folder}: object {number} is called {instances.name!r} there, and "
+                        f"{names[number]!r} here; take the models from this folder (models: bop)"
                     )
 
     def __len__(self) -> int:
@@ -357,9 +357,9 @@ def _posed(weights: PoseWeights, objects: Objects) -> tuple[list[PoseEstimate], 
     for start in range(0, len(objects), _CLOUDS_AT_ONCE):
         places = range(start, min(start + _CLOUDS_AT_ONCE, len(objects)))
         samples = [objects.view(place) for place in places]
-        found = net.estimate_many([sample.input for sample in samples])
-        estimates += found
-        for place, estimate, sample in zip(places, found, samples, strict=True):
+        posed = net.estimate_many([sample.input for sample in samples])
+        estimates += posed
+        for place, estimate, sample in zip(places, posed, samples, strict=True):
             model, pose = weights.models[place % len(weights.models)], estimate.camera_from_model
             errors.append(add_error(pose, sample.truth.camera_from_model, model))
     return estimates, errors

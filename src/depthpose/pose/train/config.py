@@ -160,13 +160,13 @@ def own_part(start: str) -> PoseTraining:
     the rate: new norms would take the place of statistics that it learnt with, and after 600 steps
     the loss of an unknown part is then a fifth higher (docs/experiments.md).
     """
-    own = PoseTraining()
+    training = PoseTraining()
     return dataclasses.replace(
-        own,
+        training,
         start=start,
-        network=dataclasses.replace(own.network, norm="none", with_bias=True),
-        adam=dataclasses.replace(own.adam, learning_rate=1e-3),
-        loop=dataclasses.replace(own.loop, steps=5300, validate_every_steps=2000, workers=1),
+        network=dataclasses.replace(training.network, norm="none", with_bias=True),
+        adam=dataclasses.replace(training.adam, learning_rate=1e-3),
+        loop=dataclasses.replace(training.loop, steps=5300, validate_every_steps=2000, workers=1),
     )
 
 

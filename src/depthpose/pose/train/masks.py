@@ -204,11 +204,11 @@ class SegmentationTask:
         table = torch.zeros(classes, classes, dtype=torch.int64)
         for index in range(len(self._held_out)):
             image, labels = self._held_out[index]
-            found = class_probabilities(self.network, image).argmax(0)
-            table += count_overlap(found, labels, classes)
+            predicted = class_probabilities(self.network, image).argmax(0)
+            table += count_overlap(predicted, labels, classes)
             if index == 0:
                 # The background darkened, and each object tinted with a colour of its own.
-                both = torch.cat([found, labels], -1)
+                both = torch.cat([predicted, labels], -1)
                 angle = 2 * torch.pi * torch.arange(classes) / max(classes - 1, 1)
                 phase = torch.tensor([0.0, 2.0, 4.0]) * torch.pi / 3
                 tint = (0.5 + 0.5 * (angle[:, None] + phase).cos())[both].movedim(-1, 0)
@@ -254,6 +254,6 @@ def train_segmentation(config: SegmentationTraining, run: Run) -> Path:
     )
     write_segmentation(path, weights, with_half=config.with_half)
     measured = held_out_text(run.folder, "Images that were held out: intersection over union.")
-    known = {"objects": ", ".join(weights.objects), **weights.facts}
-    write_card(path, "pose train --what segmentation", seconds, known, measured)
+    card = {"objects": ", ".join(weights.objects), **weights.facts}
+    write_card(path, "pose train --what segmentation", seconds, card, measured)
     return path

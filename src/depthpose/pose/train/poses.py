@@ -235,9 +235,9 @@ class DepthImageTask(ViewsTask):
         if crop is None:
             return math.inf
         batch = DepthCrop(*(part[None].to(device) for part in crop))
-        found = poses_of(self.network(batch.image, torch.tensor([number], device=device)), batch)
+        poses = poses_of(self.network(batch.image, torch.tensor([number], device=device)), batch)
         return add_error(
-            Rigid(found.R[0].cpu(), found.t_m[0].cpu()), view.truth.camera_from_model, model
+            Rigid(poses.R[0].cpu(), poses.t_m[0].cpu()), view.truth.camera_from_model, model
         )
 
 
@@ -288,10 +288,10 @@ def train_pose(config: PoseTraining | DepthImageTraining, run: Run) -> Path:
     cad = [word for file in config.models.cad for word in ("--cad", file)]
     unit = ["--unit", config.models.unit] if cad and config.models.unit else []
     command = shlex.join(["pose", "train", "--what", word, *cad, *unit])
-    known = ", ".join(f"{m.name} ({1000 * m.diameter_m:.0f} mm)" for m in weights.models)
+    listing = ", ".join(f"{m.name} ({1000 * m.diameter_m:.0f} mm)" for m in weights.models)
     alike = {model.name: near_symmetry_lines(model)[:_TURNS_ON_CARD] for model in weights.models}
     near = "; ".join(f"{name}: {', '.join(some)}" for name, some in alike.items() if some)
-    facts = {"objects": known} | ({"nearly_alike": near} if near else {}) | dict(weights.facts)
+    facts = {"objects": listing} | ({"nearly_alike": near} if near else {}) | dict(weights.facts)
     write_card(path, command, seconds, facts, table_text(table))
     return path
 
@@ -299,8 +299,8 @@ def train_pose(config: PoseTraining | DepthImageTraining, run: Run) -> Path:
 def _start_from(network: AnyNetwork, start: str, samples: TrainingViews[Any]) -> None:
     """Copy weights; of other objects, all but the last layer, except of a depth image's."""
     path = find_weights(start)
-    found = network_of(read_checkpoint(path), str(path))
-    wanted, given = config_to_dict(network.config), config_to_dict(found.config)
+    started = network_of(read_checkpoint(path), str(path))
+    wanted, given = config_to_dict(network.config), config_to_dict(started.config)
     has_norms = isinstance(network, ResUNet) and network.config.norm == "batch"
     free = ("classes", "norm", "with_bias") if has_norms else ("classes",)
     free = () if isinstance(network, DepthImageNet) else free
@@ -311,12 +311,12 @@ def _start_from(network: AnyNetwork, start: str, samples: TrainingViews[Any]) ->
                 f"{value!r}. Give the config the weights' own."
             )
     # Written weights are folded: they have no norms, but biases; batch norm takes both up.
-    if has_norms and isinstance(network, ResUNet) and isinstance(found, ResUNet):
+    if has_norms and isinstance(network, ResUNet) and isinstance(started, ResUNet):
         assert isinstance(samples, TrainingClouds)
         batch = samples.collate([samples[index] for index in range(_STATISTICS_CLOUDS)])
-        unfold_norms(found, network, Voxels.from_points(batch.coordinates, batch.features))
+        unfold_norms(started, network, Voxels.from_points(batch.coordinates, batch.features))
         return
-    state = found.state_dict()
-    if found.config.classes != network.config.classes:
+    state = started.state_dict()
+    if started.config.classes != network.config.classes:
         state |= {k: v for k, v in network.state_dict().items() if k.startswith("final.")}
     network.load_state_dict(state)
