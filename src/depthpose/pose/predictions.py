@@ -519,7 +519,8 @@ def read_bop_results(path: str | Path) -> list[Prediction]:
         ):
             raise InputError(
                 f"{path}: scene {place.scene_id} image {place.image_id} took {first_time_s} s in "
-                f"one row and {time_s} s in another; time is that of the whole image, the same in all"
+                f"one row and {time_s} s in another; time is that of the whole image, "
+                "the same in all"
             )
         estimate = PoseEstimate(
             name=f"row {len(estimates) + 1}",

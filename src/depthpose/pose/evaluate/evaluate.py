@@ -373,7 +373,8 @@ def evaluate(
         raise InputError(
             f"{dataset.folder}: none of the {len(predictions)} predictions is of one of its "
             f"{len(dataset)} instances; the first is of "
-            f"{prediction.place or prediction.estimate.name!r}. Give the predictions of this very split"
+            f"{prediction.place or prediction.estimate.name!r}. Give the predictions of "
+            "this very split"
         )
     contexts = {number: error_context(model, config) for number, model in dataset.objects.items()}
     # In the order of work; what a method of its own calls otherwise comes last.

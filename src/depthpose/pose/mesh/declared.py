@@ -151,8 +151,8 @@ def symmetry_of_each(
             name, symmetry = names[0], declaration
         else:
             raise InputError(
-                f"symmetry {declaration!r}: {len(names)} objects are known ({', '.join(names)}); say "
-                f"whose it is: {names[0]}:z,18, in Python symmetry={{{names[0]!r}: 'z,18'}}"
+                f"symmetry {declaration!r}: {len(names)} objects are known ({', '.join(names)}); "
+                f"say whose it is: {names[0]}:z,18, in Python symmetry={{{names[0]!r}: 'z,18'}}"
             )
         if name in declared:
             raise InputError(f"symmetry of {name!r} is given twice; join the two by +: z,6+x,2")
