@@ -22,7 +22,7 @@ from depthpose.core.rigid import Rigid
 from depthpose.pose.config import RefusalConfig
 from depthpose.pose.mesh import make_model
 from depthpose.pose.metrics import add_m
-from depthpose.pose.search import explained_mask, is_cut_out, nothing_found, which_object
+from depthpose.pose.search import choose_object, explained_mask, is_cut_out, nothing_found
 from depthpose.pose.surface import NEAR, prepare_surface
 from depthpose.pose.types import (
     Alternative,
@@ -177,7 +177,7 @@ def test_another_object_that_fits_too_lowers_the_probability_of_every_pose() -> 
         copy_certainty=0.5, alternatives=(copy,), evidence=evidence,
     )  # fmt: skip
     less = replace(evidence, supported=16.0, seen_through=3.0)
-    found = which_object([likely, replace(likely, object="bottle", evidence=less)])
+    found = choose_object([likely, replace(likely, object="bottle", evidence=less)])
     assert found.certainty is not None
     share = found.certainty / 0.9
     assert 0.8 < share < 0.99

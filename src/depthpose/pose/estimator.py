@@ -35,8 +35,8 @@ from depthpose.pose.inputs import (
 from depthpose.pose.propose.point_pairs import prepare_pairs
 from depthpose.pose.search import (
     SearchTargets,
+    choose_object,
     find_objects,
-    which_object,
 )
 from depthpose.pose.surface import prepare_surface
 from depthpose.pose.track import TrackedObject, track
@@ -96,7 +96,7 @@ class PoseEstimator:
     ) -> Iterator[PoseEstimate]:
         """Give each input's estimate in order; ``is_likely``: most of them show their object."""
         del is_likely
-        return each_in_threads(partial(or_unreadable, self._estimate), inputs, threads)
+        return each_in_threads(partial(unreadable_on_error, self._estimate), inputs, threads)
 
     def _estimate(self, given: AnyInput) -> PoseEstimate:
         """Estimate one input; an estimator of many at once has its own :meth:`_each`."""
@@ -201,7 +201,7 @@ class PoseEstimator:
             return self._answers([given], is_likely=True)[0]
         tried = [replace(given, object=name) for name in self.objects]
         estimates = self._answers(tried, is_likely=False)
-        return with_status(which_object(estimates), self.config.min_certainty)
+        return with_status(choose_object(estimates), self.config.min_certainty)
 
     @force_float32()
     def estimate_instances(
@@ -406,8 +406,8 @@ class PoseEstimator:
         return prepared
 
 
-def or_unreadable(work: Callable[[AnyInput], Made], given: AnyInput) -> Made | PoseEstimate:
-    """Do work for an input; where it raises :class:`InputError`, the estimate says so."""
+def unreadable_on_error(work: Callable[[AnyInput], Made], given: AnyInput) -> Made | PoseEstimate:
+    """Give what work makes of an input; a refusal where it raises an error of the input."""
     if not isinstance(given, AnyInput):
         raise InputError(
             "estimate_many takes CloudInput and ViewInput of depthpose.pose.types, not a "

@@ -37,7 +37,7 @@ from depthpose.pose.cloud import (
 from depthpose.pose.config import EstimateConfig
 from depthpose.pose.copies import PreparedObject, with_copies
 from depthpose.pose.decide import PRIOR_MASKED, PRIOR_PROPOSED, decide, refused
-from depthpose.pose.estimator import PoseEstimator, or_unreadable
+from depthpose.pose.estimator import PoseEstimator, unreadable_on_error
 from depthpose.pose.evidence import observe
 from depthpose.pose.hypotheses import compete
 from depthpose.pose.icp import RefinedPose, refine_best
@@ -165,7 +165,7 @@ class GeoPoseNet(PoseEstimator):
         The answer for an input does not depend on those beside it, but for the rounding of the
         network's sums. Only what is likely is registered, where the config wants it.
         """
-        prepared = each_in_threads(partial(or_unreadable, self._prepare), inputs, threads)
+        prepared = each_in_threads(partial(unreadable_on_error, self._prepare), inputs, threads)
         groups = map(self._ask_network, _batches(prepared, self.config.batch_voxels))
         pose = partial(self._pose, is_likely=is_likely)
         return chain.from_iterable(map(partial(each_in_threads, pose, threads=threads), groups))
@@ -250,7 +250,7 @@ class GeoPoseNet(PoseEstimator):
         """Pose a cloud by its votes, or by registration where these are doubted."""
         if isinstance(job, PoseEstimate):
             return job
-        voted = or_unreadable(partial(self._vote, job=job, is_likely=is_likely), job.given)
+        voted = unreadable_on_error(partial(self._vote, job=job, is_likely=is_likely), job.given)
         if not (self.config.register_refused and is_likely) or voted.status not in _DOUBTED:
             return voted
         start = time.perf_counter()

@@ -368,7 +368,7 @@ def _suppress(
         for other in ranked[number + 1 :]:
             if place.shared_with(other) > _RIVAL:
                 rivals.setdefault(other.object, other)
-        estimate, share = among_objects(list(rivals.values()))
+        estimate, share = choose_object_of_place(list(rivals.values()))
         if share >= _LEAST_SHARE:  # else it may be another object
             kept.append(replace(place, estimate=estimate))
     return kept, taken
@@ -499,10 +499,10 @@ def nothing_found(
     return PoseEstimate(status="doubtful", reason=reason, **facts)
 
 
-def which_object(estimates: Sequence[PoseEstimate]) -> PoseEstimate:
+def choose_object(estimates: Sequence[PoseEstimate]) -> PoseEstimate:
     """Choose which object one input shows, from the estimates for every object that it may be.
 
-    Those that are refused are none; the others share the probability of one.
+    An object that was refused is not the one; one of the others is.
 
     Args:
         estimates: for the same input, one an object.
@@ -521,7 +521,7 @@ def which_object(estimates: Sequence[PoseEstimate]) -> PoseEstimate:
         reason = f"none of {names} surely; {nearest.object} comes nearest: {nearest.reason}"
         return replace(nearest, reason=reason, seconds=dict(seconds))
     shares = _object_shares(posed)
-    best, share = _given_others(posed, shares)
+    best, share = _likeliest(posed, shares)
     if share < _LEAST_SHARE:
         candidates = ", ".join(
             f"{estimate.object} ({float(its_share):.0%})"
@@ -537,20 +537,23 @@ def which_object(estimates: Sequence[PoseEstimate]) -> PoseEstimate:
     return replace(best, seconds=dict(seconds))
 
 
-def among_objects(places: Sequence[_Judged]) -> tuple[PoseEstimate, float]:
+def choose_object_of_place(places: Sequence[_Judged]) -> tuple[PoseEstimate, float]:
     """Give the estimate of the likeliest object of one place, and its share among the objects."""
     estimates = [place.estimate for place in places]
-    return _given_others(estimates, _object_shares(estimates))
+    return _likeliest(estimates, _object_shares(estimates))
 
 
 def _object_shares(estimates: Sequence[PoseEstimate]) -> Tensor:
-    """Share the probability of one among objects, by the evidence of their best poses."""
+    """Give the probability of each object, if the readings are of one of them.
+
+    Each is weighed by the evidence of its best pose.
+    """
     evidences = [estimate.evidence for estimate in estimates if estimate.evidence is not None]
     log_odds = [log_odds_right(evidence) for evidence in evidences]
     return torch.tensor(log_odds, dtype=torch.float64).softmax(0)
 
 
-def _given_others(estimates: Sequence[PoseEstimate], shares: Tensor) -> tuple[PoseEstimate, float]:
+def _likeliest(estimates: Sequence[PoseEstimate], shares: Tensor) -> tuple[PoseEstimate, float]:
     """Give the likeliest estimate, its probabilities multiplied by its share among the objects."""
     best = int(shares.argmax())
     share, estimate = float(shares[best]), estimates[best]

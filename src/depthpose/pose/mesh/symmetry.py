@@ -87,17 +87,26 @@ class SymmetryProposal(NamedTuple):
 
 
 class SurfaceDeviation:
-    """Measures how far a turned surface lies from itself, in diameters."""
+    """Measures how far a turned surface lies from itself, in diameters.
+
+    Attributes:
+        centre_m: of the surface, about which it is turned.
+        points: samples of the surface about the centre, in diameters.
+        few: a hundred of them, for a rough measure of thousands of turns.
+        many: a thousand.
+        dense: five thousand.
+        axes: principal axes, one a row.
+    """
 
     def __init__(self, model: ObjectModel) -> None:
-        dense, normals = sample_surface(model, 20000)
-        self.centre_m = dense.double().mean(0)
-        self.points = (dense.double() - self.centre_m) / model.diameter_m
+        samples_m, normals = sample_surface(model, 20000)
+        self.centre_m = samples_m.double().mean(0)
+        self.points = (samples_m.double() - self.centre_m) / model.diameter_m
         self._normals = normals.double().numpy()
         self._tree = KDTree(self.points.numpy())
-        self.few, self.many, self.dense = (
-            take_evenly(self.points, count) for count in (100, 1000, 5000)
-        )
+        self.few = take_evenly(self.points, 100)
+        self.many = take_evenly(self.points, 1000)
+        self.dense = take_evenly(self.points, 5000)
         self._rough_tree = KDTree(take_evenly(self.points, 2500).numpy())
         self.axes = torch.linalg.eigh(self.points.T @ self.points).eigenvectors.T
 
