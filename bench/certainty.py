@@ -72,7 +72,7 @@ def answers_of(name: str, number: int) -> Iterator[Answer | None]:
 
 def add_in_diameters(pose: Rigid, truth: Rigid, copies: SymmetricCopies) -> float:
     """ADD to the nearest near-symmetric copy of the truth, in diameters: what a certainty is of."""
-    copies_of_truth = truth.double() @ Rigid.cat([copies.symmetries, copies.copies])
+    copies_of_truth = truth.double() @ Rigid.cat([copies.symmetries, copies.near_copies])
     posed_m = pose.double().apply(copies.points_m)
     true_m = copies_of_truth.apply(copies.points_m.expand(len(copies_of_truth.R), -1, -1))
     return float((posed_m - true_m).norm(dim=-1).mean(-1).min()) / copies.diameter_m

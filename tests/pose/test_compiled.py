@@ -113,10 +113,10 @@ def test_refined_poses(surface: Surface, monkeypatch: pytest.MonkeyPatch) -> Non
     cloud_m = seen(surface, starts[0])
     a, b = both(lambda: refine_pose(cloud_m, starts, surface), monkeypatch)
     # A spool turns freely about its axis, where rounding decides.
-    assert equal(a, b, 1e-6 if len(surface.copies.R) > 1 else 1e-10)
+    assert equal(a, b, 1e-6 if len(surface.symmetries.R) > 1 else 1e-10)
     one, other = both(lambda: refine_pose(cloud_m, starts[1], surface), monkeypatch)
     assert one.camera_from_model.R.shape == (3, 3)
-    assert equal(one, other, 1e-6 if len(surface.copies.R) > 1 else 1e-10)
+    assert equal(one, other, 1e-6 if len(surface.symmetries.R) > 1 else 1e-10)
 
 
 def test_nothing_near_moves_nothing(surface: Surface, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -33,7 +33,7 @@ def degrees_to(motions: Rigid, wanted: Rigid) -> float:
 
 def every_copy(copies: SymmetricCopies) -> Rigid:
     """The copies with those of their poses that are the same after a symmetry."""
-    moved = copies.copies[:, None] @ copies.symmetries
+    moved = copies.near_copies[:, None] @ copies.symmetries
     return Rigid(moved.R.flatten(0, 1), moved.t_m.flatten(0, 1))
 
 
@@ -47,7 +47,7 @@ def test_a_gear_is_the_same_after_a_step_of_any_number_of_teeth() -> None:
     for step in range(1, 12):
         about = rotation([0.0, 0, 1.0], 30.0 * step)
         assert degrees_to(copies.symmetries, about) < 2, step
-    assert len(copies.copies.R) <= 1, "all are one pose, but for the two faces at most"
+    assert len(copies.near_copies.R) <= 1, "all are one pose, but for the two faces at most"
 
 
 def test_a_keyway_makes_the_steps_of_a_gear_other_poses() -> None:
@@ -81,16 +81,16 @@ def test_what_is_declared_is_no_copy() -> None:
     flange = find_copies(make_part("flange"))
     for step in range(1, 6):
         assert degrees_to(flange.symmetries, rotation([0.0, 0, 1.0], 60.0 * step)) < 1
-        assert degrees_to(flange.copies, rotation([0.0, 0, 1.0], 60.0 * step)) > 20
+        assert degrees_to(flange.near_copies, rotation([0.0, 0, 1.0], 60.0 * step)) > 20
     upright = find_copies(bottle())
-    assert len(upright.copies.R) == 1, "after any rotation about its axis it is one pose"
-    assert float(upright.copies.R[0, 2, 2]) < -0.99, "it may stand on its head"
+    assert len(upright.near_copies.R) == 1, "after any rotation about its axis it is one pose"
+    assert float(upright.near_copies.R[0, 2, 2]) < -0.99, "it may stand on its head"
 
 
 def test_what_looks_alike_from_no_two_sides_has_no_copy() -> None:
     copies = find_copies(bracket())
     assert len(copies.symmetries.R) == 1
-    assert len(copies.copies.R) == 0
+    assert len(copies.near_copies.R) == 0
     assert copies.mirror > 0.02
 
 
@@ -99,7 +99,7 @@ def test_a_ball_is_one_pose_whatever_its_rotation() -> None:
     vertices_m, faces = torch.tensor(mesh.vertices), torch.tensor(mesh.faces).long()
     ball = make_model(vertices_m, faces, name="ball", number=1)
     copies = find_copies(with_found_symmetries(ball, None, is_taken=True))
-    assert len(copies.copies.R) == len(copies.lookalikes.R) == 0
+    assert len(copies.near_copies.R) == len(copies.lookalikes.R) == 0
     first = pose_at(seed=1).double()
     other = Rigid(pose_at(seed=2).R.double(), first.t_m)[None]
     assert bool(copies.is_same(first, other, copies.symmetries).all())
@@ -126,7 +126,7 @@ def test_half_turns_about_the_principal_axes_are_look_alikes() -> None:
     vertices = torch.cat([corners * sizes, corners * ends + at])
     profile = make_model(vertices, torch.cat([faces, faces + 8]), name="profile", number=1)
     copies = find_copies(profile)
-    every = Rigid.cat([copies.copies, copies.lookalikes])
+    every = Rigid.cat([copies.near_copies, copies.lookalikes])
     for axis in ([1.0, 0, 0], [0, 1.0, 0], [0, 0, 1.0]):
         assert degrees_to(every, rotation(axis, 180)) < 20, axis
 

@@ -106,8 +106,8 @@ def test_points_at_and_behind_the_camera_are_no_part_of_what_it_saw(
 
 
 def test_a_surface_knows_the_poses_that_look_alike(surface: Surface) -> None:
-    assert len(prepare_surface(bottle()).copies.R) > 30
-    assert len(surface.copies.R) == 1
+    assert len(prepare_surface(bottle()).symmetries.R) > 30
+    assert len(surface.symmetries.R) == 1
 
 
 def test_a_camera_on_any_side_has_a_view_from_nearby(surface: Surface) -> None:

@@ -28,7 +28,7 @@ from depthpose.pose.predictions import (
     Prediction,
     earlier_predictions,
     place_of,
-    unreadable,
+    unreadable_estimate,
     write_predictions,
 )
 from depthpose.pose.search import explained_mask
@@ -80,7 +80,9 @@ class SearchResults(Results[ViewInput, list[PoseEstimate]]):
         assert isinstance(job, PoseJob)
         if job.object is None:
             raise error
-        self.by_image[job.name] = [Prediction(estimate=unreadable(job.name, job.object, error))]
+        self.by_image[job.name] = [
+            Prediction(estimate=unreadable_estimate(job.name, job.object, error))
+        ]
         self.flush()
 
     def flush(self) -> None:
@@ -340,7 +342,7 @@ def _followed(
             try:
                 frame = job.read()
             except InputError as error:
-                frame = unreadable(job.name, name, error)
+                frame = unreadable_estimate(job.name, name, error)
             yield frame
 
     assert method.track is not None

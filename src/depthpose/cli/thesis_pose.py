@@ -204,7 +204,9 @@ def reproduce_voting(
     rows: list[dict[str, Any]] = []
     for count in points:
         cases = list(
-            pose_tables.cases_of(net, tqdm(views.samples, f"{count} points", disable=None), count)
+            pose_tables.voting_cases(
+                net, tqdm(views.samples, f"{count} points", disable=None), count
+            )
         )
         rows += [row | facts for row in pose_tables.compare_voting(cases, count)]
     page.write_table(out, rows)
@@ -276,7 +278,7 @@ def feature_panels(net: GeoPoseNet, views: Views, perplexity: float) -> list[Dra
 def field_panels(net: GeoPoseNet, views: Views, keypoint: int | None) -> list[Drawing]:
     """Draw the field of one keypoint of one view: the one whose vote errs most."""
     errors: list[tuple[float, int, int, pose_tables.VotingCase, Tensor, Tensor]] = []
-    for index, case in enumerate(pose_tables.cases_of(net, views.samples, _SCAN_POINTS)):
+    for index, case in enumerate(pose_tables.voting_cases(net, views.samples, _SCAN_POINTS)):
         if case is None:
             continue
         vote = vote_ransac(case.points_m, case.directions, None, net.config.voting)

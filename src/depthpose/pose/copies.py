@@ -38,8 +38,8 @@ class SymmetricCopies:
 
     Attributes:
         symmetries: exact ones, whose copies are one pose; the identity first.
-        copies: near-symmetries, which map at least 85 % of the surface onto itself: another pose
-            that looks nearly alike, such as a gear turned by a tooth.
+        near_copies: near-symmetries, which map at least 85 % of the surface onto itself: another
+            pose that looks nearly alike, such as a gear turned by a tooth.
         lookalikes: motions that map a smaller part of the surface onto itself, and half turns.
         trained: symmetries that a network was trained to treat as one pose; the identity first.
         mirror: how far the mirror image deviates from the model, in diameters.
@@ -51,7 +51,7 @@ class SymmetricCopies:
     """
 
     symmetries: Rigid
-    copies: Rigid
+    near_copies: Rigid
     lookalikes: Rigid
     trained: Rigid
     mirror: float
@@ -116,7 +116,7 @@ def find_copies(model: ObjectModel) -> SymmetricCopies:
         lookalikes = _empty()
     prepared = SymmetricCopies(
         symmetries=symmetries,
-        copies=_empty(),
+        near_copies=_empty(),
         lookalikes=_empty(),
         trained=symmetry_transforms(model.symmetries, 4 * _STEP_RAD).double(),
         mirror=mirror_deviation(model),
@@ -129,7 +129,7 @@ def find_copies(model: ObjectModel) -> SymmetricCopies:
     identity = Rigid(torch.eye(3)[None].double(), torch.zeros(1, 3).double())
     copies = _distinct(copies, identity, prepared)
     lookalikes = _distinct(lookalikes, Rigid.cat([identity, copies]), prepared)
-    return replace(prepared, copies=copies, lookalikes=lookalikes)
+    return replace(prepared, near_copies=copies, lookalikes=lookalikes)
 
 
 def _distinct(motions: Rigid, others: Rigid, prepared: SymmetricCopies) -> Rigid:
@@ -145,7 +145,7 @@ def _empty() -> Rigid:
     return Rigid(torch.zeros(0, 3, 3).double(), torch.zeros(0, 3).double())
 
 
-def with_copies(prepared: PreparedObject) -> SymmetricCopies:
+def copies_of(prepared: PreparedObject) -> SymmetricCopies:
     """Give an object's symmetric copies, searched when they are first asked for."""
     if prepared.copies is None:
         prepared.copies = find_copies(prepared.model)

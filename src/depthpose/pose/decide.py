@@ -23,7 +23,7 @@ from torch import Tensor
 from depthpose.core.rigid import Rigid
 from depthpose.pose.cloud import ObjectCloud, Refusal
 from depthpose.pose.config import EstimateConfig, RefusalConfig
-from depthpose.pose.copies import PreparedObject, difference_of, with_copies
+from depthpose.pose.copies import PreparedObject, copies_of, difference_of
 from depthpose.pose.evidence import Observation
 from depthpose.pose.identity import identify
 from depthpose.pose.observability import free_motions, observability, without_motions
@@ -177,10 +177,10 @@ def log_odds_right(evidence: Evidence) -> float:
     """
     area = max(LEAST_AREA, evidence.visible)
     # Only what was observed can contradict a pose, and what contradicts it was observed.
-    observed = max(LEAST_AREA, area - evidence.unobserved)
+    observed_area = max(LEAST_AREA, area - evidence.unobserved)
     rest = max(LEAST_AREA, area - evidence.seen_through - evidence.bulging)
-    contradicted = RIGHT_CONTRADICTED.log_likelihood(evidence.contradicted, observed)
-    contradicted -= WRONG_CONTRADICTED.log_likelihood(evidence.contradicted, observed)
+    contradicted = RIGHT_CONTRADICTED.log_likelihood(evidence.contradicted, observed_area)
+    contradicted -= WRONG_CONTRADICTED.log_likelihood(evidence.contradicted, observed_area)
     unobserved = RIGHT_UNOBSERVED.log_likelihood(evidence.unobserved, rest)
     unobserved -= WRONG_UNOBSERVED.log_likelihood(evidence.unobserved, rest)
     # Residuals are of the supported part alone.
@@ -250,7 +250,7 @@ def decide(
             best.pose,
             model.name,
             surface,
-            with_copies(prepared).mirror,
+            copies_of(prepared).mirror,
             evidence,
             observation.step * float(observation.K[0, 0]),
             refusal.max_size_error,
@@ -281,7 +281,7 @@ def decide(
         Alternative(
             camera_from_model=hypothesis.pose.float(),
             probability=probability * share,
-            difference=difference_of(hypothesis.pose, best.pose, with_copies(prepared)),
+            difference=difference_of(hypothesis.pose, best.pose, copies_of(prepared)),
             is_copy=is_copy,
         )
         for hypothesis, share, is_copy in competitors

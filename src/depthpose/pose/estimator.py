@@ -18,7 +18,7 @@ from depthpose.core.units import Unit
 from depthpose.pose.cloud import Refusal
 from depthpose.pose.color_inputs import with_color
 from depthpose.pose.config import EstimateConfig, RefusalConfig
-from depthpose.pose.copies import PreparedObject, with_copies
+from depthpose.pose.copies import PreparedObject, copies_of
 from depthpose.pose.datasets.detections import Box, box_mask
 from depthpose.pose.decide import PRIOR_REGION, refused, with_status
 from depthpose.pose.inputs import (
@@ -275,7 +275,7 @@ class PoseEstimator:
     @torch.no_grad()
     @force_float32()
     def find_in(
-        self, view: ViewInput, objects: Sequence[str], *, is_sure: bool = False
+        self, view: ViewInput, objects: Sequence[str], *, is_single: bool = False
     ) -> list[PoseEstimate]:
         """Do as :meth:`find` does for a view, with a refusal for each object that is not found.
 
@@ -284,14 +284,14 @@ class PoseEstimator:
         Args:
             view: depth and camera.
             objects: which may be there.
-            is_sure: search once, without further rounds for more of the same object.
+            is_single: search once, without further rounds for more of the same object.
         """
         targets = SearchTargets(
             names=objects,
             object_of=self._prepared,
             estimate_near=self._estimate_near,
             min_probability=self.refusal.min_probability,
-            is_single=is_sure,
+            is_single=is_single,
         )
         estimates = find_objects(view, targets)
         return [with_status(estimate, self.config.min_certainty) for estimate in estimates]
@@ -363,7 +363,7 @@ class PoseEstimator:
         def look(given: AnyInput) -> PoseEstimate:
             if isinstance(given, CloudInput):
                 return self._answers([given], is_likely=False)[0]
-            return self.find_in(given, [object], is_sure=True)[0]
+            return self.find_in(given, [object], is_single=True)[0]
 
         prepared = self._known(object)
         target = TrackedObject(
@@ -400,7 +400,7 @@ class PoseEstimator:
     def _prepared(self, name: str) -> PreparedObject:
         """Give an object by its name, with its point pairs, near-symmetries and turns."""
         prepared = self._known(name)
-        with_copies(prepared)
+        copies_of(prepared)
         if prepared.pairs is None:
             prepared.pairs = prepare_pairs(prepared.surface)
         return prepared

@@ -62,7 +62,8 @@ class Observation:
 
     Attributes:
         depth_m: (h, w), NaN where there is no reading.
-        is_object: (h, w) pixels that are known to be of the object, without their border.
+        is_masked: whether a mask says which pixels are of the object.
+        is_object: (h, w) these pixels, without their border; none without a mask.
         K: intrinsic matrix of the window.
         noise: of readings on the object.
         step: every so many rows and columns of the image are used.
@@ -70,6 +71,7 @@ class Observation:
     """
 
     depth_m: np.ndarray
+    is_masked: bool
     is_object: np.ndarray
     K: Float64[Tensor, "3 3"]
     noise: DepthNoise
@@ -133,6 +135,7 @@ def observe(
     window_K[:2] /= step
     return Observation(
         depth_m=np.ascontiguousarray(depth_m.float().numpy()[::step, ::step]),
+        is_masked=is_masked,
         is_object=np.ascontiguousarray(inner.numpy()[::step, ::step]) & is_masked,
         K=window_K,
         noise=noise,
@@ -259,7 +262,7 @@ def compare(observation: Observation, pose: Rigid, surface: Surface) -> Evidence
     is_supported = is_compared & (np.abs(deviations) <= THRESHOLD)
     seen_through = _patch_area(deviations > THRESHOLD, patch_px)
     bulging = _patch_area((deviations < -THRESHOLD) & is_object, patch_px)
-    if observation.is_object.any():
+    if observation.is_masked:
         is_beside = observation.is_object & np.isfinite(observation.depth_m)
         border = max(1, round((BORDER_PX + 1) / step))
         is_shown = np.zeros_like(is_beside)

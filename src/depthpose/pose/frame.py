@@ -34,11 +34,11 @@ _JUMP_PER_M = 0.012
 _TOLERANCE_M = 0.0005
 _DEVIATIONS = 4.0
 """Points lie on a plane up to half a millimetre, and four standard deviations of the error that
-neighbouring readings share, which grows with the square of the depth; but no farther than"""
+neighbouring readings share, which grows with the square of the depth."""
 _WIDEST_M = 0.004
-_WIDEST_PER_M = 0.003
-"""4 mm, and 3 mm for the square of their depth in metres: a Kinect's noise."""
-NOISE_PER_M = 0.0015
+_WIDEST_PER_M2 = 0.003
+"""But no farther than 4 mm, and 3 mm for the square of their depth in metres: a Kinect's noise."""
+NOISE_PER_M2 = 0.0015
 """Standard deviation of a Kinect's readings, for the square of the depth in metres (Nguyen et al.
 2012): where nothing better is known."""
 _PLANES = 6
@@ -67,10 +67,10 @@ class Frame:
         points_m: in the camera frame.
         normals: toward the camera.
         is_smooth: where a normal is known.
-        plane_m: diameter [m] up to which no object has the plane at a pixel as a side; 0 where
-            there is no wide plane.
+        plane_limit_m: diameter [m] up to which no object has the plane at a pixel as a side; 0
+            where there is no wide plane.
         nearest_m: least depth of the pixels up to two away; infinite where none has a reading.
-        noise_per_m: standard deviation of a reading, for the square of the depth in metres.
+        noise_per_m2: standard deviation of a reading, for the square of the depth in metres.
         planes: the wide ones.
     """
 
@@ -80,9 +80,9 @@ class Frame:
     points_m: Float64[Tensor, "h w 3"]
     normals: Float64[Tensor, "h w 3"]
     is_smooth: Bool[Tensor, "h w"]
-    plane_m: Float64[Tensor, "h w"]
+    plane_limit_m: Float64[Tensor, "h w"]
     nearest_m: Float64[Tensor, "h w"]
-    noise_per_m: float
+    noise_per_m2: float
     planes: Sequence["WidePlane"]
 
 
@@ -92,7 +92,7 @@ class WidePlane:
 
     Attributes:
         plane: through its readings.
-        diameter_m: up to which no object has it as a side, as ``Frame.plane_m``.
+        diameter_m: up to which no object has it as a side, as ``Frame.plane_limit_m``.
     """
 
     plane: Plane
@@ -113,7 +113,7 @@ def prepare_frame(
             it would be few pixels wide.
     """
     depth_m = torch.where(depth_m.isfinite() & (depth_m > 0), depth_m, 0.0).double()
-    noise_per_m = _measure_noise_per_m(depth_m)
+    noise_per_m2 = _measure_noise_per_m2(depth_m)
     step = math.ceil(math.sqrt(depth_m.numel() / _MOST_PIXELS))
     is_read = depth_m > 0
     if diameter_m is not None and bool(is_read.any()):
@@ -123,16 +123,16 @@ def prepare_frame(
     K = K.double() / torch.tensor([[step], [step], [1]])
     points_m = back_project(depth_m, K)
     normals, is_smooth = _normals(depth_m, points_m, K)
-    plane_m, planes = _planes(depth_m, points_m, normals, noise_per_m)
+    plane_limit_m, planes = _planes(depth_m, points_m, normals, noise_per_m2)
     nearest_m = -max_pool2d(-torch.where(depth_m > 0, depth_m, torch.inf)[None], 5, 1, 2)[0]
     return Frame(
         step=step, depth_m=depth_m, K=K, points_m=points_m, normals=normals, is_smooth=is_smooth,
-        plane_m=plane_m, nearest_m=nearest_m, noise_per_m=noise_per_m,
+        plane_limit_m=plane_limit_m, nearest_m=nearest_m, noise_per_m2=noise_per_m2,
         planes=planes,
     )  # fmt: skip
 
 
-def _measure_noise_per_m(depth_m: Float64[Tensor, "h w"]) -> float:
+def _measure_noise_per_m2(depth_m: Float64[Tensor, "h w"]) -> float:
     """Measure the noise of an image by second differences, over the square of the depth."""
     scaled = torch.where(depth_m > 0, depth_m, torch.nan)
     bends: list[Tensor] = []
@@ -141,7 +141,7 @@ def _measure_noise_per_m(depth_m: Float64[Tensor, "h w"]) -> float:
         bend = (along[:, : -2 * LAG_PX] + along[:, 2 * LAG_PX :] - 2 * middle) / middle.square()
         bends.append(bend[bend.isfinite()])
     bend = torch.cat(bends).abs()
-    return float(bend.median()) / 0.6745 / math.sqrt(6) if len(bend) else NOISE_PER_M
+    return float(bend.median()) / 0.6745 / math.sqrt(6) if len(bend) else NOISE_PER_M2
 
 
 def _normals(
@@ -189,23 +189,23 @@ def _planes(
     depth_m: Float64[Tensor, "h w"],
     points_m: Float64[Tensor, "h w 3"],
     normals: Float64[Tensor, "h w 3"],
-    noise_per_m: float,
+    noise_per_m2: float,
 ) -> tuple[Float64[Tensor, "h w"], list[WidePlane]]:
-    """Find wide planes by RANSAC; give each of their pixels its ``Frame.plane_m``."""
+    """Find wide planes by RANSAC; give each of their pixels its ``Frame.plane_limit_m``."""
     is_left = depth_m > 0
     planes: list[WidePlane] = []
-    plane_m = torch.zeros_like(depth_m)
+    plane_limit_m = torch.zeros_like(depth_m)
     least = max(_LEAST_POINTS, _LEAST_SHARE * int(is_left.sum()))
     generator = torch.Generator().manual_seed(0)
     for _ in range(_PLANES):
-        plane = largest_plane(points_m[is_left], generator, noise_per_m)
+        plane = largest_plane(points_m[is_left], generator, noise_per_m2)
         if plane is None:
             break
-        near = is_on_plane(points_m, plane, noise_per_m) & is_left
+        near = is_on_plane(points_m, plane, noise_per_m2) & is_left
         if int(near.sum()) < least:
             break
         is_along = is_left & ((normals @ plane[0]).abs() > _ALONG)
-        bent = near | _bent(points_m, plane, near, is_along, noise_per_m)
+        bent = near | _bent(points_m, plane, near, is_along, noise_per_m2)
         label = label_regions(depth_m, bent)
         sizes = torch.bincount(label[near], minlength=int(label.max()) + 1)
         piece = near & (label == sizes.argmax())
@@ -221,9 +221,9 @@ def _planes(
             along = offset @ axes[:, 1:]
             width_m, length_m = (along.quantile(0.95, 0) - along.quantile(0.05, 0)).tolist()
             diameter_m = max(width_m / _WIDER, length_m / _LONGER)
-            plane_m[joined] = diameter_m
+            plane_limit_m[joined] = diameter_m
             planes.append(WidePlane(plane=plane, diameter_m=diameter_m))
-    return plane_m, planes
+    return plane_limit_m, planes
 
 
 def _bent(
@@ -231,13 +231,13 @@ def _bent(
     plane: Plane,
     near: Bool[Tensor, "h w"],
     is_along: Bool[Tensor, "h w"],
-    noise_per_m: float,
+    noise_per_m2: float,
 ) -> Bool[Tensor, "h w"]:
     """Mark what is turned as a plane and lies on it as the sensor bends it, by a quadratic."""
     off_m = points_m @ plane[0] - plane[1]
     x, y = (points_m[..., :2] / points_m[..., 2:].clamp(min=1e-6)).unbind(-1)
     terms = torch.stack([torch.ones_like(x), x, y, x * x, x * y, y * y], -1)
-    tolerance_m = _tolerance_m(points_m[..., 2], noise_per_m)
+    tolerance_m = _tolerance_m(points_m[..., 2], noise_per_m2)
     is_bent = near & is_along
     for _ in range(_BENDINGS):
         A, b = (take_evenly(grid[is_bent], _SAMPLE) for grid in (terms, off_m))
@@ -249,7 +249,7 @@ def _bent(
 
 
 def largest_plane(
-    points_m: Float64[Tensor, "n 3"], generator: torch.Generator, noise_per_m: float = NOISE_PER_M
+    points_m: Float64[Tensor, "n 3"], generator: torch.Generator, noise_per_m2: float = NOISE_PER_M2
 ) -> Plane | None:
     """Give the plane that most points lie on, by RANSAC; None for fewer than 60 points."""
     some = take_evenly(points_m, _SAMPLE)
@@ -261,13 +261,13 @@ def largest_plane(
     length = normal.norm(dim=-1, keepdim=True)
     normal = normal / length.clamp(min=1e-12)
     offset = (normal * a).sum(-1)
-    tolerance_m = _tolerance_m(some[:, 2], noise_per_m)
+    tolerance_m = _tolerance_m(some[:, 2], noise_per_m2)
     on = (some @ normal.T - offset).abs() < tolerance_m[:, None]
     on &= length[:, 0] > 1e-8
     best = int(on.sum(0).argmax())
     plane = (normal[best], offset[best])
     for _ in range(3):
-        near = some[is_on_plane(some, plane, noise_per_m)]
+        near = some[is_on_plane(some, plane, noise_per_m2)]
         if len(near) < 3:
             return None
         middle = near.mean(0)
@@ -309,26 +309,26 @@ def share_behind(
     normal, offset = wide.plane
     beyond_m = (points_m @ normal - offset) * offset.sign()  # the camera is on the other side
     foot_m = points_m - ((points_m @ normal - offset)[:, None]) * normal
-    limit_m = margin_m + _tolerance_m(foot_m[:, 2].clamp(min=0), frame.noise_per_m)
+    limit_m = margin_m + _tolerance_m(foot_m[:, 2].clamp(min=0), frame.noise_per_m2)
     # What stands before the plane hides it; where the camera saw farther it has ended.
     readings = readings_toward(frame, foot_m)
     is_solid = readings.is_read & (readings.depth_m < foot_m[:, 2] + limit_m)
     return float((is_solid & (beyond_m > limit_m)).double().mean())
 
 
-def _tolerance_m(depth_m: Float64[Tensor, "*n"], noise_per_m: float) -> Float64[Tensor, "*n"]:
+def _tolerance_m(depth_m: Float64[Tensor, "*n"], noise_per_m2: float) -> Float64[Tensor, "*n"]:
     """How far from a plane a reading of it may lie, at each depth."""
     square = depth_m.square()
-    tolerance_m = _TOLERANCE_M + _DEVIATIONS * SHARED_PER_WHITE * noise_per_m * square
-    return torch.minimum(tolerance_m, _WIDEST_M + _WIDEST_PER_M * square)
+    tolerance_m = _TOLERANCE_M + _DEVIATIONS * SHARED_PER_WHITE * noise_per_m2 * square
+    return torch.minimum(tolerance_m, _WIDEST_M + _WIDEST_PER_M2 * square)
 
 
 def is_on_plane(
-    points_m: Float64[Tensor, "*batch 3"], plane: Plane, noise_per_m: float = NOISE_PER_M
+    points_m: Float64[Tensor, "*batch 3"], plane: Plane, noise_per_m2: float = NOISE_PER_M2
 ) -> Bool[Tensor, "*batch"]:
     """Whether points of the camera frame lie on a plane, as far as a depth sensor measures it."""
     normal, offset = plane
-    tolerance_m = _tolerance_m(points_m[..., 2], noise_per_m)
+    tolerance_m = _tolerance_m(points_m[..., 2], noise_per_m2)
     return (points_m @ normal - offset).abs() < tolerance_m
 
 

@@ -11,7 +11,7 @@ from depthpose.core.arrays import take_evenly
 from depthpose.core.rigid import Rigid, geodesic_rad
 from depthpose.pose.color import color_agreement, color_copies, settle_spin
 from depthpose.pose.config import IcpConfig
-from depthpose.pose.copies import PreparedObject, with_copies
+from depthpose.pose.copies import PreparedObject, copies_of
 from depthpose.pose.decide import Competition, Hypothesis, share_among_copies, share_among_poses
 from depthpose.pose.evidence import Observation, compare
 from depthpose.pose.icp import RefinedPose, refine_pose, refine_roughly
@@ -50,7 +50,7 @@ def compete(
         view: whose colour image tells copies apart; None: depth alone.
         votes_rad: mean angle between a network's directions and those to the keypoints of a pose.
     """
-    copies = with_copies(prepared)
+    copies = copies_of(prepared)
     surface = prepared.surface
 
     def hypothesis(source: RefinedPose) -> Hypothesis:
@@ -67,7 +67,7 @@ def compete(
     # Which pose is it, up to near-symmetric copies?
     first = refined.camera_from_model.double()
     starts = Rigid.cat([others.double(), first @ copies.lookalikes])
-    alike = Rigid.cat([copies.symmetries, copies.copies])
+    alike = Rigid.cat([copies.symmetries, copies.near_copies])
     leading = [hypothesis(refined)]
     for candidate in _refined(cloud_m, refined, starts, surface, icp, _MOST_LEADING):
         before = Rigid.stack([h.pose for h in leading])
@@ -76,7 +76,7 @@ def compete(
             leading.append(hypothesis(candidate.refined))
     if view is not None:  # one of its copies may have the print that is observed
         leading = _by_best_print(leading, prepared, view, alike)
-    shares = share_among_poses(leading, is_masked=bool(observation.is_object.any()))
+    shares = share_among_poses(leading, is_masked=observation.is_masked)
     winner = int(shares.argmax())
     others_shares = [(h, float(shares[k])) for k, h in enumerate(leading) if k != winner]
 
@@ -91,7 +91,7 @@ def compete(
     group = [leading[winner]]
     if view is not None:
         group = [replace(group[0], log_color=_log_color(pose, prepared, view))]
-    starts = pose @ copies.copies
+    starts = pose @ copies.near_copies
     if view is not None:  # print shows finer steps about an axis than shape does
         starts = Rigid.cat([color_copies(pose, prepared.model, view), starts])
     for candidate in _refined(cloud_m, source, starts, surface, icp, _MOST_COPIES):

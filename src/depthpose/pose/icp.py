@@ -173,7 +173,7 @@ def refine_best(
     # From the best down, those that carry the object elsewhere than any before, symmetries aside.
     others: list[int] = []
     own_m = surface.points_m[:: max(1, len(surface.points_m) // 50)]
-    copies_m = surface.copies.apply(own_m)
+    copies_m = surface.symmetries.apply(own_m)
     for k in score.argsort(descending=True).tolist():
         if len(others) == _MOST_OTHERS or score[k] == -torch.inf:
             break

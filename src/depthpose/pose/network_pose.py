@@ -35,7 +35,7 @@ from depthpose.pose.cloud import (
     refusal_of,
 )
 from depthpose.pose.config import EstimateConfig
-from depthpose.pose.copies import PreparedObject, with_copies
+from depthpose.pose.copies import PreparedObject, copies_of
 from depthpose.pose.decide import PRIOR_MASKED, PRIOR_PROPOSED, decide, refused
 from depthpose.pose.estimator import PoseEstimator, unreadable_on_error
 from depthpose.pose.evidence import observe
@@ -171,10 +171,13 @@ class GeoPoseNet(PoseEstimator):
         return chain.from_iterable(map(partial(each_in_threads, pose, threads=threads), groups))
 
     def _by_models(self) -> Registration:
-        """Give the registration of the same objects, which shares what was prepared of them."""
+        """Give the registration of the same objects, which shares what was prepared of them.
+
+        What a search proposes, and what the network refuses, is estimated by it.
+        """
         if self._registration is None:
             config = replace(self.config, register_refused=False, with_icp=True)
-            self._registration = Registration(self.models, config)
+            self._registration = Registration(self.models, config, self.refusal)
             self._registration._objects = self._objects
         return self._registration
 
@@ -209,7 +212,7 @@ class GeoPoseNet(PoseEstimator):
         if isinstance(given, ViewInput) and given.is_region:
             return self._estimate_in_region(given)
         prepared = self._known(given.object)
-        with_copies(prepared)  # in the seconds of no input
+        copies_of(prepared)  # in the seconds of no input
         start = time.perf_counter()
         cloud = prepare_cloud(given, prepared.model, self.weights.cloud, self.config)
         seconds = {"cloud": time.perf_counter() - start}
@@ -318,7 +321,7 @@ class GeoPoseNet(PoseEstimator):
         the directions point best.
         """
         keypoints_m = job.prepared.model.keypoints_m.double()
-        copies_m = (pose @ with_copies(job.prepared).trained).apply(keypoints_m)
+        copies_m = (pose @ copies_of(job.prepared).trained).apply(keypoints_m)
         points_m = job.cloud.points_m.double()
         directions = normalize(job.directions.double(), dim=-1)
         every = max(1, len(points_m) // _COMPARED)
@@ -360,10 +363,10 @@ class DepthImageRegressor(PoseEstimator):
         return super()._answers(inputs, is_likely=is_likely)
 
     def find_in(
-        self, view: ViewInput, objects: Sequence[str], *, is_sure: bool = False
+        self, view: ViewInput, objects: Sequence[str], *, is_single: bool = False
     ) -> NoReturn:
         """Refuse: nothing tells whether an object is there."""
-        del view, objects, is_sure
+        del view, objects, is_single
         raise InputError(_NEEDS_MASK)
 
     def _estimate(self, given: AnyInput) -> PoseEstimate:

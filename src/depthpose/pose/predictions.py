@@ -39,7 +39,9 @@ from depthpose.pose.types import (
 POSES = "poses.json"
 VERSION = 2  #: of an entry of ``poses.json``; ``docs/poses.schema.json`` describes it
 PICTURE, CLOUD = "pose.png", "pose.ply"  #: what follows ``NAME.`` in files that show a pose
-STAGES = ("segmentation", "cloud", "network", "voting", "svd", "icp", "check", "registration")
+STAGES = (
+    "search", "segmentation", "cloud", "network", "proposal", "icp", "evidence", "decision",
+)  # fmt: skip
 """What an estimate's ``seconds`` are of, in order; a stage that was not run is missing."""
 
 _ROTATION_SLACK = 1e-4
@@ -302,7 +304,7 @@ class PoseJob(Job[Input]):
     seconds: Mapping[str, float] = field(default_factory=dict)  #: what was spent before, on a mask
 
 
-def unreadable(name: str, object: str, error: InputError) -> PoseEstimate:
+def unreadable_estimate(name: str, object: str, error: InputError) -> PoseEstimate:
     """Make the estimate that says why an input cannot be read."""
     reason = f"cannot be read: {error}"
     return PoseEstimate(name=name, object=object, status="unreadable", reason=reason)
@@ -338,7 +340,7 @@ class PoseResults(Results[Input, PoseEstimate]):
         assert isinstance(job, PoseJob)
         if job.object is None:
             raise error
-        self._keep(job, unreadable(job.name, job.object, error))
+        self._keep(job, unreadable_estimate(job.name, job.object, error))
 
     def _keep(self, job: PoseJob[Input], estimate: PoseEstimate) -> None:
         timed = replace(estimate, seconds={**job.seconds, **estimate.seconds})

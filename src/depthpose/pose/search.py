@@ -22,7 +22,7 @@ from depthpose.core.camera import back_project, project
 from depthpose.core.devices import each_in_threads
 from depthpose.core.rigid import Rigid
 from depthpose.pose.cloud import cloud_from_depth, grow_mask
-from depthpose.pose.copies import PreparedObject, with_copies
+from depthpose.pose.copies import PreparedObject, copies_of
 from depthpose.pose.decide import LEAST_NAMED, PRIOR_MANY, PRIOR_PROPOSED, log_odds_right
 from depthpose.pose.evidence import BORDER_PX
 from depthpose.pose.frame import (
@@ -163,6 +163,7 @@ def find_objects(view: ViewInput, targets: SearchTargets) -> list[PoseEstimate]:
         accepted += more
         for place in more:
             is_unclaimed &= ~place.explained
+        # What is there twice may be there more often; what was found once is not asked for again.
         count = Counter(place.object for place in accepted)
         names = sorted({place.object for place in more if count[place.object] > 1})
         if not names:
@@ -244,12 +245,12 @@ def _best_copy(frame: Frame, pose: Rigid, prepared: PreparedObject) -> Rigid:
     share of its surface that the image contradicts.
     """
     surface = prepared.surface
-    copies = with_copies(prepared)
-    motions = Rigid.cat([copies.copies, copies.lookalikes])
+    copies = copies_of(prepared)
+    motions = Rigid.cat([copies.near_copies, copies.lookalikes])
     if len(motions.R) == 0:
         return pose
     every = Rigid.cat([pose[None], pose[None] @ motions])
-    about = (frame.depth_m > 0) & (frame.plane_m < surface.diameter_m)
+    about = (frame.depth_m > 0) & (frame.plane_limit_m < surface.diameter_m)
     middle_m = pose.apply(surface.middle_m[None])[0]
     about &= (frame.points_m - middle_m).norm(dim=-1) < surface.diameter_m
     local_m = every.inverse().apply(frame.points_m[about])
@@ -266,7 +267,7 @@ def _best_copy(frame: Frame, pose: Rigid, prepared: PreparedObject) -> Rigid:
 def _judge(
     groups: Sequence[Sequence[_Place]], frame: Frame, view: ViewInput, targets: SearchTargets
 ) -> tuple[list[_Judged], list[_Miss]]:
-    """Estimate the object of each place from what its best pose explains; part what is refused."""
+    """Estimate the object of each place from what its best pose explains; separate refusals."""
     inputs: list[CloudInput] = []
     height, width = view.depth_m.shape
     for number, group in enumerate(groups):
@@ -312,7 +313,7 @@ def _miss_at(place: _Place, agreement: float, reason: str, targets: SearchTarget
 def _weigh_instances(
     accepted: Sequence[_Judged], targets: SearchTargets
 ) -> tuple[list[_Judged], list[_Miss]]:
-    """Weigh the places of each object by each other; part those that are not likely enough."""
+    """Weigh the places of each object by each other; separate those that are not likely enough."""
     remaining: list[_Judged] = []
     misses: list[_Miss] = []
     for name in dict.fromkeys(place.object for place in accepted):
@@ -381,7 +382,7 @@ def explained_mask(image: Frame | ViewInput, pose: Rigid, surface: Surface) -> B
     depth_m = image.depth_m[window].double()
     if isinstance(image, Frame):
         points_m = image.points_m[window]
-        is_explained = (depth_m > 0) & (image.plane_m[window] < surface.diameter_m)
+        is_explained = (depth_m > 0) & (image.plane_limit_m[window] < surface.diameter_m)
     else:
         points_m = back_project(depth_m, _window_intrinsics(image.K, window).double())
         is_explained = points_m.isfinite().all(-1) & image.mask[window]

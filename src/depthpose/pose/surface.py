@@ -78,7 +78,7 @@ class Surface:
     spacing_m: float  #: distance from a point to the third nearest, in the median
     middle_m: Float64[Tensor, "3"]  #: of the box about the surface, along the axes of the model
     ball_m: Float64[Tensor, "4"]  #: middle and radius of a ball about the surface
-    copies: Rigid  #: what leaves the object as it is, ``model_from_model``, the identity first
+    symmetries: Rigid  #: declared and found, ``model_from_model``, the identity first
     tree: KDTree  #: finds the nearest of the points
     boxes: Boxes  #: find it nearly, some thirty times as fast
 
@@ -214,7 +214,7 @@ def prepare_surface(model: ObjectModel, count: int = 10_000) -> Surface:
         spacing_m=float(np.median(tree.query(some_m, k=4, workers=1)[0][:, -1])),
         middle_m=middle_m,
         ball_m=torch.cat([middle_m, radius_m[None]]),
-        copies=symmetry_transforms(model.symmetries, _TURN_STEP).double(),
+        symmetries=symmetry_transforms(model.symmetries, _TURN_STEP).double(),
         tree=tree,
         boxes=Boxes(low_m=low_m, side_m=side_m, counts=counts, nearest=nearest),
     )

@@ -152,7 +152,7 @@ def join_by_object(
     for row in rows:
         assert row.origin is not None, "rows of an evaluation say whose they are"
         groups.setdefault((row.origin.method, row.origin.masks), []).append(row)
-    our_rows = [_own(group, columns) for group in groups.values()]
+    our_rows = [_our_row(group, columns) for group in groups.values()]
     names = list(columns.values())
     if not with_published:
         return [*our_rows, *(_difference(our_rows[0], other, names) for other in our_rows[1:])]
@@ -178,7 +178,8 @@ def join_by_object(
     ]
 
 
-def _own(rows: Sequence[ObjectRow], columns: Mapping[str, str]) -> dict[str, Any]:
+def _our_row(rows: Sequence[ObjectRow], columns: Mapping[str, str]) -> dict[str, Any]:
+    """Give the row of one method of ours: percentages of each object, by the table's columns."""
     by_name = {row.object: row for row in rows}
     # Of one object there is no row of means: it is its own.
     mean = by_name.get("mean", rows[0])
@@ -243,7 +244,7 @@ class VotingCase:
     is_adds: bool
 
 
-def cases_of(
+def voting_cases(
     net: GeoPoseNet, views: Iterable[ViewSample], points: int
 ) -> Iterator[VotingCase | None]:
     """Give the votes of up to so many points of each view; None where it has too few to be posed.

@@ -469,7 +469,7 @@ class FakestereoNet:
                 self.estimate_together([depth_input], lens, with_check=with_check, mount=mount)
                 for depth_input in named
             )
-            return [depth_input for (depth_input,) in alone]
+            return [estimate for (estimate,) in alone]
         return estimates
 
     def virtual_sizes(self, image: StereoInput) -> list[tuple[int, int]]:

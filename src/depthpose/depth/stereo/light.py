@@ -547,13 +547,13 @@ class LightMatcher(NetworkMatcher):
         return layers.fold(network, example)
 
     def run(
-        self, left: Views, right: Views, network: LightConfig, first_px: int = 0
+        self, left: Views, right: Views, network_config: LightConfig, first_px: int = 0
     ) -> list[Match]:
         """Match normalised pairs whose sides suit the network."""
         read = self._network.read(
             left.to(self.dtype),
             right.to(self.dtype),
-            network.max_disparity_px,
+            network_config.max_disparity_px,
             first_px=first_px,
             with_confidence=self.config.with_confidence,
         )

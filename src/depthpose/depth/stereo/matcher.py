@@ -297,14 +297,14 @@ class NetworkMatcher(ABC):
 
     @abstractmethod
     def fold(self, network: Any, example: Tensor) -> Any:  # noqa: ANN401
-        """Fold batch norm into the convolutions; weights get the type of ``like``."""
+        """Fold batch norm into the convolutions; weights get the type of ``example``."""
 
     @abstractmethod
     def run(
         self,
         left: Views,
         right: Views,
-        network: Any,  # noqa: ANN401
+        network_config: Any,  # noqa: ANN401
         first_px: int = 0,
     ) -> list[Match]:
         """Match normalised pairs whose sides suit the network.
@@ -312,7 +312,7 @@ class NetworkMatcher(ABC):
         Args:
             left: left views.
             right: right views, the same size.
-            network: the network's config, perhaps with more disparities than it was trained with.
+            network_config: of the network, perhaps with more disparities than it was trained with.
             first_px: the least disparity that is searched, a multiple of 4; other
                 than 0 for networks alone that find the range.
         """

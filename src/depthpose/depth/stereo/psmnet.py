@@ -344,18 +344,18 @@ class PSMNetMatcher(NetworkMatcher):
         return layers.fold(network, example)
 
     def run(
-        self, left: Views, right: Views, network: PSMNetConfig, first_px: int = 0
+        self, left: Views, right: Views, network_config: PSMNetConfig, first_px: int = 0
     ) -> list[Match]:
         """Match normalised pairs whose sides suit the network."""
         assert first_px == 0, "its volume begins at 0; the views are moved instead"
         near, far = (one.to(self.dtype, memory_format=torch.channels_last) for one in (left, right))
-        costs = self._network.costs(near, far, network.max_disparity_px)[-1][:, 0]
+        costs = self._network.costs(near, far, network_config.max_disparity_px)[-1][:, 0]
         height, width = left.shape[-2:]
         matches = [
             expected_disparity(
                 cost.permute(1, 2, 0).contiguous(),
-                (network.max_disparity_px, height, width),
-                align_corners=network.align_corners,
+                (network_config.max_disparity_px, height, width),
+                align_corners=network_config.align_corners,
                 with_confidence=self.config.with_confidence,
             )
             for cost in costs

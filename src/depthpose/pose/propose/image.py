@@ -13,7 +13,7 @@ from depthpose.pose.frame import Frame, readings_toward
 from depthpose.pose.propose.point_pairs import STEP, PairTable, vote_poses
 from depthpose.pose.surface import BESIDE, NEAR, Surface
 
-_NOISE_PER_M = 0.0015
+_NOISE_PER_M2 = 0.0015
 """Standard deviation of a depth sensor's readings, for the square of the depth in metres (Nguyen et
 al. 2012): beyond where it is as large as what counts as near, no shape is seen."""
 _REFERENCES, _FEWEST, _ALL_REFERENCES = 2000, 200, 6000
@@ -27,7 +27,7 @@ _LEAST_AGREEMENT = 0.25
 """Poses with which the image agrees less are none."""
 _TOGETHER, _TOGETHER_RAD = 0.1, math.radians(25)
 """Poses are one up to this distance of their middles, in diameters, and this angle."""
-_TURNED = 0.7
+_MIN_COSINE = 0.7
 """Cosine of the angle between the normals of the image and of the posed surface, at least."""
 _HELD = 0.02
 """Damping of ICP: a motion that moves the readings across the surface by less is hardly taken."""
@@ -97,8 +97,8 @@ def _scene_points(
     frame: Frame, is_left: Bool[Tensor, "h w"], surface: Surface
 ) -> tuple[Float64[Tensor, "n 3"], Float64[Tensor, "n 3"]]:
     """Average points and normals in cells, without planes and what is too far to have a shape."""
-    used = frame.is_smooth & is_left & (frame.plane_m < surface.diameter_m)
-    used &= _NOISE_PER_M * frame.depth_m.square() < NEAR * surface.diameter_m
+    used = frame.is_smooth & is_left & (frame.plane_limit_m < surface.diameter_m)
+    used &= _NOISE_PER_M2 * frame.depth_m.square() < NEAR * surface.diameter_m
     points_m, normals = frame.points_m[used], frame.normals[used]
     if len(points_m) == 0:
         return points_m, normals
@@ -109,7 +109,7 @@ def _scene_points(
     _, place, count = key.unique(return_inverse=True, return_counts=True)
     sums = points_m.new_zeros(len(count), 6)
     sums = sums.index_add_(0, place, torch.cat([points_m, normals], 1)) / count[:, None]
-    is_one = sums[:, 3:].norm(dim=-1) > _TURNED
+    is_one = sums[:, 3:].norm(dim=-1) > _MIN_COSINE
     return sums[is_one, :3], normalize(sums[is_one, 3:], dim=-1)
 
 
@@ -135,7 +135,7 @@ def _projected(frame: Frame, poses: Rigid, surface: Surface, stage: _Stage) -> R
     Point to plane, each point with the reading in its own direction (Blais and Levine 1995): the
     inner side of a thin wall draws no reading of the outer one.
     """
-    usable = frame.is_smooth & (frame.plane_m < surface.diameter_m)
+    usable = frame.is_smooth & (frame.plane_limit_m < surface.diameter_m)
     radius_m = surface.diameter_m / 2
     held = _HELD * torch.diag(torch.tensor([radius_m**2] * 3 + [1.0] * 3, dtype=torch.float64))
     for share in stage.limits:
@@ -165,13 +165,11 @@ class ImageEvidence(NamedTuple):
     Attributes:
         agreement: share of the surface that was seen where it should be, less what contradicts it.
         continued: share of what is beside the silhouette in which the same surface goes on.
-        parted: share of it in which the camera saw a table or wall, or far behind.
         contradicted: share of the surface through which the camera saw, or a table before it.
     """
 
     agreement: Float64[Tensor, " b"]
     continued: Float64[Tensor, " b"]
-    parted: Float64[Tensor, " b"]
     contradicted: Float64[Tensor, " b"]
 
 
@@ -185,12 +183,13 @@ def compare_with_image(
     """
     posed_m, normals, is_inner, beside_m = _posed(poses, surface, stage.every)
     # A plane that is wider than the object is no side of it.
-    at, no_side = readings_toward(frame, posed_m), (frame.plane_m >= surface.diameter_m).flatten()
-    limit_m = stage.fits * surface.diameter_m + 2 * _NOISE_PER_M * posed_m[..., 2].square()
+    at = readings_toward(frame, posed_m)
+    no_side = (frame.plane_limit_m >= surface.diameter_m).flatten()
+    limit_m = stage.fits * surface.diameter_m + 2 * _NOISE_PER_M2 * posed_m[..., 2].square()
     gap_m, is_side = at.depth_m - posed_m[..., 2], ~no_side[at.pixel]
     cosine = (normals * frame.normals.flatten(0, 1)[at.pixel]).sum(-1).abs()
     fits = at.is_read & (gap_m.abs() < limit_m)
-    agrees = fits & is_side & ((cosine > _TURNED) | ~frame.is_smooth.flatten()[at.pixel])
+    agrees = fits & is_side & ((cosine > _MIN_COSINE) | ~frame.is_smooth.flatten()[at.pixel])
     before = at.is_read & (gap_m < -limit_m)
     # A sensor cuts rims and edges: the camera saw through where it saw nothing near beside either,
     # and where the surface goes on around; what it cut off counts as not read.
@@ -204,13 +203,11 @@ def compare_with_image(
     at = readings_toward(frame, beside_m)
     gap_m, limit_m = at.depth_m - beside_m[..., 2], BESIDE * surface.diameter_m
     is_level, is_table = at.is_read & (gap_m.abs() < limit_m), no_side[at.pixel]
-    is_parted = (at.is_read & (gap_m >= limit_m)) | (is_level & is_table)
     beside = beside_m[..., 2].isfinite().sum(1).clamp(min=1).double()
     continued = (is_level & ~is_table).sum(1) / beside
     return ImageEvidence(
         agreement=good / read - 0.6 * continued,
         continued=continued,
-        parted=is_parted.sum(1) / beside,
         contradicted=contradicted.sum(1) / read,
     )
 

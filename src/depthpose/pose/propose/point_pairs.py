@@ -57,7 +57,7 @@ _OWN_REFERENCES, _OWN_PEAKS, _OWN_POINTS = 40, 48, 250
 _ROUGHLY, _NEARLY, _MOSTLY = 0.25, 0.85, 0.8
 """A turn lays the first share of a surface on itself at least, and the second of what the best turn
 does; one that lays the third share there may be near another."""
-_TURNED, _TURNED_RAD, _MOST_TURNS = 0.7, math.radians(12), 36
+_MIN_COSINE, _TURNED_RAD, _MOST_TURNS = 0.7, math.radians(12), 36
 """Cosine of the normals there, the least angle between two turns, and their number at most."""
 
 
@@ -122,8 +122,8 @@ def _distinct_turns(turns: Rigid, surface: Surface) -> tuple[list[int], int]:
     index = surface.boxes.look_up(local_m)
     is_alike = (local_m - surface.points_m[index]).norm(dim=-1) < NEAR * surface.diameter_m
     cosine = ((surface.normals[index] @ turns.R.mT) * surface.normals[::every]).sum(-1)
-    share = (is_alike & (cosine.abs() > _TURNED)).double().mean(-1)
-    chosen, taken = list[int](), surface.copies.R
+    share = (is_alike & (cosine.abs() > _MIN_COSINE)).double().mean(-1)
+    chosen, taken = list[int](), surface.symmetries.R
     for k in share.argsort(descending=True).tolist():
         least = _NEARLY * float(share[chosen[0]]) if chosen else _ROUGHLY
         if share[k] < max(least, _ROUGHLY) or len(chosen) == _MOST_TURNS:
@@ -131,7 +131,7 @@ def _distinct_turns(turns: Rigid, surface: Surface) -> tuple[list[int], int]:
         apart_rad = _TURNED_RAD if share[k] >= _MOSTLY else 5 * _TURNED_RAD
         if float(geodesic_rad(turns.R[k].expand_as(taken), taken).min()) > apart_rad:
             chosen.append(k)
-            taken = torch.cat([taken, turns.R[k] @ surface.copies.R])
+            taken = torch.cat([taken, turns.R[k] @ surface.symmetries.R])
     return chosen, int((share[chosen] >= _MOSTLY).sum())
 
 
