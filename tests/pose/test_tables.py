@@ -17,11 +17,11 @@ from depthpose.thesis.pose_tables import (
     LINEMOD_DIAMETERS_M,
     ROWS,
     VotingCase,
-    voting_cases,
     compare_voting,
     join_by_object,
     linemod_number,
     ransac_one_by_one,
+    voting_cases,
 )
 
 
