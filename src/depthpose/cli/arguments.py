@@ -288,7 +288,7 @@ _RULES: tuple[tuple[str, _Case, str, str], ...] = (
      "no matcher with weights runs here"),
     ("depth match", lambda o: "matcher" in o, "weights", "--matcher matches the pair"),
     ("depth match", lambda o: "sgbm" in o["matcher"],
-     f"device speed {_NETWORK} left-right-check",
+     f"device speed {_NETWORK} left-right-check max-disparity",
      "sgbm has no weights"),
     ("depth evaluate", lambda o: "baseline" not in o, "train train-without",
      "--baseline takes it, and is not given; add it"),

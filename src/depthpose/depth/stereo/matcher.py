@@ -271,7 +271,8 @@ class NetworkMatcher(ABC):
     processor has no bf16, ``config`` says fp32 in its place.
 
     Raises:
-        InputError: the device does not exist on this machine.
+        InputError: the device does not exist on this machine; a largest disparity for a network
+            that searches those of its training alone.
     """
 
     fine_pixels: ClassVar[int]
@@ -287,6 +288,12 @@ class NetworkMatcher(ABC):
 
     def __init__(self, network: StereoNetwork, config: MatcherConfig | None = None) -> None:
         config = config or MatcherConfig()
+        if config.max_disparity_px is not None and not self.finds_range:
+            raise InputError(
+                f"max_disparity_px is {config.max_disparity_px:g}, but this network searches the "
+                f"{network.config.max_disparity_px} disparities that it was trained with; omit it "
+                "(--max-disparity), or take weights with a light matcher, as 'default'"
+            )
         self.device = usable_device(config.device)
         precision = usable_precision(config.precision, config.device)
         self.config = replace(config, precision=precision)
