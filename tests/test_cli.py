@@ -277,6 +277,8 @@ def test_options_of_psmnet_are_refused_with_sgbm(
 ) -> None:
     assert match(pair_folder, tmp_path / "o", "--matcher", "sgbm", "--left-right-check") == 2
     assert "has no effect here; sgbm has no weights" in capsys.readouterr().err
+    assert match(pair_folder, tmp_path / "o", "--matcher", "sgbm", "--max-disparity", "99") == 2
+    assert "--max-disparity" in capsys.readouterr().err
     assert not (tmp_path / "o").exists()
 
 

@@ -280,7 +280,7 @@ def test_matcher_keeps_its_own_weights() -> None:
 def test_unknown_device_is_refused() -> None:
     with pytest.raises(InputError, match="device 'toaster' cannot be used here"):
         PSMNetMatcher(random_network(SMALL), MatcherConfig(device="toaster"))
-    with pytest.raises(InputError, match="this network searches the .* omit it"):
+    with pytest.raises(InputError, match=r"this network searches the .* omit it"):
         PSMNetMatcher(random_network(SMALL), MatcherConfig(max_disparity_px=100.0))
 
 
