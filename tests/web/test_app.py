@@ -432,7 +432,7 @@ def test_every_instance_of_an_image_is_shown_and_taken_away(
     page: TestClient, tmp_path: Path
 ) -> None:
     """Two of one part, side by side: a row, a layer and a file for each, one zip of all."""
-    poses = (pose_at(-0.13, 0.7, seed=1), pose_at(0.12, 0.8, seed=2))
+    poses = (pose_at(-0.1, 0.5, seed=1), pose_at(0.1, 0.55, seed=2))
     seen, mask = view_of(make_part(PART), *poses)
     wall = torch.full(mask.shape, 1.2)
     write_depth_png(tmp_path / "depth.png", torch.where(mask, seen.float(), wall), 0.0001)
