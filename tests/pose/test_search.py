@@ -386,11 +386,11 @@ def test_what_would_lie_in_the_wall_is_not_possible(net: Registration) -> None:
     depth_m = torch.where(mask, torch.minimum(seen.float(), wall), wall)
     frame = prepare_frame(depth_m, K.float())
     view = view_input(depth_m, None, CAMERA, "bracket", "x", None)
-    assert "would lie in" in search._impossible(frame, view, pose.double(), surface)
+    assert "would lie in" in search._exclusion_by_planes(frame, view, pose.double(), surface)
     before = Rigid(pose.R, pose.t_m - torch.tensor([0.0, 0.0, 0.15]))
-    assert search._impossible(frame, view, before.double(), surface) == ""
+    assert search._exclusion_by_planes(frame, view, before.double(), surface) == ""
     gap = replace(frame, depth_m=torch.where(grow_mask(mask, 12), 3.0, frame.depth_m))
-    assert search._impossible(gap, view, pose.double(), surface) == ""
+    assert search._exclusion_by_planes(gap, view, pose.double(), surface) == ""
 
 
 def test_what_is_there_twice_is_searched_for_again(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -298,13 +298,16 @@ def readings_toward(frame: Frame, points_m: Float64[Tensor, "*n 3"]) -> Readings
 def share_behind(
     frame: Frame, wide: WidePlane, points_m: Float64[Tensor, "n 3"], margin_m: float
 ) -> float:
-    """Give the share of points that lie behind a wide plane, where the image does not end it.
+    """Give the share of points that lie behind a wide plane, where the plane is not known to end.
 
     Args:
         frame: the image.
         wide: one of its planes.
         points_m: of a posed surface, in the camera frame.
-        margin_m: points so far behind count, beyond what the sensor explains.
+        margin_m: a point counts from so far behind, beyond what the sensor's noise explains.
+
+    Returns:
+        Between 0 and 1.
     """
     normal, offset = wide.plane
     beyond_m = (points_m @ normal - offset) * offset.sign()  # the camera is on the other side

@@ -35,7 +35,7 @@ from depthpose.pose.frame import (
 from depthpose.pose.inputs import nothing_seen
 from depthpose.pose.propose.image import compare_with_image, propose_in_frame
 from depthpose.pose.surface import NEAR, Surface
-from depthpose.pose.types import CloudInput, PoseEstimate, ViewInput
+from depthpose.pose.types import CloudInput, Evidence, PoseEstimate, ViewInput
 
 _MOST_PLACES, _LEAST_PROPOSALS = 40, 4
 """Proposals that are looked at in an image, and of each object at least."""
@@ -285,10 +285,9 @@ def _judge(
         evidence = estimate.evidence
         reason = estimate.reason
         if estimate.camera_from_model is not None:
-            reason = _impossible(frame, view, estimate.camera_from_model.double(), surface)
+            reason = _exclusion_by_planes(frame, view, estimate.camera_from_model.double(), surface)
         if estimate.camera_from_model is None or evidence is None or reason:
-            agreement = 0.0 if evidence is None else evidence.agreement
-            misses.append(_miss_at(group[0], agreement, reason, targets))
+            misses.append(_miss_at(group[0], evidence, reason, targets))
             continue
         pose = estimate.camera_from_model.double()
         judged.append(
@@ -303,11 +302,17 @@ def _judge(
     return judged, misses
 
 
-def _miss_at(place: _Place, agreement: float, reason: str, targets: SearchTargets) -> _Miss:
-    """Describe a place at which an object is not."""
+def _miss_at(
+    place: _Place, evidence: Evidence | None, reason: str, targets: SearchTargets
+) -> _Miss:
+    """Describe a place at which an object was refused."""
     surface = targets.object_of(place.object).surface
-    middle_m = place.pose.apply(surface.middle_m[None])[0]
-    return _Miss(object=place.object, middle_m=middle_m, agreement=agreement, reason=reason)
+    return _Miss(
+        object=place.object,
+        middle_m=place.pose.apply(surface.middle_m[None])[0],
+        agreement=0.0 if evidence is None else evidence.agreement,
+        reason=reason,
+    )
 
 
 def _weigh_instances(
@@ -319,18 +324,18 @@ def _weigh_instances(
     for name in dict.fromkeys(place.object for place in accepted):
         places = [place for place in accepted if place.object == name]
         log_odds = torch.tensor([place.log_odds for place in places], dtype=torch.float64)
-        alone = log_odds.sigmoid()
-        probability = probability_of_instances(log_odds)
-        for place, probable, scale in zip(
-            places, probability.tolist(), (probability / alone).tolist(), strict=True
-        ):
-            if probable >= targets.min_probability:
-                remaining.append(replace(place, estimate=_scaled(place.estimate, scale)))
-                continue
-            reason = f"beside the surer ones it is right with a probability of {probable:.0%}"
-            evidence = place.estimate.evidence
-            agreement = 0.0 if evidence is None else evidence.agreement
-            misses.append(_miss_at(place, agreement, reason, targets))
+        probabilities = probability_of_instances(log_odds)
+        shares = probabilities / log_odds.sigmoid()  # of the probability that each has by itself
+        for k, place in enumerate(places):
+            probability = float(probabilities[k])
+            if probability >= targets.min_probability:
+                estimate = _scaled(place.estimate, float(shares[k]))
+                remaining.append(replace(place, estimate=estimate))
+            else:
+                reason = (
+                    f"beside the surer ones it is right with a probability of {probability:.0%}"
+                )
+                misses.append(_miss_at(place, place.estimate.evidence, reason, targets))
     return remaining, misses
 
 
@@ -445,7 +450,7 @@ def _cut(view: ViewInput, part: tuple[slice, slice]) -> ViewInput:
     return replace(view, depth_m=view.depth_m[part], mask=view.mask[part], K=K)
 
 
-def _impossible(frame: Frame, view: ViewInput, pose: Rigid, surface: Surface) -> str:
+def _exclusion_by_planes(frame: Frame, view: ViewInput, pose: Rigid, surface: Surface) -> str:
     """Say why the planes of an image exclude a pose; nothing where they do not."""
     if is_cut_out(view, pose, surface):
         return "it would be cut out of a plane that goes on beside it"
