@@ -173,11 +173,12 @@ class GeoPoseNet(PoseEstimator):
     def _by_models(self) -> Registration:
         """Give the registration of the same objects, which shares what was prepared of them.
 
-        What a search proposes, and what the network refuses, is estimated by it.
+        What a search proposes, and what the network refuses, is estimated by it, with the usual
+        limits of refusal: those of a network may doubt what registration is sure of.
         """
         if self._registration is None:
             config = replace(self.config, register_refused=False, with_icp=True)
-            self._registration = Registration(self.models, config, self.refusal)
+            self._registration = Registration(self.models, config)
             self._registration._objects = self._objects
         return self._registration
 
