@@ -81,7 +81,9 @@ def make_streets(
     return 0
 
 
-def make_near(out: NewPath, number: int = 100, first: int = 0, seed: int = 0) -> int:
+def make_near(
+    out: NewPath, number: int = 100, first: int = 0, seed: int = 0, plain: float = 0.45
+) -> int:
     """Render synthetic near scenes with exact disparity, in Middlebury's layout.
 
     Rooms, tables, bins, shelves and walls with things, 5 cm to 20 m away, seen by rigs of 1 to
@@ -95,6 +97,7 @@ def make_near(out: NewPath, number: int = 100, first: int = 0, seed: int = 0) ->
         number: how many scenes.
         first: number of the first one.
         seed: of the random scenes.
+        plain: share of the walls, floors and table tops that show next to no texture.
     """
     from tqdm import tqdm
 
@@ -109,7 +112,7 @@ def make_near(out: NewPath, number: int = 100, first: int = 0, seed: int = 0) ->
             f"--number {number} --first {first} --seed {seed}: at least 1 scene, from 0 on, and a "
             "seed of four digits at most"
         )
-    config = NearConfig(seed=seed)
+    config = NearConfig(seed=seed, plain_share=plain)
     names = {index: f"near_{seed:04d}_{index:06d}" for index in range(first, first + number)}
     settings = {k: v for k, v in config_to_dict(config).items() if k != "seed"}
     claim_folder(out, settings, list(names.values()))

@@ -118,6 +118,9 @@ class NearConfig(Settings):
     largest_share: Annotated[float, "[0.02, 0.9]"] = 0.5
     """Largest disparity of the nearest thing as a share of the width; the least is 8 px."""
 
+    plain_share: Annotated[float, "[0, 1]"] = 0.45
+    """Share of the walls, floors and table tops that show next to no texture."""
+
     infrared_share: Annotated[float, "[0, 1]"] = 0.3
     """Share of the pairs that infrared cameras take."""
 

@@ -45,7 +45,7 @@ _DISTANCES_M = (0.05, 5.0)
 _FARTHEST_M = 20.0
 """Of a backdrop, in true metres."""
 
-_BARE = ("paint", "skin", "plaster", "metal")
+_PLAIN = ("paint", "skin", "plaster", "metal")
 """Materials that show next to nothing where a tile of them is much larger than the surface."""
 
 _SHAPES = ("ball", "box", "box", "card", "pole", "fence", "wheel", "lattice", "leaves",
@@ -87,7 +87,9 @@ def make_near(config: NearConfig, index: int) -> NearScene:
     K = intrinsics(focal_px, focal_px, (width - 1) / 2, (height - 1) / 2)
     rig = StereoRig(width=width, height=height, K=K, baseline_m=_DRAWN_BASELINE_M)
     kind = _KINDS[int(rng.integers(len(_KINDS)))]
-    place = _Place(rng, near_m, (width / focal_px / 2, height / focal_px / 2))
+    place = _Place(
+        rng, near_m, (width / focal_px / 2, height / focal_px / 2), config.plain_share
+    )
     farthest = min(12.0, _FARTHEST_M / (near_m * metres_per_unit))
     match kind:
         case "room":
@@ -190,31 +192,35 @@ class _Place:
         rng: decides.
         near_m: nothing is nearer.
         half: tangents of half of the camera's angles across and down.
+        plain_share: share of the large surfaces without texture.
     """
 
-    def __init__(self, rng: np.random.Generator, near_m: float, half: tuple[float, float]) -> None:
+    def __init__(
+        self, rng: np.random.Generator, near_m: float, half: tuple[float, float], plain_share: float
+    ) -> None:
         self.rng = rng
         self.near_m = near_m
         self.half = half
+        self.plain_share = plain_share
         self.builder = MeshBuilder(rng)
         self.backdrop = 0
         self.far_m = near_m
 
-    def surface(self, size_m: float, bare_share: float = 0.3) -> Surface:
+    def surface(self, size_m: float, plain_share: float = 0.3) -> Surface:
         """Anything of any colour, or something without any texture."""
         rng = self.rng
         chosen = random_surface(rng, size_m)
-        if rng.random() >= bare_share:
+        if rng.random() >= plain_share:
             return chosen
-        material = _BARE[int(rng.integers(len(_BARE)))]
+        material = _PLAIN[int(rng.integers(len(_PLAIN)))]
         return chosen._replace(material=material, tile_m=size_m * rng.uniform(3, 40))
 
     def sheet(self, corner: Values, along: Values, up: Values) -> None:
         """Add a large rectangle; nothing of it is cut off for being near."""
         self.builder.thing += 1
         size_m = float(np.linalg.norm(np.asarray(along, float)))
-        surface = self.surface(self.near_m * log_uniform(self.rng, 0.3, 3), 0.45)
-        if surface.material in _BARE:
+        surface = self.surface(self.near_m * log_uniform(self.rng, 0.3, 3), self.plain_share)
+        if surface.material in _PLAIN:
             surface = surface._replace(tile_m=size_m)
         self.builder.rectangle(corner, along, up, surface)
         self.backdrop = self.builder.thing
