@@ -91,7 +91,7 @@ def opencv(frame: Frame, counts: dict[str, int]) -> list[PoseEstimate]:
     seen, found = prepare_frame(frame.depth_m, frame.K), list[PoseEstimate]()
     for name, count in counts.items():
         detector, surface = prepared("opencv", model_of(frame, name))
-        used = seen.is_smooth & (seen.plane_limit_m < surface.diameter_m)
+        used = seen.is_smooth & (seen.background_limit_m < surface.diameter_m)
         if int(used.sum()) < LEAST_PIXELS:
             continue
         points_m, normals = seen.points_m[used], seen.normals[used]
@@ -132,7 +132,7 @@ def open3d(frame: Frame, counts: dict[str, int]) -> list[PoseEstimate]:
     seen, found = prepare_frame(frame.depth_m, frame.K), list[PoseEstimate]()
     for name, count in counts.items():
         peer, surface = prepared("open3d", model_of(frame, name))
-        used = seen.is_smooth & (seen.plane_limit_m < surface.diameter_m)
+        used = seen.is_smooth & (seen.background_limit_m < surface.diameter_m)
         label = label_regions(seen.depth_m, used)
         clouds = [
             CloudInput(name="", points_m=seen.points_m[used & (label == k)], object=name)

@@ -52,11 +52,11 @@ def test_planes_go_and_objects_stay() -> None:
     depth_m = table()
     _, mask = view_of(bracket(), *TRUTHS)
     frame = prepare_frame(depth_m, K.float())
-    is_plane = frame.plane_limit_m >= bracket().diameter_m
+    is_plane = frame.background_limit_m >= bracket().diameter_m
     assert float(is_plane[~mask].float().mean()) > 0.95
     assert not bool(is_plane[mask].any())
     # A wall no wider than an object may be an object's side: it stays.
-    assert not bool((frame.plane_limit_m >= 5.0).any())
+    assert not bool((frame.background_limit_m >= 5.0).any())
 
 
 def test_normals_are_those_of_the_surface() -> None:
@@ -89,7 +89,7 @@ def test_a_plane_through_several_objects_is_no_plane() -> None:
         block = (slice(60, 180), slice(20 + 60 * k, 60 + 60 * k))
         depth_m[block] = (0.9 + 0.001 * torch.arange(120).float())[:, None]
         mask[block] = True
-    is_plane = prepare_frame(depth_m, K.float()).plane_limit_m >= 0.15
+    is_plane = prepare_frame(depth_m, K.float()).background_limit_m >= 0.15
     assert bool(is_plane[~mask].all())
     assert not bool(is_plane[mask].any())
 
@@ -386,11 +386,11 @@ def test_what_would_lie_in_the_wall_is_not_possible(net: Registration) -> None:
     depth_m = torch.where(mask, torch.minimum(seen.float(), wall), wall)
     frame = prepare_frame(depth_m, K.float())
     view = view_input(depth_m, None, CAMERA, "bracket", "x", None)
-    assert "would lie in" in search._exclusion_by_planes(frame, view, pose.double(), surface)
+    assert "would lie in" in search._exclusion_by_background(frame, view, pose.double(), surface)
     before = Rigid(pose.R, pose.t_m - torch.tensor([0.0, 0.0, 0.15]))
-    assert search._exclusion_by_planes(frame, view, before.double(), surface) == ""
+    assert search._exclusion_by_background(frame, view, before.double(), surface) == ""
     gap = replace(frame, depth_m=torch.where(grow_mask(mask, 12), 3.0, frame.depth_m))
-    assert search._exclusion_by_planes(gap, view, pose.double(), surface) == ""
+    assert search._exclusion_by_background(gap, view, pose.double(), surface) == ""
 
 
 def test_what_is_there_twice_is_searched_for_again(monkeypatch: pytest.MonkeyPatch) -> None:

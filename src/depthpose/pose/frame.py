@@ -1,4 +1,4 @@
-"""A depth image prepared for a search: points, normals, and wide planes that are left out."""
+"""A depth image prepared for a search: points, normals, and the background that is left out."""
 
 import math
 from collections.abc import Sequence
@@ -16,6 +16,7 @@ from torch.nn.functional import max_pool2d, normalize, pad
 from depthpose.core.arrays import take_evenly
 from depthpose.core.camera import back_project, project
 from depthpose.pose.sensor import LAG_PX, SHARED_PER_WHITE
+from depthpose.pose.types import KnownBackground
 
 _MOST_PIXELS = 110_000
 """Of a larger image every n-th row and column is used."""
@@ -67,11 +68,11 @@ class Frame:
         points_m: in the camera frame.
         normals: toward the camera.
         is_smooth: where a normal is known.
-        plane_limit_m: diameter [m] up to which no object has the plane at a pixel as a side; 0
-            where there is no wide plane.
+        background_limit_m: diameter [m] up to which no object has the background at a pixel as a
+            side; 0 where the reading is of no background, infinite on a known one.
         nearest_m: least depth of the pixels up to two away; infinite where none has a reading.
         noise_per_m2: standard deviation of a reading, for the square of the depth in metres.
-        planes: the wide ones.
+        backgrounds: the known one, and the wide planes.
     """
 
     step: int
@@ -80,37 +81,43 @@ class Frame:
     points_m: Float64[Tensor, "h w 3"]
     normals: Float64[Tensor, "h w 3"]
     is_smooth: Bool[Tensor, "h w"]
-    plane_limit_m: Float64[Tensor, "h w"]
+    background_limit_m: Float64[Tensor, "h w"]
     nearest_m: Float64[Tensor, "h w"]
     noise_per_m2: float
-    planes: Sequence["WidePlane"]
+    backgrounds: Sequence["Background"]
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class WidePlane:
-    """A table, a wall, or the side of something large.
+class Background:
+    """A surface before which objects lie: a known bin or table, or a wide plane.
 
     Attributes:
-        plane: through its readings.
-        diameter_m: up to which no object has it as a side, as ``Frame.plane_limit_m``.
+        depth_m: at which the ray of a pixel meets it, behind objects too; infinite where it does
+            not, or nothing is known.
+        diameter_m: up to which no object has it as a side, as ``Frame.background_limit_m``.
     """
 
-    plane: Plane
+    depth_m: Float64[Tensor, "h w"]
     diameter_m: float
 
 
 def prepare_frame(
-    depth_m: Float[Tensor, "h w"], K: Float[Tensor, "3 3"], diameter_m: float | None = None
+    depth_m: Float[Tensor, "h w"],
+    K: Float[Tensor, "3 3"],
+    diameter_m: float | None = None,
+    known: KnownBackground | None = None,
 ) -> Frame:
-    """Lay a plane through the neighbours of each pixel, and find the widest planes.
+    """Lay a plane through the neighbours of each pixel, and find the background.
 
-    Planes are found one after the other by RANSAC (Fischler and Bolles 1981) and refitted.
+    Beside the known one it is the widest planes, which are found one after the other by RANSAC
+    (Fischler and Bolles 1981) and refitted.
 
     Args:
         depth_m: along the optical axis; NaN or 0 where there is no reading.
         K: intrinsic matrix.
         diameter_m: of the smallest object that is looked for: the image is not thinned so much that
             it would be few pixels wide.
+        known: background that is known, of the whole image.
     """
     depth_m = torch.where(depth_m.isfinite() & (depth_m > 0), depth_m, 0.0).double()
     noise_per_m2 = _measure_noise_per_m2(depth_m)
@@ -123,17 +130,28 @@ def prepare_frame(
     K = K.double() / torch.tensor([[step], [step], [1]])
     points_m = back_project(depth_m, K)
     normals, is_smooth = _normals(depth_m, points_m, K)
-    plane_limit_m, planes = _planes(depth_m, points_m, normals, noise_per_m2)
+    limit_m = torch.zeros_like(depth_m)
+    backgrounds: list[Background] = []
+    if known is not None:
+        limit_m[known.is_seen[::step, ::step]] = torch.inf
+        known_m = known.depth_m[::step, ::step].double().nan_to_num(torch.inf)
+        backgrounds.append(Background(depth_m=known_m, diameter_m=math.inf))
+    rays = back_project(torch.ones_like(depth_m), K)
+    backgrounds += _wide_planes(depth_m, points_m, normals, rays, noise_per_m2, limit_m)
     nearest_m = -max_pool2d(-torch.where(depth_m > 0, depth_m, torch.inf)[None], 5, 1, 2)[0]
     return Frame(
         step=step, depth_m=depth_m, K=K, points_m=points_m, normals=normals, is_smooth=is_smooth,
-        plane_limit_m=plane_limit_m, nearest_m=nearest_m, noise_per_m2=noise_per_m2,
-        planes=planes,
+        background_limit_m=limit_m, nearest_m=nearest_m, noise_per_m2=noise_per_m2,
+        backgrounds=backgrounds,
     )  # fmt: skip
 
 
 def _measure_noise_per_m2(depth_m: Float64[Tensor, "h w"]) -> float:
-    """Measure the noise of an image by second differences, over the square of the depth."""
+    """Measure the noise of an image by second differences, over the square of the depth.
+
+    Args:
+        depth_m: 0 where there is no reading.
+    """
     scaled = torch.where(depth_m > 0, depth_m, torch.nan)
     bends: list[Tensor] = []
     for along in (scaled, scaled.T):
@@ -185,17 +203,27 @@ def _normals(
     return normals.double(), (n >= _FILLED * side * side) & (spread > 0.3) & (depth_m > 0)
 
 
-def _planes(
+def _wide_planes(
     depth_m: Float64[Tensor, "h w"],
     points_m: Float64[Tensor, "h w 3"],
     normals: Float64[Tensor, "h w 3"],
+    rays: Float64[Tensor, "h w 3"],
     noise_per_m2: float,
-) -> tuple[Float64[Tensor, "h w"], list[WidePlane]]:
-    """Find wide planes by RANSAC; give each of their pixels its ``Frame.plane_limit_m``."""
-    is_left = depth_m > 0
-    planes: list[WidePlane] = []
-    plane_limit_m = torch.zeros_like(depth_m)
-    least = max(_LEAST_POINTS, _LEAST_SHARE * int(is_left.sum()))
+    limit_m: Float64[Tensor, "h w"],
+) -> list[Background]:
+    """Find wide planes by RANSAC in what is of no background yet; mark their pixels in limit_m.
+
+    Args:
+        depth_m: 0 where there is no reading.
+        points_m: in the camera frame.
+        normals: toward the camera.
+        rays: points of the pixels at a depth of 1 m.
+        noise_per_m2: as in :class:`Frame`.
+        limit_m: ``Frame.background_limit_m``, which is filled in.
+    """
+    is_left = (depth_m > 0) & (limit_m == 0)
+    planes: list[Background] = []
+    least = max(_LEAST_POINTS, _LEAST_SHARE * int((depth_m > 0).sum()))
     generator = torch.Generator().manual_seed(0)
     for _ in range(_PLANES):
         plane = largest_plane(points_m[is_left], generator, noise_per_m2)
@@ -221,9 +249,11 @@ def _planes(
             along = offset @ axes[:, 1:]
             width_m, length_m = (along.quantile(0.95, 0) - along.quantile(0.05, 0)).tolist()
             diameter_m = max(width_m / _WIDER, length_m / _LONGER)
-            plane_limit_m[joined] = diameter_m
-            planes.append(WidePlane(plane=plane, diameter_m=diameter_m))
-    return plane_limit_m, planes
+            limit_m[joined] = diameter_m
+            on_rays_m = plane[1] / (rays @ plane[0])
+            on_rays_m = torch.where(on_rays_m > 0, on_rays_m, torch.inf)
+            planes.append(Background(depth_m=on_rays_m, diameter_m=diameter_m))
+    return planes
 
 
 def _bent(
@@ -296,27 +326,57 @@ def readings_toward(frame: Frame, points_m: Float64[Tensor, "*n 3"]) -> Readings
 
 
 def share_behind(
-    frame: Frame, wide: WidePlane, points_m: Float64[Tensor, "n 3"], margin_m: float
+    frame: Frame, background: Background, points_m: Float64[Tensor, "n 3"], margin_m: float
 ) -> float:
-    """Give the share of points that lie behind a wide plane, where the plane is not known to end.
+    """Give the share of points that lie behind a background, where it is not known to end.
 
     Args:
         frame: the image.
-        wide: one of its planes.
+        background: one of the image.
         points_m: of a posed surface, in the camera frame.
         margin_m: a point counts from so far behind, beyond what the sensor's noise explains.
 
     Returns:
         Between 0 and 1.
     """
-    normal, offset = wide.plane
-    beyond_m = (points_m @ normal - offset) * offset.sign()  # the camera is on the other side
-    foot_m = points_m - ((points_m @ normal - offset)[:, None]) * normal
-    limit_m = margin_m + _tolerance_m(foot_m[:, 2].clamp(min=0), frame.noise_per_m2)
-    # What stands before the plane hides it; where the camera saw farther it has ended.
-    readings = readings_toward(frame, foot_m)
-    is_solid = readings.is_read & (readings.depth_m < foot_m[:, 2] + limit_m)
-    return float((is_solid & (beyond_m > limit_m)).double().mean())
+    # Within the margin of a point the background is no deeper than its deepest pixel there.
+    margin_px = margin_m * float(frame.K[0, 0] / points_m[:, 2].median().clamp(min=1e-6))
+    reach = min(math.ceil(margin_px), min(frame.depth_m.shape) // 2)
+    limit_m = _largest_about(background.depth_m, reach)
+    limit_m += margin_m + _tolerance_m(limit_m, frame.noise_per_m2)
+    readings = readings_toward(frame, points_m)
+    limit_m = limit_m.flatten()[readings.pixel]
+    # What stands before the background hides it; where the camera saw farther it has ended.
+    is_solid = readings.is_read & (readings.depth_m < limit_m)
+    return float((is_solid & (points_m[:, 2] > limit_m)).double().mean())
+
+
+def is_on_background(
+    depth_m: Float[Tensor, "h w"], background_m: Float[Tensor, "h w"]
+) -> Bool[Tensor, "h w"]:
+    """Mark the readings that lie on a known background, as far as a depth sensor measures it.
+
+    Both images have errors, and a pixel may see what its neighbour should: a reading is of the
+    background between the nearest and the farthest that it has there, beyond the noise.
+
+    Args:
+        depth_m: the image; 0 or NaN where there is no reading.
+        background_m: depth of the background in the same image; NaN where it is not known.
+    """
+    read_m = torch.where(depth_m > 0, depth_m, 0.0).double()
+    tolerance_m = math.sqrt(2) * _tolerance_m(read_m, _measure_noise_per_m2(read_m))
+    known_m = background_m.double().nan_to_num(torch.inf)
+    farthest_m = _largest_about(known_m, 1)
+    nearest_m = -_largest_about(-known_m, 1)
+    is_between = (read_m > nearest_m - tolerance_m) & (read_m < farthest_m + tolerance_m)
+    return is_between & (read_m > 0) & farthest_m.isfinite()
+
+
+def _largest_about(values: Float64[Tensor, "h w"], reach: int) -> Float64[Tensor, "h w"]:
+    """Give the largest of the finite values up to so many pixels away; infinite without one."""
+    finite = torch.where(values.isfinite(), values, -torch.inf)
+    largest = max_pool2d(finite[None], 2 * reach + 1, 1, reach)[0]
+    return torch.where(largest.isfinite(), largest, torch.inf)
 
 
 def _tolerance_m(depth_m: Float64[Tensor, "*n"], noise_per_m2: float) -> Float64[Tensor, "*n"]:

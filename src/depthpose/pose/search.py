@@ -35,7 +35,13 @@ from depthpose.pose.frame import (
 from depthpose.pose.inputs import nothing_seen
 from depthpose.pose.propose.image import compare_with_image, propose_in_frame
 from depthpose.pose.surface import NEAR, Surface
-from depthpose.pose.types import CloudInput, Evidence, PoseEstimate, ViewInput
+from depthpose.pose.types import (
+    CloudInput,
+    Evidence,
+    KnownBackground,
+    PoseEstimate,
+    ViewInput,
+)
 
 _MOST_PLACES, _LEAST_PROPOSALS = 40, 4
 """Proposals that are looked at in an image, and of each object at least."""
@@ -61,7 +67,7 @@ _RIM = 0.05
 _REGION_MARGIN = 0.5
 """Of the larger side of a region: so far about it planes and neighbours are looked at."""
 _SUNK = 0.05
-"""Of a surface no larger share lies in a table or wall: its pose is off by less."""
+"""Of a surface no larger share lies in a bin, table or wall: its pose is off by less."""
 _LEAST_SHARE = 0.8
 """Where no object among several has so large a share of the probability, none is reported."""
 
@@ -147,7 +153,7 @@ def find_objects(view: ViewInput, targets: SearchTargets) -> list[PoseEstimate]:
     whole = view
     view = _window_of_region(view)
     smallest_m = min(targets.object_of(name).surface.diameter_m for name in targets.names)
-    frame = prepare_frame(view.depth_m, view.K, smallest_m)
+    frame = prepare_frame(view.depth_m, view.K, smallest_m, view.background)
     is_unclaimed = view.mask[:: frame.step, :: frame.step].clone()
     names = list(targets.names)
     accepted: list[_Judged] = []
@@ -250,7 +256,7 @@ def _best_copy(frame: Frame, pose: Rigid, prepared: PreparedObject) -> Rigid:
     if len(motions.R) == 0:
         return pose
     every = Rigid.cat([pose[None], pose[None] @ motions])
-    about = (frame.depth_m > 0) & (frame.plane_limit_m < surface.diameter_m)
+    about = (frame.depth_m > 0) & (frame.background_limit_m < surface.diameter_m)
     middle_m = pose.apply(surface.middle_m[None])[0]
     about &= (frame.points_m - middle_m).norm(dim=-1) < surface.diameter_m
     local_m = every.inverse().apply(frame.points_m[about])
@@ -285,7 +291,9 @@ def _judge(
         evidence = estimate.evidence
         reason = estimate.reason
         if estimate.camera_from_model is not None:
-            reason = _exclusion_by_planes(frame, view, estimate.camera_from_model.double(), surface)
+            reason = _exclusion_by_background(
+                frame, view, estimate.camera_from_model.double(), surface
+            )
         if estimate.camera_from_model is None or evidence is None or reason:
             misses.append(_miss_at(group[0], evidence, reason, targets))
             continue
@@ -381,13 +389,13 @@ def _suppress(
 
 
 def explained_mask(image: Frame | ViewInput, pose: Rigid, surface: Surface) -> Bool[Tensor, "h w"]:
-    """Mark the pixels whose points lie on a posed surface; in a frame, none of wider planes."""
+    """Mark the pixels whose points lie on a posed surface; in a frame, none of its background."""
     pose = pose.double()
     window = _pixels_about(image, pose, surface)
     depth_m = image.depth_m[window].double()
     if isinstance(image, Frame):
         points_m = image.points_m[window]
-        is_explained = (depth_m > 0) & (image.plane_limit_m[window] < surface.diameter_m)
+        is_explained = (depth_m > 0) & (image.background_limit_m[window] < surface.diameter_m)
     else:
         points_m = back_project(depth_m, _window_intrinsics(image.K, window).double())
         is_explained = points_m.isfinite().all(-1) & image.mask[window]
@@ -447,19 +455,22 @@ def _window_of_region(view: ViewInput) -> ViewInput:
 def _cut(view: ViewInput, part: tuple[slice, slice]) -> ViewInput:
     """Cut a part out of a view."""
     K = _window_intrinsics(view.K, part)
-    return replace(view, depth_m=view.depth_m[part], mask=view.mask[part], K=K)
+    known = view.background
+    if known is not None:
+        known = KnownBackground(depth_m=known.depth_m[part], is_seen=known.is_seen[part])
+    return replace(view, depth_m=view.depth_m[part], mask=view.mask[part], K=K, background=known)
 
 
-def _exclusion_by_planes(frame: Frame, view: ViewInput, pose: Rigid, surface: Surface) -> str:
-    """Say why the planes of an image exclude a pose; nothing where they do not."""
+def _exclusion_by_background(frame: Frame, view: ViewInput, pose: Rigid, surface: Surface) -> str:
+    """Say why the background of an image excludes a pose; nothing where it does not."""
     if is_cut_out(view, pose, surface):
         return "it would be cut out of a plane that goes on beside it"
     points_m = pose.apply(surface.points_m)
-    wider = [wide for wide in frame.planes if wide.diameter_m >= surface.diameter_m]
-    for wide in wider:
-        share = share_behind(frame, wide, points_m, NEAR * surface.diameter_m)
+    wider = [other for other in frame.backgrounds if other.diameter_m >= surface.diameter_m]
+    for background in wider:
+        share = share_behind(frame, background, points_m, NEAR * surface.diameter_m)
         if share > _SUNK:
-            return f"{share:.0%} of it would lie in the table or wall before which it is seen"
+            return f"{share:.0%} of it would lie in the bin, table or wall before which it is seen"
     return ""
 
 
@@ -482,6 +493,8 @@ def is_cut_out(view: ViewInput, pose: Rigid, surface: Surface) -> bool:
     pixel_m = float(points_m[explained][:, 2].median() / window.K[0, 0])
     reach = BORDER_PX + math.ceil(_RIM * surface.diameter_m / pixel_m)
     rim = grow_mask(explained, reach) & ~grow_mask(explained, BORDER_PX)
+    if window.background is not None:
+        rim &= ~window.background.is_seen
     return float(is_on_plane(points_m[rim], plane).double().mean()) > _CONTINUED
 
 

@@ -83,6 +83,14 @@ class ColorImage:
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
+class KnownBackground:
+    """What a camera sees without the objects: an empty bin or table, drawn or taken before."""
+
+    depth_m: Float[Tensor, "h w"]  #: in the pixels of the view; NaN where it is not known
+    is_seen: Bool[Tensor, "h w"]  #: whether the reading of the view lies on it
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
 class ViewInput:
     """A depth image with the mask of one object: what a :class:`CloudInput` is lifted from."""
 
@@ -96,6 +104,8 @@ class ViewInput:
     #: the mask only limits where the object is, as a detector's box does: what lies in it and is
     #: not the object is no evidence against a pose.
     is_region: bool = False
+    #: without the objects; None: it is not known.
+    background: KnownBackground | None = None
 
 
 AnyInput = CloudInput | ViewInput

@@ -97,7 +97,7 @@ def _scene_points(
     frame: Frame, is_left: Bool[Tensor, "h w"], surface: Surface
 ) -> tuple[Float64[Tensor, "n 3"], Float64[Tensor, "n 3"]]:
     """Average points and normals in cells, without planes and what is too far to have a shape."""
-    used = frame.is_smooth & is_left & (frame.plane_limit_m < surface.diameter_m)
+    used = frame.is_smooth & is_left & (frame.background_limit_m < surface.diameter_m)
     used &= _NOISE_PER_M2 * frame.depth_m.square() < NEAR * surface.diameter_m
     points_m, normals = frame.points_m[used], frame.normals[used]
     if len(points_m) == 0:
@@ -135,7 +135,7 @@ def _projected(frame: Frame, poses: Rigid, surface: Surface, stage: _Stage) -> R
     Point to plane, each point with the reading in its own direction (Blais and Levine 1995): the
     inner side of a thin wall draws no reading of the outer one.
     """
-    usable = frame.is_smooth & (frame.plane_limit_m < surface.diameter_m)
+    usable = frame.is_smooth & (frame.background_limit_m < surface.diameter_m)
     radius_m = surface.diameter_m / 2
     held = _HELD * torch.diag(torch.tensor([radius_m**2] * 3 + [1.0] * 3, dtype=torch.float64))
     for share in stage.limits:
@@ -184,7 +184,7 @@ def compare_with_image(
     posed_m, normals, is_inner, beside_m = _posed(poses, surface, stage.every)
     # A plane that is wider than the object is no side of it.
     at = readings_toward(frame, posed_m)
-    no_side = (frame.plane_limit_m >= surface.diameter_m).flatten()
+    no_side = (frame.background_limit_m >= surface.diameter_m).flatten()
     limit_m = stage.fits * surface.diameter_m + 2 * _NOISE_PER_M2 * posed_m[..., 2].square()
     gap_m, is_side = at.depth_m - posed_m[..., 2], ~no_side[at.pixel]
     cosine = (normals * frame.normals.flatten(0, 1)[at.pixel]).sum(-1).abs()
