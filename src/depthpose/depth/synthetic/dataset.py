@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
-from jaxtyping import Float, Float64, Int
+from jaxtyping import Bool, Float, Float64, Int
 from torch import Tensor
 from torch.nn import functional as F
 
@@ -40,6 +40,10 @@ class Nearest(NamedTuple):
     primitive: Indices
     shares: Vectors
     depth_m: Numbers
+
+    def select(self, index: Indices) -> "Nearest":
+        """Give those of some rays, by their numbers."""
+        return Nearest(*(values.index_select(0, index) for values in self))
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -116,70 +120,96 @@ _OFFSETS = ((-0.375, -0.125), (0.125, -0.375), (0.375, 0.125), (-0.125, 0.375))
 
 
 def draw_light(stage: Stage, sight: Sight) -> Float[Tensor, "h w 3"]:
-    """Give linear RGB, before any sensor; the mean of four samples where edges show."""
-    raster = sight.raster
-    height, width = raster.primitive.shape
-    # Beside which something else is seen, or the same bent sharply.
-    is_edge = torch.zeros(height, width, dtype=torch.bool)
-    shown = raster.primitive.clamp(min=0)
-    kind = torch.where(raster.primitive >= 0, stage.kind[shown], -1)
-    normal = stage.attributes[:, 18:21].index_select(0, shown.flatten()).unflatten(0, shown.shape)
-    every = slice(None)
-    after = slice(1, None)
-    before = slice(None, -1)
-    for here, other in (((every, after), (every, before)), ((after, every), (before, every))):
-        is_other = raster.primitive[here] != raster.primitive[other]
-        x, y, z = (normal[here] * normal[other]).unbind(-1)
-        is_bent = (x + y + z).abs() < 0.9
-        differs = is_other & ((kind[here] != kind[other]) | is_bent)
-        is_edge[here] |= differs
-        is_edge[other] |= differs
-    is_edge = is_edge.flatten()
-    light = torch.zeros(height * width, 3)
-    whole = (~is_edge).nonzero()[:, 0]
-    mixed = is_edge.nonzero()[:, 0]
-    assert raster.barycentric is not None
-    flat = [v.flatten(0, 1) for v in (raster.primitive, raster.barycentric, raster.depth_m)]
-    nearest = Nearest(*(values.index_select(0, whole) for values in flat))
+    """Give the linear RGB that reaches each pixel, before any sensor.
+
+    A pixel is lit as its centre is; one at an edge by the mean of four places in it (antialiasing).
+    """
+    assert sight.raster.barycentric is not None
+    height, width = sight.raster.primitive.shape
     index = torch.arange(height * width)
     centres = torch.stack([index % width, index // width], 1).double()
-    light[whole] = _light(stage, sight, centres[whole], nearest)
-    if len(mixed):  # the mean light of four places in each pixel
-        candidates = neighbours(sight.raster.primitive, mixed)
-        at_centre = [values.index_select(0, mixed) for values in flat]
-        places = [centres[mixed] + torch.tensor(o, dtype=torch.float64) for o in _OFFSETS]
-        hits = []
-        for there in nearest_at(sight, candidates, places):
-            # A gap between all that was seen near by: take what the pixel's centre sees.
-            is_lost = (there.primitive < 0) & (candidates >= 0).all(1)
-            hits.append([
-                torch.where(is_lost if here.ndim == 1 else is_lost[:, None], instead, here)
-                for here, instead in zip(there, at_centre, strict=True)
-            ])  # fmt: skip
-        nearest = Nearest(*(torch.cat(parts) for parts in zip(*hits, strict=True)))
-        of_places = _light(stage, sight, torch.cat(places), nearest)
-        # A glint in a quarter of a pixel would outshine the rest, as it does not in a sensor.
-        light[mixed] = of_places.clamp(max=4).reshape(len(_OFFSETS), -1, 3).mean(0)
+    is_edge = _edge_pixels(stage, sight.raster).flatten()
+    inner = (~is_edge).nonzero()[:, 0]
+    edge = is_edge.nonzero()[:, 0]
+
+    at_centre = Nearest(
+        sight.raster.primitive.flatten(),
+        sight.raster.barycentric.flatten(0, 1),
+        sight.raster.depth_m.flatten(),
+    )
+    light = torch.zeros(height * width, 3)
+    light[inner] = _light(stage, sight, centres[inner], at_centre.select(inner))
+    if len(edge):
+        light[edge] = _edge_light(stage, sight, edge, centres[edge], at_centre.select(edge))
     return light.reshape(height, width, 3)
 
 
+def _edge_pixels(stage: Stage, raster: Raster) -> Bool[Tensor, "h w"]:
+    """Find pixels beside which another kind of surface is visible, or the same one bent sharply."""
+    visible = raster.primitive.clamp(min=0)
+    kind = torch.where(raster.primitive >= 0, stage.kind[visible], -1)
+    normal = stage.attributes[:, 18:21].index_select(0, visible.flatten())
+    normal = normal.unflatten(0, visible.shape)
+    is_edge = torch.zeros(raster.primitive.shape, dtype=torch.bool)
+    every = slice(None)
+    after = slice(1, None)
+    before = slice(None, -1)
+    for here, beside in (((every, after), (every, before)), ((after, every), (before, every))):
+        is_other_triangle = raster.primitive[here] != raster.primitive[beside]
+        x, y, z = (normal[here] * normal[beside]).unbind(-1)
+        is_bent = (x + y + z).abs() < 0.9
+        differs = is_other_triangle & ((kind[here] != kind[beside]) | is_bent)
+        is_edge[here] |= differs
+        is_edge[beside] |= differs
+    return is_edge
+
+
+def _edge_light(
+    stage: Stage,
+    sight: Sight,
+    index: Indices,
+    centres: Float64[Tensor, "n 2"],
+    at_centre: Nearest,
+) -> Vectors:
+    """Give the mean light of four places in each edge pixel, of the triangles visible near it."""
+    candidates = neighbours(sight.raster.primitive, index)
+    places = [centres + torch.tensor(offset, dtype=torch.float64) for offset in _OFFSETS]
+    hits = []
+    for hit in nearest_at(sight, candidates, places):
+        # A gap between all triangles that are visible near by: take what the pixel's centre sees.
+        is_gap = (hit.primitive < 0) & (candidates >= 0).all(1)
+        hits.append(
+            Nearest(
+                torch.where(is_gap, at_centre.primitive, hit.primitive),
+                torch.where(is_gap[:, None], at_centre.shares, hit.shares),
+                torch.where(is_gap, at_centre.depth_m, hit.depth_m),
+            )
+        )
+    nearest = Nearest(*(torch.cat(parts) for parts in zip(*hits, strict=True)))
+    light = _light(stage, sight, torch.cat(places), nearest)
+    # A glint in a quarter of a pixel would outshine the rest, as it does not in a sensor.
+    return light.clamp(max=4).reshape(len(_OFFSETS), -1, 3).mean(0)
+
+
 def _light(stage: Stage, sight: Sight, pixels: Float64[Tensor, "n 2"], nearest: Nearest) -> Vectors:
-    primitive, shares, depth = nearest
+    """Give the linear RGB on the rays through some places (u, v) [px]: of a surface or the sky."""
     (a, b, c), (_, d, e), _ = sight.K.inverse().tolist()
     u, v = pixels.unbind(1)
     rays = torch.stack([a * u + b * v + c, d * v + e, torch.ones_like(u)], 1).float()
     length = rays.norm(dim=1)
     towards = rays / length[:, None]
+    sky = (nearest.primitive < 0).nonzero()[:, 0]
+    hit = (nearest.primitive >= 0).nonzero()[:, 0]
+
     light = torch.empty_like(rays)
-    sky = (primitive < 0).nonzero()[:, 0]
-    hit = (primitive >= 0).nonzero()[:, 0]
     light[sky] = sky_light(stage, towards[sky])
+    points_m = rays * nearest.depth_m[:, None] + sight.eye
     hits = Hits(
-        primitive=primitive.index_select(0, hit),
-        barycentric=shares.index_select(0, hit),
-        points=(rays * depth[:, None] + sight.eye).index_select(0, hit),
+        primitive=nearest.primitive.index_select(0, hit),
+        barycentric=nearest.shares.index_select(0, hit),
+        points=points_m.index_select(0, hit),
         towards=towards.index_select(0, hit),
-        distance_m=(length * depth).index_select(0, hit),
+        distance_m=(length * nearest.depth_m).index_select(0, hit),
     )
     light[hit] = shade(stage, hits, float(sight.K[0, 0]))
     return light

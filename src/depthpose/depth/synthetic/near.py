@@ -6,7 +6,6 @@ where textures, shadows and lenses have their usual sizes, and given in its true
 """
 
 from dataclasses import dataclass, replace
-from itertools import pairwise
 from typing import Literal
 
 import numpy as np
@@ -18,15 +17,13 @@ from depthpose.core.camera.rectified import grey_of
 from depthpose.core.errors import InputError
 from depthpose.depth.config import NearConfig, StreetsConfig
 from depthpose.depth.synthetic.dataset import Projector, StreetFrame, draw_scene
-from depthpose.depth.synthetic.mesh import MeshBuilder, Rotation, Surface, Values
+from depthpose.depth.synthetic.mesh import MeshBuilder, Values
+from depthpose.depth.synthetic.near_shapes import PLAIN, add_thing, draw_surface, random_kind
 from depthpose.depth.synthetic.scene import (
     Markings,
     StreetScene,
-    add_shape,
     draw_weather,
     log_uniform,
-    random_rotation,
-    random_surface,
 )
 from depthpose.depth.types import Mask, View
 
@@ -44,13 +41,6 @@ _DISTANCES_M = (0.05, 5.0)
 """Of the nearest thing, in true metres."""
 _FARTHEST_M = 20.0
 """Of a backdrop, in true metres."""
-
-_PLAIN = ("paint", "skin", "plaster", "metal")
-"""Materials that show next to nothing where a tile of them is much larger than the surface."""
-
-_SHAPES = ("ball", "box", "box", "card", "pole", "fence", "wheel", "lattice", "leaves",
-           "bracket", "flange", "spool", "bottle", "mug", "books", "cable", "stool")  # fmt: skip
-"""What lies and stands in a scene; one is named as often as it is met."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -87,9 +77,7 @@ def make_near(config: NearConfig, index: int) -> NearScene:
     K = intrinsics(focal_px, focal_px, (width - 1) / 2, (height - 1) / 2)
     rig = StereoRig(width=width, height=height, K=K, baseline_m=_DRAWN_BASELINE_M)
     kind = _KINDS[int(rng.integers(len(_KINDS)))]
-    place = _Place(
-        rng, near_m, (width / focal_px / 2, height / focal_px / 2), config.plain_share
-    )
+    place = _Place(rng, near_m, (width / focal_px / 2, height / focal_px / 2), config.plain_share)
     farthest = min(12.0, _FARTHEST_M / (near_m * metres_per_unit))
     match kind:
         case "room":
@@ -105,10 +93,10 @@ def make_near(config: NearConfig, index: int) -> NearScene:
     mesh = place.builder.finish()
     # Nothing but a backdrop, which reaches beside the camera, may come nearer than the nearest.
     is_far = mesh.corners[:, :, 2].min(1) > 0.97 * near_m
-    kept = is_far | (mesh.thing <= place.backdrop)
+    is_kept = is_far | (mesh.thing <= place.backdrop)
     weather = replace(draw_weather(rng), haze_m=1e5)
     scene = StreetScene(
-        mesh=mesh.part(kept),
+        mesh=mesh.part(is_kept),
         markings=Markings(
             lines=np.zeros((0, 4)), bars=np.zeros((0, 5)), brightness=0.5, wheel_tracks=(0.0, 3.0)
         ),
@@ -206,21 +194,14 @@ class _Place:
         self.backdrop = 0
         self.far_m = near_m
 
-    def surface(self, size_m: float, plain_share: float = 0.3) -> Surface:
-        """Anything of any colour, or something without any texture."""
-        rng = self.rng
-        chosen = random_surface(rng, size_m)
-        if rng.random() >= plain_share:
-            return chosen
-        material = _PLAIN[int(rng.integers(len(_PLAIN)))]
-        return chosen._replace(material=material, tile_m=size_m * rng.uniform(3, 40))
-
     def sheet(self, corner: Values, along: Values, up: Values) -> None:
         """Add a large rectangle; nothing of it is cut off for being near."""
         self.builder.thing += 1
         size_m = float(np.linalg.norm(np.asarray(along, float)))
-        surface = self.surface(self.near_m * log_uniform(self.rng, 0.3, 3), self.plain_share)
-        if surface.material in _PLAIN:
+        surface = draw_surface(
+            self.rng, self.near_m * log_uniform(self.rng, 0.3, 3), self.plain_share
+        )
+        if surface.material in PLAIN:
             surface = surface._replace(tile_m=size_m)
         self.builder.rectangle(corner, along, up, surface)
         self.backdrop = self.builder.thing
@@ -290,12 +271,13 @@ class _Place:
         height_m = extent_m * rng.uniform(0.15, 0.6)
         if is_bin:
             self.builder.thing += 1
-            for one, other in ((right, ahead), (-right, ahead), (ahead, right), (-ahead, right)):
-                start = middle + extent_m * (one - other)
-                surface = self.surface(extent_m)
-                self.builder.rectangle(start, 2 * extent_m * other, height_m * normal, surface)
+            sides = ((right, ahead), (-right, ahead), (ahead, right), (-ahead, right))
+            for outwards, along in sides:
+                corner = middle + extent_m * (outwards - along)
+                surface = draw_surface(rng, extent_m)
+                self.builder.rectangle(corner, 2 * extent_m * along, height_m * normal, surface)
         # Things on it: their places by the rays that see the plane.
-        common = _SHAPES[int(rng.integers(len(_SHAPES)))] if is_bin else None
+        common = random_kind(rng) if is_bin else None
         common_m = distance_m * self.half[0] * log_uniform(rng, 0.1, 0.5)
         for _ in range(int(rng.integers(20, 70) if is_bin else rng.integers(2, 30))):
             ray = np.array([*(rng.uniform(-1, 1, 2) * self.half), 1.0])
@@ -305,7 +287,7 @@ class _Place:
             z = distance_m * normal[2] / away
             size_m = common_m if common else z * self.half[0] * log_uniform(rng, 0.08, 0.7)
             lift = rng.uniform(0.1, 1.0) * height_m if common else rng.uniform(0.2, 0.6) * size_m
-            self.thing(ray * z + lift * normal, size_m, common)
+            self.add_thing(ray * z + lift * normal, size_m, common)
         self.far_m = distance_m
 
     def add_shelf(self) -> None:
@@ -318,7 +300,7 @@ class _Place:
         self.add_wall(back_m * rng.uniform(1.0, 1.6))
         half_x, half_y = (back_m * side * rng.uniform(0.6, 1.5) for side in self.half)
         thick_m = depth_m * rng.uniform(0.02, 0.12)
-        surface = self.surface(half_x)
+        surface = draw_surface(rng, half_x)
         turn = rng.normal(0, 0.25)
         rotation = np.array(
             [[np.cos(turn), 0, np.sin(turn)], [0, 1, 0], [-np.sin(turn), 0, np.cos(turn)]]
@@ -340,7 +322,7 @@ class _Place:
             where = np.array([
                 rng.uniform(-half_x, half_x), floor - size_m / 2, rng.uniform(-0.4, 0.4) * depth_m
             ])  # fmt: skip
-            self.thing(middle + rotation @ where, size_m)
+            self.add_thing(middle + rotation @ where, size_m)
         self.far_m = back_m
 
     def scatter(self, count: int) -> None:
@@ -349,102 +331,13 @@ class _Place:
         for _ in range(count):
             z = log_uniform(rng, 1.05 * self.near_m, max(1.1 * self.near_m, self.far_m))
             centre = np.array([*(rng.uniform(-1, 1, 2) * self.half * z), z])
-            self.thing(centre, z * self.half[0] * log_uniform(rng, 0.06, 0.7))
+            self.add_thing(centre, z * self.half[0] * log_uniform(rng, 0.06, 0.7))
 
-    def thing(self, centre: np.ndarray, size_m: float, kind: str | None = None) -> None:
-        """Add one of the shapes about a point, at least as far away as allowed."""
-        rng = self.rng
-        b = self.builder
-        b.thing += 1
+    def add_thing(self, centre: np.ndarray, size_m: float, kind: str | None = None) -> None:
+        """Add a thing about a point (3,) [m], which is moved away along its ray if too near.
+
+        ``kind`` None: of any kind.
+        """
         least_m = self.near_m + 0.6 * size_m
         centre = centre * max(1.0, least_m / max(float(centre[2]), 1e-6))
-        name = kind or _SHAPES[int(rng.integers(len(_SHAPES)))]
-        surface = self.surface(size_m)
-        R = random_rotation(rng) if rng.random() < 0.6 else np.eye(3)
-        match name:
-            case "bracket":  # two plates at a right angle, with a rib
-                long, wide, high = size_m * rng.uniform(0.4, 1, 3)
-                thick = size_m * rng.uniform(0.04, 0.15)
-                plates = (
-                    ((0, 0, 0), (long, thick, wide)),
-                    ((-long / 2, -high / 2, 0), (thick, high, wide)),
-                    ((-long / 3, -high / 5, 0), (long / 2, high / 2, thick)),
-                )
-                for at, size in plates:
-                    b.box(centre + R @ np.array(at), size, surface, R)
-            case "flange" | "spool":  # discs on a tube
-                axis = R[:, 1]
-                radius = size_m * rng.uniform(0.3, 0.6)
-                length = size_m * rng.uniform(0.15, 1.0)
-                start = centre - axis * length / 2
-                end = centre + axis * length / 2
-                inner = radius * rng.uniform(0.3, 0.7)
-                b.tube(start, end, inner, surface, 24)
-                for at in (start, end) if name == "spool" else (start,):
-                    rim = at + axis * radius * rng.uniform(0.05, 0.25)
-                    b.tube(at, rim, radius, surface, 32)
-                    for face in (at, rim):
-                        b.disc(face, axis, radius, surface, 32)
-                b.disc(end, axis, inner, surface, 24)
-            case "bottle":
-                axis = R[:, 1]
-                radius = size_m * rng.uniform(0.15, 0.3)
-                start = centre - axis * size_m / 2
-                marks = np.cumsum([0, *(size_m * rng.uniform(0.1, 0.5, 3))])
-                widths = (radius, radius, radius * rng.uniform(0.2, 0.5))
-                for low, high, one, other in zip(marks, marks[1:], widths, (*widths[1:], widths[2]),
-                                                 strict=False):  # fmt: skip
-                    b.tube(start + axis * low, start + axis * high, (one, other), surface, 24)
-                b.disc(start + axis * marks[3], axis, widths[2], surface, 24)
-            case "mug":
-                axis = R[:, 1]
-                radius = size_m * rng.uniform(0.25, 0.4)
-                start = centre - axis * size_m / 2
-                end = centre + axis * size_m / 2
-                b.tube(start, end, radius, surface, 28)
-                b.tube(start, end, 0.9 * radius, surface, 28)
-                b.disc(start, axis, radius, surface, 28)
-                angle = np.linspace(-1.2, 1.2, 8)
-                for one, other in pairwise(angle):
-                    places = [
-                        centre + R[:, 0] * (radius * (0.8 + 0.7 * np.cos(a)))
-                        + axis * (0.4 * size_m * np.sin(a)) for a in (one, other)
-                    ]  # fmt: skip
-                    b.tube(places[0], places[1], 0.12 * radius, surface, 8)
-            case _:
-                self._household(name, centre, size_m, surface, R)
-
-    def _household(
-        self, name: str, centre: np.ndarray, size_m: float, surface: Surface, R: Rotation
-    ) -> None:
-        """Add books, a cable or a stool, or one of the shapes of clutter."""
-        rng = self.rng
-        b = self.builder
-        match name:
-            case "books":
-                at = np.zeros(3)
-                down = np.array([0.0, 1, 0])
-                for _ in range(int(rng.integers(2, 9))):
-                    b.thing += 1
-                    thick = size_m * rng.uniform(0.03, 0.15)
-                    size = (size_m * rng.uniform(0.4, 0.7), thick, size_m * rng.uniform(0.5, 0.9))
-                    b.box(centre + R @ (at + down * thick / 2), size, self.surface(size_m), R)
-                    at = at + down * thick
-            case "cable":
-                at = centre
-                heading = R[0]
-                for _ in range(int(rng.integers(5, 25))):
-                    step = at + heading * size_m * 0.12
-                    b.tube(at, step, size_m * 0.02, surface, 6)
-                    at = step
-                    heading = heading + rng.normal(0, 0.4, 3)
-                    heading = heading / np.linalg.norm(heading)
-            case "stool":
-                half = size_m / 2
-                b.box(centre - R[:, 1] * half, (size_m, 0.08 * size_m, size_m), surface, R)
-                for x, z in ((-1, -1), (-1, 1), (1, -1), (1, 1)):
-                    foot = centre + R @ np.array([0.9 * x * half, half, 0.9 * z * half])
-                    head = foot - R[:, 1] * size_m
-                    b.tube(head, foot, size_m * 0.03, surface, 8)
-            case _:
-                add_shape(b, name, centre, size_m)
+        add_thing(self.builder, kind or random_kind(self.rng), centre, size_m)
