@@ -301,10 +301,11 @@ def label(
     max_difference_share: float = 0.03,
     min_confidence: float = 0.5,
 ) -> int:
-    """Make truth for pairs that have none: match them both ways, keep where both views agree.
+    """Label stereo pairs that have no true disparity: match them, keep where both views agree.
 
-    Writes a folder of pairs that every training takes; those that cannot be read are left out. Such
-    labels are no better than their matcher, and leak evaluation frames that it was trained on.
+    Writes a folder of pairs that every training takes, with the pseudo-labels as truth; pairs that
+    cannot be read are left out. Labels are no better than the matcher, and if it was trained on
+    evaluation frames, so is what trains on its labels.
 
         depthpose data label my-pairs --out my-pairs-labelled
 
@@ -324,6 +325,7 @@ def label(
     from depthpose.depth.estimator import FakestereoNet
     from depthpose.depth.labels import LabelConfig, label_pairs
 
+    # What decides the labels, and so stands in the record of the folder.
     config = LabelConfig(
         largest_difference_px=max_difference_px,
         largest_share=max_difference_share,
@@ -332,18 +334,25 @@ def label(
     dataset = open_dataset(path)
     sha256 = file_sha256(find_weights(weights))
     settings = {"dataset": dataset.name, "weights_sha256": sha256, **asdict(config)}
+
+    # A pair that fails is named at the end and stops no other; the only pair ends the command.
     failures: list[InputError] = []
-    collected = failures if len(dataset) > 1 else None  # that of the only pair ends the command
+    collected = failures if len(dataset) > 1 else None
     net = FakestereoNet.load(weights, config=MatcherConfig(device=device))
     labelled = label_pairs(net, dataset, config, out, settings, failures=collected)
     shares = [share for _, share in tqdm(labelled, unit=" pairs", leave=False, disable=None)]
+
     for failure in failures:
         print(f"depthpose: failed: {failure}", file=sys.stderr)
-    labelled_share = f", {sum(shares) / len(shares):.0%} of their pixels labelled" if shares else ""
-    failed = f"{len(failures)} failed, " if failures else ""
-    counts = f"{len(shares)} pairs labelled{labelled_share}; {failed}"
-    print(f"{out}: {counts}the others were labelled before")
+    print(f"{out}: {_label_summary(shares, len(failures))}")
     return 1 if failures else 0
+
+
+def _label_summary(shares: list[float], failures: int) -> str:
+    """Say how many pairs were labelled, which share of their pixels, and how many failed."""
+    share = f", {sum(shares) / len(shares):.0%} of their pixels labelled" if shares else ""
+    failed = f"{failures} failed, " if failures else ""
+    return f"{len(shares)} pairs labelled{share}; {failed}the others were labelled before"
 
 
 _LOOKED_AT = 8  # pairs that are checked before anything is written

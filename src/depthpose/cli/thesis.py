@@ -13,6 +13,7 @@ from depthpose.cli.pose_options import PoseDataOptions, PoseTableOptions
 from depthpose.core.errors import InputError
 
 if TYPE_CHECKING:
+    from depthpose.cli.depth_predict import Method, MethodSource
     from depthpose.thesis.depth import PublishedTable
 
 
@@ -58,6 +59,7 @@ def reproduce(
     from depthpose.depth.evaluate import find_protocol
     from depthpose.thesis.depth import TABLES
 
+    # Refuse what cannot be compared before anything is read.
     published = TABLES[table]
     if find_protocol(comparison.protocol).truth == "disparity":
         raise InputError(
@@ -67,15 +69,33 @@ def reproduce(
     refuse_below(0, "--pictures", pictures, "3")
     _refuse_rows(published, weights, matcher, beside)
     dataset = open_frames(kitti, None if split == "all" else split)
-    right = published.with_right
-    source = MethodSource(weights=None, config=matching.config, with_right=right)
-    # Each method beside the row of the thesis that it stands for, "" where it stands for none.
-    published_rows = published.own_rows
-    if len(published_rows) != len(weights):
-        published_rows = (published.own_rows[0],) * len(weights)
+
+    source = MethodSource(weights=None, config=matching.config, with_right=published.with_right)
+    methods = _build_methods(source, published, weights, matcher, beside)
+    if train:
+        training = open_training(train, train_without, dataset)
+        baselines = [baseline_method(name, training) for name in ("rows", "nearest")]
+        # A baseline uses no right image, but is measured on the frames of the other rows.
+        methods += [("", method._replace(with_right=published.with_right)) for method in baselines]
+
+    return reproduce_table(
+        published, dataset, methods, out, comparison.protocol, comparison.cap, pictures
+    )
+
+
+def _build_methods(
+    source: "MethodSource",
+    table: "PublishedTable",
+    weights: Sequence[str],
+    matcher: str | None,
+    beside: Sequence[str] | None,
+) -> list[tuple[str, "Method"]]:
+    """Build each method, with the thesis's row that it reproduces; "" where it is only beside."""
+    own_row = table.own_rows[0]
+    row_names = table.own_rows if len(table.own_rows) > 1 else [own_row] * len(weights)
     methods = [
-        (row, replace(source, weights=file).build())
-        for row, file in zip(published_rows, weights, strict=True)
+        (row_name, replace(source, weights=file).build())
+        for row_name, file in zip(row_names, weights, strict=True)
     ]
     names = [method.name for _, method in methods]
     if len(set(names)) < len(names):
@@ -83,19 +103,12 @@ def reproduce(
             f"two weights are called {names[0]!r}, and so would their predictions be: rename one."
         )
     if matcher is not None:
-        methods.append((published.own_rows[0], replace(source, with_filled_holes=True).build()))
-    if not published.with_right:
+        methods.append((own_row, replace(source, with_filled_holes=True).build()))
+    if not table.with_right:
         files = ("default",) if beside is None else beside
-        others = [replace(source, weights=file).build() for file in files]
-        methods += [("", other) for other in others if other.name not in names]
-    if train:
-        training = open_training(train, train_without, dataset)
-        baselines = [baseline_method(name, training) for name in ("rows", "nearest")]
-        # A baseline uses no right image, but is measured on the frames of the other rows.
-        methods += [("", method._replace(with_right=published.with_right)) for method in baselines]
-    return reproduce_table(
-        published, dataset, methods, out, comparison.protocol, comparison.cap, pictures
-    )
+        built = [replace(source, weights=file).build() for file in files]
+        methods += [("", method) for method in built if method.name not in names]
+    return methods
 
 
 def _refuse_rows(

@@ -164,6 +164,19 @@ class Measured:
     deciles: list[float] | None = None
 
 
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _Prepared:
+    """A frame's truth and prediction, brought to the size of the image."""
+
+    frame: Frame
+    truth: Map
+    disparity_px: Map
+    depth_m: Map | None  # of what was predicted as depth alone, which is compared
+    confidence: Map | None
+    rig: StereoRig | None
+    view: dict[str, float]  # errors of the drawn right view
+
+
 def evaluate(
     dataset: Dataset,
     predictions: Path,
@@ -193,7 +206,7 @@ def evaluate(
 def measure_frame(
     dataset: Dataset, index: int, predictions: Path, protocol: str, caps_m: Sequence[float]
 ) -> list[Measured] | str:
-    """Measure one frame by each cap, or say why it does not count.
+    """Measure one frame, once for each cap, or give the reason why it does not count.
 
     Raises:
         InputError: an unknown protocol, or a missing or damaged prediction.
@@ -202,46 +215,56 @@ def measure_frame(
     prepared = _prepare(dataset, index, predictions, rule)
     if isinstance(prepared, str):
         return prepared
-    measured: list[Measured] = []
-    for cap_m in [None] if rule.truth == "disparity" else caps_m:
-        predicted, truth = _compared(prepared, rule, cap_m)
-        counts = torch.isfinite(truth)
-        mask = counts & torch.isfinite(predicted)
-        if not bool(counts.any()):
-            continue
-        metrics = {}
-        deciles = None
-        pixels = int(mask.sum())
-        if pixels:
-            predicted = predicted[mask]
-            truth = truth[mask]
-            error = (predicted - truth).abs()
-            metrics = measure("disparity" if cap_m is None else "depth", predicted, truth)
-            if cap_m is not None:
-                error = error / truth
-            elif prepared.frame.disparity_noc is not None:
-                seen_px = read_disparity(prepared.frame.disparity_noc)
-                is_compared = torch.isfinite(seen_px) & torch.isfinite(prepared.disparity_px)
-                if bool(is_compared.any()):
-                    metrics |= measure(
-                        "disparity_noc", prepared.disparity_px[is_compared], seen_px[is_compared]
-                    )
-            metrics |= prepared.view
-            if prepared.confidence is not None:
-                metrics |= score_confidence(error, prepared.confidence[mask])
-                deciles = error_by_decile(error, prepared.confidence[mask]).tolist()
-        coverage = float(mask.sum() / counts.sum())
-        measured.append(
-            Measured(
-                frame=prepared.frame.name,
-                cap_m=cap_m,
-                pixels=pixels,
-                coverage=coverage,
-                metrics=metrics,
-                deciles=deciles,
-            )
-        )
-    return measured or "no truth within the caps and the crop"
+    caps: Sequence[float | None] = [None] if rule.truth == "disparity" else caps_m
+    measured = [_measure_by_cap(prepared, rule, cap_m) for cap_m in caps]
+    with_truth = [result for result in measured if result is not None]
+    return with_truth or "no truth within the caps and the crop"
+
+
+def _measure_by_cap(prepared: _Prepared, rule: Protocol, cap_m: float | None) -> Measured | None:
+    """Measure a frame by one cap, None for disparity; None where no truth is within it."""
+    predicted, truth = _compared(prepared, rule, cap_m)
+    has_truth = torch.isfinite(truth)
+    is_compared = has_truth & torch.isfinite(predicted)
+    if not bool(has_truth.any()):
+        return None
+
+    metrics: dict[str, float] = {}
+    deciles = None
+    if bool(is_compared.any()):
+        error = (predicted - truth).abs()
+        if cap_m is None:
+            metrics |= measure("disparity", predicted[is_compared], truth[is_compared])
+            metrics |= _visible_in_both(prepared)
+        else:
+            metrics |= measure("depth", predicted[is_compared], truth[is_compared])
+            error = error / truth
+        metrics |= prepared.view
+        # A confidence is judged by how well it ranks the pixels by their errors.
+        if prepared.confidence is not None:
+            errors = error[is_compared]
+            confidences = prepared.confidence[is_compared]
+            metrics |= score_confidence(errors, confidences)
+            deciles = error_by_decile(errors, confidences).tolist()
+    return Measured(
+        frame=prepared.frame.name,
+        cap_m=cap_m,
+        pixels=int(is_compared.sum()),
+        coverage=float(is_compared.sum() / has_truth.sum()),
+        metrics=metrics,
+        deciles=deciles,
+    )
+
+
+def _visible_in_both(prepared: _Prepared) -> dict[str, float]:
+    """Measure the disparity of pixels that both views see, where the frame has their truth."""
+    if prepared.frame.disparity_noc is None:
+        return {}
+    truth_px = read_disparity(prepared.frame.disparity_noc)
+    is_compared = torch.isfinite(truth_px) & torch.isfinite(prepared.disparity_px)
+    if not bool(is_compared.any()):
+        return {}
+    return measure("disparity_noc", prepared.disparity_px[is_compared], truth_px[is_compared])
 
 
 def summarise(
@@ -366,19 +389,6 @@ def clamped_depth(disparity_px: Map, rig: StereoRig, cap_m: float) -> Map:
     depth_m = disparity.depth_from_disparity(disparity_px, rig).nan_to_num(0.0)
     clamped_m = depth_m.clamp(SMALLEST_DEPTH_M, cap_m)
     return torch.where(torch.isnan(disparity_px), torch.nan, clamped_m)
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class _Prepared:
-    """A frame's truth and prediction, brought to the size of the image."""
-
-    frame: Frame
-    truth: Map
-    disparity_px: Map
-    depth_m: Map | None  # of what was predicted as depth alone, which is compared
-    confidence: Map | None
-    rig: StereoRig | None
-    view: dict[str, float]  # errors of the drawn right view
 
 
 def _prepare(dataset: Dataset, index: int, predictions: Path, rule: Protocol) -> _Prepared | str:

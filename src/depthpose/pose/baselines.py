@@ -99,7 +99,8 @@ def cut_depth(
     rows, columns = is_seen.nonzero(as_tuple=True)
     low = torch.stack([columns.min(), rows.min()]).float() - 0.5
     high = torch.stack([columns.max(), rows.max()]).float() + 0.5
-    middle_px, side_px = (low + high) / 2, config.margin * float((high - low).max())
+    middle_px = (low + high) / 2
+    side_px = config.margin * float((high - low).max())
     mean_m = depth_m[is_seen].mean()
     relief = ((depth_m / mean_m - 1) / config.contrast).clamp(-1, 1)
     relief = torch.where(is_seen, relief, EMPTY)
@@ -154,7 +155,8 @@ def poses_of(outputs: Float[Tensor, "b 9"], crop: DepthCrop) -> Rigid:
     one by Gram and Schmidt: continuous, as no form of three or four numbers is (Zhou et al., CVPR
     2019). Undefined where the columns are parallel or zero.
     """
-    first, second = F.normalize(outputs[:, :3], dim=-1), outputs[:, 3:6]
+    first = F.normalize(outputs[:, :3], dim=-1)
+    second = outputs[:, 3:6]
     second = F.normalize(second - (first * second).sum(-1, keepdim=True) * first, dim=-1)
     R = torch.stack([first, second, torch.linalg.cross(first, second)], -1)
     shift = crop.side_m[:, None] * outputs[:, 6:]
@@ -162,7 +164,8 @@ def poses_of(outputs: Float[Tensor, "b 9"], crop: DepthCrop) -> Rigid:
     return Rigid(crop.R @ R, t_m)
 
 
-_TRANSFORM_POOLED, _TRANSFORM_HEAD = (64, 128, 1024), (512, 256)
+_TRANSFORM_POOLED = (64, 128, 1024)  # widths of the layers before the maximum over points
+_TRANSFORM_HEAD = (512, 256)  # and after it
 
 
 class PointNet(nn.Module):
@@ -192,7 +195,8 @@ class PointNet(nn.Module):
             points_m: about the mean of their cloud.
             cloud: which cloud each belongs to, 0, 1, ..., ascending.
         """
-        x, sizes = points_m / self.config.unit_m, torch.bincount(cloud).tolist()
+        x = points_m / self.config.unit_m
+        sizes = torch.bincount(cloud).tolist()
         turns = self.turn_points(x, sizes)
         x = torch.cat([part @ T for part, T in zip(x.split(sizes), turns, strict=True)])
         x = self.local(x)
@@ -204,7 +208,8 @@ class PointNet(nn.Module):
 
     def directions(self, seen: SeenPoints) -> Float[Tensor, "points keypoints 3"]:
         """Answer for each point's own class: what every network that votes offers."""
-        points_m, cloud = seen.points_m, seen.coordinates[:, 0].long()
+        points_m = seen.points_m
+        cloud = seen.coordinates[:, 0].long()
         sizes = torch.bincount(cloud)
         sums_m = points_m.new_zeros(len(sizes), 3).index_add(0, cloud, points_m)
         local_m = points_m - (sums_m / sizes[:, None])[cloud]

@@ -251,8 +251,8 @@ _MM = {"cm": 10.0, "inches": 25.4}
 _LARGEST_SHARE = 1.5  # a cloud is part of its object; noise and grown masks make it somewhat larger
 _SMALLEST_SHARE = 0.1  # what shows less than a tenth of the diameter cannot be posed anyway
 _LIKELY_SHARE = 0.3  # a cloud too large is of another unit if that makes it as long as this
-_USUAL_SHARE, _AS_LIKELY = 0.7, 0.3
-"""What is seen of an object is about so long; of units that give it within 35 % all are named."""
+_USUAL_SHARE = 0.7  # of the diameter, the length of a usual view of an object
+_AS_LIKELY = 0.3  # difference of log lengths, up to which a unit fits nearly as well as the best
 
 
 def unit_advice(model_diameter_m: float, points_m: Float[Tensor, "n 3"]) -> str | None:
@@ -274,9 +274,9 @@ def unit_advice(model_diameter_m: float, points_m: Float[Tensor, "n 3"]) -> str 
     share = size_m / model_diameter_m
     if _SMALLEST_SHARE <= share <= _LARGEST_SHARE:
         return None
-    more, larger, smaller = max(share, 1 / share), "model", "cloud"
-    if share > 1:
-        larger, smaller = smaller, larger
+    more = max(share, 1 / share)
+    larger = "cloud" if share > 1 else "model"
+    smaller = "model" if share > 1 else "cloud"
     # Five times too large is a mask of more than the object sooner than a sliver in inches.
     least = _LIKELY_SHARE if share > 1 else _SMALLEST_SHARE
     fits = {unit: share * factor if share < 1 else share / factor
@@ -304,7 +304,8 @@ def frame_advice(points_m: Float[Tensor, "n 3"]) -> str | None:
     What a camera sees lies before it, less than 60 degrees off its axis.
     """
     behind = float((points_m[:, 2] <= 0).float().mean())
-    across_m, forward_m = points_m[:, :2].median(0).values.abs(), points_m[:, 2].median().abs()
+    across_m = points_m[:, :2].median(0).values.abs()
+    forward_m = points_m[:, 2].median().abs()
     if float(across_m.max()) > _STEEP * float(forward_m):
         axis = "xy"[int(across_m.argmax())]
         return (

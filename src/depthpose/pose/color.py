@@ -146,8 +146,10 @@ def _blurred(color: ColorImage, poses: Rigid, surface: SurfaceColors) -> _Blurre
     reach = math.ceil(3 * sigma)
     low = pixels[is_front].amin(0) - 2 * reach
     high = pixels[is_front].amax(0) + 2 * reach
-    left, right = int(low[0].clamp(0, width - 1)), int(high[0].clamp(0, width - 1)) + 1
-    top, bottom = int(low[1].clamp(0, height - 1)), int(high[1].clamp(0, height - 1)) + 1
+    left = int(low[0].clamp(0, width - 1))
+    right = int(high[0].clamp(0, width - 1)) + 1
+    top = int(low[1].clamp(0, height - 1))
+    bottom = int(high[1].clamp(0, height - 1)) + 1
     steps = torch.arange(-reach, reach + 1, dtype=torch.float32)
     kernel = torch.exp(-(steps**2) / (2 * sigma**2))
     kernel /= kernel.sum()
@@ -224,7 +226,8 @@ def _without_light(
     """Take means off features, and off brightness what is linear in the normal (Lambert)."""
     total = weight.sum(1, keepdim=True).clamp(min=1)
     features = (features - (weight * features).sum(1, keepdim=True) / total) * weight
-    lit, used = features[..., :1], weight[..., :1]
+    lit = features[..., :1]
+    used = weight[..., :1]
     sides = (normals - (used * normals).sum(1, keepdim=True) / total[..., :1]) * used
     moments = sides.mT @ sides + _RIDGE * total[..., :1] * torch.eye(3, dtype=torch.float64)
     shade = sides @ torch.linalg.solve(moments, sides.mT @ lit)

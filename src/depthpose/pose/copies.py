@@ -172,7 +172,8 @@ def difference_of(pose: Rigid, from_pose: Rigid, copies: SymmetricCopies) -> str
     axis = torch.linalg.svd(turn - torch.eye(3, dtype=turn.dtype)).Vh[-1]
     skew = torch.stack([turn[2, 1] - turn[1, 2], turn[0, 2] - turn[2, 0], turn[1, 0] - turn[0, 1]])
     axis = axis if float(axis @ skew) >= 0 else -axis
-    lengths, names = copies.lengths_m, {}
+    lengths = copies.lengths_m
+    names = {}
     if lengths[0] > _LONGER * lengths[1]:
         names[0] = "the long axis"
     if lengths[1] > _LONGER * lengths[2]:

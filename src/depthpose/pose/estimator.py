@@ -62,7 +62,8 @@ class PoseEstimator:
         self, models: Sequence[ObjectModel], config: EstimateConfig | None, refusal: RefusalConfig
     ) -> None:
         self.config = EstimateConfig() if config is None else config
-        self.models, self.refusal = tuple(models), refusal
+        self.models = tuple(models)
+        self.refusal = refusal
         self.objects = tuple(model.name for model in models)
         """Names of the objects."""
         self._objects: dict[str, PreparedObject] = {}  # those that were asked for

@@ -81,7 +81,8 @@ def direction_graph(network: ResUNet) -> Graph:
     (voxels, ``config.inputs``; float32: the number 1 where there is one). Output ``directions``
     (voxels, classes, keypoints, 3), not normalised, in the order of the voxels given.
     """
-    net, graph = fold_norms(network.eval()), Graph()
+    net = fold_norms(network.eval())
+    graph = Graph()
     coordinates = graph.input("coordinates", np.int64, ("voxels", 4))
     x = graph.input("features", np.float32, ("voxels", net.config.inputs))
     convolve = GraphConvolutions(coordinates).convolve

@@ -96,11 +96,13 @@ def refine_pose(
     """
     config = IcpConfig() if config is None else config
     # The limit shrinks in even ratios over half of the steps; then it is kept, and checked by.
-    start, end = config.start_distance_diameters, config.end_distance_diameters
+    start = config.start_distance_diameters
+    end = config.end_distance_diameters
     half = max(1, config.iterations // 2)
     shares = [start * (end / start) ** min(1.0, i / half) for i in range(config.iterations)]
     limits_m = [share * surface.diameter_m for share in (*shares, end)]
-    most, initial = config.cloud_points, initial.double()
+    most = config.cloud_points
+    initial = initial.double()
     pose, index = _iterated(points_m, most, initial, surface, limits_m, is_exact=True)
     cloud = take_evenly(points_m.double(), most)
     H, _, J, weight, residual_m, spread_m = _normal_equations(
@@ -111,7 +113,8 @@ def refine_pose(
     ray = torch.nn.functional.normalize(middle_m, dim=0)
     offset_m = config.sensor_offset_m * torch.cat([torch.zeros(3), ray])
     local = local + torch.outer(offset_m, offset_m)
-    eye, zero = torch.eye(3, dtype=torch.float64), torch.zeros(3, 3, dtype=torch.float64)
+    eye = torch.eye(3, dtype=torch.float64)
+    zero = torch.zeros(3, 3, dtype=torch.float64)
     # w x (p - c) + v = w x p + (v + c x w)
     shift = torch.cat([torch.cat([eye, zero], 1), torch.cat([cross_matrix(middle_m), eye], 1)])
     return RefinedPose(
@@ -148,7 +151,8 @@ def refine_best(
     config = IcpConfig() if config is None else config
     given = Rigid(initial.R.reshape(-1, 3, 3), initial.t_m.reshape(-1, 3))
     # The poses, then all of them turned once, twice ... about the middle of the object.
-    poses, axes = given.double(), torch.eye(3, dtype=torch.float64)
+    poses = given.double()
+    axes = torch.eye(3, dtype=torch.float64)
     middle_m = poses.R @ surface.points_m.mean(0) + poses.t_m
     axes = torch.cat([torch.zeros(1, 3).double(), axes, -axes])[: config.starts]
     turns = rotation_by(_TURN_RAD * axes)[:, None]
@@ -162,7 +166,8 @@ def refine_best(
     refined = None
     if best < len(given.R):  # the table is rough: where little holds a pose, starts drift by it
         refined = refine_pose(points_m, given[best], surface, short)
-        exact, rough = refined.camera_from_model.double(), tried[best]
+        exact = refined.camera_from_model.double()
+        rough = tried[best]
         both = Rigid.stack([exact, rough])
         if float(_score(points_m, both, surface, end_m).diff()) > 0:
             refined = None  # it began farther off than exact steps reach
@@ -222,7 +227,8 @@ def _iterated(
 
         parts = [part.detach().numpy() for part in (pose.R, pose.t_m)]
         R, t_m = (torch.from_numpy(finite_array(part).copy()) for part in parts)
-        target, points = surface.target, finite_array(cloud.detach().numpy())
+        target = surface.target
+        points = finite_array(cloud.detach().numpy())
         arrays = (points, R.view(-1, 3, 3).numpy(), t_m.view(-1, 3).numpy(), np.array(limits_m))
         places = np.full((len(arrays[2]), len(points)), -1)
         refine(*arrays, surface.diameter_m, _CONVERGED, target, is_exact, places)
@@ -230,7 +236,8 @@ def _iterated(
         return Rigid(R, t_m), index.view(*t_m.shape[:-1], len(points))
     scale = torch.tensor([1.0] * 3 + [surface.diameter_m] * 3, dtype=torch.float64)
     moves = torch.ones_like(pose.t_m[..., :1])
-    index, steps = torch.full((*pose.t_m.shape[:-1], len(cloud)), -1), len(limits_m) - 1
+    index = torch.full((*pose.t_m.shape[:-1], len(cloud)), -1)
+    steps = len(limits_m) - 1
     for k, limit_m in enumerate(limits_m):
         how = LOOKED_UP if not is_exact else SEARCHED if 2 * k < steps else ON_RAY
         matches = match(cloud, pose, surface, limit_m, how, index)
@@ -289,7 +296,8 @@ def match(
         before: what was found a step earlier.
     """
     poses = Rigid(pose.R.reshape(-1, 3, 3), pose.t_m.reshape(-1, 3))
-    local_m, eyes_m = poses.inverse().apply(cloud_m), poses.inverse().t_m[:, None]
+    local_m = poses.inverse().apply(cloud_m)
+    eyes_m = poses.inverse().t_m[:, None]
     if how == LOOKED_UP:
         index = surface.boxes.look_up(local_m)
         index = torch.where(_is_seen(eyes_m, index, surface), index, surface.across[index])
@@ -297,14 +305,17 @@ def match(
         return torch.where(is_good, index, -1).reshape(*pose.t_m.shape[:-1], -1)
     if how == ON_RAY and before is not None:
         own = before.reshape(local_m.shape[:2])
-        ray_m, normal, point_m = local_m - eyes_m, surface.normals[own], surface.points_m[own]
+        ray_m = local_m - eyes_m
+        normal = surface.normals[own]
+        point_m = surface.points_m[own]
         slope = (normal * ray_m).sum(-1, keepdim=True)
         share = (normal * (point_m - local_m)).sum(-1, keepdim=True) / slope
         is_met = slope.square() > GRAZING**2 * ray_m.square().sum(-1, keepdim=True)
         meet_m = torch.where(is_met, local_m + share * ray_m, point_m)
         local_m = torch.where(own[..., None] >= 0, meet_m, local_m)
     # Ask for ever more of the nearest samples until one is seen.
-    count, total = 1, len(surface.points_m)
+    count = 1
+    total = len(surface.points_m)
     index = torch.full(local_m.shape[:2], -1)
     which, place = (index < 0).nonzero(as_tuple=True)
     while len(which):
@@ -314,10 +325,12 @@ def match(
         is_some = nearest < total  # the tree's word for none within the limit
         nearest = nearest.clamp(max=total - 1)
         is_good = is_some & _is_seen(eyes_m[which, 0, None], nearest, surface)
-        first, is_done = is_good.int().argmax(1), is_good.any(1)
+        first = is_good.int().argmax(1)
+        is_done = is_good.any(1)
         index[which[is_done], place[is_done]] = nearest[is_done, first[is_done]]
         is_left = ~is_done & is_some.all(1) & (count < total)
-        which, place = which[is_left], place[is_left]
+        which = which[is_left]
+        place = place[is_left]
         count = min(8 * count, total)
     return index.reshape(*pose.t_m.shape[:-1], -1)
 
@@ -403,7 +416,8 @@ def _covariance(
     shares = (slope[..., None] * J)[..., None] * J[..., None, :]
     flat_m = cloud[:, :2] / cloud[:, 2:] * cloud[:, 2].mean()
     eye = torch.eye(6, dtype=torch.float64)
-    most, ways = torch.ones_like(values), eye.expand_as(own)
+    most = torch.ones_like(values)
+    ways = eye.expand_as(own)
     for side in _BLOCKS:
         cells = (flat_m / (side * diameter_m)).floor() @ torch.tensor([1.0, 1e6]).double()
         _, block = cells.unique(return_inverse=True)

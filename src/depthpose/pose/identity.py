@@ -258,7 +258,8 @@ def identify(
         f"{scale.times:.2f} times the model's size fits best (standard deviation {scale.sigma:.2f})"
     )
 
-    status, reason = "not excluded", ""
+    status = "not excluded"
+    reason = ""
     # Sides that deviate from the model may fit its mirror image a little better.
     deviation = object_m / math.sqrt(INDEPENDENT_SIDES) / (NEAR * surface.diameter_m)
     least_gain = max(_MIRROR_GAIN, deviation, scale.gain if is_other_size else 0.0)

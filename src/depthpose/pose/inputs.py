@@ -124,7 +124,8 @@ def rigid_input(
             f"{name} is a {type(pose).__name__} of shape {tuple(matrix.shape)}; give a Rigid, or "
             f"the 4x4 matrix {what} in metres"
         )
-    R, last = matrix[:3, :3], matrix.new_tensor([0, 0, 0, 1])
+    R = matrix[:3, :3]
+    last = matrix.new_tensor([0, 0, 0, 1])
     is_rotation = torch.allclose(R @ R.T, torch.eye(3).to(R), atol=1e-4) and torch.det(R) > 0
     if not is_rotation or not torch.equal(matrix[3], last):
         raise InputError(

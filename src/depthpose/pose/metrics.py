@@ -40,7 +40,8 @@ def adds_m(
     So BOP and Hinterstoisser; DenseFusion and the method's published code go the other way, from
     each estimated point to the nearest true one.
     """
-    first, second = _moved(true, points_m), _moved(estimated, points_m)
+    first = _moved(true, points_m)
+    second = _moved(estimated, points_m)
     rows = zip(first.reshape(-1, *first.shape[-2:]), second.reshape(-1, *second.shape[-2:]),
                strict=True)  # fmt: skip
     means = [float(KDTree(b.numpy()).query(a.numpy())[0].mean()) for a, b in rows]
@@ -56,10 +57,8 @@ def add_of_nearest_m(
     90 degrees, and not only those that leave the object as it is. Poses are ``camera_from_model``,
     symmetries a batch with the identity, of ``mesh.symmetry_transforms``.
     """
-    moved_m, copies = (
-        _moved(estimated, points_m),
-        _symmetric_copies(true, symmetries, len(points_m)),
-    )
+    moved_m = _moved(estimated, points_m)
+    copies = _symmetric_copies(true, symmetries, len(points_m))
     return torch.cat([(_moved(c, points_m) - moved_m).norm(dim=-1).mean(-1) for c in copies]).min()
 
 
@@ -70,10 +69,8 @@ def mssd_m(
 
     The arguments are those of :func:`add_of_nearest_m`.
     """
-    moved_m, copies = (
-        _moved(estimated, points_m),
-        _symmetric_copies(true, symmetries, len(points_m)),
-    )
+    moved_m = _moved(estimated, points_m)
+    copies = _symmetric_copies(true, symmetries, len(points_m))
     return torch.cat([(_moved(c, points_m) - moved_m).norm(dim=-1).amax(-1) for c in copies]).min()
 
 
@@ -137,7 +134,8 @@ def vsd(
         (model > 0) & ((model - measured <= delta_m) | (measured == 0)) for model in (known, found)
     )
     is_found |= is_known & (found > 0)
-    both, either = is_known & is_found, is_known | is_found
+    both = is_known & is_found
+    either = is_known | is_found
     count = int(either.sum())
     if count == 0:
         return torch.ones(len(taus_m), dtype=torch.float64)
@@ -199,7 +197,8 @@ def _moved(pose: Rigid, points_m: Float[Tensor, "n 3"]) -> Float[Tensor, "*batch
 def _symmetric_copies(true: Rigid, symmetries: Rigid, points: int) -> list[Rigid]:
     """Poses that look like the true one, in groups that fit into memory."""
     pose = true.double()
-    R, t_m = symmetries.R.double(), symmetries.t_m.double()
+    R = symmetries.R.double()
+    t_m = symmetries.t_m.double()
     size = max(1, _CHUNK // (3 * points))
     return [
         Rigid(pose.R @ rows, pose.t_m + (pose.R @ shift[..., None]).squeeze(-1))

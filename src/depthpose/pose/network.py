@@ -123,7 +123,8 @@ class ResUNet(nn.Module):
     def __init__(self, config: ResUNetConfig | None = None) -> None:
         super().__init__()
         self.config = config = config or ResUNetConfig()
-        e, d = config.encoder, config.decoder
+        e = config.encoder
+        d = config.decoder
         self.down = nn.ModuleList([ConvNorm(config, config.inputs, e[0], config.first_kernel)])
         self.down.extend(ConvNorm(config, e[i - 1], e[i], 3, 2) for i in (1, 2, 3))
         self.down_blocks = nn.ModuleList(Block(width, config) for width in e)
@@ -199,7 +200,8 @@ def fold_norms(network: ResUNet) -> ResUNet:
             continue
         target = folded.get_submodule(name)
         assert isinstance(target, ConvNorm)
-        norm, into = source.norm, target.conv
+        norm = source.norm
+        into = target.conv
         assert norm is not None and norm.running_var is not None and norm.running_mean is not None  # noqa: PT018
         assert into.bias is not None
         scale = norm.weight * (norm.running_var + norm.eps).rsqrt()
@@ -230,7 +232,9 @@ def unfold_norms(folded: ResUNet, network: ResUNet, voxels: Voxels) -> None:
     for name, source in sources.items():
         target = network.get_submodule(name)
         assert isinstance(target, ConvNorm)
-        conv, norm, bias = target.conv, target.norm, source.conv.bias
+        conv = target.conv
+        norm = target.norm
+        bias = source.conv.bias
         assert norm is not None and norm.running_var is not None and norm.running_mean is not None  # noqa: PT018
         assert bias is not None
         variance, mean = torch.var_mean(outputs[source], 0, correction=0)

@@ -87,7 +87,8 @@ def _batches(
         count = len(job.cloud.points_m) if isinstance(job, CloudToPose) else 0
         if group and total + count > most:
             yield group
-            group, total = [], 0
+            group = []
+            total = 0
         group.append(job)
         total += count
     if group:
@@ -152,7 +153,8 @@ class GeoPoseNet(PoseEstimator):
     """The same as :meth:`load`."""
 
     def __repr__(self) -> str:
-        names, named = self.objects, f", weights {self.name!r}" if self.name else ""
+        names = self.objects
+        named = f", weights {self.name!r}" if self.name else ""
         objects = ", ".join(names) if len(names) <= 5 else f"{len(names)} objects"
         kind = type(self._network).__name__
         return f"GeoPoseNet({kind} of {objects}{named}, {self.config.device})"
@@ -265,13 +267,16 @@ class GeoPoseNet(PoseEstimator):
 
     def _vote(self, given: AnyInput, *, job: CloudToPose, is_likely: bool) -> PoseEstimate:
         """Vote for the keypoints, fit the pose to them, refine it, and decide by the evidence."""
-        config, prepared, cloud = self.config, job.prepared, job.cloud
+        config = self.config
+        prepared = job.prepared
+        cloud = job.cloud
         cloud_m = cloud.cloud_m.double()
         seconds = dict(job.seconds)
 
         # Propose: where the directions meet are the keypoints, to which the model's are fitted.
         began = time.perf_counter()
-        points_m, directions = cloud.points_m.double(), job.directions.double()
+        points_m = cloud.points_m.double()
+        directions = job.directions.double()
         if config.voting.method == "ransac":
             vote = vote_ransac(points_m, directions, config=config.voting)
         else:
@@ -295,7 +300,8 @@ class GeoPoseNet(PoseEstimator):
         if config.with_icp:
             refinement = refine_best(cloud_m, poses, prepared.surface, config.icp)
             if float(refinement.refined.inlier_share) > 0:
-                leading, others = refinement.refined, refinement.others
+                leading = refinement.refined
+                others = refinement.others
                 icp = config.icp
             seconds["icp"] = time.perf_counter() - began
 
@@ -374,7 +380,9 @@ class DepthImageRegressor(PoseEstimator):
         prepared = self._known(given.object)
         if not isinstance(given, ViewInput):
             raise InputError(_NEEDS_MASK)
-        config, model, began = self._network.config, prepared.model, time.perf_counter()
+        config = self._network.config
+        model = prepared.model
+        began = time.perf_counter()
         crop = cut_depth(given, config, model.diameter_m)
         if crop is None:
             reason = f"fewer than {config.min_points} masked pixels have a depth"

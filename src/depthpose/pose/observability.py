@@ -52,11 +52,13 @@ def observability(
     if int(near.sum()) < 6:
         return 0.0, weakest
     normal = (surface.normals[index] @ pose.R.mT)[near]
-    middle, radius_m = points.mean(0), surface.diameter_m / 2
+    middle = points.mean(0)
+    radius_m = surface.diameter_m / 2
     arm = points[near] - middle
     J = torch.cat([torch.linalg.cross(arm, normal) / radius_m, normal], -1)
     # Declared symmetries as motions about the middle, turns in metres at the radius.
-    turn, shift = free[:, :3].double(), free[:, 3:].double()
+    turn = free[:, :3].double()
+    shift = free[:, 3:].double()
     motions = torch.cat([turn * radius_m, shift + turn @ cross_matrix(middle)], -1)
     _, _, rows = torch.linalg.svd(motions)  # the last ones are orthogonal to all of them
     basis = rows[int(torch.linalg.matrix_rank(motions, rtol=1e-9)) :].T

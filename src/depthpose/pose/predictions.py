@@ -38,7 +38,8 @@ from depthpose.pose.types import (
 
 POSES = "poses.json"
 VERSION = 2  #: of an entry of ``poses.json``; ``docs/poses.schema.json`` describes it
-PICTURE, CLOUD = "pose.png", "pose.ply"  #: what follows ``NAME.`` in files that show a pose
+PICTURE = "pose.png"  #: after ``NAME.``: the picture that shows a pose
+CLOUD = "pose.ply"  #: and the cloud
 STAGES = (
     "search", "segmentation", "cloud", "network", "proposal", "icp", "evidence", "decision",
 )  # fmt: skip
@@ -145,7 +146,8 @@ def score_of(estimate: PoseEstimate) -> float:
 
 def prediction_row(prediction: Prediction) -> dict[str, Any]:
     """Give the JSON values of an entry of ``poses.json``."""
-    estimate, place = prediction.estimate, prediction.place
+    estimate = prediction.estimate
+    place = prediction.place
     pose = estimate.camera_from_model
     row: dict[str, Any] = {"version": VERSION, "name": estimate.name, "object": estimate.object}
     row |= dict(zip(_PLACE, place, strict=True)) if place is not None else {}
@@ -192,10 +194,12 @@ def parse_prediction(row: dict[str, Any], source: str) -> Prediction:
             f"{source}: version is {row['version']!r}, and this depthpose reads {VERSION}; read it "
             "with the depthpose that wrote it, or a newer one"
         )
-    name, what = row.get("name"), row.get("object")
+    name = row.get("name")
+    what = row.get("object")
     if not isinstance(name, str) or not isinstance(what, str):
         raise InputError(f"{source}: name and object are {name!r} and {what!r}; write two words")
-    status, reason = row.get("status"), row.get("reason", "")
+    status = row.get("status")
+    reason = row.get("reason", "")
     if status not in get_args(Status):
         statuses = get_args(Status)
         raise InputError(f"{source}: status {status!r}: {nearest_name(str(status), statuses)}")
@@ -208,7 +212,8 @@ def parse_prediction(row: dict[str, Any], source: str) -> Prediction:
             f"{source}: an estimate that is ok or ambiguous has a camera_from_model, a refused one "
             f"none; all but ok have a reason; its status is {status!r}"
         )
-    entries, alternatives = row.get("alternatives", []), list[Alternative]()
+    entries = row.get("alternatives", [])
+    alternatives = list[Alternative]()
     if not isinstance(entries, list) or not all(isinstance(entry, dict) for entry in entries):
         raise InputError(f"{source}: alternatives are no list of poses; write [...] of them")
     for k, entry in enumerate(entries):
@@ -238,7 +243,8 @@ def parse_prediction(row: dict[str, Any], source: str) -> Prediction:
         raise InputError(f"{source}: seconds is {seconds!r}, where names to numbers belong")
     values["seconds"] = {str(stage): number(seconds, stage, None, source) for stage in seconds}
     for key, kind in (("evidence", Evidence), ("identity", Identity)):
-        value, where = row.get(key), f"{source}: {key}"
+        value = row.get(key)
+        where = f"{source}: {key}"
         if value is not None and not isinstance(value, dict):
             raise InputError(f"{where} is {value!r}, where names to values belong")
         values[key] = None if value is None else config_from_dict(value, kind, source=where)
@@ -391,7 +397,8 @@ def instance_jobs(
     """
     jobs: list[PoseJob[ViewInput]] = []
     for instance in dataset.instances:
-        mask, object = None, names[instance.object_id]
+        mask = None
+        object = names[instance.object_id]
         if predicted_mask is not None:
             file = predicted_mask.format(object=instance.object_id, image=instance.image_id)
             mask = dataset.folder / file
@@ -462,7 +469,8 @@ def detection_jobs(
             if detection.seconds is None
             else {"segmentation": detection.seconds / sharing[place[:2]]}
         )
-        instance, object = shown[place][0], names[place.object_id]
+        instance = shown[place][0]
+        object = names[place.object_id]
         read = partial(_read_view, dataset, instance, name, object, detection)
         jobs.append(PoseJob(name=name, read=read, place=place, seconds=seconds))
     return jobs
@@ -504,7 +512,8 @@ def read_bop_results(path: str | Path) -> list[Prediction]:
             raise InputError(f"{source}: {len(row)} values, where {len(_HEADER)} belong")
         try:
             place = Place(*(int(value) for value in row[:3]))
-            score, time_s = float(row[3]), float(row[6])
+            score = float(row[3])
+            time_s = float(row[6])
             R, t_mm = ([float(value) for value in text.split()] for text in row[4:6])
         except ValueError as error:
             raise InputError(
@@ -564,7 +573,8 @@ def write_bop_results(
     writer = csv.writer(text, lineterminator="\n")
     writer.writerow(_HEADER)
     for prediction in entries:
-        estimate, place = prediction.estimate, prediction.place
+        estimate = prediction.estimate
+        place = prediction.place
         if estimate.camera_from_model is None:
             continue
         if place is None:

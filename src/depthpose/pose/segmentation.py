@@ -35,8 +35,9 @@ ENCODER_KIND = "resnet18"
 WIDTHS = (64, 128, 256, 512)  #: channels of the four stages in the published network
 
 Widths = tuple[int, int, int, int]
-MEAN, STD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
-"""Of ImageNet's colours in [0, 1]: what published weights expect to be taken off."""
+MEAN = (0.485, 0.456, 0.406)
+STD = (0.229, 0.224, 0.225)
+"""Of ImageNet's colours in [0, 1], by which published weights expect images to be normalised."""
 
 
 class BasicBlock(nn.Module):
@@ -172,7 +173,8 @@ class FCN(nn.Module):
             for parameter in self.scores[1:].parameters():
                 parameter.zero_()
             # An enlargement begins as the bilinear one, each class by itself.
-            ramp, each = torch.tensor([0.25, 0.75, 0.75, 0.25]), torch.arange(classes)
+            ramp = torch.tensor([0.25, 0.75, 0.75, 0.25])
+            each = torch.arange(classes)
             for weight in self.enlarge.parameters():
                 weight.zero_()
                 weight[each, each] = ramp[:, None] * ramp
@@ -294,7 +296,8 @@ class Segmenter:
             if len(parts):
                 score = torch.stack([probability[number][part].mean() for part in parts])
                 order = score.argsort(descending=True)
-                masks[name], scores[name] = parts[order], score[order]
+                masks[name] = parts[order]
+                scores[name] = score[order]
         return Segmentation(masks=masks, scores=scores)
 
 

@@ -44,13 +44,15 @@ Keys = Int64[Tensor, " _"]
 def pack(coordinates: Int[Tensor, "n 4"]) -> Keys:
     """Pack rows of (cloud, x, y, z) into keys."""
     if len(coordinates):
-        lowest, highest = coordinates.amin(0).tolist(), coordinates.amax(0).tolist()
+        lowest = coordinates.amin(0).tolist()
+        highest = coordinates.amax(0).tolist()
         if lowest[0] < 0 or highest[0] >= CLOUD_LIMIT:
             raise InputError(
                 f"cloud numbers run from {lowest[0]} to {highest[0]}, but a batch holds clouds "
                 f"0 .. {CLOUD_LIMIT - 1}; split the batch."
             )
-        low, high = min(lowest[1:]), max(highest[1:])
+        low = min(lowest[1:])
+        high = max(highest[1:])
         if low < -COORDINATE_LIMIT or high >= COORDINATE_LIMIT:
             raise InputError(
                 f"voxel coordinates run from {low} to {high}, but must lie in "
@@ -87,14 +89,16 @@ class VoxelIndex:
 
     def __init__(self, keys: Keys, step: int) -> None:
         """Index the sorted keys of a level whose voxels lie ``step`` apart."""
-        self._keys, self._step = keys, step
+        self._keys = keys
+        self._step = step
         self._low = self._strides = keys.new_zeros(4)
         self._table: Tensor | None = None
         if not len(keys):
             return
         coordinates = unpack(keys)
         coordinates[:, 1:] >>= step.bit_length() - 1
-        low, high = coordinates.amin(0), coordinates.amax(0)
+        low = coordinates.amin(0)
+        high = coordinates.amax(0)
         sides = (high - low + 1).tolist()
         sides[1:] = [side + 2 * MARGIN for side in sides[1:]]
         cells = sides[0] * sides[1] * sides[2] * sides[3]
@@ -103,7 +107,8 @@ class VoxelIndex:
         low[1:] -= MARGIN
         strides = [sides[1] * sides[2] * sides[3], sides[2] * sides[3], sides[3], 1]
         device = low.device
-        self._low, self._strides = low, torch.tensor(strides, device=device)
+        self._low = low
+        self._strides = torch.tensor(strides, device=device)
         self._table = torch.full((cells,), len(coordinates), dtype=torch.int32, device=device)
         rows = torch.arange(len(coordinates), dtype=torch.int32, device=device)
         self._table[((coordinates - low) * self._strides).sum(1)] = rows
@@ -184,8 +189,10 @@ class NeighbourTable:
         """The pairs as a grid; ``is_transposed``: from the coarse rows to the fine ones."""
         if is_transposed not in self._slots:
             pairs = self.pairs
-            read, inputs = pairs.fine, self.fine_rows
-            written, outputs = pairs.coarse, self.table.shape[1]
+            read = pairs.fine
+            inputs = self.fine_rows
+            written = pairs.coarse
+            outputs = self.table.shape[1]
             if is_transposed:
                 read, inputs, written, outputs = written, outputs, read, inputs
             grid = read.new_full((len(self.table) * pairs.most,), inputs)
@@ -207,7 +214,8 @@ class KernelMap:
         """Give each filled offset with the rows that its pairs read, and those they add to."""
         pairs = self.neighbours.pairs
         # Lists of views, each from one call: slicing one by one costs as much as small products.
-        fine, coarse = pairs.fine.split(pairs.counts), pairs.coarse.split(pairs.counts)
+        fine = pairs.fine.split(pairs.counts)
+        coarse = pairs.coarse.split(pairs.counts)
         rows_in, rows_out = (coarse, fine) if self.is_transposed else (fine, coarse)
         return zip(pairs.filled, rows_in, rows_out, strict=True)
 
@@ -307,13 +315,15 @@ def conv(
     device = features.device.type
     if torch.is_autocast_enabled(device):
         narrower = torch.get_autocast_dtype(device)
-        features, weight = features.to(narrower), weight.to(narrower)
+        features = features.to(narrower)
+        weight = weight.to(narrower)
     is_plain = features.dtype == weight.dtype == torch.float32
     near = kernel_map.neighbours
     if is_plain and use_numba(features, weight) and near.table.numel() <= COMPILED_ELEMENTS:
         from depthpose.pose.compiled.points import convolve
 
-        read, written = near.fine_rows, near.table.shape[1]
+        read = near.fine_rows
+        written = near.table.shape[1]
         if kernel_map.is_transposed:
             read, written = written, read
         assert features.shape == (read, weight.shape[1]), "a row for each voxel"
@@ -365,7 +375,8 @@ class _Convolution(torch.autograd.Function):
 
 
 def _convolve(x: Tensor, weight: Tensor, m: KernelMap) -> Tensor:
-    way, near = _way(x, weight, m), m.neighbours
+    way = _way(x, weight, m)
+    near = m.neighbours
     if way == "table":
         return _table(x, m).T @ weight.flatten(0, 1)
     if way == "grid":  # all offsets in one operation each, padded to the fullest
@@ -376,7 +387,8 @@ def _convolve(x: Tensor, weight: Tensor, m: KernelMap) -> Tensor:
         out = F.embedding_bag(slots.order, products, slots.starts, mode="sum")
     else:  # an offset at a time: its pairs write each row once at most
         written = near.fine_rows if m.is_transposed else near.table.shape[1]
-        out, kernels = x.new_zeros(written, weight.shape[2]), weight.unbind()
+        out = x.new_zeros(written, weight.shape[2])
+        kernels = weight.unbind()
         for offset, read, write in m.by_offset():
             out.index_add_(0, write, x.index_select(0, read) @ kernels[offset])
     return out if near.centre is None else out.addmm_(x, weight[near.centre])
@@ -384,7 +396,8 @@ def _convolve(x: Tensor, weight: Tensor, m: KernelMap) -> Tensor:
 
 def _read(x: Tensor, m: KernelMap) -> Tensor:
     """Gather the slots of (volume, most); empty ones read a row of zeros."""
-    near, padded = m.neighbours, F.pad(x, (0, 0, 0, 1))
+    near = m.neighbours
+    padded = F.pad(x, (0, 0, 0, 1))
     read = padded.index_select(0, near.slots(is_transposed=m.is_transposed).read)
     return read.view(len(near.table), near.pairs.most, x.shape[1])
 
@@ -399,7 +412,8 @@ def _table(x: Tensor, m: KernelMap) -> Tensor:
 
 def _way(x: Tensor, weight: Tensor, m: KernelMap) -> Literal["table", "grid", "offset by offset"]:
     """Choose what is gathered at once: all that is read, the padded pairs, or one offset's."""
-    table, channels = m.neighbours.table, x.shape[1]
+    table = m.neighbours.table
+    channels = x.shape[1]
     is_small = channels <= NARROW and table.numel() * channels <= TABLE_ELEMENTS
     if is_small and not m.is_transposed:
         return "table"
@@ -492,7 +506,8 @@ class SparseConv(nn.Module):
         self, inputs: int, outputs: int, kernel: int = 3, stride: int = 1, *, has_bias: bool = False
     ) -> None:
         super().__init__()
-        self.kernel, self.stride = kernel, stride
+        self.kernel = kernel
+        self.stride = stride
         self.weight = nn.Parameter(torch.empty(kernel**3, inputs, outputs))
         self.bias = nn.Parameter(torch.zeros(outputs)) if has_bias else None
         # Voxels of a surface fill about 1.5 k^2 of a kernel's k^3 cells (counted: 13 to 14 of 27).

@@ -27,7 +27,8 @@ _FRONT = 0.1  # points nearer to the camera than this share of the median are no
 _BOXES = 48  # boxes along the longest side of a model, to look up what is near without a search
 _MARGIN = 0.15  # of the diameter: so far the boxes reach beyond the model
 _VIEWS = 256  # directions from which a model is looked at
-_POINTS, _RING = 160, 64  # cells of a picture at most, and those beside its silhouette
+_POINTS = 160  # cells of a picture, at most
+_RING = 64  # cells beside its silhouette, at most
 BESIDE = 0.08
 """Of the diameter: where what is beside a silhouette is no farther than so much from its border in
 depth, the same surface goes on."""
@@ -115,7 +116,8 @@ class Surface:
         from depthpose.pose.compiled.points import Tree, planted
         from depthpose.pose.compiled.poses import Target
 
-        tree, boxes = Tree(*planted(finite_array(self.points_m.numpy()))), self.boxes
+        tree = Tree(*planted(finite_array(self.points_m.numpy())))
+        boxes = self.boxes
         place = np.full(len(self.points_m) + 1, -1)
         place[tree.order] = np.arange(len(self.points_m))
         return Target(
@@ -144,10 +146,12 @@ def finite_array(array: np.ndarray) -> np.ndarray:
 
 def _view_of(surface: Surface, toward: Tensor, across: Tensor) -> tuple[Tensor, ...]:
     """Gather a surface in cells of a picture; give the nearest points, and places beside them."""
-    cell_m, side = _CELL * surface.diameter_m, 2 * round(0.5 / _CELL) + 10
+    cell_m = _CELL * surface.diameter_m
+    side = 2 * round(0.5 / _CELL) + 10
     about_m = surface.points_m - surface.middle_m
     column, row = (about_m @ across.T / cell_m).floor().long().add(side // 2).unbind(-1)
-    place, near_m = row * side + column, about_m @ toward
+    place = row * side + column
+    near_m = about_m @ toward
     most_m = near_m.new_full((side**2,), -torch.inf).scatter_reduce_(0, place, near_m, "amax")
     first = torch.full((side**2,), len(place))
     first[place[near_m == most_m[place]]] = torch.arange(len(place))[near_m == most_m[place]]
@@ -237,7 +241,8 @@ def outer_sides(
     no outer side: their normals become 0. Given beside them is, for each sample, the number of the
     nearest one of an opposite side within the limit, or -1, and which samples are never seen.
     """
-    seen, looked = np.zeros((2, len(points))), np.full((2, len(points)), 1e-9)
+    seen = np.zeros((2, len(points)))
+    looked = np.full((2, len(points)), 1e-9)
     for axis in fibonacci_directions(_SIDE_DIRECTIONS).numpy():
         across = np.linalg.svd(axis[None])[2][1:]
         flat = np.floor(points @ across.T / cell).astype(np.int64)
@@ -259,7 +264,8 @@ def outer_sides(
     outer = share.argmax(0)
     is_clear = (share.max(0) > _SEEN_FROM) & (share.min(0) < _CLEARER * share.max(0))
     outward = normals * ((1 - 2 * outer) * is_clear)[:, None]
-    across, nearest = np.full(len(points), -1), np.full(len(points), np.inf)
+    across = np.full(len(points), -1)
+    nearest = np.full(len(points), np.inf)
     for column, sign in ((c, s) for c in range(3) for s in (1, -1)):
         (is_of_side,) = np.nonzero(sign * outward[:, column] > 0.577)
         if len(is_of_side) == 0:
@@ -315,7 +321,8 @@ def look_along_rays(
     mine, theirs = (
         ((ray - middle).floor().clamp(-_REACH, _REACH) + _REACH).long() for ray in (posed, seen)
     )
-    mine, theirs = mine[..., 0] * width + mine[..., 1], theirs[..., 0] * width + theirs[..., 1]
+    mine = mine[..., 0] * width + mine[..., 1]
+    theirs = theirs[..., 0] * width + theirs[..., 1]
     depth_m = torch.where(depth_m > 0, depth_m, torch.inf)
     nearest_m = depth_m.new_full((len(depth_m), cells), torch.inf)
     nearest_m = nearest_m.scatter_reduce_(1, mine, depth_m, "amin")
@@ -350,12 +357,14 @@ def compare_depths(
     posed_m = pose.apply(surface.points_m)
     # As the depth goes to 0 the rays of a surface span any number of cells.
     least_m = _FRONT * max(float(posed_m[:, 2].median()), 0.0)
-    posed_m, scene_m = posed_m[posed_m[:, 2] > least_m], scene_m[scene_m[:, 2] > 0]
+    posed_m = posed_m[posed_m[:, 2] > least_m]
+    scene_m = scene_m[scene_m[:, 2] > 0]
     if len(posed_m) == 0 or len(scene_m) == 0:
         return 0.0, 0.0, 0.0
     scale = float(posed_m[:, 2].median()) / (_CELL * surface.diameter_m)
     rays = [(points_m[:, :2] / points_m[:, 2:] * scale).floor() for points_m in (posed_m, scene_m)]
-    low, high = rays[0].amin(0), rays[0].amax(0)
+    low = rays[0].amin(0)
+    high = rays[0].amax(0)
     width = int((high - low)[0]) + 1
     cells = width * (int((high - low)[1]) + 1)
     nearest_m = []
@@ -369,7 +378,8 @@ def compare_depths(
     # Of a cell at the silhouette a sliver may be the object's, which no ray met: its neighbours do.
     around = -max_pool2d(-seen.reshape(1, -1, width), 3, 1, 1).flatten()
     limit_m = NEAR * surface.diameter_m
-    is_posed, is_read = posed.isfinite(), seen.isfinite()
+    is_posed = posed.isfinite()
+    is_read = seen.isfinite()
     through = is_posed & is_read & (around > posed + limit_m)
     before = is_posed & is_read & (seen < posed - limit_m)
     agrees = is_posed & is_read & ~through & ~before

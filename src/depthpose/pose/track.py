@@ -59,7 +59,8 @@ def scene_about(given: AnyInput, poses: Rigid, surface: Surface) -> Float64[Tens
     radius_m += float((middles_m - middle_m).norm(dim=-1).max())
     if isinstance(given, ViewInput):
         # The square about a ball, cut out of the view.
-        z_m, K = float(middle_m[2]), given.K.double().clone()
+        z_m = float(middle_m[2])
+        K = given.K.double().clone()
         near_m = max(z_m - radius_m, 0.1 * z_m)
         u, v = (K @ (middle_m / z_m))[:2].tolist()
         across, down = (float(K[k, k]) * radius_m / near_m for k in range(2))
@@ -263,7 +264,8 @@ def _is_support(
     scene_m: Float64[Tensor, "n 3"], near: Bool[Tensor, " n"], posed_m: Float64[Tensor, "m 3"]
 ) -> Bool[Tensor, " n"]:
     """Whether points are of a table or wall beside the object, onto which ICP would pull it."""
-    is_support, is_flat = torch.zeros_like(near), torch.zeros(len(posed_m), dtype=torch.bool)
+    is_support = torch.zeros_like(near)
+    is_flat = torch.zeros(len(posed_m), dtype=torch.bool)
     generator = torch.Generator().manual_seed(0)
     for _ in range(_SUPPORTS):
         beside_m = take_evenly(scene_m[~near & ~is_support], _BESIDE)

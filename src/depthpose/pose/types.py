@@ -349,7 +349,8 @@ class PoseEstimate:
         """
         if self.camera_from_model is None:
             return None
-        eye, t_m = torch.eye(3, dtype=torch.float64), self.camera_from_model.t_m.double()
+        eye = torch.eye(3, dtype=torch.float64)
+        t_m = self.camera_from_model.t_m.double()
         turned = torch.linalg.cross(eye, t_m.expand(3, 3)).mT
         std_m = self._std_along(torch.cat([turned, eye], 1), 1e-3)
         return None if std_m is None else 1000 * std_m

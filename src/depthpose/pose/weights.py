@@ -133,14 +133,16 @@ def complete_weights(path: Path, meshes: Mapping[int, ObjectModel], out: Path) -
     checkpoint = read_checkpoint(path)
     state = dict(checkpoint.state)
     for k, record in enumerate(checkpoint.config.get("models", ())):
-        number, keypoints_m = record["number"], state[f"models.{k}.keypoints_m"]
+        number = record["number"]
+        keypoints_m = state[f"models.{k}.keypoints_m"]
         if number not in meshes:
             raise InputError(
                 f"{path}: knows object {number} ({record['name']}), but there is no such model "
                 f"among {sorted(meshes)}. Give the data set that it was trained on."
             )
         model = meshes[number]
-        off_m, own_m = gap_to_surface_m(keypoints_m, model), record["diameter_m"]
+        off_m = gap_to_surface_m(keypoints_m, model)
+        own_m = record["diameter_m"]
         if off_m > _OFF * own_m or abs(model.diameter_m / own_m - 1) > _OTHER_SIZE:
             raise InputError(
                 f"{path}: a keypoint of object {number} ({record['name']}, {own_m:.3g} m long) "
@@ -209,7 +211,8 @@ def read_pose_weights(path: Path) -> PoseWeights:
         InputError: no such weights, a part that is missing, or weights that do not fit their own
             config.
     """
-    checkpoint, source = read_checkpoint(path), str(path)
+    checkpoint = read_checkpoint(path)
+    source = str(path)
     network = network_of(checkpoint, source)
     if not any(f"models.0.{name}" in checkpoint.state for name in _SURFACE):
         word = quote(str(path))
@@ -227,7 +230,8 @@ def read_pose_weights(path: Path) -> PoseWeights:
     with refused_as(path, "file of pose weights", "it is damaged, or of another version"):
         models: list[ObjectModel] = []
         for k, record in enumerate(records):
-            prefix, stored = f"models.{k}.", checkpoint.state.items()
+            prefix = f"models.{k}."
+            stored = checkpoint.state.items()
             state = {n.removeprefix(prefix): t for n, t in stored if n.startswith(prefix)}
             lost = [name for name in _TENSORS if name not in state]
             lost += [name for name in ("name", "number", "diameter_m") if name not in record]
@@ -235,7 +239,8 @@ def read_pose_weights(path: Path) -> PoseWeights:
                 raise InputError(
                     f"{source}: model {k} has no {lost[0]!r}; the file is of another version."
                 )
-            vertices, faces = state["vertices_m"], state["faces"].long()
+            vertices = state["vertices_m"]
+            faces = state["faces"].long()
             shapes = {name: tuple(tensor.shape[1:]) for name, tensor in state.items()}
             if set(shapes.values()) != {(3,)} or len(state["normals"]) != len(vertices):
                 raise InputError(

@@ -221,7 +221,8 @@ def _rows_of(text: Iterable[str], noted: list[str]) -> Iterator[str]:
             continue
         row, _, comment = plain_numbers(line).partition("#")
         if row.lstrip().startswith("//"):
-            row, comment = "", row.strip().removeprefix("//")
+            comment = row.strip().removeprefix("//")
+            row = ""
         if row := row.strip():
             is_begun = True
             yield row

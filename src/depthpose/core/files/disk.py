@@ -365,7 +365,8 @@ def refuse_yaml_bomb(path: AnyPath, text: str) -> None:
                 case yaml.AliasEvent():
                     if anchor not in sizes:
                         raise InputError(f"{path}: refers to itself (*{anchor}); write it out")
-                    anchor, size = None, sizes[anchor]
+                    size = sizes[anchor]
+                    anchor = None
                 case yaml.ScalarEvent():
                     size = 1
             if anchor is not None:

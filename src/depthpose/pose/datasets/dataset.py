@@ -146,7 +146,8 @@ def open_bop(folder: str | Path, split: str = "test") -> BopDataset:
     """
     folder = Path(folder)
     name, layout = layout_of(folder)
-    instances, digest = list(layout.instances(folder, split)), hashlib.sha256()
+    instances = list(layout.instances(folder, split))
+    digest = hashlib.sha256()
     for instance in instances:
         pose = instance.camera_from_model
         digest.update(f"{instance.name} {instance.object_id} {instance.depth_unit_m}".encode())
@@ -350,15 +351,18 @@ def write_bop_scene(
     infos: dict[str, list[dict[str, Any]]] = {}
     for frame in frames:
         name = f"{frame.number:06d}"
-        poses, more = list[dict[str, Any]](), list[dict[str, Any]]()
-        truths[str(frame.number)], infos[str(frame.number)] = poses, more
+        poses = list[dict[str, Any]]()
+        more = list[dict[str, Any]]()
+        truths[str(frame.number)] = poses
+        infos[str(frame.number)] = more
         write_depth_png(scene / "depth" / f"{name}.png", frame.depth_m, _DEPTH_UNIT_M)
         if frame.rgb is not None:
             write_image(scene / "rgb" / f"{name}.png", frame.rgb)
         for index, shown in enumerate(frame.objects):
             write_mask(scene / "mask_visib" / f"{name}_{index:06d}.png", shown.visible)
             write_mask(scene / "mask" / f"{name}_{index:06d}.png", shown.silhouette)
-            pose, full = shown.camera_from_model, int(shown.silhouette.sum())
+            pose = shown.camera_from_model
+            full = int(shown.silhouette.sum())
             visible = int(shown.visible.sum())
             poses.append(
                 {
@@ -407,7 +411,8 @@ def write_bop_models(folder: Path, models: Sequence[ObjectModel]) -> Path:
         data = shape.export(file_type="ply")
         assert isinstance(data, bytes)
         write_bytes(home / f"obj_{model.number:06d}.ply", data)
-        low, size = vertices.min(0), np.ptp(vertices, axis=0)
+        low = vertices.min(0)
+        size = np.ptp(vertices, axis=0)
         entry: dict[str, Any] = {"diameter": 1000 * model.diameter_m, "name": model.name}
         entry |= {f"min_{axis}": float(low[i]) for i, axis in enumerate("xyz")}
         entry |= {f"size_{axis}": float(size[i]) for i, axis in enumerate("xyz")}

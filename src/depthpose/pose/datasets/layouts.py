@@ -207,7 +207,8 @@ def bop_instances(scene: Path, end: str = "") -> Iterator[Instance]:
         source = f"{truth_path}: image {key}"
         if key not in cameras:
             raise InputError(f"{source} has no entry in {camera_path.name}; add its camera")
-        entries, more = truths[key], infos.get(key, [])
+        entries = truths[key]
+        more = infos.get(key, [])
         if not isinstance(entries, list) or not isinstance(more, list):
             raise InputError(f"{source}: is no list of annotations")
         at_camera = f"{camera_path}: image {int(key)}"
@@ -298,11 +299,13 @@ def linemod_instances(folder: Path, split: str) -> Iterator[Instance]:
         listed = scene / f"{split}.txt"
         if not listed.is_file():
             raise InputError(f"{listed}: no such list; the splits are train and test")
-        truths, infos = read_mapping(scene / "gt.yml"), read_mapping(scene / "info.yml")
+        truths = read_mapping(scene / "gt.yml")
+        infos = read_mapping(scene / "info.yml")
         for line in read_text(listed, _MAX_BYTES).split():
             if entry_number(line) is None:
                 raise InputError(f"{listed}: {line[:40]!r} is no number of an image")
-            image, number = int(line), int(scene.name)
+            image = int(line)
+            number = int(scene.name)
             source = f"{scene / 'gt.yml'}: image {image}"
             entries = truths.get(image)
             if not isinstance(entries, list):
@@ -412,10 +415,12 @@ def read_bop_models(
         path = next((path for path in named if path.is_file()), None)
         if path is None:
             raise InputError(f"{home}: no obj_{wanted:06d}.ply for object {wanted}; put it there")
-        info, source = infos.get(wanted, {}), f"{home / 'models_info.json'}: object {wanted}"
+        info = infos.get(wanted, {})
+        source = f"{home / 'models_info.json'}: object {wanted}"
         symmetries = symmetries_from_bop(info, source=source)
         if symmetries.is_none and wanted in layout.half_turns:
-            up, origin = torch.tensor([0.0, 0.0, 1.0]).double(), torch.zeros(3).double()
+            up = torch.tensor([0.0, 0.0, 1.0]).double()
+            origin = torch.zeros(3).double()
             turn = turn_about(up, origin, torch.tensor([math.pi]).double())
             symmetries = Symmetries(discrete=turn)
         model = read_model(

@@ -14,7 +14,9 @@ from depthpose.core.files import read_json
 from depthpose.core.files.images import MAX_PIXELS, opened_image
 
 Runs = tuple[tuple[int, ...], int, int]  #: run lengths, height and width
-_MOST_LABELS, _HALF, _SOFT = 64, 127, 32
+_MOST_LABELS = 64  # different values of an image of labels; of more, it is a picture
+_HALF = 127  # of 255: values above it are the object, in masks with soft edges
+_SOFT = 32  # of 255: values farther than this from black and white are grey
 _MOST_BITS = 40  # of a run length in text: no image has as many pixels
 
 
@@ -182,7 +184,8 @@ def read_runs(entry: object, source: str) -> Runs:
         )
     if not isinstance(entry, Mapping) or "counts" not in entry:
         raise InputError(f'{what}; write {{"size": [height, width], "counts": [...]}}')
-    size, counts = entry.get("size"), entry["counts"]
+    size = entry.get("size")
+    counts = entry["counts"]
     if (
         not isinstance(size, list)
         or len(size) != 2
@@ -215,5 +218,6 @@ def mask_box(mask: Bool[Tensor, "h w"]) -> list[int]:
     rows, columns = mask.nonzero(as_tuple=True)
     if len(rows) == 0:
         return [-1] * 4
-    left, top = int(columns.min()), int(rows.min())
+    left = int(columns.min())
+    top = int(rows.min())
     return [left, top, int(columns.max()) - left + 1, int(rows.max()) - top + 1]

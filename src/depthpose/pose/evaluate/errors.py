@@ -74,14 +74,16 @@ def nearest_copy(
     ``symmetries`` are motions of the model that leave it as it is, the identity first. With the
     ``declared`` ones that they are of, turns about their axes are exact, not one of the steps.
     """
-    R, t_m = symmetries.R.double(), symmetries.t_m.double()
+    R = symmetries.R.double()
+    t_m = symmetries.t_m.double()
     copies = Rigid(true.R.double() @ R, (true.R.double() @ t_m[..., None])[..., 0] + true.t_m)
     nearest = int(geodesic_rad(estimated.R.double().expand_as(R), copies.R).argmin())
     copy = copies[nearest]
     if declared is None or not declared.continuous:
         return copy
     # Turned about the axes of revolution until it is nearest.
-    wanted, centre_m = estimated.R.double(), declared.ball_centre_m
+    wanted = estimated.R.double()
+    centre_m = declared.ball_centre_m
     relative = copy.R.mT @ wanted
     if centre_m is not None:
         centre_m = centre_m.to(wanted)
@@ -94,22 +96,28 @@ def nearest_copy(
         across = torch.stack([skew[2, 1], skew[0, 2], skew[1, 0]])
         angle = torch.atan2(a @ across, relative.trace() - a @ relative @ a)
         turns.append(copy @ turn_about(a, axis.point_m.to(wanted), angle))
-    return min(turns, key=lambda one: float(geodesic_rad(wanted, one.R)))
+    return min(turns, key=lambda turn: float(geodesic_rad(wanted, turn.R)))
 
 
 def _vsd(estimated: Rigid, instance: Instance, context: ErrorContext) -> Float[Tensor, "10"]:
+    """Give the visible surface discrepancy at each of BOP's ten tolerances, 0..1."""
     assert context.vsd_delta_m is not None
     depth_m = _read_depth(instance.depth, instance.depth_unit_m)
-    poses, K = (estimated, instance.camera_from_model), instance.K.double().clone()
+    poses = (estimated, instance.camera_from_model)
+    K = instance.K.double().clone()
     # What neither pose covers does not count: only the window about both is drawn.
     size = torch.tensor(depth_m.shape).flip(0)
-    points_m = torch.cat([one.double().apply(context.triangles_m).reshape(-1, 3) for one in poses])
+    points_m = torch.cat(
+        [pose.double().apply(context.triangles_m).reshape(-1, 3) for pose in poses]
+    )
     pixels = project(points_m, K)
-    low, high = torch.zeros_like(size), size
+    low = torch.zeros_like(size)
+    high = size
     if bool(pixels.isfinite().all()):  # else something lies behind the camera
         low = (pixels.amin(0) - _MARGIN_PX).clamp(min=0).minimum(size - 1).long()
         high = (pixels.amax(0) + _MARGIN_PX + 1).clamp(min=1).minimum(size).long()
-    (left, top), (right, bottom) = low.tolist(), torch.maximum(high, low + 1).tolist()
+    left, top = low.tolist()
+    right, bottom = torch.maximum(high, low + 1).tolist()
     K[0, 2] -= left
     K[1, 2] -= top
     window = depth_m[top:bottom, left:right]
@@ -193,49 +201,61 @@ def match(
     """
     places = {instance.name: place_of(instance) for instance in instances}
     matched: dict[str, PoseEstimate] = {}
-    others: list[Prediction] = []
+    unnamed: list[Prediction] = []
     for prediction in predictions:
-        place = places.get(prediction.estimate.name)
-        if place is not None and prediction.place in (None, place):
-            matched[prediction.estimate.name] = prediction.estimate
+        name = prediction.estimate.name
+        if name in places and prediction.place in (None, places[name]):
+            matched[name] = prediction.estimate
         else:
-            others.append(prediction)
-    waiting: dict[Place, list[Instance]] = defaultdict(list)
+            unnamed.append(prediction)
+
+    # The others by image and object.
+    unmatched: dict[Place, list[Instance]] = defaultdict(list)
     for instance in instances:
         if instance.name not in matched:
-            waiting[place_of(instance)].append(instance)
+            unmatched[place_of(instance)].append(instance)
     offered: dict[Place, list[PoseEstimate]] = defaultdict(list)
-    for prediction in others:
-        if prediction.place is not None and prediction.place in waiting:
+    for prediction in unnamed:
+        if prediction.place is not None and prediction.place in unmatched:
             offered[prediction.place].append(prediction.estimate)
     for place, estimates in offered.items():
-        left, model = waiting[place], models[place.object_id]
-        ranked = sorted((e for e in estimates if e.is_posed), key=score_of, reverse=True)
-        answers = ranked[: len(left)]
-        points_m = model.vertices_m[:: max(1, len(model.vertices_m) // _POINTS)]
-        costs = np.zeros((len(left), len(answers)))
-        for row, column in np.ndindex(costs.shape if len(left) > 1 else (0, 0)):
-            pose, true = answers[column].camera_from_model, left[row].camera_from_model
-            assert pose is not None
-            error_m = float(adds_m(pose, true, points_m))
-            costs[row, column] = min(error_m, _NEAR_DIAMETERS * model.diameter_m)
-        for row, column in zip(*linear_sum_assignment(costs), strict=True):
-            matched[left[row].name] = answers[column]
+        instances_there = unmatched[place]
+        model = models[place.object_id]
+        posed = sorted((e for e in estimates if e.is_posed), key=score_of, reverse=True)
+        matched |= _assign(instances_there, posed[: len(instances_there)], model)
         refusals = [estimate for estimate in estimates if not estimate.is_posed]
-        left = [instance for instance in left if instance.name not in matched]
-        matched |= {i.name: e for i, e in zip(left, refusals, strict=False)}
+        left_over = [instance for instance in instances_there if instance.name not in matched]
+        for instance, refusal in zip(left_over, refusals, strict=False):
+            matched[instance.name] = refusal
     return matched
 
 
+def _assign(
+    instances: Sequence[Instance], estimates: Sequence[PoseEstimate], model: ObjectModel
+) -> dict[str, PoseEstimate]:
+    """Assign poses to instances of an object so that the sum of ADD-S is least (Hungarian)."""
+    points_m = model.vertices_m[:: max(1, len(model.vertices_m) // _POINTS)]
+    costs_m = np.zeros((len(instances), len(estimates)))
+    if len(instances) > 1:
+        for row, column in np.ndindex(costs_m.shape):
+            pose = estimates[column].camera_from_model
+            assert pose is not None
+            error_m = float(adds_m(pose, instances[row].camera_from_model, points_m))
+            costs_m[row, column] = min(error_m, _NEAR_DIAMETERS * model.diameter_m)
+    assigned = zip(*linear_sum_assignment(costs_m), strict=True)
+    return {instances[row].name: estimates[column] for row, column in assigned}
+
+
 _TRIED = 40  # instances that each change is tried on
-_MORE = 0.2  # a change is said where so large a share more is right by it
+_MORE = 0.2  # a change is named where so large a share more is right by it
 _SCALES = {
     1.0: "",
     1000.0: "t were 1000 times larger (is it in metres? BOP's csv has millimetres)",
     10.0: "t were 10 times larger (is it in centimetres? BOP's csv has millimetres)",
     0.001: "t were 1000 times smaller (is it in mm? poses.json has metres, BOP's csv mm)",
 }
-_TURNS = {
+_FLIP = torch.diag(torch.tensor([1.0, -1.0, -1.0]))
+_CONVENTIONS: dict[str, Callable[[Rigid], Rigid]] = {
     "": lambda pose: pose,
     "R were transposed (it is written row by row)": lambda pose: Rigid(pose.R.mT, pose.t_m),
     "poses were inverted (they are camera_from_model)": lambda pose: pose.inverse(),
@@ -243,13 +263,50 @@ _TURNS = {
         lambda pose: Rigid(_FLIP.to(pose.R) @ pose.R, _FLIP.to(pose.t_m) @ pose.t_m)
     ),
 }
-_FLIP = torch.diag(torch.tensor([1.0, -1.0, -1.0]))
+_COUNTED_FROM = {"smaller (are yours counted from 1?)": -1, "larger (from 0?)": 1}
 
-_STEPS = {
-    f"{what} numbers were one {words}": tuple(step * (k == place) for k in range(3))
-    for words, step in (("smaller (are yours counted from 1?)", -1), ("larger (from 0?)", 1))
-    for place, what in enumerate(("image", "object"), 1)
-}
+
+@dataclass(frozen=True, kw_only=True)
+class _Change:
+    """A change of all predictions: of the numbers that they are of, and of their poses."""
+
+    words: str = ""
+    image_step: int = 0  # that is added to the numbers of images
+    object_step: int = 0  # and of objects
+    convention: str = ""  # a key of ``_CONVENTIONS``
+    scale: float = 1.0  # of translations
+
+    def renumber(self, prediction: Prediction) -> Prediction:
+        place = prediction.place
+        if place is None:
+            return prediction
+        image_id = place.image_id + self.image_step
+        object_id = place.object_id + self.object_step
+        return replace(prediction, place=Place(place.scene_id, image_id, object_id))
+
+    def repose(self, prediction: Prediction) -> Prediction:
+        pose = prediction.estimate.camera_from_model
+        assert pose is not None
+        pose = _CONVENTIONS[self.convention](pose.double())
+        pose = Rigid(pose.R, pose.t_m * self.scale)
+        return replace(prediction, estimate=replace(prediction.estimate, camera_from_model=pose))
+
+
+def _changes() -> list[_Change]:
+    """Give the changes that are tried: numbers by one, and conventions with units."""
+    changes = [
+        change
+        for words, step in _COUNTED_FROM.items()
+        for change in (
+            _Change(words=f"image numbers were one {words}", image_step=step),
+            _Change(words=f"object numbers were one {words}", object_step=step),
+        )
+    ]
+    for convention in _CONVENTIONS:
+        for scale, words in _SCALES.items():
+            both = " and ".join(filter(None, (words, convention)))
+            changes.append(_Change(words=both, convention=convention, scale=scale))
+    return changes
 
 
 def convention_advice(
@@ -258,47 +315,51 @@ def convention_advice(
     contexts: Mapping[int, ErrorContext],
 ) -> str | None:
     """Say by which change of all predictions many more were right; None where by none."""
-    answers = [p for p in predictions if p.estimate.is_posed]
-
-    def count_right(
-        scale: float = 1.0, turn: str = "", step: Sequence[int] = (0, 0, 0)
-    ) -> tuple[int, int]:
-        moved = [
-            one if one.place is None else replace(one, place=Place(*np.add(one.place, step)))
-            for one in answers
-        ]
-        there = match(dataset.instances, moved, dataset.objects)
-        seen = [instance for instance in dataset.instances if instance.name in there]
-        some = seen[:: max(1, len(seen) // _TRIED)][:_TRIED]
-        places, names = {place_of(one) for one in some}, {one.name for one in some}
-        changed: list[Prediction] = []
-        for one in moved:
-            pose = one.estimate.camera_from_model
-            if pose is not None and (one.place in places or one.estimate.name in names):
-                pose = _TURNS[turn](Rigid(pose.R.double(), pose.t_m.double()))
-                pose = Rigid(pose.R, pose.t_m * scale)
-                estimate = replace(one.estimate, camera_from_model=pose)
-                changed.append(replace(one, estimate=estimate))
-        found, right = match(some, changed, dataset.objects), 0
-        for instance in (one for one in some if one.name in found):
-            pose, context = found[instance.name].camera_from_model, contexts[instance.object_id]
-            assert pose is not None
-            error_m = METRICS["error_m"].measure(pose, instance, context)
-            right += float(error_m) < SUCCESS_SHARE * context.diameter_m
-        return right, len(some)
-
-    now, tried = count_right()
-    if now > (1 - _MORE) * tried > 0:
+    posed = [p for p in predictions if p.estimate.is_posed]
+    right, tried = _count_right(dataset, posed, contexts, _Change())
+    if right > (1 - _MORE) * tried > 0:
         return None
-    changes = [(*count_right(step=step), words) for words, step in _STEPS.items()]
-    changes += [
-        (*count_right(scale, turn), " and ".join(filter(None, (words, turn))))
-        for turn in _TURNS
-        for scale, words in _SCALES.items()
-    ]
-    best, of, advice = max(changes, key=lambda change: change[0])
-    if best < now + max(1, min(3, of), _MORE * of):
+
+    changes = _changes()
+    counts = [_count_right(dataset, posed, contexts, change) for change in changes]
+    best = max(range(len(changes)), key=lambda k: counts[k][0])
+    best_right, best_tried = counts[best]
+    if best_right < right + max(1, min(3, best_tried), _MORE * best_tried):
         return None
     return (
-        f"{now} of {tried} answers that were tried are right, but {best} of {of} were if {advice}"
+        f"{right} of {tried} answers that were tried are right, but {best_right} of {best_tried} "
+        f"were if {changes[best].words}"
     )
+
+
+def _count_right(
+    dataset: BopDataset,
+    posed: Sequence[Prediction],
+    contexts: Mapping[int, ErrorContext],
+    change: _Change,
+) -> tuple[int, int]:
+    """Count how many of some predictions are right by a change, and how many were tried."""
+    renumbered = [change.renumber(prediction) for prediction in posed]
+    matched = match(dataset.instances, renumbered, dataset.objects)
+    with_estimate = [instance for instance in dataset.instances if instance.name in matched]
+    tried = with_estimate[:: max(1, len(with_estimate) // _TRIED)][:_TRIED]
+    places = {place_of(instance) for instance in tried}
+    names = {instance.name for instance in tried}
+    reposed = [
+        change.repose(prediction)
+        for prediction in renumbered
+        if prediction.place in places or prediction.estimate.name in names
+    ]
+
+    # A pose may be nearest to another instance of its object once it is changed.
+    matched = match(tried, reposed, dataset.objects)
+    right = 0
+    for instance in tried:
+        if instance.name not in matched:
+            continue
+        pose = matched[instance.name].camera_from_model
+        context = contexts[instance.object_id]
+        assert pose is not None
+        error_m = METRICS["error_m"].measure(pose, instance, context)
+        right += float(error_m) < SUCCESS_SHARE * context.diameter_m
+    return right, len(tried)

@@ -160,7 +160,7 @@ def object_row(name: str, rows: Sequence[InstanceRow]) -> ObjectRow:
         refused=1 - coverage,
         wrong=coverage - success,
         coverage=coverage,
-        scores=_scores(rows),
+        scores=_summarise_errors(rows),
         ms={stage: _mean([row.ms[stage] for row in rows]) for stage in rows[0].ms},
     )
 
@@ -209,9 +209,12 @@ def risk_rows(rows: Sequence[InstanceRow]) -> list[RiskRow]:
     ]
 
 
-def _scores(rows: Sequence[InstanceRow]) -> dict[str, Number]:
-    """Sum up every metric; then BOP's average recall; then the medians of the answers."""
-    answered = [row for row in rows if row.status in POSED]
+def _summarise_errors(rows: Sequence[InstanceRow]) -> dict[str, Number]:
+    """Summarise the errors of some instances by the columns of a table; None: not measured.
+
+    Recalls and areas are over all instances, of which one without an estimate is missed; medians
+    are over the instances with an estimate.
+    """
     diameters_m = torch.tensor([row.diameter_m for row in rows], dtype=torch.float64)
     scores: dict[str, Number] = {}
     for name, metric in METRICS.items():
@@ -219,11 +222,18 @@ def _scores(rows: Sequence[InstanceRow]) -> dict[str, Number]:
         errors = torch.stack([row.errors[name] for row in rows]) if is_measured else None
         for column, summary in metric.summaries.items():
             scores[column] = None if errors is None else summary(errors, diameters_m)
-    recalls = [value for value in map(scores.get, _RECALLS) if value is not None]
-    scores["ar"] = sum(recalls) / len(_RECALLS) if len(recalls) == len(_RECALLS) else None
-    for name in (name for name, metric in METRICS.items() if metric.has_median):
-        values = [float(row.errors[name].mean()) for row in answered if name in row.errors]
-        scores[f"{name}_median"] = statistics.median(values) if values else None
+
+    # BOP's average recall is the mean over its three errors.
+    recalls = [scores[name] for name in _RECALLS]
+    measured_recalls = [recall for recall in recalls if recall is not None]
+    is_complete = len(measured_recalls) == len(recalls)
+    scores["ar"] = sum(measured_recalls) / len(recalls) if is_complete else None
+
+    posed = [row for row in rows if row.status in POSED]
+    for name, metric in METRICS.items():
+        if metric.has_median:
+            errors = [float(row.errors[name].mean()) for row in posed if name in row.errors]
+            scores[f"{name}_median"] = statistics.median(errors) if errors else None
     return scores
 
 

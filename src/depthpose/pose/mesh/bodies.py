@@ -9,9 +9,8 @@ from scipy.sparse.csgraph import connected_components
 from depthpose.core.errors import InputError, Notice
 from depthpose.core.files import AnyPath
 
-_FAR, _APART = 0.25, 1.0
-"""Gaps, in diagonals of the box about a part: of a small body beyond which it is none of the
-part's, and of any body."""
+_FAR = 0.25  # diagonals of the box about a part: a small body farther away is not of the part
+_APART = 1.0  # the same of a body of any size
 _SMALL = 0.05  # of the part's area: so small a body changes the part's size and no pose
 _MOST_NAMED = 3
 
@@ -44,7 +43,8 @@ def faces_of_part(
         return whole
 
     # The box about each body, and its area.
-    low, high = np.full((count, 3), np.inf), np.full((count, 3), -np.inf)
+    low = np.full((count, 3), np.inf)
+    high = np.full((count, 3), -np.inf)
     corners = vertices[faces]
     np.minimum.at(low, body, corners.min(1))
     np.maximum.at(high, body, corners.max(1))
@@ -54,7 +54,8 @@ def faces_of_part(
     is_part = np.zeros(count, bool)
     is_part[size.argmax()] = True
     while True:
-        part_low, part_high = low[is_part].min(0), high[is_part].max(0)
+        part_low = low[is_part].min(0)
+        part_high = high[is_part].max(0)
         diagonal = float(np.linalg.norm(part_high - part_low))
         gap = np.linalg.norm(np.maximum(0, np.maximum(low - part_high, part_low - high)), axis=1)
         is_small = size < _SMALL * size[is_part].sum()

@@ -68,7 +68,8 @@ def read_colors(path: AnyPath, scale: float, model: ObjectModel) -> SurfaceColor
         return None
     points_m = scale * samples.points
     # The shape is read by another reader, which leaves stray bodies out.
-    low_m, high_m = model.vertices_m.amin(0).double(), model.vertices_m.amax(0).double()
+    low_m = model.vertices_m.amin(0).double()
+    high_m = model.vertices_m.amax(0).double()
     slack_m = _SAME_BOX * float((high_m - low_m).max())
     is_inside = ((points_m > low_m - slack_m) & (points_m < high_m + slack_m)).all(-1)
     if float(is_inside.double().mean()) < _LEAST_INSIDE:
@@ -91,7 +92,8 @@ def average_colors(
     """
     if float(rgb.double().std(0).max()) < _LEAST_CONTRAST:
         return None
-    kept_m, kept_normals = points_m[::_DENSE].double(), normals[::_DENSE].double()
+    kept_m = points_m[::_DENSE].double()
+    kept_normals = normals[::_DENSE].double()
     tree = KDTree(kept_m.numpy())
     distance_m, _ = tree.query(kept_m.numpy()[:: max(1, len(kept_m) // 1000)], k=2)
     spacing_m = float(np.median(distance_m[:, 1]))
@@ -99,7 +101,8 @@ def average_colors(
     _, nearest = tree.query(points_m.double().numpy())
     owner = torch.from_numpy(np.asarray(nearest))
     is_same_side = (normals.double() * kept_normals[owner]).sum(-1) > 0
-    owner, values = owner[is_same_side], rgb.double()[is_same_side]
+    owner = owner[is_same_side]
+    values = rgb.double()[is_same_side]
     count = torch.zeros(len(kept_m), dtype=torch.float64)
     count.index_add_(0, owner, torch.ones_like(owner, dtype=torch.float64))
     total = torch.zeros_like(kept_m).index_add_(0, owner, values)
@@ -204,14 +207,16 @@ def _colors_of(mesh: Any, face: np.ndarray, share: np.ndarray, *, lost: bool) ->
     """
     from trimesh.visual.color import uv_to_interpolated_color
 
-    visual, corners = mesh.visual, np.asarray(mesh.faces)[face]
+    visual = mesh.visual
+    corners = np.asarray(mesh.faces)[face]
     if visual.kind == "face":
         return np.asarray(visual.face_colors)[face, :3] / 255
     if visual.kind == "vertex":
         return _between(visual.vertex_colors, corners, share) / 255
     if visual.kind != "texture":
         return None
-    material, in_vertices = visual.material, visual.vertex_attributes.get("color")
+    material = visual.material
+    in_vertices = visual.vertex_attributes.get("color")
     image = getattr(material, "baseColorTexture", None) or getattr(material, "image", None)
     # A factor of glTF is linear, and so multiplies what a screen shows by its root.
     factor = getattr(material, "baseColorFactor", None)

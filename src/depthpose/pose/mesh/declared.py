@@ -68,7 +68,9 @@ def read_symmetry(text: str) -> tuple[DeclaredTurns, ...]:
             length = float(direction.norm())
             turns = None if count == "free" else int(count)
         except (ValueError, RuntimeError):
-            length, turns, direction = 0.0, 0, torch.zeros(3)
+            length = 0.0
+            turns = 0
+            direction = torch.zeros(3)
         if not 0 < length < math.inf or not (turns is None or 2 <= turns <= _MOST_TURNS):
             raise InputError(
                 f"symmetry {text!r}: {part.strip()!r} is no axis with 2 to {_MOST_TURNS} turns; "
@@ -148,7 +150,8 @@ def symmetry_of_each(
             _refuse_other(name, names, f"symmetry {declaration!r}")
             symmetry: AnySymmetry = rest
         elif len(names) == 1:
-            name, symmetry = names[0], declaration
+            name = names[0]
+            symmetry = declaration
         else:
             raise InputError(
                 f"symmetry {declaration!r}: {len(names)} objects are known ({', '.join(names)}); "
@@ -227,7 +230,8 @@ def _point_on_axis(
     across = torch.linalg.svd(axis[None]).Vh[1:]
     half = (term.turns or 2) // 2
     angle_rad = torch.tensor(2 * math.pi * half / (term.turns or 2), dtype=torch.float64)
-    low, high = surface.points.amin(0), surface.points.amax(0)
+    low = surface.points.amin(0)
+    high = surface.points.amax(0)
     origin = -surface.centre_m / model.diameter_m
     candidates: list[tuple[float, Tensor]] = []
     for start in (torch.zeros(3).double(), (low + high) / 2, origin):

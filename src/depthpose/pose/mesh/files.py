@@ -28,7 +28,8 @@ from depthpose.pose.mesh.shapes import shape_geometry, shape_unit
 _MOST_VALUES = 2 * 10**7  # that the accessors of a GLB may declare: six million points
 _MOST_TEXT = 2**25  # bytes of an OBJ or STL in text, which are read in some seconds
 _NO_FACES = Ragged(np.empty(0, np.int64), np.empty(0, np.int64))
-_MOST_NODES, _MOST_SCENE_BYTES = 10_000, 2**22
+_MOST_NODES = 10_000  # of a GLB's scene
+_MOST_SCENE_BYTES = 2**22  # of the JSON that describes it
 _MOST_NESTED = 6e7  # sum of the cubes of the depths of a GLB's nodes: some ten seconds of trimesh
 _WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT2": 4, "MAT3": 9, "MAT4": 16}
 _KNOWN = ("KHR_materials", "KHR_texture", "KHR_lights", "KHR_xmp", "EXT_texture", "KHR_mesh_quant")
@@ -87,7 +88,8 @@ def read_geometry(path: AnyModel) -> tuple[np.ndarray, np.ndarray]:
         )
     if isinstance(faces, np.ndarray):
         faces = Ragged(np.full(len(faces), faces.shape[1]), faces.reshape(-1))
-    sizes, corners = faces.sizes, faces.values.astype(np.int64)
+    sizes = faces.sizes
+    corners = faces.values.astype(np.int64)
     if (sizes == 3).all() and ((corners >= 0) & (corners < len(vertices))).all():
         faces = corners.reshape(-1, 3)
     else:
@@ -109,7 +111,9 @@ def read_geometry(path: AnyModel) -> tuple[np.ndarray, np.ndarray]:
     merged = place.reshape(-1)[faces]
     _, first = np.unique(np.sort(merged, axis=-1), axis=0, return_index=True)
     kept = np.isin(np.arange(len(faces)), first) & (area > _NO_AREA * square)
-    faces, merged, area = faces[kept], merged[kept], area[kept]
+    faces = faces[kept]
+    merged = merged[kept]
+    area = area[kept]
     is_part = faces_of_part(str(path), places, merged, area)
     if is_part.all():
         return vertices, faces
@@ -177,7 +181,9 @@ def _read_stl(path: AnyPath) -> tuple[np.ndarray, Ragged]:
     is_text = head.startswith(b"solid") and b"facet" in head and b"\0" not in head
     if is_text and (there, more) != (count, 0):
         # Facets of one or more solids; a loop of four corners and more is a polygon.
-        places, ends, last = array("d"), array("q", [0]), b""
+        places = array("d")
+        ends = array("q", [0])
+        last = b""
         for number, words in _rows_of(path, data):
             last = words[0]
             if last == b"vertex":
@@ -203,13 +209,18 @@ def _read_stl(path: AnyPath) -> tuple[np.ndarray, Ragged]:
 
 def _read_obj(path: AnyPath) -> tuple[np.ndarray, Ragged]:
     """Read vertices and polygons; negative numbers count back from the line they stand in."""
-    places, sizes, corners, is_other = array("d"), array("q"), array("q"), False
-    highest, highest_line = 0, 0
+    places = array("d")
+    sizes = array("q")
+    corners = array("q")
+    is_other = False
+    highest = 0
+    highest_line = 0
     for number, words in _rows_of(path, read_bytes(path)):
         if words[0] == b"v":
             places.extend(_place(path, number, words))
         elif words[0] in (b"f", b"fo"):  # fo of old writers is the same
-            there, named = len(places) // 3, [0]
+            there = len(places) // 3
+            named = [0]
             with suppress(ValueError):
                 named = [int(word.partition(b"/")[0]) for word in words[1:]] or [0]
             if 0 in named or min(named) < -there or max(named) > _MOST_TEXT:
@@ -218,7 +229,8 @@ def _read_obj(path: AnyPath) -> tuple[np.ndarray, Ragged]:
                     f"names points from 1 on, or back from -1 to -{there}; export it again"
                 )
             if max(named) > highest:
-                highest, highest_line = max(named), number
+                highest = max(named)
+                highest_line = number
             sizes.append(len(named))
             corners.extend(k - 1 if k > 0 else there + k for k in named)
         is_other |= words[0] in (b"surf", b"curv", b"curv2", b"l")
@@ -263,7 +275,8 @@ def _refuse_scene(path: AnyPath, data: bytes) -> None:
             for part in scene["meshes"][node["mesh"]]["primitives"]
             if "POSITION" in part.get("attributes", {})
         )
-        nodes, work = len(scene.get("nodes", [])), _refuse_nodes(path, scene.get("nodes", []))
+        nodes = len(scene.get("nodes", []))
+        work = _refuse_nodes(path, scene.get("nodes", []))
         needed = [n for n in scene.get("extensionsRequired", []) if not n.startswith(_KNOWN)]
         parts = [part for mesh in scene.get("meshes", []) for part in mesh["primitives"]]
         needed += ["TRIANGLE_FAN" for part in parts if part.get("mode") == 6]
@@ -376,8 +389,10 @@ def cut_polygons(
             f"{path}: face {wrong.argmax()} has {sizes[wrong.argmax()]} corners, and 3 to "
             f"{_MOST_CORNERS} are read; the file is truncated, or export it as triangles"
         )
-    pieces, owners = [np.empty((0, 3), np.int64)], [np.empty(0, np.int64)]
-    overlap, area = np.zeros(len(sizes)), 0.0
+    pieces = [np.empty((0, 3), np.int64)]
+    owners = [np.empty(0, np.int64)]
+    overlap = np.zeros(len(sizes))
+    area = 0.0
     steps = 0.0
     order = np.argsort(sizes, kind="stable")
     for which in _alike(sizes, order):
@@ -424,7 +439,8 @@ def _alike(sizes: np.ndarray, order: np.ndarray) -> Iterator[np.ndarray]:
 def _back_turns(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Give the normals (m, 3) of polygons (m, n, 3), and which corners turn back (m, n)."""
     points = points - points[:, :1]
-    after, before = np.roll(points, -1, 1), np.roll(points, 1, 1)
+    after = np.roll(points, -1, 1)
+    before = np.roll(points, 1, 1)
     normals = np.cross(points, after).sum(1)
     turns = np.einsum("mnc,mc->mn", np.cross(points - before, after - points), normals)
     return normals, turns < -_FLAT * (normals**2).sum(-1, keepdims=True)
@@ -452,13 +468,18 @@ def _clip_ears(points: np.ndarray, is_back: np.ndarray) -> list[list[int]]:
     If a triangle holds any, then one of the corners that turn back. A cut changes what its two
     neighbours are, so that these alone are looked at again: three corners for each that is cut.
     """
-    count, ears, rounds = len(points), list[list[int]](), 0
-    before, after = [*range(-1, count - 1)], [*range(1, count), 0]
+    count = len(points)
+    ears = list[list[int]]()
+    rounds = 0
+    before = [*range(-1, count - 1)]
+    after = [*range(1, count), 0]
     before[0] = count - 1
     least = _FLAT * float(np.ptp(points, axis=0).max()) ** 2
-    is_left, is_waiting = [True] * count, [True] * count
+    is_left = [True] * count
+    is_waiting = [True] * count
     waiting = deque([*range(1, count), 0])
-    is_cut, must_cut = False, False
+    is_cut = False
+    must_cut = False
     while len(ears) < count - 3:
         if not waiting:
             # No ear is left: the polygon crosses itself, or touches itself. All are looked at once
@@ -466,7 +487,9 @@ def _clip_ears(points: np.ndarray, is_back: np.ndarray) -> list[list[int]]:
             waiting.extend(k for k in range(count) if is_left[k])
             for k in waiting:
                 is_waiting[k] = True
-            must_cut, is_cut, rounds = not is_cut, False, rounds + 1
+            must_cut = not is_cut
+            is_cut = False
+            rounds = rounds + 1
         k = waiting.popleft()
         is_waiting[k] = False
         if not is_left[k]:
@@ -475,8 +498,10 @@ def _clip_ears(points: np.ndarray, is_back: np.ndarray) -> list[list[int]]:
         if not (must_cut or rounds > _MOST_ROUNDS or _is_ear(points, ear, is_back, least)):
             continue
         ears.append(ear)
-        is_left[k], is_back[k] = False, False
-        is_cut, must_cut = True, False
+        is_left[k] = False
+        is_back[k] = False
+        is_cut = True
+        must_cut = False
         after[ear[0]], before[ear[2]] = ear[2], ear[0]
         # The corner before comes later: a fan of needles is cut where it can be avoided.
         for beside in (ear[2], ear[0]):

@@ -119,7 +119,8 @@ def symmetries_to_bop(symmetries: Symmetries) -> dict[str, Any]:
     """Write symmetries as ``models_info.json`` has them; kinds without an entry are left out."""
     info: dict[str, Any] = {}
     if symmetries.discrete is not None:
-        R, t_mm = symmetries.discrete.R, 1000 * symmetries.discrete.t_m
+        R = symmetries.discrete.R
+        t_mm = 1000 * symmetries.discrete.t_m
         top = torch.cat([R, t_mm[..., None]], -1).flatten(1).tolist()
         info["symmetries_discrete"] = [[*row, 0.0, 0.0, 0.0, 1.0] for row in top]
     if symmetries.continuous:
@@ -236,7 +237,8 @@ def fibonacci_directions(count: int) -> Float[Tensor, "count 3"]:
 
 
 _COARSE_MESH = 1000  # a mesh of fewer points (a box: eight) also takes keypoints inside its faces
-_LARGEST_M, _SMALLEST_M = 20.0, 0.002
+_LARGEST_M = 20.0  # a model of metres that is larger is likely one of millimetres
+_SMALLEST_M = 0.002  # and one of millimetres that is smaller is likely one of metres
 
 
 def read_model(

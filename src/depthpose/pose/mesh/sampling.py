@@ -20,6 +20,7 @@ def surface_places(
     steps = (torch.arange(count, dtype=torch.float64) + 0.5) / count * bounds[-1]
     face = torch.searchsorted(bounds, steps).clamp(max=len(bounds) - 1)
     order = torch.arange(1, count + 1, dtype=torch.float64)
-    u, v = (order / _PLASTIC) % 1, (order / _PLASTIC**2) % 1
+    u = (order / _PLASTIC) % 1
+    v = (order / _PLASTIC**2) % 1
     root = u.sqrt()
     return face, torch.stack([1 - root, root * (1 - v), root * v], -1)

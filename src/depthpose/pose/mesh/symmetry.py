@@ -170,29 +170,38 @@ def propose_symmetries(model: ObjectModel, tolerance: float = 0.02) -> list[Symm
     surface = SurfaceDeviation(model)
     limit = 2 * tolerance
     proposals: list[SymmetryProposal] = []
-    tried, revolved = list[Tensor](), list[Tensor]()  # axes, and those of revolution
-    for start in promising_turns(surface):
-        if len(revolved) >= 2 or len(tried) >= _MOST_AXES:
+    tried_axes: list[Tensor] = []
+    revolution_axes: list[Tensor] = []
+    for coarse in promising_turns(surface):
+        if len(revolution_axes) >= 2 or len(tried_axes) >= _MOST_AXES:
             break
-        # The direction that a rotation leaves alone; well defined for half turns too.
-        direction = torch.linalg.svd(start - _EYE).Vh[-1]
-        if _is_known(direction, tried, revolved):
+        if _is_known(_axis_of(coarse), tried_axes, revolution_axes):
             continue
-        R = start
-        weight = torch.ones(2 * len(surface.many), dtype=torch.float64)
-        for _ in range(_FOLLOWED):  # onto the surface: ICP about the fixed centre
-            _, index = surface.nearest(surface.many @ R.mT)
-            target = surface.points[torch.from_numpy(index)]
-            # With each point its mirror image through the centre, the fit cannot shift.
-            pairs = (torch.cat([surface.many, -surface.many]), torch.cat([target, -target]))
-            R = fit_rigid(*pairs, weight).R
-        direction = torch.linalg.svd(R - _EYE).Vh[-1]
-        if not _is_known(direction, tried, revolved):
-            tried.append(direction)
-            measured = _measure(surface, direction, limit, tolerance)
-            revolved += [direction for p in measured if p.kind == "continuous"]
+        axis = _axis_of(_follow_surface(surface, coarse))
+        if not _is_known(axis, tried_axes, revolution_axes):
+            tried_axes.append(axis)
+            measured = _measure(surface, axis, limit, tolerance)
+            revolution_axes += [axis for p in measured if p.kind == "continuous"]
             proposals += measured
     return sorted(proposals, key=lambda p: (p.kind != "continuous", -p.certainty))
+
+
+def _axis_of(R: Tensor) -> Tensor:
+    """Give the direction that a rotation leaves alone; well defined for half turns too."""
+    return torch.linalg.svd(R - _EYE).Vh[-1]
+
+
+def _follow_surface(surface: SurfaceDeviation, R: Tensor) -> Tensor:
+    """Refine a rotation that nearly maps a surface onto itself, by ICP about the fixed centre."""
+    weight = torch.ones(2 * len(surface.many), dtype=torch.float64)
+    for _ in range(_FOLLOWED):
+        _, index = surface.nearest(surface.many @ R.mT)
+        target = surface.points[torch.from_numpy(index)]
+        # With each point its mirror image through the centre, the fit cannot shift.
+        source_pairs = torch.cat([surface.many, -surface.many])
+        target_pairs = torch.cat([target, -target])
+        R = fit_rigid(source_pairs, target_pairs, weight).R
+    return R
 
 
 def symmetries_from_proposals(proposals: list[SymmetryProposal]) -> Symmetries:
@@ -289,12 +298,12 @@ def promising_turns(surface: SurfaceDeviation) -> list[Float[Tensor, "3 3"]]:
     return [turns[i] for i in coarse.argsort().tolist() if coarse[i] <= _COARSE]
 
 
-def _is_known(direction: Tensor, tried: list[Tensor], revolved: list[Tensor]) -> bool:
+def _is_known(direction: Tensor, tried_axes: list[Tensor], revolution_axes: list[Tensor]) -> bool:
     """Whether an axis was tried, or follows: all lines across an axis of revolution are alike."""
     near = math.cos(_SAME_RAD)
-    across = [a for a in revolved if abs(float(a @ direction)) < math.sin(_SAME_RAD)]
-    is_across = any(abs(float(a @ t)) < math.sin(_SAME_RAD) for a in across for t in tried)
-    return is_across or any(abs(float(direction @ t)) > near for t in tried)
+    across = [a for a in revolution_axes if abs(float(a @ direction)) < math.sin(_SAME_RAD)]
+    is_across = any(abs(float(a @ t)) < math.sin(_SAME_RAD) for a in across for t in tried_axes)
+    return is_across or any(abs(float(direction @ t)) > near for t in tried_axes)
 
 
 def _measure(
@@ -302,7 +311,8 @@ def _measure(
 ) -> list[SymmetryProposal]:
     """Measure the full circle about an axis and, unless that is sure, turns of order 2 to 12."""
     circle = _turns(direction, torch.arange(1, _TURNS) * (2 * math.pi / _TURNS))
-    full, turns = list[tuple[None, float]](), list[tuple[float, float]]()  # angle and deviation
+    full: list[tuple[None, float]] = []  # angle and deviation, of every rotation about the axis
+    turns: list[tuple[float, float]] = []  # and of single ones
     worst = math.inf
     if bool((surface.rough_distance(circle) <= _COARSE).all()):
         worst = float(surface.deviation(circle).max())
@@ -314,7 +324,8 @@ def _measure(
     if worst > tolerance and len(angles):
         deviation = surface.deviation(_turns(direction, angles))
         for i in deviation.argsort().tolist():
-            angle, value = float(angles[i]), float(deviation[i])
+            angle = float(angles[i])
+            value = float(deviation[i])
             # A turn near a better one is the same symmetry (non-maximum suppression).
             is_shadow = any(abs(angle - other) < _SUPPRESSION_RAD for other, _ in turns)
             if value <= limit and not is_shadow:
@@ -382,7 +393,8 @@ def _mirror_search(model: ObjectModel) -> float:
     # and 270 degrees about the normal n: cos (1 - nn') + sin [n] - nn'.
     normals = torch.cat([surface.axes, fibonacci_directions(_MIRROR_PLANES)])
     along = normals[:, :, None] * normals[:, None]
-    across, crossed = _EYE - along, torch.linalg.cross(normals[:, None], _EYE[None])
+    across = _EYE - along
+    crossed = torch.linalg.cross(normals[:, None], _EYE[None])
     ways = ((1, 0), (0, 1), (-1, 0), (0, -1))
     every = torch.cat([c * across + s * crossed - along for c, s in ways])
     starts: list[Float64[Tensor, "3 3"]] = []
@@ -392,7 +404,8 @@ def _mirror_search(model: ObjectModel) -> float:
         if all(float(geodesic_rad(every[k], other)) > _APART_RAD for other in starts):
             starts.append(every[k])
     turns = [refine_turn(surface, R @ _FLIP, _FLIP) for R in starts]
-    R, shift = torch.stack([t.R for t in turns]) @ _FLIP, torch.stack([t.t_m for t in turns])
+    R = torch.stack([t.R for t in turns]) @ _FLIP
+    shift = torch.stack([t.t_m for t in turns])
     return float(surface.deviation(R, shift).min())
 
 
@@ -475,12 +488,11 @@ def true_symmetries(
 def _search(model: ObjectModel) -> dict[str, Any]:
     surface = SurfaceDeviation(model)
     # Which discrete symmetries, and which axes, have copies that lie on the surface.
-    given, circle = model.symmetries, torch.arange(1, 8, dtype=torch.float64) * (math.pi / 4)
+    given = model.symmetries
+    circle = torch.arange(1, 8, dtype=torch.float64) * (math.pi / 4)
     turns = [_turns(axis.direction.double(), circle) for axis in given.continuous]
-    axes, discrete = (
-        [float(surface.deviation(R, share=ALMOST_ALL).max()) <= ALIKE for R in turns],
-        list[bool](),
-    )
+    axes = [float(surface.deviation(R, share=ALMOST_ALL).max()) <= ALIKE for R in turns]
+    discrete = list[bool]()
     if given.discrete is not None:
         R = given.discrete.R.double()
         discrete = (surface.deviation(R, share=ALMOST_ALL) <= ALIKE).tolist()
@@ -519,5 +531,6 @@ def _search(model: ObjectModel) -> dict[str, Any]:
 def _deviations(turns: list[Rigid], surface: SurfaceDeviation) -> list[tuple[float, Rigid]]:
     if not turns:
         return []
-    R, shift = torch.stack([t.R for t in turns]), torch.stack([t.t_m for t in turns])
+    R = torch.stack([t.R for t in turns])
+    shift = torch.stack([t.t_m for t in turns])
     return list(zip(surface.deviation(R, shift).tolist(), turns, strict=True))

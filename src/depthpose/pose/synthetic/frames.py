@@ -51,7 +51,8 @@ def random_pattern(
     """Draw a colour, plain or patterned, with features of about a third of a size."""
     strength = uniform(generator, 0.0, 0.25)
     directions = torch.randn(_WAVES, 3, generator=generator)
-    grey, hue = uniform(generator, 0.1, 0.8), torch.rand(3, generator=generator)
+    grey = uniform(generator, 0.1, 0.8)
+    hue = torch.rand(3, generator=generator)
     share = uniform(generator, *colourful)
     common = torch.randn(_WAVES, 1, generator=generator)
     waves = 0.5 * torch.randn(_WAVES, 3, generator=generator)
@@ -69,7 +70,8 @@ def random_clutter(generator: torch.Generator) -> Solid:
     import trimesh
 
     size_m = uniform(generator, 0.04, 0.15)
-    flat, thin = uniform(generator, 0.3, 1.0), uniform(generator, 0.3, 1.0)
+    flat = uniform(generator, 0.3, 1.0)
+    thin = uniform(generator, 0.3, 1.0)
     match whole(generator, 3):
         case 0:
             mesh = trimesh.creation.box((size_m, flat * size_m, thin * size_m))
@@ -99,7 +101,8 @@ def shade(
     """
     assert raster.barycentric is not None
     is_seen = raster.primitive >= 0
-    points, share = back_project(raster.depth_m, K)[is_seen], raster.barycentric[is_seen]
+    points = back_project(raster.depth_m, K)[is_seen]
+    share = raster.barycentric[is_seen]
     primitive = raster.primitive[is_seen]
     colour = torch.zeros_like(points)
     start = 0
@@ -109,7 +112,8 @@ def shade(
         corners = solid.normals[primitive[of_body] - start]
         normal = (corners * share[of_body, :, None]).sum(1) @ pose.R.mT
         local = pose.inverse().apply(points[of_body])
-        normal, sight = F.normalize(normal, dim=-1), F.normalize(-points[of_body], dim=-1)
+        normal = F.normalize(normal, dim=-1)
+        sight = F.normalize(-points[of_body], dim=-1)
         # Both sides of a thin part are seen.
         normal = normal * torch.where((normal * sight).sum(-1, keepdim=True) < 0, -1.0, 1.0)
         facing = (normal @ towards).clamp(min=0)[:, None]
@@ -158,7 +162,8 @@ def make_frames(
     for model in models:  # an object looks alike in every frame of every data set
         chance = sample_generator(model.number, _COLOUR_SEED)
         pattern = random_pattern(chance, model.diameter_m, (0.7, 1.0))
-        corners, normals = drawn_triangles(model), model.normals[model.faces]
+        corners = drawn_triangles(model)
+        normals = model.normals[model.faces]
         if not len(model.faces):  # each point is a disc of several triangles
             each = len(corners) // len(model.vertices_m)
             normals = model.normals.repeat_interleave(each, 0)[:, None].expand(-1, 3, 3)
@@ -189,7 +194,8 @@ def _make_frame(
     view = _viewpoint(config, generator)
     placed = [(solid, view @ pose) for solid, pose in world]
     assert config.centre_px is not None, "the config gives what was left out"
-    (fx, fy), (cx, cy) = config.focal_px, config.centre_px
+    fx, fy = config.focal_px
+    cx, cy = config.centre_px
     K = torch.tensor([[fx, 0, cx], [0, fy, cy], [0, 0, 1]], dtype=torch.float64)
     width, height = config.image_px
     corners = [pose.apply(solid.triangles_m) for solid, pose in placed]
@@ -206,7 +212,8 @@ def _make_frame(
     # A lamp above the table, warm or cold, strong or weak.
     up = view.R[:, 2]
     towards = F.normalize(1.2 * up + 0.8 * torch.randn(3, generator=generator), dim=0)
-    strength, warmth = uniform(generator, 0.3, 0.9), uniform(generator, -0.15, 0.15)
+    strength = uniform(generator, 0.3, 0.9)
+    warmth = uniform(generator, -0.15, 0.15)
     colour = torch.tensor([1 + warmth, 1.0, 1 - warmth])
     ambient = uniform(generator, 0.2, 0.6) * (2 - colour)
     lit = shade(placed, raster, K, towards, strength * colour, ambient)
@@ -308,7 +315,8 @@ def _piled(
 
 def _viewpoint(config: ObjectsConfig, generator: torch.Generator) -> Rigid:
     """Look down at about the middle of the table, from 25 to 85 degrees above it."""
-    up, around = math.radians(uniform(generator, 25.0, 85.0)), uniform(generator, 0.0, 2 * math.pi)
+    up = math.radians(uniform(generator, 25.0, 85.0))
+    around = uniform(generator, 0.0, 2 * math.pi)
     distance_m = uniform(generator, *config.distance_m)
     flat = math.cos(up)
     eye = [flat * math.cos(around), flat * math.sin(around), math.sin(up)]
@@ -318,7 +326,8 @@ def _viewpoint(config: ObjectsConfig, generator: torch.Generator) -> Rigid:
     )
     R = torch.stack([right, torch.linalg.cross(forward, right), forward])
     roll = uniform(generator, -0.3, 0.3)
-    c, s = math.cos(roll), math.sin(roll)
+    c = math.cos(roll)
+    s = math.sin(roll)
     R = torch.tensor([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]]) @ R
     target = torch.tensor([uniform(generator, -0.05, 0.05), uniform(generator, -0.05, 0.05), 0.03])
     return Rigid(R, -R @ (target + distance_m * torch.tensor(eye)))

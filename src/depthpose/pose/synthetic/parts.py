@@ -32,7 +32,8 @@ def make_part(name: str, number: int = 0, config: MeshConfig | None = None) -> O
         InputError: there is no such part.
     """
     vertices, faces = part_mesh(name)
-    up, origin = torch.tensor([0.0, 0.0, 1.0]).double(), torch.zeros(3).double()
+    up = torch.tensor([0.0, 0.0, 1.0]).double()
+    origin = torch.zeros(3).double()
     symmetries = Symmetries()
     if name == "flange":
         angle = torch.arange(1, _TEETH).double() * (2 * math.pi / _TEETH)
@@ -108,8 +109,10 @@ def circle(radius: float) -> np.ndarray:
 
 def _plate(size: tuple[float, float, float], hole_at: tuple[float, float], hole: float) -> Mesh:
     """A plate with a round hole of a diameter; the outline is seen from the hole."""
-    unit, at = circle(1.0), np.array(hole_at)
-    low, high = -np.array(size[:2]) / 2 - at, np.array(size[:2]) / 2 - at
+    unit = circle(1.0)
+    at = np.array(hole_at)
+    low = -np.array(size[:2]) / 2 - at
+    high = np.array(size[:2]) / 2 - at
     with np.errstate(divide="ignore", invalid="ignore"):
         extent = np.where(unit > 0, high / unit, np.where(unit < 0, low / unit, np.inf)).min(1)
     corners = np.array([[x, y] for x in (low[0], high[0]) for y in (low[1], high[1])])
@@ -151,7 +154,8 @@ def _hose(path: np.ndarray, radius: float) -> Mesh:
     along = np.gradient(path, axis=0)
     along /= np.linalg.norm(along, axis=1, keepdims=True)
     side = np.array([0.0, 1.0, 0.0])
-    outline, loops = circle(radius), []
+    outline = circle(radius)
+    loops = []
     for point, direction in zip(path, along, strict=True):
         across = np.cross(side, direction)
         loops.append(point + outline[:, :1] * across + outline[:, 1:] * side)
@@ -161,9 +165,11 @@ def _hose(path: np.ndarray, radius: float) -> Mesh:
 
 def _skin(loops: list[np.ndarray]) -> Mesh:
     """Join loops of as many corners, counter-clockwise seen against their order."""
-    count, vertices = len(loops[0]), np.concatenate(loops)
+    count = len(loops[0])
+    vertices = np.concatenate(loops)
     i, j = np.meshgrid(np.arange(len(loops) - 1), np.arange(count), indexing="ij")
-    a, b = i * count + j, i * count + (j + 1) % count
+    a = i * count + j
+    b = i * count + (j + 1) % count
     quads = np.stack([a, b, b + count, a, b + count, a + count], -1).reshape(-1, 3)
     corners = vertices[quads]
     area = np.linalg.norm(

@@ -74,8 +74,10 @@ def random_levels(height: int, width: int, generator: torch.Generator) -> Depth:
     Cut at a quantile, it occludes exactly the wanted share of anything.
     """
     size = max(height, width)
-    angle, stretch = uniform(generator, 0.0, 2 * math.pi), uniform(generator, 0.3, 1.0)
-    row, column = uniform(generator, 0.0, float(height)), uniform(generator, 0.0, float(width))
+    angle = uniform(generator, 0.0, 2 * math.pi)
+    stretch = uniform(generator, 0.3, 1.0)
+    row = uniform(generator, 0.0, float(height))
+    column = uniform(generator, 0.0, float(width))
     v = (torch.arange(height)[:, None] - row) / size
     u = (torch.arange(width)[None] - column) / size
     along = math.cos(angle) * u + math.sin(angle) * v
@@ -128,14 +130,16 @@ def measure(
         generator: of the chance.
     """
     kind: SensorKind = config.kinds[whole(generator, len(config.kinds))]
-    noise, missing = uniform(generator, *config.noise), uniform(generator, *config.missing)
+    noise = uniform(generator, *config.noise)
+    missing = uniform(generator, *config.missing)
     if kind == "none":
         return depth_m
     steepest = _STEEPEST if kind != "laser" else 2 * _STEEPEST
     # Lost is what is seen at a grazing angle: one pixel on, the depth changes by far too much.
     limit_m = depth_m * (steepest / focal_px[0])
     is_lost = torch.zeros_like(depth_m, dtype=torch.bool)
-    across, down = depth_m.diff(dim=1).abs_(), depth_m.diff(dim=0).abs_()
+    across = depth_m.diff(dim=1).abs_()
+    down = depth_m.diff(dim=0).abs_()
     # A jump to another surface is steep on one side alone: the flatter side decides.
     is_lost[:, 1:-1] = torch.fmin(across[:, 1:], across[:, :-1]) > limit_m[:, 1:-1]
     is_lost[1:-1] |= torch.fmin(down[1:], down[:-1]) > limit_m[1:-1]
@@ -158,7 +162,8 @@ def measure(
         is_lost |= _is_shadowed(depth_m, focal_px[0])
         # Each pixel reads one that is a pixel or none away: edges are blurred. At the ends of a row
         # it reads beyond; windows have a margin there.
-        steps, index = torch.tensor([-1, 0, 0, 1]), torch.arange(height * width)
+        steps = torch.tensor([-1, 0, 0, 1])
+        index = torch.arange(height * width)
         moves = (steps[:, None] * width + steps).flatten()
         index += moves[torch.randint(16, (height * width,), generator=generator)]
         index = index.clamp_(0, height * width - 1)
@@ -177,8 +182,10 @@ def measure(
     elif kind == "time of flight":
         # A pixel is mixed with its right or lower neighbour where depth jumps.
         share = torch.rand(depth_m.shape, generator=generator)
-        right, lower = depth_m.roll(-1, 1), depth_m.roll(-1, 0)
-        right[:, -1], lower[-1] = depth_m[:, -1], depth_m[-1]
+        right = depth_m.roll(-1, 1)
+        lower = depth_m.roll(-1, 0)
+        right[:, -1] = depth_m[:, -1]
+        lower[-1] = depth_m[-1]
         read_m = depth_m
         for other in (right, lower):
             is_jump = (other - read_m).abs() > _JUMP * read_m
@@ -253,7 +260,8 @@ def make_shape(model: ObjectModel) -> Shape:
     """Prepare an object for many views."""
     triangles = drawn_triangles(model)
     corners = triangles.reshape(-1, 3).double()
-    middle, hull_m = (corners.amin(0) + corners.amax(0)) / 2, corners
+    middle = (corners.amin(0) + corners.amax(0)) / 2
+    hull_m = corners
     with suppress(QhullError, ValueError):  # flat: every corner counts
         hull_m = corners[torch.from_numpy(ConvexHull(corners.numpy()).vertices).long()]
     return Shape(triangles_m=triangles, hull_m=hull_m - middle, middle_m=middle)
@@ -261,7 +269,8 @@ def make_shape(model: ObjectModel) -> Shape:
 
 def gaze(direction: Float[Tensor, "3"], roll_rad: float) -> Float[Tensor, "3 3"]:
     """Rotation that carries the optical axis to a direction, the shortest way, after a roll."""
-    cosine, sine = math.cos(roll_rad), math.sin(roll_rad)
+    cosine = math.cos(roll_rad)
+    sine = math.sin(roll_rad)
     roll = [[cosine, -sine, 0.0], [sine, cosine, 0.0], [0.0, 0.0, 1.0]]
     return turn_axis_to(direction) @ torch.tensor(roll, dtype=torch.float64)
 
@@ -306,14 +315,20 @@ def turn_view(
     # Homogeneous old pixels of the new grid, and how much longer the old ray is.
     ray_from_pixel = turn.mT @ pixel_to_ray(moved)
     (a, b, c), (d, e, f), (g, h, i) = (view.K @ ray_from_pixel).tolist()
-    u, v = torch.arange(width)[None], torch.arange(height)[:, None]
+    u = torch.arange(width)[None]
+    v = torch.arange(height)[:, None]
     w = g * u + h * v + i
-    u, v, values = (a * u + b * v + c) / w, (d * u + e * v + f) / w, 1 / view.depth_m
+    source_u = (a * u + b * v + c) / w
+    source_v = (d * u + e * v + f) / w
+    values = 1 / view.depth_m
     # Between pixels; at edges and beside the object the nearest pixel; NaN outside.
     rows, columns = values.shape
-    left, top = u.floor().clamp_(0, columns - 2), v.floor().clamp_(0, rows - 2)
-    x, y = u - left, v - top
-    index, flat = (top * columns + left).long(), values.reshape(-1)
+    left = source_u.floor().clamp_(0, columns - 2)
+    top = source_v.floor().clamp_(0, rows - 2)
+    x = source_u - left
+    y = source_v - top
+    index = (top * columns + left).long()
+    flat = values.reshape(-1)
     nw, ne, sw, se = (flat[index + beyond] for beyond in (0, 1, columns, columns + 1))
     smooth = torch.lerp(torch.lerp(nw, ne, x), torch.lerp(sw, se, x), y)
     nearest = torch.where(y < 0.5, torch.where(x < 0.5, nw, ne), torch.where(x < 0.5, sw, se))
@@ -389,9 +404,11 @@ class Objects:
         """Make the window of depth and the mask that a sample is lifted from."""
         number = index % len(self.models)
         generator = sample_generator(index, self.config.seed)
-        shape, views = self._shapes[number], self.config.views
+        shape = self._shapes[number]
+        views = self.config.views
         if views is None:  # drawn anew
-            R, distance_m = random_rotation(generator), uniform(generator, *self.config.distance_m)
+            R = random_rotation(generator)
+            distance_m = uniform(generator, *self.config.distance_m)
             K = self.intrinsics(uniform(generator, *self.config.resolution))
             turn = self._gaze(number, distance_m, K, generator)
             R = turn @ R
@@ -404,7 +421,8 @@ class Objects:
             depth_m = stored.depth_m.float() + stored.distance_m
             clean = turn_view(replace(stored, depth_m=depth_m, distance_m=0.0), turn, shape, K)
         silhouette = clean.depth_m.isfinite()
-        depth_m, visible = clean.depth_m, silhouette
+        depth_m = clean.depth_m
+        visible = silhouette
         if self.config.with_background:
             depth_m = self._before_background(clean, shape, generator)
         if uniform(generator, 0.0, 1.0) < self.config.occluded_share:
@@ -446,7 +464,8 @@ class Objects:
             index = place * len(self.models) + number
             generator = sample_generator(index, self.config.seed + _BANK_SEED)
             shape = self._shapes[number]
-            R, distance_m = random_rotation(generator), uniform(generator, *self.config.distance_m)
+            R = random_rotation(generator)
+            distance_m = uniform(generator, *self.config.distance_m)
             K = self.intrinsics(uniform(generator, *self.config.resolution))
             middle_m = torch.tensor([0.0, 0.0, distance_m], dtype=torch.float64)
             view = draw_view(shape, Rigid(R, middle_m - R @ shape.middle_m), K)
@@ -457,7 +476,8 @@ class Objects:
     def intrinsics(self, scale: float = 1.0) -> Float[Tensor, "3 3"]:
         """Intrinsic matrix of the sensor's image at so many times its size."""
         assert self.config.centre_px is not None, "the config gives what was left out"
-        (fx, fy), (cx, cy) = self.config.focal_px, self.config.centre_px
+        fx, fy = self.config.focal_px
+        cx, cy = self.config.centre_px
         rows = [
             [scale * fx, 0, scale * (cx + 0.5) - 0.5],
             [0, scale * fy, scale * (cy + 0.5) - 0.5],
@@ -473,7 +493,8 @@ class Objects:
         radius_px = float(K[0, 0]) * 0.5 * diameter / max(distance_m - 0.5 * diameter, 1e-3)
         place = []
         for size, middle in zip(self.config.image_px, K[:2, 2].tolist(), strict=True):
-            low, high = radius_px, scale * size - 1 - radius_px
+            low = radius_px
+            high = scale * size - 1 - radius_px
             place.append(uniform(generator, low, high) if low < high else middle)
         roll_rad = uniform(generator, 0.0, 2 * math.pi)
         pixel = torch.tensor([*place, 1.0], dtype=torch.float64)
@@ -485,7 +506,8 @@ class Objects:
         """Put a table or wall behind the object, and something else beside it."""
         pose = clean.camera_from_model
         hull_m = shape.hull_m @ pose.R.mT + (pose.t_m + pose.R @ shape.middle_m)
-        tilt, side = uniform(generator, 0.0, _TILT_RAD), uniform(generator, 0.0, 2 * math.pi)
+        tilt = uniform(generator, 0.0, _TILT_RAD)
+        side = uniform(generator, 0.0, 2 * math.pi)
         # It stands upright in the picture of its own pixel, so tilt is from the line of sight.
         normal = gaze(hull_m.mean(0), side) @ torch.tensor(
             [math.sin(tilt), 0.0, -math.cos(tilt)], dtype=torch.float64
@@ -496,7 +518,8 @@ class Objects:
         height, width = clean.depth_m.shape
         slope = a * torch.arange(width)[None] + b * torch.arange(height)[:, None] + c
         behind_m = torch.where(slope * offset > 0, offset / slope, torch.nan)
-        near, far = float(hull_m[:, 2].min()), float(hull_m[:, 2].max())
+        near = float(hull_m[:, 2].min())
+        far = float(hull_m[:, 2].max())
         levels = random_levels(height, width, generator)
         level = float(levels.amin()) + uniform(generator, 0.0, 0.6) * float(
             levels.amax() - levels.amin()

@@ -83,10 +83,13 @@ class TrainingViews(Generic[Config]):
     """
 
     def __init__(self, models: Sequence[ObjectModel], config: Config, seed: int) -> None:
-        self.models, self.config, self.seed = models, config, seed
+        self.models = models
+        self.config = config
+        self.seed = seed
         self.synthetic = Objects(models, config.objects, config.cloud)
         self._class_of = {model.name: k for k, model in enumerate(models)}
-        self._frames, self._real = config.frames, None
+        self._frames = config.frames
+        self._real = None
         frames = config.frames
         if frames is not None:
             dataset = open_bop(frames.folder, frames.split)
@@ -121,7 +124,8 @@ class TrainingClouds(TrainingViews[PoseTraining]):
         Raises:
             InputError: so many in a row have too few points that the config must be wrong.
         """
-        generator, cloud = sample_generator(index, self.seed), self.config.cloud
+        generator = sample_generator(index, self.seed)
+        cloud = self.config.cloud
         for attempt in range(TRIES):
             # Far beyond any training, and the same object.
             place = index + attempt * len(self.models) * 2**32
@@ -133,7 +137,8 @@ class TrainingClouds(TrainingViews[PoseTraining]):
             if self._frames is not None and is_frame:
                 angle_rad = 2 * math.pi * float(torch.rand((), generator=generator))
                 if self._frames.with_roll:  # the camera turns: cloud and pose turn with it
-                    c, s = math.cos(angle_rad), math.sin(angle_rad)
+                    c = math.cos(angle_rad)
+                    s = math.sin(angle_rad)
                     turn = torch.tensor([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
                     pose = sample.truth.camera_from_model
                     turned = Rigid(turn @ pose.R.float(), turn @ pose.t_m.float())
@@ -175,7 +180,8 @@ def voxelised_cloud(
     """
     points = sample_points(sample.input.points_m, config.max_points, generator)
     voxels = voxelise(points, config)
-    turn, pose = voxels.grid_from_camera.float(), sample.truth.camera_from_model
+    turn = voxels.grid_from_camera.float()
+    pose = sample.truth.camera_from_model
     return Cloud(
         points_m=points[voxels.kept].float() @ turn.mT,
         coordinates=voxels.coordinates,
@@ -205,7 +211,8 @@ def read_models(
     if not config.bop and not config.cad:
         raise InputError("there is no object to learn; name its CAD file (--cad FILE --unit mm)")
     if config.bop:
-        folder, numbers = Path(config.bop), config.objects
+        folder = Path(config.bop)
+        numbers = config.objects
         if not numbers:
             home, infos = read_models_info(folder)
             files = [path.stem.removeprefix("obj_") for path in home.glob("obj_*.ply")]
@@ -247,7 +254,8 @@ class ViewsTask:
     def __init__(
         self, network: nn.Module, models: Sequence[ObjectModel], config: ViewsTraining
     ) -> None:
-        self.models, self.training = tuple(models), config
+        self.models = tuple(models)
+        self.training = config
         self.modules: dict[str, nn.Module] = {"network": network.train()}
         self.optimizers = {"network": (make_adam(network.parameters(), config.adam), config.adam)}
         self._held_out: dict[float, list[ViewSample]] = {}
@@ -301,7 +309,8 @@ def add_error(found: Rigid | None, truth: Rigid, model: ObjectModel) -> float:
     """ADD to the nearest symmetric pose, in diameters; infinite where there is no answer."""
     if found is None:
         return math.inf
-    points_m, copies = sample_surface(model, _SURFACE)[0], symmetry_transforms(model.symmetries)
+    points_m = sample_surface(model, _SURFACE)[0]
+    copies = symmetry_transforms(model.symmetries)
     return float(add_of_nearest_m(found, truth, points_m, copies)) / model.diameter_m
 
 
@@ -353,13 +362,15 @@ def table_text(table: Table) -> str:
 def _posed(weights: PoseWeights, objects: Objects) -> tuple[list[PoseEstimate], list[float]]:
     is_regressed = isinstance(weights.network, DepthImageNet)
     net = DepthImageRegressor(weights) if is_regressed else GeoPoseNet(weights)
-    estimates, errors = [], []
+    estimates = []
+    errors = []
     for start in range(0, len(objects), _CLOUDS_AT_ONCE):
         places = range(start, min(start + _CLOUDS_AT_ONCE, len(objects)))
         samples = [objects.view(place) for place in places]
         posed = net.estimate_many([sample.input for sample in samples])
         estimates += posed
         for place, estimate, sample in zip(places, posed, samples, strict=True):
-            model, pose = weights.models[place % len(weights.models)], estimate.camera_from_model
+            model = weights.models[place % len(weights.models)]
+            pose = estimate.camera_from_model
             errors.append(add_error(pose, sample.truth.camera_from_model, model))
     return estimates, errors

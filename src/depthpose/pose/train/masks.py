@@ -150,7 +150,8 @@ def cut_window(
     ].clamp(0, 1)
     labels = F.interpolate(given.labels[None, None].float(), (rows, columns), mode="nearest-exact")
     labels = labels[0, 0].long()
-    bottom, right = max(0, size[0] - rows), max(0, size[1] - columns)
+    bottom = max(0, size[0] - rows)
+    right = max(0, size[1] - columns)
     image = F.pad(image[None], (0, right, 0, bottom), mode="replicate")[0]
     labels = F.pad(labels, (0, right, 0, bottom))
     slack = [side - part for side, part in zip(labels.shape, size, strict=True)]
@@ -177,7 +178,8 @@ class SegmentationTask:
     def __init__(
         self, network: FCN, config: SegmentationTraining, objects: Mapping[int, str]
     ) -> None:
-        self.config, self.objects = config, objects
+        self.config = config
+        self.objects = objects
         self.network = network.train()
         self.modules: dict[str, nn.Module] = {"network": network}
         self.optimizers = {"network": (make_adam(network.parameters(), config.adam), config.adam)}
@@ -200,7 +202,8 @@ class SegmentationTask:
         if self._held_out is None:
             return ValidationResult()
         self.network.eval()
-        classes, pictures = self.network.classes, {}
+        classes = self.network.classes
+        pictures = {}
         table = torch.zeros(classes, classes, dtype=torch.int64)
         for index in range(len(self._held_out)):
             image, labels = self._held_out[index]

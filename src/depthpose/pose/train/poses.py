@@ -85,7 +85,8 @@ class PoseTask(ViewsTask):
         self, network: DirectionNet, models: Sequence[ObjectModel], config: PoseTraining
     ) -> None:
         super().__init__(network, models, config)
-        self.network, self.config = network, config
+        self.network = network
+        self.config = config
         # Keypoints of each object under each of its symmetries (classes, copies, k, 3).
         turns = symmetric_copies(models, _SYMMETRY_STEP)
         keypoints_m = torch.stack([model.keypoints_m.double() for model in models])
@@ -102,8 +103,10 @@ class PoseTask(ViewsTask):
 
     def held_out_error(self, view: ViewSample, index: int) -> float:
         """Let the cloud of a view vote; one that shows too few points is a failure."""
-        number, chance = index % len(self.models), sample_generator(index, HELD_OUT_SEED)
-        model, config = self.models[number], self.config.cloud
+        number = index % len(self.models)
+        chance = sample_generator(index, HELD_OUT_SEED)
+        model = self.models[number]
+        config = self.config.cloud
         sample = lift_sample(view, model.diameter_m, config)
         if refusal_of(sample.input.points_m, config) is not None:
             return math.inf
@@ -123,7 +126,8 @@ def symmetric_copies(models: Sequence[ObjectModel], step_rad: float) -> Rigid:
     R = torch.eye(3).double().repeat(len(models), most, 1, 1)
     t_m = torch.zeros(len(models), most, 3).double()
     for k, copies in enumerate(every):
-        R[k, : len(copies.R)], t_m[k, : len(copies.R)] = copies.R, copies.t_m
+        R[k, : len(copies.R)] = copies.R
+        t_m[k, : len(copies.R)] = copies.t_m
     return Rigid(R, t_m)
 
 
@@ -209,7 +213,8 @@ class DepthImageTask(ViewsTask):
         self, network: DepthImageNet, models: tuple[ObjectModel, ...], config: DepthImageTraining
     ) -> None:
         super().__init__(network, models, config)
-        self.network, self.config = network, config
+        self.network = network
+        self.config = config
         # Points of each surface; those of a sparse model of points come again.
         count = config.surface_points
         every = [sample_surface(model, count)[0] for model in models]
@@ -219,7 +224,8 @@ class DepthImageTask(ViewsTask):
 
     def step(self, batch: CropSample) -> Iterator[Update]:
         """One update: regress, move the model's points, compare; in diameters."""
-        which, device = batch.class_of, batch.R.device
+        which = batch.class_of
+        device = batch.R.device
         outputs = self.network(batch.crop.image, which).float()
         copies = Rigid(self._copies.R.to(device)[which], self._copies.t_m.to(device)[which])
         points_m = self._points_m.to(device)[which]
@@ -230,7 +236,8 @@ class DepthImageTask(ViewsTask):
     def held_out_error(self, view: ViewSample, index: int) -> float:
         """Regress the pose of a view; one that shows too few pixels is a failure."""
         number = index % len(self.models)
-        model, device = self.models[number], next(self.network.parameters()).device
+        model = self.models[number]
+        device = next(self.network.parameters()).device
         crop = cut_depth(view.input, self.network.config, model.diameter_m)
         if crop is None:
             return math.inf
@@ -259,7 +266,8 @@ def train_pose(config: PoseTraining | DepthImageTraining, run: Run) -> Path:
     sizes = {name: size for name, size in sizes.items() if hasattr(config.network, name)}
     config = dataclasses.replace(config, network=dataclasses.replace(config.network, **sizes))
     if isinstance(config, DepthImageTraining):
-        word, samples = "depth-image", TrainingCrops(models, config, config.loop.seed)
+        word = "depth-image"
+        samples = TrainingCrops(models, config, config.loop.seed)
         network = DepthImageNet(config.network)
         task = DepthImageTask(network, models, config)
     else:
@@ -267,9 +275,11 @@ def train_pose(config: PoseTraining | DepthImageTraining, run: Run) -> Path:
         if config.loop.workers > 1 and (config.frames is None or config.frames.share < 1):
             samples.synthetic.draw_stored(config.loop.workers)
         if isinstance(config.network, PointNetConfig):
-            word, network = "pointnet", PointNet(config.network)
+            word = "pointnet"
+            network = PointNet(config.network)
         else:
-            word, network = "pose", ResUNet(config.network)
+            word = "pose"
+            network = ResUNet(config.network)
         task = PoseTask(network, models, config)
     if config.start is not None:
         _start_from(network, config.start, samples)
@@ -300,7 +310,8 @@ def _start_from(network: AnyNetwork, start: str, samples: TrainingViews[Any]) ->
     """Copy weights; of other objects, all but the last layer, except of a depth image's."""
     path = find_weights(start)
     started = network_of(read_checkpoint(path), str(path))
-    wanted, given = config_to_dict(network.config), config_to_dict(started.config)
+    wanted = config_to_dict(network.config)
+    given = config_to_dict(started.config)
     has_norms = isinstance(network, ResUNet) and network.config.norm == "batch"
     free = ("classes", "norm", "with_bias") if has_norms else ("classes",)
     free = () if isinstance(network, DepthImageNet) else free
